@@ -1,0 +1,314 @@
+"""The triangle mesh that every stage passes on."""
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from scipy.sparse import coo_array, csr_array
+from scipy.sparse.csgraph import connected_components
+
+
+@dataclass(frozen=True, eq=False)
+class Mesh:
+    """Vertices and the triangles between them.
+
+    Derived quantities are computed on first use and kept, so neither array may be written to afterwards;
+    both are set read-only.
+
+    Parameters
+    ----------
+    vertices : (N, 3) float, metres
+    faces : (F, 3) int
+        Counter-clockwise seen from outside.
+    colors : (N, 3) float in [0, 1], optional
+
+    Raises
+    ------
+    ValueError
+        An array of the wrong shape, a vertex that is not finite, an index out of range.
+    """
+
+    vertices: np.ndarray
+    faces: np.ndarray
+    colors: np.ndarray | None = None
+
+    def __post_init__(self) -> None:
+        vertices = np.array(self.vertices, dtype=np.float64)
+        faces = np.array(self.faces, dtype=np.int64)
+        if vertices.ndim != 2 or vertices.shape[1] != 3:
+            raise ValueError(f"vertices: expected shape (N, 3), got {vertices.shape}")
+        if faces.ndim != 2 or faces.shape[1] != 3:
+            raise ValueError(f"faces: expected shape (F, 3), got {faces.shape}")
+        bad = np.flatnonzero(~np.isfinite(vertices).all(axis=1))
+        if len(bad):
+            raise ValueError(f"vertices: {len(bad)} are not finite, the first is vertex {bad[0]}")
+        outside = np.flatnonzero(((faces < 0) | (faces >= len(vertices))).any(axis=1))
+        if len(outside):
+            raise ValueError(f"faces: face {outside[0]} = {faces[outside[0]].tolist()} refers to a vertex "
+                             f"outside 0..{len(vertices) - 1}")
+        if self.colors is not None:
+            colors = np.array(self.colors, dtype=np.float64)
+            if colors.shape != vertices.shape:
+                raise ValueError(f"colors: expected shape {vertices.shape}, got {colors.shape}")
+            colors.flags.writeable = False
+            object.__setattr__(self, "colors", colors)
+        vertices.flags.writeable = faces.flags.writeable = False
+        object.__setattr__(self, "vertices", vertices)
+        object.__setattr__(self, "faces", faces)
+
+    def __repr__(self) -> str:
+        return f"Mesh({len(self.vertices)} vertices, {len(self.faces)} faces)"
+
+    def with_vertices(self, vertices: np.ndarray) -> Mesh:
+        """The same triangles on other vertices (N, 3)."""
+        return Mesh(vertices, self.faces, self.colors)
+
+    @cached_property
+    def corners(self) -> np.ndarray:
+        """(F, 3, 3) the three points of every triangle, metres."""
+        return self.vertices[self.faces]
+
+    @cached_property
+    def _cross(self) -> np.ndarray:
+        c = self.corners
+        return np.cross(c[:, 1] - c[:, 0], c[:, 2] - c[:, 0])
+
+    @cached_property
+    def face_areas(self) -> np.ndarray:
+        """(F,) square metres."""
+        return 0.5 * np.linalg.norm(self._cross, axis=1)
+
+    @cached_property
+    def face_normals(self) -> np.ndarray:
+        """(F, 3) unit normals; zero for a triangle without area."""
+        return _unit(self._cross)
+
+    @cached_property
+    def vertex_normals(self) -> np.ndarray:
+        """(N, 3) unit normals, area-weighted; zero at a vertex without triangles."""
+        total = np.zeros_like(self.vertices)
+        for corner in range(3):
+            np.add.at(total, self.faces[:, corner], self._cross)
+        return _unit(total)
+
+    @cached_property
+    def vertex_areas(self) -> np.ndarray:
+        """(N,) a third of the area of the triangles around each vertex, square metres."""
+        return np.bincount(self.faces.ravel(), np.repeat(self.face_areas / 3, 3), len(self.vertices))
+
+    @cached_property
+    def _edges_and_sides(self) -> tuple[np.ndarray, np.ndarray]:
+        half = self.faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
+        edges, of_half = np.unique(np.sort(half, axis=1), axis=0, return_inverse=True)
+        return edges, of_half.reshape(-1, 3)
+
+    @property
+    def edges(self) -> np.ndarray:
+        """(E, 2) every edge once, lower vertex first."""
+        return self._edges_and_sides[0]
+
+    @property
+    def face_edges(self) -> np.ndarray:
+        """(F, 3) the row in `edges` of the sides 01, 12, 20 of every triangle."""
+        return self._edges_and_sides[1]
+
+    @cached_property
+    def edge_lengths(self) -> np.ndarray:
+        """(E,) metres."""
+        a, b = self.edges.T
+        return np.linalg.norm(self.vertices[a] - self.vertices[b], axis=1)
+
+    @cached_property
+    def edge_use(self) -> np.ndarray:
+        """(E,) how many triangles use each edge: 1 at a border, 2 inside, more where it is not manifold."""
+        return np.bincount(self.face_edges.ravel(), minlength=len(self.edges))
+
+    @cached_property
+    def face_pairs(self) -> np.ndarray:
+        """(P, 2) triangles that share an edge, for edges with exactly two triangles."""
+        order = np.argsort(self.face_edges.ravel(), kind="stable") // 3
+        start = np.concatenate([[0], np.cumsum(self.edge_use)[:-1]])
+        inner = start[self.edge_use == 2]
+        return np.stack([order[inner], order[inner + 1]], axis=1)
+
+    @cached_property
+    def vertex_adjacency(self) -> csr_array:
+        """(N, N) sparse, 1 where an edge joins two vertices."""
+        a, b = self.edges.T
+        n = len(self.vertices)
+        one = np.ones(2 * len(a))
+        return csr_array(coo_array((one, (np.r_[a, b], np.r_[b, a])), shape=(n, n)))
+
+    @cached_property
+    def is_edge_manifold(self) -> bool:
+        """No edge has more than two triangles, and neighbours agree on which side is outside."""
+        half = self.faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
+        return bool((self.edge_use <= 2).all()) and len(np.unique(half, axis=0)) == len(half)
+
+    @cached_property
+    def is_vertex_manifold(self) -> bool:
+        """The triangles around every vertex form one fan."""
+        corner = np.arange(self.faces.size).reshape(-1, 3)
+        joined = []
+        for side in range(3):        # corners of the two triangles at an inner edge that share a vertex
+            v = np.stack([self.faces[:, side], self.faces[:, (side + 1) % 3]], axis=1)
+            c = np.stack([corner[:, side], corner[:, (side + 1) % 3]], axis=1)
+            joined.append(np.concatenate([self.face_edges[:, [side]], v, c], axis=1))
+        rows = np.concatenate(joined)
+        swap = rows[:, 1] > rows[:, 2]
+        rows[swap] = rows[swap][:, [0, 2, 1, 4, 3]]
+        rows = rows[np.argsort(rows[:, 0], kind="stable")]
+        same = rows[1:, 0] == rows[:-1, 0]
+        a = np.r_[rows[:-1, 3][same], rows[:-1, 4][same]]
+        b = np.r_[rows[1:, 3][same], rows[1:, 4][same]]
+        n = self.faces.size
+        fans, _ = connected_components(coo_array((np.ones(len(a)), (a, b)), shape=(n, n)), directed=False)
+        return fans == len(np.unique(self.faces))
+
+    @cached_property
+    def boundary_vertices(self) -> np.ndarray:
+        """(B,) vertices on an edge that has one triangle, ascending."""
+        return np.unique(self.edges[self.edge_use == 1])
+
+    @cached_property
+    def boundary_loops(self) -> list[np.ndarray]:
+        """Closed borders as vertex lists, longest first, in the direction of the triangles' own sides.
+
+        Where a border touches itself in a vertex it is cut into simple loops.
+        """
+        half = self.faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
+        border = half[self.edge_use[self.face_edges.ravel()] == 1]
+        return sorted(_loops(border), key=len, reverse=True)
+
+    @cached_property
+    def is_closed(self) -> bool:
+        """Every edge has exactly two triangles."""
+        return bool(len(self.faces)) and bool((self.edge_use == 2).all())
+
+    @cached_property
+    def vertex_component(self) -> np.ndarray:
+        """(N,) number of the connected component of each vertex, largest component 0.
+
+        A vertex without triangles is a component of its own.
+        """
+        _, label = connected_components(self.vertex_adjacency, directed=False)
+        rank = np.argsort(-np.bincount(label), kind="stable")
+        return np.argsort(rank)[label]
+
+    @cached_property
+    def volume(self) -> float:
+        """Enclosed volume in cubic metres; meaningful when closed, negative when inside out."""
+        c = self.corners
+        return float(np.einsum("fi,fi->", c[:, 0], np.cross(c[:, 1], c[:, 2])) / 6)
+
+    @cached_property
+    def mean_edge(self) -> float:
+        """Mean edge length in metres, the resolution of the mesh."""
+        return float(self.edge_lengths.mean())
+
+    def submesh(self, keep: np.ndarray) -> tuple[Mesh, np.ndarray]:
+        """The triangles in `keep` and the vertices they use.
+
+        Parameters
+        ----------
+        keep : (F,) bool or (n,) int
+            Triangles to keep.
+
+        Returns
+        -------
+        Mesh
+        (n,) int
+            The old index of every new vertex.
+        """
+        faces = self.faces[keep]
+        used, new = np.unique(faces, return_inverse=True)
+        colors = None if self.colors is None else self.colors[used]
+        return Mesh(self.vertices[used], new.reshape(-1, 3), colors), used
+
+    def sample(self, count: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Points spread evenly over the surface.
+
+        Returns
+        -------
+        (count, 3) float, metres
+        (count,) int, the triangle of each
+        (count, 3) float, barycentric coordinates
+        """
+        face = rng.choice(len(self.faces), count, p=self.face_areas / self.face_areas.sum())
+        r = np.sqrt(rng.random(count))
+        s = rng.random(count)
+        bary = np.stack([1 - r, r * (1 - s), r * s], axis=1)
+        return np.einsum("nc,ncd->nd", bary, self.corners[face]), face, bary
+
+
+def template_problem(mesh: Mesh) -> str | None:
+    """Why a mesh cannot serve as template, or None when it can.
+
+    A template is one connected, closed or bordered manifold component without unused vertices,
+    repeated triangles or triangles without area.
+    """
+    if not len(mesh.faces):
+        return "it has no triangles"
+    unused = len(mesh.vertices) - len(np.unique(mesh.faces))
+    if unused:
+        return f"{unused} vertices belong to no triangle"
+    components = mesh.vertex_component.max() + 1
+    if components > 1:
+        sizes = np.bincount(mesh.vertex_component)
+        return f"it has {components} components (of {', '.join(map(str, sizes[:4]))} vertices), expected one"
+    if len(np.unique(np.sort(mesh.faces, axis=1), axis=0)) < len(mesh.faces):
+        return "some triangles appear twice"
+    flat = np.flatnonzero(mesh.face_areas < 1e-12)
+    if len(flat):
+        return f"{len(flat)} triangles have no area, the first is face {flat[0]}"
+    if not mesh.is_edge_manifold:
+        return "it is not manifold: some edges have more than two triangles or triangles facing opposite ways"
+    if not mesh.is_vertex_manifold:
+        return "it is not manifold: at some vertices separate sheets touch"
+    return None
+
+
+def check_template(mesh: Mesh, name: str = "template") -> None:
+    """Raise ValueError with the reason when a mesh cannot serve as template."""
+    problem = template_problem(mesh)
+    if problem:
+        raise ValueError(f"{name}: not usable as a template, {problem}")
+
+
+def _unit(v: np.ndarray) -> np.ndarray:
+    length = np.linalg.norm(v, axis=-1, keepdims=True)
+    return np.divide(v, length, out=np.zeros_like(v), where=length > 0)
+
+
+def _loops(border: np.ndarray) -> list[np.ndarray]:
+    """Cut directed border edges (n, 2) into simple closed loops."""
+    following: dict[int, list[int]] = {}
+    for a, b in border.tolist():
+        following.setdefault(a, []).append(b)
+    loops = []
+    while following:
+        path = [next(iter(following))]
+        place = {path[0]: 0}
+        while path:
+            ahead = following.get(path[-1])
+            if not ahead:
+                break                # an open end: only where the mesh is not manifold
+            step = ahead.pop()
+            if not ahead:
+                del following[path[-1]]
+            if step in place:
+                first = place[step]
+                loops.append(np.array(path[first:]))
+                for v in path[first + 1:]:
+                    del place[v]
+                path = path[:first + 1]
+                if step not in following:
+                    break
+            else:
+                place[step] = len(path)
+                path.append(step)
+        for v in path[:-1]:
+            if not following.get(v):
+                following.pop(v, None)
+    return loops

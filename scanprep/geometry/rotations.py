@@ -1,0 +1,104 @@
+"""The page of conventions for rotations, thin over `scipy.spatial.transform.Rotation`.
+
+- A rotation is an active 3×3 matrix that acts on column vectors: `x_world = R_world_part @ x_part`.
+- The target frame comes first in a name: `T_scan_template` takes template points to the scan.
+- A rotation vector (twist) is axis times angle in radians; `exp` and `log` go between the two.
+- A small turn is applied from the left: `R ← exp(ω) R`, with ω in world axes.
+- Points are stored as rows, so `points @ R.T` turns them.
+
+All functions take any number of leading dimensions.
+"""
+from __future__ import annotations
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+
+def exp(twist: np.ndarray) -> np.ndarray:
+    """Rotation matrices (..., 3, 3) of rotation vectors (..., 3), radians."""
+    twist = np.asarray(twist, dtype=np.float64)
+    return Rotation.from_rotvec(twist.reshape(-1, 3)).as_matrix().reshape(*twist.shape, 3)
+
+
+def log(R: np.ndarray) -> np.ndarray:
+    """Rotation vectors (..., 3), radians, of length at most π, of rotation matrices (..., 3, 3).
+
+    Well defined at angles 0 and π, where the formula printed in the paper is not.
+
+    [SCAPE] §4.2
+    """
+    R = np.asarray(R, dtype=np.float64)
+    return Rotation.from_matrix(R.reshape(-1, 3, 3)).as_rotvec().reshape(R.shape[:-1])
+
+
+def project(M: np.ndarray) -> np.ndarray:
+    """The proper rotation nearest to each matrix (..., 3, 3) in the Frobenius norm, never a reflection."""
+    U, _, Vt = np.linalg.svd(M)
+    flip = np.linalg.det(U @ Vt) < 0
+    U[flip, :, 2] *= -1
+    return U @ Vt
+
+
+def mean(R: np.ndarray) -> np.ndarray:
+    """The chordal mean (3, 3) of rotations (n, 3, 3)."""
+    return project(np.mean(R, axis=0)[None])[0]
+
+
+def hat(v: np.ndarray) -> np.ndarray:
+    """The matrices (..., 3, 3) with `hat(v) @ x == cross(v, x)`.
+
+    [SCAPE] Eq. 11
+    """
+    v = np.asarray(v, dtype=np.float64)
+    out = np.zeros((*v.shape, 3))
+    out[..., 0, 1], out[..., 0, 2], out[..., 1, 2] = -v[..., 2], v[..., 1], -v[..., 0]
+    out[..., 1, 0], out[..., 2, 0], out[..., 2, 1] = v[..., 2], -v[..., 1], v[..., 0]
+    return out
+
+
+def right_jacobian(twist: np.ndarray) -> np.ndarray:
+    """J_r (..., 3, 3) with `exp(t + d) ≈ exp(t) exp(J_r(t) d)`."""
+    t = np.asarray(twist, dtype=np.float64)
+    angle = np.linalg.norm(t, axis=-1)[..., None, None]
+    small = angle < 1e-3
+    a = np.where(small, 1.0, angle)
+    K = hat(t)
+    first = np.where(small, 0.5 - angle**2 / 24, (1 - np.cos(a)) / a**2)
+    second = np.where(small, 1 / 6 - angle**2 / 120, (a - np.sin(a)) / a**3)
+    return np.eye(3) - first * K + second * K @ K
+
+
+def inverse_right_jacobian(twist: np.ndarray) -> np.ndarray:
+    """The inverse (..., 3, 3) of `right_jacobian`, for rotation vectors shorter than 2π.
+
+    `log(exp(t) exp(d)) ≈ t + J_r⁻¹(t) d`.
+    """
+    t = np.asarray(twist, dtype=np.float64)
+    angle = np.linalg.norm(t, axis=-1)[..., None, None]
+    small = angle < 1e-3
+    a = np.where(small, 1.0, angle)
+    K = hat(t)
+    second = np.where(small, 1 / 12 + angle**2 / 720, 1 / a**2 - (1 + np.cos(a)) / (2 * a * np.sin(a)))
+    return np.eye(3) + 0.5 * K + second * K @ K
+
+
+def procrustes(source: np.ndarray, target: np.ndarray, weights: np.ndarray | None = None
+               ) -> tuple[np.ndarray, np.ndarray]:
+    """Rotation R (..., 3, 3) and translation t (..., 3) that bring `source` nearest to `target`.
+
+    Parameters
+    ----------
+    source, target : (..., n, 3) float, metres
+    weights : (n,) float, optional
+
+    Returns
+    -------
+    R, t with `target ≈ source @ R.T + t`.
+    """
+    w = np.ones(source.shape[-2]) if weights is None else np.asarray(weights, dtype=np.float64)
+    w = w / w.sum()
+    centre_s = np.einsum("n,...nd->...d", w, source)
+    centre_t = np.einsum("n,...nd->...d", w, target)
+    H = np.einsum("n,...ni,...nj->...ij", w, target - centre_t[..., None, :], source - centre_s[..., None, :])
+    R = project(H.reshape(-1, 3, 3)).reshape(H.shape)
+    return R, centre_t - np.einsum("...ij,...j->...i", R, centre_s)

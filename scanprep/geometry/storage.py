@@ -1,0 +1,90 @@
+"""One file = named arrays and a JSON header with kind and version; never pickle."""
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import zipfile
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+HEADER = "header"
+
+
+class StorageError(ValueError):
+    """A stored file that is missing, damaged, or of another kind or version."""
+
+
+@contextlib.contextmanager
+def writing(path: str | Path) -> Iterator[Path]:
+    """A temporary path beside `path` that takes its place when the block ends without an error.
+
+    The file is never seen half written, and what stood there before stays until the new one is whole.
+    """
+    path = Path(path)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    beside = path.with_name(f".{path.stem}.{os.getpid()}.part{path.suffix}")
+    try:
+        yield beside
+        os.replace(beside, path)
+    finally:
+        beside.unlink(missing_ok=True)
+
+
+def write_json(path: str | Path, value: Any) -> None:
+    """Write JSON, whole or not at all."""
+    with writing(path) as beside:
+        beside.write_text(json.dumps(value, indent=1) + "\n", encoding="utf-8")
+
+
+def save(path: str | Path, kind: str, version: int, arrays: dict[str, np.ndarray],
+         header: dict[str, Any] | None = None) -> None:
+    """Write arrays and a JSON header into one `.npz` file.
+
+    Parameters
+    ----------
+    kind, version
+        What the file holds and the number of its layout; `load` checks both.
+    arrays : name -> array
+        No object arrays.
+    header : JSON-serialisable, optional
+    """
+    text = json.dumps({"kind": kind, "version": version, **(header or {})})
+    with writing(path) as beside, open(beside, "wb") as out:
+        np.savez_compressed(out, allow_pickle=False, **{HEADER: np.array(text)}, **arrays)
+
+
+def load(path: str | Path, kind: str, versions: tuple[int, ...]) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
+    """Read a file of `save`.
+
+    Returns
+    -------
+    header, arrays
+
+    Raises
+    ------
+    StorageError
+        Missing, not such a file, damaged, another kind, or a version that is not in `versions`.
+    """
+    path = Path(path)
+    try:
+        with np.load(path, allow_pickle=False) as data:
+            if HEADER not in data.files:
+                raise StorageError(f"{path}: expected a {kind} file, found an .npz without a header")
+            header = json.loads(str(data[HEADER]))
+            arrays = {name: data[name] for name in data.files if name != HEADER}
+    except FileNotFoundError:
+        raise StorageError(f"{path}: no such file") from None
+    except StorageError:
+        raise
+    except (OSError, ValueError, EOFError, KeyError, zipfile.BadZipFile) as error:
+        raise StorageError(f"{path}: expected a {kind} file, cannot read it ({error})") from None
+    if header.get("kind") != kind:
+        raise StorageError(f"{path}: expected kind '{kind}', found '{header.get('kind')}'")
+    if header.get("version") not in versions:
+        known = ", ".join(map(str, versions))
+        raise StorageError(f"{path}: {kind} version {header.get('version')} is not known here (known: {known})")
+    return header, arrays

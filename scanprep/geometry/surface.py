@@ -1,0 +1,169 @@
+"""Closest points on a surface, matches with compatible normals, and rays."""
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from .mesh import Mesh
+
+
+@dataclass(frozen=True)
+class SurfacePoints:
+    """Points on the triangles of a mesh.
+
+    Attributes
+    ----------
+    points : (n, 3) float, metres
+    faces : (n,) int
+    bary : (n, 3) float, barycentric coordinates
+    distances : (n,) float, metres, from the query points
+    """
+
+    points: np.ndarray
+    faces: np.ndarray
+    bary: np.ndarray
+    distances: np.ndarray
+
+    def carried(self, vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
+        """The same surface points (n, 3) on other vertices of the same triangulation."""
+        return np.einsum("nc,ncd->nd", self.bary, vertices[faces[self.faces]])
+
+
+class Surface:
+    """Closest-point queries on one mesh, its search tree built once.
+
+    Parameters
+    ----------
+    mesh : Mesh
+    """
+
+    def __init__(self, mesh: Mesh) -> None:
+        import igl
+
+        self.mesh = mesh
+        self._vertices = np.ascontiguousarray(mesh.vertices)
+        self._faces = np.ascontiguousarray(mesh.faces)
+        self._tree = igl.AABB()
+        self._tree.init(self._vertices, self._faces)
+
+    def closest(self, points: np.ndarray) -> SurfacePoints:
+        """The point of the surface closest to each query point (n, 3)."""
+        points = np.ascontiguousarray(points, dtype=np.float64)
+        squared, face, closest = self._tree.squared_distance(self._vertices, self._faces, points)[:3]
+        squared, face = np.asarray(squared).reshape(-1), np.asarray(face, dtype=np.int64).reshape(-1)
+        closest = np.asarray(closest).reshape(-1, 3)
+        return SurfacePoints(closest, face, barycentric(closest, self.mesh.corners[face]),
+                             np.sqrt(np.maximum(squared, 0)))
+
+
+def barycentric(points: np.ndarray, corners: np.ndarray) -> np.ndarray:
+    """Barycentric coordinates (n, 3) of points (n, 3) in the planes of triangles (n, 3, 3).
+
+    For a triangle without area, all weight is on its first corner.
+    """
+    u, v = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
+    w = points - corners[:, 0]
+    uu, uv, vv = (np.einsum("nd,nd->n", a, b) for a, b in ((u, u), (u, v), (v, v)))
+    wu, wv = np.einsum("nd,nd->n", w, u), np.einsum("nd,nd->n", w, v)
+    det = uu * vv - uv * uv
+    flat = det <= 1e-30
+    det = np.where(flat, 1.0, det)
+    b1 = np.where(flat, 0.0, (vv * wu - uv * wv) / det)
+    b2 = np.where(flat, 0.0, (uu * wv - uv * wu) / det)
+    return np.stack([1 - b1 - b2, b1, b2], axis=1)
+
+
+@dataclass(frozen=True)
+class Matches:
+    """For each query point a target point with a compatible normal, or none.
+
+    Attributes
+    ----------
+    index : (n,) int
+        Which target, -1 where none was acceptable.
+    distances : (n,) float, metres; inf where there is none
+    """
+
+    index: np.ndarray
+    distances: np.ndarray
+
+    @property
+    def valid(self) -> np.ndarray:
+        """(n,) bool"""
+        return self.index >= 0
+
+
+class OrientedPoints:
+    """Nearest neighbours among points whose normals agree with the query's.
+
+    Points and normals are searched together in six dimensions: the squared distance is
+    |x - y|² + scale² |n - m|², so a point on the near side of a thin limb wins over a closer one on the far
+    side. Matches beyond the limits are rejected afterwards.
+
+    Parameters
+    ----------
+    points : (m, 3) float, metres
+    normals : (m, 3) float, unit
+    scale : float, metres
+        How much distance a difference of normals weighs.
+    """
+
+    def __init__(self, points: np.ndarray, normals: np.ndarray, scale: float = 0.05) -> None:
+        self.points, self.normals, self.scale = points, normals, scale
+        self._tree = cKDTree(np.hstack([points, scale * normals]))
+
+    def match(self, points: np.ndarray, normals: np.ndarray, max_distance: float = np.inf,
+              min_cosine: float = 0.5) -> Matches:
+        """The best target of each query (n, 3) with normals (n, 3)."""
+        _, index = self._tree.query(np.hstack([points, self.scale * normals]), workers=-1)
+        distances = np.linalg.norm(self.points[index] - points, axis=1)
+        cosine = np.einsum("nd,nd->n", self.normals[index], normals)
+        good = (distances <= max_distance) & (cosine >= min_cosine)
+        return Matches(np.where(good, index, -1), np.where(good, distances, np.inf))
+
+
+class Rays:
+    """Ray casting against one mesh with Embree.
+
+    Parameters
+    ----------
+    mesh : Mesh
+    """
+
+    def __init__(self, mesh: Mesh) -> None:
+        from embreex import rtcore_scene
+        from embreex.mesh_construction import TriangleMesh
+
+        # Embree works in float32: centre the mesh so that no accuracy is lost far from the origin.
+        self._origin = mesh.vertices.mean(axis=0)
+        self._scene = rtcore_scene.EmbreeScene()
+        self._mesh = TriangleMesh(self._scene, (mesh.vertices - self._origin)[mesh.faces].astype(np.float32))
+
+    def cast(self, origins: np.ndarray, directions: np.ndarray, reach: float = 1e6
+             ) -> tuple[np.ndarray, np.ndarray]:
+        """First hits of rays.
+
+        Parameters
+        ----------
+        origins, directions : (n, 3) float
+            Directions are unit vectors.
+        reach : float, metres
+
+        Returns
+        -------
+        (n,) int
+            Triangle, -1 for none.
+        (n,) float, metres
+            Distance, NaN for none.
+        """
+        start = np.ascontiguousarray(origins - self._origin, dtype=np.float32)
+        along = np.ascontiguousarray(np.broadcast_to(directions, origins.shape), dtype=np.float32)
+        hit = self._scene.run(start, along, np.full(len(start), reach, dtype=np.float32), output=True)
+        face = np.asarray(hit["primID"], dtype=np.int64)
+        return face, np.where(face >= 0, np.asarray(hit["tfar"], dtype=np.float64), np.nan)
+
+    def occluded(self, origins: np.ndarray, directions: np.ndarray, reach: float = 1e6) -> np.ndarray:
+        """(n,) bool: something lies within `reach` along each ray."""
+        return self.cast(origins, directions, reach)[0] >= 0

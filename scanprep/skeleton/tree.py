@@ -1,0 +1,224 @@
+"""The articulated skeleton: parts of the surface, a tree over them, and a joint for every link."""
+from __future__ import annotations
+
+import json
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from functools import cached_property
+from pathlib import Path
+
+import numpy as np
+from scipy.sparse import coo_array, csr_array
+
+from ..geometry import rotations, storage
+from ..geometry.mesh import Mesh
+
+VERSION = 1
+
+
+@dataclass(frozen=True, eq=False)
+class Skeleton:
+    """Rigid parts of a template and the tree that links them.
+
+    Parameters
+    ----------
+    part_of_face : (F,) int
+        Part of every triangle, 0..J-1; every part has triangles.
+    parents : (J,) int
+        Parent before child; part 0 is the root and its own parent is -1.
+    joints : (J, 3) float, metres
+        Where part j is linked to its parent, on the template; `joints[0]` is the centroid of the vertices
+        of part 0.
+    names : J strings, optional
+
+    Raises
+    ------
+    ValueError
+        Not a tree with parents first, an empty part, or shapes that do not agree.
+    """
+
+    part_of_face: np.ndarray
+    parents: np.ndarray
+    joints: np.ndarray
+    names: tuple[str, ...] = field(default=())
+
+    def __post_init__(self) -> None:
+        part_of_face = np.array(self.part_of_face, dtype=np.int64)
+        parents = np.array(self.parents, dtype=np.int64)
+        joints = np.array(self.joints, dtype=np.float64)
+        J = len(parents)
+        if joints.shape != (J, 3):
+            raise ValueError(f"joints: expected shape ({J}, 3) for {J} parents, got {joints.shape}")
+        if not J or parents[0] != -1:
+            raise ValueError("parents: expected part 0 to be the root, with parent -1")
+        wrong = np.flatnonzero((parents[1:] < 0) | (parents[1:] >= np.arange(1, J))) + 1
+        if len(wrong):
+            raise ValueError(f"parents: part {wrong[0]} has parent {parents[wrong[0]]}, "
+                             f"expected a part listed before it")
+        if part_of_face.ndim != 1 or set(np.unique(part_of_face)) != set(range(J)):
+            raise ValueError(f"part_of_face: expected every part of 0..{J - 1} to have triangles, "
+                             f"found {np.unique(part_of_face).tolist()}")
+        names = tuple(self.names) or tuple(f"part{j}" for j in range(J))
+        if len(names) != J or len(set(names)) != J:
+            raise ValueError(f"names: expected {J} different names, got {list(names)}")
+        for name, value in (("part_of_face", part_of_face), ("parents", parents), ("joints", joints)):
+            value.flags.writeable = False
+            object.__setattr__(self, name, value)
+        object.__setattr__(self, "names", names)
+
+    def __repr__(self) -> str:
+        return f"Skeleton({len(self.parents)} parts, {len(self.part_of_face)} faces)"
+
+    @cached_property
+    def joints_of_part(self) -> tuple[tuple[int, ...], ...]:
+        """For each part the joints on it: its own (unless it is the root) and those of its children."""
+        return tuple(tuple(j for j in range(1, len(self.parents)) if j == p or self.parents[j] == p)
+                     for p in range(len(self.parents)))
+
+    @cached_property
+    def descends(self) -> np.ndarray:
+        """(J, J) bool: [p, j] is true where part p is j or hangs below it."""
+        J = len(self.parents)
+        below = np.eye(J, dtype=bool)
+        for p in range(1, J):
+            below[p] |= below[self.parents[p]]
+        return below
+
+    def part_of_vertex(self, mesh: Mesh) -> np.ndarray:
+        """(N,) the part of most triangles around each vertex, the lowest number where they tie."""
+        votes = np.zeros((len(mesh.vertices), len(self.parents)), dtype=np.int64)
+        for corner in range(3):
+            np.add.at(votes, (mesh.faces[:, corner], self.part_of_face), 1)
+        return votes.argmax(axis=1)
+
+    def ring(self, mesh: Mesh, j: int, widen: int = 0) -> np.ndarray:
+        """Vertices where part j meets its parent, and those within `widen` edges of them."""
+        touches = np.zeros((len(mesh.vertices), 2), dtype=bool)
+        for side, part in enumerate((j, self.parents[j])):
+            touches[mesh.faces[self.part_of_face == part].ravel(), side] = True
+        ring = touches.all(axis=1).astype(float)
+        for _ in range(widen):
+            ring = ((ring > 0) | (mesh.vertex_adjacency @ ring > 0)).astype(float)
+        return np.flatnonzero(ring)
+
+    def joint_regressor(self, template: Mesh) -> csr_array:
+        """(J, N) weights, each row summing to 1, with `regressor @ template.vertices == joints`.
+
+        A joint is a fixed affine combination of the vertices around the ring where the parts meet (for
+        the root: the mean of its vertices), so on any posed or reshaped body `regressor @ vertices` are
+        its joints.
+
+        Raises
+        ------
+        ValueError
+            A part that does not touch its parent.
+        """
+        rows, columns, values = [], [], []
+        for j in range(len(self.parents)):
+            if j == 0:
+                ring = np.flatnonzero(self.part_of_vertex(template) == 0)
+                weights = np.full(len(ring), 1 / len(ring))
+            else:
+                ring = self.ring(template, j, widen=2)
+                if not len(ring):
+                    raise ValueError(f"part_of_face: part {j} does not touch its parent {self.parents[j]}")
+                weights = _affine_weights(template.vertices[ring], self.joints[j])
+            rows.append(np.full(len(ring), j))
+            columns.append(ring)
+            values.append(weights)
+        entries = (np.concatenate(values), (np.concatenate(rows), np.concatenate(columns)))
+        return csr_array(coo_array(entries, shape=(len(self.parents), len(template.vertices))))
+
+    def part_rotations(self, pose: np.ndarray) -> np.ndarray:
+        """World rotations (..., J, 3, 3) of the parts for poses (..., J, 3), radians.
+
+        `R_j = R_parent(j) exp(pose_j)`, `R_0 = exp(pose_0)`.
+        """
+        relative = rotations.exp(pose)
+        R = np.empty_like(relative)
+        R[..., 0, :, :] = relative[..., 0, :, :]
+        for j in range(1, len(self.parents)):
+            R[..., j, :, :] = R[..., self.parents[j], :, :] @ relative[..., j, :, :]
+        return R
+
+    def pose_of(self, R: np.ndarray) -> np.ndarray:
+        """The poses (..., J, 3), radians, of part rotations (..., J, 3, 3): the inverse of `part_rotations`."""
+        relative = R.copy()
+        child = np.arange(1, len(self.parents))
+        relative[..., 1:, :, :] = np.swapaxes(R[..., self.parents[child], :, :], -1, -2) @ R[..., 1:, :, :]
+        return rotations.log(relative)
+
+    def fit_rotations(self, template: Mesh, vertices: np.ndarray) -> np.ndarray:
+        """The rotation of every part (..., J, 3, 3) that best carries the template onto (..., N, 3)."""
+        R = np.empty((*vertices.shape[:-2], len(self.parents), 3, 3))
+        for p in range(len(self.parents)):
+            mine = np.unique(template.faces[self.part_of_face == p])
+            R[..., p, :, :] = rotations.procrustes(
+                np.broadcast_to(template.vertices[mine], (*vertices.shape[:-2], len(mine), 3)),
+                vertices[..., mine, :])[0]
+        return R
+
+    def save(self, path: str | Path) -> None:
+        """Write as JSON."""
+        storage.write_json(path, {
+            "kind": "skeleton", "version": VERSION, "names": list(self.names), "parents": self.parents.tolist(),
+            "joints": self.joints.tolist(), "part_of_face": self.part_of_face.tolist()})
+
+    @staticmethod
+    def load(path: str | Path) -> Skeleton:
+        """Read a file of `save`.
+
+        Raises
+        ------
+        StorageError
+            Missing, not a skeleton, or a version that is not known.
+        """
+        try:
+            stored = json.loads(Path(path).read_text(encoding="utf-8"))
+        except FileNotFoundError:
+            raise storage.StorageError(f"{path}: no such file") from None
+        except ValueError as error:
+            raise storage.StorageError(f"{path}: expected a skeleton in JSON, cannot read it ({error})") from None
+        if not isinstance(stored, dict) or stored.get("kind") != "skeleton":
+            raise storage.StorageError(f"{path}: expected a skeleton in JSON, found something else")
+        if stored.get("version") != VERSION:
+            raise storage.StorageError(f"{path}: skeleton version {stored.get('version')} is not known here "
+                                       f"(known: {VERSION})")
+        try:
+            return Skeleton(stored["part_of_face"], stored["parents"], stored["joints"], tuple(stored["names"]))
+        except (KeyError, TypeError) as error:
+            raise storage.StorageError(f"{path}: skeleton lacks or has a damaged field ({error})") from None
+        except ValueError as error:
+            raise storage.StorageError(f"{path}: {error}") from None
+
+
+def _affine_weights(points: np.ndarray, target: np.ndarray) -> np.ndarray:
+    """Weights nearest to equal that sum to 1 and average `points` (n, 3) to `target`."""
+    n = len(points)
+    scale = np.linalg.norm(points - points.mean(axis=0), axis=1).mean()
+    A = np.vstack([np.ones(n), (points - points.mean(axis=0)).T / scale])
+    b = np.r_[1.0, (target - points.mean(axis=0)) / scale]
+    start = np.full(n, 1 / n)
+    return start + np.linalg.lstsq(A, b - A @ start, rcond=None)[0]
+
+
+def reorder(part_of_face: np.ndarray, parents: Sequence[int], root: int) -> np.ndarray:
+    """Order of the parts (old numbers) that puts `root` first and every parent before its children.
+
+    Parameters
+    ----------
+    parents : J ints
+        An undirected tree given by any rooting, -1 at its root.
+    """
+    links: dict[int, list[int]] = {p: [] for p in range(len(parents))}
+    for child, parent in enumerate(parents):
+        if parent >= 0:
+            links[child].append(int(parent))
+            links[int(parent)].append(child)
+    size = np.bincount(part_of_face, minlength=len(parents))
+    order, seen = [root], {root}
+    for part in order:
+        ahead = sorted((q for q in links[part] if q not in seen), key=lambda q: (-size[q], q))
+        order += ahead
+        seen.update(ahead)
+    return np.array(order)
