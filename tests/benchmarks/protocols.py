@@ -20,7 +20,7 @@ def data_folder() -> Path:
     """The folder of real scans, or SystemExit with the reason."""
     folder = os.environ.get("SCAPEKIT_DATA")
     if not folder or not Path(folder, "scape_poses").is_dir():
-        raise SystemExit("set SCAPEKIT_DATA to the folder that holds scape_poses, spring_shapes and landmarks.json")
+        raise SystemExit("set SCAPEKIT_DATA to the folder of scape_poses, spring_shapes and landmarks.json")
     return Path(folder)
 
 
@@ -39,8 +39,8 @@ def load_real(folder: Path | None = None) -> RealData:
     import igl
 
     folder = folder or data_folder()
-    read = lambda name: [igl.read_triangle_mesh(str(p)) for p in sorted((folder / name).glob("*.ply"))]
-    poses, shapes = read("scape_poses"), read("spring_shapes")
+    poses, shapes = ([igl.read_triangle_mesh(str(p)) for p in sorted((folder / name).glob("*.ply"))]
+                     for name in ("scape_poses", "spring_shapes"))
     return RealData(Mesh(*poses[0]), np.stack([v for v, _ in poses]).astype(float),
                     np.stack([v for v, _ in shapes]).astype(float),
                     json.loads((folder / "landmarks.json").read_text()))
