@@ -1,0 +1,186 @@
+"""What the readers of all formats share: the error, the contents of a file, polygons and tables of numbers."""
+from __future__ import annotations
+
+import gzip
+import zlib
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+
+class MeshFileError(ValueError):
+    """A file of a mesh, points or landmarks that cannot be read: which one, what was expected, what came."""
+
+
+@dataclass(frozen=True, eq=False)
+class Contents:
+    """What a file of any format holds, in the file's own unit and order.
+
+    Attributes
+    ----------
+    vertices : (N, 3) float
+    faces : (F, 3) int, or None where the format or the file has none
+    normals : (N, 3) float, optional
+    colors : (N, 3) float in [0, 1], optional
+    """
+
+    vertices: np.ndarray
+    faces: np.ndarray | None = None
+    normals: np.ndarray | None = None
+    colors: np.ndarray | None = None
+
+
+def load_bytes(path: Path) -> bytes:
+    """The whole file, unpacked when its name ends in `.gz`.
+
+    Raises
+    ------
+    MeshFileError
+        Missing, a folder, unreadable, empty, or a damaged gzip file.
+    """
+    try:
+        data = path.read_bytes()
+        if path.suffix.lower() == ".gz":
+            data = gzip.decompress(data)
+    except FileNotFoundError:
+        raise MeshFileError(f"{path}: no such file") from None
+    except IsADirectoryError:
+        raise MeshFileError(f"{path}: expected a file, found a folder") from None
+    except (EOFError, zlib.error, gzip.BadGzipFile) as error:
+        raise MeshFileError(f"{path}: truncated or damaged gzip file ({error})") from None
+    except OSError as error:
+        raise MeshFileError(f"{path}: cannot be read ({error.strerror or error})") from None
+    if not data:
+        raise MeshFileError(f"{path}: the file is empty")
+    return data
+
+
+def quote(text: bytes | str, length: int = 40) -> str:
+    """The beginning of a piece of a file, fit for one line of an error."""
+    shown = text if isinstance(text, str) else text.decode("latin-1")
+    return repr(shown if len(shown) <= length else shown[:length] + "...")
+
+
+class Lines:
+    """The lines of a text file that hold something, with their numbers.
+
+    Parameters
+    ----------
+    path : Path
+        For the errors.
+    data : bytes
+    first : int
+        The number of the first line of `data`.
+    comment : bytes, optional
+        What follows it on a line is left out.
+    """
+
+    def __init__(self, path: Path, data: bytes, first: int = 1, comment: bytes | None = None) -> None:
+        self.path = path
+        lines = data.splitlines()
+        if comment is not None and comment in data:
+            lines = [line.split(comment, 1)[0] for line in lines]
+        kept = [(number, line) for number, line in enumerate(lines, first) if line.strip()]
+        self.numbers = [number for number, _ in kept]
+        self.text = [line for _, line in kept]
+
+    def __len__(self) -> int:
+        return len(self.text)
+
+    def fail(self, row: int, expected: str) -> MeshFileError:
+        """The error for a row that is not as expected; past the last row: the file is truncated."""
+        if row >= len(self.text):
+            return MeshFileError(f"{self.path}: truncated: expected {expected}, found the end of the file")
+        return MeshFileError(f"{self.path}: line {self.numbers[row]}: expected {expected}, "
+                             f"found {quote(self.text[row].strip())}")
+
+    def table(self, rows: Sequence[int], expected: str, columns: int, dtype: type = np.float64) -> np.ndarray:
+        """The numbers (len(rows), at least `columns`) of rows that all have equally many.
+
+        Raises
+        ------
+        MeshFileError
+            A row that is missing, too short, of another length than the first, or not numbers.
+        """
+        inside = slice(rows[0], rows[-1] + 1) if isinstance(rows, range) and rows else None
+        chunk = self.text[inside] if inside else [self.text[row] for row in rows if row < len(self.text)]
+        if not rows:
+            return np.zeros((0, columns), dtype=dtype)
+        if len(chunk) == len(rows):
+            try:
+                values: np.ndarray = np.loadtxt(chunk, dtype=dtype, ndmin=2, comments=None)
+            except ValueError:
+                pass
+            else:
+                if values.shape[1] >= columns:
+                    return values
+        raise self._first_bad(rows, expected, columns, dtype)
+
+    def _first_bad(self, rows: Sequence[int], expected: str, columns: int, dtype: type) -> MeshFileError:
+        width = None
+        for row in rows:
+            words = self.text[row].split() if row < len(self.text) else []
+            if len(words) < columns or (width is not None and len(words) != width):
+                return self.fail(row, expected)
+            width = len(words)
+            try:
+                for word in words:
+                    dtype(word)
+            except ValueError:
+                return self.fail(row, expected)
+        return self.fail(rows[0], expected)
+
+
+def polygons(path: Path, sizes: np.ndarray, corners: np.ndarray, count: int,
+             numbers: Sequence[int] | None = None) -> np.ndarray:
+    """Triangles (F, 3) of polygons, each cut into a fan around its first corner.
+
+    Parameters
+    ----------
+    path : Path
+        For the errors.
+    sizes : (P,) int
+        Corners of each polygon.
+    corners : (sum of sizes,) int
+        Their vertices, one polygon after the other.
+    count : int
+        How many vertices there are.
+    numbers : P ints, optional
+        The line of each polygon, for the errors.
+
+    Raises
+    ------
+    MeshFileError
+        Fewer than three corners, or a vertex out of range.
+    """
+    sizes, corners = np.asarray(sizes, dtype=np.int64), np.asarray(corners, dtype=np.int64)
+    start = np.cumsum(sizes) - sizes
+
+    def where(p: int) -> str:
+        return f"{path}: " + (f"line {numbers[p]}: " if numbers is not None else "") + f"face {p}"
+
+    few = np.flatnonzero(sizes < 3)
+    if len(few):
+        raise MeshFileError(f"{where(few[0])} has {sizes[few[0]]} corners, expected at least 3")
+    outside = np.flatnonzero((corners < 0) | (corners >= count))
+    if len(outside):
+        p = int(np.searchsorted(start, outside[0], side="right")) - 1
+        raise MeshFileError(f"{where(p)} refers to vertex {corners[outside[0]]}, expected 0..{count - 1}")
+    if (sizes == 3).all():
+        return corners.reshape(-1, 3)
+    of = np.repeat(np.arange(len(sizes)), sizes - 2)
+    within = np.arange(len(of)) - np.repeat(np.cumsum(sizes - 2) - (sizes - 2), sizes - 2)
+    return np.stack([corners[start[of]], corners[start[of] + within + 1], corners[start[of] + within + 2]], axis=1)
+
+
+def as_colors(values: np.ndarray, kind: np.dtype) -> np.ndarray:
+    """Colours in [0, 1] of values stored as integers of full scale or as floats in [0, 1]."""
+    scale = np.iinfo(kind).max if kind.kind in "iu" else 1.0
+    return np.clip(np.asarray(values, dtype=np.float64) / scale, 0, 1)
+
+
+def as_bytes(colors: np.ndarray) -> np.ndarray:
+    """Colours in [0, 1] as integers 0..255."""
+    return np.clip(np.rint(255 * colors), 0, 255).astype(np.uint8)

@@ -1,0 +1,272 @@
+"""PLY: ascii and binary of either byte order, with colours and normals; everything else is skipped."""
+from __future__ import annotations
+
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from .common import Contents, Lines, MeshFileError, as_bytes, as_colors, polygons, quote
+
+_TYPES = {"char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4", "float": "f4",
+          "double": "f8", "int8": "i1", "uint8": "u1", "int16": "i2", "uint16": "u2", "int32": "i4",
+          "uint32": "u4", "int64": "i8", "uint64": "u8", "float32": "f4", "float64": "f8"}
+_ORDERS = {b"ascii": "=", b"binary_little_endian": "<", b"binary_big_endian": ">"}
+_CORNERS = ("vertex_indices", "vertex_index")
+_COLORS = (("red", "green", "blue"), ("r", "g", "b"), ("diffuse_red", "diffuse_green", "diffuse_blue"))
+
+
+@dataclass(frozen=True)
+class _Property:
+    name: str
+    kind: str                        # numpy type code of the value or of the list's items
+    length_kind: str | None = None   # that of the list's length, None for a single value
+
+
+@dataclass(frozen=True)
+class _Element:
+    name: str
+    count: int
+    properties: tuple[_Property, ...]
+
+
+_Column = np.ndarray | tuple[np.ndarray, np.ndarray]     # values, or the lengths and the items of lists
+
+
+def read(path: Path, data: bytes) -> Contents:
+    """The vertices, triangles, normals and colours of a PLY file."""
+    order, elements, start, first_line = _header(path, data)
+    names = [e.name for e in elements]
+    if "vertex" not in names:
+        raise MeshFileError(f"{path}: expected an element vertex, the header has {names}")
+    lines = Lines(path, data[start:], first_line) if order == "=" else None
+    found: dict[str, dict[str, _Column]] = {}
+    place = 0 if lines else start
+    for element in elements:
+        if lines:
+            columns, place = _ascii_element(lines, element, place)
+        else:
+            columns, place = _binary_element(path, data, element, place, order)
+        found[element.name] = columns
+    rest = len(lines) - place if lines else len(data[place:].rstrip(b"\0\r\n\t "))
+    if rest > 0:
+        counts = ", ".join(f"{e.count} {e.name}" for e in elements)
+        raise MeshFileError(f"{path}: expected the end of the file after {counts}, found {rest} more "
+                            f"{'lines' if lines else 'bytes'}")
+    vertex = next(e for e in elements if e.name == "vertex")
+    return _contents(path, vertex, found)
+
+
+def _header(path: Path, data: bytes) -> tuple[str, list[_Element], int, int]:
+    """Byte order, elements, and the place and line number where the body begins."""
+    if not data.startswith(b"ply") or data[3:4] not in (b"\n", b"\r"):
+        raise MeshFileError(f"{path}: expected a PLY file that begins with 'ply', found {quote(data[:20])}")
+    end = data.find(b"end_header")
+    if end < 0:
+        raise MeshFileError(f"{path}: truncated: the PLY header has no end_header")
+    after = end + len(b"end_header")
+    after += len(b"\r\n") if data[3:5] == b"\r\n" else 1
+    order, elements, lines = None, [], data[:end].splitlines()
+    for number, line in enumerate(lines[1:], 2):
+        words = line.split()
+        try:
+            if not words or words[0] in (b"comment", b"obj_info"):
+                continue
+            if words[0] == b"format":
+                order = _ORDERS[words[1]]
+            elif words[0] == b"element":
+                elements.append(_Element(words[1].decode(), _count(words[2]), ()))
+            elif words[0] == b"property":
+                last = elements[-1]
+                elements[-1] = _Element(last.name, last.count, (*last.properties, _property(words)))
+            else:
+                raise KeyError
+        except (KeyError, IndexError, ValueError):
+            raise MeshFileError(f"{path}: line {number}: expected a line of a PLY header, "
+                                f"found {quote(line)}") from None
+    if order is None:
+        raise MeshFileError(f"{path}: expected a format line in the PLY header, found none")
+    return order, elements, after, len(lines) + 2
+
+
+def _count(word: bytes) -> int:
+    if int(word) < 0:
+        raise ValueError
+    return int(word)
+
+
+def _property(words: list[bytes]) -> _Property:
+    text = [w.decode() for w in words]
+    if text[1] == "list":
+        return _Property(text[4], _TYPES[text[3]], _TYPES[text[2]])
+    return _Property(text[2], _TYPES[text[1]])
+
+
+def _binary_element(path: Path, data: bytes, element: _Element, start: int, order: str
+                    ) -> tuple[dict[str, _Column], int]:
+    """All rows at once when every list has the length it has in the first row, else row by row."""
+    lengths = _first_lengths(data, element, start, order) if element.count else {}
+    if lengths is not None:
+        fields: list[tuple] = []
+        for i, p in enumerate(element.properties):
+            if p.length_kind:
+                fields.append((f"length{i}", order + p.length_kind))
+            fields.append((f"value{i}", order + p.kind, (lengths.get(i, 0),) if p.length_kind else ()))
+        row = np.dtype(fields)
+        whole = start + row.itemsize * element.count <= len(data)
+        if whole or not lengths:
+            if not whole:
+                raise _truncated(path, element, (len(data) - start) // row.itemsize)
+            table = np.frombuffer(data, row, element.count, start)
+            if all((table[f"length{i}"] == n).all() for i, n in lengths.items()):
+                columns: dict[str, _Column] = {}
+                for i, p in enumerate(element.properties):
+                    value = table[f"value{i}"]
+                    columns[p.name] = ((np.full(element.count, lengths.get(i, 0)), value.reshape(-1))
+                                       if p.length_kind else value)
+                return columns, start + row.itemsize * element.count
+    return _binary_rows(path, data, element, start, order)
+
+
+def _first_lengths(data: bytes, element: _Element, start: int, order: str) -> dict[int, int] | None:
+    """The length of each list in the first row, None where the data end before it does."""
+    lengths = {}
+    for i, p in enumerate(element.properties):
+        n = 1
+        if p.length_kind:
+            kind = np.dtype(order + p.length_kind)
+            if start + kind.itemsize > len(data):
+                return None
+            n = lengths[i] = int(np.frombuffer(data, kind, 1, start)[0])
+            start += kind.itemsize
+        start += n * np.dtype(p.kind).itemsize
+        if n < 0 or start > len(data):
+            return None
+    return lengths
+
+
+def _binary_rows(path: Path, data: bytes, element: _Element, start: int, order: str
+                 ) -> tuple[dict[str, _Column], int]:
+    kinds = [(np.dtype(order + p.kind), np.dtype(order + p.length_kind) if p.length_kind else None)
+             for p in element.properties]
+    sizes: list[list[int]] = [[] for _ in kinds]
+    items: list[list[np.ndarray]] = [[] for _ in kinds]
+    for row in range(element.count):
+        for i, (kind, length_kind) in enumerate(kinds):
+            n = 1
+            if length_kind is not None:
+                if start + length_kind.itemsize > len(data):
+                    raise _truncated(path, element, row)
+                n = int(np.frombuffer(data, length_kind, 1, start)[0])
+                start += length_kind.itemsize
+            if n < 0 or start + n * kind.itemsize > len(data):
+                raise _truncated(path, element, row)
+            sizes[i].append(n)
+            items[i].append(np.frombuffer(data, kind, n, start))
+            start += n * kind.itemsize
+    columns: dict[str, _Column] = {}
+    for i, p in enumerate(element.properties):
+        flat = np.concatenate(items[i]) if items[i] else np.zeros(0, p.kind)
+        columns[p.name] = (np.array(sizes[i], dtype=np.int64), flat) if p.length_kind else flat
+    return columns, start
+
+
+def _truncated(path: Path, element: _Element, found: int) -> MeshFileError:
+    return MeshFileError(f"{path}: truncated: expected {element.count} rows of element {element.name}, "
+                         f"found {found}")
+
+
+def _ascii_element(lines: Lines, element: _Element, start: int) -> tuple[dict[str, _Column], int]:
+    stop = start + element.count
+    if stop > len(lines):
+        raise _truncated(lines.path, element, max(len(lines) - start, 0))
+    width = len(element.properties)
+    expected = f"{width} values of element {element.name}"
+    whole = all(p.kind[0] in "iu" for p in element.properties)
+    if not any(p.length_kind for p in element.properties):
+        table = lines.table(range(start, stop), expected, width, np.int64 if whole else np.float64)
+        return {p.name: table[:, i] for i, p in enumerate(element.properties)}, stop
+    if width == 1 and whole and element.count:
+        n = len(lines.text[start].split()) - 1           # all lists as long as the first, or one by one below
+        try:
+            table = np.loadtxt(lines.text[start:stop], dtype=np.int64, ndmin=2, comments=None)
+        except ValueError:
+            pass
+        else:
+            if (table[:, 0] == n).all():
+                return {element.properties[0].name: (table[:, 0], table[:, 1:].reshape(-1))}, stop
+    return _ascii_rows(lines, element, start), stop
+
+
+def _ascii_rows(lines: Lines, element: _Element, start: int) -> dict[str, _Column]:
+    sizes: list[list[int]] = [[] for _ in element.properties]
+    items: list[list[float]] = [[] for _ in element.properties]
+    for row in range(start, start + element.count):
+        words = lines.text[row].split()
+        place = 0
+        try:
+            for i, p in enumerate(element.properties):
+                n = 1
+                if p.length_kind:
+                    n = int(words[place])
+                    place += 1
+                values = words[place:place + n]
+                if n < 0 or len(values) != n:
+                    raise ValueError
+                sizes[i].append(n)
+                items[i] += map(int if p.kind[0] in "iu" else float, values)
+                place += n
+        except (ValueError, IndexError):
+            raise lines.fail(row, f"a row of element {element.name} as its header says") from None
+    return {p.name: (np.array(sizes[i], dtype=np.int64), np.array(items[i])) if p.length_kind
+            else np.array(items[i]) for i, p in enumerate(element.properties)}
+
+
+def _contents(path: Path, vertex: _Element, found: dict[str, dict[str, _Column]]) -> Contents:
+    columns = found["vertex"]
+
+    def triple(names: tuple[str, ...]) -> np.ndarray | None:
+        values = [columns.get(name) for name in names]
+        if any(v is None or isinstance(v, tuple) for v in values):
+            return None
+        return np.stack([np.asarray(v, dtype=np.float64) for v in values], axis=1)
+
+    vertices = triple(("x", "y", "z"))
+    if vertices is None:
+        raise MeshFileError(f"{path}: expected properties x, y, z of element vertex, "
+                            f"found {[p.name for p in vertex.properties]}")
+    kinds = {p.name: np.dtype(p.kind) for p in vertex.properties}
+    colors = next((as_colors(c, kinds[names[0]]) for names in _COLORS if (c := triple(names)) is not None), None)
+    faces = None
+    if "face" in found:
+        lists = next((found["face"][name] for name in _CORNERS if name in found["face"]), None)
+        if not isinstance(lists, tuple):
+            raise MeshFileError(f"{path}: expected a property list vertex_indices of element face, "
+                                f"found {list(found['face'])}")
+        faces = polygons(path, lists[0], lists[1], len(vertices))
+    return Contents(vertices, faces, triple(("nx", "ny", "nz")), colors)
+
+
+def encode(contents: Contents, double: bool) -> bytes:
+    """A binary little-endian PLY file; coordinates as `double` or, smaller, as `float`."""
+    number = "f8" if double else "f4"
+    names = ["x", "y", "z"] + (["nx", "ny", "nz"] if contents.normals is not None else [])
+    fields = [(name, "<" + number) for name in names]
+    if contents.colors is not None:
+        fields += [(name, "u1") for name in _COLORS[0]]
+    rows = np.zeros(len(contents.vertices), dtype=fields)
+    for values, group in ((contents.vertices, names[:3]), (contents.normals, names[3:]),
+                          (None if contents.colors is None else as_bytes(contents.colors), _COLORS[0])):
+        if values is not None:
+            for i, name in enumerate(group):
+                rows[name] = values[:, i]
+    words = {"<f8": "double", "<f4": "float", "u1": "uchar"}
+    header = ["ply", "format binary_little_endian 1.0", f"element vertex {len(rows)}"]
+    header += [f"property {words[kind]} {name}" for name, kind in fields]
+    body = rows.tobytes()
+    if contents.faces is not None:
+        header += [f"element face {len(contents.faces)}", "property list uchar int vertex_indices"]
+        faces = np.zeros(len(contents.faces), dtype=[("length", "u1"), ("corners", "<i4", (3,))])
+        faces["length"], faces["corners"] = 3, contents.faces
+        body += faces.tobytes()
+    return ("\n".join([*header, "end_header"]) + "\n").encode() + body
