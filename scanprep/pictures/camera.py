@@ -1,0 +1,123 @@
+"""Where a picture is taken from."""
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from ..geometry.mesh import Mesh
+
+
+@dataclass(frozen=True, eq=False)
+class Camera:
+    """A view of the scene; the picture is scaled so that `width` × `height` metres fit into it.
+
+    Attributes
+    ----------
+    target : (3,) float, metres
+        What stands in the middle of the picture.
+    axes : (3, 3) float
+        Rows: right, up and back (towards the camera), unit and perpendicular.
+    vertical : (3,) float
+        Unit vector that points away from the ground.
+    width, height : float, metres
+        Extent to be visible at the target.
+    distance : float, metres
+        From the camera to the target; inf for parallel rays.
+    """
+
+    target: np.ndarray
+    axes: np.ndarray
+    vertical: np.ndarray
+    width: float
+    height: float
+    distance: float = np.inf
+
+    @classmethod
+    def around(cls, subject: Mesh | Sequence[Mesh] | np.ndarray, azimuth: float = 0.0, elevation: float = 8.0,
+               up: int = 2, lens: float = 6.0, margin: float = 1.06) -> Camera:
+        """A camera that holds the whole subject.
+
+        Parameters
+        ----------
+        subject : Mesh, several, or points (n, 3); two points are the corners of a box
+        azimuth : float, degrees
+            Counter-clockwise about the upward axis. At 0 the camera stands on the +x side when z is up, on the
+            +z side when y is up.
+        elevation : float, degrees
+            Height of the camera above the horizon.
+        up : int
+            0, 1 or 2: the axis that points up.
+        lens : float
+            Distance of the camera in sizes of the subject; inf for parallel rays.
+        margin : float
+            Extent of the picture over that of the subject.
+        """
+        points = _points(subject)
+        middle = (points.min(axis=0) + points.max(axis=0)) / 2
+        a, e = np.radians(azimuth), np.radians(elevation)
+        vertical, first, second = np.eye(3)[[up, (up + 1) % 3, (up + 2) % 3]]
+        back = np.cos(e) * (np.cos(a) * first + np.sin(a) * second) + np.sin(e) * vertical
+        right = np.cos(a) * second - np.sin(a) * first
+        axes = np.stack([right, np.cross(back, right), back])
+        size = max(float(np.linalg.norm(points.max(axis=0) - points.min(axis=0))), 1e-9)
+        x, y, depth = ((points - middle) @ axes.T).T
+        if np.isfinite(lens):
+            nearer = lens * size / (lens * size - depth)
+            x, y = x * nearer, y * nearer
+        centre = middle + axes[0] * (x.min() + x.max()) / 2 + axes[1] * (y.min() + y.max()) / 2
+        return cls(centre, axes, vertical, margin * max(float(np.ptp(x)), 1e-3 * size),
+                   margin * max(float(np.ptp(y)), 1e-3 * size), lens * size)
+
+    @property
+    def position(self) -> np.ndarray:
+        """(3,) float, metres; of a camera with parallel rays, a point far behind the scene."""
+        away = self.distance if np.isfinite(self.distance) else 10 * (self.width + self.height)
+        return self.target + away * self.axes[2]
+
+    def closer(self, factor: float, target: np.ndarray | None = None) -> Camera:
+        """The same view `factor` times as large, about another target (3,) when one is given."""
+        return replace(self, width=self.width / factor, height=self.height / factor,
+                       target=self.target if target is None else np.asarray(target, dtype=float))
+
+    def rays(self, width: int, height: int, samples: int = 1) -> tuple[np.ndarray, np.ndarray]:
+        """Origins, relative to the target, and unit directions of the rays of a picture, row by row.
+
+        Both are (height·samples · width·samples, 3) float32.
+        """
+        pixel = max(self.width / width, self.height / height) / samples
+        across = (np.arange(width * samples) + 0.5 - width * samples / 2) * pixel
+        down = (height * samples / 2 - np.arange(height * samples) - 0.5) * pixel
+        right, up, back = self.axes.astype(np.float32)
+        on_plane = (down.astype(np.float32)[:, None, None] * up + across.astype(np.float32)[:, None] * right)
+        on_plane = on_plane.reshape(-1, 3)
+        if not np.isfinite(self.distance):
+            far = np.float32(10 * (self.width + self.height))
+            origins = on_plane + far * back
+            return origins, np.broadcast_to(-back, origins.shape)
+        directions = on_plane - np.float32(self.distance) * back
+        directions /= np.sqrt(np.einsum("nd,nd->n", directions, directions))[:, None]
+        return np.broadcast_to(np.float32(self.distance) * back, directions.shape), directions
+
+    def project(self, points: np.ndarray, width: int, height: int) -> np.ndarray:
+        """Where points (n, 3) appear in a picture: (n, 2) column and row in pixels."""
+        x, y, depth = ((np.asarray(points) - self.target) @ self.axes.T).T
+        nearer = self.distance / (self.distance - depth) if np.isfinite(self.distance) else 1.0
+        pixel = max(self.width / width, self.height / height)
+        return np.stack([width / 2 + x * nearer / pixel, height / 2 - y * nearer / pixel], axis=1)
+
+
+def _points(subject: Mesh | Sequence[Mesh] | np.ndarray) -> np.ndarray:
+    if isinstance(subject, Mesh):
+        return subject.vertices
+    if isinstance(subject, np.ndarray):
+        points = np.asarray(subject, dtype=float).reshape(-1, 3)
+        points = points[np.isfinite(points).all(axis=1)]
+        if len(points) == 2:
+            points = np.stack([corner.ravel() for corner in np.meshgrid(*points.T)], axis=1)
+    else:
+        points = np.concatenate([_points(getattr(one, "mesh", one)) for one in subject])
+    if not len(points):
+        raise ValueError("subject: expected a mesh or points to look at, found none")
+    return points

@@ -1,0 +1,105 @@
+"""Colours that carry numbers: heat maps with their bar, and a palette for parts."""
+from __future__ import annotations
+
+import numpy as np
+
+HEAT = "magma_r"      # light where the value is low, so that a good result looks like a body
+HEAT_END = 0.86       # the darkest end of the map would swallow the shading
+NO_VALUE = (0.72, 0.74, 0.76)
+
+
+def heat(values: np.ndarray, low: float = 0.0, high: float | None = None, colormap: str = HEAT) -> np.ndarray:
+    """Colours of a perceptually uniform map.
+
+    Parameters
+    ----------
+    values : (...,) float
+        NaN becomes a neutral grey.
+    low, high : float
+        Values at the two ends; None for the largest value.
+    colormap : str
+        A matplotlib name.
+
+    Returns
+    -------
+    (..., 3) float in [0, 1]
+    """
+    from matplotlib import colormaps
+
+    values = np.asarray(values, dtype=float)
+    if high is None:
+        high = float(np.nanmax(values, initial=low))
+    place = np.clip((values - low) / max(high - low, 1e-30), 0, 1)
+    colors = colormaps[colormap](np.nan_to_num(place) * (HEAT_END if colormap == HEAT else 1.0))[..., :3]
+    colors[np.isnan(values)] = NO_VALUE
+    return colors
+
+
+def color_bar(low: float, high: float, title: str = "", colormap: str = HEAT, width: int = 320) -> np.ndarray:
+    """A legend for `heat` with lengths in millimetres.
+
+    Parameters
+    ----------
+    low, high : float, metres
+    title : str
+    width : int, pixels
+
+    Returns
+    -------
+    (H, W, 3) uint8
+    """
+    from PIL import Image, ImageDraw
+
+    from .sheets import INK, font
+
+    pad, thick = 26, 14
+    top = 26 if title else 6
+    image = Image.new("RGB", (width, top + thick + 26), "white")
+    draw = ImageDraw.Draw(image)
+    if title:
+        draw.text((width / 2, 4), title, fill=INK, anchor="ma", font=font(14))
+    ramp = heat(np.linspace(low, high, width - 2 * pad), low, high, colormap)
+    image.paste(Image.fromarray(np.repeat((255 * ramp[None] + 0.5).astype(np.uint8), thick, axis=0)), (pad, top))
+    for place in np.linspace(0, 1, 5):
+        x = pad + place * (width - 2 * pad - 1)
+        draw.line((x, top + thick, x, top + thick + 3), fill=INK)
+        value = f"{1000 * (low + place * (high - low)):.3g}" + (" mm" if place == 1 else "")
+        draw.text((x, top + thick + 5), value, fill=INK, anchor="ma", font=font(13))
+    return np.asarray(image)
+
+
+def part_palette(count: int) -> np.ndarray:
+    """Colours (count, 3) in [0, 1]; numbers that follow each other are far apart in hue."""
+    number = np.arange(count)
+    hue = 2 * np.pi * (0.07 + number * 0.61803398875)
+    lightness = np.array([0.74, 0.64, 0.82])[number % 3]
+    chroma = np.array([0.125, 0.15, 0.105])[number % 3]
+    return _from_oklab(np.stack([lightness, chroma * np.cos(hue), chroma * np.sin(hue)], axis=-1))
+
+
+def part_colors(part_of_face: np.ndarray) -> np.ndarray:
+    """A distinct colour (F, 3) for each part number (F,); negative numbers are grey."""
+    part_of_face = np.asarray(part_of_face)
+    palette = part_palette(int(part_of_face.max(initial=0)) + 1)
+    return np.where(part_of_face[:, None] < 0, np.array(NO_VALUE), palette[part_of_face])
+
+
+def _from_oklab(lab: np.ndarray) -> np.ndarray:
+    """sRGB in [0, 1] of Björn Ottosson's Oklab coordinates (..., 3)."""
+    to_lms = np.array([[1, 0.3963377774, 0.2158037573], [1, -0.1055613458, -0.0638541728],
+                       [1, -0.0894841775, -1.2914855480]])
+    to_rgb = np.array([[4.0767416621, -3.3077115913, 0.2309699292], [-1.2684380046, 2.6097574011, -0.3413193965],
+                       [-0.0041960863, -0.7034186147, 1.7076147010]])
+    return encode((lab @ to_lms.T) ** 3 @ to_rgb.T)
+
+
+def encode(linear: np.ndarray) -> np.ndarray:
+    """sRGB values of linear light, clipped to [0, 1]."""
+    linear = np.clip(linear, 0, 1)
+    return np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)
+
+
+def decode(color: np.ndarray) -> np.ndarray:
+    """Linear light of sRGB values in [0, 1]."""
+    color = np.asarray(color, dtype=float)
+    return np.where(color <= 0.04045, color / 12.92, ((color + 0.055) / 1.055) ** 2.4)

@@ -1,0 +1,202 @@
+"""What light does to triangles under a camera: rays, visibility, shading, and the canvas it ends on."""
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from .colors import encode
+
+# Directions of the lights in the camera's frame (right, up, back) and their linear strengths.
+KEY, FILL, RIM = ((-0.50, 0.62, 0.62), 0.92), ((0.85, 0.10, 0.50), 0.22), ((0.55, 0.45, -0.70), 0.45)
+SKY, BOUNCE = np.array([0.46, 0.48, 0.52]), np.array([0.30, 0.27, 0.25])
+BACK_FACE = np.array([0.30, 0.33, 0.40])      # tint of the inner side of an open surface
+SHADOW = 0.55                                 # darkest alpha on the floor
+
+
+@dataclass(frozen=True, eq=False)
+class Triangles:
+    """Corners (F, 3, 3) with their unit normals and linear colours, both (F, 3, 3).
+
+    Shapes whose visibility is to be computed also bring the vertex numbers (F, 3) of the corners and the normals
+    (N, 3) at the vertices.
+    """
+
+    corners: np.ndarray
+    normals: np.ndarray
+    colors: np.ndarray
+    faces: np.ndarray | None = None
+    vertex_normals: np.ndarray | None = None
+
+
+class Scene:
+    """Triangles in one search tree, with the camera's frame `axes` (3, 3) and the direction away from the ground."""
+
+    def __init__(self, shapes: Sequence[Triangles], axes: np.ndarray, vertical: np.ndarray) -> None:
+        from embreex.mesh_construction import TriangleMesh
+        from embreex.rtcore_scene import EmbreeScene
+
+        self.axes, self.vertical = axes, vertical
+        self.corners = np.concatenate([s.corners for s in shapes]).astype(np.float32)
+        self._shapes = shapes
+        self._starts = np.cumsum([0] + [len(s.corners) for s in shapes])
+        # normal, colour, ambient and key visibility of every corner, interpolated together
+        self.attributes = np.ones((len(self.corners), 3, 8), dtype=np.float32)
+        self.attributes[..., :3] = np.concatenate([s.normals for s in shapes])
+        self.attributes[..., 3:6] = np.concatenate([s.colors for s in shapes])
+        self._tree = EmbreeScene()
+        self._kept = TriangleMesh(self._tree, self.corners)
+        span = self.corners.reshape(-1, 3)
+        self.size = float(np.linalg.norm(np.ptp(span, axis=0))) if len(span) else 1.0
+        solids = [s.corners.reshape(-1, 3) @ vertical for s in shapes if s.faces is not None and len(s.corners)]
+        self.floor = min((float(h.min()) for h in solids), default=np.inf)
+
+    def seen(self, origins: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Rays that hit something, their linear colours and their distances."""
+        if not len(self.corners):
+            return np.empty(0, int), np.empty((0, 3), np.float32), np.empty(0, np.float32)
+        hit = self._tree.run(np.ascontiguousarray(origins), np.ascontiguousarray(directions), output=True)
+        rays = np.flatnonzero(hit["primID"] >= 0)
+        face = hit["primID"][rays]
+        self._light_vertices(np.unique(face))
+        u, v = hit["u"][rays], hit["v"][rays]
+        return rays, self._shade(face, np.stack([1 - u - v, u, v], axis=1), directions[rays]), hit["tfar"][rays]
+
+    def _light_vertices(self, faces: np.ndarray) -> None:
+        """Fill in the visibility at the corners of the triangles in sight."""
+        sky = sphere_directions(80)
+        key = cone_directions(_unit(np.array(KEY[0])) @ self.axes, 0.16, 14)
+        for shape, start, end in zip(self._shapes, self._starts[:-1], self._starts[1:], strict=True):
+            mine = faces[(faces >= start) & (faces < end)] - start
+            if shape.faces is None or shape.vertex_normals is None or not len(mine):
+                continue
+            vertices, first = np.unique(shape.faces[mine], return_index=True)
+            points = shape.corners[mine].reshape(-1, 3)[first]
+            normals = shape.vertex_normals[vertices]
+            light = np.ones((len(shape.vertex_normals), 2), dtype=np.float32)
+            light[vertices, 0] = self._open(points, normals, sky, 0.30 * self.size)
+            light[vertices, 1] = self._open(points, normals, key, 4 * self.size)
+            self.attributes[start + mine, :, 6:] = light[shape.faces[mine]]
+
+    def _open(self, points: np.ndarray, normals: np.ndarray, directions: np.ndarray, reach: float) -> np.ndarray:
+        """Cosine-weighted share of directions (k, 3) in which points (n, 3) look into the open."""
+        cosine = np.maximum(normals @ directions.T, 0)
+        point, direction = np.nonzero(cosine > 0.05)
+        start = (points + 2e-3 * self.size * normals).astype(np.float32)[point]
+        along = directions.astype(np.float32)[direction]
+        far = np.full(len(point), reach, dtype=np.float32)
+        blocked = self._tree.run(start, along, far, query="OCCLUDED") >= 0
+        weight = cosine[point, direction]
+        total = np.bincount(point, weight, len(points))
+        clear = np.bincount(point, weight * ~blocked, len(points))
+        return np.divide(clear, total, out=np.ones(len(points)), where=total > 1e-9)
+
+    def _shade(self, face: np.ndarray, bary: np.ndarray, directions: np.ndarray) -> np.ndarray:
+        """Linear colour (n, 3) of points on triangles seen along directions."""
+        found = np.einsum("nc,ncd->nd", bary, self.attributes[face])
+        normal, color, ambient, key_light = found[:, :3], found[:, 3:6], found[:, 6, None], found[:, 7, None]
+        c = self.corners[face]
+        inner = np.einsum("nd,nd->n", np.cross(c[:, 1] - c[:, 0], c[:, 2] - c[:, 0]), directions) > 0
+        normal = _unit(normal) * np.where(inner, -1, 1)[:, None].astype(np.float32)
+        color = np.where(inner[:, None], color * BACK_FACE.astype(np.float32), color)
+        lights = [(_unit(np.array(d)) @ self.axes).astype(np.float32) for d, _ in (KEY, FILL, RIM)]
+        key, fill, rim = (np.maximum(normal @ d, 0)[:, None] for d in lights)
+        upward = 0.5 + 0.5 * (normal @ self.vertical.astype(np.float32))[:, None]
+        sky = (upward * SKY + (1 - upward) * BOUNCE).astype(np.float32)
+        facing = np.clip(-np.einsum("nd,nd->n", normal, directions), 0, 1)[:, None]
+        half = _unit(lights[0] - directions)
+        gloss = np.maximum(np.einsum("nd,nd->n", normal, half), 0)[:, None] ** 24
+        ambient = ambient ** 1.2
+        diffuse = sky * ambient + KEY[1] * key * key_light + FILL[1] * fill * ambient + RIM[1] * rim * ambient
+        sheen = 0.07 * gloss * key_light + 0.10 * (1 - facing) ** 4 * ambient
+        return color * diffuse + np.where(inner[:, None], 0, sheen)
+
+    def ground_shadow(self, origins: np.ndarray, directions: np.ndarray, cells: int = 72) -> np.ndarray:
+        """Alpha of the shadow on the floor along each ray."""
+        a, b = self.axes[0], np.cross(self.vertical, self.axes[0])
+        points = self.corners.reshape(-1, 3)
+        tall = 0.35 * float(np.ptp(points @ self.vertical))
+        on_floor = points @ np.stack([a, b], axis=1)
+        low, high = on_floor.min(axis=0) - tall, on_floor.max(axis=0) + tall
+        s, t = (np.linspace(low[i], high[i], cells) for i in range(2))
+        grid = (s[:, None, None] * a + t[None, :, None] * b + self.floor * self.vertical).reshape(-1, 3)
+        normals = np.broadcast_to(self.vertical, grid.shape)
+        dark = 1 - self._open(grid, normals, sphere_directions(96), 0.6 * self.size).reshape(cells, cells)
+        rim = np.minimum(np.arange(cells), np.arange(cells)[::-1]) / (0.2 * cells)
+        fade = np.clip(rim, 0, 1)
+        dark = SHADOW * dark * fade[:, None] * fade[None, :]
+        fall = directions @ self.vertical.astype(np.float32)
+        with np.errstate(divide="ignore", invalid="ignore"):
+            far = (self.floor - origins @ self.vertical.astype(np.float32)) / fall
+            where = origins + far[:, None] * directions
+            place = np.stack([where @ a, where @ b], axis=1)
+            place = (place - low) / (high - low) * (cells - 1)
+            on = (far > 0) & (fall < 0) & ((place > 0) & (place < cells - 1)).all(axis=1)
+        alpha = np.zeros(len(origins), dtype=np.float32)
+        p = place[on]
+        i = p.astype(int)
+        f = p - i
+        rows = dark[i[:, 0], i[:, 1]] * (1 - f[:, 1]) + dark[i[:, 0], i[:, 1] + 1] * f[:, 1]
+        below = dark[i[:, 0] + 1, i[:, 1]] * (1 - f[:, 1]) + dark[i[:, 0] + 1, i[:, 1] + 1] * f[:, 1]
+        alpha[on] = rows * (1 - f[:, 0]) + below * f[:, 0]
+        return alpha
+
+
+class Canvas:
+    """Colour, opacity and depth of `count` rays, painted over and over, then made a picture."""
+
+    def __init__(self, count: int) -> None:
+        self.color = np.zeros((count, 3), dtype=np.float32)       # linear, times alpha
+        self.alpha = np.zeros(count, dtype=np.float32)
+        self.depth = np.full(count, np.inf, dtype=np.float32)
+
+    def cover(self, rays: np.ndarray, colors: np.ndarray, depth: np.ndarray, opacity: float = 1.0,
+              through: float = 0.0) -> None:
+        """Paint where nearer than what is there; with the alpha `through` also where hidden."""
+        alpha = np.where(depth < self.depth[rays], opacity, through).astype(np.float32)
+        self.color[rays] = colors * alpha[:, None] + self.color[rays] * (1 - alpha[:, None])
+        self.alpha[rays] = alpha + self.alpha[rays] * (1 - alpha)
+        nearer = (alpha >= 1) & (depth < self.depth[rays])
+        self.depth[rays[nearer]] = depth[nearer]
+
+    def behind(self, alpha: np.ndarray) -> None:
+        """Put black of some opacity behind everything."""
+        self.alpha += (1 - self.alpha) * alpha
+
+    def finish(self, width: int, height: int, samples: int, background: Sequence[float] | None) -> np.ndarray:
+        """Average the rays of every pixel and lay them on the background."""
+        shape = (height, samples, width, samples)
+        color = self.color.reshape(*shape, 3).mean(axis=(1, 3))
+        alpha = self.alpha.reshape(shape).mean(axis=(1, 3))[..., None]
+        if background is None:
+            straight = np.divide(color, alpha, out=np.zeros_like(color), where=alpha > 0)
+            return _bytes(np.concatenate([encode(straight), alpha], axis=-1))
+        # The background is blended as displayed, so that shadows on white fade evenly.
+        inked = encode(np.divide(color, alpha, out=np.zeros_like(color), where=alpha > 0))
+        return _bytes(inked * alpha + np.asarray(background, dtype=float) * (1 - alpha))
+
+
+def sphere_directions(count: int) -> np.ndarray:
+    """Unit vectors (count, 3) spread evenly on a golden spiral."""
+    z = 1 - (2 * np.arange(count) + 1) / count
+    angle = np.pi * (3 - 5 ** 0.5) * np.arange(count)
+    r = np.sqrt(1 - z * z)
+    return np.stack([r * np.cos(angle), r * np.sin(angle), z], axis=1)
+
+
+def cone_directions(axis: np.ndarray, radius: float, count: int) -> np.ndarray:
+    """Unit vectors (count, 3) around an axis, at most `radius` radians away."""
+    aside = _unit(np.cross(axis, np.eye(3)[np.abs(axis).argmin()]))
+    r = radius * np.sqrt((np.arange(count) + 0.5) / count)
+    angle = np.pi * (3 - 5 ** 0.5) * np.arange(count)
+    around = np.cos(angle)[:, None] * aside + np.sin(angle)[:, None] * np.cross(axis, aside)
+    return _unit(axis + r[:, None] * around)
+
+
+def _unit(v: np.ndarray) -> np.ndarray:
+    return v / np.maximum(np.linalg.norm(v, axis=-1, keepdims=True), 1e-20).astype(v.dtype)
+
+
+def _bytes(values: np.ndarray) -> np.ndarray:
+    return np.clip(255 * values + 0.5, 0, 255).astype(np.uint8)

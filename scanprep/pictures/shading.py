@@ -1,0 +1,177 @@
+"""Shaded pictures by casting rays: no graphics card, no display.
+
+Key, fill and rim light move with the camera. Ambient occlusion and the soft shadow of the key light are computed
+at the vertices in sight and interpolated, which keeps them free of noise.
+"""
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from ..geometry.mesh import Mesh
+from .camera import Camera
+from .colors import color_bar, decode, heat, part_colors, part_palette
+from .glyphs import balls, capsules
+from .lighting import Canvas, Scene, Triangles
+from .sheets import png_bytes, save_png, side_by_side
+
+__all__ = ["Bones", "Camera", "Dots", "Solid", "color_bar", "heat", "part_colors", "part_palette", "png_bytes",
+           "render", "save_png", "side_by_side"]
+
+CLAY = (0.80, 0.78, 0.755)
+ACCENT = (0.86, 0.24, 0.20)
+WHITE = (1.0, 1.0, 1.0)
+
+
+@dataclass(frozen=True, eq=False)
+class Solid:
+    """A mesh and how it looks.
+
+    Attributes
+    ----------
+    mesh : Mesh
+    color : (3,), (N, 3) per vertex or (F, 3) per triangle, in [0, 1], optional
+        The mesh's own colours, else clay, when not given.
+    opacity : float
+        Below 1 what lies behind shines through.
+    smooth : bool
+        Interpolate normals; False shows the single triangles.
+    """
+
+    mesh: Mesh
+    color: np.ndarray | Sequence[float] | None = None
+    opacity: float = 1.0
+    smooth: bool = True
+
+
+@dataclass(frozen=True, eq=False)
+class Dots:
+    """Small balls: markers, joints, landmarks.
+
+    Attributes
+    ----------
+    points : (n, 3) float, metres
+        Points that are not finite are left out.
+    color : (3,) or (n, 3) in [0, 1]
+    radius : float, metres
+    on_top : bool
+        Seen through the meshes in front of them.
+    """
+
+    points: np.ndarray
+    color: np.ndarray | Sequence[float] = ACCENT
+    radius: float = 0.012
+    on_top: bool = False
+
+
+@dataclass(frozen=True, eq=False)
+class Bones:
+    """Straight rods with round ends.
+
+    Attributes
+    ----------
+    starts, ends : (n, 3) float, metres
+    color : (3,) or (n, 3) in [0, 1]
+    radius : float, metres
+    on_top : bool
+    """
+
+    starts: np.ndarray
+    ends: np.ndarray
+    color: np.ndarray | Sequence[float] = (0.25, 0.30, 0.38)
+    radius: float = 0.006
+    on_top: bool = False
+
+
+Shape = Mesh | Solid | Dots | Bones
+
+
+def render(shapes: Shape | Sequence[Shape], camera: Camera | None = None, width: int = 480, height: int = 640,
+           ground: bool = False, background: Sequence[float] | None = WHITE, samples: int = 2) -> np.ndarray:
+    """A shaded picture.
+
+    Parameters
+    ----------
+    shapes : Mesh, Solid, Dots, Bones, or a sequence of them
+    camera : Camera, optional
+        From the front, holding all meshes, when not given.
+    width, height : int, pixels
+    ground : bool
+        A soft shadow on the floor below the lowest point.
+    background : (3,) in [0, 1], or None for a transparent picture
+    samples : int
+        Each pixel is the mean of samples × samples rays.
+
+    Returns
+    -------
+    (height, width, 3) uint8, or (height, width, 4) when the background is transparent
+    """
+    everything = [shapes] if isinstance(shapes, Shape) else list(shapes)
+    if camera is None:
+        camera = Camera.around([s for s in everything if isinstance(s, Mesh | Solid)])
+    origins, directions = camera.rays(width, height, samples)
+    canvas = Canvas(len(origins))
+    solid = [s for s in everything if not _on_top(s) and _opacity(s) == 1]
+    if solid:
+        scene = _scene(solid, camera)
+        canvas.cover(*scene.seen(origins, directions))
+        if ground and np.isfinite(scene.floor):
+            canvas.behind(scene.ground_shadow(origins, directions))
+    for shape in everything:
+        if _opacity(shape) < 1:
+            canvas.cover(*_scene([shape], camera).seen(origins, directions), opacity=_opacity(shape))
+    top = [s for s in everything if _on_top(s)]
+    if top:
+        canvas.cover(*_scene(top, camera).seen(origins, directions), through=0.8)
+    return canvas.finish(width, height, samples, background)
+
+
+def _on_top(shape: Shape) -> bool:
+    return isinstance(shape, Dots | Bones) and shape.on_top
+
+
+def _opacity(shape: Shape) -> float:
+    return shape.opacity if isinstance(shape, Solid) else 1.0
+
+
+def _scene(shapes: Sequence[Shape], camera: Camera) -> Scene:
+    return Scene([_triangles(shape, camera.target) for shape in shapes], camera.axes, camera.vertical)
+
+
+def _triangles(shape: Shape, origin: np.ndarray) -> Triangles:
+    """The triangles of a shape, moved so that `origin` is at 0."""
+    if isinstance(shape, Mesh):
+        shape = Solid(shape)
+    if isinstance(shape, Solid):
+        mesh = shape.mesh
+        normals = mesh.vertex_normals[mesh.faces] if shape.smooth else np.repeat(mesh.face_normals[:, None], 3, axis=1)
+        color = shape.color if shape.color is not None else CLAY if mesh.colors is None else mesh.colors
+        return Triangles(mesh.corners - origin, normals, _corner_colors(np.asarray(color, dtype=float), mesh),
+                         mesh.faces, mesh.vertex_normals)
+    if isinstance(shape, Dots):
+        points = np.atleast_2d(np.asarray(shape.points, dtype=float))
+        use = np.isfinite(points).all(axis=1)
+        corners, normals, owner = balls(points[use] - origin, shape.radius)
+        count = len(points)
+    else:
+        starts, ends = np.atleast_2d(shape.starts), np.atleast_2d(shape.ends)
+        use = np.isfinite(starts).all(axis=1) & np.isfinite(ends).all(axis=1)
+        corners, normals, owner = capsules(starts[use] - origin, ends[use] - origin, shape.radius)
+        count = len(starts)
+    color = decode(np.broadcast_to(np.asarray(shape.color, dtype=float), (count, 3)))[use][owner]
+    return Triangles(corners, normals, np.repeat(color[:, None], 3, axis=1))
+
+
+def _corner_colors(color: np.ndarray, mesh: Mesh) -> np.ndarray:
+    """(F, 3, 3) linear light at the corners of every triangle."""
+    linear = decode(color)
+    if color.shape == (3,):
+        return np.broadcast_to(linear, (len(mesh.faces), 3, 3))
+    if color.shape == mesh.vertices.shape:
+        return linear[mesh.faces]
+    if color.shape == mesh.faces.shape:
+        return np.repeat(linear[:, None], 3, axis=1)
+    raise ValueError(f"color: expected (3,), {mesh.vertices.shape} per vertex or {mesh.faces.shape} per triangle, "
+                     f"got {color.shape}")

@@ -1,0 +1,79 @@
+"""Pictures put together, written to files."""
+from __future__ import annotations
+
+import io
+from collections.abc import Sequence
+from pathlib import Path
+
+import numpy as np
+
+from ..geometry.storage import writing
+
+INK = (58, 62, 68)
+
+
+def font(size: int):
+    """The typeface that Pillow carries, so that labels look alike everywhere."""
+    from PIL import ImageFont
+
+    return ImageFont.load_default(size=size)
+
+
+def side_by_side(images: Sequence[np.ndarray], labels: Sequence[str] | None = None, gap: int = 8,
+                 columns: int | None = None) -> np.ndarray:
+    """A contact sheet of pictures with a line of text below each.
+
+    Parameters
+    ----------
+    images : sequence of (H, W, 3) uint8
+        Of any sizes; each is centred in its cell.
+    labels : sequence of str, optional
+    gap : int, pixels
+    columns : int, optional
+        All in one row when not given.
+
+    Returns
+    -------
+    (H, W, 3) uint8
+
+    Raises
+    ------
+    ValueError
+        No images, or another number of labels.
+    """
+    from PIL import Image, ImageDraw
+
+    if not len(images):
+        raise ValueError("images: expected at least one, got none")
+    if labels is not None and len(labels) != len(images):
+        raise ValueError(f"labels: expected {len(images)}, one for each image, got {len(labels)}")
+    columns = min(columns or len(images), len(images))
+    rows = -(-len(images) // columns)
+    text = 24 if labels else 0
+    cell_h, cell_w = max(len(i) for i in images), max(i.shape[1] for i in images)
+    sheet = Image.new("RGB", (columns * (cell_w + gap) - gap, rows * (cell_h + text + gap) - gap), "white")
+    draw = ImageDraw.Draw(sheet)
+    for number, image in enumerate(images):
+        x, y = (number % columns) * (cell_w + gap), (number // columns) * (cell_h + text + gap)
+        h, w = image.shape[:2]
+        picture = Image.fromarray(image)
+        sheet.paste(picture, (x + (cell_w - w) // 2, y + (cell_h - h) // 2), picture if image.shape[2] == 4 else None)
+        if labels:
+            draw.text((x + cell_w / 2, y + cell_h + 4), labels[number], fill=INK, anchor="ma", font=font(15))
+    return np.asarray(sheet)
+
+
+def png_bytes(image: np.ndarray) -> bytes:
+    """A picture (H, W, 3 or 4) uint8 as PNG."""
+    from PIL import Image
+
+    out = io.BytesIO()
+    Image.fromarray(image).save(out, format="PNG", optimize=True)
+    return out.getvalue()
+
+
+def save_png(path: str | Path, image: np.ndarray) -> None:
+    """Write a picture (H, W, 3 or 4) uint8, whole or not at all."""
+    data = png_bytes(image)
+    with writing(path) as beside:
+        beside.write_bytes(data)
