@@ -73,7 +73,7 @@ def part_palette(count: int) -> np.ndarray:
     number = np.arange(count)
     hue = 2 * np.pi * (0.07 + number * 0.61803398875)
     lightness = np.array([0.74, 0.64, 0.82])[number % 3]
-    chroma = np.array([0.125, 0.15, 0.105])[number % 3]
+    chroma = np.array([0.11, 0.13, 0.095])[number % 3]
     return _from_oklab(np.stack([lightness, chroma * np.cos(hue), chroma * np.sin(hue)], axis=-1))
 
 

@@ -5,12 +5,13 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.ndimage import gaussian_filter, map_coordinates
 
 from .colors import encode
 
 # Directions of the lights in the camera's frame (right, up, back) and their linear strengths.
-KEY, FILL, RIM = ((-0.50, 0.62, 0.62), 0.92), ((0.85, 0.10, 0.50), 0.22), ((0.55, 0.45, -0.70), 0.45)
-SKY, BOUNCE = np.array([0.46, 0.48, 0.52]), np.array([0.30, 0.27, 0.25])
+KEY, FILL, RIM = ((-0.58, 0.62, 0.52), 1.00), ((0.85, 0.05, 0.50), 0.13), ((0.62, 0.40, -0.68), 0.50)
+SKY, BOUNCE = np.array([0.32, 0.34, 0.38]), np.array([0.20, 0.175, 0.16])
 BACK_FACE = np.array([0.30, 0.33, 0.40])      # tint of the inner side of an open surface
 SHADOW = 0.55                                 # darkest alpha on the floor
 
@@ -30,8 +31,18 @@ class Triangles:
     vertex_normals: np.ndarray | None = None
 
 
+@dataclass(frozen=True, eq=False)
+class Seen:
+    """What rays hit: the numbers of the rays (n,), linear colours (n, 3), cosine of the slant (n,), depth (n,)."""
+
+    rays: np.ndarray
+    colors: np.ndarray
+    facing: np.ndarray
+    depth: np.ndarray
+
+
 class Scene:
-    """Triangles in one search tree, with the camera's frame `axes` (3, 3) and the direction away from the ground."""
+    """Triangles in one search tree, with the camera's frame `axes` (3, 3) and the direction off the ground."""
 
     def __init__(self, shapes: Sequence[Triangles], axes: np.ndarray, vertical: np.ndarray) -> None:
         from embreex.mesh_construction import TriangleMesh
@@ -39,6 +50,8 @@ class Scene:
 
         self.axes, self.vertical = axes, vertical
         self.corners = np.concatenate([s.corners for s in shapes]).astype(np.float32)
+        c = self.corners
+        self.outward = np.cross(c[:, 1] - c[:, 0], c[:, 2] - c[:, 0])
         self._shapes = shapes
         self._starts = np.cumsum([0] + [len(s.corners) for s in shapes])
         # normal, colour, ambient and key visibility of every corner, interpolated together
@@ -52,16 +65,17 @@ class Scene:
         solids = [s.corners.reshape(-1, 3) @ vertical for s in shapes if s.faces is not None and len(s.corners)]
         self.floor = min((float(h.min()) for h in solids), default=np.inf)
 
-    def seen(self, origins: np.ndarray, directions: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Rays that hit something, their linear colours and their distances."""
+    def seen(self, origins: np.ndarray, directions: np.ndarray) -> Seen:
+        """What rays hit."""
         if not len(self.corners):
-            return np.empty(0, int), np.empty((0, 3), np.float32), np.empty(0, np.float32)
+            return Seen(np.empty(0, int), np.empty((0, 3), np.float32), *np.empty((2, 0), np.float32))
         hit = self._tree.run(np.ascontiguousarray(origins), np.ascontiguousarray(directions), output=True)
         rays = np.flatnonzero(hit["primID"] >= 0)
         face = hit["primID"][rays]
         self._light_vertices(np.unique(face))
         u, v = hit["u"][rays], hit["v"][rays]
-        return rays, self._shade(face, np.stack([1 - u - v, u, v], axis=1), directions[rays]), hit["tfar"][rays]
+        bary = np.stack([1 - u - v, u, v], axis=1)
+        return Seen(rays, *self._shade(face, bary, directions[rays]), hit["tfar"][rays])
 
     def _light_vertices(self, faces: np.ndarray) -> None:
         """Fill in the visibility at the corners of the triangles in sight."""
@@ -92,12 +106,12 @@ class Scene:
         clear = np.bincount(point, weight * ~blocked, len(points))
         return np.divide(clear, total, out=np.ones(len(points)), where=total > 1e-9)
 
-    def _shade(self, face: np.ndarray, bary: np.ndarray, directions: np.ndarray) -> np.ndarray:
-        """Linear colour (n, 3) of points on triangles seen along directions."""
+    def _shade(self, face: np.ndarray, bary: np.ndarray, directions: np.ndarray
+               ) -> tuple[np.ndarray, np.ndarray]:
+        """Linear colour (n, 3) of points on triangles seen along directions, and the cosine of their slant."""
         found = np.einsum("nc,ncd->nd", bary, self.attributes[face])
         normal, color, ambient, key_light = found[:, :3], found[:, 3:6], found[:, 6, None], found[:, 7, None]
-        c = self.corners[face]
-        inner = np.einsum("nd,nd->n", np.cross(c[:, 1] - c[:, 0], c[:, 2] - c[:, 0]), directions) > 0
+        inner = np.einsum("nd,nd->n", self.outward[face], directions) > 0
         normal = _unit(normal) * np.where(inner, -1, 1)[:, None].astype(np.float32)
         color = np.where(inner[:, None], color * BACK_FACE.astype(np.float32), color)
         lights = [(_unit(np.array(d)) @ self.axes).astype(np.float32) for d, _ in (KEY, FILL, RIM)]
@@ -110,37 +124,37 @@ class Scene:
         ambient = ambient ** 1.2
         diffuse = sky * ambient + KEY[1] * key * key_light + FILL[1] * fill * ambient + RIM[1] * rim * ambient
         sheen = 0.07 * gloss * key_light + 0.10 * (1 - facing) ** 4 * ambient
-        return color * diffuse + np.where(inner[:, None], 0, sheen)
+        return color * diffuse + np.where(inner[:, None], 0, sheen), facing[:, 0]
 
-    def ground_shadow(self, origins: np.ndarray, directions: np.ndarray, cells: int = 72) -> np.ndarray:
+    def ground_shadow(self, origins: np.ndarray, directions: np.ndarray, cells: int = 80) -> np.ndarray:
         """Alpha of the shadow on the floor along each ray."""
-        a, b = self.axes[0], np.cross(self.vertical, self.axes[0])
+        across = np.stack([self.axes[0], np.cross(self.vertical, self.axes[0])], axis=1)
         points = self.corners.reshape(-1, 3)
-        tall = 0.35 * float(np.ptp(points @ self.vertical))
-        on_floor = points @ np.stack([a, b], axis=1)
-        low, high = on_floor.min(axis=0) - tall, on_floor.max(axis=0) + tall
-        s, t = (np.linspace(low[i], high[i], cells) for i in range(2))
-        grid = (s[:, None, None] * a + t[None, :, None] * b + self.floor * self.vertical).reshape(-1, 3)
-        normals = np.broadcast_to(self.vertical, grid.shape)
-        dark = 1 - self._open(grid, normals, sphere_directions(96), 0.6 * self.size).reshape(cells, cells)
-        rim = np.minimum(np.arange(cells), np.arange(cells)[::-1]) / (0.2 * cells)
-        fade = np.clip(rim, 0, 1)
-        dark = SHADOW * dark * fade[:, None] * fade[None, :]
-        fall = directions @ self.vertical.astype(np.float32)
-        with np.errstate(divide="ignore", invalid="ignore"):
-            far = (self.floor - origins @ self.vertical.astype(np.float32)) / fall
-            where = origins + far[:, None] * directions
-            place = np.stack([where @ a, where @ b], axis=1)
-            place = (place - low) / (high - low) * (cells - 1)
-            on = (far > 0) & (fall < 0) & ((place > 0) & (place < cells - 1)).all(axis=1)
+        tall = 0.30 * float(np.ptp(points @ self.vertical))
+        low, high = (points @ across).min(axis=0) - tall, (points @ across).max(axis=0) + tall
+        s, t = np.meshgrid(*(np.linspace(low[i], high[i], cells) for i in range(2)), indexing="ij")
+        dark = self._floor_darkness(np.stack([s.ravel(), t.ravel()], axis=1) @ across.T).reshape(cells, cells)
+        fade = np.clip(np.minimum(np.arange(cells), np.arange(cells)[::-1]) / (0.2 * cells), 0, 1)
+        dark = (SHADOW * gaussian_filter(dark, 0.02 * cells) * fade[:, None] * fade).astype(np.float32)
+        up = self.vertical.astype(np.float32)
+        fall = np.minimum(directions @ up, -1e-6)
+        far = (np.float32(self.floor) - origins @ up) / fall
+        place = (origins + far[:, None] * directions) @ across.astype(np.float32)
+        place = (place - low.astype(np.float32)) * ((cells - 1) / (high - low)).astype(np.float32)
+        on_floor = (far > 0) & (directions @ up < 0)
+        inside = np.flatnonzero(on_floor & ((place > 0) & (place < cells - 1)).all(axis=1))
         alpha = np.zeros(len(origins), dtype=np.float32)
-        p = place[on]
-        i = p.astype(int)
-        f = p - i
-        rows = dark[i[:, 0], i[:, 1]] * (1 - f[:, 1]) + dark[i[:, 0], i[:, 1] + 1] * f[:, 1]
-        below = dark[i[:, 0] + 1, i[:, 1]] * (1 - f[:, 1]) + dark[i[:, 0] + 1, i[:, 1] + 1] * f[:, 1]
-        alpha[on] = rows * (1 - f[:, 0]) + below * f[:, 0]
+        alpha[inside] = map_coordinates(dark, place[inside].T, order=1)
         return alpha
+
+    def _floor_darkness(self, across: np.ndarray) -> np.ndarray:
+        """Share of the sky, and of the key light, that the scene takes from points (n, 3) of the floor plane."""
+        points = across + self.floor * self.vertical
+        normals = np.broadcast_to(self.vertical, points.shape)
+        sky = 1 - self._open(points, normals, sphere_directions(150), 4 * self.size)
+        key = _unit(np.array(KEY[0])) @ self.axes
+        key = _unit(key + max(0.0, 1.3 - float(key @ self.vertical)) * self.vertical)
+        return sky + 0.40 * (1 - self._open(points, normals, cone_directions(key, 0.22, 32), 4 * self.size))
 
 
 class Canvas:
@@ -150,25 +164,28 @@ class Canvas:
         self.color = np.zeros((count, 3), dtype=np.float32)       # linear, times alpha
         self.alpha = np.zeros(count, dtype=np.float32)
         self.depth = np.full(count, np.inf, dtype=np.float32)
+        self.floor: np.ndarray | None = None                      # alpha of black behind all, one a pixel
 
-    def cover(self, rays: np.ndarray, colors: np.ndarray, depth: np.ndarray, opacity: float = 1.0,
-              through: float = 0.0) -> None:
-        """Paint where nearer than what is there; with the alpha `through` also where hidden."""
-        alpha = np.where(depth < self.depth[rays], opacity, through).astype(np.float32)
-        self.color[rays] = colors * alpha[:, None] + self.color[rays] * (1 - alpha[:, None])
+    def cover(self, seen: Seen, opacity: float = 1.0, through: float = 0.0) -> None:
+        """Paint where nearer than what is there; with the alpha `through` also where hidden.
+
+        What is translucent lets less light pass where it is seen at a slant, as a shell would.
+        """
+        rays, depth = seen.rays, seen.depth
+        alpha = opacity + (1 - opacity) * (1 - seen.facing) ** 2 if opacity < 1 else 1.0
+        alpha = np.where(depth < self.depth[rays], alpha, through).astype(np.float32)
+        self.color[rays] = seen.colors * alpha[:, None] + self.color[rays] * (1 - alpha[:, None])
         self.alpha[rays] = alpha + self.alpha[rays] * (1 - alpha)
         nearer = (alpha >= 1) & (depth < self.depth[rays])
         self.depth[rays[nearer]] = depth[nearer]
 
-    def behind(self, alpha: np.ndarray) -> None:
-        """Put black of some opacity behind everything."""
-        self.alpha += (1 - self.alpha) * alpha
-
     def finish(self, width: int, height: int, samples: int, background: Sequence[float] | None) -> np.ndarray:
         """Average the rays of every pixel and lay them on the background."""
-        shape = (height, samples, width, samples)
-        color = self.color.reshape(*shape, 3).mean(axis=(1, 3))
-        alpha = self.alpha.reshape(shape).mean(axis=(1, 3))[..., None]
+        color, alpha = self.color.reshape(height * samples, -1, 3), self.alpha.reshape(height * samples, -1, 1)
+        color, alpha = (sum(x[i::samples, j::samples] for i in range(samples) for j in range(samples)) / samples**2
+                        for x in (color, alpha))
+        if self.floor is not None:
+            alpha = alpha + (1 - alpha) * self.floor.reshape(height, width, 1)
         if background is None:
             straight = np.divide(color, alpha, out=np.zeros_like(color), where=alpha > 0)
             return _bytes(np.concatenate([encode(straight), alpha], axis=-1))

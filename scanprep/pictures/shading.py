@@ -116,15 +116,15 @@ def render(shapes: Shape | Sequence[Shape], camera: Camera | None = None, width:
     solid = [s for s in everything if not _on_top(s) and _opacity(s) == 1]
     if solid:
         scene = _scene(solid, camera)
-        canvas.cover(*scene.seen(origins, directions))
+        canvas.cover(scene.seen(origins, directions))
         if ground and np.isfinite(scene.floor):
-            canvas.behind(scene.ground_shadow(origins, directions))
+            canvas.floor = scene.ground_shadow(*camera.rays(width, height))
     for shape in everything:
         if _opacity(shape) < 1:
-            canvas.cover(*_scene([shape], camera).seen(origins, directions), opacity=_opacity(shape))
+            canvas.cover(_scene([shape], camera).seen(origins, directions), opacity=_opacity(shape))
     top = [s for s in everything if _on_top(s)]
     if top:
-        canvas.cover(*_scene(top, camera).seen(origins, directions), through=0.8)
+        canvas.cover(_scene(top, camera).seen(origins, directions), through=0.8)
     return canvas.finish(width, height, samples, background)
 
 
@@ -146,7 +146,8 @@ def _triangles(shape: Shape, origin: np.ndarray) -> Triangles:
         shape = Solid(shape)
     if isinstance(shape, Solid):
         mesh = shape.mesh
-        normals = mesh.vertex_normals[mesh.faces] if shape.smooth else np.repeat(mesh.face_normals[:, None], 3, axis=1)
+        flat = np.broadcast_to(mesh.face_normals[:, None], mesh.corners.shape)
+        normals = mesh.vertex_normals[mesh.faces] if shape.smooth else flat
         color = shape.color if shape.color is not None else CLAY if mesh.colors is None else mesh.colors
         return Triangles(mesh.corners - origin, normals, _corner_colors(np.asarray(color, dtype=float), mesh),
                          mesh.faces, mesh.vertex_normals)

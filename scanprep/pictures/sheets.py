@@ -57,7 +57,8 @@ def side_by_side(images: Sequence[np.ndarray], labels: Sequence[str] | None = No
         x, y = (number % columns) * (cell_w + gap), (number // columns) * (cell_h + text + gap)
         h, w = image.shape[:2]
         picture = Image.fromarray(image)
-        sheet.paste(picture, (x + (cell_w - w) // 2, y + (cell_h - h) // 2), picture if image.shape[2] == 4 else None)
+        place = (x + (cell_w - w) // 2, y + (cell_h - h) // 2)
+        sheet.paste(picture, place, picture if image.shape[2] == 4 else None)
         if labels:
             draw.text((x + cell_w / 2, y + cell_h + 4), labels[number], fill=INK, anchor="ma", font=font(15))
     return np.asarray(sheet)
