@@ -1,0 +1,65 @@
+"""Commands end with a table and a report, failures with one line and exit code 1, wrong usage with 2."""
+import dataclasses
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from scanprep import console
+from scanprep.console import Metric, Outcome
+
+
+@dataclasses.dataclass(frozen=True)
+class Settings:
+    weight: float = 0.5
+
+
+def work(out: Path, times: int = 2, settings: Settings = Settings()) -> Outcome:  # noqa: B008
+    """Do the work."""
+    if times < 0:
+        raise ValueError(f"times: expected a count,\n got {times}")
+    out.write_text("done")
+    return Outcome(out, [Metric("distance", 0.00123456, "m"), Metric("times", times)], {"settings": settings},
+                   ["scan7: empty"] if times == 7 else [])
+
+
+def test_done(tmp_path, capsys):
+    out = tmp_path / "a.txt"
+    assert console.run(work, "scape work", ["--out", str(out), "--settings.weight", "0.25"]) == 0
+    assert "0.00123" in capsys.readouterr().out
+    report = json.loads((tmp_path / "a.report.json").read_text())
+    assert report["settings"]["settings"] == {"weight": 0.25}
+    assert report["metrics"][0] == {"metric": "distance", "value": 0.00123456, "unit": "m"}
+    assert {"numpy", "python", "machine"} <= set(report["versions"])
+
+
+def test_failed_is_one_line(tmp_path, capsys):
+    assert console.run(work, "scape work", ["--out", str(tmp_path / "a"), "--times", "-1"]) == 1
+    shown = capsys.readouterr()
+    assert shown.err == "scape work: times: expected a count, got -1\n" and not shown.out
+    assert not list(tmp_path.iterdir())
+
+
+def test_some_failed(tmp_path, capsys):
+    assert console.run(work, "scape work", ["--out", str(tmp_path / "a.txt"), "--times", "7"]) == 1
+    assert "failed: scan7: empty" in capsys.readouterr().err
+
+
+def test_wrong_usage(tmp_path):
+    with pytest.raises(SystemExit) as stop:
+        console.run(work, "scape work", ["--no-such"])
+    assert stop.value.code == 2
+    assert console.dispatch({"work": ("Do it.", "nowhere:work")}, "scape", ["nothing"], "lead") == 2
+    assert console.dispatch({"work": ("Do it.", "nowhere:work")}, "scape", [], "lead") == 2
+
+
+def test_help_imports_nothing(capsys):
+    assert console.dispatch({"work": ("Do it.", "nowhere:work")}, "scape", ["--help"], "lead") == 0
+    assert "Do it." in capsys.readouterr().out
+
+
+def test_plain_survives_json():
+    value = {"a": np.float64(1.5), "b": np.arange(3), "c": Settings(), "d": (Path("x"), None)}
+    assert json.loads(json.dumps(console.plain(value))) == {
+        "a": 1.5, "b": [0, 1, 2], "c": {"weight": 0.5}, "d": ["x", None]}
