@@ -1,0 +1,144 @@
+"""Residuals of completion and animation: one energy, one function, each with its Jacobian.
+
+Unknowns of one body are a row `x = (pose (3J), trans (3), betas (K))`; all functions take any number of
+leading dimensions, so a batch of starts or frames is one call. A residual holds the square root of what is
+minimised: the energy is the sum of its squared values.
+"""
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from scanprep.geometry import rotations
+
+from .priors import GaussianPrior
+
+
+@dataclass(frozen=True, eq=False)
+class Residual:
+    """Values whose squares are summed, and their derivative with respect to the unknowns.
+
+    Attributes
+    ----------
+    values : (..., m) float
+    jacobian : (..., m, P) float
+    """
+
+    values: np.ndarray
+    jacobian: np.ndarray
+
+    @property
+    def energy(self) -> np.ndarray:
+        """(...) the sum of squares."""
+        return np.einsum("...m,...m->...", self.values, self.values)
+
+
+@dataclass(frozen=True, eq=False)
+class MovingPoints:
+    """Points that move with a body.
+
+    Attributes
+    ----------
+    positions : (..., L, 3) float, metres
+    jacobian : (..., L, 3, P) float
+        With respect to the unknowns x.
+    """
+
+    positions: np.ndarray
+    jacobian: np.ndarray
+
+
+def moving_points(positions: np.ndarray, d_pose: np.ndarray, d_betas: np.ndarray | None = None) -> MovingPoints:
+    """Join the derivatives with respect to pose, trans (the identity) and betas.
+
+    Parameters
+    ----------
+    positions : (..., L, 3) float, metres
+    d_pose : (..., L, 3, 3J) float
+    d_betas : (..., L, 3, K) float, optional
+    """
+    blocks = [d_pose, np.broadcast_to(np.eye(3), (*positions.shape, 3))]
+    if d_betas is not None:
+        blocks.append(np.broadcast_to(d_betas, (*positions.shape, d_betas.shape[-1])))
+    return MovingPoints(positions, np.concatenate(blocks, axis=-1))
+
+
+def above_skin(supports: MovingPoints, distance: np.ndarray) -> MovingPoints:
+    """Points at a distance from the skin, along a normal that moves with the body.
+
+    Parameters
+    ----------
+    supports : 3 L points
+        For every point the one on the skin and two others around it, counter-clockwise seen from outside.
+    distance : (L,) float, metres
+    """
+    p = supports.positions.reshape(*supports.positions.shape[:-2], -1, 3, 3)
+    J = supports.jacobian.reshape(*p.shape, -1)
+    u, v = p[..., 1, :] - p[..., 0, :], p[..., 2, :] - p[..., 0, :]
+    du, dv = J[..., 1, :, :] - J[..., 0, :, :], J[..., 2, :, :] - J[..., 0, :, :]
+    c = np.cross(u, v)
+    length = np.linalg.norm(c, axis=-1)[..., None]
+    n = c / length
+    tangent = (np.eye(3) - n[..., :, None] * n[..., None, :]) / length[..., None]
+    dc = rotations.hat(u) @ dv - rotations.hat(v) @ du
+    lift = distance[:, None]
+    return MovingPoints(p[..., 0, :] + lift * n, J[..., 0, :, :] + lift[..., None] * (tangent @ dc))
+
+
+def point_to_point(points: MovingPoints, targets: np.ndarray, weights: np.ndarray) -> Residual:
+    """Distance of points to their targets; a target that is NaN (not seen) counts nothing.
+
+    Parameters
+    ----------
+    points : L points
+    targets : (..., L, 3) float, metres
+    weights : (..., L) float
+        Factor on the squared distance.
+    """
+    missing = np.isnan(targets).any(axis=-1)
+    root = np.where(missing, 0.0, np.sqrt(weights))[..., None]
+    r = root * np.where(missing[..., None], 0.0, points.positions - targets)
+    J = root[..., None] * points.jacobian
+    return Residual(r.reshape(*r.shape[:-2], -1), J.reshape(*J.shape[:-3], -1, J.shape[-1]))
+
+
+def point_to_plane(points: MovingPoints, targets: np.ndarray, normals: np.ndarray, weights: np.ndarray
+                   ) -> Residual:
+    """Distance of points to planes through their targets (..., L, 3) with unit normals (..., L, 3)."""
+    root = np.sqrt(weights)
+    r = root * np.einsum("...ld,...ld->...l", normals, points.positions - targets)
+    return Residual(r, root[..., None] * (normals[..., None, :] @ points.jacobian)[..., 0, :])
+
+
+def pose_prior(x: np.ndarray, prior: GaussianPrior, weight: float | np.ndarray = 1.0) -> Residual:
+    """Squared Mahalanobis distance of the pose from the training poses (the root is free).
+
+    [SCAPE] §9
+    """
+    count = len(prior.mean)
+    root = np.sqrt(weight) * np.ones(x.shape[:-1])
+    r = root[..., None] * ((x[..., :count] - prior.mean) @ prior.whitening.T)
+    J = np.zeros((*r.shape, x.shape[-1]))
+    J[..., :count] = root[..., None, None] * prior.whitening
+    return Residual(r, J)
+
+
+def shape_prior(x: np.ndarray, first: int, weight: float = 1.0) -> Residual:
+    """Squared length of the betas, which lie in x from `first` on: a unit Gaussian."""
+    r = np.sqrt(weight) * x[..., first:]
+    J = np.zeros((*r.shape, x.shape[-1]))
+    J[..., first:] = np.sqrt(weight) * np.eye(x.shape[-1] - first)
+    return Residual(r, J)
+
+
+def stay_near(x: np.ndarray, expected: np.ndarray, weights: np.ndarray) -> Residual:
+    """Weighted distance of the unknowns (..., P) from where they are expected, weights (P,).
+
+    With the joint angles of the previous iteration as expectation this is the damping of neighbouring
+    twists, w_T |t_a - t_b|²: to first order the twists of neighbours differ by the turn of their joint.
+
+    [SCAPE] Eq. 11
+    """
+    root = np.sqrt(weights)
+    return Residual(root * (x - expected), np.broadcast_to(np.diag(root), (*x.shape, x.shape[-1])))
