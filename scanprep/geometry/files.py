@@ -1,27 +1,32 @@
-"""Files of meshes: PLY, OBJ, STL, OFF and GLB in, the same out, with errors that say what is wrong.
+"""Files of meshes, points and landmarks, with errors that say what is wrong.
 
-Vertices keep the order of the file. Coordinates become metres: a file does not say its unit, so either the
-caller does or metres are assumed, with a warning where that would make a giant or a dwarf.
+Vertices keep the order of the file. Coordinates become metres: most files do not say their unit, so either
+the caller does or metres are assumed, with a warning where that would make a giant or a dwarf.
 """
 from __future__ import annotations
 
 import gzip
-import warnings
+from dataclasses import dataclass
 from pathlib import Path
 from types import ModuleType
-from typing import Literal
+from typing import Literal, NamedTuple
 
 import numpy as np
 
 from . import storage
-from .formats import obj, ply
-from .formats.common import Contents, MeshFileError, load_bytes
+from .formats import glb, obj, off, pcd, ply, stl, xyz
+from .formats.common import Contents, MeshFileError, load_bytes, metres_per_unit
+from .landmarks import match_landmarks, read_landmark_vertices, read_landmarks, write_landmarks
 from .mesh import Mesh
 
-__all__ = ["MeshFileError", "read_mesh", "write_mesh"]
+__all__ = ["MeshFileError", "PointCloud", "Registered", "list_meshes", "match_landmarks", "read_landmark_vertices",
+           "read_landmarks", "read_mesh", "read_points", "read_registered", "write_landmarks", "write_mesh",
+           "write_points"]
 
-UNITS = {"m": 1.0, "mm": 1e-3, "cm": 1e-2, "in": 0.0254}
-_MESHES: dict[str, ModuleType] = {".ply": ply, ".obj": obj}
+Precision = Literal["double", "single"]
+
+_MESHES: dict[str, ModuleType] = {".ply": ply, ".obj": obj, ".stl": stl, ".off": off, ".glb": glb}
+_POINTS: dict[str, ModuleType] = {".ply": ply, ".pcd": pcd, ".xyz": xyz, ".txt": xyz, ".pts": xyz}
 
 
 def read_mesh(path: str | Path, unit: str | None = None) -> Mesh:
@@ -38,7 +43,7 @@ def read_mesh(path: str | Path, unit: str | None = None) -> Mesh:
     Returns
     -------
     Mesh
-        In metres.
+        In metres. From STL, which has no vertices of its own, equal corners make one vertex.
 
     Raises
     ------
@@ -58,7 +63,7 @@ def read_mesh(path: str | Path, unit: str | None = None) -> Mesh:
     return mesh if scale == 1 else mesh.with_vertices(scale * mesh.vertices)
 
 
-def write_mesh(path: str | Path, mesh: Mesh, precision: Literal["double", "single"] = "double") -> None:
+def write_mesh(path: str | Path, mesh: Mesh, precision: Precision = "double") -> None:
     """Write a mesh in metres, whole or not at all, in the format its name ends in.
 
     Parameters
@@ -68,55 +73,159 @@ def write_mesh(path: str | Path, mesh: Mesh, precision: Literal["double", "singl
     mesh : Mesh
     precision : 'double' or 'single'
         Of the coordinates: with 'double' a PLY file gives back the very same numbers. STL and GLB hold single
-        precision whatever is said here, half a micrometre at the size of a person.
+        precision whatever is said here, a tenth of a micrometre at the size of a person.
 
     Raises
     ------
     MeshFileError
         A name that ends in no known format.
     """
+    _write(Path(path), Contents(mesh.vertices, mesh.faces, None, mesh.colors), precision, _MESHES)
+
+
+@dataclass(frozen=True, eq=False)
+class PointCloud:
+    """Points of a surface.
+
+    Attributes
+    ----------
+    points : (n, 3) float, metres
+    normals : (n, 3) float, unit, optional
+    colors : (n, 3) float in [0, 1], optional
+    """
+
+    points: np.ndarray
+    normals: np.ndarray | None = None
+    colors: np.ndarray | None = None
+
+
+def read_points(path: str | Path, unit: str | None = None) -> PointCloud:
+    """Read points, or the vertices of a mesh.
+
+    Parameters
+    ----------
+    path : str or Path
+        PLY, PCD, text (`.xyz`, `.txt`, `.pts`) or any format of `read_mesh`.
+    unit : 'm', 'mm', 'cm' or 'in', optional
+        As for `read_mesh`.
+
+    Returns
+    -------
+    PointCloud
+        Normals are those of the file, or of the triangles where there are triangles.
+
+    Raises
+    ------
+    MeshFileError
+        Missing, truncated or of another format, no points, a coordinate that is not finite.
+    """
     path = Path(path)
-    if precision not in ("double", "single"):
-        raise ValueError(f"precision: expected 'double' or 'single', got {precision!r}")
-    _write(path, Contents(mesh.vertices, mesh.faces, None, mesh.colors), precision == "double", _MESHES)
+    contents = _read(path, {**_MESHES, **_POINTS})
+    bad = np.flatnonzero(~np.isfinite(contents.vertices).all(axis=1))
+    if len(bad):
+        raise MeshFileError(f"{path}: {len(bad)} points are not finite, the first is point {bad[0]}")
+    points = metres_per_unit(path, contents.vertices, unit) * contents.vertices
+    normals = contents.normals
+    if normals is None and contents.faces is not None and len(contents.faces):
+        normals = Mesh(points, contents.faces).vertex_normals
+    return PointCloud(points, normals, contents.colors)
 
 
-def metres_per_unit(path: Path, points: np.ndarray, unit: str | None) -> float:
-    """What to multiply the coordinates of a file with; warns where metres are assumed and hard to believe."""
-    if unit is not None:
-        if unit not in UNITS:
-            raise ValueError(f"unit: expected one of {', '.join(UNITS)}, got {unit!r}")
-        return UNITS[unit]
-    extent = float(np.ptp(points, axis=0).max()) if len(points) else 1.0
-    if extent > 10:
-        likely = min(("mm", "cm", "in"), key=lambda u: abs(np.log(extent * UNITS[u] / 1.7)))
-        warnings.warn(f"{path}: {extent:.4g} m from end to end when read as metres; "
-                      f"it looks like unit='{likely}' ({extent * UNITS[likely]:.3g} m)", stacklevel=3)
-    elif 0 < extent < 0.1:
-        warnings.warn(f"{path}: {extent:.2g} m from end to end when read as metres; it looks as if millimetres "
-                      f"had been divided by 1000 twice ({extent * 1000:.3g} m)", stacklevel=3)
-    return 1.0
+def write_points(path: str | Path, cloud: PointCloud, precision: Precision = "double") -> None:
+    """Write points in metres, whole or not at all: `.ply`, `.ply.gz`, `.pcd`, `.xyz`, `.txt` or `.pts`."""
+    _write(Path(path), Contents(cloud.points, None, cloud.normals, cloud.colors), precision, _POINTS)
+
+
+def list_meshes(folder: str | Path) -> list[Path]:
+    """The mesh files of a folder, sorted by name; of a RegisteredSet those in its `meshes`.
+
+    Raises
+    ------
+    MeshFileError
+        No such folder, or none in it.
+    """
+    folder = Path(folder)
+    if not folder.is_dir():
+        problem = "expected a folder, found a file" if folder.exists() else "no such folder"
+        raise MeshFileError(f"{folder}: {problem}")
+    inside = folder / "meshes" if (folder / "set.json").is_file() else folder
+    paths = sorted(p for p in inside.glob("*") if not p.name.startswith(".") and _suffix(p) in _MESHES)
+    if not paths:
+        raise MeshFileError(f"{inside}: expected meshes ({', '.join(_MESHES)}), found none")
+    return paths
+
+
+class Registered(NamedTuple):
+    """Meshes that share their triangles.
+
+    Attributes
+    ----------
+    faces : (F, 3) int
+    vertices : (M, N, 3) float, metres
+    names : M strings
+        File names without their endings.
+    """
+
+    faces: np.ndarray
+    vertices: np.ndarray
+    names: tuple[str, ...]
+
+
+def read_registered(folder: str | Path, unit: str | None = None) -> Registered:
+    """Read every mesh of a folder, or of a RegisteredSet, sorted by name.
+
+    Raises
+    ------
+    MeshFileError
+        A mesh that cannot be read, or that has other vertices or triangles than the first one.
+    """
+    paths = list_meshes(folder)
+    meshes = []
+    for path in paths:
+        meshes.append(read_mesh(path, unit))
+        check_same_topology(path, meshes[-1], paths[0], meshes[0])
+    return Registered(meshes[0].faces, np.stack([m.vertices for m in meshes]),
+                      tuple(p.name[:-len("".join(p.suffixes))] if p.suffix == ".gz" else p.stem for p in paths))
+
+
+def check_same_topology(path: Path, mesh: Mesh, first_path: Path, first: Mesh) -> None:
+    """Raise MeshFileError where a mesh does not have the triangles of the first one, saying how they differ."""
+    mine, theirs = (f"{len(m.vertices)} vertices and {len(m.faces)} faces" for m in (mesh, first))
+    if mine != theirs:
+        raise MeshFileError(f"{path}: expected the topology of {first_path.name}, {theirs}; found {mine}")
+    if not np.array_equal(mesh.faces, first.faces):
+        k = int(np.flatnonzero((mesh.faces != first.faces).any(axis=1))[0])
+        raise MeshFileError(f"{path}: expected the faces of {first_path.name} in their order; there are as many, "
+                            f"but from face {k} on they are others (another order, or edges flipped): "
+                            f"expected {first.faces[k].tolist()}, found {mesh.faces[k].tolist()}")
+
+
+def _suffix(path: Path) -> str:
+    suffixes = [s.lower() for s in path.suffixes]
+    return suffixes[-2] if len(suffixes) > 1 and suffixes[-1] == ".gz" else "".join(suffixes[-1:])
 
 
 def _format(path: Path, formats: dict[str, ModuleType]) -> ModuleType:
-    suffixes = [s.lower() for s in path.suffixes]
-    suffix = suffixes[-2] if len(suffixes) > 1 and suffixes[-1] == ".gz" else "".join(suffixes[-1:])
-    if suffix not in formats:
-        raise MeshFileError(f"{path}: expected a name ending in {', '.join(formats)}, found '{suffix}'")
-    return formats[suffix]
+    if _suffix(path) not in formats:
+        raise MeshFileError(f"{path}: expected a name ending in {', '.join(formats)}, found '{_suffix(path)}'")
+    return formats[_suffix(path)]
 
 
 def _read(path: Path, formats: dict[str, ModuleType]) -> Contents:
-    reader = _format(path, formats)
-    contents = reader.read(path, load_bytes(path))
+    reader = _format(path, formats) if path.exists() else None
+    data = load_bytes(path)
+    assert reader is not None, "a file that could be read exists"
+    contents: Contents = reader.read(path, data)
     if not len(contents.vertices):
         raise MeshFileError(f"{path}: the file holds no vertices")
     return contents
 
 
-def _write(path: Path, contents: Contents, double: bool, formats: dict[str, ModuleType]) -> None:
-    data = _format(path, formats).encode(contents, double)
+def _write(path: Path, contents: Contents, precision: Precision, formats: dict[str, ModuleType]) -> None:
+    if precision not in ("double", "single"):
+        raise ValueError(f"precision: expected 'double' or 'single', got {precision!r}")
+    data = _format(path, formats).encode(contents, precision == "double")
     if path.suffix.lower() == ".gz":
-        data = gzip.compress(data, mtime=0)
+        data = gzip.compress(data, compresslevel=6, mtime=0)
     with storage.writing(path) as beside:
         beside.write_bytes(data)

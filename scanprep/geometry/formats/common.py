@@ -2,12 +2,15 @@
 from __future__ import annotations
 
 import gzip
+import warnings
 import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
+
+UNITS = {"m": 1.0, "mm": 1e-3, "cm": 1e-2, "in": 0.0254}
 
 
 class MeshFileError(ValueError):
@@ -57,6 +60,26 @@ def load_bytes(path: Path) -> bytes:
     return data
 
 
+def metres_per_unit(path: Path, points: np.ndarray, unit: str | None, smallest: float = 0.1) -> float:
+    """What to multiply the coordinates of a file with to have metres.
+
+    Warns where metres are assumed and would make the points span more than 10 m or less than `smallest`.
+    """
+    if unit is not None:
+        if unit not in UNITS:
+            raise ValueError(f"unit: expected one of {', '.join(UNITS)}, got {unit!r}")
+        return UNITS[unit]
+    extent = float(np.ptp(points, axis=0).max()) if len(points) else 0.0
+    if extent > 10:
+        likely = min(("mm", "cm", "in"), key=lambda u: abs(np.log(extent * UNITS[u] / 1.7)))
+        warnings.warn(f"{path}: {extent:.4g} m from end to end when read as metres; "
+                      f"it looks like unit='{likely}' ({extent * UNITS[likely]:.3g} m)", stacklevel=3)
+    elif 0 < extent < smallest:
+        warnings.warn(f"{path}: {extent:.2g} m from end to end when read as metres; it looks as if millimetres "
+                      f"had been divided by 1000 twice ({extent * 1000:.3g} m)", stacklevel=3)
+    return 1.0
+
+
 def quote(text: bytes | str, length: int = 40) -> str:
     """The beginning of a piece of a file, fit for one line of an error."""
     shown = text if isinstance(text, str) else text.decode("latin-1")
@@ -82,9 +105,10 @@ class Lines:
         lines = data.splitlines()
         if comment is not None and comment in data:
             lines = [line.split(comment, 1)[0] for line in lines]
-        kept = [(number, line) for number, line in enumerate(lines, first) if line.strip()]
-        self.numbers = [number for number, _ in kept]
-        self.text = [line for _, line in kept]
+        self.text = list(filter(bytes.strip, lines))
+        self.numbers: Sequence[int] = range(first, first + len(lines))
+        if len(self.text) < len(lines):
+            self.numbers = [number for number, line in enumerate(lines, first) if line.strip()]
 
     def __len__(self) -> int:
         return len(self.text)

@@ -1,6 +1,7 @@
 """Wavefront OBJ: vertices, with colours behind the coordinates, and polygons; everything else is skipped."""
 from __future__ import annotations
 
+import re
 from pathlib import Path
 
 import numpy as np
@@ -11,47 +12,55 @@ from .common import Contents, Lines, MeshFileError, polygons
 def read(path: Path, data: bytes) -> Contents:
     """The vertices, triangles and vertex colours of an OBJ file, vertices in their order in the file."""
     lines = Lines(path, data.replace(b"\\\r\n", b" ").replace(b"\\\n", b" "), comment=b"#")
-    words = [line.split() for line in lines.text]
-    v_rows = [row for row, w in enumerate(words) if w[0] == b"v"]
-    f_rows = [row for row, w in enumerate(words) if w[0] == b"f"]
+    starts = [line[:2] for line in map(bytes.lstrip, lines.text)]
+    v_rows = [row for row, start in enumerate(starts) if start in (b"v ", b"v\t")]
+    f_rows = [row for row, start in enumerate(starts) if start in (b"f ", b"f\t", b"f")]
     if not v_rows:
         raise MeshFileError(f"{path}: expected an OBJ file with lines 'v x y z', found none")
-    table = _vertices(lines, words, v_rows)
-    corners, sizes = _corners(lines, words, v_rows, f_rows)
+    table = _vertices(lines, v_rows)
+    corners, sizes = _corners(lines, v_rows, f_rows)
     faces = polygons(path, sizes, corners, len(v_rows), [lines.numbers[row] for row in f_rows])
-    return Contents(table[:, :3], faces if f_rows else None, None, table[:, 3:6] if table.shape[1] >= 6 else None)
+    return Contents(table[:, :3], faces, None, np.clip(table[:, 3:6], 0, 1) if table.shape[1] >= 6 else None)
 
 
-def _vertices(lines: Lines, words: list[list[bytes]], rows: list[int]) -> np.ndarray:
-    """(N, 3) coordinates, or (N, 6) where every line has a colour as well."""
-    width = 6 if min(len(words[row]) for row in rows) >= 7 else 3
+def _after(lines: Lines, rows: list[int]) -> list[bytes]:
+    """What follows the keyword, one letter, on these rows."""
+    return [lines.text[row].lstrip()[1:] for row in rows]
+
+
+def _vertices(lines: Lines, rows: list[int]) -> np.ndarray:
+    """(N, 3) coordinates, or (N, 6) and more where every line has a colour as well."""
+    text = _after(lines, rows)
     try:
-        return np.array([words[row][1:width + 1] for row in rows], dtype=np.float64)
-    except ValueError:
-        for row in rows:
+        return np.loadtxt(text, ndmin=2, comments=None)[:, :6 if len(text[0].split()) >= 6 else 3]
+    except ValueError:               # lines of unequal length, or one that is wrong
+        out = []
+        for row, line in zip(rows, text, strict=True):
             try:
-                if len([float(word) for word in words[row][1:]]) < 3:
-                    raise ValueError
+                x, y, z = map(float, line.split()[:3])
             except ValueError:
                 raise lines.fail(row, "a vertex 'v x y z'") from None
-        raise
+            out.append((x, y, z))
+        return np.array(out)
 
 
-def _corners(lines: Lines, words: list[list[bytes]], v_rows: list[int], f_rows: list[int]
-             ) -> tuple[np.ndarray, np.ndarray]:
+def _corners(lines: Lines, v_rows: list[int], f_rows: list[int]) -> tuple[np.ndarray, np.ndarray]:
     """The vertices of all faces one after the other, counted from 0, and how many each face has."""
-    sizes = np.array([len(words[row]) - 1 for row in f_rows], dtype=np.int64)
-    flat = [word for row in f_rows for word in words[row][1:]]
-    if any(b"/" in word for word in flat):
-        flat = [word.split(b"/", 1)[0] for word in flat]
+    text = _after(lines, f_rows)
+    if any(b"/" in line for line in text):           # v/vt/vn: the first number is the vertex
+        text = re.sub(rb"/\S*", b"", b"\n".join(text)).split(b"\n")
     try:
-        corners = np.array(flat, dtype=np.int64)
-    except ValueError:
-        for row in f_rows:
-            for word in words[row][1:]:
-                if not word.split(b"/", 1)[0].lstrip(b"+-").isdigit():
-                    raise lines.fail(row, "a face 'f v v v' of vertex numbers") from None
-        raise
+        table: np.ndarray = np.loadtxt(text, dtype=np.int64, ndmin=2, comments=None) if text else np.zeros((0, 3))
+        if len(table) != len(text):
+            raise ValueError
+        corners, sizes = table.astype(np.int64).ravel(), np.full(len(text), table.shape[1])
+    except ValueError:               # polygons of several sizes, or one that is wrong
+        words = [line.split() for line in text]
+        bad = next((i for i, w in enumerate(words) if not all(x.lstrip(b"+-").isdigit() for x in w)), None)
+        if bad is not None:
+            raise lines.fail(f_rows[bad], "a face 'f v v v' of vertex numbers") from None
+        corners = np.array([x for w in words for x in w], dtype=np.int64)
+        sizes = np.array([len(w) for w in words])
     zero = np.flatnonzero(corners == 0)
     if len(zero):
         face = int(np.searchsorted(np.cumsum(sizes), zero[0], side="right"))

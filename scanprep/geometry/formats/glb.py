@@ -1,0 +1,195 @@
+"""GLB, the binary form of glTF 2.0: all triangles of the scene, each mesh where its node puts it."""
+from __future__ import annotations
+
+import json
+import struct
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from .common import Contents, MeshFileError, as_colors, quote
+
+_COMPONENTS = {5120: "i1", 5121: "u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
+_WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT4": 16}
+_TRIANGLES, _STRIP, _FAN = 4, 5, 6
+
+
+def read(path: Path, data: bytes) -> Contents:
+    """The meshes of the scene one after the other, in scene coordinates; points and lines are left out.
+
+    A mesh that hangs on joints is taken as it is stored, in its bind pose.
+    """
+    tree, binary = _chunks(path, data)
+    needed = tree.get("extensionsRequired", [])
+    if any("draco" in name.lower() or "meshopt" in name.lower() for name in needed):
+        raise MeshFileError(f"{path}: expected a GLB file that is not compressed, it needs {', '.join(needed)}")
+    vertices: list[np.ndarray] = []
+    faces: list[np.ndarray] = []
+    colors: list[np.ndarray | None] = []
+    start = 0
+    try:
+        for node, matrix in _nodes(tree):
+            if "mesh" not in node:
+                continue
+            matrix = np.eye(4) if "skin" in node else matrix
+            placed: dict[int, int] = {}                  # primitives may share their vertices
+            for primitive in tree["meshes"][node["mesh"]]["primitives"]:
+                if primitive.get("mode", _TRIANGLES) not in (_TRIANGLES, _STRIP, _FAN):
+                    continue
+                points = primitive["attributes"]["POSITION"]
+                if points not in placed:
+                    local = _accessor(tree, binary, points).astype(np.float64)
+                    placed[points] = start
+                    vertices.append(local @ matrix[:3, :3].T + matrix[:3, 3])
+                    colors.append(_colors(tree, binary, primitive))
+                    start += len(local)
+                corners = _triangles(tree, binary, primitive, tree["accessors"][points]["count"])
+                if np.linalg.det(matrix[:3, :3]) < 0:
+                    corners = corners[:, ::-1]
+                faces.append(_in_range(path, corners, tree["accessors"][points]["count"]) + placed[points])
+    except (KeyError, IndexError, TypeError, AttributeError, RecursionError) as error:
+        raise MeshFileError(f"{path}: damaged GLB file ({type(error).__name__}: {error})") from None
+    except _Short as error:
+        raise MeshFileError(f"{path}: truncated GLB file: {error}") from None
+    if not faces:
+        raise MeshFileError(f"{path}: expected a mesh, found a GLB file without triangles")
+    shades = [c for c in colors if c is not None]
+    return Contents(np.concatenate(vertices), np.concatenate(faces), None,
+                    np.concatenate(shades) if len(shades) == len(colors) else None)
+
+
+class _Short(Exception):
+    """Data that end before they should."""
+
+
+def _chunks(path: Path, data: bytes) -> tuple[dict[str, Any], bytes]:
+    if data[:4] != b"glTF" or len(data) < 20:
+        raise MeshFileError(f"{path}: expected a GLB file that begins with 'glTF', found {quote(data[:20])}")
+    version, length = struct.unpack_from("<II", data, 4)
+    if version != 2:
+        raise MeshFileError(f"{path}: expected glTF version 2, found version {version}")
+    if len(data) < length:
+        raise MeshFileError(f"{path}: truncated: expected {length} bytes of GLB, found {len(data)}")
+    chunks: dict[bytes, bytes] = {}
+    place = 12
+    while place + 8 <= length:
+        size, kind = struct.unpack_from("<I4s", data, place)
+        chunks.setdefault(kind, data[place + 8:place + 8 + size])
+        place += 8 + size
+    try:
+        return json.loads(chunks[b"JSON"]), chunks.get(b"BIN\0", b"")
+    except (KeyError, ValueError) as error:
+        raise MeshFileError(f"{path}: damaged GLB file, its JSON cannot be read ({error})") from None
+
+
+def _nodes(tree: dict[str, Any]) -> Iterator[tuple[dict[str, Any], np.ndarray]]:
+    """Every node of the scene with its matrix (4, 4) to the scene; all root nodes where there is no scene."""
+    nodes = tree.get("nodes", [])
+    if tree.get("scenes"):
+        roots = tree["scenes"][tree.get("scene", 0)].get("nodes", [])
+    else:
+        inner = {child for node in nodes for child in node.get("children", [])}
+        roots = [i for i in range(len(nodes)) if i not in inner]
+    open_nodes = [(i, np.eye(4), 0) for i in reversed(roots)]
+    while open_nodes:
+        i, above, depth = open_nodes.pop()
+        if depth > len(nodes):
+            raise RecursionError("a node is its own ancestor")
+        matrix = above @ _matrix(nodes[i])
+        yield nodes[i], matrix
+        open_nodes += [(child, matrix, depth + 1) for child in reversed(nodes[i].get("children", []))]
+
+
+def _matrix(node: dict[str, Any]) -> np.ndarray:
+    if "matrix" in node:
+        return np.array(node["matrix"], dtype=np.float64).reshape(4, 4).T
+    x, y, z, w = node.get("rotation", (0, 0, 0, 1))
+    R = np.array([[1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+                  [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+                  [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)]])
+    out = np.eye(4)
+    out[:3, :3] = R * np.array(node.get("scale", (1, 1, 1)), dtype=np.float64)
+    out[:3, 3] = node.get("translation", (0, 0, 0))
+    return out
+
+
+def _accessor(tree: dict[str, Any], binary: bytes, number: int) -> np.ndarray:
+    """(count, width) the values of an accessor."""
+    accessor = tree["accessors"][number]
+    kind, count = np.dtype(_COMPONENTS[accessor["componentType"]]), accessor["count"]
+    width = _WIDTHS[accessor["type"]]
+    if "sparse" in accessor:
+        raise KeyError("sparse accessors are not read here")
+    if "bufferView" not in accessor:
+        return np.zeros((count, width), dtype=kind)
+    view = tree["bufferViews"][accessor["bufferView"]]
+    start = view.get("byteOffset", 0) + accessor.get("byteOffset", 0)
+    stride = view.get("byteStride", kind.itemsize * width)
+    if count and start + stride * (count - 1) + kind.itemsize * width > len(binary):
+        raise _Short(f"accessor {number} needs {start + stride * count} bytes, found {len(binary)}")
+    return np.ndarray((count, width), kind, binary, start, (stride, kind.itemsize)).copy()
+
+
+def _triangles(tree: dict[str, Any], binary: bytes, primitive: dict[str, Any], count: int) -> np.ndarray:
+    line = (_accessor(tree, binary, primitive["indices"])[:, 0].astype(np.int64) if "indices" in primitive
+            else np.arange(count))
+    mode = primitive.get("mode", _TRIANGLES)
+    if mode == _TRIANGLES:
+        return line[:len(line) // 3 * 3].reshape(-1, 3)
+    if mode == _FAN:
+        return np.stack([np.full(max(len(line) - 2, 0), line[0]), line[1:-1], line[2:]], axis=1)
+    strip = np.stack([line[:-2], line[1:-1], line[2:]], axis=1)
+    strip[1::2] = strip[1::2, [1, 0, 2]]
+    return strip[(strip != np.roll(strip, 1, axis=1)).all(axis=1)]
+
+
+def _in_range(path: Path, corners: np.ndarray, count: int) -> np.ndarray:
+    outside = np.flatnonzero((corners >= count).any(axis=1))
+    if len(outside):
+        raise MeshFileError(f"{path}: face {outside[0]} refers to vertex {corners[outside[0]].max()}, "
+                            f"expected 0..{count - 1}")
+    return corners
+
+
+def _colors(tree: dict[str, Any], binary: bytes, primitive: dict[str, Any]) -> np.ndarray | None:
+    """The vertex colours as they are seen on a screen: glTF stores them linear in light."""
+    if "COLOR_0" not in primitive["attributes"]:
+        return None
+    values = _accessor(tree, binary, primitive["attributes"]["COLOR_0"])
+    linear = as_colors(values[:, :3], values.dtype)
+    return np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * np.maximum(linear, 1e-9) ** (1 / 2.4) - 0.055)
+
+
+def encode(contents: Contents, double: bool) -> bytes:
+    """A GLB file of one mesh with normals, in single precision whatever `double` says."""
+    from ..mesh import Mesh
+
+    assert contents.faces is not None, "a GLB file is written for meshes"
+    points = contents.vertices.astype("<f4")
+    normals = Mesh(contents.vertices, contents.faces).vertex_normals.copy()
+    normals[~normals.any(axis=1)] = (0, 0, 1)
+    blocks = [(contents.faces.reshape(-1, 1).astype("<u4"), "SCALAR", 5125, 34963), (points, "VEC3", 5126, 34962),
+              (normals.astype("<f4"), "VEC3", 5126, 34962)]
+    attributes = {"POSITION": 1, "NORMAL": 2}
+    if contents.colors is not None:
+        c = contents.colors
+        linear = np.where(c <= 0.04045, c / 12.92, ((c + 0.055) / 1.055) ** 2.4)
+        blocks.append((linear.astype("<f4"), "VEC3", 5126, 34962))
+        attributes["COLOR_0"] = 3
+    binary, views, accessors = b"", [], []
+    for i, (values, shape, kind, target) in enumerate(blocks):
+        views.append({"buffer": 0, "byteOffset": len(binary), "byteLength": values.nbytes, "target": target})
+        accessors.append({"bufferView": i, "componentType": kind, "count": len(values), "type": shape})
+        binary += values.tobytes()
+    accessors[1].update(min=points.min(axis=0).tolist(), max=points.max(axis=0).tolist())
+    tree = {"asset": {"version": "2.0", "generator": "scapekit"}, "scene": 0, "scenes": [{"nodes": [0]}],
+            "nodes": [{"mesh": 0}],
+            "meshes": [{"primitives": [{"attributes": attributes, "indices": 0, "material": 0}]}],
+            "materials": [{"pbrMetallicRoughness": {"metallicFactor": 0.0, "roughnessFactor": 0.8}}],
+            "buffers": [{"byteLength": len(binary)}], "bufferViews": views, "accessors": accessors}
+    text = json.dumps(tree, separators=(",", ":")).encode()
+    text += b" " * (-len(text) % 4)
+    body = struct.pack("<I4s", len(text), b"JSON") + text + struct.pack("<I4s", len(binary), b"BIN\0") + binary
+    return struct.pack("<4sII", b"glTF", 2, 12 + len(body)) + body

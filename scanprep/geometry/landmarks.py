@@ -1,0 +1,255 @@
+"""Files of landmarks: JSON, MeshLab `.pp`, CAESAR `.lnd`, 3D Slicer `.mrk.json`, and text."""
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from pathlib import Path
+from typing import Any
+from xml.etree import ElementTree
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from . import storage
+from .formats.common import UNITS, Lines, MeshFileError, load_bytes, metres_per_unit, quote
+from .mesh import Mesh
+
+
+def read_landmarks(path: str | Path, mesh: Mesh | None = None, unit: str | None = None) -> dict[str, np.ndarray]:
+    """Read named points.
+
+    Parameters
+    ----------
+    path : str or Path
+        JSON `{name: [x, y, z]}`, `{name: vertex}` or `{name: {"face": f, "bary": [a, b, c]}}`; MeshLab `.pp`;
+        CAESAR `.lnd`; 3D Slicer `.mrk.json`; otherwise text with lines `x y z name`.
+    mesh : Mesh, optional
+        What vertices and faces refer to.
+    unit : 'm', 'mm', 'cm' or 'in', optional
+        Unit of the coordinates in the file. When it is not given: millimetres for `.lnd`, what the file says for
+        `.mrk.json`, otherwise metres, with a UserWarning where the points span more than 10 m.
+
+    Returns
+    -------
+    dict of name to (3,) float, metres
+        In the order of the file. Points of 3D Slicer are in its LPS frame, the one in which it reads and writes
+        meshes, unless the mesh at hand shows that they were meant in RAS.
+
+    Raises
+    ------
+    MeshFileError
+        Missing or damaged, a value that is no point, a name that comes twice, a vertex or face out of range.
+    ValueError
+        A file that refers to vertices or faces, and no mesh.
+    """
+    path = Path(path)
+    return {name: _place(path, name, value, mesh) for name, value in _entries(path, mesh, unit).items()}
+
+
+def read_landmark_vertices(path: str | Path, mesh: Mesh, unit: str | None = None) -> dict[str, int]:
+    """Read named vertices of a mesh from any file of `read_landmarks`.
+
+    Returns
+    -------
+    dict of name to int
+        Where the file has coordinates the nearest vertex, where it has a point of a face the nearest corner.
+    """
+    path = Path(path)
+    entries = _entries(path, mesh, unit)
+    tree = cKDTree(mesh.vertices)
+    points = {name: _place(path, name, value, mesh) for name, value in entries.items()}
+    out = {}
+    for name, value in entries.items():
+        if isinstance(value, int):
+            out[name] = value
+        elif isinstance(value, dict):
+            corners = mesh.faces[value["face"]]
+            out[name] = int(corners[np.linalg.norm(mesh.vertices[corners] - points[name], axis=1).argmin()])
+        else:
+            out[name] = int(tree.query(points[name])[1])
+    return out
+
+
+def write_landmarks(path: str | Path, landmarks: Mapping[str, np.ndarray | int]) -> None:
+    """Write named points (3,), metres, or named vertices as JSON, whole or not at all."""
+    out: dict[str, Any] = {}
+    for name, value in landmarks.items():
+        if isinstance(value, int | np.integer):
+            out[name] = int(value)
+            continue
+        point = np.asarray(value, dtype=np.float64)
+        if point.shape != (3,) or not np.isfinite(point).all():
+            raise ValueError(f"landmarks: '{name}' expected three finite numbers or a vertex, got {value}")
+        out[name] = point.tolist()
+    storage.write_json(path, out)
+
+
+def match_landmarks(template_landmarks: Mapping[str, Any], scan_landmarks: Mapping[str, Any], minimum: int = 3
+                    ) -> tuple[tuple[str, ...], np.ndarray, np.ndarray]:
+    """The landmarks that the template and the scan have in common, in the template's order.
+
+    Returns
+    -------
+    names : L strings
+    template values : (L, ...) array
+    scan values : (L, ...) array
+
+    Raises
+    ------
+    ValueError
+        Fewer than `minimum` names match; both lists are in the message.
+    """
+    names = tuple(name for name in template_landmarks if name in scan_landmarks)
+    if len(names) < minimum:
+        raise ValueError(f"landmarks: expected at least {minimum} names that template and scan share, found "
+                         f"{len(names)}; template: {', '.join(template_landmarks) or 'none'}; "
+                         f"scan: {', '.join(scan_landmarks) or 'none'}")
+    return (names, np.array([template_landmarks[name] for name in names]),
+            np.array([scan_landmarks[name] for name in names]))
+
+
+_Entry = np.ndarray | int | dict[str, Any]       # metres, vertex, or face with barycentric coordinates
+
+
+def _entries(path: Path, mesh: Mesh | None, unit: str | None) -> dict[str, _Entry]:
+    data = load_bytes(path)
+    suffix = path.suffix.lower()
+    own_unit = None
+    pairs: list[tuple[str, _Entry]]
+    if suffix == ".json":
+        tree = _json(path, data)
+        if isinstance(tree.get("markups"), list):
+            own_unit, pairs = _slicer(path, tree["markups"], mesh, unit)
+        else:
+            pairs = [(name, _json_entry(path, name, value)) for name, value in tree.items()]
+    elif suffix == ".pp":
+        pairs = _picked_points(path, data)
+    elif suffix == ".lnd":
+        own_unit, pairs = "mm", _caesar(path, data)
+    else:
+        pairs = _text(path, data)
+    if not pairs:
+        raise MeshFileError(f"{path}: expected landmarks, found none")
+    entries = dict(pairs)
+    if len(entries) < len(pairs):
+        names = [name for name, _ in pairs]
+        raise MeshFileError(f"{path}: landmark '{next(n for n in names if names.count(n) > 1)}' comes twice")
+    points = [v for v in entries.values() if isinstance(v, np.ndarray)]
+    for name, value in entries.items():
+        if isinstance(value, np.ndarray) and not np.isfinite(value).all():
+            raise MeshFileError(f"{path}: landmark '{name}' is not finite: {value.tolist()}")
+    scale = metres_per_unit(path, np.array(points).reshape(-1, 3), unit or own_unit, smallest=0.0)
+    return {name: scale * v if isinstance(v, np.ndarray) else v for name, v in entries.items()}
+
+
+def _place(path: Path, name: str, value: _Entry, mesh: Mesh | None) -> np.ndarray:
+    if isinstance(value, np.ndarray):
+        return value
+    if mesh is None:
+        kind = "vertex" if isinstance(value, int) else "face"
+        raise ValueError(f"mesh: {path} gives landmark '{name}' by {kind}, so the mesh is needed it refers to")
+    what, index, count = (("vertex", value, len(mesh.vertices)) if isinstance(value, int)
+                          else ("face", value["face"], len(mesh.faces)))
+    if not 0 <= index < count:
+        raise MeshFileError(f"{path}: landmark '{name}' refers to {what} {index}, the mesh has 0..{count - 1}")
+    return mesh.vertices[index].copy() if isinstance(value, int) else value["bary"] @ mesh.corners[index]
+
+
+def _json(path: Path, data: bytes) -> dict[str, Any]:
+    try:
+        tree = json.loads(data)
+    except ValueError as error:
+        raise MeshFileError(f"{path}: expected landmarks in JSON, cannot read it ({error})") from None
+    if not isinstance(tree, dict):
+        raise MeshFileError(f"{path}: expected landmarks in JSON {{name: [x, y, z]}}, "
+                            f"found a {type(tree).__name__}")
+    return tree
+
+
+def _json_entry(path: Path, name: str, value: Any) -> _Entry:
+    if isinstance(value, int) and not isinstance(value, bool):
+        return value
+    if isinstance(value, dict) and isinstance(value.get("face"), int):
+        bary = _numbers(value.get("bary"))
+        if bary is not None and abs(bary.sum() - 1) < 1e-3:
+            return {"face": value["face"], "bary": bary / bary.sum()}
+    point = _numbers(value)
+    if point is None:
+        raise MeshFileError(f"{path}: landmark '{name}': expected [x, y, z], a vertex or "
+                            f'{{"face": f, "bary": [a, b, c]}}, found {quote(json.dumps(value))}')
+    return point
+
+
+def _numbers(value: Any) -> np.ndarray | None:
+    try:
+        point = np.array(value, dtype=np.float64)
+    except (TypeError, ValueError):
+        return None
+    return point if point.shape == (3,) else None
+
+
+def _slicer(path: Path, markups: list[Any], mesh: Mesh | None, unit: str | None
+            ) -> tuple[str, list[tuple[str, _Entry]]]:
+    pairs: list[tuple[str, _Entry]] = []
+    own_unit = "mm"
+    for markup in markups:
+        try:
+            units = markup.get("coordinateUnits", "mm")
+            own_unit = units[0] if isinstance(units, list) else units
+            turn = {"LPS": (1, 1, 1), "RAS": (-1, -1, 1)}[markup.get("coordinateSystem", "LPS")]
+            for i, point in enumerate(markup["controlPoints"]):
+                if point.get("positionStatus", "defined") == "defined":
+                    position = np.array(point["position"], dtype=np.float64)
+                    pairs.append((str(point.get("label", i)), position.reshape(3) * turn))
+        except (KeyError, TypeError, ValueError, AttributeError, IndexError) as error:
+            raise MeshFileError(f"{path}: expected a markups file of 3D Slicer, cannot read it "
+                                f"({type(error).__name__}: {error})") from None
+    if own_unit not in UNITS and unit is None:
+        raise MeshFileError(f"{path}: expected coordinateUnits of {', '.join(UNITS)}, found {own_unit!r}")
+    if mesh is not None and pairs:
+        points = UNITS[unit or own_unit] * np.array([p for _, p in pairs])
+        tree, flip = cKDTree(mesh.vertices), np.array([-1, -1, 1])
+        if tree.query(points * flip)[0].sum() < tree.query(points)[0].sum():
+            pairs = [(name, np.asarray(p) * flip) for name, p in pairs]
+    return own_unit, pairs
+
+
+def _picked_points(path: Path, data: bytes) -> list[tuple[str, _Entry]]:
+    """Points of MeshLab's PickPoints; those of a template that were not picked are inactive and left out."""
+    try:
+        root = ElementTree.fromstring(data)
+        return [(point.attrib["name"], np.array([float(point.attrib[axis]) for axis in "xyz"]))
+                for point in root.iter("point") if point.attrib.get("active", "1") != "0"]
+    except (ElementTree.ParseError, KeyError, ValueError) as error:
+        raise MeshFileError(f"{path}: expected picked points of MeshLab with x, y, z and name, cannot read it "
+                            f"({error})") from None
+
+
+def _caesar(path: Path, data: bytes) -> list[tuple[str, _Entry]]:
+    """Lines of number, two codes, distance from the axis, x, y, z and name, after a heading of `KEY = value`."""
+    lines = Lines(path, data)
+    pairs: list[tuple[str, _Entry]] = []
+    for row, line in enumerate(lines.text):
+        if b"=" in line:
+            continue
+        words = line.split()
+        try:
+            numbers = [float(word) for word in words[:7]]
+            if len(words) < 8:
+                raise ValueError
+        except ValueError:
+            raise lines.fail(row, "a line of a CAESAR .lnd file, seven numbers and a name") from None
+        pairs.append((b" ".join(words[7:]).decode("latin-1"), np.array(numbers[4:7])))
+    return pairs
+
+
+def _text(path: Path, data: bytes) -> list[tuple[str, _Entry]]:
+    lines = Lines(path, data, comment=b"#")
+    pairs: list[tuple[str, _Entry]] = []
+    for row, line in enumerate(lines.text):
+        words = line.split(None, 3)
+        try:
+            pairs.append((words[3].strip().decode(), np.array([float(word) for word in words[:3]])))
+        except (ValueError, IndexError):
+            raise lines.fail(row, "'x y z name'") from None
+    return pairs
