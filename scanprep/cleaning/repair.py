@@ -1,0 +1,159 @@
+"""Meshes made manifold: duplicates, triangles without area, edges and vertices where sheets touch, loose pieces."""
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+
+from ..geometry.mesh import Mesh
+
+
+@dataclass(frozen=True)
+class RepairConfig:
+    """Settings of `repair`.
+
+    Attributes
+    ----------
+    weld : float, metres
+        Vertices closer than this become one; 0 for exactly equal ones.
+    min_area : float, square metres
+        Smaller triangles are removed.
+    min_component : float
+        Pieces with a smaller share of the vertices of the largest one are dropped; 1 keeps the largest alone.
+    """
+
+    weld: float = 1e-7
+    min_area: float = 1e-12
+    min_component: float = 1.0
+
+
+def repair(mesh: Mesh, config: RepairConfig | None = None) -> Mesh:
+    """The nearest mesh that is manifold, with nothing double, flat, unused or loose in it.
+
+    Triangles are only ever removed, so holes may open; where sheets touch in a vertex it is split in two.
+
+    Parameters
+    ----------
+    mesh : Mesh
+    config : RepairConfig, optional
+
+    Returns
+    -------
+    Mesh
+
+    Raises
+    ------
+    ValueError
+        No triangle is left.
+    """
+    config = config or RepairConfig()
+    mesh = weld(mesh, config.weld)
+    mesh = drop_flat(mesh, config.min_area)
+    for _ in range(20):
+        if mesh.is_edge_manifold:
+            break
+        mesh = _drop_at_bad_edges(mesh)
+    mesh = drop_small_components(split_vertices(mesh), config.min_component)
+    if not len(mesh.faces):
+        raise ValueError("mesh: no triangle is left after repair")
+    return mesh
+
+
+def weld(mesh: Mesh, distance: float = 0.0) -> Mesh:
+    """Vertices that coincide made one; triangles that lose a corner by it, and repeated ones, removed."""
+    key = np.round(mesh.vertices / distance).astype(np.int64) if distance > 0 else mesh.vertices
+    _, first, new = np.unique(key, axis=0, return_index=True, return_inverse=True)
+    order = np.argsort(first, kind="stable")                 # keep the order of the vertices
+    faces = np.argsort(order, kind="stable")[new.reshape(-1)][mesh.faces]
+    distinct = (faces != np.roll(faces, 1, axis=1)).all(axis=1)
+    _, once = np.unique(np.sort(faces, axis=1), axis=0, return_index=True)
+    keep = np.zeros(len(faces), dtype=bool)
+    keep[once] = True
+    kept = first[order]
+    welded = Mesh(mesh.vertices[kept], faces[keep & distinct], None if mesh.colors is None else mesh.colors[kept])
+    return welded.submesh(np.arange(len(welded.faces)))[0]
+
+
+def drop_flat(mesh: Mesh, min_area: float = 1e-12) -> Mesh:
+    """Triangles without area removed by collapsing their shortest side, where that harms no neighbour."""
+    for _ in range(10):
+        flat = np.flatnonzero(mesh.face_areas < min_area)
+        if not len(flat):
+            return mesh
+        corners = mesh.corners[flat]
+        side = np.linalg.norm(corners - np.roll(corners, -1, axis=1), axis=2).argmin(axis=1)
+        a, b = mesh.faces[flat, side], mesh.faces[flat, (side + 1) % 3]
+        target = np.arange(len(mesh.vertices))
+        target[np.maximum(a, b)] = np.minimum(a, b)
+        moved = mesh.vertices[target[target]]
+        faces = target[target][mesh.faces]
+        mesh = weld(Mesh(moved, faces, mesh.colors))
+    return mesh.submesh(mesh.face_areas >= min_area)[0]
+
+
+def _drop_at_bad_edges(mesh: Mesh) -> Mesh:
+    """Without the triangles that make an edge non-manifold: of more than two the smallest, of twisted pairs both."""
+    half = mesh.faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
+    edge = mesh.face_edges.ravel()
+    forward = half[:, 0] < half[:, 1]
+    size = np.repeat(mesh.face_areas, 3)
+    # In each direction an edge may be used once: the largest triangle keeps it.
+    order = np.lexsort((-size, forward, edge))
+    e, f = edge[order], forward[order]
+    again = np.r_[False, (e[1:] == e[:-1]) & (f[1:] == f[:-1])]
+    keep = np.ones(len(mesh.faces), dtype=bool)
+    keep[order[again] // 3] = False
+    return mesh.submesh(keep)[0]
+
+
+def split_vertices(mesh: Mesh) -> Mesh:
+    """A copy of a vertex for every fan of triangles around it beyond the first."""
+    if mesh.is_vertex_manifold:
+        return mesh
+    fan = _fans(mesh)
+    number = fan.ravel()
+    _, first, new = np.unique(number, return_index=True, return_inverse=True)
+    owner = mesh.faces.ravel()[first]
+    order = np.lexsort((first, owner))
+    duplicate = np.r_[False, owner[order][1:] == owner[order][:-1]]
+    place = np.empty(len(owner), dtype=np.int64)
+    place[order] = np.where(duplicate, len(mesh.vertices) + np.cumsum(duplicate) - 1, owner[order])
+    source = np.concatenate([np.arange(len(mesh.vertices)), owner[order][duplicate]])
+    colors = None if mesh.colors is None else mesh.colors[source]
+    return Mesh(mesh.vertices[source], place[new.reshape(-1)].reshape(-1, 3), colors)
+
+
+def _fans(mesh: Mesh) -> np.ndarray:
+    """(F, 3) number of the fan each corner belongs to; corners at a vertex share it when edges join them."""
+    edge, corner = mesh.face_edges, np.arange(mesh.faces.size).reshape(-1, 3)
+    rows = []
+    for side in range(3):
+        following = (side + 1) % 3
+        swap = mesh.faces[:, side] > mesh.faces[:, following]
+        low = np.where(swap, corner[:, following], corner[:, side])
+        high = np.where(swap, corner[:, side], corner[:, following])
+        rows.append(np.stack([edge[:, side], low, high], axis=1))
+    row = np.concatenate(rows)
+    row = row[np.argsort(row[:, 0], kind="stable")]
+    same = row[1:, 0] == row[:-1, 0]
+    a, b = np.r_[row[:-1, 1][same], row[:-1, 2][same]], np.r_[row[1:, 1][same], row[1:, 2][same]]
+    n = mesh.faces.size
+    _, fan = connected_components(coo_array((np.ones(len(a)), (a, b)), shape=(n, n)), directed=False)
+    return fan.reshape(-1, 3)
+
+
+def drop_small_components(mesh: Mesh, share: float) -> Mesh:
+    """Without the pieces that have less than `share` of the vertices of the largest, and without unused vertices."""
+    if not len(mesh.faces):
+        return mesh
+    a, b = mesh.faces[:, [0, 1]].T, mesh.faces[:, [1, 2]].T       # not mesh.edges: sorting them takes longer
+    count = len(mesh.vertices)
+    sides = coo_array((np.ones(a.size), (a.ravel(), b.ravel())), shape=(count, count))
+    _, label = connected_components(sides, directed=False)
+    size = np.bincount(label)
+    keep = size >= share * size.max()
+    if share >= 1:
+        keep = np.arange(len(size)) == size.argmax()
+    return mesh.submesh(keep[label[mesh.faces[:, 0]]])[0]
