@@ -1,0 +1,143 @@
+"""Labels of triangles by a Markov random field: own costs, and a price for every border between labels."""
+from __future__ import annotations
+
+import numpy as np
+from scipy.sparse import coo_array, csr_array
+from scipy.sparse.csgraph import breadth_first_order, connected_components, maximum_flow
+
+RESOLUTION = 1e-4                # of the mean own cost: the unit of the integer capacities
+
+
+def field_energy(costs: np.ndarray, pairs: np.ndarray, prices: np.ndarray, label: np.ndarray) -> float:
+    """What a labelling costs: the sum of own costs and of the prices of neighbours that differ.
+
+    Parameters
+    ----------
+    costs : (F, P) float
+    pairs : (n, 2) int
+        Triangles that are neighbours.
+    prices : (n,) float
+    label : (F,) int
+    """
+    differ = label[pairs[:, 0]] != label[pairs[:, 1]]
+    return float(costs[np.arange(len(label)), label].sum() + prices[differ].sum())
+
+
+def relabel(costs: np.ndarray, pairs: np.ndarray, prices: np.ndarray, label: np.ndarray,
+            rounds: int = 3) -> np.ndarray:
+    """Lower the energy of a labelling by α-expansion moves, each of them optimal, until none helps.
+
+    Arguments as for `field_energy`; returns the new labels (F,).
+
+    [Articulated] E-step
+    """
+    around = np.bincount(pairs.ravel(), np.repeat(prices, 2), len(label))
+    unit = max(costs.mean() * RESOLUTION, np.finfo(float).tiny)
+    energy = field_energy(costs, pairs, prices, label)
+    for _ in range(rounds):
+        for alpha in range(costs.shape[1]):
+            gain = costs[:, alpha] - costs[np.arange(len(label)), label]
+            free = (label != alpha) & (gain < around)        # the others lose more than all borders can give
+            if free.any():
+                label = np.where(_expand(gain, pairs, prices, label, alpha, free, unit), alpha, label)
+        before, energy = energy, field_energy(costs, pairs, prices, label)
+        if energy >= before * (1 - 1e-5):
+            break
+    return label
+
+
+def _expand(gain: np.ndarray, pairs: np.ndarray, prices: np.ndarray, label: np.ndarray, alpha: int,
+            free: np.ndarray, unit: float) -> np.ndarray:
+    """(F,) bool: which triangles have label `alpha` in the best labelling where any free one may turn to it.
+
+    With x = 1 for a triangle that turns, a pair (i, j) costs, up to linear terms, W (1 - x_i) x_j with
+    W ≥ 0. A triangle whose own cost outweighs all its neighbours is decided without a cut; the rest
+    is a minimum cut.
+    """
+    near = free[pairs].any(axis=1)
+    node, number = np.unique(np.r_[pairs[near].ravel(), np.flatnonzero(free)], return_inverse=True)
+    i, j = number[:2 * near.sum()].reshape(-1, 2).T
+    price, old = prices[near], label[node]
+    keep_cost = np.where(old[i] != old[j], price, 0)
+    j_turns = np.where(old[i] != alpha, price, 0)
+    i_turns = np.where(old[j] != alpha, price, 0)
+    n = len(node)
+    own = gain[node] + np.bincount(i, i_turns - keep_cost, n) - np.bincount(j, i_turns, n)
+    own, W = np.rint(own / unit), np.rint((j_turns + i_turns - keep_cost) / unit)
+    state = np.where(old == alpha, 1, np.where(free[node], -1, 0))    # 1 turns or is alpha, 0 keeps, -1 open
+    own, i, j, W = _fold(own, i, j, W, state >= 0, state)
+    while True:
+        sure = (state < 0) & (np.abs(own) >= np.bincount(np.r_[i, j], np.r_[W, W], n))
+        if not sure.any():
+            break
+        state[sure] = own[sure] < 0
+        own, i, j, W = _fold(own, i, j, W, sure, state)
+    if (state < 0).any():
+        state = _cut(own, i, j, W, state)
+    out = label == alpha
+    out[node[state == 1]] = True
+    return out
+
+
+def _fold(own: np.ndarray, i: np.ndarray, j: np.ndarray, W: np.ndarray, new: np.ndarray, state: np.ndarray
+          ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Turn pairs with a newly decided side (bool) into own costs of the other side."""
+    to_i, to_j = new[j] & (state[j] == 1), new[i] & (state[i] == 0)
+    own = own - np.bincount(i[to_i], W[to_i], len(own)) + np.bincount(j[to_j], W[to_j], len(own))
+    left = ~new[i] & ~new[j] & (W > 0)
+    return own, i[left], j[left], W[left]
+
+
+def _cut(own: np.ndarray, i: np.ndarray, j: np.ndarray, W: np.ndarray, state: np.ndarray) -> np.ndarray:
+    """Decide what is left by a minimum cut: the source side keeps, the sink side turns."""
+    node = np.flatnonzero(state < 0)
+    number = np.full(len(own), -1)
+    number[node] = np.arange(len(node))
+    source, sink = len(node), len(node) + 1
+    mine = own[node].astype(np.int64)
+    up, down = np.flatnonzero(mine > 0), np.flatnonzero(mine < 0)
+    rows = np.r_[number[i], np.full(len(up), source), down]
+    columns = np.r_[number[j], up, np.full(len(down), sink)]
+    capacity = np.r_[W, mine[up], -mine[down]]
+    if capacity.max(initial=0) > 2**29:
+        capacity = np.ceil(capacity * (2.0**29 / capacity.max()))
+    graph = csr_array(coo_array((capacity.astype(np.int32), (rows, columns)), shape=(sink + 1, sink + 1)))
+    rest = graph - maximum_flow(graph, source, sink).flow
+    rest.data = (rest.data > 0).astype(np.int32)
+    rest.eliminate_zeros()
+    keeps = np.zeros(sink + 1, dtype=bool)
+    keeps[breadth_first_order(rest, source, return_predecessors=False)] = True
+    out = state.copy()
+    out[node] = ~keeps[:source]
+    return out
+
+
+def pieces(pairs: np.ndarray, label: np.ndarray) -> np.ndarray:
+    """(F,) number of the connected piece of equal labels that each triangle lies in."""
+    a, b = pairs[label[pairs[:, 0]] == label[pairs[:, 1]]].T
+    n = len(label)
+    return connected_components(coo_array((np.ones(len(a)), (a, b)), shape=(n, n)), directed=False)[1]
+
+
+def keep_connected(costs: np.ndarray, pairs: np.ndarray, areas: np.ndarray, label: np.ndarray) -> np.ndarray:
+    """Give every piece but the largest of each label to the neighbouring label where it costs least."""
+    label = label.copy()
+    for _ in range(len(label)):
+        piece = pieces(pairs, label)
+        size = np.bincount(piece, areas)
+        of_piece = np.zeros(len(size), dtype=np.int64)
+        of_piece[piece] = label
+        main = np.full(costs.shape[1], -1)
+        order = np.argsort(size, kind="stable")
+        main[of_piece[order]] = order
+        stray = [c for c in order if main[of_piece[c]] != c]
+        if not stray:
+            break
+        for c in stray:
+            inside = piece == c
+            across = np.r_[pairs[inside[pairs[:, 0]] & ~inside[pairs[:, 1]], 1],
+                           pairs[inside[pairs[:, 1]] & ~inside[pairs[:, 0]], 0]]
+            around = np.setdiff1d(label[across], of_piece[c])
+            if len(around):
+                label[inside] = around[np.argmin(costs[np.ix_(inside, around)].sum(axis=0))]
+    return label

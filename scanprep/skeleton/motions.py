@@ -1,0 +1,151 @@
+"""Rigid motions of sets of vertices over all poses, from sums that add up when sets are joined.
+
+For a set of vertices with weights the best rotation, translation and residual of every pose depend only on a
+few sums over the set. Joining two sets adds their sums, so the cost of a union is found without touching
+the vertices again.
+"""
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.sparse import coo_array, csr_array
+
+from ..geometry.mesh import Mesh
+
+
+@dataclass(frozen=True, eq=False)
+class Moments:
+    """Weighted sums over P sets of vertices, in M poses.
+
+    Attributes
+    ----------
+    w : (P,) float
+        Σ w.
+    x : (P, 3) float
+        Σ w x, x on the template.
+    y : (P, M, 3) float
+        Σ w y, y in the pose.
+    yx : (P, M, 3, 3) float
+        Σ w y xᵀ.
+    xx, yy : (P,) float
+        Σ w |x|² and Σ w |y|² over all poses.
+    """
+
+    w: np.ndarray
+    x: np.ndarray
+    y: np.ndarray
+    yx: np.ndarray
+    xx: np.ndarray
+    yy: np.ndarray
+
+    def _each(self) -> tuple[np.ndarray, ...]:
+        return self.w, self.x, self.y, self.yx, self.xx, self.yy
+
+    def __getitem__(self, sets: np.ndarray) -> Moments:
+        """The sums of some of the sets."""
+        return Moments(*(a[sets] for a in self._each()))
+
+    def __add__(self, other: Moments) -> Moments:
+        """The sums of the unions, set by set."""
+        return Moments(*(a + b for a, b in zip(self._each(), other._each(), strict=True)))
+
+    def absorb(self, a: int, b: int) -> None:
+        """Add set b to set a, in place."""
+        for array in self._each():
+            array[a] += array[b]
+
+
+@dataclass(frozen=True, eq=False)
+class Motions:
+    """Best rigid motions of P sets in M poses.
+
+    Attributes
+    ----------
+    R : (P, M, 3, 3) float
+    t : (P, M, 3) float, metres
+        `y ≈ R x + t`, in the centred coordinates of `PosedSurface`.
+    cost : (P,) float, square metres
+        Σ w |R x + t - y|², mean over the poses.
+    """
+
+    R: np.ndarray
+    t: np.ndarray
+    cost: np.ndarray
+
+
+def fit_motions(moments: Moments) -> Motions:
+    """The rigid motion that carries each set best onto every pose (Procrustes), and what it leaves."""
+    m = moments
+    cx, cy = m.x / m.w[:, None], m.y / m.w[:, None, None]
+    H = m.yx - m.y[..., :, None] * cx[:, None, None, :]
+    U, s, Vt = np.linalg.svd(H)
+    proper = np.where(np.linalg.det(U) * np.linalg.det(Vt) < 0, -1.0, 1.0)
+    U[..., :, 2] *= proper[..., None]
+    s[..., 2] *= proper
+    R = U @ Vt
+    spread = (m.xx - np.einsum("pi,pi->p", m.x, cx)) * H.shape[1] + m.yy - np.einsum("pmi,pmi->p", m.y, cy)
+    cost = np.maximum(spread - 2 * s.sum(axis=(1, 2)), 0) / H.shape[1]
+    return Motions(R, cy - np.einsum("pmij,pj->pmi", R, cx), cost)
+
+
+def union_costs(moments: Moments, pairs: np.ndarray) -> np.ndarray:
+    """(n,) square metres: the cost of one rigid motion for both sets of each pair (n, 2)."""
+    return fit_motions(moments[pairs[:, 0]] + moments[pairs[:, 1]]).cost
+
+
+class PosedSurface:
+    """A template and its poses, centred and laid out for sums over vertices.
+
+    Vertices weigh as much as the area around them, the whole surface 1.
+
+    Parameters
+    ----------
+    template : Mesh
+    poses : (M, N, 3) float, metres
+    """
+
+    def __init__(self, template: Mesh, poses: np.ndarray) -> None:
+        self.mesh = template
+        self.area = float(template.face_areas.sum())
+        self.face_weights = template.face_areas / self.area
+        weights = template.vertex_areas / self.area
+        self.origin = weights @ template.vertices
+        self.pose_origins = np.einsum("n,mni->mi", weights, poses)
+        self.x = template.vertices - self.origin
+        self.y = np.ascontiguousarray((poses - self.pose_origins[:, None]).transpose(1, 0, 2))
+        self._yy = np.einsum("nmi,nmi->n", self.y, self.y)
+        self.pairs = template.face_pairs
+        self.pair_lengths = template.edge_lengths[template.edge_use == 2]
+
+    def moments(self, label: np.ndarray) -> Moments:
+        """Sums over the triangles of every label; a third of a triangle's area goes to each corner.
+
+        Parameters
+        ----------
+        label : (F,) int, 0..P-1
+        """
+        rows, columns = np.repeat(label, 3), self.mesh.faces.ravel()
+        W = csr_array(coo_array((np.repeat(self.face_weights / 3, 3), (rows, columns)),
+                                shape=(label.max() + 1, len(self.x))))
+        n, M = self.y.shape[:2]
+        flat = self.y.reshape(n, -1)
+        yx = np.stack([(W @ (flat * self.x[:, [i]])).reshape(-1, M, 3) for i in range(3)], axis=-1)
+        return Moments(np.asarray(W.sum(axis=1)).ravel(), W @ self.x, (W @ flat).reshape(-1, M, 3), yx,
+                       W @ np.einsum("ni,ni->n", self.x, self.x), W @ self._yy)
+
+    def face_costs(self, motions: Motions) -> np.ndarray:
+        """(F, P) square metres: what each triangle would cost under each motion, mean over the poses.
+
+        The squares are multiplied out, so that the sum over the poses is one matrix product.
+        """
+        P, M = motions.t.shape[:2]
+        A = np.concatenate([motions.R, motions.t[..., None]], axis=-1)
+        x1 = np.c_[self.x, np.ones(len(self.x))]
+        gram = np.einsum("pmia,pmib->pab", A, A)
+        cross = self.y.reshape(len(x1), -1) @ A.transpose(1, 2, 0, 3).reshape(3 * M, 4 * P)
+        cost = self._yy[:, None] - 2 * np.einsum("npa,na->np", cross.reshape(-1, P, 4), x1)
+        for p in range(P):
+            cost[:, p] += np.einsum("na,na->n", x1 @ gram[p], x1)
+        corners = np.maximum(cost, 0)[self.mesh.faces].mean(axis=1)
+        return corners * (self.face_weights / M)[:, None]

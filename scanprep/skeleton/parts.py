@@ -1,0 +1,276 @@
+"""Rigid parts of a surface, found from its poses without being told how many there are."""
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.sparse import coo_array, csr_array
+from scipy.sparse.csgraph import dijkstra
+
+from .labels import keep_connected, relabel
+from .motions import Moments, Motions, PosedSurface, fit_motions, union_costs
+
+BORDER_WIDTH = 0.01              # of the body's size: how much surface at mean cost a border is worth
+STEADY = 5e-4                    # of the surface: fewer changes of label count as none
+
+
+@dataclass(frozen=True)
+class SkeletonConfig:
+    """Settings of `find_skeleton`.
+
+    Attributes
+    ----------
+    parts : int, optional
+        Exact number of parts; without it the data decide.
+    separation : float
+        Two neighbours stay two parts when one motion for both leaves at least this many times the squared
+        residual that two motions leave.
+    tolerance : float
+        Residual, as a fraction of the square root of the surface area, that counts as rigid.
+    smallest : float
+        Smallest part, as a fraction of the surface area.
+    smoothness : float
+        Price of the borders between parts.
+    patches : int
+        Number of patches of the first cover.
+    start : int
+        Number of parts after the patches were joined and before labels and motions alternate.
+    """
+
+    parts: int | None = None
+    separation: float = 2.3
+    tolerance: float = 0.001
+    smallest: float = 0.005
+    smoothness: float = 1.0
+    patches: int = 300
+    start: int = 30
+
+    def __post_init__(self) -> None:
+        if self.parts is not None and self.parts < 1:
+            raise ValueError(f"parts: expected at least 1, got {self.parts}")
+        if not self.separation > 1:
+            raise ValueError(f"separation: expected more than 1, got {self.separation}")
+        for name in ("tolerance", "smallest", "smoothness"):
+            if not getattr(self, name) > 0:
+                raise ValueError(f"{name}: expected more than 0, got {getattr(self, name)}")
+
+
+class PartSearch:
+    """The moves of the search: alternate, join, split.
+
+    Parameters
+    ----------
+    surface : PosedSurface
+    config : SkeletonConfig
+    """
+
+    def __init__(self, surface: PosedSurface, config: SkeletonConfig) -> None:
+        self.surface, self.config = surface, config
+        self.floor = config.tolerance**2 * surface.area
+        self.width = config.smoothness * BORDER_WIDTH / np.sqrt(surface.area)
+
+    def motions(self, label: np.ndarray) -> Motions:
+        """Rigid motions of the parts (the M-step)."""
+        return fit_motions(self.surface.moments(label))
+
+    def alternate(self, label: np.ndarray, rounds: int) -> np.ndarray:
+        """Alternate labels and motions until the labels (F,) stay.
+
+        [Articulated]
+        """
+        s = self.surface
+        for _ in range(rounds):
+            label = np.unique(label, return_inverse=True)[1]
+            motions = self.motions(label)
+            costs = s.face_costs(motions)
+            moved = relabel(costs, s.pairs, self.prices(motions, 1.0, s.pair_lengths), label, rounds=2)
+            moved = keep_connected(costs, s.pairs, s.face_weights, moved)
+            changed = s.face_weights[moved != label].sum()
+            label = moved
+            if changed < STEADY:
+                break
+        return np.unique(label, return_inverse=True)[1]
+
+    def prices(self, motions: Motions, share: float, lengths: np.ndarray) -> np.ndarray:
+        """Prices of borders of the given lengths where `share` of the surface follows the motions."""
+        return self.width * max(float(motions.cost.sum()) / share, self.floor) * lengths
+
+    def contacts(self, label: np.ndarray) -> np.ndarray:
+        """(n, 2) pairs of labels that touch, lower first."""
+        touching = np.sort(label[self.surface.pairs], axis=1)
+        return np.unique(touching[touching[:, 0] != touching[:, 1]], axis=0)
+
+    def separations(self, label: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """For all pairs of labels that touch (n, 2), the residual of one motion over that of two (n,)."""
+        moments = self.surface.moments(label)
+        pairs = self.contacts(label)
+        if not len(pairs):
+            return pairs, np.zeros(0)
+        return pairs, self._apart(moments, pairs)
+
+    def join_down(self, label: np.ndarray, count: int | None) -> np.ndarray:
+        """Join the pair that is least apart, alternate, and so on.
+
+        Stops at `count` parts, or where it is None when all pairs are apart and no part is too small.
+        """
+        while True:
+            label = self.alternate(label, rounds=2)
+            pairs, separation = self.separations(label)
+            if not len(pairs) or len(np.unique(label)) <= (count or 1):
+                return label
+            share = np.bincount(label, self.surface.face_weights)
+            score = np.where((share[pairs] < self.config.smallest).any(axis=1), separation - 1e9, separation)
+            least = int(score.argmin())
+            if count is None and score[least] >= self.config.separation:
+                return label
+            label = np.where(label == pairs[least, 1], pairs[least, 0], label)
+
+    def split(self, label: np.ndarray, part: int, patch: np.ndarray) -> tuple[np.ndarray, float]:
+        """Cut one part in two where it bends most.
+
+        Returns
+        -------
+        (F,) int
+            Labels, one more than before; unchanged if no acceptable cut was found.
+        float
+            How far apart the halves are, 0 where there is no cut.
+        """
+        s = self.surface
+        inside = np.flatnonzero(label == part)
+        number = np.unique(patch[inside], return_inverse=True)[1]
+        local = np.zeros(len(label), dtype=np.int64)             # 0 outside, halves 1 and 2
+        local[inside] = number + 1
+        among = self.contacts(local)
+        among = among[among[:, 0] > 0] - 1
+        half = agglomerate(s.moments(local)[1:], among, 2)[number]
+        within = (label[s.pairs] == part).all(axis=1)
+        pairs, lengths = np.searchsorted(inside, s.pairs[within]), s.pair_lengths[within]
+        weights = s.face_weights[inside]
+        for _ in range(4):
+            if np.bincount(half, weights, 2).min() < self.config.smallest:
+                return label, 0.0
+            local[inside] = half + 1
+            moments = s.moments(local)[1:]
+            motions = fit_motions(moments)
+            costs = s.face_costs(motions)[inside]
+            half = relabel(costs, pairs, self.prices(motions, weights.sum(), lengths), half, rounds=2)
+            half = keep_connected(costs, pairs, weights, half)
+        cut = label.copy()
+        cut[inside[half == 1]] = label.max() + 1
+        return cut, float(self._apart(moments, np.array([[0, 1]]))[0])
+
+    def _apart(self, moments: Moments, pairs: np.ndarray) -> np.ndarray:
+        floor = self.floor * moments.w[pairs].sum(axis=1)
+        two = fit_motions(moments).cost[pairs].sum(axis=1)
+        return (union_costs(moments, pairs) + floor) / (two + floor)
+
+
+def find_parts(surface: PosedSurface, config: SkeletonConfig,
+               progress: Callable[[int, int], None] | None = None) -> np.ndarray:
+    """Labels of triangles such that every label moves rigidly through the poses, as nearly as can be.
+
+    Many patches are joined greedily, labels and motions alternate while the least separate parts go on
+    being joined; then parts are cut where that shows a motion that was missed.
+
+    Parameters
+    ----------
+    surface : PosedSurface
+    config : SkeletonConfig
+    progress : callable(done, total), optional
+
+    Returns
+    -------
+    (F,) int, 0..P-1, every label connected
+
+    [Articulated]
+    """
+    tell = progress or (lambda done, total: None)
+    search = PartSearch(surface, config)
+    patch = cover(surface, min(config.patches, len(surface.face_weights)))
+    tell(1, 4)
+    start = max(config.start, 2 * (config.parts or 0))
+    label = agglomerate(surface.moments(patch), search.contacts(patch), start)[patch]
+    label = search.join_down(label, config.parts)
+    tell(2, 4)
+    label = _split_and_join(search, label, patch)
+    tell(3, 4)
+    label = search.alternate(label, rounds=10)
+    tell(4, 4)
+    return label
+
+
+def _split_and_join(search: PartSearch, label: np.ndarray, patch: np.ndarray) -> np.ndarray:
+    """Cut parts and join again, as long as that gives more parts, or as many that fit better."""
+    wanted = search.config.parts
+    limit = search.config.separation
+    tried: set[bytes] = set()
+    for _ in range(2 * search.config.start):
+        found = label.max() + 1
+        cuts = [search.split(label, part, patch) for part in range(found)]
+        worth = [c for c in cuts if c[1] > 0 and c[0].tobytes() not in tried
+                 and (c[1] >= limit or (wanted is not None and found < wanted))]
+        if not worth:
+            break
+        cut = max(worth, key=lambda c: c[1])[0]
+        tried.add(cut.tobytes())
+        again = search.join_down(cut, wanted)
+        more = again.max() + 1 - found
+        if more > 0 or (more == 0 and search.motions(again).cost.sum() < 0.995 * search.motions(label).cost.sum()):
+            label = again
+    return label
+
+
+def cover(surface: PosedSurface, count: int) -> np.ndarray:
+    """(F,) patch of every triangle: `count` seeds, each the farthest from those before, along the surface."""
+    centre = surface.x[surface.mesh.faces].mean(axis=1)
+    a, b = surface.pairs.T
+    step = np.linalg.norm(centre[a] - centre[b], axis=1)
+    n = len(centre)
+    graph = csr_array(coo_array((np.r_[step, step], (np.r_[a, b], np.r_[b, a])), shape=(n, n)))
+    distance, patch = np.full(n, np.inf), np.zeros(n, dtype=np.int64)
+    seed = int(np.linalg.norm(centre, axis=1).argmax())
+    for k in range(count):
+        ahead = dijkstra(graph, indices=seed, limit=distance.max())
+        nearer = ahead < distance
+        patch[nearer], distance[nearer] = k, ahead[nearer]
+        seed = int(distance.argmax())
+    return np.unique(patch, return_inverse=True)[1]
+
+
+def agglomerate(moments: Moments, contacts: np.ndarray, count: int) -> np.ndarray:
+    """Join sets that touch, each time the pair whose union costs least more, until `count` are left.
+
+    Parameters
+    ----------
+    moments : Moments of P sets
+    contacts : (n, 2) int
+    count : int
+
+    Returns
+    -------
+    (P,) int, the new number of every set, 0..count-1
+    """
+    moments = moments[np.arange(len(moments.w))]
+    cost = fit_motions(moments).cost
+    owner = np.arange(len(cost))
+    union: dict[tuple[int, int], float] = {}
+
+    def measure(pairs: list[tuple[int, int]]) -> None:
+        if pairs:
+            union.update(zip(pairs, union_costs(moments, np.array(pairs)), strict=True))
+
+    measure([(int(a), int(b)) for a, b in contacts])
+    left = len(cost)
+    while left > count and union:
+        a, b = min(union, key=lambda pair: union[pair] - cost[pair[0]] - cost[pair[1]])
+        cost[a] = union[a, b]
+        moments.absorb(a, b)
+        owner[owner == b] = a
+        left -= 1
+        touched = [pair for pair in union if a in pair or b in pair]
+        others = {c for pair in touched for c in pair} - {a, b}
+        for pair in touched:
+            del union[pair]
+        measure([(min(a, c), max(a, c)) for c in sorted(others)])
+    return np.unique(owner, return_inverse=True)[1]
