@@ -1,0 +1,267 @@
+"""The registered set: a folder of meshes in one topology, handed over from `scanprep` to `model`."""
+from __future__ import annotations
+
+import csv
+import io
+import json
+import re
+from collections.abc import Sequence
+from dataclasses import astuple, dataclass, field, fields
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from .geometry import storage
+from .geometry.files import MeshFileError, check_same_topology, read_mesh, write_mesh
+from .geometry.mesh import Mesh
+from .skeleton.tree import Skeleton
+
+VERSION = 1
+KIND = "registered set"
+
+
+@dataclass(frozen=True)
+class SetEntry:
+    """One registered mesh: a row of `set.csv`.
+
+    Attributes
+    ----------
+    name : str
+        Its own in the set, and the name of its file.
+    subject, pose, sex : str
+        Whose body, in which pose; empty where not known.
+    file : str
+        Path inside the folder.
+    """
+
+    name: str
+    subject: str = ""
+    pose: str = ""
+    sex: str = ""
+    file: str = ""
+
+
+_COLUMNS = [f.name for f in fields(SetEntry)]
+
+
+@dataclass(frozen=True, eq=False)
+class RegisteredSet:
+    """A folder of registered meshes: `template.ply`, `meshes/*.ply`, `set.csv`, `skeleton.json`, `set.json`.
+
+    Every change is on disk when the method returns, whole or not at all, so that work that was interrupted
+    can go on; the set at hand is never changed, the new one is returned.
+
+    Attributes
+    ----------
+    folder : Path
+    template : Mesh
+    entries : tuple of SetEntry
+        In the order in which they were added.
+    skeleton : Skeleton or None
+    info : dict
+        What else `set.json` says.
+    """
+
+    folder: Path
+    template: Mesh
+    entries: tuple[SetEntry, ...] = ()
+    skeleton: Skeleton | None = None
+    info: dict[str, Any] = field(default_factory=dict)
+
+    def __repr__(self) -> str:
+        return f"RegisteredSet({self.folder}, {len(self.entries)} meshes of {len(self.subjects)} subjects)"
+
+    @staticmethod
+    def create(folder: str | Path, template: Mesh, info: dict[str, Any] | None = None) -> RegisteredSet:
+        """Begin a set, or go on with the one in the folder.
+
+        Parameters
+        ----------
+        info : dict of JSON values, optional
+            Kept in `set.json`.
+
+        Raises
+        ------
+        ValueError
+            The folder holds a set of another template.
+        """
+        folder = Path(folder)
+        if (folder / "set.json").exists():
+            old = RegisteredSet.load(folder)
+            if not (np.array_equal(old.template.faces, template.faces)
+                    and np.allclose(old.template.vertices, template.vertices, rtol=0, atol=1e-6)):
+                raise ValueError(f"folder: {folder} holds a set of another template, {old.template}; "
+                                 f"expected {template}")
+            return old
+        write_mesh(folder / "template.ply", template)
+        _write_rows(folder, ())
+        header = {"kind": KIND, "version": VERSION, "vertices": len(template.vertices),
+                  "faces": len(template.faces), **(info or {})}
+        storage.write_json(folder / "set.json", header)          # last: with it the set exists
+        return RegisteredSet.load(folder)
+
+    @staticmethod
+    def load(folder: str | Path) -> RegisteredSet:
+        """Read a set; its meshes stay on disk until they are asked for.
+
+        Raises
+        ------
+        MeshFileError, StorageError
+            No such set, or one that is damaged or of an unknown version: which file, and what is wrong.
+        """
+        folder = Path(folder)
+        info = _read_header(folder)
+        template = read_mesh(folder / "template.ply", unit="m")
+        if [len(template.vertices), len(template.faces)] != [info.pop("vertices"), info.pop("faces")]:
+            raise MeshFileError(f"{folder / 'template.ply'}: found {template}, set.json says otherwise")
+        path = folder / "skeleton.json"
+        skeleton = Skeleton.load(path) if path.exists() else None
+        if skeleton is not None and len(skeleton.part_of_face) != len(template.faces):
+            raise storage.StorageError(f"{path}: expected {len(template.faces)} faces as template.ply has, "
+                                       f"found {len(skeleton.part_of_face)}")
+        return RegisteredSet(folder, template, _read_rows(folder), skeleton, info)
+
+    def add(self, name: str, mesh: Mesh | np.ndarray, subject: str = "", pose: str = "", sex: str = ""
+            ) -> RegisteredSet:
+        """Write a mesh into the set; one of the same name is replaced.
+
+        Parameters
+        ----------
+        name : str
+            Letters, digits, blanks and `._-`.
+        mesh : Mesh or (N, 3) float, metres
+            In the topology of the template.
+
+        Raises
+        ------
+        ValueError
+            A name that cannot be a file, or a mesh of another topology.
+        """
+        if not re.fullmatch(r"\w[\w. -]*", name):
+            raise ValueError(f"name: expected letters, digits, blanks and '._-', got {name!r}")
+        if not isinstance(mesh, Mesh):
+            if np.shape(mesh) != self.template.vertices.shape:
+                raise ValueError(f"mesh: expected vertices {self.template.vertices.shape}, got {np.shape(mesh)}")
+            mesh = self.template.with_vertices(mesh)
+        check_same_topology(Path(name), mesh, self.folder / "template.ply", self.template)
+        entry = SetEntry(name, subject, pose, sex, f"meshes/{name}.ply")
+        write_mesh(self.folder / entry.file, mesh)
+        rows = list(_read_rows(self.folder))
+        places = [i for i, row in enumerate(rows) if row.name == name]
+        place = places[0] if places else len(rows)
+        rows[place:place + 1] = [entry]
+        _write_rows(self.folder, rows)
+        return RegisteredSet(self.folder, self.template, tuple(rows), self.skeleton, self.info)
+
+    def with_skeleton(self, skeleton: Skeleton) -> RegisteredSet:
+        """Write a skeleton into the set.
+
+        Raises
+        ------
+        ValueError
+            A skeleton of another triangulation.
+        """
+        if len(skeleton.part_of_face) != len(self.template.faces):
+            raise ValueError(f"skeleton: expected {len(self.template.faces)} faces as the template has, "
+                             f"got {len(skeleton.part_of_face)}")
+        skeleton.save(self.folder / "skeleton.json")
+        return RegisteredSet(self.folder, self.template, self.entries, skeleton, self.info)
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """The names of all meshes."""
+        return tuple(entry.name for entry in self.entries)
+
+    @property
+    def subjects(self) -> tuple[str, ...]:
+        """Every subject once, in order of appearance."""
+        return tuple(dict.fromkeys(entry.subject for entry in self.entries))
+
+    def vertices(self, names: Sequence[str] | None = None) -> np.ndarray:
+        """Vertices (M, N, 3), metres, of the meshes of these names, or of all.
+
+        Raises
+        ------
+        MeshFileError
+            A mesh that is missing, damaged or of another topology.
+        ValueError
+            A name that is not in the set.
+        """
+        by_name = {entry.name: entry for entry in self.entries}
+        unknown = [name for name in names or () if name not in by_name]
+        if unknown:
+            raise ValueError(f"names: {', '.join(unknown)} not in {self.folder}, which has {', '.join(by_name)}")
+        wanted = self.entries if names is None else [by_name[name] for name in names]
+        out = np.empty((len(wanted), *self.template.vertices.shape))
+        for place, entry in zip(out, wanted, strict=True):
+            mesh = read_mesh(self.folder / entry.file, unit="m")
+            check_same_topology(self.folder / entry.file, mesh, self.folder / "template.ply", self.template)
+            place[:] = mesh.vertices
+        return out
+
+    def poses(self, subject: str | None = None) -> np.ndarray:
+        """Vertices (M, N, 3), metres, of all meshes of a subject, by default of the one with the most."""
+        if not self.entries:
+            raise ValueError(f"{self.folder}: the set holds no meshes")
+        count = [entry.subject for entry in self.entries].count
+        wanted = max(self.subjects, key=count) if subject is None else subject
+        if wanted not in self.subjects:
+            raise ValueError(f"subject: expected one of {', '.join(self.subjects)}, got {wanted!r}")
+        return self.vertices([entry.name for entry in self.entries if entry.subject == wanted])
+
+    def shapes(self) -> np.ndarray:
+        """Vertices (S, N, 3), metres, of one mesh of every subject: the one that was added first."""
+        first = {entry.subject: entry.name for entry in reversed(self.entries)}
+        return self.vertices([first[subject] for subject in self.subjects])
+
+
+def _read_header(folder: Path) -> dict[str, Any]:
+    path = folder / "set.json"
+    try:
+        info = json.loads(path.read_text(encoding="utf-8"))
+    except (FileNotFoundError, NotADirectoryError):
+        raise storage.StorageError(f"{path}: no such file; expected the folder of a registered set") from None
+    except ValueError as error:
+        raise storage.StorageError(f"{path}: expected JSON, cannot read it ({error})") from None
+    if not isinstance(info, dict) or info.pop("kind", None) != KIND or not {"vertices", "faces"} <= set(info):
+        raise storage.StorageError(f"{path}: expected the header of a registered set, found something else")
+    version = info.pop("version", None)
+    if version != VERSION:
+        raise storage.StorageError(f"{path}: version {version} of registered sets is not known here "
+                                   f"(known: {VERSION})")
+    return info
+
+
+def _read_rows(folder: Path) -> tuple[SetEntry, ...]:
+    path = folder / "set.csv"
+    try:
+        rows = list(csv.reader(io.StringIO(path.read_text(encoding="utf-8-sig"))))
+    except FileNotFoundError:
+        raise storage.StorageError(f"{path}: no such file") from None
+    if not rows or not {"name", "file"} <= set(rows[0]):
+        raise storage.StorageError(f"{path}: line 1: expected the columns {','.join(_COLUMNS)}, "
+                                   f"found {','.join(rows[0]) if rows else 'an empty file'}")
+    entries: list[SetEntry] = []
+    for number, row in enumerate(rows[1:], 2):
+        if not row:
+            continue
+        if len(row) != len(rows[0]):
+            raise storage.StorageError(f"{path}: line {number}: expected {len(rows[0])} values, found {len(row)}")
+        value = dict(zip(rows[0], row, strict=True))
+        entry = SetEntry(**{column: value.get(column, "") for column in _COLUMNS})
+        if not (folder / entry.file).is_file():
+            raise storage.StorageError(f"{path}: line {number}: there is no file {entry.file}")
+        if any(entry.name == other.name for other in entries):
+            raise storage.StorageError(f"{path}: line {number}: the name {entry.name} comes twice")
+        entries.append(entry)
+    return tuple(entries)
+
+
+def _write_rows(folder: Path, rows: Sequence[SetEntry]) -> None:
+    text = io.StringIO()
+    table = csv.writer(text, lineterminator="\n")
+    table.writerow(_COLUMNS)
+    table.writerows(astuple(row) for row in rows)
+    with storage.writing(folder / "set.csv") as beside:
+        beside.write_text(text.getvalue(), encoding="utf-8")

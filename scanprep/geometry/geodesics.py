@@ -1,0 +1,170 @@
+"""Distances along the surface."""
+from __future__ import annotations
+
+import numpy as np
+from scipy.sparse import coo_array, csr_array
+from scipy.sparse.csgraph import dijkstra
+
+from .mesh import Mesh
+
+
+class SurfaceGraph:
+    """Shortest paths over edges and across pairs of triangles: for any mesh, with holes or in pieces.
+
+    A path runs along the edges and straight across two neighbouring triangles, unfolded into a plane. It
+    is never shorter than the true one, on even triangles at most 4 percent longer (along edges alone 15).
+
+    Parameters
+    ----------
+    mesh : Mesh
+    """
+
+    def __init__(self, mesh: Mesh) -> None:
+        self.mesh = mesh
+        self._graph = _with_diagonals(mesh)
+
+    def distances(self, sources: np.ndarray | int, limit: float = np.inf) -> np.ndarray:
+        """Distances from each source to every vertex.
+
+        Parameters
+        ----------
+        sources : (S,) int, or one int
+            Vertices.
+        limit : float, metres
+            Beyond it a distance is infinite; a small limit saves time.
+
+        Returns
+        -------
+        (S, N) float, or (N,) for one source, metres
+            Infinite where no path leads.
+        """
+        return dijkstra(self._graph, directed=False, indices=_checked(self.mesh, sources), limit=limit)
+
+    def nearest(self, sources: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """The source nearest to each vertex along the surface.
+
+        Returns
+        -------
+        (N,) float, metres
+            Distance, infinite where no path leads.
+        (N,) int
+            Place in `sources`, -1 where no path leads.
+        """
+        sources = np.atleast_1d(_checked(self.mesh, sources))
+        distance, _, origin = dijkstra(self._graph, directed=False, indices=sources, min_only=True,
+                                       return_predecessors=True)
+        place = np.full(len(self.mesh.vertices), -1)
+        place[sources] = np.arange(len(sources))
+        return distance, np.where(np.isfinite(distance), place[origin], -1)
+
+    def farthest_points(self, count: int, first: int = 0) -> np.ndarray:
+        """Vertices spread over the surface: each the one farthest from those before it.
+
+        Parameters
+        ----------
+        count : int
+            At most the number of vertices.
+        first : int
+            The vertex to begin with.
+
+        Returns
+        -------
+        (count,) int
+            A piece of the surface that no path reaches yet is served first.
+        """
+        if not 1 <= count <= len(self.mesh.vertices):
+            raise ValueError(f"count: expected 1..{len(self.mesh.vertices)}, got {count}")
+        chosen = [int(_checked(self.mesh, first))]
+        nearest = self.distances(chosen[0])
+        while len(chosen) < count:
+            nearest[chosen] = -1.0                       # never twice, even where all are at distance zero
+            chosen.append(int(nearest.argmax()))
+            reach = nearest[chosen[-1]]
+            nearest = np.minimum(nearest, self.distances(chosen[-1], limit=reach if reach > 0 else np.inf))
+        return np.array(chosen)
+
+
+class HeatGeodesics:
+    """Smooth distances by the heat method, factored once: fast for many sources on one mesh.
+
+    More even than shortest paths over edges and without their preferred directions, but only approximate;
+    made for meshes whose triangles are not too thin.
+
+    Parameters
+    ----------
+    mesh : Mesh
+        Every vertex belongs to a triangle.
+    """
+
+    def __init__(self, mesh: Mesh) -> None:
+        import igl
+
+        unused = len(mesh.vertices) - len(np.unique(mesh.faces))
+        if unused:
+            raise ValueError(f"mesh: expected every vertex to belong to a triangle, {unused} do not")
+        self.mesh = mesh
+        self._solve = igl.heat_geodesics_solve
+        self._data = igl.HeatGeodesicsData()
+        igl.heat_geodesics_precompute(np.ascontiguousarray(mesh.vertices), np.ascontiguousarray(mesh.faces),
+                                      self._data)
+
+    def distances(self, sources: np.ndarray | int) -> np.ndarray:
+        """Distance (N,), metres, of every vertex to the nearest of the sources (S,).
+
+        Infinite in pieces of the surface that hold no source.
+        """
+        sources = np.atleast_1d(_checked(self.mesh, sources))
+        piece = self.mesh.vertex_component
+        out = np.full(len(piece), np.inf)
+        found = np.asarray(self._solve(self._data, sources)).reshape(-1)
+        for p in np.unique(piece[sources]):
+            inside = piece == p
+            mine = sources[piece[sources] == p]
+            out[inside] = np.maximum(found[inside] - found[mine].min(), 0)
+        out[sources] = 0.0
+        return out
+
+
+def _checked(mesh: Mesh, sources: np.ndarray | int) -> np.ndarray:
+    vertices = np.asarray(sources, dtype=np.int64)
+    if not vertices.size or vertices.min() < 0 or vertices.max() >= len(mesh.vertices):
+        raise ValueError(f"sources: expected vertices of 0..{len(mesh.vertices) - 1}, got {sources}")
+    return vertices
+
+
+def _with_diagonals(mesh: Mesh) -> csr_array:
+    """The graph of edges, and of straight lines between the two corners that face an inner edge."""
+    a, b = mesh.edges.T
+    c, d, across = _diagonals(mesh)
+    n = len(mesh.vertices)
+    rows, columns = np.r_[a, c], np.r_[b, d]
+    lengths = np.maximum(np.r_[mesh.edge_lengths, across], 1e-15)   # a stored zero would mean no edge
+    keys = np.minimum(rows, columns) * n + np.maximum(rows, columns)
+    order = np.lexsort((lengths, keys))                   # of two ways between the same vertices the shorter
+    first = order[np.r_[True, keys[order][1:] != keys[order][:-1]]]
+    return csr_array(coo_array((lengths[first], (rows[first], columns[first])), shape=(n, n)))
+
+
+def _diagonals(mesh: Mesh) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Corners (D,), (D,) that face the same inner edge, and the straight line (D,) between them when unfolded.
+
+    Only where that line crosses the edge, so that it runs inside the two triangles.
+    """
+    order = np.argsort(mesh.face_edges.ravel(), kind="stable")
+    start = np.concatenate([[0], np.cumsum(mesh.edge_use)[:-1]])
+    inner = np.flatnonzero(mesh.edge_use == 2)
+    sides = np.stack([order[start[inner]], order[start[inner] + 1]])
+    c, d = mesh.faces[sides // 3, (sides % 3 + 2) % 3]    # the corner that faces side 01, 12 or 20
+    x = mesh.vertices
+    a, b = mesh.edges[inner].T
+    length = np.maximum(mesh.edge_lengths[inner], 1e-15)
+    along = (x[b] - x[a]) / length[:, None]
+    place, height = [], []                                # coordinates in the unfolded plane, the edge as axis
+    for corner in (c, d):
+        arm = x[corner] - x[a]
+        place.append(np.einsum("nd,nd->n", arm, along))
+        height.append(np.linalg.norm(arm - place[-1][:, None] * along, axis=1))
+    total = np.maximum(height[0] + height[1], 1e-15)
+    crossing = (place[0] * height[1] + place[1] * height[0]) / total
+    good = (crossing > 0) & (crossing < length) & (c != d)
+    return c[good], d[good], np.hypot(place[0] - place[1], total)[good]
