@@ -142,7 +142,8 @@ def border_distance(mesh: Mesh, limit: float) -> np.ndarray:
     if not len(border):
         return np.full(len(mesh.vertices), limit)
     lengths = mesh.vertex_adjacency.copy().tocoo()
-    lengths.data = np.maximum(np.linalg.norm(mesh.vertices[lengths.row] - mesh.vertices[lengths.col], axis=1), 1e-12)
+    apart = mesh.vertices[lengths.row] - mesh.vertices[lengths.col]
+    lengths.data = np.maximum(np.linalg.norm(apart, axis=1), 1e-12)
     return np.minimum(dijkstra(lengths.tocsr(), indices=border, min_only=True, limit=limit), limit)
 
 

@@ -1,4 +1,4 @@
-"""Meshes made manifold: duplicates, triangles without area, edges and vertices where sheets touch, loose pieces."""
+"""Meshes made manifold: no double or flat triangles, no sheets that touch, no loose pieces."""
 from __future__ import annotations
 
 from dataclasses import dataclass
@@ -94,7 +94,7 @@ def drop_flat(mesh: Mesh, min_area: float = 1e-12) -> Mesh:
 
 
 def _drop_at_bad_edges(mesh: Mesh) -> Mesh:
-    """Without the triangles that make an edge non-manifold: of more than two the smallest, of twisted pairs both."""
+    """Without the triangles that make an edge non-manifold; of two that use it in one direction the smaller."""
     half = mesh.faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
     edge = mesh.face_edges.ravel()
     forward = half[:, 0] < half[:, 1]
@@ -145,7 +145,7 @@ def _fans(mesh: Mesh) -> np.ndarray:
 
 
 def drop_small_components(mesh: Mesh, share: float) -> Mesh:
-    """Without the pieces that have less than `share` of the vertices of the largest, and without unused vertices."""
+    """Without the pieces that have less than `share` of the vertices of the largest, and unused vertices."""
     if not len(mesh.faces):
         return mesh
     a, b = mesh.faces[:, [0, 1]].T, mesh.faces[:, [1, 2]].T       # not mesh.edges: sorting them takes longer

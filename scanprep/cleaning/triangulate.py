@@ -1,0 +1,118 @@
+"""Triangles across one closed loop of points [Liepa]."""
+from __future__ import annotations
+
+import heapq
+
+import numpy as np
+
+ANGLE_STEP = 0.05        # differences of 1 - cos below this count as none, and area decides
+
+
+def triangulate_loop(points: np.ndarray, rim_normals: np.ndarray, forbidden: np.ndarray,
+                     largest: int = 300) -> np.ndarray | None:
+    """The triangles across a loop that bend least at their edges and, among those, have the smallest area.
+
+    Dynamic programming over all triangulations, O(n³); of longer loops, ears are cut off first.
+
+    Parameters
+    ----------
+    points : (n, 3) float, metres
+        In the direction in which the new triangles run along the loop.
+    rim_normals : (n, 3) float
+        Normal of the surface on the other side of each edge i, i + 1.
+    forbidden : (n, n) bool
+        Pairs that must not be joined because an edge joins them already.
+    largest : int
+        Longest loop that is solved as a whole.
+
+    Returns
+    -------
+    (n - 2, 3) int, or None when every triangulation needs a forbidden edge
+
+    [Liepa] hole triangulation
+    """
+    kept, ears = _cut_ears(points, rim_normals, forbidden, largest)
+    normals = _chord_normals(points, rim_normals, kept, ears) if ears else rim_normals
+    inner = _least_weight(points[kept], normals, forbidden[np.ix_(kept, kept)])
+    return None if inner is None else np.concatenate([np.asarray(ears, dtype=int).reshape(-1, 3), kept[inner]])
+
+
+def _least_weight(p: np.ndarray, rim: np.ndarray, forbidden: np.ndarray) -> np.ndarray | None:
+    n = len(p)
+    bend, area = np.full((n, n), np.inf), np.full((n, n), np.inf)
+    normal, choice = np.zeros((n, n, 3)), np.zeros((n, n), dtype=np.int64)
+    first = np.arange(n - 1)
+    bend[first, first + 1] = area[first, first + 1] = 0
+    normal[first, first + 1] = rim[:-1]
+    for span in range(2, n):
+        i = np.arange(n - span)[:, None]
+        k = i + span
+        m = i + np.arange(1, span)[None]
+        across = np.cross(p[m] - p[i], p[k] - p[i])
+        size = np.linalg.norm(across, axis=-1)
+        across /= np.maximum(size, 1e-30)[..., None]
+        worst = np.maximum(1 - np.einsum("...d,...d", across, normal[i, m]),
+                           1 - np.einsum("...d,...d", across, normal[m, k]))
+        if span == n - 1:
+            worst = np.maximum(worst, 1 - across @ rim[-1])
+        worst = np.maximum(worst, np.maximum(bend[i, m], bend[m, k]))
+        total = size / 2 + area[i, m] + area[m, k]
+        stepped = np.floor(worst / ANGLE_STEP)
+        tied = stepped <= stepped.min(axis=1, keepdims=True)
+        best = np.where(tied, total, np.inf).argmin(axis=1)
+        row = np.arange(n - span)
+        i, k = i[:, 0], k[:, 0]
+        closed = forbidden[i, k] & (span < n - 1)
+        bend[i, k] = np.where(closed, np.inf, worst[row, best])
+        area[i, k] = np.where(closed, np.inf, total[row, best])
+        normal[i, k], choice[i, k] = across[row, best], best + i + 1
+    if not np.isfinite(area[0, n - 1]):
+        return None
+    triangles, stack = [], [(0, n - 1)]
+    while stack:
+        i, k = stack.pop()
+        if k - i >= 2:
+            m = int(choice[i, k])
+            triangles.append((i, m, k))
+            stack += [(i, m), (m, k)]
+    return np.array(triangles)
+
+
+def _cut_ears(points: np.ndarray, rim: np.ndarray, forbidden: np.ndarray, largest: int
+              ) -> tuple[np.ndarray, list[tuple[int, int, int]]]:
+    """Cut corners that point away from the hole, shortest new edge first, until at most `largest` are left."""
+    n = len(points)
+    after, before = (np.arange(n) + 1) % n, np.arange(n) - 1
+    before[0] = n - 1
+    normal = rim + np.roll(rim, 1, axis=0)
+    alive, ears = np.ones(n, dtype=bool), []
+
+    def entry(i: int) -> tuple[float, int, int, int] | None:
+        a, b = int(before[i]), int(after[i])
+        across = np.cross(points[i] - points[a], points[b] - points[a])
+        if forbidden[a, b] or across @ normal[i] <= 0.2 * np.linalg.norm(across) * np.linalg.norm(normal[i]):
+            return None
+        return float(np.linalg.norm(points[a] - points[b])), i, a, b
+
+    heap = [e for e in map(entry, range(n)) if e] if n > largest else []
+    heapq.heapify(heap)
+    left = n
+    while heap and left > largest:
+        _, i, a, b = heapq.heappop(heap)
+        if not alive[i] or before[i] != a or after[i] != b:
+            continue
+        ears.append((a, i, b))
+        alive[i], after[a], before[b], left = False, b, a, left - 1
+        for fresh in filter(None, map(entry, (a, b))):
+            heapq.heappush(heap, fresh)
+    return np.flatnonzero(alive), ears
+
+
+def _chord_normals(points: np.ndarray, rim: np.ndarray, kept: np.ndarray, ears: list[tuple[int, int, int]]
+                   ) -> np.ndarray:
+    """Normals beyond the edges of the loop that is left after cutting ears."""
+    of_edge = {(i, (i + 1) % len(points)): rim[i] for i in range(len(points))}
+    for a, i, b in ears:
+        across = np.cross(points[i] - points[a], points[b] - points[a])
+        of_edge[a, b] = across / max(np.linalg.norm(across), 1e-30)
+    return np.array([of_edge[int(a), int(b)] for a, b in zip(kept, np.roll(kept, -1), strict=True)])
