@@ -1,0 +1,216 @@
+"""Deformation gradients: the 3×3 matrices that carry the template's triangles into each instance."""
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from scipy.sparse import coo_array, csc_array
+
+from scanprep.geometry.mesh import Mesh
+from scanprep.geometry.sparse import Factored
+
+Linear = Callable[[np.ndarray], np.ndarray]
+
+SETTLE = 1e-4                        # pull towards I, as a share of w_s: decides what nothing else decides
+
+
+def edges(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """The two edges of every triangle from its first vertex.
+
+    Parameters
+    ----------
+    vertices : (..., N, 3) float, metres
+    faces : (F, 3) int
+
+    Returns
+    -------
+    (..., F, 2, 3) float, metres
+
+    [SCAPE] Eq. 1
+    """
+    first = vertices[..., faces[:, 0], :]
+    return np.stack([vertices[..., faces[:, 1], :] - first, vertices[..., faces[:, 2], :] - first], axis=-2)
+
+
+def local_edges(vertices: np.ndarray, faces: np.ndarray, R: np.ndarray) -> np.ndarray:
+    """The edges of an instance seen from the frame of each triangle's part, `Rᵀ v`.
+
+    Parameters
+    ----------
+    vertices : (..., N, 3) float, metres
+    faces : (F, 3) int
+    R : (..., F, 3, 3) float
+        Rotation of the part of every triangle.
+
+    Returns
+    -------
+    (..., F, 2, 3) float, metres
+
+    [SCAPE] Eq. 1
+    """
+    return edges(vertices, faces) @ R
+
+
+@dataclass(frozen=True, eq=False)
+class GradientSystem:
+    """The least-squares systems of Eq. 5 and Eq. 8 over the triangles of one template.
+
+    One row of a gradient is three unknowns a triangle; the three rows share the matrix.
+
+    Parameters
+    ----------
+    template : Mesh
+    smoothness : float
+        The paper's 0.001; times the mean edge length in metres it is w_s.
+    parts : (F,) int, optional
+        When given, neighbours in different parts are not smoothed over.
+
+    [SCAPE] Eq. 5
+    """
+
+    template: Mesh
+    smoothness: float = 0.001
+    parts: np.ndarray | None = None
+
+    @property
+    def w_s(self) -> float:
+        """The weight of the smoothness, in square metres as the data term counts it."""
+        return self.smoothness * self.template.mean_edge
+
+    @cached_property
+    def laplacian(self) -> csc_array:
+        """(F, F) graph Laplacian of the smoothed pairs, times w_s, with the pull towards I on its diagonal."""
+        pairs = self.template.face_pairs
+        if self.parts is not None:
+            pairs = pairs[self.parts[pairs[:, 0]] == self.parts[pairs[:, 1]]]
+        F = len(self.template.faces)
+        a, b = pairs.T
+        degree = np.bincount(pairs.ravel(), minlength=F) + SETTLE
+        off = coo_array((-np.ones(2 * len(a)), (np.r_[a, b], np.r_[b, a])), shape=(F, F))
+        diagonal = coo_array((degree, (np.arange(F), np.arange(F))), shape=(F, F))
+        return csc_array(off + diagonal) * self.w_s
+
+    def matrix(self, blocks: np.ndarray) -> csc_array:
+        """(3F, 3F) normal matrix for the data blocks `Σ_j e_j e_jᵀ` (F, 3, 3) of the edges acted upon."""
+        F = len(blocks)
+        k = np.arange(F)
+        row = (3 * k[:, None, None] + np.arange(3)[:, None]) + np.zeros((1, 1, 3), int)
+        column = (3 * k[:, None, None] + np.arange(3)[None, :]) + np.zeros((1, 3, 1), int)
+        smooth = coo_array(self.laplacian)
+        r = [row.ravel()] + [3 * smooth.row + c for c in range(3)]
+        s = [column.ravel()] + [3 * smooth.col + c for c in range(3)]
+        v = [blocks.ravel()] + [smooth.data] * 3
+        return csc_array(coo_array((np.concatenate(v), (np.concatenate(r), np.concatenate(s))),
+                                   shape=(3 * F, 3 * F)))
+
+    def right_side(self, before: np.ndarray, after: np.ndarray) -> np.ndarray:
+        """(..., F, 3, 3) of `Σ_j e_j v_jᵀ`, for edges (..., F, 2, 3) before and after, and the pull towards I."""
+        return np.swapaxes(before, -1, -2) @ after + SETTLE * self.w_s * np.eye(3)
+
+
+def pose_gradients(system: GradientSystem, local: np.ndarray) -> np.ndarray:
+    """Q of every triangle in every pose, all instances from one factorisation.
+
+    Parameters
+    ----------
+    system : GradientSystem
+        With the parts, so that only neighbours in one part are smoothed.
+    local : (M, F, 2, 3) float, metres
+        Edges of the instances in the frames of their parts.
+
+    Returns
+    -------
+    (M, F, 3, 3) float
+
+    [SCAPE] Eq. 5
+    """
+    v_hat = edges(system.template.vertices, system.template.faces)
+    M, F = local.shape[:2]
+    solver = Factored(system.matrix(np.swapaxes(v_hat, -1, -2) @ v_hat))
+    Q = np.empty((M, F, 3, 3))
+    step = Factored.LIMIT // 3
+    for start in range(0, M, step):
+        rhs = system.right_side(v_hat, local[start:start + step])        # (m, F, column, row)
+        x = solver.solve(rhs.transpose(1, 2, 0, 3).reshape(3 * F, -1))
+        Q[start:start + step] = x.reshape(F, 3, -1, 3).transpose(2, 0, 3, 1)
+    return Q
+
+
+class ShapeGradients:
+    """Solver of Eq. 8 for one person after the other.
+
+    The matrix holds the person's own `Q v̂`, so conjugate gradients run on it, preconditioned by the
+    factored matrix of the template's edges.
+
+    Parameters
+    ----------
+    system : GradientSystem
+        Without parts: all neighbours are smoothed.
+    tolerance : float
+        Relative residual at which to stop.
+    limit : int
+        Largest number of steps.
+
+    [SCAPE] Eq. 8
+    """
+
+    def __init__(self, system: GradientSystem, tolerance: float = 1e-6, limit: int = 200) -> None:
+        self.system, self.tolerance, self.limit = system, tolerance, limit
+        v_hat = edges(system.template.vertices, system.template.faces)
+        self._shared = Factored(system.matrix(np.swapaxes(v_hat, -1, -2) @ v_hat))
+
+    def solve(self, posed: np.ndarray, local: np.ndarray) -> tuple[np.ndarray, int]:
+        """S of every triangle of one person.
+
+        Parameters
+        ----------
+        posed : (F, 2, 3) float, metres
+            `Q v̂` at the person's pose.
+        local : (F, 2, 3) float, metres
+            Edges of the person's scan in the frames of the parts.
+
+        Returns
+        -------
+        (F, 3, 3) float
+        int
+            Steps taken; `limit` when it did not converge.
+        """
+        blocks = np.swapaxes(posed, -1, -2) @ posed
+        laplacian = self.system.laplacian
+        F = len(blocks)
+
+        def apply(x: np.ndarray) -> np.ndarray:
+            return blocks @ x + (laplacian @ x.reshape(F, 9)).reshape(F, 3, 3)
+
+        def precondition(x: np.ndarray) -> np.ndarray:
+            return self._shared.solve(x.reshape(3 * F, 3)).reshape(F, 3, 3)
+
+        rhs = self.system.right_side(posed, local)
+        x, steps = _conjugate_gradients(apply, precondition, rhs, np.broadcast_to(np.eye(3), rhs.shape).copy(),
+                                        self.tolerance, self.limit)
+        return np.swapaxes(x, -1, -2), steps
+
+
+def _conjugate_gradients(apply: Linear, precondition: Linear, rhs: np.ndarray, x: np.ndarray, tolerance: float,
+                         limit: int) -> tuple[np.ndarray, int]:
+    """Preconditioned conjugate gradients for several right-hand sides, in the last axis, at once."""
+    def dot(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+        return np.einsum("fcr,fcr->r", a, b)
+
+    residual = rhs - apply(x)
+    goal = tolerance * np.sqrt(dot(rhs, rhs))
+    z = precondition(residual)
+    direction, rz = z, dot(residual, z)
+    for step in range(limit):
+        if (np.sqrt(dot(residual, residual)) <= goal).all():
+            return x, step
+        image = apply(direction)
+        alpha = np.divide(rz, dot(direction, image), out=np.zeros_like(rz), where=rz > 0)
+        x = x + alpha * direction
+        residual = residual - alpha * image
+        z = precondition(residual)
+        previous, rz = rz, dot(residual, z)
+        direction = z + np.divide(rz, previous, out=np.zeros_like(rz), where=previous > 0) * direction
+    return x, limit

@@ -1,0 +1,193 @@
+"""Learning a SCAPE model from registered meshes."""
+from __future__ import annotations
+
+import hashlib
+from collections.abc import Callable
+from dataclasses import asdict, dataclass
+from typing import Any
+
+import numpy as np
+
+from scanprep.geometry.mesh import Mesh, check_template
+from scanprep.skeleton.tree import Skeleton
+
+from .fitting import FitConfig, fit_pose
+from .gradients import GradientSystem, ShapeGradients, edges, local_edges, pose_gradients
+from .linear import Subject, build_basis
+from .pose_space import PoseSpace, Regression, learn_pose_space, twists
+from .scape import ScapeModel
+from .shape_space import ShapeSpace, learn_shape_space
+from .stitching import StitchingSystem
+
+Progress = Callable[[int, int], None]
+
+
+@dataclass(frozen=True)
+class LearnConfig:
+    """Settings of `learn_scape`.
+
+    Parameters
+    ----------
+    smoothness : float
+        The paper's 0.001: times the mean edge length it is w_s of Eq. 5 and 8.
+    pruning : float, square radians
+        Twist directions of smaller variance are not regressed on.
+    ridges : floats, square radians
+        Strengths of the regression's penalty; the one that predicts left-out poses best is taken.
+    refinements : int
+        How often part rotations are fitted anew with the learned model and the model learned again.
+    components : int
+        Shape components to keep, fewer where there are fewer people.
+    """
+
+    smoothness: float = 0.001
+    pruning: float = 0.01
+    ridges: tuple[float, ...] = (1e-4, 1e-3, 3e-3, 0.01, 0.03, 0.1, 0.3)
+    refinements: int = 1
+    components: int = 40
+
+
+def learn_scape(template: Mesh, poses: np.ndarray, shapes: np.ndarray | None, skeleton: Skeleton,
+                config: LearnConfig | None = None, progress: Progress | None = None) -> ScapeModel:
+    """Learn a body model from one person in many poses and many people in about one pose.
+
+    Parameters
+    ----------
+    template : Mesh
+        One of the poses.
+    poses : (M, N, 3) float, metres
+        The template's person in M poses.
+    shapes : (S, N, 3) float, metres, or None
+        Other people; None for a model of the template's own body alone.
+    skeleton : Skeleton
+    config : LearnConfig, optional
+    progress : callable, optional
+        Called with the work done and the whole.
+
+    Raises
+    ------
+    ValueError
+        Fewer than two poses, vertices of another count or not finite, a skeleton of another template.
+
+    [SCAPE] Eq. 4, Eq. 5, Eq. 7, Eq. 8
+    """
+    config = config or LearnConfig()
+    check_template(template)
+    _check_skeleton(template, skeleton)
+    poses = _checked_bodies(template, poses, "poses")
+    shapes = None if shapes is None else _checked_bodies(template, shapes, "shapes")
+    tick = _Ticks(progress, (config.refinements + 1) * len(poses) + (0 if shapes is None else len(shapes)))
+
+    R = skeleton.fit_rotations(template, poses)
+    regression = _learn_pose(template, skeleton, poses, R, config)
+    tick(len(poses))
+    system = StitchingSystem(template, skeleton)
+    for _ in range(config.refinements):
+        R = _refit(template, skeleton, system, regression.space, poses, tick)
+        regression = _learn_pose(template, skeleton, poses, R, config)
+    space = regression.space
+
+    shape_space = ShapeSpace.empty(len(template.faces))
+    if shapes is not None:
+        S = _shape_deformations(template, space, shapes, config, tick)
+        shape_space = learn_shape_space(S, config.components)
+    mean, covariance = pose_prior(skeleton.pose_of(R))
+    info: dict[str, Any] = {
+        "settings": asdict(config), "poses": len(poses), "shapes": 0 if shapes is None else len(shapes),
+        "ridge": regression.ridge, "left_out_edge_error": regression.left_out_error,
+        "features": space.features.count, "digest": _digest(template, poses, shapes)}
+    return ScapeModel(template, skeleton, space, shape_space, mean, covariance, info)
+
+
+def pose_prior(poses: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Mean (J, 3) and covariance (3J, 3J) of poses (M, J, 3), radians, zero for the root."""
+    flat = twists(poses).reshape(len(poses), -1).copy()
+    flat[:, :3] = 0
+    return flat.mean(axis=0).reshape(-1, 3), np.cov(flat.T, ddof=1)
+
+
+def _learn_pose(template: Mesh, skeleton: Skeleton, poses: np.ndarray, R: np.ndarray, config: LearnConfig
+                ) -> Regression:
+    """Q of the training poses for given part rotations (M, J, 3, 3), regressed on the twists.
+
+    [SCAPE] Eq. 4, Eq. 5
+    """
+    parts = skeleton.part_of_face
+    system = GradientSystem(template, config.smoothness, parts)
+    Q = pose_gradients(system, np.stack([local_edges(y, template.faces, r[parts])
+                                         for y, r in zip(poses, R, strict=True)]))
+    return learn_pose_space(template, skeleton, skeleton.pose_of(R), Q, config.pruning, config.ridges)
+
+
+def _refit(template: Mesh, skeleton: Skeleton, system: StitchingSystem, space: PoseSpace, poses: np.ndarray,
+           tick: _Ticks) -> np.ndarray:
+    """Part rotations (M, J, 3, 3) with which the learned model comes nearest to the training poses."""
+    S = np.broadcast_to(np.eye(3), (len(template.faces), 3, 3))
+    subject = Subject(template, skeleton, None, space.features, build_basis(system, template, space, S),
+                      skeleton.joints[0])
+    R = np.empty((len(poses), len(skeleton.parents), 3, 3))
+    for i, y in enumerate(poses):
+        R[i] = skeleton.part_rotations(fit_pose(subject, y, FitConfig(polish=0)).pose)
+        tick(1)
+    return R
+
+
+def _shape_deformations(template: Mesh, space: PoseSpace, shapes: np.ndarray, config: LearnConfig,
+                        tick: _Ticks) -> np.ndarray:
+    """S (P, F, 3, 3) of every person, in float32 to halve the memory.
+
+    [SCAPE] Eq. 8
+    """
+    skeleton = space.skeleton
+    solver = ShapeGradients(GradientSystem(template, config.smoothness))
+    v_hat = edges(template.vertices, template.faces)
+    S = np.empty((len(shapes), len(template.faces), 3, 3), dtype=np.float32)
+    for i, y in enumerate(shapes):
+        R = skeleton.fit_rotations(template, y)
+        posed = v_hat @ np.swapaxes(space.gradients(skeleton.pose_of(R)), -1, -2)
+        S[i], _ = solver.solve(posed, local_edges(y, template.faces, R[skeleton.part_of_face]))
+        tick(1)
+    return S
+
+
+class _Ticks:
+    """Counts work for a progress callback."""
+
+    def __init__(self, progress: Progress | None, total: int) -> None:
+        self.progress, self.total, self.done = progress, total, 0
+
+    def __call__(self, more: int) -> None:
+        self.done += more
+        if self.progress:
+            self.progress(self.done, self.total)
+
+
+def _check_skeleton(template: Mesh, skeleton: Skeleton) -> None:
+    if len(skeleton.part_of_face) != len(template.faces):
+        raise ValueError(f"skeleton: it has {len(skeleton.part_of_face)} faces, "
+                         f"the template {len(template.faces)}")
+    root = template.vertices[skeleton.part_of_vertex(template) == 0].mean(axis=0)
+    if np.linalg.norm(root - skeleton.joints[0]) > 1e-6 * np.ptp(template.vertices, axis=0).max():
+        raise ValueError("skeleton: joints[0] is not the centroid of part 0, so it belongs to another template")
+
+
+def _checked_bodies(template: Mesh, bodies: np.ndarray, name: str) -> np.ndarray:
+    """At least two bodies (n, N, 3) in the template's topology, or ValueError."""
+    bodies, N = np.asarray(bodies, dtype=np.float64), len(template.vertices)
+    if bodies.ndim != 3 or bodies.shape[1:] != (N, 3):
+        raise ValueError(f"{name}: expected shape (n, {N}, 3) like the template, got {bodies.shape}")
+    bad = np.flatnonzero(~np.isfinite(bodies).all(axis=(1, 2)))
+    if len(bad):
+        raise ValueError(f"{name}: body {bad[0]} has vertices that are not finite")
+    if len(bodies) < 2:
+        raise ValueError(f"{name}: expected at least 2 bodies, got {len(bodies)}")
+    return bodies
+
+
+def _digest(template: Mesh, poses: np.ndarray, shapes: np.ndarray | None) -> str:
+    """SHA-256 of the training set."""
+    total = hashlib.sha256()
+    for array in (template.vertices, template.faces, poses, shapes):
+        if array is not None:
+            total.update(np.ascontiguousarray(array).tobytes())
+    return total.hexdigest()

@@ -1,0 +1,246 @@
+"""The fast path: a fixed body whose vertices are one matrix product away from its poses.
+
+Stitching is linear, so with Q linear in the features δ of the joints
+
+    Y = Σ_p Σ_a δ_{p,a} T_{p,a} R_pᵀ + joints[0] + trans
+
+where `T_{p,a}` is stitched once from the edges that feature a of part p contributes.
+"""
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
+import numpy as np
+
+from scanprep.geometry import rotations
+from scanprep.geometry.mesh import Mesh
+from scanprep.skeleton.tree import Skeleton
+
+from .gradients import edges
+from .pose_space import JointFeatures, PoseSpace
+from .stitching import StitchingSystem
+
+
+def build_basis(system: StitchingSystem, template: Mesh, pose_space: PoseSpace, S: np.ndarray) -> np.ndarray:
+    """T of every feature of every part for one body.
+
+    Parameters
+    ----------
+    S : (F, 3, 3) float
+        Shape deformation of every triangle.
+
+    Returns
+    -------
+    (A, N, 3) float, metres
+
+    [SCAPE] Eq. 9
+    """
+    v_hat = edges(template.vertices, template.faces)
+    features = pose_space.features
+    G = system.edge_operator
+    rhs = np.empty((system.n_vertices, features.count, 3))
+    for p, faces in enumerate(pose_space.faces_of_part):
+        a = pose_space.coefficients[p].astype(np.float64)
+        wanted = v_hat[faces] @ np.swapaxes(S[faces] @ a, -1, -2)             # (n, f, 2, 3)
+        rows = (2 * faces[:, None] + np.arange(2)).ravel()
+        columns = wanted.reshape(len(a), -1, 3).transpose(1, 0, 2).reshape(len(rows), -1)
+        rhs[:, features.of_part(p)] = (G[rows].T @ columns).reshape(system.n_vertices, len(a), 3)
+    return system.solve(rhs.reshape(system.n_vertices, -1)).reshape(rhs.shape).transpose(1, 0, 2)
+
+
+def _checked(skeleton: Skeleton, pose: Any, trans: Any) -> tuple[np.ndarray, np.ndarray]:
+    """Pose (..., J, 3) and trans (..., 3), finite and with the same leading shape."""
+    pose = np.asarray(pose, dtype=np.float64)
+    J = len(skeleton.parents)
+    if pose.ndim not in (2, 3) or pose.shape[-2:] != (J, 3):
+        raise ValueError(f"pose: expected shape ({J}, 3) or (B, {J}, 3), got {pose.shape}")
+    trans = np.zeros(3) if trans is None else np.asarray(trans, dtype=np.float64)
+    if trans.shape not in ((3,), (*pose.shape[:-2], 3)):
+        raise ValueError(f"trans: expected shape (3,) or {(*pose.shape[:-2], 3)}, got {trans.shape}")
+    if not (np.isfinite(pose).all() and np.isfinite(trans).all()):
+        raise ValueError("pose and trans: expected finite numbers")
+    return pose, np.broadcast_to(trans, (*pose.shape[:-2], 3))
+
+
+def _product(features: JointFeatures, flat: np.ndarray, pose: np.ndarray) -> np.ndarray:
+    """(..., 3, L) of Σ δ T Rᵀ for `flat` (3A, L) and poses (..., J, 3): one matrix product."""
+    R = features.skeleton.part_rotations(pose)[..., features.part, :, :]
+    W = np.moveaxis(features.evaluate(pose)[..., None, None] * R, -3, -2)     # (..., i, a, j)
+    W = W.reshape(-1, flat.shape[0]).astype(flat.dtype, copy=False)
+    return (W @ flat).reshape(*pose.shape[:-2], 3, -1)
+
+
+@dataclass(frozen=True, eq=False)
+class PointOperator:
+    """Some surface points of a fixed body as a function of pose and place, with derivatives.
+
+    Built by `Subject.points`; it never touches the mesh.
+
+    Parameters
+    ----------
+    features : JointFeatures
+    basis : (A, L, 3) float, metres
+    origin : (3,) float, metres
+        Where the root part's centroid stands when trans is zero.
+    """
+
+    features: JointFeatures
+    basis: np.ndarray
+    origin: np.ndarray
+
+    @property
+    def count(self) -> int:
+        """L, the number of points."""
+        return self.basis.shape[1]
+
+    @cached_property
+    def _flat(self) -> np.ndarray:
+        return np.ascontiguousarray(self.basis.transpose(0, 2, 1)).reshape(-1, self.count)
+
+    def evaluate(self, pose: np.ndarray, trans: np.ndarray | None = None) -> np.ndarray:
+        """Positions of the points.
+
+        Parameters
+        ----------
+        pose : (J, 3) or (B, J, 3) float, radians
+        trans : (3,) or (B, 3) float, metres
+
+        Returns
+        -------
+        (L, 3) or (B, L, 3) float, metres
+        """
+        pose, trans = _checked(self.features.skeleton, pose, trans)
+        return np.swapaxes(_product(self.features, self._flat, pose), -1, -2) + (self.origin + trans)[..., None, :]
+
+    def jacobian(self, pose: np.ndarray, trans: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
+        """Positions and their derivatives with respect to the pose parameters.
+
+        A pose parameter turns its part and all that hangs below it, and changes the features of its joint.
+        The derivative with respect to trans is the identity.
+
+        Parameters
+        ----------
+        pose : (J, 3) or (B, J, 3) float, radians
+        trans : (3,) or (B, 3) float, metres
+
+        Returns
+        -------
+        positions : (L, 3) or (B, L, 3) float, metres
+        d_pose : (L, 3, 3J) or (B, L, 3, 3J) float, metres per radian
+        """
+        pose, trans = _checked(self.features.skeleton, pose, trans)
+        if pose.ndim == 3:
+            each = [self.jacobian(p, t) for p, t in zip(pose, trans, strict=True)]
+            return np.stack([y for y, _ in each]), np.stack([d for _, d in each])
+        y, columns = self.columns(pose, trans)
+        return y, np.moveaxis(columns, 0, -1)
+
+    def columns(self, pose: np.ndarray, trans: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """As `jacobian` for one pose, with the derivatives as (3J, L, 3), contiguous for each parameter."""
+        features, skeleton = self.features, self.features.skeleton
+        J, A, L = len(skeleton.parents), features.count, self.count
+        R = skeleton.part_rotations(pose)
+        turned = self.basis @ np.swapaxes(R[features.part], -1, -2)          # (A, L, 3)
+        delta = features.evaluate(pose)
+        gather = np.zeros((J, A))                                            # C_p = Σ_a δ_a T_a R_pᵀ
+        gather[features.part, np.arange(A)] = delta
+        sway = np.zeros((J, 3, A))
+        moved = np.flatnonzero(features.joint >= 0)
+        sway[features.joint[moved], :, moved] = features.derivative(pose)[moved]
+        below = skeleton.descends.T.astype(float) @ gather                   # all that hangs below each joint
+        both = np.concatenate([below, sway.reshape(3 * J, A)]) @ turned.reshape(A, -1)
+        carried, columns = both[:J].reshape(J, L, 3), both[J:].reshape(J, 3, L, 3)
+        turn = R @ rotations.right_jacobian(pose)                            # world turn per parameter, in columns
+        # ω × x = x @ hat(ω)ᵀ for every column ω of `turn`
+        columns += carried[:, None] @ np.swapaxes(rotations.hat(np.swapaxes(turn, -1, -2)), -1, -2)
+        return carried[0] + self.origin + trans, columns.reshape(3 * J, L, 3)
+
+
+@dataclass(frozen=True, eq=False)
+class Subject:
+    """A body of fixed shape, ready to be posed fast.
+
+    Parameters
+    ----------
+    template : Mesh
+    skeleton : Skeleton
+    betas : (K,) float or None
+        The body's shape; None is the template's own body.
+    features : JointFeatures
+    basis : (A, N, 3) float64 or float32, metres
+        Of this type are the vertices; float32 is twice as fast and agrees to a few micrometres.
+    origin : (3,) float, metres
+    """
+
+    template: Mesh
+    skeleton: Skeleton
+    betas: np.ndarray | None
+    features: JointFeatures
+    basis: np.ndarray
+    origin: np.ndarray
+
+    @property
+    def n_vertices(self) -> int:
+        """N."""
+        return self.basis.shape[1]
+
+    @cached_property
+    def _flat(self) -> np.ndarray:
+        return np.ascontiguousarray(self.basis.transpose(0, 2, 1)).reshape(-1, self.n_vertices)
+
+    def vertices(self, poses: np.ndarray, trans: np.ndarray | None = None) -> np.ndarray:
+        """Vertices for one pose or a batch.
+
+        Parameters
+        ----------
+        poses : (J, 3) or (B, J, 3) float, radians
+        trans : (3,) or (B, 3) float, metres
+
+        Returns
+        -------
+        (N, 3) or (B, N, 3) float of the subject's dtype, metres
+        """
+        poses, trans = _checked(self.skeleton, poses, trans)
+        y = _product(self.features, self._flat, poses)
+        y += (self.origin + trans)[..., None].astype(y.dtype)
+        return np.swapaxes(y, -1, -2)
+
+    def points(self, vertex_ids: np.ndarray, weights: np.ndarray | None = None) -> PointOperator:
+        """Some surface points of the body.
+
+        Parameters
+        ----------
+        vertex_ids : (L,) or (L, k) int
+            The vertices, or the k vertices that each point is a combination of.
+        weights : (L, k) float, optional
+            Each row sums to 1.
+
+        Raises
+        ------
+        ValueError
+            Indices out of range, shapes that do not agree, weights that do not sum to 1.
+        """
+        ids, weights = check_points(self.n_vertices, vertex_ids, weights)
+        if weights is None:
+            basis = self.basis[:, ids].astype(np.float64)
+        else:
+            basis = np.einsum("alkd,lk->ald", self.basis[:, ids].astype(np.float64), weights)
+        return PointOperator(self.features, basis, self.origin)
+
+
+def check_points(n_vertices: int, vertex_ids: np.ndarray, weights: np.ndarray | None
+                 ) -> tuple[np.ndarray, np.ndarray | None]:
+    """Vertex indices and weights of surface points as arrays, or ValueError."""
+    ids = np.asarray(vertex_ids, dtype=np.int64)
+    if ids.ndim != (1 if weights is None else 2):
+        raise ValueError(f"vertex_ids: expected shape (L,), or (L, k) with weights, got {ids.shape}")
+    if ids.size and (ids.min() < 0 or ids.max() >= n_vertices):
+        raise ValueError(f"vertex_ids: expected 0..{n_vertices - 1}, got {ids.min()}..{ids.max()}")
+    if weights is None:
+        return ids, None
+    weights = np.asarray(weights, dtype=np.float64)
+    if weights.shape != ids.shape or not np.allclose(weights.sum(axis=1), 1, atol=1e-6):
+        raise ValueError(f"weights: expected shape {ids.shape} with rows that sum to 1, got {weights.shape}")
+    return ids, weights

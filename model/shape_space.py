@@ -1,0 +1,88 @@
+"""The space of body shapes: principal components of the shape deformation S."""
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+
+@dataclass(frozen=True, eq=False)
+class ShapeSpace:
+    """S of every triangle as mean plus components.
+
+    Parameters
+    ----------
+    mean : (F, 3, 3) float
+        The mean person.
+    components : (K, F, 3, 3) float
+        Change of S for one standard deviation of each component.
+    variances : (K,) float
+        Variance of S over the training set along each component, largest first.
+    total_variance : float
+        Variance of S over the training set in all directions.
+
+    [SCAPE] Eq. 7
+    """
+
+    mean: np.ndarray
+    components: np.ndarray
+    variances: np.ndarray
+    total_variance: float
+
+    @property
+    def count(self) -> int:
+        """K, the number of components."""
+        return len(self.components)
+
+    @property
+    def explained(self) -> np.ndarray:
+        """(K,) share of the total variance that the first 1..K components explain."""
+        return np.cumsum(self.variances) / max(self.total_variance, np.finfo(float).tiny)
+
+    def gradients(self, betas: np.ndarray | None) -> np.ndarray:
+        """S (F, 3, 3) of betas (k,), k ≤ K, in standard deviations; None is the template's own body, S = I.
+
+        [SCAPE] Eq. 7
+        """
+        if betas is None:
+            return np.broadcast_to(np.eye(3), self.mean.shape).copy()
+        betas = np.asarray(betas, dtype=np.float64)
+        if betas.ndim != 1 or len(betas) > self.count:
+            raise ValueError(f"betas: expected at most {self.count} numbers, got shape {betas.shape}")
+        if not np.isfinite(betas).all():
+            raise ValueError("betas: expected finite numbers")
+        S = self.mean.astype(np.float64)
+        for beta, component in zip(betas, self.components, strict=False):
+            S += np.multiply(beta, component, dtype=np.float64)  # in float64, though the components are stored as float32
+        return S
+
+    @staticmethod
+    def empty(n_faces: int) -> ShapeSpace:
+        """The space without components: only the template's own body."""
+        mean = np.broadcast_to(np.eye(3, dtype=np.float32), (n_faces, 3, 3)).copy()
+        return ShapeSpace(mean, np.zeros((0, n_faces, 3, 3), dtype=np.float32), np.zeros(0), 0.0)
+
+
+def learn_shape_space(S: np.ndarray, components: int) -> ShapeSpace:
+    """Principal components of the shape deformations of a set of people.
+
+    Parameters
+    ----------
+    S : (P, F, 3, 3) float
+    components : int
+        Fewer are returned where the people do not span as many.
+
+    [SCAPE] Eq. 7
+    """
+    P = len(S)
+    mean = S.mean(axis=0, dtype=np.float64)
+    centred = (S - mean).reshape(P, -1)
+    gram = np.asarray(centred @ centred.T, dtype=np.float64) / P
+    variances, modes = np.linalg.eigh(gram)
+    variances, modes = np.maximum(variances[::-1], 0), modes[:, ::-1]
+    count = min(components, int((variances > 1e-9 * max(variances[0], 1e-30)).sum()), P - 1)
+    # unit variance of betas: component k is one standard deviation, Σ_p modes[p, k] centred[p] / √P
+    directions = modes[:, :count].T.astype(centred.dtype) @ centred / np.sqrt(P)
+    directions *= np.where(modes[np.abs(modes[:, :count]).argmax(axis=0), np.arange(count)] < 0, -1, 1)[:, None]
+    return ShapeSpace(mean.astype(np.float32), directions.reshape(count, *S.shape[1:]).astype(np.float32),
+                      variances[:count], float(variances.sum()))

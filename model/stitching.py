@@ -1,0 +1,79 @@
+"""Vertices from triangle edges: the sparse solve that is the oracle of the fast path."""
+from __future__ import annotations
+
+from functools import cached_property
+
+import numpy as np
+from scipy.sparse import coo_array, csc_array
+
+from scanprep.geometry.mesh import Mesh
+from scanprep.geometry.sparse import Factored
+from scanprep.skeleton.tree import Skeleton
+
+
+class StitchingSystem:
+    """The least-squares fit of vertices to edges, factored once for a triangulation.
+
+    Edges say nothing of where the body stands: the centroid of the vertices of part 0 is put in the
+    origin, and callers add the place.
+
+    Parameters
+    ----------
+    template : Mesh
+        One connected component.
+    skeleton : Skeleton
+
+    [SCAPE] Eq. 2
+    """
+
+    def __init__(self, template: Mesh, skeleton: Skeleton) -> None:
+        self.faces = template.faces
+        self.n_vertices = len(template.vertices)
+        self.root_vertices = np.flatnonzero(skeleton.part_of_vertex(template) == 0)
+
+    @cached_property
+    def edge_operator(self) -> csc_array:
+        """(2F, N) sparse: `edge_operator @ vertices` are the edges, two rows a triangle."""
+        F = len(self.faces)
+        row = np.arange(2 * F)
+        one = np.ones(2 * F)
+        end, start = self.faces[:, 1:].ravel(), np.repeat(self.faces[:, 0], 2)
+        return csc_array(coo_array((np.r_[one, -one], (np.r_[row, row], np.r_[end, start])),
+                                   shape=(2 * F, self.n_vertices)))
+
+    @cached_property
+    def _factored(self) -> Factored:
+        # The right-hand sides sum to zero over the vertices, so holding vertex 0 leaves the fit unchanged.
+        anchor = coo_array(([1.0], ([0], [0])), shape=(self.n_vertices, self.n_vertices))
+        return Factored(csc_array(self.edge_operator.T @ self.edge_operator + anchor))
+
+    def solve(self, rhs: np.ndarray) -> np.ndarray:
+        """Solve the normal equations for `edge_operatorᵀ edges` (N, k), root part centred in the origin."""
+        y = self._factored.solve(rhs)
+        return y - y[self.root_vertices].mean(axis=0)
+
+    def solve_adjoint(self, pick: np.ndarray) -> np.ndarray:
+        """(N, k) with `solve_adjoint(pick).T @ rhs == pick.T @ solve(rhs)` for rhs that sum to zero."""
+        centred = pick.copy()
+        centred[self.root_vertices] -= pick.sum(axis=0) / len(self.root_vertices)
+        return self._factored.solve(centred)
+
+    def stitch(self, edges: np.ndarray) -> np.ndarray:
+        """Vertices whose edges come closest to the wanted ones in the least-squares sense.
+
+        Parameters
+        ----------
+        edges : (..., F, 2, 3) float, metres
+
+        Returns
+        -------
+        (..., N, 3) float, metres
+            The centroid of the vertices of part 0 lies in the origin.
+
+        [SCAPE] Eq. 2, Eq. 9
+        """
+        leading = edges.shape[:-3]
+        columns = np.moveaxis(edges.reshape(-1, 2 * len(self.faces), 3), 0, 1)
+        rhs = self.edge_operator.T @ columns.reshape(2 * len(self.faces), -1)
+        y = self.solve(rhs).reshape(self.n_vertices, -1, 3)
+        return np.moveaxis(y, 1, 0).reshape(*leading, self.n_vertices, 3)
