@@ -1,0 +1,202 @@
+"""A graph of turning and scaling nodes that carries a surface: the coarse degrees of freedom of a registration."""
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.sparse import coo_array, csr_array
+from scipy.sparse.csgraph import dijkstra
+from scipy.spatial import cKDTree
+
+from ..geometry import rotations
+from ..geometry.mesh import Mesh
+from ..geometry.surface import Rays
+
+
+@dataclass(frozen=True, eq=False)
+class DeformationGraph:
+    """Nodes on a template, how they carry its vertices, and which nodes hold each other.
+
+    Attributes
+    ----------
+    rest : (N, 3) float, metres
+        The template's vertices.
+    node_vertices : (M,) int
+        The vertex where each node sits.
+    carriers : (N, K) int
+        The nodes that carry each vertex.
+    weights : (N, K) float
+        Their shares, each row summing to 1.
+    edges : (E, 2) int
+        Directed pairs of nodes, each pair in both directions.
+    edge_area : (E,) float, square metres
+        The part of the surface that each edge stands for.
+    """
+
+    rest: np.ndarray
+    node_vertices: np.ndarray
+    carriers: np.ndarray
+    weights: np.ndarray
+    edges: np.ndarray
+    edge_area: np.ndarray
+
+    @property
+    def nodes(self) -> np.ndarray:
+        """(M, 3) rest positions of the nodes, metres."""
+        return self.rest[self.node_vertices]
+
+    @property
+    def edge_vectors(self) -> np.ndarray:
+        """(E, 3) from the first to the second node at rest, metres."""
+        return self.nodes[self.edges[:, 1]] - self.nodes[self.edges[:, 0]]
+
+
+@dataclass(frozen=True, eq=False)
+class NodeMotion:
+    """How every node has turned, grown and moved.
+
+    Attributes
+    ----------
+    R : (M, 3, 3) float
+    log_scale : (M,) float
+    positions : (M, 3) float, metres
+    """
+
+    R: np.ndarray
+    log_scale: np.ndarray
+    positions: np.ndarray
+
+    @property
+    def linear(self) -> np.ndarray:
+        """(M, 3, 3) turn and growth together."""
+        return np.exp(self.log_scale)[:, None, None] * self.R
+
+    def moved(self, step: np.ndarray) -> NodeMotion:
+        """After a step (M, 7): left rotation (radians), change of log-scale, translation (metres)."""
+        return replace(self, R=rotations.exp(step[:, :3]) @ self.R, log_scale=self.log_scale + step[:, 3],
+                       positions=self.positions + step[:, 4:])
+
+
+def start(graph: DeformationGraph, T: np.ndarray, scale: float = 1.0) -> NodeMotion:
+    """The motion of all nodes by one rigid transform (4, 4), after scaling the template by `scale`."""
+    M = len(graph.nodes)
+    return NodeMotion(np.broadcast_to(T[:3, :3], (M, 3, 3)).copy(), np.full(M, np.log(scale)),
+                      scale * graph.nodes @ T[:3, :3].T + T[:3, 3])
+
+
+def arms(graph: DeformationGraph, motion: NodeMotion) -> np.ndarray:
+    """(N, K, 3) from each carrying node to the vertex, as the node sees it after the motion, metres."""
+    local = graph.rest[:, None] - graph.nodes[graph.carriers]
+    return np.matmul(motion.linear[graph.carriers], local[..., None])[..., 0]
+
+
+def deform(graph: DeformationGraph, motion: NodeMotion) -> np.ndarray:
+    """The template's vertices (N, 3) after the motion, metres."""
+    reached = motion.positions[graph.carriers] + arms(graph, motion)
+    return np.einsum("nk,nkd->nd", graph.weights, reached)
+
+
+def carry_over(old: DeformationGraph, motion: NodeMotion, new: DeformationGraph) -> NodeMotion:
+    """The motion of a finer graph of the same template that repeats the motion of a coarser one."""
+    at = new.node_vertices
+    w, carriers = old.weights[at], old.carriers[at]
+    R = rotations.project(np.einsum("mk,mkij->mij", w, motion.R[carriers]))
+    return NodeMotion(R, np.einsum("mk,mk->m", w, motion.log_scale[carriers]), deform(old, motion)[at])
+
+
+def build_graph(template: Mesh, count: int, carriers: int = 4, reach: float = 0.18) -> DeformationGraph:
+    """Spread nodes over a template and link them along and through the body.
+
+    Neighbours on the surface are linked, and so are nodes that face each other through the inside: these
+    keep the thickness of limbs where the scan shows nothing, and make a limb's cross-section turn as one.
+
+    Parameters
+    ----------
+    template : Mesh
+    count : int
+        Number of nodes.
+    carriers : int
+        Nodes that carry one vertex.
+    reach : float
+        Longest link through the inside, as a multiple of the square root of the template's area.
+
+    Returns
+    -------
+    DeformationGraph
+    """
+    nodes = farthest_points(template.vertices, min(count, len(template.vertices)))
+    carrying, weights = _carriers(template, nodes, min(carriers, len(nodes) - 1))
+    surface = _surface_links(carrying)
+    inner = _inner_links(template, nodes, reach * np.sqrt(template.face_areas.sum()))
+    links = np.unique(np.sort(np.concatenate([surface, inner]), axis=1), axis=0)
+    edges = np.concatenate([links, links[:, ::-1]])
+    area = np.bincount(carrying.ravel(), (weights * template.vertex_areas[:, None]).ravel(), len(nodes))
+    degree = np.bincount(edges[:, 0], minlength=len(nodes))
+    return DeformationGraph(template.vertices, nodes, carrying, weights, edges, (area / degree)[edges[:, 0]])
+
+
+def farthest_points(points: np.ndarray, count: int) -> np.ndarray:
+    """Indices (count,) of points far from each other, beginning with the one farthest from the middle."""
+    chosen = np.empty(count, dtype=np.int64)
+    chosen[0] = np.argmax(np.linalg.norm(points - points.mean(axis=0), axis=1))
+    nearest = np.full(len(points), np.inf)
+    for k in range(1, count):
+        np.minimum(nearest, ((points - points[chosen[k - 1]]) ** 2).sum(axis=1), out=nearest)
+        chosen[k] = np.argmax(nearest)
+    return chosen
+
+
+def _carriers(template: Mesh, nodes: np.ndarray, K: int) -> tuple[np.ndarray, np.ndarray]:
+    """The K nodes nearest to each vertex along the surface (N, K) and their shares (N, K)."""
+    a, b = template.edges.T
+    N = len(template.vertices)
+    lengths = csr_array(coo_array((template.edge_lengths, (a, b)), shape=(N, N)))
+    best = np.full((N, K + 1), np.inf)
+    index = np.zeros((N, K + 1), dtype=np.int64)
+    limit = 4 * np.sqrt(template.face_areas.sum() / len(nodes))
+    for first in range(0, len(nodes), 128):
+        block = nodes[first:first + 128]
+        distance = dijkstra(lengths, directed=False, indices=block, limit=limit).T
+        every = np.concatenate([best, distance], axis=1)
+        number = np.concatenate([index, np.broadcast_to(first + np.arange(len(block)), distance.shape)], axis=1)
+        order = np.argpartition(every, K, axis=1)[:, :K + 1]
+        best = np.take_along_axis(every, order, axis=1)
+        index = np.take_along_axis(number, order, axis=1)
+    order = np.argsort(best, axis=1)
+    best, index = np.take_along_axis(best, order, axis=1), np.take_along_axis(index, order, axis=1)
+    lost = np.flatnonzero(~np.isfinite(best[:, 0]))
+    if len(lost):
+        straight = ((template.vertices[lost, None] - template.vertices[nodes]) ** 2).sum(axis=-1)
+        index[lost], best[lost, 0] = np.argmin(straight, axis=1)[:, None], 0.0
+    radius = np.where(np.isfinite(best[:, -1]), best[:, -1], 1.2 * limit)[:, None]
+    share = np.where(np.isfinite(best[:, :K]), np.maximum(1 - best[:, :K] / radius, 0) ** 2, 0.0)
+    share[:, 0] += 1e-9
+    index = np.where(np.isfinite(best), index, index[:, :1])
+    return index[:, :K], share / share.sum(axis=1, keepdims=True)
+
+
+def _surface_links(carriers: np.ndarray) -> np.ndarray:
+    """(L, 2) pairs of nodes that carry a vertex together."""
+    K = carriers.shape[1]
+    pairs = np.concatenate([carriers[:, [i, j]] for i in range(K) for j in range(i + 1, K)])
+    return np.unique(np.sort(pairs[pairs[:, 0] != pairs[:, 1]], axis=1), axis=0)
+
+
+def _inner_links(template: Mesh, nodes: np.ndarray, reach: float, most: int = 8) -> np.ndarray:
+    """(L, 2) pairs of nodes that see each other through the inside, for each node the `most` nearest."""
+    points, normals = template.vertices[nodes], template.vertex_normals[nodes]
+    pairs = cKDTree(points).query_pairs(reach, output_type="ndarray")
+    i, j = np.concatenate([pairs, pairs[:, ::-1]]).T
+    along = points[j] - points[i]
+    length = np.linalg.norm(along, axis=1)
+    along /= np.maximum(length, 1e-12)[:, None]
+    inward = (np.einsum("nd,nd->n", normals[i], along) < -0.3) & (np.einsum("nd,nd->n", normals[j], along) > 0.3)
+    i, j, along, length = i[inward], j[inward], along[inward], length[inward]
+    skin = 0.02 * reach
+    _, hit = Rays(template).cast(points[i] + skin * along, along)
+    clear = np.abs(hit + skin - length) < skin
+    i, j, length = i[clear], j[clear], length[clear]
+    order = np.lexsort((length, i))
+    i, j = i[order], j[order]
+    rank = np.arange(len(i)) - np.searchsorted(i, i)
+    return np.stack([i, j], axis=1)[rank < most]

@@ -1,0 +1,71 @@
+"""The last pass of a registration: the surface follows the scan, smooth where there is none."""
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+from scipy.sparse import csc_array, diags_array
+
+from ..geometry.mesh import Mesh
+from ..geometry.sparse import Factored
+from .energies import Pull
+
+
+class Shell:
+    """A thin shell over a template that resists stretching and bending of its displacement.
+
+    Parameters
+    ----------
+    template : Mesh
+    """
+
+    def __init__(self, template: Mesh) -> None:
+        import igl
+
+        vertices, faces = np.ascontiguousarray(template.vertices), np.ascontiguousarray(template.faces)
+        L = -csc_array(igl.cotmatrix(vertices, faces))
+        areas = np.maximum(template.vertex_areas, 1e-3 * template.vertex_areas.mean())
+        self._membrane = L
+        self._plate = csc_array(L.T @ diags_array(1 / areas) @ L)
+        self._tiny = 1e-9 * areas.mean()
+
+    def displaced(self, start: np.ndarray, wanted: Pull, smoothing: float, tension: float) -> np.ndarray:
+        """Vertices (N, 3) that follow what matches want, as a smooth displacement of `start`.
+
+        Minimises `wanted(x) + smoothing⁴ ∫|Δd|² + tension² ∫|∇d|²` for `d = x - start`.
+
+        Parameters
+        ----------
+        start : (N, 3) float, metres
+        wanted : Pull
+        smoothing : float, metres
+            Details of the displacement smaller than this are damped.
+        tension : float, metres
+            A gradient of one costs as much as this distance from the data.
+        """
+        smooth = smoothing**4 * self._plate + tension**2 * self._membrane
+        across = np.linalg.eigvalsh(wanted.A)[:, 2]
+        nearly = Factored(csc_array(smooth + diags_array(across + self._tiny)))
+        force = wanted.b - np.einsum("nij,nj->ni", wanted.A, start)
+        return start + _conjugate_gradients(
+            lambda d: smooth @ d + np.einsum("nij,nj->ni", wanted.A, d) + self._tiny * d, force, nearly.solve)
+
+
+def _conjugate_gradients(apply: Callable[[np.ndarray], np.ndarray], force: np.ndarray,
+                         precondition: Callable[[np.ndarray], np.ndarray], iterations: int = 40,
+                         tolerance: float = 1e-4) -> np.ndarray:
+    """Solve `apply(d) = force` for arrays of any shape, with a symmetric positive definite `apply`."""
+    d, r = np.zeros_like(force), force.copy()
+    z = precondition(r)
+    p, rz = z, float(np.sum(r * z))
+    first = rz
+    for _ in range(iterations):
+        if rz <= tolerance**2 * first or not rz:
+            break
+        Ap = apply(p)
+        a = rz / float(np.sum(p * Ap))
+        d, r = d + a * p, r - a * Ap
+        z = precondition(r)
+        rz, last = float(np.sum(r * z)), rz
+        p = z + rz / last * p
+    return d
