@@ -83,7 +83,7 @@ def fill_holes(mesh: Mesh, config: FillConfig | None = None,
 
         return repair(poisson(mesh, config.poisson_depth))
     if not mesh.is_edge_manifold:
-        raise ValueError("mesh: expected at most two triangles at every edge, facing the same way; repair it first")
+        raise ValueError("mesh: expected at most two triangles at an edge, facing the same way; repair it first")
     mesh = split_vertices(mesh)
     loops = [loop for loop in mesh.boundary_loops if len(loop) <= (config.max_edges or len(mesh.vertices))]
     if not loops:
@@ -131,7 +131,8 @@ class _Patch:
         triangles, extra = [around.faces], [around.vertices]
         for done, loop in enumerate(loops):
             ring = loop[::-1]                             # the new triangles run the other way along the border
-            rim_normals = np.array([normal_of[int(b), int(a)] for a, b in zip(ring, np.roll(ring, -1), strict=True)])
+            ahead = np.roll(ring, -1)
+            rim_normals = np.array([normal_of[int(b), int(a)] for a, b in zip(ring, ahead, strict=True)])
             joined = adjacency[ring][:, ring].toarray() > 0
             found = triangulate_loop(around.vertices[ring], rim_normals, joined, largest)
             if found is None:
@@ -187,7 +188,8 @@ class _Patch:
             return
         rows = np.concatenate([np.flatnonzero(self.rim), free])
         laplacian = clamped_cotangents(self.mesh)[rows]
-        scale = 1 / np.sqrt(np.maximum(self.mesh.vertex_areas[rows], 1e-12))
+        area = self.mesh.vertex_areas[rows]
+        scale = 1 / np.sqrt(np.maximum(area, 0.1 * np.median(area)))   # slivers on a rim must not rule
         b = csr_array(laplacian.multiply(scale[:, None])).tocsc()
         known = b[:, :self.old_vertices] @ self.mesh.vertices[:self.old_vertices]
         b = b[:, free]

@@ -139,12 +139,20 @@ def relax(mesh: Mesh, surface: Surface | None = None, rounds: int = 5, step: flo
 def smooth(mesh: Mesh, rounds: int = 10, lower: float = 0.5, upper: float = -0.53) -> Mesh:
     """Noise taken off without shrinking, by steps forward and back [Taubin].
 
-    Border vertices stay where they are.
+    A border is smoothed as the curve it is.
     """
-    mean = mean_of_neighbours(mesh)
+    border = mesh.edges[mesh.edge_use == 1]
+    inner = np.ones(len(mesh.vertices), dtype=bool)
+    inner[border] = False
+    a, b = mesh.edges[inner[mesh.edges].any(axis=1)].T
+    rows = np.concatenate([a[inner[a]], b[inner[b]], border[:, 0], border[:, 1]])
+    columns = np.concatenate([b[inner[a]], a[inner[b]], border[:, 1], border[:, 0]])
+    count = len(mesh.vertices)
+    near = csr_array(coo_array((np.ones(len(rows)), (rows, columns)), shape=(count, count)))
+    degree = np.asarray(near.sum(axis=1)).ravel()
+    mean = csr_array(near.multiply(1 / np.maximum(degree, 1)[:, None]))
+    free = degree > 0
     vertices = np.array(mesh.vertices)
-    free = np.ones(len(vertices), dtype=bool)
-    free[mesh.boundary_vertices] = False
     for _ in range(rounds):
         for step in (lower, upper):
             vertices[free] += step * (mean @ vertices - vertices)[free]

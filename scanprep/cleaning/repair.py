@@ -63,14 +63,19 @@ def repair(mesh: Mesh, config: RepairConfig | None = None) -> Mesh:
 
 def weld(mesh: Mesh, distance: float = 0.0) -> Mesh:
     """Vertices that coincide made one; triangles that lose a corner by it, and repeated ones, removed."""
-    key = np.round(mesh.vertices / distance).astype(np.int64) if distance > 0 else mesh.vertices
-    _, first, new = np.unique(key, axis=0, return_index=True, return_inverse=True)
+    key = np.round(mesh.vertices / distance) if distance > 0 else mesh.vertices
+    rows = np.lexsort(key.T)
+    new = np.empty(len(key), dtype=np.int64)
+    new[rows] = np.cumsum(np.r_[True, (key[rows][1:] != key[rows][:-1]).any(axis=1)][:len(key)]) - 1
+    first = np.full(int(new.max(initial=-1)) + 1, len(key))
+    np.minimum.at(first, new, np.arange(len(key)))
     order = np.argsort(first, kind="stable")                 # keep the order of the vertices
-    faces = np.argsort(order, kind="stable")[new.reshape(-1)][mesh.faces]
+    faces = np.argsort(order, kind="stable")[new][mesh.faces]
     distinct = (faces != np.roll(faces, 1, axis=1)).all(axis=1)
-    _, once = np.unique(np.sort(faces, axis=1), axis=0, return_index=True)
-    keep = np.zeros(len(faces), dtype=bool)
-    keep[once] = True
+    corners = np.sort(faces, axis=1)
+    rows = np.lexsort(corners.T)                             # stable: the first of equal triangles stays
+    keep = np.ones(len(faces), dtype=bool)
+    keep[rows[1:]] = (corners[rows][1:] != corners[rows][:-1]).any(axis=1)
     kept = first[order]
     welded = Mesh(mesh.vertices[kept], faces[keep & distinct], None if mesh.colors is None else mesh.colors[kept])
     return welded.submesh(np.arange(len(welded.faces)))[0]
@@ -157,3 +162,24 @@ def drop_small_components(mesh: Mesh, share: float) -> Mesh:
     if share >= 1:
         keep = np.arange(len(size)) == size.argmax()
     return mesh.submesh(keep[label[mesh.faces[:, 0]]])[0]
+
+
+def peel_border(mesh: Mesh, rings: int, smallest: int = 40) -> Mesh:
+    """Without the outermost rings of triangles along borders, where scans are least certain.
+
+    Parameters
+    ----------
+    mesh : Mesh
+    rings : int
+    smallest : int
+        Borders of fewer edges are pinholes and keep their triangles.
+    """
+    for _ in range(rings):
+        loops = [loop for loop in mesh.boundary_loops if len(loop) >= smallest]
+        if not loops:
+            break
+        on_border = np.zeros(len(mesh.vertices), dtype=bool)
+        on_border[np.concatenate(loops)] = True
+        mesh = drop_small_components(mesh.submesh(~on_border[mesh.faces].any(axis=1))[0], 1.0)
+        mesh = split_vertices(mesh)
+    return mesh

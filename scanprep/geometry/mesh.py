@@ -99,9 +99,10 @@ class Mesh:
 
     @cached_property
     def _edges_and_sides(self) -> tuple[np.ndarray, np.ndarray]:
-        half = self.faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
-        edges, of_half = np.unique(np.sort(half, axis=1), axis=0, return_inverse=True)
-        return edges, of_half.reshape(-1, 3)
+        a, b = self.faces, np.roll(self.faces, -1, axis=1)
+        count = len(self.vertices)           # one number per edge sorts several times faster than rows
+        key, of_half = np.unique(np.minimum(a, b) * count + np.maximum(a, b), return_inverse=True)
+        return np.stack(np.divmod(key, max(count, 1)), axis=1), of_half.reshape(-1, 3)
 
     @property
     def edges(self) -> np.ndarray:
@@ -143,8 +144,8 @@ class Mesh:
     @cached_property
     def is_edge_manifold(self) -> bool:
         """No edge has more than two triangles, and neighbours agree on which side is outside."""
-        half = self.faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
-        return bool((self.edge_use <= 2).all()) and len(np.unique(half, axis=0)) == len(half)
+        half = self.faces * len(self.vertices) + np.roll(self.faces, -1, axis=1)
+        return bool((self.edge_use <= 2).all()) and len(np.unique(half)) == half.size
 
     @cached_property
     def is_vertex_manifold(self) -> bool:
