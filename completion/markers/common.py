@@ -1,0 +1,32 @@
+"""What the readers of marker files share."""
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from scanprep.geometry.formats.common import UNITS
+
+MARKER_UNITS = UNITS
+
+
+class MarkerFileError(ValueError):
+    """A file of markers or of a marker layout that cannot be read: which one, what was expected, what came."""
+
+
+@dataclass(frozen=True, eq=False)
+class RawMarkers:
+    """What a marker file holds, in its own unit.
+
+    Attributes
+    ----------
+    positions : (T, L, 3) float, NaN where missing
+    labels : L strings, as they stand in the file
+    rate : float, frames per second, or None where the file does not say
+    unit : str, as it stands in the file
+    """
+
+    positions: np.ndarray
+    labels: tuple[str, ...]
+    rate: float | None
+    unit: str

@@ -1,0 +1,195 @@
+"""Where on the body the markers sit."""
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from scanprep.geometry import storage
+from scanprep.geometry.mesh import Mesh
+
+from .common import MarkerFileError
+
+DISTANCE = 0.0095        # metres from the skin to the centre of a common marker
+
+
+@dataclass(frozen=True, eq=False)
+class MarkerLayout:
+    """Markers on the skin of a body, or a little above it.
+
+    Parameters
+    ----------
+    labels : L strings, each different
+    vertices : (L,) int, or (L, 3) int
+        The vertex below each marker, or three vertices whose weighted mean is the point of the skin.
+    distances : (L,) float, metres, or one number
+        From the skin to the marker's centre, along the normal.
+    weights : (L, 3) float, optional
+        For three vertices; each row sums to 1.
+
+    Raises
+    ------
+    ValueError
+        Shapes that do not agree, a label that comes twice, a negative vertex.
+    """
+
+    labels: tuple[str, ...]
+    vertices: np.ndarray
+    distances: np.ndarray | float = DISTANCE
+    weights: np.ndarray | None = None
+
+    def __post_init__(self) -> None:
+        labels, vertices = tuple(self.labels), np.array(self.vertices, dtype=np.int64)
+        L = len(labels)
+        if len(set(labels)) < L:
+            raise ValueError(f"labels: expected each once, "
+                             f"{next(x for x in labels if labels.count(x) > 1)} comes more often")
+        wanted = (L,) if self.weights is None else (L, 3)
+        if vertices.shape != wanted:
+            raise ValueError(f"vertices: expected shape {wanted} for {L} labels, got {vertices.shape}")
+        if (vertices < 0).any():
+            raise ValueError(f"vertices: expected numbers from 0, got {vertices.min()}")
+        try:
+            distances = np.broadcast_to(np.asarray(self.distances, dtype=np.float64), (L,)).copy()
+        except ValueError:
+            raise ValueError(f"distances: expected one number or {L}, got {np.shape(self.distances)}") from None
+        if not np.isfinite(distances).all():
+            raise ValueError("distances: expected finite numbers")
+        values: dict[str, Any] = {"labels": labels, "vertices": vertices, "distances": distances}
+        if self.weights is not None:
+            weights = np.array(self.weights, dtype=np.float64)
+            if weights.shape != (L, 3) or not np.allclose(weights.sum(axis=1), 1, atol=1e-6):
+                raise ValueError(f"weights: expected shape ({L}, 3) with rows that sum to 1, got {weights.shape}")
+            values["weights"] = weights
+        for name, value in values.items():
+            if isinstance(value, np.ndarray):
+                value.flags.writeable = False
+            object.__setattr__(self, name, value)
+
+    def __repr__(self) -> str:
+        return f"MarkerLayout({len(self.labels)} markers)"
+
+    @staticmethod
+    def load(path: str | Path, n_vertices: int | None = None) -> MarkerLayout:
+        """Read a layout of `save`, or of the same form from elsewhere.
+
+        The form is `{"markersets": [{"type": ..., "distance_from_skin": 0.0095, "indices": {label: vertex}}]}`;
+        in place of a vertex there may be `{"vertices": [a, b, c], "weights": [u, v, w]}`.
+
+        Parameters
+        ----------
+        n_vertices : int, optional
+            Of the body, to refuse a layout that was made for another one.
+
+        Raises
+        ------
+        MarkerFileError
+            Missing, of another form, a label that comes twice, a vertex that the body does not have.
+        """
+        path = Path(path)
+        try:
+            tree = json.loads(path.read_text(encoding="utf-8"))
+        except FileNotFoundError:
+            raise MarkerFileError(f"{path}: no such file") from None
+        except (ValueError, OSError) as error:
+            raise MarkerFileError(f"{path}: expected a marker layout in JSON, cannot read it ({error})") from None
+        rows = _rows(path, tree)
+        if not rows:
+            raise MarkerFileError(f"{path}: expected markers in the layout, found none")
+        simple = all(isinstance(place, int) for _, place, _ in rows)
+        labels, places, distances = zip(*rows, strict=True)
+        try:
+            if simple:
+                layout = MarkerLayout(labels, np.array(places), np.array(distances))
+            else:
+                pairs = [([p] * 3, [1.0, 0.0, 0.0]) if isinstance(p, int) else (p["vertices"], p["weights"])
+                         for p in places]
+                layout = MarkerLayout(labels, np.array([v for v, _ in pairs]), np.array(distances),
+                                      np.array([w for _, w in pairs]))
+        except (ValueError, KeyError, TypeError) as error:
+            raise MarkerFileError(f"{path}: damaged marker layout ({error})") from None
+        if n_vertices is not None:
+            layout._check(n_vertices, str(path))
+        return layout
+
+    def save(self, path: str | Path) -> None:
+        """Write as JSON, one marker set for each distance from the skin, whole or not at all."""
+        sets: dict[float, dict[str, Any]] = {}
+        for i, (label, distance) in enumerate(zip(self.labels, np.asarray(self.distances).tolist(), strict=True)):
+            place: Any = self.vertices[i].tolist()
+            if self.weights is not None:
+                place = {"vertices": place, "weights": self.weights[i].tolist()}
+            sets.setdefault(distance, {})[label] = place
+        storage.write_json(path, {"markersets": [
+            {"type": "body", "distance_from_skin": distance, "indices": indices}
+            for distance, indices in sets.items()]})
+
+    def matched(self, labels: Sequence[str], minimum: int = 3) -> tuple[str, ...]:
+        """Those of the labels that the layout knows, in their own order.
+
+        Raises
+        ------
+        ValueError
+            Fewer than `minimum`; both lists are in the message.
+        """
+        found = tuple(label for label in labels if label in self.labels)
+        if len(found) < minimum:
+            raise ValueError(f"labels: expected at least {minimum} markers of the layout, found {len(found)}; "
+                             f"layout: {', '.join(self.labels)}; sequence: {', '.join(labels) or 'none'}")
+        return found
+
+    def select(self, labels: Sequence[str]) -> MarkerLayout:
+        """The markers of these labels, in this order."""
+        unknown = [label for label in labels if label not in self.labels]
+        if unknown:
+            raise ValueError(f"labels: {', '.join(unknown)} not among {', '.join(self.labels)}")
+        rows = [self.labels.index(label) for label in labels]
+        return MarkerLayout(tuple(labels), self.vertices[rows], np.asarray(self.distances)[rows],
+                            None if self.weights is None else self.weights[rows])
+
+    def place(self, mesh: Mesh) -> np.ndarray:
+        """Where the markers are on a body (L, 3), metres: the point of the skin, and out along its normal.
+
+        Raises
+        ------
+        ValueError
+            A layout of another body.
+        """
+        self._check(len(mesh.vertices), "vertices")
+        vertices, normals = mesh.vertices[self.vertices], mesh.vertex_normals[self.vertices]
+        if self.weights is not None:
+            vertices = np.einsum("lc,lcd->ld", self.weights, vertices)
+            normals = np.einsum("lc,lcd->ld", self.weights, normals)
+            length = np.linalg.norm(normals, axis=1, keepdims=True)
+            normals = np.divide(normals, length, out=np.zeros_like(normals), where=length > 0)
+        return vertices + np.asarray(self.distances)[:, None] * normals
+
+    def _check(self, n_vertices: int, what: str) -> None:
+        outside = [label for label, v in zip(self.labels, self.vertices, strict=True) if np.max(v) >= n_vertices]
+        if outside:
+            place = self.vertices[self.labels.index(outside[0])].tolist()
+            error = ValueError if what == "vertices" else MarkerFileError
+            raise error(f"{what}: marker '{outside[0]}' sits on vertex {place}, the body has 0..{n_vertices - 1}")
+
+
+def _rows(path: Path, tree: Any) -> list[tuple[str, Any, float]]:
+    """Label, place and distance of every marker in the file."""
+    sets = tree.get("markersets") if isinstance(tree, Mapping) else None
+    if not isinstance(sets, list):
+        raise MarkerFileError(f"{path}: expected a marker layout {{\"markersets\": [...]}}, found something else")
+    rows = []
+    for markers in sets:
+        indices = markers.get("indices") if isinstance(markers, Mapping) else None
+        distance = markers.get("distance_from_skin", DISTANCE) if isinstance(markers, Mapping) else None
+        if not isinstance(indices, Mapping) or not isinstance(distance, int | float):
+            raise MarkerFileError(f"{path}: expected marker sets with 'indices' {{label: vertex}} and a number "
+                                  f"'distance_from_skin'")
+        for label, place in indices.items():
+            if isinstance(place, bool) or not isinstance(place, int | Mapping):
+                raise MarkerFileError(f"{path}: marker '{label}': expected a vertex, found {place!r}")
+            rows.append((label, place, float(distance)))
+    return rows
