@@ -48,6 +48,10 @@ class MovingPoints:
     positions: np.ndarray
     jacobian: np.ndarray
 
+    def __getitem__(self, some: slice) -> MovingPoints:
+        """Some of the points."""
+        return MovingPoints(self.positions[..., some, :], self.jacobian[..., some, :, :])
+
 
 def moving_points(positions: np.ndarray, d_pose: np.ndarray, d_betas: np.ndarray | None = None) -> MovingPoints:
     """Join the derivatives with respect to pose, trans (the identity) and betas.

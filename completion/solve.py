@@ -52,7 +52,7 @@ class Minimum:
     iterations: int
 
 
-def minimise(energy: Energy, start: np.ndarray, config: MinimiseConfig = MinimiseConfig()) -> Minimum:
+def minimise(energy: Energy, start: np.ndarray, config: MinimiseConfig | None = None) -> Minimum:
     """Levenberg-Marquardt on a batch of independent problems, each with its own damping.
 
     Parameters
@@ -60,6 +60,7 @@ def minimise(energy: Energy, start: np.ndarray, config: MinimiseConfig = Minimis
     energy : x (B, P) -> residuals with leading dimension B
     start : (B, P) float
     """
+    config = config or MinimiseConfig()
     x = np.array(start, dtype=np.float64)
     cost, gradient, hessian = normal_equations(energy(x))
     damping = np.full(len(x), config.damping)

@@ -1,0 +1,76 @@
+"""Poses drawn at random: around what is known, or one limb at a time, and a quick look at how they fit."""
+from __future__ import annotations
+
+from typing import TYPE_CHECKING
+
+import numpy as np
+
+from scanprep.geometry.surface import OrientedPoints
+from scanprep.skeleton.tree import Skeleton
+
+from . import energy
+from .bodies import FixedBody, Follow
+from .priors import GaussianPrior
+from .scan import spread
+from .solve import normal_equations
+
+if TYPE_CHECKING:
+    from .fit import ScanFit
+
+LARGEST = 3                          # parts of a limb that is redrawn as a whole
+
+
+def around(body: FixedBody, follow: Follow, x: np.ndarray, targets: np.ndarray, sd: float, prior: GaussianPrior,
+           count: int, rng: np.random.Generator) -> np.ndarray:
+    """Draws (count, P) of what the landmarks and the pose prior leave open around their optimum x (P,).
+
+    The normal distribution whose precision is the Gauss-Newton matrix (Laplace's approximation).
+    """
+    weights = np.full(len(targets), sd**-2)
+    terms = [energy.point_to_point(follow(x[None]), targets, weights), energy.pose_prior(x[None], prior)]
+    free = body.n_angles + 3
+    precision = normal_equations(terms)[2][0, :free, :free] + 1e-6 * np.eye(free)
+    drawn = np.repeat(x[None], count, axis=0)
+    drawn[:, :free] += np.linalg.solve(np.linalg.cholesky(precision).T, rng.normal(size=(free, count))).T
+    return drawn
+
+
+def limbs(skeleton: Skeleton) -> list[int]:
+    """Joints below which hang a few parts, the largest limbs first."""
+    size = skeleton.descends.sum(axis=0)
+    return [int(j) for j in np.argsort(-size, kind="stable") if j > 0 and size[j] <= LARGEST]
+
+
+def redrawn(body: FixedBody, x: np.ndarray, root: int, prior: GaussianPrior, count: int,
+            rng: np.random.Generator) -> np.ndarray:
+    """Draws (count, P) of the limb at a joint from the prior, given the other joints of x (P,)."""
+    parts = np.flatnonzero(body.skeleton.descends[:, root])
+    angles = (3 * parts[:, None] + np.arange(3)).ravel()
+    precision = prior.whitening.T @ prior.whitening
+    others = np.setdiff1d(np.arange(body.n_angles), angles)
+    block = precision[np.ix_(angles, angles)]
+    pull = precision[np.ix_(angles, others)] @ (x[others] - prior.mean[others])
+    drawn = np.repeat(x[None], count, axis=0)
+    spreads = np.linalg.solve(np.linalg.cholesky(block).T, rng.normal(size=(len(angles), count))).T
+    drawn[:, angles] = prior.mean[angles] - np.linalg.solve(block, pull) + spreads
+    return drawn
+
+
+def quick_misfits(fit: ScanFit, x: np.ndarray, cap: float = 0.1, vertices: int = 3000) -> np.ndarray:
+    """How badly bodies (n, P) explain the scan, on few vertices whose normals turn with their parts."""
+    body, config = fit.body, fit.config
+    ids = spread(body.template.vertices, vertices)
+    part = body.skeleton.part_of_vertex(body.template)[ids]
+    pose, trans, _ = body.split(x)
+    places = body.subject.points(ids).evaluate(pose, trans)
+    R = body.skeleton.part_rotations(pose)[:, part]
+    normals = (R @ body.template.vertex_normals[ids][:, :, None])[..., 0]
+    out = np.empty(len(x))
+    for i, (y, n) in enumerate(zip(places, normals, strict=True)):
+        found = OrientedPoints(y, n).match(fit.coarse.points, fit.coarse.normals, cap, config.min_cosine)
+        apart = (np.minimum(found.distances, cap)**2).mean()
+        if fit.sight is not None:
+            excess = fit.sight.trespass(y[::3], config.silhouette_tolerance)[0]
+            apart += config.silhouette_weight * (np.minimum(excess, cap)**2).mean()
+        out[i] = config.evidence * apart / config.scan_sd**2 + energy.pose_prior(x[i], fit.prior).energy
+    return out

@@ -1,0 +1,113 @@
+"""A motion: one pose and place a frame, and the file it lives in."""
+from __future__ import annotations
+
+import zipfile
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from model.linear import Subject
+from scanprep.geometry import storage
+
+SURFACE_MODEL = "scape"
+
+
+@dataclass(frozen=True, eq=False)
+class Motion:
+    """Poses of one body over time.
+
+    Attributes
+    ----------
+    poses : (T, J, 3) float, radians
+    trans : (T, 3) float, metres
+    betas : (K,) float, or None for the template's own body
+    rate : float, frames per second
+    residuals : (T, L) float, metres
+        Distance of each marker from where the body puts it, NaN where it was not seen; L may be 0.
+    labels : L strings
+        The markers.
+    gender : str
+        As body-model files name it: "male", "female" or "neutral".
+    converged : (T,) bool
+        Frames whose solution settled; all true for a motion that was read from a file.
+    """
+
+    poses: np.ndarray
+    trans: np.ndarray
+    betas: np.ndarray | None
+    rate: float
+    residuals: np.ndarray
+    labels: tuple[str, ...] = ()
+    gender: str = "neutral"
+    converged: np.ndarray = field(default_factory=lambda: np.zeros(0, dtype=bool))
+
+    def __post_init__(self) -> None:
+        T = len(self.poses)
+        if self.poses.ndim != 3 or self.poses.shape[2] != 3 or self.trans.shape != (T, 3):
+            raise ValueError(f"poses, trans: expected (T, J, 3) and (T, 3), got {self.poses.shape} "
+                             f"and {self.trans.shape}")
+        if self.residuals.shape != (T, len(self.labels)):
+            raise ValueError(f"residuals: expected shape {(T, len(self.labels))}, got {self.residuals.shape}")
+        if not len(self.converged):
+            object.__setattr__(self, "converged", np.ones(T, dtype=bool))
+
+    def __repr__(self) -> str:
+        return f"Motion({len(self.poses)} frames at {self.rate:g}/s, {self.poses.shape[1]} parts)"
+
+    def vertices(self, subject: Subject, frames: np.ndarray | slice = slice(None)) -> np.ndarray:
+        """The meshes (n, N, 3) of some frames, metres.
+
+        Parameters
+        ----------
+        subject : Subject
+            Whose body moves: the one that was followed, or another.
+        frames : indices or slice, optional
+        """
+        return subject.vertices(self.poses[frames], self.trans[frames])
+
+    def save(self, path: str | Path) -> None:
+        """Write an `.npz` with the array names that body-model files use, poses as (T, 3J)."""
+        arrays = {
+            "poses": self.poses.reshape(len(self.poses), -1), "trans": self.trans,
+            "betas": np.zeros(0) if self.betas is None else self.betas,
+            "gender": np.array(self.gender), "mocap_frame_rate": np.array(float(self.rate)),
+            "surface_model_type": np.array(SURFACE_MODEL), "marker_residuals": self.residuals,
+            "marker_labels": np.array(self.labels, dtype=str), "converged": self.converged}
+        with storage.writing(path) as beside, open(beside, "wb") as out:
+            np.savez_compressed(out, allow_pickle=False, **arrays)  # type: ignore[arg-type]
+
+    @staticmethod
+    def load(path: str | Path) -> Motion:
+        """Read a file of `save`, or a body-model motion file of the same kind from elsewhere.
+
+        Raises
+        ------
+        StorageError
+            Missing, not a motion, or made for another body model, whose betas mean nothing here.
+        """
+        try:
+            with np.load(path, allow_pickle=False) as data:
+                stored = {name: data[name] for name in data.files}
+        except FileNotFoundError:
+            raise storage.StorageError(f"{path}: no such file") from None
+        except (OSError, ValueError, EOFError, zipfile.BadZipFile, AttributeError) as error:
+            raise storage.StorageError(f"{path}: expected a motion (.npz), cannot read it ({error})") from None
+        lacking = [name for name in ("poses", "trans") if name not in stored]
+        if lacking:
+            raise storage.StorageError(f"{path}: expected a motion, it lacks {' and '.join(lacking)}")
+        kind = str(stored.get("surface_model_type", ""))
+        if kind != SURFACE_MODEL:
+            raise storage.StorageError(f"{path}: expected surface_model_type '{SURFACE_MODEL}', found '{kind}'")
+        rate = stored.get("mocap_frame_rate", stored.get("mocap_framerate"))
+        if rate is None:
+            raise storage.StorageError(f"{path}: expected mocap_frame_rate or mocap_framerate")
+        try:
+            poses = stored["poses"].astype(np.float64).reshape(len(stored["poses"]), -1, 3)
+            labels = tuple(str(label) for label in stored.get("marker_labels", ()))
+            betas = stored.get("betas", np.zeros(0)).astype(np.float64)
+            return Motion(poses, stored["trans"].astype(np.float64), betas if betas.size else None, float(rate),
+                          stored.get("marker_residuals", np.zeros((len(poses), 0))), labels,
+                          str(stored.get("gender", "neutral")), stored.get("converged", np.zeros(0, dtype=bool)))
+        except (ValueError, TypeError) as error:
+            raise storage.StorageError(f"{path}: {error}") from None

@@ -1,0 +1,102 @@
+"""What one camera must have seen is evidence too: nothing stands beside or in front of what it saw."""
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from scipy.optimize import minimize
+from scipy.spatial import cKDTree
+
+from .scan import ScanPoints, spread
+
+GRAZING = 0.3                        # cosine below which a scanner sees little
+FEW = 2000                           # points that are enough to find the viewpoint
+
+
+@dataclass(frozen=True, eq=False)
+class Sight:
+    """A scan as one camera saw it.
+
+    Attributes
+    ----------
+    viewpoint : (3,) float, metres
+    points : (n, 3) float, metres
+    """
+
+    viewpoint: np.ndarray
+    points: np.ndarray
+
+    @cached_property
+    def _rays(self) -> tuple[np.ndarray, np.ndarray, cKDTree]:
+        depth = np.linalg.norm(self.points - self.viewpoint, axis=1)
+        direction = (self.points - self.viewpoint) / depth[:, None]
+        return depth, direction, cKDTree(direction)
+
+    def trespass(self, vertices: np.ndarray, tolerance: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """How far vertices stand where the camera saw nothing, or in front of what it saw.
+
+        Parameters
+        ----------
+        vertices : (n, 3) float, metres
+        tolerance : float, metres
+            What is allowed for the rim that scanners lose and for an inexact viewpoint.
+
+        Returns
+        -------
+        (n,) float, metres
+            Beyond the tolerance; zero where there is nothing to object to.
+        (n, 3) float
+            The way out, from the vertex's side: the normal of the plane it should reach.
+        (n, 3) float, metres
+            A point of that plane.
+        """
+        depth, direction, tree = self._rays
+        away = vertices - self.viewpoint
+        far = np.linalg.norm(away, axis=1)
+        chord, near = tree.query(away / far[:, None], 6, workers=-1)
+        along = np.einsum("nd,nd->n", away, direction[near[:, 0]])
+        beside = away - along[:, None] * direction[near[:, 0]]
+        wide = np.linalg.norm(beside, axis=1)
+        front = np.where(chord * far[:, None] < tolerance, depth[near], np.inf).min(axis=1)
+        ahead = np.where(np.isfinite(front), front - far, 0.0)
+        outside = wide > np.maximum(tolerance, ahead)
+        normal = np.where(outside[:, None], beside / np.maximum(wide, 1e-12)[:, None], -away / far[:, None])
+        excess = np.maximum(np.where(outside, wide, ahead) - tolerance, 0)
+        return excess, normal, vertices - excess[:, None] * normal
+
+
+def find_sight(cloud: ScanPoints, viewpoint: np.ndarray | None = None, share: float = 0.97) -> Sight | None:
+    """The camera of a scan, or None when no single viewpoint faces nearly all of it.
+
+    Parameters
+    ----------
+    viewpoint : (3,) float, metres, optional
+        Where it is known. Otherwise it is the one that the fewest normals turn away from; its direction is
+        good to a few degrees, its distance is not.
+    share : float
+        Of the points, that must face it.
+    """
+    if viewpoint is None:
+        viewpoint = _facing_point(cloud)
+    to = viewpoint - cloud.points
+    facing = np.einsum("nd,nd->n", to, cloud.normals) > 0.05 * np.linalg.norm(to, axis=1)
+    return Sight(np.asarray(viewpoint, dtype=np.float64), cloud.points) if facing.mean() >= share else None
+
+
+def _facing_point(cloud: ScanPoints) -> np.ndarray:
+    keep = spread(cloud.points, FEW) if len(cloud.points) > FEW else slice(None)
+    normals, centre = cloud.normals[keep], cloud.points[keep].mean(axis=0)
+    points = cloud.points[keep] - centre
+    size = np.linalg.norm(points, axis=1).max()
+
+    def turned_away(q: np.ndarray) -> float:
+        to = q[:3] / np.linalg.norm(q[:3]) - q[3] * points / size
+        cosine = np.einsum("nd,nd->n", normals, to) / np.linalg.norm(to, axis=1)
+        return float(np.mean(np.maximum(GRAZING - cosine, 0)**2))
+
+    start = normals.mean(axis=0)
+    found = minimize(turned_away, np.r_[start / max(np.linalg.norm(start), 1e-12), 0.3], method="Nelder-Mead",
+                     options={"maxiter": 400, "xatol": 1e-3, "fatol": 1e-9}).x
+    nearness = np.clip(found[3], 0.05, 0.7)
+    return centre + size / nearness * found[:3] / np.linalg.norm(found[:3])
