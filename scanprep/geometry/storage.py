@@ -34,6 +34,11 @@ def writing(path: str | Path) -> Iterator[Path]:
         beside.unlink(missing_ok=True)
 
 
+def as_json(value: Any) -> Any:
+    """A value as it comes back from a JSON file: tuples as lists, keys as strings."""
+    return json.loads(json.dumps(value))
+
+
 def write_json(path: str | Path, value: Any) -> None:
     """Write JSON, whole or not at all."""
     with writing(path) as beside:
