@@ -7,9 +7,10 @@ graph or scan are divided.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Protocol
 
 import numpy as np
-from scipy.sparse import bsr_array, coo_array, csc_array, csr_array
+from scipy.sparse import bsr_array, coo_array, csc_array, csr_array, diags_array
 
 from ..geometry import rotations
 from ..geometry.sparse import factor
@@ -78,7 +79,7 @@ class NodePattern:
         of_edges = np.concatenate([i * M + i, i * M + j, j * M + i, j * M + j])
         keys, where = np.unique(np.concatenate([of_vertices, of_edges, np.arange(M) * (M + 1)]),
                                 return_inverse=True)
-        self.shape = (M, K)
+        self.nodes = M
         self.rows, self.columns = keys // M, keys % M
         self._indptr = np.searchsorted(self.rows, np.arange(M + 1))
         self.vertex_slots = where[:len(of_vertices)].reshape(-1, K * K)
@@ -92,40 +93,109 @@ class NodePattern:
 
     def matrix(self, blocks: np.ndarray) -> csc_array:
         """The sparse symmetric matrix of all blocks."""
-        size = self.shape[0] * UNKNOWNS
+        size = self.nodes * UNKNOWNS
         return csc_array(bsr_array((blocks, self.columns, self._indptr), shape=(size, size)))
 
 
+class Term(Protocol):
+    """One energy at one state: its value, and on demand what it adds to the normal equations."""
+
+    @property
+    def value(self) -> float: ...
+
+    def normal(self, pattern: NodePattern) -> tuple[np.ndarray, np.ndarray]:
+        """Gauss-Newton blocks (P, 7, 7) of the pattern and half the gradient (M, 7)."""
+        ...
+
+
 @dataclass(frozen=True, eq=False)
-class Parts:
-    """One energy term at one state: half its gradient, its Gauss-Newton matrix in blocks, its value."""
+class EdgeTerm:
+    """`Σ w |r|²` over the edges of a graph.
 
-    blocks: np.ndarray
-    gradient: np.ndarray
-    value: float
+    Attributes
+    ----------
+    edges : (E, 2) int
+    r : (E, d) float
+    Ji, Jj : (E, d, 7) float
+        Derivatives of the residual by the unknowns of the first and the second node.
+    w : (E,) float
+    """
+
+    edges: np.ndarray
+    r: np.ndarray
+    Ji: np.ndarray
+    Jj: np.ndarray
+    w: np.ndarray
+
+    @property
+    def value(self) -> float:
+        return float(np.sum(self.w[:, None] * self.r**2))
+
+    def normal(self, pattern: NodePattern) -> tuple[np.ndarray, np.ndarray]:
+        wi, wj = (self.w[:, None, None] * J.transpose(0, 2, 1) for J in (self.Ji, self.Jj))
+        blocks = np.concatenate([wi @ self.Ji, wi @ self.Jj, wj @ self.Ji, wj @ self.Jj])
+        force = np.concatenate([wi @ self.r[..., None], wj @ self.r[..., None]])[..., 0]
+        return (pattern.gather(pattern.edge_slots.reshape(-1), blocks),
+                _sum_to(self.edges.T.reshape(-1), force, pattern.nodes))
 
 
-def data_term(graph: DeformationGraph, pattern: NodePattern, motion: NodeMotion, wanted: Pull) -> Parts:
+@dataclass(frozen=True, eq=False)
+class DataTerm:
+    """What matches and landmarks ask of the nodes that carry the vertices (only those that are asked).
+
+    Attributes
+    ----------
+    active : (n,) int
+        Vertices with a force on them.
+    carriers, w : (n, K)
+        The nodes that carry them, and their shares.
+    y : (n, K, 3) float, metres
+        From node to vertex.
+    x : (n, 3) float, metres
+        Where the vertices are.
+    A, b, c
+        As in `Pull`.
+    """
+
+    active: np.ndarray
+    carriers: np.ndarray
+    w: np.ndarray
+    y: np.ndarray
+    x: np.ndarray
+    A: np.ndarray
+    b: np.ndarray
+    c: float
+
+    @property
+    def value(self) -> float:
+        force = np.matmul(self.A, self.x[..., None])[..., 0] - 2 * self.b
+        return float(np.sum(self.x * force) + self.c)
+
+    def normal(self, pattern: NodePattern) -> tuple[np.ndarray, np.ndarray]:
+        n, K = self.w.shape
+        J = np.empty((n, 3, K, UNKNOWNS))
+        J[..., :3] = -rotations.hat(self.y).transpose(0, 2, 1, 3)
+        J[..., 3] = self.y.transpose(0, 2, 1)
+        J[..., 4:] = np.eye(3)[:, None]
+        J *= self.w[:, None, :, None]
+        flat = J.reshape(n, 3, K * UNKNOWNS)
+        force = np.matmul(self.A, self.x[..., None])[..., 0] - self.b
+        normal = np.matmul(flat.transpose(0, 2, 1), np.matmul(self.A, flat)).reshape(n, K, UNKNOWNS, K, UNKNOWNS)
+        per_node = np.matmul(flat.transpose(0, 2, 1), force[..., None]).reshape(-1, UNKNOWNS)
+        return (pattern.gather(pattern.vertex_slots[self.active].reshape(-1),
+                               normal.transpose(0, 1, 3, 2, 4).reshape(-1, UNKNOWNS, UNKNOWNS)),
+                _sum_to(self.carriers.reshape(-1), per_node, pattern.nodes))
+
+
+def data_term(graph: DeformationGraph, motion: NodeMotion, wanted: Pull) -> DataTerm:
     """What matches and landmarks ask of the nodes that carry the vertices."""
     active = np.flatnonzero(np.einsum("nii->n", wanted.A) > 0)
-    y, w, carriers = arms(graph, motion)[active], graph.weights[active], graph.carriers[active]
+    y, w, carriers = arms(graph, motion, active), graph.weights[active], graph.carriers[active]
     x = np.einsum("nk,nkd->nd", w, motion.positions[carriers] + y)
-    J = np.empty((*y.shape[:2], 3, UNKNOWNS))
-    J[..., :3], J[..., 3] = -rotations.hat(y), y
-    J[..., 4:] = np.eye(3)
-    J *= w[:, :, None, None]
-    n, K = w.shape
-    flat = J.transpose(0, 2, 1, 3).reshape(n, 3, K * UNKNOWNS)
-    force = np.einsum("nij,nj->ni", wanted.A[active], x) - wanted.b[active]
-    normal = np.matmul(flat.transpose(0, 2, 1), np.matmul(wanted.A[active], flat))
-    blocks = normal.reshape(n, K, UNKNOWNS, K, UNKNOWNS).transpose(0, 1, 3, 2, 4).reshape(-1, UNKNOWNS, UNKNOWNS)
-    per_node = np.matmul(flat.transpose(0, 2, 1), force[..., None]).reshape(-1, UNKNOWNS)
-    value = float(np.sum(x * force) - np.sum(wanted.b[active] * x) + wanted.c)
-    return Parts(pattern.gather(pattern.vertex_slots[active].reshape(-1), blocks),
-                 _sum_to(carriers.reshape(-1), per_node, pattern.shape[0]), value)
+    return DataTerm(active, carriers, w, y, x, wanted.A[active], wanted.b[active], wanted.c)
 
 
-def stretch_term(graph: DeformationGraph, pattern: NodePattern, motion: NodeMotion, stiffness: float) -> Parts:
+def stretch_term(graph: DeformationGraph, motion: NodeMotion, stiffness: float) -> EdgeTerm:
     """Every node wants to see its neighbours where its own turn and growth would put them.
 
     Parameters
@@ -135,15 +205,14 @@ def stretch_term(graph: DeformationGraph, pattern: NodePattern, motion: NodeMoti
     """
     i, j = graph.edges.T
     rest = graph.edge_vectors
-    w = stiffness**2 * graph.edge_area / np.einsum("ed,ed->e", rest, rest)
     y = np.matmul(motion.linear[i], rest[..., None])[..., 0]
-    r = y - (motion.positions[j] - motion.positions[i])
     Ji, Jj = np.zeros((2, len(i), 3, UNKNOWNS))
     Ji[..., :3], Ji[..., 3], Ji[..., 4:], Jj[..., 4:] = -rotations.hat(y), y, np.eye(3), -np.eye(3)
-    return _edge_parts(graph, pattern, r, Ji, Jj, w)
+    return EdgeTerm(graph.edges, y - (motion.positions[j] - motion.positions[i]), Ji, Jj,
+                    stiffness**2 * graph.edge_area / np.sum(rest**2, axis=1))
 
 
-def bend_term(graph: DeformationGraph, pattern: NodePattern, motion: NodeMotion, stiffness: float) -> Parts:
+def bend_term(graph: DeformationGraph, motion: NodeMotion, stiffness: float) -> EdgeTerm:
     """Neighbours want to turn alike.
 
     Parameters
@@ -153,12 +222,13 @@ def bend_term(graph: DeformationGraph, pattern: NodePattern, motion: NodeMotion,
     """
     i, j = graph.edges.T
     r = rotations.log(motion.R[j] @ motion.R[i].transpose(0, 2, 1))
+    inverse = rotations.inverse_right_jacobian(r)
     Ji, Jj = np.zeros((2, len(i), 3, UNKNOWNS))
-    Ji[..., :3], Jj[..., :3] = -np.eye(3), np.eye(3)
-    return _edge_parts(graph, pattern, r, Ji, Jj, stiffness**2 * graph.edge_area)
+    Ji[..., :3], Jj[..., :3] = -inverse, inverse.transpose(0, 2, 1)
+    return EdgeTerm(graph.edges, r, Ji, Jj, stiffness**2 * graph.edge_area)
 
 
-def growth_term(graph: DeformationGraph, pattern: NodePattern, motion: NodeMotion, stiffness: float) -> Parts:
+def growth_term(graph: DeformationGraph, motion: NodeMotion, stiffness: float) -> EdgeTerm:
     """Neighbours want to grow alike.
 
     Parameters
@@ -167,21 +237,10 @@ def growth_term(graph: DeformationGraph, pattern: NodePattern, motion: NodeMotio
         A factor of e between neighbours costs as much as this distance from the data.
     """
     i, j = graph.edges.T
-    r = (motion.log_scale[j] - motion.log_scale[i])[:, None]
     Ji, Jj = np.zeros((2, len(i), 1, UNKNOWNS))
     Ji[..., 3], Jj[..., 3] = -1, 1
-    return _edge_parts(graph, pattern, r, Ji, Jj, stiffness**2 * graph.edge_area)
-
-
-def _edge_parts(graph: DeformationGraph, pattern: NodePattern, r: np.ndarray, Ji: np.ndarray, Jj: np.ndarray,
-                w: np.ndarray) -> Parts:
-    """Parts of `Σ w |r|²` for residuals (E, d) with Jacobians (E, d, 7) at both ends of each edge."""
-    i, j = graph.edges.T
-    wi, wj = w[:, None, None] * Ji.transpose(0, 2, 1), w[:, None, None] * Jj.transpose(0, 2, 1)
-    blocks = np.concatenate([wi @ Ji, wi @ Jj, wj @ Ji, wj @ Jj])
-    force = np.concatenate([wi @ r[..., None], wj @ r[..., None]])[..., 0]
-    return Parts(pattern.gather(pattern.edge_slots.reshape(-1), blocks),
-                 _sum_to(np.concatenate([i, j]), force, pattern.shape[0]), float(np.einsum("e,ed,ed->", w, r, r)))
+    return EdgeTerm(graph.edges, (motion.log_scale[j] - motion.log_scale[i])[:, None], Ji, Jj,
+                    stiffness**2 * graph.edge_area)
 
 
 def _sum_to(index: np.ndarray, values: np.ndarray, count: int) -> np.ndarray:
@@ -198,13 +257,12 @@ class Stiffness:
     growth: float
 
 
-def terms(graph: DeformationGraph, pattern: NodePattern, motion: NodeMotion, wanted: Pull, stiffness: Stiffness
-          ) -> dict[str, Parts]:
+def terms(graph: DeformationGraph, motion: NodeMotion, wanted: Pull, stiffness: Stiffness) -> dict[str, Term]:
     """All terms of the energy at one state."""
-    return {"data": data_term(graph, pattern, motion, wanted),
-            "stretch": stretch_term(graph, pattern, motion, stiffness.stretch),
-            "bend": bend_term(graph, pattern, motion, stiffness.bend),
-            "growth": growth_term(graph, pattern, motion, stiffness.growth)}
+    return {"data": data_term(graph, motion, wanted),
+            "stretch": stretch_term(graph, motion, stiffness.stretch),
+            "bend": bend_term(graph, motion, stiffness.bend),
+            "growth": growth_term(graph, motion, stiffness.growth)}
 
 
 @dataclass(frozen=True, eq=False)
@@ -226,26 +284,25 @@ def minimise(graph: DeformationGraph, pattern: NodePattern, motion: NodeMotion, 
     tolerance : float
         Relative decrease of the energy below which it has settled.
     """
-    damping, done, settled = 1e-4, 0, False
-    parts = terms(graph, pattern, motion, wanted, stiffness)
-    while done < iterations and not settled:
-        gradient = np.sum([p.gradient for p in parts.values()], axis=0)
-        value = sum(p.value for p in parts.values())
-        H = pattern.matrix(np.sum([p.blocks for p in parts.values()], axis=0))
+    damping, done, settled = 1e-5, 0, False
+    now = terms(graph, motion, wanted, stiffness)
+    value = sum(term.value for term in now.values())
+    while done < iterations and not settled and damping < 1e3:
+        normal = [term.normal(pattern) for term in now.values()]
+        H = pattern.matrix(np.sum([blocks for blocks, _ in normal], axis=0))
+        gradient = np.sum([half for _, half in normal], axis=0).reshape(-1)
         diagonal = H.diagonal()
-        floor = 1e-9 * diagonal.max()
-        while True:
-            D = csc_array(coo_array((damping * diagonal + floor, (np.arange(len(diagonal)),) * 2), shape=H.shape))
-            step = -factor(H + D)(gradient.reshape(-1)).reshape(-1, UNKNOWNS)
+        for _ in range(8):
+            added = damping * diagonal + 1e-9 * diagonal.max()
+            step = -factor(H + csc_array(diags_array(added)))(gradient).reshape(-1, UNKNOWNS)
             trial = motion.moved(step)
-            new = terms(graph, pattern, trial, wanted, stiffness)
-            new_value = sum(p.value for p in new.values())
-            if new_value <= value or damping > 1e3:
+            ahead = terms(graph, trial, wanted, stiffness)
+            ahead_value = sum(term.value for term in ahead.values())
+            if ahead_value <= value:
                 break
-            damping = max(damping, 1e-4) * 10
-        done += 1
-        if new_value > value:
+            damping = max(damping, 1e-5) * 10
+        else:
             break
-        settled = value - new_value <= tolerance * value
-        motion, parts, damping = trial, new, damping / 5
-    return Descent(motion, {name: p.value for name, p in parts.items()}, done, settled)
+        settled = value - ahead_value <= tolerance * value
+        motion, now, value, damping, done = trial, ahead, ahead_value, damping / 5, done + 1
+    return Descent(motion, {name: term.value for name, term in now.items()}, done, settled)

@@ -84,16 +84,20 @@ def start(graph: DeformationGraph, T: np.ndarray, scale: float = 1.0) -> NodeMot
                       scale * graph.nodes @ T[:3, :3].T + T[:3, 3])
 
 
-def arms(graph: DeformationGraph, motion: NodeMotion) -> np.ndarray:
-    """(N, K, 3) from each carrying node to the vertex, as the node sees it after the motion, metres."""
-    local = graph.rest[:, None] - graph.nodes[graph.carriers]
-    return np.matmul(motion.linear[graph.carriers], local[..., None])[..., 0]
+def arms(graph: DeformationGraph, motion: NodeMotion, vertices: np.ndarray) -> np.ndarray:
+    """(n, K, 3) from each carrying node to each of the vertices (n,), as the node sees it, metres."""
+    carriers = graph.carriers[vertices]
+    local = graph.rest[vertices, None] - graph.nodes[carriers]
+    return np.matmul(motion.linear[carriers], local[..., None])[..., 0]
 
 
 def deform(graph: DeformationGraph, motion: NodeMotion) -> np.ndarray:
     """The template's vertices (N, 3) after the motion, metres."""
-    reached = motion.positions[graph.carriers] + arms(graph, motion)
-    return np.einsum("nk,nkd->nd", graph.weights, reached)
+    linear = motion.linear
+    offset = motion.positions - np.matmul(linear, graph.nodes[..., None])[..., 0]
+    affine = np.concatenate([linear, offset[..., None]], axis=2).reshape(-1, 12)
+    blended = np.einsum("nk,nkc->nc", graph.weights, affine[graph.carriers]).reshape(-1, 3, 4)
+    return np.matmul(blended[..., :3], graph.rest[..., None])[..., 0] + blended[..., 3]
 
 
 def carry_over(old: DeformationGraph, motion: NodeMotion, new: DeformationGraph) -> NodeMotion:

@@ -29,6 +29,11 @@ class Target:
     border: np.ndarray
     oriented: bool
 
+    def thinned(self, cell: float) -> Target:
+        """One point for each cubic cell (metres)."""
+        keep = thin(self.points, cell)
+        return Target(self.points[keep], self.normals[keep], self.border[keep], self.oriented)
+
 
 def target_of(scan: Mesh | np.ndarray, neighbours: int = 16, name: str = "scan") -> Target:
     """Prepare a scan: normals averaged over neighbours, borders marked.
@@ -72,12 +77,11 @@ def _one_sided(points: np.ndarray, near: np.ndarray, limit: float = 0.3) -> np.n
     return np.linalg.norm(offset.mean(axis=1), axis=1) > limit * reach
 
 
-def thin(target: Target, cell: float) -> Target:
-    """One point for each cubic cell (metres) that holds any: even density, and less work."""
-    key = np.floor((target.points - target.points.min(axis=0)) / cell).astype(np.int64)
+def thin(points: np.ndarray, cell: float) -> np.ndarray:
+    """Indices of one point for each cubic cell (metres) that holds any: even density, and less work."""
+    key = np.floor((points - points.min(axis=0)) / cell).astype(np.int64)
     key = (key[:, 0] * (key[:, 1].max() + 1) + key[:, 1]) * (key[:, 2].max() + 1) + key[:, 2]
-    keep = np.unique(key, return_index=True)[1]
-    return Target(target.points[keep], target.normals[keep], target.border[keep], target.oriented)
+    return np.sort(np.unique(key, return_index=True)[1])
 
 
 @dataclass(frozen=True, eq=False)
@@ -111,7 +115,7 @@ def orient(target: Target, deformed: Mesh, scale: float) -> Target:
     return replace(target, normals=np.where(cost[0] <= cost[1], 1, -1)[:, None] * target.normals)
 
 
-def match_both_ways(deformed: Mesh, areas: np.ndarray, target: Target, reach: float, slide: float,
+def match_both_ways(deformed: Mesh, sample: np.ndarray, area: float, target: Target, reach: float, slide: float,
                     scale: float) -> Matching:
     """Match template to scan and scan to template, and weigh the matches by their distance.
 
@@ -119,8 +123,10 @@ def match_both_ways(deformed: Mesh, areas: np.ndarray, target: Target, reach: fl
     ----------
     deformed : Mesh
         The template as it lies now.
-    areas : (N,) float, square metres
-        What each vertex stands for.
+    sample : (n,) int
+        Vertices that look for a match; points of the scan may choose any vertex.
+    area : float, square metres
+        Of the template; either direction weighs as much as this.
     reach : float, metres
         Matches farther apart than this do not count; the weight falls to zero towards it.
     slide : float
@@ -130,20 +136,19 @@ def match_both_ways(deformed: Mesh, areas: np.ndarray, target: Target, reach: fl
     """
     target = orient(target, deformed, scale)
     x, normals, N = deformed.vertices, deformed.vertex_normals, len(deformed.vertices)
-    forward = OrientedPoints(target.points, target.normals, scale).match(x, normals, reach)
+    forward = OrientedPoints(target.points, target.normals, scale).match(x[sample], normals[sample], reach)
     good = forward.valid & ~target.border[forward.index]
-    v, p = np.flatnonzero(good), forward.index[good]
-    weights = areas[v] * _robust(forward.distances[v], reach)
+    v, p = sample[good], forward.index[good]
+    weights = area / len(sample) * _robust(forward.distances[good], reach)
     wanted = pull(N, v, target.points[p], weights, target.normals[p], slide)
     distances = np.full(N, np.nan)
     distances[v] = np.abs(np.einsum("nd,nd->n", target.normals[p], x[v] - target.points[p]))
 
     backward = OrientedPoints(x, normals, scale).match(target.points, target.normals, reach)
     p = np.flatnonzero(backward.valid)
-    share = areas.sum() / len(target.points)
-    wanted += pull(N, backward.index[p], target.points[p], share * _robust(backward.distances[p], reach),
-                   target.normals[p], slide)
-    return Matching(wanted, good, distances)
+    weights = area / len(target.points) * _robust(backward.distances[p], reach)
+    wanted += pull(N, backward.index[p], target.points[p], weights, target.normals[p], slide)
+    return Matching(wanted, np.isfinite(distances), distances)
 
 
 def _robust(distances: np.ndarray, reach: float) -> np.ndarray:

@@ -42,7 +42,7 @@ class GraphStage:
     rounds : int
         Times that matches are sought anew; without matches, most steps.
     detail : float
-        Spacing to which the scan is thinned.
+        Spacing to which scan and template are thinned for matching.
     """
 
     nodes: int
@@ -53,7 +53,7 @@ class GraphStage:
     reach: float
     slide: float = 0.1
     rounds: int = 8
-    detail: float = 0.014
+    detail: float = 0.02
 
 
 @dataclass(frozen=True)
@@ -196,7 +196,7 @@ class _Fit:
                  config: RegistrationConfig, progress: Callable[[int, int], None]) -> None:
         self.template, self.target, self.landmarks, self.config = template, target, landmarks, config
         self.size = float(np.sqrt(template.face_areas.sum()))
-        self.areas = template.vertex_areas
+        self.all = np.arange(len(template.vertices))
         self.progress, self.done = progress, 0
         self.total = sum(stage.rounds for stage in config.graph) + len(config.shell)
         self.energies: dict[str, float] = {}
@@ -226,9 +226,12 @@ class _Fit:
         graph, size = self.graph, self.size
         stiffness = Stiffness(stage.stretch * size, stage.bend * size, stage.growth * size)
         held = self.landmark_pull(stage.landmarks)
-        target = thin(self.target, stage.detail * size)
+        target = self.target.thinned(stage.detail * size)
+        sample = thin(self.template.vertices, stage.detail * size)
         for _ in range(stage.rounds if stage.reach else 1):
-            wanted = held + self.matches(target, stage.reach, stage.slide).wanted if stage.reach else held
+            wanted = held
+            if stage.reach:
+                wanted = held + self.matches(target, sample, stage.reach, stage.slide).wanted
             steps = 1 if stage.reach else stage.rounds
             found = minimise(graph, self.pattern, self.motion, wanted, stiffness, steps, 1e-3)
             self.motion, self.energies = found.motion, found.energies
@@ -246,19 +249,20 @@ class _Fit:
     def follow(self, stage: ShellStage) -> None:
         """One round of the last pass."""
         self.shell = self.shell or Shell(self.template)
-        wanted = self.matches(self.target, stage.reach, stage.slide).wanted + self.landmark_pull(stage.landmarks)
+        matching = self.matches(self.target, self.all, stage.reach, stage.slide)
+        wanted = matching.wanted + self.landmark_pull(stage.landmarks)
         x = self.shell.displaced(self.x, wanted, stage.smoothing * self.size, stage.tension * self.size)
         self.energies["shell"] = wanted.energy(x)
         self._advance(x, 1)
 
-    def matches(self, target: Target, reach: float, slide: float) -> Matching:
+    def matches(self, target: Target, sample: np.ndarray, reach: float, slide: float) -> Matching:
         """Matches with the template as it lies now; `reach` as a multiple of its size."""
-        return match_both_ways(self.template.with_vertices(self.x), self.areas, target, reach * self.size, slide,
-                               self.config.normal_weight * self.size)
+        return match_both_ways(self.template.with_vertices(self.x), sample, self.size**2, target,
+                               reach * self.size, slide, self.config.normal_weight * self.size)
 
     def result(self) -> Registration:
         last = (self.config.shell or self.config.graph)[-1]
-        matching = self.matches(self.target, last.reach, last.slide)
+        matching = self.matches(self.target, self.all, last.reach, last.slide)
         seen = matching.distances[matching.seen]
         landmark_rms = np.nan
         if self.landmarks is not None:
