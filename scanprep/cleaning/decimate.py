@@ -78,8 +78,8 @@ def decimate(mesh: Mesh, faces: int, config: DecimateConfig | None = None) -> Me
 def _quadric(mesh: Mesh, faces: int) -> Mesh:
     import igl
 
-    vertices, triangles = igl.qslim(np.asfortranarray(mesh.vertices), np.asfortranarray(mesh.faces, dtype=np.int32),
-                                    faces)[:2]
+    vertices, triangles = igl.qslim(np.asfortranarray(mesh.vertices),
+                                    np.asfortranarray(mesh.faces, dtype=np.int32), faces)[:2]
     return Mesh(vertices, triangles)
 
 

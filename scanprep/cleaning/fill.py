@@ -152,7 +152,7 @@ class _Patch:
     def refine(self, density: float) -> None:
         """Cut triangles at their centroids until they are as small as those around the hole."""
         size = self._edge_size()
-        self.flip(min_cosine=-0.5)
+        self.flip(min_cosine=-1)
         for _ in range(25):
             v, faces = self.mesh.vertices, self.mesh.faces[self.old_faces:]
             centre = v[faces].mean(axis=1)
@@ -169,7 +169,7 @@ class _Patch:
             self.mesh = Mesh(np.concatenate([v, centre[cut]]),
                              np.concatenate([self.mesh.faces[:self.old_faces], faces, more]))
             size = np.concatenate([size, wanted[cut]])
-            self.flip(min_cosine=-0.5)
+            self.flip(min_cosine=-1)
 
     def _edge_size(self) -> np.ndarray:
         """Mean length of the existing edges at every vertex; for a vertex without one, the mean of all."""

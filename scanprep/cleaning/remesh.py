@@ -26,7 +26,7 @@ def flip_edges(mesh: Mesh, allowed: np.ndarray | None = None, rounds: int = 20, 
         Triangles that may change; an edge is turned only between two of them.
     rounds : int
     min_cosine : float
-        Edges whose triangles meet at a sharper angle stay, and no turn makes a sharper one.
+        Edges whose triangles meet at a sharper angle stay, and no turn makes a sharper one; -1 turns all.
 
     Returns
     -------
@@ -62,8 +62,10 @@ def _flip_once(v: np.ndarray, faces: np.ndarray, allowed: np.ndarray, min_cosine
     old = _normal(v, a, b, c), _normal(v, b, a, d)
     new = _normal(v, a, d, c), _normal(v, d, b, c)
     mean = old[0] + old[1]
-    good = ((_dot(*old) > min_cosine) & (_dot(*new) > min_cosine) & (_dot(new[0], mean) > 0)
-            & (_dot(new[1], mean) > 0))
+    good = np.ones(len(h), dtype=bool)
+    if min_cosine > -1:
+        good = (_dot(*old) > min_cosine) & (_dot(*new) > min_cosine) & (_dot(new[0], mean) > 0)
+        good &= _dot(new[1], mean) > 0
     h, g, a, b, c, d, gain, ends = (x[good] for x in (h, g, a, b, c, d, gain, ends))
     best = np.zeros(len(faces))
     np.maximum.at(best, face[h], gain)

@@ -5,7 +5,7 @@ import heapq
 
 import numpy as np
 
-ANGLE_STEP = 0.05        # differences of 1 - cos below this count as none, and area decides
+ANGLE_STEP = 0.5         # bends (1 - cos) are told apart in steps of this; within one step, area decides
 
 
 def triangulate_loop(points: np.ndarray, rim_normals: np.ndarray, forbidden: np.ndarray,
