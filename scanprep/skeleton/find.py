@@ -6,7 +6,7 @@ from collections.abc import Callable
 import numpy as np
 
 from ..geometry.mesh import Mesh, check_template
-from .joints import middle_part, place_joints, to_tree
+from .joints import middle_part, place_joints, refine_tree, to_tree
 from .motions import PosedSurface
 from .parts import PartSearch, SkeletonConfig, find_parts
 from .tree import Skeleton, reorder
@@ -44,11 +44,11 @@ def find_skeleton(template: Mesh, poses: np.ndarray, config: SkeletonConfig | No
     poses = _checked_poses(template, poses)
     surface = PosedSurface(template, poses)
     search = PartSearch(surface, config)
-    label = find_parts(surface, config, lambda done, total: tell(done, total + 1))
-    label, links = to_tree(search, label)
-    motions = search.motions(label)
-    joints = place_joints(search, label, motions, links)
-    tell(5, 5)
+    label, links = to_tree(search, find_parts(search, lambda done, total: tell(done, total + 1)))
+    if config.parts is not None:
+        label, links = refine_tree(search, label, links, config.parts)
+    joints = place_joints(search, label, surface.core_motions(label), links)
+    tell(4, 4)
     return _assemble(template, label, links, joints)
 
 

@@ -9,7 +9,8 @@ from .motions import Motions, fit_motions, union_costs
 from .parts import PartSearch
 
 WEAK_CONTACT = 0.2               # of the longer borders of both parts: thighs that touch are not linked
-PULL_TO_RING = 0.01              # squared radians: turns smaller than 0.1 say little about where the joint is
+LEAST_PULL = 1e-4                # squared radians: turns below 0.01 say nothing about where a joint is
+PRIOR_WIDTH = 3.0                # of the border's radius: how far from its centroid a joint is expected
 
 
 def border_lengths(search: PartSearch, label: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -78,6 +79,29 @@ def to_tree(search: PartSearch, label: np.ndarray) -> tuple[np.ndarray, np.ndarr
         label = search.alternate(np.where(label == b, a, label), rounds=4)
 
 
+def refine_tree(search: PartSearch, label: np.ndarray, links: np.ndarray, count: int
+                ) -> tuple[np.ndarray, np.ndarray]:
+    """Cut parts of a tree, the one that bends most first, until there are `count` and still a tree.
+
+    Raises
+    ------
+    ValueError
+        No part can be cut so that a tree remains.
+    """
+    while len(links) + 1 < count:
+        cuts = sorted((search.split(label, p) for p in range(len(links) + 1)),
+                      key=lambda cut: -cut[1])
+        for cut, apart in cuts:
+            parts = int(cut.max()) + 1
+            trial = without_weak(*border_lengths(search, cut), parts)
+            if apart > 0 and len(trial) == parts - 1:
+                label, links = cut, trial
+                break
+        else:
+            raise ValueError(f"parts: no tree of {count} parts was found, only one of {len(links) + 1}")
+    return label, links
+
+
 def place_joints(search: PartSearch, label: np.ndarray, motions: Motions, links: np.ndarray) -> np.ndarray:
     """Points on the template that both parts of a link carry to the same place in every pose.
 
@@ -103,11 +127,24 @@ def place_joints(search: PartSearch, label: np.ndarray, motions: Motions, links:
     for n, (a, b) in enumerate(links):
         border = (both == [min(a, b), max(a, b)]).all(axis=1)
         ring = np.average(middle[border], axis=0, weights=s.pair_lengths[border])
+        radius = np.sqrt(np.average(((middle[border] - ring)**2).sum(axis=1), weights=s.pair_lengths[border]))
         dR = motions.R[a] - motions.R[b]
-        gap = motions.t[a] - motions.t[b] + dR @ ring
-        normal = np.einsum("mki,mkj->ij", dR, dR) / len(dR) + PULL_TO_RING * np.eye(3)
-        joints[n] = ring - np.linalg.solve(normal, np.einsum("mki,mk->i", dR, gap) / len(dR))
+        joints[n] = ring + _meeting_point(dR, motions.t[a] - motions.t[b] + dR @ ring, radius)
     return joints + s.origin
+
+
+def _meeting_point(dR: np.ndarray, gap: np.ndarray, radius: float) -> np.ndarray:
+    """The c (3,) that makes `dR c + gap` (M, 3) small, drawn to 0 where the poses do not settle it.
+
+    The pull is that of a prior of a few times `radius` beside the error that no c removes.
+    """
+    A = np.einsum("mki,mkj->ij", dR, dR) / len(dR)
+    b = np.einsum("mki,mk->i", dR, gap) / len(dR)
+    pull = LEAST_PULL
+    for _ in range(2):
+        c = -np.linalg.solve(A + pull * np.eye(3), b)
+        pull = max(LEAST_PULL, float(((dR @ c + gap)**2).sum(axis=1).mean()) / (PRIOR_WIDTH * radius)**2)
+    return c
 
 
 def middle_part(areas: np.ndarray, centres: np.ndarray, links: np.ndarray, joints: np.ndarray) -> int:

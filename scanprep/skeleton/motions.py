@@ -42,7 +42,7 @@ class Moments:
     def _each(self) -> tuple[np.ndarray, ...]:
         return self.w, self.x, self.y, self.yx, self.xx, self.yy
 
-    def __getitem__(self, sets: np.ndarray) -> Moments:
+    def __getitem__(self, sets: np.ndarray | slice) -> Moments:
         """The sums of some of the sets."""
         return Moments(*(a[sets] for a in self._each()))
 
@@ -118,21 +118,38 @@ class PosedSurface:
         self.pairs = template.face_pairs
         self.pair_lengths = template.edge_lengths[template.edge_use == 2]
 
-    def moments(self, label: np.ndarray) -> Moments:
-        """Sums over the triangles of every label; a third of a triangle's area goes to each corner.
+    def moments(self, label: np.ndarray, face_weights: np.ndarray | None = None) -> Moments:
+        """Sums over the triangles of every label; a third of a triangle's weight goes to each corner.
 
         Parameters
         ----------
         label : (F,) int, 0..P-1
+        face_weights : (F,) float, optional
+            Instead of the areas.
         """
+        weights = self.face_weights if face_weights is None else face_weights
         rows, columns = np.repeat(label, 3), self.mesh.faces.ravel()
-        W = csr_array(coo_array((np.repeat(self.face_weights / 3, 3), (rows, columns)),
+        W = csr_array(coo_array((np.repeat(weights / 3, 3), (rows, columns)),
                                 shape=(label.max() + 1, len(self.x))))
         n, M = self.y.shape[:2]
         flat = self.y.reshape(n, -1)
         yx = np.stack([(W @ (flat * self.x[:, [i]])).reshape(-1, M, 3) for i in range(3)], axis=-1)
         return Moments(np.asarray(W.sum(axis=1)).ravel(), W @ self.x, (W @ flat).reshape(-1, M, 3), yx,
                        W @ np.einsum("ni,ni->n", self.x, self.x), W @ self._yy)
+
+    def core_motions(self, label: np.ndarray) -> Motions:
+        """Rigid motions (of parts (F,)) from the triangles that do not touch another part.
+
+        At a border the surface follows both parts. A part that has little else is fitted as a whole.
+        """
+        corner = self.mesh.faces
+        low, high = np.full(len(self.x), label.max()), np.zeros(len(self.x), dtype=np.int64)
+        for c in corner.T:
+            np.minimum.at(low, c, label)
+            np.maximum.at(high, c, label)
+        core = np.where((low == high)[corner].all(axis=1), self.face_weights, 0)
+        share = np.bincount(label, core) / np.bincount(label, self.face_weights)
+        return fit_motions(self.moments(label, np.where((share > 0.3)[label], core, self.face_weights)))
 
     def face_costs(self, motions: Motions) -> np.ndarray:
         """(F, P) square metres: what each triangle would cost under each motion, mean over the poses.

@@ -69,6 +69,7 @@ class PartSearch:
         self.surface, self.config = surface, config
         self.floor = config.tolerance**2 * surface.area
         self.width = config.smoothness * BORDER_WIDTH / np.sqrt(surface.area)
+        self.patch = cover(surface, min(config.patches, len(surface.face_weights)))
 
     def motions(self, label: np.ndarray) -> Motions:
         """Rigid motions of the parts (the M-step)."""
@@ -126,7 +127,7 @@ class PartSearch:
                 return label
             label = np.where(label == pairs[least, 1], pairs[least, 0], label)
 
-    def split(self, label: np.ndarray, part: int, patch: np.ndarray) -> tuple[np.ndarray, float]:
+    def split(self, label: np.ndarray, part: int) -> tuple[np.ndarray, float]:
         """Cut one part in two where it bends most.
 
         Returns
@@ -138,7 +139,7 @@ class PartSearch:
         """
         s = self.surface
         inside = np.flatnonzero(label == part)
-        number = np.unique(patch[inside], return_inverse=True)[1]
+        number = np.unique(self.patch[inside], return_inverse=True)[1]
         local = np.zeros(len(label), dtype=np.int64)             # 0 outside, halves 1 and 2
         local[inside] = number + 1
         among = self.contacts(local)
@@ -166,7 +167,7 @@ class PartSearch:
         return (union_costs(moments, pairs) + floor) / (two + floor)
 
 
-def find_parts(surface: PosedSurface, config: SkeletonConfig,
+def find_parts(search: PartSearch,
                progress: Callable[[int, int], None] | None = None) -> np.ndarray:
     """Labels of triangles such that every label moves rigidly through the poses, as nearly as can be.
 
@@ -175,8 +176,7 @@ def find_parts(surface: PosedSurface, config: SkeletonConfig,
 
     Parameters
     ----------
-    surface : PosedSurface
-    config : SkeletonConfig
+    search : PartSearch
     progress : callable(done, total), optional
 
     Returns
@@ -186,28 +186,26 @@ def find_parts(surface: PosedSurface, config: SkeletonConfig,
     [Articulated]
     """
     tell = progress or (lambda done, total: None)
-    search = PartSearch(surface, config)
-    patch = cover(surface, min(config.patches, len(surface.face_weights)))
-    tell(1, 4)
+    config, patch = search.config, search.patch
     start = max(config.start, 2 * (config.parts or 0))
-    label = agglomerate(surface.moments(patch), search.contacts(patch), start)[patch]
+    label = agglomerate(search.surface.moments(patch), search.contacts(patch), start)[patch]
     label = search.join_down(label, config.parts)
-    tell(2, 4)
-    label = _split_and_join(search, label, patch)
-    tell(3, 4)
+    tell(1, 3)
+    label = _split_and_join(search, label)
+    tell(2, 3)
     label = search.alternate(label, rounds=10)
-    tell(4, 4)
+    tell(3, 3)
     return label
 
 
-def _split_and_join(search: PartSearch, label: np.ndarray, patch: np.ndarray) -> np.ndarray:
+def _split_and_join(search: PartSearch, label: np.ndarray) -> np.ndarray:
     """Cut parts and join again, as long as that gives more parts, or as many that fit better."""
     wanted = search.config.parts
     limit = search.config.separation
     tried: set[bytes] = set()
     for _ in range(2 * search.config.start):
         found = label.max() + 1
-        cuts = [search.split(label, part, patch) for part in range(found)]
+        cuts = [search.split(label, part) for part in range(found)]
         worth = [c for c in cuts if c[1] > 0 and c[0].tobytes() not in tried
                  and (c[1] >= limit or (wanted is not None and found < wanted))]
         if not worth:

@@ -1,0 +1,228 @@
+"""Parts, tree and joints of a figure of boxes that moves exactly as told."""
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+import pytest
+
+from scanprep.geometry import rotations
+from scanprep.geometry.mesh import Mesh, check_template
+from scanprep.skeleton.find import find_skeleton
+from scanprep.skeleton.parts import SkeletonConfig
+from scanprep.skeleton.tree import Skeleton
+
+CELL = 0.04
+#         name       from            to            parent  joint
+BOXES = [("torso", (-4, -2, 0), (4, 2, 10), -1, (0, 0, 5)),          # no two parts of one size
+         ("head", (-2, -2, 10), (2, 2, 15), 0, (0, 0, 10)),
+         ("upper arm l", (4, -1, 7), (11, 1, 9), 0, (4, 0, 8)),
+         ("upper arm r", (-10, -1, 7), (-4, 1, 9), 0, (-4, 0, 8)),
+         ("thigh l", (1, -2, -8), (4, 2, 0), 0, (2.5, 0, 0)),
+         ("thigh r", (-4, -2, -7), (-1, 2, 0), 0, (-2.5, 0, 0)),
+         ("forearm l", (11, -1, 7), (20, 1, 9), 2, (11, 0, 8)),
+         ("forearm r", (-18, -1, 7), (-10, 1, 9), 3, (-10, 0, 8)),
+         ("shin l", (1, -2, -15), (4, 2, -8), 4, (2.5, 0, -8)),
+         ("shin r", (-4, -2, -13), (-1, 2, -7), 5, (-2.5, 0, -7))]
+PARENTS = np.array([box[3] for box in BOXES])
+JOINTS = CELL * np.array([box[4] for box in BOXES])
+
+
+def surface_of_cells(cells: set[tuple[int, int, int]]) -> Mesh:
+    """The outside of a set of unit cells, as triangles."""
+    corner_number: dict[tuple[int, int, int], int] = {}
+    faces = []
+    for cell in sorted(cells):
+        for axis in range(3):
+            for side in (0, 1):
+                beyond = list(cell)
+                beyond[axis] += 2 * side - 1
+                if tuple(beyond) in cells:
+                    continue
+                quad = []
+                for u, v in ((0, 0), (1, 0), (1, 1), (0, 1)):
+                    corner = list(cell)
+                    corner[axis] += side
+                    corner[(axis + 1) % 3] += u
+                    corner[(axis + 2) % 3] += v
+                    quad.append(corner_number.setdefault(tuple(corner), len(corner_number)))
+                quad = quad if side else quad[::-1]
+                faces += [[quad[0], quad[1], quad[2]], [quad[0], quad[2], quad[3]]]
+    return Mesh(CELL * np.array(list(corner_number)), np.array(faces))
+
+
+@dataclass(frozen=True)
+class Figure:
+    template: Mesh
+    part_of_vertex: np.ndarray
+
+    @property
+    def pure(self) -> np.ndarray:
+        """(F,) the part of triangles whose corners all follow the same part, -1 elsewhere."""
+        corners = self.part_of_vertex[self.template.faces]
+        return np.where((corners == corners[:, :1]).all(axis=1), corners[:, 0], -1)
+
+    def posed(self, pose: np.ndarray, trans: np.ndarray) -> np.ndarray:
+        R, place = np.empty((len(PARENTS), 3, 3)), np.empty((len(PARENTS), 3))
+        for j, parent in enumerate(PARENTS):
+            R[j] = rotations.exp(pose[j]) if parent < 0 else R[parent] @ rotations.exp(pose[j])
+            place[j] = trans if parent < 0 else place[parent] + R[parent] @ (JOINTS[j] - JOINTS[parent])
+        p = self.part_of_vertex
+        return np.einsum("nij,nj->ni", R[p], self.template.vertices - JOINTS[p]) + place[p]
+
+    def poses(self, count: int, rng: np.random.Generator, still: tuple[int, ...] = ()) -> np.ndarray:
+        turns = rng.normal(0, 0.4, (count, len(PARENTS), 3))
+        turns[:, still] = 0
+        return np.stack([self.posed(pose, rng.normal(0, 0.3, 3)) for pose in turns])
+
+
+@pytest.fixture(scope="module")
+def figure() -> Figure:
+    cells = {(x, y, z) for _, low, high, *_ in BOXES for x in range(low[0], high[0])
+             for y in range(low[1], high[1]) for z in range(low[2], high[2])}
+    template = surface_of_cells(cells)
+    check_template(template)
+    part = np.zeros(len(template.vertices), dtype=np.int64)
+    for p, (_, low, high, *_) in enumerate(BOXES):
+        inside = ((template.vertices > CELL * np.array(low) - 1e-9)
+                  & (template.vertices < CELL * np.array(high) + 1e-9)).all(axis=1)
+        part[inside] = p              # the ring between two parts follows the child
+    return Figure(template, part)
+
+
+@pytest.fixture(scope="module")
+def poses(figure: Figure) -> np.ndarray:
+    return figure.poses(12, np.random.default_rng(5))
+
+
+@pytest.fixture(scope="module")
+def found(figure: Figure, poses: np.ndarray) -> Skeleton:
+    return find_skeleton(figure.template, poses)
+
+
+def match(figure: Figure, skeleton: Skeleton) -> np.ndarray:
+    """The found part of every true one, after checking that they share all triangles that are not between."""
+    pure = figure.pure
+    pairs = np.unique(np.stack([pure, skeleton.part_of_face], axis=1)[pure >= 0], axis=0)
+    assert len(pairs) == len(np.unique(pairs[:, 1])), "a found part holds triangles of two true ones"
+    assert len(pairs) == len(np.unique(pairs[:, 0])), "a true part is spread over two found ones"
+    return pairs[:, 1]
+
+
+def test_parts_tree_and_joints_of_the_figure_are_found(figure: Figure, found: Skeleton) -> None:
+    part = match(figure, found)
+    assert len(found.parents) == len(BOXES)
+    assert part[0] == 0
+    assert [found.parents[part[j]] for j in range(1, len(BOXES))] == [part[p] for p in PARENTS[1:]]
+    assert np.linalg.norm(found.joints[part[1:]] - JOINTS[1:], axis=1).max() < 1e-4
+    root = found.part_of_vertex(figure.template) == 0
+    assert np.allclose(found.joints[0], figure.template.vertices[root].mean(axis=0), atol=1e-12)
+
+
+def test_parts_that_never_move_against_each_other_are_one(figure: Figure) -> None:
+    forearm, head = 6, 1
+    poses = figure.poses(12, np.random.default_rng(6), still=(forearm, head))
+    skeleton = find_skeleton(figure.template, poses)
+    assert len(skeleton.parents) == len(BOXES) - 2
+    pure = figure.pure
+    for together in ({0, head}, {2, forearm}):
+        assert len(set(skeleton.part_of_face[np.isin(pure, list(together))])) == 1
+    assert len(set(skeleton.part_of_face[np.isin(pure, [0, 2])])) == 2
+
+
+def test_a_body_that_does_not_move_is_one_part(figure: Figure) -> None:
+    poses = np.stack([figure.template.vertices @ rotations.exp([0, 0.3 * k, 1.0]).T + k for k in range(4)])
+    skeleton = find_skeleton(figure.template, poses)
+    assert skeleton.parents.tolist() == [-1]
+    assert np.allclose(skeleton.joints[0], figure.template.vertices.mean(axis=0), atol=1e-12)
+
+
+@pytest.mark.parametrize("count", [4, 9])
+def test_an_exact_number_of_parts_is_kept(figure: Figure, poses: np.ndarray, count: int) -> None:
+    skeleton = find_skeleton(figure.template, poses, SkeletonConfig(parts=count))
+    assert len(skeleton.parents) == count
+
+
+def test_more_parts_than_can_be_told_apart_are_refused(figure: Figure, poses: np.ndarray) -> None:
+    with pytest.raises(ValueError, match="parts: no tree of 200 parts"):
+        find_skeleton(figure.template, poses, SkeletonConfig(parts=200))
+
+
+def test_moving_the_bodies_and_the_template_changes_nothing_but_the_place(
+        figure: Figure, poses: np.ndarray, found: Skeleton) -> None:
+    rng = np.random.default_rng(7)
+    R, t = rotations.exp(rng.normal(0, 2, (len(poses), 3))), rng.normal(0, 3, (len(poses), 1, 3))
+    R0, t0 = rotations.exp([0.4, -1.2, 0.7]), np.array([10.0, -4.0, 2.0])
+    moved = figure.template.with_vertices(figure.template.vertices @ R0.T + t0)
+    skeleton = find_skeleton(moved, np.einsum("mij,mnj->mni", R, poses) + t)
+    assert np.array_equal(match(figure, skeleton), match(figure, found))
+    assert np.array_equal(skeleton.parents, found.parents)
+    assert np.allclose(skeleton.joints[1:], found.joints[1:] @ R0.T + t0, atol=1e-4)
+
+
+def test_millimetres_give_the_same_parts(figure: Figure, poses: np.ndarray, found: Skeleton) -> None:
+    large = figure.template.with_vertices(1000 * figure.template.vertices)
+    skeleton = find_skeleton(large, 1000 * poses)
+    assert np.array_equal(skeleton.part_of_face, found.part_of_face)
+    assert np.allclose(skeleton.joints, 1000 * found.joints, atol=1e-6)
+
+
+def test_the_order_of_vertices_and_faces_does_not_matter(
+        figure: Figure, poses: np.ndarray, found: Skeleton) -> None:
+    rng = np.random.default_rng(8)
+    mesh = figure.template
+    old, old_face = rng.permutation(len(mesh.vertices)), rng.permutation(len(mesh.faces))
+    new = np.argsort(old)
+    shuffled = Figure(Mesh(mesh.vertices[old], new[mesh.faces[old_face]]), figure.part_of_vertex[old])
+    skeleton = find_skeleton(shuffled.template, poses[:, old])
+    part, before = match(shuffled, skeleton), match(figure, found)
+    assert np.allclose(skeleton.joints[part[1:]], found.joints[before[1:]], atol=1e-4)
+
+
+def test_the_same_input_gives_the_same_bytes(figure: Figure, poses: np.ndarray, found: Skeleton) -> None:
+    again = find_skeleton(figure.template, poses)
+    assert again.joints.tobytes() == found.joints.tobytes()
+    assert again.part_of_face.tobytes() == found.part_of_face.tobytes()
+
+
+def test_noise_leaves_the_parts(figure: Figure, poses: np.ndarray) -> None:
+    noisy = poses + np.random.default_rng(9).normal(0, 0.005, poses.shape)
+    part = match(figure, skeleton := find_skeleton(figure.template, noisy))
+    assert len(skeleton.parents) == len(BOXES)
+    assert np.linalg.norm(skeleton.joints[part[1:]] - JOINTS[1:], axis=1).max() < 0.01
+
+
+def test_progress_ends_at_its_total(figure: Figure, poses: np.ndarray) -> None:
+    seen: list[tuple[int, int]] = []
+    find_skeleton(figure.template, poses, progress=lambda done, total: seen.append((done, total)))
+    assert [done for done, _ in seen] == sorted(done for done, _ in seen)
+    assert seen[-1][0] == seen[-1][1] and len({total for _, total in seen}) == 1
+
+
+def test_bad_poses_are_refused_by_name(figure: Figure, poses: np.ndarray) -> None:
+    template = figure.template
+    with pytest.raises(ValueError, match=r"poses: expected shape \(M, \d+, 3\)"):
+        find_skeleton(template, poses[:, 1:])
+    with pytest.raises(ValueError, match="poses: expected shape"):
+        find_skeleton(template, poses[0])
+    with pytest.raises(ValueError, match="poses: expected at least 3, got 2"):
+        find_skeleton(template, poses[:2])
+    broken = poses.copy()
+    broken[4, 17, 1] = np.nan
+    with pytest.raises(ValueError, match="poses: 1 have vertices that are not finite, the first is pose 4"):
+        find_skeleton(template, broken)
+
+
+def test_a_template_in_two_pieces_is_refused(figure: Figure, poses: np.ndarray) -> None:
+    mesh = figure.template
+    n = len(mesh.vertices)
+    double = Mesh(np.vstack([mesh.vertices, mesh.vertices + 9]), np.vstack([mesh.faces, mesh.faces + n]))
+    with pytest.raises(ValueError, match="template: not usable as a template, it has 2 components"):
+        find_skeleton(double, np.concatenate([poses, poses + 9], axis=1))
+
+
+@pytest.mark.parametrize(("name", "value"), [("parts", 0), ("separation", 1.0), ("smoothness", -1.0),
+                                             ("tolerance", 0.0), ("smallest", float("nan"))])
+def test_bad_settings_are_refused_by_name(name: str, value: float) -> None:
+    with pytest.raises(ValueError, match=name):
+        replace(SkeletonConfig(), **{name: value})
