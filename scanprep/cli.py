@@ -159,7 +159,7 @@ def align(source: MeshArg, target: TargetArg, output: Output, landmarks: Path | 
                                           read_landmarks(target_landmarks, fixed, unit))
         T = align_landmarks(mine, theirs).T_target_source
     placed = moving.with_vertices(moving.vertices @ T[:3, :3].T + T[:3, 3])
-    found = align_rigid(placed, fixed, config)
+    found = align_rigid(placed, fixed, config=config)
     T = found.T_target_source @ T
     write_mesh(output, moving.with_vertices(moving.vertices @ T[:3, :3].T + T[:3, 3]))
     return Outcome(output, [
