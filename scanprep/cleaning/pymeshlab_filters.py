@@ -1,0 +1,55 @@
+"""Filters of MeshLab.
+
+pymeshlab is licensed under the GPL, version 3. It is imported in this file alone, when one of these functions is
+called; a program that distributes pymeshlab together with this package must respect that licence.
+"""
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+
+from ..geometry.mesh import Mesh
+from .open3d_filters import MISSING, MissingLibrary, recolored
+
+
+def quadric_decimation(mesh: Mesh, faces: int) -> Mesh:
+    """Fewer triangles by MeshLab's quadric edge collapses, keeping the topology.
+
+    Raises
+    ------
+    MissingLibrary
+        pymeshlab cannot be imported.
+    """
+    meshes = _meshes(mesh)
+    meshes.meshing_decimation_quadric_edge_collapse(targetfacenum=faces, preservetopology=True, preserveboundary=True)
+    return _result(meshes)
+
+
+def poisson(mesh: Mesh, depth: int = 8) -> Mesh:
+    """A closed surface near the mesh by screened Poisson reconstruction.
+
+    Raises
+    ------
+    MissingLibrary
+        pymeshlab cannot be imported.
+    """
+    meshes = _meshes(mesh)
+    meshes.generate_surface_reconstruction_screened_poisson(depth=depth)
+    return recolored(_result(meshes), mesh)
+
+
+def _meshes(mesh: Mesh) -> Any:
+    try:
+        import pymeshlab
+    except (ImportError, OSError) as error:
+        raise MissingLibrary(MISSING.format(name="pymeshlab", error=error)) from None
+    meshes = pymeshlab.MeshSet()
+    meshes.add_mesh(pymeshlab.Mesh(vertex_matrix=mesh.vertices, face_matrix=mesh.faces.astype(np.int32),
+                                   v_normals_matrix=mesh.vertex_normals))
+    return meshes
+
+
+def _result(meshes: Any) -> Mesh:
+    current = meshes.current_mesh()
+    return Mesh(current.vertex_matrix(), current.face_matrix())
