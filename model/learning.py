@@ -12,7 +12,7 @@ from scanprep.geometry.mesh import Mesh, check_template
 from scanprep.skeleton.tree import Skeleton
 
 from .fitting import FitConfig, fit_pose
-from .gradients import GradientSystem, ShapeGradients, edges, local_edges, pose_gradients
+from .gradients import GradientSystem, edges, local_edges, pose_gradients, shape_gradients
 from .linear import Subject, build_basis
 from .pose_space import PoseSpace, Regression, learn_pose_space, twists
 from .scape import ScapeModel
@@ -139,13 +139,13 @@ def _shape_deformations(template: Mesh, space: PoseSpace, shapes: np.ndarray, co
     [SCAPE] Eq. 8
     """
     skeleton = space.skeleton
-    solver = ShapeGradients(GradientSystem(template, config.smoothness))
+    system = GradientSystem(template, config.smoothness)
     v_hat = edges(template.vertices, template.faces)
     S = np.empty((len(shapes), len(template.faces), 3, 3), dtype=np.float32)
     for i, y in enumerate(shapes):
         R = skeleton.fit_rotations(template, y)
         posed = v_hat @ np.swapaxes(space.gradients(skeleton.pose_of(R)), -1, -2)
-        S[i], _ = solver.solve(posed, local_edges(y, template.faces, R[skeleton.part_of_face]))
+        S[i] = shape_gradients(system, posed, local_edges(y, template.faces, R[skeleton.part_of_face]))
         tick(1)
     return S
 

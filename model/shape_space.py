@@ -53,7 +53,7 @@ class ShapeSpace:
             raise ValueError("betas: expected finite numbers")
         S = self.mean.astype(np.float64)
         for beta, component in zip(betas, self.components, strict=False):
-            S += np.multiply(beta, component, dtype=np.float64)  # in float64, though the components are stored as float32
+            S += np.multiply(beta, component, dtype=np.float64)
         return S
 
     @staticmethod

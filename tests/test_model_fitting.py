@@ -1,0 +1,77 @@
+import numpy as np
+import pytest
+from model_bodies import random_poses, worm_model
+
+from model.fitting import FitConfig, fit_pose, fit_shape, spread_vertices
+from model.scape import ScapeModel
+from model.shape_space import ShapeSpace
+from scanprep.geometry import rotations
+
+
+@pytest.fixture(scope="module")
+def model():
+    return worm_model()
+
+
+@pytest.mark.parametrize("sample", [60, 10**6])
+def test_pose_of_the_models_own_bodies(model, sample):
+    rng = np.random.default_rng(0)
+    subject = model.subject([0.5, -0.5, 1.0])
+    for pose in random_poses(model, 6, rng, 0.6):
+        trans = rng.normal(size=3)
+        truth = subject.vertices(pose, trans)
+        fit = fit_pose(subject, truth, FitConfig(sample=sample))
+        assert fit.converged and fit.rms < 1e-6 and fit.mean <= fit.rms
+        np.testing.assert_allclose(rotations.exp(fit.pose), rotations.exp(pose), atol=1e-4)
+        np.testing.assert_allclose(fit.trans, trans, atol=1e-5)
+
+
+def test_pose_follows_a_rigid_motion_of_the_data(model):
+    rng = np.random.default_rng(1)
+    subject = model.subject()
+    data = subject.vertices(random_poses(model, 1, rng)[0]) + rng.normal(0, 0.005, model.template.vertices.shape)
+    R, shift = rotations.exp([1.0, -2.0, 0.5]), np.array([3.0, -1, 2])
+    tight = FitConfig(tolerance=1e-12)
+    a, b = fit_pose(subject, data, tight), fit_pose(subject, data @ R.T + shift, tight)
+    np.testing.assert_allclose(b.vertices, a.vertices @ R.T + shift, atol=1e-5)
+    np.testing.assert_allclose(b.pose[1:], a.pose[1:], atol=1e-4)
+    assert 0.005 < a.rms < 0.005 * np.sqrt(3)               # the noise is left, and not more
+
+
+def test_shape_and_pose_of_the_models_own_bodies(model):
+    rng = np.random.default_rng(2)
+    for _ in range(3):
+        pose, betas, trans = random_poses(model, 1, rng, 0.3)[0], rng.normal(size=3), rng.normal(size=3)
+        fit = fit_shape(model, model.vertices(pose, betas, trans))
+        assert fit.converged and fit.rms < 1e-5
+        np.testing.assert_allclose(fit.betas, betas, atol=1e-3)
+
+
+def test_shape_with_fewer_components(model):
+    truth = model.vertices(np.zeros((4, 3)), [1.5])
+    fit = fit_shape(model, truth, FitConfig(n_betas=1))
+    assert fit.betas.shape == (3,) and fit.betas[1] == fit.betas[2] == 0
+    assert fit.betas[0] == pytest.approx(1.5, abs=1e-3)
+
+
+def test_spread_vertices_cover_the_body(model):
+    chosen = spread_vertices(model.template.vertices, 40)
+    assert len(np.unique(chosen)) == 40
+    gap = np.linalg.norm(model.template.vertices[:, None] - model.template.vertices[chosen], axis=2).min(axis=1)
+    assert gap.max() < 0.2                                   # 40 discs of 20 cm cover 1.7 m² several times
+    np.testing.assert_array_equal(spread_vertices(model.template.vertices, 10**6), np.arange(398))
+
+
+@pytest.mark.parametrize("vertices, word", [(np.zeros((5, 3)), "shape"), (np.full((398, 3), np.nan), "finite")])
+def test_refuses_bad_vertices(model, vertices, word):
+    with pytest.raises(ValueError, match=word):
+        fit_pose(model.subject(), vertices)
+    with pytest.raises(ValueError, match=word):
+        fit_shape(model, vertices)
+
+
+def test_refuses_a_model_without_shapes(model):
+    none = ShapeSpace.empty(len(model.template.faces))
+    alone = ScapeModel(model.template, model.skeleton, model.pose_space, none, model.pose_mean, model.pose_covariance)
+    with pytest.raises(ValueError, match="n_betas"):
+        fit_shape(alone, model.template.vertices)

@@ -1,0 +1,110 @@
+import numpy as np
+import pytest
+from model_bodies import random_poses, worm_model
+
+from model.pose_space import JointFeatures, PoseSpace, kept_directions, learn_pose_space, nearest_joints, twists
+from scanprep.geometry import rotations
+
+
+@pytest.fixture(scope="module")
+def model():
+    return worm_model()
+
+
+def test_twists_are_the_short_way_round():
+    axis = np.array([0.6, 0.0, 0.8])
+    np.testing.assert_allclose(twists((2 * np.pi - 0.5) * axis), -0.5 * axis, atol=1e-12)
+    np.testing.assert_array_equal(twists(3.0 * axis), 3.0 * axis)
+
+
+def test_features_of_a_part_are_one_and_its_joints(model):
+    features = model.pose_space.features
+    pose = random_poses(model, 1, np.random.default_rng(0))[0]
+    delta = features.evaluate(pose)
+    np.testing.assert_allclose(delta[features.of_part(0)], [1, *pose[1], *pose[2]], atol=1e-15)
+    np.testing.assert_allclose(delta[features.of_part(2)], [1, *pose[2], *pose[3, :2]], atol=1e-15)
+    assert features.count == 7 + 4 + 6 + 3
+
+
+def test_root_pose_changes_no_feature(model):
+    pose = random_poses(model, 1, np.random.default_rng(1))[0]
+    other = pose.copy()
+    other[0] += 1.0
+    np.testing.assert_array_equal(model.pose_space.gradients(pose), model.pose_space.gradients(other))
+
+
+@pytest.mark.parametrize("size", [0.4, 2.5])                 # 2.5: many joints beyond π
+def test_feature_derivative_matches_differences(model, size):
+    features = model.pose_space.features
+    pose = random_poses(model, 1, np.random.default_rng(2), size)[0]
+    d = features.derivative(pose)
+    for a in np.flatnonzero(features.joint >= 0):
+        for m in range(3):
+            step = np.zeros_like(pose)
+            step[features.joint[a], m] = 1e-6
+            slope = (features.evaluate(pose + step)[a] - features.evaluate(pose - step)[a]) / 2e-6
+            assert slope == pytest.approx(d[a, m], abs=1e-8)
+
+
+def test_nearest_joints_are_those_of_the_part(model):
+    near = nearest_joints(model.template, model.skeleton, count=1)
+    parts, x = model.skeleton.part_of_face, model.template.corners.mean(axis=1)[:, 0] - 0.3
+    assert near[parts == 1].tolist() == [[False, True, False, False]] * (parts == 1).sum()
+    assert near[(parts == 0) & (x < -0.05), 1].all() and near[(parts == 0) & (x > 0.05), 2].all()
+    assert nearest_joints(model.template, model.skeleton).sum(axis=1).max() == 2
+
+
+def test_pruning_keeps_the_axes_that_move():
+    rng = np.random.default_rng(3)
+    poses = np.zeros((200, 2, 3))
+    axis = np.array([1.0, 2.0, 2.0]) / 3
+    poses[:, 1] = rng.normal(0, 0.8, (200, 1)) * axis + rng.normal(0, 0.02, (200, 3))
+    kept = kept_directions(poses, 0.01)
+    assert kept[0].shape == (3, 0) and kept[1].shape == (3, 1)
+    assert abs(kept[1][:, 0] @ axis) > 0.999
+    assert kept_directions(poses, 0.0)[1].shape == (3, 3)
+
+
+def test_a_linear_truth_is_learned_exactly(model):
+    rng = np.random.default_rng(4)
+    poses = random_poses(model, 30, rng)
+    poses[:, 3, 2] = 0                                        # the truth does not use this axis
+    Q = model.pose_space.gradients(poses)
+    learned = learn_pose_space(model.template, model.skeleton, poses, Q, 1e-4, (0.0,))
+    new = random_poses(model, 5, rng)
+    new[:, 3, 2] = 0
+    np.testing.assert_allclose(learned.space.gradients(new), model.pose_space.gradients(new), atol=2e-6)  # float32
+    assert learned.space.features.count == model.pose_space.features.count
+
+
+def test_left_out_error_is_the_error_of_leaving_out(model):
+    rng = np.random.default_rng(5)
+    poses = random_poses(model, 12, rng)
+    Q = model.pose_space.gradients(poses) + rng.normal(0, 0.05, (12, len(model.template.faces), 3, 3))
+    ridges = (0.02, 0.5)
+    learned = learn_pose_space(model.template, model.skeleton, poses, Q, 0.0, ridges)
+    v_hat = np.swapaxes(model.template.corners[:, 1:] - model.template.corners[:, :1], -1, -2)
+    by_hand = []
+    for ridge in ridges:
+        total = 0.0
+        for i in range(12):
+            rest = np.delete(np.arange(12), i)
+            # the penalty counts instances, so it must stay what it was with all of them
+            fit = learn_pose_space(model.template, model.skeleton, poses[rest], Q[rest], 0.0, (ridge * 12 / 11,))
+            total += (((fit.space.gradients(poses[i]) - Q[i]) @ v_hat) ** 2).sum()
+        by_hand.append(np.sqrt(total / (12 * len(v_hat) * 2)))
+    assert learned.left_out_error == pytest.approx(min(by_hand), rel=1e-4)
+    assert learned.ridge == ridges[int(np.argmin(by_hand))]
+
+
+def test_identity_space_is_rigid(model):
+    space = PoseSpace.identity(model.skeleton)
+    Q = space.gradients(random_poses(model, 3, np.random.default_rng(6)))
+    np.testing.assert_array_equal(Q, np.broadcast_to(np.eye(3), Q.shape))
+
+
+def test_single_part_has_only_the_constant():
+    from scanprep.skeleton.tree import Skeleton
+
+    features = JointFeatures(Skeleton(np.zeros(5, int), [-1], np.zeros((1, 3))), (np.zeros((3, 0)),))
+    np.testing.assert_array_equal(features.evaluate(rotations.log(rotations.exp([[1, 2, 3.0]]))), [1.0])
