@@ -1,0 +1,211 @@
+"""Implicit surfaces: lofted tubes, round cones and ellipsoids, joined smoothly, with soft bumps on top.
+
+All functions take points (n, 3) in metres and give an approximate signed distance (n,), negative inside.
+"""
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from scipy.interpolate import CubicSpline, PchipInterpolator
+
+
+class Field(Protocol):
+    """Anything that gives an approximate signed distance."""
+
+    def __call__(self, points: np.ndarray) -> np.ndarray: ...
+
+
+class Loft:
+    """Superelliptic cross-sections along an axis, closed by rounded caps.
+
+    Parameters
+    ----------
+    origin : (3,) float, metres
+    frame : (3, 3) float
+        Rows: the sideways direction, the front direction, the axis.
+    keys : (k, 8) float
+        Position on the axis, centre sideways, centre frontwards, extents to +side, -side, front and back,
+        all in metres, and the exponent of the superellipse.
+    caps : (2,) float, metres
+        How far the rounded ends reach beyond the first and the last key.
+    """
+
+    _TABLE = 400
+
+    def __init__(self, origin: np.ndarray, frame: np.ndarray, keys: np.ndarray, caps: tuple[float, float]) -> None:
+        self.origin, self.frame, self.caps = origin, frame, caps
+        self.start, self.end = keys[0, 0], keys[-1, 0]
+        at = np.linspace(self.start, self.end, self._TABLE)
+        smooth = CubicSpline(keys[:, 0], keys[:, 1:], bc_type="natural")(at)
+        monotone = PchipInterpolator(keys[:, 0], keys[:, 1:])(at)
+        self._table = 0.5 * (smooth + monotone)
+
+    def local(self, points: np.ndarray) -> np.ndarray:
+        """Side, front and axis coordinates (n, 3) of points."""
+        return (points - self.origin) @ self.frame.T
+
+    def __call__(self, points: np.ndarray) -> np.ndarray:
+        side, front, t = self.local(points).T
+        inside = np.clip(t, self.start, self.end)
+        place = (inside - self.start) * ((self._TABLE - 1) / (self.end - self.start))
+        low = np.minimum(place.astype(np.int64), self._TABLE - 2)
+        part = (place - low)[:, None]
+        row = self._table[low] * (1 - part) + self._table[low + 1] * part
+        u, v = side - row[:, 0], front - row[:, 1]
+        a = np.where(u > 0, row[:, 2], row[:, 3])
+        b = np.where(v > 0, row[:, 4], row[:, 5])
+        n = row[:, 6]
+        q = (np.abs(u / a)**n + np.abs(v / b)**n + 1e-12)**(1 / n)
+        over = np.where(t < self.start, (t - self.start) / self.caps[0], (t - inside) / self.caps[1])
+        q = np.sqrt(q * q + over * over)
+        rho = np.sqrt(u * u + v * v + (t - inside)**2 + 1e-12)
+        return np.where(q > 0.2, rho * (1 - 1 / np.maximum(q, 0.2)), rho - np.minimum(a, b))
+
+
+class RoundCone:
+    """The hull of two spheres.
+
+    Parameters
+    ----------
+    a, b : (3,) float, metres
+    radius_a, radius_b : float, metres
+    """
+
+    def __init__(self, a: np.ndarray, b: np.ndarray, radius_a: float, radius_b: float) -> None:
+        self.a, self.b, self.ra, self.rb = np.asarray(a), np.asarray(b), radius_a, radius_b
+        self.axis = self.b - self.a
+        self.squared = float(self.axis @ self.axis)
+
+    def __call__(self, points: np.ndarray) -> np.ndarray:
+        h = np.clip((points - self.a) @ self.axis / self.squared, 0, 1)
+        away = points - self.a - h[:, None] * self.axis
+        return np.sqrt((away * away).sum(axis=1)) - (self.ra + (self.rb - self.ra) * h)
+
+
+class Ellipsoid:
+    """An ellipsoid, its radii along the rows of a frame.
+
+    Parameters
+    ----------
+    centre, radii : (3,) float, metres
+    frame : (3, 3) float, optional
+    """
+
+    def __init__(self, centre: np.ndarray, radii: np.ndarray, frame: np.ndarray | None = None) -> None:
+        self.centre, self.radii = np.asarray(centre), np.asarray(radii, dtype=np.float64)
+        self.frame = np.eye(3) if frame is None else frame
+
+    def __call__(self, points: np.ndarray) -> np.ndarray:
+        local = (points - self.centre) @ self.frame.T / self.radii
+        q = np.sqrt((local * local).sum(axis=1) + 1e-12)
+        slope = np.sqrt(((local / self.radii)**2).sum(axis=1) + 1e-12)
+        return np.where(q > 0.3, q * (q - 1) / slope, -self.radii.min() * (1 - q))
+
+
+@dataclass(frozen=True)
+class Bump:
+    """A soft rise (height > 0) or hollow (height < 0) of the surface around a point.
+
+    Parameters
+    ----------
+    centre : (3,) float, metres
+    height : float, metres
+    widths : (3,) float, metres
+        Standard deviations along the rows of `frame`.
+    frame : (3, 3) float, optional
+    """
+
+    centre: np.ndarray
+    height: float
+    widths: Sequence[float]
+    frame: np.ndarray | None = None
+
+    def __call__(self, points: np.ndarray) -> np.ndarray:
+        out = np.zeros(len(points))
+        near = np.flatnonzero(np.abs(points[:, 2] - self.centre[2]) < 4.5 * max(self.widths))
+        local = points[near] - self.centre
+        if self.frame is not None:
+            local = local @ self.frame.T
+        local = local / np.asarray(self.widths)
+        out[near] = self.height * np.exp(-0.5 * np.minimum((local * local).sum(axis=1), 60))
+        return out
+
+
+def smooth_union(a: np.ndarray, b: np.ndarray, k: float) -> np.ndarray:
+    """The union of two fields (n,), the seam rounded over about `k` metres."""
+    h = np.maximum(k - np.abs(a - b), 0) / k
+    return np.minimum(a, b) - h * h * (k / 4)
+
+
+class Group:
+    """Fields joined one after the other, evaluated only near themselves.
+
+    Parameters
+    ----------
+    members : (field, k) pairs
+        `k` rounds the seam with the members before, metres.
+    bumps : Bump
+    bounds : (3,) and (3,) ends, and radius, metres, optional
+        Points outside this capsule get their distance to it.
+    """
+
+    MARGIN = 0.06
+
+    def __init__(self, members: Sequence[tuple[Field, float]], bumps: Sequence[Bump] = (),
+                 bounds: tuple[np.ndarray, np.ndarray, float] | None = None) -> None:
+        self.members, self.bumps, self.bounds = list(members), list(bumps), bounds
+
+    def __call__(self, points: np.ndarray) -> np.ndarray:
+        if self.bounds is None:
+            return self._evaluate(points)
+        a, b, radius = self.bounds
+        d = RoundCone(a, b, radius, radius)(points) + self.MARGIN
+        near = np.flatnonzero(d < self.MARGIN)
+        if len(near):
+            d[near] = self._evaluate(points[near])
+        return d
+
+    def _evaluate(self, points: np.ndarray) -> np.ndarray:
+        d = self.members[0][0](points)
+        for member, k in self.members[1:]:
+            d = smooth_union(d, member(points), k)
+        for bump in self.bumps:
+            d = d - bump(points)
+        return d
+
+
+class Mirrored:
+    """A field given for x >= 0, with its mirror image; rounded over `width` metres at x = 0."""
+
+    def __init__(self, field: Field, width: float = 0.003) -> None:
+        self.field, self.width = field, width
+
+    def __call__(self, points: np.ndarray) -> np.ndarray:
+        folded = points.copy()
+        folded[:, 0] = np.sqrt(points[:, 0]**2 + self.width**2)
+        return self.field(folded)
+
+
+_TETRAHEDRON = np.array([[1, -1, -1], [-1, -1, 1], [-1, 1, -1], [1, 1, 1]], dtype=np.float64)
+
+
+def value_and_gradient(field: Field, points: np.ndarray, step: float = 1e-4) -> tuple[np.ndarray, np.ndarray]:
+    """Field (n,) and its gradient (n, 3) by differences over a small tetrahedron."""
+    n = len(points)
+    values = field((points[None] + step * _TETRAHEDRON[:, None]).reshape(-1, 3)).reshape(4, n)
+    return values.mean(axis=0), np.einsum("kn,kd->nd", values, _TETRAHEDRON) / (4 * step)
+
+
+def project(field: Field, points: np.ndarray, steps: int = 4, reach: float = 0.03) -> np.ndarray:
+    """Points moved onto the zero surface along the gradient, Newton's method with a limited step."""
+    points = points.copy()
+    for _ in range(steps):
+        value, gradient = value_and_gradient(field, points)
+        squared = np.maximum((gradient * gradient).sum(axis=1), 0.05)
+        step = -(value / squared)[:, None] * gradient
+        length = np.linalg.norm(step, axis=1, keepdims=True)
+        points += step * np.minimum(1, reach / np.maximum(length, 1e-12))
+    return points

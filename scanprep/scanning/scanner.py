@@ -1,0 +1,235 @@
+"""A virtual range scanner: views around a body, noise along the rays, dropout, and real holes."""
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ..geometry.mesh import Mesh
+from ..geometry.surface import Rays
+
+
+@dataclass(frozen=True)
+class ScannerConfig:
+    """Settings of the scanner.
+
+    Parameters
+    ----------
+    views : number of cameras, evenly spaced around the vertical
+    distance : of the cameras from the middle of the body, metres
+    height : of the cameras above the middle of the body, metres; every other one as far below it
+    azimuth : direction of the first camera from the front (-y) towards the left (+x), degrees
+    resolution : spacing of the rays at the middle of the body, metres
+    noise : standard deviation along the ray, metres
+    grazing : angle between ray and surface below which nothing is measured, degrees
+    dropout : chance that a ray is lost at a right angle to the surface; grows towards `grazing`
+    depth_jump : neighbours farther apart in depth than this many ray spacings are not joined
+    blind_reach : how near two surfaces that face each other must be to hide each other, metres; this blinds
+        the scanner in armpits and between the legs
+    min_island : connected pieces with fewer triangles are removed
+
+    Raises
+    ------
+    ValueError
+        A value out of its range.
+    """
+
+    views: int = 4
+    distance: float = 2.5
+    height: float = 0.35
+    azimuth: float = 45.0
+    resolution: float = 0.0064
+    noise: float = 0.002
+    grazing: float = 12.0
+    dropout: float = 0.005
+    depth_jump: float = 5.0
+    blind_reach: float = 0.05
+    min_island: int = 30
+
+    def __post_init__(self) -> None:
+        if self.views < 1:
+            raise ValueError(f"views: expected at least 1, got {self.views}")
+        for name in ("distance", "resolution", "depth_jump"):
+            if not getattr(self, name) > 0:
+                raise ValueError(f"{name}: expected a positive number, got {getattr(self, name)}")
+        if not (self.noise >= 0 and 0 <= self.grazing < 90 and 0 <= self.dropout < 1 and self.blind_reach >= 0):
+            raise ValueError("noise, grazing, dropout, blind_reach: expected noise >= 0, grazing in [0, 90), dropout in "
+                             f"[0, 1) and blind_reach >= 0, got {self.noise}, {self.grazing}, {self.dropout}, "
+                             f"{self.blind_reach}")
+
+
+@dataclass(frozen=True, eq=False)
+class RangeView:
+    """What one camera saw.
+
+    Attributes
+    ----------
+    mesh : Mesh
+        The triangulated range image; its vertices are `points`.
+    normals : (n, 3) float
+        Of the triangulated points, unit, outwards.
+    camera : (3,) float, metres
+    T_world_camera : (4, 4) float
+        Camera axes are right, down, ahead.
+    depth : (H, W) float, metres
+        Distance along the optical axis, NaN where nothing was measured.
+    intrinsics : (3, 3) float, pixels
+    """
+
+    mesh: Mesh
+    normals: np.ndarray
+    camera: np.ndarray
+    T_world_camera: np.ndarray
+    depth: np.ndarray
+    intrinsics: np.ndarray
+
+    @property
+    def points(self) -> np.ndarray:
+        """(n, 3) metres."""
+        return self.mesh.vertices
+
+    def project(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Column u, row v (n,), pixels, and depth (n,), metres, of points (n, 3)."""
+        local = (points - self.camera) @ self.T_world_camera[:3, :3]
+        u, v, _ = ((local / local[:, 2:]) @ self.intrinsics.T).T
+        return u, v, local[:, 2]
+
+    def rays(self) -> np.ndarray:
+        """(H, W, 3) unit directions of the pixels in the world."""
+        return pixel_rays(self.depth.shape, self.intrinsics, self.T_world_camera[:3, :3])
+
+
+@dataclass(frozen=True, eq=False)
+class Scan:
+    """All views of one body.
+
+    Attributes
+    ----------
+    views : RangeView of every camera
+    merged : Mesh
+        The triangles of all views side by side.
+    """
+
+    views: tuple[RangeView, ...]
+    merged: Mesh
+
+
+def pixel_rays(shape: tuple[int, ...], intrinsics: np.ndarray, R_world_camera: np.ndarray) -> np.ndarray:
+    """Unit directions (H, W, 3) through the pixels of an image, in the world."""
+    v, u = np.meshgrid(np.arange(shape[0]), np.arange(shape[1]), indexing="ij")
+    local = np.stack([(u - intrinsics[0, 2]) / intrinsics[0, 0], (v - intrinsics[1, 2]) / intrinsics[1, 1],
+                      np.ones(shape)], axis=-1)
+    world = local @ R_world_camera.T
+    return world / np.linalg.norm(world, axis=-1, keepdims=True)
+
+
+def scan(mesh: Mesh, config: ScannerConfig | None = None, rng: np.random.Generator | None = None) -> Scan:
+    """Scan a body that stands upright along z.
+
+    Parameters
+    ----------
+    mesh : Mesh
+        The true surface.
+    config : ScannerConfig, optional
+    rng : Generator, optional
+        Source of noise and dropout; seed 0 when not given.
+
+    Raises
+    ------
+    ValueError
+        A mesh without triangles.
+    """
+    config = config or ScannerConfig()
+    rng = rng or np.random.default_rng(0)
+    if not len(mesh.faces):
+        raise ValueError("mesh: expected a surface with triangles, got none")
+    rays = Rays(mesh)
+    views = tuple(_view(mesh, rays, config, k, rng) for k in range(config.views))
+    offsets = np.cumsum([0] + [len(view.mesh.vertices) for view in views])
+    merged = Mesh(np.vstack([view.mesh.vertices for view in views]),
+                  np.vstack([view.mesh.faces + start for view, start in zip(views, offsets, strict=False)]))
+    return Scan(views, merged)
+
+
+def camera_pose(target: np.ndarray, camera: np.ndarray) -> np.ndarray:
+    """T_world_camera (4, 4) of a camera that looks at a point, z up; camera axes right, down, ahead."""
+    ahead = (target - camera) / np.linalg.norm(target - camera)
+    right = np.cross(ahead, [0.0, 0.0, 1.0])
+    right /= np.linalg.norm(right)
+    T = np.eye(4)
+    T[:3, 0], T[:3, 1], T[:3, 2], T[:3, 3] = right, np.cross(ahead, right), ahead, camera
+    return T
+
+
+def _view(mesh: Mesh, rays: Rays, config: ScannerConfig, number: int, rng: np.random.Generator) -> RangeView:
+    low, high = mesh.vertices.min(axis=0), mesh.vertices.max(axis=0)
+    middle = 0.5 * (low + high)
+    azimuth = np.radians(config.azimuth + 360.0 * number / config.views)
+    lift = config.height * (1 if number % 2 == 0 else -1)
+    camera = middle + [config.distance * np.sin(azimuth), -config.distance * np.cos(azimuth), lift]
+    T = camera_pose(middle, camera)
+    focal = config.distance / config.resolution
+    local = (mesh.vertices - camera) @ T[:3, :3]
+    extent = np.abs(local[:, :2] / local[:, 2:]).max(axis=0) * focal + 3
+    width, height = (2 * np.ceil(extent) + 1).astype(int)
+    K = np.array([[focal, 0, (width - 1) / 2], [0, focal, (height - 1) / 2], [0, 0, 1.0]])
+    directions = pixel_rays((height, width), K, T[:3, :3]).reshape(-1, 3)
+    face, distance = rays.cast(np.broadcast_to(camera, directions.shape), directions)
+    distance = _measured(mesh, rays, config, camera, directions, face, distance, rng)
+    seen = np.isfinite(distance)
+    triangles = _triangulate(distance.reshape(height, width), config)
+    points = camera + np.where(seen, distance, 0)[:, None] * directions
+    used, index = np.unique(triangles, return_inverse=True)
+    surface = Mesh(points[used], index.reshape(-1, 3))
+    depth = (distance * (directions @ T[:3, 2])).reshape(height, width)
+    kept = np.full(height * width, np.nan)
+    kept[used] = depth.reshape(-1)[used]
+    return RangeView(surface, surface.vertex_normals, camera, T, kept.reshape(height, width), K)
+
+
+def _measured(mesh: Mesh, rays: Rays, config: ScannerConfig, camera: np.ndarray, directions: np.ndarray,
+              face: np.ndarray, distance: np.ndarray, rng: np.random.Generator) -> np.ndarray:
+    """Distances with noise; NaN where the ray missed, grazed, was lost or fell into a blind region."""
+    hit = np.flatnonzero(face >= 0)
+    normal = mesh.face_normals[face[hit]]
+    cosine = np.abs(np.einsum("nd,nd->n", normal, directions[hit]))
+    limit = np.sin(np.radians(config.grazing))
+    margin = np.clip((cosine - limit) / max(1 - limit, 1e-9), 0, 1)
+    lost = (cosine <= limit) | (rng.random(len(hit)) < config.dropout + (1 - config.dropout) * np.exp(-margin / 0.05))
+    points = camera + distance[hit, None] * directions[hit]
+    blind = np.zeros(len(hit), dtype=bool)
+    if config.blind_reach > 0:
+        other, _ = rays.cast(points + 1e-4 * normal, normal, config.blind_reach)
+        facing = np.zeros(len(hit), dtype=bool)
+        met = other >= 0
+        facing[met] = np.einsum("nd,nd->n", mesh.face_normals[other[met]], normal[met]) < -0.3
+        blind = facing
+    out = np.full(len(face), np.nan)
+    measured = distance[hit] + config.noise * rng.normal(size=len(hit))
+    out[hit] = np.where(lost | blind, np.nan, measured)
+    return out
+
+
+def _triangulate(distance: np.ndarray, config: ScannerConfig) -> np.ndarray:
+    """Triangles (F, 3) of pixel numbers between neighbours at similar distance, outward as the camera sees."""
+    height, width = distance.shape
+    number = np.arange(height * width).reshape(height, width)
+    a, b, c, d = number[:-1, :-1], number[:-1, 1:], number[1:, :-1], number[1:, 1:]
+    flat = distance.reshape(-1)
+    with np.errstate(invalid="ignore"):
+        first = np.abs(flat[a] - flat[d]) <= np.abs(flat[b] - flat[c])
+    first |= ~np.isfinite(flat[b] + flat[c])
+    first &= np.isfinite(flat[a] + flat[d])
+    one = np.where(first[..., None], np.stack([a, c, d], -1), np.stack([a, c, b], -1))
+    two = np.where(first[..., None], np.stack([a, d, b], -1), np.stack([b, c, d], -1))
+    triangles = np.concatenate([one.reshape(-1, 3), two.reshape(-1, 3)])
+    corner = flat[triangles]
+    with np.errstate(invalid="ignore"):
+        good = corner.max(axis=1) - corner.min(axis=1) < config.depth_jump * config.resolution
+    triangles = triangles[good]
+    if not len(triangles):
+        return triangles
+    used, index = np.unique(triangles, return_inverse=True)
+    surface = Mesh(np.zeros((len(used), 3)), index.reshape(-1, 3))
+    island = surface.vertex_component[surface.faces[:, 0]]
+    return triangles[np.bincount(island)[island] >= config.min_island]
