@@ -10,6 +10,7 @@ from scanprep.skeleton.tree import Skeleton
 
 from . import energy
 from .bodies import FixedBody, Follow
+from .contact import Contact
 from .priors import GaussianPrior
 from .scan import spread
 from .solve import normal_equations
@@ -18,6 +19,7 @@ if TYPE_CHECKING:
     from .fit import ScanFit
 
 LARGEST = 3                          # parts of a limb that is redrawn as a whole
+VERTICES = 3000                      # that a quick look takes
 
 
 def around(body: FixedBody, follow: Follow, x: np.ndarray, targets: np.ndarray, sd: float, prior: GaussianPrior,
@@ -56,21 +58,30 @@ def redrawn(body: FixedBody, x: np.ndarray, root: int, prior: GaussianPrior, cou
     return drawn
 
 
-def quick_misfits(fit: ScanFit, x: np.ndarray, cap: float = 0.1, vertices: int = 3000) -> np.ndarray:
-    """How badly bodies (n, P) explain the scan, on few vertices whose normals turn with their parts."""
+def quick_misfits(fit: ScanFit, x: np.ndarray, moved: np.ndarray | None = None, cap: float = 0.1) -> np.ndarray:
+    """How badly bodies (n, P) explain the scan, on few vertices whose normals turn with their parts.
+
+    Parameters
+    ----------
+    moved : ints, optional
+        The parts in which the bodies differ; only these are tested for passing through others.
+    """
     body, config = fit.body, fit.config
-    ids = spread(body.template.vertices, vertices)
-    part = body.skeleton.part_of_vertex(body.template)[ids]
+    ids = spread(body.template.vertices, VERTICES)
+    few = slice(None, None, 3)
+    contact = Contact(body.skeleton, fit.part[ids[few]])
     pose, trans, _ = body.split(x)
     places = body.subject.points(ids).evaluate(pose, trans)
-    R = body.skeleton.part_rotations(pose)[:, part]
+    R = body.skeleton.part_rotations(pose)[:, fit.part[ids]]
     normals = (R @ body.template.vertex_normals[ids][:, :, None])[..., 0]
     out = np.empty(len(x))
     for i, (y, n) in enumerate(zip(places, normals, strict=True)):
         found = OrientedPoints(y, n).match(fit.coarse.points, fit.coarse.normals, cap, config.min_cosine)
         apart = (np.minimum(found.distances, cap)**2).mean()
+        depth = contact.intrusions(y[few], n[few], moved)[0]
+        apart += config.contact_weight * (np.minimum(depth, cap)**2).mean()
         if fit.sight is not None:
-            excess = fit.sight.trespass(y[::3], config.silhouette_tolerance)[0]
+            excess = fit.sight.trespass(y[few], config.silhouette_tolerance)[0]
             apart += config.silhouette_weight * (np.minimum(excess, cap)**2).mean()
         out[i] = config.evidence * apart / config.scan_sd**2 + energy.pose_prior(x[i], fit.prior).energy
     return out

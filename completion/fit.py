@@ -10,12 +10,15 @@ from scanprep.geometry.surface import OrientedPoints
 
 from . import energy
 from .bodies import FixedBody
+from .contact import Contact
 from .draws import around, limbs, quick_misfits, redrawn
 from .priors import GaussianPrior, gaussian_prior
 from .scan import ScanPoints, spread
 from .sight import find_sight
 from .solve import MinimiseConfig, minimise
 from .starts import distinct, search
+
+PROMISING = 30.0                     # a limb drawn at random may be this much worse before it is fitted
 
 
 @dataclass(frozen=True)
@@ -66,6 +69,8 @@ class CompletionConfig:
         How much a vertex counts that stands where a single camera saw nothing, against one that lies on the
         scan; 0 when the scan has parts cut away by hand.
     silhouette_tolerance : float, metres
+    contact_weight : float
+        The same for a vertex that stands inside another part of the body.
     viewpoint : (3,) floats, metres, optional
         Where the scan was seen from; found by itself when not given.
     """
@@ -91,6 +96,7 @@ class CompletionConfig:
     seed: int = 0
     silhouette_weight: float = 0.5
     silhouette_tolerance: float = 0.03
+    contact_weight: float = 0.5
     viewpoint: tuple[float, float, float] | None = None
 
 
@@ -119,6 +125,8 @@ class ScanFit:
         given = None if config.viewpoint is None else np.array(config.viewpoint)
         self.sight = find_sight(cloud, given) if config.silhouette_weight > 0 else None
         self.spread = spread(body.template.vertices, config.model_points)
+        self.part = body.skeleton.part_of_vertex(body.template)
+        self.contact = Contact(body.skeleton, self.part[self.spread])
         self.rng = np.random.default_rng(config.seed)
 
     def from_landmarks(self) -> np.ndarray:
@@ -151,9 +159,12 @@ class ScanFit:
         best = self.misfit(x)
         for root in limbs(self.body.skeleton):
             drawn = redrawn(self.body, x, root, self.prior, self.config.draws, self.rng)
-            drawn = drawn[np.argsort(quick_misfits(self, drawn))[:2]]
-            for start in drawn:
-                tried = self.approach(start, (0.2, 0.15, 0.1))
+            moved = np.flatnonzero(self.body.skeleton.descends[:, root])
+            quick = quick_misfits(self, np.vstack([x, drawn]), moved)
+            for i in np.argsort(quick[1:])[:2]:
+                if quick[i + 1] > quick[0] + PROMISING:
+                    continue
+                tried = self.approach(drawn[i], (0.2, 0.15, 0.1))
                 if (misfit := self.misfit(tried)) < best - 5:
                     x, best = tried, misfit
         return x
@@ -168,6 +179,8 @@ class ScanFit:
         if self.sight is not None:
             excess = self.sight.trespass(mesh.vertices[self.spread], config.silhouette_tolerance)[0]
             apart += config.silhouette_weight * (np.minimum(excess, cap)**2).mean()
+        depth = self.contact.intrusions(mesh.vertices[self.spread], mesh.vertex_normals[self.spread])[0]
+        apart += config.contact_weight * (np.minimum(depth, cap)**2).mean()
         off = ((mesh.vertices[self.vertices] - self.points)**2).sum() / config.landmark_sd**2
         prior = energy.pose_prior(x, self.prior, config.prior_weight).energy
         return float(config.evidence * apart / config.scan_sd**2 + off + prior)
@@ -211,7 +224,7 @@ class ScanFit:
                     energy.stay_near(at, x, held)]
 
         best = minimise(energies, x[None], MinimiseConfig(iterations=4, tolerance=1e-3)).x
-        names = ("landmarks", "pose_prior", "shape_prior", "scan_planes", "scan_points", "silhouette", "twists")
+        names = ("landmarks", "pose_prior", "shape_prior", "scan_planes", "scan_points", "trespass", "twists")
         return best[0], {n: float(r.energy[0]) for n, r in zip(names, energies(best), strict=True)}
 
     def matches(self, x: np.ndarray, scan: ScanPoints, reach: float) -> tuple[np.ndarray, ...]:
@@ -237,15 +250,25 @@ class ScanFit:
         return ids, target, normal, weights
 
     def trespasses(self, x: np.ndarray) -> tuple[np.ndarray, ...]:
-        """Vertices that the camera denies, points and normals of the planes they should reach, weights."""
+        """Vertices that are where nothing can be, points and normals of the planes they should reach, weights.
+
+        The camera would have seen them, or another part of the body is there.
+        """
         config, mine = self.config, self.spread
-        if self.sight is None:
-            return mine[:0], np.zeros((0, 3)), np.zeros((0, 3)), np.zeros(0)
-        excess, normal, target = self.sight.trespass(self.body.vertices(x)[mine], config.silhouette_tolerance)
-        out = excess > 0
-        weights = (config.silhouette_weight * config.evidence / config.scan_sd**2 / len(mine)
-                   * geman_mcclure(excess[out], 0.1))
-        return mine[out], target[out], normal[out], weights
+        mesh = self.body.template.with_vertices(self.body.vertices(x))
+        places = mesh.vertices[mine]
+        found = [(config.contact_weight, self.contact.intrusions(places, mesh.vertex_normals[mine]))]
+        if self.sight is not None:
+            found.append((config.silhouette_weight, self.sight.trespass(places, config.silhouette_tolerance)))
+        share = config.evidence / config.scan_sd**2 / len(mine)
+        ids, targets, normals, weights = [], [], [], []
+        for weight, (excess, normal, target) in found:
+            out = excess > 0
+            ids.append(mine[out])
+            targets.append(target[out])
+            normals.append(normal[out])
+            weights.append(weight * share * geman_mcclure(excess[out], 0.1))
+        return tuple(np.concatenate(part) for part in (ids, targets, normals, weights))
 
 
 def geman_mcclure(distance: np.ndarray, scale: float) -> np.ndarray:

@@ -54,7 +54,7 @@ class Sight:
         depth, direction, tree = self._rays
         away = vertices - self.viewpoint
         far = np.linalg.norm(away, axis=1)
-        chord, near = tree.query(away / far[:, None], 6, workers=-1)
+        chord, near = tree.query(away / far[:, None], 6)
         along = np.einsum("nd,nd->n", away, direction[near[:, 0]])
         beside = away - along[:, None] * direction[near[:, 0]]
         wide = np.linalg.norm(beside, axis=1)

@@ -117,7 +117,8 @@ class OrientedPoints:
     def match(self, points: np.ndarray, normals: np.ndarray, max_distance: float = np.inf,
               min_cosine: float = 0.5) -> Matches:
         """The best target of each query (n, 3) with normals (n, 3)."""
-        _, index = self._tree.query(np.hstack([points, self.scale * normals]), workers=-1)
+        workers = -1 if len(points) > 4000 else 1        # threads cost more than they save on few points
+        _, index = self._tree.query(np.hstack([points, self.scale * normals]), workers=workers)
         distances = np.linalg.norm(self.points[index] - points, axis=1)
         cosine = np.einsum("nd,nd->n", self.normals[index], normals)
         good = (distances <= max_distance) & (cosine >= min_cosine)
