@@ -38,8 +38,8 @@ def poisson(mesh: Mesh, depth: int = 8) -> Mesh:
         open3d cannot be imported.
     """
     o3d = _open3d()
-    cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(mesh.vertices))
-    cloud.normals = o3d.utility.Vector3dVector(mesh.vertex_normals)
+    cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(np.array(mesh.vertices)))
+    cloud.normals = o3d.utility.Vector3dVector(np.array(mesh.vertex_normals))
     closed, _ = o3d.geometry.TriangleMesh.create_from_point_cloud_poisson(cloud, depth=depth, n_threads=1)
     return recolored(Mesh(np.asarray(closed.vertices), np.asarray(closed.triangles)), mesh)
 
@@ -61,5 +61,5 @@ def _open3d() -> Any:
 
 
 def _to_open3d(o3d: Any, mesh: Mesh) -> Any:
-    return o3d.geometry.TriangleMesh(o3d.utility.Vector3dVector(mesh.vertices),
+    return o3d.geometry.TriangleMesh(o3d.utility.Vector3dVector(np.array(mesh.vertices)),      # it wants its own
                                      o3d.utility.Vector3iVector(mesh.faces.astype(np.int32)))

@@ -22,7 +22,8 @@ def quadric_decimation(mesh: Mesh, faces: int) -> Mesh:
         pymeshlab cannot be imported.
     """
     meshes = _meshes(mesh)
-    meshes.meshing_decimation_quadric_edge_collapse(targetfacenum=faces, preservetopology=True, preserveboundary=True)
+    meshes.meshing_decimation_quadric_edge_collapse(targetfacenum=faces, preservetopology=True,
+                                                    preserveboundary=True)
     return _result(meshes)
 
 

@@ -70,11 +70,11 @@ def _least_weight(p: np.ndarray, rim: np.ndarray, forbidden: np.ndarray) -> np.n
         return None
     triangles, stack = [], [(0, n - 1)]
     while stack:
-        i, k = stack.pop()
-        if k - i >= 2:
-            m = int(choice[i, k])
-            triangles.append((i, m, k))
-            stack += [(i, m), (m, k)]
+        start, end = stack.pop()
+        if end - start >= 2:
+            tip = int(choice[start, end])
+            triangles.append((start, tip, end))
+            stack += [(start, tip), (tip, end)]
     return np.array(triangles)
 
 

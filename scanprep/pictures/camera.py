@@ -1,8 +1,8 @@
 """Where a picture is taken from."""
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 
@@ -35,13 +35,13 @@ class Camera:
     distance: float = np.inf
 
     @classmethod
-    def around(cls, subject: Mesh | Sequence[Mesh] | np.ndarray, azimuth: float = 0.0, elevation: float = 8.0,
+    def around(cls, subject: Any, azimuth: float = 0.0, elevation: float = 8.0,
                up: int = 2, lens: float = 6.0, margin: float = 1.06) -> Camera:
         """A camera that holds the whole subject.
 
         Parameters
         ----------
-        subject : Mesh, several, or points (n, 3); two points are the corners of a box
+        subject : Mesh, Solid, a sequence of them, or points (n, 3); two points are the corners of a box
         azimuth : float, degrees
             Counter-clockwise about the upward axis. At 0 the camera stands on the +x side when z is up, on the
             +z side when y is up.
@@ -108,7 +108,8 @@ class Camera:
         return np.stack([width / 2 + x * nearer / pixel, height / 2 - y * nearer / pixel], axis=1)
 
 
-def _points(subject: Mesh | Sequence[Mesh] | np.ndarray) -> np.ndarray:
+def _points(subject: Any) -> np.ndarray:
+    subject = getattr(subject, "mesh", subject)
     if isinstance(subject, Mesh):
         return subject.vertices
     if isinstance(subject, np.ndarray):
@@ -117,7 +118,7 @@ def _points(subject: Mesh | Sequence[Mesh] | np.ndarray) -> np.ndarray:
         if len(points) == 2:
             points = np.stack([corner.ravel() for corner in np.meshgrid(*points.T)], axis=1)
     else:
-        points = np.concatenate([_points(getattr(one, "mesh", one)) for one in subject])
+        points = np.concatenate([_points(one) for one in subject])
     if not len(points):
         raise ValueError("subject: expected a mesh or points to look at, found none")
     return points

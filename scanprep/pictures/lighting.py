@@ -181,9 +181,12 @@ class Canvas:
 
     def finish(self, width: int, height: int, samples: int, background: Sequence[float] | None) -> np.ndarray:
         """Average the rays of every pixel and lay them on the background."""
-        color, alpha = self.color.reshape(height * samples, -1, 3), self.alpha.reshape(height * samples, -1, 1)
-        color, alpha = (sum(x[i::samples, j::samples] for i in range(samples) for j in range(samples)) / samples**2
-                        for x in (color, alpha))
+        def mean(values: np.ndarray) -> np.ndarray:
+            rows = values.reshape(height * samples, width * samples, -1)
+            parts = [rows[i::samples, j::samples] for i in range(samples) for j in range(samples)]
+            return np.add.reduce(parts) / len(parts)
+
+        color, alpha = mean(self.color), mean(self.alpha)
         if self.floor is not None:
             alpha = alpha + (1 - alpha) * self.floor.reshape(height, width, 1)
         if background is None:
