@@ -42,7 +42,8 @@ def read(path: Path, data: bytes) -> Contents:
                 if points not in placed:
                     local = _accessor(tree, binary, points).astype(np.float64)
                     placed[points] = start
-                    vertices.append(local @ matrix[:3, :3].T + matrix[:3, 3])
+                    with np.errstate(invalid="ignore"):          # what is not finite is refused later
+                        vertices.append(local @ matrix[:3, :3].T + matrix[:3, 3])
                     colors.append(_colors(tree, binary, primitive))
                     start += len(local)
                 corners = _triangles(tree, binary, primitive, tree["accessors"][points]["count"])
@@ -122,8 +123,6 @@ def _accessor(tree: dict[str, Any], binary: bytes, number: int) -> np.ndarray:
     width = _WIDTHS[accessor["type"]]
     if "sparse" in accessor:
         raise KeyError("sparse accessors are not read here")
-    if "bufferView" not in accessor:
-        return np.zeros((count, width), dtype=kind)
     view = tree["bufferViews"][accessor["bufferView"]]
     start = view.get("byteOffset", 0) + accessor.get("byteOffset", 0)
     stride = view.get("byteStride", kind.itemsize * width)

@@ -105,6 +105,8 @@ def _property(words: list[bytes]) -> _Property:
 def _binary_element(path: Path, data: bytes, element: _Element, start: int, order: str
                     ) -> tuple[dict[str, _Column], int]:
     """All rows at once when every list has the length it has in the first row, else row by row."""
+    if not element.properties:
+        return {}, start
     lengths = _first_lengths(data, element, start, order) if element.count else {}
     if lengths is not None:
         fields: list[tuple] = []
