@@ -39,10 +39,10 @@ def trunk(a: Anatomy) -> tuple[list[tuple[Field, float]], list[tuple[Field, floa
     fatness = 0.5 * s.weight + 0.25 * s.hip_width
     r = g * np.array([0.083 + 0.002 * (1 - man), 0.070 + 0.005 * (1 - man), 0.083])
     r = r + g * np.array([0.004, 0.008, 0.006]) * fatness + g * np.array([0.002, 0.003, 0.002]) * s.muscle
-    members.append((Ellipsoid(a.front(0.074 * g, -0.062 * g, a.at(-0.06)), r), 0.035 * g))
+    members.append((Ellipsoid(a.front(0.074 * g, -0.062 * g, a.at(-0.06)), r), 0.06 * g))
     if man < 1:
         members.append((breast(a), 0.022 * g))
-    return members, [(neck(a), 0.03 * g), *((t, 0.045 * g) for t in shoulder_line(a))]
+    return members, [(neck(a), 0.03 * g), *((t, 0.06 * g) for t in shoulder_line(a))]
 
 
 def breast(a: Anatomy) -> Field:
@@ -79,12 +79,12 @@ def neck(a: Anatomy) -> Field:
 def shoulder_line(a: Anatomy) -> list[Field]:
     """Trapezius and the top of the shoulder."""
     s, g = a.shape, a.scale
-    r = g * (0.024 + 0.004 * a.man + 0.003 * s.muscle + 0.0015 * s.weight)
+    r = g * (0.020 + 0.004 * a.man + 0.003 * s.muscle + 0.0015 * s.weight)
     shoulder = a.joints[4]
-    top = shoulder + a.front(-0.015 * g, 0, 0.030 * g)
-    mid = a.front(0.55 * shoulder[0], -0.042 * g, a.level["neck"] - 0.004 * g)
-    return [RoundCone(a.front(0.030 * g, -0.050 * g, a.level["neck"] + 0.035 * g), mid, r * 0.9, r),
-            RoundCone(mid, top, r, r * 0.85)]
+    top = shoulder + a.front(-0.020 * g, 0.002 * g, 0.026 * g)
+    mid = a.front(0.52 * shoulder[0], -0.040 * g, a.level["neck"] - 0.010 * g)
+    return [RoundCone(a.front(0.030 * g, -0.052 * g, a.level["neck"] + 0.035 * g), mid, r * 0.9, r),
+            RoundCone(mid, top, r, r * 0.9)]
 
 
 def _limb(a: Anatomy, origin: np.ndarray, frame: np.ndarray, at: np.ndarray, extents: np.ndarray,
@@ -208,14 +208,15 @@ def head(a: Anatomy) -> Field:
     nose = RoundCone(at(0, 0.086, 0.010), at(0, 0.0945 + 0.012 * big, -0.036), 0.0065 * h, 0.0095 * h)
     wing = Ellipsoid(at(0.0115, 0.0965, -0.0395), np.array([0.0075, 0.0095, 0.0065]) * h)
     eyeball = Ellipsoid(at(0.0315, 0.0715, 0.0), np.array([0.0125, 0.0125, 0.0115]) * h)
+    bun = Ellipsoid(at(0, -0.098 + 0.040 * man, 0.045), np.array([0.034, 0.036, 0.032]) * h)
     lean = np.radians(14)
-    flare = np.radians(24)
+    flare = np.radians(30)
     ear_frame = np.array([[np.cos(flare), np.sin(flare), 0], [-np.sin(flare), np.cos(flare), 0], [0, 0, 1.0]])
     tip = np.array([[1.0, 0, 0], [0, np.cos(lean), np.sin(lean)], [0, -np.sin(lean), np.cos(lean)]])
-    ear = Ellipsoid(at(0.0770, -0.008, -0.010), np.array([0.0080, 0.0175, 0.0320]) * h, ear_frame @ tip)
+    ear = Ellipsoid(at(0.0800, -0.010, -0.010), np.array([0.0065, 0.0185, 0.0320]) * h, ear_frame @ tip)
     parts: list[tuple[Field, float]] = [(cranium, 0), (face, 0.03 * h)]
     return Group([(Group(parts, _face_bumps(a)), 0), (eyeball, 0.004 * h), (nose, 0.012 * h), (wing, 0.007 * h),
-                  (ear, 0.008 * h)], _feature_bumps(a), bounds=(a.eye, a.eye + 1e-3, 0.19 * h))
+                  (ear, 0.006 * h), (bun, 0.012 * h)], _feature_bumps(a), bounds=(a.eye, a.eye + 1e-3, 0.19 * h))
 
 
 def _face_bumps(a: Anatomy) -> list[Bump]:

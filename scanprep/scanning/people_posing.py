@@ -58,7 +58,7 @@ class Poser:
             change = relative[arm] @ self.axes[arm] - self.axes[arm]
             up, across, fore = change[2], -side * change[0], -change[1]
             shift[arm] = self.anatomy.scale * np.array([-side * (0.012 * up + 0.012 * across), -0.022 * fore,
-                                                        0.032 * up - 0.004 * abs(across)])
+                                                        0.036 * up - 0.004 * abs(across)])
         return shift
 
     def __call__(self, pose: np.ndarray) -> np.ndarray:

@@ -98,27 +98,32 @@ def load() -> Template:
 
 def label_faces(mesh: Mesh, anatomy: Anatomy) -> np.ndarray:
     """Part of every triangle (F,): cut by a plane through each joint, across the surface only."""
+    from .people_parts import arm, hand, trunk
+
     c = mesh.corners.mean(axis=1)
-    j, e = anatomy.joints, anatomy.ends
+    j = anatomy.joints
     part = np.zeros(len(c), dtype=np.int64)
 
     def beyond(joint: int, normal: np.ndarray) -> np.ndarray:
         return (c - j[joint]) @ normal > 0
 
+    folded = np.abs(c * [1, 0, 0]) + c * [0, 1, 1]
+    of_arm = np.minimum(arm(anatomy)(folded), hand(anatomy)(folded)) < 0.02
+    of_arm &= trunk(anatomy)[0][0][0](c) > 0.012 * anatomy.scale
     part[c[:, 2] > j[1, 2]] = 1
     part[c[:, 2] > j[2, 2]] = 2
     neck = np.array([0, -0.35, 1.0])
     part[beyond(3, neck / np.linalg.norm(neck)) & (np.abs(c[:, 0]) < 0.12)] = 3
-    for side, arm, leg in ((1, 4, 10), (-1, 7, 13)):
+    for side, upper, leg in ((1, 4, 10), (-1, 7, 13)):
         flip = np.array([side, 1, 1])
         up = flip * anatomy.upper_arm_frame[2]
         out = up * 0.75 + 0.66 * np.array([side, 0, 0.25])
-        armpit = j[arm] + 0.012 * anatomy.scale * flip * [-1, 0, 0]
-        mine = ((c - armpit) @ out > 0) & (c[:, 0] * side > 0.10 * anatomy.scale) & _near_bone(c, j[arm], e[arm + 2], 0.13)
+        armpit = j[upper] + 0.012 * anatomy.scale * flip * [-1, 0, 0]
+        mine = ((c - armpit) @ out > 0) & (c[:, 0] * side > 0.10 * anatomy.scale) & of_arm
         fore = up + flip * anatomy.forearm_frame[2]
-        part[mine] = arm
-        part[mine & beyond(arm + 1, fore)] = arm + 1
-        part[mine & beyond(arm + 2, flip * anatomy.forearm_frame[2])] = arm + 2
+        part[mine] = upper
+        part[mine & beyond(upper + 1, fore)] = upper + 1
+        part[mine & beyond(upper + 2, flip * anatomy.forearm_frame[2])] = upper + 2
         cut = np.array([0.72 * side, -0.0, -1.0])
         top = j[leg] + np.array([0.0, 0, -0.012 * anatomy.scale])
         mine = ((c - top) @ cut > 0) & (c[:, 0] * side > 0) & (c[:, 2] < j[0, 2] + 0.02) & (part < 3)
@@ -127,11 +132,6 @@ def label_faces(mesh: Mesh, anatomy: Anatomy) -> np.ndarray:
         heel = np.array([0, -0.5, -1.0])
         part[mine & beyond(leg + 2, heel)] = leg + 2
     return part
-
-
-def _near_bone(points: np.ndarray, a: np.ndarray, b: np.ndarray, radius: float) -> np.ndarray:
-    h = np.clip((points - a) @ (b - a) / ((b - a) @ (b - a)), 0, 1)
-    return np.linalg.norm(points - a - h[:, None] * (b - a), axis=1) < radius
 
 
 @lru_cache(maxsize=1)
@@ -147,18 +147,24 @@ def blending() -> tuple[np.ndarray, np.ndarray]:
         np.add.at(share, (mesh.faces[:, corner], template.part_of_face), mesh.face_areas / 3)
     share /= share.sum(axis=1, keepdims=True)
     a, b = mesh.edges.T
-    w = 1 / mesh.edge_lengths**2
-    A = csr_array((np.r_[w, w], (np.r_[a, b], np.r_[b, a])), shape=(n, n))
-    L = diags_array(A.sum(axis=1)) - A
-    M = diags_array(np.full(n, 1.0))
+    width = _blend_width(template)
     results = []
-    for width in (0.045, 0.030):
-        weights = share
-        solve = factor((M + (width**2 / 6) * L).tocsc())
-        for _ in range(2):
-            weights = solve(weights)
+    for factor_ in (1.3, 1.0):
+        w = (factor_ * 0.5 * (width[a] + width[b]) / mesh.edge_lengths)**2 / 6
+        A = csr_array((np.r_[w, w], (np.r_[a, b], np.r_[b, a])), shape=(n, n))
+        solve = factor((diags_array(1 + A.sum(axis=1)) - A).tocsc())
+        weights = solve(solve(share))
         results.append(weights / weights.sum(axis=1, keepdims=True))
     return results[0], results[1]
+
+
+def _blend_width(template: Template) -> np.ndarray:
+    """Over how many metres (N,) the motion of one part passes into that of the next."""
+    wide = {1: 0.075, 2: 0.075, 3: 0.040, 4: 0.052, 5: 0.030, 6: 0.020, 10: 0.060, 11: 0.034, 12: 0.020}
+    v = np.abs(template.mesh.vertices * [1, 0, 0]) + template.mesh.vertices * [0, 1, 1]
+    d = np.stack([np.linalg.norm(v - template.anatomy.joints[j], axis=1) for j in wide], axis=1)
+    near = np.exp(-0.5 * ((d - d.min(axis=1, keepdims=True)) / 0.04)**2)
+    return near @ np.array(list(wide.values())) / near.sum(axis=1)
 
 
 @lru_cache(maxsize=1)
