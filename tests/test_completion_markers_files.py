@@ -1,0 +1,360 @@
+"""Marker sequences: what is written comes back, foreign forms are understood, bad files say what is wrong."""
+import csv
+import os
+import struct
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from completion.markers.files import MarkerFileError, MarkerSequence, read_markers, write_markers
+
+ezc3d = pytest.importorskip("ezc3d")
+
+
+def sequence(rng, frames=7, labels=("C7", "LFHD", "RKNE", "RTOE"), rate=120.0):
+    positions = rng.normal(size=(frames, len(labels), 3))
+    positions[rng.random(positions.shape[:2]) < 0.2] = np.nan
+    return MarkerSequence(positions, labels, rate)
+
+
+def c3d_file(path, labels, points, units=("mm",), rate=100.0, **groups):
+    """Write points (3, L, T) as they are."""
+    tree = ezc3d.c3d()
+    parameters = tree["parameters"]["POINT"]
+    parameters["LABELS"]["value"] = tuple(labels)
+    parameters["RATE"]["value"] = [rate]
+    if units is not None:
+        parameters["UNITS"]["value"] = list(units)
+    for key, value in groups.items():
+        tree.add_parameter("POINT", key, value)
+    tree["data"]["points"] = np.concatenate([points, np.ones((1, *points.shape[1:]))])
+    tree.write(str(path))
+    return path
+
+
+def trc_file(path, seq, unit="mm", factor=1000.0, missing=""):
+    rows = ["PathFileType\t4\t(X/Y/Z)\ta.trc",
+            "DataRate\tCameraRate\tNumFrames\tNumMarkers\tUnits\tOrigDataRate\tOrigDataStartFrame\tOrigNumFrames",
+            f"{seq.rate}\t{seq.rate}\t{len(seq.positions)}\t{len(seq.labels)}\t{unit}\t120\t1\t9",
+            "Frame#\tTime\t" + "\t\t\t".join(seq.labels) + "\t\t",
+            "\t\t" + "\t".join(f"{a}{i + 1}" for i in range(len(seq.labels)) for a in "XYZ"), ""]
+    for t, frame in enumerate(seq.positions):
+        cells = [missing if np.isnan(v) else repr(factor * float(v)) for v in frame.ravel()]
+        rows.append("\t".join([str(t + 1), f"{t / seq.rate:.6f}", *cells]))
+    path.write_text("\n".join(rows) + "\n")
+    return path
+
+
+def agree(found, expected, tolerance=1e-9):
+    assert found.labels == expected.labels and found.rate == pytest.approx(expected.rate, rel=1e-9)
+    np.testing.assert_array_equal(found.seen, expected.seen)
+    np.testing.assert_allclose(found.positions, expected.positions, atol=tolerance)
+
+
+# ---- what is written comes back
+
+@pytest.mark.parametrize(("suffix", "tolerance"), [(".csv", 1e-8), (".c3d", 1e-6)])
+@pytest.mark.parametrize("rate", [120.0, 59.94, 1000 / 3, 30.0])
+def test_round_trip(tmp_path, suffix, tolerance, rate):
+    seq = sequence(np.random.default_rng(0), rate=rate)
+    write_markers(tmp_path / f"a{suffix}", seq)
+    back = read_markers(tmp_path / f"a{suffix}")
+    agree(back, MarkerSequence(seq.positions, seq.labels, back.rate), tolerance)
+    assert back.rate == pytest.approx(rate, rel=1e-6)
+    assert [p.name for p in tmp_path.iterdir()] == [f"a{suffix}"]
+
+
+@settings(max_examples=25, deadline=None)
+@given(st.integers(1, 4), st.integers(1, 5), st.integers(0, 2**32 - 1))
+def test_round_trip_of_any_csv(tmp_path_factory, frames, markers, seed):
+    seq = sequence(np.random.default_rng(seed), frames, tuple(f"M {i}_x" for i in range(markers)), 50.0)
+    path = tmp_path_factory.mktemp("csv") / "a.csv"
+    write_markers(path, seq)
+    assert read_markers(path).labels == seq.labels
+    agree(read_markers(path, rate=50.0), seq, 1e-8)
+
+
+def test_more_than_255_labels_go_on_in_labels2(tmp_path):
+    seq = sequence(np.random.default_rng(1), 3, tuple(f"M{i}" for i in range(600)))
+    write_markers(tmp_path / "a.c3d", seq)
+    agree(read_markers(tmp_path / "a.c3d"), seq, 1e-6)
+
+
+@pytest.mark.parametrize("missing", ["", "NaN", "0.0"])
+@pytest.mark.parametrize(("unit", "factor"), [("mm", 1000), ("m", 1), ("cm", 100)])
+def test_trc_in_its_own_unit(tmp_path, missing, unit, factor):
+    seq = sequence(np.random.default_rng(2))
+    agree(read_markers(trc_file(tmp_path / "a.trc", seq, unit, factor, missing)), seq)
+
+
+# ---- what C3D files hold
+
+@pytest.mark.parametrize(("units", "factor"), [(("mm",), 1e-3), (("M ",), 1), (("cm",), 1e-2), (None, 1e-3),
+                                               (("",), 1e-3)])
+def test_c3d_units_millimetres_where_it_does_not_say(tmp_path, units, factor):
+    points = np.random.default_rng(3).uniform(1, 2, (3, 4, 5))
+    path = c3d_file(tmp_path / "a.c3d", "ABCD", points, units)
+    np.testing.assert_allclose(read_markers(path).positions, factor * points.transpose(2, 1, 0), rtol=1e-6)
+    np.testing.assert_allclose(read_markers(path, unit="in").positions, 0.0254 * points.transpose(2, 1, 0),
+                               rtol=1e-6)
+
+
+def test_c3d_an_unknown_unit_asks_for_one(tmp_path):
+    path = c3d_file(tmp_path / "a.c3d", "AB", np.ones((3, 2, 2)), ("furlong",))
+    with pytest.raises(MarkerFileError, match=r"a\.c3d: expected a unit of m, mm, cm, in, found 'furlong'"):
+        read_markers(path)
+    assert read_markers(path, unit="mm").positions.max() == 1e-3
+
+
+def test_c3d_missing_is_nan_or_zero_or_a_negative_residual(tmp_path):
+    tree = ezc3d.c3d()
+    tree["parameters"]["POINT"]["LABELS"]["value"] = ("A", "B", "C", "D")
+    tree["parameters"]["POINT"]["RATE"]["value"] = [100.0]
+    points = np.full((4, 4, 2), 500.0)
+    points[:3, 0, 0], points[:3, 1, 0], points[:2, 3, 0] = np.nan, 0.0, 0.0
+    residuals = np.zeros((1, 4, 2))
+    residuals[0, 2, 0] = -1
+    tree["data"]["points"] = points
+    tree["data"]["meta_points"] = {"residuals": residuals, "camera_masks": np.zeros((7, 4, 2), dtype=bool)}
+    tree.write(str(tmp_path / "a.c3d"))
+    seq = read_markers(tmp_path / "a.c3d")
+    assert seq.seen.tolist() == [[False, False, False, True], [True] * 4]
+    assert np.isnan(seq.positions[0, :3]).all() and seq.positions[0, 3].tolist() == [0, 0, 0.5]
+
+
+def test_c3d_labels_lose_their_subject(tmp_path):
+    points = np.arange(3 * 4 * 2, dtype=float).reshape(3, 4, 2) + 1
+    path = c3d_file(tmp_path / "one.c3d", ["Ann:C7", "Ann:T10", "*3", "Ann:RKNE"], points)
+    assert read_markers(path).labels == ("C7", "T10", "*3", "RKNE")
+    path = c3d_file(tmp_path / "two.c3d", ["Ann:C7", "Bob:C7", "Ann:T10", "Bob:T10"], points)
+    with pytest.raises(MarkerFileError, match=r"two\.c3d: expected one subject, found Ann, Bob; say subject="):
+        read_markers(path)
+    bob = read_markers(path, subject="Bob")
+    assert bob.labels == ("C7", "T10")
+    np.testing.assert_allclose(bob.positions, 1e-3 * points.transpose(2, 1, 0)[:, [1, 3]])
+    with pytest.raises(MarkerFileError, match=r"two\.c3d: expected the subject 'Cid', found Ann, Bob"):
+        read_markers(path, subject="Cid")
+
+
+def test_c3d_computed_quantities_are_no_markers(tmp_path):
+    path = c3d_file(tmp_path / "a.c3d", ["C7", "LKneeAngles", "T10", "LKneeMoment"], np.ones((3, 4, 2)),
+                    ANGLES=["LKneeAngles"], MOMENTS=["LKneeMoment"])
+    assert read_markers(path).labels == ("C7", "T10")
+
+
+def test_c3d_a_label_that_comes_twice(tmp_path):
+    path = c3d_file(tmp_path / "a.c3d", ["C7", "T10", "C7"], np.ones((3, 3, 2)))
+    with pytest.raises(MarkerFileError, match=r"a\.c3d: labels: .* C7 comes more often"):
+        read_markers(path)
+
+
+def test_c3d_points_without_a_label_get_a_number(tmp_path):
+    path = c3d_file(tmp_path / "a.c3d", ["C7", "", "T10"], np.ones((3, 3, 2)))
+    assert read_markers(path).labels == ("C7", "point1", "T10")
+
+
+# ---- CSV from elsewhere
+
+def test_csv_with_frames_asks_for_a_rate(tmp_path):
+    (tmp_path / "a.csv").write_text("Frame,C7_X,C7_Y,C7_Z\n0,1,2,3\n1,,,\n2,1.5,2,3\n")
+    with pytest.raises(MarkerFileError, match=r"a\.csv: expected a column time.*say rate="):
+        read_markers(tmp_path / "a.csv")
+    seq = read_markers(tmp_path / "a.csv", rate=60)
+    assert seq.rate == 60 and seq.labels == ("C7",) and seq.seen.ravel().tolist() == [True, False, True]
+
+
+def test_csv_in_millimetres_when_the_caller_says_so(tmp_path):
+    (tmp_path / "a.csv").write_text("time,frame,C7_x,C7_y,C7_z\n0.5,1,1000,2000,3000\n0.51,2,1000,2000,\n")
+    seq = read_markers(tmp_path / "a.csv", unit="mm")
+    assert seq.rate == pytest.approx(100) and seq.positions[0, 0].tolist() == [1, 2, 3]
+    assert np.isnan(seq.positions[1, 0]).all()
+
+
+def test_csv_is_plain_enough_for_a_spreadsheet(tmp_path):
+    write_markers(tmp_path / "a.csv", MarkerSequence([[[1, 2, 3], [np.nan] * 3]], ("C7", "T10"), 100))
+    rows = list(csv.reader((tmp_path / "a.csv").open()))
+    assert rows == [["time", "C7_x", "C7_y", "C7_z", "T10_x", "T10_y", "T10_z"], ["0", "1", "2", "3", "", "", ""]]
+
+
+# ---- bad files
+
+def refused(path, *words):
+    with pytest.raises(MarkerFileError) as caught:
+        read_markers(path)
+    message = str(caught.value)
+    assert str(path) in message and "\n" not in message, message
+    assert all(word in message for word in words), message
+
+
+@pytest.mark.parametrize("suffix", [".c3d", ".trc", ".csv"])
+def test_missing_empty_folder_and_foreign_files(tmp_path, suffix):
+    refused(tmp_path / f"none{suffix}", "no such file")
+    (tmp_path / f"empty{suffix}").touch()
+    refused(tmp_path / f"empty{suffix}", "empty")
+    (tmp_path / f"folder{suffix}").mkdir()
+    refused(tmp_path / f"folder{suffix}", "directory")
+    (tmp_path / f"foreign{suffix}").write_bytes(b"\x89PNG\r\n" + bytes(range(256)) * 8)
+    refused(tmp_path / f"foreign{suffix}", "expected")
+    (tmp_path / f"text{suffix}").write_text("hello\nworld\n" * 100)
+    refused(tmp_path / f"text{suffix}", "expected")
+
+
+def test_a_name_of_no_known_format(tmp_path):
+    (tmp_path / "a.bvh").write_text("HIERARCHY")
+    refused(tmp_path / "a.bvh", ".c3d", "'.bvh'")
+    with pytest.raises(MarkerFileError, match=r"a\.trc: expected a name ending in \.csv or \.c3d"):
+        write_markers(tmp_path / "a.trc", sequence(np.random.default_rng(4)))
+
+
+@pytest.mark.parametrize("part", [0.001, 0.05, 0.3, 0.6, 0.9])
+def test_a_c3d_cut_off_anywhere_is_refused(tmp_path, part):
+    write_markers(tmp_path / "whole.c3d", sequence(np.random.default_rng(5), 200))
+    data = (tmp_path / "whole.c3d").read_bytes()
+    (tmp_path / "cut.c3d").write_bytes(data[:int(part * len(data))])
+    refused(tmp_path / "cut.c3d")
+
+
+def test_a_c3d_without_points(tmp_path):
+    tree = ezc3d.c3d()
+    tree["parameters"]["POINT"]["RATE"]["value"] = [100.0]
+    tree["parameters"]["ANALOG"]["RATE"]["value"] = [100.0]
+    tree["parameters"]["ANALOG"]["LABELS"]["value"] = ("force",)
+    tree["data"]["points"], tree["data"]["analogs"] = np.ones((4, 0, 5)), np.ones((1, 1, 5))
+    tree["data"]["rotations"] = np.zeros((4, 4, 0, 5))
+    tree.write(str(tmp_path / "a.c3d"))
+    refused(tmp_path / "a.c3d", "expected points")
+
+
+@pytest.mark.parametrize(("old", "new", "words"), [
+    ("time,", "clock,", ["line 1", "time,LABEL_x"]),
+    ("C7_y", "C7_w", ["line 1", "LABEL_y"]),
+    ("0.01,1,2,3", "0.01,1,2", ["line 3", "4 values", "found 3"]),
+    ("0.01,1,2,3", "0.01,1,two,3", ["line 3", "two"]),
+    ("0.01,1,2,3", "0.05,1,2,3", ["line 3", "even steps"]),
+    ("0.02,1,2,3\n", "0.00,1,2,3\n", ["even steps"]),
+    ("0,1,2,3\n0.01,1,2,3\n0.02,1,2,3\n", "", ["found none"]),
+    ("0.01,1,2,3", "0.01,1,inf,3", ["finite"]),
+])
+def test_a_bad_csv_says_where(tmp_path, old, new, words):
+    text = "time,C7_x,C7_y,C7_z\n0,1,2,3\n0.01,1,2,3\n0.02,1,2,3\n"
+    assert old in text
+    (tmp_path / "bad.csv").write_text(text.replace(old, new))
+    refused(tmp_path / "bad.csv", *words)
+
+
+@pytest.mark.parametrize(("line", "new", "words"), [
+    (2, "many\t120\t7\t4\tmm\t120\t1\t9", ["line 3", "DataRate"]),
+    (3, "Frame#\tTime\tC7", ["line 4", "4 marker names", "found 1"]),
+    (7, "2\t0.1\t1\t2\tx", ["line 8", "x"]),
+    (7, "2\t0.1" + 13 * "\t1", ["line 8", "14 values", "found 15"]),
+    (12, "", ["truncated", "7 frames", "found 6"]),
+])
+def test_a_bad_trc_says_where(tmp_path, line, new, words):
+    path = trc_file(tmp_path / "bad.trc", sequence(np.random.default_rng(6)))
+    lines = path.read_text().split("\n")
+    lines[line] = new
+    path.write_text("\n".join(lines))
+    refused(path, *words)
+
+
+# ---- the sequence itself
+
+def test_select_and_frames():
+    seq = sequence(np.random.default_rng(7), 10)
+    picked = seq.select(["RTOE", "C7"])
+    assert picked.labels == ("RTOE", "C7")
+    np.testing.assert_array_equal(picked.positions, seq.positions[:, [3, 0]])
+    half = seq.frames(slice(1, None, 2))
+    assert half.rate == 60 and len(half.positions) == 5
+    np.testing.assert_array_equal(half.positions, seq.positions[1::2])
+    with pytest.raises(ValueError, match="labels: NOSE not among C7, LFHD"):
+        seq.select(["NOSE"])
+
+
+@pytest.mark.parametrize("rate", [120.0, 60.0, 240.0, 47.0, 100.0])
+def test_resampling_a_straight_motion_is_exact(rate):
+    t = np.arange(31) / 120
+
+    def motion(t):
+        return np.stack([2 * t, 1 - t, 0.5 + 0 * t], axis=-1)[:, None]
+
+    found = MarkerSequence(motion(t), ("A",), 120).resampled(rate)
+    assert found.rate == rate and len(found.positions) == int(30 / 120 * rate + 1e-9) + 1
+    np.testing.assert_allclose(found.positions, motion(found.times), atol=1e-12)
+
+
+def test_resampling_keeps_gaps_missing_and_nothing_else():
+    positions = np.ones((5, 1, 3))
+    positions[2] = np.nan
+    found = MarkerSequence(positions, ("A",), 10).resampled(20)
+    assert found.seen[:, 0].tolist() == [True, True, True, False, False, False, True, True, True]
+
+
+@pytest.mark.parametrize(("positions", "labels", "rate", "says"), [
+    (np.ones((2, 3, 3)), ("A", "B"), 100, "positions: expected shape"),
+    (np.ones((2, 2, 3)), ("A", "A"), 100, "labels: .* A comes"),
+    (np.ones((2, 2, 3)), ("A", "B"), 0, "rate"),
+    (np.ones((2, 2, 3)), ("A", "B"), np.nan, "rate"),
+    (np.full((2, 2, 3), np.inf), ("A", "B"), 100, "finite"),
+])
+def test_a_sequence_refuses_what_does_not_agree(positions, labels, rate, says):
+    with pytest.raises(ValueError, match=says):
+        MarkerSequence(positions, labels, rate)
+
+
+def test_a_marker_with_one_missing_coordinate_is_missing():
+    seq = MarkerSequence([[[1, np.nan, 2], [1, 2, 3]]], ("A", "B"), 100)
+    assert np.isnan(seq.positions[0, 0]).all() and seq.seen.tolist() == [[False, True]]
+
+
+def test_dec_floats_are_read(tmp_path):
+    """A file of integers turned to the DEC number format by hand gives the same positions."""
+    write_markers(tmp_path / "a.c3d", sequence(np.random.default_rng(8), 5))
+    data = bytearray((tmp_path / "a.c3d").read_bytes())
+    start, points = (struct.unpack_from("<H", data, 16)[0] - 1) * 512, struct.unpack_from("<H", data, 2)[0]
+    expected = read_markers(tmp_path / "a.c3d")
+    for place in (12, 20, *range(start, start + 5 * points * 16, 4)):
+        data[place:place + 4] = _dec(data[place:place + 4])
+    parameters = (data[0] - 1) * 512
+    data[parameters + 3] = 85
+    for place in _float_parameters(data, parameters):
+        data[place:place + 4] = _dec(data[place:place + 4])
+    (tmp_path / "dec.c3d").write_bytes(bytes(data))
+    agree(read_markers(tmp_path / "dec.c3d"), expected, 1e-6)
+
+
+def _dec(ieee):
+    value = struct.unpack("<f", ieee)[0]
+    bits = struct.pack("<f", 0.0 if np.isnan(value) else 4 * value)
+    return bits[2:] + bits[:2]
+
+
+def _float_parameters(data, start):
+    """Where the float values of all parameters stand."""
+    place = start + 4
+    while place < len(data) and data[place]:
+        length, group = abs(struct.unpack_from("b", data, place)[0]), struct.unpack_from("b", data, place + 1)[0]
+        offset = place + 2 + length
+        step = struct.unpack_from("<h", data, offset)[0]
+        if group > 0:
+            kind, dims = struct.unpack_from("b", data, offset + 2)[0], data[offset + 3]
+            count = int(np.prod(list(data[offset + 4:offset + 4 + dims]))) if dims else 1
+            if kind == 4:
+                yield from range(offset + 4 + dims, offset + 4 + dims + 4 * count, 4)
+        if step == 0:
+            return
+        place = offset + step
+
+
+@pytest.mark.real
+def test_real_marker_files_hold_people():
+    folder = os.environ.get("SCAPEKIT_MARKERS")
+    if not folder:
+        pytest.skip("SCAPEKIT_MARKERS is not set")
+    for path in sorted(Path(folder).glob("*.c3d")):
+        seq = read_markers(path)
+        height = np.nanmax(seq.positions[..., 2], axis=1) - np.nanmin(seq.positions[..., 2], axis=1)
+        assert seq.rate == 120 and len(seq.labels) in (41, 42) and 1.4 < np.median(height) < 2.1
