@@ -124,6 +124,7 @@ class Anatomy:
     def __init__(self, shape: BodyShape) -> None:
         self.shape = s = shape
         self.man = w = (s.sex + 1) / 2
+        self.fat = s.weight + 0.45 * w + 0.70 * (1 - w)       # the tables are of lean people
         self.scale = s.stature / (w * tables.MAN + (1 - w) * tables.WOMAN)
         self._levels()
         self._place_joints()
@@ -200,7 +201,7 @@ class Anatomy:
 
         torso, shoulders = trunk(self)
         body: list[tuple[Field, float]] = [*torso, (leg(self), 0.035 * self.scale)]
-        left = Group([(Group(body), 0), *shoulders, (arm(self), 0.030 * self.scale)], trunk_bumps(self))
+        left = Group([(Group(body), 0), *shoulders, (arm(self), 0.040 * self.scale)], trunk_bumps(self))
         members: list[tuple[Field, float]] = [(left, 0), (head(self), 0.012), (hand(self), 0.012)]
         self.field: Field = Mirrored(Group(members))
 

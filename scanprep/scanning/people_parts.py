@@ -21,7 +21,7 @@ def trunk(a: Anatomy) -> tuple[list[tuple[Field, float]], list[tuple[Field, floa
     s, g, man = a.shape, a.scale, a.man
     table = man * tables.TRUNK_MAN + (1 - man) * tables.TRUNK_WOMAN
     fat = man * tables.TRUNK_FAT + (1 - man) * tables.TRUNK_FAT_WOMAN
-    body = table[:, 1:4] + s.weight * fat + s.muscle * tables.TRUNK_MUSCLE
+    body = table[:, 1:4] + a.fat * fat + s.muscle * tables.TRUNK_MUSCLE
     up = table[:, 0]
     belly = np.exp(-((up - 0.28) / 0.20)**2)
     body[:, 1] += s.belly * 0.017 * belly
@@ -36,26 +36,26 @@ def trunk(a: Anatomy) -> tuple[list[tuple[Field, float]], list[tuple[Field, floa
     main = Loft(np.zeros(3), UPRIGHT, _keys(at, body[:, 0], body[:, 0], body[:, 1], body[:, 2], table[:, 4]),
                 (0.03 * g, 0.03 * g))
     members: list[tuple[Field, float]] = [(main, 0)]
-    fatness = 0.5 * s.weight + 0.25 * s.hip_width
-    r = g * np.array([0.083 + 0.002 * (1 - man), 0.070 + 0.005 * (1 - man), 0.083])
-    r = r + g * np.array([0.004, 0.008, 0.006]) * fatness + g * np.array([0.002, 0.003, 0.002]) * s.muscle
-    members.append((Ellipsoid(a.front(0.074 * g, -0.062 * g, a.at(-0.06)), r), 0.06 * g))
+    fatness = 0.7 * a.fat + 0.25 * s.hip_width
+    r = g * np.array([0.076 + 0.004 * (1 - man), 0.068 + 0.005 * (1 - man), 0.083])
+    r = r + g * np.array([0.006, 0.009, 0.007]) * fatness + g * np.array([0.002, 0.003, 0.002]) * s.muscle
+    members.append((Ellipsoid(a.front(0.072 * g, -0.058 * g, a.at(-0.06)), r), 0.06 * g))
     if man < 1:
-        members.append((breast(a), 0.022 * g))
+        members.append((breast(a), 0.030 * g))
     return members, [(neck(a), 0.03 * g), *((t, 0.06 * g) for t in shoulder_line(a))]
 
 
 def breast(a: Anatomy) -> Field:
     """The breast of a woman, shrinking into the chest towards the man."""
     s, g = a.shape, a.scale
-    size = (1 - a.man) * (1 + 0.10 * s.chest + 0.09 * s.weight)
+    size = (1 - a.man) * (1 + 0.10 * s.chest + 0.09 * a.fat)
     size = max(size, 0.05)
     r = g * np.array([0.060, 0.056, 0.058]) * size**0.7
     drop = 0.012 * (size - 1)
-    depth = (0.052 + 0.011 * s.weight + 0.012 * (size - 1)) - 0.04 * a.man
+    depth = (0.052 + 0.011 * a.fat + 0.012 * (size - 1)) - 0.04 * a.man
     tilt = np.radians(16)
     frame = np.array([[np.cos(tilt), np.sin(tilt), 0], [np.sin(tilt), -np.cos(tilt), 0], [0, 0, 1.0]])
-    return Ellipsoid(a.front((0.071 + 0.004 * s.weight) * g, depth * g, a.at(0.665) - drop * g), r, frame)
+    return Ellipsoid(a.front((0.071 + 0.004 * a.fat) * g, depth * g, a.at(0.665) - drop * g), r, frame)
 
 
 def neck(a: Anatomy) -> Field:
@@ -68,22 +68,22 @@ def neck(a: Anatomy) -> Field:
     front = np.cross([1.0, 0, 0], axis)
     front = -front if front[1] > 0 else front
     part = np.array([0.0, 0.3, 0.6, 0.85, 1.0])
-    thick = (0.915 - 0.10 * (1 - a.man)) * g**0.5 * a.head_scale**0.5 * np.ones(5)
-    grow = 0.0035 * s.weight + 0.003 * s.muscle
-    side = np.array([0.072, 0.063, 0.060, 0.060, 0.062]) * thick + grow
+    thick = (0.915 - 0.125 * (1 - a.man)) * g**0.5 * a.head_scale**0.5 * np.ones(5)
+    grow = 0.0035 * a.fat + 0.003 * s.muscle
+    side = np.array([0.070, 0.062, 0.059, 0.059, 0.061]) * thick + grow
     fore = np.array([0.052, 0.056, 0.057, 0.055, 0.052]) * thick + grow * 1.1
-    back = np.array([0.056, 0.058, 0.060, 0.064, 0.068]) * thick + grow
+    back = np.array([0.054, 0.055, 0.056, 0.060, 0.066]) * thick + grow
     return Loft(low, np.array([[1.0, 0, 0], front, axis]), _keys(part * length, side, side, fore, back), (0.03, 0.03))
 
 
 def shoulder_line(a: Anatomy) -> list[Field]:
     """Trapezius and the top of the shoulder."""
     s, g = a.shape, a.scale
-    r = g * (0.020 + 0.004 * a.man + 0.003 * s.muscle + 0.0015 * s.weight)
+    r = g * (0.020 + 0.004 * a.man + 0.003 * s.muscle + 0.0015 * a.fat)
     shoulder = a.joints[4]
     top = shoulder + a.front(-0.020 * g, 0.002 * g, 0.026 * g)
     mid = a.front(0.52 * shoulder[0], -0.040 * g, a.level["neck"] - 0.010 * g)
-    return [RoundCone(a.front(0.030 * g, -0.052 * g, a.level["neck"] + 0.035 * g), mid, r * 0.9, r),
+    return [RoundCone(a.front(0.028 * g, -0.048 * g, a.level["neck"] + 0.020 * g), mid, r * 0.8, r),
             RoundCone(mid, top, r, r * 0.9)]
 
 
@@ -96,11 +96,11 @@ def _limb(a: Anatomy, origin: np.ndarray, frame: np.ndarray, at: np.ndarray, ext
 def leg(a: Anatomy) -> Field:
     """Leg and foot."""
     s, g = a.shape, a.scale
-    table = a.man * tables.LEG_MAN + (1 - a.man) * tables.LEG_WOMAN * (tables.MAN / tables.WOMAN) * 0.965
-    fat = (s.weight * (1.0 + 0.25 * (1 - a.man)) + 0.7 * s.limbs)[..., None] if False else \
-        s.weight * (1.0 + 0.25 * (1 - a.man)) + 0.7 * s.limbs
-    extents = table[:, 1:] + fat * tables.LEG_FAT[:, None] + s.muscle * tables.LEG_MUSCLE
-    extents = extents * (g if a.man == 1 else g * (a.man + (1 - a.man) * tables.WOMAN / tables.MAN))
+    own = a.man + (1 - a.man) * tables.WOMAN / tables.MAN           # the tables are for a man's size
+    table = a.man * tables.LEG_MAN + (1 - a.man) * tables.LEG_WOMAN
+    fat = a.fat * (1.0 + 0.25 * (1 - a.man)) + 0.7 * s.limbs
+    extents = table[:, 1:] * (1 - 0.035 * (1 - a.man)) + (fat * tables.LEG_FAT[:, None] + s.muscle * tables.LEG_MUSCLE) * own
+    extents = extents * g
     thigh = np.linalg.norm(a.joints[11] - a.joints[10])
     shin = np.linalg.norm(a.joints[12] - a.joints[11])
     at = np.interp(table[:, 0], [-1, 0, 1, 2, 3], [-thigh, 0, thigh, thigh + shin, thigh + 2 * shin])
@@ -127,7 +127,7 @@ def foot(a: Anatomy) -> Field:
     origin = np.array([ankle[0], ankle[1], sole])
     t, shift, half, top, bottom = (tables.FOOT * length).T
     centre, extent = (top - bottom) / 2, (top + bottom) / 2
-    wide = 1 + 0.02 * a.shape.weight
+    wide = 1 + 0.02 * a.fat
     main = Loft(origin, frame, _keys(t, half * wide, half * wide, extent, extent, 2.5, shift, centre),
                 (0.018 * length, 0.03 * length))
     members: list[tuple[Field, float]] = [(main, 0)]
@@ -144,7 +144,7 @@ def arm(a: Anatomy) -> Field:
     """Upper arm and forearm."""
     s, g = a.shape, a.scale
     thin = (a.man + (1 - a.man) * tables.ARM_WOMAN) * g
-    fat = s.weight * (1.0 + 0.2 * (1 - a.man)) + 0.6 * s.limbs
+    fat = a.fat * (1.0 + 0.2 * (1 - a.man)) + 0.6 * s.limbs
     upper, fore = tables.UPPER_ARM_MAN, tables.FOREARM_MAN
     extents = upper[:, 1:] + fat * tables.UPPER_ARM_FAT[:, None] + s.muscle * tables.UPPER_ARM_MUSCLE
     first = _limb(a, a.joints[4], a.upper_arm_frame, upper[:, 0] * a.width["upper_arm"], extents * thin,
@@ -163,7 +163,7 @@ def hand(a: Anatomy) -> Field:
     """Palm, four fingers slightly apart and curled, thumb."""
     L = a.width["hand"] / 0.19
     f, wrist = a.forearm_frame, a.joints[6]
-    wide = L * (a.man + (1 - a.man) * 0.94) * (1 + 0.012 * a.shape.weight)
+    wide = L * (a.man + (1 - a.man) * 0.94) * (1 + 0.012 * a.fat)
 
     def at(palm: float, thumb: float, along: float) -> np.ndarray:
         return wrist + f.T @ np.array([-palm * wide, thumb * wide, along * L])
@@ -196,10 +196,12 @@ def head(a: Anatomy) -> Field:
     def at(side: float, front: float, up: float) -> np.ndarray:
         return a.eye + np.array([side, -front, up]) * h
 
-    cranium = Ellipsoid(at(0, -0.010, 0.0205), np.array([0.0765, 0.099, 0.092]) * h)
+    cranium = Ellipsoid(at(0, -0.008, 0.0195), np.array([0.0755, 0.0965, 0.0895]) * h)
+    hair = Ellipsoid(at(0, -0.024, 0.0255 - 0.004 * (1 - man)),
+                     np.array([0.0785 + 0.004 * (1 - man), 0.0960 + 0.004 * (1 - man), 0.087 + 0.004 * (1 - man)]) * h)
     up = np.array([0.052, 0.022, 0.0, -0.030, -0.058, -0.082, -0.100])
     half = np.array([0.064, 0.0675, 0.068, 0.0665, 0.059 - 0.002 * (1 - man), 0.048 - 0.004 * (1 - man),
-                     0.034 - 0.003 * (1 - man)]) + s.weight * np.array([0, 0, 0.0005, 0.002, 0.003, 0.0035, 0.003])
+                     0.034 - 0.003 * (1 - man)]) + a.fat * np.array([0, 0, 0.0005, 0.002, 0.003, 0.0035, 0.003])
     fore = np.array([0.082, 0.089, 0.0875, 0.088, 0.0885, 0.0855, 0.0785])
     back = np.array([0.07, 0.07, 0.07, 0.06, 0.045, 0.03, 0.02])
     face = Loft(a.eye, UPRIGHT, _keys(up[::-1], half[::-1], half[::-1], fore[::-1], back[::-1], 2.25) *
@@ -207,14 +209,14 @@ def head(a: Anatomy) -> Field:
     big = 1 + 0.10 * s.nose + 0.06 * (man - 0.5)
     nose = RoundCone(at(0, 0.086, 0.010), at(0, 0.0945 + 0.012 * big, -0.036), 0.0065 * h, 0.0095 * h)
     wing = Ellipsoid(at(0.0115, 0.0965, -0.0395), np.array([0.0075, 0.0095, 0.0065]) * h)
-    eyeball = Ellipsoid(at(0.0315, 0.0715, 0.0), np.array([0.0125, 0.0125, 0.0115]) * h)
+    eyeball = Ellipsoid(at(0.0315, 0.0715, -0.001), np.array([0.0160, 0.0125, 0.0115]) * h)
     bun = Ellipsoid(at(0, -0.098 + 0.040 * man, 0.045), np.array([0.034, 0.036, 0.032]) * h)
     lean = np.radians(14)
     flare = np.radians(30)
     ear_frame = np.array([[np.cos(flare), np.sin(flare), 0], [-np.sin(flare), np.cos(flare), 0], [0, 0, 1.0]])
     tip = np.array([[1.0, 0, 0], [0, np.cos(lean), np.sin(lean)], [0, -np.sin(lean), np.cos(lean)]])
-    ear = Ellipsoid(at(0.0800, -0.010, -0.010), np.array([0.0065, 0.0185, 0.0320]) * h, ear_frame @ tip)
-    parts: list[tuple[Field, float]] = [(cranium, 0), (face, 0.03 * h)]
+    ear = Ellipsoid(at(0.0800, -0.010, -0.010), np.array([0.0075, 0.0185, 0.0320]) * h, ear_frame @ tip)
+    parts: list[tuple[Field, float]] = [(cranium, 0), (face, 0.03 * h), (hair, 0.004 * h)]
     return Group([(Group(parts, _face_bumps(a)), 0), (eyeball, 0.004 * h), (nose, 0.012 * h), (wing, 0.007 * h),
                   (ear, 0.006 * h), (bun, 0.012 * h)], _feature_bumps(a), bounds=(a.eye, a.eye + 1e-3, 0.19 * h))
 
@@ -225,12 +227,12 @@ def _face_bumps(a: Anatomy) -> list[Bump]:
     def bump(place: tuple[float, float, float], height: float, widths: tuple[float, float, float]) -> Bump:
         return Bump(a.eye + np.array([place[0], -place[1], place[2]]) * h, height * h, np.array(widths) * h)
 
-    return [bump((0.031, 0.085, 0.001), -0.0115, (0.0145, 0.03, 0.0105)),
-            bump((0.013, 0.088, 0.0), -0.004, (0.008, 0.02, 0.010)),
+    return [bump((0.031, 0.085, 0.003), -0.0100, (0.0150, 0.03, 0.0105)),
+            bump((0.014, 0.088, 0.001), -0.0045, (0.007, 0.02, 0.010)),
             bump((0.030, 0.088, 0.019), 0.0025 + 0.0025 * man, (0.018, 0.03, 0.0065)),
             bump((0, 0.09, 0.020), 0.002 + 0.002 * man, (0.012, 0.03, 0.008)),
             bump((0.047, 0.066, -0.022), 0.0055, (0.015, 0.02, 0.011)),
-            bump((0.046, 0.060, -0.056), -0.004 + 0.003 * s.weight, (0.014, 0.025, 0.016)),
+            bump((0.046, 0.060, -0.056), -0.004 + 0.003 * a.fat, (0.014, 0.025, 0.016)),
             bump((0.050, 0.015, -0.066), 0.005 * man, (0.014, 0.018, 0.014)),
             bump((0.070, 0.045, 0.020), -0.003, (0.02, 0.018, 0.018)),
             bump((0, 0.088, -0.0955), 0.0065 + 0.001 * man, (0.015, 0.03, 0.0105)),
@@ -246,16 +248,16 @@ def _feature_bumps(a: Anatomy) -> list[Bump]:
     return [bump((0, 0.092, -0.0565), 0.0050, (0.016, 0.03, 0.0042)),
             bump((0, 0.092, -0.0685), 0.0058, (0.0145, 0.03, 0.0046)),
             bump((0, 0.092, -0.0622), -0.0030, (0.021, 0.03, 0.0020)),
-            bump((0.088, -0.002, -0.010), -0.006, (0.010, 0.009, 0.014)),
+            bump((0.090, -0.004, -0.010), -0.005, (0.010, 0.008, 0.014)),
             bump((0.0115, 0.100, -0.0475), -0.003, (0.004, 0.008, 0.003))]
 
 
 def trunk_bumps(a: Anatomy) -> list[Bump]:
     """Muscles, bones and hollows of the trunk."""
     s, g, man = a.shape, a.scale, a.man
-    lean = np.clip(1 - 0.35 * s.weight, 0.25, 1.6)
+    lean = np.clip(1 - 0.35 * a.fat, 0.25, 1.6)
     firm = np.clip(1 + 0.35 * s.muscle, 0.4, 2.2)
-    deep = 0.011 * s.weight
+    deep = 0.011 * a.fat
 
     def bump(side: float, front: float, level: float, height: float, widths: tuple[float, float, float]) -> Bump:
         return Bump(a.front(side * g, front * g, a.at(level)), height * g, np.array(widths) * g)
@@ -271,8 +273,8 @@ def trunk_bumps(a: Anatomy) -> list[Bump]:
     clavicle = Bump(a.front(collar[0] * g, collar[1] * g, a.at(collar[2])), 0.005 * lean * g,
                     np.array([0.045, 0.03, 0.0075]) * g, along)
     return [clavicle,
-            bump(0.078, 0.105, 0.745, 0.011 * man * firm, (0.050, 0.05, 0.040)),
-            bump(0.080, 0.105, 0.610, -0.004 * man * lean, (0.045, 0.05, 0.016)),
+            bump(0.080, 0.105, 0.745, 0.014 * man * firm, (0.048, 0.05, 0.038)),
+            bump(0.080, 0.105, 0.610, -0.006 * man * lean, (0.045, 0.05, 0.015)),
             bump(0.0, 0.115, 0.76, -0.006 * (0.5 + 0.5 * man), (0.012, 0.06, 0.075)),
             bump(0.088 if man > 0.5 else 0.080, 0.11, 0.690, 0.0025, (0.008, 0.06, 0.008)),
             bump(0.0, 0.10 + deep, 0.45, -0.004 * lean, (0.011, 0.06, 0.075)),

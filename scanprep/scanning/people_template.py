@@ -11,7 +11,7 @@ from scipy.sparse import csr_array, diags_array
 from ..geometry import storage
 from ..geometry.mesh import Mesh
 from .people_anatomy import PARENTS, Anatomy, BodyShape
-from .people_field import project, value_and_gradient
+from .people_field import Field, project, value_and_gradient
 
 STORED = Path(__file__).with_name("people_template.npz")
 CANONICAL = BodyShape(sex=0.0, stature=1.69)
@@ -44,8 +44,8 @@ def sizing(anatomy: Anatomy) -> object:
     foot[2] = 0.01
     face = anatomy.eye + np.array([0, -0.095, -0.035])
     ear = anatomy.eye + np.array([0.08, 0.008, -0.01])
-    spots = [(hand, 0.0068, 0.09), (foot, 0.0085, 0.05), (face, 0.0064, 0.05), (anatomy.eye, 0.0130, 0.12),
-             (ear, 0.0072, 0.03)]
+    spots = [(hand, 0.0068, 0.09), (foot, 0.0085, 0.05), (face, 0.0062, 0.05), (anatomy.eye, 0.0110, 0.12),
+             (ear, 0.0055, 0.036)]
 
     def size(points: np.ndarray) -> np.ndarray:
         wanted = np.full(len(points), 0.0235)
@@ -215,23 +215,42 @@ def carry(shape: BodyShape, stages: int = 3) -> tuple[np.ndarray, Anatomy]:
         vertices = np.einsum("nij,nj->ni", blend, vertices) + weights @ shift
         total = frames(now) @ np.linalg.inv(frames(template.anatomy))
         wanted = np.einsum("np,pij,nj->ni", weights, total, offset)
+        gradient = None
         for _ in range(2):
-            vertices = _settle(now, vertices, wanted, mean)
+            vertices, gradient = _settle(now.field, vertices, wanted, gradient)
         before = now
-    value, gradient = value_and_gradient(now.field, vertices)
-    vertices = vertices - (value / np.maximum((gradient**2).sum(axis=1), 0.1))[:, None] * gradient
-    vertices = 0.5 * (vertices + vertices[template.mirror] * [-1, 1, 1])
-    return vertices, now
+    value, gradient = _symmetric(now.field, vertices)
+    step = np.clip(value / np.maximum((gradient**2).sum(axis=1), 0.1), -0.005, 0.005)
+    vertices = vertices - step[:, None] * gradient
+    return 0.5 * (vertices + vertices[template.mirror] * [-1, 1, 1]), now
 
 
-def _settle(anatomy: Anatomy, vertices: np.ndarray, wanted: np.ndarray, mean: csr_array) -> np.ndarray:
+def _symmetric(field: Field, vertices: np.ndarray, gradient: np.ndarray | None = None
+               ) -> tuple[np.ndarray, np.ndarray]:
+    """Field (N,) and gradient (N, 3), worked out on the left half; a known gradient is kept."""
+    twin = load().mirror
+    left = np.flatnonzero(load().mesh.vertices[:, 0] >= -1e-9)
+    value = np.empty(len(vertices))
+    if gradient is None:
+        gradient = np.empty_like(vertices)
+        value[left], gradient[left] = value_and_gradient(field, vertices[left])
+        gradient[twin[left]] = gradient[left] * [-1, 1, 1]
+    else:
+        value[left] = field(vertices[left])
+    value[twin[left]] = value[left]
+    return value, gradient
+
+
+def _settle(field: Field, vertices: np.ndarray, wanted: np.ndarray, gradient: np.ndarray | None
+            ) -> tuple[np.ndarray, np.ndarray]:
     """One Newton step onto the surface, then tangential steps towards the canonical neighbourhoods."""
-    value, gradient = value_and_gradient(anatomy.field, vertices)
+    value, gradient = _symmetric(field, vertices, gradient)
     length = np.sqrt(np.maximum((gradient**2).sum(axis=1), 0.05))
     normal = gradient / length[:, None]
     vertices = vertices - np.clip(value / length, -0.03, 0.03)[:, None] * normal
+    mean = neighbour_mean()
     for _ in range(6):
         step = mean @ vertices + wanted - vertices
         step -= np.einsum("nd,nd->n", step, normal)[:, None] * normal
         vertices = vertices + 0.5 * step
-    return vertices
+    return vertices, gradient
