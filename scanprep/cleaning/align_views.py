@@ -1,0 +1,168 @@
+"""Range views with rough camera poses brought together, all at once."""
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from ..geometry import rotations
+from ..geometry.mesh import Mesh
+from ..geometry.surface import OrientedPoints
+from .merge import border_distance, mesh_and_camera
+from .remesh import smooth
+
+
+@dataclass(frozen=True)
+class AlignViewsConfig:
+    """Settings of `align_views`.
+
+    Attributes
+    ----------
+    iterations : int
+        Most rounds of matching.
+    points : int
+        Points of each view that look for matches.
+    reach : float, metres
+        Farthest match of the first round; later ones keep three times the median distance.
+    min_cosine : float
+        Matches whose normals differ more do not count.
+    border : float, metres
+        Points nearer to the border of their view do not count.
+    smoothing : int
+        Rounds of smoothing before normals are taken.
+    tolerance : float, metres
+        Settled when no view's points move further in a round.
+    """
+
+    iterations: int = 40
+    points: int = 4000
+    reach: float = 0.08
+    min_cosine: float = 0.8
+    border: float = 0.02
+    smoothing: int = 10
+    tolerance: float = 2e-5
+
+
+@dataclass(frozen=True, eq=False)
+class AlignedViews:
+    """Views after `align_views`.
+
+    Attributes
+    ----------
+    views : list of (Mesh, (3,)) pairs
+        Moved surfaces and camera positions, ready for `merge_views`.
+    T_world_view : (V, 4, 4) float
+        The motion of each view; the first one stays.
+    rms : float, metres
+        Of the distances between matched points and planes, in the end.
+    converged : bool
+    iterations : int
+    """
+
+    views: list[tuple[Mesh, np.ndarray]]
+    T_world_view: np.ndarray
+    rms: float
+    converged: bool
+    iterations: int
+
+
+def align_views(views: Sequence[Any], config: AlignViewsConfig | None = None,
+                rng: np.random.Generator | None = None) -> AlignedViews:
+    """Refine rough camera poses by point-to-plane matching between all pairs of views together.
+
+    Parameters
+    ----------
+    views : sequence of RangeView, or of (Mesh, camera position (3,)) pairs
+        A few centimetres and degrees from where they belong.
+    config : AlignViewsConfig, optional
+    rng : numpy.random.Generator, optional
+        Draws the points that look for matches.
+
+    Returns
+    -------
+    AlignedViews
+
+    Raises
+    ------
+    ValueError
+        No views.
+    """
+    config, rng = config or AlignViewsConfig(), rng or np.random.default_rng(0)
+    pairs = [mesh_and_camera(view) for view in views]
+    if not pairs:
+        raise ValueError("views: expected at least one, got none")
+    samples = [_oriented(mesh, config, rng) for mesh, _ in pairs]
+    poses = np.tile(np.eye(4), (len(pairs), 1, 1))
+    reach, rms, settled, rounds = config.reach, 0.0, len(pairs) == 1, 0
+    while rounds < config.iterations and not settled:
+        placed = [(p @ T[:3, :3].T + T[:3, 3], n @ T[:3, :3].T)
+                  for T, (p, n, _) in zip(poses, samples, strict=True)]
+        matches = _match(placed, [inner for _, _, inner in samples], reach, config)
+        if not matches:
+            break
+        steps, residual = _solve(placed, matches)
+        moved = max(float(np.linalg.norm(p @ S[:3, :3].T + S[:3, 3] - p, axis=1).mean())
+                    for S, (p, _) in zip(steps, placed, strict=True))
+        poses = steps @ poses
+        rms, settled, rounds = float(np.sqrt(np.mean(residual**2))), moved < config.tolerance, rounds + 1
+        distances = np.concatenate([d for *_, d in matches])
+        reach = min(reach, max(3 * float(np.median(distances)), 0.005))
+    out = [(mesh.with_vertices(mesh.vertices @ T[:3, :3].T + T[:3, 3]), T[:3, :3] @ camera + T[:3, 3])
+           for T, (mesh, camera) in zip(poses, pairs, strict=True)]
+    return AlignedViews(out, poses, rms, settled, rounds)
+
+
+def _oriented(mesh: Mesh, config: AlignViewsConfig, rng: np.random.Generator
+              ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Points of a view, their normals, and which of them lie well inside."""
+    even = smooth(mesh, config.smoothing)
+    inner = border_distance(mesh, config.border) >= config.border
+    chosen = rng.permutation(len(mesh.vertices))[:4 * config.points]
+    return even.vertices[chosen], even.vertex_normals[chosen], inner[chosen]
+
+
+def _match(placed: list[tuple[np.ndarray, np.ndarray]], inner: list[np.ndarray], reach: float,
+           config: AlignViewsConfig) -> list[tuple[int, int, np.ndarray, np.ndarray, np.ndarray]]:
+    """For every pair of views (i, j): points of i, their matches in j, distances."""
+    found = []
+    for j, (points, normals) in enumerate(placed):
+        target = OrientedPoints(points, normals)
+        for i, (mine, my_normals) in enumerate(placed):
+            if i == j:
+                continue
+            rows = np.flatnonzero(inner[i][:config.points])
+            match = target.match(mine[rows], my_normals[rows], reach, config.min_cosine)
+            good = match.valid & inner[j][np.maximum(match.index, 0)]
+            if good.sum() >= 30:
+                found.append((i, j, rows[good], match.index[good], match.distances[good]))
+    return found
+
+
+def _solve(placed: list[tuple[np.ndarray, np.ndarray]],
+           matches: list[tuple[int, int, np.ndarray, np.ndarray, np.ndarray]]) -> tuple[np.ndarray, np.ndarray]:
+    """Small motions (V, 4, 4) of all views but the first that lessen the point-to-plane distances most."""
+    count = len(placed)
+    A, b, residuals = np.zeros((6 * count, 6 * count)), np.zeros(6 * count), []
+    centre = np.concatenate([p for p, _ in placed]).mean(axis=0)
+    for i, j, rows, targets, _ in matches:
+        x, y, n = placed[i][0][rows] - centre, placed[j][0][targets] - centre, placed[j][1][targets]
+        residual = np.einsum("nd,nd->n", n, x - y)
+        J = np.concatenate([np.cross(x, n), n], axis=1)
+        JJ, Jr = J.T @ J, J.T @ residual
+        a, c = slice(6 * i, 6 * i + 6), slice(6 * j, 6 * j + 6)
+        A[a, a] += JJ
+        A[c, c] += JJ
+        A[a, c] -= JJ
+        A[c, a] -= JJ
+        b[a] -= Jr
+        b[c] += Jr
+        residuals.append(residual)
+    A += 1e-6 * np.trace(A) / len(A) * np.eye(len(A))         # a view without matches stays
+    step = np.zeros((count, 6))
+    step[1:] = np.linalg.solve(A[6:, 6:], b[6:]).reshape(-1, 6)
+    T = np.tile(np.eye(4), (count, 1, 1))
+    T[:, :3, :3] = rotations.exp(step[:, :3])
+    T[:, :3, 3] = step[:, 3:] + centre - np.einsum("vij,j->vi", T[:, :3, :3], centre)
+    return T, np.concatenate(residuals)
