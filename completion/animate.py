@@ -22,6 +22,7 @@ from .solve import MinimiseConfig, minimise
 from .starts import search
 
 Progress = Callable[[int, int], None]
+STARTS = 2                           # that are followed to their end
 
 
 @dataclass(frozen=True)
@@ -33,7 +34,8 @@ class AnimateConfig:
     marker_sd : float, metres
         How far a marker lies from where the body would put it.
     outlier : float, metres
-        Residual at which a marker has lost three quarters of its weight.
+        Residual at which a marker has lost three quarters of its weight, at least; on a body that fits badly
+        it is three times the median residual.
     prior_weight : float
         Factor on the pose prior: small, it speaks for joints that no marker sees.
     prior_shrinkage : float in [0, 1]
@@ -109,8 +111,7 @@ def animate(subject: Subject, markers: MarkerSequence, layout: MarkerLayout, con
         x = smooth_sequence(follower, x)
     pose, trans, _ = follower.body.split(x)
     residuals = np.full(markers.positions.shape[:2], np.nan)
-    for t in range(len(x)):
-        residuals[t, follower.rows] = np.linalg.norm(follower.positions(x[t]) - follower.targets[t], axis=1)
+    residuals[:, follower.rows] = np.linalg.norm(follower.positions(x) - follower.targets, axis=2)
     return Motion(pose.copy(), trans.copy(), subject.betas, markers.rate, residuals, markers.labels,
                   converged=settled)
 
@@ -138,6 +139,7 @@ class MarkerFollower:
         self.distances = np.asarray(known.distances)
         ids, weights = supports(subject.template, known)
         self._follow = self.body.follow(ids, np.zeros(self.body.n_angles + 3), weights)
+        self._supports = subject.points(ids, weights)
         self.prior = gaussian_prior(self.body.pose_mean, self.body.pose_covariance, config.prior_shrinkage)
         step = 100 / self.rate
         self.loose = np.full(self.body.n_angles + 3, (config.angle_sd * step)**-2)
@@ -148,8 +150,9 @@ class MarkerFollower:
         return energy.above_skin(self._follow(x), self.distances)
 
     def positions(self, x: np.ndarray) -> np.ndarray:
-        """Where the body puts the markers (L, 3), metres, for unknowns (P,)."""
-        return self.follow(x).positions
+        """Where the body puts the markers (..., L, 3), metres, for unknowns (..., P)."""
+        pose, trans, _ = self.body.split(x)
+        return energy.lifted(self._supports.evaluate(pose, trans), self.distances)
 
     def first_frame(self) -> int:
         """The first frame with nearly as many markers as ever."""
@@ -163,7 +166,11 @@ class MarkerFollower:
         """Unknowns (P,) of a frame from nothing but its markers."""
         config = self.config
         x, _ = search(self.body, self.follow, self.targets[t], config.marker_sd, self.prior, config.start_axes)
-        return x[0]
+        weights = np.full(len(self.rows), config.marker_sd**-2)
+        end = minimise(lambda x: [energy.point_to_point(self.follow(x), self.targets[t], weights),
+                                  energy.pose_prior(x, self.prior, config.prior_weight)],
+                       x[:STARTS], MinimiseConfig(iterations=30))
+        return end.x[np.argmin(end.energy)]
 
     def frame(self, t: int, past: list[np.ndarray]) -> tuple[np.ndarray, bool]:
         """Unknowns (P,) of a frame that follows others (the nearest first), and whether it settled."""
@@ -188,7 +195,7 @@ class MarkerFollower:
                     energy.pose_prior(x, self.prior, config.prior_weight),
                     energy.stay_near(x, expected, self.loose)]
 
-        end = minimise(energies, expected[None], MinimiseConfig(config.iterations, 1e-4, 1e-3))
+        end = minimise(energies, expected[None], MinimiseConfig(config.iterations, 1e-4, 1e-2))
         return end.x[0], bool(end.converged[0])
 
     def weights(self, t: int, positions: np.ndarray) -> np.ndarray:
@@ -199,7 +206,7 @@ class MarkerFollower:
         off = positions - self.targets[t]
         off = off - np.nan_to_num(np.nanmedian(off, axis=0))
         squared = np.nan_to_num((off**2).sum(axis=1))
-        scale = self.config.outlier**2
+        scale = max(self.config.outlier, 3 * np.sqrt(np.median(squared[~np.isnan(off[:, 0])])))**2
         return (scale / (scale + squared))**2 / self.config.marker_sd**2
 
     def predict(self, past: list[np.ndarray]) -> np.ndarray:

@@ -90,6 +90,13 @@ def above_skin(supports: MovingPoints, distance: np.ndarray) -> MovingPoints:
     return MovingPoints(p[..., 0, :] + lift * n, J[..., 0, :, :] + lift[..., None] * (tangent @ dc))
 
 
+def lifted(supports: np.ndarray, distance: np.ndarray) -> np.ndarray:
+    """The positions (..., L, 3) of `above_skin` alone, from supports (..., 3L, 3), metres."""
+    p = supports.reshape(*supports.shape[:-2], -1, 3, 3)
+    c = np.cross(p[..., 1, :] - p[..., 0, :], p[..., 2, :] - p[..., 0, :])
+    return p[..., 0, :] + distance[:, None] * c / np.linalg.norm(c, axis=-1, keepdims=True)
+
+
 def point_to_point(points: MovingPoints, targets: np.ndarray, weights: np.ndarray) -> Residual:
     """Distance of points to their targets; a target that is NaN (not seen) counts nothing.
 

@@ -26,8 +26,9 @@ def smooth_sequence(follower: MarkerFollower, x: np.ndarray) -> np.ndarray:
         return x
     local = _local(x)
     gradient, hessian = np.empty((T, P)), np.empty((T, P, P))
+    positions = follower.positions(x)
     for t in range(T):
-        weights = follower.weights(t, follower.positions(x[t]))
+        weights = follower.weights(t, positions[t])
         at = x[t][None]
         terms = [energy.point_to_point(follower.follow(at), follower.targets[t], weights),
                  energy.pose_prior(at, follower.prior, follower.config.prior_weight)]

@@ -69,7 +69,7 @@ def _product(features: JointFeatures, flat: np.ndarray, pose: np.ndarray) -> np.
     R = features.skeleton.part_rotations(pose)[..., features.part, :, :]
     W = np.moveaxis(features.evaluate(pose)[..., None, None] * R, -3, -2)     # (..., i, a, j)
     W = W.reshape(-1, flat.shape[0]).astype(flat.dtype, copy=False)
-    return (W @ flat).reshape(*pose.shape[:-2], 3, -1)
+    return (W @ flat).reshape(*pose.shape[:-2], 3, flat.shape[1])
 
 
 @dataclass(frozen=True, eq=False)
@@ -172,6 +172,8 @@ class Subject:
     basis : (A, N, 3) float64 or float32, metres
         Of this type are the vertices; float32 is twice as fast and agrees to a few micrometres.
     origin : (3,) float, metres
+    pose_mean, pose_covariance : (J, 3) and (3J, 3J) float, optional
+        The model's pose prior, which a body of known shape keeps.
     """
 
     template: Mesh
@@ -180,6 +182,8 @@ class Subject:
     features: JointFeatures
     basis: np.ndarray
     origin: np.ndarray
+    pose_mean: np.ndarray | None = None
+    pose_covariance: np.ndarray | None = None
 
     @property
     def n_vertices(self) -> int:

@@ -119,7 +119,8 @@ class ScapeModel:
         basis = build_basis(self.stitching, self.template, self.pose_space, self.shape_space.gradients(betas))
         kept = None if betas is None else np.array(betas, dtype=np.float64)
         return Subject(self.template, self.skeleton, kept, self.pose_space.features,
-                       basis.astype(dtype, copy=False), self.skeleton.joints[0])
+                       basis.astype(dtype, copy=False), self.skeleton.joints[0], self.pose_mean,
+                       self.pose_covariance)
 
     def points(self, vertex_ids: np.ndarray, weights: np.ndarray | None = None) -> ShapedPoints:
         """Some surface points as a function of pose, betas and place, without touching the mesh again.
