@@ -55,7 +55,8 @@ class SurfaceGraph:
                                        return_predecessors=True)
         place = np.full(len(self.mesh.vertices), -1)
         place[sources] = np.arange(len(sources))
-        return distance, np.where(np.isfinite(distance), place[origin], -1)
+        reached = np.isfinite(distance)
+        return distance, np.where(reached, place[np.where(reached, origin, 0)], -1)
 
     def farthest_points(self, count: int, first: int = 0) -> np.ndarray:
         """Vertices spread over the surface: each the one farthest from those before it.

@@ -1,0 +1,148 @@
+"""Distances along the surface: known solids, libigl's exact ones, metric axioms."""
+import igl
+import numpy as np
+import pytest
+import trimesh
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import dijkstra
+
+from scanprep.geometry.geodesics import HeatGeodesics, SurfaceGraph
+from scanprep.geometry.mesh import Mesh
+
+
+def ball(subdivisions=3):
+    sphere = trimesh.creation.icosphere(subdivisions, 1.0)
+    return Mesh(sphere.vertices, sphere.faces)
+
+
+def lumpy(seed=0):
+    """A closed surface with uneven triangles, stretched, many of them obtuse."""
+    points = np.random.default_rng(seed).normal(size=(400, 3))
+    mesh = trimesh.convex.convex_hull(points / np.linalg.norm(points, axis=1, keepdims=True))
+    return Mesh(mesh.vertices * (0.3, 0.4, 0.9), mesh.faces)
+
+
+def hexagons(n=20):
+    """A flat sheet of equilateral triangles with side 1, and its middle vertex."""
+    i, j = np.meshgrid(np.arange(n), np.arange(n), indexing="ij")
+    v = np.stack([i + j / 2, j * np.sqrt(3) / 2, 0.0 * i], axis=-1).reshape(-1, 3)
+    k = np.arange(n * n).reshape(n, n)
+    a, b, c, d = k[:-1, :-1], k[1:, :-1], k[1:, 1:], k[:-1, 1:]
+    faces = np.concatenate([np.stack(t, axis=-1).reshape(-1, 3) for t in ((a, b, d), (b, c, d))])
+    return Mesh(v, faces), n * n // 2 + n // 2
+
+
+def exact(mesh, source):
+    none = np.array([], dtype=np.int64)
+    return igl.exact_geodesic(np.array(mesh.vertices), np.array(mesh.faces), np.array([source]), none,
+                              np.arange(len(mesh.vertices)), none)
+
+
+def test_on_even_triangles_the_way_is_at_most_four_percent_too_long():
+    mesh, source = hexagons()
+    found = SurfaceGraph(mesh).distances(source)
+    true = np.linalg.norm(mesh.vertices - mesh.vertices[source], axis=1)
+    near = (true > 0) & (true < 7)                       # where the straight way does not leave the sheet
+    ratio = found[near] / true[near]
+    assert ratio.min() > 1 - 1e-12 and ratio.max() < 1.036
+
+
+@pytest.mark.parametrize(("mesh", "longer"), [(ball(), 1.02), (lumpy(), 1.07), (lumpy(1), 1.07)])
+def test_against_exact_geodesics(mesh, longer):
+    for source in (0, 57, 200):
+        true = exact(mesh, source)
+        far = true > 0.2
+        graph = SurfaceGraph(mesh).distances(source)
+        assert (graph > true - 1e-9).all()               # a real way on the surface is never too short
+        assert (graph / np.maximum(true, 1e-12))[far].mean() < longer
+        heat = HeatGeodesics(mesh).distances(source)
+        assert np.abs(heat - true)[far].mean() < 0.05 * true[far].mean()
+
+
+@pytest.mark.parametrize("mesh", [ball(2), lumpy(2)], ids=["ball", "lumpy"])
+def test_never_longer_than_along_the_edges_and_a_metric(mesh):
+    a, b = mesh.edges.T
+    n = len(mesh.vertices)
+    along = dijkstra(coo_array((mesh.edge_lengths, (a, b)), shape=(n, n)).tocsr(), directed=False)
+    d = SurfaceGraph(mesh).distances(np.arange(n))
+    straight = np.linalg.norm(mesh.vertices[:, None] - mesh.vertices, axis=2)
+    assert (d <= along + 1e-12).all() and (d >= straight - 1e-12).all()
+    np.testing.assert_allclose(d, d.T, atol=1e-12)
+    assert (np.diag(d) == 0).all()
+    for k in range(0, n, 17):
+        assert (d <= d[:, [k]] + d[[k]] + 1e-12).all()
+
+
+def test_one_source_many_sources_and_a_limit_agree():
+    graph = SurfaceGraph(ball(2))
+    sources = np.array([3, 70, 11])
+    many = graph.distances(sources)
+    assert many.shape == (3, 162)
+    for row, source in zip(many, sources, strict=True):
+        np.testing.assert_array_equal(row, graph.distances(int(source)))
+    limited = graph.distances(3, limit=0.8)
+    np.testing.assert_array_equal(limited, np.where(many[0] <= 0.8, many[0], np.inf))
+    distance, which = graph.nearest(sources)
+    np.testing.assert_allclose(distance, many.min(axis=0))
+    np.testing.assert_allclose(many[which, np.arange(162)], distance)
+    np.testing.assert_array_equal(which[sources], [0, 1, 2])
+
+
+def test_ways_go_around_a_hole_and_not_across_it():
+    mesh, source = hexagons(15)
+    wall = (np.abs(mesh.vertices[:, 0] - mesh.vertices[source, 0] - 2) < 0.6) & (mesh.vertices[:, 1] > 2)
+    cut, used = mesh.submesh(~wall[mesh.faces].any(axis=1))
+    place = np.searchsorted(used, source)
+    whole, around = SurfaceGraph(mesh).distances(source)[used], SurfaceGraph(cut).distances(int(place))
+    assert (around >= whole - 1e-12).all() and (around > whole + 1).any()
+
+
+def test_pieces_without_a_source_are_infinitely_far():
+    one = ball(1)
+    two = Mesh(np.r_[one.vertices, one.vertices + 5], np.r_[one.faces, one.faces + 42])
+    distance, which = SurfaceGraph(two).nearest(np.array([4]))
+    assert np.isinf(distance[42:]).all() and (which[42:] == -1).all() and (which[:42] == 0).all()
+    heat = HeatGeodesics(two)
+    assert np.isinf(heat.distances(4)[42:]).all() and np.isfinite(heat.distances(4)[:42]).all()
+    np.testing.assert_allclose(heat.distances(np.array([4, 46]))[42:], heat.distances(4)[:42], atol=1e-6)
+    assert set(SurfaceGraph(two).farthest_points(2) // 42) == {0, 1}         # the other piece is served first
+
+
+def test_farthest_points_are_the_greedy_ones_and_cover_the_surface():
+    mesh = lumpy(3)
+    graph = SurfaceGraph(mesh)
+    d = graph.distances(np.arange(len(mesh.vertices)))
+    chosen = graph.farthest_points(30, first=5)
+    assert chosen[0] == 5 and len(set(chosen)) == 30
+    for i in range(1, 30):
+        nearest = d[chosen[:i]].min(axis=0)
+        assert nearest[chosen[i]] == pytest.approx(nearest.max())
+    assert sorted(graph.farthest_points(len(mesh.vertices))) == list(range(len(mesh.vertices)))
+
+
+def test_heat_follows_scale_and_turning():
+    mesh = lumpy(4)
+    R = np.linalg.qr(np.random.default_rng(1).normal(size=(3, 3)))[0]
+    moved = mesh.with_vertices(3 * mesh.vertices @ (R * np.linalg.det(R)).T + 7)
+    np.testing.assert_allclose(HeatGeodesics(moved).distances(9), 3 * HeatGeodesics(mesh).distances(9), atol=1e-6)
+
+
+def test_thin_and_flat_triangles_do_no_harm_to_paths():
+    mesh = Mesh([[0, 0, 0], [1, 0, 0], [2, 0, 0], [1, 1e-9, 0], [1, -1, 0], [0, 0, 0]],
+                [[0, 1, 2], [0, 2, 3], [0, 4, 1], [0, 5, 4]])
+    d = SurfaceGraph(mesh).distances(0)
+    np.testing.assert_allclose(d, [0, 1, 2, 1, np.sqrt(2), 0], atol=1e-8)
+
+
+def test_what_is_refused():
+    fin = Mesh([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, -1, 0], [0, 0, 1]], [[0, 1, 2], [1, 0, 3], [0, 1, 4]])
+    unused = Mesh(np.r_[ball(0).vertices, [[0, 0, 0]]], ball(0).faces)
+    with pytest.raises(ValueError, match="at most two triangles"):
+        HeatGeodesics(fin)
+    with pytest.raises(ValueError, match="1 do not"):
+        HeatGeodesics(unused)
+    graph = SurfaceGraph(fin)
+    with pytest.raises(ValueError, match=r"sources: expected vertices of 0\.\.4, got 9"):
+        graph.distances(9)
+    with pytest.raises(ValueError, match=r"count: expected 1\.\.5, got 6"):
+        graph.farthest_points(6)

@@ -1,0 +1,139 @@
+"""Rotations: group axioms, scipy as oracle, finite differences."""
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+from scipy.linalg import expm
+from scipy.spatial.transform import Rotation
+
+from scanprep.geometry import rotations
+
+number = st.floats(-1, 1)
+direction = st.tuples(number, number, number).map(np.array).filter(lambda v: np.linalg.norm(v) > 0.1)
+
+
+@st.composite
+def twists(draw, longest=np.pi - 1e-6):
+    v = draw(direction)
+    return v / np.linalg.norm(v) * draw(st.floats(0, longest))
+
+
+@given(twists(), twists(), twists())
+def test_rotations_are_a_group(a, b, c):
+    A, B, C = rotations.exp(np.stack([a, b, c]))
+    np.testing.assert_allclose((A @ B) @ C, A @ (B @ C), atol=1e-14)
+    np.testing.assert_allclose(rotations.exp(np.zeros(3)), np.eye(3), atol=0)
+    np.testing.assert_allclose(A @ rotations.exp(-a), np.eye(3), atol=1e-14)
+    np.testing.assert_allclose(A.T @ A, np.eye(3), atol=1e-14)
+    assert np.linalg.det(A @ B) == pytest.approx(1)
+
+
+@given(twists())
+def test_log_undoes_exp(t):
+    np.testing.assert_allclose(rotations.log(rotations.exp(t)), t, atol=1e-7)
+
+
+@given(twists(3 * np.pi))
+def test_exp_is_the_matrix_exponential(t):
+    np.testing.assert_allclose(rotations.exp(t), expm(rotations.hat(t)), atol=1e-12)
+
+
+@given(direction)
+def test_log_at_and_around_a_half_turn(v):
+    v = v / np.linalg.norm(v)
+    for angle in (np.pi, np.pi - 1e-9, np.pi - 1e-4):
+        back = rotations.log(rotations.exp(angle * v))
+        assert np.linalg.norm(back) == pytest.approx(angle, abs=1e-6)
+        assert abs(back @ v) / np.linalg.norm(back) == pytest.approx(1, abs=1e-6)
+
+
+def test_log_near_zero_keeps_its_digits():
+    for size in (1e-4, 1e-8, 1e-12, 0):
+        t = size * np.array([1.0, -2.0, 0.5])
+        np.testing.assert_allclose(rotations.log(rotations.exp(t)), t, rtol=1e-6, atol=1e-16)
+
+
+def test_leading_dimensions_are_kept():
+    t = np.random.default_rng(0).normal(size=(2, 4, 3))
+    R = rotations.exp(t)
+    assert R.shape == (2, 4, 3, 3)
+    for i in range(2):
+        for j in range(4):
+            np.testing.assert_array_equal(R[i, j], rotations.exp(t[i, j]))
+    np.testing.assert_allclose(rotations.log(R).shape, t.shape)
+
+
+@given(twists(), direction)
+def test_a_rotation_is_active_and_right_handed(t, x):
+    np.testing.assert_allclose(rotations.exp(t) @ x, Rotation.from_rotvec(t).apply(x), atol=1e-12)
+    np.testing.assert_allclose(rotations.hat(t) @ x, np.cross(t, x), atol=1e-12)
+
+
+def test_a_quarter_turn_about_z_takes_x_to_y():
+    np.testing.assert_allclose(rotations.exp([0, 0, np.pi / 2]) @ [1, 0, 0], [0, 1, 0], atol=1e-15)
+
+
+@given(twists(3.0), direction)
+def test_right_jacobian_is_the_derivative(t, d):
+    step = 1e-5 * d
+    plus = rotations.log(rotations.exp(t).T @ rotations.exp(t + step))
+    minus = rotations.log(rotations.exp(t).T @ rotations.exp(t - step))
+    np.testing.assert_allclose(rotations.right_jacobian(t) @ d, (plus - minus) / 2e-5, atol=1e-8)
+
+
+@given(twists(3.0), direction)
+def test_inverse_right_jacobian_is_the_inverse_and_the_derivative_of_log(t, d):
+    J, inverse = rotations.right_jacobian(t), rotations.inverse_right_jacobian(t)
+    np.testing.assert_allclose(inverse @ J, np.eye(3), atol=1e-8)
+    step = 1e-6 * d
+    change = (rotations.log(rotations.exp(t) @ rotations.exp(step))
+              - rotations.log(rotations.exp(t) @ rotations.exp(-step))) / 2e-6
+    np.testing.assert_allclose(inverse @ d, change, atol=1e-6)
+
+
+@pytest.mark.parametrize("angle", [0, 1e-9, 9.9e-4, 1.01e-3, 0.1])
+def test_the_series_for_small_angles_joins_the_formula(angle):
+    t = angle * np.array([0.6, 0, 0.8])
+    K = rotations.hat(t)
+    series = sum(np.linalg.matrix_power(-K, n) / float(np.prod(np.arange(1, n + 2))) for n in range(12))
+    np.testing.assert_allclose(rotations.right_jacobian(t), series, atol=1e-10)
+    np.testing.assert_allclose(rotations.inverse_right_jacobian(t), np.linalg.inv(series), atol=1e-10)
+
+
+def test_projection_gives_the_nearest_rotation_and_never_a_reflection():
+    rng = np.random.default_rng(1)
+    M = rng.normal(size=(40, 3, 3))
+    R = rotations.project(M)
+    np.testing.assert_allclose(np.linalg.det(R), 1)
+    np.testing.assert_allclose(np.swapaxes(R, -1, -2) @ R, np.tile(np.eye(3), (40, 1, 1)), atol=1e-12)
+    others = Rotation.random(2000, rng=rng).as_matrix()
+    for m, r in zip(M, R, strict=True):
+        assert np.linalg.norm(m - r) <= np.linalg.norm(m - others, axis=(1, 2)).min() + 1e-12
+    np.testing.assert_allclose(rotations.project(R), R, atol=1e-12)
+
+
+def test_mean_of_rotations_about_one_axis_is_the_middle():
+    R = rotations.exp(np.outer([0.1, 0.3, 0.5], [0, 1, 0]))
+    np.testing.assert_allclose(rotations.log(rotations.mean(R)), [0, 0.3, 0], atol=1e-12)
+
+
+@given(twists(), st.integers(3, 20), st.integers(0, 1000))
+def test_procrustes_finds_the_motion_that_was_made(t, n, seed):
+    rng = np.random.default_rng(seed)
+    source, shift, R = rng.normal(size=(n, 3)), rng.normal(size=3), rotations.exp(t)
+    found, moved = rotations.procrustes(source, source @ R.T + shift)
+    if n > 3:
+        np.testing.assert_allclose(found, R, atol=1e-6)
+    np.testing.assert_allclose(source @ found.T + moved, source @ R.T + shift, atol=1e-6)
+
+
+def test_procrustes_agrees_with_scipy_with_weights_and_mirrored_points():
+    rng = np.random.default_rng(2)
+    source, target, w = rng.normal(size=(2, 30, 3)), rng.normal(size=(2, 30, 3)), rng.random(30)
+    target[1] = source[1] * (-1, 1, 1)               # a reflection fits best, a rotation is wanted
+    R, t = rotations.procrustes(source, target, w)
+    for i in range(2):
+        cs, ct = np.average(source[i], axis=0, weights=w), np.average(target[i], axis=0, weights=w)
+        expected = Rotation.align_vectors(target[i] - ct, source[i] - cs, weights=w)[0].as_matrix()
+        np.testing.assert_allclose(R[i], expected, atol=1e-8)
+        np.testing.assert_allclose(t[i], ct - expected @ cs, atol=1e-8)

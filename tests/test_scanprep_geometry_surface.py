@@ -1,0 +1,118 @@
+"""Closest points, compatible matches and rays against brute force."""
+import numpy as np
+import pytest
+import trimesh
+
+from scanprep.geometry.mesh import Mesh
+from scanprep.geometry.surface import OrientedPoints, Rays, Surface, barycentric
+
+RNG = np.random.default_rng
+
+
+def ball(subdivisions=1, radius=0.5, centre=(0, 0, 0)):
+    sphere = trimesh.creation.icosphere(subdivisions, radius)
+    return Mesh(sphere.vertices + centre, sphere.faces)
+
+
+def brute_force(mesh, points):
+    """Distance to the surface: the best of all triangles' insides, sides and corners."""
+    best = np.full(len(points), np.inf)
+    for a, b, c in mesh.corners:
+        normal = np.cross(b - a, c - a)
+        normal /= np.linalg.norm(normal)
+        flat = points - ((points - a) @ normal)[:, None] * normal
+        inside = np.ones(len(points), dtype=bool)
+        for p, q in ((a, b), (b, c), (c, a)):
+            inside &= (flat - p) @ np.cross(normal, q - p) >= 0
+            t = np.clip((points - p) @ (q - p) / ((q - p) @ (q - p)), 0, 1)
+            best = np.minimum(best, np.linalg.norm(points - p - t[:, None] * (q - p), axis=1))
+        best = np.where(inside, np.minimum(best, np.abs((points - a) @ normal)), best)
+    return best
+
+
+def test_closest_points_against_brute_force():
+    mesh, points = ball(), RNG(0).normal(size=(400, 3))
+    found = Surface(mesh).closest(points)
+    np.testing.assert_allclose(found.distances, brute_force(mesh, points), atol=1e-12)
+    np.testing.assert_allclose(np.linalg.norm(points - found.points, axis=1), found.distances, atol=1e-12)
+    np.testing.assert_allclose(np.einsum("nc,ncd->nd", found.bary, mesh.corners[found.faces]), found.points,
+                               atol=1e-12)
+    assert found.bary.min() > -1e-9
+
+
+def test_a_surface_point_is_carried_with_its_triangle():
+    mesh = ball()
+    found = Surface(mesh).closest(RNG(1).normal(size=(50, 3)))
+    A, t = RNG(2).normal(size=(3, 3)), np.array([1, 2, 3])
+    carried = found.carried(mesh.vertices @ A.T + t, mesh.faces)
+    np.testing.assert_allclose(carried, found.points @ A.T + t, atol=1e-12)
+
+
+def test_points_on_the_surface_are_at_distance_zero():
+    mesh = ball(2)
+    points, _, _ = mesh.sample(500, RNG(3))
+    assert Surface(mesh).closest(points).distances.max() < 1e-9
+
+
+def test_barycentric_coordinates_come_back_and_flat_triangles_give_their_first_corner():
+    corners, bary = RNG(4).normal(size=(200, 3, 3)), RNG(5).dirichlet((1, 1, 1), 200)
+    points = np.einsum("nc,ncd->nd", bary, corners)
+    np.testing.assert_allclose(barycentric(points, corners), bary, atol=1e-8)
+    off_plane = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    np.testing.assert_allclose(barycentric(points + off_plane, corners), bary, atol=1e-8)
+    np.testing.assert_array_equal(barycentric(np.ones((1, 3)), np.ones((1, 3, 3))), [[1, 0, 0]])
+
+
+def test_matches_mind_the_normal_on_a_thin_sheet():
+    points = RNG(6).uniform(0, 1, (300, 2))
+    front, back = np.c_[points, np.full(300, 0.01)], np.c_[points, np.full(300, 0.0)]
+    normals = np.r_[np.tile([0, 0, 1.0], (300, 1)), np.tile([0, 0, -1.0], (300, 1))]
+    target = OrientedPoints(np.r_[front, back], normals)
+    query = front - (0, 0, 0.009)                    # nearer to the back, but it faces the front
+    found = target.match(query, normals[:300])
+    np.testing.assert_array_equal(found.index, np.arange(300))
+    np.testing.assert_allclose(found.distances, 0.009)
+    assert found.valid.all()
+
+
+def test_matches_are_the_best_in_six_dimensions_within_the_limits():
+    rng, scale = RNG(7), 0.05
+    unit = lambda n: n / np.linalg.norm(n, axis=1, keepdims=True)            # noqa: E731
+    points, normals = rng.normal(size=(200, 3)), unit(rng.normal(size=(200, 3)))
+    query, theirs = rng.normal(size=(100, 3)), unit(rng.normal(size=(100, 3)))
+    found = OrientedPoints(points, normals, scale).match(query, theirs, max_distance=0.5, min_cosine=0.3)
+    apart, turned = ((query[:, None] - points) ** 2).sum(axis=2), ((theirs[:, None] - normals) ** 2).sum(axis=2)
+    cost = apart + scale**2 * turned
+    best = cost.argmin(axis=1)
+    good = (np.linalg.norm(points[best] - query, axis=1) <= 0.5) & ((normals[best] * theirs).sum(axis=1) >= 0.3)
+    np.testing.assert_array_equal(found.index, np.where(good, best, -1))
+    np.testing.assert_array_equal(found.valid, good)
+    assert np.isinf(found.distances[~good]).all() and 0 < good.sum() < 100
+
+
+@pytest.mark.parametrize("centre", [(0, 0, 0), (100, -50, 20)])
+def test_rays_hit_a_ball_where_they_should(centre):
+    mesh, rng = ball(4, centre=centre), RNG(8)
+    origins = rng.normal(size=(300, 3))
+    origins *= 2 / np.linalg.norm(origins, axis=1, keepdims=True)
+    aim = rng.normal(size=(300, 3)) * 0.4 - origins
+    aim /= np.linalg.norm(aim, axis=1, keepdims=True)
+    face, distance = Rays(mesh).cast(origins + centre, aim)
+    along = -(origins * aim).sum(axis=1)
+    miss = np.sqrt(np.maximum((origins**2).sum(axis=1) - along**2, 0))       # how far the line passes the middle
+    sure = np.abs(miss - 0.5) > 0.01
+    np.testing.assert_array_equal((face >= 0)[sure], (miss < 0.5)[sure])
+    np.testing.assert_array_equal(np.isnan(distance), face < 0)
+    hit = (face >= 0) & (miss < 0.4)
+    np.testing.assert_allclose(distance[hit], (along - np.sqrt(np.maximum(0.25 - miss**2, 0)))[hit], atol=5e-3)
+    points = origins[hit] + centre + distance[hit, None] * aim[hit]
+    plane = np.einsum("nd,nd->n", points - mesh.corners[face[hit], 0], mesh.face_normals[face[hit]])
+    assert np.abs(plane).max() < 1e-5
+
+
+def test_a_ray_reaches_only_so_far():
+    mesh = ball(2)
+    rays, origin, down = Rays(mesh), np.array([[0, 0, 2.0]]), np.array([[0, 0, -1.0]])
+    assert rays.occluded(origin, down, reach=1.6).all() and not rays.occluded(origin, down, reach=1.4).any()
+    assert rays.cast(origin, down)[1][0] == pytest.approx(1.5, abs=1e-5)
+    assert not rays.occluded(origin, -down).any()
