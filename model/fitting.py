@@ -3,12 +3,15 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
 from .linear import PointOperator, Subject
 from .pose_space import twists
 from .scape import ScapeModel
+
+EXACT = 1e-9                         # metres: nearer than this needs no further step
 
 
 @dataclass(frozen=True)
@@ -85,29 +88,48 @@ def fit_pose(subject: Subject, vertices: np.ndarray, config: FitConfig | None = 
     ValueError
         Vertices of another count or not finite.
     """
-    config = config or FitConfig()
-    vertices = _checked_vertices(vertices, subject.n_vertices)
-    J = len(subject.skeleton.parents)
-    chosen = spread_vertices(subject.template.vertices, config.sample)
-    operator = subject.points(chosen)
-    best: tuple[np.ndarray, bool, int, float] | None = None
-    for start in _starts(subject, vertices):
-        x, converged, steps, energy = _minimise(*_pose_energy(operator, vertices[chosen]), start, J,
-                                                config.tolerance, config.iterations)
-        if best is None or energy < best[3]:
-            best = x, converged, steps, energy
-        if np.sqrt(energy / len(chosen)) < 0.02 * np.ptp(vertices, axis=0).max():
-            break
-    assert best is not None
-    x, converged, steps, _ = best
-    if len(chosen) < subject.n_vertices and config.polish:
-        everything = subject.points(np.arange(subject.n_vertices))
-        x, converged, more, _ = _minimise(*_pose_energy(everything, vertices), x, J, config.tolerance,
-                                          config.polish)
-        steps += more
-    pose, trans = x[:3 * J].reshape(J, 3), x[3 * J:]
-    fitted = np.asarray(subject.vertices(pose, trans), dtype=np.float64)
-    return PoseFit(pose, trans, fitted, *_distances(fitted, vertices), converged, steps)
+    return PoseFitter(subject, config).fit(vertices)
+
+
+class PoseFitter:
+    """`fit_pose` for many scans of one subject: what does not depend on the scan is prepared once.
+
+    Parameters
+    ----------
+    subject : Subject
+    config : FitConfig, optional
+    """
+
+    def __init__(self, subject: Subject, config: FitConfig | None = None) -> None:
+        self.subject, self.config = subject, config or FitConfig()
+        self._chosen = spread_vertices(subject.template.vertices, self.config.sample)
+        self._sample = subject.points(self._chosen)
+
+    @cached_property
+    def _everything(self) -> PointOperator:
+        return self.subject.points(np.arange(self.subject.n_vertices))
+
+    def fit(self, vertices: np.ndarray, start: np.ndarray | None = None) -> PoseFit:
+        """Pose and place from all vertices (N, 3), from a start that is sought unless a pose (J, 3) is given."""
+        subject, config, chosen = self.subject, self.config, self._chosen
+        vertices = _checked_vertices(vertices, subject.n_vertices)
+        J = len(subject.skeleton.parents)
+        energy = _pose_energy(self._sample, vertices[chosen])
+        best: Minimum | None = None
+        for x in _starts(subject, vertices) if start is None else [_placed(subject, vertices, start)]:
+            found = _minimise(*energy, x, J, config.tolerance, config.iterations)
+            if best is None or found.energy < best.energy:
+                best = found
+            if np.sqrt(found.energy / len(chosen)) < 0.02 * np.ptp(vertices, axis=0).max():
+                break
+        assert best is not None
+        steps = best.steps
+        if len(chosen) < subject.n_vertices and config.polish:
+            best = _minimise(*_pose_energy(self._everything, vertices), best.x, J, config.tolerance, config.polish)
+            steps += best.steps
+        pose, trans = best.x[:3 * J].reshape(J, 3), best.x[3 * J:]
+        fitted = np.asarray(subject.vertices(pose, trans), dtype=np.float64)
+        return PoseFit(pose, trans, fitted, *_distances(fitted, vertices), best.converged, steps)
 
 
 def fit_shape(model: ScapeModel, vertices: np.ndarray, config: FitConfig | None = None) -> ShapeFit:
@@ -134,16 +156,16 @@ def fit_shape(model: ScapeModel, vertices: np.ndarray, config: FitConfig | None 
     first = fit_pose(model.subject(np.zeros(K)), vertices, FitConfig(config.sample, 10, 0, 1e-3))
     x = np.concatenate([first.pose.ravel(), first.trans, np.zeros(K)])
     chosen = spread_vertices(model.template.vertices, config.sample)
-    x, converged, steps, _ = _minimise(*_shape_energy(model, chosen, vertices[chosen], K), x, J, config.tolerance,
-                                       config.iterations)
+    best = _minimise(*_shape_energy(model, chosen, vertices[chosen], K), x, J, config.tolerance, config.iterations)
+    steps = best.steps
     if config.polish:
-        x, converged, more, _ = _minimise(*_whole_energy(model, vertices, K), x, J, config.tolerance,
-                                          config.polish)
-        steps += more
+        best = _minimise(*_whole_energy(model, vertices, K), best.x, J, config.tolerance, config.polish)
+        steps += best.steps
+    x = best.x
     pose, trans, betas = x[:3 * J].reshape(J, 3), x[3 * J:3 * J + 3], np.zeros(model.n_betas)
     betas[:K] = x[3 * J + 3:]
     fitted = model.vertices(pose, betas, trans)
-    return ShapeFit(pose, trans, fitted, *_distances(fitted, vertices), converged, steps, betas)
+    return ShapeFit(pose, trans, fitted, *_distances(fitted, vertices), best.converged, steps, betas)
 
 
 def spread_vertices(vertices: np.ndarray, count: int) -> np.ndarray:
@@ -168,10 +190,14 @@ def _starts(subject: Subject, vertices: np.ndarray) -> list[np.ndarray]:
     stiff = np.broadcast_to(R[0], R.shape)
     starts = []
     for rotations in (R, stiff):
-        pose = subject.skeleton.pose_of(rotations.copy())
-        posed = np.asarray(subject.vertices(pose), dtype=np.float64)
-        starts.append(np.concatenate([pose.ravel(), (vertices - posed).mean(axis=0)]))
+        starts.append(_placed(subject, vertices, subject.skeleton.pose_of(rotations.copy())))
     return starts
+
+
+def _placed(subject: Subject, vertices: np.ndarray, pose: np.ndarray) -> np.ndarray:
+    """Unknowns (3J + 3,) for a pose, standing where it fits best."""
+    posed = np.asarray(subject.vertices(pose), dtype=np.float64)
+    return np.concatenate([pose.ravel(), (vertices - posed).mean(axis=0)])
 
 
 def _pose_energy(operator: PointOperator, target: np.ndarray) -> tuple[Evaluate, Derive]:
@@ -222,14 +248,18 @@ def _whole_energy(model: ScapeModel, target: np.ndarray, K: int) -> tuple[Evalua
     return evaluate, derive
 
 
-def _minimise(evaluate: Evaluate, derive: Derive, x: np.ndarray, J: int, tolerance: float, limit: int
-              ) -> tuple[np.ndarray, bool, int, float]:
-    """Levenberg-Marquardt; the first 3J unknowns are a pose, kept below π.
+@dataclass(frozen=True, eq=False)
+class Minimum:
+    """Where Levenberg-Marquardt stopped: unknowns, energy in square metres."""
 
-    Returns
-    -------
-    unknowns, whether it converged, steps taken, energy in square metres
-    """
+    x: np.ndarray
+    converged: bool
+    steps: int
+    energy: float
+
+
+def _minimise(evaluate: Evaluate, derive: Derive, x: np.ndarray, J: int, tolerance: float, limit: int) -> Minimum:
+    """Levenberg-Marquardt; the first 3J unknowns are a pose, kept below π."""
     damping, step = 1e-4, 0
     residual, columns = derive(x)
     energy = float(residual @ residual)
@@ -243,16 +273,16 @@ def _minimise(evaluate: Evaluate, derive: Derive, x: np.ndarray, J: int, toleran
                 break
             damping = max(damping, 1e-7) * 10
         else:
-            return x, True, step, energy             # no step lowers it any more
+            return Minimum(x, True, step, energy)    # no step lowers it any more
         step += 1
         decrease = energy - float(value @ value)
         trial[:3 * J] = twists(trial[:3 * J].reshape(J, 3)).ravel()
         x, damping = trial, damping / 5
-        if decrease <= tolerance * energy:
-            return x, True, step, energy - decrease
+        if decrease <= tolerance * energy or energy - decrease < EXACT**2 * len(residual):
+            return Minimum(x, True, step, energy - decrease)
         residual, columns = derive(x)
         energy = float(residual @ residual)
-    return x, False, step, energy
+    return Minimum(x, False, step, energy)
 
 
 def _distances(fitted: np.ndarray, vertices: np.ndarray) -> tuple[float, float]:

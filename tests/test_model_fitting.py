@@ -72,6 +72,6 @@ def test_refuses_bad_vertices(model, vertices, word):
 
 def test_refuses_a_model_without_shapes(model):
     none = ShapeSpace.empty(len(model.template.faces))
-    alone = ScapeModel(model.template, model.skeleton, model.pose_space, none, model.pose_mean, model.pose_covariance)
+    alone = ScapeModel(model.template, model.skeleton, model.pose_space, none, np.zeros((4, 3)), np.eye(12))
     with pytest.raises(ValueError, match="n_betas"):
         fit_shape(alone, model.template.vertices)

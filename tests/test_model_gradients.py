@@ -35,7 +35,7 @@ def test_a_linear_map_per_part_is_recovered_exactly(body):
     local = edges(body.vertices, body.faces) @ np.swapaxes(Q[:, parts], -1, -2)
     found = pose_gradients(GradientSystem(body, 0.001, parts), local)
     # the pull towards I is the only thing that moves them
-    np.testing.assert_allclose(found, Q[:, parts], atol=2e-4)
+    np.testing.assert_allclose(found, Q[:, parts], atol=1e-3)
 
 
 def test_eq_5_is_the_minimum_of_its_energy(body):

@@ -5,7 +5,7 @@ import pytest
 from model_bodies import random_poses, worm_model
 
 from model.scape import ScapeModel, load_model
-from scanprep.geometry import storage
+from scanprep.geometry import rotations, storage
 
 
 @pytest.fixture(scope="module")
@@ -31,10 +31,13 @@ def test_parts_far_from_the_joints_turn_rigidly():
     pose = np.zeros((4, 3))
     pose[1] = [0, 0.8, 0]
     y = stiff.vertices(pose)
-    tip = np.flatnonzero(stiff.template.vertices[:, 0] - 0.3 < -0.8)
-    R = stiff.skeleton.part_rotations(pose)[1]
-    moved = stiff.template.vertices[tip] @ R.T
-    np.testing.assert_allclose(y[tip] - y[tip].mean(axis=0), moved - moved.mean(axis=0), atol=1e-9)
+    far = stiff.template.vertices[:, 0] - 0.3 < -0.8
+    R, _ = rotations.procrustes(stiff.template.vertices[far], y[far])
+    # what the border disagrees on is spread by stitching and fades along the part
+    np.testing.assert_allclose(R, rotations.exp(pose[1]), atol=0.01)
+    root = stiff.stitching.root_vertices
+    R, _ = rotations.procrustes(stiff.template.vertices[root], y[root])
+    assert np.linalg.norm(rotations.log(R)) < 0.1 * 0.8
 
 
 def test_shape_jacobian_matches_differences(model):
