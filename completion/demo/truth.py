@@ -1,0 +1,69 @@
+"""How far the results of the chain are from the ground truth of the embedded people."""
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from scanprep.geometry.mesh import Mesh
+from scanprep.geometry.surface import Surface, SurfacePoints
+from scanprep.scanning.embedded import GroundTruth
+from scanprep.skeleton.tree import Skeleton
+
+
+@dataclass(frozen=True, eq=False)
+class TruthMap:
+    """Where each vertex of the template truly lies on any embedded person.
+
+    All embedded people share one triangulation, so a point of the surface is a triangle with barycentric
+    coordinates, and is carried from the scan that the template was made of to every other person and pose.
+
+    Attributes
+    ----------
+    template : Mesh
+    places : SurfacePoints
+        The true surface points nearest to the template's vertices.
+    part_of_face : (F,) int
+        True part under each triangle of the template.
+    """
+
+    template: Mesh
+    places: SurfacePoints
+    part_of_face: np.ndarray
+
+    @staticmethod
+    def of(template: Mesh, rest: GroundTruth) -> TruthMap:
+        """From the truth of the scan that the template was made of."""
+        surface = Surface(rest.mesh)
+        middle = surface.closest(template.corners.mean(axis=1))
+        return TruthMap(template, surface.closest(template.vertices), rest.part_of_face[middle.faces])
+
+    def vertices(self, truth: GroundTruth) -> np.ndarray:
+        """True places (N, 3) of the template's vertices, metres."""
+        return self.places.carried(truth.vertices, truth.faces)
+
+
+def surface_error(mesh: Mesh, truth: GroundTruth) -> np.ndarray:
+    """Distance (N,) of the vertices of a mesh to the true surface, metres."""
+    return Surface(truth.mesh).closest(mesh.vertices).distances
+
+
+def mean_over_area(values: np.ndarray, mesh: Mesh, where: np.ndarray | None = None) -> float:
+    """The mean of values (N,) over the surface, or over the vertices in `where` (N,) bool."""
+    weights = mesh.vertex_areas if where is None else mesh.vertex_areas * where
+    return float(values @ weights / weights.sum())
+
+
+def adjusted_rand(one: np.ndarray, other: np.ndarray, weights: np.ndarray) -> float:
+    """Agreement of two labellings (n,) with weights (n,): 1 the same partition, 0 as by chance."""
+    table = np.zeros((one.max() + 1, other.max() + 1))
+    np.add.at(table, (one, other), weights / weights.sum())
+    together, rows, columns = (float((t**2).sum()) for t in (table, table.sum(axis=1), table.sum(axis=0)))
+    chance = rows * columns
+    return (together - chance) / (0.5 * (rows + columns) - chance)
+
+
+def joint_errors(skeleton: Skeleton, rest: GroundTruth) -> np.ndarray:
+    """Distance (J - 1,) of every joint found to the nearest true one at rest, metres."""
+    apart = np.linalg.norm(skeleton.joints[1:, None] - rest.joints[None, 1:], axis=2)
+    return apart.min(axis=1)
