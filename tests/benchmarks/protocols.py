@@ -5,8 +5,10 @@ from the checkout; nothing here is a test.
 """
 from __future__ import annotations
 
+import importlib.metadata
 import json
 import os
+import platform
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -102,3 +104,21 @@ def half_view(body: Mesh, k: int, landmarks: dict[str, int], rng: np.random.Gene
     named = [v for v in landmarks.values() if seen[v]]
     chosen = np.array(named)[np.round(np.linspace(0, len(named) - 1, 7)).astype(int)]
     return HalfView(points, seen, (chosen, body.vertices[chosen]), camera)
+
+
+def machine() -> dict[str, object]:
+    """What the figures were measured on: processor count, Python, and the versions that matter."""
+    packages = ("scapekit", "numpy", "scipy", "cholespy")
+    versions = {}
+    for name in packages:
+        try:
+            versions[name] = importlib.metadata.version(name)
+        except importlib.metadata.PackageNotFoundError:
+            versions[name] = "not installed"
+    return {"cores": os.cpu_count(), "threads": os.environ.get("OMP_NUM_THREADS", "all"),
+            "platform": platform.platform(), "python": platform.python_version(), **versions}
+
+
+def write_report(path: str | Path, report: dict[str, object]) -> None:
+    """Write the figures of a benchmark as JSON; numpy numbers become plain ones."""
+    Path(path).write_text(json.dumps(report, indent=1, default=float) + "\n")
