@@ -1,8 +1,29 @@
-"""A body that can be posed and reshaped, learned from registered meshes."""
-from .fitting import FitConfig, PoseFit, ShapeFit, fit_pose, fit_shape
-from .learning import LearnConfig, learn_scape
-from .linear import PointOperator, Subject
-from .scape import ScapeModel, load_model
+"""A body that can be posed and reshaped, learned from registered meshes.
+
+The public names are loaded when they are first used, so that the command line answers at once.
+"""
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from .fitting import FitConfig, PoseFit, ShapeFit, fit_pose, fit_shape
+    from .learning import LearnConfig, learn_scape
+    from .linear import PointOperator, Subject
+    from .scape import ScapeModel, load_model
+
+_ROOMS = {
+    "fitting": ("FitConfig", "PoseFit", "ShapeFit", "fit_pose", "fit_shape"),
+    "learning": ("LearnConfig", "learn_scape"),
+    "linear": ("PointOperator", "Subject"),
+    "scape": ("ScapeModel", "load_model"),
+}
+_ROOM_OF = {name: room for room, names in _ROOMS.items() for name in names}
 
 __all__ = ["FitConfig", "LearnConfig", "PointOperator", "PoseFit", "ScapeModel", "ShapeFit", "Subject", "fit_pose",
            "fit_shape", "learn_scape", "load_model"]
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _ROOM_OF:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(import_module(f".{_ROOM_OF[name]}", __name__), name)

@@ -1,16 +1,45 @@
-"""From raw range scans to registered meshes and a skeleton."""
-from .cleaning.decimate import decimate
-from .cleaning.fill import fill_holes
-from .cleaning.merge import merge_views
-from .dataset import RegisteredSet
-from .geometry.files import MeshFileError, read_mesh, read_points, write_mesh
-from .geometry.landmarks import read_landmark_vertices, read_landmarks, write_landmarks
-from .geometry.mesh import Mesh
-from .matching.nonrigid import RegistrationConfig, register
-from .matching.rigid import align_rigid
-from .skeleton.find import find_skeleton
-from .skeleton.tree import Skeleton
+"""From raw range scans to registered meshes and a skeleton.
 
-__all__ = ["Mesh", "MeshFileError", "RegisteredSet", "RegistrationConfig", "Skeleton", "align_rigid", "decimate",
-           "fill_holes", "find_skeleton", "merge_views", "read_landmark_vertices", "read_landmarks", "read_mesh",
-           "read_points", "register", "write_landmarks", "write_mesh"]
+The public names are loaded when they are first used, so that the command line answers at once.
+"""
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from .cleaning.decimate import decimate
+    from .cleaning.fill import fill_holes
+    from .cleaning.merge import merge_views
+    from .dataset import RegisteredSet
+    from .geometry.files import MeshFileError, read_mesh, read_points, write_mesh
+    from .geometry.landmarks import match_landmarks, read_landmark_vertices, read_landmarks, write_landmarks
+    from .geometry.mesh import Mesh
+    from .matching.nonrigid import RegistrationConfig, register
+    from .matching.rigid import align_rigid
+    from .skeleton.find import SkeletonConfig, find_skeleton
+    from .skeleton.tree import Skeleton
+
+_ROOMS = {
+    "cleaning.decimate": ("decimate",),
+    "cleaning.fill": ("fill_holes",),
+    "cleaning.merge": ("merge_views",),
+    "dataset": ("RegisteredSet",),
+    "geometry.files": ("MeshFileError", "read_mesh", "read_points", "write_mesh"),
+    "geometry.landmarks": ("match_landmarks", "read_landmark_vertices", "read_landmarks", "write_landmarks"),
+    "geometry.mesh": ("Mesh",),
+    "matching.nonrigid": ("RegistrationConfig", "register"),
+    "matching.rigid": ("align_rigid",),
+    "skeleton.find": ("SkeletonConfig", "find_skeleton"),
+    "skeleton.tree": ("Skeleton",),
+}
+_ROOM_OF = {name: room for room, names in _ROOMS.items() for name in names}
+
+__all__ = ["Mesh", "MeshFileError", "RegisteredSet", "RegistrationConfig", "Skeleton", "SkeletonConfig",
+           "align_rigid", "decimate", "fill_holes", "find_skeleton", "match_landmarks", "merge_views",
+           "read_landmark_vertices", "read_landmarks", "read_mesh", "read_points", "register", "write_landmarks",
+           "write_mesh"]
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _ROOM_OF:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(import_module(f".{_ROOM_OF[name]}", __name__), name)

@@ -88,7 +88,8 @@ class DemoConfig:
     learn: LearnConfig = field(default_factory=LearnConfig)
 
 
-QUICK = DemoConfig(poses=9, subjects=4, faces=7000, resolution=0.011, template_resolution=0.006, held_out=2, frames=66, rate=30.0)
+QUICK = DemoConfig(poses=9, subjects=4, faces=7000, resolution=0.011, template_resolution=0.006, held_out=2, frames=66,
+                   rate=30.0)
 
 
 @dataclass(frozen=True)
@@ -149,7 +150,7 @@ class Demo:
         if not path.exists():
             rng = np.random.default_rng([self.config.seed, 6])
             with self.bar("making the template") as progress:
-                scanner = replace(self.scanner, views=self.config.template_views, resolution=self.config.template_resolution)
+                scanner = ScannerConfig(views=self.config.template_views, resolution=self.config.template_resolution)
                 careful = scan(self.rest.mesh, scanner, rng)
                 marks = click_landmarks(self.rest, rng, seen=careful.merged.vertices)
                 write_scan(folder, "rest", careful, self.rest, marks)
@@ -180,8 +181,9 @@ class Demo:
         """
         config = PrepareConfig()
         template, marks = self.template, self.template_landmarks
+        tasks = find_scans(self.folder / "scans")
         with self.bar("registering scans") as first, self.bar("finding the skeleton") as second:
-            done = prepare(find_scans(self.folder / "scans"), template, marks, self.folder / "set", config, first, second)
+            done = prepare(tasks, template, marks, self.folder / "set", config, first, second)
         if done.failures:
             raise ValueError("; ".join(done.failures))
         return done
@@ -259,8 +261,8 @@ class Demo:
         if not (folder / "walk.c3d").exists():
             with self.bar("recording a walk") as progress:
                 self._record(folder, bodies, progress)
-        return (read_markers(folder / "walk.c3d"), MarkerLayout.load(folder / "layout.json", len(self.template.vertices)),
-                bodies)
+        layout = MarkerLayout.load(folder / "layout.json", len(self.template.vertices))
+        return read_markers(folder / "walk.c3d"), layout, bodies
 
     def _record(self, folder: Path, bodies: np.ndarray, progress: Callable[[int, int], None]) -> None:
         rng = np.random.default_rng([self.config.seed, 9])
