@@ -201,7 +201,7 @@ class Anatomy:
 
         torso, shoulders = trunk(self)
         body: list[tuple[Field, float]] = [*torso, (leg(self), 0.035 * self.scale)]
-        left = Group([(Group(body), 0), *shoulders, (arm(self), 0.040 * self.scale)], trunk_bumps(self))
+        left = Group([(Group(body), 0), *shoulders, (arm(self), 0.048 * self.scale)], trunk_bumps(self))
         members: list[tuple[Field, float]] = [(left, 0), (head(self), 0.012), (hand(self), 0.012)]
         self.field: Field = Mirrored(Group(members))
 
@@ -214,4 +214,4 @@ class Anatomy:
         return self.level["hip"] + level * (self.level["shoulder"] - self.level["hip"])
 
 
-__all__ = ["PARENTS", "PARTS", "Anatomy", "Bump", "BodyShape", "Ellipsoid", "Loft", "RoundCone"]
+__all__ = ["PARENTS", "PARTS", "Anatomy", "BodyShape", "Bump", "Ellipsoid", "Loft", "RoundCone"]

@@ -197,8 +197,8 @@ def head(a: Anatomy) -> Field:
         return a.eye + np.array([side, -front, up]) * h
 
     cranium = Ellipsoid(at(0, -0.008, 0.0195), np.array([0.0755, 0.0965, 0.0895]) * h)
-    hair = Ellipsoid(at(0, -0.024, 0.0255 - 0.004 * (1 - man)),
-                     np.array([0.0785 + 0.004 * (1 - man), 0.0960 + 0.004 * (1 - man), 0.087 + 0.004 * (1 - man)]) * h)
+    hair = Ellipsoid(at(0, -0.020, 0.0255 - 0.004 * (1 - man)),
+                     np.array([0.0785 + 0.004 * (1 - man), 0.0940 + 0.004 * (1 - man), 0.087 + 0.004 * (1 - man)]) * h)
     up = np.array([0.052, 0.022, 0.0, -0.030, -0.058, -0.082, -0.100])
     half = np.array([0.064, 0.0675, 0.068, 0.0665, 0.059 - 0.002 * (1 - man), 0.048 - 0.004 * (1 - man),
                      0.034 - 0.003 * (1 - man)]) + a.fat * np.array([0, 0, 0.0005, 0.002, 0.003, 0.0035, 0.003])
@@ -210,7 +210,7 @@ def head(a: Anatomy) -> Field:
     nose = RoundCone(at(0, 0.086, 0.010), at(0, 0.0945 + 0.012 * big, -0.036), 0.0065 * h, 0.0095 * h)
     wing = Ellipsoid(at(0.0115, 0.0965, -0.0395), np.array([0.0075, 0.0095, 0.0065]) * h)
     eyeball = Ellipsoid(at(0.0315, 0.0715, -0.001), np.array([0.0160, 0.0125, 0.0115]) * h)
-    bun = Ellipsoid(at(0, -0.098 + 0.040 * man, 0.045), np.array([0.034, 0.036, 0.032]) * h)
+    bun = Ellipsoid(at(0, -0.119 + 0.052 * man, 0.034), np.array([0.031, 0.029, 0.030]) * h)
     lean = np.radians(14)
     flare = np.radians(30)
     ear_frame = np.array([[np.cos(flare), np.sin(flare), 0], [-np.sin(flare), np.cos(flare), 0], [0, 0, 1.0]])
@@ -218,7 +218,7 @@ def head(a: Anatomy) -> Field:
     ear = Ellipsoid(at(0.0800, -0.010, -0.010), np.array([0.0075, 0.0185, 0.0320]) * h, ear_frame @ tip)
     parts: list[tuple[Field, float]] = [(cranium, 0), (face, 0.03 * h), (hair, 0.004 * h)]
     return Group([(Group(parts, _face_bumps(a)), 0), (eyeball, 0.004 * h), (nose, 0.012 * h), (wing, 0.007 * h),
-                  (ear, 0.006 * h), (bun, 0.012 * h)], _feature_bumps(a), bounds=(a.eye, a.eye + 1e-3, 0.19 * h))
+                  (ear, 0.006 * h), (bun, 0.007 * h)], _feature_bumps(a), bounds=(a.eye, a.eye + 1e-3, 0.19 * h))
 
 
 def _face_bumps(a: Anatomy) -> list[Bump]:

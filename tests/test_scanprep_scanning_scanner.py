@@ -1,0 +1,150 @@
+"""The virtual scanner and the embedded data set."""
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+
+from scanprep.geometry.files import read_mesh
+from scanprep.geometry.mesh import Mesh
+from scanprep.geometry.surface import Surface
+from scanprep.scanning import embedded, people
+from scanprep.scanning.people import BodyShape, Person
+from scanprep.scanning.scanner import ScannerConfig, scan
+
+COARSE = ScannerConfig(resolution=0.014)
+
+
+@pytest.fixture(scope="module")
+def body() -> Mesh:
+    return Person(BodyShape()).mesh
+
+
+@pytest.fixture(scope="module")
+def scanned(body):
+    return scan(body, ScannerConfig(), np.random.default_rng(5))
+
+
+def test_default_scan_has_about_fifty_thousand_points_in_four_views(scanned):
+    assert len(scanned.views) == 4
+    assert 40_000 < sum(len(view.points) for view in scanned.views) < 60_000
+    assert len(scanned.merged.faces) == sum(len(view.mesh.faces) for view in scanned.views)
+
+
+def test_points_lie_on_the_body_with_the_noise_along_the_ray(body, scanned):
+    """Distance along the ray between each point and the true surface: zero mean, the asked deviation."""
+    from scanprep.geometry.surface import Rays
+
+    rays = Rays(body)
+    for view in scanned.views:
+        ray = view.points - view.camera
+        measured = np.linalg.norm(ray, axis=1)
+        _, true = rays.cast(np.broadcast_to(view.camera, ray.shape), ray / measured[:, None])
+        error = (measured - true)[np.isfinite(true)]
+        error = error[np.abs(error) < 0.02]
+        assert len(error) > 0.99 * len(ray)
+        assert abs(error.mean()) < 3e-4 and error.std() == pytest.approx(0.002, rel=0.1)
+
+
+def test_without_noise_points_are_on_the_surface(body):
+    clean = scan(body, ScannerConfig(resolution=0.014, noise=0.0), np.random.default_rng(0))
+    assert Surface(body).closest(clean.merged.vertices).distances.max() < 1e-5
+
+
+def test_normals_face_the_camera_and_agree_with_the_body(body, scanned):
+    for view in scanned.views:
+        away = view.camera - view.points
+        assert (np.einsum("nd,nd->n", view.mesh.face_normals,
+                          view.camera - view.mesh.corners.mean(axis=1)) > 0).all()
+        assert (np.einsum("nd,nd->n", view.normals, away) > 0).mean() > 0.999
+        hit = Surface(body).closest(view.points)
+        assert np.median(np.einsum("nd,nd->n", view.normals, body.face_normals[hit.faces])) > 0.9
+
+
+def test_depth_image_and_projection_agree(scanned):
+    for view in scanned.views:
+        u, v, depth = view.project(view.points)
+        column, row = np.round(u).astype(int), np.round(v).astype(int)
+        assert np.abs(u - column).max() < 1e-6 and np.abs(v - row).max() < 1e-6
+        assert np.abs(view.depth[row, column] - depth).max() < 1e-9
+        assert np.isfinite(view.depth).sum() == len(view.points)
+        direction = (view.points - view.camera) / np.linalg.norm(view.points - view.camera, axis=1, keepdims=True)
+        assert np.abs(view.rays()[row, column] - direction).max() < 1e-9
+        assert np.abs(view.T_world_camera[:3, :3].T @ view.T_world_camera[:3, :3] - np.eye(3)).max() < 1e-12
+
+
+def test_armpits_and_inner_thighs_are_holes(body, scanned):
+    """The blind regions are far from every measured point, the chest is not."""
+    from scipy.spatial import cKDTree
+
+    d, _ = cKDTree(scanned.merged.vertices).query(body.vertices)
+    assert (d > 0.012).mean() > 0.005
+    assert np.median(d) < 0.006
+    hidden = body.vertices[d > 0.012]
+    chest = np.abs(hidden - [0, -0.1, 1.25]).max(axis=1) < 0.08
+    assert not chest.any()
+    near_crotch = np.linalg.norm(body.vertices - body.vertices[people.LANDMARKS["crotch"]], axis=1) < 0.04
+    assert d[near_crotch].max() > 0.015
+    assert all(view.mesh.boundary_loops for view in scanned.views)
+
+
+def test_depth_jumps_are_not_bridged(scanned):
+    for view in scanned.views:
+        assert view.mesh.edge_lengths.max() < 0.06
+        assert view.mesh.is_edge_manifold
+
+
+def test_the_scan_has_its_own_triangulation_and_the_seed_decides(body):
+    one, two, three = (scan(body, COARSE, np.random.default_rng(seed)) for seed in (1, 1, 2))
+    assert np.array_equal(one.merged.vertices, two.merged.vertices) and np.array_equal(one.merged.faces, two.merged.faces)
+    assert one.merged.vertices.shape != three.merged.vertices.shape or (one.merged.vertices != three.merged.vertices).any()
+
+
+def test_more_grazing_and_dropout_means_fewer_points(body):
+    def count(**settings: float) -> int:
+        return len(scan(body, ScannerConfig(resolution=0.014, **settings), np.random.default_rng(0)).merged.vertices)
+
+    assert count(grazing=40.0) < count(grazing=10.0)
+    assert count(dropout=0.3) < 0.85 * count(dropout=0.0)
+
+
+def test_settings_are_checked(body):
+    with pytest.raises(ValueError, match="views"):
+        ScannerConfig(views=0)
+    with pytest.raises(ValueError, match="noise"):
+        ScannerConfig(noise=-1)
+    with pytest.raises(ValueError, match="mesh"):
+        scan(Mesh(np.zeros((3, 3)), np.zeros((0, 3))))
+
+
+def test_embedded_dataset_is_complete_repeatable_and_resumable(tmp_path):
+    calls = []
+    first = embedded.embedded_dataset(tmp_path / "a", seed=3, subject_poses=2, subjects=2, config=COARSE,
+                                      progress=lambda done, total: calls.append((done, total)))
+    assert calls == [(1, 4), (2, 4), (3, 4), (4, 4)]
+    assert [e.sex for e in first[2:]] == ["female", "male"] and len({e.name for e in first}) == 4
+    for entry in first:
+        mesh = read_mesh(entry.path)
+        truth = embedded.GroundTruth.load(entry.truth)
+        views = embedded.read_views(entry.views)
+        assert sum(len(v.points) for v in views) == len(mesh.vertices)
+        assert Surface(truth.mesh).closest(mesh.vertices).distances.mean() < 0.003
+        assert truth.vertices[:, 2].min() == pytest.approx(0, abs=1e-9)
+        person = Person(truth.shape)
+        assert np.abs(person.posed(truth.pose, truth.trans) - truth.vertices).max() < 1e-9
+        clicked = json.loads(entry.landmarks.read_text())
+        errors = np.array([np.linalg.norm(point - truth.vertices[people.LANDMARKS[name]]) for name, point in clicked.items()])
+        assert len(clicked) >= 20 and 0.002 < errors.mean() < 0.009
+    stamps = [entry.path.stat().st_mtime_ns for entry in first]
+    bytes_before = first[1].path.read_bytes()
+    first[1].path.unlink()
+    again = embedded.embedded_dataset(tmp_path / "a", seed=3, subject_poses=2, subjects=2, config=COARSE)
+    assert again == first
+    assert first[1].path.read_bytes() == bytes_before
+    assert [e.path.stat().st_mtime_ns for e in again][0] == stamps[0]
+
+
+def test_first_scan_is_the_rest_pose(tmp_path):
+    entry = embedded.embedded_dataset(tmp_path, subject_poses=1, subjects=0, config=COARSE)[0]
+    assert entry.pose == "rest" and np.abs(embedded.GroundTruth.load(entry.truth).pose).max() == 0
