@@ -310,6 +310,48 @@ def test_a_marker_with_one_missing_coordinate_is_missing():
     assert np.isnan(seq.positions[0, 0]).all() and seq.seen.tolist() == [[False, True]]
 
 
+def test_ezc3d_reads_the_same(tmp_path):
+    seq = sequence(np.random.default_rng(9), 30)
+    write_markers(tmp_path / "a.c3d", seq)
+    theirs = ezc3d.c3d(str(tmp_path / "a.c3d"))
+    np.testing.assert_allclose(1e-3 * theirs["data"]["points"][:3].transpose(2, 1, 0),
+                               read_markers(tmp_path / "a.c3d").positions, atol=1e-12)
+    assert tuple(theirs["parameters"]["POINT"]["LABELS"]["value"]) == seq.labels
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_a_damaged_c3d_is_read_or_refused_but_never_breaks(tmp_path, seed):
+    rng = np.random.default_rng(seed)
+    write_markers(tmp_path / "a.c3d", sequence(rng))
+    whole = (tmp_path / "a.c3d").read_bytes()
+    for _ in range(20):
+        data = bytearray(whole)
+        for _ in range(rng.integers(1, 5)):
+            data[rng.integers(0, min(1200, len(data)))] = rng.integers(0, 256)
+        (tmp_path / "bad.c3d").write_bytes(bytes(data))
+        try:
+            read_markers(tmp_path / "bad.c3d")
+        except MarkerFileError as error:
+            assert "bad.c3d" in str(error) and "\n" not in str(error)
+
+
+def test_integers_times_the_scale_are_read(tmp_path):
+    steps = np.random.default_rng(10).integers(-2000, 2000, (6, 4, 3))
+    expected = MarkerSequence(steps * 5e-4, ("A", "B", "C", "D"), 100.0)
+    write_markers(tmp_path / "a.c3d", expected)
+    data = bytearray((tmp_path / "a.c3d").read_bytes())
+    start = (struct.unpack_from("<H", data, 16)[0] - 1) * 512
+    rows = np.zeros((6, 4, 4), dtype="<i2")
+    rows[..., :3] = steps
+    rows[2, 1, 3] = -1
+    data[12:16] = struct.pack("<f", 0.5)
+    data = data[:start] + rows.tobytes()
+    (tmp_path / "integers.c3d").write_bytes(bytes(data))
+    gap = expected.positions.copy()
+    gap[2, 1] = np.nan
+    agree(read_markers(tmp_path / "integers.c3d"), MarkerSequence(gap, expected.labels, 100.0))
+
+
 def test_dec_floats_are_read(tmp_path):
     """A file of integers turned to the DEC number format by hand gives the same positions."""
     write_markers(tmp_path / "a.c3d", sequence(np.random.default_rng(8), 5))

@@ -1,6 +1,11 @@
-"""C3D, the file of motion-capture systems, through ezc3d."""
+"""C3D, the file of motion-capture systems: read here, of every processor type; written through ezc3d.
+
+The reader is our own because ezc3d ends the process on some damaged files and reads truncated ones as shorter.
+"""
 from __future__ import annotations
 
+import struct
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -10,86 +15,158 @@ from .common import MarkerFileError, RawMarkers
 
 _MAGIC = 0x50
 _BLOCK = 512
-_BIG_ENDIAN, _DEC = 86, 85
+_INTEL, _DEC, _MIPS = 84, 85, 86
 _COMPUTED = ("ANGLES", "FORCES", "MOMENTS", "POWERS", "SCALARS")     # stored among the points, but no positions
+_Parameters = dict[tuple[str, str], list[Any]]                       # group and name -> values
+
+
+class _Damaged(Exception):
+    """What is wrong with the file."""
+
+
+@dataclass(frozen=True)
+class _Numbers:
+    """How one processor stores its numbers."""
+
+    processor: int
+
+    @property
+    def order(self) -> str:
+        return ">" if self.processor == _MIPS else "<"
+
+    def words(self, data: bytes, kind: str) -> np.ndarray:
+        return np.frombuffer(data, self.order + kind)
+
+    def floats(self, data: bytes) -> np.ndarray:
+        if self.processor != _DEC:
+            return self.words(data, "f4").astype(np.float64)
+        halves = np.frombuffer(data, "<u2").reshape(-1, 2)           # the upper half first, exponent larger by 2
+        return halves[:, ::-1].copy().view("<f4")[:, 0].astype(np.float64) / 4
 
 
 def read_c3d(path: Path, data: bytes) -> RawMarkers:
-    """The points of a C3D file, of any processor type.
-
-    Missing are points with NaN or a negative residual.
+    """The points of a C3D file; missing are those with a negative residual.
 
     Raises
     ------
     MarkerFileError
-        Not a C3D file, truncated, or without points.
+        Not a C3D file, damaged, truncated, or without points.
     """
-    _check(path, data)
+    start = (data[0] - 1) * _BLOCK
+    if len(data) < _BLOCK or data[1] != _MAGIC:
+        raise MarkerFileError(f"{path}: expected a C3D file, with byte 2 = 80 and a header of {_BLOCK} bytes; "
+                              f"found {len(data)} bytes that begin {data[:8]!r}")
+    if not 0 < start < len(data) - 4:
+        raise MarkerFileError(f"{path}: truncated or damaged: expected C3D parameters at byte {start}, "
+                              f"found {len(data)} bytes")
+    numbers = _Numbers(data[start + 3])
+    if numbers.processor not in (_INTEL, _DEC, _MIPS):
+        raise MarkerFileError(f"{path}: expected processor type 84, 85 or 86 in the C3D file, "
+                              f"found {numbers.processor}")
     try:
-        import ezc3d
-    except ImportError:
-        raise ImportError("C3D files need ezc3d: pip install ezc3d") from None
-    try:
-        tree = ezc3d.c3d(str(path))
-    except (OSError, RuntimeError, ValueError, IndexError) as error:
-        raise MarkerFileError(f"{path}: expected a C3D file, cannot read it ({str(error).strip()})") from None
-    parameters = tree["parameters"]["POINT"]
-    points = tree["data"]["points"]                                  # (4, L, T)
-    residuals = tree["data"]["meta_points"]["residuals"][0]          # (L, T)
-    positions = points[:3].transpose(2, 1, 0).copy()
-    if not positions.size:
-        raise MarkerFileError(f"{path}: expected points, the C3D file holds {positions.shape[1]} points "
-                              f"in {positions.shape[0]} frames")
-    if residuals.shape == points.shape[1:]:
-        positions[residuals.T < 0] = np.nan
-    labels = _labels(parameters, points.shape[1])
-    computed = {label for key in _COMPUTED for label in _value(parameters, key)}
+        parameters = _parameters(data, start + 4, numbers)
+        positions = _positions(data, parameters, numbers)
+    except _Damaged as problem:
+        raise MarkerFileError(f"{path}: {problem}") from None
+    except (struct.error, IndexError, ValueError) as error:
+        raise MarkerFileError(f"{path}: damaged C3D file ({error})") from None
+    labels = _labels(parameters, positions.shape[1])
+    computed = {label for key in _COMPUTED for label in parameters.get(("POINT", key), ())}
     kept = [i for i, label in enumerate(labels) if label not in computed]
-    rate = float(np.ravel(_value(parameters, "RATE") or [0])[0]) or float(tree["header"]["points"]["frame_rate"])
-    unit = str((list(_value(parameters, "UNITS")) or ["mm"])[0]).strip().lower() or "mm"
-    return RawMarkers(positions[:, kept], tuple(labels[i] for i in kept), rate or None, unit)
+    rate = (parameters.get(("POINT", "RATE")) or numbers.floats(data[20:24]).tolist())[0]
+    unit = str((parameters.get(("POINT", "UNITS")) or ["mm"])[0]).lower() or "mm"
+    known_rate = float(rate) if isinstance(rate, float | int) and rate > 0 else None
+    return RawMarkers(positions[:, kept], tuple(labels[i] for i in kept), known_rate, unit)
 
 
-def _value(parameters: Any, key: str) -> list[Any]:
-    return list(parameters[key]["value"]) if key in parameters else []
+def _parameters(data: bytes, place: int, numbers: _Numbers) -> _Parameters:
+    """All parameters; a group is known by its number, which may come after its parameters."""
+    groups: dict[int, str] = {}
+    found: list[tuple[int, str, list[Any]]] = []
+    while place + 2 < len(data) and data[place]:
+        length, group = abs(struct.unpack_from("b", data, place)[0]), struct.unpack_from("b", data, place + 1)[0]
+        name = data[place + 2:place + 2 + length].decode("latin-1").upper()
+        link = place + 2 + length
+        step = int(numbers.words(data[link:link + 2], "u2")[0])
+        if group < 0:
+            groups[-group] = name
+        else:
+            found.append((group, name, _values(data, link + 2, numbers)))
+        if step == 0:
+            break
+        place = link + step
+    return {(groups.get(group, ""), name): values for group, name, values in found}
 
 
-def _labels(parameters: Any, count: int) -> list[str]:
+def _values(data: bytes, place: int, numbers: _Numbers) -> list[Any]:
+    """The values of one parameter: text stripped of blanks, or numbers."""
+    kind, count = struct.unpack_from("bB", data, place)
+    dims = list(data[place + 2:place + 2 + count])
+    total = int(np.prod(dims)) if dims else 1
+    raw = data[place + 2 + count:place + 2 + count + abs(kind) * total]
+    if len(raw) < abs(kind) * total:
+        raise _Damaged("truncated: the C3D parameters end before they should")
+    if kind == -1:
+        width = dims[0] if dims else 1
+        return [raw[i:i + width].decode("latin-1").strip(" \0") for i in range(0, len(raw), width or 1)]
+    if kind == 4:
+        return numbers.floats(raw).tolist()
+    return numbers.words(raw, {1: "i1", 2: "i2"}[kind] if kind in (1, 2) else "i1").tolist()
+
+
+def _positions(data: bytes, parameters: _Parameters, numbers: _Numbers) -> np.ndarray:
+    """(T, L, 3) in the file's unit, NaN where the residual is negative."""
+    _, points, analog, first, last = numbers.words(data[:10], "u2").astype(np.int64)
+    start = (int(numbers.words(data[16:18], "u2")[0]) - 1) * _BLOCK
+    scale = float(numbers.floats(data[12:16])[0])
+    size = 4 if scale < 0 else 2
+    width = (4 * points + analog) * size
+    frames = _frames(parameters, first, last)
+    if not points or not frames:
+        raise _Damaged(f"expected points, the C3D file holds {points} points in {frames} frames")
+    if start < _BLOCK or not np.isfinite(scale):
+        raise _Damaged(f"damaged: the header says that the points begin at byte {start}, their scale is {scale}")
+    if start + frames * width > len(data):
+        raise _Damaged(f"truncated: expected {frames} frames in {start + frames * width} bytes, "
+                       f"found {len(data)} bytes")
+    body = data[start:start + frames * width]
+    rows = numbers.floats(body) if size == 4 else numbers.words(body, "i2").astype(np.float64)
+    rows = rows.reshape(frames, -1)[:, :4 * points].reshape(frames, points, 4)
+    positions = rows[..., :3] * (1.0 if size == 4 else scale)
+    positions[(rows[..., 3] < 0) | np.isnan(rows).any(axis=2)] = np.nan
+    return positions
+
+
+def _frames(parameters: _Parameters, first: int, last: int) -> int:
+    """How many frames there are: the header counts to 65535, longer files say it in parameters."""
+    counted = max(int(last) - int(first) + 1, 0)
+    if last < 65535:
+        return counted
+    ends = [parameters.get(("TRIAL", key), []) for key in ("ACTUAL_START_FIELD", "ACTUAL_END_FIELD")]
+    if all(len(end) == 2 for end in ends):
+        low, high = ((int(end[0]) & 0xFFFF) + 65536 * (int(end[1]) & 0xFFFF) for end in ends)
+        return max(high - low + 1, 0)
+    said = parameters.get(("POINT", "LONG_FRAMES")) or parameters.get(("POINT", "FRAMES")) or [0]
+    return max(int(said[0]), counted)
+
+
+def _labels(parameters: _Parameters, count: int) -> list[str]:
     """The labels of all points; beyond 255 they go on in LABELS2, LABELS3, ..."""
     labels: list[str] = []
     part = 1
-    while len(labels) < count and (more := _value(parameters, "LABELS" if part == 1 else f"LABELS{part}")):
-        labels += [str(label).strip() for label in more]
+    while more := parameters.get(("POINT", "LABELS" if part == 1 else f"LABELS{part}"), []):
+        labels += map(str, more)
         part += 1
     labels = (labels + [""] * count)[:count]
     return [label or f"point{i}" for i, label in enumerate(labels)]
 
 
-def _check(path: Path, data: bytes) -> None:
-    """Refuse what is not a C3D file, and one that ends before its header says: ezc3d would read on."""
-    parameters = (data[0] - 1) * _BLOCK if data else -1
-    if len(data) < _BLOCK or data[1] != _MAGIC:
-        raise MarkerFileError(f"{path}: expected a C3D file, with byte 2 = 80 and a header of {_BLOCK} bytes; "
-                              f"found {len(data)} bytes that begin {data[:8]!r}")
-    if not 0 < parameters < len(data) - 4:
-        raise MarkerFileError(f"{path}: truncated: expected C3D parameters at byte {parameters}, "
-                              f"found {len(data)} bytes")
-    processor = data[parameters + 3]
-    words = np.frombuffer(data, ">u2" if processor == _BIG_ENDIAN else "<u2", 10).astype(np.int64)
-    points, analog, first, last, start = words[1], words[2], words[3], words[4], words[8]
-    sign = data[{_BIG_ENDIAN: 12, _DEC: 13}.get(processor, 15)]      # of the scale: negative for real numbers
-    size = 4 if sign & 0x80 else 2
-    frames = max(last - first + 1, 0)
-    expected = (start - 1) * _BLOCK + frames * (4 * points + analog) * size
-    if start > 0 and len(data) < expected:
-        raise MarkerFileError(f"{path}: truncated: expected {frames} frames in {expected} bytes, "
-                              f"found {len(data)} bytes")
-
-
 def write_c3d(path: Path, positions: np.ndarray, labels: tuple[str, ...], rate: float) -> None:
     """Write positions (T, L, 3), metres, as a C3D file in millimetres; missing points have residual -1."""
-    import ezc3d
-
+    try:
+        import ezc3d
+    except ImportError:
+        raise ImportError("writing C3D files needs ezc3d: pip install ezc3d") from None
     tree = ezc3d.c3d()
     parameters = tree["parameters"]["POINT"]
     parameters["UNITS"]["value"] = ["mm"]
