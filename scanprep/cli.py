@@ -10,9 +10,10 @@ import tyro
 from .cleaning.decimate import DecimateConfig, decimate
 from .cleaning.fill import FillConfig, fill_holes
 from .cleaning.merge import MergeConfig, merge_views
+from .cleaning.template import make_template
 from .console import Metric, Outcome, bar, dispatch, read_json, say
 from .dataset import RegisteredSet
-from .geometry.files import list_meshes, read_mesh, read_registered, write_mesh
+from .geometry.files import UNITS, list_meshes, read_mesh, read_registered, write_mesh
 from .geometry.landmarks import match_landmarks, read_landmark_vertices, read_landmarks
 from .geometry.mesh import Mesh, template_problem
 from .matching.nonrigid import register
@@ -32,6 +33,7 @@ MM = 1000.0
 
 COMMANDS = {
     "run": ("Scans -> registered set with a skeleton; goes on where it was interrupted.", "scanprep.cli:run_all"),
+    "template": ("Range views with known cameras -> a closed template.", "scanprep.cli:template_of_views"),
     "merge": ("Range views with known cameras -> one surface.", "scanprep.cli:merge"),
     "fill": ("Close the holes of a mesh.", "scanprep.cli:fill"),
     "decimate": ("Fewer triangles for the same surface.", "scanprep.cli:reduce"),
@@ -90,9 +92,29 @@ def run_all(scans: ScansArg, template: Path, output: Output, landmarks: Path | N
         Metric("unit assumed", unit or "m")], {"prepare": config}, list(done.failures))
 
 
+def template_of_views(views: ViewsArg, output: Output, cameras: Path | None = None, faces: int = 14000,
+                      unit: Unit | None = None) -> Outcome:
+    """Merge range views, close the holes, and decimate to a template.
+
+    Example: scape prep template views --faces 12000 -o template.ply
+
+    Args:
+        views: Folder of range meshes in one frame.
+        output: Mesh to write.
+        cameras: JSON {file name without ending: [x, y, z]}; else cameras.json in the folder.
+        faces: Triangles of the template.
+        unit: Unit of the views and cameras.
+    """
+    seen = _read_views(views, cameras, unit)
+    with bar("making the template") as progress:
+        made = make_template(seen, faces, progress=progress)
+    write_mesh(output, made)
+    return Outcome(output, [Metric("views", len(seen)), *_about(made)])
+
+
 def merge(views: ViewsArg, output: Output, cameras: Path | None = None, unit: Unit | None = None,
           config: Annotated[MergeConfig, tyro.conf.arg(name="")] = MergeConfig()) -> Outcome:  # noqa: B008
-    """Merge range views into one surface.
+    """Merge range views into one surface, open where nothing was seen.
 
     Example: scape prep merge views -o body.ply
 
@@ -103,19 +125,11 @@ def merge(views: ViewsArg, output: Output, cameras: Path | None = None, unit: Un
         unit: Unit of the views and cameras.
         config: Settings.
     """
-    where = read_json(cameras or views / "cameras.json", "camera positions {name: [x, y, z]}")
-    paths = list_meshes(views)
-    missing = [p.stem for p in paths if p.stem not in where]
-    if missing:
-        raise ValueError(f"{cameras or views / 'cameras.json'}: expected a camera for each view, "
-                         f"none for {', '.join(missing)}")
-    meshes = [read_mesh(path, unit) for path in paths]
-    scale = {None: 1.0, "m": 1.0, "mm": 1e-3, "cm": 1e-2, "in": 0.0254}[unit]
+    seen = _read_views(views, cameras, unit)
     with bar("merging views") as progress:
-        merged = merge_views([(mesh, scale * np.asarray(where[path.stem], dtype=float))
-                              for path, mesh in zip(paths, meshes, strict=True)], config, progress)
+        merged = merge_views(seen, config, progress)
     write_mesh(output, merged)
-    return Outcome(output, [Metric("views", len(paths)), *_about(merged)], {"merge": config})
+    return Outcome(output, [Metric("views", len(seen)), *_about(merged)], {"merge": config})
 
 
 def fill(mesh: MeshArg, output: Output, unit: Unit | None = None,
@@ -225,6 +239,18 @@ def read_poses(folder: Path, template: Path | None, subject: str | None, unit: U
     if not np.array_equal(body.faces, found.faces):
         raise ValueError(f"{template}: expected the triangles of the meshes in {folder}; it has other ones")
     return body, found.vertices
+
+
+def _read_views(folder: Path, cameras: Path | None, unit: Unit | None) -> list[tuple[Mesh, np.ndarray]]:
+    """The range meshes of a folder with the positions of their cameras."""
+    given = cameras or folder / "cameras.json"
+    where = read_json(given, "camera positions {name: [x, y, z]}")
+    paths = list_meshes(folder)
+    missing = [path.stem for path in paths if np.shape(where.get(path.stem)) != (3,)]
+    if missing:
+        raise ValueError(f"{given}: expected a camera position [x, y, z] for each view, none for {', '.join(missing)}")
+    scale = UNITS[unit or "m"]
+    return [(read_mesh(path, unit), scale * np.array(where[path.stem], dtype=np.float64)) for path in paths]
 
 
 def _beside(template: Path) -> Path:

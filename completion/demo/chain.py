@@ -180,7 +180,7 @@ class Demo:
             A scan that could not be registered.
         """
         config = PrepareConfig()
-        template, marks = self.template, self.template_landmarks
+        template, marks, _ = self.template, self.template_landmarks, self.scans
         tasks = find_scans(self.folder / "scans")
         with self.bar("registering scans") as first, self.bar("finding the skeleton") as second:
             done = prepare(tasks, template, marks, self.folder / "set", config, first, second)
