@@ -84,10 +84,10 @@ def fill_holes(mesh: Mesh, config: FillConfig | None = None,
         return repair(poisson(mesh, config.poisson_depth))
     if not mesh.is_edge_manifold:
         raise ValueError("mesh: expected at most two triangles at an edge, facing the same way; repair it first")
-    mesh = split_vertices(mesh)
+    mesh = split_vertices(mesh, across_holes=True)
     loops = [loop for loop in mesh.boundary_loops if len(loop) <= (config.max_edges or len(mesh.vertices))]
     if not loops:
-        return mesh
+        return split_vertices(mesh)
     rim = np.zeros(len(mesh.vertices), dtype=bool)
     rim[np.concatenate(loops)] = True
     around, used = mesh.submesh(rim[mesh.faces].any(axis=1))      # all that the patches have to know
@@ -100,7 +100,7 @@ def fill_holes(mesh: Mesh, config: FillConfig | None = None,
         patch.fair()
         patch.flip(min_cosine=0.3)
     patch.fair()
-    return patch.onto(mesh, used)
+    return split_vertices(patch.onto(mesh, used))
 
 
 class _Patch:
@@ -129,11 +129,18 @@ class _Patch:
         normal_of = _border_normals(around)
         adjacency = around.vertex_adjacency
         triangles, extra = [around.faces], [around.vertices]
+        shared = np.bincount(np.concatenate(loops), minlength=len(around.vertices)) > 1
+        chords: list[np.ndarray] = []                     # new edges between vertices where loops touch
         for done, loop in enumerate(loops):
             ring = loop[::-1]                             # the new triangles run the other way along the border
             ahead = np.roll(ring, -1)
             rim_normals = np.array([normal_of[int(b), int(a)] for a, b in zip(ring, ahead, strict=True)])
             joined = adjacency[ring][:, ring].toarray() > 0
+            if chords and shared[ring].sum() > 1:
+                place = {int(v): i for i, v in enumerate(ring)}
+                for a, b in np.concatenate(chords).tolist():
+                    if a in place and b in place:
+                        joined[place[a], place[b]] = joined[place[b], place[a]] = True
             found = triangulate_loop(around.vertices[ring], rim_normals, joined, largest)
             if found is None:
                 centre = sum(map(len, extra))
@@ -141,6 +148,8 @@ class _Patch:
                 triangles.append(np.stack([ring, np.roll(ring, -1), np.full(len(ring), centre)], axis=1))
             else:
                 triangles.append(ring[found])
+                sides = ring[found[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)]
+                chords += [sides[shared[sides].all(axis=1)]] if shared[ring].sum() > 1 else []
             if progress:
                 progress(done + 1, len(loops))
         self.mesh = Mesh(np.concatenate(extra), np.concatenate(triangles))

@@ -59,10 +59,11 @@ class _View:
     mesh: Mesh
     camera: np.ndarray
     rays: Rays
-    weights: np.ndarray        # (N,) at the vertices
+    cosines: np.ndarray        # (N,) between normals and lines of sight, at the vertices
+    weights: np.ndarray        # (N,)
 
     def look(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """Along the line of sight through each point: triangle or -1, how far in front of it, weight, bary."""
+        """The triangle behind or before each point, or -1; how far in front of its plane; weight; bary."""
         along = points - self.camera
         depth = np.linalg.norm(along, axis=1)
         along /= depth[:, None]
@@ -71,9 +72,10 @@ class _View:
         where = self.camera + hit[seen, None] * along[seen]
         bary = np.zeros((len(points), 3))
         bary[seen] = np.clip(barycentric(where, self.mesh.corners[face[seen]]), 0, 1)
-        weight = np.zeros(len(points))
-        weight[seen] = np.einsum("nc,nc->n", bary[seen], self.weights[self.mesh.faces[face[seen]]])
-        return face, np.where(seen, hit - depth, np.nan), weight, bary
+        corners = self.mesh.faces[face]
+        weight = np.einsum("nc,nc->n", bary, self.weights[corners])
+        cosine = np.einsum("nc,nc->n", bary, self.cosines[corners])
+        return face, (hit - depth) * cosine, weight, bary
 
 
 def merge_views(views: Sequence[Any], config: MergeConfig | None = None,
@@ -81,8 +83,8 @@ def merge_views(views: Sequence[Any], config: MergeConfig | None = None,
     """One surface from several range views with known cameras.
 
     Every view measures, along its lines of sight, how far each voxel near its surface lies in front of it or
-    behind it. The weighted mean of these distances changes sign on the merged surface, which stays open where no
-    view saw anything.
+    behind it, and turns this into a distance from the surface. The weighted mean of these distances changes sign
+    on the merged surface, which stays open where no view saw anything.
 
     Parameters
     ----------
@@ -155,7 +157,7 @@ def _prepare(mesh: Mesh, camera: np.ndarray, config: MergeConfig) -> _View:
     cosine = np.einsum("nd,nd->n", normals, towards)
     angle = np.clip((cosine - config.min_cosine) / (1 - config.min_cosine), 0, 1)
     border = border_distance(mesh, config.taper) / config.taper if config.taper > 0 else 1.0
-    return _View(mesh, camera, Rays(mesh), angle * border)
+    return _View(mesh, camera, Rays(mesh), np.clip(cosine, config.min_cosine, 1), angle * border)
 
 
 @dataclass(frozen=True, eq=False)

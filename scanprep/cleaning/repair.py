@@ -113,12 +113,19 @@ def _drop_at_bad_edges(mesh: Mesh) -> Mesh:
     return mesh.submesh(keep)[0]
 
 
-def split_vertices(mesh: Mesh) -> Mesh:
-    """A copy of a vertex for every fan of triangles around it beyond the first."""
+def split_vertices(mesh: Mesh, across_holes: bool = False) -> Mesh:
+    """A copy of a vertex for every fan of triangles around it beyond the first.
+
+    Parameters
+    ----------
+    mesh : Mesh
+    across_holes : bool
+        Leave fans together that will be one when the holes between them are filled.
+    """
     if mesh.is_vertex_manifold:
         return mesh
     fan = _fans(mesh)
-    number = fan.ravel()
+    number = (_joined_by_holes(mesh, fan)[fan] if across_holes else fan).ravel()
     _, first, new = np.unique(number, return_index=True, return_inverse=True)
     owner = mesh.faces.ravel()[first]
     order = np.lexsort((first, owner))
@@ -147,6 +154,19 @@ def _fans(mesh: Mesh) -> np.ndarray:
     n = mesh.faces.size
     _, fan = connected_components(coo_array((np.ones(len(a)), (a, b)), shape=(n, n)), directed=False)
     return fan.reshape(-1, 3)
+
+
+def _joined_by_holes(mesh: Mesh, fan: np.ndarray) -> np.ndarray:
+    """A common number for the fans at a vertex between which a simple border loop passes."""
+    face, side = np.nonzero(mesh.edge_use[mesh.face_edges] == 1)
+    ends = mesh.faces[face, side], mesh.faces[face, (side + 1) % 3]
+    at = {(int(a), int(b)): (int(p), int(q)) for a, b, p, q in
+          zip(*ends, fan[face, side], fan[face, (side + 1) % 3], strict=True)}
+    pairs = [(at[u, v][1], at[v, w][0]) for loop in mesh.boundary_loops
+             for u, v, w in zip(np.roll(loop, 1).tolist(), loop.tolist(), np.roll(loop, -1).tolist(), strict=True)]
+    a, b = np.array(pairs, dtype=np.int64).reshape(-1, 2).T
+    count = int(fan.max()) + 1
+    return connected_components(coo_array((np.ones(len(a)), (a, b)), shape=(count, count)), directed=False)[1]
 
 
 def drop_small_components(mesh: Mesh, share: float) -> Mesh:

@@ -1,0 +1,50 @@
+"""Smooth shapes with known surfaces and a bare scanner for the tests of cleaning."""
+import numpy as np
+
+from scanprep.geometry.mesh import Mesh
+from scanprep.geometry.surface import Rays
+from scanprep.pictures.glyphs import sphere
+
+
+def ball(divisions: int = 4, radius: float = 0.1) -> Mesh:
+    """A closed sphere with vertices on the exact surface."""
+    from scanprep.cleaning.repair import weld
+
+    vertices, faces = sphere(divisions)
+    return weld(Mesh(radius * vertices, faces), 1e-9)
+
+
+def bumpy(divisions: int = 5) -> Mesh:
+    """A closed surface without symmetry, about 20 cm across."""
+    mesh = ball(divisions, 1.0)
+    x, y, z = mesh.vertices.T
+    radius = 0.1 * (1 + 0.15 * np.sin(3 * x + 1) * np.cos(2 * y) + 0.12 * np.sin(4 * z + x) + 0.1 * y * z)
+    return mesh.with_vertices(mesh.vertices * radius[:, None] * np.array([1, 0.8, 1.3]))
+
+
+def view(mesh: Mesh, towards: np.ndarray, rng=None, noise: float = 0.0, spacing: float = 0.003):
+    """What a camera a metre away in a direction sees: a mesh of its own and the camera's position."""
+    back = np.asarray(towards, dtype=float) / np.linalg.norm(towards)
+    right = np.cross(back, np.eye(3)[np.abs(back).argmin()])
+    right /= np.linalg.norm(right)
+    count = int(0.5 / spacing)
+    step = (np.arange(count) - count / 2) * spacing
+    y, x = np.meshgrid(step, step, indexing="ij")
+    rays = x[..., None] * right + y[..., None] * np.cross(back, right) - back
+    rays = (rays / np.linalg.norm(rays, axis=2, keepdims=True)).reshape(-1, 3)
+    face, depth = Rays(mesh).cast(np.repeat(back[None], len(rays), axis=0), rays)
+    slant = -np.einsum("nd,nd->n", mesh.face_normals[face], rays)
+    depth = np.where((face >= 0) & (slant > 0.15), depth, np.nan)
+    if noise:
+        depth = depth + noise * rng.normal(size=len(depth))
+    points = back + depth[:, None] * rays
+    number = np.arange(count * count).reshape(count, count)
+    a, b, c, d = number[:-1, :-1], number[:-1, 1:], number[1:, 1:], number[1:, :-1]
+    faces = np.concatenate([np.stack(t, axis=-1).reshape(-1, 3) for t in ((a, b, c), (a, c, d))])
+    faces = faces[np.isfinite(depth[faces]).all(axis=1)]
+    faces = faces[np.ptp(depth[faces], axis=1) < 0.02]
+    seen, corners = np.unique(faces, return_inverse=True)
+    return Mesh(points[seen], corners.reshape(-1, 3)), back
+
+
+SIX = np.concatenate([np.eye(3), -np.eye(3)])

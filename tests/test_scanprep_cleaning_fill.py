@@ -1,0 +1,183 @@
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from scanned_shapes import ball, bumpy
+
+from scanprep.cleaning.fill import FillConfig, fill_holes
+from scanprep.cleaning.triangulate import triangulate_loop
+from scanprep.geometry import rotations
+from scanprep.geometry.mesh import Mesh, template_problem
+from scanprep.geometry.surface import Surface
+
+
+def pierced(mesh, centres, radius):
+    middle = mesh.corners.mean(axis=1)
+    keep = np.all([np.linalg.norm(middle - c, axis=1) > radius for c in np.atleast_2d(centres)], axis=0)
+    return mesh.submesh(keep)[0]
+
+
+def all_triangulations(i, k):
+    if k - i < 2:
+        yield []
+        return
+    for m in range(i + 1, k):
+        for left in all_triangulations(i, m):
+            for right in all_triangulations(m, k):
+                yield [(i, m, k), *left, *right]
+
+
+def area(points, triangles):
+    a, b, c = points[np.asarray(triangles)].transpose(1, 0, 2)
+    return np.linalg.norm(np.cross(b - a, c - a), axis=1).sum() / 2
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_loops_get_the_smallest_area_of_all_triangulations(seed):
+    rng = np.random.default_rng(seed)
+    angle = 2 * np.pi * (np.arange(8) + rng.uniform(-0.3, 0.3, 8)) / 8
+    points = np.stack([np.cos(angle), np.sin(angle), 0.05 * rng.normal(size=8)], axis=1)
+    rim = np.tile([0.0, 0.0, 1.0], (8, 1))
+    found = triangulate_loop(points, rim, np.zeros((8, 8), dtype=bool))
+    every = list(all_triangulations(0, 7))
+    assert len(every) == 132
+    assert area(points, found) == pytest.approx(min(area(points, t) for t in every), rel=1e-9)
+
+
+def test_forbidden_edges_are_avoided_or_refused():
+    angle = 2 * np.pi * np.arange(6) / 6
+    points = np.stack([np.cos(angle), np.sin(angle), 0 * angle], axis=1)
+    rim = np.tile([0.0, 0.0, 1.0], (6, 1))
+    forbidden = np.zeros((6, 6), dtype=bool)
+    forbidden[0, 2] = forbidden[2, 0] = forbidden[0, 3] = forbidden[3, 0] = True
+    found = triangulate_loop(points, rim, forbidden)
+    edges = {frozenset(e) for t in found for e in pairwise([*t, t[0]])}
+    assert not edges & {frozenset((0, 2)), frozenset((0, 3))}
+    assert triangulate_loop(points, rim, np.ones((6, 6), dtype=bool)) is None
+
+
+def test_holes_of_a_ball_are_closed_round():
+    whole = ball(4)
+    holed = pierced(whole, [[0.1, 0, 0], [0, -0.1, 0], [-0.06, 0, 0.08]], 0.04)
+    filled = fill_holes(holed)
+    assert filled.is_closed and template_problem(filled) is None
+    assert filled.volume == pytest.approx(whole.volume, rel=0.01)
+    new = filled.vertices[len(holed.vertices):]
+    assert len(new) > 60
+    assert np.abs(np.linalg.norm(new, axis=1) - 0.1).max() < 0.003
+
+
+def test_existing_vertices_and_triangles_are_untouched():
+    holed = pierced(bumpy(4), [[0.1, 0, 0], [0, 0, 0.14]], 0.045)
+    filled = fill_holes(holed)
+    assert np.array_equal(filled.vertices[:len(holed.vertices)], holed.vertices)
+    assert np.array_equal(filled.faces[:len(holed.faces)], holed.faces)
+
+
+def test_new_triangles_are_as_small_as_those_around():
+    whole = ball(4)
+    holed = pierced(whole, [0.1, 0, 0], 0.06)
+    filled = fill_holes(holed)
+    new = Mesh(filled.vertices, filled.faces[len(holed.faces):])
+    assert 0.6 < new.edge_lengths.mean() / holed.mean_edge < 1.4
+    assert np.median(new.face_areas) == pytest.approx(np.median(holed.face_areas), rel=0.5)
+
+
+def test_a_hole_in_a_plane_stays_plane():
+    x, y = np.meshgrid(np.arange(16.0), np.arange(16.0))
+    number = np.arange(256).reshape(16, 16)
+    a, b, c, d = number[:-1, :-1], number[:-1, 1:], number[1:, 1:], number[1:, :-1]
+    faces = np.concatenate([np.stack(t, axis=-1).reshape(-1, 3) for t in ((a, b, c), (a, c, d))])
+    plane = Mesh(0.01 * np.stack([x.ravel(), y.ravel(), 0 * x.ravel()], axis=1), faces)
+    holed = pierced(plane, [0.08, 0.07, 0], 0.035)
+    filled = fill_holes(holed, FillConfig(max_edges=40))
+    assert [len(loop) for loop in filled.boundary_loops] == [60]       # the outer border is longer than allowed
+    assert np.abs(filled.vertices[:, 2]).max() < 1e-9
+    assert filled.face_normals[:, 2].min() > 0.999
+    assert filled.face_areas.sum() == pytest.approx(plane.face_areas.sum(), rel=1e-9)
+
+
+def test_holes_that_touch_in_a_vertex():
+    whole = ball(3)
+    centre = 17
+    around = np.flatnonzero((whole.faces == centre).any(axis=1))
+    order = [around[0]]
+    while len(order) < len(around):              # walk the fan
+        order.append(next(f for f in around if f not in order
+                          and len(set(whole.faces[f]) & set(whole.faces[order[-1]])) == 2))
+    holed = whole.submesh(np.setdiff1d(np.arange(len(whole.faces)), [order[0], order[len(order) // 2]]))[0]
+    assert not holed.is_vertex_manifold
+    filled = fill_holes(holed)
+    assert filled.is_closed and template_problem(filled) is None
+    assert filled.volume == pytest.approx(whole.volume, rel=1e-3)
+
+
+def test_sheets_that_touch_in_a_vertex_are_closed_apart():
+    a, b = ball(2), ball(2)
+    top, bottom = a.vertices[:, 2].argmax(), b.vertices[:, 2].argmin()
+    shift = a.vertices[top] - b.vertices[bottom]
+    faces = np.concatenate([a.faces, b.faces + len(a.vertices)])
+    faces[faces == bottom + len(a.vertices)] = top
+    pair = Mesh(np.concatenate([a.vertices, b.vertices + shift]), faces)
+    pair = pair.submesh(np.setdiff1d(np.arange(len(faces)),
+                                     [np.flatnonzero((faces[:len(a.faces)] == top).any(axis=1))[0],
+                                      len(a.faces) + np.flatnonzero((faces[len(a.faces):] == top).any(axis=1))[0]]))[0]
+    filled = fill_holes(pair)
+    assert filled.is_closed and filled.is_vertex_manifold
+    assert filled.volume == pytest.approx(2 * a.volume, rel=1e-6)
+
+
+def test_a_border_of_hundreds_of_edges():
+    whole = ball(6, 0.5)
+    holed = pierced(whole, [0.5, 0, 0], 0.35)
+    assert len(holed.boundary_loops[0]) > 200
+    filled = fill_holes(holed, FillConfig(exact_edges=120))
+    assert filled.is_closed and template_problem(filled) is None
+    new = filled.vertices[len(holed.vertices):]
+    assert np.abs(np.linalg.norm(new, axis=1) - 0.5).max() < 0.05
+    at = Surface(whole).closest(new)
+    assert (np.einsum("nd,nd->n", filled.vertex_normals[len(holed.vertices):], whole.face_normals[at.faces])
+            > 0.5).all()
+
+
+def test_filling_moves_along_with_the_mesh():
+    holed = pierced(bumpy(4), [0.1, 0, 0], 0.05)
+    R, t = rotations.exp(np.array([0.4, -1.1, 0.3])), np.array([0.2, -3.0, 1.0])
+    filled = fill_holes(holed)
+    moved = fill_holes(holed.with_vertices(2 * holed.vertices @ R.T + t))
+    back = (moved.vertices - t) @ R / 2
+    assert Surface(filled).closest(back).distances.max() < 0.001
+
+
+def test_colours_are_continued():
+    whole = ball(3)
+    red = Mesh(whole.vertices, whole.faces, np.tile([0.8, 0.1, 0.2], (len(whole.vertices), 1)))
+    filled = fill_holes(pierced(red, [0.1, 0, 0], 0.06))
+    assert np.allclose(filled.colors, [0.8, 0.1, 0.2])
+
+
+def test_what_cannot_be_filled_is_refused():
+    with pytest.raises(ValueError, match="without triangles"):
+        fill_holes(Mesh(np.zeros((3, 3)), np.empty((0, 3), dtype=int)))
+    points = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, -1, 0], [0, 0, 1]])
+    fan = Mesh(points, [[0, 1, 2], [1, 0, 3], [0, 1, 4]])
+    with pytest.raises(ValueError, match="at most two triangles at an edge"):
+        fill_holes(fan)
+
+
+def test_a_closed_mesh_comes_back():
+    whole = ball(2)
+    assert np.array_equal(fill_holes(whole).faces, whole.faces)
+
+
+@pytest.mark.gl
+@pytest.mark.parametrize(("method", "library"), [("poisson-open3d", "open3d"), ("poisson-pymeshlab", "pymeshlab")])
+def test_poisson_closes_a_ball(method, library):
+    try:
+        __import__(library)
+    except (ImportError, OSError) as error:
+        pytest.skip(f"{library} cannot be imported: {error}")
+    holed = pierced(ball(4), [0.1, 0, 0], 0.04)
+    filled = fill_holes(holed, FillConfig(method=method, poisson_depth=6))
+    assert filled.is_closed and template_problem(filled) is None
+    assert np.abs(np.linalg.norm(filled.vertices, axis=1) - 0.1).max() < 0.01

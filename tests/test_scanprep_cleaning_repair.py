@@ -1,0 +1,145 @@
+import numpy as np
+import pytest
+from scanned_shapes import ball, bumpy
+
+from scanprep.cleaning.remesh import flip_edges, improve_triangles, smooth, triangle_quality
+from scanprep.cleaning.repair import RepairConfig, drop_small_components, peel_border, repair, split_vertices, weld
+from scanprep.geometry.mesh import Mesh, template_problem
+from scanprep.geometry.surface import Surface
+
+
+def joined(*meshes):
+    starts = np.cumsum([0] + [len(m.vertices) for m in meshes[:-1]])
+    return Mesh(np.concatenate([m.vertices for m in meshes]),
+                np.concatenate([m.faces + s for m, s in zip(meshes, starts, strict=True)]))
+
+
+def soup(mesh):
+    return Mesh(mesh.corners.reshape(-1, 3), np.arange(3 * len(mesh.faces)).reshape(-1, 3))
+
+
+def test_a_soup_of_triangles_becomes_the_mesh_again():
+    mesh = bumpy(3)
+    again = weld(soup(mesh))
+    assert len(again.vertices) == len(mesh.vertices) and again.is_closed
+    assert np.array_equal(again.corners, mesh.corners)
+
+
+@pytest.mark.parametrize("spoil", ["double", "flipped double", "flat", "fin", "unused", "piece", "soup"])
+def test_each_defect_is_removed(spoil):
+    mesh = bumpy(3)
+    v, f = mesh.vertices, mesh.faces
+    middle = (v[f[5, 0]] + v[f[5, 1]]) / 2
+    bad = {"double": Mesh(v, np.concatenate([f, f[3:9]])),
+           "flipped double": Mesh(v, np.concatenate([f, f[3:9, ::-1]])),
+           "flat": Mesh(np.concatenate([v, [middle]]), np.concatenate([f, [[f[5, 0], f[5, 1], len(v)]]])),
+           "fin": Mesh(np.concatenate([v, [1.01 * v[f[5, 0]]]]), np.concatenate([f, [[f[5, 0], f[5, 1], len(v)]]])),
+           "unused": Mesh(np.concatenate([v, [[9.0, 9, 9]]]), f),
+           "piece": joined(mesh, ball(1, 0.02)),
+           "soup": soup(mesh)}[spoil]
+    assert template_problem(bad) is not None
+    good = repair(bad)
+    assert template_problem(good) is None
+    assert len(good.faces) >= len(f) - 1
+    assert Surface(good).closest(v).distances.max() < 0.5 * mesh.mean_edge
+
+
+def test_a_good_mesh_comes_back_unchanged():
+    mesh = bumpy(3)
+    again = repair(mesh)
+    assert np.array_equal(again.vertices, mesh.vertices) and np.array_equal(again.faces, mesh.faces)
+
+
+def test_repair_twice_is_repair_once():
+    rng = np.random.default_rng(0)
+    mesh = bumpy(3)
+    stray = rng.integers(0, len(mesh.vertices), (40, 3))
+    once = repair(Mesh(mesh.vertices, np.concatenate([mesh.faces[rng.random(len(mesh.faces)) > 0.1], stray])))
+    assert template_problem(once) is None
+    twice = repair(once)
+    assert np.array_equal(once.corners, twice.corners) and len(once.vertices) == len(twice.vertices)
+
+
+def test_two_fans_at_a_vertex_are_parted():
+    a, b = ball(1), ball(1)
+    faces = np.concatenate([a.faces, b.faces + len(a.vertices)])
+    faces[faces == len(a.vertices)] = 0
+    pair = Mesh(np.concatenate([a.vertices, b.vertices + a.vertices[0] - b.vertices[0]]), faces)
+    assert not pair.is_vertex_manifold
+    parted = split_vertices(pair)
+    assert parted.is_vertex_manifold
+    assert np.array_equal(parted.corners, pair.corners)
+    assert len(np.unique(parted.faces)) == len(np.unique(pair.faces)) + 1
+
+
+def test_nothing_left_is_an_error():
+    with pytest.raises(ValueError, match="no triangle is left"):
+        repair(Mesh(np.zeros((3, 3)), [[0, 1, 2]]))
+
+
+def test_pieces_are_dropped_by_size():
+    mesh = joined(ball(3), ball(2, 0.05), ball(0, 0.01))
+    sizes = [len(ball(d).vertices) for d in (3, 2, 0)]
+    for share, kept in ((0.0, sizes), (0.1, sizes[:2]), (1.0, sizes[:1])):
+        assert len(drop_small_components(mesh, share).vertices) == sum(kept)
+    assert len(repair(mesh, RepairConfig(min_component=0.1)).vertices) == sum(sizes[:2])
+
+
+def test_peeling_takes_rings_from_large_borders_only():
+    mesh = ball(4)
+    far = mesh.corners.mean(axis=1)
+    holed = mesh.submesh((far[:, 0] < 0.08) & (np.linalg.norm(far + [0.1, 0, 0], axis=1) > 0.012))[0]
+    large, small = (len(loop) for loop in holed.boundary_loops)
+    assert small < 20 < large
+    peeled = peel_border(holed, 2, smallest=20)
+    assert small in [len(loop) for loop in peeled.boundary_loops]
+    assert peeled.vertices[:, 0].max() < holed.vertices[:, 0].max() - mesh.mean_edge
+
+
+def test_turned_edges_of_a_plane_are_delaunay():
+    rng = np.random.default_rng(1)
+    inner = rng.random((60, 2))
+    corners = np.array([[-1, -1], [2, -1], [2, 2], [-1, 2]])
+    points = np.concatenate([corners, inner])
+    faces = [(0, 1, 2), (0, 2, 3)]
+    for p in range(4, len(points)):               # split the triangle that holds each point: slivers abound
+        for k, (a, b, c) in enumerate(faces):
+            s = [np.linalg.det([points[v] - points[u], points[p] - points[u]]) for u, v in ((a, b), (b, c), (c, a))]
+            if min(s) > 0:
+                faces[k:k + 1] = [(a, b, p), (b, c, p), (c, a, p)]
+                break
+    mesh = Mesh(np.c_[points, np.zeros(len(points))], faces)
+    turned = flip_edges(mesh, rounds=200)
+    assert turned.face_areas.sum() == pytest.approx(mesh.face_areas.sum())
+    assert turned.face_normals[:, 2].min() > 0.999
+    for a, b, c in points[turned.faces]:          # no point inside any circumscribed circle
+        centre = np.linalg.solve(2 * np.array([b - a, c - a]), [b @ b - a @ a, c @ c - a @ a])
+        radius = np.linalg.norm(a - centre)
+        assert np.linalg.norm(points - centre, axis=1).min() > radius * (1 - 1e-2)
+
+
+def test_triangles_get_better_on_the_same_surface():
+    rng = np.random.default_rng(2)
+    exact = bumpy(4)
+    poor = exact.with_vertices(exact.vertices + 0.3 * exact.mean_edge * rng.normal(size=exact.vertices.shape))
+    poor = poor.with_vertices(Surface(exact).closest(poor.vertices).points)
+    better = improve_triangles(poor, Surface(exact))
+    assert np.percentile(triangle_quality(better), 1) > 0.6 > 2 * np.percentile(triangle_quality(poor), 1)
+    assert template_problem(better) is None and better.is_closed
+    assert Surface(exact).closest(better.vertices).distances.max() < 0.02 * exact.mean_edge
+    assert better.volume == pytest.approx(exact.volume, rel=0.01)
+
+
+def test_smoothing_takes_noise_off_and_keeps_the_size():
+    rng = np.random.default_rng(3)
+    exact = ball(4)
+    noisy = exact.with_vertices(exact.vertices * (1 + 0.01 * rng.normal(size=(len(exact.vertices), 1))))
+    even = smooth(noisy, 10)
+    off = np.linalg.norm(even.vertices, axis=1) - 0.1
+    assert off.std() < 0.4 * 0.001
+    assert abs(off.mean()) < 2e-4
+
+
+def test_quality_of_known_triangles():
+    mesh = Mesh(np.array([[0, 0, 0], [1, 0, 0], [0.5, 3 ** 0.5 / 2, 0], [2, 0, 0]]), [[0, 1, 2], [0, 1, 3]])
+    assert triangle_quality(mesh) == pytest.approx([1, 0])
