@@ -83,6 +83,12 @@ def test_more_than_255_labels_go_on_in_labels2(tmp_path):
     agree(read_markers(tmp_path / "a.c3d"), seq, 1e-6)
 
 
+def test_more_frames_than_the_header_can_count(tmp_path):
+    positions = np.random.default_rng(1).normal(size=(70_000, 1, 3))
+    write_markers(tmp_path / "a.c3d", MarkerSequence(positions, ("A",), 1000))
+    agree(read_markers(tmp_path / "a.c3d"), MarkerSequence(positions, ("A",), 1000), 1e-6)
+
+
 @pytest.mark.parametrize("missing", ["", "NaN", "0.0"])
 @pytest.mark.parametrize(("unit", "factor"), [("mm", 1000), ("m", 1), ("cm", 100)])
 def test_trc_in_its_own_unit(tmp_path, missing, unit, factor):

@@ -121,7 +121,7 @@ def _positions(data: bytes, parameters: _Parameters, numbers: _Numbers) -> np.nd
     scale = float(numbers.floats(data[12:16])[0])
     size = 4 if scale < 0 else 2
     width = (4 * points + analog) * size
-    frames = _frames(parameters, first, last)
+    frames = _frames(parameters, first, last, (len(data) - start) // width if width else 0)
     if not points or not frames:
         raise _Damaged(f"expected points, the C3D file holds {points} points in {frames} frames")
     if start < _BLOCK or not np.isfinite(scale):
@@ -137,8 +137,8 @@ def _positions(data: bytes, parameters: _Parameters, numbers: _Numbers) -> np.nd
     return positions
 
 
-def _frames(parameters: _Parameters, first: int, last: int) -> int:
-    """How many frames there are: the header counts to 65535, longer files say it in parameters."""
+def _frames(parameters: _Parameters, first: int, last: int, room: int) -> int:
+    """How many frames there are: the header counts to 65535, longer files say it in parameters or not at all."""
     counted = max(int(last) - int(first) + 1, 0)
     if last < 65535:
         return counted
@@ -146,8 +146,8 @@ def _frames(parameters: _Parameters, first: int, last: int) -> int:
     if all(len(end) == 2 for end in ends):
         low, high = ((int(end[0]) & 0xFFFF) + 65536 * (int(end[1]) & 0xFFFF) for end in ends)
         return max(high - low + 1, 0)
-    said = parameters.get(("POINT", "LONG_FRAMES")) or parameters.get(("POINT", "FRAMES")) or [0]
-    return max(int(said[0]), counted)
+    said = parameters.get(("POINT", "LONG_FRAMES"))
+    return int(said[0]) if said else max(room, counted)
 
 
 def _labels(parameters: _Parameters, count: int) -> list[str]:
@@ -179,4 +179,7 @@ def write_c3d(path: Path, positions: np.ndarray, labels: tuple[str, ...], rate: 
     missing = np.isnan(positions[..., 0]).T
     tree["data"]["meta_points"] = {"residuals": np.where(missing, -1.0, 0.0)[None],
                                    "camera_masks": np.zeros((7, L, T), dtype=bool)}
+    if T > 65535:
+        for key, frame in (("ACTUAL_START_FIELD", 1), ("ACTUAL_END_FIELD", T)):
+            tree.add_parameter("TRIAL", key, np.array([frame & 0xFFFF, frame >> 16], "u2").view("i2").tolist())
     tree.write(str(path))
