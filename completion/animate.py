@@ -22,6 +22,7 @@ from .solve import MinimiseConfig, minimise
 from .starts import search
 
 Progress = Callable[[int, int], None]
+PREDICTION = 10.0                    # variance of a prediction from two uncertain frames, against the acceleration's
 STARTS = 2                           # that are followed to their end
 
 
@@ -42,9 +43,9 @@ class AnimateConfig:
         See `gaussian_prior`.
     start_axes : int
         Directions of the training poses along which the first frame is searched.
-    angle_sd : float, radians
-        How far a joint angle may be from the one predicted from the two frames before, at 100 frames a second.
-    place_sd : float, metres
+    angle_acceleration : float, radians per second squared
+        How strongly joints accelerate, as a standard deviation.
+    place_acceleration : float, metres per second squared
         The same for the place.
     momentum : float in [0, 1]
         Share of the velocity that the prediction keeps.
@@ -61,8 +62,8 @@ class AnimateConfig:
     prior_weight: float = 0.3
     prior_shrinkage: float = 0.3
     start_axes: int = 6
-    angle_sd: float = 0.03
-    place_sd: float = 0.01
+    angle_acceleration: float = 60.0
+    place_acceleration: float = 15.0
     momentum: float = 0.9
     iterations: int = 3
     lost: float = 0.08
@@ -141,9 +142,8 @@ class MarkerFollower:
         self._follow = self.body.follow(ids, np.zeros(self.body.n_angles + 3), weights)
         self._supports = subject.points(ids, weights)
         self.prior = gaussian_prior(self.body.pose_mean, self.body.pose_covariance, config.prior_shrinkage)
-        step = 100 / self.rate
-        self.loose = np.full(self.body.n_angles + 3, (config.angle_sd * step)**-2)
-        self.loose[-3:] = (config.place_sd * step)**-2
+        self.inertia = np.full(self.body.n_angles + 3, (config.angle_acceleration / self.rate**2)**-2)
+        self.inertia[-3:] = (config.place_acceleration / self.rate**2)**-2
 
     def follow(self, x: np.ndarray) -> MovingPoints:
         """The markers for unknowns (..., P)."""
@@ -193,7 +193,7 @@ class MarkerFollower:
         def energies(x: np.ndarray) -> list[energy.Residual]:
             return [energy.point_to_point(self.follow(x), self.targets[t], weights),
                     energy.pose_prior(x, self.prior, config.prior_weight),
-                    energy.stay_near(x, expected, self.loose)]
+                    energy.stay_near(x, expected, self.inertia / PREDICTION)]
 
         end = minimise(energies, expected[None], MinimiseConfig(config.iterations, 1e-4, 1e-2))
         return end.x[0], bool(end.converged[0])

@@ -31,7 +31,7 @@ class FixedBody:
         self.skeleton: Skeleton = subject.skeleton
         self.n_angles = 3 * len(subject.skeleton.parents)
         if subject.pose_mean is None or subject.pose_covariance is None:
-            raise ValueError("subject: expected one with the pose prior of its model, as ScapeModel.subject makes it")
+            raise ValueError("subject: expected one that ScapeModel.subject made, with its pose prior")
         self.pose_mean, self.pose_covariance = subject.pose_mean, subject.pose_covariance
 
     def split(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

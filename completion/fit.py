@@ -136,9 +136,8 @@ class ScanFit:
         x, _ = search(body, follow, self.points, config.landmark_sd, self.prior, config.start_axes)
         places = body.subject.points(self.spread).evaluate(*body.split(x)[:2])
         x = x[distinct(places, config.candidates)]
-        drawn = [around(body, follow, start, self.points, config.landmark_sd, self.prior, config.draws, self.rng)
-                 for start in x]
-        drawn = np.concatenate([x, *drawn])
+        drawn = np.concatenate([x, *(around(body, follow, start, self.points, config.landmark_sd, self.prior,
+                                            config.draws, self.rng) for start in x)])
         drawn = drawn[np.argsort(quick_misfits(self, drawn))]
         places = body.subject.points(self.spread).evaluate(*body.split(drawn)[:2])
         return drawn[distinct(places, config.candidates)]

@@ -38,9 +38,9 @@ def smooth_sequence(follower: MarkerFollower, x: np.ndarray) -> np.ndarray:
     D = np.array([1.0, -2.0, 1.0])
     band = np.zeros((3, T, P))                       # of a frame with itself, the next and the one after
     for i in range(3):
-        gradient[i:T - 2 + i] += D[i] * follower.loose * bend
+        gradient[i:T - 2 + i] += D[i] * follower.inertia * bend
         for j in range(i, 3):
-            band[j - i, i:T - 2 + i] += D[i] * D[j] * follower.loose
+            band[j - i, i:T - 2 + i] += D[i] * D[j] * follower.inertia
     step = -_solve_banded(hessian, band, gradient)
     pose = rotations.exp(x[:, :-3].reshape(T, -1, 3)) @ rotations.exp(step[:, :-3].reshape(T, -1, 3))
     return np.concatenate([rotations.log(pose).reshape(T, -1), x[:, -3:] + step[:, -3:]], axis=1)

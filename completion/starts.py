@@ -8,7 +8,7 @@ from scanprep.geometry import rotations
 from . import energy
 from .bodies import FixedBody, Follow
 from .priors import GaussianPrior, typical_poses
-from .solve import MinimiseConfig, minimise
+from .solve import Energy, MinimiseConfig, minimise
 
 ANNEALING = (10.0, 3.0, 1.0)         # weight of the pose prior: first near the usual poses, then free
 
@@ -39,11 +39,13 @@ def search(body: FixedBody, follow: Follow, targets: np.ndarray, sd: float, prio
     weights = np.full(len(targets), sd**-2)
     still = np.zeros(x.shape[1])
     still[body.n_angles + 3:] = 1e6
+
+    def energies(stiff: float) -> Energy:
+        return lambda x: [energy.point_to_point(follow(x), targets, weights),
+                          energy.pose_prior(x, prior, stiff), energy.stay_near(x, 0 * x, still)]
+
     for stiff in ANNEALING:
-        end = minimise(lambda x, stiff=stiff: [energy.point_to_point(follow(x), targets, weights),
-                                               energy.pose_prior(x, prior, stiff),
-                                               energy.stay_near(x, 0 * x, still)],
-                       x, MinimiseConfig(iterations=8, tolerance=1e-3))
+        end = minimise(energies(stiff), x, MinimiseConfig(iterations=8, tolerance=1e-3))
         x = end.x
     order = np.argsort(end.energy)
     return x[order], end.energy[order]

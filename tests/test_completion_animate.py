@@ -1,0 +1,195 @@
+import numpy as np
+import pytest
+from completion_bodies import MEAN, worm_with_prior
+
+from completion import energy
+from completion.animate import AnimateConfig, MarkerFollower, animate, supports
+from completion.markers.files import MarkerSequence
+from completion.markers.layout import MarkerLayout
+from completion.motion import Motion
+from completion.smooth import _local, _second_differences, smooth_sequence
+from scanprep.geometry.storage import StorageError
+
+FRAMES = 60
+PLAIN = AnimateConfig(start_axes=2, smoothing=0)
+
+
+@pytest.fixture(scope="module")
+def subject():
+    return worm_with_prior().subject(np.array([0.5, -0.5, 0.2]))
+
+
+@pytest.fixture(scope="module")
+def layout(subject):
+    vertices = np.random.default_rng(4).choice(396, 30, replace=False)
+    return MarkerLayout(tuple(f"M{i}" for i in range(30)), vertices, 0.012)
+
+
+@pytest.fixture(scope="module")
+def walk(subject, layout):
+    """A motion that turns all the way round, and its markers, as the layout puts them on the meshes."""
+    t = np.arange(FRAMES) / 100
+    swing = np.sin(2 * np.pi * t[:, None, None] + np.arange(4)[:, None]) * np.array([0.05, 0.3, 0.2])
+    poses = MEAN + swing
+    poses[:, 0] = np.stack([0 * t, 0 * t, 7.5 * t], axis=1)          # through half a turn, where the chart ends
+    trans = np.stack([1.2 * t, 0.1 * np.sin(4 * t), 0 * t], axis=1)
+    meshes = subject.vertices(poses, trans)
+    positions = np.stack([layout.place(subject.template.with_vertices(v)) for v in meshes])
+    return meshes, MarkerSequence(positions, layout.labels, 100.0)
+
+
+def surface_error(subject, motion, meshes):
+    return np.linalg.norm(motion.vertices(subject) - meshes, axis=2).mean(axis=1)
+
+
+def changed(sequence, positions):
+    return MarkerSequence(positions, sequence.labels, sequence.rate)
+
+
+def test_the_motion_comes_back_from_its_markers(subject, layout, walk):
+    meshes, sequence = walk
+    ticks = []
+    motion = animate(subject, sequence, layout, PLAIN, lambda done, total: ticks.append((done, total)))
+    assert surface_error(subject, motion, meshes).max() < 0.006
+    assert motion.residuals.shape == (FRAMES, 30) and np.nanmean(motion.residuals) < 0.004
+    assert motion.poses.shape == (FRAMES, 4, 3) and motion.labels == layout.labels and motion.rate == 100
+    assert np.linalg.norm(motion.poses, axis=2).max() < np.pi + 0.1
+    assert ticks[-1] == (FRAMES, FRAMES)
+
+
+def test_missing_markers_are_left_out(subject, layout, walk):
+    meshes, sequence = walk
+    whole = surface_error(subject, animate(subject, sequence, layout, PLAIN), meshes).mean()
+    rng = np.random.default_rng(0)
+    positions = sequence.positions.copy()
+    for marker in rng.choice(30, 6, replace=False):                  # a fifth, for half a second each
+        first = rng.integers(FRAMES - 50)
+        positions[first:first + 50, marker] = np.nan
+    positions[:3] = np.nan                                           # it begins before anything is seen
+    motion = animate(subject, changed(sequence, positions), layout, PLAIN)
+    assert surface_error(subject, motion, meshes)[3:].mean() < 1.33 * whole + 1e-3
+    np.testing.assert_array_equal(np.isnan(motion.residuals), np.isnan(positions[..., 0]))
+    assert np.isfinite(motion.poses).all() and not motion.converged[:3].any()
+
+
+def test_a_swapped_and_a_stray_marker_do_not_pull(subject, layout, walk):
+    meshes, sequence = walk
+    positions = sequence.positions.copy()
+    positions[20:40, [3, 9]] = positions[20:40, [9, 3]]
+    positions[10:, 5] += [0.4, 0.3, -0.5]
+    motion = animate(subject, changed(sequence, positions), layout, PLAIN)
+    assert surface_error(subject, motion, meshes).max() < 0.015
+    assert motion.residuals[20:, 5].min() > 0.3
+
+
+def test_smoothing_takes_noise_away(subject, layout, walk):
+    meshes, sequence = walk
+    noisy = changed(sequence, sequence.positions + np.random.default_rng(1).normal(0, 0.01, (FRAMES, 30, 3)))
+    rough = animate(subject, noisy, layout, PLAIN)
+    smooth = animate(subject, noisy, layout, AnimateConfig(start_axes=2, smoothing=2))
+    assert surface_error(subject, smooth, meshes).mean() < 0.9 * surface_error(subject, rough, meshes).mean()
+
+    def jerk(motion):
+        return np.abs(np.diff(motion.vertices(subject), 3, axis=0)).mean()
+
+    assert jerk(smooth) < 0.3 * jerk(rough)
+
+
+def test_one_smoothing_step_is_the_dense_gauss_newton_step(subject, layout, walk):
+    _, sequence = walk
+    few = MarkerSequence(sequence.positions[:5], sequence.labels, 100.0)
+    follower = MarkerFollower(subject, few, layout, PLAIN)
+    x = np.random.default_rng(0).normal(0, 0.05, (5, 15))            # small angles: turns add
+    assert np.abs(smooth_sequence(follower, smooth_sequence(follower, x)) - x).max() > 0
+    rows, values = [], []
+    for t in range(5):
+        at = x[t][None]
+        terms = [energy.point_to_point(follower.follow(at), follower.targets[t],
+                                       follower.weights(t, follower.positions(x[t]))),
+                 energy.pose_prior(at, follower.prior, PLAIN.prior_weight)]
+        for term in terms:
+            block = np.zeros((term.values.size, 75))
+            block[:, 15 * t:15 * t + 15] = term.jacobian[0] @ _local(x)[t]
+            rows.append(block)
+            values.append(term.values[0])
+    D = np.kron(np.array([[1, -2, 1, 0, 0], [0, 1, -2, 1, 0], [0, 0, 1, -2, 1.0]]), np.diag(np.sqrt(follower.inertia)))
+    rows.append(D)
+    values.append((np.sqrt(follower.inertia) * _second_differences(x)).ravel())
+    step = -np.linalg.lstsq(np.vstack(rows), np.concatenate(values), rcond=None)[0].reshape(5, 15)
+    got = smooth_sequence(follower, x)
+    np.testing.assert_allclose(got[:, -3:] - x[:, -3:], step[:, -3:], atol=1e-5)
+
+
+def test_markers_sit_where_the_layout_places_them(subject, layout, walk):
+    _, sequence = walk
+    follower = MarkerFollower(subject, sequence, layout, PLAIN)
+    rest = np.zeros(15)
+    wanted = layout.place(subject.template.with_vertices(subject.vertices(np.zeros((4, 3)), np.zeros(3))))
+    assert np.linalg.norm(follower.positions(rest) - wanted, axis=1).max() < 0.004   # two ways to a normal
+    flat = MarkerLayout(layout.labels, layout.vertices, 0.0)
+    np.testing.assert_allclose(MarkerFollower(subject, sequence, flat, PLAIN).positions(rest), flat.place(
+        subject.template.with_vertices(subject.vertices(np.zeros((4, 3))))), atol=1e-12)
+    ids, weights = supports(subject.template, layout)
+    np.testing.assert_allclose(weights.sum(axis=1), 1)
+    assert len(ids) == 3 * len(layout.labels)
+
+
+def test_a_layout_that_shares_too_few_labels_is_refused(subject, layout, walk):
+    sequence = MarkerSequence(walk[1].positions[:, :5], ("M0", "M1", "X", "Y", "Z"), 100.0)
+    with pytest.raises(ValueError, match="expected at least 3 markers of the layout, found 2"):
+        animate(subject, sequence, layout)
+    blind = changed(walk[1], np.where(np.arange(30)[:, None] < 2, walk[1].positions, np.nan))
+    with pytest.raises(ValueError, match="expected a frame with at least 3 known markers, the best has 2"):
+        animate(subject, blind, layout)
+    other = MarkerLayout(("M0", "M1", "M2"), np.array([1, 2, 9999]))
+    with pytest.raises(ValueError, match=r"expected vertices of 0\.\.397, got 9999"):
+        animate(subject, walk[1], other)
+
+
+@pytest.fixture
+def motion():
+    rng = np.random.default_rng(0)
+    residuals = rng.random((6, 2))
+    residuals[1, 1] = np.nan
+    return Motion(rng.normal(size=(6, 4, 3)), rng.normal(size=(6, 3)), np.array([0.1, -2]), 120.0, residuals,
+                  ("LSHO", "RSHO"), "male", np.arange(6) > 0)
+
+
+def test_a_motion_is_read_as_it_was_written(motion, tmp_path):
+    motion.save(tmp_path / "walk.npz")
+    back = Motion.load(tmp_path / "walk.npz")
+    for name in ("poses", "trans", "betas", "residuals", "converged"):
+        np.testing.assert_array_equal(getattr(back, name), getattr(motion, name))
+    assert (back.rate, back.labels, back.gender) == (120.0, ("LSHO", "RSHO"), "male")
+    with np.load(tmp_path / "walk.npz", allow_pickle=False) as data:
+        assert data["poses"].shape == (6, 12) and str(data["surface_model_type"]) == "scape"
+        assert float(data["mocap_frame_rate"]) == 120
+
+
+def test_a_motion_with_the_other_spelling_of_its_rate_is_read(tmp_path):
+    np.savez(tmp_path / "m.npz", poses=np.zeros((2, 9)), trans=np.zeros((2, 3)), betas=np.zeros(0),
+             mocap_framerate=60, surface_model_type="scape")
+    back = Motion.load(tmp_path / "m.npz")
+    assert back.rate == 60 and back.poses.shape == (2, 3, 3) and back.betas is None and back.labels == ()
+
+
+@pytest.mark.parametrize("content, message", [
+    ({"poses": np.zeros((2, 9))}, "it lacks trans"),
+    ({"poses": np.zeros((2, 9)), "trans": np.zeros((2, 3)), "surface_model_type": "other"},
+     "expected surface_model_type 'scape', found 'other'"),
+    ({"poses": np.zeros((2, 9)), "trans": np.zeros((2, 3)), "surface_model_type": "scape"}, "mocap_frame_rate"),
+    ({"poses": np.zeros((2, 9)), "trans": np.zeros((3, 3)), "surface_model_type": "scape", "mocap_frame_rate": 1},
+     "poses, trans"),
+])
+def test_files_that_are_no_motion_are_refused(tmp_path, content, message):
+    np.savez(tmp_path / "m.npz", **content)
+    with pytest.raises(StorageError, match=message):
+        Motion.load(tmp_path / "m.npz")
+
+
+def test_missing_and_damaged_files_are_refused(tmp_path):
+    with pytest.raises(StorageError, match="no such file"):
+        Motion.load(tmp_path / "none.npz")
+    (tmp_path / "text.npz").write_text("nothing of the kind")
+    with pytest.raises(StorageError, match="expected a motion"):
+        Motion.load(tmp_path / "text.npz")
