@@ -8,6 +8,7 @@ import pytest
 from scanprep.geometry import rotations, storage
 from scanprep.geometry.mesh import Mesh, template_problem
 from scanprep.scanning import people, people_template
+from scanprep.scanning.people_muscles import COLUMNS, masks
 from scanprep.scanning.people import NAMED_POSES, PARENTS, PARTS, BodyShape, Person
 
 MAN = BodyShape()
@@ -135,8 +136,8 @@ def test_shape_out_of_range_is_refused():
 def test_every_shape_parameter_moves_the_surface(man):
     for name in ("weight", "muscle", "leg_length", "arm_length", "shoulder_width", "hip_width", "belly", "chest", "neck",
                  "head_size", "limbs", "extremities", "nose"):
-        change = np.abs(Person(BodyShape(**{name: 1.5})).mesh.vertices - man.mesh.vertices).max()
-        assert change > 0.003, name
+        other = people_template.Anatomy(BodyShape(**{name: 1.5}))
+        assert np.abs(other.field(man.mesh.vertices)).max() > 0.0025, name
 
 
 def test_pose_zero_is_rest(bodies):
@@ -163,12 +164,12 @@ def test_root_part_stays_centred(man):
 
 def test_parts_follow_their_rotations(man):
     """Away from the joints every part turns as the pose says."""
-    for name in ("run", "strong_arms", "kick_left"):
+    for name in ("run", "point_right", "kick_left"):
         pose = people.named_pose(name)
         R = man.part_rotations(pose)
         fitted = man.skeleton.fit_rotations(man.mesh, man.posed(pose))
         angle = np.degrees(np.linalg.norm(rotations.log(np.swapaxes(R, 1, 2) @ fitted), axis=1))
-        assert np.median(angle) < 4 and angle.max() < 28, dict(zip(PARTS, angle.round(1), strict=True))
+        assert np.median(angle) < 3 and angle.max() < 15, dict(zip(PARTS, angle.round(1), strict=True))
 
 
 def test_posing_is_not_linear_blend_skinning(man):
@@ -182,37 +183,26 @@ def test_posing_is_not_linear_blend_skinning(man):
                                         + man._poser.settling(pose))[..., None]], axis=2)
     rest = np.hstack([man.mesh.vertices, np.ones((len(man.mesh.vertices), 1))])
     residual = np.empty(len(rest))
-    for v in range(0, len(rest), 40):
+    for v in range(0, len(rest), 60):
         basis = np.einsum("kpij,j->kip", affine, rest[v]).reshape(-1, 16)
         weights = np.linalg.lstsq(basis, posed[:, v].reshape(-1), rcond=1e-6)[0]
         residual[v] = np.sqrt(np.mean((basis @ weights - posed[:, v].reshape(-1))**2) * 3)
-    sampled = residual[::40]
+    sampled = residual[::60]
     assert np.mean(sampled) > 0.0015 and np.percentile(sampled, 90) > 0.003
 
 
 def test_muscles_bulge_with_strength():
-    """A bent elbow raises the biceps, more on a strong person."""
-    pose = np.zeros((16, 3))
-    pose[4:7] = people.named_pose("strong_arms")[4:7]
+    """A bent elbow raises the biceps in the frame of the upper arm, more on a strong person."""
+    bent = people.compose(left_arm={"elbow": 95})
     rises = []
     for muscle in (-1.0, 2.0):
         person = Person(BodyShape(muscle=muscle))
-        straight = pose.copy()
-        straight[5] = 0
-        bent = person.posed(pose)
-        still = person.posed(straight)
-        upper = np.flatnonzero(person.part_of_vertex == 4)
-        joint, elbow = person.posed_joints(straight)[4:6]
-        axis = (elbow - joint) / np.linalg.norm(elbow - joint)
-        along = (still[upper] - joint) @ axis / np.linalg.norm(elbow - joint)
-        upper = upper[(along > 0.4) & (along < 0.75)]
-
-        def radius(v: np.ndarray, near: np.ndarray, line: np.ndarray, ids: np.ndarray) -> float:
-            d = v[ids] - near
-            return float(np.linalg.norm(d - (d @ line)[:, None] * line, axis=1).max())
-
-        rises.append(radius(bent, person.posed_joints(pose)[4], axis, upper) - radius(still, joint, axis, upper))
-    assert rises[0] > 0.003 and rises[1] > rises[0] + 0.004
+        biceps = masks()[:, COLUMNS["biceps", "l"]].argmax()
+        rest = person.mesh.vertices[biceps] - person.joints[4]
+        R = person.part_rotations(bent)[4]
+        moved = R.T @ (person.posed(bent)[biceps] - person.posed_joints(bent)[4])
+        rises.append((moved - rest) @ person.mesh.vertex_normals[biceps])
+    assert 0.004 < rises[0] < 0.02 and rises[1] > rises[0] + 0.004
 
 
 def test_raised_arms_raise_the_shoulders(man):
@@ -251,7 +241,7 @@ def test_random_poses_are_repeatable_varied_and_scale_with_spread():
 def test_walk_goes_ahead_with_a_foot_on_the_floor(man):
     poses, trans = people.walk(44, rate=20.0)
     assert poses.shape == (44, 16, 3) and trans.shape == (44, 3)
-    assert 1.0 < -(trans[-1, 1] - trans[0, 1]) / (43 / 20) < 2.0            # metres a second, towards -y
+    assert 0.8 < -(trans[-1, 1] - trans[0, 1]) / (43 / 20) < 2.0            # metres a second, towards -y
     lowest = np.array([(man.posed(p, t))[:, 2].min() for p, t in zip(poses[::4], trans[::4], strict=True)])
     assert np.abs(lowest).max() < 0.03
     once, _ = people.walk(1, rate=20.0)

@@ -14,11 +14,11 @@ from ..geometry.mesh import Mesh
 from ..skeleton.tree import Skeleton
 from .people_anatomy import PARENTS, PARTS, BodyShape
 from .people_marks import landmarks, markers
-from .people_motion import NAMED_POSES, mirrored_pose, named_pose, random_pose, walk
+from .people_motion import NAMED_POSES, compose, mirrored_pose, named_pose, random_pose, walk
 from .people_posing import Poser, part_of_vertex
 from .people_template import carry, load
 
-__all__ = ["LANDMARKS", "MARKERS", "NAMED_POSES", "PARENTS", "PARTS", "BodyShape", "Person", "mirrored_pose",
+__all__ = ["LANDMARKS", "MARKERS", "NAMED_POSES", "PARENTS", "PARTS", "BodyShape", "Person", "compose", "mirrored_pose",
            "named_pose", "random_pose", "walk"]
 
 

@@ -151,7 +151,7 @@ class Anatomy:
         self.arm = 1 + 0.03 * s.arm_length
         tip = 1 + 0.035 * s.extremities
         width["shoulder"] += self.scale * (0.007 * s.shoulder_width + 0.003 * s.muscle + 0.002 * s.weight)
-        width["hip"] += self.scale * (0.004 * s.hip_width + 0.001 * s.weight)
+        width["hip"] += self.scale * (0.004 * s.hip_width + 0.004 * max(self.fat, 0) + 0.0015 * max(s.muscle, 0))
         width["upper_arm"] *= self.arm
         width["forearm"] *= self.arm
         width["hand"] *= tip

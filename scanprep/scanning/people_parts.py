@@ -99,7 +99,7 @@ def leg(a: Anatomy) -> Field:
     own = a.man + (1 - a.man) * tables.WOMAN / tables.MAN           # the tables are for a man's size
     table = a.man * tables.LEG_MAN + (1 - a.man) * tables.LEG_WOMAN
     fat = a.fat * (1.0 + 0.25 * (1 - a.man)) + 0.7 * s.limbs
-    extents = table[:, 1:] * (1 - 0.035 * (1 - a.man)) + (fat * tables.LEG_FAT[:, None] + s.muscle * tables.LEG_MUSCLE) * own
+    extents = table[:, 1:] * (1 - 0.035 * (1 - a.man)) + (fat * tables.LEG_FAT[:, None] * [1.2, 0.45, 1.0, 1.0] + s.muscle * tables.LEG_MUSCLE) * own
     extents = extents * g
     thigh = np.linalg.norm(a.joints[11] - a.joints[10])
     shin = np.linalg.norm(a.joints[12] - a.joints[11])
@@ -206,7 +206,7 @@ def head(a: Anatomy) -> Field:
     back = np.array([0.07, 0.07, 0.07, 0.06, 0.045, 0.03, 0.02])
     face = Loft(a.eye, UPRIGHT, _keys(up[::-1], half[::-1], half[::-1], fore[::-1], back[::-1], 2.25) *
                 np.array([h] * 7 + [1.0]), (0.010 * h, 0.03 * h))
-    big = 1 + 0.10 * s.nose + 0.06 * (man - 0.5)
+    big = 1 + 0.20 * s.nose + 0.06 * (man - 0.5)
     nose = RoundCone(at(0, 0.086, 0.010), at(0, 0.0945 + 0.012 * big, -0.036), 0.0065 * h, 0.0095 * h)
     wing = Ellipsoid(at(0.0115, 0.0965, -0.0395), np.array([0.0075, 0.0095, 0.0065]) * h)
     eyeball = Ellipsoid(at(0.0315, 0.0715, -0.001), np.array([0.0160, 0.0125, 0.0115]) * h)

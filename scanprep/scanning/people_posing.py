@@ -130,7 +130,7 @@ def twist_shares() -> list[tuple[int, np.ndarray]]:
     v, a = template.mesh.vertices, template.anatomy
     weights = blending()[1]
     shares = []
-    for part, reach in ((4, 0.75), (7, 0.75), (10, 0.6), (13, 0.6)):
+    for part, reach in ((4, 0.5), (7, 0.5), (10, 0.45), (13, 0.45)):
         axis = a.ends[part] - a.joints[part]
         s = (v - a.joints[part]) @ axis / (axis @ axis)
         chain = weights[:, part]
