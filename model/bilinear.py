@@ -2,6 +2,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 
@@ -46,10 +47,14 @@ class ShapedPoints:
 
     def shape_jacobian(self, pose: np.ndarray) -> np.ndarray:
         """Derivative (L, 3, K) of the points with respect to betas at a pose (J, 3), metres."""
-        K, A, L, _ = self.shape_basis.shape
-        flat = np.ascontiguousarray(self.shape_basis.transpose(1, 3, 0, 2)).reshape(3 * A, K * L)
-        by_beta = _product(self.features, flat, np.asarray(pose, dtype=np.float64)).reshape(3, K, L)
+        K, _, L, _ = self.shape_basis.shape
+        by_beta = _product(self.features, self._flat, np.asarray(pose, dtype=np.float64)).reshape(3, K, L)
         return by_beta.transpose(2, 0, 1)
+
+    @cached_property
+    def _flat(self) -> np.ndarray:
+        K, A, L, _ = self.shape_basis.shape
+        return np.ascontiguousarray(self.shape_basis.transpose(1, 3, 0, 2)).reshape(3 * A, K * L)
 
 
 def build_shaped_points(system: StitchingSystem, template: Mesh, pose_space: PoseSpace, shape_space: ShapeSpace,

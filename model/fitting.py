@@ -1,17 +1,15 @@
 """Pose and shape of a body from its registered vertices, by Levenberg-Marquardt."""
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
 
+from .bilinear import ShapedPoints
 from .linear import PointOperator, Subject
-from .pose_space import twists
+from .minimise import Derive, Evaluate, Minimum, minimise
 from .scape import ScapeModel
-
-EXACT = 1e-9                         # metres: nearer than this needs no further step
 
 
 @dataclass(frozen=True)
@@ -70,10 +68,6 @@ class ShapeFit(PoseFit):
     betas: np.ndarray
 
 
-Evaluate = Callable[[np.ndarray], np.ndarray]
-Derive = Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]
-
-
 def fit_pose(subject: Subject, vertices: np.ndarray, config: FitConfig | None = None) -> PoseFit:
     """Pose and place of a known body from all its vertices.
 
@@ -117,7 +111,7 @@ class PoseFitter:
         energy = _pose_energy(self._sample, vertices[chosen])
         best: Minimum | None = None
         for x in _starts(subject, vertices) if start is None else [_placed(subject, vertices, start)]:
-            found = _minimise(*energy, x, J, config.tolerance, config.iterations)
+            found = minimise(*energy, x, J, config.tolerance, config.iterations)
             if best is None or found.energy < best.energy:
                 best = found
             if np.sqrt(found.energy / len(chosen)) < 0.02 * np.ptp(vertices, axis=0).max():
@@ -125,7 +119,7 @@ class PoseFitter:
         assert best is not None
         steps = best.steps
         if len(chosen) < subject.n_vertices and config.polish:
-            best = _minimise(*_pose_energy(self._everything, vertices), best.x, J, config.tolerance, config.polish)
+            best = minimise(*_pose_energy(self._everything, vertices), best.x, J, config.tolerance, config.polish)
             steps += best.steps
         pose, trans = best.x[:3 * J].reshape(J, 3), best.x[3 * J:]
         fitted = np.asarray(subject.vertices(pose, trans), dtype=np.float64)
@@ -147,25 +141,49 @@ def fit_shape(model: ScapeModel, vertices: np.ndarray, config: FitConfig | None 
     ValueError
         Vertices of another count or not finite, or a model without shape components.
     """
-    config = config or FitConfig()
-    vertices = _checked_vertices(vertices, len(model.template.vertices))
-    K = model.n_betas if config.n_betas is None else config.n_betas
-    if not 0 < K <= model.n_betas:
-        raise ValueError(f"n_betas: expected 1..{model.n_betas}, got {K}")
-    J = len(model.skeleton.parents)
-    first = fit_pose(model.subject(np.zeros(K)), vertices, FitConfig(config.sample, 10, 0, 1e-3))
-    x = np.concatenate([first.pose.ravel(), first.trans, np.zeros(K)])
-    chosen = spread_vertices(model.template.vertices, config.sample)
-    best = _minimise(*_shape_energy(model, chosen, vertices[chosen], K), x, J, config.tolerance, config.iterations)
-    steps = best.steps
-    if config.polish:
-        best = _minimise(*_whole_energy(model, vertices, K), best.x, J, config.tolerance, config.polish)
-        steps += best.steps
-    x = best.x
-    pose, trans, betas = x[:3 * J].reshape(J, 3), x[3 * J:3 * J + 3], np.zeros(model.n_betas)
-    betas[:K] = x[3 * J + 3:]
-    fitted = model.vertices(pose, betas, trans)
-    return ShapeFit(pose, trans, fitted, *_distances(fitted, vertices), best.converged, steps, betas)
+    return ShapeFitter(model, config).fit(vertices)
+
+
+class ShapeFitter:
+    """`fit_shape` for many scans: what does not depend on the scan is prepared once.
+
+    Parameters
+    ----------
+    model : ScapeModel
+        With shape components.
+    config : FitConfig, optional
+    """
+
+    def __init__(self, model: ScapeModel, config: FitConfig | None = None) -> None:
+        self.model, self.config = model, config or FitConfig()
+        self.n_betas = model.n_betas if self.config.n_betas is None else self.config.n_betas
+        if not 0 < self.n_betas <= model.n_betas:
+            raise ValueError(f"n_betas: expected 1..{model.n_betas}, got {self.n_betas}")
+        self._chosen = spread_vertices(model.template.vertices, self.config.sample)
+        first = FitConfig(self.config.sample, iterations=10, polish=0, tolerance=1e-3)
+        self._mean_person = PoseFitter(model.subject(np.zeros(self.n_betas)), first)
+
+    @cached_property
+    def _points(self) -> ShapedPoints:
+        return self.model.points(self._chosen, n_betas=self.n_betas)
+
+    def fit(self, vertices: np.ndarray) -> ShapeFit:
+        """Shape, pose and place from all vertices (N, 3)."""
+        model, config, K = self.model, self.config, self.n_betas
+        vertices = _checked_vertices(vertices, len(model.template.vertices))
+        J = len(model.skeleton.parents)
+        start = self._mean_person.fit(vertices)
+        x = np.concatenate([start.pose.ravel(), start.trans, np.zeros(K)])
+        best = minimise(*_shape_energy(self._points, vertices[self._chosen]), x, J, config.tolerance,
+                        config.iterations)
+        steps = best.steps
+        if config.polish:
+            best = minimise(*_whole_energy(model, vertices, K), best.x, J, config.tolerance, config.polish)
+            steps += best.steps
+        pose, trans, betas = best.x[:3 * J].reshape(J, 3), best.x[3 * J:3 * J + 3], np.zeros(model.n_betas)
+        betas[:K] = best.x[3 * J + 3:]
+        fitted = model.vertices(pose, betas, trans)
+        return ShapeFit(pose, trans, fitted, *_distances(fitted, vertices), best.converged, steps, betas)
 
 
 def spread_vertices(vertices: np.ndarray, count: int) -> np.ndarray:
@@ -215,18 +233,17 @@ def _pose_energy(operator: PointOperator, target: np.ndarray) -> tuple[Evaluate,
     return evaluate, derive
 
 
-def _shape_energy(model: ScapeModel, chosen: np.ndarray, target: np.ndarray, K: int) -> tuple[Evaluate, Derive]:
+def _shape_energy(points: ShapedPoints, target: np.ndarray) -> tuple[Evaluate, Derive]:
     """As `_pose_energy`, with betas behind pose and place, on a few vertices."""
-    points = model.points(chosen)
-    J3 = 3 * len(model.skeleton.parents)
+    J3 = 3 * len(points.features.skeleton.parents)
 
     def evaluate(x: np.ndarray) -> np.ndarray:
         return _pose_energy(points.operator(x[J3 + 3:]), target)[0](x[:J3 + 3])
 
     def derive(x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         residual, columns = _pose_energy(points.operator(x[J3 + 3:]), target)[1](x[:J3 + 3])
-        by_shape = np.moveaxis(points.shape_jacobian(x[:J3].reshape(-1, 3))[..., :K], -1, 0)
-        return residual, np.concatenate([columns, by_shape.reshape(K, -1)])
+        by_shape = np.moveaxis(points.shape_jacobian(x[:J3].reshape(-1, 3)), -1, 0)
+        return residual, np.concatenate([columns, by_shape.reshape(len(by_shape), -1)])
 
     return evaluate, derive
 
@@ -246,43 +263,6 @@ def _whole_energy(model: ScapeModel, target: np.ndarray, K: int) -> tuple[Evalua
         return residual, np.concatenate([columns, by_shape.reshape(K, -1)])
 
     return evaluate, derive
-
-
-@dataclass(frozen=True, eq=False)
-class Minimum:
-    """Where Levenberg-Marquardt stopped: unknowns, energy in square metres."""
-
-    x: np.ndarray
-    converged: bool
-    steps: int
-    energy: float
-
-
-def _minimise(evaluate: Evaluate, derive: Derive, x: np.ndarray, J: int, tolerance: float, limit: int) -> Minimum:
-    """Levenberg-Marquardt; the first 3J unknowns are a pose, kept below π."""
-    damping, step = 1e-4, 0
-    residual, columns = derive(x)
-    energy = float(residual @ residual)
-    while step < limit:
-        normal, slope = columns @ columns.T, columns @ residual
-        scale = np.diag(normal) + 1e-9 * np.trace(normal) / len(normal)
-        for _ in range(12):
-            trial = x - np.linalg.solve(normal + damping * np.diag(scale), slope)
-            value = evaluate(trial)
-            if float(value @ value) < energy:
-                break
-            damping = max(damping, 1e-7) * 10
-        else:
-            return Minimum(x, True, step, energy)    # no step lowers it any more
-        step += 1
-        decrease = energy - float(value @ value)
-        trial[:3 * J] = twists(trial[:3 * J].reshape(J, 3)).ravel()
-        x, damping = trial, damping / 5
-        if decrease <= tolerance * energy or energy - decrease < EXACT**2 * len(residual):
-            return Minimum(x, True, step, energy - decrease)
-        residual, columns = derive(x)
-        energy = float(residual @ residual)
-    return Minimum(x, False, step, energy)
 
 
 def _distances(fitted: np.ndarray, vertices: np.ndarray) -> tuple[float, float]:

@@ -122,15 +122,18 @@ class ScapeModel:
                        basis.astype(dtype, copy=False), self.skeleton.joints[0], self.pose_mean,
                        self.pose_covariance)
 
-    def points(self, vertex_ids: np.ndarray, weights: np.ndarray | None = None) -> ShapedPoints:
+    def points(self, vertex_ids: np.ndarray, weights: np.ndarray | None = None, n_betas: int | None = None
+               ) -> ShapedPoints:
         """Some surface points as a function of pose, betas and place, without touching the mesh again.
 
         Parameters
         ----------
         vertex_ids, weights
             As for `Subject.points`.
+        n_betas : int, optional
+            Of the first components only.
         """
-        return build_shaped_points(self.stitching, self.template, self.pose_space, self.shape_space,
+        return build_shaped_points(self.stitching, self.template, self.pose_space, self.shape_space.first(n_betas),
                                    self.skeleton.joints[0], vertex_ids, weights)
 
     def shape_jacobian(self, pose: np.ndarray, betas: np.ndarray | None = None, trans: np.ndarray | None = None,

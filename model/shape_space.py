@@ -56,6 +56,10 @@ class ShapeSpace:
             S += np.multiply(beta, component, dtype=np.float64)
         return S
 
+    def first(self, count: int | None) -> ShapeSpace:
+        """The space of the first `count` components; None for all."""
+        return ShapeSpace(self.mean, self.components[:count], self.variances[:count], self.total_variance)
+
     @staticmethod
     def empty(n_faces: int) -> ShapeSpace:
         """The space without components: only the template's own body."""

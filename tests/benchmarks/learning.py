@@ -14,7 +14,7 @@ import time
 import numpy as np
 from protocols import load_real, machine, spring_split, write_report
 
-from model.fitting import FitConfig, fit_shape
+from model.fitting import FitConfig, ShapeFitter
 from model.learning import LearnConfig, learn_scape
 from model.scape import ScapeModel
 from scanprep.skeleton.find import find_skeleton
@@ -66,7 +66,8 @@ def main() -> None:
               "explained": model.shape_space.explained[[9, 19, 39]].tolist(), "fast_path": fast_path(model)}
     for count in (20, 40):
         begin = time.perf_counter()
-        fits = [fit_shape(model, body, FitConfig(n_betas=count)) for body in data.shapes[held[:args.held]]]
+        fitter = ShapeFitter(model, FitConfig(n_betas=count))
+        fits = [fitter.fit(body) for body in data.shapes[held[:args.held]]]
         errors = 1e3 * np.array([fit.mean for fit in fits])
         report[f"held_out_{count}_mm"] = errors.mean()
         report[f"held_out_{count}_worst_mm"] = errors.max()
