@@ -358,20 +358,27 @@ def test_integers_times_the_scale_are_read(tmp_path):
     agree(read_markers(tmp_path / "integers.c3d"), MarkerSequence(gap, expected.labels, 100.0))
 
 
-def test_dec_floats_are_read(tmp_path):
-    """A file of integers turned to the DEC number format by hand gives the same positions."""
+@pytest.mark.parametrize(("processor", "turn"), [(85, "dec"), (86, "big")])
+def test_numbers_of_other_processors_are_read(tmp_path, processor, turn):
+    """A file whose numbers were turned to another form by hand gives the same positions."""
     write_markers(tmp_path / "a.c3d", sequence(np.random.default_rng(8), 5))
-    data = bytearray((tmp_path / "a.c3d").read_bytes())
+    expected, data = read_markers(tmp_path / "a.c3d"), bytearray((tmp_path / "a.c3d").read_bytes())
     start, points = (struct.unpack_from("<H", data, 16)[0] - 1) * 512, struct.unpack_from("<H", data, 2)[0]
-    expected = read_markers(tmp_path / "a.c3d")
-    for place in (12, 20, *range(start, start + 5 * points * 16, 4)):
-        data[place:place + 4] = _dec(data[place:place + 4])
     parameters = (data[0] - 1) * 512
-    data[parameters + 3] = 85
-    for place in _float_parameters(data, parameters):
-        data[place:place + 4] = _dec(data[place:place + 4])
-    (tmp_path / "dec.c3d").write_bytes(bytes(data))
-    agree(read_markers(tmp_path / "dec.c3d"), expected, 1e-6)
+    places = [(2, 2), (4, 2), (6, 2), (8, 2), (12, 4), (16, 2), (20, 4), *_numbers(data, parameters),
+              *((place, 4) for place in range(start, start + 5 * points * 16, 4))]
+    for place, size in places:
+        number = bytes(data[place:place + size])
+        if turn == "big":
+            data[place:place + size] = number[::-1]
+        elif size == 4:
+            data[place:place + size] = _dec(number)
+    data[parameters + 3] = processor
+    (tmp_path / "turned.c3d").write_bytes(bytes(data))
+    agree(read_markers(tmp_path / "turned.c3d"), expected, 1e-6)
+    if turn == "dec":                # big-endian files ezc3d does not read
+        theirs = ezc3d.c3d(str(tmp_path / "turned.c3d"))["data"]["points"][:3].transpose(2, 1, 0)
+        np.testing.assert_allclose(1e-3 * theirs[expected.seen], expected.positions[expected.seen], atol=1e-6)
 
 
 def _dec(ieee):
@@ -380,18 +387,19 @@ def _dec(ieee):
     return bits[2:] + bits[:2]
 
 
-def _float_parameters(data, start):
-    """Where the float values of all parameters stand."""
+def _numbers(data, start):
+    """Where the links and the numbers of all parameters stand, and how many bytes each has."""
     place = start + 4
     while place < len(data) and data[place]:
         length, group = abs(struct.unpack_from("b", data, place)[0]), struct.unpack_from("b", data, place + 1)[0]
         offset = place + 2 + length
         step = struct.unpack_from("<h", data, offset)[0]
+        yield offset, 2
         if group > 0:
             kind, dims = struct.unpack_from("b", data, offset + 2)[0], data[offset + 3]
             count = int(np.prod(list(data[offset + 4:offset + 4 + dims]))) if dims else 1
-            if kind == 4:
-                yield from range(offset + 4 + dims, offset + 4 + dims + 4 * count, 4)
+            if kind in (2, 4):
+                yield from ((offset + 4 + dims + kind * i, kind) for i in range(count))
         if step == 0:
             return
         place = offset + step

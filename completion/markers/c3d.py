@@ -1,6 +1,7 @@
 """C3D, the file of motion-capture systems: read here, of every processor type; written through ezc3d.
 
-The reader is our own because ezc3d ends the process on some damaged files and reads truncated ones as shorter.
+The reader is our own because ezc3d ends the process on some damaged files, reads truncated ones as shorter, and
+does not know big-endian ones.
 """
 from __future__ import annotations
 
