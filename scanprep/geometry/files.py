@@ -15,13 +15,13 @@ import numpy as np
 
 from . import storage
 from .formats import glb, obj, off, pcd, ply, stl, xyz
-from .formats.common import Contents, MeshFileError, load_bytes, metres_per_unit
+from .formats.common import UNITS, Contents, MeshFileError, load_bytes, metres_per_unit
 from .landmarks import match_landmarks, read_landmark_vertices, read_landmarks, write_landmarks
 from .mesh import Mesh
 
-__all__ = ["MeshFileError", "PointCloud", "Registered", "list_meshes", "match_landmarks", "read_landmark_vertices",
-           "read_landmarks", "read_mesh", "read_points", "read_registered", "write_landmarks", "write_mesh",
-           "write_points"]
+__all__ = ["UNITS", "MeshFileError", "PointCloud", "Registered", "list_meshes", "match_landmarks",
+           "read_landmark_vertices", "read_landmarks", "read_mesh", "read_points", "read_registered",
+           "write_landmarks", "write_mesh", "write_points"]
 
 Precision = Literal["double", "single"]
 
