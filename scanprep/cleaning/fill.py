@@ -9,7 +9,7 @@ import numpy as np
 from scipy.sparse import csr_array
 from scipy.spatial import cKDTree
 
-from ..geometry.mesh import Mesh
+from ..geometry.mesh import Mesh, template_problem
 from ..geometry.sparse import factor
 from .remesh import clamped_cotangents, flip_edges
 from .repair import repair, split_vertices
@@ -77,11 +77,11 @@ def fill_holes(mesh: Mesh, config: FillConfig | None = None,
     if config.method == "poisson-open3d":
         from .open3d_filters import poisson
 
-        return repair(poisson(mesh, config.poisson_depth))
+        return close(poisson(mesh, config.poisson_depth))
     if config.method == "poisson-pymeshlab":
         from .pymeshlab_filters import poisson
 
-        return repair(poisson(mesh, config.poisson_depth))
+        return close(poisson(mesh, config.poisson_depth))
     if not mesh.is_edge_manifold:
         raise ValueError("mesh: expected at most two triangles at an edge, facing the same way; repair it first")
     mesh = split_vertices(mesh, across_holes=True)
@@ -101,6 +101,29 @@ def fill_holes(mesh: Mesh, config: FillConfig | None = None,
         patch.flip(min_cosine=0.3)
     patch.fair()
     return split_vertices(patch.onto(mesh, used))
+
+
+def close(mesh: Mesh, config: FillConfig | None = None, rounds: int = 4) -> Mesh:
+    """Repair and fill in turns, until nothing is open or defective.
+
+    Parameters
+    ----------
+    mesh : Mesh
+    config : FillConfig, optional
+        Of the first filling; what repair opens afterwards is filled with fair patches.
+    rounds : int
+
+    Returns
+    -------
+    Mesh
+        One closed manifold component, unless `rounds` do not suffice.
+    """
+    mesh = fill_holes(repair(mesh), config)
+    for _ in range(rounds):
+        if mesh.is_closed and template_problem(mesh) is None:
+            break
+        mesh = fill_holes(repair(mesh))
+    return mesh
 
 
 class _Patch:

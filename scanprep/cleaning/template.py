@@ -10,7 +10,7 @@ import numpy as np
 from ..geometry.mesh import Mesh, check_template
 from ..geometry.surface import Surface
 from .decimate import DecimateConfig, decimate
-from .fill import FillConfig, fill_holes
+from .fill import FillConfig, close
 from .merge import MergeConfig, merge_views
 from .remesh import improve_triangles, smooth
 from .repair import peel_border, repair
@@ -63,12 +63,10 @@ def make_template(views: Sequence[Any], faces: int = 14000, config: TemplateConf
     tell = progress or (lambda done, total: None)
     mesh = merge_views(views, config.merge)
     tell(1, 4)
-    mesh = smooth(repair(mesh), config.smoothing)
-    mesh = smooth(peel_border(mesh, config.peel), config.smoothing)
+    mesh = peel_border(smooth(repair(mesh), config.smoothing), config.peel)
+    mesh = smooth(mesh, config.smoothing)
     tell(2, 4)
-    mesh = repair(fill_holes(mesh, config.fill))
-    if not mesh.is_closed:
-        mesh = fill_holes(mesh, config.fill)
+    mesh = close(mesh, config.fill)
     tell(3, 4)
     surface = Surface(mesh)
     mesh = improve_triangles(decimate(mesh, faces, config.decimate), surface)

@@ -100,6 +100,9 @@ def gif_bytes(images: Sequence[np.ndarray], rate: float) -> bytes:
     step = max(1, len(images) // 6)
     palette = Image.fromarray(np.concatenate([i[::2, ::2] for i in images[::step]])).quantize(
         255, method=Image.Quantize.MEDIANCUT)
+    colors = np.array(palette.getpalette()).reshape(-1, 3)
+    colors[colors.sum(axis=1).argmax()] = 255                 # the background of most pictures
+    palette.putpalette(colors.ravel().tolist())
     drawn = [Image.fromarray(i).quantize(palette=palette, dither=Image.Dither.FLOYDSTEINBERG) for i in images]
     out = io.BytesIO()
     drawn[0].save(out, format="GIF", save_all=True, append_images=drawn[1:], loop=0,

@@ -1,0 +1,90 @@
+import base64
+import re
+from html.parser import HTMLParser
+
+import numpy as np
+import pytest
+
+from scanprep.pictures.page import Page
+
+
+class Reader(HTMLParser):
+    VOID = frozenset({"meta", "img", "br", "link"})
+
+    def __init__(self, text):
+        super().__init__()
+        self.open, self.found, self.words = [], [], []
+        self.feed(text)
+        self.close()
+        assert not self.open, self.open
+
+    def handle_starttag(self, tag, attrs):
+        self.found.append((tag, dict(attrs)))
+        if tag not in self.VOID:
+            self.open.append(tag)
+
+    def handle_endtag(self, tag):
+        assert self.open.pop() == tag
+
+    def handle_data(self, data):
+        self.words.append(data.strip())
+
+    def all(self, tag):
+        return [attrs for name, attrs in self.found if name == tag]
+
+
+@pytest.fixture
+def image():
+    return np.random.default_rng(0).integers(0, 255, (12, 20, 3), dtype=np.uint8)
+
+
+def test_everything_is_in_the_one_file(image, tmp_path):
+    matplotlib = pytest.importorskip("matplotlib")
+    matplotlib.use("agg")
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(2, 1))
+    figure.subplots().plot([1, 2, 3])
+    page = (Page("A <title>", "Lead & all").section("One", "First.\n\nSecond.").picture(image, "A picture")
+            .section("Two").pictures([image, image], ["left", "right"]).chart(figure, "A chart")
+            .section("Three").table([("error", 9.51234, True), ("bodies", 1820, "–")], ("metric", "value", "ok"))
+            .code("scape demo").download("body.glb", b"glTF\x00\x01"))
+    page.write(tmp_path / "report.html")
+    text = (tmp_path / "report.html").read_text(encoding="utf-8")
+    assert text == page.html()
+    read = Reader(text)
+    assert read.words.count("A <title>") == 2 and "Lead & all" in read.words
+    assert [i["alt"] for i in read.all("img")] == ["A picture", "left", "right", "A chart"]
+    for attrs in read.all("img"):
+        assert attrs["src"].startswith("data:image/")
+    assert not read.all("script") and not read.all("link")
+    outside = re.findall(r'(?:src|href)="(?!data:|#)|url\(|@import', text)
+    assert not outside
+    assert {"9.51", "1,820", "yes", "First.", "Second."} <= set(read.words)
+    assert [a["href"] for a in read.all("nav") and read.all("a")[:3]] == ["#s1", "#s2", "#s3"]
+
+
+def test_downloads_are_the_same_bytes():
+    data = bytes(range(256))
+    link = Reader(Page("x").download("motion.glb", data).html()).all("a")[0]
+    assert link["download"] == "motion.glb"
+    head, body = link["href"].split(",")
+    assert head == "data:model/gltf-binary;base64"
+    assert base64.b64decode(body) == data
+
+
+def test_text_is_escaped():
+    nasty = '<script>alert("x")</script>'
+    page = Page(nasty, nasty).section(nasty, nasty).table([(nasty,)], (nasty,)).code(nasty).download(nasty, b"", nasty)
+    assert not Reader(page.html()).all("script")
+
+
+def test_pictures_are_checked(image):
+    with pytest.raises(ValueError, match="captions: expected 2"):
+        Page("x").pictures([image, image], ["one"])
+    with pytest.raises(ValueError, match="image: expected an array"):
+        Page("x").picture(b"nothing known")
+
+
+def test_missing_numbers_show_as_a_dash():
+    assert "<td class=\"number\">–</td>" in Page("x").table([(float("nan"),)]).html()
