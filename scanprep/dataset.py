@@ -129,7 +129,7 @@ class RegisteredSet:
         Parameters
         ----------
         name : str
-            Letters, digits, blanks and `._-`.
+            One that can be a file: no dot in front and none of `<>:"/\\|?*`.
         mesh : Mesh or (N, 3) float, metres
             In the topology of the template.
 
@@ -138,8 +138,8 @@ class RegisteredSet:
         ValueError
             A name that cannot be a file, or a mesh of another topology.
         """
-        if not re.fullmatch(r"\w[\w. -]*", name):
-            raise ValueError(f"name: expected letters, digits, blanks and '._-', got {name!r}")
+        if not re.fullmatch(r"[^.<>:\"/\\|?*\x00-\x1f][^<>:\"/\\|?*\x00-\x1f]*", name):
+            raise ValueError(f"name: expected one that can be a file, without a dot in front, got {name!r}")
         if not isinstance(mesh, Mesh):
             if np.shape(mesh) != self.template.vertices.shape:
                 raise ValueError(f"mesh: expected vertices {self.template.vertices.shape}, got {np.shape(mesh)}")

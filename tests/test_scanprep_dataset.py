@@ -65,6 +65,15 @@ def test_adding_a_name_again_replaces_its_row_and_its_mesh(full):
     assert len(list((full.folder / "meshes").iterdir())) == 5
 
 
+@pytest.mark.parametrize("name", ["scan (1), late", "Zoë_07", "a.b.c", "x+y", "café 100%"])
+def test_names_that_people_give_their_scans(full, name):
+    added = full.add(name, body(6), 'Ann "Lee", senior')
+    back = RegisteredSet.load(full.folder)
+    assert back.entries == added.entries and back.names[-1] == name
+    np.testing.assert_array_equal(back.vertices([name]), [body(6)])
+    assert set(read_registered(full.folder).names) == set(back.names)
+
+
 def test_work_goes_on_after_an_interruption(full, monkeypatch):
     def fail(path, mesh):
         raise KeyboardInterrupt
@@ -92,6 +101,7 @@ def test_a_set_of_another_template_is_not_overwritten(full):
 
 @pytest.mark.parametrize(("name", "mesh", "says"), [
     ("../x", TEMPLATE, "name"), ("", TEMPLATE, "name"), (".x", TEMPLATE, "name"), ("a/b", TEMPLATE, "name"),
+    ("a\\b", TEMPLATE, "name"), ("a\nb", TEMPLATE, "name"),
     ("x", np.zeros((3, 3)), r"mesh: expected vertices \(42, 3\), got \(3, 3\)"),
     ("x", Mesh(TEMPLATE.vertices, TEMPLATE.faces[::-1]), "x: .*from face 0"),
     ("x", Mesh(TEMPLATE.vertices, TEMPLATE.faces[1:]), "x: .*42 vertices and 79 faces"),

@@ -494,12 +494,12 @@ def test_points_have_units_too(tmp_path):
 def test_a_folder_of_one_topology_is_read_sorted_by_name(tmp_path):
     rng, mesh = np.random.default_rng(9), body(np.random.default_rng(9), 30)
     expected = {}
-    for name in ("b.ply", "a.obj", "c.ply.gz"):
-        expected[name.split(".")[0]] = mesh.vertices + rng.normal(size=3)
-        write_mesh(tmp_path / name, mesh.with_vertices(expected[name.split(".")[0]]))
+    for name in ("b.ply", "a.obj", "c.1.ply.gz"):
+        expected[name.split(".ply")[0].split(".obj")[0]] = vertices = mesh.vertices + rng.normal(size=3)
+        write_mesh(tmp_path / name, mesh.with_vertices(vertices))
     (tmp_path / "notes.md").write_text("not a mesh")
     registered = read_registered(tmp_path)
-    assert registered.names == ("a", "b", "c") and len(list_meshes(tmp_path)) == 3
+    assert registered.names == ("a", "b", "c.1") and len(list_meshes(tmp_path)) == 3
     np.testing.assert_array_equal(registered.faces, mesh.faces)
     for vertices, name in zip(registered.vertices, registered.names, strict=True):
         np.testing.assert_allclose(vertices, expected[name], atol=1e-10)

@@ -185,7 +185,7 @@ def read_registered(folder: str | Path, unit: str | None = None) -> Registered:
         meshes.append(read_mesh(path, unit))
         check_same_topology(path, meshes[-1], paths[0], meshes[0])
     return Registered(meshes[0].faces, np.stack([m.vertices for m in meshes]),
-                      tuple(p.name[:-len("".join(p.suffixes))] if p.suffix == ".gz" else p.stem for p in paths))
+                      tuple(Path(p.stem).stem if p.suffix.lower() == ".gz" else p.stem for p in paths))
 
 
 def check_same_topology(path: Path, mesh: Mesh, first_path: Path, first: Mesh) -> None:
