@@ -18,6 +18,7 @@ from .sight import find_sight
 from .solve import MinimiseConfig, minimise
 from .starts import distinct, search
 
+DOUBT = 0.015                        # share of scan or body that may be in the wrong place for no reason
 PROMISING = 30.0                     # a limb drawn at random may be this much worse before it is fitted
 
 
@@ -86,7 +87,7 @@ class CompletionConfig:
     candidates: int = 3
     reach: float = 0.2
     final_reach: float = 0.03
-    rounds: int = 12
+    rounds: int = 8
     min_cosine: float = 0.6
     scan_points: int = 2500
     model_points: int = 1200
@@ -155,6 +156,8 @@ class ScanFit:
 
     def redraw_limbs(self, x: np.ndarray) -> np.ndarray:
         """Unknowns (P,) with limbs moved elsewhere where that explains the scan better."""
+        if not self.doubtful(x):
+            return x
         best = self.misfit(x)
         for root in limbs(self.body.skeleton):
             drawn = redrawn(self.body, x, root, self.prior, self.config.draws, self.rng)
@@ -167,6 +170,13 @@ class ScanFit:
                 if (misfit := self.misfit(tried)) < best - 5:
                     x, best = tried, misfit
         return x
+
+    def doubtful(self, x: np.ndarray) -> bool:
+        """Whether more than a little of the scan is unexplained, or of the body where nothing can be."""
+        mesh = self.body.template.with_vertices(self.body.vertices(x))
+        found = OrientedPoints(mesh.vertices, mesh.vertex_normals).match(self.thin.points, self.thin.normals, 0.05,
+                                                                         self.config.min_cosine)
+        return bool((~found.valid).mean() > DOUBT or len(self.trespasses(x)[0]) > DOUBT * len(self.spread))
 
     def misfit(self, x: np.ndarray, cap: float = 0.05) -> float:
         """How badly a body explains scan and landmarks, for the choice between starts."""
@@ -191,7 +201,7 @@ class ScanFit:
         shift = np.inf
         energies: dict[str, float] = {}
         reaches = np.geomspace(config.reach, config.final_reach, config.rounds)
-        for i, reach in enumerate([*reaches, *[config.final_reach] * 5]):
+        for i, reach in enumerate([*reaches, *[config.final_reach] * 6]):
             before = x
             x, energies = self.step(x, self.thin, reach)
             shift = np.abs(x[:-3] - before[:-3]).max()
@@ -222,7 +232,7 @@ class ScanFit:
                     energy.point_to_plane(denied, out_target, out_normal, out_weights),
                     energy.stay_near(at, x, held)]
 
-        best = minimise(energies, x[None], MinimiseConfig(iterations=4, tolerance=1e-3)).x
+        best = minimise(energies, x[None], MinimiseConfig(iterations=2, tolerance=1e-3)).x
         names = ("landmarks", "pose_prior", "shape_prior", "scan_planes", "scan_points", "trespass", "twists")
         return best[0], {n: float(r.energy[0]) for n, r in zip(names, energies(best), strict=True)}
 

@@ -10,7 +10,7 @@ from scanprep.console import run
 @pytest.fixture(scope="session")
 def demo_folder(tmp_path_factory):
     """The folder of one `scape demo --quick`, run once for all tests that look at it."""
-    from completion.commands import demo
+    from completion.cli import demo
 
     folder = tmp_path_factory.mktemp("demo") / "scape_demo"
     assert run(demo, "scape demo", ["--quick", "--out", str(folder)]) == 0

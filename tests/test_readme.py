@@ -7,7 +7,7 @@ from pathlib import Path
 
 import pytest
 
-from completion.cli import main
+from completion.__main__ import main
 from scanprep import write_mesh
 from scanprep.scanning.embedded import read_views
 

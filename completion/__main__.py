@@ -1,0 +1,25 @@
+"""`scape`: all commands under one name."""
+from __future__ import annotations
+
+import sys
+
+from scanprep.console import dispatch
+
+COMMANDS = {
+    "demo": ("The whole chain on embedded scans; ends with a page to open.", "completion.cli:demo"),
+    "prep": ("Scans -> registered meshes and a skeleton; also its single stages.", "scanprep.cli:group"),
+    "learn": ("Registered meshes -> a body model.", "model.cli:learn"),
+    "model": ("Look into a body model and pose it.", "model.cli:group"),
+    "complete": ("A partial scan -> the whole body.", "completion.cli:complete_scan"),
+    "animate": ("Markers of a known subject -> a moving body.", "completion.cli:animate_markers"),
+}
+
+
+def main(argv: list[str] | None = None) -> int:
+    """The command line."""
+    lead = "From raw 3D body scans to moving people."
+    return dispatch(COMMANDS, "scape", sys.argv[1:] if argv is None else argv, lead)
+
+
+if __name__ == "__main__":
+    sys.exit(main())
