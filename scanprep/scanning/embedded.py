@@ -71,7 +71,8 @@ def stand(person: Person, pose: np.ndarray) -> GroundTruth:
     """A person in a pose with the lowest point on the floor, z = 0."""
     vertices = person.posed(pose)
     trans = np.array([0.0, 0.0, -vertices[:, 2].min()])
-    return GroundTruth(person.shape, np.asarray(pose, dtype=np.float64), trans, vertices + trans, person.mesh.faces,
+    return GroundTruth(person.shape, np.asarray(pose, dtype=np.float64), trans, vertices + trans,
+                       person.mesh.faces,
                        person.part_of_face, person.posed_joints(pose, trans))
 
 
@@ -141,7 +142,8 @@ def read_views(path: str | Path) -> list[RangeView]:
     """
     header, a = storage.load(path, "range views", (VERSION,))
     return [RangeView(Mesh(a[f"points{k}"], a[f"faces{k}"]), a[f"normals{k}"], a[f"T_world_camera{k}"][:3, 3],
-                      a[f"T_world_camera{k}"], a[f"depth{k}"], a[f"intrinsics{k}"]) for k in range(header["views"])]
+                      a[f"T_world_camera{k}"], a[f"depth{k}"],
+                      a[f"intrinsics{k}"]) for k in range(header["views"])]
 
 
 @dataclass(frozen=True)
@@ -213,7 +215,8 @@ def _embedded_scan(folder: Path, seed: int, k: int, is_pose: bool, config: Scann
         pose, label, subject = near_rest(rng), "rest", f"person{k:02d}"
         name = f"person_{k:02d}_{'female' if k % 2 == 0 else 'male'}"
     entry = EmbeddedScan(name, subject, label, "male" if shape.sex > 0 else "female", folder / f"{name}.ply",
-                         folder / f"{name}.landmarks.json", folder / VIEWS / f"{name}.npz", folder / TRUTH / f"{name}.npz")
+                         folder / f"{name}.landmarks.json", folder / VIEWS / f"{name}.npz",
+                         folder / TRUTH / f"{name}.npz")
     if not entry.path.exists():
         truth = stand(Person(shape), pose)
         scanned = scan(truth.mesh, config, rng)

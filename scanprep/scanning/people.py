@@ -14,12 +14,13 @@ from ..geometry.mesh import Mesh
 from ..skeleton.tree import Skeleton
 from .people_anatomy import PARENTS, PARTS, BodyShape
 from .people_marks import landmarks, markers
-from .people_motion import NAMED_POSES, compose, mirrored_pose, named_pose, random_pose, walk
+from .people_motion import NAMED_POSES, compose, mirrored_pose, named_pose, random_pose
 from .people_posing import Poser, part_of_vertex
 from .people_template import carry, load
+from .people_walk import walk
 
-__all__ = ["LANDMARKS", "MARKERS", "NAMED_POSES", "PARENTS", "PARTS", "BodyShape", "Person", "compose", "mirrored_pose",
-           "named_pose", "random_pose", "walk"]
+__all__ = ["NAMED_POSES", "PARENTS", "PARTS", "BodyShape", "Person", "compose", "mirrored_pose", "named_pose",
+           "random_pose", "walk"]
 
 
 class Person:

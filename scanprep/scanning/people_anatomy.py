@@ -10,7 +10,7 @@ from dataclasses import dataclass, fields
 import numpy as np
 
 from . import people_tables as tables
-from .people_field import Bump, Ellipsoid, Field, Group, Loft, Mirrored, RoundCone
+from .people_field import Field, Group, Mirrored
 
 PARTS = ("pelvis", "abdomen", "chest", "head",
          "l_upper_arm", "l_forearm", "l_hand", "r_upper_arm", "r_forearm", "r_hand",
@@ -178,7 +178,8 @@ class Anatomy:
         down = put(np.sin(a), 0, -np.cos(a))
         self.upper_arm_frame = np.array([put(np.cos(a), 0, np.sin(a)), put(0, 1, 0), down])
         fore = np.cos(b) * down + np.sin(b) * put(0, 1, 0)
-        self.forearm_frame = np.array([put(np.cos(a), 0, np.sin(a)), np.cos(b) * put(0, 1, 0) - np.sin(b) * down, fore])
+        self.forearm_frame = np.array([put(np.cos(a), 0, np.sin(a)), np.cos(b) * put(0, 1, 0) - np.sin(b) * down,
+                                       fore])
         joints[5] = joints[4] + wd["upper_arm"] * down
         joints[6] = joints[5] + wd["forearm"] * fore
         ends[4], ends[5], ends[6] = joints[5], joints[6], joints[6] + wd["hand"] * fore
@@ -197,7 +198,8 @@ class Anatomy:
         self.joints, self.ends = joints, ends
 
     def _build_field(self) -> None:
-        from .people_parts import arm, hand, head, leg, trunk, trunk_bumps
+        from .people_head import head
+        from .people_parts import arm, hand, leg, trunk, trunk_bumps
 
         torso, shoulders = trunk(self)
         body: list[tuple[Field, float]] = [*torso, (leg(self), 0.035 * self.scale)]
@@ -212,6 +214,3 @@ class Anatomy:
     def at(self, level: float) -> float:
         """Height in metres of a level of the trunk: 0 hip joints, 1 shoulder joints."""
         return self.level["hip"] + level * (self.level["shoulder"] - self.level["hip"])
-
-
-__all__ = ["PARENTS", "PARTS", "Anatomy", "BodyShape", "Bump", "Ellipsoid", "Loft", "RoundCone"]

@@ -120,7 +120,7 @@ class Bump:
 
     centre: np.ndarray
     height: float
-    widths: Sequence[float]
+    widths: Sequence[float] | np.ndarray
     frame: np.ndarray | None = None
 
     def __call__(self, points: np.ndarray) -> np.ndarray:

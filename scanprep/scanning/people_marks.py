@@ -33,7 +33,8 @@ def _points() -> dict[str, np.ndarray]:
     return {
         "{} toe": foot(-0.113, 0.05, 0.79), "{} heel": foot(0, 0.10, -0.22), "{} ankle": limb(11, 0.98, 0.05, 0),
         "{} knee": limb(10, 0.99, 0, 0.075), "{} knee inside": limb(10, 1.0, -0.07, 0),
-        "{} waist": body(0.17, 0, 0.38), "crotch": body(0, 0.0, -0.26), "{} middle finger": limb(6, 1.0, -0.017, 0.013),
+        "{} waist": body(0.17, 0, 0.38), "crotch": body(0, 0.0, -0.26),
+        "{} middle finger": limb(6, 1.0, -0.017, 0.013),
         "{} thumb": limb(6, 0.55, -0.016, 0.068), "{} wrist": limb(5, 1.0, 0.03, 0),
         "{} elbow outside": limb(5, 0.0, 0.03, -0.05), "{} elbow inside": limb(5, 0.0, -0.0, 0.06),
         "{} shoulder": limb(4, -0.05, 0.07, 0.0) + [0, 0, 0.03], "{} armpit": limb(4, 0.22, -0.06, 0.0),
@@ -55,7 +56,8 @@ def _points() -> dict[str, np.ndarray]:
 
 
 _MARKERS = {
-    "FHD": "{} forehead", "BHD": "{} back of head", "SHO": "{} shoulder", "UPA": "{} upper arm", "ELB": "{} outer elbow",
+    "FHD": "{} forehead", "BHD": "{} back of head", "SHO": "{} shoulder", "UPA": "{} upper arm",
+    "ELB": "{} outer elbow",
     "FRM": "{} forearm", "WRA": "{} wrist thumb", "WRB": "{} wrist little", "FIN": "{} knuckle",
     "FWT": "{} front waist", "BWT": "{} back waist", "THI": "{} thigh", "KNE": "{} outer knee", "SHN": "{} shin",
     "ANK": "{} ankle", "HEE": "{} heel", "MT5": "{} fifth toe", "TOE": "{} first toe",

@@ -1,4 +1,4 @@
-"""Poses and motion of the embedded people: everyday poses by name, random ones between them, and a walk."""
+"""Poses of the embedded people: everyday poses by name, and random ones between them."""
 from __future__ import annotations
 
 from functools import lru_cache
@@ -6,13 +6,14 @@ from functools import lru_cache
 import numpy as np
 from scipy.spatial.transform import Rotation
 
-from .people_anatomy import PARENTS, Anatomy, BodyShape
+from .people_anatomy import Anatomy, BodyShape
 
 _LEFT_ARM, _RIGHT_ARM, _LEFT_LEG, _RIGHT_LEG = 4, 7, 10, 13
 
 
 @lru_cache(maxsize=1)
-def _rest() -> Anatomy:
+def average() -> Anatomy:
+    """The skeleton that poses are made for."""
     return Anatomy(BodyShape())
 
 
@@ -29,7 +30,8 @@ def _towards(axis: np.ndarray, direction: np.ndarray, twist: float) -> np.ndarra
     return (Rotation.from_rotvec(swing) * Rotation.from_rotvec(twist * axis)).as_rotvec()
 
 
-def arm(direction: tuple[float, float, float], elbow: float = 0, twist: float = 0, turn: float = 0, wrist: float = 0,
+def arm(direction: tuple[float, float, float], elbow: float = 0, twist: float = 0, turn: float = 0,
+        wrist: float = 0,
         side: int = 1) -> np.ndarray:
     """Rotation vectors (3, 3) of upper arm, forearm and hand.
 
@@ -42,7 +44,7 @@ def arm(direction: tuple[float, float, float], elbow: float = 0, twist: float = 
         hand; flexion of the wrist towards the palm.
     side : 1 left, -1 right
     """
-    a = _rest()
+    a = average()
     out, front, up = direction
     upper, fore = a.upper_arm_frame, a.forearm_frame
     bend = np.cross(upper[2], upper[1])
@@ -64,7 +66,7 @@ def leg(direction: tuple[float, float, float], knee: float = 0, twist: float = 0
     knee, twist, foot : degrees
         Flexion; rotation of the thigh about itself, positive outwards; raising of the toes.
     """
-    a = _rest()
+    a = average()
     out, front, up = direction
     axis = a.leg_frame[2]
     pose = np.array([_towards(axis, np.array([out, -front, up]), -np.radians(twist)),
@@ -119,14 +121,18 @@ _NAMED: dict[str, dict] = {
     "strong_arms": _both(direction=(1, 0.15, 0.1), elbow=95, twist=-90),
     "hands_on_hips": _both(direction=(0.88, -0.25, -0.68), elbow=72, twist=55, turn=30),
     "surrender": _both(direction=(1, 0.1, -0.05), elbow=75, twist=-80, turn=30),
-    "left_arm_up": {"left_arm": {"direction": (0.3, 0.15, 1)}, "back": {"lean": -12}, "neck": {"turn": 25, "nod": -12}},
+    "left_arm_up": {"left_arm": {"direction": (0.3, 0.15, 1)}, "back": {"lean": -12},
+                    "neck": {"turn": 25, "nod": -12}},
     "point_right": {"right_arm": {"direction": (0.75, 0.65, 0.15)}, "neck": {"turn": -40}, "back": {"turn": -20},
                     "left_arm": {"direction": (0.45, -0.1, -0.9), "elbow": 25}},
-    "sitting": {**_legs(direction=(0.16, 1, -0.05), knee=88), **_both(direction=(0.35, 0.55, -0.8), elbow=45, turn=40),
+    "sitting": {**_legs(direction=(0.16, 1, -0.05), knee=88), **_both(direction=(0.35, 0.55, -0.8), elbow=45,
+                                                                      turn=40),
                 "back": {"bend": 10}},
-    "squat": {**_legs(direction=(0.35, 1, -0.25), knee=92, twist=12, foot=14), **_both(direction=(0.1, 1, -0.1), elbow=5),
+    "squat": {**_legs(direction=(0.35, 1, -0.25), knee=92, twist=12, foot=14),
+              **_both(direction=(0.1, 1, -0.1), elbow=5),
               "back": {"bend": 14}, "root": (22, 0, 0)},
-    "kick_left": {"left_leg": {"direction": (0.08, 1, -0.45), "knee": 12, "foot": -25}, "back": {"bend": 8, "turn": -15},
+    "kick_left": {"left_leg": {"direction": (0.08, 1, -0.45), "knee": 12, "foot": -25},
+                  "back": {"bend": 8, "turn": -15},
                   "left_arm": {"direction": (0.7, -0.6, -0.5), "elbow": 25},
                   "right_arm": {"direction": (0.5, 0.8, -0.2), "elbow": 30}},
     "kick_back_right": {"right_leg": {"direction": (0.1, -0.45, -1), "knee": 75, "foot": -30},
@@ -142,21 +148,27 @@ _NAMED: dict[str, dict] = {
     "knee_up_right": {"right_leg": {"direction": (0.12, 1, 0.15), "knee": 105, "foot": -10},
                       "left_arm": {"direction": (0.4, 0.6, -0.6), "elbow": 70},
                       "right_arm": {"direction": (0.45, -0.5, -0.8), "elbow": 60}},
-    "twist_left": {"back": {"turn": 50}, "neck": {"turn": 30}, "left_arm": {"direction": (0.9, -0.35, -0.1), "elbow": 20},
+    "twist_left": {"back": {"turn": 50}, "neck": {"turn": 30}, "left_arm": {"direction": (0.9, -0.35, -0.1),
+                                                                            "elbow": 20},
                    "right_arm": {"direction": (0.25, 0.9, -0.15), "elbow": 35}},
-    "twist_right": {"back": {"turn": -50, "bend": 8}, "neck": {"turn": -20}, **_both(direction=(1, 0.1, -0.15), elbow=25)},
+    "twist_right": {"back": {"turn": -50, "bend": 8}, "neck": {"turn": -20},
+                    **_both(direction=(1, 0.1, -0.15), elbow=25)},
     "bow": {"back": {"bend": 42}, "neck": {"nod": 15}, "root": (28, 0, 0), **_legs(direction=(0.078, 0.53, -1.0)),
             **_both(direction=(0.45, 0.45, -0.85), elbow=8)},
-    "lean_left": {"back": {"lean": 32}, "neck": {"lean": 10}, "right_arm": {"direction": (0.3, 0.1, 1), "elbow": 25},
+    "lean_left": {"back": {"lean": 32}, "neck": {"lean": 10},
+                  "right_arm": {"direction": (0.3, 0.1, 1), "elbow": 25},
                   "left_arm": {"direction": (0.55, 0.1, -0.8)}},
     "lean_back": {"back": {"bend": -24}, "neck": {"nod": -20}, **_both(direction=(0.8, 0.35, 0.55), elbow=15)},
     "boxer": {"left_arm": {"direction": (0.35, 0.6, -0.7), "elbow": 98, "twist": -10},
               "right_arm": {"direction": (0.40, 0.35, -0.8), "elbow": 102, "twist": -10},
-              "back": {"bend": 10, "turn": -20}, "left_leg": {"direction": (0.14, 0.35, -1), "knee": 24, "foot": 4},
+              "back": {"bend": 10, "turn": -20}, "left_leg": {"direction": (0.14, 0.35, -1), "knee": 24,
+                                                              "foot": 4},
               "right_leg": {"direction": (0.16, -0.15, -1), "knee": 22, "twist": 15, "foot": 10}},
-    "throw_right": {"right_arm": {"direction": (0.85, -0.35, 0.45), "elbow": 85, "twist": -70}, "back": {"turn": -30, "bend": -8},
+    "throw_right": {"right_arm": {"direction": (0.85, -0.35, 0.45), "elbow": 85, "twist": -70},
+                    "back": {"turn": -30, "bend": -8},
                     "left_arm": {"direction": (0.35, 0.9, 0.1), "elbow": 15},
-                    "left_leg": {"direction": (0.1, 0.45, -1), "knee": 15}, "right_leg": {"direction": (0.12, -0.25, -1), "knee": 12}},
+                    "left_leg": {"direction": (0.1, 0.45, -1), "knee": 15},
+                    "right_leg": {"direction": (0.12, -0.25, -1), "knee": 12}},
     "run": {"left_leg": {"direction": (0.06, 0.85, -0.75), "knee": 85}, "root": (10, 0, 0),
             "right_leg": {"direction": (0.06, -0.4, -1), "knee": 35, "foot": -18},
             "left_arm": {"direction": (0.35, -0.6, -0.75), "elbow": 80},
@@ -215,82 +227,3 @@ def mirrored_pose(pose: np.ndarray) -> np.ndarray:
     from .people_anatomy import MIRROR_PART
 
     return pose[..., MIRROR_PART, :] * [1, -1, -1]
-
-
-# Joint angles over one gait cycle from heel strike, degrees (typical values of published gait analysis).
-_PHASE = np.linspace(0, 1, 11)
-_HIP = np.array([28, 24, 15, 5, -5, -11, -4, 14, 27, 31, 28.0])
-_KNEE = np.array([4, 16, 14, 8, 5, 10, 34, 60, 52, 18, 4.0])
-_ANKLE = np.array([0, -4, 3, 7, 10, 8, -14, -8, 0, 2, 0.0])
-
-
-def walk(frames: int, rate: float = 60.0, speed: float = 1.0) -> tuple[np.ndarray, np.ndarray]:
-    """A walk straight ahead.
-
-    Parameters
-    ----------
-    frames : int
-    rate : float, frames a second
-    speed : float
-        1 is a gait cycle of 1.1 seconds.
-
-    Returns
-    -------
-    (frames, 16, 3) float, radians
-    (frames, 3) float, metres
-        The place of the root against rest, so that the lower foot stays on the floor.
-    """
-    t = np.arange(frames) / rate * speed / 1.1
-    poses = np.stack([_stride(phase) for phase in t % 1.0])
-    fine = 120
-    heights, advance = _footing(np.stack([_stride(k / fine) for k in range(fine + 1)]))
-    cycle = np.concatenate([[0], np.cumsum(advance)])
-    at = (t % 1.0) * fine
-    ahead = np.interp(at, np.arange(fine + 1), cycle) + np.floor(t) * cycle[-1]
-    lift = np.interp(at, np.arange(fine + 1), heights)
-    return poses, np.stack([np.zeros(frames), -ahead, lift], axis=1)
-
-
-def _stride(phase: float) -> np.ndarray:
-    from scipy.interpolate import CubicSpline
-
-    curves = CubicSpline(_PHASE, np.stack([_HIP, _KNEE, _ANKLE], axis=1), bc_type="periodic")
-    wave = 2 * np.pi * phase
-    limbs = {}
-    for name, shift in (("left", 0.0), ("right", 0.5)):
-        hip, knee, ankle = curves((phase + shift) % 1.0)
-        swing = np.cos(wave + 2 * np.pi * shift)
-        limbs[f"{name}_leg"] = {"direction": (0.035, np.tan(np.radians(hip)), -1.0), "knee": float(knee), "foot": float(ankle)}
-        limbs[f"{name}_arm"] = {"direction": (0.28, 0.05 - 0.33 * swing, -1.0), "elbow": 10 - 9 * swing, "twist": 12}
-    pose = compose(**limbs, back={"turn": 9 * np.cos(wave), "bend": 2}, neck={"turn": -5 * np.cos(wave), "nod": 1})
-    pose[0] = Rotation.from_euler("zyx", [-4.5 * np.cos(wave), 2.5 * np.sin(wave), 2], degrees=True).as_rotvec()
-    return pose
-
-
-def _footing(poses: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Lift of the root (T,) that puts the lower foot on the floor, and how far it moves ahead (T - 1,)."""
-    a = _rest()
-    soles = []
-    for foot in (12, 15):
-        toe = a.ends[foot] * [1, 1, 0]
-        heel = a.joints[foot] * [1, 1, 0] + [0, 0.055, 0]
-        soles.append([_carried(a, pose, foot, np.stack([heel, toe])) for pose in poses])
-    points = np.swapaxes(np.array(soles), 0, 1).reshape(len(poses), 4, 3)
-    lowest = points[:, :, 2].min(axis=1)
-    weight = np.exp(-(points[:, :, 2] - lowest[:, None]) / 0.01)
-    weight = 0.5 * (weight[1:] + weight[:-1])
-    weight /= weight.sum(axis=1, keepdims=True)
-    advance = (weight * np.diff(points[:, :, 1], axis=0)).sum(axis=1)
-    kernel = np.hanning(15) / np.hanning(15).sum()
-    smooth = np.convolve(np.r_[lowest[-8:-1], lowest, lowest[1:8]], kernel, "valid")
-    advance = np.convolve(np.r_[advance[-7:], advance, advance[:7]], kernel, "valid")
-    return -smooth, advance
-
-
-def _carried(a: Anatomy, pose: np.ndarray, part: int, points: np.ndarray) -> np.ndarray:
-    chain = [part]
-    while PARENTS[chain[-1]] >= 0:
-        chain.append(int(PARENTS[chain[-1]]))
-    for p in chain:
-        points = a.joints[p] + Rotation.from_rotvec(pose[p]).apply(points - a.joints[p])
-    return points

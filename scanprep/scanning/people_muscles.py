@@ -1,12 +1,17 @@
 """Muscles and folds: where the surface rises or sinks, and which angle of which joint makes it do so."""
 from __future__ import annotations
 
+from collections.abc import Callable
 from functools import lru_cache
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
+from ..geometry import rotations
 from .people_anatomy import Anatomy
 from .people_template import blending, load
+
+Put = Callable[[str, str, float], None]
 
 # name, part, place along the bone (0 joint, 1 end), direction in the bone's (out, front) plane in degrees
 # from the front towards outside, widths along the bone (m) and around it (degrees), height (m)
@@ -29,7 +34,8 @@ TRUNK_MUSCLES = (
     ("pectoral", 1, 1, 0.075, 0.78, 0.050, 0.050, 0.013), ("scapula_in", 1, -1, 0.075, 0.84, 0.030, 0.045, 0.010),
     ("scapula_out", 1, -1, 0.135, 0.80, 0.028, 0.045, 0.014), ("lat", 1, -1, 0.15, 0.62, 0.045, 0.075, 0.012),
     ("trapezius", 1, -1, 0.07, 1.07, 0.035, 0.030, 0.012), ("flank", 1, 0, 0.15, 0.30, 0.08, 0.050, 0.016),
-    ("gluteus", 1, -1, 0.080, -0.06, 0.060, 0.060, 0.020), ("gluteus_medius", 1, 0, 0.16, 0.10, 0.06, 0.050, 0.010),
+    ("gluteus", 1, -1, 0.080, -0.06, 0.060, 0.060, 0.020), ("gluteus_medius", 1, 0, 0.16, 0.10, 0.06, 0.050,
+                                                            0.010),
     ("sternomastoid", 1, 1, 0.040, 1.16, 0.014, 0.045, 0.006), ("throat", 0, 1, 0.0, 1.26, 0.03, 0.020, 0.008),
 )
 
@@ -114,7 +120,8 @@ def _bend(axes: np.ndarray, relative: np.ndarray, parent: int, part: int) -> flo
     return float(np.arccos(np.clip(axes[parent] @ relative[part] @ axes[part], -1, 1)) - rest)
 
 
-def _arm_drivers(put, side, sign, axes, relative, arm, strong, soft) -> None:  # type: ignore[no-untyped-def]
+def _arm_drivers(put: Put, side: str, sign: int, axes: np.ndarray, relative: np.ndarray, arm: int, strong: float,
+                 soft: float) -> None:
     flexion = _bend(axes, relative, arm, arm + 1)
     f = np.sin(np.clip(flexion, -0.5, 2.6) / 2) * 1.15
     put("biceps", side, strong * f)
@@ -124,9 +131,7 @@ def _arm_drivers(put, side, sign, axes, relative, arm, strong, soft) -> None:  #
     put("flexors", side, 0.8 * (0.5 * strong + 0.5 * soft) * f)
     change = relative[arm] @ axes[arm] - axes[arm]
     up, fore, across = change[2], -change[1], -sign * change[0]
-    from .people_posing import twist_about
-
-    rotvec = rotation_vector(relative[arm + 2])
+    rotvec = rotations.log(relative[arm + 2])
     put("brachioradialis", side, -0.7 * sign * twist_about(rotvec, axes[arm + 1]) * strong)
     put("deltoid", side, strong * up / 1.3)
     put("shoulder_cap", side, up / 1.5)
@@ -137,7 +142,8 @@ def _arm_drivers(put, side, sign, axes, relative, arm, strong, soft) -> None:  #
     put("trapezius", side, strong * 0.7 * up)
 
 
-def _leg_drivers(put, side, sign, axes, relative, leg, strong, soft) -> None:  # type: ignore[no-untyped-def]
+def _leg_drivers(put: Put, side: str, sign: int, axes: np.ndarray, relative: np.ndarray, leg: int, strong: float,
+                 soft: float) -> None:
     knee = _bend(axes, relative, leg, leg + 1)
     k = np.sin(np.clip(knee, 0, 2.6) / 2) * 1.15
     firm = 0.5 * strong + 0.5 * soft
@@ -160,8 +166,7 @@ def _leg_drivers(put, side, sign, axes, relative, leg, strong, soft) -> None:  #
     put("instep", side, max(point, 0))
 
 
-def rotation_vector(R: np.ndarray) -> np.ndarray:
-    """The rotation vector (3,) of a matrix."""
-    from ..geometry import rotations
-
-    return rotations.log(R)
+def twist_about(rotvec: np.ndarray, axis: np.ndarray) -> float:
+    """The angle of the part of a rotation that turns about an axis (swing-twist)."""
+    q = Rotation.from_rotvec(rotvec).as_quat()
+    return float(2 * np.arctan2(q[:3] @ axis, q[3])) if q[3] >= 0 else float(2 * np.arctan2(-q[:3] @ axis, -q[3]))

@@ -10,9 +10,10 @@ from .people_field import Bump, Ellipsoid, Field, Group, Loft, RoundCone
 UPRIGHT = np.array([[1.0, 0, 0], [0, -1.0, 0], [0, 0, 1.0]])       # rows: sideways, frontwards, up
 
 
-def _keys(at: np.ndarray, out: np.ndarray, inner: np.ndarray, front: np.ndarray, back: np.ndarray,
-          exponent: np.ndarray | float = 2.1, side: np.ndarray | float = 0.0, fore: np.ndarray | float = 0.0
-          ) -> np.ndarray:
+def cross_sections(at: np.ndarray, out: np.ndarray, inner: np.ndarray, front: np.ndarray, back: np.ndarray,
+                   exponent: np.ndarray | float = 2.1, side: np.ndarray | float = 0.0,
+                   fore: np.ndarray | float = 0.0) -> np.ndarray:
+    """Keys of a Loft (k, 8) from columns that are broadcast against each other."""
     return np.stack(np.broadcast_arrays(at, side, fore, out, inner, front, back, exponent), axis=1)
 
 
@@ -33,7 +34,7 @@ def trunk(a: Anatomy) -> tuple[list[tuple[Field, float]], list[tuple[Field, floa
     body = np.maximum(body, [0.05, 0.004, 0.03]) * g
     body[:, 1] = np.where(up > 1, np.maximum(body[:, 1], 0.004), body[:, 1])
     at = np.array([a.at(u) for u in up])
-    main = Loft(np.zeros(3), UPRIGHT, _keys(at, body[:, 0], body[:, 0], body[:, 1], body[:, 2], table[:, 4]),
+    main = Loft(np.zeros(3), UPRIGHT, cross_sections(at, body[:, 0], body[:, 0], body[:, 1], body[:, 2], table[:, 4]),
                 (0.03 * g, 0.03 * g))
     members: list[tuple[Field, float]] = [(main, 0)]
     fatness = 0.7 * a.fat + 0.25 * s.hip_width
@@ -73,7 +74,8 @@ def neck(a: Anatomy) -> Field:
     side = np.array([0.070, 0.062, 0.059, 0.059, 0.061]) * thick + grow
     fore = np.array([0.052, 0.056, 0.057, 0.055, 0.052]) * thick + grow * 1.1
     back = np.array([0.054, 0.055, 0.056, 0.060, 0.066]) * thick + grow
-    return Loft(low, np.array([[1.0, 0, 0], front, axis]), _keys(part * length, side, side, fore, back), (0.03, 0.03))
+    return Loft(low, np.array([[1.0, 0, 0], front, axis]), cross_sections(part * length, side, side, fore, back),
+                (0.03, 0.03))
 
 
 def shoulder_line(a: Anatomy) -> list[Field]:
@@ -90,7 +92,8 @@ def shoulder_line(a: Anatomy) -> list[Field]:
 def _limb(a: Anatomy, origin: np.ndarray, frame: np.ndarray, at: np.ndarray, extents: np.ndarray,
           caps: tuple[float, float], exponent: float = 2.1) -> Loft:
     extents = np.maximum(extents, 0.012)
-    return Loft(origin, frame, _keys(at, *extents.T, exponent), caps)
+    out, inner, front, back = extents.T
+    return Loft(origin, frame, cross_sections(at, out, inner, front, back, exponent), caps)
 
 
 def leg(a: Anatomy) -> Field:
@@ -99,21 +102,29 @@ def leg(a: Anatomy) -> Field:
     own = a.man + (1 - a.man) * tables.WOMAN / tables.MAN           # the tables are for a man's size
     table = a.man * tables.LEG_MAN + (1 - a.man) * tables.LEG_WOMAN
     fat = a.fat * (1.0 + 0.25 * (1 - a.man)) + 0.7 * s.limbs
-    extents = table[:, 1:] * (1 - 0.035 * (1 - a.man)) + (fat * tables.LEG_FAT[:, None] * [1.2, 0.45, 1.0, 1.0] + s.muscle * tables.LEG_MUSCLE) * own
+    grown = fat * tables.LEG_FAT[:, None] * [1.2, 0.45, 1.0, 1.0] + s.muscle * tables.LEG_MUSCLE
+    extents = table[:, 1:] * (1 - 0.035 * (1 - a.man)) + grown * own
     extents = extents * g
     thigh = np.linalg.norm(a.joints[11] - a.joints[10])
     shin = np.linalg.norm(a.joints[12] - a.joints[11])
     at = np.interp(table[:, 0], [-1, 0, 1, 2, 3], [-thigh, 0, thigh, thigh + shin, thigh + 2 * shin])
     shank = _limb(a, a.joints[10], a.leg_frame, at, extents, (0.02 * g, 0.012 * g))
     knee, ankle, f = a.joints[11], a.joints[12], a.leg_frame
-    bumps = [Bump(knee + f.T @ np.array([0.0, 0.052, -0.012]) * g, 0.007 * g, np.array([0.019, 0.03, 0.024]) * g, f),
-             Bump(knee + f.T @ np.array([0.0, 0.045, 0.055]) * g, 0.004 * g, np.array([0.014, 0.03, 0.016]) * g, f),
-             Bump(ankle + f.T @ np.array([0.036, -0.006, -0.002]) * g, 0.007 * g, np.array([0.012, 0.010, 0.012]) * g, f),
-             Bump(ankle + f.T @ np.array([-0.034, 0.004, -0.010]) * g, 0.007 * g, np.array([0.012, 0.011, 0.012]) * g, f),
+    bumps = [Bump(knee + f.T @ np.array([0.0, 0.052, -0.012]) * g, 0.007 * g, np.array([0.019, 0.03, 0.024]) * g,
+                  f),
+             Bump(knee + f.T @ np.array([0.0, 0.045, 0.055]) * g, 0.004 * g, np.array([0.014, 0.03, 0.016]) * g,
+                  f),
+             Bump(ankle + f.T @ np.array([0.036, -0.006, -0.002]) * g, 0.007 * g,
+                  np.array([0.012, 0.010, 0.012]) * g, f),
+             Bump(ankle + f.T @ np.array([-0.034, 0.004, -0.010]) * g, 0.007 * g,
+                  np.array([0.012, 0.011, 0.012]) * g, f),
              Bump(knee + f.T @ np.array([0.030, -0.05, 0.0]) * g, 0.003 * g, np.array([0.008, 0.02, 0.04]) * g, f),
-             Bump(knee + f.T @ np.array([-0.030, -0.05, 0.0]) * g, 0.003 * g, np.array([0.008, 0.02, 0.04]) * g, f),
-             Bump(ankle + f.T @ np.array([0.022, -0.035, -0.035]) * g, -0.005 * g, np.array([0.012, 0.014, 0.05]) * g, f),
-             Bump(ankle + f.T @ np.array([-0.022, -0.035, -0.035]) * g, -0.005 * g, np.array([0.012, 0.014, 0.05]) * g, f)]
+             Bump(knee + f.T @ np.array([-0.030, -0.05, 0.0]) * g, 0.003 * g, np.array([0.008, 0.02, 0.04]) * g,
+                  f),
+             Bump(ankle + f.T @ np.array([0.022, -0.035, -0.035]) * g, -0.005 * g,
+                  np.array([0.012, 0.014, 0.05]) * g, f),
+             Bump(ankle + f.T @ np.array([-0.022, -0.035, -0.035]) * g, -0.005 * g,
+                  np.array([0.012, 0.014, 0.05]) * g, f)]
     return Group([(shank, 0), (foot(a), 0.022 * g)], bumps,
                  (a.joints[10] + [0, 0, 0.05], np.array([ankle[0], ankle[1] - 0.05, 0.02]), 0.29 * g))
 
@@ -128,7 +139,7 @@ def foot(a: Anatomy) -> Field:
     t, shift, half, top, bottom = (tables.FOOT * length).T
     centre, extent = (top - bottom) / 2, (top + bottom) / 2
     wide = 1 + 0.02 * a.fat
-    main = Loft(origin, frame, _keys(t, half * wide, half * wide, extent, extent, 2.5, shift, centre),
+    main = Loft(origin, frame, cross_sections(t, half * wide, half * wide, extent, extent, 2.5, shift, centre),
                 (0.018 * length, 0.03 * length))
     members: list[tuple[Field, float]] = [(main, 0)]
     toes = [(-0.113, 0.55, 0.745, 0.046), (-0.030, 0.55, 0.752, 0.034), (0.035, 0.53, 0.722, 0.032),
@@ -153,9 +164,12 @@ def arm(a: Anatomy) -> Field:
     second = _limb(a, a.joints[5], a.forearm_frame, fore[:, 0] * a.width["forearm"], extents * thin,
                    (0.02 * g, 0.006 * g))
     elbow, wrist, f = a.joints[5], a.joints[6], a.forearm_frame
-    bumps = [Bump(elbow + f.T @ np.array([0.0, -0.037, -0.004]) * g, 0.006 * g, np.array([0.012, 0.02, 0.016]) * g, f),
-             Bump(elbow + f.T @ np.array([-0.034, -0.006, -0.010]) * g, 0.004 * g, np.array([0.015, 0.011, 0.014]) * g, f),
-             Bump(wrist + f.T @ np.array([0.018, -0.018, -0.015]) * g, 0.004 * g, np.array([0.01, 0.009, 0.010]) * g, f)]
+    bumps = [Bump(elbow + f.T @ np.array([0.0, -0.037, -0.004]) * g, 0.006 * g, np.array([0.012, 0.02, 0.016]) * g,
+                  f),
+             Bump(elbow + f.T @ np.array([-0.034, -0.006, -0.010]) * g, 0.004 * g,
+                  np.array([0.015, 0.011, 0.014]) * g, f),
+             Bump(wrist + f.T @ np.array([0.018, -0.018, -0.015]) * g, 0.004 * g,
+                  np.array([0.01, 0.009, 0.010]) * g, f)]
     return Group([(first, 0), (second, 0.018 * g)], bumps, (a.joints[4], wrist, 0.20 * g))
 
 
@@ -172,7 +186,7 @@ def hand(a: Anatomy) -> Field:
     thick = np.array([0.0195, 0.0185, 0.0165, 0.0145, 0.0115]) * wide
     front = np.array([0.0275, 0.031, 0.037, 0.041, 0.041]) * wide
     back = np.array([0.0275, 0.031, 0.037, 0.040, 0.038]) * wide
-    palm = Loft(wrist, f, _keys(t, thick * 0.85, thick * 1.05, front, back, 2.5), (0.006 * L, 0.010 * L))
+    palm = Loft(wrist, f, cross_sections(t, thick * 0.85, thick * 1.05, front, back, 2.5), (0.006 * L, 0.010 * L))
     members: list[tuple[Field, float]] = [(palm, 0)]
     fingers = [(0.0318, 0.0425, 0.072, 0.0088, 0.0), (0.0108, 0.0145, 0.080, 0.0091, 0.003),
                (-0.0107, -0.0140, 0.074, 0.0087, 0.001), (-0.0310, -0.0410, 0.058, 0.0080, -0.006)]
@@ -181,75 +195,14 @@ def hand(a: Anatomy) -> Field:
         bent, far = at(0.006, 0.5 * (base + tip), middle), at(0.017, tip, end)
         members += [(RoundCone(at(0.0005, base, s0), bent, r * 1.06 * wide, r * 0.97 * wide), 0.005 * L),
                     (RoundCone(bent, far, r * 0.97 * wide, r * 0.80 * wide), 0.003 * L)]
-    members.append((RoundCone(at(0.001, 0.030, 0.100), at(0.001, -0.028, 0.094), 0.0062 * wide, 0.0062 * wide), 0.006 * L))
+    members.append((RoundCone(at(0.001, 0.030, 0.100), at(0.001, -0.028, 0.094), 0.0062 * wide, 0.0062 * wide),
+                    0.006 * L))
     thumb = [at(0.006, 0.018, 0.018), at(0.013, 0.044, 0.052), at(0.016, 0.056, 0.078), at(0.016, 0.061, 0.104)]
-    for first, last, r0, r1, k in ((thumb[0], thumb[1], 0.0165, 0.0125, 0.016), (thumb[1], thumb[2], 0.0125, 0.0105, 0.006),
+    for first, last, r0, r1, k in ((thumb[0], thumb[1], 0.0165, 0.0125, 0.016),
+                                   (thumb[1], thumb[2], 0.0125, 0.0105, 0.006),
                                    (thumb[2], thumb[3], 0.0108, 0.0082, 0.004)):
         members.append((RoundCone(first, last, r0 * wide, r1 * wide), k * L))
     return Group(members, bounds=(at(0, 0, 0.03), at(0, 0, 0.15), 0.15 * L))
-
-
-def head(a: Anatomy) -> Field:
-    """Skull, face and ears."""
-    s, h, man = a.shape, a.head_scale, a.man
-
-    def at(side: float, front: float, up: float) -> np.ndarray:
-        return a.eye + np.array([side, -front, up]) * h
-
-    cranium = Ellipsoid(at(0, -0.008, 0.0195), np.array([0.0755, 0.0965, 0.0895]) * h)
-    hair = Ellipsoid(at(0, -0.020, 0.0255 - 0.004 * (1 - man)),
-                     np.array([0.0785 + 0.004 * (1 - man), 0.0940 + 0.004 * (1 - man), 0.087 + 0.004 * (1 - man)]) * h)
-    up = np.array([0.052, 0.022, 0.0, -0.030, -0.058, -0.082, -0.100])
-    half = np.array([0.064, 0.0675, 0.068, 0.0665, 0.059 - 0.002 * (1 - man), 0.048 - 0.004 * (1 - man),
-                     0.034 - 0.003 * (1 - man)]) + a.fat * np.array([0, 0, 0.0005, 0.002, 0.003, 0.0035, 0.003])
-    fore = np.array([0.082, 0.089, 0.0875, 0.088, 0.0885, 0.0855, 0.0785])
-    back = np.array([0.07, 0.07, 0.07, 0.06, 0.045, 0.03, 0.02])
-    face = Loft(a.eye, UPRIGHT, _keys(up[::-1], half[::-1], half[::-1], fore[::-1], back[::-1], 2.25) *
-                np.array([h] * 7 + [1.0]), (0.010 * h, 0.03 * h))
-    big = 1 + 0.20 * s.nose + 0.06 * (man - 0.5)
-    nose = RoundCone(at(0, 0.086, 0.010), at(0, 0.0945 + 0.012 * big, -0.036), 0.0065 * h, 0.0095 * h)
-    wing = Ellipsoid(at(0.0115, 0.0965, -0.0395), np.array([0.0075, 0.0095, 0.0065]) * h)
-    eyeball = Ellipsoid(at(0.0315, 0.0715, -0.001), np.array([0.0160, 0.0125, 0.0115]) * h)
-    bun = Ellipsoid(at(0, -0.119 + 0.052 * man, 0.034), np.array([0.031, 0.029, 0.030]) * h)
-    lean = np.radians(14)
-    flare = np.radians(30)
-    ear_frame = np.array([[np.cos(flare), np.sin(flare), 0], [-np.sin(flare), np.cos(flare), 0], [0, 0, 1.0]])
-    tip = np.array([[1.0, 0, 0], [0, np.cos(lean), np.sin(lean)], [0, -np.sin(lean), np.cos(lean)]])
-    ear = Ellipsoid(at(0.0800, -0.010, -0.010), np.array([0.0075, 0.0185, 0.0320]) * h, ear_frame @ tip)
-    parts: list[tuple[Field, float]] = [(cranium, 0), (face, 0.03 * h), (hair, 0.004 * h)]
-    return Group([(Group(parts, _face_bumps(a)), 0), (eyeball, 0.004 * h), (nose, 0.012 * h), (wing, 0.007 * h),
-                  (ear, 0.006 * h), (bun, 0.007 * h)], _feature_bumps(a), bounds=(a.eye, a.eye + 1e-3, 0.19 * h))
-
-
-def _face_bumps(a: Anatomy) -> list[Bump]:
-    h, man, s = a.head_scale, a.man, a.shape
-
-    def bump(place: tuple[float, float, float], height: float, widths: tuple[float, float, float]) -> Bump:
-        return Bump(a.eye + np.array([place[0], -place[1], place[2]]) * h, height * h, np.array(widths) * h)
-
-    return [bump((0.031, 0.085, 0.003), -0.0100, (0.0150, 0.03, 0.0105)),
-            bump((0.014, 0.088, 0.001), -0.0045, (0.007, 0.02, 0.010)),
-            bump((0.030, 0.088, 0.019), 0.0025 + 0.0025 * man, (0.018, 0.03, 0.0065)),
-            bump((0, 0.09, 0.020), 0.002 + 0.002 * man, (0.012, 0.03, 0.008)),
-            bump((0.047, 0.066, -0.022), 0.0055, (0.015, 0.02, 0.011)),
-            bump((0.046, 0.060, -0.056), -0.004 + 0.003 * a.fat, (0.014, 0.025, 0.016)),
-            bump((0.050, 0.015, -0.066), 0.005 * man, (0.014, 0.018, 0.014)),
-            bump((0.070, 0.045, 0.020), -0.003, (0.02, 0.018, 0.018)),
-            bump((0, 0.088, -0.0955), 0.0065 + 0.001 * man, (0.015, 0.03, 0.0105)),
-            bump((0, 0.088, -0.0790), -0.004, (0.016, 0.03, 0.0055))]
-
-
-def _feature_bumps(a: Anatomy) -> list[Bump]:
-    h = a.head_scale
-
-    def bump(place: tuple[float, float, float], height: float, widths: tuple[float, float, float]) -> Bump:
-        return Bump(a.eye + np.array([place[0], -place[1], place[2]]) * h, height * h, np.array(widths) * h)
-
-    return [bump((0, 0.092, -0.0565), 0.0050, (0.016, 0.03, 0.0042)),
-            bump((0, 0.092, -0.0685), 0.0058, (0.0145, 0.03, 0.0046)),
-            bump((0, 0.092, -0.0622), -0.0030, (0.021, 0.03, 0.0020)),
-            bump((0.090, -0.004, -0.010), -0.005, (0.010, 0.008, 0.014)),
-            bump((0.0115, 0.100, -0.0475), -0.003, (0.004, 0.008, 0.003))]
 
 
 def trunk_bumps(a: Anatomy) -> list[Bump]:

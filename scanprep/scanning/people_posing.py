@@ -10,7 +10,7 @@ from scipy.spatial.transform import Rotation
 from ..geometry import rotations
 from ..geometry.mesh import Mesh
 from .people_anatomy import PARENTS, Anatomy
-from .people_muscles import drivers, masks
+from .people_muscles import drivers, masks, twist_about
 from .people_template import blending, load, neighbour_mean
 
 
@@ -101,12 +101,6 @@ class Poser:
                 x = x.copy()
                 x[near] = base + turn.apply(x[near] - base)
         return x
-
-
-def twist_about(rotvec: np.ndarray, axis: np.ndarray) -> float:
-    """The angle of the part of a rotation that turns about an axis (swing-twist)."""
-    q = Rotation.from_rotvec(rotvec).as_quat()
-    return float(2 * np.arctan2(q[:3] @ axis, q[3])) if q[3] >= 0 else float(2 * np.arctan2(-q[:3] @ axis, -q[3]))
 
 
 @lru_cache(maxsize=1)

@@ -41,7 +41,8 @@ def polygonise(field: Field, low: np.ndarray, high: np.ndarray, step: float) -> 
     points = np.stack(np.meshgrid(*fine_axes[::-1], indexing="ij")[::-1], axis=-1)
     wanted = points[todo]
     values[todo] = np.concatenate([field(part) for part in np.array_split(wanted, max(1, len(wanted) // 200_000))])
-    vertices, faces = igl.marching_cubes(values.reshape(-1), points.reshape(-1, 3), int(n[0]), int(n[1]), int(n[2]),
+    vertices, faces = igl.marching_cubes(values.reshape(-1), points.reshape(-1, 3), int(n[0]), int(n[1]),
+                                         int(n[2]),
                                          0.0)[:2]
     mesh = Mesh(vertices, np.asarray(faces, dtype=np.int64))
     _, gradient_sign = mesh.face_normals, field(mesh.corners.mean(axis=1) + 1e-3 * mesh.face_normals)
@@ -112,7 +113,8 @@ def _split(vertices: np.ndarray, faces: np.ndarray, sizing: Sizing) -> tuple[np.
     return vertices, faces
 
 
-def _collapse(vertices: np.ndarray, faces: np.ndarray, sizing: Sizing, passes: int = 3) -> tuple[np.ndarray, np.ndarray]:
+def _collapse(vertices: np.ndarray, faces: np.ndarray, sizing: Sizing, passes: int = 3) -> tuple[np.ndarray,
+                                                                                                 np.ndarray]:
     for _ in range(passes):
         mesh = Mesh(vertices, faces)
         length = _lengths(vertices, mesh.edges, sizing)

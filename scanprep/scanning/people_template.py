@@ -1,6 +1,7 @@
 """The topology that all people share, and how it is carried onto another body."""
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -10,6 +11,7 @@ from scipy.sparse import csr_array, diags_array
 
 from ..geometry import storage
 from ..geometry.mesh import Mesh
+from ..geometry.sparse import factor
 from .people_anatomy import PARENTS, Anatomy, BodyShape
 from .people_field import Field, project, value_and_gradient
 
@@ -37,7 +39,7 @@ class Template:
     anatomy: Anatomy
 
 
-def sizing(anatomy: Anatomy) -> object:
+def sizing(anatomy: Anatomy) -> Callable[[np.ndarray], np.ndarray]:
     """Wanted edge length in metres at points (n, 3): fine on face, ears, hands and toes."""
     hand = anatomy.joints[6] + 0.6 * (anatomy.ends[6] - anatomy.joints[6])
     foot = anatomy.joints[12] + 0.75 * anatomy.width["foot"] * anatomy.foot_frame[2] * [1, 1, 0]
@@ -63,23 +65,22 @@ def build(step: float = 0.0035) -> Template:
     from .people_remesh import mirror, polygonise, remesh
 
     anatomy = Anatomy(CANONICAL)
-    joints = anatomy.joints
     high = np.array([anatomy.ends[6, 0] + 0.08, 0.22, CANONICAL.stature + 0.03])
     half = polygonise(anatomy.field, np.array([0.0, -0.30, -0.02]), high, step)
     keep = half.vertex_component[half.faces[:, 0]] == 0
-    half = remesh(half.submesh(keep)[0], anatomy.field, sizing(anatomy))  # type: ignore[arg-type]
+    half = remesh(half.submesh(keep)[0], anatomy.field, sizing(anatomy))
     mesh, twin = mirror(half)
     order = np.lexsort((np.round(mesh.vertices[:, 0], 4), np.round(mesh.vertices[:, 2], 3)))
     place = np.argsort(order)
     mesh = Mesh(mesh.vertices[order], place[mesh.faces])
-    del joints
     return Template(mesh, place[twin[order]], label_faces(mesh, anatomy), anatomy)
 
 
 def store(template: Template, path: Path = STORED) -> None:
     """Keep a built template beside the code."""
     storage.save(path, "people template", VERSION, {
-        "vertices": np.round(template.mesh.vertices * 1e5).astype(np.int32), "mirror": template.mirror.astype(np.uint16),
+        "vertices": np.round(template.mesh.vertices * 1e5).astype(np.int32),
+        "mirror": template.mirror.astype(np.uint16),
         "faces": template.mesh.faces.astype(np.uint16)})
 
 
@@ -137,8 +138,6 @@ def label_faces(mesh: Mesh, anatomy: Anatomy) -> np.ndarray:
 @lru_cache(maxsize=1)
 def blending() -> tuple[np.ndarray, np.ndarray]:
     """Smooth part weights (N, 16) on the shared topology: for carrying, and for posing."""
-    from ..geometry.sparse import factor
-
     template = load()
     mesh = template.mesh
     n = len(mesh.vertices)

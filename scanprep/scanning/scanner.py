@@ -36,7 +36,7 @@ class ScannerConfig:
 
     views: int = 4
     distance: float = 2.5
-    height: float = 0.35
+    height: float = 0.6
     azimuth: float = 45.0
     resolution: float = 0.0064
     noise: float = 0.002
@@ -53,9 +53,9 @@ class ScannerConfig:
             if not getattr(self, name) > 0:
                 raise ValueError(f"{name}: expected a positive number, got {getattr(self, name)}")
         if not (self.noise >= 0 and 0 <= self.grazing < 90 and 0 <= self.dropout < 1 and self.blind_reach >= 0):
-            raise ValueError("noise, grazing, dropout, blind_reach: expected noise >= 0, grazing in [0, 90), dropout in "
-                             f"[0, 1) and blind_reach >= 0, got {self.noise}, {self.grazing}, {self.dropout}, "
-                             f"{self.blind_reach}")
+            raise ValueError("noise, grazing, dropout, blind_reach: expected noise >= 0, grazing in [0, 90), "
+                             f"dropout in [0, 1) and blind_reach >= 0, got {self.noise}, {self.grazing}, "
+                             f"{self.dropout}, {self.blind_reach}")
 
 
 @dataclass(frozen=True, eq=False)
