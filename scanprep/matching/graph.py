@@ -2,6 +2,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import numpy as np
 from scipy.sparse import coo_array, csr_array
@@ -100,6 +101,12 @@ def deform(graph: DeformationGraph, motion: NodeMotion) -> np.ndarray:
     return np.matmul(blended[..., :3], graph.rest[..., None])[..., 0] + blended[..., 3]
 
 
+def turn(graph: DeformationGraph, motion: NodeMotion, normals: np.ndarray) -> np.ndarray:
+    """Normals of the template's vertices (N, 3) after the turns of their nodes; not of unit length."""
+    blended = np.einsum("nk,nkc->nc", graph.weights, motion.R.reshape(-1, 9)[graph.carriers]).reshape(-1, 3, 3)
+    return np.matmul(blended, normals[..., None])[..., 0]
+
+
 def carry_over(old: DeformationGraph, motion: NodeMotion, new: DeformationGraph) -> NodeMotion:
     """The motion of a finer graph of the same template that repeats the motion of a coarser one."""
     at = new.node_vertices
@@ -108,6 +115,7 @@ def carry_over(old: DeformationGraph, motion: NodeMotion, new: DeformationGraph)
     return NodeMotion(R, np.einsum("mk,mk->m", w, motion.log_scale[carriers]), deform(old, motion)[at])
 
 
+@lru_cache(maxsize=4)                # a folder of scans shares one template
 def build_graph(template: Mesh, count: int, carriers: int = 4, reach: float = 0.18) -> DeformationGraph:
     """Spread nodes over a template and link them along and through the body.
 

@@ -16,7 +16,7 @@ import numpy as np
 
 from ..geometry.mesh import Mesh, check_template
 from .energies import NodePattern, Pull, Stiffness, minimise, pull
-from .graph import build_graph, carry_over, deform, start
+from .graph import build_graph, carry_over, deform, start, turn
 from .matches import Matching, Target, match_both_ways, target_of, thin
 from .rigid import align_landmarks, align_rigid
 from .shell import Shell
@@ -51,8 +51,8 @@ class GraphStage:
     growth: float
     landmarks: float
     reach: float
-    slide: float = 0.1
-    rounds: int = 8
+    slide: float = 0.02
+    rounds: int = 2
     detail: float = 0.02
 
 
@@ -98,12 +98,14 @@ class RegistrationConfig:
         GraphStage(300, 0.7, 0.07, 2.0, 0.001, 0.0, rounds=20),
         GraphStage(300, 0.7, 0.07, 2.0, 0.1, 0.0, rounds=20),
         GraphStage(300, 0.7, 0.07, 2.0, 10.0, 0.0, rounds=20),
-        GraphStage(300, 0.35, 0.035, 0.7, 0.01, 0.21, slide=0.3),
-        GraphStage(300, 0.2, 0.02, 0.7, 0.01, 0.14, slide=0.3),
-        GraphStage(300, 0.14, 0.014, 0.7, 0.003, 0.085, slide=0.2),
-        GraphStage(300, 0.07, 0.007, 0.7, 0.001, 0.056),
-        GraphStage(1000, 0.07, 0.007, 0.35, 0.001, 0.042, rounds=4, detail=0.008),
-        GraphStage(1000, 0.035, 0.0035, 0.2, 0.0005, 0.028, slide=0.05, rounds=4, detail=0.008),
+        GraphStage(300, 0.2, 0.02, 0.7, 0.01, 0.21),
+        GraphStage(300, 0.13, 0.013, 0.7, 0.01, 0.15),
+        GraphStage(300, 0.09, 0.009, 0.7, 0.01, 0.11),
+        GraphStage(300, 0.06, 0.006, 0.7, 0.01, 0.08),
+        GraphStage(300, 0.04, 0.004, 0.7, 0.01, 0.06),
+        GraphStage(1000, 0.04, 0.004, 0.35, 0.01, 0.05, detail=0.008),
+        GraphStage(1000, 0.025, 0.0025, 0.35, 0.01, 0.037, detail=0.008),
+        GraphStage(1000, 0.015, 0.0015, 0.35, 0.005, 0.028, detail=0.008),
     )
     shell: tuple[ShellStage, ...] = (
         ShellStage(0.02, 0.007, 0.0002, 0.02),
@@ -186,6 +188,7 @@ def register(template: Mesh, scan: Mesh | np.ndarray, landmarks: tuple[np.ndarra
         fit.bend_graph(stage)
     for round_ in config.shell:
         fit.follow(round_)
+    fit.unfold()
     return fit.result()
 
 
@@ -270,7 +273,25 @@ class _Fit:
             landmark_rms = float(np.sqrt(np.mean(apart**2)))
         return Registration(self.template.with_vertices(self.x), matching.distances, matching.seen,
                             float(np.sqrt(np.mean(seen**2))) if len(seen) else np.nan, landmark_rms,
-                            self.converged, self.done, self.energies, 0)
+                            self.converged, self.done, self.energies, int(self.flipped(self.x).sum()))
+
+    def flipped(self, x: np.ndarray) -> np.ndarray:
+        """(F,) bool: triangles that face away from where the nodes around them have turned."""
+        turned = turn(self.graph, self.motion, self.template.vertex_normals)
+        return np.einsum("fd,fcd->f", self.template.with_vertices(x).face_normals, turned[self.template.faces]) < 0
+
+    def unfold(self) -> None:
+        """Even out the shell's displacement around flipped triangles until there is none."""
+        base = deform(self.graph, self.motion)
+        displacement = self.x - base
+        near = self.template.vertex_adjacency
+        for _ in range(20):
+            bad = np.unique(self.template.faces[self.flipped(base + displacement)])
+            if not len(bad):
+                break
+            around = np.flatnonzero(near @ np.isin(self.all, bad) + np.isin(self.all, bad))
+            displacement[around] = (near @ displacement)[around] / near.sum(axis=1)[around, None]
+        self.x = base + displacement
 
     def _advance(self, x: np.ndarray, steps: int) -> None:
         self.converged = bool(np.linalg.norm(x - self.x, axis=1).mean() <= self.config.settled * self.size)
