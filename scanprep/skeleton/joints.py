@@ -5,10 +5,11 @@ import numpy as np
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components, dijkstra
 
-from .motions import Motions, fit_motions, union_costs
+from .motions import Motions
 from .parts import PartSearch
 
 WEAK_CONTACT = 0.2               # of the longer borders of both parts: thighs that touch are not linked
+LOOP_SEPARATION = 1.5            # times the separation of parts: on a loop, closer ones are merged
 LEAST_PULL = 1e-4                # squared radians: turns below 0.01 say nothing about where a joint is
 PRIOR_WIDTH = 3.0                # of the border's radius: how far from its centroid a joint is expected
 
@@ -47,10 +48,11 @@ def without_weak(pairs: np.ndarray, lengths: np.ndarray, count: int) -> np.ndarr
 
 
 def to_tree(search: PartSearch, label: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Merge parts until those that touch form a tree.
+    """Merge parts, and drop links, until parts and links form a tree.
 
-    Of the links that lie on a loop, the one whose two parts cost least as one is merged, until there is no
-    loop left: this joined the halves of crotch and chest in the paper, by hand.
+    On a loop, the two parts whose union costs least become one unless they are well apart: this joined the
+    halves of crotch and chest in the paper, by hand. Where all parts of a loop move freely, the link whose
+    parts move most against each other is dropped: thighs that touch under the crotch.
 
     Parameters
     ----------
@@ -69,13 +71,19 @@ def to_tree(search: PartSearch, label: np.ndarray) -> tuple[np.ndarray, np.ndarr
     while True:
         count = int(label.max()) + 1
         links = without_weak(*border_lengths(search, label), count)
-        if len(links) == count - 1:
+        pairs, separation, extra = search.separations(label)
+        of_pair = {tuple(pair): i for i, pair in enumerate(pairs.tolist())}
+        while len(links) > count - 1:
+            each = np.arange(len(links))
+            loop = [i for i in each if linked(links[each != i], count)]
+            number = np.array([of_pair[tuple(links[i].tolist())] for i in loop])
+            cheapest = number[extra[number].argmin()]
+            if search.config.parts is None and separation[cheapest] < LOOP_SEPARATION * search.config.separation:
+                break
+            links = np.delete(links, loop[int(extra[number].argmax())], axis=0)
+        else:
             return label, links
-        each = np.arange(len(links))
-        loop = links[[linked(links[each != i], count) for i in each]]
-        moments = search.surface.moments(label)
-        extra = union_costs(moments, loop) - fit_motions(moments).cost[loop].sum(axis=1)
-        a, b = loop[extra.argmin()]
+        a, b = pairs[cheapest]
         label = search.alternate(np.where(label == b, a, label), rounds=4)
 
 

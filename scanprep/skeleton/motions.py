@@ -50,6 +50,11 @@ class Moments:
         """The sums of the unions, set by set."""
         return Moments(*(a + b for a, b in zip(self._each(), other._each(), strict=True)))
 
+    def gather(self, label: np.ndarray) -> Moments:
+        """The sums over the sets (P,) of each label."""
+        into = csr_array((np.ones(len(label)), (label, np.arange(len(label)))))
+        return Moments(*((into @ a.reshape(len(label), -1)).reshape(-1, *a.shape[1:]) for a in self._each()))
+
     def absorb(self, a: int, b: int) -> None:
         """Add set b to set a, in place."""
         for array in self._each():

@@ -24,8 +24,7 @@ class SkeletonConfig:
     parts : int, optional
         Exact number of parts; without it the data decide.
     separation : float
-        Two neighbours stay two parts when one motion for both leaves at least this many times the squared
-        residual that two motions leave.
+        Two neighbours that are less apart become one part, see `PartSearch.separations`.
     tolerance : float
         Residual, as a fraction of the square root of the surface area, that counts as rigid.
     smallest : float
@@ -39,7 +38,7 @@ class SkeletonConfig:
     """
 
     parts: int | None = None
-    separation: float = 2.3
+    separation: float = 5.0
     tolerance: float = 0.001
     smallest: float = 0.005
     smoothness: float = 1.0
@@ -49,9 +48,7 @@ class SkeletonConfig:
     def __post_init__(self) -> None:
         if self.parts is not None and self.parts < 1:
             raise ValueError(f"parts: expected at least 1, got {self.parts}")
-        if not self.separation > 1:
-            raise ValueError(f"separation: expected more than 1, got {self.separation}")
-        for name in ("tolerance", "smallest", "smoothness"):
+        for name in ("separation", "tolerance", "smallest", "smoothness"):
             if not getattr(self, name) > 0:
                 raise ValueError(f"{name}: expected more than 0, got {getattr(self, name)}")
 
@@ -70,6 +67,7 @@ class PartSearch:
         self.floor = config.tolerance**2 * surface.area
         self.width = config.smoothness * BORDER_WIDTH / np.sqrt(surface.area)
         self.patch = cover(surface, min(config.patches, len(surface.face_weights)))
+        self._cuts: dict[bytes, tuple[np.ndarray, float]] = {}
 
     def motions(self, label: np.ndarray) -> Motions:
         """Rigid motions of the parts (the M-step)."""
@@ -102,13 +100,33 @@ class PartSearch:
         touching = np.sort(label[self.surface.pairs], axis=1)
         return np.unique(touching[touching[:, 0] != touching[:, 1]], axis=0)
 
-    def separations(self, label: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """For all pairs of labels that touch (n, 2), the residual of one motion over that of two (n,)."""
+    def separations(self, label: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """For all pairs of labels that touch (n, 2), how far apart they are and what their union costs more.
+
+        How far apart is the geometric mean of two ratios: the residual of one motion over that of two, and the
+        gain of the border over that of the best cut through the smaller part. The first tells a joint from a
+        surface that gives way everywhere, the second also from noise.
+        """
         moments = self.surface.moments(label)
         pairs = self.contacts(label)
         if not len(pairs):
-            return pairs, np.zeros(0)
-        return pairs, self._apart(moments, pairs)
+            return pairs, np.zeros(0), np.zeros(0)
+        return pairs, *self._apart(moments, pairs, self._next_gains(label))
+
+    def _next_gains(self, label: np.ndarray, first: int = 0) -> np.ndarray:
+        """(P,) square metres: what each part from `first` on would gain by its best cut along the patches."""
+        P, K = int(label.max()) + 1, int(self.patch.max()) + 1
+        used, piece = np.unique(label * K + self.patch, return_inverse=True)
+        moments, contacts = self.surface.moments(piece), self.contacts(piece)
+        gains = np.zeros(P)
+        for part in range(first, P):
+            mine = np.flatnonzero(used // K == part)
+            among = contacts[((contacts >= mine[0]) & (contacts <= mine[-1])).all(axis=1)] - mine[0]
+            sub = moments[mine]
+            half = agglomerate(sub, among, 2)
+            whole = sub.gather(np.zeros(len(mine), dtype=np.int64))
+            gains[part] = fit_motions(whole).cost[0] - fit_motions(sub.gather(half)).cost.sum()
+        return np.maximum(gains, 0)
 
     def join_down(self, label: np.ndarray, count: int | None) -> np.ndarray:
         """Join the pair that is least apart, alternate, and so on.
@@ -117,14 +135,17 @@ class PartSearch:
         """
         while True:
             label = self.alternate(label, rounds=2)
-            pairs, separation = self.separations(label)
+            pairs, separation, extra = self.separations(label)
             if not len(pairs) or len(np.unique(label)) <= (count or 1):
                 return label
             share = np.bincount(label, self.surface.face_weights)
-            score = np.where((share[pairs] < self.config.smallest).any(axis=1), separation - 1e9, separation)
-            least = int(score.argmin())
-            if count is None and score[least] >= self.config.separation:
+            small = (share[pairs] < self.config.smallest).any(axis=1)
+            open_ = small | (separation < self.config.separation)
+            if count is not None and not open_.any():
+                open_ = separation <= separation.min()
+            if not open_.any():
                 return label
+            least = int(np.where(open_, extra, np.inf).argmin())
             label = np.where(label == pairs[least, 1], pairs[least, 0], label)
 
     def split(self, label: np.ndarray, part: int) -> tuple[np.ndarray, float]:
@@ -137,34 +158,46 @@ class PartSearch:
         float
             How far apart the halves are, 0 where there is no cut.
         """
+        key = (label == part).tobytes()
+        if key not in self._cuts:
+            self._cuts[key] = self._split(label == part)
+        half, apart = self._cuts[key]
+        return np.where(half, label.max() + 1, label), apart
+
+    def _split(self, mine: np.ndarray) -> tuple[np.ndarray, float]:
+        """Which triangles (F,) bool of a part `mine` (F,) bool to cut off, and how far apart the halves are."""
         s = self.surface
-        inside = np.flatnonzero(label == part)
+        inside = np.flatnonzero(mine)
         number = np.unique(self.patch[inside], return_inverse=True)[1]
-        local = np.zeros(len(label), dtype=np.int64)             # 0 outside, halves 1 and 2
+        local = np.zeros(len(mine), dtype=np.int64)             # 0 outside, halves 1 and 2
         local[inside] = number + 1
         among = self.contacts(local)
         among = among[among[:, 0] > 0] - 1
         half = agglomerate(s.moments(local)[1:], among, 2)[number]
-        within = (label[s.pairs] == part).all(axis=1)
+        within = mine[s.pairs].all(axis=1)
         pairs, lengths = np.searchsorted(inside, s.pairs[within]), s.pair_lengths[within]
         weights = s.face_weights[inside]
         for _ in range(4):
             if np.bincount(half, weights, 2).min() < self.config.smallest:
-                return label, 0.0
+                return np.zeros_like(mine), 0.0
             local[inside] = half + 1
             moments = s.moments(local)[1:]
             motions = fit_motions(moments)
             costs = s.face_costs(motions)[inside]
             half = relabel(costs, pairs, self.prices(motions, weights.sum(), lengths), half, rounds=2)
             half = keep_connected(costs, pairs, weights, half)
-        cut = label.copy()
-        cut[inside[half == 1]] = label.max() + 1
-        return cut, float(self._apart(moments, np.array([[0, 1]]))[0])
+        cut = np.zeros_like(mine)
+        cut[inside[half == 1]] = True
+        gains = self._next_gains(local, first=1)[1:]
+        return cut, float(self._apart(moments, np.array([[0, 1]]), gains)[0][0])
 
-    def _apart(self, moments: Moments, pairs: np.ndarray) -> np.ndarray:
-        floor = self.floor * moments.w[pairs].sum(axis=1)
-        two = fit_motions(moments).cost[pairs].sum(axis=1)
-        return (union_costs(moments, pairs) + floor) / (two + floor)
+    def _apart(self, moments: Moments, pairs: np.ndarray, gains: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        share = moments.w[pairs]
+        cost = fit_motions(moments).cost[pairs].sum(axis=1)
+        extra = np.maximum(union_costs(moments, pairs) - cost, 0)
+        ratio = 1 + extra / (cost + self.floor * share.sum(axis=1))
+        smaller = np.take_along_axis(pairs, share.argmin(axis=1)[:, None], axis=1)[:, 0]
+        return np.sqrt(ratio * extra / (gains[smaller] + self.floor * moments.w[smaller])), extra
 
 
 def find_parts(search: PartSearch,
