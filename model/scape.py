@@ -1,6 +1,7 @@
 """The body model: pose and shape to vertices."""
 from __future__ import annotations
 
+import importlib.metadata
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -176,7 +177,7 @@ class ScapeModel:
             "shape_total_variance": np.array(self.shape_space.total_variance),
             "pose_mean": self.pose_mean, "pose_covariance": self.pose_covariance}
         header = {"units": {"length": "metre", "angle": "radian", "betas": "standard deviation"},
-                  "names": list(self.skeleton.names), "info": self.info}
+                  "versions": _versions(), "names": list(self.skeleton.names), "info": self.info}
         storage.save(path, self.kind, VERSION, arrays, header)
 
     @staticmethod
@@ -198,6 +199,15 @@ class ScapeModel:
                               a["pose_mean"], a["pose_covariance"], header["info"])
         except (KeyError, ValueError, IndexError) as error:
             raise storage.StorageError(f"{path}: the model lacks or has a damaged part ({error})") from None
+
+
+def _versions() -> dict[str, str]:
+    """What wrote the file."""
+    try:
+        ours = importlib.metadata.version("scapekit")
+    except importlib.metadata.PackageNotFoundError:
+        ours = "not installed"
+    return {"scapekit": ours, "numpy": np.__version__}
 
 
 def load_model(path: str | Path) -> ScapeModel:
