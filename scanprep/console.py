@@ -52,15 +52,40 @@ class Outcome:
 
 @contextlib.contextmanager
 def bar(what: str) -> Iterator[Progress]:
-    """A progress bar on standard error; yields the callback that moves it."""
+    """A progress bar on standard error that appears with its first news; yields the callback that moves it.
+
+    Bars that are open at the same time stand below each other.
+    """
+    with _display() as shown:
+        task = shown.add_task(what, total=None, start=False, visible=False)
+
+        def tell(done: int, total: int) -> None:
+            shown.start_task(task)
+            shown.update(task, completed=done, total=total, visible=True)
+
+        yield tell
+
+
+_open_displays: list[Any] = []
+
+
+@contextlib.contextmanager
+def _display() -> Iterator[Any]:
+    """The display of the bars that are open now, or a new one."""
     from rich import progress
     from rich.console import Console
 
+    if _open_displays:
+        yield _open_displays[-1]
+        return
     columns = (progress.TextColumn("{task.description:<34}"), progress.BarColumn(), progress.MofNCompleteColumn(),
                progress.TimeElapsedColumn(), progress.TextColumn("left"), progress.TimeRemainingColumn())
     with progress.Progress(*columns, console=Console(stderr=True)) as shown:
-        task = shown.add_task(what, total=None)
-        yield lambda done, total: shown.update(task, completed=done, total=total)
+        _open_displays.append(shown)
+        try:
+            yield shown
+        finally:
+            _open_displays.pop()
 
 
 def say(text: str) -> None:
