@@ -3,6 +3,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, fields
+from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
@@ -204,6 +205,11 @@ def embedded_dataset(folder: str | Path, seed: int = 0, subject_poses: int = 20,
     return out
 
 
+@lru_cache(maxsize=1)
+def _person(shape: BodyShape) -> Person:
+    return Person(shape)
+
+
 def _embedded_scan(folder: Path, seed: int, k: int, is_pose: bool, config: ScannerConfig, click_error: float
                    ) -> EmbeddedScan:
     rng = np.random.default_rng([seed, int(is_pose), k])
@@ -218,7 +224,7 @@ def _embedded_scan(folder: Path, seed: int, k: int, is_pose: bool, config: Scann
                          folder / f"{name}.landmarks.json", folder / VIEWS / f"{name}.npz",
                          folder / TRUTH / f"{name}.npz")
     if not entry.path.exists():
-        truth = stand(Person(shape), pose)
+        truth = stand(_person(shape), pose)
         scanned = scan(truth.mesh, config, rng)
         write_scan(folder, name, scanned, truth, click_landmarks(truth, rng, click_error, scanned.merged.vertices))
     return entry

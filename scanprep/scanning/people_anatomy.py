@@ -145,7 +145,7 @@ class Anatomy:
         for name in ("ankle", "knee", "hip"):
             level[name] *= leg
         level["head"] = s.stature - 0.165 * self.head_scale
-        neck = (level["head"] - level["neck"]) - (0.110 - 0.006 * s.neck) * self.scale
+        neck = (level["head"] - level["neck"]) - (0.110 + 0.006 * s.neck) * self.scale
         level["neck"] += neck
         level["shoulder"] += neck
         self.arm = 1 + 0.03 * s.arm_length
