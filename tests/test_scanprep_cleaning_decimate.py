@@ -1,3 +1,6 @@
+import os
+from pathlib import Path
+
 import numpy as np
 import pytest
 from scanned_shapes import SIX, bumpy, view
@@ -7,8 +10,10 @@ from scanprep.cleaning.merge import MergeConfig
 from scanprep.cleaning.open3d_filters import MissingLibrary
 from scanprep.cleaning.remesh import triangle_quality
 from scanprep.cleaning.template import TemplateConfig, make_template
+from scanprep.geometry.files import read_mesh
 from scanprep.geometry.mesh import Mesh, template_problem
 from scanprep.geometry.surface import Surface
+from scanprep.scanning.scanner import ScannerConfig, scan
 
 
 @pytest.mark.parametrize("method", ["quadric", "even", "fast"])
@@ -100,3 +105,18 @@ def test_views_become_a_template():
     assert at.distances.mean() < 0.001
     assert (np.einsum("nd,nd->n", template.vertex_normals, shape.face_normals[at.faces]) > 0).all()
     assert np.percentile(triangle_quality(template), 1) > 0.7
+
+
+@pytest.mark.real
+def test_views_of_a_real_body_become_a_template():
+    folder = os.environ.get("SCAPEKIT_DATA")
+    if not folder:
+        pytest.skip("SCAPEKIT_DATA does not point at the real scans")
+    body = read_mesh(Path(folder) / "scape_poses" / "mesh000.ply")
+    views = scan(body, ScannerConfig(views=4, noise=0.002)).views
+    template = make_template(views, 8000, TemplateConfig(merge=MergeConfig(voxel=0.007, min_cosine=0.15)))
+    assert template.is_closed and template_problem(template) is None
+    at = Surface(body).closest(template.vertices)
+    assert at.distances.mean() < 0.002
+    assert (np.einsum("nd,nd->n", template.vertex_normals, body.face_normals[at.faces]) > 0).mean() > 0.99
+    assert template.volume == pytest.approx(body.volume, rel=0.03)

@@ -13,7 +13,7 @@ from .colors import encode
 KEY, FILL, RIM = ((-0.58, 0.62, 0.52), 1.00), ((0.85, 0.05, 0.50), 0.13), ((0.62, 0.40, -0.68), 0.50)
 SKY, BOUNCE = np.array([0.32, 0.34, 0.38]), np.array([0.20, 0.175, 0.16])
 BACK_FACE = np.array([0.30, 0.33, 0.40])      # tint of the inner side of an open surface
-SHADOW = 0.55                                 # darkest alpha on the floor
+SHADOW = 0.46                                 # darkest alpha on the floor
 
 
 @dataclass(frozen=True, eq=False)
@@ -126,7 +126,7 @@ class Scene:
         sheen = 0.07 * gloss * key_light + 0.10 * (1 - facing) ** 4 * ambient
         return color * diffuse + np.where(inner[:, None], 0, sheen), facing[:, 0]
 
-    def ground_shadow(self, origins: np.ndarray, directions: np.ndarray, cells: int = 80) -> np.ndarray:
+    def ground_shadow(self, origins: np.ndarray, directions: np.ndarray, cells: int = 64) -> np.ndarray:
         """Alpha of the shadow on the floor along each ray."""
         across = np.stack([self.axes[0], np.cross(self.vertical, self.axes[0])], axis=1)
         points = self.corners.reshape(-1, 3)
@@ -151,7 +151,7 @@ class Scene:
         """Share of the sky, and of the key light, that the scene takes from points (n, 3) of the floor plane."""
         points = across + self.floor * self.vertical
         normals = np.broadcast_to(self.vertical, points.shape)
-        sky = 1 - self._open(points, normals, sphere_directions(150), 4 * self.size)
+        sky = 1 - self._open(points, normals, sphere_directions(120), 4 * self.size)
         key = _unit(np.array(KEY[0])) @ self.axes
         key = _unit(key + max(0.0, 1.3 - float(key @ self.vertical)) * self.vertical)
         return sky + 0.40 * (1 - self._open(points, normals, cone_directions(key, 0.22, 32), 4 * self.size))

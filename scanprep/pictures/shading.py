@@ -20,7 +20,7 @@ from .sheets import png_bytes, save_png, side_by_side
 __all__ = ["Bones", "Camera", "Dots", "Solid", "color_bar", "heat", "part_colors", "part_palette", "png_bytes",
            "render", "save_png", "side_by_side"]
 
-CLAY = (0.80, 0.78, 0.755)
+CLAY = (0.79, 0.76, 0.725)
 ACCENT = (0.86, 0.24, 0.20)
 WHITE = (1.0, 1.0, 1.0)
 
