@@ -329,14 +329,15 @@ class Demo:
         return [Metric(f"model: {len(wanted)} held-out poses, mean vertex error", MM * float(np.mean(error)), "mm")]
 
     def _completion_figures(self) -> list[Metric]:
-        done, (_, _, truth) = self.completion, self.half_scan
-        surface = surface_error(done.completed, truth)
-        apart = distance(done.completed.vertices, self.truth_map.vertices(truth))
-        return [Metric("completion: vertices seen", 100 * float(done.seen.mean()), "%"),
+        done, (half, _, truth) = self.completion, self.half_scan
+        surface, wanted = surface_error(done.completed, truth), self.truth_map.vertices(truth)
+        apart = distance(done.completed.vertices, wanted)
+        seen = cKDTree(half.vertices).query(wanted)[0] < 2 * self.config.resolution
+        return [Metric("completion: vertices seen", 100 * float(seen.mean()), "%"),
                 Metric("completion: seen, distance to the true surface",
-                       MM * mean_over_area(surface, self.template, done.seen), "mm"),
+                       MM * mean_over_area(surface, self.template, seen), "mm"),
                 Metric("completion: unseen, distance of corresponding points",
-                       MM * mean_over_area(apart, self.template, ~done.seen), "mm")]
+                       MM * mean_over_area(apart, self.template, ~seen), "mm")]
 
     def _animation_figures(self) -> list[Metric]:
         motion, (_, _, bodies) = self.motion, self.walk

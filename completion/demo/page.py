@@ -73,14 +73,14 @@ def _registration(demo: Demo, page: Page) -> None:
         meshes[name] = demo.template.with_vertices(vertices)
         errors[name] = surface_error(meshes[name], demo.truths[name])
     order = sorted(names, key=lambda name: -errors[name].mean())
-    images = []
+    images: list[np.ndarray | bytes] = []
     for name in order[:4]:
         camera = look_around(demo.template, meshes[name].vertices, (25,))[0]
         scan = render(read_mesh(demo.folder / "scans" / f"{name}.ply"), camera, 300, 420)
         images.append(side_by_side([scan, render(meshes[name], camera, 300, 420),
                                     render(Solid(meshes[name], heat(errors[name], 0, FAR)), camera, 300, 420)],
                                    [name, "registered", f"{1000 * errors[name].mean():.1f} mm from the truth"]))
-    page.picture(side_by_side(images, columns=2), "the four worst; heat from 0 (light) to 10 mm (dark)")
+    page.text("The four worst, with heat from 0 (light) to 10 mm (dark).").pictures(images)
     page.table([(f.name, 1000 * f.distance, 1000 * float(errors[f.name].mean()), 100 * f.seen, f.seconds)
                 for f in sorted(demo.prepared.figures, key=lambda f: -errors[f.name].mean())],
                ("scan", "to the scan (mm)", "to the truth (mm)", "with data (%)", "time (s)"))

@@ -26,7 +26,7 @@ def side_by_side(images: Sequence[np.ndarray], labels: Sequence[str] | None = No
     Parameters
     ----------
     images : sequence of (H, W, 3) uint8
-        Of any sizes; each is centred in its cell.
+        Of any sizes; each is centred in its cell, and every row is as high as its highest picture.
     labels : sequence of str, optional
     gap : int, pixels
     columns : int, optional
@@ -50,11 +50,13 @@ def side_by_side(images: Sequence[np.ndarray], labels: Sequence[str] | None = No
     columns = min(columns or len(images), len(images))
     rows = -(-len(images) // columns)
     text = 24 if labels else 0
-    cell_h, cell_w = max(len(i) for i in images), max(i.shape[1] for i in images)
-    sheet = Image.new("RGB", (columns * (cell_w + gap) - gap, rows * (cell_h + text + gap) - gap), "white")
+    cell_w = max(i.shape[1] for i in images)
+    heights = [max(len(i) for i in images[r * columns:(r + 1) * columns]) for r in range(rows)]
+    tops = np.concatenate([[0], np.cumsum([h + text + gap for h in heights])])
+    sheet = Image.new("RGB", (columns * (cell_w + gap) - gap, int(tops[-1]) - gap), "white")
     draw = ImageDraw.Draw(sheet)
     for number, image in enumerate(images):
-        x, y = (number % columns) * (cell_w + gap), (number // columns) * (cell_h + text + gap)
+        x, y, cell_h = (number % columns) * (cell_w + gap), int(tops[number // columns]), heights[number // columns]
         h, w = image.shape[:2]
         picture = Image.fromarray(image)
         place = (x + (cell_w - w) // 2, y + (cell_h - h) // 2)
