@@ -11,12 +11,14 @@ from scanprep.geometry import storage
 from scanprep.geometry.files import read_mesh
 from scanprep.pictures.animation import animated_glb
 from scanprep.pictures.page import Page
-from scanprep.pictures.shading import Solid, heat, render, side_by_side
+from scanprep.pictures.shading import Shape, Solid, heat, part_colors, render, side_by_side
 from scanprep.pictures.sheets import save_png
 from scanprep.pictures.views import look_around, upright
 
 from ..report import (
+    COMPLETED,
     HEIGHT,
+    MEASURED,
     animated_picture,
     chart_residuals,
     picture_completion,
@@ -30,7 +32,7 @@ FAR = 0.01                 # metres at the end of the heat maps
 
 
 def write_page(demo: Demo, metrics: list[Metric], tell: Callable[[int, int], None]) -> None:
-    """Write `report.html`, the animated GLB and the pictures for the README into the folder of the demo."""
+    """Write `report.html`, the animated GLB and `overview.png` into the folder of the demo."""
     page = Page("From raw scans to a moving person",
                 "Every stage of the chain on embedded people, whose true shape, pose and correspondence are known.")
     page.table([(m.name, m.text(), m.unit) for m in metrics], ("against the ground truth", "value", "unit"))
@@ -38,7 +40,32 @@ def write_page(demo: Demo, metrics: list[Metric], tell: Callable[[int, int], Non
     for i, stage in enumerate(stages):
         stage(demo, page)
         tell(i + 1, len(stages))
+    save_png(demo.folder / "overview.png", overview(demo))
     page.write(demo.folder / "report.html")
+
+
+def overview(demo: Demo, height: int = 400) -> np.ndarray:
+    """The chain in one row of pictures: scan, registration, parts, body shapes, completion, animation."""
+    template, model, done = demo.template, demo.model, demo.completion
+    name = max((s.name for s in demo.scans if s.subject == "subject"), key=lambda n: np.ptp(demo.truths[n].vertices))
+    registered = template.with_vertices(demo.prepared.registered.vertices([name])[0])
+    rest = np.zeros((len(model.skeleton.parents), 3))
+    people = [template.with_vertices(model.vertices(rest, betas)) for betas in ([-1.8], [1.8])]
+    walking = demo.motion.vertices(demo.subject, np.array([0, len(demo.motion.poses) // 4]))
+    colors = np.where(done.seen[:, None], MEASURED, COMPLETED)
+    shown: list[tuple[Shape, np.ndarray, float, str]] = [
+        (read_mesh(demo.folder / "scans" / f"{name}.ply"), registered.vertices, 25, "scan"),
+        (registered, registered.vertices, 25, "registered"),
+        (Solid(template, part_colors(model.skeleton.part_of_face)), template.vertices, 0, "parts found"),
+        *((person, people[1].vertices, 15.0, "body shape") for person in people),
+        (Solid(demo.half_scan[0], MEASURED), done.completed.vertices, -30, "half a view"),
+        (Solid(done.completed, colors), done.completed.vertices, 30, "completed"),
+        *((template.with_vertices(v), v, 40.0, "animated") for v in walking)]
+    images = []
+    for shape, fits, turn, _ in shown:
+        camera = look_around(template, fits, (turn,))[0]
+        images.append(render(shape, camera, max(150, int(height * camera.width / camera.height) + 8), height))
+    return side_by_side(images, [label for *_, label in shown])
 
 
 def _scans(demo: Demo, page: Page) -> None:
