@@ -9,7 +9,7 @@ import numpy as np
 from scanprep.geometry.mesh import Mesh
 
 from .gradients import edges
-from .linear import PointOperator, _product, check_points
+from .linear import PointOperator, check_points, posed_product
 from .pose_space import JointFeatures, PoseSpace
 from .shape_space import ShapeSpace
 from .stitching import StitchingSystem
@@ -48,7 +48,7 @@ class ShapedPoints:
     def shape_jacobian(self, pose: np.ndarray) -> np.ndarray:
         """Derivative (L, 3, K) of the points with respect to betas at a pose (J, 3), metres."""
         K, _, L, _ = self.shape_basis.shape
-        by_beta = _product(self.features, self._flat, np.asarray(pose, dtype=np.float64)).reshape(3, K, L)
+        by_beta = posed_product(self.features, self._flat, np.asarray(pose, dtype=np.float64)).reshape(3, K, L)
         return by_beta.transpose(2, 0, 1)
 
     @cached_property

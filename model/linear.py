@@ -50,7 +50,7 @@ def build_basis(system: StitchingSystem, template: Mesh, pose_space: PoseSpace, 
     return system.solve(rhs.reshape(system.n_vertices, -1)).reshape(rhs.shape).transpose(1, 0, 2)
 
 
-def _checked(skeleton: Skeleton, pose: Any, trans: Any) -> tuple[np.ndarray, np.ndarray]:
+def check_pose(skeleton: Skeleton, pose: Any, trans: Any) -> tuple[np.ndarray, np.ndarray]:
     """Pose (..., J, 3) and trans (..., 3), finite and with the same leading shape."""
     pose = np.asarray(pose, dtype=np.float64)
     J = len(skeleton.parents)
@@ -64,7 +64,7 @@ def _checked(skeleton: Skeleton, pose: Any, trans: Any) -> tuple[np.ndarray, np.
     return pose, np.broadcast_to(trans, (*pose.shape[:-2], 3))
 
 
-def _product(features: JointFeatures, flat: np.ndarray, pose: np.ndarray) -> np.ndarray:
+def posed_product(features: JointFeatures, flat: np.ndarray, pose: np.ndarray) -> np.ndarray:
     """(..., 3, L) of Σ δ T Rᵀ for `flat` (3A, L) and poses (..., J, 3): one matrix product."""
     R = features.skeleton.part_rotations(pose)[..., features.part, :, :]
     W = np.moveaxis(features.evaluate(pose)[..., None, None] * R, -3, -2)     # (..., i, a, j)
@@ -111,8 +111,8 @@ class PointOperator:
         -------
         (L, 3) or (B, L, 3) float, metres
         """
-        pose, trans = _checked(self.features.skeleton, pose, trans)
-        return np.swapaxes(_product(self.features, self._flat, pose), -1, -2) + (self.origin + trans)[..., None, :]
+        pose, trans = check_pose(self.features.skeleton, pose, trans)
+        return np.swapaxes(posed_product(self.features, self._flat, pose), -1, -2) + (self.origin + trans)[..., None, :]
 
     def jacobian(self, pose: np.ndarray, trans: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
         """Positions and their derivatives with respect to the pose parameters.
@@ -130,7 +130,7 @@ class PointOperator:
         positions : (L, 3) or (B, L, 3) float, metres
         d_pose : (L, 3, 3J) or (B, L, 3, 3J) float, metres per radian
         """
-        pose, trans = _checked(self.features.skeleton, pose, trans)
+        pose, trans = check_pose(self.features.skeleton, pose, trans)
         if pose.ndim == 3:
             each = [self.jacobian(p, t) for p, t in zip(pose, trans, strict=True)]
             return np.stack([y for y, _ in each]), np.stack([d for _, d in each])
@@ -206,8 +206,8 @@ class Subject:
         -------
         (N, 3) or (B, N, 3) float of the subject's dtype, metres
         """
-        poses, trans = _checked(self.skeleton, poses, trans)
-        y = _product(self.features, self._flat, poses)
+        poses, trans = check_pose(self.skeleton, poses, trans)
+        y = posed_product(self.features, self._flat, poses)
         y += (self.origin + trans)[..., None].astype(y.dtype)
         return np.swapaxes(y, -1, -2)
 

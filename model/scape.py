@@ -15,7 +15,7 @@ from scanprep.skeleton.tree import Skeleton
 
 from .bilinear import ShapedPoints, build_shaped_points
 from .gradients import edges
-from .linear import Subject, _checked, build_basis
+from .linear import Subject, build_basis, check_pose
 from .pose_space import JointFeatures, PoseSpace
 from .shape_space import ShapeSpace
 from .stitching import StitchingSystem
@@ -99,7 +99,7 @@ class ScapeModel:
 
         [SCAPE] Eq. 6, Eq. 9
         """
-        pose, trans = _checked(self.skeleton, pose, trans)
+        pose, trans = check_pose(self.skeleton, pose, trans)
         S = self.shape_space.gradients(betas)
         out = np.empty((*pose.shape[:-2], *self.template.vertices.shape))
         for b in np.ndindex(*pose.shape[:-2]):
@@ -155,7 +155,7 @@ class ScapeModel:
         -------
         (L, 3, K) float, metres per standard deviation
         """
-        pose, _ = _checked(self.skeleton, pose, trans)
+        pose, _ = check_pose(self.skeleton, pose, trans)
         R, posed = self._posed(pose)
         U = self.shape_space.components.astype(np.float64)
         if not len(U):
