@@ -17,7 +17,8 @@ class ScannerConfig:
     ----------
     views : number of cameras, evenly spaced around the vertical
     distance : of the cameras from the middle of the body, metres
-    height : of the cameras above the middle of the body, metres; every other one as far below it
+    height : of the cameras above the middle of the body, metres; every other one as far below it,
+        but above the feet
     azimuth : direction of the first camera from the front (-y) towards the left (+x), degrees
     resolution : spacing of the rays at the middle of the body, metres
     noise : standard deviation along the ray, metres
@@ -36,9 +37,9 @@ class ScannerConfig:
 
     views: int = 4
     distance: float = 2.5
-    height: float = 0.6
+    height: float = 1.2
     azimuth: float = 45.0
-    resolution: float = 0.0064
+    resolution: float = 0.0059
     noise: float = 0.002
     grazing: float = 12.0
     dropout: float = 0.005
@@ -167,6 +168,7 @@ def _view(mesh: Mesh, rays: Rays, config: ScannerConfig, number: int, rng: np.ra
     azimuth = np.radians(config.azimuth + 360.0 * number / config.views)
     lift = config.height * (1 if number % 2 == 0 else -1)
     camera = middle + [config.distance * np.sin(azimuth), -config.distance * np.cos(azimuth), lift]
+    camera[2] = max(camera[2], low[2] + 0.1)
     T = camera_pose(middle, camera)
     focal = config.distance / config.resolution
     local = (mesh.vertices - camera) @ T[:3, :3]
