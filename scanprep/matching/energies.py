@@ -10,10 +10,9 @@ from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
-from scipy.sparse import bsr_array, coo_array, csc_array, csr_array, diags_array
+from scipy.sparse import bsr_array, coo_array, csc_array, csr_array
 
 from ..geometry import rotations
-from ..geometry.sparse import factor
 from .graph import DeformationGraph, NodeMotion, arms
 
 UNKNOWNS = 7
@@ -89,7 +88,7 @@ class NodePattern:
         """Sum blocks (n, 7, 7) into their slots (n,)."""
         n = len(slots)
         add = csr_array(coo_array((np.ones(n), (slots, np.arange(n))), shape=(len(self.rows), n)))
-        return (add @ blocks.reshape(n, -1)).reshape(-1, UNKNOWNS, UNKNOWNS)
+        return (add @ blocks.reshape(n, UNKNOWNS**2)).reshape(-1, UNKNOWNS, UNKNOWNS)
 
     def matrix(self, blocks: np.ndarray) -> csc_array:
         """The sparse symmetric matrix of all blocks."""
@@ -181,9 +180,9 @@ class DataTerm:
         flat = J.reshape(n, 3, K * UNKNOWNS)
         force = np.matmul(self.A, self.x[..., None])[..., 0] - self.b
         normal = np.matmul(flat.transpose(0, 2, 1), np.matmul(self.A, flat)).reshape(n, K, UNKNOWNS, K, UNKNOWNS)
-        per_node = np.matmul(flat.transpose(0, 2, 1), force[..., None]).reshape(-1, UNKNOWNS)
+        per_node = np.matmul(flat.transpose(0, 2, 1), force[..., None]).reshape(n * K, UNKNOWNS)
         return (pattern.gather(pattern.vertex_slots[self.active].reshape(-1),
-                               normal.transpose(0, 1, 3, 2, 4).reshape(-1, UNKNOWNS, UNKNOWNS)),
+                               normal.transpose(0, 1, 3, 2, 4).reshape(n * K * K, UNKNOWNS, UNKNOWNS)),
                 _sum_to(self.carriers.reshape(-1), per_node, pattern.nodes))
 
 
@@ -246,63 +245,3 @@ def growth_term(graph: DeformationGraph, motion: NodeMotion, stiffness: float) -
 def _sum_to(index: np.ndarray, values: np.ndarray, count: int) -> np.ndarray:
     n = len(index)
     return csr_array(coo_array((np.ones(n), (index, np.arange(n))), shape=(count, n))) @ values
-
-
-@dataclass(frozen=True)
-class Stiffness:
-    """How much the nodes resist, each in metres of distance to the data."""
-
-    stretch: float
-    bend: float
-    growth: float
-
-
-def terms(graph: DeformationGraph, motion: NodeMotion, wanted: Pull, stiffness: Stiffness) -> dict[str, Term]:
-    """All terms of the energy at one state."""
-    return {"data": data_term(graph, motion, wanted),
-            "stretch": stretch_term(graph, motion, stiffness.stretch),
-            "bend": bend_term(graph, motion, stiffness.bend),
-            "growth": growth_term(graph, motion, stiffness.growth)}
-
-
-@dataclass(frozen=True, eq=False)
-class Descent:
-    """The end of a minimisation: the motion, the energy of each term, steps taken, whether it settled."""
-
-    motion: NodeMotion
-    energies: dict[str, float]
-    iterations: int
-    converged: bool
-
-
-def minimise(graph: DeformationGraph, pattern: NodePattern, motion: NodeMotion, wanted: Pull, stiffness: Stiffness,
-             iterations: int, tolerance: float = 1e-4) -> Descent:
-    """Levenberg-Marquardt over the motion of all nodes.
-
-    Parameters
-    ----------
-    tolerance : float
-        Relative decrease of the energy below which it has settled.
-    """
-    damping, done, settled = 1e-5, 0, False
-    now = terms(graph, motion, wanted, stiffness)
-    value = sum(term.value for term in now.values())
-    while done < iterations and not settled and damping < 1e3:
-        normal = [term.normal(pattern) for term in now.values()]
-        H = pattern.matrix(np.sum([blocks for blocks, _ in normal], axis=0))
-        gradient = np.sum([half for _, half in normal], axis=0).reshape(-1)
-        diagonal = H.diagonal()
-        for _ in range(8):
-            added = damping * diagonal + 1e-9 * diagonal.max()
-            step = -factor(H + csc_array(diags_array(added)))(gradient).reshape(-1, UNKNOWNS)
-            trial = motion.moved(step)
-            ahead = terms(graph, trial, wanted, stiffness)
-            ahead_value = sum(term.value for term in ahead.values())
-            if ahead_value <= value:
-                break
-            damping = max(damping, 1e-5) * 10
-        else:
-            break
-        settled = value - ahead_value <= tolerance * value
-        motion, now, value, damping, done = trial, ahead, ahead_value, damping / 5, done + 1
-    return Descent(motion, {name: term.value for name, term in now.items()}, done, settled)

@@ -101,10 +101,10 @@ def deform(graph: DeformationGraph, motion: NodeMotion) -> np.ndarray:
     return np.matmul(blended[..., :3], graph.rest[..., None])[..., 0] + blended[..., 3]
 
 
-def turn(graph: DeformationGraph, motion: NodeMotion, normals: np.ndarray) -> np.ndarray:
-    """Normals of the template's vertices (N, 3) after the turns of their nodes; not of unit length."""
-    blended = np.einsum("nk,nkc->nc", graph.weights, motion.R.reshape(-1, 9)[graph.carriers]).reshape(-1, 3, 3)
-    return np.matmul(blended, normals[..., None])[..., 0]
+def vertex_linear(graph: DeformationGraph, motion: NodeMotion) -> np.ndarray:
+    """(N, 3, 3) turn and growth around every vertex, blended from its nodes."""
+    blended = np.einsum("nk,nkc->nc", graph.weights, motion.linear.reshape(-1, 9)[graph.carriers])
+    return blended.reshape(-1, 3, 3)
 
 
 def carry_over(old: DeformationGraph, motion: NodeMotion, new: DeformationGraph) -> NodeMotion:

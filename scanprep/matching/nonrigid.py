@@ -15,105 +15,13 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..geometry.mesh import Mesh, check_template
-from .energies import NodePattern, Pull, Stiffness, minimise, pull
-from .graph import build_graph, carry_over, deform, start, turn
+from .descent import Stiffness, minimise
+from .energies import NodePattern, Pull, pull
+from .graph import build_graph, carry_over, deform, start, vertex_linear
 from .matches import Matching, Target, match_both_ways, target_of, thin
 from .rigid import align_landmarks, align_rigid
-from .shell import Shell
-
-
-@dataclass(frozen=True)
-class GraphStage:
-    """One stage of the coarse registration. Lengths are multiples of the template's size, √area.
-
-    Attributes
-    ----------
-    nodes : int
-        Nodes of the graph.
-    stretch, bend, growth : float
-        Resistance of the nodes, as the distance to the data that a strain, a turn by a radian between
-        neighbours, or a growth by e between them is worth.
-    landmarks : float
-        The share of the surface that one landmark weighs as much as.
-    reach : float
-        Farthest match that counts; 0 leaves the scan out.
-    slide : float
-        Force of a match along the surface, as a share of that across it.
-    rounds : int
-        Times that matches are sought anew; without matches, most steps.
-    detail : float
-        Spacing to which scan and template are thinned for matching.
-    """
-
-    nodes: int
-    stretch: float
-    bend: float
-    growth: float
-    landmarks: float
-    reach: float
-    slide: float = 0.02
-    rounds: int = 2
-    detail: float = 0.02
-
-
-@dataclass(frozen=True)
-class ShellStage:
-    """One round of the last pass. Lengths are multiples of the template's size, √area.
-
-    Attributes
-    ----------
-    smoothing : float
-        Details smaller than this are damped.
-    tension : float
-        Distance to the data that a gradient of one is worth.
-    landmarks, reach, slide : float
-        As in `GraphStage`.
-    """
-
-    smoothing: float
-    tension: float
-    landmarks: float
-    reach: float
-    slide: float = 0.02
-
-
-@dataclass(frozen=True)
-class RegistrationConfig:
-    """Settings of `register`.
-
-    Attributes
-    ----------
-    graph : stages of the coarse registration
-    shell : rounds of the last pass
-    neighbours : int
-        Points of the scan over which its normals are averaged.
-    normal_weight : float
-        Distance, as a multiple of the template's size, that a difference of normals of one is worth when
-        matching.
-    settled : float
-        Converged when the last round moves the mean vertex by less than this multiple of the size.
-    """
-
-    graph: tuple[GraphStage, ...] = (
-        GraphStage(300, 0.7, 0.07, 2.0, 0.001, 0.0, rounds=20),
-        GraphStage(300, 0.7, 0.07, 2.0, 0.1, 0.0, rounds=20),
-        GraphStage(300, 0.7, 0.07, 2.0, 10.0, 0.0, rounds=20),
-        GraphStage(300, 0.2, 0.02, 0.7, 0.01, 0.21),
-        GraphStage(300, 0.13, 0.013, 0.7, 0.01, 0.15),
-        GraphStage(300, 0.09, 0.009, 0.7, 0.01, 0.11),
-        GraphStage(300, 0.06, 0.006, 0.7, 0.01, 0.08),
-        GraphStage(300, 0.04, 0.004, 0.7, 0.01, 0.06),
-        GraphStage(1000, 0.04, 0.004, 0.35, 0.01, 0.05, detail=0.008),
-        GraphStage(1000, 0.025, 0.0025, 0.35, 0.01, 0.037, detail=0.008),
-        GraphStage(1000, 0.015, 0.0015, 0.35, 0.005, 0.028, detail=0.008),
-    )
-    shell: tuple[ShellStage, ...] = (
-        ShellStage(0.02, 0.007, 0.0002, 0.02),
-        ShellStage(0.015, 0.003, 0.0002, 0.015),
-    )
-    neighbours: int = 16
-    normal_weight: float = 0.04
-    settled: float = 0.001
+from .schedule import GraphStage, RegistrationConfig, ShellStage
+from .shell import Shell, flipped, unfold
 
 
 @dataclass(frozen=True, eq=False)
@@ -134,7 +42,7 @@ class Registration:
         NaN without landmarks.
     converged : bool
     iterations : int
-        Rounds over all stages.
+        Steps over all stages.
     energies : dict
         Value of each term at the end of the coarse registration, and of the data at the very end.
     flipped : int
@@ -188,7 +96,7 @@ def register(template: Mesh, scan: Mesh | np.ndarray, landmarks: tuple[np.ndarra
         fit.bend_graph(stage)
     for round_ in config.shell:
         fit.follow(round_)
-    fit.unfold()
+    fit.x = unfold(template, fit.x, vertex_linear(fit.graph, fit.motion))
     return fit.result()
 
 
@@ -200,7 +108,7 @@ class _Fit:
         self.template, self.target, self.landmarks, self.config = template, target, landmarks, config
         self.size = float(np.sqrt(template.face_areas.sum()))
         self.all = np.arange(len(template.vertices))
-        self.progress, self.done = progress, 0
+        self.progress, self.done, self.iterations = progress, 0, 0
         self.total = sum(stage.rounds for stage in config.graph) + len(config.shell)
         self.energies: dict[str, float] = {}
         self.converged = False
@@ -232,13 +140,14 @@ class _Fit:
         target = self.target.thinned(stage.detail * size)
         sample = thin(self.template.vertices, stage.detail * size)
         for _ in range(stage.rounds if stage.reach else 1):
-            wanted = held
+            wanted, steps = held, stage.rounds
             if stage.reach:
-                wanted = held + self.matches(target, sample, stage.reach, stage.slide).wanted
-            steps = 1 if stage.reach else stage.rounds
-            found = minimise(graph, self.pattern, self.motion, wanted, stiffness, steps, 1e-3)
-            self.motion, self.energies = found.motion, found.energies
-            self._advance(deform(graph, self.motion), steps)
+                wanted, steps = held + self.matches(target, sample, stage.reach, stage.slide).wanted, 1
+            if wanted.A.any():
+                found = minimise(graph, self.pattern, self.motion, wanted, stiffness, steps, 1e-3)
+                self.motion, self.energies = found.motion, found.energies
+                self.iterations += found.iterations
+            self.advance(deform(graph, self.motion), steps)
 
     def refine(self, nodes: int) -> None:
         """Go on with a graph of so many nodes."""
@@ -256,7 +165,8 @@ class _Fit:
         wanted = matching.wanted + self.landmark_pull(stage.landmarks)
         x = self.shell.displaced(self.x, wanted, stage.smoothing * self.size, stage.tension * self.size)
         self.energies["shell"] = wanted.energy(x)
-        self._advance(x, 1)
+        self.iterations += 1
+        self.advance(x, 1)
 
     def matches(self, target: Target, sample: np.ndarray, reach: float, slide: float) -> Matching:
         """Matches with the template as it lies now; `reach` as a multiple of its size."""
@@ -264,6 +174,8 @@ class _Fit:
                                reach * self.size, slide, self.config.normal_weight * self.size)
 
     def result(self) -> Registration:
+        """What was found, measured against the whole scan."""
+        folded = flipped(self.template, self.x, vertex_linear(self.graph, self.motion))
         last = (self.config.shell or self.config.graph)[-1]
         matching = self.matches(self.target, self.all, last.reach, last.slide)
         seen = matching.distances[matching.seen]
@@ -273,27 +185,10 @@ class _Fit:
             landmark_rms = float(np.sqrt(np.mean(apart**2)))
         return Registration(self.template.with_vertices(self.x), matching.distances, matching.seen,
                             float(np.sqrt(np.mean(seen**2))) if len(seen) else np.nan, landmark_rms,
-                            self.converged, self.done, self.energies, int(self.flipped(self.x).sum()))
+                            self.converged, self.iterations, self.energies, int(folded.sum()))
 
-    def flipped(self, x: np.ndarray) -> np.ndarray:
-        """(F,) bool: triangles that face away from where the nodes around them have turned."""
-        turned = turn(self.graph, self.motion, self.template.vertex_normals)
-        return np.einsum("fd,fcd->f", self.template.with_vertices(x).face_normals, turned[self.template.faces]) < 0
-
-    def unfold(self) -> None:
-        """Even out the shell's displacement around flipped triangles until there is none."""
-        base = deform(self.graph, self.motion)
-        displacement = self.x - base
-        near = self.template.vertex_adjacency
-        for _ in range(20):
-            bad = np.unique(self.template.faces[self.flipped(base + displacement)])
-            if not len(bad):
-                break
-            around = np.flatnonzero(near @ np.isin(self.all, bad) + np.isin(self.all, bad))
-            displacement[around] = (near @ displacement)[around] / near.sum(axis=1)[around, None]
-        self.x = base + displacement
-
-    def _advance(self, x: np.ndarray, steps: int) -> None:
+    def advance(self, x: np.ndarray, steps: int) -> None:
+        """Take new vertices and tell of the progress."""
         self.converged = bool(np.linalg.norm(x - self.x, axis=1).mean() <= self.config.settled * self.size)
         self.x = x
         self.done += steps

@@ -1,13 +1,13 @@
-"""The last pass of a registration: the surface follows the scan, smooth where there is none."""
+"""The last pass of a registration: the surface follows the scan, smooth where there is none, and unfolds."""
 from __future__ import annotations
 
 from collections.abc import Callable
 
 import numpy as np
-from scipy.sparse import csc_array, diags_array
+from scipy.sparse import coo_array, csc_array, diags_array
 
 from ..geometry.mesh import Mesh
-from ..geometry.sparse import Factored
+from ..geometry.sparse import Factored, factor
 from .energies import Pull
 
 
@@ -49,6 +49,57 @@ class Shell:
         force = wanted.b - np.einsum("nij,nj->ni", wanted.A, start)
         return start + _conjugate_gradients(
             lambda d: smooth @ d + np.einsum("nij,nj->ni", wanted.A, d) + self._tiny * d, force, nearly.solve)
+
+
+def flipped(template: Mesh, x: np.ndarray, linear: np.ndarray) -> np.ndarray:
+    """(F,) bool: triangles of vertices (N, 3) that face away from where their surroundings (N, 3, 3) turned them."""
+    turned = np.matmul(linear, template.vertex_normals[..., None])[..., 0]
+    return np.einsum("fd,fcd->f", template.with_vertices(x).face_normals, turned[template.faces]) < 0
+
+
+def unfold(template: Mesh, x: np.ndarray, linear: np.ndarray, rounds: int = 8) -> np.ndarray:
+    """Lay small patches around flipped triangles anew, each edge as its surroundings turned it.
+
+    Parameters
+    ----------
+    x : (N, 3) float, metres
+    linear : (N, 3, 3) float
+        Turn and growth around every vertex.
+    rounds : int
+        Patches are one ring wider each round, until nothing is flipped.
+
+    Returns
+    -------
+    (N, 3) float, metres
+    """
+    a, b = template.edges.T
+    rest = template.vertices[b] - template.vertices[a]
+    wanted = np.matmul(0.5 * (linear[a] + linear[b]), rest[..., None])[..., 0]
+    for rings in range(1, rounds + 1):
+        bad = flipped(template, x, linear)
+        if not bad.any():
+            break
+        patch = np.zeros(len(x))
+        patch[template.faces[bad]] = 1
+        for _ in range(rings):
+            patch = (patch + template.vertex_adjacency @ patch > 0).astype(float)
+        x = _laid(x, patch > 0, template.edges, wanted)
+    return x
+
+
+def _laid(x: np.ndarray, free: np.ndarray, edges: np.ndarray, wanted: np.ndarray) -> np.ndarray:
+    """Vertices (N, 3) where those that are free have moved so that their edges are nearest to the wanted ones."""
+    if free.all():
+        return x
+    near = free[edges].any(axis=1)
+    e = np.arange(int(near.sum()))
+    a, b = edges[near].T
+    D = csc_array(coo_array((np.r_[np.full(len(e), -1.0), np.ones(len(e))], (np.r_[e, e], np.r_[a, b])),
+                            shape=(len(e), len(x))))
+    inside, outside = D[:, np.flatnonzero(free)], D[:, np.flatnonzero(~free)]
+    x = x.copy()
+    x[free] = factor(csc_array(inside.T @ inside))(inside.T @ (wanted[near] - outside @ x[~free]))
+    return x
 
 
 def _conjugate_gradients(apply: Callable[[np.ndarray], np.ndarray], force: np.ndarray,

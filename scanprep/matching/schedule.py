@@ -1,0 +1,98 @@
+"""The schedule of a non-rigid registration, as data."""
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class GraphStage:
+    """One stage of the coarse registration. Lengths are multiples of the template's size, √area.
+
+    Attributes
+    ----------
+    nodes : int
+        Nodes of the graph.
+    stretch, bend, growth : float
+        Resistance of the nodes, as the distance to the data that a strain, a turn by a radian between
+        neighbours, or a growth by e between them is worth.
+    landmarks : float
+        The share of the surface that one landmark weighs as much as.
+    reach : float
+        Farthest match that counts; 0 leaves the scan out.
+    slide : float
+        Force of a match along the surface, as a share of that across it.
+    rounds : int
+        Times that matches are sought anew; without matches, most steps.
+    detail : float
+        Spacing to which scan and template are thinned for matching.
+    """
+
+    nodes: int
+    stretch: float
+    bend: float
+    growth: float
+    landmarks: float
+    reach: float
+    slide: float = 0.02
+    rounds: int = 2
+    detail: float = 0.02
+
+
+@dataclass(frozen=True)
+class ShellStage:
+    """One round of the last pass. Lengths are multiples of the template's size, √area.
+
+    Attributes
+    ----------
+    smoothing : float
+        Details smaller than this are damped.
+    tension : float
+        Distance to the data that a gradient of one is worth.
+    landmarks, reach, slide : float
+        As in `GraphStage`.
+    """
+
+    smoothing: float
+    tension: float
+    landmarks: float
+    reach: float
+    slide: float = 0.02
+
+
+@dataclass(frozen=True)
+class RegistrationConfig:
+    """Settings of `register`.
+
+    Attributes
+    ----------
+    graph : stages of the coarse registration
+    shell : rounds of the last pass
+    neighbours : int
+        Points of the scan over which its normals are averaged.
+    normal_weight : float
+        Distance, as a multiple of the template's size, that a difference of normals of one is worth when
+        matching.
+    settled : float
+        Converged when the last round moves the mean vertex by less than this multiple of the size.
+    """
+
+    graph: tuple[GraphStage, ...] = (
+        GraphStage(300, 0.7, 0.07, 2.0, 0.001, 0.0, rounds=20),
+        GraphStage(300, 0.7, 0.07, 2.0, 0.1, 0.0, rounds=20),
+        GraphStage(300, 0.7, 0.07, 2.0, 10.0, 0.0, rounds=20),
+        GraphStage(300, 0.2, 0.02, 0.7, 0.01, 0.21),
+        GraphStage(300, 0.13, 0.013, 0.7, 0.01, 0.15),
+        GraphStage(300, 0.09, 0.009, 0.7, 0.01, 0.11),
+        GraphStage(300, 0.06, 0.006, 0.7, 0.01, 0.08),
+        GraphStage(300, 0.04, 0.004, 0.7, 0.01, 0.06),
+        GraphStage(1000, 0.04, 0.004, 0.35, 0.01, 0.05, detail=0.008),
+        GraphStage(1000, 0.025, 0.0025, 0.35, 0.01, 0.037, detail=0.008),
+        GraphStage(1000, 0.015, 0.0015, 0.35, 0.005, 0.028, detail=0.008),
+    )
+    shell: tuple[ShellStage, ...] = (
+        ShellStage(0.02, 0.007, 0.0002, 0.02),
+        ShellStage(0.015, 0.003, 0.0002, 0.015),
+    )
+    neighbours: int = 16
+    normal_weight: float = 0.04
+    settled: float = 0.001
