@@ -83,9 +83,8 @@ def _vertices() -> dict[str, int]:
 
 def landmarks() -> dict[str, int]:
     """Name -> vertex of the anatomical landmarks."""
-    names = [name for name in _points() if name != "{} forehead"]
-    stop = list(_points()).index("{} forehead")
-    names = list(_points())[:stop]
+    names = list(_points())
+    names = names[:names.index("{} forehead")]
     return {full: _vertices()[full] for name in names
             for full in ([name.format("left"), name.format("right")] if "{}" in name else [name])}
 

@@ -45,8 +45,8 @@ def polygonise(field: Field, low: np.ndarray, high: np.ndarray, step: float) -> 
                                          int(n[2]),
                                          0.0)[:2]
     mesh = Mesh(vertices, np.asarray(faces, dtype=np.int64))
-    _, gradient_sign = mesh.face_normals, field(mesh.corners.mean(axis=1) + 1e-3 * mesh.face_normals)
-    return mesh if np.median(gradient_sign) > 0 else Mesh(vertices, mesh.faces[:, ::-1])
+    outside = field(mesh.corners.mean(axis=1) + 1e-3 * mesh.face_normals)
+    return mesh if np.median(outside) > 0 else Mesh(vertices, mesh.faces[:, ::-1])
 
 
 def remesh(mesh: Mesh, field: Field, sizing: Sizing, rounds: int = 12) -> Mesh:
@@ -178,7 +178,7 @@ def _flip(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
             new = np.array([[c, a, d], [c, d, b]])
             corner = vertices[new]
             n = np.cross(corner[:, 1] - corner[:, 0], corner[:, 2] - corner[:, 0])
-            if (n @ (normals[f] + normals[g]) <= 1e-9 * 0).any() or np.einsum("i,i->", n[0], n[1]) <= 0:
+            if (n @ (normals[f] + normals[g]) <= 0).any() or np.einsum("i,i->", n[0], n[1]) <= 0:
                 continue
             faces[f], faces[g] = new
             joined.add((min(c, d), max(c, d)))

@@ -148,8 +148,8 @@ def blending() -> tuple[np.ndarray, np.ndarray]:
     a, b = mesh.edges.T
     width = _blend_width(template)
     results = []
-    for factor_ in (1.3, 1.0):
-        w = (factor_ * 0.5 * (width[a] + width[b]) / mesh.edge_lengths)**2 / 6
+    for spread in (1.3, 1.0):
+        w = (spread * 0.5 * (width[a] + width[b]) / mesh.edge_lengths)**2 / 6
         A = csr_array((np.r_[w, w], (np.r_[a, b], np.r_[b, a])), shape=(n, n))
         solve = factor((diags_array(1 + A.sum(axis=1)) - A).tocsc())
         weights = solve(solve(share))
