@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.surface import OrientedPoints
 
 from . import energy
@@ -18,6 +19,7 @@ from .sight import find_sight
 from .solve import MinimiseConfig, minimise
 from .starts import distinct, search
 
+SETTLED = 5e-4                       # metres, root mean square over the vertices from round to round
 DOUBT = 0.015                        # share of scan or body that may be in the wrong place for no reason
 PROMISING = 30.0                     # a limb drawn at random may be this much worse before it is fitted
 
@@ -83,7 +85,7 @@ class CompletionConfig:
     evidence: float = 400.0
     prior_weight: float = 1.0
     prior_shrinkage: float = 0.3
-    start_axes: int = 6
+    start_axes: int = 4
     candidates: int = 3
     reach: float = 0.2
     final_reach: float = 0.03
@@ -130,6 +132,10 @@ class ScanFit:
         self.contact = Contact(body.skeleton, self.part[self.spread])
         self.rng = np.random.default_rng(config.seed)
 
+    def mesh(self, x: np.ndarray) -> Mesh:
+        """The predicted mesh of unknowns (P,)."""
+        return self.body.template.with_vertices(self.body.vertices(x))
+
     def from_landmarks(self) -> np.ndarray:
         """The likeliest bodies (n, P) that meet the landmarks, distinct and best first."""
         body, config = self.body, self.config
@@ -173,15 +179,15 @@ class ScanFit:
 
     def doubtful(self, x: np.ndarray) -> bool:
         """Whether more than a little of the scan is unexplained, or of the body where nothing can be."""
-        mesh = self.body.template.with_vertices(self.body.vertices(x))
+        mesh = self.mesh(x)
         found = OrientedPoints(mesh.vertices, mesh.vertex_normals).match(self.thin.points, self.thin.normals, 0.05,
                                                                          self.config.min_cosine)
-        return bool((~found.valid).mean() > DOUBT or len(self.trespasses(x)[0]) > DOUBT * len(self.spread))
+        return bool((~found.valid).mean() > DOUBT or len(self.trespasses(mesh)[0]) > DOUBT * len(self.spread))
 
     def misfit(self, x: np.ndarray, cap: float = 0.05) -> float:
         """How badly a body explains scan and landmarks, for the choice between starts."""
         config = self.config
-        mesh = self.body.template.with_vertices(self.body.vertices(x))
+        mesh = self.mesh(x)
         found = OrientedPoints(mesh.vertices, mesh.vertex_normals).match(self.thin.points, self.thin.normals, cap,
                                                                          config.min_cosine)
         apart = (np.minimum(found.distances, cap)**2).mean()
@@ -198,23 +204,24 @@ class ScanFit:
                     ) -> tuple[np.ndarray, bool, int, dict[str, float]]:
         """Unknowns after rounds of matching with shrinking reach, whether they settled, rounds, energies."""
         config = self.config
-        shift = np.inf
+        shift, place = np.inf, self.mesh(x).vertices
         energies: dict[str, float] = {}
         reaches = np.geomspace(config.reach, config.final_reach, config.rounds)
         for i, reach in enumerate([*reaches, *[config.final_reach] * 6]):
-            before = x
             x, energies = self.step(x, self.thin, reach)
-            shift = np.abs(x[:-3] - before[:-3]).max()
+            before, place = place, self.mesh(x).vertices
+            shift = float(np.sqrt(((place - before)**2).sum(axis=1).mean()))
             tell(min(i + 1, config.rounds))
-            if i >= config.rounds and shift < 2e-3:
+            if i >= config.rounds and shift < SETTLED:
                 break
-        return x, bool(shift < 1e-2), i + 1, energies
+        return x, bool(shift < 2 * SETTLED), i + 1, energies
 
     def step(self, x: np.ndarray, scan: ScanPoints, reach: float) -> tuple[np.ndarray, dict[str, float]]:
         """One matching and the best unknowns (P,) for it, and the energies there."""
         body, config = self.body, self.config
-        ids, target, normal, weights = self.matches(x, scan, reach)
-        out_ids, out_target, out_normal, out_weights = self.trespasses(x)
+        mesh = self.mesh(x)
+        ids, target, normal, weights = self.matches(mesh, scan, reach)
+        out_ids, out_target, out_normal, out_weights = self.trespasses(mesh)
         follow = body.follow(np.concatenate([self.vertices, ids, out_ids]), x)
         count, end = len(self.vertices), len(self.vertices) + len(ids)
         held = np.full(len(x), config.twist_weight)
@@ -236,10 +243,9 @@ class ScanFit:
         names = ("landmarks", "pose_prior", "shape_prior", "scan_planes", "scan_points", "trespass", "twists")
         return best[0], {n: float(r.energy[0]) for n, r in zip(names, energies(best), strict=True)}
 
-    def matches(self, x: np.ndarray, scan: ScanPoints, reach: float) -> tuple[np.ndarray, ...]:
+    def matches(self, mesh: Mesh, scan: ScanPoints, reach: float) -> tuple[np.ndarray, ...]:
         """Vertices, scan points, their normals and weights, by closest points both ways."""
         config = self.config
-        mesh = self.body.template.with_vertices(self.body.vertices(x))
         there = OrientedPoints(mesh.vertices, mesh.vertex_normals).match(scan.points, scan.normals, reach,
                                                                          config.min_cosine)
         mine = self.spread
@@ -258,13 +264,12 @@ class ScanFit:
         weights = config.evidence / config.scan_sd**2 * share * geman_mcclure(distance, max(reach / 2, 0.015))
         return ids, target, normal, weights
 
-    def trespasses(self, x: np.ndarray) -> tuple[np.ndarray, ...]:
+    def trespasses(self, mesh: Mesh) -> tuple[np.ndarray, ...]:
         """Vertices that are where nothing can be, points and normals of the planes they should reach, weights.
 
         The camera would have seen them, or another part of the body is there.
         """
         config, mine = self.config, self.spread
-        mesh = self.body.template.with_vertices(self.body.vertices(x))
         places = mesh.vertices[mine]
         found = [(config.contact_weight, self.contact.intrusions(places, mesh.vertex_normals[mine]))]
         if self.sight is not None:

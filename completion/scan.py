@@ -11,6 +11,7 @@ from scipy.spatial import cKDTree
 from scanprep.geometry.mesh import Mesh
 
 NEIGHBOURS = 16                      # points that make one normal
+COARSE = 2000                        # points that show the form at large
 WIDE = 0.12                          # metres: at this scale a body is convex enough to tell in from out
 
 
@@ -121,9 +122,10 @@ def _turn_outward(points: np.ndarray, normals: np.ndarray, near: np.ndarray, dis
         for i in order[1:]:
             if out[i] @ out[before[i]] < 0:
                 out[i] = -out[i]
-    coarse = cKDTree(points[spread(points, 2000)])
-    inside = np.array([coarse.data[c].mean(axis=0) if c else p for c, p in
-                       zip(coarse.query_ball_point(points, WIDE, workers=-1), points, strict=True)])
-    bulge = np.einsum("nd,nd->n", out, points - inside)
+    coarse = points[spread(points, COARSE)] if n > COARSE else points
+    far, around = cKDTree(coarse).query(points, 48, distance_upper_bound=WIDE, workers=-1)
+    found = np.isfinite(far)
+    total = np.where(found[:, :, None], coarse[np.where(found, around, 0)] - points[:, None], 0).sum(axis=1)
+    bulge = -np.einsum("nd,nd->n", out, total)
     sign = np.where(np.bincount(patch, bulge, patches) < 0, -1.0, 1.0)
     return out * sign[patch][:, None]

@@ -55,9 +55,11 @@ def distinct(places: np.ndarray, count: int, apart: float = 0.02) -> list[int]:
     """The first `count` of the bodies (n, L, 3) that differ from those before, by mean distance in metres."""
     kept: list[int] = []
     for i, place in enumerate(places):
-        if all(np.linalg.norm(place - places[k], axis=1).mean() > apart for k in kept):
+        if len(kept) == count:
+            break
+        if (np.linalg.norm(place - places[kept], axis=2).mean(axis=1) > apart).all():
             kept.append(i)
-    return kept[:count]
+    return kept
 
 
 def _placed(body: FixedBody, follow: Follow, targets: np.ndarray, pose: np.ndarray) -> np.ndarray:
