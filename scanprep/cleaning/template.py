@@ -26,15 +26,16 @@ class TemplateConfig:
     fill : FillConfig
     decimate : DecimateConfig
     peel : int
-        Rings of triangles removed along the borders of holes before they are filled.
+        Rings of triangles removed along the borders of holes before they are filled; takes hands and feet that
+        were seen in part with it.
     smoothing : int
-        Rounds of smoothing of the merged surface.
+        Rounds of smoothing, once before the holes are filled and once after.
     """
 
     merge: MergeConfig = field(default_factory=lambda: MergeConfig(voxel=0.005, min_cosine=0.15))
     fill: FillConfig = field(default_factory=FillConfig)
     decimate: DecimateConfig = field(default_factory=lambda: DecimateConfig(method="even"))
-    peel: int = 3
+    peel: int = 0
     smoothing: int = 8
 
 
@@ -63,10 +64,9 @@ def make_template(views: Sequence[Any], faces: int = 14000, config: TemplateConf
     tell = progress or (lambda done, total: None)
     mesh = merge_views(views, config.merge)
     tell(1, 4)
-    mesh = peel_border(smooth(repair(mesh), config.smoothing), config.peel)
-    mesh = smooth(mesh, config.smoothing)
+    mesh = peel_border(smooth(repair(mesh), config.smoothing), config.peel)      # smooth rims make fair patches
     tell(2, 4)
-    mesh = close(mesh, config.fill)
+    mesh = smooth(close(mesh, config.fill), config.smoothing)
     tell(3, 4)
     surface = Surface(mesh)
     mesh = improve_triangles(decimate(mesh, faces, config.decimate), surface)
