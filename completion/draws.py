@@ -58,6 +58,18 @@ def redrawn(body: FixedBody, x: np.ndarray, root: int, prior: GaussianPrior, cou
     return drawn
 
 
+def near_points(fit: ScanFit, x: np.ndarray, moved: np.ndarray, points: np.ndarray, count: int) -> np.ndarray:
+    """Those `count` of the bodies (n, P) whose moved parts come nearest to points (m, 3) that want explaining."""
+    ids = fit.spread[np.isin(fit.part[fit.spread], moved)][::2]
+    if len(points) < 5 or not len(ids):
+        return x[:count]
+    pose, trans, _ = fit.body.split(x)
+    places = fit.body.subject.points(ids).evaluate(pose, trans)
+    some = points[::max(1, len(points) // 40)]
+    apart = np.linalg.norm(places[:, :, None] - some, axis=3).min(axis=1)
+    return x[np.argsort((np.minimum(apart, 0.15)**2).mean(axis=1))[:count]]
+
+
 def quick_misfits(fit: ScanFit, x: np.ndarray, moved: np.ndarray | None = None, cap: float = 0.1) -> np.ndarray:
     """How badly bodies (n, P) explain the scan, on few vertices whose normals turn with their parts.
 

@@ -12,7 +12,7 @@ from scanprep.geometry.surface import OrientedPoints
 from . import energy
 from .bodies import FixedBody
 from .contact import Contact
-from .draws import around, limbs, quick_misfits, redrawn
+from .draws import around, limbs, near_points, quick_misfits, redrawn
 from .priors import GaussianPrior, gaussian_prior
 from .scan import ScanPoints, spread
 from .sight import find_sight
@@ -21,6 +21,7 @@ from .starts import distinct, search
 
 SETTLED = 5e-4                       # metres, root mean square over the vertices from round to round
 DOUBT = 0.015                        # share of scan or body that may be in the wrong place for no reason
+MANY = 6                             # times as many draws of a limb are compared with what is unexplained
 PROMISING = 30.0                     # a limb drawn at random may be this much worse before it is fitted
 
 
@@ -166,8 +167,10 @@ class ScanFit:
             return x
         best = self.misfit(x)
         for root in limbs(self.body.skeleton):
-            drawn = redrawn(self.body, x, root, self.prior, self.config.draws, self.rng)
             moved = np.flatnonzero(self.body.skeleton.descends[:, root])
+            drawn = redrawn(self.body, x, root, self.prior, MANY * self.config.draws, self.rng)
+            drawn = near_points(self, drawn, moved, self.coarse.points[self.unexplained(x, self.coarse)],
+                                self.config.draws // 2)
             quick = quick_misfits(self, np.vstack([x, drawn]), moved)
             for i in np.argsort(quick[1:])[:2]:
                 if quick[i + 1] > quick[0] + PROMISING:
@@ -177,12 +180,16 @@ class ScanFit:
                     x, best = tried, misfit
         return x
 
+    def unexplained(self, x: np.ndarray, scan: ScanPoints) -> np.ndarray:
+        """(n,) bool: points of the scan with nothing of the body near."""
+        mesh = self.mesh(x)
+        return ~OrientedPoints(mesh.vertices, mesh.vertex_normals).match(scan.points, scan.normals, 0.05,
+                                                                         self.config.min_cosine).valid
+
     def doubtful(self, x: np.ndarray) -> bool:
         """Whether more than a little of the scan is unexplained, or of the body where nothing can be."""
-        mesh = self.mesh(x)
-        found = OrientedPoints(mesh.vertices, mesh.vertex_normals).match(self.thin.points, self.thin.normals, 0.05,
-                                                                         self.config.min_cosine)
-        return bool((~found.valid).mean() > DOUBT or len(self.trespasses(mesh)[0]) > DOUBT * len(self.spread))
+        return bool(self.unexplained(x, self.thin).mean() > DOUBT
+                    or len(self.trespasses(self.mesh(x))[0]) > DOUBT * len(self.spread))
 
     def misfit(self, x: np.ndarray, cap: float = 0.05) -> float:
         """How badly a body explains scan and landmarks, for the choice between starts."""
