@@ -15,6 +15,8 @@ from .remesh import clamped_cotangents, flip_edges
 from .repair import repair, split_vertices
 from .triangulate import triangulate_loop
 
+METHODS = ("fair", "poisson-open3d", "poisson-pymeshlab")
+
 
 @dataclass(frozen=True)
 class FillConfig:
@@ -67,13 +69,15 @@ def fill_holes(mesh: Mesh, config: FillConfig | None = None,
     Raises
     ------
     ValueError
-        The mesh is empty or not manifold along its edges.
+        The mesh is empty or not manifold along its edges, or the method is unknown.
 
     [Liepa] triangulation, refinement, fairing
     """
     config = config or FillConfig()
     if not len(mesh.faces):
         raise ValueError("mesh: expected a surface with holes, got one without triangles")
+    if config.method not in METHODS:
+        raise ValueError(f"config.method: expected one of {', '.join(METHODS)}, got {config.method!r}")
     if config.method == "poisson-open3d":
         from .open3d_filters import poisson
 
