@@ -52,12 +52,12 @@ class Shell:
 
 
 def flipped(template: Mesh, x: np.ndarray, linear: np.ndarray) -> np.ndarray:
-    """(F,) bool: triangles of vertices (N, 3) that face away from where their surroundings (N, 3, 3) turned them."""
-    turned = np.matmul(linear, template.vertex_normals[..., None])[..., 0]
-    return np.einsum("fd,fcd->f", template.with_vertices(x).face_normals, turned[template.faces]) < 0
+    """(F,) bool: triangles of vertices (N, 3) that face away from where their corners (N, 3, 3) turned them."""
+    turned = np.matmul(linear[template.faces].sum(axis=1), template.face_normals[..., None])[..., 0]
+    return np.einsum("fd,fd->f", template.with_vertices(x).face_normals, turned) < 0
 
 
-def unfold(template: Mesh, x: np.ndarray, linear: np.ndarray, rounds: int = 8) -> np.ndarray:
+def unfold(template: Mesh, x: np.ndarray, linear: np.ndarray, rings: tuple[int, ...] = (1, 1, 2)) -> np.ndarray:
     """Lay small patches around flipped triangles anew, each edge as its surroundings turned it.
 
     Parameters
@@ -65,8 +65,9 @@ def unfold(template: Mesh, x: np.ndarray, linear: np.ndarray, rounds: int = 8) -
     x : (N, 3) float, metres
     linear : (N, 3, 3) float
         Turn and growth around every vertex.
-    rounds : int
-        Patches are one ring wider each round, until nothing is flipped.
+    rings : ints
+        How far patches reach around flipped triangles in each round. They stay small: where skin truly folds
+        triangles stay turned, and laying wide patches there would leave the data.
 
     Returns
     -------
@@ -75,13 +76,13 @@ def unfold(template: Mesh, x: np.ndarray, linear: np.ndarray, rounds: int = 8) -
     a, b = template.edges.T
     rest = template.vertices[b] - template.vertices[a]
     wanted = np.matmul(0.5 * (linear[a] + linear[b]), rest[..., None])[..., 0]
-    for rings in range(1, rounds + 1):
+    for reach in rings:
         bad = flipped(template, x, linear)
         if not bad.any():
             break
         patch = np.zeros(len(x))
         patch[template.faces[bad]] = 1
-        for _ in range(rings):
+        for _ in range(reach):
             patch = (patch + template.vertex_adjacency @ patch > 0).astype(float)
         x = _laid(x, patch > 0, template.edges, wanted)
     return x
