@@ -90,7 +90,7 @@ def test_left_and_right_are_mirror_images(bodies):
 def test_mirrored_pose_gives_the_mirrored_body(man):
     twin = people_template.load().mirror
     pose = people.named_pose("throw_right")
-    assert np.abs(man.posed(people.mirrored_pose(pose))[twin] * [-1, 1, 1] - man.posed(pose)).max() < 2e-3
+    assert np.abs(man.posed(people.mirrored_pose(pose))[twin] * [-1, 1, 1] - man.posed(pose)).max() < 1e-9
 
 
 def test_joints_lie_inside_the_body(bodies):

@@ -33,7 +33,7 @@ def head(a: Anatomy) -> Field:
     bun = Ellipsoid(at(0, -0.119 + 0.052 * man, 0.034), np.array([0.031, 0.029, 0.030]) * h)
     lean = np.radians(14)
     flare = np.radians(30)
-    ear_frame = np.array([[np.cos(flare), np.sin(flare), 0], [-np.sin(flare), np.cos(flare), 0], [0, 0, 1.0]])
+    ear_frame = np.array([[np.cos(flare), -np.sin(flare), 0], [np.sin(flare), np.cos(flare), 0], [0, 0, 1.0]])
     tip = np.array([[1.0, 0, 0], [0, np.cos(lean), np.sin(lean)], [0, -np.sin(lean), np.cos(lean)]])
     ear = Ellipsoid(at(0.0800, -0.010, -0.010), np.array([0.0075, 0.0185, 0.0320]) * h, ear_frame @ tip)
     parts: list[tuple[Field, float]] = [(cranium, 0), (face, 0.03 * h), (hair, 0.004 * h)]
@@ -47,7 +47,7 @@ def _face_bumps(a: Anatomy) -> list[Bump]:
     def bump(place: tuple[float, float, float], height: float, widths: tuple[float, float, float]) -> Bump:
         return Bump(a.eye + np.array([place[0], -place[1], place[2]]) * h, height * h, np.array(widths) * h)
 
-    return [bump((0.031, 0.085, 0.003), -0.0100, (0.0150, 0.03, 0.0105)),
+    return [bump((0.031, 0.085, 0.003), -0.0088, (0.0150, 0.03, 0.0105)),
             bump((0.014, 0.088, 0.001), -0.0035, (0.007, 0.02, 0.010)),
             bump((0.030, 0.088, 0.019), 0.0025 + 0.0025 * man, (0.018, 0.03, 0.0065)),
             bump((0, 0.09, 0.020), 0.001 + 0.0012 * man, (0.012, 0.03, 0.008)),

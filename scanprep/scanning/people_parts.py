@@ -139,7 +139,7 @@ def foot(a: Anatomy) -> Field:
     t, shift, half, top, bottom = (tables.FOOT * length).T
     centre, extent = (top - bottom) / 2, (top + bottom) / 2
     wide = 1 + 0.02 * a.fat
-    main = Loft(origin, frame, cross_sections(t, half * wide, half * wide, extent, extent, 2.5, shift, centre),
+    main = Loft(origin, frame, cross_sections(t, half * wide, half * wide, extent, extent, 2.8, shift, centre),
                 (0.018 * length, 0.03 * length))
     members: list[tuple[Field, float]] = [(main, 0)]
     toes = [(-0.113, 0.55, 0.745, 0.046), (-0.030, 0.55, 0.752, 0.034), (0.035, 0.53, 0.722, 0.032),

@@ -186,8 +186,17 @@ def _detail_frames(x: np.ndarray, faces: np.ndarray) -> np.ndarray:
 
 @lru_cache(maxsize=1)
 def _first_neighbour() -> np.ndarray:
-    adjacency = load().mesh.vertex_adjacency
-    return adjacency.indices[adjacency.indptr[:-1]]
+    """(N,) one neighbour of every vertex, mirror images for mirror images, on the middle line for its own."""
+    template = load()
+    twin, adjacency = template.mirror, template.mesh.vertex_adjacency
+    owner = np.repeat(np.arange(len(twin)), np.diff(adjacency.indptr))
+    middle = twin == np.arange(len(twin))
+    first = adjacency.indices[adjacency.indptr[:-1]].astype(np.int64)
+    along = middle[owner] & middle[adjacency.indices]
+    first[owner[along]] = adjacency.indices[along]
+    right = template.mesh.vertices[:, 0] < -1e-9
+    first[right] = twin[first[twin[right]]]
+    return first
 
 
 def _dual_quaternion_blend(x: np.ndarray, weights: np.ndarray, main: np.ndarray, R: np.ndarray, t: np.ndarray
