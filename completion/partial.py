@@ -84,7 +84,7 @@ def complete(body: ScapeModel | Subject, scan: Mesh | np.ndarray, landmarks: tup
     [SCAPE] Eq. 10
     """
     config = config or CompletionConfig()
-    marked = check_landmarks(landmarks, len(body.template.vertices))
+    marked = check_landmarks(landmarks, body.template)
     cloud = prepare_scan(scan, None if config.viewpoint is None else np.array(config.viewpoint))
     posed = as_body(body)
     task = ScanFit(posed, cloud, *marked, config)
@@ -105,14 +105,16 @@ def complete(body: ScapeModel | Subject, scan: Mesh | np.ndarray, landmarks: tup
                       float(np.sqrt((off**2).sum(axis=1).mean())), converged, rounds, energies)
 
 
-def check_landmarks(landmarks: tuple[np.ndarray, np.ndarray], count: int) -> tuple[np.ndarray, np.ndarray]:
+def check_landmarks(landmarks: tuple[np.ndarray, np.ndarray], template: Mesh) -> tuple[np.ndarray, np.ndarray]:
     """Landmark vertices (L,) and points (L, 3) as arrays.
 
     Raises
     ------
     ValueError
-        Fewer than 3, lists of different length, vertices that do not exist, points that are not finite.
+        Fewer than 3, lists of different length, vertices that do not exist, points that are not finite or of
+        another scale than the template.
     """
+    count = len(template.vertices)
     vertices, points = (np.asarray(part) for part in landmarks)
     if vertices.ndim != 1 or points.shape != (len(vertices), 3):
         raise ValueError(f"landmarks: expected (L,) vertices and (L, 3) points, got {vertices.shape} "
@@ -126,6 +128,10 @@ def check_landmarks(landmarks: tuple[np.ndarray, np.ndarray], count: int) -> tup
                          f"got {vertices.min()}..{vertices.max()}")
     if not np.isfinite(points).all():
         raise ValueError("landmarks: expected finite points")
+    extent, whole = (float(np.ptp(p, axis=0).max()) for p in (points, template.vertices))
+    if not whole / 100 < extent < 5 * whole:
+        raise ValueError(f"landmarks: they extend over {extent:.3g} m, the template over {whole:.3g} m; "
+                         "expected the scan in metres")
     return vertices.astype(np.int64), points.astype(np.float64)
 
 

@@ -71,6 +71,8 @@ def prepare_scan(scan: Mesh | np.ndarray, viewpoint: np.ndarray | None = None) -
         border = np.zeros(len(points), dtype=bool)
         border[scan.boundary_vertices] = True
         used = (scan.vertex_normals != 0).any(axis=1)
+        if used.sum() <= NEIGHBOURS:
+            raise ValueError(f"scan: expected more than {NEIGHBOURS} vertices with triangles, got {used.sum()}")
         return ScanPoints(points[used], scan.vertex_normals[used], border[used], spacing)
     normals = _plane_normals(points, near)
     if viewpoint is None:

@@ -15,25 +15,41 @@ if TYPE_CHECKING:
     from .animate import MarkerFollower
 
 
+WINDOW, OVERLAP = 1000, 60           # frames solved at once, and those that each side lends to its neighbour
+
+
 def smooth_sequence(follower: MarkerFollower, x: np.ndarray) -> np.ndarray:
     """One Gauss-Newton step on all frames (T, P) with constant velocity between them as prior.
 
     Unknowns are small turns of every joint from the right, `exp(pose) exp(d)`, so that nothing happens at a
-    half turn; velocities are taken as differences of these, which is exact for slow motion.
+    half turn; velocities are taken as differences of these, which is exact for slow motion. Long sequences
+    are solved in windows that overlap by more than a frame's influence reaches.
     """
-    T, P = x.shape
+    T = len(x)
     if T < 3:
         return x
+    step = np.empty_like(x)
+    for start in range(0, T, WINDOW):
+        first, last = max(0, min(start - OVERLAP, T - 3)), min(T, start + WINDOW + OVERLAP)
+        kept = slice(start - first, min(start + WINDOW, T) - first)
+        step[start:start + WINDOW] = _window_step(follower, x[first:last], np.arange(first, last))[kept]
+    pose = rotations.exp(x[:, :-3].reshape(T, -1, 3)) @ rotations.exp(step[:, :-3].reshape(T, -1, 3))
+    return np.concatenate([rotations.log(pose).reshape(T, -1), x[:, -3:] + step[:, -3:]], axis=1)
+
+
+def _window_step(follower: MarkerFollower, x: np.ndarray, frames: np.ndarray) -> np.ndarray:
+    """The step (T, P) in small turns for the unknowns (T, P) of some frames that follow each other."""
+    T, P = x.shape
     local = _local(x)
     gradient, hessian = np.empty((T, P)), np.empty((T, P, P))
     positions = follower.positions(x)
-    for t in range(T):
-        weights = follower.weights(t, positions[t])
-        at = x[t][None]
+    for i, t in enumerate(frames):
+        weights = follower.weights(t, positions[i])
+        at = x[i][None]
         terms = [energy.point_to_point(follower.follow(at), follower.targets[t], weights),
                  energy.pose_prior(at, follower.prior, follower.config.prior_weight)]
         _, g, H = normal_equations(terms)
-        gradient[t], hessian[t] = local[t].T @ g[0], local[t].T @ H[0] @ local[t]
+        gradient[i], hessian[i] = local[i].T @ g[0], local[i].T @ H[0] @ local[i]
     bend = _second_differences(x)
     D = np.array([1.0, -2.0, 1.0])
     band = np.zeros((3, T, P))                       # of a frame with itself, the next and the one after
@@ -41,9 +57,7 @@ def smooth_sequence(follower: MarkerFollower, x: np.ndarray) -> np.ndarray:
         gradient[i:T - 2 + i] += D[i] * follower.inertia * bend
         for j in range(i, 3):
             band[j - i, i:T - 2 + i] += D[i] * D[j] * follower.inertia
-    step = -_solve_banded(hessian, band, gradient)
-    pose = rotations.exp(x[:, :-3].reshape(T, -1, 3)) @ rotations.exp(step[:, :-3].reshape(T, -1, 3))
-    return np.concatenate([rotations.log(pose).reshape(T, -1), x[:, -3:] + step[:, -3:]], axis=1)
+    return -_solve_banded(hessian, band, gradient)
 
 
 def _local(x: np.ndarray) -> np.ndarray:

@@ -120,6 +120,15 @@ def test_one_smoothing_step_is_the_dense_gauss_newton_step(subject, layout, walk
     np.testing.assert_allclose(got[:, -3:] - x[:, -3:], step[:, -3:], atol=1e-5)
 
 
+def test_windows_agree_with_the_whole(subject, layout, walk, monkeypatch):
+    follower = MarkerFollower(subject, walk[1], layout, PLAIN)
+    x = np.random.default_rng(0).normal(0, 0.02, (FRAMES, 15))
+    whole = smooth_sequence(follower, x)
+    monkeypatch.setattr("completion.smooth.WINDOW", 20)
+    monkeypatch.setattr("completion.smooth.OVERLAP", 15)
+    assert np.abs(smooth_sequence(follower, x) - whole).max() < 0.02 * np.abs(whole - x).max()
+
+
 def test_markers_sit_where_the_layout_places_them(subject, layout, walk):
     _, sequence = walk
     follower = MarkerFollower(subject, sequence, layout, PLAIN)

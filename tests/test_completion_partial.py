@@ -113,6 +113,7 @@ def test_a_scan_turned_and_moved_gives_the_body_turned_and_moved(model, known):
     (lambda v, p: (np.r_[v[:6], 9999], p), "expected vertices of 0..397"),
     (lambda v, p: (v, p[:5]), "expected .L,. vertices and .L, 3. points"),
     (lambda v, p: (v.astype(float), p), "expected vertex numbers"),
+    (lambda v, p: (v, 1000 * p), "expected the scan in metres"),
     (lambda v, p: (v, np.where(np.arange(7)[:, None] == 3, np.nan, p)), "expected finite points"),
 ])
 def test_landmarks_that_cannot_be_used_are_refused(model, known, change, message):
