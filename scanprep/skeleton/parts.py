@@ -67,6 +67,7 @@ class PartSearch:
         self.width = config.smoothness * BORDER_WIDTH / np.sqrt(surface.area)
         self.patch = cover(surface, min(config.patches, len(surface.face_weights)))
         self._cuts: dict[bytes, tuple[np.ndarray, float]] = {}
+        self._gains: dict[bytes, float] = {}
 
     def motions(self, label: np.ndarray) -> Motions:
         """Rigid motions of the parts (the M-step)."""
@@ -115,17 +116,20 @@ class PartSearch:
     def _next_gains(self, label: np.ndarray, first: int = 0) -> np.ndarray:
         """(P,) square metres: what each part from `first` on would gain by its best cut along the patches."""
         P, K = int(label.max()) + 1, int(self.patch.max()) + 1
-        used, piece = np.unique(label * K + self.patch, return_inverse=True)
-        moments, contacts = self.surface.moments(piece), self.contacts(piece)
-        gains = np.zeros(P)
-        for part in range(first, P):
+        keys = [np.packbits(label == part).tobytes() for part in range(first, P)]
+        if any(key not in self._gains for key in keys):
+            used, piece = np.unique(label * K + self.patch, return_inverse=True)
+            moments, contacts = self.surface.moments(piece), self.contacts(piece)
+        for part, key in enumerate(keys, first):
+            if key in self._gains:
+                continue
             mine = np.flatnonzero(used // K == part)
             among = contacts[((contacts >= mine[0]) & (contacts <= mine[-1])).all(axis=1)] - mine[0]
             sub = moments[mine]
             half = agglomerate(sub, among, 2)
             whole = sub.gather(np.zeros(len(mine), dtype=np.int64))
-            gains[part] = fit_motions(whole).cost[0] - fit_motions(sub.gather(half)).cost.sum()
-        return np.maximum(gains, 0)
+            self._gains[key] = max(fit_motions(whole).cost[0] - fit_motions(sub.gather(half)).cost.sum(), 0.0)
+        return np.array([0.0] * first + [self._gains[key] for key in keys])
 
     def join_down(self, label: np.ndarray, count: int | None) -> np.ndarray:
         """Join the pair that is least apart, alternate, and so on.
