@@ -14,6 +14,7 @@ from scanprep.dataset import RegisteredSet
 from scanprep.geometry.files import read_mesh, read_registered, write_mesh
 from scanprep.geometry.landmarks import read_landmark_vertices
 from scanprep.geometry.mesh import Mesh
+from scanprep.geometry.storage import load_arrays
 from scanprep.skeleton.find import find_skeleton
 from scanprep.skeleton.tree import Skeleton
 
@@ -128,14 +129,10 @@ def read_subject(model: ScapeModel, given: Path | None, unit: Unit | None = None
     """
     if given is None:
         return model.subject(None)
-    if given.suffix == ".json":
-        found = read_json(given, "betas [b1, b2, ...] or {\"betas\": [...]}")
-        return model.subject(np.array(found["betas"] if isinstance(found, dict) else found, dtype=float))
-    if given.suffix == ".npz":
-        with np.load(given, allow_pickle=False) as stored:
-            if "betas" not in stored:
-                raise ValueError(f"{given}: expected an array 'betas', found {', '.join(stored)}")
-            betas = stored["betas"]
+    if given.suffix in (".json", ".npz"):
+        betas = _read_betas(given)
+        if len(betas) > model.n_betas:
+            raise ValueError(f"{given}: expected at most the {model.n_betas} betas of the model, found {len(betas)}")
         return model.subject(betas if len(betas) else None)
     person = read_mesh(given, unit)
     if not np.array_equal(person.faces, model.template.faces):
@@ -144,6 +141,23 @@ def read_subject(model: ScapeModel, given: Path | None, unit: Unit | None = None
     if not model.n_betas:
         raise ValueError(f"{given}: the model has no shape components, so it knows its own body only")
     return model.subject(fit_shape(model, person.vertices).betas)
+
+
+def _read_betas(path: Path) -> np.ndarray:
+    """Betas (k,) from JSON or from the array of that name in an `.npz`; none for the template's own body."""
+    wanted = 'betas [b1, b2, ...] or {"betas": [...]}'
+    if path.suffix == ".json":
+        found = read_json(path, wanted)
+        found = found.get("betas") if isinstance(found, dict) else found
+    else:
+        found = load_arrays(path).get("betas")
+    try:
+        betas = np.array(found, dtype=np.float64)
+    except (TypeError, ValueError):
+        betas = np.array(np.nan)
+    if betas.ndim != 1 or not np.isfinite(betas).all():
+        raise ValueError(f"{path}: expected {wanted}, found something else")
+    return betas
 
 
 def _read_shapes(folder: Path, body: Mesh, unit: Unit | None) -> np.ndarray:

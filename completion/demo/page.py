@@ -50,7 +50,7 @@ def overview(demo: Demo, height: int = 400) -> np.ndarray:
     name = max((s.name for s in demo.scans if s.subject == "subject"), key=lambda n: np.ptp(demo.truths[n].vertices))
     registered = template.with_vertices(demo.prepared.registered.vertices([name])[0])
     rest = np.zeros((len(model.skeleton.parents), 3))
-    people = [template.with_vertices(model.vertices(rest, betas)) for betas in ([-1.8], [1.8])]
+    people = [template.with_vertices(model.vertices(rest, betas)) for betas in (np.array([-1.8]), np.array([1.8]))]
     walking = demo.motion.vertices(demo.subject, np.array([0, len(demo.motion.poses) // 4]))
     colors = np.where(done.seen[:, None], MEASURED, COMPLETED)
     shown: list[tuple[Shape, np.ndarray, float, str]] = [

@@ -62,6 +62,17 @@ def save(path: str | Path, kind: str, version: int, arrays: dict[str, np.ndarray
         np.savez_compressed(out, allow_pickle=False, **{HEADER: np.array(text)}, **arrays)
 
 
+def load_arrays(path: str | Path, what: str = "an .npz file") -> dict[str, np.ndarray]:
+    """All arrays of an `.npz` file, or StorageError when it is missing, damaged or holds objects."""
+    try:
+        with np.load(path, allow_pickle=False) as data:
+            return {name: data[name] for name in data.files}
+    except FileNotFoundError:
+        raise StorageError(f"{path}: no such file") from None
+    except (OSError, ValueError, EOFError, KeyError, AttributeError, zipfile.BadZipFile) as error:
+        raise StorageError(f"{path}: expected {what}, cannot read it ({error})") from None
+
+
 def load(path: str | Path, kind: str, versions: tuple[int, ...]) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
     """Read a file of `save`.
 
@@ -75,18 +86,13 @@ def load(path: str | Path, kind: str, versions: tuple[int, ...]) -> tuple[dict[s
         Missing, not such a file, damaged, another kind, or a version that is not in `versions`.
     """
     path = Path(path)
+    arrays = load_arrays(path, f"a {kind} file")
+    if HEADER not in arrays:
+        raise StorageError(f"{path}: expected a {kind} file, found an .npz without a header")
     try:
-        with np.load(path, allow_pickle=False) as data:
-            if HEADER not in data.files:
-                raise StorageError(f"{path}: expected a {kind} file, found an .npz without a header")
-            header = json.loads(str(data[HEADER]))
-            arrays = {name: data[name] for name in data.files if name != HEADER}
-    except FileNotFoundError:
-        raise StorageError(f"{path}: no such file") from None
-    except StorageError:
-        raise
-    except (OSError, ValueError, EOFError, KeyError, zipfile.BadZipFile) as error:
-        raise StorageError(f"{path}: expected a {kind} file, cannot read it ({error})") from None
+        header = json.loads(str(arrays.pop(HEADER)))
+    except ValueError as error:
+        raise StorageError(f"{path}: expected a {kind} file, its header is damaged ({error})") from None
     if header.get("kind") != kind:
         raise StorageError(f"{path}: expected kind '{kind}', found '{header.get('kind')}'")
     if header.get("version") not in versions:

@@ -1,0 +1,174 @@
+"""What a user may get wrong: one clear line that names the file, exit code 1, no traceback, nothing half written."""
+import json
+
+import numpy as np
+import pytest
+from completion_bodies import half_view, worm_with_prior
+from model_bodies import worm
+
+from completion import MarkerLayout, MarkerSequence, write_markers
+from completion.__main__ import main
+from scanprep import Mesh, write_landmarks, write_mesh
+from scanprep.geometry.files import PointCloud, write_points
+
+MARKS = {"head": 10, "tail": 380, "left": 100, "right": 200, "middle": 250}
+
+
+@pytest.fixture
+def place(tmp_path, monkeypatch):
+    """A user's folder with a good model, template, scans, half view, markers; each test breaks one thing."""
+    monkeypatch.chdir(tmp_path)
+    model = worm_with_prior()
+    body = model.template
+    write_mesh("template.ply", body)
+    write_landmarks("template.landmarks.json", MARKS)
+    model.info["landmarks"] = MARKS
+    model.save("model.npz")
+    for k in range(3):
+        moved = body.with_vertices(body.vertices + [0, 0, 0.05 * k])
+        write_mesh(f"scans/scan{k}.ply", moved)
+        write_landmarks(f"scans/scan{k}.landmarks.json", {name: moved.vertices[v] for name, v in MARKS.items()})
+        write_mesh(f"poses/pose{k}.ply", moved)
+    points, _ = half_view(body, np.array([0.0, -1.0, 0.0]))
+    write_points("half.ply", PointCloud(points))
+    write_landmarks("half.landmarks.json", {name: body.vertices[v] for name, v in MARKS.items()})
+    labels = tuple(MARKS)
+    still = np.repeat(body.vertices[None, list(MARKS.values())], 40, axis=0)
+    write_markers("walk.c3d", MarkerSequence(still, labels, 60.0))
+    MarkerLayout(labels, np.array(list(MARKS.values()))).save("layout.json")
+    return tmp_path
+
+
+PREP = "prep run scans --template template.ply -o out"
+FILL = "prep fill mesh.ply -o out.ply"
+LEARN = "learn --poses poses -o out.npz"
+COMPLETE = "complete half.ply -m model.npz --subject template -o out"
+ANIMATE = "animate walk.c3d -m model.npz --layout layout.json -o out"
+TRIANGLE = "ply\nformat ascii 1.0\nelement vertex 3\nproperty float x\nproperty float y\nproperty float z\n" \
+           "element face 1\nproperty list uchar int vertex_indices\nend_header\n"
+
+
+def broken_mesh(text):
+    def write(place):
+        (place / "mesh.ply").write_text(text)
+    return write
+
+
+def template(change):
+    def write(place):
+        write_mesh("template.ply", change(worm()))
+    return write
+
+
+def two_pieces(body):
+    return Mesh(np.vstack([body.vertices, body.vertices + 9]), np.vstack([body.faces, body.faces + len(body.vertices)]))
+
+
+def model_of_version(version):
+    def write(place):
+        with np.load("model.npz") as stored:
+            arrays = dict(stored)
+        header = json.loads(str(arrays["header"]))
+        arrays["header"] = np.array(json.dumps({**header, "version": version}))
+        np.savez("model.npz", **arrays)
+    return write
+
+
+def remove(name):
+    return lambda place: (place / name).unlink()
+
+
+def text(name, content):
+    return lambda place: (place / name).write_text(content)
+
+
+def fan(body):
+    """A third triangle on an edge."""
+    third = [*body.faces[0, :2], len(body.vertices)]
+    return Mesh(np.vstack([body.vertices, [[0.3, 2, 2]]]), np.vstack([body.faces, [third]]))
+
+
+def flattened(body):
+    """The first triangle pressed into a line."""
+    vertices, (a, b, c) = body.vertices.copy(), body.faces[0]
+    vertices[a] = (vertices[b] + vertices[c]) / 2
+    return Mesh(vertices, body.faces)
+
+
+def cut(name, end):
+    return lambda place: (place / name).write_bytes((place / name).read_bytes()[:end])
+
+
+CASES = {
+    "missing file": (FILL, lambda place: None, ["mesh.ply", "no such file"]),
+    "truncated": (FILL, lambda place: (place / "mesh.ply").write_bytes((place / "template.ply").read_bytes()[:-50]),
+                  ["mesh.ply", "face"]),
+    "another format": (FILL, broken_mesh("solid is not a ply"), ["mesh.ply", "expected"]),
+    "not a number": (FILL, broken_mesh(TRIANGLE + "0 0 0\n1 0 nan\n0 1 0\n3 0 1 2\n"),
+                     ["mesh.ply", "finite", "vertex 1"]),
+    "infinite": (FILL, broken_mesh(TRIANGLE + "0 0 inf\n1 0 0\n0 1 0\n3 0 1 2\n"), ["mesh.ply", "finite"]),
+    "face out of range": (FILL, broken_mesh(TRIANGLE + "0 0 0\n1 0 0\n0 1 0\n3 0 1 7\n"), ["mesh.ply", "7"]),
+    "empty": (FILL, broken_mesh(""), ["mesh.ply"]),
+    "points for a mesh": (FILL, lambda place: write_points("mesh.ply", PointCloud(np.eye(3))), ["mesh.ply", "faces"]),
+    "template in pieces": (PREP, template(two_pieces), ["template", "2 components"]),
+    "template not manifold": (PREP, template(fan), ["template", "not manifold"]),
+    "template with a flat face": (PREP, template(flattened), ["template", "no area", "face 0"]),
+    "template with vertices at one place": (PREP, template(
+        lambda b: Mesh(np.vstack([b.vertices[:-1], b.vertices[:1]]), b.faces)), ["template", "vertex 0", "weld"]),
+    "template with a face twice": (PREP, template(lambda b: Mesh(b.vertices, np.vstack([b.faces, b.faces[:1]]))),
+                                   ["template", "twice"]),
+    "no landmarks of the template": (PREP, remove("template.landmarks.json"), ["template.ply", "landmarks"]),
+    "no scans": ("prep run nowhere --template template.ply -o out", lambda place: None, ["nowhere"]),
+    "poses of other topology": (LEARN, lambda place: write_mesh("poses/pose1.ply", worm(20)),
+                                ["pose1.ply", "pose0.ply"]),
+    "faces in another order": (LEARN, lambda place: write_mesh("poses/pose1.ply", Mesh(
+        worm().vertices, worm().faces[::-1])), ["pose1.ply", "face"]),
+    "one pose": (LEARN, lambda place: [(place / "poses" / f"pose{k}.ply").unlink() for k in (1, 2)], ["poses"]),
+    "shapes of other topology": (LEARN + " --shapes shapes", lambda place: write_mesh("shapes/a.ply", worm(20)),
+                                 ["shapes", "triangles of the poses"]),
+    "skeleton that is none": (LEARN + " --skeleton layout.json", lambda place: None, ["layout.json", "skeleton"]),
+    "landmark names that do not match": (COMPLETE, text("half.landmarks.json", '{"a": [0, 0, 0], "b": [1, 0, 0]}'),
+                                         ["half.landmarks.json", "head"]),
+    "two landmarks": (COMPLETE, text("half.landmarks.json", '{"head": [0, 0, 0], "tail": [1, 0, 0]}'),
+                      ["half.landmarks.json", "3"]),
+    "no landmark file": (COMPLETE, remove("half.landmarks.json"), ["half", "landmarks"]),
+    "landmarks cut off": (COMPLETE, text("half.landmarks.json", '{"head": [0, 0'), ["half.landmarks.json"]),
+    "model of the future": (COMPLETE, model_of_version(99), ["model.npz", "version 99"]),
+    "model that is none": (COMPLETE, text("model.npz", "nothing"), ["model.npz"]),
+    "model cut off": (COMPLETE, cut("model.npz", 2000), ["model.npz"]),
+    "scan missing": (COMPLETE, remove("half.ply"), ["half.ply"]),
+    "no marker of the layout": (ANIMATE, lambda place: MarkerLayout(("A", "B", "C"), np.arange(3)).save("layout.json"),
+                                ["head", "A"]),
+    "layout of another body": (ANIMATE, lambda place: MarkerLayout(
+        tuple(MARKS), np.arange(5) + 10_000).save("layout.json"), ["layout.json"]),
+    "layout that is none": (ANIMATE, text("layout.json", "[]"), ["layout.json"]),
+    "recording cut off": (ANIMATE, cut("walk.c3d", -1200), ["walk.c3d"]),
+    "betas that are none": (ANIMATE + " --subject layout.json", lambda place: None, ["layout.json", "betas"]),
+    "too many betas": (ANIMATE + " --subject betas.json", text("betas.json", "[1, 2, 3, 4, 5, 6, 7, 8, 9]"),
+                       ["betas.json", "3"]),
+    "mesh of another topology for a subject": (ANIMATE + " --subject other.ply",
+                                               lambda place: write_mesh("other.ply", worm(20)), ["other.ply"]),
+}
+
+
+@pytest.mark.parametrize("case", CASES)
+def test_one_clear_line(place, capsys, case):
+    command, spoil, expected = CASES[case]
+    spoil(place)
+    before = sorted(place.rglob("*"))
+    assert main(command.split()) == 1
+    lines = capsys.readouterr().err.splitlines()
+    said = [line for line in lines if line.startswith("scape ") and ": note: " not in line]
+    assert len(said) == 1, said
+    assert all(word in said[0] for word in expected), said[0]
+    assert "Traceback" not in said[0]
+    assert sorted(place.rglob("*")) == before
+
+
+def test_the_good_files_are_good(place, capsys):
+    """Or the cases above would prove nothing."""
+    assert main(COMPLETE.split()) == 0
+    assert main(ANIMATE.replace("-o out", "-o out2").split()) == 0
+    assert {"completed.ply", "predicted.ply", "completion.npz", "report.html", "report.json"} == {
+        p.name for p in (place / "out").iterdir()}
+    assert {"motion.npz", "animation.glb", "report.html", "report.json"} == {p.name for p in (place / "out2").iterdir()}
