@@ -44,6 +44,10 @@ class FixedBody:
         betas = np.zeros((*trans.shape[:-1], self.n_betas))
         return np.concatenate([pose.reshape(*pose.shape[:-2], -1), trans, betas], axis=-1)
 
+    def held(self, x: np.ndarray) -> FixedBody:
+        """The body with the shape it has at x (P,), as one of known shape."""
+        return self
+
     def vertices(self, x: np.ndarray) -> np.ndarray:
         """The predicted mesh (N, 3) of unknowns (P,)."""
         pose, trans, _ = self.split(x)
@@ -88,6 +92,10 @@ class ShapedBody(FixedBody):
         self.pose_mean, self.pose_covariance = model.pose_mean, model.pose_covariance
         self._at = np.zeros(self.n_betas)
         self.subject = model.subject(self._at)
+
+    def held(self, x: np.ndarray) -> FixedBody:
+        """The body with the shape it has at x (P,), as one of known shape."""
+        return FixedBody(self.model.subject(self.split(x)[2]))
 
     def vertices(self, x: np.ndarray) -> np.ndarray:
         """The predicted mesh (N, 3) of unknowns (P,)."""

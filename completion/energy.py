@@ -153,3 +153,8 @@ def stay_near(x: np.ndarray, expected: np.ndarray, weights: np.ndarray) -> Resid
     """
     root = np.sqrt(weights)
     return Residual(root * (x - expected), np.broadcast_to(np.diag(root), (*x.shape, x.shape[-1])))
+
+
+def geman_mcclure(distance: np.ndarray, scale: float) -> np.ndarray:
+    """Weight in (0, 1] of residuals that may be outliers, a quarter at `scale`."""
+    return (scale**2 / (scale**2 + distance**2))**2

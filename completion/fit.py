@@ -162,15 +162,23 @@ class ScanFit:
         return x
 
     def redraw_limbs(self, x: np.ndarray) -> np.ndarray:
-        """Unknowns (P,) with limbs moved elsewhere where that explains the scan better."""
+        """Unknowns (P,) with limbs moved elsewhere where that explains the scan better; the shape is held."""
         if not self.doubtful(x):
             return x
+        whole, self.body = self.body, self.body.held(x)
+        free = whole.n_angles + 3
+        moved = self._redrawn(x[:free])
+        self.body = whole
+        return np.concatenate([moved[:free], x[free:]])
+
+    def _redrawn(self, x: np.ndarray) -> np.ndarray:
         best = self.misfit(x)
         for root in limbs(self.body.skeleton):
             moved = np.flatnonzero(self.body.skeleton.descends[:, root])
             drawn = redrawn(self.body, x, root, self.prior, MANY * self.config.draws, self.rng)
-            drawn = near_points(self, drawn, moved, self.coarse.points[self.unexplained(x, self.coarse)],
-                                self.config.draws // 2)
+            wanted = self.coarse.points[self.unexplained(x, self.coarse)]
+            drawn = np.vstack([near_points(self, drawn, moved, wanted, self.config.draws // 3),
+                               drawn[:self.config.draws]])
             quick = quick_misfits(self, np.vstack([x, drawn]), moved)
             for i in np.argsort(quick[1:])[:2]:
                 if quick[i + 1] > quick[0] + PROMISING:
@@ -268,7 +276,7 @@ class ScanFit:
         normal = np.concatenate([scan.normals[a], self.cloud.normals[hit[b]]])
         distance = np.concatenate([there.distances[a], back.distances[b]])
         share = np.concatenate([np.full(a.sum(), 1 / len(scan.points)), np.full(b.sum(), 0.5 / len(mine))])
-        weights = config.evidence / config.scan_sd**2 * share * geman_mcclure(distance, max(reach / 2, 0.015))
+        weights = config.evidence / config.scan_sd**2 * share * energy.geman_mcclure(distance, max(reach / 2, 0.015))
         return ids, target, normal, weights
 
     def trespasses(self, mesh: Mesh) -> tuple[np.ndarray, ...]:
@@ -288,10 +296,5 @@ class ScanFit:
             ids.append(mine[out])
             targets.append(target[out])
             normals.append(normal[out])
-            weights.append(weight * share * geman_mcclure(excess[out], 0.1))
+            weights.append(weight * share * energy.geman_mcclure(excess[out], 0.1))
         return tuple(np.concatenate(part) for part in (ids, targets, normals, weights))
-
-
-def geman_mcclure(distance: np.ndarray, scale: float) -> np.ndarray:
-    """Weight in (0, 1] of residuals that may be outliers, half a quarter of it at `scale`."""
-    return (scale**2 / (scale**2 + distance**2))**2

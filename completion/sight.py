@@ -93,7 +93,7 @@ def _facing_point(cloud: ScanPoints) -> np.ndarray:
     def turned_away(q: np.ndarray) -> float:
         to = q[:3] / np.linalg.norm(q[:3]) - q[3] * points / size
         cosine = np.einsum("nd,nd->n", normals, to) / np.linalg.norm(to, axis=1)
-        return float(np.mean(np.maximum(GRAZING - cosine, 0)**2))
+        return float(np.mean(np.clip(GRAZING - cosine, 0, 0.5)**2))   # some normals may have the wrong sign
 
     start = normals.mean(axis=0)
     found = minimize(turned_away, np.r_[start / max(np.linalg.norm(start), 1e-12), 0.3], method="Nelder-Mead",

@@ -2,10 +2,11 @@ import numpy as np
 import pytest
 from completion_bodies import half_view, worm_with_prior
 
+from completion import energy
 from completion.bodies import FixedBody
 from completion.contact import Contact
 from completion.draws import limbs, redrawn
-from completion.fit import CompletionConfig, geman_mcclure
+from completion.fit import CompletionConfig
 from completion.partial import complete
 from completion.priors import gaussian_prior
 from scanprep.geometry import rotations
@@ -161,4 +162,4 @@ def test_a_part_inside_another_is_pushed_out(model):
 
 
 def test_robust_weight_is_one_at_zero_and_a_quarter_at_its_scale():
-    np.testing.assert_allclose(geman_mcclure(np.array([0, 0.02, np.inf]), 0.02), [1, 0.25, 0])
+    np.testing.assert_allclose(energy.geman_mcclure(np.array([0, 0.02, np.inf]), 0.02), [1, 0.25, 0])
