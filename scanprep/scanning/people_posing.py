@@ -57,8 +57,8 @@ class Poser:
         for arm, side in ((4, 1), (7, -1)):
             change = relative[arm] @ self.axes[arm] - self.axes[arm]
             up, across, fore = change[2], -side * change[0], -change[1]
-            shift[arm] = self.anatomy.scale * np.array([-side * (0.012 * up + 0.012 * across), -0.022 * fore,
-                                                        0.036 * up - 0.004 * abs(across)])
+            shift[arm] = self.anatomy.scale * np.array([-side * (0.006 * up + 0.006 * across), -0.011 * fore,
+                                                        0.018 * up - 0.002 * abs(across)])
         return shift
 
     def __call__(self, pose: np.ndarray) -> np.ndarray:
