@@ -20,7 +20,7 @@ from .solve import MinimiseConfig, minimise
 from .starts import distinct, search
 
 SETTLED = 5e-4                       # metres, root mean square over the vertices from round to round
-DOUBT = 0.015                        # share of scan or body that may be in the wrong place for no reason
+DOUBT = 0.012                        # share of scan or body that may be in the wrong place for no reason
 MANY = 6                             # times as many draws of a limb are compared with what is unexplained
 PROMISING = 30.0                     # a limb drawn at random may be this much worse before it is fitted
 
