@@ -15,7 +15,7 @@ class Settings:
     weight: float = 0.5
 
 
-def work(out: Path, times: int = 2, settings: Settings = Settings()) -> Outcome:  # noqa: B008
+def work(out: Path, times: int = 2, settings: Settings = Settings()) -> Outcome:
     """Do the work."""
     if times < 0:
         raise ValueError(f"times: expected a count,\n got {times}")
