@@ -113,8 +113,6 @@ CASES = {
     "template in pieces": (PREP, template(two_pieces), ["template", "2 components"]),
     "template not manifold": (PREP, template(fan), ["template", "not manifold"]),
     "template with a flat face": (PREP, template(flattened), ["template", "no area", "face 0"]),
-    "template with vertices at one place": (PREP, template(
-        lambda b: Mesh(np.vstack([b.vertices[:-1], b.vertices[:1]]), b.faces)), ["template", "vertex 0", "weld"]),
     "template with a face twice": (PREP, template(lambda b: Mesh(b.vertices, np.vstack([b.faces, b.faces[:1]]))),
                                    ["template", "twice"]),
     "no landmarks of the template": (PREP, remove("template.landmarks.json"), ["template.ply", "landmarks"]),

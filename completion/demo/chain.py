@@ -16,7 +16,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from model import LearnConfig, ScapeModel, Subject, fit_pose, learn_scape, load_model
-from scanprep.cleaning.template import make_template
+from scanprep.cleaning.template import TemplateConfig, make_template
 from scanprep.console import Metric, read_json
 from scanprep.dataset import RegisteredSet
 from scanprep.geometry import storage
@@ -78,7 +78,7 @@ class DemoConfig:
     faces: int = 14000
     resolution: float = 0.0068
     template_resolution: float = 0.004
-    template_views: int = 8
+    template_views: int = 12
     held_out: int = 5
     landmarks: int = 7
     frames: int = 132
@@ -150,11 +150,16 @@ class Demo:
         if not path.exists():
             rng = np.random.default_rng([self.config.seed, 6])
             with self.bar("making the template") as progress:
-                scanner = ScannerConfig(views=self.config.template_views, resolution=self.config.template_resolution)
+                # from above and below too, and into places that a fixed scanner does not reach: hands have fingers
+                scanner = ScannerConfig(views=self.config.template_views, resolution=self.config.template_resolution,
+                                        height=1.2, blind_reach=0.01)
                 careful = scan(self.rest.mesh, scanner, rng)
                 marks = click_landmarks(self.rest, rng, seen=careful.merged.vertices)
                 write_scan(folder, "rest", careful, self.rest, marks)
-                mesh = make_template(read_views(folder / "views" / "rest.npz"), self.config.faces, progress=progress)
+                settings = TemplateConfig()
+                settings = replace(settings, merge=replace(settings.merge, voxel=self.config.template_resolution))
+                views = read_views(folder / "views" / "rest.npz")
+                mesh = make_template(views, self.config.faces, settings, progress)
             landmarks = read_landmark_vertices(folder / "rest.landmarks.json", mesh)
             write_landmarks(self.folder / "template.landmarks.json", landmarks)
             write_mesh(path, mesh)

@@ -57,7 +57,7 @@ def overview(demo: Demo, height: int = 400) -> np.ndarray:
         (read_mesh(demo.folder / "scans" / f"{name}.ply"), registered.vertices, 25, "scan"),
         (registered, registered.vertices, 25, "registered"),
         (Solid(template, part_colors(model.skeleton.part_of_face)), template.vertices, 0, "parts found"),
-        *((person, people[1].vertices, 15.0, "body shape") for person in people),
+        *((person, np.concatenate([p.vertices for p in people]), 15.0, "body shape") for person in people),
         (Solid(demo.half_scan[0], MEASURED), done.completed.vertices, -30, "half a view"),
         (Solid(done.completed, colors), done.completed.vertices, 30, "completed"),
         *((template.with_vertices(v), v, 40.0, "animated") for v in walking)]

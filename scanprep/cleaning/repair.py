@@ -8,6 +8,7 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from ..geometry.mesh import Mesh
+from ..geometry.surface import Rays
 
 
 @dataclass(frozen=True)
@@ -182,6 +183,18 @@ def drop_small_components(mesh: Mesh, share: float) -> Mesh:
     if share >= 1:
         keep = np.arange(len(size)) == size.argmax()
     return mesh.submesh(keep[label[mesh.faces[:, 0]]])[0]
+
+
+def drop_thin(mesh: Mesh, thinnest: float) -> Mesh:
+    """Without what is thinner than `thinnest` metres, as fingers are that were hardly seen, and what hung on it.
+
+    Thickness is measured along the inward normals; the rest is open where something was taken off.
+    """
+    middle = mesh.corners.mean(axis=1)
+    inward = -mesh.face_normals
+    _, depth = Rays(mesh).cast(middle + 1e-4 * inward, inward, 10 * thinnest)
+    thick = ~(depth < thinnest)
+    return drop_small_components(mesh.submesh(thick)[0], 1.0) if not thick.all() else mesh
 
 
 def peel_border(mesh: Mesh, rings: int, smallest: int = 40) -> Mesh:

@@ -13,7 +13,7 @@ from .decimate import DecimateConfig, decimate
 from .fill import FillConfig, close
 from .merge import MergeConfig, merge_views
 from .remesh import improve_triangles, smooth
-from .repair import peel_border, repair
+from .repair import drop_thin, peel_border, repair
 
 
 @dataclass(frozen=True)
@@ -32,11 +32,12 @@ class TemplateConfig:
         Rounds of smoothing, once before the holes are filled and once after.
     """
 
-    merge: MergeConfig = field(default_factory=lambda: MergeConfig(voxel=0.005, min_cosine=0.15))
+    merge: MergeConfig = field(default_factory=lambda: MergeConfig(voxel=0.004, truncation=2.0, min_cosine=0.15))
     fill: FillConfig = field(default_factory=FillConfig)
-    decimate: DecimateConfig = field(default_factory=lambda: DecimateConfig(method="even"))
+    decimate: DecimateConfig = field(default_factory=lambda: DecimateConfig(method="quadric", improve=True))
     peel: int = 0
-    smoothing: int = 8
+    smoothing: int = 6
+    thinnest: float = 0.007
 
 
 def make_template(views: Sequence[Any], faces: int = 14000, config: TemplateConfig | None = None,
@@ -66,7 +67,8 @@ def make_template(views: Sequence[Any], faces: int = 14000, config: TemplateConf
     tell(1, 4)
     mesh = peel_border(smooth(repair(mesh), config.smoothing), config.peel)      # smooth rims make fair patches
     tell(2, 4)
-    mesh = smooth(close(mesh, config.fill), config.smoothing)
+    mesh = close(mesh, config.fill)
+    mesh = smooth(close(drop_thin(mesh, config.thinnest), config.fill), config.smoothing)
     tell(3, 4)
     surface = Surface(mesh)
     mesh = improve_triangles(decimate(mesh, faces, config.decimate), surface)

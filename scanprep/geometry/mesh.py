@@ -247,7 +247,7 @@ class Mesh:
 def template_problem(mesh: Mesh) -> str | None:
     """Why a mesh cannot serve as template, or None when it can.
 
-    A template is one connected, closed or bordered manifold component without unused or coinciding vertices,
+    A template is one connected, closed or bordered manifold component without unused vertices,
     repeated triangles or triangles without area.
     """
     if not len(mesh.faces):
@@ -261,10 +261,6 @@ def template_problem(mesh: Mesh) -> str | None:
         return f"it has {components} components (of {', '.join(map(str, sizes[:4]))} vertices), expected one"
     if len(np.unique(np.sort(mesh.faces, axis=1), axis=0)) < len(mesh.faces):
         return "some triangles appear twice"
-    _, first, count = np.unique(mesh.vertices, axis=0, return_index=True, return_counts=True)
-    if len(first) < len(mesh.vertices):
-        return (f"{count[count > 1].sum()} vertices lie exactly on others, among them vertex {first[count > 1].min()}; "
-                "weld them first")
     flat = np.flatnonzero(mesh.face_areas < 1e-12)
     if len(flat):
         return f"{len(flat)} triangles have no area, the first is face {flat[0]}"

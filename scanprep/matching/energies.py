@@ -207,8 +207,10 @@ def stretch_term(graph: DeformationGraph, motion: NodeMotion, stiffness: float) 
     y = np.matmul(motion.linear[i], rest[..., None])[..., 0]
     Ji, Jj = np.zeros((2, len(i), 3, UNKNOWNS))
     Ji[..., :3], Ji[..., 3], Ji[..., 4:], Jj[..., 4:] = -rotations.hat(y), y, np.eye(3), -np.eye(3)
+    squared = np.sum(rest**2, axis=1)
+    squared = np.maximum(squared, 1e-6 * squared.mean())           # nodes may coincide where sheets touch
     return EdgeTerm(graph.edges, y - (motion.positions[j] - motion.positions[i]), Ji, Jj,
-                    stiffness**2 * graph.edge_area / np.sum(rest**2, axis=1))
+                    stiffness**2 * graph.edge_area / squared)
 
 
 def bend_term(graph: DeformationGraph, motion: NodeMotion, stiffness: float) -> EdgeTerm:
