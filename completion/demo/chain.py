@@ -36,6 +36,7 @@ from scanprep.scanning.embedded import (
 )
 from scanprep.scanning.people import MARKERS, Person, random_pose, walk
 from scanprep.scanning.scanner import ScannerConfig, scan
+from scanprep.skeleton.find import SkeletonConfig
 
 from ..animate import animate
 from ..markers.files import MarkerSequence, read_markers, write_markers
@@ -59,6 +60,8 @@ class DemoConfig:
         Scans of one subject in many poses, and of other people.
     faces : int
         Triangles of the template.
+    parts : int
+        Of the skeleton. Left to itself, the search finds three more in these scans: shoulder and hip rings.
     resolution, template_resolution : float, metres
         Spacing of the scanner's rays, for the scans and for the careful one that the template is made of.
     template_views : int
@@ -76,6 +79,7 @@ class DemoConfig:
     poses: int = 20
     subjects: int = 12
     faces: int = 14000
+    parts: int = 16
     resolution: float = 0.0068
     template_resolution: float = 0.004
     template_views: int = 12
@@ -184,7 +188,7 @@ class Demo:
         ValueError
             A scan that could not be registered.
         """
-        config = PrepareConfig()
+        config = PrepareConfig(skeleton=SkeletonConfig(parts=self.config.parts))
         template, marks, _ = self.template, self.template_landmarks, self.scans
         tasks = find_scans(self.folder / "scans")
         with self.bar("registering scans") as first, self.bar("finding the skeleton") as second:

@@ -114,8 +114,8 @@ def _registration(demo: Demo, page: Page) -> None:
 
 
 def _skeleton(demo: Demo, page: Page) -> None:
-    page.section("Skeleton", "Parts that move rigidly, found from the registered poses of the subject with no number "
-                 "given, and the joints between them.")
+    page.section("Skeleton", f"The {demo.config.parts} parts that move most rigidly, found from the registered "
+                 "poses of the subject, and the joints between them.")
     skeleton = demo.model.skeleton
     page.picture(picture_parts(demo.template, skeleton), "parts and joints")
 
