@@ -116,7 +116,7 @@ def machine() -> dict[str, object]:
         except importlib.metadata.PackageNotFoundError:
             versions[name] = "not installed"
     return {"cores": os.cpu_count(), "threads": os.environ.get("OMP_NUM_THREADS", "all"),
-            "platform": platform.platform(), "python": platform.python_version(), **versions}
+            "platform": f"{platform.system()} {platform.machine()}", "python": platform.python_version(), **versions}
 
 
 def write_report(path: str | Path, report: dict[str, object]) -> None:
