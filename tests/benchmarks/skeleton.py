@@ -116,7 +116,7 @@ def embedded(noise: float, slide: float, seed: int = 1, count: int = 20) -> dict
 
 
 if __name__ == "__main__":
-    report = {"machine": platform.platform(), "numpy": np.__version__, "scipy": scipy.__version__, "real": real(),
+    report = {"machine": platform.machine(), "numpy": np.__version__, "scipy": scipy.__version__, "real": real(),
               "embedded": [embedded(n, s) for n, s in ((0, 0), (0.003, 0.005), (0.005, 0.01))]}
     text = json.dumps(report, indent=1)
     print(text)
