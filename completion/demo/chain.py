@@ -92,7 +92,7 @@ class DemoConfig:
     learn: LearnConfig = field(default_factory=LearnConfig)
 
 
-QUICK = DemoConfig(poses=9, subjects=4, faces=7000, resolution=0.011, template_resolution=0.006, held_out=2, frames=66,
+QUICK = DemoConfig(poses=8, subjects=3, faces=7000, resolution=0.011, template_resolution=0.006, held_out=2, frames=66,
                    rate=30.0)
 
 
@@ -188,7 +188,8 @@ class Demo:
         ValueError
             A scan that could not be registered.
         """
-        config = PrepareConfig(skeleton=SkeletonConfig(parts=self.config.parts))
+        # registration slides some millimetres along the skin: less than that is not motion
+        config = PrepareConfig(skeleton=SkeletonConfig(parts=self.config.parts, tolerance=0.003))
         template, marks, _ = self.template, self.template_landmarks, self.scans
         tasks = find_scans(self.folder / "scans")
         with self.bar("registering scans") as first, self.bar("finding the skeleton") as second:

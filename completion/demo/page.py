@@ -84,7 +84,7 @@ def _template(demo: Demo, page: Page) -> None:
                  "decimated to well-shaped triangles. All other scans are described by bending it.")
     mesh, (front, side, back, _) = demo.template, look_around(demo.template)
     colored = picture_distance(mesh, surface_error(mesh, demo.rest), [front, back], FAR,
-                               title="distance to the true surface (mm)")
+                               title="distance to the true surface")
     triangles = render(Solid(mesh, smooth=False), side.closer(1.0), 300, HEIGHT)
     page.pictures([triangles, colored], [f"{len(mesh.faces):,} triangles", "error of the template"])
 
@@ -100,14 +100,15 @@ def _registration(demo: Demo, page: Page) -> None:
         meshes[name] = demo.template.with_vertices(vertices)
         errors[name] = surface_error(meshes[name], demo.truths[name])
     order = sorted(names, key=lambda name: -errors[name].mean())
-    images: list[np.ndarray | bytes] = []
+    images = []
     for name in order[:4]:
         camera = look_around(demo.template, meshes[name].vertices, (25,))[0]
         scan = render(read_mesh(demo.folder / "scans" / f"{name}.ply"), camera, 300, 420)
         images.append(side_by_side([scan, render(meshes[name], camera, 300, 420),
                                     render(Solid(meshes[name], heat(errors[name], 0, FAR)), camera, 300, 420)],
                                    [name, "registered", f"{1000 * errors[name].mean():.1f} mm from the truth"]))
-    page.text("The four worst, with heat from 0 (light) to 10 mm (dark).").pictures(images)
+    page.text("The four worst, with heat from 0 (light) to 10 mm (dark).")
+    page.picture(side_by_side(images[:2])).picture(side_by_side(images[2:]))
     page.table([(f.name, 1000 * f.distance, 1000 * float(errors[f.name].mean()), 100 * f.seen, f.seconds)
                 for f in sorted(demo.prepared.figures, key=lambda f: -errors[f.name].mean())],
                ("scan", "to the scan (mm)", "to the truth (mm)", "with data (%)", "time (s)"))
@@ -151,7 +152,7 @@ def _completion(demo: Demo, page: Page) -> None:
     views = look_around(demo.template, demo.completion.completed.vertices, (-30, 150))
     page.picture(image, f"{len(marks)} landmarks, then the scan itself")
     page.picture(picture_distance(demo.completion.completed, error, views, 3 * FAR,
-                                  title="distance of corresponding points to the truth (mm)"))
+                                  title="distance of corresponding points"))
 
 
 def _animation(demo: Demo, page: Page) -> None:

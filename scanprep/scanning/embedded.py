@@ -240,7 +240,8 @@ def subject_pose(k: int, rng: np.random.Generator) -> tuple[str, np.ndarray]:
         name = order[(k * step) % len(order)]
         loose = 0.08 * rng.normal(size=(16, 3))
         loose[[0, 5, 8, 11, 14]] *= 0.3
-        loose[[6, 9]] *= 4.5                      # hands held in all ways, or nobody could tell where they begin
+        loose[[6, 9]] *= 4.5                      # hands and feet held in all ways, or none could tell where they begin
+        loose[[12, 15]] *= 3.0
         pose = named_pose(name) + loose
         return name, mirrored_pose(pose) if rng.random() < 0.4 else pose
     return f"random{k}", random_pose(rng)
