@@ -1,10 +1,33 @@
-"""The whole body from a partial scan or from markers."""
-from .animate import AnimateConfig, animate
-from .fit import CompletionConfig
-from .markers.files import MarkerSequence, read_markers, write_markers
-from .markers.layout import MarkerLayout
-from .motion import Motion
-from .partial import Completion, complete
+"""The whole body from a partial scan or from markers.
+
+The public names are loaded when they are first used, so that the command line answers at once.
+"""
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from .animation import AnimateConfig, animate
+    from .fit import CompletionConfig
+    from .markers.files import MarkerSequence, read_markers, write_markers
+    from .markers.layout import MarkerLayout
+    from .motion import Motion
+    from .partial import Completion, complete
+
+_ROOMS = {
+    "animation": ("AnimateConfig", "animate"),
+    "fit": ("CompletionConfig",),
+    "markers.files": ("MarkerSequence", "read_markers", "write_markers"),
+    "markers.layout": ("MarkerLayout",),
+    "motion": ("Motion",),
+    "partial": ("Completion", "complete"),
+}
+_ROOM_OF = {name: room for room, names in _ROOMS.items() for name in names}
 
 __all__ = ["AnimateConfig", "Completion", "CompletionConfig", "MarkerLayout", "MarkerSequence", "Motion", "animate",
            "complete", "read_markers", "write_markers"]
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _ROOM_OF:
+        raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
+    return getattr(import_module(f".{_ROOM_OF[name]}", __name__), name)

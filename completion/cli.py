@@ -17,7 +17,7 @@ from scanprep.geometry.landmarks import match_landmarks, read_landmark_vertices,
 from scanprep.geometry.mesh import Mesh
 from scanprep.pipeline import LANDMARK_ENDINGS, read_scan
 
-from .animate import AnimateConfig, animate
+from .animation import AnimateConfig, animate
 from .demo.chain import QUICK, Demo, DemoConfig
 from .fit import CompletionConfig
 from .markers.files import read_markers
@@ -42,11 +42,12 @@ def demo(out: Out = Path("scape_demo"), quick: bool = False, seed: int = DemoCon
         quick: A small run.
         seed: Another seed scans other people.
     """
+    from .demo.figures import figures
     from .demo.page import write_page
 
     run = Demo(out, replace(QUICK if quick else DemoConfig(), seed=seed), bar)
     run.begin()
-    metrics = run.figures()
+    metrics = figures(run)
     with bar("drawing the report") as progress:
         write_page(run, metrics, progress)
     say(f"open {out / 'report.html'} in a browser; {out / 'animation' / 'walk.glb'} in any 3D viewer")

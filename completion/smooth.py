@@ -12,7 +12,7 @@ from . import energy
 from .solve import normal_equations
 
 if TYPE_CHECKING:
-    from .animate import MarkerFollower
+    from .animation import MarkerFollower
 
 
 WINDOW, OVERLAP = 1000, 60           # frames solved at once, and those that each side lends to its neighbour

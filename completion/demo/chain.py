@@ -17,7 +17,7 @@ from scipy.spatial import cKDTree
 
 from model import LearnConfig, ScapeModel, Subject, fit_pose, learn_scape, load_model
 from scanprep.cleaning.template import TemplateConfig, make_template
-from scanprep.console import Metric, read_json
+from scanprep.console import read_json
 from scanprep.dataset import RegisteredSet
 from scanprep.geometry import storage
 from scanprep.geometry.files import read_mesh, write_mesh
@@ -38,15 +38,14 @@ from scanprep.scanning.people import MARKERS, Person, random_pose, walk
 from scanprep.scanning.scanner import ScannerConfig, scan
 from scanprep.skeleton.find import SkeletonConfig
 
-from ..animate import animate
+from ..animation import animate
 from ..markers.files import MarkerSequence, read_markers, write_markers
 from ..markers.layout import DISTANCE, MarkerLayout
 from ..motion import Motion
 from ..partial import Completion, complete
 from ..results import load_completion, save_completion
-from .truth import TruthMap, adjusted_rand, joint_errors, mean_over_area, surface_error
+from .truth import TruthMap
 
-MM = 1000.0
 Bar = Callable[[str], AbstractContextManager[Callable[[int, int], None]]]
 
 
@@ -305,61 +304,3 @@ class Demo:
     def truth_map(self) -> TruthMap:
         """Where the template's vertices truly lie."""
         return TruthMap.of(self.template, self.rest)
-
-    def figures(self) -> list[Metric]:
-        """Run what has not been run, and measure it against the ground truth."""
-        return [*self._registration_figures(), *self._skeleton_figures(), *self._pose_figures(),
-                *self._completion_figures(), *self._animation_figures()]
-
-    def _registration_figures(self) -> list[Metric]:
-        registered, template = self.prepared.registered, self.template
-        surface, apart = [], []
-        for name, vertices in zip(registered.names, registered.vertices(), strict=True):
-            mesh, truth = template.with_vertices(vertices), self.truths[name]
-            surface.append(mean_over_area(surface_error(mesh, truth), template))
-            apart.append(mean_over_area(distance(vertices, self.truth_map.vertices(truth)), template))
-        worst = int(np.argmax(surface))
-        return [Metric("registration: scans", len(surface)),
-                Metric("registration: distance to the true surface, mean", MM * float(np.mean(surface)), "mm"),
-                Metric(f"registration: worst scan ({registered.names[worst]})", MM * surface[worst], "mm"),
-                Metric("registration: distance of corresponding points, mean", MM * float(np.mean(apart)), "mm")]
-
-    def _skeleton_figures(self) -> list[Metric]:
-        skeleton = self.prepared.registered.skeleton
-        assert skeleton is not None, "the subject has enough poses for a skeleton"
-        agreement = adjusted_rand(skeleton.part_of_face, self.truth_map.part_of_face, self.template.face_areas)
-        return [Metric("skeleton: parts (true: 16)", len(skeleton.parents)),
-                Metric("skeleton: adjusted Rand index against the true parts", agreement),
-                Metric("skeleton: joints to the nearest true one, mean",
-                       MM * float(joint_errors(skeleton, self.rest).mean()), "mm")]
-
-    def _pose_figures(self) -> list[Metric]:
-        wanted = [self.truth_map.vertices(truth) for truth in self.held_out]
-        error = [mean_over_area(distance(self.fitted(w), w), self.template) for w in wanted]
-        return [Metric(f"model: {len(wanted)} held-out poses, mean vertex error", MM * float(np.mean(error)), "mm")]
-
-    def _completion_figures(self) -> list[Metric]:
-        done, (half, _, truth) = self.completion, self.half_scan
-        surface, wanted = surface_error(done.completed, truth), self.truth_map.vertices(truth)
-        apart = distance(done.completed.vertices, wanted)
-        seen = cKDTree(half.vertices).query(wanted)[0] < 2 * self.config.resolution
-        return [Metric("completion: vertices seen", 100 * float(seen.mean()), "%"),
-                Metric("completion: seen, distance to the true surface",
-                       MM * mean_over_area(surface, self.template, seen), "mm"),
-                Metric("completion: unseen, distance of corresponding points",
-                       MM * mean_over_area(apart, self.template, ~seen), "mm")]
-
-    def _animation_figures(self) -> list[Metric]:
-        motion, (_, _, bodies) = self.motion, self.walk
-        followed = motion.vertices(self.subject)
-        faces = self.person.mesh.faces
-        apart = [distance(f, self.truth_map.places.carried(b, faces)) for f, b in zip(followed, bodies, strict=True)]
-        return [Metric("animation: frames", len(followed)),
-                Metric("animation: distance of markers, mean", MM * float(np.nanmean(motion.residuals)), "mm"),
-                Metric("animation: distance of corresponding points, mean",
-                       MM * mean_over_area(np.mean(apart, axis=0), self.template), "mm")]
-
-
-def distance(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """(N,) distances of corresponding points (N, 3)."""
-    return np.linalg.norm(a - b, axis=1)

@@ -3,7 +3,7 @@ import pytest
 from completion_bodies import MEAN, worm_with_prior
 
 from completion import energy
-from completion.animate import AnimateConfig, MarkerFollower, animate, supports
+from completion.animation import AnimateConfig, MarkerFollower, animate, supports
 from completion.markers.files import MarkerSequence
 from completion.markers.layout import MarkerLayout
 from completion.motion import Motion
