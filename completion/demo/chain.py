@@ -60,7 +60,7 @@ class DemoConfig:
     faces : int
         Triangles of the template.
     parts : int
-        Of the skeleton. Left to itself, the search finds three more in these scans: shoulder and hip rings.
+        Of the skeleton. Left to itself, the search finds rings at the shoulders too, which move with the skin.
     resolution, template_resolution : float, metres
         Spacing of the scanner's rays, for the scans and for the careful one that the template is made of.
     template_views : int

@@ -47,7 +47,7 @@ def write_page(demo: Demo, metrics: list[Metric], tell: Callable[[int, int], Non
 def overview(demo: Demo, height: int = 400) -> np.ndarray:
     """The chain in one row of pictures: scan, registration, parts, body shapes, completion, animation."""
     template, model, done = demo.template, demo.model, demo.completion
-    name = max((s.name for s in demo.scans if s.subject == "subject"), key=lambda n: np.ptp(demo.truths[n].vertices))
+    name = demo.scans[1].name                       # the first pose after rest
     registered = template.with_vertices(demo.prepared.registered.vertices([name])[0])
     rest = np.zeros((len(model.skeleton.parents), 3))
     people = [template.with_vertices(model.vertices(rest, betas)) for betas in (np.array([-1.8]), np.array([1.8]))]
