@@ -9,7 +9,7 @@ import io
 import os
 import time
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import asdict, astuple, dataclass, field, fields
+from dataclasses import asdict, astuple, dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -259,9 +259,14 @@ def _run(tasks: Sequence[ScanTask], template: Mesh, template_landmarks: dict[str
     rest = (template, template_landmarks, config.registration, config.unit)
     # one thread for linear algebra in each process, so that they do not take each other's cores
     with parallel_config("loky", n_jobs=workers, inner_max_num_threads=1):
-        jobs = (delayed(_numbered)(i, task, *rest) for i, task in enumerate(tasks))
+        jobs = (delayed(_numbered)(i, _absolute(task), *rest) for i, task in enumerate(tasks))
         for i, outcome in Parallel(return_as="generator_unordered", batch_size=1)(jobs):
             yield tasks[i], outcome
+
+
+def _absolute(task: ScanTask) -> ScanTask:
+    """With whole paths: a process may have been started in another folder."""
+    return replace(task, scan=task.scan.absolute(), landmarks=task.landmarks and task.landmarks.absolute())
 
 
 def _numbered(i: int, *task) -> tuple[int, tuple[np.ndarray, ScanFigures] | str]:  # type: ignore[no-untyped-def]

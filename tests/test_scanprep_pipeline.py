@@ -122,3 +122,14 @@ def test_template_that_cannot_serve(scans, template, tmp_path):
     with pytest.raises(ValueError, match="2 components"):
         prepare(find_scans(scans), two, MARKS, tmp_path / "set", QUICK)
     assert not (tmp_path / "set").exists()
+
+
+def test_relative_paths_from_another_folder(scans, template, tmp_path, monkeypatch):
+    """Processes are kept from one call to the next, and were started elsewhere."""
+    monkeypatch.chdir(tmp_path)
+    two = dataclasses.replace(QUICK, workers=2)
+    assert not prepare(find_scans("scans"), template, MARKS, "set", two).failures
+    (tmp_path / "elsewhere").mkdir()
+    shutil.move(tmp_path / "scans", tmp_path / "elsewhere" / "scans")
+    monkeypatch.chdir(tmp_path / "elsewhere")
+    assert not prepare(find_scans("scans"), template, MARKS, "set", two).failures
