@@ -63,7 +63,8 @@ def main() -> None:
               "skeleton_s": found, "skeleton_cpu_s": found_cpu, "learn_s": time.perf_counter() - wall - found,
               "learn_cpu_s": time.process_time() - start - found_cpu,
               "peak_gib": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20,
-              "explained": model.shape_space.explained[[9, 19, 39]].tolist(), "fast_path": fast_path(model)}
+              "explained": model.shape_space.explained[[9, 19, 39]].tolist(), "fast_path": fast_path(model),
+              "held": min(args.held, len(held))}
     for count in (20, 40):
         begin = time.perf_counter()
         fitter = ShapeFitter(model, FitConfig(n_betas=count))

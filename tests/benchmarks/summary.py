@@ -54,8 +54,8 @@ def learning(report: dict) -> str:
     rows: Rows = [("finding the skeleton (s)", report["skeleton_s"], ""), ("learning (s)", report["learn_s"], ""),
                   ("largest memory (GiB)", report["peak_gib"], "")]
     for count, yardstick in ((20, 10.0), (40, 7.4)):
-        rows.append((f"held-out people, {count} components (mm)", report[f"held_out_{count}_mm"],
-                     f"plain vertex PCA {yardstick}"))
+        rows.append((f"held-out people ({report['held']} of 45), {count} components (mm)",
+                     report[f"held_out_{count}_mm"], f"plain vertex PCA of all 45: {yardstick}"))
     rows += [(f"fast path: {name}", value, "") for name, value in flat(fast)]
     return table(("", "", "for comparison"), rows)
 
