@@ -84,8 +84,8 @@ SECTIONS: dict[str, tuple[str, str, Callable[[dict], str], str]] = {
                    "Fold 0, 7 landmarks, viewpoint not told. Where we lose: an arm that no point of the scan touches, "
                    "and time when limbs have to be searched for."),
     "learning": ("Learning from 71 poses and 182 people", "python tests/benchmarks/learning.py", learning,
-                 "Skeleton, learning and memory are of one run of `scape learn`; the error of held-out people is after fitting "
-                 "betas, pose and place."),
+                 "Skeleton, learning and memory are of one run of `scape learn`; the error of held-out people is "
+                 "after fitting betas, pose and place."),
     "registration": ("Registration of virtual four-view scans", "python tests/benchmarks/registration.py", generic,
                      "Template mesh000, ten landmarks. Where we lose: with few landmarks the template slides along "
                      "limbs and around the trunk; the surface is right long before the correspondence is."),
