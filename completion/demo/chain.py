@@ -187,7 +187,8 @@ class Demo:
         ValueError
             A scan that could not be registered.
         """
-        # registration slides some millimetres along the skin: less than that is not motion
+        # registration slides some millimetres along the skin: less than that is not motion. The value was chosen
+        # on these very scans, so the agreement with the true parts shows what can be reached, not what to expect.
         config = PrepareConfig(skeleton=SkeletonConfig(parts=self.config.parts, tolerance=0.003))
         template, marks, _ = self.template, self.template_landmarks, self.scans
         tasks = find_scans(self.folder / "scans")

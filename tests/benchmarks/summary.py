@@ -78,14 +78,17 @@ def generic(report: dict) -> str:
 
 SECTIONS: dict[str, tuple[str, str, Callable[[dict], str], str]] = {
     "scape_5fold": ("Held-out poses (SCAPE-5fold)", "python tests/benchmarks/scape_5fold.py", poses,
-                    "Skeleton and model from the training poses of the fold alone. Where we lose: seated poses with "
+                    "Skeleton and model from the training poses of the fold alone; `refinements` and `steps` were "
+                    "chosen while looking at fold 0. Where we lose: seated poses with "
                     "the trunk far bent, and folds in which the search finds another number of parts."),
     "half_views": ("Half views of held-out poses, known subject", "python tests/benchmarks/half_views.py", half_views,
                    "Fold 0, 7 landmarks, viewpoint not told. Where we lose: an arm that no point of the scan touches, "
                    "and time when limbs have to be searched for."),
     "learning": ("Learning from 71 poses and 182 people", "python tests/benchmarks/learning.py", learning,
-                 "Skeleton, learning and memory are of one run of `scape learn`; the error of held-out people is "
-                 "after fitting betas, pose and place."),
+                 "Put together by hand with that script's functions, not by one run of it: skeleton, learning and "
+                 "memory (of the whole process) are read off one run of `scape learn`; the rest is of the model it "
+                 "wrote. The error of held-out people is after fitting betas, pose and place, on every fifth of the "
+                 "45, so it is not strictly comparable with the yardstick."),
     "registration": ("Registration of virtual four-view scans", "python tests/benchmarks/registration.py", generic,
                      "Template mesh000, ten landmarks. Where we lose: with few landmarks the template slides along "
                      "limbs and around the trunk; the surface is right long before the correspondence is."),
