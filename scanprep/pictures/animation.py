@@ -2,8 +2,6 @@
 from __future__ import annotations
 
 import io
-import json
-import struct
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -13,12 +11,7 @@ import numpy as np
 from ..geometry.mesh import Mesh
 from ..geometry.storage import writing
 from .colors import decode
-
-# Turns of a node that bring each axis to +y, the upward axis of glTF: quaternions x, y, z, w.
-_HALF = 0.5 ** 0.5
-_UPRIGHT = {0: [0.0, 0.0, _HALF, _HALF], 1: [0.0, 0.0, 0.0, 1.0], 2: [-_HALF, 0.0, 0.0, _HALF]}
-_FLOAT, _UINT = 5126, 5125
-_VERTICES, _INDICES = 34962, 34963
+from .gltf import UPRIGHT, VERTICES, Glb, skin_material, some_normal
 
 
 def write_animated_glb(path: str | Path, faces: np.ndarray, frames: np.ndarray, rate: float,
@@ -57,24 +50,22 @@ def animated_glb(faces: np.ndarray, frames: np.ndarray, rate: float, colors: np.
     _check(frames, rate, up, keys)
     chosen = np.unique(np.linspace(0, len(frames) - 1, min(keys, len(frames))).round().astype(int))
     meshes = [Mesh(frames[t], faces) for t in chosen]
-    glb = _Glb()
-    base, normals = meshes[0].vertices, _some_normal(meshes[0])
-    attributes = {"POSITION": glb.add(base, "VEC3", _VERTICES, bounds=True),
-                  "NORMAL": glb.add(normals, "VEC3", _VERTICES)}
+    glb = Glb()
+    base, normals = meshes[0].vertices, some_normal(meshes[0])
+    attributes = {"POSITION": glb.add(base, "VEC3", VERTICES, bounds=True),
+                  "NORMAL": glb.add(normals, "VEC3", VERTICES)}
     if colors is not None:
         rgba = np.concatenate([decode(np.asarray(colors)), np.ones((len(base), 1))], axis=1)
-        attributes["COLOR_0"] = glb.add(rgba, "VEC4", _VERTICES)
+        attributes["COLOR_0"] = glb.add(rgba, "VEC4", VERTICES)
     primitive: dict[str, Any] = {"attributes": attributes, "indices": glb.add_indices(faces), "material": 0}
-    primitive["targets"] = [{"POSITION": glb.add(m.vertices - base, "VEC3", _VERTICES, bounds=True),
-                             "NORMAL": glb.add(_some_normal(m) - normals, "VEC3", _VERTICES)} for m in meshes[1:]]
+    primitive["targets"] = [{"POSITION": glb.add(m.vertices - base, "VEC3", VERTICES, bounds=True),
+                             "NORMAL": glb.add(some_normal(m) - normals, "VEC3", VERTICES)} for m in meshes[1:]]
     count = len(meshes) - 1
     mesh: dict[str, Any] = {"name": "body", "primitives": [primitive]}
     document: dict[str, Any] = {
-        "asset": {"version": "2.0", "generator": "scapekit"}, "scene": 0, "scenes": [{"nodes": [0]}],
-        "nodes": [{"name": "body", "mesh": 0, "rotation": _UPRIGHT[up]}], "meshes": [mesh],
-        "materials": [{"name": "skin", "pbrMetallicRoughness": {
-            "baseColorFactor": [1, 1, 1, 1] if colors is not None else [0.60, 0.57, 0.53, 1],
-            "metallicFactor": 0, "roughnessFactor": 0.75}}]}
+        "scene": 0, "scenes": [{"nodes": [0]}], "meshes": [mesh],
+        "nodes": [{"name": "body", "mesh": 0, "rotation": UPRIGHT[up]}],
+        "materials": [skin_material((1, 1, 1)) if colors is not None else skin_material()]}
     if count:
         mesh["weights"] = [0] * count
         mesh["extras"] = {"targetNames": [f"frame {t}" for t in chosen[1:]]}
@@ -125,59 +116,7 @@ def _check(frames: np.ndarray, rate: float, up: int, keys: int) -> None:
         raise ValueError(f"frames: {len(bad)} are not finite, the first is frame {bad[0]}")
     if not rate > 0:
         raise ValueError(f"rate: expected a positive number of frames a second, got {rate}")
-    if up not in _UPRIGHT:
+    if up not in UPRIGHT:
         raise ValueError(f"up: expected 0, 1 or 2, got {up}")
     if keys < 1:
         raise ValueError(f"keys: expected at least 1, got {keys}")
-
-
-def _some_normal(mesh: Mesh) -> np.ndarray:
-    """Unit normals at all vertices: glTF allows no zero normal, not even where there are no triangles."""
-    normals = np.array(mesh.vertex_normals)
-    normals[~normals.any(axis=1)] = (0, 0, 1)
-    return normals
-
-
-class _Glb:
-    """Arrays gathered into the one buffer of a binary glTF file."""
-
-    def __init__(self) -> None:
-        self._data = bytearray()
-        self._views: list[dict[str, Any]] = []
-        self._accessors: list[dict[str, Any]] = []
-
-    def add(self, array: np.ndarray, kind: str, target: int | None, bounds: bool = False) -> int:
-        """An accessor of float32 numbers; its index."""
-        values = np.ascontiguousarray(array, dtype="<f4")
-        extra: dict[str, Any] = {}
-        if bounds:
-            rows = values.reshape(len(values), -1).astype(float)
-            extra = {"min": rows.min(axis=0).tolist(), "max": rows.max(axis=0).tolist()}
-        return self._append(values.tobytes(), len(values), kind, _FLOAT, target, extra)
-
-    def add_indices(self, faces: np.ndarray) -> int:
-        """An accessor of the corners of triangles; its index."""
-        data = np.ascontiguousarray(faces, dtype="<u4").tobytes()
-        return self._append(data, faces.size, "SCALAR", _UINT, _INDICES, {})
-
-    def _append(self, data: bytes, count: int, kind: str, component: int, target: int | None,
-                extra: dict[str, Any]) -> int:
-        view: dict[str, Any] = {"buffer": 0, "byteOffset": len(self._data), "byteLength": len(data)}
-        if target is not None:
-            view["target"] = target
-        self._data += data
-        self._views.append(view)
-        self._accessors.append({"bufferView": len(self._views) - 1, "componentType": component, "count": count,
-                                "type": kind, **extra})
-        return len(self._accessors) - 1
-
-    def pack(self, document: dict[str, Any]) -> bytes:
-        """The file: header, JSON, buffer."""
-        document = {**document, "buffers": [{"byteLength": len(self._data)}], "bufferViews": self._views,
-                    "accessors": self._accessors}
-        text = json.dumps(document, separators=(",", ":")).encode()
-        text += b" " * (-len(text) % 4)
-        data = bytes(self._data) + b"\0" * (-len(self._data) % 4)
-        size = 12 + 8 + len(text) + 8 + len(data)
-        return (struct.pack("<4sII", b"glTF", 2, size) + struct.pack("<I4s", len(text), b"JSON") + text
-                + struct.pack("<I4s", len(data), b"BIN\0") + data)
