@@ -5,8 +5,8 @@ from collections.abc import Callable
 
 import numpy as np
 
+from model.body import BodyModel
 from model.linear import Subject
-from model.scape import ScapeModel
 from scanprep.geometry.mesh import Mesh
 from scanprep.skeleton.tree import Skeleton
 
@@ -31,7 +31,7 @@ class FixedBody:
         self.skeleton: Skeleton = subject.skeleton
         self.n_angles = 3 * len(subject.skeleton.parents)
         if subject.pose_mean is None or subject.pose_covariance is None:
-            raise ValueError("subject: expected one that ScapeModel.subject made, with its pose prior")
+            raise ValueError("subject: expected one that a model made, with its pose prior")
         self.pose_mean, self.pose_covariance = subject.pose_mean, subject.pose_covariance
 
     def split(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -79,12 +79,12 @@ class ShapedBody(FixedBody):
 
     Parameters
     ----------
-    model : ScapeModel
+    model : BodyModel
     renew : float
         Length of the step in betas, in standard deviations, after which the subject is rebuilt.
     """
 
-    def __init__(self, model: ScapeModel, renew: float = 0.5) -> None:
+    def __init__(self, model: BodyModel, renew: float = 0.5) -> None:
         self.model, self.renew = model, renew
         self.n_betas = model.n_betas
         self.template, self.skeleton = model.template, model.skeleton
@@ -123,7 +123,7 @@ class ShapedBody(FixedBody):
         return move
 
 
-def as_body(body: ScapeModel | Subject) -> FixedBody:
+def as_body(body: BodyModel | Subject) -> FixedBody:
     """The face for a model (shape unknown) or a subject (shape known).
 
     Raises
@@ -133,6 +133,6 @@ def as_body(body: ScapeModel | Subject) -> FixedBody:
     """
     if isinstance(body, Subject):
         return FixedBody(body)
-    if isinstance(body, ScapeModel):
+    if isinstance(body, BodyModel):
         return ShapedBody(body) if body.n_betas else FixedBody(body.subject(None))
-    raise ValueError(f"body: expected a ScapeModel or a Subject, got {type(body).__name__}")
+    raise ValueError(f"body: expected a BodyModel or a Subject, got {type(body).__name__}")

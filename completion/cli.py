@@ -8,9 +8,10 @@ from typing import Annotated, Any
 import numpy as np
 import tyro
 
+from model.body import BodyModel
 from model.cli import read_subject
+from model.files import load_model
 from model.linear import Subject
-from model.scape import ScapeModel, load_model
 from scanprep.cli import MM, Output, ScanArg, Unit
 from scanprep.console import Metric, Outcome, bar, say
 from scanprep.geometry.landmarks import match_landmarks, read_landmark_vertices, read_landmarks
@@ -82,7 +83,7 @@ def complete_scan(scan: ScanArg, model: ModelFile, output: Output, landmarks: Pa
         _, vertices, points = match_landmarks(_template_landmarks(loaded, template_landmarks, model), found)
     except ValueError as error:
         raise ValueError(f"{given}: {error}") from None
-    body: ScapeModel | Subject = loaded
+    body: BodyModel | Subject = loaded
     if subject is not None or not loaded.n_betas:
         body = read_subject(loaded, None if subject in (None, "template") else Path(subject), unit)
     with bar("completing") as progress:
@@ -159,7 +160,7 @@ def _beside(scan: Path) -> Path:
     return found
 
 
-def _template_landmarks(model: ScapeModel, given: Path | None, path: Path) -> dict[str, int]:
+def _template_landmarks(model: BodyModel, given: Path | None, path: Path) -> dict[str, int]:
     if given is not None:
         return read_landmark_vertices(given, model.template)
     kept = model.info.get("landmarks")

@@ -7,8 +7,8 @@ from dataclasses import dataclass, field
 import numpy as np
 from scipy.sparse import csr_array
 
+from model.body import BodyModel
 from model.linear import Subject
-from model.scape import ScapeModel
 from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.surface import Surface
 
@@ -62,13 +62,13 @@ class Completion:
     energies: dict[str, float] = field(default_factory=dict)
 
 
-def complete(body: ScapeModel | Subject, scan: Mesh | np.ndarray, landmarks: tuple[np.ndarray, np.ndarray],
+def complete(body: BodyModel | Subject, scan: Mesh | np.ndarray, landmarks: tuple[np.ndarray, np.ndarray],
              config: CompletionConfig | None = None, progress: Progress | None = None) -> Completion:
     """The whole body from a scan of some of it.
 
     Parameters
     ----------
-    body : ScapeModel or Subject
+    body : BodyModel or Subject
         A model when the person's shape is unknown, a subject when it is known.
     scan : Mesh, or (n, 3) float, metres
     landmarks : ((L,) int, (L, 3) float)

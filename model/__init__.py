@@ -6,21 +6,25 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from .body import BodyModel, Derivatives
+    from .files import load_model
     from .fitting import FitConfig, PoseFit, ShapeFit, fit_pose, fit_shape
     from .learning import LearnConfig, learn_scape
     from .linear import PointOperator, Subject
-    from .scape import ScapeModel, load_model
+    from .scape import ScapeModel
 
 _ROOMS = {
+    "body": ("BodyModel", "Derivatives"),
+    "files": ("load_model",),
     "fitting": ("FitConfig", "PoseFit", "ShapeFit", "fit_pose", "fit_shape"),
     "learning": ("LearnConfig", "learn_scape"),
     "linear": ("PointOperator", "Subject"),
-    "scape": ("ScapeModel", "load_model"),
+    "scape": ("ScapeModel",),
 }
 _ROOM_OF = {name: room for room, names in _ROOMS.items() for name in names}
 
-__all__ = ["FitConfig", "LearnConfig", "PointOperator", "PoseFit", "ScapeModel", "ShapeFit", "Subject", "fit_pose",
-           "fit_shape", "learn_scape", "load_model"]
+__all__ = ["BodyModel", "Derivatives", "FitConfig", "LearnConfig", "PointOperator", "PoseFit", "ScapeModel", "ShapeFit",
+           "Subject", "fit_pose", "fit_shape", "learn_scape", "load_model"]
 
 
 def __getattr__(name: str) -> Any:

@@ -18,10 +18,11 @@ from scanprep.geometry.storage import load_arrays
 from scanprep.skeleton.find import find_skeleton
 from scanprep.skeleton.tree import Skeleton
 
+from .body import BodyModel
+from .files import load_model
 from .fitting import fit_shape
 from .learning import LearnConfig, learn_scape
 from .linear import Subject
-from .scape import ScapeModel, load_model
 
 ModelArg = Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="MODEL.npz")]
 
@@ -117,7 +118,7 @@ def mesh(model: ModelArg, output: Output, pose: Path | None = None, betas: tuple
                             Metric("largest extent", float(np.ptp(vertices, axis=0).max()), "m")])
 
 
-def read_subject(model: ScapeModel, given: Path | None, unit: Unit | None = None) -> Subject:
+def read_subject(model: BodyModel, given: Path | None, unit: Unit | None = None) -> Subject:
     """The subject named on the command line: betas in JSON or a motion file, or a mesh in the model's topology.
 
     Without a name it is the template's own body.
@@ -191,15 +192,14 @@ def _read_marks(given: Path | None, poses: Path, body: Mesh) -> dict[str, int]:
     return read_landmark_vertices(path, body)
 
 
-def _about(model: ScapeModel) -> list[Metric]:
-    rows = [Metric("pose features", model.pose_space.features.count), Metric("shape components", model.n_betas)]
+def _about(model: BodyModel) -> list[Metric]:
+    rows = [Metric("pose features", model.terms.features.count), Metric("shape components", model.n_betas)]
     if model.n_betas:
-        share = model.shape_space.variances.sum() / model.shape_space.total_variance
-        rows.append(Metric("variance of S they explain", 100 * float(share), "%"))
+        rows.append(Metric("variance of shape they explain", 100 * float(model.explained[-1]), "%"))
     return rows
 
 
-def _draw(model: ScapeModel, output: Path) -> None:
+def _draw(model: BodyModel, output: Path) -> None:
     from scanprep.pictures.shading import save_png
 
     from .report import picture_components, picture_parts

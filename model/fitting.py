@@ -7,9 +7,9 @@ from functools import cached_property
 import numpy as np
 
 from .bilinear import ShapedPoints
+from .body import BodyModel
 from .linear import PointOperator, Subject
 from .minimise import Derive, Evaluate, Minimum, minimise
-from .scape import ScapeModel
 
 
 @dataclass(frozen=True)
@@ -126,12 +126,12 @@ class PoseFitter:
         return PoseFit(pose, trans, fitted, *_distances(fitted, vertices), best.converged, steps)
 
 
-def fit_shape(model: ScapeModel, vertices: np.ndarray, config: FitConfig | None = None) -> ShapeFit:
+def fit_shape(model: BodyModel, vertices: np.ndarray, config: FitConfig | None = None) -> ShapeFit:
     """Shape, pose and place of an unknown body from all its vertices.
 
     Parameters
     ----------
-    model : ScapeModel
+    model : BodyModel
         With shape components.
     vertices : (N, 3) float, metres
     config : FitConfig, optional
@@ -149,12 +149,12 @@ class ShapeFitter:
 
     Parameters
     ----------
-    model : ScapeModel
+    model : BodyModel
         With shape components.
     config : FitConfig, optional
     """
 
-    def __init__(self, model: ScapeModel, config: FitConfig | None = None) -> None:
+    def __init__(self, model: BodyModel, config: FitConfig | None = None) -> None:
         self.model, self.config = model, config or FitConfig()
         self.n_betas = model.n_betas if self.config.n_betas is None else self.config.n_betas
         if not 0 < self.n_betas <= model.n_betas:
@@ -220,7 +220,7 @@ def _placed(subject: Subject, vertices: np.ndarray, pose: np.ndarray) -> np.ndar
 
 def _pose_energy(operator: PointOperator, target: np.ndarray) -> tuple[Evaluate, Derive]:
     """Residual (3L,) of the points against their targets, and its derivatives (3J + 3, 3L)."""
-    J3 = 3 * len(operator.features.skeleton.parents)
+    J3 = 3 * len(operator.terms.skeleton.parents)
     place = np.broadcast_to(np.eye(3)[:, None], (3, operator.count, 3)).reshape(3, -1)
 
     def evaluate(x: np.ndarray) -> np.ndarray:
@@ -235,7 +235,7 @@ def _pose_energy(operator: PointOperator, target: np.ndarray) -> tuple[Evaluate,
 
 def _shape_energy(points: ShapedPoints, target: np.ndarray) -> tuple[Evaluate, Derive]:
     """As `_pose_energy`, with betas behind pose and place, on a few vertices."""
-    J3 = 3 * len(points.features.skeleton.parents)
+    J3 = 3 * len(points.terms.skeleton.parents)
 
     def evaluate(x: np.ndarray) -> np.ndarray:
         return _pose_energy(points.operator(x[J3 + 3:]), target)[0](x[:J3 + 3])
@@ -248,7 +248,7 @@ def _shape_energy(points: ShapedPoints, target: np.ndarray) -> tuple[Evaluate, D
     return evaluate, derive
 
 
-def _whole_energy(model: ScapeModel, target: np.ndarray, K: int) -> tuple[Evaluate, Derive]:
+def _whole_energy(model: BodyModel, target: np.ndarray, K: int) -> tuple[Evaluate, Derive]:
     """As `_shape_energy`, on all vertices: the operator is stitched again whenever betas change."""
     J3 = 3 * len(model.skeleton.parents)
     everything = np.arange(len(target))

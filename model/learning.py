@@ -11,10 +11,12 @@ import numpy as np
 from scanprep.geometry.mesh import Mesh, check_template
 from scanprep.skeleton.tree import Skeleton
 
+from .carriers import build_basis, carried_terms, make_carriers, rigid_weights
+from .features import twists
 from .fitting import FitConfig, PoseFitter
 from .gradients import GradientSystem, edges, local_edges, pose_gradients, shape_gradients
-from .linear import Subject, build_basis
-from .pose_space import PoseSpace, Regression, learn_pose_space, twists
+from .linear import Subject
+from .pose_space import PoseSpace, Regression, learn_pose_space
 from .scape import ScapeModel
 from .shape_space import ShapeSpace, learn_shape_space
 from .stitching import StitchingSystem
@@ -144,8 +146,9 @@ def _learn_pose(template: Mesh, skeleton: Skeleton, bodies: np.ndarray, config: 
 def _subject(template: Mesh, skeleton: Skeleton, system: StitchingSystem, space: PoseSpace) -> Subject:
     """The template's own body with a pose space in the making."""
     S = np.broadcast_to(np.eye(3), (len(template.faces), 3, 3))
-    basis = build_basis(system, template, space, S)
-    return Subject(template, skeleton, None, space.features, basis, skeleton.joints[0])
+    carriers = make_carriers(skeleton, rigid_weights(skeleton))
+    basis = build_basis(system, template, space, S, carriers)
+    return Subject(template, skeleton, None, carried_terms(space.features, carriers), basis, skeleton.joints[0])
 
 
 def _fit_poses(subject: Subject, bodies: np.ndarray, poses: np.ndarray, tick: _Ticks) -> np.ndarray:

@@ -1,10 +1,10 @@
 """The fast path: a fixed body whose vertices are one matrix product away from its poses.
 
-Stitching is linear, so with Q linear in the features δ of the joints
+Every kind of model is, for a fixed body, linear in products of a feature δ and the rotation of a part:
 
-    Y = Σ_p Σ_a δ_{p,a} T_{p,a} R_pᵀ + joints[0] + trans
+    Y = Σ_m δ_m T_m R_mᵀ + joints[0] + trans
 
-where `T_{p,a}` is stitched once from the edges that feature a of part p contributes.
+where `T_m` is made once, for SCAPE stitched from the edges that the product contributes.
 """
 from __future__ import annotations
 
@@ -18,36 +18,9 @@ from scanprep.geometry import rotations
 from scanprep.geometry.mesh import Mesh
 from scanprep.skeleton.tree import Skeleton
 
-from .gradients import edges
-from .pose_space import JointFeatures, PoseSpace
-from .stitching import StitchingSystem
+from .features import Terms
 
-
-def build_basis(system: StitchingSystem, template: Mesh, pose_space: PoseSpace, S: np.ndarray) -> np.ndarray:
-    """T of every feature of every part for one body.
-
-    Parameters
-    ----------
-    S : (F, 3, 3) float
-        Shape deformation of every triangle.
-
-    Returns
-    -------
-    (A, N, 3) float, metres
-
-    [SCAPE] Eq. 9
-    """
-    v_hat = edges(template.vertices, template.faces)
-    features = pose_space.features
-    G = system.edge_operator
-    rhs = np.empty((system.n_vertices, features.count, 3))
-    for p, faces in enumerate(pose_space.faces_of_part):
-        a = pose_space.coefficients[p].astype(np.float64)
-        wanted = v_hat[faces] @ np.swapaxes(S[faces] @ a, -1, -2)             # (n, f, 2, 3)
-        rows = (2 * faces[:, None] + np.arange(2)).ravel()
-        columns = wanted.reshape(len(a), -1, 3).transpose(1, 0, 2).reshape(len(rows), -1)
-        rhs[:, features.of_part(p)] = (G[rows].T @ columns).reshape(system.n_vertices, len(a), 3)
-    return system.solve(rhs.reshape(system.n_vertices, -1)).reshape(rhs.shape).transpose(1, 0, 2)
+AT_ONCE = 2**24                      # numbers that a batch of derivatives holds at a time
 
 
 def check_pose(skeleton: Skeleton, pose: Any, trans: Any) -> tuple[np.ndarray, np.ndarray]:
@@ -64,10 +37,9 @@ def check_pose(skeleton: Skeleton, pose: Any, trans: Any) -> tuple[np.ndarray, n
     return pose, np.broadcast_to(trans, (*pose.shape[:-2], 3))
 
 
-def posed_product(features: JointFeatures, flat: np.ndarray, pose: np.ndarray) -> np.ndarray:
-    """(..., 3, L) of Σ δ T Rᵀ for `flat` (3A, L) and poses (..., J, 3): one matrix product."""
-    R = features.skeleton.part_rotations(pose)[..., features.part, :, :]
-    W = np.moveaxis(features.evaluate(pose)[..., None, None] * R, -3, -2)     # (..., i, a, j)
+def posed_product(terms: Terms, flat: np.ndarray, pose: np.ndarray) -> np.ndarray:
+    """(..., 3, L) of Σ δ T Rᵀ for `flat` (3M, L) and poses (..., J, 3): one matrix product."""
+    W = np.moveaxis(terms.weights(pose), -3, -2)                              # (..., i, m, j)
     W = W.reshape(-1, flat.shape[0]).astype(flat.dtype, copy=False)
     return (W @ flat).reshape(*pose.shape[:-2], 3, flat.shape[1])
 
@@ -80,13 +52,13 @@ class PointOperator:
 
     Parameters
     ----------
-    features : JointFeatures
-    basis : (A, L, 3) float, metres
+    terms : Terms
+    basis : (M, L, 3) float, metres
     origin : (3,) float, metres
         Where the root part's centroid stands when trans is zero.
     """
 
-    features: JointFeatures
+    terms: Terms
     basis: np.ndarray
     origin: np.ndarray
 
@@ -111,8 +83,8 @@ class PointOperator:
         -------
         (L, 3) or (B, L, 3) float, metres
         """
-        pose, trans = check_pose(self.features.skeleton, pose, trans)
-        return np.swapaxes(posed_product(self.features, self._flat, pose), -1, -2) + (self.origin + trans)[..., None, :]
+        pose, trans = check_pose(self.terms.skeleton, pose, trans)
+        return np.swapaxes(posed_product(self.terms, self._flat, pose), -1, -2) + (self.origin + trans)[..., None, :]
 
     def jacobian(self, pose: np.ndarray, trans: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
         """Positions and their derivatives with respect to the pose parameters.
@@ -130,32 +102,37 @@ class PointOperator:
         positions : (L, 3) or (B, L, 3) float, metres
         d_pose : (L, 3, 3J) or (B, L, 3, 3J) float, metres per radian
         """
-        pose, trans = check_pose(self.features.skeleton, pose, trans)
-        if pose.ndim == 3:
-            each = [self.jacobian(p, t) for p, t in zip(pose, trans, strict=True)]
-            return np.stack([y for y, _ in each]), np.stack([d for _, d in each])
-        y, columns = self.columns(pose, trans)
-        return y, np.moveaxis(columns, 0, -1)
+        pose, trans = check_pose(self.terms.skeleton, pose, trans)
+        if pose.ndim == 2:
+            y, columns = self.columns(pose, trans)
+            return y, np.moveaxis(columns, 0, -1)
+        B, J, L = len(pose), len(self.terms.skeleton.parents), self.count
+        y, d_pose = np.empty((B, L, 3)), np.empty((B, L, 3, 3 * J))
+        step = max(1, AT_ONCE // (3 * L * (self.terms.count + 4 * J)))
+        for start in range(0, B, step):
+            mine = slice(start, start + step)
+            y[mine], columns = self.columns(pose[mine], trans[mine])
+            d_pose[mine] = np.moveaxis(columns, 1, -1)
+        return y, d_pose
 
     def columns(self, pose: np.ndarray, trans: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """As `jacobian` for one pose, with the derivatives as (3J, L, 3), contiguous for each parameter."""
-        features, skeleton = self.features, self.features.skeleton
-        J, A, L = len(skeleton.parents), features.count, self.count
+        """As `jacobian`, with the derivatives as (..., 3J, L, 3), contiguous for each parameter."""
+        terms, skeleton = self.terms, self.terms.skeleton
+        J, M, L, leading = len(skeleton.parents), terms.count, self.count, pose.shape[:-2]
         R = skeleton.part_rotations(pose)
-        turned = self.basis @ np.swapaxes(R[features.part], -1, -2)          # (A, L, 3)
-        delta = features.evaluate(pose)
-        gather = np.zeros((J, A))                                            # C_p = Σ_a δ_a T_a R_pᵀ
-        gather[features.part, np.arange(A)] = delta
-        sway = np.zeros((J, 3, A))
-        moved = np.flatnonzero(features.joint >= 0)
-        sway[features.joint[moved], :, moved] = features.derivative(pose)[moved]
-        below = skeleton.descends.T.astype(float) @ gather                   # all that hangs below each joint
-        both = np.concatenate([below, sway.reshape(3 * J, A)]) @ turned.reshape(A, -1)
-        carried, columns = both[:J].reshape(J, L, 3), both[J:].reshape(J, 3, L, 3)
-        turn = R @ rotations.right_jacobian(pose)                            # world turn per parameter, in columns
+        turned = self.basis @ np.swapaxes(R[..., terms.part, :, :], -1, -2)   # (..., M, L, 3)
+        gather = np.zeros((*leading, J, M))                                   # C_p = Σ_m δ_m T_m R_pᵀ
+        gather[..., terms.part, np.arange(M)] = terms.features.evaluate(pose)[..., terms.feature]
+        below = skeleton.descends.T.astype(float) @ gather                    # all that hangs below each joint
+        sway = np.moveaxis(terms.features.derivative(pose)[..., terms.feature, :, :], -3, -1)   # (..., J, 3, M)
+        both = np.concatenate([below, sway.reshape(*leading, 3 * J, M)], axis=-2) @ turned.reshape(*leading, M, -1)
+        carried = both[..., :J, :].reshape(*leading, J, L, 3)
+        columns = both[..., J:, :].reshape(*leading, J, 3, L, 3)
+        turn = R @ rotations.right_jacobian(pose)                             # world turn per parameter, in columns
         # ω × x = x @ hat(ω)ᵀ for every column ω of `turn`
-        columns += carried[:, None] @ np.swapaxes(rotations.hat(np.swapaxes(turn, -1, -2)), -1, -2)
-        return carried[0] + self.origin + trans, columns.reshape(3 * J, L, 3)
+        columns += carried[..., None, :, :] @ np.swapaxes(rotations.hat(np.swapaxes(turn, -1, -2)), -1, -2)
+        y = carried[..., 0, :, :] + (self.origin + trans)[..., None, :]
+        return y, columns.reshape(*leading, 3 * J, L, 3)
 
 
 @dataclass(frozen=True, eq=False)
@@ -168,8 +145,8 @@ class Subject:
     skeleton : Skeleton
     betas : (K,) float or None
         The body's shape; None is the template's own body.
-    features : JointFeatures
-    basis : (A, N, 3) float64 or float32, metres
+    terms : Terms
+    basis : (M, N, 3) float64 or float32, metres
         Of this type are the vertices; float32 is twice as fast and agrees to a few micrometres.
     origin : (3,) float, metres
     pose_mean, pose_covariance : (J, 3) and (3J, 3J) float, optional
@@ -179,7 +156,7 @@ class Subject:
     template: Mesh
     skeleton: Skeleton
     betas: np.ndarray | None
-    features: JointFeatures
+    terms: Terms
     basis: np.ndarray
     origin: np.ndarray
     pose_mean: np.ndarray | None = None
@@ -207,7 +184,7 @@ class Subject:
         (N, 3) or (B, N, 3) float of the subject's dtype, metres
         """
         poses, trans = check_pose(self.skeleton, poses, trans)
-        y = posed_product(self.features, self._flat, poses)
+        y = posed_product(self.terms, self._flat, poses)
         y += (self.origin + trans)[..., None].astype(y.dtype)
         return np.swapaxes(y, -1, -2)
 
@@ -231,7 +208,7 @@ class Subject:
             basis = self.basis[:, ids].astype(np.float64)
         else:
             basis = np.einsum("alkd,lk->ald", self.basis[:, ids].astype(np.float64), weights)
-        return PointOperator(self.features, basis, self.origin)
+        return PointOperator(self.terms, basis, self.origin)
 
 
 def check_points(n_vertices: int, vertex_ids: np.ndarray, weights: np.ndarray | None

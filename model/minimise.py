@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from .pose_space import twists
+from .features import twists
 
 EXACT = 1e-9                         # metres: nearer than this needs no further step
 TRIES = 12                           # steps of growing damping before giving up

@@ -6,89 +6,10 @@ from functools import cached_property
 
 import numpy as np
 
-from scanprep.geometry import rotations
 from scanprep.geometry.mesh import Mesh
 from scanprep.skeleton.tree import Skeleton
 
-
-def twists(pose: np.ndarray) -> np.ndarray:
-    """The twists (..., J, 3), radians, at most π long, of poses (..., J, 3) of any length.
-
-    [SCAPE] §4.2
-    """
-    pose = np.asarray(pose, dtype=np.float64)
-    far = np.linalg.norm(pose, axis=-1, keepdims=True) > np.pi
-    return np.where(far, rotations.log(rotations.exp(pose)), pose) if far.any() else pose
-
-
-@dataclass(frozen=True, eq=False)
-class JointFeatures:
-    """What Q is linear in: for every part a constant and the kept twist directions of its joints.
-
-    Parameters
-    ----------
-    skeleton : Skeleton
-    directions : J arrays (3, k_j)
-        Orthonormal twist directions of each joint that are kept; none for the root.
-
-    [SCAPE] Eq. 3
-    """
-
-    skeleton: Skeleton
-    directions: tuple[np.ndarray, ...]
-
-    @cached_property
-    def _table(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        part, joint, axis = [], [], []
-        for p, joints in enumerate(self.skeleton.joints_of_part):
-            mine = [(-1, np.zeros(3))] + [(j, direction) for j in joints for direction in self.directions[j].T]
-            part += [p] * len(mine)
-            joint += [j for j, _ in mine]
-            axis += [direction for _, direction in mine]
-        return np.array(part), np.array(joint), np.array(axis)
-
-    @property
-    def part(self) -> np.ndarray:
-        """(A,) the part of every feature."""
-        return self._table[0]
-
-    @property
-    def joint(self) -> np.ndarray:
-        """(A,) the joint of every feature, -1 for a constant."""
-        return self._table[1]
-
-    @property
-    def axis(self) -> np.ndarray:
-        """(A, 3) the twist direction of every feature, zero for a constant."""
-        return self._table[2]
-
-    @property
-    def count(self) -> int:
-        """A, the number of features of all parts together."""
-        return len(self.part)
-
-    @cached_property
-    def starts(self) -> np.ndarray:
-        """(J,) the first feature of every part, its constant."""
-        return np.flatnonzero(self.joint < 0)
-
-    def of_part(self, p: int) -> slice:
-        """The features of part p."""
-        end = self.starts[p + 1] if p + 1 < len(self.starts) else self.count
-        return slice(int(self.starts[p]), int(end))
-
-    def evaluate(self, pose: np.ndarray) -> np.ndarray:
-        """Features (..., A) of poses (..., J, 3), radians."""
-        t = twists(pose)
-        return (t[..., self.joint, :] * self.axis).sum(axis=-1) + (self.joint < 0)
-
-    def derivative(self, pose: np.ndarray) -> np.ndarray:
-        """(..., A, 3) derivative of every feature by the pose parameters of its own joint."""
-        pose = np.asarray(pose, dtype=np.float64)
-        far = np.linalg.norm(pose, axis=-1) > np.pi
-        turn = np.broadcast_to(np.eye(3), (*pose.shape, 3)).copy()
-        turn[far] = rotations.inverse_right_jacobian(twists(pose)[far]) @ rotations.right_jacobian(pose[far])
-        return (self.axis[:, None, :] @ turn[..., self.joint, :, :])[..., 0, :]
+from .features import PoseFeatures, linear_features, twists
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,14 +18,14 @@ class PoseSpace:
 
     Parameters
     ----------
-    features : JointFeatures
+    features : PoseFeatures
     coefficients : J arrays (n_p, F_p, 3, 3)
         For each part: feature × triangle of the part, in the order of the faces.
 
     [SCAPE] Eq. 3
     """
 
-    features: JointFeatures
+    features: PoseFeatures
     coefficients: tuple[np.ndarray, ...]
 
     @property
@@ -132,7 +53,7 @@ class PoseSpace:
     @staticmethod
     def identity(skeleton: Skeleton) -> PoseSpace:
         """The pose space without deformation: rigid parts, Q = I."""
-        features = JointFeatures(skeleton, tuple(np.zeros((3, 0)) for _ in skeleton.parents))
+        features = linear_features(skeleton, tuple(np.zeros((3, 0)) for _ in skeleton.parents))
         return PoseSpace(features, tuple(np.broadcast_to(np.eye(3, dtype=np.float32), (1, len(f), 3, 3)).copy()
                                          for f in faces_of_part(skeleton)))
 
@@ -213,7 +134,7 @@ def learn_pose_space(template: Mesh, skeleton: Skeleton, poses: np.ndarray, Q: n
 
     [SCAPE] Eq. 4
     """
-    features = JointFeatures(skeleton, kept_directions(poses, pruning))
+    features = linear_features(skeleton, kept_directions(poses, pruning))
     groups = _groups(template, features)
     delta = features.evaluate(poses)
     if len(ridges) > 1:
@@ -239,7 +160,7 @@ def learn_pose_space(template: Mesh, skeleton: Skeleton, poses: np.ndarray, Q: n
     return Regression(PoseSpace(features, coefficients), ridges[best], errors[best])
 
 
-def _groups(template: Mesh, features: JointFeatures) -> list[tuple[int, np.ndarray, np.ndarray]]:
+def _groups(template: Mesh, features: PoseFeatures) -> list[tuple[int, np.ndarray, np.ndarray]]:
     """Triangles of one part that regress on the same joints: (part, features without the constant, faces)."""
     near = nearest_joints(template, features.skeleton)
     groups = []
@@ -247,7 +168,7 @@ def _groups(template: Mesh, features: JointFeatures) -> list[tuple[int, np.ndarr
         kinds, which = np.unique(near[faces], axis=0, return_inverse=True)
         mine = np.arange(features.count)[features.of_part(p)][1:]
         for g, joints in enumerate(kinds):
-            groups.append((p, mine[joints[features.joint[mine]]], faces[which.ravel() == g]))
+            groups.append((p, mine[~(features.uses[mine] & ~joints).any(axis=1)], faces[which.ravel() == g]))
     return groups
 
 

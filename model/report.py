@@ -10,7 +10,7 @@ from scanprep.pictures.shading import Bones, Dots, Shape, Solid, part_colors, re
 from scanprep.pictures.views import look_around
 from scanprep.skeleton.tree import Skeleton
 
-from .scape import ScapeModel
+from .body import BodyModel
 
 
 def picture_parts(template: Mesh, skeleton: Skeleton, height: int = 640) -> np.ndarray:
@@ -26,7 +26,7 @@ def picture_parts(template: Mesh, skeleton: Skeleton, height: int = 640) -> np.n
     return side_by_side(images, [f"{len(skeleton.parents)} parts, front", "back", "joints"])
 
 
-def picture_components(model: ScapeModel, count: int = 4, deviations: float = 2.0, height: int = 420,
+def picture_components(model: BodyModel, count: int = 4, deviations: float = 2.0, height: int = 420,
                        tell: Callable[[int, int], None] | None = None) -> np.ndarray:
     """The mean person, then the first components at minus and plus some standard deviations.
 

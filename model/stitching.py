@@ -14,8 +14,8 @@ from scanprep.skeleton.tree import Skeleton
 class StitchingSystem:
     """The least-squares fit of vertices to edges, factored once for a triangulation.
 
-    Edges say nothing of where the body stands: the centroid of the vertices of part 0 is put in the
-    origin, and callers add the place.
+    Edges say nothing of where the body stands: the root's joint (the centroid of the vertices of part 0) is put
+    in the origin, and callers add the place.
 
     Parameters
     ----------
@@ -29,7 +29,9 @@ class StitchingSystem:
     def __init__(self, template: Mesh, skeleton: Skeleton) -> None:
         self.faces = template.faces
         self.n_vertices = len(template.vertices)
-        self.root_vertices = np.flatnonzero(skeleton.part_of_vertex(template) == 0)
+        self.root_weights = np.zeros(self.n_vertices)
+        ring, weights = skeleton.joint_weights(template, 0)
+        self.root_weights[ring] = weights
 
     @cached_property
     def edge_operator(self) -> csc_array:
@@ -48,15 +50,13 @@ class StitchingSystem:
         return Factored(csc_array(self.edge_operator.T @ self.edge_operator + anchor))
 
     def solve(self, rhs: np.ndarray) -> np.ndarray:
-        """Solve the normal equations for `edge_operatorᵀ edges` (N, k), root part centred in the origin."""
+        """Solve the normal equations for `edge_operatorᵀ edges` (N, k), the root's joint in the origin."""
         y = self._factored.solve(rhs)
-        return y - y[self.root_vertices].mean(axis=0)
+        return y - self.root_weights @ y
 
     def solve_adjoint(self, pick: np.ndarray) -> np.ndarray:
         """(N, k) with `solve_adjoint(pick).T @ rhs == pick.T @ solve(rhs)` for rhs that sum to zero."""
-        centred = pick.copy()
-        centred[self.root_vertices] -= pick.sum(axis=0) / len(self.root_vertices)
-        return self._factored.solve(centred)
+        return self._factored.solve(pick - np.outer(self.root_weights, pick.sum(axis=0)))
 
     def stitch(self, edges: np.ndarray) -> np.ndarray:
         """Vertices whose edges come closest to the wanted ones in the least-squares sense.
@@ -68,7 +68,7 @@ class StitchingSystem:
         Returns
         -------
         (..., N, 3) float, metres
-            The centroid of the vertices of part 0 lies in the origin.
+            The root's joint lies in the origin.
 
         [SCAPE] Eq. 2, Eq. 9
         """

@@ -3,7 +3,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from model.pose_space import JointFeatures, PoseSpace, nearest_joints
+from model.features import linear_features
+from model.pose_space import PoseSpace, nearest_joints
 from model.scape import ScapeModel
 from model.shape_space import ShapeSpace
 from scanprep.geometry.mesh import Mesh
@@ -44,7 +45,7 @@ def worm_model(seed: int = 0, components: int = 3, bulge: float = 0.15) -> Scape
     template = worm()
     skeleton = worm_skeleton(template)
     rng = np.random.default_rng(seed)
-    features = JointFeatures(skeleton, (np.zeros((3, 0)), np.eye(3), np.eye(3), np.eye(3)[:, :2]))
+    features = linear_features(skeleton, (np.zeros((3, 0)), np.eye(3), np.eye(3), np.eye(3)[:, :2]))
     near = nearest_joints(template, skeleton)
     centre = template.corners.mean(axis=1)
     coefficients = []
@@ -52,7 +53,7 @@ def worm_model(seed: int = 0, components: int = 3, bulge: float = 0.15) -> Scape
         faces = np.flatnonzero(skeleton.part_of_face == p)
         a = np.zeros((features.of_part(p).stop - features.of_part(p).start, len(faces), 3, 3))
         a[0] = np.eye(3)
-        for row, j in enumerate(features.joint[features.of_part(p)][1:], start=1):
+        for row, j in enumerate(features.uses[features.of_part(p)][1:].argmax(axis=1), start=1):
             close = np.exp(-np.linalg.norm(centre[faces] - skeleton.joints[j], axis=1) ** 2 / 0.04)
             a[row] = (close * near[faces, j])[:, None, None] * rng.normal(0, bulge, (3, 3))
         coefficients.append(a.astype(np.float32))

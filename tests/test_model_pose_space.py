@@ -2,19 +2,14 @@ import numpy as np
 import pytest
 from model_bodies import random_poses, worm_model
 
-from model.pose_space import JointFeatures, PoseSpace, kept_directions, learn_pose_space, nearest_joints, twists
+from model.features import linear_features
+from model.pose_space import PoseSpace, kept_directions, learn_pose_space, nearest_joints
 from scanprep.geometry import rotations
 
 
 @pytest.fixture(scope="module")
 def model():
     return worm_model()
-
-
-def test_twists_are_the_short_way_round():
-    axis = np.array([0.6, 0.0, 0.8])
-    np.testing.assert_allclose(twists((2 * np.pi - 0.5) * axis), -0.5 * axis, atol=1e-12)
-    np.testing.assert_array_equal(twists(3.0 * axis), 3.0 * axis)
 
 
 def test_features_of_a_part_are_one_and_its_joints(model):
@@ -31,19 +26,6 @@ def test_root_pose_changes_no_feature(model):
     other = pose.copy()
     other[0] += 1.0
     np.testing.assert_array_equal(model.pose_space.gradients(pose), model.pose_space.gradients(other))
-
-
-@pytest.mark.parametrize("size", [0.4, 2.5])                 # 2.5: many joints beyond π
-def test_feature_derivative_matches_differences(model, size):
-    features = model.pose_space.features
-    pose = random_poses(model, 1, np.random.default_rng(2), size)[0]
-    d = features.derivative(pose)
-    for a in np.flatnonzero(features.joint >= 0):
-        for m in range(3):
-            step = np.zeros_like(pose)
-            step[features.joint[a], m] = 1e-6
-            slope = (features.evaluate(pose + step)[a] - features.evaluate(pose - step)[a]) / 2e-6
-            assert slope == pytest.approx(d[a, m], abs=1e-8)
 
 
 def test_nearest_joints_are_those_of_the_part(model):
@@ -106,5 +88,5 @@ def test_identity_space_is_rigid(model):
 def test_single_part_has_only_the_constant():
     from scanprep.skeleton.tree import Skeleton
 
-    features = JointFeatures(Skeleton(np.zeros(5, int), [-1], np.zeros((1, 3))), (np.zeros((3, 0)),))
+    features = linear_features(Skeleton(np.zeros(5, int), [-1], np.zeros((1, 3))), (np.zeros((3, 0)),))
     np.testing.assert_array_equal(features.evaluate(rotations.log(rotations.exp([[1, 2, 3.0]]))), [1.0])

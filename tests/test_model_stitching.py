@@ -14,7 +14,7 @@ def system():
 
 
 def root_centred(system, vertices):
-    return vertices - vertices[system.root_vertices].mean(axis=0)
+    return vertices - system.root_weights @ vertices
 
 
 def test_true_edges_give_back_the_body(system):

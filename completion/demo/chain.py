@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial import cKDTree
 
-from model import LearnConfig, ScapeModel, Subject, fit_pose, learn_scape, load_model
+from model import BodyModel, LearnConfig, Subject, fit_pose, learn_scape, load_model
 from scanprep.cleaning.template import TemplateConfig, make_template
 from scanprep.console import read_json
 from scanprep.dataset import RegisteredSet
@@ -199,7 +199,7 @@ class Demo:
         return done
 
     @cached_property
-    def model(self) -> ScapeModel:
+    def model(self) -> BodyModel:
         """The body model."""
         path = self.folder / "model.npz"
         if not path.exists():

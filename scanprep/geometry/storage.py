@@ -73,6 +73,31 @@ def load_arrays(path: str | Path, what: str = "an .npz file") -> dict[str, np.nd
         raise StorageError(f"{path}: expected {what}, cannot read it ({error})") from None
 
 
+def kind_of(path: str | Path) -> str:
+    """The kind of a file of `save`, read from its header alone, or StorageError."""
+    try:
+        with np.load(path, allow_pickle=False) as data:
+            return str(_header(path, "scapekit", data[HEADER] if HEADER in data.files else None)["kind"])
+    except FileNotFoundError:
+        raise StorageError(f"{path}: no such file") from None
+    except StorageError:
+        raise
+    except (OSError, ValueError, EOFError, KeyError, AttributeError, zipfile.BadZipFile) as error:
+        raise StorageError(f"{path}: expected an .npz file with a header, cannot read it ({error})") from None
+
+
+def _header(path: str | Path, kind: str, stored: np.ndarray | None) -> dict[str, Any]:
+    if stored is None:
+        raise StorageError(f"{path}: expected a {kind} file, found an .npz without a header")
+    try:
+        header = json.loads(str(stored))
+    except ValueError as error:
+        raise StorageError(f"{path}: expected a {kind} file, its header is damaged ({error})") from None
+    if not isinstance(header, dict):
+        raise StorageError(f"{path}: expected a {kind} file, its header is damaged (not a table)")
+    return header
+
+
 def load(path: str | Path, kind: str, versions: tuple[int, ...]) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
     """Read a file of `save`.
 
@@ -87,12 +112,7 @@ def load(path: str | Path, kind: str, versions: tuple[int, ...]) -> tuple[dict[s
     """
     path = Path(path)
     arrays = load_arrays(path, f"a {kind} file")
-    if HEADER not in arrays:
-        raise StorageError(f"{path}: expected a {kind} file, found an .npz without a header")
-    try:
-        header = json.loads(str(arrays.pop(HEADER)))
-    except ValueError as error:
-        raise StorageError(f"{path}: expected a {kind} file, its header is damaged ({error})") from None
+    header = _header(path, kind, arrays.pop(HEADER, None))
     if header.get("kind") != kind:
         raise StorageError(f"{path}: expected kind '{kind}', found '{header.get('kind')}'")
     if header.get("version") not in versions:

@@ -113,21 +113,20 @@ class Skeleton:
         ValueError
             A part that does not touch its parent.
         """
-        rows, columns, values = [], [], []
-        for j in range(len(self.parents)):
-            if j == 0:
-                ring = np.flatnonzero(self.part_of_vertex(template) == 0)
-                weights = np.full(len(ring), 1 / len(ring))
-            else:
-                ring = self.ring(template, j, widen=2)
-                if not len(ring):
-                    raise ValueError(f"part_of_face: part {j} does not touch its parent {self.parents[j]}")
-                weights = _affine_weights(template.vertices[ring], self.joints[j])
-            rows.append(np.full(len(ring), j))
-            columns.append(ring)
-            values.append(weights)
-        entries = (np.concatenate(values), (np.concatenate(rows), np.concatenate(columns)))
-        return csr_array(coo_array(entries, shape=(len(self.parents), len(template.vertices))))
+        rings, values = zip(*(self.joint_weights(template, j) for j in range(len(self.parents))), strict=True)
+        rows = np.repeat(np.arange(len(rings)), [len(r) for r in rings])
+        return csr_array(coo_array((np.concatenate(values), (rows, np.concatenate(rings))),
+                                   shape=(len(rings), len(template.vertices))))
+
+    def joint_weights(self, template: Mesh, j: int) -> tuple[np.ndarray, np.ndarray]:
+        """The vertices around joint j and their weights: one row of `joint_regressor`."""
+        if j == 0:
+            ring = np.flatnonzero(self.part_of_vertex(template) == 0)
+        else:
+            ring = self.ring(template, j, widen=2)
+            if not len(ring):
+                raise ValueError(f"part_of_face: part {j} does not touch its parent {self.parents[j]}")
+        return ring, _affine_weights(template.vertices[ring], self.joints[j])
 
     def part_rotations(self, pose: np.ndarray) -> np.ndarray:
         """World rotations (..., J, 3, 3) of the parts for poses (..., J, 3), radians.

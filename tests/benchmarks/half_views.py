@@ -18,8 +18,9 @@ from protocols import HalfView, RealData, half_view, load_real, machine, scape_f
 
 from completion.fit import CompletionConfig
 from completion.partial import Completion, complete
+from model.files import load_model
 from model.learning import LearnConfig, learn_scape
-from model.scape import ScapeModel, load_model
+from model.scape import ScapeModel
 from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.surface import Surface
 from scanprep.skeleton.find import find_skeleton

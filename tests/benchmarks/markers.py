@@ -18,8 +18,9 @@ from protocols import RealData, load_real, machine, scape_fold, write_report
 from completion.animation import AnimateConfig, animate
 from completion.markers.files import MarkerSequence, read_markers
 from completion.markers.layout import MarkerLayout
+from model.files import load_model
 from model.learning import learn_scape
-from model.scape import ScapeModel, load_model
+from model.scape import ScapeModel
 from scanprep.skeleton.find import find_skeleton
 
 

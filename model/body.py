@@ -1,0 +1,201 @@
+"""What every kind of body model offers, whatever it is made of."""
+from __future__ import annotations
+
+import importlib.metadata
+from abc import ABC, abstractmethod
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, ClassVar
+
+import numpy as np
+
+from scanprep.geometry.mesh import Mesh
+from scanprep.skeleton.tree import Skeleton
+
+from .bilinear import ShapedPoints
+from .features import Terms
+from .linear import Subject, check_pose
+
+HERE_OR_EVERYWHERE = 0.25            # share of the vertices beyond which derivatives are made for all of them
+
+
+@dataclass(frozen=True, eq=False)
+class Derivatives:
+    """Vertices and how they change.
+
+    Attributes
+    ----------
+    vertices : (L, 3) float, metres
+    pose : (L, 3, 3J) float, metres per radian
+    betas : (L, 3, k) float, metres per standard deviation
+        k = 0 where the body is the template's own, which has no betas.
+
+    The derivative with respect to trans is the identity for every vertex.
+    """
+
+    vertices: np.ndarray
+    pose: np.ndarray
+    betas: np.ndarray
+
+
+class BodyModel(ABC):
+    """A body as a function of pose, shape and place, with derivatives.
+
+    Attributes
+    ----------
+    kind : str
+        The name of the kind of model in files.
+    template : Mesh
+    skeleton : Skeleton
+    pose_mean : (J, 3) float, radians
+    pose_covariance : (3J, 3J) float, square radians
+        Of the training poses, zero in the root's rows: a Gaussian prior of the pose.
+    info : dict
+        How the model was made: settings, sizes and a digest of the training set.
+    """
+
+    kind: ClassVar[str]
+    template: Mesh
+    skeleton: Skeleton
+    pose_mean: np.ndarray
+    pose_covariance: np.ndarray
+    info: dict[str, Any]
+
+    def __repr__(self) -> str:
+        return f"{type(self).__name__}({self.template!r}, {len(self.skeleton.parents)} parts, {self.n_betas} betas)"
+
+    @property
+    @abstractmethod
+    def n_betas(self) -> int:
+        """K, the number of shape components."""
+
+    @property
+    @abstractmethod
+    def explained(self) -> np.ndarray:
+        """(K,) share of the training people's variance that the first 1..K components explain."""
+
+    @property
+    @abstractmethod
+    def terms(self) -> Terms:
+        """The products of features and rotations that a fixed body is linear in."""
+
+    @abstractmethod
+    def basis(self, betas: np.ndarray | None = None) -> np.ndarray:
+        """T (M, N, 3), metres, of every term for the body with betas (k,), k ≤ K; None is the template's own."""
+
+    @abstractmethod
+    def points(self, vertex_ids: np.ndarray, weights: np.ndarray | None = None, n_betas: int | None = None
+               ) -> ShapedPoints:
+        """Some surface points as a function of pose, betas and place, without touching the mesh again.
+
+        Parameters
+        ----------
+        vertex_ids, weights
+            As for `Subject.points`.
+        n_betas : int, optional
+            Of the first components only.
+        """
+
+    @abstractmethod
+    def vertices_of(self, pose: np.ndarray, betas: np.ndarray | None) -> np.ndarray:
+        """Vertices (N, 3), metres, of one checked pose (J, 3) and betas (k,), the root's joint in the origin."""
+
+    @abstractmethod
+    def shape_jacobian(self, pose: np.ndarray, vertex_ids: np.ndarray | None = None) -> np.ndarray:
+        """Derivative of the vertices with respect to betas.
+
+        Vertices are affine in betas, so it depends on the pose alone.
+
+        Parameters
+        ----------
+        pose : (J, 3) float, radians
+        vertex_ids : (L,) int, optional
+            Of these vertices only.
+
+        Returns
+        -------
+        (L, 3, K) float, metres per standard deviation
+        """
+
+    @abstractmethod
+    def save(self, path: str | Path) -> None:
+        """Write the model into one `.npz` file with a JSON header."""
+
+    def vertices(self, pose: np.ndarray, betas: np.ndarray | None = None, trans: np.ndarray | None = None
+                 ) -> np.ndarray:
+        """Vertices for one pose or a batch, the exact way.
+
+        For many poses of one body, `subject(betas).vertices` is far faster and agrees.
+
+        Parameters
+        ----------
+        pose : (J, 3) or (B, J, 3) float, radians
+        betas : (k,) or (B, k) float, k ≤ K, optional
+            None is the template's own body.
+        trans : (3,) or (B, 3) float, metres
+
+        Returns
+        -------
+        (N, 3) or (B, N, 3) float, metres
+
+        Raises
+        ------
+        ValueError
+            A pose, betas or trans of the wrong shape or not finite.
+        """
+        if betas is not None and np.ndim(betas) == 2 and np.ndim(pose) == 2:
+            pose = np.broadcast_to(pose, (len(betas), *np.shape(pose)))
+        pose, trans = check_pose(self.skeleton, pose, trans)
+        if betas is not None and np.ndim(betas) == 2 and np.shape(betas)[:1] != pose.shape[:-2]:
+            raise ValueError(f"betas: expected as many rows as poses, {pose.shape[:-2]}, got shape {np.shape(betas)}")
+        out = np.empty((*pose.shape[:-2], *self.template.vertices.shape))
+        for b in np.ndindex(*pose.shape[:-2]):
+            mine = None if betas is None else np.asarray(betas)[b] if np.ndim(betas) == 2 else betas
+            out[b] = self.vertices_of(pose[b], mine)
+        return out + (self.skeleton.joints[0] + trans)[..., None, :]
+
+    def subject(self, betas: np.ndarray | None = None, dtype: Any = np.float64) -> Subject:
+        """The body of one person, ready to be posed fast.
+
+        Parameters
+        ----------
+        betas : (k,) float, k ≤ K, optional
+            None is the template's own body.
+        dtype
+            float64, or float32 for speed.
+        """
+        kept = None if betas is None else np.array(betas, dtype=np.float64)
+        return Subject(self.template, self.skeleton, kept, self.terms, self.basis(betas).astype(dtype, copy=False),
+                       self.skeleton.joints[0], self.pose_mean, self.pose_covariance)
+
+    def jacobian(self, pose: np.ndarray, betas: np.ndarray | None = None, trans: np.ndarray | None = None,
+                 vertex_ids: np.ndarray | None = None) -> Derivatives:
+        """Vertices at one pose with their derivatives with respect to pose parameters and betas.
+
+        Parameters
+        ----------
+        pose : (J, 3) float, radians
+        betas : (k,) float, k ≤ K, optional
+        trans : (3,) float, metres
+        vertex_ids : (L,) int, optional
+            Of these vertices only.
+        """
+        N, K = len(self.template.vertices), 0 if betas is None else len(betas)
+        few = vertex_ids is not None and len(vertex_ids) < HERE_OR_EVERYWHERE * N
+        ids = np.arange(N) if vertex_ids is None else np.asarray(vertex_ids)
+        if few:
+            shaped = self.points(ids, n_betas=K)
+            y, by_pose = shaped.operator(betas).jacobian(pose, trans)
+            return Derivatives(y, by_pose, shaped.shape_jacobian(pose))
+        y, by_pose = self.subject(betas).points(ids).jacobian(pose, trans)
+        by_shape = self.shape_jacobian(pose, ids)[..., :K] if K else np.zeros((len(ids), 3, 0))
+        return Derivatives(y, by_pose, by_shape)
+
+
+def versions() -> dict[str, str]:
+    """What wrote a file."""
+    try:
+        ours = importlib.metadata.version("scapekit")
+    except importlib.metadata.PackageNotFoundError:
+        ours = "not installed"
+    return {"scapekit": ours, "numpy": np.__version__}

@@ -1,0 +1,269 @@
+"""What a pose model is linear in: functions of the joint twists, and their products with part rotations."""
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Protocol
+
+import numpy as np
+
+from scanprep.geometry import rotations
+from scanprep.skeleton.tree import Skeleton
+
+_FIRST, _SECOND = np.triu_indices(3)
+
+
+def twists(pose: np.ndarray) -> np.ndarray:
+    """The twists (..., J, 3), radians, at most π long, of poses (..., J, 3) of any length.
+
+    [SCAPE] §4.2
+    """
+    pose = np.asarray(pose, dtype=np.float64)
+    far = np.linalg.norm(pose, axis=-1, keepdims=True) > np.pi
+    return np.where(far, rotations.log(rotations.exp(pose)), pose) if far.any() else pose
+
+
+class Lift(Protocol):
+    """A fixed map of the twists of each joint to a few numbers a joint, in which a regression is linear.
+
+    Attributes
+    ----------
+    kind : str
+        The name of the map in files.
+    width : int
+        m, the numbers of each joint.
+    """
+
+    kind: str
+
+    @property
+    def width(self) -> int: ...
+
+    def evaluate(self, t: np.ndarray) -> np.ndarray:
+        """Values (..., J, m) at twists (..., J, 3), radians."""
+        ...
+
+    def derivative(self, t: np.ndarray) -> np.ndarray:
+        """Derivatives (..., J, m, 3) of the values of each joint by its own twist (..., J, 3)."""
+        ...
+
+    def arrays(self) -> dict[str, np.ndarray]:
+        """What a file must hold to make the map again."""
+        ...
+
+
+@dataclass(frozen=True)
+class LinearLift:
+    """The twist itself.
+
+    [SCAPE] Eq. 3
+    """
+
+    kind = "linear"
+    width = 3
+
+    def evaluate(self, t: np.ndarray) -> np.ndarray:
+        return t
+
+    def derivative(self, t: np.ndarray) -> np.ndarray:
+        return np.broadcast_to(np.eye(3), (*t.shape, 3))
+
+    def arrays(self) -> dict[str, np.ndarray]:
+        return {}
+
+
+@dataclass(frozen=True)
+class QuadraticLift:
+    """The twist and the six products of its entries."""
+
+    kind = "quadratic"
+    width = 9
+
+    def evaluate(self, t: np.ndarray) -> np.ndarray:
+        return np.concatenate([t, t[..., _FIRST] * t[..., _SECOND]], axis=-1)
+
+    def derivative(self, t: np.ndarray) -> np.ndarray:
+        eye = np.eye(3)
+        product = t[..., _FIRST, None] * eye[_SECOND] + t[..., _SECOND, None] * eye[_FIRST]
+        return np.concatenate([np.broadcast_to(eye, (*t.shape, 3)), product], axis=-2)
+
+    def arrays(self) -> dict[str, np.ndarray]:
+        return {}
+
+
+@dataclass(frozen=True, eq=False)
+class RadialLift:
+    """The twist, and Gaussian bells around twists that were seen.
+
+    Parameters
+    ----------
+    centres : (J, m, 3) float, radians
+    radius : (J,) float, radians
+        Standard deviation of the bells of each joint.
+
+    [SCAPE-patent] §0087
+    """
+
+    centres: np.ndarray
+    radius: np.ndarray
+
+    kind = "radial"
+
+    @property
+    def width(self) -> int:
+        return 3 + self.centres.shape[1]
+
+    def _bells(self, t: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        off = (t[..., None, :] - self.centres) / self.radius[:, None, None]
+        return np.exp(-0.5 * (off**2).sum(axis=-1)), off
+
+    def evaluate(self, t: np.ndarray) -> np.ndarray:
+        return np.concatenate([t, self._bells(t)[0]], axis=-1)
+
+    def derivative(self, t: np.ndarray) -> np.ndarray:
+        value, off = self._bells(t)
+        slope = -value[..., None] * off / self.radius[:, None, None]
+        return np.concatenate([np.broadcast_to(np.eye(3), (*t.shape, 3)), slope], axis=-2)
+
+    def arrays(self) -> dict[str, np.ndarray]:
+        return {"centres": self.centres, "radius": self.radius}
+
+
+def make_lift(kind: str, arrays: dict[str, np.ndarray]) -> Lift:
+    """The map of a file, from its name and its arrays."""
+    if kind == LinearLift.kind:
+        return LinearLift()
+    if kind == QuadraticLift.kind:
+        return QuadraticLift()
+    if kind == RadialLift.kind:
+        return RadialLift(arrays["centres"], arrays["radius"])
+    raise ValueError(f"features: '{kind}' is not known here (known: linear, quadratic, radial)")
+
+
+@dataclass(frozen=True, eq=False)
+class PoseFeatures:
+    """What Q is linear in: for every part a constant, and mixtures of the lifted twists of its joints.
+
+    Parameters
+    ----------
+    skeleton : Skeleton
+    lift : Lift
+    part : (A,) int
+        The part of every feature, in rising order; the first feature of each part is its constant.
+    mix : (J, m, A) float
+        How much each lifted number counts in each feature; zero for the constants.
+
+    [SCAPE] Eq. 3
+    """
+
+    skeleton: Skeleton
+    lift: Lift
+    part: np.ndarray
+    mix: np.ndarray
+
+    def __post_init__(self) -> None:
+        J, A = len(self.skeleton.parents), len(self.part)
+        if self.mix.shape != (J, self.lift.width, A):
+            raise ValueError(f"mix: expected shape {(J, self.lift.width, A)}, got {self.mix.shape}")
+        if (np.diff(self.part) < 0).any() or set(self.part.tolist()) != set(range(J)):
+            raise ValueError(f"part: expected 0..{J - 1} in rising order, got {self.part.tolist()}")
+
+    @property
+    def count(self) -> int:
+        """A, the number of features of all parts together."""
+        return len(self.part)
+
+    @cached_property
+    def starts(self) -> np.ndarray:
+        """(J,) the first feature of every part, its constant."""
+        return np.searchsorted(self.part, np.arange(len(self.skeleton.parents)))
+
+    @cached_property
+    def constant(self) -> np.ndarray:
+        """(A,) 1 for the constants, 0 for the others."""
+        return np.isin(np.arange(self.count), self.starts).astype(float)
+
+    @cached_property
+    def uses(self) -> np.ndarray:
+        """(A, J) bool: which joints each feature depends on."""
+        return (self.mix != 0).any(axis=1).T
+
+    @cached_property
+    def _flat(self) -> np.ndarray:
+        return self.mix.reshape(-1, self.count)
+
+    def of_part(self, p: int) -> slice:
+        """The features of part p."""
+        end = self.starts[p + 1] if p + 1 < len(self.starts) else self.count
+        return slice(int(self.starts[p]), int(end))
+
+    def evaluate(self, pose: np.ndarray) -> np.ndarray:
+        """Features (..., A) of poses (..., J, 3), radians."""
+        raised = self.lift.evaluate(twists(pose))
+        return raised.reshape(*raised.shape[:-2], len(self._flat)) @ self._flat + self.constant
+
+    def derivative(self, pose: np.ndarray) -> np.ndarray:
+        """(..., A, J, 3) derivative of every feature by the pose parameters (..., J, 3)."""
+        pose = np.asarray(pose, dtype=np.float64)
+        t = twists(pose)
+        slope = self.lift.derivative(t)                                       # (..., J, m, 3)
+        far = np.linalg.norm(pose, axis=-1) > np.pi
+        if far.any():
+            turn = rotations.inverse_right_jacobian(t[far]) @ rotations.right_jacobian(pose[far])
+            slope = slope.copy()
+            slope[far] = slope[far] @ turn
+        by_joint = np.swapaxes(self.mix, -1, -2) @ slope                      # (..., J, A, 3)
+        return np.swapaxes(by_joint, -2, -3)
+
+
+def linear_features(skeleton: Skeleton, directions: tuple[np.ndarray, ...]) -> PoseFeatures:
+    """The features of the paper: for every part a constant and the kept twist directions of its joints.
+
+    Parameters
+    ----------
+    directions : J arrays (3, k_j)
+        Orthonormal twist directions of each joint that are kept; none for the root.
+
+    [SCAPE] Eq. 3
+    """
+    J = len(skeleton.parents)
+    part, columns = [], []
+    for p, joints in enumerate(skeleton.joints_of_part):
+        kept = [(j, direction) for j in joints for direction in directions[j].T]
+        part += [p] * (1 + len(kept))
+        columns.append(np.zeros((J, 3)))
+        for j, direction in kept:
+            columns.append(np.zeros((J, 3)))
+            columns[-1][j] = direction
+    return PoseFeatures(skeleton, LinearLift(), np.array(part), np.stack(columns, axis=-1))
+
+
+@dataclass(frozen=True, eq=False)
+class Terms:
+    """The products of a feature and a part's rotation in which the vertices of a fixed body are linear.
+
+    Parameters
+    ----------
+    features : PoseFeatures
+    part : (M,) int
+        Whose rotation.
+    feature : (M,) int
+    """
+
+    features: PoseFeatures
+    part: np.ndarray
+    feature: np.ndarray
+
+    @property
+    def skeleton(self) -> Skeleton:
+        return self.features.skeleton
+
+    @property
+    def count(self) -> int:
+        """M, the number of products."""
+        return len(self.part)
+
+    def weights(self, pose: np.ndarray) -> np.ndarray:
+        """(..., M, 3, 3) of δ R at poses (..., J, 3), radians."""
+        R = self.skeleton.part_rotations(pose)[..., self.part, :, :]
+        return self.features.evaluate(pose)[..., self.feature, None, None] * R
