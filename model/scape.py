@@ -25,7 +25,7 @@ from .stitching import StitchingSystem
 VERSION = 2                          # 1 had linear features only
 
 
-@dataclass(frozen=True, eq=False)
+@dataclass(frozen=True, eq=False, repr=False)
 class ScapeModel(BodyModel):
     """A body learned from registered meshes, every part of which turns stiffly and is deformed triangle by triangle.
 
