@@ -4,6 +4,7 @@ from __future__ import annotations
 import hashlib
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -11,7 +12,7 @@ import numpy as np
 from scanprep.geometry.mesh import Mesh, check_template
 from scanprep.skeleton.tree import Skeleton
 
-from .carriers import build_basis, carried_terms, make_carriers, rigid_weights
+from .carriers import Carrier, build_basis, carried_terms, make_carriers, rigid_weights
 from .features import twists
 from .fitting import FitConfig, PoseFitter
 from .gradients import GradientSystem, edges, local_edges, pose_gradients, shape_gradients
@@ -83,7 +84,8 @@ def learn_scape(template: Mesh, poses: np.ndarray, shapes: np.ndarray | None, sk
     shapes = None if shapes is None else _checked_bodies(template, shapes, "shapes")
     tick = _Ticks(progress, (config.refinements + 1) * len(poses) + (0 if shapes is None else len(shapes)))
 
-    trained = _learn_pose(template, skeleton, poses, config, tick)
+    carriage = Carriage(template, skeleton, rigid_weights(skeleton))
+    trained = _learn_pose(carriage, poses, config, tick)
     space = trained.regression.space
 
     shape_space = ShapeSpace.empty(len(template.faces))
@@ -106,13 +108,59 @@ def pose_prior(poses: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 
 @dataclass(frozen=True, eq=False)
+class Carriage:
+    """How rotations carry the triangles of a template, with all that does not change while a model is learned.
+
+    Parameters
+    ----------
+    template : Mesh
+    skeleton : Skeleton
+    weights : (F, J) float
+        How much each rotation carries of each triangle.
+    """
+
+    template: Mesh
+    skeleton: Skeleton
+    weights: np.ndarray
+
+    @cached_property
+    def carriers(self) -> list[Carrier]:
+        return make_carriers(self.skeleton, self.weights)
+
+    @cached_property
+    def system(self) -> StitchingSystem:
+        return StitchingSystem(self.template, self.skeleton)
+
+    @cached_property
+    def v_hat(self) -> np.ndarray:
+        return edges(self.template.vertices, self.template.faces)
+
+    def local_edges(self, bodies: np.ndarray, poses: np.ndarray) -> np.ndarray:
+        """Edges (M, F, 2, 3) of bodies (M, N, 3), or of differences, as they were before rotations carried them.
+
+        [SCAPE] Eq. 1
+        """
+        out = np.empty((len(bodies), *self.v_hat.shape))
+        for i, (y, R) in enumerate(zip(bodies, self.skeleton.part_rotations(poses), strict=True)):
+            turned = np.tensordot(self.weights, R, axes=1)
+            out[i] = local_edges(y, self.template.faces, np.swapaxes(np.linalg.inv(turned), -1, -2))
+        return out
+
+    def subject(self, space: PoseSpace, S: np.ndarray | None = None) -> Subject:
+        """A body with a pose space in the making, the template's own unless S (F, 3, 3) is given."""
+        S = np.broadcast_to(np.eye(3), (len(self.template.faces), 3, 3)) if S is None else S
+        basis = build_basis(self.system, self.template, space, S, self.carriers)
+        return Subject(self.template, self.skeleton, None, carried_terms(space.features, self.carriers), basis,
+                       self.skeleton.joints[0])
+
+
+@dataclass(frozen=True, eq=False)
 class _Trained:
     regression: Regression
     poses: np.ndarray
 
 
-def _learn_pose(template: Mesh, skeleton: Skeleton, bodies: np.ndarray, config: LearnConfig, tick: _Ticks
-                ) -> _Trained:
+def _learn_pose(carriage: Carriage, bodies: np.ndarray, config: LearnConfig, tick: _Ticks) -> _Trained:
     """The pose space, first as in the paper, then refined on the stitched surface.
 
     Stitching sees only what neighbouring triangles agree on, and Eq. 4 does not know it. So, with the part
@@ -122,33 +170,20 @@ def _learn_pose(template: Mesh, skeleton: Skeleton, bodies: np.ndarray, config: 
 
     [SCAPE] Eq. 4, Eq. 5
     """
-    parts, faces = skeleton.part_of_face, template.faces
-    gradients = GradientSystem(template, config.smoothness, parts)
-    R = skeleton.fit_rotations(template, bodies)
-    poses = skeleton.pose_of(R)
-    local = np.stack([local_edges(y, faces, r[parts]) for y, r in zip(bodies, R, strict=True)])
-    Q = pose_gradients(gradients, local)
+    template, skeleton = carriage.template, carriage.skeleton
+    gradients = GradientSystem(template, config.smoothness, skeleton.part_of_face)
+    poses = skeleton.pose_of(skeleton.fit_rotations(template, bodies))
+    Q = pose_gradients(gradients, carriage.local_edges(bodies, poses))
     regression = learn_pose_space(template, skeleton, poses, Q, config.pruning, config.ridges)
     tick(len(bodies))
-    system, v_hat = StitchingSystem(template, skeleton), edges(template.vertices, faces)
     for _ in range(config.refinements):
-        poses = _fit_poses(_subject(template, skeleton, system, regression.space), bodies, poses, tick)
-        R = skeleton.part_rotations(poses)
+        poses = _fit_poses(carriage.subject(regression.space), bodies, poses, tick)
         for _ in range(config.steps):
-            left = bodies - _subject(template, skeleton, system, regression.space).vertices(poses)
-            local = np.stack([v_hat + local_edges(d, faces, r[parts]) for d, r in zip(left, R, strict=True)])
+            left = bodies - carriage.subject(regression.space).vertices(poses)
             Q = regression.space.gradients(poses)
-            Q += pose_gradients(gradients, local) - np.eye(3)
+            Q += pose_gradients(gradients, carriage.v_hat + carriage.local_edges(left, poses)) - np.eye(3)
             regression = learn_pose_space(template, skeleton, poses, Q, config.pruning, (regression.ridge,))
     return _Trained(regression, poses)
-
-
-def _subject(template: Mesh, skeleton: Skeleton, system: StitchingSystem, space: PoseSpace) -> Subject:
-    """The template's own body with a pose space in the making."""
-    S = np.broadcast_to(np.eye(3), (len(template.faces), 3, 3))
-    carriers = make_carriers(skeleton, rigid_weights(skeleton))
-    basis = build_basis(system, template, space, S, carriers)
-    return Subject(template, skeleton, None, carried_terms(space.features, carriers), basis, skeleton.joints[0])
 
 
 def _fit_poses(subject: Subject, bodies: np.ndarray, poses: np.ndarray, tick: _Ticks) -> np.ndarray:

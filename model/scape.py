@@ -157,7 +157,12 @@ class ScapeModel(BodyModel):
         shapes = ShapeSpace(a["shape_mean"], a["shape_components"], a["shape_variances"],
                             float(a["shape_total_variance"]))
         return cls(Mesh(a["vertices"], a["faces"]), skeleton, PoseSpace(features, coefficients), shapes,
-                   a["pose_mean"], a["pose_covariance"], header["info"])
+                   a["pose_mean"], a["pose_covariance"], header["info"], **cls._extra(a))
+
+    @classmethod
+    def _extra(cls, a: dict[str, np.ndarray]) -> dict[str, Any]:
+        """What a kind built on this one keeps besides."""
+        return {}
 
 
 def _restored_features(skeleton: Skeleton, header: dict[str, Any], a: dict[str, np.ndarray]) -> PoseFeatures:
