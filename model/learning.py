@@ -79,10 +79,10 @@ def learn_scape(template: Mesh, poses: np.ndarray, shapes: np.ndarray | None, sk
     """
     config = config or LearnConfig()
     check_template(template)
-    _check_skeleton(template, skeleton)
-    poses = _checked_bodies(template, poses, "poses")
-    shapes = None if shapes is None else _checked_bodies(template, shapes, "shapes")
-    tick = _Ticks(progress, (config.refinements + 1) * len(poses) + (0 if shapes is None else len(shapes)))
+    check_skeleton(template, skeleton)
+    poses = checked_bodies(template, poses, "poses")
+    shapes = None if shapes is None else checked_bodies(template, shapes, "shapes")
+    tick = Ticks(progress, (config.refinements + 1) * len(poses) + (0 if shapes is None else len(shapes)))
 
     carriage = Carriage(template, skeleton, rigid_weights(skeleton))
     trained = _learn_pose(carriage, poses, config, tick)
@@ -90,13 +90,13 @@ def learn_scape(template: Mesh, poses: np.ndarray, shapes: np.ndarray | None, sk
 
     shape_space = ShapeSpace.empty(len(template.faces))
     if shapes is not None:
-        S = _shape_deformations(template, space, shapes, config, tick)
+        S = shape_deformations(template, space, shapes, config, tick)
         shape_space = learn_shape_space(S, config.components)
     mean, covariance = pose_prior(trained.poses)
     info: dict[str, Any] = {
         "settings": asdict(config), "poses": len(poses), "shapes": 0 if shapes is None else len(shapes),
         "ridge": trained.regression.ridge,
-        "features": space.features.count, "digest": _digest(template, poses, shapes)}
+        "features": space.features.count, "digest": digest(template, poses, shapes)}
     return ScapeModel(template, skeleton, space, shape_space, mean, covariance, info)
 
 
@@ -160,7 +160,7 @@ class _Trained:
     poses: np.ndarray
 
 
-def _learn_pose(carriage: Carriage, bodies: np.ndarray, config: LearnConfig, tick: _Ticks) -> _Trained:
+def _learn_pose(carriage: Carriage, bodies: np.ndarray, config: LearnConfig, tick: Ticks) -> _Trained:
     """The pose space, first as in the paper, then refined on the stitched surface.
 
     Stitching sees only what neighbouring triangles agree on, and Eq. 4 does not know it. So, with the part
@@ -177,7 +177,7 @@ def _learn_pose(carriage: Carriage, bodies: np.ndarray, config: LearnConfig, tic
     regression = learn_pose_space(template, skeleton, poses, Q, config.pruning, config.ridges)
     tick(len(bodies))
     for _ in range(config.refinements):
-        poses = _fit_poses(carriage.subject(regression.space), bodies, poses, tick)
+        poses = fit_poses(carriage.subject(regression.space), bodies, poses, tick)
         for _ in range(config.steps):
             left = bodies - carriage.subject(regression.space).vertices(poses)
             Q = regression.space.gradients(poses)
@@ -186,7 +186,7 @@ def _learn_pose(carriage: Carriage, bodies: np.ndarray, config: LearnConfig, tic
     return _Trained(regression, poses)
 
 
-def _fit_poses(subject: Subject, bodies: np.ndarray, poses: np.ndarray, tick: _Ticks) -> np.ndarray:
+def fit_poses(subject: Subject, bodies: np.ndarray, poses: np.ndarray, tick: Ticks) -> np.ndarray:
     """Poses (M, J, 3), radians, with which the subject comes nearest to the bodies, from poses nearby."""
     fitter = PoseFitter(subject, FitConfig(polish=0))
     fitted = []
@@ -196,8 +196,8 @@ def _fit_poses(subject: Subject, bodies: np.ndarray, poses: np.ndarray, tick: _T
     return np.stack(fitted)
 
 
-def _shape_deformations(template: Mesh, space: PoseSpace, shapes: np.ndarray, config: LearnConfig,
-                        tick: _Ticks) -> np.ndarray:
+def shape_deformations(template: Mesh, space: PoseSpace, shapes: np.ndarray, config: LearnConfig,
+                        tick: Ticks) -> np.ndarray:
     """S (P, F, 3, 3) of every person, in float32 to halve the memory.
 
     [SCAPE] Eq. 8
@@ -214,7 +214,7 @@ def _shape_deformations(template: Mesh, space: PoseSpace, shapes: np.ndarray, co
     return S
 
 
-class _Ticks:
+class Ticks:
     """Counts work for a progress callback."""
 
     def __init__(self, progress: Progress | None, total: int) -> None:
@@ -226,7 +226,7 @@ class _Ticks:
             self.progress(self.done, self.total)
 
 
-def _check_skeleton(template: Mesh, skeleton: Skeleton) -> None:
+def check_skeleton(template: Mesh, skeleton: Skeleton) -> None:
     if len(skeleton.part_of_face) != len(template.faces):
         raise ValueError(f"skeleton: it has {len(skeleton.part_of_face)} faces, "
                          f"the template {len(template.faces)}")
@@ -235,7 +235,7 @@ def _check_skeleton(template: Mesh, skeleton: Skeleton) -> None:
         raise ValueError("skeleton: joints[0] is not the centroid of part 0, so it belongs to another template")
 
 
-def _checked_bodies(template: Mesh, bodies: np.ndarray, name: str) -> np.ndarray:
+def checked_bodies(template: Mesh, bodies: np.ndarray, name: str) -> np.ndarray:
     """At least two bodies (n, N, 3) in the template's topology, or ValueError."""
     bodies, N = np.asarray(bodies, dtype=np.float64), len(template.vertices)
     if bodies.ndim != 3 or bodies.shape[1:] != (N, 3):
@@ -248,7 +248,7 @@ def _checked_bodies(template: Mesh, bodies: np.ndarray, name: str) -> np.ndarray
     return bodies
 
 
-def _digest(template: Mesh, poses: np.ndarray, shapes: np.ndarray | None) -> str:
+def digest(template: Mesh, poses: np.ndarray, shapes: np.ndarray | None) -> str:
     """SHA-256 of the training set."""
     total = hashlib.sha256()
     for array in (template.vertices, template.faces, poses, shapes):
