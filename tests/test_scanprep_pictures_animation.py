@@ -1,42 +1,13 @@
 import io
-import json
-import struct
 
 import numpy as np
 import pytest
+from glb_reader import Glb
 
 from scanprep.geometry import rotations
 from scanprep.geometry.mesh import Mesh
 from scanprep.pictures.animation import animated_glb, gif_bytes, write_animated_glb, write_gif
 from scanprep.pictures.glyphs import sphere
-
-WIDTH = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}
-
-
-class Glb:
-    """The little of glTF that is needed to read back what was written."""
-
-    def __init__(self, data):
-        magic, version, size = struct.unpack("<4sII", data[:12])
-        assert (magic, version, size) == (b"glTF", 2, len(data))
-        length, kind = struct.unpack("<I4s", data[12:20])
-        assert kind == b"JSON" and length % 4 == 0
-        self.json = json.loads(data[20:20 + length])
-        rest = data[20 + length:]
-        length, kind = struct.unpack("<I4s", rest[:8])
-        assert kind == b"BIN\0" and length == len(rest) - 8 and length % 4 == 0
-        self.buffer = rest[8:]
-
-    def array(self, number):
-        accessor = self.json["accessors"][number]
-        view = self.json["bufferViews"][accessor["bufferView"]]
-        dtype = {5126: "<f4", 5125: "<u4"}[accessor["componentType"]]
-        data = self.buffer[view["byteOffset"]:view["byteOffset"] + view["byteLength"]]
-        values = np.frombuffer(data, dtype).reshape(accessor["count"], WIDTH[accessor["type"]])
-        if "min" in accessor:
-            assert np.array_equal(values.min(axis=0), np.float32(accessor["min"]))
-            assert np.array_equal(values.max(axis=0), np.float32(accessor["max"]))
-        return values
 
 
 @pytest.fixture(scope="module")

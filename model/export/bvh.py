@@ -1,0 +1,136 @@
+"""BVH: a skeleton and its motion, for animation programs."""
+from __future__ import annotations
+
+import warnings
+from pathlib import Path
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from scanprep.geometry.mesh import Mesh
+from scanprep.geometry.storage import writing
+from scanprep.skeleton.tree import Skeleton
+
+from .rig import check_motion, turn_up
+
+UNITS = {"m": 1.0, "cm": 100.0, "mm": 1000.0, "in": 1 / 0.0254}
+_ORDER = "ZXY"                       # R = R_z R_x R_y, about axes that turn with the part
+_TURNS = " ".join(f"{axis}rotation" for axis in _ORDER)
+
+
+def write_bvh(path: str | Path, skeleton: Skeleton, poses: np.ndarray | None = None, trans: np.ndarray | None = None,
+              rate: float = 30.0, unit: str = "cm", up: int = 2, body: Mesh | None = None) -> None:
+    """Write a skeleton and its motion as BVH.
+
+    Offsets are those between the joints at rest, where all parts have the axes of the world. The root has six
+    channels, its place and its turn, the others three. Turns are Euler angles in degrees in the order Z, X, Y:
+    `R = R_z R_x R_y`. The root's offset is zero and its place is where its joint stands, so that readers who add
+    the two and readers who do not agree. Everything is turned so that y is up, as BVH readers expect.
+
+    Parameters
+    ----------
+    path : str or Path
+    skeleton : Skeleton
+        With the joints of the body that moves (`Rig.skeleton`, or the template's).
+    poses : (T, J, 3) float, radians, optional
+        Without frames, one frame at rest is written.
+    trans : (T, 3) float, metres, optional
+    rate : float, frames a second
+    unit : "m", "cm", "mm" or "in"
+        Of the lengths in the file, which does not say it; readers expect centimetres.
+    up : int
+        0, 1 or 2: the axis of the body that points up.
+    body : Mesh, optional
+        The rest mesh, to end the leaf parts where it ends; without it a leaf is as long as the bone before it.
+
+    Raises
+    ------
+    ValueError
+        A motion of other parts or not finite; a rate that is not positive; an unknown unit; an axis that
+        does not exist; names with white space.
+    """
+    if unit not in UNITS:
+        raise ValueError(f"unit: expected one of {', '.join(UNITS)}, got {unit!r}")
+    spaced = [name for name in skeleton.names if name.split() != [name]]
+    if spaced:
+        raise ValueError(f"names: expected names without white space in BVH, got {spaced[0]!r}")
+    if poses is None or not len(poses):
+        poses, trans = np.zeros((1, len(skeleton.parents), 3)), None
+    poses, trans = check_motion(skeleton, poses, trans, rate)
+    U = turn_up(up).T
+    scale = UNITS[unit]
+    lines = ["HIERARCHY", *_hierarchy(skeleton, scale * skeleton.joints @ U, scale * part_ends(skeleton, body) @ U),
+             "MOTION", f"Frames: {len(poses)}", f"Frame Time: {1 / rate:.9f}"]
+    places = scale * (skeleton.joints[0] + trans) @ U
+    angles = euler_degrees(poses @ U)[:, _written(skeleton)]
+    for row in np.concatenate([places, angles.reshape(len(poses), -1)], axis=1):
+        lines.append(" ".join(_number(value) for value in row))
+    with writing(path) as beside:
+        beside.write_text("\n".join(lines) + "\n", encoding="utf-8")
+
+
+def euler_degrees(poses: np.ndarray) -> np.ndarray:
+    """Angles (T, J, 3) in degrees about z, x, y of poses (T, J, 3), without jumps of a full turn over time."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", UserWarning)      # where two axes fall together one of the answers is right
+        angles = Rotation.from_rotvec(poses.reshape(-1, 3)).as_euler(_ORDER, degrees=True)
+    return np.unwrap(angles.reshape(poses.shape), axis=0, period=360)
+
+
+def part_ends(skeleton: Skeleton, body: Mesh | None = None) -> np.ndarray:
+    """(J, 3) the far end of every part, metres: of a leaf the tip of its surface, seen along the part.
+
+    Parameters
+    ----------
+    body : Mesh, optional
+        At rest; without it the bone before a part is continued by its own length.
+    """
+    joints, parents = skeleton.joints, skeleton.parents
+    ends = 2 * joints - joints[np.maximum(parents, 0)]
+    for j in range(len(parents) if body is not None else 0):
+        assert body is not None
+        mine = body.vertices[np.unique(body.faces[skeleton.part_of_face == j])] - joints[j]
+        along = mine.mean(axis=0)
+        length = float(np.linalg.norm(along))
+        if length > 0:
+            ends[j] = joints[j] + along / length * max(float((mine @ along).max()) / length, length)
+    return ends
+
+
+def _written(skeleton: Skeleton) -> list[int]:
+    """The joints in the order of the file: every joint is followed by all that hangs below it."""
+    order: list[int] = []
+    waiting = [0]
+    while waiting:
+        j = waiting.pop()
+        order.append(j)
+        waiting += np.flatnonzero(skeleton.parents == j)[::-1].tolist()
+    return order
+
+
+def _hierarchy(skeleton: Skeleton, joints: np.ndarray, ends: np.ndarray) -> list[str]:
+    lines: list[str] = []
+    level = np.zeros(len(joints), dtype=int)
+    open_joints: list[int] = []
+    for j in _written(skeleton):
+        parent = int(skeleton.parents[j])
+        while open_joints and open_joints[-1] != parent:
+            lines.append("  " * level[open_joints.pop()] + "}")
+        level[j] = level[parent] + 1 if j else 0
+        pad = "  " * level[j]
+        offset = joints[j] - joints[parent] if j else np.zeros(3)
+        channels = f"3 {_TURNS}" if j else f"6 Xposition Yposition Zposition {_TURNS}"
+        lines += [f"{pad}{'JOINT' if j else 'ROOT'} {skeleton.names[j]}", pad + "{", f"{pad}  {_offset(offset)}",
+                  f"{pad}  CHANNELS {channels}"]
+        open_joints.append(j)
+        if not (skeleton.parents == j).any():
+            lines += [f"{pad}  End Site", pad + "  {", f"{pad}    {_offset(ends[j] - joints[j])}", pad + "  }"]
+    return lines + ["  " * level[j] + "}" for j in reversed(open_joints)]
+
+
+def _offset(offset: np.ndarray) -> str:
+    return "OFFSET " + " ".join(_number(value) for value in offset)
+
+
+def _number(value: float) -> str:
+    return f"{value + 0.0:.6f}".replace("-0.000000", "0.000000")

@@ -1,0 +1,154 @@
+"""A skinned body as glTF 2.0: joints, weights, shapes as morph targets, and a motion."""
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from scanprep.geometry.mesh import Mesh
+from scanprep.geometry.storage import writing
+from scanprep.pictures.gltf import VERTICES, Glb, skin_material, some_normal
+
+from .correctives import Correctives
+from .rig import CARRIERS, Rig, check_motion, turn_up
+
+
+def write_skinned_glb(path: str | Path, rig: Rig, poses: np.ndarray | None = None, trans: np.ndarray | None = None,
+                      rate: float = 30.0, correctives: Correctives | None = None, up: int = 2) -> None:
+    """Write a body that hangs on joints, for any glTF 2.0 viewer, animation program or game engine.
+
+    One node for every joint, where the joint is at rest and with the axes of the world; morph targets `beta 1`,
+    `beta 2`, ... whose weight is added to the beta of this body. The joints stay where they are when such a
+    weight changes, so export a person of another shape with betas of their own. Everything is turned so that
+    y is up, as glTF has it.
+
+    Parameters
+    ----------
+    path : str or Path
+    rig : Rig
+    poses : (T, J, 3) float, radians, optional
+        A motion: rotations of all joints and places of the root.
+    trans : (T, 3) float, metres, optional
+    rate : float, frames a second
+    correctives : Correctives, optional
+        What skinning lacks in this motion, as further morph targets that the motion drives.
+    up : int
+        0, 1 or 2: the axis of the body that points up.
+
+    Raises
+    ------
+    ValueError
+        A motion of other parts, empty, not finite or of another length than the correctives; a rate that is
+        not positive; an axis that does not exist.
+    """
+    data = skinned_glb(rig, poses, trans, rate, correctives, up)
+    with writing(path) as beside:
+        beside.write_bytes(data)
+
+
+def skinned_glb(rig: Rig, poses: np.ndarray | None = None, trans: np.ndarray | None = None, rate: float = 30.0,
+                correctives: Correctives | None = None, up: int = 2) -> bytes:
+    """The bytes of `write_skinned_glb`."""
+    U = turn_up(up).T
+    rig, glb = rig.turned(up), Glb()
+    names = [f"beta {k + 1}" for k in range(len(rig.shapes))]
+    targets = rig.shapes
+    if correctives is not None:
+        names += [f"corrective {k + 1}" for k in range(len(correctives.shapes))]
+        targets = np.concatenate([targets, correctives.shapes @ U])
+    mesh: dict[str, Any] = {"name": "body", "primitives": [_primitive(glb, rig, targets)]}
+    if names:
+        mesh |= {"weights": [0] * len(names), "extras": {"targetNames": names}}
+    document = {"scene": 0, "scenes": [{"nodes": [0, 1]}], "nodes": _nodes(rig), "meshes": [mesh],
+                "skins": [_skin(glb, rig)], "materials": [skin_material()]}
+    if poses is not None:
+        poses, trans = check_motion(rig.skeleton, poses, trans, rate)
+        animation = _animation(glb, rig, poses @ U, trans @ U, rate)
+        if correctives is not None:
+            _drive(glb, animation, correctives.weights, len(names))
+        document["animations"] = [animation]
+    elif correctives is not None:
+        raise ValueError("correctives: expected the poses that they belong to")
+    return glb.pack(document)
+
+
+def four_carriers(weights: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The joints (N, 4) that carry each vertex most, and their weights (N, 4), which sum to 1.
+
+    Where fewer carry it, joint 0 stands with weight 0.
+    """
+    joints = np.argsort(-weights, axis=1, kind="stable")[:, :CARRIERS]
+    kept = np.take_along_axis(weights, joints, axis=1)
+    joints[kept == 0] = 0
+    missing = CARRIERS - joints.shape[1]
+    return np.pad(joints, ((0, 0), (0, missing))), np.pad(kept, ((0, 0), (0, missing)))
+
+
+def continuous_quaternions(poses: np.ndarray) -> np.ndarray:
+    """Unit quaternions (T, J, 4), scalar last, of poses (T, J, 3), without a change of sign from frame to frame."""
+    q = Rotation.from_rotvec(poses.reshape(-1, 3)).as_quat().reshape(*poses.shape[:-1], 4)
+    same = (q[1:] * q[:-1]).sum(axis=-1, keepdims=True) >= 0
+    q[1:] *= np.cumprod(np.where(same, 1, -1), axis=0)
+    return q
+
+
+def _primitive(glb: Glb, rig: Rig, targets: np.ndarray) -> dict[str, Any]:
+    base, normals = rig.mesh.vertices, some_normal(rig.mesh)
+    joints, weights = four_carriers(rig.weights)
+    out: dict[str, Any] = {
+        "attributes": {"POSITION": glb.add(base, "VEC3", VERTICES, bounds=True),
+                       "NORMAL": glb.add(normals, "VEC3", VERTICES), "JOINTS_0": glb.add_joints(joints),
+                       "WEIGHTS_0": glb.add(weights, "VEC4", VERTICES)},
+        "indices": glb.add_indices(rig.mesh.faces), "material": 0}
+    if len(targets):
+        out["targets"] = [{"POSITION": glb.add(change, "VEC3", VERTICES, bounds=True),
+                           "NORMAL": glb.add(some_normal(Mesh(base + change, rig.mesh.faces)) - normals, "VEC3",
+                                             VERTICES)} for change in targets]
+    return out
+
+
+def _nodes(rig: Rig) -> list[dict[str, Any]]:
+    """The mesh, then the joints; joint j is node j + 1."""
+    joints, parents = rig.skeleton.joints, rig.skeleton.parents
+    nodes: list[dict[str, Any]] = [{"name": "body", "mesh": 0, "skin": 0}]
+    for j, name in enumerate(rig.skeleton.names):
+        offset = joints[j] - (joints[parents[j]] if j else 0)
+        nodes.append({"name": name, "translation": offset.tolist()})
+        children = np.flatnonzero(parents == j)
+        if len(children):
+            nodes[-1]["children"] = (children + 1).tolist()
+    return nodes
+
+
+def _skin(glb: Glb, rig: Rig) -> dict[str, Any]:
+    J = len(rig.skeleton.parents)
+    inverse = np.tile(np.eye(4), (J, 1, 1))
+    inverse[:, 3, :3] = -rig.skeleton.joints                                  # column after column
+    return {"name": "skeleton", "joints": list(range(1, J + 1)), "skeleton": 1,
+            "inverseBindMatrices": glb.add(inverse.reshape(J, 16), "MAT4", None)}
+
+
+def _animation(glb: Glb, rig: Rig, poses: np.ndarray, trans: np.ndarray, rate: float) -> dict[str, Any]:
+    q = continuous_quaternions(poses)
+    times = glb.add(np.arange(len(poses)) / rate, "SCALAR", None, bounds=True)
+    places = glb.add(rig.skeleton.joints[0] + trans, "VEC3", None)
+    out: dict[str, Any] = {"name": "motion", "samplers": [], "channels": []}
+    _channel(out, times, places, 1, "translation")
+    for j in range(q.shape[1]):
+        _channel(out, times, glb.add(q[:, j], "VEC4", None), j + 1, "rotation")
+    return out
+
+
+def _drive(glb: Glb, animation: dict[str, Any], weights: np.ndarray, count: int) -> None:
+    """Let the motion drive the last of `count` morph targets with weights (T, C)."""
+    times = animation["samplers"][0]["input"]
+    everything = np.zeros((len(weights), count))
+    everything[:, count - weights.shape[1]:] = weights
+    _channel(animation, times, glb.add(everything.ravel(), "SCALAR", None), 0, "weights")
+
+
+def _channel(animation: dict[str, Any], times: int, values: int, node: int, path: str) -> None:
+    animation["channels"].append({"sampler": len(animation["samplers"]), "target": {"node": node, "path": path}})
+    animation["samplers"].append({"input": times, "output": values, "interpolation": "LINEAR"})

@@ -1,0 +1,231 @@
+"""A body as other programs move it: a mesh that hangs on joints by linear blend skinning."""
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.sparse import csc_array, diags_array
+
+from scanprep.cleaning.remesh import clamped_cotangents
+from scanprep.geometry import rotations
+from scanprep.geometry.mesh import Mesh
+from scanprep.geometry.sparse import factor
+from scanprep.pictures.gltf import UPRIGHT
+from scanprep.skeleton.tree import Skeleton
+
+from ..body import BodyModel
+
+CARRIERS = 4                         # joints that carry one vertex: more is not what other programs read
+WIDTH = 0.05                         # of 0.005 to 0.08 the nearest to a SCAPE model of real scans, within a percent
+
+
+@dataclass(frozen=True, eq=False)
+class Rig:
+    """A rest mesh, its skeleton, and how much each joint carries each vertex.
+
+    At rest all parts have the axes of the world. A pose turns every part about its joint, and the root's joint
+    stands at `joints[0] + trans`, as in the models.
+
+    Parameters
+    ----------
+    mesh : Mesh
+        At rest: pose and trans are zero.
+    skeleton : Skeleton
+        With the joints of this body.
+    weights : (N, J) float
+        Rows sum to 1, with at most `CARRIERS` entries that are not zero.
+    shapes : (K, N, 3) float, metres
+        Change of the rest mesh for one standard deviation of each beta.
+    """
+
+    mesh: Mesh
+    skeleton: Skeleton
+    weights: np.ndarray
+    shapes: np.ndarray
+
+    def __post_init__(self) -> None:
+        N, J = len(self.mesh.vertices), len(self.skeleton.parents)
+        if self.weights.shape != (N, J):
+            raise ValueError(f"weights: expected shape {(N, J)}, got {self.weights.shape}")
+        if not (self.weights >= 0).all() or not np.allclose(self.weights.sum(axis=1), 1, atol=1e-6):
+            raise ValueError("weights: expected numbers of at least 0 that sum to 1 for every vertex")
+        if ((self.weights > 0).sum(axis=1) > CARRIERS).any():
+            raise ValueError(f"weights: expected at most {CARRIERS} for a vertex (see strongest)")
+        if self.shapes.ndim != 3 or self.shapes.shape[1:] != (N, 3):
+            raise ValueError(f"shapes: expected shape (K, {N}, 3), got {self.shapes.shape}")
+
+    def vertices(self, poses: np.ndarray, trans: np.ndarray | None = None, changes: np.ndarray | None = None
+                 ) -> np.ndarray:
+        """The skinned mesh.
+
+        Parameters
+        ----------
+        poses : (J, 3) or (T, J, 3) float, radians
+        trans : (3,) or (T, 3) float, metres
+        changes : (N, 3) or (T, N, 3) float, metres, optional
+            Added to the rest mesh before it is skinned.
+
+        Returns
+        -------
+        (N, 3) or (T, N, 3) float, metres
+        """
+        R = self.skeleton.part_rotations(poses)
+        offset = joint_places(self.skeleton, poses, trans) - np.einsum("...jab,jb->...ja", R, self.skeleton.joints)
+        out = np.einsum("nj,nb,...jab->...na", self.weights, self.mesh.vertices, R, optimize=True)
+        if changes is not None:
+            out += np.einsum("nj,...nb,...jab->...na", self.weights, changes, R, optimize=True)
+        return out + self.weights @ offset
+
+    def turned(self, up: int) -> Rig:
+        """The same body with the axis `up` turned to +y; poses and trans turn with `turn_up`."""
+        U = turn_up(up).T
+        return replace(self, mesh=self.mesh.with_vertices(self.mesh.vertices @ U), shapes=self.shapes @ U,
+                       skeleton=replace(self.skeleton, joints=self.skeleton.joints @ U))
+
+
+def make_rig(model: BodyModel, betas: np.ndarray | None = None, shapes: int = 0, weights: np.ndarray | None = None
+             ) -> Rig:
+    """The body of one person, ready for linear blend skinning.
+
+    Parameters
+    ----------
+    model : BodyModel
+    betas : (k,) float, optional
+        None is the template's own body, which has no shapes.
+    shapes : int
+        So many of the first betas become shapes; more than the model has are not asked for.
+    weights : (N, J) float, optional
+        Else `skin_weights`. Of every vertex the largest `CARRIERS` are kept.
+
+    Raises
+    ------
+    ValueError
+        Weights of another shape, shapes of the template's own body.
+    """
+    if shapes and betas is None:
+        raise ValueError(f"shapes: the template's own body has none, got {shapes}")
+    rest = np.zeros((len(model.skeleton.parents), 3))
+    mesh = model.template.with_vertices(model.vertices(rest, betas))
+    joints = model.skeleton.joint_regressor(model.template) @ mesh.vertices
+    if weights is None:
+        weights = skin_weights(model.template, model.skeleton)
+    changes = np.zeros((0, *mesh.vertices.shape))
+    if shapes:
+        changes = np.moveaxis(model.shape_jacobian(rest)[..., :shapes], -1, 0)
+    return Rig(mesh, replace(model.skeleton, joints=joints), strongest(weights), changes)
+
+
+def skin_weights(template: Mesh, skeleton: Skeleton, width: float = WIDTH) -> np.ndarray:
+    """How much each part carries each vertex, smooth across the borders of parts.
+
+    The labels of the parts are spread over the surface by one step of diffusion. What comes from a part that is
+    not linked to the vertex's own one counts for the part on the way to it, so that a thigh never carries the
+    other one.
+
+    Parameters
+    ----------
+    width : float, metres
+        How far a label spreads along the surface.
+
+    Returns
+    -------
+    (N, J) float
+        Rows sum to 1.
+
+    Raises
+    ------
+    ValueError
+        A width that is not positive.
+    """
+    if not width > 0:
+        raise ValueError(f"width: expected a positive length, got {width}")
+    J = len(skeleton.parents)
+    areas = np.maximum(template.vertex_areas, 1e-12)
+    labels = np.zeros((len(template.vertices), J))
+    for corner in range(3):
+        np.add.at(labels, (template.faces[:, corner], skeleton.part_of_face), template.face_areas / 3)
+    alone = ~labels.any(axis=1)
+    labels[alone, skeleton.part_of_vertex(template)[alone]] = areas[alone]
+    spread = factor(csc_array(diags_array(areas) + width**2 * clamped_cotangents(template)))(labels)
+    spread = np.maximum(spread, 0)
+    weights = np.zeros_like(spread)
+    owner, toward = spread.argmax(axis=1), _first_step(skeleton)
+    for p in range(J):
+        mine = owner == p
+        for q in range(J):
+            weights[mine, toward[p, q]] += spread[mine, q]
+    return weights / weights.sum(axis=1, keepdims=True)
+
+
+def strongest(weights: np.ndarray, count: int = CARRIERS) -> np.ndarray:
+    """Weights (N, J) with no more than the largest `count` of each vertex, which sum to 1."""
+    kept = np.array(weights, dtype=np.float64)
+    if count < kept.shape[1]:
+        np.put_along_axis(kept, np.argsort(-kept, axis=1, kind="stable")[:, count:], 0, axis=1)
+    kept[kept < 1e-6] = 0
+    return kept / kept.sum(axis=1, keepdims=True)
+
+
+def _first_step(skeleton: Skeleton) -> np.ndarray:
+    """(J, J) the part next to p on the way to q along the tree; p itself where q is p."""
+    J = len(skeleton.parents)
+    step = np.zeros((J, J), dtype=np.int64)
+    for p in range(J):
+        for q in range(J):
+            below = [c for c in np.flatnonzero(skeleton.parents == p) if skeleton.descends[q, c]]
+            step[p, q] = p if p == q else below[0] if below else skeleton.parents[p]
+    return step
+
+
+def joint_places(skeleton: Skeleton, poses: np.ndarray, trans: np.ndarray | None = None) -> np.ndarray:
+    """Where the joints (..., J, 3) of a skeleton with bones of fixed length stand, metres.
+
+    Parameters
+    ----------
+    poses : (..., J, 3) float, radians
+    trans : (..., 3) float, metres
+    """
+    R = skeleton.part_rotations(poses)
+    out = np.empty(R.shape[:-1])
+    out[..., 0, :] = skeleton.joints[0] + (0.0 if trans is None else np.asarray(trans))
+    for j in range(1, len(skeleton.parents)):
+        p = skeleton.parents[j]
+        out[..., j, :] = out[..., p, :] + R[..., p, :, :] @ (skeleton.joints[j] - skeleton.joints[p])
+    return out
+
+
+def typical_poses(model: BodyModel, count: int, seed: int = 0) -> np.ndarray:
+    """Poses (count, J, 3), radians, drawn from the model's prior: like those that it was learned from."""
+    variance, directions = np.linalg.eigh(model.pose_covariance)
+    root = directions * np.sqrt(np.maximum(variance, 0))
+    draws = np.random.default_rng(seed).normal(size=(count, len(root))) @ root.T
+    return model.pose_mean + draws.reshape(count, -1, 3)
+
+
+def check_motion(skeleton: Skeleton, poses: np.ndarray, trans: np.ndarray | None, rate: float
+                 ) -> tuple[np.ndarray, np.ndarray]:
+    """Poses (T, J, 3) and trans (T, 3) of a motion, or ValueError."""
+    poses = np.asarray(poses, dtype=np.float64)
+    J = len(skeleton.parents)
+    if poses.ndim != 3 or poses.shape[1:] != (J, 3) or not len(poses):
+        raise ValueError(f"poses: expected shape (T, {J}, 3) with at least one frame, got {poses.shape}")
+    trans = np.zeros((len(poses), 3)) if trans is None else np.asarray(trans, dtype=np.float64)
+    if trans.shape != (len(poses), 3):
+        raise ValueError(f"trans: expected shape {(len(poses), 3)}, got {trans.shape}")
+    bad = np.flatnonzero(~(np.isfinite(poses).all(axis=(1, 2)) & np.isfinite(trans).all(axis=1)))
+    if len(bad):
+        raise ValueError(f"poses, trans: {len(bad)} frames are not finite, the first is frame {bad[0]}")
+    if not (np.isfinite(rate) and rate > 0):
+        raise ValueError(f"rate: expected a positive number of frames a second, got {rate}")
+    return poses, trans
+
+
+def turn_up(up: int) -> np.ndarray:
+    """The rotation (3, 3) that brings an axis to +y; points, poses and trans turn as `x @ turn_up(up).T`.
+
+    A rotation vector turns like a point because the axes of all parts are those of the world at rest.
+    """
+    if up not in UPRIGHT:
+        raise ValueError(f"up: expected 0, 1 or 2, got {up}")
+    axis = np.array(UPRIGHT[up][:3])
+    return rotations.exp(axis / max(float(np.linalg.norm(axis)), 1e-12) * (0 if up == 1 else np.pi / 2)).round()
