@@ -14,6 +14,7 @@ from scanprep.skeleton.tree import Skeleton
 from .rig import check_motion, turn_up
 
 UNITS = {"m": 1.0, "cm": 100.0, "mm": 1000.0, "in": 1 / 0.0254}
+_DIGITS = 8                          # after the point: in any unit finer than a tenth of a micrometre
 _ORDER = "ZXY"                       # R = R_z R_x R_y, about axes that turn with the part
 _TURNS = " ".join(f"{axis}rotation" for axis in _ORDER)
 
@@ -133,4 +134,4 @@ def _offset(offset: np.ndarray) -> str:
 
 
 def _number(value: float) -> str:
-    return f"{value + 0.0:.6f}".replace("-0.000000", "0.000000")
+    return f"{round(float(value), _DIGITS) + 0.0:.{_DIGITS}f}"

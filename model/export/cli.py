@@ -21,10 +21,11 @@ from .correctives import motion_correctives, spaced
 from .glb import write_skinned_glb
 from .meshes import write_frames
 from .npz import pose_features, write_body_npz
-from .rig import Rig, joint_places, make_rig, typical_poses
+from .rig import Rig, check_motion, joint_places, make_rig, typical_poses
 
 MM = 1000.0
 SHAPES = 10                          # morph targets where nobody says how many
+MOTIONS_OF = "scape"                 # what motion files say they are made for
 MEASURED = 40                        # poses in which the files are compared with the exact model
 _MESHES = (".obj", ".ply", ".stl", ".off", ".ply.gz")
 _TAKES = {"glb": {"betas", "own_body", "motion", "shapes", "correctives", "up"},
@@ -98,17 +99,25 @@ def read_motion(path: Path, model: BodyModel) -> _Moves:
         Missing, not a motion, or of another body.
     """
     stored = load_arrays(path, "a motion (.npz)")
-    lacking = [name for name in ("poses", "trans", "mocap_frame_rate") if name not in stored]
+    stored.setdefault("mocap_frame_rate", stored.pop("mocap_framerate", np.array(np.nan)))
+    lacking = [name for name in ("poses", "trans") if name not in stored]
     if lacking:
         raise StorageError(f"{path}: expected a motion, it lacks {' and '.join(lacking)}")
-    J, poses, trans = len(model.skeleton.parents), stored["poses"], stored["trans"]
-    if poses.reshape(len(poses), -1).shape[1] != 3 * J or not len(poses):
-        raise StorageError(f"{path}: expected poses of the model's {J} parts, found shape {poses.shape}")
-    betas = stored.get("betas", np.zeros(0)).astype(np.float64)
+    made_for = str(stored.get("surface_model_type", model.kind))
+    if made_for not in (MOTIONS_OF, model.kind):
+        raise StorageError(f"{path}: expected surface_model_type '{MOTIONS_OF}', found '{made_for}'")
+    J, T = len(model.skeleton.parents), len(np.atleast_1d(stored["poses"]))
+    if not T or stored["poses"].size != T * 3 * J:
+        raise StorageError(f"{path}: expected frames of the model's {J} parts, found shape {stored['poses'].shape}")
+    betas = stored.get("betas", np.zeros(0))
     if betas.ndim != 1 or len(betas) > model.n_betas:
         raise StorageError(f"{path}: expected at most the {model.n_betas} betas of the model, found {betas.shape}")
-    return _Moves(poses.astype(np.float64).reshape(-1, J, 3), trans.astype(np.float64),
-                  betas if betas.size else None, float(stored["mocap_frame_rate"]))
+    try:
+        poses, rate = stored["poses"].astype(np.float64).reshape(T, J, 3), float(stored["mocap_frame_rate"])
+        poses, trans = check_motion(model.skeleton, poses, stored["trans"], rate)
+        return _Moves(poses, trans, betas.astype(np.float64) if betas.size else None, rate)
+    except (TypeError, ValueError) as error:
+        raise StorageError(f"{path}: {error}") from None
 
 
 def _kind(output: Path) -> str:

@@ -67,6 +67,9 @@ def skinned_glb(rig: Rig, poses: np.ndarray | None = None, trans: np.ndarray | N
         poses, trans = check_motion(rig.skeleton, poses, trans, rate)
         animation = _animation(glb, rig, poses @ U, trans @ U, rate)
         if correctives is not None:
+            if len(correctives.weights) != len(poses):
+                raise ValueError(f"correctives: expected weights for {len(poses)} frames, "
+                                 f"got {len(correctives.weights)}")
             _drive(glb, animation, correctives.weights, len(names))
         document["animations"] = [animation]
     elif correctives is not None:

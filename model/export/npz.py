@@ -58,7 +58,8 @@ def body_arrays(model: BodyModel, weights: np.ndarray | None = None, draws: int 
         "kintree_table": np.stack([model.skeleton.parents, np.arange(J)]),
         "J_regressor": model.skeleton.joint_regressor(model.template).toarray(), "J": rig.skeleton.joints,
         "shapedirs": np.moveaxis(rig.shapes, 0, -1).astype(np.float32),
-        "part_names": np.array(model.skeleton.names, dtype=str), "betas_unit": np.array("standard deviation"), "length_unit": np.array("metre")}
+        "part_names": np.array(model.skeleton.names, dtype=str), "betas_unit": np.array("standard deviation"),
+        "length_unit": np.array("metre")}
     if draws and J > 1:
         poses = typical_poses(model, draws)
         arrays["posedirs"] = pose_directions(rig, poses, model.subject(mean).vertices(poses)).astype(np.float32)

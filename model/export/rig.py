@@ -54,6 +54,9 @@ class Rig:
         if self.shapes.ndim != 3 or self.shapes.shape[1:] != (N, 3):
             raise ValueError(f"shapes: expected shape (K, {N}, 3), got {self.shapes.shape}")
 
+    def __repr__(self) -> str:
+        return f"Rig({self.mesh!r}, {len(self.skeleton.parents)} joints, {len(self.shapes)} shapes)"
+
     def vertices(self, poses: np.ndarray, trans: np.ndarray | None = None, changes: np.ndarray | None = None
                  ) -> np.ndarray:
         """The skinned mesh.

@@ -1,0 +1,391 @@
+"""Exported files, read back by readers of their own."""
+import json
+
+import numpy as np
+import pytest
+from glb_reader import Glb
+from model_bodies import random_poses, worm_model
+
+from model.export.bvh import part_ends, write_bvh
+from model.export.cli import export, read_motion
+from model.export.correctives import motion_correctives
+from model.export.glb import continuous_quaternions, skinned_glb, write_skinned_glb
+from model.export.meshes import write_frames
+from model.export.npz import pose_directions, pose_features, write_body_npz
+from model.export.rig import joint_places, make_rig, turn_up
+from scanprep.console import run
+from scanprep.geometry import rotations
+from scanprep.geometry.files import read_mesh
+from scanprep.geometry.mesh import Mesh
+from scanprep.geometry.storage import StorageError
+
+BETAS = np.array([0.5, -1.0])
+
+
+@pytest.fixture(scope="module")
+def model():
+    return worm_model()
+
+
+@pytest.fixture(scope="module")
+def rig(model):
+    return make_rig(model, BETAS, 3)
+
+
+@pytest.fixture(scope="module")
+def motion(model):
+    rng = np.random.default_rng(0)
+    return random_poses(model, 5, rng, 0.8), rng.normal(size=(5, 3))
+
+
+@pytest.mark.parametrize("up", [0, 1, 2])
+def test_a_viewer_sees_the_skinned_motion(rig, motion, up):
+    poses, trans = motion
+    glb = Glb(skinned_glb(rig, poses, trans, 4.0, up=up))
+    assert np.array_equal(glb.faces, rig.mesh.faces)
+    for t, expected in enumerate(rig.vertices(poses, trans)):
+        assert np.abs(glb.skinned(t) - expected @ turn_up(up).T).max() < 1e-5
+    times = [glb.array(s["input"]) for s in glb.json["animations"][0]["samplers"]]
+    assert all(np.allclose(t[:, 0], [0, 0.25, 0.5, 0.75, 1.0]) for t in times)
+
+
+def test_at_rest_nothing_is_moved(rig):
+    glb = Glb(skinned_glb(rig, up=1))
+    assert np.abs(glb.skinned() - rig.mesh.vertices).max() < 1e-6
+    assert np.abs(glb.morphed([0, 0, 0]) - rig.mesh.vertices).max() < 1e-6
+    world = glb.matrices()
+    skin = glb.json["skins"][0]
+    inverse = glb.array(skin["inverseBindMatrices"]).reshape(-1, 4, 4).transpose(0, 2, 1)
+    for j, node in enumerate(skin["joints"]):
+        assert np.abs(world[node] @ inverse[j] - np.eye(4)).max() < 1e-6
+        assert np.abs(world[node][:3, 3] - rig.skeleton.joints[j]).max() < 1e-6
+        assert glb.json["nodes"][node]["name"] == rig.skeleton.names[j]
+    assert "animations" not in glb.json
+
+
+def test_weights_are_as_gltf_wants_them(rig):
+    glb = Glb(skinned_glb(rig))
+    joints = glb.array(glb.primitive["attributes"]["JOINTS_0"])
+    weights = glb.array(glb.primitive["attributes"]["WEIGHTS_0"])
+    assert joints.max() < 4 and np.abs(weights.sum(axis=1, dtype=float) - 1).max() < 1e-6
+    assert (joints[weights == 0] == 0).all() and (weights >= 0).all()
+    spread = np.zeros(rig.weights.shape)
+    for k in range(4):
+        np.add.at(spread, (np.arange(len(joints)), joints[:, k]), weights[:, k])
+    assert np.abs(spread - rig.weights).max() < 1e-6
+
+
+@pytest.mark.parametrize("k", [0, 1, 2])
+def test_morph_targets_are_betas(model, rig, k):
+    glb = Glb(skinned_glb(rig, up=1))
+    assert glb.json["meshes"][0]["extras"]["targetNames"] == ["beta 1", "beta 2", "beta 3"]
+    weights, betas = np.zeros(3), np.r_[BETAS, 0]
+    weights[k], betas[k] = 2, betas[k] + 2
+    body = model.vertices(np.zeros((4, 3)), betas)
+    assert np.abs(glb.skinned(weights=weights) - body).max() < 1e-6
+    one = Mesh(rig.mesh.vertices + rig.shapes[k], rig.mesh.faces)
+    assert np.abs(glb.morphed(weights / 2, "NORMAL") - one.vertex_normals).max() < 1e-6
+
+
+def test_correctives_play_with_the_motion(model, rig, motion):
+    poses, trans = 0.3 * motion[0], motion[1]
+    subject = model.subject(BETAS)
+    extra = motion_correctives(rig, subject, poses, 5)
+    glb = Glb(skinned_glb(rig, poses, trans, 4.0, extra, up=1))
+    names = glb.json["meshes"][0]["extras"]["targetNames"]
+    assert names == ["beta 1", "beta 2", "beta 3", *(f"corrective {k}" for k in range(1, 6))]
+    plain, exact = rig.vertices(poses, trans), subject.vertices(poses, trans)
+    for t in range(5):
+        assert np.abs(plain[t] - exact[t]).max() > 10 * np.abs(glb.skinned(t) - exact[t]).max()
+    with pytest.raises(ValueError, match="correctives: expected the poses"):
+        skinned_glb(rig, correctives=extra)
+    with pytest.raises(ValueError, match="correctives: expected weights for 4 frames, got 5"):
+        skinned_glb(rig, poses[:4], trans[:4], 4.0, extra)
+
+
+def test_quaternions_do_not_jump():
+    angle = np.linspace(0, 4 * np.pi, 41)
+    poses = angle[:, None, None] * np.array([[0.6, 0, 0.8], [0, 1, 0]])
+    q = continuous_quaternions(poses)
+    assert ((q[1:] * q[:-1]).sum(axis=-1) > 0.98).all() and np.allclose(np.linalg.norm(q, axis=-1), 1)
+    expected = np.concatenate([np.sin(angle / 2)[:, None, None] * np.array([[0.6, 0, 0.8], [0, 1, 0]]),
+                               np.broadcast_to(np.cos(angle / 2)[:, None, None], (41, 2, 1))], axis=-1)
+    assert np.abs(q - expected).max() < 1e-9
+
+
+def test_other_readers_find_the_rest_mesh(rig, motion, tmp_path):
+    trimesh = pytest.importorskip("trimesh")
+    write_skinned_glb(tmp_path / "a.glb", rig, *motion, rate=4.0, up=1)
+    (mesh,) = trimesh.load(tmp_path / "a.glb", process=False).geometry.values()
+    ours = read_mesh(tmp_path / "a.glb")
+    for vertices, faces in ((mesh.vertices, mesh.faces), (ours.vertices, ours.faces)):
+        assert np.abs(vertices - rig.mesh.vertices).max() < 1e-6 and np.array_equal(faces, rig.mesh.faces)
+    assert [p.name for p in tmp_path.iterdir()] == ["a.glb"]
+
+
+@pytest.mark.parametrize(("change", "words"), [
+    (lambda p, t: (p[:, :3], t, 4.0), r"poses: expected shape \(T, 4, 3\)"),
+    (lambda p, t: (p[:0], t[:0], 4.0), "at least one frame"), (lambda p, t: (p, t[:2], 4.0), "trans: expected"),
+    (lambda p, t: (p, t, 0.0), "rate: expected a positive"),
+    (lambda p, t: (np.where(np.arange(5)[:, None, None] == 3, np.nan, p), t, 4.0), "the first is frame 3")])
+def test_bad_motion_is_refused(rig, motion, change, words):
+    with pytest.raises(ValueError, match=words):
+        skinned_glb(rig, *change(*motion))
+
+
+class Bvh:
+    """A BVH file, read word by word."""
+
+    def __init__(self, text):
+        self.words = text.split()
+        self.names, self.parents, self.offsets, self.channels, self.ends = [], [], [], [], {}
+        assert self.take() == "HIERARCHY" and self.take() == "ROOT"
+        self.joint(-1)
+        assert [self.take() for _ in range(2)] == ["MOTION", "Frames:"]
+        count = int(self.take())
+        assert [self.take() for _ in range(2)] == ["Frame", "Time:"]
+        self.time = float(self.take())
+        self.frames = np.array(self.words, dtype=float).reshape(count, -1)
+        assert self.frames.shape[1] == sum(map(len, self.channels))
+
+    def take(self):
+        return self.words.pop(0)
+
+    def vector(self):
+        assert self.take() == "OFFSET"
+        return np.array([float(self.take()) for _ in range(3)])
+
+    def joint(self, parent):
+        me = len(self.names)
+        self.names.append(self.take())
+        self.parents.append(parent)
+        assert self.take() == "{"
+        self.offsets.append(self.vector())
+        assert self.take() == "CHANNELS"
+        self.channels.append([self.take() for _ in range(int(self.take()))])
+        while (word := self.take()) != "}":
+            if word == "JOINT":
+                self.joint(me)
+            else:
+                assert (word, self.take(), self.take()) == ("End", "Site", "{")
+                self.ends[self.names[me]] = self.vector()
+                assert self.take() == "}"
+
+    def positions(self, frame):
+        """name -> place of the joint, each channel a matrix that is multiplied on from the right."""
+        values = iter(self.frames[frame])
+        world = []
+        for j, parent in enumerate(self.parents):
+            M = np.eye(4) if parent < 0 else world[parent].copy()
+            for axis, step in enumerate(self.offsets[j]):
+                M = M @ moved(axis, step)
+            for channel in self.channels[j]:
+                axis, value = "XYZ".index(channel[0]), next(values)
+                M = M @ (moved(axis, value) if channel.endswith("position") else spun(axis, np.radians(value)))
+            world.append(M)
+        return {name: M[:3, 3] for name, M in zip(self.names, world, strict=True)}
+
+
+def moved(axis, step):
+    M = np.eye(4)
+    M[axis, 3] = step
+    return M
+
+
+def spun(axis, angle):
+    M = np.eye(4)
+    b, c = (axis + 1) % 3, (axis + 2) % 3
+    M[b, b] = M[c, c] = np.cos(angle)
+    M[c, b], M[b, c] = np.sin(angle), -np.sin(angle)
+    return M
+
+
+@pytest.mark.parametrize(("up", "unit", "metre"), [(0, "cm", 100), (1, "m", 1), (2, "in", 39.37007874015748)])
+def test_bvh_holds_the_motion_of_the_joints(rig, motion, tmp_path, up, unit, metre):
+    poses, trans = motion[0].copy(), motion[1]
+    poses[0, 2] = [np.pi / 2, 0, 0]                                # two Euler axes fall together
+    poses[1, 1] = [0, 0, 3.5]
+    write_bvh(tmp_path / "a.bvh", rig.skeleton, poses, trans, 120.0, unit, up)
+    bvh = Bvh((tmp_path / "a.bvh").read_text())
+    assert abs(bvh.time - 1 / 120) < 1e-9 and len(bvh.frames) == 5
+    assert [len(c) for c in bvh.channels] == [6, 3, 3, 3] and not bvh.offsets[0].any()
+    for t, places in enumerate(joint_places(rig.skeleton, poses, trans) @ turn_up(up).T):
+        found = bvh.positions(t)
+        for name, place in zip(rig.skeleton.names, places, strict=True):
+            assert np.abs(found[name] / metre - place).max() < 1e-6
+
+
+def test_bvh_turns_do_not_jump(rig, tmp_path):
+    poses = np.zeros((50, 4, 3))
+    poses[:, 2, 2] = np.linspace(0, 4 * np.pi, 50)
+    write_bvh(tmp_path / "a.bvh", rig.skeleton, poses, up=1)
+    frames = Bvh((tmp_path / "a.bvh").read_text()).frames
+    assert np.abs(np.diff(frames, axis=0)).max() < 15
+    assert frames[-1].max() == pytest.approx(720)
+
+
+def test_bvh_without_motion_is_one_frame_at_rest(rig, tmp_path):
+    for name, frames in (("a.bvh", None), ("b.bvh", np.zeros((0, 4, 3)))):
+        write_bvh(tmp_path / name, rig.skeleton, frames, body=rig.mesh, up=1)
+    bvh = Bvh((tmp_path / "a.bvh").read_text())
+    assert (tmp_path / "a.bvh").read_text() == (tmp_path / "b.bvh").read_text()
+    assert len(bvh.frames) == 1 and not bvh.frames[0, 3:].any()
+    places = bvh.positions(0)
+    for name, joint in zip(rig.skeleton.names, rig.skeleton.joints, strict=True):
+        assert np.abs(places[name] / 100 - joint).max() < 1e-6
+    assert set(bvh.ends) == {"part1", "part3"}, "the leaves"
+    # the worm's parts end where the worm ends, along its axis
+    for name, end in (("part1", rig.mesh.vertices[:, 0].min()), ("part3", rig.mesh.vertices[:, 0].max())):
+        assert (places[name] + bvh.ends[name])[0] / 100 == pytest.approx(end, abs=0.02)
+
+
+def test_without_a_body_a_leaf_is_as_long_as_the_bone_before_it(rig):
+    joints = rig.skeleton.joints
+    assert np.allclose(part_ends(rig.skeleton)[3], 2 * joints[3] - joints[2])
+
+
+def test_bad_bvh_is_refused(rig, model, tmp_path):
+    from dataclasses import replace
+
+    with pytest.raises(ValueError, match="unit: expected one of m, cm, mm, in, got 'ft'"):
+        write_bvh(tmp_path / "a.bvh", rig.skeleton, unit="ft")
+    with pytest.raises(ValueError, match="without white space"):
+        write_bvh(tmp_path / "a.bvh", replace(rig.skeleton, names=("a", "b", "c", "left arm")))
+    with pytest.raises(ValueError, match="rate"):
+        write_bvh(tmp_path / "a.bvh", rig.skeleton, rate=-1.0)
+    assert not list(tmp_path.iterdir())
+
+
+def body(arrays, pose, betas, trans):
+    """A body from nothing but the arrays of the file, as its users pose it."""
+    parents = arrays["kintree_table"][0]
+    shaped = arrays["v_template"] + arrays["shapedirs"] @ betas
+    joints = arrays["J_regressor"] @ shaped
+    R = rotations.exp(pose)
+    bent = shaped + arrays["posedirs"] @ (R[1:] - np.eye(3)).ravel()
+    world = []
+    for j, parent in enumerate(parents):
+        local = np.eye(4)
+        local[:3, :3], local[:3, 3] = R[j], joints[j] - (joints[parent] if j else 0)
+        world.append(world[parent] @ local if j else local)
+    carry = np.array(world)
+    carry[:, :3, 3] -= np.einsum("jab,jb->ja", carry[:, :3, :3], joints)
+    return (np.einsum("nj,jab,nb->na", arrays["weights"], carry[:, :3, :3], bent)
+            + arrays["weights"] @ carry[:, :3, 3] + trans)
+
+
+def test_npz_has_the_arrays_that_users_expect(model, tmp_path):
+    write_body_npz(tmp_path / "a.npz", model)
+    with np.load(tmp_path / "a.npz", allow_pickle=False) as stored:
+        arrays = {name: stored[name] for name in stored.files}
+    N, F, J, K = len(model.template.vertices), len(model.template.faces), 4, 3
+    shapes = {"v_template": (N, 3), "f": (F, 3), "weights": (N, J), "kintree_table": (2, J), "J_regressor": (J, N),
+              "J": (J, 3), "shapedirs": (N, 3, K), "posedirs": (N, 3, 9 * (J - 1)), "part_names": (J,)}
+    assert {name: arrays[name].shape for name in shapes} == shapes
+    assert str(arrays["betas_unit"]) == "standard deviation" and str(arrays["length_unit"]) == "metre"
+    assert np.array_equal(arrays["kintree_table"], [[-1, 0, 0, 2], [0, 1, 2, 3]])
+    assert np.allclose(arrays["J_regressor"] @ arrays["v_template"], arrays["J"], atol=1e-12)
+    rest, trans = np.zeros((4, 3)), np.array([1.0, -2.0, 0.5])
+    betas = np.array([1.0, -2.0, 0.5])
+    assert np.abs(body(arrays, rest, betas, trans) - model.vertices(rest, betas, trans)).max() < 1e-6
+    turned = rest.copy()
+    turned[0] = [1.0, 0.5, 2.0]
+    assert np.abs(body(arrays, turned, betas, trans) - model.vertices(turned, betas, trans)).max() < 1e-6
+
+
+def test_pose_directions_bring_skinning_to_the_model(tmp_path):
+    model = worm_model()
+    object.__setattr__(model, "pose_covariance", 0.15 * np.diag([0, 0, 0] + [1] * 9))
+    arrays = write_body_npz(tmp_path / "a.npz", model)
+    without = {**arrays, "posedirs": np.zeros_like(arrays["posedirs"])}
+    poses = random_poses(model, 10, np.random.default_rng(7), 0.35)
+    poses[:, 0] = 0
+    error = [np.mean([np.linalg.norm(body(a, p, np.zeros(3), 0) - model.vertices(p, np.zeros(3)), axis=1).mean()
+                      for p in poses]) for a in (without, arrays)]
+    assert error[1] < 0.35 * error[0]
+
+
+def test_known_pose_directions_are_found(model, rig):
+    poses = random_poses(model, 120, np.random.default_rng(8), 0.4)
+    known = np.random.default_rng(9).normal(0, 0.01, (*rig.mesh.vertices.shape, 27))
+    changes = np.tensordot(pose_features(poses), known, axes=(1, 2))
+    found = pose_directions(rig, poses, rig.vertices(poses, changes=changes))
+    off = np.tensordot(pose_features(poses), found - known, axes=(1, 2))
+    assert np.abs(off).mean() < 0.03 * np.abs(changes).mean(), "but for the ridge"
+
+
+def test_a_motion_becomes_a_folder_of_meshes(model, motion, tmp_path):
+    subject = model.subject(BETAS)
+    calls = []
+    paths = write_frames(tmp_path / "frames", subject, *motion, progress=lambda *now: calls.append(now))
+    assert [p.name for p in paths] == [f"{t:05d}.ply" for t in range(5)] and calls[-1] == (5, 5)
+    for t, path in enumerate(paths):
+        assert np.abs(read_mesh(path, "m").vertices - subject.vertices(motion[0][t], motion[1][t])).max() < 1e-6
+
+
+@pytest.fixture(scope="module")
+def files(model, motion, tmp_path_factory):
+    folder = tmp_path_factory.mktemp("export")
+    model.save(folder / "model.npz")
+    np.savez(folder / "motion.npz", poses=motion[0].reshape(5, -1), trans=motion[1], betas=BETAS,
+             mocap_frame_rate=np.array(4.0), surface_model_type=np.array("scape"))
+    return folder
+
+
+def exported(files, output, *arguments):
+    """Metrics of the report of a run that succeeded."""
+    assert run(export, "scape model export", [str(files / "model.npz"), "-o", str(files / output), *arguments]) == 0
+    place = files / output
+    report = place / "report.json" if place.is_dir() else place.with_suffix(".report.json")
+    return {m["metric"]: m["value"] for m in json.loads(report.read_text())["metrics"]}
+
+
+def test_the_command_writes_what_the_name_says(files, model, rig, motion):
+    figures = exported(files, "a.glb", "--motion", str(files / "motion.npz"), "--up", "1", "--correctives", "2")
+    glb = Glb((files / "a.glb").read_bytes())
+    assert len(glb.json["meshes"][0]["extras"]["targetNames"]) == 5 == figures["shape targets"] + 2
+    off = np.stack([glb.skinned(t) for t in range(5)]) - model.subject(BETAS).vertices(*motion)
+    assert figures["distance from exact body, mean"] == pytest.approx(
+        1000 * np.linalg.norm(off, axis=2).mean(), rel=1e-3)
+    assert figures["frames"] == 5 and figures["joints"] == 4
+    exported(files, "a.bvh", "--betas", "0.5", "-1", "--unit", "m", "--up", "1")
+    places = Bvh((files / "a.bvh").read_text()).positions(0)
+    assert np.allclose([places[name] for name in rig.skeleton.names], rig.skeleton.joints, atol=1e-5)
+    figures = exported(files, "a.npz")
+    assert figures["distance from exact body, with pose directions, mean"] < figures[
+        "distance from exact body, skinning alone, mean"]
+    exported(files, "a.ply", "--own-body")
+    assert np.abs(read_mesh(files / "a.ply", "m").vertices - model.vertices(np.zeros((4, 3)))).max() < 1e-12
+    assert exported(files, "frames", "--motion", str(files / "motion.npz"))["meshes"] == 5
+    assert len(list((files / "frames").glob("*.ply"))) == 5
+
+
+@pytest.mark.parametrize(("arguments", "words"), [
+    (["-o", "a.fbx"], "expected a name ending in .glb, .bvh, .npz"),
+    (["-o", "b.npz", "--betas", "1"], "--betas: it says nothing about a npz"),
+    (["-o", "b.ply", "--motion", "motion.npz"], "name a folder for the meshes of a motion"),
+    (["-o", "b.glb", "--correctives", "3"], "name it with --motion"),
+    (["-o", "nothing"], "name it with --motion"),
+    (["-o", "b.glb", "--own-body", "--betas", "1"], "the template's own body has no betas"),
+    (["-o", "b.glb", "--own-body", "--shapes", "2"], "shapes: the template's own body has none"),
+    (["-o", "b.bvh", "--motion", "model.npz"], "expected a motion, it lacks poses and trans")])
+def test_the_command_refuses_in_one_line(files, arguments, words, capsys, monkeypatch):
+    monkeypatch.chdir(files)
+    assert run(export, "scape model export", ["model.npz", *arguments]) == 1
+    assert words in capsys.readouterr().err
+    assert not list(files.glob("b.*")) and not (files / "nothing").exists()
+
+
+def test_motions_of_other_bodies_are_refused(model, tmp_path):
+    good = {"poses": np.zeros((2, 12)), "trans": np.zeros((2, 3)), "mocap_frame_rate": np.array(30.0)}
+    for change, words in (({"poses": np.zeros((2, 15))}, "4 parts"), ({"betas": np.zeros(7)}, "at most the 3 betas"),
+                          ({"poses": np.zeros((0, 12))}, "4 parts"),
+                          ({"surface_model_type": np.array("other")}, "surface_model_type 'scape'"),
+                          ({"trans": np.zeros((3, 3))}, r"trans: expected shape \(2, 3\)"),
+                          ({"mocap_frame_rate": np.array(0.0)}, "rate")):
+        np.savez(tmp_path / "m.npz", **{**good, **change})
+        with pytest.raises(StorageError, match=words):
+            read_motion(tmp_path / "m.npz", model)
+    good["mocap_framerate"] = good.pop("mocap_frame_rate")
+    np.savez(tmp_path / "m.npz", **good)
+    assert read_motion(tmp_path / "m.npz", model).rate == 30.0
