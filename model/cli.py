@@ -29,6 +29,7 @@ ModelArg = Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="MODEL.np
 COMMANDS = {
     "info": ("What a model holds and how it was made.", "model.cli:info"),
     "mesh": ("The mesh of one pose and shape.", "model.cli:mesh"),
+    "export": ("Files for other programs: skinned GLB, BVH, body-model npz, meshes.", "model.export.cli:export"),
 }
 
 
