@@ -7,6 +7,11 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from .body import BodyModel, Derivatives
+    from .export.bvh import write_bvh
+    from .export.correctives import motion_correctives
+    from .export.glb import write_skinned_glb
+    from .export.npz import write_body_npz
+    from .export.rig import Rig, make_rig, skin_weights
     from .files import load_model
     from .fitting import FitConfig, PoseFit, ShapeFit, fit_pose, fit_shape
     from .learning import LearnConfig, learn_scape
@@ -15,6 +20,11 @@ if TYPE_CHECKING:
 
 _ROOMS = {
     "body": ("BodyModel", "Derivatives"),
+    "export.bvh": ("write_bvh",),
+    "export.correctives": ("motion_correctives",),
+    "export.glb": ("write_skinned_glb",),
+    "export.npz": ("write_body_npz",),
+    "export.rig": ("Rig", "make_rig", "skin_weights"),
     "files": ("load_model",),
     "fitting": ("FitConfig", "PoseFit", "ShapeFit", "fit_pose", "fit_shape"),
     "learning": ("LearnConfig", "learn_scape"),
@@ -23,8 +33,9 @@ _ROOMS = {
 }
 _ROOM_OF = {name: room for room, names in _ROOMS.items() for name in names}
 
-__all__ = ["BodyModel", "Derivatives", "FitConfig", "LearnConfig", "PointOperator", "PoseFit", "ScapeModel", "ShapeFit",
-           "Subject", "fit_pose", "fit_shape", "learn_scape", "load_model"]
+__all__ = ["BodyModel", "Derivatives", "FitConfig", "LearnConfig", "PointOperator", "PoseFit", "Rig", "ScapeModel",
+           "ShapeFit", "Subject", "fit_pose", "fit_shape", "learn_scape", "load_model", "make_rig",
+           "motion_correctives", "skin_weights", "write_body_npz", "write_bvh", "write_skinned_glb"]
 
 
 def __getattr__(name: str) -> Any:
