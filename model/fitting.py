@@ -1,7 +1,8 @@
 """Pose and shape of a body from its registered vertices, by Levenberg-Marquardt."""
 from __future__ import annotations
 
-from dataclasses import dataclass
+from copy import copy
+from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
@@ -10,6 +11,9 @@ from .bilinear import ShapedPoints
 from .body import BodyModel
 from .linear import PointOperator, Subject
 from .minimise import Derive, Evaluate, Minimum, minimise
+
+REUSE = 2                            # steps on all vertices for which one set of derivatives serves: they are 20
+                                     # times as dear as residuals, and change little between the last steps
 
 
 @dataclass(frozen=True)
@@ -167,18 +171,28 @@ class ShapeFitter:
     def _points(self) -> ShapedPoints:
         return self.model.points(self._chosen, n_betas=self.n_betas)
 
-    def fit(self, vertices: np.ndarray) -> ShapeFit:
-        """Shape, pose and place from all vertices (N, 3)."""
+    def first(self, n_betas: int) -> ShapeFitter:
+        """The fitter of the first components only, which shares what has been prepared."""
+        if not 0 < n_betas <= self.n_betas:
+            raise ValueError(f"n_betas: expected 1..{self.n_betas}, got {n_betas}")
+        fewer = copy(self)
+        fewer.config, fewer.n_betas = replace(self.config, n_betas=n_betas), n_betas
+        fewer._points = replace(self._points, shape_basis=self._points.shape_basis[:n_betas])
+        return fewer
+
+    def fit(self, vertices: np.ndarray, start: PoseFit | None = None) -> ShapeFit:
+        """Shape, pose and place from all vertices (N, 3), from a start that is sought unless a fit is given."""
         model, config, K = self.model, self.config, self.n_betas
         vertices = _checked_vertices(vertices, len(model.template.vertices))
         J = len(model.skeleton.parents)
-        start = self._mean_person.fit(vertices)
-        x = np.concatenate([start.pose.ravel(), start.trans, np.zeros(K)])
+        start = start or self._mean_person.fit(vertices)
+        betas = start.betas[:K] if isinstance(start, ShapeFit) else np.zeros(K)
+        x = np.concatenate([start.pose.ravel(), start.trans, betas])
         best = minimise(*_shape_energy(self._points, vertices[self._chosen]), x, J, config.tolerance,
                         config.iterations)
         steps = best.steps
         if config.polish:
-            best = minimise(*_whole_energy(model, vertices, K), best.x, J, config.tolerance, config.polish)
+            best = minimise(*_whole_energy(model, vertices, K), best.x, J, config.tolerance, config.polish, REUSE)
             steps += best.steps
         pose, trans, betas = best.x[:3 * J].reshape(J, 3), best.x[3 * J:3 * J + 3], np.zeros(model.n_betas)
         betas[:K] = best.x[3 * J + 3:]

@@ -34,7 +34,8 @@ class Minimum:
     energy: float
 
 
-def minimise(evaluate: Evaluate, derive: Derive, x: np.ndarray, J: int, tolerance: float, limit: int) -> Minimum:
+def minimise(evaluate: Evaluate, derive: Derive, x: np.ndarray, J: int, tolerance: float, limit: int,
+             reuse: int = 1) -> Minimum:
     """Least squares by Levenberg-Marquardt; a step is taken only where it lowers the energy.
 
     Parameters
@@ -49,27 +50,38 @@ def minimise(evaluate: Evaluate, derive: Derive, x: np.ndarray, J: int, toleranc
         Relative decrease of the energy at which to stop.
     limit : int
         Largest number of steps.
+    reuse : int
+        Steps for which derivatives serve, where they cost far more than residuals; a search ends on new ones only.
     """
-    damping, step = 1e-4, 0
+    damping, step, used = 1e-4, 0, 0
     residual, columns = derive(x)
-    energy = float(residual @ residual)
+    normal, energy = columns @ columns.T, float(residual @ residual)
     while step < limit:
-        normal, slope = columns @ columns.T, columns @ residual
-        scale = np.diag(normal) + 1e-9 * np.trace(normal) / len(normal)
-        for _ in range(TRIES):
-            trial = x - np.linalg.solve(normal + damping * np.diag(scale), slope)
-            value = evaluate(trial)
-            if float(value @ value) < energy:
-                break
-            damping = max(damping, 1e-7) * 10
-        else:
-            return Minimum(x, True, step, energy)    # no step lowers it any more
-        step += 1
-        lower = float(value @ value)
-        trial[:3 * J] = twists(trial[:3 * J].reshape(J, 3)).ravel()
-        x, damping = trial, damping / 5
-        if energy - lower <= tolerance * energy or lower < EXACT**2 * len(residual):
-            return Minimum(x, True, step, lower)
-        residual, columns = derive(x)
-        energy = float(residual @ residual)
+        lower, damping = _lower(evaluate, x, energy, normal, columns @ residual, damping)
+        if lower is None and not used:
+            return Minimum(x, True, step, energy)
+        if lower is not None:
+            trial, residual, before, energy = *lower, energy, float(lower[1] @ lower[1])
+            x, step, damping = trial.copy(), step + 1, damping / 5
+            x[:3 * J] = twists(x[:3 * J].reshape(J, 3)).ravel()
+            small = before - energy <= tolerance * before
+            if (small and not used) or energy < EXACT**2 * len(residual):
+                return Minimum(x, True, step, energy)
+            used += 1
+        if lower is None or small or used >= reuse or not np.array_equal(x, trial):
+            residual, columns = derive(x)
+            normal, energy, used = columns @ columns.T, float(residual @ residual), 0
     return Minimum(x, False, step, energy)
+
+
+def _lower(evaluate: Evaluate, x: np.ndarray, energy: float, normal: np.ndarray, slope: np.ndarray, damping: float
+           ) -> tuple[tuple[np.ndarray, np.ndarray] | None, float]:
+    """Unknowns of lower energy with their residuals, or None where no step finds any; and the damping it took."""
+    scale = np.diag(normal) + 1e-9 * np.trace(normal) / len(normal)
+    for _ in range(TRIES):
+        trial = x - np.linalg.solve(normal + damping * np.diag(scale), slope)
+        value = evaluate(trial)
+        if float(value @ value) < energy:
+            return (trial, value), damping
+        damping = max(damping, 1e-7) * 10
+    return None, damping

@@ -1,0 +1,218 @@
+"""`scape model evaluate` and `scape model sample`: how good a model is, and random bodies of it."""
+from __future__ import annotations
+
+import csv
+import io
+from collections.abc import Iterable, Sequence
+from dataclasses import replace
+from pathlib import Path
+from typing import Annotated, Any
+
+import numpy as np
+import tyro
+
+from scanprep.cli import Output, Unit
+from scanprep.console import Metric, Outcome, bar
+from scanprep.dataset import RegisteredSet
+from scanprep.geometry import storage
+from scanprep.geometry.files import read_registered, write_mesh
+
+from ..body import BodyModel
+from ..cli import ModelArg, read_subject
+from ..files import load_model
+from .digests import set_digest, trained_on
+from .errors import Errors, compactness, pose_errors, shape_errors
+from .page import MM, Findings, evaluation_page, generalisation_rows, picture_samples
+from .sampling import sample_bodies, specificity
+
+RANDOM = 100                         # random bodies that specificity is measured on
+SHOWN = 8                            # random bodies on the page
+
+
+def evaluate(model: ModelArg, output: Output, poses: Path | None = None, shapes: Path | None = None,
+             counts: tuple[int, ...] = (10, 20, 40), train_shapes: Path | None = None, subject: Path | None = None,
+             seed: int = 0, unit: Unit | None = None) -> Outcome:
+    """Errors of a model on bodies that it was not trained on, with a page of curves and pictures.
+
+    Example: scape model evaluate model.npz --poses held_poses --shapes held_people -o evaluation
+
+    Args:
+        model: Model file.
+        output: Folder for report.html, report.json, poses.csv and people.csv.
+        poses: Held-out meshes of the model's own body, or a registered set.
+        shapes: Held-out people, or a registered set, of which the first mesh of each subject counts.
+        counts: Numbers of shape components to fit people with.
+        train_shapes: The people that the model was trained on: adds plain PCA of vertices and specificity.
+        subject: Whose poses they are, betas or a mesh; else the template's own body.
+        seed: Of the random bodies.
+        unit: Unit of the meshes.
+    """
+    loaded = load_model(model)
+    if poses is None and shapes is None:
+        raise ValueError("nothing to measure: give --poses, --shapes, or both")
+    if shapes is None and train_shapes is not None:
+        raise ValueError("--train-shapes serves to judge people: give --shapes too")
+    if shapes is not None and not loaded.n_betas:
+        raise ValueError(f"{model}: it has no shape components, so it cannot be measured on people")
+    posed, pose_names = _read_bodies(loaded, poses, unit, one_person=True)
+    people, people_names = _read_bodies(loaded, shapes, unit)
+    train, _ = _read_bodies(loaded, train_shapes, unit)
+    found = Findings(pose_names=pose_names, pose_bodies=posed, shape_names=people_names, shape_bodies=people)
+    if posed is not None:
+        with bar("fitting poses") as progress:
+            found = replace(found, poses=pose_errors(loaded, posed, read_subject(loaded, subject, unit),
+                                                     progress=progress))
+    if people is not None:
+        with bar("fitting people") as progress:
+            found = replace(found, shapes=shape_errors(loaded, people, counts, train, progress=progress))
+    if train is not None:
+        with bar("bringing training people to rest") as progress:
+            found = replace(found, specificity=specificity(
+                loaded, train, RANDOM, np.random.default_rng(seed), counts, progress=progress))
+    if loaded.n_betas:
+        found = replace(found, samples=sample_bodies(loaded, SHOWN, np.random.default_rng(seed)))
+    notes, metrics = _notes(loaded, posed, people), _metrics(loaded, found)
+    metrics += [Metric("note", note) for note in notes]
+    _write_tables(output, loaded, found)
+    with bar("drawing the page") as progress:
+        page = evaluation_page(model.stem, loaded, found, [(m.name, m.value, m.unit) for m in metrics
+                                                           if m.name != "note"], notes, progress)
+    page.write(output / "report.html")
+    return Outcome(output, metrics, {"model": model, "poses": poses, "shapes": shapes, "counts": counts,
+                                     "train_shapes": train_shapes, "subject": subject, "seed": seed})
+
+
+def sample(model: ModelArg, output: Output,
+           count: Annotated[int, tyro.conf.arg(aliases=["-n"])] = 9, seed: int = 0,
+           pose_too: bool = False, betas: int | None = None) -> Outcome:
+    """Write random bodies of a model, a sheet of their pictures, and their betas and poses.
+
+    Example: scape model sample model.npz -n 9 -o random
+
+    Args:
+        model: Model file.
+        output: Folder for body_1.ply, body_1.betas.json, body_1.pose.json ..., sheet.png.
+        count: How many bodies.
+        seed: The same seed gives the same bodies.
+        pose_too: Random poses as well, from the Gaussian of the training poses; else all stand at rest.
+        betas: Vary the first so many shape components only.
+    """
+    from scanprep.pictures.shading import save_png
+
+    loaded = load_model(model)
+    drawn = sample_bodies(loaded, count, np.random.default_rng(seed), pose_too, betas)
+    width = len(str(count))
+    for i, vertices in enumerate(drawn.vertices):
+        name = f"body_{i + 1:0{width}d}"
+        write_mesh(output / f"{name}.ply", loaded.template.with_vertices(vertices))
+        storage.write_json(output / f"{name}.betas.json", {"betas": drawn.betas[i].tolist()})
+        storage.write_json(output / f"{name}.pose.json",
+                           dict(zip(loaded.skeleton.names, drawn.poses[i].tolist(), strict=True)))
+    save_png(output / "sheet.png", picture_samples(loaded, drawn))
+    extent = np.ptp(drawn.vertices, axis=1).max(axis=1)
+    return Outcome(output, [
+        Metric("bodies", count), Metric("shape components", drawn.betas.shape[1]),
+        Metric("largest extent, smallest body", float(extent.min()), "m"),
+        Metric("largest extent, largest body", float(extent.max()), "m")], {"seed": seed, "pose_too": pose_too})
+
+
+def _read_bodies(model: BodyModel, folder: Path | None, unit: Unit | None, one_person: bool = False
+                 ) -> tuple[np.ndarray | None, tuple[str, ...]]:
+    """Vertices (n, N, 3) and names of a folder or a set: all of one person, or one of every person."""
+    if folder is None:
+        return None, ()
+    if (folder / "set.json").exists():
+        whole = RegisteredSet.load(folder)
+        faces, subjects = whole.template.faces, [entry.subject for entry in whole.entries]
+        if not subjects:
+            raise ValueError(f"{folder}: the set holds no meshes")
+        most = max(whole.subjects, key=subjects.count)
+        names = tuple(entry.name for i, entry in enumerate(whole.entries) if
+                      (entry.subject == most if one_person else entry.subject not in subjects[:i]))
+        vertices = whole.vertices(names)
+    else:
+        faces, vertices, names = read_registered(folder, unit)
+    if not np.array_equal(faces, model.template.faces):
+        order = ", in another order" if len(faces) == len(model.template.faces) else ""
+        raise ValueError(f"{folder}: expected the triangles of the model ({model.template}); these have {len(faces)} "
+                         f"faces and {vertices.shape[1]} vertices{order}")
+    return vertices, names
+
+
+def _notes(model: BodyModel, posed: np.ndarray | None, people: np.ndarray | None) -> list[str]:
+    """Whether the bodies trained the model, as far as its file tells."""
+    if posed is not None and model.info.get("digest") == set_digest(model.template, posed, people):
+        return ["these are the very bodies that the model was trained on, so the errors are not held-out errors"]
+    notes = []
+    for name, bodies in (("poses", posed), ("people", people)):
+        known = None if bodies is None else trained_on(model, bodies)
+        if known is not None and known.any():
+            notes.append(f"{known.sum()} of the {len(known)} {name} trained the model, so the errors are not "
+                         "held-out errors")
+    if "digests" not in model.info:
+        notes.append("the model file does not tell its training bodies one by one, so nobody checked that these are "
+                     "others")
+    return notes
+
+
+def _metrics(model: BodyModel, found: Findings) -> list[Metric]:
+    rows = []
+    if found.poses is not None:
+        rows += _about("pose", found.poses.errors, found.pose_names)
+        rows.append(Metric("pose: fits that converged", 100 * float(found.poses.converged.mean()), "%"))
+    if found.shapes is not None:
+        shapes = found.shapes
+        for count, mean, p95, _, held, pca in generalisation_rows(shapes):
+            rows += [Metric(f"people, {count} components: mean", mean, "mm"),
+                     Metric(f"people, {count} components: 95th percentile", p95, "mm"),
+                     Metric(f"people, {count} components: mean with the pose held", held, "mm")]
+            if shapes.vertex_pca is not None:
+                rows.append(Metric(f"people, {count} components: mean of vertex PCA", pca, "mm"))
+        rows += _about("people, all of these components", shapes.errors[-1], found.shape_names)[1:]
+        rows.append(Metric("people: fits that converged", 100 * float(shapes.converged.mean()), "%"))
+    if found.specificity is not None:
+        for count, far in zip(found.specificity.counts, found.specificity.distances, strict=True):
+            rows.append(Metric(f"specificity, {count} components", MM * float(far.mean()), "mm"))
+        rows.append(Metric("training people to their nearest other", MM * found.specificity.between_people, "mm"))
+    if model.n_betas:
+        explained = compactness(model)
+        rows += [Metric(f"variance that {k} components explain", 100 * float(explained[k - 1]), "%")
+                 for k in (1, 5, 10, 20, 40, 80) if k <= model.n_betas]
+    return rows
+
+
+def _about(what: str, errors: Errors, names: Sequence[str]) -> list[Metric]:
+    return [Metric(f"{what}: bodies", len(errors.mean)), Metric(f"{what}: mean", MM * errors.overall, "mm"),
+            Metric(f"{what}: 95th percentile", MM * float(errors.p95.mean()), "mm"),
+            Metric(f"{what}: worst body", names[int(errors.mean.argmax())]),
+            Metric(f"{what}: mean of the worst body", MM * float(errors.mean.max()), "mm"),
+            Metric(f"{what}: worst vertex", MM * float(errors.worst.max()), "mm")]
+
+
+def _write_tables(output: Path, model: BodyModel, found: Findings) -> None:
+    """A row for every body, millimetres."""
+    parts = [f"{name}_mm" for name in model.skeleton.names]
+    if found.poses is not None:
+        rows = _rows(found.pose_names, found.poses.errors, found.poses.converged)
+        _write_csv(output / "poses.csv", ["name", "mean_mm", "p95_mm", "worst_mm", *parts, "converged"], rows)
+    if found.shapes is not None:
+        rows = [[count, *row] for count, errors, converged in
+                zip(found.shapes.counts, found.shapes.errors, found.shapes.converged, strict=True)
+                for row in _rows(found.shape_names, errors, converged)]
+        _write_csv(output / "people.csv", ["components", "name", "mean_mm", "p95_mm", "worst_mm", *parts, "converged"],
+                   rows)
+
+
+def _rows(names: Sequence[str], errors: Errors, converged: np.ndarray) -> list[list[Any]]:
+    table = np.column_stack([errors.mean, errors.p95, errors.worst, errors.by_part])
+    return [[name, *(f"{MM * value:.4f}" for value in row), "yes" if done else "no"]
+            for name, row, done in zip(names, table, converged, strict=True)]
+
+
+def _write_csv(path: Path, header: Sequence[str], rows: Iterable[Sequence[Any]]) -> None:
+    text = io.StringIO()
+    table = csv.writer(text, lineterminator="\n")
+    table.writerow(header)
+    table.writerows(rows)
+    with storage.writing(path) as beside:
+        beside.write_text(text.getvalue(), encoding="utf-8")

@@ -1,0 +1,34 @@
+"""Which bodies a model was trained on, told by digests."""
+from __future__ import annotations
+
+import hashlib
+
+import numpy as np
+
+from scanprep.geometry.mesh import Mesh
+
+from ..body import BodyModel
+
+LENGTH = 16                          # hexadecimal digits: two of a billion bodies meet once in ten lives
+
+
+def body_digest(vertices: np.ndarray) -> str:
+    """A short digest of one registered body (N, 3), the same for float64 and float32."""
+    return hashlib.sha256(np.ascontiguousarray(vertices, dtype=np.float32).tobytes()).hexdigest()[:LENGTH]
+
+
+def set_digest(template: Mesh, poses: np.ndarray, shapes: np.ndarray | None) -> str:
+    """SHA-256 of a whole training set: `info["digest"]` of a model."""
+    total = hashlib.sha256()
+    for array in (template.vertices, template.faces, poses, shapes):
+        if array is not None:
+            total.update(np.ascontiguousarray(array).tobytes())
+    return total.hexdigest()
+
+
+def trained_on(model: BodyModel, bodies: np.ndarray) -> np.ndarray | None:
+    """(M,) bool: which of the bodies (M, N, 3) the model was trained on; None where its file does not say."""
+    known = model.info.get("digests")
+    if known is None:
+        return None
+    return np.array([body_digest(body) in set(known) for body in bodies], dtype=bool)

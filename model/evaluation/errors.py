@@ -1,0 +1,286 @@
+"""How good a model is: held-out errors of pose and shape, compactness.
+
+Every figure is made through the contract of `BodyModel` alone, so that kinds of model can be compared.
+"""
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from ..body import BodyModel
+from ..fitting import FitConfig, PoseFitter, ShapeFit, ShapeFitter
+from ..linear import Subject
+
+Progress = Callable[[int, int], None]
+
+
+@dataclass(frozen=True, eq=False)
+class Errors:
+    """Distances of corresponding vertices between bodies and what was made of them.
+
+    Attributes
+    ----------
+    mean, p95, worst : (M,) float, metres
+        Of the vertices of each body.
+    by_vertex : (N,) float, metres
+        Mean over the bodies.
+    by_part : (M, J) float, metres
+        Mean over the vertices of each part.
+    """
+
+    mean: np.ndarray
+    p95: np.ndarray
+    worst: np.ndarray
+    by_vertex: np.ndarray
+    by_part: np.ndarray
+
+    @property
+    def overall(self) -> float:
+        """Mean over bodies and vertices, metres."""
+        return float(self.mean.mean())
+
+
+@dataclass(frozen=True, eq=False)
+class PoseErrors:
+    """What is left of bodies after fitting pose and place.
+
+    Attributes
+    ----------
+    errors : Errors
+    poses : (M, J, 3) float, radians
+    trans : (M, 3) float, metres
+    betas : (k,) float or None
+        Of the body that was posed; None is the template's own.
+    converged : (M,) bool
+    """
+
+    errors: Errors
+    poses: np.ndarray
+    trans: np.ndarray
+    betas: np.ndarray | None
+    converged: np.ndarray
+
+    def vertices(self, model: BodyModel, i: int) -> np.ndarray:
+        """(N, 3) what the model made of body i, metres."""
+        return model.vertices(self.poses[i], self.betas, self.trans[i])
+
+
+@dataclass(frozen=True, eq=False)
+class ShapeErrors:
+    """What is left of people after fitting shape, pose and place with several numbers of components.
+
+    Attributes
+    ----------
+    counts : (C,) int
+        Numbers of components, rising.
+    errors : C Errors
+        After `fit_shape`.
+    pose_held : C Errors
+        After fitting betas and place alone, the pose that of the parts' own best rotations.
+    vertex_pca : C Errors, or None
+        Of principal components of the vertices of the training people, every body centred; None where no
+        training people were given.
+    betas : (C, S, K) float
+    poses : (C, S, J, 3) float, radians
+    trans : (C, S, 3) float, metres
+    converged : (C, S) bool
+    """
+
+    counts: np.ndarray
+    errors: tuple[Errors, ...]
+    pose_held: tuple[Errors, ...]
+    vertex_pca: tuple[Errors, ...] | None
+    betas: np.ndarray
+    poses: np.ndarray
+    trans: np.ndarray
+    converged: np.ndarray
+
+    def vertices(self, model: BodyModel, c: int, i: int) -> np.ndarray:
+        """(N, 3) what the model made of person i with the c-th number of components, metres."""
+        return model.vertices(self.poses[c, i], self.betas[c, i], self.trans[c, i])
+
+
+class _Tally:
+    """Gathers the distances of one body after the other."""
+
+    def __init__(self, model: BodyModel) -> None:
+        part = model.skeleton.part_of_vertex(model.template)
+        self._of_part = (part == np.arange(len(model.skeleton.parents))[:, None]).astype(float)
+        self._of_part /= np.maximum(self._of_part.sum(axis=1, keepdims=True), 1)
+        self._rows: list[tuple[float, float, float]] = []
+        self._parts: list[np.ndarray] = []
+        self._sum = np.zeros(len(model.template.vertices))
+
+    def add(self, made: np.ndarray, truth: np.ndarray) -> None:
+        far = np.linalg.norm(made - truth, axis=1)
+        self._rows.append((far.mean(), np.percentile(far, 95), far.max()))
+        self._parts.append(self._of_part @ far)
+        self._sum += far
+
+    def errors(self) -> Errors:
+        mean, p95, worst = np.array(self._rows).T
+        return Errors(mean, p95, worst, self._sum / len(mean), np.stack(self._parts))
+
+
+def pose_errors(model: BodyModel, bodies: np.ndarray, subject: Subject | None = None,
+                config: FitConfig | None = None, progress: Progress | None = None) -> PoseErrors:
+    """Error of one person's bodies after fitting pose and place.
+
+    Parameters
+    ----------
+    model : BodyModel
+    bodies : (M, N, 3) float, metres
+        Registered, of the subject, best those that the model was not trained on.
+    subject : Subject, optional
+        Whose bodies they are; the template's own body when not given.
+    config : FitConfig, optional
+    progress : callable, optional
+        Called with the bodies done and their number.
+
+    Raises
+    ------
+    ValueError
+        Bodies of another count of vertices or not finite.
+    """
+    bodies = checked_bodies(model, bodies, "bodies")
+    subject = subject or model.subject()
+    fitter, tally, fits = PoseFitter(subject, config), _Tally(model), []
+    for body in bodies:
+        fits.append(fitter.fit(body))
+        tally.add(fits[-1].vertices, body)
+        if progress:
+            progress(len(fits), len(bodies))
+    return PoseErrors(tally.errors(), np.stack([f.pose for f in fits]), np.stack([f.trans for f in fits]),
+                      subject.betas, np.array([f.converged for f in fits]))
+
+
+def shape_errors(model: BodyModel, people: np.ndarray, counts: Sequence[int] = (10, 20, 40),
+                 train: np.ndarray | None = None, config: FitConfig | None = None,
+                 progress: Progress | None = None) -> ShapeErrors:
+    """Error of people after fitting shape, pose and place: the curve of generalisation.
+
+    Parameters
+    ----------
+    model : BodyModel
+        With shape components.
+    people : (S, N, 3) float, metres
+        Registered, best people that the model was not trained on.
+    counts : ints
+        Numbers of components; those that the model does not have are left out.
+    train : (P, N, 3) float, metres, optional
+        The training people, for plain principal components of vertices as a yardstick.
+    config : FitConfig, optional
+    progress : callable, optional
+        Called with the fits done and their number.
+
+    Raises
+    ------
+    ValueError
+        People of another count of vertices or not finite, no count that the model has.
+    """
+    people, wanted = checked_bodies(model, people, "people"), checked_counts(model, counts)
+    largest = ShapeFitter(model, replace(config or FitConfig(), n_betas=wanted[-1]))
+    fitters = [largest.first(count) for count in wanted]
+    free, held = [_Tally(model) for _ in wanted], [_Tally(model) for _ in wanted]
+    fits, done = [], 0
+    for person in people:
+        for tally, made in zip(held, fit_with_held_pose(model, person, wanted), strict=True):
+            tally.add(made, person)
+        mine: list[ShapeFit] = []
+        for fitter, tally in zip(fitters, free, strict=True):
+            mine.append(fitter.fit(person, mine[-1] if mine else None))
+            tally.add(mine[-1].vertices, person)
+            done += 1
+            if progress:
+                progress(done, len(people) * len(wanted))
+        fits.append(mine)
+    by_count = list(zip(*fits, strict=True))
+    return ShapeErrors(
+        np.array(wanted), tuple(t.errors() for t in free), tuple(t.errors() for t in held),
+        None if train is None else _pca_errors(model, checked_bodies(model, train, "train"), people, wanted),
+        np.array([[f.betas for f in row] for row in by_count]), np.array([[f.pose for f in row] for row in by_count]),
+        np.array([[f.trans for f in row] for row in by_count]),
+        np.array([[f.converged for f in row] for row in by_count]))
+
+
+def fit_with_held_pose(model: BodyModel, person: np.ndarray, counts: Sequence[int]) -> list[np.ndarray]:
+    """Bodies (N, 3), metres, with betas and place fitted and the pose that of the parts' own best rotations.
+
+    Vertices are affine in betas, so this is linear least squares, and one normal matrix serves all counts.
+    """
+    J, K = len(model.skeleton.parents), max(counts)
+    pose = model.skeleton.pose_of(model.skeleton.fit_rotations(model.template, person))
+    by_shape = model.shape_jacobian(pose)[..., :K]
+    mean = model.vertices(pose, np.zeros(K), np.zeros(3))
+    assert by_shape.shape == (len(mean), 3, K) and pose.shape == (J, 3)
+    centred, left = by_shape - by_shape.mean(axis=0), (person - mean) - (person - mean).mean(axis=0)
+    columns = centred.reshape(-1, K)
+    normal, slope = columns.T @ columns, columns.T @ left.ravel()
+    made = []
+    for count in counts:
+        betas = np.linalg.solve(normal[:count, :count], slope[:count])
+        moved = mean + by_shape[..., :count] @ betas
+        made.append(moved + (person - moved).mean(axis=0))
+    return made
+
+
+def vertex_components(train: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
+    """Plain principal components of centred bodies.
+
+    Parameters
+    ----------
+    train : (P, N, 3) float, metres
+    count : int
+        Fewer are returned where the bodies do not span as many.
+
+    Returns
+    -------
+    mean : (3N,) float, metres
+    components : (k, 3N) float
+        Orthonormal, largest variance first.
+    """
+    flat = (train - train.mean(axis=1, keepdims=True)).reshape(len(train), -1)
+    mean = flat.mean(axis=0)
+    flat -= mean
+    variances, modes = np.linalg.eigh(flat @ flat.T)
+    keep = np.flatnonzero(variances[::-1] > 1e-10 * max(variances[-1], 1e-30))[:count]
+    directions = modes[:, ::-1][:, keep].T @ flat
+    return mean, directions / np.linalg.norm(directions, axis=1, keepdims=True)
+
+
+def _pca_errors(model: BodyModel, train: np.ndarray, people: np.ndarray, counts: Sequence[int]
+                ) -> tuple[Errors, ...]:
+    mean, components = vertex_components(train, max(counts))
+    tallies = [_Tally(model) for _ in counts]
+    for person in people:
+        middle = person.mean(axis=0)
+        weights = components @ ((person - middle).ravel() - mean)
+        for count, tally in zip(counts, tallies, strict=True):
+            tally.add((mean + weights[:count] @ components[:count]).reshape(-1, 3) + middle, person)
+    return tuple(t.errors() for t in tallies)
+
+
+def compactness(model: BodyModel) -> np.ndarray:
+    """(K,) share of the training people's variance of shape that the first 1..K components explain."""
+    return np.asarray(model.explained, dtype=np.float64)
+
+
+def checked_counts(model: BodyModel, counts: Sequence[int]) -> list[int]:
+    """Those numbers of components that the model has, rising, or ValueError."""
+    wanted = sorted({int(c) for c in counts if 0 < c <= model.n_betas})
+    if not wanted:
+        raise ValueError(f"counts: expected some of 1..{model.n_betas}, the components of the model, "
+                         f"got {', '.join(map(str, counts)) or 'none'}")
+    return wanted
+
+
+def checked_bodies(model: BodyModel, bodies: np.ndarray, name: str) -> np.ndarray:
+    """At least one finite body (n, N, 3) in the topology of the model, or ValueError."""
+    bodies, N = np.asarray(bodies, dtype=np.float64), len(model.template.vertices)
+    if bodies.ndim != 3 or bodies.shape[1:] != (N, 3) or not len(bodies):
+        raise ValueError(f"{name}: expected shape (n, {N}, 3) like the template, got {bodies.shape}")
+    if not np.isfinite(bodies).all():
+        raise ValueError(f"{name}: expected finite numbers")
+    return bodies

@@ -1,0 +1,255 @@
+"""The page of `scape model evaluate`: curves, heat maps, the best and the worst, random bodies."""
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from scanprep.geometry.mesh import Mesh
+from scanprep.pictures.page import Page
+from scanprep.pictures.shading import Solid, color_bar, heat, render, side_by_side
+from scanprep.pictures.views import look_around, upright
+
+from ..body import BodyModel
+from ..report import picture_components
+from .errors import Errors, PoseErrors, ShapeErrors, compactness
+from .sampling import Samples, Specificity
+
+MM = 1000.0
+HEIGHT = 400
+Tell = Callable[[int, int], None]
+
+
+@dataclass(frozen=True, eq=False)
+class Findings:
+    """What was measured, and on which bodies.
+
+    Attributes
+    ----------
+    poses : PoseErrors, or None where it was not asked for
+    pose_names : M strings
+    pose_bodies : (M, N, 3) float, metres
+    shapes : ShapeErrors, or None
+    shape_names : S strings
+    shape_bodies : (S, N, 3) float, metres
+    specificity : Specificity, or None
+    samples : Samples, or None for a model without shape components
+    """
+
+    poses: PoseErrors | None = None
+    pose_names: tuple[str, ...] = ()
+    pose_bodies: np.ndarray | None = None
+    shapes: ShapeErrors | None = None
+    shape_names: tuple[str, ...] = ()
+    shape_bodies: np.ndarray | None = None
+    specificity: Specificity | None = None
+    samples: Samples | None = None
+
+
+def evaluation_page(name: str, model: BodyModel, found: Findings, rows: Sequence[tuple[str, Any, str]],
+                    notes: Sequence[str] = (), tell: Tell | None = None) -> Page:
+    """The page, self-contained.
+
+    Parameters
+    ----------
+    name : str
+        Of the model.
+    rows : metric, value, unit
+        The closing table of the command.
+    notes : strings
+        What a reader must know, such as that the bodies trained the model.
+    tell : callable, optional
+        Called with the sections done and their number.
+    """
+    page = Page(f"{name}, evaluated", f"A model of kind {model.kind} with {len(model.skeleton.parents)} parts and "
+                f"{model.n_betas} shape components, measured on bodies given to it.")
+    for note in notes:
+        page.text(f"Note: {note}.")
+    page.table(rows, ("metric", "value", "unit"))
+    sections = [_pose_section if found.poses else None, _shape_section if found.shapes else None,
+                _space_section if model.n_betas else None]
+    wanted = [s for s in sections if s]
+    for i, section in enumerate(wanted):
+        section(page, model, found)
+        if tell:
+            tell(i + 1, len(wanted))
+    return page
+
+
+def _pose_section(page: Page, model: BodyModel, found: Findings) -> None:
+    poses, bodies, names = found.poses, found.pose_bodies, found.pose_names
+    assert poses is not None and bodies is not None
+    page.section("Poses", "One known body, of which only pose and place were fitted. What is left is what the model "
+                 "does not know about how the body bends.")
+    page.chart(chart_bodies(poses.errors, names), "distance of corresponding vertices, each body")
+    rest = model.template.with_vertices(model.vertices(np.zeros_like(poses.poses[0]), poses.betas))
+    page.picture(picture_error_map(rest, poses.errors.by_vertex, "mean over the bodies"),
+                 "where the error lies: mean of all bodies, shown on the body at rest")
+    page.picture(picture_extremes(model, poses.errors, names, bodies, lambda i: poses.vertices(model, i), poses.poses),
+                 "the best and the worst body: as given, then the fitted body coloured by its error")
+    page.table(_part_rows(model, poses.errors), ("part", "mean (mm)", "worst body (mm)", "which"))
+
+
+def _shape_section(page: Page, model: BodyModel, found: Findings) -> None:
+    shapes, bodies, names = found.shapes, found.shape_bodies, found.shape_names
+    assert shapes is not None and bodies is not None
+    page.section("People", "Of every person shape, pose and place were fitted, with more and more components.")
+    page.chart(chart_generalisation(shapes), "mean over people and vertices")
+    page.table(generalisation_rows(shapes), ("components", "fitted (mm)", "95th percentile (mm)", "worst vertex (mm)",
+                                             "pose held (mm)", "vertex PCA (mm)"))
+    last, count = shapes.errors[-1], int(shapes.counts[-1])
+    rest = model.template.with_vertices(model.vertices(np.zeros_like(shapes.poses[0, 0]), np.zeros(1)))
+    page.picture(picture_error_map(rest, last.by_vertex, f"mean over the people, {count} components"),
+                 "where the error lies: mean of all people, shown on the mean person")
+    page.picture(picture_extremes(model, last, names, bodies, lambda i: shapes.vertices(model, -1, i),
+                                  shapes.poses[-1]),
+                 "the best and the worst person: as given, then the fitted body coloured by its error")
+    page.chart(chart_bodies(last, names), f"distance of corresponding vertices, each person, {count} components")
+
+
+def _space_section(page: Page, model: BodyModel, found: Findings) -> None:
+    page.section("Space of shapes", "How much of the training people's variance the components explain, and what "
+                 "they do.")
+    page.chart(chart_compactness(model), "compactness")
+    page.picture(picture_components(model), "the mean person, then the first components")
+    if found.specificity is not None:
+        page.text("Specificity: random bodies of the model against the nearest training person. Small is good, as "
+                  "long as it is not far below the distance between people themselves. The people were brought to "
+                  "rest: each was fitted with all components, and what the fit leaves was turned back with the parts.")
+        page.chart(chart_specificity(found.specificity), "mean vertex distance to the nearest training person")
+    if found.samples is not None:
+        page.picture(picture_samples(model, found.samples), "random bodies")
+
+
+def _part_rows(model: BodyModel, errors: Errors) -> list[tuple[str, float, float, int]]:
+    order = np.argsort(-errors.by_part.mean(axis=0))
+    return [(model.skeleton.names[p], MM * float(errors.by_part[:, p].mean()), MM * float(errors.by_part[:, p].max()),
+             int(errors.by_part[:, p].argmax()) + 1) for p in order]
+
+
+def generalisation_rows(shapes: ShapeErrors) -> list[tuple[int, float, float, float, float, float]]:
+    """Components, then fitted, 95th percentile, worst vertex, pose held, vertex PCA (NaN without), millimetres."""
+    pca = [np.nan] * len(shapes.counts) if shapes.vertex_pca is None else [MM * e.overall for e in shapes.vertex_pca]
+    return [(int(k), MM * e.overall, MM * float(e.p95.mean()), MM * float(e.worst.max()), MM * held.overall, plain)
+            for k, e, held, plain in zip(shapes.counts, shapes.errors, shapes.pose_held, pca, strict=True)]
+
+
+def picture_error_map(body: Mesh, distance: np.ndarray, title: str, height: int = HEIGHT) -> np.ndarray:
+    """A body coloured by a distance (N,) in metres, from the front and the back, with its colour bar."""
+    front, left, back, _ = look_around(body)
+    high = _round_up(float(np.percentile(distance, 99.5)))
+    colored = Solid(body, heat(distance, 0.0, high))
+    images = [render(colored, view, int(height * view.width / view.height) + 20, height)
+              for view in (front, left, back)]
+    return side_by_side([side_by_side(images), color_bar(0.0, high, title)], columns=1)
+
+
+def picture_extremes(model: BodyModel, errors: Errors, names: Sequence[str], bodies: np.ndarray,
+                     make: Callable[[int], np.ndarray], poses: np.ndarray, height: int = HEIGHT) -> np.ndarray:
+    """The best and the worst body as given, then as fitted from both sides, coloured by error.
+
+    Parameters
+    ----------
+    make : i -> (N, 3) float, metres
+        The fitted body.
+    poses : (M, J, 3) float, radians
+        The cameras turn with the bodies about the vertical.
+    """
+    images, labels = [], []
+    shown = [("best", int(errors.mean.argmin())), ("worst", int(errors.mean.argmax()))]
+    made = [make(i) for _, i in shown]
+    high = _round_up(max(float(np.percentile(np.linalg.norm(y - bodies[i], axis=1), 99))
+                         for y, (_, i) in zip(made, shown, strict=True)))
+    for (word, i), y in zip(shown, made, strict=True):
+        turn = _turn(model, poses[i])
+        views = look_around(model.template, bodies[i], (turn + 25, turn + 205))
+        width = int(height * max(v.width / v.height for v in views)) + 10
+        colored = Solid(model.template.with_vertices(y), heat(np.linalg.norm(y - bodies[i], axis=1), 0.0, high))
+        given = model.template.with_vertices(bodies[i])
+        images += [render(given, views[0], width, height), *(render(colored, v, width, height) for v in views)]
+        labels += [f"{word}: {names[i]}", f"{MM * errors.mean[i]:.1f} mm, up to {MM * errors.worst[i]:.0f}", "behind"]
+    return side_by_side([side_by_side(images, labels, columns=3), color_bar(0.0, high, "distance")], columns=1)
+
+
+def picture_samples(model: BodyModel, samples: Samples, columns: int | None = None, height: int = 300) -> np.ndarray:
+    """A contact sheet of random bodies, numbered."""
+    camera = look_around(model.template, samples.vertices, (25,))[0]
+    width = int(height * camera.width / camera.height) + 6
+    images = [render(model.template.with_vertices(v), camera, width, height) for v in samples.vertices]
+    return side_by_side(images, [str(i + 1) for i in range(len(images))],
+                        columns=columns or int(np.ceil(np.sqrt(2.5 * len(images)))))
+
+
+def _turn(model: BodyModel, pose: np.ndarray) -> float:
+    """How far the root is turned about the vertical, degrees."""
+    up, _ = upright(model.template)
+    a, b = (up + 1) % 3, (up + 2) % 3
+    R = model.skeleton.part_rotations(pose)[0]
+    return float(np.degrees(np.arctan2(R[b, a] - R[a, b], R[a, a] + R[b, b])))
+
+
+def _round_up(length: float) -> float:
+    """The next of 1, 1.5, 2, 3, 4, 5, 6, 8 × a power of ten, metres."""
+    power = 10.0 ** np.floor(np.log10(max(length, 1e-9)))
+    return float(power * min(step for step in (1, 1.5, 2, 3, 4, 5, 6, 8, 10) if step * power >= length * (1 - 1e-9)))
+
+
+def chart_bodies(errors: Errors, names: Sequence[str]) -> Any:
+    """A matplotlib figure: mean and 95th percentile of every body, worst first."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(8.0, 2.8))
+    axes, order = figure.add_subplot(), np.argsort(-errors.mean)
+    place = np.arange(len(order))
+    axes.bar(place, MM * errors.mean[order], width=0.7, label="mean")
+    axes.plot(place, MM * errors.p95[order], "_", color="0.35", markersize=7, label="95th percentile")
+    axes.set(ylabel="distance (mm)", ylim=(0, None), xlim=(-0.7, len(order) - 0.3))
+    axes.set_xticks(place, [names[i] for i in order], rotation=90, fontsize=8 if len(order) <= 50 else 5)
+    axes.legend(frameon=False)
+    return figure
+
+
+def chart_generalisation(shapes: ShapeErrors) -> Any:
+    """A matplotlib figure: error over the number of components, with what it is compared to."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(7.0, 3.0))
+    axes = figure.add_subplot()
+    axes.plot(shapes.counts, [MM * e.overall for e in shapes.errors], "o-", label="shape, pose and place fitted")
+    axes.plot(shapes.counts, [MM * e.overall for e in shapes.pose_held], "s--", color="0.45",
+              label="pose held at the parts' own rotations")
+    if shapes.vertex_pca is not None:
+        axes.plot(shapes.counts, [MM * e.overall for e in shapes.vertex_pca], "^:", color="C1",
+                  label="plain PCA of vertices")
+    axes.set(xlabel="shape components", ylabel="distance (mm)", ylim=(0, None))
+    axes.legend(frameon=False)
+    return figure
+
+
+def chart_compactness(model: BodyModel) -> Any:
+    """A matplotlib figure: variance explained over the number of components."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(7.0, 2.6))
+    axes, explained = figure.add_subplot(), compactness(model)
+    axes.plot(np.arange(len(explained) + 1), 100 * np.concatenate([[0], explained]), "-")
+    axes.set(xlabel="shape components", ylabel="variance explained (%)", ylim=(0, 100), xlim=(0, len(explained)))
+    return figure
+
+
+def chart_specificity(found: Specificity) -> Any:
+    """A matplotlib figure: distance of random bodies to the nearest person, over the number of components."""
+    from matplotlib.figure import Figure
+
+    figure = Figure(figsize=(7.0, 2.6))
+    axes, far = figure.add_subplot(), MM * found.distances
+    axes.fill_between(found.counts, *np.percentile(far, [10, 90], axis=1), alpha=0.25, linewidth=0,
+                      label="10th to 90th percentile")
+    axes.plot(found.counts, far.mean(axis=1), "o-", label="mean")
+    axes.axhline(MM * found.between_people, color="0.45", linestyle="--", linewidth=1,
+                 label="training people to their nearest other")
+    axes.set(xlabel="shape components", ylabel="distance (mm)", ylim=(0, None))
+    axes.legend(frameon=False)
+    return figure

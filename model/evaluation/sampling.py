@@ -1,0 +1,176 @@
+"""Random bodies of a model, and how far they are from real people."""
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from ..body import BodyModel
+from ..fitting import FitConfig, ShapeFitter
+from .errors import checked_bodies, checked_counts
+
+Progress = Callable[[int, int], None]
+
+
+@dataclass(frozen=True, eq=False)
+class Samples:
+    """Random bodies.
+
+    Attributes
+    ----------
+    betas : (n, k) float, standard deviations
+        k = 0 for a model without shape components, whose own body it is then.
+    poses : (n, J, 3) float, radians
+    vertices : (n, N, 3) float, metres
+    """
+
+    betas: np.ndarray
+    poses: np.ndarray
+    vertices: np.ndarray
+
+
+def sample_bodies(model: BodyModel, count: int, rng: np.random.Generator, pose_too: bool = False,
+                  n_betas: int | None = None) -> Samples:
+    """Bodies with betas of the standard normal distribution.
+
+    Parameters
+    ----------
+    model : BodyModel
+    count : int
+    rng : numpy Generator
+    pose_too : bool
+        Poses from the Gaussian of the training poses; else all stand at rest.
+    n_betas : int, optional
+        Vary the first components only.
+
+    Raises
+    ------
+    ValueError
+        A count below 1, more components than the model has, poses wanted of a model that lacks them.
+
+    [SCAPE] Eq. 7
+    """
+    K, J = model.n_betas if n_betas is None else n_betas, len(model.skeleton.parents)
+    if count < 1:
+        raise ValueError(f"count: expected at least 1, got {count}")
+    if not 0 <= K <= model.n_betas:
+        raise ValueError(f"n_betas: expected 0..{model.n_betas}, the components of the model, got {K}")
+    if not K and not pose_too:
+        raise ValueError("n_betas: the model has no shape components, so only poses can be random (pose_too)")
+    betas, poses = rng.normal(size=(count, K)), np.zeros((count, J, 3))
+    if pose_too:
+        # the covariance is singular: the root and pruned joints do not turn
+        variances, directions = np.linalg.eigh(model.pose_covariance)
+        spread = directions * np.sqrt(np.maximum(variances, 0))
+        poses = model.pose_mean + (rng.normal(size=(count, 3 * J)) @ spread.T).reshape(count, J, 3)
+    return Samples(betas, poses, model.vertices(poses, betas if model.n_betas else None))
+
+
+@dataclass(frozen=True, eq=False)
+class Specificity:
+    """How far random bodies of the model are from the nearest real person.
+
+    Attributes
+    ----------
+    counts : (C,) int
+        Numbers of components.
+    distances : (C, n) float, metres
+        Mean vertex distance of every random body to the training person that is nearest to it.
+    nearest : (C, n) int
+        Which person that is.
+    between_people : float, metres
+        Mean over the training people of the distance to their nearest other, as a measure to compare with.
+    """
+
+    counts: np.ndarray
+    distances: np.ndarray
+    nearest: np.ndarray
+    between_people: float
+
+
+def specificity(model: BodyModel, people: np.ndarray, count: int = 100, rng: np.random.Generator | None = None,
+                counts: Sequence[int] = (10, 20, 40), config: FitConfig | None = None,
+                progress: Progress | None = None) -> Specificity:
+    """Distance of random bodies of the model to the nearest training person.
+
+    Random bodies have betas of the standard normal distribution and stand at rest. The people are brought to rest
+    by `unposed`, and all bodies are centred, before vertices are compared.
+
+    Parameters
+    ----------
+    model : BodyModel
+        With shape components.
+    people : (S, N, 3) float, metres
+        Registered, the people that the model was trained on.
+    count : int
+        Random bodies for each number of components.
+    rng : numpy Generator, optional
+        The one of seed 0 when not given.
+    counts : ints
+        Numbers of components; those that the model does not have are left out.
+    config : FitConfig, optional
+    progress : callable, optional
+        Called with the people fitted and their number.
+
+    Raises
+    ------
+    ValueError
+        Fewer than two people, no count that the model has.
+    """
+    rng = rng or np.random.default_rng(0)
+    people, wanted = checked_bodies(model, people, "people"), checked_counts(model, counts)
+    if count < 1:
+        raise ValueError(f"count: expected at least 1, got {count}")
+    if len(people) < 2:
+        raise ValueError(f"people: expected at least 2, got {len(people)}")
+    real = _centred(unposed(model, people, config, progress)).astype(np.float32)
+    rest = np.zeros((len(model.skeleton.parents), 3))
+    mean = _centred(model.vertices(rest, np.zeros(wanted[-1]))[None])[0]
+    change = np.moveaxis(_centred(np.moveaxis(model.shape_jacobian(rest), -1, 0)), 0, -1)
+    betas = rng.normal(size=(count, wanted[-1]))
+    distances, nearest = np.empty((len(wanted), count)), np.empty((len(wanted), count), dtype=np.int64)
+    for c, k in enumerate(wanted):
+        for i, b in enumerate(betas):
+            far = _distances_to(real, (mean + change[..., :k] @ b[:k]).astype(np.float32))
+            nearest[c, i] = far.argmin()
+            distances[c, i] = far.min()
+    others = [np.delete(_distances_to(real, person), i).min() for i, person in enumerate(real)]
+    return Specificity(np.array(wanted), distances, nearest, float(np.mean(others)))
+
+
+def unposed(model: BodyModel, people: np.ndarray, config: FitConfig | None = None, progress: Progress | None = None
+            ) -> np.ndarray:
+    """People at rest: `fit_shape` with all components, then the fitted body at zero pose.
+
+    What the fit leaves at every vertex is turned back with the rotation of the vertex's part and added, so that it
+    is the person, not the model's idea of the person, that comes to rest.
+
+    Parameters
+    ----------
+    people : (S, N, 3) float, metres
+
+    Returns
+    -------
+    (S, N, 3) float, metres
+    """
+    fitter, part = ShapeFitter(model, config), model.skeleton.part_of_vertex(model.template)
+    rest = np.zeros((len(model.skeleton.parents), 3))
+    out = np.empty_like(people)
+    for i, person in enumerate(people):
+        fit = fitter.fit(person)
+        R = model.skeleton.part_rotations(fit.pose)[part]
+        left = np.squeeze((person - fit.vertices)[:, None] @ R, axis=1)          # Rᵀ r of every vertex
+        out[i] = model.vertices(rest, fit.betas) + left
+        if progress:
+            progress(i + 1, len(people))
+    return out
+
+
+def _centred(bodies: np.ndarray) -> np.ndarray:
+    return bodies - bodies.mean(axis=1, keepdims=True)
+
+
+def _distances_to(real: np.ndarray, body: np.ndarray) -> np.ndarray:
+    """Mean vertex distance (S,) of a body (N, 3) to each of (S, N, 3)."""
+    return np.array([np.sqrt(((person - body) ** 2).sum(axis=1)).mean(dtype=np.float64) for person in real])
