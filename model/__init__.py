@@ -17,6 +17,8 @@ if TYPE_CHECKING:
     from .learning import LearnConfig, learn_scape
     from .linear import PointOperator, Subject
     from .scape import ScapeModel
+    from .skin_learning import SkinConfig, learn_skinning
+    from .skinning import SkinningModel
 
 _ROOMS = {
     "body": ("BodyModel", "Derivatives"),
@@ -30,12 +32,15 @@ _ROOMS = {
     "learning": ("LearnConfig", "learn_scape"),
     "linear": ("PointOperator", "Subject"),
     "scape": ("ScapeModel",),
+    "skin_learning": ("SkinConfig", "learn_skinning"),
+    "skinning": ("SkinningModel",),
 }
 _ROOM_OF = {name: room for room, names in _ROOMS.items() for name in names}
 
 __all__ = ["BodyModel", "Derivatives", "FitConfig", "LearnConfig", "PointOperator", "PoseFit", "Rig", "ScapeModel",
-           "ShapeFit", "Subject", "fit_pose", "fit_shape", "learn_scape", "load_model", "make_rig",
-           "motion_correctives", "skin_weights", "write_body_npz", "write_bvh", "write_skinned_glb"]
+           "ShapeFit", "SkinConfig", "SkinningModel", "Subject", "fit_pose", "fit_shape", "learn_scape",
+           "learn_skinning", "load_model", "make_rig", "motion_correctives", "skin_weights", "write_body_npz",
+           "write_bvh", "write_skinned_glb"]
 
 
 def __getattr__(name: str) -> Any:

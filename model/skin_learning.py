@@ -1,0 +1,297 @@
+"""Learning a skinning model from registered meshes."""
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import asdict, dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from scanprep.geometry.mesh import Mesh, check_template
+from scanprep.skeleton.tree import Skeleton
+
+from .features import Lift, LinearLift, PoseFeatures, QuadraticLift
+from .fitting import FitConfig, PoseFitter, ShapeFitter
+from .learning import check_skeleton, checked_bodies, digest, pose_prior
+from .pose_learning import Ticks
+from .pose_space import kept_directions
+from .shape_space import learn_shape_space
+from .skin_weights import diffused_weights, fit_weights, kept_weights
+from .skinning import SkinningModel
+
+Progress = Callable[[int, int], None]
+SOFTEST = 0.2                        # a mean of rotations that shrinks further is not undone
+
+
+@dataclass(frozen=True)
+class SkinConfig:
+    """Settings of `learn_skinning`.
+
+    Parameters
+    ----------
+    correctives : str
+        What displaces the rest vertices: `none`, `linear` or `quadratic` functions of the joint twists.
+    joints : int
+        So many joints correct a vertex: those of its heaviest part that are nearest to it.
+    pruning : float, square radians
+        Twist directions of smaller variance are not regressed on.
+    ridges : floats
+        Strengths of the regression's penalty; the one that predicts left-out poses best is taken.
+    width : float, metres
+        Over so much surface the weights pass from part to part before they are fitted.
+    smoothness : float, metres
+        So large an error is as bad as a weight that changes by 1 along an edge.
+    parts : int
+        Largest number of parts that a vertex follows.
+    rounds : int
+        Largest number of times that poses, weights, joints and correctives are fitted in turn.
+    components : int
+        Shape components to keep, fewer where there are fewer people.
+    people_rounds : int
+        How often the poses of the other people are fitted.
+    """
+
+    correctives: str = "quadratic"
+    joints: int = 2
+    pruning: float = 0.01
+    ridges: tuple[float, ...] = (1e-4, 1e-3, 3e-3, 0.01, 0.03, 0.1, 0.3)
+    width: float = 0.05
+    smoothness: float = 0.005
+    parts: int = 4
+    rounds: int = 8
+    components: int = 40
+    people_rounds: int = 3
+
+
+def learn_skinning(template: Mesh, poses: np.ndarray, shapes: np.ndarray | None, skeleton: Skeleton,
+                   config: SkinConfig | None = None, progress: Progress | None = None) -> SkinningModel:
+    """Learn a skinning model from one person in many poses and many people in about one pose.
+
+    Parameters
+    ----------
+    template : Mesh
+        One of the poses.
+    poses : (M, N, 3) float, metres
+        The template's person in M poses.
+    shapes : (S, N, 3) float, metres, or None
+        Other people; None for a model of the template's own body alone.
+    skeleton : Skeleton
+        The parts and where the joints are sought.
+    config : SkinConfig, optional
+    progress : callable, optional
+        Called with the work done and the whole.
+
+    Raises
+    ------
+    ValueError
+        Fewer than two poses, vertices of another count or not finite, a skeleton of another template.
+    """
+    config = config or SkinConfig()
+    if config.correctives not in ("none", "linear", "quadratic"):
+        raise ValueError(f"correctives: expected none, linear or quadratic, got '{config.correctives}'")
+    check_template(template)
+    check_skeleton(template, skeleton)
+    poses = checked_bodies(template, poses, "poses")
+    shapes = None if shapes is None else checked_bodies(template, shapes, "shapes")
+    tick = Ticks(progress, config.rounds * len(poses) + (0 if shapes is None else config.people_rounds * len(shapes)))
+    model, at = _learn_pose(_start(template, skeleton, config), poses, config, tick)
+    tick(config.rounds * len(poses) - tick.done)
+    if shapes is not None:
+        model = _learn_people(model, shapes, config, tick)
+    mean, covariance = pose_prior(at)
+    info: dict[str, Any] = {
+        "settings": asdict(config), "poses": len(poses), "shapes": 0 if shapes is None else len(shapes),
+        **model.info, "terms": model.terms.count, "digest": digest(template, poses, shapes)}
+    return replace(model, pose_mean=mean, pose_covariance=covariance, info=info)
+
+
+def _start(template: Mesh, skeleton: Skeleton, config: SkinConfig) -> SkinningModel:
+    """The template itself, with weights that pass smoothly from part to part, and no correctives."""
+    J, N = len(skeleton.parents), len(template.vertices)
+    constants = PoseFeatures(skeleton, LinearLift(), np.arange(J), np.zeros((J, 3, J)))
+    weights = kept_weights(diffused_weights(template, skeleton, config.width), config.parts)
+    return SkinningModel(template, skeleton, template.vertices, weights, constants, np.zeros((0, N, 3), np.float32),
+                         template.vertices, np.zeros((0, N, 3), np.float32), np.zeros(0), 0.0,
+                         np.zeros((J, 3)), np.zeros((3 * J, 3 * J)))
+
+
+def _learn_pose(model: SkinningModel, bodies: np.ndarray, config: SkinConfig, tick: Ticks
+                ) -> tuple[SkinningModel, np.ndarray]:
+    """Poses, weights, joints, rest vertices and correctives in turn, while left-out poses are met better."""
+    allowed = diffused_weights(model.template, model.skeleton, 2 * config.width) > 0
+    poses = model.skeleton.pose_of(model.skeleton.fit_rotations(model.template, bodies))
+    best: tuple[SkinningModel, np.ndarray] | None = None
+    for turn in range(config.rounds):
+        fitter = PoseFitter(model.subject(), FitConfig(polish=0))
+        for i, body in enumerate(bodies):
+            poses[i] = fitter.fit(body, poses[i]).pose
+            tick(1)
+        model = _with_weights(model, poses, bodies, allowed, config)
+        model = _with_joints(model, poses, bodies)
+        model = _with_correctives(model, poses, bodies, config if turn else replace(config, correctives="none"))
+        error = model.info["left_out_error"]
+        if turn > 1 and best is not None and error > 0.99 * best[0].info["left_out_error"]:
+            break
+        best = model, poses.copy()
+    assert best is not None, "at least one round"
+    return best
+
+
+def _carried(model: SkinningModel, pose: np.ndarray, body: np.ndarray) -> np.ndarray:
+    """(J, N, 3) where each part alone would carry each vertex, the whole standing where the body stands."""
+    R, turns = model.skeleton.part_rotations(pose), model.joint_turns(pose)
+    offset = np.einsum("pj,jde,je->pd", model.skeleton.descends.astype(float), turns,
+                       model.joint_regressor @ model.rest)
+    each = (model.rest + model.corrections(pose)) @ np.swapaxes(R, -1, -2) + offset[:, None]
+    return np.asarray(each + (body - np.einsum("np,pnd->nd", model.weights, each)).mean(axis=0))
+
+
+def _with_weights(model: SkinningModel, poses: np.ndarray, bodies: np.ndarray, allowed: np.ndarray,
+                  config: SkinConfig) -> SkinningModel:
+    """The model with weights fitted to the bodies at their poses."""
+    carried = [_carried(model, p, y) for p, y in zip(poses, bodies, strict=True)]
+    weights = fit_weights(carried, bodies, model.template, model.weights, allowed, config.smoothness)
+    return replace(model, weights=kept_weights(weights, config.parts))
+
+
+def _with_joints(model: SkinningModel, poses: np.ndarray, bodies: np.ndarray) -> SkinningModel:
+    """The model with joints where they fit best, which is linear least squares once the poses are known."""
+    J = len(model.skeleton.parents)
+    if J == 1:
+        return model
+    below = model.below[:, 1:] - model.below[:, 1:].mean(axis=0)              # the place of a body is free
+    overlap, normal, slope = below.T @ below, np.zeros((J - 1, 3, J - 1, 3)), np.zeros((J - 1, 3))
+    joints = model.joint_regressor @ model.rest
+    for pose, body in zip(poses, bodies, strict=True):
+        D = model.joint_turns(pose)[1:]
+        left = below.T @ (body - model.vertices(pose))
+        normal += np.einsum("ab,aki,bkj->aibj", overlap, D, D)
+        slope += np.einsum("aki,ak->ai", D, left)
+    flat = normal.reshape(3 * J - 3, -1)
+    flat += 1e-3 * np.trace(flat) / len(flat) * np.eye(len(flat))             # what nothing decides stays
+    moved = joints.copy()
+    moved[1:] += np.linalg.solve(flat, slope.ravel()).reshape(J - 1, 3)
+    return _with_joints_at(model, moved)
+
+
+def _with_joints_at(model: SkinningModel, wanted: np.ndarray) -> SkinningModel:
+    """The model whose joints, as combinations of its rest vertices, lie where wanted."""
+    for _ in range(3):                          # where the rest vertices are not the template's, by a few millimetres
+        shift = wanted - model.joint_regressor @ model.rest
+        shift[0] = 0
+        old = model.skeleton
+        skeleton = Skeleton(old.part_of_face, old.parents, old.joints + shift, old.names)
+        model = replace(model, skeleton=skeleton, features=replace(model.features, skeleton=skeleton))
+    return model
+
+
+def _with_correctives(model: SkinningModel, poses: np.ndarray, bodies: np.ndarray, config: SkinConfig
+                      ) -> SkinningModel:
+    """The model with rest vertices and correctives regressed on the unposed bodies."""
+    unposed = np.stack([_unposed(model, p, y) for p, y in zip(poses, bodies, strict=True)])
+    features = corrective_features(model.skeleton, poses, config)
+    joints = _acting_joints(model, config.joints)
+    errors = [_regress(features, poses, unposed, joints, ridge)[2] for ridge in config.ridges] \
+        if features.count > len(features.starts) else [0.0]
+    ridge = config.ridges[int(np.argmin(errors))]
+    rest, correctives, error = _regress(features, poses, unposed, joints, ridge)
+    moved = _with_joints_at(replace(model, rest=rest), model.joint_regressor @ model.rest)
+    return replace(moved, features=replace(features, skeleton=moved.skeleton), correctives=correctives,
+                   info={"ridge": ridge, "left_out_error": error})
+
+
+def _unposed(model: SkinningModel, pose: np.ndarray, body: np.ndarray) -> np.ndarray:
+    """(N, 3) rest vertices, correctives included, that the model with its joints carries onto a body."""
+    y = model.vertices(pose)
+    left = body - y
+    return model.rest + model.corrections(pose) + _undone(model.blended(pose), left - left.mean(axis=0))
+
+
+def _undone(B: np.ndarray, moved: np.ndarray) -> np.ndarray:
+    """`B⁻¹ moved` (N, 3) for means of rotations (N, 3, 3), gently where they have collapsed."""
+    U, s, Vt = np.linalg.svd(B)
+    return np.einsum("nki,nk,njk,nj->ni", Vt, 1 / np.maximum(s, SOFTEST), U, moved)
+
+
+def corrective_features(skeleton: Skeleton, poses: np.ndarray, config: SkinConfig) -> PoseFeatures:
+    """For every joint a constant, its kept twist directions, and their products where they are asked for."""
+    J = len(skeleton.parents)
+    lift: Lift = QuadraticLift() if config.correctives == "quadratic" else LinearLift()
+    part, columns = [], []
+    for j, directions in enumerate(kept_directions(poses, config.pruning)):
+        mine = [np.zeros(lift.width)]
+        if config.correctives != "none":
+            mine += [np.pad(d, (0, lift.width - 3)) for d in directions.T]
+        if config.correctives == "quadratic":
+            a, b = np.triu_indices(3)
+            for m, d in enumerate(directions.T):
+                for e in directions.T[m:]:
+                    product = np.outer(d, e) + np.outer(e, d) * (~np.eye(3, dtype=bool))
+                    mine.append(np.r_[np.zeros(3), product[a, b]])
+        for column in mine:
+            part.append(j)
+            columns.append(np.zeros((J, lift.width)))
+            columns[-1][j] = column
+    return PoseFeatures(skeleton, lift, np.array(part), np.stack(columns, axis=-1))
+
+
+def _acting_joints(model: SkinningModel, count: int) -> np.ndarray:
+    """(N, J) bool: the joints of the heaviest part of each vertex that are nearest to it."""
+    x, joints = model.template.vertices, model.skeleton.joints
+    acting = np.zeros(model.weights.shape, dtype=bool)
+    for p, of_part in enumerate(model.skeleton.joints_of_part):
+        mine, near = np.flatnonzero(model.weights.argmax(axis=1) == p), np.array(of_part, dtype=np.int64)
+        far = np.linalg.norm(x[mine, None] - joints[near], axis=2)
+        acting[mine[:, None], near[np.argsort(far, axis=1, kind="stable")[:, :count]]] = True
+    return acting
+
+
+def _regress(features: PoseFeatures, poses: np.ndarray, unposed: np.ndarray, acting: np.ndarray, ridge: float
+             ) -> tuple[np.ndarray, np.ndarray, float]:
+    """Rest vertices (N, 3), correctives (C, N, 3) and the error of left-out poses, root mean square in metres."""
+    free = np.flatnonzero(features.constant == 0)
+    delta, M = features.evaluate(poses)[:, free], len(poses)
+    rest, correctives = np.empty(unposed.shape[1:]), np.zeros((len(free), *unposed.shape[1:]), dtype=np.float32)
+    kinds, which = np.unique(acting, axis=0, return_inverse=True)
+    total = 0.0
+    for g, joints in enumerate(kinds):
+        used, mine = np.flatnonzero(~features.uses[free][:, ~joints].any(axis=1)), which.ravel() == g
+        target = unposed[:, mine].reshape(M, -1)
+        centre, middle = delta[:, used].mean(axis=0), target.mean(axis=0)
+        X = delta[:, used] - centre
+        solver = np.linalg.solve(X.T @ X + (M * ridge + 1e-12) * np.eye(len(used)), X.T)
+        slope, hat = solver @ target, X @ solver + 1 / M
+        left = (target - middle - X @ slope) / np.maximum(1 - np.diag(hat), 1e-6)[:, None]
+        total += float((left**2).sum())
+        rest[mine] = (middle - centre @ slope).reshape(-1, 3)
+        correctives[np.ix_(used, mine)] = slope.reshape(len(used), mine.sum(), 3)
+    return rest, correctives, float(np.sqrt(total / (M * len(rest))))
+
+
+def _learn_people(model: SkinningModel, shapes: np.ndarray, config: SkinConfig, tick: Ticks) -> SkinningModel:
+    """The model with the shape components of people whose poses are fitted and undone in turn."""
+    for turn in range(config.people_rounds):
+        quick = FitConfig(polish=0, n_betas=min(20, model.n_betas) or None)
+        people = np.empty(shapes.shape)
+        fitter = ShapeFitter(model, quick) if turn else PoseFitter(model.subject(), quick)
+        for i, body in enumerate(shapes):
+            people[i] = _person(model, fitter.fit(body).pose, body)
+            tick(1)
+        space = learn_shape_space(people, config.components)
+        model = replace(model, shape_mean=space.mean.astype(np.float64), shape_components=space.components,
+                        shape_variances=space.variances, shape_total=space.total_variance)
+    return model
+
+
+def _person(model: SkinningModel, pose: np.ndarray, body: np.ndarray) -> np.ndarray:
+    """(N, 3) rest vertices that the model carries onto a body exactly, joints of their own included."""
+    B, A = model.blended(pose), model.joint_regressor
+    # x = B⁻¹ (y - Σ_j below_j turn_j j_j) - c with the joints j = A x: first solved for the joints alone
+    bare = _undone(B, body) - model.corrections(pose)
+    pulls = np.stack([[_undone(B, model.below[:, j, None] * column) for column in turn.T]
+                      for j, turn in enumerate(model.joint_turns(pose))])     # (J, 3, N, 3)
+    J = len(pulls)
+    coupling = np.stack([A @ pull for pull in pulls.reshape(3 * J, -1, 3)], axis=-1).reshape(3 * J, 3 * J)
+    joints = np.linalg.solve(np.eye(3 * J) + coupling, (A @ bare).ravel())
+    x = bare - np.tensordot(joints, pulls.reshape(3 * J, -1, 3), axes=1)
+    return np.asarray(x + model.skeleton.joints[0] - (A @ x)[0])
