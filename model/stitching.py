@@ -36,12 +36,7 @@ class StitchingSystem:
     @cached_property
     def edge_operator(self) -> csc_array:
         """(2F, N) sparse: `edge_operator @ vertices` are the edges, two rows a triangle."""
-        F = len(self.faces)
-        row = np.arange(2 * F)
-        one = np.ones(2 * F)
-        end, start = self.faces[:, 1:].ravel(), np.repeat(self.faces[:, 0], 2)
-        return csc_array(coo_array((np.r_[one, -one], (np.r_[row, row], np.r_[end, start])),
-                                   shape=(2 * F, self.n_vertices)))
+        return edge_operator(self.faces, self.n_vertices)
 
     @cached_property
     def _factored(self) -> Factored:
@@ -77,3 +72,12 @@ class StitchingSystem:
         rhs = self.edge_operator.T @ columns.reshape(2 * len(self.faces), -1)
         y = self.solve(rhs).reshape(self.n_vertices, -1, 3)
         return np.moveaxis(y, 1, 0).reshape(*leading, self.n_vertices, 3)
+
+
+def edge_operator(faces: np.ndarray, n_vertices: int) -> csc_array:
+    """(2F, N) sparse: times vertices (N, 3) it gives the two edges of every triangle (F, 3), two rows each."""
+    row = np.arange(2 * len(faces))
+    one = np.ones(len(row))
+    end, start = faces[:, 1:].ravel(), np.repeat(faces[:, 0], 2)
+    return csc_array(coo_array((np.r_[one, -one], (np.r_[row, row], np.r_[end, start])),
+                               shape=(len(row), n_vertices)))

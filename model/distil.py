@@ -1,0 +1,154 @@
+"""What a model carried to another resolution still lacks, found by comparing the two in many poses."""
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from scanprep.geometry.mesh import Mesh
+from scanprep.geometry.surface import Surface
+
+from .gradients import edges
+from .pieces import gradients_of
+from .pose_space import PoseSpace
+from .scape import ScapeModel
+from .shape_space import ShapeSpace
+
+PER_FEATURE = 3                      # poses for each feature of the part that has most, if that is more
+SHRINK = 1e-3                        # of the mean square: holds what the poses do not show
+
+
+class Follower:
+    """The vertices of one triangulation as points that ride on another one.
+
+    Parameters
+    ----------
+    ridden, rider : Mesh
+        At rest.
+    """
+
+    def __init__(self, ridden: Mesh, rider: Mesh) -> None:
+        self._on = Surface(ridden).closest(rider.vertices)
+        self._corners = ridden.faces[self._on.faces]
+        off = rider.vertices - self._on.points
+        self._off = np.einsum("nji,nj->ni", _frames(ridden.vertices[self._corners]), off)
+
+    def positions(self, vertices: np.ndarray) -> np.ndarray:
+        """Where the riders (..., n, 3) are when the ridden vertices are at (..., N, 3), metres."""
+        corners = vertices[..., self._corners, :]
+        return self._between(corners) + np.einsum("...nij,nj->...ni", _frames(corners), self._off)
+
+    def displacements(self, fields: np.ndarray) -> np.ndarray:
+        """What the riders (..., n, 3) have of a small displacement (..., N, 3), metres."""
+        return self._between(fields[..., self._corners, :])
+
+    def _between(self, corners: np.ndarray) -> np.ndarray:
+        return np.einsum("nc,...ncd->...nd", self._on.bary, corners)
+
+
+def _frames(corners: np.ndarray) -> np.ndarray:
+    """(..., 3, 3) an orthonormal frame, in columns, of triangles (..., 3, 3)."""
+    first, second = corners[..., 1, :] - corners[..., 0, :], corners[..., 2, :] - corners[..., 0, :]
+    normal = np.cross(first, second)
+    normal /= np.linalg.norm(normal, axis=-1, keepdims=True)
+    first = first / np.linalg.norm(first, axis=-1, keepdims=True)
+    return np.stack([first, np.cross(normal, first), normal], axis=-1)
+
+
+@dataclass(frozen=True, eq=False)
+class Distillation:
+    """Lowers what a carried model leaves of the model it was made of.
+
+    The way is that of learning: what is left of every body, as edges in the frames of the parts, is regressed and
+    added to what the triangles have.
+
+    Parameters
+    ----------
+    model : ScapeModel
+        To be imitated.
+    follow : Follower
+        The imitation's vertices on the model's.
+    poses : (M, J, 3) float, radians
+    """
+
+    model: ScapeModel
+    follow: Follower
+    poses: np.ndarray
+
+    def pose_space(self, imitation: ScapeModel, rounds: int) -> ScapeModel:
+        """The imitation with a pose space corrected on the template's own body.
+
+        [SCAPE] Eq. 4
+        """
+        wanted = self.follow.positions(self.model.subject(None).vertices(self.poses))
+        for _ in range(rounds):
+            left = wanted - imitation.subject(None).vertices(self.poses)
+            imitation = replace(imitation, pose_space=self._corrected(imitation, left))
+        return imitation
+
+    def _corrected(self, imitation: ScapeModel, left: np.ndarray) -> PoseSpace:
+        space, v_hat = imitation.pose_space, edges(imitation.template.vertices, imitation.template.faces)
+        local = np.stack([_unturned(imitation, d, pose) for d, pose in zip(left, self.poses, strict=True)])
+        delta = space.features.evaluate(self.poses)
+        coefficients = []
+        for p, faces in enumerate(space.faces_of_part):
+            X = delta[:, space.features.of_part(p)]
+            shrink = SHRINK * np.diag(np.maximum((X**2).sum(axis=0), 1e-12))
+            slope = np.linalg.solve(X.T @ X + shrink, X.T @ local[:, faces].reshape(len(X), -1))
+            more = gradients_of(v_hat[faces], slope.reshape(-1, len(faces), 2, 3))
+            coefficients.append((space.coefficients[p] + more).astype(space.coefficients[p].dtype))
+        return PoseSpace(space.features, tuple(coefficients))
+
+    def shape_space(self, imitation: ScapeModel, rounds: int) -> ScapeModel:
+        """The imitation with a mean person and shape components corrected.
+
+        [SCAPE] Eq. 8
+        """
+        if not self.model.n_betas:
+            return imitation
+        wanted = [self.follow.positions(mean) for mean, _ in self._people(self.model)]
+        slopes = [self.follow.displacements(slope).astype(np.float32) for _, slope in self._people(self.model)]
+        for _ in range(rounds):
+            square, product = np.zeros((3, 3)), np.zeros((3, 3))
+            for pose, y, dy, (mean, slope) in zip(self.poses, wanted, slopes, self._people(imitation), strict=True):
+                local = _unturned(imitation, np.concatenate([(y - mean)[None], dy - slope]), pose)
+                posed = _posed(imitation, pose)
+                square = square + np.swapaxes(posed, -1, -2) @ posed
+                product = product + np.swapaxes(local, -1, -2) @ posed
+            shrink = SHRINK * np.trace(square, axis1=-2, axis2=-1)[:, None, None] * np.eye(3)
+            more, space = product @ np.linalg.inv(square + shrink), imitation.shape_space
+            imitation = replace(imitation, shape_space=ShapeSpace(
+                (space.mean + more[0]).astype(space.mean.dtype),
+                (space.components + more[1:]).astype(space.components.dtype), space.variances, space.total_variance))
+        return imitation
+
+    def _people(self, model: ScapeModel) -> Iterator[tuple[np.ndarray, np.ndarray]]:
+        """The mean person (N, 3) in every pose, and the change (K, N, 3) by each beta."""
+        for pose in self.poses:
+            yield model.vertices(pose, np.zeros(model.n_betas)), np.moveaxis(model.shape_jacobian(pose), -1, 0)
+
+
+def drawn_poses(model: ScapeModel, count: int) -> np.ndarray:
+    """Poses (count, J, 3), radians, of the model's prior, the mean first, the same ones every time."""
+    variances, axes = np.linalg.eigh(model.pose_covariance)
+    unit = np.random.default_rng(0).normal(size=(count, len(variances)))
+    unit[:1] = 0
+    return model.pose_mean + ((unit * np.sqrt(np.maximum(variances, 0))) @ axes.T).reshape(count, -1, 3)
+
+
+def enough_poses(model: ScapeModel, least: int) -> int:
+    """How many poses settle the features of every part."""
+    return max(least, PER_FEATURE * int(np.bincount(model.pose_space.features.part).max()))
+
+
+def _unturned(model: ScapeModel, field: np.ndarray, pose: np.ndarray) -> np.ndarray:
+    """Edges (..., F, 2, 3) of a displacement (..., N, 3) as they were before rotations carried them."""
+    R = np.tensordot(model.rotation_weights, model.skeleton.part_rotations(pose), axes=1)
+    return edges(field, model.template.faces) @ np.swapaxes(np.linalg.inv(R), -1, -2)
+
+
+def _posed(model: ScapeModel, pose: np.ndarray) -> np.ndarray:
+    """`Q v̂` (F, 2, 3) at a pose."""
+    v_hat = edges(model.template.vertices, model.template.faces)
+    return v_hat @ np.swapaxes(model.pose_space.gradients(pose), -1, -2)

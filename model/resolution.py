@@ -1,0 +1,162 @@
+"""The same model on another triangulation of its template's surface."""
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from functools import singledispatch
+from typing import Any
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from scanprep.cleaning.decimate import DecimateConfig, decimate
+from scanprep.geometry.mesh import Mesh, check_template
+from scanprep.geometry.surface import Surface
+from scanprep.skeleton.tree import Skeleton
+
+from .blendscape import BlendScapeModel
+from .body import BodyModel
+from .distil import Distillation, Follower, drawn_poses, enough_poses
+from .pieces import Piece, carry_skeleton, gradients_of
+from .pose_space import PoseSpace, faces_of_part
+from .scape import ScapeModel
+from .shape_space import ShapeSpace
+
+ASTRAY = 2.0                         # mean edges of the coarser surface that the two may lie apart
+
+
+@dataclass(frozen=True)
+class ResolutionConfig:
+    """Settings of `change_resolution`.
+
+    Parameters
+    ----------
+    poses : int
+        Poses of the model's prior in which both are compared and the new one corrected, or more if the features ask
+        for more.
+    shape_poses : int
+        The same for the shape components.
+    rounds : int
+        How often each is corrected; none for a fast and rougher answer.
+    """
+
+    poses: int = 40
+    shape_poses: int = 8
+    rounds: int = 2
+
+
+def change_resolution(model: BodyModel, template: Mesh, config: ResolutionConfig | None = None) -> BodyModel:
+    """Carry a model to a coarser or finer triangulation, so that pose, betas and trans keep their meaning.
+
+    Parameters
+    ----------
+    model : BodyModel
+    template : Mesh
+        Other triangles on the surface of the model's template, in the same place.
+    config : ResolutionConfig, optional
+
+    Returns
+    -------
+    BodyModel
+        Of the same kind, with the same tree, joints, features, betas and priors; landmarks are on the nearest new
+        vertices.
+
+    Raises
+    ------
+    ValueError
+        Not usable as a template, another surface, or too coarse to have every part.
+
+    [MoSh]
+    """
+    check_template(template)
+    _check_same_surface(model.template, template)
+    return carry_model(model, template, config or ResolutionConfig())
+
+
+@singledispatch
+def carry_model(model: BodyModel, template: Mesh, config: ResolutionConfig) -> BodyModel:
+    """What `change_resolution` does for one kind of model."""
+    raise ValueError(f"model: the resolution of the kind '{model.kind}' cannot be changed")
+
+
+@carry_model.register
+def _carry_scape(model: ScapeModel, template: Mesh, config: ResolutionConfig) -> ScapeModel:
+    skeleton = carry_skeleton(model.skeleton, model.template, template)
+    pieces = [Piece(model.template, template, old, new) for old, new in
+              zip(faces_of_part(model.skeleton), faces_of_part(skeleton), strict=True)]
+    carried = replace(
+        model, template=template, skeleton=skeleton, pose_space=_carry_pose_space(model.pose_space, skeleton, pieces),
+        shape_space=_carry_shape_space(model, pieces), info=carry_info(model, template), **_carry_blend(model, pieces))
+    if not config.rounds:
+        return carried
+    follow, poses = Follower(model.template, template), drawn_poses(model, enough_poses(model, config.poses))
+    carried = Distillation(model, follow, poses).pose_space(carried, config.rounds)
+    return Distillation(model, follow, poses[:config.shape_poses]).shape_space(carried, config.rounds)
+
+
+def _carry_pose_space(space: PoseSpace, skeleton: Skeleton, pieces: list[Piece]) -> PoseSpace:
+    coefficients = []
+    for piece, a in zip(pieces, space.coefficients, strict=True):
+        action = a.astype(np.float64)
+        average = np.stack([piece.average(each) for each in action])
+        coefficients.append(gradients_of(piece.v_hat, piece.edges(action), average).astype(a.dtype))
+    return PoseSpace(replace(space.features, skeleton=skeleton), tuple(coefficients))
+
+
+def _carry_shape_space(model: ScapeModel, pieces: list[Piece]) -> ShapeSpace:
+    """S with which the parts, in the mean pose, have the shapes they had."""
+    old, F = model.shape_space, sum(len(piece.new_faces) for piece in pieces)
+    Q = model.pose_space.gradients(model.pose_mean)
+    mean = np.empty((F, 3, 3), dtype=old.mean.dtype)
+    components = np.empty((old.count, F, 3, 3), dtype=old.components.dtype)
+    for piece in pieces:
+        S = np.concatenate([old.mean[None, piece.old_faces], old.components[:, piece.old_faces]]).astype(np.float64)
+        average = np.stack([piece.average(each) for each in S])
+        bent = Q[piece.old_faces]
+        posed = piece.edges(bent[None])[0]
+        S = gradients_of(posed, piece.edges(S @ bent), average)
+        mean[piece.new_faces], components[:, piece.new_faces] = S[0], S[1:]
+    return ShapeSpace(mean, components, old.variances, old.total_variance)
+
+
+def _carry_blend(model: ScapeModel, pieces: list[Piece]) -> dict[str, np.ndarray]:
+    """The weights of blended rotations, where the model has them."""
+    if not isinstance(model, BlendScapeModel):
+        return {}
+    blend = np.empty((sum(len(piece.new_faces) for piece in pieces), model.blend.shape[1]))
+    for piece in pieces:
+        blend[piece.new_faces] = piece.average(model.blend[piece.old_faces])
+    return {"blend": blend}
+
+
+def carry_info(model: BodyModel, template: Mesh) -> dict[str, Any]:
+    """The model's info with its landmarks on the nearest new vertices and a note of the resolution it was made at."""
+    old, marks = model.template, model.info.get("landmarks", {})
+    points = old.vertices[np.array(list(marks.values()), dtype=np.int64)]
+    nearest = cKDTree(template.vertices).query(points)[1]
+    return {**model.info, "landmarks": {name: int(v) for name, v in zip(marks, nearest, strict=True)},
+            "resolution_of": f"{len(old.vertices)} vertices, {len(old.faces)} triangles"}
+
+
+def subdivide(mesh: Mesh, times: int = 1) -> Mesh:
+    """Every triangle cut into four by the middles of its sides, so that the surface stays."""
+    import igl
+
+    return Mesh(*igl.upsample(mesh.vertices, mesh.faces, times))
+
+
+def resample(mesh: Mesh, vertices: int) -> Mesh:
+    """About so many vertices on the same surface: subdivided until there are enough, then decimated."""
+    times = 0
+    while len(mesh.vertices) < vertices:
+        mesh, times = subdivide(mesh), times + 1
+    faces = len(mesh.faces) - 2 * (len(mesh.vertices) - vertices)
+    return decimate(mesh, faces, DecimateConfig(method="even" if times else "quadric"))
+
+
+def _check_same_surface(old: Mesh, new: Mesh) -> None:
+    limit = ASTRAY * max(old.mean_edge, new.mean_edge)
+    for a, b, which in ((new, old, "it lies"), (old, new, "the model's own lies")):
+        far = float(Surface(b).closest(a.vertices).distances.max())
+        if far > limit:
+            raise ValueError(f"template: expected the surface of the model's template in the same place, {which} up to "
+                             f"{far:.3g} m away from the other")

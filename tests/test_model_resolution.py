@@ -1,0 +1,198 @@
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from model_bodies import random_poses, worm_model
+
+from model import load_model
+from model.blendscape import BlendScapeModel
+from model.distil import Follower
+from model.features import linear_features
+from model.pieces import Piece, carry_skeleton, gradients_of
+from model.pose_space import PoseSpace
+from model.resolution import ResolutionConfig, change_resolution, resample, subdivide
+from model.scape import ScapeModel
+from model.shape_space import ShapeSpace
+from scanprep import decimate
+from scanprep.geometry import rotations
+from scanprep.geometry.mesh import Mesh
+
+ROUGH = ResolutionConfig(rounds=0)
+
+
+@pytest.fixture(scope="module")
+def model():
+    given = worm_model()
+    return replace(given, pose_covariance=np.diag([0.0] * 3 + [0.1] * 9), info={"digest": "d", "landmarks": {"tip": 3}})
+
+
+@pytest.fixture(scope="module")
+def finer(model):
+    return change_resolution(model, subdivide(model.template))
+
+
+def apart(a, b, pose, betas=None):
+    """Mean and largest distance of the vertices of b from the points of a on which they lie at rest, metres."""
+    ridden = Follower(a.template, b.template).positions(a.vertices(pose, betas))
+    far = np.linalg.norm(ridden - b.vertices(pose, betas), axis=-1)
+    return far.mean(), far.max()
+
+
+def typical(model, count=6, seed=5):
+    poses = random_poses(model, count, np.random.default_rng(seed), 0.3)
+    return poses
+
+
+def test_the_same_triangles_give_the_same_model(model):
+    same = change_resolution(model, model.template, ROUGH)
+    pose = typical(model, 1)[0]
+    np.testing.assert_allclose(same.vertices(pose), model.vertices(pose), rtol=0, atol=1e-6)
+    # S is carried as the shapes that the parts have in the mean pose, which is a little less than all of S
+    mean, betas = model.pose_mean, [1.0, -1.0, 0.5]
+    np.testing.assert_allclose(same.vertices(mean, betas), model.vertices(mean, betas), rtol=0, atol=1e-6)
+    np.testing.assert_allclose(same.vertices(pose, betas), model.vertices(pose, betas), rtol=0, atol=1e-3)
+    np.testing.assert_array_equal(same.skeleton.part_of_face, model.skeleton.part_of_face)
+
+
+def test_the_same_triangles_in_another_order(model):
+    order = np.random.default_rng(0).permutation(len(model.template.faces))
+    turned = change_resolution(model, Mesh(model.template.vertices, model.template.faces[order]), ROUGH)
+    np.testing.assert_array_equal(turned.skeleton.part_of_face, model.skeleton.part_of_face[order])
+    pose = typical(model, 1)[0]
+    np.testing.assert_allclose(turned.vertices(pose), model.vertices(pose), rtol=0, atol=1e-6)
+
+
+@pytest.mark.parametrize("faces", [None, 500])
+def test_a_model_deformed_alike_everywhere_stays_exact(model, faces):
+    """One affine map for all triangles is the gradient of a displacement at any resolution."""
+    skeleton = model.skeleton
+    features = linear_features(skeleton, tuple(np.zeros((3, 0)) for _ in skeleton.parents))
+    A = np.eye(3) + np.random.default_rng(1).normal(0, 0.1, (3, 3))
+    B = np.random.default_rng(2).normal(0, 0.1, (3, 3))
+    sizes = np.bincount(skeleton.part_of_face)
+    alike = ScapeModel(
+        model.template, skeleton, PoseSpace(features, tuple(np.tile(A, (1, n, 1, 1)) for n in sizes)),
+        ShapeSpace(np.tile(np.eye(3) + B, (sizes.sum(), 1, 1)), np.tile(B, (1, sizes.sum(), 1, 1)), np.ones(1), 1.0),
+        np.zeros((4, 3)), np.zeros((12, 12)))
+    template = subdivide(model.template) if faces is None else decimate(model.template, faces)
+    carried = change_resolution(alike, template, ROUGH)
+    centre = skeleton.joints[0]
+    for betas, M in ((None, A), ([2.0], (np.eye(3) + 3 * B) @ A)):
+        y = carried.vertices(np.zeros((4, 3)), betas)
+        np.testing.assert_allclose(y, (template.vertices - centre) @ M.T + centre, atol=1e-9)
+
+
+def test_finer_and_coarser_mean_the_same_body(model, finer):
+    assert (len(finer.template.faces), finer.skeleton.names) == (4 * len(model.template.faces), model.skeleton.names)
+    coarser = change_resolution(model, decimate(model.template, 500))
+    for pose in typical(model):
+        for betas in (None, [1.0, -0.5, 1.0]):
+            assert apart(model, finer, pose, betas)[0] < 2.5e-3
+            assert apart(model, coarser, pose, betas)[0] < 8e-3
+
+
+def test_correction_lowers_what_is_left(model, finer):
+    rough = change_resolution(model, finer.template, ROUGH)
+    for betas in (None, [1.0, -0.5, 1.0]):
+        left = [np.mean([apart(model, m, pose, betas)[0] for pose in typical(model)]) for m in (rough, finer)]
+        assert left[1] < 0.7 * left[0]
+
+
+def test_there_and_back(model, finer):
+    back = change_resolution(finer, model.template)
+    for pose in typical(model, 3):
+        far = np.linalg.norm(back.vertices(pose, [1.0]) - model.vertices(pose, [1.0]), axis=1)
+        assert far.mean() < 2e-3
+
+
+def test_the_place_stays(model, finer):
+    for pose in typical(model):
+        shift = Follower(model.template, finer.template).positions(model.vertices(pose)) - finer.vertices(pose)
+        assert np.linalg.norm(shift.mean(axis=0)) < 2e-3
+    trans = np.array([1.0, 2.0, 3.0])
+    np.testing.assert_allclose(finer.vertices(pose, None, trans) - finer.vertices(pose), np.tile(trans, (
+        len(finer.template.vertices), 1)), atol=1e-12)
+
+
+def test_what_is_kept(model, finer, tmp_path):
+    assert finer.info["digest"] == "d" and finer.info["resolution_of"] == "398 vertices, 792 triangles"
+    place = finer.template.vertices[finer.info["landmarks"]["tip"]]
+    np.testing.assert_allclose(place, model.template.vertices[3], atol=1e-12)
+    np.testing.assert_array_equal(finer.pose_covariance, model.pose_covariance)
+    np.testing.assert_array_equal(finer.skeleton.joints, model.skeleton.joints)
+    finer.save(tmp_path / "fine.npz")
+    back = load_model(tmp_path / "fine.npz")
+    pose = typical(model, 1)[0]
+    np.testing.assert_array_equal(back.vertices(pose, [1.0]), finer.vertices(pose, [1.0]))
+
+
+def test_blended_rotations_are_carried_too(model):
+    x = model.template.corners.mean(axis=1)[:, 0] - 0.3
+    blend = np.zeros((len(x), 4))
+    near = 0.5 * np.exp(-(x + 0.35) ** 2 / 0.01)
+    blend[np.arange(len(x)), model.skeleton.part_of_face] = 1 - near
+    blend[np.arange(len(x)), np.where(model.skeleton.part_of_face == 1, 0, 1)] += near
+    fields = {name: getattr(model, name) for name in ("template", "skeleton", "pose_space", "shape_space", "pose_mean",
+                                                      "pose_covariance", "info")}
+    blended = BlendScapeModel(**fields, blend=blend)
+    finer = change_resolution(blended, subdivide(model.template))
+    assert isinstance(finer, BlendScapeModel)
+    np.testing.assert_allclose(finer.blend.sum(axis=1), 1, atol=1e-12)
+    for pose in typical(model, 3):
+        assert apart(blended, finer, pose)[0] < 2.5e-3
+
+
+def test_parts_are_connected_and_nearly_where_they_were(model):
+    coarse = decimate(model.template, 300)
+    skeleton = carry_skeleton(model.skeleton, model.template, coarse)
+    x = coarse.corners.mean(axis=1)[:, 0] - 0.3
+    inside = np.abs(x[:, None] - [-0.35, 0.35, 0.7]).min(axis=1) > 0.1
+    np.testing.assert_array_equal(skeleton.part_of_face[inside],
+                                  np.select([x < -0.35, x < 0.35, x < 0.7], [1, 0, 2], 3)[inside])
+    for p in range(4):
+        assert coarse.submesh(skeleton.part_of_face == p)[0].vertex_component.max() == 0
+
+
+def test_refuses_what_cannot_be(model):
+    with pytest.raises(ValueError, match="too coarse"):
+        change_resolution(model, decimate(model.template, 20))
+    with pytest.raises(ValueError, match="same place"):
+        change_resolution(model, model.template.with_vertices(model.template.vertices + 1))
+    with pytest.raises(ValueError, match="not usable as a template"):
+        change_resolution(model, Mesh(model.template.vertices, model.template.faces[:0]))
+    with pytest.raises(ValueError, match="kind"):
+        change_resolution(type("Other", (), {"kind": "other", "template": model.template})(), model.template)
+
+
+def test_gradients_of_edges_and_the_rest():
+    rng = np.random.default_rng(0)
+    before, M, N = rng.normal(size=(5, 2, 3)), rng.normal(size=(5, 3, 3)), rng.normal(size=(5, 3, 3))
+    found = gradients_of(before, before @ np.swapaxes(M, -1, -2), N)
+    normal = np.cross(before[:, 0], before[:, 1])
+    np.testing.assert_allclose(found @ np.swapaxes(before, -1, -2), M @ np.swapaxes(before, -1, -2), atol=1e-12)
+    np.testing.assert_allclose((found @ normal[..., None]), (N @ normal[..., None]), atol=1e-12)
+
+
+def test_averages_are_by_area(model):
+    finer = subdivide(model.template)
+    every = np.arange(len(finer.faces))
+    piece = Piece(finer, model.template, every, np.arange(len(model.template.faces)))
+    np.testing.assert_allclose(piece.average(np.ones(len(every))), 1)
+    centre = finer.corners.mean(axis=1)
+    flat = np.abs(model.template.face_normals[:, 0]) < 0.9
+    np.testing.assert_allclose(piece.average(centre)[flat], model.template.corners.mean(axis=1)[flat], atol=2e-3)
+
+
+def test_followers_move_stiffly_with_a_stiff_body(model):
+    rng = np.random.default_rng(0)
+    rider = model.template.with_vertices(model.template.vertices + rng.normal(0, 0.01, model.template.vertices.shape))
+    R, t = rotations.exp([0.3, -0.7, 1.1]), np.array([1.0, 2.0, 3.0])
+    moved = Follower(model.template, rider).positions(model.template.vertices @ R.T + t)
+    np.testing.assert_allclose(moved, rider.vertices @ R.T + t, atol=1e-12)
+
+
+def test_resample_reaches_the_count(model):
+    for count in (200, 700, 2000):
+        changed = resample(model.template, count)
+        assert abs(len(changed.vertices) - count) <= 2
+        assert changed.is_closed
