@@ -29,6 +29,8 @@ ModelArg = Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="MODEL.np
 COMMANDS = {
     "info": ("What a model holds and how it was made.", "model.cli:info"),
     "mesh": ("The mesh of one pose and shape.", "model.cli:mesh"),
+    "sample": ("Random bodies: meshes, a sheet of pictures, betas and poses.", "model.evaluation.cli:sample"),
+    "evaluate": ("Errors on held-out bodies, with a page of curves and pictures.", "model.evaluation.cli:evaluate"),
     "export": ("Files for other programs: skinned GLB, BVH, body-model npz, meshes.", "model.export.cli:export"),
 }
 
