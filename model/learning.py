@@ -1,10 +1,12 @@
-"""Learning a SCAPE model from registered meshes."""
+"""Learning SCAPE and BlendSCAPE models from registered meshes."""
 from __future__ import annotations
 
+import contextlib
 import hashlib
-from collections.abc import Callable
+import logging
+import time
+from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass
-from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -12,45 +14,45 @@ import numpy as np
 from scanprep.geometry.mesh import Mesh, check_template
 from scanprep.skeleton.tree import Skeleton
 
-from .carriers import Carrier, build_basis, carried_terms, make_carriers, rigid_weights
+from .blendscape import BlendScapeModel
+from .borders import face_weights
+from .carriage import Carriage
+from .carriers import rigid_weights
 from .features import twists
-from .fitting import FitConfig, PoseFitter
-from .gradients import GradientSystem, edges, local_edges, pose_gradients, shape_gradients
-from .linear import Subject
-from .pose_space import PoseSpace, Regression, learn_pose_space
+from .gradients import GradientSystem, shape_gradients
+from .pose_learning import PoseConfig, Ticks, learn_pose
+from .pose_space import PoseSpace
 from .scape import ScapeModel
 from .shape_space import ShapeSpace, learn_shape_space
-from .stitching import StitchingSystem
 
 Progress = Callable[[int, int], None]
+LOG = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True)
-class LearnConfig:
-    """Settings of `learn_scape`.
+class LearnConfig(PoseConfig):
+    """Settings of `learn_scape`: those of the pose space, and of the space of shapes.
 
     Parameters
     ----------
-    smoothness : float
-        The paper's 0.001: times the mean edge length it is w_s of Eq. 5 and 8.
-    pruning : float, square radians
-        Twist directions of smaller variance are not regressed on.
-    ridges : floats, square radians
-        Strengths of the regression's penalty; the one that predicts left-out poses best is taken.
-    refinements : int
-        How often part rotations are fitted anew to the learned model.
-    steps : int
-        How often, after each of these, the regression is corrected by what the stitched model leaves.
     components : int
         Shape components to keep, fewer where there are fewer people.
     """
 
-    smoothness: float = 0.001
-    pruning: float = 0.01
-    ridges: tuple[float, ...] = (1e-4, 1e-3, 3e-3, 0.01, 0.03, 0.1, 0.3)
-    refinements: int = 2
-    steps: int = 3
     components: int = 40
+
+
+@dataclass(frozen=True)
+class BlendConfig(LearnConfig):
+    """Settings of `learn_blendscape`: those of `learn_scape`, and how far rotations blend.
+
+    Parameters
+    ----------
+    width : float
+        How far a rotation reaches over the border of its part, as a share of the template's diagonal.
+    """
+
+    width: float = 0.01
 
 
 def learn_scape(template: Mesh, poses: np.ndarray, shapes: np.ndarray | None, skeleton: Skeleton,
@@ -80,24 +82,59 @@ def learn_scape(template: Mesh, poses: np.ndarray, shapes: np.ndarray | None, sk
     config = config or LearnConfig()
     check_template(template)
     check_skeleton(template, skeleton)
+    carriage = Carriage(template, skeleton, rigid_weights(skeleton))
+    return ScapeModel(template, skeleton, *_learn(carriage, poses, shapes, config, progress))
+
+
+def learn_blendscape(template: Mesh, poses: np.ndarray, shapes: np.ndarray | None, skeleton: Skeleton,
+                     config: BlendConfig | None = None, progress: Progress | None = None) -> BlendScapeModel:
+    """Learn a body model whose rotations blend across the borders of parts.
+
+    All is as in `learn_scape`, with `R` a mixture of rotations for triangles near a border. A mixture is no rotation;
+    what it shrinks, Q learns to undo.
+
+    Parameters
+    ----------
+    template, poses, shapes, skeleton, progress
+        As for `learn_scape`.
+    config : BlendConfig, optional
+
+    Raises
+    ------
+    ValueError
+        As `learn_scape`, and a width that is not positive.
+
+    [BlendSCAPE]
+    """
+    config = config or BlendConfig()
+    check_template(template)
+    check_skeleton(template, skeleton)
+    blend = face_weights(template, skeleton, config.width * float(np.linalg.norm(np.ptp(template.vertices, axis=0))))
+    carriage = Carriage(template, skeleton, blend)
+    return BlendScapeModel(template, skeleton, *_learn(carriage, poses, shapes, config, progress), blend=blend)
+
+
+def _learn(carriage: Carriage, poses: np.ndarray, shapes: np.ndarray | None, config: LearnConfig,
+           progress: Progress | None) -> tuple[PoseSpace, ShapeSpace, np.ndarray, np.ndarray, dict[str, Any]]:
+    """Pose space, shape space, mean and covariance of the poses, and how they came about."""
+    template = carriage.template
     poses = checked_bodies(template, poses, "poses")
     shapes = None if shapes is None else checked_bodies(template, shapes, "shapes")
     tick = Ticks(progress, (config.refinements + 1) * len(poses) + (0 if shapes is None else len(shapes)))
-
-    carriage = Carriage(template, skeleton, rigid_weights(skeleton))
-    trained = _learn_pose(carriage, poses, config, tick)
-    space = trained.regression.space
-
+    with timed("pose space"):
+        learned = learn_pose(carriage, poses, config, tick)
     shape_space = ShapeSpace.empty(len(template.faces))
     if shapes is not None:
-        S = shape_deformations(template, space, shapes, config, tick)
-        shape_space = learn_shape_space(S, config.components)
-    mean, covariance = pose_prior(trained.poses)
+        with timed("shape of every person"):
+            S = shape_deformations(carriage, learned.space, shapes, config.smoothness, tick)
+        with timed("shape components"):
+            shape_space = learn_shape_space(S, config.components)
+    design = learned.design
     info: dict[str, Any] = {
         "settings": asdict(config), "poses": len(poses), "shapes": 0 if shapes is None else len(shapes),
-        "ridge": trained.regression.ridge,
-        "features": space.features.count, "digest": digest(template, poses, shapes)}
-    return ScapeModel(template, skeleton, space, shape_space, mean, covariance, info)
+        "pruning": design.pruning, "ridge": design.ridge, "features": learned.space.features.count,
+        "left_out_error": design.left_out_error, "digest": digest(template, poses, shapes)}
+    return learned.space, shape_space, *pose_prior(learned.poses), info
 
 
 def pose_prior(poses: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -107,123 +144,29 @@ def pose_prior(poses: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     return flat.mean(axis=0).reshape(-1, 3), np.cov(flat.T, ddof=1)
 
 
-@dataclass(frozen=True, eq=False)
-class Carriage:
-    """How rotations carry the triangles of a template, with all that does not change while a model is learned.
-
-    Parameters
-    ----------
-    template : Mesh
-    skeleton : Skeleton
-    weights : (F, J) float
-        How much each rotation carries of each triangle.
-    """
-
-    template: Mesh
-    skeleton: Skeleton
-    weights: np.ndarray
-
-    @cached_property
-    def carriers(self) -> list[Carrier]:
-        return make_carriers(self.skeleton, self.weights)
-
-    @cached_property
-    def system(self) -> StitchingSystem:
-        return StitchingSystem(self.template, self.skeleton)
-
-    @cached_property
-    def v_hat(self) -> np.ndarray:
-        return edges(self.template.vertices, self.template.faces)
-
-    def local_edges(self, bodies: np.ndarray, poses: np.ndarray) -> np.ndarray:
-        """Edges (M, F, 2, 3) of bodies (M, N, 3), or of differences, as they were before rotations carried them.
-
-        [SCAPE] Eq. 1
-        """
-        out = np.empty((len(bodies), *self.v_hat.shape))
-        for i, (y, R) in enumerate(zip(bodies, self.skeleton.part_rotations(poses), strict=True)):
-            turned = np.tensordot(self.weights, R, axes=1)
-            out[i] = local_edges(y, self.template.faces, np.swapaxes(np.linalg.inv(turned), -1, -2))
-        return out
-
-    def subject(self, space: PoseSpace, S: np.ndarray | None = None) -> Subject:
-        """A body with a pose space in the making, the template's own unless S (F, 3, 3) is given."""
-        S = np.broadcast_to(np.eye(3), (len(self.template.faces), 3, 3)) if S is None else S
-        basis = build_basis(self.system, self.template, space, S, self.carriers)
-        return Subject(self.template, self.skeleton, None, carried_terms(space.features, self.carriers), basis,
-                       self.skeleton.joints[0])
+@contextlib.contextmanager
+def timed(step: str) -> Iterator[None]:
+    """Tell the log how many seconds a step took."""
+    begun = time.perf_counter()
+    yield
+    LOG.info("%s: %.2f s", step, time.perf_counter() - begun)
 
 
-@dataclass(frozen=True, eq=False)
-class _Trained:
-    regression: Regression
-    poses: np.ndarray
-
-
-def _learn_pose(carriage: Carriage, bodies: np.ndarray, config: LearnConfig, tick: Ticks) -> _Trained:
-    """The pose space, first as in the paper, then refined on the stitched surface.
-
-    Stitching sees only what neighbouring triangles agree on, and Eq. 4 does not know it. So, with the part
-    rotations fitted anew to the learned model, what the stitched model leaves of every body (as deformation of
-    the triangles) is added to what the model says now, and regressed again: majorise and minimise, which
-    lowers the error of the stitched edges step by step.
-
-    [SCAPE] Eq. 4, Eq. 5
-    """
-    template, skeleton = carriage.template, carriage.skeleton
-    gradients = GradientSystem(template, config.smoothness, skeleton.part_of_face)
-    poses = skeleton.pose_of(skeleton.fit_rotations(template, bodies))
-    Q = pose_gradients(gradients, carriage.local_edges(bodies, poses))
-    regression = learn_pose_space(template, skeleton, poses, Q, config.pruning, config.ridges)
-    tick(len(bodies))
-    for _ in range(config.refinements):
-        poses = fit_poses(carriage.subject(regression.space), bodies, poses, tick)
-        for _ in range(config.steps):
-            left = bodies - carriage.subject(regression.space).vertices(poses)
-            Q = regression.space.gradients(poses)
-            Q += pose_gradients(gradients, carriage.v_hat + carriage.local_edges(left, poses)) - np.eye(3)
-            regression = learn_pose_space(template, skeleton, poses, Q, config.pruning, (regression.ridge,))
-    return _Trained(regression, poses)
-
-
-def fit_poses(subject: Subject, bodies: np.ndarray, poses: np.ndarray, tick: Ticks) -> np.ndarray:
-    """Poses (M, J, 3), radians, with which the subject comes nearest to the bodies, from poses nearby."""
-    fitter = PoseFitter(subject, FitConfig(polish=0))
-    fitted = []
-    for body, pose in zip(bodies, poses, strict=True):
-        fitted.append(fitter.fit(body, pose).pose)
-        tick(1)
-    return np.stack(fitted)
-
-
-def shape_deformations(template: Mesh, space: PoseSpace, shapes: np.ndarray, config: LearnConfig,
-                        tick: Ticks) -> np.ndarray:
+def shape_deformations(carriage: Carriage, space: PoseSpace, shapes: np.ndarray, smoothness: float, tick: Ticks
+                       ) -> np.ndarray:
     """S (P, F, 3, 3) of every person, in float32 to halve the memory.
 
     [SCAPE] Eq. 8
     """
-    skeleton = space.skeleton
-    system = GradientSystem(template, config.smoothness)
-    v_hat = edges(template.vertices, template.faces)
+    template, skeleton = carriage.template, carriage.skeleton
+    system = GradientSystem(template, smoothness)
     S = np.empty((len(shapes), len(template.faces), 3, 3), dtype=np.float32)
     for i, y in enumerate(shapes):
-        R = skeleton.fit_rotations(template, y)
-        posed = v_hat @ np.swapaxes(space.gradients(skeleton.pose_of(R)), -1, -2)
-        S[i] = shape_gradients(system, posed, local_edges(y, template.faces, R[skeleton.part_of_face]))
+        pose = skeleton.pose_of(skeleton.fit_rotations(template, y))
+        posed = carriage.v_hat @ np.swapaxes(space.gradients(pose), -1, -2)
+        S[i] = shape_gradients(system, posed, carriage.local_edges(y[None], pose[None])[0])
         tick(1)
     return S
-
-
-class Ticks:
-    """Counts work for a progress callback."""
-
-    def __init__(self, progress: Progress | None, total: int) -> None:
-        self.progress, self.total, self.done = progress, total, 0
-
-    def __call__(self, more: int) -> None:
-        self.done += more
-        if self.progress:
-            self.progress(self.done, self.total)
 
 
 def check_skeleton(template: Mesh, skeleton: Skeleton) -> None:

@@ -1,71 +1,104 @@
-"""SCAPE-5fold: error on held-out poses of the real man, beside the time it takes.
+"""SCAPE-5fold: error on held-out poses of the real man, for every kind of model and regressor, beside the time.
 
     SCAPEKIT_DATA=... python tests/benchmarks/scape_5fold.py -o scape_5fold.json
 
-Skeleton and model of every fold come from its training poses alone. Rigid parts with the same skeleton
-(Q = I) are the baseline.
+Skeleton and model of every fold come from its training poses alone; all kinds share the fold's skeleton. Done
+folds and kinds are kept in the output and not run again, so that the script can be stopped and started.
 """
 from __future__ import annotations
 
 import argparse
-import dataclasses
+import json
 import time
+from collections.abc import Callable
+from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 from protocols import load_real, machine, scape_fold, write_report
 
+from model import BodyModel, LearnConfig, SkinConfig, learn_blendscape, learn_scape, learn_skinning
 from model.fitting import PoseFitter
-from model.learning import LearnConfig, learn_scape
 from model.pose_space import PoseSpace
-from model.scape import ScapeModel
+from scanprep.geometry.mesh import Mesh
 from scanprep.skeleton.find import find_skeleton
+from scanprep.skeleton.tree import Skeleton
+
+Learn = Callable[[Mesh, np.ndarray, Skeleton], BodyModel]
 
 
-def held_out_errors(model: ScapeModel, bodies: np.ndarray) -> np.ndarray:
-    """Mean vertex distance in millimetres of every body, after fitting pose and place."""
+def scape(**settings: object) -> Learn:
+    """Learning with some settings that differ from the defaults."""
+    config = replace(LearnConfig(), **settings)
+    return lambda template, poses, skeleton: learn_scape(template, poses, None, skeleton, config)
+
+
+def rigid(template: Mesh, poses: np.ndarray, skeleton: Skeleton) -> BodyModel:
+    """Parts that only turn, Q = I."""
+    model = learn_scape(template, poses, None, skeleton, replace(LearnConfig(), features="linear", refinements=0))
+    return replace(model, pose_space=PoseSpace.identity(skeleton))
+
+
+def skinning(correctives: str) -> Learn:
+    """Linear blend skinning, with or without pose-corrective shapes."""
+    config = SkinConfig(correctives=correctives)
+    return lambda template, poses, skeleton: learn_skinning(template, poses, None, skeleton, config)
+
+
+KINDS: dict[str, Learn] = {
+    "rigid parts": rigid,
+    "LBS": skinning("none"),
+    "LBS + linear correctives": skinning("linear"),
+    "LBS + quadratic correctives": skinning("quadratic"),
+    "SCAPE, linear": scape(features="linear"),
+    "SCAPE, quadratic": scape(features="quadratic"),
+    "SCAPE, radial": scape(features="radial"),
+    "SCAPE, support vectors": scape(features="radial", regressor="svr"),
+    "BlendSCAPE": lambda template, poses, skeleton: learn_blendscape(template, poses, None, skeleton),
+}
+
+
+def run(learn: Learn, template: Mesh, training: np.ndarray, held: np.ndarray, skeleton: Skeleton) -> dict:
+    """Error of every held-out body in millimetres after fitting pose and place, and what it took."""
+    start = time.perf_counter()
+    model = learn(template, training, skeleton)
+    learned = time.perf_counter()
     fitter = PoseFitter(model.subject())
-    return np.array([1e3 * fitter.fit(body).mean for body in bodies])
-
-
-def run_fold(fold: int, config: LearnConfig) -> dict:
-    """Everything about one fold."""
-    data = load_real()
-    train, held = scape_fold(fold, len(data.poses))
-    clock = [time.perf_counter()]
-    skeleton = find_skeleton(data.template, data.poses[train])
-    clock.append(time.perf_counter())
-    model = learn_scape(data.template, data.poses[train], None, skeleton, config)
-    clock.append(time.perf_counter())
-    errors = held_out_errors(model, data.poses[held])
-    clock.append(time.perf_counter())
-    rigid = held_out_errors(dataclasses.replace(model, pose_space=PoseSpace.identity(skeleton)), data.poses[held])
-    seconds = np.diff(clock)
-    return {"fold": fold, "parts": len(skeleton.parents), "ridge": model.info["ridge"],
-            "features": model.info["features"], "held": held.tolist(), "error_mm": errors.round(2).tolist(),
-            "rigid_mm": rigid.round(2).tolist(), "skeleton_s": seconds[0], "learn_s": seconds[1],
-            "fit_s_per_pose": seconds[2] / len(held)}
+    errors = [1e3 * fitter.fit(body).mean for body in held]
+    return {"error_mm": np.round(errors, 2).tolist(), "features": model.terms.features.count,
+            "terms": model.terms.count, "learn_s": learned - start,
+            "fit_s_per_pose": (time.perf_counter() - learned) / len(held),
+            "chosen": {k: v for k, v in model.info.items() if isinstance(v, float | int | str) and k != "digest"}}
 
 
 def main() -> None:
     """Run the folds and print the table."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("-o", "--output", default="scape_5fold.json")
+    parser.add_argument("-o", "--output", type=Path, default=Path("scape_5fold.json"))
     parser.add_argument("--folds", type=int, nargs="*", default=range(5))
+    parser.add_argument("--kinds", nargs="*", default=list(KINDS), choices=list(KINDS))
     args = parser.parse_args()
-    config = LearnConfig()
-    folds = []
+    data = load_real()
+    report = json.loads(args.output.read_text()) if args.output.exists() else {"folds": {}}
     for fold in args.folds:
-        folds.append(run_fold(fold, config))
-        f = folds[-1]
-        print(f"fold {fold}: {f['parts']} parts, SCAPE {np.mean(f['error_mm']):.2f} mm "
-              f"(worst {max(f['error_mm']):.1f}), rigid {np.mean(f['rigid_mm']):.2f} mm, "
-              f"learned in {f['learn_s']:.0f} s, {f['fit_s_per_pose']:.2f} s a fit", flush=True)
-    error, rigid = (np.concatenate([f[key] for f in folds]) for key in ("error_mm", "rigid_mm"))
-    print(f"held-out vertex error, mean over {len(error)} poses: SCAPE {error.mean():.2f} mm, "
-          f"worst pose {error.max():.1f} mm; rigid parts {rigid.mean():.2f} mm")
-    write_report(args.output, {
-        "protocol": "SCAPE-5fold", "config": dataclasses.asdict(config), "machine": machine(), "folds": folds,
-        "mean_mm": error.mean(), "worst_mm": error.max(), "rigid_mean_mm": rigid.mean()})
+        train, held = scape_fold(fold, len(data.poses))
+        kept = args.output.with_suffix(f".skeleton{fold}.json")
+        done = report["folds"].setdefault(str(fold), {"held": held.tolist(), "kinds": {}})
+        if not kept.exists():
+            start = time.perf_counter()
+            find_skeleton(data.template, data.poses[train]).save(kept)
+            done["skeleton_s"] = time.perf_counter() - start
+        skeleton = Skeleton.load(kept)
+        done["parts"] = len(skeleton.parents)
+        for kind in args.kinds:
+            if kind not in done["kinds"]:
+                done["kinds"][kind] = run(KINDS[kind], data.template, data.poses[train], data.poses[held], skeleton)
+                report.update(protocol="SCAPE-5fold", machine=machine())
+                write_report(args.output, report)
+            result = done["kinds"][kind]
+            print(f"fold {fold}, {len(skeleton.parents)} parts, {kind}: {np.mean(result['error_mm']):.2f} mm "
+                  f"(worst {max(result['error_mm']):.1f}), {result['terms']} terms, learned in "
+                  f"{result['learn_s']:.0f} s, {result['fit_s_per_pose']:.2f} s a fit", flush=True)
 
 
 if __name__ == "__main__":
