@@ -5,6 +5,8 @@ from model_bodies import random_poses, worm, worm_model, worm_skeleton
 
 from model.export.correctives import motion_correctives, rest_corrections
 from model.export.rig import Rig, joint_places, make_rig, skin_weights, strongest, turn_up, typical_poses
+from model.features import linear_features
+from model.skinning import SkinningModel
 from scanprep.geometry import rotations
 from scanprep.geometry.mesh import Mesh
 from scanprep.skeleton.tree import Skeleton
@@ -119,6 +121,24 @@ def test_a_turned_rig_moves_as_the_turned_body(model, rig, up):
     rng = np.random.default_rng(1)
     pose, trans = random_poses(model, 1, rng)[0], rng.normal(size=3)
     assert np.abs(rig.turned(up).vertices(pose @ U.T, U @ trans) - rig.vertices(pose, trans) @ U.T).max() < 1e-12
+
+
+def test_a_skinning_model_keeps_its_weights(model):
+    """Skinned with its own weights it is its rig, but for the rule that places a model by its root part."""
+    template, skeleton, K = model.template, model.skeleton, 2
+    rng = np.random.default_rng(6)
+    weights = strongest(rng.uniform(0, 1, (len(template.vertices), 4)), 3)
+    features = linear_features(skeleton, (np.zeros((3, 0)),) * 4)
+    shapes = rng.normal(0, 0.02, (K, 1, 3)) * template.vertices[None] ** 2
+    shapes -= (skeleton.joint_regressor(template)[[0]] @ shapes.transpose(1, 0, 2).reshape(-1, 3 * K)).reshape(K, 1, 3)
+    x = template.vertices
+    skinned = SkinningModel(template, skeleton, x, weights, features, np.zeros((0, *x.shape)), x, shapes, np.ones(K),
+                            2.0, np.zeros((4, 3)), np.eye(12))
+    rig = make_rig(skinned, np.array([1.0, -2.0]), 2)
+    assert np.abs(rig.weights - weights).max() < 1e-12
+    poses = random_poses(model, 3, rng)
+    off = rig.vertices(poses) - skinned.vertices(poses, np.array([1.0, -2.0]))
+    assert np.abs(off - off.mean(axis=1, keepdims=True)).max() < 1e-9 < 1e-4 < np.abs(off).max()
 
 
 def test_bad_rigs_are_refused(model, rig):

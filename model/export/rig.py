@@ -14,6 +14,7 @@ from scanprep.pictures.gltf import UPRIGHT
 from scanprep.skeleton.tree import Skeleton
 
 from ..body import BodyModel
+from ..skinning import SkinningModel
 
 CARRIERS = 4                         # joints that carry one vertex: more is not what other programs read
 WIDTH = 0.05                         # of 0.005 to 0.08 the nearest to a SCAPE model of real scans, within a percent
@@ -98,7 +99,7 @@ def make_rig(model: BodyModel, betas: np.ndarray | None = None, shapes: int = 0,
     shapes : int
         So many of the first betas become shapes; more than the model has are not asked for.
     weights : (N, J) float, optional
-        Else `skin_weights`. Of every vertex the largest `CARRIERS` are kept.
+        Else those of a skinning model, or `skin_weights`. Of every vertex the largest `CARRIERS` are kept.
 
     Raises
     ------
@@ -111,7 +112,7 @@ def make_rig(model: BodyModel, betas: np.ndarray | None = None, shapes: int = 0,
     mesh = model.template.with_vertices(model.vertices(rest, betas))
     joints = model.skeleton.joint_regressor(model.template) @ mesh.vertices
     if weights is None:
-        weights = skin_weights(model.template, model.skeleton)
+        weights = model.weights if isinstance(model, SkinningModel) else skin_weights(model.template, model.skeleton)
     changes = np.zeros((0, *mesh.vertices.shape))
     if shapes:
         changes = np.moveaxis(model.shape_jacobian(rest)[..., :shapes], -1, 0)
