@@ -168,7 +168,7 @@ def shape_errors(model: BodyModel, people: np.ndarray, counts: Sequence[int] = (
     people : (S, N, 3) float, metres
         Registered, best people that the model was not trained on.
     counts : ints
-        Numbers of components; those that the model does not have are left out.
+        Numbers of components; more than the model has means all of them.
     train : (P, N, 3) float, metres, optional
         The training people, for plain principal components of vertices as a yardstick.
     config : FitConfig, optional
@@ -178,7 +178,7 @@ def shape_errors(model: BodyModel, people: np.ndarray, counts: Sequence[int] = (
     Raises
     ------
     ValueError
-        People of another count of vertices or not finite, no count that the model has.
+        People of another count of vertices or not finite, a count below 1, a model without shape components.
     """
     people, wanted = checked_bodies(model, people, "people"), checked_counts(model, counts)
     largest = ShapeFitter(model, replace(config or FitConfig(), n_betas=wanted[-1]))
@@ -268,12 +268,12 @@ def compactness(model: BodyModel) -> np.ndarray:
 
 
 def checked_counts(model: BodyModel, counts: Sequence[int]) -> list[int]:
-    """Those numbers of components that the model has, rising, or ValueError."""
-    wanted = sorted({int(c) for c in counts if 0 < c <= model.n_betas})
-    if not wanted:
-        raise ValueError(f"counts: expected some of 1..{model.n_betas}, the components of the model, "
-                         f"got {', '.join(map(str, counts)) or 'none'}")
-    return wanted
+    """Numbers of components, rising, those beyond what the model has cut down to it, or ValueError."""
+    if not len(counts) or min(counts) < 1:
+        raise ValueError(f"counts: expected numbers from 1 on, got {', '.join(map(str, counts)) or 'none'}")
+    if not model.n_betas:
+        raise ValueError("model: expected one with shape components, this one has none")
+    return sorted({min(int(count), model.n_betas) for count in counts})
 
 
 def checked_bodies(model: BodyModel, bodies: np.ndarray, name: str) -> np.ndarray:

@@ -191,9 +191,10 @@ def _turn(model: BodyModel, pose: np.ndarray) -> float:
 
 
 def _round_up(length: float) -> float:
-    """The next of 1, 1.5, 2, 3, 4, 5, 6, 8 × a power of ten, metres."""
+    """The next length whose quarters are round numbers, metres."""
     power = 10.0 ** np.floor(np.log10(max(length, 1e-9)))
-    return float(power * min(step for step in (1, 1.5, 2, 3, 4, 5, 6, 8, 10) if step * power >= length * (1 - 1e-9)))
+    steps = (1, 1.2, 1.6, 2, 2.4, 3.2, 4, 6, 8, 10)
+    return float(power * min(step for step in steps if step * power >= length * (1 - 1e-9)))
 
 
 def chart_bodies(errors: Errors, names: Sequence[str]) -> Any:

@@ -108,7 +108,7 @@ def specificity(model: BodyModel, people: np.ndarray, count: int = 100, rng: np.
     rng : numpy Generator, optional
         The one of seed 0 when not given.
     counts : ints
-        Numbers of components; those that the model does not have are left out.
+        Numbers of components; more than the model has means all of them.
     config : FitConfig, optional
     progress : callable, optional
         Called with the people fitted and their number.
@@ -116,7 +116,7 @@ def specificity(model: BodyModel, people: np.ndarray, count: int = 100, rng: np.
     Raises
     ------
     ValueError
-        Fewer than two people, no count that the model has.
+        Fewer than two people, a count below 1, a model without shape components.
     """
     rng = rng or np.random.default_rng(0)
     people, wanted = checked_bodies(model, people, "people"), checked_counts(model, counts)

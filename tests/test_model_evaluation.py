@@ -1,0 +1,280 @@
+import csv
+import json
+
+import numpy as np
+import pytest
+from model_bodies import random_poses, worm_model
+
+from model.cli import mesh as mesh_command
+from model.evaluation.cli import evaluate, sample
+from model.evaluation.digests import body_digest, set_digest, trained_on
+from model.evaluation.errors import (
+    compactness,
+    fit_with_held_pose,
+    pose_errors,
+    shape_errors,
+    vertex_components,
+)
+from model.evaluation.page import picture_error_map
+from model.evaluation.sampling import sample_bodies, specificity, unposed
+from model.fitting import FitConfig, ShapeFitter
+from model.learning import LearnConfig, learn_scape
+from model.scape import ScapeModel
+from model.shape_space import ShapeSpace
+from scanprep.dataset import RegisteredSet
+from scanprep.geometry.files import read_mesh, write_mesh
+
+
+@pytest.fixture(scope="module")
+def model():
+    return worm_model()
+
+
+@pytest.fixture(scope="module")
+def people(model):
+    """Twelve people of the model in gentle poses, somewhere."""
+    rng = np.random.default_rng(5)
+    return model.vertices(random_poses(model, 12, rng, 0.1), rng.normal(size=(12, 3)), rng.normal(size=(12, 3)))
+
+
+def test_no_error_on_poses_that_the_model_can_make(model):
+    rng = np.random.default_rng(0)
+    poses, trans = random_poses(model, 5, rng, 0.4), rng.normal(size=(5, 3))
+    found = pose_errors(model, model.vertices(poses, None, trans))
+    assert found.converged.all() and found.betas is None
+    assert found.errors.worst.max() < 1e-5 and found.errors.by_vertex.max() < 1e-5
+    np.testing.assert_allclose(found.trans, trans, atol=1e-5)
+    np.testing.assert_allclose(found.vertices(model, 3), model.vertices(poses[3], None, trans[3]), atol=1e-5)
+
+
+def test_the_subject_is_whom_the_bodies_are_of(model):
+    betas, done = np.array([1.0, -1.0, 0.5]), []
+    bodies = model.vertices(random_poses(model, 2, np.random.default_rng(1)), betas)
+    own = pose_errors(model, bodies, progress=lambda i, n: done.append((i, n)))
+    theirs = pose_errors(model, bodies, model.subject(betas))
+    assert theirs.errors.overall < 1e-5 < 1e-2 < own.errors.overall
+    assert done == [(1, 2), (2, 2)]
+    np.testing.assert_array_equal(theirs.betas, betas)
+
+
+def test_summaries_agree_with_the_fitted_bodies(model):
+    rng = np.random.default_rng(2)
+    bodies = model.vertices(random_poses(model, 3, rng)) + rng.normal(0, 0.01, (3, 398, 3))
+    found = pose_errors(model, bodies)
+    far = np.stack([np.linalg.norm(found.vertices(model, i) - bodies[i], axis=1) for i in range(3)])
+    part = model.skeleton.part_of_vertex(model.template)
+    np.testing.assert_allclose(found.errors.mean, far.mean(axis=1), atol=1e-9)
+    np.testing.assert_allclose(found.errors.p95, np.percentile(far, 95, axis=1), atol=1e-9)
+    np.testing.assert_allclose(found.errors.worst, far.max(axis=1), atol=1e-9)
+    np.testing.assert_allclose(found.errors.by_vertex, far.mean(axis=0), atol=1e-9)
+    np.testing.assert_allclose(found.errors.by_part, [[row[part == p].mean() for p in range(4)] for row in far],
+                               atol=1e-9)
+    assert found.errors.overall == pytest.approx(far.mean(), abs=1e-9)
+    assert 0.012 < found.errors.overall < 0.017                # noise of 10 mm an axis: its mean length is 16 mm
+
+
+def test_more_components_leave_less_and_all_leave_nothing(model, people):
+    found = shape_errors(model, people, counts=(3, 1, 2, 99))
+    np.testing.assert_array_equal(found.counts, [1, 2, 3])
+    left = [e.overall for e in found.errors]
+    assert left[0] > left[1] > left[2] and left[2] < 1e-5
+    assert found.converged.all() and found.vertex_pca is None
+    assert (found.betas[0, :, 1:] == 0).all() and (found.betas[1, :, 2:] == 0).all()
+    np.testing.assert_allclose(found.vertices(model, 2, 4), people[4], atol=1e-4)
+    held = [e.overall for e in found.pose_held]
+    assert all(free <= fixed for free, fixed in zip(left, held, strict=True))
+
+
+def test_with_the_right_pose_betas_are_exact(model):
+    # the parts' own rotations are the true ones where the body is the template itself
+    stiff = ScapeModel(model.template, model.skeleton, model.pose_space, ShapeSpace(
+        np.broadcast_to(np.eye(3), (len(model.template.faces), 3, 3)), model.shape_space.components,
+        model.shape_space.variances, model.shape_space.total_variance), model.pose_mean, model.pose_covariance)
+    for made in fit_with_held_pose(stiff, model.template.vertices + [1.0, 2, 3], (1, 3)):
+        np.testing.assert_allclose(made, model.template.vertices + [1.0, 2, 3], atol=1e-9)
+
+
+def test_vertex_pca_is_that_of_the_singular_value_decomposition(model, people):
+    train, held = people[:8], people[8:]
+    found = shape_errors(model, held, (1, 3), train)
+    flat = (train - train.mean(axis=1, keepdims=True)).reshape(8, -1)
+    mean = flat.mean(axis=0)
+    rows = np.linalg.svd(flat - mean, full_matrices=False)[2]
+    centred = (held - held.mean(axis=1, keepdims=True)).reshape(4, -1) - mean
+    for count, errors in zip((1, 3), found.vertex_pca, strict=True):
+        left = centred - centred @ rows[:count].T @ rows[:count]
+        far = np.linalg.norm(left.reshape(4, -1, 3), axis=2)
+        np.testing.assert_allclose(errors.mean, far.mean(axis=1), atol=1e-9)
+        np.testing.assert_allclose(errors.by_vertex, far.mean(axis=0), atol=1e-9)
+
+
+def test_vertex_pca_has_no_more_components_than_the_bodies_span(people):
+    mean, components = vertex_components(people[:4], 40)
+    assert components.shape == (3, mean.size)
+    np.testing.assert_allclose(components @ components.T, np.eye(3), atol=1e-10)
+
+
+def test_fitters_of_fewer_components_agree_with_their_own(model, people):
+    shared = ShapeFitter(model).first(2).fit(people[0])
+    own = ShapeFitter(model, FitConfig(n_betas=2)).fit(people[0])
+    np.testing.assert_allclose(shared.vertices, own.vertices, atol=1e-12)
+    warm = ShapeFitter(model).fit(people[0], shared)
+    np.testing.assert_allclose(warm.vertices, people[0], atol=1e-5)
+    with pytest.raises(ValueError, match="n_betas"):
+        ShapeFitter(model).first(4)
+
+
+def test_compactness_rises_to_one(model):
+    share = compactness(model)
+    assert share.shape == (3,) and (np.diff(share) >= 0).all() and share[-1] == pytest.approx(1)
+
+
+def test_people_come_to_rest_with_what_the_model_leaves_of_them(model):
+    rng = np.random.default_rng(3)
+    betas, rest = rng.normal(size=(3, 3)), np.zeros((3, 4, 3))
+    at_rest = model.vertices(rest, betas)
+    np.testing.assert_allclose(unposed(model, at_rest + [1.0, 0, 0]), at_rest, atol=1e-5)
+    noisy = at_rest + rng.normal(0, 1e-4, at_rest.shape)      # what is left comes along, so nothing is lost
+    np.testing.assert_allclose(unposed(model, noisy), noisy, atol=2e-4)
+    turned = model.vertices(random_poses(model, 3, rng, 0.3), betas)
+    np.testing.assert_allclose(unposed(model, turned), at_rest, atol=1e-4)
+
+
+def test_specificity_is_zero_where_the_random_bodies_are_the_people(model):
+    betas = np.random.default_rng(7).normal(size=(6, 3))
+    poses = random_poses(model, 6, np.random.default_rng(8), 0.1)
+    found = specificity(model, model.vertices(poses, betas), 6, np.random.default_rng(7), (3,))
+    assert found.distances.max() < 1e-4
+    np.testing.assert_array_equal(found.nearest, [range(6)])
+    assert found.between_people > 0.01
+
+
+def test_specificity_against_all_distances(model, people):
+    found = specificity(model, people, 5, np.random.default_rng(0), (1, 3))
+    real = unposed(model, people)
+    betas = np.random.default_rng(0).normal(size=(5, 3))
+    for c, k in enumerate((1, 3)):
+        bodies = model.vertices(np.zeros((5, 4, 3)), betas[:, :k])
+        centred = [b - b.mean(axis=1, keepdims=True) for b in (bodies, real)]
+        far = np.linalg.norm(centred[0][:, None] - centred[1], axis=3).mean(axis=2)
+        np.testing.assert_allclose(found.distances[c], far.min(axis=1), atol=1e-6)
+        np.testing.assert_array_equal(found.nearest[c], far.argmin(axis=1))
+
+
+def test_random_bodies_are_the_models_and_follow_the_seed(model):
+    a, b = (sample_bodies(model, 4, np.random.default_rng(1), pose_too=True) for _ in range(2))
+    np.testing.assert_array_equal(a.vertices, b.vertices)
+    np.testing.assert_array_equal(a.vertices[2], model.vertices(a.poses[2], a.betas[2]))
+    still = sample_bodies(model, 4, np.random.default_rng(1), n_betas=2)
+    assert still.betas.shape == (4, 2) and not still.poses.any()
+
+
+def test_random_poses_have_the_moments_of_the_training_poses(model):
+    rng = np.random.default_rng(9)
+    root = rng.normal(size=(9, 12))
+    covariance = np.zeros((12, 12))
+    covariance[3:, 3:] = root[:, :9] @ root[:, :9].T / 90
+    mean = np.zeros((4, 3))
+    mean[1:] = 0.2
+    posed = ScapeModel(model.template, model.skeleton, model.pose_space, model.shape_space, mean, covariance)
+    poses = sample_bodies(posed, 400, np.random.default_rng(0), pose_too=True).poses
+    assert not poses[:, 0].any()                              # the root does not turn
+    assert np.abs(poses.mean(axis=0) - mean).max() < 0.06
+    assert np.abs(np.cov(poses.reshape(400, -1).T) - covariance).max() < 0.3 * covariance.max()
+
+
+def test_a_model_knows_the_bodies_that_trained_it(model, people):
+    poses = model.vertices(random_poses(model, 6, np.random.default_rng(4)))
+    learned = learn_scape(model.template, poses, people, model.skeleton, LearnConfig(refinements=0, components=3))
+    assert learned.info["digest"] == set_digest(model.template, poses, people)
+    told = ScapeModel(model.template, model.skeleton, model.pose_space, model.shape_space, model.pose_mean,
+                      model.pose_covariance, {"digests": [body_digest(p) for p in people[:3]]})
+    np.testing.assert_array_equal(trained_on(told, people[2:5].astype(np.float32)), [True, False, False])
+    assert trained_on(model, people) is None
+
+
+@pytest.mark.parametrize("what, word", [
+    (lambda m, p: pose_errors(m, p[:, :5]), "bodies: expected shape"),
+    (lambda m, p: pose_errors(m, np.full_like(p, np.nan)), "finite"),
+    (lambda m, p: shape_errors(m, p, (0, 2)), "counts"),
+    (lambda m, p: shape_errors(m, p, ()), "counts"),
+    (lambda m, p: shape_errors(m, p, (1,), p[:, :5]), "train"),
+    (lambda m, p: specificity(m, p[:1]), "at least 2"),
+    (lambda m, p: specificity(m, p, 0, counts=(1,)), "count"),
+    (lambda m, p: sample_bodies(m, 0, np.random.default_rng(0)), "count"),
+    (lambda m, p: sample_bodies(m, 1, np.random.default_rng(0), n_betas=4), "n_betas"),
+    (lambda m, p: sample_bodies(m, 1, np.random.default_rng(0), n_betas=0), "n_betas")])
+def test_refuses(model, people, what, word):
+    with pytest.raises(ValueError, match=word):
+        what(model, people)
+
+
+@pytest.fixture(scope="module")
+def files(model, people, tmp_path_factory):
+    """A model file, a folder of poses, a set of people."""
+    folder = tmp_path_factory.mktemp("evaluation")
+    ScapeModel(model.template, model.skeleton, model.pose_space, model.shape_space, model.pose_mean,
+               0.02 * np.diag(np.arange(12) > 2)).save(folder / "worm.npz")
+    for i, vertices in enumerate(model.vertices(random_poses(model, 3, np.random.default_rng(6), 0.3))):
+        write_mesh(folder / "poses" / f"bent{i}.ply", model.template.with_vertices(vertices))
+    held = RegisteredSet.create(folder / "held", model.template)
+    for i, person in enumerate(people[:3]):
+        held = held.add(f"p{i}", person, subject=f"s{i}")
+    held.add("again", people[3], subject="s1")
+    for i, person in enumerate(people[4:7]):
+        write_mesh(folder / "train" / f"t{i}.ply", model.template.with_vertices(person))
+    return folder
+
+
+def test_evaluate_command(files):
+    out = files / "out"
+    done = evaluate(files / "worm.npz", out, files / "poses", files / "held", (1, 3), files / "train")
+    figures = {m.name: m.value for m in done.metrics}
+    assert figures["pose: bodies"] == 3 and figures["pose: mean"] < 0.01
+    assert figures["people, all of these components: mean"] < 0.01 < figures["people, 1 components: mean"]
+    assert figures["people, 1 components: mean of vertex PCA"] > 0 and figures["specificity, 3 components"] > 0
+    assert "nobody checked" in figures["note"] and done.output == out
+    page = (out / "report.html").read_text()
+    assert page.count("<img") >= 9 and "src=\"http" not in page and "not held-out" not in page
+    people = list(csv.DictReader((out / "people.csv").open()))
+    assert [(r["components"], r["name"]) for r in people] == [(c, f"p{i}") for c in "13" for i in range(3)]
+    poses = list(csv.DictReader((out / "poses.csv").open()))
+    assert [r["name"] for r in poses] == ["bent0", "bent1", "bent2"] and {r["converged"] for r in poses} == {"yes"}
+    assert np.mean([float(r["mean_mm"]) for r in poses]) == pytest.approx(figures["pose: mean"], abs=1e-3)
+
+
+def test_evaluate_says_when_the_bodies_trained_the_model(model, files):
+    posed = np.stack([read_mesh(p).vertices for p in sorted((files / "poses").glob("*.ply"))])
+    for info in ({"digests": [body_digest(posed[1])]}, {"digest": set_digest(model.template, posed, None)}):
+        ScapeModel(model.template, model.skeleton, model.pose_space, ShapeSpace.empty(len(model.template.faces)),
+                   model.pose_mean, model.pose_covariance, info).save(files / "told.npz")
+        done = evaluate(files / "told.npz", files / "told", files / "poses")
+        assert any("not held-out" in str(m.value) for m in done.metrics if m.name == "note")
+        assert "not held-out" in (files / "told" / "report.html").read_text()
+
+
+@pytest.mark.parametrize("given, word", [({}, "--poses"), ({"poses": "poses", "train_shapes": "train"}, "--shapes"),
+                                         ({"shapes": "other"}, "other.*expected the triangles"),
+                                         ({"poses": "poses", "counts": (3,), "shapes": "nowhere"}, "nowhere")])
+def test_evaluate_refuses(model, files, given, word):
+    write_mesh(files / "other" / "a.ply", model.template.submesh(np.arange(600))[0])
+    given = {k: files / v if isinstance(v, str) else v for k, v in given.items()}
+    with pytest.raises(ValueError, match=word):
+        evaluate(files / "worm.npz", files / "no", **given)
+
+
+def test_sample_command_writes_what_the_mesh_command_reads(files):
+    out = files / "random"
+    done = sample(files / "worm.npz", out, 3, seed=4, pose_too=True)
+    assert {m.name: m.value for m in done.metrics}["bodies"] == 3
+    betas = json.loads((out / "body_2.betas.json").read_text())["betas"]
+    mesh_command(files / "worm.npz", files / "again.ply", out / "body_2.pose.json", tuple(betas))
+    again, written = read_mesh(files / "again.ply"), read_mesh(out / "body_2.ply")
+    np.testing.assert_allclose(again.vertices, written.vertices, atol=1e-9)
+    assert (out / "sheet.png").stat().st_size > 5000
+
+
+def test_error_map_shows_where_the_error_is(model):
+    far = np.where(model.template.vertices[:, 0] > 0.3, 0.02, 0.0)
+    clean, spotted = (picture_error_map(model.template, d, "") for d in (0 * far + 1e-4 * (far > 1), far))
+    assert clean.shape == spotted.shape and (clean != spotted).any(axis=2).mean() > 0.05
