@@ -7,6 +7,8 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from .body import BodyModel, Derivatives
+    from .evaluation.errors import PoseErrors, ShapeErrors, compactness, pose_errors, shape_errors
+    from .evaluation.sampling import Samples, Specificity, sample_bodies, specificity
     from .export.bvh import write_bvh
     from .export.correctives import motion_correctives
     from .export.glb import write_skinned_glb
@@ -22,6 +24,8 @@ if TYPE_CHECKING:
 
 _ROOMS = {
     "body": ("BodyModel", "Derivatives"),
+    "evaluation.errors": ("PoseErrors", "ShapeErrors", "compactness", "pose_errors", "shape_errors"),
+    "evaluation.sampling": ("Samples", "Specificity", "sample_bodies", "specificity"),
     "export.bvh": ("write_bvh",),
     "export.correctives": ("motion_correctives",),
     "export.glb": ("write_skinned_glb",),
@@ -37,10 +41,11 @@ _ROOMS = {
 }
 _ROOM_OF = {name: room for room, names in _ROOMS.items() for name in names}
 
-__all__ = ["BodyModel", "Derivatives", "FitConfig", "LearnConfig", "PointOperator", "PoseFit", "Rig", "ScapeModel",
-           "ShapeFit", "SkinConfig", "SkinningModel", "Subject", "fit_pose", "fit_shape", "learn_scape",
-           "learn_skinning", "load_model", "make_rig", "motion_correctives", "skin_weights", "write_body_npz",
-           "write_bvh", "write_skinned_glb"]
+__all__ = ["BodyModel", "Derivatives", "FitConfig", "LearnConfig", "PointOperator", "PoseErrors", "PoseFit", "Rig",
+           "Samples", "ScapeModel", "ShapeErrors", "ShapeFit", "SkinConfig", "SkinningModel", "Specificity",
+           "Subject", "compactness", "fit_pose", "fit_shape", "learn_scape", "learn_skinning", "load_model",
+           "make_rig", "motion_correctives", "pose_errors", "sample_bodies", "shape_errors", "skin_weights",
+           "specificity", "write_body_npz", "write_bvh", "write_skinned_glb"]
 
 
 def __getattr__(name: str) -> Any:
