@@ -3,8 +3,8 @@ import pytest
 from model_bodies import random_poses, worm_model
 
 from model.features import PoseFeatures, QuadraticLift
+from model.learning.regression import Design, RegressionConfig, choose_design, condense
 from model.pose_space import PoseSpace
-from model.regression import Design, RegressionConfig, choose_design, condense
 
 
 @pytest.fixture(scope="module")

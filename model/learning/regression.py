@@ -10,8 +10,8 @@ import numpy as np
 from scanprep.geometry.mesh import Mesh
 from scanprep.skeleton.tree import Skeleton
 
-from .features import Lift, LinearLift, PoseFeatures, QuadraticLift, RadialLift, twists
-from .pose_space import PoseSpace, faces_of_part, kept_directions, nearest_joints
+from ..features import Lift, LinearLift, PoseFeatures, QuadraticLift, RadialLift, twists
+from ..pose_space import PoseSpace, faces_of_part, kept_directions, nearest_joints
 
 Judge = Callable[[np.ndarray], float]
 NOTHING = 1e-9                       # relative size below which a direction of the features is none

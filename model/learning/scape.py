@@ -14,16 +14,16 @@ import numpy as np
 from scanprep.geometry.mesh import Mesh, check_template
 from scanprep.skeleton.tree import Skeleton
 
-from .blendscape import BlendScapeModel
-from .borders import face_weights
+from ..blendscape import BlendScapeModel
+from ..borders import face_weights
+from ..carriers import rigid_weights
+from ..features import twists
+from ..gradients import GradientSystem, shape_gradients
+from ..pose_space import PoseSpace
+from ..scape import ScapeModel
+from ..shape_space import ShapeSpace, learn_shape_space
 from .carriage import Carriage
-from .carriers import rigid_weights
-from .features import twists
-from .gradients import GradientSystem, shape_gradients
-from .pose_learning import PoseConfig, Ticks, learn_pose
-from .pose_space import PoseSpace
-from .scape import ScapeModel
-from .shape_space import ShapeSpace, learn_shape_space
+from .pose import PoseConfig, Ticks, learn_pose
 
 Progress = Callable[[int, int], None]
 LOG = logging.getLogger(__name__)

@@ -1,0 +1,132 @@
+"""The pose space of one person, learned from that person in many poses."""
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from ..fitting import FitConfig, PoseFitter
+from ..gradients import GradientSystem, pose_gradients
+from ..linear import Subject
+from ..pose_space import PoseSpace
+from .carriage import Carriage
+from .regression import Design, RegressionConfig, choose_design, condense
+
+Progress = Callable[[int, int], None]
+
+
+@dataclass(frozen=True)
+class PoseConfig(RegressionConfig):
+    """Settings of the pose space: those of the regression, and how it is refined.
+
+    Parameters
+    ----------
+    smoothness : float
+        The paper's 0.001: times the mean edge length it is w_s of Eq. 5 and 8.
+    refinements : int
+        How often part rotations are fitted anew to the learned model.
+    steps : int
+        How often, after each of these, the regression is corrected by what the stitched model leaves.
+    detail : float, metres
+        Features are joined to fewer ones as long as that changes the edges of a part by less.
+    """
+
+    smoothness: float = 0.001
+    refinements: int = 2
+    steps: int = 3
+    detail: float = 2e-4
+
+
+@dataclass(frozen=True, eq=False)
+class LearnedPose:
+    """What was learned of the poses.
+
+    Attributes
+    ----------
+    space : PoseSpace
+    poses : (M, J, 3) float, radians
+        Of the training bodies.
+    design : Design
+        What was chosen.
+    """
+
+    space: PoseSpace
+    poses: np.ndarray
+    design: Design
+
+
+def learn_pose(carriage: Carriage, bodies: np.ndarray, config: PoseConfig, tick: Ticks) -> LearnedPose:
+    """The pose space, first as in the paper, then refined on the stitched surface.
+
+    Stitching sees only what neighbouring triangles agree on, and Eq. 4 does not know it. So, with the part
+    rotations fitted anew to the learned model, what the stitched model leaves of every body (as deformation of
+    the triangles) is added to what the model says now, and regressed again: majorise and minimise, which
+    lowers the error of the stitched edges step by step. What Q depends on is chosen first by the edges of left-out
+    poses, and after each fit of the rotations by their stitched vertices.
+
+    [SCAPE] Eq. 4, Eq. 5
+    """
+    template, skeleton = carriage.template, carriage.skeleton
+    gradients = GradientSystem(template, config.smoothness, skeleton.part_of_face)
+    poses = skeleton.pose_of(skeleton.fit_rotations(template, bodies))
+    Q = pose_gradients(gradients, carriage.local_edges(bodies, poses))
+    design = choose_design(template, skeleton, poses, Q, config, _by_edges(carriage, Q))
+    space = design.fit(poses, Q)
+    tick(len(bodies))
+    for _ in range(config.refinements):
+        poses = fit_poses(carriage.subject(space), bodies, poses, tick)
+        for step in range(config.steps):
+            left = bodies - carriage.subject(space).vertices(poses)
+            Q = space.gradients(poses)
+            Q += pose_gradients(gradients, carriage.v_hat + carriage.local_edges(left, poses)) - np.eye(3)
+            if step == 0:
+                design = choose_design(template, skeleton, poses, Q, config, _by_vertices(carriage, bodies, poses),
+                                       design)
+            space = design.fit(poses, Q)
+    return LearnedPose(condense(space, poses, template, config.detail), poses, design)
+
+
+def fit_poses(subject: Subject, bodies: np.ndarray, poses: np.ndarray, tick: Ticks) -> np.ndarray:
+    """Poses (M, J, 3), radians, with which the subject comes nearest to the bodies, from poses nearby."""
+    fitter = PoseFitter(subject, FitConfig(polish=0))
+    fitted = []
+    for body, pose in zip(bodies, poses, strict=True):
+        fitted.append(fitter.fit(body, pose).pose)
+        tick(1)
+    return np.stack(fitted)
+
+
+class Ticks:
+    """Counts work for a progress callback."""
+
+    def __init__(self, progress: Progress | None, total: int) -> None:
+        self.progress, self.total, self.done = progress, total, 0
+
+    def __call__(self, more: int) -> None:
+        self.done += more
+        if self.progress:
+            self.progress(self.done, self.total)
+
+
+def _by_edges(carriage: Carriage, Q: np.ndarray) -> Callable[[np.ndarray], float]:
+    """A judge of predictions of Q (M, F, 3, 3): the root mean square error of an edge."""
+    v_hat = np.swapaxes(carriage.v_hat, -1, -2)
+
+    def error(predicted: np.ndarray) -> float:
+        return float(np.sqrt(np.mean([(((q - p) @ v_hat) ** 2).sum(axis=1).mean()
+                                      for q, p in zip(Q, predicted, strict=True)])))
+
+    return error
+
+
+def _by_vertices(carriage: Carriage, bodies: np.ndarray, poses: np.ndarray) -> Callable[[np.ndarray], float]:
+    """A judge of predictions of Q (M, F, 3, 3): the mean distance of the stitched vertices, well placed."""
+    def error(predicted: np.ndarray) -> float:
+        far = []
+        for body, pose, Q in zip(bodies, poses, predicted, strict=True):
+            off = carriage.stitched(Q, pose) - body
+            far.append(np.linalg.norm(off - off.mean(axis=0), axis=1).mean())
+        return float(np.mean(far))
+
+    return error
