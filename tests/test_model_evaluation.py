@@ -5,6 +5,7 @@ import numpy as np
 import pytest
 from model_bodies import random_poses, worm_model
 
+from model import LearnConfig, learn_scape
 from model.cli import mesh as mesh_command
 from model.evaluation.cli import evaluate, sample
 from model.evaluation.digests import body_digest, set_digest, trained_on
@@ -18,7 +19,6 @@ from model.evaluation.errors import (
 from model.evaluation.page import picture_error_map
 from model.evaluation.sampling import sample_bodies, specificity, unposed
 from model.fitting import FitConfig, ShapeFitter
-from model.learning import LearnConfig, learn_scape
 from model.scape import ScapeModel
 from model.shape_space import ShapeSpace
 from scanprep.dataset import RegisteredSet

@@ -13,5 +13,5 @@ from .scape import (
     pose_prior,
 )
 
-__all__ = ["BlendConfig", "Carriage", "LearnConfig", "Progress", "Ticks", "check_skeleton", "checked_bodies", "digest", "fit_poses",
-           "learn_blendscape", "learn_scape", "pose_prior"]
+__all__ = ["BlendConfig", "Carriage", "LearnConfig", "Progress", "Ticks", "check_skeleton", "checked_bodies", "digest",
+           "fit_poses", "learn_blendscape", "learn_scape", "pose_prior"]
