@@ -21,6 +21,8 @@ from .skinning import SkinningModel
 
 Progress = Callable[[int, int], None]
 SOFTEST = 0.2                        # a mean of rotations that shrinks further is not undone
+ENOUGH = 0.005                       # relative gain of a round below which the next is not worth it
+QUICK = FitConfig(sample=400, iterations=20, polish=0, tolerance=1e-4)     # of poses that will be fitted again
 
 
 @dataclass(frozen=True)
@@ -44,7 +46,8 @@ class SkinConfig:
     parts : int
         Largest number of parts that a vertex follows.
     rounds : int
-        Largest number of times that poses, weights, joints and correctives are fitted in turn.
+        Largest number of times that poses, weights and joints are fitted in turn, first without correctives and
+        then with them.
     components : int
         Shape components to keep, fewer where there are fewer people.
     people_rounds : int
@@ -93,9 +96,13 @@ def learn_skinning(template: Mesh, poses: np.ndarray, shapes: np.ndarray | None,
     check_skeleton(template, skeleton)
     poses = checked_bodies(template, poses, "poses")
     shapes = None if shapes is None else checked_bodies(template, shapes, "shapes")
-    tick = Ticks(progress, config.rounds * len(poses) + (0 if shapes is None else config.people_rounds * len(shapes)))
-    model, at = _learn_pose(_start(template, skeleton, config), poses, config, tick)
-    tick(config.rounds * len(poses) - tick.done)
+    later = 0 if shapes is None else config.people_rounds * len(shapes)
+    tick = Ticks(progress, (1 + (config.correctives != "none")) * config.rounds * len(poses) + later)
+    at = skeleton.pose_of(skeleton.fit_rotations(template, poses))
+    model = _start(template, skeleton, config)
+    for correctives in ("none", config.correctives) if config.correctives != "none" else ("none",):
+        model, at = _learn_pose(model, at, poses, replace(config, correctives=correctives), tick)
+    tick(tick.total - tick.done - later)
     if shapes is not None:
         model = _learn_people(model, shapes, config, tick)
     mean, covariance = pose_prior(at)
@@ -115,26 +122,25 @@ def _start(template: Mesh, skeleton: Skeleton, config: SkinConfig) -> SkinningMo
                          np.zeros((J, 3)), np.zeros((3 * J, 3 * J)))
 
 
-def _learn_pose(model: SkinningModel, bodies: np.ndarray, config: SkinConfig, tick: Ticks
+def _learn_pose(model: SkinningModel, poses: np.ndarray, bodies: np.ndarray, config: SkinConfig, tick: Ticks
                 ) -> tuple[SkinningModel, np.ndarray]:
     """Poses, weights, joints, rest vertices and correctives in turn, while left-out poses are met better."""
     allowed = diffused_weights(model.template, model.skeleton, 2 * config.width) > 0
-    poses = model.skeleton.pose_of(model.skeleton.fit_rotations(model.template, bodies))
-    best: tuple[SkinningModel, np.ndarray] | None = None
+    model = replace(model, info={"left_out_error": np.inf})
     for turn in range(config.rounds):
-        fitter = PoseFitter(model.subject(), FitConfig(polish=0))
-        for i, body in enumerate(bodies):
-            poses[i] = fitter.fit(body, poses[i]).pose
+        fitter, fitted = PoseFitter(model.subject(), QUICK), []
+        for body, pose in zip(bodies, poses, strict=True):
+            fitted.append(fitter.fit(body, pose).pose)
             tick(1)
-        model = _with_weights(model, poses, bodies, allowed, config)
-        model = _with_joints(model, poses, bodies)
-        model = _with_correctives(model, poses, bodies, config if turn else replace(config, correctives="none"))
-        error = model.info["left_out_error"]
-        if turn > 1 and best is not None and error > 0.99 * best[0].info["left_out_error"]:
+        tried = _with_weights(model, np.stack(fitted), bodies, allowed, config)
+        tried = _with_joints(tried, np.stack(fitted), bodies)
+        tried = _with_correctives(tried, np.stack(fitted), bodies, config)
+        gain = 1 - tried.info["left_out_error"] / model.info["left_out_error"]
+        if gain > 0:
+            model, poses = tried, np.stack(fitted)
+        if gain < ENOUGH:
             break
-        best = model, poses.copy()
-    assert best is not None, "at least one round"
-    return best
+    return model, poses
 
 
 def _carried(model: SkinningModel, pose: np.ndarray, body: np.ndarray) -> np.ndarray:
@@ -209,8 +215,12 @@ def _unposed(model: SkinningModel, pose: np.ndarray, body: np.ndarray) -> np.nda
 
 def _undone(B: np.ndarray, moved: np.ndarray) -> np.ndarray:
     """`B⁻¹ moved` (N, 3) for means of rotations (N, 3, 3), gently where they have collapsed."""
-    U, s, Vt = np.linalg.svd(B)
-    return np.einsum("nki,nk,njk,nj->ni", Vt, 1 / np.maximum(s, SOFTEST), U, moved)
+    flat = np.linalg.det(B) < SOFTEST
+    if flat.any():
+        U, s, Vt = np.linalg.svd(B[flat])
+        B = B.copy()
+        B[flat] = (U * np.maximum(s, SOFTEST)[:, None]) @ Vt
+    return np.linalg.solve(B, moved[..., None])[..., 0]
 
 
 def corrective_features(skeleton: Skeleton, poses: np.ndarray, config: SkinConfig) -> PoseFeatures:

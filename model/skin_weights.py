@@ -31,7 +31,7 @@ def kept_weights(weights: np.ndarray, count: int) -> np.ndarray:
 
 
 def fit_weights(carried: list[np.ndarray], bodies: np.ndarray, template: Mesh, start: np.ndarray,
-                allowed: np.ndarray, smoothness: float, steps: int = 300) -> np.ndarray:
+                allowed: np.ndarray, smoothness: float, steps: int = 100) -> np.ndarray:
     """Weights with which the mean of what the parts say comes nearest to the bodies.
 
     Per vertex it is least squares over weights that are not negative and sum to 1, and neighbours are drawn to each

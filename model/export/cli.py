@@ -52,7 +52,8 @@ def export(model: ModelArg, output: Output, betas: tuple[float, ...] = (), own_b
     its motion. OUT.npz: the whole model as linear blend skinning under the usual array names. OUT.ply, .obj, .stl,
     .off: the mesh at rest. A folder: the exact mesh of every frame of the motion.
 
-    GLB, BVH and NPZ hold skinned bodies, which the models are not: the table says how far they are apart.
+    GLB, BVH and NPZ hold bodies that are skinned with bones of fixed length: the table says how far they are from the
+    model's own. With --correctives a motion in GLB comes as near as you like.
 
     Example: scape model export model.npz --motion walk/motion.npz -o walk.glb
 
@@ -61,7 +62,7 @@ def export(model: ModelArg, output: Output, betas: tuple[float, ...] = (), own_b
         output: File or folder to write: .glb, .bvh, .npz, .ply, .obj, .stl, .off, or a folder.
         betas: Shape in standard deviations, the first of them; else that of the motion, else the mean person.
         own_body: The template's own body.
-        motion: Motion file, as of scape animate.
+        motion: Motion file (.npz), as of scape animate.
         shapes: Morph targets for so many of the first betas; 10 where there are so many.
         correctives: Further morph targets by which the motion comes nearer to the exact one.
         unit: Of the lengths in a BVH file; cm.

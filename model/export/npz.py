@@ -39,9 +39,8 @@ def body_arrays(model: BodyModel, weights: np.ndarray | None = None, draws: int 
     weights : (N, J) float, optional
         As for `make_rig`.
     draws : int
-        Poses drawn from the model's prior to which the pose directions are fitted: the models of this package
-        are not skinned, so these are the skinned model nearest to them, not the models themselves. With 0 there are
-        none.
+        Poses drawn from the model's prior to which the pose directions are fitted. No kind of model here is linear
+        in R - I, so the file holds what comes nearest to the model, not the model itself. With 0 there are none.
 
     Returns
     -------

@@ -31,8 +31,8 @@ class RegressionConfig:
         Twist directions of smaller variance are not regressed on; the best is chosen by leaving poses out.
     ridges : floats, square radians
         Strengths of the penalty; the best is chosen by leaving poses out.
-    radii : floats
-        Widths of the bells, as multiples of the median distance between the seen twists; the best is chosen.
+    radii : floats, radians
+        Standard deviations of the bells; the best is chosen by leaving poses out.
     tube : float, metres
         Errors of an edge below this cost nothing to support-vector regression.
     """
@@ -41,7 +41,7 @@ class RegressionConfig:
     regressor: Literal["ridge", "svr"] = "ridge"
     prunings: tuple[float, ...] = (0.003, 0.01, 0.03)
     ridges: tuple[float, ...] = (3e-4, 1e-3, 3e-3, 0.01, 0.03, 0.1, 0.3)
-    radii: tuple[float, ...] = (0.7, 1.4)
+    radii: tuple[float, ...] = (0.5, 0.7, 1.0, 1.4)
     tube: float = 2e-4
 
 
@@ -219,9 +219,7 @@ def _make_lift(t: np.ndarray, kind: str, pruning: float, radius: float) -> tuple
                 mine[3:, k + c] = np.where(first == second, 0.5, 1.0) * pair[first, second]
             axes.append(mine)
         return quadratic, axes
-    far = np.linalg.norm(t[:, None] - t[None], axis=-1)             # (M, M, J)
-    typical = np.maximum(np.median(far.reshape(-1, J), axis=0), 1e-3)
-    radial = RadialLift(np.ascontiguousarray(t.transpose(1, 0, 2)), radius * typical)
+    radial = RadialLift(np.ascontiguousarray(t.transpose(1, 0, 2)), np.full(J, radius))
     bells = radial.evaluate(t)[..., 3:]
     axes = []
     for j in range(J):
@@ -231,9 +229,10 @@ def _make_lift(t: np.ndarray, kind: str, pruning: float, radius: float) -> tuple
         # the penalty is that of the kernel: on K^-1/2 k(t) a plain ridge is kernel ridge regression
         values, vectors = np.linalg.eigh(bells[:, j])
         good = values > 1e-6 * values[-1]
-        white = np.zeros((radial.width, 3 + int(good.sum())))
-        white[:3, :3] = np.eye(3)
-        white[3:, 3:] = vectors[:, good] / np.sqrt(values[good])
+        k = kept[j].shape[1]
+        white = np.zeros((radial.width, k + int(good.sum())))
+        white[:3, :k] = kept[j]
+        white[3:, k:] = vectors[:, good] / np.sqrt(values[good])
         axes.append(white)
     return radial, axes
 
