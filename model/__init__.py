@@ -17,9 +17,9 @@ if TYPE_CHECKING:
     from .files import load_model
     from .fitting import FitConfig, PoseFit, ShapeFit, fit_pose, fit_shape
     from .learning import LearnConfig, learn_scape
+    from .learning.skin import SkinConfig, learn_skinning
     from .linear import PointOperator, Subject
     from .scape import ScapeModel
-    from .skin_learning import SkinConfig, learn_skinning
     from .skinning import SkinningModel
 
 _ROOMS = {
@@ -34,9 +34,9 @@ _ROOMS = {
     "files": ("load_model",),
     "fitting": ("FitConfig", "PoseFit", "ShapeFit", "fit_pose", "fit_shape"),
     "learning": ("LearnConfig", "learn_scape"),
+    "learning.skin": ("SkinConfig", "learn_skinning"),
     "linear": ("PointOperator", "Subject"),
     "scape": ("ScapeModel",),
-    "skin_learning": ("SkinConfig", "learn_skinning"),
     "skinning": ("SkinningModel",),
 }
 _ROOM_OF = {name: room for room, names in _ROOMS.items() for name in names}

@@ -11,10 +11,10 @@ from model_bodies import worm, worm_model, worm_skeleton
 from model.blendscape import BlendScapeModel
 from model.body import BodyModel
 from model.features import Lift, PoseFeatures, QuadraticLift, RadialLift
+from model.learning.skin import SkinConfig, corrective_features
+from model.learning.skin_weights import diffused_weights
 from model.pose_space import PoseSpace
 from model.scape import ScapeModel
-from model.skin_learning import SkinConfig, corrective_features
-from model.skin_weights import diffused_weights
 from model.skinning import SkinningModel
 from scanprep.geometry.mesh import Mesh
 from scanprep.skeleton.tree import Skeleton

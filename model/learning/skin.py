@@ -10,14 +10,14 @@ import numpy as np
 from scanprep.geometry.mesh import Mesh, check_template
 from scanprep.skeleton.tree import Skeleton
 
-from .features import Lift, LinearLift, PoseFeatures, QuadraticLift
-from .fitting import FitConfig, PoseFitter, ShapeFitter
-from .learning import check_skeleton, checked_bodies, digest, pose_prior
-from .pose_learning import Ticks
-from .pose_space import kept_directions
-from .shape_space import learn_shape_space
+from ..features import Lift, LinearLift, PoseFeatures, QuadraticLift
+from ..fitting import FitConfig, PoseFitter, ShapeFitter
+from ..pose_space import kept_directions
+from ..shape_space import learn_shape_space
+from ..skinning import SkinningModel
+from .pose import Ticks
+from .scape import check_skeleton, checked_bodies, digest, pose_prior
 from .skin_weights import diffused_weights, fit_weights, kept_weights
-from .skinning import SkinningModel
 
 Progress = Callable[[int, int], None]
 SOFTEST = 0.2                        # a mean of rotations that shrinks further is not undone
@@ -127,7 +127,7 @@ def _learn_pose(model: SkinningModel, poses: np.ndarray, bodies: np.ndarray, con
     """Poses, weights, joints, rest vertices and correctives in turn, while left-out poses are met better."""
     allowed = diffused_weights(model.template, model.skeleton, 2 * config.width) > 0
     model = replace(model, info={"left_out_error": np.inf})
-    for turn in range(config.rounds):
+    for _turn in range(config.rounds):
         fitter, fitted = PoseFitter(model.subject(), QUICK), []
         for body, pose in zip(bodies, poses, strict=True):
             fitted.append(fitter.fit(body, pose).pose)
