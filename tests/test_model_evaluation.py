@@ -7,8 +7,8 @@ from model_bodies import random_poses, worm_model
 
 from model import LearnConfig, learn_scape
 from model.cli import mesh as mesh_command
+from model.digests import body_digest, digest, trained_on
 from model.evaluation.cli import evaluate, sample
-from model.evaluation.digests import body_digest, set_digest, trained_on
 from model.evaluation.errors import (
     compactness,
     fit_with_held_pose,
@@ -186,7 +186,7 @@ def test_random_poses_have_the_moments_of_the_training_poses(model):
 def test_a_model_knows_the_bodies_that_trained_it(model, people):
     poses = model.vertices(random_poses(model, 6, np.random.default_rng(4)))
     learned = learn_scape(model.template, poses, people, model.skeleton, LearnConfig(refinements=0, components=3))
-    assert learned.info["digest"] == set_digest(model.template, poses, people)
+    assert learned.info["digest"] == digest(model.template, poses, people)
     told = ScapeModel(model.template, model.skeleton, model.pose_space, model.shape_space, model.pose_mean,
                       model.pose_covariance, {"digests": [body_digest(p) for p in people[:3]]})
     np.testing.assert_array_equal(trained_on(told, people[2:5].astype(np.float32)), [True, False, False])
@@ -245,7 +245,7 @@ def test_evaluate_command(files):
 
 def test_evaluate_says_when_the_bodies_trained_the_model(model, files):
     posed = np.stack([read_mesh(p).vertices for p in sorted((files / "poses").glob("*.ply"))])
-    for info in ({"digests": [body_digest(posed[1])]}, {"digest": set_digest(model.template, posed, None)}):
+    for info in ({"digests": [body_digest(posed[1])]}, {"digest": digest(model.template, posed, None)}):
         ScapeModel(model.template, model.skeleton, model.pose_space, ShapeSpace.empty(len(model.template.faces)),
                    model.pose_mean, model.pose_covariance, info).save(files / "told.npz")
         done = evaluate(files / "told.npz", files / "told", files / "poses")

@@ -19,8 +19,8 @@ from scanprep.geometry.files import read_registered, write_mesh
 
 from ..body import BodyModel
 from ..cli import ModelArg, read_subject
+from ..digests import digest, trained_on
 from ..files import load_model
-from .digests import set_digest, trained_on
 from .errors import Errors, compactness, pose_errors, shape_errors
 from .page import MM, Findings, evaluation_page, generalisation_rows, picture_samples
 from .sampling import sample_bodies, specificity
@@ -141,7 +141,7 @@ def _read_bodies(model: BodyModel, folder: Path | None, unit: Unit | None, one_p
 
 def _notes(model: BodyModel, posed: np.ndarray | None, people: np.ndarray | None) -> list[str]:
     """Whether the bodies trained the model, as far as its file tells."""
-    if posed is not None and model.info.get("digest") == set_digest(model.template, posed, people):
+    if posed is not None and model.info.get("digest") == digest(model.template, posed, people):
         return ["these are the very bodies that the model was trained on, so the errors are not held-out errors"]
     notes = []
     for name, bodies in (("poses", posed), ("people", people)):

@@ -1,4 +1,5 @@
 """Learning body models from registered meshes."""
+from ..digests import digest
 from .carriage import Carriage
 from .pose import Ticks, fit_poses
 from .scape import (
@@ -7,7 +8,6 @@ from .scape import (
     Progress,
     check_skeleton,
     checked_bodies,
-    digest,
     learn_blendscape,
     learn_scape,
     pose_prior,

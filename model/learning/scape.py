@@ -2,7 +2,6 @@
 from __future__ import annotations
 
 import contextlib
-import hashlib
 import logging
 import time
 from collections.abc import Callable, Iterator
@@ -17,6 +16,7 @@ from scanprep.skeleton.tree import Skeleton
 from ..blendscape import BlendScapeModel
 from ..borders import face_weights
 from ..carriers import rigid_weights
+from ..digests import body_digests, digest
 from ..features import twists
 from ..gradients import GradientSystem, shape_gradients
 from ..pose_space import PoseSpace
@@ -133,7 +133,8 @@ def _learn(carriage: Carriage, poses: np.ndarray, shapes: np.ndarray | None, con
     info: dict[str, Any] = {
         "settings": asdict(config), "poses": len(poses), "shapes": 0 if shapes is None else len(shapes),
         "pruning": design.pruning, "ridge": design.ridge, "features": learned.space.features.count,
-        "left_out_error": design.left_out_error, "digest": digest(template, poses, shapes)}
+        "left_out_error": design.left_out_error, "digest": digest(template, poses, shapes),
+        "digests": body_digests(poses, shapes)}
     return learned.space, shape_space, *pose_prior(learned.poses), info
 
 
@@ -189,12 +190,3 @@ def checked_bodies(template: Mesh, bodies: np.ndarray, name: str) -> np.ndarray:
     if len(bodies) < 2:
         raise ValueError(f"{name}: expected at least 2 bodies, got {len(bodies)}")
     return bodies
-
-
-def digest(template: Mesh, poses: np.ndarray, shapes: np.ndarray | None) -> str:
-    """SHA-256 of the training set."""
-    total = hashlib.sha256()
-    for array in (template.vertices, template.faces, poses, shapes):
-        if array is not None:
-            total.update(np.ascontiguousarray(array).tobytes())
-    return total.hexdigest()

@@ -7,7 +7,7 @@ import numpy as np
 
 from scanprep.geometry.mesh import Mesh
 
-from ..body import BodyModel
+from .body import BodyModel
 
 LENGTH = 16                          # hexadecimal digits: two of a billion bodies meet once in ten lives
 
@@ -17,13 +17,18 @@ def body_digest(vertices: np.ndarray) -> str:
     return hashlib.sha256(np.ascontiguousarray(vertices, dtype=np.float32).tobytes()).hexdigest()[:LENGTH]
 
 
-def set_digest(template: Mesh, poses: np.ndarray, shapes: np.ndarray | None) -> str:
+def digest(template: Mesh, poses: np.ndarray, shapes: np.ndarray | None) -> str:
     """SHA-256 of a whole training set: `info["digest"]` of a model."""
     total = hashlib.sha256()
     for array in (template.vertices, template.faces, poses, shapes):
         if array is not None:
             total.update(np.ascontiguousarray(array).tobytes())
     return total.hexdigest()
+
+
+def body_digests(*sets: np.ndarray | None) -> list[str]:
+    """The digest of every body of some training sets (M, N, 3): `info["digests"]` of a model."""
+    return [body_digest(body) for bodies in sets if bodies is not None for body in bodies]
 
 
 def trained_on(model: BodyModel, bodies: np.ndarray) -> np.ndarray | None:
