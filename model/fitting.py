@@ -9,11 +9,10 @@ import numpy as np
 
 from .bilinear import ShapedPoints
 from .body import BodyModel
+from .features import twists
 from .linear import PointOperator, Subject
-from .minimise import Derive, Evaluate, Minimum, minimise
-
-REUSE = 2                            # steps on all vertices for which one set of derivatives serves: they are 20
-                                     # times as dear as residuals, and change little between the last steps
+from .minimise import Derive, Evaluate, Minimum, Slope, descend, minimise
+from .pullback import pull_back
 
 
 @dataclass(frozen=True)
@@ -36,7 +35,7 @@ class FitConfig:
 
     sample: int = 800
     iterations: int = 60
-    polish: int = 4
+    polish: int = 10
     tolerance: float = 1e-5
     n_betas: int | None = None
 
@@ -164,6 +163,7 @@ class ShapeFitter:
         if not 0 < self.n_betas <= model.n_betas:
             raise ValueError(f"n_betas: expected 1..{model.n_betas}, got {self.n_betas}")
         self._chosen = spread_vertices(model.template.vertices, self.config.sample)
+        self._share = share_of_vertices(model.template.vertices, self._chosen)
         first = FitConfig(self.config.sample, iterations=10, polish=0, tolerance=1e-3)
         self._mean_person = PoseFitter(model.subject(np.zeros(self.n_betas)), first)
 
@@ -188,13 +188,15 @@ class ShapeFitter:
         start = start or self._mean_person.fit(vertices)
         betas = start.betas[:K] if isinstance(start, ShapeFit) else np.zeros(K)
         x = np.concatenate([start.pose.ravel(), start.trans, betas])
-        best = minimise(*_shape_energy(self._points, vertices[self._chosen]), x, J, config.tolerance,
-                        config.iterations)
+        evaluate, derive = _shape_energy(self._points, vertices[self._chosen], np.sqrt(self._share))
+        best = minimise(evaluate, derive, x, J, config.tolerance, config.iterations)
         steps = best.steps
-        if config.polish:
-            best = minimise(*_whole_energy(model, vertices, K), best.x, J, config.tolerance, config.polish, REUSE)
+        if len(self._chosen) < len(vertices) and config.polish:
+            columns = derive(best.x)[1]
+            best = descend(*_whole_energy(model, vertices), columns @ columns.T, best.x, config.tolerance,
+                           config.polish)
             steps += best.steps
-        pose, trans, betas = best.x[:3 * J].reshape(J, 3), best.x[3 * J:3 * J + 3], np.zeros(model.n_betas)
+        pose, trans, betas = twists(best.x[:3 * J].reshape(J, 3)), best.x[3 * J:3 * J + 3], np.zeros(model.n_betas)
         betas[:K] = best.x[3 * J + 3:]
         fitted = model.vertices(pose, betas, trans)
         return ShapeFit(pose, trans, fitted, *_distances(fitted, vertices), best.converged, steps, betas)
@@ -212,6 +214,14 @@ def spread_vertices(vertices: np.ndarray, count: int) -> np.ndarray:
         far = np.minimum(far, ((vertices - vertices[at]) ** 2).sum(axis=1))
         at = int(far.argmax())
     return np.sort(chosen)
+
+
+def share_of_vertices(vertices: np.ndarray, chosen: np.ndarray) -> np.ndarray:
+    """(L,) how many of all vertices (N, 3) lie nearest to each of those chosen (L,)."""
+    from scipy.spatial import cKDTree
+
+    nearest = cKDTree(vertices[chosen]).query(vertices)[1]
+    return np.bincount(nearest, minlength=len(chosen)).astype(float)
 
 
 def _starts(subject: Subject, vertices: np.ndarray) -> list[np.ndarray]:
@@ -247,36 +257,34 @@ def _pose_energy(operator: PointOperator, target: np.ndarray) -> tuple[Evaluate,
     return evaluate, derive
 
 
-def _shape_energy(points: ShapedPoints, target: np.ndarray) -> tuple[Evaluate, Derive]:
-    """As `_pose_energy`, with betas behind pose and place, on a few vertices."""
-    J3 = 3 * len(points.terms.skeleton.parents)
+def _shape_energy(points: ShapedPoints, target: np.ndarray, weights: np.ndarray) -> tuple[Evaluate, Derive]:
+    """As `_pose_energy`, with betas behind pose and place; residuals are times the weights (L,) of their points."""
+    J3, each = 3 * len(points.terms.skeleton.parents), np.repeat(weights, 3)
 
     def evaluate(x: np.ndarray) -> np.ndarray:
-        return _pose_energy(points.operator(x[J3 + 3:]), target)[0](x[:J3 + 3])
+        return each * _pose_energy(points.operator(x[J3 + 3:]), target)[0](x[:J3 + 3])
 
     def derive(x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         residual, columns = _pose_energy(points.operator(x[J3 + 3:]), target)[1](x[:J3 + 3])
         by_shape = np.moveaxis(points.shape_jacobian(x[:J3].reshape(-1, 3)), -1, 0)
-        return residual, np.concatenate([columns, by_shape.reshape(len(by_shape), -1)])
+        return each * residual, each * np.concatenate([columns, by_shape.reshape(len(by_shape), -1)])
 
     return evaluate, derive
 
 
-def _whole_energy(model: BodyModel, target: np.ndarray, K: int) -> tuple[Evaluate, Derive]:
-    """As `_shape_energy`, on all vertices: the operator is stitched again whenever betas change."""
+def _whole_energy(model: BodyModel, target: np.ndarray) -> tuple[Evaluate, Slope]:
+    """Residuals of all vertices, and half the gradient of their squares, with unknowns as `_shape_energy` has."""
     J3 = 3 * len(model.skeleton.parents)
-    everything = np.arange(len(target))
 
     def evaluate(x: np.ndarray) -> np.ndarray:
         return (model.vertices(x[:J3].reshape(-1, 3), x[J3 + 3:], x[J3:J3 + 3]) - target).ravel()
 
-    def derive(x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        operator = model.subject(x[J3 + 3:]).points(everything)
-        residual, columns = _pose_energy(operator, target)[1](x[:J3 + 3])
-        by_shape = np.moveaxis(model.shape_jacobian(x[:J3].reshape(-1, 3))[..., :K], -1, 0)
-        return residual, np.concatenate([columns, by_shape.reshape(K, -1)])
+    def slope(x: np.ndarray, residual: np.ndarray) -> np.ndarray:
+        force = residual.reshape(-1, 3)
+        by_pose, by_betas = pull_back(model, force, x[:J3].reshape(-1, 3), x[J3 + 3:])
+        return np.concatenate([by_pose, force.sum(axis=0), by_betas])
 
-    return evaluate, derive
+    return evaluate, slope
 
 
 def _distances(fitted: np.ndarray, vertices: np.ndarray) -> tuple[float, float]:

@@ -1,4 +1,4 @@
-"""Levenberg-Marquardt over a pose and what comes with it."""
+"""Least squares over a pose and what comes with it: Levenberg-Marquardt, and a last descent by gradients alone."""
 from __future__ import annotations
 
 from collections.abc import Callable
@@ -13,6 +13,7 @@ TRIES = 12                           # steps of growing damping before giving up
 
 Evaluate = Callable[[np.ndarray], np.ndarray]
 Derive = Callable[[np.ndarray], tuple[np.ndarray, np.ndarray]]
+Slope = Callable[[np.ndarray, np.ndarray], np.ndarray]
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,8 +35,7 @@ class Minimum:
     energy: float
 
 
-def minimise(evaluate: Evaluate, derive: Derive, x: np.ndarray, J: int, tolerance: float, limit: int,
-             reuse: int = 1) -> Minimum:
+def minimise(evaluate: Evaluate, derive: Derive, x: np.ndarray, J: int, tolerance: float, limit: int) -> Minimum:
     """Least squares by Levenberg-Marquardt; a step is taken only where it lowers the energy.
 
     Parameters
@@ -50,38 +50,83 @@ def minimise(evaluate: Evaluate, derive: Derive, x: np.ndarray, J: int, toleranc
         Relative decrease of the energy at which to stop.
     limit : int
         Largest number of steps.
-    reuse : int
-        Steps for which derivatives serve, where they cost far more than residuals; a search ends on new ones only.
     """
-    damping, step, used = 1e-4, 0, 0
+    damping, step = 1e-4, 0
     residual, columns = derive(x)
-    normal, energy = columns @ columns.T, float(residual @ residual)
+    energy = float(residual @ residual)
     while step < limit:
-        lower, damping = _lower(evaluate, x, energy, normal, columns @ residual, damping)
-        if lower is None and not used:
-            return Minimum(x, True, step, energy)
-        if lower is not None:
-            trial, residual, before, energy = *lower, energy, float(lower[1] @ lower[1])
-            x, step, damping = trial.copy(), step + 1, damping / 5
-            x[:3 * J] = twists(x[:3 * J].reshape(J, 3)).ravel()
-            small = before - energy <= tolerance * before
-            if (small and not used) or energy < EXACT**2 * len(residual):
-                return Minimum(x, True, step, energy)
-            used += 1
-        if lower is None or small or used >= reuse or not np.array_equal(x, trial):
-            residual, columns = derive(x)
-            normal, energy, used = columns @ columns.T, float(residual @ residual), 0
+        normal, slope = columns @ columns.T, columns @ residual
+        scale = np.diag(normal) + 1e-9 * np.trace(normal) / len(normal)
+        for _ in range(TRIES):
+            trial = x - np.linalg.solve(normal + damping * np.diag(scale), slope)
+            value = evaluate(trial)
+            if float(value @ value) < energy:
+                break
+            damping = max(damping, 1e-7) * 10
+        else:
+            return Minimum(x, True, step, energy)    # no step lowers it any more
+        step += 1
+        lower = float(value @ value)
+        trial[:3 * J] = twists(trial[:3 * J].reshape(J, 3)).ravel()
+        x, damping = trial, damping / 5
+        if energy - lower <= tolerance * energy or lower < EXACT**2 * len(residual):
+            return Minimum(x, True, step, lower)
+        residual, columns = derive(x)
+        energy = float(residual @ residual)
     return Minimum(x, False, step, energy)
 
 
-def _lower(evaluate: Evaluate, x: np.ndarray, energy: float, normal: np.ndarray, slope: np.ndarray, damping: float
-           ) -> tuple[tuple[np.ndarray, np.ndarray] | None, float]:
-    """Unknowns of lower energy with their residuals, or None where no step finds any; and the damping it took."""
-    scale = np.diag(normal) + 1e-9 * np.trace(normal) / len(normal)
-    for _ in range(TRIES):
-        trial = x - np.linalg.solve(normal + damping * np.diag(scale), slope)
-        value = evaluate(trial)
-        if float(value @ value) < energy:
-            return (trial, value), damping
-        damping = max(damping, 1e-7) * 10
-    return None, damping
+def descend(evaluate: Evaluate, slope: Slope, normal: np.ndarray, x: np.ndarray, tolerance: float, limit: int
+            ) -> Minimum:
+    """Least squares from a good start, by gradients and a normal matrix of a like problem: L-BFGS that begins there.
+
+    The minimum is that of `evaluate`, whatever the matrix; a good one saves steps.
+
+    Parameters
+    ----------
+    evaluate : x -> (m,) float, metres
+        Residuals.
+    slope : x, residuals -> (n,) float
+        Half the gradient of the sum of squared residuals.
+    normal : (n, n) float
+        Near half the second derivatives of that sum.
+    x : (n,) float
+    tolerance : float
+        Expected relative decrease of the energy at which to stop.
+    limit : int
+        Largest number of steps.
+    """
+    inverse = np.linalg.inv(normal + 1e-6 * np.diag(np.diag(normal)))
+    residual = evaluate(x)
+    energy, gradient, steps = float(residual @ residual), slope(x, residual), 0
+    memory: list[tuple[np.ndarray, np.ndarray]] = []
+    while True:
+        ahead = -_quasi_newton(inverse, memory, gradient)
+        if -gradient @ ahead <= max(tolerance * energy, EXACT**2 * len(residual)):
+            return Minimum(x, True, steps, energy)
+        if steps == limit:
+            return Minimum(x, False, steps, energy)
+        for halving in range(TRIES):
+            trial = x + 0.5**halving * ahead
+            residual = evaluate(trial)
+            if float(residual @ residual) < energy:
+                break
+        else:
+            return Minimum(x, True, steps, energy)       # no step lowers it any more
+        before, gradient = gradient, slope(trial, residual)
+        if (trial - x) @ (gradient - before) > 0:
+            memory.append((trial - x, gradient - before))
+        x, energy, steps = trial, float(residual @ residual), steps + 1
+
+
+def _quasi_newton(inverse: np.ndarray, memory: list[tuple[np.ndarray, np.ndarray]], gradient: np.ndarray
+                  ) -> np.ndarray:
+    """The gradient times the inverse of the normal matrix, corrected by the steps (s, y) that were seen."""
+    q, shares = gradient.copy(), []
+    for s, y in reversed(memory):
+        shares.append(s @ q / (s @ y))
+        q -= shares[-1] * y
+    q = inverse @ q
+    for (s, y), share in zip(memory, reversed(shares), strict=True):
+        q += (share - y @ q / (s @ y)) * s
+    return q

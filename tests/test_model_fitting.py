@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 from model_bodies import random_poses, worm_model
 
-from model.fitting import FitConfig, fit_pose, fit_shape, spread_vertices
+from model.fitting import FitConfig, fit_pose, fit_shape, share_of_vertices, spread_vertices
 from model.scape import ScapeModel
 from model.shape_space import ShapeSpace
 from scanprep.geometry import rotations
@@ -38,13 +38,36 @@ def test_pose_follows_a_rigid_motion_of_the_data(model):
     assert 0.005 < a.rms < 0.005 * np.sqrt(3)               # the noise is left, and not more
 
 
-def test_shape_and_pose_of_the_models_own_bodies(model):
+@pytest.mark.parametrize("sample", [60, 10**6])
+def test_shape_and_pose_of_the_models_own_bodies(model, sample):
     rng = np.random.default_rng(2)
     for _ in range(3):
         pose, betas, trans = random_poses(model, 1, rng, 0.3)[0], rng.normal(size=3), rng.normal(size=3)
-        fit = fit_shape(model, model.vertices(pose, betas, trans))
+        fit = fit_shape(model, model.vertices(pose, betas, trans), FitConfig(sample=sample))
         assert fit.converged and fit.rms < 1e-5
         np.testing.assert_allclose(fit.betas, betas, atol=1e-3)
+
+
+def test_polish_finds_the_minimum_over_all_vertices(model):
+    """From 60 vertices with gradients alone, as from derivatives of them all."""
+    rng = np.random.default_rng(4)
+    body = model.vertices(random_poses(model, 1, rng, 0.3)[0], [1.0, 0, -1]) + rng.normal(0, 0.01, (398, 3))
+    rough, fast, whole = (fit_shape(model, body, FitConfig(sample=sample, polish=polish, tolerance=1e-10))
+                          for sample, polish in ((60, 0), (60, 40), (398, 0)))
+    assert fast.converged and rough.rms > 1.001 * whole.rms
+    assert fast.rms == pytest.approx(whole.rms, rel=1e-8)
+    np.testing.assert_allclose(fast.vertices, whole.vertices, atol=2e-6)
+    np.testing.assert_allclose(fast.betas, whole.betas, atol=1e-4)
+
+
+def test_shares_count_every_vertex_once(model):
+    vertices = model.template.vertices
+    chosen = spread_vertices(vertices, 40)
+    far = np.linalg.norm(vertices[:, None] - vertices[chosen], axis=2)
+    share = share_of_vertices(vertices, chosen)
+    assert share.sum() == len(vertices) and share.min() >= 1
+    at_least = ((far <= far.min(axis=1, keepdims=True) + 1e-12).sum(axis=1) == 1)      # those with one nearest
+    assert (share >= np.bincount(far[at_least].argmin(axis=1), minlength=40)).all()
 
 
 def test_shape_with_fewer_components(model):

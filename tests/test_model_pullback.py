@@ -1,0 +1,36 @@
+import numpy as np
+import pytest
+from model_bodies import random_poses, worm_model
+
+from model.body import BodyModel
+from model.pullback import pull_back
+
+
+@pytest.fixture(scope="module")
+def model():
+    return worm_model()
+
+
+@pytest.mark.parametrize("size", [0.0, 0.5, 2.5])             # 2.5: beyond half a turn, where twists wrap
+def test_backwards_is_the_transpose_of_forwards(model, size):
+    rng = np.random.default_rng(0)
+    pose, betas = random_poses(model, 1, rng, size)[0], rng.normal(size=2)
+    force = rng.normal(size=model.template.vertices.shape)
+    slow = pull_back.dispatch(BodyModel)(model, force, pose, betas)
+    for fast, full in zip(pull_back(model, force, pose, betas), slow, strict=True):
+        assert fast.shape == full.shape
+        np.testing.assert_allclose(fast, full, atol=1e-6 * np.abs(full).max())
+
+
+def test_gradient_is_the_finite_difference(model):
+    rng = np.random.default_rng(1)
+    pose, betas = random_poses(model, 1, rng)[0], rng.normal(size=3)
+    force = rng.normal(size=model.template.vertices.shape)
+    by_pose, by_betas = pull_back(model, force, pose, betas)
+    def value(pose, betas):
+        return float((force * model.vertices(pose, betas)).sum())
+    h = 1e-6
+    for i, step in enumerate(h * np.eye(12).reshape(12, 4, 3)):
+        assert by_pose[i] == pytest.approx((value(pose + step, betas) - value(pose - step, betas)) / (2 * h), abs=1e-5)
+    for k, step in enumerate(h * np.eye(3)):
+        assert by_betas[k] == pytest.approx((value(pose, betas + step) - value(pose, betas - step)) / (2 * h), abs=1e-5)
