@@ -43,6 +43,10 @@ class Follower:
         """What the riders (..., n, 3) have of a small displacement (..., N, 3), metres."""
         return self._between(fields[..., self._corners, :])
 
+    def values(self, values: np.ndarray) -> np.ndarray:
+        """What the riders (n, k) have of values (N, k) of the ridden vertices."""
+        return np.einsum("nc,nck->nk", self._on.bary, values[self._corners])
+
     def _between(self, corners: np.ndarray) -> np.ndarray:
         return np.einsum("nc,...ncd->...nd", self._on.bary, corners)
 

@@ -20,6 +20,7 @@ from .pieces import Piece, carry_skeleton, gradients_of
 from .pose_space import PoseSpace, faces_of_part
 from .scape import ScapeModel
 from .shape_space import ShapeSpace
+from .skinning import SkinningModel
 
 ASTRAY = 2.0                         # mean edges of the coarser surface that the two may lie apart
 
@@ -126,6 +127,26 @@ def _carry_blend(model: ScapeModel, pieces: list[Piece]) -> dict[str, np.ndarray
     for piece in pieces:
         blend[piece.new_faces] = piece.average(model.blend[piece.old_faces])
     return {"blend": blend}
+
+
+@carry_model.register
+def _carry_skinning(model: SkinningModel, template: Mesh, config: ResolutionConfig) -> SkinningModel:
+    skeleton = carry_skeleton(model.skeleton, model.template, template)
+    follow = Follower(model.template, template)
+
+    def displaced(field: np.ndarray) -> np.ndarray:
+        return follow.displacements(field.astype(np.float64)).astype(field.dtype)
+
+    weights = np.maximum(follow.values(model.weights), 0)
+    rest, shape_mean = (follow.positions(x.astype(np.float64)).astype(x.dtype) for x in (model.rest, model.shape_mean))
+    # the variance is summed over the vertices, of which there are now more or fewer
+    per_vertex = len(template.vertices) / len(model.template.vertices)
+    return replace(
+        model, template=template, skeleton=skeleton, rest=rest, weights=weights / weights.sum(axis=1, keepdims=True),
+        features=replace(model.features, skeleton=skeleton), correctives=displaced(model.correctives),
+        shape_mean=shape_mean, shape_components=displaced(model.shape_components),
+        shape_variances=model.shape_variances * per_vertex, shape_total=model.shape_total * per_vertex,
+        info=carry_info(model, template))
 
 
 def carry_info(model: BodyModel, template: Mesh) -> dict[str, Any]:

@@ -1,0 +1,221 @@
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from model_bodies import random_poses, worm, worm_model, worm_skeleton
+from posing_bodies import skinned, symmetric_worm
+
+from model.limits import JointLimits
+from model.mirroring import find_mirror, mirror_pose
+from model.posing import pose_from_angles, sample_poses, turn
+from scanprep.geometry import rotations
+from scanprep.skeleton.tree import Skeleton
+
+
+@pytest.fixture(scope="module")
+def body():
+    return symmetric_worm()
+
+
+def test_the_plane_and_the_partners_are_found(body):
+    template, skeleton, _ = body
+    mirror = find_mirror(template, skeleton)
+    np.testing.assert_allclose(np.abs(mirror.normal), [1, 0, 0], atol=1e-6)
+    assert abs((mirror.point - [0.3, 0, 0]) @ mirror.normal) < 1e-6
+    assert mirror.partners.tolist() == [0, 2, 1, 4, 3] and mirror.distance < 1e-6
+
+
+def test_the_plane_turns_with_the_body(body):
+    template, skeleton, _ = body
+    R, t = rotations.exp([0.4, -1.0, 0.7]), np.array([3.0, -2.0, 1.0])
+    moved = Skeleton(skeleton.part_of_face, skeleton.parents, skeleton.joints @ R.T + t)
+    mirror = find_mirror(template.with_vertices(template.vertices @ R.T + t), moved)
+    np.testing.assert_allclose(np.abs(mirror.normal @ R), [1, 0, 0], atol=1e-6)
+    assert mirror.partners.tolist() == [0, 2, 1, 4, 3]
+
+
+def test_mirrored_poses_give_mirrored_bodies(body):
+    template, skeleton, swap = body
+    model, mirror = skinned(template, skeleton), find_mirror(template, skeleton)
+    rng = np.random.default_rng(0)
+    poses, trans = rng.normal(0, 0.6, (4, 5, 3)), rng.normal(size=(4, 3))
+    y = model.vertices(poses, None, trans)
+    there = model.vertices(mirror_pose(mirror, poses), None, mirror.trans(skeleton, trans))
+    np.testing.assert_allclose(there[:, swap], mirror.points(y), rtol=0, atol=1e-3)
+
+
+def test_mirrored_twice_is_the_identity(body):
+    template, skeleton, _ = body
+    mirror = find_mirror(template, skeleton)
+    poses = np.random.default_rng(1).normal(0, 2, (3, 5, 3))
+    np.testing.assert_allclose(mirror_pose(mirror, mirror_pose(mirror, poses)), poses, atol=1e-12)
+    R, M = skeleton.part_rotations(poses), mirror.matrix
+    np.testing.assert_allclose(skeleton.part_rotations(mirror_pose(mirror, poses)), M @ R[:, mirror.partners] @ M,
+                               atol=1e-12)
+    trans = np.array([1.0, 2.0, 3.0])
+    np.testing.assert_allclose(mirror.trans(skeleton, mirror.trans(skeleton, trans)), trans, atol=1e-12)
+
+
+def test_a_body_without_pairs_may_be_symmetric_all_the_same():
+    mirror = find_mirror(worm(), worm_skeleton(worm()))
+    assert mirror.partners.tolist() == [0, 1, 2, 3] and abs(mirror.normal[0]) < 1e-3
+
+
+def test_says_why_there_is_no_mirror(body):
+    template, skeleton, _ = body
+    far = skeleton.joints + np.where(np.arange(5)[:, None] == 4, [0, 0.5, 0.8], 0)
+    with pytest.raises(ValueError, match=r"not symmetric; in the best mirror, part '.*end' comes to lie 0\.\d+ m"):
+        find_mirror(template, Skeleton(skeleton.part_of_face, skeleton.parents, far, skeleton.names))
+    bent = template.vertices + np.where(template.vertices[:, [0]] > 0.3, [0, 0.5, 0.3], 0)
+    lone = worm_skeleton(template)
+    with pytest.raises(ValueError, match="no two parts can be exchanged"):
+        find_mirror(template.with_vertices(bent), Skeleton(lone.part_of_face, lone.parents,
+                                                           lone.joints * [1, 1, 2] + lone.joints[:, [0]] ** 2))
+
+
+def test_poses_from_angles():
+    skeleton = symmetric_worm()[1]
+    pose = pose_from_angles(skeleton, {"left": [0.1, 0.2, 0.3], 2: ("x", 90), "left end": ((0, 3, 4), -180)})
+    expected = np.zeros((5, 3))
+    expected[1], expected[2], expected[3] = [0.1, 0.2, 0.3], [np.pi / 2, 0, 0], -np.pi * np.array([0, 0.6, 0.8])
+    np.testing.assert_allclose(pose, expected, atol=1e-12)
+    assert not pose_from_angles(skeleton, {}).any()
+
+
+@pytest.mark.parametrize(("angles", "message"), [
+    ({"arm": [0, 0, 0]}, "no 'arm'"), ({7: [0, 0, 0]}, r"0\.\.4"), ({1: [0, 0, 0], "left": [0, 0, 0]}, "twice"),
+    ({1: [1, 2]}, "axis-angle vector"), ({1: ("u", 30)}, "x, y or z"), ({1: ((0, 0, 0), 30)}, "no direction"),
+    ({1: [0, np.nan, 0]}, "axis-angle vector")])
+def test_angles_that_are_none(angles, message):
+    with pytest.raises(ValueError, match=message):
+        pose_from_angles(symmetric_worm()[1], angles)
+
+
+def test_turns_about_the_axes_of_each_frame():
+    skeleton = symmetric_worm()[1]
+    poses = np.random.default_rng(0).normal(0, 0.8, (6, 5, 3))
+    w = np.array([0.3, -0.5, 0.2])
+    R = skeleton.part_rotations(poses)
+    more, above = rotations.exp(w), R[:, 2]
+    expected = {"world": more @ R[:, 4], "own": R[:, 4] @ more,
+                "parent": above @ more @ np.swapaxes(above, -1, -2) @ R[:, 4]}
+    for frame, wanted in expected.items():
+        turned = turn(skeleton, poses, "right end", w, frame)
+        np.testing.assert_allclose(skeleton.part_rotations(turned)[:, 4], wanted, atol=1e-12)
+        np.testing.assert_array_equal(np.delete(turned, 4, axis=-2), np.delete(poses, 4, axis=-2))
+    root = turn(skeleton, poses, 0, ("z", 30), "world")
+    np.testing.assert_allclose(skeleton.part_rotations(root), rotations.exp([0, 0, np.pi / 6]) @ R, atol=1e-12)
+
+
+def test_turned_there_and_back():
+    skeleton = symmetric_worm()[1]
+    pose = np.random.default_rng(0).normal(0, 0.8, (5, 3))
+    for frame in ("parent", "world", "own"):
+        there = turn(skeleton, pose, 3, ("y", 40), frame)
+        np.testing.assert_allclose(turn(skeleton, there, 3, ("y", -40), frame), pose, atol=1e-12)
+    with pytest.raises(ValueError, match="frame"):
+        turn(skeleton, pose, 3, ("y", 40), "sideways")
+    with pytest.raises(ValueError, match="pose"):
+        turn(skeleton, pose[:3], 3, ("y", 40))
+
+
+@pytest.fixture(scope="module")
+def limits():
+    """A hinge about (1, 1, 0), a ball joint around a bent position, and two that hardly move."""
+    skeleton = symmetric_worm()[1]
+    rng = np.random.default_rng(3)
+    poses = rng.normal(0, 0.01, (300, 5, 3))
+    poses[:, 0] = rng.normal(0, 2, (300, 3))
+    poses[:, 1] += rng.uniform(0, 2, (300, 1)) * np.array([1, 1, 0]) / np.sqrt(2)
+    poses[:, 2] = rotations.log(rotations.exp([3.0, 0, 0]) @ rotations.exp(rng.uniform(-0.5, 0.5, (300, 3))))
+    return JointLimits.from_poses(skeleton, poses, coverage=1.0, slack=0.05), poses
+
+
+def test_limits_hold_what_they_were_made_of(limits):
+    bounds, poses = limits
+    assert bounds.excess(poses).max() == 0
+    np.testing.assert_array_equal(bounds.clip(poses), poses)
+    r, dr = bounds.residual(poses[0])
+    assert not r.any() and not dr.any()
+
+
+def test_a_hinge_is_bounded_at_its_ends(limits):
+    bounds, _ = limits
+    hinge = np.array([1, 1, 0]) / np.sqrt(2)
+    pose = np.zeros((4, 5, 3))
+    pose[:, 2] = [3.0, 0, 0]
+    pose[:, 1] = np.array([-0.5, 1.0, 2.6, 0])[:, None] * hinge
+    pose[3, 1] = [0, 0, 0.5]
+    np.testing.assert_allclose(bounds.excess(pose)[:, 1], [0.45, 0, 0.55, 0.45 - 0.02], atol=0.04)
+    np.testing.assert_allclose(bounds.clip(pose)[[0, 2], 1], [-0.05 * hinge, 2.05 * hinge], atol=0.04)
+
+
+def test_bounds_have_no_seam_at_a_half_turn(limits):
+    """The ball joint's poses lie on both sides of π, where axis-angle vectors jump."""
+    bounds, poses = limits
+    assert (poses[:, 2, 0] > 0).any() and (poses[:, 2, 0] < 0).any()
+    assert (bounds.high[2] - bounds.low[2]).max() < np.sqrt(3) + 0.1         # at most the diagonal of the cube
+    assert np.abs(rotations.log(rotations.exp(-bounds.mean[2]) @ rotations.exp([3.0, 0, 0]))).max() < 0.1
+
+
+def test_the_root_is_free(limits):
+    bounds, _ = limits
+    pose = np.zeros((5, 3))
+    pose[0], pose[2] = [3, 0.2, -0.4], [3.0, 0, 0]
+    assert not bounds.excess(pose).any()
+
+
+def test_clipping_reaches_the_bounds_and_stays(limits):
+    bounds, _ = limits
+    pose = np.random.default_rng(0).normal(0, 1, (50, 5, 3))
+    clipped = bounds.clip(pose)
+    assert bounds.excess(pose).max() > 1 and bounds.excess(clipped).max() < 1e-9
+    np.testing.assert_allclose(bounds.clip(clipped), clipped, atol=1e-9)
+
+
+def test_the_residual_is_the_excess_and_its_slope_a_difference(limits):
+    bounds, _ = limits
+    for pose in np.random.default_rng(1).normal(0, 0.9, (5, 5, 3)):
+        r, dr = bounds.residual(pose)
+        np.testing.assert_allclose(np.linalg.norm(r.reshape(5, 3), axis=1), bounds.excess(pose), atol=1e-12)
+        step = 1e-6 * np.eye(15).reshape(15, 5, 3)
+        slope = np.stack([bounds.residual(pose + s)[0] - bounds.residual(pose - s)[0] for s in step], axis=1) / 2e-6
+        np.testing.assert_allclose(dr, slope, atol=1e-7)
+
+
+def test_coverage_leaves_out_what_is_rare():
+    skeleton = symmetric_worm()[1]
+    poses = np.random.default_rng(0).normal(0, 0.2, (400, 5, 3))
+    poses[0, 1] = [2.5, 0, 0]
+    every, most = (JointLimits.from_poses(skeleton, poses, coverage, 0.0) for coverage in (1.0, 0.95))
+    assert every.high[1].max() > 2 or every.low[1].min() < -2
+    assert (most.high - most.low)[1:].max() < 0.9
+    inside = (most.excess(poses)[:, 1:] == 0).mean(axis=0)
+    assert (inside > 0.8).all() and (inside < 0.95).all()
+
+
+def test_limits_refuse_too_little():
+    skeleton = symmetric_worm()[1]
+    with pytest.raises(ValueError, match="at least 5 poses"):
+        JointLimits.from_poses(skeleton, np.zeros((4, 5, 3)))
+    with pytest.raises(ValueError, match="coverage"):
+        JointLimits.from_poses(skeleton, np.zeros((9, 5, 3)), coverage=0)
+    with pytest.raises(ValueError, match="finite"):
+        JointLimits.from_poses(skeleton, np.full((9, 5, 3), np.nan))
+
+
+def test_sampled_poses_follow_the_prior_and_the_limits():
+    rng = np.random.default_rng(0)
+    A = rng.normal(size=(12, 12)) * 0.1
+    A[:3] = 0
+    mean = np.r_[np.zeros((1, 3)), rng.normal(0, 0.1, (3, 3))]
+    model = replace(worm_model(), pose_mean=mean, pose_covariance=A @ A.T)
+    poses = sample_poses(model, 20000, np.random.default_rng(1))
+    flat = poses.reshape(-1, 12)
+    np.testing.assert_allclose(flat.mean(axis=0), mean.ravel(), atol=0.01)
+    np.testing.assert_allclose(np.cov(flat.T), A @ A.T, atol=0.01)
+    assert not poses[:, 0].any()
+    np.testing.assert_array_equal(poses, sample_poses(model, 20000, np.random.default_rng(1)))
+    limits = JointLimits.from_poses(model.skeleton, random_poses(model, 50, rng, 0.1))
+    within = sample_poses(model, 200, np.random.default_rng(1), limits)
+    assert limits.excess(poses[:200]).max() > 0.1 and limits.excess(within).max() < 1e-9

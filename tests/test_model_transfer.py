@@ -1,0 +1,152 @@
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from model_bodies import random_poses, worm_model
+from posing_bodies import skinned, symmetric_worm
+
+from model import fit_pose
+from model.blendscape import BlendScapeModel
+from model.features import linear_features
+from model.fitting import PoseFit, ShapeFit
+from model.transfer import own_body, repose, subject_from_body
+from scanprep.geometry import rotations
+
+
+@pytest.fixture(scope="module")
+def model():
+    return replace(worm_model(), pose_covariance=0.1 * np.eye(12))
+
+
+def fit_of(pose, betas=None):
+    """A fit that says so."""
+    if betas is None:
+        return PoseFit(pose, np.zeros(3), None, 0.0, 0.0, True, 0)
+    return ShapeFit(pose, np.zeros(3), None, 0.0, 0.0, True, 0, betas)
+
+
+def lumpy(model):
+    """The template with detail that the shape components do not have."""
+    x = model.template.vertices
+    lump = 0.02 * np.sin(9 * x[:, :1]) * model.template.vertex_normals
+    return x + lump
+
+
+def test_of_a_body_of_the_model_it_is_that_person(model):
+    rng = np.random.default_rng(0)
+    pose, others = random_poses(model, 1, rng, 0.3)[0], random_poses(model, 4, rng, 0.3)
+    betas, trans = np.array([1.0, -1.0, 0.5]), np.array([0.3, 1.0, -2.0])
+    found = own_body(model, model.vertices(pose, betas, trans), fit_of(pose, betas))
+    assert found.largest < 1e-9
+    np.testing.assert_allclose(found.trans, trans, atol=1e-9)
+    np.testing.assert_allclose(found.subject.vertices(others), model.vertices(others, betas), rtol=0, atol=1e-9)
+    # with betas that say less, the rest of S is known only as far as one pose shows it
+    found = own_body(model, model.vertices(pose, betas, trans), fit_of(pose, np.zeros(3)))
+    assert found.mean < 1e-3
+    far, average = (np.linalg.norm(y - model.vertices(others, betas), axis=-1).mean()
+                    for y in (found.subject.vertices(others), model.vertices(others, np.zeros(3))))
+    assert far < 0.25 * average
+
+
+def test_detail_that_betas_do_not_have_is_kept(model):
+    body, rest = lumpy(model), np.zeros((4, 3))
+    pose = random_poses(model, 1, np.random.default_rng(1), 0.3)[0]
+    lumps = body - model.template.vertices
+    found = own_body(model, body, fit_of(rest))
+    assert found.mean < 1e-3 and found.largest < 5e-3 < np.abs(lumps).max()
+    there = repose(model, body, pose, fit=fit_of(rest)) - model.vertices(pose)
+    R = model.skeleton.part_rotations(pose)[model.skeleton.part_of_vertex(model.template)]
+    turned = np.einsum("nij,nj->ni", R, lumps)
+    # far from the borders a lump turns with its part
+    x = model.template.vertices[:, 0] - 0.3
+    middle = np.abs(x[:, None] - [-0.35, 0.35, 0.7]).min(axis=1) > 0.12
+    share = (there * turned)[middle].sum() / (turned[middle] ** 2).sum()
+    assert 0.8 < share < 1.2
+    np.testing.assert_allclose(repose(model, body, rest, fit=fit_of(rest)), found.vertices - found.trans, atol=1e-12)
+
+
+def test_a_body_that_only_turned_is_turned_back():
+    """Rigid parts, no bulges: whatever the body looks like, stiff motions are undone exactly."""
+    model = worm_model(bulge=0.0)
+    body, R = lumpy(model), rotations.exp([0.5, 1.0, -0.3])
+    pose = np.zeros((4, 3))
+    pose[0] = rotations.log(R)
+    subject = own_body(model, body @ R.T, fit_of(pose)).subject
+    plain = own_body(model, body, fit_of(np.zeros((4, 3)))).subject
+    np.testing.assert_allclose(subject.basis, plain.basis, rtol=0, atol=1e-9)
+
+
+def test_the_pose_is_found(model):
+    rng = np.random.default_rng(2)
+    pose = random_poses(model, 1, rng, 0.2)[0]
+    body = model.vertices(pose, [0.5, -0.5, 0.5], [1.0, 0, 0]) + 1e-3 * rng.normal(size=model.template.vertices.shape)
+    found = own_body(model, body)
+    assert found.mean < 1e-3
+    np.testing.assert_allclose(found.subject.betas, [0.5, -0.5, 0.5], atol=0.1)
+    again = fit_pose(found.subject, body)
+    np.testing.assert_allclose(again.pose, found.pose, atol=0.02)
+    subject = subject_from_body(model, body)
+    np.testing.assert_array_equal(subject.basis, found.subject.basis)
+    assert subject.pose_covariance is model.pose_covariance
+
+
+def test_batches_are_loops_and_trans_is_added(model):
+    body, rest = lumpy(model), fit_of(np.zeros((4, 3)))
+    poses = random_poses(model, 3, np.random.default_rng(3))
+    trans = np.random.default_rng(4).normal(size=(3, 3))
+    batch = repose(model, body, poses, trans, rest)
+    for b in range(3):
+        np.testing.assert_allclose(repose(model, body, poses[b], None, rest) + trans[b], batch[b], atol=1e-12)
+
+
+def test_with_blended_rotations(model):
+    x = model.template.corners.mean(axis=1)[:, 0] - 0.3
+    part = model.skeleton.part_of_face
+    blend = np.zeros((len(x), 4))
+    near = 0.5 * np.exp(-(x + 0.35) ** 2 / 0.01)
+    blend[np.arange(len(x)), part] = 1 - near
+    blend[np.arange(len(x)), np.where(part == 1, 0, 1)] += near
+    fields = {name: getattr(model, name) for name in ("template", "skeleton", "pose_space", "shape_space", "pose_mean",
+                                                      "pose_covariance", "info")}
+    blended = BlendScapeModel(**fields, blend=blend)
+    pose, other = random_poses(model, 2, np.random.default_rng(5), 0.3)
+    betas = np.array([1.0, 1.0, -1.0])
+    found = own_body(blended, blended.vertices(pose, betas), fit_of(pose, betas))
+    np.testing.assert_allclose(found.subject.vertices(other), blended.vertices(other, betas), rtol=0, atol=1e-9)
+    assert own_body(blended, lumpy(model), fit_of(np.zeros((4, 3)))).mean < 1e-3
+
+
+def test_skinning_is_undone_exactly():
+    template, skeleton, _ = symmetric_worm()
+    model = skinned(template, skeleton)
+    rng = np.random.default_rng(6)
+    features = linear_features(skeleton, (np.zeros((3, 0)), *[np.eye(3)] * 4))
+    bends = rng.normal(0, 0.01, (features.count - 5, len(template.vertices), 3))
+    bent = replace(model, features=features, correctives=bends)
+    pose, other = rng.normal(0, 0.5, (2, 5, 3))
+    person = template.vertices + 0.02 * rng.normal(size=template.vertices.shape)
+    trans = np.array([1.0, -1.0, 0.5])
+    own = replace(bent, rest=person)
+    found = own_body(bent, own.vertices(pose, None, trans), fit_of(pose))
+    assert found.largest < 1e-9
+    np.testing.assert_allclose(found.trans, trans, atol=1e-9)
+    np.testing.assert_allclose(found.subject.vertices(other), own.vertices(other), rtol=0, atol=1e-9)
+
+
+def test_refuses_other_bodies(model):
+    rest = fit_of(np.zeros((4, 3)))
+    with pytest.raises(ValueError, match="vertices"):
+        repose(model, np.zeros((5, 3)), np.zeros((4, 3)), fit=rest)
+    with pytest.raises(ValueError, match="vertices"):
+        subject_from_body(model, np.full(model.template.vertices.shape, np.nan))
+    with pytest.raises(ValueError, match="pose"):
+        repose(model, model.template.vertices, np.zeros((3, 3)), fit=rest)
+    with pytest.raises(ValueError, match="vertices"):
+        own_body(model, np.full(model.template.vertices.shape, np.nan), rest)
+
+
+def test_without_shape_components_too(model):
+    bare = replace(model, shape_space=model.shape_space.first(0))
+    pose = random_poses(model, 1, np.random.default_rng(7), 0.2)[0]
+    found = own_body(bare, bare.vertices(pose))
+    assert found.mean < 1e-3 and found.subject.betas is None
