@@ -4,16 +4,14 @@ from __future__ import annotations
 from dataclasses import dataclass, replace
 
 import numpy as np
-from scipy.sparse import csc_array, diags_array
 
-from scanprep.cleaning.remesh import clamped_cotangents
 from scanprep.geometry import rotations
 from scanprep.geometry.mesh import Mesh
-from scanprep.geometry.sparse import factor
 from scanprep.pictures.gltf import UPRIGHT
 from scanprep.skeleton.tree import Skeleton
 
 from ..body import BodyModel
+from ..borders import vertex_weights
 from ..skinning import SkinningModel
 
 CARRIERS = 4                         # joints that carry one vertex: more is not what other programs read
@@ -120,45 +118,19 @@ def make_rig(model: BodyModel, betas: np.ndarray | None = None, shapes: int = 0,
 
 
 def skin_weights(template: Mesh, skeleton: Skeleton, width: float = WIDTH) -> np.ndarray:
-    """How much each part carries each vertex, smooth across the borders of parts.
-
-    The labels of the parts are spread over the surface by one step of diffusion. What comes from a part that is
-    not linked to the vertex's own one counts for the part on the way to it, so that a thigh never carries the
-    other one.
+    """(N, J) how much each part carries each vertex, smooth across the borders of parts, rows sum to 1.
 
     Parameters
     ----------
     width : float, metres
-        How far a label spreads along the surface.
-
-    Returns
-    -------
-    (N, J) float
-        Rows sum to 1.
+        How far a part reaches along the surface.
 
     Raises
     ------
     ValueError
         A width that is not positive.
     """
-    if not width > 0:
-        raise ValueError(f"width: expected a positive length, got {width}")
-    J = len(skeleton.parents)
-    areas = np.maximum(template.vertex_areas, 1e-12)
-    labels = np.zeros((len(template.vertices), J))
-    for corner in range(3):
-        np.add.at(labels, (template.faces[:, corner], skeleton.part_of_face), template.face_areas / 3)
-    alone = ~labels.any(axis=1)
-    labels[alone, skeleton.part_of_vertex(template)[alone]] = areas[alone]
-    spread = factor(csc_array(diags_array(areas) + width**2 * clamped_cotangents(template)))(labels)
-    spread = np.maximum(spread, 0)
-    weights = np.zeros_like(spread)
-    owner, toward = spread.argmax(axis=1), _first_step(skeleton)
-    for p in range(J):
-        mine = owner == p
-        for q in range(J):
-            weights[mine, toward[p, q]] += spread[mine, q]
-    return weights / weights.sum(axis=1, keepdims=True)
+    return vertex_weights(template, skeleton, width)
 
 
 def strongest(weights: np.ndarray, count: int = CARRIERS) -> np.ndarray:
@@ -168,17 +140,6 @@ def strongest(weights: np.ndarray, count: int = CARRIERS) -> np.ndarray:
         np.put_along_axis(kept, np.argsort(-kept, axis=1, kind="stable")[:, count:], 0, axis=1)
     kept[kept < 1e-6] = 0
     return kept / kept.sum(axis=1, keepdims=True)
-
-
-def _first_step(skeleton: Skeleton) -> np.ndarray:
-    """(J, J) the part next to p on the way to q along the tree; p itself where q is p."""
-    J = len(skeleton.parents)
-    step = np.zeros((J, J), dtype=np.int64)
-    for p in range(J):
-        for q in range(J):
-            below = [c for c in np.flatnonzero(skeleton.parents == p) if skeleton.descends[q, c]]
-            step[p, q] = p if p == q else below[0] if below else skeleton.parents[p]
-    return step
 
 
 def joint_places(skeleton: Skeleton, poses: np.ndarray, trans: np.ndarray | None = None) -> np.ndarray:
