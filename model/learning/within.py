@@ -1,0 +1,128 @@
+"""Regressing Q over the bodies of many people, each of whom has something of their own that no pose explains."""
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from scanprep.geometry.mesh import Mesh
+from scanprep.skeleton.tree import Skeleton
+
+from ..pose_space import PoseSpace, faces_of_part
+from .regression import Design, RegressionConfig, choose_design
+
+OWN = 10.0                           # variance between people over that within, of what regression does not explain
+
+
+@dataclass(frozen=True, eq=False)
+class Within:
+    """The transform that makes a regression with a random effect a person an ordinary one.
+
+    From every body a share of the mean over its person's bodies is taken, the larger the more there are. What people
+    have of their own weighs little then, and where each has one body only, all are weighed alike.
+
+    Parameters
+    ----------
+    who : (M,) int
+        Whose body each is, 0..P-1.
+    """
+
+    who: np.ndarray
+
+    def __call__(self, values: np.ndarray) -> np.ndarray:
+        """Values (M, ...) without that share."""
+        out = np.array(values, dtype=np.float64)
+        for person in range(int(self.who.max()) + 1):
+            mine = self.who == person
+            out[mine] -= (1 - 1 / np.sqrt(1 + OWN * mine.sum())) * out[mine].mean(axis=0)
+        return out
+
+    def without_the_person(self, X: np.ndarray, operator: np.ndarray, target: np.ndarray) -> np.ndarray:
+        """Residuals (M, n) of transformed targets, every person predicted from the others, in closed form.
+
+        Parameters
+        ----------
+        X : (M, k) float
+            Transformed features.
+        operator : (k, M) float
+            From targets to coefficients.
+        target : (M, n) float
+        """
+        hat = X @ operator
+        left = target - hat @ target
+        for person in range(int(self.who.max()) + 1):
+            mine = np.flatnonzero(self.who == person)
+            left[mine] = np.linalg.solve(np.eye(len(mine)) * (1 + 1e-9) - hat[np.ix_(mine, mine)], left[mine])
+        return left
+
+
+def choose_within(template: Mesh, skeleton: Skeleton, poses: np.ndarray, Q: np.ndarray, who: np.ndarray,
+                  config: RegressionConfig) -> Design:
+    """The pruning and penalty that predict the edges of left-out people best.
+
+    Parameters
+    ----------
+    poses : (M, J, 3) float, radians
+    Q : (M, F, 3, 3) float
+    who : (M,) int
+        Whose body each is.
+
+    [SCAPE] Eq. 4
+    """
+    best: Design | None = None
+    for pruning in config.prunings:
+        only = replace(config, prunings=(pruning,), ridges=config.ridges[:1], radii=config.radii[:1])
+        design = choose_design(template, skeleton, poses, Q, only, lambda predicted: 0.0)
+        for ridge in config.ridges:
+            error = _left_out_error(replace(design, ridge=ridge), poses, Q, who)
+            if best is None or error < best.left_out_error:
+                best = replace(design, ridge=ridge, left_out_error=error)
+    assert best is not None
+    return best
+
+
+def fit_within(design: Design, poses: np.ndarray, Q: np.ndarray, who: np.ndarray) -> PoseSpace:
+    """Q as a function of the features, as `Design.fit`, were it not for what each person has of their own.
+
+    Parameters
+    ----------
+    poses : (M, J, 3) float, radians
+    Q : (M, F, 3, 3) float
+    who : (M,) int
+        Whose body each is.
+
+    [SCAPE] Eq. 4
+    """
+    features, within = design.features, Within(who)
+    delta = within(features.evaluate(poses))
+    each = faces_of_part(features.skeleton)
+    coefficients = tuple(np.zeros((features.of_part(p).stop - features.of_part(p).start, len(f), 3, 3),
+                                  dtype=np.float32) for p, f in enumerate(each))
+    place = np.empty(len(design.template.faces), dtype=np.int64)
+    for faces in each:
+        place[faces] = np.arange(len(faces))
+    for part, used, faces in design.groups:
+        rows = np.r_[features.starts[part], used]
+        found = _operator(delta[:, rows], design.ridge) @ within(Q[:, faces]).reshape(len(poses), -1)
+        coefficients[part][(rows - features.starts[part])[:, None], place[faces]] = \
+            found.reshape(len(rows), len(faces), 3, 3)
+    return PoseSpace(features, coefficients)
+
+
+def _operator(X: np.ndarray, ridge: float) -> np.ndarray:
+    """(k, M) from targets to coefficients of features (M, k), the first of which is the constant and free."""
+    penalty = np.full(X.shape[1], len(X) * ridge + 1e-12)
+    penalty[0] = 1e-12
+    return np.linalg.solve(X.T @ X + np.diag(penalty), X.T)
+
+
+def _left_out_error(design: Design, poses: np.ndarray, Q: np.ndarray, who: np.ndarray) -> float:
+    """Root mean square error in metres of the edges of left-out people, apart from what is their own."""
+    within = Within(who)
+    delta, total = within(design.features.evaluate(poses)), 0.0
+    v_hat = np.swapaxes(design.template.corners[:, 1:] - design.template.corners[:, :1], -1, -2)
+    for part, used, faces in design.groups:
+        X = delta[:, np.r_[design.features.starts[part], used]]
+        target = within(Q[:, faces] @ v_hat[faces]).reshape(len(poses), -1)
+        total += float((within.without_the_person(X, _operator(X, design.ridge), target) ** 2).sum())
+    return float(np.sqrt(total / (Q.shape[0] * Q.shape[1] * 2)))
