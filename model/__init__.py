@@ -19,6 +19,11 @@ if TYPE_CHECKING:
     from .learning import LearnConfig, learn_scape
     from .learning.skin import SkinConfig, learn_skinning
     from .linear import PointOperator, Subject
+    from .posing.angles import pose_from_angles, sample_poses, turn
+    from .posing.limits import JointLimits
+    from .posing.mirroring import Mirror, find_mirror, mirror_pose
+    from .posing.transfer import TransferConfig, repose, subject_from_body
+    from .resolution.change import ResolutionConfig, change_resolution
     from .scape import ScapeModel
     from .skinning import SkinningModel
 
@@ -36,16 +41,23 @@ _ROOMS = {
     "learning": ("LearnConfig", "learn_scape"),
     "learning.skin": ("SkinConfig", "learn_skinning"),
     "linear": ("PointOperator", "Subject"),
+    "posing.angles": ("pose_from_angles", "sample_poses", "turn"),
+    "posing.limits": ("JointLimits",),
+    "posing.mirroring": ("Mirror", "find_mirror", "mirror_pose"),
+    "posing.transfer": ("TransferConfig", "repose", "subject_from_body"),
+    "resolution.change": ("ResolutionConfig", "change_resolution"),
     "scape": ("ScapeModel",),
     "skinning": ("SkinningModel",),
 }
 _ROOM_OF = {name: room for room, names in _ROOMS.items() for name in names}
 
-__all__ = ["BodyModel", "Derivatives", "FitConfig", "LearnConfig", "PointOperator", "PoseErrors", "PoseFit", "Rig",
-           "Samples", "ScapeModel", "ShapeErrors", "ShapeFit", "SkinConfig", "SkinningModel", "Specificity",
-           "Subject", "compactness", "fit_pose", "fit_shape", "learn_scape", "learn_skinning", "load_model",
-           "make_rig", "motion_correctives", "pose_errors", "sample_bodies", "shape_errors", "skin_weights",
-           "specificity", "write_body_npz", "write_bvh", "write_skinned_glb"]
+__all__ = ["BodyModel", "Derivatives", "FitConfig", "JointLimits", "LearnConfig", "Mirror", "PointOperator",
+           "PoseErrors", "PoseFit", "ResolutionConfig", "Rig", "Samples", "ScapeModel", "ShapeErrors", "ShapeFit",
+           "SkinConfig", "SkinningModel", "Specificity", "Subject", "TransferConfig", "change_resolution",
+           "compactness", "find_mirror", "fit_pose", "fit_shape", "learn_scape", "learn_skinning", "load_model",
+           "make_rig", "mirror_pose", "motion_correctives", "pose_errors", "pose_from_angles", "repose",
+           "sample_bodies", "sample_poses", "shape_errors", "skin_weights", "specificity", "subject_from_body", "turn",
+           "write_body_npz", "write_bvh", "write_skinned_glb"]
 
 
 def __getattr__(name: str) -> Any:

@@ -3,17 +3,19 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from model_bodies import random_poses, worm_model
+from posing_bodies import skinned, symmetric_worm
 
 from model import load_model
 from model.blendscape import BlendScapeModel
-from model.distil import Follower
+from model.cli import group
 from model.features import linear_features
-from model.pieces import Piece, carry_skeleton, gradients_of
 from model.pose_space import PoseSpace
-from model.resolution import ResolutionConfig, change_resolution, resample, subdivide
+from model.resolution.change import ResolutionConfig, change_resolution, resample, resolution_gap, subdivide
+from model.resolution.distil import Follower
+from model.resolution.pieces import Piece, carry_skeleton, gradients_of
 from model.scape import ScapeModel
 from model.shape_space import ShapeSpace
-from scanprep import decimate
+from scanprep import decimate, write_mesh
 from scanprep.geometry import rotations
 from scanprep.geometry.mesh import Mesh
 
@@ -196,3 +198,35 @@ def test_resample_reaches_the_count(model):
         changed = resample(model.template, count)
         assert abs(len(changed.vertices) - count) <= 2
         assert changed.is_closed
+
+
+def test_skinning_models_are_carried_too():
+    template, skeleton, _ = symmetric_worm()
+    rng = np.random.default_rng(0)
+    plain = skinned(template, skeleton)
+    features = linear_features(skeleton, (np.zeros((3, 0)), *[np.eye(3)] * 4))
+    waves = np.sin(3 * template.vertices)
+    model = replace(
+        plain, features=features, correctives=rng.normal(0, 0.02, (features.count - 5, 1, 1)) * waves,
+        rest=plain.rest + 0.01 * waves, shape_mean=1.1 * plain.rest, shape_variances=np.ones(1), shape_total=1.0,
+        shape_components=0.05 * waves[None, :, ::-1])
+    poses = rng.normal(0, 0.3, (3, 5, 3))
+    finer = change_resolution(model, subdivide(template))
+    assert isinstance(finer, type(model)) and finer.shape_total == 1586 / 398
+    for betas in (None, np.ones((3, 1))):
+        assert resolution_gap(model, finer, poses, betas).max() < 2e-3          # of a body 2 m long
+        assert resolution_gap(model, change_resolution(model, decimate(template, 500)), poses, betas).max() < 3e-3
+    same = change_resolution(model, template)
+    np.testing.assert_allclose(same.vertices(poses, [1.0]), model.vertices(poses, [1.0]), atol=1e-12)
+
+
+def test_from_the_command_line(model, tmp_path):
+    model.save(tmp_path / "worm.npz")
+    out = tmp_path / "fine.npz"
+    assert group(["resample", str(tmp_path / "worm.npz"), "--vertices", "600", "-o", str(out)]) == 0
+    assert abs(len(load_model(out).template.vertices) - 600) <= 2
+    write_mesh(tmp_path / "t.ply", subdivide(model.template))
+    assert group(["resample", str(tmp_path / "worm.npz"), "--template", str(tmp_path / "t.ply"), "-o", str(out)]) == 0
+    assert len(load_model(out).template.vertices) == 1586
+    assert group(["resample", str(tmp_path / "worm.npz"), "-o", str(out)]) == 1
+    assert group(["resample", str(tmp_path / "worm.npz"), "--vertices", "20", "-o", str(out)]) == 1

@@ -7,9 +7,11 @@ from posing_bodies import skinned, symmetric_worm
 
 from model import fit_pose
 from model.blendscape import BlendScapeModel
+from model.cli import group
 from model.features import linear_features
 from model.fitting import PoseFit, ShapeFit
-from model.transfer import own_body, repose, subject_from_body
+from model.posing.transfer import own_body, repose, subject_from_body
+from scanprep import read_mesh, write_mesh
 from scanprep.geometry import rotations
 
 
@@ -150,3 +152,19 @@ def test_without_shape_components_too(model):
     pose = random_poses(model, 1, np.random.default_rng(7), 0.2)[0]
     found = own_body(bare, bare.vertices(pose))
     assert found.mean < 1e-3 and found.subject.betas is None
+
+
+def test_from_the_command_line(model, tmp_path):
+    model.save(tmp_path / "worm.npz")
+    write_mesh(tmp_path / "body.ply", model.template.with_vertices(lumpy(model)))
+    poses = random_poses(model, 3, np.random.default_rng(8), 0.3)
+    np.savez(tmp_path / "motion.npz", poses=poses.reshape(3, 12), trans=np.ones((3, 3)), mocap_frame_rate=30.0,
+             betas=np.zeros(3), surface_model_type="scape")
+    arguments = ["repose", str(tmp_path / "worm.npz"), str(tmp_path / "body.ply"), "--poses",
+                 str(tmp_path / "motion.npz"), "-o", str(tmp_path / "out")]
+    assert group(arguments) == 0
+    expected = repose(model, lumpy(model), poses, np.ones((3, 3)))
+    for t in range(3):
+        np.testing.assert_allclose(read_mesh(tmp_path / "out" / f"{t:05d}.ply").vertices, expected[t], atol=1e-5)
+    write_mesh(tmp_path / "body.ply", model.template.submesh(np.arange(100))[0])
+    assert group(arguments) == 1

@@ -6,14 +6,14 @@ from functools import singledispatch
 
 import numpy as np
 
-from .body import BodyModel
-from .carriers import build_basis
-from .features import Terms
-from .fitting import FitConfig, PoseFit, ShapeFit, fit_pose, fit_shape
-from .gradients import GradientSystem, edges, shape_gradients
-from .linear import Subject, check_pose
-from .scape import ScapeModel
-from .skinning import SkinningModel
+from ..body import BodyModel
+from ..carriers import build_basis
+from ..features import Terms
+from ..fitting import FitConfig, PoseFit, ShapeFit, fit_pose, fit_shape
+from ..gradients import GradientSystem, edges, shape_gradients
+from ..linear import Subject, check_pose
+from ..scape import ScapeModel
+from ..skinning import SkinningModel
 
 
 @dataclass(frozen=True)

@@ -9,9 +9,9 @@ import numpy as np
 from scanprep.geometry import rotations
 from scanprep.skeleton.tree import Skeleton
 
-from .body import BodyModel
+from ..body import BodyModel
+from ..linear import check_pose
 from .limits import JointLimits
-from .linear import check_pose
 
 Frame = Literal["parent", "world", "own"]
 

@@ -1,7 +1,7 @@
 """What a model carried to another resolution still lacks, found by comparing the two in many poses."""
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -9,11 +9,13 @@ import numpy as np
 from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.surface import Surface
 
-from .gradients import edges
+from ..gradients import edges
+from ..pose_space import PoseSpace
+from ..scape import ScapeModel
+from ..shape_space import ShapeSpace
 from .pieces import gradients_of
-from .pose_space import PoseSpace
-from .scape import ScapeModel
-from .shape_space import ShapeSpace
+
+Progress = Callable[[int, int], None]
 
 PER_FEATURE = 3                      # poses for each feature of the part that has most, if that is more
 SHRINK = 1e-3                        # of the mean square: holds what the poses do not show
@@ -73,53 +75,51 @@ class Distillation:
         To be imitated.
     follow : Follower
         The imitation's vertices on the model's.
-    poses : (M, J, 3) float, radians
+    rounds : int
+        How often.
+    progress : callable, optional
+        Called with the work done and the whole.
     """
 
     model: ScapeModel
     follow: Follower
-    poses: np.ndarray
+    rounds: int
+    progress: Progress | None = None
 
-    def pose_space(self, imitation: ScapeModel, rounds: int) -> ScapeModel:
-        """The imitation with a pose space corrected on the template's own body.
+    def pose_space(self, imitation: ScapeModel, poses: np.ndarray) -> ScapeModel:
+        """The imitation with a pose space corrected on the template's own body in poses (M, J, 3).
 
         [SCAPE] Eq. 4
         """
-        wanted = self.follow.positions(self.model.subject(None).vertices(self.poses))
-        for _ in range(rounds):
-            left = wanted - imitation.subject(None).vertices(self.poses)
-            imitation = replace(imitation, pose_space=self._corrected(imitation, left))
+        wanted = self.follow.positions(self.model.subject(None).vertices(poses))
+        for _ in range(self.rounds):
+            left = wanted - imitation.subject(None).vertices(poses)
+            local = np.stack([_unturned(imitation, d, pose) for d, pose in zip(left, poses, strict=True)])
+            imitation = replace(imitation, pose_space=_corrected(imitation, poses, local))
         return imitation
 
-    def _corrected(self, imitation: ScapeModel, left: np.ndarray) -> PoseSpace:
-        space, v_hat = imitation.pose_space, edges(imitation.template.vertices, imitation.template.faces)
-        local = np.stack([_unturned(imitation, d, pose) for d, pose in zip(left, self.poses, strict=True)])
-        delta = space.features.evaluate(self.poses)
-        coefficients = []
-        for p, faces in enumerate(space.faces_of_part):
-            X = delta[:, space.features.of_part(p)]
-            shrink = SHRINK * np.diag(np.maximum((X**2).sum(axis=0), 1e-12))
-            slope = np.linalg.solve(X.T @ X + shrink, X.T @ local[:, faces].reshape(len(X), -1))
-            more = gradients_of(v_hat[faces], slope.reshape(-1, len(faces), 2, 3))
-            coefficients.append((space.coefficients[p] + more).astype(space.coefficients[p].dtype))
-        return PoseSpace(space.features, tuple(coefficients))
-
-    def shape_space(self, imitation: ScapeModel, rounds: int) -> ScapeModel:
-        """The imitation with a mean person and shape components corrected.
+    def shape_space(self, imitation: ScapeModel, poses: np.ndarray) -> ScapeModel:
+        """The imitation with a mean person and shape components corrected in poses (M, J, 3).
 
         [SCAPE] Eq. 8
         """
         if not self.model.n_betas:
             return imitation
-        wanted = [self.follow.positions(mean) for mean, _ in self._people(self.model)]
-        slopes = [self.follow.displacements(slope).astype(np.float32) for _, slope in self._people(self.model)]
-        for _ in range(rounds):
+        total, done = (self.rounds + 1) * len(poses), 0
+        wanted = []
+        for pose in poses:
+            mean, slope = _people(self.model, pose)
+            wanted.append((self.follow.positions(mean), self.follow.displacements(slope).astype(np.float32)))
+            done = self._tell(done + 1, total)
+        for _ in range(self.rounds):
             square, product = np.zeros((3, 3)), np.zeros((3, 3))
-            for pose, y, dy, (mean, slope) in zip(self.poses, wanted, slopes, self._people(imitation), strict=True):
+            for pose, (y, dy) in zip(poses, wanted, strict=True):
+                mean, slope = _people(imitation, pose)
                 local = _unturned(imitation, np.concatenate([(y - mean)[None], dy - slope]), pose)
                 posed = _posed(imitation, pose)
                 square = square + np.swapaxes(posed, -1, -2) @ posed
                 product = product + np.swapaxes(local, -1, -2) @ posed
+                done = self._tell(done + 1, total)
             shrink = SHRINK * np.trace(square, axis1=-2, axis2=-1)[:, None, None] * np.eye(3)
             more, space = product @ np.linalg.inv(square + shrink), imitation.shape_space
             imitation = replace(imitation, shape_space=ShapeSpace(
@@ -127,10 +127,29 @@ class Distillation:
                 (space.components + more[1:]).astype(space.components.dtype), space.variances, space.total_variance))
         return imitation
 
-    def _people(self, model: ScapeModel) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-        """The mean person (N, 3) in every pose, and the change (K, N, 3) by each beta."""
-        for pose in self.poses:
-            yield model.vertices(pose, np.zeros(model.n_betas)), np.moveaxis(model.shape_jacobian(pose), -1, 0)
+    def _tell(self, done: int, total: int) -> int:
+        if self.progress:
+            self.progress(done, total)
+        return done
+
+
+def _corrected(model: ScapeModel, poses: np.ndarray, local: np.ndarray) -> PoseSpace:
+    """The pose space with a regression of edges (M, F, 2, 3) that are left in poses (M, J, 3) added."""
+    space, v_hat = model.pose_space, edges(model.template.vertices, model.template.faces)
+    delta = space.features.evaluate(poses)
+    coefficients = []
+    for p, faces in enumerate(space.faces_of_part):
+        X = delta[:, space.features.of_part(p)]
+        shrink = SHRINK * np.diag(np.maximum((X**2).sum(axis=0), 1e-12))
+        slope = np.linalg.solve(X.T @ X + shrink, X.T @ local[:, faces].reshape(len(X), -1))
+        more = gradients_of(v_hat[faces], slope.reshape(-1, len(faces), 2, 3))
+        coefficients.append((space.coefficients[p] + more).astype(space.coefficients[p].dtype))
+    return PoseSpace(space.features, tuple(coefficients))
+
+
+def _people(model: ScapeModel, pose: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """The mean person (N, 3) in a pose, and the change (K, N, 3) by each beta."""
+    return model.vertices(pose, np.zeros(model.n_betas)), np.moveaxis(model.shape_jacobian(pose), -1, 0)
 
 
 def drawn_poses(model: ScapeModel, count: int) -> np.ndarray:

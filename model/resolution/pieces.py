@@ -12,8 +12,8 @@ from scanprep.geometry.surface import Surface
 from scanprep.skeleton.labels import keep_connected
 from scanprep.skeleton.tree import Skeleton
 
-from .gradients import edges
-from .stitching import edge_operator
+from ..gradients import edges
+from ..stitching import edge_operator
 
 LEAST = 6                            # triangles that a part needs: fewer are no piece of surface
 

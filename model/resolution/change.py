@@ -13,14 +13,14 @@ from scanprep.geometry.mesh import Mesh, check_template
 from scanprep.geometry.surface import Surface
 from scanprep.skeleton.tree import Skeleton
 
-from .blendscape import BlendScapeModel
-from .body import BodyModel
-from .distil import Distillation, Follower, drawn_poses, enough_poses
+from ..blendscape import BlendScapeModel
+from ..body import BodyModel
+from ..pose_space import PoseSpace, faces_of_part
+from ..scape import ScapeModel
+from ..shape_space import ShapeSpace
+from ..skinning import SkinningModel
+from .distil import Distillation, Follower, Progress, drawn_poses, enough_poses
 from .pieces import Piece, carry_skeleton, gradients_of
-from .pose_space import PoseSpace, faces_of_part
-from .scape import ScapeModel
-from .shape_space import ShapeSpace
-from .skinning import SkinningModel
 
 ASTRAY = 2.0                         # mean edges of the coarser surface that the two may lie apart
 
@@ -45,7 +45,8 @@ class ResolutionConfig:
     rounds: int = 2
 
 
-def change_resolution(model: BodyModel, template: Mesh, config: ResolutionConfig | None = None) -> BodyModel:
+def change_resolution(model: BodyModel, template: Mesh, config: ResolutionConfig | None = None,
+                      progress: Progress | None = None) -> BodyModel:
     """Carry a model to a coarser or finer triangulation, so that pose, betas and trans keep their meaning.
 
     Parameters
@@ -54,6 +55,8 @@ def change_resolution(model: BodyModel, template: Mesh, config: ResolutionConfig
     template : Mesh
         Other triangles on the surface of the model's template, in the same place.
     config : ResolutionConfig, optional
+    progress : callable, optional
+        Called with the work done and the whole.
 
     Returns
     -------
@@ -70,17 +73,18 @@ def change_resolution(model: BodyModel, template: Mesh, config: ResolutionConfig
     """
     check_template(template)
     _check_same_surface(model.template, template)
-    return carry_model(model, template, config or ResolutionConfig())
+    return carry_model(model, template, config or ResolutionConfig(), progress)
 
 
 @singledispatch
-def carry_model(model: BodyModel, template: Mesh, config: ResolutionConfig) -> BodyModel:
+def carry_model(model: BodyModel, template: Mesh, config: ResolutionConfig, progress: Progress | None) -> BodyModel:
     """What `change_resolution` does for one kind of model."""
     raise ValueError(f"model: the resolution of the kind '{model.kind}' cannot be changed")
 
 
 @carry_model.register
-def _carry_scape(model: ScapeModel, template: Mesh, config: ResolutionConfig) -> ScapeModel:
+def _carry_scape(model: ScapeModel, template: Mesh, config: ResolutionConfig, progress: Progress | None
+                 ) -> ScapeModel:
     skeleton = carry_skeleton(model.skeleton, model.template, template)
     pieces = [Piece(model.template, template, old, new) for old, new in
               zip(faces_of_part(model.skeleton), faces_of_part(skeleton), strict=True)]
@@ -89,9 +93,9 @@ def _carry_scape(model: ScapeModel, template: Mesh, config: ResolutionConfig) ->
         shape_space=_carry_shape_space(model, pieces), info=carry_info(model, template), **_carry_blend(model, pieces))
     if not config.rounds:
         return carried
-    follow, poses = Follower(model.template, template), drawn_poses(model, enough_poses(model, config.poses))
-    carried = Distillation(model, follow, poses).pose_space(carried, config.rounds)
-    return Distillation(model, follow, poses[:config.shape_poses]).shape_space(carried, config.rounds)
+    poses = drawn_poses(model, enough_poses(model, config.poses))
+    teacher = Distillation(model, Follower(model.template, template), config.rounds, progress)
+    return teacher.shape_space(teacher.pose_space(carried, poses), poses[:config.shape_poses])
 
 
 def _carry_pose_space(space: PoseSpace, skeleton: Skeleton, pieces: list[Piece]) -> PoseSpace:
@@ -130,7 +134,8 @@ def _carry_blend(model: ScapeModel, pieces: list[Piece]) -> dict[str, np.ndarray
 
 
 @carry_model.register
-def _carry_skinning(model: SkinningModel, template: Mesh, config: ResolutionConfig) -> SkinningModel:
+def _carry_skinning(model: SkinningModel, template: Mesh, config: ResolutionConfig, progress: Progress | None
+                    ) -> SkinningModel:
     skeleton = carry_skeleton(model.skeleton, model.template, template)
     follow = Follower(model.template, template)
 
@@ -154,8 +159,34 @@ def carry_info(model: BodyModel, template: Mesh) -> dict[str, Any]:
     old, marks = model.template, model.info.get("landmarks", {})
     points = old.vertices[np.array(list(marks.values()), dtype=np.int64)]
     nearest = cKDTree(template.vertices).query(points)[1]
-    return {**model.info, "landmarks": {name: int(v) for name, v in zip(marks, nearest, strict=True)},
+    # digests of training bodies say nothing of bodies in another topology
+    kept = {name: value for name, value in model.info.items() if name != "digests"}
+    return {**kept, "landmarks": {name: int(v) for name, v in zip(marks, nearest, strict=True)},
             "resolution_of": f"{len(old.vertices)} vertices, {len(old.faces)} triangles"}
+
+
+def resolution_gap(model: BodyModel, changed: BodyModel, poses: np.ndarray, betas: np.ndarray | None = None
+                   ) -> np.ndarray:
+    """How far two resolutions of a model are apart, at the vertices of the second.
+
+    Parameters
+    ----------
+    model, changed : BodyModel
+    poses : (B, J, 3) float, radians
+    betas : (B, k) float, optional
+        None is the template's own body.
+
+    Returns
+    -------
+    (B,) float, metres
+        Mean over the vertices.
+    """
+    follow, gaps = Follower(model.template, changed.template), []
+    for b, pose in enumerate(poses):
+        mine = None if betas is None else betas[b]
+        off = follow.positions(model.vertices(pose, mine)) - changed.vertices(pose, mine)
+        gaps.append(np.linalg.norm(off, axis=1).mean())
+    return np.array(gaps)
 
 
 def subdivide(mesh: Mesh, times: int = 1) -> Mesh:

@@ -1,0 +1,1 @@
+"""The same model with fewer or more triangles."""

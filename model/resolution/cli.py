@@ -1,0 +1,55 @@
+"""`scape model resample`: a model with fewer or more triangles."""
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+import tyro
+
+from scanprep.cli import Output, Unit
+from scanprep.console import Metric, Outcome, bar
+from scanprep.geometry.files import read_mesh
+
+from ..cli import ModelArg
+from ..files import load_model
+from ..posing.angles import sample_poses
+from .change import ResolutionConfig, change_resolution, resample, resolution_gap
+
+MM = 1000.0
+MEASURED = 20                        # poses in which the two models are compared
+
+
+def resample_model(model: ModelArg, output: Output, template: Path | None = None, vertices: int | None = None,
+                   unit: Unit | None = None, config: Annotated[ResolutionConfig, tyro.conf.arg(name="")]
+                   = ResolutionConfig()) -> Outcome:  # noqa: B008
+    """Carry a model to fewer or more triangles; poses, betas and places keep their meaning.
+
+    Example: scape model resample model.npz --vertices 5389 -o coarse.npz
+
+    Args:
+        model: Model file.
+        output: Model file to write.
+        template: Mesh with other triangles on the surface of the model's template.
+        vertices: Without a template: how many vertices to decimate or subdivide to.
+        unit: Unit of the template.
+        config: Settings.
+    """
+    if (template is None) == (vertices is None):
+        raise ValueError("--template and --vertices: expected one of them")
+    loaded = load_model(model)
+    mesh = resample(loaded.template, vertices) if vertices is not None else read_mesh(Path(str(template)), unit)
+    with bar("carrying the model") as progress:
+        changed = change_resolution(loaded, mesh, config, progress)
+    changed.save(output)
+    rng = np.random.default_rng(1)
+    poses, betas = sample_poses(loaded, MEASURED, rng), rng.normal(size=(MEASURED, loaded.n_betas))
+    gaps = [("the template's own body", resolution_gap(loaded, changed, poses))]
+    if loaded.n_betas:
+        gaps.append(("random people", resolution_gap(loaded, changed, poses, betas)))
+    return Outcome(output, [
+        Metric("vertices before", len(loaded.template.vertices)), Metric("vertices", len(mesh.vertices)),
+        Metric("triangles", len(mesh.faces)),
+        *(Metric(f"distance in {MEASURED} random poses, {who}, {what}", MM * float(value), "mm")
+          for who, gap in gaps for what, value in (("mean", gap.mean()), ("worst pose", gap.max())))],
+        {"resample": config})
