@@ -230,9 +230,10 @@ def test_evaluate_command(files):
     out = files / "out"
     done = evaluate(files / "worm.npz", out, files / "poses", files / "held", (1, 3), files / "train")
     figures = {m.name: m.value for m in done.metrics}
-    assert figures["pose: bodies"] == 3 and figures["pose: mean"] < 0.01
-    assert figures["people, all of these components: mean"] < 0.01 < figures["people, 1 components: mean"]
-    assert figures["people, 1 components: mean of vertex PCA"] > 0 and figures["specificity, 3 components"] > 0
+    assert figures["poses"] == figures["people"] == 3 and figures["poses: mean"] < 0.01
+    assert figures["people: mean"] == figures["people, components 3"] < 0.01 < figures["people, components 1"]
+    assert figures["people, components 1, vertex PCA"] > 0 and figures["specificity, components 3"] > 0
+    assert figures["variance, components 3"] == pytest.approx(100)
     assert "nobody checked" in figures["note"] and done.output == out
     page = (out / "report.html").read_text()
     assert page.count("<img") >= 9 and "src=\"http" not in page and "not held-out" not in page
@@ -240,7 +241,7 @@ def test_evaluate_command(files):
     assert [(r["components"], r["name"]) for r in people] == [(c, f"p{i}") for c in "13" for i in range(3)]
     poses = list(csv.DictReader((out / "poses.csv").open()))
     assert [r["name"] for r in poses] == ["bent0", "bent1", "bent2"] and {r["converged"] for r in poses} == {"yes"}
-    assert np.mean([float(r["mean_mm"]) for r in poses]) == pytest.approx(figures["pose: mean"], abs=1e-3)
+    assert np.mean([float(r["mean_mm"]) for r in poses]) == pytest.approx(figures["poses: mean"], abs=1e-3)
 
 
 def test_evaluate_says_when_the_bodies_trained_the_model(model, files):

@@ -158,35 +158,28 @@ def _notes(model: BodyModel, posed: np.ndarray | None, people: np.ndarray | None
 def _metrics(model: BodyModel, found: Findings) -> list[Metric]:
     rows = []
     if found.poses is not None:
-        rows += _about("pose", found.poses.errors, found.pose_names)
-        rows.append(Metric("pose: fits that converged", 100 * float(found.poses.converged.mean()), "%"))
+        rows += _about("poses", found.poses.errors, found.pose_names, found.poses.converged)
     if found.shapes is not None:
-        shapes = found.shapes
-        for count, mean, p95, _, held, pca in generalisation_rows(shapes):
-            rows += [Metric(f"people, {count} components: mean", mean, "mm"),
-                     Metric(f"people, {count} components: 95th percentile", p95, "mm"),
-                     Metric(f"people, {count} components: mean with the pose held", held, "mm")]
-            if shapes.vertex_pca is not None:
-                rows.append(Metric(f"people, {count} components: mean of vertex PCA", pca, "mm"))
-        rows += _about("people, all of these components", shapes.errors[-1], found.shape_names)[1:]
-        rows.append(Metric("people: fits that converged", 100 * float(shapes.converged.mean()), "%"))
+        rows += _about("people", found.shapes.errors[-1], found.shape_names, found.shapes.converged)
+        for count, fitted, _, _, held, pca in generalisation_rows(found.shapes):
+            rows += [Metric(f"people, components {count}", fitted, "mm"),
+                     Metric(f"people, components {count}, pose held", held, "mm")]
+            if found.shapes.vertex_pca is not None:
+                rows.append(Metric(f"people, components {count}, vertex PCA", pca, "mm"))
+            rows.append(Metric(f"variance, components {count}", 100 * float(compactness(model)[count - 1]), "%"))
     if found.specificity is not None:
-        for count, far in zip(found.specificity.counts, found.specificity.distances, strict=True):
-            rows.append(Metric(f"specificity, {count} components", MM * float(far.mean()), "mm"))
-        rows.append(Metric("training people to their nearest other", MM * found.specificity.between_people, "mm"))
-    if model.n_betas:
-        explained = compactness(model)
-        rows += [Metric(f"variance that {k} components explain", 100 * float(explained[k - 1]), "%")
-                 for k in (1, 5, 10, 20, 40, 80) if k <= model.n_betas]
+        rows += [Metric(f"specificity, components {count}", MM * float(far.mean()), "mm")
+                 for count, far in zip(found.specificity.counts, found.specificity.distances, strict=True)]
+        rows.append(Metric("training people to their nearest", MM * found.specificity.between_people, "mm"))
     return rows
 
 
-def _about(what: str, errors: Errors, names: Sequence[str]) -> list[Metric]:
-    return [Metric(f"{what}: bodies", len(errors.mean)), Metric(f"{what}: mean", MM * errors.overall, "mm"),
+def _about(what: str, errors: Errors, names: Sequence[str], converged: np.ndarray) -> list[Metric]:
+    return [Metric(what, len(errors.mean)), Metric(f"{what}: mean", MM * errors.overall, "mm"),
             Metric(f"{what}: 95th percentile", MM * float(errors.p95.mean()), "mm"),
-            Metric(f"{what}: worst body", names[int(errors.mean.argmax())]),
-            Metric(f"{what}: mean of the worst body", MM * float(errors.mean.max()), "mm"),
-            Metric(f"{what}: worst vertex", MM * float(errors.worst.max()), "mm")]
+            Metric(f"{what}: worst", MM * float(errors.mean.max()), f"mm, {names[int(errors.mean.argmax())]}"),
+            Metric(f"{what}: worst vertex", MM * float(errors.worst.max()), "mm"),
+            Metric(f"{what}: fits that converged", 100 * float(converged.mean()), "%")]
 
 
 def _write_tables(output: Path, model: BodyModel, found: Findings) -> None:

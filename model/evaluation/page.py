@@ -89,7 +89,7 @@ def _pose_section(page: Page, model: BodyModel, found: Findings) -> None:
                  "where the error lies: mean of all bodies, shown on the body at rest")
     page.picture(picture_extremes(model, poses.errors, names, bodies, lambda i: poses.vertices(model, i), poses.poses),
                  "the best and the worst body: as given, then the fitted body coloured by its error")
-    page.table(_part_rows(model, poses.errors), ("part", "mean (mm)", "worst body (mm)", "which"))
+    page.table(_part_rows(model, poses.errors, names), ("part", "mean (mm)", "worst body (mm)", "which"))
 
 
 def _shape_section(page: Page, model: BodyModel, found: Findings) -> None:
@@ -123,10 +123,10 @@ def _space_section(page: Page, model: BodyModel, found: Findings) -> None:
         page.picture(picture_samples(model, found.samples), "random bodies")
 
 
-def _part_rows(model: BodyModel, errors: Errors) -> list[tuple[str, float, float, int]]:
+def _part_rows(model: BodyModel, errors: Errors, names: Sequence[str]) -> list[tuple[str, float, float, str]]:
     order = np.argsort(-errors.by_part.mean(axis=0))
     return [(model.skeleton.names[p], MM * float(errors.by_part[:, p].mean()), MM * float(errors.by_part[:, p].max()),
-             int(errors.by_part[:, p].argmax()) + 1) for p in order]
+             names[int(errors.by_part[:, p].argmax())]) for p in order]
 
 
 def generalisation_rows(shapes: ShapeErrors) -> list[tuple[int, float, float, float, float, float]]:
@@ -208,7 +208,7 @@ def chart_bodies(errors: Errors, names: Sequence[str]) -> Any:
     axes.plot(place, MM * errors.p95[order], "_", color="0.35", markersize=7, label="95th percentile")
     axes.set(ylabel="distance (mm)", ylim=(0, None), xlim=(-0.7, len(order) - 0.3))
     axes.set_xticks(place, [names[i] for i in order], rotation=90, fontsize=8 if len(order) <= 50 else 5)
-    axes.legend(frameon=False)
+    axes.legend(frameon=False, loc="lower right", bbox_to_anchor=(1, 1), ncols=2)
     return figure
 
 
