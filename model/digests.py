@@ -9,7 +9,7 @@ from scanprep.geometry.mesh import Mesh
 
 from .body import BodyModel
 
-LENGTH = 16                          # hexadecimal digits: two of a billion bodies meet once in ten lives
+LENGTH = 16                          # hexadecimal digits, 64 bits: chance meetings are rare below a billion bodies
 
 
 def body_digest(vertices: np.ndarray) -> str:

@@ -3,6 +3,7 @@ import json
 
 import numpy as np
 import pytest
+from conformance_bodies import KINDS
 from model_bodies import random_poses, worm_model
 
 from model import LearnConfig, learn_scape
@@ -83,6 +84,17 @@ def test_more_components_leave_less_and_all_leave_nothing(model, people):
     np.testing.assert_allclose(found.vertices(model, 2, 4), people[4], atol=1e-4)
     held = [e.overall for e in found.pose_held]
     assert all(free <= fixed for free, fixed in zip(left, held, strict=True))
+
+
+@pytest.mark.parametrize("kind", list(KINDS))
+def test_every_kind_of_model_is_measured(kind):
+    model, rng = KINDS[kind](), np.random.default_rng(3)
+    poses, betas = random_poses(model, 2, rng, 0.2), rng.normal(size=(2, model.n_betas))
+    assert pose_errors(model, model.vertices(poses)).errors.worst.max() < 1e-4
+    found = shape_errors(model, model.vertices(poses, betas), (1, model.n_betas), config=FitConfig(sample=100))
+    assert found.errors[-1].worst.max() < 2e-4 < 2e-3 < found.errors[0].overall
+    drawn = sample_bodies(model, 2, rng, pose_too=True)
+    np.testing.assert_allclose(drawn.vertices[1], model.vertices(drawn.poses[1], drawn.betas[1]), atol=1e-12)
 
 
 def test_with_the_right_pose_betas_are_exact(model):

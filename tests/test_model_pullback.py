@@ -1,5 +1,6 @@
 import numpy as np
 import pytest
+from conformance_bodies import KINDS
 from model_bodies import random_poses, worm_model
 
 from model.body import BodyModel
@@ -20,6 +21,16 @@ def test_backwards_is_the_transpose_of_forwards(model, size):
     for fast, full in zip(pull_back(model, force, pose, betas), slow, strict=True):
         assert fast.shape == full.shape
         np.testing.assert_allclose(fast, full, atol=1e-6 * np.abs(full).max())
+
+
+@pytest.mark.parametrize("kind", list(KINDS))
+def test_every_kind_of_model_goes_backwards(kind):
+    rng, model = np.random.default_rng(2), KINDS[kind]()
+    pose, betas = random_poses(model, 1, rng)[0], rng.normal(size=3)
+    force, full = rng.normal(size=model.template.vertices.shape), model.jacobian(pose, betas)
+    by_pose, by_betas = pull_back(model, force, pose, betas)
+    np.testing.assert_allclose(by_pose, np.tensordot(force, full.pose, axes=2), atol=1e-5)
+    np.testing.assert_allclose(by_betas, np.tensordot(force, full.betas, axes=2), atol=1e-5)
 
 
 def test_gradient_is_the_finite_difference(model):
