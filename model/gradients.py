@@ -138,15 +138,13 @@ def pose_gradients(system: GradientSystem, local: np.ndarray) -> np.ndarray:
 def shape_gradients(system: GradientSystem, posed: np.ndarray, local: np.ndarray) -> np.ndarray:
     """S of every triangle of one person.
 
-    The matrix holds the person's own `Q v̂`, so every person has a factorisation of their own.
-
     Parameters
     ----------
     system : GradientSystem
         Without parts: all neighbours are smoothed.
     posed : (F, 2, 3) float, metres
-        `Q v̂` at the person's pose.
-    local : (F, 2, 3) float, metres
+        `Q v̂` at the person's pose; (F, 2n, 3) for n scans of one person together.
+    local : as posed
         Edges of the person's scan in the frames of the parts.
 
     Returns
@@ -155,8 +153,30 @@ def shape_gradients(system: GradientSystem, posed: np.ndarray, local: np.ndarray
 
     [SCAPE] Eq. 8
     """
+    return ShapeSolver(system, posed)(local)
+
+
+class ShapeSolver:
+    """Eq. 8 for one person, factored once.
+
+    The matrix holds the person's own `Q v̂`, so every person has a factorisation of their own.
+
+    Parameters
+    ----------
+    system, posed
+        As for `shape_gradients`.
+
+    [SCAPE] Eq. 8
+    """
+
     # A shared preconditioner and conjugate gradients take 20-40 steps and save a third of the time at best,
     # with people in about one pose; in mixed poses they take longer than factoring.
-    solver = Factored(system.matrix(np.swapaxes(posed, -1, -2) @ posed))
-    x = solver.solve(system.right_side(posed, local).reshape(-1, 3))
-    return np.swapaxes(x.reshape(-1, 3, 3), -1, -2)
+
+    def __init__(self, system: GradientSystem, posed: np.ndarray) -> None:
+        self.system, self.posed = system, posed
+        self._factored = Factored(system.matrix(np.swapaxes(posed, -1, -2) @ posed))
+
+    def __call__(self, local: np.ndarray) -> np.ndarray:
+        """S (F, 3, 3) for edges `local`, as for `shape_gradients`."""
+        x = self._factored.solve(self.system.right_side(self.posed, local).reshape(-1, 3))
+        return np.swapaxes(x.reshape(-1, 3, 3), -1, -2)

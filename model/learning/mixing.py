@@ -17,7 +17,7 @@ from scanprep.skeleton.tree import Skeleton
 from ..carriers import rigid_weights
 from ..digests import body_digests, digest
 from ..fitting import FitConfig, ShapeFitter
-from ..gradients import GradientSystem, pose_gradients, shape_gradients
+from ..gradients import GradientSystem, ShapeSolver, pose_gradients
 from ..pose_space import PoseSpace
 from ..scape import ScapeModel
 from ..shape_space import learn_shape_space
@@ -239,6 +239,8 @@ def _at_rest(space: PoseSpace) -> PoseSpace:
 def people_shapes(mix: Mix, poses: np.ndarray, space: PoseSpace) -> np.ndarray:
     """S (P, F, 3, 3) of every person from all of his bodies together, in float32 to halve the memory.
 
+    As with Q, Eq. 8 does not know of the stitching: what the stitched bodies leave is added and solved for again.
+
     [SCAPE] Eq. 8
     """
     carriage = mix.carriage
@@ -246,10 +248,21 @@ def people_shapes(mix: Mix, poses: np.ndarray, space: PoseSpace) -> np.ndarray:
     S = np.empty((mix.people, len(carriage.template.faces), 3, 3), dtype=np.float32)
     for person in range(mix.people):
         mine = mix.of(person)
-        posed = carriage.v_hat @ np.swapaxes(space.gradients(poses[mine]), -1, -2)
-        local = carriage.local_edges(mix.bodies[mine], poses[mine])
-        S[person] = shape_gradients(system, np.concatenate(list(posed), axis=1), np.concatenate(list(local), axis=1))
+        Q = space.gradients(poses[mine])
+        posed = _side_by_side(carriage.v_hat @ np.swapaxes(Q, -1, -2))
+        solve = ShapeSolver(system, posed)
+        found = solve(_side_by_side(carriage.local_edges(mix.bodies[mine], poses[mine])))
+        for _ in range(mix.config.steps):
+            left = mix.bodies[mine] - np.stack([carriage.stitched(found @ q, pose)
+                                                for q, pose in zip(Q, poses[mine], strict=True)])
+            found = solve(posed @ np.swapaxes(found, -1, -2) + _side_by_side(carriage.local_edges(left, poses[mine])))
+        S[person] = found
     return S
+
+
+def _side_by_side(edges: np.ndarray) -> np.ndarray:
+    """Edges (n, F, 2, 3) of several scans as those (F, 2n, 3) of one."""
+    return np.concatenate(list(edges), axis=1)
 
 
 def _simplified(S: np.ndarray, count: int) -> np.ndarray:

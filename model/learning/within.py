@@ -11,7 +11,7 @@ from scanprep.skeleton.tree import Skeleton
 from ..pose_space import PoseSpace, faces_of_part
 from .regression import Design, RegressionConfig, choose_design
 
-OWN = 10.0                           # variance between people over that within, of what regression does not explain
+OWN = 30.0                           # variance between people over that within, of what regression does not explain
 
 
 @dataclass(frozen=True, eq=False)

@@ -1,0 +1,80 @@
+"""Models of women, of men and of everybody, from one training set."""
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import asdict
+
+import numpy as np
+
+from scanprep.geometry.mesh import Mesh, check_template
+from scanprep.skeleton.tree import Skeleton
+
+from ..carriers import rigid_weights
+from ..digests import body_digests, digest
+from ..scape import ScapeModel
+from ..shape_space import learn_shape_space
+from .carriage import Carriage
+from .pose import Ticks, learn_pose
+from .scape import LearnConfig, Progress, check_skeleton, checked_bodies, pose_prior, shape_deformations
+
+SEXES = ("female", "male")
+FEWEST = 2                           # people that span a space of shapes
+
+
+def learn_by_sex(template: Mesh, poses: np.ndarray, shapes: np.ndarray, sexes: Sequence[str], skeleton: Skeleton,
+                 config: LearnConfig | None = None, progress: Progress | None = None) -> dict[str, ScapeModel]:
+    """Learn a model of everybody and one of each sex: one pose space, and a space of shapes a group.
+
+    Parameters
+    ----------
+    template, poses, shapes, skeleton, config, progress
+        As for `learn_scape`.
+    sexes : S strings
+        "female", "male", or "" where it is not known; those count in the model of everybody alone.
+
+    Returns
+    -------
+    dict
+        "neutral", and "female" and "male" where there are at least two people of that sex. `info["sex"]` of each
+        model is its key.
+
+    Raises
+    ------
+    ValueError
+        As `learn_scape`, and sexes of another count or of another name.
+
+    [SCAPE] Eq. 4, Eq. 5, Eq. 7, Eq. 8
+    """
+    config = config or LearnConfig()
+    check_template(template)
+    check_skeleton(template, skeleton)
+    poses, shapes = checked_bodies(template, poses, "poses"), checked_bodies(template, shapes, "shapes")
+    groups = _groups(sexes, len(shapes))
+    carriage = Carriage(template, skeleton, rigid_weights(skeleton))
+    tick = Ticks(progress, (config.refinements + 1) * len(poses) + len(shapes))
+    learned = learn_pose(carriage, poses, config, tick)
+    S = shape_deformations(carriage, learned.space, shapes, config.smoothness, tick)
+    models = {}
+    for sex, chosen in groups.items():
+        info = {"settings": asdict(config), "sex": sex, "poses": len(poses), "shapes": len(chosen),
+                "pruning": learned.design.pruning, "ridge": learned.design.ridge,
+                "features": learned.space.features.count, "left_out_error": learned.design.left_out_error,
+                "digest": digest(template, poses, shapes[chosen]), "digests": body_digests(poses, shapes[chosen])}
+        models[sex] = ScapeModel(template, skeleton, learned.space, learn_shape_space(S[chosen], config.components),
+                                 *pose_prior(learned.poses), info)
+    return models
+
+
+def _groups(sexes: Sequence[str], count: int) -> dict[str, np.ndarray]:
+    """The people of every model that can be learned, or ValueError."""
+    if isinstance(sexes, str) or len(sexes) != count:
+        raise ValueError(f"sexes: expected {count}, one a person, got {len(sexes)}")
+    unknown = sorted({sex for sex in sexes if sex not in (*SEXES, "")})
+    if unknown:
+        raise ValueError(f"sexes: expected 'female', 'male' or '', got {', '.join(map(repr, unknown))}")
+    groups = {"neutral": np.arange(count)}
+    for sex in SEXES:
+        chosen = np.flatnonzero(np.array(list(sexes), dtype=object) == sex)
+        if len(chosen) >= FEWEST:
+            groups[sex] = chosen
+    return groups
