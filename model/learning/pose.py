@@ -28,14 +28,15 @@ class PoseConfig(RegressionConfig):
         How often part rotations are fitted anew to the learned model.
     steps : int
         How often, after each of these, the regression is corrected by what the stitched model leaves.
-    detail : float, metres
-        Features are joined to fewer ones as long as that changes the edges of a part by less.
+    detail : float
+        Features are joined to fewer ones as long as that changes the edges of a part by less, as a share of the mean
+        edge length.
     """
 
     smoothness: float = 0.001
     refinements: int = 2
     steps: int = 3
-    detail: float = 2e-4
+    detail: float = 0.03
 
 
 @dataclass(frozen=True, eq=False)
@@ -84,7 +85,7 @@ def learn_pose(carriage: Carriage, bodies: np.ndarray, config: PoseConfig, tick:
                 design = choose_design(template, skeleton, poses, Q, config, _by_vertices(carriage, bodies, poses),
                                        design)
             space = design.fit(poses, Q)
-    return LearnedPose(condense(space, poses, template, config.detail), poses, design)
+    return LearnedPose(condense(space, poses, template, config.detail * template.mean_edge), poses, design)
 
 
 def fit_poses(subject: Subject, bodies: np.ndarray, poses: np.ndarray, tick: Ticks) -> np.ndarray:

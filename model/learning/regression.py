@@ -37,11 +37,11 @@ class RegressionConfig:
         Errors of an edge below this cost nothing to support-vector regression.
     """
 
-    features: Literal["linear", "quadratic", "radial"] = "quadratic"
+    features: Literal["linear", "quadratic", "radial"] = "linear"
     regressor: Literal["ridge", "svr"] = "ridge"
     prunings: tuple[float, ...] = (0.003, 0.01, 0.03)
-    ridges: tuple[float, ...] = (3e-4, 1e-3, 3e-3, 0.01, 0.03, 0.1, 0.3)
-    radii: tuple[float, ...] = (0.5, 0.7, 1.0, 1.4)
+    ridges: tuple[float, ...] = (1e-3, 3e-3, 0.01, 0.03, 0.1)
+    radii: tuple[float, ...] = (0.5, 0.7, 1.0)
     tube: float = 2e-4
 
 
