@@ -17,6 +17,8 @@ if TYPE_CHECKING:
     from .files import load_model
     from .fitting import FitConfig, PoseFit, ShapeFit, fit_pose, fit_shape
     from .learning import LearnConfig, learn_scape
+    from .learning.mixing import MixConfig, learn_scape_mix
+    from .learning.sexes import learn_by_sex
     from .learning.skin import SkinConfig, learn_skinning
     from .linear import PointOperator, Subject
     from .posing.angles import pose_from_angles, sample_poses, turn
@@ -39,6 +41,8 @@ _ROOMS = {
     "files": ("load_model",),
     "fitting": ("FitConfig", "PoseFit", "ShapeFit", "fit_pose", "fit_shape"),
     "learning": ("LearnConfig", "learn_scape"),
+    "learning.mixing": ("MixConfig", "learn_scape_mix"),
+    "learning.sexes": ("learn_by_sex",),
     "learning.skin": ("SkinConfig", "learn_skinning"),
     "linear": ("PointOperator", "Subject"),
     "posing.angles": ("pose_from_angles", "sample_poses", "turn"),
@@ -51,13 +55,13 @@ _ROOMS = {
 }
 _ROOM_OF = {name: room for room, names in _ROOMS.items() for name in names}
 
-__all__ = ["BodyModel", "Derivatives", "FitConfig", "JointLimits", "LearnConfig", "Mirror", "PointOperator",
-           "PoseErrors", "PoseFit", "ResolutionConfig", "Rig", "Samples", "ScapeModel", "ShapeErrors", "ShapeFit",
-           "SkinConfig", "SkinningModel", "Specificity", "Subject", "TransferConfig", "change_resolution",
-           "compactness", "find_mirror", "fit_pose", "fit_shape", "learn_scape", "learn_skinning", "load_model",
-           "make_rig", "mirror_pose", "motion_correctives", "pose_errors", "pose_from_angles", "repose",
-           "sample_bodies", "sample_poses", "shape_errors", "skin_weights", "specificity", "subject_from_body", "turn",
-           "write_body_npz", "write_bvh", "write_skinned_glb"]
+__all__ = ["BodyModel", "Derivatives", "FitConfig", "JointLimits", "LearnConfig", "Mirror", "MixConfig",
+           "PointOperator", "PoseErrors", "PoseFit", "ResolutionConfig", "Rig", "Samples", "ScapeModel", "ShapeErrors",
+           "ShapeFit", "SkinConfig", "SkinningModel", "Specificity", "Subject", "TransferConfig", "change_resolution",
+           "compactness", "find_mirror", "fit_pose", "fit_shape", "learn_by_sex", "learn_scape", "learn_scape_mix",
+           "learn_skinning", "load_model", "make_rig", "mirror_pose", "motion_correctives", "pose_errors",
+           "pose_from_angles", "repose", "sample_bodies", "sample_poses", "shape_errors", "skin_weights",
+           "specificity", "subject_from_body", "turn", "write_body_npz", "write_bvh", "write_skinned_glb"]
 
 
 def __getattr__(name: str) -> Any:

@@ -40,8 +40,9 @@ class MixConfig(RegressionConfig):
     ----------
     smoothness : float
         The paper's 0.001: times the mean edge length it is w_s of Eq. 5 and 8.
-    detail : float, metres
-        Features are joined to fewer ones as long as that changes the edges of a part by less.
+    detail : float
+        Features are joined to fewer ones as long as that changes the edges of a part by less, as a share of the mean
+        edge length.
     components : int
         Shape components to keep, fewer where there are fewer people.
     stiff : int
@@ -62,7 +63,7 @@ class MixConfig(RegressionConfig):
     """
 
     smoothness: float = 0.001
-    detail: float = 2e-4
+    detail: float = 0.03
     components: int = 40
     stiff: int = 5
     steps: int = 2
@@ -218,7 +219,7 @@ def _learn_pose(mix: Mix, state: State) -> tuple[PoseSpace, Design]:
         design = design or choose_within(template, skeleton, poses, Q, mix.who, config)
         space = fit_within(design, poses, Q, mix.who)
     assert design is not None
-    return _at_rest(condense(space, poses, template, config.detail)), design
+    return _at_rest(condense(space, poses, template, config.detail * template.mean_edge)), design
 
 
 def _safe_inverse(S: np.ndarray) -> np.ndarray:
