@@ -8,13 +8,13 @@ from model_bodies import random_poses, worm, worm_skeleton
 from model.fitting import fit_pose, fit_shape
 from model.learning.skin import (
     SkinConfig,
-    _person,
     _with_joints,
     _with_joints_at,
     _with_weights,
     corrective_features,
     learn_skinning,
 )
+from model.learning.skin_people import unposed_person
 from model.learning.skin_weights import _onto_simplex, diffused_weights, fit_weights, kept_weights
 from scanprep.geometry import rotations
 from scanprep.geometry.mesh import Mesh
@@ -85,7 +85,7 @@ def test_new_people_of_the_truth_are_met(truth, learned):
 def test_a_person_is_unposed_exactly(truth):
     rng = np.random.default_rng(4)
     for pose, betas in zip(random_poses(truth, 3, rng, 0.4), rng.normal(size=(3, 3)), strict=True):
-        back = _person(truth, pose, truth.vertices(pose, betas, rng.normal(size=3)))
+        back = unposed_person(truth, pose, truth.vertices(pose, betas, rng.normal(size=3)))
         x = truth.rest_vertices(betas)
         at = truth.skeleton.joints[0] - (truth.joint_regressor @ x)[0]
         np.testing.assert_allclose(back, x + at, rtol=0, atol=1e-12)

@@ -11,16 +11,15 @@ from scanprep.geometry.mesh import Mesh, check_template
 from scanprep.skeleton.tree import Skeleton
 
 from ..features import Lift, LinearLift, PoseFeatures, QuadraticLift
-from ..fitting import FitConfig, PoseFitter, ShapeFitter
+from ..fitting import FitConfig, PoseFitter
 from ..pose_space import kept_directions
-from ..shape_space import learn_shape_space
 from ..skinning import SkinningModel
 from .pose import Ticks
 from .scape import check_skeleton, checked_bodies, digest, pose_prior
+from .skin_people import learn_people, unblended
 from .skin_weights import diffused_weights, fit_weights, kept_weights
 
 Progress = Callable[[int, int], None]
-SOFTEST = 0.2                        # a mean of rotations that shrinks further is not undone
 ENOUGH = 0.005                       # relative gain of a round below which the next is not worth it
 QUICK = FitConfig(sample=400, iterations=20, polish=0, tolerance=1e-4)     # of poses that will be fitted again
 
@@ -104,7 +103,7 @@ def learn_skinning(template: Mesh, poses: np.ndarray, shapes: np.ndarray | None,
         model, at = _learn_pose(model, at, poses, replace(config, correctives=correctives), tick)
     tick(tick.total - tick.done - later)
     if shapes is not None:
-        model = _learn_people(model, shapes, config, tick)
+        model = learn_people(model, shapes, config.components, config.people_rounds, tick)
     mean, covariance = pose_prior(at)
     info: dict[str, Any] = {
         "settings": asdict(config), "poses": len(poses), "shapes": 0 if shapes is None else len(shapes),
@@ -210,17 +209,8 @@ def _unposed(model: SkinningModel, pose: np.ndarray, body: np.ndarray) -> np.nda
     """(N, 3) rest vertices, correctives included, that the model with its joints carries onto a body."""
     y = model.vertices(pose)
     left = body - y
-    return model.rest + model.corrections(pose) + _undone(model.blended(pose), left - left.mean(axis=0))
-
-
-def _undone(B: np.ndarray, moved: np.ndarray) -> np.ndarray:
-    """`B⁻¹ moved` (N, 3) for means of rotations (N, 3, 3), gently where they have collapsed."""
-    flat = np.linalg.det(B) < SOFTEST
-    if flat.any():
-        U, s, Vt = np.linalg.svd(B[flat])
-        B = B.copy()
-        B[flat] = (U * np.maximum(s, SOFTEST)[:, None]) @ Vt
-    return np.linalg.solve(B, moved[..., None])[..., 0]
+    moved = np.einsum("nij,nj->ni", unblended(model.blended(pose)), left - left.mean(axis=0))
+    return model.rest + model.corrections(pose) + moved
 
 
 def corrective_features(skeleton: Skeleton, poses: np.ndarray, config: SkinConfig) -> PoseFeatures:
@@ -276,32 +266,3 @@ def _regress(features: PoseFeatures, poses: np.ndarray, unposed: np.ndarray, act
         rest[mine] = (middle - centre @ slope).reshape(-1, 3)
         correctives[np.ix_(used, mine)] = slope.reshape(len(used), mine.sum(), 3)
     return rest, correctives, float(np.sqrt(total / (M * len(rest))))
-
-
-def _learn_people(model: SkinningModel, shapes: np.ndarray, config: SkinConfig, tick: Ticks) -> SkinningModel:
-    """The model with the shape components of people whose poses are fitted and undone in turn."""
-    for turn in range(config.people_rounds):
-        quick = FitConfig(polish=0, n_betas=min(20, model.n_betas) or None)
-        people = np.empty(shapes.shape)
-        fitter = ShapeFitter(model, quick) if turn else PoseFitter(model.subject(), quick)
-        for i, body in enumerate(shapes):
-            people[i] = _person(model, fitter.fit(body).pose, body)
-            tick(1)
-        space = learn_shape_space(people, config.components)
-        model = replace(model, shape_mean=space.mean.astype(np.float64), shape_components=space.components,
-                        shape_variances=space.variances, shape_total=space.total_variance)
-    return model
-
-
-def _person(model: SkinningModel, pose: np.ndarray, body: np.ndarray) -> np.ndarray:
-    """(N, 3) rest vertices that the model carries onto a body exactly, joints of their own included."""
-    B, A = model.blended(pose), model.joint_regressor
-    # x = B⁻¹ (y - Σ_j below_j turn_j j_j) - c with the joints j = A x: first solved for the joints alone
-    bare = _undone(B, body) - model.corrections(pose)
-    pulls = np.stack([[_undone(B, model.below[:, j, None] * column) for column in turn.T]
-                      for j, turn in enumerate(model.joint_turns(pose))])     # (J, 3, N, 3)
-    J = len(pulls)
-    coupling = np.stack([A @ pull for pull in pulls.reshape(3 * J, -1, 3)], axis=-1).reshape(3 * J, 3 * J)
-    joints = np.linalg.solve(np.eye(3 * J) + coupling, (A @ bare).ravel())
-    x = bare - np.tensordot(joints, pulls.reshape(3 * J, -1, 3), axes=1)
-    return np.asarray(x + model.skeleton.joints[0] - (A @ x)[0])
