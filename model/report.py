@@ -27,7 +27,7 @@ def picture_parts(template: Mesh, skeleton: Skeleton, height: int = 640) -> np.n
 
 
 def picture_components(model: BodyModel, count: int = 4, deviations: float = 2.0, height: int = 420,
-                       tell: Callable[[int, int], None] | None = None) -> np.ndarray:
+                       tell: Callable[[int, int], None] | None = None, columns: int | None = None) -> np.ndarray:
     """The mean person, then the first components at minus and plus some standard deviations.
 
     [SCAPE] Eq. 7
@@ -47,4 +47,4 @@ def picture_components(model: BodyModel, count: int = 4, deviations: float = 2.0
         images.append(render(body, camera, width, height))
         if tell:
             tell(i + 1, len(bodies))
-    return side_by_side(images, [name for name, _ in wanted])
+    return side_by_side(images, [name for name, _ in wanted], columns=columns)

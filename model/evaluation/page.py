@@ -113,7 +113,7 @@ def _space_section(page: Page, model: BodyModel, found: Findings) -> None:
     page.section("Space of shapes", "How much of the training people's variance the components explain, and what "
                  "they do.")
     page.chart(chart_compactness(model), "compactness")
-    page.picture(picture_components(model), "the mean person, then the first components")
+    page.picture(picture_components(model, height=320, columns=5), "the mean person, then the first components")
     if found.specificity is not None:
         page.text("Specificity: random bodies of the model against the nearest training person. Small is good, as "
                   "long as it is not far below the distance between people themselves. The people were brought to "
@@ -178,8 +178,8 @@ def picture_samples(model: BodyModel, samples: Samples, columns: int | None = No
     camera = look_around(model.template, samples.vertices, (25,))[0]
     width = int(height * camera.width / camera.height) + 6
     images = [render(model.template.with_vertices(v), camera, width, height) for v in samples.vertices]
-    return side_by_side(images, [str(i + 1) for i in range(len(images))],
-                        columns=columns or int(np.ceil(np.sqrt(2.5 * len(images)))))
+    rows = max(1, round(np.sqrt(len(images) / 2.5)))
+    return side_by_side(images, [str(i + 1) for i in range(len(images))], columns=columns or -(-len(images) // rows))
 
 
 def _turn(model: BodyModel, pose: np.ndarray) -> float:
