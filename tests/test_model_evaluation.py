@@ -199,6 +199,8 @@ def test_a_model_knows_the_bodies_that_trained_it(model, people):
     poses = model.vertices(random_poses(model, 6, np.random.default_rng(4)))
     learned = learn_scape(model.template, poses, people, model.skeleton, LearnConfig(refinements=0, components=3))
     assert learned.info["digest"] == digest(model.template, poses, people)
+    assert trained_on(learned, poses).all() and trained_on(learned, people).all()
+    assert not trained_on(learned, poses + 1e-3).any()
     told = ScapeModel(model.template, model.skeleton, model.pose_space, model.shape_space, model.pose_mean,
                       model.pose_covariance, {"digests": [body_digest(p) for p in people[:3]]})
     np.testing.assert_array_equal(trained_on(told, people[2:5].astype(np.float32)), [True, False, False])
