@@ -40,7 +40,7 @@ class RegressionConfig:
     features: Literal["linear", "quadratic", "radial"] = "linear"
     regressor: Literal["ridge", "svr"] = "ridge"
     prunings: tuple[float, ...] = (0.003, 0.01, 0.03)
-    ridges: tuple[float, ...] = (1e-3, 3e-3, 0.01, 0.03, 0.1)
+    ridges: tuple[float, ...] = (1e-4, 1e-3, 3e-3, 0.01, 0.03, 0.1)
     radii: tuple[float, ...] = (0.5, 0.7, 1.0)
     tube: float = 2e-4
 
