@@ -6,6 +6,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from .blendscape import BlendScapeModel
     from .body import BodyModel, Derivatives
     from .evaluation.errors import PoseErrors, ShapeErrors, compactness, pose_errors, shape_errors
     from .evaluation.sampling import Samples, Specificity, sample_bodies, specificity
@@ -16,8 +17,9 @@ if TYPE_CHECKING:
     from .export.rig import Rig, make_rig, skin_weights
     from .files import load_model
     from .fitting import FitConfig, PoseFit, ShapeFit, fit_pose, fit_shape
-    from .learning import LearnConfig, learn_scape
+    from .learning import BlendConfig, LearnConfig, learn_blendscape, learn_scape
     from .learning.mixing import MixConfig, learn_scape_mix
+    from .learning.parts import ChosenSkeleton, PartsConfig, choose_skeleton
     from .learning.sexes import learn_by_sex
     from .learning.skin import SkinConfig, learn_skinning
     from .linear import PointOperator, Subject
@@ -31,7 +33,7 @@ if TYPE_CHECKING:
 
 _ROOMS = {
     "body": ("BodyModel", "Derivatives"),
-    "evaluation.errors": ("PoseErrors", "ShapeErrors", "compactness", "pose_errors", "shape_errors"),
+    "evaluation.errors": ("PoseErrors", "ShapeErrors", "choose_skeleton", "compactness", "pose_errors", "shape_errors"),
     "evaluation.sampling": ("Samples", "Specificity", "sample_bodies", "specificity"),
     "export.bvh": ("write_bvh",),
     "export.correctives": ("motion_correctives",),
@@ -40,9 +42,11 @@ _ROOMS = {
     "export.rig": ("Rig", "make_rig", "skin_weights"),
     "files": ("load_model",),
     "fitting": ("FitConfig", "PoseFit", "ShapeFit", "fit_pose", "fit_shape"),
-    "learning": ("LearnConfig", "learn_scape"),
-    "learning.mixing": ("MixConfig", "learn_scape_mix"),
-    "learning.sexes": ("learn_by_sex",),
+    "blendscape": ("BlendScapeModel",),
+    "learning": ("BlendConfig", "LearnConfig", "learn_blendscape", "learn_scape"),
+    "learning.mixing": ("MixConfig", "PartsConfig", "learn_scape_mix"),
+    "learning.parts": ("ChosenSkeleton", "PartsConfig", "choose_skeleton"),
+    "learning.sexes": ("learn_blendscape", "learn_by_sex",),
     "learning.skin": ("SkinConfig", "learn_skinning"),
     "linear": ("PointOperator", "Subject"),
     "posing.angles": ("pose_from_angles", "sample_poses", "turn"),
@@ -55,13 +59,15 @@ _ROOMS = {
 }
 _ROOM_OF = {name: room for room, names in _ROOMS.items() for name in names}
 
-__all__ = ["BodyModel", "Derivatives", "FitConfig", "JointLimits", "LearnConfig", "Mirror", "MixConfig",
-           "PointOperator", "PoseErrors", "PoseFit", "ResolutionConfig", "Rig", "Samples", "ScapeModel", "ShapeErrors",
-           "ShapeFit", "SkinConfig", "SkinningModel", "Specificity", "Subject", "TransferConfig", "change_resolution",
-           "compactness", "find_mirror", "fit_pose", "fit_shape", "learn_by_sex", "learn_scape", "learn_scape_mix",
-           "learn_skinning", "load_model", "make_rig", "mirror_pose", "motion_correctives", "pose_errors",
-           "pose_from_angles", "repose", "sample_bodies", "sample_poses", "shape_errors", "skin_weights",
-           "specificity", "subject_from_body", "turn", "write_body_npz", "write_bvh", "write_skinned_glb"]
+__all__ = ["BlendConfig", "BlendScapeModel", "BodyModel", "ChosenSkeleton", "Derivatives", "FitConfig", "JointLimits",
+           "LearnConfig", "Mirror", "MixConfig", "PartsConfig", "PointOperator", "PoseErrors", "PoseFit",
+           "ResolutionConfig", "Rig", "Samples", "ScapeModel", "ShapeErrors", "ShapeFit", "SkinConfig",
+           "SkinningModel", "Specificity", "Subject", "TransferConfig", "change_resolution", "choose_skeleton",
+           "compactness", "find_mirror", "fit_pose", "fit_shape", "learn_blendscape", "learn_by_sex", "learn_scape",
+           "learn_scape_mix", "learn_skinning", "load_model", "make_rig", "mirror_pose", "motion_correctives",
+           "pose_errors", "pose_from_angles", "repose", "sample_bodies", "sample_poses", "shape_errors",
+           "skin_weights", "specificity", "subject_from_body", "turn", "write_body_npz", "write_bvh",
+           "write_skinned_glb"]
 
 
 def __getattr__(name: str) -> Any:

@@ -1,27 +1,21 @@
 """`scape learn` and `scape model`: learn a body from registered meshes, look into it, pose it."""
 from __future__ import annotations
 
-import dataclasses
 from pathlib import Path
 from typing import Annotated
 
 import numpy as np
 import tyro
 
-from scanprep.cli import Output, Unit, read_poses
-from scanprep.console import Metric, Outcome, bar, dispatch, read_json
-from scanprep.dataset import RegisteredSet
-from scanprep.geometry.files import read_mesh, read_registered, write_mesh
-from scanprep.geometry.landmarks import read_landmark_vertices
-from scanprep.geometry.mesh import Mesh
+from scanprep.cli import Output, Unit
+from scanprep.console import Metric, Outcome, dispatch, read_json
+from scanprep.geometry.files import read_mesh, write_mesh
 from scanprep.geometry.storage import load_arrays
-from scanprep.skeleton.find import find_skeleton
-from scanprep.skeleton.tree import Skeleton
 
 from .body import BodyModel
 from .files import load_model
 from .fitting import fit_shape
-from .learning import LearnConfig, learn_scape
+from .learning.cli import about
 from .linear import Subject
 
 ModelArg = Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="MODEL.npz")]
@@ -42,45 +36,6 @@ def group(argv: list[str]) -> int:
     return dispatch(COMMANDS, "scape model", argv, "Look into a body model and pose it.")
 
 
-def learn(poses: Path, output: Output, shapes: Path | None = None, template: Path | None = None,
-          skeleton: Path | None = None, landmarks: Path | None = None, subject: str | None = None,
-          unit: Unit | None = None, pictures: bool = True,
-          config: Annotated[LearnConfig, tyro.conf.arg(name="")] = LearnConfig()) -> Outcome:  # noqa: B008
-    """Learn a body model from one person in many poses and many people in about one pose.
-
-    Example: scape learn --poses set --shapes set -o model.npz
-
-    Args:
-        poses: Folder of meshes of one person that share their triangles, or a registered set.
-        output: Model file to write.
-        shapes: Folder of meshes of many people, or a registered set; without it the model has no shape of its own.
-        template: The mesh that the others are deformations of; else the first of the poses, or the set's own.
-        skeleton: JSON of `scape prep skeleton`; else the set's own, else found from the poses.
-        landmarks: Landmarks of the template, kept in the model for `scape complete`; else the set's own.
-        subject: Of a registered set, whose meshes are the poses; else of the one with the most.
-        unit: Unit of the meshes.
-        pictures: Write a picture of the parts and one of the shape components beside the model.
-        config: Settings.
-    """
-    body, posed = read_poses(poses, template, subject, unit)
-    people = None if shapes is None else _read_shapes(shapes, body, unit)
-    tree = _read_skeleton(skeleton, poses, body)
-    marks = _read_marks(landmarks, poses, body)
-    if tree is None:
-        with bar("finding the skeleton") as progress:
-            tree = find_skeleton(body, posed, progress=progress)
-    with bar("learning the model") as progress:
-        model = learn_scape(body, posed, people, tree, config, progress)
-    model = dataclasses.replace(model, info={**model.info, "landmarks": marks})
-    model.save(output)
-    if pictures:
-        _draw(model, output)
-    return Outcome(output, [
-        Metric("poses", len(posed)), Metric("people", 0 if people is None else len(people)),
-        Metric("triangles", len(body.faces)), Metric("parts", len(tree.parents)), *_about(model)],
-        {"learn": config})
-
-
 def info(model: ModelArg) -> Outcome:
     """What a model holds and how it was made.
 
@@ -92,7 +47,7 @@ def info(model: ModelArg) -> Outcome:
     return Outcome(None, [
         Metric("kind", loaded.kind), Metric("vertices", len(loaded.template.vertices)),
         Metric("triangles", len(loaded.template.faces)), Metric("parts", ", ".join(loaded.skeleton.names)),
-        *_about(loaded), Metric("landmarks", len(loaded.info.get("landmarks", {}))), *facts])
+        *about(loaded), Metric("landmarks", len(loaded.info.get("landmarks", {}))), *facts])
 
 
 def mesh(model: ModelArg, output: Output, pose: Path | None = None, betas: tuple[float, ...] = (),
@@ -164,51 +119,3 @@ def _read_betas(path: Path) -> np.ndarray:
     if betas.ndim != 1 or not np.isfinite(betas).all():
         raise ValueError(f"{path}: expected {wanted}, found something else")
     return betas
-
-
-def _read_shapes(folder: Path, body: Mesh, unit: Unit | None) -> np.ndarray:
-    if (folder / "set.json").exists():
-        whole = RegisteredSet.load(folder)
-        faces, vertices = whole.template.faces, whole.shapes()
-    else:
-        faces, vertices, _ = read_registered(folder, unit)
-    if not np.array_equal(faces, body.faces):
-        order = ", in another order" if len(faces) == len(body.faces) else ""
-        raise ValueError(f"{folder}: expected the triangles of the poses ({body}); these have {len(faces)} faces "
-                         f"and {vertices.shape[1]} vertices{order}")
-    return vertices
-
-
-def _read_skeleton(given: Path | None, poses: Path, body: Mesh) -> Skeleton | None:
-    path = given or poses / "skeleton.json"
-    if given is None and not path.exists():
-        return None
-    tree = Skeleton.load(path)
-    if len(tree.part_of_face) != len(body.faces):
-        raise ValueError(f"{path}: expected a skeleton of {len(body.faces)} triangles as the meshes have, "
-                         f"found {len(tree.part_of_face)}")
-    return tree
-
-
-def _read_marks(given: Path | None, poses: Path, body: Mesh) -> dict[str, int]:
-    path = given or poses / "landmarks.json"
-    if given is None and not path.exists():
-        return {}
-    return read_landmark_vertices(path, body)
-
-
-def _about(model: BodyModel) -> list[Metric]:
-    rows = [Metric("pose features", model.terms.features.count), Metric("shape components", model.n_betas)]
-    if model.n_betas:
-        rows.append(Metric("variance of shape they explain", 100 * float(model.explained[-1]), "%"))
-    return rows
-
-
-def _draw(model: BodyModel, output: Path) -> None:
-    from scanprep.pictures.shading import save_png
-
-    from .report import picture_components, picture_parts
-
-    save_png(output.with_suffix(".parts.png"), picture_parts(model.template, model.skeleton))
-    if model.n_betas:
-        save_png(output.with_suffix(".components.png"), picture_components(model))

@@ -1,1 +1,0 @@
-from .learning.carriage import *  # noqa: F403

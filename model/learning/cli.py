@@ -1,0 +1,226 @@
+"""`scape learn`: a body model from registered meshes."""
+from __future__ import annotations
+
+import contextlib
+import csv
+import dataclasses
+import logging
+import re
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Annotated, Literal
+
+import numpy as np
+import tyro
+
+from scanprep.cli import Output, Unit, read_poses
+from scanprep.console import Metric, Outcome, bar
+from scanprep.dataset import RegisteredSet
+from scanprep.geometry.files import list_meshes, read_registered
+from scanprep.geometry.landmarks import read_landmark_vertices
+from scanprep.geometry.mesh import Mesh
+from scanprep.skeleton.find import find_skeleton
+from scanprep.skeleton.parts import SkeletonConfig
+from scanprep.skeleton.tree import Skeleton
+
+from ..body import BodyModel
+from .mixing import MixConfig, learn_scape_mix
+from .parts import choose_skeleton
+from .scape import BlendConfig, LearnConfig, learn_blendscape, learn_scape, timed
+from .sexes import learn_by_sex
+from .skin import SkinConfig, learn_skinning
+
+Kind = Literal["scape", "blendscape", "skinning"]
+Whole = dict[str, BodyModel]
+
+
+@dataclasses.dataclass(frozen=True)
+class Other:
+    """Settings of what only some ways of learning need.
+
+    Parameters
+    ----------
+    width : float
+        How far a rotation reaches over the border of its part in BlendSCAPE, as a share of the template's diagonal.
+    skin : SkinConfig
+        Of the kind `skinning`.
+    mix : MixConfig
+        Of `--mixed`.
+    """
+
+    width: float = BlendConfig.width
+    skin: SkinConfig = dataclasses.field(default_factory=SkinConfig)
+    mix: MixConfig = dataclasses.field(default_factory=MixConfig)
+
+
+def learn(poses: Path, output: Output, shapes: Path | None = None, template: Path | None = None,
+          skeleton: Path | None = None, landmarks: Path | None = None, subject: str | None = None,
+          unit: Unit | None = None, parts: int | None = None, kind: Kind = "scape", mixed: bool = False,
+          by_sex: bool = False, sexes: Path | None = None, pictures: bool = True,
+          config: Annotated[LearnConfig, tyro.conf.arg(name="")] = LearnConfig(),  # noqa: B008
+          other: Annotated[Other, tyro.conf.arg(name="")] = Other()) -> Outcome:
+    """Learn a body model from one person in many poses and many people in about one pose, or from a mix.
+
+    Example: scape learn --poses set --shapes set -o model.npz
+
+    Args:
+        poses: Folder of meshes of one person that share their triangles, or a registered set.
+        output: Model file to write.
+        shapes: Folder of meshes of many people, or a registered set; without it the model has no shape of its own.
+        template: The mesh that the others are deformations of; else the first of the poses, or the set's own.
+        skeleton: JSON of `scape prep skeleton`; else the set's own, else found from the poses, with as many parts as
+            predict left-out poses best.
+        landmarks: Landmarks of the template, kept in the model for `scape complete`; else the set's own.
+        subject: Of a registered set, whose meshes are the poses; else of the one with the most.
+        unit: Unit of the meshes.
+        parts: Find a skeleton with so many parts, whatever skeleton there is.
+        kind: SCAPE, BlendSCAPE, or linear blend skinning with pose-corrective shapes.
+        mixed: The poses are those of many people: a registered set that says whose mesh each is.
+        by_sex: Also a model of the women and one of the men, beside the neutral one, where the set says the sex.
+        sexes: CSV with the columns name,sex for the meshes of a plain folder of shapes.
+        pictures: Write a picture of the parts and one of the shape components beside the model.
+        config: Settings.
+        other: More settings.
+    """
+    if mixed and (shapes is not None or by_sex or kind != "scape"):
+        raise ValueError("--mixed: it learns one SCAPE model of --poses alone, without --shapes, --by-sex and --kind")
+    if by_sex and (shapes is None or kind != "scape"):
+        raise ValueError("--by-sex: it needs --shapes and the kind scape")
+    body, posed = read_poses(poses, template, subject, unit) if not mixed else _read_mix(poses)
+    people = None if shapes is None else _read_shapes(shapes, body, unit)
+    known = None if not by_sex or shapes is None else _read_sexes(shapes, sexes)
+    tree = None if parts is not None else _read_skeleton(skeleton, poses, body)
+    marks = _read_marks(landmarks, poses, body)
+    with _timed() as seconds:
+        if tree is None:
+            if mixed:
+                raise ValueError(f"{poses}: a mix of people shows no skeleton; name one with --skeleton")
+            with bar("finding the skeleton") as progress, timed("skeleton"):
+                tree = choose_skeleton(body, posed, learning=config, progress=progress).skeleton if parts is None \
+                    else find_skeleton(body, posed, SkeletonConfig(parts=parts), progress)
+        with bar("learning the model") as progress:
+            if mixed:
+                who = [entry.subject for entry in RegisteredSet.load(poses).entries]
+                models: Whole = {"neutral": learn_scape_mix(body, posed, who, tree, other.mix, progress)}
+            elif known is not None:
+                assert people is not None
+                models = {**learn_by_sex(body, posed, people, known, tree, config, progress)}
+            elif kind == "blendscape":
+                settings = BlendConfig(**vars(config), width=other.width)
+                models = {"neutral": learn_blendscape(body, posed, people, tree, settings, progress)}
+            elif kind == "skinning":
+                models = {"neutral": learn_skinning(body, posed, people, tree, other.skin, progress)}
+            else:
+                models = {"neutral": learn_scape(body, posed, people, tree, config, progress)}
+    for name, model in models.items():
+        path = output if name == "neutral" else output.with_suffix(f".{name}.npz")
+        kept = dataclasses.replace(model, info={**model.info, "landmarks": marks})     # type: ignore[type-var]
+        kept.save(path)
+        if pictures:
+            _draw(kept, path)
+    return Outcome(output, [
+        Metric("kind", models["neutral"].kind), Metric("poses", len(posed)),
+        Metric("people", 0 if people is None else len(people)), Metric("triangles", len(body.faces)),
+        Metric("parts", len(tree.parents)), *about(models["neutral"]),
+        *[Metric(f"people of the {name} model", model.info["shapes"]) for name, model in models.items() if by_sex],
+        *[Metric(f"time: {step}", value, "s") for step, value in seconds.items()]],
+        {"learn": config, "other": other})
+
+
+def about(model: BodyModel) -> list[Metric]:
+    """What a model is made of."""
+    rows = [Metric("pose features", model.terms.features.count), Metric("terms of the fast path", model.terms.count),
+            Metric("shape components", model.n_betas)]
+    if model.n_betas:
+        rows.append(Metric("variance of shape they explain", 100 * float(model.explained[-1]), "%"))
+    return rows
+
+
+@contextlib.contextmanager
+def _timed() -> Iterator[dict[str, float]]:
+    """Seconds of every step that the library logs meanwhile."""
+    seconds: dict[str, float] = {}
+    log, handler = logging.getLogger("model"), logging.Handler(logging.INFO)
+    before = log.level
+
+    def keep(record: logging.LogRecord) -> None:
+        found = re.fullmatch(r"(.+): ([0-9.]+) s", record.getMessage())
+        if found:
+            seconds[found[1]] = seconds.get(found[1], 0.0) + float(found[2])
+
+    handler.emit = keep                                                       # type: ignore[method-assign]
+    log.addHandler(handler)
+    log.setLevel(logging.INFO)
+    try:
+        yield seconds
+    finally:
+        log.removeHandler(handler)
+        log.setLevel(before)
+
+
+def _read_mix(folder: Path) -> tuple[Mesh, np.ndarray]:
+    """Template and all meshes of a registered set."""
+    if not (folder / "set.json").exists():
+        raise ValueError(f"{folder}: expected a registered set, which says whose mesh each is, found a plain folder")
+    whole = RegisteredSet.load(folder)
+    return whole.template, whole.vertices()
+
+
+def _read_shapes(folder: Path, body: Mesh, unit: Unit | None) -> np.ndarray:
+    if (folder / "set.json").exists():
+        whole = RegisteredSet.load(folder)
+        faces, vertices = whole.template.faces, whole.shapes()
+    else:
+        faces, vertices, _ = read_registered(folder, unit)
+    if not np.array_equal(faces, body.faces):
+        order = ", in another order" if len(faces) == len(body.faces) else ""
+        raise ValueError(f"{folder}: expected the triangles of the poses ({body}); these have {len(faces)} faces "
+                         f"and {vertices.shape[1]} vertices{order}")
+    return vertices
+
+
+def _read_sexes(folder: Path, given: Path | None) -> list[str]:
+    """The sex of every person, in the order of `_read_shapes`; empty where not known."""
+    if given is None and (folder / "set.json").exists():
+        whole = RegisteredSet.load(folder)
+        first = {entry.subject: entry.sex for entry in reversed(whole.entries)}
+        return [first[subject] for subject in whole.subjects]
+    if given is None:
+        raise ValueError(f"{folder}: a plain folder does not say the sex; name a CSV name,sex with --sexes")
+    try:
+        with open(given, newline="", encoding="utf-8") as lines:
+            table = {row["name"]: row["sex"] for row in csv.DictReader(lines)}
+    except (OSError, KeyError, UnicodeDecodeError, csv.Error):
+        raise ValueError(f"{given}: expected a CSV with the columns name,sex") from None
+    names = [path.name.split(".")[0] for path in list_meshes(folder)]
+    if not any(name in table for name in names):
+        raise ValueError(f"{given}: none of its names is a mesh of {folder}")
+    return [table.get(name, "") for name in names]
+
+
+def _read_skeleton(given: Path | None, poses: Path, body: Mesh) -> Skeleton | None:
+    path = given or poses / "skeleton.json"
+    if given is None and not path.exists():
+        return None
+    tree = Skeleton.load(path)
+    if len(tree.part_of_face) != len(body.faces):
+        raise ValueError(f"{path}: expected a skeleton of {len(body.faces)} triangles as the meshes have, "
+                         f"found {len(tree.part_of_face)}")
+    return tree
+
+
+def _read_marks(given: Path | None, poses: Path, body: Mesh) -> dict[str, int]:
+    path = given or poses / "landmarks.json"
+    if given is None and not path.exists():
+        return {}
+    return read_landmark_vertices(path, body)
+
+
+def _draw(model: BodyModel, output: Path) -> None:
+    from scanprep.pictures.shading import save_png
+
+    from ..report import picture_components, picture_parts
+
+    save_png(output.with_suffix(".parts.png"), picture_parts(model.template, model.skeleton))
+    if model.n_betas:
+        save_png(output.with_suffix(".components.png"), picture_components(model))

@@ -1,0 +1,129 @@
+"""How many parts: as many as predict poses that were left out."""
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from scanprep.cleaning.decimate import decimate
+from scanprep.geometry.mesh import Mesh
+from scanprep.skeleton.find import find_skeleton
+from scanprep.skeleton.parts import SkeletonConfig
+from scanprep.skeleton.tree import Skeleton
+
+from ..carriers import rigid_weights
+from .carriage import Carriage
+from .pose import PoseConfig, Ticks, learn_pose
+
+Progress = Callable[[int, int], None]
+
+
+@dataclass(frozen=True)
+class PartsConfig:
+    """Settings of `choose_skeleton`.
+
+    Parameters
+    ----------
+    step : int
+        So many parts more are tried each time.
+    steps : int
+        Largest number of times.
+    gain : float
+        Share of the left-out error that more parts must save to be kept.
+    vertices : int
+        The models that are compared are learned on so many vertices.
+    """
+
+    step: int = 4
+    steps: int = 3
+    gain: float = 0.03
+    vertices: int = 2500
+
+
+@dataclass(frozen=True, eq=False)
+class ChosenSkeleton:
+    """A skeleton and why it was chosen.
+
+    Attributes
+    ----------
+    skeleton : Skeleton
+    errors : {int: float}, metres
+        Error of poses that were left out, by the number of parts.
+    """
+
+    skeleton: Skeleton
+    errors: dict[int, float]
+
+
+def choose_skeleton(template: Mesh, poses: np.ndarray, config: PartsConfig | None = None,
+                    learning: PoseConfig | None = None, progress: Progress | None = None) -> ChosenSkeleton:
+    """A skeleton with as many parts as help to predict poses that were left out.
+
+    The search for rigid parts stops where surfaces no longer meet in a joint. A trunk or a shoulder bends without
+    one, and a model of it gains from more parts than that: so finer skeletons are sought, a model is learned with each
+    on a coarse copy of the bodies, and they are kept while the error of left-out poses falls.
+
+    Parameters
+    ----------
+    template : Mesh
+    poses : (M, N, 3) float, metres
+        Of one person.
+    config : PartsConfig, optional
+    learning : PoseConfig, optional
+        Settings with which models are learned.
+    progress : callable, optional
+        Called with the skeletons done and their largest number.
+
+    Raises
+    ------
+    ValueError
+        As `find_skeleton`.
+    """
+    config, learning = config or PartsConfig(), learning or PoseConfig()
+    tell = progress or (lambda done, total: None)
+    chosen = _coarse(template, config.vertices)
+    best = find_skeleton(template, poses)
+    errors = {len(best.parents): _left_out_error(template, poses, best, chosen, learning)}
+    tell(1, 1 + config.steps)
+    for done in range(config.steps):
+        wanted = len(best.parents) + config.step
+        try:
+            finer = find_skeleton(template, poses, SkeletonConfig(parts=wanted))
+        except ValueError:                        # no tree of so many parts: the poses do not tell them apart
+            break
+        errors[wanted] = _left_out_error(template, poses, finer, chosen, learning)
+        tell(2 + done, 1 + config.steps)
+        if errors[wanted] > (1 - config.gain) * errors[len(best.parents)]:
+            break
+        best = finer
+    tell(1 + config.steps, 1 + config.steps)
+    return ChosenSkeleton(best, errors)
+
+
+def _coarse(template: Mesh, count: int) -> tuple[np.ndarray, np.ndarray]:
+    """Some vertices (n,) of the template and triangles (f, 3) over them."""
+    if len(template.vertices) <= count:
+        return np.arange(len(template.vertices)), template.faces
+    small = decimate(template, 2 * count)
+    vertex = cKDTree(template.vertices).query(small.vertices)[1]
+    kept, faces = np.unique(vertex[small.faces], return_inverse=True)
+    faces = faces.reshape(-1, 3)
+    distinct = (faces != np.roll(faces, 1, axis=1)).all(axis=1)
+    return kept, faces[distinct]
+
+
+def _left_out_error(template: Mesh, poses: np.ndarray, skeleton: Skeleton, chosen: tuple[np.ndarray, np.ndarray],
+                    learning: PoseConfig) -> float:
+    """Mean distance in metres of the vertices of left-out poses, on the coarse bodies."""
+    vertices, faces = chosen
+    coarse = Mesh(template.vertices[vertices], faces)
+    near = cKDTree(template.corners.mean(axis=1)).query(coarse.corners.mean(axis=1))[1]
+    part = skeleton.part_of_face[near]
+    joints = skeleton.joints.copy()
+    unplaced = Skeleton(part, skeleton.parents, joints)
+    joints[0] = coarse.vertices[unplaced.part_of_vertex(coarse) == 0].mean(axis=0)
+    placed = Skeleton(part, skeleton.parents, joints)
+    learned = learn_pose(Carriage(coarse, placed, rigid_weights(placed)), poses[:, vertices], learning, Ticks(None, 1))
+    return learned.design.left_out_error

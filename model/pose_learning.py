@@ -1,1 +1,0 @@
-from .learning.pose import *  # noqa: F403
