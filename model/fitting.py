@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from .bilinear import ShapedPoints
 from .body import BodyModel
@@ -218,8 +219,6 @@ def spread_vertices(vertices: np.ndarray, count: int) -> np.ndarray:
 
 def share_of_vertices(vertices: np.ndarray, chosen: np.ndarray) -> np.ndarray:
     """(L,) how many of all vertices (N, 3) lie nearest to each of those chosen (L,)."""
-    from scipy.spatial import cKDTree
-
     nearest = cKDTree(vertices[chosen]).query(vertices)[1]
     return np.bincount(nearest, minlength=len(chosen)).astype(float)
 

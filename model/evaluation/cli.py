@@ -177,7 +177,8 @@ def _metrics(model: BodyModel, found: Findings) -> list[Metric]:
 def _about(what: str, errors: Errors, names: Sequence[str], converged: np.ndarray) -> list[Metric]:
     return [Metric(what, len(errors.mean)), Metric(f"{what}: mean", MM * errors.overall, "mm"),
             Metric(f"{what}: 95th percentile", MM * float(errors.p95.mean()), "mm"),
-            Metric(f"{what}: worst", MM * float(errors.mean.max()), f"mm, {names[int(errors.mean.argmax())]}"),
+            Metric(f"{what}: worst", names[int(errors.mean.argmax())]),
+            Metric(f"{what}: mean of the worst", MM * float(errors.mean.max()), "mm"),
             Metric(f"{what}: worst vertex", MM * float(errors.worst.max()), "mm"),
             Metric(f"{what}: fits that converged", 100 * float(converged.mean()), "%")]
 
