@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Hashable, Sequence
 from dataclasses import asdict, dataclass
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 
@@ -62,10 +62,12 @@ class MixConfig(RegressionConfig):
         Support vectors asked for; rounds, or a share to hold out, out of range.
     """
 
+    features: Literal["linear", "quadratic", "radial"] = "quadratic"
+    ridges: tuple[float, ...] = (1e-4, 3e-4, 1e-3, 3e-3, 0.01, 0.03, 0.1)
     smoothness: float = 0.001
-    detail: float = 0.03
+    detail: float = 0.005
     components: int = 40
-    stiff: int = 5
+    stiff: int = 20
     steps: int = 2
     rounds: int = 6
     held_out: float = 0.2

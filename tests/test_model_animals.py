@@ -1,0 +1,79 @@
+"""The whole way from registered meshes to a model, for an animal: nothing in it knows of people."""
+import numpy as np
+import pytest
+from animal_bodies import ODD, Animal, Build, random_pose
+
+from model.fitting import fit_pose, fit_shape
+from model.learning import LearnConfig, learn_scape
+from scanprep.skeleton.find import find_skeleton
+from scanprep.skeleton.parts import SkeletonConfig
+
+CONFIG = LearnConfig(prunings=(0.01,), ridges=(0.001,), refinements=1)
+TWELVE = SkeletonConfig(parts=12, patches=100, start=20)
+
+
+@pytest.fixture(scope="module")
+def herd():
+    """Template, its poses, other animals about at rest, and the size of the animal."""
+    rng, first = np.random.default_rng(0), Animal()
+    poses = np.stack([first.mesh.vertices, *(first.posed(random_pose(rng)) for _ in range(13))])
+    others = np.stack([Animal(Build.random(rng)).posed(0.2 * random_pose(rng)) for _ in range(10)])
+    return first.mesh, poses, others, float(np.ptp(first.straight.vertices, axis=0).max())
+
+
+@pytest.fixture(scope="module")
+def skeleton(herd):
+    return find_skeleton(*herd[:2], TWELVE)
+
+
+@pytest.fixture(scope="module")
+def model(herd, skeleton):
+    return learn_scape(*herd[:3], skeleton, CONFIG)
+
+
+def test_the_animals_are_what_they_should_be(herd):
+    """Closed bodies off every axis and without symmetry; poses keep bones long; rest is rest."""
+    mesh, first = herd[0], Animal()
+    assert not len(mesh.boundary_vertices) and mesh.volume > 0
+    axes = np.linalg.eigh(np.cov(mesh.vertices.T))[1]
+    assert np.abs(axes).max() < 0.95
+    np.testing.assert_allclose(first.posed(np.zeros((12, 3))), mesh.vertices, atol=1e-12)
+    straight = mesh.vertices @ ODD
+    assert straight[straight[:, 0].argmax(), 1] > 0.08                        # the head is carried to one side
+    turned = np.zeros((12, 3))
+    turned[0] = [0.3, -1.0, 0.5]
+    R = first.skeleton.part_rotations(turned)[0]
+    joint = first.bones[0, 0] @ ODD.T
+    np.testing.assert_allclose(first.posed(turned), (mesh.vertices - joint) @ R.T + joint, atol=0.02)
+
+
+def test_the_skeleton_is_found(herd, skeleton):
+    """Barrel, neck and legs: parts lie within true parts, and the joints of the legs where they are."""
+    mesh, _, _, size = herd
+    truth = Animal().skeleton
+    inside = sum(np.bincount(truth.part_of_face[skeleton.part_of_face == p],
+                             mesh.face_areas[skeleton.part_of_face == p]).max() for p in range(12))
+    assert inside / mesh.face_areas.sum() > 0.85
+    for j in range(4, 12):
+        assert np.linalg.norm(skeleton.joints - truth.joints[j], axis=1).min() < 0.04 * size
+
+
+def test_new_poses_and_new_animals_are_met(herd, model):
+    size, rng, first = herd[3], np.random.default_rng(1), Animal()
+    own = [fit_pose(model.subject(), first.posed(random_pose(rng))).mean for _ in range(3)]
+    new = [fit_shape(model, Animal(Build.random(rng)).posed(random_pose(rng))).mean for _ in range(3)]
+    assert max(own) < 0.01 * size and max(new) < 0.01 * size
+
+
+def test_the_coordinate_system_does_not_matter(herd, skeleton, model):
+    """Upside down and elsewhere, the same model comes out."""
+    from scanprep.geometry import rotations
+    from scanprep.geometry.mesh import Mesh
+
+    mesh, poses, others, _ = herd
+    R, t = rotations.exp(np.array([2.0, 1.5, -1.0])), np.array([3.0, -2.0, 5.0])
+    again = find_skeleton(Mesh(mesh.vertices @ R.T + t, mesh.faces), poses @ R.T + t, TWELVE)
+    assert (again.part_of_face == skeleton.part_of_face).mean() > 0.98
+    turned = learn_scape(Mesh(mesh.vertices @ R.T + t, mesh.faces), poses @ R.T + t, others @ R.T + t,
+                         type(skeleton)(skeleton.part_of_face, skeleton.parents, skeleton.joints @ R.T + t), CONFIG)
+    np.testing.assert_allclose(turned.shape_space.variances, model.shape_space.variances, rtol=1e-2)
