@@ -144,7 +144,7 @@ class BodyModel(ABC):
             A pose, betas or trans of the wrong shape or not finite.
         """
         if betas is not None and np.ndim(betas) == 2 and np.ndim(pose) == 2:
-            pose = np.broadcast_to(pose, (len(betas), *np.shape(pose)))
+            pose = np.repeat(np.asarray(pose)[None], len(betas), axis=0)
         pose, trans = check_pose(self.skeleton, pose, trans)
         if betas is not None and np.ndim(betas) == 2 and np.shape(betas)[:1] != pose.shape[:-2]:
             raise ValueError(f"betas: expected as many rows as poses, {pose.shape[:-2]}, got shape {np.shape(betas)}")

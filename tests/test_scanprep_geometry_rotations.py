@@ -137,3 +137,8 @@ def test_procrustes_agrees_with_scipy_with_weights_and_mirrored_points():
         expected = Rotation.align_vectors(target[i] - ct, source[i] - cs, weights=w)[0].as_matrix()
         np.testing.assert_allclose(R[i], expected, atol=1e-8)
         np.testing.assert_allclose(t[i], ct - expected @ cs, atol=1e-8)
+
+
+def test_arrays_that_are_read_only_will_do():
+    twist = np.broadcast_to([0.1, 0.2, 0.3], (4, 3))
+    np.testing.assert_allclose(rotations.log(np.broadcast_to(rotations.exp(twist)[0], (2, 3, 3))), twist[:2], atol=1e-12)

@@ -16,7 +16,7 @@ from scipy.spatial.transform import Rotation
 
 def exp(twist: np.ndarray) -> np.ndarray:
     """Rotation matrices (..., 3, 3) of rotation vectors (..., 3), radians."""
-    twist = np.asarray(twist, dtype=np.float64)
+    twist = np.require(twist, np.float64, "W")                  # scipy refuses arrays that are read-only
     return Rotation.from_rotvec(twist.reshape(-1, 3)).as_matrix().reshape(*twist.shape, 3)
 
 
@@ -27,7 +27,7 @@ def log(R: np.ndarray) -> np.ndarray:
 
     [SCAPE] §4.2
     """
-    R = np.asarray(R, dtype=np.float64)
+    R = np.require(R, np.float64, "W")
     return Rotation.from_matrix(R.reshape(-1, 3, 3)).as_rotvec().reshape(R.shape[:-1])
 
 
