@@ -141,4 +141,5 @@ def test_procrustes_agrees_with_scipy_with_weights_and_mirrored_points():
 
 def test_arrays_that_are_read_only_will_do():
     twist = np.broadcast_to([0.1, 0.2, 0.3], (4, 3))
-    np.testing.assert_allclose(rotations.log(np.broadcast_to(rotations.exp(twist)[0], (2, 3, 3))), twist[:2], atol=1e-12)
+    R = np.broadcast_to(rotations.exp(twist)[0], (2, 3, 3))
+    np.testing.assert_allclose(rotations.log(R), twist[:2], atol=1e-12)
