@@ -64,6 +64,12 @@ def change_resolution(model: BodyModel, template: Mesh, config: ResolutionConfig
         Of the same kind, with the same tree, joints, features, betas and priors; landmarks are on the nearest new
         vertices.
 
+    Notes
+    -----
+    A skinning model turns parts about joints, and on a body of other betas these are averages of the vertices within
+    two edges of the borders of parts. With other triangles that is a band of another width, so that
+    such bodies move some millimetres apart when they bend; SCAPE models do not use joints in this way.
+
     Raises
     ------
     ValueError
