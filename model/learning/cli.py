@@ -96,7 +96,7 @@ def learn(poses: Path, output: Output, shapes: Path | None = None, template: Pat
             if mixed:
                 raise ValueError(f"{poses}: a mix of people shows no skeleton; name one with --skeleton")
             with bar("finding the skeleton") as progress, timed("skeleton"):
-                tree = choose_skeleton(body, posed, learning=config, progress=progress).skeleton if parts is None \
+                tree = choose_skeleton(body, posed, progress=progress).skeleton if parts is None \
                     else find_skeleton(body, posed, SkeletonConfig(parts=parts), progress)
         with bar("learning the model") as progress:
             if mixed:

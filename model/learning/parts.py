@@ -18,6 +18,7 @@ from .carriage import Carriage
 from .pose import PoseConfig, Ticks, learn_pose
 
 Progress = Callable[[int, int], None]
+QUICK = PoseConfig(prunings=(0.01,), ridges=(1e-3, 1e-2), refinements=1, steps=2)
 
 
 @dataclass(frozen=True)
@@ -72,7 +73,7 @@ def choose_skeleton(template: Mesh, poses: np.ndarray, config: PartsConfig | Non
         Of one person.
     config : PartsConfig, optional
     learning : PoseConfig, optional
-        Settings with which models are learned.
+        Settings with which the models are learned that are compared; by default quick ones.
     progress : callable, optional
         Called with the skeletons done and their largest number.
 
@@ -81,7 +82,7 @@ def choose_skeleton(template: Mesh, poses: np.ndarray, config: PartsConfig | Non
     ValueError
         As `find_skeleton`.
     """
-    config, learning = config or PartsConfig(), learning or PoseConfig()
+    config, learning = config or PartsConfig(), learning or QUICK
     tell = progress or (lambda done, total: None)
     chosen = _coarse(template, config.vertices)
     best = find_skeleton(template, poses)

@@ -17,9 +17,10 @@ from ..skinning import SkinningModel
 from .pose import Ticks
 from .scape import check_skeleton, checked_bodies, digest, pose_prior
 from .skin_people import learn_people, unblended
-from .skin_weights import diffused_weights, fit_weights, kept_weights
+from .skin_weights import diffused, diffused_weights, fit_weights, kept_weights
 
 Progress = Callable[[int, int], None]
+LEVELS = 8                           # of how freely a joint corrects a vertex: vertices of one level share a solve
 ENOUGH = 0.005                       # relative gain of a round below which the next is not worth it
 QUICK = FitConfig(sample=400, iterations=20, polish=0, tolerance=1e-4)     # of poses that will be fitted again
 
@@ -42,6 +43,8 @@ class SkinConfig:
         Over so much surface the weights pass from part to part before they are fitted.
     smoothness : float, metres
         So large an error is as bad as a weight that changes by 1 along an edge.
+    fading : float, metres
+        Over so much surface the correctives of a joint fade where other joints take over.
     parts : int
         Largest number of parts that a vertex follows.
     rounds : int
@@ -58,6 +61,7 @@ class SkinConfig:
     pruning: float = 0.01
     ridges: tuple[float, ...] = (1e-4, 1e-3, 3e-3, 0.01, 0.03, 0.1, 0.3)
     width: float = 0.05
+    fading: float = 0.05
     smoothness: float = 0.005
     parts: int = 4
     rounds: int = 8
@@ -195,7 +199,7 @@ def _with_correctives(model: SkinningModel, poses: np.ndarray, bodies: np.ndarra
     """The model with rest vertices and correctives regressed on the unposed bodies."""
     unposed = np.stack([_unposed(model, p, y) for p, y in zip(poses, bodies, strict=True)])
     features = corrective_features(model.skeleton, poses, config)
-    joints = _acting_joints(model, config.joints)
+    joints = _acting_joints(model, config.joints, config.fading)
     errors = [_regress(features, poses, unposed, joints, ridge)[2] for ridge in config.ridges] \
         if features.count > len(features.starts) else [0.0]
     ridge = config.ridges[int(np.argmin(errors))]
@@ -235,15 +239,15 @@ def corrective_features(skeleton: Skeleton, poses: np.ndarray, config: SkinConfi
     return PoseFeatures(skeleton, lift, np.array(part), np.stack(columns, axis=-1))
 
 
-def _acting_joints(model: SkinningModel, count: int) -> np.ndarray:
-    """(N, J) bool: the joints of the heaviest part of each vertex that are nearest to it."""
+def _acting_joints(model: SkinningModel, count: int, width: float) -> np.ndarray:
+    """(N, J) how freely each joint corrects each vertex: the nearest ones of its heaviest part, fading over a width."""
     x, joints = model.template.vertices, model.skeleton.joints
-    acting = np.zeros(model.weights.shape, dtype=bool)
+    acting = np.zeros(model.weights.shape)
     for p, of_part in enumerate(model.skeleton.joints_of_part):
         mine, near = np.flatnonzero(model.weights.argmax(axis=1) == p), np.array(of_part, dtype=np.int64)
         far = np.linalg.norm(x[mine, None] - joints[near], axis=2)
-        acting[mine[:, None], near[np.argsort(far, axis=1, kind="stable")[:, :count]]] = True
-    return acting
+        acting[mine[:, None], near[np.argsort(far, axis=1, kind="stable")[:, :count]]] = 1
+    return np.round(LEVELS * diffused(model.template, acting, width)) / LEVELS
 
 
 def _regress(features: PoseFeatures, poses: np.ndarray, unposed: np.ndarray, acting: np.ndarray, ridge: float
@@ -254,15 +258,16 @@ def _regress(features: PoseFeatures, poses: np.ndarray, unposed: np.ndarray, act
     rest, correctives = np.empty(unposed.shape[1:]), np.zeros((len(free), *unposed.shape[1:]), dtype=np.float32)
     kinds, which = np.unique(acting, axis=0, return_inverse=True)
     total = 0.0
-    for g, joints in enumerate(kinds):
-        used, mine = np.flatnonzero(~features.uses[free][:, ~joints].any(axis=1)), which.ravel() == g
-        target = unposed[:, mine].reshape(M, -1)
-        centre, middle = delta[:, used].mean(axis=0), target.mean(axis=0)
-        X = delta[:, used] - centre
+    joint = features.part[free]
+    for g, freedom in enumerate(kinds):
+        used, mine = np.flatnonzero(freedom[joint] > 0), which.ravel() == g
+        target, scale = unposed[:, mine].reshape(M, -1), freedom[joint[used]]
+        centre, middle = delta[:, used].mean(axis=0) * scale, target.mean(axis=0)
+        X = delta[:, used] * scale - centre
         solver = np.linalg.solve(X.T @ X + (M * ridge + 1e-12) * np.eye(len(used)), X.T)
         slope, hat = solver @ target, X @ solver + 1 / M
         left = (target - middle - X @ slope) / np.maximum(1 - np.diag(hat), 1e-6)[:, None]
         total += float((left**2).sum())
         rest[mine] = (middle - centre @ slope).reshape(-1, 3)
-        correctives[np.ix_(used, mine)] = slope.reshape(len(used), mine.sum(), 3)
+        correctives[np.ix_(used, mine)] = (scale[:, None] * slope).reshape(len(used), mine.sum(), 3)
     return rest, correctives, float(np.sqrt(total / (M * len(rest))))

@@ -16,9 +16,14 @@ CANDIDATES = 6                       # parts that a vertex may choose from
 def diffused_weights(template: Mesh, skeleton: Skeleton, width: float) -> np.ndarray:
     """Weights (N, J) that pass from part to part over a width, in metres, along the surface."""
     own = np.eye(len(skeleton.parents))[skeleton.part_of_vertex(template)]
+    return kept_weights(diffused(template, own, width), CANDIDATES)
+
+
+def diffused(template: Mesh, values: np.ndarray, width: float) -> np.ndarray:
+    """Values (N, k) of the vertices after they have spread over a width, in metres, along the surface."""
     reach = (width / template.mean_edge) ** 2
-    smooth = eye_array(len(own)) + reach * csc_array(laplacian(template.vertex_adjacency))
-    return kept_weights(Factored(csc_array(smooth)).solve(own), CANDIDATES)
+    smooth = eye_array(len(values)) + reach * csc_array(laplacian(template.vertex_adjacency))
+    return Factored(csc_array(smooth)).solve(values)
 
 
 def kept_weights(weights: np.ndarray, count: int) -> np.ndarray:
