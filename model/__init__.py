@@ -46,7 +46,7 @@ _ROOMS = {
     "learning": ("BlendConfig", "LearnConfig", "learn_blendscape", "learn_scape"),
     "learning.mixing": ("MixConfig", "PartsConfig", "learn_scape_mix"),
     "learning.parts": ("ChosenSkeleton", "PartsConfig", "choose_skeleton"),
-    "learning.sexes": ("learn_blendscape", "learn_by_sex",),
+    "learning.sexes": ("learn_by_sex",),
     "learning.skin": ("SkinConfig", "learn_skinning"),
     "linear": ("PointOperator", "Subject"),
     "posing.angles": ("pose_from_angles", "sample_poses", "turn"),

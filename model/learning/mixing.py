@@ -24,7 +24,7 @@ from ..shape_space import learn_shape_space
 from .carriage import Carriage
 from .pose import Progress, Ticks, fit_poses
 from .regression import Design, RegressionConfig, condense
-from .scape import check_skeleton, checked_bodies, pose_prior
+from .scape import check_skeleton, checked_bodies, pose_prior, timed
 from .within import choose_within, fit_within
 
 FEWEST_PEOPLE = 5                    # from here on whole people are held out, otherwise bodies of any
@@ -122,12 +122,14 @@ def learn_scape_mix(template: Mesh, bodies: np.ndarray, subjects: Sequence[Hasha
     bodies = checked_bodies(template, bodies, "bodies")
     mix = Mix(Carriage(template, skeleton, rigid_weights(skeleton)), bodies, _numbered(subjects, len(bodies)), config)
     tick = Ticks(progress, 2 * config.rounds * len(bodies))
-    errors = held_out_errors(mix, tick)
+    with timed("how many rounds"):
+        errors = held_out_errors(mix, tick)
     rounds = 1 + int(np.argmin(errors))
     tick((config.rounds - len(errors)) * len(bodies))
     state = start(mix)
-    for number in range(rounds):
-        state = next_round(mix, state, number, tick)
+    with timed("poses and shapes in turns"):
+        for number in range(rounds):
+            state = next_round(mix, state, number, tick)
     tick((config.rounds - rounds) * len(bodies))
     assert state.design is not None
     info: dict[str, Any] = {
