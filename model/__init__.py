@@ -33,7 +33,7 @@ if TYPE_CHECKING:
 
 _ROOMS = {
     "body": ("BodyModel", "Derivatives"),
-    "evaluation.errors": ("PoseErrors", "ShapeErrors", "choose_skeleton", "compactness", "pose_errors", "shape_errors"),
+    "evaluation.errors": ("PoseErrors", "ShapeErrors", "compactness", "pose_errors", "shape_errors"),
     "evaluation.sampling": ("Samples", "Specificity", "sample_bodies", "specificity"),
     "export.bvh": ("write_bvh",),
     "export.correctives": ("motion_correctives",),
@@ -44,7 +44,7 @@ _ROOMS = {
     "fitting": ("FitConfig", "PoseFit", "ShapeFit", "fit_pose", "fit_shape"),
     "blendscape": ("BlendScapeModel",),
     "learning": ("BlendConfig", "LearnConfig", "learn_blendscape", "learn_scape"),
-    "learning.mixing": ("MixConfig", "PartsConfig", "learn_scape_mix"),
+    "learning.mixing": ("MixConfig", "learn_scape_mix"),
     "learning.parts": ("ChosenSkeleton", "PartsConfig", "choose_skeleton"),
     "learning.sexes": ("learn_by_sex",),
     "learning.skin": ("SkinConfig", "learn_skinning"),
