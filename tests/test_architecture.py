@@ -1,5 +1,6 @@
 """The structure of the project holds: imports point down, tags name known papers, libraries do not print."""
 import ast
+import importlib
 import re
 import subprocess
 import sys
@@ -97,3 +98,12 @@ def test_packages_import_without_heavy_libraries(package):
             f"import {package}\nfor name in {package}.__all__: getattr({package}, name)")
     done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
+
+
+@pytest.mark.parametrize("package", PACKAGES)
+def test_every_public_name_loads_from_one_room(package):
+    module = importlib.import_module(package)
+    listed = [name for names in module._ROOMS.values() for name in names]
+    assert sorted(listed) == sorted(set(listed)) == sorted(module.__all__)
+    for public in module.__all__:
+        assert getattr(module, public) is not None

@@ -43,9 +43,9 @@ class Other:
     width : float
         How far a rotation reaches over the border of its part in BlendSCAPE, as a share of the template's diagonal.
     skin : SkinConfig
-        Of the kind `skinning`.
+        Of the kind `skinning`; its components are those of `--components`.
     mix : MixConfig
-        Of `--mixed`.
+        Of `--mixed`; its components too.
     """
 
     width: float = BlendConfig.width
@@ -100,8 +100,9 @@ def learn(poses: Path, output: Output, shapes: Path | None = None, template: Pat
                     else find_skeleton(body, posed, SkeletonConfig(parts=parts), progress)
         with bar("learning the model") as progress:
             if mixed:
+                mixing = dataclasses.replace(other.mix, components=config.components)
                 who = [entry.subject for entry in RegisteredSet.load(poses).entries]
-                models: Whole = {"neutral": learn_scape_mix(body, posed, who, tree, other.mix, progress)}
+                models: Whole = {"neutral": learn_scape_mix(body, posed, who, tree, mixing, progress)}
             elif known is not None:
                 assert people is not None
                 models = {**learn_by_sex(body, posed, people, known, tree, config, progress)}
@@ -109,7 +110,8 @@ def learn(poses: Path, output: Output, shapes: Path | None = None, template: Pat
                 settings = BlendConfig(**vars(config), width=other.width)
                 models = {"neutral": learn_blendscape(body, posed, people, tree, settings, progress)}
             elif kind == "skinning":
-                models = {"neutral": learn_skinning(body, posed, people, tree, other.skin, progress)}
+                skin = dataclasses.replace(other.skin, components=config.components)
+                models = {"neutral": learn_skinning(body, posed, people, tree, skin, progress)}
             else:
                 models = {"neutral": learn_scape(body, posed, people, tree, config, progress)}
     for name, model in models.items():

@@ -1,0 +1,119 @@
+"""`scape learn`: every kind, mixes and sexes, from a registered set and from plain folders."""
+import json
+from itertools import pairwise
+
+import numpy as np
+import pytest
+from model_bodies import random_poses, worm_model
+
+from model import LearnConfig, load_model
+from model.learning.cli import Other, learn
+from model.learning.mixing import MixConfig
+from model.learning.parts import PartsConfig, choose_skeleton
+from model.learning.skin import SkinConfig
+from scanprep import RegisteredSet, write_mesh
+
+QUICK = LearnConfig(refinements=1, steps=1, components=4, prunings=(0.01,), ridges=(1e-3,))
+OTHER = Other(skin=SkinConfig(rounds=2, people_rounds=1), mix=MixConfig(rounds=1))
+SEXES = ["female", "male", "female", "male", "female", ""]
+
+
+@pytest.fixture(scope="module")
+def truth():
+    return worm_model()
+
+
+@pytest.fixture(scope="module")
+def folder(truth, tmp_path_factory):
+    """A registered set of one worm in twelve poses and of six others; as plain folders too."""
+    rng = np.random.default_rng(0)
+    place = tmp_path_factory.mktemp("learn")
+    whole = RegisteredSet.create(place / "set", truth.template)
+    poses = random_poses(truth, 12, rng, 0.4)
+    poses[0] = 0
+    for i, body in enumerate(truth.subject().vertices(poses)):
+        whole = whole.add(f"pose{i:02d}", body, subject="anna", pose=str(i), sex="female")
+        write_mesh(place / "poses" / f"pose{i:02d}.ply", truth.template.with_vertices(body))
+    for i, sex in enumerate(SEXES):
+        body = truth.vertices(random_poses(truth, 1, rng, 0.1)[0], rng.normal(size=3))
+        whole = whole.add(f"person{i}", body, subject=f"p{i}", sex=sex)
+        write_mesh(place / "people" / f"person{i}.ply", truth.template.with_vertices(body))
+    whole.with_skeleton(truth.skeleton)
+    (place / "sexes.csv").write_text("name,sex\n" + "".join(f"person{i},{s}\n" for i, s in enumerate(SEXES)))
+    truth.skeleton.save(place / "skeleton.json")
+    return place
+
+
+@pytest.mark.parametrize("kind", ["scape", "blendscape", "skinning"])
+def test_every_kind_is_learned_and_read_again(folder, truth, tmp_path, kind):
+    path = tmp_path / f"{kind}.npz"
+    outcome = learn(folder / "set", path, folder / "set", kind=kind, config=QUICK, other=OTHER,
+                    pictures=kind == "scape")
+    model = load_model(path)
+    assert model.kind == kind and model.n_betas == 4 and model.skeleton.parents.tolist() == [-1, 0, 0, 2]
+    figures = {m.name: m.value for m in outcome.metrics}
+    assert figures["poses"] == 12 and figures["people"] == 7 and figures["kind"] == kind
+    assert model.info["poses"] == 12 and len(model.info["digest"]) == 64 and model.info["landmarks"] == {}
+    if kind != "skinning":
+        assert figures["time: pose space"] > 0 and figures["time: shape of every person"] > 0
+    assert (tmp_path / f"{kind}.components.png").exists() == (kind == "scape")
+    body = truth.subject().vertices(random_poses(truth, 1, np.random.default_rng(3), 0.3)[0])
+    off = np.linalg.norm(model.subject().vertices(np.zeros((4, 3))) - truth.template.vertices, axis=1).mean()
+    assert off < 0.02 * np.ptp(body, axis=0).max()
+
+
+def test_models_by_sex_stand_beside_the_neutral_one(folder, tmp_path):
+    outcome = learn(folder / "set", tmp_path / "m.npz", folder / "set", by_sex=True, config=QUICK, pictures=False)
+    count = {name: load_model(tmp_path / f"m{name}.npz").info["shapes"] for name in ("", ".female", ".male")}
+    assert count == {"": 7, ".female": 4, ".male": 2}                     # anna counts, the unknown one in none
+    assert {m.name: m.value for m in outcome.metrics}["people of the male model"] == 2
+
+
+def test_sexes_of_a_plain_folder_come_from_a_table(folder, tmp_path):
+    learn(folder / "poses", tmp_path / "m.npz", folder / "people", skeleton=folder / "skeleton.json", by_sex=True,
+          sexes=folder / "sexes.csv", config=QUICK, pictures=False)
+    assert load_model(tmp_path / "m.female.npz").info["shapes"] == 3
+    with pytest.raises(ValueError, match="--sexes"):
+        learn(folder / "poses", tmp_path / "m.npz", folder / "people", skeleton=folder / "skeleton.json", by_sex=True)
+    (tmp_path / "other.csv").write_text("name,sex\nnobody,male\n")
+    with pytest.raises(ValueError, match="none of its names"):
+        learn(folder / "poses", tmp_path / "m.npz", folder / "people", skeleton=folder / "skeleton.json", by_sex=True,
+              sexes=tmp_path / "other.csv")
+
+
+def test_a_mix_takes_every_mesh_of_the_set(folder, tmp_path):
+    learn(folder / "set", tmp_path / "mix.npz", mixed=True, config=QUICK, other=OTHER, pictures=False)
+    model = load_model(tmp_path / "mix.npz")
+    assert model.info["bodies"] == 18 and model.info["people"] == 7 and model.n_betas == 4
+
+
+@pytest.mark.parametrize("given, words", [
+    ({"mixed": True, "by_sex": True}, "--mixed"), ({"mixed": True, "kind": "skinning"}, "--mixed"),
+    ({"by_sex": True}, "--by-sex")])
+def test_ways_of_learning_that_exclude_each_other(folder, tmp_path, given, words):
+    with pytest.raises(ValueError, match=words):
+        learn(folder / "set", tmp_path / "m.npz", **given)
+
+
+def test_a_mix_wants_a_set_and_a_skeleton(folder, tmp_path):
+    with pytest.raises(ValueError, match="registered set"):
+        learn(folder / "poses", tmp_path / "m.npz", mixed=True)
+
+
+def test_parts_are_found_where_none_are_given(folder, tmp_path):
+    outcome = learn(folder / "poses", tmp_path / "m.npz", parts=3, config=QUICK, pictures=False)
+    assert {m.name: m.value for m in outcome.metrics}["parts"] == 3
+    assert json.loads(json.dumps(load_model(tmp_path / "m.npz").info))["shapes"] == 0
+
+
+def test_more_parts_are_kept_while_left_out_poses_gain(truth):
+    """A worm that bends everywhere wants more parts than the fewest; what was tried tells why."""
+    rng = np.random.default_rng(5)
+    poses = truth.subject().vertices(random_poses(truth, 16, rng, 0.5))
+    poses[0] = truth.template.vertices
+    found = choose_skeleton(truth.template, poses, PartsConfig(step=2, steps=1, gain=0.03))
+    tried, kept = sorted(found.errors), len(found.skeleton.parents)
+    assert kept in tried and tried[0] <= kept
+    for fewer, more in pairwise(tried):
+        gained = found.errors[more] <= 0.97 * found.errors[fewer]
+        assert gained == (kept >= more), found.errors
