@@ -2,8 +2,9 @@
 
     SCAPEKIT_DATA=... python tests/benchmarks/scape_5fold.py -o scape_5fold.json
 
-Skeleton and model of every fold come from its training poses alone; all kinds share the fold's skeleton. Done
-folds and kinds are kept in the output and not run again, so that the script can be stopped and started.
+Skeleton and model of every fold come from its training poses alone; all kinds share the fold's skeleton, which is
+the one that `scape learn` finds (`--skeleton chosen`) or that of the search for rigid parts alone (`rigid`). Done folds
+and kinds are kept in the output and not run again, so that the script can be stopped and started.
 """
 from __future__ import annotations
 
@@ -19,6 +20,7 @@ from protocols import load_real, machine, scape_fold, write_report
 
 from model import BodyModel, LearnConfig, SkinConfig, learn_blendscape, learn_scape, learn_skinning
 from model.fitting import PoseFitter
+from model.learning.parts import choose_skeleton
 from model.pose_space import PoseSpace
 from scanprep.geometry.mesh import Mesh
 from scanprep.skeleton.find import find_skeleton
@@ -77,16 +79,22 @@ def main() -> None:
     parser.add_argument("-o", "--output", type=Path, default=Path("scape_5fold.json"))
     parser.add_argument("--folds", type=int, nargs="*", default=range(5))
     parser.add_argument("--kinds", nargs="*", default=list(KINDS), choices=list(KINDS))
+    parser.add_argument("--skeleton", choices=["chosen", "rigid"], default="chosen")
     args = parser.parse_args()
     data = load_real()
     report = json.loads(args.output.read_text()) if args.output.exists() else {"folds": {}}
     for fold in args.folds:
         train, held = scape_fold(fold, len(data.poses))
-        kept = args.output.with_suffix(f".skeleton{fold}.json")
-        done = report["folds"].setdefault(str(fold), {"held": held.tolist(), "kinds": {}})
+        kept = args.output.with_suffix(f".{args.skeleton}{fold}.json")
+        done = report["folds"].setdefault(f"{args.skeleton} {fold}", {"held": held.tolist(), "kinds": {}})
         if not kept.exists():
             start = time.perf_counter()
-            find_skeleton(data.template, data.poses[train]).save(kept)
+            if args.skeleton == "rigid":
+                find_skeleton(data.template, data.poses[train]).save(kept)
+            else:
+                found = choose_skeleton(data.template, data.poses[train])
+                found.skeleton.save(kept)
+                done["left_out_mm_by_parts"] = {str(n): 1e3 * error for n, error in found.errors.items()}
             done["skeleton_s"] = time.perf_counter() - start
         skeleton = Skeleton.load(kept)
         done["parts"] = len(skeleton.parents)
