@@ -101,9 +101,9 @@ def main() -> None:
     """Run all seeds and print the ratios."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("-o", "--output", default="mixed.json")
-    parser.add_argument("--faces", type=int, default=5000, help="triangles of the bodies; all of them at 18756")
+    parser.add_argument("--faces", type=int, default=2000, help="triangles of the bodies; all of them at 18756")
     parser.add_argument("--held", type=int, default=20, help="new people in new poses")
-    parser.add_argument("--seeds", type=int, nargs="+", default=[1, 2])
+    parser.add_argument("--seeds", type=int, nargs="+", default=[1, 2, 3])
     parser.add_argument("--features", default=MixConfig.features, help="of the mix")
     args = parser.parse_args()
     stage = Stage(args.faces)
