@@ -25,9 +25,8 @@ from .carriage import Carriage
 from .pose import Progress, Ticks, fit_poses
 from .regression import Design, RegressionConfig, condense
 from .scape import check_skeleton, checked_bodies, pose_prior, timed
-from .within import choose_within, fit_within
+from .within import choose_within, fit_within, held_out_bodies, number_people
 
-FEWEST_PEOPLE = 5                    # from here on whole people are held out, otherwise bodies of any
 
 DAMPING = 0.1                        # of the inverse of S, against triangles that somebody has nearly flat
 
@@ -120,7 +119,7 @@ def learn_scape_mix(template: Mesh, bodies: np.ndarray, subjects: Sequence[Hasha
     check_template(template)
     check_skeleton(template, skeleton)
     bodies = checked_bodies(template, bodies, "bodies")
-    mix = Mix(Carriage(template, skeleton, rigid_weights(skeleton)), bodies, _numbered(subjects, len(bodies)), config)
+    mix = Mix(Carriage(template, skeleton, rigid_weights(skeleton)), bodies, number_people(subjects, len(bodies)), config)
     tick = Ticks(progress, 2 * config.rounds * len(bodies))
     with timed("how many rounds"):
         errors = held_out_errors(mix, tick)
@@ -282,7 +281,7 @@ def _simplified(S: np.ndarray, count: int) -> np.ndarray:
 
 def held_out_errors(mix: Mix, tick: Ticks) -> list[float]:
     """Mean error, metres, of bodies that are held out, after each round until it stops falling."""
-    held = _held_out(mix.who, mix.config.held_out)
+    held = held_out_bodies(mix.who, mix.config.held_out)
     train = mix.some(np.setdiff1d(np.arange(len(mix.bodies)), held))
     state, errors = start(train), list[float]()
     for number in range(mix.config.rounds):
@@ -293,22 +292,3 @@ def held_out_errors(mix: Mix, tick: Ticks) -> list[float]:
         if number and errors[-1] > (1 - mix.config.tolerance) * min(errors[:-1]):
             break
     return errors
-
-
-def _held_out(who: np.ndarray, share: float) -> np.ndarray:
-    """Bodies to hold out, evenly from the whole: all of some people, or where there are few people any bodies."""
-    groups = who if who.max() + 1 >= FEWEST_PEOPLE else np.arange(len(who))
-    count = int(groups.max()) + 1
-    chosen = np.linspace(0, count - 1, max(1, round(share * count)) + 2).round().astype(int)[1:-1]
-    return np.flatnonzero(np.isin(groups, chosen))
-
-
-def _numbered(subjects: Sequence[Hashable], count: int) -> np.ndarray:
-    """(M,) numbers of the people in order of appearance, or ValueError."""
-    if len(subjects) != count:
-        raise ValueError(f"subjects: expected {count} labels, one a body, got {len(subjects)}")
-    order = {label: i for i, label in enumerate(dict.fromkeys(subjects))}
-    if len(order) < 2 or count < 4:
-        raise ValueError(f"subjects: expected at least 2 people and 4 bodies, got {len(order)} people and "
-                         f"{count} bodies; learn_scape learns from the poses of one person")
-    return np.array([order[label] for label in subjects])

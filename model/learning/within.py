@@ -1,6 +1,7 @@
 """Regressing Q over the bodies of many people, each of whom has something of their own that no pose explains."""
 from __future__ import annotations
 
+from collections.abc import Hashable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -12,6 +13,7 @@ from ..pose_space import PoseSpace, faces_of_part
 from .regression import Design, RegressionConfig, choose_design
 
 OWN = 30.0                           # variance between people over that within, of what regression does not explain
+FEWEST_PEOPLE = 5                    # from here on whole people are held out, otherwise bodies of any
 
 
 @dataclass(frozen=True, eq=False)
@@ -126,3 +128,22 @@ def _left_out_error(design: Design, poses: np.ndarray, Q: np.ndarray, who: np.nd
         target = within(Q[:, faces] @ v_hat[faces]).reshape(len(poses), -1)
         total += float((within.without_the_person(X, _operator(X, design.ridge), target) ** 2).sum())
     return float(np.sqrt(total / (Q.shape[0] * Q.shape[1] * 2)))
+
+
+def held_out_bodies(who: np.ndarray, share: float) -> np.ndarray:
+    """Bodies to hold out, evenly from the whole: all of some people, or where there are few people any bodies."""
+    groups = who if who.max() + 1 >= FEWEST_PEOPLE else np.arange(len(who))
+    count = int(groups.max()) + 1
+    chosen = np.linspace(0, count - 1, max(1, round(share * count)) + 2).round().astype(int)[1:-1]
+    return np.flatnonzero(np.isin(groups, chosen))
+
+
+def number_people(subjects: Sequence[Hashable], count: int) -> np.ndarray:
+    """(M,) numbers of the people in order of appearance, or ValueError."""
+    if len(subjects) != count:
+        raise ValueError(f"subjects: expected {count} labels, one a body, got {len(subjects)}")
+    order = {label: i for i, label in enumerate(dict.fromkeys(subjects))}
+    if len(order) < 2 or count < 4:
+        raise ValueError(f"subjects: expected at least 2 people and 4 bodies, got {len(order)} people and "
+                         f"{count} bodies; learn_scape learns from the poses of one person")
+    return np.array([order[label] for label in subjects])
