@@ -27,7 +27,6 @@ from .regression import Design, RegressionConfig, condense
 from .scape import check_skeleton, checked_bodies, pose_prior, timed
 from .within import choose_within, fit_within, held_out_bodies, number_people
 
-
 DAMPING = 0.1                        # of the inverse of S, against triangles that somebody has nearly flat
 
 
@@ -119,7 +118,8 @@ def learn_scape_mix(template: Mesh, bodies: np.ndarray, subjects: Sequence[Hasha
     check_template(template)
     check_skeleton(template, skeleton)
     bodies = checked_bodies(template, bodies, "bodies")
-    mix = Mix(Carriage(template, skeleton, rigid_weights(skeleton)), bodies, number_people(subjects, len(bodies)), config)
+    who = number_people(subjects, len(bodies))
+    mix = Mix(Carriage(template, skeleton, rigid_weights(skeleton)), bodies, who, config)
     tick = Ticks(progress, 2 * config.rounds * len(bodies))
     with timed("how many rounds"):
         errors = held_out_errors(mix, tick)
