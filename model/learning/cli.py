@@ -101,7 +101,7 @@ def learn(poses: Path, output: Output, shapes: Path | None = None, template: Pat
         with bar("learning the model") as progress:
             if mixed:
                 mixing = dataclasses.replace(other.mix, components=config.components)
-                who = [entry.subject for entry in RegisteredSet.load(poses).entries]
+                who = [entry.subject or entry.name for entry in RegisteredSet.load(poses).entries]
                 models: Whole = {"neutral": learn_scape_mix(body, posed, who, tree, mixing, progress)}
             elif known is not None:
                 assert people is not None
