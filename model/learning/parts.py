@@ -80,21 +80,26 @@ def choose_skeleton(template: Mesh, poses: np.ndarray, config: PartsConfig | Non
     Raises
     ------
     ValueError
-        As `find_skeleton`.
+        As `find_skeleton`; a part that is too small for `config.vertices`.
     """
     config, learning = config or PartsConfig(), learning or QUICK
     tell = progress or (lambda done, total: None)
-    chosen = _coarse(template, config.vertices)
+    poses = np.asarray(poses, dtype=np.float64)
+    vertices, coarse = coarse_copy(template, config.vertices)
+
+    def error(skeleton: Skeleton) -> float:
+        return _left_out_error(poses[:, vertices], coarse_skeleton(skeleton, template, coarse), coarse, learning)
+
     best = find_skeleton(template, poses)
-    errors = {len(best.parents): _left_out_error(template, poses, best, chosen, learning)}
+    errors = {len(best.parents): error(best)}
     tell(1, 1 + config.steps)
     for done in range(config.steps):
         wanted = len(best.parents) + config.step
         try:
             finer = find_skeleton(template, poses, SkeletonConfig(parts=wanted))
-        except ValueError:                        # no tree of so many parts: the poses do not tell them apart
+            errors[wanted] = error(finer)
+        except ValueError:                        # no tree of so many parts, or parts too small to compare
             break
-        errors[wanted] = _left_out_error(template, poses, finer, chosen, learning)
         tell(2 + done, 1 + config.steps)
         if errors[wanted] > (1 - config.gain) * errors[len(best.parents)]:
             break
@@ -103,28 +108,31 @@ def choose_skeleton(template: Mesh, poses: np.ndarray, config: PartsConfig | Non
     return ChosenSkeleton(best, errors)
 
 
-def _coarse(template: Mesh, count: int) -> tuple[np.ndarray, np.ndarray]:
-    """Some vertices (n,) of the template and triangles (f, 3) over them."""
+def coarse_copy(template: Mesh, count: int) -> tuple[np.ndarray, Mesh]:
+    """About `count` of the template's vertices (n,), and triangles over them alone."""
     if len(template.vertices) <= count:
-        return np.arange(len(template.vertices)), template.faces
+        return np.arange(len(template.vertices)), template
     small = decimate(template, 2 * count)
     vertex = cKDTree(template.vertices).query(small.vertices)[1]
     kept, faces = np.unique(vertex[small.faces], return_inverse=True)
     faces = faces.reshape(-1, 3)
     distinct = (faces != np.roll(faces, 1, axis=1)).all(axis=1)
-    return kept, faces[distinct]
+    return kept, Mesh(template.vertices[kept], faces[distinct])
 
 
-def _left_out_error(template: Mesh, poses: np.ndarray, skeleton: Skeleton, chosen: tuple[np.ndarray, np.ndarray],
-                    learning: PoseConfig) -> float:
-    """Mean distance in metres of the vertices of left-out poses, on the coarse bodies."""
-    vertices, faces = chosen
-    coarse = Mesh(template.vertices[vertices], faces)
+def coarse_skeleton(skeleton: Skeleton, template: Mesh, coarse: Mesh) -> Skeleton:
+    """The skeleton on a coarse copy: every triangle has the part of the nearest one."""
     near = cKDTree(template.corners.mean(axis=1)).query(coarse.corners.mean(axis=1))[1]
-    part = skeleton.part_of_face[near]
-    joints = skeleton.joints.copy()
+    part, joints = skeleton.part_of_face[near], skeleton.joints.copy()
+    lost = np.setdiff1d(np.arange(len(skeleton.parents)), part)
+    if len(lost):
+        raise ValueError(f"vertices: {len(coarse.vertices)} are too few, part {skeleton.names[lost[0]]} is lost")
     unplaced = Skeleton(part, skeleton.parents, joints)
     joints[0] = coarse.vertices[unplaced.part_of_vertex(coarse) == 0].mean(axis=0)
-    placed = Skeleton(part, skeleton.parents, joints)
-    learned = learn_pose(Carriage(coarse, placed, rigid_weights(placed)), poses[:, vertices], learning, Ticks(None, 1))
+    return Skeleton(part, skeleton.parents, joints)
+
+
+def _left_out_error(poses: np.ndarray, skeleton: Skeleton, coarse: Mesh, learning: PoseConfig) -> float:
+    """Mean distance in metres of the vertices of left-out poses (M, n, 3) of the coarse bodies."""
+    learned = learn_pose(Carriage(coarse, skeleton, rigid_weights(skeleton)), poses, learning, Ticks(None, 1))
     return learned.design.left_out_error
