@@ -11,6 +11,8 @@ import argparse
 import dataclasses
 import logging
 import resource
+import subprocess
+import sys
 import time
 from pathlib import Path
 
@@ -19,7 +21,7 @@ from protocols import load_real, machine, spring_split, write_report
 
 from model import BlendConfig, BodyModel, LearnConfig, learn_blendscape, learn_scape, load_model
 from model.evaluation import shape_errors
-from scanprep.skeleton.find import find_skeleton
+from model.learning.parts import choose_skeleton
 
 
 class Steps(logging.Handler):
@@ -61,6 +63,14 @@ def _best(call, repeats: int = 7) -> float:
     return min(times[1:])
 
 
+def loaded_mib(path: Path) -> float:
+    """Memory that loading a model takes, in a process of its own."""
+    code = ("import resource, sys, model.scape, model.files; peak = lambda: "
+            "resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024; before = peak(); "
+            "model.files.load_model(sys.argv[1]); print(peak() - before)")
+    return float(subprocess.run([sys.executable, "-c", code, str(path)], check=True, capture_output=True).stdout)
+
+
 def held_out_people(model: BodyModel, people: np.ndarray, train: np.ndarray, counts: list[int]) -> list[dict]:
     """Errors in millimetres for every number of components, beside plain vertex PCA."""
     start = time.perf_counter()
@@ -89,7 +99,7 @@ def main() -> None:
     steps, start, cpu = Steps(), time.perf_counter(), time.process_time()
     logging.getLogger("model").addHandler(steps)
     logging.getLogger("model").setLevel(logging.INFO)
-    skeleton = find_skeleton(data.template, data.poses)
+    skeleton = choose_skeleton(data.template, data.poses).skeleton
     steps.seconds["skeleton"] = time.perf_counter() - start
     learn = learn_scape if args.kind == "scape" else learn_blendscape
     model: BodyModel = learn(data.template, data.poses, data.shapes[train], skeleton, config)   # type: ignore[operator]
@@ -103,6 +113,7 @@ def main() -> None:
         begun = time.perf_counter()
         load_model(args.keep)
         report["load_s"] = time.perf_counter() - begun
+        report["loaded_mib"] = loaded_mib(args.keep)
     report["fast_path"] = fast_path(model)
     write_report(args.output, report)
     report["people"] = held_out_people(model, data.shapes[held[:args.held]], data.shapes[train], [20, 40, 80])

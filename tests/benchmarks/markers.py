@@ -20,8 +20,9 @@ from completion.markers.files import MarkerSequence, read_markers
 from completion.markers.layout import MarkerLayout
 from model.files import load_model
 from model.learning import learn_scape
+from model.learning.parts import choose_skeleton
 from model.scape import ScapeModel
-from scanprep.skeleton.find import find_skeleton
+from scanprep.skeleton.tree import Skeleton
 
 
 def held_out_poses(data: RealData, model: ScapeModel, fold: int, count: int) -> list[dict[str, float]]:
@@ -66,6 +67,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("-o", "--output", default="markers.json")
     parser.add_argument("-m", "--model", help="of the training part of the fold; learned when not given")
+    parser.add_argument("--skeleton", help="found from the training part of the fold; sought when not given")
     parser.add_argument("--fold", type=int, default=0)
     parser.add_argument("--count", type=int, default=56)
     parser.add_argument("--c3d", type=Path, help="folder of real sequences")
@@ -77,7 +79,9 @@ def main() -> None:
         model = load_model(args.model)
     else:
         train, _ = scape_fold(args.fold)
-        model = learn_scape(data.template, data.poses[train], None, find_skeleton(data.template, data.poses[train]))
+        skeleton = Skeleton.load(args.skeleton) if args.skeleton else \
+            choose_skeleton(data.template, data.poses[train]).skeleton
+        model = learn_scape(data.template, data.poses[train], None, skeleton)
     rows = held_out_poses(data, model, args.fold, args.count)
     report = {"protocol": f"{args.count} markers, SCAPE fold {args.fold}", "machine": machine(), "poses": rows,
               "config": dataclasses.asdict(AnimateConfig()),
