@@ -20,7 +20,7 @@ import numpy as np
 from protocols import load_real, machine, spring_split, write_report
 
 from model import BlendConfig, BodyModel, LearnConfig, learn_blendscape, learn_scape, load_model
-from model.evaluation import shape_errors
+from model.evaluation.errors import shape_errors
 from model.learning.parts import choose_skeleton
 
 

@@ -88,7 +88,7 @@ def learning(report: dict) -> str:
     people = [tuple(row[n] for n in ("components", "people", "mean_mm", "worst_person_mm", "pose_held_mm",
                                      "vertex_pca_mm", "fit_s")) for row in report["people"]]
     return table(("", ""), rows) + "\n\n" + table(
-        ("components", "held-out people", "mean error (mm)", "worst person (mm)", "pose held at Procrustes rotations (mm)",
+        ("components", "held-out people", "mean error (mm)", "worst person (mm)", "pose held (mm)",
          "plain vertex PCA (mm)", "fit (s)"), people)
 
 
