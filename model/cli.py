@@ -14,9 +14,9 @@ from scanprep.geometry.storage import load_arrays
 
 from .body import BodyModel
 from .files import load_model
-from .fitting import fit_shape
 from .learning.cli import about
 from .linear import Subject
+from .posing.transfer import subject_from_body
 
 ModelArg = Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="MODEL.npz")]
 
@@ -51,7 +51,7 @@ def info(model: ModelArg) -> Outcome:
 
 
 def mesh(model: ModelArg, output: Output, pose: Path | None = None, betas: tuple[float, ...] = (),
-         own_body: bool = False) -> Outcome:
+         subject: Path | None = None, own_body: bool = False) -> Outcome:
     """Write the mesh of one pose and shape.
 
     Example: scape model mesh model.npz --betas 2 -1 -o body.ply
@@ -61,6 +61,7 @@ def mesh(model: ModelArg, output: Output, pose: Path | None = None, betas: tuple
         output: Mesh to write.
         pose: JSON {part name: [x, y, z]} of axis-angle turns against the parent in radians, others at rest.
         betas: Shape in standard deviations, the first of them; the mean person without.
+        subject: Betas in JSON or .npz, or a mesh in the model's triangles, instead of --betas.
         own_body: The template's own body instead of the mean person.
     """
     loaded = load_model(model)
@@ -69,10 +70,14 @@ def mesh(model: ModelArg, output: Output, pose: Path | None = None, betas: tuple
         if name not in loaded.skeleton.names:
             raise ValueError(f"{pose}: no part '{name}'; the model has {', '.join(loaded.skeleton.names)}")
         turns[loaded.skeleton.names.index(name)] = turn
-    shape = None if own_body else np.array(betas if betas else (0.0,))
-    if shape is not None and not loaded.n_betas:
+    if (subject is not None) + bool(betas) + own_body > 1:
+        raise ValueError("--betas, --subject and --own-body: expected one of them")
+    if subject is not None or own_body:
+        vertices = read_subject(loaded, subject).vertices(turns)
+    elif not loaded.n_betas:
         raise ValueError(f"{model}: it has no shape components; ask for --own-body")
-    vertices = loaded.vertices(turns, shape, np.zeros(3))
+    else:
+        vertices = loaded.vertices(turns, np.array(betas if betas else (0.0,)))
     write_mesh(output, loaded.template.with_vertices(vertices))
     return Outcome(output, [Metric("vertices", len(vertices)),
                             Metric("largest extent", float(np.ptp(vertices, axis=0).max()), "m")])
@@ -81,7 +86,7 @@ def mesh(model: ModelArg, output: Output, pose: Path | None = None, betas: tuple
 def read_subject(model: BodyModel, given: Path | None, unit: Unit | None = None) -> Subject:
     """The subject named on the command line: betas in JSON or a motion file, or a mesh in the model's topology.
 
-    Without a name it is the template's own body.
+    Without a name it is the template's own body; of a mesh it has all the detail, which betas have not.
 
     Raises
     ------
@@ -99,9 +104,7 @@ def read_subject(model: BodyModel, given: Path | None, unit: Unit | None = None)
     if not np.array_equal(person.faces, model.template.faces):
         raise ValueError(f"{given}: expected the triangles of the model ({model.template}), found {person}; "
                          "register the template to it first (scape prep register)")
-    if not model.n_betas:
-        raise ValueError(f"{given}: the model has no shape components, so it knows its own body only")
-    return model.subject(fit_shape(model, person.vertices).betas)
+    return subject_from_body(model, person.vertices)
 
 
 def _read_betas(path: Path) -> np.ndarray:
