@@ -34,7 +34,7 @@ class PoseConfig(RegressionConfig):
     """
 
     smoothness: float = 0.001
-    refinements: int = 2
+    refinements: int = 4
     steps: int = 3
     detail: float = 0.03
 
@@ -64,7 +64,7 @@ def learn_pose(carriage: Carriage, bodies: np.ndarray, config: PoseConfig, tick:
     rotations fitted anew to the learned model, what the stitched model leaves of every body (as deformation of
     the triangles) is added to what the model says now, and regressed again: majorise and minimise, which
     lowers the error of the stitched edges step by step. What Q depends on is chosen first by the edges of left-out
-    poses, and after each fit of the rotations by their stitched vertices.
+    poses, and after the first fit of the rotations once more by their stitched vertices.
 
     [SCAPE] Eq. 4, Eq. 5
     """
@@ -75,13 +75,13 @@ def learn_pose(carriage: Carriage, bodies: np.ndarray, config: PoseConfig, tick:
     design = choose_design(template, skeleton, poses, Q, config, _by_edges(carriage, Q))
     space = design.fit(poses, Q)
     tick(len(bodies))
-    for _ in range(config.refinements):
+    for number in range(config.refinements):
         poses = fit_poses(carriage.subject(space), bodies, poses, tick)
         for step in range(config.steps):
             left = bodies - carriage.subject(space).vertices(poses)
             Q = space.gradients(poses)
             Q += pose_gradients(gradients, carriage.v_hat + carriage.local_edges(left, poses)) - np.eye(3)
-            if step == 0:
+            if number == step == 0:
                 design = choose_design(template, skeleton, poses, Q, config, _by_vertices(carriage, bodies, poses),
                                        design)
             space = design.fit(poses, Q)

@@ -56,7 +56,7 @@ class SkinConfig:
         How often the poses of the other people are fitted.
     """
 
-    correctives: str = "quadratic"
+    correctives: str = "linear"
     joints: int = 2
     pruning: float = 0.01
     ridges: tuple[float, ...] = (1e-4, 1e-3, 3e-3, 0.01, 0.03, 0.1, 0.3)
