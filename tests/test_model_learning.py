@@ -27,7 +27,7 @@ def training(truth):
 
 @pytest.fixture(scope="module")
 def learned(truth, training):
-    return learn_scape(truth.template, *training, truth.skeleton, LearnConfig(components=5))
+    return learn_scape(truth.template, *training, truth.skeleton, LearnConfig(components=5, refinements=2))
 
 
 def test_new_poses_of_the_truth_are_met(truth, training):

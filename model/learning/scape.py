@@ -157,6 +157,9 @@ def shape_deformations(carriage: Carriage, space: PoseSpace, shapes: np.ndarray,
                        ) -> np.ndarray:
     """S (P, F, 3, 3) of every person, in float32 to halve the memory.
 
+    Poses are those of Procrustes. Fitting each part to the template in the pose found, again and again, left the same
+    error on new people (6.50, 5.44 and 4.37 mm at 20, 40 and 80 components against 6.48, 5.47 and 4.38).
+
     [SCAPE] Eq. 8
     """
     template, skeleton = carriage.template, carriage.skeleton
