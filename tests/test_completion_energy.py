@@ -115,5 +115,5 @@ def test_known_and_unknown_shape_agree_with_the_model():
 
 
 def test_a_body_must_be_a_model_or_a_subject():
-    with pytest.raises(ValueError, match="body: expected a ScapeModel or a Subject, got Mesh"):
+    with pytest.raises(ValueError, match="body: expected a BodyModel or a Subject, got Mesh"):
         as_body(MODEL.template)
