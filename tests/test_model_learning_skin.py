@@ -40,7 +40,7 @@ def training(truth):
 
 @pytest.fixture(scope="module")
 def learned(truth, training):
-    config = SkinConfig(components=5, people_rounds=2, **NARROW)
+    config = SkinConfig(correctives="quadratic", components=5, people_rounds=2, **NARROW)
     return learn_skinning(truth.template, *training, truth.skeleton, config)
 
 

@@ -130,10 +130,12 @@ def markers(report: dict) -> str:
 SECTIONS: dict[str, tuple[str, str, Callable[[dict], str], str]] = {
     "scape_5fold": ("Held-out poses (SCAPE-5fold)", "python tests/benchmarks/scape_5fold.py", poses,
                     "Skeleton and model from the training poses of the fold alone. Seen on held-out poses while "
-                    "deciding: `refinements` and `steps` on fold 0; that more parts help at all on folds 1 and 3, "
-                    "after which the number of each fold was left to its training poses. A pose fit has three "
-                    "numbers a part, so some of the gain of more parts is freedom of the fit. Where we lose: seated "
-                    "poses with the trunk far bent, and time: skinning poses faster."),
+                    "deciding: `refinements` and `steps` on fold 0 and on coarse copies of folds 0 and 1; the width of "
+                    "blending on fold 1; that more parts help at all, and the radial features, on folds 1 and 3, after "
+                    "which the number of parts of each fold was left to its training poses. A pose fit has three "
+                    "numbers a part, so some of the gain of more parts is freedom of the fit. The folds ran beside "
+                    "each other and other work on two cores: read the times as upper bounds. Where we lose: deep "
+                    "squats and seated poses, and some folds to skinning with correctives."),
     "regressors": ("Regressors of the pose deformation", "python tests/benchmarks/regressors.py", regressors,
                    "On copies of about 2,500 vertices. `left out` is what leaving training poses out predicts, without "
                    "fitting them again."),
