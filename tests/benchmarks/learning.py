@@ -65,9 +65,9 @@ def _best(call, repeats: int = 7) -> float:
 
 def loaded_mib(path: Path) -> float:
     """Memory that loading a model takes, in a process of its own."""
-    code = ("import resource, sys, model.scape, model.files; peak = lambda: "
-            "resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 1024; before = peak(); "
-            "model.files.load_model(sys.argv[1]); print(peak() - before)")
+    code = ("import os, sys, model.scape, model.files; "
+            "held = lambda: int(open('/proc/self/statm').read().split()[1]) * os.sysconf('SC_PAGE_SIZE') / 2**20; "
+            "before = held(); kept = model.files.load_model(sys.argv[1]); print(held() - before)")
     return float(subprocess.run([sys.executable, "-c", code, str(path)], check=True, capture_output=True).stdout)
 
 
