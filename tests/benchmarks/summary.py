@@ -140,7 +140,9 @@ SECTIONS: dict[str, tuple[str, str, Callable[[dict], str], str]] = {
                    "On copies of about 2,500 vertices. `left out` is what leaving training poses out predicts, without "
                    "fitting them again."),
     "learning": ("Learning from 71 poses and 182 people (SPRING-182/45)", "python tests/benchmarks/learning.py",
-                 learning, "Vertex PCA has no pose to adjust. With the pose held, only betas and place are fitted."),
+                 learning, "Vertex PCA has no pose to adjust. With the pose held, only betas and place are "
+                 "fitted. Learning ran beside other work on two cores: its wall times are upper bounds. The memory of "
+                 "the loaded model was measured afterwards on the same file."),
     "mixed": ("Learning from a random mix of embedded people", "python tests/benchmarks/mixed.py", mixed,
               "30 people in 3 poses each against one person in many poses and others in one, as many meshes, at 2,000 "
               "triangles with the true skeleton. Merged from one run of seed 1 and one of seeds 2 and 3; settings "
@@ -152,7 +154,7 @@ SECTIONS: dict[str, tuple[str, str, Callable[[dict], str], str]] = {
                      "Template mesh000, ten landmarks. Where we lose: with few landmarks the template slides along "
                      "limbs and around the trunk; the surface is right long before the correspondence is."),
     "markers": ("Markers on random vertices of held-out poses", "python tests/benchmarks/markers.py", markers,
-                "Known subject, every pose a frame of its own; skeleton and model from the training poses."),
+                "Fold 0, known subject, every pose a frame of its own; skeleton and model from the training poses."),
 }
 
 
