@@ -141,8 +141,10 @@ SECTIONS: dict[str, tuple[str, str, Callable[[dict], str], str]] = {
                    "fitting them again."),
     "learning": ("Learning from 71 poses and 182 people (SPRING-182/45)", "python tests/benchmarks/learning.py",
                  learning, "Vertex PCA has no pose to adjust. With the pose held, only betas and place are "
-                 "fitted. Learning ran beside other work on two cores: its wall times are upper bounds. The memory of "
-                 "the loaded model was measured afterwards on the same file."),
+                 "fitted. Learning ran beside other work on two cores: its wall times are upper bounds. With "
+                 "nothing else running and the same skeleton given, `learn_scape` took 202 s: 81 for the pose space, "
+                 "119 for the people, 1 for the components. The memory of the loaded model was measured afterwards on "
+                 "the same file."),
     "mixed": ("Learning from a random mix of embedded people", "python tests/benchmarks/mixed.py", mixed,
               "30 people in 3 poses each against one person in many poses and others in one, as many meshes, at 2,000 "
               "triangles with the true skeleton. Merged from one run of seed 1 and one of seeds 2 and 3; settings "
