@@ -3,7 +3,8 @@ import pytest
 from model_bodies import random_poses, worm_model
 
 from model.features import PoseFeatures, QuadraticLift
-from model.learning.regression import Design, RegressionConfig, choose_design, condense
+from model.learning.condense import condense
+from model.learning.regression import Design, RegressionConfig, choose_design
 from model.pose_space import PoseSpace
 
 

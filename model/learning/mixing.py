@@ -22,8 +22,9 @@ from ..pose_space import PoseSpace
 from ..scape import ScapeModel
 from ..shape_space import learn_shape_space
 from .carriage import Carriage
+from .condense import condense
 from .pose import Progress, Ticks, fit_poses
-from .regression import Design, RegressionConfig, condense
+from .regression import Design, RegressionConfig
 from .scape import check_skeleton, checked_bodies, pose_prior, timed
 from .within import choose_within, fit_within, held_out_bodies, number_people
 

@@ -11,7 +11,8 @@ from ..gradients import GradientSystem, pose_gradients
 from ..linear import Subject
 from ..pose_space import PoseSpace
 from .carriage import Carriage
-from .regression import Design, RegressionConfig, choose_design, condense
+from .condense import condense
+from .regression import Design, RegressionConfig, choose_design
 
 Progress = Callable[[int, int], None]
 

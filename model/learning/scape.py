@@ -23,7 +23,7 @@ from ..pose_space import PoseSpace
 from ..scape import ScapeModel
 from ..shape_space import ShapeSpace, learn_shape_space
 from .carriage import Carriage
-from .pose import PoseConfig, Ticks, learn_pose
+from .pose import LearnedPose, PoseConfig, Ticks, learn_pose
 
 Progress = Callable[[int, int], None]
 LOG = logging.getLogger(__name__)
@@ -129,13 +129,17 @@ def _learn(carriage: Carriage, poses: np.ndarray, shapes: np.ndarray | None, con
             S = shape_deformations(carriage, learned.space, shapes, config.smoothness, tick)
         with timed("shape components"):
             shape_space = learn_shape_space(S, config.components)
+    return learned.space, shape_space, *pose_prior(learned.poses), how_learned(template, learned, poses, shapes, config)
+
+
+def how_learned(template: Mesh, learned: LearnedPose, poses: np.ndarray, shapes: np.ndarray | None, config: LearnConfig
+                ) -> dict[str, Any]:
+    """What a model keeps of its making: settings, what was chosen, sizes and digests of the training set."""
     design = learned.design
-    info: dict[str, Any] = {
-        "settings": asdict(config), "poses": len(poses), "shapes": 0 if shapes is None else len(shapes),
-        "pruning": design.pruning, "ridge": design.ridge, "features": learned.space.features.count,
-        "left_out_error": design.left_out_error, "digest": digest(template, poses, shapes),
-        "digests": body_digests(poses, shapes)}
-    return learned.space, shape_space, *pose_prior(learned.poses), info
+    return {"settings": asdict(config), "poses": len(poses), "shapes": 0 if shapes is None else len(shapes),
+            "pruning": design.pruning, "ridge": design.ridge, "features": learned.space.features.count,
+            "left_out_error": design.left_out_error, "digest": digest(template, poses, shapes),
+            "digests": body_digests(poses, shapes)}
 
 
 def pose_prior(poses: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

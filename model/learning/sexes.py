@@ -2,7 +2,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import asdict
 
 import numpy as np
 
@@ -10,12 +9,11 @@ from scanprep.geometry.mesh import Mesh, check_template
 from scanprep.skeleton.tree import Skeleton
 
 from ..carriers import rigid_weights
-from ..digests import body_digests, digest
 from ..scape import ScapeModel
 from ..shape_space import learn_shape_space
 from .carriage import Carriage
 from .pose import Ticks, learn_pose
-from .scape import LearnConfig, Progress, check_skeleton, checked_bodies, pose_prior, shape_deformations
+from .scape import LearnConfig, Progress, check_skeleton, checked_bodies, how_learned, pose_prior, shape_deformations
 
 SEXES = ("female", "male")
 FEWEST = 2                           # people that span a space of shapes
@@ -56,10 +54,7 @@ def learn_by_sex(template: Mesh, poses: np.ndarray, shapes: np.ndarray, sexes: S
     S = shape_deformations(carriage, learned.space, shapes, config.smoothness, tick)
     models = {}
     for sex, chosen in groups.items():
-        info = {"settings": asdict(config), "sex": sex, "poses": len(poses), "shapes": len(chosen),
-                "pruning": learned.design.pruning, "ridge": learned.design.ridge,
-                "features": learned.space.features.count, "left_out_error": learned.design.left_out_error,
-                "digest": digest(template, poses, shapes[chosen]), "digests": body_digests(poses, shapes[chosen])}
+        info = {**how_learned(template, learned, poses, shapes[chosen], config), "sex": sex}
         models[sex] = ScapeModel(template, skeleton, learned.space, learn_shape_space(S[chosen], config.components),
                                  *pose_prior(learned.poses), info)
     return models
