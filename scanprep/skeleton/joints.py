@@ -5,6 +5,7 @@ import numpy as np
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components, dijkstra
 
+from ..geometry.mesh import Mesh
 from .motions import Motions
 from .parts import PartSearch
 
@@ -153,6 +154,15 @@ def _meeting_point(dR: np.ndarray, gap: np.ndarray, radius: float) -> np.ndarray
         c = -np.linalg.solve(A + pull * np.eye(3), b)
         pull = max(LEAST_PULL, float(((dR @ c + gap)**2).sum(axis=1).mean()) / (PRIOR_WIDTH * radius)**2)
     return c
+
+
+def ring_centre(template: Mesh, ring: np.ndarray) -> np.ndarray:
+    """The middle (3,) of a ring of vertices, metres: each counts for its share of the length around."""
+    inside = np.isin(template.edges, ring).all(axis=1)
+    if not inside.any():
+        return template.vertices[ring].mean(axis=0)
+    return np.average(template.vertices[template.edges[inside]].mean(axis=1), axis=0,
+                      weights=template.edge_lengths[inside])
 
 
 def middle_part(areas: np.ndarray, centres: np.ndarray, links: np.ndarray, joints: np.ndarray) -> int:

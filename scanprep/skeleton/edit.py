@@ -1,0 +1,289 @@
+"""Changing a skeleton by hand: merge and split parts, rename them, move joints, one by one or from a file.
+
+A file of edits is JSON, a list carried out from the first to the last:
+
+    [{"merge": ["chest", "shoulder_left"]},
+     {"split": "chest", "names": ["chest", "abdomen"]},
+     {"rename": {"part3": "neck"}},
+     {"move_joint": "neck", "position": [0.0, 0.02, 1.43]},
+     {"move_joint": "hand_left", "ring": [8120, 8131, 8140]}]
+
+Parts are given by name or by number; numbers are those of the skeleton at that entry. Positions are in metres on the
+template; a ring is a list of its vertices, in whose middle the joint is put. `names` of a split may be left out.
+"""
+from __future__ import annotations
+
+import json
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ..geometry import storage
+from ..geometry.mesh import Mesh
+from .joints import ring_centre
+from .partition import Links, assemble, border_between, cut_across, cut_where_it_bends
+from .tree import Skeleton
+
+
+def part_number(skeleton: Skeleton, part: int | str) -> int:
+    """The number of a part that is given by name or number.
+
+    Raises
+    ------
+    ValueError
+        No such part.
+    """
+    names = skeleton.names
+    if isinstance(part, str) and part in names:
+        return names.index(part)
+    digits = str(part)
+    if not isinstance(part, bool) and digits.isdecimal() and int(digits) < len(names):
+        return int(digits)
+    raise ValueError(f"part: expected one of {', '.join(names)} or a number below {len(names)}, got {part!r}")
+
+
+def merge_parts(skeleton: Skeleton, template: Mesh, a: int | str, b: int | str) -> Skeleton:
+    """Two parts as one, called like the first.
+
+    They are linked, or touch and hang on the same part: then the joint comes to lie between their two.
+
+    Parameters
+    ----------
+    skeleton : Skeleton
+    template : Mesh
+    a, b : names or numbers of parts
+
+    Raises
+    ------
+    ValueError
+        A part that is not there, twice the same, or parts whose union would close a loop or lie in two pieces.
+    """
+    first, second = part_number(skeleton, a), part_number(skeleton, b)
+    if first == second:
+        raise ValueError(f"parts: expected two different parts, got '{skeleton.names[first]}' twice")
+    parents = skeleton.parents
+    low, high = min(first, second), max(first, second)
+    siblings = parents[low] == parents[high]
+    if parents[high] != low and not siblings:
+        raise ValueError(f"parts: '{skeleton.names[first]}' and '{skeleton.names[second]}' are neither linked nor on "
+                         "the same part, as one they would close a loop")
+    if not len(border_between(template, skeleton.part_of_face, low, high)[0]):
+        raise ValueError(f"parts: '{skeleton.names[first]}' and '{skeleton.names[second]}' do not touch")
+    joints = skeleton.joints.copy()
+    if siblings:
+        joints[low] = (joints[low] + joints[high]) / 2
+    new = np.arange(len(parents)) - (np.arange(len(parents)) > high)
+    new[high] = new[low]
+    keep = np.arange(len(parents)) != high
+    above = np.where(parents < 0, -1, new[parents])
+    names = [skeleton.names[first] if p == low else name for p, name in enumerate(skeleton.names)]
+    return assemble(template, new[skeleton.part_of_face], above[keep], joints[keep],
+                    tuple(name for p, name in enumerate(names) if keep[p]))
+
+
+def split_part(skeleton: Skeleton, template: Mesh, part: int | str, poses: np.ndarray | None = None,
+               names: Sequence[str] | None = None) -> Skeleton:
+    """One part as two: where it bends most in the poses or, without poses, across its length in the middle.
+
+    The half that lies on the old parent (in the root: the larger) keeps number and name; the new one follows it.
+    Children go with the half they share the longer border with.
+
+    Parameters
+    ----------
+    skeleton : Skeleton
+    template : Mesh
+    part : name or number
+    poses : (M, N, 3) float, metres, optional
+    names : two strings, optional
+        Of the half that stays and of the new one.
+
+    Raises
+    ------
+    ValueError
+        A part that is not there, one that the poses do not bend, or names that are taken.
+    """
+    p = part_number(skeleton, part)
+    label = skeleton.part_of_face
+    cut = (cut_across(template, label == p, skeleton.joints[list(skeleton.joints_of_part[p])]) if poses is None
+           else cut_where_it_bends(template, poses, label == p))
+    if cut is None:
+        raise ValueError(f"part: '{skeleton.names[p]}' cannot be cut in two"
+                         + ("" if poses is None else ", it does not bend in these poses"))
+    P = len(skeleton.parents)
+    halved = np.where(cut, P, label)
+
+    def nearer(other: int) -> int:
+        lengths = [border_between(template, halved, other, half)[1].sum() for half in (p, P)]
+        return p if lengths[0] >= lengths[1] else P
+
+    areas = [template.face_areas[halved == half].sum() for half in (p, P)]
+    stays = nearer(int(skeleton.parents[p])) if p else (0 if areas[0] >= areas[1] else P)
+    if stays == P:                                                      # the half that keeps its number is p
+        halved = np.where(label == p, np.where(cut, p, P), label)
+    place = np.r_[np.arange(p + 1), np.arange(p + 2, P + 1), p + 1]     # old number -> new, the new half after p
+    parents = np.full(P + 1, -1)
+    for j in range(1, P):
+        parents[place[j]] = place[nearer(j) if skeleton.parents[j] == p else skeleton.parents[j]]
+    parents[p + 1] = p
+    joints = np.empty((P + 1, 3))
+    joints[place] = np.r_[skeleton.joints, np.zeros((1, 3))]
+    chosen = tuple(names) if names is not None else (skeleton.names[p], _free(skeleton, skeleton.names[p]))
+    if len(chosen) != 2:
+        raise ValueError(f"names: expected two, got {list(chosen)}")
+    listed = [*skeleton.names[:p], *chosen, *skeleton.names[p + 1:]]
+    joints[p + 1] = Links(template, place[halved], poses).joint(p, p + 1)
+    return assemble(template, place[halved], parents, joints, tuple(listed))
+
+
+def rename_part(skeleton: Skeleton, part: int | str, name: str) -> Skeleton:
+    """The skeleton with another name for one part.
+
+    Raises
+    ------
+    ValueError
+        A part that is not there, or a name that is empty, a number, or taken.
+    """
+    p = part_number(skeleton, part)
+    if not isinstance(name, str) or not name.strip() or name.isdecimal():
+        raise ValueError(f"name: expected a name that is not a number, got {name!r}")
+    if name in skeleton.names and skeleton.names[p] != name:
+        raise ValueError(f"name: '{name}' is part {skeleton.names.index(name)} already")
+    names = tuple(name if j == p else old for j, old in enumerate(skeleton.names))
+    return Skeleton(skeleton.part_of_face, skeleton.parents, skeleton.joints, names)
+
+
+def move_joint(skeleton: Skeleton, template: Mesh, part: int | str, position: Sequence[float] | None = None,
+               ring: Sequence[int] | None = None) -> Skeleton:
+    """The skeleton with the joint between a part and its parent elsewhere.
+
+    Parameters
+    ----------
+    skeleton : Skeleton
+    template : Mesh
+    part : name or number
+    position : (3,) float, metres, on the template
+    ring : (n,) int
+        Instead of a position: vertices of the template, in whose middle the joint is put.
+
+    Raises
+    ------
+    ValueError
+        The root, which has no joint; not one of `position` and `ring`; numbers that are no position or no vertices.
+    """
+    p = part_number(skeleton, part)
+    if p == 0:
+        raise ValueError(f"part: '{skeleton.names[0]}' is the root, its joint is the middle of its vertices")
+    if (position is None) == (ring is None):
+        raise ValueError("position, ring: expected one of the two")
+    joints = skeleton.joints.copy()
+    if ring is not None:
+        vertices = np.asarray(ring)
+        n = len(template.vertices)
+        whole = vertices.ndim == 1 and len(vertices) >= 3 and np.issubdtype(vertices.dtype, np.integer)
+        if not whole or vertices.min() < 0 or vertices.max() >= n:
+            raise ValueError(f"ring: expected at least three vertices of 0..{n - 1}, got {list(ring)}")
+        joints[p] = ring_centre(template, vertices)
+    else:
+        point = np.asarray(position, dtype=np.float64)
+        if point.shape != (3,) or not np.isfinite(point).all():
+            raise ValueError(f"position: expected three finite numbers, got {position}")
+        joints[p] = point
+    return Skeleton(skeleton.part_of_face, skeleton.parents, joints, skeleton.names)
+
+
+def apply_edits(skeleton: Skeleton, template: Mesh, edits: Sequence[dict[str, Any]],
+                poses: np.ndarray | None = None) -> Skeleton:
+    """Carry out a list of edits, as it stands in a file (see the head of this module).
+
+    Parameters
+    ----------
+    skeleton : Skeleton
+    template : Mesh
+    edits : list of dict
+    poses : (M, N, 3) float, metres, optional
+        A split is made where the part bends most in them.
+
+    Raises
+    ------
+    ValueError
+        An entry that cannot be read or carried out, named by its number from 1 and its words.
+    """
+    if len(skeleton.part_of_face) != len(template.faces):
+        raise ValueError(f"template: expected the {len(skeleton.part_of_face)} triangles of the skeleton, "
+                         f"got {len(template.faces)}")
+    for number, edit in enumerate(edits, 1):
+        try:
+            skeleton = _applied(skeleton, template, edit, poses)
+        except ValueError as error:
+            raise ValueError(f"edits: entry {number}, {json.dumps(edit, default=str)}: {error}") from None
+    return skeleton
+
+
+def read_edits(path: str | Path) -> list[dict[str, Any]]:
+    """The edits of a JSON file.
+
+    Raises
+    ------
+    StorageError
+        Missing, or not a list of edits in JSON.
+    """
+    try:
+        stored = json.loads(Path(path).read_text(encoding="utf-8"))
+    except FileNotFoundError:
+        raise storage.StorageError(f"{path}: no such file") from None
+    except ValueError as error:
+        raise storage.StorageError(f"{path}: expected a list of edits in JSON, cannot read it ({error})") from None
+    if not isinstance(stored, list):
+        raise storage.StorageError(f"{path}: expected a list of edits in JSON, found something else")
+    return stored
+
+
+Action = Callable[[Skeleton, Mesh, dict[str, Any], np.ndarray | None], Skeleton]
+
+
+def _merge(skeleton: Skeleton, template: Mesh, edit: dict[str, Any], poses: np.ndarray | None) -> Skeleton:
+    pair = edit["merge"]
+    if not isinstance(pair, list) or len(pair) != 2:
+        raise ValueError(f"merge: expected a list of two parts, got {pair!r}")
+    return merge_parts(skeleton, template, *pair)
+
+
+def _split(skeleton: Skeleton, template: Mesh, edit: dict[str, Any], poses: np.ndarray | None) -> Skeleton:
+    return split_part(skeleton, template, edit["split"], poses, edit.get("names"))
+
+
+def _rename(skeleton: Skeleton, template: Mesh, edit: dict[str, Any], poses: np.ndarray | None) -> Skeleton:
+    if not isinstance(edit["rename"], dict):
+        raise ValueError(f"rename: expected {{old: new}}, got {edit['rename']!r}")
+    for old, new in edit["rename"].items():
+        skeleton = rename_part(skeleton, old, new)
+    return skeleton
+
+
+def _move(skeleton: Skeleton, template: Mesh, edit: dict[str, Any], poses: np.ndarray | None) -> Skeleton:
+    return move_joint(skeleton, template, edit["move_joint"], edit.get("position"), edit.get("ring"))
+
+
+ACTIONS: dict[str, tuple[Action, frozenset[str]]] = {
+    "merge": (_merge, frozenset()), "split": (_split, frozenset({"names"})), "rename": (_rename, frozenset()),
+    "move_joint": (_move, frozenset({"position", "ring"}))}
+
+
+def _applied(skeleton: Skeleton, template: Mesh, edit: dict[str, Any], poses: np.ndarray | None) -> Skeleton:
+    if not isinstance(edit, dict):
+        raise ValueError(f"expected an object with one of {', '.join(ACTIONS)}")
+    asked = [action for action in ACTIONS if action in edit]
+    if len(asked) != 1:
+        raise ValueError(f"expected one of {', '.join(ACTIONS)}, found {asked or list(edit)}")
+    action, extras = ACTIONS[asked[0]]
+    unknown = set(edit) - extras - {asked[0]}
+    if unknown:
+        raise ValueError(f"{asked[0]} does not know {', '.join(sorted(unknown))}")
+    return action(skeleton, template, edit, poses)
+
+
+def _free(skeleton: Skeleton, name: str) -> str:
+    """`name` with the lowest number from 2 that makes it new."""
+    return next(new for k in range(2, len(skeleton.names) + 3) if (new := f"{name}_{k}") not in skeleton.names)
