@@ -1,0 +1,1 @@
+"""Co-registration: scans registered with a model as prior, and the model learned again [BlendSCAPE]."""

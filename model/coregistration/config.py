@@ -1,0 +1,135 @@
+"""Settings of co-registration."""
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+from scanprep.matching.schedule import GraphStage, RegistrationConfig, ShellStage
+
+from ..learning.scape import LearnConfig
+
+
+@dataclass(frozen=True)
+class PoseStage:
+    """One stage of bringing the model to a scan by its pose and betas alone. Lengths are shares of √area.
+
+    Attributes
+    ----------
+    reach : float
+        Farthest match that counts.
+    slide : float
+        Force of a match along the surface, as a share of that across it.
+    prior : float
+        Distance to the data that a joint one standard deviation away from the training poses is worth.
+    landmarks : float
+        The share of the surface that one landmark weighs as much as.
+    rounds : int
+        Times that matches are sought anew.
+    detail : float
+        Spacing to which the scan is thinned.
+    sample : int
+        Vertices of the model that are matched.
+    """
+
+    reach: float
+    slide: float
+    prior: float
+    landmarks: float
+    rounds: int = 5
+    detail: float = 0.02
+    sample: int = 600
+
+
+@dataclass(frozen=True)
+class ModelFitConfig:
+    """Settings of bringing the model to a scan.
+
+    Attributes
+    ----------
+    search : stages that every start goes through
+    refine : stages that the best few go through
+    kept : int
+        How many starts are refined.
+    axes : int
+        Typical poses are the mean of the training poses and a step both ways along so many main directions.
+    turns : int
+        Without landmarks and without a start, each typical pose is turned so often about the vertical.
+    up : (3,) float, optional
+        The vertical; by default the coordinate axis along which the template is longest.
+    normal_weight : float
+        Distance, as a share of √area, that a difference of normals of one is worth when matching.
+    n_betas : int
+        Most shape components used while the pose is sought.
+    shape_prior : float
+        Distance to the data, as a share of √area, that one standard deviation of a beta is worth.
+    explained : float
+        A scan point nearer to the body than this share of √area, with a like normal, is explained.
+    """
+
+    search: tuple[PoseStage, ...] = (
+        PoseStage(0.25, 0.5, 0.003, 0.02, 5, 0.04, 250),
+        PoseStage(0.15, 0.3, 0.002, 0.02, 5, 0.04, 250),
+    )
+    refine: tuple[PoseStage, ...] = (
+        PoseStage(0.1, 0.2, 0.0015, 0.01),
+        PoseStage(0.06, 0.1, 0.001, 0.01),
+        PoseStage(0.04, 0.05, 0.0007, 0.01),
+    )
+    kept: int = 3
+    axes: int = 6
+    turns: int = 8
+    up: tuple[float, float, float] | None = None
+    normal_weight: float = 0.05
+    n_betas: int = 20
+    shape_prior: float = 0.0005
+    explained: float = 0.012
+
+
+# the predicted mesh lies near already: fine stages only, whose stiffness is relative to the prediction's own shape
+NEAR = RegistrationConfig(
+    graph=(
+        GraphStage(300, 0.09, 0.009, 0.7, 0.01, 0.08),
+        GraphStage(300, 0.06, 0.006, 0.7, 0.01, 0.06),
+        GraphStage(1000, 0.04, 0.004, 0.35, 0.01, 0.05, detail=0.008),
+        GraphStage(1000, 0.025, 0.0025, 0.35, 0.01, 0.037, detail=0.008),
+    ),
+    shell=(ShellStage(0.02, 0.007, 0.0002, 0.02), ShellStage(0.015, 0.003, 0.0002, 0.015)))
+
+# while the pose is still sought the alignment keeps more of the predicted shape
+COUPLED = RegistrationConfig(
+    graph=(
+        GraphStage(300, 0.2, 0.02, 2.0, 0.01, 0.08),
+        GraphStage(300, 0.13, 0.013, 1.4, 0.01, 0.06),
+    ), shell=())
+
+
+@dataclass(frozen=True)
+class CoregistrationConfig:
+    """Settings of `register_with_model` and `coregister`.
+
+    Attributes
+    ----------
+    fit : ModelFitConfig
+    coupled : tuple of RegistrationConfig
+        Alignments, softer and softer, from each of which pose and betas are taken anew.
+    last : RegistrationConfig
+        Of the final alignment to the last prediction.
+    learn : LearnConfig
+        How the model is learned again.
+    rounds : int
+        Most times that all scans are registered and the model is learned.
+    tolerance : float
+        Settled when a round moves the mean vertex by less than this share of √area.
+    failed : float
+        A scan of which a larger share of points stays unexplained does not teach the model.
+    workers : int
+        Processes; 0 for one a core.
+    """
+
+    fit: ModelFitConfig = field(default_factory=ModelFitConfig)
+    coupled: tuple[RegistrationConfig, ...] = (COUPLED,)
+    last: RegistrationConfig = NEAR
+    learn: LearnConfig = field(default_factory=LearnConfig)
+    rounds: int = 3
+    tolerance: float = 0.0007
+    failed: float = 0.1
+    workers: int = 0

@@ -1,0 +1,207 @@
+"""The model brought to a scan by its pose, place and betas: search from many starts, then the best few refined."""
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+
+from scanprep.geometry import rotations
+from scanprep.geometry.mesh import Mesh
+from scanprep.matching.matches import Target, orient
+
+from ..body import BodyModel
+from ..features import twists
+from ..fitting import share_of_vertices, spread_vertices
+from ..linear import Subject
+from ..minimise import minimise
+from .attraction import Attraction, attraction, towards, unexplained
+from .config import ModelFitConfig, PoseStage
+from .posed import PosedPoints, posed_points, typical_poses, whitening
+
+STEPS = 2                            # of Levenberg-Marquardt between matchings
+
+
+@dataclass(frozen=True, eq=False)
+class Candidate:
+    """A pose, place and betas in one vector, and how badly scan and body explain each other, in metres."""
+
+    x: np.ndarray
+    score: float
+
+
+class ModelFit:
+    """One body and one scan: searches for the pose, place and betas.
+
+    Parameters
+    ----------
+    body : BodyModel or Subject
+        A model where the shape is unknown, a subject where it is known.
+    target : Target
+    landmarks : (L,) int and (L, 3) float, metres, optional
+    config : ModelFitConfig
+    """
+
+    def __init__(self, body: BodyModel | Subject, target: Target, landmarks: tuple[np.ndarray, np.ndarray] | None,
+                 config: ModelFitConfig) -> None:
+        template = body.template
+        self.body, self.target, self.config = body, target, config
+        self.size = float(np.sqrt(template.face_areas.sum()))
+        none = np.zeros(0, dtype=np.int64), np.zeros((0, 3))
+        self.marks, self.marked = none if landmarks is None else landmarks
+        assert body.pose_mean is not None and body.pose_covariance is not None, "a body without a pose prior"
+        self.pose_mean, self.covariance = body.pose_mean, body.pose_covariance
+        self.whitening = whitening(self.covariance)
+        self.points = lru_cache(maxsize=4)(self._points)
+
+    def _points(self, sample: int) -> tuple[PosedPoints, np.ndarray]:
+        """Spread vertices with the landmarks behind them, and the share of the surface of each of the former."""
+        ids = spread_vertices(self.body.template.vertices, sample)
+        share = share_of_vertices(self.body.template.vertices, ids) / len(self.body.template.vertices)
+        return posed_points(self.body, np.r_[ids, self.marks], self.config.n_betas), share
+
+    @property
+    def unknowns(self) -> int:
+        """How many numbers x has."""
+        points = self.points(self.config.refine[-1].sample)[0]
+        return points.J3 + 3 + points.n_betas
+
+    def settle(self, x: np.ndarray, points: PosedPoints, wanted: Attraction, prior: float, steps: int) -> np.ndarray:
+        """Least squares over x of what is wanted of the points, the pose prior and that of the betas.
+
+        Parameters
+        ----------
+        prior : float
+            As in `PoseStage`.
+        """
+        J3, W = points.J3, prior * self.size * self.whitening
+        mean, b = self.pose_mean.ravel(), self.config.shape_prior * self.size
+        by_prior = np.zeros((len(x), len(W) + points.n_betas))
+        by_prior[:J3, :len(W)] = W.T
+        by_prior[J3 + 3:, len(W):] = b * np.eye(points.n_betas)
+
+        def priors(x: np.ndarray) -> np.ndarray:
+            return np.r_[W @ (x[:J3] - mean), b * x[J3 + 3:]]
+
+        def evaluate(x: np.ndarray) -> np.ndarray:
+            return np.r_[wanted.residual(points.positions(x)), priors(x)]
+
+        def derive(x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+            y, columns = points.columns(x)
+            by_data = np.einsum("lij,plj->pli", wanted.root, columns, optimize=True).reshape(len(x), -1)
+            return np.r_[wanted.residual(y), priors(x)], np.concatenate([by_data, by_prior], axis=1)
+
+        return minimise(evaluate, derive, x, J3 // 3, 1e-5, steps).x
+
+    def follow(self, x: np.ndarray, stage: PoseStage) -> np.ndarray:
+        """One stage: match, settle, and again."""
+        points, share = self.points(stage.sample)
+        target, scale = self.target.thinned(stage.detail * self.size), self.config.normal_weight * self.size
+        L = len(share)
+        marks = towards(self.marked, np.full(len(self.marks), stage.landmarks))
+        for _ in range(stage.rounds):
+            y, n = points.positions(x)[:L], points.normals(x)[:L]
+            if not target.oriented:
+                target = orient(self.target.thinned(stage.detail * self.size), self.predicted(x), scale)
+            wanted = attraction(y, n, share, target, stage.reach * self.size, stage.slide, scale)
+            x = self.settle(x, points, wanted.joined(marks), stage.prior, STEPS)
+        return x
+
+    def scored(self, x: np.ndarray, stage: PoseStage) -> Candidate:
+        """How far scan and body are apart, both ways and at most the stage's reach, as a root mean square."""
+        points, share = self.points(stage.sample)
+        L, limit, scale = len(share), stage.reach * self.size, self.config.normal_weight * self.size
+        target = self.target.thinned(stage.detail * self.size)
+        if not target.oriented:
+            target = orient(target, self.predicted(x), scale)
+        y = points.positions(x)
+        back, forward = unexplained(y[:L], points.normals(x)[:L], target, limit, scale)
+        off = np.linalg.norm(y[L:] - self.marked, axis=1)
+        bent = self.whitening @ (x[:points.J3] - self.pose_mean.ravel())
+        energy = (back**2).mean() + share @ forward**2 + stage.landmarks * np.sum(np.minimum(off, limit)**2) \
+            + (stage.prior * self.size)**2 * float(bent @ bent)
+        return Candidate(x, float(np.sqrt(energy)))
+
+    def search(self, starts: list[np.ndarray]) -> list[Candidate]:
+        """The best few of many starts, best first, after the stages of the search."""
+        found = []
+        for x in starts:
+            for stage in self.config.search:
+                x = self.follow(x, stage)
+            found.append(self.scored(x, self.config.search[-1]))
+        found.sort(key=lambda candidate: candidate.score)
+        return found[:self.config.kept]
+
+    def refine(self, x: np.ndarray) -> Candidate:
+        """The end of the stages that follow the scan closely."""
+        for stage in self.config.refine:
+            x = self.follow(x, stage)
+        return self.scored(x, self.config.refine[-1])
+
+    def taken_from(self, vertices: np.ndarray, weights: np.ndarray, x: np.ndarray, prior: float, steps: int = 10
+                   ) -> np.ndarray:
+        """Pose, place and betas from an alignment's vertices (N, 3), metres, weighted (N,), from x on."""
+        stage = self.config.refine[-1]
+        points, share = self.points(stage.sample)
+        ids = spread_vertices(self.body.template.vertices, stage.sample)
+        wanted = towards(np.r_[vertices[ids], self.marked],
+                         np.r_[share * weights[ids], np.full(len(self.marks), stage.landmarks)])
+        return self.settle(x, points, wanted, prior, steps)
+
+    def start_from(self, vertices: np.ndarray, weights: np.ndarray) -> np.ndarray:
+        """Unknowns near an alignment that may be wrong here and there."""
+        skeleton, template = self.body.skeleton, self.body.template
+        pose = skeleton.pose_of(skeleton.fit_rotations(template, vertices))
+        return self.taken_from(vertices, weights, self.placed(pose, vertices), self.config.search[0].prior)
+
+    def placed(self, pose: np.ndarray, onto: np.ndarray) -> np.ndarray:
+        """Unknowns of a pose (J, 3), mean betas, with the body's middle in that of points (n, 3), metres."""
+        x = np.zeros(self.unknowns)
+        x[:pose.size] = twists(pose).ravel()
+        points, _ = self.points(self.config.search[0].sample)
+        x[pose.size:pose.size + 3] = onto.mean(axis=0) - points.positions(x).mean(axis=0)
+        return x
+
+    def starts(self) -> list[np.ndarray]:
+        """Typical poses where landmarks place them, or without landmarks turned about the vertical."""
+        poses = typical_poses(self.pose_mean, self.covariance, self.config.axes)
+        if len(self.marks) >= 3:
+            return [self._on_landmarks(pose) for pose in poses]
+        up = np.zeros(3)
+        up[np.ptp(self.body.template.vertices, axis=0).argmax()] = 1
+        if self.config.up is not None:
+            up = np.asarray(self.config.up) / np.linalg.norm(self.config.up)
+        out = []
+        for turn in 2 * np.pi * np.arange(self.config.turns) / self.config.turns:
+            for pose in poses:
+                turned = pose.copy()
+                turned[0] = rotations.log(rotations.exp(turn * up) @ rotations.exp(pose[0]))
+                out.append(self.placed(turned, self.target.points))
+        return out
+
+    def _on_landmarks(self, pose: np.ndarray) -> np.ndarray:
+        """A pose turned as a whole, then bent, towards the landmarks."""
+        stage = self.config.search[0]
+        points, share = self.points(stage.sample)
+        x = self.placed(pose, self.marked)
+        here = points.positions(x)[len(share):]
+        R, _ = rotations.procrustes(here, self.marked)
+        turned = pose.copy()
+        turned[0] = rotations.log(R @ rotations.exp(pose[0]))
+        x = self.placed(turned, self.marked)
+        x[points.J3:points.J3 + 3] += (self.marked - points.positions(x)[len(share):]).mean(axis=0)
+        nothing = Attraction(np.zeros((len(share), 3, 3)), np.zeros((len(share), 3)))
+        marks = towards(self.marked, np.full(len(self.marks), 1 / len(self.marks)))
+        return self.settle(x, points, nothing.joined(marks), stage.prior, 15)
+
+    def predicted(self, x: np.ndarray) -> Mesh:
+        """The body's mesh."""
+        pose, trans, betas = self.split(x)
+        body = self.body
+        vertices = body.vertices(pose, trans) if isinstance(body, Subject) else body.vertices(pose, betas, trans)
+        return body.template.with_vertices(np.asarray(vertices, dtype=np.float64))
+
+    def split(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray | None]:
+        """Pose (J, 3), trans (3,), and betas (K,) or None where the shape is known."""
+        J3 = self.pose_mean.size
+        return x[:J3].reshape(-1, 3), x[J3:J3 + 3], x[J3 + 3:] if len(x) > J3 + 3 else None

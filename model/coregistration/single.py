@@ -1,0 +1,143 @@
+"""One scan registered with a model as prior."""
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from scanprep.geometry.mesh import Mesh
+from scanprep.matching.matches import Target, orient, target_of
+from scanprep.matching.nonrigid import register
+
+from ..body import BodyModel
+from ..linear import Subject
+from .attraction import unexplained
+from .config import CoregistrationConfig
+from .modelfit import ModelFit
+
+Landmarks = tuple[np.ndarray, np.ndarray]
+
+
+@dataclass(frozen=True, eq=False)
+class ModelRegistration:
+    """The template on a scan, and the model that led it there.
+
+    Attributes
+    ----------
+    mesh : Mesh
+        Follows the scan where there are data, the model along the surface and where there are none.
+    predicted : Mesh
+        The model's own mesh.
+    pose : (J, 3) float, radians
+    trans : (3,) float, metres
+    betas : (K,) float, or None for a body of known shape
+    seen : (N,) bool
+        Whether there were data here.
+    distances : (N,) float, metres
+        From each vertex that was seen to the surface of the scan; NaN for the others.
+    rms : float, metres
+        Of these distances.
+    explained : float
+        Share of the scan's points that the mesh explains.
+    apart : float, metres
+        Mean distance of the mesh from the prediction where there were data: much of it tells of a wrong pose.
+    landmark_rms : float, metres
+        NaN without landmarks.
+    flipped : int
+        Triangles that face against their surroundings.
+    score : float, metres
+        How far scan and model were apart, of the best start.
+    starts : int
+        How many starts were tried.
+    """
+
+    mesh: Mesh
+    predicted: Mesh
+    pose: np.ndarray
+    trans: np.ndarray
+    betas: np.ndarray | None
+    seen: np.ndarray
+    distances: np.ndarray
+    rms: float
+    explained: float
+    apart: float
+    landmark_rms: float
+    flipped: int
+    score: float
+    starts: int
+
+
+def register_with_model(body: BodyModel | Subject, scan: Mesh | np.ndarray, landmarks: Landmarks | None = None,
+                        start: np.ndarray | None = None, config: CoregistrationConfig | None = None,
+                        progress: Callable[[int, int], None] | None = None) -> ModelRegistration:
+    """Bring the template onto a scan with a model of it as prior.
+
+    1. Pose, place and betas are sought from several starts by matches alone.
+    2. The template is aligned from the best prediction, held to its shape; pose and betas are taken from where
+       the alignment has data, and a new prediction is made.
+    3. The last alignment follows the scan: what data there are decide, the model the rest.
+
+    Parameters
+    ----------
+    body : BodyModel or Subject
+        A model where the person's shape is unknown, a subject where it is known.
+    scan : Mesh or (n, 3) float, metres
+    landmarks : (L,) int and (L, 3) float, metres, optional
+        Vertices of the template and where they are on the scan.
+    start : (N, 3) float, metres, or (J, 3) float, radians, optional
+        An earlier registration, right or wrong, or a pose; it is tried beside the typical poses.
+    config : CoregistrationConfig, optional
+    progress : callable, optional
+        Called as progress(done, total).
+
+    Raises
+    ------
+    ValueError
+        A scan, landmarks or a start that cannot be used.
+
+    [BlendSCAPE]
+    """
+    config = config or CoregistrationConfig()
+    tell = progress or (lambda done, total: None)
+    total = 2 + len(config.coupled)
+    target = target_of(scan, config.last.neighbours)
+    fit = ModelFit(body, target, landmarks, config.fit)
+    starts = fit.starts() + ([] if start is None else [_given(fit, start)])
+    best = min((fit.refine(found.x) for found in fit.search(starts)), key=lambda candidate: candidate.score)
+    tell(1, total)
+    x = best.x
+    for i, coupled in enumerate(config.coupled):
+        aligned = register(fit.predicted(x), scan, None, coupled)
+        x = fit.taken_from(aligned.mesh.vertices, aligned.seen.astype(float), x, config.fit.refine[-1].prior)
+        tell(2 + i, total)
+    predicted = fit.predicted(x)
+    aligned = register(predicted, scan, None, config.last)
+    tell(total, total)
+    mesh, seen = aligned.mesh, aligned.seen
+    pose, trans, betas = fit.split(x)
+    apart = np.linalg.norm(mesh.vertices - predicted.vertices, axis=1)[seen]
+    off = np.linalg.norm(mesh.vertices[fit.marks] - fit.marked, axis=1)
+    return ModelRegistration(mesh, predicted, pose, trans, betas, seen, aligned.distances, aligned.rms,
+                             explained_share(mesh, target, fit, config), float(apart.mean()) if len(apart) else np.nan,
+                             float(np.sqrt((off**2).mean())) if len(off) else np.nan, aligned.flipped, best.score,
+                             len(starts))
+
+
+def explained_share(mesh: Mesh, target: Target, fit: ModelFit, config: CoregistrationConfig) -> float:
+    """Share of the scan's points that lie near the mesh and face as it does."""
+    scale = config.fit.normal_weight * fit.size
+    limit = config.fit.explained * fit.size
+    far, _ = unexplained(mesh.vertices, mesh.vertex_normals, orient(target, mesh, scale), limit, scale)
+    return float((far < limit).mean())
+
+
+def _given(fit: ModelFit, start: np.ndarray) -> np.ndarray:
+    """Unknowns of a start given as vertices or as a pose."""
+    start = np.asarray(start, dtype=np.float64)
+    shapes = fit.body.template.vertices.shape, fit.pose_mean.shape
+    if start.shape not in shapes or not np.isfinite(start).all():
+        raise ValueError(f"start: expected finite vertices {shapes[0]} or a pose {shapes[1]}, got {start.shape}")
+    if start.shape == shapes[0]:
+        return fit.start_from(start, np.ones(len(start)))
+    return fit.placed(start, fit.target.points)
