@@ -10,7 +10,7 @@ import numpy as np
 from protocols import RealData
 
 from scanprep.geometry.mesh import Mesh
-from scanprep.scanning.scanner import ScannerConfig, scan
+from scanprep.scanning.scanner import RangeView, ScannerConfig, scan
 
 HELD_POSES = (2, 7, 17, 22, 32, 37, 47, 52, 62, 67)
 HELD_MEN = (2, 27, 52, 77, 97, 122, 147, 172, 197, 222)
@@ -37,12 +37,24 @@ class TestScan:
     truth : Mesh
     seen : (N,) bool
         True vertices with a point of the scan within 12 mm.
+    views : tuple of RangeView
     """
 
     name: str
     scan: Mesh
     truth: Mesh
     seen: np.ndarray
+    views: tuple[RangeView, ...]
+
+    def merged(self) -> Mesh:
+        """One closed surface of even triangles, for tools that need one: merged, largest piece, holes filled."""
+        from scanprep import decimate, fill_holes, merge_views
+        from scanprep.cleaning.decimate import DecimateConfig
+        from scanprep.cleaning.merge import MergeConfig
+        from scanprep.cleaning.repair import repair
+
+        closed = fill_holes(repair(merge_views(self.views, MergeConfig(voxel=0.006, min_component=0.5))))
+        return decimate(closed, 30_000, DecimateConfig("even"))
 
     def landmarks(self, data: RealData, which: str) -> tuple[np.ndarray, np.ndarray] | None:
         """Template vertices and their places on the scan: a set of `MARKS`."""
@@ -61,9 +73,9 @@ def test_scan(data: RealData, kind: str, index: int, front: bool = False) -> Tes
     if front:
         chest = truth.vertex_normals[data.landmarks["cornea"]]
         config = replace(config, views=1, azimuth=float(np.degrees(np.arctan2(chest[0], -chest[1]))))
-    surface = scan(truth, config, np.random.default_rng(index)).merged
-    seen = cKDTree(surface.vertices).query(truth.vertices)[0] < 0.012
-    return TestScan(f"{kind}{index:03d}{'front' if front else ''}", surface, truth, seen)
+    scanned = scan(truth, config, np.random.default_rng(index))
+    seen = cKDTree(scanned.merged.vertices).query(truth.vertices)[0] < 0.012
+    return TestScan(f"{kind}{index:03d}{'front' if front else ''}", scanned.merged, truth, seen, scanned.views)
 
 
 test_scan.__test__ = False        # type: ignore[attr-defined]
