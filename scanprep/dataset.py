@@ -154,6 +154,13 @@ class RegisteredSet:
         _write_rows(self.folder, rows)
         return RegisteredSet(self.folder, self.template, tuple(rows), self.skeleton, self.info)
 
+    def in_order(self) -> RegisteredSet:
+        """The set with its meshes in the order of their names, however they came in."""
+        rows = tuple(sorted(self.entries, key=lambda entry: entry.name))
+        if rows != self.entries:
+            _write_rows(self.folder, rows)
+        return RegisteredSet(self.folder, self.template, rows, self.skeleton, self.info)
+
     def with_skeleton(self, skeleton: Skeleton) -> RegisteredSet:
         """Write a skeleton into the set.
 

@@ -1,82 +1,31 @@
 """A folder of scans to a registered set: one task a scan, resumable, and one bad scan stops no other.
 
-    scans/name.ply, its landmarks, scans.csv  ->  set/meshes/name.ply, set.csv, registration.csv, skeleton.json
+    scans/name.ply, its landmarks, scans.csv  ->  set/meshes/name.ply, set.csv, skeleton.json,
+                                                  registration.csv, failures.csv, pictures/name.webp, report.html
 """
 from __future__ import annotations
 
-import csv
-import io
-import os
-import time
-from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import asdict, astuple, dataclass, field, fields, replace
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import asdict, dataclass, field, replace
 from pathlib import Path
-from typing import Any
 
-import numpy as np
-
+from .batch.figures import Failure, ScanFigures, read_failures, read_figures, write_failures, write_figures
+from .batch.lock import locked
+from .batch.page import PICTURES, write_set_page
+from .batch.scan import RegisteredScan, ScanSettings, one_thread, register_scan
+from .batch.tasks import LANDMARK_ENDINGS, TABLE, ScanTask, find_scans, read_scan
+from .batch.workers import Outcome, Work, run_in_processes
 from .dataset import RegisteredSet
 from .geometry import storage
-from .geometry.files import list_meshes, read_mesh, read_points
-from .geometry.landmarks import match_landmarks, read_landmarks, write_landmarks
+from .geometry.landmarks import write_landmarks
 from .geometry.mesh import Mesh, check_template
-from .matching.nonrigid import RegistrationConfig, register
-from .skeleton.find import SkeletonConfig, find_skeleton
+from .skeleton.find import find_skeleton
+from .skeleton.parts import SkeletonConfig
+
+__all__ = ["LANDMARK_ENDINGS", "TABLE", "PrepareConfig", "Prepared", "ScanFigures", "ScanSettings", "ScanTask",
+           "find_scans", "prepare", "read_scan", "register_scan"]
 
 Progress = Callable[[int, int], None]
-
-LANDMARK_ENDINGS = (".json", ".mrk.json", ".landmarks.json", ".pp", "_picked_points.pp", ".lnd", ".landmarks.txt")
-TABLE = "scans.csv"
-
-
-@dataclass(frozen=True)
-class ScanTask:
-    """One scan of a folder and what is known of it.
-
-    Attributes
-    ----------
-    name : str
-    scan : Path
-    landmarks : Path or None
-    subject, pose, sex : str
-        Empty where not known.
-    """
-
-    name: str
-    scan: Path
-    landmarks: Path | None = None
-    subject: str = ""
-    pose: str = ""
-    sex: str = ""
-
-
-@dataclass(frozen=True)
-class ScanFigures:
-    """How well the template lies on one scan: a row of `registration.csv`.
-
-    Attributes
-    ----------
-    name : str
-    distance, rms : float, metres
-        Of the vertices with data to the surface of the scan.
-    seen : float
-        Share of the vertices with data.
-    landmarks : float, metres
-        RMS distance of the landmarks.
-    flipped : int
-        Triangles that face against their surroundings.
-    converged : bool
-    seconds : float
-    """
-
-    name: str
-    distance: float
-    rms: float
-    seen: float
-    landmarks: float
-    flipped: int
-    converged: bool
-    seconds: float
 
 
 @dataclass(frozen=True)
@@ -85,21 +34,25 @@ class PrepareConfig:
 
     Attributes
     ----------
-    registration : RegistrationConfig
+    scan : ScanSettings
+        How each scan is registered.
     skeleton : SkeletonConfig
-    unit : 'm', 'mm', 'cm' or 'in', optional
-        Of the scans and their landmarks, where the files cannot tell.
     min_poses : int
         A skeleton is sought when one subject has at least so many meshes.
     workers : int
-        Processes; 0 for one a core.
+        Processes on this machine; 0 for one a core.
+    scheduler : str, optional
+        Address of a Dask scheduler, whose workers then do the work.
+    ship : bool
+        Send the files of the scans to those workers, which otherwise read them under the same path.
     """
 
-    registration: RegistrationConfig = field(default_factory=RegistrationConfig)
+    scan: ScanSettings = field(default_factory=ScanSettings)
     skeleton: SkeletonConfig = field(default_factory=SkeletonConfig)
-    unit: str | None = None
     min_poses: int = 5
     workers: int = 0
+    scheduler: str | None = None
+    ship: bool = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -112,56 +65,25 @@ class Prepared:
     figures : tuple of ScanFigures, of all scans in the set
     failures : tuple of str
         One line a scan that could not be registered: which file, and why.
+    fresh : int
+        Scans that were registered now; the others had been before.
     """
 
     registered: RegisteredSet
     figures: tuple[ScanFigures, ...]
     failures: tuple[str, ...]
-
-
-def find_scans(folder: str | Path, landmarks: str | Path | None = None, subject: str = "") -> list[ScanTask]:
-    """The scans of a folder, their landmark files, and what `scans.csv` says of them.
-
-    Parameters
-    ----------
-    folder : path
-        Meshes or point clouds. `scans.csv`, where there is one, has the columns name, subject, pose, sex (any of
-        the last three may be missing).
-    landmarks : path, optional
-        Folder of the landmark files, by default `landmarks` inside the folder or the folder itself. A file
-        belongs to the scan of the same name.
-    subject : str
-        Whose scans they are, where `scans.csv` does not say; when empty, every scan is a subject of its own.
-
-    Raises
-    ------
-    ValueError
-        No such folder, no scans, a table without names.
-    """
-    folder = Path(folder)
-    paths = list_meshes(folder)
-    about = _read_table(folder / TABLE)
-    unknown = sorted(set(about) - {path.name.split(".")[0] for path in paths})
-    if unknown:
-        raise ValueError(f"{folder / TABLE}: no scan is called {', '.join(unknown[:5])}")
-    places = [Path(landmarks)] if landmarks else [folder / "landmarks", folder]
-    tasks = []
-    for path in paths:
-        name = path.name.split(".")[0]
-        row = about.get(name, {})
-        candidates = [place / (name + ending) for place in places for ending in LANDMARK_ENDINGS]
-        tasks.append(ScanTask(name, path, next((c for c in candidates if c.is_file()), None),
-                              row.get("subject") or subject or name, row.get("pose", ""), row.get("sex", "")))
-    return tasks
+    fresh: int = 0
 
 
 def prepare(tasks: Sequence[ScanTask], template: Mesh, template_landmarks: dict[str, int], folder: str | Path,
             config: PrepareConfig | None = None, progress: Progress | None = None,
             skeleton_progress: Progress | None = None) -> Prepared:
-    """Register the template to every scan and find the skeleton.
+    """Register the template to every scan, find the skeleton, and write a page that shows how it went.
 
-    Scans that the folder already holds are not registered again, so the same call goes on where it was
-    interrupted. A scan that cannot be read or registered is listed and the others go on.
+    Scans that the folder already holds are not registered again unless their files have changed, so the same call
+    goes on where it was interrupted. A scan that cannot be read or registered is listed and the others go on.
+    What is written does not depend on the number of workers, on their order or on interruptions; only `times.csv`
+    does.
 
     Parameters
     ----------
@@ -169,112 +91,90 @@ def prepare(tasks: Sequence[ScanTask], template: Mesh, template_landmarks: dict[
     template : Mesh
         One connected manifold component.
     template_landmarks : name -> vertex
+        May be empty where no scan has landmarks.
     folder : path
         Of the registered set.
 
     Raises
     ------
     ValueError
-        A template that cannot serve, or a folder that holds a set made with another template or settings.
+        A template that cannot serve, a folder that holds a set made with another template or settings or where
+        another run is at work, a scheduler that does not answer.
     """
     config = config or PrepareConfig()
     folder = Path(folder)
     check_template(template)
-    registered = _open_set(folder, template, config)
-    write_landmarks(folder / "landmarks.json", {name: int(v) for name, v in template_landmarks.items()})
-    figures = {f.name: f for f in _read_figures(folder)}
-    wanted = [task for task in tasks if task.name not in figures or task.name not in registered.names]
-    failures = []
-    done = len(tasks) - len(wanted)
-    if progress:
-        progress(done, len(tasks))
-    for task, outcome in _run(wanted, template, template_landmarks, config):
-        if isinstance(outcome, str):
-            failures.append(outcome)
-        else:
-            vertices, row = outcome
-            registered = registered.add(task.name, vertices, task.subject, task.pose, task.sex)
-            figures[row.name] = row
-            _write_figures(folder, figures.values())
-        done += 1
-        if progress:
-            progress(done, len(tasks))
-    registered = _with_skeleton(registered, config, skeleton_progress)
-    return Prepared(registered, tuple(figures[n] for n in registered.names if n in figures), tuple(failures))
-
-
-def register_scan(task: ScanTask, template: Mesh, template_landmarks: dict[str, int], config: RegistrationConfig,
-                  unit: str | None = None) -> tuple[np.ndarray, ScanFigures]:
-    """Read and register one scan: vertices (N, 3) in metres, and how well they lie.
-
-    Raises
-    ------
-    ValueError
-        A file that cannot be read, landmarks that do not match.
-    """
-    start = time.perf_counter()
-    scan = read_scan(task.scan, unit)
-    landmarks = None
-    if task.landmarks is not None:
-        mesh = scan if isinstance(scan, Mesh) else None
-        found = read_landmarks(task.landmarks, mesh, unit)
+    with locked(folder), one_thread():
+        registered = _open_set(folder, template, config)
+        write_landmarks(folder / "landmarks.json", {name: int(v) for name, v in template_landmarks.items()})
+        run = _Run(registered, tasks, progress or (lambda done, total: None))
         try:
-            landmarks = match_landmarks(template_landmarks, found)[1:]
-        except ValueError as error:
-            raise ValueError(f"{task.landmarks}: {error}") from None
-    fit = register(template, scan, landmarks, config)
-    return fit.mesh.vertices, ScanFigures(
-        task.name, float(np.nanmean(fit.distances)) if fit.seen.any() else np.nan, fit.rms, float(fit.seen.mean()),
-        fit.landmark_rms, fit.flipped, fit.converged, time.perf_counter() - start)
+            run.register(_outcomes(run.wanted, Work(template, template_landmarks, config.scan), config))
+            run.registered = _with_skeleton(run.registered.in_order(), config, skeleton_progress)
+        finally:
+            write_set_page(folder)
+    return run.result()
 
 
-def read_scan(path: str | Path, unit: str | None = None) -> Mesh | np.ndarray:
-    """A scan as a mesh, or as points (n, 3) where the file has no triangles."""
-    cloud = read_points(path, unit)
-    if Path(path).suffix.lower() in (".xyz", ".pcd", ".txt", ".pts"):
-        return cloud.points
-    try:
-        return read_mesh(path, unit)
-    except ValueError as error:
-        if "no faces" in str(error):
-            return cloud.points
-        raise
+class _Run:
+    """A run under way: what the set holds, what is still to be done, what failed."""
+
+    def __init__(self, registered: RegisteredSet, tasks: Sequence[ScanTask], progress: Progress) -> None:
+        self.registered, self.tasks, self.progress = registered, tasks, progress
+        self.folder = registered.folder
+        for stale in self.folder.rglob(".*.part*"):         # half-written when an earlier run was killed
+            stale.unlink()
+        self.figures = {f.name: f for f in read_figures(self.folder) if f.name in registered.names}
+        names = {task.name for task in tasks}
+        self.failures = {f.name: f for f in read_failures(self.folder) if f.name in names}
+        self.wanted = [task for task in tasks if not self.is_done(task)]
+
+    def is_done(self, task: ScanTask) -> bool:
+        """Whether the set holds the scan as its files are now."""
+        known = self.figures.get(task.name)
+        return known is not None and known.inputs == task.fingerprint()
+
+    def register(self, outcomes: Iterator[tuple[ScanTask, Outcome]]) -> None:
+        """Write each outcome as it comes, the row of figures last: with it the scan is done."""
+        done = len(self.tasks) - len(self.wanted)
+        self.progress(done, len(self.tasks))
+        for task, outcome in outcomes:
+            if isinstance(outcome, str):
+                self.failures[task.name] = Failure(task.name, outcome)
+                write_failures(self.folder, self.failures.values())
+            else:
+                self.keep(task, outcome)
+            done += 1
+            self.progress(done, len(self.tasks))
+
+    def keep(self, task: ScanTask, found: RegisteredScan) -> None:
+        """A registered scan into the set."""
+        if found.picture:
+            with storage.writing(self.folder / PICTURES / f"{task.name}.webp") as beside:
+                beside.write_bytes(found.picture)
+        self.registered = self.registered.add(task.name, found.vertices, task.subject, task.pose, task.sex)
+        if self.failures.pop(task.name, None):
+            write_failures(self.folder, self.failures.values())
+        self.figures[task.name] = found.figures
+        write_figures(self.folder, self.figures.values())
+
+    def result(self) -> Prepared:
+        """What this run leaves."""
+        fresh = sum(task.name in self.figures and task.name not in self.failures for task in self.wanted)
+        return Prepared(self.registered, tuple(self.figures[n] for n in self.registered.names if n in self.figures),
+                        tuple(f.reason for _, f in sorted(self.failures.items())), fresh)
 
 
-def _attempt(task: ScanTask, template: Mesh, template_landmarks: dict[str, int], config: RegistrationConfig,
-             unit: str | None) -> tuple[np.ndarray, ScanFigures] | str:
-    try:
-        return register_scan(task, template, template_landmarks, config, unit)
-    except (ValueError, OSError, MemoryError) as error:
-        text = " ".join(str(error).split()) or type(error).__name__
-        return text if str(task.scan) in text or str(task.landmarks) in text else f"{task.scan}: {text}"
+def _outcomes(tasks: Sequence[ScanTask], work: Work, config: PrepareConfig) -> Iterator[tuple[ScanTask, Outcome]]:
+    if config.scheduler is None or not tasks:
+        return run_in_processes(work, tasks, config.workers)
+    from .batch.cluster import run_on_cluster
 
-
-def _run(tasks: Sequence[ScanTask], template: Mesh, template_landmarks: dict[str, int], config: PrepareConfig
-         ) -> Iterator[tuple[ScanTask, tuple[np.ndarray, ScanFigures] | str]]:
-    """Each task with its vertices and figures, or with the reason of its failure, as they come in."""
-    from joblib import Parallel, delayed, parallel_config
-
-    workers = min(config.workers or os.cpu_count() or 1, max(len(tasks), 1))
-    rest = (template, template_landmarks, config.registration, config.unit)
-    # one thread for linear algebra in each process, so that they do not take each other's cores
-    with parallel_config("loky", n_jobs=workers, inner_max_num_threads=1):
-        jobs = (delayed(_numbered)(i, _absolute(task), *rest) for i, task in enumerate(tasks))
-        for i, outcome in Parallel(return_as="generator_unordered", batch_size=1)(jobs):
-            yield tasks[i], outcome
-
-
-def _absolute(task: ScanTask) -> ScanTask:
-    """With whole paths: a process may have been started in another folder."""
-    return replace(task, scan=task.scan.absolute(), landmarks=task.landmarks and task.landmarks.absolute())
-
-
-def _numbered(i: int, *task) -> tuple[int, tuple[np.ndarray, ScanFigures] | str]:  # type: ignore[no-untyped-def]
-    return i, _attempt(*task)
+    return run_on_cluster(config.scheduler, work, tasks, config.ship)
 
 
 def _open_set(folder: Path, template: Mesh, config: PrepareConfig) -> RegisteredSet:
-    settings = {"registration": asdict(config.registration), "unit": config.unit}
+    settings = asdict(replace(config.scan, pictures=True))          # pictures change no mesh
     registered = RegisteredSet.create(folder, template, {"settings": settings})
     # through JSON, as the stored settings have been
     if storage.as_json(registered.info.get("settings")) != storage.as_json(settings):
@@ -288,35 +188,3 @@ def _with_skeleton(registered: RegisteredSet, config: PrepareConfig, progress: P
         return registered
     skeleton = find_skeleton(registered.template, registered.poses(), config.skeleton, progress=progress)
     return registered.with_skeleton(skeleton)
-
-
-def _read_table(path: Path) -> dict[str, dict[str, str]]:
-    if not path.exists():
-        return {}
-    rows = list(csv.DictReader(io.StringIO(path.read_text(encoding="utf-8-sig"))))
-    if rows and "name" not in rows[0]:
-        raise ValueError(f"{path}: line 1: expected a column 'name' beside subject, pose and sex, "
-                         f"found {', '.join(rows[0])}")
-    return {row["name"]: row for row in rows}
-
-
-def _read_figures(folder: Path) -> list[ScanFigures]:
-    path = folder / "registration.csv"
-    names = [f.name for f in fields(ScanFigures)]
-    if not path.exists():
-        return []
-    rows = csv.DictReader(io.StringIO(path.read_text(encoding="utf-8")))
-    read: dict[str, Callable[[str], Any]] = {"str": str, "float": float, "int": int, "bool": "True".__eq__}
-    try:
-        return [ScanFigures(*(read[str(f.type)](row[f.name]) for f in fields(ScanFigures))) for row in rows]
-    except (KeyError, ValueError, TypeError) as error:
-        raise ValueError(f"{path}: expected the columns {', '.join(names)} ({error})") from None
-
-
-def _write_figures(folder: Path, figures: Iterable[ScanFigures]) -> None:
-    text = io.StringIO()
-    table = csv.writer(text, lineterminator="\n")
-    table.writerow([f.name for f in fields(ScanFigures)])
-    table.writerows(astuple(row) for row in figures)
-    with storage.writing(folder / "registration.csv") as beside:
-        beside.write_text(text.getvalue(), encoding="utf-8")

@@ -9,12 +9,12 @@ import pytest
 
 from scanprep import Mesh, RegisteredSet, write_landmarks, write_mesh
 from scanprep.matching.nonrigid import GraphStage, RegistrationConfig, ShellStage
-from scanprep.pipeline import PrepareConfig, find_scans, prepare
+from scanprep.pipeline import PrepareConfig, ScanSettings, find_scans, prepare
 
 MARKS = {"top": 0, "left": 1, "right": 2, "front": 3, "back": 4}
-QUICK = PrepareConfig(min_poses=99, workers=1, registration=RegistrationConfig(
+QUICK = PrepareConfig(ScanSettings(RegistrationConfig(
     graph=(GraphStage(40, 0.35, 0.035, 0.7, 0.01, 0.2, slide=0.3, rounds=2),),
-    shell=(ShellStage(0.02, 0.007, 0.0002, 0.05),)))
+    shell=(ShellStage(0.02, 0.007, 0.0002, 0.05),))), min_poses=99, workers=1)
 
 
 @pytest.fixture(scope="module")
@@ -112,7 +112,7 @@ def test_bad_scans_stop_no_other(scans, template, tmp_path):
 def test_other_settings_or_template_in_the_folder(scans, template, tmp_path):
     prepare(find_scans(scans)[:1], template, MARKS, tmp_path / "set", QUICK)
     with pytest.raises(ValueError, match="other settings"):
-        prepare(find_scans(scans), template, MARKS, tmp_path / "set", dataclasses.replace(QUICK, unit="mm"))
+        prepare(find_scans(scans), template, MARKS, tmp_path / "set", dataclasses.replace(QUICK, scan=dataclasses.replace(QUICK.scan, unit="mm")))
     with pytest.raises(ValueError, match="another template"):
         prepare(find_scans(scans), template.with_vertices(2 * template.vertices), MARKS, tmp_path / "set", QUICK)
 

@@ -64,6 +64,7 @@ class Page:
     def __init__(self, title: str, lead: str = "") -> None:
         self.title, self.lead = title, lead
         self._parts: list[str] = []
+        self._styles: list[str] = []
         self._sections: list[str] = []
 
     def section(self, title: str, text: str = "") -> Page:
@@ -80,6 +81,13 @@ class Page:
     def code(self, text: str) -> Page:
         """Text in a typewriter face, as it stands: commands, settings."""
         self._parts.append(f"<pre><code>{escape(text.strip())}</code></pre>")
+        return self
+
+    def markup(self, html: str, style: str = "") -> Page:
+        """HTML as it stands, for what the other methods cannot show, and the CSS rules it needs, once each."""
+        self._parts.append(html)
+        if style and style not in self._styles:
+            self._styles.append(style)
         return self
 
     def picture(self, image: np.ndarray | bytes, caption: str = "", alt: str = "") -> Page:
@@ -139,7 +147,7 @@ class Page:
         nav = f'<nav aria-label="Contents">{links}</nav>' if len(self._sections) > 2 else ""
         return (f'<!doctype html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
                 f'<meta name="viewport" content="width=device-width, initial-scale=1">\n'
-                f"<title>{escape(self.title)}</title>\n<style>{_STYLE}</style>\n</head>\n<body>\n<main>\n"
+                f"<title>{escape(self.title)}</title>\n<style>{_STYLE}{''.join(self._styles)}</style>\n</head>\n<body>\n<main>\n"
                 f"<header><h1>{escape(self.title)}</h1>{lead}{nav}</header>\n"
                 + "\n".join(self._parts) + "\n</main>\n</body>\n</html>\n")
 
@@ -152,7 +160,7 @@ class Page:
 def _figure(image: np.ndarray | bytes, caption: str, alt: str) -> str:
     data = image if isinstance(image, bytes) else png_bytes(image)
     below = f"<figcaption>{escape(caption)}</figcaption>" if caption else ""
-    source = _data_uri(data, _image_kind(data))
+    source = data_uri(data)
     size = "" if isinstance(image, bytes) else f' width="{image.shape[1]}" height="{image.shape[0]}"'
     return f'<figure><img src="{source}" alt="{escape(alt or caption or "picture")}"{size}>{below}</figure>'
 
@@ -166,6 +174,11 @@ def _image_kind(data: bytes) -> str:
     if kind is None:
         raise ValueError(f"image: expected an array or a PNG, GIF, JPEG, WebP or SVG file, got {data[:8]!r}...")
     return kind
+
+
+def data_uri(data: bytes) -> str:
+    """The bytes of a picture as the address of an `img`."""
+    return _data_uri(data, _image_kind(data))
 
 
 def _data_uri(data: bytes, kind: str | None) -> str:

@@ -1,0 +1,126 @@
+"""`scape prep run` and `scape prep page`: a whole folder of scans."""
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+import tyro
+
+from ..cli import MM, Output, Unit, landmarks_beside
+from ..console import Metric, Outcome, bar, say
+from ..geometry.files import read_mesh
+from ..geometry.landmarks import read_landmark_vertices
+from ..geometry.mesh import Mesh
+from ..pipeline import PrepareConfig, Prepared, find_scans, prepare
+from .figures import ScanFigures
+from .page import judge_set, write_set_page
+from .review import Limits, Verdict
+from .scan import Guide, ScanSettings
+from .tasks import ScanTask
+
+ScansArg = Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="SCANS")]
+SetArg = Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="SET")]
+LISTED = 5                    # scans that the closing table names
+
+
+def run_all(scans: ScansArg, template: Path, output: Output, landmarks: Path | None = None,
+            template_landmarks: Path | None = None, guide: Guide = "best", subject: str = "",
+            unit: Unit | None = None, min_poses: int = PrepareConfig.min_poses, workers: int = PrepareConfig.workers,
+            scheduler: str | None = None, ship: bool = False) -> Outcome:
+    """Register a template to every scan of a folder, find the skeleton, and write a page of all scans, worst first.
+
+    Killed and started again it goes on where it was; scans whose files have changed are registered anew.
+
+    Example: scape prep run scans --template template.ply -o set
+
+    Args:
+        scans: Folder of meshes or point clouds. scans.csv in it may say more: name,subject,pose,sex.
+        template: Mesh to bring onto the scans: one closed or bordered manifold component.
+        output: Folder of the registered set; open report.html in it.
+        landmarks: Folder of landmark files with the names of the scans; else scans/landmarks, or beside the scans.
+        template_landmarks: Landmarks of the template; else the file of its name beside it.
+        guide: What leads the template to a scan: its landmarks, or only its pose, which must then be near the
+            template's; best takes landmarks where there are some.
+        subject: Whose scans they are, where scans.csv does not say; else each is a person of its own.
+        unit: Unit of the scans and landmarks, where the files cannot tell.
+        min_poses: A skeleton is sought when one subject has at least so many scans.
+        workers: Processes on this machine; 0 for one a core.
+        scheduler: Address of a Dask scheduler, whose workers do the work instead, such as tcp://host:8786.
+        ship: Send the scans to those workers, which otherwise read them under the same path.
+    """
+    body, tasks = read_mesh(template), find_scans(scans, landmarks, subject)
+    marks = _template_marks(template, template_landmarks, body, tasks, guide)
+    config = PrepareConfig(ScanSettings(unit=unit, guide=guide), min_poses=min_poses, workers=workers,
+                           scheduler=scheduler, ship=ship)
+    with bar("registering scans") as registering, bar("finding the skeleton") as finding:
+        done = prepare(tasks, body, marks, output, config, registering, finding)
+    return Outcome(output, [*_progress_made(done, tasks), *_quality(output, done.figures),
+                            Metric("unit assumed", unit or "m")], {"prepare": config}, list(done.failures))
+
+
+def page(registered: SetArg, limits: Annotated[Limits, tyro.conf.arg(name="")] = Limits()) -> Outcome:  # noqa: B008
+    """Write the page of a registered set again, with other limits for what needs a look.
+
+    Example: scape prep page set --missed 0.05
+
+    Args:
+        registered: Folder that scape prep run wrote.
+        limits: Limits.
+    """
+    written = write_set_page(registered, limits)
+    verdicts = judge_set(registered, limits)
+    figures = [v.figures for v in verdicts if v.figures is not None]
+    return Outcome(written, _quality(registered, figures, limits), {"limits": limits})
+
+
+def _template_marks(template: Path, given: Path | None, body: Mesh, tasks: Sequence[ScanTask], guide: Guide
+                    ) -> dict[str, int]:
+    """The landmarks of the template, where any scan is led by landmarks."""
+    without = [task.name for task in tasks if task.landmarks is None]
+    if guide == "pose" or (guide == "best" and len(without) == len(tasks)):
+        say("note: no landmarks are used; all scans must be near the template's pose")
+        return {}
+    if without and guide == "best":
+        say(f"note: no landmarks for {len(without)} of {len(tasks)} scans ({', '.join(without[:LISTED])}); "
+            "they must be near the template's pose")
+    return read_landmark_vertices(given or landmarks_beside(template), body)
+
+
+def _progress_made(done: Prepared, tasks: Sequence[ScanTask]) -> list[Metric]:
+    tree = done.registered.skeleton
+    seconds = [f.seconds for f in done.figures if np.isfinite(f.seconds)]
+    return [Metric("scans registered", f"{len(tasks) - len(done.failures)} of {len(tasks)}"),
+            Metric("of them in this run", done.fresh),
+            *(Metric(f"led by {way}", count) for way, count in sorted(Counter(map(_way, done.figures)).items())),
+            Metric("time a scan, mean", float(np.mean(seconds)) if seconds else "", "s"),
+            Metric("parts of the skeleton", len(tree.parents) if tree else "none sought")]
+
+
+def _quality(folder: Path, figures: Sequence[ScanFigures], limits: Limits | None = None) -> list[Metric]:
+    """Means over the set, and the scans that need a look."""
+    verdicts = judge_set(folder, limits)
+    suspects = [v for v in verdicts if v.suspect]
+
+    def mean(name: str) -> float:
+        values = np.array([getattr(f, name) for f in figures], dtype=float)
+        return float(values[np.isfinite(values)].mean()) if np.isfinite(values).any() else np.nan
+
+    return [Metric("distance to the scan, mean", MM * mean("distance"), "mm"),
+            Metric("vertices with data, mean", 100 * mean("seen"), "%"),
+            Metric("scan off the template, mean", 100 * mean("missed"), "%"),
+            Metric("distance of landmarks, mean RMS", MM * mean("landmarks"), "mm"),
+            Metric("flipped triangles", sum(f.flipped for f in figures)),
+            Metric("scans that need a look", len(suspects)),
+            *(Metric(f"  {v.name}", _short(v)) for v in suspects[:LISTED])]
+
+
+def _short(verdict: Verdict) -> str:
+    return "failed" if verdict.failed else verdict.reasons[0]
+
+
+def _way(figures: ScanFigures) -> str:
+    """Landmarks, correspondences or pose, without their number."""
+    return figures.guide.lstrip("0123456789 ")

@@ -1,0 +1,157 @@
+"""How well the template lies on each scan: figures, and their tables in the folder of the set."""
+from __future__ import annotations
+
+import csv
+import io
+from collections.abc import Callable, Iterable
+from dataclasses import dataclass, fields
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ..geometry import storage
+from ..geometry.mesh import Mesh
+from ..geometry.surface import Surface
+
+FIGURES, TIMES, FAILURES = "registration.csv", "times.csv", "failures.csv"
+
+
+@dataclass(frozen=True)
+class ScanFigures:
+    """How well the template lies on one scan: a row of `registration.csv`.
+
+    Attributes
+    ----------
+    name : str
+    guide : str
+        What led the template there: "10 landmarks", "160 correspondences", "pose".
+    distance, rms : float, metres
+        Of the vertices with data to the surface of the scan.
+    seen : float
+        Share of the vertices with data.
+    confidence : float
+        Mean over all vertices, from 0 to 1.
+    missed : float
+        Share of the scan's points that lie off the registered template: a limb it does not cover, or clutter.
+    stretch : float
+        Share of the template's surface that is more than twice, or less than half, as long in some direction.
+    landmarks : float, metres
+        RMS distance of the landmarks; NaN without.
+    flipped : int
+        Triangles that face against their surroundings.
+    converged : bool
+    inputs : str
+        Fingerprint of the files of the scan.
+    seconds : float
+        Kept in `times.csv`, as it is the one figure that differs from run to run.
+    """
+
+    name: str
+    guide: str
+    distance: float
+    rms: float
+    seen: float
+    confidence: float
+    missed: float
+    stretch: float
+    landmarks: float
+    flipped: int
+    converged: bool
+    inputs: str = ""
+    seconds: float = np.nan
+
+
+@dataclass(frozen=True)
+class Failure:
+    """A scan that could not be registered: a row of `failures.csv`.
+
+    Attributes
+    ----------
+    name : str
+    reason : str
+        One line, which names the file.
+    """
+
+    name: str
+    reason: str
+
+
+def missed_share(scan: Mesh | np.ndarray, registered: Mesh, far: float, samples: int = 5000) -> float:
+    """Share of the points of a scan that lie further than `far` (metres) from a mesh."""
+    points = scan.vertices if isinstance(scan, Mesh) else scan
+    points = points[:: max(1, len(points) // samples)]
+    return float((Surface(registered).closest(points).distances > far).mean())
+
+
+def stretched_share(template: Mesh, registered: Mesh, factor: float = 2.0) -> float:
+    """Share of the template's area that is longer by `factor`, or shorter, in some direction than the template."""
+    long, short = principal_stretches(template, registered)
+    return float(template.face_areas @ ((long > factor) | (short < 1 / factor)) / template.face_areas.sum())
+
+
+def principal_stretches(template: Mesh, registered: Mesh) -> tuple[np.ndarray, np.ndarray]:
+    """The largest and the smallest stretch (F,) of every triangle."""
+    rest, now = (m.corners[:, 1:] - m.corners[:, :1] for m in (template, registered))
+    # edges of the template in an orthonormal basis of its triangle, as a lower triangular matrix
+    gram = np.einsum("fid,fjd->fij", rest, rest)
+    basis = np.linalg.inv(np.linalg.cholesky(gram + 1e-18 * np.eye(2)))
+    metric = np.einsum("fij,fjd,fkd,flk->fil", basis, now, now, basis)
+    squared = np.linalg.eigvalsh(metric)
+    return np.sqrt(np.maximum(squared[:, 1], 0)), np.sqrt(np.maximum(squared[:, 0], 0))
+
+
+_TABLED = [f for f in fields(ScanFigures) if f.name != "seconds"]
+_READ: dict[str, Callable[[str], Any]] = {"str": str, "float": float, "int": int, "bool": "True".__eq__}
+
+
+def read_figures(folder: Path) -> list[ScanFigures]:
+    """The figures of all scans of a set, as they stand in its tables.
+
+    Raises
+    ------
+    ValueError
+        A table with other columns or values.
+    """
+    seconds = {row["name"]: float(row["seconds"]) for row in _read(folder / TIMES)}
+    rows = _read(folder / FIGURES)
+    try:
+        return [ScanFigures(**{f.name: _READ[str(f.type)](row[f.name]) for f in _TABLED},
+                            seconds=seconds.get(row["name"], np.nan)) for row in rows]
+    except (KeyError, ValueError, TypeError) as error:
+        raise ValueError(f"{folder / FIGURES}: expected the columns {', '.join(f.name for f in _TABLED)} "
+                         f"({type(error).__name__}: {error})") from None
+
+
+def write_figures(folder: Path, figures: Iterable[ScanFigures]) -> None:
+    """Write the tables of figures and times, sorted by name."""
+    rows = sorted(figures, key=lambda f: f.name)
+    _write(folder / TIMES, ["name", "seconds"], [[f.name, f"{f.seconds:.2f}"] for f in rows])
+    names = [f.name for f in _TABLED]
+    _write(folder / FIGURES, names, [[getattr(row, name) for name in names] for row in rows])
+
+
+def read_failures(folder: Path) -> list[Failure]:
+    """The scans that could not be registered when they were tried last."""
+    return [Failure(row["name"], row["reason"]) for row in _read(folder / FAILURES)]
+
+
+def write_failures(folder: Path, failures: Iterable[Failure]) -> None:
+    """Write the table of failures, sorted by name; without any there is none."""
+    rows = sorted(failures, key=lambda f: f.name)
+    if rows:
+        _write(folder / FAILURES, ["name", "reason"], [[f.name, f.reason] for f in rows])
+    else:
+        (folder / FAILURES).unlink(missing_ok=True)
+
+
+def _read(path: Path) -> list[dict[str, str]]:
+    return list(csv.DictReader(io.StringIO(path.read_text(encoding="utf-8")))) if path.exists() else []
+
+
+def _write(path: Path, header: list[str], rows: list[list[Any]]) -> None:
+    text = io.StringIO()
+    table = csv.writer(text, lineterminator="\n")
+    table.writerows([header, *rows])
+    with storage.writing(path) as beside:
+        beside.write_text(text.getvalue(), encoding="utf-8")

@@ -1,0 +1,149 @@
+"""One scan of a folder: read, registered, measured, its picture taken."""
+from __future__ import annotations
+
+import contextlib
+import threading
+import time
+from collections.abc import Iterator
+from dataclasses import dataclass, field
+from typing import Any, Literal
+
+import numpy as np
+
+from ..geometry.landmarks import match_landmarks, read_landmarks
+from ..geometry.mesh import Mesh
+from ..matching.nonrigid import Registration, RegistrationConfig, register
+from .figures import ScanFigures, missed_share, stretched_share
+from .tasks import ScanTask, read_scan
+
+Guide = Literal["best", "landmarks", "pose"]
+FAR = 0.01                  # of the template's size (the root of its area): a point of the scan that was missed
+
+Landmarks = tuple[np.ndarray, np.ndarray]
+
+
+@dataclass(frozen=True)
+class ScanSettings:
+    """How one scan is registered.
+
+    Attributes
+    ----------
+    registration : RegistrationConfig
+    unit : 'm', 'mm', 'cm' or 'in', optional
+        Of the scan and its landmarks, where the files cannot tell.
+    guide : 'best', 'landmarks' or 'pose'
+        What leads the template to the scan: its landmark file (a scan without is a failure), or nothing but the
+        pose, which must be near that of the template; 'best' takes landmarks where there are some.
+    pictures : bool
+        Take a picture for the page of the set.
+    """
+
+    registration: RegistrationConfig = field(default_factory=RegistrationConfig)
+    unit: str | None = None
+    guide: Guide = "best"
+    pictures: bool = True
+
+
+@dataclass(frozen=True, eq=False)
+class RegisteredScan:
+    """What a scan became.
+
+    Attributes
+    ----------
+    vertices : (N, 3) float, metres
+    figures : ScanFigures
+    picture : bytes
+        A strip of small pictures as a WebP file; empty where none were asked for.
+    """
+
+    vertices: np.ndarray
+    figures: ScanFigures
+    picture: bytes = b""
+
+
+def register_scan(task: ScanTask, template: Mesh, template_landmarks: dict[str, int],
+                  settings: ScanSettings | None = None) -> RegisteredScan:
+    """Read and register one scan.
+
+    Raises
+    ------
+    ValueError
+        A file that cannot be read, landmarks that do not match.
+    """
+    settings = settings or ScanSettings()
+    start = time.perf_counter()
+    with one_thread():
+        scan = read_scan(task.scan, settings.unit)
+        landmarks = _landmarks(task, scan, template_landmarks, settings)
+        fit = register(template, scan, landmarks, settings.registration)
+        picture = b""
+        if settings.pictures:
+            from .pictures import strip
+
+            picture = strip(template, scan, fit)
+    guide = f"{len(landmarks[0])} landmarks" if landmarks is not None else "pose"
+    return RegisteredScan(fit.mesh.vertices, _measure(task, template, scan, fit, guide, start), picture)
+
+
+def attempt(task: ScanTask, template: Mesh, template_landmarks: dict[str, int], settings: ScanSettings
+            ) -> RegisteredScan | str:
+    """The same, or one line that says which file failed and why; an error in our code stops no other scan."""
+    try:
+        return register_scan(task, template, template_landmarks, settings)
+    except Exception as error:
+        text = " ".join(str(error).split())
+        if not isinstance(error, ValueError | OSError):
+            text = f"{type(error).__name__}: {text}"
+        return text if str(task.scan) in text or str(task.landmarks) in text else f"{task.scan}: {text}"
+
+
+def _landmarks(task: ScanTask, scan: Mesh | np.ndarray, template_landmarks: dict[str, int], settings: ScanSettings
+               ) -> Landmarks | None:
+    """Vertices of the template and points of the scan, or None where landmarks are not wanted or not there."""
+    if settings.guide == "pose" or (task.landmarks is None and settings.guide == "best"):
+        return None
+    if task.landmarks is None:
+        raise ValueError(f"{task.scan}: expected a landmark file of the name {task.name}, found none")
+    found = read_landmarks(task.landmarks, scan if isinstance(scan, Mesh) else None, settings.unit)
+    try:
+        return match_landmarks(template_landmarks, found)[1:]
+    except ValueError as error:
+        raise ValueError(f"{task.landmarks}: {error}") from None
+
+
+def _measure(task: ScanTask, template: Mesh, scan: Mesh | np.ndarray, fit: Registration, guide: str, start: float
+             ) -> ScanFigures:
+    size = float(np.sqrt(template.face_areas.sum()))
+    return ScanFigures(
+        task.name, guide, float(np.nanmean(fit.distances)) if fit.seen.any() else np.nan, fit.rms,
+        float(fit.seen.mean()), float(fit.seen.mean()), missed_share(scan, fit.mesh, FAR * size),
+        stretched_share(template, fit.mesh), fit.landmark_rms, fit.flipped, fit.converged, task.fingerprint(),
+        time.perf_counter() - start)
+
+
+_guard = threading.Lock()
+_limits: list[Any] = []
+_users = 0
+
+
+@contextlib.contextmanager
+def one_thread() -> Iterator[None]:
+    """One thread for linear algebra in this process.
+
+    Scans in parallel do not take each other's cores, and the order of sums, and with it the last digits, do not
+    depend on where a scan is registered. The first of several users sets the limit, the last lifts it.
+    """
+    from threadpoolctl import threadpool_limits
+
+    global _users
+    with _guard:
+        _users += 1
+        if not _limits:
+            _limits.append(threadpool_limits(1))
+    try:
+        yield
+    finally:
+        with _guard:
+            _users -= 1
+            if not _users:
+                _limits.pop().restore_original_limits()

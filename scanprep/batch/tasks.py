@@ -1,0 +1,163 @@
+"""The scans of a folder, their landmark files, and what a table says of them."""
+from __future__ import annotations
+
+import csv
+import hashlib
+import io
+from collections.abc import Iterable
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+
+from ..geometry.files import MeshFileError, read_mesh, read_points
+from ..geometry.mesh import Mesh
+
+LANDMARK_ENDINGS = (".json", ".mrk.json", ".landmarks.json", ".pp", "_picked_points.pp", ".lnd", ".landmarks.txt")
+SCAN_ENDINGS = (".ply", ".ply.gz", ".obj", ".stl", ".off", ".glb", ".xyz", ".pcd", ".pts")
+POINT_ENDINGS = (".xyz", ".pcd", ".txt", ".pts")
+TABLE = "scans.csv"
+
+
+@dataclass(frozen=True)
+class ScanTask:
+    """One scan of a folder and what is known of it.
+
+    Attributes
+    ----------
+    name : str
+    scan : Path
+    landmarks : Path or None
+    subject, pose, sex : str
+        Empty where not known.
+    """
+
+    name: str
+    scan: Path
+    landmarks: Path | None = None
+    subject: str = ""
+    pose: str = ""
+    sex: str = ""
+
+    def absolute(self) -> ScanTask:
+        """With whole paths: a process may have been started in another folder."""
+        return replace(self, scan=self.scan.absolute(), landmarks=self.landmarks and self.landmarks.absolute())
+
+    def fingerprint(self, ends: int = 1 << 16) -> str:
+        """Short text that changes with the files: their sizes, and what stands at both ends of each.
+
+        Empty when a file cannot be read. Whole scans are not read, as a folder may hold gigabytes.
+        """
+        digest = hashlib.sha256()
+        try:
+            for path in (self.scan, self.landmarks):
+                if path is not None:
+                    size = path.stat().st_size
+                    with open(path, "rb") as file:
+                        digest.update(f"{size}:".encode() + file.read(ends))
+                        file.seek(max(size - ends, 0))
+                        digest.update(file.read(ends))
+        except OSError:
+            return ""
+        return digest.hexdigest()[:16]
+
+
+def find_scans(folder: str | Path, landmarks: str | Path | None = None, subject: str = "") -> list[ScanTask]:
+    """The scans of a folder, their landmark files, and what `scans.csv` says of them.
+
+    Parameters
+    ----------
+    folder : path
+        Meshes or point clouds, not those of the folders inside it; a scan that consists of several views is
+        merged first. `scans.csv`, where there is one, has the columns name, subject, pose, sex (any of the last
+        three may be missing).
+    landmarks : path, optional
+        Folder of the landmark files, by default `landmarks` inside the folder or the folder itself. A file
+        belongs to the scan of the same name.
+    subject : str
+        Whose scans they are, where `scans.csv` does not say; when empty, every scan is a subject of its own.
+
+    Returns
+    -------
+    list of ScanTask
+        Sorted by name: the part of the file name before its first dot.
+
+    Raises
+    ------
+    ValueError
+        No such folder, no scans, two scans of one name, a table without names or with unknown ones.
+    """
+    folder = Path(folder)
+    paths = _list_scans(folder)
+    about = _read_table(folder / TABLE)
+    unknown = sorted(set(about) - set(paths))
+    if unknown:
+        raise ValueError(f"{folder / TABLE}: no scan is called {', '.join(unknown[:5])}")
+    if landmarks and not Path(landmarks).is_dir():
+        raise ValueError(f"landmarks: expected a folder, there is none at {landmarks}")
+    places = [Path(landmarks)] if landmarks else [folder / "landmarks", folder]
+    tasks = []
+    for name, path in sorted(paths.items()):
+        row = about.get(name, {})
+        candidates = [place / (name + ending) for place in places for ending in LANDMARK_ENDINGS]
+        tasks.append(ScanTask(name, path, next((c for c in candidates if c.is_file()), None),
+                              row.get("subject") or subject or name, row.get("pose") or "", row.get("sex") or ""))
+    return tasks
+
+
+def read_scan(path: str | Path, unit: str | None = None) -> Mesh | np.ndarray:
+    """A scan as a mesh, or as points (n, 3) where the file has no triangles."""
+    if Path(path).suffix.lower() in POINT_ENDINGS:
+        return read_points(path, unit).points
+    try:
+        return read_mesh(path, unit)
+    except ValueError as error:
+        if "no faces" in str(error):
+            return read_points(path, unit).points
+        raise
+
+
+def _list_scans(folder: Path) -> dict[str, Path]:
+    """Name -> file."""
+    if not folder.is_dir():
+        problem = "expected a folder, found a file" if folder.exists() else "no such folder"
+        raise MeshFileError(f"{folder}: {problem}")
+    found: dict[str, Path] = {}
+    for path in sorted(filter(_is_scan, folder.iterdir())):
+        name = path.name.split(".")[0]
+        if name in found:
+            raise ValueError(f"{folder}: expected one file a scan, found {found[name].name} and {path.name}, both "
+                             f"of the name '{name}'; rename one, or merge them where they are views of one scan")
+        found[name] = path
+    if not found:
+        inner = sorted({path.parent.name for path in folder.glob("*/*") if _is_scan(path)})
+        hint = f"; there are some in its folders {', '.join(inner[:5])}: name one of them" if inner else ""
+        raise MeshFileError(f"{folder}: expected scans ({', '.join(SCAN_ENDINGS)}), found none{hint}")
+    return found
+
+
+def _is_scan(path: Path) -> bool:
+    name = path.name.lower()
+    return name.endswith(SCAN_ENDINGS) and not name.startswith(".") and path.is_file()
+
+
+def _read_table(path: Path) -> dict[str, dict[str, str]]:
+    if not path.exists():
+        return {}
+    rows = list(csv.DictReader(io.StringIO(path.read_text(encoding="utf-8-sig"))))
+    if rows and "name" not in rows[0]:
+        raise ValueError(f"{path}: line 1: expected a column 'name' beside subject, pose and sex, "
+                         f"found {', '.join(map(str, rows[0]))}")
+    twice = _repeated(row["name"] for row in rows)
+    if twice:
+        raise ValueError(f"{path}: the name {twice} comes twice")
+    return {row["name"]: row for row in rows}
+
+
+def _repeated(names: Iterable[str]) -> str | None:
+    seen: set[str] = set()
+    for name in names:
+        if name in seen:
+            return name
+        seen.add(name)
+    return None

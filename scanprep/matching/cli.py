@@ -1,0 +1,65 @@
+"""`scape prep align` and `register`: one mesh onto another."""
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+import tyro
+
+from ..batch.tasks import read_scan
+from ..cli import MM, MeshArg, Output, ScanArg, Unit, landmarks_beside
+from ..console import Metric, Outcome, bar
+from ..geometry.files import read_mesh, write_mesh
+from ..geometry.landmarks import match_landmarks, read_landmark_vertices, read_landmarks
+from ..geometry.mesh import Mesh
+from .nonrigid import register
+from .rigid import RigidConfig, align_landmarks, align_rigid
+
+TargetArg = Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="TARGET")]
+
+
+def align(source: MeshArg, target: TargetArg, output: Output, landmarks: Path | None = None,
+          target_landmarks: Path | None = None, unit: Unit | None = None,
+          config: Annotated[RigidConfig, tyro.conf.arg(name="")] = RigidConfig()) -> Outcome:  # noqa: B008
+    """Move a mesh rigidly onto another: by landmarks where both have them, then by their surfaces.
+
+    Example: scape prep align front.ply back.ply -o front_aligned.ply
+    """
+    moving, fixed = read_mesh(source, unit), read_mesh(target, unit)
+    T = np.eye(4)
+    if landmarks or target_landmarks:
+        if not (landmarks and target_landmarks):
+            raise ValueError("landmarks: expected --landmarks and --target-landmarks together")
+        _, mine, theirs = match_landmarks(read_landmarks(landmarks, moving, unit),
+                                          read_landmarks(target_landmarks, fixed, unit))
+        T = align_landmarks(mine, theirs).T_target_source
+    placed = moving.with_vertices(moving.vertices @ T[:3, :3].T + T[:3, 3])
+    found = align_rigid(placed, fixed, config=config)
+    T = found.T_target_source @ T
+    write_mesh(output, moving.with_vertices(moving.vertices @ T[:3, :3].T + T[:3, 3]))
+    return Outcome(output, [
+        Metric("RMS distance", MM * found.rms, "mm"), Metric("converged", str(found.converged)),
+        Metric("T_target_source", np.array2string(T, precision=6).replace("\n", " "))], {"align": config})
+
+
+def register_one(scan: ScanArg, template: Path, output: Output, landmarks: Path | None = None,
+                 template_landmarks: Path | None = None, unit: Unit | None = None) -> Outcome:
+    """Bend the template onto one scan.
+
+    Example: scape prep register scan.ply --template template.ply --landmarks scan.json -o registered.ply
+    """
+    body, data = read_mesh(template), read_scan(scan, unit)
+    pairs = None
+    if landmarks:
+        marks = read_landmark_vertices(template_landmarks or landmarks_beside(template), body)
+        found = read_landmarks(landmarks, data if isinstance(data, Mesh) else None, unit)
+        pairs = match_landmarks(marks, found)[1:]
+    with bar("registering") as progress:
+        fit = register(body, data, pairs, progress=progress)
+    write_mesh(output, fit.mesh)
+    return Outcome(output, [
+        Metric("distance to the scan, RMS", MM * fit.rms, "mm"),
+        Metric("vertices with data", 100 * float(fit.seen.mean()), "%"),
+        Metric("distance of landmarks, RMS", MM * fit.landmark_rms, "mm"),
+        Metric("flipped triangles", fit.flipped), Metric("converged", str(fit.converged))])
