@@ -33,15 +33,43 @@ def area(points, triangles):
 
 
 @pytest.mark.parametrize("seed", range(6))
-def test_loops_get_the_smallest_area_of_all_triangulations(seed):
+def test_nearly_flat_loops_get_the_smallest_area_of_all_triangulations(seed):
     rng = np.random.default_rng(seed)
     angle = 2 * np.pi * (np.arange(8) + rng.uniform(-0.3, 0.3, 8)) / 8
-    points = np.stack([np.cos(angle), np.sin(angle), 0.05 * rng.normal(size=8)], axis=1)
+    points = np.stack([np.cos(angle), np.sin(angle), 1e-3 * rng.normal(size=8)], axis=1)
     rim = np.tile([0.0, 0.0, 1.0], (8, 1))
     found = triangulate_loop(points, rim, np.zeros((8, 8), dtype=bool))
     every = list(all_triangulations(0, 7))
     assert len(every) == 132
     assert area(points, found) == pytest.approx(min(area(points, t) for t in every), rel=1e-9)
+
+
+def test_a_groove_is_continued_to_its_bottom():
+    """Two walls of a groove, cut off above its bottom: the patch goes down to where they meet, and makes no lid."""
+    along, depth, opening = np.linspace(0, 0.10, 11), 0.08, 0.03
+    bottom_ends = [[0.0, 0.0, -depth]], [[0.10, 0.0, -depth]]
+
+    def wall(side):
+        return np.stack([along, side * opening + 0 * along, 0 * along], axis=1)
+
+    points = np.concatenate([wall(-1), bottom_ends[1], wall(1)[::-1], bottom_ends[0]])
+    n = len(points)
+    ahead = np.roll(points, -1, axis=0) - points
+    rim = np.zeros((n, 3))
+    for i in range(n):               # beyond the rim the walls and the ends go straight on
+        middle = (points[i] + points[(i + 1) % n]) / 2
+        if abs(middle[1]) > 0.99 * opening:
+            rim[i] = np.cross(ahead[i], [0, np.sign(middle[1]) * opening, depth])
+        else:
+            rim[i] = np.cross(ahead[i], [np.sign(middle[0] - 0.05), 0, 0.0])
+        rim[i] *= -1
+        rim[i] /= np.linalg.norm(rim[i])
+    found = triangulate_loop(points, rim, np.zeros((n, n), dtype=bool))
+    at_bottom = points[found].mean(axis=1)[:, 2]
+    assert len(found) == n - 2
+    edges = {frozenset(e) for t in found.tolist() for e in pairwise([*t, t[0]])}
+    assert frozenset((11, n - 1)) in edges
+    assert at_bottom.max() < -0.02
 
 
 def test_forbidden_edges_are_avoided_or_refused():

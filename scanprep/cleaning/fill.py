@@ -15,6 +15,8 @@ from .remesh import clamped_cotangents, flip_edges
 from .repair import repair, split_vertices
 from .triangulate import triangulate_loop
 
+RIM_BEND, PATCH_BEND = 2.0, 4.0      # bends, in curvature times radius of the hole, that count less than squared
+REWEIGHTINGS = 3
 METHODS = ("fair", "poisson-open3d", "poisson-pymeshlab")
 
 
@@ -41,7 +43,7 @@ class FillConfig:
     method: Literal["fair", "poisson-open3d", "poisson-pymeshlab"] = "fair"
     max_edges: int | None = None
     density: float = 2 ** 0.5
-    fair_rounds: int = 2
+    fair_rounds: int = 0
     exact_edges: int = 300
     poisson_depth: int = 8
 
@@ -104,6 +106,7 @@ def fill_holes(mesh: Mesh, config: FillConfig | None = None,
         patch.fair()
         patch.flip(min_cosine=0.3)
     patch.fair()
+    patch.flip(min_cosine=0.3)
     return split_vertices(patch.onto(mesh, used))
 
 
@@ -218,20 +221,40 @@ class _Patch:
         return np.divide(total, count, out=np.full(len(v), length.mean()), where=count > 0)
 
     def fair(self) -> None:
-        """Move the new vertices to where the squared mean curvature of patch and rim is least."""
+        """Move the new vertices to where patch and rim bend least.
+
+        The energy is the squared mean curvature, but large curvatures count less than by their square: a patch
+        may meet its rim in an edge (soles) or keep a crease (armpits) where being round would take it far away.
+        """
         free = np.arange(self.old_vertices, len(self.mesh.vertices))
         if not len(free):
             return
-        rows = np.concatenate([np.flatnonzero(self.rim), free])
-        laplacian = clamped_cotangents(self.mesh)[rows]
+        rim = np.flatnonzero(self.rim)
+        rows = np.concatenate([rim, free])
         area = self.mesh.vertex_areas[rows]
-        scale = 1 / np.sqrt(np.maximum(area, 0.1 * np.median(area)))   # slivers on a rim must not rule
-        b = csr_array(laplacian.multiply(scale[:, None])).tocsc()
-        known = b[:, :self.old_vertices] @ self.mesh.vertices[:self.old_vertices]
-        b = b[:, free]
-        vertices = np.array(self.mesh.vertices)
-        vertices[free] = factor(b.T @ b)(-(b.T @ known))
-        self.mesh = self.mesh.with_vertices(vertices)
+        area = np.maximum(area, 0.1 * np.median(area))                 # slivers on a rim must not rule
+        laplacian = csr_array(clamped_cotangents(self.mesh)[rows])
+        large = np.repeat([RIM_BEND, PATCH_BEND], [len(rim), len(free)]) / self._radii()[rows]
+        weight = np.ones(len(rows))
+        for _ in range(REWEIGHTINGS + 1):
+            b = csr_array(laplacian.multiply(np.sqrt(weight / area)[:, None])).tocsc()
+            known = b[:, :self.old_vertices] @ self.mesh.vertices[:self.old_vertices]
+            inner = b[:, free]
+            vertices = np.array(self.mesh.vertices)
+            vertices[free] = factor(inner.T @ inner)(-(inner.T @ known))
+            self.mesh = self.mesh.with_vertices(vertices)
+            bend = laplacian @ vertices
+            outward = np.einsum("nd,nd->n", bend, self.mesh.vertex_normals[rows]) > 0
+            curvature = np.linalg.norm(bend, axis=1) / area
+            weight = 1 / np.sqrt(1 + (curvature / large) ** 2)
+            weight[:len(rim)][~outward[:len(rim)]] = 1                 # a rim may be an edge but not a groove
+
+    def _radii(self) -> np.ndarray:
+        """(n,) radius of the disc with the area of the patch that each of its vertices belongs to, metres."""
+        new = self.mesh.faces[self.old_faces:]
+        patch = Mesh(self.mesh.vertices, new).vertex_component
+        area = np.bincount(patch[new[:, 0]], self.mesh.face_areas[self.old_faces:], minlength=patch.max() + 1)
+        return np.sqrt(np.maximum(area, 1e-12) / np.pi)[patch]
 
     def onto(self, mesh: Mesh, used: np.ndarray) -> Mesh:
         """The mesh the patch was made for, with it; `used` are the numbers of the vertices around the holes."""
