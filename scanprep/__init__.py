@@ -13,6 +13,7 @@ if TYPE_CHECKING:
     from .geometry.files import MeshFileError, read_mesh, read_points, write_mesh
     from .geometry.landmarks import match_landmarks, read_landmark_vertices, read_landmarks, write_landmarks
     from .geometry.mesh import Mesh
+    from .matching.correlated import CorrelatedConfig, find_correspondences
     from .matching.nonrigid import RegistrationConfig, register
     from .matching.rigid import align_rigid
     from .skeleton.find import SkeletonConfig, find_skeleton
@@ -26,6 +27,7 @@ _ROOMS = {
     "geometry.files": ("MeshFileError", "read_mesh", "read_points", "write_mesh"),
     "geometry.landmarks": ("match_landmarks", "read_landmark_vertices", "read_landmarks", "write_landmarks"),
     "geometry.mesh": ("Mesh",),
+    "matching.correlated": ("CorrelatedConfig", "find_correspondences"),
     "matching.nonrigid": ("RegistrationConfig", "register"),
     "matching.rigid": ("align_rigid",),
     "skeleton.find": ("SkeletonConfig", "find_skeleton"),
@@ -33,10 +35,10 @@ _ROOMS = {
 }
 _ROOM_OF = {name: room for room, names in _ROOMS.items() for name in names}
 
-__all__ = ["Mesh", "MeshFileError", "RegisteredSet", "RegistrationConfig", "Skeleton", "SkeletonConfig",
-           "align_rigid", "decimate", "fill_holes", "find_skeleton", "match_landmarks", "merge_views",
-           "read_landmark_vertices", "read_landmarks", "read_mesh", "read_points", "register", "write_landmarks",
-           "write_mesh"]
+__all__ = ["CorrelatedConfig", "Mesh", "MeshFileError", "RegisteredSet", "RegistrationConfig", "Skeleton",
+           "SkeletonConfig", "align_rigid", "decimate", "fill_holes", "find_correspondences", "find_skeleton",
+           "match_landmarks", "merge_views", "read_landmark_vertices", "read_landmarks", "read_mesh",
+           "read_points", "register", "write_landmarks", "write_mesh"]
 
 
 def __getattr__(name: str) -> Any:
