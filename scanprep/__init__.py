@@ -7,6 +7,8 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from .cleaning.decimate import decimate
+    from .cleaning.decimate_set import DecimateSetConfig, decimate_set
+    from .cleaning.decimate_set_files import write_decimated_set
     from .cleaning.fill import fill_holes
     from .cleaning.merge import merge_views
     from .dataset import RegisteredSet
@@ -21,6 +23,8 @@ if TYPE_CHECKING:
 
 _ROOMS = {
     "cleaning.decimate": ("decimate",),
+    "cleaning.decimate_set": ("DecimateSetConfig", "decimate_set"),
+    "cleaning.decimate_set_files": ("write_decimated_set",),
     "cleaning.fill": ("fill_holes",),
     "cleaning.merge": ("merge_views",),
     "dataset": ("RegisteredSet",),
@@ -35,10 +39,11 @@ _ROOMS = {
 }
 _ROOM_OF = {name: room for room, names in _ROOMS.items() for name in names}
 
-__all__ = ["CorrelatedConfig", "Mesh", "MeshFileError", "RegisteredSet", "RegistrationConfig", "Skeleton",
-           "SkeletonConfig", "align_rigid", "decimate", "fill_holes", "find_correspondences", "find_skeleton",
-           "match_landmarks", "merge_views", "read_landmark_vertices", "read_landmarks", "read_mesh",
-           "read_points", "register", "write_landmarks", "write_mesh"]
+__all__ = ["CorrelatedConfig", "DecimateSetConfig", "Mesh", "MeshFileError", "RegisteredSet", "RegistrationConfig",
+           "Skeleton", "SkeletonConfig", "align_rigid", "decimate", "decimate_set", "fill_holes",
+           "find_correspondences", "find_skeleton", "match_landmarks", "merge_views", "read_landmark_vertices",
+           "read_landmarks", "read_mesh", "read_points", "register", "write_decimated_set", "write_landmarks",
+           "write_mesh"]
 
 
 def __getattr__(name: str) -> Any:

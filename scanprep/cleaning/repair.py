@@ -125,7 +125,7 @@ def split_vertices(mesh: Mesh, across_holes: bool = False) -> Mesh:
     """
     if mesh.is_vertex_manifold:
         return mesh
-    fan = _fans(mesh)
+    fan = corner_fans(mesh)
     number = (_joined_by_holes(mesh, fan)[fan] if across_holes else fan).ravel()
     _, first, new = np.unique(number, return_index=True, return_inverse=True)
     owner = mesh.faces.ravel()[first]
@@ -138,7 +138,7 @@ def split_vertices(mesh: Mesh, across_holes: bool = False) -> Mesh:
     return Mesh(mesh.vertices[source], place[new.reshape(-1)].reshape(-1, 3), colors)
 
 
-def _fans(mesh: Mesh) -> np.ndarray:
+def corner_fans(mesh: Mesh) -> np.ndarray:
     """(F, 3) number of the fan each corner belongs to; corners at a vertex share it when edges join them."""
     edge, corner = mesh.face_edges, np.arange(mesh.faces.size).reshape(-1, 3)
     rows = []

@@ -1,0 +1,122 @@
+"""Quadrics: squared distances to many planes at once, as one polynomial of a point [QEM].
+
+A quadric is ten numbers, of `x A x + 2 b x + c`: A as xx, xy, xz, yy, yz, zz, then b, then c. Arrays of them
+have any shape in front; vertices of several bodies that share triangles are (N, M, 3), their quadrics (N, M, 10).
+"""
+from __future__ import annotations
+
+import numpy as np
+
+_ROW, _COLUMN = np.array([0, 0, 0, 1, 1, 2]), np.array([0, 1, 2, 1, 2, 2])
+
+
+def plane_quadrics(normals: np.ndarray, through: np.ndarray, weights: np.ndarray) -> np.ndarray:
+    """Weighted squared distance to planes.
+
+    Parameters
+    ----------
+    normals : (..., 3) float, unit
+    through : (..., 3) float, metres
+        A point of each plane.
+    weights : (...) float
+
+    Returns
+    -------
+    (..., 10) float
+
+    [QEM] fundamental error quadric
+    """
+    d = -np.einsum("...d,...d->...", normals, through)[..., None]
+    return weights[..., None] * np.concatenate([normals[..., _ROW] * normals[..., _COLUMN], d * normals, d * d],
+                                               axis=-1)
+
+
+def point_quadrics(points: np.ndarray, weights: np.ndarray) -> np.ndarray:
+    """Weighted squared distance to points (..., 3): quadrics (..., 10) that have a minimum in any case."""
+    out = np.zeros((*points.shape[:-1], 10))
+    out[..., [0, 3, 5]] = 1
+    out[..., 6:9] = -points
+    out[..., 9] = np.einsum("...d,...d->...", points, points)
+    return weights[..., None] * out
+
+
+def surface_quadrics(points: np.ndarray, faces: np.ndarray, hold: float) -> tuple[np.ndarray, np.ndarray]:
+    """The quadrics of all vertices for the planes of the triangles around them, by their area.
+
+    Parameters
+    ----------
+    points : (N, M, 3) float, metres
+    faces : (F, 3) int
+    hold : float
+        Weight of the distance to the vertex itself beside that to the planes.
+
+    Returns
+    -------
+    quadrics : (N, M, 10) float
+    areas : (N, M, 3) float, square metres
+        Normals of the triangles around each vertex times their areas, summed.
+    """
+    corners = points[faces]
+    cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]) / 2
+    area = np.linalg.norm(cross, axis=-1)
+    normal = cross / np.maximum(area, 1e-300)[..., None]
+    planes = np.concatenate([plane_quadrics(normal, corners[:, 0], area), cross, area[..., None]], axis=-1)
+    total = sum_at(faces, planes, len(points))
+    return total[..., :10] + point_quadrics(points, hold * total[..., 13]), total[..., 10:13]
+
+
+def curve_quadrics(points: np.ndarray, ends: np.ndarray, normals: np.ndarray, weight: float) -> np.ndarray:
+    """The quadrics of all vertices for walls along curves that are to stay where they are.
+
+    Parameters
+    ----------
+    points : (N, M, 3) float, metres
+    ends : (E, 2) int
+        Edges of the curves.
+    normals : (E, M, 3) float
+        Of the surface there; the walls stand upright on it.
+    weight : float
+        Of a wall as high as its edge is long, beside triangles of the same area.
+
+    Returns
+    -------
+    (N, M, 10) float
+
+    [QEM] boundary constraints
+    """
+    along = points[ends[:, 1]] - points[ends[:, 0]]
+    across = np.cross(along, normals)
+    across /= np.maximum(np.linalg.norm(across, axis=-1, keepdims=True), 1e-300)
+    walls = plane_quadrics(across, points[ends[:, 0]], weight * np.einsum("...d,...d->...", along, along))
+    return sum_at(ends, walls, len(points))
+
+
+def sum_at(index: np.ndarray, values: np.ndarray, count: int) -> np.ndarray:
+    """What every row of values (n, ...) gives to each of its `index` (n, k), summed: (count, ...)."""
+    flat = values.reshape(len(values), -1)
+    out = np.empty((flat.shape[1], count))
+    target = index.T.ravel()
+    for column, place in zip(flat.T, out, strict=True):
+        place[:] = np.bincount(target, np.tile(column, index.shape[1]), count)
+    return np.ascontiguousarray(out.T).reshape(count, *values.shape[1:])
+
+
+def value(Q: np.ndarray, x: np.ndarray) -> np.ndarray:
+    """Quadrics (..., 10) at points (..., 3)."""
+    x0, x1, x2 = x[..., 0], x[..., 1], x[..., 2]
+    return (x0 * (Q[..., 0] * x0 + 2 * (Q[..., 1] * x1 + Q[..., 2] * x2 + Q[..., 6]))
+            + x1 * (Q[..., 3] * x1 + 2 * (Q[..., 4] * x2 + Q[..., 7]))
+            + x2 * (Q[..., 5] * x2 + 2 * Q[..., 8]) + Q[..., 9])
+
+
+def lowest(Q: np.ndarray) -> np.ndarray:
+    """The points (..., 3) where quadrics (..., 10) are least, which must be unique.
+
+    [QEM] optimal placement
+    """
+    xx, xy, xz, yy, yz, zz, bx, by, bz = (Q[..., i] for i in range(9))
+    c0, c1, c2 = yy * zz - yz * yz, xz * yz - xy * zz, xy * yz - xz * yy
+    det = xx * c0 + xy * c1 + xz * c2
+    c3, c4, c5 = xx * zz - xz * xz, xy * xz - xx * yz, xx * yy - xy * xy
+    return -np.stack([c0 * bx + c1 * by + c2 * bz, c1 * bx + c3 * by + c4 * bz, c2 * bx + c4 * by + c5 * bz],
+                     axis=-1) / det[..., None]
