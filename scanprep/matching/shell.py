@@ -47,7 +47,7 @@ class Shell:
         across = np.linalg.eigvalsh(wanted.A)[:, 2]
         nearly = Factored(csc_array(smooth + diags_array(across + self._tiny)))
         force = wanted.b - np.einsum("nij,nj->ni", wanted.A, start)
-        return start + _conjugate_gradients(
+        return start + conjugate_gradients(
             lambda d: smooth @ d + np.einsum("nij,nj->ni", wanted.A, d) + self._tiny * d, force, nearly.solve)
 
 
@@ -103,7 +103,7 @@ def _laid(x: np.ndarray, free: np.ndarray, edges: np.ndarray, wanted: np.ndarray
     return x
 
 
-def _conjugate_gradients(apply: Callable[[np.ndarray], np.ndarray], force: np.ndarray,
+def conjugate_gradients(apply: Callable[[np.ndarray], np.ndarray], force: np.ndarray,
                          precondition: Callable[[np.ndarray], np.ndarray], iterations: int = 40,
                          tolerance: float = 1e-4) -> np.ndarray:
     """Solve `apply(d) = force` for arrays of any shape, with a symmetric positive definite `apply`."""
