@@ -5,15 +5,15 @@ Each room has its commands in its own `cli.py`; here is the list of them and wha
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import TYPE_CHECKING, Annotated, Literal
 
 import numpy as np
 import tyro
 
 from .console import Metric, dispatch
-from .dataset import RegisteredSet
-from .geometry.files import read_mesh, read_registered
-from .geometry.mesh import Mesh, template_problem
+
+if TYPE_CHECKING:               # imported where they are used: this module must answer --help at once
+    from .geometry.mesh import Mesh
 
 Unit = Literal["m", "mm", "cm", "in"]
 ScanArg = Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="SCAN")]
@@ -32,6 +32,8 @@ COMMANDS = {
     "align": ("Move one scan rigidly onto another.", "scanprep.matching.cli:align"),
     "register": ("Bend the template onto one scan.", "scanprep.matching.cli:register_one"),
     "skeleton": ("Rigid parts, joints and a tree from registered poses.", "scanprep.skeleton.cli:skeleton"),
+    "edit-skeleton": ("Merge, split and rename parts, move joints, by hand or from a file.",
+                      "scanprep.skeleton.cli:edit"),
 }
 
 
@@ -43,6 +45,10 @@ def group(argv: list[str]) -> int:
 def read_poses(folder: Path, template: Path | None, subject: str | None, unit: Unit | None
                ) -> tuple[Mesh, np.ndarray]:
     """Template and vertices (M, N, 3) of one person from a registered set or a folder of meshes."""
+    from .dataset import RegisteredSet
+    from .geometry.files import read_mesh, read_registered
+    from .geometry.mesh import Mesh
+
     if (folder / "set.json").exists():
         whole = RegisteredSet.load(folder)
         return whole.template, whole.poses(subject)
@@ -67,6 +73,8 @@ def landmarks_beside(template: Path) -> Path:
 
 def about_mesh(mesh: Mesh) -> list[Metric]:
     """The rows of the closing table that describe a mesh."""
+    from .geometry.mesh import template_problem
+
     problem = template_problem(mesh)
     return [Metric("vertices", len(mesh.vertices)), Metric("triangles", len(mesh.faces)),
             Metric("holes", len(mesh.boundary_loops)),

@@ -1,40 +1,46 @@
 """A folder of scans: resumable, one bad scan stops no other, and the workers change nothing."""
 import dataclasses
 import json
+import os
 import shutil
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
 
-import igl
 import numpy as np
 import pytest
+from scan_folders import MARKS, QUICK, WITH_PICTURES, ball, contents, write_scans
 
-from scanprep import Mesh, RegisteredSet, write_landmarks, write_mesh
-from scanprep.matching.nonrigid import GraphStage, RegistrationConfig, ShellStage
-from scanprep.pipeline import PrepareConfig, ScanSettings, find_scans, prepare
-
-MARKS = {"top": 0, "left": 1, "right": 2, "front": 3, "back": 4}
-QUICK = PrepareConfig(ScanSettings(RegistrationConfig(
-    graph=(GraphStage(40, 0.35, 0.035, 0.7, 0.01, 0.2, slide=0.3, rounds=2),),
-    shell=(ShellStage(0.02, 0.007, 0.0002, 0.05),))), min_poses=99, workers=1)
+from scanprep import Mesh, RegisteredSet
+from scanprep.batch import cluster
+from scanprep.batch.figures import read_figures
+from scanprep.batch.lock import locked
+from scanprep.batch.scan import one_thread
+from scanprep.batch.workers import Work, run_in_processes
+from scanprep.pipeline import ScanTask, find_scans, prepare
 
 
 @pytest.fixture(scope="module")
 def template():
-    vertices, faces = igl.icosahedron()
-    vertices, faces = igl.upsample(vertices, faces.astype(np.int64), 3)
-    vertices /= np.linalg.norm(vertices, axis=1, keepdims=True)
-    return Mesh(vertices * [0.3, 0.2, 0.9], faces)
+    return ball()
 
 
 @pytest.fixture
 def scans(tmp_path, template):
-    folder = tmp_path / "scans"
-    rng = np.random.default_rng(1)
-    for k in range(3):
-        body = template.with_vertices(template.vertices * (1 + 0.1 * rng.normal(size=3)) + rng.normal(size=3))
-        write_mesh(folder / f"body{k}.ply", body)
-        write_landmarks(folder / f"body{k}.landmarks.json", {name: body.vertices[v] for name, v in MARKS.items()})
-    (folder / "scans.csv").write_text("name,subject,sex\nbody0,anna,female\nbody1,anna,female\nbody2,ben,male\n")
-    return folder
+    return write_scans(tmp_path / "scans", template)
+
+
+@pytest.fixture(scope="module")
+def six(tmp_path_factory, template):
+    """Six scans, one of them broken, and the set that a single process makes of them without being disturbed."""
+    place = tmp_path_factory.mktemp("six")
+    scans = write_scans(place / "scans", template, 6)
+    (scans / "body3.ply").write_bytes((scans / "body3.ply").read_bytes()[:-50])
+    done = prepare(find_scans(scans), template, MARKS, place / "one" / "set", WITH_PICTURES)
+    assert len(done.figures) == 5 and len(done.failures) == 1
+    return scans, place / "one" / "set"
 
 
 def test_scans_and_what_is_known_of_them(scans):
@@ -47,6 +53,25 @@ def test_scans_and_what_is_known_of_them(scans):
     assert {t.subject for t in find_scans(scans, subject="carl")} == {"carl"}
 
 
+def test_point_clouds_are_scans(scans):
+    (scans / "cloud.xyz").write_text("0 0 0\n1 0 0\n")
+    (scans / "notes.txt").write_text("Tuesday")
+    assert [t.name for t in find_scans(scans)] == ["body0", "body1", "body2", "cloud"]
+
+
+def test_folders_that_cannot_be_meant(scans, tmp_path):
+    shutil.copy(scans / "body0.ply", scans / "body0.obj")
+    with pytest.raises(ValueError, match=r"body0\.obj and body0\.ply, both of the name 'body0'"):
+        find_scans(scans)
+    with pytest.raises(ValueError, match="in its folders scans: name one of them"):
+        find_scans(tmp_path)
+    with pytest.raises(ValueError, match="no such folder"):
+        find_scans(tmp_path / "nowhere")
+    (scans / "body0.obj").unlink()
+    with pytest.raises(ValueError, match="landmarks: expected a folder"):
+        find_scans(scans, tmp_path / "nowhere")
+
+
 def test_table_that_names_no_scan(scans):
     (scans / "scans.csv").write_text("name,subject\nnobody,anna\n")
     with pytest.raises(ValueError, match=r"scans\.csv: no scan is called nobody"):
@@ -54,14 +79,18 @@ def test_table_that_names_no_scan(scans):
     (scans / "scans.csv").write_text("scan,subject\nbody0,anna\n")
     with pytest.raises(ValueError, match="expected a column 'name'"):
         find_scans(scans)
+    (scans / "scans.csv").write_text("name,subject\nbody0,anna\nbody0,ben\n")
+    with pytest.raises(ValueError, match="body0 comes twice"):
+        find_scans(scans)
 
 
 def test_registers_all(scans, template, tmp_path):
     calls = []
     done = prepare(find_scans(scans), template, MARKS, tmp_path / "set", QUICK, lambda *a: calls.append(a))
-    assert not done.failures and done.registered.names == ("body0", "body1", "body2")
+    assert not done.failures and done.registered.names == ("body0", "body1", "body2") and done.fresh == 3
     assert calls[0] == (0, 3) and calls[-1] == (3, 3)
-    assert all(f.distance < 0.01 and f.seen > 0.9 for f in done.figures)
+    assert all(f.distance < 0.01 and f.seen > 0.9 and f.missed < 0.01 for f in done.figures)
+    assert {f.guide for f in done.figures} == {"5 landmarks"}
     again = RegisteredSet.load(tmp_path / "set")
     assert again.subjects == ("anna", "ben") and len(again.poses()) == 2
     assert json.loads((tmp_path / "set" / "landmarks.json").read_text()) == MARKS
@@ -69,12 +98,50 @@ def test_registers_all(scans, template, tmp_path):
 
 def test_goes_on_and_does_nothing_twice(scans, template, tmp_path):
     tasks = find_scans(scans)
-    prepare(tasks[:2], template, MARKS, tmp_path / "set", QUICK)
+    prepare(tasks[1:], template, MARKS, tmp_path / "set", QUICK)
     written = {p: p.stat().st_mtime_ns for p in (tmp_path / "set" / "meshes").iterdir()}
     done = prepare(tasks, template, MARKS, tmp_path / "set", QUICK)
-    assert len(done.figures) == 3
+    assert len(done.figures) == 3 and done.fresh == 1
+    assert done.registered.names == ("body0", "body1", "body2")
     assert all(p.stat().st_mtime_ns == t for p, t in written.items())
     assert not [p for p in (tmp_path / "set").rglob("*") if ".part" in p.name]
+
+
+def test_only_what_has_changed_is_done_again(scans, template, tmp_path):
+    prepare(find_scans(scans), template, MARKS, tmp_path / "set", QUICK)
+    before = contents(tmp_path / "set")
+    marks = json.loads((scans / "body1.landmarks.json").read_text())
+    marks["top"][2] += 0.05
+    (scans / "body1.landmarks.json").write_text(json.dumps(marks))
+    done = prepare(find_scans(scans), template, MARKS, tmp_path / "set", QUICK)
+    assert done.fresh == 1
+    changed = {name for name, data in contents(tmp_path / "set").items() if data != before[name]}
+    assert changed == {"meshes/body1.ply", "registration.csv", "report.html"}
+
+
+@pytest.mark.parametrize("sign", [signal.SIGKILL, signal.SIGINT])
+def test_killed_in_the_middle_and_started_again(six, tmp_path, sign):
+    scans, whole = six
+    command = [sys.executable, str(Path(__file__).with_name("scan_folders.py")), str(scans), str(tmp_path / "set")]
+    run = subprocess.Popen([*command, "2"], start_new_session=True)
+    deadline = time.monotonic() + 120
+    while len(done := finished(tmp_path / "set")) < 2:
+        assert run.poll() is None and time.monotonic() < deadline
+        time.sleep(0.005)
+    os.killpg(run.pid, sign)                    # as Ctrl-C does in a terminal: the workers too
+    assert run.wait(60) == (130 if sign == signal.SIGINT else -sign)
+    done = finished(tmp_path / "set")
+    assert 2 <= len(done) < 5, "killed too late to show anything"
+    if sign == signal.SIGINT:
+        assert 'id="scan-' in (tmp_path / "set" / "report.html").read_text()
+    stamps = {name: (tmp_path / "set" / "meshes" / f"{name}.ply").stat().st_mtime_ns for name in done}
+    assert subprocess.run([*command, "2"]).returncode == 0
+    assert {name: (tmp_path / "set" / "meshes" / f"{name}.ply").stat().st_mtime_ns for name in done} == stamps
+    assert contents(tmp_path / "set") == contents(whole)
+
+
+def finished(folder):
+    return [f.name for f in read_figures(folder)]
 
 
 def test_interrupted_keeps_what_was_done(scans, template, tmp_path):
@@ -89,11 +156,86 @@ def test_interrupted_keeps_what_was_done(scans, template, tmp_path):
     assert len(done.figures) == 3
 
 
-def test_workers_change_nothing(scans, template, tmp_path):
-    one = prepare(find_scans(scans), template, MARKS, tmp_path / "one", QUICK)
-    two = prepare(find_scans(scans), template, MARKS, tmp_path / "two", dataclasses.replace(QUICK, workers=2))
-    for name in one.registered.names:
-        np.testing.assert_allclose(one.registered.vertices([name]), two.registered.vertices([name]), atol=1e-9)
+def test_two_runs_in_one_folder(scans, template, tmp_path):
+    prepare(find_scans(scans)[:1], template, MARKS, tmp_path / "set", QUICK)
+    before = contents(tmp_path / "set")
+    with locked(tmp_path / "set"), pytest.raises(ValueError, match=f"another run is at work .*process {os.getpid()} "):
+        prepare(find_scans(scans), template, MARKS, tmp_path / "set", QUICK)
+    assert contents(tmp_path / "set") == before and not (tmp_path / "set" / ".lock").exists()
+
+
+def test_processes_change_nothing(six, template, tmp_path):
+    scans, whole = six
+    done = prepare(find_scans(scans), template, MARKS, tmp_path / "set", dataclasses.replace(WITH_PICTURES, workers=2))
+    assert "body3.ply" in done.failures[0]
+    assert contents(tmp_path / "set") == contents(whole)
+
+
+@pytest.mark.parametrize("processes, ship", [(True, False), (False, True)])
+def test_a_cluster_changes_nothing(six, template, tmp_path, processes, ship):
+    from distributed import LocalCluster
+
+    scans, whole = six
+    layout = {"n_workers": 2, "threads_per_worker": 1} if processes else {"n_workers": 1, "threads_per_worker": 3}
+    with LocalCluster(processes=processes, dashboard_address=None, **layout) as local:
+        config = dataclasses.replace(WITH_PICTURES, scheduler=local.scheduler_address, ship=ship)
+        prepare(find_scans(scans), template, MARKS, tmp_path / "set", config)
+    assert contents(tmp_path / "set") == contents(whole)
+
+
+def test_shipped_files_need_no_folder(scans, template):
+    task = find_scans(scans)[0]
+    files, work = cluster._files(task), Work(template, MARKS, QUICK.scan)
+    there = dataclasses.replace(task, scan=Path("/no/such/body0.ply"), landmarks=Path("/no/such/body0.landmarks.json"))
+    shipped = cluster._on_worker(work, there, files, cluster._versions())
+    np.testing.assert_array_equal(shipped.vertices, work.do(task).vertices)
+    files[task.scan.name] = files[task.scan.name][:-9]
+    failed = cluster._on_worker(work, there, files, cluster._versions())
+    assert failed.startswith("/no/such/body0.ply: ")
+
+
+def test_no_scheduler(scans, template, tmp_path, monkeypatch):
+    monkeypatch.setattr(cluster, "ANSWER", 1)
+    config = dataclasses.replace(QUICK, scheduler="tcp://127.0.0.1:1")
+    with pytest.raises(ValueError, match=r"none answers at tcp://127\.0\.0\.1:1"):
+        prepare(find_scans(scans), template, MARKS, tmp_path / "set", config)
+
+
+def test_workers_of_another_version(scans, template):
+    task = find_scans(scans)[0]
+    with pytest.raises(RuntimeError, match="the worker has scapekit"):
+        cluster._on_worker(Work(template, MARKS, QUICK.scan), task, None, {"scapekit": "0.0.0", "numpy": "1"})
+
+
+class Deadly(Work):
+    """Dies of the second scan."""
+
+    def do(self, task):
+        if task.name == "body1":
+            os._exit(9)
+        return task.name
+
+
+def test_a_process_that_dies_stops_no_other_scan(template):
+    tasks = [ScanTask(f"body{k}", Path(f"/scans/body{k}.ply")) for k in range(3)]
+    outcomes = {task.name: outcome for task, outcome in run_in_processes(Deadly(template, MARKS, QUICK.scan), tasks, 2)}
+    assert outcomes["body0"] == "body0" and outcomes["body2"] == "body2"
+    assert outcomes["body1"].startswith("/scans/body1.ply: the process at work on it died")
+
+
+def test_one_thread_while_anyone_needs_it():
+    from threadpoolctl import threadpool_info, threadpool_limits
+
+    def threads():
+        return {pool["num_threads"] for pool in threadpool_info()}
+
+    with threadpool_limits(2):
+        before = threads()
+        with one_thread():
+            with one_thread():
+                assert threads() == {1}
+            assert threads() == {1}
+        assert threads() == before
 
 
 def test_bad_scans_stop_no_other(scans, template, tmp_path):
@@ -107,12 +249,27 @@ def test_bad_scans_stop_no_other(scans, template, tmp_path):
     joined = " | ".join(sorted(done.failures))
     assert "body0.ply" in joined and "body1.landmarks.json" in joined and "broken.landmarks.json" in joined
     assert "nose" in joined and "top" in joined
+    write_scans(scans, template)                       # mended; the fourth is taken away
+    (scans / "broken.ply").unlink()
+    again = prepare(find_scans(scans), template, MARKS, tmp_path / "set", QUICK)
+    assert not again.failures and again.fresh == 2 and not (tmp_path / "set" / "failures.csv").exists()
+
+
+def test_what_leads_the_template(scans, template, tmp_path):
+    (scans / "body0.landmarks.json").unlink()
+    settings = {guide: dataclasses.replace(QUICK, scan=dataclasses.replace(QUICK.scan, guide=guide))
+                for guide in ("landmarks", "pose")}
+    asked = prepare(find_scans(scans), template, MARKS, tmp_path / "asked", settings["landmarks"])
+    assert asked.registered.names == ("body1", "body2") and "body0" in asked.failures[0]
+    near = prepare(find_scans(scans)[:2], template, {}, tmp_path / "near", settings["pose"])
+    assert [f.guide for f in near.figures] == ["pose", "pose"] and np.isnan(near.figures[0].landmarks)
 
 
 def test_other_settings_or_template_in_the_folder(scans, template, tmp_path):
     prepare(find_scans(scans)[:1], template, MARKS, tmp_path / "set", QUICK)
+    other = dataclasses.replace(QUICK, scan=dataclasses.replace(QUICK.scan, unit="mm"))
     with pytest.raises(ValueError, match="other settings"):
-        prepare(find_scans(scans), template, MARKS, tmp_path / "set", dataclasses.replace(QUICK, scan=dataclasses.replace(QUICK.scan, unit="mm")))
+        prepare(find_scans(scans), template, MARKS, tmp_path / "set", other)
     with pytest.raises(ValueError, match="another template"):
         prepare(find_scans(scans), template.with_vertices(2 * template.vertices), MARKS, tmp_path / "set", QUICK)
 

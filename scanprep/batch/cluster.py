@@ -14,7 +14,7 @@ import numpy as np
 from .tasks import ScanTask
 from .workers import Outcome, Work
 
-WAIT = 60          # seconds for the first worker of a cluster that has just been started
+ANSWER, WAIT = 10, 60          # seconds for the scheduler, and for the first worker of a cluster just started
 
 
 def run_on_cluster(address: str, work: Work, tasks: Sequence[ScanTask], ship: bool = False
@@ -41,7 +41,7 @@ def run_on_cluster(address: str, work: Work, tasks: Sequence[ScanTask], ship: bo
     Client, as_completed, KilledWorker = _distributed()
     tasks = [task.absolute() for task in tasks]
     try:
-        client = Client(address, timeout="10s", set_as_default=False)
+        client = Client(address, timeout=ANSWER, set_as_default=False)
     except (OSError, ValueError) as error:
         raise ValueError(f"scheduler: expected the address of a Dask scheduler, none answers at {address} "
                          f"({' '.join(str(error).split())})") from None
@@ -50,7 +50,7 @@ def run_on_cluster(address: str, work: Work, tasks: Sequence[ScanTask], ship: bo
         shared = client.scatter(work, broadcast=True)
         waiting = iter(range(len(tasks)))
         number: dict[Any, int] = {}
-        running = as_completed([])
+        running = as_completed([], loop=client.loop)
 
         def submit() -> None:
             """The next task; few at a time, so that shipped files do not pile up at the scheduler."""

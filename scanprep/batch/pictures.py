@@ -4,9 +4,11 @@ from __future__ import annotations
 import io
 
 import numpy as np
+from scipy.sparse import eye_array
 
 from ..geometry import rotations
 from ..geometry.mesh import Mesh
+from ..matching.matches import thin
 from ..matching.nonrigid import Registration
 from ..pictures.camera import Camera
 from ..pictures.colors import heat
@@ -16,7 +18,7 @@ from ..pictures.views import upright
 WIDTH, HEIGHT = 150, 216
 FAR = 0.005                 # of the template's size: the dark end of the distances
 TURN = 20.0                 # degrees from the front
-BALLS = 4000
+BALL = 0.013                # of the template's size: radius of the balls that stand for points
 
 PANELS = ("the scan", "the template on it", "distance, front", "distance, back")
 
@@ -32,7 +34,7 @@ def strip(template: Mesh, scan: Mesh | np.ndarray, fit: Registration) -> bytes:
     up, front = upright(template)
     near, back = (Camera.around(body.vertices, front + turn, up=up, margin=1.12) for turn in (TURN, TURN + 180))
     size = float(np.sqrt(template.face_areas.sum()))
-    far = Solid(body, heat(fit.distances, 0, FAR * size))
+    far = Solid(body, heat(evened(body, fit.distances), 0, FAR * size))
     shown = [(_scan(scan, R, middle, size), near), (Solid(body, CLAY), near), (far, near), (far, back)]
     return webp_bytes(np.concatenate([render(shape, camera, WIDTH, HEIGHT) for shape, camera in shown], axis=1))
 
@@ -43,7 +45,17 @@ def _scan(scan: Mesh | np.ndarray, R: np.ndarray, middle: np.ndarray, size: floa
         coarse = coarsened(scan, 0.007 * size)
         return Solid(coarse.with_vertices((coarse.vertices - middle) @ R.T))
     points = scan.vertices if isinstance(scan, Mesh) else scan
-    return Dots((points[:: max(1, len(points) // BALLS)] - middle) @ R.T, CLAY, 0.006 * size)
+    return Dots((points[thin(points, 1.25 * BALL * size)] - middle) @ R.T, CLAY, BALL * size)
+
+
+def evened(mesh: Mesh, values: np.ndarray, rounds: int = 2) -> np.ndarray:
+    """Values (N,) averaged with those of neighbours, so that noise fades and misfit stays; NaN stays NaN."""
+    known = np.isfinite(values)
+    weights = mesh.vertex_adjacency.astype(float) + eye_array(len(values))
+    for _ in range(rounds):
+        total = weights @ np.where(known, values, 0.0)
+        values = np.where(known, total / np.maximum(weights @ known.astype(float), 1.0), np.nan)
+    return values
 
 
 def coarsened(mesh: Mesh, cell: float) -> Mesh:

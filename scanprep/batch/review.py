@@ -32,7 +32,7 @@ class Limits:
         RMS distance of the landmarks, over the size.
     """
 
-    missed: float = 0.01
+    missed: float = 0.005
     distance: float = 0.002
     unseen: float = 0.15
     stretch: float = 0.02

@@ -1,18 +1,24 @@
-"""`scape prep skeleton`: parts, joints and a tree."""
+"""`scape prep skeleton` and `edit-skeleton`: parts, joints and a tree, found and changed by hand."""
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import numpy as np
 import tyro
 
 from ..cli import Output, Unit, read_poses
 from ..console import Metric, Outcome, bar
+from ..dataset import RegisteredSet
+from ..geometry.files import read_mesh
+from ..geometry.mesh import Mesh
+from .edit import apply_edits, read_edits
 from .find import find_skeleton
 from .parts import SkeletonConfig
+from .tree import Skeleton
 
 PosesArg = Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="POSES")]
+SkeletonArg = Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="SKELETON")]
 
 
 def skeleton(poses: PosesArg, output: Output, template: Path | None = None, subject: str | None = None,
@@ -34,7 +40,68 @@ def skeleton(poses: PosesArg, output: Output, template: Path | None = None, subj
     with bar("finding the skeleton") as progress:
         found = find_skeleton(body, vertices, config, progress=progress)
     found.save(output)
-    shares = np.bincount(found.part_of_face, body.face_areas) / body.face_areas.sum()
     return Outcome(output, [Metric("poses", len(vertices)), Metric("parts", len(found.parents)),
-                            *(Metric(f"{name}, share of the surface", 100 * float(share), "%")
-                              for name, share in zip(found.names, shares, strict=True))], {"skeleton": config})
+                            *_shares(found, body)], {"skeleton": config})
+
+
+def edit(skeleton: SkeletonArg, output: Output, template: Path | None = None, edits: Path | None = None,
+         merge: tuple[str, str] | None = None, split: str | None = None, rename: tuple[str, str] | None = None,
+         move_joint: tuple[str, float, float, float] | None = None, unit: Unit | None = None) -> Outcome:
+    """Change a skeleton by hand: merge, split and rename parts, move joints.
+
+    Example: scape prep edit-skeleton set --merge chest shoulder_left --rename part3 neck -o set/skeleton.json
+
+    Args:
+        skeleton: Registered set with a skeleton, or a skeleton in JSON.
+        output: JSON file to write.
+        template: Its mesh; of a set it is known.
+        edits: JSON list of edits, such as [{"merge": [a, b]}, {"split": a, "names": [b, c]}, {"rename": {a: b}},
+            {"move_joint": a, "position": [x, y, z]}], which are made first, in their order.
+        merge: Two parts to become one, called like the first.
+        split: A part to become two, where it bends most in the poses of the set.
+        rename: A part and its new name.
+        move_joint: A part and where the joint to its parent belongs on the template, in metres.
+        unit: Unit of the template.
+    """
+    wanted = [*(read_edits(edits) if edits else []), *_asked(merge, split, rename, move_joint)]
+    if not wanted:
+        raise ValueError("edits: expected --edits FILE or one of --merge, --split, --rename, --move-joint")
+    before, body, poses = _read_skeleton(skeleton, template, unit)
+    after = apply_edits(before, body, wanted, poses)
+    after.save(output)
+    return Outcome(output, [Metric("edits", len(wanted)), Metric("parts before", len(before.parents)),
+                            Metric("parts", len(after.parents)), *_shares(after, body)], {"edits": wanted})
+
+
+def _asked(merge: tuple[str, str] | None, split: str | None, rename: tuple[str, str] | None,
+           move_joint: tuple[str, float, float, float] | None) -> list[dict[str, Any]]:
+    """The edits of the command line as they stand in a file."""
+    asked: list[dict[str, Any]] = []
+    if merge:
+        asked.append({"merge": list(merge)})
+    if split is not None:
+        asked.append({"split": split})
+    if rename:
+        asked.append({"rename": {rename[0]: rename[1]}})
+    if move_joint:
+        asked.append({"move_joint": move_joint[0], "position": list(move_joint[1:])})
+    return asked
+
+
+def _read_skeleton(path: Path, template: Path | None, unit: Unit | None
+                   ) -> tuple[Skeleton, Mesh, np.ndarray | None]:
+    """Skeleton, template, and the poses where a set has them."""
+    if path.is_dir():
+        whole = RegisteredSet.load(path)
+        if whole.skeleton is None:
+            raise ValueError(f"{path}: expected a set with a skeleton, it has none; find one with scape prep skeleton")
+        return whole.skeleton, whole.template, whole.poses() if whole.entries else None
+    if template is None:
+        raise ValueError(f"template: expected the mesh that the skeleton {path} belongs to")
+    return Skeleton.load(path), read_mesh(template, unit), None
+
+
+def _shares(found: Skeleton, body: Mesh) -> list[Metric]:
+    shares = np.bincount(found.part_of_face, body.face_areas, len(found.parents)) / body.face_areas.sum()
+    return [Metric(f"{name}, share of the surface", 100 * float(share), "%")
+            for name, share in zip(found.names, shares, strict=True)]

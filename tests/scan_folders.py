@@ -1,0 +1,50 @@
+"""Folders of tiny scans; started as a program it registers one: SCANS SET WORKERS."""
+import sys
+from dataclasses import replace
+from pathlib import Path
+
+import igl
+import numpy as np
+
+from scanprep import Mesh, write_landmarks, write_mesh
+from scanprep.matching.nonrigid import GraphStage, RegistrationConfig, ShellStage
+from scanprep.pipeline import PrepareConfig, ScanSettings, find_scans, prepare
+
+MARKS = {"top": 0, "left": 1, "right": 2, "front": 3, "back": 4}
+QUICK = PrepareConfig(ScanSettings(RegistrationConfig(
+    graph=(GraphStage(40, 0.35, 0.035, 0.7, 0.01, 0.2, slide=0.3, rounds=2),),
+    shell=(ShellStage(0.02, 0.007, 0.0002, 0.05),)), pictures=False), min_poses=99, workers=1)
+WITH_PICTURES = replace(QUICK, scan=replace(QUICK.scan, pictures=True))
+CHANGING = {"times.csv"}            # the only file that may differ between two runs
+
+
+def ball(level=3, radii=(0.3, 0.2, 0.9)):
+    vertices, faces = igl.icosahedron()
+    vertices, faces = igl.upsample(vertices, faces.astype(np.int64), level)
+    vertices /= np.linalg.norm(vertices, axis=1, keepdims=True)
+    return Mesh(vertices * radii, faces)
+
+
+def write_scans(folder, template, count=3):
+    rng = np.random.default_rng(1)
+    for k in range(count):
+        body = template.with_vertices(template.vertices * (1 + 0.1 * rng.normal(size=3)) + rng.normal(size=3))
+        write_mesh(folder / f"body{k}.ply", body)
+        write_landmarks(folder / f"body{k}.landmarks.json", {name: body.vertices[v] for name, v in MARKS.items()})
+    rows = [f"body{k},{('anna', 'anna', 'ben')[k % 3]},{('female', 'female', 'male')[k % 3]}" for k in range(count)]
+    (folder / "scans.csv").write_text("\n".join(["name,subject,sex", *rows]) + "\n")
+    return folder
+
+
+def contents(folder):
+    """Path -> bytes of all files that must not depend on how a run went."""
+    return {str(p.relative_to(folder)): p.read_bytes() for p in sorted(folder.rglob("*"))
+            if p.is_file() and p.name not in CHANGING}
+
+
+if __name__ == "__main__":
+    try:
+        prepare(find_scans(sys.argv[1]), ball(), MARKS, Path(sys.argv[2]),
+                replace(WITH_PICTURES, workers=int(sys.argv[3])))
+    except KeyboardInterrupt:
+        sys.exit(130)
