@@ -71,6 +71,9 @@ def minimise(evaluate: Evaluate, derive: Derive, x: np.ndarray, J: int, toleranc
         x, damping = trial, damping / 5
         if energy - lower <= tolerance * energy or lower < EXACT**2 * len(residual):
             return Minimum(x, True, step, lower)
+        energy = lower
+        if step == limit:
+            break
         residual, columns = derive(x)
         energy = float(residual @ residual)
     return Minimum(x, False, step, energy)

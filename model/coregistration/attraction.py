@@ -5,7 +5,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from scanprep.geometry.surface import OrientedPoints
+from scanprep.geometry.mesh import Mesh
+from scanprep.geometry.surface import OrientedPoints, Surface
 from scanprep.matching.matches import Target
 
 
@@ -72,12 +73,12 @@ def attraction(x: np.ndarray, normals: np.ndarray, share: np.ndarray, target: Ta
     return Attraction(root, np.einsum("nij,nj->ni", inverse, b))
 
 
-def unexplained(x: np.ndarray, normals: np.ndarray, target: Target, limit: float, scale: float
-                ) -> tuple[np.ndarray, np.ndarray]:
-    """Distances of scan points to the body (n,), and of body points (L,) to the scan, metres, at most `limit`."""
-    back = OrientedPoints(x, normals, scale).match(target.points, target.normals, limit)
-    forward = OrientedPoints(target.points, target.normals, scale).match(x, normals, limit)
-    return np.minimum(back.distances, limit), np.minimum(forward.distances, limit)
+def apart(mesh: Mesh, target: Target, limit: float) -> np.ndarray:
+    """Distances (n,) of scan points to the nearest place of a mesh, metres; at most `limit`, which it is where the two
+    face away from each other."""
+    found = Surface(mesh).closest(target.points)
+    facing = np.einsum("nd,nd->n", mesh.face_normals[found.faces], target.normals) > 0
+    return np.where(facing, np.minimum(found.distances, limit), limit)
 
 
 def _robust(distances: np.ndarray, reach: float) -> np.ndarray:

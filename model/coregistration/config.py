@@ -4,6 +4,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 from scanprep.matching.schedule import GraphStage, RegistrationConfig, ShellStage
+from scanprep.skeleton.parts import SkeletonConfig
 
 from ..learning.scape import LearnConfig
 
@@ -46,13 +47,11 @@ class ModelFitConfig:
     Attributes
     ----------
     search : stages that every start goes through
-    refine : stages that the best few go through
-    kept : int
-        How many starts are refined.
+    refine : stages that follow, once for starts that end alike
     axes : int
         Typical poses are the mean of the training poses and a step both ways along so many main directions.
     turns : int
-        Without landmarks and without a start, each typical pose is turned so often about the vertical.
+        Without landmarks, each typical pose is turned so often about the vertical.
     up : (3,) float, optional
         The vertical; by default the coordinate axis along which the template is longest.
     normal_weight : float
@@ -61,8 +60,8 @@ class ModelFitConfig:
         Most shape components used while the pose is sought.
     shape_prior : float
         Distance to the data, as a share of √area, that one standard deviation of a beta is worth.
-    explained : float
-        A scan point nearer to the body than this share of √area, with a like normal, is explained.
+    near, enough : float
+        No further start is tried once this share of the scan's points is nearer to the body than this share of √area.
     """
 
     search: tuple[PoseStage, ...] = (
@@ -74,14 +73,14 @@ class ModelFitConfig:
         PoseStage(0.06, 0.1, 0.001, 0.01),
         PoseStage(0.04, 0.05, 0.0007, 0.01),
     )
-    kept: int = 3
     axes: int = 6
     turns: int = 8
     up: tuple[float, float, float] | None = None
     normal_weight: float = 0.05
     n_betas: int = 20
     shape_prior: float = 0.0005
-    explained: float = 0.012
+    near: float = 0.02
+    enough: float = 0.98
 
 
 # the predicted mesh lies near already: fine stages only, whose stiffness is relative to the prediction's own shape
@@ -94,14 +93,6 @@ NEAR = RegistrationConfig(
     ),
     shell=(ShellStage(0.02, 0.007, 0.0002, 0.02), ShellStage(0.015, 0.003, 0.0002, 0.015)))
 
-# while the pose is still sought the alignment keeps more of the predicted shape
-COUPLED = RegistrationConfig(
-    graph=(
-        GraphStage(300, 0.2, 0.02, 2.0, 0.01, 0.08),
-        GraphStage(300, 0.13, 0.013, 1.4, 0.01, 0.06),
-    ), shell=())
-
-
 @dataclass(frozen=True)
 class CoregistrationConfig:
     """Settings of `register_with_model` and `coregister`.
@@ -109,27 +100,33 @@ class CoregistrationConfig:
     Attributes
     ----------
     fit : ModelFitConfig
-    coupled : tuple of RegistrationConfig
-        Alignments, softer and softer, from each of which pose and betas are taken anew.
-    last : RegistrationConfig
-        Of the final alignment to the last prediction.
+    registration : RegistrationConfig
+        Of the template as the model predicts it, which resists by the predicted shape.
+    alignments : int
+        How often the template is aligned; before each further time, pose and betas are taken from the alignment.
     learn : LearnConfig
         How the model is learned again.
     rounds : int
         Most times that all scans are registered and the model is learned.
     tolerance : float
         Settled when a round moves the mean vertex by less than this share of √area.
+    explained : float
+        A scan point nearer to the mesh than this share of √area, and not facing away from it, is explained.
     failed : float
-        A scan of which a larger share of points stays unexplained does not teach the model.
+        A scan of which a larger share of points stays unexplained has failed, and does not teach the model.
+    skeleton : SkeletonConfig, optional
+        Find the skeleton again in every round; without it the model keeps the one it has.
     workers : int
         Processes; 0 for one a core.
     """
 
     fit: ModelFitConfig = field(default_factory=ModelFitConfig)
-    coupled: tuple[RegistrationConfig, ...] = (COUPLED,)
-    last: RegistrationConfig = NEAR
+    registration: RegistrationConfig = NEAR
+    alignments: int = 1
     learn: LearnConfig = field(default_factory=LearnConfig)
     rounds: int = 3
     tolerance: float = 0.0007
-    failed: float = 0.1
+    explained: float = 0.006
+    failed: float = 0.015
+    skeleton: SkeletonConfig | None = None
     workers: int = 0

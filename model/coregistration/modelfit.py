@@ -1,10 +1,12 @@
-"""The model brought to a scan by its pose, place and betas: search from many starts, then the best few refined."""
+"""The model brought to a scan by its pose, place and betas alone, from as many starts as it takes."""
 from __future__ import annotations
 
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from scanprep.geometry import rotations
 from scanprep.geometry.mesh import Mesh
@@ -15,11 +17,12 @@ from ..features import twists
 from ..fitting import share_of_vertices, spread_vertices
 from ..linear import Subject
 from ..minimise import minimise
-from .attraction import Attraction, attraction, towards, unexplained
+from .attraction import Attraction, apart, attraction, towards
 from .config import ModelFitConfig, PoseStage
 from .posed import PosedPoints, posed_points, typical_poses, whitening
 
 STEPS = 2                            # of Levenberg-Marquardt between matchings
+ALIKE = 0.005                        # share of √area: searches that end nearer to each other have found the same
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,12 +50,13 @@ class ModelFit:
         template = body.template
         self.body, self.target, self.config = body, target, config
         self.size = float(np.sqrt(template.face_areas.sum()))
-        none = np.zeros(0, dtype=np.int64), np.zeros((0, 3))
-        self.marks, self.marked = none if landmarks is None else landmarks
+        self.marks, self.marked = landmarks or (np.zeros(0, dtype=np.int64), np.zeros((0, 3)))
         assert body.pose_mean is not None and body.pose_covariance is not None, "a body without a pose prior"
         self.pose_mean, self.covariance = body.pose_mean, body.pose_covariance
         self.whitening = whitening(self.covariance)
         self.points = lru_cache(maxsize=4)(self._points)
+        self.thinned = lru_cache(maxsize=4)(lambda detail: target.thinned(detail * self.size))
+        self._tree = cKDTree(target.thinned(0.01 * self.size).points)
 
     def _points(self, sample: int) -> tuple[PosedPoints, np.ndarray]:
         """Spread vertices with the landmarks behind them, and the share of the surface of each of the former."""
@@ -96,13 +100,14 @@ class ModelFit:
     def follow(self, x: np.ndarray, stage: PoseStage) -> np.ndarray:
         """One stage: match, settle, and again."""
         points, share = self.points(stage.sample)
-        target, scale = self.target.thinned(stage.detail * self.size), self.config.normal_weight * self.size
+        scale = self.config.normal_weight * self.size
         L = len(share)
         marks = towards(self.marked, np.full(len(self.marks), stage.landmarks))
         for _ in range(stage.rounds):
             y, n = points.positions(x)[:L], points.normals(x)[:L]
+            target = self.thinned(stage.detail)
             if not target.oriented:
-                target = orient(self.target.thinned(stage.detail * self.size), self.predicted(x), scale)
+                target = orient(target, self.predicted(x), scale)
             wanted = attraction(y, n, share, target, stage.reach * self.size, stage.slide, scale)
             x = self.settle(x, points, wanted.joined(marks), stage.prior, STEPS)
         return x
@@ -110,33 +115,45 @@ class ModelFit:
     def scored(self, x: np.ndarray, stage: PoseStage) -> Candidate:
         """How far scan and body are apart, both ways and at most the stage's reach, as a root mean square."""
         points, share = self.points(stage.sample)
-        L, limit, scale = len(share), stage.reach * self.size, self.config.normal_weight * self.size
-        target = self.target.thinned(stage.detail * self.size)
-        if not target.oriented:
-            target = orient(target, self.predicted(x), scale)
+        mesh, limit = self.predicted(x), stage.reach * self.size
+        back = apart(mesh, self.oriented(mesh, stage.detail), limit)
         y = points.positions(x)
-        back, forward = unexplained(y[:L], points.normals(x)[:L], target, limit, scale)
-        off = np.linalg.norm(y[L:] - self.marked, axis=1)
+        forward = np.minimum(self._tree.query(y[:len(share)])[0], limit)
+        off = np.minimum(np.linalg.norm(y[len(share):] - self.marked, axis=1), limit)
         bent = self.whitening @ (x[:points.J3] - self.pose_mean.ravel())
-        energy = (back**2).mean() + share @ forward**2 + stage.landmarks * np.sum(np.minimum(off, limit)**2) \
+        energy = (back**2).mean() + share @ forward**2 + stage.landmarks * off @ off \
             + (stage.prior * self.size)**2 * float(bent @ bent)
         return Candidate(x, float(np.sqrt(energy)))
 
-    def search(self, starts: list[np.ndarray]) -> list[Candidate]:
-        """The best few of many starts, best first, after the stages of the search."""
-        found = []
-        for x in starts:
-            for stage in self.config.search:
-                x = self.follow(x, stage)
-            found.append(self.scored(x, self.config.search[-1]))
-        found.sort(key=lambda candidate: candidate.score)
-        return found[:self.config.kept]
+    def oriented(self, mesh: Mesh, detail: float) -> Target:
+        """The scan, thinned, with normals that point outward."""
+        return orient(self.thinned(detail), mesh, self.config.normal_weight * self.size)
 
-    def refine(self, x: np.ndarray) -> Candidate:
-        """The end of the stages that follow the scan closely."""
-        for stage in self.config.refine:
-            x = self.follow(x, stage)
-        return self.scored(x, self.config.refine[-1])
+    def best_of(self, starts: Iterable[np.ndarray]) -> tuple[Candidate, int]:
+        """The best end of starts (one at least), which are tried until one explains enough; and how many were tried."""
+        config, best, ends, tried = self.config, None, [], 0
+        points, _ = self.points(config.search[-1].sample)
+        for x in starts:
+            tried += 1
+            for stage in config.search:
+                x = self.follow(x, stage)
+            y = points.positions(x)
+            if any(np.linalg.norm(y - end, axis=1).mean() < ALIKE * self.size for end in ends):
+                continue
+            ends.append(y)
+            for stage in config.refine:
+                x = self.follow(x, stage)
+            found = self.scored(x, config.refine[-1])
+            if best is None or found.score < best.score:
+                best = found
+            if self.explained(self.predicted(x), config.refine[-1].detail, config.near) >= config.enough:
+                break
+        assert best is not None, "no start"
+        return best, tried
+
+    def explained(self, mesh: Mesh, detail: float, limit: float) -> float:
+        """Share of the points of the scan, thinned to a detail, that lie nearer to the mesh than a share of √area."""
+        return float((apart(mesh, self.oriented(mesh, detail), limit * self.size) < limit * self.size).mean())
 
     def taken_from(self, vertices: np.ndarray, weights: np.ndarray, x: np.ndarray, prior: float, steps: int = 10
                    ) -> np.ndarray:
@@ -162,22 +179,21 @@ class ModelFit:
         x[pose.size:pose.size + 3] = onto.mean(axis=0) - points.positions(x).mean(axis=0)
         return x
 
-    def starts(self) -> list[np.ndarray]:
+    def starts(self) -> Iterator[np.ndarray]:
         """Typical poses where landmarks place them, or without landmarks turned about the vertical."""
         poses = typical_poses(self.pose_mean, self.covariance, self.config.axes)
         if len(self.marks) >= 3:
-            return [self._on_landmarks(pose) for pose in poses]
+            yield from map(self._on_landmarks, poses)
+            return
         up = np.zeros(3)
         up[np.ptp(self.body.template.vertices, axis=0).argmax()] = 1
         if self.config.up is not None:
             up = np.asarray(self.config.up) / np.linalg.norm(self.config.up)
-        out = []
         for turn in 2 * np.pi * np.arange(self.config.turns) / self.config.turns:
             for pose in poses:
                 turned = pose.copy()
                 turned[0] = rotations.log(rotations.exp(turn * up) @ rotations.exp(pose[0]))
-                out.append(self.placed(turned, self.target.points))
-        return out
+                yield self.placed(turned, self.target.points)
 
     def _on_landmarks(self, pose: np.ndarray) -> np.ndarray:
         """A pose turned as a whole, then bent, towards the landmarks."""

@@ -1,18 +1,18 @@
 """One scan registered with a model as prior."""
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 
 from scanprep.geometry.mesh import Mesh
-from scanprep.matching.matches import Target, orient, target_of
+from scanprep.matching.matches import target_of
 from scanprep.matching.nonrigid import register
 
 from ..body import BodyModel
 from ..linear import Subject
-from .attraction import unexplained
 from .config import CoregistrationConfig
 from .modelfit import ModelFit
 
@@ -41,7 +41,8 @@ class ModelRegistration:
     explained : float
         Share of the scan's points that the mesh explains.
     apart : float, metres
-        Mean distance of the mesh from the prediction where there were data: much of it tells of a wrong pose.
+        Root mean square distance of the mesh from the prediction where there were data; much of it tells of a wrong
+        pose.
     landmark_rms : float, metres
         NaN without landmarks.
     flipped : int
@@ -74,9 +75,9 @@ def register_with_model(body: BodyModel | Subject, scan: Mesh | np.ndarray, land
     """Bring the template onto a scan with a model of it as prior.
 
     1. Pose, place and betas are sought from several starts by matches alone.
-    2. The template is aligned from the best prediction, held to its shape; pose and betas are taken from where
-       the alignment has data, and a new prediction is made.
-    3. The last alignment follows the scan: what data there are decide, the model the rest.
+    2. The template as the model predicts it is aligned with the scan, which it follows where there are data; along
+       the surface and elsewhere it keeps the predicted shape.
+    3. Pose and betas are taken from where the alignment has data, and the template is aligned from there anew.
 
     Parameters
     ----------
@@ -100,36 +101,27 @@ def register_with_model(body: BodyModel | Subject, scan: Mesh | np.ndarray, land
     """
     config = config or CoregistrationConfig()
     tell = progress or (lambda done, total: None)
-    total = 2 + len(config.coupled)
-    target = target_of(scan, config.last.neighbours)
-    fit = ModelFit(body, target, landmarks, config.fit)
-    starts = fit.starts() + ([] if start is None else [_given(fit, start)])
-    best = min((fit.refine(found.x) for found in fit.search(starts)), key=lambda candidate: candidate.score)
+    total = 1 + config.alignments
+    fit = ModelFit(body, target_of(scan, config.registration.neighbours), landmarks, config.fit)
+    given = [] if start is None else [_given(fit, start)]
+    best, tried = fit.best_of(itertools.chain(given, fit.starts()))
     tell(1, total)
-    x = best.x
-    for i, coupled in enumerate(config.coupled):
-        aligned = register(fit.predicted(x), scan, None, coupled)
-        x = fit.taken_from(aligned.mesh.vertices, aligned.seen.astype(float), x, config.fit.refine[-1].prior)
+    x, held = best.x, config.fit.refine[-1].prior
+    for i in range(config.alignments):
+        aligned = register(fit.predicted(x), scan, None, config.registration)
+        x = fit.taken_from(aligned.mesh.vertices, aligned.seen.astype(float), x, held)
         tell(2 + i, total)
-    predicted = fit.predicted(x)
-    aligned = register(predicted, scan, None, config.last)
-    tell(total, total)
+    predicted, (pose, trans, betas) = fit.predicted(x), fit.split(x)
     mesh, seen = aligned.mesh, aligned.seen
-    pose, trans, betas = fit.split(x)
-    apart = np.linalg.norm(mesh.vertices - predicted.vertices, axis=1)[seen]
-    off = np.linalg.norm(mesh.vertices[fit.marks] - fit.marked, axis=1)
+    off_model = np.linalg.norm(mesh.vertices - predicted.vertices, axis=1)[seen]
+    off_marks = np.linalg.norm(mesh.vertices[fit.marks] - fit.marked, axis=1)
     return ModelRegistration(mesh, predicted, pose, trans, betas, seen, aligned.distances, aligned.rms,
-                             explained_share(mesh, target, fit, config), float(apart.mean()) if len(apart) else np.nan,
-                             float(np.sqrt((off**2).mean())) if len(off) else np.nan, aligned.flipped, best.score,
-                             len(starts))
+                             fit.explained(mesh, 0.01, config.explained), _rms(off_model), _rms(off_marks),
+                             aligned.flipped, best.score, tried)
 
 
-def explained_share(mesh: Mesh, target: Target, fit: ModelFit, config: CoregistrationConfig) -> float:
-    """Share of the scan's points that lie near the mesh and face as it does."""
-    scale = config.fit.normal_weight * fit.size
-    limit = config.fit.explained * fit.size
-    far, _ = unexplained(mesh.vertices, mesh.vertex_normals, orient(target, mesh, scale), limit, scale)
-    return float((far < limit).mean())
+def _rms(distances: np.ndarray) -> float:
+    return float(np.sqrt((distances**2).mean())) if len(distances) else np.nan
 
 
 def _given(fit: ModelFit, start: np.ndarray) -> np.ndarray:
