@@ -167,6 +167,7 @@ class _Grid:
     origin: np.ndarray
     blocks: tuple[int, ...]
     voxel: float
+    block: int = BLOCK
 
     @classmethod
     def around(cls, low: np.ndarray, high: np.ndarray, voxel: float) -> _Grid:
@@ -177,7 +178,7 @@ class _Grid:
 
     @property
     def shape(self) -> tuple[int, ...]:
-        return tuple(BLOCK * count for count in self.blocks)
+        return tuple(self.block * count for count in self.blocks)
 
     def points(self, keys: np.ndarray) -> np.ndarray:
         return self.origin + self.voxel * np.stack(np.unravel_index(keys, self.shape), axis=1)
@@ -246,6 +247,12 @@ def _zero_surface(grid: _Grid, keys: np.ndarray, points: np.ndarray, distance: n
     vertices, faces, _ = igl.marching_cubes(values, np.ascontiguousarray(points[used]),
                                             np.ascontiguousarray(local, dtype=np.int64), 0.0)
     return Mesh(vertices, faces)
+
+
+def zero_surface(points: np.ndarray, values: np.ndarray, shape: tuple[int, ...]) -> Mesh:
+    """Where values (N,) on a full grid (N, 3) of a shape change sign, by marching cubes."""
+    grid = _Grid(np.zeros(3), tuple(shape), 1.0, block=1)
+    return _zero_surface(grid, np.arange(len(values)), points, values / max(float(np.abs(values).max()), 1e-30))
 
 
 def _with_colors(mesh: Mesh, views: Sequence[_View]) -> Mesh:

@@ -9,7 +9,7 @@ AREA_SHARE = 0.01        # what the area, over the size of the loop, adds to the
 
 
 def triangulate_loop(points: np.ndarray, rim_normals: np.ndarray, forbidden: np.ndarray,
-                     largest: int = 300) -> np.ndarray | None:
+                     largest: int = 300, dear: np.ndarray | None = None) -> np.ndarray | None:
     """The triangles across a loop that bend least along their edges and, where nothing bends, have the smallest area.
 
     An edge of length l between triangles whose normals have the cosine c costs l (1 - c)²: a few sharp bends are
@@ -27,6 +27,8 @@ def triangulate_loop(points: np.ndarray, rim_normals: np.ndarray, forbidden: np.
         Pairs that must not be joined because an edge joins them already.
     largest : int
         Longest loop that is solved as a whole.
+    dear : (n, n) float, metres, optional
+        What joining a pair costs beside its bend.
 
     Returns
     -------
@@ -36,11 +38,12 @@ def triangulate_loop(points: np.ndarray, rim_normals: np.ndarray, forbidden: np.
     """
     kept, ears = _cut_ears(points, rim_normals, forbidden, largest)
     normals = _chord_normals(points, rim_normals, kept, ears) if ears else rim_normals
-    inner = _least_weight(points[kept], normals, forbidden[np.ix_(kept, kept)])
+    price = np.zeros((len(kept), len(kept))) if dear is None else dear[np.ix_(kept, kept)]
+    inner = _least_weight(points[kept], normals, forbidden[np.ix_(kept, kept)], price)
     return None if inner is None else np.concatenate([np.asarray(ears, dtype=int).reshape(-1, 3), kept[inner]])
 
 
-def _least_weight(p: np.ndarray, rim: np.ndarray, forbidden: np.ndarray) -> np.ndarray | None:
+def _least_weight(p: np.ndarray, rim: np.ndarray, forbidden: np.ndarray, dear: np.ndarray) -> np.ndarray | None:
     n = len(p)
     cost = np.full((n, n), np.inf)
     normal, choice = np.zeros((n, n, 3)), np.zeros((n, n), dtype=np.int64)
@@ -68,7 +71,7 @@ def _least_weight(p: np.ndarray, rim: np.ndarray, forbidden: np.ndarray) -> np.n
         row = np.arange(n - span)
         i, k = i[:, 0], k[:, 0]
         closed = forbidden[i, k] & (span < n - 1)
-        cost[i, k] = np.where(closed, np.inf, total[row, best])
+        cost[i, k] = np.where(closed, np.inf, total[row, best] + dear[i, k])
         normal[i, k], choice[i, k] = across[row, best], best + i + 1
     if not np.isfinite(cost[0, n - 1]):
         return None

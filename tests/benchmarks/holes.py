@@ -5,7 +5,9 @@ from dataclasses import dataclass
 
 import numpy as np
 from protocols import RealData
+from scipy.spatial import cKDTree
 
+from scanprep.cleaning.repair import drop_small_components, split_vertices
 from scanprep.geometry.geodesics import SurfaceGraph
 from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.surface import Surface
@@ -50,11 +52,13 @@ def six_holes(name: str, truth: Mesh, marks: dict[str, int], sole: dict[str, np.
     graph = SurfaceGraph(truth)
     gone = {hole: (graph.distances(marks[hole], 2 * radius) < radius)[truth.faces].all(axis=1)
             for hole, radius in RADII.items()} | sole
-    holed, used = truth.submesh(~np.any(list(gone.values()), axis=0))
+    mesh = truth.submesh(~np.any(list(gone.values()), axis=0))[0]
+    mesh = drop_small_components(split_vertices(mesh), 1.0)     # no loose islands
+    used = cKDTree(truth.vertices).query(mesh.vertices)[1]
     left = np.zeros(len(truth.vertices), dtype=bool)
     left[used] = True
     removed = {hole: np.setdiff1d(truth.faces[faces], np.flatnonzero(left)) for hole, faces in gone.items()}
-    return HoledBody(name, truth, holed, removed)
+    return HoledBody(name, truth, mesh, removed)
 
 
 def real_body(data: RealData, kind: str, index: int) -> HoledBody:
@@ -72,10 +76,11 @@ def embedded_body(seed: int) -> HoledBody:
     from scanprep.scanning.people_anatomy import BodyShape
 
     rng = np.random.default_rng(seed)
-    body = stand(people.Person(BodyShape.random(rng)), near_rest(rng)).mesh
+    person = people.Person(BodyShape.random(rng))
+    rest, body = stand(person, np.zeros((16, 3))).mesh, stand(person, near_rest(rng)).mesh
     toes = {"left sole": people.LANDMARKS["left toe"], "right sole": people.LANDMARKS["right toe"]}
     marks = {hole: people.LANDMARKS[mark] for hole, mark in EMBEDDED_MARKS.items()}
-    return six_holes(f"embedded{seed}", body, marks, soles(body, toes))
+    return six_holes(f"embedded{seed}", body, marks, soles(rest, toes))
 
 
 def distances(item: HoledBody, filled: Mesh, kept: int | None) -> dict[str, float]:
