@@ -18,6 +18,7 @@ if TYPE_CHECKING:               # imported where they are used: this module must
 Unit = Literal["m", "mm", "cm", "in"]
 ScanArg = Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="SCAN")]
 MeshArg = Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="MESH")]
+SetArg = Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="SET")]
 Output = Annotated[Path, tyro.conf.arg(aliases=["-o"])]
 MM = 1000.0
 
@@ -26,10 +27,13 @@ COMMANDS = {
     "page": ("The page of a registered set: every scan with pictures and figures, worst first.",
              "scanprep.batch.cli:page"),
     "template": ("Range views with known cameras -> a closed template.", "scanprep.cleaning.cli:template_of_views"),
+    "views": ("Refine the rough poses of range views.", "scanprep.cleaning.cli:align_cameras"),
     "merge": ("Range views with known cameras -> one surface.", "scanprep.cleaning.cli:merge"),
     "fill": ("Close the holes of a mesh.", "scanprep.cleaning.cli:fill"),
     "decimate": ("Fewer triangles for the same surface.", "scanprep.cleaning.cli:reduce"),
+    "decimate-set": ("A registered set in fewer triangles.", "scanprep.cleaning.cli:reduce_set"),
     "align": ("Move one scan rigidly onto another.", "scanprep.matching.cli:align"),
+    "correspond": ("From a few landmarks to nearly two hundred pairs of places.", "scanprep.matching.cli:correspond"),
     "register": ("Bend the template onto one scan.", "scanprep.matching.cli:register_one"),
     "skeleton": ("Rigid parts, joints and a tree from registered poses.", "scanprep.skeleton.cli:skeleton"),
     "edit-skeleton": ("Merge, split and rename parts, move joints, by hand or from a file.",

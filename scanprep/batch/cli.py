@@ -9,7 +9,7 @@ from typing import Annotated
 import numpy as np
 import tyro
 
-from ..cli import MM, Output, Unit, landmarks_beside
+from ..cli import MM, Output, SetArg, Unit, landmarks_beside
 from ..console import Metric, Outcome, bar, say
 from ..geometry.files import read_mesh
 from ..geometry.landmarks import read_landmark_vertices
@@ -22,7 +22,6 @@ from .scan import Guide, ScanSettings
 from .tasks import ScanTask
 
 ScansArg = Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="SCANS")]
-SetArg = Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="SET")]
 LISTED = 5                    # scans that the closing table names
 
 
@@ -70,10 +69,10 @@ def page(registered: SetArg, limits: Annotated[Limits, tyro.conf.arg(name="")] =
         registered: Folder that scape prep run wrote.
         limits: Limits.
     """
-    written = write_set_page(registered, limits)
+    say(f"written: {write_set_page(registered, limits)}")
     verdicts = judge_set(registered, limits)
     figures = [v.figures for v in verdicts if v.figures is not None]
-    return Outcome(written, _quality(registered, figures, limits), {"limits": limits})
+    return Outcome(None, _quality(registered, figures, limits), {"limits": limits})
 
 
 def _template_marks(template: Path, given: Path | None, body: Mesh, tasks: Sequence[ScanTask], guide: Guide

@@ -1,4 +1,4 @@
-"""`scape prep template`, `merge`, `fill` and `decimate`: from range views to a clean mesh."""
+"""From range views to a clean mesh: `scape prep views`, `merge`, `fill`, `decimate`, `template`, and `decimate-set`."""
 from __future__ import annotations
 
 from pathlib import Path
@@ -7,11 +7,17 @@ from typing import Annotated
 import numpy as np
 import tyro
 
-from ..cli import MeshArg, Output, Unit, about_mesh
+from ..cli import MM, MeshArg, Output, SetArg, Unit, about_mesh
 from ..console import Metric, Outcome, bar, read_json
+from ..dataset import RegisteredSet
+from ..geometry import storage
 from ..geometry.files import UNITS, list_meshes, read_mesh, write_mesh
+from ..geometry.landmarks import read_landmark_vertices
 from ..geometry.mesh import Mesh
+from .align_views import AlignViewsConfig, align_views
 from .decimate import DecimateConfig, decimate
+from .decimate_set import DecimateSetConfig
+from .decimate_set_files import write_decimated_set
 from .fill import FillConfig, fill_holes
 from .merge import MergeConfig, merge_views
 from .template import make_template
@@ -37,6 +43,33 @@ def template_of_views(views: ViewsArg, output: Output, cameras: Path | None = No
         made = make_template(seen, faces, progress=progress)
     write_mesh(output, made)
     return Outcome(output, [Metric("views", len(seen)), *about_mesh(made)])
+
+
+def align_cameras(views: ViewsArg, output: Output, cameras: Path | None = None, unit: Unit | None = None,
+                  config: Annotated[AlignViewsConfig, tyro.conf.arg(name="")] = AlignViewsConfig()  # noqa: B008
+                  ) -> Outcome:
+    """Refine the rough poses of range views, all of them together.
+
+    Example: scape prep views views -o aligned
+
+    Args:
+        views: Folder of range meshes, roughly in one frame.
+        output: Folder for the moved meshes and their cameras.json.
+        cameras: JSON {file name without ending: [x, y, z]}; else cameras.json in the folder.
+        unit: Unit of the views and cameras.
+        config: Settings.
+    """
+    seen, names = _read_views(views, cameras, unit), [path.stem for path in list_meshes(views)]
+    found = align_views(seen, config)
+    for name, (mesh, _) in zip(names, found.views, strict=True):
+        write_mesh(output / f"{name}.ply", mesh)
+    storage.write_json(output / "cameras.json",
+                       {name: camera.tolist() for name, (_, camera) in zip(names, found.views, strict=True)})
+    shifts = [float(np.linalg.norm(new - old)) for (_, new), (_, old) in zip(found.views, seen, strict=True)]
+    return Outcome(output, [
+        Metric("views", len(seen)), Metric("distance between views, RMS", MM * found.rms, "mm"),
+        Metric("rounds", found.iterations), Metric("converged", str(found.converged)),
+        Metric("largest shift of a camera", MM * max(shifts), "mm")], {"views": config})
 
 
 def merge(views: ViewsArg, output: Output, cameras: Path | None = None, unit: Unit | None = None,
@@ -72,16 +105,47 @@ def fill(mesh: MeshArg, output: Output, unit: Unit | None = None,
     return Outcome(output, [Metric("holes before", len(before.boundary_loops)), *about_mesh(after)], {"fill": config})
 
 
-def reduce(mesh: MeshArg, output: Output, faces: int, unit: Unit | None = None,
+def reduce(mesh: MeshArg, output: Output, faces: int, landmarks: Path | None = None, unit: Unit | None = None,
            config: Annotated[DecimateConfig, tyro.conf.arg(name="")] = DecimateConfig()) -> Outcome:  # noqa: B008
     """Fewer triangles for the same surface.
 
     Example: scape prep decimate closed.ply --faces 14000 -o template.ply
+
+    Args:
+        mesh: Mesh.
+        output: Mesh to write.
+        faces: How many triangles are wanted.
+        landmarks: Landmarks of the mesh, whose vertices stay where they are.
+        unit: Unit of the mesh and its landmarks.
+        config: Settings.
     """
     before = read_mesh(mesh, unit)
-    after = decimate(before, faces, config)
+    keep = np.array(list(read_landmark_vertices(landmarks, before, unit).values())) if landmarks else None
+    with bar("decimating") as progress:
+        after = decimate(before, faces, config, keep, progress=progress)
     write_mesh(output, after)
     return Outcome(output, [Metric("triangles before", len(before.faces)), *about_mesh(after)], {"decimate": config})
+
+
+def reduce_set(registered: SetArg, output: Output, faces: int,
+               config: Annotated[DecimateSetConfig, tyro.conf.arg(name="")] = DecimateSetConfig()  # noqa: B008
+               ) -> Outcome:
+    """A registered set in fewer triangles: template, meshes, skeleton and landmarks stay in step.
+
+    Example: scape prep decimate-set set --faces 5000 -o small_set
+
+    Args:
+        registered: Folder of a registered set.
+        output: Folder of the smaller one, which also holds the map between the two in decimation.npz.
+        faces: How many triangles are wanted.
+        config: Settings.
+    """
+    before = RegisteredSet.load(registered)
+    with bar("decimating") as progress:
+        after = write_decimated_set(before, output, faces, config, progress)
+    return Outcome(output, [
+        Metric("meshes", len(after.entries)), Metric("triangles before", len(before.template.faces)),
+        *about_mesh(after.template)], {"decimate-set": config})
 
 
 def _read_views(folder: Path, cameras: Path | None, unit: Unit | None) -> list[tuple[Mesh, np.ndarray]]:

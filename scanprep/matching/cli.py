@@ -1,4 +1,4 @@
-"""`scape prep align` and `register`: one mesh onto another."""
+"""`scape prep align`, `correspond` and `register`: one mesh onto another."""
 from __future__ import annotations
 
 from pathlib import Path
@@ -13,6 +13,8 @@ from ..console import Metric, Outcome, bar
 from ..geometry.files import read_mesh, write_mesh
 from ..geometry.landmarks import match_landmarks, read_landmark_vertices, read_landmarks
 from ..geometry.mesh import Mesh
+from .correlated import CorrelatedConfig, find_correspondences
+from .correspondence_files import write_correspondences
 from .nonrigid import register
 from .rigid import RigidConfig, align_landmarks, align_rigid
 
@@ -43,18 +45,49 @@ def align(source: MeshArg, target: TargetArg, output: Output, landmarks: Path | 
         Metric("T_target_source", np.array2string(T, precision=6).replace("\n", " "))], {"align": config})
 
 
+def correspond(scan: ScanArg, template: Path, output: Output, landmarks: Path,
+               template_landmarks: Path | None = None, unit: Unit | None = None,
+               config: Annotated[CorrelatedConfig, tyro.conf.arg(name="")] = CorrelatedConfig()) -> Outcome:  # noqa: B008
+    """From a few landmarks to nearly two hundred pairs of places on template and scan.
+
+    Example: scape prep correspond scan.ply --template template.ply --landmarks scan.json -o pairs.json
+
+    Args:
+        scan: Mesh or point cloud.
+        template: Mesh to find on the scan.
+        output: JSON file of vertices of the template, points of the scan in metres, and confidence.
+        landmarks: Landmarks of the scan: three at least, spread over the body.
+        template_landmarks: Landmarks of the template; else the file of its name beside it.
+        unit: Unit of the scan and its landmarks.
+        config: Settings; lengths are multiples of the root of the template's area.
+    """
+    body, data = read_mesh(template), read_scan(scan, unit)
+    pairs = _pairs(body, data, template, landmarks, template_landmarks, unit)
+    with bar("finding correspondences") as progress:
+        found = find_correspondences(body, data, pairs, config, progress)
+    write_correspondences(output, found)
+    return Outcome(output, [
+        Metric("landmarks", len(pairs[0])), Metric("correspondences", len(found)),
+        Metric("confidence, median", float(np.median(found.confidence))),
+        Metric("converged", str(found.converged))], {"correspond": config})
+
+
 def register_one(scan: ScanArg, template: Path, output: Output, landmarks: Path | None = None,
                  template_landmarks: Path | None = None, unit: Unit | None = None) -> Outcome:
     """Bend the template onto one scan.
 
     Example: scape prep register scan.ply --template template.ply --landmarks scan.json -o registered.ply
+
+    Args:
+        scan: Mesh or point cloud.
+        template: Mesh to bring onto it.
+        output: Mesh to write.
+        landmarks: Landmarks of the scan; without them it must be near the template's pose.
+        template_landmarks: Landmarks of the template; else the file of its name beside it.
+        unit: Unit of the scan and its landmarks.
     """
     body, data = read_mesh(template), read_scan(scan, unit)
-    pairs = None
-    if landmarks:
-        marks = read_landmark_vertices(template_landmarks or landmarks_beside(template), body)
-        found = read_landmarks(landmarks, data if isinstance(data, Mesh) else None, unit)
-        pairs = match_landmarks(marks, found)[1:]
+    pairs = _pairs(body, data, template, landmarks, template_landmarks, unit) if landmarks else None
     with bar("registering") as progress:
         fit = register(body, data, pairs, progress=progress)
     write_mesh(output, fit.mesh)
@@ -63,3 +96,11 @@ def register_one(scan: ScanArg, template: Path, output: Output, landmarks: Path 
         Metric("vertices with data", 100 * float(fit.seen.mean()), "%"),
         Metric("distance of landmarks, RMS", MM * fit.landmark_rms, "mm"),
         Metric("flipped triangles", fit.flipped), Metric("converged", str(fit.converged))])
+
+
+def _pairs(body: Mesh, data: Mesh | np.ndarray, template: Path, landmarks: Path, template_landmarks: Path | None,
+           unit: Unit | None) -> tuple[np.ndarray, np.ndarray]:
+    """Vertices of the template and points of the scan that carry the same names."""
+    marks = read_landmark_vertices(template_landmarks or landmarks_beside(template), body)
+    found = read_landmarks(landmarks, data if isinstance(data, Mesh) else None, unit)
+    return match_landmarks(marks, found)[1:]

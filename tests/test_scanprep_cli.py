@@ -1,0 +1,212 @@
+"""The commands of `scape prep`: each explains itself, and hands files from one to the next."""
+import json
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scan_folders import MARKS, QUICK, ball, write_scans
+from scipy.spatial.transform import Rotation
+
+from completion.__main__ import main
+from scanprep import RegisteredSet, Skeleton, read_mesh, write_landmarks, write_mesh
+from scanprep.batch import cli as batch_cli
+from scanprep.cli import COMMANDS
+from scanprep.geometry.storage import StorageError
+from scanprep.matching.correspondence_files import read_correspondences, write_correspondences
+from scanprep.matching.correspondences import Correspondences
+from scanprep.pipeline import ScanSettings, find_scans, prepare
+
+ROOT = Path(__file__).parents[1]
+
+
+@pytest.fixture(scope="module")
+def template():
+    return ball()
+
+
+@pytest.fixture(scope="module")
+def place(tmp_path_factory, template):
+    """A template with landmarks, three scans, and a set with a skeleton of three parts along the body."""
+    place = tmp_path_factory.mktemp("cli")
+    write_mesh(place / "template.ply", template)
+    write_landmarks(place / "template.landmarks.json", MARKS)
+    write_scans(place / "scans", template)
+    registered = prepare(find_scans(place / "scans"), template, MARKS, place / "set", QUICK).registered
+    height = template.vertices[template.faces].mean(axis=1)[:, 2]
+    part = np.select([height < -0.3, height > 0.3], [1, 2], 0)
+    joints = [[0, 0, 0], [0, 0, -0.3], [0, 0, 0.3]]
+    registered.with_skeleton(Skeleton(part, [-1, 0, 0], joints, ("middle", "low", "top")))
+    return place
+
+
+@pytest.fixture
+def quick(monkeypatch):
+    """Registration with few steps, which the command line has no options for."""
+    from functools import partial
+
+    monkeypatch.setattr(batch_cli, "ScanSettings", partial(ScanSettings, registration=QUICK.scan.registration))
+
+
+def run(*words):
+    return main(["prep", *map(str, words)])
+
+
+def report(path):
+    return {m["metric"]: m["value"] for m in json.loads(Path(path).read_text())["metrics"]}
+
+
+@pytest.mark.parametrize("command", COMMANDS)
+def test_every_command_explains_itself(command, capsys):
+    with pytest.raises(SystemExit) as stop:
+        run(command, "--help")
+    shown = " ".join(capsys.readouterr().out.replace("│", " ").split())
+    assert stop.value.code == 0 and f"Example: scape prep {command} " in shown
+
+
+def test_help_answers_at_once():
+    """Nothing that takes long is imported for it; the time itself is for the benchmarks."""
+    code = ("import sys\nfrom completion.__main__ import main\nassert main(['prep', '--help']) == 0\n"
+            "slow = {'scipy', 'igl', 'distributed', 'joblib', 'matplotlib', 'PIL', 'trimesh'} & set(sys.modules)\n"
+            "assert not slow, slow")
+    done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+    assert all(f"\n  {command} " in done.stdout for command in COMMANDS)
+
+
+def test_dask_is_loaded_for_a_scheduler_alone(place):
+    code = (f"import sys\nsys.path.insert(0, {str(ROOT)!r})\nimport scanprep.pipeline\n"
+            "from completion.__main__ import main\nmain(['prep', 'page', 'set'])\n"
+            "assert 'distributed' not in sys.modules and 'dask' not in sys.modules")
+    done = subprocess.run([sys.executable, "-c", code], cwd=place, capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
+
+
+def test_run(place, tmp_path, capsys, quick):
+    (place / "scans" / "broken.ply").write_text("nothing")
+    code = run("run", place / "scans", "--template", place / "template.ply", "-o", tmp_path / "set", "--workers", 1)
+    (place / "scans" / "broken.ply").unlink()
+    shown = capsys.readouterr()
+    assert code == 1 and "broken.ply" in shown.err and "needs a look" not in shown.err
+    figures = report(tmp_path / "set" / "report.json")
+    assert figures["scans registered"] == "3 of 4" and figures["of them in this run"] == 3
+    assert figures["led by landmarks"] == 3 and figures["scans that need a look"] >= 1
+    assert figures["  broken"] == "failed"
+    page = (tmp_path / "set" / "report.html").read_text()
+    assert page.index("scan-broken") and page.count('loading="lazy"') == 3
+
+
+def test_page_with_other_limits(place, capsys):
+    page = place / "set" / "report.html"
+    assert run("page", place / "set", "--no-unsettled") == 0
+    assert re.search(r"scans that need a look\W+0\b", capsys.readouterr().out)
+    assert page.read_text().count('class="scan fine"') == 3
+    assert run("page", place / "set", "--distance", 1e-9) == 0
+    shown = capsys.readouterr()
+    assert re.search(r"scans that need a look\W+3\b", shown.out) and str(page) in shown.err
+    assert page.read_text().count('class="scan look"') == 3
+
+
+def test_no_landmarks_wanted(place, tmp_path, capsys, quick):
+    scans = write_scans(tmp_path / "scans", ball(), 1)
+    (tmp_path / "bare.ply").write_bytes((place / "template.ply").read_bytes())
+    words = ["run", scans, "--template", tmp_path / "bare.ply", "-o", tmp_path / "set", "--workers", 1]
+    assert run(*words) == 1
+    assert "expected its landmarks in bare.landmarks.json" in capsys.readouterr().err
+    assert run(*words, "--guide", "pose") == 0
+    assert report(tmp_path / "set" / "report.json")["led by pose"] == 1
+
+
+def test_edit_skeleton(place, tmp_path):
+    out = tmp_path / "skeleton.json"
+    assert run("edit-skeleton", place / "set", "--rename", "top", "head", "-o", out) == 0
+    assert Skeleton.load(out).names == ("middle", "low", "head")
+    words = ["edit-skeleton", out, "--template", place / "template.ply"]
+    assert run(*words, "--merge", "middle", "head", "-o", tmp_path / "two.json") == 0
+    two, three = Skeleton.load(tmp_path / "two.json"), Skeleton.load(out)
+    assert two.names == ("middle", "low")
+    np.testing.assert_array_equal(two.part_of_face == 1, three.part_of_face == 1)
+    edits = [{"rename": {"low": "foot"}}, {"move_joint": "foot", "position": [0, 0, -0.31]}]
+    (tmp_path / "edits.json").write_text(json.dumps(edits))
+    assert run(*words, "--edits", tmp_path / "edits.json", "-o", tmp_path / "moved.json") == 0
+    moved = Skeleton.load(tmp_path / "moved.json")
+    assert moved.names == ("middle", "foot", "head")
+    np.testing.assert_allclose(moved.joints[1], [0, 0, -0.31], atol=1e-9)
+
+
+def test_edit_nothing(place, tmp_path, capsys):
+    assert run("edit-skeleton", place / "set", "-o", tmp_path / "s.json") == 1
+    assert "expected --edits FILE or one of" in capsys.readouterr().err
+    Skeleton(np.zeros(1280, int), [-1], [[0, 0, 0]]).save(tmp_path / "one.json")
+    assert run("edit-skeleton", tmp_path / "one.json", "--rename", "a", "b", "-o", tmp_path / "s.json") == 1
+    assert "expected the mesh that the skeleton" in capsys.readouterr().err
+
+
+def test_decimate_keeps_landmarks(place, tmp_path):
+    out = tmp_path / "small.ply"
+    assert run("decimate", place / "template.ply", "--faces", 400, "--landmarks", place / "template.landmarks.json",
+               "-o", out) == 0
+    small, template = read_mesh(out), ball()
+    assert len(small.faces) <= 400 and small.is_closed
+    apart = np.linalg.norm(small.vertices[:, None] - template.vertices[list(MARKS.values())], axis=2).min(axis=0)
+    assert apart.max() < 1e-9
+
+
+def test_decimate_set(place, tmp_path):
+    assert run("decimate-set", place / "set", "--faces", 500, "-o", tmp_path / "small") == 0
+    small, whole = RegisteredSet.load(tmp_path / "small"), RegisteredSet.load(place / "set")
+    assert small.names == whole.names and len(small.template.faces) <= 500
+    assert small.skeleton.names == whole.skeleton.names
+    kept = {tuple(v) for v in whole.vertices(["body1"])[0].round(9)}
+    assert {tuple(v) for v in small.vertices(["body1"])[0].round(9)} <= kept
+
+
+def test_views_come_together(tmp_path):
+    """Two views of a bumpy body, one of them misplaced by a known motion."""
+    body = ball(5, (0.5, 0.5, 0.5))
+    body = body.with_vertices(body.vertices * (1 + 0.08 * np.sin(9 * body.vertices).sum(axis=1, keepdims=True)))
+    cameras = {"a": [2.0, 0.0, 0.0], "b": [0.0, 2.0, 0.0]}
+    R, t = Rotation.from_rotvec([0, 0.02, 0.03]).as_matrix(), np.array([0.01, -0.015, 0.008])
+    for name, camera in cameras.items():
+        sight = np.asarray(camera) - body.vertices[body.faces].mean(axis=1)
+        view = body.submesh(np.einsum("fd,fd->f", sight, body.face_normals) > 0.2)[0]
+        moved = view if name == "a" else view.with_vertices(view.vertices @ R.T + t)
+        write_mesh(tmp_path / "views" / f"{name}.ply", moved)
+    cameras["b"] = (R @ cameras["b"] + t).tolist()
+    (tmp_path / "views" / "cameras.json").write_text(json.dumps(cameras))
+    assert run("views", tmp_path / "views", "-o", tmp_path / "aligned") == 0
+    found = json.loads((tmp_path / "aligned" / "cameras.json").read_text())
+    assert np.linalg.norm(np.array(found["b"]) - [0, 2, 0]) < 0.006 < np.linalg.norm(np.array(cameras["b"]) - [0, 2, 0])
+    assert run("merge", tmp_path / "aligned", "--voxel", 0.03, "-o", tmp_path / "merged.ply") == 0
+
+
+def test_correspondences_in_a_file(place, tmp_path, capsys):
+    scan = place / "scans" / "body0.ply"
+    words = ["correspond", scan, "--template", place / "template.ply", "--landmarks",
+             place / "scans" / "body0.landmarks.json", "--points", 40]
+    assert run(*words, "-o", tmp_path / "pairs.json") == 0
+    found = read_correspondences(tmp_path / "pairs.json")
+    assert len(found) == report(tmp_path / "pairs.report.json")["correspondences"] > 5
+    assert 0 <= found.template_vertices.min() and found.template_vertices.max() < 642
+    assert ((found.confidence >= 0) & (found.confidence <= 1)).all()
+
+
+def test_files_of_correspondences(tmp_path):
+    rng = np.random.default_rng(0)
+    numbers, points, confidence = rng.integers(0, 99, 7), rng.normal(size=(7, 3)), rng.random(7)
+    before = Correspondences(numbers, points, confidence, "by hand", {"a": 1.5}, False)
+    write_correspondences(tmp_path / "c.json", before)
+    after = read_correspondences(tmp_path / "c.json")
+    for name in ("template_vertices", "scan_points", "confidence"):
+        np.testing.assert_array_equal(getattr(after, name), getattr(before, name))
+    assert (after.method, after.energies, after.converged) == ("by hand", {"a": 1.5}, False)
+    for text, problem in (("{", "cannot read it"), ("{}", "something else"), ("[]", "something else"),
+                          ('{"kind": "correspondences", "version": 9}', "version 9"),
+                          ('{"kind": "correspondences", "version": 1, "pairs": [{"vertex": 1}]}', "point")):
+        (tmp_path / "c.json").write_text(text)
+        with pytest.raises(StorageError, match=problem):
+            read_correspondences(tmp_path / "c.json")
+    with pytest.raises(StorageError, match="no such file"):
+        read_correspondences(tmp_path / "none.json")

@@ -1,0 +1,163 @@
+"""The page of a set: worst first, every scan on it, nothing that must be fetched; and the figures behind it."""
+import re
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from scan_folders import MARKS, WITH_PICTURES, ball, write_scans
+from scipy.spatial.transform import Rotation
+
+from scanprep import RegisteredSet
+from scanprep.batch import pictures
+from scanprep.batch.figures import (
+    Failure,
+    ScanFigures,
+    missed_share,
+    principal_stretches,
+    read_failures,
+    read_figures,
+    stretched_share,
+    write_failures,
+    write_figures,
+)
+from scanprep.batch.page import write_set_page
+from scanprep.batch.review import Limits, review
+from scanprep.geometry.files import PointCloud, write_points
+from scanprep.pipeline import find_scans, prepare
+
+GOOD = ScanFigures("good", "10 landmarks", 0.001, 0.0015, 0.85, 0.85, 0.0, 0.004, 0.002, 0, True, "abc", 3.25)
+
+
+@pytest.fixture(scope="module")
+def template():
+    return ball()
+
+
+@pytest.fixture(scope="module")
+def folder(tmp_path_factory, template):
+    """A set of two scans that fit, one cut in half, a cloud with clutter, and one that cannot be read."""
+    place = tmp_path_factory.mktemp("page")
+    scans = write_scans(place / "scans", template, 5)
+    half = template.submesh(template.face_normals[:, 1] > 0.3)[0]
+    from scanprep import write_mesh
+
+    write_mesh(scans / "body2.ply", half)
+    (scans / "body2.landmarks.json").unlink()
+    cloud = np.vstack([template.vertices, template.vertices * 0.2 + [2.0, 0, 0]])
+    (scans / "body3.ply").unlink()
+    (scans / "body3.landmarks.json").unlink()
+    write_points(scans / "body3.xyz", PointCloud(cloud, None, None))
+    (scans / "body4.ply").write_text("no mesh <b>")
+    prepare(find_scans(scans), template, MARKS, place / "set", WITH_PICTURES)
+    return place / "set"
+
+
+def test_worst_first(folder):
+    page = (folder / "report.html").read_text()
+    assert re.findall(r'<section class="scan (\w+)" id="scan-(\w+)">', page)[:2] == [
+        ("failed", "body4"), ("look", "body3")]
+    order = [float(number) for number in re.findall(r"<small>([\d.]+)</small>", page)]
+    assert len(order) == 4 and order == sorted(order, reverse=True)
+    assert "body4.ply" in page and "of the scan lies off the template" in page
+
+
+def test_everything_is_in_the_page(folder):
+    page = (folder / "report.html").read_text()
+    links = set(re.findall(r'href="#(scan-\w+)"', page))
+    assert links == {f"scan-body{k}" for k in range(5)} == set(re.findall(r'id="(scan-\w+)"', page))
+    sources = re.findall(r'(?:src|href)="([^"]+)"', page)
+    assert all(s.startswith(("data:image/", "#")) for s in sources)
+    assert sum(s.startswith("data:image/webp") for s in sources) == 4
+    assert page.count('loading="lazy"') == 4
+
+
+def test_size_is_sane(folder):
+    """Two hundred scans make a page of a few megabytes."""
+    largest = max(p.stat().st_size for p in (folder / "pictures").iterdir())
+    assert 1000 < largest < 20_000
+
+
+def test_pictures_show_what_they_say(folder):
+    """The half that was not scanned is grey on one side; the scan of points looks like a body."""
+    from PIL import Image
+
+    shown = np.asarray(Image.open(folder / "pictures" / "body0.webp").convert("RGB")).astype(int)
+    assert shown.shape == (pictures.HEIGHT, pictures.WIDTH * len(pictures.PANELS), 3)
+    covered = [(panel.min(axis=2) < 240).mean() for panel in np.split(shown, len(pictures.PANELS), axis=1)]
+    assert min(covered) > 0.1 and np.ptp(covered) < 0.03        # the same body in the same place in all of them
+    half = np.asarray(Image.open(folder / "pictures" / "body2.webp").convert("RGB")).astype(int)
+    front, back = np.split(half, len(pictures.PANELS), axis=1)[2:4]
+
+    def colored(panel):
+        return (np.ptp(panel, axis=2) > 60).mean()
+
+    assert max(colored(front), colored(back)) > 4 * min(colored(front), colored(back))
+
+
+def test_names_cannot_break_the_page(folder, tmp_path):
+    whole = RegisteredSet.create(tmp_path / "set", ball(0))
+    whole.add("a b&c", ball(0).vertices, "<script>", "'\"")
+    write_figures(tmp_path / "set", [replace(GOOD, name="a b&c")])
+    write_failures(tmp_path / "set", [Failure("d", "<i>broken</i>")])
+    page = write_set_page(tmp_path / "set").read_text()
+    assert "<script" not in page and "<i>" not in page and "a b&amp;c" in page
+
+
+def test_set_without_scans(tmp_path):
+    RegisteredSet.create(tmp_path / "set", ball(0))
+    assert "0 scans" in write_set_page(tmp_path / "set").read_text()
+
+
+@pytest.mark.parametrize("change, reason", [
+    ({"missed": 0.02}, "off the template"), ({"distance": 0.004}, "on average"), ({"seen": 0.5}, "without data"),
+    ({"stretch": 0.05}, "stretched"), ({"flipped": 30}, "flipped"), ({"landmarks": 0.04}, "landmarks"),
+    ({"converged": False}, "converged"), ({"seen": 0.0, "distance": np.nan, "rms": np.nan}, "nowhere near")])
+def test_each_figure_alone_is_noticed(change, reason):
+    figures = [replace(GOOD, name=f"good{k}") for k in range(4)] + [replace(GOOD, name="bad", **change)]
+    verdicts = review(figures, [], size=1.4, faces=25_000)
+    assert verdicts[0].name == "bad" and verdicts[0].suspect and any(reason in r for r in verdicts[0].reasons)
+    assert not any(v.suspect or v.reasons for v in verdicts[1:])
+
+
+def test_order_of_verdicts():
+    figures = [replace(GOOD, name="a"), replace(GOOD, name="b", missed=0.02), replace(GOOD, name="c", missed=0.2),
+               replace(GOOD, name="d", landmarks=np.nan)]
+    verdicts = review(figures, [Failure("a", "gone"), Failure("z", "broken")], 1.4, 25_000, Limits(missed=0.01))
+    assert [v.name for v in verdicts] == ["a", "z", "c", "b", "d"]
+    assert [v.failed for v in verdicts] == [True, True, False, False, False]
+    assert [v.badness for v in verdicts[2:4]] == [pytest.approx(20), pytest.approx(2)]
+
+
+def test_scans_from_one_side_are_not_blamed_for_it():
+    front = [replace(GOOD, name=f"front{k}", seen=0.4) for k in range(5)]
+    assert not any(v.suspect for v in review(front, [], 1.4, 25_000))
+
+
+def test_stretches_of_a_known_map(template):
+    R = Rotation.from_rotvec([0.3, -1.0, 0.7]).as_matrix()
+    flat = template.with_vertices(template.vertices * [1, 1, 0] + [0, 0, 1])
+    grown = flat.with_vertices((flat.vertices * [3.0, 0.5, 1]) @ R.T + 7)
+    usable = flat.face_areas > 1e-6
+    long, short = principal_stretches(flat, grown)
+    np.testing.assert_allclose(long[usable], 3, rtol=1e-6)
+    np.testing.assert_allclose(short[usable], 0.5, rtol=1e-6)
+    moved = template.with_vertices(template.vertices @ R.T)
+    np.testing.assert_allclose(np.concatenate(principal_stretches(template, moved)), 1, atol=1e-9)
+    assert stretched_share(template, moved) == 0
+    assert stretched_share(template, template.with_vertices(2.1 * template.vertices)) == 1
+
+
+def test_missed_points(template):
+    points = np.vstack([template.vertices * 1.001, template.vertices[:214] + [3, 0, 0]])
+    assert missed_share(points, template, 0.01, samples=len(points)) == pytest.approx(214 / 856)
+
+
+def test_tables_keep_their_numbers(tmp_path):
+    rows = [replace(GOOD, name="b", landmarks=np.nan), replace(GOOD, name="a", distance=1 / 3, converged=False)]
+    write_figures(tmp_path, rows)
+    assert [repr(f) for f in read_figures(tmp_path)] == [repr(rows[1]), repr(rows[0])]
+    write_failures(tmp_path, [Failure("x", 'a, "b"\tc')])
+    assert read_failures(tmp_path) == [Failure("x", 'a, "b"\tc')]
+    (tmp_path / "registration.csv").write_text("name,distance\na,1\n")
+    with pytest.raises(ValueError, match=r"registration\.csv: expected the columns name, guide"):
+        read_figures(tmp_path)
