@@ -163,6 +163,18 @@ def test_decimate_set(place, tmp_path):
     assert {tuple(v) for v in small.vertices(["body1"])[0].round(9)} <= kept
 
 
+def test_fill(tmp_path):
+    body = ball()
+    open_body = body.submesh(body.vertices[body.faces].mean(axis=1)[:, 2] < 0.8)[0]
+    write_mesh(tmp_path / "open.ply", open_body)
+    assert run("fill", tmp_path / "open.ply", "-o", tmp_path / "closed.ply") == 0
+    closed, figures = read_mesh(tmp_path / "closed.ply"), report(tmp_path / "closed.report.json")
+    assert closed.is_closed and figures["holes before"] == 1 and figures["fair patches"] == 1
+    np.testing.assert_array_equal(closed.vertices[:len(open_body.vertices)], open_body.vertices)
+    assert run("fill", tmp_path / "open.ply", "--method", "diffusion", "-o", tmp_path / "diffused.ply") == 0
+    assert report(tmp_path / "diffused.report.json")["diffusion patches"] == 1
+
+
 def test_views_come_together(tmp_path):
     """Two views of a bumpy body, one of them misplaced by a known motion."""
     body = ball(5, (0.5, 0.5, 0.5))

@@ -18,7 +18,7 @@ from .align_views import AlignViewsConfig, align_views
 from .decimate import DecimateConfig, decimate
 from .decimate_set import DecimateSetConfig
 from .decimate_set_files import write_decimated_set
-from .fill import FillConfig, fill_holes
+from .fill import FillConfig, FilledHole, fill_holes, fill_report
 from .merge import MergeConfig, merge_views
 from .template import make_template
 
@@ -92,17 +92,36 @@ def merge(views: ViewsArg, output: Output, cameras: Path | None = None, unit: Un
     return Outcome(output, [Metric("views", len(seen)), *about_mesh(merged)], {"merge": config})
 
 
-def fill(mesh: MeshArg, output: Output, unit: Unit | None = None,
+def fill(mesh: MeshArg, output: Output, views: Path | None = None, cameras: Path | None = None,
+         unit: Unit | None = None,
          config: Annotated[FillConfig, tyro.conf.arg(name="")] = FillConfig()) -> Outcome:  # noqa: B008
     """Close the holes of a mesh; what was there stays as it was.
 
     Example: scape prep fill body.ply -o closed.ply
+
+    Args:
+        mesh: Mesh with holes.
+        output: Mesh to write.
+        views: Folder of the range meshes it was merged from: space that they look through is left empty.
+        cameras: JSON {file name without ending: [x, y, z]}; else cameras.json in that folder.
+        unit: Unit of the mesh, the views and the cameras.
+        config: Settings.
     """
     before = read_mesh(mesh, unit)
+    seen = _read_views(views, cameras, unit) if views else ()
+    holes: tuple[FilledHole, ...] = ()
     with bar("filling holes") as progress:
-        after = fill_holes(before, config, progress)
+        if config.method.startswith("poisson"):
+            after = fill_holes(before, config, progress)
+        else:
+            report = fill_report(before, config, progress, seen)
+            after, holes = report.mesh, report.holes
     write_mesh(output, after)
-    return Outcome(output, [Metric("holes before", len(before.boundary_loops)), *about_mesh(after)], {"fill": config})
+    return Outcome(output, [
+        Metric("holes before", len(before.boundary_loops)),
+        *(Metric(f"{way} patches", sum(hole.method == way for hole in holes)) for way in ("fair", "diffusion")),
+        Metric("triangles that run through others", sum(hole.intersections for hole in holes)),
+        *about_mesh(after)], {"fill": config})
 
 
 def reduce(mesh: MeshArg, output: Output, faces: int, landmarks: Path | None = None, unit: Unit | None = None,
