@@ -1,6 +1,8 @@
 """From rigid parts to a tree with a joint on every link."""
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components, dijkstra
@@ -8,6 +10,7 @@ from scipy.sparse.csgraph import connected_components, dijkstra
 from ..geometry.mesh import Mesh
 from .motions import Motions
 from .parts import PartSearch
+from .sides import mirror_pairs, reductions
 
 WEAK_CONTACT = 0.2               # of the longer borders of both parts: thighs that touch are not linked
 LOOP_SEPARATION = 1.5            # times the separation of parts: on a loop, closer ones are merged
@@ -31,29 +34,57 @@ def linked(links: np.ndarray, count: int) -> bool:
     return bool(connected_components(graph, directed=False)[0] == 1)
 
 
-def without_weak(pairs: np.ndarray, lengths: np.ndarray, count: int) -> np.ndarray:
+def without_weak(search: PartSearch, label: np.ndarray) -> np.ndarray:
     """The links (n, 2) without contacts that are short beside the other borders of both parts.
 
     A contact that alone holds parts together stays.
     """
+    pairs, lengths = border_lengths(search, label)
+    count = int(label.max()) + 1
+    image = mirror_pairs(pairs, search.sides.partners(label))
+    lengths = (lengths + lengths[image]) / 2
     longest = np.zeros(count)
     for side in range(2):
         np.maximum.at(longest, pairs[:, side], lengths)
     weak = lengths < WEAK_CONTACT * longest[pairs].min(axis=1)
     keep = np.ones(len(pairs), dtype=bool)
     for i in np.argsort(lengths, kind="stable"):
-        if weak[i]:
-            keep[i] = False
-            keep[i] = not linked(pairs[keep], count)
+        if weak[i] and keep[i]:
+            keep[[i, image[i]]] = False
+            if not linked(pairs[keep], count):
+                keep[[i, image[i]]] = True
     return pairs[keep]
 
 
-def to_tree(search: PartSearch, label: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+@dataclass(frozen=True, eq=False)
+class Loop:
+    """A loop of parts that was opened.
+
+    Attributes
+    ----------
+    sides : two (F,) bool
+        The triangles of the two parts where it was opened, before.
+    joined : bool
+        Whether the two became one; else only the link between them was dropped.
+    length : int
+        Number of links that lay on loops.
+    separation : float
+        How far apart the two were.
+    """
+
+    sides: tuple[np.ndarray, np.ndarray]
+    joined: bool
+    length: int
+    separation: float
+
+
+def to_tree(search: PartSearch, label: np.ndarray) -> tuple[np.ndarray, np.ndarray, list[Loop]]:
     """Merge parts, and drop links, until parts and links form a tree.
 
     On a loop, the two parts whose union costs least become one unless they are well apart: this joined the
     halves of crotch and chest in the paper, by hand. Where all parts of a loop move freely, the link whose
-    parts move most against each other is dropped: thighs that touch under the crotch.
+    parts move most against each other is dropped: thighs that touch under the crotch. On a symmetric body both
+    happen on both sides, so that the tree is symmetric too.
 
     Parameters
     ----------
@@ -66,49 +97,76 @@ def to_tree(search: PartSearch, label: np.ndarray) -> tuple[np.ndarray, np.ndarr
         Labels.
     (P - 1, 2) int
         Links.
+    list of Loop
+        The loops that were opened.
 
     [SCAPE] §3
     """
+    loops: list[Loop] = []
     while True:
         count = int(label.max()) + 1
-        links = without_weak(*border_lengths(search, label), count)
+        links = without_weak(search, label)
         pairs, separation, extra = search.separations(label)
         of_pair = {tuple(pair): i for i, pair in enumerate(pairs.tolist())}
         while len(links) > count - 1:
             each = np.arange(len(links))
             loop = [i for i in each if linked(links[each != i], count)]
             number = np.array([of_pair[tuple(links[i].tolist())] for i in loop])
+            image = mirror_pairs(links, search.sides.partners(label))
             cheapest = number[extra[number].argmin()]
-            if search.config.parts is None and separation[cheapest] < LOOP_SEPARATION * search.config.separation:
+            sound = [k for k in np.argsort(-extra[number], kind="stable")
+                     if linked(np.delete(links, [loop[k], image[loop[k]]], axis=0), count)]
+            close = separation[cheapest] < LOOP_SEPARATION * search.config.separation
+            joined = not sound or close
+            at = cheapest if joined else number[sound[0]]
+            loops.append(Loop((label == pairs[at, 0], label == pairs[at, 1]), joined, len(loop), float(separation[at])))
+            if joined:
                 break
-            links = np.delete(links, loop[int(extra[number].argmax())], axis=0)
+            links = np.delete(links, np.unique([loop[sound[0]], image[loop[sound[0]]]]), axis=0)
         else:
-            return label, links
-        a, b = pairs[cheapest]
-        label = search.alternate(np.where(label == b, a, label), rounds=4)
+            return label, links, loops
+        label = search.alternate(search.join(label, *pairs[cheapest]), rounds=4)
 
 
-def refine_tree(search: PartSearch, label: np.ndarray, links: np.ndarray, count: int
-                ) -> tuple[np.ndarray, np.ndarray]:
-    """Cut parts of a tree, the one that bends most first, until there are `count` and still a tree.
+def tree_of(search: PartSearch, label: np.ndarray, links: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
+    """From a tree of parts one of exactly `count`: linked parts joined, or the parts cut that bend most.
 
     Raises
     ------
     ValueError
-        No part can be cut so that a tree remains.
+        No part can be cut so that a tree remains, or on a symmetric body none of those in the middle.
     """
-    while len(links) + 1 < count:
-        cuts = sorted((search.split(label, p) for p in range(len(links) + 1)),
-                      key=lambda cut: -cut[1])
-        for cut, apart in cuts:
-            parts = int(cut.max()) + 1
-            trial = without_weak(*border_lengths(search, cut), parts)
-            if apart > 0 and len(trial) == parts - 1:
-                label, links = cut, trial
-                break
-        else:
+    while len(links) + 1 != count:
+        found = (_fewer if len(links) + 1 > count else _more)(search, label, count)
+        if found is None:
             raise ValueError(f"parts: no tree of {count} parts was found, only one of {len(links) + 1}")
+        label, links = found
     return label, links
+
+
+def _more(search: PartSearch, label: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray] | None:
+    """The tree where the part that bends most is cut; it may have one part too many if two of them can be joined."""
+    cuts = sorted((search.split(label, p) for p in range(int(label.max()) + 1)), key=lambda cut: -cut[1])
+    for cut, apart in cuts:
+        many = int(cut.max()) + 1
+        links = without_weak(search, cut)
+        if apart > 0 and len(links) == many - 1 and (many <= count or _fewer(search, cut, count) is not None):
+            return cut, links
+    return None
+
+
+def _fewer(search: PartSearch, label: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray] | None:
+    """The tree where the two linked parts are one whose union costs least, with not less than `count` parts."""
+    many, partner = int(label.max()) + 1, search.sides.partners(label)
+    pairs, _, extra = search.separations(label)
+    fewer = reductions(pairs, partner) if search.sides.tied else np.ones(len(pairs), dtype=np.int64)
+    for i in np.argsort(extra * fewer, kind="stable"):
+        if many - fewer[i] >= count:
+            joined = search.alternate(search.join(label, *pairs[i]), rounds=4)
+            links = without_weak(search, joined)
+            if joined.max() + 1 == many - fewer[i] and len(links) == joined.max():
+                return joined, links
+    return None
 
 
 def place_joints(search: PartSearch, label: np.ndarray, motions: Motions, links: np.ndarray) -> np.ndarray:

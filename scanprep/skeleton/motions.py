@@ -13,6 +13,8 @@ from scipy.sparse import coo_array, csr_array
 
 from ..geometry.mesh import Mesh
 
+NEWTON = 60                      # steps at most; few are needed unless the points of a set lie on a line
+
 
 @dataclass(frozen=True, eq=False)
 class Moments:
@@ -94,9 +96,44 @@ def fit_motions(moments: Moments) -> Motions:
     return Motions(R, cy - np.einsum("pmij,pj->pmi", R, cx), cost)
 
 
+def rigid_costs(moments: Moments) -> np.ndarray:
+    """(P,) square metres: the costs of `fit_motions`, without the motions, several times faster."""
+    m = moments
+    cx, cy = m.x / m.w[:, None], m.y / m.w[:, None, None]
+    H = m.yx - m.y[..., :, None] * cx[:, None, None, :]
+    spread = (m.xx - np.einsum("pi,pi->p", m.x, cx)) * H.shape[1] + m.yy - np.einsum("pmi,pmi->p", m.y, cy)
+    return np.maximum(spread - 2 * _best_trace(H).sum(axis=1), 0) / H.shape[1]
+
+
+def _best_trace(H: np.ndarray) -> np.ndarray:
+    """The largest trace(RᵀH) of all rotations R, for matrices (..., 3, 3).
+
+    It is e = s1 + s2 ± s3, the singular values with the sign of the determinant d. With a = Σ s² and b = Σ s²s² it is
+    the largest root of (e² - a)² / 4 = b + 2 d e, which Newton's method reaches from above.
+    """
+    c0, c1, c2 = H[..., 0], H[..., 1], H[..., 2]
+    cross = np.stack([c0[..., 1] * c1[..., 2] - c0[..., 2] * c1[..., 1],
+                      c0[..., 2] * c1[..., 0] - c0[..., 0] * c1[..., 2],
+                      c0[..., 0] * c1[..., 1] - c0[..., 1] * c1[..., 0]], axis=-1)
+    d = (cross * c2).sum(axis=-1)
+    n0, n1, n2 = ((c * c).sum(axis=-1) for c in (c0, c1, c2))
+    d01, d12, d02 = (c0 * c1).sum(axis=-1), (c1 * c2).sum(axis=-1), (c0 * c2).sum(axis=-1)
+    a = n0 + n1 + n2
+    b = np.maximum(n0 * n1 - d01**2, 0) + np.maximum(n1 * n2 - d12**2, 0) + np.maximum(n0 * n2 - d02**2, 0)
+    e = np.sqrt(3 * a)
+    for _ in range(NEWTON):
+        over = e * e - a
+        slope = over * e - 2 * d
+        step = (over * over / 4 - b - 2 * d * e) / np.where(slope > 0, slope, np.inf)
+        e = e - np.maximum(step, 0)
+        if (step <= 1e-13 * e).all():
+            break
+    return e
+
+
 def union_costs(moments: Moments, pairs: np.ndarray) -> np.ndarray:
     """(n,) square metres: the cost of one rigid motion for both sets of each pair (n, 2)."""
-    return fit_motions(moments[pairs[:, 0]] + moments[pairs[:, 1]]).cost
+    return rigid_costs(moments[pairs[:, 0]] + moments[pairs[:, 1]])
 
 
 class PosedSurface:

@@ -1,14 +1,14 @@
 """Rigid parts of a surface, found from its poses without being told how many there are."""
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
 
-from .labels import keep_connected, relabel
-from .motions import Moments, Motions, PosedSurface, fit_motions, union_costs
+from .motions import Moments, Motions, PosedSurface, fit_motions, rigid_costs, union_costs
 from .patches import agglomerate, cover
+from .sides import Sides, mirror_pairs
+from .symmetry import Symmetry
 
 BORDER_WIDTH = 0.01              # of the body's size: how much surface at mean cost a border is worth
 STEADY = 5e-4                    # of the surface: fewer changes of label count as none
@@ -34,6 +34,16 @@ class SkeletonConfig:
         Number of patches of the first cover.
     start : int
         Number of parts after the patches were joined and before labels and motions alternate.
+    symmetric : bool, optional
+        Whether left and right are mirror images; without it they are where the body is.
+    restarts : int
+        So often the search begins anew, with other patches; the best result is kept.
+    seed : int
+        Of the random numbers that place the patches.
+    worth : float
+        By how much a part must lower the logarithm of the energy to count in the comparison of restarts.
+    fading : float
+        A part dissolves when its neighbours' motions, blended from place to place, explain so much of its own.
     """
 
     parts: int | None = None
@@ -43,29 +53,42 @@ class SkeletonConfig:
     smoothness: float = 1.0
     patches: int = 300
     start: int = 30
+    symmetric: bool | None = None
+    restarts: int = 3
+    seed: int = 0
+    worth: float = 0.1
+    fading: float = 0.8
 
     def __post_init__(self) -> None:
         if self.parts is not None and self.parts < 1:
             raise ValueError(f"parts: expected at least 1, got {self.parts}")
+        if self.restarts < 1:
+            raise ValueError(f"restarts: expected at least 1, got {self.restarts}")
         for name in ("separation", "tolerance", "smallest", "smoothness"):
             if not getattr(self, name) > 0:
                 raise ValueError(f"{name}: expected more than 0, got {getattr(self, name)}")
 
 
 class PartSearch:
-    """The moves of the search: alternate, join, split.
+    """The moves of the search: alternate, join, split. On a symmetric body every move is made on both sides.
 
     Parameters
     ----------
     surface : PosedSurface
     config : SkeletonConfig
+    symmetry : Symmetry, optional
+        Parts found are symmetric in it.
+    rng : numpy Generator, optional
+        Where the first patches lie.
     """
 
-    def __init__(self, surface: PosedSurface, config: SkeletonConfig) -> None:
+    def __init__(self, surface: PosedSurface, config: SkeletonConfig, symmetry: Symmetry | None = None,
+                 rng: np.random.Generator | None = None) -> None:
         self.surface, self.config = surface, config
+        self.sides = Sides(surface, symmetry)
         self.floor = config.tolerance**2 * surface.area
         self.width = config.smoothness * BORDER_WIDTH / np.sqrt(surface.area)
-        self.patch = cover(surface, min(config.patches, len(surface.face_weights)))
+        self.patch = cover(surface, min(config.patches, len(surface.face_weights)), self.sides, rng)
         self._cuts: dict[bytes, tuple[np.ndarray, float]] = {}
         self._gains: dict[bytes, float] = {}
 
@@ -83,17 +106,22 @@ class PartSearch:
             label = np.unique(label, return_inverse=True)[1]
             motions = self.motions(label)
             costs = s.face_costs(motions)
-            moved = relabel(costs, s.pairs, self.prices(motions, 1.0, s.pair_lengths), label, rounds=2)
-            moved = keep_connected(costs, s.pairs, s.face_weights, moved)
+            moved = self.sides.relabel(costs, self.price(motions, 1.0), label, self.sides.partners(label))
             changed = s.face_weights[moved != label].sum()
             label = moved
             if changed < STEADY:
                 break
         return np.unique(label, return_inverse=True)[1]
 
-    def prices(self, motions: Motions, share: float, lengths: np.ndarray) -> np.ndarray:
-        """Prices of borders of the given lengths where `share` of the surface follows the motions."""
-        return self.width * max(float(motions.cost.sum()) / share, self.floor) * lengths
+    def price(self, motions: Motions, share: float) -> float:
+        """Price of a metre of border where `share` of the surface follows the motions."""
+        return self.width * max(float(motions.cost.sum()) / share, self.floor)
+
+    def energy(self, label: np.ndarray) -> float:
+        """What a labelling costs, square metres: the residual of the parts and the price of their borders."""
+        s, motions = self.surface, self.motions(label)
+        border = s.pair_lengths[label[s.pairs[:, 0]] != label[s.pairs[:, 1]]].sum()
+        return float(motions.cost.sum() + self.price(motions, 1.0) * border)
 
     def contacts(self, label: np.ndarray) -> np.ndarray:
         """(n, 2) pairs of labels that touch, lower first."""
@@ -111,7 +139,7 @@ class PartSearch:
         pairs = self.contacts(label)
         if not len(pairs):
             return pairs, np.zeros(0), np.zeros(0)
-        return pairs, *self._apart(moments, pairs, self._next_gains(label))
+        return pairs, *self._apart(moments, pairs, self._next_gains(label), self.sides.partners(label))
 
     def _next_gains(self, label: np.ndarray, first: int = 0) -> np.ndarray:
         """(P,) square metres: what each part from `first` on would gain by its best cut along the patches."""
@@ -128,83 +156,100 @@ class PartSearch:
             sub = moments[mine]
             half = agglomerate(sub, among, 2)
             whole = sub.gather(np.zeros(len(mine), dtype=np.int64))
-            self._gains[key] = max(fit_motions(whole).cost[0] - fit_motions(sub.gather(half)).cost.sum(), 0.0)
+            self._gains[key] = max(rigid_costs(whole)[0] - rigid_costs(sub.gather(half)).sum(), 0.0)
         return np.array([0.0] * first + [self._gains[key] for key in keys])
 
-    def join_down(self, label: np.ndarray, count: int | None) -> np.ndarray:
-        """Join the pair that is least apart, alternate, and so on.
+    def _apart(self, moments: Moments, pairs: np.ndarray, gains: np.ndarray, partner: np.ndarray
+               ) -> tuple[np.ndarray, np.ndarray]:
+        share = moments.w[pairs]
+        cost = rigid_costs(moments)[pairs].sum(axis=1)
+        extra = np.maximum(union_costs(moments, pairs) - cost, 0)
+        base = cost + self.floor * share.sum(axis=1)
+        smaller = np.take_along_axis(pairs, share.argmin(axis=1)[:, None], axis=1)[:, 0]
+        gain = gains[smaller] + self.floor * moments.w[smaller]
+        if self.sides.tied:                                          # a pair and its mirror image are judged as one
+            image = mirror_pairs(pairs, partner)
+            extra, base, gain = ((value + value[image]) / 2 for value in (extra, base, gain))
+        return np.sqrt((1 + extra / base) * extra / gain), extra
 
-        Stops at `count` parts, or where it is None when all pairs are apart and no part is too small.
-        """
+    def join(self, label: np.ndarray, a: int, b: int) -> np.ndarray:
+        """Labels (F,) with a and b as one, on a symmetric body on both sides."""
+        return self.sides.join(label, a, b, self.sides.partners(label))
+
+    def join_down(self, label: np.ndarray) -> np.ndarray:
+        """Join the pair that is least apart, alternate, and so on, until all are apart and no part is too small."""
         while True:
             label = self.alternate(label, rounds=2)
             pairs, separation, extra = self.separations(label)
-            if not len(pairs) or len(np.unique(label)) <= (count or 1):
+            if not len(pairs):
                 return label
             share = np.bincount(label, self.surface.face_weights)
-            small = (share[pairs] < self.config.smallest).any(axis=1)
-            open_ = small | (separation < self.config.separation)
-            if count is not None and not open_.any():
-                open_ = separation <= separation.min()
+            open_ = (share[pairs] < self.config.smallest).any(axis=1) | (separation < self.config.separation)
             if not open_.any():
                 return label
-            least = int(np.where(open_, extra, np.inf).argmin())
-            label = np.where(label == pairs[least, 1], pairs[least, 0], label)
+            label = self.join(label, *pairs[np.where(open_, extra, np.inf).argmin()])
 
     def split(self, label: np.ndarray, part: int) -> tuple[np.ndarray, float]:
-        """Cut one part in two where it bends most.
+        """Cut one part where it bends most: in two or, in the middle of a symmetric body, in three.
 
         Returns
         -------
         (F,) int
-            Labels, one more than before; unchanged if no acceptable cut was found.
+            Labels, more than before; unchanged if no acceptable cut was found.
         float
-            How far apart the halves are, 0 where there is no cut.
+            How far apart the pieces are, 0 where there is no cut.
         """
-        key = (label == part).tobytes()
+        partner = self.sides.partners(label)
+        mine = (label == part) | (label == partner[part])
+        key = mine.tobytes() + bytes([int(partner[part] == part)])
         if key not in self._cuts:
-            self._cuts[key] = self._split(label == part)
-        half, apart = self._cuts[key]
-        return np.where(half, label.max() + 1, label), apart
+            self._cuts[key] = self._split(mine, label == part)
+        piece, apart = self._cuts[key]
+        if apart == 0:
+            return label, 0.0
+        return np.unique(np.where(mine, label.max() + piece, label), return_inverse=True)[1], apart
 
-    def _split(self, mine: np.ndarray) -> tuple[np.ndarray, float]:
-        """Which triangles (F,) bool of a part `mine` (F,) bool to cut off, and how far apart the halves are."""
-        s = self.surface
-        inside = np.flatnonzero(mine)
-        number = np.unique(self.patch[inside], return_inverse=True)[1]
-        local = np.zeros(len(mine), dtype=np.int64)             # 0 outside, halves 1 and 2
-        local[inside] = number + 1
+    def _split(self, mine: np.ndarray, one: np.ndarray) -> tuple[np.ndarray, float]:
+        """Pieces (F,), from 1, of a part and its mirror image, `mine` (F,) bool, and how far apart they are.
+
+        `one` (F,) bool is the part alone.
+        """
+        s, sides = self.surface, self.sides
+        two = bool((mine & ~one).any())
+        local = np.zeros(len(mine), dtype=np.int64)             # 0 outside
+        local[mine] = np.unique(2 * self.patch[mine] + one[mine], return_inverse=True)[1] + 1
+        of_one = np.bincount(local, one & mine) > 0
         among = self.contacts(local)
-        among = among[among[:, 0] > 0] - 1
-        half = agglomerate(s.moments(local)[1:], among, 2)[number]
-        within = mine[s.pairs].all(axis=1)
-        pairs, lengths = np.searchsorted(inside, s.pairs[within]), s.pair_lengths[within]
-        weights = s.face_weights[inside]
+        among = among[(among[:, 0] > 0) & (of_one[among[:, 0]] == of_one[among[:, 1]])] - 1
+        partner = sides.partners(local)[1:] - 1 if sides.tied else None
+        piece = agglomerate(s.moments(local)[1:], among, 2, partner)
+        local[mine] = piece[local[mine] - 1] + 1
+        weights = s.face_weights[mine]
         for _ in range(4):
-            if np.bincount(half, weights, 2).min() < self.config.smallest:
-                return np.zeros_like(mine), 0.0
-            local[inside] = half + 1
-            moments = s.moments(local)[1:]
-            motions = fit_motions(moments)
-            costs = s.face_costs(motions)[inside]
-            half = relabel(costs, pairs, self.prices(motions, weights.sum(), lengths), half, rounds=2)
-            half = keep_connected(costs, pairs, weights, half)
-        cut = np.zeros_like(mine)
-        cut[inside[half == 1]] = True
-        gains = self._next_gains(local, first=1)[1:]
-        return cut, float(self._apart(moments, np.array([[0, 1]]), gains)[0][0])
+            shares = np.bincount(local[mine] - 1, weights)
+            if len(shares) < (4 if two else 2) or shares.min() < self.config.smallest:
+                return local, 0.0
+            motions = fit_motions(s.moments(local)[1:])
+            partner = sides.partners(local)[1:] - 1 if sides.tied else np.arange(len(shares))
+            moved = sides.relabel(s.face_costs(motions), self.price(motions, weights.sum()),
+                                  np.maximum(local - 1, 0), partner, mine)
+            local[mine] = np.unique(moved[mine], return_inverse=True)[1] + 1
+        return local, self._least_apart(local, one, two)
 
-    def _apart(self, moments: Moments, pairs: np.ndarray, gains: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        share = moments.w[pairs]
-        cost = fit_motions(moments).cost[pairs].sum(axis=1)
-        extra = np.maximum(union_costs(moments, pairs) - cost, 0)
-        ratio = 1 + extra / (cost + self.floor * share.sum(axis=1))
-        smaller = np.take_along_axis(pairs, share.argmin(axis=1)[:, None], axis=1)[:, 0]
-        return np.sqrt(ratio * extra / (gains[smaller] + self.floor * moments.w[smaller])), extra
+    def _least_apart(self, local: np.ndarray, one: np.ndarray, two: bool) -> float:
+        """How far apart the least separate pieces of a part are."""
+        moments, pairs = self.surface.moments(local)[1:], self.contacts(local)
+        pairs = pairs[pairs[:, 0] > 0]
+        if two:
+            of_one = np.bincount(local, one) > 0
+            pairs = pairs[of_one[pairs[:, 0]] == of_one[pairs[:, 1]]]
+        if not len(pairs):
+            return 0.0
+        partner = self.sides.partners(local)[1:] - 1
+        return float(self._apart(moments, pairs - 1, self._next_gains(local, first=1)[1:], partner)[0].min())
 
 
-def find_parts(search: PartSearch,
-               progress: Callable[[int, int], None] | None = None) -> np.ndarray:
+def find_parts(search: PartSearch) -> np.ndarray:
     """Labels of triangles such that every label moves rigidly through the poses, as nearly as can be.
 
     Many patches are joined greedily, labels and motions alternate while the least separate parts go on
@@ -213,7 +258,6 @@ def find_parts(search: PartSearch,
     Parameters
     ----------
     search : PartSearch
-    progress : callable(done, total), optional
 
     Returns
     -------
@@ -221,35 +265,26 @@ def find_parts(search: PartSearch,
 
     [Articulated]
     """
-    tell = progress or (lambda done, total: None)
-    config, patch = search.config, search.patch
-    start = max(config.start, 2 * (config.parts or 0))
-    label = agglomerate(search.surface.moments(patch), search.contacts(patch), start)[patch]
-    label = search.join_down(label, config.parts)
-    tell(1, 3)
-    label = _split_and_join(search, label)
-    tell(2, 3)
-    label = search.alternate(label, rounds=10)
-    tell(3, 3)
-    return label
+    patch, tied = search.patch, search.sides.tied
+    sets = -(-3 * search.config.start // 5) if tied else search.config.start    # a part and its image are one
+    label = agglomerate(search.surface.moments(patch), search.contacts(patch), sets,
+                        search.sides.partners(patch) if tied else None)[patch]
+    label = _split_and_join(search, search.join_down(label))
+    return search.alternate(label, rounds=10)
 
 
 def _split_and_join(search: PartSearch, label: np.ndarray) -> np.ndarray:
     """Cut parts and join again, as long as that gives more parts, or as many that fit better."""
-    wanted = search.config.parts
-    limit = search.config.separation
     tried: set[bytes] = set()
     for _ in range(2 * search.config.start):
-        found = label.max() + 1
-        cuts = [search.split(label, part) for part in range(found)]
-        worth = [c for c in cuts if c[1] > 0 and c[0].tobytes() not in tried
-                 and (c[1] >= limit or (wanted is not None and found < wanted))]
+        cuts = [search.split(label, part) for part in range(label.max() + 1)]
+        worth = [c for c in cuts if c[1] >= search.config.separation and c[0].tobytes() not in tried]
         if not worth:
             break
         cut = max(worth, key=lambda c: c[1])[0]
         tried.add(cut.tobytes())
-        again = search.join_down(cut, wanted)
-        more = again.max() + 1 - found
+        again = search.join_down(cut)
+        more = again.max() - label.max()
         if more > 0 or (more == 0 and search.motions(again).cost.sum() < 0.995 * search.motions(label).cost.sum()):
             label = again
     return label

@@ -5,27 +5,33 @@ import numpy as np
 from scipy.sparse import coo_array, csr_array
 from scipy.sparse.csgraph import dijkstra
 
-from .motions import Moments, PosedSurface, fit_motions, union_costs
+from .motions import Moments, PosedSurface, rigid_costs, union_costs
+from .sides import Sides, closure
 
 
-def cover(surface: PosedSurface, count: int) -> np.ndarray:
-    """(F,) patch of every triangle: `count` seeds, each the farthest from those before, along the surface."""
-    centre = surface.x[surface.mesh.faces].mean(axis=1)
-    a, b = surface.pairs.T
+def cover(surface: PosedSurface, count: int, sides: Sides, rng: np.random.Generator | None = None) -> np.ndarray:
+    """(F,) patch of every triangle: about `count` seeds, each the farthest from those before, along the surface.
+
+    The first is the farthest from the middle or, with `rng`, any. On a symmetric body the patches of one side are
+    the mirror images of those of the other.
+    """
+    half, n = sides.half, len(sides.half)
+    centre = surface.x[surface.mesh.faces[half]].mean(axis=1)
+    a, b = sides.pairs.T
     step = np.linalg.norm(centre[a] - centre[b], axis=1)
-    n = len(centre)
     graph = csr_array(coo_array((np.r_[step, step], (np.r_[a, b], np.r_[b, a])), shape=(n, n)))
     distance, patch = np.full(n, np.inf), np.zeros(n, dtype=np.int64)
-    seed = int(np.linalg.norm(centre, axis=1).argmax())
-    for k in range(count):
+    seed = int(np.linalg.norm(centre, axis=1).argmax()) if rng is None else int(rng.integers(n))
+    for k in range(min(-(-count // 2) if sides.tied else count, n)):
         ahead = dijkstra(graph, indices=seed, limit=distance.max())
         nearer = ahead < distance
         patch[nearer], distance[nearer] = k, ahead[nearer]
         seed = int(distance.argmax())
-    return np.unique(patch, return_inverse=True)[1]
+    K = int(patch.max()) + 1
+    return np.unique(sides.spread(patch, np.r_[np.arange(K) + K, np.arange(K)]), return_inverse=True)[1]
 
 
-def agglomerate(moments: Moments, contacts: np.ndarray, count: int) -> np.ndarray:
+def agglomerate(moments: Moments, contacts: np.ndarray, count: int, partner: np.ndarray | None = None) -> np.ndarray:
     """Join sets that touch, each time the pair whose union costs least more, until `count` are left.
 
     Parameters
@@ -33,31 +39,48 @@ def agglomerate(moments: Moments, contacts: np.ndarray, count: int) -> np.ndarra
     moments : Moments of P sets
     contacts : (n, 2) int
     count : int
+        A set and its partner count as one.
+    partner : (P,) int, optional
+        The mirror image of every set: mirror images are joined together.
 
     Returns
     -------
-    (P,) int, the new number of every set, 0..count-1
+    (P,) int, the new number of every set, from 0
     """
     moments = moments[np.arange(len(moments.w))]
-    cost = fit_motions(moments).cost
+    cost = rigid_costs(moments)
     owner = np.arange(len(cost))
+    partner = owner.copy() if partner is None else partner.copy()
+    tied = bool((partner != owner).any())
     union: dict[tuple[int, int], float] = {}
 
     def measure(pairs: list[tuple[int, int]]) -> None:
         if pairs:
-            union.update(zip(pairs, union_costs(moments, np.array(pairs)), strict=True))
+            extra = union_costs(moments, np.array(pairs)) - cost[np.array(pairs)].sum(axis=1)
+            union.update(zip(pairs, extra.tolist(), strict=True))
+
+    def price(pair: tuple[int, int]) -> float:
+        a, b = int(partner[pair[0]]), int(partner[pair[1]])
+        return union[pair] + union.get((min(a, b), max(a, b)), union[pair]) if tied else union[pair]
 
     measure([(int(a), int(b)) for a, b in contacts])
-    left = len(cost)
+    left = int((partner >= owner).sum())
     while left > count and union:
-        a, b = min(union, key=lambda pair: union[pair] - cost[pair[0]] - cost[pair[1]])
-        cost[a] = union[a, b]
-        moments.absorb(a, b)
-        owner[owner == b] = a
-        left -= 1
-        touched = [pair for pair in union if a in pair or b in pair]
-        others = {c for pair in touched for c in pair} - {a, b}
+        a, b = min(union, key=price)
+        sets = closure(a, b, partner)
+        gone = {c for together in sets for c in together[1:]}
+        left -= len({min(c, int(partner[c])) for together in sets for c in together}) - 1
+        for together in sets:
+            for c in together[1:]:
+                moments.absorb(together[0], c)
+                owner[owner == c] = together[0]
+            cost[together[0]] = rigid_costs(moments[np.array(together[:1])])[0]
+        for together, other in zip(sets, sets[::-1], strict=True):
+            partner[together[0]] = other[0]
+        kept = {together[0] for together in sets}
+        touched = [pair for pair in union if not kept.isdisjoint(pair) or not gone.isdisjoint(pair)]
         for pair in touched:
             del union[pair]
-        measure([(min(a, c), max(a, c)) for c in sorted(others)])
+        now = {(int(owner[c]), int(owner[d])) for c, d in touched}
+        measure(sorted({(min(pair), max(pair)) for pair in now if pair[0] != pair[1]}))
     return np.unique(owner, return_inverse=True)[1]

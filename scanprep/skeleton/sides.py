@@ -1,0 +1,136 @@
+"""Left and right tied: one side of a symmetric body is labelled, the other is its mirror image.
+
+Every label has a partner, the label of the mirrored triangles; a label in the middle is its own. A body that is not
+symmetric is all one side: then nothing is tied, and every label counts as its own partner.
+"""
+from __future__ import annotations
+
+import numpy as np
+
+from .labels import keep_connected, relabel
+from .motions import PosedSurface
+from .symmetry import Symmetry
+
+
+class Sides:
+    """The side that is labelled and what follows from it on the other.
+
+    Parameters
+    ----------
+    surface : PosedSurface
+    symmetry : Symmetry, optional
+        Without it nothing is tied.
+
+    Attributes
+    ----------
+    tied : bool
+    half : (H,) int
+        The triangles that are labelled.
+    home : (F,) int
+        For every triangle the place in `half` of itself or of its mirror image.
+    mirrored : (F,) bool
+        Triangles that take the partner of the label of their home.
+    """
+
+    def __init__(self, surface: PosedSurface, symmetry: Symmetry | None = None) -> None:
+        F = len(surface.face_weights)
+        self.tied = symmetry is not None and bool(symmetry.left.any()) and not bool(symmetry.left.all())
+        self.mirrored = ~symmetry.left if symmetry is not None and self.tied else np.zeros(F, dtype=bool)
+        self.half = np.flatnonzero(~self.mirrored)
+        self.home = np.arange(F)
+        if symmetry is not None and self.tied:
+            number = np.full(F, -1)
+            number[self.half] = np.arange(len(self.half))
+            self.home = number[np.where(self.mirrored, symmetry.partner, np.arange(F))]
+        across = self.mirrored[surface.pairs]
+        own, over = ~across.any(axis=1), across[:, 0] != across[:, 1]
+        self.pairs = self.home[surface.pairs[own]]
+        self.lengths = surface.pair_lengths[own] * (2 if self.tied else 1)          # the mirrored borders count too
+        self.middle = np.bincount(self.home[surface.pairs[over]].ravel(),           # metres of border over the plane
+                                  np.repeat(surface.pair_lengths[over] / 2, 2), len(self.half))
+        self.areas = surface.face_weights[self.half]
+
+    def partners(self, label: np.ndarray) -> np.ndarray:
+        """(P,) the partner of every label (F,)."""
+        P = int(label.max()) + 1
+        if not self.tied:
+            return np.arange(P)
+        there = self.mirrored
+        table = np.bincount(label[self.half][self.home[there]] * P + label[there], minlength=P * P).reshape(P, P)
+        table = table + table.T
+        found = np.where(table.any(axis=1), table.argmax(axis=1), np.arange(P))
+        return np.where(found[found] == np.arange(P), found, np.arange(P))
+
+    def spread(self, label: np.ndarray, partner: np.ndarray) -> np.ndarray:
+        """(F,) labels of all triangles from those of the labelled side (H,)."""
+        everywhere = label[self.home]
+        return np.where(self.mirrored, partner[everywhere], everywhere)
+
+    def relabel(self, costs: np.ndarray, price: float, label: np.ndarray, partner: np.ndarray,
+                inside: np.ndarray | None = None) -> np.ndarray:
+        """Better labels for costs (F, P) and a price for every metre of border, every label connected.
+
+        Parameters
+        ----------
+        costs : (F, P) float
+        price : float
+        label : (F,) int
+        partner : (P,) int
+        inside : (F,) bool, optional
+            Only these change; the labels of the others do not matter to them.
+        """
+        here = np.arange(len(self.half)) if inside is None else np.flatnonzero(inside[self.half])
+        P = costs.shape[1]
+        both = costs[self.half]
+        if self.tied:
+            there = np.flatnonzero(self.mirrored)
+            for p in range(P):
+                both[:, p] += np.bincount(self.home[there], costs[there, partner[p]], len(self.half))
+            both += price * self.middle[:, None] * (partner != np.arange(P))
+        within = slice(None) if inside is None else np.isin(self.pairs, here).all(axis=1)
+        pairs, prices = np.searchsorted(here, self.pairs[within]), price * self.lengths[within]
+        mine = label[self.half][here]
+        mine = relabel(both[here], pairs, prices, mine, rounds=2)
+        mine = keep_connected(both[here], pairs, self.areas[here], mine)
+        mine, partner = self._apart(mine, partner, here)
+        out = label[self.half]
+        out[here] = mine
+        spread = self.spread(out, partner)
+        return spread if inside is None else np.where(inside, spread, label)
+
+    def _apart(self, label: np.ndarray, partner: np.ndarray, here: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """A label of the middle that does not reach the plane any more becomes two."""
+        if not self.tied:
+            return label, partner
+        at_plane = np.unique(label[self.middle[here] > 0])
+        for p in np.setdiff1d(label, at_plane):
+            if partner[p] == p:
+                partner = np.r_[partner, p]
+                partner[p] = len(partner) - 1
+        return label, partner
+
+    def join(self, label: np.ndarray, a: int, b: int, partner: np.ndarray) -> np.ndarray:
+        """Labels with a and b as one, and their partners as one."""
+        sets = closure(a, b, partner)
+        for together in sets:
+            label = np.where(np.isin(label, together), together[0], label)
+        return label
+
+
+def closure(a: int, b: int, partner: np.ndarray) -> list[list[int]]:
+    """The sets of labels that become one each when a and b do: one set, or two that are mirror images."""
+    one, other = {int(a), int(b)}, {int(partner[a]), int(partner[b])}
+    return [sorted(one | other)] if one & other else [sorted(one), sorted(other)]
+
+
+def reductions(pairs: np.ndarray, partner: np.ndarray) -> np.ndarray:
+    """(n,) how many labels fewer there are when the pairs (n, 2) of labels become one each."""
+    a, b = pairs.T
+    return np.where((partner[a] == b) | ((partner[a] == a) & (partner[b] == b)), 1, 2)
+
+
+def mirror_pairs(pairs: np.ndarray, partner: np.ndarray) -> np.ndarray:
+    """(n,) for pairs (n, 2), lower first, where among them their mirror image is, or they where it is not there."""
+    number = {(int(a), int(b)): i for i, (a, b) in enumerate(pairs)}
+    image = np.sort(partner[pairs], axis=1)
+    return np.array([number.get((int(a), int(b)), i) for i, (a, b) in enumerate(image)], dtype=np.int64)

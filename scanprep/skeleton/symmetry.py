@@ -1,0 +1,181 @@
+"""The left-right symmetry of a body, from its surface alone: which triangle is the mirror image of which."""
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.sparse import csc_array, diags_array
+from scipy.spatial import cKDTree
+
+from ..geometry.mesh import Mesh
+from ..geometry.sparse import factor
+from ..geometry.surface import OrientedPoints
+
+SAMPLES = 800                        # points of the surface that planes are tried with
+POSES = 24                           # that are tried where the body is not symmetric at rest
+DIRECTIONS = 60                      # of planes, over half the sphere
+NORMAL_WEIGHT = 0.05                 # of the body's size: how much distance a difference of normals weighs
+STIFFNESS = (300.0, 100.0, 30.0, 10.0, 3.0)       # of the warp that takes the mirror image onto the body, falling
+SYMMETRIC = 0.03                     # of the body's size: the mirror image lies so near the body, RMS
+NEAR = 0.02                          # of the body's size: near by
+RETURNS = 0.8                        # of the surface that comes back to where it was when mirrored twice
+
+
+@dataclass(frozen=True, eq=False)
+class Symmetry:
+    """The plane of symmetry and the mirror image of every triangle.
+
+    Attributes
+    ----------
+    normal : (3,) float
+        Unit normal of the plane, in the coordinates of the body it was found in.
+    point : (3,) float, metres
+        On the plane.
+    partner : (F,) int
+        The triangle where the mirror image of each triangle lies; for many, but not all, of an odd triangulation the
+        partner's partner is the triangle itself.
+    left : (F,) bool
+        On the side the normal points to.
+    distance : float
+        Of the mirror image from the body, RMS, as a share of the body's size.
+    returns : float
+        Share of the surface whose partner's partner is near by.
+    pose : int
+        The pose it was found in, -1 for the template.
+    """
+
+    normal: np.ndarray
+    point: np.ndarray
+    partner: np.ndarray
+    left: np.ndarray
+    distance: float
+    returns: float
+    pose: int = -1
+
+    @property
+    def holds(self) -> bool:
+        """Whether the body is symmetric, within the tolerances above."""
+        return self.distance <= SYMMETRIC and self.returns >= RETURNS
+
+    def reflect(self, points: np.ndarray) -> np.ndarray:
+        """Mirrored points (..., 3), metres."""
+        return reflect(points, self.normal, self.point)
+
+
+def reflect(points: np.ndarray, normal: np.ndarray, point: np.ndarray) -> np.ndarray:
+    """Points (..., 3) mirrored in a plane."""
+    return points - 2 * ((points - point) @ normal)[..., None] * normal
+
+
+def find_symmetry(template: Mesh, poses: np.ndarray | None = None) -> Symmetry:
+    """The best mirror symmetry of a body.
+
+    It is sought at rest and, where the body does not stand symmetrically there, in its most symmetric pose: planes in
+    all directions through the middle, the best ones fitted to nearest points, and a smooth warp from the mirror image
+    onto the body, so that a stance that is not quite symmetric does no harm. Nothing is taken from the numbers of
+    vertices.
+
+    Parameters
+    ----------
+    template : Mesh
+    poses : (M, N, 3) float, metres, optional
+
+    Returns
+    -------
+    Symmetry
+        `holds` says whether the body is symmetric at all.
+    """
+    few = _spread(template, SAMPLES)
+    at_rest = _matched(template, *_best_plane(template, few)[1:], -1)
+    if at_rest.holds or poses is None:
+        return at_rest
+    chosen = np.unique(np.linspace(0, len(poses) - 1, min(len(poses), POSES)).astype(int))
+    planes = [_best_plane(template.with_vertices(poses[m]), few) for m in chosen]
+    best = int(np.argmin([distance for distance, _, _ in planes]))
+    posed = _matched(template.with_vertices(poses[chosen[best]]), *planes[best][1:], int(chosen[best]))
+    return posed if posed.holds or posed.distance < at_rest.distance else at_rest
+
+
+def _spread(template: Mesh, count: int) -> np.ndarray:
+    """About `count` vertices spread over the surface, each the nearest to one of evenly drawn points."""
+    points = template.sample(count, np.random.default_rng(0))[0]
+    return np.unique(cKDTree(template.vertices).query(points)[1])
+
+
+def _best_plane(body: Mesh, few: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
+    """Distance of the mirror image (a share of the size), normal and point of the best plane."""
+    size = float(np.linalg.norm(np.ptp(body.vertices, axis=0)))
+    x, normals = body.vertices[few], body.vertex_normals[few]
+    target = OrientedPoints(x, normals, NORMAL_WEIGHT * size)
+    centre = np.average(body.corners.mean(axis=1), axis=0, weights=body.face_areas)
+    axes = np.linalg.eigh(np.cov(x.T))[1].T
+
+    def fitted(normal: np.ndarray, point: np.ndarray, rounds: int) -> tuple[float, np.ndarray, np.ndarray]:
+        for _ in range(rounds):
+            y = x[target.match(reflect(x, normal, point), _turned(normals, normal), min_cosine=-1.0).index]
+            point = (x.mean(axis=0) + y.mean(axis=0)) / 2
+            cross = (x - x.mean(axis=0)).T @ (y - y.mean(axis=0))
+            normal = np.linalg.eigh(cross + cross.T)[1][:, 0]
+        match = target.match(reflect(x, normal, point), _turned(normals, normal), min_cosine=-1.0)
+        apart = np.sqrt(match.distances**2 + target.scale**2 * ((target.normals[match.index]
+                                                                - _turned(normals, normal))**2).sum(axis=1))
+        return float(np.sqrt((apart**2).mean())) / size, normal, point
+
+    rough = [fitted(normal, centre, 0) for normal in np.vstack([axes, _half_sphere(DIRECTIONS) @ axes])]
+    rough.sort(key=lambda plane: plane[0])
+    return min((fitted(normal, point, 12) for _, normal, point in rough[:5]), key=lambda plane: plane[0])
+
+
+def _half_sphere(count: int) -> np.ndarray:
+    """(count, 3) directions spread evenly over half the sphere."""
+    k = np.arange(count)
+    z, turn = (k + 0.5) / count, k * np.pi * (3 - np.sqrt(5))
+    r = np.sqrt(1 - z**2)
+    return np.stack([r * np.cos(turn), r * np.sin(turn), z], axis=1)
+
+
+def _turned(normals: np.ndarray, normal: np.ndarray) -> np.ndarray:
+    return reflect(normals, normal, np.zeros(3))
+
+
+def _matched(body: Mesh, normal: np.ndarray, point: np.ndarray, pose: int) -> Symmetry:
+    """Warp the mirror image of a body onto it and pair the triangles."""
+    size = float(np.linalg.norm(np.ptp(body.vertices, axis=0)))
+    target = OrientedPoints(body.vertices, body.vertex_normals, NORMAL_WEIGHT * size)
+    start = reflect(body.vertices, normal, point)
+    graph = body.vertex_adjacency
+    laplacian = diags_array(np.asarray(graph.sum(axis=1)).ravel()) - graph
+    image, flipped = start, body.faces[:, ::-1]
+    for stiffness in STIFFNESS:
+        normals = Mesh(image, flipped).vertex_normals
+        match = target.match(image, normals)
+        weight = match.valid / (1 + (match.distances / (0.03 * size))**2)
+        weight[~match.valid] = 0
+        solve = factor(csc_array(diags_array(weight + 1e-6) + stiffness * laplacian))
+        image = start + solve(weight[:, None] * (body.vertices[match.index] - start))
+    return _paired(body, start, image, normal, point, pose)
+
+
+def _paired(body: Mesh, start: np.ndarray, image: np.ndarray, normal: np.ndarray, point: np.ndarray, pose: int
+            ) -> Symmetry:
+    """Pair triangles by the warped mirror image (N, 3) of the body, which began at `start` (N, 3)."""
+    size = float(np.linalg.norm(np.ptp(body.vertices, axis=0)))
+    centres, areas, normals = body.corners.mean(axis=1), body.face_areas, body.face_normals
+    seen, seen_normals = image[body.faces].mean(axis=1), Mesh(image, body.faces[:, ::-1]).face_normals
+
+    def nearest(among: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        target = OrientedPoints(centres[among], normals[among], NORMAL_WEIGHT * size)
+        match = target.match(seen[faces], seen_normals[faces], min_cosine=-1.0)
+        return among[match.index], match.distances
+
+    everything = np.arange(len(areas))
+    partner, apart = nearest(everything, everything)
+    left = np.einsum("fi,i->f", centres - centres[partner], normal) > 0
+    sides = np.flatnonzero(left), np.flatnonzero(~left)
+    for here, there in (sides, sides[::-1]):                     # a partner lies on the other side
+        if len(here) and len(there):
+            partner[here] = nearest(there, here)[0]
+    back = np.linalg.norm(centres[partner[partner]] - centres, axis=1) < NEAR * size
+    moved = np.average(((start - image)**2).sum(axis=1), weights=body.vertex_areas)
+    distance = np.sqrt(moved + np.average(apart**2, weights=areas)) / size
+    return Symmetry(normal, point, partner, left, float(distance), float(areas[back].sum() / areas.sum()), pose)
