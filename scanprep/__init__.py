@@ -6,6 +6,7 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
+    from .cleaning.components import CleanScanConfig, clean_scan
     from .cleaning.decimate import decimate
     from .cleaning.decimate_set import DecimateSetConfig, decimate_set
     from .cleaning.decimate_set_files import write_decimated_set
@@ -22,6 +23,7 @@ if TYPE_CHECKING:
     from .skeleton.tree import Skeleton
 
 _ROOMS = {
+    "cleaning.components": ("CleanScanConfig", "clean_scan"),
     "cleaning.decimate": ("decimate",),
     "cleaning.decimate_set": ("DecimateSetConfig", "decimate_set"),
     "cleaning.decimate_set_files": ("write_decimated_set",),
@@ -39,11 +41,11 @@ _ROOMS = {
 }
 _ROOM_OF = {name: room for room, names in _ROOMS.items() for name in names}
 
-__all__ = ["CorrelatedConfig", "DecimateSetConfig", "Mesh", "MeshFileError", "RegisteredSet", "RegistrationConfig",
-           "Skeleton", "SkeletonConfig", "align_rigid", "decimate", "decimate_set", "fill_holes",
-           "find_correspondences", "find_skeleton", "match_landmarks", "merge_views", "read_landmark_vertices",
-           "read_landmarks", "read_mesh", "read_points", "register", "write_decimated_set", "write_landmarks",
-           "write_mesh"]
+__all__ = ["CleanScanConfig", "CorrelatedConfig", "DecimateSetConfig", "Mesh", "MeshFileError", "RegisteredSet",
+           "RegistrationConfig", "Skeleton", "SkeletonConfig", "align_rigid", "clean_scan", "decimate",
+           "decimate_set", "fill_holes", "find_correspondences", "find_skeleton", "match_landmarks", "merge_views",
+           "read_landmark_vertices", "read_landmarks", "read_mesh", "read_points", "register", "write_decimated_set",
+           "write_landmarks", "write_mesh"]
 
 
 def __getattr__(name: str) -> Any:

@@ -1,0 +1,236 @@
+"""The body out of a raw scan: floor, furniture and specks removed, and an account of every piece."""
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+import numpy as np
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
+
+from ..geometry.mesh import Mesh
+from .floor import FloorConfig, Plane, find_plane, floor_points
+
+LARGEST, LANDMARKS, NEAR = "the largest piece", "the piece with the landmarks", "near the body"
+FAR, SPECKS, FLOOR = "apart from the body", "specks", "a plane with all on one side"
+
+
+@dataclass(frozen=True)
+class CleanScanConfig:
+    """Settings of `clean_scan`.
+
+    Attributes
+    ----------
+    link : float, metres
+        Points closer than this belong together, whether triangles join them or not.
+    spacings : float
+        So do those closer than this many times the median distance to the nearest neighbour.
+    gap : float, metres
+        Pieces closer than this to the body belong to it: hands and feet that the scanner saw apart.
+    min_points : int
+        Smaller pieces are specks, wherever they are.
+    planes : int
+        Most floors and walls that are taken off.
+    floor : FloorConfig
+        How floors are found.
+    """
+
+    link: float = 0.012
+    spacings: float = 3.0
+    gap: float = 0.03
+    min_points: int = 30
+    planes: int = 3
+    floor: FloorConfig = field(default_factory=FloorConfig)
+
+
+@dataclass(frozen=True)
+class Component:
+    """One piece of a scan.
+
+    Attributes
+    ----------
+    points : int
+    area : float, square metres
+        Of its triangles; NaN in a point cloud.
+    size : (3,) float, metres
+        Extent along the axes.
+    gap : float, metres
+        To the body; 0 for the body itself.
+    kept : bool
+    reason : str
+        Why it was kept or dropped.
+    """
+
+    points: int
+    area: float
+    size: tuple[float, float, float]
+    gap: float
+    kept: bool
+    reason: str
+
+
+@dataclass(frozen=True, eq=False)
+class CleanedScan:
+    """A scan after `clean_scan`.
+
+    Attributes
+    ----------
+    scan : Mesh or (n, 3) float, metres
+        The body alone, of the same kind as what was given.
+    kept : (N,) bool
+        Which points of the raw scan are in it.
+    label : (N,) int
+        The row in `components` of every point of the raw scan.
+    components : tuple of Component
+        Planes first, then pieces, largest first, then all specks as one.
+    floor : Plane or None
+        The plane on which the body stands.
+    """
+
+    scan: Mesh | np.ndarray
+    kept: np.ndarray
+    label: np.ndarray
+    components: tuple[Component, ...]
+    floor: Plane | None
+
+    @property
+    def mesh(self) -> Mesh:
+        """The body as a mesh; without triangles when a point cloud was given."""
+        return self.scan if isinstance(self.scan, Mesh) else Mesh(self.scan, np.zeros((0, 3), dtype=np.int64))
+
+
+def clean_scan(scan: Mesh | np.ndarray, config: CleanScanConfig | None = None, landmarks: np.ndarray | None = None,
+               rng: np.random.Generator | None = None) -> CleanedScan:
+    """Keep the body of a raw scan and drop the floor, walls, furniture and specks.
+
+    A floor is a large plane that has everything else on one side. What lies within its noise belongs to the body
+    inside the outline in which the body meets it, and to the floor elsewhere. Of the rest the largest piece is the
+    body, with the pieces that nearly touch it.
+
+    Parameters
+    ----------
+    scan : Mesh or (N, 3) float, metres
+        Views may lie side by side.
+    config : CleanScanConfig, optional
+    landmarks : (L, 3) float, metres, optional
+        Points on the body, which then is the piece that most of them are nearest to.
+    rng : numpy.random.Generator, optional
+        Draws where planes are tried.
+
+    Returns
+    -------
+    CleanedScan
+
+    Raises
+    ------
+    ValueError
+        A scan without points, or one of which nothing is left.
+    """
+    config, rng = config or CleanScanConfig(), rng or np.random.default_rng(0)
+    mesh = scan if isinstance(scan, Mesh) else Mesh(scan, np.zeros((0, 3), dtype=np.int64))
+    points = mesh.vertices
+    if not len(points):
+        raise ValueError("scan: expected points, got none")
+    spacing = float(np.median(cKDTree(points).query(points[rng.permutation(len(points))[:2000]], 2)[0][:, 1]))
+    link = max(config.link, config.spacings * spacing)
+    label, planes = _without_planes(mesh, link, config, landmarks, rng)
+    rest = np.flatnonzero(label < 0)
+    if not len(rest):
+        raise ValueError("scan: nothing is left when planes are taken off; expected a body in front of them")
+    piece = pieces(mesh, rest, link)
+    main, why = _body_of(points[rest], piece, config, landmarks)
+    # All specks together are one row: a scanned floor leaves hundreds.
+    size = np.bincount(piece)
+    large = np.flatnonzero((size >= config.min_points) | (np.arange(len(size)) == main))
+    row_of = np.full(len(size), len(large))
+    row_of[large] = np.arange(len(large))
+    label[rest] = len(planes) + row_of[piece]
+    body = cKDTree(points[rest[piece == main]])
+    rows = [_component(mesh, label == i, _gap(body, points[label == i]), False, FLOOR)
+            for i in range(len(planes))]
+    for number, old in enumerate(large):
+        mine = label == len(planes) + number
+        gap = 0.0 if old == main else _gap(body, points[mine])
+        reason = why if old == main else NEAR if gap <= max(config.gap, link) else FAR
+        rows.append(_component(mesh, mine, gap, reason in (why, NEAR), reason))
+    specks = label == len(planes) + len(large)
+    if specks.any():
+        rows.append(_component(mesh, specks, _gap(body, points[specks]), False, SPECKS))
+    kept = np.array([row.kept for row in rows])[label]
+    floor = next((p for p in planes if p.height(body.data).min() <= config.gap), None)
+    return CleanedScan(_only(scan, kept), kept, label, tuple(rows), floor)
+
+
+def _without_planes(mesh: Mesh, link: float, config: CleanScanConfig, landmarks: np.ndarray | None,
+                    rng: np.random.Generator) -> tuple[np.ndarray, list[Plane]]:
+    """The number of the plane that each vertex (N,) lies on, -1 for none, and the planes."""
+    points, planes = mesh.vertices, list[Plane]()
+    label = np.full(len(points), -1)
+    while len(planes) < config.planes and (label < 0).sum() > config.min_points:
+        rest = np.flatnonzero(label < 0)
+        plane = find_plane(points[rest], config.floor, rng)
+        if plane is None:
+            break
+        high = plane.height(points[rest]) > config.floor.sigmas * plane.noise
+        standing = rest[high]
+        piece = pieces(mesh, standing, link)
+        body = standing[piece == _body_of(points[standing], piece, config, landmarks)[0]] if len(standing) else standing
+        label[rest[floor_points(points[rest], plane, points[body], config.floor)]] = len(planes)
+        planes.append(plane)
+    return label, planes
+
+
+def pieces(mesh: Mesh, chosen: np.ndarray, link: float) -> np.ndarray:
+    """Number of the piece that each of the chosen vertices (n,) belongs to, largest piece 0.
+
+    Vertices hang together when a side of a triangle joins them or when they are closer than about `link` metres.
+    """
+    points = mesh.vertices[chosen]
+    new = np.full(len(mesh.vertices), -1)
+    new[chosen] = np.arange(len(chosen))
+    sides = new[np.concatenate([mesh.faces[:, [0, 1]], mesh.faces[:, [1, 2]]])]
+    sides = sides[(sides >= 0).all(axis=1)]
+    # One point of every small cell stands for all of it, so that dense scans do not take long.
+    _, first, cell = np.unique(np.floor(points / (link / 2)).astype(np.int64), axis=0, return_index=True,
+                               return_inverse=True)
+    near = cKDTree(points[first]).query_pairs(link, output_type="ndarray")
+    a = np.concatenate([sides[:, 0], first[near[:, 0]], np.arange(len(points))])
+    b = np.concatenate([sides[:, 1], first[near[:, 1]], first[cell.reshape(-1)]])
+    _, label = connected_components(coo_array((np.ones(len(a)), (a, b)), shape=(len(points), len(points))),
+                                    directed=False)
+    size = np.bincount(label[first])                    # by cells, not by points, which crowd near the scanner
+    rank = np.argsort(np.argsort(-size, kind="stable"), kind="stable")
+    return np.asarray(rank[label])
+
+
+def _body_of(points: np.ndarray, piece: np.ndarray, config: CleanScanConfig, landmarks: np.ndarray | None
+             ) -> tuple[int, str]:
+    """The piece that is the body, and why."""
+    if landmarks is None:
+        return 0, LARGEST
+    large = np.bincount(piece)[piece] >= config.min_points
+    if not large.any():
+        large = np.ones(len(piece), dtype=bool)
+    found = piece[large][cKDTree(points[large]).query(np.reshape(landmarks, (-1, 3)))[1]]
+    return int(np.bincount(found).argmax()), LANDMARKS
+
+
+def _gap(body: cKDTree, points: np.ndarray) -> float:
+    """The least distance; a few points first, because far queries take long without a bound."""
+    bound = float(body.query(points[::max(len(points) // 300, 1)])[0].min())
+    return min(bound, float(body.query(points, distance_upper_bound=bound + 1e-12)[0].min()))
+
+
+def _component(mesh: Mesh, mine: np.ndarray, gap: float, kept: bool, reason: str) -> Component:
+    points = mesh.vertices[mine]
+    area = float(mesh.face_areas[mine[mesh.faces].all(axis=1)].sum()) if len(mesh.faces) else float("nan")
+    size = tuple(float(x) for x in np.ptp(points, axis=0)) if len(points) else (0.0, 0.0, 0.0)
+    return Component(len(points), area, (size[0], size[1], size[2]), gap, kept, reason)
+
+
+def _only(scan: Mesh | np.ndarray, kept: np.ndarray) -> Mesh | np.ndarray:
+    if not isinstance(scan, Mesh):
+        return np.asarray(scan)[kept]
+    if not len(scan.faces):
+        return Mesh(scan.vertices[kept], scan.faces, None if scan.colors is None else scan.colors[kept])
+    return scan.submesh(kept[scan.faces].all(axis=1))[0]

@@ -1,0 +1,203 @@
+"""The floor under a scanned body, found and taken off without the soles."""
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy import ndimage
+from scipy.spatial import cKDTree
+
+
+@dataclass(frozen=True)
+class FloorConfig:
+    """Settings of `find_plane` and `floor_points`.
+
+    Attributes
+    ----------
+    min_area : float, square metres
+        A plane on which less is measured is no floor; both soles together have about 0.04.
+    max_below : float
+        Share of all points that may lie behind a floor.
+    tries : int
+        Planes that are tried.
+    widest : float, metres
+        Farthest distance of the points that a first guess is fitted to.
+    roughest : float
+        Points on a floor deviate by at most this many times what neighbouring points do.
+    sigmas : float
+        Points within this many standard deviations of a floor are on it.
+    footprint_height : float, metres
+        What of the body is lower than this shows where it stands.
+    bridge : float, metres
+        Gaps in the outline of a footprint that are closed.
+    """
+
+    min_area: float = 0.1
+    max_below: float = 0.01
+    tries: int = 150
+    widest: float = 0.03
+    roughest: float = 2.0
+    sigmas: float = 3.5
+    footprint_height: float = 0.03
+    bridge: float = 0.015
+
+
+@dataclass(frozen=True)
+class Plane:
+    """A plane with what was measured on it in front.
+
+    Attributes
+    ----------
+    normal : (3,) float, unit
+        Towards the body.
+    offset : float, metres
+        Of points x on the plane, `normal @ x`.
+    noise : float, metres
+        Standard deviation of the points that were measured on it.
+    """
+
+    normal: np.ndarray
+    offset: float
+    noise: float
+
+    def height(self, points: np.ndarray) -> np.ndarray:
+        """Distances (n,) of points (n, 3) in front of the plane, metres."""
+        return np.asarray(points @ self.normal - self.offset)
+
+    def flat(self, points: np.ndarray) -> np.ndarray:
+        """Coordinates (n, 2) of points along the plane, metres."""
+        u = np.cross(self.normal, np.eye(3)[np.abs(self.normal).argmin()])
+        u /= np.linalg.norm(u)
+        return points @ np.stack([u, np.cross(self.normal, u)], axis=1)
+
+
+def find_plane(points: np.ndarray, config: FloorConfig | None = None, rng: np.random.Generator | None = None
+               ) -> Plane | None:
+    """The largest plane that has nearly all points on it or on one side of it, or None.
+
+    Guesses go through single points along the normal of their neighbourhood, and the best is fitted to closer and
+    closer points.
+
+    Parameters
+    ----------
+    points : (n, 3) float, metres
+    config : FloorConfig, optional
+    rng : numpy.random.Generator, optional
+        Draws where planes are tried.
+    """
+    config, rng = config or FloorConfig(), rng or np.random.default_rng(0)
+    few = points[rng.permutation(len(points))[:10_000]]
+    tree = cKDTree(few)
+    seeds = rng.choice(len(few), min(config.tries, len(few)), replace=False)
+    best, best_area = None, config.min_area
+    for seed in seeds:
+        near = few[tree.query_ball_point(few[seed], 2 * config.widest)]
+        if len(near) < 6:
+            continue
+        plane = _fit(near)
+        height = plane.height(few)
+        if np.mean(height < -config.widest) > np.mean(height > config.widest):
+            plane, height = Plane(-plane.normal, -plane.offset, plane.noise), -height
+        if np.mean(height < -config.widest) > config.max_below:
+            continue
+        area = covered_area(plane.flat(few[np.abs(height) < config.widest / 2]), config.widest)
+        if area > best_area:
+            best, best_area = plane, area
+    if best is None:
+        return None
+    plane = _refined(best, points, config)
+    height = plane.height(points)
+    on_it = np.abs(height) <= config.sigmas * plane.noise
+    if (plane.noise > config.roughest * local_noise(points, rng)           # a back is nearly flat, but only nearly
+            or np.mean(height < -config.widest / 2) > config.max_below
+            or covered_area(plane.flat(points[on_it]), config.widest) < config.min_area):
+        return None
+    return plane
+
+
+def local_noise(points: np.ndarray, rng: np.random.Generator, count: int = 500, near: int = 16) -> float:
+    """Standard deviation, metres, of points (n, 3) from planes through their nearest neighbours: the median."""
+    near = min(near, len(points))
+    index = cKDTree(points).query(points[rng.choice(len(points), min(count, len(points)), replace=False)], near)[1]
+    patch = points[index.reshape(-1, near)]
+    spread = np.linalg.svd(patch - patch.mean(axis=1, keepdims=True), compute_uv=False)[:, 2]
+    return max(float(np.median(spread)) / max(near - 3, 1) ** 0.5, 1e-4)
+
+
+def floor_points(points: np.ndarray, plane: Plane, body: np.ndarray, config: FloorConfig | None = None
+                 ) -> np.ndarray:
+    """Which points are the floor: those on it outside the footprint of the body, and what lies under it.
+
+    Parameters
+    ----------
+    points : (n, 3) float, metres
+    plane : Plane
+    body : (m, 3) float, metres
+        Points of what stands on the floor; those near it make the footprint.
+    config : FloorConfig, optional
+
+    Returns
+    -------
+    (n,) bool
+    """
+    config = config or FloorConfig()
+    band = config.sigmas * plane.noise
+    height = plane.height(points)
+    on_it = np.abs(height) <= band
+    above = plane.height(body)
+    low = plane.flat(body[(above > band) & (above < band + config.footprint_height)])
+    on_it[on_it] = ~inside_outline(plane.flat(points[on_it]), low, config.bridge)
+    return np.asarray(on_it | (height < -band))
+
+
+def inside_outline(points: np.ndarray, outline: np.ndarray, bridge: float) -> np.ndarray:
+    """(n,) bool: points (n, 2) on or inside the closed curves that other points (m, 2) trace with gaps.
+
+    Parameters
+    ----------
+    bridge : float, metres
+        Gaps that are closed.
+    """
+    if not len(outline) or not len(points):
+        return np.zeros(len(points), dtype=bool)
+    cell = bridge / 3
+    start = outline.min(axis=0) - 3 * bridge
+    place = ((outline - start) / cell).astype(int)
+    drawn = np.zeros(place.max(axis=0) + 10, dtype=bool)
+    drawn[tuple(place.T)] = True
+    reach = np.hypot(*np.mgrid[-3:4, -3:4]) <= 3
+    filled = ndimage.binary_fill_holes(ndimage.binary_dilation(drawn, reach))
+    filled = ndimage.binary_erosion(filled, reach) | drawn
+    at = np.floor((points - start) / cell).astype(int)
+    known = ((at >= 0) & (at < filled.shape)).all(axis=1)
+    inside = np.zeros(len(points), dtype=bool)
+    inside[known] = filled[tuple(at[known].T)]
+    return inside
+
+
+def covered_area(flat: np.ndarray, cell: float) -> float:
+    """Square metres of the cells, `cell` metres wide, that have one of the points (n, 2)."""
+    place = np.floor(flat / cell).astype(np.int64)
+    place -= place.min(axis=0, initial=0)
+    return len(np.unique(place[:, 0] * (place[:, 1].max(initial=0) + 1) + place[:, 1])) * cell**2
+
+
+def _fit(points: np.ndarray) -> Plane:
+    centre = points.mean(axis=0)
+    spread, axes = np.linalg.eigh(np.cov(points.T, bias=True))
+    return Plane(axes[:, 0], float(axes[:, 0] @ centre), float(np.sqrt(max(spread[0], 0.0))))
+
+
+def _refined(plane: Plane, points: np.ndarray, config: FloorConfig) -> Plane:
+    """Fitted to points that are closer every time, the noise by the median so that feet do not count."""
+    band = config.widest
+    for _ in range(8):
+        height = plane.height(points)
+        near = points[np.abs(height) < band]
+        fitted = _fit(near)
+        if fitted.normal @ plane.normal < 0:
+            fitted = Plane(-fitted.normal, -fitted.offset, fitted.noise)
+        noise = 1.4826 * float(np.median(np.abs(fitted.height(near))))
+        plane = Plane(fitted.normal, fitted.offset, max(noise, 1e-5))
+        band = min(band, max(3 * plane.noise, 1e-4))
+    return plane
