@@ -8,6 +8,10 @@ from typing import TYPE_CHECKING, Any
 if TYPE_CHECKING:
     from .blendscape import BlendScapeModel
     from .body import BodyModel, Derivatives
+    from .coregistration.config import CoregistrationConfig
+    from .coregistration.first import FirstModel, learn_from_scans
+    from .coregistration.rounds import Coregistration, coregister
+    from .coregistration.single import ModelRegistration, register_with_model
     from .evaluation.errors import PoseErrors, ShapeErrors, compactness, pose_errors, shape_errors
     from .evaluation.sampling import Samples, Specificity, sample_bodies, specificity
     from .export.bvh import write_bvh
@@ -33,6 +37,10 @@ if TYPE_CHECKING:
 
 _ROOMS = {
     "body": ("BodyModel", "Derivatives"),
+    "coregistration.config": ("CoregistrationConfig",),
+    "coregistration.first": ("FirstModel", "learn_from_scans"),
+    "coregistration.rounds": ("Coregistration", "coregister"),
+    "coregistration.single": ("ModelRegistration", "register_with_model"),
     "evaluation.errors": ("PoseErrors", "ShapeErrors", "compactness", "pose_errors", "shape_errors"),
     "evaluation.sampling": ("Samples", "Specificity", "sample_bodies", "specificity"),
     "export.bvh": ("write_bvh",),
@@ -59,15 +67,16 @@ _ROOMS = {
 }
 _ROOM_OF = {name: room for room, names in _ROOMS.items() for name in names}
 
-__all__ = ["BlendConfig", "BlendScapeModel", "BodyModel", "ChosenSkeleton", "Derivatives", "FitConfig", "JointLimits",
-           "LearnConfig", "Mirror", "MixConfig", "PartsConfig", "PointOperator", "PoseErrors", "PoseFit",
-           "ResolutionConfig", "Rig", "Samples", "ScapeModel", "ShapeErrors", "ShapeFit", "SkinConfig",
-           "SkinningModel", "Specificity", "Subject", "TransferConfig", "change_resolution", "choose_skeleton",
-           "compactness", "find_mirror", "fit_pose", "fit_shape", "learn_blendscape", "learn_by_sex", "learn_scape",
-           "learn_scape_mix", "learn_skinning", "load_model", "make_rig", "mirror_pose", "motion_correctives",
-           "pose_errors", "pose_from_angles", "repose", "sample_bodies", "sample_poses", "shape_errors",
-           "skin_weights", "specificity", "subject_from_body", "turn", "write_body_npz", "write_bvh",
-           "write_skinned_glb"]
+__all__ = ["BlendConfig", "BlendScapeModel", "BodyModel", "ChosenSkeleton", "Coregistration", "CoregistrationConfig",
+           "Derivatives", "FirstModel", "FitConfig", "JointLimits", "LearnConfig", "Mirror", "MixConfig",
+           "ModelRegistration", "PartsConfig", "PointOperator", "PoseErrors", "PoseFit", "ResolutionConfig", "Rig",
+           "Samples", "ScapeModel", "ShapeErrors", "ShapeFit", "SkinConfig", "SkinningModel", "Specificity",
+           "Subject", "TransferConfig", "change_resolution", "choose_skeleton", "compactness", "coregister",
+           "find_mirror", "fit_pose", "fit_shape", "learn_blendscape", "learn_by_sex", "learn_from_scans",
+           "learn_scape", "learn_scape_mix", "learn_skinning", "load_model", "make_rig", "mirror_pose",
+           "motion_correctives", "pose_errors", "pose_from_angles", "register_with_model", "repose", "sample_bodies",
+           "sample_poses", "shape_errors", "skin_weights", "specificity", "subject_from_body", "turn",
+           "write_body_npz", "write_bvh", "write_skinned_glb"]
 
 
 def __getattr__(name: str) -> Any:

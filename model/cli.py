@@ -26,6 +26,8 @@ COMMANDS = {
     "sample": ("Random bodies: meshes, a sheet of pictures, betas and poses.", "model.evaluation.cli:sample"),
     "evaluate": ("Errors on held-out bodies, with a page of curves and pictures.", "model.evaluation.cli:evaluate"),
     "resample": ("The model with fewer or more triangles.", "model.resolution.cli:resample_model"),
+    "coregister": ("Scans registered with a model as prior, and the model learned again.",
+                   "model.coregistration.cli:coregister_scans"),
     "repose": ("A registered body in the poses of a motion.", "model.posing.cli:repose"),
     "export": ("Files for other programs: skinned GLB, BVH, body-model npz, meshes.", "model.export.cli:export"),
 }

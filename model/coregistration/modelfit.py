@@ -50,8 +50,9 @@ class ModelFit:
         template = body.template
         self.body, self.target, self.config = body, target, config
         self.size = float(np.sqrt(template.face_areas.sum()))
-        self.marks, self.marked = landmarks or (np.zeros(0, dtype=np.int64), np.zeros((0, 3)))
-        assert body.pose_mean is not None and body.pose_covariance is not None, "a body without a pose prior"
+        self.marks, self.marked = _checked(template, landmarks)
+        if body.pose_mean is None or body.pose_covariance is None:
+            raise ValueError("body: expected one with a mean and covariance of the pose, got a subject without")
         self.pose_mean, self.covariance = body.pose_mean, body.pose_covariance
         self.whitening = whitening(self.covariance)
         self.points = lru_cache(maxsize=4)(self._points)
@@ -131,8 +132,10 @@ class ModelFit:
 
     def best_of(self, starts: Iterable[np.ndarray]) -> tuple[Candidate, int]:
         """The best end of starts (one at least), which are tried until one explains enough; and how many were tried."""
-        config, best, ends, tried = self.config, None, [], 0
-        points, _ = self.points(config.search[-1].sample)
+        config, tried = self.config, 0
+        best: Candidate | None = None
+        ends: list[np.ndarray] = []
+        points, _ = self.points(config.refine[-1].sample)
         for x in starts:
             tried += 1
             for stage in config.search:
@@ -169,13 +172,14 @@ class ModelFit:
         """Unknowns near an alignment that may be wrong here and there."""
         skeleton, template = self.body.skeleton, self.body.template
         pose = skeleton.pose_of(skeleton.fit_rotations(template, vertices))
-        return self.taken_from(vertices, weights, self.placed(pose, vertices), self.config.search[0].prior)
+        return self.taken_from(vertices, weights, self.placed(pose, vertices),
+                               (self.config.search + self.config.refine)[0].prior)
 
     def placed(self, pose: np.ndarray, onto: np.ndarray) -> np.ndarray:
         """Unknowns of a pose (J, 3), mean betas, with the body's middle in that of points (n, 3), metres."""
         x = np.zeros(self.unknowns)
         x[:pose.size] = twists(pose).ravel()
-        points, _ = self.points(self.config.search[0].sample)
+        points, _ = self.points(self.config.refine[-1].sample)
         x[pose.size:pose.size + 3] = onto.mean(axis=0) - points.positions(x).mean(axis=0)
         return x
 
@@ -197,7 +201,7 @@ class ModelFit:
 
     def _on_landmarks(self, pose: np.ndarray) -> np.ndarray:
         """A pose turned as a whole, then bent, towards the landmarks."""
-        stage = self.config.search[0]
+        stage = (self.config.search + self.config.refine)[0]
         points, share = self.points(stage.sample)
         x = self.placed(pose, self.marked)
         here = points.positions(x)[len(share):]
@@ -221,3 +225,19 @@ class ModelFit:
         """Pose (J, 3), trans (3,), and betas (K,) or None where the shape is known."""
         J3 = self.pose_mean.size
         return x[:J3].reshape(-1, 3), x[J3:J3 + 3], x[J3 + 3:] if len(x) > J3 + 3 else None
+
+
+def _checked(template: Mesh, landmarks: tuple[np.ndarray, np.ndarray] | None) -> tuple[np.ndarray, np.ndarray]:
+    """Landmarks as arrays, none or more, or ValueError."""
+    if landmarks is None:
+        return np.zeros(0, dtype=np.int64), np.zeros((0, 3))
+    marks, marked = np.asarray(landmarks[0]), np.asarray(landmarks[1], dtype=np.float64)
+    if marks.ndim != 1 or not np.issubdtype(marks.dtype, np.integer) or marked.shape != (len(marks), 3):
+        raise ValueError(f"landmarks: expected vertices (L,) and points (L, 3), got {marks.dtype} {marks.shape} and "
+                         f"{marked.shape}")
+    if len(marks) and not 0 <= marks.min() <= marks.max() < len(template.vertices):
+        raise ValueError(f"landmarks: expected vertices of 0..{len(template.vertices) - 1}, got "
+                         f"{marks.min()}..{marks.max()}")
+    if not np.isfinite(marked).all():
+        raise ValueError("landmarks: expected finite points")
+    return marks, marked

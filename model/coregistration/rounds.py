@@ -122,7 +122,7 @@ def coregister(model: BodyModel, scans: Sequence[Scan], landmarks: Sequence[Land
     if model.kind not in ("scape", "blendscape"):
         raise ValueError(f"model: expected one of the kind scape or blendscape, got {model.kind}")
     marks = list(landmarks) if landmarks is not None else [None] * n
-    before = list(starts) if starts is not None else [None] * n
+    before: Sequence[np.ndarray | None] = list(starts) if starts is not None else [None] * n
     own = _own(subjects, n)
     history: list[Round] = []
     good, registrations = np.zeros(n, dtype=bool), list[ModelRegistration]()

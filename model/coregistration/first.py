@@ -1,0 +1,133 @@
+"""A first model from scans alone: plain registration, a skeleton, and learning from what came out well."""
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from scanprep.geometry.mesh import Mesh
+from scanprep.matching.matches import orient, target_of
+from scanprep.matching.nonrigid import register
+from scanprep.matching.schedule import RegistrationConfig
+from scanprep.skeleton.find import find_skeleton
+from scanprep.skeleton.parts import SkeletonConfig
+from scanprep.skeleton.tree import Skeleton
+
+from ..learning.scape import learn_scape
+from ..scape import ScapeModel
+from .attraction import apart
+from .config import CoregistrationConfig
+from .rounds import Coregistration, coregister
+from .single import Landmarks
+
+Progress = Callable[[int, int], None]
+DETAIL = 0.01                        # share of √area to which scans are thinned before it is asked what is explained
+
+
+@dataclass(frozen=True)
+class FirstConfig:
+    """Settings of `learn_from_scans`.
+
+    Attributes
+    ----------
+    registration : RegistrationConfig
+        Of the template, without a model.
+    skeleton : SkeletonConfig
+    rounds : CoregistrationConfig
+        Of the co-registration that follows.
+    """
+
+    registration: RegistrationConfig = field(default_factory=RegistrationConfig)
+    skeleton: SkeletonConfig = field(default_factory=SkeletonConfig)
+    rounds: CoregistrationConfig = field(default_factory=CoregistrationConfig)
+
+
+@dataclass(frozen=True, eq=False)
+class FirstModel:
+    """A model from scans alone.
+
+    Attributes
+    ----------
+    registered : (n, N, 3) float, metres
+        The first registrations, without a model.
+    explained : (n,) float
+        Share of the points of each scan that its first registration explains.
+    good : (n,) bool
+        The first model was learned from these.
+    model : ScapeModel
+        The first model.
+    coregistration : Coregistration
+        What came of it.
+    """
+
+    registered: np.ndarray
+    explained: np.ndarray
+    good: np.ndarray
+    model: ScapeModel
+    coregistration: Coregistration
+
+
+def learn_from_scans(template: Mesh, scans: Sequence[Mesh | np.ndarray], landmarks: Sequence[Landmarks | None],
+                     skeleton: Skeleton | None = None, config: FirstConfig | None = None,
+                     progress: Progress | None = None) -> FirstModel:
+    """A body model from scans of one person in many poses, whose first registrations may fail for some.
+
+    Parameters
+    ----------
+    template : Mesh
+        Of the person.
+    scans : n Meshes or (k, 3) float, metres
+    landmarks : n pairs of (L,) int and (L, 3) float, metres, or None
+    skeleton : Skeleton, optional
+        Found from the first registrations that are good unless given.
+    config : FirstConfig, optional
+    progress : callable, optional
+        Called as progress(done, total), with scans registered.
+
+    Raises
+    ------
+    ValueError
+        Lists of different length, scans that cannot be used, too few good registrations to find a skeleton.
+    """
+    from joblib import Parallel, delayed, parallel_config
+
+    config = config or FirstConfig()
+    if len(landmarks) != len(scans):
+        raise ValueError(f"landmarks: expected {len(scans)}, one a scan, got {len(landmarks)}")
+    n, tell = len(scans), progress or (lambda done, total: None)
+    total = n * (1 + config.rounds.rounds)
+    workers = min(config.rounds.workers or os.cpu_count() or 1, max(n, 1))
+    jobs = (delayed(_registered)(template, scan, marks, config.registration)
+            for scan, marks in zip(scans, landmarks, strict=True))
+    first = []
+    with parallel_config("loky" if workers > 1 else "sequential", n_jobs=workers):
+        for vertices in Parallel(return_as="generator", batch_size=1)(jobs):
+            first.append(vertices)
+            tell(len(first), total)
+    registered = np.stack(first)
+    share = np.array([explained_share(template.with_vertices(v), scan, config.rounds)
+                      for v, scan in zip(registered, scans, strict=True)])
+    good = share >= 1 - config.rounds.failed
+    bodies = np.concatenate([template.vertices[None], registered[good]])
+    if len(bodies) < 3:
+        raise ValueError(f"scans: {int(good.sum())} of {n} could be registered without a model; at least 2 are needed")
+    tree = find_skeleton(template, bodies, config.skeleton) if skeleton is None else skeleton
+    model = learn_scape(template, bodies, None, tree, config.rounds.learn)
+    found = coregister(model, scans, landmarks, config.rounds, list(registered),
+                       progress=lambda done, _: tell(n + done, total))
+    return FirstModel(registered, share, good, model, found)
+
+
+def explained_share(mesh: Mesh, scan: Mesh | np.ndarray, config: CoregistrationConfig) -> float:
+    """Share of the points of a scan that lie near a registered mesh and do not face away from it."""
+    size = float(np.sqrt(mesh.face_areas.sum()))
+    limit = config.explained * size
+    target = orient(target_of(scan).thinned(DETAIL * size), mesh, config.fit.normal_weight * size)
+    return float((apart(mesh, target, limit) < limit).mean())
+
+
+def _registered(template: Mesh, scan: Mesh | np.ndarray, marks: Landmarks | None, config: RegistrationConfig
+                ) -> np.ndarray:
+    return register(template, scan, marks, config).mesh.vertices
