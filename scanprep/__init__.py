@@ -19,6 +19,7 @@ if TYPE_CHECKING:
     from .matching.correlated import CorrelatedConfig, find_correspondences
     from .matching.nonrigid import RegistrationConfig, register
     from .matching.rigid import align_rigid
+    from .matching.seeds import SeedConfig, find_seeds
     from .skeleton.find import SkeletonConfig, find_skeleton
     from .skeleton.tree import Skeleton
 
@@ -36,16 +37,17 @@ _ROOMS = {
     "matching.correlated": ("CorrelatedConfig", "find_correspondences"),
     "matching.nonrigid": ("RegistrationConfig", "register"),
     "matching.rigid": ("align_rigid",),
+    "matching.seeds": ("SeedConfig", "find_seeds"),
     "skeleton.find": ("SkeletonConfig", "find_skeleton"),
     "skeleton.tree": ("Skeleton",),
 }
 _ROOM_OF = {name: room for room, names in _ROOMS.items() for name in names}
 
 __all__ = ["CleanScanConfig", "CorrelatedConfig", "DecimateSetConfig", "Mesh", "MeshFileError", "RegisteredSet",
-           "RegistrationConfig", "Skeleton", "SkeletonConfig", "align_rigid", "clean_scan", "decimate",
-           "decimate_set", "fill_holes", "find_correspondences", "find_skeleton", "match_landmarks", "merge_views",
-           "read_landmark_vertices", "read_landmarks", "read_mesh", "read_points", "register", "write_decimated_set",
-           "write_landmarks", "write_mesh"]
+           "RegistrationConfig", "SeedConfig", "Skeleton", "SkeletonConfig", "align_rigid", "clean_scan",
+           "decimate", "decimate_set", "fill_holes", "find_correspondences", "find_seeds", "find_skeleton",
+           "match_landmarks", "merge_views", "read_landmark_vertices", "read_landmarks", "read_mesh",
+           "read_points", "register", "write_decimated_set", "write_landmarks", "write_mesh"]
 
 
 def __getattr__(name: str) -> Any:

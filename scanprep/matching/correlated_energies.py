@@ -42,9 +42,9 @@ class PotentialConfig:
     turn: float = 0.4
     turn_weight: float = 3.0
     signature: float = 1.0
-    length_share: float = 0.12
-    length_floor: float = 0.008
-    lean: float = 0.3
+    length_share: float = 0.08
+    length_floor: float = 0.006
+    lean: float = 0.25
     direction: float = 0.3
     direction_weight: float = 1.0
     place_weight: float = 0.5
