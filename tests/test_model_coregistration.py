@@ -61,7 +61,7 @@ def scan_of(body, vertices, keep=None, seed=0):
     """Noisy points all over, or where `keep` says of points and normals."""
     rng = np.random.default_rng(seed)
     truth = body.with_vertices(vertices)
-    points, face, _ = truth.sample(6000, rng)
+    points, face, _ = truth.sample(3900, rng)
     chosen = np.ones(len(points), dtype=bool) if keep is None else keep(points, truth.face_normals[face])
     return (points + rng.normal(0, 5e-4, points.shape))[chosen]
 
