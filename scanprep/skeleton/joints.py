@@ -15,7 +15,7 @@ from .sides import mirror_pairs, reductions
 WEAK_CONTACT = 0.2               # of the longer borders of both parts: thighs that touch are not linked
 LOOP_SEPARATION = 1.5            # times the separation of parts: on a loop, closer ones are merged
 LEAST_PULL = 1e-4                # squared radians: turns below 0.01 say nothing about where a joint is
-PRIOR_WIDTH = 3.0                # of the border's radius: how far from its centroid a joint is expected
+PRIOR_WIDTH = 0.6                # of the border's radius: how far from its centroid a joint is expected
 
 
 def border_lengths(search: PartSearch, label: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -119,7 +119,8 @@ def to_tree(search: PartSearch, label: np.ndarray) -> tuple[np.ndarray, np.ndarr
             close = separation[cheapest] < LOOP_SEPARATION * search.config.separation
             joined = not sound or close
             at = cheapest if joined else number[sound[0]]
-            loops.append(Loop((label == pairs[at, 0], label == pairs[at, 1]), joined, len(loop), float(separation[at])))
+            both = label == pairs[at, 0], label == pairs[at, 1]
+            loops.append(Loop(both, bool(joined), len(loop), float(separation[at])))
             if joined:
                 break
             links = np.delete(links, np.unique([loop[sound[0]], image[loop[sound[0]]]]), axis=0)
@@ -137,25 +138,25 @@ def tree_of(search: PartSearch, label: np.ndarray, links: np.ndarray, count: int
         No part can be cut so that a tree remains, or on a symmetric body none of those in the middle.
     """
     while len(links) + 1 != count:
-        found = (_fewer if len(links) + 1 > count else _more)(search, label, count)
+        found = (fewer_parts if len(links) + 1 > count else more_parts)(search, label, count)
         if found is None:
             raise ValueError(f"parts: no tree of {count} parts was found, only one of {len(links) + 1}")
         label, links = found
     return label, links
 
 
-def _more(search: PartSearch, label: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray] | None:
+def more_parts(search: PartSearch, label: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray] | None:
     """The tree where the part that bends most is cut; it may have one part too many if two of them can be joined."""
     cuts = sorted((search.split(label, p) for p in range(int(label.max()) + 1)), key=lambda cut: -cut[1])
     for cut, apart in cuts:
         many = int(cut.max()) + 1
         links = without_weak(search, cut)
-        if apart > 0 and len(links) == many - 1 and (many <= count or _fewer(search, cut, count) is not None):
+        if apart > 0 and len(links) == many - 1 and (many <= count or fewer_parts(search, cut, count) is not None):
             return cut, links
     return None
 
 
-def _fewer(search: PartSearch, label: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray] | None:
+def fewer_parts(search: PartSearch, label: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray] | None:
     """The tree where the two linked parts are one whose union costs least, with not less than `count` parts."""
     many, partner = int(label.max()) + 1, search.sides.partners(label)
     pairs, _, extra = search.separations(label)

@@ -13,6 +13,8 @@ from scipy.sparse import coo_array, csr_array
 
 from ..geometry.mesh import Mesh
 
+CORE_ROUNDS = 3                  # of weights and motions
+RIGID = 1e-5                     # of the square root of the area: residuals below count as none
 NEWTON = 60                      # steps at most; few are needed unless the points of a set lie on a line
 
 
@@ -180,9 +182,11 @@ class PosedSurface:
                        W @ np.einsum("ni,ni->n", self.x, self.x), W @ self._yy)
 
     def core_motions(self, label: np.ndarray) -> Motions:
-        """Rigid motions (of parts (F,)) from the triangles that do not touch another part.
+        """Rigid motions (of parts (F,)) from the triangles that do not touch another part and move most rigidly.
 
-        At a border the surface follows both parts. A part that has little else is fitted as a whole.
+        At a border the surface follows both parts, and skin far from a bone slides over it: the waist with the thighs.
+        A part that has little else than border is fitted as a whole. Triangles count less the farther they are from
+        their part's motion, beside the median of the part (weights of Geman and McClure).
         """
         corner = self.mesh.faces
         low, high = np.full(len(self.x), label.max()), np.zeros(len(self.x), dtype=np.int64)
@@ -191,7 +195,14 @@ class PosedSurface:
             np.maximum.at(high, c, label)
         core = np.where((low == high)[corner].all(axis=1), self.face_weights, 0)
         share = np.bincount(label, core) / np.bincount(label, self.face_weights)
-        return fit_motions(self.moments(label, np.where((share > 0.3)[label], core, self.face_weights)))
+        core = np.where((share > 0.3)[label], core, self.face_weights)
+        sets = [np.flatnonzero((label == p) & (core > 0)) for p in range(label.max() + 1)]
+        motions = fit_motions(self.moments(label, core))
+        for _ in range(CORE_ROUNDS):
+            off = self.face_costs(motions)[np.arange(len(label)), label] / self.face_weights
+            typical = np.array([np.median(off[mine]) for mine in sets]) + RIGID**2 * self.area
+            motions = fit_motions(self.moments(label, core / (1 + off / typical[label])**2))
+        return motions
 
     def face_costs(self, motions: Motions) -> np.ndarray:
         """(F, P) square metres: what each triangle would cost under each motion, mean over the poses.

@@ -96,8 +96,8 @@ class PartSearch:
         """Rigid motions of the parts (the M-step)."""
         return fit_motions(self.surface.moments(label))
 
-    def alternate(self, label: np.ndarray, rounds: int) -> np.ndarray:
-        """Alternate labels and motions until the labels (F,) stay.
+    def alternate(self, label: np.ndarray, rounds: int, core: bool = False) -> np.ndarray:
+        """Alternate labels and motions until the labels (F,) stay; motions from the core of the parts if so wished.
 
         [Articulated]
         """
@@ -105,7 +105,7 @@ class PartSearch:
         for _ in range(rounds):
             label = np.unique(label, return_inverse=True)[1]
             motions = self.motions(label)
-            costs = s.face_costs(motions)
+            costs = s.face_costs(s.core_motions(label) if core else motions)
             moved = self.sides.relabel(costs, self.price(motions, 1.0), label, self.sides.partners(label))
             changed = s.face_weights[moved != label].sum()
             label = moved

@@ -7,13 +7,15 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ..geometry.mesh import Mesh, check_template
-from .bands import dissolve_bands
-from .joints import Loop, middle_part, place_joints, to_tree, tree_of, without_weak
+from .bands import dissolve_bands, passages
+from .joints import Loop, fewer_parts, middle_part, more_parts, place_joints, to_tree, tree_of, without_weak
 from .motions import PosedSurface
+from .names import names_by_symmetry
 from .parts import PartSearch, SkeletonConfig, find_parts
 from .symmetry import Symmetry, find_symmetry
 from .tree import Skeleton, reorder
 
+LEAST_GAIN = 0.005               # of the score: less is no improvement
 LOOSE = 0.85                     # of the energy: where sides let go find so much less, the body is not symmetric
 
 
@@ -128,8 +130,11 @@ def search_skeleton(template: Mesh, poses: np.ndarray, config: SkeletonConfig | 
     label, links = best.label, best.links
     if config.parts is not None:
         label, links, wanted = _of_count(best, surface, config)
+        label, links = _settled(best.search, label, links) if wanted else (label, links)
     joints = place_joints(best.search, label, surface.core_motions(label), links)
     skeleton = _assemble(template, label, links, joints)
+    if wanted:
+        skeleton = replace(skeleton, names=names_by_symmetry(template, skeleton, symmetry))
     ticks.finish()
     loops = tuple(OpenedLoop(_named(loop, skeleton), loop.joined, loop.length) for loop in best.loops)
     return SkeletonSearch(skeleton, loops, symmetry, wanted, tuple(run.energy for run in runs),
@@ -173,17 +178,47 @@ def _best_of(surface: PosedSurface, config: SkeletonConfig, symmetry: Symmetry |
     for _ in range(config.restarts):
         search = PartSearch(surface, config, symmetry, rng)
         label, links, loops = to_tree(search, dissolve_bands(search, find_parts(search)))
-        label, links = _settled(search, label, links)
-        energy = search.energy(label) / surface.area
-        score = np.log(energy + config.tolerance**2) + config.worth * (len(links) + 1)
-        runs.append(Restart(label, links, tuple(loops), energy, float(score), search))
+        label, links = _settled(search, *_improved(search, label, links))
+        runs.append(Restart(label, links, tuple(loops), search.energy(label) / surface.area, _score(search, label),
+                            search))
         ticks.tick()
     return sorted(runs, key=lambda run: run.score)
 
 
+def _score(search: PartSearch, label: np.ndarray) -> float:
+    """What is compared: the logarithm of the energy, and what every part must be worth."""
+    energy = search.energy(label) / search.surface.area
+    return float(np.log(energy + search.config.tolerance**2) + search.config.worth * (label.max() + 1))
+
+
+def _improved(search: PartSearch, label: np.ndarray, links: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Labels and links of a tree after parts were joined, and cut, as long as the score falls.
+
+    A cut that makes a mere band of skin does not count.
+    """
+    score = _score(search, label)
+    for _ in range(search.config.start):
+        many = int(label.max()) + 1
+        moves = (fewer_parts, max(many - 2, 1)), (more_parts, many + 2)
+        trials = (move(search, label, count) for move, count in moves)
+        for trial in trials:
+            if trial is None:
+                continue
+            moved = search.alternate(trial[0], rounds=4)
+            tree = without_weak(search, moved)
+            better = _score(search, moved)
+            if (len(tree) == moved.max() and better < score - LEAST_GAIN
+                    and (moved.max() < many or passages(search, moved)[0].max() < search.config.fading)):
+                label, links, score = moved, tree, better
+                break
+        else:
+            return label, links
+    return label, links
+
+
 def _settled(search: PartSearch, label: np.ndarray, links: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Labels and links of a tree after labels and motions alternated to the end, if it is still a tree of as many."""
-    moved = search.alternate(label, rounds=20)
+    """Labels and links of a tree after labels and core motions alternated to the end, if it still is that tree."""
+    moved = search.alternate(label, rounds=12, core=True)
     tree = without_weak(search, moved)
     return (moved, tree) if moved.max() == label.max() and len(tree) == len(links) else (label, links)
 

@@ -1,0 +1,196 @@
+"""Names for the parts of people, from the tree, its symmetry, and where the parts lie."""
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from ..geometry.mesh import Mesh
+from .symmetry import Symmetry, find_symmetry
+from .tree import Skeleton
+
+ARM = {1: ("arm",), 2: ("upper_arm", "forearm"), 3: ("upper_arm", "forearm", "hand")}
+LEG = {1: ("leg",), 2: ("thigh", "shin"), 3: ("thigh", "shin", "foot")}
+SHORT = 0.45                     # of the next segment: a first segment so short is a shoulder or hip, no upper arm
+UPRIGHT = 0.7                    # cosine: so far the legs go on where the trunk ends
+POINTING = 0.04                  # of the leg's length: so far forward of the ankle the middle of the sole lies
+SOLE, ANKLE = 0.05, (0.12, 0.22)                 # of the leg's length from its end
+
+
+def name_parts(template: Mesh, skeleton: Skeleton, up: np.ndarray | None = None) -> tuple[str, ...]:
+    """Names of the parts of a person: pelvis, abdomen, chest, head, upper_arm_left, ..., foot_right.
+
+    A body counts as a person if it is symmetric with a tree that is, the parts in the middle form one chain that
+    ends in a head, one pair of limbs hangs at its other end and one further up, every limb is a chain, and the legs go
+    on where the trunk ends, as on somebody who stands. Left and right follow from the feet, whose soles are taken to
+    reach forward from the ankles. Any other body keeps the names it has.
+
+    Parameters
+    ----------
+    template : Mesh
+    skeleton : Skeleton
+    up : (3,) float, optional
+        Direction of the sky; then a person must also stand on the feet in it.
+
+    Returns
+    -------
+    tuple of J strings
+    """
+    return names_by_symmetry(template, skeleton, find_symmetry(template), up)
+
+
+def names_by_symmetry(template: Mesh, skeleton: Skeleton, symmetry: Symmetry, up: np.ndarray | None = None
+                      ) -> tuple[str, ...]:
+    """`name_parts` where the symmetry is known."""
+    person = _person(template, skeleton, symmetry) if symmetry.holds else None
+    if person is None or (up is not None and np.asarray(up, dtype=np.float64) @ person.up <= 0):
+        return skeleton.names
+    left = _left(template, skeleton, person)
+    if left is None:
+        return skeleton.names
+    names = dict(zip(person.spine, _spine_names(person), strict=True))
+    for limbs, kinds, first in ((person.arms, ARM, "shoulder"), (person.legs, LEG, "hip")):
+        for limb in limbs:
+            side = "left" if (_middle(template, skeleton, limb) - person.centre) @ left > 0 else "right"
+            for part, name in zip(limb, _limb_names(skeleton, limb, kinds, first), strict=True):
+                names[part] = f"{name}_{side}"
+    return tuple(names[p] for p in range(len(skeleton.parents)))
+
+
+@dataclass(frozen=True, eq=False)
+class _Person:
+    """The chain in the middle, pelvis first, the limbs as chains of parts, the way up and the middle of the pelvis."""
+
+    spine: list[int]
+    arms: list[list[int]]
+    legs: list[list[int]]
+    chest: int
+    up: np.ndarray
+    centre: np.ndarray
+
+
+def part_partners(template: Mesh, skeleton: Skeleton, symmetry: Symmetry) -> np.ndarray | None:
+    """(J,) the part that holds most of each part's mirror image; None if that pairs no parts or breaks the tree."""
+    J, part = len(skeleton.parents), skeleton.part_of_face
+    table = np.zeros((J, J))
+    np.add.at(table, (part, part[symmetry.partner]), template.face_areas)
+    partner = (table + table.T).argmax(axis=1)
+    tree = {frozenset(link) for link in zip(range(1, J), skeleton.parents[1:].tolist(), strict=True)}
+    mirrored = {frozenset(partner[list(link)].tolist()) for link in tree}
+    return partner if (partner[partner] == np.arange(J)).all() and tree == mirrored else None
+
+
+def _person(template: Mesh, skeleton: Skeleton, symmetry: Symmetry) -> _Person | None:
+    """What makes the body a person, None if it is none."""
+    partner = part_partners(template, skeleton, symmetry)
+    if partner is None:
+        return None
+    near = _neighbours(skeleton)
+    middle = [p for p in range(len(partner)) if partner[p] == p]
+    along = {p: [q for q in near[p] if partner[q] == q] for p in middle}
+    limbs = [(p, chain) for p in middle for q in near[p] if partner[q] != q and (chain := _chain(near, p, q))]
+    hung = {p for p, _ in limbs}
+    tips = [p for p in middle if len(along[p]) == 1 and p not in hung]
+    if (len(limbs) != 4 or len(tips) != 1 or max(len(q) for q in along.values()) > 2
+            or len(middle) + sum(len(chain) for _, chain in limbs) != len(partner)):
+        return None
+    spine = _chain(along, -1, tips[0])[::-1]                                  # from the far end to the head
+    reach = [spine.index(p) for p, _ in limbs]
+    neck = _joint(skeleton, spine[-1], spine[-2])
+    roots = np.array([_joint(skeleton, chain[0], p) for p, chain in limbs])
+    order = np.lexsort((-np.linalg.norm(roots - neck, axis=1), reach))    # legs first: far from the neck
+    legs, arms = [limbs[i][1] for i in order[:2]], [limbs[i][1] for i in order[2:]]
+    if {partner[legs[0][0]], partner[arms[0][0]]} != {legs[1][0], arms[1][0]} or min(reach) != 0:
+        return None
+    hips = roots[order[:2]].mean(axis=0)
+    up = (neck - hips) / np.linalg.norm(neck - hips)
+    down = np.mean([_end(template, skeleton, leg) for leg in legs], axis=0) - hips
+    if down @ up > -UPRIGHT * np.linalg.norm(down):
+        return None
+    return _Person(spine, arms, legs, limbs[order[2]][0], up, hips)
+
+
+def _neighbours(skeleton: Skeleton) -> dict[int, list[int]]:
+    near: dict[int, list[int]] = {p: [] for p in range(len(skeleton.parents))}
+    for child, parent in enumerate(skeleton.parents.tolist()):
+        if parent >= 0:
+            near[child].append(parent)
+            near[parent].append(child)
+    return near
+
+
+def _chain(near: dict[int, list[int]], before: int, first: int) -> list[int]:
+    """The parts from `first` on away from `before`; empty where they branch."""
+    chain, last = [first], before
+    while ahead := [q for q in near[chain[-1]] if q != last]:
+        if len(ahead) > 1:
+            return []
+        last = chain[-1]
+        chain.append(ahead[0])
+    return chain
+
+
+def _joint(skeleton: Skeleton, a: int, b: int) -> np.ndarray:
+    """The joint between two linked parts."""
+    return skeleton.joints[a if skeleton.parents[a] == b else b]
+
+
+def _points(template: Mesh, skeleton: Skeleton, parts: list[int]) -> tuple[np.ndarray, np.ndarray]:
+    """Centres (n, 3) and areas (n,) of the triangles of some parts."""
+    mine = np.isin(skeleton.part_of_face, parts)
+    return template.corners[mine].mean(axis=1), template.face_areas[mine]
+
+
+def _middle(template: Mesh, skeleton: Skeleton, parts: list[int]) -> np.ndarray:
+    points, areas = _points(template, skeleton, parts)
+    return areas @ points / areas.sum()
+
+
+def _end(template: Mesh, skeleton: Skeleton, limb: list[int]) -> np.ndarray:
+    """The point of a limb's last part farthest from where the limb begins."""
+    points, _ = _points(template, skeleton, limb[-1:])
+    parent = skeleton.parents[limb[0]]
+    start = skeleton.joints[limb[0]] if parent not in limb else _middle(template, skeleton, limb[:1])
+    return points[np.linalg.norm(points - start, axis=1).argmax()]
+
+
+def _left(template: Mesh, skeleton: Skeleton, person: _Person) -> np.ndarray | None:
+    """The direction (3,) to the person's left: up × front, front where the soles reach; None if that is not clear."""
+    front, length = np.zeros(3), 0.0
+    for leg in person.legs:
+        points, areas = _points(template, skeleton, leg)
+        height = points @ person.up
+        bottom, size = height.min(), np.ptp(height)
+        sole = height < bottom + SOLE * size
+        ankle = (height > bottom + ANKLE[0] * size) & (height < bottom + ANKLE[1] * size)
+        if not sole.any() or not ankle.any():
+            return None
+        front += (np.average(points[sole], axis=0, weights=areas[sole])
+                  - np.average(points[ankle], axis=0, weights=areas[ankle])) / 2
+        length += size / 2
+    front -= person.up * (front @ person.up)
+    return np.cross(person.up, front) if np.linalg.norm(front) > POINTING * length else None
+
+
+def _spine_names(person: _Person) -> list[str]:
+    chest = person.spine.index(person.chest)
+    beyond = len(person.spine) - chest - 2                                    # between chest and head
+    trunk = (["trunk"] if chest == 0 else
+             ["pelvis", *([] if chest == 1 else ["abdomen"] if chest == 2 else
+                          [f"abdomen{k}" for k in range(1, chest)]), "chest"])
+    return [*trunk, *([] if beyond == 0 else ["neck"] if beyond == 1 else [f"neck{k + 1}" for k in range(beyond)]),
+            "head"]
+
+
+def _limb_names(skeleton: Skeleton, limb: list[int], kinds: dict[int, tuple[str, ...]], first: str) -> tuple[str, ...]:
+    """Names from the body outwards; limbs with more segments than are known are numbered."""
+    n = len(limb)
+    places = [_joint(skeleton, a, b) for a, b in zip(limb[1:], limb, strict=False)]
+    if n in (3, 4) and len(places) > 1 and skeleton.parents[limb[0]] not in limb:
+        lengths = np.linalg.norm(np.diff([skeleton.joints[limb[0]], *places], axis=0), axis=1)
+        if lengths[0] < SHORT * lengths[1]:
+            return first, *kinds[n - 1]
+    if n in kinds:
+        return kinds[n]
+    whole = kinds[1][0]
+    return tuple(f"{whole}{k + 1}" for k in range(n))
