@@ -26,6 +26,7 @@ COMMANDS = {
     "run": ("Scans -> registered set with a skeleton; goes on where it was interrupted.", "scanprep.batch.cli:run_all"),
     "page": ("The page of a registered set: every scan with pictures and figures, worst first.",
              "scanprep.batch.cli:page"),
+    "clean": ("Floor, furniture and specks off a raw scan.", "scanprep.cleaning.cli:clean"),
     "template": ("Range views with known cameras -> a closed template.", "scanprep.cleaning.cli:template_of_views"),
     "views": ("Refine the rough poses of range views.", "scanprep.cleaning.cli:align_cameras"),
     "merge": ("Range views with known cameras -> one surface.", "scanprep.cleaning.cli:merge"),

@@ -109,7 +109,7 @@ def prepare(tasks: Sequence[ScanTask], template: Mesh, template_landmarks: dict[
         write_landmarks(folder / "landmarks.json", {name: int(v) for name, v in template_landmarks.items()})
         run = _Run(registered, tasks, progress or (lambda done, total: None))
         try:
-            run.register(_outcomes(run.wanted, Work(template, template_landmarks, config.scan), config))
+            run.register(_outcomes(run.wanted, _work(template, template_landmarks, config), config))
             run.registered = _with_skeleton(run.registered.in_order(), config, skeleton_progress)
         finally:
             write_set_page(folder)
@@ -171,6 +171,11 @@ def _outcomes(tasks: Sequence[ScanTask], work: Work, config: PrepareConfig) -> I
     from .batch.cluster import run_on_cluster
 
     return run_on_cluster(config.scheduler, work, tasks, config.ship)
+
+
+def _work(template: Mesh, template_landmarks: dict[str, int], config: PrepareConfig) -> Work:
+    """What the scans have in common, without what the template has worked out about itself: it is sent around."""
+    return Work(Mesh(template.vertices, template.faces, template.colors), template_landmarks, config.scan)
 
 
 def _open_set(folder: Path, template: Mesh, config: PrepareConfig) -> RegisteredSet:

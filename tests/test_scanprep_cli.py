@@ -11,9 +11,10 @@ from scan_folders import MARKS, QUICK, ball, write_scans
 from scipy.spatial.transform import Rotation
 
 from completion.__main__ import main
-from scanprep import RegisteredSet, Skeleton, read_mesh, write_landmarks, write_mesh
+from scanprep import Mesh, RegisteredSet, Skeleton, read_mesh, read_points, write_landmarks, write_mesh
 from scanprep.batch import cli as batch_cli
 from scanprep.cli import COMMANDS
+from scanprep.geometry.files import PointCloud, write_points
 from scanprep.geometry.storage import StorageError
 from scanprep.matching.correspondence_files import read_correspondences, write_correspondences
 from scanprep.matching.correspondences import Correspondences
@@ -161,6 +162,19 @@ def test_decimate_set(place, tmp_path):
     assert small.skeleton.names == whole.skeleton.names
     kept = {tuple(v) for v in whole.vertices(["body1"])[0].round(9)}
     assert {tuple(v) for v in small.vertices(["body1"])[0].round(9)} <= kept
+
+
+def test_clean(tmp_path):
+    body = ball()
+    specks = ball(0).with_vertices(ball(0).vertices * 0.02 + [1, 1, 0])
+    raw = Mesh(np.vstack([body.vertices, specks.vertices]), np.vstack([body.faces, specks.faces + 642]))
+    write_mesh(tmp_path / "raw.ply", raw)
+    assert run("clean", tmp_path / "raw.ply", "-o", tmp_path / "body.ply") == 0
+    np.testing.assert_array_equal(read_mesh(tmp_path / "body.ply").vertices, body.vertices)
+    write_points(tmp_path / "raw.xyz", PointCloud(raw.vertices, None, None))
+    assert run("clean", tmp_path / "raw.xyz", "-o", tmp_path / "body.xyz") == 0
+    assert len(read_points(tmp_path / "body.xyz").points) == 642
+    assert report(tmp_path / "body.report.json")["points before"] == 654
 
 
 def test_fill(tmp_path):

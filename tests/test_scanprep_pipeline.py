@@ -2,6 +2,7 @@
 import dataclasses
 import json
 import os
+import pickle
 import shutil
 import signal
 import subprocess
@@ -13,12 +14,13 @@ import numpy as np
 import pytest
 from scan_folders import MARKS, QUICK, WITH_PICTURES, ball, contents, write_scans
 
-from scanprep import Mesh, RegisteredSet
+from scanprep import Mesh, RegisteredSet, read_mesh, write_mesh
 from scanprep.batch import cluster
 from scanprep.batch.figures import read_figures
 from scanprep.batch.lock import locked
 from scanprep.batch.scan import one_thread
 from scanprep.batch.workers import Work, run_in_processes
+from scanprep.cleaning.components import CleanScanConfig
 from scanprep.pipeline import ScanTask, find_scans, prepare
 
 
@@ -184,13 +186,13 @@ def test_a_cluster_changes_nothing(six, template, tmp_path, processes, ship):
 
 
 def test_shipped_files_need_no_folder(scans, template):
-    task = find_scans(scans)[0]
-    files, work = cluster._files(task), Work(template, MARKS, QUICK.scan)
+    task, work = find_scans(scans)[0], Work(template, MARKS, QUICK.scan)
+    files, shared = cluster._files(task), pickle.dumps((work, cluster._versions()))
     there = dataclasses.replace(task, scan=Path("/no/such/body0.ply"), landmarks=Path("/no/such/body0.landmarks.json"))
-    shipped = cluster._on_worker(work, there, files, cluster._versions())
+    shipped = cluster.do_there(shared, pickle.dumps((there, files)))
     np.testing.assert_array_equal(shipped.vertices, work.do(task).vertices)
     files[task.scan.name] = files[task.scan.name][:-9]
-    failed = cluster._on_worker(work, there, files, cluster._versions())
+    failed = cluster.do_there(shared, pickle.dumps((there, files)))
     assert failed.startswith("/no/such/body0.ply: ")
 
 
@@ -202,9 +204,19 @@ def test_no_scheduler(scans, template, tmp_path, monkeypatch):
 
 
 def test_workers_of_another_version(scans, template):
-    task = find_scans(scans)[0]
+    shared = pickle.dumps((Work(template, MARKS, QUICK.scan), {"scapekit": "0.0.0", "numpy": "1"}))
     with pytest.raises(RuntimeError, match="the worker has scapekit"):
-        cluster._on_worker(Work(template, MARKS, QUICK.scan), task, None, {"scapekit": "0.0.0", "numpy": "1"})
+        cluster.do_there(shared, pickle.dumps((find_scans(scans)[0], None)))
+
+
+def test_a_scheduler_needs_nothing_of_ours():
+    """It unpacks the function and its arguments; ours would have to be installed there too."""
+    import cloudpickle
+
+    code = f"import pickle, sys\npickle.loads({cloudpickle.dumps(cluster._entrance())!r})\nassert not any(" \
+           "name.split('.')[0] == 'scanprep' for name in sys.modules)"
+    done = subprocess.run([sys.executable, "-c", code], cwd="/", capture_output=True, text=True)
+    assert done.returncode == 0, done.stderr
 
 
 class Deadly(Work):
@@ -263,6 +275,18 @@ def test_what_leads_the_template(scans, template, tmp_path):
     assert asked.registered.names == ("body1", "body2") and "body0" in asked.failures[0]
     near = prepare(find_scans(scans)[:2], template, {}, tmp_path / "near", settings["pose"])
     assert [f.guide for f in near.figures] == ["pose", "pose"] and np.isnan(near.figures[0].landmarks)
+
+
+def test_clutter_is_cleaned_off_when_asked(scans, template, tmp_path):
+    body = read_mesh(scans / "body0.ply")
+    chair = body.with_vertices(body.vertices * 0.2 + [2, 2, 2])
+    write_mesh(scans / "body0.ply", Mesh(np.vstack([body.vertices, chair.vertices]),
+                                         np.vstack([body.faces, chair.faces + 642])))
+    asked = dataclasses.replace(QUICK, scan=dataclasses.replace(QUICK.scan, clean=CleanScanConfig()))
+    plain = prepare(find_scans(scans)[:1], template, MARKS, tmp_path / "plain", QUICK).figures[0]
+    clean = prepare(find_scans(scans)[:1], template, MARKS, tmp_path / "clean", asked).figures[0]
+    assert (plain.removed, clean.removed) == (0, 0.5)
+    assert plain.missed == pytest.approx(0.5, abs=0.01) and clean.missed == 0
 
 
 def test_other_settings_or_template_in_the_folder(scans, template, tmp_path):

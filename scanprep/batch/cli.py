@@ -9,6 +9,7 @@ from typing import Annotated
 import numpy as np
 import tyro
 
+from ..cleaning.components import CleanScanConfig
 from ..cli import MM, Output, SetArg, Unit, landmarks_beside
 from ..console import Metric, Outcome, bar, say
 from ..geometry.files import read_mesh
@@ -26,9 +27,9 @@ LISTED = 5                    # scans that the closing table names
 
 
 def run_all(scans: ScansArg, template: Path, output: Output, landmarks: Path | None = None,
-            template_landmarks: Path | None = None, guide: Guide = "best", subject: str = "",
-            unit: Unit | None = None, min_poses: int = PrepareConfig.min_poses, workers: int = PrepareConfig.workers,
-            scheduler: str | None = None, ship: bool = False) -> Outcome:
+            template_landmarks: Path | None = None, guide: Guide = "best", clean: bool = False,
+            subject: str = "", unit: Unit | None = None, min_poses: int = PrepareConfig.min_poses,
+            workers: int = PrepareConfig.workers, scheduler: str | None = None, ship: bool = False) -> Outcome:
     """Register a template to every scan of a folder, find the skeleton, and write a page of all scans, worst first.
 
     Killed and started again it goes on where it was; scans whose files have changed are registered anew.
@@ -43,6 +44,7 @@ def run_all(scans: ScansArg, template: Path, output: Output, landmarks: Path | N
         template_landmarks: Landmarks of the template; else the file of its name beside it.
         guide: What leads the template to a scan: its landmarks, or only its pose, which must then be near the
             template's; best takes landmarks where there are some.
+        clean: Take floor, furniture and specks off each scan before.
         subject: Whose scans they are, where scans.csv does not say; else each is a person of its own.
         unit: Unit of the scans and landmarks, where the files cannot tell.
         min_poses: A skeleton is sought when one subject has at least so many scans.
@@ -52,8 +54,8 @@ def run_all(scans: ScansArg, template: Path, output: Output, landmarks: Path | N
     """
     body, tasks = read_mesh(template), find_scans(scans, landmarks, subject)
     marks = _template_marks(template, template_landmarks, body, tasks, guide)
-    config = PrepareConfig(ScanSettings(unit=unit, guide=guide), min_poses=min_poses, workers=workers,
-                           scheduler=scheduler, ship=ship)
+    settings = ScanSettings(unit=unit, guide=guide, clean=CleanScanConfig() if clean else None)
+    config = PrepareConfig(settings, min_poses=min_poses, workers=workers, scheduler=scheduler, ship=ship)
     with bar("registering scans") as registering, bar("finding the skeleton") as finding:
         done = prepare(tasks, body, marks, output, config, registering, finding)
     return Outcome(output, [*_progress_made(done, tasks), *_quality(output, done.figures),

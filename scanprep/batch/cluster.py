@@ -3,8 +3,10 @@ from __future__ import annotations
 
 import contextlib
 import importlib.metadata
+import pickle
 import tempfile
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import CancelledError
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -47,26 +49,38 @@ def run_on_cluster(address: str, work: Work, tasks: Sequence[ScanTask], ship: bo
                          f"({' '.join(str(error).split())})") from None
     with client:
         _await_workers(client, address)
-        shared = client.scatter(work, broadcast=True)
-        waiting = iter(range(len(tasks)))
-        number: dict[Any, int] = {}
+        # a task that gives its argument back: unlike scattered data it is made anew where all copies are lost
+        shared = client.submit(bytes, pickle.dumps((work, _versions())), pure=False)
+        there = _entrance()
+        waiting = iter(tasks)
+        task_of: dict[Any, ScanTask] = {}
         running = as_completed([], loop=client.loop)
 
         def submit() -> None:
             """The next task; few at a time, so that shipped files do not pile up at the scheduler."""
-            for i in waiting:
-                files = _files(tasks[i]) if ship else None
-                future = client.submit(_on_worker, shared, tasks[i], files, _versions(), pure=False)
-                number[future] = i
+            for task in waiting:
+                future = client.submit(there, shared, pickle.dumps((task, _files(task) if ship else None)), pure=False)
+                task_of[future] = task
                 running.add(future)
                 return
 
         for _ in range(2 * sum(client.nthreads().values())):
             submit()
         for future in running:
-            i = number.pop(future)
+            task = task_of.pop(future)
             submit()
-            yield tasks[i], _outcome(future, tasks[i], address, KilledWorker)
+            yield task, _outcome(future, task, address, KilledWorker)
+
+
+def _entrance() -> Callable[[bytes, bytes], Outcome]:
+    """What is sent to the workers. Dask sends a function without a name of its own as code, and all else are
+    bytes, so that a scheduler needs nothing of ours."""
+    def there(shared: bytes, task: bytes) -> Outcome:
+        from scanprep.batch.cluster import do_there
+
+        return do_there(shared, task)
+
+    return there
 
 
 def _distributed() -> tuple[Any, Any, Any]:
@@ -85,7 +99,10 @@ def _await_workers(client: Any, address: str) -> None:
 
 
 def _outcome(future: Any, task: ScanTask, address: str, KilledWorker: type) -> Outcome:
-    error = future.exception()
+    try:
+        error = future.exception()
+    except CancelledError:
+        raise ValueError(f"scheduler: {address} has gone; what was done is kept, start again to go on") from None
     if error is None:
         return future.result()
     if isinstance(error, KilledWorker):
@@ -94,12 +111,23 @@ def _outcome(future: Any, task: ScanTask, address: str, KilledWorker: type) -> O
                      f"{' '.join(str(error).split())}); expected {_described(_versions())} on every worker")
 
 
-def _on_worker(work: Work, task: ScanTask, files: dict[str, bytes] | None, versions: dict[str, str]) -> Outcome:
-    """One scan, on the machine of a worker."""
-    if _versions() != versions:
+def do_there(shared: bytes, packed: bytes) -> Outcome:
+    """One scan, on the machine of a worker.
+
+    Raises
+    ------
+    RuntimeError
+        Other versions here than where the work comes from.
+    """
+    work, versions = pickle.loads(shared)
+    if versions != _versions():
         raise RuntimeError(f"the worker has {_described(_versions())}")
-    if files is None:
-        return work.do(task)
+    task, files = pickle.loads(packed)
+    return work.do(task) if files is None else _unpacked(work, task, files)
+
+
+def _unpacked(work: Work, task: ScanTask, files: dict[str, bytes]) -> Outcome:
+    """One scan whose files came along."""
     with tempfile.TemporaryDirectory() as folder:
         for name, data in files.items():
             Path(folder, name).write_bytes(data)

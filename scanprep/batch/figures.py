@@ -41,6 +41,8 @@ class ScanFigures:
     flipped : int
         Triangles that face against their surroundings.
     converged : bool
+    removed : float
+        Share of the scan's points that were cleaned off before.
     inputs : str
         Fingerprint of the files of the scan.
     seconds : float
@@ -58,6 +60,7 @@ class ScanFigures:
     landmarks: float
     flipped: int
     converged: bool
+    removed: float = 0.0
     inputs: str = ""
     seconds: float = np.nan
 

@@ -22,7 +22,7 @@ main { max-width: 76rem; }
 .scan h3 { grid-column: 1 / -1; margin: 0; font-size: 1.08rem; }
 .scan h3 small { font-weight: 400; color: var(--soft); margin-left: .6rem; }
 .scan ul { grid-column: 1 / -1; margin: .1rem 0 .5rem; padding: 0; list-style: none; font-size: .95rem; }
-.scan li { display: inline-block; margin-right: 1.1rem; }
+.scan li { display: inline-block; margin-right: 1.1rem; overflow-wrap: anywhere; }
 .scan img { background: #fff; border-radius: 8px; width: 100%; }
 .scan .panels { display: grid; grid-auto-flow: column; grid-auto-columns: 1fr; color: var(--soft); font-size: .82rem;
   text-align: center; }
@@ -139,6 +139,8 @@ def _card(folder: Path, verdict: Verdict, entry: SetEntry | None) -> str:
         shown = (f'<div><img src="{data_uri(path.read_bytes())}" alt="{escape(verdict.name)}: {", ".join(PANELS)}" '
                  f'width="{WIDTH * len(PANELS)}" height="{HEIGHT}" loading="lazy" decoding="async">'
                  f'<div class="panels">{labels}</div></div>')
+    if verdict.figures and verdict.figures.removed:
+        about += f" · {100 * verdict.figures.removed:.0f}% of the points cleaned off"
     table = _figure_table(verdict.figures) if verdict.figures else ""
     return (f'<section class="scan {_mark(verdict)}" id="{_anchor(verdict)}"><h3><span class="dot"></span>'
             f"{escape(verdict.name)} <small>{badness}</small><small>{escape(about)}</small></h3>"

@@ -5,11 +5,12 @@ import contextlib
 import threading
 import time
 from collections.abc import Iterator
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, Literal
 
 import numpy as np
 
+from ..cleaning.components import CleanScanConfig, clean_scan
 from ..geometry.landmarks import match_landmarks, read_landmarks
 from ..geometry.mesh import Mesh
 from ..matching.nonrigid import Registration, RegistrationConfig, register
@@ -34,6 +35,8 @@ class ScanSettings:
     guide : 'best', 'landmarks' or 'pose'
         What leads the template to the scan: its landmark file (a scan without is a failure), or nothing but the
         pose, which must be near that of the template; 'best' takes landmarks where there are some.
+    clean : CleanScanConfig, optional
+        Take floor, furniture and specks off the scan before.
     pictures : bool
         Take a picture for the page of the set.
     """
@@ -41,6 +44,7 @@ class ScanSettings:
     registration: RegistrationConfig = field(default_factory=RegistrationConfig)
     unit: str | None = None
     guide: Guide = "best"
+    clean: CleanScanConfig | None = None
     pictures: bool = True
 
 
@@ -75,6 +79,7 @@ def register_scan(task: ScanTask, template: Mesh, template_landmarks: dict[str, 
     with one_thread():
         scan = read_scan(task.scan, settings.unit)
         landmarks = _landmarks(task, scan, template_landmarks, settings)
+        scan, removed = _cleaned(scan, landmarks, settings.clean)
         fit = register(template, scan, landmarks, settings.registration)
         picture = b""
         if settings.pictures:
@@ -82,7 +87,9 @@ def register_scan(task: ScanTask, template: Mesh, template_landmarks: dict[str, 
 
             picture = strip(template, scan, fit)
     guide = f"{len(landmarks[0])} landmarks" if landmarks is not None else "pose"
-    return RegisteredScan(fit.mesh.vertices, _measure(task, template, scan, fit, guide, start), picture)
+    figures = _measure(task, template, scan, fit, guide)
+    return RegisteredScan(fit.mesh.vertices, replace(figures, removed=removed, seconds=time.perf_counter() - start),
+                          picture)
 
 
 def attempt(task: ScanTask, template: Mesh, template_landmarks: dict[str, int], settings: ScanSettings
@@ -111,14 +118,21 @@ def _landmarks(task: ScanTask, scan: Mesh | np.ndarray, template_landmarks: dict
         raise ValueError(f"{task.landmarks}: {error}") from None
 
 
-def _measure(task: ScanTask, template: Mesh, scan: Mesh | np.ndarray, fit: Registration, guide: str, start: float
-             ) -> ScanFigures:
+def _cleaned(scan: Mesh | np.ndarray, landmarks: Landmarks | None, config: CleanScanConfig | None
+             ) -> tuple[Mesh | np.ndarray, float]:
+    """The body alone, and the share of points that were taken off."""
+    if config is None:
+        return scan, 0.0
+    found = clean_scan(scan, config, None if landmarks is None else landmarks[1])
+    return found.scan, 1 - float(found.kept.mean())
+
+
+def _measure(task: ScanTask, template: Mesh, scan: Mesh | np.ndarray, fit: Registration, guide: str) -> ScanFigures:
     size = float(np.sqrt(template.face_areas.sum()))
     return ScanFigures(
         task.name, guide, float(np.nanmean(fit.distances)) if fit.seen.any() else np.nan, fit.rms,
         float(fit.seen.mean()), float(fit.seen.mean()), missed_share(scan, fit.mesh, FAR * size),
-        stretched_share(template, fit.mesh), fit.landmark_rms, fit.flipped, fit.converged, task.fingerprint(),
-        time.perf_counter() - start)
+        stretched_share(template, fit.mesh), fit.landmark_rms, fit.flipped, fit.converged, 0.0, task.fingerprint())
 
 
 _guard = threading.Lock()

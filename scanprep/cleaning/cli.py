@@ -7,14 +7,16 @@ from typing import Annotated
 import numpy as np
 import tyro
 
-from ..cli import MM, MeshArg, Output, SetArg, Unit, about_mesh
+from ..batch.tasks import read_scan
+from ..cli import MM, MeshArg, Output, ScanArg, SetArg, Unit, about_mesh
 from ..console import Metric, Outcome, bar, read_json
 from ..dataset import RegisteredSet
 from ..geometry import storage
-from ..geometry.files import UNITS, list_meshes, read_mesh, write_mesh
-from ..geometry.landmarks import read_landmark_vertices
+from ..geometry.files import UNITS, PointCloud, list_meshes, read_mesh, write_mesh, write_points
+from ..geometry.landmarks import read_landmark_vertices, read_landmarks
 from ..geometry.mesh import Mesh
 from .align_views import AlignViewsConfig, align_views
+from .components import CleanScanConfig, clean_scan
 from .decimate import DecimateConfig, decimate
 from .decimate_set import DecimateSetConfig
 from .decimate_set_files import write_decimated_set
@@ -43,6 +45,33 @@ def template_of_views(views: ViewsArg, output: Output, cameras: Path | None = No
         made = make_template(seen, faces, progress=progress)
     write_mesh(output, made)
     return Outcome(output, [Metric("views", len(seen)), *about_mesh(made)])
+
+
+def clean(scan: ScanArg, output: Output, landmarks: Path | None = None, unit: Unit | None = None,
+          config: Annotated[CleanScanConfig, tyro.conf.arg(name="")] = CleanScanConfig()) -> Outcome:  # noqa: B008
+    """Keep the body of a raw scan; floor, furniture and specks go.
+
+    Example: scape prep clean raw.ply -o body.ply
+
+    Args:
+        scan: Mesh or point cloud.
+        output: File to write, a mesh or a point cloud as the scan is.
+        landmarks: Landmarks of the scan, where the body is not its largest piece.
+        unit: Unit of the scan and its landmarks.
+        config: Settings.
+    """
+    raw = read_scan(scan, unit)
+    mesh = raw if isinstance(raw, Mesh) else None
+    marks = np.array(list(read_landmarks(landmarks, mesh, unit).values())) if landmarks else None
+    found = clean_scan(raw, config, marks)
+    if isinstance(found.scan, Mesh):
+        write_mesh(output, found.scan)
+    else:
+        write_points(output, PointCloud(found.scan, None, None))
+    return Outcome(output, [
+        Metric("points before", len(found.kept)), Metric("points", int(found.kept.sum())),
+        *(Metric(f"{'kept' if piece.kept else 'dropped'}: {piece.reason}", piece.points, "points")
+          for piece in found.components)], {"clean": config})
 
 
 def align_cameras(views: ViewsArg, output: Output, cameras: Path | None = None, unit: Unit | None = None,
