@@ -9,6 +9,7 @@ from scipy.spatial import cKDTree
 from ..geometry.mesh import Mesh
 from ..geometry.surface import OrientedPoints
 from .energies import Pull, pull
+from .thinning import thin
 
 
 @dataclass(frozen=True, eq=False)
@@ -22,17 +23,21 @@ class Target:
         On the edge of a hole: such a point says where data end, not where the surface is.
     oriented : bool
         Whether the normals are known to point outward.
+    marks : (n, q) float, optional
+        Where a point lies on the body (see `paths.path_marks`).
     """
 
     points: np.ndarray
     normals: np.ndarray
     border: np.ndarray
     oriented: bool
+    marks: np.ndarray | None = None
 
     def thinned(self, cell: float) -> Target:
         """One point for each cubic cell (metres)."""
         keep = thin(self.points, cell)
-        return Target(self.points[keep], self.normals[keep], self.border[keep], self.oriented)
+        return Target(self.points[keep], self.normals[keep], self.border[keep], self.oriented,
+                      None if self.marks is None else self.marks[keep])
 
 
 def target_of(scan: Mesh | np.ndarray, neighbours: int = 16, name: str = "scan") -> Target:
@@ -77,13 +82,6 @@ def _one_sided(points: np.ndarray, near: np.ndarray, limit: float = 0.3) -> np.n
     return np.linalg.norm(offset.mean(axis=1), axis=1) > limit * reach
 
 
-def thin(points: np.ndarray, cell: float) -> np.ndarray:
-    """Indices of one point for each cubic cell (metres) that holds any: even density, and less work."""
-    key = np.floor((points - points.min(axis=0)) / cell).astype(np.int64)
-    key = (key[:, 0] * (key[:, 1].max() + 1) + key[:, 1]) * (key[:, 2].max() + 1) + key[:, 2]
-    return np.sort(np.unique(key, return_index=True)[1])
-
-
 @dataclass(frozen=True, eq=False)
 class Matching:
     """What matches want of the vertices, and how far those with data are from them.
@@ -108,15 +106,36 @@ def orient(target: Target, deformed: Mesh, scale: float) -> Target:
         return target
     tree = OrientedPoints(deformed.vertices, deformed.vertex_normals, scale)
     cost = []
-    for sign in (1, -1):
-        index = tree.match(target.points, sign * target.normals, min_cosine=-1.0).index
+    for way in (1, -1):
+        index = tree.match(target.points, way * target.normals, min_cosine=-1.0).index
         apart = ((tree.points[index] - target.points) ** 2).sum(axis=1)
-        cost.append(apart + scale**2 * ((tree.normals[index] - sign * target.normals) ** 2).sum(axis=1))
-    return replace(target, normals=np.where(cost[0] <= cost[1], 1, -1)[:, None] * target.normals)
+        cost.append(apart + scale**2 * ((tree.normals[index] - way * target.normals) ** 2).sum(axis=1))
+    sign = np.where(cost[0] <= cost[1], 1, -1)[:, None]
+    return replace(target, normals=sign * target.normals)
+
+
+@dataclass(frozen=True)
+class Likeness:
+    """What a match is sought by, each as the distance in metres that a difference of one is worth.
+
+    Attributes
+    ----------
+    place : float
+        Of positions: 1, or less where the template does not lie near yet; 0 seeks by marks alone.
+    normals : float, metres
+    marks : float, metres
+    mark_limit : float
+        Marks that differ by more than this do not match.
+    """
+
+    place: float = 1.0
+    normals: float = 0.05
+    marks: float = 0.0
+    mark_limit: float = 0.3
 
 
 def match_both_ways(deformed: Mesh, sample: np.ndarray, area: float, target: Target, reach: float, slide: float,
-                    scale: float) -> Matching:
+                    like: Likeness, marks: np.ndarray | None = None) -> Matching:
     """Match template to scan and scan to template, and weigh the matches by their distance.
 
     Parameters
@@ -131,24 +150,60 @@ def match_both_ways(deformed: Mesh, sample: np.ndarray, area: float, target: Tar
         Matches farther apart than this do not count; the weight falls to zero towards it.
     slide : float
         Force along the surface as a share of the force across it.
-    scale : float, metres
-        How much distance opposite normals weigh, halved.
+    like : Likeness
+    marks : (N, q) float, optional
+        Of the template's vertices, to be compared with the target's.
     """
-    target = orient(target, deformed, scale)
+    target = orient(target, deformed, max(like.normals, 1e-6))
     x, normals, N = deformed.vertices, deformed.vertex_normals, len(deformed.vertices)
-    forward = OrientedPoints(target.points, target.normals, scale).match(x[sample], normals[sample], reach)
-    good = forward.valid & ~target.border[forward.index]
-    v, p = sample[good], forward.index[good]
-    weights = area / len(sample) * _robust(forward.distances[good], reach)
+    mine = Described(x, normals, marks)
+    theirs = Described(target.points, target.normals, target.marks)
+    p, apart = mine.of(sample).matched(theirs, reach, like)
+    good = (p >= 0) & ~target.border[p]
+    v, p = sample[good], p[good]
+    weights = area / len(sample) * _robust(apart[good], reach)
     wanted = pull(N, v, target.points[p], weights, target.normals[p], slide)
     distances = np.full(N, np.nan)
     distances[v] = np.abs(np.einsum("nd,nd->n", target.normals[p], x[v] - target.points[p]))
 
-    backward = OrientedPoints(x, normals, scale).match(target.points, target.normals, reach)
-    p = np.flatnonzero(backward.valid)
-    weights = area / len(target.points) * _robust(backward.distances[p], reach)
-    wanted += pull(N, backward.index[p], target.points[p], weights, target.normals[p], slide)
+    chosen, apart = theirs.matched(mine, reach, like)
+    p = np.flatnonzero(chosen >= 0)
+    weights = area / len(target.points) * _robust(apart[p], reach)
+    wanted += pull(N, chosen[p], target.points[p], weights, target.normals[p], slide)
     return Matching(wanted, np.isfinite(distances), distances)
+
+
+@dataclass(frozen=True, eq=False)
+class Described:
+    """Points with what they are matched by."""
+
+    points: np.ndarray
+    normals: np.ndarray
+    marks: np.ndarray | None = None
+
+    def of(self, sample: np.ndarray) -> Described:
+        """Some of the points."""
+        return Described(self.points[sample], self.normals[sample],
+                         None if self.marks is None else self.marks[sample])
+
+    def columns(self, like: Likeness) -> np.ndarray:
+        parts = [like.place * self.points, like.normals * self.normals] if like.place else []
+        if like.marks and self.marks is not None:
+            parts.append(like.marks * self.marks)
+        return np.hstack(parts)
+
+    def matched(self, others: Described, reach: float, like: Likeness) -> tuple[np.ndarray, np.ndarray]:
+        """For each point the best of others, -1 where it is beyond the limits; and how far apart they are."""
+        workers = -1 if len(self.points) > 4000 else 1          # threads cost more than they save on few points
+        mine, theirs = self.columns(like), others.columns(like)
+        _, index = cKDTree(theirs).query(mine, workers=workers)
+        apart = np.linalg.norm(others.points[index] - self.points, axis=1)
+        good = apart <= reach
+        if like.place:
+            good &= np.einsum("nd,nd->n", others.normals[index], self.normals) >= 0.5
+        if like.marks and self.marks is not None and others.marks is not None:
+            good &= np.linalg.norm(others.marks[index] - self.marks, axis=1) <= like.mark_limit
+        return np.where(good, index, -1), apart
 
 
 def _robust(distances: np.ndarray, reach: float) -> np.ndarray:

@@ -10,18 +10,23 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from ..geometry.mesh import Mesh, check_template
+from .anchors import Hints, checked_landmarks, hints_of, mark_both, path_anchors, place_by_marks
+from .confidence import evidence
+from .correspondences import Correspondences
 from .descent import Stiffness, minimise
 from .energies import NodePattern, Pull, pull
 from .graph import build_graph, carry_over, deform, start, vertex_linear
-from .matches import Matching, Target, match_both_ways, target_of, thin
+from .matches import Likeness, Matching, Target, match_both_ways, target_of
 from .rigid import align_landmarks, align_rigid
 from .schedule import GraphStage, RegistrationConfig, ShellStage
+from .settle import SettleConfig, settle
 from .shell import Shell, flipped, unfold
+from .thinning import thin
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,7 +40,7 @@ class Registration:
     distances : (N,) float, metres
         From each vertex that was seen to the surface of the scan; NaN for the others.
     seen : (N,) bool
-        Whether there were data here.
+        Whether there were data here: the confidence is at least one half.
     rms : float, metres
         Of the distances of the vertices seen.
     landmark_rms : float, metres
@@ -47,6 +52,8 @@ class Registration:
         Value of each term at the end of the coarse registration, and of the data at the very end.
     flipped : int
         Triangles that face against their surroundings.
+    confidence : (N,) float
+        From 0, made up from the surroundings, to 1: there were data here, from both directions.
     """
 
     mesh: Mesh
@@ -58,11 +65,12 @@ class Registration:
     iterations: int
     energies: dict[str, float]
     flipped: int
+    confidence: np.ndarray
 
 
 def register(template: Mesh, scan: Mesh | np.ndarray, landmarks: tuple[np.ndarray, np.ndarray] | None = None,
-             config: RegistrationConfig | None = None, progress: Callable[[int, int], None] | None = None
-             ) -> Registration:
+             config: RegistrationConfig | None = None, progress: Callable[[int, int], None] | None = None,
+             correspondences: Correspondences | None = None) -> Registration:
     """Bring a template onto a scan.
 
     Parameters
@@ -75,6 +83,8 @@ def register(template: Mesh, scan: Mesh | np.ndarray, landmarks: tuple[np.ndarra
         Vertices of the template and where they are on the scan. Needed wherever the pose differs much.
     progress : callable, optional
         Called as progress(done, total).
+    correspondences : Correspondences, optional
+        Hints, some of which may be wrong: they draw softly, and less the farther they are from all others.
 
     Returns
     -------
@@ -90,12 +100,15 @@ def register(template: Mesh, scan: Mesh | np.ndarray, landmarks: tuple[np.ndarra
     check_template(template)
     target = target_of(scan, config.neighbours)
     if landmarks is not None:
-        landmarks = _checked(template, landmarks)
-    fit = _Fit(template, target, landmarks, config, progress or (lambda done, total: None))
-    for stage in config.graph:
+        landmarks = checked_landmarks(template, landmarks)
+    hints = None if correspondences is None else hints_of(template, correspondences)
+    fit = _Fit(template, target, landmarks, hints, config, progress or (lambda done, total: None))
+    for stage in fit.stages:
         fit.bend_graph(stage)
     for round_ in config.shell:
         fit.follow(round_)
+    if config.settle is not None:
+        fit.settle(config.settle)
     fit.x = unfold(template, fit.x, vertex_linear(fit.graph, fit.motion))
     return fit.result()
 
@@ -104,24 +117,39 @@ class _Fit:
     """A registration under way: where the template lies, its graph, what has been counted."""
 
     def __init__(self, template: Mesh, target: Target, landmarks: tuple[np.ndarray, np.ndarray] | None,
-                 config: RegistrationConfig, progress: Callable[[int, int], None]) -> None:
-        self.template, self.target, self.landmarks, self.config = template, target, landmarks, config
+                 hints: Hints | None, config: RegistrationConfig, progress: Callable[[int, int], None]) -> None:
+        self.template, self.landmarks, self.hints, self.config = template, landmarks, hints, config
         self.size = float(np.sqrt(template.face_areas.sum()))
         self.all = np.arange(len(template.vertices))
         self.progress, self.done, self.iterations = progress, 0, 0
-        self.total = sum(stage.rounds for stage in config.graph) + len(config.shell)
         self.energies: dict[str, float] = {}
         self.converged = False
-        if landmarks is not None:
-            self.T = align_landmarks(template.vertices[landmarks[0]], landmarks[1]).T_target_source
-        else:
-            self.T = align_rigid(template, target.points).T_target_source
+        self.marks: np.ndarray | None = None
+        anchors = path_anchors(landmarks, hints, target, 3 * config.path_cell * self.size)
+        if anchors is not None:
+            self.marks, theirs = mark_both(template, target, anchors, config.path_cell * self.size, self.size)
+            target = replace(target, marks=theirs)
+        self.target = target
+        self.T = self.placed()
+        self.stages = [s for s in config.graph if s.place == 1 or self.marks is not None]
+        self.total = sum(stage.rounds for stage in self.stages) + len(config.shell) \
+            + (config.settle is not None)
         self.x = template.vertices @ self.T[:3, :3].T + self.T[:3, 3]
-        self.nodes = config.graph[0].nodes
+        self.nodes = self.stages[0].nodes
         self.graph = build_graph(template, self.nodes)
         self.pattern = NodePattern(self.graph)
         self.motion = start(self.graph, self.T)
         self.shell: Shell | None = None
+
+    def placed(self) -> np.ndarray:
+        """The rigid transform (4, 4) to begin with."""
+        if self.marks is not None:
+            coarse = 0.03 * self.size
+            return place_by_marks(self.template, self.marks, self.target.thinned(coarse),
+                                  thin(self.template.vertices, coarse))
+        if self.landmarks is not None:
+            return align_landmarks(self.template.vertices[self.landmarks[0]], self.landmarks[1]).T_target_source
+        return align_rigid(self.template, self.target.points).T_target_source
 
     def landmark_pull(self, share: float) -> Pull:
         """Each landmark weighs as much as this share of the surface."""
@@ -142,7 +170,9 @@ class _Fit:
         for _ in range(stage.rounds if stage.reach else 1):
             wanted, steps = held, stage.rounds
             if stage.reach:
-                wanted, steps = held + self.matches(target, sample, stage.reach, stage.slide).wanted, 1
+                wanted, steps = held + self.matches(target, sample, stage.reach, stage.slide, stage).wanted, 1
+                if self.hints is not None and stage.hints:
+                    wanted += self.hints.wanted(self.x, stage.reach * size, stage.hints * size**2)
             if wanted.A.any():
                 found = minimise(graph, self.pattern, self.motion, wanted, stiffness, steps, 1e-3)
                 self.motion, self.energies = found.motion, found.energies
@@ -168,24 +198,36 @@ class _Fit:
         self.iterations += 1
         self.advance(x, 1)
 
-    def matches(self, target: Target, sample: np.ndarray, reach: float, slide: float) -> Matching:
+    def settle(self, config: SettleConfig) -> None:
+        """The last pass."""
+        settled = settle(self.template, self.x, self.target, self.landmarks, config)
+        self.iterations += settled.iterations
+        self.energies["strain"] = settled.strain
+        self.advance(settled.vertices, 1)
+
+    def matches(self, target: Target, sample: np.ndarray, reach: float, slide: float,
+                stage: GraphStage | None = None) -> Matching:
         """Matches with the template as it lies now; `reach` as a multiple of its size."""
+        like = Likeness(normals=self.config.normal_weight * self.size)
+        if stage is not None:
+            like = replace(like, place=stage.place, marks=stage.paths * self.size)
         return match_both_ways(self.template.with_vertices(self.x), sample, self.size**2, target,
-                               reach * self.size, slide, self.config.normal_weight * self.size)
+                               reach * self.size, slide, like, self.marks)
 
     def result(self) -> Registration:
         """What was found, measured against the whole scan."""
         folded = flipped(self.template, self.x, vertex_linear(self.graph, self.motion))
-        last = (self.config.shell or self.config.graph)[-1]
-        matching = self.matches(self.target, self.all, last.reach, last.slide)
-        seen = matching.distances[matching.seen]
+        found = evidence(self.template.with_vertices(self.x), self.target, self.config.near * self.size,
+                         self.config.normal_weight * self.size)
+        seen = found.confidence >= 0.5
+        distances = np.where(seen, found.distances, np.nan)
         landmark_rms = np.nan
         if self.landmarks is not None:
             apart = np.linalg.norm(self.x[self.landmarks[0]] - self.landmarks[1], axis=1)
             landmark_rms = float(np.sqrt(np.mean(apart**2)))
-        return Registration(self.template.with_vertices(self.x), matching.distances, matching.seen,
-                            float(np.sqrt(np.mean(seen**2))) if len(seen) else np.nan, landmark_rms,
-                            self.converged, self.iterations, self.energies, int(folded.sum()))
+        return Registration(self.template.with_vertices(self.x), distances, seen,
+                            float(np.sqrt(np.mean(distances[seen] ** 2))) if seen.any() else np.nan, landmark_rms,
+                            self.converged, self.iterations, self.energies, int(folded.sum()), found.confidence)
 
     def advance(self, x: np.ndarray, steps: int) -> None:
         """Take new vertices and tell of the progress."""
@@ -193,20 +235,3 @@ class _Fit:
         self.x = x
         self.done += steps
         self.progress(self.done, self.total)
-
-def _checked(template: Mesh, landmarks: tuple[np.ndarray, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-    """Landmarks as arrays, or ValueError with what is wrong with them."""
-    vertices, points = np.asarray(landmarks[0]), np.asarray(landmarks[1], dtype=np.float64)
-    if vertices.ndim != 1 or not np.issubdtype(vertices.dtype, np.integer):
-        raise ValueError(f"landmarks: expected vertex numbers of shape (L,), got {vertices.dtype} "
-                         f"of shape {vertices.shape}")
-    if points.shape != (len(vertices), 3):
-        raise ValueError(f"landmarks: expected points of shape ({len(vertices)}, 3), got {points.shape}")
-    if len(vertices) < 3:
-        raise ValueError(f"landmarks: expected at least 3, got {len(vertices)}")
-    outside = (vertices < 0) | (vertices >= len(template.vertices))
-    if outside.any():
-        raise ValueError(f"landmarks: vertex {vertices[outside][0]} is outside 0..{len(template.vertices) - 1}")
-    if not np.isfinite(points).all():
-        raise ValueError(f"landmarks: {(~np.isfinite(points).all(axis=1)).sum()} points are not finite")
-    return vertices, points

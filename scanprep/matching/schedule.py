@@ -1,7 +1,9 @@
 """The schedule of a non-rigid registration, as data."""
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
+
+from .settle import SettleConfig
 
 
 @dataclass(frozen=True)
@@ -25,6 +27,12 @@ class GraphStage:
         Times that matches are sought anew; without matches, most steps.
     detail : float
         Spacing to which scan and template are thinned for matching.
+    place : float
+        How much positions count when matches are sought; 0 seeks by paths alone.
+    paths : float
+        Distance that a difference by e between path lengths to the landmarks is worth when matching.
+    hints : float
+        The share of the surface that all given correspondences together weigh as much as.
     """
 
     nodes: int
@@ -36,6 +44,9 @@ class GraphStage:
     slide: float = 0.02
     rounds: int = 2
     detail: float = 0.02
+    place: float = 1.0
+    paths: float = 0.0
+    hints: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -66,33 +77,39 @@ class RegistrationConfig:
     Attributes
     ----------
     graph : stages of the coarse registration
-    shell : rounds of the last pass
+    shell : rounds in which the surface follows the scan as a thin shell
+    settle : SettleConfig or None
+        The last pass.
+    path_cell : float
+        Spacing of the points that paths to the landmarks run over, as a multiple of the template's size.
     neighbours : int
         Points of the scan over which its normals are averaged.
     normal_weight : float
         Distance, as a multiple of the template's size, that a difference of normals of one is worth when
         matching.
+    near : float
+        Data farther from a vertex than this multiple of the size are not data of that vertex.
     settled : float
         Converged when the last round moves the mean vertex by less than this multiple of the size.
     """
 
     graph: tuple[GraphStage, ...] = (
-        GraphStage(300, 0.7, 0.07, 2.0, 0.001, 0.0, rounds=20),
-        GraphStage(300, 0.7, 0.07, 2.0, 0.1, 0.0, rounds=20),
-        GraphStage(300, 0.7, 0.07, 2.0, 10.0, 0.0, rounds=20),
-        GraphStage(300, 0.2, 0.02, 0.7, 0.01, 0.21),
-        GraphStage(300, 0.13, 0.013, 0.7, 0.01, 0.15),
-        GraphStage(300, 0.09, 0.009, 0.7, 0.01, 0.11),
-        GraphStage(300, 0.06, 0.006, 0.7, 0.01, 0.08),
-        GraphStage(300, 0.04, 0.004, 0.7, 0.01, 0.06),
+        GraphStage(300, 0.7, 0.07, 2.0, 0.1, 1.0, 1.0, rounds=4, place=0.0, paths=0.3, hints=1.0),
+        GraphStage(300, 0.5, 0.05, 2.0, 0.1, 0.3, 0.3, rounds=5, place=0.3, paths=0.3, hints=1.0),
+        GraphStage(300, 0.3, 0.03, 0.7, 0.05, 0.2, 0.1, rounds=6, paths=0.2, hints=0.5),
+        GraphStage(300, 0.2, 0.02, 0.7, 0.01, 0.15, 0.05, rounds=6, paths=0.1, hints=0.2),
+        GraphStage(300, 0.13, 0.013, 0.7, 0.01, 0.11, 0.0, rounds=6, paths=0.05, hints=0.1),
+        GraphStage(300, 0.09, 0.009, 0.7, 0.01, 0.08, 0.0, rounds=6),
+        GraphStage(300, 0.06, 0.006, 0.7, 0.01, 0.06, 0.0, rounds=6),
+        GraphStage(300, 0.04, 0.004, 0.7, 0.01, 0.05, 0.0, rounds=6),
         GraphStage(1000, 0.04, 0.004, 0.35, 0.01, 0.05, detail=0.008),
         GraphStage(1000, 0.025, 0.0025, 0.35, 0.01, 0.037, detail=0.008),
         GraphStage(1000, 0.015, 0.0015, 0.35, 0.005, 0.028, detail=0.008),
     )
-    shell: tuple[ShellStage, ...] = (
-        ShellStage(0.02, 0.007, 0.0002, 0.02),
-        ShellStage(0.015, 0.003, 0.0002, 0.015),
-    )
+    shell: tuple[ShellStage, ...] = ()
+    settle: SettleConfig | None = field(default_factory=SettleConfig)
+    path_cell: float = 0.012
     neighbours: int = 16
     normal_weight: float = 0.04
+    near: float = 0.015
     settled: float = 0.001
