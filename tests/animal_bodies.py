@@ -1,7 +1,7 @@
 """Four-legged animals with a known skeleton, in any pose, all with one triangulation.
 
 Built from the implicit surfaces of `scanprep.scanning`. Nothing stands upright or looks along an axis: every body is
-turned by an odd rotation, and the head is carried to one side.
+turned by an odd rotation, and the head is carried to one side unless told otherwise.
 """
 from __future__ import annotations
 
@@ -26,7 +26,7 @@ SOFT = 0.025                         # metres over which the motion of one part 
 
 @dataclass(frozen=True)
 class Build:
-    """How one animal differs from another, each about 1."""
+    """How one animal differs from another, each about 1; `aside` 0 makes it symmetric."""
 
     length: float = 1.0
     girth: float = 1.0
@@ -34,6 +34,7 @@ class Build:
     neck: float = 1.0
     head: float = 1.0
     tail: float = 1.0
+    aside: float = 1.0
 
     @staticmethod
     def random(rng: np.random.Generator) -> Build:
@@ -53,9 +54,9 @@ class Animal:
         b = build or Build()
         x, w = 0.42 * b.length, 0.11 * b.girth
         tips = {0: ((-x, 0, 0), (x, 0, 0.02))}
-        tips[1] = ((x, 0, 0.06), (x + 0.26 * b.neck, 0.07, 0.06 + 0.30 * b.neck))
+        tips[1] = ((x, 0, 0.06), (x + 0.26 * b.neck, 0.07 * b.aside, 0.06 + 0.30 * b.neck))
         nape = np.array(tips[1][1])
-        tips[2] = (nape, nape + b.head * np.array([0.24, 0.09, -0.04]))
+        tips[2] = (nape, nape + b.head * np.array([0.24, 0.09 * b.aside, -0.04]))
         tips[3] = ((-x - 0.06, 0, 0.03), (-x - 0.06 - 0.34 * b.tail, 0, -0.16 * b.tail))
         for k, (front, side) in enumerate(((1, 1), (1, -1), (-1, 1), (-1, -1))):
             top = np.array([front * 0.9 * x, side * w, -0.09])
