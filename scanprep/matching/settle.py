@@ -71,13 +71,13 @@ class SettleConfig:
     """
 
     rounds: tuple[SettleRound, ...] = (
-        SettleRound(0.02, 0.01, 0.02),
-        SettleRound(0.02, 0.01, 0.015),
-        SettleRound(0.015, 0.007, 0.015),
-        SettleRound(0.015, 0.007, 0.015),
+        SettleRound(0.02, 0.007, 0.02),
+        SettleRound(0.015, 0.004, 0.015),
+        SettleRound(0.015, 0.004, 0.015),
+        SettleRound(0.015, 0.004, 0.015),
     )
     noise_width: float = 0.007
-    slide: float = 0.0
+    slide: float = 0.05
     stay: float = 0.0
     landmarks: float = 0.0002
     normal_weight: float = 0.04
@@ -247,13 +247,14 @@ class _Settling:
         """What was reached."""
         flipped, needles = self.bad(stage.field * self.size)
         measured, smooth, _ = self.field(stage.field * self.size)
-        share = self.triangles.areas / self.triangles.areas.sum()
-        log = np.log(np.linalg.svd(measured.gradient, compute_uv=False))
-        off = np.log(np.linalg.svd(measured.gradient @ np.linalg.inv(smooth.gradient), compute_uv=False))
         found = self.touch(stage.reach)
-        return Settled(self.x, found.seen, found.distances, self.skin.noise,
-                       *(float(np.sqrt(share @ (e**2).mean(axis=1))) for e in (log, off)), int(flipped.sum()),
+        return Settled(self.x, found.seen, found.distances, self.skin.noise, self._strain(measured.gradient),
+                       self._strain(measured.gradient @ np.linalg.inv(smooth.gradient)), int(flipped.sum()),
                        int(needles.sum()), self.iterations, self.moved <= self.config.settled * self.size)
+
+    def _strain(self, gradient: np.ndarray) -> float:
+        stretch = np.log(np.linalg.svd(gradient, compute_uv=False))
+        return float(np.sqrt(np.average((stretch**2).mean(axis=1), weights=self.triangles.areas)))
 
 
 def _checked(template: Mesh, start: np.ndarray, confidence: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:
