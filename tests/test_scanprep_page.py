@@ -7,7 +7,7 @@ import pytest
 from scan_folders import MARKS, WITH_PICTURES, ball, write_scans
 from scipy.spatial.transform import Rotation
 
-from scanprep import RegisteredSet
+from scanprep import RegisteredSet, write_landmarks, write_mesh
 from scanprep.batch import pictures
 from scanprep.batch.figures import (
     Failure,
@@ -25,7 +25,7 @@ from scanprep.batch.review import Limits, review
 from scanprep.geometry.files import PointCloud, write_points
 from scanprep.pipeline import find_scans, prepare
 
-GOOD = ScanFigures("good", "10 landmarks", 0.001, 0.0015, 0.85, 0.85, 0.0, 0.004, 0.002, 0, True, "abc", 3.25)
+GOOD = ScanFigures("good", "10 landmarks", 0.001, 0.0015, 0.85, 0.85, 0.0, 0.004, 0.002, 0, True, 0.0, "abc", 3.25)
 
 
 @pytest.fixture(scope="module")
@@ -39,13 +39,11 @@ def folder(tmp_path_factory, template):
     place = tmp_path_factory.mktemp("page")
     scans = write_scans(place / "scans", template, 5)
     half = template.submesh(template.face_normals[:, 1] > 0.3)[0]
-    from scanprep import write_mesh
-
     write_mesh(scans / "body2.ply", half)
-    (scans / "body2.landmarks.json").unlink()
     cloud = np.vstack([template.vertices, template.vertices * 0.2 + [2.0, 0, 0]])
     (scans / "body3.ply").unlink()
-    (scans / "body3.landmarks.json").unlink()
+    for name in ("body2", "body3"):
+        write_landmarks(scans / f"{name}.landmarks.json", {mark: template.vertices[v] for mark, v in MARKS.items()})
     write_points(scans / "body3.xyz", PointCloud(cloud, None, None))
     (scans / "body4.ply").write_text("no mesh <b>")
     prepare(find_scans(scans), template, MARKS, place / "set", WITH_PICTURES)

@@ -273,6 +273,8 @@ def test_what_leads_the_template(scans, template, tmp_path):
                 for guide in ("landmarks", "pose")}
     asked = prepare(find_scans(scans), template, MARKS, tmp_path / "asked", settings["landmarks"])
     assert asked.registered.names == ("body1", "body2") and "body0" in asked.failures[0]
+    best = prepare(find_scans(scans), template, MARKS, tmp_path / "best", QUICK)
+    assert best.registered.names == ("body1", "body2") and "or the guide 'pose'" in best.failures[0]  # it has no limbs
     near = prepare(find_scans(scans)[:2], template, {}, tmp_path / "near", settings["pose"])
     assert [f.guide for f in near.figures] == ["pose", "pose"] and np.isnan(near.figures[0].landmarks)
 

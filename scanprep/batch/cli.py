@@ -42,8 +42,9 @@ def run_all(scans: ScansArg, template: Path, output: Output, landmarks: Path | N
         output: Folder of the registered set; open report.html in it.
         landmarks: Folder of landmark files with the names of the scans; else scans/landmarks, or beside the scans.
         template_landmarks: Landmarks of the template; else the file of its name beside it.
-        guide: What leads the template to a scan: its landmarks, or only its pose, which must then be near the
-            template's; best takes landmarks where there are some.
+        guide: What leads the template to a scan: its landmarks, correspondences that are found without any, or only
+            its pose, which must then be near the template's; best takes landmarks where there are some and
+            correspondences elsewhere.
         clean: Take floor, furniture and specks off each scan before.
         subject: Whose scans they are, where scans.csv does not say; else each is a person of its own.
         unit: Unit of the scans and landmarks, where the files cannot tell.
@@ -81,12 +82,15 @@ def _template_marks(template: Path, given: Path | None, body: Mesh, tasks: Seque
                     ) -> dict[str, int]:
     """The landmarks of the template, where any scan is led by landmarks."""
     without = [task.name for task in tasks if task.landmarks is None]
-    if guide == "pose" or (guide == "best" and len(without) == len(tasks)):
+    if guide == "pose":
         say("note: no landmarks are used; all scans must be near the template's pose")
+        return {}
+    if guide == "automatic" or (guide == "best" and len(without) == len(tasks)):
+        say("note: no landmarks are used; look at the page for scans turned round or mirrored")
         return {}
     if without and guide == "best":
         say(f"note: no landmarks for {len(without)} of {len(tasks)} scans ({', '.join(without[:LISTED])}); "
-            "they must be near the template's pose")
+            "look at the page for those turned round or mirrored")
     return read_landmark_vertices(given or landmarks_beside(template), body)
 
 

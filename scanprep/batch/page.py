@@ -17,7 +17,7 @@ PICTURES, PAGE = "pictures", "report.html"
 
 _STYLE = """
 main { max-width: 76rem; }
-.scan { display: grid; grid-template-columns: minmax(0, 1fr) 17rem; gap: .2rem 1.4rem; padding: 1rem 0 1.1rem;
+.scan { display: grid; grid-template-columns: minmax(0, 1fr) 16rem; gap: .2rem 1.4rem; padding: 1rem 0 1.1rem;
   border-top: 1px solid var(--line); content-visibility: auto; contain-intrinsic-size: auto 300px; }
 .scan h3 { grid-column: 1 / -1; margin: 0; font-size: 1.08rem; }
 .scan h3 small { font-weight: 400; color: var(--soft); margin-left: .6rem; }
@@ -149,7 +149,8 @@ def _card(folder: Path, verdict: Verdict, entry: SetEntry | None) -> str:
 
 def _figure_table(f: ScanFigures) -> str:
     rows = (("distance, mean", f"{1000 * f.distance:.2f} mm"), ("distance, RMS", f"{1000 * f.rms:.2f} mm"),
-            ("with data", f"{100 * f.seen:.0f}%"), ("scan off the template", f"{100 * f.missed:.1f}%"),
+            ("with data", f"{100 * f.seen:.0f}%"), ("confidence, mean", f"{f.confidence:.2f}"),
+            ("scan off the template", f"{100 * f.missed:.1f}%"),
             ("stretched or shrunk", f"{100 * f.stretch:.1f}%"), ("flipped triangles", f"{f.flipped}"),
             ("landmarks off, RMS", "–" if np.isnan(f.landmarks) else f"{1000 * f.landmarks:.1f} mm"),
             ("settled", "yes" if f.converged else "no"))

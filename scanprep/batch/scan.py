@@ -13,11 +13,13 @@ import numpy as np
 from ..cleaning.components import CleanScanConfig, clean_scan
 from ..geometry.landmarks import match_landmarks, read_landmarks
 from ..geometry.mesh import Mesh
+from ..matching.correlated import CorrelatedConfig, find_correspondences
+from ..matching.correspondences import Correspondences
 from ..matching.nonrigid import Registration, RegistrationConfig, register
 from .figures import ScanFigures, missed_share, stretched_share
 from .tasks import ScanTask, read_scan
 
-Guide = Literal["best", "landmarks", "pose"]
+Guide = Literal["best", "landmarks", "automatic", "pose"]
 FAR = 0.01                  # of the template's size (the root of its area): a point of the scan that was missed
 
 Landmarks = tuple[np.ndarray, np.ndarray]
@@ -32,9 +34,12 @@ class ScanSettings:
     registration : RegistrationConfig
     unit : 'm', 'mm', 'cm' or 'in', optional
         Of the scan and its landmarks, where the files cannot tell.
-    guide : 'best', 'landmarks' or 'pose'
-        What leads the template to the scan: its landmark file (a scan without is a failure), or nothing but the
-        pose, which must be near that of the template; 'best' takes landmarks where there are some.
+    guide : 'best', 'landmarks', 'automatic' or 'pose'
+        What leads the template to the scan: its landmark file (a scan without is a failure); correspondences that
+        are found with no landmarks; or nothing but the pose, which must be near that of the template. 'best' takes
+        landmarks where there are some and correspondences elsewhere.
+    correspondences : CorrelatedConfig
+        How correspondences are found.
     clean : CleanScanConfig, optional
         Take floor, furniture and specks off the scan before.
     pictures : bool
@@ -44,6 +49,7 @@ class ScanSettings:
     registration: RegistrationConfig = field(default_factory=RegistrationConfig)
     unit: str | None = None
     guide: Guide = "best"
+    correspondences: CorrelatedConfig = field(default_factory=CorrelatedConfig)
     clean: CleanScanConfig | None = None
     pictures: bool = True
 
@@ -80,13 +86,15 @@ def register_scan(task: ScanTask, template: Mesh, template_landmarks: dict[str, 
         scan = read_scan(task.scan, settings.unit)
         landmarks = _landmarks(task, scan, template_landmarks, settings)
         scan, removed = _cleaned(scan, landmarks, settings.clean)
-        fit = register(template, scan, landmarks, settings.registration)
+        pairs = _correspondences(template, scan, landmarks, settings)
+        fit = register(template, scan, landmarks, settings.registration, correspondences=pairs)
         picture = b""
         if settings.pictures:
             from .pictures import strip
 
             picture = strip(template, scan, fit)
-    guide = f"{len(landmarks[0])} landmarks" if landmarks is not None else "pose"
+    guide = (f"{len(landmarks[0])} landmarks" if landmarks is not None else
+             f"{len(pairs)} correspondences" if pairs is not None else "pose")
     figures = _measure(task, template, scan, fit, guide)
     return RegisteredScan(fit.mesh.vertices, replace(figures, removed=removed, seconds=time.perf_counter() - start),
                           picture)
@@ -107,7 +115,7 @@ def attempt(task: ScanTask, template: Mesh, template_landmarks: dict[str, int], 
 def _landmarks(task: ScanTask, scan: Mesh | np.ndarray, template_landmarks: dict[str, int], settings: ScanSettings
                ) -> Landmarks | None:
     """Vertices of the template and points of the scan, or None where landmarks are not wanted or not there."""
-    if settings.guide == "pose" or (task.landmarks is None and settings.guide == "best"):
+    if settings.guide in ("automatic", "pose") or (task.landmarks is None and settings.guide == "best"):
         return None
     if task.landmarks is None:
         raise ValueError(f"{task.scan}: expected a landmark file of the name {task.name}, found none")
@@ -116,6 +124,17 @@ def _landmarks(task: ScanTask, scan: Mesh | np.ndarray, template_landmarks: dict
         return match_landmarks(template_landmarks, found)[1:]
     except ValueError as error:
         raise ValueError(f"{task.landmarks}: {error}") from None
+
+
+def _correspondences(template: Mesh, scan: Mesh | np.ndarray, landmarks: Landmarks | None, settings: ScanSettings
+                     ) -> Correspondences | None:
+    """What leads the template where landmarks do not, or None where its pose is to do."""
+    if landmarks is not None or settings.guide == "pose":
+        return None
+    try:
+        return find_correspondences(template, scan, config=settings.correspondences)
+    except ValueError as error:
+        raise ValueError(f"{error} (a landmark file, or the guide 'pose', needs no ends of limbs)") from None
 
 
 def _cleaned(scan: Mesh | np.ndarray, landmarks: Landmarks | None, config: CleanScanConfig | None
@@ -131,7 +150,7 @@ def _measure(task: ScanTask, template: Mesh, scan: Mesh | np.ndarray, fit: Regis
     size = float(np.sqrt(template.face_areas.sum()))
     return ScanFigures(
         task.name, guide, float(np.nanmean(fit.distances)) if fit.seen.any() else np.nan, fit.rms,
-        float(fit.seen.mean()), float(fit.seen.mean()), missed_share(scan, fit.mesh, FAR * size),
+        float(fit.seen.mean()), float(fit.confidence.mean()), missed_share(scan, fit.mesh, FAR * size),
         stretched_share(template, fit.mesh), fit.landmark_rms, fit.flipped, fit.converged, 0.0, task.fingerprint())
 
 
