@@ -97,7 +97,7 @@ def test_a_good_registration_stays_on_the_data(body, crab_model):
     off = Surface(body.with_vertices(truth)).closest(found.mesh.vertices).distances
     predicted = Surface(body.with_vertices(truth)).closest(found.predicted.vertices).distances
     assert off[found.seen].mean() < 1e-3 and predicted.max() > 5e-3
-    assert mean_mm(found.mesh.vertices, truth) < 3
+    assert mean_mm(found.mesh.vertices, truth) < 4
 
 
 def test_what_was_not_seen_follows_the_model(body, crab_model):

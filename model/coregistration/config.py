@@ -60,8 +60,11 @@ class ModelFitConfig:
         Most shape components used while the pose is sought.
     shape_prior : float
         Distance to the data, as a share of √area, that one standard deviation of a beta is worth.
+    least : int
+        Starts that are tried in any case: an arm turned about itself explains a scan as well.
     near, enough : float
-        No further start is tried once this share of the scan's points is nearer to the body than this share of √area.
+        After these, none is tried once the share `enough` of the scan's points is nearer to the body than the share
+        `near` of √area.
     """
 
     search: tuple[PoseStage, ...] = (
@@ -79,6 +82,7 @@ class ModelFitConfig:
     normal_weight: float = 0.05
     n_betas: int = 20
     shape_prior: float = 0.0005
+    least: int = 2
     near: float = 0.02
     enough: float = 0.98
 

@@ -132,7 +132,7 @@ class ModelFit:
 
     def best_of(self, starts: Iterable[np.ndarray]) -> tuple[Candidate, int]:
         """The best end of starts (one at least), which are tried until one explains enough; and how many were tried."""
-        config, tried = self.config, 0
+        config, tried, enough = self.config, 0, False
         best: Candidate | None = None
         ends: list[np.ndarray] = []
         points, _ = self.points(config.refine[-1].sample)
@@ -141,15 +141,14 @@ class ModelFit:
             for stage in config.search:
                 x = self.follow(x, stage)
             y = points.positions(x)
-            if any(np.linalg.norm(y - end, axis=1).mean() < ALIKE * self.size for end in ends):
-                continue
-            ends.append(y)
-            for stage in config.refine:
-                x = self.follow(x, stage)
-            found = self.scored(x, config.refine[-1])
-            if best is None or found.score < best.score:
-                best = found
-            if self.explained(self.predicted(x), config.refine[-1].detail, config.near) >= config.enough:
+            if not any(np.linalg.norm(y - end, axis=1).mean() < ALIKE * self.size for end in ends):
+                ends.append(y)
+                for stage in config.refine:
+                    x = self.follow(x, stage)
+                found = self.scored(x, config.refine[-1])
+                best = found if best is None or found.score < best.score else best
+                enough |= self.explained(self.predicted(x), config.refine[-1].detail, config.near) >= config.enough
+            if enough and tried >= config.least:
                 break
         assert best is not None, "no start"
         return best, tried
