@@ -3,7 +3,15 @@ import pytest
 from scanned_shapes import ball, bumpy
 
 from scanprep.cleaning.remesh import flip_edges, improve_triangles, smooth, triangle_quality
-from scanprep.cleaning.repair import RepairConfig, drop_small_components, peel_border, repair, split_vertices, weld
+from scanprep.cleaning.repair import (
+    RepairConfig,
+    drop_small_components,
+    orient,
+    peel_border,
+    repair,
+    split_vertices,
+    weld,
+)
 from scanprep.geometry.mesh import Mesh, template_problem
 from scanprep.geometry.surface import Surface
 
@@ -70,6 +78,78 @@ def test_two_fans_at_a_vertex_are_parted():
     assert parted.is_vertex_manifold
     assert np.array_equal(parted.corners, pair.corners)
     assert len(np.unique(parted.faces)) == len(np.unique(pair.faces)) + 1
+
+
+@pytest.mark.parametrize("share", [0.05, 0.4])
+def test_turned_triangles_are_turned_back(share):
+    rng = np.random.default_rng(4)
+    mesh = bumpy(4)
+    turned = rng.random(len(mesh.faces)) < share
+    mixed = Mesh(mesh.vertices, np.where(turned[:, None], mesh.faces[:, ::-1], mesh.faces))
+    good = repair(mixed)
+    assert good.is_closed and template_problem(good) is None and len(good.faces) == len(mesh.faces)
+    assert good.volume == pytest.approx(mesh.volume, rel=1e-12)
+
+
+def test_a_piece_that_is_inside_out_keeps_its_side():
+    inside_out = Mesh(ball(2).vertices, ball(2).faces[:, ::-1])
+    assert orient(inside_out) is inside_out
+    both = joined(ball(3), inside_out)
+    assert np.array_equal(orient(both).faces, both.faces)
+
+
+def moebius(count=60):
+    angle = np.linspace(0, 2 * np.pi, count, endpoint=False)
+    across = np.stack([np.cos(angle / 2) * np.cos(angle), np.cos(angle / 2) * np.sin(angle), np.sin(angle / 2)], axis=1)
+    middle = np.stack([np.cos(angle), np.sin(angle), np.zeros(count)], axis=1)
+    vertices = np.concatenate([middle + 0.3 * across, middle - 0.3 * across])
+    i = np.arange(count)
+    a, b = i, i + count
+    c, d = np.where(i < count - 1, i + 1, count), np.where(i < count - 1, i + 1 + count, 0)
+    return Mesh(vertices, np.concatenate([np.stack([a, b, c], axis=1), np.stack([c, b, d], axis=1)]))
+
+
+def test_a_strip_with_one_side_is_cut_once():
+    strip = moebius()
+    assert not strip.is_edge_manifold and (strip.edge_use <= 2).all()
+    good = repair(strip)
+    assert template_problem(good) is None
+    assert len(good.faces) >= len(strip.faces) - 2
+
+
+def three_sheets():
+    """Three half planes that meet in a line, with a bow tie of two triangles at one end of it."""
+    line = np.stack([np.zeros(6), np.zeros(6), np.arange(6.0)], axis=1)
+    wings = [line + [np.cos(a), np.sin(a), 0] for a in (0, 2, 4)]
+    i = np.arange(5)
+    faces = [np.concatenate([np.stack([i, i + 1, s + i], axis=1), np.stack([i + 1, s + i + 1, s + i], axis=1)])
+             for s in (6, 12, 18)]
+    tie = np.array([[0, 0, -1], [1, 0, -1], [-1, 1, -1], [-1, 2, -2]], dtype=float)
+    return Mesh(np.concatenate([line, *wings, tie]), np.concatenate([*faces, [[0, 24, 25], [0, 26, 27]]]))
+
+
+def test_sheets_that_meet_in_a_line_are_parted():
+    good = repair(three_sheets(), RepairConfig(min_component=0.0))
+    assert good.is_edge_manifold and good.is_vertex_manifold
+    assert len(good.faces) >= 20                                       # two of the three sheets and the tie
+
+
+@pytest.mark.parametrize("seed", range(6))
+def test_whatever_comes_in_comes_out_manifold(seed):
+    """Shared and doubled vertices, needles, folds, strays and turned triangles all at once."""
+    rng = np.random.default_rng(seed)
+    mesh = joined(bumpy(3), ball(2, 0.05), moebius(20))
+    v, f = mesh.vertices.copy(), mesh.faces
+    near = rng.integers(0, len(v), (60, 2))
+    v[near[:, 0]] = v[near[:, 1]] + 1e-9 * rng.normal(size=(60, 3))      # far vertices pulled onto each other
+    stray = rng.integers(0, len(v), (200, 3))
+    f = np.concatenate([f, f[:50, ::-1], f[50:90], stray])
+    f = f[rng.permutation(len(f))]
+    f = np.where(rng.random(len(f))[:, None] < 0.2, f[:, ::-1], f)
+    good = repair(Mesh(v, f))
+    assert template_problem(good) is None
+    kept = {tuple(np.round(p, 6)) for p in v}
+    assert all(tuple(np.round(p, 6)) in kept for p in good.vertices)      # nothing was made up
 
 
 def test_nothing_left_is_an_error():

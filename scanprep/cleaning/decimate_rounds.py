@@ -9,6 +9,7 @@ import numpy as np
 from .decimate_quadrics import lowest, value
 
 FREE, CURVE, FIXED = 0, 1, 2
+PIECE = 20_000                       # edges priced at once: what stays in the processor's cache
 
 
 @dataclass(frozen=True)
@@ -81,10 +82,8 @@ class Rounds:
         self.curve = np.zeros(len(keys), dtype=bool)
         self.curve[np.searchsorted(keys, curves.min(axis=1) * N + curves.max(axis=1))] = True
         self.refused = np.zeros(len(keys), dtype=bool)
-        self.goal = np.empty((len(keys), *points.shape[1:]))
         self.cost = np.empty(len(keys))
-        for start in range(0, len(keys), 100_000):           # pieces that stay in the processor's cache
-            self._price(np.arange(start, min(start + 100_000, len(keys))))
+        self._price(np.arange(len(keys)))
 
     def run(self, count: int, progress: Callable[[int, int], None] | None = None) -> None:
         """Collapse until `count` triangles are left, or none can go."""
@@ -109,27 +108,30 @@ class Rounds:
         return kept, np.searchsorted(kept, owner)
 
     def _price(self, rows: np.ndarray) -> None:
-        """Order the ends of edges (kept first), and set the goal and cost of collapsing them."""
-        a, b = self.ends[rows].T
-        flip = self.kinds[b] > self.kinds[a]
-        a, b = np.where(flip, b, a), np.where(flip, a, b)
-        kind_a, kind_b = self.kinds[a], self.kinds[b]
-        Q = self.quadrics[a] + self.quadrics[b]
-        alike = (kind_a == kind_b) & (kind_a != FIXED)
-        if self.config.onto_vertices:
-            goal = self.points[a]
-            cost = value(Q, goal).sum(axis=1)
-            other = self.points[b]
-            cost_other = value(Q, other).sum(axis=1)
-            turn = alike & (cost_other < cost)
+        """Order the ends of edges (kept first), and set the cost of collapsing them."""
+        for start in range(0, len(rows), PIECE):
+            part = rows[start:start + PIECE]
+            a, b = self.ends[part].T
+            turn = self.kinds[b] > self.kinds[a]
             a, b = np.where(turn, b, a), np.where(turn, a, b)
-            goal, cost = np.where(turn[:, None, None], other, goal), np.where(turn, cost_other, cost)
-        else:
-            goal = np.where(alike[:, None, None], lowest(Q), self.points[a])
-            cost = value(Q, goal).sum(axis=1)
-        banned = (kind_b == FIXED) | ((kind_b == CURVE) & ~self.curve[rows])
-        self.ends[rows], self.goal[rows], self.cost[rows] = np.stack([a, b], axis=1), goal, np.where(banned, np.inf,
-                                                                                                    cost)
+            if self.config.onto_vertices:
+                Q = self.quadrics[a] + self.quadrics[b]
+                turn = self.kinds[a] == self.kinds[b]
+                turn &= value(Q, self.points[b]).sum(axis=1) < value(Q, self.points[a]).sum(axis=1)
+                a, b = np.where(turn, b, a), np.where(turn, a, b)
+            cost = value(*self._goals(a, b)).sum(axis=1)
+            cost[(self.kinds[b] == FIXED) | ((self.kinds[b] == CURVE) & ~self.curve[part])] = np.inf
+            self.ends[part], self.cost[part] = np.stack([a, b], axis=1), cost
+
+    def _goals(self, a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Quadrics (n, M, 10) of vertices b collapsed into a, and where these then lie (n, M, 3)."""
+        Q = self.quadrics[a] + self.quadrics[b]
+        if self.config.onto_vertices:
+            return Q, self.points[a]
+        anchored = (self.kinds[a] != self.kinds[b]) | (self.kinds[a] == FIXED)
+        goal = lowest(Q)
+        goal[anchored] = self.points[a[anchored]]
+        return Q, goal
 
     def _choose(self) -> np.ndarray:
         """Cheap edges no two of which have neighbouring ends, cheapest first."""
@@ -140,7 +142,7 @@ class Rounds:
         place = min(open_edges - 1, max(int(self.config.share * len(cost)), 50))
         limit = np.partition(cost, place)[place]
         rows = np.flatnonzero(cost <= limit)
-        rows = rows[np.argsort(cost[rows], kind="stable")]
+        rows = rows[np.argsort(cost[rows])]
         best = np.full(len(self.points), len(rows))
         for side in (0, 1):
             first = np.full(len(self.points), len(rows))
@@ -163,25 +165,27 @@ class Rounds:
     def _collapse(self, rows: np.ndarray, surplus: int) -> None:
         """Collapse those edges that harm nothing, no more than take `surplus` triangles away."""
         label = self._labels(rows)
-        face_label = label[self.faces]
-        star = np.flatnonzero((face_label >= 0).any(axis=1))
-        face_label = face_label[star]
-        of = face_label.max(axis=1)
-        gone = (face_label >= 0).sum(axis=1) == 2
+        first, second, third = (label[self.faces[:, corner]] for corner in range(3))
+        of = np.maximum(np.maximum(first, second), third)
+        star = np.flatnonzero(of >= 0)                       # at most two corners are ends, and of the same edge
+        gone = (first[star] + second[star] + third[star]) == 2 * of[star] - 1
+        of = of[star]
         removed = np.bincount(of[gone], minlength=len(rows))
-        end_label = label[self.ends]
-        near = np.flatnonzero((end_label >= 0).any(axis=1))
-        near = near[end_label[near, 0] != end_label[near, 1]]
-        of_near = end_label[near].max(axis=1)
-        outer = np.where(end_label[near, 0] >= 0, self.ends[near, 1], self.ends[near, 0])
-        order = np.argsort(of_near * len(self.points) + outer, kind="stable")
+        first, second = label[self.ends[:, 0]], label[self.ends[:, 1]]
+        near = np.flatnonzero((first >= 0) != (second >= 0))
+        first, second = first[near], second[near]
+        of_near = np.maximum(first, second)
+        outer = np.where(first >= 0, self.ends[near, 1], self.ends[near, 0])
+        order = np.argsort(of_near * len(self.points) + outer)
         near, of_near, outer = near[order], of_near[order], outer[order]
         twin = np.flatnonzero((of_near[1:] == of_near[:-1]) & (outer[1:] == outer[:-1]))
+        Q, goal = self._goals(*self.ends[rows].T)
         good = self._keeps_topology(len(rows), removed, near, of_near, outer, twin)
-        good &= self._keeps_triangles(rows, star[~gone], of[~gone])
+        good &= self._keeps_triangles(rows, goal[:, 0], star[~gone], of[~gone])
         self.refused[rows[~good]] = True
         good[good] = np.cumsum(removed[good]) - removed[good] < surplus
-        self._apply(rows, good, star, gone, of, near, of_near, outer, twin)
+        self._apply(rows[good], Q[good], goal[good])
+        self._rejoin(rows, good, star, gone, of, near, of_near, outer, twin)
 
     def _keeps_topology(self, count: int, removed: np.ndarray, near: np.ndarray, of_near: np.ndarray,
                         outer: np.ndarray, twin: np.ndarray) -> np.ndarray:
@@ -199,7 +203,7 @@ class Rounds:
         good[valence < 3] = False
         return good
 
-    def _keeps_triangles(self, rows: np.ndarray, star: np.ndarray, of: np.ndarray) -> np.ndarray:
+    def _keeps_triangles(self, rows: np.ndarray, goal: np.ndarray, star: np.ndarray, of: np.ndarray) -> np.ndarray:
         """(count,) bool: no triangle turns over, away from what its corners stood for, or into a sliver.
 
         Only on the first body: others may have folds of their own, which would forbid far too much.
@@ -207,7 +211,7 @@ class Rounds:
         faces = self.faces[star]
         moved = (faces == self.ends[rows[of], 0][:, None]) | (faces == self.ends[rows[of], 1][:, None])
         old = self.points[faces, 0]
-        new = np.where(moved[:, :, None], self.goal[rows[of], 0][:, None], old)
+        new = np.where(moved[:, :, None], goal[of][:, None], old)
         n_old, q_old = _normals_and_quality(old)
         n_new, q_new = _normals_and_quality(new)
         meant = self.areas[faces]
@@ -220,17 +224,21 @@ class Rounds:
         good[of[bad]] = False
         return good
 
-    def _apply(self, rows: np.ndarray, good: np.ndarray, star: np.ndarray, gone: np.ndarray, of: np.ndarray,
-               near: np.ndarray, of_near: np.ndarray, outer: np.ndarray, twin: np.ndarray) -> None:
-        keep, drop = self.ends[rows[good]].T
+    def _apply(self, rows: np.ndarray, quadrics: np.ndarray, goal: np.ndarray) -> None:
+        """Merge the ends of edges."""
+        keep, drop = self.ends[rows].T
         self.owner[drop] = keep
-        self.points[keep] = self.goal[rows[good]]
-        self.quadrics[keep] += self.quadrics[drop]
+        self.points[keep], self.quadrics[keep] = goal, quadrics
         self.areas[keep] += self.areas[drop]
+
+    def _rejoin(self, rows: np.ndarray, good: np.ndarray, star: np.ndarray, gone: np.ndarray, of: np.ndarray,
+                near: np.ndarray, of_near: np.ndarray, outer: np.ndarray, twin: np.ndarray) -> None:
+        """Triangles and edges without those that collapsed, the others with their new ends."""
         changed = star[good[of] & ~gone]
         self.faces[changed] = self.owner[self.faces[changed]]
         left = np.ones(len(self.faces), dtype=bool)
         left[star[good[of] & gone]] = False
+        left = np.flatnonzero(left)
         self.faces, self.face_rows = self.faces[left], self.face_rows[left]
         twin = twin[good[of_near[twin]]]
         self.curve[near[twin]] |= self.curve[near[twin + 1]]
@@ -241,10 +249,10 @@ class Rounds:
         around = np.zeros(len(self.points), dtype=bool)
         around[outer[mine]] = True
         self.refused &= ~(around[self.ends[:, 0]] | around[self.ends[:, 1]])
-        priced = near[mine & left[near]]
-        self._price(priced)
+        self._price(near[mine & left[near]])
+        left = np.flatnonzero(left)
         self.ends, self.curve, self.refused = self.ends[left], self.curve[left], self.refused[left]
-        self.goal, self.cost = self.goal[left], self.cost[left]
+        self.cost = self.cost[left]
 
 
 def _first_of_each_clash(count: int, a: np.ndarray, b: np.ndarray) -> np.ndarray:

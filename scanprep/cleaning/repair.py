@@ -33,7 +33,8 @@ class RepairConfig:
 def repair(mesh: Mesh, config: RepairConfig | None = None) -> Mesh:
     """The nearest mesh that is manifold, with nothing double, flat, unused or loose in it.
 
-    Triangles are only ever removed, so holes may open; where sheets touch in a vertex it is split in two.
+    Triangles are turned over where neighbours disagree and else only ever removed, so holes may open; where sheets
+    touch in a vertex it is split in two.
 
     Parameters
     ----------
@@ -51,7 +52,7 @@ def repair(mesh: Mesh, config: RepairConfig | None = None) -> Mesh:
     """
     config = config or RepairConfig()
     mesh = weld(mesh, config.weld)
-    mesh = drop_flat(mesh, config.min_area)
+    mesh = orient(drop_flat(mesh, config.min_area))
     for _ in range(20):
         if mesh.is_edge_manifold:
             break
@@ -97,6 +98,31 @@ def drop_flat(mesh: Mesh, min_area: float = 1e-12) -> Mesh:
         faces = target[target][mesh.faces]
         mesh = weld(Mesh(moved, faces, mesh.colors))
     return mesh.submesh(mesh.face_areas >= min_area)[0]
+
+
+def orient(mesh: Mesh) -> Mesh:
+    """Triangles turned so that neighbours face the same way, in every patch the way most of its area does.
+
+    Patches end at edges with more than two triangles. One that has a single side only, as a Möbius strip has, is
+    left as it is.
+    """
+    if mesh.is_edge_manifold:
+        return mesh
+    forward = (mesh.faces < np.roll(mesh.faces, -1, axis=1)).ravel()
+    order = np.argsort(mesh.face_edges.ravel(), kind="stable")
+    start = np.concatenate([[0], np.cumsum(mesh.edge_use)[:-1]])[mesh.edge_use == 2]
+    first, second = order[start], order[start + 1]
+    a, b, agree = first // 3, second // 3, forward[first] != forward[second]
+    # Every triangle is there twice, as it is and turned over; what faces the same way hangs together.
+    count = len(mesh.faces)
+    rows, columns = np.r_[a, a + count], np.r_[np.where(agree, b, b + count), np.where(agree, b + count, b)]
+    _, patch = connected_components(coo_array((np.ones(len(rows)), (rows, columns)), shape=(2 * count, 2 * count)),
+                                    directed=False)
+    as_is, turned = patch[:count], patch[count:]
+    area = np.bincount(as_is, mesh.face_areas, patch.max() + 1)     # of what a patch leaves as it is
+    turn = area[turned] > area[as_is]
+    turn |= (area[turned] == area[as_is]) & (turned < as_is)
+    return Mesh(mesh.vertices, np.where(turn[:, None], mesh.faces[:, ::-1], mesh.faces), mesh.colors)
 
 
 def _drop_at_bad_edges(mesh: Mesh) -> Mesh:
