@@ -71,13 +71,13 @@ def test_a_mesh_gives_the_same_as_its_points(truth):
 
 
 def test_moves_and_scales_with_the_input(truth):
-    config = replace(small(), graph=small().graph[:6])
+    config = replace(small(), settle=None)
     scan = scan_of(truth, np.random.default_rng(1), 2500)
     first = register(crab(), scan, (MARKS, truth.vertices[MARKS]), config).mesh.vertices
     s, R, t = 7.0, rotations.exp(np.array([0.3, -1.0, 2.0])), np.array([4.0, -2.0, 1.0])
     body = crab().with_vertices(s * crab().vertices)
     moved = register(body, s * scan @ R.T + t, (MARKS, s * truth.vertices[MARKS] @ R.T + t), config).mesh.vertices
-    np.testing.assert_allclose((moved - t) @ R / s, first, atol=0.004)
+    np.testing.assert_allclose((moved - t) @ R / s, first, atol=0.006)
     assert np.abs((moved - t) @ R / s - first).mean() < 5e-4
 
 

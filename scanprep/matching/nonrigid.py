@@ -18,15 +18,16 @@ from ..geometry.mesh import Mesh, check_template
 from .anchors import Hints, checked_landmarks, hints_of, mark_both, path_anchors, place_by_marks
 from .confidence import evidence
 from .correspondences import Correspondences
-from .descent import Stiffness, minimise
+from .descent import Stiffness, minimise, terms
 from .energies import NodePattern, Pull, pull
 from .graph import build_graph, carry_over, deform, start, vertex_linear
-from .matches import Likeness, Matching, Target, match_both_ways, target_of
+from .matches import Likeness, Matching, Target, match_both_ways, orient, target_of
 from .rigid import align_landmarks, align_rigid
 from .schedule import GraphStage, RegistrationConfig, ShellStage
 from .settle import SettleConfig, settle
 from .shell import Shell, flipped, unfold
 from .thinning import thin
+from .twists import find_ends, mismatch, turned_end
 
 
 @dataclass(frozen=True, eq=False)
@@ -105,6 +106,8 @@ def register(template: Mesh, scan: Mesh | np.ndarray, landmarks: tuple[np.ndarra
     fit = _Fit(template, target, landmarks, hints, config, progress or (lambda done, total: None))
     for stage in fit.stages:
         fit.bend_graph(stage)
+        if stage.twists:
+            fit.try_twists(stage)
     for round_ in config.shell:
         fit.follow(round_)
     if config.settle is not None:
@@ -162,22 +165,55 @@ class _Fit:
     def bend_graph(self, stage: GraphStage) -> None:
         """One stage of the coarse registration."""
         self.refine(stage.nodes)
-        graph, size = self.graph, self.size
-        stiffness = Stiffness(stage.stretch * size, stage.bend * size, stage.growth * size)
+        before = self.x
+        self.rounds(stage)
+        self.advance(before, stage.rounds)
+
+    def rounds(self, stage: GraphStage) -> None:
+        """Seek matches and follow them, as often as the stage says."""
         held = self.landmark_pull(stage.landmarks)
-        target = self.target.thinned(stage.detail * size)
-        sample = thin(self.template.vertices, stage.detail * size)
+        target = self.target.thinned(stage.detail * self.size)
+        sample = thin(self.template.vertices, stage.detail * self.size)
         for _ in range(stage.rounds if stage.reach else 1):
             wanted, steps = held, stage.rounds
             if stage.reach:
                 wanted, steps = held + self.matches(target, sample, stage.reach, stage.slide, stage).wanted, 1
                 if self.hints is not None and stage.hints:
-                    wanted += self.hints.wanted(self.x, stage.reach * size, stage.hints * size**2)
+                    wanted += self.hints.wanted(self.x, stage.reach * self.size, stage.hints * self.size**2)
             if wanted.A.any():
-                found = minimise(graph, self.pattern, self.motion, wanted, stiffness, steps, 1e-3)
+                found = minimise(self.graph, self.pattern, self.motion, wanted, self.stiffness(stage), steps, 1e-3)
                 self.motion, self.energies = found.motion, found.energies
                 self.iterations += found.iterations
-            self.advance(deform(graph, self.motion), steps)
+            self.x = deform(self.graph, self.motion)
+
+    def try_twists(self, stage: GraphStage) -> None:
+        """Turn ends of the body about themselves; keep what lies nearer to the scan, stretch counted in."""
+        twists, size = self.config.twists, self.size
+        scale = self.config.normal_weight * size
+        target = orient(self.target.thinned(0.5 * stage.detail * size), self.template.with_vertices(self.x), scale)
+        for end in find_ends(self.template, twists.ends, twists.radius * size):
+            turned = turned_end(self.template, end, self.x, target, scale, twists, size)
+            if turned is None:
+                continue
+            before = self.x, self.motion, self.energies
+            value = self.misfit(target, twists.cap * size, stage)
+            drawn = pull(len(self.x), end.vertices, turned, self.template.vertex_areas[end.vertices])
+            found = minimise(self.graph, self.pattern, self.motion, drawn + self.landmark_pull(stage.landmarks),
+                             self.stiffness(stage), 8, 1e-3)
+            self.motion, self.x = found.motion, deform(self.graph, found.motion)
+            self.rounds(replace(stage, hints=0.0, paths=0.0))
+            if self.misfit(target, twists.cap * size, stage) >= value:
+                self.x, self.motion, self.energies = before
+
+    def misfit(self, target: Target, cap: float, stage: GraphStage) -> float:
+        """Error against the scan and strain, as they are now."""
+        error = mismatch(self.template.with_vertices(self.x), self.all, target, self.config.normal_weight * self.size,
+                         cap)
+        now = terms(self.graph, self.motion, self.landmark_pull(stage.landmarks), self.stiffness(stage))
+        return float(error @ self.template.vertex_areas) + sum(term.value for term in now.values())
+
+    def stiffness(self, stage: GraphStage) -> Stiffness:
+        return Stiffness(stage.stretch * self.size, stage.bend * self.size, stage.growth * self.size)
 
     def refine(self, nodes: int) -> None:
         """Go on with a graph of so many nodes."""
@@ -196,14 +232,17 @@ class _Fit:
         x = self.shell.displaced(self.x, wanted, stage.smoothing * self.size, stage.tension * self.size)
         self.energies["shell"] = wanted.energy(x)
         self.iterations += 1
-        self.advance(x, 1)
+        before, self.x = self.x, x
+        self.advance(before, 1)
 
     def settle(self, config: SettleConfig) -> None:
         """The last pass."""
         settled = settle(self.template, self.x, self.target, self.landmarks, config)
         self.iterations += settled.iterations
         self.energies["strain"] = settled.strain
-        self.advance(settled.vertices, 1)
+        before, self.x = self.x, settled.vertices
+        self.advance(before, 1)
+        self.converged = settled.converged
 
     def matches(self, target: Target, sample: np.ndarray, reach: float, slide: float,
                 stage: GraphStage | None = None) -> Matching:
@@ -229,9 +268,8 @@ class _Fit:
                             float(np.sqrt(np.mean(distances[seen] ** 2))) if seen.any() else np.nan, landmark_rms,
                             self.converged, self.iterations, self.energies, int(folded.sum()), found.confidence)
 
-    def advance(self, x: np.ndarray, steps: int) -> None:
-        """Take new vertices and tell of the progress."""
-        self.converged = bool(np.linalg.norm(x - self.x, axis=1).mean() <= self.config.settled * self.size)
-        self.x = x
+    def advance(self, before: np.ndarray, steps: int) -> None:
+        """Note how far the vertices have moved, and tell of the progress."""
+        self.converged = bool(np.linalg.norm(self.x - before, axis=1).mean() <= self.config.settled * self.size)
         self.done += steps
         self.progress(self.done, self.total)

@@ -4,6 +4,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 from .settle import SettleConfig
+from .twists import TwistConfig
 
 
 @dataclass(frozen=True)
@@ -31,6 +32,8 @@ class GraphStage:
         How much positions count when matches are sought; 0 seeks by paths alone.
     paths : float
         Distance that a difference by e between path lengths to the landmarks is worth when matching.
+    twists : bool
+        Afterwards, see whether ends of the body are turned about themselves.
     hints : float
         The share of the surface that all given correspondences together weigh as much as.
     """
@@ -47,6 +50,7 @@ class GraphStage:
     place: float = 1.0
     paths: float = 0.0
     hints: float = 0.0
+    twists: bool = False
 
 
 @dataclass(frozen=True)
@@ -78,6 +82,8 @@ class RegistrationConfig:
     ----------
     graph : stages of the coarse registration
     shell : rounds in which the surface follows the scan as a thin shell
+    twists : TwistConfig
+        The search for ends of the body that are turned about themselves.
     settle : SettleConfig or None
         The last pass.
     path_cell : float
@@ -96,17 +102,17 @@ class RegistrationConfig:
     graph: tuple[GraphStage, ...] = (
         GraphStage(300, 0.7, 0.07, 2.0, 0.1, 1.0, 1.0, rounds=4, place=0.0, paths=0.3, hints=1.0),
         GraphStage(300, 0.5, 0.05, 2.0, 0.1, 0.3, 0.3, rounds=5, place=0.3, paths=0.3, hints=1.0),
-        GraphStage(300, 0.3, 0.03, 0.7, 0.05, 0.2, 0.1, rounds=6, paths=0.2, hints=0.5),
-        GraphStage(300, 0.2, 0.02, 0.7, 0.01, 0.15, 0.05, rounds=6, paths=0.1, hints=0.2),
-        GraphStage(300, 0.13, 0.013, 0.7, 0.01, 0.11, 0.0, rounds=6, paths=0.05, hints=0.1),
-        GraphStage(300, 0.09, 0.009, 0.7, 0.01, 0.08, 0.0, rounds=6),
-        GraphStage(300, 0.06, 0.006, 0.7, 0.01, 0.06, 0.0, rounds=6),
-        GraphStage(300, 0.04, 0.004, 0.7, 0.01, 0.05, 0.0, rounds=6),
-        GraphStage(1000, 0.04, 0.004, 0.35, 0.01, 0.05, detail=0.008),
-        GraphStage(1000, 0.025, 0.0025, 0.35, 0.01, 0.037, detail=0.008),
+        GraphStage(300, 0.3, 0.03, 0.7, 0.05, 0.2, 0.1, rounds=4, paths=0.2, hints=0.5),
+        GraphStage(300, 0.2, 0.02, 0.7, 0.01, 0.15, 0.05, rounds=5, paths=0.1, hints=0.2),
+        GraphStage(300, 0.13, 0.013, 0.7, 0.01, 0.11, 0.0, rounds=4, paths=0.05, hints=0.1),
+        GraphStage(300, 0.09, 0.009, 0.7, 0.01, 0.08, 0.0, rounds=4),
+        GraphStage(300, 0.06, 0.006, 0.7, 0.01, 0.06, 0.0, rounds=4),
+        GraphStage(300, 0.02, 0.002, 0.7, 0.01, 0.05, 0.0, rounds=5, twists=True),
+        GraphStage(1000, 0.02, 0.002, 0.35, 0.01, 0.037, detail=0.008),
         GraphStage(1000, 0.015, 0.0015, 0.35, 0.005, 0.028, detail=0.008),
     )
     shell: tuple[ShellStage, ...] = ()
+    twists: TwistConfig = field(default_factory=TwistConfig)
     settle: SettleConfig | None = field(default_factory=SettleConfig)
     path_cell: float = 0.012
     neighbours: int = 16
