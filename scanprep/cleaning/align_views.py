@@ -1,7 +1,7 @@
 """Range views with rough camera poses brought together, all at once."""
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -11,6 +11,8 @@ from ..geometry import rotations
 from ..geometry.mesh import Mesh
 from ..geometry.surface import OrientedPoints
 from .merge import border_distance, mesh_and_camera
+from .place_features import place_by_features
+from .place_views import fit_of_views, place_by_landmarks
 from .remesh import smooth
 
 
@@ -34,15 +36,21 @@ class AlignViewsConfig:
         Rounds of smoothing before normals are taken.
     tolerance : float, metres
         Settled when no view's points move further in a round.
+    min_overlap : float
+        Share of a view that others must have seen as well for its place to be trusted.
+    max_conflict : float
+        Share of a view that others may look through before its place is not trusted.
     """
 
-    iterations: int = 40
+    iterations: int = 60
     points: int = 4000
     reach: float = 0.08
     min_cosine: float = 0.8
     border: float = 0.02
     smoothing: int = 10
-    tolerance: float = 2e-5
+    tolerance: float = 5e-5
+    min_overlap: float = 0.15
+    max_conflict: float = 0.03
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,6 +67,13 @@ class AlignedViews:
         Of the distances between matched points and planes, in the end.
     converged : bool
     iterations : int
+    overlap : (V,) float
+        Share of each view that others saw as well.
+    conflict : (V,) float
+        Share of each view that others look through, which cannot be where views are in place.
+    trusted : (V,) bool
+        Views that came to rest, overlap with others and do not contradict them; where one is False the result
+        should not be merged.
     """
 
     views: list[tuple[Mesh, np.ndarray]]
@@ -66,19 +81,27 @@ class AlignedViews:
     rms: float
     converged: bool
     iterations: int
+    overlap: np.ndarray
+    conflict: np.ndarray
+    trusted: np.ndarray
 
 
 def align_views(views: Sequence[Any], config: AlignViewsConfig | None = None,
-                rng: np.random.Generator | None = None) -> AlignedViews:
+                rng: np.random.Generator | None = None,
+                landmarks: Sequence[Mapping[str, np.ndarray]] | None = None, features: bool = False) -> AlignedViews:
     """Refine rough camera poses by point-to-plane matching between all pairs of views together.
 
     Parameters
     ----------
     views : sequence of RangeView, or of (Mesh, camera position (3,)) pairs
-        A few centimetres and degrees from where they belong.
+        A few centimetres and degrees from where they belong, unless landmarks or features place them first.
     config : AlignViewsConfig, optional
     rng : numpy.random.Generator, optional
         Draws the points that look for matches.
+    landmarks : sequence of mappings name -> (3,) point, one for each view, optional
+        Clicked points or markers, each in two views or more; they bring the views to where matching can begin.
+    features : bool
+        Find the places of the views from their shapes alone, without any knowledge of the cameras.
 
     Returns
     -------
@@ -93,6 +116,12 @@ def align_views(views: Sequence[Any], config: AlignViewsConfig | None = None,
     pairs = [mesh_and_camera(view) for view in views]
     if not pairs:
         raise ValueError("views: expected at least one, got none")
+    start = np.tile(np.eye(4), (len(pairs), 1, 1))
+    if landmarks is not None:
+        start = place_by_landmarks(landmarks, len(pairs))
+    elif features:
+        start = place_by_features(pairs, rng)
+    pairs = [_moved(pair, T) for pair, T in zip(pairs, start, strict=True)]
     samples = [_oriented(mesh, config, rng) for mesh, _ in pairs]
     poses = np.tile(np.eye(4), (len(pairs), 1, 1))
     reach, rms, settled, rounds = config.reach, 0.0, len(pairs) == 1, 0
@@ -109,9 +138,15 @@ def align_views(views: Sequence[Any], config: AlignViewsConfig | None = None,
         rms, settled, rounds = float(np.sqrt(np.mean(residual**2))), moved < config.tolerance, rounds + 1
         distances = np.concatenate([d for *_, d in matches])
         reach = min(reach, max(3 * float(np.median(distances)), 0.005))
-    out = [(mesh.with_vertices(mesh.vertices @ T[:3, :3].T + T[:3, 3]), T[:3, :3] @ camera + T[:3, 3])
-           for T, (mesh, camera) in zip(poses, pairs, strict=True)]
-    return AlignedViews(out, poses, rms, settled, rounds)
+    out = [_moved(pair, T) for pair, T in zip(pairs, poses, strict=True)]
+    overlap, conflict = fit_of_views(out)
+    trusted = settled & (overlap >= config.min_overlap) & (conflict <= config.max_conflict) | (len(out) == 1)
+    return AlignedViews(out, poses @ start, rms, settled, rounds, overlap, conflict, trusted)
+
+
+def _moved(view: tuple[Mesh, np.ndarray], T: np.ndarray) -> tuple[Mesh, np.ndarray]:
+    mesh, camera = view
+    return mesh.with_vertices(mesh.vertices @ T[:3, :3].T + T[:3, 3]), T[:3, :3] @ camera + T[:3, 3]
 
 
 def _oriented(mesh: Mesh, config: AlignViewsConfig, rng: np.random.Generator

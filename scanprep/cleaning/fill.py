@@ -235,7 +235,7 @@ class _Filling:
         guide = diffused_surface(*_around(mesh, rim, 4.0), self.config.diffusion, self.seen)
         filled = self._patched(mesh, [group], guide, None)
         faults = self._faults(filled, len(mesh.faces), [group])[0]
-        if method == "diffusion" or (faults[1] > 0.02, faults[0], faults[1]) <= (
+        if method == "diffusion" or (faults[1] > 0.02, faults[0], faults[1]) < (
                 fair_faults[1] > 0.02, fair_faults[0], fair_faults[1]):
             return filled, faults, "diffusion"
         return self._patched(mesh, [group], None, None), fair_faults, "fair"

@@ -5,9 +5,9 @@ from dataclasses import dataclass
 
 import numpy as np
 from protocols import RealData
-from scipy.spatial import cKDTree
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
 
-from scanprep.cleaning.repair import drop_small_components, split_vertices
 from scanprep.geometry.geodesics import SurfaceGraph
 from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.surface import Surface
@@ -47,29 +47,36 @@ def soles(upright: Mesh, toes: dict[str, int], height: float = 0.012) -> dict[st
     return {name: down & (nearest == k) for k, name in enumerate(toes)}
 
 
-def six_holes(name: str, truth: Mesh, marks: dict[str, int], sole: dict[str, np.ndarray]) -> HoledBody:
-    """Discs along the surface about the landmarks, and both soles, cut out."""
+def six_holes(name: str, truth: Mesh, marks: dict[str, int], sole: dict[str, np.ndarray], scale: float = 1.0
+              ) -> HoledBody:
+    """Discs along the surface about the landmarks, of `RADII` times a scale, and both soles, cut out."""
     graph = SurfaceGraph(truth)
-    gone = {hole: (graph.distances(marks[hole], 2 * radius) < radius)[truth.faces].all(axis=1)
+    gone = {hole: (graph.distances(marks[hole], 2 * radius) < scale * radius)[truth.faces].all(axis=1)
             for hole, radius in RADII.items()} | sole
-    mesh = truth.submesh(~np.any(list(gone.values()), axis=0))[0]
-    mesh = drop_small_components(split_vertices(mesh), 1.0)     # no loose islands
-    used = cKDTree(truth.vertices).query(mesh.vertices)[1]
+    mesh, used = truth.submesh(_one_piece(truth, ~np.any(list(gone.values()), axis=0)))
     left = np.zeros(len(truth.vertices), dtype=bool)
     left[used] = True
     removed = {hole: np.setdiff1d(truth.faces[faces], np.flatnonzero(left)) for hole, faces in gone.items()}
     return HoledBody(name, truth, mesh, removed)
 
 
-def real_body(data: RealData, kind: str, index: int) -> HoledBody:
+def _one_piece(mesh: Mesh, keep: np.ndarray) -> np.ndarray:
+    """(F,) bool: of the triangles to keep, those of the largest piece that hangs together by edges."""
+    pairs = mesh.face_pairs[keep[mesh.face_pairs].all(axis=1)]
+    count = len(mesh.faces)
+    label = connected_components(coo_array((np.ones(len(pairs)), pairs.T), shape=(count, count)), directed=False)[1]
+    return np.asarray(label == np.bincount(label[keep]).argmax())
+
+
+def real_body(data: RealData, kind: str, index: int, scale: float = 1.0) -> HoledBody:
     """A pose ("pose") or a man ("man") of the real scans."""
     truth = data.template.with_vertices((data.poses if kind == "pose" else data.shapes)[index])
     toes = {"left sole": data.landmarks["toe in left leg"], "right sole": data.landmarks["toe in right leg"]}
     marks = {hole: data.landmarks[mark] for hole, mark in REAL_MARKS.items()}
-    return six_holes(f"{kind}{index:03d}", truth, marks, soles(data.template, toes))
+    return six_holes(f"{kind}{index:03d}", truth, marks, soles(data.template, toes), scale)
 
 
-def embedded_body(seed: int) -> HoledBody:
+def embedded_body(seed: int, scale: float = 1.0) -> HoledBody:
     """A procedural person near the rest pose."""
     from scanprep.scanning import people
     from scanprep.scanning.embedded import near_rest, stand
@@ -80,7 +87,7 @@ def embedded_body(seed: int) -> HoledBody:
     rest, body = stand(person, np.zeros((16, 3))).mesh, stand(person, near_rest(rng)).mesh
     toes = {"left sole": people.LANDMARKS["left toe"], "right sole": people.LANDMARKS["right toe"]}
     marks = {hole: people.LANDMARKS[mark] for hole, mark in EMBEDDED_MARKS.items()}
-    return six_holes(f"embedded{seed}", body, marks, soles(rest, toes))
+    return six_holes(f"embedded{seed}", body, marks, soles(rest, toes), scale)
 
 
 def distances(item: HoledBody, filled: Mesh, kept: int | None) -> dict[str, float]:
