@@ -7,8 +7,15 @@ import pytest
 from scanprep.geometry.storage import StorageError
 from scanprep.scanning.people import Person
 from scanprep.scanning.people_motion import named_pose
-from scanprep.skeleton.edit import (apply_edits, merge_parts, move_joint, part_number, read_edits, rename_part,
-                                    split_part)
+from scanprep.skeleton.edit import (
+    apply_edits,
+    merge_parts,
+    move_joint,
+    part_number,
+    read_edits,
+    rename_part,
+    split_part,
+)
 from scanprep.skeleton.labels import pieces
 
 
@@ -73,7 +80,8 @@ def test_a_part_is_split_across_its_length_into_connected_halves(person):
     for half in (top, end):
         assert len(np.unique(pieces(mesh.face_pairs, np.where(half, 0, 1))[half])) == 1
         assert mesh.face_areas[half].sum() > 0.3 * mesh.face_areas[faces(before, "l_thigh")].sum()
-    assert [parent(after, name) for name in ("thigh_top", "thigh_end", "l_shin")] == ["pelvis", "thigh_top", "thigh_end"]
+    assert parent(after, "thigh_top") == "pelvis" and parent(after, "thigh_end") == "thigh_top"
+    assert parent(after, "l_shin") == "thigh_end"
     hip, knee = joint(before, "l_thigh"), joint(before, "l_shin")
     along = (joint(after, "thigh_end") - hip) @ (knee - hip) / ((knee - hip) @ (knee - hip))
     assert 0.3 < along < 0.7
@@ -171,5 +179,5 @@ def test_parts_are_known_by_name_and_number(person):
 
 def test_a_skeleton_of_another_template_is_refused(person):
     small = person.mesh.submesh(np.arange(len(person.mesh.faces)) < 100)[0]
-    with pytest.raises(ValueError, match="template: expected the .* triangles of the skeleton, got"):
+    with pytest.raises(ValueError, match=r"template: expected the \d+ triangles of the skeleton, got"):
         apply_edits(person.skeleton, small, [])

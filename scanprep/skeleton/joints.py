@@ -156,13 +156,17 @@ def more_parts(search: PartSearch, label: np.ndarray, count: int) -> tuple[np.nd
     return None
 
 
-def fewer_parts(search: PartSearch, label: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray] | None:
-    """The tree where the two linked parts are one whose union costs least, with not less than `count` parts."""
+def fewer_parts(search: PartSearch, label: np.ndarray, count: int, limit: float = np.inf
+                ) -> tuple[np.ndarray, np.ndarray] | None:
+    """The tree where the two linked parts are one whose union costs least, with not less than `count` parts.
+
+    Parts farther apart than `limit` stay.
+    """
     many, partner = int(label.max()) + 1, search.sides.partners(label)
-    pairs, _, extra = search.separations(label)
+    pairs, separation, extra = search.separations(label)
     fewer = reductions(pairs, partner) if search.sides.tied else np.ones(len(pairs), dtype=np.int64)
     for i in np.argsort(extra * fewer, kind="stable"):
-        if many - fewer[i] >= count:
+        if many - fewer[i] >= count and separation[i] < limit:
             joined = search.alternate(search.join(label, *pairs[i]), rounds=4)
             links = without_weak(search, joined)
             if joined.max() + 1 == many - fewer[i] and len(links) == joined.max():

@@ -56,7 +56,7 @@ class SkeletonConfig:
     symmetric: bool | None = None
     restarts: int = 3
     seed: int = 0
-    worth: float = 0.1
+    worth: float = 0.08
     fading: float = 0.8
 
     def __post_init__(self) -> None:
@@ -64,7 +64,7 @@ class SkeletonConfig:
             raise ValueError(f"parts: expected at least 1, got {self.parts}")
         if self.restarts < 1:
             raise ValueError(f"restarts: expected at least 1, got {self.restarts}")
-        for name in ("separation", "tolerance", "smallest", "smoothness"):
+        for name in ("separation", "tolerance", "smallest", "smoothness", "worth", "fading"):
             if not getattr(self, name) > 0:
                 raise ValueError(f"{name}: expected more than 0, got {getattr(self, name)}")
 

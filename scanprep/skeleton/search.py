@@ -8,7 +8,17 @@ import numpy as np
 
 from ..geometry.mesh import Mesh, check_template
 from .bands import dissolve_bands, passages
-from .joints import Loop, fewer_parts, middle_part, more_parts, place_joints, to_tree, tree_of, without_weak
+from .joints import (
+    LOOP_SEPARATION,
+    Loop,
+    fewer_parts,
+    middle_part,
+    more_parts,
+    place_joints,
+    to_tree,
+    tree_of,
+    without_weak,
+)
 from .motions import PosedSurface
 from .names import names_by_symmetry
 from .parts import PartSearch, SkeletonConfig, find_parts
@@ -194,14 +204,14 @@ def _score(search: PartSearch, label: np.ndarray) -> float:
 def _improved(search: PartSearch, label: np.ndarray, links: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Labels and links of a tree after parts were joined, and cut, as long as the score falls.
 
-    A cut that makes a mere band of skin does not count.
+    Only parts that are not well apart are joined: hands are too small to lower the energy much. A cut that makes a mere
+    band of skin does not count.
     """
     score = _score(search, label)
     for _ in range(search.config.start):
         many = int(label.max()) + 1
-        moves = (fewer_parts, max(many - 2, 1)), (more_parts, many + 2)
-        trials = (move(search, label, count) for move, count in moves)
-        for trial in trials:
+        for trial in (fewer_parts(search, label, max(many - 2, 1), LOOP_SEPARATION * search.config.separation),
+                      more_parts(search, label, many + 2)):
             if trial is None:
                 continue
             moved = search.alternate(trial[0], rounds=4)

@@ -1,0 +1,175 @@
+"""Symmetry of bodies, symmetric skeletons, bands of skin that are no parts, loops, and fast costs of rigid motions."""
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from animal_bodies import ODD, Animal, Build, random_pose
+
+from scanprep.geometry import rotations
+from scanprep.geometry.mesh import Mesh
+from scanprep.scanning.people import Person
+from scanprep.scanning.people_anatomy import MIRROR_PART
+from scanprep.skeleton.bands import dissolve_bands, passages
+from scanprep.skeleton.joints import to_tree, without_weak
+from scanprep.skeleton.motions import PosedSurface, fit_motions, rigid_costs
+from scanprep.skeleton.names import part_partners
+from scanprep.skeleton.parts import PartSearch, SkeletonConfig
+from scanprep.skeleton.patches import cover
+from scanprep.skeleton.search import search_skeleton
+from scanprep.skeleton.sides import Sides, closure, mirror_pairs
+from scanprep.skeleton.symmetry import find_symmetry
+
+CONFIG = SkeletonConfig(restarts=1, patches=120, start=20)
+
+
+@pytest.fixture(scope="module")
+def animal():
+    return Animal(Build(aside=0.0))
+
+
+@pytest.fixture(scope="module")
+def poses(animal):
+    rng = np.random.default_rng(0)
+    return np.stack([animal.mesh.vertices, *(animal.posed(random_pose(rng)) for _ in range(13))])
+
+
+@pytest.fixture(scope="module")
+def found(animal, poses):
+    return search_skeleton(animal.mesh, poses, CONFIG)
+
+
+def shares(mesh, skeleton):
+    return np.bincount(skeleton.part_of_face, mesh.face_areas) / mesh.face_areas.sum()
+
+
+def adjusted_rand(a, b):
+    table = np.zeros((a.max() + 1, b.max() + 1))
+    np.add.at(table, (a, b), 1)
+    together, rows, columns = ((t * (t - 1) / 2).sum() for t in (table, table.sum(axis=1), table.sum(axis=0)))
+    chance = rows * columns / (len(a) * (len(a) - 1) / 2)
+    return (together - chance) / ((rows + columns) / 2 - chance)
+
+
+@pytest.mark.parametrize("seed", range(2))
+def test_the_plane_of_a_person_is_found_in_any_direction_and_order(seed):
+    rng, body = np.random.default_rng(seed), Person()
+    R, old = rotations.exp(rng.normal(0, 2, 3)), rng.permutation(len(body.mesh.faces))
+    symmetry = find_symmetry(Mesh(body.mesh.vertices @ R.T + rng.normal(0, 3, 3), body.mesh.faces[old]))
+    assert symmetry.holds and symmetry.distance < 0.005 and symmetry.returns > 0.99
+    assert abs(symmetry.normal @ R[:, 0]) > np.cos(np.radians(1))
+    part = body.part_of_face[old]
+    assert (part[symmetry.partner] == MIRROR_PART[part]).mean() > 0.99
+
+
+def test_a_body_that_stands_crooked_is_judged_in_its_straightest_pose():
+    body, bent = Person(), np.zeros((16, 3))
+    bent[[4, 5, 10]] = [[0, -1.5, 0.4], [0, 0.8, 0.8], [-1.4, 0, 0]]
+    crooked = body.mesh.with_vertices(body.posed(bent))
+    alone = find_symmetry(crooked)
+    helped = find_symmetry(crooked, np.stack([body.posed(bent / 2), body.mesh.vertices, body.posed(-bent / 2)]))
+    assert not alone.holds and alone.pose == -1
+    assert helped.holds and helped.pose == 1 and abs(helped.normal[0]) > 0.999
+
+
+def test_a_lump_is_not_symmetric():
+    animal = Animal(Build(aside=0.0))
+    x = animal.mesh.vertices @ ODD
+    lump = x * (1 + 0.5 * np.sin(x @ [[4.0, 1], [2, 5], [3, -2]]).sum(axis=1, keepdims=True)) + 0.4 * x[:, [1, 2, 0]]
+    assert not find_symmetry(Mesh(lump, animal.mesh.faces)).holds
+
+
+def test_tied_labels_are_mirror_images(animal, poses):
+    surface, symmetry = PosedSurface(animal.mesh, poses), find_symmetry(animal.mesh)
+    sides = Sides(surface, symmetry)
+    patch = cover(surface, 60, sides, np.random.default_rng(1))
+    partner = sides.partners(patch)
+    assert (partner[partner] == np.arange(len(partner))).all() and (partner != np.arange(len(partner))).all()
+    assert (patch[sides.mirrored] == partner[patch[symmetry.partner[sides.mirrored]]]).all()
+    joined = sides.join(patch, 0, int(partner[0]), partner)
+    assert len(np.unique(joined)) == len(partner) - 1
+    pairs = np.array([[0, 1], *np.sort(partner[[[0, 1]]])])
+    assert mirror_pairs(pairs, partner).tolist() == [1, 0]
+
+
+def test_pairs_join_together():
+    partner = np.array([1, 0, 2, 4, 3, 5])
+    assert closure(0, 3, partner) == [[0, 3], [1, 4]]
+    assert closure(0, 1, partner) == [[0, 1]]
+    assert closure(2, 3, partner) == [[2, 3, 4]]
+    assert [sorted(s) for s in closure(2, 5, partner)] == [[2, 5]]
+
+
+def test_a_symmetric_animal_gets_its_twelve_symmetric_parts(animal, poses, found):
+    skeleton, truth = found.skeleton, animal.skeleton
+    assert found.symmetric and found.symmetry.holds and found.restarts == 1 and found.energies[0] > 0
+    assert len(skeleton.parents) == 12
+    partner = part_partners(animal.mesh, skeleton, found.symmetry)
+    assert partner is not None and (partner == np.arange(12)).sum() == 4
+    share = shares(animal.mesh, skeleton)
+    assert (np.abs(share - share[partner]) < 0.15 * share).all()
+    assert adjusted_rand(truth.part_of_face, skeleton.part_of_face) > 0.92
+    for j in range(1, 12):
+        assert np.linalg.norm(skeleton.joints - truth.joints[j], axis=1).min() < 0.03
+
+
+def test_another_seed_finds_the_same_tree(animal, poses, found):
+    again = search_skeleton(animal.mesh, poses, replace(CONFIG, seed=7))
+    assert adjusted_rand(found.skeleton.part_of_face, again.skeleton.part_of_face) >= 0.98
+    assert len(again.skeleton.parents) == 12
+
+
+@pytest.mark.parametrize("count", [9, 13])
+def test_as_many_parts_as_asked_for(animal, poses, count):
+    skeleton = search_skeleton(animal.mesh, poses, replace(CONFIG, parts=count)).skeleton
+    assert len(skeleton.parents) == count
+    assert set(np.unique(skeleton.part_of_face)) == set(range(count))
+
+
+def test_symmetry_can_be_refused(animal, poses, found):
+    free = search_skeleton(animal.mesh, poses, replace(CONFIG, symmetric=False))
+    assert not free.symmetric and free.symmetry.holds
+    assert adjusted_rand(free.skeleton.part_of_face, found.skeleton.part_of_face) > 0.9
+
+
+def test_a_band_between_two_parts_is_no_part(animal, poses):
+    """A ring cut out where the knee bends dissolves, its neighbours do not."""
+    surface, truth = PosedSurface(animal.mesh, poses), animal.skeleton
+    search, free = PartSearch(surface, CONFIG, find_symmetry(animal.mesh)), PartSearch(surface, CONFIG)
+    knee = np.linalg.norm(animal.mesh.corners.mean(axis=1) - truth.joints[5], axis=1) < 0.06
+    label = np.where(knee & np.isin(truth.part_of_face, [4, 5]), 12, truth.part_of_face)
+    assert (label == 12).sum() > 10
+    explained = passages(free, label)[0]
+    assert explained[12] > 0.8 > explained[:12].max()
+    assert dissolve_bands(free, label).max() == 11
+    assert passages(search, truth.part_of_face)[0].max() < 0.8
+
+
+def test_a_loop_is_opened_and_reported(animal, poses):
+    """The barrel cut into four quarters around its length: they close a loop, and become one."""
+    surface, truth = PosedSurface(animal.mesh, poses), animal.skeleton
+    search = PartSearch(surface, CONFIG)
+    across = (animal.mesh.corners.mean(axis=1) @ ODD)[:, [1, 2]] > 0
+    quarter = across @ [1, 2]
+    label = np.where(truth.part_of_face == 0, np.where(quarter == 0, 0, quarter + 11), truth.part_of_face)
+    label, links, loops = to_tree(search, label)
+    assert loops and all(loop.length >= 3 for loop in loops) and any(loop.joined for loop in loops)
+    assert len(links) == label.max() and len(without_weak(search, label)) >= len(links)
+
+
+def test_costs_of_rigid_motions_without_the_motions():
+    rng = np.random.default_rng(0)
+    mesh = Animal().mesh
+    turned = [mesh.vertices @ rotations.exp(rng.normal(size=3)).T for _ in range(9)]
+    poses = np.stack([x * rng.uniform(-1.1, 1.1, 3) for x in turned])
+    surface = PosedSurface(mesh, poses)
+    moments = surface.moments(rng.integers(0, 40, len(mesh.faces)))
+    exact = fit_motions(moments).cost
+    np.testing.assert_allclose(rigid_costs(moments), exact, atol=1e-12 * moments.yy.max())
+    rigid = PosedSurface(mesh, np.stack([mesh.vertices @ rotations.exp([0, 0, k]).T for k in range(3)]))
+    assert rigid_costs(rigid.moments(np.zeros(len(mesh.faces), dtype=int)))[0] < 1e-14
+
+
+def test_bad_settings_of_the_search_are_refused_by_name():
+    for name, value in (("restarts", 0), ("worth", -1.0), ("fading", 0.0)):
+        with pytest.raises(ValueError, match=name):
+            replace(CONFIG, **{name: value})
