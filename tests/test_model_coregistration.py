@@ -30,7 +30,7 @@ QUICK = CoregistrationConfig(
     fit=ModelFitConfig(axes=2, turns=2),
     registration=RegistrationConfig(graph=(GraphStage(80, 0.09, 0.009, 0.7, 0.01, 0.08),
                                            GraphStage(80, 0.06, 0.006, 0.7, 0.01, 0.05)),
-                                    shell=(ShellStage(0.02, 0.007, 0.0002, 0.02),)),
+                                    shell=(ShellStage(0.02, 0.007, 0.0002, 0.02),), settle=None),
     learn=LearnConfig(refinements=1, steps=1), rounds=2, workers=1)
 PLAIN = replace(QUICK.registration, graph=(GraphStage(80, 0.2, 0.02, 0.7, 0.01, 0.21),
                                            GraphStage(80, 0.13, 0.013, 0.7, 0.01, 0.15), *QUICK.registration.graph))

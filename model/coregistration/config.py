@@ -3,7 +3,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
-from scanprep.matching.schedule import GraphStage, RegistrationConfig, ShellStage
+from scanprep.matching.schedule import GraphStage, RegistrationConfig
 from scanprep.skeleton.parts import SkeletonConfig
 
 from ..learning.scape import LearnConfig
@@ -88,14 +88,13 @@ class ModelFitConfig:
 
 
 # the predicted mesh lies near already: fine stages only, whose stiffness is relative to the prediction's own shape
-NEAR = RegistrationConfig(
-    graph=(
-        GraphStage(300, 0.09, 0.009, 0.7, 0.01, 0.08),
-        GraphStage(300, 0.06, 0.006, 0.7, 0.01, 0.06),
-        GraphStage(1000, 0.04, 0.004, 0.35, 0.01, 0.05, detail=0.008),
-        GraphStage(1000, 0.025, 0.0025, 0.35, 0.01, 0.037, detail=0.008),
-    ),
-    shell=(ShellStage(0.02, 0.007, 0.0002, 0.02), ShellStage(0.015, 0.003, 0.0002, 0.015)))
+NEAR = RegistrationConfig(graph=(
+    GraphStage(300, 0.09, 0.009, 0.7, 0.01, 0.08),
+    GraphStage(300, 0.06, 0.006, 0.7, 0.01, 0.06),
+    GraphStage(1000, 0.04, 0.004, 0.35, 0.01, 0.05, detail=0.008),
+    GraphStage(1000, 0.025, 0.0025, 0.35, 0.01, 0.037, detail=0.008),
+))
+
 
 @dataclass(frozen=True)
 class CoregistrationConfig:

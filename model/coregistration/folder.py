@@ -78,13 +78,13 @@ class RoundsFolder:
             return None
         figures: dict[str, Any] = {name: np.nan if header[name] is None else header[name] for name in _FIGURES}
         return ModelRegistration(Mesh(a["mesh"], self.faces), Mesh(a["predicted"], self.faces), a["pose"], a["trans"],
-                                 a.get("betas"), a["seen"], a["distances"], **figures)
+                                 a.get("betas"), a["seen"], a["distances"], confidence=a["confidence"], **figures)
 
     def keep(self, turn: int, scan: int, registration: ModelRegistration) -> None:
         """Write what came of a scan in a round."""
         r = registration
         arrays = {"mesh": r.mesh.vertices, "predicted": r.predicted.vertices, "pose": r.pose, "trans": r.trans,
-                  "seen": r.seen, "distances": r.distances}
+                  "seen": r.seen, "distances": r.distances, "confidence": r.confidence}
         if r.betas is not None:
             arrays["betas"] = r.betas
         header = {name: None if np.isnan(getattr(r, name)) else getattr(r, name) for name in _FIGURES}

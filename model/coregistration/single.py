@@ -47,6 +47,8 @@ class ModelRegistration:
         NaN without landmarks.
     flipped : int
         Triangles that face against their surroundings.
+    confidence : (N,) float
+        From 0, made up by the model, to 1: there were data here.
     score : float, metres
         How far scan and model were apart, of the best start.
     starts : int
@@ -65,6 +67,7 @@ class ModelRegistration:
     apart: float
     landmark_rms: float
     flipped: int
+    confidence: np.ndarray
     score: float
     starts: int
 
@@ -109,7 +112,7 @@ def register_with_model(body: BodyModel | Subject, scan: Mesh | np.ndarray, land
     x, held = best.x, config.fit.refine[-1].prior
     for i in range(config.alignments):
         aligned = register(fit.predicted(x), scan, None, config.registration)
-        x = fit.taken_from(aligned.mesh.vertices, aligned.seen.astype(float), x, held)
+        x = fit.taken_from(aligned.mesh.vertices, aligned.confidence, x, held)
         tell(2 + i, total)
     predicted, (pose, trans, betas) = fit.predicted(x), fit.split(x)
     mesh, seen = aligned.mesh, aligned.seen
@@ -117,7 +120,7 @@ def register_with_model(body: BodyModel | Subject, scan: Mesh | np.ndarray, land
     off_marks = np.linalg.norm(mesh.vertices[fit.marks] - fit.marked, axis=1)
     return ModelRegistration(mesh, predicted, pose, trans, betas, seen, aligned.distances, aligned.rms,
                              fit.explained(mesh, 0.01, config.explained), _rms(off_model), _rms(off_marks),
-                             aligned.flipped, best.score, tried)
+                             aligned.flipped, aligned.confidence, best.score, tried)
 
 
 def _rms(distances: np.ndarray) -> float:

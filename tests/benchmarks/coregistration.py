@@ -1,7 +1,7 @@
 """Co-registration of virtual four-view scans of one man: errors before, and after each round.
 
     SCAPEKIT_DATA=... python tests/benchmarks/coregistration.py [--landmarks 4|7|10] [--again 0|4|7|10] [--rounds 2]
-        [--faces 5000] [--held] [--out coregistration.json]
+        [--faces 5000] [--held] [--beside 10] [--clickless 0] [--out coregistration.json]
 
 1. The template is registered to every scan without a model, with few landmarks.
 2. Skeleton and model are learned from those whose scan they explain; the truth is not asked.
@@ -37,7 +37,7 @@ from scanprep.matching.nonrigid import register
 from scanprep.skeleton.find import find_skeleton
 
 TOO_FAR = 25.0                       # mm
-BESIDE = (1, 5, 11, 16, 20, 35, 40, 45, 54, 66)     # poses that are scanned too, besides ten to look at
+BESIDE = (45, 20, 54, 16, 1, 5, 11, 35, 40, 66)     # poses that are scanned too, besides ten to look at
 
 
 def coarse(data: RealData, faces: int) -> RealData:
@@ -114,13 +114,14 @@ def main() -> None:
     parser.add_argument("--rounds", type=int, default=2)
     parser.add_argument("--faces", type=int, default=5000)
     parser.add_argument("--held", action="store_true", help="show the held-out poses instead of those for tuning")
+    parser.add_argument("--beside", type=int, default=10, help="how many further poses are scanned and learned from")
     parser.add_argument("--clickless", type=int, default=0)
     parser.add_argument("--workers", type=int, default=1)
     parser.add_argument("--out", default="coregistration.json")
     args = parser.parse_args()
     whole = load_real()
     shown = HELD_POSES if args.held else TUNING_POSES
-    poses = (*shown, *BESIDE)
+    poses = (*shown, *BESIDE[:args.beside])
     data = coarse(whole, args.faces)
     story = Story(data, [test_scan(whole, "pose", i) for i in poses], poses, shown)
     config = CoregistrationConfig(rounds=args.rounds, workers=args.workers, learn=LearnConfig(refinements=1))
