@@ -22,8 +22,6 @@ class PotentialConfig:
         Width of the sine between the directions away from two seeds.
     turn_weight : float
         Of all those sines together.
-    signature : float
-        Weight of the local shape.
     length_share, length_floor : float, share and multiples of the template's size
         Width of the length of an edge.
     lean : float
@@ -41,7 +39,6 @@ class PotentialConfig:
     seed_floor: float = 0.014
     turn: float = 0.4
     turn_weight: float = 3.0
-    signature: float = 1.0
     length_share: float = 0.08
     length_floor: float = 0.006
     lean: float = 0.25
@@ -60,22 +57,20 @@ def robust(r: np.ndarray, limit: float) -> np.ndarray:
 def place_energy(scan: Places, template: Places, config: PotentialConfig, size: float) -> np.ndarray:
     """Energy (n, m) of every place of the template as the image of every place of the scan.
 
-    [CC] local signature and geodesic potentials
+    [CC] geodesic potentials, as evidence for single places
     """
     energy = np.zeros((len(scan), len(template)))
     known = np.zeros_like(energy)
-    for x, y in zip(scan.to_seeds.T, template.to_seeds.T, strict=True):
+    for x, y, w in zip(scan.to_seeds.T, template.to_seeds.T, scan.sure.T, strict=True):
         width = config.seed_floor * size + config.seed_share * np.minimum(x[:, None], y[None])
-        r = robust((x[:, None] - y[None]) / width, 2.0)
+        r = robust((x[:, None] - y[None]) / width * w[:, None], 2.0)
         energy += np.nan_to_num(r)
         known += np.isfinite(r)
     energy *= scan.to_seeds.shape[1] / np.maximum(known, 1)
-    pairs = scan.turns.shape[1]
-    for x, y in zip(scan.turns.T, template.turns.T, strict=True):
-        energy += config.turn_weight / pairs * robust((x[:, None] - y[None]) / config.turn, 2.0)
-    if scan.signatures.shape[1] and config.signature:
-        for x, y in zip(scan.signatures.T, template.signatures.T, strict=True):
-            energy += config.signature / scan.signatures.shape[1] * robust(x[:, None] - y[None], 2.0)
+    a, b = np.triu_indices(scan.to_seeds.shape[1], 1)
+    both = (scan.sure[:, a] * scan.sure[:, b]).T
+    for x, y, w in zip(scan.turns.T, template.turns.T, both, strict=True):
+        energy += config.turn_weight / len(a) * w[:, None] * robust((x[:, None] - y[None]) / config.turn, 2.0)
     return energy
 
 
@@ -114,10 +109,10 @@ def edge_energy(scan: Places, template: Places, edges: np.ndarray, domains: np.n
         energy += 0.5 * robust((lean_k - at_i[e]) / config.lean, 3.0)
         energy += 0.5 * robust((lean_l - at_j[e]) / config.lean, 3.0)
         energy += 0.5 * robust((n[k] @ n[l].T - bend[e]) / (1.5 * config.lean), 3.0)
-        known = np.flatnonzero(np.isfinite(nearer[e]))
-        for s in known:
+        w = np.where(np.isfinite(nearer[e]), np.minimum(scan.sure[i], scan.sure[j]), 0.0)
+        for s in np.flatnonzero(w):
             r = (d[l, s][None] - d[k, s][:, None] - nearer[e, s]) / (config.direction * length[e])
-            energy += config.direction_weight / len(known) * robust(r, 2.0)
+            energy += config.direction_weight * w[s] / w.sum() * robust(r, 2.0)
         out[e] = energy
     return out
 
@@ -129,4 +124,4 @@ def most_edge_energy(config: PotentialConfig) -> float:
 
 def most_place_energy(config: PotentialConfig, seeds: int) -> float:
     """No place can cost more."""
-    return 4.0 * (seeds + config.turn_weight + config.signature)
+    return 4.0 * (seeds + config.turn_weight)

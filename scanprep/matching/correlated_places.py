@@ -20,20 +20,20 @@ class Places:
     turns : (n, S(S-1)/2) float
         For every pair of seeds the sine of the angle from the direction away from the first to that away from
         the second, about the normal: reflections change its sign, bending does not.
-    signatures : (n, D) float
-        Shape of the surroundings; D may be 0.
+    sure : (n, S) float
+        How much the way to each seed is to be trusted, 1 for a way that needs no bridge between pieces.
     """
 
     points: np.ndarray
     normals: np.ndarray
     to_seeds: np.ndarray
     turns: np.ndarray
-    signatures: np.ndarray
+    sure: np.ndarray
 
     def __getitem__(self, index: np.ndarray) -> Places:
         """Some of the places."""
         return Places(self.points[index], self.normals[index], self.to_seeds[index], self.turns[index],
-                      self.signatures[index])
+                      self.sure[index])
 
     def __len__(self) -> int:
         return len(self.points)

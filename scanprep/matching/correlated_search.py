@@ -56,6 +56,8 @@ class CorrelatedConfig:
         Edges that each point has to its nearest neighbours along the surface.
     frame : float
         Radius over which directions on the surface are averaged.
+    bridged : float
+        How much a way to a seed is trusted that bridges a gap of the scan or ends in one.
     levels : from coarse to fine
     potentials : PotentialConfig
     iterations : int
@@ -77,6 +79,7 @@ class CorrelatedConfig:
     spacing: float = 0.009
     links: int = 6
     frame: float = 0.042
+    bridged: float = 0.3
     levels: tuple[BeliefLevel, ...] = (BeliefLevel(2000, 80), BeliefLevel(2000, 60), BeliefLevel(1_000_000, 60))
     potentials: PotentialConfig = field(default_factory=PotentialConfig)
     iterations: int = 40
@@ -111,11 +114,15 @@ class Search:
         self.scale = scale_between(on_template[:, seeds[0]], on_scan[:, clicked])
         self.chosen = farthest_points(sheet.points, min(config.points, len(sheet.points)))
         self.edges = neighbour_edges(sheet, self.chosen, config.links, 0.3 * self.size)
-        self.scan = seen_from(sheet.points, sheet.normals, on_scan, self.chosen, config.frame * self.size)
+        off = np.linalg.norm(sheet.points[clicked] - seeds[1], axis=1)         # a click where there are no data
+        same = (sheet.piece[self.chosen][:, None] == sheet.piece[clicked]) & (off < 3 * sheet.spacing)
+        self.scan = seen_from(sheet.points, sheet.normals, on_scan, self.chosen, config.frame * self.size,
+                              np.where(same, 1.0, config.bridged))
         most = min(max(level.places for level in config.levels), len(template.vertices))
         self.vertices = spread_vertices(template, most)
         self.places = seen_from(self.scale * template.vertices, template.vertex_normals, self.scale * on_template,
-                                self.vertices, config.frame * self.size)
+                                self.vertices, config.frame * self.size,
+                                np.ones((most, len(seeds[0]))))
         self.beliefs: Beliefs | None = None
         self.domains = np.zeros((len(self.chosen), 0), dtype=np.int64)
         self.energy = np.nan
@@ -213,12 +220,12 @@ def scale_between(template: np.ndarray, scan: np.ndarray) -> float:
     return float(np.median(near[good] / far[good])) if good.any() else 1.0
 
 
-def seen_from(points: np.ndarray, normals: np.ndarray, distances: np.ndarray, at: np.ndarray, frame: float
-              ) -> Places:
+def seen_from(points: np.ndarray, normals: np.ndarray, distances: np.ndarray, at: np.ndarray, frame: float,
+              sure: np.ndarray) -> Places:
     """Some points of a surface as seen from the seeds, from which `distances` (S, m) are."""
     to_seeds = np.where(np.isfinite(distances[:, at]), distances[:, at], np.nan).T
     turns = turns_between(points, normals, distances, at, frame)
-    return Places(points[at], normals[at], to_seeds, turns, np.zeros((len(at), 0)))
+    return Places(points[at], normals[at], to_seeds, turns, sure)
 
 
 def neighbour_edges(sheet: Sheet, chosen: np.ndarray, links: int, limit: float) -> np.ndarray:

@@ -3,7 +3,7 @@ from __future__ import annotations
 
 import numpy as np
 from scipy.sparse import coo_array, csr_array
-from scipy.sparse.csgraph import connected_components, dijkstra, minimum_spanning_tree
+from scipy.sparse.csgraph import breadth_first_order, connected_components, dijkstra, minimum_spanning_tree
 from scipy.spatial import cKDTree
 
 from .matches import Target, thin
@@ -21,6 +21,14 @@ class Sheet:
         Points with smooth normals.
     spacing : float, metres
         Distance that the points are thinned to.
+
+    Attributes
+    ----------
+    points, normals : (n, 3) float
+    piece : (n,) int
+        Which connected piece each point belongs to.
+    surface, graph : (n, n) sparse, metres
+        Lengths of the short ways, without and with the bridges that join the larger pieces.
     """
 
     REACH = 2.6          # radius of the neighbourhood, in spacings: about twenty neighbours
@@ -34,7 +42,9 @@ class Sheet:
         self.points, self.normals = _averaged(target, keep, spacing)
         if not target.oriented:
             self.normals = _oriented(self.points, self.normals, self.REACH * spacing)
-        self._graph = _joined(self.points, self._edges(), spacing)
+        self.surface = self._edges()
+        _, self.piece = connected_components(self.surface, directed=False)
+        self.graph = _joined(self.points, self.surface, self.piece)
         self.tree = cKDTree(self.points)
 
     def _edges(self) -> csr_array:
@@ -53,7 +63,7 @@ class Sheet:
 
     def distances(self, sources: np.ndarray, limit: float = np.inf) -> np.ndarray:
         """Distances (S, n), metres, from points of the sheet (S,) to all; infinite where no way leads."""
-        return dijkstra(self._graph, directed=False, indices=sources, limit=limit)
+        return dijkstra(self.graph, directed=False, indices=sources, limit=limit)
 
     def at(self, points: np.ndarray) -> np.ndarray:
         """The point of the sheet nearest to each of `points` (m, 3)."""
@@ -77,9 +87,8 @@ def _symmetric(i: np.ndarray, j: np.ndarray, length: np.ndarray, count: int) -> 
     return csr_array(coo_array((np.maximum(np.r_[length, length], 1e-9), (rows, columns)), shape=(count, count)))
 
 
-def _joined(points: np.ndarray, graph: csr_array, spacing: float) -> csr_array:
+def _joined(points: np.ndarray, graph: csr_array, label: np.ndarray) -> csr_array:
     """The graph with its larger pieces linked by the shortest straight bridges, as holes may part a body."""
-    _, label = connected_components(graph, directed=False)
     size = np.bincount(label)
     large = np.flatnonzero(size >= max(20, 0.002 * len(points)))
     if len(large) < 2:
@@ -103,12 +112,15 @@ def _joined(points: np.ndarray, graph: csr_array, spacing: float) -> csr_array:
 def _oriented(points: np.ndarray, normals: np.ndarray, reach: float) -> np.ndarray:
     """Normals (n, 3) with signs that agree between neighbours and point outward on the whole."""
     i, j = cKDTree(points).query_pairs(reach, output_type="ndarray").T
-    cosine = np.einsum("nd,nd->n", normals[i], normals[j])
+    along = points[j] - points[i]
+    along /= np.maximum(np.linalg.norm(along, axis=1, keepdims=True), 1e-12)
+    # Through a thin part normals agree up to sign too, but the way there runs along them.
+    through = np.maximum(np.abs(np.einsum("nd,nd->n", normals[i], along)),
+                         np.abs(np.einsum("nd,nd->n", normals[j], along)))
+    cost = 1.001 - np.abs(np.einsum("nd,nd->n", normals[i], normals[j])) + 2 * through**2
     n = len(points)
-    tree = minimum_spanning_tree(csr_array(coo_array((1.001 - np.abs(cosine), (i, j)), shape=(n, n))))
+    tree = minimum_spanning_tree(csr_array(coo_array((cost, (i, j)), shape=(n, n))))
     tree = csr_array(tree + tree.T)
-    from scipy.sparse.csgraph import breadth_first_order
-
     normals, todo = normals.copy(), np.ones(n, dtype=bool)
     while todo.any():
         root = int(np.flatnonzero(todo)[points[todo, 2].argmax()])
