@@ -13,7 +13,7 @@ from scanprep.pipeline import PrepareConfig, ScanSettings, find_scans, prepare
 MARKS = {"top": 0, "left": 1, "right": 2, "front": 3, "back": 4}
 QUICK = PrepareConfig(ScanSettings(RegistrationConfig(
     graph=(GraphStage(40, 0.35, 0.035, 0.7, 0.01, 0.2, slide=0.3, rounds=2),),
-    shell=(ShellStage(0.02, 0.007, 0.0002, 0.05),)), pictures=False), min_poses=99, workers=1)
+    shell=(ShellStage(0.02, 0.007, 0.0002, 0.05),), settle=None), pictures=False), min_poses=99, workers=1)
 WITH_PICTURES = replace(QUICK, scan=replace(QUICK.scan, pictures=True))
 CHANGING = {"times.csv"}            # the only file that may differ between two runs
 

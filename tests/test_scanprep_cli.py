@@ -16,8 +16,10 @@ from scanprep.batch import cli as batch_cli
 from scanprep.cli import COMMANDS
 from scanprep.geometry.files import PointCloud, write_points
 from scanprep.geometry.storage import StorageError
+from scanprep.matching import cli as matching_cli
 from scanprep.matching.correspondence_files import read_correspondences, write_correspondences
 from scanprep.matching.correspondences import Correspondences
+from scanprep.matching.nonrigid import register
 from scanprep.pipeline import ScanSettings, find_scans, prepare
 
 ROOT = Path(__file__).parents[1]
@@ -49,6 +51,7 @@ def quick(monkeypatch):
     from functools import partial
 
     monkeypatch.setattr(batch_cli, "ScanSettings", partial(ScanSettings, registration=QUICK.scan.registration))
+    monkeypatch.setattr(matching_cli, "register", partial(register, config=QUICK.scan.registration))
 
 
 def run(*words):
@@ -101,7 +104,7 @@ def test_run(place, tmp_path, capsys, quick):
 
 def test_page_with_other_limits(place, capsys):
     page = place / "set" / "report.html"
-    assert run("page", place / "set", "--no-unsettled") == 0
+    assert run("page", place / "set", "--unseen", 0.5) == 0
     assert re.search(r"scans that need a look\W+0\b", capsys.readouterr().out)
     assert page.read_text().count('class="scan fine"') == 3
     assert run("page", place / "set", "--distance", 1e-9) == 0
@@ -208,7 +211,7 @@ def test_views_come_together(tmp_path):
     assert run("merge", tmp_path / "aligned", "--voxel", 0.03, "-o", tmp_path / "merged.ply") == 0
 
 
-def test_correspondences_in_a_file(place, tmp_path, capsys):
+def test_correspondences_in_a_file(place, tmp_path, capsys, quick):
     scan = place / "scans" / "body0.ply"
     words = ["correspond", scan, "--template", place / "template.ply", "--landmarks",
              place / "scans" / "body0.landmarks.json", "--points", 40]
@@ -217,6 +220,13 @@ def test_correspondences_in_a_file(place, tmp_path, capsys):
     assert len(found) == report(tmp_path / "pairs.report.json")["correspondences"] > 5
     assert 0 <= found.template_vertices.min() and found.template_vertices.max() < 642
     assert ((found.confidence >= 0) & (found.confidence <= 1)).all()
+    assert run("correspond", scan, "--template", place / "template.ply", "-o", tmp_path / "none.json") == 1
+    assert "at least three limbs" in capsys.readouterr().err
+    few = read_mesh(scan).vertices[::90]
+    write_correspondences(tmp_path / "few.json", Correspondences(np.arange(642)[::90], few, np.ones(len(few))))
+    assert run("register", scan, "--template", place / "template.ply", "--correspondences", tmp_path / "few.json",
+               "-o", tmp_path / "registered.ply") == 0
+    assert report(tmp_path / "registered.report.json")["vertices with data"] > 95
 
 
 def test_files_of_correspondences(tmp_path):

@@ -112,7 +112,7 @@ def test_set_without_scans(tmp_path):
     ({"converged": False}, "converged"), ({"seen": 0.0, "distance": np.nan, "rms": np.nan}, "nowhere near")])
 def test_each_figure_alone_is_noticed(change, reason):
     figures = [replace(GOOD, name=f"good{k}") for k in range(4)] + [replace(GOOD, name="bad", **change)]
-    verdicts = review(figures, [], size=1.4, faces=25_000)
+    verdicts = review(figures, [], size=1.4, faces=25_000, limits=Limits(unsettled=1))
     assert verdicts[0].name == "bad" and verdicts[0].suspect and any(reason in r for r in verdicts[0].reasons)
     assert not any(v.suspect or v.reasons for v in verdicts[1:])
 

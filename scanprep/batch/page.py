@@ -105,7 +105,7 @@ def _explanation(limits: Limits, size: float) -> str:
         f"{100 * limits.unseen:.3g} points more surface without data than is usual in this set, "
         f"{100 * limits.stretch:.3g}% of the surface stretched to the double or shrunk to the half, "
         f"{100 * limits.flipped:.3g}% of the triangles flipped, landmarks {1000 * limits.landmarks * size:.0f} mm "
-        f"off{', or a registration that did not settle' if limits.unsettled else ''}.\n\n"
+        f"off. A registration that did not settle counts {limits.unsettled:.3g}.\n\n"
         "To mend a scan, correct its landmarks or click more of them where it went wrong and run the same command "
         "again: only scans whose files have changed are registered anew.")
 

@@ -30,8 +30,9 @@ class Limits:
         Share of the triangles that face against their surroundings.
     landmarks : float
         RMS distance of the landmarks, over the size.
-    unsettled : bool
-        Whether a registration that did not converge is suspect.
+    unsettled : float
+        What a registration that did not converge counts, as a multiple of a limit; below 1 it is not suspect for
+        that alone.
     """
 
     missed: float = 0.005
@@ -40,7 +41,7 @@ class Limits:
     stretch: float = 0.02
     flipped: float = 0.001
     landmarks: float = 0.015
-    unsettled: bool = True
+    unsettled: float = 0.5
 
 
 @dataclass(frozen=True)
@@ -109,7 +110,7 @@ def _judge(f: ScanFigures, size: float, faces: int, usual: float, limits: Limits
             f.stretch / limits.stretch,
         f"{f.flipped} triangles flipped": f.flipped / faces / limits.flipped,
         f"landmarks {1000 * f.landmarks:.0f} mm off": f.landmarks / (limits.landmarks * size),
-        "not converged": float(limits.unsettled and not f.converged),
+        "not converged": 0.0 if f.converged else limits.unsettled,
         "nowhere near the scan": 0.0 if f.seen else 100.0}
     over = {reason: value for reason, value in over.items() if np.isfinite(value)}
     reasons = sorted((reason for reason, value in over.items() if value >= 1), key=lambda reason: -over[reason])

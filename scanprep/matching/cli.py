@@ -14,7 +14,7 @@ from ..geometry.files import read_mesh, write_mesh
 from ..geometry.landmarks import match_landmarks, read_landmark_vertices, read_landmarks
 from ..geometry.mesh import Mesh
 from .correlated import CorrelatedConfig, find_correspondences
-from .correspondence_files import write_correspondences
+from .correspondence_files import read_correspondences, write_correspondences
 from .nonrigid import register
 from .rigid import RigidConfig, align_landmarks, align_rigid
 
@@ -45,10 +45,10 @@ def align(source: MeshArg, target: TargetArg, output: Output, landmarks: Path | 
         Metric("T_target_source", np.array2string(T, precision=6).replace("\n", " "))], {"align": config})
 
 
-def correspond(scan: ScanArg, template: Path, output: Output, landmarks: Path,
+def correspond(scan: ScanArg, template: Path, output: Output, landmarks: Path | None = None,
                template_landmarks: Path | None = None, unit: Unit | None = None,
                config: Annotated[CorrelatedConfig, tyro.conf.arg(name="")] = CorrelatedConfig()) -> Outcome:  # noqa: B008
-    """From a few landmarks to nearly two hundred pairs of places on template and scan.
+    """From a few landmarks, or none, to nearly two hundred pairs of places on template and scan.
 
     Example: scape prep correspond scan.ply --template template.ply --landmarks scan.json -o pairs.json
 
@@ -56,24 +56,26 @@ def correspond(scan: ScanArg, template: Path, output: Output, landmarks: Path,
         scan: Mesh or point cloud.
         template: Mesh to find on the scan.
         output: JSON file of vertices of the template, points of the scan in metres, and confidence.
-        landmarks: Landmarks of the scan: three at least, spread over the body.
+        landmarks: Landmarks of the scan: three at least, spread over the body; without them the ends of the limbs
+            are looked for.
         template_landmarks: Landmarks of the template; else the file of its name beside it.
         unit: Unit of the scan and its landmarks.
         config: Settings; lengths are multiples of the root of the template's area.
     """
     body, data = read_mesh(template), read_scan(scan, unit)
-    pairs = _pairs(body, data, template, landmarks, template_landmarks, unit)
+    pairs = _pairs(body, data, template, landmarks, template_landmarks, unit) if landmarks else None
     with bar("finding correspondences") as progress:
         found = find_correspondences(body, data, pairs, config, progress)
     write_correspondences(output, found)
     return Outcome(output, [
-        Metric("landmarks", len(pairs[0])), Metric("correspondences", len(found)),
+        Metric("landmarks", len(pairs[0]) if pairs else 0), Metric("correspondences", len(found)),
         Metric("confidence, median", float(np.median(found.confidence))),
         Metric("converged", str(found.converged))], {"correspond": config})
 
 
 def register_one(scan: ScanArg, template: Path, output: Output, landmarks: Path | None = None,
-                 template_landmarks: Path | None = None, unit: Unit | None = None) -> Outcome:
+                 template_landmarks: Path | None = None, correspondences: Path | None = None,
+                 unit: Unit | None = None) -> Outcome:
     """Bend the template onto one scan.
 
     Example: scape prep register scan.ply --template template.ply --landmarks scan.json -o registered.ply
@@ -82,18 +84,21 @@ def register_one(scan: ScanArg, template: Path, output: Output, landmarks: Path 
         scan: Mesh or point cloud.
         template: Mesh to bring onto it.
         output: Mesh to write.
-        landmarks: Landmarks of the scan; without them it must be near the template's pose.
+        landmarks: Landmarks of the scan. With neither these nor correspondences it must be near the template's pose.
         template_landmarks: Landmarks of the template; else the file of its name beside it.
+        correspondences: File of scape prep correspond; wrong pairs among them do little harm.
         unit: Unit of the scan and its landmarks.
     """
     body, data = read_mesh(template), read_scan(scan, unit)
     pairs = _pairs(body, data, template, landmarks, template_landmarks, unit) if landmarks else None
+    hints = read_correspondences(correspondences) if correspondences else None
     with bar("registering") as progress:
-        fit = register(body, data, pairs, progress=progress)
+        fit = register(body, data, pairs, progress=progress, correspondences=hints)
     write_mesh(output, fit.mesh)
     return Outcome(output, [
         Metric("distance to the scan, RMS", MM * fit.rms, "mm"),
         Metric("vertices with data", 100 * float(fit.seen.mean()), "%"),
+        Metric("confidence, mean", float(fit.confidence.mean())),
         Metric("distance of landmarks, RMS", MM * fit.landmark_rms, "mm"),
         Metric("flipped triangles", fit.flipped), Metric("converged", str(fit.converged))])
 
