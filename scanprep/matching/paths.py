@@ -28,14 +28,14 @@ def path_lengths(points: np.ndarray, normals: np.ndarray, sources: np.ndarray, c
     Returns
     -------
     (n, L) float, metres
-        Infinite on small pieces that are far from everything.
+        Small pieces far from everything take the way to the nearest point of the rest as the crow flies.
     """
     keep = thin(points, cell)
     p, n = points[keep], normals[keep]
-    graph = _bridged(p, _links(p, n, cell, oriented))
-    tree = cKDTree(p)
+    graph, joined = _bridged(p, _links(p, n, cell, oriented))
+    tree = cKDTree(p[joined])
     near, at = tree.query(sources)
-    lengths = dijkstra(graph, directed=False, indices=at).T + near
+    lengths = dijkstra(graph, directed=False, indices=joined[at]).T[joined] + near
     apart, nearest = tree.query(points)
     return lengths[nearest] + apart[:, None]
 
@@ -45,7 +45,7 @@ def path_marks(lengths: np.ndarray, size: float) -> np.ndarray:
 
     Divided by the root of their number: the distance of two marks is the root mean square over landmarks.
     """
-    return np.log(np.where(np.isfinite(lengths), lengths, 1e3 * size) / size + 0.1) / np.sqrt(lengths.shape[1])
+    return np.log(lengths / size + 0.1) / np.sqrt(lengths.shape[1])
 
 
 def _links(p: np.ndarray, n: np.ndarray, cell: float, oriented: bool, neighbours: int = 10) -> csr_array:
@@ -61,8 +61,8 @@ def _links(p: np.ndarray, n: np.ndarray, cell: float, oriented: bool, neighbours
     return csr_array(coo_array((length[good], (i[good], j[good])), shape=(len(p), len(p))))
 
 
-def _bridged(p: np.ndarray, graph: csr_array, smallest: float = 0.003) -> csr_array:
-    """The graph with its larger pieces joined to the largest, each where it is nearest to what is joined."""
+def _bridged(p: np.ndarray, graph: csr_array, smallest: float = 0.003) -> tuple[csr_array, np.ndarray]:
+    """The graph with its larger pieces joined to the largest where they are nearest; the points that belong to it."""
     count, label = connected_components(graph, directed=False)
     size = np.bincount(label, minlength=count)
     joined = label == size.argmax()
@@ -76,6 +76,7 @@ def _bridged(p: np.ndarray, graph: csr_array, smallest: float = 0.003) -> csr_ar
             extra.append((int(piece[q]), int(inside[to[q]]), float(length[q])))
         joined[piece] = True
     if not extra:
-        return graph
+        return graph, np.flatnonzero(joined)
     i, j, length = (np.array(column) for column in zip(*extra, strict=True))
-    return csr_array(graph + coo_array((length, (i.astype(int), j.astype(int))), shape=graph.shape))
+    bridges = coo_array((length, (i.astype(int), j.astype(int))), shape=graph.shape)
+    return csr_array(graph + bridges), np.flatnonzero(joined)
