@@ -28,7 +28,7 @@ COMMANDS = {
              "scanprep.batch.cli:page"),
     "clean": ("Floor, furniture and specks off a raw scan.", "scanprep.cleaning.cli:clean"),
     "template": ("Range views with known cameras -> a closed template.", "scanprep.cleaning.cli:template_of_views"),
-    "views": ("Refine the rough poses of range views.", "scanprep.cleaning.cli:align_cameras"),
+    "views": ("Bring range views into one frame.", "scanprep.cleaning.cli:align_cameras"),
     "merge": ("Range views with known cameras -> one surface.", "scanprep.cleaning.cli:merge"),
     "fill": ("Close the holes of a mesh.", "scanprep.cleaning.cli:fill"),
     "decimate": ("Fewer triangles for the same surface.", "scanprep.cleaning.cli:reduce"),

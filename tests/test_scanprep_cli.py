@@ -208,6 +208,10 @@ def test_views_come_together(tmp_path):
     assert run("views", tmp_path / "views", "-o", tmp_path / "aligned") == 0
     found = json.loads((tmp_path / "aligned" / "cameras.json").read_text())
     assert np.linalg.norm(np.array(found["b"]) - [0, 2, 0]) < 0.006 < np.linalg.norm(np.array(cameras["b"]) - [0, 2, 0])
+    marks = {f"m{k}": body.vertices[k] for k in (12, 700, 3000, 9000)}
+    write_landmarks(tmp_path / "marks" / "a.json", marks)
+    write_landmarks(tmp_path / "marks" / "b.json", {name: R @ p + t for name, p in marks.items()})
+    assert run("views", tmp_path / "views", "--landmarks", tmp_path / "marks", "-o", tmp_path / "by_marks") == 0
     assert run("merge", tmp_path / "aligned", "--voxel", 0.03, "-o", tmp_path / "merged.ply") == 0
 
 

@@ -7,7 +7,7 @@ from typing import Annotated
 import numpy as np
 import tyro
 
-from ..batch.tasks import read_scan
+from ..batch.tasks import LANDMARK_ENDINGS, read_scan
 from ..cli import MM, MeshArg, Output, ScanArg, SetArg, Unit, about_mesh
 from ..console import Metric, Outcome, bar, read_json
 from ..dataset import RegisteredSet
@@ -74,31 +74,49 @@ def clean(scan: ScanArg, output: Output, landmarks: Path | None = None, unit: Un
           for piece in found.components)], {"clean": config})
 
 
-def align_cameras(views: ViewsArg, output: Output, cameras: Path | None = None, unit: Unit | None = None,
+def align_cameras(views: ViewsArg, output: Output, cameras: Path | None = None, landmarks: Path | None = None,
+                  features: bool = False, unit: Unit | None = None,
                   config: Annotated[AlignViewsConfig, tyro.conf.arg(name="")] = AlignViewsConfig()  # noqa: B008
                   ) -> Outcome:
-    """Refine the rough poses of range views, all of them together.
+    """Bring range views into one frame, all of them together.
 
     Example: scape prep views views -o aligned
 
     Args:
-        views: Folder of range meshes, roughly in one frame.
+        views: Folder of range meshes: roughly in one frame, unless landmarks or features place them.
         output: Folder for the moved meshes and their cameras.json.
-        cameras: JSON {file name without ending: [x, y, z]}; else cameras.json in the folder.
-        unit: Unit of the views and cameras.
+        cameras: JSON {file name without ending: [x, y, z]}, each in the frame of its view; else cameras.json in the
+            folder.
+        landmarks: Folder of landmark files with the names of the views, which place them first.
+        features: Place the views by their shapes alone first.
+        unit: Unit of the views, cameras and landmarks.
         config: Settings.
     """
     seen, names = _read_views(views, cameras, unit), [path.stem for path in list_meshes(views)]
-    found = align_views(seen, config)
+    marks = [_view_landmarks(landmarks, name, mesh, unit) for name, (mesh, _) in zip(names, seen, strict=True)] \
+        if landmarks else None
+    found = align_views(seen, config, landmarks=marks, features=features)
     for name, (mesh, _) in zip(names, found.views, strict=True):
         write_mesh(output / f"{name}.ply", mesh)
     storage.write_json(output / "cameras.json",
                        {name: camera.tolist() for name, (_, camera) in zip(names, found.views, strict=True)})
     shifts = [float(np.linalg.norm(new - old)) for (_, new), (_, old) in zip(found.views, seen, strict=True)]
+    doubtful = [name for name, trusted in zip(names, found.trusted, strict=True) if not trusted]
     return Outcome(output, [
         Metric("views", len(seen)), Metric("distance between views, RMS", MM * found.rms, "mm"),
         Metric("rounds", found.iterations), Metric("converged", str(found.converged)),
-        Metric("largest shift of a camera", MM * max(shifts), "mm")], {"views": config})
+        Metric("largest shift of a camera", MM * max(shifts), "mm"),
+        Metric("seen by others too, least of a view", 100 * float(found.overlap.min()), "%"),
+        Metric("looked through by others, most of a view", 100 * float(found.conflict.max()), "%")],
+        {"views": config}, [f"{name}: its place is not to be trusted" for name in doubtful])
+
+
+def _view_landmarks(folder: Path, name: str, view: Mesh, unit: Unit | None) -> dict[str, np.ndarray]:
+    """The landmarks of one view; none where it has no file."""
+    for ending in LANDMARK_ENDINGS:
+        if (folder / (name + ending)).is_file():
+            return read_landmarks(folder / (name + ending), view, unit)
+    return {}
 
 
 def merge(views: ViewsArg, output: Output, cameras: Path | None = None, unit: Unit | None = None,
