@@ -36,7 +36,7 @@ class RoundsConfig:
     min_cosine: float = 0.3
     min_quality: float = 0.1
     hold: float = 3e-4
-    wall: float = 3.0
+    wall: float = 30.0
     onto_vertices: bool = False
 
 

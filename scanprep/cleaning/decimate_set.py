@@ -28,13 +28,18 @@ class DecimateSetConfig:
         How many meshes, as different as possible, the cost of a collapse is summed over; 1 for the template alone.
     placement : str
         "vertices": every vertex of the small meshes is one of the large ones, so that the map of vertices is exact.
-        "solved": every mesh has its vertices where its own error is least, and the map names the nearest.
+        "solved": every mesh has its vertices where its own error is least, which is nearer to the surface by a third,
+        but a vertex slides a little along the skin from mesh to mesh, and the map only says which ones it stands for.
+    anchor : float
+        For "solved": weight of the distance to the vertices it stands for beside that to their planes; large lets
+        it slide less.
     rounds : RoundsConfig
         Settings of the collapses.
     """
 
     meshes: int = 8
     placement: Literal["vertices", "solved"] = "vertices"
+    anchor: float = 0.03
     rounds: RoundsConfig = field(default_factory=RoundsConfig)
 
 
@@ -91,7 +96,7 @@ class DecimatedSet:
     def _solved(self, vertices: np.ndarray, curves: np.ndarray) -> np.ndarray:
         centre = vertices.mean(axis=0)
         points = (vertices - centre)[:, None]
-        quadrics, areas = surface_quadrics(points, self.source.faces, self.config.rounds.hold)
+        quadrics, areas = surface_quadrics(points, self.source.faces, self.config.anchor)
         if len(curves):
             quadrics += curve_quadrics(points, curves, areas[curves].sum(axis=1), self.config.rounds.wall)
         solved = lowest(sum_at(self.owner[:, None], quadrics, len(self.vertex_map)))[:, 0] + centre
