@@ -13,14 +13,17 @@ from pathlib import Path
 import numpy as np
 import pytest
 from scan_folders import MARKS, QUICK, WITH_PICTURES, ball, contents, write_scans
+from scipy.spatial.transform import Rotation
 
 from scanprep import Mesh, RegisteredSet, read_mesh, write_mesh
 from scanprep.batch import cluster
+from scanprep.batch import scan as scan_module
 from scanprep.batch.figures import read_figures
 from scanprep.batch.lock import locked
 from scanprep.batch.scan import one_thread
 from scanprep.batch.workers import Work, run_in_processes
 from scanprep.cleaning.components import CleanScanConfig
+from scanprep.matching.correspondences import Correspondences
 from scanprep.pipeline import ScanTask, find_scans, prepare
 
 
@@ -277,6 +280,20 @@ def test_what_leads_the_template(scans, template, tmp_path):
     assert best.registered.names == ("body1", "body2") and "or the guide 'pose'" in best.failures[0]  # it has no limbs
     near = prepare(find_scans(scans)[:2], template, {}, tmp_path / "near", settings["pose"])
     assert [f.guide for f in near.figures] == ["pose", "pose"] and np.isnan(near.figures[0].landmarks)
+
+
+def test_correspondences_lead_where_there_are_no_landmarks(scans, template, tmp_path, monkeypatch):
+    """A scan upside down, which its pose alone cannot lead to; how correspondences are found has tests of its own."""
+    turned = template.with_vertices(template.vertices @ Rotation.from_rotvec([2.0, 0, 0]).as_matrix().T)
+    write_mesh(scans / "body0.ply", turned)
+    (scans / "body0.landmarks.json").unlink()
+    some = np.arange(0, 642, 30)
+    pairs = Correspondences(some, turned.vertices[some], np.ones(len(some)))
+    monkeypatch.setattr(scan_module, "find_correspondences", lambda *args, **named: pairs)
+    done = prepare(find_scans(scans), template, MARKS, tmp_path / "set", QUICK)
+    assert [f.guide for f in done.figures] == ["22 correspondences", "5 landmarks", "5 landmarks"]
+    found = done.registered.vertices(["body0"])[0]
+    assert np.linalg.norm(found - turned.vertices, axis=1).max() < 0.05
 
 
 def test_clutter_is_cleaned_off_when_asked(scans, template, tmp_path):
