@@ -12,6 +12,7 @@ from ..geometry.sparse import factor
 from ..geometry.surface import OrientedPoints
 
 SAMPLES = 800                        # points of the surface that planes are tried with
+ROUNDS = 60                          # of pairs and plane, at most
 POSES = 24                           # that are tried where the body is not symmetric at rest
 DIRECTIONS = 60                      # of planes, over half the sphere
 NORMAL_WEIGHT = 0.05                 # of the body's size: how much distance a difference of normals weighs
@@ -104,15 +105,20 @@ def _spread(template: Mesh, count: int) -> np.ndarray:
 
 def _best_plane(body: Mesh, few: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
     """Distance of the mirror image (a share of the size), normal and point of the best plane."""
-    size = float(np.linalg.norm(np.ptp(body.vertices, axis=0)))
+    size = _size(body)
     x, normals = body.vertices[few], body.vertex_normals[few]
     target = OrientedPoints(x, normals, NORMAL_WEIGHT * size)
     centre = np.average(body.corners.mean(axis=1), axis=0, weights=body.face_areas)
     axes = np.linalg.eigh(np.cov(x.T))[1].T
+    axes[(((x - centre) @ axes.T)**3).sum(axis=0) < 0] *= -1                # the same whichever way the body is turned
 
     def fitted(normal: np.ndarray, point: np.ndarray, rounds: int) -> tuple[float, np.ndarray, np.ndarray]:
+        before = np.zeros(0)
         for _ in range(rounds):
-            y = x[target.match(reflect(x, normal, point), _turned(normals, normal), min_cosine=-1.0).index]
+            nearest = target.match(reflect(x, normal, point), _turned(normals, normal), min_cosine=-1.0).index
+            if np.array_equal(nearest, before):
+                break
+            before, y = nearest, x[nearest]
             point = (x.mean(axis=0) + y.mean(axis=0)) / 2
             cross = (x - x.mean(axis=0)).T @ (y - y.mean(axis=0))
             normal = np.linalg.eigh(cross + cross.T)[1][:, 0]
@@ -123,7 +129,12 @@ def _best_plane(body: Mesh, few: np.ndarray) -> tuple[float, np.ndarray, np.ndar
 
     rough = [fitted(normal, centre, 0) for normal in np.vstack([axes, _half_sphere(DIRECTIONS) @ axes])]
     rough.sort(key=lambda plane: plane[0])
-    return min((fitted(normal, point, 12) for _, normal, point in rough[:5]), key=lambda plane: plane[0])
+    return min((fitted(normal, point, ROUNDS) for _, normal, point in rough[:5]), key=lambda plane: plane[0])
+
+
+def _size(body: Mesh) -> float:
+    """Twice the distance of the farthest vertex from the middle, metres."""
+    return 2 * float(np.linalg.norm(body.vertices - body.vertices.mean(axis=0), axis=1).max())
 
 
 def _half_sphere(count: int) -> np.ndarray:
@@ -140,7 +151,7 @@ def _turned(normals: np.ndarray, normal: np.ndarray) -> np.ndarray:
 
 def _matched(body: Mesh, normal: np.ndarray, point: np.ndarray, pose: int) -> Symmetry:
     """Warp the mirror image of a body onto it and pair the triangles."""
-    size = float(np.linalg.norm(np.ptp(body.vertices, axis=0)))
+    size = _size(body)
     target = OrientedPoints(body.vertices, body.vertex_normals, NORMAL_WEIGHT * size)
     start = reflect(body.vertices, normal, point)
     graph = body.vertex_adjacency
@@ -159,7 +170,7 @@ def _matched(body: Mesh, normal: np.ndarray, point: np.ndarray, pose: int) -> Sy
 def _paired(body: Mesh, start: np.ndarray, image: np.ndarray, normal: np.ndarray, point: np.ndarray, pose: int
             ) -> Symmetry:
     """Pair triangles by the warped mirror image (N, 3) of the body, which began at `start` (N, 3)."""
-    size = float(np.linalg.norm(np.ptp(body.vertices, axis=0)))
+    size = _size(body)
     centres, areas, normals = body.corners.mean(axis=1), body.face_areas, body.face_normals
     seen, seen_normals = image[body.faces].mean(axis=1), Mesh(image, body.faces[:, ::-1]).face_normals
 
@@ -170,7 +181,10 @@ def _paired(body: Mesh, start: np.ndarray, image: np.ndarray, normal: np.ndarray
 
     everything = np.arange(len(areas))
     partner, apart = nearest(everything, everything)
-    left = np.einsum("fi,i->f", centres - centres[partner], normal) > 0
+    across = (centres - centres[partner]) @ normal
+    if areas[across > 0].sum() < areas[across < 0].sum():        # so that it does not matter how the body is turned
+        normal, across = -normal, -across
+    left = across > 0
     sides = np.flatnonzero(left), np.flatnonzero(~left)
     for here, there in (sides, sides[::-1]):                     # a partner lies on the other side
         if len(here) and len(there):
