@@ -69,16 +69,16 @@ def hahnel_stages() -> tuple[LinkStage, ...]:
 
 def allen_stages() -> tuple[LinkStage, ...]:
     """Landmarks and smoothness first, then data with landmarks, then data alone [Allen]."""
-    first = tuple(LinkStage("affine", length, 1.0, 0.0, 1) for length in (1.0, 0.5))
-    middle = tuple(LinkStage("affine", length, 0.1, 0.15, 4) for length in (0.5, 0.3))
-    return first + middle + tuple(LinkStage("affine", length, 0.0, 0.06, 4) for length in (0.2, 0.1))
+    first = LinkStage("affine", 0.5, 1.0, 0.0, 1)
+    middle = tuple(LinkStage("affine", length, 0.1, 0.3, 4) for length in (0.5, 0.3))
+    return first, *middle, *(LinkStage("affine", length, 0.0, 0.06, 4) for length in (0.2, 0.1, 0.05))
 
 
 def amberg_stages() -> tuple[LinkStage, ...]:
     """The stiffness falls by a constant factor, landmarks fade with it, each step to its optimum [Amberg]."""
-    lengths = np.geomspace(1.0, 0.04, 10)
-    return tuple(LinkStage("affine", float(length), float(length**2), float(max(0.2 * length, 0.03)), 3)
-                 for length in lengths)
+    steps = tuple(LinkStage("affine", float(length), float(0.4 * length**2), float(max(0.6 * length, 0.03)), 4,
+                            translation=0.1) for length in np.geomspace(0.5, 0.04, 8))
+    return LinkStage("affine", 0.5, 1.0, 0.0, 1, translation=0.1), *steps
 
 
 class Links(Protocol):

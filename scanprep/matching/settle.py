@@ -53,7 +53,7 @@ class SettleConfig:
     slide : float
         Force of the data along the surface, as a share of that across it.
     stay : float
-        Force towards the start, as a share of that of the data across the surface.
+        Force towards the start where there are no data, as a share of what the data would have.
     landmarks : float
         The share of the surface that one landmark weighs as much as.
     normal_weight : float
@@ -78,7 +78,7 @@ class SettleConfig:
     )
     noise_width: float = 0.007
     slide: float = 0.05
-    stay: float = 0.0
+    stay: float = 0.003
     landmarks: float = 0.0002
     normal_weight: float = 0.04
     neighbours: int = 16
@@ -171,7 +171,7 @@ class _Settling:
     def __init__(self, template: Mesh, start: np.ndarray, target: Target,
                  landmarks: tuple[np.ndarray, np.ndarray] | None, config: SettleConfig, trust: np.ndarray,
                  extra: Pull | None) -> None:
-        self.template, self.config, self.trust, self.x = template, config, trust, start
+        self.template, self.config, self.trust, self.x, self.start = template, config, trust, start, start
         self.size = float(np.sqrt(template.face_areas.sum()))
         self.triangles = Triangles(template)
         self.areas = np.maximum(template.vertex_areas, 1e-3 * template.vertex_areas.mean())
@@ -184,7 +184,7 @@ class _Settling:
 
     def _held(self, start: np.ndarray, landmarks: tuple[np.ndarray, np.ndarray] | None, extra: Pull | None) -> Pull:
         N, everywhere = len(start), np.arange(len(start))
-        held = pull(N, everywhere, start, (self.config.stay + 1e-9) * self.areas)
+        held = pull(N, everywhere, start, 1e-9 * self.areas)
         if landmarks is not None:
             weights = np.full(len(landmarks[0]), self.config.landmarks * self.size**2)
             held += pull(N, landmarks[0], landmarks[1], weights)
@@ -208,7 +208,11 @@ class _Settling:
     def round(self, stage: SettleRound) -> None:
         """Measure, smooth, and lay out anew under the pull of the data."""
         _, smooth, _ = self.field(stage.field * self.size)
-        x = self.laid(smooth, self.touch(stage.reach).wanted + self.held, stage.tension * self.size)
+        data = self.touch(stage.reach)
+        # Rounds of smoothing would straighten a limb that nothing holds: there the start is all that is known.
+        free = 1 - self.trust * data.seen
+        stay = pull(len(self.x), np.arange(len(self.x)), self.start, self.config.stay * free * self.areas)
+        x = self.laid(smooth, data.wanted + self.held + stay, stage.tension * self.size)
         self.moved = float(np.linalg.norm(x - self.x, axis=1).mean())
         self.x = x
         self.iterations += 1

@@ -22,12 +22,15 @@ class Skin:
     border : (n,) bool
     noise : float, metres
         Standard deviation of the scan's points around the fitted surfaces.
+    spacing : float, metres
+        Between neighbouring points.
     """
 
     points: np.ndarray
     normals: np.ndarray
     border: np.ndarray
     noise: float
+    spacing: float
 
 
 def skin_of(target: Target, width: float, neighbours: int = 40) -> Skin:
@@ -58,7 +61,8 @@ def skin_of(target: Target, width: float, neighbours: int = 40) -> Skin:
     noise = width * np.sqrt(np.median(np.sum(w * rest**2, axis=1) / np.maximum(w.sum(axis=1), 1e-12)))
     normals = n - fit[:, 1:2] * axes[:, 0] - fit[:, 2:3] * axes[:, 1]
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
-    return Skin(P + width * np.clip(fit[:, :1], -1, 1) * n, normals, target.border, float(noise))
+    spacing = np.median(apart[:, min(4, apart.shape[1] - 1)])
+    return Skin(P + width * np.clip(fit[:, :1], -1, 1) * n, normals, target.border, float(noise), float(spacing))
 
 
 @dataclass(frozen=True, eq=False)
@@ -99,7 +103,9 @@ def touch(deformed: Mesh, areas: np.ndarray, skin: Skin, reach: float, slide: fl
     """
     x = deformed.vertices
     found = OrientedPoints(skin.points, skin.normals, scale).match(x, deformed.vertex_normals, reach)
-    v = np.flatnonzero(found.valid & ~skin.border[found.index])
+    # At the edge of a hole a point speaks for its own neighbourhood, not for what lies beyond the edge.
+    beside = np.linalg.norm(np.cross(skin.normals[found.index], x - skin.points[found.index]), axis=1)
+    v = np.flatnonzero(found.valid & (~skin.border[found.index] | (beside <= skin.spacing)))
     p = found.index[v]
     weights = areas[v] * trust[v] * np.maximum(1 - (found.distances[v] / reach) ** 2, 0) ** 2
     distances = np.full(len(x), np.nan)
