@@ -1,14 +1,16 @@
 """Co-registration: a model leads the template where plain registration fails, and the data where there are some."""
 import csv
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
 from matching_bodies import bent, crab
 from model_bodies import random_poses, worm_model
 
+import model.coregistration.cli as cli_module
 import model.coregistration.rounds as rounds_module
-from model import CoregistrationConfig, coregister, learn_scape, load_model, register_with_model
+from model import CoregistrationConfig, ModelRegistration, coregister, learn_scape, load_model, register_with_model
 from model.coregistration.attraction import apart, attraction, towards
 from model.coregistration.cli import coregister_scans
 from model.coregistration.config import ModelFitConfig
@@ -82,7 +84,7 @@ def test_a_scan_that_plain_registration_gets_wrong_is_right_with_the_model(body,
 
 def test_without_any_start_or_landmark_the_pose_is_found(body, crab_model):
     truth = bent(body, *FAR) @ np.array([[0, -1, 0], [1, 0, 0], [0, 0, 1.0]]).T + [3, 1, -2]
-    turned = replace(QUICK, fit=replace(QUICK.fit, turns=8, up=(0.0, 0.0, 1.0)))
+    turned = replace(QUICK, fit=replace(QUICK.fit, turns=4, up=(0.0, 0.0, 1.0)))
     found = register_with_model(crab_model.subject(), scan_of(body, truth), config=turned)
     assert mean_mm(found.mesh.vertices, truth) < 4 and found.starts > 1
 
@@ -204,43 +206,62 @@ class Memory:
         self.models[turn] = learned
 
 
+def made_of(template, vertices, explained=1.0):
+    """A registration as it would have come, without the work."""
+    mesh, N = template.with_vertices(vertices), len(vertices)
+    return ModelRegistration(mesh, mesh, np.zeros((4, 3)), np.zeros(3), None, np.ones(N, dtype=bool), np.zeros(N), 0.0,
+                             explained, 0.0, np.nan, 0, np.ones(N), 0.0, 1)
+
+
+def test_the_person_with_most_scans_teaches_poses_and_others_shapes():
+    worm = worm_model()
+    rng = np.random.default_rng(3)
+    who = ["b", "a", "a", "b", "a", "c", "a", "d"]
+    store = Memory()
+    for i, name in enumerate(who):
+        pose = 0.3 * random_poses(worm, 1, rng)[0]
+        betas = None if name == "a" else np.full(3, "bcd".index(name) - 1.0)
+        store.kept[0, i] = made_of(worm.template, worm.vertices(pose, betas), 0.5 if i == 6 else 1.0)
+    done = coregister(worm, [worm.template] * 8, None, replace(QUICK, rounds=1), subjects=who, store=store)
+    assert done.model.info["poses"] == 1 + 3 and done.model.info["shapes"] == 3      # the template; not the one failed
+    assert done.good.tolist() == [True] * 6 + [False, True] and done.history[0].failed == 1
+    assert done.model.n_betas == 2
+
+
 @pytest.fixture(scope="module")
 def story(body, skeleton):
     """A poor model from near poses; scans of which plain registration fails on two; what became of them."""
-    turns = np.random.default_rng(5).normal(0, 0.25, (6, 2, 3)) * [0.3, 1, 1]
-    truths = np.stack([*(bent(body, *t) for t in turns[:4]), bent(body, *FAR), bent(body, *[-t for t in FAR])])
+    turns = np.random.default_rng(5).normal(0, 0.25, (3, 2, 3)) * [0.3, 1, 1]
+    truths = np.stack([*(bent(body, *t) for t in turns), bent(body, *FAR), bent(body, *[-t for t in FAR])])
     scans = [scan_of(body, truth, seed=i) for i, truth in enumerate(truths)]
     plain = np.stack([register(body, scan, config=PLAIN).mesh.vertices for scan in scans])
-    first = learn_scape(body, np.stack([body.vertices, *plain[:4]]), None, skeleton, QUICK.learn)
+    first = learn_scape(body, np.stack([body.vertices, *plain[:3]]), None, skeleton, QUICK.learn)
     store = Memory()
     return truths, scans, plain, first, coregister(first, scans, None, QUICK, list(plain), store=store), store
 
 
 def test_rounds_mend_what_failed_and_better_the_model(story, body):
-    truths, _, plain, first, done, store = story
+    truths, _, plain, _, done, store = story
     before = np.array([mean_mm(v, t) for v, t in zip(plain, truths, strict=True)])
     after = np.array([mean_mm(r.mesh.vertices, t) for r, t in zip(done.registrations, truths, strict=True)])
     assert (before > 25).sum() == 2 and (after < 6).all() and done.good.all()
-    assert after[:4].mean() < before[:4].mean() + 0.5
+    assert after[:3].mean() < before[:3].mean() + 0.5
     assert done.rounds == 2 and [turn.failed for turn in done.history] == [0, 0]
     assert np.isnan(done.history[0].change) and done.history[1].change < 3e-3
-    assert len(store.kept) == 12 and done.model is store.models[1] and done.model.info["poses"] == 7
-    gap = [np.linalg.norm(np.asarray(m.subject().vertices(done.registrations[4].pose)) - truths[4], axis=1).mean()
-           for m in (first, done.model)]
-    assert np.isfinite(gap).all()
+    assert len(store.kept) == 10 and done.model is store.models[1] and done.model.info["poses"] == 6
 
 
 def test_a_settled_folder_stops_early_and_reports_it(story):
     _, scans, _, _, done, _ = story
     store = Memory()
-    again = coregister(done.model, scans[:3], None, replace(QUICK, tolerance=0.02, rounds=4),
-                       [r.mesh.vertices for r in done.registrations[:3]], store=store)
-    assert again.converged and again.rounds == 2 and len(store.kept) == 6
+    again = coregister(done.model, scans[:2], None, replace(QUICK, tolerance=0.02, rounds=4),
+                       [r.mesh.vertices for r in done.registrations[:2]], store=store)
+    assert again.converged and again.rounds == 2 and len(store.kept) == 4
 
 
 def test_what_was_kept_is_not_made_again(story, body, tmp_path, monkeypatch):
     _, scans, plain, first, done, memory = story
-    names, marks = [f"s{i}" for i in range(6)], [f"{i}" for i in range(6)]
+    names, marks = [f"s{i}" for i in range(5)], [f"{i}" for i in range(5)]
     store = RoundsFolder(tmp_path, first, names, marks, QUICK)
     for (turn, scan), registration in memory.kept.items():
         store.keep(turn, scan, registration)
@@ -277,9 +298,11 @@ def test_command_writes_a_set_and_a_model(story, body, tmp_path, monkeypatch):
     earlier = RegisteredSet.create(tmp_path / "set", body)
     earlier.add("s0", plain[0])
 
+    monkeypatch.setattr(cli_module, "CoregistrationConfig", partial(replace, QUICK))        # quick settings
+
     def run():
         return coregister_scans(tmp_path / "first.npz", tmp_path / "scans", tmp_path / "out", first=tmp_path / "set",
-                                rounds=1, workers=1)
+                                rounds=1, workers=1, failed=0.05)
 
     done = run()
     assert len(done.failures) == 1 and "broken.ply" in done.failures[0]
@@ -289,7 +312,7 @@ def test_command_writes_a_set_and_a_model(story, body, tmp_path, monkeypatch):
     assert all(mean_mm(v, truths[i]) < 6 for v, i in zip(found.vertices(), (0, 4), strict=True))
     assert load_model(tmp_path / "out" / "model.npz").info["landmarks"] == marks
     rows = list(csv.DictReader((tmp_path / "out" / "coregistration.csv").open()))
-    assert [row["name"] for row in rows] == ["s0", "s4"] and float(rows[1]["explained"]) > 0.98
+    assert [row["name"] for row in rows] == ["s0", "s4"] and float(rows[1]["explained"]) > 0.95
     monkeypatch.setattr(rounds_module, "register_with_model", None)
     assert run().metrics[0].value == "2 of 2"
 
