@@ -111,7 +111,7 @@ def _landmarks(model: BodyModel, path: Path | None, scan: Mesh | np.ndarray, uni
 def _starts(first: Path | None, model: BodyModel, names: Sequence[str]) -> list[np.ndarray | None]:
     """The earlier registrations of scans, where a set has them."""
     if first is None:
-        return [None] * len(names)
+        return [None for _ in names]
     earlier = RegisteredSet.load(first)
     if not np.array_equal(earlier.template.faces, model.template.faces):
         raise ValueError(f"{first}: expected the triangles of the model ({model.template}), found {earlier.template}")

@@ -121,8 +121,8 @@ def coregister(model: BodyModel, scans: Sequence[Scan], landmarks: Sequence[Land
             raise ValueError(f"{name}: expected {n}, one a scan, got {len(given)}")
     if model.kind not in ("scape", "blendscape"):
         raise ValueError(f"model: expected one of the kind scape or blendscape, got {model.kind}")
-    marks = list(landmarks) if landmarks is not None else [None] * n
-    before: Sequence[np.ndarray | None] = list(starts) if starts is not None else [None] * n
+    marks = list(landmarks) if landmarks is not None else [None for _ in scans]
+    before: Sequence[np.ndarray | None] = list(starts) if starts is not None else [None for _ in scans]
     own = _own(subjects, n)
     history: list[Round] = []
     good, registrations = np.zeros(n, dtype=bool), list[ModelRegistration]()
