@@ -224,6 +224,9 @@ def test_correspondences_in_a_file(place, tmp_path, capsys, quick):
     assert len(found) == report(tmp_path / "pairs.report.json")["correspondences"] > 5
     assert 0 <= found.template_vertices.min() and found.template_vertices.max() < 642
     assert ((found.confidence >= 0) & (found.confidence <= 1)).all()
+    assert run(*words, "--functional", "-o", tmp_path / "map.json") == 0
+    by_map = read_correspondences(tmp_path / "map.json")
+    assert by_map.method != found.method and len(by_map) > 5
     assert run("correspond", scan, "--template", place / "template.ply", "-o", tmp_path / "none.json") == 1
     assert "at least three limbs" in capsys.readouterr().err
     few = read_mesh(scan).vertices[::90]

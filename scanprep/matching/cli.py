@@ -15,6 +15,7 @@ from ..geometry.landmarks import match_landmarks, read_landmark_vertices, read_l
 from ..geometry.mesh import Mesh
 from .correlated import CorrelatedConfig, find_correspondences
 from .correspondence_files import read_correspondences, write_correspondences
+from .functional import find_functional_correspondences
 from .nonrigid import register
 from .rigid import RigidConfig, align_landmarks, align_rigid
 
@@ -46,7 +47,7 @@ def align(source: MeshArg, target: TargetArg, output: Output, landmarks: Path | 
 
 
 def correspond(scan: ScanArg, template: Path, output: Output, landmarks: Path | None = None,
-               template_landmarks: Path | None = None, unit: Unit | None = None,
+               template_landmarks: Path | None = None, functional: bool = False, unit: Unit | None = None,
                config: Annotated[CorrelatedConfig, tyro.conf.arg(name="")] = CorrelatedConfig()) -> Outcome:  # noqa: B008
     """From a few landmarks, or none, to nearly two hundred pairs of places on template and scan.
 
@@ -59,18 +60,21 @@ def correspond(scan: ScanArg, template: Path, output: Output, landmarks: Path | 
         landmarks: Landmarks of the scan: three at least, spread over the body; without them the ends of the limbs
             are looked for.
         template_landmarks: Landmarks of the template; else the file of its name beside it.
+        functional: By a functional map instead of beliefs; the settings below then do not apply.
         unit: Unit of the scan and its landmarks.
         config: Settings; lengths are multiples of the root of the template's area.
     """
     body, data = read_mesh(template), read_scan(scan, unit)
     pairs = _pairs(body, data, template, landmarks, template_landmarks, unit) if landmarks else None
     with bar("finding correspondences") as progress:
-        found = find_correspondences(body, data, pairs, config, progress)
+        found = (find_functional_correspondences(body, data, pairs) if functional else
+                 find_correspondences(body, data, pairs, config, progress))
     write_correspondences(output, found)
     return Outcome(output, [
-        Metric("landmarks", len(pairs[0]) if pairs else 0), Metric("correspondences", len(found)),
+        Metric("method", found.method), Metric("landmarks", len(pairs[0]) if pairs else 0),
+        Metric("correspondences", len(found)),
         Metric("confidence, median", float(np.median(found.confidence))),
-        Metric("converged", str(found.converged))], {"correspond": config})
+        Metric("converged", str(found.converged))], {} if functional else {"correspond": config})
 
 
 def register_one(scan: ScanArg, template: Path, output: Output, landmarks: Path | None = None,
