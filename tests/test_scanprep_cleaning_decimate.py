@@ -5,10 +5,14 @@ import numpy as np
 import pytest
 from scanned_shapes import SIX, bumpy, view
 
-from scanprep.cleaning.decimate import DecimateConfig, decimate
+from scanprep.cleaning.decimate import DecimateConfig, collapse, decimate
+from scanprep.cleaning.decimate_mend import fast_collapses
+from scanprep.cleaning.decimate_quadrics import lowest, plane_quadrics, point_quadrics, value
+from scanprep.cleaning.intersections import intersecting_faces
 from scanprep.cleaning.merge import MergeConfig
 from scanprep.cleaning.open3d_filters import MissingLibrary
 from scanprep.cleaning.remesh import triangle_quality
+from scanprep.cleaning.repair import weld
 from scanprep.cleaning.template import TemplateConfig, make_template
 from scanprep.geometry.files import read_mesh
 from scanprep.geometry.mesh import Mesh, template_problem
@@ -48,6 +52,115 @@ def test_even_triangles_are_even():
     assert np.percentile(triangle_quality(small), 1) > 0.75
 
 
+def test_a_quadric_is_the_squared_distance_to_planes():
+    rng = np.random.default_rng(0)
+    n = rng.normal(size=(5, 3))
+    n /= np.linalg.norm(n, axis=1, keepdims=True)
+    through, weight, x = rng.normal(size=(5, 3)), rng.random(5), rng.normal(size=(7, 1, 3))
+    expected = weight * np.einsum("pd,npd->np", n, x - through) ** 2
+    np.testing.assert_allclose(value(plane_quadrics(n, through, weight), x), expected, atol=1e-12)
+    np.testing.assert_allclose(value(point_quadrics(through, weight), x), weight * ((x - through) ** 2).sum(axis=2),
+                               atol=1e-12)
+    total = plane_quadrics(n, through, weight).sum(axis=0)
+    A, b = (np.sqrt(weight)[:, None] * n), np.sqrt(weight) * np.einsum("pd,pd->p", n, through)
+    np.testing.assert_allclose(lowest(total), np.linalg.lstsq(A, b, rcond=None)[0], atol=1e-9)
+
+
+def torus(around=48, through=24):
+    a, b = np.meshgrid(np.arange(around), np.arange(through), indexing="ij")
+    u, w = 2 * np.pi * a / around, 2 * np.pi * b / through
+    r = 0.1 + 0.03 * np.cos(w)
+    number = lambda i, j: (i % around) * through + j % through      # noqa: E731
+    corner = [number(a + i, b + j).ravel() for i, j in ((0, 0), (1, 0), (1, 1), (0, 1))]
+    faces = np.concatenate([np.stack([corner[0], corner[1], corner[2]], axis=1),
+                            np.stack([corner[0], corner[2], corner[3]], axis=1)])
+    return Mesh(np.stack([r * np.cos(u), r * np.sin(u), 0.03 * np.sin(w)], axis=-1).reshape(-1, 3), faces)
+
+
+@pytest.mark.parametrize("method", ["quadric", "fast"])
+def test_the_hole_of_a_ring_stays_however_few_triangles_are_wanted(method):
+    small = decimate(torus(), 4, DecimateConfig(method))
+    assert small.is_closed and template_problem(small) is None
+    assert len(small.vertices) - len(small.edges) + len(small.faces) == 0
+    assert len(small.faces) < 200
+
+
+def test_a_ball_ends_as_a_manifold_however_few_triangles_are_wanted():
+    small = decimate(bumpy(3), 4)
+    assert small.is_closed and template_problem(small) is None
+    assert len(small.vertices) - len(small.edges) + len(small.faces) == 2
+    assert len(small.faces) < 40
+
+
+def test_maps_say_what_became_of_everything():
+    mesh = bumpy(4)
+    done = collapse(mesh, 700)
+    assert np.array_equal(done.mesh.faces, done.owner[mesh.faces[done.face_map]])
+    assert np.array_equal(done.owner[done.vertex_map], np.arange(len(done.mesh.vertices)))
+    far = np.linalg.norm(done.mesh.vertices[done.owner] - mesh.vertices, axis=1)
+    assert far.max() < 3 * done.mesh.edge_lengths.max()
+    assert not len(intersecting_faces(done.mesh))
+    at = Surface(mesh).closest(done.mesh.corners.mean(axis=1)).faces
+    assert (np.einsum("fd,fd->f", done.mesh.face_normals, mesh.face_normals[at]) > 0).all()
+
+
+def test_kept_vertices_and_borders_of_parts_stay():
+    mesh = bumpy(5)
+    part = (mesh.corners[:, :, 2].mean(axis=1) > 0.01).astype(int) + 2 * (mesh.corners[:, :, 0].mean(axis=1) > 0)
+    keep = np.random.default_rng(0).choice(len(mesh.vertices), 40, replace=False)
+    done = collapse(mesh, 1000, None, keep, part)
+    assert np.array_equal(done.mesh.vertices[done.owner[keep]], mesh.vertices[keep])
+    new = part[done.face_map]
+    left, right = done.mesh.face_pairs.T
+    border = done.mesh.edges[done.mesh.edge_use == 2][new[left] != new[right]]
+    before = mesh.edges[part[mesh.face_pairs[:, 0]] != part[mesh.face_pairs[:, 1]]]
+    assert len(before) / 10 < len(border) < len(before) / 2
+    corners = np.flatnonzero(np.bincount(before.ravel(), minlength=len(mesh.vertices)) > 2)
+    assert len(corners) and np.array_equal(done.mesh.vertices[done.owner[corners]], mesh.vertices[corners])
+    ends = mesh.vertices[before]
+    line = np.concatenate([ends[:, 0] * t + ends[:, 1] * (1 - t) for t in np.linspace(0, 1, 20)])
+    far = np.linalg.norm(line - done.mesh.vertices[np.unique(border)][:, None], axis=2).min(axis=1)
+    assert far.mean() < 0.25 * mesh.mean_edge and far.max() < mesh.mean_edge
+
+
+def test_creases_of_a_box_stay_straight():
+    n = 13
+    x, y = (g.ravel() for g in np.meshgrid(np.linspace(0, 1, n), np.linspace(0, 1, n), indexing="ij"))
+    number = np.arange(n * n).reshape(n, n)
+    a, b, c, d = number[:-1, :-1], number[1:, :-1], number[1:, 1:], number[:-1, 1:]
+    sheet = np.concatenate([np.stack(t, axis=-1).reshape(-1, 3) for t in ((a, b, c), (a, c, d))])
+    sides = [(np.roll(np.stack([x, y, np.full(n * n, s)], axis=1), k, axis=1), sheet if s else sheet[:, ::-1])
+             for k in range(3) for s in (0.0, 1.0)]
+    box = weld(Mesh(np.concatenate([v for v, _ in sides]),
+                    np.concatenate([f + i * n * n for i, (_, f) in enumerate(sides)])), 1e-6)
+    assert box.is_closed and box.volume == pytest.approx(1)
+    small = decimate(box, 60, DecimateConfig(crease=0.5))
+    assert len(small.faces) <= 60 and small.is_closed and small.volume == pytest.approx(1, abs=2e-4)
+    off = np.minimum(np.abs(small.vertices), np.abs(small.vertices - 1)).min(axis=1)
+    assert off.max() < 2e-4                                          # `hold` draws them in by this little
+
+
+def test_broken_collapses_of_fast_simplification_are_taken_back():
+    mesh = bumpy(4)
+    thin = mesh.with_vertices(mesh.vertices * [1, 1, 0.002])        # two sheets nearly on each other
+    mended = fast_collapses(thin, 60)
+    assert mended.is_closed and template_problem(mended) is None
+    assert len(mended.vertices) - len(mended.edges) + len(mended.faces) == 2
+
+
+def test_progress_is_told():
+    mesh, told = bumpy(4), []
+    decimate(mesh, 1000, progress=lambda *state: told.append(state))
+    done, total = zip(*told, strict=True)
+    assert list(done) == sorted(done) and done[-1] == total[-1] == len(mesh.faces) - 1000
+
+
+def test_where_the_mesh_lies_does_not_matter():
+    mesh = bumpy(4)
+    here, there = decimate(mesh, 800), decimate(mesh.with_vertices(mesh.vertices + [50, -20, 9]), 800)
+    assert np.abs(np.sort(here.edge_lengths) - np.sort(there.edge_lengths)).mean() < 1e-3 * here.mean_edge
+
+
 def test_colours_are_kept():
     mesh = bumpy(4)
     colored = Mesh(mesh.vertices, mesh.faces, np.clip(mesh.vertices + 0.5, 0, 1))
@@ -64,6 +177,12 @@ def test_arguments_are_checked():
     mesh = bumpy(3)
     with pytest.raises(ValueError, match="faces: expected at least 4"):
         decimate(mesh, 2)
+    with pytest.raises(ValueError, match="keep: the method 'fast' cannot"):
+        decimate(mesh, 100, DecimateConfig("fast"), keep=[1])
+    with pytest.raises(ValueError, match="keep: expected vertices"):
+        decimate(mesh, 100, keep=[10**6])
+    with pytest.raises(ValueError, match="labels: expected one for each"):
+        decimate(mesh, 100, labels=np.zeros(3))
     with pytest.raises(ValueError, match=r"config\.method"):
         decimate(mesh, 100, DecimateConfig("magic"))
     doubled = Mesh(mesh.vertices, np.concatenate([mesh.faces, mesh.faces[:1]]))

@@ -37,9 +37,18 @@ def begin(mesh: Mesh, points: np.ndarray, config: RoundsConfig, keep: np.ndarray
     if keep is not None:
         kinds[checked_vertices(mesh, keep)] = FIXED
     quadrics, areas = surface_quadrics(points, mesh.faces, config.hold)
-    if len(curves):
-        quadrics += curve_quadrics(points, curves, areas[curves].sum(axis=1), config.wall)
+    quadrics += held_curves(mesh, points, areas, curves, config)
     return Rounds(points, mesh.faces, quadrics, areas[:, 0], kinds, curves, config)
+
+
+def held_curves(mesh: Mesh, points: np.ndarray, areas: np.ndarray, curves: np.ndarray, config: RoundsConfig
+                ) -> np.ndarray | float:
+    """Quadrics (N, M, 10) of the walls along curves (E, 2), or 0 where there are none."""
+    if not len(curves):
+        return 0.0
+    border = mesh.edges[mesh.edge_use == 1] @ [len(mesh.vertices), 1]
+    weight = np.where(np.isin(curves @ [len(mesh.vertices), 1], border), config.wall, config.seam)
+    return curve_quadrics(points, curves, areas[curves].sum(axis=1), weight)
 
 
 def kept_curves(mesh: Mesh, labels: np.ndarray | None = None, crease: float | None = None) -> np.ndarray:

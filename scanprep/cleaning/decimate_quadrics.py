@@ -65,7 +65,7 @@ def surface_quadrics(points: np.ndarray, faces: np.ndarray, hold: float) -> tupl
     return total[..., :10] + point_quadrics(points, hold * total[..., 13]), total[..., 10:13]
 
 
-def curve_quadrics(points: np.ndarray, ends: np.ndarray, normals: np.ndarray, weight: float) -> np.ndarray:
+def curve_quadrics(points: np.ndarray, ends: np.ndarray, normals: np.ndarray, weights: np.ndarray) -> np.ndarray:
     """The quadrics of all vertices for walls along curves that are to stay where they are.
 
     Parameters
@@ -75,8 +75,8 @@ def curve_quadrics(points: np.ndarray, ends: np.ndarray, normals: np.ndarray, we
         Edges of the curves.
     normals : (E, M, 3) float
         Of the surface there; the walls stand upright on it.
-    weight : float
-        Of a wall as high as its edge is long, beside triangles of the same area.
+    weights : (E,) float
+        Of walls as high as their edges are long, beside triangles of the same area.
 
     Returns
     -------
@@ -87,7 +87,7 @@ def curve_quadrics(points: np.ndarray, ends: np.ndarray, normals: np.ndarray, we
     along = points[ends[:, 1]] - points[ends[:, 0]]
     across = np.cross(along, normals)
     across /= np.maximum(np.linalg.norm(across, axis=-1, keepdims=True), 1e-300)
-    walls = plane_quadrics(across, points[ends[:, 0]], weight * np.einsum("...d,...d->...", along, along))
+    walls = plane_quadrics(across, points[ends[:, 0]], weights[:, None] * np.einsum("...d,...d->...", along, along))
     return sum_at(ends, walls, len(points))
 
 

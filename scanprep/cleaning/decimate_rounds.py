@@ -27,7 +27,9 @@ class RoundsConfig:
     hold : float
         Weight of the distance to vertices beside that to planes: keeps triangles of an even size where it is flat.
     wall : float
-        Weight of the distance to borders and other curves beside that to planes.
+        Weight of the distance to borders beside that to planes.
+    seam : float
+        The same for curves inside the surface; large keeps every zigzag of theirs.
     onto_vertices : bool
         Collapse onto one of the two vertices instead of to the point of least error.
     """
@@ -37,6 +39,7 @@ class RoundsConfig:
     min_quality: float = 0.1
     hold: float = 3e-4
     wall: float = 30.0
+    seam: float = 3.0
     onto_vertices: bool = False
 
 

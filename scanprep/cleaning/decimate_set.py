@@ -10,8 +10,8 @@ import numpy as np
 from ..geometry import rotations
 from ..geometry.mesh import Mesh, check_template
 from ..skeleton.tree import Skeleton
-from .decimate_begin import begin, checked_vertices, kept_curves
-from .decimate_quadrics import curve_quadrics, lowest, sum_at, surface_quadrics
+from .decimate_begin import begin, checked_vertices, held_curves, kept_curves
+from .decimate_quadrics import lowest, sum_at, surface_quadrics
 from .decimate_rounds import FIXED, RoundsConfig
 
 Progress = Callable[[int, int], None]
@@ -97,8 +97,7 @@ class DecimatedSet:
         centre = vertices.mean(axis=0)
         points = (vertices - centre)[:, None]
         quadrics, areas = surface_quadrics(points, self.source.faces, self.config.anchor)
-        if len(curves):
-            quadrics += curve_quadrics(points, curves, areas[curves].sum(axis=1), self.config.rounds.wall)
+        quadrics += held_curves(self.source, points, areas, curves, self.config.rounds)
         solved = lowest(sum_at(self.owner[:, None], quadrics, len(self.vertex_map)))[:, 0] + centre
         solved[self.fixed] = vertices[self.vertex_map[self.fixed]]
         return solved
