@@ -123,6 +123,7 @@ def keep_connected(costs: np.ndarray, pairs: np.ndarray, areas: np.ndarray, labe
     """Give every piece but the largest of each label to the neighbouring label where it costs least."""
     label = label.copy()
     for _ in range(len(label)):
+        before = label.copy()
         piece = pieces(pairs, label)
         size = np.bincount(piece, areas)
         of_piece = np.zeros(len(size), dtype=np.int64)
@@ -140,4 +141,6 @@ def keep_connected(costs: np.ndarray, pairs: np.ndarray, areas: np.ndarray, labe
             around = np.setdiff1d(label[across], of_piece[c])
             if len(around):
                 label[inside] = around[np.argmin(costs[np.ix_(inside, around)].sum(axis=0))]
+        if np.array_equal(label, before):                # what is left touches nothing
+            break
     return label

@@ -10,6 +10,7 @@ from scipy.spatial import cKDTree
 from ..geometry.mesh import Mesh
 from ..geometry.sparse import factor
 from ..geometry.surface import OrientedPoints
+from .labels import keep_connected
 
 SAMPLES = 800                        # points of the surface that planes are tried with
 ROUNDS = 60                          # of pairs and plane, at most
@@ -184,7 +185,7 @@ def _paired(body: Mesh, start: np.ndarray, image: np.ndarray, normal: np.ndarray
     across = (centres - centres[partner]) @ normal
     if areas[across > 0].sum() < areas[across < 0].sum():        # so that it does not matter how the body is turned
         normal, across = -normal, -across
-    left = across > 0
+    left = keep_connected(np.zeros((len(areas), 2)), body.face_pairs, areas, (across > 0).astype(np.int64)) == 1
     sides = np.flatnonzero(left), np.flatnonzero(~left)
     for here, there in (sides, sides[::-1]):                     # a partner lies on the other side
         if len(here) and len(there):
