@@ -62,8 +62,10 @@ class ModelFitConfig:
         Distance to the data, as a share of √area, that one standard deviation of a beta is worth.
     least : int
         Starts that are tried in any case: an arm turned about itself explains a scan as well.
+    agreed : int
+        After more than `turns`, none is tried once so many have ended alike, better than all others.
     near, enough : float
-        After these, none is tried once the share `enough` of the scan's points is nearer to the body than the share
+        Nor is any, after the least, once the share `enough` of the scan's points is nearer to the body than the share
         `near` of √area.
     """
 
@@ -83,6 +85,7 @@ class ModelFitConfig:
     n_betas: int = 20
     shape_prior: float = 0.0005
     least: int = 2
+    agreed: int = 4
     near: float = 0.02
     enough: float = 0.98
 

@@ -131,24 +131,30 @@ class ModelFit:
         return orient(self.thinned(detail), mesh, self.config.normal_weight * self.size)
 
     def best_of(self, starts: Iterable[np.ndarray]) -> tuple[Candidate, int]:
-        """The best end of starts (one at least), which are tried until one explains enough; and how many were tried."""
-        config, tried, enough = self.config, 0, False
+        """The best end of starts (one at least), tried until one explains enough or some agree; and how many."""
+        config, tried, enough, which = self.config, 0, False, 0
         best: Candidate | None = None
         ends: list[np.ndarray] = []
+        met: list[int] = []
         points, _ = self.points(config.refine[-1].sample)
         for x in starts:
             tried += 1
             for stage in config.search:
                 x = self.follow(x, stage)
             y = points.positions(x)
-            if not any(np.linalg.norm(y - end, axis=1).mean() < ALIKE * self.size for end in ends):
-                ends.append(y)
+            alike = [k for k, end in enumerate(ends) if np.linalg.norm(y - end, axis=1).mean() < ALIKE * self.size]
+            if alike:
+                met[alike[0]] += 1
+            else:
                 for stage in config.refine:
                     x = self.follow(x, stage)
                 found = self.scored(x, config.refine[-1])
-                best = found if best is None or found.score < best.score else best
+                if best is None or found.score < best.score:
+                    best, which = found, len(ends)
+                ends.append(y)
+                met.append(1)
                 enough |= self.explained(self.predicted(x), config.refine[-1].detail, config.near) >= config.enough
-            if enough and tried >= config.least:
+            if (enough and tried >= config.least) or (met[which] >= config.agreed and tried > config.turns):
                 break
         assert best is not None, "no start"
         return best, tried
@@ -192,10 +198,11 @@ class ModelFit:
         up[np.ptp(self.body.template.vertices, axis=0).argmax()] = 1
         if self.config.up is not None:
             up = np.asarray(self.config.up) / np.linalg.norm(self.config.up)
-        for turn in 2 * np.pi * np.arange(self.config.turns) / self.config.turns:
-            for pose in poses:
+        turns = rotations.exp(2 * np.pi * np.arange(self.config.turns)[:, None] / self.config.turns * up)
+        for pose in poses:
+            for R in turns:                              # all ways round first: what faces backwards may explain much
                 turned = pose.copy()
-                turned[0] = rotations.log(rotations.exp(turn * up) @ rotations.exp(pose[0]))
+                turned[0] = rotations.log(R @ rotations.exp(pose[0]))
                 yield self.placed(turned, self.target.points)
 
     def _on_landmarks(self, pose: np.ndarray) -> np.ndarray:
