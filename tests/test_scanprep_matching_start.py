@@ -16,6 +16,8 @@ from scanprep.matching.correspondences import Correspondences
 from scanprep.matching.matches import Likeness, match_both_ways, target_of
 from scanprep.matching.nonrigid import RegistrationConfig, register
 from scanprep.matching.paths import path_lengths, path_marks
+from scanprep.matching.schedule import published
+from scanprep.matching.turns import turns
 from scanprep.matching.twists import TwistConfig, find_ends, turned_end
 
 BEND = np.array([0.0, 0.0, 1.2]), np.array([0.0, 1.4, 0.0])
@@ -218,3 +220,34 @@ def test_clutter_beside_the_body_changes_little_and_noise_is_told():
     apart = [np.linalg.norm(found.mesh.vertices - x, axis=1).mean() for found in (clean, cluttered, noisy)]
     assert apart[0] < 0.008 and apart[1] < 0.012 and apart[2] < 0.014
     assert noisy.rms > 2 * clean.rms
+
+
+# ---- published regularisers ---------------------------------------------------------------------------------
+
+@pytest.mark.parametrize("method", ["hahnel", "allen", "amberg"])
+def test_published_regularisers_bend_the_body_too(method):
+    mesh = crab()
+    x = bent(mesh, 0.2 * BEND[0], 0.2 * BEND[1])
+    marks = np.array([820, 821, 9 * 20, 9 * 20 + 10, 31 * 20 + 5, 31 * 20 + 15])
+    config = published(method)
+    config = replace(config, links=tuple(replace(s, nodes=150, rounds=min(s.rounds, 3)) for s in config.links))
+    found = register(mesh, Mesh(x, mesh.faces), (marks, x[marks]), config)
+    apart, before = (np.linalg.norm(y - x, axis=1).mean() for y in (found.mesh.vertices, mesh.vertices))
+    assert apart < 0.02 and apart < 0.8 * before        # affine links slide along the skin
+    assert found.rms < 0.001 and found.seen.mean() > 0.8
+
+
+def test_an_unknown_method_is_named():
+    with pytest.raises(ValueError, match="icp"):
+        published("icp")
+
+
+# ---- turns --------------------------------------------------------------------------------------------------
+
+def test_turns_are_those_of_a_rigid_motion_and_a_fold_does_not_sway_them():
+    mesh = crab()
+    R = rotations.exp(np.array([1.0, -0.3, 2.0]))
+    x = mesh.vertices @ R.T + 1.0
+    np.testing.assert_allclose(turns(mesh, x), np.broadcast_to(R, (len(x), 3, 3)), atol=1e-9)
+    x[[405, 406]] = x[[406, 405]]
+    assert np.linalg.norm(rotations.log(turns(mesh, x) @ R.T), axis=1).max() < 0.3

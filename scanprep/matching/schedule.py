@@ -3,6 +3,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
+from .affine import LinkStage, allen_stages, amberg_stages, hahnel_stages
 from .settle import SettleConfig
 from .twists import TwistConfig
 
@@ -81,6 +82,7 @@ class RegistrationConfig:
     Attributes
     ----------
     graph : stages of the coarse registration
+    links : stages of a published regulariser, after or instead of those of the graph (see `published`)
     shell : rounds in which the surface follows the scan as a thin shell
     twists : TwistConfig
         The search for ends of the body that are turned about themselves.
@@ -111,6 +113,7 @@ class RegistrationConfig:
         GraphStage(1000, 0.02, 0.002, 0.35, 0.01, 0.037, detail=0.008),
         GraphStage(1000, 0.015, 0.0015, 0.35, 0.005, 0.028, detail=0.008),
     )
+    links: tuple[LinkStage, ...] = ()
     shell: tuple[ShellStage, ...] = ()
     twists: TwistConfig = field(default_factory=TwistConfig)
     settle: SettleConfig | None = field(default_factory=SettleConfig)
@@ -119,3 +122,25 @@ class RegistrationConfig:
     normal_weight: float = 0.04
     near: float = 0.015
     settled: float = 0.001
+
+
+PUBLISHED = {"hahnel": hahnel_stages, "allen": allen_stages, "amberg": amberg_stages}
+
+
+def published(method: str) -> RegistrationConfig:
+    """Settings with the regulariser of a published method in place of ours, and without our last pass.
+
+    Parameters
+    ----------
+    method : "hahnel", "allen" or "amberg"
+
+    Raises
+    ------
+    ValueError
+        Another name.
+
+    [Hahnel], [Allen], [Amberg]
+    """
+    if method not in PUBLISHED:
+        raise ValueError(f"method: expected one of {', '.join(PUBLISHED)}, got {method!r}")
+    return RegistrationConfig(graph=(), links=PUBLISHED[method](), settle=None)
