@@ -4,7 +4,10 @@ import numpy as np
 import pytest
 from scanned_shapes import ball, bumpy
 
-from scanprep.cleaning.fill import FillConfig, fill_holes
+from scanprep.cleaning.fill import FillConfig, fill_holes, fill_report
+from scanprep.cleaning.intersections import intersecting_faces
+from scanprep.cleaning.loops import group_loops, joined_polygon
+from scanprep.cleaning.repair import repair
 from scanprep.cleaning.triangulate import triangulate_loop
 from scanprep.geometry import rotations
 from scanprep.geometry.mesh import Mesh, template_problem
@@ -198,6 +201,114 @@ def test_what_cannot_be_filled_is_refused():
 def test_a_closed_mesh_comes_back():
     whole = ball(2)
     assert np.array_equal(fill_holes(whole).faces, whole.faces)
+
+
+def ring_mesh(point, rows, columns, closed_rows=False):
+    """A surface over a grid of angles (u around, v along), closed around."""
+    u = 2 * np.pi * np.arange(columns) / columns
+    v = 2 * np.pi * np.arange(rows) / rows if closed_rows else np.linspace(0, 1, rows)
+    grid = np.array([[point(a, b) for a in u] for b in v]).reshape(-1, 3)
+    number = np.arange(rows * columns).reshape(rows, columns)
+    a, b = number, np.roll(number, -1, axis=1)
+    d, c = np.roll(number, -1, axis=0), np.roll(b, -1, axis=0)
+    keep = slice(None) if closed_rows else slice(0, -1)
+    faces = np.concatenate([np.stack(t, axis=-1)[keep].reshape(-1, 3) for t in ((a, b, c), (a, c, d))])
+    return Mesh(grid, faces)
+
+
+def torus(columns=40, rows=80):
+    return ring_mesh(lambda u, v: [(0.1 + 0.035 * np.cos(u)) * np.cos(v), (0.1 + 0.035 * np.cos(u)) * np.sin(v),
+                                   -0.035 * np.sin(u)], rows, columns, closed_rows=True)
+
+
+@pytest.mark.parametrize("spot", [[0.135, 0, 0], [0.065, 0, 0], [0.1, 0, 0.035]])
+def test_round_saddle_and_flat_places_of_a_torus(spot):
+    """Outside it is round, inside a saddle, on top in between."""
+    whole = torus()
+    assert whole.volume > 0 and whole.is_closed
+    holed = pierced(whole, spot, 0.03)
+    report = fill_report(holed)
+    new = report.mesh.vertices[len(holed.vertices):]
+    apart = np.hypot(np.hypot(new[:, 0], new[:, 1]) - 0.1, new[:, 2]) - 0.035
+    assert len(new) > 15 and np.abs(apart).max() < 0.003 and np.abs(apart).mean() < 0.0012
+    assert report.mesh.is_closed and template_problem(report.mesh) is None
+    assert len(intersecting_faces(report.mesh)) == 0 and report.holes[0].intersections == 0
+
+
+def test_a_limb_that_was_cut_through_is_joined():
+    def limb(u, v):
+        return [(0.05 + 0.01 * v) * np.cos(u), (0.05 + 0.01 * v) * np.sin(u), 0.5 * v]
+
+    whole = ring_mesh(limb, 51, 30)
+    height = whole.corners.mean(axis=1)[:, 2]
+    cut = whole.submesh(np.abs(height - 0.25) > 0.03)[0]
+    assert len(cut.boundary_loops) == 4
+    groups = group_loops(cut, cut.boundary_loops)
+    assert sorted(len(group) for group in groups) == [1, 1, 2]
+    joined = fill_report(cut)
+    assert joined.mesh.is_closed and template_problem(joined.mesh) is None
+    assert sorted(hole.borders for hole in joined.holes) == [1, 1, 2]
+    new = joined.mesh.vertices[len(cut.vertices):]
+    band = new[np.abs(new[:, 2] - 0.25) < 0.028]
+    assert len(band) > 50
+    assert np.abs(np.linalg.norm(band[:, :2], axis=1) - 0.05 - 0.02 * band[:, 2]).max() < 0.004
+    apart = fill_report(cut, FillConfig(join=False))
+    assert apart.mesh.vertex_component.max() == 1 and len(apart.holes) == 4
+
+
+def test_joined_polygons_go_around_every_border_once():
+    cut = torus().submesh(np.abs(torus().corners.mean(axis=1)[:, 0]) > 0.03)[0]
+    loops = cut.boundary_loops
+    polygon = joined_polygon(cut.vertices, loops[:2])
+    assert len(polygon) == len(loops[0]) + len(loops[1]) + 2
+    assert set(polygon.tolist()) == set(np.concatenate(loops[:2]).tolist())
+    steps = {(a, b) for a, b in zip(polygon.tolist(), np.roll(polygon, -1).tolist(), strict=True)}
+    assert all((a, b) in steps for loop in loops[:2]
+               for a, b in zip(loop.tolist(), np.roll(loop, -1).tolist(), strict=True))
+
+
+def test_crossing_triangles_are_found_as_by_another_library():
+    import igl
+
+    rng = np.random.default_rng(0)
+    soup = Mesh(rng.uniform(size=(120, 1, 3)).repeat(3, axis=1).reshape(-1, 3) + 0.15 * rng.normal(size=(360, 3)),
+                np.arange(360).reshape(-1, 3))
+    found = {tuple(pair) for pair in intersecting_faces(soup).tolist()}
+    expected = {(i, k) for i in range(120) for k in range(i + 1, 120)
+                if igl.tri_tri_intersection_test_3d(*soup.corners[[i, k]].reshape(6, 1, 3))[0]}
+    assert 50 < len(found) and found == expected
+    some = np.arange(40)
+    assert {tuple(p) for p in intersecting_faces(soup, some).tolist()} == {p for p in found if min(p) < 40}
+
+
+def test_neighbours_cross_only_when_folded_or_pierced():
+    v = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0.9, 0.9, 0], [0.3, 0.3, -1], [0.3, 0.3, 1], [0.3, 0.2, 0],
+                  [-1, -1, 0.2]], float)
+    assert len(intersecting_faces(Mesh(v, [[0, 1, 2], [2, 1, 3]]))) == 0
+    assert len(intersecting_faces(Mesh(v, [[0, 1, 2], [1, 0, 6]]))) == 1                 # folded flat onto it
+    assert len(intersecting_faces(Mesh(v, [[0, 1, 2], [0, 4, 5]]))) == 1                 # at a vertex, through it
+    assert len(intersecting_faces(Mesh(v, [[0, 1, 2], [0, 4, 7]]))) == 0
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_reports_of_ragged_holes_count_what_crosses(seed):
+    """Random teeth along the rim: nothing existing moves, and what could not be kept apart is told."""
+    rng = np.random.default_rng(seed)
+    whole = bumpy(4)
+    middle = whole.corners.mean(axis=1)
+    centre = middle[rng.integers(len(middle))]
+    teeth = 0.045 * rng.uniform(0.95, 1.05, len(middle))
+    holed = repair(whole.submesh(np.linalg.norm(middle - centre, axis=1) > teeth)[0])
+    report = fill_report(holed)
+    assert report.mesh.is_closed and report.mesh.is_edge_manifold
+    assert sum(hole.intersections for hole in report.holes) == len(intersecting_faces(report.mesh)) < 20
+    assert np.array_equal(report.mesh.vertices[:len(holed.vertices)], holed.vertices)
+
+
+def test_reports_are_of_methods_that_keep_the_mesh():
+    with pytest.raises(ValueError, match="remeshes everything"):
+        fill_report(ball(1), FillConfig(method="poisson-open3d"))
+    assert fill_report(ball(1)).holes == ()
 
 
 @pytest.mark.gl

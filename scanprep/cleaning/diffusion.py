@@ -31,8 +31,8 @@ class DiffusionConfig:
         Space counts as seen to be empty this far in front of what was seen.
     """
 
-    voxels: int = 20
-    band: float = 2.0
+    voxels: int = 12
+    band: float = 3.0
     margin: float = 5.0
     empty: float = 0.01
 

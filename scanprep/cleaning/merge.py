@@ -235,6 +235,7 @@ def _zero_surface(grid: _Grid, keys: np.ndarray, points: np.ndarray, distance: n
     place = np.searchsorted(keys, keys[:, None] + CORNERS @ step)
     place = np.minimum(place, max(len(keys) - 1, 0))
     whole = (keys[place] == keys[:, None] + CORNERS @ step).all(axis=1)
+    whole &= np.all([at < size - 1 for at, size in zip(np.unravel_index(keys, shape), shape, strict=True)], axis=0)
     cells = place[whole]
     inside = (distance < 0)[cells].sum(axis=1)
     cells = cells[(inside > 0) & (inside < 8)]

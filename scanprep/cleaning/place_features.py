@@ -10,9 +10,9 @@ from ..geometry.surface import OrientedPoints
 from .carve import SeenSpace
 from .remesh import smooth
 
-SPACING, REACH, BINS = 0.015, 0.10, 11     # metres between points that are described; radius of a description
-DRAWS, PROPOSALS, TRIED, INLIER = 30_000, 4000, 12, 0.03
-ICP_ROUNDS = 12
+SPACING, REACH, BINS = 1 / 120, 1 / 18, 11      # shares of a view's extent: between described points; described
+INLIER, NEAR, THROUGH = 1 / 60, 1 / 120, 1 / 60
+DRAWS, PROPOSALS, JUDGES, TRIED, ICP_ROUNDS = 30_000, 4000, 1500, 12, 12
 
 
 def place_by_features(views: list[tuple[Mesh, np.ndarray]], rng: np.random.Generator) -> np.ndarray:
@@ -32,9 +32,10 @@ def place_by_features(views: list[tuple[Mesh, np.ndarray]], rng: np.random.Gener
     (V, 4, 4) float
         The first view stays. The proposal may be wrong where views overlap little: see `AlignedViews.trusted`.
     """
-    described = [_described(mesh) for mesh, _ in views]
+    extent = float(max(np.ptp(mesh.vertices, axis=0).max() for mesh, _ in views))
+    described = [_described(mesh, extent) for mesh, _ in views]
     count = len(views)
-    pairs = {(i, j): _place(described[i], described[j], views[i], views[j], rng)
+    pairs = {(i, j): _place(described[i], described[j], views[i], views[j], extent, rng)
              for i in range(count) for j in range(i)}
     T, placed = np.tile(np.eye(4), (count, 1, 1)), {0}
     while len(placed) < count:
@@ -48,12 +49,12 @@ def place_by_features(views: list[tuple[Mesh, np.ndarray]], rng: np.random.Gener
     return T
 
 
-def _described(mesh: Mesh) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def _described(mesh: Mesh, extent: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Points (n, 3) spread over a view, their normals, and a histogram (n, 33) for each."""
     even = smooth(mesh, 10)
-    rows = np.unique(np.floor(even.vertices / SPACING).astype(np.int64), axis=0, return_index=True)[1]
+    rows = np.unique(np.floor(even.vertices / (SPACING * extent)).astype(np.int64), axis=0, return_index=True)[1]
     p, n = even.vertices[rows], even.vertex_normals[rows]
-    a, b = cKDTree(p).query_pairs(REACH, output_type="ndarray").T
+    a, b = cKDTree(p).query_pairs(REACH * extent, output_type="ndarray").T
     a, b = np.r_[a, b], np.r_[b, a]
     across = p[b] - p[a]
     far = np.linalg.norm(across, axis=1)
@@ -70,12 +71,12 @@ def _described(mesh: Mesh) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         np.add.at(single, (a, place), 1)
     single /= np.maximum(single.sum(axis=1, keepdims=True), 1)
     total = single.copy()
-    np.add.at(total, a, single[b] * (0.02 / (0.02 + far))[:, None] / 8)
+    np.add.at(total, a, single[b] * (0.2 * REACH * extent / (0.2 * REACH * extent + far))[:, None] / 8)
     return p, n, total / np.maximum(np.linalg.norm(total, axis=1, keepdims=True), 1e-9)
 
 
 def _place(mine: tuple[np.ndarray, np.ndarray, np.ndarray], other: tuple[np.ndarray, np.ndarray, np.ndarray],
-           view: tuple[Mesh, np.ndarray], target: tuple[Mesh, np.ndarray], rng: np.random.Generator
+           view: tuple[Mesh, np.ndarray], target: tuple[Mesh, np.ndarray], extent: float, rng: np.random.Generator
            ) -> tuple[float, np.ndarray]:
     """The best motion of one view onto another, and its score."""
     p, n, f = mine
@@ -85,21 +86,24 @@ def _place(mine: tuple[np.ndarray, np.ndarray, np.ndarray], other: tuple[np.ndar
     draws = rng.integers(len(source), size=(DRAWS, 3))
     x, y = p[source[draws]], q[goal[draws]]
     side_x, side_y = (np.linalg.norm(z - np.roll(z, 1, axis=1), axis=2) for z in (x, y))
-    rigid = (np.minimum(side_x, side_y) > 0.9 * np.maximum(side_x, side_y)).all(axis=1) & (side_x.min(axis=1) > 0.1)
+    rigid = (np.minimum(side_x, side_y) > 0.9 * np.maximum(side_x, side_y)).all(axis=1)
+    rigid &= side_x.min(axis=1) > REACH * extent
     x, y = x[rigid], y[rigid]
     best: tuple[float, np.ndarray] = (-np.inf, np.eye(4))
     if not len(x):
         return best
     R, t = rotations.procrustes(x[:PROPOSALS], y[:PROPOSALS])
-    hits = np.array([((np.linalg.norm(p[source] @ r.T + s - q[goal], axis=1) < INLIER)
-                      & (np.einsum("nd,nd->n", n[source] @ r.T, m[goal]) > 0.7)).sum()
-                     for r, s in zip(R, t, strict=True)])
+    some = rng.permutation(len(source))[:JUDGES]
+    a, b, na, nb = p[source[some]], q[goal[some]], n[source[some]], m[goal[some]]
+    hits = np.array([((np.linalg.norm(a @ r.T + s - b, axis=1) < INLIER * extent)
+                      & (np.einsum("nd,nd->n", na @ r.T, nb) > 0.7)).sum() for r, s in zip(R, t, strict=True)])
     tree, back = OrientedPoints(q, m), SeenSpace([view])
     front = SeenSpace([target])
     for k in np.argsort(-hits)[:TRIED]:
-        r, s = _refined(p, n, tree, R[k], t[k])
-        found = tree.match(p @ r.T + s, n @ r.T, 0.015, 0.7).valid.mean()
-        through = max(float((front.ahead(p @ r.T + s) > 0.03).mean()), float((back.ahead((q - s) @ r) > 0.03).mean()))
+        r, s = _refined(p, n, tree, R[k], t[k], extent)
+        found = tree.match(p @ r.T + s, n @ r.T, NEAR * extent, 0.7).valid.mean()
+        through = max(float((front.ahead(p @ r.T + s) > THROUGH * extent).mean()),
+                      float((back.ahead((q - s) @ r) > THROUGH * extent).mean()))
         score = float(found) - 2 * through
         if score > best[0]:
             T = np.eye(4)
@@ -108,10 +112,10 @@ def _place(mine: tuple[np.ndarray, np.ndarray, np.ndarray], other: tuple[np.ndar
     return best
 
 
-def _refined(p: np.ndarray, n: np.ndarray, tree: OrientedPoints, R: np.ndarray, t: np.ndarray
-             ) -> tuple[np.ndarray, np.ndarray]:
+def _refined(p: np.ndarray, n: np.ndarray, tree: OrientedPoints, R: np.ndarray, t: np.ndarray,
+             extent: float) -> tuple[np.ndarray, np.ndarray]:
     """A motion after a few rounds of point-to-point matching."""
-    for reach in np.linspace(0.06, 0.02, ICP_ROUNDS):
+    for reach in extent * np.linspace(1 / 30, 1 / 90, ICP_ROUNDS):
         match = tree.match(p @ R.T + t, n @ R.T, reach, 0.6)
         good = match.valid
         if good.sum() < 20:

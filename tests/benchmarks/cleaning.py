@@ -25,7 +25,7 @@ from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.surface import Surface
 from scanprep.scanning.scanner import RangeView, scan
 
-SEEN = 0.012           # metres: true surface with a scan point this close was seen
+SEEN = 0.007           # metres: true surface with a scan point this close was seen
 
 
 def knocked(views: list[tuple[Mesh, np.ndarray]], degrees: float, metres: float, rng: np.random.Generator
@@ -182,7 +182,7 @@ def open3d_fill(mesh: Mesh) -> tuple[Mesh, bool]:
     legacy = o3d.geometry.TriangleMesh(o3d.utility.Vector3dVector(np.array(mesh.vertices)),
                                        o3d.utility.Vector3iVector(mesh.faces.astype(np.int32)))
     filled = o3d.t.geometry.TriangleMesh.from_legacy(legacy).fill_holes(1e6)
-    return Mesh(filled.vertex.positions.numpy().astype(float), filled.triangle.indices.numpy()), True
+    return Mesh(filled.vertex.positions.numpy().astype(float), filled.triangle.indices.numpy()), False
 
 
 def pymeshlab_fill(mesh: Mesh) -> tuple[Mesh, bool]:

@@ -1,0 +1,98 @@
+import numpy as np
+import pytest
+from scanned_shapes import SIX, bumpy, view
+
+from scanprep.cleaning.align_views import AlignViewsConfig, align_views
+from scanprep.cleaning.place_views import fit_of_views, place_by_landmarks
+from scanprep.geometry import rotations
+
+
+@pytest.fixture(scope="module")
+def views():
+    return [view(bumpy(4), d, spacing=0.005) for d in SIX]
+
+
+def moved(views, rng, turn=1.0, shift=0.5):
+    """Every view in a frame of its own, and the frames."""
+    out, frames = [], []
+    for mesh, camera in views:
+        R, t = rotations.exp(turn * rng.normal(size=3)), shift * rng.normal(size=3)
+        out.append((mesh.with_vertices(mesh.vertices @ R.T + t), R @ camera + t))
+        frames.append((R, t))
+    return out, frames
+
+
+def worst(found, frames, views):
+    """Largest mean distance of a view from where the first one says it belongs."""
+    R, t = frames[0]
+    return max(np.linalg.norm(mesh.vertices - (true.vertices @ R.T + t), axis=1).mean()
+               for (mesh, _), (true, _) in zip(found, views, strict=True))
+
+
+def test_landmarks_alone_place_views_exactly(views):
+    rng = np.random.default_rng(0)
+    points = {f"mark {k}": 0.1 * rng.normal(size=3) for k in range(8)}
+    frames = moved(views, rng)[1]
+    clicked = [{name: R @ points[name] + t for name in list(points)[k:k + 4]}     # a chain: 3 shared with the next
+               for k, (R, t) in enumerate(frames[:5])]
+    T = place_by_landmarks(clicked, 5)
+    for motion, (R, t) in zip(T, frames, strict=False):
+        assert np.allclose(motion[:3, :3] @ R, frames[0][0], atol=1e-9)
+        assert np.allclose(motion[:3, :3] @ t + motion[:3, 3], frames[0][1], atol=1e-9)
+    assert np.array_equal(T[0], np.eye(4))
+
+
+def test_views_without_cameras_but_with_rough_landmarks(views):
+    rng = np.random.default_rng(1)
+    lost, frames = moved(views, rng)
+    points = bumpy(3).vertices[[3, 70, 150, 210, 300]]
+    clicked = [{str(k): R @ p + t + 0.0003 * rng.normal(size=3) for k, p in enumerate(points)} for R, t in frames]
+    assert worst(lost, frames, views) > 0.3
+    found = align_views(lost, AlignViewsConfig(iterations=10), landmarks=clicked)
+    assert found.overlap.min() > 0.5 and found.conflict.max() < 0.01
+    assert found.converged or not found.trusted.any()            # a smooth lump settles slowly; that is told
+    assert worst(found.views, frames, views) < 0.005
+    for (mesh, _), (start, _), T in zip(found.views, lost, found.T_world_view, strict=True):
+        assert np.allclose(start.vertices @ T[:3, :3].T + T[:3, 3], mesh.vertices, atol=1e-9)
+
+
+def test_a_failure_is_told(views):
+    lost, frames = moved(views, np.random.default_rng(2), turn=1.0, shift=0.05)
+    found = align_views(lost, AlignViewsConfig(iterations=10))
+    assert worst(found.views, frames, views) > 0.02
+    assert not found.trusted.all()
+
+
+def test_fit_of_views_knows_right_from_wrong(views):
+    overlap, conflict = fit_of_views(views)
+    assert overlap.min() > 0.3 and conflict.max() < 0.01
+    mesh, camera = views[1]
+    R = rotations.exp(np.array([0, 0, 0.6]))
+    _, conflict = fit_of_views([views[0], (mesh.with_vertices(mesh.vertices @ R.T + [0, 0.05, 0]), R @ camera),
+                                *views[2:]])
+    assert conflict.max() > 0.03
+
+
+def test_shapes_alone_bring_views_together(views):
+    views = [views[k] for k in (0, 1, 2)]
+    lost, frames = moved(views, np.random.default_rng(3))
+    found = align_views(lost, AlignViewsConfig(reach=0.02, iterations=15), np.random.default_rng(0), features=True)
+    if found.trusted.all():                      # a smooth lump may defeat it, but never without saying so
+        assert worst(found.views, frames, views) < 0.002
+    else:
+        assert worst(found.views, frames, views) > 0.002
+
+
+def test_a_single_view_is_where_it_is(views):
+    found = align_views(views[:1])
+    assert found.trusted.all() and np.array_equal(found.views[0][0].vertices, views[0][0].vertices)
+
+
+def test_too_few_landmarks_are_refused(views):
+    with pytest.raises(ValueError, match="one mapping for each of 6 views, got 1"):
+        align_views(views, landmarks=[{}])
+    with pytest.raises(ValueError, match=r"view 1 shares 2 .* at least three"):
+        place_by_landmarks([{c: np.eye(3)[k % 3] for k, c in enumerate("abc")}, {c: np.ones(3) for c in "ab"}], 2)
+    line = {str(k): np.array([0.1 * k, 0.0, 0.0]) for k in range(5)}
+    with pytest.raises(ValueError, match="not on one line"):
+        place_by_landmarks([line, line], 2)
