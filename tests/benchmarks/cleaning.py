@@ -104,10 +104,10 @@ def aligned(views: list[tuple[Mesh, np.ndarray]], features: bool = False,
 
 def lost(views: list[tuple[Mesh, np.ndarray]], marks: list[dict[str, np.ndarray]], rng: np.random.Generator
          ) -> tuple[list[tuple[Mesh, np.ndarray]], bool, list[dict[str, np.ndarray]]]:
-    """Views in frames of their own, with the landmarks that were clicked on each."""
+    """Views in frames of their own, except the first, with the landmarks that were clicked on each."""
     moved, clicked = [], []
-    for (mesh, camera), points in zip(views, marks, strict=True):
-        R, t = rotations.exp(2 * rng.normal(size=3)), rng.normal(size=3)
+    for number, ((mesh, camera), points) in enumerate(zip(views, marks, strict=True)):
+        R, t = rotations.exp(2 * rng.normal(size=3) * (number > 0)), rng.normal(size=3) * (number > 0)
         moved.append((mesh.with_vertices(mesh.vertices @ R.T + t), R @ camera + t))
         clicked.append({name: R @ point + t for name, point in points.items()})
     return moved, False, clicked
