@@ -20,7 +20,10 @@ if TYPE_CHECKING:
     from .matching.nonrigid import RegistrationConfig, register
     from .matching.rigid import align_rigid
     from .matching.seeds import SeedConfig, find_seeds
+    from .skeleton.edit import apply_edits, merge_parts, move_joint, read_edits, rename_part, split_part
     from .skeleton.find import SkeletonConfig, find_skeleton
+    from .skeleton.names import name_parts
+    from .skeleton.search import SkeletonSearch, search_skeleton
     from .skeleton.tree import Skeleton
 
 _ROOMS = {
@@ -39,15 +42,20 @@ _ROOMS = {
     "matching.rigid": ("align_rigid",),
     "matching.seeds": ("SeedConfig", "find_seeds"),
     "skeleton.find": ("SkeletonConfig", "find_skeleton"),
+    "skeleton.edit": ("apply_edits", "merge_parts", "move_joint", "read_edits", "rename_part", "split_part"),
+    "skeleton.names": ("name_parts",),
+    "skeleton.search": ("SkeletonSearch", "search_skeleton"),
     "skeleton.tree": ("Skeleton",),
 }
 _ROOM_OF = {name: room for room, names in _ROOMS.items() for name in names}
 
 __all__ = ["CleanScanConfig", "CorrelatedConfig", "DecimateSetConfig", "Mesh", "MeshFileError", "RegisteredSet",
-           "RegistrationConfig", "SeedConfig", "Skeleton", "SkeletonConfig", "align_rigid", "clean_scan",
-           "decimate", "decimate_set", "fill_holes", "find_correspondences", "find_seeds", "find_skeleton",
-           "match_landmarks", "merge_views", "read_landmark_vertices", "read_landmarks", "read_mesh",
-           "read_points", "register", "write_decimated_set", "write_landmarks", "write_mesh"]
+           "RegistrationConfig", "SeedConfig", "Skeleton", "SkeletonConfig", "SkeletonSearch",
+           "align_rigid", "apply_edits", "clean_scan", "decimate", "decimate_set", "fill_holes",
+           "find_correspondences", "find_seeds", "find_skeleton", "match_landmarks", "merge_parts",
+           "merge_views", "move_joint", "name_parts", "read_edits", "read_landmark_vertices",
+           "read_landmarks", "read_mesh", "read_points", "register", "rename_part", "search_skeleton",
+           "split_part", "write_decimated_set", "write_landmarks", "write_mesh"]
 
 
 def __getattr__(name: str) -> Any:
