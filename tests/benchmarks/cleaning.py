@@ -133,6 +133,9 @@ def merge_peers(views: list[RangeView], truth: Mesh) -> Iterator[tuple[str, dict
     mesh = volume.extract_triangle_mesh()
     merged = Mesh(np.asarray(mesh.vertices), np.asarray(mesh.triangles))
     row: dict[str, object] = {"seconds": time.process_time() - start}
+    if not len(merged.faces):
+        print("open3d TSDF: no surface came out", flush=True)
+        return
     row |= merge_errors(merged, truth, np.concatenate([v.mesh.vertices for v in views]), False)
     print("open3d TSDF", row, flush=True)
     yield "open3d TSDF, known cameras", row
