@@ -77,7 +77,7 @@ def test_moves_and_scales_with_the_input(truth):
     s, R, t = 7.0, rotations.exp(np.array([0.3, -1.0, 2.0])), np.array([4.0, -2.0, 1.0])
     body = crab().with_vertices(s * crab().vertices)
     moved = register(body, s * scan @ R.T + t, (MARKS, s * truth.vertices[MARKS] @ R.T + t), config).mesh.vertices
-    np.testing.assert_allclose((moved - t) @ R / s, first, atol=0.010)   # which points thinning keeps depends on the turn
+    np.testing.assert_allclose((moved - t) @ R / s, first, atol=0.010)   # thinning keeps other points
     assert np.abs((moved - t) @ R / s - first).mean() < 1e-3
 
 
