@@ -96,7 +96,7 @@ def choose_skeleton(template: Mesh, poses: np.ndarray, config: PartsConfig | Non
     for done in range(config.steps):
         wanted = len(best.parents) + config.step
         try:
-            finer = find_skeleton(template, poses, SkeletonConfig(parts=wanted))
+            finer = find_skeleton(template, poses, SkeletonConfig(parts=wanted, restarts=1))
             errors[wanted] = error(finer)
         except ValueError:                        # no tree of so many parts, or parts too small to compare
             break

@@ -13,8 +13,8 @@ from ..dataset import RegisteredSet
 from ..geometry.files import read_mesh
 from ..geometry.mesh import Mesh
 from .edit import apply_edits, read_edits
-from .find import find_skeleton
 from .parts import SkeletonConfig
+from .search import SkeletonSearch, search_skeleton
 from .tree import Skeleton
 
 PosesArg = Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="POSES")]
@@ -38,10 +38,21 @@ def skeleton(poses: PosesArg, output: Output, template: Path | None = None, subj
     """
     body, vertices = read_poses(poses, template, subject, unit)
     with bar("finding the skeleton") as progress:
-        found = find_skeleton(body, vertices, config, progress=progress)
-    found.save(output)
-    return Outcome(output, [Metric("poses", len(vertices)), Metric("parts", len(found.parents)),
-                            *_shares(found, body)], {"skeleton": config})
+        search = search_skeleton(body, vertices, config, progress=progress)
+    search.skeleton.save(output)
+    return Outcome(output, [Metric("poses", len(vertices)), Metric("parts", len(search.skeleton.parents)),
+                            *_facts(search), *_shares(search.skeleton, body)], {"skeleton": config})
+
+
+def _facts(search: SkeletonSearch) -> list[Metric]:
+    """What was found on the way: sides, loops, restarts."""
+    facts = [Metric("left and right alike", "yes" if search.symmetric else "no"),
+             Metric("restarts that ended with as many parts",
+                    f"{search.parts.count(len(search.skeleton.parents))} of {len(search.parts)}")]
+    for loop in search.loops:
+        end = "joined" if loop.joined else "no longer linked"
+        facts.append(Metric(f"loop of {loop.length} links opened at", f"{' and '.join(loop.parts)}, {end}"))
+    return facts
 
 
 def edit(skeleton: SkeletonArg, output: Output, template: Path | None = None, edits: Path | None = None,
