@@ -3,7 +3,7 @@
     SCAPEKIT_DATA=... python tests/benchmarks/registration.py [--marks 10|7|4|0] [--front] [--set tuning|held]
         [--poses 3,8] [--men 3] [--json FILE]
 
-With `--marks 0` the template is placed by `find_seeds`, with no click. What we lose at: the surface is right long
+With `--marks 0` the template is led by `find_correspondences`, with no click. What we lose at: the surface is right long
 before the correspondence is; skin slides over muscles, and nothing in the shape says by how much.
 """
 from __future__ import annotations
@@ -26,9 +26,9 @@ def registered(data: RealData, item: TestScan, marks: str) -> Registration:
     landmarks = item.landmarks(data, marks)
     if landmarks is not None:
         return register(data.template, item.scan, landmarks)
-    from scanprep.matching.seeds import find_seeds
+    from scanprep.matching.correlated import find_correspondences
 
-    return register(data.template, item.scan, correspondences=find_seeds(data.template, item.scan))
+    return register(data.template, item.scan, correspondences=find_correspondences(data.template, item.scan))
 
 
 def measure(data: RealData, kind: str, index: int, marks: str, front: bool) -> dict[str, object]:
