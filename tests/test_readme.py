@@ -39,6 +39,7 @@ def place(demo_folder, tmp_path_factory):
                            ("half_view/half_view.landmarks.json", "half_view.landmarks.json"),
                            ("markers/layout.json", "layout.json")):
         shutil.copy(demo / source, folder / target)
+    shutil.copy(demo / "scans" / f"{mine[1].split(',')[0]}.ply", folder / "anna.ply")
     cameras = {}
     for k, view in enumerate(read_views(demo / "template_scan" / "views" / "rest.npz")):
         write_mesh(folder / "views" / f"view{k}.ply", view.mesh)

@@ -142,7 +142,8 @@ def main() -> None:
         person = done.model.subject()
         story.tell("no start, no landmark", {i: register_with_model(person, story.scans[i].scan, config=free
                                                                     ).mesh.vertices for i in range(args.clickless)})
-    write_report(Path(args.out), {"protocol": __doc__, "machine": machine(), "settings": vars(args), "poses": poses,
+    settings = {name: value for name, value in vars(args).items() if name != "out"}
+    write_report(Path(args.out), {"protocol": __doc__, "machine": machine(), "settings": settings, "poses": poses,
                                   "shown": shown, "parts": len(skeleton.parents), "rows": story.rows,
                                   "converged": done.converged})
 

@@ -90,7 +90,8 @@ def main() -> None:
     mean["failed"] = len(rows) - len(done)
     print("mean of scans: " + ", ".join(f"{name} {value:.3g}" for name, value in mean.items()))
     if options.json:
-        write_report(options.json, {"settings": vars(options), "machine": machine(), "scans": rows, "mean": mean})
+        settings = {name: value for name, value in vars(options).items() if name != "json"}
+        write_report(options.json, {"settings": settings, "machine": machine(), "scans": rows, "mean": mean})
 
 
 if __name__ == "__main__":

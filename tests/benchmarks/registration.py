@@ -3,8 +3,8 @@
     SCAPEKIT_DATA=... python tests/benchmarks/registration.py [--marks 10|7|4|0] [--front] [--set tuning|held]
         [--poses 3,8] [--men 3] [--json FILE]
 
-With `--marks 0` the template is led by `find_correspondences`, with no click. What we lose at: the surface is right long
-before the correspondence is; skin slides over muscles, and nothing in the shape says by how much.
+With `--marks 0` the template is led by `find_correspondences`, with no click. What we lose at: the surface is right
+long before the correspondence is; skin slides over muscles, and nothing in the shape says by how much.
 """
 from __future__ import annotations
 
