@@ -249,8 +249,8 @@ SECTIONS: dict[str, tuple[str, str, Callable[[dict], str], str]] = {
                    "Fold 0, 7 landmarks, viewpoint not told. Where we lose: an arm that no point of the scan touches, "
                    "and time when limbs have to be searched for."),
     "registration_10": ("Registration, ten landmarks", "python tests/benchmarks/registration.py --set held --marks 10",
-                        registration, "Virtual four-view scans, template mesh000, held-out poses and men. Where we lose: "
-                        "sharply bent limbs, whose skin slides; the surface is right long before the correspondence "
+                        registration, "Virtual four-view scans, template mesh000, held-out poses and men. Where we "
+                        "lose: sharply bent limbs, whose skin slides; the surface is right long before the correspondence "
                         "is. The elastic energy itself ends some 10 mm from the truth even when it begins there."),
     "registration_4": ("Registration, four landmarks", "python tests/benchmarks/registration.py --set held --marks 4",
                        registration, "Hands and toes."),
@@ -275,19 +275,19 @@ SECTIONS: dict[str, tuple[str, str, Callable[[dict], str], str]] = {
                           "In pose 7, where hands and feet are not the farthest ends, body and scan are matched upside "
                           "down."),
     "coregistration": ("Co-registration", "python tests/benchmarks/coregistration.py --held --landmarks 7 --rounds 2 "
-                       "--clickless 10", generic, "Virtual scans of 20 poses of one man, ten of them held out, on copies "
-                       "of 5,000 triangles. Skeleton and model come from the registrations alone. `failed`: more than 25 "
-                       "mm off on average."),
+                       "--clickless 10", generic, "Virtual scans of 20 poses of one man, ten of them held out, on "
+                       "copies of 5,000 triangles. Skeleton and model come from the registrations alone. `failed`: "
+                       "more than 25 mm off on average."),
     "skeleton": ("Skeletons", "python tests/benchmarks/skeleton.py", skeletons,
-                 "Real poses have no truth: agreement is the adjusted Rand index of triangles. What a part must be worth "
-                 "was chosen on these poses and one embedded person. py-dem-bones is told the number of parts and finds "
-                 "no joints. Where we lose: to it in time, and in agreement on the animal with its head straight."),
+                 "Real poses have no truth: agreement is the adjusted Rand index of triangles. What a part must be "
+                 "worth was chosen on these poses and one embedded person. py-dem-bones is told the number of parts and "
+                 "finds no joints. Where we lose: to it in time, and in agreement on the animal with its head straight."),
     "decimation": ("Decimation of 400,000 triangles to 50,000", "python tests/benchmarks/decimation.py", decimation,
-                   "A body subdivided twice, with relief. Where we lose: fast-simplification and pyfqmr are several times "
-                   "quicker; at 2,000 triangles the former leaves holes. Beside other work on two cores."),
+                   "A body subdivided twice, with relief. Where we lose: fast-simplification and pyfqmr are several "
+                   "times quicker; at 2,000 triangles the former leaves holes. Beside other work on two cores."),
     "decimated_set": ("Decimation of a registered set", "python tests/benchmarks/decimation.py", decimated_set,
-                      "Learned on every second pose, measured on the others and on men. `slide`: how far a vertex moves "
-                      "along the skin, carried back to the template. The anchor of `solved` was chosen on some of the "
+                      "Learned on every second pose, measured on the others and on men. `slide`: how far a vertex "
+                      "moves along the skin, carried back to the template. The anchor of `solved` was chosen on some of the "
                       "poses that it is measured on."),
     "holes": ("Six holes of a body", "python tests/benchmarks/cleaning.py --held --merge 0 --holes 2", holes,
               "Crown, armpits, crotch and soles of real and embedded bodies; one of the seven, pose000, was tuned on. "
