@@ -206,8 +206,8 @@ def holes(report: dict) -> str:
         for filler in dict.fromkeys(r["filler"] for r in report[size]):
             mine = [r for r in report[size] if r["filler"] == filler and "truth_mean_mm" in r]
             names = ("patch_mean_mm", "patch_max_mm", "truth_mean_mm", "truth_max_mm")
-            rows.append((filler, len(mine),
-                         *(float(np.mean([r[n] for r in mine])) if mine and n in mine[0] else "" for n in names),
+            known = {n: [r[n] for r in mine if n in r] for n in names}
+            rows.append((filler, len(mine), *(float(np.mean(known[n])) if known[n] else "" for n in names),
                          sum(r.get("crossing", 0) for r in mine), sum(r["closed"] and r["manifold"] for r in mine),
                          sum(bool(r.get("untouched")) for r in mine)))
         out.append(table((size, "bodies", "patch to truth, mean (mm)", "worst, mean over bodies (mm)",
@@ -250,8 +250,9 @@ SECTIONS: dict[str, tuple[str, str, Callable[[dict], str], str]] = {
                    "and time when limbs have to be searched for."),
     "registration_10": ("Registration, ten landmarks", "python tests/benchmarks/registration.py --set held --marks 10",
                         registration, "Virtual four-view scans, template mesh000, held-out poses and men. Where we "
-                        "lose: sharply bent limbs, whose skin slides; the surface is right long before the correspondence "
-                        "is. The elastic energy itself ends some 10 mm from the truth even when it begins there."),
+                        "lose: sharply bent limbs, whose skin slides; the surface is right long before the "
+                        "correspondence is. The elastic energy itself ends some 10 mm from the truth even when it "
+                        "begins there."),
     "registration_4": ("Registration, four landmarks", "python tests/benchmarks/registration.py --set held --marks 4",
                        registration, "Hands and toes."),
     "registration_0": ("Registration without landmarks", "python tests/benchmarks/registration.py --set held --marks 0",
@@ -280,15 +281,16 @@ SECTIONS: dict[str, tuple[str, str, Callable[[dict], str], str]] = {
                        "more than 25 mm off on average."),
     "skeleton": ("Skeletons", "python tests/benchmarks/skeleton.py", skeletons,
                  "Real poses have no truth: agreement is the adjusted Rand index of triangles. What a part must be "
-                 "worth was chosen on these poses and one embedded person. py-dem-bones is told the number of parts and "
-                 "finds no joints. Where we lose: to it in time, and in agreement on the animal with its head straight."),
+                 "worth was chosen on these poses and one embedded person. py-dem-bones is told the number of parts "
+                 "and finds no joints. Where we lose: to it in time, and in agreement on the animal with its head "
+                 "straight."),
     "decimation": ("Decimation of 400,000 triangles to 50,000", "python tests/benchmarks/decimation.py", decimation,
                    "A body subdivided twice, with relief. Where we lose: fast-simplification and pyfqmr are several "
                    "times quicker; at 2,000 triangles the former leaves holes. Beside other work on two cores."),
     "decimated_set": ("Decimation of a registered set", "python tests/benchmarks/decimation.py", decimated_set,
                       "Learned on every second pose, measured on the others and on men. `slide`: how far a vertex "
-                      "moves along the skin, carried back to the template. The anchor of `solved` was chosen on some of the "
-                      "poses that it is measured on."),
+                      "moves along the skin, carried back to the template. The anchor of `solved` was chosen on some "
+                      "of the poses that it is measured on."),
     "holes": ("Six holes of a body", "python tests/benchmarks/cleaning.py --held --merge 0 --holes 2", holes,
               "Crown, armpits, crotch and soles of real and embedded bodies; one of the seven, pose000, was tuned on. "
               "The second size was added after the first had been seen. Where we lose: armpits, up to 22 mm from patch "
