@@ -217,17 +217,20 @@ def _clear_triangles(around: Mesh, ring: np.ndarray, rim_normals: np.ndarray, jo
     points = around.vertices[ring]
     dear = _price(points) * _pierced(points, joined, rays)
     best, fewest = None, np.inf
+    corners = around.corners                    # what overlaps the box of the ring; the new triangles lie inside it
+    near = around.faces[((corners.max(axis=1) >= points.min(axis=0))
+                         & (corners.min(axis=1) <= points.max(axis=0))).all(axis=1)]
     for _ in range(RETRIES):
         found = triangulate_loop(points, rim_normals, joined, largest, dear)
         if found is None:
             return best
-        mesh = Mesh(around.vertices, np.concatenate([around.faces, ring[found]]))
-        pairs = intersecting_faces(mesh, np.arange(len(around.faces), len(mesh.faces)))
+        mesh = Mesh(around.vertices, np.concatenate([near, ring[found]]))
+        pairs = intersecting_faces(mesh, np.arange(len(near), len(mesh.faces)))
         if len(pairs) < fewest:
             best, fewest = found, len(pairs)
         if not fewest:
             break
-        bad = np.unique(pairs[pairs >= len(around.faces)]) - len(around.faces)
+        bad = np.unique(pairs[pairs >= len(near)]) - len(near)
         sides = found[bad][:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
         dear[sides[:, 0], sides[:, 1]] += _price(points)
         dear = np.maximum(dear, dear.T)
