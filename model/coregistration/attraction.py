@@ -7,7 +7,7 @@ import numpy as np
 
 from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.surface import OrientedPoints, Surface
-from scanprep.matching.matches import Target
+from scanprep.matching.matches import Target, tukey
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,7 +60,7 @@ def attraction(x: np.ndarray, normals: np.ndarray, share: np.ndarray, target: Ta
     back = OrientedPoints(x, normals, scale).match(target.points, target.normals, reach)
     p = np.flatnonzero(back.valid)
     mine, theirs = np.r_[i, back.index[p]], np.r_[forward.index[i], p]
-    w = np.r_[share[i] * _robust(forward.distances[i], reach), _robust(back.distances[p], reach) / len(target.points)]
+    w = np.r_[share[i] * tukey(forward.distances[i], reach), tukey(back.distances[p], reach) / len(target.points)]
     n, z = target.normals[theirs], target.points[theirs]
     A_each = w[:, None, None] * (slide * np.eye(3) + (1 - slide) * n[:, :, None] * n[:, None, :])
     A, b = np.zeros((len(x), 3, 3)), np.zeros((len(x), 3))
@@ -79,8 +79,3 @@ def apart(mesh: Mesh, target: Target, limit: float) -> np.ndarray:
     found = Surface(mesh).closest(target.points)
     facing = np.einsum("nd,nd->n", mesh.face_normals[found.faces], target.normals) > 0
     return np.where(facing, np.minimum(found.distances, limit), limit)
-
-
-def _robust(distances: np.ndarray, reach: float) -> np.ndarray:
-    """Tukey's weight: one at zero distance, zero at `reach`."""
-    return np.maximum(1 - (distances / reach) ** 2, 0) ** 2

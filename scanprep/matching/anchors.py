@@ -8,7 +8,7 @@ from scipy.spatial import cKDTree
 
 from ..geometry import rotations
 from ..geometry.mesh import Mesh
-from .correspondences import Correspondences
+from .correspondences import Correspondences, checked_pairs
 from .energies import Pull, pull
 from .graph import farthest_points
 from .matches import Described, Likeness, Target
@@ -45,17 +45,12 @@ class Hints:
 
 def hints_of(template: Mesh, correspondences: Correspondences) -> Hints:
     """Correspondences as hints, or ValueError with what is wrong with them."""
-    vertices, points = _pairs(template, correspondences.template_vertices, correspondences.scan_points,
-                              "correspondences", 0)
+    vertices, points = checked_pairs(template, correspondences.template_vertices, correspondences.scan_points,
+                                     "correspondences", 0)
     confidence = np.asarray(correspondences.confidence, dtype=np.float64)
     if confidence.shape != (len(vertices),) or not (np.isfinite(confidence) & (confidence >= 0)).all():
         raise ValueError(f"correspondences: expected {len(vertices)} confidences of at least 0")
     return Hints(vertices, points, confidence)
-
-
-def checked_landmarks(template: Mesh, landmarks: tuple[np.ndarray, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-    """Landmarks as arrays, or ValueError with what is wrong with them."""
-    return _pairs(template, landmarks[0], landmarks[1], "landmarks", 3)
 
 
 def path_anchors(landmarks: tuple[np.ndarray, np.ndarray] | None, hints: Hints | None, target: Target, near: float,
@@ -106,21 +101,3 @@ def place_by_marks(template: Mesh, marks: np.ndarray, target: Target, sample: np
     T = np.eye(4)
     T[:3, :3], T[:3, 3] = R, b.mean(axis=0) - R @ a.mean(axis=0)
     return T
-
-
-def _pairs(template: Mesh, vertices: np.ndarray, points: np.ndarray, name: str, least: int
-           ) -> tuple[np.ndarray, np.ndarray]:
-    vertices, points = np.asarray(vertices), np.asarray(points, dtype=np.float64)
-    if vertices.ndim != 1 or not np.issubdtype(vertices.dtype, np.integer):
-        raise ValueError(f"{name}: expected vertex numbers of shape (L,), got {vertices.dtype} "
-                         f"of shape {vertices.shape}")
-    if points.shape != (len(vertices), 3):
-        raise ValueError(f"{name}: expected points of shape ({len(vertices)}, 3), got {points.shape}")
-    if len(vertices) < least:
-        raise ValueError(f"{name}: expected at least {least}, got {len(vertices)}")
-    outside = (vertices < 0) | (vertices >= len(template.vertices))
-    if outside.any():
-        raise ValueError(f"{name}: vertex {vertices[outside][0]} is outside 0..{len(template.vertices) - 1}")
-    if not np.isfinite(points).all():
-        raise ValueError(f"{name}: {(~np.isfinite(points).all(axis=1)).sum()} points are not finite")
-    return vertices, points

@@ -17,7 +17,7 @@ from ..geometry.geodesics import SurfaceGraph
 from ..geometry.mesh import Mesh, check_template
 from .correlated_search import BeliefLevel, CorrelatedConfig, Search
 from .correlated_sheet import Sheet
-from .correspondences import Correspondences
+from .correspondences import Correspondences, checked_pairs
 from .matches import target_of
 from .seeds import find_seeds
 
@@ -59,7 +59,7 @@ def find_correspondences(template: Mesh, scan: Mesh | np.ndarray, seeds: tuple[n
     if seeds is None:
         found = find_seeds(template, scan)
         seeds = (found.template_vertices, found.scan_points)
-    seeds = checked_seeds(template, seeds)
+    seeds = checked_pairs(template, *seeds, "seeds")
     total = 2 + 2 * len(config.levels)
     sheet = Sheet(target_of(scan, config.neighbours), config.spacing * float(np.sqrt(template.face_areas.sum())))
     search = Search(template, sheet, SurfaceGraph(template), seeds, config)
@@ -68,21 +68,3 @@ def find_correspondences(template: Mesh, scan: Mesh | np.ndarray, seeds: tuple[n
         search.descend(level)
         tell(4 + 2 * number, total)
     return search.result()
-
-
-def checked_seeds(template: Mesh, seeds: tuple[np.ndarray, np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-    """Seeds as arrays, or ValueError with what is wrong with them."""
-    vertices, points = np.asarray(seeds[0]), np.asarray(seeds[1], dtype=np.float64)
-    if vertices.ndim != 1 or not np.issubdtype(vertices.dtype, np.integer):
-        raise ValueError(f"seeds: expected vertex numbers of shape (S,), got {vertices.dtype} of shape "
-                         f"{vertices.shape}")
-    if points.shape != (len(vertices), 3):
-        raise ValueError(f"seeds: expected points of shape ({len(vertices)}, 3), got {points.shape}")
-    if len(vertices) < 3:
-        raise ValueError(f"seeds: expected at least 3, got {len(vertices)}")
-    outside = (vertices < 0) | (vertices >= len(template.vertices))
-    if outside.any():
-        raise ValueError(f"seeds: vertex {vertices[outside][0]} is outside 0..{len(template.vertices) - 1}")
-    if not np.isfinite(points).all():
-        raise ValueError(f"seeds: {(~np.isfinite(points).all(axis=1)).sum()} points are not finite")
-    return vertices.astype(np.int64), points

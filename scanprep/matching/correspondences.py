@@ -5,6 +5,8 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from ..geometry.mesh import Mesh
+
 
 @dataclass(frozen=True, eq=False)
 class Correspondences:
@@ -32,3 +34,33 @@ class Correspondences:
 
     def __len__(self) -> int:
         return len(self.template_vertices)
+
+
+def checked_pairs(template: Mesh, vertices: np.ndarray, points: np.ndarray, name: str, least: int = 3
+                  ) -> tuple[np.ndarray, np.ndarray]:
+    """Vertices of a template and their places as arrays, or ValueError with what is wrong with them.
+
+    Parameters
+    ----------
+    template : Mesh
+    vertices : (L,) int
+    points : (L, 3) float, metres
+    name : str
+        What the argument is called where it was given.
+    least : int
+        So many are needed.
+    """
+    vertices, points = np.asarray(vertices), np.asarray(points, dtype=np.float64)
+    if vertices.ndim != 1 or not np.issubdtype(vertices.dtype, np.integer):
+        raise ValueError(f"{name}: expected vertex numbers of shape (L,), got {vertices.dtype} "
+                         f"of shape {vertices.shape}")
+    if points.shape != (len(vertices), 3):
+        raise ValueError(f"{name}: expected points of shape ({len(vertices)}, 3), got {points.shape}")
+    if len(vertices) < least:
+        raise ValueError(f"{name}: expected at least {least}, got {len(vertices)}")
+    outside = (vertices < 0) | (vertices >= len(template.vertices))
+    if outside.any():
+        raise ValueError(f"{name}: vertex {vertices[outside][0]} is outside 0..{len(template.vertices) - 1}")
+    if not np.isfinite(points).all():
+        raise ValueError(f"{name}: {(~np.isfinite(points).all(axis=1)).sum()} points are not finite")
+    return vertices, points

@@ -161,14 +161,14 @@ def match_both_ways(deformed: Mesh, sample: np.ndarray, area: float, target: Tar
     p, apart = mine.of(sample).matched(theirs, reach, like)
     good = (p >= 0) & ~target.border[p]
     v, p = sample[good], p[good]
-    weights = area / len(sample) * _robust(apart[good], reach)
+    weights = area / len(sample) * tukey(apart[good], reach)
     wanted = pull(N, v, target.points[p], weights, target.normals[p], slide)
     distances = np.full(N, np.nan)
     distances[v] = np.abs(np.einsum("nd,nd->n", target.normals[p], x[v] - target.points[p]))
 
     chosen, apart = theirs.matched(mine, reach, like)
     p = np.flatnonzero(chosen >= 0)
-    weights = area / len(target.points) * _robust(apart[p], reach)
+    weights = area / len(target.points) * tukey(apart[p], reach)
     wanted += pull(N, chosen[p], target.points[p], weights, target.normals[p], slide)
     return Matching(wanted, np.isfinite(distances), distances)
 
@@ -206,7 +206,7 @@ class Described:
         return np.where(good, index, -1), apart
 
 
-def _robust(distances: np.ndarray, reach: float) -> np.ndarray:
+def tukey(distances: np.ndarray, reach: float) -> np.ndarray:
     """Tukey's weight: one at zero distance, zero at `reach`."""
     return np.maximum(1 - (distances / reach) ** 2, 0) ** 2
 

@@ -15,9 +15,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..geometry.mesh import Mesh, check_template
-from .anchors import checked_landmarks, hints_of
+from .anchors import hints_of
 from .confidence import evidence
-from .correspondences import Correspondences
+from .correspondences import Correspondences, checked_pairs
 from .fit import Fit
 from .matches import target_of
 from .schedule import GraphStage, RegistrationConfig, ShellStage
@@ -98,7 +98,7 @@ def register(template: Mesh, scan: Mesh | np.ndarray, landmarks: tuple[np.ndarra
     check_template(template)
     target = target_of(scan, config.neighbours)
     if landmarks is not None:
-        landmarks = checked_landmarks(template, landmarks)
+        landmarks = checked_pairs(template, *landmarks, "landmarks")
     hints = None if correspondences is None else hints_of(template, correspondences)
     fit = Fit(template, target, landmarks, hints, config, progress or (lambda done, total: None))
     for stage in fit.stages:
