@@ -63,3 +63,11 @@ def test_a_bent_body_by_its_seeds():
 def test_a_scan_with_too_few_points_is_refused():
     with pytest.raises(ValueError, match="points"):
         find_functional_correspondences(crab(), crab().vertices[:30], None, SMALL)
+
+
+def test_wrong_seeds_are_refused():
+    body = crab()
+    with pytest.raises(ValueError, match="seeds: expected at least 3"):
+        find_functional_correspondences(body, body, (np.array([0, 1]), body.vertices[:2]), SMALL)
+    with pytest.raises(ValueError, match="seeds: vertex 999999"):
+        find_functional_correspondences(body, body, (np.array([0, 1, 999999]), body.vertices[:3]), SMALL)

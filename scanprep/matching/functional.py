@@ -21,7 +21,7 @@ from scipy.spatial import cKDTree
 from ..geometry.mesh import Mesh, check_template
 from ..geometry.sparse import factor
 from .correlated_sheet import Sheet
-from .correspondences import Correspondences
+from .correspondences import Correspondences, checked_pairs
 from .graph import farthest_points
 from .matches import Target, target_of
 
@@ -106,10 +106,12 @@ def find_functional_correspondences(template: Mesh, scan: Mesh | np.ndarray,
     Raises
     ------
     ValueError
-        A template that is not one manifold component, a scan with fewer points than frequencies.
+        A template that is not one manifold component, a scan with fewer points than frequencies, fewer than three
+        seeds or seeds that do not exist.
     """
     config = config or FunctionalConfig()
     check_template(template)
+    seeds = seeds and checked_pairs(template, *seeds, "seeds")
     size = float(np.sqrt(template.face_areas.sum()))
     body = Sheet(Target(template.vertices, template.vertex_normals, np.zeros(len(template.vertices), dtype=bool),
                         True), config.spacing * size)
@@ -120,8 +122,7 @@ def find_functional_correspondences(template: Mesh, scan: Mesh | np.ndarray,
     a, b = (spectrum(s, config.last) for s in (body, sheet))
     marks = None
     if seeds is not None:
-        clicked = (template.vertices[np.asarray(seeds[0])], np.asarray(seeds[1]))
-        marks = (cKDTree(a.points).query(clicked[0])[1], cKDTree(b.points).query(clicked[1])[1])
+        marks = (cKDTree(a.points).query(template.vertices[seeds[0]])[1], cKDTree(b.points).query(seeds[1])[1])
     sample = farthest_points(b.points, min(config.sample, len(b.points)))
     C = zoom_out(a, b, first_map(a, b, marks, config), sample, config)
     chosen = sample[:config.points]

@@ -272,8 +272,8 @@ SECTIONS: dict[str, tuple[str, str, Callable[[dict], str], str]] = {
     "correspondences_7": ("Correlated correspondence, seven seeds",
                           "python tests/benchmarks/correspondences.py --set held --seeds 7", correspondences,
                           "Distances along the true body. Where we lose: pose 7, a deep squat, and single front views "
-                          "(medians of 19 to 45 mm on four tuning poses). No point that was kept is a guess at random: "
-                          "the 170 of 240 with least strain are kept, and the others are worse."),
+                          "(medians of 19 to 45 mm on four tuning poses). The figures are "
+                          "of the 170 points out of 240 with the least strain; the others are worse."),
     "correspondences_0": ("Correlated correspondence without seeds",
                           "python tests/benchmarks/correspondences.py --set held --seeds 0 --first 3", correspondences,
                           "In pose 7, where hands and feet are not the farthest ends, body and scan are matched upside "
@@ -296,8 +296,9 @@ SECTIONS: dict[str, tuple[str, str, Callable[[dict], str], str]] = {
                       "of the poses that it is measured on."),
     "holes": ("Six holes of a body", "python tests/benchmarks/cleaning.py --held --merge 0 --holes 2", holes,
               "Crown, armpits, crotch and soles of real and embedded bodies; one of the seven, pose000, was tuned on. "
-              "The second size was added after the first had been seen. Where we lose: armpits, up to 22 mm from patch "
-              "to truth; Poisson columns of the patch are missing as it remeshes everything."),
+              "The second size was added after the first had been seen. Measured before borders of more than "
+              "120 edges lost ears first and before diffusion was left to known lines of sight. Where we lose: armpits, "
+              "up to 22 mm from patch to truth; Poisson columns of the patch are missing as it remeshes everything."),
     "markers": ("Markers on random vertices of held-out poses", "python tests/benchmarks/markers.py", markers,
                 "Fold 0, known subject, every pose a frame of its own; skeleton and model from the training poses."),
 }
