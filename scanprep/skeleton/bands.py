@@ -11,14 +11,20 @@ def dissolve_bands(search: PartSearch, label: np.ndarray) -> np.ndarray:
     """Labels (F,) without the parts that are only the passage between two neighbours.
 
     The skin of a shoulder or a knee moves in between; cut out, such a band looks like a part. It is none if a blend of
-    its neighbours' motions, vertex by vertex, explains nearly all that its own motion explains.
+    its neighbours' motions, vertex by vertex, explains nearly all that its own motion explains. A band stays if the
+    labels that follow are no fewer.
     """
     while True:
         explained, between = passages(search, label)
-        band = int(explained.argmax())
-        if explained[band] < search.config.fading:
+        for band in np.argsort(-explained, kind="stable"):
+            if explained[band] < search.config.fading:
+                return label
+            without = search.alternate(_shared_out(search, label, int(band), between[band]), rounds=4)
+            if without.max() < label.max():
+                label = without
+                break
+        else:
             return label
-        label = search.alternate(_shared_out(search, label, band, between[band]), rounds=4)
 
 
 def passages(search: PartSearch, label: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

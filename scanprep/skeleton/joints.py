@@ -126,7 +126,10 @@ def to_tree(search: PartSearch, label: np.ndarray) -> tuple[np.ndarray, np.ndarr
             links = np.delete(links, np.unique([loop[sound[0]], image[loop[sound[0]]]]), axis=0)
         else:
             return label, links, loops
-        label = search.alternate(search.join(label, *pairs[cheapest]), rounds=4)
+        joined = search.join(label, *pairs[cheapest])
+        label = search.alternate(joined, rounds=4)
+        if label.max() + 1 >= count:                             # cut again by the alternation
+            label = np.unique(joined, return_inverse=True)[1]
 
 
 def tree_of(search: PartSearch, label: np.ndarray, links: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:

@@ -177,17 +177,22 @@ class PartSearch:
         return self.sides.join(label, a, b, self.sides.partners(label))
 
     def join_down(self, label: np.ndarray) -> np.ndarray:
-        """Join the pair that is least apart, alternate, and so on, until all are apart and no part is too small."""
+        """Join the pair that is least apart, alternate, and so on, until all are apart and no part is too small.
+
+        A pair whose union the alternation cuts again stays two.
+        """
+        label = self.alternate(label, rounds=2)
         while True:
-            label = self.alternate(label, rounds=2)
             pairs, separation, extra = self.separations(label)
-            if not len(pairs):
-                return label
             share = np.bincount(label, self.surface.face_weights)
             open_ = (share[pairs] < self.config.smallest).any(axis=1) | (separation < self.config.separation)
-            if not open_.any():
+            for i in np.flatnonzero(open_)[np.argsort(extra[open_], kind="stable")]:
+                joined = self.alternate(self.join(label, *pairs[i]), rounds=2)
+                if joined.max() < label.max():
+                    label = joined
+                    break
+            else:
                 return label
-            label = self.join(label, *pairs[np.where(open_, extra, np.inf).argmin()])
 
     def split(self, label: np.ndarray, part: int) -> tuple[np.ndarray, float]:
         """Cut one part where it bends most: in two or, in the middle of a symmetric body, in three.
