@@ -34,12 +34,16 @@ def relabel(costs: np.ndarray, pairs: np.ndarray, prices: np.ndarray, label: np.
     around = np.bincount(pairs.ravel(), np.repeat(prices, 2), len(label))
     unit = max(costs.mean() * RESOLUTION, np.finfo(float).tiny)
     energy = field_energy(costs, pairs, prices, label)
+    vain = np.zeros(costs.shape[1], dtype=bool)              # moves that changed nothing, and nothing has changed since
     for _ in range(rounds):
-        for alpha in range(costs.shape[1]):
+        for alpha in np.flatnonzero(~vain).tolist():
             gain = costs[:, alpha] - costs[np.arange(len(label)), label]
             free = (label != alpha) & (gain < around)        # the others lose more than all borders can give
-            if free.any():
-                label = np.where(_expand(gain, pairs, prices, label, alpha, free, unit), alpha, label)
+            turned = _expand(gain, pairs, prices, label, alpha, free, unit) & free if free.any() else free
+            if turned.any():
+                label = np.where(turned, alpha, label)
+                vain[:] = False
+            vain[alpha] = True                               # the best of its moves has been made
         before, energy = energy, field_energy(costs, pairs, prices, label)
         if energy >= before * (1 - 1e-5):
             break

@@ -7,6 +7,7 @@ the vertices again.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import pairwise
 
 import numpy as np
 from scipy.sparse import coo_array, csr_array
@@ -43,25 +44,26 @@ class Moments:
     xx: np.ndarray
     yy: np.ndarray
 
-    def _each(self) -> tuple[np.ndarray, ...]:
+    def each(self) -> tuple[np.ndarray, ...]:
+        """All sums, arrays of P rows."""
         return self.w, self.x, self.y, self.yx, self.xx, self.yy
 
     def __getitem__(self, sets: np.ndarray | slice) -> Moments:
         """The sums of some of the sets."""
-        return Moments(*(a[sets] for a in self._each()))
+        return Moments(*(a[sets] for a in self.each()))
 
     def __add__(self, other: Moments) -> Moments:
         """The sums of the unions, set by set."""
-        return Moments(*(a + b for a, b in zip(self._each(), other._each(), strict=True)))
+        return Moments(*(a + b for a, b in zip(self.each(), other.each(), strict=True)))
 
     def gather(self, label: np.ndarray) -> Moments:
         """The sums over the sets (P,) of each label."""
         into = csr_array((np.ones(len(label)), (label, np.arange(len(label)))))
-        return Moments(*((into @ a.reshape(len(label), -1)).reshape(-1, *a.shape[1:]) for a in self._each()))
+        return Moments(*((into @ a.reshape(len(label), -1)).reshape(-1, *a.shape[1:]) for a in self.each()))
 
     def absorb(self, a: int, b: int) -> None:
         """Add set b to set a, in place."""
-        for array in self._each():
+        for array in self.each():
             array[a] += array[b]
 
 
@@ -176,9 +178,13 @@ class PosedSurface:
         W = csr_array(coo_array((np.repeat(weights / 3, 3), (rows, columns)),
                                 shape=(label.max() + 1, len(self.x))))
         n, M = self.y.shape[:2]
-        flat = self.y.reshape(n, -1)
-        yx = np.stack([(W @ (flat * self.x[:, [i]])).reshape(-1, M, 3) for i in range(3)], axis=-1)
-        return Moments(np.asarray(W.sum(axis=1)).ravel(), W @ self.x, (W @ flat).reshape(-1, M, 3), yx,
+        flat, x1 = self.y.reshape(n, -1), np.c_[self.x, np.ones(n)]
+        yx1 = np.empty((W.shape[0], 3 * M, 4))
+        for p, (start, end) in enumerate(pairwise(W.indptr)):
+            mine = W.indices[start:end]
+            yx1[p] = flat[mine].T @ (W.data[start:end, None] * x1[mine])
+        yx1 = yx1.reshape(-1, M, 3, 4)
+        return Moments(np.asarray(W.sum(axis=1)).ravel(), W @ self.x, yx1[..., 3].copy(), yx1[..., :3].copy(),
                        W @ np.einsum("ni,ni->n", self.x, self.x), W @ self._yy)
 
     def core_motions(self, label: np.ndarray) -> Motions:

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from .motions import Moments, Motions, PosedSurface, fit_motions, rigid_costs, union_costs
-from .patches import agglomerate, cover
+from .patches import agglomerate, cover, halve
 from .sides import Sides, mirror_pairs
 from .symmetry import Symmetry
 
@@ -145,18 +145,19 @@ class PartSearch:
         """(P,) square metres: what each part from `first` on would gain by its best cut along the patches."""
         P, K = int(label.max()) + 1, int(self.patch.max()) + 1
         keys = [np.packbits(label == part).tobytes() for part in range(first, P)]
-        if any(key not in self._gains for key in keys):
+        new = [part for part, key in enumerate(keys, first) if key not in self._gains]
+        if new:
             used, piece = np.unique(label * K + self.patch, return_inverse=True)
-            moments, contacts = self.surface.moments(piece), self.contacts(piece)
-        for part, key in enumerate(keys, first):
-            if key in self._gains:
-                continue
-            mine = np.flatnonzero(used // K == part)
-            among = contacts[((contacts >= mine[0]) & (contacts <= mine[-1])).all(axis=1)] - mine[0]
-            sub = moments[mine]
-            half = agglomerate(sub, among, 2)
-            whole = sub.gather(np.zeros(len(mine), dtype=np.int64))
-            self._gains[key] = max(rigid_costs(whole)[0] - rigid_costs(sub.gather(half)).sum(), 0.0)
+            ours, contacts = np.flatnonzero(np.isin(used // K, new)), self.contacts(piece)
+            number, place = np.full(len(used), -1), np.full(P, -1)
+            number[ours], place[new] = np.arange(len(ours)), np.arange(len(new))
+            moments, among, group = self.surface.moments(piece)[ours], number[contacts], place[used[ours] // K]
+            among = among[(among >= 0).all(axis=1)]
+            among = among[group[among[:, 0]] == group[among[:, 1]]]
+            half, of_set = np.unique(halve(moments, among, group), return_inverse=True)
+            cut = np.bincount(group[half], rigid_costs(moments.gather(of_set)), len(new))
+            gains = np.maximum(rigid_costs(moments.gather(group)) - cut, 0)
+            self._gains.update(zip((keys[part - first] for part in new), gains.tolist(), strict=True))
         return np.array([0.0] * first + [self._gains[key] for key in keys])
 
     def _apart(self, moments: Moments, pairs: np.ndarray, gains: np.ndarray, partner: np.ndarray

@@ -84,3 +84,44 @@ def agglomerate(moments: Moments, contacts: np.ndarray, count: int, partner: np.
         now = {(int(owner[c]), int(owner[d])) for c, d in touched}
         measure(sorted({(min(pair), max(pair)) for pair in now if pair[0] != pair[1]}))
     return np.unique(owner, return_inverse=True)[1]
+
+
+def halve(moments: Moments, contacts: np.ndarray, group: np.ndarray) -> np.ndarray:
+    """What `agglomerate` down to two sets does, for many groups of sets side by side.
+
+    Parameters
+    ----------
+    moments : Moments of P sets
+    contacts : (n, 2) int
+        Pairs of sets of one group.
+    group : (P,) int, 0..G-1
+
+    Returns
+    -------
+    (P,) int
+        A set of those that became one; of every group two are left, or as many pieces as it is in.
+    """
+    moments = moments[np.arange(len(moments.w))]
+    cost, owner, pairs = rigid_costs(moments), np.arange(len(group)), contacts
+    left = np.bincount(group)
+    extra = union_costs(moments, pairs) - cost[pairs].sum(axis=1) if len(pairs) else np.zeros(0)
+    while True:
+        open_ = left[group[pairs[:, 0]]] > 2
+        pairs, extra = pairs[open_], extra[open_]
+        if not len(pairs):
+            return owner
+        order = np.lexsort((extra, group[pairs[:, 0]]))
+        first = np.r_[True, np.diff(group[pairs[order, 0]]) > 0]
+        kept, gone = pairs[order[first]].T
+        left[group[kept]] -= 1
+        for array in moments.each():
+            array[kept] += array[gone]
+        cost[kept] = rigid_costs(moments[kept])
+        into = np.arange(len(group))
+        into[gone] = kept
+        owner = into[owner]
+        touched = np.isin(pairs, np.r_[kept, gone]).any(axis=1)
+        now = np.sort(into[pairs[touched]], axis=1)
+        now = np.unique(now[now[:, 0] != now[:, 1]], axis=0)
+        fresh = union_costs(moments, now) - cost[now].sum(axis=1) if len(now) else np.zeros(0)
+        pairs, extra = np.concatenate([pairs[~touched], now]), np.r_[extra[~touched], fresh]

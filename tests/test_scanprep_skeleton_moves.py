@@ -1,0 +1,63 @@
+"""The moves of the search for parts: halves of many groups at once, and an end where every move is taken back."""
+import numpy as np
+import pytest
+from animal_bodies import Animal, Build, random_pose
+
+from scanprep.skeleton.bands import dissolve_bands, passages
+from scanprep.skeleton.joints import to_tree
+from scanprep.skeleton.motions import PosedSurface, rigid_costs
+from scanprep.skeleton.parts import PartSearch, SkeletonConfig
+from scanprep.skeleton.patches import agglomerate, halve
+
+
+@pytest.fixture(scope="module")
+def search():
+    rng, animal = np.random.default_rng(3), Animal(Build(aside=0.0))
+    poses = np.stack([animal.posed(random_pose(rng)) for _ in range(5)])
+    poses += rng.normal(0, 0.01, poses.shape)
+    return PartSearch(PosedSurface(animal.mesh, poses), SkeletonConfig(patches=120, separation=1e6, fading=1e-6))
+
+
+@pytest.fixture
+def label(search):
+    """Twelve parts, each of several patches."""
+    return agglomerate(search.surface.moments(search.patch), search.contacts(search.patch), 12)[search.patch]
+
+
+def test_groups_are_halved_side_by_side_as_one_by_one(search, label):
+    used, piece = np.unique(label * (search.patch.max() + 1) + search.patch, return_inverse=True)
+    group = used // (search.patch.max() + 1)
+    moments, contacts = search.surface.moments(piece), search.contacts(piece)
+    within = contacts[group[contacts[:, 0]] == group[contacts[:, 1]]]
+    half = halve(moments, within, group)
+    assert len(np.unique(group)) == 12
+    for part in range(12):
+        mine = np.flatnonzero(group == part)
+        number = np.searchsorted(mine, within[group[within[:, 0]] == part])
+        alone = agglomerate(moments[mine], number, 2)
+        here = np.unique(half[mine], return_inverse=True)[1]
+        costs = [np.sort(rigid_costs(moments[mine].gather(sets))) for sets in (alone, here)]
+        np.testing.assert_allclose(*costs, rtol=1e-9, atol=1e-15)
+
+
+def test_a_group_in_pieces_keeps_them(search):
+    moments = search.surface.moments(search.patch)
+    half = halve(moments, np.array([[0, 1], [1, 2]]), np.zeros(len(moments.w), dtype=np.int64))
+    assert len(np.unique(half)) == len(moments.w) - 2
+
+
+@pytest.mark.parametrize("move", [dissolve_bands, PartSearch.join_down])
+@pytest.mark.timeout(60)
+def test_moves_that_the_alternation_takes_back_come_to_an_end(search, label, monkeypatch, move):
+    """A band was dissolved and found again without end."""
+    assert passages(search, label)[0].max() > search.config.fading
+    monkeypatch.setattr(PartSearch, "alternate", lambda *_, **__: label)
+    np.testing.assert_array_equal(move(search, label), label)
+
+
+@pytest.mark.timeout(60)
+def test_a_tree_is_reached_though_the_alternation_cuts_again(search, monkeypatch):
+    label = np.unique(search.patch % 40, return_inverse=True)[1]
+    monkeypatch.setattr(PartSearch, "alternate", lambda *_, **__: label)
+    parts, links, loops = to_tree(search, label)
+    assert loops and len(links) == parts.max() < label.max()
