@@ -196,15 +196,11 @@ if __name__ == "__main__":
     parser.add_argument("--only", nargs="*", default=["real", "folds", "embedded", "animals"])
     asked = parser.parse_args()
     report: dict[str, object] = {"machine": platform.machine(), "numpy": np.__version__, "scipy": scipy.__version__}
-    if "embedded" in asked.only:
-        report["embedded"] = [embedded(n, s) for n, s in ((0, 0), (0.003, 0.005), (0.005, 0.01))]
-    if "animals" in asked.only:
-        report["animals"] = [animal(aside) for aside in (0.0, 1.0)]
-    if "real" in asked.only:
-        report["real"] = real(asked.seeds)
-    if "folds" in asked.only:
-        report["folds"] = held_out()
-    text = json.dumps(report, indent=1)
-    print(text)
-    if asked.output:
-        asked.output.write_text(text)
+    sections = {"embedded": lambda: [embedded(n, s) for n, s in ((0, 0), (0.003, 0.005), (0.005, 0.01))],
+                "animals": lambda: [animal(aside) for aside in (0.0, 1.0)],
+                "real": lambda: real(asked.seeds), "folds": held_out}
+    for section in (name for name in sections if name in asked.only):
+        report[section] = sections[section]()
+        print(section, json.dumps(report[section], indent=1), flush=True)
+        if asked.output:
+            asked.output.write_text(json.dumps(report, indent=1))
