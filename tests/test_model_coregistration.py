@@ -302,7 +302,7 @@ def test_command_writes_a_set_and_a_model(story, body, tmp_path, monkeypatch):
 
     def run():
         return coregister_scans(tmp_path / "first.npz", tmp_path / "scans", tmp_path / "out", first=tmp_path / "set",
-                                rounds=1, workers=1, failed=0.05)
+                                rounds=1, workers=2, failed=0.05)
 
     done = run()
     assert len(done.failures) == 1 and "broken.ply" in done.failures[0]

@@ -1,4 +1,6 @@
 """Factored systems against dense solves."""
+import pickle
+
 import numpy as np
 import pytest
 from scipy.sparse import csc_array, eye_array, random_array
@@ -35,3 +37,8 @@ def test_right_hand_sides_may_lie_in_memory_in_any_way(layout):
 def test_a_singular_matrix_is_refused():
     with pytest.raises(ValueError, match="no unique solution"):
         factor(csc_array(np.diag([1.0, 0.0, 1.0])))
+
+
+def test_a_factored_system_can_be_sent_to_another_process():
+    A, b = system(), np.random.default_rng(3).normal(size=(80, 3))
+    np.testing.assert_array_equal(pickle.loads(pickle.dumps(Factored(A))).solve(b), Factored(A).solve(b))

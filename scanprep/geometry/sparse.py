@@ -38,7 +38,8 @@ def factor(matrix: csc_array) -> Callable[[np.ndarray], np.ndarray]:
 class Factored:
     """A factored SPD system for many right-hand sides (CHOLMOD-class supernodal Cholesky from cholespy).
 
-    Slower to factor than `factor`, several times faster to solve with three or more columns.
+    Slower to factor than `factor`, several times faster to solve with three or more columns. Pickled, it is the matrix,
+    and factored again where it is read.
     """
 
     LIMIT = 128                      # columns cholespy takes in one call
@@ -46,10 +47,14 @@ class Factored:
     def __init__(self, matrix: csc_array) -> None:
         from cholespy import CholeskySolverD, MatrixType
 
+        self._matrix = matrix
         entries = coo_array(matrix)
         self.size = entries.shape[0]
         self._solver = CholeskySolverD(self.size, entries.row.astype(np.int32), entries.col.astype(np.int32),
                                        entries.data.astype(np.float64), MatrixType.COO)
+
+    def __reduce__(self) -> tuple[type[Factored], tuple[csc_array]]:
+        return Factored, (self._matrix,)
 
     def solve(self, rhs: np.ndarray) -> np.ndarray:
         """Solve for (n,) or (n, k) right-hand sides."""
