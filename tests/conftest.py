@@ -1,10 +1,26 @@
-"""What several test files share: one small run of the demonstration, and the folder of real scans."""
+"""What several test files share: one small run of the demonstration, and the folder of real scans.
+
+Files of tests run side by side, one process for each core; those that look at the demonstration in one process, begun
+first because it takes longest.
+"""
 import os
 from pathlib import Path
 
 import pytest
 
+if "PYTEST_XDIST_WORKER" in os.environ:                      # processes do not take each other's cores
+    os.environ.setdefault("OMP_NUM_THREADS", "1")
+
 from scanprep.console import run
+
+
+@pytest.hookimpl(tryfirst=True)
+def pytest_collection_modifyitems(items):
+    """One group for every file, and one for the files that share the demonstration."""
+    shared = {item.path for item in items if "demo_folder" in item.fixturenames}
+    for item in items:
+        item.add_marker(pytest.mark.xdist_group("demo" if item.path in shared else item.path.name))
+    items.sort(key=lambda item: item.path not in shared)
 
 
 @pytest.fixture(scope="session")
