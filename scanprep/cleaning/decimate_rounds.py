@@ -10,6 +10,7 @@ from .decimate_quadrics import lowest, value
 
 FREE, CURVE, FIXED = 0, 1, 2
 PIECE = 20_000                       # edges priced at once: what stays in the processor's cache
+STUCK = 1e-3                         # of the triangles: where a round takes less away, thin triangles may be made
 
 
 @dataclass(frozen=True)
@@ -23,7 +24,7 @@ class RoundsConfig:
     min_cosine : float
         Triangles that would turn by more in one collapse forbid it.
     min_quality : float
-        Triangles thinner than this may not be made of better ones (1: equilateral).
+        Triangles thinner than this may not be made of better ones (1: equilateral), until nothing else is left.
     hold : float
         Weight of the distance to vertices beside that to planes: keeps triangles of an even size where it is flat.
     wall : float
@@ -74,6 +75,7 @@ class Rounds:
     def __init__(self, points: np.ndarray, faces: np.ndarray, quadrics: np.ndarray, areas: np.ndarray,
                  kinds: np.ndarray, curves: np.ndarray, config: RoundsConfig | None = None) -> None:
         self.config = config or RoundsConfig()
+        self.thinnest = self.config.min_quality
         self.points, self.quadrics, self.areas, self.kinds = (np.array(x) for x in (points, quadrics, areas, kinds))
         self.faces, self.face_rows = np.array(faces), np.arange(len(faces))
         self.owner = np.arange(len(points))
@@ -92,10 +94,14 @@ class Rounds:
         """Collapse until `count` triangles are left, or none can go."""
         total = len(self.faces) - count
         while len(self.faces) > count:
-            chosen = self._choose()
-            if not len(chosen):
+            before, chosen = len(self.faces), self._choose()
+            if len(chosen):
+                self._collapse(chosen, len(self.faces) - count)
+            elif self.thinnest == 0:
                 break
-            self._collapse(chosen, len(self.faces) - count)
+            if before - len(self.faces) < STUCK * before and self.thinnest > 0:
+                self.thinnest = 0.0
+                self.refused[:] = False
             if progress is not None:
                 progress(min(total, total - (len(self.faces) - count)), total)
 
@@ -222,7 +228,7 @@ class Rounds:
         was, now = _dot(n_old, meant), _dot(n_new, meant)
         bad = _dot(n_old, n_new) < self.config.min_cosine
         bad |= (now < 0.3) & (now < was)
-        bad |= (q_new < self.config.min_quality) & (q_new < q_old)
+        bad |= (q_new < self.thinnest) & (q_new < q_old)
         good = np.ones(len(rows), dtype=bool)
         good[of[bad]] = False
         return good

@@ -56,7 +56,7 @@ class SkeletonConfig:
     symmetric: bool | None = None
     restarts: int = 3
     seed: int = 0
-    worth: float = 0.08
+    worth: float = 0.1
     fading: float = 0.8
 
     def __post_init__(self) -> None:
