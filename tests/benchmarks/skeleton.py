@@ -11,17 +11,15 @@ from __future__ import annotations
 
 import argparse
 import json
-import platform
 import sys
 import time
 from pathlib import Path
 
 import numpy as np
-import scipy
 
 sys.path.insert(0, str(Path(__file__).parents[1]))
 from animal_bodies import Animal, Build, random_pose
-from protocols import load_real, scape_fold
+from protocols import load_real, machine, scape_fold
 from scipy.sparse import csc_array, diags_array, eye_array
 
 from scanprep.geometry.mesh import Mesh
@@ -195,7 +193,7 @@ if __name__ == "__main__":
     parser.add_argument("--seeds", type=int, default=5)
     parser.add_argument("--only", nargs="*", default=["real", "folds", "embedded", "animals"])
     asked = parser.parse_args()
-    report: dict[str, object] = {"machine": platform.machine(), "numpy": np.__version__, "scipy": scipy.__version__}
+    report: dict[str, object] = {"machine": machine()}
     sections = {"embedded": lambda: [embedded(n, s) for n, s in ((0, 0), (0.003, 0.005), (0.005, 0.01))],
                 "animals": lambda: [animal(aside) for aside in (0.0, 1.0)],
                 "real": lambda: real(asked.seeds), "folds": held_out}

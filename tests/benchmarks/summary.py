@@ -13,18 +13,19 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from summary_scans import (
+    Rows,
+    correspondences,
+    decimated_set,
+    decimation,
+    holes,
+    peers,
+    registration,
+    skeletons,
+    table,
+)
 
 HERE = Path(__file__).parent
-Rows = list[tuple[Any, ...]]
-
-
-def table(header: tuple[str, ...], rows: Rows) -> str:
-    """A Markdown table; fractions with three significant digits."""
-    def text(value: Any) -> str:
-        return f"{value:.3g}" if isinstance(value, float) else str(value)
-
-    lines = [header, tuple("---" for _ in header), *rows]
-    return "\n".join("| " + " | ".join(map(text, line)) + " |" for line in lines)
 
 
 def poses(report: dict) -> str:
@@ -118,102 +119,6 @@ def generic(report: dict) -> str:
     rows = report["rows"]
     names = tuple(rows[0])
     return table(names, [tuple(r[n] for n in names) for r in rows])
-
-
-def registration(report: dict) -> str:
-    """Every scan, and the means of poses and men."""
-    names = ("all_mm", "seen_mm", "unseen_mm", "beyond_50mm", "surface_seen_mm", "max_mm", "flipped", "cpu_s")
-    rows: Rows = [(r["scan"], *(r[n] for n in names)) for r in report["rows"]]
-    for kind, figures in report["summary"].items():
-        rows.append((f"mean of {kind}s", *(figures[n] for n in names)))
-        rows.append((f"{kind}s below 15 mm", f"{figures['below_15mm']:.0%}", *([""] * (len(names) - 1))))
-    return table(("scan", "all (mm)", "where data (mm)", "elsewhere (mm)", "share beyond 50 mm",
-                  "to the true surface, where data (mm)", "worst vertex (mm)", "flipped", "time (s CPU)"), rows)
-
-
-def peers(report: dict) -> str:
-    """A row for every tool: its error on every body, and its time."""
-    bodies = list(dict.fromkeys(r["body"] for r in report["rows"]))
-    rows: Rows = []
-    for tool in dict.fromkeys(r["tool"] for r in report["rows"]):
-        mine = {r["body"]: r for r in report["rows"] if r["tool"] == tool}
-        done = [r for r in mine.values() if "all_mm" in r]
-        rows.append((tool, *(mine[b].get("all_mm", "missing") if b in mine else "" for b in bodies),
-                     float(np.mean([r["surface_seen_mm"] for r in done])) if done else "",
-                     float(np.mean([r["seconds"] for r in done])) if done else ""))
-    return table(("mean vertex error (mm)", *bodies, "to the true surface, where data (mm)", "time (s wall)"), rows)
-
-
-def correspondences(report: dict) -> str:
-    """Pairs of every scan."""
-    rows: Rows = [(name, r["count"], r["median_mm"], r["p90_mm"], r["beyond_100mm"], r["flipped"], r["seconds"])
-                  for name, r in report["scans"].items()]
-    return table(("scan", "pairs", "median (mm)", "90% (mm)", "share beyond 100 mm", "flipped", "time (s CPU)"), rows)
-
-
-def skeletons(report: dict) -> str:
-    """Real poses from several seeds, exactly sixteen parts, embedded people and animals."""
-    out = []
-    if "real" in report:
-        seeds, exact = report["real"]["seeds"], report["real"]["sixteen"]
-        named = [*(f"seed {k}" for k in range(len(seeds["runs"]))), "sixteen asked for"]
-        many = zip(named, [*seeds["runs"], exact], [*seeds["agreement_with_first"], ""], [*seeds["same_links"], ""],
-                   strict=True)
-        out.append(table(
-            ("71 real poses", "parts", "left and right, areas differ by", "agreement with seed 0", "same tree", "loops",
-             "rigid residual (mm)", "time (s CPU)"),
-            [(name, r["parts"], r["left_and_right_differ_in_area"], agreement, same, len(r["loops"]), r["rigid_mm"],
-              r["cpu_s"]) for name, r, agreement, same in many]))
-    rows: Rows = []
-    for kind in ("embedded", "animals"):
-        for r in report.get(kind, []):
-            what = (f"person, noise {r['noise_mm']:.0f} mm, slide {r['slide_mm']:.0f} mm" if kind == "embedded"
-                    else "animal, head " + ("aside" if r["head_aside"] else "straight"))
-            joints = list(r["joint_mm"].values())
-            rows.append((what, r["found"]["parts"], r["adjusted_rand"], float(np.mean(joints)), float(np.max(joints)),
-                         r["found"]["cpu_s"], *_of_bones(r["dem_bones"])))
-    return "\n\n".join([*out, table(("against the truth", "parts", "adjusted Rand", "joints, mean (mm)", "worst (mm)",
-                                     "time (s CPU)", "py-dem-bones: Rand", "RMSE (mm)", "time (s CPU)"), rows)])
-
-
-def _of_bones(found: dict | str) -> tuple[Any, ...]:
-    return ("", "", "") if isinstance(found, str) else (found["adjusted_rand"] or "", found["rmse_mm"], found["cpu_s"])
-
-
-def decimation(report: dict) -> str:
-    """One closed body, the same cut open, and a registered set, every tool a row."""
-    names = ("cpu_s", "mean_mm", "p95_mm", "to_original_max_mm", "closed", "edge_manifold",
-             "vertex_manifold", "intersecting_pairs", "turned_faces")
-    header = ("", "time (s CPU)", "mean (mm)", "95% (mm)", "worst (mm)", "closed", "edges manifold",
-              "vertices manifold", "pairs that cross", "turned")
-    return table(header, [(tool, *(r.get(n, "") for n in names)) for tool, r in report["closed"].items()])
-
-
-def decimated_set(report: dict) -> str:
-    """A registered set in fewer triangles."""
-    names = ("poses_mean_mm", "men_mean_mm", "poses_slide_mm", "men_slide_mm", "cpu_s")
-    rows: Rows = [(faces, way, *(r[n] for n in names))
-                  for faces, ways in report["set"].items() for way, r in ways.items()]
-    return table(("", "way", "poses (mm)", "men (mm)", "slide along the skin, poses (mm)", "men (mm)", "time (s CPU)"),
-                 rows)
-
-
-def holes(report: dict) -> str:
-    """Six holes of every body, every filler a row, at each size of the holes."""
-    out = []
-    for size in (name for name in report if name.startswith("holes")):
-        rows: Rows = []
-        for filler in dict.fromkeys(r["filler"] for r in report[size]):
-            mine = [r for r in report[size] if r["filler"] == filler and "truth_mean_mm" in r]
-            names = ("patch_mean_mm", "patch_max_mm", "truth_mean_mm", "truth_max_mm")
-            known = {n: [r[n] for r in mine if n in r] for n in names}
-            rows.append((filler, len(mine), *(float(np.mean(known[n])) if known[n] else "" for n in names),
-                         sum(r.get("crossing", 0) for r in mine), sum(r["closed"] and r["manifold"] for r in mine),
-                         sum(bool(r.get("untouched")) for r in mine)))
-        out.append(table((size, "bodies", "patch to truth, mean (mm)", "worst, mean over bodies (mm)",
-                          "truth to patch, mean (mm)", "worst, mean over bodies (mm)", "pairs that cross",
-                          "closed and manifold", "rest untouched"), rows))
-    return "\n\n".join(out)
 
 
 def markers(report: dict) -> str:
