@@ -11,7 +11,7 @@ from scipy.sparse.csgraph import dijkstra
 from ..geometry.mesh import Mesh
 from ..geometry.surface import Rays, barycentric
 from .remesh import smooth
-from .repair import drop_small_components
+from .repair import drop_small_components, split_vertices
 
 BLOCK = 4                      # voxels along the side of a block; the smallest piece of the volume that is stored
 CORNERS = np.array([(0, 0, 0), (1, 0, 0), (1, 1, 0), (0, 1, 0), (0, 0, 1), (1, 0, 1), (1, 1, 1), (0, 1, 1)])
@@ -96,7 +96,7 @@ def merge_views(views: Sequence[Any], config: MergeConfig | None = None,
     Returns
     -------
     Mesh
-        With colours when all views have them.
+        Borders do not touch themselves. With colours when all views have them.
 
     Raises
     ------
@@ -124,7 +124,7 @@ def merge_views(views: Sequence[Any], config: MergeConfig | None = None,
     seen = weight > config.min_weight
     distance = np.divide(total, weight, out=np.zeros_like(total), where=seen)
     mesh = _zero_surface(grid, keys[seen], points[seen], distance[seen])
-    mesh = drop_small_components(mesh, config.min_component)
+    mesh = drop_small_components(split_vertices(mesh), config.min_component)
     if not len(mesh.faces):
         raise ValueError("views: no surface is left after merging; is every camera on the outer side of its view?")
     return _with_colors(mesh, prepared)
