@@ -1,4 +1,5 @@
 """Folders of tiny scans; started as a program it registers one: SCANS SET WORKERS."""
+import signal
 import sys
 from dataclasses import replace
 from pathlib import Path
@@ -43,6 +44,7 @@ def contents(folder):
 
 
 if __name__ == "__main__":
+    signal.signal(signal.SIGINT, signal.default_int_handler)        # a shell ignores it for what it starts behind
     try:
         prepare(find_scans(sys.argv[1]), ball(), MARKS, Path(sys.argv[2]),
                 replace(WITH_PICTURES, workers=int(sys.argv[3])))

@@ -84,7 +84,7 @@ class SkeletonSearch:
     symmetry : Symmetry
         The best mirror symmetry of the body, whether it holds or not.
     symmetric : bool
-        Whether left and right of the skeleton are mirror images by construction.
+        Whether left and right have the same parts by construction; only borders may differ, as far as the poses show.
     energies : tuple of float
         Of every restart, as a share of the squared size of the body.
     parts : tuple of int
@@ -141,6 +141,7 @@ def search_skeleton(template: Mesh, poses: np.ndarray, config: SkeletonConfig | 
     if config.parts is not None:
         label, links, wanted = _of_count(best, surface, config)
         label, links = _settled(best.search, label, links) if wanted else (label, links)
+    label = _freed(surface, config, label, links) if wanted else label
     joints = place_joints(best.search, label, surface.core_motions(label), links)
     skeleton = _assemble(template, label, links, joints)
     if wanted:
@@ -231,6 +232,15 @@ def _settled(search: PartSearch, label: np.ndarray, links: np.ndarray) -> tuple[
     moved = search.alternate(label, rounds=12, core=True)
     tree = without_weak(search, moved)
     return (moved, tree) if moved.max() == label.max() and len(tree) == len(links) else (label, links)
+
+
+def _freed(surface: PosedSurface, config: SkeletonConfig, label: np.ndarray, links: np.ndarray) -> np.ndarray:
+    """Labels of the same tree after the borders of left and right settled each by itself; no body is quite symmetric."""
+    free = PartSearch(surface, replace(config, patches=2), None)
+    moved = free.alternate(label, rounds=12, core=True)
+    touching = {tuple(pair) for pair in free.contacts(moved).tolist()}
+    same = moved.max() == label.max() and touching.issuperset(map(tuple, np.sort(links, axis=1).tolist()))
+    return moved if same else label
 
 
 def _held_back(run: Restart) -> bool:
