@@ -220,6 +220,7 @@ def test_clutter_beside_the_body_changes_little_and_noise_is_told():
     apart = [np.linalg.norm(found.mesh.vertices - x, axis=1).mean() for found in (clean, cluttered, noisy)]
     assert apart[0] < 0.008 and apart[1] < 0.012 and apart[2] < 0.014
     assert noisy.rms > 2 * clean.rms
+    assert clean.missed < 0.005 and cluttered.missed == pytest.approx(1500 / 6500, abs=0.01)
 
 
 # ---- published regularisers ---------------------------------------------------------------------------------

@@ -12,7 +12,6 @@ import numpy as np
 
 from ..geometry import storage
 from ..geometry.mesh import Mesh
-from ..geometry.surface import Surface
 
 FIGURES, TIMES, FAILURES = "registration.csv", "times.csv", "failures.csv"
 
@@ -78,13 +77,6 @@ class Failure:
 
     name: str
     reason: str
-
-
-def missed_share(scan: Mesh | np.ndarray, registered: Mesh, far: float, samples: int = 5000) -> float:
-    """Share of the points of a scan that lie further than `far` (metres) from a mesh."""
-    points = scan.vertices if isinstance(scan, Mesh) else scan
-    points = points[:: max(1, len(points) // samples)]
-    return float((Surface(registered).closest(points).distances > far).mean())
 
 
 def stretched_share(template: Mesh, registered: Mesh, factor: float = 2.0) -> float:

@@ -16,11 +16,10 @@ from ..geometry.mesh import Mesh
 from ..matching.correlated import CorrelatedConfig, find_correspondences
 from ..matching.correspondences import Correspondences
 from ..matching.nonrigid import Registration, RegistrationConfig, register
-from .figures import ScanFigures, missed_share, stretched_share
+from .figures import ScanFigures, stretched_share
 from .tasks import ScanTask, read_scan
 
 Guide = Literal["best", "landmarks", "automatic", "pose"]
-FAR = 0.01                  # of the template's size (the root of its area): a point of the scan that was missed
 
 Landmarks = tuple[np.ndarray, np.ndarray]
 
@@ -95,7 +94,7 @@ def register_scan(task: ScanTask, template: Mesh, template_landmarks: dict[str, 
             picture = strip(template, scan, fit)
     guide = (f"{len(landmarks[0])} landmarks" if landmarks is not None else
              f"{len(pairs)} correspondences" if pairs is not None else "pose")
-    figures = _measure(task, template, scan, fit, guide)
+    figures = _measure(task, template, fit, guide)
     return RegisteredScan(fit.mesh.vertices, replace(figures, removed=removed, seconds=time.perf_counter() - start),
                           picture)
 
@@ -146,11 +145,10 @@ def _cleaned(scan: Mesh | np.ndarray, landmarks: Landmarks | None, config: Clean
     return found.scan, 1 - float(found.kept.mean())
 
 
-def _measure(task: ScanTask, template: Mesh, scan: Mesh | np.ndarray, fit: Registration, guide: str) -> ScanFigures:
-    size = float(np.sqrt(template.face_areas.sum()))
+def _measure(task: ScanTask, template: Mesh, fit: Registration, guide: str) -> ScanFigures:
     return ScanFigures(
         task.name, guide, float(np.nanmean(fit.distances)) if fit.seen.any() else np.nan, fit.rms,
-        float(fit.seen.mean()), float(fit.confidence.mean()), missed_share(scan, fit.mesh, FAR * size),
+        float(fit.seen.mean()), float(fit.confidence.mean()), fit.missed,
         stretched_share(template, fit.mesh), fit.landmark_rms, fit.flipped, fit.converged, 0.0, task.fingerprint())
 
 

@@ -103,6 +103,7 @@ def register_one(scan: ScanArg, template: Path, output: Output, landmarks: Path 
         Metric("distance to the scan, RMS", MM * fit.rms, "mm"),
         Metric("vertices with data", 100 * float(fit.seen.mean()), "%"),
         Metric("confidence, mean", float(fit.confidence.mean())),
+        Metric("scan off the template", 100 * fit.missed, "%"),
         Metric("distance of landmarks, RMS", MM * fit.landmark_rms, "mm"),
         Metric("flipped triangles", fit.flipped), Metric("converged", str(fit.converged))])
 

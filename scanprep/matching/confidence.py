@@ -1,4 +1,4 @@
-"""How sure it is that there were data at each vertex."""
+"""How sure it is that there were data at each vertex, and how much of the scan is off the template."""
 from __future__ import annotations
 
 from dataclasses import dataclass
@@ -7,7 +7,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from ..geometry.mesh import Mesh
-from ..geometry.surface import OrientedPoints
+from ..geometry.surface import OrientedPoints, Surface
 from .matches import Target, orient
 
 
@@ -81,3 +81,10 @@ def _found_back(deformed: Mesh, target: Target, reach: float, scale: float) -> n
 
 def _ramp(value: np.ndarray, low: float, high: float) -> np.ndarray:
     return np.clip((value - low) / (high - low), 0, 1)
+
+
+def missed_share(scan: Mesh | np.ndarray, registered: Mesh, far: float, samples: int = 5000) -> float:
+    """Share of the points of a scan that lie further than `far` (metres) from a mesh."""
+    points = scan.vertices if isinstance(scan, Mesh) else scan
+    points = points[:: max(1, len(points) // samples)]
+    return float((Surface(registered).closest(points).distances > far).mean())

@@ -16,7 +16,7 @@ import numpy as np
 
 from ..geometry.mesh import Mesh, check_template
 from .anchors import hints_of
-from .confidence import evidence
+from .confidence import evidence, missed_share
 from .correspondences import Correspondences, checked_pairs
 from .fit import Fit
 from .matches import target_of
@@ -25,6 +25,8 @@ from .shell import flipped, unfold
 from .turns import turns
 
 __all__ = ["GraphStage", "Registration", "RegistrationConfig", "ShellStage", "register"]
+
+FAR = 0.01                       # of the template's size: points of the scan farther off were missed
 
 
 @dataclass(frozen=True, eq=False)
@@ -52,6 +54,9 @@ class Registration:
         Triangles that face against their surroundings.
     confidence : (N,) float
         From 0, made up from the surroundings, to 1: there were data here, from both directions.
+    missed : float
+        Share of the scan's points off the template, by more than a hundredth of its size (the root of its area). More
+        than half a per cent is a limb in the wrong place, or clutter; `converged` does not tell.
     """
 
     mesh: Mesh
@@ -64,6 +69,7 @@ class Registration:
     energies: dict[str, float]
     flipped: int
     confidence: np.ndarray
+    missed: float
 
 
 def register(template: Mesh, scan: Mesh | np.ndarray, landmarks: tuple[np.ndarray, np.ndarray] | None = None,
@@ -112,10 +118,10 @@ def register(template: Mesh, scan: Mesh | np.ndarray, landmarks: tuple[np.ndarra
     if config.settle is not None:
         fit.settle(config.settle)
     fit.x = unfold(template, fit.x, turns(template, fit.x))
-    return _result(fit)
+    return _result(fit, scan)
 
 
-def _result(fit: Fit) -> Registration:
+def _result(fit: Fit, scan: Mesh | np.ndarray) -> Registration:
     """What was found, measured against the whole scan."""
     folded = flipped(fit.template, fit.x, turns(fit.template, fit.x))
     found = evidence(fit.template.with_vertices(fit.x), fit.target, fit.config.near * fit.size,
@@ -126,6 +132,8 @@ def _result(fit: Fit) -> Registration:
     if fit.landmarks is not None:
         apart = np.linalg.norm(fit.x[fit.landmarks[0]] - fit.landmarks[1], axis=1)
         landmark_rms = float(np.sqrt(np.mean(apart**2)))
-    return Registration(fit.template.with_vertices(fit.x), distances, seen,
+    body = fit.template.with_vertices(fit.x)
+    return Registration(body, distances, seen,
                         float(np.sqrt(np.mean(distances[seen] ** 2))) if seen.any() else np.nan, landmark_rms,
-                        fit.converged, fit.iterations, fit.energies, int(folded.sum()), found.confidence)
+                        fit.converged, fit.iterations, fit.energies, int(folded.sum()), found.confidence,
+                        missed_share(scan, body, FAR * fit.size))

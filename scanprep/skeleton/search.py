@@ -235,7 +235,7 @@ def _settled(search: PartSearch, label: np.ndarray, links: np.ndarray) -> tuple[
 
 
 def _freed(surface: PosedSurface, config: SkeletonConfig, label: np.ndarray, links: np.ndarray) -> np.ndarray:
-    """Labels of the same tree after the borders of left and right settled each by itself; no body is quite symmetric."""
+    """Labels of the same tree after the borders of both sides settled, each by itself: no body is quite symmetric."""
     free = PartSearch(surface, replace(config, patches=2), None)
     moved = free.alternate(label, rounds=12, core=True)
     touching = {tuple(pair) for pair in free.contacts(moved).tolist()}
