@@ -111,3 +111,11 @@ def holes(report: dict) -> str:
                           "truth to patch, mean (mm)", "worst, mean over bodies (mm)", "pairs that cross",
                           "closed and manifold", "rest untouched"), rows))
     return "\n\n".join(out)
+
+
+def merging(report: dict) -> str:
+    """Every way to bring four views together, means over bodies."""
+    names = ("bodies", "trusted", "mean_mm", "p95_mm", "max_mm", "back_mean_mm", "back_p95_mm", "seconds")
+    rows: Rows = [(way, *(r.get(n, "") for n in names)) for way, r in report["merge_means"].items()]
+    return table(("cameras", "bodies", "trusted", "to the truth, mean (mm)", "95% (mm)", "worst (mm)",
+                  "back from where data, mean (mm)", "95% (mm)", "time (s CPU)"), rows)
