@@ -83,7 +83,11 @@ def merging(data: RealData, bodies: list[tuple[str, int]]) -> list[dict[str, obj
             "unknown, features": lambda pairs=pairs, rng=rng: aligned(knocked(pairs, 120, 1.0, rng), features=True)}
         for way, make in ways.items():
             start = time.process_time()
-            found = make()
+            try:
+                found = make()
+            except ValueError as error:                          # too few landmarks seen by two views, say
+                print(f"{kind}{index:03d}, {way}: {error}", flush=True)
+                found = None
             row: dict[str, object] = {"body": f"{kind}{index:03d}", "way": way, "trusted": found is not None}
             if found is not None:
                 merged = merge_views(found)

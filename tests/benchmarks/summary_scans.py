@@ -119,3 +119,11 @@ def merging(report: dict) -> str:
     rows: Rows = [(way, *(r.get(n, "") for n in names)) for way, r in report["merge_means"].items()]
     return table(("cameras", "bodies", "trusted", "to the truth, mean (mm)", "95% (mm)", "worst (mm)",
                   "back from where data, mean (mm)", "95% (mm)", "time (s CPU)"), rows)
+
+
+def signatures(report: dict) -> str:
+    """Means over the poses of the correlation at every scale."""
+    names = {"reference": "published registration", "slid": "the same, slid 4 mm at random", "ours": "ours"}
+    scales = tuple(f"smoothed over {s:.0f} mm" for s in report["scales_mm"])
+    return table((f"correlation, mean of {len(report['rows'])} poses", *scales),
+                 [(names[name], *values) for name, values in report["means"].items()])
