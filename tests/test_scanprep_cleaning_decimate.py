@@ -8,6 +8,7 @@ from scanned_shapes import SIX, bumpy, view
 from scanprep.cleaning.decimate import DecimateConfig, collapse, decimate
 from scanprep.cleaning.decimate_mend import fast_collapses
 from scanprep.cleaning.decimate_quadrics import lowest, plane_quadrics, point_quadrics, value
+from scanprep.cleaning.decimate_rounds import RoundsConfig
 from scanprep.cleaning.intersections import intersecting_faces
 from scanprep.cleaning.merge import MergeConfig
 from scanprep.cleaning.open3d_filters import MissingLibrary
@@ -90,6 +91,13 @@ def test_a_ball_ends_as_a_manifold_however_few_triangles_are_wanted():
     assert small.is_closed and template_problem(small) is None
     assert len(small.vertices) - len(small.edges) + len(small.faces) == 2
     assert len(small.faces) < 40
+
+
+def test_the_count_is_reached_where_only_thin_triangles_are_left():
+    mesh = bumpy(3)
+    strict = DecimateConfig(rounds=RoundsConfig(min_quality=0.999))
+    thin = decimate(mesh, 200, strict)
+    assert len(thin.faces) == 200 and thin.is_closed and thin.is_vertex_manifold
 
 
 def test_maps_say_what_became_of_everything():

@@ -52,6 +52,11 @@ def test_what_no_view_saw_stays_open(shape, views):
     assert facing.min() > 0
 
 
+def test_nothing_hangs_by_a_vertex(shape):
+    ragged = merge_views([view(shape, SIX[0], np.random.default_rng(0), 0.004)], COARSE)
+    assert not ragged.is_closed and ragged.is_vertex_manifold
+
+
 def test_order_of_views_does_not_matter(views):
     a, b = merge_views(views, COARSE), merge_views(views[::-1], COARSE)
     assert np.array_equal(a.faces, b.faces)

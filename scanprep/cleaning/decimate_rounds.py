@@ -10,7 +10,7 @@ from .decimate_quadrics import lowest, value
 
 FREE, CURVE, FIXED = 0, 1, 2
 PIECE = 20_000                       # edges priced at once: what stays in the processor's cache
-STUCK = 1e-3                         # of the triangles: where a round takes less away, thin triangles may be made
+STUCK = 1e-3, 5                      # where so many rounds take less of the triangles away, thin ones may be made
 
 
 @dataclass(frozen=True)
@@ -92,14 +92,15 @@ class Rounds:
 
     def run(self, count: int, progress: Callable[[int, int], None] | None = None) -> None:
         """Collapse until `count` triangles are left, or none can go."""
-        total = len(self.faces) - count
+        total, idle = len(self.faces) - count, 0
         while len(self.faces) > count:
             before, chosen = len(self.faces), self._choose()
             if len(chosen):
                 self._collapse(chosen, len(self.faces) - count)
             elif self.thinnest == 0:
                 break
-            if before - len(self.faces) < STUCK * before and self.thinnest > 0:
+            idle = idle + 1 if before - len(self.faces) < STUCK[0] * before else 0
+            if self.thinnest > 0 and (idle == STUCK[1] or not len(chosen)):
                 self.thinnest = 0.0
                 self.refused[:] = False
             if progress is not None:

@@ -18,7 +18,7 @@ def find_skeleton(template: Mesh, poses: np.ndarray, config: SkeletonConfig | No
     """Rigid parts, the tree over them, and the joints, from registered poses of one body.
 
     Parts that never move against each other in the poses cannot be told apart. Of a symmetric body left and right
-    get mirror images of the same parts. `search_skeleton` tells more of how they were found.
+    get the same parts. `search_skeleton` tells more of how they were found.
 
     Parameters
     ----------

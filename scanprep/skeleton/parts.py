@@ -35,7 +35,7 @@ class SkeletonConfig:
     start : int
         Number of parts after the patches were joined and before labels and motions alternate.
     symmetric : bool, optional
-        Whether left and right are mirror images; without it they are where the body is.
+        Whether left and right have the same parts; without it they have where the body is symmetric.
     restarts : int
         So often the search begins anew, with other patches; the best result is kept.
     seed : int
