@@ -124,18 +124,15 @@ def merge_peers(views: list[RangeView], truth: Mesh) -> Iterator[tuple[str, dict
     except (ImportError, OSError):
         return
     start = time.process_time()
-    volume = o3d.pipelines.integration.ScalableTSDFVolume(
-        voxel_length=0.004, sdf_trunc=0.012, color_type=o3d.pipelines.integration.TSDFVolumeColorType.NoColor)
+    core = o3d.core
+    volume = o3d.t.geometry.VoxelBlockGrid(("tsdf", "weight"), (core.float32, core.float32), ((1,), (1,)), 0.004, 16,
+                                           50_000, core.Device("CPU:0"))
     for view in views:
-        depth = np.nan_to_num(view.depth).astype(np.float32)
-        image = o3d.geometry.RGBDImage.create_from_color_and_depth(
-            o3d.geometry.Image(np.zeros((*depth.shape, 3), np.uint8)), o3d.geometry.Image(depth), depth_scale=1.0,
-            depth_trunc=10.0)
-        K = view.intrinsics
-        camera = o3d.camera.PinholeCameraIntrinsic(depth.shape[1], depth.shape[0], K[0, 0], K[1, 1], K[0, 2], K[1, 2])
-        volume.integrate(image, camera, np.linalg.inv(view.T_world_camera))
-    mesh = volume.extract_triangle_mesh()
-    merged = Mesh(np.asarray(mesh.vertices), np.asarray(mesh.triangles))
+        depth = o3d.t.geometry.Image(core.Tensor(np.nan_to_num(view.depth).astype(np.float32)))
+        camera = core.Tensor(view.intrinsics), core.Tensor(np.linalg.inv(view.T_world_camera)), 1.0, 10.0
+        volume.integrate(volume.compute_unique_block_coordinates(depth, *camera), depth, *camera)
+    mesh = volume.extract_triangle_mesh(0.5)
+    merged = Mesh(mesh.vertex.positions.numpy().astype(float), mesh.triangle.indices.numpy().astype(np.int64))
     row: dict[str, object] = {"seconds": time.process_time() - start}
     if not len(merged.faces):
         print("open3d TSDF: no surface came out", flush=True)

@@ -149,7 +149,8 @@ def main() -> None:
     data = load_real()
     rows: list[dict[str, object]] = []
     for body in args.bodies.split(","):
-        item = test_scan(data, body.rstrip("0123456789"), int(body.lstrip("posemn")))
+        kind = body.rstrip("0123456789")
+        item = test_scan(data, kind, int(body.removeprefix(kind)))
         for name, tool in TOOLS.items():
             if args.only not in name:
                 continue
