@@ -48,6 +48,17 @@ def correspondences(report: dict) -> str:
     return table(("scan", "pairs", "median (mm)", "90% (mm)", "share beyond 100 mm", "flipped", "time (s CPU)"), rows)
 
 
+def coregistration(report: dict) -> str:
+    """What came out before there was a model, after every round, and without a landmark in the end."""
+    names = ("scans", "failed", "all_mm", "median_mm", "worst_mm", "shown_mm", "shown_failed", "surface_seen_mm",
+             "cpu_s")
+    rows: Rows = [(r["what"], *(r[n] for n in names), sum(e < 15 for e in r["each_mm"].values()))
+                  for r in report["rows"]]
+    return table(("", "scans", "failed", "mean (mm)", "median (mm)", "worst scan (mm)", "held out, mean (mm)",
+                  "held out, failed", "to the true surface, where data (mm)", "time so far (s CPU)",
+                  "scans below 15 mm"), rows)
+
+
 def skeletons(report: dict) -> str:
     """Real poses from several seeds, exactly sixteen parts, embedded people and animals."""
     out = []
