@@ -212,9 +212,9 @@ SECTIONS: dict[str, tuple[str, str, Callable[[dict], str], str]] = {
                 "whose alignment says of every view that it can be relied on; the others are not merged."),
     "holes": ("Six holes of a body", "python tests/benchmarks/cleaning.py --held --merge 0 --holes 2", holes,
               "Crown, armpits, crotch and soles of real and embedded bodies; one of the seven, pose000, was tuned on. "
-              "The second size was added after the first had been seen. Measured before borders of more than "
-              "120 edges lost ears first and before diffusion was left to known lines of sight. Where we lose: armpits "
-              "(up to 22 mm from patch to truth); Poisson columns of the patch are missing as it remeshes everything."),
+              "The second size was added after the first had been seen. `auto` is `fair` where no lines of sight "
+              "are known. Where we lose: armpits (up to 22 mm from patch to truth); Poisson columns of the patch are "
+              "missing as it remeshes everything."),
     "markers": ("Markers on random vertices of held-out poses", "python tests/benchmarks/markers.py", markers,
                 "Fold 0, known subject, every pose a frame of its own; skeleton and model from the training poses."),
 }
