@@ -3,6 +3,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import warnings
 from collections.abc import Generator, Iterator, Sequence
 from dataclasses import dataclass
 
@@ -75,7 +76,8 @@ def _parallel(work: Work, tasks: Sequence[ScanTask], wanted: Sequence[int], work
 
     if not wanted:
         return
-    with parallel_config("loky", n_jobs=workers, inner_max_num_threads=1):
+    with parallel_config("loky", n_jobs=workers, inner_max_num_threads=1), warnings.catch_warnings():
+        warnings.filterwarnings("ignore", "A worker stopped while some jobs")      # one that has grown is begun anew
         jobs = (delayed(_numbered)(i, work, tasks[i]) for i in wanted)
         try:
             yield from Parallel(return_as="generator_unordered", batch_size=1)(jobs)
