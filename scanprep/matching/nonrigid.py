@@ -26,6 +26,7 @@ from .turns import turns
 
 __all__ = ["GraphStage", "Registration", "RegistrationConfig", "ShellStage", "register"]
 
+WIDER = (2,), (2, 3), (3, 4)     # rings of the patches where folds are left
 FAR = 0.01                       # of the template's size: points of the scan farther off were missed
 
 
@@ -117,8 +118,22 @@ def register(template: Mesh, scan: Mesh | np.ndarray, landmarks: tuple[np.ndarra
         fit.follow(round_)
     if config.settle is not None:
         fit.settle(config.settle)
-    fit.x = unfold(template, fit.x, turns(template, fit.x))
+    fit.x = _without_folds(template, fit.x)
     return _result(fit, scan)
+
+
+def _without_folds(template: Mesh, x: np.ndarray) -> np.ndarray:
+    """Vertices (N, 3) where patches around turned triangles were laid anew, wider ones while that leaves fewer."""
+    x = unfold(template, x, turns(template, x))
+    left = int(flipped(template, x, turns(template, x)).sum())
+    for rings in WIDER:
+        if not left:
+            break
+        trial = unfold(template, x, turns(template, x), rings)
+        turned = int(flipped(template, trial, turns(template, trial)).sum())
+        if turned < left:
+            x, left = trial, turned
+    return x
 
 
 def _result(fit: Fit, scan: Mesh | np.ndarray) -> Registration:
