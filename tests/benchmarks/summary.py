@@ -133,9 +133,9 @@ def markers(report: dict) -> str:
 
 SECTIONS: dict[str, tuple[str, str, Callable[[dict], str], str]] = {
     "scape_5fold": ("Held-out poses (SCAPE-5fold)", "python tests/benchmarks/scape_5fold.py", poses,
-                    "Skeleton and model from the training poses of the fold alone, with an earlier search for parts. With "
-                    "today's (20 parts) fold 0 has 6.02 mm with SCAPE and 6.44 with skinning and linear correctives. "
-                    "Seen on held-out poses while "
+                    "Skeleton and model from the training poses of the fold alone, with an earlier search for parts. "
+                    "With today's (20 parts) fold 0 has 6.02 mm with SCAPE and 6.44 with skinning and linear "
+                    "correctives. Seen on held-out poses while "
                     "deciding: `refinements` and `steps` on fold 0 and on coarse copies of folds 0 and 1; the width of "
                     "blending on fold 1; that more parts help at all, and the radial features, on folds 1 and 3, after "
                     "which the number of parts of each fold was left to its training poses. A pose fit has three "
