@@ -1,9 +1,9 @@
 """What several test files share: one small run of the demonstration, and the folder of real scans.
 
-Files of tests run side by side, one process for each core; those that look at the demonstration in one process, begun
-first because it takes longest.
+Files of tests run side by side, one process for each core.
 """
 import os
+import time
 from pathlib import Path
 
 import pytest
@@ -14,22 +14,26 @@ if "PYTEST_XDIST_WORKER" in os.environ:                      # processes do not 
 from scanprep.console import run
 
 
-@pytest.hookimpl(tryfirst=True)
-def pytest_collection_modifyitems(items):
-    """One group for every file, and one for the files that share the demonstration."""
-    shared = {item.path for item in items if "demo_folder" in item.fixturenames}
-    for item in items:
-        item.add_marker(pytest.mark.xdist_group("demo" if item.path in shared else item.path.name))
-    items.sort(key=lambda item: item.path not in shared)
-
-
 @pytest.fixture(scope="session")
 def demo_folder(tmp_path_factory):
-    """The folder of one `scape demo --quick`, run once for all tests that look at it."""
-    from completion.cli import demo
+    """The folder of one `scape demo --quick`, run once for all tests that look at it, in whatever process."""
+    base = tmp_path_factory.getbasetemp()
+    base = base.parent if "PYTEST_XDIST_WORKER" in os.environ else base
+    folder, ended = base / "demo" / "scape_demo", base / "demo.ended"
+    try:
+        folder.parent.mkdir()
+    except FileExistsError:                                  # another process is at it
+        while not ended.exists():
+            time.sleep(0.5)
+    else:
+        from completion.cli import demo
 
-    folder = tmp_path_factory.mktemp("demo") / "scape_demo"
-    assert run(demo, "scape demo", ["--quick", "--out", str(folder)]) == 0
+        code = None
+        try:
+            code = run(demo, "scape demo", ["--quick", "--out", str(folder)])
+        finally:
+            ended.write_text(str(code))
+    assert ended.read_text() == "0"
     return folder
 
 
