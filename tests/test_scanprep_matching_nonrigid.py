@@ -13,7 +13,7 @@ from matching_bodies import bent, crab
 from scanprep.geometry import rotations
 from scanprep.geometry.mesh import Mesh, template_problem
 from scanprep.geometry.surface import Surface
-from scanprep.matching import descent, energies, graph, shell
+from scanprep.matching import descent, energies, graph, nonrigid, shell
 from scanprep.matching.nonrigid import GraphStage, RegistrationConfig, register
 
 LEFT, RIGHT = np.array([0.0, 0.0, 1.2]), np.array([0.0, 1.4, 0.0])
@@ -130,6 +130,16 @@ def random_motion(g, rng, size=0.3):
     M = len(g.node_vertices)
     step = size * rng.normal(size=(M, 7)) * [1, 1, 1, 0.3, 0.1, 0.1, 0.1]
     return graph.start(g, np.eye(4)).moved(step)
+
+
+@pytest.mark.parametrize("mended", [True, False])
+def test_wider_patches_are_kept_only_where_they_leave_fewer_turned_triangles(monkeypatch, mended):
+    body = crab()
+    few, more = body.vertices.copy(), body.vertices.copy()
+    few[410], more[[205, 410, 615]] = -few[410], -more[[205, 410, 615]]
+    wide = body.vertices if mended else more
+    monkeypatch.setattr(nonrigid, "unfold", lambda template, x, linear, rings=None: wide if rings else few)
+    np.testing.assert_array_equal(nonrigid._without_folds(body, few), wide if mended else few)
 
 
 def test_a_similarity_is_free_and_exact():

@@ -139,7 +139,8 @@ def _without_folds(template: Mesh, x: np.ndarray) -> np.ndarray:
 def _result(fit: Fit, scan: Mesh | np.ndarray) -> Registration:
     """What was found, measured against the whole scan."""
     folded = flipped(fit.template, fit.x, turns(fit.template, fit.x))
-    found = evidence(fit.template.with_vertices(fit.x), fit.target, fit.config.near * fit.size,
+    body = fit.template.with_vertices(fit.x)
+    found = evidence(body, fit.target, fit.config.near * fit.size,
                      fit.config.normal_weight * fit.size)
     seen = found.confidence >= 0.5
     distances = np.where(seen, found.distances, np.nan)
@@ -147,7 +148,6 @@ def _result(fit: Fit, scan: Mesh | np.ndarray) -> Registration:
     if fit.landmarks is not None:
         apart = np.linalg.norm(fit.x[fit.landmarks[0]] - fit.landmarks[1], axis=1)
         landmark_rms = float(np.sqrt(np.mean(apart**2)))
-    body = fit.template.with_vertices(fit.x)
     return Registration(body, distances, seen,
                         float(np.sqrt(np.mean(distances[seen] ** 2))) if seen.any() else np.nan, landmark_rms,
                         fit.converged, fit.iterations, fit.energies, int(folded.sum()), found.confidence,
