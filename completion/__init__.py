@@ -6,20 +6,20 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from .animation import AnimateConfig, animate
-    from .fit import CompletionConfig
+    from .animation.follow import AnimateConfig, animate
     from .markers.files import MarkerSequence, read_markers, write_markers
     from .markers.layout import MarkerLayout
     from .motion import Motion
-    from .partial import Completion, complete
+    from .partial.completion import Completion, complete
+    from .partial.settings import CompletionConfig
 
 _ROOMS = {
-    "animation": ("AnimateConfig", "animate"),
-    "fit": ("CompletionConfig",),
+    "animation.follow": ("AnimateConfig", "animate"),
     "markers.files": ("MarkerSequence", "read_markers", "write_markers"),
     "markers.layout": ("MarkerLayout",),
     "motion": ("Motion",),
-    "partial": ("Completion", "complete"),
+    "partial.completion": ("Completion", "complete"),
+    "partial.settings": ("CompletionConfig",),
 }
 _ROOM_OF = {name: room for room, names in _ROOMS.items() for name in names}
 

@@ -6,12 +6,12 @@ import sys
 from scanprep.console import dispatch
 
 COMMANDS = {
-    "demo": ("The whole chain on embedded scans; ends with a page to open.", "completion.cli:demo"),
+    "demo": ("The whole chain on embedded scans; ends with a page to open.", "completion.demo.cli:demo"),
     "prep": ("Scans -> registered meshes and a skeleton; also its single stages.", "scanprep.cli:group"),
     "learn": ("Registered meshes -> a body model.", "model.learning.cli:learn"),
     "model": ("Look into a body model and pose it.", "model.cli:group"),
-    "complete": ("A partial scan -> the whole body.", "completion.cli:complete_scan"),
-    "animate": ("Markers of a known subject -> a moving body.", "completion.cli:animate_markers"),
+    "complete": ("A partial scan -> the whole body.", "completion.partial.cli:complete_scan"),
+    "animate": ("Markers of a known subject -> a moving body.", "completion.animation.cli:animate_markers"),
 }
 
 

@@ -1,14 +1,10 @@
-"""The two solvers of completion: unknowns of the body by Levenberg-Marquardt, the free surface by one factor."""
+"""The unknowns of bodies by Levenberg-Marquardt, a batch of problems at once."""
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.sparse import coo_array, csc_array, csr_array
-
-from scanprep.geometry import sparse
-from scanprep.geometry.mesh import Mesh
 
 from .energy import Residual
 
@@ -95,56 +91,3 @@ def normal_equations(residuals: Sequence[Residual]) -> tuple[np.ndarray, np.ndar
         gradient += (transposed @ term.values[..., None])[..., 0]
         hessian += transposed @ term.jacobian
     return cost, gradient, hessian
-
-
-class FreeSurface:
-    """The surface that follows data, and where there are none keeps to the shape the model predicts.
-
-    The model's own energy E_H has its minimum at the predicted vertices, and it is quadratic with the
-    matrix L = GᵀG of the triangulation, so E_H[Y] = E_H[Ŷ] + tr (Y - Ŷ)ᵀ L (Y - Ŷ) holds exactly: neither
-    R, S nor Q are needed again.
-
-    Parameters
-    ----------
-    mesh : Mesh
-        The triangulation.
-    """
-
-    def __init__(self, mesh: Mesh) -> None:
-        self.count = len(mesh.vertices)
-        self.matrix = edge_matrix(mesh.faces, self.count)
-
-    def solve(self, predicted: np.ndarray, weights: csr_array, targets: np.ndarray, data_weight: np.ndarray
-              ) -> np.ndarray:
-        """Vertices (N, 3) that minimise E_H[Y] + w_Z Σ |y_l - z_l|².
-
-        Parameters
-        ----------
-        predicted : (N, 3) float, metres
-            The model's vertices Ŷ, the minimum of E_H.
-        weights : (L, N) sparse
-            The points y_l = weights @ Y on the surface, by barycentric coordinates.
-        targets : (L, 3) float, metres
-            Where they were measured, z_l.
-        data_weight : (L,) float
-            w_Z for each.
-
-        [SCAPE] Eq. 10
-        """
-        if not len(targets):
-            return predicted
-        measured = csc_array(weights.T * data_weight[None, :])
-        tiny = 1e-9 * coo_array((np.ones(self.count), (np.arange(self.count),) * 2))
-        solve = sparse.factor(csc_array(self.matrix + measured @ weights + tiny))
-        return predicted + solve(measured @ (targets - weights @ predicted))
-
-
-def edge_matrix(faces: np.ndarray, count: int) -> csc_array:
-    """L = GᵀG (N, N), where G takes the vertices to the two edges of every triangle from its first vertex.
-
-    [SCAPE] Eq. 2
-    """
-    rows = np.repeat(np.arange(2 * len(faces)), 2)
-    columns = faces[:, [1, 0, 2, 0]].ravel()
-    G = csr_array((np.tile([1.0, -1.0], 2 * len(faces)), (rows, columns)), shape=(2 * len(faces), count))
-    return csc_array(G.T @ G)

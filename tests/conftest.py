@@ -26,7 +26,7 @@ def demo_folder(tmp_path_factory):
         while not ended.exists():
             time.sleep(0.5)
     else:
-        from completion.cli import demo
+        from completion.demo.cli import demo
 
         code = None
         try:

@@ -3,11 +3,11 @@ import pytest
 from completion_bodies import MEAN, worm_with_prior
 
 from completion import energy
-from completion.animation import AnimateConfig, MarkerFollower, animate, supports
+from completion.animation.follow import AnimateConfig, MarkerFollower, animate, supports
+from completion.animation.smooth import _local, _second_differences, smooth_sequence
 from completion.markers.files import MarkerSequence
 from completion.markers.layout import MarkerLayout
 from completion.motion import Motion
-from completion.smooth import _local, _second_differences, smooth_sequence
 from scanprep.geometry.storage import StorageError
 
 FRAMES = 60
@@ -124,8 +124,8 @@ def test_windows_agree_with_the_whole(subject, layout, walk, monkeypatch):
     follower = MarkerFollower(subject, walk[1], layout, PLAIN)
     x = np.random.default_rng(0).normal(0, 0.02, (FRAMES, 15))
     whole = smooth_sequence(follower, x)
-    monkeypatch.setattr("completion.smooth.WINDOW", 20)
-    monkeypatch.setattr("completion.smooth.OVERLAP", 15)
+    monkeypatch.setattr("completion.animation.smooth.WINDOW", 20)
+    monkeypatch.setattr("completion.animation.smooth.OVERLAP", 15)
     assert np.abs(smooth_sequence(follower, x) - whole).max() < 0.02 * np.abs(whole - x).max()
 
 

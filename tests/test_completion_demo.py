@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from completion import Motion
-from completion.cli import demo
+from completion.demo.cli import demo
 from model import load_model
 from scanprep import RegisteredSet
 from scanprep.console import run

@@ -4,7 +4,8 @@ from completion_bodies import worm_with_prior
 from scipy.sparse import csr_array
 
 from completion.energy import Residual
-from completion.solve import FreeSurface, MinimiseConfig, edge_matrix, minimise
+from completion.partial.surface import FreeSurface, edge_matrix
+from completion.solve import MinimiseConfig, minimise
 from model.gradients import edges
 
 RNG = np.random.default_rng(0)

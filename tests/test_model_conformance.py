@@ -5,11 +5,11 @@ from completion_bodies import half_view
 from conformance_bodies import KINDS, stiff_bodies
 from model_bodies import random_poses
 
-from completion.animation import AnimateConfig, animate
-from completion.fit import CompletionConfig
+from completion.animation.follow import AnimateConfig, animate
 from completion.markers.files import MarkerSequence
 from completion.markers.layout import MarkerLayout
-from completion.partial import complete
+from completion.partial.completion import complete
+from completion.partial.settings import CompletionConfig
 from model.body import BodyModel
 from model.files import load_model
 from model.fitting import FitConfig, fit_pose, fit_shape

@@ -38,12 +38,12 @@ from scanprep.scanning.people import MARKERS, Person, random_pose, walk
 from scanprep.scanning.scanner import ScannerConfig, scan
 from scanprep.skeleton.find import SkeletonConfig
 
-from ..animation import animate
+from ..animation.follow import animate
 from ..markers.files import MarkerSequence, read_markers, write_markers
 from ..markers.layout import DISTANCE, MarkerLayout
 from ..motion import Motion
-from ..partial import Completion, complete
-from ..results import load_completion, save_completion
+from ..partial.completion import Completion, complete
+from ..partial.results import load_completion, save_completion
 from .truth import TruthMap
 
 Bar = Callable[[str], AbstractContextManager[Callable[[int, int], None]]]

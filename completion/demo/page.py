@@ -15,16 +15,8 @@ from scanprep.pictures.shading import Shape, Solid, heat, part_colors, render, s
 from scanprep.pictures.sheets import save_png
 from scanprep.pictures.views import look_around, upright
 
-from ..report import (
-    COMPLETED,
-    HEIGHT,
-    MEASURED,
-    animated_picture,
-    chart_residuals,
-    picture_completion,
-    picture_distance,
-    picture_frames,
-)
+from ..animation.report import animated_picture, chart_residuals, picture_frames
+from ..partial.report import COMPLETED, HEIGHT, MEASURED, picture_completion, picture_distance
 from .chain import Demo
 from .truth import surface_error
 

@@ -16,8 +16,8 @@ from pathlib import Path
 import numpy as np
 from protocols import HalfView, RealData, half_view, load_real, machine, scape_fold, spring_split, write_report
 
-from completion.fit import CompletionConfig
-from completion.partial import Completion, complete
+from completion.partial.completion import Completion, complete
+from completion.partial.settings import CompletionConfig
 from model.files import load_model
 from model.learning import LearnConfig, learn_scape
 from model.scape import ScapeModel

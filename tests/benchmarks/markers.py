@@ -15,7 +15,7 @@ from pathlib import Path
 import numpy as np
 from protocols import RealData, load_real, machine, scape_fold, write_report
 
-from completion.animation import AnimateConfig, animate
+from completion.animation.follow import AnimateConfig, animate
 from completion.markers.files import MarkerSequence, read_markers
 from completion.markers.layout import MarkerLayout
 from model.files import load_model

@@ -8,11 +8,11 @@ from scipy.linalg import solveh_banded
 
 from scanprep.geometry import rotations
 
-from . import energy
-from .solve import normal_equations
+from .. import energy
+from ..solve import normal_equations
 
 if TYPE_CHECKING:
-    from .animation import MarkerFollower
+    from .follow import MarkerFollower
 
 
 WINDOW, OVERLAP = 1000, 60           # frames solved at once, and those that each side lends to its neighbour

@@ -5,17 +5,17 @@ from collections.abc import Callable
 from dataclasses import dataclass, field
 
 import numpy as np
-from scipy.sparse import csr_array
 
 from model.body import BodyModel
 from model.linear import Subject
 from scanprep.geometry.mesh import Mesh
-from scanprep.geometry.surface import Surface
 
-from .bodies import as_body
-from .fit import CompletionConfig, ScanFit
-from .scan import ScanPoints, prepare_scan
-from .solve import FreeSurface
+from ..bodies import as_body
+from .fit import ScanFit
+from .restarts import best_start, from_landmarks, redraw_limbs
+from .scan import prepare_scan
+from .settings import CompletionConfig
+from .surface import free_surface
 
 Progress = Callable[[int, int], None]
 
@@ -90,9 +90,9 @@ def complete(body: BodyModel | Subject, scan: Mesh | np.ndarray, landmarks: tupl
     task = ScanFit(posed, cloud, *marked, config)
     total = config.rounds + 3
     tell = progress or (lambda done, total: None)
-    starts = task.from_landmarks()
+    starts = from_landmarks(task)
     tell(1, total)
-    x = task.redraw_limbs(task.best_start(starts))
+    x = redraw_limbs(task, best_start(task, starts))
     tell(2, total)
     x, converged, rounds, energies = task.follow_scan(x, lambda done: tell(2 + done, total))
     predicted = posed.template.with_vertices(posed.vertices(x))
@@ -133,30 +133,3 @@ def check_landmarks(landmarks: tuple[np.ndarray, np.ndarray], template: Mesh) ->
         raise ValueError(f"landmarks: they extend over {extent:.3g} m, the template over {whole:.3g} m; "
                          "expected the scan in metres")
     return vertices.astype(np.int64), points.astype(np.float64)
-
-
-def free_surface(predicted: Mesh, cloud: ScanPoints, config: CompletionConfig
-                 ) -> tuple[Mesh, np.ndarray, np.ndarray, float]:
-    """The completed mesh, its seen vertices (N,), the scan points used (n,) and their RMS distance to it.
-
-    [SCAPE] Eq. 10
-    """
-    solver = FreeSurface(predicted)
-    mesh = predicted
-    for _ in range(config.surface_rounds):
-        found = Surface(mesh).closest(cloud.points)
-        agree = np.einsum("nd,nd->n", mesh.face_normals[found.faces], cloud.normals) > config.min_cosine
-        used = agree & (found.distances < config.surface_reach)
-        weights = _rows(predicted, found.faces[used], found.bary[used])
-        mesh = predicted.with_vertices(solver.solve(predicted.vertices, weights, cloud.points[used],
-                                                    np.full(used.sum(), config.surface_weight)))
-    seen = np.zeros(len(predicted.vertices), dtype=bool)
-    seen[predicted.faces[found.faces[used]]] = True
-    distance = Surface(mesh).closest(cloud.points[used]).distances if used.any() else np.array([np.nan])
-    return mesh, seen, used, float(np.sqrt((distance**2).mean()))
-
-
-def _rows(mesh: Mesh, faces: np.ndarray, bary: np.ndarray) -> csr_array:
-    """(L, N) sparse weights of points on triangles."""
-    rows = np.repeat(np.arange(len(faces)), 3)
-    return csr_array((bary.ravel(), (rows, mesh.faces[faces].ravel())), shape=(len(faces), len(mesh.vertices)))

@@ -10,16 +10,16 @@ from model.linear import Subject
 from scanprep.geometry import rotations
 from scanprep.geometry.mesh import Mesh
 
-from . import energy
-from .bodies import FixedBody
-from .energy import MovingPoints
-from .markers.files import MarkerSequence
-from .markers.layout import MarkerLayout
-from .motion import Motion
-from .priors import gaussian_prior
+from .. import energy
+from ..bodies import FixedBody
+from ..energy import MovingPoints
+from ..markers.files import MarkerSequence
+from ..markers.layout import MarkerLayout
+from ..motion import Motion
+from ..priors import gaussian_prior
+from ..solve import MinimiseConfig, minimise
+from ..starts import search
 from .smooth import smooth_sequence
-from .solve import MinimiseConfig, minimise
-from .starts import search
 
 Progress = Callable[[int, int], None]
 PREDICTION = 10.0                    # variance of a prediction from two uncertain frames, against the acceleration's

@@ -2,106 +2,22 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
 
 import numpy as np
 
 from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.surface import OrientedPoints
 
-from . import energy
-from .bodies import FixedBody
+from .. import energy
+from ..bodies import FixedBody
+from ..priors import GaussianPrior, gaussian_prior
+from ..solve import MinimiseConfig, minimise
 from .contact import Contact
-from .draws import around, limbs, near_points, quick_misfits, redrawn
-from .priors import GaussianPrior, gaussian_prior
 from .scan import ScanPoints, spread
+from .settings import CompletionConfig
 from .sight import find_sight
-from .solve import MinimiseConfig, minimise
-from .starts import distinct, search
 
 SETTLED = 5e-4                       # metres, root mean square over the vertices from round to round
-DOUBT = 0.012                        # share of scan or body that may be in the wrong place for no reason
-MANY = 6                             # times as many draws of a limb are compared with what is unexplained
-PROMISING = 30.0                     # a limb drawn at random may be this much worse before it is fitted
-
-
-@dataclass(frozen=True)
-class CompletionConfig:
-    """Settings of `complete`.
-
-    Attributes
-    ----------
-    surface_weight : float
-        w_Z of Eq. 10: how strongly each measured point draws the completed surface.
-    twist_weight : float
-        w_T of Eq. 11: how strongly one round holds the joint angles of the round before.
-    landmark_sd : float, metres
-        How far a landmark may lie from its vertex.
-    scan_sd : float, metres
-        How far the scan lies from the predicted mesh, as the model is not exact.
-    evidence : float
-        How many independent measurements the whole scan is worth; what the model cannot follow is alike
-        at neighbouring points, so this is far fewer than there are points.
-    prior_weight : float
-        Factor on the pose prior once the scan is used.
-    prior_shrinkage : float in [0, 1]
-        See `gaussian_prior`.
-    start_axes : int
-        Directions of the training poses along which the search starts.
-    candidates : int
-        Starts that are carried on from the landmarks to the scan.
-    reach : float, metres
-        First limit on the distance of matches; it shrinks to `final_reach`.
-    final_reach : float, metres
-    rounds : int
-        Matchings from `reach` to `final_reach`.
-    min_cosine : float
-        Least cosine between the normals of a match.
-    scan_points : int
-        Points of the scan that are matched to the model.
-    model_points : int
-        Vertices of the model that are matched to the scan.
-    surface_reach : float, metres
-        Limit on the distance of scan points to the free surface.
-    surface_rounds : int
-        Matchings of the free surface.
-    draws : int
-        Poses drawn at random around each start, and for each limb that may be wrong.
-    seed : int
-        Of the random draws.
-    silhouette_weight : float
-        How much a vertex counts that stands where a single camera saw nothing, against one that lies on the
-        scan; 0 when the scan has parts cut away by hand.
-    silhouette_tolerance : float, metres
-    contact_weight : float
-        The same for a vertex that stands inside another part of the body.
-    viewpoint : (3,) floats, metres, optional
-        Where the scan was seen from; found by itself when not given.
-    """
-
-    surface_weight: float = 1.0
-    twist_weight: float = 1.0
-    landmark_sd: float = 0.01
-    scan_sd: float = 0.008
-    evidence: float = 400.0
-    prior_weight: float = 1.0
-    prior_shrinkage: float = 0.3
-    start_axes: int = 4
-    candidates: int = 3
-    reach: float = 0.2
-    final_reach: float = 0.03
-    rounds: int = 8
-    min_cosine: float = 0.6
-    scan_points: int = 2500
-    model_points: int = 1200
-    surface_reach: float = 0.03
-    surface_rounds: int = 4
-    draws: int = 60
-    seed: int = 0
-    silhouette_weight: float = 0.5
-    silhouette_tolerance: float = 0.03
-    contact_weight: float = 0.5
-    viewpoint: tuple[float, float, float] | None = None
 
 
 class ScanFit:
@@ -137,67 +53,11 @@ class ScanFit:
         """The predicted mesh of unknowns (P,)."""
         return self.body.template.with_vertices(self.body.vertices(x))
 
-    def from_landmarks(self) -> np.ndarray:
-        """The likeliest bodies (n, P) that meet the landmarks, distinct and best first."""
-        body, config = self.body, self.config
-        follow = body.follow(self.vertices, np.zeros(body.n_angles + 3 + body.n_betas))
-        x, _ = search(body, follow, self.points, config.landmark_sd, self.prior, config.start_axes)
-        places = body.subject.points(self.spread).evaluate(*body.split(x)[:2])
-        x = x[distinct(places, config.candidates)]
-        drawn = np.concatenate([x, *(around(body, follow, start, self.points, config.landmark_sd, self.prior,
-                                            config.draws, self.rng) for start in x)])
-        drawn = drawn[np.argsort(quick_misfits(self, drawn))]
-        places = body.subject.points(self.spread).evaluate(*body.split(drawn)[:2])
-        return drawn[distinct(places, config.candidates)]
-
-    def best_start(self, starts: np.ndarray) -> np.ndarray:
-        """The start (P,) that explains the scan best after a few rounds on few points."""
-        ends = [self.approach(x) for x in starts]
-        return ends[int(np.argmin([self.misfit(x) for x in ends]))]
-
-    def approach(self, x: np.ndarray, reaches: tuple[float, ...] = (0.25, 0.2, 0.15, 0.12, 0.1)) -> np.ndarray:
-        """Unknowns (P,) after a few rounds on few points."""
-        for reach in reaches:
-            x = self.step(x, self.coarse, reach)[0]
-        return x
-
-    def redraw_limbs(self, x: np.ndarray) -> np.ndarray:
-        """Unknowns (P,) with limbs moved elsewhere where that explains the scan better; the shape is held."""
-        if not self.doubtful(x):
-            return x
-        whole, self.body = self.body, self.body.held(x)
-        free = whole.n_angles + 3
-        moved = self._redrawn(x[:free])
-        self.body = whole
-        return np.concatenate([moved[:free], x[free:]])
-
-    def _redrawn(self, x: np.ndarray) -> np.ndarray:
-        best = self.misfit(x)
-        for root in limbs(self.body.skeleton):
-            moved = np.flatnonzero(self.body.skeleton.descends[:, root])
-            drawn = redrawn(self.body, x, root, self.prior, MANY * self.config.draws, self.rng)
-            wanted = self.coarse.points[self.unexplained(x, self.coarse)]
-            drawn = np.vstack([near_points(self, drawn, moved, wanted, self.config.draws // 3),
-                               drawn[:self.config.draws]])
-            quick = quick_misfits(self, np.vstack([x, drawn]), moved)
-            for i in np.argsort(quick[1:])[:2]:
-                if quick[i + 1] > quick[0] + PROMISING:
-                    continue
-                tried = self.approach(drawn[i], (0.2, 0.15, 0.1))
-                if (misfit := self.misfit(tried)) < best - 5:
-                    x, best = tried, misfit
-        return x
-
     def unexplained(self, x: np.ndarray, scan: ScanPoints) -> np.ndarray:
         """(n,) bool: points of the scan with nothing of the body near."""
         mesh = self.mesh(x)
         return ~OrientedPoints(mesh.vertices, mesh.vertex_normals).match(scan.points, scan.normals, 0.05,
                                                                          self.config.min_cosine).valid
-
-    def doubtful(self, x: np.ndarray) -> bool:
-        """Whether more than a little of the scan is unexplained, or of the body where nothing can be."""
-        return bool(self.unexplained(x, self.thin).mean() > DOUBT
-                    or len(self.trespasses(self.mesh(x))[0]) > DOUBT * len(self.spread))
 
     def misfit(self, x: np.ndarray, cap: float = 0.05) -> float:
         """How badly a body explains scan and landmarks, for the choice between starts."""

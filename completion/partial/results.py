@@ -8,7 +8,7 @@ import numpy as np
 from scanprep.geometry import storage
 from scanprep.geometry.files import read_mesh, write_mesh
 
-from .partial import Completion
+from .completion import Completion
 
 KIND, VERSION = "completion", 1
 _ARRAYS, _FACTS = ("pose", "betas", "trans", "seen"), ("rms", "explained", "landmark_rms", "converged", "iterations")

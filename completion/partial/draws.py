@@ -8,12 +8,12 @@ import numpy as np
 from scanprep.geometry.surface import OrientedPoints
 from scanprep.skeleton.tree import Skeleton
 
-from . import energy
-from .bodies import FixedBody, Follow
+from .. import energy
+from ..bodies import FixedBody, Follow
+from ..priors import GaussianPrior
+from ..solve import normal_equations
 from .contact import Contact
-from .priors import GaussianPrior
 from .scan import spread
-from .solve import normal_equations
 
 if TYPE_CHECKING:
     from .fit import ScanFit

@@ -1,0 +1,1 @@
+"""Markers of a person move a body."""

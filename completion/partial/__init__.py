@@ -1,0 +1,1 @@
+"""A partial scan becomes a whole body."""

@@ -1,0 +1,75 @@
+"""Where the fit of a scan begins, and where it begins again when a limb is in the wrong place."""
+from __future__ import annotations
+
+import numpy as np
+
+from ..starts import distinct, search
+from .draws import around, limbs, near_points, quick_misfits, redrawn
+from .fit import ScanFit
+
+COARSE = (0.25, 0.2, 0.15, 0.12, 0.1)    # metres: reaches of the first rounds, on few points
+DOUBT = 0.012                        # share of scan or body that may be in the wrong place for no reason
+MANY = 6                             # times as many draws of a limb are compared with what is unexplained
+PROMISING = 30.0                     # a limb drawn at random may be this much worse before it is fitted
+BETTER = 5.0                         # by how much the misfit must fall for a limb to be moved
+
+
+def from_landmarks(fit: ScanFit) -> np.ndarray:
+    """The likeliest bodies (n, P) that meet the landmarks, distinct and best first."""
+    body, config = fit.body, fit.config
+    follow = body.follow(fit.vertices, np.zeros(body.n_angles + 3 + body.n_betas))
+    x, _ = search(body, follow, fit.points, config.landmark_sd, fit.prior, config.start_axes)
+    places = body.subject.points(fit.spread).evaluate(*body.split(x)[:2])
+    x = x[distinct(places, config.candidates)]
+    drawn = np.concatenate([x, *(around(body, follow, start, fit.points, config.landmark_sd, fit.prior,
+                                        config.draws, fit.rng) for start in x)])
+    drawn = drawn[np.argsort(quick_misfits(fit, drawn))]
+    places = body.subject.points(fit.spread).evaluate(*body.split(drawn)[:2])
+    return drawn[distinct(places, config.candidates)]
+
+
+def best_start(fit: ScanFit, starts: np.ndarray) -> np.ndarray:
+    """The start (P,) that explains the scan best after a few rounds on few points."""
+    ends = [approach(fit, x) for x in starts]
+    return ends[int(np.argmin([fit.misfit(x) for x in ends]))]
+
+
+def approach(fit: ScanFit, x: np.ndarray, reaches: tuple[float, ...] = COARSE) -> np.ndarray:
+    """Unknowns (P,) after a few rounds on few points."""
+    for reach in reaches:
+        x = fit.step(x, fit.coarse, reach)[0]
+    return x
+
+
+def redraw_limbs(fit: ScanFit, x: np.ndarray) -> np.ndarray:
+    """Unknowns (P,) with limbs moved elsewhere where that explains the scan better; the shape is held."""
+    if not doubtful(fit, x):
+        return x
+    whole, fit.body = fit.body, fit.body.held(x)
+    free = whole.n_angles + 3
+    moved = _redrawn(fit, x[:free])
+    fit.body = whole
+    return np.concatenate([moved[:free], x[free:]])
+
+
+def _redrawn(fit: ScanFit, x: np.ndarray) -> np.ndarray:
+    best, config = fit.misfit(x), fit.config
+    for root in limbs(fit.body.skeleton):
+        moved = np.flatnonzero(fit.body.skeleton.descends[:, root])
+        drawn = redrawn(fit.body, x, root, fit.prior, MANY * config.draws, fit.rng)
+        wanted = fit.coarse.points[fit.unexplained(x, fit.coarse)]
+        drawn = np.vstack([near_points(fit, drawn, moved, wanted, config.draws // 3), drawn[:config.draws]])
+        quick = quick_misfits(fit, np.vstack([x, drawn]), moved)
+        for i in np.argsort(quick[1:])[:2]:
+            if quick[i + 1] > quick[0] + PROMISING:
+                continue
+            tried = approach(fit, drawn[i], (0.2, 0.15, 0.1))
+            if (misfit := fit.misfit(tried)) < best - BETTER:
+                x, best = tried, misfit
+    return x
+
+
+def doubtful(fit: ScanFit, x: np.ndarray) -> bool:
+    """Whether more than a little of the scan is unexplained, or of the body where nothing can be."""
+    return bool(fit.unexplained(x, fit.thin).mean() > DOUBT
+                or len(fit.trespasses(fit.mesh(x))[0]) > DOUBT * len(fit.spread))

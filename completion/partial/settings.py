@@ -1,0 +1,83 @@
+"""Settings of `complete`."""
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+
+@dataclass(frozen=True)
+class CompletionConfig:
+    """Settings of `complete`.
+
+    Attributes
+    ----------
+    surface_weight : float
+        w_Z of Eq. 10: how strongly each measured point draws the completed surface.
+    twist_weight : float
+        w_T of Eq. 11: how strongly one round holds the joint angles of the round before.
+    landmark_sd : float, metres
+        How far a landmark may lie from its vertex.
+    scan_sd : float, metres
+        How far the scan lies from the predicted mesh, as the model is not exact.
+    evidence : float
+        How many independent measurements the whole scan is worth; what the model cannot follow is alike
+        at neighbouring points, so this is far fewer than there are points.
+    prior_weight : float
+        Factor on the pose prior once the scan is used.
+    prior_shrinkage : float in [0, 1]
+        See `gaussian_prior`.
+    start_axes : int
+        Directions of the training poses along which the search starts.
+    candidates : int
+        Starts that are carried on from the landmarks to the scan.
+    reach : float, metres
+        First limit on the distance of matches; it shrinks to `final_reach`.
+    final_reach : float, metres
+    rounds : int
+        Matchings from `reach` to `final_reach`.
+    min_cosine : float
+        Least cosine between the normals of a match.
+    scan_points : int
+        Points of the scan that are matched to the model.
+    model_points : int
+        Vertices of the model that are matched to the scan.
+    surface_reach : float, metres
+        Limit on the distance of scan points to the free surface.
+    surface_rounds : int
+        Matchings of the free surface.
+    draws : int
+        Poses drawn at random around each start, and for each limb that may be wrong.
+    seed : int
+        Of the random draws.
+    silhouette_weight : float
+        How much a vertex counts that stands where a single camera saw nothing, against one that lies on the
+        scan; 0 when the scan has parts cut away by hand.
+    silhouette_tolerance : float, metres
+    contact_weight : float
+        The same for a vertex that stands inside another part of the body.
+    viewpoint : (3,) floats, metres, optional
+        Where the scan was seen from; found by itself when not given.
+    """
+
+    surface_weight: float = 1.0
+    twist_weight: float = 1.0
+    landmark_sd: float = 0.01
+    scan_sd: float = 0.008
+    evidence: float = 400.0
+    prior_weight: float = 1.0
+    prior_shrinkage: float = 0.3
+    start_axes: int = 4
+    candidates: int = 3
+    reach: float = 0.2
+    final_reach: float = 0.03
+    rounds: int = 8
+    min_cosine: float = 0.6
+    scan_points: int = 2500
+    model_points: int = 1200
+    surface_reach: float = 0.03
+    surface_rounds: int = 4
+    draws: int = 60
+    seed: int = 0
+    silhouette_weight: float = 0.5
+    silhouette_tolerance: float = 0.03
+    contact_weight: float = 0.5
+    viewpoint: tuple[float, float, float] | None = None
