@@ -3,6 +3,7 @@ from __future__ import annotations
 
 import importlib.metadata
 from abc import ABC, abstractmethod
+from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, ClassVar
@@ -50,6 +51,8 @@ class BodyModel(ABC):
     pose_mean : (J, 3) float, radians
     pose_covariance : (3J, 3J) float, square radians
         Of the training poses, zero in the root's rows: a Gaussian prior of the pose.
+    pose_examples : (M, J, 3) float, radians
+        The training poses themselves, the root not turned; M = 0 in files of earlier versions.
     info : dict
         How the model was made: settings, sizes and a digest of the training set.
     """
@@ -59,6 +62,7 @@ class BodyModel(ABC):
     skeleton: Skeleton
     pose_mean: np.ndarray
     pose_covariance: np.ndarray
+    pose_examples: np.ndarray
     info: dict[str, Any]
 
     def __repr__(self) -> str:
@@ -166,7 +170,7 @@ class BodyModel(ABC):
         """
         kept = None if betas is None else np.array(betas, dtype=np.float64)
         return Subject(self.template, self.skeleton, kept, self.terms, self.basis(betas).astype(dtype, copy=False),
-                       self.skeleton.joints[0], self.pose_mean, self.pose_covariance)
+                       self.skeleton.joints[0], self.pose_mean, self.pose_covariance, self.pose_examples)
 
     def jacobian(self, pose: np.ndarray, betas: np.ndarray | None = None, trans: np.ndarray | None = None,
                  vertex_ids: np.ndarray | None = None) -> Derivatives:
@@ -190,6 +194,22 @@ class BodyModel(ABC):
         y, by_pose = self.subject(betas).points(ids).jacobian(pose, trans)
         by_shape = self.shape_jacobian(pose, ids)[..., :K] if K else np.zeros((len(ids), 3, 0))
         return Derivatives(y, by_pose, by_shape)
+
+
+def kept_examples(earlier: bool, arrays: Mapping[str, np.ndarray]) -> np.ndarray:
+    """The training poses (M, J, 3) in the arrays of a model file; none in a file of an earlier version.
+
+    Raises
+    ------
+    KeyError, ValueError
+        Missing in a file that must have them, or for another skeleton.
+    """
+    if earlier:
+        return np.zeros((0, *arrays["pose_mean"].shape))
+    examples = arrays["pose_examples"]
+    if len(examples) and examples.shape[1:] != arrays["pose_mean"].shape:
+        raise ValueError(f"pose_examples: expected (M, {len(arrays['pose_mean'])}, 3), got {examples.shape}")
+    return examples
 
 
 def versions() -> dict[str, str]:

@@ -151,6 +151,8 @@ class Subject:
     origin : (3,) float, metres
     pose_mean, pose_covariance : (J, 3) and (3J, 3J) float, optional
         The model's pose prior, which a body of known shape keeps.
+    pose_examples : (M, J, 3) float, radians, optional
+        The model's training poses.
     """
 
     template: Mesh
@@ -161,6 +163,7 @@ class Subject:
     origin: np.ndarray
     pose_mean: np.ndarray | None = None
     pose_covariance: np.ndarray | None = None
+    pose_examples: np.ndarray | None = None
 
     @property
     def n_vertices(self) -> int:

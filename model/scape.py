@@ -13,7 +13,7 @@ from scanprep.geometry.mesh import Mesh
 from scanprep.skeleton.tree import Skeleton
 
 from .bilinear import ShapedPoints
-from .body import BodyModel, versions
+from .body import BodyModel, kept_examples, versions
 from .carriers import Carrier, build_basis, build_shaped_points, carried_terms, make_carriers, rigid_weights
 from .features import PoseFeatures, Terms, linear_features, make_lift
 from .gradients import edges
@@ -22,7 +22,7 @@ from .pose_space import PoseSpace
 from .shape_space import ShapeSpace
 from .stitching import StitchingSystem
 
-VERSION = 2                          # 1 had linear features only
+VERSION = 3                          # 1 had linear features only, 2 no pose examples
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -39,6 +39,8 @@ class ScapeModel(BodyModel):
     pose_mean : (J, 3) float, radians
     pose_covariance : (3J, 3J) float, square radians
         Of the training poses, zero in the root's rows: a Gaussian prior of the pose.
+    pose_examples : (M, J, 3) float, radians
+        The training poses themselves, the root not turned; M = 0 in files of earlier versions.
     info : dict
         How the model was made: settings, sizes and a digest of the training set.
 
@@ -52,6 +54,7 @@ class ScapeModel(BodyModel):
     pose_mean: np.ndarray
     pose_covariance: np.ndarray
     info: dict[str, Any] = field(default_factory=dict)
+    pose_examples: np.ndarray = field(default_factory=lambda: np.zeros((0, 0, 3)), kw_only=True)
 
     kind: ClassVar[str] = "scape"
 
@@ -129,7 +132,8 @@ class ScapeModel(BodyModel):
             "shape_mean": self.shape_space.mean, "shape_components": self.shape_space.components,
             "shape_variances": self.shape_space.variances,
             "shape_total_variance": np.array(self.shape_space.total_variance),
-            "pose_mean": self.pose_mean, "pose_covariance": self.pose_covariance}
+            "pose_mean": self.pose_mean, "pose_covariance": self.pose_covariance,
+            "pose_examples": self.pose_examples}
 
     def save(self, path: str | Path) -> None:
         header = {"units": {"length": "metre", "angle": "radian", "betas": "standard deviation"},
@@ -140,7 +144,7 @@ class ScapeModel(BodyModel):
     @classmethod
     def load(cls, path: str | Path) -> ScapeModel:
         """Read a file of `save`; see `load_model`."""
-        header, a = storage.load(path, cls.kind, (1, VERSION))
+        header, a = storage.load(path, cls.kind, (1, 2, VERSION))
         try:
             return cls._restored(header, a)
         except (KeyError, ValueError, IndexError) as error:
@@ -157,7 +161,8 @@ class ScapeModel(BodyModel):
         shapes = ShapeSpace(a["shape_mean"], a["shape_components"], a["shape_variances"],
                             float(a["shape_total_variance"]))
         return cls(Mesh(a["vertices"], a["faces"]), skeleton, PoseSpace(features, coefficients), shapes,
-                   a["pose_mean"], a["pose_covariance"], header["info"], **cls._extra(a))
+                   a["pose_mean"], a["pose_covariance"], header["info"],
+                   pose_examples=kept_examples(header["version"] < VERSION, a), **cls._extra(a))
 
     @classmethod
     def _extra(cls, a: dict[str, np.ndarray]) -> dict[str, Any]:

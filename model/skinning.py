@@ -14,11 +14,11 @@ from scanprep.geometry.mesh import Mesh
 from scanprep.skeleton.tree import Skeleton
 
 from .bilinear import ShapedPoints
-from .body import BodyModel, versions
+from .body import BodyModel, kept_examples, versions
 from .features import PoseFeatures, Terms, make_lift
 from .linear import check_points, check_pose
 
-VERSION = 1
+VERSION = 2                          # 1 had no pose examples
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -53,6 +53,8 @@ class SkinningModel(BodyModel):
     pose_mean : (J, 3) float, radians
     pose_covariance : (3J, 3J) float, square radians
         Of the training poses, zero in the root's rows: a Gaussian prior of the pose.
+    pose_examples : (M, J, 3) float, radians
+        The training poses themselves, the root not turned; M = 0 in files of earlier versions.
     info : dict
         How the model was made: settings, sizes and a digest of the training set.
     """
@@ -70,6 +72,7 @@ class SkinningModel(BodyModel):
     pose_mean: np.ndarray
     pose_covariance: np.ndarray
     info: dict[str, Any] = field(default_factory=dict)
+    pose_examples: np.ndarray = field(default_factory=lambda: np.zeros((0, 0, 3)), kw_only=True)
 
     kind: ClassVar[str] = "skinning"
 
@@ -219,19 +222,21 @@ class SkinningModel(BodyModel):
             "part_of_face": self.skeleton.part_of_face.astype(np.int32), "parents": self.skeleton.parents,
             "joints": self.skeleton.joints, "feature_part": self.features.part, "feature_mix": self.features.mix,
             **{f"lift_{name}": array for name, array in self.features.lift.arrays().items()},
+            "pose_examples": self.pose_examples,
             **{name: np.asarray(getattr(self, name)) for name in _STORED}}
         storage.save(path, self.kind, VERSION, arrays, header)
 
     @classmethod
     def load(cls, path: str | Path) -> SkinningModel:
         """Read a file of `save`; see `load_model`."""
-        header, a = storage.load(path, cls.kind, (VERSION,))
+        header, a = storage.load(path, cls.kind, (1, VERSION))
         try:
             skeleton = Skeleton(a["part_of_face"], a["parents"], a["joints"], tuple(header["names"]))
             lift = make_lift(header["lift"], {name[5:]: array for name, array in a.items() if name[:5] == "lift_"})
             features = PoseFeatures(skeleton, lift, a["feature_part"], a["feature_mix"])
             stored: dict[str, Any] = {**{name: a[name] for name in _STORED}, "shape_total": float(a["shape_total"])}
-            return cls(Mesh(a["vertices"], a["faces"]), skeleton, features=features, info=header["info"], **stored)
+            return cls(Mesh(a["vertices"], a["faces"]), skeleton, features=features, info=header["info"],
+                       pose_examples=kept_examples(header["version"] < VERSION, a), **stored)
         except (KeyError, ValueError, IndexError) as error:
             raise storage.StorageError(f"{path}: the model lacks or has a damaged part ({error})") from None
 

@@ -10,8 +10,9 @@ from .scape import (
     checked_bodies,
     learn_blendscape,
     learn_scape,
+    pose_examples,
     pose_prior,
 )
 
 __all__ = ["BlendConfig", "Carriage", "LearnConfig", "Progress", "Ticks", "check_skeleton", "checked_bodies", "digest",
-           "fit_poses", "learn_blendscape", "learn_scape", "pose_prior"]
+           "fit_poses", "learn_blendscape", "learn_scape", "pose_examples", "pose_prior"]

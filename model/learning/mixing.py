@@ -25,7 +25,7 @@ from .carriage import Carriage
 from .condense import condense
 from .pose import Progress, Ticks, fit_poses
 from .regression import Design, RegressionConfig
-from .scape import check_skeleton, checked_bodies, pose_prior, timed
+from .scape import check_skeleton, checked_bodies, pose_examples, pose_prior, timed
 from .within import choose_within, fit_within, held_out_bodies, number_people
 
 DAMPING = 0.1                        # of the inverse of S, against triangles that somebody has nearly flat
@@ -196,7 +196,8 @@ def next_round(mix: Mix, state: State, number: int, tick: Ticks) -> State:
 def make_model(mix: Mix, state: State, info: dict[str, Any]) -> ScapeModel:
     """The model that a round has reached."""
     shapes = learn_shape_space(state.S, mix.config.components)
-    return ScapeModel(mix.carriage.template, mix.carriage.skeleton, state.space, shapes, *pose_prior(state.poses), info)
+    return ScapeModel(mix.carriage.template, mix.carriage.skeleton, state.space, shapes, *pose_prior(state.poses), info,
+                      pose_examples=pose_examples(state.poses))
 
 
 def _learn_pose(mix: Mix, state: State) -> tuple[PoseSpace, Design]:

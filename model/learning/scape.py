@@ -83,7 +83,8 @@ def learn_scape(template: Mesh, poses: np.ndarray, shapes: np.ndarray | None, sk
     check_template(template)
     check_skeleton(template, skeleton)
     carriage = Carriage(template, skeleton, rigid_weights(skeleton))
-    return ScapeModel(template, skeleton, *_learn(carriage, poses, shapes, config, progress))
+    space, shape_space, mean, covariance, info, examples = _learn(carriage, poses, shapes, config, progress)
+    return ScapeModel(template, skeleton, space, shape_space, mean, covariance, info, pose_examples=examples)
 
 
 def learn_blendscape(template: Mesh, poses: np.ndarray, shapes: np.ndarray | None, skeleton: Skeleton,
@@ -111,12 +112,15 @@ def learn_blendscape(template: Mesh, poses: np.ndarray, shapes: np.ndarray | Non
     check_skeleton(template, skeleton)
     blend = face_weights(template, skeleton, config.width * float(np.linalg.norm(np.ptp(template.vertices, axis=0))))
     carriage = Carriage(template, skeleton, blend)
-    return BlendScapeModel(template, skeleton, *_learn(carriage, poses, shapes, config, progress), blend=blend)
+    space, shape_space, mean, covariance, info, examples = _learn(carriage, poses, shapes, config, progress)
+    return BlendScapeModel(template, skeleton, space, shape_space, mean, covariance, info, pose_examples=examples,
+                           blend=blend)
 
 
 def _learn(carriage: Carriage, poses: np.ndarray, shapes: np.ndarray | None, config: LearnConfig,
-           progress: Progress | None) -> tuple[PoseSpace, ShapeSpace, np.ndarray, np.ndarray, dict[str, Any]]:
-    """Pose space, shape space, mean and covariance of the poses, and how they came about."""
+           progress: Progress | None
+           ) -> tuple[PoseSpace, ShapeSpace, np.ndarray, np.ndarray, dict[str, Any], np.ndarray]:
+    """Pose space, shape space, mean and covariance of the poses, how they came about, and the poses."""
     template = carriage.template
     poses = checked_bodies(template, poses, "poses")
     shapes = None if shapes is None else checked_bodies(template, shapes, "shapes")
@@ -129,7 +133,8 @@ def _learn(carriage: Carriage, poses: np.ndarray, shapes: np.ndarray | None, con
             S = shape_deformations(carriage, learned.space, shapes, config.smoothness, tick)
         with timed("shape components"):
             shape_space = learn_shape_space(S, config.components)
-    return learned.space, shape_space, *pose_prior(learned.poses), how_learned(template, learned, poses, shapes, config)
+    return (learned.space, shape_space, *pose_prior(learned.poses),
+            how_learned(template, learned, poses, shapes, config), pose_examples(learned.poses))
 
 
 def how_learned(template: Mesh, learned: LearnedPose, poses: np.ndarray, shapes: np.ndarray | None, config: LearnConfig
@@ -144,9 +149,15 @@ def how_learned(template: Mesh, learned: LearnedPose, poses: np.ndarray, shapes:
 
 def pose_prior(poses: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Mean (J, 3) and covariance (3J, 3J) of poses (M, J, 3), radians, zero for the root."""
-    flat = twists(poses).reshape(len(poses), -1).copy()
-    flat[:, :3] = 0
+    flat = pose_examples(poses).reshape(len(poses), -1)
     return flat.mean(axis=0).reshape(-1, 3), np.cov(flat.T, ddof=1)
+
+
+def pose_examples(poses: np.ndarray) -> np.ndarray:
+    """Poses (M, J, 3), radians, below a half turn and without the root's."""
+    out = twists(poses).copy()
+    out[:, 0] = 0
+    return out
 
 
 @contextlib.contextmanager

@@ -13,7 +13,16 @@ from ..scape import ScapeModel
 from ..shape_space import learn_shape_space
 from .carriage import Carriage
 from .pose import Ticks, learn_pose
-from .scape import LearnConfig, Progress, check_skeleton, checked_bodies, how_learned, pose_prior, shape_deformations
+from .scape import (
+    LearnConfig,
+    Progress,
+    check_skeleton,
+    checked_bodies,
+    how_learned,
+    pose_examples,
+    pose_prior,
+    shape_deformations,
+)
 
 SEXES = ("female", "male")
 FEWEST = 2                           # people that span a space of shapes
@@ -56,7 +65,7 @@ def learn_by_sex(template: Mesh, poses: np.ndarray, shapes: np.ndarray, sexes: S
     for sex, chosen in groups.items():
         info = {**how_learned(template, learned, poses, shapes[chosen], config), "sex": sex}
         models[sex] = ScapeModel(template, skeleton, learned.space, learn_shape_space(S[chosen], config.components),
-                                 *pose_prior(learned.poses), info)
+                                 *pose_prior(learned.poses), info, pose_examples=pose_examples(learned.poses))
     return models
 
 

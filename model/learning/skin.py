@@ -15,7 +15,7 @@ from ..fitting import FitConfig, PoseFitter
 from ..pose_space import kept_directions
 from ..skinning import SkinningModel
 from .pose import Ticks
-from .scape import check_skeleton, checked_bodies, digest, pose_prior
+from .scape import check_skeleton, checked_bodies, digest, pose_examples, pose_prior
 from .skin_people import learn_people, unblended
 from .skin_weights import diffused, diffused_weights, fit_weights, kept_weights
 
@@ -112,7 +112,7 @@ def learn_skinning(template: Mesh, poses: np.ndarray, shapes: np.ndarray | None,
     info: dict[str, Any] = {
         "settings": asdict(config), "poses": len(poses), "shapes": 0 if shapes is None else len(shapes),
         **model.info, "terms": model.terms.count, "digest": digest(template, poses, shapes)}
-    return replace(model, pose_mean=mean, pose_covariance=covariance, info=info)
+    return replace(model, pose_mean=mean, pose_covariance=covariance, pose_examples=pose_examples(at), info=info)
 
 
 def _start(template: Mesh, skeleton: Skeleton, config: SkinConfig) -> SkinningModel:

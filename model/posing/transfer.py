@@ -176,7 +176,7 @@ def _of_vertices(model: SkinningModel, vertices: np.ndarray, fit: PoseFit, confi
 
 def _subject(model: BodyModel, terms: Terms, basis: np.ndarray) -> Subject:
     return Subject(model.template, model.skeleton, None, terms, basis, model.skeleton.joints[0], model.pose_mean,
-                   model.pose_covariance)
+                   model.pose_covariance, model.pose_examples)
 
 
 def _unpose(model: SkinningModel, vertices: np.ndarray, pose: np.ndarray) -> np.ndarray:
