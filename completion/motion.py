@@ -31,6 +31,8 @@ class Motion:
         As body-model files name it: "male", "female" or "neutral".
     converged : (T,) bool
         Frames whose solution settled; all true for a motion that was read from a file.
+    trusted : (T, L) bool
+        Markers that were seen and believed under their own label; when not given, all that were seen.
     """
 
     poses: np.ndarray
@@ -41,6 +43,7 @@ class Motion:
     labels: tuple[str, ...] = ()
     gender: str = "neutral"
     converged: np.ndarray = field(default_factory=lambda: np.zeros(0, dtype=bool))
+    trusted: np.ndarray = field(default_factory=lambda: np.zeros((0, 0), dtype=bool))
 
     def __post_init__(self) -> None:
         T = len(self.poses)
@@ -51,6 +54,10 @@ class Motion:
             raise ValueError(f"residuals: expected shape {(T, len(self.labels))}, got {self.residuals.shape}")
         if not len(self.converged):
             object.__setattr__(self, "converged", np.ones(T, dtype=bool))
+        if not self.trusted.size:
+            object.__setattr__(self, "trusted", np.isfinite(self.residuals))
+        if self.trusted.shape != self.residuals.shape:
+            raise ValueError(f"trusted: expected shape {self.residuals.shape}, got {self.trusted.shape}")
 
     def __repr__(self) -> str:
         return f"Motion({len(self.poses)} frames at {self.rate:g}/s, {self.poses.shape[1]} parts)"
@@ -73,7 +80,8 @@ class Motion:
             "betas": np.zeros(0) if self.betas is None else self.betas,
             "gender": np.array(self.gender), "mocap_frame_rate": np.array(float(self.rate)),
             "surface_model_type": np.array(SURFACE_MODEL), "marker_residuals": self.residuals,
-            "marker_labels": np.array(self.labels, dtype=str), "converged": self.converged}
+            "marker_labels": np.array(self.labels, dtype=str), "converged": self.converged,
+            "marker_trusted": self.trusted}
         with storage.writing(path) as beside, open(beside, "wb") as out:
             np.savez_compressed(out, allow_pickle=False, **arrays)  # type: ignore[arg-type]
 
@@ -108,6 +116,7 @@ class Motion:
             betas = stored.get("betas", np.zeros(0)).astype(np.float64)
             return Motion(poses, stored["trans"].astype(np.float64), betas if betas.size else None, float(rate),
                           stored.get("marker_residuals", np.zeros((len(poses), 0))), labels,
-                          str(stored.get("gender", "neutral")), stored.get("converged", np.zeros(0, dtype=bool)))
+                          str(stored.get("gender", "neutral")), stored.get("converged", np.zeros(0, dtype=bool)),
+                          stored.get("marker_trusted", np.zeros((0, 0), dtype=bool)))
         except (ValueError, TypeError) as error:
             raise storage.StorageError(f"{path}: {error}") from None
