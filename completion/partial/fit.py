@@ -13,9 +13,12 @@ from ..bodies import FixedBody
 from ..priors import GaussianPrior, gaussian_prior
 from ..solve import MinimiseConfig, minimise
 from .contact import Contact
+from .masks import Cover, part_vertices
 from .scan import ScanPoints, spread
 from .settings import CompletionConfig
-from .sight import find_sight
+from .sight import find_sights
+
+Denial = tuple[np.ndarray, np.ndarray, np.ndarray]
 
 SETTLED = 5e-4                       # metres, root mean square over the vertices from round to round
 
@@ -42,9 +45,11 @@ class ScanFit:
         self.thin = cloud.thinned(config.scan_points)
         self.coarse = cloud.thinned(config.scan_points // 4)
         self.tree = OrientedPoints(cloud.points, cloud.normals)
-        given = None if config.viewpoint is None else np.array(config.viewpoint)
-        self.sight = find_sight(cloud, given) if config.silhouette_weight > 0 else None
+        self.sight = find_sights(cloud) if config.silhouette_weight > 0 else None
+        self.cover = None if cloud.masked is None else Cover(cloud.masked)
         self.spread = spread(body.template.vertices, config.model_points)
+        self.ignored = part_vertices(body.template, body.skeleton, config.ignored_parts)
+        self.matched = self.spread[~self.ignored[self.spread]]
         self.part = body.skeleton.part_of_vertex(body.template)
         self.contact = Contact(body.skeleton, self.part[self.spread])
         self.rng = np.random.default_rng(config.seed)
@@ -56,8 +61,16 @@ class ScanFit:
     def unexplained(self, x: np.ndarray, scan: ScanPoints) -> np.ndarray:
         """(n,) bool: points of the scan with nothing of the body near."""
         mesh = self.mesh(x)
-        return ~OrientedPoints(mesh.vertices, mesh.vertex_normals).match(scan.points, scan.normals, 0.05,
-                                                                         self.config.min_cosine).valid
+        found = OrientedPoints(mesh.vertices, mesh.vertex_normals).match(scan.points, scan.normals, 0.05,
+                                                                         self.config.min_cosine)
+        return ~found.valid
+
+    def without_ignored(self, cloud: ScanPoints, predicted: Mesh) -> ScanPoints:
+        """A scan without its points on parts of the body that are not to be matched."""
+        if not self.ignored.any():
+            return cloud
+        found = OrientedPoints(predicted.vertices, predicted.vertex_normals).match(cloud.points, cloud.normals)
+        return cloud.some(~(self.ignored[found.index] & found.valid))
 
     def misfit(self, x: np.ndarray, cap: float = 0.05) -> float:
         """How badly a body explains scan and landmarks, for the choice between starts."""
@@ -65,12 +78,10 @@ class ScanFit:
         mesh = self.mesh(x)
         found = OrientedPoints(mesh.vertices, mesh.vertex_normals).match(self.thin.points, self.thin.normals, cap,
                                                                          config.min_cosine)
-        apart = (np.minimum(found.distances, cap)**2).mean()
-        if self.sight is not None:
-            excess = self.sight.trespass(mesh.vertices[self.spread], config.silhouette_tolerance)[0]
-            apart += config.silhouette_weight * (np.minimum(excess, cap)**2).mean()
-        depth = self.contact.intrusions(mesh.vertices[self.spread], mesh.vertex_normals[self.spread])[0]
-        apart += config.contact_weight * (np.minimum(depth, cap)**2).mean()
+        counted = np.minimum(found.distances, cap)**2 * ~(found.valid & self.ignored[found.index])
+        apart = counted.mean()
+        for weight, ids, (excess, _, _) in self._denials(mesh):
+            apart += weight * (np.minimum(excess, cap)**2).sum() / len(ids)
         off = ((mesh.vertices[self.vertices] - self.points)**2).sum() / config.landmark_sd**2
         prior = energy.pose_prior(x, self.prior, config.prior_weight).energy
         return float(config.evidence * apart / config.scan_sd**2 + off + prior)
@@ -123,14 +134,14 @@ class ScanFit:
         config = self.config
         there = OrientedPoints(mesh.vertices, mesh.vertex_normals).match(scan.points, scan.normals, reach,
                                                                          config.min_cosine)
-        mine = self.spread
+        mine = self.matched
         back = self.tree.match(mesh.vertices[mine], mesh.vertex_normals[mine], reach, config.min_cosine)
         hit = back.index
         off = mesh.vertices[mine] - self.cloud.points[hit]
         along = np.einsum("nd,nd->n", off, self.cloud.normals[hit])
         beside = np.sqrt(np.maximum((off**2).sum(axis=1) - along**2, 0))
         inner = back.valid & ~self.cloud.border[hit] & (beside < 2 * self.cloud.spacing + 0.3 * np.abs(along))
-        a, b = there.valid, inner
+        a, b = there.valid & ~self.ignored[there.index], inner
         ids = np.concatenate([there.index[a], mine[b]])
         target = np.concatenate([scan.points[a], self.cloud.points[hit[b]]])
         normal = np.concatenate([scan.normals[a], self.cloud.normals[hit[b]]])
@@ -142,19 +153,27 @@ class ScanFit:
     def trespasses(self, mesh: Mesh) -> tuple[np.ndarray, ...]:
         """Vertices that are where nothing can be, points and normals of the planes they should reach, weights.
 
-        The camera would have seen them, or another part of the body is there.
+        The camera would have seen them, they stick out of clothing, or another part of the body is there.
         """
-        config, mine = self.config, self.spread
-        places = mesh.vertices[mine]
-        found = [(config.contact_weight, self.contact.intrusions(places, mesh.vertex_normals[mine]))]
-        if self.sight is not None:
-            found.append((config.silhouette_weight, self.sight.trespass(places, config.silhouette_tolerance)))
-        share = config.evidence / config.scan_sd**2 / len(mine)
+        share = self.config.evidence / self.config.scan_sd**2
         ids, targets, normals, weights = [], [], [], []
-        for weight, (excess, normal, target) in found:
+        for weight, mine, (excess, normal, target) in self._denials(mesh):
             out = excess > 0
             ids.append(mine[out])
             targets.append(target[out])
             normals.append(normal[out])
-            weights.append(weight * share * energy.geman_mcclure(excess[out], 0.1))
+            weights.append(weight * share / len(mine) * energy.geman_mcclure(excess[out], 0.1))
         return tuple(np.concatenate(part) for part in (ids, targets, normals, weights))
+
+    def _denials(self, mesh: Mesh) -> list[tuple[float, np.ndarray, Denial]]:
+        """What says that vertices cannot be where they are: its weight, the vertices, and what `trespass` gives."""
+        config, places, normals = self.config, mesh.vertices, mesh.vertex_normals
+        found = [(config.contact_weight, self.spread, self.contact.intrusions(places[self.spread],
+                                                                              normals[self.spread]))]
+        if self.sight is not None:
+            found.append((config.silhouette_weight, self.matched,
+                          self.sight.trespass(places[self.matched], config.silhouette_tolerance)))
+        if self.cover is not None:
+            found.append((config.cover_weight, self.matched,
+                          self.cover.trespass(places[self.matched], normals[self.matched])))
+        return found

@@ -1,133 +1,248 @@
-"""A scan made ready for matching: points with outward normals, thinned, borders marked."""
+"""A scan made ready for matching: points with outward normals, thinned, borders marked, what is clothing set apart."""
 from __future__ import annotations
 
-from dataclasses import dataclass
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import breadth_first_order, connected_components, minimum_spanning_tree
 from scipy.spatial import cKDTree
 
+from scanprep.geometry.files import PointCloud
 from scanprep.geometry.mesh import Mesh
 
+from .normals import completed_normals, one_sign, plane_normals, spread, turn_outward
+
 NEIGHBOURS = 16                      # points that make one normal
-COARSE = 2000                        # points that show the form at large
-WIDE = 0.12                          # metres: at this scale a body is convex enough to tell in from out
+
+View = Mesh | PointCloud | np.ndarray
 
 
 @dataclass(frozen=True, eq=False)
 class ScanPoints:
-    """Oriented points of a scan.
+    """Oriented points of a scan, of one view or of several.
 
     Attributes
     ----------
     points : (n, 3) float, metres
     normals : (n, 3) float, unit, outward
     border : (n,) bool
-        On the border of the scan's own triangulation; all false for bare points.
+        On the border of what the views show together; all false for bare points.
     spacing : float, metres
         Median distance of neighbouring points.
+    view : (n,) int
+        Which view each point belongs to.
+    index : (n,) int
+        Its number among all points that were given, one view after the other.
+    masked : ScanPoints, optional
+        The points that are clothing or hair; they are not among `points`.
+    viewpoints : (views, 3) float, metres, optional
+        Where each view was seen from, when that was told.
     """
 
     points: np.ndarray
     normals: np.ndarray
     border: np.ndarray
     spacing: float
+    view: np.ndarray
+    index: np.ndarray
+    masked: ScanPoints | None = None
+    viewpoints: np.ndarray | None = None
+
+    @property
+    def views(self) -> int:
+        """How many views there are."""
+        return 1 + max(part.view.max(initial=0) for part in (self, self.masked) if part is not None)
+
+    @property
+    def everything(self) -> ScanPoints:
+        """All points, masked or not."""
+        return self if self.masked is None else _joined([replace(self, masked=None), self.masked])
+
+    def some(self, keep: np.ndarray) -> ScanPoints:
+        """Some of the points, by number or mask (n,); the masked ones stay."""
+        return replace(self, points=self.points[keep], normals=self.normals[keep], border=self.border[keep],
+                       view=self.view[keep], index=self.index[keep])
 
     def thinned(self, count: int) -> ScanPoints:
         """At most about `count` of the points, spread evenly."""
-        if len(self.points) <= count:
-            return self
-        keep = spread(self.points, count)
-        return ScanPoints(self.points[keep], self.normals[keep], self.border[keep], self.spacing)
+        return self if len(self.points) <= count else self.some(spread(self.points, count))
+
+    def scaled(self, factor: float) -> ScanPoints:
+        """The scan in another unit: all lengths times a factor."""
+        masked = None if self.masked is None else self.masked.scaled(factor)
+        seen_from = None if self.viewpoints is None else factor * self.viewpoints
+        return replace(self, points=factor * self.points, spacing=factor * self.spacing, masked=masked,
+                       viewpoints=seen_from)
 
 
-def prepare_scan(scan: Mesh | np.ndarray, viewpoint: np.ndarray | None = None) -> ScanPoints:
+def prepare_scan(scan: View | Sequence[View], viewpoint: Any = None, masked: np.ndarray | None = None,
+                 metres: float = 1.0) -> ScanPoints:
     """Points and normals of a scan.
 
     Parameters
     ----------
-    scan : Mesh, or (n, 3) float, metres
-        A mesh brings its normals. For bare points they are estimated from neighbours and turned outward.
-    viewpoint : (3,) float, metres, optional
+    scan : Mesh, PointCloud, (n, 3) or (n, 6) float, metres, or a sequence of these
+        A sequence holds several views in one frame. A mesh brings its normals, as do a point cloud that has some
+        and the last three columns of six; where their sign is mixed they are turned outward. For bare points
+        normals are estimated from neighbours and turned outward.
+    viewpoint : (3,) float, metres, or one for each view, optional
         Where bare points were seen from; their normals are turned towards it.
+    masked : (n,) bool, optional
+        Points, one view after the other, that are clothing or hair.
+    metres : float
+        Of one unit of the scan and its viewpoints.
 
     Raises
     ------
     ValueError
-        Too few points, or points that are not finite.
+        Too few points, points that are not finite, a mask or viewpoints that do not fit the scan.
     """
-    points = scan.vertices if isinstance(scan, Mesh) else np.asarray(scan, dtype=np.float64)
-    if points.ndim != 2 or points.shape[1] != 3:
-        raise ValueError(f"scan: expected points of shape (n, 3), got {points.shape}")
+    views = [in_metres(view, metres) for view in as_views(scan)]
+    from_where = check_viewpoints(viewpoint, len(views), metres)
+    parts, start = [], 0
+    for number, view in enumerate(views):
+        name = "scan" if len(views) == 1 else f"scan: view {number}"
+        part = _prepare_view(view, None if from_where is None else from_where[number], name)
+        parts.append(replace(part, view=np.full(len(part.points), number), index=part.index + start))
+        start += point_count(view)
+    whole = parts[0] if len(parts) == 1 else _without_inner_borders(_joined(parts))
+    whole = replace(whole, viewpoints=from_where)
+    return whole if masked is None else _set_apart(whole, check_mask(masked, start))
+
+
+def as_views(scan: View | Sequence[View]) -> list[View]:
+    """The views of a scan: a list of one for a single mesh or cloud.
+
+    Raises
+    ------
+    ValueError
+        No view at all.
+    """
+    if isinstance(scan, Mesh | PointCloud | np.ndarray):
+        return [scan]
+    views = list(scan)
+    if not views:
+        raise ValueError("scan: expected at least one view, got none")
+    if all(isinstance(view, Mesh | PointCloud) or np.ndim(view) == 2 for view in views):
+        return [view if isinstance(view, Mesh | PointCloud) else np.asarray(view, dtype=np.float64) for view in views]
+    return [np.asarray(views, dtype=np.float64)]
+
+
+def point_count(view: View) -> int:
+    """Points of a view, also those that belong to no triangle."""
+    return len(view.vertices) if isinstance(view, Mesh) else len(view.points) if isinstance(view, PointCloud) \
+        else len(view)
+
+
+def in_metres(view: View, metres: float) -> View:
+    """A view times a factor; normals stay."""
+    if metres == 1:
+        return view
+    if isinstance(view, Mesh):
+        return view.with_vertices(metres * view.vertices)
+    if isinstance(view, PointCloud):
+        return replace(view, points=metres * view.points)
+    return np.hstack([metres * view[:, :3], view[:, 3:]])
+
+
+def all_points(scan: View | Sequence[View]) -> np.ndarray:
+    """(n, 3) the points of all views, one after the other, metres."""
+    return np.concatenate([_split(view, f"scan: view {i}")[0] for i, view in enumerate(as_views(scan))])
+
+
+def check_viewpoints(viewpoint: Any, views: int, metres: float = 1.0) -> np.ndarray | None:
+    """Viewpoints (views, 3), or None.
+
+    Raises
+    ------
+    ValueError
+        Neither one point nor one for each view.
+    """
+    if viewpoint is None:
+        return None
+    given = np.asarray(viewpoint, dtype=np.float64)
+    if given.shape not in ((3,), (views, 3)) or not np.isfinite(given).all():
+        raise ValueError(f"viewpoint: expected 3 finite numbers, or 3 for each of the {views} views, "
+                         f"got shape {given.shape}")
+    return metres * np.broadcast_to(given, (views, 3))
+
+
+def check_mask(masked: np.ndarray, count: int) -> np.ndarray:
+    """A mask (count,) bool.
+
+    Raises
+    ------
+    ValueError
+        Not one boolean for each point, or nothing left to match.
+    """
+    masked = np.asarray(masked)
+    if masked.dtype != bool or masked.shape != (count,):
+        raise ValueError(f"masked: expected {count} booleans, one for each point of the scan, "
+                         f"got {masked.dtype} of shape {masked.shape}")
+    if count - masked.sum() <= NEIGHBOURS:
+        raise ValueError(f"masked: expected more than {NEIGHBOURS} points that are not masked, "
+                         f"got {count - masked.sum()}")
+    return masked
+
+
+def _prepare_view(scan: View, viewpoint: np.ndarray | None, name: str) -> ScanPoints:
+    points, given = _split(scan, name)
     if len(points) <= NEIGHBOURS:
-        raise ValueError(f"scan: expected more than {NEIGHBOURS} points, got {len(points)}")
+        raise ValueError(f"{name}: expected more than {NEIGHBOURS} points, got {len(points)}")
     if not np.isfinite(points).all():
         bad = np.flatnonzero(~np.isfinite(points).all(axis=1))
-        raise ValueError(f"scan: {len(bad)} points are not finite, the first is point {bad[0]}")
+        raise ValueError(f"{name}: {len(bad)} points are not finite, the first is point {bad[0]}")
     distance, near = cKDTree(points).query(points, NEIGHBOURS, workers=-1)
     spacing = float(np.median(distance[:, 1:5].mean(axis=1)))
+    every = np.arange(len(points))
     if isinstance(scan, Mesh) and len(scan.faces):
         border = np.zeros(len(points), dtype=bool)
         border[scan.boundary_vertices] = True
         used = (scan.vertex_normals != 0).any(axis=1)
         if used.sum() <= NEIGHBOURS:
-            raise ValueError(f"scan: expected more than {NEIGHBOURS} vertices with triangles, got {used.sum()}")
-        return ScanPoints(points[used], scan.vertex_normals[used], border[used], spacing)
-    normals = _plane_normals(points, near)
-    if viewpoint is None:
-        normals = _turn_outward(points, normals, near, distance, 4 * spacing)
-    else:
+            raise ValueError(f"{name}: expected more than {NEIGHBOURS} vertices with triangles, got {used.sum()}")
+        return ScanPoints(points[used], scan.vertex_normals[used], border[used], spacing, 0 * every[used], every[used])
+    normals = plane_normals(points, near) if given is None else completed_normals(given, points, near)
+    if viewpoint is not None:
         normals = normals * np.where(np.einsum("nd,nd->n", normals, viewpoint - points) < 0, -1, 1)[:, None]
-    return ScanPoints(points, normals, np.zeros(len(points), dtype=bool), spacing)
+    elif given is None or not one_sign(normals, near):
+        normals = turn_outward(points, normals, near, distance, 4 * spacing)
+    return ScanPoints(points, normals, np.zeros(len(points), dtype=bool), spacing, 0 * every, every)
 
 
-def spread(points: np.ndarray, count: int) -> np.ndarray:
-    """Indices of about `count` points, one to each cell of a grid, so that they cover the whole evenly."""
-    extent = np.ptp(points, axis=0).max()
-    low, high = extent / 2048, extent
-    for _ in range(20):
-        cell = np.sqrt(low * high)
-        keys = np.floor((points - points.min(axis=0)) / cell).astype(np.int64)
-        _, first = np.unique(keys @ np.array([1, 4096, 4096**2]), return_index=True)
-        if len(first) > count:
-            low = cell
-        else:
-            high = cell
-        if abs(len(first) - count) <= 0.03 * count:
-            break
-    return np.sort(first)
+def _split(scan: View, name: str) -> tuple[np.ndarray, np.ndarray | None]:
+    """Points (n, 3), and normals (n, 3) where they are given."""
+    if isinstance(scan, Mesh):
+        return scan.vertices, None
+    given = None if not isinstance(scan, PointCloud) else scan.normals
+    points = np.asarray(scan.points if isinstance(scan, PointCloud) else scan, dtype=np.float64)
+    if points.ndim == 2 and points.shape[1] == 6 and not isinstance(scan, PointCloud):
+        points, given = points[:, :3], points[:, 3:]
+    if points.ndim != 2 or points.shape[1] != 3:
+        raise ValueError(f"{name}: expected points of shape (n, 3), or (n, 6) with normals, got {points.shape}")
+    if given is not None and np.shape(given) != points.shape:
+        raise ValueError(f"{name}: expected one normal for each of {len(points)} points, got {np.shape(given)}")
+    return points, None if given is None else np.asarray(given, dtype=np.float64)
 
 
-def _plane_normals(points: np.ndarray, near: np.ndarray) -> np.ndarray:
-    """Unit normals (n, 3), of either sign, of the planes through the neighbours of each point."""
-    around = points[near] - points[near].mean(axis=1, keepdims=True)
-    _, axes = np.linalg.eigh(np.swapaxes(around, 1, 2) @ around)
-    return axes[:, :, 0]
+def _joined(parts: Sequence[ScanPoints]) -> ScanPoints:
+    points, normals, border, view, index = (np.concatenate([getattr(part, name) for part in parts])
+                                            for name in ("points", "normals", "border", "view", "index"))
+    return ScanPoints(points, normals, border, float(np.median([part.spacing for part in parts])), view, index)
 
 
-def _turn_outward(points: np.ndarray, normals: np.ndarray, near: np.ndarray, distance: np.ndarray, reach: float
-                  ) -> np.ndarray:
-    """Normals of one sign along each connected patch, then each patch turned to its convex side."""
-    n = len(points)
-    a, b = np.repeat(np.arange(n), near.shape[1] - 1), near[:, 1:].ravel()
-    kept = distance[:, 1:].ravel() <= reach
-    a, b = a[kept], b[kept]
-    turn = 1.001 - np.abs(np.einsum("nd,nd->n", normals[a], normals[b]))
-    graph = coo_array((turn, (a, b)), shape=(n, n)).tocsr()
-    tree = minimum_spanning_tree(graph)
-    tree = tree + tree.T
-    patches, patch = connected_components(tree, directed=False)
-    out = normals.copy()
-    for root in np.unique(patch, return_index=True)[1]:
-        order, before = breadth_first_order(tree, root, directed=False)
-        for i in order[1:]:
-            if out[i] @ out[before[i]] < 0:
-                out[i] = -out[i]
-    coarse = points[spread(points, COARSE)] if n > COARSE else points
-    far, around = cKDTree(coarse).query(points, 48, distance_upper_bound=WIDE, workers=-1)
-    found = np.isfinite(far)
-    total = np.where(found[:, :, None], coarse[np.where(found, around, 0)] - points[:, None], 0).sum(axis=1)
-    bulge = -np.einsum("nd,nd->n", out, total)
-    sign = np.where(np.bincount(patch, bulge, patches) < 0, -1.0, 1.0)
-    return out * sign[patch][:, None]
+def _without_inner_borders(scan: ScanPoints) -> ScanPoints:
+    """A border of one view is none where another view goes on."""
+    border = scan.border.copy()
+    for number in np.unique(scan.view[border]):
+        mine = np.flatnonzero(border & (scan.view == number))
+        others = scan.points[(scan.view != number) & ~scan.border]
+        if len(others):
+            border[mine] = cKDTree(others).query(scan.points[mine])[0] > 2 * scan.spacing
+    return replace(scan, border=border)
+
+
+def _set_apart(scan: ScanPoints, masked: np.ndarray) -> ScanPoints:
+    out = masked[scan.index]
+    return replace(scan.some(~out), masked=scan.some(out)) if out.any() else scan

@@ -54,8 +54,14 @@ class CompletionConfig:
     silhouette_tolerance : float, metres
     contact_weight : float
         The same for a vertex that stands inside another part of the body.
-    viewpoint : (3,) floats, metres, optional
+    viewpoint : (3,) floats, metres, or one for each view, optional
         Where the scan was seen from; found by itself when not given.
+    cover_weight : float
+        The same for a vertex that sticks out of clothing or hair, of which `complete` is told.
+    ignored_parts : names of parts
+        Parts of the body that the scan says nothing about, though it may show something there.
+    free_scale : bool
+        The unit of the scan is not known: one factor is found together with pose, place and shape.
     """
 
     surface_weight: float = 1.0
@@ -80,4 +86,7 @@ class CompletionConfig:
     silhouette_weight: float = 0.5
     silhouette_tolerance: float = 0.03
     contact_weight: float = 0.5
-    viewpoint: tuple[float, float, float] | None = None
+    viewpoint: tuple[float, float, float] | tuple[tuple[float, float, float], ...] | None = None
+    cover_weight: float = 1.0
+    ignored_parts: tuple[str, ...] = ()
+    free_scale: bool = False

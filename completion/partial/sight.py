@@ -1,6 +1,7 @@
-"""What one camera must have seen is evidence too: nothing stands beside or in front of what it saw."""
+"""What cameras must have seen is evidence too: nothing stands beside or in front of what one of them saw."""
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
 
@@ -64,6 +65,44 @@ class Sight:
         normal = np.where(outside[:, None], beside / np.maximum(wide, 1e-12)[:, None], -away / far[:, None])
         excess = np.maximum(np.where(outside, wide, ahead) - tolerance, 0)
         return excess, normal, vertices - excess[:, None] * normal
+
+
+@dataclass(frozen=True, eq=False)
+class Sights:
+    """A scan as several cameras saw it.
+
+    Attributes
+    ----------
+    cameras : Sight of each view whose viewpoint is known
+    """
+
+    cameras: tuple[Sight, ...]
+
+    @property
+    def points(self) -> np.ndarray:
+        """(n, 3) what all of them saw, metres."""
+        return np.concatenate([camera.points for camera in self.cameras])
+
+    def trespass(self, vertices: np.ndarray, tolerance: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """As `Sight.trespass`: what one camera denies is denied, by the one that objects most."""
+        found = [camera.trespass(vertices, tolerance) for camera in self.cameras]
+        worst = np.argmax([excess for excess, _, _ in found], axis=0)
+        each = np.arange(len(vertices))
+        excess, normal, target = (np.stack(part)[worst, each] for part in zip(*found, strict=True))
+        return excess, normal, target
+
+
+def find_sights(cloud: ScanPoints) -> Sight | Sights | None:
+    """What the camera saw, or those of all views, or None when no view has a viewpoint.
+
+    What is masked was seen too.
+    """
+    seen = cloud.everything
+    views = [seen.some(seen.view == number) for number in range(cloud.views)]
+    given: Sequence[np.ndarray | None] = [None] * len(views) if cloud.viewpoints is None else list(cloud.viewpoints)
+    found = [find_sight(view, place) for view, place in zip(views, given, strict=True) if len(view.points)]
+    cameras = tuple(sight for sight in found if sight is not None)
+    return None if not cameras else cameras[0] if len(cameras) == 1 else Sights(cameras)
 
 
 def find_sight(cloud: ScanPoints, viewpoint: np.ndarray | None = None, share: float = 0.97) -> Sight | None:

@@ -1,0 +1,92 @@
+"""What a user gives, checked and brought into metres."""
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+
+from scanprep.geometry.mesh import Mesh
+
+from ..bodies import FixedBody
+from .scale import landmark_scale, rough_scale
+from .scan import ScanPoints, View, all_points, check_mask, prepare_scan
+from .settings import CompletionConfig
+
+
+@dataclass(frozen=True, eq=False)
+class Given:
+    """A scan and its landmarks.
+
+    Attributes
+    ----------
+    cloud : ScanPoints
+    vertices : (L,) int
+    points : (L, 3) float, metres
+        The landmarks.
+    metres : float
+        Of one unit of the scan as it was given.
+    """
+
+    cloud: ScanPoints
+    vertices: np.ndarray
+    points: np.ndarray
+    metres: float = 1.0
+
+    def scaled(self, factor: float) -> Given:
+        """All lengths times a factor."""
+        return replace(self, cloud=self.cloud.scaled(factor), points=factor * self.points,
+                       metres=factor * self.metres)
+
+
+def in_metres(body: FixedBody, scan: View | Sequence[View], landmarks: tuple[np.ndarray, np.ndarray] | None,
+              masked: np.ndarray | None, config: CompletionConfig) -> Given:
+    """A scan made ready for matching; of unknown scale, as nearly in metres as can be told before the fit.
+
+    Raises
+    ------
+    ValueError
+        A scan, landmarks or a mask that cannot be used.
+    """
+    metres = 1.0
+    if config.free_scale:
+        every = all_points(scan)
+        bare = every if masked is None else every[~check_mask(masked, len(every))]
+        metres = rough_scale(body, bare)
+    vertices, points = np.zeros(0, dtype=np.int64), np.zeros((0, 3))
+    if landmarks is not None:
+        vertices, points = check_landmarks((landmarks[0], metres * np.asarray(landmarks[1])), body.template)
+    given = Given(prepare_scan(scan, config.viewpoint, masked, metres), vertices, points, metres)
+    if config.free_scale and len(vertices):
+        return given.scaled(landmark_scale(body, vertices, points, config))
+    return given
+
+
+def check_landmarks(landmarks: tuple[np.ndarray, np.ndarray], template: Mesh) -> tuple[np.ndarray, np.ndarray]:
+    """Landmark vertices (L,) and points (L, 3) as arrays.
+
+    Raises
+    ------
+    ValueError
+        Fewer than 3, lists of different length, vertices that do not exist, points that are not finite or of
+        another scale than the template.
+    """
+    count = len(template.vertices)
+    vertices, points = (np.asarray(part) for part in landmarks)
+    if vertices.ndim != 1 or points.shape != (len(vertices), 3):
+        raise ValueError(f"landmarks: expected (L,) vertices and (L, 3) points, got {vertices.shape} "
+                         f"and {points.shape}")
+    if len(np.unique(vertices)) < 3:
+        raise ValueError(f"landmarks: expected at least 3 different ones, got {len(np.unique(vertices))}")
+    if not np.issubdtype(vertices.dtype, np.integer):
+        raise ValueError("landmarks: expected vertex numbers")
+    if vertices.min() < 0 or vertices.max() >= count:
+        raise ValueError(f"landmarks: expected vertices of 0..{count - 1}, "
+                         f"got {vertices.min()}..{vertices.max()}")
+    if not np.isfinite(points).all():
+        raise ValueError("landmarks: expected finite points")
+    extent, whole = (float(np.ptp(p, axis=0).max()) for p in (points, template.vertices))
+    if not whole / 100 < extent < 5 * whole:
+        raise ValueError(f"landmarks: they extend over {extent:.3g} m, the template over {whole:.3g} m; "
+                         "expected the scan in metres")
+    return vertices.astype(np.int64), points.astype(np.float64)

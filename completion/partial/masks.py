@@ -1,0 +1,192 @@
+"""Clothing and hair: points that hide the body, and the files that say which they are; parts that are left out."""
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from scanprep.console import read_json
+from scanprep.geometry.files import read_points
+from scanprep.geometry.mesh import Mesh
+from scanprep.geometry.surface import OrientedPoints
+from scanprep.skeleton.tree import Skeleton
+
+from .scan import ScanPoints
+
+REACH = 0.10                         # metres that hair or a skirt may stand off the skin
+GREY = 0.1                           # least difference of two channels of a colour that marks
+NEAR = 0.001                         # metres from a point of a marked file to the point of the scan it means
+
+
+class Cover:
+    """What lies over the skin: the body is inside it.
+
+    Parameters
+    ----------
+    scan : ScanPoints
+        The points of clothing and hair.
+    tolerance : float, metres
+        How far skin may stick out, for noise.
+    """
+
+    def __init__(self, scan: ScanPoints, tolerance: float = 0.003) -> None:
+        self.scan, self.tolerance = scan, tolerance
+        self._near = OrientedPoints(scan.points, scan.normals)
+
+    def trespass(self, places: np.ndarray, normals: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """How far vertices stick out of it.
+
+        Parameters
+        ----------
+        places, normals : (n, 3) float
+
+        Returns
+        -------
+        (n,) float, metres
+            Beyond the tolerance; zero inside, and where no clothing is.
+        (n, 3) float
+            Normal of the plane to reach.
+        (n, 3) float, metres
+            A point of that plane.
+        """
+        found = self._near.match(places, normals, REACH, 0.3)
+        normal = self.scan.normals[found.index]
+        off = places - self.scan.points[found.index]
+        out = np.einsum("nd,nd->n", off, normal)
+        beside = np.sqrt(np.maximum((off**2).sum(axis=1) - out**2, 0))
+        over = found.valid & (beside < 2 * self.scan.spacing + 0.3 * np.abs(out))
+        depth = np.where(over, np.maximum(out - self.tolerance, 0), 0.0)
+        return depth, normal, places - depth[:, None] * normal
+
+
+def part_vertices(template: Mesh, skeleton: Skeleton, names: Sequence[str]) -> np.ndarray:
+    """(N,) bool: vertices of the parts of these names.
+
+    Raises
+    ------
+    ValueError
+        A part that the body has not, or all of its parts.
+    """
+    unknown = [name for name in names if name not in skeleton.names]
+    if unknown:
+        raise ValueError(f"ignored_parts: expected names of {', '.join(skeleton.names)}; got {', '.join(unknown)}")
+    if names and set(names) == set(skeleton.names):
+        raise ValueError("ignored_parts: expected to leave some parts of the body to match, got all of them")
+    numbers = [skeleton.names.index(name) for name in names]
+    return np.isin(skeleton.part_of_vertex(template), numbers)
+
+
+def read_mask(path: str | Path, points: np.ndarray, unit: str | None = None) -> np.ndarray:
+    """Which points of a scan a file marks.
+
+    Parameters
+    ----------
+    path : path
+        `.npy`, `.json` or `.txt` with one true, false, 1 or 0 for each point, or with the numbers of the marked
+        points; or a mesh or point cloud (PLY, PCD, OBJ, GLB) with points of the scan, where those are marked that
+        have a colour and not a grey: paint clothing in a colour over white, as MeshLab and Blender do.
+    points : (n, 3) float, metres
+        Of the scan, one view after the other.
+    unit : 'm', 'mm', 'cm' or 'in', optional
+        Of a mesh or cloud.
+
+    Returns
+    -------
+    (n,) bool
+
+    Raises
+    ------
+    ValueError
+        A file that is missing or holds something else: file, line or element, what was expected, what came.
+    """
+    path = Path(path)
+    ending = path.suffix.lower()
+    if ending == ".npy":
+        return _marked(path, _load(path), len(points))
+    if ending == ".json":
+        found = read_json(path, "booleans or numbers of points")
+        if not isinstance(found, list):
+            raise ValueError(f"{path}: expected a list of booleans or of numbers of points, "
+                             f"found {type(found).__name__}")
+        return _marked(path, _plain(path, found, "element"), len(points))
+    if ending == ".txt":
+        return _marked(path, _words(path), len(points))
+    return _painted(path, points, unit)
+
+
+def _load(path: Path) -> np.ndarray:
+    try:
+        return np.asarray(np.load(path, allow_pickle=False))
+    except FileNotFoundError:
+        raise ValueError(f"{path}: no such file") from None
+    except (ValueError, EOFError, OSError) as error:
+        raise ValueError(f"{path}: expected an array of NumPy, cannot read it ({error})") from None
+
+
+def _plain(path: Path, values: Sequence[Any], what: str) -> np.ndarray:
+    """Booleans, or whole numbers, as an array of one type."""
+    if values and all(isinstance(value, bool) for value in values):
+        return np.array(values, dtype=bool)
+    for i, value in enumerate(values):
+        if isinstance(value, bool) or not isinstance(value, int):
+            raise ValueError(f"{path}: {what} {i}: expected the number of a point, or true or false for every one, "
+                             f"found {value!r}")
+    return np.array(values, dtype=np.int64)
+
+
+def _words(path: Path) -> np.ndarray:
+    try:
+        lines = path.read_text(encoding="utf-8").splitlines()
+    except FileNotFoundError:
+        raise ValueError(f"{path}: no such file") from None
+    except (OSError, UnicodeDecodeError) as error:
+        raise ValueError(f"{path}: expected text, cannot read it ({error})") from None
+    known: dict[str, bool] = {"true": True, "false": False}
+    values: list[bool | int] = []
+    for number, line in enumerate(lines, 1):
+        for word in line.split("#", 1)[0].replace(",", " ").split():
+            if word.lower() not in known and not word.isdigit():
+                raise ValueError(f"{path}: line {number}: expected numbers of points, or true and false, "
+                                 f"found {word[:40]!r}")
+            values.append(known[word.lower()] if word.lower() in known else int(word))
+    return _plain(path, values, "word")
+
+
+def _marked(path: Path, values: np.ndarray, count: int) -> np.ndarray:
+    if values.ndim != 1:
+        raise ValueError(f"{path}: expected one row of values, found an array of shape {values.shape}")
+    if values.dtype == bool or (len(values) == count and len(values) > 2 and set(np.unique(values)) <= {0, 1}):
+        if len(values) != count:
+            raise ValueError(f"{path}: expected {count} values, one for each point of the scan, "
+                             f"found {len(values)}")
+        return values.astype(bool)
+    if len(values) and not np.issubdtype(values.dtype, np.integer):
+        raise ValueError(f"{path}: expected booleans or numbers of points, found values of type {values.dtype}")
+    bad = np.flatnonzero((values < 0) | (values >= count))
+    if len(bad):
+        raise ValueError(f"{path}: element {bad[0]}: expected a point of 0..{count - 1}, found {values[bad[0]]}")
+    out = np.zeros(count, dtype=bool)
+    out[values.astype(np.int64)] = True
+    return out
+
+
+def _painted(path: Path, points: np.ndarray, unit: str | None) -> np.ndarray:
+    """The points nearest to the coloured ones of a file."""
+    cloud = read_points(path, unit)
+    if cloud.colors is None:
+        raise ValueError(f"{path}: expected colours, those of clothing other than grey; found none")
+    coloured = np.ptp(cloud.colors, axis=1) > GREY
+    if len(cloud.points) == len(points) and np.allclose(cloud.points, points, atol=NEAR):
+        return coloured
+    far, near = cKDTree(points).query(cloud.points[coloured])
+    off = np.flatnonzero(far > NEAR)
+    if len(off):
+        which = np.flatnonzero(coloured)[off[0]]
+        raise ValueError(f"{path}: point {which}: expected the points of the scan, this one is "
+                         f"{1000 * far[off[0]]:.1f} mm from the nearest of them")
+    out = np.zeros(len(points), dtype=bool)
+    out[near] = True
+    return out

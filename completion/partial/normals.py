@@ -1,0 +1,79 @@
+"""Normals of points: estimated, completed, turned outward."""
+from __future__ import annotations
+
+import numpy as np
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import breadth_first_order, connected_components, minimum_spanning_tree
+from scipy.spatial import cKDTree
+
+COARSE = 2000                        # points that show the form at large
+WIDE = 0.12                          # metres: at this scale a body is convex enough to tell in from out
+AGREE = 0.95                         # share of neighbours that must agree for given normals to be of one sign
+
+
+def spread(points: np.ndarray, count: int) -> np.ndarray:
+    """Indices of about `count` points, one to each cell of a grid, so that they cover the whole evenly."""
+    extent = np.ptp(points, axis=0).max()
+    low, high = extent / 2048, extent
+    for _ in range(20):
+        cell = np.sqrt(low * high)
+        keys = np.floor((points - points.min(axis=0)) / cell).astype(np.int64)
+        _, first = np.unique(keys @ np.array([1, 4096, 4096**2]), return_index=True)
+        if len(first) > count:
+            low = cell
+        else:
+            high = cell
+        if abs(len(first) - count) <= 0.03 * count:
+            break
+    return np.sort(first)
+
+
+def plane_normals(points: np.ndarray, near: np.ndarray) -> np.ndarray:
+    """Unit normals (n, 3), of either sign, of the planes through the neighbours of each point."""
+    around = points[near] - points[near].mean(axis=1, keepdims=True)
+    _, axes = np.linalg.eigh(np.swapaxes(around, 1, 2) @ around)
+    return axes[:, :, 0]
+
+
+def completed_normals(given: np.ndarray, points: np.ndarray, near: np.ndarray) -> np.ndarray:
+    """Unit normals (n, 3): those given, and where one is zero or not finite that of the neighbours' plane."""
+    length = np.linalg.norm(given, axis=1)
+    good = np.isfinite(length) & (length > 1e-9)
+    normals = np.where(good[:, None], given / np.where(good, length, 1)[:, None], 0.0)
+    if not good.all():
+        plane = plane_normals(points, near[~good])
+        around = normals[near[~good]].sum(axis=1)
+        normals[~good] = plane * np.where(np.einsum("nd,nd->n", plane, around) < 0, -1, 1)[:, None]
+    return normals
+
+
+def one_sign(normals: np.ndarray, near: np.ndarray) -> bool:
+    """Whether given normals were oriented: many programs estimate them and leave their sign to chance."""
+    return float((np.einsum("nd,nd->n", normals, normals[near[:, 1]]) > 0).mean()) > AGREE
+
+
+def turn_outward(points: np.ndarray, normals: np.ndarray, near: np.ndarray, distance: np.ndarray, reach: float
+                  ) -> np.ndarray:
+    """Normals of one sign along each connected patch, then each patch turned to its convex side."""
+    n = len(points)
+    a, b = np.repeat(np.arange(n), near.shape[1] - 1), near[:, 1:].ravel()
+    kept = distance[:, 1:].ravel() <= reach
+    a, b = a[kept], b[kept]
+    turn = 1.001 - np.abs(np.einsum("nd,nd->n", normals[a], normals[b]))
+    graph = coo_array((turn, (a, b)), shape=(n, n)).tocsr()
+    tree = minimum_spanning_tree(graph)
+    tree = tree + tree.T
+    patches, patch = connected_components(tree, directed=False)
+    out = normals.copy()
+    for root in np.unique(patch, return_index=True)[1]:
+        order, before = breadth_first_order(tree, root, directed=False)
+        for i in order[1:]:
+            if out[i] @ out[before[i]] < 0:
+                out[i] = -out[i]
+    coarse = points[spread(points, COARSE)] if n > COARSE else points
+    far, around = cKDTree(coarse).query(points, 48, distance_upper_bound=WIDE, workers=-1)
+    found = np.isfinite(far)
+    total = np.where(found[:, :, None], coarse[np.where(found, around, 0)] - points[:, None], 0).sum(axis=1)
+    bulge = -np.einsum("nd,nd->n", out, total)
+    sign = np.where(np.bincount(patch, bulge, patches) < 0, -1.0, 1.0)
+    return out * sign[patch][:, None]
