@@ -6,12 +6,18 @@ import numpy as np
 from ..starts import distinct, search
 from .draws import around, limbs, near_points, quick_misfits, redrawn
 from .fit import ScanFit
+from .search import from_nothing
 
 COARSE = (0.25, 0.2, 0.15, 0.12, 0.1)    # metres: reaches of the first rounds, on few points
 DOUBT = 0.012                        # share of scan or body that may be in the wrong place for no reason
 MANY = 6                             # times as many draws of a limb are compared with what is unexplained
 PROMISING = 30.0                     # a limb drawn at random may be this much worse before it is fitted
 BETTER = 5.0                         # by how much the misfit must fall for a limb to be moved
+
+
+def first_starts(fit: ScanFit) -> np.ndarray:
+    """Bodies (n, P) to start from: those that meet the landmarks, or, without any, typical poses on the scan."""
+    return from_landmarks(fit) if len(fit.vertices) else from_nothing(fit)
 
 
 def from_landmarks(fit: ScanFit) -> np.ndarray:
