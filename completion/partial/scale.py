@@ -140,4 +140,3 @@ def landmark_scale(body: FixedBody, vertices: np.ndarray, points: np.ndarray, co
         found = minimise(energies(stiff), x, MinimiseConfig(iterations=8, tolerance=1e-3))
         x = found.x
     return float(np.exp(LOOSE * x[np.argmin(found.energy), -1]))
-
