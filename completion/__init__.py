@@ -7,6 +7,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from .animation.follow import AnimateConfig, animate
+    from .animation.stream import Frame, MarkerStream
     from .markers.files import MarkerSequence, read_markers, write_markers
     from .markers.layout import MarkerLayout
     from .motion import Motion
@@ -15,6 +16,7 @@ if TYPE_CHECKING:
 
 _ROOMS = {
     "animation.follow": ("AnimateConfig", "animate"),
+    "animation.stream": ("Frame", "MarkerStream"),
     "markers.files": ("MarkerSequence", "read_markers", "write_markers"),
     "markers.layout": ("MarkerLayout",),
     "motion": ("Motion",),
@@ -23,8 +25,8 @@ _ROOMS = {
 }
 _ROOM_OF = {name: room for room, names in _ROOMS.items() for name in names}
 
-__all__ = ["AnimateConfig", "Completion", "CompletionConfig", "MarkerLayout", "MarkerSequence", "Motion", "animate",
-           "complete", "read_markers", "write_markers"]
+__all__ = ["AnimateConfig", "Completion", "CompletionConfig", "Frame", "MarkerLayout", "MarkerSequence", "MarkerStream",
+           "Motion", "animate", "complete", "read_markers", "write_markers"]
 
 
 def __getattr__(name: str) -> Any:

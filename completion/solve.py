@@ -9,6 +9,8 @@ import numpy as np
 from .energy import Residual
 
 Energy = Callable[[np.ndarray], Sequence[Residual]]
+System = Callable[[np.ndarray], tuple[np.ndarray, np.ndarray, np.ndarray]]
+Move = Callable[[np.ndarray, np.ndarray], np.ndarray]
 
 
 @dataclass(frozen=True)
@@ -40,12 +42,15 @@ class Minimum:
     energy : (B,) float
     converged : (B,) bool
     iterations : int
+    hessian : (B, P, P) float
+        The Gauss-Newton matrix at x.
     """
 
     x: np.ndarray
     energy: np.ndarray
     converged: np.ndarray
     iterations: int
+    hessian: np.ndarray
 
 
 def minimise(energy: Energy, start: np.ndarray, config: MinimiseConfig | None = None) -> Minimum:
@@ -56,9 +61,22 @@ def minimise(energy: Energy, start: np.ndarray, config: MinimiseConfig | None = 
     energy : x (B, P) -> residuals with leading dimension B
     start : (B, P) float
     """
+    return descend(lambda x: normal_equations(energy(x)), start, config)
+
+
+def descend(system: System, start: np.ndarray, config: MinimiseConfig | None = None, move: Move = np.add) -> Minimum:
+    """`minimise` for those who make the normal equations themselves, and whose unknowns need not add.
+
+    Parameters
+    ----------
+    system : x (B, P) -> energy (B,), half its gradient (B, P), Gauss-Newton matrix (B, P, P)
+    start : (B, P) float
+    move : x (B, P), step (B, P) -> x (B, P)
+        What a step does to the unknowns.
+    """
     config = config or MinimiseConfig()
     x = np.array(start, dtype=np.float64)
-    cost, gradient, hessian = normal_equations(energy(x))
+    cost, gradient, hessian = system(x)
     damping = np.full(len(x), config.damping)
     converged = np.zeros(len(x), dtype=bool)
     done = 0
@@ -68,15 +86,16 @@ def minimise(energy: Energy, start: np.ndarray, config: MinimiseConfig | None = 
         ridge = damping[:, None] * diagonal + 1e-9 * diagonal.max(axis=1, keepdims=True)
         step = -np.linalg.solve(hessian + ridge[:, :, None] * np.eye(x.shape[1]), gradient[..., None])[..., 0]
         step[converged] = 0
-        tried = normal_equations(energy(x + step))
+        ahead = move(x, step)
+        tried = system(ahead)
         better = (tried[0] < cost) & ~converged
         settled = np.abs(cost - tried[0]) <= config.tolerance * np.maximum(cost, 1e-300)
         converged |= settled | (damping > 1e8)
-        x[better] += step[better]
+        x[better] = ahead[better]
         for old, new in zip((cost, gradient, hessian), tried, strict=True):
             old[better] = new[better]
         damping = np.where(better, np.maximum(damping / 5, 1e-9), damping * 8)
-    return Minimum(x, cost, converged, done)
+    return Minimum(x, cost, converged, done, hessian)
 
 
 def normal_equations(residuals: Sequence[Residual]) -> tuple[np.ndarray, np.ndarray, np.ndarray]:

@@ -1,13 +1,16 @@
 import numpy as np
 import pytest
 from completion_bodies import MEAN, worm_with_prior
+from scipy.linalg import block_diag
 
 from completion import energy
-from completion.animation.follow import AnimateConfig, MarkerFollower, animate, supports
-from completion.animation.smooth import _local, _second_differences, smooth_sequence
+from completion.animation.follow import AnimateConfig, MarkerFollower, animate
+from completion.animation.marked import supports
+from completion.animation.smooth import smooth_sequence
 from completion.markers.files import MarkerSequence
 from completion.markers.layout import MarkerLayout
 from completion.motion import Motion
+from scanprep.geometry import rotations
 from scanprep.geometry.storage import StorageError
 
 FRAMES = 60
@@ -40,6 +43,11 @@ def walk(subject, layout):
 
 def surface_error(subject, motion, meshes):
     return np.linalg.norm(motion.vertices(subject) - meshes, axis=2).mean(axis=1)
+
+
+def by_small_turns(x):
+    """Derivative (P, P) of unknowns by turns of the joints from the right."""
+    return block_diag(*rotations.inverse_right_jacobian(x[:-3].reshape(-1, 3)), np.eye(3))
 
 
 def changed(sequence, positions):
@@ -109,12 +117,13 @@ def test_one_smoothing_step_is_the_dense_gauss_newton_step(subject, layout, walk
                  energy.pose_prior(at, follower.prior, PLAIN.prior_weight)]
         for term in terms:
             block = np.zeros((term.values.size, 75))
-            block[:, 15 * t:15 * t + 15] = term.jacobian[0] @ _local(x)[t]
+            block[:, 15 * t:15 * t + 15] = term.jacobian[0] @ by_small_turns(x[t])
             rows.append(block)
             values.append(term.values[0])
     D = np.kron(np.array([[1, -2, 1, 0, 0], [0, 1, -2, 1, 0], [0, 0, 1, -2, 1.0]]), np.diag(np.sqrt(follower.inertia)))
     rows.append(D)
-    values.append((np.sqrt(follower.inertia) * _second_differences(x)).ravel())
+    velocity = follower.body.step_to(x[:-1], x[1:])
+    values.append((np.sqrt(follower.inertia) * np.diff(velocity, axis=0)).ravel())
     step = -np.linalg.lstsq(np.vstack(rows), np.concatenate(values), rcond=None)[0].reshape(5, 15)
     got = smooth_sequence(follower, x)
     np.testing.assert_allclose(got[:, -3:] - x[:, -3:], step[:, -3:], atol=1e-5)

@@ -1,0 +1,65 @@
+"""What may be chosen when markers are followed."""
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+
+@dataclass(frozen=True)
+class AnimateConfig:
+    """Settings of `animate` and `MarkerStream`.
+
+    Attributes
+    ----------
+    marker_sd : float, metres
+        How far a marker lies from where the body would put it.
+    outlier : float, metres
+        Residual at which a marker has lost three quarters of its weight, at least; on a body that fits badly
+        it is three times the median residual.
+    prior_weight : float
+        Factor on the pose prior: small, it speaks for joints that no marker sees.
+    prior_shrinkage : float in [0, 1]
+        See `gaussian_prior`.
+    start_axes : int
+        Directions of the training poses along which the first frame is searched.
+    prediction : "velocity" or "kalman"
+        What a frame is expected to be: the one before, moved on at its velocity and held by how strongly
+        joints accelerate; or a Kalman filter, whose uncertainty remembers what the markers have told.
+    angle_acceleration : float, radians per second squared
+        How strongly joints accelerate, as a standard deviation.
+    place_acceleration : float, metres per second squared
+        The same for the place.
+    momentum : float in [0, 1]
+        Share of the velocity that the prediction keeps.
+    iterations : int
+        Most steps for a frame.
+    lost : float, metres
+        Median residual of a frame above which it is searched anew.
+    key_interval : float, seconds
+        Between the frames of a whole sequence that are solved one after the other; the others begin between them.
+    smoothing : int
+        Rounds over the whole sequence; 0 leaves the frame-by-frame solution.
+    low_pass : float, hertz
+        Cut-off of a Butterworth filter without lag on the result; 0 is none.
+    ground : bool
+        Feet do not sink into the floor and do not slide while they stand on it.
+    floor : four numbers, optional
+        A unit normal that points up, and the height of the floor along it, metres; else both come from the motion.
+    """
+
+    marker_sd: float = 0.01
+    outlier: float = 0.06
+    prior_weight: float = 0.3
+    prior_shrinkage: float = 0.3
+    start_axes: int = 6
+    prediction: Literal["velocity", "kalman"] = "velocity"
+    angle_acceleration: float = 60.0
+    place_acceleration: float = 15.0
+    momentum: float = 0.9
+    iterations: int = 3
+    lost: float = 0.08
+    key_interval: float = 0.1
+    smoothing: int = 2
+    low_pass: float = 0.0
+    ground: bool = False
+    floor: tuple[float, float, float, float] | None = None

@@ -1,0 +1,200 @@
+"""Markers as they come: one frame in, one pose out, from nothing but the frames before."""
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from functools import partial
+
+import numpy as np
+
+from model.linear import Subject
+
+from ..markers.layout import MarkerLayout
+from ..solve import MinimiseConfig, Minimum, descend
+from ..starts import search
+from .marked import MarkedBody, System
+from .prediction import make_prediction
+from .settings import AnimateConfig
+from .trust import LabelWatch, distances_apart, marker_weights
+
+STARTS = 2                           # of a search that are followed to their end
+ENOUGH = 0.5                         # share of the markers that a search wants
+PATIENCE = 0.25                      # seconds between two searches
+SETTLED = MinimiseConfig(iterations=30)
+
+
+@dataclass(frozen=True, eq=False)
+class Frame:
+    """What one frame of markers tells.
+
+    Attributes
+    ----------
+    pose : (J, 3) float, radians
+        NaN as long as no frame has shown enough markers to begin with.
+    trans : (3,) float, metres
+    residuals : (L,) float, metres
+        Distance of each marker from where the body puts it; NaN where it was not seen or is in no layout.
+    trusted : (L,) bool
+        Seen, and believed under its own label.
+    converged : bool
+        The solution settled.
+    """
+
+    pose: np.ndarray
+    trans: np.ndarray
+    residuals: np.ndarray
+    trusted: np.ndarray
+    converged: bool
+
+
+class MarkerStream:
+    """The motion of a body from markers, frame by frame as they arrive.
+
+    Parameters
+    ----------
+    subject : Subject
+        The person, of known shape.
+    layout : MarkerLayout
+        Where on the body the markers sit.
+    labels : strings
+        Of the markers that `push` will be given, in this order; those that the layout does not know are left out.
+    rate : float, frames per second
+    config : AnimateConfig, optional
+
+    Raises
+    ------
+    ValueError
+        Fewer than 3 labels in the layout, a layout of another body, a rate that is not above zero, settings
+        that need later frames.
+
+    [SCAPE] §8
+    """
+
+    def __init__(self, subject: Subject, layout: MarkerLayout, labels: Sequence[str], rate: float,
+                 config: AnimateConfig | None = None) -> None:
+        config = config or AnimateConfig()
+        if config.ground or config.low_pass:
+            raise ValueError("config: expected ground=False and low_pass=0 for a stream, both need later frames")
+        if not rate > 0:
+            raise ValueError(f"rate: expected a number above 0, got {rate}")
+        known = layout.matched(labels)
+        self.rows = np.array([list(labels).index(label) for label in known])
+        self.n_labels = len(labels)
+        body = MarkedBody(subject, layout.select(known), config.prior_weight, config.prior_shrinkage)
+        self.tracker = Tracker(body, config, rate)
+
+    def push(self, positions: np.ndarray) -> Frame:
+        """The next frame.
+
+        Parameters
+        ----------
+        positions : (L, 3) float, metres
+            NaN where a marker is out of sight.
+        """
+        positions = np.asarray(positions, dtype=np.float64)
+        if positions.shape != (self.n_labels, 3):
+            raise ValueError(f"positions: expected shape ({self.n_labels}, 3), got {positions.shape}")
+        x, settled = self.tracker.push(positions[self.rows])
+        residuals, trusted = np.full(self.n_labels, np.nan), np.zeros(self.n_labels, dtype=bool)
+        pose, trans, _ = self.tracker.body.body.split(x)
+        if np.isfinite(x).all():
+            residuals[self.rows], trusted[self.rows] = self.tracker.judge(x, positions[self.rows])
+        return Frame(pose, trans, residuals, trusted, settled)
+
+
+class Tracker:
+    """The state of a stream of markers (L, 3) that all belong to the body.
+
+    Parameters
+    ----------
+    body : MarkedBody
+    config : AnimateConfig
+    rate : float, frames per second
+    """
+
+    def __init__(self, body: MarkedBody, config: AnimateConfig, rate: float) -> None:
+        self.body, self.config, self.rate = body, config, rate
+        self.watch = LabelWatch(body.count, config.outlier)
+        self.prediction = make_prediction(body, config, rate)
+        self.wait, self.started = 0, False
+
+    def begin(self, x: np.ndarray) -> None:
+        """Continue from these unknowns (P,), at rest."""
+        self.prediction.begin(x)
+        self.watch.forget()
+        self.started = True
+
+    def push(self, targets: np.ndarray) -> tuple[np.ndarray, bool]:
+        """Unknowns (P,) of the next frame, NaN before the first that could be solved, and whether it settled."""
+        there = int((~np.isnan(targets[:, 0])).sum())
+        self.wait = max(0, self.wait - 1)
+        if not self.started:
+            if there < max(3, ENOUGH * self.body.count):
+                return np.full(self.body.n_unknowns, np.nan), False
+            self.begin(self.search(targets))
+        expected, information = self.prediction.expect()
+        if not there:
+            self.prediction.update(expected, 0 * information)
+            return expected, False
+        targets = targets[self.watch.update(self.body.positions(expected), targets)]
+        end = self.solve(targets, expected, information)
+        miss = self._miss(end.x[0], targets)
+        if miss > self.config.lost and not self.wait and there >= max(3, ENOUGH * self.body.count):
+            self.wait = round(PATIENCE * self.rate)
+            found = self.search(targets)
+            if self._miss(found, targets) < 0.7 * miss:
+                self.begin(found)
+                return found, True
+        self.prediction.update(end.x[0], end.hessian[0] - information)
+        return end.x[0], bool(end.converged[0])
+
+    def solve(self, targets: np.ndarray, expected: np.ndarray, information: np.ndarray) -> Minimum:
+        """The best unknowns of a frame near the expected ones."""
+        config, body = self.config, self.body
+        weights, _ = marker_weights(body.positions(expected), targets, config.marker_sd, config.outlier)
+
+        def system(x: np.ndarray) -> System:
+            cost, gradient, hessian = body.system(x, targets[None], weights[None])
+            step = body.step_to(expected, x[0])
+            pull = information @ step
+            return cost + step @ pull, gradient + pull, hessian + information
+
+        return descend(system, expected[None], MinimiseConfig(config.iterations, 1e-4, 1e-2), body.retract)
+
+    def search(self, targets: np.ndarray) -> np.ndarray:
+        """Unknowns (P,) of a frame from nothing but its markers."""
+        config, body = self.config, self.body
+        x, _ = search(body.body, body.follow, targets, config.marker_sd, body.prior, config.start_axes)
+        x = x[:STARTS]
+        weights = np.full(body.count, config.marker_sd**-2)
+        for _ in range(2):                                              # with all markers, then with the likely ones
+            system = partial(body.system, targets=np.broadcast_to(targets, (len(x), *targets.shape)),
+                             weights=np.broadcast_to(weights, (len(x), len(weights))))
+            end = descend(system, x, SETTLED, body.retract)
+            x = end.x[np.argmin(end.energy)][None]
+            weights, _ = marker_weights(body.positions(x[0]), targets, config.marker_sd, config.outlier)
+        return x[0]
+
+    def judge(self, x: np.ndarray, targets: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Residuals (L,), metres, of the markers as they came, and which of them were believed."""
+        return judge(self.body.positions(x), targets, self.watch.order, self.config)
+
+    def _miss(self, x: np.ndarray, targets: np.ndarray) -> float:
+        return float(np.nanmedian(np.linalg.norm(self.body.positions(x) - targets, axis=1)))
+
+
+def judge(positions: np.ndarray, targets: np.ndarray, order: np.ndarray, config: AnimateConfig
+          ) -> tuple[np.ndarray, np.ndarray]:
+    """Residuals (..., L), metres, of the markers as they came, and which were believed under their own label.
+
+    Parameters
+    ----------
+    positions, targets : (..., L, 3) float, metres
+    order : (..., L) int
+        Which column each marker was taken from.
+    """
+    residuals = np.linalg.norm(positions - targets, axis=-1)
+    squared, scale = distances_apart(positions, targets, config.outlier)
+    return residuals, (np.nan_to_num(squared, nan=np.inf) < scale**2) & (order == np.arange(order.shape[-1]))
+
+

@@ -1,0 +1,102 @@
+"""Which markers are believed: weights that outliers lose, and labels that two markers have exchanged."""
+from __future__ import annotations
+
+import numpy as np
+
+ENTER, LEAVE = 0.5, 1.0              # share of the distance that remains when labels are exchanged, and put back
+
+
+def marker_weights(positions: np.ndarray, targets: np.ndarray, sd: float, outlier: float
+                   ) -> tuple[np.ndarray, np.ndarray]:
+    """Weights of the markers of frames, low for outliers, and whether each is believed.
+
+    What is common to all markers does not make an outlier: the body may be a step behind.
+
+    Parameters
+    ----------
+    positions : (..., L, 3) float, metres
+        Where the body puts them.
+    targets : (..., L, 3) float, metres
+        NaN where a marker was not seen.
+    sd, outlier : float, metres
+        See `AnimateConfig`.
+
+    Returns
+    -------
+    (..., L) float
+        Factors on the squared distance, zero where nothing was seen.
+    (..., L) bool
+        Seen, and of more than a quarter of the full weight.
+    """
+    squared, scale = distances_apart(positions, targets, outlier)
+    share = (scale**2 / (scale**2 + np.nan_to_num(squared, nan=np.inf)))**2
+    return share / sd**2, share > 0.25
+
+
+def distances_apart(positions: np.ndarray, targets: np.ndarray, outlier: float) -> tuple[np.ndarray, np.ndarray]:
+    """Squared distances (..., L) without what is common to all, and the length (..., 1) that makes an outlier."""
+    off = positions - targets
+    off = off - np.nan_to_num(_median(np.swapaxes(off, -1, -2)))[..., None, :]
+    squared = np.einsum("...d,...d->...", off, off)
+    return squared, np.maximum(outlier, 3 * np.sqrt(np.nan_to_num(_median(squared))))[..., None]
+
+
+def _median(values: np.ndarray) -> np.ndarray:
+    """The median (...) of values (..., n) that are not NaN; several times as fast as numpy's on few values."""
+    ordered = np.sort(values, axis=-1)                                  # NaN comes last
+    seen = (~np.isnan(ordered)).sum(axis=-1)[..., None]
+    below = np.take_along_axis(ordered, np.maximum((seen - 1) // 2, 0), axis=-1)
+    above = np.take_along_axis(ordered, np.minimum(seen // 2, ordered.shape[-1] - 1), axis=-1)
+    return np.where(seen > 0, 0.5 * (below + above), np.nan)[..., 0]
+
+
+class LabelWatch:
+    """Finds pairs of markers that have exchanged their labels, and remembers them from frame to frame.
+
+    A pair is exchanged when that removes most of the distance of both from where the body would put them,
+    and put back when the labels as they came fit better again: in between nothing changes.
+
+    Parameters
+    ----------
+    count : int
+        L, the number of markers.
+    outlier : float, metres
+        See `AnimateConfig`.
+    """
+
+    def __init__(self, count: int, outlier: float) -> None:
+        self.outlier = outlier
+        self.order = np.arange(count)
+
+    def forget(self) -> None:
+        """Take the labels as they come."""
+        self.order = np.arange(len(self.order))
+
+    def update(self, positions: np.ndarray, targets: np.ndarray) -> np.ndarray:
+        """Which column (L,) each marker is taken from.
+
+        Parameters
+        ----------
+        positions : (L, 3) float, metres
+            Where the body puts the markers.
+        targets : (L, 3) float, metres
+            As they came.
+        """
+        taken = targets[self.order]
+        squared, scale = distances_apart(positions, taken, self.outlier)
+        suspect = np.nan_to_num(squared) > (0.5 * scale)**2
+        changed = self.order != np.arange(len(self.order))
+        if suspect.sum() < 2 and not changed.any():
+            return self.order
+        shift = np.nan_to_num(_median((positions - taken).T))
+        some = np.flatnonzero((suspect | changed) & ~np.isnan(squared))
+        apart = np.linalg.norm(positions[some, None] - shift - taken[some], axis=2)
+        for i, j in zip(*np.triu_indices(len(some), 1), strict=True):
+            now, then = apart[i, i] + apart[j, j], apart[i, j] + apart[j, i]
+            a, b = some[i], some[j]
+            back = self.order[a] == b
+            if then < (LEAVE if back else ENTER) * now and (back or max(apart[i, j], apart[j, i]) < 0.5 * scale[0]):
+                self.order[[a, b]] = self.order[[b, a]]
+                taken[[a, b]] = taken[[b, a]]
+                apart[:, [i, j]] = apart[:, [j, i]]
+        return self.order
