@@ -21,6 +21,8 @@ CAP = 0.15                           # metres: further off is as bad
 NORMALS = 0.1                        # metres that a difference of normals of unit length weighs
 CELL, MARGIN = 0.04, 0.3             # metres: of the table of what the camera must have seen
 FACING = 0.15                        # cosine to the camera's direction from which a vertex counts as seen
+PROMISING = 0.4                      # share of all placements, those least denied by the camera, that are compared
+AT_ONCE = 1000                       # points that are compared at a time
 POOL = 200                           # best placements that are kept
 BLIND, APART = 12, 0.1               # of them, starts that differ by so many metres on average
 
@@ -87,13 +89,17 @@ def placements(fit: ScanFit) -> tuple[np.ndarray, np.ndarray]:
     cameras = fit.sight.cameras if isinstance(fit.sight, Sights) else [fit.sight] if fit.sight else []
     toward = np.array([_unit(camera.viewpoint - scan.points.mean(axis=0)) for camera in cameras]).reshape(-1, 3)
     table = None if fit.sight is None else Outside(fit.sight, config.silhouette_tolerance)
-    cost, shift = np.empty((len(poses), TURNS)), np.empty((len(poses), TURNS, 3))
+    cost, shift = np.zeros((len(poses), TURNS)), np.empty((len(poses), TURNS, 3))
     for a, (y, n) in enumerate(zip(places, normals, strict=True)):
         shift[a] = scan.points.mean(axis=0) - (turns @ _shown(y, n, turns, toward)[:, :, None])[..., 0]
-        cost[a] = _distances(y, n, turns, shift[a], scan)
         if table is not None:
             out = table.at((y @ np.swapaxes(turns, 1, 2) + shift[a][:, None]).astype(np.float32))
-            cost[a] += config.silhouette_weight * (out**2).mean(axis=1)
+            cost[a] = config.silhouette_weight * (out**2).mean(axis=1)
+    doubtful = cost > (np.quantile(cost, PROMISING) if table is not None else np.inf)
+    for a, (y, n) in enumerate(zip(places, normals, strict=True)):
+        likely = ~doubtful[a]
+        cost[a, likely] += _distances(y, n, turns[likely], shift[a, likely], scan)
+    cost[doubtful] = np.inf
     order = np.argsort(cost, axis=None, kind="stable")[:POOL]
     which, turn = np.unravel_index(order, cost.shape)
     x = np.array([body.join(_turned(poses[a], turns[b]), np.zeros(3)) for a, b in zip(which, turn, strict=True)])
@@ -122,7 +128,10 @@ def _distances(y: np.ndarray, n: np.ndarray, turns: np.ndarray, shift: np.ndarra
     points, directions = (scan.points - shift[:, None]) @ turns, scan.normals @ turns
     ask = np.concatenate([points, NORMALS * directions], axis=2).reshape(-1, 6).astype(np.float32)
     have = np.hstack([y, NORMALS * n]).astype(np.float32)
-    nearest = ((have**2).sum(axis=1) - 2 * (ask @ have.T)).min(axis=1) + (ask**2).sum(axis=1)
+    squared = (have**2).sum(axis=1)[:, None]
+    # |a - b|² = |a|² + (|b|² - 2 a·b); a piece at a time, so that it stays near the processor
+    nearest = np.concatenate([(squared + have @ (-2 * some.T)).min(axis=0)
+                              for some in np.array_split(ask, 1 + len(ask) // AT_ONCE)]) + (ask**2).sum(axis=1)
     return np.minimum(nearest, CAP**2).reshape(len(turns), -1).mean(axis=1)
 
 
