@@ -1,0 +1,182 @@
+"""Textures: read with a scan, baked onto a completed body, written as GLB."""
+from __future__ import annotations
+
+import io
+import warnings
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from scanprep.geometry.formats.common import UNITS
+from scanprep.geometry.mesh import Mesh
+from scanprep.geometry.storage import writing
+from scanprep.geometry.surface import Rays, barycentric
+
+SIZE = 2048                          # pixels of a baked texture, each way
+PADDING = 8                          # pixels that colours go on beyond the border of a chart
+
+# colours and weights of places with normals
+Look = Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]
+
+
+@dataclass(frozen=True, eq=False)
+class Texture:
+    """A picture laid on a mesh.
+
+    Attributes
+    ----------
+    mesh : Mesh
+        Its vertices are repeated where charts meet.
+    uv : (N, 2) float
+        Place of each vertex in the picture: (0, 0) is its lower left corner, (1, 1) its upper right one.
+    image : (H, W, 3) float in [0, 1]
+        Rows from the top.
+    """
+
+    mesh: Mesh
+    uv: np.ndarray
+    image: np.ndarray
+
+    def scaled(self, factor: float) -> Texture:
+        """All lengths of the mesh times a factor."""
+        return self if factor == 1 else replace(self, mesh=self.mesh.with_vertices(factor * self.mesh.vertices))
+
+    def sample(self, faces: np.ndarray, bary: np.ndarray) -> np.ndarray:
+        """Colours (n, 3) at points on triangles, interpolated between pixels."""
+        height, width = self.image.shape[:2]
+        u, v = np.einsum("nc,ncd->nd", bary, self.uv[self.mesh.faces[faces]]).T
+        x, y = (u % 1.0000001) * width - 0.5, (1 - v % 1.0000001) * height - 0.5
+        left, top = np.floor(x), np.floor(y)
+        out = np.zeros((len(x), 3))
+        for dx in (0, 1):
+            for dy in (0, 1):
+                share = np.abs(1 - dx - (x - left)) * np.abs(1 - dy - (y - top))
+                row = np.clip(top + dy, 0, height - 1).astype(int)
+                column = np.clip(left + dx, 0, width - 1).astype(int)
+                out += share[:, None] * self.image[row, column]
+        return out
+
+
+def read_texture(path: str | Path, unit: str | None = None) -> Texture | None:
+    """The texture of an OBJ with its MTL, or of a GLB; None where the file has none.
+
+    Warns where the file names a material whose picture cannot be found.
+    """
+    path = Path(path)
+    if not _names_a_picture(path):
+        return None
+    import trimesh
+
+    try:
+        loaded = trimesh.load_mesh(path, process=False)
+    except Exception as error:           # trimesh raises whatever its readers raise
+        raise ValueError(f"{path}: expected a mesh with a texture, cannot read it ({error})") from None
+    visual = loaded.visual
+    image = _picture(getattr(visual, "material", None))
+    uv = getattr(visual, "uv", None)
+    if image is None or uv is None or len(uv) != len(loaded.vertices):
+        warnings.warn(f"{path}: it names a texture, but its material file or picture cannot be read; "
+                      "its colours are left out", stacklevel=2)
+        return None
+    mesh = Mesh(UNITS[unit or "m"] * np.asarray(loaded.vertices), np.asarray(loaded.faces))
+    return Texture(mesh, np.asarray(uv, dtype=np.float64), image)
+
+
+def _names_a_picture(path: Path) -> bool:
+    ending = path.suffix.lower()
+    if ending not in (".obj", ".glb"):
+        return False
+    data = path.read_bytes()
+    return b"mtllib" in data if ending == ".obj" else b'"images"' in data
+
+
+def _picture(material: Any) -> np.ndarray | None:
+    """(H, W, 3) of a material of trimesh, or None."""
+    if material is None:
+        return None
+    image = getattr(material, "image", None)
+    if image is None:
+        image = getattr(material, "baseColorTexture", None)
+    if image is None:
+        return None
+    return np.asarray(image.convert("RGB"), dtype=np.float64) / 255
+
+
+def bake(body: Mesh, look: Look, unseen: np.ndarray, size: int = SIZE) -> Texture:
+    """A texture of a body: what `look` says of each of its pixels, elsewhere the colours of its vertices.
+
+    Parameters
+    ----------
+    body : Mesh
+    look : (places (n, 3), normals (n, 3)) -> colours (n, 3), weights (n,)
+    unseen : (N, 3) float in [0, 1]
+        Colours where the weight is zero.
+    size : int, pixels
+    """
+    kept, faces, uv = unwrap(body)
+    flat = Mesh(np.column_stack([uv, np.zeros(len(uv))]), faces)
+    at = (np.arange(size) + 0.5) / size
+    x, y = np.meshgrid(at, at[::-1])
+    pixels = np.column_stack([x.ravel(), y.ravel(), np.ones(size**2)])
+    face, _ = Rays(flat).cast(pixels, np.array([0.0, 0.0, -1.0]))
+    turned = np.flatnonzero(face < 0)
+    face[turned] = Rays(flat).cast(pixels[turned] * (1, 1, -1), np.array([0.0, 0.0, 1.0]))[0]
+    covered = np.flatnonzero(face >= 0)
+    corners = kept[faces[face[covered]]]
+    bary = barycentric(pixels[covered] * (1, 1, 0), flat.corners[face[covered]])
+    places, normals, plain = (np.einsum("nc,ncd->nd", bary, values[corners])
+                              for values in (body.vertices, body.vertex_normals, unseen))
+    colors, weight = look(places, normals / np.maximum(np.linalg.norm(normals, axis=1), 1e-12)[:, None])
+    image = np.full((size * size, 3), unseen.mean())
+    image[covered] = np.where(weight[:, None] > 0, colors, plain)
+    return Texture(Mesh(body.vertices[kept], faces), uv, _padded(image.reshape(size, size, 3),
+                                                                 (face >= 0).reshape(size, size)))
+
+
+def unwrap(mesh: Mesh) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """A mesh cut into flat charts.
+
+    Returns
+    -------
+    (n,) int
+        The vertex that each vertex of the cut mesh was.
+    (F, 3) int
+        Its triangles, in the old order.
+    (n, 2) float in [0, 1]
+
+    Raises
+    ------
+    ModuleNotFoundError
+        xatlas is not installed.
+    """
+    try:
+        import xatlas
+    except ModuleNotFoundError:
+        raise ModuleNotFoundError("a texture needs the body unwrapped by xatlas: pip install xatlas") from None
+    kept, faces, uv = xatlas.parametrize(mesh.vertices.astype(np.float32), mesh.faces.astype(np.uint32))
+    return kept.astype(np.int64), faces.astype(np.int64), uv.astype(np.float64)
+
+
+def _padded(image: np.ndarray, covered: np.ndarray) -> np.ndarray:
+    """The picture with the colours of charts going on a little beyond them, so that seams do not show."""
+    from scipy.ndimage import distance_transform_edt
+
+    far, nearest = distance_transform_edt(~covered, return_indices=True)
+    return np.where((far <= PADDING)[:, :, None], image[nearest[0], nearest[1]], image)
+
+
+def write_textured(path: str | Path, texture: Texture) -> None:
+    """Write a GLB with its picture inside, whole or not at all."""
+    import trimesh
+    from PIL import Image
+
+    picture = Image.fromarray((255 * np.clip(texture.image, 0, 1) + 0.5).astype(np.uint8))
+    material = trimesh.visual.material.PBRMaterial(baseColorTexture=picture, metallicFactor=0.0, roughnessFactor=0.8)
+    visual = trimesh.visual.TextureVisuals(uv=texture.uv, material=material)
+    mesh = trimesh.Trimesh(texture.mesh.vertices, texture.mesh.faces, visual=visual, process=False)
+    out = io.BytesIO(trimesh.exchange.gltf.export_glb(trimesh.Scene(mesh)))
+    with writing(path) as beside:
+        beside.write_bytes(out.getvalue())
