@@ -1,6 +1,7 @@
 """The command `scape complete`."""
 from __future__ import annotations
 
+import shutil
 from pathlib import Path
 from typing import Annotated
 
@@ -8,80 +9,95 @@ import tyro
 
 from model.body import BodyModel
 from model.cli import read_subject
-from model.files import load_model
 from model.linear import Subject
-from scanprep.cli import MM, Output, ScanArg, Unit
-from scanprep.console import Metric, Outcome, bar
-from scanprep.geometry.landmarks import match_landmarks, read_landmark_vertices, read_landmarks
-from scanprep.geometry.mesh import Mesh
-from scanprep.pipeline import LANDMARK_ENDINGS, read_scan
+from scanprep.cli import Output, Unit
+from scanprep.console import Outcome, bar, say
+from scanprep.geometry.landmarks import read_landmark_vertices
+from scanprep.pipeline import LANDMARK_ENDINGS
 
-from ..cli import ModelFile, rows
-from .completion import complete
-from .results import save_completion
+from ..cli import ModelOrNone, read_model
+from .colors import ColorConfig
+from .folder import complete_folder, file_digest, folder_inputs, settings_key, stale, summary
 from .settings import CompletionConfig
+from .work import Inputs, Work, complete_files
+
+ScansArg = Annotated[tyro.conf.Positional[tuple[Path, ...]], tyro.conf.arg(metavar="SCAN [SCAN ...]")]
 
 
-def complete_scan(scan: ScanArg, model: ModelFile, output: Output, landmarks: Path | None = None,
-                  subject: str | None = None, template_landmarks: Path | None = None, unit: Unit | None = None,
+def complete_scan(scans: ScansArg, output: Output, model: ModelOrNone = None, landmarks: Path | None = None,
+                  subject: str | None = None, template_landmarks: Path | None = None, mask: tuple[Path, ...] = (),
+                  unit: Unit | None = None, fill_colors: bool = False,
                   config: Annotated[CompletionConfig, tyro.conf.arg(name="")] = CompletionConfig()  # noqa: B008
                   ) -> Outcome:
     """The whole body from a scan of some of it.
 
+    Several scans are views of one body in one frame. A folder is completed scan by scan, each into a folder of its
+    name; called again, it goes on where it was, and does anew what has changed.
+
     Example: scape complete half.ply -m model.npz --landmarks half.landmarks.json -o completed
 
     Args:
-        scan: Mesh or point cloud.
-        model: Model of `scape learn`.
-        output: Folder to write completed.ply, predicted.ply, completion.npz and report.html to.
-        landmarks: 4 to 10 named points on the scan; else the file of the scan's name beside it.
+        scans: Mesh or point cloud, the views of one body, or a folder of scans.
+        output: Folder to write completed.ply, predicted.ply, completion.npz and report.html to; completed.glb for a
+            scan with a texture.
+        model: Model of `scape learn`; without it that of the embedded people, which is made on first use.
+        landmarks: 4 to 10 named points on the scan; else the file of the scan's name beside it. Without any the
+            search starts from typical poses. For a folder of scans, the folder of such files.
         subject: Whose body it is: "template" for the one the model's poses were learned from, betas in JSON or .npz,
             or a mesh in the model's triangles. Without it the shape is found too.
         template_landmarks: Where these landmarks are on the model's template; else those kept in the model.
-        unit: Unit of the scan and landmarks.
+        mask: Which points are clothing or hair: .npy, .json or .txt of booleans or of the numbers of points, or a
+            mesh or cloud in which they are painted in a colour. One file, or one for each view; for a folder of
+            scans, the folder of such files.
+        unit: Unit of the scan and landmarks; --free-scale when nobody knows it.
+        fill_colors: Spread the scan's colours over what was not seen, which else is grey.
         config: Settings.
     """
-    from .report import completion_page
-
-    loaded, data = load_model(model), read_scan(scan, unit)
-    given = landmarks or _beside(scan)
-    found = read_landmarks(given, data if isinstance(data, Mesh) else None, unit)
-    try:
-        _, vertices, points = match_landmarks(_template_landmarks(loaded, template_landmarks, model), found)
-    except ValueError as error:
-        raise ValueError(f"{given}: {error}") from None
+    if not scans:
+        raise ValueError("SCAN: expected at least one scan, or a folder of scans")
+    if unit is not None and config.free_scale:
+        raise ValueError("--unit, --free-scale: expected one of them, got both")
+    folder = scans[0] if len(scans) == 1 and scans[0].is_dir() else None
+    found = folder_inputs(folder, landmarks, _only(mask)) if folder else {}
+    loaded, name = read_model(model)
     body: BodyModel | Subject = loaded
     if subject is not None or not loaded.n_betas:
-        body = read_subject(loaded, None if subject in (None, "template") else Path(subject), unit)
-    with bar("completing") as progress:
-        done = complete(body, data, (vertices, points), config, progress)
-    save_completion(output, done)
-    metrics = [
-        Metric("distance of the scan to the completed mesh, RMS", MM * done.rms, "mm"),
-        Metric("scan points explained", 100 * done.explained, "%"),
-        Metric("vertices with data", 100 * float(done.seen.mean()), "%"),
-        Metric("landmarks used", len(vertices)),
-        Metric("distance of landmarks, predicted mesh, RMS", MM * done.landmark_rms, "mm"),
-        Metric("converged", str(done.converged)), Metric("rounds", done.iterations)]
-    page = completion_page(data, done, loaded.template, scan.name, rows(metrics))
-    page.write(output / "report.html")
-    return Outcome(output, metrics, {"complete": config})
+        body = read_subject(loaded, None if subject in (None, "template") else Path(str(subject)), unit)
+    inputs = Inputs(scans, landmarks or _beside(scans), mask)
+    wanted = any(one.landmarks for one in found.values()) if folder else inputs.landmarks is not None
+    marks = _template_landmarks(loaded, template_landmarks, name) if wanted else {}
+    work = Work(body, name, marks, config, unit, ColorConfig(fill=fill_colors))
+    if folder is None:
+        if inputs.landmarks is None:
+            say("note: no landmarks; the search starts from typical poses, look at report.html for limbs mixed up")
+        with bar("completing") as progress:
+            return Outcome(output, complete_files(work, inputs, output, progress), {"complete": config, "model": name})
+    for left in stale(output):
+        shutil.rmtree(left)
+    key = settings_key(config, work.colors, unit, marks, name if model is None else file_digest(model), subject,
+                       file_digest(Path(subject)) if subject else "")
+    with bar("completing scans") as progress:
+        done = complete_folder(work, found, output, key, f"scape complete {folder}", progress)
+    return Outcome(output, summary(done, len(found)), {"complete": config, "model": name}, done.failures)
 
 
-def _beside(scan: Path) -> Path:
-    stem = scan.name.split(".")[0]
-    places = [scan.with_name(stem + ending) for ending in LANDMARK_ENDINGS]
-    found = next((place for place in places if place.is_file()), None)
-    if found is None:
-        raise ValueError(f"{scan}: expected its landmarks in {stem}.landmarks.json beside it; "
-                         "name the file with --landmarks")
-    return found
+def _only(masks: tuple[Path, ...]) -> Path | None:
+    if len(masks) > 1:
+        raise ValueError(f"--mask: expected one folder of masks for a folder of scans, got {len(masks)}")
+    return masks[0] if masks else None
 
 
-def _template_landmarks(model: BodyModel, given: Path | None, path: Path) -> dict[str, int]:
+def _beside(scans: tuple[Path, ...]) -> Path | None:
+    """The landmark file of the first view's name."""
+    stem = scans[0].name.split(".")[0]
+    places = [scans[0].with_name(stem + ending) for ending in LANDMARK_ENDINGS]
+    return next((place for place in places if place.is_file()), None)
+
+
+def _template_landmarks(model: BodyModel, given: Path | None, name: str) -> dict[str, int]:
     if given is not None:
         return read_landmark_vertices(given, model.template)
     kept = model.info.get("landmarks")
     if not kept:
-        raise ValueError(f"{path}: the model keeps no landmarks of its template; name them with --template-landmarks")
+        raise ValueError(f"{name}: the model keeps no landmarks of its template; name them with --template-landmarks")
     return {name: int(vertex) for name, vertex in kept.items()}

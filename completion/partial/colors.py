@@ -105,7 +105,8 @@ class ColoredView:
 
 
 def carry_colors(body: Mesh, seen: np.ndarray, scan: View | Sequence[View], config: ColorConfig | None = None,
-                 viewpoint: object = None, metres: float = 1.0) -> np.ndarray:
+                 viewpoint: object = None, metres: float = 1.0, textures: Sequence[Texture | None] = ()
+                 ) -> np.ndarray:
     """Colours (N, 3) in [0, 1] of a completed body.
 
     Parameters
@@ -121,6 +122,8 @@ def carry_colors(body: Mesh, seen: np.ndarray, scan: View | Sequence[View], conf
         they looked.
     metres : float
         Of one unit of the scan: `Completion.scale`.
+    textures : Texture or None of each view, optional
+        Instead of the colours of its vertices.
 
     Raises
     ------
@@ -128,7 +131,7 @@ def carry_colors(body: Mesh, seen: np.ndarray, scan: View | Sequence[View], conf
         No view has colours.
     """
     config = config or ColorConfig()
-    colors, weight = blend(colored_views(scan, viewpoint, metres), body.vertices, body.vertex_normals, config)
+    colors, weight = blend(colored_views(scan, viewpoint, metres, textures), body.vertices, body.vertex_normals, config)
     known = seen & (weight > 0)
     out = np.where(known[:, None], colors, config.grey)
     return fill_colors(body, out, known) if config.fill and known.any() else out
