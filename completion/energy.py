@@ -12,7 +12,7 @@ import numpy as np
 
 from scanprep.geometry import rotations
 
-from .priors import GaussianPrior
+from .priors import GaussianPrior, JointLimits
 
 
 @dataclass(frozen=True, eq=False)
@@ -133,6 +133,16 @@ def pose_prior(x: np.ndarray, prior: GaussianPrior, weight: float | np.ndarray =
     J = np.zeros((*r.shape, x.shape[-1]))
     J[..., :count] = root[..., None, None] * prior.whitening
     return Residual(r, J)
+
+
+def joint_limits(x: np.ndarray, limits: JointLimits, weight: float = 1.0) -> Residual:
+    """How far joint angles are beyond their limits; nothing within."""
+    count = len(limits.low)
+    angles, root = x[..., :count], np.sqrt(weight) / limits.give
+    beyond = np.maximum(angles - limits.high, 0) - np.maximum(limits.low - angles, 0)
+    J = np.zeros((*beyond.shape, x.shape[-1]))
+    J[..., np.arange(count), np.arange(count)] = root * (beyond != 0)
+    return Residual(root * beyond, J)
 
 
 def shape_prior(x: np.ndarray, first: int, weight: float = 1.0) -> Residual:

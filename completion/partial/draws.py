@@ -95,5 +95,5 @@ def quick_misfits(fit: ScanFit, x: np.ndarray, moved: np.ndarray | None = None, 
         if fit.sight is not None:
             excess = fit.sight.trespass(y[few], config.silhouette_tolerance)[0]
             apart += config.silhouette_weight * (np.minimum(excess, cap)**2).mean()
-        out[i] = config.evidence * apart / config.scan_sd**2 + energy.pose_prior(x[i], fit.prior).energy
+        out[i] = config.evidence * apart / config.scan_sd**2 + fit.unlikely(x[i])
     return out

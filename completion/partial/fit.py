@@ -10,7 +10,7 @@ from scanprep.geometry.surface import OrientedPoints
 
 from .. import energy
 from ..bodies import FixedBody
-from ..priors import GaussianPrior, gaussian_prior
+from ..priors import GaussianPrior, choose_prior, gaussian_prior, joint_limits
 from ..solve import MinimiseConfig, minimise
 from .contact import Contact
 from .masks import Cover, part_vertices
@@ -41,6 +41,9 @@ class ScanFit:
         self.body, self.config = body, config
         self.vertices, self.points = vertices, points
         self.prior: GaussianPrior = gaussian_prior(body.pose_mean, body.pose_covariance, config.prior_shrinkage)
+        self.habit = choose_prior(config.pose_prior, body.pose_mean, body.pose_covariance, body.pose_examples,
+                                  body.skeleton.parents, config.prior_shrinkage)
+        self.limits = joint_limits(body.pose_examples)
         self.cloud = cloud
         self.thin = cloud.thinned(config.scan_points)
         self.coarse = cloud.thinned(config.scan_points // 4)
@@ -83,8 +86,12 @@ class ScanFit:
         for weight, ids, (excess, _, _) in self._denials(mesh):
             apart += weight * (np.minimum(excess, cap)**2).sum() / len(ids)
         off = ((mesh.vertices[self.vertices] - self.points)**2).sum() / config.landmark_sd**2
-        prior = energy.pose_prior(x, self.prior, config.prior_weight).energy
-        return float(config.evidence * apart / config.scan_sd**2 + off + prior)
+        return float(config.evidence * apart / config.scan_sd**2 + off) + self.unlikely(x)
+
+    def unlikely(self, x: np.ndarray) -> float:
+        """Energy of the pose of unknowns (P,) before anything is measured."""
+        over = energy.joint_limits(x, self.limits).energy if self.config.joint_limits else 0.0
+        return float(self.config.prior_weight * (self.habit.energy(self.body.split(x)[0]) + over))
 
     def follow_scan(self, x: np.ndarray, tell: Callable[[int], None]
                     ) -> tuple[np.ndarray, bool, int, dict[str, float]]:
@@ -113,12 +120,14 @@ class ScanFit:
         held = np.full(len(x), config.twist_weight)
         held[:3] = held[body.n_angles:] = 0
         landmark_weights = np.full(count, config.landmark_sd**-2)
+        prior, limit = self.habit.near(body.split(x)[0]), config.prior_weight * config.joint_limits
 
         def energies(at: np.ndarray) -> list[energy.Residual]:
             points = follow(at)
             marked, free, denied = points[:count], points[count:end], points[end:]
             return [energy.point_to_point(marked, self.points, landmark_weights),
-                    energy.pose_prior(at, self.prior, config.prior_weight),
+                    energy.pose_prior(at, prior, config.prior_weight),
+                    energy.joint_limits(at, self.limits, limit),
                     energy.shape_prior(at, body.n_angles + 3),
                     energy.point_to_plane(free, target, normal, weights),
                     energy.point_to_point(free, target, 0.1 * weights),
@@ -126,7 +135,8 @@ class ScanFit:
                     energy.stay_near(at, x, held)]
 
         best = minimise(energies, x[None], MinimiseConfig(iterations=2, tolerance=1e-3)).x
-        names = ("landmarks", "pose_prior", "shape_prior", "scan_planes", "scan_points", "trespass", "twists")
+        names = ("landmarks", "pose_prior", "joint_limits", "shape_prior", "scan_planes", "scan_points", "trespass",
+                 "twists")
         return best[0], {n: float(r.energy[0]) for n, r in zip(names, energies(best), strict=True)}
 
     def matches(self, mesh: Mesh, scan: ScanPoints, reach: float) -> tuple[np.ndarray, ...]:

@@ -3,6 +3,8 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+from ..priors import PosePrior
+
 
 @dataclass(frozen=True)
 class CompletionConfig:
@@ -25,6 +27,10 @@ class CompletionConfig:
         Factor on the pose prior once the scan is used.
     prior_shrinkage : float in [0, 1]
         See `gaussian_prior`.
+    pose_prior : "gaussian", "mixture" or "nearest"
+        What is known of poses: one Gaussian, a mixture around the training poses of each limb, or the nearest of them.
+    joint_limits : bool
+        Joints that turn further than in the training poses are held back.
     start_axes : int
         Directions of the training poses along which the search starts.
     candidates : int
@@ -71,6 +77,8 @@ class CompletionConfig:
     evidence: float = 400.0
     prior_weight: float = 1.0
     prior_shrinkage: float = 0.3
+    pose_prior: PosePrior = "gaussian"
+    joint_limits: bool = False
     start_axes: int = 4
     candidates: int = 3
     reach: float = 0.2
