@@ -3,7 +3,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -30,17 +30,25 @@ class MarkerLayout:
         From the skin to the marker's centre, along the normal.
     weights : (L, 3) float, optional
         For three vertices; each row sums to 1.
+    aliases : {label: label}
+        Other labels for the same places, where files differ.
+    loose : strings
+        Labels of markers that sit anywhere on their limb, not on a point of the anatomy: `vertices` has them where
+        they usually are, `subject_from_markers` finds where they are on one person.
 
     Raises
     ------
     ValueError
-        Shapes that do not agree, a label that comes twice, a negative vertex.
+        Shapes that do not agree, a label that comes twice, a negative vertex, an alias of an unknown label, an
+        unknown loose label.
     """
 
     labels: tuple[str, ...]
     vertices: np.ndarray
     distances: np.ndarray | float = DISTANCE
     weights: np.ndarray | None = None
+    aliases: Mapping[str, str] = field(default_factory=dict)
+    loose: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         labels, vertices = tuple(self.labels), np.array(self.vertices, dtype=np.int64)
@@ -65,6 +73,14 @@ class MarkerLayout:
             if weights.shape != (L, 3) or not np.allclose(weights.sum(axis=1), 1, atol=1e-6):
                 raise ValueError(f"weights: expected shape ({L}, 3) with rows that sum to 1, got {weights.shape}")
             values["weights"] = weights
+        wrong = [alias for alias, label in self.aliases.items() if label not in labels or alias in labels]
+        if wrong:
+            raise ValueError(f"aliases: expected new labels for markers of the layout, got {wrong[0]!r} for "
+                             f"{self.aliases[wrong[0]]!r}")
+        unknown = [label for label in self.loose if label not in labels]
+        if unknown:
+            raise ValueError(f"loose: {', '.join(unknown)} not among {', '.join(labels)}")
+        values["loose"] = tuple(self.loose)
         for name, value in values.items():
             if isinstance(value, np.ndarray):
                 value.flags.writeable = False
@@ -78,7 +94,8 @@ class MarkerLayout:
         """Read a layout of `save`, or of the same form from elsewhere.
 
         The form is `{"markersets": [{"type": ..., "distance_from_skin": 0.0095, "indices": {label: vertex}}]}`;
-        in place of a vertex there may be `{"vertices": [a, b, c], "weights": [u, v, w]}`.
+        in place of a vertex there may be `{"vertices": [a, b, c], "weights": [u, v, w]}`, a set may be `"loose": true`,
+        and beside the sets there may be `"aliases": {other label: label}`.
 
         Parameters
         ----------
@@ -100,56 +117,95 @@ class MarkerLayout:
         rows = _rows(path, tree)
         if not rows:
             raise MarkerFileError(f"{path}: expected markers in the layout, found none")
-        simple = all(isinstance(place, int) for _, place, _ in rows)
-        labels, places, distances = zip(*rows, strict=True)
+        simple = all(isinstance(place, int) for _, place, _, _ in rows)
+        labels, places, distances, loose = zip(*rows, strict=True)
+        free = tuple(label for label, is_loose in zip(labels, loose, strict=True) if is_loose)
+        aliases = tree.get("aliases", {})
         try:
             if simple:
-                layout = MarkerLayout(labels, np.array(places), np.array(distances))
+                layout = MarkerLayout(labels, np.array(places), np.array(distances), None, aliases, free)
             else:
                 pairs = [([p] * 3, [1.0, 0.0, 0.0]) if isinstance(p, int) else (p["vertices"], p["weights"])
                          for p in places]
                 layout = MarkerLayout(labels, np.array([v for v, _ in pairs]), np.array(distances),
-                                      np.array([w for _, w in pairs]))
-        except (ValueError, KeyError, TypeError) as error:
+                                      np.array([w for _, w in pairs]), aliases, free)
+        except (ValueError, KeyError, TypeError, AttributeError) as error:
             raise MarkerFileError(f"{path}: damaged marker layout ({error})") from None
         if n_vertices is not None:
             layout._check(n_vertices, str(path))
         return layout
 
+    @staticmethod
+    def named(name: str, template: Mesh, kept: np.ndarray | None = None) -> MarkerLayout:
+        """A usual marker set on a body that is known here: the triangles of SCAPE and SPRING, or the embedded people.
+
+        Parameters
+        ----------
+        name : str
+            One of `layout_names()`, such as "cmu41".
+        template : Mesh
+            Known by its triangles, whatever its shape and pose.
+        kept : (N,) int, optional
+            The vertices of the embedded people that a template with fewer triangles kept,
+            `info["people_vertices"]` of their model.
+
+        Raises
+        ------
+        ValueError
+            A set that does not come along, or a body on which it is not known.
+        """
+        from .named import named_layout
+
+        return named_layout(name, template, kept)
+
     def save(self, path: str | Path) -> None:
         """Write as JSON, one marker set for each distance from the skin, whole or not at all."""
-        sets: dict[float, dict[str, Any]] = {}
+        sets: dict[tuple[float, bool], dict[str, Any]] = {}
         for i, (label, distance) in enumerate(zip(self.labels, np.asarray(self.distances).tolist(), strict=True)):
             place: Any = self.vertices[i].tolist()
             if self.weights is not None:
                 place = {"vertices": place, "weights": self.weights[i].tolist()}
-            sets.setdefault(distance, {})[label] = place
-        storage.write_json(path, {"markersets": [
-            {"type": "body", "distance_from_skin": distance, "indices": indices}
-            for distance, indices in sets.items()]})
+            sets.setdefault((distance, label in self.loose), {})[label] = place
+        tree: dict[str, Any] = {"markersets": [
+            {"type": "body", "distance_from_skin": distance} | ({"loose": True} if loose else {})
+            | {"indices": indices} for (distance, loose), indices in sets.items()]}
+        storage.write_json(path, tree | ({"aliases": dict(self.aliases)} if self.aliases else {}))
 
     def matched(self, labels: Sequence[str], minimum: int = 3) -> tuple[str, ...]:
-        """Those of the labels that the layout knows, in their own order.
+        """Those of the labels that the layout knows, in their own order; an alias only where its marker is not there.
 
         Raises
         ------
         ValueError
             Fewer than `minimum`; both lists are in the message.
         """
-        found = tuple(label for label in labels if label in self.labels)
+        names = [label if label in self.labels else self.aliases.get(label) for label in labels]
+        found = tuple(label for i, label in enumerate(labels)
+                      if names[i] is not None and (names[i] == label or names[i] not in [*labels, *names[:i]]))
         if len(found) < minimum:
             raise ValueError(f"labels: expected at least {minimum} markers of the layout, found {len(found)}; "
                              f"layout: {', '.join(self.labels)}; sequence: {', '.join(labels) or 'none'}")
         return found
 
     def select(self, labels: Sequence[str]) -> MarkerLayout:
-        """The markers of these labels, in this order."""
-        unknown = [label for label in labels if label not in self.labels]
+        """The markers of these labels, in this order; an alias becomes the label."""
+        unknown = [label for label in labels if label not in self.labels and label not in self.aliases]
         if unknown:
             raise ValueError(f"labels: {', '.join(unknown)} not among {', '.join(self.labels)}")
-        rows = [self.labels.index(label) for label in labels]
+        rows = [self.labels.index(self.aliases.get(label, label)) for label in labels]
+        loose = tuple(label for label, row in zip(labels, rows, strict=True) if self.labels[row] in self.loose)
         return MarkerLayout(tuple(labels), self.vertices[rows], np.asarray(self.distances)[rows],
-                            None if self.weights is None else self.weights[rows])
+                            None if self.weights is None else self.weights[rows], loose=loose)
+
+    def moved(self, places: Mapping[str, int]) -> MarkerLayout:
+        """The same with some markers on other vertices, {label: vertex}; an alias moves its marker."""
+        vertices, weights = self.vertices.copy(), None if self.weights is None else self.weights.copy()
+        for label, vertex in places.items():
+            row = self.labels.index(self.aliases.get(label, label))
+            vertices[row] = vertex
+            if weights is not None:
+                weights[row] = [1.0, 0.0, 0.0]
+        return MarkerLayout(self.labels, vertices, self.distances, weights, self.aliases, self.loose)
 
     def place(self, mesh: Mesh) -> np.ndarray:
         """Where the markers are on a body (L, 3), metres: the point of the skin, and out along its normal.
@@ -176,8 +232,8 @@ class MarkerLayout:
             raise error(f"{what}: marker '{outside[0]}' sits on vertex {place}, the body has 0..{n_vertices - 1}")
 
 
-def _rows(path: Path, tree: Any) -> list[tuple[str, Any, float]]:
-    """Label, place and distance of every marker in the file."""
+def _rows(path: Path, tree: Any) -> list[tuple[str, Any, float, bool]]:
+    """Label, place, distance and looseness of every marker in the file."""
     sets = tree.get("markersets") if isinstance(tree, Mapping) else None
     if not isinstance(sets, list):
         raise MarkerFileError(f"{path}: expected a marker layout {{\"markersets\": [...]}}, found something else")
@@ -191,5 +247,5 @@ def _rows(path: Path, tree: Any) -> list[tuple[str, Any, float]]:
         for label, place in indices.items():
             if isinstance(place, bool) or not isinstance(place, int | Mapping):
                 raise MarkerFileError(f"{path}: marker '{label}': expected a vertex, found {place!r}")
-            rows.append((label, place, float(distance)))
+            rows.append((label, place, float(distance), bool(markers.get("loose", False))))
     return rows

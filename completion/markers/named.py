@@ -1,0 +1,69 @@
+"""The layouts that come along: usual marker sets on the bodies that are known here."""
+from __future__ import annotations
+
+import hashlib
+import json
+from functools import cache
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+
+from scanprep.geometry.mesh import Mesh
+from scanprep.geometry.surface import Surface
+
+if TYPE_CHECKING:
+    from .layout import MarkerLayout
+
+FOLDER = Path(__file__).parent / "layouts"
+EMBEDDED = "embedded people"
+OWN = ('write a file {"markersets": [{"distance_from_skin": 0.0095, "indices": {LABEL: VERTEX, ...}}]} '
+       "and load it with MarkerLayout.load (--layout FILE)")
+
+
+def faces_digest(faces: np.ndarray) -> str:
+    """16 hexadecimal digits that tell one triangulation from another."""
+    return hashlib.sha256(np.ascontiguousarray(faces, dtype="<i8").tobytes()).hexdigest()[:16]
+
+
+def layout_names() -> tuple[str, ...]:
+    """The marker sets that come along."""
+    return tuple(sorted({tree["name"] for _, tree in _files()}))
+
+
+def named_layout(name: str, template: Mesh, kept: np.ndarray | None = None) -> MarkerLayout:
+    """See `MarkerLayout.named`."""
+    from .layout import MarkerLayout
+
+    if name not in layout_names():
+        raise ValueError(f"name: expected a marker layout of {', '.join(layout_names())}, got {name!r}; for another, "
+                         + OWN)
+    bodies = [(path, tree["body"]) for path, tree in _files() if tree["name"] == name]
+    digest = faces_digest(template.faces)
+    for path, body in bodies:
+        if (body["vertices"], body["faces"]) == (len(template.vertices), digest):
+            return MarkerLayout.load(path)
+    if kept is not None and len(kept) == len(template.vertices):
+        for path, body in bodies:
+            if body["name"] == EMBEDDED:
+                return _on_kept(MarkerLayout.load(path), template, np.asarray(kept))
+    known = ", ".join(f"{body['name']} ({body['vertices']} vertices)" for _, body in bodies)
+    raise ValueError(f"template: expected a body on which '{name}' is known: {known}; got another triangulation with "
+                     f"{len(template.vertices)} vertices; for this one, {OWN}")
+
+
+def _on_kept(layout: MarkerLayout, template: Mesh, kept: np.ndarray) -> MarkerLayout:
+    """The layout of the embedded people on a template that kept only some of their vertices."""
+    from scanprep.scanning.people_template import load
+
+    from .layout import MarkerLayout
+
+    whole = load().mesh.vertices
+    found = Surface(Mesh(whole[kept], template.faces)).closest(whole[layout.vertices])
+    return MarkerLayout(layout.labels, template.faces[found.faces], layout.distances, found.bary, layout.aliases,
+                        layout.loose)
+
+
+@cache
+def _files() -> tuple[tuple[Path, dict[str, Any]], ...]:
+    return tuple((path, json.loads(path.read_text(encoding="utf-8"))) for path in sorted(FOLDER.glob("*.json")))
