@@ -89,7 +89,10 @@ def descend(system: System, start: np.ndarray, config: MinimiseConfig | None = N
         ahead = move(x, step)
         tried = system(ahead)
         better = (tried[0] < cost) & ~converged
-        settled = np.abs(cost - tried[0]) <= config.tolerance * np.maximum(cost, 1e-300)
+        hoped = -np.einsum("bp,bp->b", 2 * gradient + (hessian @ step[..., None])[..., 0], step)
+        least = config.tolerance * np.maximum(cost, 1e-300)
+        # a step that failed settles nothing unless there was nothing to gain: it may have been too long
+        settled = (better & (cost - tried[0] <= least)) | (hoped <= least)
         converged |= settled | (damping > 1e8)
         x[better] = ahead[better]
         for old, new in zip((cost, gradient, hessian), tried, strict=True):

@@ -3,7 +3,7 @@ import pytest
 from completion_bodies import worm_with_prior
 
 from completion import energy
-from completion.bodies import FixedBody, ShapedBody, as_body
+from completion.bodies import Anchor, FixedBody, ShapedBody, as_body
 from completion.priors import gaussian_prior
 from scanprep.geometry import rotations
 
@@ -112,6 +112,24 @@ def test_known_and_unknown_shape_agree_with_the_model():
     np.testing.assert_allclose(SHAPED.follow(IDS, x)(x[None]).positions[0], y[IDS], atol=1e-9)
     held = ShapedBody(MODEL, renew=np.inf)                         # never rebuilds, yet affine in betas
     np.testing.assert_allclose(held.follow(IDS, x)(x[None]).positions[0], y[IDS], atol=1e-9)
+
+
+def test_derivatives_by_betas_are_carried_with_the_bones():
+    """They are exact where they were stitched and after a turn of the whole, and close after a turn of the joints."""
+    x = unknowns(SHAPED)
+    pose = x[:12].reshape(4, 3)
+    anchor = Anchor(MODEL, pose)
+    ids = np.arange(0, 398, 7)
+    np.testing.assert_allclose(anchor.carried(ids, pose), MODEL.shape_jacobian(pose, ids), atol=1e-12)
+    whole = pose.copy()
+    whole[0] = rotations.log(rotations.exp(np.array([1.0, -0.4, 0.3])) @ rotations.exp(pose[0]))
+    np.testing.assert_allclose(anchor.carried(ids, whole), MODEL.shape_jacobian(whole, ids), atol=1e-12)
+    np.testing.assert_allclose(anchor.turned(whole), np.linalg.norm([1.0, -0.4, 0.3]), atol=1e-9)
+    bent = pose + np.random.default_rng(5).normal(0, 0.1, (4, 3)) * [[0], [1], [1], [1]]
+    exact = MODEL.shape_jacobian(bent, ids)
+    off = np.linalg.norm(anchor.carried(ids, bent) - exact) / np.linalg.norm(exact)
+    still = np.linalg.norm(anchor.carried(ids, pose) - exact) / np.linalg.norm(exact)
+    assert off < 0.05 and off < 0.6 * still
 
 
 def test_a_body_must_be_a_model_or_a_subject():

@@ -1,0 +1,191 @@
+"""Half views of men of unknown shape, ours against the nearest training body and against plain hole filling.
+
+    SCAPEKIT_DATA=... python tests/benchmarks/half_people.py -m MODEL.npz -o half_people.json [--inner] [--only K ...]
+        [--nearest] [--points DIR] [--pictures DIR] [--set NAME=VALUE ...]
+    python tests/benchmarks/half_people.py --poisson DIR -o poisson.json       (needs open3d; reads DIR/*.npz)
+
+`--inner` takes every fifth of the 182 training men, for tuning, with a model learned from the others; else the 45
+held-out men. Each row of the table: *seen* is the mean distance of the seen vertices to the true surface, *unseen*
+that of corresponding unseen vertices, *closest* that of the true unseen vertices to the nearest point of the mesh,
+which is also defined for meshes without correspondence.
+
+- nearest rigid: of all training bodies, each laid on the landmarks and moved rigidly by closest points (point to
+  plane, trimmed), the one nearest to the scan.
+- nearest posed: that body then bent at its joints by our own solver: it is made the template of a pose-only model.
+- Poisson: screened Poisson of the scan's points and normals, depth 8, everything that it invents is kept. It has no
+  vertices in common with the truth: only the distances to the closest point are given.
+"""
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import resource
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from protocols import HalfView, RealData, half_view, load_real, machine, spring_split, write_report
+
+
+def men(count: int, inner: bool) -> tuple[np.ndarray, np.ndarray]:
+    """Indices of the men that train and of those that are tried."""
+    train, held = spring_split(count)
+    if not inner:
+        return train, held
+    tried = np.arange(len(train)) % 5 == 0
+    return train[~tried], train[tried]
+
+
+def figures(body: Any, mesh: Any, view: HalfView) -> dict[str, float]:
+    """Errors of one mesh in the triangles of the body, millimetres."""
+    from scanprep.geometry.surface import Surface
+
+    apart = 1e3 * np.linalg.norm(mesh.vertices - body.vertices, axis=1)
+    return {"seen_mm": 1e3 * Surface(body).closest(mesh.vertices[view.seen]).distances.mean(),
+            "unseen_mm": apart[~view.seen].mean(),
+            "closest_mm": 1e3 * Surface(mesh).closest(body.vertices[~view.seen]).distances.mean()}
+
+
+def nearest(data: RealData, train: np.ndarray, cloud: Any, landmarks: tuple[np.ndarray, np.ndarray]
+            ) -> tuple[np.ndarray, int]:
+    """The training body (N, 3) that comes nearest to the scan when it is moved rigidly, and which."""
+    from scanprep.geometry import rotations
+    from scanprep.geometry.surface import OrientedPoints
+
+    scan, best = cloud.thinned(1500), (np.inf, np.zeros(0), -1)
+    for i in train:
+        mesh = data.template.with_vertices(data.shapes[i])
+        R, t = rotations.procrustes(mesh.vertices[landmarks[0]], landmarks[1])
+        y = mesh.vertices @ R.T + t
+        normals = mesh.vertex_normals @ R.T
+        for _ in range(8):
+            found = OrientedPoints(y, normals).match(scan.points, scan.normals, 0.1, 0.6)
+            near = found.valid & (found.distances < np.quantile(found.distances[found.valid], 0.9))
+            at, to, n = y[found.index[near]], scan.points[near], scan.normals[near]
+            rows = np.hstack([np.cross(at, n), n])
+            step = np.linalg.lstsq(rows, np.einsum("nd,nd->n", n, to - at), rcond=None)[0]
+            turn = rotations.exp(step[:3])
+            y, normals = y @ turn.T + step[3:], normals @ turn.T
+        apart = np.minimum(OrientedPoints(y, normals).match(scan.points, scan.normals, 0.1, 0.6).distances, 0.1).mean()
+        if apart < best[0]:
+            best = (apart, y, int(i))
+    return best[1], best[2]
+
+
+def bent(model: Any, vertices: np.ndarray, view: HalfView) -> Any:
+    """The nearest body bent at its joints: the predicted mesh of a pose-only model whose template it is."""
+    from completion.partial.completion import complete
+    from model.shape_space import ShapeSpace
+
+    template = model.template.with_vertices(vertices)
+    joints = model.skeleton.joint_regressor(model.template) @ vertices
+    skeleton = dataclasses.replace(model.skeleton, joints=joints)
+    features = dataclasses.replace(model.pose_space.features, skeleton=skeleton)
+    own = dataclasses.replace(model, template=template, skeleton=skeleton,
+                              pose_space=dataclasses.replace(model.pose_space, features=features),
+                              shape_space=ShapeSpace.empty(len(template.faces)))
+    return complete(own.subject(None), view.points, view.landmarks).predicted
+
+
+def poisson(folder: Path) -> tuple[list[dict[str, Any]], dict[str, Any]]:
+    """Screened Poisson of every file of points: a row of errors for each, and the settings."""
+    import open3d
+
+    rows = []
+    for path in sorted(folder.glob("*.npz")):
+        with np.load(path) as kept:
+            cloud = open3d.geometry.PointCloud(open3d.utility.Vector3dVector(kept["points"]))
+            cloud.normals = open3d.utility.Vector3dVector(kept["normals"])
+            truth, seen, faces = kept["truth"], kept["seen"], kept["faces"]
+        start = time.process_time()
+        mesh, _ = open3d.geometry.TriangleMesh.create_from_point_cloud_poisson(cloud, depth=8)
+        spent = time.process_time() - start
+        away = {}
+        for name, surface, points in (("seen", (truth, faces), np.asarray(mesh.vertices)),
+                                      ("mesh", (np.asarray(mesh.vertices), np.asarray(mesh.triangles)), truth)):
+            scene = open3d.t.geometry.RaycastingScene()
+            scene.add_triangles(surface[0].astype(np.float32), surface[1].astype(np.uint32))
+            away[name] = 1e3 * scene.compute_distance(points.astype(np.float32)).numpy()
+        off = away["mesh"]
+        rows.append({"k": int(path.stem), "seen_mm": off[seen].mean(), "closest_mm": off[~seen].mean(),
+                     "invented_mm": away["seen"].mean(), "cpu_seconds": spent})
+        print(rows[-1], flush=True)
+    return rows, {"depth": 8, "open3d": open3d.__version__}
+
+
+def keep_points(path: Path, view: HalfView, cloud: Any, body: Any) -> None:
+    """What `--poisson` reads."""
+    path.parent.mkdir(parents=True, exist_ok=True)
+    np.savez(path, points=cloud.points, normals=cloud.normals, truth=body.vertices, seen=view.seen, faces=body.faces)
+
+
+def tried(args: argparse.Namespace) -> tuple[list[dict[str, Any]], dict[str, Any]]:
+    """A row for every man, and the settings."""
+    from half_views import picture
+
+    from completion.partial.completion import complete
+    from completion.partial.scan import prepare_scan
+    from completion.partial.settings import CompletionConfig
+    from model.files import load_model
+    from model.scape import ScapeModel
+
+    data, model, config = load_real(), load_model(args.model), CompletionConfig(**dict(args.set or []))
+    assert isinstance(model, ScapeModel)
+    train, bodies = men(len(data.shapes), args.inner)
+    rows = []
+    for k in args.only if args.only is not None else range(len(bodies)):
+        body = data.template.with_vertices(data.shapes[bodies[k]])
+        view = half_view(body, k, data.landmarks, np.random.default_rng(k))
+        start, cpu = time.perf_counter(), time.process_time()
+        result = complete(model, view.points, view.landmarks, config)
+        row: dict[str, Any] = {"k": k, "seconds": time.perf_counter() - start,
+                               "cpu_seconds": time.process_time() - cpu, "rounds": result.iterations,
+                               "converged": result.converged, "betas": np.linalg.norm(np.asarray(result.betas))}
+        found = {"completed": result.completed, "predicted": result.predicted}
+        if args.nearest or args.points:
+            cloud = prepare_scan(view.points)
+        if args.nearest:
+            rigid, row["nearest"] = nearest(data, train, cloud, view.landmarks)
+            found |= {"nearest_rigid": data.template.with_vertices(rigid), "nearest_posed": bent(model, rigid, view)}
+        if args.points:
+            keep_points(args.points / f"{k:02d}.npz", view, cloud, body)
+        for name, mesh in found.items():
+            row |= {f"{name}_{what}": value for what, value in figures(body, mesh, view).items()}
+        if args.pictures:
+            picture(body, view, result, args.pictures / f"person_{k:02d}.png")
+        rows.append({name: round(float(value), 3) for name, value in row.items()})
+        print(rows[-1], flush=True)
+    return rows, dataclasses.asdict(config)
+
+
+def setting(text: str) -> tuple[str, Any]:
+    """A `name=value` of `CompletionConfig`."""
+    name, value = text.split("=")
+    return name, value if value.isalpha() else float(value) if "." in value or "e" in value else int(value)
+
+
+def main() -> None:
+    """Complete every half view and print the table."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("-o", "--output", default="half_people.json")
+    parser.add_argument("-m", "--model", help="learned from the training part alone")
+    parser.add_argument("--inner", action="store_true", help="the tuning men instead of the held-out ones")
+    parser.add_argument("--only", type=int, nargs="*", help="indices in the list of men")
+    parser.add_argument("--nearest", action="store_true", help="also the nearest training body")
+    parser.add_argument("--points", type=Path, help="folder to keep what --poisson reads")
+    parser.add_argument("--poisson", type=Path, help="only screened Poisson, on the files of such a folder")
+    parser.add_argument("--pictures", type=Path, help="folder for a picture of each")
+    parser.add_argument("--set", type=setting, nargs="*", help="name=value of CompletionConfig")
+    args = parser.parse_args()
+    rows, facts = poisson(args.poisson) if args.poisson else tried(args)
+    mean = {name: float(np.mean([row[name] for row in rows])) for name in rows[0] if name != "k"}
+    for name, value in mean.items():
+        print(f"{name:28s} {value:8.2f}")
+    write_report(args.output, {"protocol": "half views of people", "inner": args.inner, "machine": machine(),
+                               "peak_memory_gib": resource.getrusage(resource.RUSAGE_SELF).ru_maxrss / 2**20,
+                               "mean": mean, "rows": rows, "config": facts})
+
+
+if __name__ == "__main__":
+    main()
