@@ -13,6 +13,8 @@ if TYPE_CHECKING:
     from .motion import Motion
     from .partial.completion import Completion, complete
     from .partial.settings import CompletionConfig
+    from .tracking.sequence import track
+    from .tracking.settings import TrackConfig
 
 _ROOMS = {
     "animation.follow": ("AnimateConfig", "animate"),
@@ -22,11 +24,13 @@ _ROOMS = {
     "motion": ("Motion",),
     "partial.completion": ("Completion", "complete"),
     "partial.settings": ("CompletionConfig",),
+    "tracking.sequence": ("track",),
+    "tracking.settings": ("TrackConfig",),
 }
 _ROOM_OF = {name: room for room, names in _ROOMS.items() for name in names}
 
 __all__ = ["AnimateConfig", "Completion", "CompletionConfig", "Frame", "MarkerLayout", "MarkerSequence", "MarkerStream",
-           "Motion", "animate", "complete", "read_markers", "write_markers"]
+           "Motion", "TrackConfig", "animate", "complete", "read_markers", "track", "write_markers"]
 
 
 def __getattr__(name: str) -> Any:

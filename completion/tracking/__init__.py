@@ -1,0 +1,1 @@
+"""Marker-less capture: the motion of a body from frames of points."""

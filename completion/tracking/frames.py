@@ -1,0 +1,123 @@
+"""A frame of one or several depth cameras made ready for matching, fast and without trust in noisy normals."""
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from scanprep.geometry.files import PointCloud
+from scanprep.geometry.mesh import Mesh
+
+from ..partial.scan import NEIGHBOURS, ScanPoints, View, prepare_scan, spread
+
+FEWEST = 60                          # points below which a frame shows nothing
+DENSER = 4                           # times as many points as are matched make the normals
+RIM = 0.35                           # offset of the neighbours' mean, as a share of their reach, at a border
+
+Frame = Mesh | PointCloud | np.ndarray | Sequence[View] | None
+
+
+@dataclass(frozen=True, eq=False)
+class _Points:
+    """The points of one view: (n, 3), what is said of their normals (n, 3) or None, and where they were seen from."""
+
+    points: np.ndarray
+    rough: np.ndarray | None
+    viewpoint: np.ndarray | None
+
+
+def prepare_frame(frame: Frame, count: int, neighbours: int, viewpoints: Any = None, expected: Mesh | None = None
+                  ) -> ScanPoints | None:
+    """Points with normals of a frame, or None when it shows nothing.
+
+    Normals are those of planes through many neighbours, so that some millimetres of noise do not turn them. Their
+    sign is that of given normals or of the triangles, or else such that they face the viewpoint, or else that of the
+    expected body, or else outward by the form of the cloud alone.
+
+    Parameters
+    ----------
+    frame : Mesh, PointCloud, (n, 3) or (n, 6) float, metres, a sequence of these (cameras), or None
+        Points that are not finite are left out, as depth cameras give such where they saw nothing.
+    count : int
+        How many points to keep, all cameras together.
+    neighbours : int
+        That make one normal.
+    viewpoints : (3,) float, metres, or one for each camera, optional
+    expected : Mesh, optional
+        The body about where it should be.
+
+    Raises
+    ------
+    ValueError
+        Arrays of another shape.
+    """
+    views = [] if frame is None else [frame] if isinstance(frame, Mesh | PointCloud | np.ndarray) else list(frame)
+    given = None if viewpoints is None else np.broadcast_to(np.asarray(viewpoints, float), (len(views), 3))
+    read = [_read(view, None if given is None else given[i], i) for i, view in enumerate(views)]
+    read = [view for view in read if len(view.points) > max(NEIGHBOURS, neighbours)]
+    if sum(len(view.points) for view in read) < FEWEST:
+        return None
+    parts = [_oriented(view, count // len(read), neighbours, expected) for view in read]
+    points, normals = (np.concatenate([part[i] for part in parts]) for i in (0, 1))
+    dense = np.concatenate([part[2] for part in parts])
+    border, spacing = _borders(points, normals, dense, neighbours)
+    number = np.repeat(np.arange(len(parts)), [len(part[0]) for part in parts])
+    return ScanPoints(points, normals, border, spacing, number, np.arange(len(points)))
+
+
+def as_views(cloud: ScanPoints) -> list[PointCloud]:
+    """A prepared frame as the views that `complete` takes."""
+    return [PointCloud(cloud.points[cloud.view == k], cloud.normals[cloud.view == k]) for k in np.unique(cloud.view)]
+
+
+def _read(view: View, viewpoint: np.ndarray | None, number: int) -> _Points:
+    if isinstance(view, Mesh):
+        points, rough = view.vertices, view.vertex_normals if len(view.faces) else None
+    elif isinstance(view, PointCloud):
+        points, rough = view.points, view.normals
+    else:
+        array = np.asarray(view, dtype=np.float64)
+        if array.size == 0:
+            array = np.zeros((0, 3))
+        if array.ndim != 2 or array.shape[1] not in (3, 6):
+            raise ValueError(f"frame: view {number}: expected points of shape (n, 3), or (n, 6) with normals, "
+                             f"got {array.shape}")
+        points, rough = array[:, :3], array[:, 3:] if array.shape[1] == 6 else None
+    good = np.isfinite(points).all(axis=1)
+    return _Points(points[good], None if rough is None else np.nan_to_num(rough[good]), viewpoint)
+
+
+def _oriented(view: _Points, count: int, neighbours: int, expected: Mesh | None
+              ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Some points of a view, their normals, and the denser points that these were made from."""
+    many = spread(view.points, DENSER * count) if len(view.points) > DENSER * count else np.arange(len(view.points))
+    dense = view.points[many]
+    few = spread(dense, count) if len(dense) > count else np.arange(len(dense))
+    _, near = cKDTree(dense).query(dense[few], neighbours)
+    around = dense[near] - dense[near].mean(axis=1, keepdims=True)
+    normals = np.linalg.eigh(np.swapaxes(around, 1, 2) @ around)[1][:, :, 0]
+    if view.rough is not None:
+        outward = view.rough[many][near].sum(axis=1)
+    elif view.viewpoint is not None:
+        outward = view.viewpoint - dense[few]
+    elif expected is not None:
+        _, beside = cKDTree(expected.vertices).query(dense[few], 4)
+        outward = expected.vertex_normals[beside].sum(axis=1)
+    else:
+        outward = prepare_scan(dense).normals[few]
+    normals *= np.where(np.einsum("nd,nd->n", normals, outward) < 0, -1, 1)[:, None]
+    return dense[few], normals, dense
+
+
+def _borders(points: np.ndarray, normals: np.ndarray, dense: np.ndarray, neighbours: int
+             ) -> tuple[np.ndarray, float]:
+    """Which points lie on the border of what all views show, where neighbours are on one side; and the spacing."""
+    distance, near = cKDTree(dense).query(points, neighbours)
+    mean = dense[near].mean(axis=1) - points
+    mean -= np.einsum("nd,nd->n", mean, normals)[:, None] * normals
+    border = np.linalg.norm(mean, axis=1) > RIM * distance[:, -1]
+    apart = cKDTree(points).query(points, 5)[0][:, 1:].mean(axis=1)
+    return border, float(np.median(apart))
