@@ -11,7 +11,7 @@ from scanprep.geometry.surface import OrientedPoints
 from .. import energy
 from ..bodies import FixedBody
 from ..priors import GaussianPrior, choose_prior, gaussian_prior, joint_limits
-from ..solve import MinimiseConfig, minimise
+from ..solve import Energy, MinimiseConfig, minimise, normal_equations
 from .contact import Contact
 from .masks import Cover, part_vertices
 from .scan import ScanPoints, spread
@@ -20,6 +20,7 @@ from .sight import find_sights
 
 Denial = tuple[np.ndarray, np.ndarray, np.ndarray]
 
+TERMS = ("landmarks", "pose_prior", "joint_limits", "shape_prior", "scan_planes", "scan_points", "trespass")
 SETTLED = 5e-4                       # metres, root mean square over the vertices from round to round
 
 
@@ -111,14 +112,29 @@ class ScanFit:
 
     def step(self, x: np.ndarray, scan: ScanPoints, reach: float) -> tuple[np.ndarray, dict[str, float]]:
         """One matching and the best unknowns (P,) for it, and the energies there."""
+        held = np.full(len(x), self.config.twist_weight)
+        held[:3] = held[self.body.n_angles:] = 0
+        terms = self.terms(x, scan, reach)
+
+        def energies(at: np.ndarray) -> list[energy.Residual]:
+            return [*terms(at), energy.stay_near(at, x, held)]
+
+        best = minimise(energies, x[None], MinimiseConfig(iterations=2, tolerance=1e-3)).x
+        return best[0], {n: float(r.energy[0]) for n, r in zip((*TERMS, "twists"), energies(best), strict=True)}
+
+    def precision(self, x: np.ndarray) -> np.ndarray:
+        """(P, P) how sharply scan, landmarks and priors together determine unknowns (P,): the Gauss-Newton matrix."""
+        terms = self.terms(x, self.thin, self.config.final_reach)
+        return normal_equations(terms(x[None]))[2][0]
+
+    def terms(self, x: np.ndarray, scan: ScanPoints, reach: float) -> Energy:
+        """The energies `TERMS` of unknowns (B, P) near x (P,), for the matches at x."""
         body, config = self.body, self.config
         mesh = self.mesh(x)
         ids, target, normal, weights = self.matches(mesh, scan, reach)
         out_ids, out_target, out_normal, out_weights = self.trespasses(mesh)
         follow = body.follow(np.concatenate([self.vertices, ids, out_ids]), x)
         count, end = len(self.vertices), len(self.vertices) + len(ids)
-        held = np.full(len(x), config.twist_weight)
-        held[:3] = held[body.n_angles:] = 0
         landmark_weights = np.full(count, config.landmark_sd**-2)
         prior, limit = self.habit.near(body.split(x)[0]), config.prior_weight * config.joint_limits
 
@@ -131,13 +147,9 @@ class ScanFit:
                     energy.shape_prior(at, body.n_angles + 3),
                     energy.point_to_plane(free, target, normal, weights),
                     energy.point_to_point(free, target, 0.1 * weights),
-                    energy.point_to_plane(denied, out_target, out_normal, out_weights),
-                    energy.stay_near(at, x, held)]
+                    energy.point_to_plane(denied, out_target, out_normal, out_weights)]
 
-        best = minimise(energies, x[None], MinimiseConfig(iterations=2, tolerance=1e-3)).x
-        names = ("landmarks", "pose_prior", "joint_limits", "shape_prior", "scan_planes", "scan_points", "trespass",
-                 "twists")
-        return best[0], {n: float(r.energy[0]) for n, r in zip(names, energies(best), strict=True)}
+        return energies
 
     def matches(self, mesh: Mesh, scan: ScanPoints, reach: float) -> tuple[np.ndarray, ...]:
         """Vertices, scan points, their normals and weights, by closest points both ways."""
