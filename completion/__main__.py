@@ -12,6 +12,7 @@ COMMANDS = {
     "model": ("Look into a body model and pose it.", "model.cli:group"),
     "complete": ("A partial scan -> the whole body.", "completion.partial.cli:complete_scan"),
     "animate": ("Markers of a known subject -> a moving body.", "completion.animation.cli:animate_markers"),
+    "track": ("Frames of points -> a moving body, without markers.", "completion.tracking.cli:track_frames"),
 }
 
 

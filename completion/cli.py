@@ -4,6 +4,7 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Annotated, Any
 
+import numpy as np
 import tyro
 
 from model.body import BodyModel
@@ -28,6 +29,36 @@ def read_model(path: Path | None) -> tuple[BodyModel, str]:
     with bar("building the embedded people") as progress:
         model = embedded_model(progress)
     return model, f"embedded people, built {model.info['built']}, cached at {embedded_path()}"
+
+
+def read_landmark_pairs(model: BodyModel, name: str, scan: Path, template: Path | None, unit: str | None
+                        ) -> tuple[np.ndarray, np.ndarray]:
+    """Vertices (L,) and points (L, 3) of the landmarks that a file and the model have in common.
+
+    Parameters
+    ----------
+    name : str
+        Of the model, for messages.
+    scan : Path
+        Named points.
+    template : Path, optional
+        Where they are on the template; else those kept in the model.
+
+    Raises
+    ------
+    ValueError
+        A model that keeps none, fewer than three in common.
+    """
+    from scanprep.geometry.landmarks import match_landmarks, read_landmark_vertices, read_landmarks
+
+    kept = model.info.get("landmarks") if template is None else read_landmark_vertices(template, model.template)
+    if not kept:
+        raise ValueError(f"{name}: the model keeps no landmarks of its template; name them with --template-landmarks")
+    try:
+        _, vertices, points = match_landmarks(kept, read_landmarks(scan, None, unit))
+    except ValueError as error:
+        raise ValueError(f"{scan}: {error}") from None
+    return vertices, points
 
 
 def rows(metrics: list[Metric]) -> list[tuple[str, Any, str]]:

@@ -86,12 +86,13 @@ class Tracker:
         self._shape_known = not isinstance(self.whole, ShapedBody)
 
     def resume(self, frames: list[TrackedFrame], betas: np.ndarray | None) -> None:
-        """Go on after frames that were tracked before, of which the last two are enough, with the shape found."""
+        """Go on after frames that were tracked before, with the shape that was found."""
         if isinstance(self.whole, ShapedBody):
             assert betas is not None, "a shape was found"
             self.betas, self.body, self._shape_known = betas, FixedBody(self.whole.model.subject(betas)), True
         self._past = [frame.x for frame in frames[:-3:-1]]
         self._number = frames[-1].number + 1
+        self._lost = next((i for i, frame in enumerate(reversed(frames)) if frame.found), len(frames))
 
     def push(self, frame: Frame) -> list[TrackedFrame]:
         """Take the next frame; returns those that are done, which may be none or several."""

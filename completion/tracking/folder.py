@@ -1,0 +1,134 @@
+"""A folder of frames: which file is which frame and camera, and reading them one by one."""
+from __future__ import annotations
+
+import re
+from collections.abc import Iterator
+from pathlib import Path
+
+import numpy as np
+
+from scanprep.geometry.files import MeshFileError, PointCloud, read_points
+
+ENDINGS = (".ply", ".ply.gz", ".obj", ".stl", ".off", ".glb", ".pcd", ".xyz", ".txt", ".pts")
+NOTHING = ("holds no vertices", "the file is empty")
+SPARSE = 2                           # numbers may leave out as many frames as there are; else they only give the order
+
+
+class FrameFolder:
+    """Frames in the order of the numbers in their names.
+
+    A folder holds a file for each frame, or a subfolder of such files for each camera, or, with a pattern, the files
+    of all cameras. A number that is left out is a frame in which nothing was seen.
+
+    Parameters
+    ----------
+    folder : Path
+    pattern : str, optional
+        File names with {camera} and {frame} in them, such as "cam{camera}_{frame}.ply".
+    unit : 'm', 'mm', 'cm' or 'in', optional
+
+    Attributes
+    ----------
+    names : str of every frame
+    cameras : str of every camera; one without a name where there is one
+    problems : str, files that could not be read so far and why
+
+    Raises
+    ------
+    ValueError
+        No such folder, no frames in it, files whose number is missing or comes twice.
+    """
+
+    def __init__(self, folder: Path, pattern: str | None = None, unit: str | None = None) -> None:
+        self.folder, self.unit = folder, unit
+        self.problems: list[str] = []
+        if not folder.is_dir():
+            raise ValueError(f"{folder}: " + ("expected a folder of frames, found a file" if folder.exists()
+                                              else "no such folder"))
+        cameras = _by_pattern(folder, pattern) if pattern else _by_folder(folder)
+        self.cameras = tuple(cameras)
+        self._paths = cameras
+        self.numbers = _numbers({n for files in cameras.values() for n in files})
+        self.names = tuple(f"{n}" for n in self.numbers)
+
+    def __len__(self) -> int:
+        return len(self.numbers)
+
+    def __iter__(self) -> Iterator[list[PointCloud]]:
+        return (self[i] for i in range(len(self)))
+
+    def __getitem__(self, i: int) -> list[PointCloud]:
+        """What the cameras saw in frame i; a file that cannot be read is a camera that saw nothing."""
+        found = [self._read(path) for path in self.paths(i)]
+        return [cloud for cloud in found if cloud is not None]
+
+    def paths(self, i: int) -> list[Path]:
+        """The files of frame i."""
+        return [files[self.numbers[i]] for files in self._paths.values() if self.numbers[i] in files]
+
+    def _read(self, path: Path) -> PointCloud | None:
+        try:
+            return read_points(path, self.unit)
+        except MeshFileError as error:
+            if not any(word in str(error) for word in NOTHING) and str(error) not in self.problems:
+                self.problems.append(str(error))
+            return None
+
+
+def _by_folder(folder: Path) -> dict[str, dict[int, Path]]:
+    own = _files(folder)
+    if own:
+        return {"": _numbered(own)}
+    inner = {path.name: _files(path) for path in sorted(folder.iterdir()) if path.is_dir()}
+    found = {name: _numbered(files) for name, files in inner.items() if files}
+    if not found:
+        raise ValueError(f"{folder}: expected frames ({', '.join(ENDINGS)}) in it, or in one folder for each camera, "
+                         "found none")
+    return found
+
+
+def _by_pattern(folder: Path, pattern: str) -> dict[str, dict[int, Path]]:
+    if "{camera}" not in pattern or "{frame}" not in pattern:
+        raise ValueError(f"--cameras: expected a name with {{camera}} and {{frame}} in it, got '{pattern}'")
+    expression = re.escape(pattern).replace(r"\{camera\}", "(?P<camera>.+?)").replace(r"\{frame\}", r"(?P<frame>\d+)")
+    found: dict[str, dict[int, Path]] = {}
+    for path in sorted(folder.rglob("*")):
+        match = re.fullmatch(expression, path.relative_to(folder).as_posix())
+        if match and path.is_file():
+            mine, number = found.setdefault(match["camera"], {}), int(match["frame"])
+            if number in mine:
+                raise ValueError(f"{folder}: {mine[number].name} and {path.name} are both frame {number} of camera "
+                                 f"{match['camera']}")
+            mine[number] = path
+    if not found:
+        raise ValueError(f"{folder}: no file is named as --cameras '{pattern}' says")
+    return dict(sorted(found.items()))
+
+
+def _files(folder: Path) -> list[Path]:
+    return sorted(path for path in folder.iterdir() if path.is_file() and not path.name.startswith(".")
+                  and path.name.lower().endswith(ENDINGS))
+
+
+def _numbered(paths: list[Path]) -> dict[int, Path]:
+    """Files by the last number in their names."""
+    out: dict[int, Path] = {}
+    for path in paths:
+        digits = re.findall(r"\d+", path.name.split(".")[0])
+        if not digits:
+            raise ValueError(f"{path}: expected the number of the frame in its name")
+        number = int(digits[-1])
+        if number in out:
+            raise ValueError(f"{path.parent}: {out[number].name} and {path.name} are both frame {number}; put cameras "
+                             "into folders of their own, or name them with --cameras")
+        out[number] = path
+    return out
+
+
+def _numbers(found: set[int]) -> list[int]:
+    """Frame numbers in order, with those between that are left out, unless they are too many to be frames."""
+    order = sorted(found)
+    steps = np.diff(order)
+    step = int(np.gcd.reduce(steps)) if len(steps) else 1
+    filled = list(range(order[0], order[-1] + 1, step))
+    return filled if len(filled) <= SPARSE * len(order) else order
