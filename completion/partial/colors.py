@@ -132,7 +132,9 @@ def carry_colors(body: Mesh, seen: np.ndarray, scan: View | Sequence[View], conf
     """
     config = config or ColorConfig()
     colors, weight = blend(colored_views(scan, viewpoint, metres, textures), body.vertices, body.vertex_normals, config)
-    known = seen & (weight > 0)
+    near = body.vertex_adjacency
+    closed = seen | (near @ seen.astype(float) > 0.5 * near.sum(axis=1))     # single gaps amid what was seen
+    known = closed & (weight > 0)
     out = np.where(known[:, None], colors, config.grey)
     return fill_colors(body, out, known) if config.fill and known.any() else out
 

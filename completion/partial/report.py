@@ -22,8 +22,8 @@ from .scan import View, all_points, as_views, in_metres
 MEASURED, COMPLETED = (0.55, 0.67, 0.80), (0.93, 0.75, 0.42)
 CLOTHING, MARK = (0.62, 0.48, 0.66), (0.80, 0.12, 0.10)
 HEIGHT = 520
-SIDES = ("from the camera", "from its right", "from behind", "from its left")
-FEW = 6000                           # points of a bare cloud that a picture shows
+SIDES = ("from the camera", "from the right of it", "from the other side", "from the left of it")
+FEW = 9000                           # points of a bare cloud that a picture shows
 
 
 def picture_completion(scan: View | Sequence[View], completion: Completion, template: Mesh, height: int = HEIGHT,
@@ -74,7 +74,7 @@ def scan_shapes(scan: View | Sequence[View], masked: np.ndarray | None = None, m
             out.append(Solid(view, colors))
         else:
             some = slice(None, None, max(1, len(points) // FEW))
-            out.append(Dots(points[some], colors[some], radius=0.004))
+            out.append(Dots(points[some], colors[some], radius=0.005))
     return out
 
 
@@ -144,7 +144,7 @@ def _distances(page: Page, scan: View | Sequence[View], completion: Completion, 
 
 
 def _confidence(page: Page, completion: Completion, cameras: list[Camera]) -> None:
-    expected = getattr(completion, "expected_error", None)
+    expected = completion.expected_error
     if expected is None:
         return
     body = Mesh(completion.completed.vertices, completion.completed.faces)

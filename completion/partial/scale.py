@@ -21,6 +21,7 @@ LOOSE = 0.3                          # standard deviation of the logarithm of wh
 POINTS = 1500                        # that show how far a scan extends
 DIRECTIONS = 40                      # from which each pose is looked at
 ALIKE = 25                           # views of poses that extend like the scan
+AXES = 4                             # main directions of the poses
 ALIGNED = 12                         # poses that meet the landmarks best and are followed up
 
 
@@ -83,9 +84,7 @@ def rough_scale(body: FixedBody, points: np.ndarray) -> float:
     """
     some = points[spread(points, POINTS)]
     size, form = _extent(some[None])
-    poses = body.pose_examples
-    if not len(poses):
-        poses = typical_poses(body.pose_mean, body.pose_covariance, 4)
+    poses = _usual_poses(body)
     ids = spread(body.template.vertices, POINTS)
     places = body.subject.points(ids).evaluate(poses, np.zeros((len(poses), 3)))
     part = body.skeleton.part_of_vertex(body.template)[ids]
@@ -102,6 +101,12 @@ def rough_scale(body: FixedBody, points: np.ndarray) -> float:
     return float(np.median(np.concatenate(sizes)[near]) / size[0])
 
 
+def _usual_poses(body: FixedBody) -> np.ndarray:
+    """(M, J, 3) those the body was learned from, where it keeps them, and steps along their main directions."""
+    typical = typical_poses(body.pose_mean, body.pose_covariance, AXES)
+    return np.concatenate([body.pose_examples, typical]) if len(body.pose_examples) else typical
+
+
 def _extent(points: np.ndarray, weights: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
     """Root mean square distance (B,) from the middle, and its shares (B, 3) along the main axes."""
     w = np.ones(points.shape[:2]) if weights is None else weights
@@ -116,7 +121,7 @@ def landmark_scale(body: FixedBody, vertices: np.ndarray, points: np.ndarray, co
     """What to multiply landmarks (L, 3) with, which are roughly in metres, to be in metres more closely."""
     scaled = ScaledBody(body)
     prior = gaussian_prior(body.pose_mean, body.pose_covariance, config.prior_shrinkage)
-    poses = np.concatenate([body.pose_examples, typical_poses(body.pose_mean, body.pose_covariance, 4)])
+    poses = _usual_poses(body)
     here = body.subject.points(vertices).evaluate(poses, np.zeros((len(poses), 3)))
     start, misfit = [], []
     for pose, at in zip(poses, here, strict=True):

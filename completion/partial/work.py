@@ -103,7 +103,7 @@ def figures(work: Work, inputs: Inputs, done: Completion, landmarks: tuple[np.nd
         rows.append(Metric("scan points masked", 100 * float(masked.mean()), "%"))
     if work.config.free_scale:
         rows.append(Metric("unit of the scan", float(done.scale), "m"))
-    return [*rows, Metric("converged", str(done.converged)), Metric("rounds", done.iterations),
+    return [*rows, Metric("converged", "yes" if done.converged else "no"), Metric("rounds", done.iterations),
             Metric("model", work.model)]
 
 
