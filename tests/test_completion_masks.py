@@ -166,5 +166,5 @@ def test_painted_points_must_be_those_of_the_scan(tmp_path):
     colors = np.zeros((3, 3)) + [1, 0, 0]
     moved = POINTS[:3] + [[0, 0, 0], [0, 0, 0], [0, 0.02, 0]]
     write_points(tmp_path / "moved.ply", PointCloud(moved, None, colors))
-    with pytest.raises(ValueError, match="moved.ply: point 2: expected the points of the scan, this one is 20.0 mm"):
+    with pytest.raises(ValueError, match=r"moved.ply: point 2: expected the points of the scan, this one is 20\.0 mm"):
         read_mask(tmp_path / "moved.ply", POINTS)
