@@ -62,6 +62,11 @@ class Motion:
     def __repr__(self) -> str:
         return f"Motion({len(self.poses)} frames at {self.rate:g}/s, {self.poses.shape[1]} parts)"
 
+    @property
+    def times(self) -> np.ndarray:
+        """(T,) seconds from the first frame."""
+        return np.arange(len(self.poses)) / self.rate
+
     def vertices(self, subject: Subject, frames: np.ndarray | slice = slice(None)) -> np.ndarray:
         """The meshes (n, N, 3) of some frames, metres.
 
