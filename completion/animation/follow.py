@@ -17,7 +17,7 @@ from .prediction import inertia
 from .settings import AnimateConfig
 from .smooth import smooth_sequence
 from .stream import Tracker, judge
-from .trust import LabelWatch, distances_apart, marker_weights
+from .trust import LabelWatch, exchangeable, marker_weights
 
 __all__ = ["AnimateConfig", "MarkerFollower", "animate"]
 
@@ -165,13 +165,9 @@ class MarkerFollower:
         """See in every frame whether labels have been exchanged, the body being at x (T, P)."""
         watch = LabelWatch(self.body.count, self.config.outlier)
         positions = self.positions(x)
-        squared, scale = distances_apart(positions, self.targets, self.config.outlier)
-        doubtful = (np.nan_to_num(squared) > (0.5 * scale)**2).sum(axis=1) > 1
-        for t in range(len(x)):
-            if doubtful[t]:
+        for t, doubtful in enumerate(exchangeable(positions, self.targets, self.config.outlier)):
+            if doubtful or not watch.idle:
                 watch.update(positions[t], self.targets[t])
-            else:
-                watch.forget()
             self.order[t] = watch.order
 
 

@@ -2,8 +2,8 @@
 from __future__ import annotations
 
 import numpy as np
-from scipy.spatial.transform import Rotation
 
+from model.features import twists
 from model.linear import Subject
 from scanprep.geometry import rotations
 from scanprep.geometry.mesh import Mesh
@@ -12,6 +12,7 @@ from ..bodies import FixedBody
 from ..energy import MovingPoints, moving_points
 from ..markers.layout import MarkerLayout
 from ..priors import gaussian_prior
+from . import turns
 from .points import marker_shapes
 
 System = tuple[np.ndarray, np.ndarray, np.ndarray]                      # energy, half its gradient, Gauss-Newton matrix
@@ -50,8 +51,8 @@ class MarkedBody:
         pose, trans, _ = self.body.split(x)
         y, by_turn = self.shapes.columns(pose, trans)
         B, J = pose.shape[:2]
-        turns = np.moveaxis(by_turn.reshape(B, J, 3, 3, self.count), 2, -1)                      # (B, J, 3, L, 3)
-        by_pose = turns @ rotations.right_jacobian(pose)[:, :, None]
+        by_turn = np.moveaxis(by_turn.reshape(B, J, 3, 3, self.count), 2, -1)                    # (B, J, 3, L, 3)
+        by_pose = by_turn @ rotations.right_jacobian(pose)[:, :, None]
         return moving_points(np.swapaxes(y, -1, -2),
                              by_pose.transpose(0, 3, 2, 1, 4).reshape(B, self.count, 3, 3 * J))
 
@@ -70,18 +71,21 @@ class MarkedBody:
         """
         pose, trans, _ = self.body.split(x)
         B, n = len(x), self.body.n_angles
-        y, by_turn = self.shapes.columns(pose, trans)
-        root = np.sqrt(np.where(np.isnan(targets[..., 0]), 0.0, weights))[:, None]
-        residual = (root * np.nan_to_num(y - np.swapaxes(targets, -1, -2))).reshape(B, -1)
+        pose = twists(pose)
+        local = rotations.inverse_right_jacobian(pose)                                           # dpose = local d
+        y, by_turn = self.shapes.columns(pose, trans, local)
+        missing = np.isnan(targets[..., 0])
+        root = np.sqrt(np.where(missing, 0.0, weights))[:, None]
+        off = np.where(missing[:, None], 0.0, y - np.swapaxes(targets, -1, -2))
+        residual = (root * off).reshape(B, -1)
         columns = np.empty((B, self.n_unknowns, 3, self.count))
         np.multiply(by_turn, root[:, None], out=columns[:, :n])
         columns[:, n:] = np.eye(3)[:, :, None] * root[:, None]
         A = columns.reshape(B, self.n_unknowns, -1)
         energy, gradient = (residual**2).sum(axis=1), (A @ residual[..., None])[..., 0]
         hessian = A @ np.swapaxes(A, -1, -2)
-        off = x[:, :n] - self.prior.mean
+        off = pose.reshape(B, n) - self.prior.mean
         pull = off @ self._precision
-        local = rotations.inverse_right_jacobian(pose)                                           # dpose = local d
         gradient[:, :n] += (pull.reshape(B, -1, 1, 3) @ local).reshape(B, n)
         half = self._precision.reshape(n, -1, 3).swapaxes(0, 1) @ local                          # (B, J, n, 3)
         half = half.reshape(B, -1, n // 3, 3, 3).swapaxes(-1, -2)                                # transposed rows
@@ -92,16 +96,14 @@ class MarkedBody:
         """The unknowns (..., P) after a step (..., P); poses come out at most a half turn long."""
         n = self.body.n_angles
         out = x + step
-        turned = Rotation.from_rotvec(x[..., :n].reshape(-1, 3)) * Rotation.from_rotvec(step[..., :n].reshape(-1, 3))
-        out[..., :n] = turned.as_rotvec().reshape(*x.shape[:-1], n)
+        out[..., :n] = turns.compose(*(a[..., :n].reshape(-1, 3) for a in (x, step))).reshape(*x.shape[:-1], n)
         return out
 
     def step_to(self, x: np.ndarray, goal: np.ndarray) -> np.ndarray:
         """The step (..., P) that leads from unknowns (..., P) to others."""
         n = self.body.n_angles
         out = goal - x
-        here, there = (Rotation.from_rotvec(some[..., :n].reshape(-1, 3)) for some in (x, goal))
-        out[..., :n] = (here.inv() * there).as_rotvec().reshape(*x.shape[:-1], n)
+        out[..., :n] = turns.compose(*(a[..., :n].reshape(-1, 3) for a in (-x, goal))).reshape(*x.shape[:-1], n)
         return out
 
 

@@ -19,6 +19,7 @@ from scanprep.skeleton.tree import Skeleton
 
 from .. import energy
 from ..priors import gaussian_prior
+from .turns import exp
 
 SAMPLES = 120                        # poses from which the turning of the normals is learned
 RIDGE = 1e-2                         # that holds a normal to its part where the poses say little
@@ -62,33 +63,36 @@ class PartShapes:
 
     def rotations(self, pose: np.ndarray) -> np.ndarray:
         """World rotations (J, B, 3, 3) of the parts at poses (J, B, 3)."""
-        turns = rotations.exp(pose)
-        R = turns.copy()
+        relative = exp(pose)
+        R = relative.copy()
         for children, parents in self._levels:
-            R[children] = R[parents] @ turns[children]
+            R[children] = R[parents] @ relative[children]
         return R
 
     def shapes(self, t: np.ndarray) -> np.ndarray:
         """Local shapes (J, B, 3, L) of the parts at twists (J, B, 3)."""
-        raised = np.moveaxis(self.lift.evaluate(np.moveaxis(t, 0, 1)), 1, 0)                     # (J, B, m)
-        known = np.moveaxis(raised[self._joint_of], 1, 2)                                        # (J, B, n, m)
+        raised = self.lift.evaluate(t.swapaxes(0, 1)).swapaxes(0, 1)                             # (J, B, m)
+        known = raised[self._joint_of].swapaxes(1, 2)                                            # (J, B, n, m)
         J, B = t.shape[:2]
         bent = known.reshape(J, B, -1) @ self._by_part.reshape(J, -1, 3 * self.count)
         return self.constant[:, None] + bent.reshape(J, B, 3, -1)
 
     def evaluate(self, pose: np.ndarray, trans: np.ndarray) -> np.ndarray:
         """Places (B, 3, L), metres, at poses (B, J, 3) and trans (B, 3)."""
-        pose = np.moveaxis(pose, 1, 0)
+        pose = pose.swapaxes(0, 1)
         carried = self.rotations(pose) @ self.shapes(twists(pose))
         return carried.sum(axis=0) + (self.origin + trans)[:, :, None]
 
-    def columns(self, pose: np.ndarray, trans: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    def columns(self, pose: np.ndarray, trans: np.ndarray, local: np.ndarray | None = None
+                ) -> tuple[np.ndarray, np.ndarray]:
         """Places and their derivatives.
 
         Parameters
         ----------
         pose : (B, J, 3) float, radians
         trans : (B, 3) float, metres
+        local : (B, J, 3, 3) float, optional
+            The inverse right Jacobians of poses that are at most a half turn long, where they are known.
 
         Returns
         -------
@@ -96,19 +100,19 @@ class PartShapes:
         (B, 3J, 3, L) float
             By small turns of the joints from the right; by trans it is the identity.
         """
-        pose = np.moveaxis(pose, 1, 0)
-        (J, B), L = pose.shape[:2], self.count
-        t = twists(pose)
-        R = self.rotations(pose)
+        t = (pose if local is not None else twists(pose)).swapaxes(0, 1)
+        (J, B), L = t.shape[:2], self.count
+        local = rotations.inverse_right_jacobian(t) if local is None else local.swapaxes(0, 1)
+        R = self.rotations(t)
         below = (self._below @ (R @ self.shapes(t)).reshape(J, -1)).reshape(J, B, 3, L)
         # a turn about the column ω of R moves x by ω × x = hat(ω) @ x
         columns = rotations.hat(np.swapaxes(R, -1, -2)).reshape(J, B, 9, 3) @ below
-        slope = np.moveaxis(self.lift.derivative(np.moveaxis(t, 0, 1)), 1, 0) @ rotations.inverse_right_jacobian(t)
-        turned = np.moveaxis(R[self._part_of], 1, 2)                                             # (J, B, n, 3, 3)
+        slope = self.lift.derivative(t.swapaxes(0, 1)).swapaxes(0, 1) @ local
+        turned = R[self._part_of].swapaxes(1, 2)                                                 # (J, B, n, 3, 3)
         sway = slope.swapaxes(-1, -2)[:, :, :, None, None, :, None] * turned[:, :, None].swapaxes(-2, -3)[..., None, :]
         columns += (sway.reshape(J, 9 * B, -1) @ self._by_joint.reshape(J, -1, L)).reshape(J, B, 9, L)
         return below[0] + (self.origin + trans)[:, :, None], \
-            np.moveaxis(columns.reshape(J, B, 3, 3, L), 0, 1).reshape(B, 3 * J, 3, L)
+            columns.reshape(J, B, 3, 3, L).swapaxes(0, 1).reshape(B, 3 * J, 3, L)
 
     def lift_off(self, part: np.ndarray, offsets: np.ndarray, bends: list[dict[int, np.ndarray]]) -> None:
         """Add to every point a vector that turns with a part and bends with its joints.

@@ -91,16 +91,19 @@ class KalmanPrediction:
             block[np.diag_indices(len(block))] += share * self.noise
         self._ahead = place, cross, speed
         self._expected = self.body.retract(self.x, m * self.velocity)
-        self._information = np.linalg.inv(place)
+        information = np.linalg.inv(place)
+        self._information = 0.5 * (information + information.T)
         return self._expected, self._information
 
     def update(self, x: np.ndarray, measured: np.ndarray) -> None:
         _, cross, speed = self._ahead
         gain = self._information @ cross                                # of the velocity, by the place
         self.velocity = self.momentum * self.velocity + self.body.step_to(self._expected, x) @ gain
-        self.place = np.linalg.inv(self._information + measured)
+        place = np.linalg.inv(self._information + measured)
+        self.place = 0.5 * (place + place.T)
         known = self.place @ gain
-        self.speed = speed - cross.T @ gain + gain.T @ known
+        speed = speed - cross.T @ gain + gain.T @ known
+        self.speed = 0.5 * (speed + speed.T)                            # rounding grows where it is not symmetric
         self.cross = known
         self.x = x
 

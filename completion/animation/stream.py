@@ -94,11 +94,11 @@ class MarkerStream:
         positions = np.asarray(positions, dtype=np.float64)
         if positions.shape != (self.n_labels, 3):
             raise ValueError(f"positions: expected shape ({self.n_labels}, 3), got {positions.shape}")
-        x, settled = self.tracker.push(positions[self.rows])
+        tracker, targets = self.tracker, positions[self.rows]
+        x, settled = tracker.push(targets)
         residuals, trusted = np.full(self.n_labels, np.nan), np.zeros(self.n_labels, dtype=bool)
-        pose, trans, _ = self.tracker.body.body.split(x)
-        if np.isfinite(x).all():
-            residuals[self.rows], trusted[self.rows] = self.tracker.judge(x, positions[self.rows])
+        residuals[self.rows], trusted[self.rows] = judge(tracker.places, targets, tracker.watch.order, tracker.config)
+        pose, trans, _ = tracker.body.body.split(x)
         return Frame(pose, trans, residuals, trusted, settled)
 
 
@@ -117,6 +117,7 @@ class Tracker:
         self.watch = LabelWatch(body.count, config.outlier)
         self.prediction = make_prediction(body, config, rate)
         self.wait, self.started = 0, False
+        self.places = np.full((body.count, 3), np.nan)                  # of the markers on the body of the last frame
 
     def begin(self, x: np.ndarray) -> None:
         """Continue from these unknowns (P,), at rest."""
@@ -133,25 +134,29 @@ class Tracker:
                 return np.full(self.body.n_unknowns, np.nan), False
             self.begin(self.search(targets))
         expected, information = self.prediction.expect()
+        self.places = self.body.positions(expected)
         if not there:
             self.prediction.update(expected, 0 * information)
             return expected, False
-        targets = targets[self.watch.update(self.body.positions(expected), targets)]
+        targets = targets[self.watch.update(self.places, targets)]
         end = self.solve(targets, expected, information)
-        miss = self._miss(end.x[0], targets)
+        self.places = self.body.positions(end.x[0])
+        miss = _miss(self.places, targets)
         if miss > self.config.lost and not self.wait and there >= max(3, ENOUGH * self.body.count):
             self.wait = round(PATIENCE * self.rate)
             found = self.search(targets)
-            if self._miss(found, targets) < 0.7 * miss:
+            places = self.body.positions(found)
+            if _miss(places, targets) < 0.7 * miss:
                 self.begin(found)
+                self.places = places
                 return found, True
         self.prediction.update(end.x[0], end.hessian[0] - information)
         return end.x[0], bool(end.converged[0])
 
     def solve(self, targets: np.ndarray, expected: np.ndarray, information: np.ndarray) -> Minimum:
-        """The best unknowns of a frame near the expected ones."""
+        """The best unknowns of a frame near the expected ones, which put the markers where `places` says."""
         config, body = self.config, self.body
-        weights, _ = marker_weights(body.positions(expected), targets, config.marker_sd, config.outlier)
+        weights, _ = marker_weights(self.places, targets, config.marker_sd, config.outlier)
 
         def system(x: np.ndarray) -> System:
             cost, gradient, hessian = body.system(x, targets[None], weights[None])
@@ -175,13 +180,6 @@ class Tracker:
             weights, _ = marker_weights(body.positions(x[0]), targets, config.marker_sd, config.outlier)
         return x[0]
 
-    def judge(self, x: np.ndarray, targets: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Residuals (L,), metres, of the markers as they came, and which of them were believed."""
-        return judge(self.body.positions(x), targets, self.watch.order, self.config)
-
-    def _miss(self, x: np.ndarray, targets: np.ndarray) -> float:
-        return float(np.nanmedian(np.linalg.norm(self.body.positions(x) - targets, axis=1)))
-
 
 def judge(positions: np.ndarray, targets: np.ndarray, order: np.ndarray, config: AnimateConfig
           ) -> tuple[np.ndarray, np.ndarray]:
@@ -195,6 +193,12 @@ def judge(positions: np.ndarray, targets: np.ndarray, order: np.ndarray, config:
     """
     residuals = np.linalg.norm(positions - targets, axis=-1)
     squared, scale = distances_apart(positions, targets, config.outlier)
-    return residuals, (np.nan_to_num(squared, nan=np.inf) < scale**2) & (order == np.arange(order.shape[-1]))
+    return residuals, (squared < scale**2) & (order == np.arange(order.shape[-1]))
+
+
+def _miss(places: np.ndarray, targets: np.ndarray) -> float:
+    """Median distance of the markers (L, 3) that were seen, metres."""
+    apart = np.linalg.norm(places - targets, axis=1)
+    return float(np.median(apart[~np.isnan(apart)]))
 
 

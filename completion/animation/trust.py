@@ -29,25 +29,44 @@ def marker_weights(positions: np.ndarray, targets: np.ndarray, sd: float, outlie
         Seen, and of more than a quarter of the full weight.
     """
     squared, scale = distances_apart(positions, targets, outlier)
-    share = (scale**2 / (scale**2 + np.nan_to_num(squared, nan=np.inf)))**2
+    share = np.where(np.isnan(squared), 0.0, (scale**2 / (scale**2 + squared))**2)
     return share / sd**2, share > 0.25
 
 
 def distances_apart(positions: np.ndarray, targets: np.ndarray, outlier: float) -> tuple[np.ndarray, np.ndarray]:
     """Squared distances (..., L) without what is common to all, and the length (..., 1) that makes an outlier."""
     off = positions - targets
-    off = off - np.nan_to_num(_median(np.swapaxes(off, -1, -2)))[..., None, :]
+    off = off - _median(np.swapaxes(off, -1, -2))[..., None, :]
     squared = np.einsum("...d,...d->...", off, off)
-    return squared, np.maximum(outlier, 3 * np.sqrt(np.nan_to_num(_median(squared))))[..., None]
+    return squared, np.maximum(outlier, 3 * np.sqrt(_median(squared)))[..., None]
 
 
 def _median(values: np.ndarray) -> np.ndarray:
-    """The median (...) of values (..., n) that are not NaN; several times as fast as numpy's on few values."""
+    """The median (...) of values (..., n) that are not NaN, 0 without any; on few values much faster than numpy's."""
     ordered = np.sort(values, axis=-1)                                  # NaN comes last
     seen = (~np.isnan(ordered)).sum(axis=-1)[..., None]
     below = np.take_along_axis(ordered, np.maximum((seen - 1) // 2, 0), axis=-1)
     above = np.take_along_axis(ordered, np.minimum(seen // 2, ordered.shape[-1] - 1), axis=-1)
-    return np.where(seen > 0, 0.5 * (below + above), np.nan)[..., 0]
+    return np.where(seen > 0, 0.5 * (below + above), 0.0)[..., 0]
+
+
+def exchangeable(positions: np.ndarray, targets: np.ndarray, outlier: float) -> np.ndarray:
+    """Frames (T,) bool in which a `LabelWatch` would exchange some labels, for places and targets (T, L, 3)."""
+    squared, scale = distances_apart(positions, targets, outlier)
+    suspect = squared > (0.5 * scale)**2
+    out = np.zeros(len(targets), dtype=bool)
+    for t in np.flatnonzero(suspect.sum(axis=1) > 1):
+        some = np.flatnonzero(suspect[t])
+        off = positions[t] - targets[t]
+        out[t] = bool(_gains(positions[t, some] - _median(off.T), targets[t, some], scale[t, 0]).any())
+    return out
+
+
+def _gains(places: np.ndarray, targets: np.ndarray, scale: float) -> np.ndarray:
+    """Pairs (n, n) bool that would fit well if they exchanged their targets, and do not as they are."""
+    apart = np.linalg.norm(places[:, None] - targets, axis=2)
+    own = np.diag(apart)
+    return (apart + apart.T < ENTER * (own[:, None] + own)) & (np.maximum(apart, apart.T) < 0.5 * scale)
 
 
 class LabelWatch:
@@ -72,6 +91,11 @@ class LabelWatch:
         """Take the labels as they come."""
         self.order = np.arange(len(self.order))
 
+    @property
+    def idle(self) -> bool:
+        """No labels are exchanged at present."""
+        return bool((self.order == np.arange(len(self.order))).all())
+
     def update(self, positions: np.ndarray, targets: np.ndarray) -> np.ndarray:
         """Which column (L,) each marker is taken from.
 
@@ -84,11 +108,11 @@ class LabelWatch:
         """
         taken = targets[self.order]
         squared, scale = distances_apart(positions, taken, self.outlier)
-        suspect = np.nan_to_num(squared) > (0.5 * scale)**2
+        suspect = squared > (0.5 * scale)**2                            # never of NaN
         changed = self.order != np.arange(len(self.order))
         if suspect.sum() < 2 and not changed.any():
             return self.order
-        shift = np.nan_to_num(_median((positions - taken).T))
+        shift = _median((positions - taken).T)
         some = np.flatnonzero((suspect | changed) & ~np.isnan(squared))
         apart = np.linalg.norm(positions[some, None] - shift - taken[some], axis=2)
         for i, j in zip(*np.triu_indices(len(some), 1), strict=True):
