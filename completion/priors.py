@@ -116,7 +116,7 @@ class JointLimits:
 
 def choose_prior(kind: PosePrior, mean: np.ndarray, covariance: np.ndarray, examples: np.ndarray,
                  parents: np.ndarray, shrinkage: float = 0.3) -> GaussianPrior | MixturePrior:
-    """The prior of that kind; a model that keeps no examples (M = 0, an older file) has the Gaussian.
+    """The prior of that kind; a model that keeps no examples (M < 2, an older file) has the Gaussian.
 
     Raises
     ------
@@ -125,7 +125,7 @@ def choose_prior(kind: PosePrior, mean: np.ndarray, covariance: np.ndarray, exam
     """
     if kind not in ("gaussian", "mixture", "nearest"):
         raise ValueError(f"pose_prior: expected gaussian, mixture or nearest, got {kind!r}")
-    if kind == "gaussian" or not len(examples):
+    if kind == "gaussian" or len(examples) < 2:
         return gaussian_prior(mean, covariance, shrinkage)
     return mixture_prior(examples, parents, shrinkage, sharp=kind == "nearest")
 

@@ -4,13 +4,14 @@ from completion_bodies import worm_with_prior
 
 from completion import energy
 from completion.bodies import Anchor, FixedBody, ShapedBody, as_body
-from completion.priors import gaussian_prior
+from completion.priors import gaussian_prior, joint_limits
 from scanprep.geometry import rotations
 
 RNG = np.random.default_rng(3)
 MODEL = worm_with_prior()
 FIXED, SHAPED = FixedBody(MODEL.subject(None)), ShapedBody(MODEL)
 PRIOR = gaussian_prior(MODEL.pose_mean, MODEL.pose_covariance)
+LIMITS = joint_limits(np.random.default_rng(5).normal(0, 0.2, (9, 4, 3)), margin=0.05)
 IDS = RNG.choice(398, 5, replace=False)
 TRIPLES = RNG.choice(398, (6, 3), replace=False)
 TARGETS = RNG.normal(size=(5, 3))
@@ -44,6 +45,7 @@ ENERGIES = {
     "point_to_plane": planes,
     "above_skin": skin,
     "pose_prior": lambda body, x0: lambda x: energy.pose_prior(x, PRIOR, 2.0),
+    "joint_limits": lambda body, x0: lambda x: energy.joint_limits(x, LIMITS, 2.0),
     "shape_prior": lambda body, x0: lambda x: energy.shape_prior(x, body.n_angles + 3, 2.0),
     "stay_near": lambda body, x0: lambda x: energy.stay_near(x, x0 + 0.1, np.arange(len(x0)) / 3),
 }
