@@ -1,10 +1,13 @@
 """Half views completed: held-out SCAPE poses of a known subject, or held-out SPRING men of unknown shape.
 
     SCAPEKIT_DATA=... python tests/benchmarks/half_views.py -o half_views.json --pictures DIR
+    SCAPEKIT_DATA=... python tests/benchmarks/half_views.py -m MODEL.npz --marks 0 -o half_views_blind.json
     SCAPEKIT_DATA=... python tests/benchmarks/half_views.py --people -m MODEL.npz -o half_people.json
 
 Without a model it is learned first, from the training part alone. `seen` is the distance of the seen vertices to
 the true surface, `unseen` that of corresponding vertices; both for the completed mesh and for the predicted one.
+With `--marks 0` there are no landmarks. A limb counts as flipped when the vertices of one part are FLIPPED off in
+the mean, and at least SHOWN of them were seen: where nothing was seen of it, its place is a guess.
 """
 from __future__ import annotations
 
@@ -25,6 +28,9 @@ from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.surface import Surface
 from scanprep.skeleton.find import find_skeleton
 
+FLIPPED, FAR = 100.0, 30.0           # mm: mean of one part, and of all that was not seen
+SHOWN = 0.2                          # share of a part's vertices
+
 
 def errors(body: Mesh, view: HalfView, result: Completion, part: np.ndarray) -> dict[str, float]:
     """Figures of one completion, millimetres."""
@@ -34,7 +40,11 @@ def errors(body: Mesh, view: HalfView, result: Completion, part: np.ndarray) -> 
         out[f"{name}_seen_mm"] = 1e3 * surface.closest(mesh.vertices[view.seen]).distances.mean()
         out[f"{name}_unseen_mm"] = apart[~view.seen].mean()
     worst = [apart[part == p].mean() for p in range(part.max() + 1)]
-    out |= {"worst_part_mm": max(worst), "worst_part": int(np.argmax(worst)), "explained": result.explained,
+    shown = [view.seen[part == p].mean() for p in range(part.max() + 1)]
+    seen_worst = max(w for w, s in zip(worst, shown, strict=True) if s >= SHOWN)
+    out |= {"below_30_mm": out["completed_unseen_mm"] < FAR, "flipped": seen_worst > FLIPPED,
+            "worst_part_mm": max(worst), "worst_part": int(np.argmax(worst)), "worst_seen_part_mm": seen_worst,
+            "explained": result.explained,
             "landmark_rms_mm": 1e3 * result.landmark_rms, "rounds": result.iterations,
             "converged": result.converged}
     return {name: round(float(value), 3) for name, value in out.items()}
@@ -49,7 +59,7 @@ def picture(body: Mesh, view: HalfView, result: Completion, path: Path) -> None:
 
     apart = np.linalg.norm(result.completed.vertices - body.vertices, axis=1)
     two = np.where(result.seen[:, None], [0.45, 0.6, 0.8], [0.9, 0.6, 0.35])
-    shapes = [[Solid(body), Dots(view.landmarks[1], (0.8, 0.1, 0.1), 0.015)], [Solid(result.completed, two)],
+    shapes: list[list[Solid | Dots]] = [[Solid(body), Dots(view.landmarks[1], (0.8, 0.1, 0.1), 0.015)], [Solid(result.completed, two)],
               [Solid(result.completed, heat(apart, 0, 0.05))]]
     away = view.camera - body.vertices.mean(axis=0)
     azimuth = np.degrees(np.arctan2(away[1], away[0]))
@@ -76,6 +86,7 @@ def main() -> None:
     parser.add_argument("--people", action="store_true", help="SPRING men of unknown shape")
     parser.add_argument("--fold", type=int, default=0)
     parser.add_argument("--only", type=int, nargs="*", help="indices in the list of held-out bodies")
+    parser.add_argument("--marks", type=int, choices=(0, 7), default=7, help="landmarks on each view")
     parser.add_argument("--known-viewpoint", action="store_true", help="tell where the camera stood")
     parser.add_argument("--pictures", type=Path, help="folder for a picture of each")
     args = parser.parse_args()
@@ -90,7 +101,7 @@ def main() -> None:
         view = half_view(body, k, data.landmarks, np.random.default_rng(k))
         config = CompletionConfig(viewpoint=tuple(view.camera) if args.known_viewpoint else None)
         start, cpu = time.perf_counter(), time.process_time()
-        result = complete(subject, view.points, view.landmarks, config)
+        result = complete(subject, view.points, view.landmarks if args.marks else None, config)
         row = {"k": k, **errors(body, view, result, part), "seconds": round(time.perf_counter() - start, 2),
                "cpu_seconds": round(time.process_time() - cpu, 2)}
         rows.append(row)
@@ -101,6 +112,7 @@ def main() -> None:
     for name, value in mean.items():
         print(f"{name:24s} {value:8.2f}")
     write_report(args.output, {"protocol": "half views", "people": args.people, "fold": args.fold,
+                               "marks": args.marks,
                                "machine": machine(), "config": dataclasses.asdict(config), "mean": mean,
                                "rows": rows})
 
