@@ -83,13 +83,14 @@ def _follow(tracker: Tracker, frames: FrameFolder, store: FrameStore, surfaces: 
     if before:
         tracker.resume(done, betas)
         say(f"{before} frames were tracked before")
+    frames.problems += store.problems
 
     def keep(ready: list[TrackedFrame]) -> None:
         for frame in ready:
             if surfaces is not None:
                 _write_surface(surfaces, tracker, frame)
             done.append(without_points(frame))
-            store.add(done[-1], tracker.betas)
+            store.add(done[-1], tracker.betas, frames.problems)
             progress(len(done), len(frames))
 
     with bar("following the body") as progress:
@@ -98,7 +99,7 @@ def _follow(tracker: Tracker, frames: FrameFolder, store: FrameStore, surfaces: 
                 keep(tracker.push(frames[i]))
             keep(tracker.finish())
         finally:                                     # after an interruption too
-            store.write(tracker.betas)
+            store.write(tracker.betas, frames.problems)
     return done, before
 
 
@@ -145,4 +146,4 @@ def _page(output: Path, motion: Motion, person: Subject, frames: FrameFolder, na
     def cloud(t: int) -> np.ndarray[Any, Any]:
         return np.concatenate([np.zeros((0, 3)), *(view.points for view in frames[t])])
 
-    track_page(motion, person, cloud, name, rows(metrics)).write(output / "report.html")
+    track_page(motion, person, cloud, name, frames.numbers, rows(metrics)).write(output / "report.html")

@@ -22,27 +22,24 @@ Cloud = Callable[[int], np.ndarray]
 
 
 def picture_tracked(motion: Motion, subject: Subject, cloud: Cloud, count: int = 7, height: int = 340) -> np.ndarray:
-    """Some frames from two sides, the body with the points that were measured; a lost frame is grey.
+    """Some frames: the points that were measured, and the body from two sides; a lost frame is grey.
 
     Parameters
     ----------
     cloud : frame -> (n, 3) float, metres
     """
     frames = np.unique(np.linspace(0, len(motion.poses) - 1, count).round().astype(int))
-    rows = []
-    for side in SIDES:
-        images = []
-        for t in frames:
-            vertices = motion.vertices(subject, np.array([t]))[0].astype(float)
-            camera = look_around(subject.template, vertices, (side,))[0]
-            body = Solid(subject.template.with_vertices(vertices), BODY if motion.converged[t] else LOST)
-            shapes: list[Shape] = [body]
-            points = cloud(int(t))
-            if len(points):
-                shapes.append(Dots(points[::max(1, len(points) // SHOWN)], POINTS, radius=0.005))
-            images.append(render(shapes, camera, int(0.6 * height), height))
-        rows.append(side_by_side(images, [f"{t / motion.rate:.2f} s" for t in frames]))
-    return side_by_side(rows, ["from the front", "from behind"], columns=1)
+    measured, bodies = [], []
+    for t in frames:
+        vertices = motion.vertices(subject, np.array([t]))[0].astype(float)
+        body = Solid(subject.template.with_vertices(vertices), BODY if motion.converged[t] else LOST)
+        cameras, points = look_around(subject.template, vertices, SIDES), cloud(int(t))
+        dots: list[Shape] = [Dots(points[::max(1, len(points) // SHOWN)], POINTS, radius=0.006)] if len(points) else []
+        measured.append(render(dots, cameras[0], int(0.6 * height), height))
+        bodies.append([render(body, camera, int(0.6 * height), height) for camera in cameras])
+    seconds = [f"{t / motion.rate:.2f} s" for t in frames]
+    front, behind = (list(images) for images in zip(*bodies, strict=True))
+    return side_by_side([side_by_side(measured), side_by_side(front), side_by_side(behind, seconds)], columns=1)
 
 
 def animated(motion: Motion, subject: Subject, frames_per_second: float = 15.0, seconds: float = 4.0) -> bytes:
@@ -72,19 +69,22 @@ def chart_residuals(motion: Motion) -> Any:
                      label="lost" if i == 0 else None)
     if (edges > 0).any():
         axes.legend(frameon=False)
-    axes.set(xlabel="time (s)", ylabel="distance of the points (mm)", ylim=(0, None),
+    high = 1000 * np.nanmax(motion.residuals, initial=0.001)
+    axes.set(xlabel="time (s)", ylabel="distance of the points (mm)", ylim=(0, 1.15 * high),
              xlim=(-0.5 / motion.rate, (len(seconds) - 0.5) / motion.rate))
     return figure
 
 
-def track_page(motion: Motion, subject: Subject, cloud: Cloud, name: str, rows: list[tuple[str, Any, str]]) -> Page:
-    """The page of `scape track`."""
-    page = Page(f"{name}, tracked", "The body in some frames, with the points that were measured.")
+def track_page(motion: Motion, subject: Subject, cloud: Cloud, name: str, numbers: list[int],
+               rows: list[tuple[str, Any, str]]) -> Page:
+    """The page of `scape track`; numbers are those of the frames in their files."""
+    page = Page(f"{name}, tracked", "Some frames: the points that were measured, then the body from the same side "
+                "and from behind. Where it is grey the frame was lost.")
     page.picture(picture_tracked(motion, subject, cloud))
     page.picture(animated(motion, subject), "the first seconds")
     page.section("Distance of the points to the body").chart(
         chart_residuals(motion), "mean over the points of a frame, before smoothing")
-    lost = np.flatnonzero(~motion.converged)
+    lost = np.array(numbers)[~motion.converged]
     if len(lost):
         page.text("Lost frames: " + _ranges(lost) + ". There the motion is what the frames around it suggest.")
     return page.section("Figures").table(rows, ("metric", "value", "unit"))

@@ -25,11 +25,16 @@ class FrameStore:
     folder : Path
     key : dict
         What the frames depend on; frames that were found with another key are removed.
+
+    Attributes
+    ----------
+    problems : str, what was wrong with files of the frames loaded
     """
 
     def __init__(self, folder: Path, key: dict[str, Any]) -> None:
         self.folder = folder
         self.digest = hashlib.sha256(json.dumps(key, sort_keys=True, default=str).encode()).hexdigest()[:16]
+        self.problems: list[str] = []
         self._waiting: list[TrackedFrame] = []
 
     def load(self) -> tuple[list[TrackedFrame], np.ndarray | None]:
@@ -44,18 +49,19 @@ class FrameStore:
             if header.get("key") != self.digest or header.get("first") != len(done):
                 path.unlink()
                 continue
+            self.problems = header["problems"]
             betas = a["betas"] if header["shaped"] else None
             done += [TrackedFrame(len(done) + i, *(_plain(a[name][i]) for name in _ARRAYS))
                      for i in range(len(a["x"]))]
         return done, betas
 
-    def add(self, frame: TrackedFrame, betas: np.ndarray | None) -> None:
-        """Keep a frame; it is written with others."""
+    def add(self, frame: TrackedFrame, betas: np.ndarray | None, problems: list[str]) -> None:
+        """Keep a frame; it is written with others, and with all problems so far."""
         self._waiting.append(frame)
         if len(self._waiting) >= AT_ONCE:
-            self.write(betas)
+            self.write(betas, problems)
 
-    def write(self, betas: np.ndarray | None) -> None:
+    def write(self, betas: np.ndarray | None, problems: list[str]) -> None:
         """Write what waits."""
         if not self._waiting:
             return
@@ -63,7 +69,7 @@ class FrameStore:
         arrays = {name: np.stack([np.asarray(getattr(f, name)) for f in frames]) for name in _ARRAYS}
         storage.save(self.folder / f"{first:08d}.npz", KIND, VERSION,
                      {**arrays, "betas": np.zeros(0) if betas is None else betas},
-                     {"key": self.digest, "first": first, "shaped": betas is not None})
+                     {"key": self.digest, "first": first, "shaped": betas is not None, "problems": problems})
         self._waiting = []
 
 
