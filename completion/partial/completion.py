@@ -3,6 +3,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
+from functools import partial
 
 import numpy as np
 
@@ -11,6 +12,8 @@ from model.linear import Subject
 from scanprep.geometry.mesh import Mesh
 
 from ..bodies import as_body
+from .alternation import follow_alternating, model_for_turns
+from .confidence import distance_to_seen, expected_error, posterior_error, probability_within
 from .fit import ScanFit
 from .given import in_metres
 from .restarts import best_start, first_starts, redraw_limbs
@@ -36,7 +39,7 @@ class Completion:
     betas : (K,) float, or None for the template's own body
     trans : (3,) float, metres
     seen : (N,) bool
-        Vertices that had data.
+        Vertices that had data: they were observed, the others are extrapolated.
     rms : float, metres
         Distance of the scan points that were used to the completed mesh.
     explained : float
@@ -50,6 +53,11 @@ class Completion:
         Each term of the energy at the end.
     scale : float
         Metres per unit of the scan: times this it lies on the completed mesh.
+    expected_error : (N,) float, metres
+        How far each vertex of the completed mesh may be from the truth, root mean square: from the true surface
+        where it was seen, from its true place elsewhere. None in files of earlier versions.
+    confidence : (N,) float in [0, 1]
+        Probability that the vertex is within `config.tolerance` of the truth. None in files of earlier versions.
     """
 
     completed: Mesh
@@ -65,6 +73,8 @@ class Completion:
     iterations: int
     energies: dict[str, float] = field(default_factory=dict)
     scale: float = 1.0
+    expected_error: np.ndarray | None = None
+    confidence: np.ndarray | None = None
 
 
 def complete(body: BodyModel | Subject, scan: View | Sequence[View],
@@ -96,6 +106,7 @@ def complete(body: BodyModel | Subject, scan: View | Sequence[View],
     """
     config = config or CompletionConfig()
     posed = as_body(body)
+    by_turns = model_for_turns(body, config)
     given = in_metres(posed, scan, landmarks, masked, config)
     sized = ScaledBody(posed) if config.free_scale else None
     task = ScanFit(sized or posed, given.cloud, given.vertices, given.points, config)
@@ -105,17 +116,21 @@ def complete(body: BodyModel | Subject, scan: View | Sequence[View],
     tell(1, total)
     x = redraw_limbs(task, best_start(task, starts))
     tell(2, total)
-    x, converged, rounds, energies = task.follow_scan(x, lambda done: tell(2 + done, total))
+    follow = partial(follow_alternating, task, by_turns) if by_turns else task.follow_scan
+    x, converged, rounds, energies = follow(x, lambda done: tell(2 + done, total))
+    open_error = posterior_error(task.body, x, task.precision(x))
     if sized:
         x, factor = sized.in_metres(x)
-        given = given.scaled(factor)
+        given, open_error = given.scaled(factor), factor * open_error
     predicted = posed.template.with_vertices(posed.vertices(x))
     cloud = task.without_ignored(given.cloud, predicted)
     completed, seen, used, rms = free_surface(predicted, cloud, config)
+    error = expected_error(open_error, distance_to_seen(predicted, seen), rms)
     tell(total, total)
     pose, trans, betas = posed.split(x)
     shape = body.betas if isinstance(body, Subject) else betas if posed.n_betas else None
     off = np.linalg.norm(predicted.vertices[given.vertices] - given.points, axis=1)
     landmark_rms = float(np.sqrt((off**2).mean())) if len(off) else np.nan
     return Completion(completed, predicted, pose, shape, trans, seen, rms, float(used.mean()),
-                      landmark_rms, converged, rounds, energies, given.metres)
+                      landmark_rms, converged, rounds, energies, given.metres, error,
+                      probability_within(error, config.tolerance))

@@ -10,12 +10,13 @@ from scanprep.geometry.files import read_mesh, write_mesh
 
 from .completion import Completion
 
-KIND, VERSION = "completion", 1
-_ARRAYS, _FACTS = ("pose", "betas", "trans", "seen"), ("rms", "explained", "landmark_rms", "converged", "iterations")
+KIND, VERSION = "completion", 2       # 1 had no scale, expected error and confidence
+_ARRAYS = ("pose", "betas", "trans", "seen", "expected_error", "confidence")
+_FACTS = ("rms", "explained", "landmark_rms", "converged", "iterations")
 
 
 def save_completion(folder: str | Path, completion: Completion) -> Path:
-    """Write `completed.ply`, `predicted.ply` and `completion.npz` (pose, betas, trans, seen, figures).
+    """Write `completed.ply`, `predicted.ply` and `completion.npz` (the arrays and figures).
 
     Returns
     -------
@@ -25,8 +26,8 @@ def save_completion(folder: str | Path, completion: Completion) -> Path:
     write_mesh(folder / "completed.ply", completion.completed)
     write_mesh(folder / "predicted.ply", completion.predicted)
     arrays = {name: getattr(completion, name) for name in _ARRAYS if getattr(completion, name) is not None}
-    facts = {name: getattr(completion, name) for name in _FACTS}
-    storage.save(folder / "completion.npz", KIND, VERSION, arrays, {**facts, "energies": completion.energies})
+    facts = {name: getattr(completion, name) for name in (*_FACTS, "energies", "scale")}
+    storage.save(folder / "completion.npz", KIND, VERSION, arrays, facts)
     return folder
 
 
@@ -39,10 +40,12 @@ def load_completion(folder: str | Path) -> Completion:
         A file that is missing, damaged or of another kind.
     """
     folder = Path(folder)
-    header, arrays = storage.load(folder / "completion.npz", KIND, (VERSION,))
+    header, arrays = storage.load(folder / "completion.npz", KIND, (1, VERSION))
     try:
         return Completion(read_mesh(folder / "completed.ply", unit="m"), read_mesh(folder / "predicted.ply", unit="m"),
                           arrays["pose"], arrays.get("betas"), arrays["trans"], np.asarray(arrays["seen"], dtype=bool),
-                          **{name: header[name] for name in (*_FACTS, "energies")})
+                          **{name: header[name] for name in (*_FACTS, "energies")},
+                          scale=header["scale"] if header["version"] > 1 else 1.0,
+                          expected_error=arrays.get("expected_error"), confidence=arrays.get("confidence"))
     except KeyError as error:
         raise storage.StorageError(f"{folder / 'completion.npz'}: it lacks {error}") from None

@@ -2,8 +2,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Literal
 
 from ..priors import PosePrior
+
+Method = Literal["joint", "alternation"]
 
 
 @dataclass(frozen=True)
@@ -66,6 +69,13 @@ class CompletionConfig:
         The same for a vertex that sticks out of clothing or hair, of which `complete` is told.
     ignored_parts : names of parts
         Parts of the body that the scan says nothing about, though it may show something there.
+    method : {"joint", "alternation"}
+        All unknowns at once by Levenberg-Marquardt, or rotations, surface and shape in turns as the paper does; the
+        latter takes SCAPE models only, and neither priors, contact nor what a camera must have seen.
+    twist_damping : float, square metres
+        w_T of Eq. 11 in the alternation, against the squared edges of a part.
+    tolerance : float, metres
+        Distance from the truth within which a vertex counts as right in `Completion.confidence`.
     free_scale : bool
         The unit of the scan is not known: one factor is found together with pose, place and shape.
     """
@@ -97,4 +107,7 @@ class CompletionConfig:
     viewpoint: tuple[float, float, float] | tuple[tuple[float, float, float], ...] | None = None
     cover_weight: float = 1.0
     ignored_parts: tuple[str, ...] = ()
+    method: Method = "joint"
+    twist_damping: float = 0.1
+    tolerance: float = 0.01
     free_scale: bool = False

@@ -1,0 +1,236 @@
+"""Eq. 10 as the paper solves it: rotations of the parts, surface and shape in turns.
+
+The energy is E_H[Y] + w_Z Σ |y_l - z_l|². Each block is a linear least-squares problem while the others are held, and
+the joint angles follow from the rotations afterwards. The variant of the patent, in which a kinematic chain of joint
+angles replaces the rotations, so that moving one joint carries all that hangs on it and changes its own Q, is what
+the default method does: its unknowns are the pose parameters, and `model.linear.PointOperator.jacobian` holds the
+derivative of the chain [SCAPE-patent §0090-0091].
+"""
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from scipy.sparse import csr_array
+
+from model.body import BodyModel
+from model.gradients import edges
+from model.linear import Subject
+from model.scape import ScapeModel
+from scanprep.geometry import rotations
+from scanprep.geometry.mesh import Mesh
+from scanprep.skeleton.tree import Skeleton
+
+from .fit import SETTLED, ScanFit
+from .settings import CompletionConfig
+from .surface import FreeSurface
+
+MORE = 3                             # times as many rounds as the joint method: each block gives way only a little
+
+
+def model_for_turns(body: BodyModel | Subject, config: CompletionConfig) -> ScapeModel | None:
+    """The model that the alternation works on; None when the settings ask for the joint method.
+
+    Raises
+    ------
+    ValueError
+        Another method than these; for the alternation a body that is not made of R, S and Q triangle by triangle, or
+        a scan of unknown scale.
+    """
+    if config.method == "joint":
+        return None
+    if config.method != "alternation":
+        raise ValueError(f"method: expected 'joint' or 'alternation', got {config.method!r}")
+    if config.free_scale:
+        raise ValueError("free_scale: expected False with method='alternation'; a scan of unknown scale needs 'joint'")
+    if isinstance(body, ScapeModel) and body.kind == ScapeModel.kind:
+        return body
+    what = f"a model of kind {body.kind!r}" if isinstance(body, BodyModel) else f"a {type(body).__name__}"
+    raise ValueError(f"body: expected a SCAPE model with method='alternation', which turns and deforms its triangles, "
+                     f"got {what}; a model learned without shapes stands for its template's own body")
+
+
+@dataclass(frozen=True, eq=False)
+class Markers:
+    """The measured points of Eq. 10.
+
+    Parameters
+    ----------
+    vertices : (L,) int
+        y_l is one of the vertices.
+    points : (L, 3) float, metres
+        z_l.
+    weights : (L,) float
+        w_Z of each.
+    """
+
+    vertices: np.ndarray
+    points: np.ndarray
+    weights: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
+class Blocks:
+    """The variables of Eq. 10.
+
+    Attributes
+    ----------
+    R : (J, 3, 3) float
+        Rotations of the parts.
+    Y : (N, 3) float, metres
+    betas : (K,) float
+    """
+
+    R: np.ndarray
+    Y: np.ndarray
+    betas: np.ndarray
+
+
+class Alternation:
+    """The three steps for one model.
+
+    Parameters
+    ----------
+    model : ScapeModel
+    """
+
+    def __init__(self, model: ScapeModel) -> None:
+        self.model, self.skeleton = model, model.skeleton
+        self.part = model.skeleton.part_of_face
+        self.v_hat = edges(model.template.vertices, model.template.faces)
+        self.surface = FreeSurface(model.template)
+
+    @cached_property
+    def _components(self) -> np.ndarray:
+        return np.ascontiguousarray(self.model.shape_space.components)
+
+    def posed(self, R: np.ndarray) -> np.ndarray:
+        """`Q v̂` (F, 2, 3) for rotations (J, 3, 3), from the joint angles between them."""
+        Q = self.model.pose_space.gradients(self.skeleton.pose_of(R))
+        return self.v_hat @ np.swapaxes(Q, -1, -2)
+
+    def shape(self, betas: np.ndarray) -> np.ndarray:
+        """S (F, 3, 3); a model without components means the template's own body."""
+        return self.model.shape_space.gradients(betas if len(betas) else None)
+
+    def predicted(self, R: np.ndarray, betas: np.ndarray) -> np.ndarray:
+        """The minimum Ŷ (N, 3) of E_H, the root's joint in the origin."""
+        turned = R[self.part] @ self.shape(betas)
+        return self.model.stitching.stitch(self.posed(R) @ np.swapaxes(turned, -1, -2))
+
+    def turned(self, now: Blocks, w_T: float) -> Blocks:
+        """R for fixed Y and betas, Q held, neighbouring twists damped.
+
+        [SCAPE] Eq. 11
+        """
+        e = self.posed(now.R) @ np.swapaxes(now.R[self.part] @ self.shape(now.betas), -1, -2)
+        t = damped_twists(self.skeleton, self.part, e, edges(now.Y, self.model.template.faces), w_T)
+        return Blocks(rotations.exp(t) @ now.R, now.Y, now.betas)
+
+    def stretched(self, now: Blocks, markers: Markers) -> Blocks:
+        """Y for fixed R and betas.
+
+        [SCAPE] Eq. 10
+        """
+        L = len(markers.vertices)
+        pick = csr_array((np.ones(L), (np.arange(L), markers.vertices)), shape=(L, len(now.Y)))
+        Y = self.surface.solve(self.predicted(now.R, now.betas), pick, markers.points, markers.weights)
+        return Blocks(now.R, Y, now.betas)
+
+    def shaped(self, now: Blocks) -> Blocks:
+        """Betas for fixed R and Y: a quadratic function in which R cancels.
+
+        [SCAPE] §6
+        """
+        if not len(now.betas):
+            return now
+        q = np.swapaxes(self.posed(now.R), -1, -2)                                                   # (F, 3, 2)
+        U = (self._components @ q.astype(self._components.dtype)).reshape(len(now.betas), -1)
+        wanted = np.swapaxes(edges(now.Y, self.model.template.faces) @ now.R[self.part], -1, -2)      # Rᵀ v
+        left = (wanted - self.model.shape_space.mean @ q).reshape(-1)
+        normal = (U @ U.T).astype(np.float64)
+        betas = np.linalg.solve(normal + 1e-9 * np.trace(normal) * np.eye(len(normal)), U @ left)
+        return Blocks(now.R, now.Y, betas)
+
+    def energy(self, now: Blocks, markers: Markers) -> float:
+        """E_H[Y] + w_Z Σ |y_l - z_l|².
+
+        [SCAPE] Eq. 10
+        """
+        e = self.posed(now.R) @ np.swapaxes(now.R[self.part] @ self.shape(now.betas), -1, -2)
+        off = now.Y[markers.vertices] - markers.points
+        return float(((e - edges(now.Y, self.model.template.faces))**2).sum()
+                     + (markers.weights * (off**2).sum(axis=1)).sum())
+
+
+def damped_twists(skeleton: Skeleton, part: np.ndarray, e: np.ndarray, v: np.ndarray, w_T: float) -> np.ndarray:
+    """Twists (J, 3) that turn the edges e of every part onto v, neighbours alike.
+
+    Minimises Σ |(I + t̂) e - v|² + w_T Σ_adj |t_a - t_b|².
+
+    Parameters
+    ----------
+    part : (F,) int
+    e, v : (F, 2, 3) float, metres
+    w_T : float, square metres
+
+    [SCAPE] Eq. 11
+    """
+    J = len(skeleton.parents)
+    block = np.einsum("fjd,fjd->f", e, e)[:, None, None] * np.eye(3) - np.swapaxes(e, -1, -2) @ e   # [e]ᵀ[e]
+    right = np.cross(e, v).sum(axis=1)
+    normal, side = np.zeros((J, 3, J, 3)), np.zeros((J, 3))
+    np.add.at(side, part, right)
+    own = np.zeros((J, 3, 3))
+    np.add.at(own, part, block)
+    normal[np.arange(J), :, np.arange(J), :] = own
+    for j in range(1, J):
+        p = skeleton.parents[j]
+        for a, b, sign in ((j, j, 1), (p, p, 1), (j, p, -1), (p, j, -1)):
+            normal[a, :, b, :] += sign * w_T * np.eye(3)
+    return np.linalg.solve(normal.reshape(3 * J, 3 * J), side.ravel()).reshape(J, 3)
+
+
+def follow_alternating(fit: ScanFit, model: ScapeModel, x: np.ndarray, tell: Callable[[int], None]
+                       ) -> tuple[np.ndarray, bool, int, dict[str, float]]:
+    """As `ScanFit.follow_scan`: unknowns after rounds of matching, whether they settled, rounds, energies.
+
+    One round: the points closest to the current Y[Z] become the markers, then R, Y and betas are found in turns, each
+    once.
+
+    [SCAPE] §7
+    """
+    config, steps = fit.config, Alternation(model)
+    pose, trans, betas = fit.body.split(x)
+    now = Blocks(model.skeleton.part_rotations(pose), fit.body.vertices(x), betas)
+    rounds, shift = MORE * config.rounds, np.inf
+    reaches = np.geomspace(config.reach, config.final_reach, rounds)
+    for i, reach in enumerate([*reaches, *[config.final_reach] * rounds]):
+        markers = nearest_markers(fit, model.template.with_vertices(now.Y), reach)
+        before = now.Y
+        now = steps.shaped(steps.stretched(steps.turned(now, config.twist_damping), markers))
+        shift = float(np.sqrt(((now.Y - before)**2).sum(axis=1).mean()))
+        tell(min(1 + i // MORE, config.rounds))
+        if i >= rounds and shift < SETTLED / MORE:
+            break
+    trans = model.stitching.root_weights @ now.Y - model.skeleton.joints[0]
+    x = np.concatenate([model.skeleton.pose_of(now.R).ravel(), trans, now.betas])
+    return x, bool(shift < SETTLED), i + 1, {"eq_10": steps.energy(now, markers)}
+
+
+def nearest_markers(fit: ScanFit, mesh: Mesh, reach: float) -> Markers:
+    """Closest points and landmarks as markers, weighted as in the joint method, in units of one point of the scan.
+
+    The weight of the setting is meant for all points of the scan; what is matched are fewer.
+
+    [SCAPE] §7
+    """
+    config = fit.config
+    ids, points, _, weights = fit.matches(mesh, fit.thin, reach)
+    one = config.evidence / config.scan_sd**2 / len(fit.thin.points)
+    w_Z = config.surface_weight * len(fit.cloud.points) / len(fit.thin.points)
+    marked = np.full(len(fit.vertices), config.landmark_sd**-2)
+    return Markers(np.concatenate([fit.vertices, ids]), np.concatenate([fit.points, points]),
+                   w_Z / one * np.concatenate([marked, weights]))

@@ -1,0 +1,71 @@
+"""How far each vertex of a completed mesh may be from the truth."""
+from __future__ import annotations
+
+import numpy as np
+from scipy.special import gammainc
+
+from scanprep.geometry.geodesics import SurfaceGraph
+from scanprep.geometry.mesh import Mesh
+
+from ..bodies import FixedBody
+
+# Chosen on completions of tuning bodies (poses of a known man, men of unknown shape), see `expected_error`.
+INFLATED = 1.0                       # real errors against those that the fit believes in, as it is not quite linear
+BEYOND = 0.008                       # metres: what the model cannot explain far from all data
+FADES = 0.05                         # metres along the surface within which data say what the model cannot
+NEAREST = 0.0005                     # metres: no scan is better
+
+
+def posterior_error(body: FixedBody, x: np.ndarray, precision: np.ndarray) -> np.ndarray:
+    """Standard deviation (N,), metres, of every vertex of the predicted mesh.
+
+    The covariance of the unknowns, the inverse of the Gauss-Newton matrix with all priors in it (Laplace's
+    approximation), is pushed through the derivatives of the vertices: what the data leave open in the pose shows in
+    the hand that nobody saw.
+
+    Parameters
+    ----------
+    x : (P,) float
+    precision : (P, P) float
+    """
+    ridge = 1e-9 * np.diag(precision).max()
+    root = np.linalg.inv(np.linalg.cholesky(precision + ridge * np.eye(len(x))))      # rootᵀ root is the covariance
+    jacobian = body.follow(np.arange(len(body.template.vertices)), x)(x[None]).jacobian[0]
+    N, _, P = jacobian.shape
+    return np.linalg.norm((jacobian.reshape(-1, P) @ root.T).reshape(N, -1), axis=1)
+
+
+def distance_to_seen(mesh: Mesh, seen: np.ndarray) -> np.ndarray:
+    """Way (N,), metres, along the surface from every vertex to the nearest one that was seen; inf where none leads."""
+    if not seen.any():
+        return np.full(len(mesh.vertices), np.inf)
+    return SurfaceGraph(mesh).nearest(np.flatnonzero(seen))[0]
+
+
+def expected_error(posterior: np.ndarray, away: np.ndarray, rms: float) -> np.ndarray:
+    """Root mean square distance (N,), metres, of vertices from the truth.
+
+    Where the scan was, that is the distance to the true surface, and as large as the scan's own from the completed
+    mesh. Away from it two things add up, as squares: what pose and shape leave open, and what no pose and shape of
+    the model can follow. Near the scan the free surface carries the data over, so both set in gradually.
+
+    Parameters
+    ----------
+    posterior : (N,) float, metres
+        See `posterior_error`.
+    away : (N,) float, metres
+        Distance from what was seen, along the surface.
+    rms : float, metres
+        Distance of the scan points that were used to the completed mesh.
+    """
+    sets_in = 1 - np.exp(-away / FADES)
+    near = max(NEAREST, 0.0 if np.isnan(rms) else rms)
+    return np.sqrt(near**2 + sets_in * ((INFLATED * posterior)**2 + BEYOND**2))
+
+
+def probability_within(error: np.ndarray, tolerance: float) -> np.ndarray:
+    """Probability (N,) that a vertex is within a tolerance of the truth, metres, when its error (N,) is as expected.
+
+    The error is taken as Gaussian and alike in all three directions.
+    """
+    return np.asarray(gammainc(1.5, 1.5 * (tolerance / error)**2))

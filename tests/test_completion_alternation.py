@@ -1,0 +1,104 @@
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from completion_bodies import half_view, worm_with_prior
+
+from completion.partial.alternation import Alternation, Blocks, Markers, damped_twists
+from completion.partial.completion import complete
+from completion.partial.settings import CompletionConfig
+from model.gradients import edges
+from scanprep.geometry import rotations
+from scanprep.geometry.surface import Surface
+
+POSE = np.array([[0.3, -0.5, 0.8], [0.2, 0.5, -0.4], [-0.1, -0.6, 0.3], [0.3, 0.1, 0.5]])
+TRANS = np.array([0.4, -0.3, 1.1])
+BETAS = np.array([1.2, -0.8, 0.5])
+MARKS = np.array([6, 75, 130, 200, 255, 330, 396])
+TURNS = CompletionConfig(draws=12, rounds=6, scan_points=800, model_points=300, candidates=2, start_axes=2,
+                         method="alternation")
+MODEL = worm_with_prior()
+
+
+def away(betas=BETAS):
+    """Blocks some way from the truth, and all vertices of the truth as markers."""
+    truth = MODEL.vertices(POSE, betas, TRANS)
+    off = np.random.default_rng(0).normal(0, 0.15, (4, 3))
+    R, start = MODEL.skeleton.part_rotations(POSE + off), 0 * betas
+    now = Blocks(R, Alternation(MODEL).predicted(R, start) + MODEL.skeleton.joints[0] + TRANS, start)
+    return truth, now, Markers(np.arange(len(truth)), truth, np.full(len(truth), 1.0))
+
+
+def test_each_step_lowers_the_energy_over_its_own_block():
+    _, now, markers = away()
+    steps = Alternation(MODEL)
+    for _ in range(4):
+        before = steps.energy(now, markers)
+        stretched = steps.stretched(now, markers)
+        shaped = steps.shaped(stretched)
+        assert steps.energy(shaped, markers) < steps.energy(stretched, markers) < before
+        assert stretched.R is now.R and stretched.betas is now.betas and shaped.R is now.R and shaped.Y is stretched.Y
+        now = steps.turned(shaped, 0.0)
+
+
+def test_the_surface_and_the_betas_are_where_the_gradient_vanishes():
+    _, now, markers = away()
+    steps, rng = Alternation(MODEL), np.random.default_rng(1)
+    for found, name, h in ((steps.stretched(now, markers), "Y", 1e-4), (steps.shaped(now), "betas", 1e-3)):
+        direction = rng.normal(size=getattr(found, name).shape)
+
+        def at(step, found=found, name=name, direction=direction):
+            return steps.energy(replace(found, **{name: getattr(found, name) + step * direction}), markers)
+
+        slope, bend = (at(h) - at(-h)) / (2 * h), (at(h) - 2 * at(0) + at(-h)) / h**2
+        assert bend > 0 and abs(slope) < 1e-3 * bend * h
+
+
+def test_turns_reach_the_truth_when_every_point_is_known():
+    truth, now, markers = away()
+    steps = Alternation(MODEL)
+    markers = replace(markers, weights=100 * markers.weights)        # the more they weigh, the fewer turns it takes
+    for _ in range(30):
+        now = steps.shaped(steps.stretched(steps.turned(now, 0.01), markers))
+    assert np.linalg.norm(now.Y - truth, axis=1).mean() < 1e-3
+    true = Blocks(MODEL.skeleton.part_rotations(POSE), truth, BETAS)
+    assert steps.energy(now, markers) <= steps.energy(true, markers)     # not zero: the edges do not quite fit together
+    np.testing.assert_allclose(now.betas, BETAS, atol=0.2)
+    np.testing.assert_allclose(now.R, true.R, atol=0.08)               # how Q turns with R is ignored
+
+
+def test_twists_without_damping_are_those_of_each_part_and_with_much_they_are_one():
+    rng = np.random.default_rng(0)
+    e = edges(MODEL.template.vertices, MODEL.template.faces)
+    part = MODEL.skeleton.part_of_face
+    turn = rng.normal(0, 1e-4, (4, 3))
+    v = e @ np.swapaxes(rotations.exp(turn), -1, -2)[part]
+    np.testing.assert_allclose(damped_twists(MODEL.skeleton, part, e, v, 0.0), turn, atol=1e-7)
+    stiff = damped_twists(MODEL.skeleton, part, e, v, 1e6)
+    np.testing.assert_allclose(stiff, np.tile(stiff[0], (4, 1)), atol=1e-9)
+    middle = damped_twists(MODEL.skeleton, part, e, v, 0.1)
+    assert np.ptp(stiff, axis=0).max() < np.ptp(middle, axis=0).max() < np.ptp(turn, axis=0).max()
+
+
+@pytest.mark.parametrize("betas", [None, BETAS], ids=["own body", "unknown shape"])
+def test_half_a_scan_is_completed_in_turns(betas):
+    model = MODEL if betas is not None else worm_with_prior(0)
+    body = model.template.with_vertices(model.vertices(POSE, betas, TRANS))
+    points, seen = half_view(body, np.array([0.3, -1, 0.5]), noise=0.001)
+    result = complete(model, points, (MARKS, body.vertices[MARKS]), TURNS)
+    assert Surface(body).closest(result.completed.vertices[seen]).distances.mean() < 0.002
+    assert np.linalg.norm(result.completed.vertices - body.vertices, axis=1)[~seen].mean() < 0.02
+    assert set(result.energies) == {"eq_10"} and result.iterations > TURNS.rounds
+    assert (result.betas is None) == (betas is None)
+    assert result.expected_error.shape == result.confidence.shape == seen.shape
+    assert result.confidence[result.seen].min() > result.confidence[~result.seen].mean()
+
+
+@pytest.mark.parametrize("body, change, message", [
+    (MODEL.subject(None), {}, "body: expected a SCAPE model .* got a Subject; a model learned without shapes"),
+    (MODEL, {"free_scale": True}, "free_scale: expected False with method='alternation'"),
+    (MODEL, {"method": "jointly"}, "method: expected 'joint' or 'alternation', got 'jointly'"),
+])
+def test_what_the_alternation_cannot_use_is_refused(body, change, message):
+    with pytest.raises(ValueError, match=message):
+        complete(body, np.zeros((100, 3)), None, replace(TURNS, **change))
