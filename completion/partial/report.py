@@ -26,8 +26,8 @@ SIDES = ("from the camera", "from the right of it", "from the other side", "from
 FEW = 9000                           # points of a bare cloud that a picture shows
 
 
-def picture_completion(scan: View | Sequence[View], completion: Completion, template: Mesh, height: int = HEIGHT,
-                       masked: np.ndarray | None = None) -> np.ndarray:
+def picture_completion(scan: View | Sequence[View], completion: Completion, template: Mesh,
+                       height: int | None = None, masked: np.ndarray | None = None) -> np.ndarray:
     """The scan, and the completed body in two colours from the side that was seen and from behind.
 
     Parameters
@@ -37,6 +37,7 @@ def picture_completion(scan: View | Sequence[View], completion: Completion, temp
     masked : (n,) bool, optional
         Points of the scan that are clothing or hair, shown in another colour.
     """
+    height = height or HEIGHT
     views = [sides(completion, template)[turn] for turn in (0, 2)]
     body, colors = completion.completed, _two_colors(completion)
     given = scan_shapes(scan, masked, completion.scale)
@@ -79,8 +80,10 @@ def scan_shapes(scan: View | Sequence[View], masked: np.ndarray | None = None, m
 
 
 def picture_distance(mesh: Mesh, distance: np.ndarray, views: Sequence[Camera], high: float = 0.01,
-                     height: int = HEIGHT, title: str = "distance", labels: Sequence[str] | None = None) -> np.ndarray:
+                     height: int | None = None, title: str = "distance", labels: Sequence[str] | None = None
+                     ) -> np.ndarray:
     """A mesh coloured by a distance (N,) in metres from several sides, with its colour bar; grey where it is NaN."""
+    height = height or HEIGHT
     width = _width(views, height)
     colored = Solid(mesh, heat(distance, 0.0, high))
     images = [render(colored, view, width, height) for view in views]
@@ -96,7 +99,8 @@ def scan_distances(points: np.ndarray, mesh: Mesh, body: Mesh, seen: np.ndarray)
 
 def completion_page(scan: View | Sequence[View], completion: Completion, template: Mesh, name: str,
                     rows: list[tuple[str, Any, str]], masked: np.ndarray | None = None,
-                    landmarks: tuple[np.ndarray, np.ndarray] | None = None) -> Page:
+                    landmarks: tuple[np.ndarray, np.ndarray] | None = None, picture: np.ndarray | None = None
+                    ) -> Page:
     """The page of `scape complete`.
 
     Parameters
@@ -108,13 +112,15 @@ def completion_page(scan: View | Sequence[View], completion: Completion, templat
         As for `complete`.
     landmarks : ((L,) int, (L, 3) float), optional
         As for `complete`, in the unit of the scan.
+    picture : (H, W, 3) uint8, optional
+        That of `picture_completion`, where it is there already.
     """
     cameras = sides(completion, template)
     body = completion.completed
     plain = Mesh(body.vertices, body.faces)
     page = Page(f"{name}, completed", "Blue was measured, yellow was filled in by the body model."
                 + (" Violet is clothing or hair: the body is somewhere inside." if masked is not None else ""))
-    page.picture(picture_completion(scan, completion, template, masked=masked))
+    page.picture(picture_completion(scan, completion, template, masked=masked) if picture is None else picture)
     page.table(rows, ("metric", "value", "unit"))
     width = _width(cameras, HEIGHT)
     marks = [] if landmarks is None else [Dots(completion.scale * np.asarray(landmarks[1]), MARK, 0.012, True)]

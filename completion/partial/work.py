@@ -79,9 +79,10 @@ def complete_files(work: Work, inputs: Inputs, output: Path, progress: Progress 
         done = _with_colors(work, files, done, output)
     save_completion(output, done)
     metrics = figures(work, inputs, done, landmarks, masked)
-    page = completion_page(views, done, work.body.template, inputs.name,
-                                 [(m.name, m.value, m.unit) for m in metrics], masked, landmarks)
-    save_png(output / "picture.png", picture_completion(views, done, work.body.template, masked=masked))
+    picture = picture_completion(views, done, work.body.template, masked=masked)
+    save_png(output / "picture.png", picture)
+    rows = [(m.name, m.value, m.unit) for m in metrics]
+    page = completion_page(views, done, work.body.template, inputs.name, rows, masked, landmarks, picture)
     page.write(output / "report.html")
     return metrics
 

@@ -1,0 +1,182 @@
+"""`scape complete`: files in, a folder with meshes, figures and a page out."""
+import json
+import re
+import shutil
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from completion_bodies import half_view, worm_with_prior
+
+from completion.__main__ import main
+from completion.partial import report
+from completion.partial.results import load_completion
+from completion.partial.views import read_view
+from scanprep.geometry.files import PointCloud, read_mesh, write_mesh, write_points
+from scanprep.geometry.landmarks import write_landmarks
+from scanprep.geometry.mesh import Mesh
+
+POSE = np.array([[0.3, -0.5, 0.8], [0.2, 0.5, -0.4], [-0.1, -0.6, 0.3], [0.3, 0.1, 0.5]])
+TRANS = np.array([0.4, -0.3, 1.1])
+MARKS = {f"m{v}": v for v in (6, 75, 130, 200, 255, 330, 396)}
+QUICK = ("--draws", "3", "--rounds", "3", "--scan-points", "300", "--model-points", "150", "--candidates", "1",
+         "--start-axes", "1")
+
+
+@pytest.fixture(scope="module", autouse=True)
+def small_pictures():
+    """Nobody looks at them here."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(report, "HEIGHT", 60)
+        yield
+
+
+@pytest.fixture(scope="module")
+def place(tmp_path_factory):
+    """A model, two coloured views of a body as meshes, one as points, landmarks, a mask."""
+    place = tmp_path_factory.mktemp("complete")
+    model = worm_with_prior()
+    model = replace(model, info={**model.info, "landmarks": MARKS})
+    model.save(place / "model.npz")
+    body = model.template.with_vertices(model.vertices(POSE, None, TRANS))
+    points = {name: body.vertices[v] for name, v in MARKS.items()}
+    for name, toward in (("one", [0.3, -1, 0.5]), ("two", [-0.9, 0.6, 0.1])):
+        bare, seen = half_view(body, np.array(toward), count=1500, noise=0.001)
+        view = body.submesh(seen[body.faces].all(axis=1))[0]
+        write_mesh(place / f"{name}.ply", Mesh(view.vertices, view.faces, np.full(view.vertices.shape, 0.2)))
+        write_points(place / f"{name}.xyz", PointCloud(bare))
+    write_landmarks(place / "one.landmarks.json", points)
+    np.save(place / "mask.npy", np.arange(10))
+    return place
+
+
+def run(*words):
+    return main(["complete", *map(str, words)])
+
+
+def told(folder):
+    written = json.loads((folder / "report.json").read_text())
+    return {row["metric"]: row["value"] for row in written["metrics"]}, written
+
+
+def test_two_coloured_views_make_one_body_and_a_page(place, tmp_path, capsys):
+    out = tmp_path / "out"
+    assert run(place / "one.ply", place / "two.ply", "-m", place / "model.npz", "--subject", "template", "-o", out,
+               "--mask", place / "mask.npy", *QUICK) == 0
+    metrics, written = told(out)
+    assert metrics["views"] == 2 and metrics["landmarks used"] == 7 and metrics["vertices with data"] > 70
+    assert metrics["scan points masked"] > 0 and str(place / "model.npz") in metrics["model"]
+    assert written["settings"]["complete"]["draws"] == 3
+    done = load_completion(out)
+    assert done.betas is None and done.rms * 1000 == pytest.approx(
+        metrics["distance of the scan to the completed mesh, RMS"])
+    colors = read_mesh(out / "completed.ply").colors
+    np.testing.assert_allclose(colors[done.seen & (colors != 0.6).any(axis=1)], 0.2, atol=0.01)
+    assert ((colors[:, 0] - 0.2)**2 < 1e-3).mean() > 0.5
+    page = (out / "report.html").read_text()
+    for wanted in ("From all sides", "Colours", "Distance of the scan", "clothing or hair", "scan points explained"):
+        assert wanted in page
+    assert len(re.findall("<img", page)) >= 5 and not list(out.glob(".*"))
+    assert "distance of the scan" in capsys.readouterr().out
+
+
+def test_without_landmarks_it_says_so_and_goes_on(place, tmp_path, capsys):
+    assert run(place / "two.xyz", "-m", place / "model.npz", "--subject", "template", "-o", tmp_path / "out",
+               *QUICK) == 0
+    assert told(tmp_path / "out")[0]["landmarks used"] == "none"
+    assert "no landmarks" in capsys.readouterr().err
+
+
+def test_the_unit_of_the_scan_may_be_unknown(place, tmp_path, capsys):
+    view = read_mesh(place / "one.ply")
+    write_mesh(tmp_path / "large.ply", view.with_vertices(view.vertices / 0.0254))
+    marks = json.loads((place / "one.landmarks.json").read_text())
+    write_landmarks(tmp_path / "large.landmarks.json", {n: np.array(p) / 0.0254 for n, p in marks.items()})
+    assert run(tmp_path / "large.ply", "-m", place / "model.npz", "--subject", "template", "-o", tmp_path / "out",
+               "--free-scale", *QUICK) == 0
+    assert told(tmp_path / "out")[0]["unit of the scan"] == pytest.approx(0.0254, rel=0.05)
+    assert "looks like unit" not in capsys.readouterr().err
+    assert load_completion(tmp_path / "out").scale == pytest.approx(0.0254, rel=0.05)
+
+
+@pytest.fixture(scope="module")
+def folder(place, tmp_path_factory):
+    """Three scans of a folder, of which one is damaged, completed once."""
+    scans, out = tmp_path_factory.mktemp("scans"), tmp_path_factory.mktemp("done") / "out"
+    for name in ("a", "b"):
+        shutil.copy(place / "one.ply", scans / f"{name}.ply")
+        shutil.copy(place / "one.landmarks.json", scans / f"{name}.landmarks.json")
+    (scans / "c.ply").write_text("ply\nformat ascii 1.0\nelement vertex 3\n")
+    code = run(scans, "-m", place / "model.npz", "--subject", "template", "-o", out, *QUICK)
+    return scans, out, code
+
+
+def words(place, folder, *more):
+    return (folder[0], "-m", place / "model.npz", "--subject", "template", "-o", folder[1], *QUICK, *more)
+
+
+def test_a_folder_is_completed_scan_by_scan(folder):
+    _, out, code = folder
+    assert code == 1                                                 # one scan failed
+    metrics, written = told(out)
+    assert metrics["scans completed"] == "2 of 3" and metrics["of them in this run"] == 2
+    assert len(written["failures"]) == 1 and "c.ply" in written["failures"][0]
+    for name in ("a", "b"):
+        assert load_completion(out / name).seen.any() and (out / name / "report.html").is_file()
+    page = (out / "report.html").read_text()
+    assert 'href="a/report.html"' in page and 'src="b/picture.png"' in page and "c.ply" in page
+    assert sorted(p.name for p in out.iterdir()) == ["a", "b", "report.html", "report.json"]
+
+
+def test_what_is_finished_is_skipped_and_what_changed_is_done_anew(place, folder, capsys):
+    scans, out, _ = folder
+    (out / ".a.77.part").mkdir()                                     # left by a run that was killed
+    before = {name: (out / name / "completed.ply").stat().st_mtime_ns for name in ("a", "b")}
+
+    def fresh(*more):
+        run(*words(place, folder, *more))
+        return told(out)[0]["of them in this run"]
+
+    assert fresh() == 0
+    assert before == {name: (out / name / "completed.ply").stat().st_mtime_ns for name in ("a", "b")}
+    assert not list(out.glob(".*"))
+    marks = json.loads((scans / "b.landmarks.json").read_text())
+    write_landmarks(scans / "b.landmarks.json", {n: np.array(p) + 0.001 for n, p in marks.items()})
+    assert fresh() == 1 and fresh() == 0                             # a changed input
+    assert fresh("--surface-weight", "2") == 2                       # a changed setting
+
+
+@pytest.mark.parametrize("words, message", [
+    (("none.ply",), "none.ply: no such file"),
+    (("one.ply", "--landmarks", "none.json"), "none.json: no such file"),
+    (("one.ply", "--mask", "none.npy"), "none.npy: no such file"),
+    (("one.ply", "--mask", "long.json"), "long.json: element 0: expected a point of 0.."),
+    (("one.ply", "--ignored-parts", "wing"), "ignored_parts: expected names of"),
+    (("one.ply", "--unit", "mm", "--free-scale"), "--unit, --free-scale: expected one of them"),
+    (("one.ply", "two.ply", "--mask", *["mask.npy"] * 3), "expected one file, or one for each of the 2 views, got 3"),
+    (("one.ply", "--subject", "none.json"), "none.json: no such file"),
+])
+def test_what_cannot_be_used_is_named(place, tmp_path, capsys, monkeypatch, words, message):
+    monkeypatch.chdir(place)
+    (place / "long.json").write_text("[99999]")
+    assert run(*words, "-m", "model.npz", "-o", tmp_path / "out", *QUICK) == 1
+    assert message in " ".join(capsys.readouterr().err.split())
+
+
+def test_wrong_usage_is_2_and_help_shows_an_example(capsys):
+    with pytest.raises(SystemExit) as stop:
+        run("scan.ply")                                              # no output
+    assert stop.value.code == 2
+    with pytest.raises(SystemExit) as stop:
+        run("--help")
+    assert stop.value.code == 0 and "Example: scape complete half.ply" in capsys.readouterr().out
+
+
+def test_clouds_keep_normals_and_colours(tmp_path):
+    points = np.random.default_rng(0).normal(size=(20, 3))
+    up = np.tile([0, 0, 1.0], (20, 1))
+    for name in ("a.ply", "a.pcd"):
+        write_points(tmp_path / name, PointCloud(points, up, 0 * up))
+        view = read_view(tmp_path / name)
+        np.testing.assert_allclose(view.normals, up)
+        np.testing.assert_array_equal(view.colors, 0)
