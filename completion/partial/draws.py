@@ -10,7 +10,7 @@ from scanprep.skeleton.tree import Skeleton
 
 from .. import energy
 from ..bodies import FixedBody, Follow
-from ..priors import GaussianPrior
+from ..priors import GaussianPrior, unbranched
 from ..solve import normal_equations
 from .contact import Contact
 from .scan import spread
@@ -18,7 +18,7 @@ from .scan import spread
 if TYPE_CHECKING:
     from .fit import ScanFit
 
-LARGEST = 3                          # parts of a limb that is redrawn as a whole
+LOOSE = 0.1                          # radians around the limb of a training pose
 VERTICES = 3000                      # that a quick look takes
 
 
@@ -38,9 +38,22 @@ def around(body: FixedBody, follow: Follow, x: np.ndarray, targets: np.ndarray, 
 
 
 def limbs(skeleton: Skeleton) -> list[int]:
-    """Joints below which hang a few parts, the largest limbs first."""
+    """Joints below which hangs a limb without a branch, the largest limbs first."""
     size = skeleton.descends.sum(axis=0)
-    return [int(j) for j in np.argsort(-size, kind="stable") if j > 0 and size[j] <= LARGEST]
+    starts = [j for run in unbranched(skeleton.parents) for j in run if size[run[-1]] == 1]
+    return sorted(starts, key=lambda j: (-size[j], j))
+
+
+def examples_of(body: FixedBody, x: np.ndarray, root: int, count: int, rng: np.random.Generator) -> np.ndarray:
+    """Draws (count or none, P) of the limb at a joint: as it is in the training poses, loosened a little."""
+    drawn = np.repeat(x[None], count if len(body.pose_examples) else 0, axis=0)
+    if len(drawn):
+        parts = np.flatnonzero(body.skeleton.descends[:, root])
+        angles = (3 * parts[:, None] + np.arange(3)).ravel()
+        which = np.arange(count) % len(body.pose_examples)
+        drawn[:, angles] = body.pose_examples.reshape(len(body.pose_examples), -1)[which][:, angles]
+        drawn[:, angles] += rng.normal(0, LOOSE, (count, len(angles)))
+    return drawn
 
 
 def redrawn(body: FixedBody, x: np.ndarray, root: int, prior: GaussianPrior, count: int,

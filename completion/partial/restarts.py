@@ -4,11 +4,13 @@ from __future__ import annotations
 import numpy as np
 
 from ..starts import distinct, search
-from .draws import around, limbs, near_points, quick_misfits, redrawn
+from .draws import around, examples_of, limbs, near_points, quick_misfits, redrawn
 from .fit import ScanFit
 from .search import from_nothing
 
 COARSE = (0.25, 0.2, 0.15, 0.12, 0.1)    # metres: reaches of the first rounds, on few points
+FINALISTS = 4                        # starts that are carried through all these rounds
+SETTLE = (0.2, 0.15, 0.1)            # metres: reaches of the rounds after a limb was moved
 DOUBT = 0.012                        # share of scan or body that may be in the wrong place for no reason
 MANY = 6                             # times as many draws of a limb are compared with what is unexplained
 PROMISING = 30.0                     # a limb drawn at random may be this much worse before it is fitted
@@ -35,8 +37,14 @@ def from_landmarks(fit: ScanFit) -> np.ndarray:
 
 
 def best_start(fit: ScanFit, starts: np.ndarray) -> np.ndarray:
-    """The start (P,) that explains the scan best after a few rounds on few points."""
-    ends = [approach(fit, x) for x in starts]
+    """The start (P,) that explains the scan best after a few rounds on few points; the worst drop out early."""
+    ends = np.array(starts)
+    if len(ends) > FINALISTS:
+        ends = np.array([approach(fit, x, COARSE[:2]) for x in ends])
+        ends = ends[np.argsort([fit.misfit(x) for x in ends], kind="stable")[:FINALISTS]]
+        ends = np.array([approach(fit, x, COARSE[2:]) for x in ends])
+    else:
+        ends = np.array([approach(fit, x) for x in ends])
     return ends[int(np.argmin([fit.misfit(x) for x in ends]))]
 
 
@@ -53,25 +61,29 @@ def redraw_limbs(fit: ScanFit, x: np.ndarray) -> np.ndarray:
         return x
     whole, fit.body = fit.body, fit.body.held(x)
     free = whole.n_angles + 3
-    moved = _redrawn(fit, x[:free])
+    moved = approach(fit, x[:free], SETTLE)
+    for root in limbs(fit.body.skeleton):
+        moved = _redrawn(fit, moved, root)
     fit.body = whole
     return np.concatenate([moved[:free], x[free:]])
 
 
-def _redrawn(fit: ScanFit, x: np.ndarray) -> np.ndarray:
-    best, config = fit.misfit(x), fit.config
-    for root in limbs(fit.body.skeleton):
-        moved = np.flatnonzero(fit.body.skeleton.descends[:, root])
-        drawn = redrawn(fit.body, x, root, fit.prior, MANY * config.draws, fit.rng)
-        wanted = fit.coarse.points[fit.unexplained(x, fit.coarse)]
-        drawn = np.vstack([near_points(fit, drawn, moved, wanted, config.draws // 3), drawn[:config.draws]])
-        quick = quick_misfits(fit, np.vstack([x, drawn]), moved)
-        for i in np.argsort(quick[1:])[:2]:
-            if quick[i + 1] > quick[0] + PROMISING:
-                continue
-            tried = approach(fit, drawn[i], (0.2, 0.15, 0.1))
-            if (misfit := fit.misfit(tried)) < best - BETTER:
-                x, best = tried, misfit
+def _redrawn(fit: ScanFit, x: np.ndarray, root: int) -> np.ndarray:
+    """Unknowns (P,) with the limb at a joint as it is, or drawn from the prior and from the training poses."""
+    best, count = fit.misfit(x), fit.config.draws
+    moved = np.flatnonzero(fit.body.skeleton.descends[:, root])
+    drawn = np.concatenate([examples_of(fit.body, x, root, MANY * count // 2, fit.rng),
+                            redrawn(fit.body, x, root, fit.prior, MANY * count, fit.rng)])
+    drawn = drawn[fit.rng.permutation(len(drawn))]
+    wanted = fit.coarse.points[fit.unexplained(x, fit.coarse)]
+    drawn = np.vstack([near_points(fit, drawn, moved, wanted, count // 3), drawn[:count]])
+    quick = quick_misfits(fit, np.vstack([x, drawn]), moved)
+    for i in np.argsort(quick[1:])[:2]:
+        if quick[i + 1] > quick[0] + PROMISING:
+            continue
+        tried = approach(fit, drawn[i], SETTLE)
+        if (misfit := fit.misfit(tried)) < best - BETTER:
+            x, best = tried, misfit
     return x
 
 

@@ -16,6 +16,7 @@ if TYPE_CHECKING:
     from .fit import ScanFit
 
 TURNS = 600                          # about 25 degrees between neighbours
+POSES = 100                          # tried at most
 VERTICES, POINTS = 500, 120          # of body and scan, in the first look at all turns
 CAP = 0.15                           # metres: further off is as bad
 NORMALS = 0.1                        # metres that a difference of normals of unit length weighs
@@ -24,7 +25,7 @@ FACING = 0.15                        # cosine to the camera's direction from whi
 PROMISING = 0.4                      # share of all placements, those least denied by the camera, that are compared
 AT_ONCE = 1000                       # points that are compared at a time
 POOL = 200                           # best placements that are kept
-BLIND, APART = 12, 0.1               # of them, starts that differ by so many metres on average
+BLIND, APART = 24, 0.08              # of them, starts that differ by so many metres on average
 
 
 def from_nothing(fit: ScanFit) -> np.ndarray:
@@ -41,10 +42,23 @@ def from_nothing(fit: ScanFit) -> np.ndarray:
 def starting_poses(fit: ScanFit) -> np.ndarray:
     """Poses (M, J, 3) to try: those the model was trained on, or steps along the Gaussian's main directions."""
     body = fit.body
-    examples = body.pose_examples
-    if len(examples):
-        return np.concatenate([[np.vstack([np.zeros((1, 3)), body.pose_mean[1:]])], examples])
-    return typical_poses(body.pose_mean, body.pose_covariance, fit.config.start_axes)
+    if not len(body.pose_examples):
+        return typical_poses(body.pose_mean, body.pose_covariance, fit.config.start_axes)
+    mean = body.pose_mean.copy()
+    mean[0] = 0
+    return varied(np.concatenate([mean[None], body.pose_examples]), POSES)
+
+
+def varied(poses: np.ndarray, count: int) -> np.ndarray:
+    """Those `count` of the poses (M, J, 3), the first among them, that differ most from one another."""
+    if len(poses) <= count:
+        return poses
+    flat, kept = poses.reshape(len(poses), -1), [0]
+    apart = np.linalg.norm(flat - flat[0], axis=1)
+    while len(kept) < count:
+        kept.append(int(np.argmax(apart)))
+        apart = np.minimum(apart, np.linalg.norm(flat - flat[kept[-1]], axis=1))
+    return poses[kept]
 
 
 def all_turns(count: int) -> np.ndarray:

@@ -1,0 +1,103 @@
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from completion_bodies import half_view, worm_with_prior
+
+from completion.bodies import FixedBody
+from completion.partial.completion import complete
+from completion.partial.draws import examples_of
+from completion.partial.fit import ScanFit
+from completion.partial.scan import prepare_scan
+from completion.partial.search import Outside, all_turns, from_nothing, placements, starting_poses, varied
+from completion.partial.settings import CompletionConfig
+from completion.partial.sight import find_sight
+from scanprep.geometry import rotations
+from scanprep.geometry.surface import Surface
+
+NOTHING = (np.zeros(0, dtype=np.int64), np.zeros((0, 3)))
+POSE = np.array([[0.3, -0.5, 2.8], [0.2, 0.5, -0.4], [-0.1, -0.6, 0.3], [0.3, 0.1, 0.5]])
+TRANS = np.array([0.4, -0.3, 1.1])
+QUICK = CompletionConfig(draws=12, rounds=6, scan_points=800, model_points=300, start_axes=2)
+
+
+@pytest.fixture(scope="module")
+def model():
+    """A worm that kept its training poses; the one of the scan is not among them."""
+    examples = np.random.default_rng(4).normal(0, 0.35, (20, 4, 3)) + worm_with_prior().pose_mean
+    examples[:, 0] = 0
+    return replace(worm_with_prior(), pose_examples=examples)
+
+
+@pytest.fixture(scope="module")
+def scene(model):
+    body = model.template.with_vertices(model.vertices(POSE, None, TRANS))
+    points, _ = half_view(body, np.array([0.3, -1, 0.5]), noise=0.001)
+    return body, points
+
+
+def test_turns_are_rotations_that_leave_no_gap():
+    turns = all_turns(600)
+    np.testing.assert_allclose(turns @ np.swapaxes(turns, 1, 2), np.broadcast_to(np.eye(3), (600, 3, 3)), atol=1e-12)
+    np.testing.assert_allclose(np.linalg.det(turns), 1)
+    any_turn = rotations.exp(np.random.default_rng(0).normal(0, 2, (300, 3)))
+    cosine = (np.einsum("aij,bij->ab", any_turn, turns).max(axis=1) - 1) / 2
+    assert np.degrees(np.arccos(cosine.min())) < 35                       # of any turn, one is near
+    assert np.degrees(np.arccos(cosine.mean())) < 20
+
+
+def test_varied_poses_are_the_corners():
+    poses = np.zeros((9, 2, 3))
+    poses[:, 1, 0] = [0, 0.1, 0.2, -0.1, 1, 0.9, -1, -0.95, 0.05]
+    np.testing.assert_array_equal(varied(poses, 3)[:, 1, 0], [0, 1, -1])
+    assert varied(poses, 9) is poses
+
+
+def test_the_table_says_what_the_camera_denies(scene):
+    _, points = scene
+    sight = find_sight(prepare_scan(points))
+    table = Outside(sight, 0.03)
+    places = points[::40] + np.random.default_rng(0).normal(0, 0.1, (len(points[::40]), 3))
+    there = np.minimum(sight.trespass(places, 0.03)[0], 0.15)
+    assert np.abs(table.at(places) - there).mean() < 0.015               # cells are 4 cm wide
+    assert table.at(points[:1] + 10)[0] == pytest.approx(0.15)
+
+
+def test_what_is_laid_on_the_scan_lies_there(model, scene):
+    _, points = scene
+    fit = ScanFit(FixedBody(model.subject(None)), prepare_scan(points), *NOTHING, QUICK)
+    x, cost = placements(fit)
+    assert (np.diff(cost) >= 0).all()
+    best = Surface(fit.mesh(x[0])).closest(points).distances
+    assert best.mean() < 0.04 and Surface(fit.mesh(x[-1])).closest(points).distances.mean() > best.mean()
+    starts = from_nothing(fit)
+    places = np.array([fit.body.vertices(start) for start in starts])
+    assert len(starts) > 3 and np.linalg.norm(places[0] - places[1], axis=1).mean() > 0.07
+
+
+@pytest.mark.parametrize("kept", [20, 0], ids=["examples", "moments"])
+def test_half_a_scan_without_landmarks_gives_the_whole_body(model, scene, kept):
+    """A worm looks alike from both ends, so its surface is compared and not its vertices."""
+    body, points = scene
+    some = replace(model, pose_examples=model.pose_examples[:kept])
+    assert len(starting_poses(ScanFit(FixedBody(some.subject(None)), prepare_scan(points), *NOTHING, QUICK))) == (
+        21 if kept else 5)
+    result = complete(some.subject(None), points, None, QUICK)
+    assert result.explained > 0.97 and np.isnan(result.landmark_rms)
+    assert Surface(result.completed).closest(body.vertices).distances.mean() < 0.015
+
+
+def test_a_scan_turned_is_found_as_well(model, scene):
+    body, points = scene
+    R, t = rotations.exp(np.array([1.7, -1.1, 0.4])), np.array([3.0, -2, 1])
+    result = complete(model.subject(None), points @ R.T + t, None, QUICK)
+    assert Surface(result.completed).closest(body.vertices @ R.T + t).distances.mean() < 0.015
+
+
+def test_limbs_are_drawn_from_the_training_poses(model):
+    body, x = FixedBody(model.subject(None)), np.arange(15.0)
+    drawn = examples_of(body, x, 2, 40, np.random.default_rng(0))
+    np.testing.assert_array_equal(drawn[:, [*range(6), 12, 13, 14]], np.tile(x[[*range(6), 12, 13, 14]], (40, 1)))
+    wanted = model.pose_examples[np.arange(40) % 20, 2:].reshape(40, -1)
+    assert 0.05 < (drawn[:, 6:12] - wanted).std() < 0.15
+    assert len(examples_of(FixedBody(worm_with_prior().subject(None)), x, 2, 40, np.random.default_rng(0))) == 0
