@@ -6,7 +6,9 @@ from typing import Any
 import numpy as np
 
 from model.linear import Subject
+from scanprep.geometry import rotations
 from scanprep.pictures.animation import gif_bytes
+from scanprep.pictures.camera import Camera
 from scanprep.pictures.page import Page
 from scanprep.pictures.shading import Dots, Shape, render, side_by_side
 from scanprep.pictures.views import look_around, upright
@@ -18,33 +20,89 @@ MARKER = (0.85, 0.25, 0.2)
 
 
 def picture_frames(motion: Motion, subject: Subject, markers: MarkerSequence | None, count: int = 8,
-                   height: int = 360) -> np.ndarray:
-    """Some frames side by side, the measured markers as dots."""
+                   height: int = 360, turn: float = 35.0) -> np.ndarray:
+    """Some frames side by side, the measured markers as dots.
+
+    Parameters
+    ----------
+    turn : float, degrees
+        Where the camera stands, from the front of the body.
+    """
     frames = np.unique(np.linspace(0, len(motion.poses) - 1, count).round().astype(int))
-    bodies = motion.vertices(subject, frames)
+    return _frames_in_a_row(motion, subject, markers, frames, height, turn)
+
+
+def picture_worst(motion: Motion, subject: Subject, markers: MarkerSequence, count: int = 8, height: int = 360
+                  ) -> np.ndarray:
+    """The frames with the largest mean residual, at least a quarter of a second apart."""
+    off = np.where(np.isfinite(motion.residuals), motion.residuals, 0).sum(axis=1)
+    off /= np.maximum(np.isfinite(motion.residuals).sum(axis=1), 1)
+    frames: list[int] = []
+    for t in np.argsort(-off):
+        if len(frames) < count and all(abs(int(t) - other) >= motion.rate / 4 for other in frames):
+            frames.append(int(t))
+    return _frames_in_a_row(motion, subject, markers, np.sort(frames), height, 35.0)
+
+
+def _frames_in_a_row(motion: Motion, subject: Subject, markers: MarkerSequence | None, frames: np.ndarray,
+                     height: int, turn: float) -> np.ndarray:
     images = []
-    for t, vertices in zip(frames, bodies, strict=True):
-        mesh = subject.template.with_vertices(vertices)
-        camera = look_around(subject.template, vertices, (35,))[0]
-        shapes: list[Shape] = [mesh]
+    for t, vertices in zip(frames, motion.vertices(subject, frames), strict=True):
+        camera = facing(subject, motion.poses[t], vertices, turn)
+        shapes: list[Shape] = [subject.template.with_vertices(vertices)]
         if markers is not None:
             shapes.append(Dots(markers.positions[t], MARKER, radius=0.013))
         images.append(render(shapes, camera, int(0.62 * height), height))
     return side_by_side(images, [f"{t / motion.rate:.2f} s" for t in frames])
 
 
+def morph_frames(motion: Motion, subject: Subject, bodies: np.ndarray, frames: np.ndarray, count: int = 8,
+                 height: int = 360) -> np.ndarray:
+    """Some of the meshes (n, N, 3) of a body that changes side by side, at one scale; `frames` (n,) is when."""
+    chosen = np.unique(np.linspace(0, len(frames) - 1, count).round().astype(int))
+    size = 1.06 * np.ptp(bodies[chosen], axis=1).max(axis=0) / 2
+    images = []
+    for i in chosen:
+        middle = (bodies[i].min(axis=0) + bodies[i].max(axis=0)) / 2
+        camera = facing(subject, motion.poses[frames[i]], np.stack([middle - size, middle + size]), 35.0)
+        images.append(render(subject.template.with_vertices(bodies[i]), camera, int(0.62 * height), height))
+    return side_by_side(images, [f"{frames[i] / motion.rate:.2f} s" for i in chosen])
+
+
+def facing(subject: Subject, pose: np.ndarray, vertices: np.ndarray, turn: float) -> Camera:
+    """A camera that sees a posed body (N, 3) from so many degrees beside its front, wherever it has turned."""
+    up, front = upright(subject.template)
+    across = [(up + 1) % 3, (up + 2) % 3]
+    ahead = np.zeros(3)
+    ahead[across] = np.cos(np.radians(front)), np.sin(np.radians(front))
+    now = (rotations.exp(pose[0]) @ ahead)[across]
+    return Camera.around(vertices, azimuth=float(np.degrees(np.arctan2(now[1], now[0]))) + turn, up=up)
+
+
 def animated_picture(motion: Motion, subject: Subject, frames_per_second: float = 15.0, seconds: float = 2.4,
                      width: int = 300, height: int = 400) -> bytes:
     """The motion as an endless GIF, at most so many seconds of it, the camera following the body."""
-    step = max(1, round(motion.rate / frames_per_second))
-    frames = np.arange(0, min(len(motion.poses), round(seconds * motion.rate)), step)
-    bodies = motion.vertices(subject, frames)
+    frames = _shown(motion, frames_per_second, seconds)
+    return moving_picture(motion.vertices(subject, frames), subject, motion.rate * len(frames) / _span(motion, seconds),
+                          width, height)
+
+
+def moving_picture(bodies: np.ndarray, subject: Subject, rate: float, width: int = 300, height: int = 400) -> bytes:
+    """Meshes (n, N, 3) as an endless GIF of `rate` pictures a second, the camera following them over the ground."""
     centred = bodies - bodies.mean(axis=1, keepdims=True)
     up, _ = upright(subject.template)
     centred[..., up] = bodies[..., up]
     camera = look_around(subject.template, centred, (35,))[0]
     images = [render(subject.template.with_vertices(v), camera, width, height, ground=True) for v in centred]
-    return gif_bytes(images, motion.rate / step)
+    return gif_bytes(images, rate)
+
+
+def _span(motion: Motion, seconds: float) -> int:
+    return max(1, min(len(motion.poses), round(seconds * motion.rate)))
+
+
+def _shown(motion: Motion, frames_per_second: float, seconds: float) -> np.ndarray:
+    return np.arange(0, _span(motion, seconds), max(1, round(motion.rate / frames_per_second)))
 
 
 def chart_residuals(motion: Motion) -> Any:
@@ -64,14 +122,57 @@ def chart_residuals(motion: Motion) -> Any:
     return figure
 
 
+def chart_missing(motion: Motion, seen_columns: np.ndarray) -> Any:
+    """A matplotlib figure: when which marker was missing or not believed.
+
+    Parameters
+    ----------
+    seen_columns : (L,) bool
+        Markers to show.
+    """
+    from matplotlib.colors import ListedColormap
+    from matplotlib.figure import Figure
+
+    labels = [label for label, shown in zip(motion.labels, seen_columns, strict=True) if shown]
+    missing = ~np.isfinite(motion.residuals[:, seen_columns])
+    state = np.where(missing, 2, np.where(motion.trusted[:, seen_columns], 0, 1))
+    steps = np.array_split(np.arange(len(state)), min(len(state), 600))
+    shown = np.array([state[part].max(axis=0) for part in steps])
+    figure = Figure(figsize=(7.5, 0.6 + 0.13 * len(labels)))
+    axes = figure.add_subplot()
+    axes.imshow(shown.T, aspect="auto", interpolation="nearest", vmin=0, vmax=2,
+                cmap=ListedColormap(["#dfe7ee", "#e39b3b", "#8c2f39"]),
+                extent=(0, len(state) / motion.rate, len(labels) - 0.5, -0.5))
+    axes.set_yticks(range(len(labels)), labels, fontsize=6)
+    axes.set_xlabel("time (s)")
+    return figure
+
+
 def motion_page(motion: Motion, subject: Subject, markers: MarkerSequence, name: str,
                 rows: list[tuple[str, Any, str]]) -> Page:
     """The page of `scape animate`."""
-    page = Page(f"{name}, animated", "The body in some frames, with the markers that were measured.")
-    page.picture(picture_frames(motion, subject, markers)).picture(animated_picture(motion, subject), "first seconds")
+    page = Page(f"{name}, animated", "The body in some frames, with the markers that were measured as dots.")
+    page.picture(picture_frames(motion, subject, markers), "from the front and the person's left")
+    page.picture(picture_frames(motion, subject, markers, turn=215.0), "the same frames from behind")
+    page.picture(animated_picture(motion, subject, 10.0, 4.0), "first seconds")
     page.section("Markers").chart(chart_residuals(motion), "distance of the markers to where the body puts them")
-    mean = np.array([np.nanmean(r) if np.isfinite(r).any() else np.nan for r in motion.residuals.T])
-    worst = np.argsort(-np.nan_to_num(mean))
-    page.table([(motion.labels[i], 1000 * float(mean[i]), 100 * float(np.isfinite(motion.residuals[:, i]).mean()))
-                for i in worst], ("marker", "mean distance (mm)", "seen (%)"))
+    page.picture(picture_worst(motion, subject, markers), "where the markers are farthest off")
+    used = np.isfinite(motion.residuals).any(axis=0)
+    page.chart(chart_missing(motion, used), "light: seen; orange: seen, but not believed; red: missing")
+    page.table(_marker_rows(motion, used), ("marker", "mean distance (mm)", "95th percentile (mm)", "seen (%)",
+                                            "believed (%)"))
+    unused = [label for label, is_used in zip(motion.labels, used, strict=True) if not is_used]
+    if unused:
+        page.text(f"Not used, because the layout does not know them or they were never seen: {', '.join(unused)}.")
     return page.section("Figures").table(rows, ("metric", "value", "unit"))
+
+
+def _marker_rows(motion: Motion, used: np.ndarray) -> list[tuple[str, float, float, float, float]]:
+    """The markers, that with the largest mean distance first."""
+    found = []
+    for i in np.flatnonzero(used):
+        seen = np.isfinite(motion.residuals[:, i])
+        off = 1000 * motion.residuals[seen, i]
+        found.append((motion.labels[i], float(off.mean()), float(np.percentile(off, 95)), 100 * float(seen.mean()),
+                      100 * float(motion.trusted[seen, i].mean())))
+    return sorted(found, key=lambda row: -row[1])

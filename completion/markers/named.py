@@ -3,6 +3,7 @@ from __future__ import annotations
 
 import hashlib
 import json
+from collections.abc import Sequence
 from functools import cache
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
@@ -67,3 +68,18 @@ def _on_kept(layout: MarkerLayout, template: Mesh, kept: np.ndarray) -> MarkerLa
 @cache
 def _files() -> tuple[tuple[Path, dict[str, Any]], ...]:
     return tuple((path, json.loads(path.read_text(encoding="utf-8"))) for path in sorted(FOLDER.glob("*.json")))
+
+
+def fitting_layout(labels: Sequence[str], template: Mesh, kept: np.ndarray | None = None
+                   ) -> tuple[MarkerLayout, str]:
+    """The named layout that knows most of some labels, and its name.
+
+    Raises
+    ------
+    ValueError
+        A body on which none is known, or labels of which none knows three.
+    """
+    found = {name: named_layout(name, template, kept) for name in layout_names()}
+    best = max(found, key=lambda name: (len(found[name].matched(labels, 0)), -len(found[name].labels)))
+    found[best].matched(labels)
+    return found[best], best
