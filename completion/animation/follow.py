@@ -12,6 +12,8 @@ from ..energy import MovingPoints
 from ..markers.files import MarkerSequence
 from ..markers.layout import MarkerLayout
 from ..motion import Motion
+from .ground import Floor, Standing
+from .lowpass import low_pass
 from .marked import MarkedBody
 from .prediction import inertia
 from .settings import AnimateConfig
@@ -22,6 +24,7 @@ from .trust import LabelWatch, exchangeable, marker_weights
 __all__ = ["AnimateConfig", "MarkerFollower", "animate"]
 
 Progress = Callable[[int, int], None]
+GROUND_ROUNDS = 2                    # over the whole sequence, the feet held
 KEY_STEPS = 8                        # most steps for a key frame
 STILL = 0.005                        # metres that the last round moves any marker of a frame that has settled
 
@@ -53,11 +56,14 @@ def animate(subject: Subject, markers: MarkerSequence, layout: MarkerLayout, con
     """
     follower = MarkerFollower(subject, markers, layout, config or AnimateConfig())
     first, T = follower.first_frame(), len(markers.positions)
-    if follower.config.smoothing:
+    if follower.config.smoothing or follower.config.ground:
         x, settled = follower.whole(first, progress)
     else:
         x, settled = follower.one_by_one(np.arange(T), first, progress)
     pose, trans, _ = follower.body.body.split(x)
+    if follower.config.low_pass:
+        pose, trans = low_pass(pose, trans, markers.rate, follower.config.low_pass)
+        x = follower.body.body.join(pose, trans)
     residuals = np.full(markers.positions.shape[:2], np.nan)
     trusted = np.zeros(residuals.shape, dtype=bool)
     residuals[:, follower.rows], trusted[:, follower.rows] = judge(
@@ -80,7 +86,7 @@ class MarkerFollower:
     def __init__(self, subject: Subject, markers: MarkerSequence, layout: MarkerLayout, config: AnimateConfig
                  ) -> None:
         labels = layout.matched(markers.labels)
-        self.config, self.rate = config, markers.rate
+        self.config, self.rate, self.standing = config, markers.rate, None
         self.rows = np.array([markers.labels.index(label) for label in labels])
         self.targets = markers.positions[:, self.rows]
         self.order = np.tile(np.arange(len(labels)), (len(self.targets), 1))
@@ -140,13 +146,20 @@ class MarkerFollower:
         some = np.flatnonzero(seen.any(axis=1))
         inside = np.arange(some[0], some[-1] + 1)
         moved = np.zeros(T)
-        for i in range(self.config.smoothing):
+        free = max(self.config.smoothing, 1)
+        rounds = free + GROUND_ROUNDS * self.config.ground
+        for i in range(rounds):
+            if self.standing:
+                self.standing.refresh(self.standing.points(x))
+            elif i == free:
+                floor = None if self.config.floor is None else Floor.given(self.config.floor)
+                self.standing = Standing(self.body, x, self.rate, floor)
             self.find_exchanges(x)
             better = smooth_sequence(self, x[inside], inside)
             apart = np.linalg.norm(self.positions(better) - self.positions(x[inside]), axis=2)
             moved[inside], x[inside] = apart.max(axis=1), better
             if progress:
-                progress(round(T * (i + 1) / self.config.smoothing), T)
+                progress(round(T * (i + 1) / rounds), T)
         return x, seen.any(axis=1) & (moved < STILL)
 
     def between_keys(self, first: int) -> np.ndarray:

@@ -13,9 +13,10 @@ from ..energy import MovingPoints, moving_points
 from ..markers.layout import MarkerLayout
 from ..priors import gaussian_prior
 from . import turns
-from .points import marker_shapes
+from .points import PartShapes, marker_shapes
 
 System = tuple[np.ndarray, np.ndarray, np.ndarray]                      # energy, half its gradient, Gauss-Newton matrix
+BATCH = 64                           # frames whose parts are held at once
 
 
 class MarkedBody:
@@ -43,7 +44,11 @@ class MarkedBody:
     def positions(self, x: np.ndarray) -> np.ndarray:
         """Where the body puts the markers (..., L, 3), metres, for unknowns (..., P)."""
         pose, trans, _ = self.body.split(x)
-        y = self.shapes.evaluate(pose.reshape(-1, *pose.shape[-2:]), trans.reshape(-1, 3))
+        pose, trans = pose.reshape(-1, *pose.shape[-2:]), trans.reshape(-1, 3)
+        y = np.empty((len(pose), 3, self.count))
+        for start in range(0, len(pose), BATCH):
+            some = slice(start, start + BATCH)
+            y[some] = self.shapes.evaluate(pose[some], trans[some])
         return np.swapaxes(y, -1, -2).reshape(*x.shape[:-1], self.count, 3)
 
     def follow(self, x: np.ndarray) -> MovingPoints:
@@ -71,19 +76,9 @@ class MarkedBody:
         """
         pose, trans, _ = self.body.split(x)
         B, n = len(x), self.body.n_angles
+        energy, gradient, hessian = point_system(self.shapes, pose, trans, targets, weights)
         pose = twists(pose)
         local = rotations.inverse_right_jacobian(pose)                                           # dpose = local d
-        y, by_turn = self.shapes.columns(pose, trans, local)
-        missing = np.isnan(targets[..., 0])
-        root = np.sqrt(np.where(missing, 0.0, weights))[:, None]
-        off = np.where(missing[:, None], 0.0, y - np.swapaxes(targets, -1, -2))
-        residual = (root * off).reshape(B, -1)
-        columns = np.empty((B, self.n_unknowns, 3, self.count))
-        np.multiply(by_turn, root[:, None], out=columns[:, :n])
-        columns[:, n:] = np.eye(3)[:, :, None] * root[:, None]
-        A = columns.reshape(B, self.n_unknowns, -1)
-        energy, gradient = (residual**2).sum(axis=1), (A @ residual[..., None])[..., 0]
-        hessian = A @ np.swapaxes(A, -1, -2)
         off = pose.reshape(B, n) - self.prior.mean
         pull = off @ self._precision
         gradient[:, :n] += (pull.reshape(B, -1, 1, 3) @ local).reshape(B, n)
@@ -105,6 +100,30 @@ class MarkedBody:
         out = goal - x
         out[..., :n] = turns.compose(*(a[..., :n].reshape(-1, 3) for a in (-x, goal))).reshape(*x.shape[:-1], n)
         return out
+
+
+def point_system(shapes: PartShapes, pose: np.ndarray, trans: np.ndarray, targets: np.ndarray, weights: np.ndarray
+                 ) -> System:
+    """Points that are to be at their targets (B, L, 3): energy (B,), half its gradient, Gauss-Newton matrix.
+
+    Parameters
+    ----------
+    pose, trans : (B, J, 3), (B, 3) float
+    targets : (B, L, 3) float, metres
+        NaN where there is none.
+    weights : (B, L) float
+        Factor on the squared distance.
+    """
+    y, by_turn = shapes.columns(pose, trans)
+    (B, n), L = by_turn.shape[:2], shapes.count
+    missing = np.isnan(targets[..., 0])
+    root = np.sqrt(np.where(missing, 0.0, weights))[:, None]
+    residual = (root * np.where(missing[:, None], 0.0, y - np.swapaxes(targets, -1, -2))).reshape(B, -1)
+    columns = np.empty((B, n + 3, 3, L))
+    np.multiply(by_turn, root[:, None], out=columns[:, :n])
+    columns[:, n:] = np.eye(3)[:, :, None] * root[:, None]
+    A = columns.reshape(B, n + 3, -1)
+    return (residual**2).sum(axis=1), (A @ residual[..., None])[..., 0], A @ np.swapaxes(A, -1, -2)
 
 
 def supports(template: Mesh, layout: MarkerLayout) -> tuple[np.ndarray, np.ndarray]:

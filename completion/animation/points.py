@@ -79,20 +79,17 @@ class PartShapes:
 
     def evaluate(self, pose: np.ndarray, trans: np.ndarray) -> np.ndarray:
         """Places (B, 3, L), metres, at poses (B, J, 3) and trans (B, 3)."""
-        pose = pose.swapaxes(0, 1)
-        carried = self.rotations(pose) @ self.shapes(twists(pose))
+        t = twists(pose).swapaxes(0, 1)
+        carried = self.rotations(t) @ self.shapes(t)
         return carried.sum(axis=0) + (self.origin + trans)[:, :, None]
 
-    def columns(self, pose: np.ndarray, trans: np.ndarray, local: np.ndarray | None = None
-                ) -> tuple[np.ndarray, np.ndarray]:
+    def columns(self, pose: np.ndarray, trans: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Places and their derivatives.
 
         Parameters
         ----------
         pose : (B, J, 3) float, radians
         trans : (B, 3) float, metres
-        local : (B, J, 3, 3) float, optional
-            The inverse right Jacobians of poses that are at most a half turn long, where they are known.
 
         Returns
         -------
@@ -100,14 +97,13 @@ class PartShapes:
         (B, 3J, 3, L) float
             By small turns of the joints from the right; by trans it is the identity.
         """
-        t = (pose if local is not None else twists(pose)).swapaxes(0, 1)
+        t = twists(pose).swapaxes(0, 1)
         (J, B), L = t.shape[:2], self.count
-        local = rotations.inverse_right_jacobian(t) if local is None else local.swapaxes(0, 1)
         R = self.rotations(t)
         below = (self._below @ (R @ self.shapes(t)).reshape(J, -1)).reshape(J, B, 3, L)
         # a turn about the column ω of R moves x by ω × x = hat(ω) @ x
         columns = rotations.hat(np.swapaxes(R, -1, -2)).reshape(J, B, 9, 3) @ below
-        slope = self.lift.derivative(t.swapaxes(0, 1)).swapaxes(0, 1) @ local
+        slope = self.lift.derivative(t.swapaxes(0, 1)).swapaxes(0, 1) @ rotations.inverse_right_jacobian(t)
         turned = R[self._part_of].swapaxes(1, 2)                                                 # (J, B, n, 3, 3)
         sway = slope.swapaxes(-1, -2)[:, :, :, None, None, :, None] * turned[:, :, None].swapaxes(-2, -3)[..., None, :]
         columns += (sway.reshape(J, 9 * B, -1) @ self._by_joint.reshape(J, -1, L)).reshape(J, B, 9, L)
@@ -163,7 +159,7 @@ def marker_shapes(subject: Subject, vertex_ids: np.ndarray, weights: np.ndarray,
         A = known - middle
         slope = np.linalg.solve(A.T @ A + RIDGE * len(poses) * np.eye(A.shape[1]), A.T @ (wanted - wanted.mean(axis=0)))
         offsets[i] = distances[i] * (wanted.mean(axis=0) - middle @ slope)
-        bends.append(dict(zip(joints, distances[i] * slope.reshape(len(joints), -1, 3), strict=True)))
+        bends.append(dict(zip(joints, distances[i] * slope.reshape(len(joints), shapes.lift.width, 3), strict=True)))
     shapes.lift_off(part, offsets, bends)
     return shapes
 

@@ -6,12 +6,13 @@ from typing import TYPE_CHECKING
 import numpy as np
 from scipy.linalg import solveh_banded
 
+from .marked import BATCH
+
 if TYPE_CHECKING:
     from .follow import MarkerFollower
 
 
 WINDOW, OVERLAP = 1000, 60           # frames solved at once, and those that each side lends to its neighbour
-BATCH = 64                           # frames whose derivatives are held at once
 FURTHEST = 0.5                       # radians or metres that a step may go
 
 
@@ -50,6 +51,10 @@ def _measured(follower: MarkerFollower, x: np.ndarray, frames: np.ndarray) -> tu
     for start in range(0, T, BATCH):
         some = slice(start, start + BATCH)
         _, gradient[some], hessian[some] = follower.body.system(x[some], targets[some], weights[some])
+        if follower.standing:
+            _, pull, stiff = follower.standing.system(x[some], frames[some])
+            gradient[some] += pull
+            hessian[some] += stiff
     return gradient, hessian
 
 
