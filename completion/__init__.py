@@ -11,7 +11,9 @@ if TYPE_CHECKING:
     from .markers.files import MarkerSequence, read_markers, write_markers
     from .markers.layout import MarkerLayout
     from .motion import Motion
+    from .partial.colors import ColorConfig, carry_colors
     from .partial.completion import Completion, complete
+    from .partial.masks import read_mask
     from .partial.settings import CompletionConfig
     from .tracking.sequence import track
     from .tracking.settings import TrackConfig
@@ -22,15 +24,18 @@ _ROOMS = {
     "markers.files": ("MarkerSequence", "read_markers", "write_markers"),
     "markers.layout": ("MarkerLayout",),
     "motion": ("Motion",),
+    "partial.colors": ("ColorConfig", "carry_colors"),
     "partial.completion": ("Completion", "complete"),
+    "partial.masks": ("read_mask",),
     "partial.settings": ("CompletionConfig",),
     "tracking.sequence": ("track",),
     "tracking.settings": ("TrackConfig",),
 }
 _ROOM_OF = {name: room for room, names in _ROOMS.items() for name in names}
 
-__all__ = ["AnimateConfig", "Completion", "CompletionConfig", "Frame", "MarkerLayout", "MarkerSequence", "MarkerStream",
-           "Motion", "TrackConfig", "animate", "complete", "read_markers", "track", "write_markers"]
+__all__ = ["AnimateConfig", "ColorConfig", "Completion", "CompletionConfig", "Frame", "MarkerLayout", "MarkerSequence",
+           "MarkerStream", "Motion", "TrackConfig", "animate", "carry_colors", "complete", "read_markers", "read_mask",
+           "track", "write_markers"]
 
 
 def __getattr__(name: str) -> Any:
