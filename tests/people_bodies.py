@@ -1,0 +1,22 @@
+"""A small model of the embedded people, for the tests of markers: made once a process, in a few seconds."""
+from __future__ import annotations
+
+from functools import lru_cache
+
+import numpy as np
+
+from completion.embedded import EmbeddedRecipe, build_embedded
+from model.body import BodyModel
+from model.learning.scape import LearnConfig
+
+
+@lru_cache(maxsize=1)
+def small_people() -> BodyModel:
+    """16 parts, four betas, a thousand vertices."""
+    return build_embedded(EmbeddedRecipe(poses=12, people=8, faces=2000,
+                                         learn=LearnConfig(components=4, refinements=0)), None)
+
+
+def kept() -> np.ndarray:
+    """The vertices of `Person` that the model kept."""
+    return np.array(small_people().info["people_vertices"])

@@ -1,0 +1,128 @@
+"""`scape animate`: markers in, a folder with motions, tables and a page out."""
+import json
+
+import numpy as np
+import pytest
+from completion_bodies import MEAN, worm_with_prior
+from glb_reader import Glb
+
+from completion.__main__ import main
+from completion.animation import report
+from completion.markers.files import MarkerSequence, write_markers
+from completion.markers.layout import MarkerLayout
+from completion.motion import Motion
+
+FRAMES = 30
+BETAS = np.array([0.9, -0.6, 0.4])
+WRITTEN = {"motion.npz", "animation.glb", "motion.bvh", "joint_angles.csv", "joint_centres.csv", "residuals.csv",
+           "report.html"}
+QUICK = ("--start-axes", "1", "--keys", "6", "--shape.frames", "4", "--shape.start-axes", "1")
+
+
+@pytest.fixture(scope="module", autouse=True)
+def small_pictures():
+    """Nobody looks at them here."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(report, "render", lambda *_rest, **_named: np.full((30, 20, 3), 255, dtype=np.uint8))
+        yield
+
+
+@pytest.fixture(scope="module")
+def place(tmp_path_factory):
+    """A model, a layout, and markers on a body of unknown shape: one file, and a folder of two."""
+    place = tmp_path_factory.mktemp("animate")
+    model = worm_with_prior()
+    model.save(place / "model.npz")
+    vertices = np.random.default_rng(4).choice(396, 30, replace=False)
+    layout = MarkerLayout(tuple(f"M{i}" for i in range(30)), vertices, 0.012)
+    layout.save(place / "layout.json")
+    t = np.arange(FRAMES) / 60
+    poses = MEAN + np.sin(3 * t[:, None, None] + np.arange(4)[:, None]) * np.array([0.05, 0.3, 0.2])
+    trans = np.stack([t, 0 * t, 0 * t], axis=1)
+    meshes = model.subject(BETAS).vertices(poses, trans)
+    positions = np.stack([layout.place(model.template.with_vertices(v)) for v in meshes])
+    positions[5:9, 3] = np.nan
+    (place / "many").mkdir()
+    for name in ("walk.csv", "many/one.csv", "many/two.c3d"):
+        write_markers(place / name, MarkerSequence(positions, layout.labels, 60.0))
+    np.savez(place / "truth.npz", meshes=meshes)
+    return place
+
+
+def run(place, *words):
+    return main(["animate", *map(str, words), "-m", str(place / "model.npz"), "--layout", str(place / "layout.json"),
+                 *QUICK])
+
+
+def told(folder):
+    return {row["metric"]: row["value"] for row in json.loads((folder / "report.json").read_text())["metrics"]}
+
+
+def test_a_person_and_the_motion_from_markers(place, tmp_path):
+    (tmp_path / "to.json").write_text(json.dumps({"0": [0, 0, 0], "0.4": [2.0, 0, 0]}))
+    (tmp_path / "onto.json").write_text("[-1, 1, 0.5]")
+    out = tmp_path / "out"
+    assert run(place, place / "walk.csv", "-o", out, "--onto", tmp_path / "onto.json", "--betas-to",
+               tmp_path / "to.json") == 0
+    assert {p.name for p in out.iterdir()} >= WRITTEN | {"subject.json", "layout.json", "onto.npz", "onto.glb",
+                                                         "morph.glb", "report.json"}
+    motion = Motion.load(out / "motion.npz")
+    assert (len(motion.poses), motion.rate) == (FRAMES, 60)
+    np.testing.assert_allclose(json.loads((out / "subject.json").read_text())["betas"], motion.betas)
+    model = worm_with_prior()
+    off = np.linalg.norm(motion.vertices(model.subject(motion.betas)) - np.load(place / "truth.npz")["meshes"], axis=2)
+    assert off.mean() < 0.01
+    np.testing.assert_array_equal(Motion.load(out / "onto.npz").betas, [-1, 1, 0.5])
+    figures = told(out)
+    assert figures["markers used"] == "30 of 30" and figures["layout"].endswith("layout.json")
+    assert figures["distance of markers, mean"] < 5 and figures["markers missing"] == pytest.approx(100 * 4 / 900)
+    page = (out / "report.html").read_text()
+    assert "On another person" in page and "With a body that changes" in page and ">M29<" in page
+
+
+def test_the_glb_lasts_as_long_as_the_motion(place, tmp_path):
+    assert run(place, place / "walk.csv", "-o", tmp_path / "out", "--subject", "template") == 0
+    glb = Glb((tmp_path / "out" / "animation.glb").read_bytes())
+    times = glb.array(glb.json["animations"][0]["samplers"][0]["input"])[:, 0]
+    assert len(times) == 6 and times[0] == 0 and times[-1] == pytest.approx((FRAMES - 1) / 60, rel=1e-5)
+    assert Motion.load(tmp_path / "out" / "motion.npz").betas is None
+    assert not (tmp_path / "out" / "subject.json").exists()
+
+
+def test_a_known_subject_is_taken_as_it_is(place, tmp_path):
+    (tmp_path / "betas.json").write_text(json.dumps({"betas": BETAS.tolist()}))
+    assert run(place, place / "walk.csv", "-o", tmp_path / "out", "--subject", tmp_path / "betas.json") == 0
+    np.testing.assert_array_equal(Motion.load(tmp_path / "out" / "motion.npz").betas, BETAS)
+    assert told(tmp_path / "out")["distance of markers, mean"] < 3
+
+
+def test_a_folder_goes_on_where_it_was(place, tmp_path, capsys):
+    out = tmp_path / "out"
+    assert run(place, place / "many", "-o", out, "--subject", "template") == 0
+    assert WRITTEN <= {p.name for p in (out / "one").iterdir()} and WRITTEN <= {p.name for p in (out / "two").iterdir()}
+    assert told(out)["done before"] == 0
+    when = (out / "one" / "motion.npz").stat().st_mtime_ns
+    write_markers(place / "many" / "two.c3d", MarkerSequence(np.random.default_rng(0).random((5, 3, 3)),
+                                                             ("A", "B", "C"), 60.0))
+    assert run(place, place / "many", "-o", out, "--subject", "template") == 1
+    assert (out / "one" / "motion.npz").stat().st_mtime_ns == when
+    assert told(out) | {"done before": 1, "failed": 1, "files": 2} == told(out)
+    assert "two.c3d: labels: expected at least 3 markers of the layout, found 0" in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("words, message", [
+    (("--betas-to", "bad.json"), "expected betas at the end"),
+    (("--layout", "cmu40"), "--layout: expected a file or one of biomech57, cmu41"),
+    (("--layout", "cmu41"), "template: expected a body on which 'cmu41' is known"),
+])
+def test_wrong_words_are_one_line(place, tmp_path, capsys, words, message):
+    (tmp_path / "bad.json").write_text('{"0": "fat"}')
+    words = [str(tmp_path / w) if w.endswith(".json") else w for w in words]
+    code = main(["animate", str(place / "walk.csv"), "-o", str(tmp_path / "out"), "-m", str(place / "model.npz"),
+                 *(() if "--layout" in words else ("--layout", str(place / "layout.json"))), *words])
+    assert code == 1 and message in capsys.readouterr().err
+
+
+def test_an_empty_folder_is_refused(place, tmp_path, capsys):
+    assert run(place, tmp_path, "-o", tmp_path / "out") == 1
+    assert "expected files ending in .c3d, .trc, .csv, found none" in capsys.readouterr().err
