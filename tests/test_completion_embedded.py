@@ -1,0 +1,97 @@
+import numpy as np
+import pytest
+
+from completion import embedded
+from completion.cli import read_landmark_pairs, read_model
+from completion.embedded import EmbeddedRecipe, cache_folder, embedded_model, embedded_path
+from model import LearnConfig, fit_pose
+from scanprep.scanning.embedded import SUBJECT
+from scanprep.scanning.people import Person, random_pose
+from scanprep.scanning.people_marks import landmarks, markers
+
+SMALL = EmbeddedRecipe(poses=6, people=3, faces=2400, learn=LearnConfig(components=2, refinements=0, steps=0))
+
+
+@pytest.fixture(scope="module")
+def built(tmp_path_factory):
+    folder, ticks = tmp_path_factory.mktemp("cache"), []
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setenv("SCAPEKIT_CACHE", str(folder))
+        model = embedded_model(lambda done, total: ticks.append((done, total)), SMALL)
+    return folder, model, ticks
+
+
+@pytest.fixture
+def cache(built, monkeypatch):
+    monkeypatch.setenv("SCAPEKIT_CACHE", str(built[0]))
+    return built[0]
+
+
+def test_the_model_is_that_of_the_embedded_people(built):
+    _, model, ticks = built
+    person, rng = Person(SUBJECT), np.random.default_rng(3)
+    kept = np.array(model.info["people_vertices"])
+    np.testing.assert_allclose(model.template.vertices, person.mesh.vertices[kept], atol=1e-9)
+    assert model.template.is_closed and len(model.template.faces) <= SMALL.faces
+    assert model.n_betas == 2 and model.skeleton.names == person.names
+    for named, mine in ((landmarks(), model.info["landmarks"]), (markers(), model.info["markers"])):
+        assert {name: kept[v] for name, v in mine.items()} == named
+    truth = person.posed(0.5 * random_pose(rng))[kept]
+    assert np.linalg.norm(fit_pose(model.subject(None), truth).vertices - truth, axis=1).mean() < 0.012
+    done, total = zip(*ticks, strict=True)
+    assert list(done) == sorted(done) and done[-1] == total[-1] and len(set(total)) == 1
+
+
+def test_it_is_built_once(cache, built, monkeypatch):
+    monkeypatch.setattr(embedded, "build_embedded", lambda *_: pytest.fail("built again"))
+    again = embedded_model(recipe=SMALL)
+    np.testing.assert_array_equal(again.template.vertices, built[1].template.vertices)
+    assert again.info["built"] == built[1].info["built"]
+    assert [p.name for p in cache.iterdir()] == [embedded_path(SMALL).name]
+
+
+def test_another_recipe_or_a_damaged_file_is_built_anew(cache, built, monkeypatch):
+    calls = []
+    monkeypatch.setattr(embedded, "build_embedded", lambda recipe, progress: calls.append(recipe) or built[1])
+    other = EmbeddedRecipe(seed=6)
+    assert embedded_path(other) != embedded_path(SMALL)
+    embedded_model(recipe=other)
+    embedded_path(other).write_bytes(b"half a file")
+    embedded_model(recipe=other)
+    embedded_model(recipe=other)
+    assert calls == [other, other]
+    embedded_path(other).unlink()
+
+
+def test_a_cache_that_cannot_be_written_is_named(tmp_path, built, monkeypatch):
+    (tmp_path / "file").write_text("")
+    monkeypatch.setenv("SCAPEKIT_CACHE", str(tmp_path / "file" / "inner"))
+    monkeypatch.setattr(embedded, "build_embedded", lambda *_: built[1])
+    with pytest.raises(ValueError, match=r"inner.*SCAPEKIT_CACHE"):
+        embedded_model(recipe=SMALL)
+
+
+def test_without_the_variable_it_is_the_users_cache(monkeypatch):
+    pytest.importorskip("platformdirs")
+    monkeypatch.delenv("SCAPEKIT_CACHE", raising=False)
+    assert cache_folder().is_absolute() and "scapekit" in cache_folder().parts
+
+
+def test_commands_name_the_model(cache, built, tmp_path, monkeypatch):
+    monkeypatch.setattr(embedded, "EmbeddedRecipe", lambda: SMALL)
+    model, name = read_model(None)
+    assert name == f"embedded people, built {built[1].info['built']}, cached at {embedded_path(SMALL)}"
+    model.save(tmp_path / "own.npz")
+    assert read_model(tmp_path / "own.npz")[1] == str(tmp_path / "own.npz")
+
+
+def test_landmarks_of_a_scan_are_matched_by_name(built, tmp_path):
+    model, marks = built[1], tmp_path / "marks.json"
+    marks.write_text('{"navel": [0, 1, 2], "left heel": [3, 4, 5], "right heel": [6, 7, 8], "other": [0, 0, 0]}')
+    vertices, points = read_landmark_pairs(model, "m", marks, None, "m")
+    found = dict(zip(vertices.tolist(), points.tolist(), strict=True))
+    assert found == {model.info["landmarks"][n]: p for n, p in
+                     (("navel", [0, 1, 2]), ("left heel", [3, 4, 5]), ("right heel", [6, 7, 8]))}
+    marks.write_text('{"navel": [0, 1, 2]}')
+    with pytest.raises(ValueError, match=r"marks\.json"):
+        read_landmark_pairs(model, "m", marks, None, "m")
