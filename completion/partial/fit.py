@@ -21,6 +21,7 @@ from .sight import find_sights
 Denial = tuple[np.ndarray, np.ndarray, np.ndarray]
 
 TERMS = ("landmarks", "pose_prior", "joint_limits", "shape_prior", "scan_planes", "scan_points", "trespass")
+LIKELY = 0.04                        # metres: matches closer than this are mostly right
 SETTLED = 5e-4                       # metres, root mean square over the vertices from round to round
 
 
@@ -137,6 +138,7 @@ class ScanFit:
         count, end = len(self.vertices), len(self.vertices) + len(ids)
         landmark_weights = np.full(count, config.landmark_sd**-2)
         prior, limit = self.habit.near(body.split(x)[0]), config.prior_weight * config.joint_limits
+        stiff = max(1.0, reach / LIKELY)             # far matches are often wrong, and shape gives way before pose does
 
         def energies(at: np.ndarray) -> list[energy.Residual]:
             points = follow(at)
@@ -144,7 +146,7 @@ class ScanFit:
             return [energy.point_to_point(marked, self.points, landmark_weights),
                     energy.pose_prior(at, prior, config.prior_weight),
                     energy.joint_limits(at, self.limits, limit),
-                    energy.shape_prior(at, body.n_angles + 3),
+                    energy.shape_prior(at, body.n_angles + 3, stiff),
                     energy.point_to_plane(free, target, normal, weights),
                     energy.point_to_point(free, target, 0.1 * weights),
                     energy.point_to_plane(denied, out_target, out_normal, out_weights)]
@@ -170,7 +172,12 @@ class ScanFit:
         distance = np.concatenate([there.distances[a], back.distances[b]])
         share = np.concatenate([np.full(a.sum(), 1 / len(scan.points)), np.full(b.sum(), 0.5 / len(mine))])
         weights = config.evidence / config.scan_sd**2 * share * energy.geman_mcclure(distance, max(reach / 2, 0.015))
-        return ids, target, normal, weights
+        if self.cover is None:
+            return ids, target, normal, weights
+        under, over, away = self.cover.below(mesh.vertices[mine], mesh.vertex_normals[mine])
+        loose = np.full(under.sum(), config.evidence / config.cover_sd**2 / len(mine))
+        return (np.concatenate([ids, mine[under]]), np.concatenate([target, over[under]]),
+                np.concatenate([normal, away[under]]), np.concatenate([weights, loose]))
 
     def trespasses(self, mesh: Mesh) -> tuple[np.ndarray, ...]:
         """Vertices that are where nothing can be, points and normals of the planes they should reach, weights.

@@ -52,14 +52,23 @@ class Cover:
         (n, 3) float, metres
             A point of that plane.
         """
-        found = self._near.match(places, normals, REACH, 0.3)
-        normal = self.scan.normals[found.index]
-        off = places - self.scan.points[found.index]
-        out = np.einsum("nd,nd->n", off, normal)
-        beside = np.sqrt(np.maximum((off**2).sum(axis=1) - out**2, 0))
-        over = found.valid & (beside < 2 * self.scan.spacing + 0.3 * np.abs(out))
+        over, out, near = self._over(places, normals)
         depth = np.where(over, np.maximum(out - self.tolerance, 0), 0.0)
+        normal = self.scan.normals[near]
         return depth, normal, places - depth[:, None] * normal
+
+    def below(self, places: np.ndarray, normals: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Which vertices (n,) are under it, and the point (n, 3) and normal (n, 3) of what lies over each."""
+        over, out, near = self._over(places, normals)
+        return over & (out < 0), self.scan.points[near], self.scan.normals[near]
+
+    def _over(self, places: np.ndarray, normals: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Whether something lies over a vertex or under it, how far the vertex is outside, and which point it is."""
+        found = self._near.match(places, normals, REACH, 0.3)
+        off = places - self.scan.points[found.index]
+        out = np.einsum("nd,nd->n", off, self.scan.normals[found.index])
+        beside = np.sqrt(np.maximum((off**2).sum(axis=1) - out**2, 0))
+        return found.valid & (beside < 2 * self.scan.spacing + 0.3 * np.abs(out)), out, found.index
 
 
 def part_vertices(template: Mesh, skeleton: Skeleton, names: Sequence[str]) -> np.ndarray:

@@ -36,6 +36,8 @@ class CompletionConfig:
         Joints that turn further than in the training poses are held back.
     start_axes : int
         Directions of the training poses along which the search starts.
+    correspondences : bool
+        Landmarks are multiplied first, by correlated correspondence.
     candidates : int
         Starts that are carried on from the landmarks to the scan.
     reach : float, metres
@@ -67,6 +69,8 @@ class CompletionConfig:
         Where the scan was seen from; found by itself when not given.
     cover_weight : float
         The same for a vertex that sticks out of clothing or hair, of which `complete` is told.
+    cover_sd : float, metres
+        How far clothing and hair usually stand off the skin.
     ignored_parts : names of parts
         Parts of the body that the scan says nothing about, though it may show something there.
     method : {"joint", "alternation"}
@@ -90,6 +94,7 @@ class CompletionConfig:
     pose_prior: PosePrior = "gaussian"
     joint_limits: bool = False
     start_axes: int = 4
+    correspondences: bool = False
     candidates: int = 3
     reach: float = 0.2
     final_reach: float = 0.03
@@ -106,6 +111,7 @@ class CompletionConfig:
     contact_weight: float = 0.5
     viewpoint: tuple[float, float, float] | tuple[tuple[float, float, float], ...] | None = None
     cover_weight: float = 1.0
+    cover_sd: float = 0.06
     ignored_parts: tuple[str, ...] = ()
     method: Method = "joint"
     twist_damping: float = 0.1

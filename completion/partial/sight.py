@@ -99,7 +99,7 @@ def find_sights(cloud: ScanPoints) -> Sight | Sights | None:
     """
     seen = cloud.everything
     views = [seen.some(seen.view == number) for number in range(cloud.views)]
-    given: Sequence[np.ndarray | None] = [None] * len(views) if cloud.viewpoints is None else list(cloud.viewpoints)
+    given: Sequence[np.ndarray | None] = len(views) * (None,) if cloud.viewpoints is None else list(cloud.viewpoints)
     found = [find_sight(view, place) for view, place in zip(views, given, strict=True) if len(view.points)]
     cameras = tuple(sight for sight in found if sight is not None)
     return None if not cameras else cameras[0] if len(cameras) == 1 else Sights(cameras)
