@@ -7,9 +7,13 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
     from .animation.follow import AnimateConfig, animate
+    from .animation.outputs import joint_angles, joint_centres
+    from .animation.retarget import morphed_vertices, retarget
+    from .animation.shape import MarkerShapeConfig, MarkerSubject, subject_from_markers
     from .animation.stream import Frame, MarkerStream
     from .markers.files import MarkerSequence, read_markers, write_markers
     from .markers.layout import MarkerLayout
+    from .markers.named import layout_names
     from .motion import Motion
     from .partial.colors import ColorConfig, carry_colors
     from .partial.completion import Completion, complete
@@ -20,9 +24,13 @@ if TYPE_CHECKING:
 
 _ROOMS = {
     "animation.follow": ("AnimateConfig", "animate"),
+    "animation.outputs": ("joint_angles", "joint_centres"),
+    "animation.retarget": ("morphed_vertices", "retarget"),
+    "animation.shape": ("MarkerShapeConfig", "MarkerSubject", "subject_from_markers"),
     "animation.stream": ("Frame", "MarkerStream"),
     "markers.files": ("MarkerSequence", "read_markers", "write_markers"),
     "markers.layout": ("MarkerLayout",),
+    "markers.named": ("layout_names",),
     "motion": ("Motion",),
     "partial.colors": ("ColorConfig", "carry_colors"),
     "partial.completion": ("Completion", "complete"),
@@ -34,8 +42,9 @@ _ROOMS = {
 _ROOM_OF = {name: room for room, names in _ROOMS.items() for name in names}
 
 __all__ = ["AnimateConfig", "ColorConfig", "Completion", "CompletionConfig", "Frame", "MarkerLayout", "MarkerSequence",
-           "MarkerStream", "Motion", "TrackConfig", "animate", "carry_colors", "complete", "read_markers", "read_mask",
-           "track", "write_markers"]
+           "MarkerShapeConfig", "MarkerStream", "MarkerSubject", "Motion", "TrackConfig", "animate", "carry_colors",
+           "complete", "joint_angles", "joint_centres", "layout_names", "morphed_vertices", "read_markers",
+           "read_mask", "retarget", "subject_from_markers", "track", "write_markers"]
 
 
 def __getattr__(name: str) -> Any:
