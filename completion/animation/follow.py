@@ -86,7 +86,8 @@ class MarkerFollower:
     def __init__(self, subject: Subject, markers: MarkerSequence, layout: MarkerLayout, config: AnimateConfig
                  ) -> None:
         labels = layout.matched(markers.labels)
-        self.config, self.rate, self.standing = config, markers.rate, None
+        self.config, self.rate = config, markers.rate
+        self.standing: Standing | None = None
         self.rows = np.array([markers.labels.index(label) for label in labels])
         self.targets = markers.positions[:, self.rows]
         self.order = np.tile(np.arange(len(labels)), (len(self.targets), 1))

@@ -34,7 +34,7 @@ class AnimateConfig:
     iterations : int
         Most steps for a frame.
     lost : float, metres
-        Median residual of a frame above which it is searched anew.
+        Median residual of a frame above which it is searched anew, as one is that a fifth of its markers belie.
     key_interval : float, seconds
         Between the frames of a whole sequence that are solved one after the other; the others begin between them.
     smoothing : int
@@ -52,10 +52,10 @@ class AnimateConfig:
     prior_weight: float = 0.3
     prior_shrinkage: float = 0.3
     start_axes: int = 6
-    prediction: Literal["velocity", "kalman"] = "velocity"
+    prediction: Literal["velocity", "kalman"] = "kalman"
     angle_acceleration: float = 60.0
     place_acceleration: float = 15.0
-    momentum: float = 0.9
+    momentum: float = 0.95
     iterations: int = 3
     lost: float = 0.08
     key_interval: float = 0.1

@@ -19,7 +19,8 @@ from .trust import LabelWatch, distances_apart, marker_weights
 
 STARTS = 2                           # of a search that are followed to their end
 ENOUGH = 0.5                         # share of the markers that a search wants
-PATIENCE = 0.25                      # seconds between two searches
+BELIED = 0.2                         # share of the markers seen that are outliers on a body gone astray
+PATIENCE = 0.25                      # seconds from a search that found nothing to the next; then twice as many
 SETTLED = MinimiseConfig(iterations=30)
 
 
@@ -116,7 +117,7 @@ class Tracker:
         self.body, self.config, self.rate = body, config, rate
         self.watch = LabelWatch(body.count, config.outlier)
         self.prediction = make_prediction(body, config, rate)
-        self.wait, self.started = 0, False
+        self.wait, self.patience, self.started = 0, PATIENCE * rate, False
         self.places = np.full((body.count, 3), np.nan)                  # of the markers on the body of the last frame
 
     def begin(self, x: np.ndarray) -> None:
@@ -141,17 +142,22 @@ class Tracker:
         targets = targets[self.watch.update(self.places, targets)]
         end = self.solve(targets, expected, information)
         self.places = self.body.positions(end.x[0])
-        miss = _miss(self.places, targets)
-        if miss > self.config.lost and not self.wait and there >= max(3, ENOUGH * self.body.count):
-            self.wait = round(PATIENCE * self.rate)
+        if not self.wait and there >= max(3, ENOUGH * self.body.count) and self._astray(targets):
             found = self.search(targets)
             places = self.body.positions(found)
-            if _miss(places, targets) < 0.7 * miss:
+            if _misfit(places, targets, self.config.outlier) < 0.7 * _misfit(self.places, targets, self.config.outlier):
                 self.begin(found)
-                self.places = places
+                self.places, self.patience = places, PATIENCE * self.rate
                 return found, True
+            self.wait, self.patience = round(self.patience), 2 * self.patience
         self.prediction.update(end.x[0], end.hessian[0] - information)
         return end.x[0], bool(end.converged[0])
+
+    def _astray(self, targets: np.ndarray) -> bool:
+        """The body has lost its markers (L, 3), or many of them."""
+        apart = np.linalg.norm(self.places - targets, axis=1)
+        apart = apart[~np.isnan(apart)]
+        return bool(np.median(apart) > self.config.lost or (apart > self.config.outlier).mean() > BELIED)
 
     def solve(self, targets: np.ndarray, expected: np.ndarray, information: np.ndarray) -> Minimum:
         """The best unknowns of a frame near the expected ones, which put the markers where `places` says."""
@@ -196,9 +202,9 @@ def judge(positions: np.ndarray, targets: np.ndarray, order: np.ndarray, config:
     return residuals, (squared < scale**2) & (order == np.arange(order.shape[-1]))
 
 
-def _miss(places: np.ndarray, targets: np.ndarray) -> float:
-    """Median distance of the markers (L, 3) that were seen, metres."""
-    apart = np.linalg.norm(places - targets, axis=1)
-    return float(np.median(apart[~np.isnan(apart)]))
+def _misfit(places: np.ndarray, targets: np.ndarray, outlier: float) -> float:
+    """How badly markers (L, 3) fit, of 0 to 1; each outlier counts the same."""
+    squared = ((places - targets)**2).sum(axis=1)
+    return float(np.nanmean(squared / (outlier**2 + squared)))
 
 
