@@ -108,7 +108,7 @@ class PointOperator:
             return y, np.moveaxis(columns, 0, -1)
         B, J, L = len(pose), len(self.terms.skeleton.parents), self.count
         y, d_pose = np.empty((B, L, 3)), np.empty((B, L, 3, 3 * J))
-        step = max(1, AT_ONCE // (3 * L * (self.terms.count + 4 * J)))
+        step = max(1, AT_ONCE // max(1, 3 * L * (self.terms.count + 4 * J)))
         for start in range(0, B, step):
             mine = slice(start, start + step)
             y[mine], columns = self.columns(pose[mine], trans[mine])

@@ -111,7 +111,7 @@ class Tracker:
 
     def finish(self) -> list[TrackedFrame]:
         """The frames that were still kept."""
-        if self.body is None:
+        if not self._past:
             raise ValueError("frames: expected at least one that shows something")
         return self._done(last=True)
 
