@@ -3,12 +3,15 @@ from __future__ import annotations
 
 import numpy as np
 
+from scanprep import find_correspondences
+
 from ..starts import distinct, search
 from .draws import around, examples_of, limbs, near_points, quick_misfits, redrawn
 from .fit import ScanFit
 from .search import from_nothing
 
 COARSE = (0.25, 0.2, 0.15, 0.12, 0.1)    # metres: reaches of the first rounds, on few points
+PAIRS_SD = 0.05                      # metres: correspondences are that far off, and not independently of each other
 FINALISTS = 4                        # starts that are carried through all these rounds
 SETTLE = (0.2, 0.15, 0.1)            # metres: reaches of the rounds after a limb was moved
 DOUBT = 0.012                        # share of scan or body that may be in the wrong place for no reason
@@ -19,18 +22,25 @@ BETTER = 5.0                         # by how much the misfit must fall for a li
 
 def first_starts(fit: ScanFit) -> np.ndarray:
     """Bodies (n, P) to start from: those that meet the landmarks, or, without any, typical poses on the scan."""
-    return from_landmarks(fit) if len(fit.vertices) else from_nothing(fit)
+    if not len(fit.vertices):
+        return from_nothing(fit)
+    marked = from_landmarks(fit, fit.vertices, fit.points, fit.config.landmark_sd)
+    if not fit.config.correspondences:
+        return marked
+    pairs = find_correspondences(fit.body.template, fit.cloud.points, (fit.vertices, fit.points))
+    more = from_landmarks(fit, pairs.template_vertices, pairs.scan_points, PAIRS_SD)
+    return np.concatenate([more, marked])
 
 
-def from_landmarks(fit: ScanFit) -> np.ndarray:
-    """The likeliest bodies (n, P) that meet the landmarks, distinct and best first."""
+def from_landmarks(fit: ScanFit, vertices: np.ndarray, points: np.ndarray, sd: float) -> np.ndarray:
+    """The likeliest bodies (n, P) that meet landmarks (L,), (L, 3) to within sd metres, distinct and best first."""
     body, config = fit.body, fit.config
-    follow = body.follow(fit.vertices, np.zeros(body.n_angles + 3 + body.n_betas))
-    x, _ = search(body, follow, fit.points, config.landmark_sd, fit.prior, config.start_axes)
+    follow = body.follow(vertices, np.zeros(body.n_angles + 3 + body.n_betas))
+    x, _ = search(body, follow, points, sd, fit.prior, config.start_axes)
     places = body.subject.points(fit.spread).evaluate(*body.split(x)[:2])
     x = x[distinct(places, config.candidates)]
-    drawn = np.concatenate([x, *(around(body, follow, start, fit.points, config.landmark_sd, fit.prior,
-                                        config.draws, fit.rng) for start in x)])
+    drawn = np.concatenate([x, *(around(body, follow, start, points, sd, fit.prior, config.draws, fit.rng)
+                                for start in x)])
     drawn = drawn[np.argsort(quick_misfits(fit, drawn))]
     places = body.subject.points(fit.spread).evaluate(*body.split(drawn)[:2])
     return drawn[distinct(places, config.candidates)]
