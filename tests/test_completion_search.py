@@ -18,6 +18,7 @@ from scanprep.geometry.surface import Surface
 NOTHING = (np.zeros(0, dtype=np.int64), np.zeros((0, 3)))
 POSE = np.array([[0.3, -0.5, 2.8], [0.2, 0.5, -0.4], [-0.1, -0.6, 0.3], [0.3, 0.1, 0.5]])
 TRANS = np.array([0.4, -0.3, 1.1])
+MARKS = np.array([6, 75, 130, 200, 255, 330, 396])
 QUICK = CompletionConfig(draws=12, rounds=6, scan_points=800, model_points=300, start_axes=2)
 
 
@@ -101,3 +102,14 @@ def test_limbs_are_drawn_from_the_training_poses(model):
     wanted = model.pose_examples[np.arange(40) % 20, 2:].reshape(40, -1)
     assert 0.05 < (drawn[:, 6:12] - wanted).std() < 0.15
     assert len(examples_of(FixedBody(worm_with_prior().subject(None)), x, 2, 40, np.random.default_rng(0))) == 0
+
+
+@pytest.mark.parametrize("change", [
+    {"correspondences": True}, {"pose_prior": "mixture", "joint_limits": True}, {"pose_prior": "nearest"},
+], ids=["correspondences", "mixture", "nearest"])
+def test_whatever_is_chosen_completes_half_a_worm(model, scene, change):
+    body, points = scene
+    landmarks = MARKS, body.vertices[MARKS]
+    result = complete(model.subject(None), points, landmarks, replace(QUICK, candidates=2, **change))
+    assert np.linalg.norm(result.completed.vertices - body.vertices, axis=1).mean() < 0.008
+    assert result.energies["joint_limits"] < 1
