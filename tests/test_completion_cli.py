@@ -9,8 +9,9 @@ import pytest
 from completion_bodies import half_view, worm_with_prior
 
 from completion.__main__ import main
-from completion.partial import report
+from completion.partial import report, textures
 from completion.partial.results import load_completion
+from completion.partial.textures import read_texture
 from completion.partial.views import read_view
 from scanprep.geometry.files import PointCloud, read_mesh, write_mesh, write_points
 from scanprep.geometry.landmarks import write_landmarks
@@ -28,6 +29,7 @@ def small_pictures():
     """Nobody looks at them here."""
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(report, "HEIGHT", 60)
+        patch.setattr(textures, "SIZE", 256)
         yield
 
 
@@ -97,6 +99,35 @@ def test_the_unit_of_the_scan_may_be_unknown(place, tmp_path, capsys):
     assert told(tmp_path / "out")[0]["unit of the scan"] == pytest.approx(0.0254, rel=0.05)
     assert "looks like unit" not in capsys.readouterr().err
     assert load_completion(tmp_path / "out").scale == pytest.approx(0.0254, rel=0.05)
+
+
+def test_a_textured_scan_gives_a_textured_body(place, tmp_path):
+    pytest.importorskip("xatlas")
+    from PIL import Image
+
+    view = read_mesh(place / "one.ply")
+    low, extent = view.vertices.min(axis=0), np.ptp(view.vertices, axis=0)
+    uv = ((view.vertices - low) / extent)[:, [0, 2]]
+    ramp = np.broadcast_to((np.arange(256) / 255)[::-1, None], (256, 256))        # grows with v, from the bottom row
+    Image.fromarray((255 * np.stack([ramp, 0 * ramp, 1 - ramp], axis=-1)).astype(np.uint8)).save(tmp_path / "a.png")
+    (tmp_path / "a.mtl").write_text("newmtl skin\nKd 1 1 1\nmap_Kd a.png\n")
+    lines = [f"v {x} {y} {z}" for x, y, z in view.vertices] + [f"vt {u} {v}" for u, v in uv]
+    faces = [f"f {a}/{a} {b}/{b} {c}/{c}" for a, b, c in view.faces + 1]
+    (tmp_path / "one.obj").write_text("\n".join(["mtllib a.mtl", *lines, "usemtl skin", *faces]) + "\n")
+    shutil.copy(place / "one.landmarks.json", tmp_path)
+    assert run(tmp_path / "one.obj", "-m", place / "model.npz", "--subject", "template", "-o", tmp_path / "out",
+               *QUICK) == 0
+    done = load_completion(tmp_path / "out")
+    wanted = np.clip((done.completed.vertices[:, 2] - low[2]) / extent[2], 0, 1)
+    colored = done.seen & (np.abs(done.completed.colors - 0.6) > 0.02).any(axis=1)
+    off = np.abs(done.completed.colors[:, 0] - wanted)[colored]
+    assert colored.sum() > 50 and np.quantile(off, 0.95) < 0.03
+    texture = read_texture(tmp_path / "out" / "completed.glb")
+    points, face, bary = texture.mesh.sample(3000, np.random.default_rng(0))
+    found = texture.sample(face, bary)
+    shown = np.abs(found[:, 1]) < 0.05                               # not the grey of what was not seen
+    height = np.clip((points[:, 2] - low[2]) / extent[2], 0, 1)
+    assert shown.mean() > 0.2 and np.quantile(np.abs(found[:, 0] - height)[shown], 0.95) < 0.04
 
 
 @pytest.fixture(scope="module")

@@ -15,7 +15,7 @@ from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.storage import writing
 from scanprep.geometry.surface import Rays, barycentric
 
-SIZE = 2048                          # pixels of a baked texture, each way
+SIZE = 1024                          # pixels of a baked texture, each way
 PADDING = 8                          # pixels that colours go on beyond the border of a chart
 
 # colours and weights of places with normals
@@ -105,7 +105,7 @@ def _picture(material: Any) -> np.ndarray | None:
     return np.asarray(image.convert("RGB"), dtype=np.float64) / 255
 
 
-def bake(body: Mesh, look: Look, unseen: np.ndarray, size: int = SIZE) -> Texture:
+def bake(body: Mesh, look: Look, unseen: np.ndarray, size: int | None = None) -> Texture:
     """A texture of a body: what `look` says of each of its pixels, elsewhere the colours of its vertices.
 
     Parameters
@@ -114,16 +114,15 @@ def bake(body: Mesh, look: Look, unseen: np.ndarray, size: int = SIZE) -> Textur
     look : (places (n, 3), normals (n, 3)) -> colours (n, 3), weights (n,)
     unseen : (N, 3) float in [0, 1]
         Colours where the weight is zero.
-    size : int, pixels
+    size : int, pixels, optional
     """
+    size = size or SIZE
     kept, faces, uv = unwrap(body)
     flat = Mesh(np.column_stack([uv, np.zeros(len(uv))]), faces)
     at = (np.arange(size) + 0.5) / size
     x, y = np.meshgrid(at, at[::-1])
     pixels = np.column_stack([x.ravel(), y.ravel(), np.ones(size**2)])
-    face, _ = Rays(flat).cast(pixels, np.array([0.0, 0.0, -1.0]))
-    turned = np.flatnonzero(face < 0)
-    face[turned] = Rays(flat).cast(pixels[turned] * (1, 1, -1), np.array([0.0, 0.0, 1.0]))[0]
+    face, _ = Rays(flat).cast(pixels, np.array([0.0, 0.0, -1.0]))    # from above, through charts of either side
     covered = np.flatnonzero(face >= 0)
     corners = kept[faces[face[covered]]]
     bary = barycentric(pixels[covered] * (1, 1, 0), flat.corners[face[covered]])
