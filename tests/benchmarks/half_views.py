@@ -47,7 +47,7 @@ def errors(body: Mesh, view: HalfView, result: Completion, part: np.ndarray) -> 
             "explained": result.explained,
             "landmark_rms_mm": 1e3 * result.landmark_rms, "rounds": result.iterations,
             "converged": result.converged}
-    return {name: round(float(value), 3) for name, value in out.items()}
+    return {name: round(float(value), 3) for name, value in out.items() if np.isfinite(value)}   # no landmarks, no rms
 
 
 def picture(body: Mesh, view: HalfView, result: Completion, path: Path) -> None:
