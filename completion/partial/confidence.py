@@ -10,9 +10,9 @@ from scanprep.geometry.mesh import Mesh
 from ..bodies import FixedBody
 
 # Chosen on completions of tuning bodies (poses of a known man, men of unknown shape), see `expected_error`.
-INFLATED = 1.0                       # real errors against those that the fit believes in, as it is not quite linear
-BEYOND = 0.008                       # metres: what the model cannot explain far from all data
-FADES = 0.05                         # metres along the surface within which data say what the model cannot
+INFLATED = 1.4                       # real errors against those that the fit believes in, as it is not quite linear
+BEYOND = 0.0075                      # metres: what the model cannot explain far from all data
+FADES = 0.014                        # metres along the surface within which data say what the model cannot
 NEAREST = 0.0005                     # metres: no scan is better
 
 

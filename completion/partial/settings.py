@@ -114,6 +114,6 @@ class CompletionConfig:
     cover_sd: float = 0.06
     ignored_parts: tuple[str, ...] = ()
     method: Method = "joint"
-    twist_damping: float = 0.1
+    twist_damping: float = 1.0
     tolerance: float = 0.01
     free_scale: bool = False

@@ -25,7 +25,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from protocols import HalfView, RealData, half_view, load_real, machine, spring_split, write_report
+from protocols import HalfView, half_view, load_real, machine, spring_split, write_report
 
 
 def men(count: int, inner: bool) -> tuple[np.ndarray, np.ndarray]:
@@ -47,29 +47,29 @@ def figures(body: Any, mesh: Any, view: HalfView) -> dict[str, float]:
             "closest_mm": 1e3 * Surface(mesh).closest(body.vertices[~view.seen]).distances.mean()}
 
 
-def nearest(data: RealData, train: np.ndarray, cloud: Any, landmarks: tuple[np.ndarray, np.ndarray]
-            ) -> tuple[np.ndarray, int]:
-    """The training body (N, 3) that comes nearest to the scan when it is moved rigidly, and which."""
-    from scanprep.geometry import rotations
-    from scanprep.geometry.surface import OrientedPoints
+def nearest(bodies: list[Any], cloud: Any, landmarks: tuple[np.ndarray, np.ndarray]) -> tuple[np.ndarray, int]:
+    """The body (N, 3) that comes nearest to the scan when it is moved rigidly, and its place in the list.
 
-    scan, best = cloud.thinned(1500), (np.inf, np.zeros(0), -1)
-    for i in train:
-        mesh = data.template.with_vertices(data.shapes[i])
-        R, t = rotations.procrustes(mesh.vertices[landmarks[0]], landmarks[1])
-        y = mesh.vertices @ R.T + t
-        normals = mesh.vertex_normals @ R.T
-        for _ in range(8):
-            found = OrientedPoints(y, normals).match(scan.points, scan.normals, 0.1, 0.6)
+    It is the scan that is moved onto each body (`OrientedPoints` of its vertices), and the body with the inverse.
+    """
+    from scanprep.geometry import rotations
+
+    scan, best = cloud.thinned(800), (np.inf, np.zeros(0), -1)
+    for i, body in enumerate(bodies):
+        R, t = rotations.procrustes(landmarks[1], body.points[landmarks[0]])
+        for _ in range(7):
+            y, n = scan.points @ R.T + t, scan.normals @ R.T
+            found = body.match(y, n, 0.1, 0.6)
             near = found.valid & (found.distances < np.quantile(found.distances[found.valid], 0.9))
-            at, to, n = y[found.index[near]], scan.points[near], scan.normals[near]
-            rows = np.hstack([np.cross(at, n), n])
-            step = np.linalg.lstsq(rows, np.einsum("nd,nd->n", n, to - at), rcond=None)[0]
+            at, to, up = y[near], body.points[found.index[near]], body.normals[found.index[near]]
+            rows = np.hstack([np.cross(at, up), up])
+            step = np.linalg.lstsq(rows, np.einsum("nd,nd->n", up, to - at), rcond=None)[0]
             turn = rotations.exp(step[:3])
-            y, normals = y @ turn.T + step[3:], normals @ turn.T
-        apart = np.minimum(OrientedPoints(y, normals).match(scan.points, scan.normals, 0.1, 0.6).distances, 0.1).mean()
+            R, t = turn @ R, turn @ t + step[3:]
+        found = body.match(scan.points @ R.T + t, scan.normals @ R.T, 0.1, 0.6)
+        apart = np.minimum(found.distances, 0.1).mean()
         if apart < best[0]:
-            best = (apart, y, int(i))
+            best = (apart, (body.points - t) @ R, i)
     return best[1], best[2]
 
 
@@ -129,10 +129,15 @@ def tried(args: argparse.Namespace) -> tuple[list[dict[str, Any]], dict[str, Any
     from completion.partial.settings import CompletionConfig
     from model.files import load_model
     from model.scape import ScapeModel
+    from scanprep.geometry.surface import OrientedPoints
 
     data, model, config = load_real(), load_model(args.model), CompletionConfig(**dict(args.set or []))
     assert isinstance(model, ScapeModel)
     train, bodies = men(len(data.shapes), args.inner)
+    others = []
+    if args.nearest:
+        meshes = [data.template.with_vertices(data.shapes[i]) for i in train]
+        others = [OrientedPoints(mesh.vertices, mesh.vertex_normals) for mesh in meshes]
     rows = []
     for k in args.only if args.only is not None else range(len(bodies)):
         body = data.template.with_vertices(data.shapes[bodies[k]])
@@ -146,10 +151,16 @@ def tried(args: argparse.Namespace) -> tuple[list[dict[str, Any]], dict[str, Any
         if args.nearest or args.points:
             cloud = prepare_scan(view.points)
         if args.nearest:
-            rigid, row["nearest"] = nearest(data, train, cloud, view.landmarks)
+            rigid, row["nearest"] = nearest(others, cloud, view.landmarks)
             found |= {"nearest_rigid": data.template.with_vertices(rigid), "nearest_posed": bent(model, rigid, view)}
         if args.points:
             keep_points(args.points / f"{k:02d}.npz", view, cloud, body)
+        apart = np.linalg.norm(result.completed.vertices - body.vertices, axis=1)[~view.seen]
+        assert result.expected_error is not None and result.confidence is not None
+        row |= {"expected_mm": 1e3 * np.sqrt((result.expected_error[~view.seen]**2).mean()),
+                "rms_mm": 1e3 * np.sqrt((apart**2).mean()),
+                "correlation": np.corrcoef(result.expected_error[~view.seen], apart)[0, 1],
+                "confidence": result.confidence[~view.seen].mean(), "within": (apart < config.tolerance).mean()}
         for name, mesh in found.items():
             row |= {f"{name}_{what}": value for what, value in figures(body, mesh, view).items()}
         if args.pictures:
