@@ -7,7 +7,9 @@ from pathlib import Path
 
 import pytest
 
+from completion import Motion
 from completion.__main__ import main
+from model import load_model
 from scanprep import write_mesh
 from scanprep.scanning.embedded import read_views
 
@@ -22,7 +24,7 @@ pytestmark = pytest.mark.timeout(1800)
 
 @pytest.fixture(scope="module")
 def place(demo_folder, tmp_path_factory):
-    """A folder with a user's files: five scans, a template, a half view, a recording."""
+    """A folder with a user's files: five scans, a template, a half view, a recording, frames of a walk."""
     folder = tmp_path_factory.mktemp("readme")
     shutil.copytree(demo_folder, folder / "scape_demo")
     demo = folder / "scape_demo"
@@ -45,6 +47,9 @@ def place(demo_folder, tmp_path_factory):
         write_mesh(folder / "views" / f"view{k}.ply", view.mesh)
         cameras[f"view{k}"] = view.camera.tolist()
     (folder / "views" / "cameras.json").write_text(json.dumps(cameras))
+    model, motion = load_model(demo / "model.npz"), Motion.load(demo / "animation" / "motion.npz")
+    for t, vertices in enumerate(motion.vertices(model.subject(None), slice(0, 8, 2))):
+        write_mesh(folder / "frames" / f"{t:04d}.ply", model.template.with_vertices(vertices))
     for part, names in (("poses", mine), ("people", others + mine[:1])):
         (folder / "registered" / part).mkdir(parents=True)
         for row in names:
@@ -61,6 +66,7 @@ def test_set_up_is_what_ci_does():
 def test_commands(place, monkeypatch):
     """In their order, as each uses what the one before it wrote; the template is not overwritten."""
     monkeypatch.chdir(place)
+    monkeypatch.setenv("SCAPEKIT_CACHE", str(place / "cache"))
     wanted = [line for line in COMMANDS if line not in SET_UP]
     assert len(wanted) >= 8
     for line in wanted:
@@ -69,6 +75,7 @@ def test_commands(place, monkeypatch):
         words = ["own.ply" if w == "template.ply" and "views" in words else w for w in words]
         assert main(words[1:]) == 0, line
     assert (place / "completed" / "report.html").exists() and (place / "walk" / "animation.glb").exists()
+    assert (place / "first_answer" / "completed.ply").exists() and (place / "tracked" / "motion.npz").exists()
 
 
 @pytest.mark.parametrize("code", [text for kind, text in BLOCKS if kind == "python"])
