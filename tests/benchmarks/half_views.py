@@ -59,8 +59,9 @@ def picture(body: Mesh, view: HalfView, result: Completion, path: Path) -> None:
 
     apart = np.linalg.norm(result.completed.vertices - body.vertices, axis=1)
     two = np.where(result.seen[:, None], [0.45, 0.6, 0.8], [0.9, 0.6, 0.35])
-    shapes: list[list[Solid | Dots]] = [[Solid(body), Dots(view.landmarks[1], (0.8, 0.1, 0.1), 0.015)], [Solid(result.completed, two)],
-              [Solid(result.completed, heat(apart, 0, 0.05))]]
+    marks = Dots(view.landmarks[1], (0.8, 0.1, 0.1), 0.015)
+    shapes: list[list[Solid | Dots]] = [[Solid(body), marks], [Solid(result.completed, two)],
+                                        [Solid(result.completed, heat(apart, 0, 0.05))]]
     away = view.camera - body.vertices.mean(axis=0)
     azimuth = np.degrees(np.arctan2(away[1], away[0]))
     images = [render(shape, Camera.around(body, azimuth + turn), width=300, height=400)
