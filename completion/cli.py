@@ -8,7 +8,7 @@ import numpy as np
 import tyro
 
 from model.body import BodyModel
-from scanprep.console import Metric, bar
+from scanprep.console import Metric, bar, say
 
 ModelFile = Annotated[Path, tyro.conf.arg(aliases=["-m"])]
 ModelOrNone = Annotated[Path | None, tyro.conf.arg(aliases=["-m"])]
@@ -26,6 +26,7 @@ def read_model(path: Path | None) -> tuple[BodyModel, str]:
 
     if path is not None:
         return load_model(path), str(path)
+    say("note: no model named; that of the embedded people, who are made and not measured, gives a first answer")
     with bar("building the embedded people") as progress:
         model = embedded_model(progress)
     return model, f"embedded people, built {model.info['built']}, cached at {embedded_path()}"

@@ -68,6 +68,12 @@ def embedded_model(progress: Progress | None = None, recipe: EmbeddedRecipe | No
         Called with (done, total) while the model is built.
     recipe : EmbeddedRecipe, optional
 
+    Notes
+    -----
+    Embedded people are made, not measured: the model gives a first answer, no more. Of a half view of one real man
+    (SPRING), the completed mesh lay 15 mm from the true surface on average and 27 mm where nothing had been seen; of
+    an embedded woman not among those it was learned from, 1 and 2 mm.
+
     Raises
     ------
     ValueError

@@ -146,6 +146,8 @@ def test_the_command_writes_all_it_promises(recording, output):
         assert np.linalg.norm(vertices - body.vertices, axis=1).mean() < 0.03
     assert (output / "animation.glb").read_bytes()[:4] == b"glTF"
     assert f"Frames: {FRAMES}" in (output / "motion.bvh").read_text()
+    for table in ("joint_angles", "joint_centres", "residuals"):
+        assert len((output / f"{table}.csv").read_text().splitlines()) == 1 + FRAMES
     page = (output / "report.html").read_text()
     assert "Lost frames: 5" in page and "image/gif" in page and page.count("<figure") == 3
     told = {m["metric"]: m["value"] for m in json.loads((output / "report.json").read_text())["metrics"]}

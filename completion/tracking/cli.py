@@ -39,7 +39,8 @@ def track_frames(frames: FramesArg, output: Output, model: ModelOrNone = None, r
     Args:
         frames: Folder of meshes or point clouds, one for each frame; or with one such folder for each camera, all
             cameras in one frame of reference.
-        output: Folder to write motion.npz, animation.glb, motion.bvh and report.html to.
+        output: Folder to write motion.npz, animation.glb, motion.bvh, joint_angles.csv, joint_centres.csv,
+            residuals.csv and report.html to.
         model: Model of `scape learn`; without it that of the embedded people, which is made on first use.
         rate: Frames per second.
         cameras: How files of several cameras in one folder are named, such as "cam{camera}_{frame}.ply".
@@ -120,23 +121,15 @@ def _figures(motion: Motion) -> list[Metric]:
 
 
 def _write(output: Path, motion: Motion, person: Subject, keys: int) -> None:
-    from dataclasses import replace
-
-    from model.export.bvh import write_bvh
-    from scanprep.pictures.animation import write_animated_glb
-    from scanprep.pictures.views import upright
+    from ..animation.outputs import write_joint_angles, write_joint_centres, write_motion_bvh, write_residuals
+    from ..animation.work import write_glb
 
     motion.save(output / "motion.npz")
-    chosen = np.unique(np.linspace(0, len(motion.poses) - 1, min(keys, len(motion.poses))).round().astype(int))
-    up = upright(person.template)[0]
-    write_animated_glb(output / "animation.glb", person.template.faces, motion.vertices(person, chosen),
-                       motion.rate * len(chosen) / len(motion.poses), up=up, keys=keys)
-    rest = person.vertices(np.zeros_like(motion.poses[0])).astype(float)
-    joints = person.skeleton.joint_regressor(person.template) @ rest
-    skeleton = replace(person.skeleton, joints=joints,
-                       names=tuple("_".join(name.split()) for name in person.skeleton.names))
-    write_bvh(output / "motion.bvh", skeleton, motion.poses, motion.trans, motion.rate, up=up,
-              body=person.template.with_vertices(rest))
+    write_glb(output / "animation.glb", motion, person, keys)
+    write_motion_bvh(output / "motion.bvh", motion, person)
+    write_joint_angles(output / "joint_angles.csv", motion, person.skeleton.names)
+    write_joint_centres(output / "joint_centres.csv", motion, person)
+    write_residuals(output / "residuals.csv", motion)
 
 
 def _page(output: Path, motion: Motion, person: Subject, frames: FrameFolder, name: str, metrics: list[Metric]
