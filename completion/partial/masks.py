@@ -18,7 +18,7 @@ from .scan import ScanPoints
 
 REACH = 0.10                         # metres that hair or a skirt may stand off the skin
 GREY = 0.1                           # least difference of two channels of a colour that marks
-NEAR = 0.001                         # metres from a point of a marked file to the point of the scan it means
+NEAR = 6e-4                          # of the scan's extent: from a point of a marked file to the point it means
 
 
 class Cover:
@@ -188,10 +188,11 @@ def _painted(path: Path, points: np.ndarray, unit: str | None) -> np.ndarray:
     if cloud.colors is None:
         raise ValueError(f"{path}: expected colours, those of clothing other than grey; found none")
     coloured = np.ptp(cloud.colors, axis=1) > GREY
-    if len(cloud.points) == len(points) and np.allclose(cloud.points, points, atol=NEAR):
+    limit = NEAR * float(np.ptp(points, axis=0).max())
+    if len(cloud.points) == len(points) and np.allclose(cloud.points, points, rtol=0, atol=limit):
         return coloured
     far, near = cKDTree(points).query(cloud.points[coloured])
-    off = np.flatnonzero(far > NEAR)
+    off = np.flatnonzero(far > limit)
     if len(off):
         which = np.flatnonzero(coloured)[off[0]]
         raise ValueError(f"{path}: point {which}: expected the points of the scan, this one is "

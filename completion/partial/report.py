@@ -129,7 +129,8 @@ def completion_page(scan: View | Sequence[View], completion: Completion, templat
     page.picture(side_by_side([render([Solid(plain, _two_colors(completion)), *marks], view, width, HEIGHT)
                                for view in cameras], SIDES))
     if body.colors is not None:
-        page.section("Colours", "Carried over from the scan where it was seen.")
+        page.section("Colours", "Carried over from the scan where it was seen; elsewhere grey, or spread smoothly when "
+                     "--fill-colors asks for it.")
         page.picture(side_by_side([render(Solid(body), view, width, HEIGHT) for view in cameras], SIDES))
     _distances(page, scan, completion, cameras, masked)
     _confidence(page, completion, cameras)

@@ -1,7 +1,6 @@
 """The scans named on the command line: meshes or clouds with all they have, normals, colours, textures."""
 from __future__ import annotations
 
-import warnings
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -38,24 +37,19 @@ class ScanFiles:
         return only if len(self.views) == 1 and isinstance(only, Mesh) else None
 
 
-def read_views(paths: Sequence[Path], unit: str | None = None, any_scale: bool = False) -> ScanFiles:
+def read_views(paths: Sequence[Path], unit: str | None = None) -> ScanFiles:
     """Read the views of a scan.
 
     Parameters
     ----------
     unit : 'm', 'mm', 'cm' or 'in', optional
-    any_scale : bool
-        The unit is not known: no warning where the scan is a giant or a dwarf.
 
     Raises
     ------
     MeshFileError
         A file that cannot be read.
     """
-    with warnings.catch_warnings():
-        if any_scale:
-            warnings.filterwarnings("ignore", ".*when read as metres", UserWarning)
-        views = tuple(read_view(path, unit) for path in paths)
+    views = tuple(read_view(path, unit) for path in paths)
     return ScanFiles(views, tuple(read_texture(path, unit) if isinstance(view, Mesh) else None
                                   for path, view in zip(paths, views, strict=True)))
 

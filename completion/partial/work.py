@@ -70,9 +70,12 @@ def complete_files(work: Work, inputs: Inputs, output: Path, progress: Progress 
     ValueError
         A file that cannot be read or does not fit: which one, what was expected, what came.
     """
-    files = read_views(inputs.scans, work.unit, work.config.free_scale)
-    landmarks = _landmarks(work, inputs, files)
-    masked = read_masks(inputs.masks, files, work.unit)
+    with warnings.catch_warnings():
+        if work.config.free_scale:
+            warnings.filterwarnings("ignore", ".*when read as metres", UserWarning)
+        files = read_views(inputs.scans, work.unit)
+        landmarks = _landmarks(work, inputs, files)
+        masked = read_masks(inputs.masks, files, work.unit)
     views = list(files.views)
     done = complete(work.body, views, landmarks, work.config, progress, masked)
     if files.colored:
@@ -132,10 +135,7 @@ def read_masks(paths: tuple[Path, ...], files: ScanFiles, unit: Unit | None) -> 
 def _landmarks(work: Work, inputs: Inputs, files: ScanFiles) -> tuple[np.ndarray, np.ndarray] | None:
     if inputs.landmarks is None:
         return None
-    with warnings.catch_warnings():
-        if work.config.free_scale:
-            warnings.filterwarnings("ignore", ".*when read as metres", UserWarning)
-        found = read_landmarks(inputs.landmarks, files.mesh, work.unit)
+    found = read_landmarks(inputs.landmarks, files.mesh, work.unit)
     try:
         _, vertices, points = match_landmarks(work.marks, found)
     except ValueError as error:
