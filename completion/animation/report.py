@@ -61,9 +61,11 @@ def morph_frames(motion: Motion, subject: Subject, bodies: np.ndarray, frames: n
     """Some of the meshes (n, N, 3) of a body that changes side by side, at one scale; `frames` (n,) is when."""
     chosen = np.unique(np.linspace(0, len(frames) - 1, count).round().astype(int))
     size = 1.06 * np.ptp(bodies[chosen], axis=1).max(axis=0) / 2
-    images = []
+    up, images = upright(subject.template)[0], []
+    floor = bodies[chosen][..., up].min()
     for i in chosen:
         middle = (bodies[i].min(axis=0) + bodies[i].max(axis=0)) / 2
+        middle[up] = floor + size[up] / 1.06                        # all on one line
         camera = facing(subject, motion.poses[frames[i]], np.stack([middle - size, middle + size]), 35.0)
         images.append(render(subject.template.with_vertices(bodies[i]), camera, int(0.62 * height), height))
     return side_by_side(images, [f"{frames[i] / motion.rate:.2f} s" for i in chosen])

@@ -86,8 +86,9 @@ def main() -> None:
         if args.pictures:
             args.pictures.mkdir(parents=True, exist_ok=True)
             picture(model, found, motion, markers, 100, args.pictures / f"{path.stem}.png")
-    write_report(args.output, {"protocol": f"subject and motion from {args.layout}", "machine": machine(),
-                               "files": rows, "shape": dataclasses.asdict(shape), "animate": dataclasses.asdict(config)})
+    write_report(args.output, {
+        "protocol": f"subject and motion from {args.layout}", "machine": machine(), "files": rows,
+        "shape": dataclasses.asdict(shape), "animate": dataclasses.asdict(config)})
 
 
 if __name__ == "__main__":
