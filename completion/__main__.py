@@ -10,8 +10,8 @@ COMMANDS = {
     "prep": ("Scans -> registered meshes and a skeleton; also its single stages.", "scanprep.cli:group"),
     "learn": ("Registered meshes -> a body model.", "model.learning.cli:learn"),
     "model": ("Look into a body model and pose it.", "model.cli:group"),
-    "complete": ("A partial scan -> the whole body.", "completion.partial.cli:complete_scan"),
-    "animate": ("Markers of a known subject -> a moving body.", "completion.animation.cli:animate_markers"),
+    "complete": ("A partial scan, or several views -> the whole body.", "completion.partial.cli:complete_scan"),
+    "animate": ("Markers -> the person and a moving body.", "completion.animation.cli:animate_markers"),
     "track": ("Frames of points -> a moving body, without markers.", "completion.tracking.cli:track_frames"),
 }
 
