@@ -148,7 +148,7 @@ class MarkerFollower:
         inside = np.arange(some[0], some[-1] + 1)
         moved = np.zeros(T)
         free = max(self.config.smoothing, 1)
-        rounds = free + GROUND_ROUNDS * self.config.ground
+        rounds = free + GROUND_ROUNDS * (self.config.ground and T > 2)
         for i in range(rounds):
             if self.standing:
                 self.standing.refresh(self.standing.points(x))

@@ -4,17 +4,20 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.ndimage import label
+from scipy.ndimage import label, uniform_filter1d
 
 from .marked import MarkedBody, System, point_system
 from .points import PartShapes
 
-SOLES = 16                           # points that may stand
+SOLES = 24                           # points that may stand
 TOUCH = 0.025                        # metres above the floor below which a point may stand
 STILL = 0.2                          # metres per second below which it does
+CALM = 0.15                          # seconds over which a place is averaged, to tell its speed
 SHORTEST = 0.08                      # seconds that standing lasts at least
 CONTACT_SD = 0.002                   # metres that a standing point may be from its place
 LOOKED_AT = 150                      # frames in which the soles are sought
+UNREST = 0.005                       # metres by which any end of a body rises and falls
+FOOT = 0.06                          # of the height of a body are feet, or the top of its head
 LEVEL = 20.0                         # percentile of the lowest point's height that is the floor
 
 
@@ -51,8 +54,8 @@ class Floor:
     def below(vertices: np.ndarray) -> Floor:
         """The floor under a moving body.
 
-        Vertical is the world axis along which the body is longest on average, down is the end that stays more
-        level, and the floor is where that end mostly is. Who stands still or lies down should give the floor.
+        Vertical is the world axis along which the body is longest on average, down is the end that is broad and
+        stays level, and the floor is where that end mostly is. For who lies or sits the floor should be given.
 
         Parameters
         ----------
@@ -60,14 +63,23 @@ class Floor:
         """
         low, high = vertices.min(axis=1), vertices.max(axis=1)
         axis = int((high - low).mean(axis=0).argmax())
-        unrest = [np.subtract(*np.percentile(end[:, axis], [75, 25])) for end in (low, high)]
-        sign = 1.0 if unrest[0] <= unrest[1] else -1.0
+        support = [_breadth(sign * vertices, axis) / (np.subtract(*np.percentile(end[:, axis], [75, 25])) + UNREST)
+                   for sign, end in ((1, low), (-1, high))]
+        sign = 1.0 if support[0] >= support[1] else -1.0
         end = low[:, axis] if sign > 0 else -high[:, axis]
         return Floor(sign * np.eye(3)[axis], float(np.percentile(end, LEVEL)))
 
     def above(self, points: np.ndarray) -> np.ndarray:
         """Height (...) of points (..., 3) above the floor, metres."""
         return points @ self.normal - self.height
+
+
+def _breadth(vertices: np.ndarray, axis: int) -> float:
+    """How far what is low (n, N, 3) along an axis reaches sideways, on average over the frames, metres."""
+    height = vertices[..., axis] - vertices[..., axis].min(axis=1, keepdims=True)
+    near = height < FOOT * height.max()
+    flat = np.delete(vertices, axis, axis=2)
+    return float(np.mean([np.linalg.norm(np.ptp(v[some], axis=0)) for v, some in zip(flat, near, strict=True)]))
 
 
 class Standing:
@@ -113,9 +125,9 @@ class Standing:
     def _held(self, points: np.ndarray, rate: float) -> np.ndarray:
         """Places (T, K, 3) where points stand, NaN where they move freely."""
         held = np.full(points.shape, np.nan)
-        height = self.floor.above(points)
-        speed = np.linalg.norm(np.gradient(points, axis=0), axis=2) * rate if len(points) > 1 else 0 * height
-        stands = (height < TOUCH) & (speed < STILL)
+        calm = uniform_filter1d(points, max(1, round(CALM * rate)), axis=0, mode="nearest")
+        speed = np.linalg.norm(np.gradient(calm, axis=0), axis=2) * rate
+        stands = (self.floor.above(calm) < TOUCH) & (speed < STILL)
         for k in range(points.shape[1]):
             runs, count = label(stands[:, k])
             for run in range(1, count + 1):
