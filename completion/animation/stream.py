@@ -18,6 +18,7 @@ from .settings import AnimateConfig
 from .trust import LabelWatch, distances_apart, marker_weights
 
 STARTS = 2                           # of a search that are followed to their end
+ROUNDS = 5                           # in which outliers of a search are found
 ENOUGH = 0.5                         # share of the markers that a search wants
 BELIED = 0.2                         # share of the markers seen that are outliers on a body gone astray
 PATIENCE = 0.25                      # seconds from a search that found nothing to the next; then twice as many
@@ -178,7 +179,7 @@ class Tracker:
         x, _ = search(body.body, body.follow, targets, config.marker_sd, body.prior, config.start_axes)
         x = x[:STARTS]
         weights = np.full(body.count, config.marker_sd**-2)
-        for _ in range(2):                                              # with all markers, then with the likely ones
+        for _ in range(ROUNDS):                                         # with all markers, then with the likely ones
             system = partial(body.system, targets=np.broadcast_to(targets, (len(x), *targets.shape)),
                              weights=np.broadcast_to(weights, (len(x), len(weights))))
             end = descend(system, x, SETTLED, body.retract)
