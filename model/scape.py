@@ -89,6 +89,12 @@ class ScapeModel(BodyModel):
     def _v_hat(self) -> np.ndarray:
         return edges(self.template.vertices, self.template.faces)
 
+    @cached_property
+    def _components_by_face(self) -> np.ndarray:
+        """(F, 3 K, 3) the components, row by row of each triangle."""
+        U = self.shape_space.components
+        return np.ascontiguousarray(U.transpose(1, 2, 0, 3)).reshape(U.shape[1], -1, 3)
+
     def _posed(self, pose: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Rotation (F, 3, 3), or mixture of rotations, and `Q v̂` (F, 2, 3) of every triangle at one pose."""
         R = np.tensordot(self.rotation_weights, self.skeleton.part_rotations(pose), axes=1)
@@ -114,11 +120,15 @@ class ScapeModel(BodyModel):
     def shape_jacobian(self, pose: np.ndarray, vertex_ids: np.ndarray | None = None) -> np.ndarray:
         pose, _ = check_pose(self.skeleton, pose, None)
         R, posed = self._posed(pose)
-        U = self.shape_space.components.astype(np.float64)
-        if not len(U):
+        K, F = self.n_betas, len(R)
+        if not K:
             return np.zeros((self.template.vertices.shape[0] if vertex_ids is None else len(vertex_ids), 3, 0))
-        y = self.stitching.stitch(posed @ np.swapaxes(R @ U, -1, -2))
-        return np.moveaxis(y if vertex_ids is None else y[:, vertex_ids], 0, -1)
+        U = self._components_by_face
+        bent = (U @ np.swapaxes(posed, -1, -2).astype(U.dtype)).reshape(F, 3, 2 * K)     # few large products, not K F small
+        e = (R.astype(U.dtype) @ bent).reshape(F, 3, K, 2)                               # R U_k Q v̂_j
+        rhs = self.stitching.edge_operator.T @ e.transpose(0, 3, 1, 2).reshape(2 * F, 3 * K).astype(np.float64)
+        y = self.stitching.solve(rhs).reshape(-1, 3, K)
+        return y if vertex_ids is None else y[vertex_ids]
 
     def _arrays(self) -> dict[str, np.ndarray]:
         """What the file holds."""
