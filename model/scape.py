@@ -123,10 +123,9 @@ class ScapeModel(BodyModel):
         K, F = self.n_betas, len(R)
         if not K:
             return np.zeros((self.template.vertices.shape[0] if vertex_ids is None else len(vertex_ids), 3, 0))
-        U = self._components_by_face
-        bent = (U @ np.swapaxes(posed, -1, -2).astype(U.dtype)).reshape(F, 3, 2 * K)     # few large products, not K F small
-        e = (R.astype(U.dtype) @ bent).reshape(F, 3, K, 2)                               # R U_k Q v̂_j
-        rhs = self.stitching.edge_operator.T @ e.transpose(0, 3, 1, 2).reshape(2 * F, 3 * K).astype(np.float64)
+        bent = self._components_by_face.astype(np.float64) @ np.swapaxes(posed, -1, -2)      # F products, not K F
+        e = (R @ bent.reshape(F, 3, 2 * K)).reshape(F, 3, K, 2)                             # R U_k Q v̂_j
+        rhs = self.stitching.edge_operator.T @ e.transpose(0, 3, 1, 2).reshape(2 * F, 3 * K)
         y = self.stitching.solve(rhs).reshape(-1, 3, K)
         return y if vertex_ids is None else y[vertex_ids]
 
