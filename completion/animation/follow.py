@@ -12,6 +12,7 @@ from ..energy import MovingPoints
 from ..markers.files import MarkerSequence
 from ..markers.layout import MarkerLayout
 from ..motion import Motion
+from .beginning import search
 from .ground import Floor, Standing
 from .lowpass import low_pass
 from .marked import MarkedBody
@@ -125,7 +126,7 @@ class MarkerFollower:
         """Unknowns (n, P) of some frames, each from those before; begins at one of them and goes both ways."""
         x, settled = np.empty((len(frames), self.body.n_unknowns)), np.zeros(len(frames), dtype=bool)
         at = int(np.searchsorted(frames, first))
-        start = Tracker(self.body, self.config, self.rate).search(self.targets[first])
+        start = search(self.body, self.targets[first], self.config)
         ways: tuple[Sequence[int], Sequence[int]] = range(at, len(frames)), range(at - 1, -1, -1)
         done = 0
         for way in ways:

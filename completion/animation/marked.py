@@ -61,7 +61,7 @@ class MarkedBody:
         return moving_points(np.swapaxes(y, -1, -2),
                              by_pose.transpose(0, 3, 2, 1, 4).reshape(B, self.count, 3, 3 * J))
 
-    def system(self, x: np.ndarray, targets: np.ndarray, weights: np.ndarray) -> System:
+    def system(self, x: np.ndarray, targets: np.ndarray, weights: np.ndarray, stiff: float = 1.0) -> System:
         """Markers and pose prior: energy (B,), half its gradient (B, P) and Gauss-Newton matrix (B, P, P).
 
         Parameters
@@ -71,6 +71,8 @@ class MarkedBody:
             NaN where a marker was not seen.
         weights : (B, L) float
             Factor on the squared distance.
+        stiff : float
+            Further factor on the pose prior.
 
         [SCAPE] §8
         """
@@ -80,9 +82,10 @@ class MarkedBody:
         pose = twists(pose)
         local = rotations.inverse_right_jacobian(pose)                                           # dpose = local d
         off = pose.reshape(B, n) - self.prior.mean
-        pull = off @ self._precision
+        precision = stiff * self._precision
+        pull = off @ precision
         gradient[:, :n] += (pull.reshape(B, -1, 1, 3) @ local).reshape(B, n)
-        half = self._precision.reshape(n, -1, 3).swapaxes(0, 1) @ local                          # (B, J, n, 3)
+        half = precision.reshape(n, -1, 3).swapaxes(0, 1) @ local                          # (B, J, n, 3)
         half = half.reshape(B, -1, n // 3, 3, 3).swapaxes(-1, -2)                                # transposed rows
         hessian[:, :n, :n] += (half @ local[:, None]).transpose(0, 1, 3, 2, 4).reshape(B, n, n)
         return energy + (pull * off).sum(axis=1), gradient, hessian

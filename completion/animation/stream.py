@@ -3,7 +3,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from functools import partial
 
 import numpy as np
 
@@ -11,18 +10,15 @@ from model.linear import Subject
 
 from ..markers.layout import MarkerLayout
 from ..solve import MinimiseConfig, Minimum, descend
-from ..starts import search
+from .beginning import search
 from .marked import MarkedBody, System
 from .prediction import make_prediction
 from .settings import AnimateConfig
 from .trust import LabelWatch, distances_apart, marker_weights
 
-STARTS = 2                           # of a search that are followed to their end
-ROUNDS = 5                           # in which outliers of a search are found
 ENOUGH = 0.5                         # share of the markers that a search wants
 BELIED = 0.2                         # share of the markers seen that are outliers on a body gone astray
 PATIENCE = 0.25                      # seconds from a search that found nothing to the next; then twice as many
-SETTLED = MinimiseConfig(iterations=30)
 
 
 @dataclass(frozen=True, eq=False)
@@ -134,7 +130,7 @@ class Tracker:
         if not self.started:
             if there < max(3, ENOUGH * self.body.count):
                 return np.full(self.body.n_unknowns, np.nan), False
-            self.begin(self.search(targets))
+            self.begin(search(self.body, targets, self.config))
         expected, information = self.prediction.expect()
         self.places = self.body.positions(expected)
         if not there:
@@ -144,7 +140,7 @@ class Tracker:
         end = self.solve(targets, expected, information)
         self.places = self.body.positions(end.x[0])
         if not self.wait and there >= max(3, ENOUGH * self.body.count) and self._astray(targets):
-            found = self.search(targets)
+            found = search(self.body, targets, self.config)
             places = self.body.positions(found)
             if _misfit(places, targets, self.config.outlier) < 0.7 * _misfit(self.places, targets, self.config.outlier):
                 self.begin(found)
@@ -172,20 +168,6 @@ class Tracker:
             return cost + step @ pull, gradient + pull, hessian + information
 
         return descend(system, expected[None], MinimiseConfig(config.iterations, 1e-4, 1e-2), body.retract)
-
-    def search(self, targets: np.ndarray) -> np.ndarray:
-        """Unknowns (P,) of a frame from nothing but its markers."""
-        config, body = self.config, self.body
-        x, _ = search(body.body, body.follow, targets, config.marker_sd, body.prior, config.start_axes)
-        x = x[:STARTS]
-        weights = np.full(body.count, config.marker_sd**-2)
-        for _ in range(ROUNDS):                                         # with all markers, then with the likely ones
-            system = partial(body.system, targets=np.broadcast_to(targets, (len(x), *targets.shape)),
-                             weights=np.broadcast_to(weights, (len(x), len(weights))))
-            end = descend(system, x, SETTLED, body.retract)
-            x = end.x[np.argmin(end.energy)][None]
-            weights, _ = marker_weights(body.positions(x[0]), targets, config.marker_sd, config.outlier)
-        return x[0]
 
 
 def judge(positions: np.ndarray, targets: np.ndarray, order: np.ndarray, config: AnimateConfig
