@@ -23,7 +23,7 @@ from scanprep.scanning.people_marks import landmarks, markers
 Progress = Callable[[int, int], None]
 
 CACHE = "SCAPEKIT_CACHE"             # environment variable that names another folder
-VERSION = 1                          # raised when the same recipe makes another model
+VERSION = 2                          # raised when the same recipe makes another model
 
 
 @dataclass(frozen=True)

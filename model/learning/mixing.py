@@ -196,8 +196,9 @@ def next_round(mix: Mix, state: State, number: int, tick: Ticks) -> State:
 def make_model(mix: Mix, state: State, info: dict[str, Any]) -> ScapeModel:
     """The model that a round has reached."""
     shapes = learn_shape_space(state.S, mix.config.components)
-    return ScapeModel(mix.carriage.template, mix.carriage.skeleton, state.space, shapes, *pose_prior(state.poses), info,
-                      pose_examples=pose_examples(state.poses))
+    template, skeleton = mix.carriage.template, mix.carriage.skeleton
+    return ScapeModel(template, skeleton, state.space, shapes, *pose_prior(state.poses), info,
+                      pose_examples=pose_examples(template, skeleton, state.poses))
 
 
 def _learn_pose(mix: Mix, state: State) -> tuple[PoseSpace, Design]:

@@ -134,7 +134,8 @@ def _learn(carriage: Carriage, poses: np.ndarray, shapes: np.ndarray | None, con
         with timed("shape components"):
             shape_space = learn_shape_space(S, config.components)
     return (learned.space, shape_space, *pose_prior(learned.poses),
-            how_learned(template, learned, poses, shapes, config), pose_examples(learned.poses))
+            how_learned(template, learned, poses, shapes, config),
+            pose_examples(template, carriage.skeleton, learned.poses, shapes))
 
 
 def how_learned(template: Mesh, learned: LearnedPose, poses: np.ndarray, shapes: np.ndarray | None, config: LearnConfig
@@ -149,11 +150,23 @@ def how_learned(template: Mesh, learned: LearnedPose, poses: np.ndarray, shapes:
 
 def pose_prior(poses: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Mean (J, 3) and covariance (3J, 3J) of poses (M, J, 3), radians, zero for the root."""
-    flat = pose_examples(poses).reshape(len(poses), -1)
+    flat = _below_half_turn(poses).reshape(len(poses), -1)
     return flat.mean(axis=0).reshape(-1, 3), np.cov(flat.T, ddof=1)
 
 
-def pose_examples(poses: np.ndarray) -> np.ndarray:
+def pose_examples(template: Mesh, skeleton: Skeleton, poses: np.ndarray, shapes: np.ndarray | None = None
+                  ) -> np.ndarray:
+    """Poses (M, J, 3), radians, that bodies were seen in: the training poses, and how the people (P, N, 3) stand.
+
+    The root is not turned.
+    """
+    out = _below_half_turn(poses)
+    if shapes is None:
+        return out
+    return np.concatenate([out, _below_half_turn(skeleton.pose_of(skeleton.fit_rotations(template, shapes)))])
+
+
+def _below_half_turn(poses: np.ndarray) -> np.ndarray:
     """Poses (M, J, 3), radians, below a half turn and without the root's."""
     out = twists(poses).copy()
     out[:, 0] = 0

@@ -65,7 +65,8 @@ def learn_by_sex(template: Mesh, poses: np.ndarray, shapes: np.ndarray, sexes: S
     for sex, chosen in groups.items():
         info = {**how_learned(template, learned, poses, shapes[chosen], config), "sex": sex}
         models[sex] = ScapeModel(template, skeleton, learned.space, learn_shape_space(S[chosen], config.components),
-                                 *pose_prior(learned.poses), info, pose_examples=pose_examples(learned.poses))
+                                 *pose_prior(learned.poses), info,
+                                 pose_examples=pose_examples(template, skeleton, learned.poses, shapes))
     return models
 
 

@@ -112,7 +112,8 @@ def learn_skinning(template: Mesh, poses: np.ndarray, shapes: np.ndarray | None,
     info: dict[str, Any] = {
         "settings": asdict(config), "poses": len(poses), "shapes": 0 if shapes is None else len(shapes),
         **model.info, "terms": model.terms.count, "digest": digest(template, poses, shapes)}
-    return replace(model, pose_mean=mean, pose_covariance=covariance, pose_examples=pose_examples(at), info=info)
+    return replace(model, pose_mean=mean, pose_covariance=covariance, info=info,
+                   pose_examples=pose_examples(template, skeleton, at, shapes))
 
 
 def _start(template: Mesh, skeleton: Skeleton, config: SkinConfig) -> SkinningModel:
