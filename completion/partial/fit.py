@@ -2,6 +2,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from copy import copy
 
 import numpy as np
 
@@ -46,18 +47,30 @@ class ScanFit:
         self.habit = choose_prior(config.pose_prior, body.pose_mean, body.pose_covariance, body.pose_examples,
                                   body.skeleton.parents, config.prior_shrinkage)
         self.limits = joint_limits(body.pose_examples)
-        self.cloud = cloud
-        self.thin = cloud.thinned(config.scan_points)
-        self.coarse = cloud.thinned(config.scan_points // 4)
-        self.tree = OrientedPoints(cloud.points, cloud.normals)
-        self.sight = find_sights(cloud) if config.silhouette_weight > 0 else None
-        self.cover = None if cloud.masked is None else Cover(cloud.masked)
         self.spread = spread(body.template.vertices, config.model_points)
         self.ignored = part_vertices(body.template, body.skeleton, config.ignored_parts)
         self.matched = self.spread[~self.ignored[self.spread]]
         self.part = body.skeleton.part_of_vertex(body.template)
         self.contact = Contact(body.skeleton, self.part[self.spread])
         self.rng = np.random.default_rng(config.seed)
+        self._take(cloud)
+
+    def _take(self, cloud: ScanPoints) -> None:
+        """All that belongs to the scan."""
+        config = self.config
+        self.cloud = cloud
+        self.thin = cloud.thinned(config.scan_points)
+        self.coarse = cloud.thinned(config.scan_points // 4)
+        self.tree = OrientedPoints(cloud.points, cloud.normals)
+        self.sight = find_sights(cloud) if config.silhouette_weight > 0 else None
+        self.cover = None if cloud.masked is None else Cover(cloud.masked)
+
+    def on(self, cloud: ScanPoints) -> ScanFit:
+        """The same body with another scan, without landmarks; all that belongs to the body is shared."""
+        out = copy(self)
+        out.vertices, out.points = np.zeros(0, dtype=np.int64), np.zeros((0, 3))
+        out._take(cloud)
+        return out
 
     def mesh(self, x: np.ndarray) -> Mesh:
         """The predicted mesh of unknowns (P,)."""

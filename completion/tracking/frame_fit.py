@@ -1,19 +1,17 @@
 """One frame: the body near where it is expected, drawn to the points."""
 from __future__ import annotations
 
-import copy
 from dataclasses import dataclass
 
 import numpy as np
 
-from scanprep.geometry.surface import OrientedPoints, Surface
+from scanprep.geometry.surface import Surface
 
 from .. import energy
 from ..bodies import FixedBody
 from ..partial.fit import ScanFit
 from ..partial.restarts import approach, best_start, first_starts, redraw_limbs
 from ..partial.scan import ScanPoints
-from ..partial.sight import find_sights
 from ..solve import Energy, MinimiseConfig, minimise, normal_equations
 from .dynamics import inertia
 from .settings import TrackConfig
@@ -64,7 +62,7 @@ class FrameFit:
 
     def on(self, cloud: ScanPoints) -> ScanFit:
         """The same fit with another frame."""
-        return on_cloud(self._fit, cloud)
+        return self._fit.on(cloud)
 
     def good(self, found: Settled) -> bool:
         """Whether a frame is not lost."""
@@ -114,17 +112,6 @@ def _middle(points: np.ndarray) -> np.ndarray:
     return 0.5 * np.sum(np.percentile(points, [2, 98], axis=0), axis=0)
 
 
-def on_cloud(fit: ScanFit, cloud: ScanPoints) -> ScanFit:
-    """A fit whose frame is exchanged; all that belongs to the body is shared."""
-    out = copy.copy(fit)
-    out.cloud = cloud
-    out.thin = cloud.thinned(fit.config.scan_points)
-    out.coarse = cloud.thinned(fit.config.scan_points // 4)
-    out.tree = OrientedPoints(cloud.points, cloud.normals)
-    out.sight = find_sights(cloud) if fit.config.silhouette_weight > 0 else None
-    return out
-
-
 def scan_terms(fit: ScanFit, x: np.ndarray, reach: float) -> Energy:
     """The energies of one matching at x (P,), as a function of the unknowns (B, P)."""
     mesh = fit.mesh(x)
@@ -132,11 +119,12 @@ def scan_terms(fit: ScanFit, x: np.ndarray, reach: float) -> Energy:
     out_ids, out_target, out_normal, out_weights = fit.trespasses(mesh)
     follow = fit.body.follow(np.concatenate([ids, out_ids]), x)
     count = len(ids)
+    prior = fit.habit.near(fit.body.split(x)[0])
 
     def terms(at: np.ndarray) -> list[energy.Residual]:
         points = follow(at)
         free, denied = points[:count], points[count:]
-        return [energy.pose_prior(at, fit.prior, fit.config.prior_weight),
+        return [energy.pose_prior(at, prior, fit.config.prior_weight),
                 energy.point_to_plane(free, target, normal, weights),
                 energy.point_to_point(free, target, 0.1 * weights),
                 energy.point_to_plane(denied, out_target, out_normal, out_weights)]

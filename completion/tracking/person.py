@@ -12,7 +12,7 @@ from ..bodies import ShapedBody
 from ..partial.fit import ScanFit
 from ..partial.scan import ScanPoints
 from ..solve import normal_equations
-from .frame_fit import NOTHING, on_cloud, scan_terms
+from .frame_fit import NOTHING, scan_terms
 from .settings import TrackConfig
 
 
@@ -48,7 +48,7 @@ def shared_shape(body: ShapedBody, clouds: Sequence[ScanPoints], x: np.ndarray, 
         To begin with.
     """
     fit = ScanFit(body, clouds[0], *NOTHING, config.scan)
-    fits = [_own_body(on_cloud(fit, cloud), body) for cloud in clouds]
+    fits = [_own_body(fit.on(cloud), body) for cloud in clouds]
     x, betas, free = x.copy(), betas.copy(), x.shape[1]
     for i in range(config.shape_rounds):
         reach = config.reach * (config.final_reach / config.reach)**min(1.0, i / 2)
