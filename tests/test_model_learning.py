@@ -3,7 +3,7 @@ import pytest
 from model_bodies import random_poses, worm, worm_model, worm_skeleton
 
 from model.fitting import fit_pose, fit_shape
-from model.learning import LearnConfig, learn_scape, pose_prior
+from model.learning import LearnConfig, learn_scape, pose_examples, pose_prior
 from model.pose_space import PoseSpace
 from model.scape import ScapeModel
 from scanprep.geometry.mesh import Mesh
@@ -64,17 +64,32 @@ def test_affine_people_are_learned_exactly(truth, training):
     np.testing.assert_allclose(model.vertices(np.zeros((4, 3))), truth.template.vertices, atol=1e-6)
 
 
-def test_prior_is_that_of_the_training_poses(truth, learned):
+def test_prior_is_that_of_the_training_poses(truth, training):
     rng = np.random.default_rng(0)
     poses = random_poses(truth, 40, rng, 0.4)
     poses[0] = 0
-    mean, covariance = pose_prior(poses)
+    mean, covariance = pose_prior(pose_examples(truth.template, truth.skeleton, poses), len(poses))
     np.testing.assert_allclose(mean[1:], poses[:, 1:].mean(axis=0), atol=1e-12)
+    np.testing.assert_allclose(covariance[3:, 3:], np.cov(poses[:, 1:].reshape(40, -1).T), atol=1e-12)
     assert (covariance[:3] == 0).all() and (covariance[:, :3] == 0).all() and (mean[0] == 0).all()
+    learned = learn_scape(truth.template, training[0], None, truth.skeleton, LearnConfig(refinements=2))
     np.testing.assert_allclose(learned.pose_mean, mean, atol=0.06)
     # R and Q share what lies between them, so the learned turns are a little smaller than those of the truth
     share = np.diag(learned.pose_covariance)[3:] / np.diag(covariance)[3:]
     assert (share > 0.5).all() and (share < 1.1).all()
+
+
+def test_how_people_stand_counts_as_much_as_the_poses(truth, training, learned):
+    """12 people near rest and 40 wide poses: the mean lies half-way, and the people's poses are kept as examples."""
+    assert learned.pose_examples.shape == (52, 4, 3) and (learned.pose_examples[:, 0] == 0).all()
+    wide, near = (kind.reshape(len(kind), -1) for kind in np.split(learned.pose_examples, [40]))
+    assert near.std() < 0.5 * wide.std()
+    mean, covariance = pose_prior(learned.pose_examples, 40)
+    np.testing.assert_allclose(mean.ravel(), (wide.mean(axis=0) + near.mean(axis=0)) / 2, atol=1e-12)
+    np.testing.assert_array_equal(learned.pose_mean, mean)
+    twice = pose_prior(np.concatenate([wide, near, near]).reshape(-1, 4, 3), 40)
+    np.testing.assert_allclose(twice[0], mean, atol=1e-12)
+    np.testing.assert_allclose(twice[1], covariance, atol=1e-12)
 
 
 def test_rigid_motion_of_the_data_changes_nothing_within(truth, training):

@@ -197,8 +197,9 @@ def make_model(mix: Mix, state: State, info: dict[str, Any]) -> ScapeModel:
     """The model that a round has reached."""
     shapes = learn_shape_space(state.S, mix.config.components)
     template, skeleton = mix.carriage.template, mix.carriage.skeleton
-    return ScapeModel(template, skeleton, state.space, shapes, *pose_prior(state.poses), info,
-                      pose_examples=pose_examples(template, skeleton, state.poses))
+    examples = pose_examples(template, skeleton, state.poses)
+    return ScapeModel(template, skeleton, state.space, shapes, *pose_prior(examples, len(examples)), info,
+                      pose_examples=examples)
 
 
 def _learn_pose(mix: Mix, state: State) -> tuple[PoseSpace, Design]:

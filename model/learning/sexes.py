@@ -61,12 +61,13 @@ def learn_by_sex(template: Mesh, poses: np.ndarray, shapes: np.ndarray, sexes: S
     tick = Ticks(progress, (config.refinements + 1) * len(poses) + len(shapes))
     learned = learn_pose(carriage, poses, config, tick)
     S = shape_deformations(carriage, learned.space, shapes, config.smoothness, tick)
+    examples = pose_examples(template, skeleton, learned.poses, shapes)
+    prior = pose_prior(examples, len(poses))
     models = {}
     for sex, chosen in groups.items():
         info = {**how_learned(template, learned, poses, shapes[chosen], config), "sex": sex}
         models[sex] = ScapeModel(template, skeleton, learned.space, learn_shape_space(S[chosen], config.components),
-                                 *pose_prior(learned.poses), info,
-                                 pose_examples=pose_examples(template, skeleton, learned.poses, shapes))
+                                 *prior, info, pose_examples=examples)
     return models
 
 

@@ -108,12 +108,12 @@ def learn_skinning(template: Mesh, poses: np.ndarray, shapes: np.ndarray | None,
     tick(tick.total - tick.done - later)
     if shapes is not None:
         model = learn_people(model, shapes, config.components, config.people_rounds, tick)
-    mean, covariance = pose_prior(at)
+    examples = pose_examples(template, skeleton, at, shapes)
+    mean, covariance = pose_prior(examples, len(at))
     info: dict[str, Any] = {
         "settings": asdict(config), "poses": len(poses), "shapes": 0 if shapes is None else len(shapes),
         **model.info, "terms": model.terms.count, "digest": digest(template, poses, shapes)}
-    return replace(model, pose_mean=mean, pose_covariance=covariance, info=info,
-                   pose_examples=pose_examples(template, skeleton, at, shapes))
+    return replace(model, pose_mean=mean, pose_covariance=covariance, pose_examples=examples, info=info)
 
 
 def _start(template: Mesh, skeleton: Skeleton, config: SkinConfig) -> SkinningModel:
