@@ -13,6 +13,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from summary_completion import COMPLETION
 from summary_scans import (
     Rows,
     coregistration,
@@ -70,17 +71,6 @@ def regressors(report: dict) -> str:
                   "worst pose (mm)", "learning (s CPU)"), rows)
 
 
-def half_views(report: dict) -> str:
-    """Half views of the held-out poses of one fold, or of held-out people."""
-    rows: Rows = [(r["k"], r["completed_seen_mm"], r["completed_unseen_mm"], r["predicted_seen_mm"],
-                   r["predicted_unseen_mm"], r["worst_part_mm"], r["seconds"]) for r in report["rows"]]
-    mean = report["mean"]
-    rows.append(("mean", *(mean[n] for n in ("completed_seen_mm", "completed_unseen_mm", "predicted_seen_mm",
-                                             "predicted_unseen_mm", "worst_part_mm", "seconds"))))
-    return table(("view", "completed, seen (mm)", "completed, unseen (mm)", "predicted, seen (mm)",
-                  "predicted, unseen (mm)", "worst part (mm)", "time (s)"), rows)
-
-
 def learning(report: dict) -> str:
     """Learning, held-out people and the fast path."""
     rows: Rows = [(f"time: {step} (s)", value) for step, value in report["steps_s"].items()]
@@ -124,13 +114,6 @@ def generic(report: dict) -> str:
     return table(names, [tuple(r[n] for n in names) for r in rows])
 
 
-def markers(report: dict) -> str:
-    """The whole surface from some of its points."""
-    rows: Rows = [tuple(row[n] for n in ("pose", "surface_mm", "worst_mm", "markers_mm")) for row in report["poses"]]
-    rows.append(("mean", *(report["mean"][n] for n in ("surface_mm", "worst_mm", "markers_mm"))))
-    return table(("pose", "whole surface (mm)", "worst vertex (mm)", "markers (mm)"), rows)
-
-
 SECTIONS: dict[str, tuple[str, str, Callable[[dict], str], str]] = {
     "scape_5fold": ("Held-out poses (SCAPE-5fold)", "python tests/benchmarks/scape_5fold.py", poses,
                     "Skeleton and model from the training poses of the fold alone, with an earlier search for parts. "
@@ -155,9 +138,6 @@ SECTIONS: dict[str, tuple[str, str, Callable[[dict], str], str]] = {
               "30 people in 3 poses each against one person in many poses and others in one, as many meshes, at 2,000 "
               "triangles with the true skeleton. Merged from one run of seed 1 and one of seeds 2 and 3; settings "
               "were tuned on other seeds. Where we lose: time, and the worst person of seed 1."),
-    "half_views": ("Half views of held-out poses, known subject", "python tests/benchmarks/half_views.py", half_views,
-                   "Fold 0, 7 landmarks, viewpoint not told. Where we lose: an arm that no point of the scan touches, "
-                   "and time when limbs have to be searched for."),
     "registration_10": ("Registration, ten landmarks", "python tests/benchmarks/registration.py --set held --marks 10",
                         registration, "Virtual four-view scans, template mesh000, held-out poses and men. Where we "
                         "lose: sharply bent limbs, whose skin slides; the surface is right long before the "
@@ -217,8 +197,7 @@ SECTIONS: dict[str, tuple[str, str, Callable[[dict], str], str]] = {
               "The second size was added after the first had been seen. `auto` is `fair` where no lines of sight "
               "are known. Where we lose: armpits (up to 22 mm from patch to truth); Poisson columns of the patch are "
               "missing as it remeshes everything."),
-    "markers": ("Markers on random vertices of held-out poses", "python tests/benchmarks/markers.py", markers,
-                "Fold 0, known subject, every pose a frame of its own; skeleton and model from the training poses."),
+    **COMPLETION,
 }
 
 

@@ -1,0 +1,112 @@
+"""Tables of BENCHMARKS.md on completion: half views, people, markers, frames of points."""
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from summary_scans import Rows, table
+
+
+def half_views(report: dict) -> str:
+    """Half views of the held-out poses of one fold."""
+    names = ("completed_seen_mm", "completed_unseen_mm", "predicted_seen_mm", "predicted_unseen_mm", "worst_part_mm",
+             "cpu_seconds")
+    rows: Rows = [(r["k"], *(r[n] for n in names)) for r in report["rows"]]
+    rows.append(("mean", *(report["mean"][n] for n in names)))
+    rows.append((f"below 30 mm: {report['mean']['below_30_mm']:.0%}", f"flipped limbs: {report['mean']['flipped']:.0%}",
+                 *[""] * 5))
+    return table(("view", "completed, seen (mm)", "completed, unseen (mm)", "predicted, seen (mm)",
+                  "predicted, unseen (mm)", "worst part (mm)", "time (s CPU)"), rows)
+
+
+def half_people(report: dict) -> str:
+    """Half views of people: ours, the nearest training body, plain hole filling; then every man."""
+    mean = report["mean"]
+    kinds = [(label, name) for label, name in (
+        ("completed", "completed"), ("predicted", "predicted"), ("nearest training body, moved", "nearest_rigid"),
+        ("nearest training body, bent", "nearest_posed"), ("screened Poisson", "poisson")) if f"{name}_seen_mm" in mean]
+    rows: Rows = [(label, mean[f"{name}_seen_mm"], mean.get(f"{name}_unseen_mm", ""), mean[f"{name}_closest_mm"])
+                  for label, name in kinds]
+    facts: Rows = [(r["k"], r["completed_seen_mm"], r["completed_unseen_mm"], r["predicted_unseen_mm"],
+                    r.get("nearest_posed_unseen_mm", ""), r["expected_mm"], r["rms_mm"], r["cpu_seconds"])
+                   for r in report["rows"]]
+    facts.append(("mean", mean["completed_seen_mm"], mean["completed_unseen_mm"], mean["predicted_unseen_mm"],
+                  mean.get("nearest_posed_unseen_mm", ""), mean["expected_mm"], mean["rms_mm"], mean["cpu_seconds"]))
+    summary = table(("mean of all", "seen (mm)", "unseen (mm)", "unseen, to the closest point (mm)"), rows)
+    return summary + "\n\n" + table(
+        ("man", "completed, seen (mm)", "completed, unseen (mm)", "predicted, unseen (mm)",
+         "nearest body bent, unseen (mm)", "expected error, unseen (mm, RMS)", "real (mm, RMS)", "time (s CPU)"), facts)
+
+
+def markers(report: dict) -> str:
+    """The whole surface from some of its points; with markers missing, exchanged, astray; real files."""
+    rows: Rows = [tuple(row[n] for n in ("pose", "surface_mm", "worst_mm", "markers_mm")) for row in report["poses"]]
+    rows.append(("mean", *(report["mean"][n] for n in ("surface_mm", "worst_mm", "markers_mm"))))
+    out = [table(("pose", "whole surface (mm)", "worst vertex (mm)", "markers (mm)"), rows)]
+    moving: Rows = [tuple(row[n] for n in ("way", "markers", "surface_mm", "p95_mm", "worst_mm", "per_s", "per_cpu_s"))
+                    for row in report.get("motion", [])]
+    if moving:
+        out.append(table(("way", "markers", "surface (mm)", "95% of frames below (mm)", "worst frame (mm)",
+                          "frames/s", "frames/s CPU"), moving))
+    real: Rows = [tuple(row[n] for n in ("file", "frames", "way", "mean_mm", "p95_mm", "settled", "per_s", "per_cpu_s"))
+                  for row in report.get("real", [])]
+    if real:
+        out.append(table(("file", "frames", "way", "markers, mean (mm)", "p95 (mm)", "settled", "frames/s",
+                          "frames/s CPU"), real))
+    return "\n\n".join(out)
+
+
+def recordings(report: dict) -> str:
+    """Real marker files: the person and the motion, with loose markers moved and as the layout has them."""
+    rows: Rows = [(f["file"], f["frames"], f["mean_mm"], f["p95_mm"], f["worst_frame_mm"], f["as_laid"]["mean_mm"],
+                   f["subject_cpu_s"], f["frames_per_cpu_s"], f["beta_rms"]) for f in report["files"]]
+    return table(("file", "frames", "markers, mean (mm)", "p95 (mm)", "worst frame (mm)", "layout as it is (mm)",
+                  "the person (s CPU)", "frames/s CPU", "betas (RMS)"), rows)
+
+
+def tracking(report: dict) -> str:
+    """Frames of points: a row for every way to disturb them."""
+    names = ("surface", "surface, worst frame", "seen part", "vertices", "vertices, worst frame",
+             "surface in the disturbed frames", "lost frames", "CPU s a frame")
+    rows: Rows = [(kind, *("" if run[n] is None else run[n] for n in names)) for kind, run in report["runs"].items()]
+    return table(("frames", *(n if n in ("lost frames", "CPU s a frame") else f"{n} (mm)" for n in names)), rows)
+
+
+COMPLETION: dict[str, tuple[str, str, Callable[[dict], str], str]] = {
+    "half_views": (
+        "Half views of held-out poses, known subject, seven landmarks",
+        "python tests/benchmarks/half_views.py -m FOLD_0", half_views,
+        "Fold 0, model of 20 parts, viewpoint not told; settings were chosen on fold 1. A part of which a fifth was "
+        "seen counts as flipped when it is 100 mm off. Where we lose: fists that are turned about themselves, and "
+        "an arm that no point of the scan touches."),
+    "half_views_blind": (
+        "The same without landmarks",
+        "python tests/benchmarks/half_views.py -m FOLD_0 --marks 0", half_views,
+        "Started from the training poses in 600 turns each. On fold 1, which settings were chosen on, two of 14 "
+        "arms that are wholly hidden end elsewhere; no prior that we tried knows where they are."),
+    "half_people": (
+        "Half views of held-out men, unknown shape",
+        "python tests/benchmarks/half_people.py -m MODEL --nearest --points DIR; --poisson DIR", half_people,
+        "45 men, seven landmarks, 40 components, settings chosen on 37 of the training men with a model without "
+        "them; six of the 45 had been run once before, with a pose prior that did not know how people stand. The "
+        "nearest training body is the nearest of 182 by trimmed closest points; bent: made the template of a pose- "
+        "only model and fitted by our own solver. Poisson has no vertices in common with the truth."),
+    "markers": (
+        "Markers on random vertices of held-out poses, and real recordings",
+        "python tests/benchmarks/markers.py -m FOLD_0 --c3d FOLDER --people MODEL", markers,
+        "Fold 0, known subject. First every pose a frame of its own; then a motion through these scans at 120 Hz, "
+        "with markers missing, exchanged and astray; then four recordings whose person comes from the markers. One "
+        "core, beside other work: frames a second of wall time are lower bounds. Where we lose: strays in the very "
+        "first frame, and acrobatics, where a quarter of the frames does not settle."),
+    "c3d": (
+        "Person and motion from real recordings",
+        "python tests/benchmarks/c3d.py FOLDER -m MODEL", recordings,
+        "One layout for four people. Its firm markers were moved by their mean residual over these same files, so "
+        "the figures are not of unseen data; markers that the layout calls loose are sought on each person. As the "
+        "layout has them, all of them fixed, the mean is above 20 mm."),
+    "tracking": (
+        "Frames of points without markers",
+        "python tests/benchmarks/tracking.py tracking.json", tracking,
+        "A walk of 120 frames at 30 Hz of an embedded person who is not in the model of the embedded people, two "
+        "depth cameras with 5 mm noise, no landmarks. `surface`: the model's vertices to the true surface of the "
+        "whole body."),
+}
