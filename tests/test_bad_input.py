@@ -129,7 +129,8 @@ CASES = {
                                          ["half.landmarks.json", "head"]),
     "two landmarks": (COMPLETE, text("half.landmarks.json", '{"head": [0, 0, 0], "tail": [1, 0, 0]}'),
                       ["half.landmarks.json", "3"]),
-    "no landmark file": (COMPLETE, remove("half.landmarks.json"), ["half", "landmarks"]),
+    "no such landmark file": (COMPLETE + " --landmarks clicks.json", lambda place: None,
+                              ["clicks.json", "no such file"]),
     "landmarks cut off": (COMPLETE, text("half.landmarks.json", '{"head": [0, 0'), ["half.landmarks.json"]),
     "model of the future": (COMPLETE, model_of_version(99), ["model.npz", "version 99"]),
     "model that is none": (COMPLETE, text("model.npz", "nothing"), ["model.npz"]),
@@ -167,6 +168,8 @@ def test_the_good_files_are_good(place, capsys):
     """Or the cases above would prove nothing."""
     assert main(COMPLETE.split()) == 0
     assert main(ANIMATE.replace("-o out", "-o out2").split()) == 0
-    assert {"completed.ply", "predicted.ply", "completion.npz", "report.html", "report.json"} == {
+    assert {"completed.ply", "predicted.ply", "completion.npz", "picture.png", "report.html", "report.json"} == {
         p.name for p in (place / "out").iterdir()}
-    assert {"motion.npz", "animation.glb", "report.html", "report.json"} == {p.name for p in (place / "out2").iterdir()}
+    assert {"motion.npz", "animation.glb", "motion.bvh", "joint_angles.csv", "joint_centres.csv", "residuals.csv",
+            "subject.json", "layout.json",
+            "report.html", "report.json"} == {p.name for p in (place / "out2").iterdir()}

@@ -84,16 +84,17 @@ def animate_file(work: Work, path: Path, output: Path, finding: Progress, follow
     """Follow the markers of a file, write everything into a folder, and return the figures."""
     sequence = read_markers(path, work.unit, work.who)
     layout, name = work.read_layout(sequence.labels)
-    output.mkdir(parents=True, exist_ok=True)
     metrics = [Metric("model", work.name), Metric("layout", name)]
-    body = work.subject
+    body, found = work.subject, None
     if body is None:
         found = subject_from_markers(work.model, sequence, layout, work.shape, finding)
         body, layout = work.model.subject(found.betas), found.layout
-        storage.write_json(output / "subject.json", {"betas": found.betas.tolist(), "frames": found.frames.tolist()})
-        layout.save(output / "layout.json")
         metrics.append(Metric("subject", f"{len(found.betas)} betas from {len(found.frames)} frames"))
     motion = animate(body, sequence, layout, work.animate, following)
+    output.mkdir(parents=True, exist_ok=True)
+    if found is not None:
+        storage.write_json(output / "subject.json", {"betas": found.betas.tolist(), "frames": found.frames.tolist()})
+        layout.save(output / "layout.json")
     metrics += figures(motion, sequence)
     _write(work, output, motion, body)
     page = motion_page(motion, body, sequence, path.name, rows(metrics))

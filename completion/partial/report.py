@@ -22,6 +22,7 @@ from .scan import View, all_points, as_views, in_metres
 MEASURED, COMPLETED = (0.55, 0.67, 0.80), (0.93, 0.75, 0.42)
 CLOTHING, MARK = (0.62, 0.48, 0.66), (0.80, 0.12, 0.10)
 HEIGHT = 520
+WIDEST = 2.0                         # times as wide as high a picture of one side may be
 SIDES = ("from the camera", "from the right of it", "from the other side", "from the left of it")
 FEW = 9000                           # points of a bare cloud that a picture shows
 
@@ -37,7 +38,6 @@ def picture_completion(scan: View | Sequence[View], completion: Completion, temp
     masked : (n,) bool, optional
         Points of the scan that are clothing or hair, shown in another colour.
     """
-    height = height or HEIGHT
     views = [sides(completion, template)[turn] for turn in (0, 2)]
     body, colors = completion.completed, _two_colors(completion)
     given = scan_shapes(scan, masked, completion.scale)
@@ -45,7 +45,7 @@ def picture_completion(scan: View | Sequence[View], completion: Completion, temp
         (given, views[0], "scan, from the camera"), (given, views[1], "scan, from behind"),
         ([Solid(body, colors)], views[0], "completed"), ([Solid(body, colors)], views[1], "completed, from behind"),
         ([Solid(completion.predicted)], views[1], "predicted, from behind")]
-    width = _width(views, height)
+    width, height = _size(views, height or HEIGHT)
     return side_by_side([render(shape, view, width, height) for shape, view, _ in shown],
                         [label for _, _, label in shown])
 
@@ -83,8 +83,7 @@ def picture_distance(mesh: Mesh, distance: np.ndarray, views: Sequence[Camera], 
                      height: int | None = None, title: str = "distance", labels: Sequence[str] | None = None
                      ) -> np.ndarray:
     """A mesh coloured by a distance (N,) in metres from several sides, with its colour bar; grey where it is NaN."""
-    height = height or HEIGHT
-    width = _width(views, height)
+    width, height = _size(views, height or HEIGHT)
     colored = Solid(mesh, heat(distance, 0.0, high))
     images = [render(colored, view, width, height) for view in views]
     return side_by_side([side_by_side(images, labels), color_bar(0.0, high, title)], columns=1)
@@ -122,16 +121,16 @@ def completion_page(scan: View | Sequence[View], completion: Completion, templat
                 + (" Violet is clothing or hair: the body is somewhere inside." if masked is not None else ""))
     page.picture(picture_completion(scan, completion, template, masked=masked) if picture is None else picture)
     page.table(rows, ("metric", "value", "unit"))
-    width = _width(cameras, HEIGHT)
+    width, height = _size(cameras, HEIGHT)
     marks = [] if landmarks is None else [Dots(completion.scale * np.asarray(landmarks[1]), MARK, 0.012, True)]
     page.section("From all sides", "The completed body." + (" Red: where the landmarks are on the scan."
                                                             if marks else ""))
-    page.picture(side_by_side([render([Solid(plain, _two_colors(completion)), *marks], view, width, HEIGHT)
+    page.picture(side_by_side([render([Solid(plain, _two_colors(completion)), *marks], view, width, height)
                                for view in cameras], SIDES))
     if body.colors is not None:
         page.section("Colours", "Carried over from the scan where it was seen; elsewhere grey, or spread smoothly when "
                      "--fill-colors asks for it.")
-        page.picture(side_by_side([render(Solid(body), view, width, HEIGHT) for view in cameras], SIDES))
+        page.picture(side_by_side([render(Solid(body), view, width, height) for view in cameras], SIDES))
     _distances(page, scan, completion, cameras, masked)
     _confidence(page, completion, cameras)
     return page
@@ -172,5 +171,8 @@ def _up(completion: Completion, template: Mesh) -> int:
     return up if turned[up] > 0.6 else int(np.argmax(turned))
 
 
-def _width(views: Sequence[Camera], height: int) -> int:
-    return int(height * max(view.width / view.height for view in views)) + 10
+def _size(views: Sequence[Camera], height: int) -> tuple[int, int]:
+    """Width and height of a picture in which all views fit; one of something long is less high."""
+    aspect = max(view.width / view.height for view in views)
+    height = max(1, min(height, round(WIDEST * height / aspect)))
+    return int(height * aspect) + 10, height

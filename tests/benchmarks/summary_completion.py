@@ -86,10 +86,10 @@ COMPLETION: dict[str, tuple[str, str, Callable[[dict], str], str]] = {
     "half_people": (
         "Half views of held-out men, unknown shape",
         "python tests/benchmarks/half_people.py -m MODEL --nearest --points DIR; --poisson DIR", half_people,
-        "45 men, seven landmarks, 40 components, settings chosen on 37 of the training men with a model without "
-        "them; six of the 45 had been run once before, with a pose prior that did not know how people stand. The "
-        "nearest training body is the nearest of 182 by trimmed closest points; bent: made the template of a pose- "
-        "only model and fitted by our own solver. Poisson has no vertices in common with the truth."),
+        "45 men, seven landmarks, 40 components, settings chosen on a dozen of the training men with a model "
+        "without them; six of the 45 had been run once before, with a pose prior that did not know how people stand. "
+        "The nearest training body is the nearest of 182 by trimmed closest points; bent: made the template of a "
+        "pose-only model and fitted by our own solver. Poisson has no vertices in common with the truth."),
     "markers": (
         "Markers on random vertices of held-out poses, and real recordings",
         "python tests/benchmarks/markers.py -m FOLD_0 --c3d FOLDER --people MODEL", markers,
