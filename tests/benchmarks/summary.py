@@ -200,6 +200,8 @@ SECTIONS: dict[str, tuple[str, str, Callable[[dict], str], str]] = {
     **COMPLETION,
 }
 
+BESIDE = {"half_people": "half_people_poisson"}      # a run with another library, in the same table
+
 
 def main() -> None:
     """Collect and write."""
@@ -212,6 +214,8 @@ def main() -> None:
         if not path.exists():
             continue
         report = json.loads(path.read_text())
+        if name in BESIDE:
+            report["beside"] = json.loads((folder / f"{BESIDE[name]}.json").read_text())
         machine = report.get("machine") or report.get("versions") or {}
         facts = ", ".join(f"{key} {value}" for key, value in machine.items())
         parts.append(f"\n## {title}\n\n`{command}` on {facts}.\n\n{section(report)}\n\n{note}\n")

@@ -23,9 +23,11 @@ def half_people(report: dict) -> str:
     mean = report["mean"]
     kinds = [(label, name) for label, name in (
         ("completed", "completed"), ("predicted", "predicted"), ("nearest training body, moved", "nearest_rigid"),
-        ("nearest training body, bent", "nearest_posed"), ("screened Poisson", "poisson")) if f"{name}_seen_mm" in mean]
+        ("nearest training body, bent", "nearest_posed")) if f"{name}_seen_mm" in mean]
     rows: Rows = [(label, mean[f"{name}_seen_mm"], mean.get(f"{name}_unseen_mm", ""), mean[f"{name}_closest_mm"])
                   for label, name in kinds]
+    poisson = report["beside"]["mean"]
+    rows.append(("screened Poisson", poisson["seen_mm"], "", poisson["closest_mm"]))
     facts: Rows = [(r["k"], r["completed_seen_mm"], r["completed_unseen_mm"], r["predicted_unseen_mm"],
                     r.get("nearest_posed_unseen_mm", ""), r["expected_mm"], r["rms_mm"], r["cpu_seconds"])
                    for r in report["rows"]]
