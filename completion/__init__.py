@@ -1,4 +1,4 @@
-"""The whole body from a partial scan or from markers.
+"""The whole body from a partial scan, from markers, or from frames of points.
 
 The public names are loaded when they are first used, so that the command line answers at once.
 """
@@ -11,6 +11,7 @@ if TYPE_CHECKING:
     from .animation.retarget import morphed_vertices, retarget
     from .animation.shape import MarkerShapeConfig, MarkerSubject, subject_from_markers
     from .animation.stream import Frame, MarkerStream
+    from .embedded import embedded_model
     from .markers.files import MarkerSequence, read_markers, write_markers
     from .markers.layout import MarkerLayout
     from .markers.named import layout_names
@@ -28,6 +29,7 @@ _ROOMS = {
     "animation.retarget": ("morphed_vertices", "retarget"),
     "animation.shape": ("MarkerShapeConfig", "MarkerSubject", "subject_from_markers"),
     "animation.stream": ("Frame", "MarkerStream"),
+    "embedded": ("embedded_model",),
     "markers.files": ("MarkerSequence", "read_markers", "write_markers"),
     "markers.layout": ("MarkerLayout",),
     "markers.named": ("layout_names",),
@@ -43,8 +45,8 @@ _ROOM_OF = {name: room for room, names in _ROOMS.items() for name in names}
 
 __all__ = ["AnimateConfig", "ColorConfig", "Completion", "CompletionConfig", "Frame", "MarkerLayout", "MarkerSequence",
            "MarkerShapeConfig", "MarkerStream", "MarkerSubject", "Motion", "TrackConfig", "animate", "carry_colors",
-           "complete", "joint_angles", "joint_centres", "layout_names", "morphed_vertices", "read_markers",
-           "read_mask", "retarget", "subject_from_markers", "track", "write_markers"]
+           "complete", "embedded_model", "joint_angles", "joint_centres", "layout_names", "morphed_vertices",
+           "read_markers", "read_mask", "retarget", "subject_from_markers", "track", "write_markers"]
 
 
 def __getattr__(name: str) -> Any:
