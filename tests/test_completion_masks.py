@@ -4,20 +4,14 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from completion_bodies import half_view, worm_with_prior
+from completion_bodies import MARKS, POSE, QUICK, TRANS, half_view, worm_with_prior
 
 from completion.partial.completion import complete
 from completion.partial.masks import Cover, part_vertices, read_mask
 from completion.partial.scan import prepare_scan
-from completion.partial.settings import CompletionConfig
 from scanprep.geometry.files import PointCloud, write_mesh, write_points
 from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.surface import Surface
-
-POSE = np.array([[0.3, -0.5, 0.8], [0.2, 0.5, -0.4], [-0.1, -0.6, 0.3], [0.3, 0.1, 0.5]])
-TRANS = np.array([0.4, -0.3, 1.1])
-MARKS = np.array([6, 75, 130, 200, 255, 330, 396])
-QUICK = CompletionConfig(draws=6, rounds=5, scan_points=800, model_points=300, candidates=2, start_axes=2)
 
 
 @pytest.fixture(scope="module")

@@ -3,24 +3,19 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from completion_bodies import half_view, worm_with_prior
+from completion_bodies import MARKS, POSE, QUICK, TRANS, half_view, worm_with_prior
 
 from completion.bodies import as_body
 from completion.partial.completion import complete
 from completion.partial.scale import LOOSE, ScaledBody, landmark_scale, rough_scale
 from completion.partial.scan import as_views, prepare_scan
-from completion.partial.settings import CompletionConfig
 from completion.partial.sight import Sights, find_sights
 from scanprep.geometry.files import PointCloud
 from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.surface import Surface
 
-POSE = np.array([[0.3, -0.5, 0.8], [0.2, 0.5, -0.4], [-0.1, -0.6, 0.3], [0.3, 0.1, 0.5]])
-TRANS = np.array([0.4, -0.3, 1.1])
 BETAS = np.array([1.2, -0.8, 0.5])
-MARKS = np.array([6, 75, 130, 200, 255, 330, 396])
 FROM = (np.array([0.3, -1, 0.5]), np.array([-0.9, 0.6, 0.1]))
-QUICK = CompletionConfig(draws=6, rounds=5, scan_points=800, model_points=300, candidates=2, start_axes=2)
 
 
 @pytest.fixture(scope="module")
