@@ -1,0 +1,1 @@
+"""Shape, pose and soft tissue of people from markers alone [MoSh]."""

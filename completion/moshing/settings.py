@@ -1,0 +1,140 @@
+"""What may be chosen when bodies are found from markers alone."""
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+from typing import Literal
+
+Attachment = Literal["triangle", "neighbourhood"]
+
+
+@dataclass(frozen=True)
+class PersonConfig:
+    """Settings of `find_person`: the shape of a person and where the markers really sit, from some frames.
+
+    Weights are those of the paper: on squared distances in centimetres, on squared standard deviations of betas and
+    on the squared Mahalanobis distance of poses.
+
+    Attributes
+    ----------
+    frames : int
+        Frames that are used, over all sequences.
+    choice : "spread" or "random"
+        Frames that differ most, or drawn at random.
+    n_betas : int
+        Betas that are looked for, at most; the others stay zero.
+    attachment : "triangle" or "neighbourhood"
+        A latent marker in the coordinate frame of its nearest triangle, or as a sum of the neighbours of its
+        nearest vertex and the normal there.
+    data, surface, initial, shape, pose : float
+        Weights of the terms: markers against their simulation, prescribed distance from the skin, usual place,
+        shape and pose priors.
+    loose : float
+        Weight of the usual place of markers that the layout calls loose.
+    annealing : floats
+        Factors on the last three weights, one stage each.
+    outlier : float, metres
+        Residual at which a marker has lost three quarters of its weight.
+    prior_shrinkage : float in [0, 1]
+        See `gaussian_prior`.
+    start_axes : int
+        Directions of the training poses along which the pose of each frame is searched.
+    iterations : int
+        Most steps of each stage.
+    seed : int
+        Of the frames drawn at random.
+    """
+
+    frames: int = 12
+    choice: Literal["spread", "random"] = "spread"
+    n_betas: int = 40
+    attachment: Attachment = "triangle"
+    data: float = 0.75
+    surface: float = 100.0
+    initial: float = 0.25
+    shape: float = 1.0
+    pose: float = 0.25
+    loose: float = 0.0025
+    annealing: tuple[float, ...] = (40.0, 20.0, 10.0, 4.0, 2.0, 1.0)
+    outlier: float = 0.06
+    prior_shrinkage: float = 0.3
+    start_axes: int = 6
+    iterations: int = 8
+    seed: int = 0
+
+
+@dataclass(frozen=True)
+class FollowConfig:
+    """Settings of the poses of every frame of a person whose shape and markers are known.
+
+    Attributes
+    ----------
+    data, pose, velocity : float
+        Weights of the terms, in the paper's units: markers, pose prior, and change of velocity from frame to frame.
+    outlier : float, metres
+        Residual at which a marker has lost three quarters of its weight.
+    prior_shrinkage : float in [0, 1]
+        See `gaussian_prior`.
+    """
+
+    data: float = 0.75
+    pose: float = 1.0
+    velocity: float = 6.25
+    outlier: float = 0.06
+    prior_shrinkage: float = 0.3
+
+
+@dataclass(frozen=True)
+class SoftTissueConfig:
+    """Settings of `follow_soft_tissue`.
+
+    Attributes
+    ----------
+    n_betas : int
+        Components in which the shape may change, more than those of a person; all that the model has, at most.
+    data, pose, velocity : float
+        As in `FollowConfig`.
+    change : float
+        Weight on the squared change of betas from the person's own.
+    steadiness : float
+        Weight on the squared second difference of that change over time.
+    iterations : int
+        Rounds over the whole sequence.
+    """
+
+    n_betas: int = 200
+    data: float = 0.75
+    pose: float = 1.0
+    velocity: float = 6.25
+    change: float = 0.25
+    steadiness: float = 0.0
+    iterations: int = 3
+
+
+@dataclass(frozen=True)
+class FaultConfig:
+    """Settings of `find_faults`; the room that finds them says what they mean."""
+
+
+@dataclass(frozen=True)
+class MoshConfig:
+    """Settings of `mosh`.
+
+    Attributes
+    ----------
+    person : PersonConfig
+        Shape and marker places, from some frames.
+    follow : FollowConfig
+        Poses of all frames.
+    soft : SoftTissueConfig
+        The shape that changes with time.
+    faults : FaultConfig
+        What is wrong with the markers.
+    soft_tissue : bool
+        Let the shape change with time.
+    """
+
+    person: PersonConfig = field(default_factory=PersonConfig)
+    follow: FollowConfig = field(default_factory=FollowConfig)
+    soft: SoftTissueConfig = field(default_factory=SoftTissueConfig)
+    faults: FaultConfig = field(default_factory=FaultConfig)
+    soft_tissue: bool = True
