@@ -77,18 +77,26 @@ class MarkedBody:
         [SCAPE] §8
         """
         pose, trans, _ = self.body.split(x)
-        B, n = len(x), self.body.n_angles
+        n = self.body.n_angles
         energy, gradient, hessian = point_system(self.shapes, pose, trans, targets, weights)
+        prior = self.prior_system(pose, stiff)
+        gradient[:, :n] += prior[1]
+        hessian[:, :n, :n] += prior[2]
+        return energy + prior[0], gradient, hessian
+
+    def prior_system(self, pose: np.ndarray, stiff: float = 1.0) -> System:
+        """The pose prior at poses (B, J, 3): energy (B,), half its gradient (B, 3J), its matrix (B, 3J, 3J)."""
         pose = twists(pose)
+        B, n = len(pose), self.body.n_angles
         local = rotations.inverse_right_jacobian(pose)                                           # dpose = local d
         off = pose.reshape(B, n) - self.prior.mean
         precision = stiff * self._precision
         pull = off @ precision
-        gradient[:, :n] += (pull.reshape(B, -1, 1, 3) @ local).reshape(B, n)
+        gradient = (pull.reshape(B, -1, 1, 3) @ local).reshape(B, n)
         half = precision.reshape(n, -1, 3).swapaxes(0, 1) @ local                          # (B, J, n, 3)
         half = half.reshape(B, -1, n // 3, 3, 3).swapaxes(-1, -2)                                # transposed rows
-        hessian[:, :n, :n] += (half @ local[:, None]).transpose(0, 1, 3, 2, 4).reshape(B, n, n)
-        return energy + (pull * off).sum(axis=1), gradient, hessian
+        hessian = (half @ local[:, None]).transpose(0, 1, 3, 2, 4).reshape(B, n, n)
+        return (pull * off).sum(axis=1), gradient, hessian
 
     def retract(self, x: np.ndarray, step: np.ndarray) -> np.ndarray:
         """The unknowns (..., P) after a step (..., P); poses come out at most a half turn long."""

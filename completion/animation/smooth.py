@@ -6,7 +6,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 from scipy.linalg import solveh_banded
 
-from .marked import BATCH
+from .marked import BATCH, MarkedBody
 
 if TYPE_CHECKING:
     from .follow import MarkerFollower
@@ -34,13 +34,30 @@ def smooth_sequence(follower: MarkerFollower, x: np.ndarray, frames: np.ndarray 
         return x
     frames = np.arange(T) if frames is None else frames
     gradient, hessian = _measured(follower, x, frames)
-    step = np.empty_like(x)
+    step = coupled_steps(follower.body, follower.inertia, x, gradient, hessian)
+    longest = np.abs(step).max(axis=1, keepdims=True)
+    return follower.body.retract(x, step * np.minimum(1, FURTHEST / np.maximum(longest, 1e-12)))
+
+
+def coupled_steps(body: MarkedBody, inertia: np.ndarray, x: np.ndarray, gradient: np.ndarray, hessian: np.ndarray
+                  ) -> np.ndarray:
+    """The step (T, P) of frames that follow each other, T at least 3, window by window.
+
+    Parameters
+    ----------
+    body : MarkedBody
+    inertia : (P,) float
+        Weight on the squared change of velocity.
+    x : (T, P) float
+    gradient, hessian : (T, P), (T, P, P) float
+        Half the gradient and the Gauss-Newton matrix of everything but the change of velocity.
+    """
+    T, step = len(x), np.empty_like(x)
     for start in range(0, T, WINDOW):
         near = slice(max(0, min(start - OVERLAP, T - 3)), min(T, start + WINDOW + OVERLAP))
         kept = slice(start - near.start, min(start + WINDOW, T) - near.start)
-        step[start:start + WINDOW] = _window_step(follower, x[near], gradient[near], hessian[near])[kept]
-    longest = np.abs(step).max(axis=1, keepdims=True)
-    return follower.body.retract(x, step * np.minimum(1, FURTHEST / np.maximum(longest, 1e-12)))
+        step[start:start + WINDOW] = _window_step(body, inertia, x[near], gradient[near], hessian[near])[kept]
+    return step
 
 
 def _measured(follower: MarkerFollower, x: np.ndarray, frames: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -58,17 +75,18 @@ def _measured(follower: MarkerFollower, x: np.ndarray, frames: np.ndarray) -> tu
     return gradient, hessian
 
 
-def _window_step(follower: MarkerFollower, x: np.ndarray, gradient: np.ndarray, hessian: np.ndarray) -> np.ndarray:
+def _window_step(body: MarkedBody, inertia: np.ndarray, x: np.ndarray, gradient: np.ndarray, hessian: np.ndarray
+                 ) -> np.ndarray:
     """The step (T, P) in small turns for the unknowns (T, P) of some frames that follow each other."""
     T, P = x.shape
     gradient = gradient.copy()
-    bend = np.diff(follower.body.step_to(x[:-1], x[1:]), axis=0)
+    bend = np.diff(body.step_to(x[:-1], x[1:]), axis=0)
     D = np.array([1.0, -2.0, 1.0])
     band = np.zeros((3, T, P))                       # of a frame with itself, the next and the one after
     for i in range(3):
-        gradient[i:T - 2 + i] += D[i] * follower.inertia * bend
+        gradient[i:T - 2 + i] += D[i] * inertia * bend
         for j in range(i, 3):
-            band[j - i, i:T - 2 + i] += D[i] * D[j] * follower.inertia
+            band[j - i, i:T - 2 + i] += D[i] * D[j] * inertia
     return -_solve_banded(hessian, band, gradient)
 
 
