@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from .markers.files import MarkerSequence, read_markers, write_markers
     from .markers.layout import MarkerLayout
     from .markers.named import layout_names
+    from .moshing.soft import follow_soft_tissue
     from .motion import Motion
     from .partial.colors import ColorConfig, carry_colors
     from .partial.completion import Completion, complete
@@ -33,6 +34,7 @@ _ROOMS = {
     "markers.files": ("MarkerSequence", "read_markers", "write_markers"),
     "markers.layout": ("MarkerLayout",),
     "markers.named": ("layout_names",),
+    "moshing.soft": ("follow_soft_tissue",),
     "motion": ("Motion",),
     "partial.colors": ("ColorConfig", "carry_colors"),
     "partial.completion": ("Completion", "complete"),
@@ -45,7 +47,7 @@ _ROOM_OF = {name: room for room, names in _ROOMS.items() for name in names}
 
 __all__ = ["AnimateConfig", "ColorConfig", "Completion", "CompletionConfig", "Frame", "MarkerLayout", "MarkerSequence",
            "MarkerShapeConfig", "MarkerStream", "MarkerSubject", "Motion", "TrackConfig", "animate", "carry_colors",
-           "complete", "embedded_model", "joint_angles", "joint_centres", "layout_names", "morphed_vertices",
+           "complete", "embedded_model", "follow_soft_tissue", "joint_angles", "joint_centres", "layout_names", "morphed_vertices",
            "read_markers", "read_mask", "retarget", "subject_from_markers", "track", "write_markers"]
 
 

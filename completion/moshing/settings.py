@@ -91,7 +91,7 @@ class SoftTissueConfig:
     ----------
     n_betas : int
         Components in which the shape may change, more than those of a person; all that the model has, at most.
-    data, pose, velocity : float
+    data, pose, velocity, outlier, prior_shrinkage
         As in `FollowConfig`.
     change : float
         Weight on the squared change of betas from the person's own.
@@ -107,6 +107,8 @@ class SoftTissueConfig:
     velocity: float = 6.25
     change: float = 0.25
     steadiness: float = 0.0
+    outlier: float = 0.06
+    prior_shrinkage: float = 0.3
     iterations: int = 3
 
 

@@ -1,0 +1,142 @@
+"""Markers on a body whose shape changes: the places, and the normal equations of poses and changes."""
+from __future__ import annotations
+
+import numpy as np
+
+from model.body import BodyModel
+from model.linear import posed_product
+from scanprep.geometry import rotations
+
+from ..animation.marked import BATCH, MarkedBody, supports
+from ..markers.layout import MarkerLayout
+
+SAMPLES = 12                         # poses over which the turning of the normals by betas is averaged
+
+System = tuple[np.ndarray, np.ndarray, np.ndarray]
+
+
+class SwayingBody:
+    """A person with markers whose shape changes by betas Δ (K,) around their own.
+
+    Markers are affine in Δ, `y(θ) + D(θ) Δ`, and D (3L, K) is a linear function of products of features and
+    rotations: for a batch of poses it is one matrix product.
+
+    Parameters
+    ----------
+    model : BodyModel
+    betas : (k,) float
+        The person's own.
+    layout : MarkerLayout
+    n_betas : int
+        K, components in which the shape may change.
+    prior_weight, prior_shrinkage : float
+        See `MarkedBody`.
+    poses : (T, J, 3) float, radians
+        Some that occur: the normals of the skin are followed best near them.
+    """
+
+    def __init__(self, model: BodyModel, betas: np.ndarray, layout: MarkerLayout, n_betas: int, prior_weight: float,
+                 prior_shrinkage: float, poses: np.ndarray) -> None:
+        self.marked = MarkedBody(model.subject(betas), layout, prior_weight, prior_shrinkage)
+        self.count, self.n_betas = self.marked.count, n_betas
+        self.terms = model.terms
+        self._flat = self._slopes(model, betas, layout, poses)
+
+    def _slopes(self, model: BodyModel, betas: np.ndarray, layout: MarkerLayout, poses: np.ndarray) -> np.ndarray:
+        """(3M, K L): the change of the markers with betas, normals included."""
+        ids, weights = supports(model.template, layout)
+        distances = np.asarray(layout.distances)
+        if not distances.any():
+            ids, weights = ids[::3], weights[::3]
+        shaped = model.points(ids, weights, self.n_betas)
+        basis = shaped.shape_basis
+        if distances.any():
+            some = poses[np.linspace(0, len(poses) - 1, min(SAMPLES, len(poses))).round().astype(int)]
+            operator = shaped.operator(np.pad(betas[:self.n_betas], (0, max(0, self.n_betas - len(betas)))))
+            part, turning = normal_slopes(operator.evaluate(some), np.stack([shaped.shape_jacobian(p) for p in some]),
+                                          self.terms.skeleton.part_rotations(some))
+            basis = basis[:, :, ::3].copy()
+            plain = self.terms.features.constant[self.terms.feature] == 1
+            for i, p in enumerate(part):
+                row = np.flatnonzero(plain & (self.terms.part == p))[0]
+                basis[:, row, i] += distances[i] * turning[i].T
+        return np.ascontiguousarray(basis.transpose(1, 3, 0, 2)).reshape(3 * basis.shape[1], -1)
+
+    def slopes(self, pose: np.ndarray) -> np.ndarray:
+        """Derivative (B, K, 3, L) of the markers by betas at poses (B, J, 3), metres."""
+        D = posed_product(self.terms, self._flat, pose)
+        return D.reshape(len(pose), 3, self.n_betas, self.count).swapaxes(1, 2)
+
+    def positions(self, x: np.ndarray, changes: np.ndarray) -> np.ndarray:
+        """Where the body puts the markers (T, L, 3), metres, for unknowns (T, P) and changes (T, K)."""
+        pose, trans, _ = self.marked.body.split(x)
+        y = np.empty((len(x), self.count, 3))
+        for start in range(0, len(x), BATCH):
+            some = slice(start, start + BATCH)
+            D = self.slopes(pose[some])
+            y[some] = np.swapaxes(self.marked.shapes.evaluate(pose[some], trans[some]), 1, 2)
+            y[some] += np.einsum("bk,bkdl->bld", changes[some], D)
+        return y
+
+    def system(self, x: np.ndarray, changes: np.ndarray, targets: np.ndarray, weights: np.ndarray) -> System:
+        """Markers and pose prior: energy (B,), half its gradient (B, P + K) and Gauss-Newton matrix.
+
+        Parameters
+        ----------
+        x : (B, P) float
+        changes : (B, K) float
+        targets : (B, L, 3) float, metres
+            NaN where a marker was not seen.
+        weights : (B, L) float
+            Factor on the squared distance.
+        """
+        pose, trans, _ = self.marked.body.split(x)
+        y, by_turn = self.marked.shapes.columns(pose, trans)
+        D = self.slopes(pose)
+        y += (changes[:, None] @ D.reshape(len(x), self.n_betas, -1)).reshape(y.shape)
+        (B, n), P, L = by_turn.shape[:2], x.shape[1], self.count
+        missing = np.isnan(targets[..., 0])
+        root = np.sqrt(np.where(missing, 0.0, weights))[:, None]
+        residual = (root * np.where(missing[:, None], 0.0, y - np.swapaxes(targets, -1, -2))).reshape(B, -1)
+        A = np.empty((B, P + self.n_betas, 3, L))
+        np.multiply(by_turn, root[:, None], out=A[:, :n])
+        A[:, n:P] = np.eye(3)[:, :, None] * root[:, None]
+        np.multiply(D, root[:, None], out=A[:, P:])
+        A = A.reshape(B, P + self.n_betas, -1)
+        energy, gradient, hessian = (residual**2).sum(axis=1), (A @ residual[..., None])[..., 0], A @ A.swapaxes(1, 2)
+        prior = self.marked.prior_system(pose)
+        gradient[:, :n] += prior[1]
+        hessian[:, :n, :n] += prior[2]
+        return energy + prior[0], gradient, hessian
+
+
+def normal_slopes(supports: np.ndarray, slopes: np.ndarray, R: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """How the normals of the skin turn with betas, in the frame of the part in which that changes least.
+
+    Parameters
+    ----------
+    supports : (S, 3L, 3) float, metres
+        Three points of the skin for each marker, as `energy.above_skin` takes them, in some poses.
+    slopes : (S, 3L, 3, K) float
+        Their derivative by betas.
+    R : (S, J, 3, 3) float
+        Rotations of the parts.
+
+    Returns
+    -------
+    (L,) int
+        The part.
+    (L, 3, K) float
+        Derivative of the unit normal in its frame, the mean over the poses.
+    """
+    p = supports.reshape(len(supports), -1, 3, 3)
+    J = slopes.reshape(*p.shape, -1)
+    u, v = p[:, :, 1] - p[:, :, 0], p[:, :, 2] - p[:, :, 0]
+    c = np.cross(u, v)
+    length = np.linalg.norm(c, axis=-1)[..., None]
+    n = c / length
+    tangent = (np.eye(3) - n[..., :, None] * n[..., None, :]) / length[..., None]
+    dn = tangent @ (rotations.hat(u) @ (J[:, :, 2] - J[:, :, 0]) - rotations.hat(v) @ (J[:, :, 1] - J[:, :, 0]))
+    local = np.swapaxes(R, -1, -2)[:, :, None] @ n[:, None, ..., None]                    # (S, J, L, 3, 1)
+    part = local.var(axis=0).sum(axis=(-1, -2)).argmin(axis=0)
+    return part, (np.swapaxes(R, -1, -2)[:, part] @ dn).mean(axis=0)
