@@ -45,10 +45,11 @@ _ROOMS = {
 }
 _ROOM_OF = {name: room for room, names in _ROOMS.items() for name in names}
 
-__all__ = ["AnimateConfig", "ColorConfig", "Completion", "CompletionConfig", "Frame", "MarkerLayout", "MarkerSequence",
-           "MarkerShapeConfig", "MarkerStream", "MarkerSubject", "Motion", "TrackConfig", "animate", "carry_colors",
-           "complete", "embedded_model", "follow_soft_tissue", "joint_angles", "joint_centres", "layout_names", "morphed_vertices",
-           "read_markers", "read_mask", "retarget", "subject_from_markers", "track", "write_markers"]
+__all__ = ["AnimateConfig", "ColorConfig", "Completion", "CompletionConfig", "Frame", "MarkerLayout",
+           "MarkerSequence", "MarkerShapeConfig", "MarkerStream", "MarkerSubject", "Motion", "TrackConfig", "animate",
+           "carry_colors", "complete", "embedded_model", "follow_soft_tissue", "joint_angles", "joint_centres",
+           "layout_names", "morphed_vertices", "read_markers", "read_mask", "retarget", "subject_from_markers",
+           "track", "write_markers"]
 
 
 def __getattr__(name: str) -> Any:
