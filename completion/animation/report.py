@@ -35,13 +35,18 @@ def picture_frames(motion: Motion, subject: Subject, markers: MarkerSequence | N
 def picture_worst(motion: Motion, subject: Subject, markers: MarkerSequence, count: int = 8, height: int = 360
                   ) -> np.ndarray:
     """The frames with the largest mean residual, at least a quarter of a second apart."""
+    return _frames_in_a_row(motion, subject, markers, worst_frames(motion, count), height, 35.0)
+
+
+def worst_frames(motion: Motion, count: int) -> np.ndarray:
+    """At most so many frames, in order: those with the largest mean residual, at least a quarter of a second apart."""
     off = np.where(np.isfinite(motion.residuals), motion.residuals, 0).sum(axis=1)
     off /= np.maximum(np.isfinite(motion.residuals).sum(axis=1), 1)
     frames: list[int] = []
     for t in np.argsort(-off):
         if len(frames) < count and all(abs(int(t) - other) >= motion.rate / 4 for other in frames):
             frames.append(int(t))
-    return _frames_in_a_row(motion, subject, markers, np.sort(frames), height, 35.0)
+    return np.sort(frames).astype(int)
 
 
 def _frames_in_a_row(motion: Motion, subject: Subject, markers: MarkerSequence | None, frames: np.ndarray,

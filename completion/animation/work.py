@@ -69,15 +69,26 @@ class Work:
 
     def read_layout(self, labels: tuple[str, ...]) -> tuple[MarkerLayout, str]:
         """The layout for these labels, and its name."""
-        kept = self.model.info.get("people_vertices")
-        of_people = None if kept is None else np.array(kept)
-        if self.layout is None:
-            return fitting_layout(labels, self.model.template, of_people)
-        if self.layout in layout_names():
-            return MarkerLayout.named(self.layout, self.model.template, of_people), self.layout
-        if not Path(self.layout).exists():
-            raise ValueError(f"--layout: expected a file or one of {', '.join(layout_names())}, got '{self.layout}'")
-        return MarkerLayout.load(self.layout, len(self.model.template.vertices)), self.layout
+        return choose_layout(self.model, self.layout, labels)
+
+
+def choose_layout(model: BodyModel, given: str | None, labels: tuple[str, ...]) -> tuple[MarkerLayout, str]:
+    """The layout that is named, or in a file, or the named one that fits some labels best; and its name.
+
+    Raises
+    ------
+    ValueError
+        Neither a name nor a file, a body on which the named one is not known.
+    """
+    kept = model.info.get("people_vertices")
+    of_people = None if kept is None else np.array(kept)
+    if given is None:
+        return fitting_layout(labels, model.template, of_people)
+    if given in layout_names():
+        return MarkerLayout.named(given, model.template, of_people), given
+    if not Path(given).exists():
+        raise ValueError(f"--layout: expected a file or one of {', '.join(layout_names())}, got '{given}'")
+    return MarkerLayout.load(given, len(model.template.vertices)), given
 
 
 def animate_file(work: Work, path: Path, output: Path, finding: Progress, following: Progress) -> list[Metric]:
@@ -191,12 +202,12 @@ def morph_keys(given: BetasTo, motion: Motion) -> dict[float, np.ndarray]:
 
 def settings_key(work: Work, path: Path, given: dict[str, Any]) -> str:
     """A digest of all that the output of a file depends on: settings, the file, and files that settings name."""
-    told = {"given": {name: _told(value) for name, value in given.items()}, "animate": plain(work.animate),
-            "shape": plain(work.shape), "model": work.name, "file": _told(path)}
+    told = {"given": {name: contents(value) for name, value in given.items()}, "animate": plain(work.animate),
+            "shape": plain(work.shape), "model": work.name, "file": contents(path)}
     return hashlib.sha256(json.dumps(told, sort_keys=True).encode()).hexdigest()[:16]
 
 
-def _told(value: Any) -> Any:
+def contents(value: Any) -> Any:
     """A setting, or what is in it when it names a file."""
     if value is None or not Path(str(value)).is_file():
         return None if value is None else str(value)

@@ -135,20 +135,9 @@ def read_markers(path: str | Path, unit: str | None = None, subject: str | None 
         Missing, truncated or of another format, several subjects and none named, a label that comes twice.
     """
     path = Path(path)
-    readers = {".c3d": read_c3d, ".trc": read_trc, ".csv": read_csv}
     if unit is not None and unit not in MARKER_UNITS:
         raise ValueError(f"unit: expected one of {', '.join(MARKER_UNITS)}, got {unit!r}")
-    try:
-        data = path.read_bytes()
-    except FileNotFoundError:
-        raise MarkerFileError(f"{path}: no such file") from None
-    except OSError as error:
-        raise MarkerFileError(f"{path}: cannot be read ({error.strerror or error})") from None
-    if path.suffix.lower() not in readers:
-        raise MarkerFileError(f"{path}: expected a name ending in {', '.join(readers)}, found '{path.suffix}'")
-    if not data:
-        raise MarkerFileError(f"{path}: the file is empty")
-    raw: RawMarkers = readers[path.suffix.lower()](path, data)
+    raw = _read_raw(path)
     own_unit = unit or raw.unit
     if own_unit not in MARKER_UNITS:
         raise MarkerFileError(f"{path}: expected a unit of {', '.join(MARKER_UNITS)}, found '{raw.unit}'; "
@@ -162,6 +151,34 @@ def read_markers(path: str | Path, unit: str | None = None, subject: str | None 
         return MarkerSequence(positions, labels, rate or raw.rate or 0.0)
     except ValueError as error:
         raise MarkerFileError(f"{path}: {error}") from None
+
+
+def marker_subjects(path: str | Path) -> tuple[str, ...]:
+    """Whose markers are in a file: what stands before the colon of its labels; none where there is no colon.
+
+    Raises
+    ------
+    MarkerFileError
+        As `read_markers`.
+    """
+    split = (label.rpartition(":") for label in _read_raw(Path(path)).labels)
+    return tuple(dict.fromkeys(who for who, colon, _ in split if colon))
+
+
+def _read_raw(path: Path) -> RawMarkers:
+    """What a file holds, by its ending."""
+    readers = {".c3d": read_c3d, ".trc": read_trc, ".csv": read_csv}
+    try:
+        data = path.read_bytes()
+    except FileNotFoundError:
+        raise MarkerFileError(f"{path}: no such file") from None
+    except OSError as error:
+        raise MarkerFileError(f"{path}: cannot be read ({error.strerror or error})") from None
+    if path.suffix.lower() not in readers:
+        raise MarkerFileError(f"{path}: expected a name ending in {', '.join(readers)}, found '{path.suffix}'")
+    if not data:
+        raise MarkerFileError(f"{path}: the file is empty")
+    return readers[path.suffix.lower()](path, data)
 
 
 def _of_subject(path: Path, labels: tuple[str, ...], subject: str | None) -> tuple[list[int], tuple[str, ...]]:

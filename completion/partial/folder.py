@@ -3,8 +3,6 @@ from __future__ import annotations
 
 import hashlib
 import json
-import os
-import shutil
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
@@ -139,17 +137,11 @@ def _known(place: Path) -> str | None:
 
 def _replace(work: Work, inputs: Inputs, place: Path, mark: str, command: str) -> None:
     """A scan completed beside its folder, which then takes its place."""
-    beside = place.with_name(f".{place.name}.{os.getpid()}.part")
     start = time.perf_counter()
-    try:
+    with storage.writing_folder(place) as beside:
         metrics = complete_files(work, inputs, beside)
         write_report(Outcome(beside, metrics, {"complete": work.config}), command, time.perf_counter() - start)
         storage.write_json(beside / KEY, {"inputs": mark})
-        if place.exists():
-            shutil.rmtree(place)
-        os.replace(beside, place)
-    finally:
-        shutil.rmtree(beside, ignore_errors=True)
 
 
 def _figures(place: Path) -> dict[str, Any]:
