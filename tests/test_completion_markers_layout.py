@@ -59,6 +59,18 @@ def test_matching_and_selecting():
         LAYOUT.select(["D"])
 
 
+def test_markers_are_left_out_with_their_aliases():
+    layout = MarkerLayout(("A", "B", "C"), np.array([3, 0, 2]), np.array([0.01, 0.02, 0.03]),
+                          aliases={"X": "A", "Y": "B"}, loose=("A", "B"))
+    rest = layout.without(["X"])
+    assert (rest.labels, rest.aliases, rest.loose) == (("B", "C"), {"Y": "B"}, ("B",))
+    np.testing.assert_array_equal(rest.distances, [0.02, 0.03])
+    np.testing.assert_array_equal(rest.place(MESH), layout.place(MESH)[1:])
+    assert layout.without([]).labels == layout.labels and BETWEEN.without(["A"]).weights.tolist() == [[0, 1, 0]]
+    with pytest.raises(ValueError, match="labels: D not among A, B, C"):
+        layout.without(["D"])
+
+
 @pytest.mark.parametrize(("content", "words"), [
     ("{oops", ["JSON"]),
     ([], ["markersets"]),

@@ -3,7 +3,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -197,6 +197,22 @@ class MarkerLayout:
         return MarkerLayout(tuple(labels), self.vertices[rows], np.asarray(self.distances)[rows],
                             None if self.weights is None else self.weights[rows], loose=loose)
 
+    def without(self, labels: Sequence[str]) -> MarkerLayout:
+        """All markers but these; an alias takes its marker out, and aliases of markers that go, go too.
+
+        Raises
+        ------
+        ValueError
+            An unknown label.
+        """
+        known = {**{label: label for label in self.labels}, **self.aliases}
+        unknown = [label for label in labels if label not in known]
+        if unknown:
+            raise ValueError(f"labels: {', '.join(unknown)} not among {', '.join(self.labels)}")
+        gone = {known[label] for label in labels}
+        kept = self.select([label for label in self.labels if label not in gone])
+        return replace(kept, aliases={a: label for a, label in self.aliases.items() if label not in gone})
+
     def moved(self, places: Mapping[str, int]) -> MarkerLayout:
         """The same with some markers on other vertices, {label: vertex}; an alias moves its marker."""
         vertices, weights = self.vertices.copy(), None if self.weights is None else self.weights.copy()
@@ -208,7 +224,9 @@ class MarkerLayout:
         return MarkerLayout(self.labels, vertices, self.distances, weights, self.aliases, self.loose)
 
     def place(self, mesh: Mesh) -> np.ndarray:
-        """Where the markers are on a body (L, 3), metres: the point of the skin, and out along its normal.
+        """Where the markers are on a body (L, 3), metres: the point of the skin, and out along the normal there.
+
+        The normal is that of the vertex or of the triangle on which a marker sits.
 
         Raises
         ------
@@ -218,10 +236,12 @@ class MarkerLayout:
         self._check(len(mesh.vertices), "vertices")
         vertices, normals = mesh.vertices[self.vertices], mesh.vertex_normals[self.vertices]
         if self.weights is not None:
-            vertices = np.einsum("lc,lcd->ld", self.weights, vertices)
-            normals = np.einsum("lc,lcd->ld", self.weights, normals)
+            corners, smooth = vertices, normals
+            vertices = np.einsum("lc,lcd->ld", self.weights, corners)
+            normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+            normals *= np.where(np.einsum("ld,lcd->l", normals, smooth) < 0, -1.0, 1.0)[:, None]
             length = np.linalg.norm(normals, axis=1, keepdims=True)
-            normals = np.divide(normals, length, out=np.zeros_like(normals), where=length > 0)
+            normals = np.divide(normals, length, out=smooth[:, 0].copy(), where=length > 0)
         return vertices + np.asarray(self.distances)[:, None] * normals
 
     def _check(self, n_vertices: int, what: str) -> None:
