@@ -41,10 +41,11 @@ class ShapedPoints:
         return PointOperator(self.terms, self.mean_basis + change, self.origin)
 
     def shape_jacobian(self, pose: np.ndarray) -> np.ndarray:
-        """Derivative (L, 3, K) of the points with respect to betas at a pose (J, 3), metres."""
+        """Derivative (..., L, 3, K) of the points with respect to betas at poses (..., J, 3), metres."""
         K, _, L, _ = self.shape_basis.shape
-        by_beta = posed_product(self.terms, self._flat, np.asarray(pose, dtype=np.float64)).reshape(3, K, L)
-        return by_beta.transpose(2, 0, 1)
+        pose = np.asarray(pose, dtype=np.float64)
+        by_beta = posed_product(self.terms, self._flat, pose).reshape(*pose.shape[:-2], 3, K, L)
+        return np.moveaxis(by_beta, -1, -3)
 
     @cached_property
     def _flat(self) -> np.ndarray:

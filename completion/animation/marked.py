@@ -140,8 +140,9 @@ def point_system(shapes: PartShapes, pose: np.ndarray, trans: np.ndarray, target
 def supports(template: Mesh, layout: MarkerLayout) -> tuple[np.ndarray, np.ndarray]:
     """Three points of the skin for each marker: below it, and two around it that span its tangent plane.
 
-    The two are weighted sums of the ring of neighbours, with cosines and sines of the angle about the normal
-    as weights, so that their cross product is a smooth normal that moves with the body.
+    A marker on a triangle has the triangle's own plane. For one on a vertex the two are weighted sums of the ring of
+    neighbours, with cosines and sines of the angle about the normal as weights, so that their cross product is a
+    smooth normal that moves with the body.
 
     Returns
     -------
@@ -157,6 +158,9 @@ def supports(template: Mesh, layout: MarkerLayout) -> tuple[np.ndarray, np.ndarr
     adjacency = template.vertex_adjacency
     rows: list[tuple[np.ndarray, np.ndarray]] = []
     for mine, share in zip(base, weights, strict=True):
+        if len(set(mine.tolist())) == 3:
+            rows += [(mine, share + side) for side in _sides(template, mine)]
+            continue
         centre = int(mine[np.argmax(share)])
         ring = adjacency.indices[adjacency.indptr[centre]:adjacency.indptr[centre + 1]]
         spokes = template.vertices[ring] - template.vertices[centre]
@@ -172,3 +176,14 @@ def supports(template: Mesh, layout: MarkerLayout) -> tuple[np.ndarray, np.ndarr
     width = max(len(ids) for ids, _ in rows)
     ids = np.array([np.pad(i, (0, width - len(i)), mode="edge") for i, _ in rows])
     return ids, np.array([np.pad(w, (0, width - len(w))) for _, w in rows])
+
+
+def _sides(template: Mesh, corners: np.ndarray) -> np.ndarray:
+    """(3, 3) what leads from the place of a marker to its three supports, as weights of the corners of its triangle.
+
+    The supports turn about the outward normal, whichever way round the corners (3,) are named.
+    """
+    p = template.vertices[corners]
+    outward = np.cross(p[1] - p[0], p[2] - p[0]) @ template.vertex_normals[corners].sum(axis=0) >= 0
+    sides = np.array([[0, 0, 0], [-1, 1, 0], [-1, 0, 1]])
+    return sides if outward else sides[[0, 2, 1]]
