@@ -15,6 +15,7 @@ from ..motion import Motion
 
 FLAT = 1e-6                          # share of the largest change of betas below which a direction counts nothing
 AT_ONCE = 256                        # frames whose meshes are held at a time
+A_BODY = 20                          # frames whose meshes cost as much, one by one, as making the body of a person
 STANDING = 2.0                       # percentile of the lowest points over time that is taken for the floor
 
 
@@ -55,7 +56,8 @@ def morphed_vertices(model: BodyModel, motion: Motion, betas: np.ndarray | Mappi
                      frames: np.ndarray | slice = slice(None), grounded: bool = True) -> np.ndarray:
     """The meshes (n, N, 3), metres, of a motion while the body changes.
 
-    Vertices are affine in betas, so a change along a line needs no more than two bodies.
+    Vertices are affine in betas, so a change along a line needs no more than two bodies. Few frames of a body that
+    changes in many ways are made one by one.
 
     Parameters
     ----------
@@ -82,17 +84,26 @@ def morphed_vertices(model: BodyModel, motion: Motion, betas: np.ndarray | Mappi
     U, size, directions = np.linalg.svd(betas - middle, full_matrices=False)
     some = size > FLAT * max(size.max(initial=0), 1.0)
     shares, steps = U[:, some] * size[some], directions[some]
-    first = model.subject(middle)
-    out = first.vertices(poses, trans).astype(np.float64)
-    for share, step in zip(shares.T, steps, strict=True):
-        change = model.subject(middle + step).basis - first.basis
-        moving = replace(first, basis=change, origin=np.zeros(3))
-        out += share[:, None, None] * moving.vertices(poses)
+    if len(poses) < A_BODY * len(steps):
+        out = model.vertices(poses, betas, trans)
+    else:
+        out = _along_lines(model, middle, shares, steps, poses, trans)
     if grounded:
         own = model.subject(motion.betas)
         up, sign = world_up(motion, own)
         low = lowest(own, poses, trans, up, sign)
         out[:, :, up] += (sign * (low - (sign * out[:, :, up]).min(axis=1)))[:, None]
+    return out
+
+
+def _along_lines(model: BodyModel, middle: np.ndarray, shares: np.ndarray, steps: np.ndarray, poses: np.ndarray,
+                 trans: np.ndarray) -> np.ndarray:
+    """Meshes (n, N, 3) of bodies that are a middle (k,) and shares (n, r) of steps (r, k)."""
+    first = model.subject(middle)
+    out = first.vertices(poses, trans).astype(np.float64)
+    for share, step in zip(shares.T, steps, strict=True):
+        change = model.subject(middle + step).basis - first.basis
+        out += share[:, None, None] * replace(first, basis=change, origin=np.zeros(3)).vertices(poses)
     return out
 
 
