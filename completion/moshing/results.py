@@ -2,6 +2,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 
@@ -92,6 +93,9 @@ class Exchange:
     end: int
 
 
+BadKind = Literal["slipped", "noisy", "stray"]
+
+
 @dataclass(frozen=True, eq=False)
 class BadSpan:
     """A marker that was not where the body says, from one frame to another, both included.
@@ -107,7 +111,7 @@ class BadSpan:
     """
 
     label: str
-    kind: str
+    kind: BadKind
     begin: int
     end: int
     distance: float

@@ -4,6 +4,8 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Literal
 
+from ..animation.settings import AnimateConfig
+
 Attachment = Literal["triangle", "neighbourhood"]
 
 
@@ -32,6 +34,8 @@ class PersonConfig:
         Weight of the usual place of markers that the layout calls loose.
     annealing : floats
         Factors on the last three weights, one stage each.
+    loose_reach : float, metres
+        How far from its usual place a loose marker is looked for; 0 begins at the usual place.
     outlier : float, metres
         Residual at which a marker has lost three quarters of its weight.
     prior_shrinkage : float in [0, 1]
@@ -54,6 +58,7 @@ class PersonConfig:
     shape: float = 1.0
     pose: float = 0.25
     loose: float = 0.0025
+    loose_reach: float = 0.2
     annealing: tuple[float, ...] = (40.0, 20.0, 10.0, 4.0, 2.0, 1.0)
     outlier: float = 0.06
     prior_shrinkage: float = 0.3
@@ -69,7 +74,8 @@ class FollowConfig:
     Attributes
     ----------
     data, pose, velocity : float
-        Weights of the terms, in the paper's units: markers, pose prior, and change of velocity from frame to frame.
+        Weights of the terms, in the paper's units: markers, pose prior, and change of velocity from frame to frame,
+        120 frames a second.
     outlier : float, metres
         Residual at which a marker has lost three quarters of its weight.
     prior_shrinkage : float in [0, 1]
@@ -114,7 +120,42 @@ class SoftTissueConfig:
 
 @dataclass(frozen=True)
 class FaultConfig:
-    """Settings of `find_faults`; the room that finds them says what they mean."""
+    """Settings of `find_faults`.
+
+    Attributes
+    ----------
+    follow : AnimateConfig
+        How the body follows the markers.
+    rounds : int
+        Most times that markers are repaired and the body follows them anew.
+    floor : float, metres
+        Least standard deviation of a track around where it is expected a frame later.
+    jump : float, metres
+        Least distance from there that is a jump.
+    deviation : float, metres
+        How far a marker lies from its usual place on the body, in each direction.
+    memory : float, seconds
+        How long that distance stays much the same.
+    doubt : float
+        What each change of a label must be worth, as half a squared number of standard deviations.
+    slip : float, metres
+        Least lasting displacement in the frame of a body part.
+    stray : float, metres
+        Least distance from the simulated marker for a marker that is somewhere else for a while.
+    noise : float, metres
+        Least jitter from frame to frame, as the median length of the second difference.
+    """
+
+    follow: AnimateConfig = field(default_factory=AnimateConfig)
+    rounds: int = 4
+    floor: float = 0.002
+    jump: float = 0.006
+    deviation: float = 0.008
+    memory: float = 0.1
+    doubt: float = 4.0
+    slip: float = 0.015
+    stray: float = 0.06
+    noise: float = 0.012
 
 
 @dataclass(frozen=True)

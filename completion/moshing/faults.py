@@ -1,0 +1,159 @@
+"""What is wrong with the markers of a sequence, by the body that carries them."""
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+
+from model.linear import Subject
+
+from ..animation.trust import marker_weights
+from ..markers.files import MarkerSequence
+from ..markers.layout import MarkerLayout
+from ..motion import Motion
+from .badspans import find_bad
+from .exchanges import Evidence, find_order, listed, marker_levels
+from .results import BadSpan, MarkerFaults
+from .settings import FaultConfig
+from .simulation import Simulation
+from .tracks import Tracks
+
+Progress = Callable[[int, int], None]
+USUAL_PLACE = 0.04                   # metres, most that a marker's usual place is taken to be from its simulation
+UNSURE = 0.25                        # share of the frames in which a label was exchanged, the more likely of two ways
+ENOUGH = 0.6                         # share of the markers that must be left without those
+SETTLED = 0.002                      # share of the markers that may still change when the search ends
+
+
+def find_faults(subject: Subject, markers: MarkerSequence, layout: MarkerLayout, config: FaultConfig | None = None,
+                motion: Motion | None = None, progress: Progress | None = None) -> MarkerFaults:
+    """Labels that were exchanged, and markers that slip, jitter or stray.
+
+    First the tracks alone tell where two labels change places. The body follows the markers so repaired, and where
+    it has them tells with the tracks which labels are exchanged, and which markers are elsewhere. It follows what is
+    left, until nothing changes.
+
+    Parameters
+    ----------
+    subject : Subject
+        The person, of known shape.
+    markers : MarkerSequence
+    layout : MarkerLayout
+        Where on the person the markers sit. Exchanges are also found among labels that it does not know.
+    motion : Motion, optional
+        Of the person in this sequence, where it is known already; it is followed anew where markers are repaired.
+    progress : callable, optional
+        Called with (done, total) rounds.
+
+    Raises
+    ------
+    ValueError
+        Fewer than 3 markers in common, no frame with 3 of them, a layout of another body, a motion of other length.
+    """
+    config = config or FaultConfig()
+    if motion is not None and len(motion.poses) != len(markers.positions):
+        raise ValueError(f"motion: expected {len(markers.positions)} frames as the markers have, "
+                         f"got {len(motion.poses)}")
+    search = _Search(subject, markers, layout, config)
+    for done in range(config.rounds):
+        if motion is not None and not done and search.untouched:
+            search.take(motion)
+        else:
+            search.follow()
+        settled = search.look()
+        if progress:
+            progress(done + 1, config.rounds)
+        if settled:
+            break
+    return search.result()
+
+
+class _Search:
+    """The state of the search: labels, bad spans and the body that follows the rest.
+
+    Parameters
+    ----------
+    subject : Subject
+    markers : MarkerSequence
+    layout : MarkerLayout
+    config : FaultConfig
+    """
+
+    def __init__(self, subject: Subject, markers: MarkerSequence, layout: MarkerLayout, config: FaultConfig) -> None:
+        self.config, self.markers = config, markers
+        self.body = Simulation(subject, markers, layout, config.follow)
+        T, L = markers.positions.shape[:2]
+        self.order = find_order(Evidence(markers.positions, np.zeros((T, L, L), dtype=np.float32)), config)
+        self.bad: tuple[BadSpan, ...] = ()
+        self.unsure = (self.order != np.arange(L)).mean(axis=0) > UNSURE
+        self.solved: np.ndarray | None = None
+        self.out = np.zeros((T, L), dtype=bool)
+
+    @property
+    def untouched(self) -> bool:
+        """No label has been exchanged."""
+        return bool((self.order == np.arange(self.order.shape[1])).all())
+
+    @property
+    def ordered(self) -> np.ndarray:
+        """The markers (T, L, 3), metres, under their right labels."""
+        return np.take_along_axis(self.markers.positions, self.order[..., None], axis=1)
+
+    @property
+    def repaired(self) -> np.ndarray:
+        """The same without bad spans."""
+        return np.where(self.out[..., None], np.nan, self.ordered)
+
+    def take(self, motion: Motion) -> None:
+        """Have the body as in a motion."""
+        self.body.targets = self.repaired[:, self.body.rows]
+        self.x, self.solved = self.body.body.body.join(motion.poses, motion.trans), self.order
+
+    def follow(self) -> None:
+        """Have the body follow the repaired markers, but at first those of which it is not sure whose label is whose."""
+        targets = np.where(self.unsure[:, None], np.nan, self.repaired)[:, self.body.rows]
+        if np.isfinite(targets[..., 0]).sum(axis=1).max() < ENOUGH * len(self.body.rows):
+            targets = self.repaired[:, self.body.rows]
+        same = self.solved is not None and (self.solved == self.order).all()
+        self.x = self.body.solve(targets, self.x if same and not self.unsure.any() else None)
+        self.solved = self.order
+
+    def look(self) -> bool:
+        """Find exchanges and bad spans by where the body has the markers; whether nothing has changed."""
+        before, out = self.order, self.out
+        rows, T = self.body.rows, len(self.x)
+        places = np.full(self.markers.positions.shape, np.nan)
+        simulated = self.body.positions(self.x)
+        places[:, rows] = self._usual(simulated)
+        levels = marker_levels(places, self.markers.positions, self.config, self.markers.rate)
+        self.order = find_order(Evidence(self.markers.positions, levels), self.config)
+        ordered = self.ordered[:, rows]
+        tracks = Tracks(ordered, self.config.floor, self.config.jump)
+        local = self.body.local(self.x, simulated, ordered)
+        self.bad = find_bad(local, tracks.jumped, self.body.labels, self.config, self.markers.rate)
+        self.out = np.zeros((T, len(self.markers.labels)), dtype=bool)
+        for span in self.bad:
+            self.out[span.begin:span.end + 1, self.markers.labels.index(span.label)] = True
+        changed = (before != self.order) | (self.out != out)
+        unsure, self.unsure = self.unsure.any(), np.zeros(len(self.unsure), dtype=bool)
+        return bool(not unsure and (before == self.order).all() and changed[:, rows].mean() <= SETTLED)
+
+    def _usual(self, simulated: np.ndarray) -> np.ndarray:
+        """Where markers (T, L, 3) are expected: off the simulated ones as they mostly are in their part's frame."""
+        R = self.body.part_rotations(self.x)
+        off = np.einsum("tldc,tld->tlc", R, self.repaired[:, self.body.rows] - simulated)
+        usual = np.array([np.median(o[np.isfinite(o[:, 0])], axis=0) if np.isfinite(o[:, 0]).any() else np.zeros(3)
+                          for o in np.swapaxes(off, 0, 1)])
+        usual[self.unsure[self.body.rows]] = 0
+        length = np.linalg.norm(usual, axis=1, keepdims=True)
+        usual *= np.minimum(1, USUAL_PLACE / np.maximum(length, 1e-12))
+        return simulated + np.einsum("tldc,lc->tld", R, usual)
+
+    def result(self) -> MarkerFaults:
+        """What has been found."""
+        repaired, labels = self.repaired, self.markers.labels
+        simulated = self.body.positions(self.x)
+        targets, sd = repaired[:, self.body.rows], self.config.follow.marker_sd
+        weights, _ = marker_weights(simulated, targets, sd, self.config.follow.outlier)
+        return MarkerFaults(listed(self.order, self.markers.seen, labels), self.bad, simulated, self.body.labels,
+                            MarkerSequence(repaired, labels, self.markers.rate), weights * sd**2)
