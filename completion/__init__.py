@@ -15,6 +15,13 @@ if TYPE_CHECKING:
     from .markers.files import MarkerSequence, read_markers, write_markers
     from .markers.layout import MarkerLayout
     from .markers.named import layout_names
+    from .moshing.capture import mosh
+    from .moshing.cartoons import Cartoon, CartoonShape, cartoon
+    from .moshing.characters import deformation, retarget_soft_tissue
+    from .moshing.person import find_person
+    from .moshing.results import MoshResult, PersonFit
+    from .moshing.settings import MoshConfig, PersonConfig
+    from .moshing.sex import SexedMosh, mosh_by_sex
     from .moshing.soft import follow_soft_tissue
     from .motion import Motion
     from .partial.colors import ColorConfig, carry_colors
@@ -34,6 +41,13 @@ _ROOMS = {
     "markers.files": ("MarkerSequence", "read_markers", "write_markers"),
     "markers.layout": ("MarkerLayout",),
     "markers.named": ("layout_names",),
+    "moshing.capture": ("mosh",),
+    "moshing.cartoons": ("Cartoon", "CartoonShape", "cartoon"),
+    "moshing.characters": ("deformation", "retarget_soft_tissue"),
+    "moshing.person": ("find_person",),
+    "moshing.results": ("MoshResult", "PersonFit"),
+    "moshing.settings": ("MoshConfig", "PersonConfig"),
+    "moshing.sex": ("SexedMosh", "mosh_by_sex"),
     "moshing.soft": ("follow_soft_tissue",),
     "motion": ("Motion",),
     "partial.colors": ("ColorConfig", "carry_colors"),
@@ -45,11 +59,12 @@ _ROOMS = {
 }
 _ROOM_OF = {name: room for room, names in _ROOMS.items() for name in names}
 
-__all__ = ["AnimateConfig", "ColorConfig", "Completion", "CompletionConfig", "Frame", "MarkerLayout",
-           "MarkerSequence", "MarkerShapeConfig", "MarkerStream", "MarkerSubject", "Motion", "TrackConfig", "animate",
-           "carry_colors", "complete", "embedded_model", "follow_soft_tissue", "joint_angles", "joint_centres",
-           "layout_names", "morphed_vertices", "read_markers", "read_mask", "retarget", "subject_from_markers",
-           "track", "write_markers"]
+__all__ = ["AnimateConfig", "Cartoon", "CartoonShape", "ColorConfig", "Completion", "CompletionConfig", "Frame",
+           "MarkerLayout", "MarkerSequence", "MarkerShapeConfig", "MarkerStream", "MarkerSubject", "MoshConfig",
+           "MoshResult", "Motion", "PersonConfig", "PersonFit", "SexedMosh", "TrackConfig", "animate", "carry_colors",
+           "cartoon", "complete", "deformation", "embedded_model", "find_person", "follow_soft_tissue", "joint_angles",
+           "joint_centres", "layout_names", "morphed_vertices", "mosh", "mosh_by_sex", "read_markers", "read_mask",
+           "retarget", "retarget_soft_tissue", "subject_from_markers", "track", "write_markers"]
 
 
 def __getattr__(name: str) -> Any:

@@ -1,0 +1,100 @@
+"""From marker files of one subject to a moving body: all stages one after the other."""
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from model.body import BodyModel
+
+from ..markers.files import MarkerSequence
+from ..markers.layout import MarkerLayout
+from .faults import find_faults
+from .person import find_person, one_or_more
+from .poses import follow_poses
+from .results import MoshResult, PersonFit
+from .settings import MoshConfig
+from .soft import follow_soft_tissue
+
+Progress = Callable[[int, int], None]
+STEPS = 100                          # of progress, of each stage
+
+
+def mosh(model: BodyModel, sequences: MarkerSequence | Sequence[MarkerSequence], layout: MarkerLayout,
+         config: MoshConfig | None = None, progress: Progress | None = None) -> MoshResult:
+    """Body shape, marker places, poses and soft tissue of one subject from marker sequences.
+
+    The person is found from a few frames of all sequences, then the pose of every frame. The motion tells which
+    labels were exchanged and which markers were not on the body; where that concerns the frames that told of the
+    person, the person is found again. At last the shape may change with time.
+
+    Parameters
+    ----------
+    model : BodyModel
+    sequences : MarkerSequence, or several of one subject
+    layout : MarkerLayout
+        Where markers usually sit on the model's template. Markers that only one of the two knows are left out.
+    config : MoshConfig, optional
+    progress : callable, optional
+        Called with (done, total).
+
+    Raises
+    ------
+    ValueError
+        A model without betas, no sequence, fewer than 3 markers in common, no frame with 3 of them, a layout of
+        another body.
+
+    [MoSh] Eq. 23, Eq. 24
+    """
+    config, sequences = config or MoshConfig(), one_or_more(sequences)
+    count = len(sequences)
+    bar = _Bar(progress, STEPS * (1 + 2 * count + count * config.soft_tissue))
+    person = find_person(model, sequences, layout, config.person, bar.stage())
+    subject = model.subject(person.betas)
+    motions = [follow_poses(subject, each, person.layout, config.follow, bar.stage()) for each in sequences]
+    faults = [find_faults(subject, each, person.layout, config.faults, motion, bar.stage())
+              for each, motion in zip(sequences, motions, strict=True)]
+    mended = [fault.repaired for fault in faults]
+    if _matters(person, sequences, mended):
+        person = find_person(model, mended, layout, config.person)
+        subject = model.subject(person.betas)
+        motions = [follow_poses(subject, each, person.layout, config.follow) for each in mended]
+    else:
+        motions = [motion if same(before, after) else follow_poses(subject, after, person.layout, config.follow)
+                   for motion, before, after in zip(motions, sequences, mended, strict=True)]
+    soft = [follow_soft_tissue(model, motion, each, person.layout, config.soft, bar.stage())
+            for motion, each in zip(motions, mended, strict=True)] if config.soft_tissue else []
+    return MoshResult(person.betas, person.layout, person, tuple(motions), tuple(soft), tuple(faults))
+
+
+def same(first: MarkerSequence, second: MarkerSequence) -> bool:
+    """Whether two sequences hold the same markers in the same places."""
+    return np.array_equal(first.positions, second.positions, equal_nan=True)
+
+
+def _matters(person: PersonFit, sequences: Sequence[MarkerSequence], mended: Sequence[MarkerSequence]) -> bool:
+    """Whether anything was repaired in the frames that told of the person."""
+    return any(not np.array_equal(sequences[i].positions[t], mended[i].positions[t], equal_nan=True)
+               for i, t in person.frames)
+
+
+@dataclass
+class _Bar:
+    """Progress of stages one after the other, each as long as the others."""
+
+    progress: Progress | None
+    total: int
+    done: int = 0
+
+    def stage(self) -> Progress | None:
+        """The callback of the next stage."""
+        if self.progress is None:
+            return None
+        tell, before = self.progress, self.done
+        self.done += STEPS
+
+        def report(done: int, total: int) -> None:
+            tell(before + round(STEPS * done / max(total, 1)), self.total)
+
+        return report
