@@ -1,7 +1,9 @@
 """From marker files of one subject to a moving body: all stages one after the other."""
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+import time
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 
 import numpy as np
@@ -13,7 +15,7 @@ from ..markers.layout import MarkerLayout
 from .faults import find_faults
 from .person import find_person, one_or_more
 from .poses import follow_poses
-from .results import MoshResult, PersonFit
+from .results import MoshResult, PersonFit, SoftTissue
 from .settings import MoshConfig
 from .soft import follow_soft_tissue
 
@@ -50,22 +52,29 @@ def mosh(model: BodyModel, sequences: MarkerSequence | Sequence[MarkerSequence],
     config, sequences = config or MoshConfig(), one_or_more(sequences)
     count = len(sequences)
     bar = _Bar(progress, STEPS * (1 + 2 * count + count * config.soft_tissue))
-    person = find_person(model, sequences, layout, config.person, bar.stage())
-    subject = model.subject(person.betas)
-    motions = [follow_poses(subject, each, person.layout, config.follow, bar.stage()) for each in sequences]
-    faults = [find_faults(subject, each, person.layout, config.faults, motion, bar.stage())
-              for each, motion in zip(sequences, motions, strict=True)]
-    mended = [fault.repaired for fault in faults]
-    if _matters(person, sequences, mended):
-        person = find_person(model, mended, layout, config.person)
+    clock = _Clock()
+    with clock.running("person"):
+        person = find_person(model, sequences, layout, config.person, bar.stage())
         subject = model.subject(person.betas)
-        motions = [follow_poses(subject, each, person.layout, config.follow) for each in mended]
-    else:
-        motions = [motion if same(before, after) else follow_poses(subject, after, person.layout, config.follow)
-                   for motion, before, after in zip(motions, sequences, mended, strict=True)]
-    soft = [follow_soft_tissue(model, motion, each, person.layout, config.soft, bar.stage())
-            for motion, each in zip(motions, mended, strict=True)] if config.soft_tissue else []
-    return MoshResult(person.betas, person.layout, person, tuple(motions), tuple(soft), tuple(faults))
+    with clock.running("poses"):
+        motions = [follow_poses(subject, each, person.layout, config.follow, bar.stage()) for each in sequences]
+    with clock.running("faults"):
+        faults = [find_faults(subject, each, person.layout, config.faults, motion, bar.stage())
+                  for each, motion in zip(sequences, motions, strict=True)]
+        mended = [fault.repaired for fault in faults]
+        if _matters(person, sequences, mended):
+            person = find_person(model, mended, layout, config.person)
+            subject = model.subject(person.betas)
+            motions = [follow_poses(subject, each, person.layout, config.follow) for each in mended]
+        else:
+            motions = [motion if same(before, after) else follow_poses(subject, after, person.layout, config.follow)
+                       for motion, before, after in zip(motions, sequences, mended, strict=True)]
+    soft: list[SoftTissue] = []
+    if config.soft_tissue:
+        with clock.running("soft tissue"):
+            soft = [follow_soft_tissue(model, motion, each, person.layout, config.soft, bar.stage())
+                    for motion, each in zip(motions, mended, strict=True)]
+    return MoshResult(person.betas, person.layout, person, tuple(motions), tuple(soft), tuple(faults), clock.seconds)
 
 
 def same(first: MarkerSequence, second: MarkerSequence) -> bool:
@@ -77,6 +86,19 @@ def _matters(person: PersonFit, sequences: Sequence[MarkerSequence], mended: Seq
     """Whether anything was repaired in the frames that told of the person."""
     return any(not np.array_equal(sequences[i].positions[t], mended[i].positions[t], equal_nan=True)
                for i, t in person.frames)
+
+
+class _Clock:
+    """How long each stage takes, seconds."""
+
+    def __init__(self) -> None:
+        self.seconds: dict[str, float] = {}
+
+    @contextmanager
+    def running(self, stage: str) -> Iterator[None]:
+        start = time.perf_counter()
+        yield
+        self.seconds[stage] = time.perf_counter() - start
 
 
 @dataclass

@@ -1,7 +1,7 @@
 """What `mosh` and its stages find."""
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Literal
 
 import numpy as np
@@ -166,6 +166,8 @@ class MoshResult:
         With the shape fixed; residuals in the order of the sequence's labels, NaN where the layout does not know one.
     soft_tissue : one SoftTissue for each sequence, or none
     faults : one MarkerFaults for each sequence
+    seconds : {str: float}
+        How long each stage took: "person", "poses", "faults", "soft tissue".
     """
 
     betas: np.ndarray
@@ -174,3 +176,4 @@ class MoshResult:
     motions: tuple[Motion, ...]
     soft_tissue: tuple[SoftTissue, ...]
     faults: tuple[MarkerFaults, ...]
+    seconds: dict[str, float] = field(default_factory=dict)
