@@ -1,0 +1,1 @@
+"""Which markers, and which frames, tell most about a body [MoSh]."""

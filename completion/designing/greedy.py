@@ -1,0 +1,190 @@
+"""Sets of markers, made smaller or larger step by step, with all bodies and all candidates at once."""
+from __future__ import annotations
+
+from collections.abc import Callable, Collection, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from .linear import LinearBodies
+
+Groups = Sequence[tuple[int, ...]]
+ADD, REMOVE = 1, -1
+
+
+@dataclass(frozen=True, eq=False)
+class Path:
+    """Sets of markers, each the one before and a group more or less.
+
+    Attributes
+    ----------
+    start : (m,) int
+        Groups of the first set, in rising order.
+    steps : tuple of int
+        The group that came or went in each step.
+    added : bool
+        They came.
+    counts : (S,) int
+        Markers of each set, the first included.
+    rmse : (S,) float, metres
+    """
+
+    start: np.ndarray
+    steps: tuple[int, ...]
+    added: bool
+    counts: np.ndarray
+    rmse: np.ndarray
+
+    def set(self, i: int) -> np.ndarray:
+        """Groups of the i-th set, in rising order."""
+        combine = np.union1d if self.added else np.setdiff1d
+        return np.asarray(combine(self.start, np.array(self.steps[:i], dtype=np.int64)))
+
+    def at(self, count: int) -> int:
+        """Which set has that many markers, or the most below it; -1 where all have more."""
+        below = np.flatnonzero(self.counts <= count)
+        return int(below[np.argmax(self.counts[below])]) if len(below) else -1
+
+
+class MarkerSets:
+    """A set of groups of markers, what it leaves of every body, and what each group more or less would do to that.
+
+    For a group with rows B that comes (s = +1) or goes (s = -1), with C the covariance of the step d and
+    `k = (I + s B C Bᵀ)⁻¹ (g - B d)`, the step becomes `d + s C Bᵀ k` and the cost changes by
+    `2 s k·q + kᵀ F k`, where `q = B C (G d - p)` and `F = B C G C Bᵀ`. What changes with C is kept for the rows of
+    each group alone, so trying all groups costs small solves only, and taking one costs one pass over the rows.
+
+    Parameters
+    ----------
+    linear : LinearBodies
+    groups : candidates that come and go together
+    chosen : groups of the first set
+
+    [MoSh] Eq. 26
+    [MoSh] Eq. 27
+    """
+
+    def __init__(self, linear: LinearBodies, groups: Groups, chosen: Collection[int]) -> None:
+        Z, _, r, P = linear.rows.shape
+        width = r * max(len(group) for group in groups)
+        self.sizes = np.array([len(group) for group in groups])
+        self.inside = np.isin(np.arange(len(groups)), np.array(sorted(chosen), dtype=np.int64))
+        self._rows, gaps = np.zeros((Z, len(groups), width, P)), np.zeros((Z, len(groups), width))
+        for i, group in enumerate(groups):
+            self._rows[:, i, :r * len(group)] = linear.rows[:, group].reshape(Z, -1, P)
+            gaps[:, i, :r * len(group)] = linear.gaps[:, group].reshape(Z, -1)
+        members = [c for i in np.flatnonzero(self.inside) for c in groups[i]]
+        B = linear.rows[:, members].reshape(Z, -1, P)
+        self._gram = linear.gram
+        self._C = np.linalg.inv(np.swapaxes(B, -1, -2) @ B + linear.precision)
+        d = linear.steps(members)
+        self.costs = linear.left(d)
+        slope = ((linear.gram @ d[..., None])[..., 0] - linear.pull)[..., None]
+        self._rho = gaps - (self._rows @ d[:, None, :, None])[..., 0]
+        self._q = (self._rows @ (self._C @ slope)[:, None])[..., 0]
+        self._S, self._F = np.empty((2, Z, len(groups), width, width))
+        for z in range(Z):                               # one body after the other: the products are as large as rows
+            W = self._rows[z] @ self._C[z]
+            self._S[z] = W @ np.swapaxes(self._rows[z], -1, -2)
+            self._F[z] = (W @ linear.gram[z]) @ np.swapaxes(W, -1, -2)
+
+    @property
+    def count(self) -> int:
+        """Markers of the set."""
+        return int(self.sizes[self.inside].sum())
+
+    @property
+    def rmse(self) -> float:
+        """Root of the mean squared distance, metres."""
+        return float(np.sqrt(self.costs.mean()))
+
+    def tried(self, groups: np.ndarray, sign: int) -> np.ndarray:
+        """(n,) mean squared distance after each of some groups comes (+1) or goes (-1)."""
+        rho, S = self._rho[:, groups], self._S[:, groups]
+        k = np.linalg.solve(np.eye(S.shape[-1]) + sign * S, rho[..., None])
+        change = 2 * sign * (k[..., 0] * self._q[:, groups]).sum(axis=-1)
+        change += (k * (self._F[:, groups] @ k)).sum(axis=(-1, -2))
+        return np.asarray((self.costs[:, None] + change).mean(axis=0))
+
+    def take(self, group: int, sign: int) -> None:
+        """Let a group come (+1) or go (-1)."""
+        U = self._rows[:, group] @ self._C                                                # (Z, w, P)
+        S, F, rho = self._S[:, group].copy(), self._F[:, group].copy(), self._rho[:, group, :, None].copy()
+        M = np.linalg.inv(np.eye(S.shape[-1]) + sign * S)
+        k = M @ rho
+        both = np.concatenate([U, U @ self._gram @ self._C], axis=1)
+        found = self._rows @ np.swapaxes(both, -1, -2)[:, None]
+        K, L = np.split(found, 2, axis=-1)                                                # B C Bᵀ, B C G C Bᵀ
+        KM = K @ M[:, None]
+        self.costs = self.costs + (2 * sign * (k[..., 0] * self._q[:, group]).sum(axis=-1)
+                                   + (k * (F @ k)).sum(axis=(-1, -2)))
+        behind = self._q[:, group, :, None] + sign * (F @ k)
+        self._q += (sign * (L @ k[:, None] - KM @ behind[:, None]))[..., 0]
+        self._rho -= (sign * (K @ k[:, None]))[..., 0]
+        self._S -= sign * (KM @ np.swapaxes(K, -1, -2))
+        cross = KM @ np.swapaxes(L, -1, -2)
+        self._F += KM @ F[:, None] @ np.swapaxes(KM, -1, -2) - sign * (cross + np.swapaxes(cross, -1, -2))
+        self._C -= sign * (np.swapaxes(U, -1, -2) @ M @ U)
+        self.inside[group] = sign == ADD
+
+
+def walk(sets: MarkerSets, sign: int, movable: np.ndarray, until: int, through: Collection[int] = (),
+         tell: Callable[[int], None] | None = None) -> Path:
+    """Let the group come or go that serves best for each of its markers, again and again.
+
+    Parameters
+    ----------
+    sets : MarkerSets
+        Is changed.
+    sign : +1 adds, -1 removes
+    movable : (n,) bool
+        Groups that may come or go.
+    until : int
+        Count at which to stop.
+    through : ints
+        Counts that are not stepped over where a single marker can be had.
+    tell : callable, optional
+        Called with the count after each step.
+    """
+    start, steps = np.flatnonzero(sets.inside), []
+    counts, rmse = [sets.count], [sets.rmse]
+    while True:
+        open_ = np.flatnonzero(movable & (sets.inside == (sign == REMOVE)))
+        open_ = open_[sign * (sets.count + sign * sets.sizes[open_]) <= sign * until]
+        if not len(open_):
+            return Path(start, tuple(steps), sign == ADD, np.array(counts), np.array(rmse))
+        passed = np.array([any(0 < sign * (stop - sets.count) < size for stop in through)
+                           for size in sets.sizes[open_]])
+        open_ = open_ if passed.all() else open_[~passed]
+        gain = (sets.tried(open_, sign) - sets.costs.mean()) / sets.sizes[open_]
+        steps.append(int(open_[np.argmin(gain)]))
+        sets.take(steps[-1], sign)
+        counts.append(sets.count)
+        rmse.append(sets.rmse)
+        if tell is not None:
+            tell(sets.count)
+
+
+def exchange(sets: MarkerSets, movable: np.ndarray, rounds: int) -> int:
+    """Put every group that may go against all of its size that are out; return how many were exchanged.
+
+    Parameters
+    ----------
+    sets : MarkerSets
+        Is changed.
+    movable : (n,) bool
+    rounds : int
+        Most times that every group is tried.
+    """
+    done = 0
+    for _ in range(rounds):
+        before = done
+        for group in np.flatnonzero(movable & sets.inside):
+            sets.take(int(group), REMOVE)
+            others = np.flatnonzero(movable & ~sets.inside & (sets.sizes == sets.sizes[group]))
+            best = int(others[np.argmin(sets.tried(others, ADD))])
+            sets.take(best, ADD)
+            done += best != group
+        if done == before:
+            break
+    return done
