@@ -24,10 +24,12 @@ if TYPE_CHECKING:
     from .learning import BlendConfig, LearnConfig, learn_blendscape, learn_scape
     from .learning.mixing import MixConfig, learn_scape_mix
     from .learning.parts import ChosenSkeleton, PartsConfig, choose_skeleton
+    from .learning.sex_plane import SexGuess, guess_sex
     from .learning.sexes import learn_by_sex
     from .learning.skin import SkinConfig, learn_skinning
     from .linear import PointOperator, Subject
     from .posing.angles import pose_from_angles, sample_poses, turn
+    from .posing.character import CharacterConfig, character_model
     from .posing.limits import JointLimits
     from .posing.mirroring import Mirror, find_mirror, mirror_pose
     from .posing.transfer import TransferConfig, repose, subject_from_body
@@ -54,10 +56,12 @@ _ROOMS = {
     "learning": ("BlendConfig", "LearnConfig", "learn_blendscape", "learn_scape"),
     "learning.mixing": ("MixConfig", "learn_scape_mix"),
     "learning.parts": ("ChosenSkeleton", "PartsConfig", "choose_skeleton"),
+    "learning.sex_plane": ("SexGuess", "guess_sex"),
     "learning.sexes": ("learn_by_sex",),
     "learning.skin": ("SkinConfig", "learn_skinning"),
     "linear": ("PointOperator", "Subject"),
     "posing.angles": ("pose_from_angles", "sample_poses", "turn"),
+    "posing.character": ("CharacterConfig", "character_model"),
     "posing.limits": ("JointLimits",),
     "posing.mirroring": ("Mirror", "find_mirror", "mirror_pose"),
     "posing.transfer": ("TransferConfig", "repose", "subject_from_body"),
@@ -67,16 +71,16 @@ _ROOMS = {
 }
 _ROOM_OF = {name: room for room, names in _ROOMS.items() for name in names}
 
-__all__ = ["BlendConfig", "BlendScapeModel", "BodyModel", "ChosenSkeleton", "Coregistration", "CoregistrationConfig",
-           "Derivatives", "FirstModel", "FitConfig", "JointLimits", "LearnConfig", "Mirror", "MixConfig",
-           "ModelRegistration", "PartsConfig", "PointOperator", "PoseErrors", "PoseFit", "ResolutionConfig", "Rig",
-           "Samples", "ScapeModel", "ShapeErrors", "ShapeFit", "SkinConfig", "SkinningModel", "Specificity",
-           "Subject", "TransferConfig", "change_resolution", "choose_skeleton", "compactness", "coregister",
-           "find_mirror", "fit_pose", "fit_shape", "learn_blendscape", "learn_by_sex", "learn_from_scans",
-           "learn_scape", "learn_scape_mix", "learn_skinning", "load_model", "make_rig", "mirror_pose",
-           "motion_correctives", "pose_errors", "pose_from_angles", "register_with_model", "repose", "sample_bodies",
-           "sample_poses", "shape_errors", "skin_weights", "specificity", "subject_from_body", "turn",
-           "write_body_npz", "write_bvh", "write_skinned_glb"]
+__all__ = ["BlendConfig", "BlendScapeModel", "BodyModel", "CharacterConfig", "ChosenSkeleton", "Coregistration",
+           "CoregistrationConfig", "Derivatives", "FirstModel", "FitConfig", "JointLimits", "LearnConfig", "Mirror",
+           "MixConfig", "ModelRegistration", "PartsConfig", "PointOperator", "PoseErrors", "PoseFit",
+           "ResolutionConfig", "Rig", "Samples", "ScapeModel", "SexGuess", "ShapeErrors", "ShapeFit", "SkinConfig",
+           "SkinningModel", "Specificity", "Subject", "TransferConfig", "change_resolution", "character_model",
+           "choose_skeleton", "compactness", "coregister", "find_mirror", "fit_pose", "fit_shape", "guess_sex",
+           "learn_blendscape", "learn_by_sex", "learn_from_scans", "learn_scape", "learn_scape_mix", "learn_skinning",
+           "load_model", "make_rig", "mirror_pose", "motion_correctives", "pose_errors", "pose_from_angles",
+           "register_with_model", "repose", "sample_bodies", "sample_poses", "shape_errors", "skin_weights",
+           "specificity", "subject_from_body", "turn", "write_body_npz", "write_bvh", "write_skinned_glb"]
 
 
 def __getattr__(name: str) -> Any:

@@ -56,6 +56,14 @@ class ShapeSpace:
             S += np.multiply(beta, component, dtype=np.float64)
         return S
 
+    def betas_of(self, S: np.ndarray) -> np.ndarray:
+        """Betas (P, K) nearest to shape deformations (P, F, 3, 3), by the components' right angles.
+
+        [SCAPE] Eq. 7
+        """
+        flat = self.components.reshape(self.count, -1)
+        return np.stack([flat @ (one - self.mean).ravel() for one in S]) / (flat**2).sum(axis=1)
+
     def first(self, count: int | None) -> ShapeSpace:
         """The space of the first `count` components; None for all."""
         return ShapeSpace(self.mean, self.components[:count], self.variances[:count], self.total_variance)

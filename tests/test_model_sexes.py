@@ -1,9 +1,13 @@
+from dataclasses import replace
+
 import numpy as np
 import pytest
 from model_bodies import random_poses, worm_model
 
+from model.files import load_model
 from model.fitting import fit_shape
 from model.learning import LearnConfig, learn_scape
+from model.learning.sex_plane import PLANE, guess_sex, learn_sex_plane
 from model.learning.sexes import learn_by_sex
 
 CONFIG = LearnConfig(prunings=(0.01,), ridges=(0.001,), refinements=0)
@@ -41,7 +45,8 @@ def test_each_model_is_that_of_its_people(truth, data, models):
         assert model.pose_space is models["neutral"].pose_space
         np.testing.assert_array_equal(model.shape_space.mean, alone.shape_space.mean)
         np.testing.assert_array_equal(model.shape_space.components, alone.shape_space.components)
-        assert {**alone.info, "sex": sex} == model.info
+        assert {**alone.info, "sex": sex} == {name: value for name, value in model.info.items() if name != PLANE}
+        assert (PLANE in model.info) == (sex == "neutral")
 
 
 def test_sex_is_no_component_of_the_model_of_one_sex(truth, models):
@@ -66,3 +71,59 @@ def test_refuses_bad_input(truth, data):
             learn_by_sex(truth.template, poses, shapes, bad, truth.skeleton, CONFIG)
     with pytest.raises(ValueError, match=r"shapes.*expected shape"):
         learn_by_sex(truth.template, poses, shapes[:, 1:], SEXES, truth.skeleton, CONFIG)
+
+
+def test_the_neutral_model_tells_its_people_apart(truth, models):
+    """People who were not learned from, found by the model, are told by their betas; a model of one sex cannot."""
+    rng = np.random.default_rng(7)
+    for sex, side in (("female", -1.2), ("male", 1.2)):
+        for _ in range(3):
+            body = truth.vertices(np.zeros((4, 3)), np.r_[side, rng.normal(0, 0.4, 2)])
+            guess = guess_sex(models["neutral"], fit_shape(models["neutral"], body).betas)
+            assert guess.sex == sex and guess.margin * side > 0 and 0.5 < guess.probability <= 1
+    with pytest.raises(ValueError, match=r"model.*scape learn --by-sex"):
+        guess_sex(models["male"], np.zeros(2))
+
+
+def test_betas_of_the_people_are_their_projections(models, data):
+    neutral = models["neutral"]
+    S = np.stack([neutral.shape_space.gradients(b) for b in np.eye(neutral.n_betas)[:, ::-1]])
+    np.testing.assert_allclose(neutral.shape_space.betas_of(S), np.eye(neutral.n_betas)[:, ::-1], atol=1e-4)
+
+
+def test_the_plane_lies_between_two_clouds():
+    """Normal along the only beta that differs, halfway; said shares and probabilities are those of new people."""
+    rng = np.random.default_rng(1)
+    men = rng.random(400) < 0.3
+    betas = rng.normal(size=(400, 5))
+    betas[:, 2] += np.where(men, 2.5, 0.5)
+    plane = learn_sex_plane(betas[:200], np.where(men, "male", "female")[:200].tolist())
+    assert plane.weights[2] > 0.9
+    assert np.linalg.norm(plane.weights) == pytest.approx(1)
+    assert abs(plane.margins(np.array([0, 0, 1.5, 0, 0]))) < 0.3
+    right = ((plane.margins(betas[200:]) > 0) == men[200:])
+    assert abs(right.mean() - plane.accuracy) < 0.08
+    sure = 1 / (1 + np.exp(-(plane.slope * np.abs(plane.margins(betas[200:])))))
+    assert abs(sure.mean() - right.mean()) < 0.08
+
+
+def test_a_plane_is_kept_in_the_file(models, tmp_path):
+    models["neutral"].save(tmp_path / "neutral.npz")
+    betas = np.array([0.3, -0.2])
+    assert guess_sex(load_model(tmp_path / "neutral.npz"), betas) == guess_sex(models["neutral"], betas)
+
+
+def test_refuses_what_says_no_sex(models):
+    for betas, sexes, word in (([[0.0], [1.0]], ["male", "female"], "two women and two men"),
+                               (np.zeros((4, 1)), ["male", "female", "x", "male"], "'x'"),
+                               (np.zeros((3, 1)), ["male", "female", "male", "male"], r"\(4, K\)"),
+                               (np.full((4, 1), np.nan), ["male", "female"] * 2, "finite")):
+        with pytest.raises(ValueError, match=word):
+            learn_sex_plane(betas, sexes)
+    neutral = models["neutral"]
+    for betas in (np.zeros(neutral.n_betas + 1), np.array([np.nan]), np.zeros((1, 1))):
+        with pytest.raises(ValueError, match="betas"):
+            guess_sex(neutral, betas)
+    damaged = {**neutral.info, PLANE: {**neutral.info[PLANE], "weights": [1.0]}}
+    with pytest.raises(ValueError, match="damaged"):
+        guess_sex(replace(neutral, info=damaged), np.zeros(1))

@@ -2,6 +2,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 
 import numpy as np
 
@@ -23,6 +24,7 @@ from .scape import (
     pose_prior,
     shape_deformations,
 )
+from .sex_plane import PLANE, learn_sex_plane
 
 SEXES = ("female", "male")
 FEWEST = 2                           # people that span a space of shapes
@@ -43,7 +45,8 @@ def learn_by_sex(template: Mesh, poses: np.ndarray, shapes: np.ndarray, sexes: S
     -------
     dict
         "neutral", and "female" and "male" where there are at least two people of that sex. `info["sex"]` of each
-        model is its key.
+        model is its key. Where there are both, `info["sex_plane"]` of the neutral one tells them apart by their betas
+        (`guess_sex`).
 
     Raises
     ------
@@ -68,7 +71,17 @@ def learn_by_sex(template: Mesh, poses: np.ndarray, shapes: np.ndarray, sexes: S
         info = {**how_learned(template, learned, poses, shapes[chosen], config), "sex": sex}
         models[sex] = ScapeModel(template, skeleton, learned.space, learn_shape_space(S[chosen], config.components),
                                  *prior, info, pose_examples=examples)
+    if all(sex in models for sex in SEXES):
+        models["neutral"] = _with_plane(models["neutral"], S, sexes)
     return models
+
+
+def _with_plane(model: ScapeModel, S: np.ndarray, sexes: Sequence[str]) -> ScapeModel:
+    """The model with what tells its people's sexes apart."""
+    known = np.isin(np.array(list(sexes), dtype=object), SEXES)
+    betas = model.shape_space.betas_of(S[known])
+    plane = learn_sex_plane(betas, [sex for sex in sexes if sex in SEXES])
+    return replace(model, info={**model.info, PLANE: plane.kept()})
 
 
 def _groups(sexes: Sequence[str], count: int) -> dict[str, np.ndarray]:

@@ -170,7 +170,7 @@ def _of_triangles(model: ScapeModel, vertices: np.ndarray, fit: PoseFit, config:
 
 @exact_subject.register
 def _of_vertices(model: SkinningModel, vertices: np.ndarray, fit: PoseFit, config: TransferConfig) -> Subject:
-    unposed = replace(model, rest=_unpose(model, vertices, fit.pose))
+    unposed = replace(model, rest=unpose(model, vertices, fit.pose))
     return _subject(model, unposed.terms, unposed.basis(None))
 
 
@@ -179,7 +179,7 @@ def _subject(model: BodyModel, terms: Terms, basis: np.ndarray) -> Subject:
                    model.pose_covariance, model.pose_examples)
 
 
-def _unpose(model: SkinningModel, vertices: np.ndarray, pose: np.ndarray) -> np.ndarray:
+def unpose(model: SkinningModel, vertices: np.ndarray, pose: np.ndarray) -> np.ndarray:
     """Rest vertices x (N, 3) that skinning carries to the given ones, the root's joint where the template has it.
 
     With its joints known a vertex is `x = B⁻¹ (y + t - Σ_j below_j T_j joint_j) - c`, and the joints are averages
