@@ -12,6 +12,8 @@ COMMANDS = {
     "model": ("Look into a body model and pose it.", "model.cli:group"),
     "complete": ("A partial scan, or several views -> the whole body.", "completion.partial.cli:complete_scan"),
     "animate": ("Markers -> the person and a moving body.", "completion.animation.cli:animate_markers"),
+    "mosh": ("Markers -> shape, motion and soft tissue; a file, or a folder of people.",
+             "completion.moshing.cli:mosh_markers"),
     "track": ("Frames of points -> a moving body, without markers.", "completion.tracking.cli:track_frames"),
 }
 

@@ -78,15 +78,15 @@ class Motion:
         """
         return subject.vertices(self.poses[frames], self.trans[frames])
 
-    def save(self, path: str | Path) -> None:
-        """Write an `.npz` with the array names that body-model files use, poses as (T, 3J)."""
+    def save(self, path: str | Path, **more: np.ndarray) -> None:
+        """Write an `.npz` with the array names that body-model files use, poses as (T, 3J), and more arrays."""
         arrays = {
             "poses": self.poses.reshape(len(self.poses), -1), "trans": self.trans,
             "betas": np.zeros(0) if self.betas is None else self.betas,
             "gender": np.array(self.gender), "mocap_frame_rate": np.array(float(self.rate)),
             "surface_model_type": np.array(SURFACE_MODEL), "marker_residuals": self.residuals,
             "marker_labels": np.array(self.labels, dtype=str), "converged": self.converged,
-            "marker_trusted": self.trusted}
+            "marker_trusted": self.trusted, **more}
         with storage.writing(path) as beside, open(beside, "wb") as out:
             np.savez_compressed(out, allow_pickle=False, **arrays)  # type: ignore[arg-type]
 

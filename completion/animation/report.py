@@ -7,6 +7,7 @@ import numpy as np
 
 from model.linear import Subject
 from scanprep.geometry import rotations
+from scanprep.geometry.mesh import Mesh
 from scanprep.pictures.animation import gif_bytes
 from scanprep.pictures.camera import Camera
 from scanprep.pictures.page import Page
@@ -94,13 +95,21 @@ def animated_picture(motion: Motion, subject: Subject, frames_per_second: float 
                           width, height)
 
 
-def moving_picture(bodies: np.ndarray, subject: Subject, rate: float, width: int = 300, height: int = 400) -> bytes:
-    """Meshes (n, N, 3) as an endless GIF of `rate` pictures a second, the camera following them over the ground."""
+def moving_picture(bodies: np.ndarray, subject: Subject, rate: float, width: int = 300, height: int = 400,
+                   faces: np.ndarray | None = None) -> bytes:
+    """Meshes (n, N, 3) as an endless GIF of `rate` pictures a second, the camera following them over the ground.
+
+    Parameters
+    ----------
+    faces : (f, 3) int, optional
+        Triangles of the meshes, where they are not the subject's.
+    """
     centred = bodies - bodies.mean(axis=1, keepdims=True)
     up, _ = upright(subject.template)
     centred[..., up] = bodies[..., up]
     camera = look_around(subject.template, centred, (35,))[0]
-    images = [render(subject.template.with_vertices(v), camera, width, height, ground=True) for v in centred]
+    faces = subject.template.faces if faces is None else faces
+    images = [render(Mesh(v, faces), camera, width, height, ground=True) for v in centred]
     return gif_bytes(images, rate)
 
 

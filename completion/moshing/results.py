@@ -2,11 +2,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Literal
 
 import numpy as np
 
 from model.body import BodyModel
+from scanprep.geometry import storage
 
 from ..markers.files import MarkerSequence
 from ..markers.layout import MarkerLayout
@@ -81,6 +83,26 @@ class SoftTissue:
         from ..animation.retarget import morphed_vertices
 
         return morphed_vertices(model, self.motion, self.betas(factor), frames, grounded=False)
+
+    def save(self, path: str | Path) -> None:
+        """Write a motion file (see `Motion.save`) that also holds the changes, as `shape_changes`."""
+        self.motion.save(path, shape_changes=self.changes)
+
+    @staticmethod
+    def load(path: str | Path) -> SoftTissue:
+        """Read a file of `save`.
+
+        Raises
+        ------
+        StorageError
+            Missing, not a motion, or one of a fixed shape.
+        """
+        motion, stored = Motion.load(path), storage.load_arrays(path, "a motion")
+        changes = stored.get("shape_changes", np.zeros(0))
+        if changes.ndim != 2 or len(changes) != len(motion.poses):
+            raise storage.StorageError(f"{path}: expected shape_changes, a row for each of {len(motion.poses)} frames, "
+                                       f"found shape {changes.shape}")
+        return SoftTissue(motion, changes.astype(np.float64))
 
 
 @dataclass(frozen=True, eq=False)

@@ -58,12 +58,15 @@ class Dots:
     radius : float, metres
     on_top : bool
         Seen through the meshes in front of them.
+    coarse : bool
+        Balls of few triangles, for pictures in which they are a few pixels wide.
     """
 
     points: np.ndarray
     color: np.ndarray | Sequence[float] = ACCENT
     radius: float = 0.012
     on_top: bool = False
+    coarse: bool = False
 
 
 @dataclass(frozen=True, eq=False)
@@ -154,7 +157,7 @@ def _triangles(shape: Shape, origin: np.ndarray) -> Triangles:
     if isinstance(shape, Dots):
         points = np.atleast_2d(np.asarray(shape.points, dtype=float))
         use = np.isfinite(points).all(axis=1)
-        corners, normals, owner = balls(points[use] - origin, shape.radius)
+        corners, normals, owner = balls(points[use] - origin, shape.radius, 1 if shape.coarse else None)
         count = len(points)
     else:
         starts, ends = np.atleast_2d(shape.starts), np.atleast_2d(shape.ends)

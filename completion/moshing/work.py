@@ -1,0 +1,228 @@
+"""One person: read the recordings, find the person and the motions, and write everything."""
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from model.body import BodyModel
+from scanprep.console import Metric, Outcome, Progress, write_report
+from scanprep.pictures.page import Page
+from scanprep.pictures.sheets import save_png
+
+from ..animation.report import morph_frames
+from ..animation.retarget import retarget
+from ..animation.work import choose_layout, key_frames, write_glb
+from ..markers.files import MarkerSequence, read_markers
+from ..markers.layout import MarkerLayout
+from .capture import mosh
+from .characters import moving_character, retarget_soft_tissue, write_character
+from .charts import MM
+from .outputs import filled_in, write_person, write_take
+from .recordings import Actor, Recording
+from .report import PICTURE, person_page, person_picture, take_page, take_picture
+from .results import MoshResult
+from .settings import MoshConfig
+from .sex import mosh_by_sex
+from .takes import LightMesh, Take, held_out
+
+ERRORS = ("marker error, fixed shape", "marker error, soft tissue", "held-out error, fixed shape",
+          "held-out error, soft tissue")
+
+
+@dataclass(frozen=True, eq=False)
+class Work:
+    """What is the same for all people of a call.
+
+    Attributes
+    ----------
+    model : BodyModel
+    name : str
+        Of the model, for the output.
+    sexes : {"female", "male": BodyModel}
+        Models for the sex that `model` tells; empty to do without.
+    character : BodyModel, optional
+        Whose body makes the motions too.
+    layout : str, optional
+        A named layout or a file; else the named one that fits the labels best.
+    hold_out : strings
+        Markers that no stage sees.
+    unit : str, optional
+        As `read_markers` takes it.
+    keys : int
+        Largest number of key frames in a GLB.
+    factor : float
+        On soft tissue, in exaggerated.glb and on the character.
+    """
+
+    model: BodyModel
+    name: str
+    sexes: Mapping[str, BodyModel]
+    character: BodyModel | None
+    layout: str | None
+    hold_out: tuple[str, ...]
+    unit: str | None
+    keys: int
+    factor: float
+    config: MoshConfig
+
+
+@dataclass(frozen=True, eq=False)
+class _Found:
+    """A person."""
+
+    model: BodyModel
+    sex: str | None
+    result: MoshResult
+    takes: list[Take]
+    usual: MarkerLayout
+    layout_name: str
+
+
+def mosh_person(work: Work, actor: Actor, folder: Path, command: str, solving: Progress, writing: Progress
+                ) -> tuple[list[Metric], list[str]]:
+    """Everything of one person into a folder: the figures, and what failed.
+
+    A recording that cannot be read is left out and told.
+
+    Parameters
+    ----------
+    command : str
+        For report.json.
+    solving, writing : callables
+        Called with (done, total).
+
+    Raises
+    ------
+    ValueError
+        No recording that can be read, or as `mosh`.
+    """
+    start = time.perf_counter()
+    found, failures = _solve(work, actor, solving)
+    settings = {"mosh": work.config, "model": work.name, "layout": found.layout_name, "held out": work.hold_out}
+    about = {"model": work.name, "layout": found.layout_name, "held_out": work.hold_out, "sex": found.sex,
+             "recordings": [str(r.path) for r in actor.recordings]}
+    write_person(folder, found.result, about)
+    figures: dict[str, list[Metric]] = {}
+    total = len(found.takes) + 1
+    for i, take in enumerate(found.takes):
+        writing(i, total)
+        figures[take.name] = _write(work, found, take, folder / take.name, command, settings)
+    writing(total - 1, total)
+    metrics = [Metric("model", work.name), *_person_metrics(found), *_figures(found.takes)]
+    person_page(actor.name, found.model, found.result, found.usual, found.takes, metrics, figures,
+                settings).write(folder / "report.html")
+    save_png(folder / PICTURE, person_picture(found.model, found.result))
+    write_report(Outcome(folder, metrics, settings, failures), command, time.perf_counter() - start)
+    writing(total, total)
+    return metrics, failures
+
+
+def _solve(work: Work, actor: Actor, progress: Progress) -> tuple[_Found, list[str]]:
+    names, sequences, failures = _read(work, actor.recordings)
+    labels = tuple(dict.fromkeys(label for each in sequences for label in each.labels))
+    usual, layout_name = choose_layout(work.model, work.layout, labels)
+    try:
+        layout = usual.without(work.hold_out) if work.hold_out else usual
+    except ValueError as error:
+        raise ValueError(f"--hold-out: {error}") from None
+    model, sex = work.model, None
+    if work.sexes:
+        told = mosh_by_sex({"neutral": work.model, **work.sexes}, sequences, layout, work.config, progress)
+        model, sex, result = told.model, told.guess.sex, told.result
+    else:
+        result = mosh(model, sequences, layout, work.config, progress)
+    subject = model.subject(result.betas)
+    light, takes = LightMesh.of(model.template), []
+    for i, (name, markers) in enumerate(zip(names, sequences, strict=True)):
+        soft = result.soft_tissue[i] if result.soft_tissue else None
+        held = held_out(model, usual, work.hold_out, markers, result.motions[i], soft)
+        takes.append(Take(name, model, subject, markers, result.motions[i], soft, result.faults[i], held, light))
+    return _Found(model, sex, result, takes, usual, layout_name), failures
+
+
+def _read(work: Work, recordings: Sequence[Recording]) -> tuple[list[str], list[MarkerSequence], list[str]]:
+    names, sequences, failures = [], [], []
+    for recording in recordings:
+        try:
+            sequences.append(read_markers(recording.path, work.unit, recording.who))
+            names.append(recording.name)
+        except ValueError as error:
+            failures.append(" ".join(str(error).split()))
+    if not sequences:
+        raise ValueError("; ".join(failures))
+    return names, sequences, failures
+
+
+def _write(work: Work, found: _Found, take: Take, folder: Path, command: str, settings: Mapping[str, Any]
+           ) -> list[Metric]:
+    """A sequence into its folder; the figures."""
+    start = time.perf_counter()
+    folder.mkdir()
+    metrics = [Metric("layout", found.layout_name), *_figures([take])]
+    write_take(folder, take, work.keys, work.factor)
+    page = take_page(take, metrics, settings)
+    if work.character is not None:
+        _character(work.character, take, folder, page, work.keys, work.factor)
+    page.write(folder / "report.html")
+    save_png(folder / PICTURE, take_picture(take))
+    write_report(Outcome(folder, metrics, settings), command, time.perf_counter() - start)
+    return metrics
+
+
+def _person_metrics(found: _Found) -> list[Metric]:
+    moved, result, frames = MM * found.result.person.moved, found.result, sum(len(t.motion.poses) for t in found.takes)
+    told = [Metric("layout", found.layout_name), Metric("sequences", len(found.takes)),
+            Metric("betas, length", float(np.linalg.norm(result.betas)), "sd"),
+            Metric("markers moved, mean", float(moved.mean()), "mm"),
+            Metric(f"markers moved, most ({result.layout.labels[int(moved.argmax())]})", float(moved.max()), "mm")]
+    if found.sex is not None:
+        told.insert(1, Metric("sex", found.sex))
+    for stage, seconds in result.seconds.items():
+        told.append(Metric(f"{stage}, time", seconds, "s") if stage == "person" else
+                    Metric(f"{stage}, speed", frames / max(seconds, 1e-9), "frames/s"))
+    return told
+
+
+def _figures(takes: Sequence[Take]) -> list[Metric]:
+    """What motions are judged by, of all frames together."""
+    T = sum(len(take.motion.poses) for take in takes)
+    out = [Metric("frames", T)]
+    if len(takes) == 1:
+        out.append(Metric("rate", takes[0].motion.rate, "1/s"))
+    fixed, soft = ([t.motion.residuals for t in takes], [t.soft.motion.residuals for t in takes if t.soft is not None])
+    held = [t.held for t in takes if t.held is not None]
+    held_soft = [h.soft for h in held if h.soft is not None]
+    for name, values in zip(ERRORS, (fixed, soft, [h.fixed for h in held], held_soft), strict=True):
+        if values:
+            out.append(Metric(name, MM * float(np.nanmean(np.concatenate([v.ravel() for v in values]))), "mm"))
+    seen = sum(int(t.markers.seen.sum()) for t in takes)
+    filled = sum(sum(filled_in(t.faults).values()) for t in takes)
+    return [*out, Metric("exchanges", sum(len(t.faults.exchanges) for t in takes)),
+            Metric("bad spans", sum(len(t.faults.bad) for t in takes)),
+            Metric("gaps filled in", 100 * filled / max(seen, 1), "% of what was seen")]
+
+
+def _character(character: BodyModel, take: Take, folder: Path, page: Page, keys: int, factor: float) -> None:
+    """The motion on a character: character.npz, character.glb, and its pictures."""
+    page.section("On a character", "The same turns of the joints, and feet on the ground when those of the person are; "
+                 f"soft tissue taken {factor:g} times.")
+    if take.soft is not None:
+        moving = retarget_soft_tissue(take.soft, take.model, character, factor)
+        moving.save(folder / "character.npz")
+        write_character(folder / "character.glb", character, moving, keys)
+        frames = key_frames(moving.motion, 8)
+        _, bodies = moving_character(character, moving, frames)
+        motion, body = moving.motion, character.subject(np.zeros(moving.changes.shape[1]))
+    else:
+        body = character.subject(np.zeros(character.n_betas))
+        motion = retarget(take.motion, take.subject, body)
+        motion.save(folder / "character.npz")
+        write_glb(folder / "character.glb", motion, body, keys)
+        frames = key_frames(motion, 8)
+        bodies = motion.vertices(body, frames)
+    page.picture(morph_frames(motion, body, bodies, frames))
