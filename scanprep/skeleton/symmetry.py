@@ -42,6 +42,8 @@ class Symmetry:
         Of the mirror image from the body, RMS, as a share of the body's size.
     returns : float
         Share of the surface whose partner's partner is near by.
+    image : (N, 3) float, metres
+        Where the mirror image of every vertex comes to lie, bent onto the body in the pose it was found in.
     pose : int
         The pose it was found in, -1 for the template.
     """
@@ -52,6 +54,7 @@ class Symmetry:
     left: np.ndarray
     distance: float
     returns: float
+    image: np.ndarray
     pose: int = -1
 
     @property
@@ -193,4 +196,5 @@ def _paired(body: Mesh, start: np.ndarray, image: np.ndarray, normal: np.ndarray
     back = np.linalg.norm(centres[partner[partner]] - centres, axis=1) < NEAR * size
     moved = np.average(((start - image)**2).sum(axis=1), weights=body.vertex_areas)
     distance = np.sqrt(moved + np.average(apart**2, weights=areas)) / size
-    return Symmetry(normal, point, partner, left, float(distance), float(areas[back].sum() / areas.sum()), pose)
+    return Symmetry(normal, point, partner, left, float(distance), float(areas[back].sum() / areas.sum()), image,
+                    pose)
