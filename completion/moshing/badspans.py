@@ -1,24 +1,31 @@
 """Markers that slip, jitter or stray: what they are off in the frame of their body part, over the whole sequence."""
 from __future__ import annotations
 
+from itertools import pairwise
+
 import numpy as np
 from scipy.ndimage import binary_dilation, median_filter
 
-from .results import BadSpan, BadKind
+from .results import BadKind, BadSpan
 from .settings import FaultConfig
 
-SLIP_WINDOW = 0.3                    # seconds on either side of a slip
+SLIP_WINDOW = 0.1                    # seconds in which a slip is over
 SLIP_SUDDEN = 0.6                    # share of the lasting displacement that comes within that time
-SLIP_LASTS = 0.85                    # share of the frames before and after that lie on their side of its middle
+SLIP_USUAL = 3.0                     # times the usual change within that time
+SLIP_STAYS = 0.5                     # seconds that a marker is seen before and after
+SLIP_LEAP = 0.5                      # share of it that the jump of a track must be
+SLIP_LASTS = 0.65, 0.85              # share of the frames on either side that keep to it, with a jump or without
+SLIP_SMOOTH = 2.0                    # times the least displacement that it takes where no track jumps
 NOISE_WINDOW = 0.15                  # seconds, over which jitter is a median
 NOISE_USUAL = 5.0                    # times the usual jitter
 STRAY_USUAL = 4.0                    # times the usual distance of the markers of a frame
 STRAY_JUMPED = 0.5                   # share of the limit that does where a track jumps away and back
-STRAY_SMOOTH = 2.0                   # times the limit that it takes where no track jumps
+STRAY_SMOOTH = 3.0                   # times the limit that it takes where no track jumps
+STRAY_LEAP = 0.5                     # share of the displacement that the jump of a track must be
 JOINED = 0.1                         # seconds between two spans of a kind that are one
 
 
-def find_bad(local: np.ndarray, jumped: np.ndarray, labels: tuple[str, ...], config: FaultConfig, rate: float
+def find_bad(local: np.ndarray, jumps: np.ndarray, labels: tuple[str, ...], config: FaultConfig, rate: float
              ) -> tuple[BadSpan, ...]:
     """The bad spans of markers.
 
@@ -26,8 +33,8 @@ def find_bad(local: np.ndarray, jumped: np.ndarray, labels: tuple[str, ...], con
     ----------
     local : (T, L, 3) float, metres
         From the simulated marker to the measured one, in the frame of its part; NaN where it was not seen.
-    jumped : (T, L) bool
-        Where the track jumps.
+    jumps : (T, L) float, metres
+        How far the track jumps, zero where it goes on.
     labels : L strings
     rate : float, frames per second
     """
@@ -40,14 +47,14 @@ def find_bad(local: np.ndarray, jumped: np.ndarray, labels: tuple[str, ...], con
         seen = np.flatnonzero(np.isfinite(local[:, i, 0]))
         if len(seen) < 3:
             continue
-        off, torn = local[seen, i], jumped[seen, i]
+        off, leap = local[seen, i], jumps[seen, i]
         noisy = _noisy(jitter[i], limit, rate)
-        slip = _slip(off, ~noisy, config.slip, rate)
+        slip = _slip(off, ~noisy, leap, config.slip, rate)
         before = ~noisy & (np.arange(len(seen)) < slip)
         middle = np.median(off[before] if before.any() else off, axis=0)
         away = np.linalg.norm(off - middle, axis=1)
         gap = np.r_[False, np.diff(seen) > 1]
-        stray = _stray(away, np.maximum(config.stray, STRAY_USUAL * usual[seen]), torn, gap) & before
+        stray = _stray(away, np.maximum(config.stray, STRAY_USUAL * usual[seen]), leap, gap) & before
         kinds: tuple[tuple[BadKind, np.ndarray], ...] = (
             ("noisy", noisy), ("slipped", np.arange(len(seen)) >= slip), ("stray", stray))
         for kind, bad in kinds:
@@ -71,68 +78,79 @@ def _noisy(jitter: np.ndarray, limit: float, rate: float) -> np.ndarray:
     out = np.zeros(len(jitter), dtype=bool)
     for run in _runs(reach):
         some = run[rough[run]]
-        if len(some):
+        if len(some) > width // 2:
             out[some[0]:some[-1] + 1] = True
     return out
 
 
-def _slip(off: np.ndarray, clean: np.ndarray, least: float, rate: float) -> int:
+def _slip(off: np.ndarray, clean: np.ndarray, jumps: np.ndarray, least: float, rate: float) -> int:
     """From which frame on a track (n, 3) stays displaced; n when it does not."""
-    n, width = len(off), max(3, round(SLIP_WINDOW * rate))
+    n, lag, stays = len(off), max(1, round(0.5 * SLIP_WINDOW * rate)), max(3, round(SLIP_STAYS * rate))
     some = np.flatnonzero(clean)
-    if len(some) < 3 * width:
+    if len(some) < 2 * stays:
         return n
     track = off[some]
-    smooth = median_filter(track, size=(width, 1), mode="nearest")
-    half = width // 2
+    smooth = median_filter(track, size=(2 * lag + 1, 1), mode="nearest")
     step = np.zeros_like(track)
-    step[half + 1:len(track) - half] = smooth[2 * half + 1:] - smooth[:len(track) - 2 * half - 1]
+    step[stays:len(track) - stays] = (smooth[2 * lag:] - smooth[:-2 * lag])[stays - lag:len(track) - stays - lag]
     size = np.linalg.norm(step, axis=1)
+    size[size < max(SLIP_SUDDEN * least, SLIP_USUAL * float(np.median(size)))] = 0
     best, found = 0.0, n
-    while (k := int(size.argmax())) and size[k] >= SLIP_SUDDEN * least:
-        worth, at = _lasting(track, k, step[k], least, width)
+    while size[k := int(size.argmax())] > 0:
+        worth, at = _lasting(track, jumps[some], k, step[k], least, lag)
         if worth > best:
             best, found = worth, int(some[at])
-        size[max(0, k - width):k + width] = 0
+        size[max(0, k - 2 * lag):k + 2 * lag] = 0
     return found
 
 
-def _lasting(track: np.ndarray, k: int, step: np.ndarray, least: float, width: int) -> tuple[float, int]:
-    """How well a step at k parts a track (n, 3) in two, zero when it is no slip, and its exact place."""
+def _lasting(track: np.ndarray, jumps: np.ndarray, k: int, step: np.ndarray, least: float, lag: int
+             ) -> tuple[float, int]:
+    """How well a step at k parts a track (n, 3) in two, zero when it is no slip, and its exact place.
+
+    Where the track itself jumps, less is needed: a body that fits worse from some time on makes no track jump.
+    """
     before, after = np.median(track[:k], axis=0), np.median(track[k:], axis=0)
     way = after - before
     far = float(np.linalg.norm(way))
-    if far < least or step @ way < SLIP_SUDDEN * far**2:
+    near = np.arange(max(1, k - 2 * lag), min(len(track), k + 2 * lag))
+    jumped = jumps[near].max() > SLIP_LEAP * far
+    if far < (least if jumped else SLIP_SMOOTH * least) or step @ way < SLIP_SUDDEN * far**2:
         return 0.0, k
     share = (track - before) @ way / far**2
-    if (share[:k] < 0.5).mean() < SLIP_LASTS or (share[k:] > 0.5).mean() < SLIP_LASTS:
+    lasts = SLIP_LASTS[0 if jumped else 1]
+    if (share[:k] < 0.5).mean() < lasts or (share[k:] > 0.5).mean() < lasts:
         return 0.0, k
     share = np.clip(share, 0, 1)
     cost = np.r_[0, np.cumsum(share)] + np.r_[np.cumsum((1 - share)[::-1])[::-1], 0]
-    near = np.arange(max(1, k - width), min(len(track), k + width))
-    return far**2 * k * (len(track) - k) / len(track), int(near[cost[near].argmin()])
+    at = near[jumps[near].argmax() if jumped else cost[near].argmin()]
+    return far**2 * k * (len(track) - k) / len(track), int(at)
 
 
-def _stray(away: np.ndarray, limit: np.ndarray, jumped: np.ndarray, gap: np.ndarray) -> np.ndarray:
+def _stray(away: np.ndarray, limit: np.ndarray, jumps: np.ndarray, gap: np.ndarray) -> np.ndarray:
     """Frames (n,) bool of a marker that is somewhere else, from one tear of its track to the next.
 
     Parameters
     ----------
     away, limit : (n,) float, metres
         From its usual place, and how far that may be.
-    jumped, gap : (n,) bool
-        The track jumps from the frame before to this one, or was out of sight between them.
+    jumps : (n,) float, metres
+        How far the track jumps from the frame before to this one.
+    gap : (n,) bool
+        It was out of sight between them.
     """
     out = away > STRAY_SMOOTH * limit
-    cuts = np.flatnonzero(jumped | gap)
-    ends = np.r_[0, cuts, len(away)]
-    for begin, end in zip(ends[:-1], ends[1:], strict=True):
+    ends = np.r_[0, np.flatnonzero((jumps > 0) | gap), len(away)]
+    leaps, gaps = np.r_[jumps, 0.0], np.r_[gap, False]
+    for begin, end in pairwise(ends):
         if begin == end:
             continue
-        tears = [jumped[begin] or gap[begin], end < len(away) and (jumped[end] or gap[end])]
-        leaps = jumped[begin] or (end < len(away) and bool(jumped[end]))
-        share = np.median(away[begin:end] / limit[begin:end])
-        out[begin:end] |= share > (STRAY_JUMPED if all(tears) and leaps else 1.0 if any(tears) else STRAY_SMOOTH)
+        far = float(np.median(away[begin:end]))
+        torn = [leaps[at] > STRAY_LEAP * far for at in (begin, end)]
+        open_ended = [gaps[at] or at in (0, len(away)) for at in (begin, end)]
+        both = all(a or b for a, b in zip(torn, open_ended, strict=True))
+        share = STRAY_JUMPED if all(torn) else 1.0 if any(torn) and both else STRAY_SMOOTH
+        out[begin:end] |= far > share * np.median(limit[begin:end])
     return out
 
 

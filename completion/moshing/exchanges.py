@@ -39,13 +39,13 @@ def marker_levels(places: np.ndarray, positions: np.ndarray, config: FaultConfig
     Parameters
     ----------
     places, positions : (T, L, 3) float, metres
-        NaN for markers that the body does not know, or that were not seen.
+        NaN for markers that the body does not know, which are taken to be nowhere near, or that were not seen.
     """
     squared = sum((places[:, :, None, d] - positions[:, None, :, d])**2 for d in range(3))
     assert isinstance(squared, np.ndarray)
     share = min(1.0, 1 / (config.memory * rate))
-    cost = share * np.minimum(squared / (2 * config.deviation**2), AWAY)
-    return np.nan_to_num(cost, nan=0.0)
+    cost = share * np.minimum(np.nan_to_num(squared / (2 * config.deviation**2), nan=AWAY), AWAY)
+    return cost * np.isfinite(positions[:, None, :, 0])
 
 
 def find_order(evidence: Evidence, config: FaultConfig) -> np.ndarray:

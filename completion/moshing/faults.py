@@ -110,7 +110,7 @@ class _Search:
         self.x, self.solved = self.body.body.body.join(motion.poses, motion.trans), self.order
 
     def follow(self) -> None:
-        """Have the body follow the repaired markers, but at first those of which it is not sure whose label is whose."""
+        """Have the body follow the repaired markers, at first without those whose label is in doubt."""
         targets = np.where(self.unsure[:, None], np.nan, self.repaired)[:, self.body.rows]
         if np.isfinite(targets[..., 0]).sum(axis=1).max() < ENOUGH * len(self.body.rows):
             targets = self.repaired[:, self.body.rows]
@@ -130,7 +130,8 @@ class _Search:
         ordered = self.ordered[:, rows]
         tracks = Tracks(ordered, self.config.floor, self.config.jump)
         local = self.body.local(self.x, simulated, ordered)
-        self.bad = find_bad(local, tracks.jumped, self.body.labels, self.config, self.markers.rate)
+        jumps = np.where(tracks.jumped, tracks.off, 0)
+        self.bad = find_bad(local, jumps, self.body.labels, self.config, self.markers.rate)
         self.out = np.zeros((T, len(self.markers.labels)), dtype=bool)
         for span in self.bad:
             self.out[span.begin:span.end + 1, self.markers.labels.index(span.label)] = True

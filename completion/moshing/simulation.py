@@ -13,7 +13,7 @@ from ..markers.files import MarkerSequence
 from ..markers.layout import MarkerLayout
 
 LOOKS = 15.0                         # frames per second in which it is asked how a marker draws the body
-OWN = 0.75                           # most of a displacement that the body is taken to have followed
+OWN = 0.6                            # most of a displacement that the body is taken to have followed
 
 
 class Simulation(MarkerFollower):

@@ -28,16 +28,17 @@ from completion.animation.marked import supports
 from completion.animation.shape import subject_from_markers
 from completion.markers.files import MarkerSequence, read_markers
 from completion.markers.layout import MarkerLayout
-from completion.motion import Motion
 from completion.moshing.faults import find_faults
 from completion.moshing.results import BadSpan, Exchange, MarkerFaults
 from completion.moshing.settings import FaultConfig
+from completion.motion import Motion
 from model.body import BodyModel
 from model.files import load_model
 from model.linear import Subject
 from model.posing.transfer import subject_from_body
 
 SPANS = (0.2, 2.0)                   # seconds that an exchange lasts
+APART = 60                           # frames between two exchanges of a marker
 NEAR = 0.2                           # metres, between the markers of a close pair
 KINDS = ("slipped", "noisy", "stray")
 
@@ -66,7 +67,7 @@ def exchanged(sequence: MarkerSequence, share: float, close: bool, rng: np.rando
         length = min(round(rng.uniform(*SPANS) * sequence.rate), T // 3)
         t = int(rng.integers(1 - length, T))
         begin, end = max(t, 0), min(t + length, T)
-        margin = slice(max(begin - 1, 0), end + 1)                   # two that touch would be one, or a cycle
+        margin = slice(max(begin - APART, 0), end + APART)           # two with a gap between them would be one
         if end - begin < 0.1 * sequence.rate or busy[margin, two].any():
             continue
         busy[begin:end, two] = True
@@ -85,7 +86,7 @@ def spoilt(sequence: MarkerSequence, kind: str, count: int, part_rotations: np.n
         From the frame of a marker's part to the world.
     """
     positions = sequence.positions.copy()
-    T, L = positions.shape[:2]
+    T = len(positions)
     out = []
     for i in rng.permutation(np.flatnonzero(sequence.seen.mean(axis=0) > 0.5))[:count]:
         way = rng.normal(size=3)
