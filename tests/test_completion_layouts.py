@@ -11,9 +11,9 @@ from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.rotations import exp
 from scanprep.scanning.people import Person
 
-COUNTS = {"biomech57": 57, "cmu41": 41, "helenhayes29": 29, "plugingait39": 39, "vicon47": 47}
+COUNTS = {"biomech57": 57, "cmu41": 41, "helenhayes29": 29, "mosh67": 67, "plugingait39": 39, "vicon47": 47}
 MIDDLE = {"C7", "T10", "CLAV", "STRN", "CV7", "TV2", "TV7", "SJN", "SXS", "Top.Head", "Front.Head", "Rear.Head",
-          "V.Sacral", "ARIEL"}
+          "V.Sacral", "ARIEL", "NAVL", "VL3"}
 FILES = sorted(FOLDER.glob("*.json"))
 
 

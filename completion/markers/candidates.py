@@ -171,7 +171,7 @@ def _with_partners(base: MarkerLayout, mirror: SkinMirror) -> MarkerLayout:
     """The base, and the partners that are missing in it."""
     lonely = [i for i, label in enumerate(base.labels) if (o := other_side(label)) and o not in base.labels]
     others = [other_side(base.labels[i]) or "" for i in lonely]
-    places = [(int(mirror.partner[_vertices(base)[i]]),) for i in lonely]
+    places: list[tuple[int, ...]] = [(int(mirror.partner[_vertices(base)[i]]),) for i in lonely]
     free = {base.labels[i] for i in lonely} & set(base.loose)
     joined = _joined(base, places, others)
     aliases = {a: label for a, label in joined.aliases.items() if a not in others}

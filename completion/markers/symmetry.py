@@ -15,7 +15,7 @@ from .layout import MarkerLayout
 
 FAR = 0.06                           # metres: a marker of no telling label has no partner beyond it
 _WORDS = re.compile(r"(?<![A-Za-z])(left|right)(?![A-Za-z])", re.IGNORECASE)
-_LETTER = re.compile(r"^[LR](?=[A-Z0-9._ ])|(?<=[._ ])[LRlr]$|(?<=[a-z0-9])[LR]$")
+_LETTER = re.compile(r"^[LR](?=[A-Z0-9._ ])|^[lr](?=[._ ])|(?<=[._ ])[LRlr]$|(?<=[a-z0-9])[LR]$")
 _OTHER = {"L": "R", "R": "L", "l": "r", "r": "l", "left": "right", "right": "left"}
 
 
@@ -75,7 +75,7 @@ def _like(word: str) -> str:
 
 
 def label_pairs(labels: Sequence[str]) -> np.ndarray:
-    """(L,) the place of each label's partner, its own for a label that names no side, -1 where the partner is missing."""
+    """(L,) the place of each label's partner: its own for a label that names no side, -1 where it is missing."""
     rows = {label: i for i, label in enumerate(labels)}
     others = [other_side(label) for label in labels]
     return np.array([i if other is None else rows.get(other, -1) for i, other in enumerate(others)], dtype=np.int64)
@@ -174,8 +174,8 @@ def _by_symmetry(template: Mesh, poses: np.ndarray | None) -> tuple[Mesh, np.nda
 
     found = find_symmetry(template, poses)
     if not found.holds:
-        raise ValueError(f"template: expected one that stands symmetrically, its mirror image is {found.distance:.1%} of "
-                         "its size away; give landmarks whose names tell the sides")
+        raise ValueError("template: expected one that stands symmetrically, its mirror image is "
+                         f"{found.distance:.1%} of its size away; give landmarks whose names tell the sides")
     body = template if found.pose < 0 or poses is None else template.with_vertices(poses[found.pose])
     return body, found.image, found.normal
 
@@ -185,7 +185,7 @@ def _by_landmarks(template: Mesh, landmarks: Mapping[str, int]) -> tuple[Mesh, n
     from scanprep.matching.nonrigid import register
 
     pairs = [(v, landmarks[other]) for name, v in landmarks.items()
-             if side_of(name) == 1 and (other := other_side(name)) in landmarks]
+             if side_of(name) == 1 and (other := other_side(name)) is not None and other in landmarks]
     if len(pairs) < 3:
         raise ValueError(f"landmarks: expected at least 3 pairs of left and right, found {len(pairs)} among "
                          f"{', '.join(landmarks) or 'none'}")
