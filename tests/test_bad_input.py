@@ -44,6 +44,7 @@ FILL = "prep fill mesh.ply -o out.ply"
 LEARN = "learn --poses poses -o out.npz"
 COMPLETE = "complete half.ply -m model.npz --subject template -o out"
 ANIMATE = "animate walk.c3d -m model.npz --layout layout.json -o out"
+MOSH = "mosh walk.c3d -m model.npz --layout layout.json -o out"
 TRIANGLE = "ply\nformat ascii 1.0\nelement vertex 3\nproperty float x\nproperty float y\nproperty float z\n" \
            "element face 1\nproperty list uchar int vertex_indices\nend_header\n"
 
@@ -147,6 +148,13 @@ CASES = {
                        ["betas.json", "3"]),
     "mesh of another topology for a subject": (ANIMATE + " --subject other.ply",
                                                lambda place: write_mesh("other.ply", worm(20)), ["other.ply"]),
+    "nothing to mosh": ("mosh nowhere -m model.npz -o out", lambda place: None, ["nowhere", "no such file"]),
+    "a folder without markers": ("mosh poses -m model.npz -o out", lambda place: None, ["poses", ".c3d"]),
+    "a table of nobody": (MOSH + " --subjects layout.json", lambda place: None, ["layout.json", "subject"]),
+    "a table of other files": (MOSH + " --subjects who.csv", text("who.csv", "file,subject\nrun.c3d,ann\n"),
+                               ["who.csv", "run.c3d"]),
+    "a character that is none": (MOSH + " --character layout.json", lambda place: None, ["layout.json"]),
+    "a sex alone": (MOSH + " --female model.npz", lambda place: None, ["--female", "--male"]),
 }
 
 

@@ -2,7 +2,6 @@
 from __future__ import annotations
 
 import numpy as np
-from scipy.signal import butter, sosfiltfilt
 from scipy.spatial.transform import Rotation
 
 ORDER = 2                            # of each of the two passes
@@ -26,6 +25,8 @@ def low_pass(pose: np.ndarray, trans: np.ndarray, rate: float, cutoff: float) ->
     ValueError
         A cut-off that is not between zero and half the rate, too few frames to filter.
     """
+    from scipy.signal import butter, sosfiltfilt
+
     if not 0 < cutoff < rate / 2:
         raise ValueError(f"low_pass: expected a frequency between 0 and half the rate, {rate / 2:g}, got {cutoff:g}")
     sections = butter(ORDER, cutoff, fs=rate, output="sos")

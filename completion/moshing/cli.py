@@ -18,7 +18,7 @@ from .recordings import Actor, By, Grouping, find_actors
 from .settings import MoshConfig
 from .work import Work
 
-MarkersArg = Annotated[tyro.conf.Positional[tuple[Path, ...]], tyro.conf.arg(metavar="MARKERS...")]
+MarkersArg = Annotated[tyro.conf.Positional[tuple[Path, ...]], tyro.conf.arg(metavar="MARKERS [MARKERS ...]")]
 TOLD = 20                            # people that are listed before the work begins
 
 
@@ -61,6 +61,8 @@ def mosh_markers(markers: MarkersArg, output: Output, model: ModelOrNone = None,
         keys: Largest number of key frames in a GLB.
         config: Settings.
     """
+    if not markers:
+        raise ValueError("MARKERS: expected at least one file or folder")
     grouping = Grouping(by, subjects, name, who)
     actors = find_actors(markers, grouping, output)
     held = tuple(label for words in hold_out for label in words.split(",") if label)

@@ -140,7 +140,7 @@ def _index(output: Path, actors: Sequence[Actor], metrics: Mapping[str, Sequence
             continue
         told = [f"{m.name}: {m.text()} {m.unit}" for m in metrics[actor.name]
                 if m.name in (*ERRORS, "sequences", "frames", "sex")]
-        lines = "".join(f"<p>{escape(line)}</p>" for line in (*told, f"one person {actor.rule}"))
+        lines = "".join(f"<p>{escape(line)}</p>" for line in (*told, f"recordings put together: {actor.rule}"))
         link = escape(actor.name)
         page.markup(f'<div class="person"><div><a href="{link}/report.html"><b>{link}</b></a>{lines}</div>'
                     f'<a href="{link}/report.html"><img src="{link}/{PICTURE}" alt="{link}"></a></div>', _STYLE)

@@ -164,9 +164,14 @@ def picture_fixed_and_soft(take: Take, frames: np.ndarray, height: int = 400) ->
 
 
 def most_changed(take: Take, frames: np.ndarray, count: int) -> np.ndarray:
-    """Of some frames those, in order, in which soft tissue moves the body most."""
+    """Of some frames those, in order, in which soft tissue moves the body most, no two close in time."""
     size = np.sqrt((soft_change(take, frames)**2).mean(axis=1))
-    return np.sort(frames[np.argsort(-size)[:count]])
+    apart = len(take.motion.poses) / (3 * count)
+    chosen: list[int] = []
+    for t in frames[np.argsort(-size)].tolist():
+        if len(chosen) < count and all(abs(t - other) >= apart for other in chosen):
+            chosen.append(t)
+    return np.sort(chosen)
 
 
 def moving(take: Take, seconds: float = 4.0, rate: float = 6.0) -> bytes:

@@ -57,13 +57,13 @@ def person_page(name: str, model: BodyModel, result: MoshResult, usual: MarkerLa
     page.picture(pictures.picture_sides(body, found, before.place(body), labels))
     page.table(_moved_rows(result, before, moved, takes),
                ("marker", "moved (mm)", "up (mm)", "forward (mm)", "to the left (mm)", "off the skin, layout (mm)",
-                "found (mm)", "distance left over (mm)"))
+                "found (mm)", "distance left, fixed shape (mm)"))
     if before.loose:
         page.text(f"Loose markers, which may sit anywhere on their limb: {', '.join(before.loose)}.")
     page.section("Frames that shape and markers were found from")
     page.picture(_chosen_frames(model, result, takes))
     page.section("Figures").table(rows(list(metrics)), ("metric", "value", "unit"))
-    return page.section("Settings").code(json.dumps(plain(settings), indent=1))
+    return _settings(page, settings)
 
 
 def take_page(take: Take, metrics: Sequence[Metric], settings: Mapping[str, Any]) -> Page:
@@ -77,7 +77,8 @@ def take_page(take: Take, metrics: Sequence[Metric], settings: Mapping[str, Any]
     page.picture(pictures.moving(take), "the first seconds")
     page.section("Distance of the markers", "From where the body has them to where they were measured.")
     page.chart(chart_frames(take), "mean of the markers, over time")
-    page.chart(chart_map(take), "every marker over time, the worst first; white where it was not seen")
+    page.chart(chart_map(take), "every marker over time, the worst first; white where it was not seen, or taken out "
+                                "as bad")
     page.picture(pictures.picture_large(take, worst_frames(take.shown, WORST)), "the frames in which they are farthest")
     page.table(_marker_rows(take), ("marker", "fixed shape (mm)", "soft tissue (mm)", "95th percentile (mm)",
                                     "seen (%)", "believed (%)"))
@@ -86,7 +87,12 @@ def take_page(take: Take, metrics: Sequence[Metric], settings: Mapping[str, Any]
         _soft_section(page, take, frames)
     _fault_section(page, take)
     page.section("Figures").table(rows(list(metrics)), ("metric", "value", "unit"))
-    return page.section("Settings").code(json.dumps(plain(settings), indent=1))
+    return _settings(page, settings)
+
+
+def _settings(page: Page, settings: Mapping[str, Any]) -> Page:
+    text = escape(json.dumps(plain(settings), indent=1))
+    return page.markup(f"<details><summary>All settings</summary><pre><code>{text}</code></pre></details>")
 
 
 def _soft_section(page: Page, take: Take, frames: np.ndarray) -> None:

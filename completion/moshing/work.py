@@ -200,11 +200,14 @@ def _figures(takes: Sequence[Take]) -> list[Metric]:
     for name, values in zip(ERRORS, (fixed, soft, [h.fixed for h in held], held_soft), strict=True):
         if values:
             out.append(Metric(name, MM * float(np.nanmean(np.concatenate([v.ravel() for v in values]))), "mm"))
-    seen = sum(int(t.markers.seen.sum()) for t in takes)
+    missing = sum(int((~t.markers.select(t.faults.labels).seen).sum()) for t in takes)
     filled = sum(sum(filled_in(t.faults).values()) for t in takes)
+    share = 100 / max(sum(t.faults.simulated[..., 0].size for t in takes), 1)
     return [*out, Metric("exchanges", sum(len(t.faults.exchanges) for t in takes)),
             Metric("bad spans", sum(len(t.faults.bad) for t in takes)),
-            Metric("gaps filled in", 100 * filled / max(seen, 1), "% of what was seen")]
+            Metric("markers missing", share * missing, "%"),
+            Metric("taken out as bad", share * max(filled - missing, 0), "%"),
+            Metric("gaps filled in", filled, "positions")]
 
 
 def _character(character: BodyModel, take: Take, folder: Path, page: Page, keys: int, factor: float) -> None:

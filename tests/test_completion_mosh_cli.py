@@ -1,0 +1,244 @@
+"""`scape mosh`: people and their motions from files and folders of markers."""
+import csv
+import json
+import shutil
+
+import numpy as np
+import pytest
+from completion_bodies import MEAN, worm_with_prior
+from glb_reader import Glb
+
+from completion import MarkerLayout, MarkerSequence, Motion, read_markers, write_markers
+from completion.__main__ import main
+from completion.animation import report as animation_report
+from completion.moshing import pictures, report
+from completion.moshing.pictures import every
+from completion.moshing.recordings import Grouping, find_actors
+from completion.moshing.results import SoftTissue
+from completion.moshing.takes import held_out
+
+FRAMES = 40
+BETAS = {"ann": np.array([0.9, -0.6, 0.4]), "bob": np.array([-0.8, 0.5, -0.3])}
+PERSON = {"subject.json", "layout.json", "report.html", "report.json", "done.json", "picture.png"}
+TAKE = {"motion.npz", "soft_tissue.npz", "animation.glb", "motion.bvh", "joint_angles.csv", "joint_centres.csv",
+        "residuals.csv", "residuals_soft.csv", "virtual.c3d", "faults.json", "faults.csv", "report.html", "report.json",
+        "picture.png"}
+QUICK = ("--keys", "5", "--person.frames", "4", "--person.start-axes", "1", "--person.annealing", "4", "1",
+         "--person.iterations", "4")
+
+
+@pytest.fixture(scope="module", autouse=True)
+def small_pictures():
+    """Nobody looks at them here."""
+    with pytest.MonkeyPatch.context() as patch:
+        for module in (report, pictures, animation_report):
+            patch.setattr(module, "render", lambda *_rest, **_named: np.full((30, 20, 3), 255, dtype=np.uint8))
+        yield
+
+
+def recorded(model, layout, betas, phase):
+    """Markers (T, L, 3) on a worm that bends, and its meshes."""
+    t = np.arange(FRAMES) / 60
+    poses = MEAN + np.sin(3 * t[:, None, None] + np.arange(4)[:, None] + phase) * np.array([0.05, 0.3, 0.2])
+    meshes = model.subject(betas).vertices(poses, np.stack([t, 0 * t, 0 * t], axis=1))
+    return np.stack([layout.place(model.template.with_vertices(v)) for v in meshes]), meshes
+
+
+@pytest.fixture(scope="module")
+def place(tmp_path_factory):
+    """A model, a layout, and two people: ann with two recordings, bob with one."""
+    place = tmp_path_factory.mktemp("mosh")
+    model = worm_with_prior()
+    model.save(place / "model.npz")
+    vertices = np.random.default_rng(4).choice(396, 34, replace=False)
+    layout = MarkerLayout(tuple(f"M{i}" for i in range(34)), vertices, 0.012)
+    layout.save(place / "layout.json")
+    truth = {}
+    for person, name, phase in (("ann", "walk", 0.0), ("ann", "run", 1.0), ("bob", "jump", 0.5)):
+        positions, truth[name] = recorded(model, layout, BETAS[person], phase)
+        positions[5:9, 3] = np.nan
+        (place / "people" / person).mkdir(parents=True, exist_ok=True)
+        write_markers(place / "people" / person / f"{name}.csv", MarkerSequence(positions, layout.labels, 60.0))
+    np.savez(place / "truth.npz", **truth)
+    return place
+
+
+def run(place, *words, quick=QUICK):
+    return main(["mosh", *map(str, words), "-m", str(place / "model.npz"), "--layout", str(place / "layout.json"), *quick])
+
+
+def told(folder):
+    return {row["metric"]: row["value"] for row in json.loads((folder / "report.json").read_text())["metrics"]}
+
+
+@pytest.fixture(scope="module")
+def done(place, tmp_path_factory):
+    """The two recordings of ann, two markers held out."""
+    out = tmp_path_factory.mktemp("done") / "out"
+    files = [place / "people" / "ann" / f"{name}.csv" for name in ("walk", "run")]
+    assert run(place, *files, "-o", out, "--name", "ann", "--hold-out", "M7,M9", "--factor", "2") == 0
+    return out
+
+
+def test_everything_is_written(done):
+    assert {p.name for p in done.iterdir()} == {"ann", "report.html", "report.json", "subjects.csv"}
+    assert {p.name for p in (done / "ann").iterdir()} == PERSON | {"walk", "run"}
+    for name in ("walk", "run"):
+        assert {p.name for p in (done / "ann" / name).iterdir()} == TAKE | {"exaggerated.glb"}
+
+
+def test_the_body_is_the_one_that_carried_the_markers(done, place):
+    model, truth = worm_with_prior(), np.load(place / "truth.npz")
+    for name in ("walk", "run"):
+        motion = Motion.load(done / "ann" / name / "motion.npz")
+        np.testing.assert_allclose(json.loads((done / "ann" / "subject.json").read_text())["betas"], motion.betas)
+        off = np.linalg.norm(motion.vertices(model.subject(motion.betas)) - truth[name], axis=2)
+        assert off.mean() < 0.02
+        soft = SoftTissue.load(done / "ann" / name / "soft_tissue.npz")
+        assert soft.changes.shape == (FRAMES, 3) and soft.motion.labels == motion.labels
+
+
+def test_held_out_markers_are_used_in_no_stage_and_scored(done, place):
+    motion = Motion.load(done / "ann" / "walk" / "motion.npz")
+    unused = [label for i, label in enumerate(motion.labels) if np.isnan(motion.residuals[:, i]).all()]
+    assert unused == ["M7", "M9"]
+    assert not {"M7", "M9"} & set(MarkerLayout.load(done / "ann" / "layout.json").labels)
+    figures = told(done / "ann" / "walk")
+    model, layout = worm_with_prior(), MarkerLayout.load(place / "layout.json")
+    markers = read_markers(place / "people" / "ann" / "walk.csv")
+    held = held_out(model, layout, ("M7", "M9"), markers, motion, None)
+    meshes = motion.vertices(model.subject(motion.betas))
+    places = np.stack([layout.select(["M7", "M9"]).place(model.template.with_vertices(v)) for v in meshes])
+    off = np.linalg.norm(places - markers.select(["M7", "M9"]).positions, axis=2)
+    assert np.abs(held.fixed - off).max() < 0.004          # its normal is that of the ring of neighbours
+    assert figures["held-out error, fixed shape"] == pytest.approx(1000 * held.fixed.mean())
+    assert figures["held-out error, soft tissue"] < 40
+
+
+def test_held_out_markers_of_a_changing_shape_are_those_of_its_meshes(done, place):
+    model, layout = worm_with_prior(), MarkerLayout.load(place / "layout.json")
+    markers = read_markers(place / "people" / "ann" / "walk.csv")
+    soft = SoftTissue.load(done / "ann" / "walk" / "soft_tissue.npz")
+    soft = SoftTissue(soft.motion, np.sin(np.arange(3 * FRAMES)).reshape(FRAMES, 3))
+    held = held_out(model, layout, ("M7", "M9"), markers, soft.motion, soft)
+    places = np.stack([layout.select(["M7", "M9"]).place(model.template.with_vertices(v))
+                       for v in soft.vertices(model)])
+    off = np.linalg.norm(places - markers.select(["M7", "M9"]).positions, axis=2)
+    assert np.abs(held.soft - off).max() < 0.004
+
+
+def test_gaps_are_filled_and_counted(done):
+    virtual = read_markers(done / "ann" / "walk" / "virtual.c3d")
+    column = virtual.labels.index("M3")
+    assert virtual.seen[5:9, column].all()
+    steps = np.linalg.norm(np.diff(virtual.positions[:, column], axis=0), axis=1)
+    assert steps[4:9].max() < 3 * np.median(steps) + 0.02
+    faults = json.loads((done / "ann" / "walk" / "faults.json").read_text())
+    assert faults["filled"]["M3"] >= 4
+    figures = told(done / "ann" / "walk")
+    assert figures["gaps filled in"] == sum(faults["filled"].values())
+    assert figures["markers missing"] == pytest.approx(100 * 4 / (FRAMES * 32))
+
+
+def test_the_glb_lasts_as_long_as_the_motion_and_exaggerates(done):
+    deviations = []
+    for name in ("animation.glb", "exaggerated.glb"):
+        glb = Glb((done / "ann" / "walk" / name).read_bytes())
+        times = glb.array(glb.json["animations"][0]["samplers"][0]["input"])[:, 0]
+        assert len(times) == 5 and times[-1] == pytest.approx((FRAMES - 1) / 60, rel=1e-5)
+        deviations.append(glb.array(glb.json["meshes"][0]["primitives"][0]["attributes"]["POSITION"]))
+    assert np.abs(deviations[0] - deviations[1]).max() > 1e-5
+
+
+def test_pages_lead_to_each_other_and_tell_the_markers(done):
+    assert 'href="ann/report.html"' in (done / "report.html").read_text()
+    person = (done / "ann" / "report.html").read_text()
+    assert 'href="walk/report.html"' in person and "Markers before and after" in person and ">M33<" in person
+    take = (done / "ann" / "walk" / "report.html").read_text()
+    assert "M7 (held out)" in take and "Soft tissue" in take and "Faults of the markers" in take
+
+
+def test_a_folder_of_people_goes_on_where_it_was(place, tmp_path, capsys):
+    people, out = tmp_path / "people", tmp_path / "out"
+    shutil.copytree(place / "people", people)
+    (people / "ann" / "run.csv").unlink()
+    bare = (*QUICK, "--no-soft-tissue")
+    assert run(place, people, "-o", out, quick=bare) == 0
+    assert "ann: walk.csv (by the sub-folder)" in capsys.readouterr().err
+    assert (told(out)["people"], told(out)["done before"], told(out)["failed"]) == (2, 0, 0)
+    assert not (out / "ann" / "walk" / "soft_tissue.npz").exists()
+    when = (out / "ann" / "walk" / "motion.npz").stat().st_mtime_ns
+    (people / "bob" / "jump.csv").write_text("time,A_x,A_y,A_z\n0,1,2,3\n0.1,1,2,3\n")
+    (people / "bob" / "swim.csv").write_text("nothing")
+    assert run(place, people, "-o", out, quick=bare) == 1
+    said = capsys.readouterr().err
+    assert "bob: labels: expected at least 3 markers of the layout" in said
+    assert (out / "ann" / "walk" / "motion.npz").stat().st_mtime_ns == when
+    assert (told(out)["done before"], told(out)["failed"]) == (1, 1)
+    assert (out / "bob" / "jump" / "motion.npz").exists()              # what was there stays until there is better
+    shutil.copy(place / "people" / "bob" / "jump.csv", people / "bob" / "jump.csv")
+    assert run(place, people, "-o", out, quick=bare) == 1              # one file of bob's cannot be read
+    assert "bob: " in (said := capsys.readouterr().err) and "swim.csv" in said and "ann: ann" not in said
+    assert told(out)["done before"] == 1 and told(out)["failed"] == 0
+    assert run(place, people, "-o", out, quick=bare) == 1
+    assert told(out)["done before"] == 2 and "swim.csv" in capsys.readouterr().err
+    assert not list(out.glob(".*"))
+
+
+def names(actors):
+    return {actor.name: [r.name for r in actor.recordings] for actor in actors}
+
+
+def empty(*paths):
+    for path in paths:
+        path.parent.mkdir(parents=True, exist_ok=True)
+        path.write_text("")
+
+
+def test_who_is_who(tmp_path):
+    labelled = MarkerSequence(np.zeros((2, 2, 3)) + 1, ("Eve:A", "Eve:B"), 10.0)
+    both = MarkerSequence(np.zeros((2, 2, 3)) + 1, ("Eve:A", "Adam:A"), 10.0)
+    write_markers(tmp_path / "walk.c3d", labelled)
+    write_markers(tmp_path / "dance.c3d", both)
+    empty(*(tmp_path / name for name in ("85_02.csv", "85_03.csv", "7_01.csv", "a_b.csv", "a.csv", ".hidden.csv",
+                                         "zoe/1.csv", "zoe/day/1.csv", "zoe/1.trc", "notes.txt")))
+    assert names(find_actors([tmp_path], Grouping())) == {
+        "85": ["85_02", "85_03"], "7": ["7_01"], "a_b": ["a_b"], "a": ["a"], "Eve": ["dance", "walk"],
+        "Adam": ["dance"], "zoe": ["1.csv", "1.trc", "day_1"]}
+    who = {a.name: [r.who for r in a.recordings] for a in find_actors([tmp_path], Grouping())}
+    assert who["Adam"] == ["Adam"] and who["Eve"] == ["Eve", None]
+    assert set(names(find_actors([tmp_path], Grouping("name")))) == {"85", "7", "a", "walk", "dance", "1"}
+    assert len(find_actors([tmp_path], Grouping("all"))) == 1
+    files = [tmp_path / "85_02.csv", tmp_path / "a.csv"]
+    assert names(find_actors(files, Grouping())) == {"85": ["85_02", "a"]}
+    assert names(find_actors(files, Grouping(name="me & you"))) == {"me_you": ["85_02", "a"]}
+    assert names(find_actors(files, Grouping("each"))) == {"85_02": ["85_02"], "a": ["a"]}
+    assert names(find_actors([tmp_path], Grouping(), tmp_path / "zoe")).keys() == {"85", "7", "a_b", "a", "Eve", "Adam"}
+
+
+@pytest.mark.parametrize("ending", ["csv", "json"])
+def test_a_table_says_who_is_who(tmp_path, ending):
+    empty(tmp_path / "in" / "x" / "1.csv", tmp_path / "in" / "y" / "1.csv", tmp_path / "in" / "2.c3d")
+    table, said = tmp_path / f"t.{ending}", {"x/1.csv": "u", "2": "u", "y/1.csv": "v"}
+    if ending == "json":
+        table.write_text(json.dumps(said))
+    else:
+        with open(table, "w", newline="") as out:
+            csv.writer(out).writerows([("file", "subject"), *said.items()])
+    found = find_actors([tmp_path / "in"], Grouping(table=table))
+    assert names(found) == {"u": ["2", "x_1"], "v": ["y_1"]}
+
+
+@pytest.mark.parametrize("count, step", [(1, 1), (56, 1), (57, 2), (280, 5), (494, 10), (2751, 50), (10**6, 20000)])
+def test_every_so_many_frames_are_a_round_number(count, step):
+    assert every(count) == step
+
+
+@pytest.mark.parametrize("words, message", [
+    (("--hold-out", "M99"), "--hold-out: labels: M99 not among M0"),
+    (("--female", "model.npz"), "--female and --male: expected both or none"),
+    (("--subjects", "no.csv"), "no.csv: cannot be read"),
+])
+def test_wrong_words_are_one_line(place, tmp_path, capsys, words, message):
+    code = run(place, place / "people" / "bob" / "jump.csv", "-o", tmp_path / "out", *words)
+    assert code == 1 and message in capsys.readouterr().err
