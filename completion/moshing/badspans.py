@@ -12,8 +12,8 @@ from .settings import FaultConfig
 SLIP_WINDOW = 0.1                    # seconds in which a slip is over
 SLIP_SUDDEN = 0.6                    # share of the lasting displacement that comes within that time
 SLIP_USUAL = 3.0                     # times the usual change within that time
-SLIP_STAYS = 0.5                     # seconds that a marker is seen before and after
-SLIP_LEAP = 0.5                      # share of it that the jump of a track must be
+SLIP_STAYS = 0.25                    # seconds that a marker is seen before and after
+SLIP_LEAP = 0.5                      # share of it that the jump of a track must be, at least, and it of the jump
 SLIP_LASTS = 0.65, 0.85              # share of the frames on either side that keep to it, with a jump or without
 SLIP_SMOOTH = 2.0                    # times the least displacement that it takes where no track jumps
 NOISE_WINDOW = 0.15                  # seconds, over which jitter is a median
@@ -25,38 +25,38 @@ STRAY_LEAP = 0.5                     # share of the displacement that the jump o
 JOINED = 0.1                         # seconds between two spans of a kind that are one
 
 
-def find_bad(local: np.ndarray, jumps: np.ndarray, labels: tuple[str, ...], config: FaultConfig, rate: float
-             ) -> tuple[BadSpan, ...]:
+def find_bad(off: np.ndarray, alone: np.ndarray, jumps: np.ndarray, labels: tuple[str, ...], config: FaultConfig,
+             rate: float) -> tuple[BadSpan, ...]:
     """The bad spans of markers.
 
     Parameters
     ----------
-    local : (T, L, 3) float, metres
-        From the simulated marker to the measured one, in the frame of its part; NaN where it was not seen.
+    off, alone : (T, L, 3) float, metres
+        From the simulated marker to the measured one, in the frame of its part, as the body follows all markers, and
+        as it would follow the others alone; NaN where it was not seen.
     jumps : (T, L) float, metres
         How far the track jumps, zero where it goes on.
     labels : L strings
     rate : float, frames per second
     """
-    usual = np.nan_to_num(_median(np.linalg.norm(local - _median(local), axis=2), axis=1))
-    jitter = [_jitter(local[:, i][np.isfinite(local[:, i, 0])]) for i in range(len(labels))]
+    usual = np.nan_to_num(_median(np.linalg.norm(off - _median(off), axis=2), axis=1))
+    jitter = [_jitter(off[:, i][np.isfinite(off[:, i, 0])]) for i in range(len(labels))]
     known = [np.median(q) for q in jitter if len(q)]
     limit = max(config.noise, NOISE_USUAL * float(np.median(known))) if known else config.noise
     out: list[BadSpan] = []
     for i, label in enumerate(labels):
-        seen = np.flatnonzero(np.isfinite(local[:, i, 0]))
+        seen = np.flatnonzero(np.isfinite(off[:, i, 0]))
         if len(seen) < 3:
             continue
-        off, leap = local[seen, i], jumps[seen, i]
+        mine, leap, gap = off[seen, i], jumps[seen, i], np.r_[False, np.diff(seen) > 1]
         noisy = _noisy(jitter[i], limit, rate)
-        slip = _slip(off, ~noisy, leap, config.slip, rate)
+        slip = _slip(alone[seen, i], ~noisy, leap, config.slip, rate)
         before = ~noisy & (np.arange(len(seen)) < slip)
-        middle = np.median(off[before] if before.any() else off, axis=0)
-        away = np.linalg.norm(off - middle, axis=1)
-        gap = np.r_[False, np.diff(seen) > 1]
+        middle = np.median(mine[before] if before.any() else mine, axis=0)
+        away = np.linalg.norm(mine - middle, axis=1)
         stray = _stray(away, np.maximum(config.stray, STRAY_USUAL * usual[seen]), leap, gap) & before
-        kinds: tuple[tuple[BadKind, np.ndarray], ...] = (
-            ("noisy", noisy), ("slipped", np.arange(len(seen)) >= slip), ("stray", stray))
+        slipped = np.arange(len(seen)) >= slip
+        kinds: tuple[tuple[BadKind, np.ndarray], ...] = (("noisy", noisy), ("slipped", slipped), ("stray", stray))
         for kind, bad in kinds:
             out += _spans(label, kind, seen, bad, away, JOINED * rate)
     return tuple(sorted(out, key=lambda s: (s.begin, s.label)))
@@ -114,7 +114,7 @@ def _lasting(track: np.ndarray, jumps: np.ndarray, k: int, step: np.ndarray, lea
     way = after - before
     far = float(np.linalg.norm(way))
     near = np.arange(max(1, k - 2 * lag), min(len(track), k + 2 * lag))
-    jumped = jumps[near].max() > SLIP_LEAP * far
+    jumped = SLIP_LEAP * far < jumps[near].max() < far / SLIP_LEAP
     if far < (least if jumped else SLIP_SMOOTH * least) or step @ way < SLIP_SUDDEN * far**2:
         return 0.0, k
     share = (track - before) @ way / far**2

@@ -127,11 +127,11 @@ class _Search:
         places[:, rows] = self._usual(simulated)
         levels = marker_levels(places, self.markers.positions, self.config, self.markers.rate)
         self.order = find_order(Evidence(self.markers.positions, levels), self.config)
-        ordered = self.ordered[:, rows]
-        tracks = Tracks(ordered, self.config.floor, self.config.jump)
-        local = self.body.local(self.x, simulated, ordered)
+        tracks = Tracks(self.ordered[:, rows], self.config.floor, self.config.jump)
+        off = tracks.positions - simulated
+        mine, alone = (self.body.local(v, self.x) for v in (off, self.body.alone(off, self.x)))
         jumps = np.where(tracks.jumped, tracks.off, 0)
-        self.bad = find_bad(local, jumps, self.body.labels, self.config, self.markers.rate)
+        self.bad = find_bad(mine, alone, jumps, self.body.labels, self.config, self.markers.rate)
         self.out = np.zeros((T, len(self.markers.labels)), dtype=bool)
         for span in self.bad:
             self.out[span.begin:span.end + 1, self.markers.labels.index(span.label)] = True
@@ -142,7 +142,7 @@ class _Search:
     def _usual(self, simulated: np.ndarray) -> np.ndarray:
         """Where markers (T, L, 3) are expected: off the simulated ones as they mostly are in their part's frame."""
         R = self.body.part_rotations(self.x)
-        off = np.einsum("tldc,tld->tlc", R, self.repaired[:, self.body.rows] - simulated)
+        off = self.body.local(self.repaired[:, self.body.rows] - simulated, self.x)
         usual = np.array([np.median(o[np.isfinite(o[:, 0])], axis=0) if np.isfinite(o[:, 0]).any() else np.zeros(3)
                           for o in np.swapaxes(off, 0, 1)])
         usual[self.unsure[self.body.rows]] = 0

@@ -51,23 +51,24 @@ class Simulation(MarkerFollower):
             x[inside] = smooth_sequence(self, x[inside], inside)
         return x
 
-    def local(self, x: np.ndarray, places: np.ndarray, measured: np.ndarray) -> np.ndarray:
-        """From the simulated markers to the measured ones (T, L, 3), metres, in the frames of their parts.
+    def alone(self, off: np.ndarray, x: np.ndarray) -> np.ndarray:
+        """What markers would be off (T, L, 3), metres, if the body x (T, P) followed the others alone.
 
-        The body has followed a displaced marker a little: what a marker is off is told by the other markers alone,
-        by taking back its own part in the normal equations.
+        The body has gone after a displaced marker a little. Its own part in the normal equations is taken back.
 
         Parameters
         ----------
-        x : (T, P) float
-            The body that followed `targets`.
-        places, measured : (T, L, 3) float, metres
+        off : (T, L, 3) float, metres
+            From the simulated markers to the measured ones.
         """
         T, every = len(x), max(1, round(self.rate / LOOKS))
-        frames = np.arange(every // 2 if T > every // 2 else 0, T, every)
+        frames = np.arange(min(every // 2, T - 1), T, every)
         freed = _between(self._freed(x[frames], frames), frames, T)
-        off = (freed @ (measured - places)[..., None])[..., 0]
-        return np.einsum("tldc,tld->tlc", self.part_rotations(x), off)
+        return (freed @ off[..., None])[..., 0]
+
+    def local(self, vectors: np.ndarray, x: np.ndarray) -> np.ndarray:
+        """Vectors (T, L, 3) of markers in the frames of their parts, the body being at x (T, P)."""
+        return np.einsum("tldc,tld->tlc", self.part_rotations(x), vectors)
 
     def part_rotations(self, x: np.ndarray) -> np.ndarray:
         """Rotations (T, L, 3, 3) of the markers' parts, from the part to the world."""

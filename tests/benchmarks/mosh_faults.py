@@ -29,7 +29,7 @@ from completion.animation.shape import subject_from_markers
 from completion.markers.files import MarkerSequence, read_markers
 from completion.markers.layout import MarkerLayout
 from completion.moshing.faults import find_faults
-from completion.moshing.results import BadSpan, Exchange, MarkerFaults
+from completion.moshing.results import BadKind, BadSpan, Exchange, MarkerFaults
 from completion.moshing.settings import FaultConfig
 from completion.motion import Motion
 from model.body import BodyModel
@@ -40,7 +40,7 @@ from model.posing.transfer import subject_from_body
 SPANS = (0.2, 2.0)                   # seconds that an exchange lasts
 APART = 60                           # frames between two exchanges of a marker
 NEAR = 0.2                           # metres, between the markers of a close pair
-KINDS = ("slipped", "noisy", "stray")
+KINDS: tuple[BadKind, ...] = ("slipped", "noisy", "stray")
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,11 +72,11 @@ def exchanged(sequence: MarkerSequence, share: float, close: bool, rng: np.rando
             continue
         busy[begin:end, two] = True
         positions[begin:end, two] = positions[begin:end, two[::-1]]
-        out.append(Exchange(*(sequence.labels[i] for i in two), begin, end - 1))
+        out.append(Exchange(sequence.labels[two[0]], sequence.labels[two[1]], begin, end - 1))
     return Faulty(MarkerSequence(positions, sequence.labels, sequence.rate), tuple(out), ())
 
 
-def spoilt(sequence: MarkerSequence, kind: str, count: int, part_rotations: np.ndarray, rng: np.random.Generator
+def spoilt(sequence: MarkerSequence, kind: BadKind, count: int, part_rotations: np.ndarray, rng: np.random.Generator
            ) -> Faulty:
     """So many markers with one fault each.
 
