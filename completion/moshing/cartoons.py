@@ -45,16 +45,16 @@ class CartoonShape:
     """
 
     height: float = 1.35
-    legs: float = 0.30
-    head: float = 0.165
-    neck: float = 0.02
-    belly: float = 0.165
-    chest: float = 0.115
-    shoulders: float = 0.125
+    legs: float = 0.34
+    head: float = 0.155
+    neck: float = 0.025
+    belly: float = 0.15
+    chest: float = 0.11
+    shoulders: float = 0.13
     arms: float = 0.33
-    limbs: float = 0.042
-    hands: float = 0.17
-    feet: float = 0.20
+    limbs: float = 0.036
+    hands: float = 0.19
+    feet: float = 0.19
 
 
 CARTOONS = {

@@ -13,8 +13,8 @@ from model.linear import Subject, posed_product
 from ..animation.retarget import AT_ONCE, retarget, world_up
 from .results import SoftTissue
 
-SOLES = 60                           # points that may touch the ground
 FULL = 0.2                           # deformation at the end of the heat map
+SOLES = 60                           # points that may touch the ground
 
 
 def retarget_soft_tissue(soft: SoftTissue, model: BodyModel, character: BodyModel, factor: float = 1.0) -> SoftTissue:
@@ -134,6 +134,9 @@ def write_character(path: Path, character: BodyModel, soft: SoftTissue, keys: in
 
     Parameters
     ----------
+    character : BodyModel
+        The model that the soft tissue is of: a character's, or the person's own.
+    soft : SoftTissue
     keys : int
         Largest number of key frames.
     """
@@ -149,4 +152,4 @@ def write_character(path: Path, character: BodyModel, soft: SoftTissue, keys: in
     rate = soft.motion.rate * max(len(frames) - 1, 1) / max(len(soft.motion.poses) - 1, 1)
     write_animated_glb(path, character.template.faces, changed, rate, heat(most, 0.0, FULL),
                        upright(character.template)[0], keys)
-    return most
+    return np.asarray(most)

@@ -35,14 +35,18 @@ def heat(values: np.ndarray, low: float = 0.0, high: float | None = None, colorm
     return colors
 
 
-def color_bar(low: float, high: float, title: str = "", colormap: str = HEAT, width: int = 320) -> np.ndarray:
-    """A legend for `heat` with lengths in millimetres.
+def color_bar(low: float, high: float, title: str = "", colormap: str = HEAT, width: int = 320,
+              scale: float = 1000.0, unit: str = "mm") -> np.ndarray:
+    """A legend for `heat`, of lengths in millimetres or of what else the unit says.
 
     Parameters
     ----------
     low, high : float, metres
     title : str
     width : int, pixels
+    scale : float
+        Of the numbers that are written: 100 for per cent of a share.
+    unit : str
 
     Returns
     -------
@@ -63,7 +67,7 @@ def color_bar(low: float, high: float, title: str = "", colormap: str = HEAT, wi
     for place in np.linspace(0, 1, 5):
         x = pad + place * (width - 2 * pad - 1)
         draw.line((x, top + thick, x, top + thick + 3), fill=INK)
-        value = f"{1000 * (low + place * (high - low)):.3g}" + (" mm" if place == 1 else "")
+        value = f"{scale * (low + place * (high - low)):.3g}" + (f" {unit}" if place == 1 else "")
         draw.text((x, top + thick + 5), value, fill=INK, anchor="ma", font=font(13))
     return np.asarray(image)
 

@@ -1,0 +1,144 @@
+"""From a character's mesh of any triangles and some landmarks on it to a model of the character."""
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from scanprep.geometry.landmarks import match_landmarks
+from scanprep.geometry.mesh import Mesh
+from scanprep.matching.nonrigid import Registration, register
+from scanprep.matching.schedule import RegistrationConfig
+
+from ..body import BodyModel
+from .character import CharacterConfig, character_model, character_pose
+
+Progress = Callable[[int, int], None]
+
+
+@dataclass(frozen=True)
+class CharacterMeshConfig:
+    """Settings of `register_character`.
+
+    Attributes
+    ----------
+    rounds : int
+        Times that the template is registered, each time from where it came: a character is farther from people than
+        people are from each other, and one registration does not stretch so far.
+    register : RegistrationConfig
+        Of every round.
+    character : CharacterConfig
+        How the character becomes the mean of the model.
+
+    Raises
+    ------
+    ValueError
+        Less than one round.
+    """
+
+    rounds: int = 2
+    register: RegistrationConfig = field(default_factory=RegistrationConfig)
+    character: CharacterConfig = field(default_factory=CharacterConfig)
+
+    def __post_init__(self) -> None:
+        if self.rounds < 1:
+            raise ValueError(f"rounds: expected at least 1, got {self.rounds}")
+
+
+@dataclass(frozen=True, eq=False)
+class Character:
+    """A character as a body model.
+
+    Attributes
+    ----------
+    model : BodyModel
+        With the character as its mean.
+    mesh : Mesh
+        The template on the character, as it stands.
+    pose : (J, 3) float, radians
+        How it stands.
+    joints : (J, 3) float, metres
+        Where it bends, on `mesh`.
+    inside : (J,) bool
+        Joints that lie inside the character.
+    registration : Registration or None
+        How the template lies on the character; None for a mesh that had the template's triangles.
+    """
+
+    model: BodyModel
+    mesh: Mesh
+    pose: np.ndarray
+    joints: np.ndarray
+    inside: np.ndarray
+    registration: Registration | None
+
+
+def register_character(model: BodyModel, mesh: Mesh, landmarks: Mapping[str, np.ndarray] | None = None,
+                       template_landmarks: Mapping[str, int] | None = None, config: CharacterMeshConfig | None = None,
+                       progress: Progress | None = None) -> Character:
+    """Make a model of a character from its mesh: register the template to it, then `character_model`.
+
+    Parameters
+    ----------
+    model : BodyModel
+    mesh : Mesh
+        Of any size, in any place and direction, about in the template's pose; with the template's triangles it is
+        taken as it is, and nothing is registered.
+    landmarks : {name: (3,) float, metres}, optional
+        On the mesh. A dozen spread over the body are enough: tips of hands and feet, elbows, knees, head, trunk.
+    template_landmarks : {name: vertex}, optional
+        Of the template; else those that the model keeps.
+    config : CharacterMeshConfig, optional
+    progress : callable, optional
+        Called as progress(done, total).
+
+    Raises
+    ------
+    ValueError
+        Fewer than four landmarks with the same names, or none for a mesh of other triangles.
+
+    [MoSh]
+    """
+    config = config or CharacterMeshConfig()
+    fit = None
+    if np.array_equal(mesh.faces, model.template.faces):
+        body = mesh
+    else:
+        known = model.info.get("landmarks", {}) if template_landmarks is None else template_landmarks
+        _, vertices, points = match_landmarks(known, landmarks or {}, minimum=4)
+        fit = _registered(model.template, mesh, vertices.astype(np.int64), points, config, progress)
+        body = fit.mesh
+    pose = character_pose(model, body.vertices, config.character)
+    found = character_model(model, body.vertices, config.character, pose)
+    joints = model.skeleton.joint_regressor(model.template) @ body.vertices
+    return Character(found, body, pose, joints, inside(body, joints), fit)
+
+
+def _registered(template: Mesh, mesh: Mesh, vertices: np.ndarray, points: np.ndarray, config: CharacterMeshConfig,
+                progress: Progress | None) -> Registration:
+    """The template on the mesh; first at the template's size, then from where that left it."""
+    tell = progress or (lambda done, total: None)
+    size = _spread(template.vertices[vertices]) / _spread(points)
+    start = template.with_vertices(template.vertices / size)
+    for k in range(config.rounds):
+        def told(done: int, total: int, before: int = k) -> None:
+            tell(before * total + done, config.rounds * total)
+
+        fit = register(start, mesh, (vertices, points), config.register, told)
+        start = fit.mesh
+    return fit
+
+
+def _spread(points: np.ndarray) -> float:
+    """The root mean square distance of points (n, 3) from their middle."""
+    return float(np.sqrt(((points - points.mean(axis=0))**2).sum(axis=1).mean()))
+
+
+def inside(mesh: Mesh, points: np.ndarray) -> np.ndarray:
+    """Which points (n, 3) lie inside a closed mesh."""
+    import igl
+
+    turns = igl.fast_winding_number(np.ascontiguousarray(mesh.vertices), np.ascontiguousarray(mesh.faces),
+                                    np.ascontiguousarray(points))
+    return np.asarray(np.abs(turns) > 0.5)

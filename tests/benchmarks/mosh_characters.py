@@ -1,0 +1,153 @@
+"""Pose and soft tissue on characters: cartoon figures of the project, registered and moved by people.
+
+    python tests/benchmarks/mosh_characters.py --walk -o OUT
+    SCAPEKIT_DATA=... python tests/benchmarks/mosh_characters.py -m PEOPLE.npz --c3d FILE.c3d -o OUT
+
+The template is registered to each figure once and kept in OUT. Whose motion it is comes from `mosh`: an embedded man
+who walks, or a file. Counted are triangles that face the other way than their part does, against how they face at rest,
+on the character and on the person, and how far the joints lie from those that the figure was made with. Pictures and
+animated GLB are written beside the figures.
+"""
+from __future__ import annotations
+
+import argparse
+import time
+from pathlib import Path
+
+import numpy as np
+from protocols import load_real, machine, write_report
+
+from completion.embedded import embedded_model
+from completion.markers.files import MarkerSequence, read_markers
+from completion.markers.layout import MarkerLayout
+from completion.moshing.capture import mosh
+from completion.moshing.cartoons import CARTOONS, Cartoon, cartoon
+from completion.moshing.character_pictures import picture_transfer
+from completion.moshing.characters import deformation, moving_character, retarget_soft_tissue, write_character
+from completion.moshing.results import SoftTissue
+from model.body import BodyModel
+from model.posing.character_mesh import Character, register_character
+from scanprep.geometry.mesh import Mesh
+from scanprep.pictures.shading import save_png
+from scanprep.scanning.embedded import SUBJECT
+from scanprep.scanning.people import Person, walk
+
+MM = 1000.0
+OF_SCAPE = {                         # names of the landmarks of the SCAPE template
+    "{} toe": "toe in {} leg", "{} heel": "heel in {} leg", "{} knee": "knee in {} leg",
+    "{} knee inside": "knee (inside) in {} leg", "{} waist": "waist {} side", "crotch": "between two legs",
+    "{} middle finger": "middle finger {} hand", "{} elbow outside": "elbow (outside) {} arm",
+    "{} elbow inside": "elbow (inside) {} arm", "{} shoulder": "shoulder (upper) {} side",
+    "{} armpit": "shoulder (bottom) {} side", "{} nipple": "tit, {}", "navel": "cornea",
+    "back": "cornea (on the back, similar position)", "neck front": "neck (front)", "neck back": "neck (back)",
+    "{} eye": "eye, {}", "nose tip": "tip of nose", "mouth": "mouse (middle)", "{} ear": "ear, {}",
+    "top of head": "top of head", "{} hip": "hip, {}"}
+PARTS_OF_SCAPE = {"l_upper_arm": "upper_arm_left", "r_upper_arm": "upper_arm_right", "l_forearm": "forearm_left",
+                  "r_forearm": "forearm_right", "l_hand": "hand_left", "r_hand": "hand_right", "l_thigh": "thigh_left",
+                  "r_thigh": "thigh_right", "l_shin": "shin_left", "r_shin": "shin_right", "l_foot": "foot_left",
+                  "r_foot": "foot_right"}
+
+
+def template_marks(model: BodyModel) -> dict[str, int]:
+    """Landmarks of the template by the names of the figures'."""
+    if "landmarks" in model.info:
+        return dict(model.info["landmarks"])
+    known = load_real().landmarks
+    sides = [(name.format(side), other.format(side)) for name, other in OF_SCAPE.items() for side in ("left", "right")]
+    return {name: known[other] for name, other in sides}
+
+
+def on_figure(model: BodyModel, figure: Cartoon, kept: Path) -> tuple[Character, float]:
+    """The figure as a model, and the seconds that its registration took; the registered mesh is kept."""
+    start, marks = time.process_time(), template_marks(model)
+    if kept.exists():
+        return register_character(model, Mesh(np.load(kept), model.template.faces)), 0.0
+    found = register_character(model, figure.mesh, figure.landmarks, marks)
+    np.save(kept, found.mesh.vertices)
+    return found, time.process_time() - start
+
+
+def joints_off(model: BodyModel, figure: Cartoon, found: Character) -> list[float]:
+    """How far the joints of the limbs lie from those that the figure was made with, metres."""
+    names = list(model.skeleton.names)
+    pairs = [(names.index(name if name in names else other), figure.joints[name])
+             for name, other in PARTS_OF_SCAPE.items()]
+    return [float(np.linalg.norm(found.joints[j] - at)) for j, at in pairs]
+
+
+def turned_over(model: BodyModel, rest: np.ndarray, bodies: np.ndarray, poses: np.ndarray) -> np.ndarray:
+    """(n, F) bool: triangles that face away from where the rotation of their part turns them from rest."""
+    faces, part = model.template.faces, model.skeleton.part_of_face
+
+    def normals(vertices: np.ndarray) -> np.ndarray:
+        corner = vertices[..., faces, :]
+        return np.cross(corner[..., 1, :] - corner[..., 0, :], corner[..., 2, :] - corner[..., 0, :])
+
+    R = model.skeleton.part_rotations(poses)[:, part]
+    return np.einsum("tfi,tfij,fj->tf", normals(bodies), R, normals(rest)) < 0
+
+
+def walking_man(model: BodyModel, frames: int, rate: float) -> tuple[MarkerSequence, MarkerLayout]:
+    """Markers of an embedded man who walks, and their layout on the model's template."""
+    person = Person(SUBJECT)
+    layout = MarkerLayout.named("cmu41", person.mesh)
+    poses, trans = walk(frames, rate)
+    bodies = [person.mesh.with_vertices(person.posed(p, t)) for p, t in zip(poses, trans, strict=True)]
+    markers = MarkerSequence(np.stack([layout.place(body) for body in bodies]), layout.labels, rate)
+    return markers, MarkerLayout.named("cmu41", model.template, np.array(model.info["people_vertices"]))
+
+
+def measure(model: BodyModel, found: Character, soft: SoftTissue, factor: float, frames: np.ndarray) -> dict:
+    """Triangles turned over, feet, and deformation on a character, with the soft tissue so many times."""
+    moved = retarget_soft_tissue(soft, model, found.model, factor)
+    fixed, changed = moving_character(found.model, moved, frames)
+    rest = found.model.vertices(np.zeros_like(soft.motion.poses[0]), np.zeros(1))
+    own_rest = model.vertices(np.zeros_like(soft.motion.poses[0]), soft.motion.betas)
+    _, person = moving_character(model, soft, frames)
+    poses = soft.motion.poses[frames]
+    theirs, ours = turned_over(model, own_rest, person, poses), turned_over(model, rest, changed, poses)
+    share = deformation(model.template.faces, fixed, changed)
+    return {"factor": factor, "frames": len(frames), "turned_over": int(ours.sum()),
+            "worst_frame": int(ours.sum(axis=1).max()), "triangles": int(ours.any(axis=0).sum()),
+            "of_person": int(theirs.sum()), "deformed_mean": float(share.mean()),
+            "deformed_most": float(np.percentile(share, 99.9)),
+            "moved_by_soft_tissue_mm": float(MM * np.linalg.norm(changed - fixed, axis=2).mean())}
+
+
+def main() -> None:
+    """Run and print a row for each figure and factor."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("-o", "--output", type=Path, required=True)
+    parser.add_argument("-m", "--model", type=Path, help="of the file's person; else the embedded one")
+    parser.add_argument("--c3d", type=Path)
+    parser.add_argument("--walk", action="store_true")
+    parser.add_argument("--frames", type=int, default=60, help="that are measured and shown")
+    parser.add_argument("--factors", type=float, nargs="*", default=[0.0, 1.0, 2.0])
+    args = parser.parse_args()
+    from model.files import load_model
+
+    args.output.mkdir(parents=True, exist_ok=True)
+    model = load_model(args.model) if args.model else embedded_model()
+    markers, layout = walking_man(model, 120, 60.0) if args.walk else \
+        (read_markers(args.c3d), MarkerLayout.named("cmu41", model.template))
+    soft = mosh(model, markers, layout).soft_tissue[0]
+    frames = np.unique(np.linspace(0, len(soft.motion.poses) - 1, args.frames).round().astype(int))
+    rows = []
+    for name in CARTOONS:
+        figure = cartoon(name)
+        found, seconds = on_figure(model, figure, args.output / f"{name}.{len(model.template.faces)}.npy")
+        off = joints_off(model, figure, found)
+        about = {"figure": name, "joints_inside": f"{found.inside.sum()} of {len(found.inside)}",
+                 "limb_joints_off_mm": MM * float(np.mean(off)), "worst_joint_mm": MM * max(off), "register_s": seconds}
+        for factor in args.factors:
+            rows.append({**about, **measure(model, found, soft, factor, frames)})
+            print(rows[-1], flush=True)
+        moved = retarget_soft_tissue(soft, model, found.model, max(args.factors))
+        save_png(args.output / f"{name}.png", picture_transfer(model, soft, found.model, moved, 8))
+        write_character(args.output / f"{name}.glb", found.model, moved)
+    write_report(args.output / "report.json", {"motion": str(args.c3d or "embedded walk"), "machine": machine(),
+                                               "rows": rows})
+
+
+if __name__ == "__main__":
+    main()
