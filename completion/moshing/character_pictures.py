@@ -1,5 +1,7 @@
-"""Pictures of soft tissue on a character, and of where it deforms."""
+"""Pictures and files of soft tissue on a character, and of where it deforms."""
 from __future__ import annotations
+
+from pathlib import Path
 
 import numpy as np
 
@@ -10,9 +12,10 @@ from scanprep.pictures.views import upright
 
 from ..animation.report import facing
 from ..animation.work import key_frames
-from .characters import FULL, deformation, moving_character
+from .characters import deformation, moving_character
 from .results import SoftTissue
 
+FULL = 0.2                           # deformation at the end of the heat map
 TURN = 35.0                          # degrees of the camera beside the front
 
 
@@ -59,3 +62,25 @@ def _row(model: BodyModel, soft: SoftTissue, bodies: np.ndarray, frames: np.ndar
         images.append(render(Solid(mesh.with_vertices(body), None if colors is None else colors[i]), camera,
                              int(0.62 * height), height))
     return images
+
+
+def write_character(path: Path, character: BodyModel, soft: SoftTissue, keys: int = 60) -> np.ndarray:
+    """Write an animated GLB with soft tissue, coloured by the most that the skin is deformed; returns that (N,).
+
+    Parameters
+    ----------
+    character : BodyModel
+        The model that the soft tissue is of: a character's, or the person's own.
+    soft : SoftTissue
+    keys : int
+        Largest number of key frames.
+    """
+    from scanprep.pictures.animation import write_animated_glb
+
+    frames = key_frames(soft.motion, keys)
+    fixed, changed = moving_character(character, soft, frames)
+    most = deformation(character.template.faces, fixed, changed).max(axis=0)
+    rate = soft.motion.rate * max(len(frames) - 1, 1) / max(len(soft.motion.poses) - 1, 1)
+    write_animated_glb(path, character.template.faces, changed, rate, heat(most, 0.0, FULL),
+                       upright(character.template)[0], keys)
+    return np.asarray(most)

@@ -2,7 +2,6 @@
 from __future__ import annotations
 
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 from scipy.sparse import csr_array
@@ -13,7 +12,6 @@ from model.linear import Subject, posed_product
 from ..animation.retarget import AT_ONCE, retarget, world_up
 from .results import SoftTissue
 
-FULL = 0.2                           # deformation at the end of the heat map
 SOLES = 60                           # points that may touch the ground
 
 
@@ -127,29 +125,3 @@ def moving_character(character: BodyModel, soft: SoftTissue, frames: np.ndarray)
     poses, trans = soft.motion.poses[frames], soft.motion.trans[frames]
     fixed = soft.motion.vertices(character.subject(soft.motion.betas), frames)
     return fixed, character.vertices(poses, soft.betas()[frames], trans)
-
-
-def write_character(path: Path, character: BodyModel, soft: SoftTissue, keys: int = 60) -> np.ndarray:
-    """Write an animated GLB with soft tissue, coloured by the most that the skin is deformed; returns that (N,).
-
-    Parameters
-    ----------
-    character : BodyModel
-        The model that the soft tissue is of: a character's, or the person's own.
-    soft : SoftTissue
-    keys : int
-        Largest number of key frames.
-    """
-    from scanprep.pictures.animation import write_animated_glb
-    from scanprep.pictures.colors import heat
-    from scanprep.pictures.views import upright
-
-    from ..animation.work import key_frames
-
-    frames = key_frames(soft.motion, keys)
-    fixed, changed = moving_character(character, soft, frames)
-    most = deformation(character.template.faces, fixed, changed).max(axis=0)
-    rate = soft.motion.rate * max(len(frames) - 1, 1) / max(len(soft.motion.poses) - 1, 1)
-    write_animated_glb(path, character.template.faces, changed, rate, heat(most, 0.0, FULL),
-                       upright(character.template)[0], keys)
-    return np.asarray(most)

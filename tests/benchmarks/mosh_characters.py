@@ -22,8 +22,8 @@ from completion.markers.files import MarkerSequence, read_markers
 from completion.markers.layout import MarkerLayout
 from completion.moshing.capture import mosh
 from completion.moshing.cartoons import CARTOONS, Cartoon, cartoon
-from completion.moshing.character_pictures import picture_transfer
-from completion.moshing.characters import deformation, moving_character, retarget_soft_tissue, write_character
+from completion.moshing.character_pictures import picture_transfer, write_character
+from completion.moshing.characters import deformation, moving_character, retarget_soft_tissue
 from completion.moshing.results import SoftTissue
 from model.body import BodyModel
 from model.posing.character_mesh import Character, register_character
