@@ -13,6 +13,7 @@ from scanprep.pictures.views import upright
 from ..animation.report import facing
 from ..animation.work import key_frames
 from .characters import deformation, moving_character
+from .creases import Creases, at_rest
 from .results import SoftTissue
 
 FULL = 0.2                           # deformation at the end of the heat map
@@ -38,6 +39,7 @@ def picture_transfer(model: BodyModel, soft: SoftTissue, character: BodyModel, m
     person = moving_character(model, soft, frames)[1]
     fixed, changed = moving_character(character, moved, frames)
     colors = heat(deformation(character.template.faces, fixed, changed), 0.0, FULL)
+    changed = Creases(at_rest(character), character.skeleton).smoothed(changed, moved.motion.poses[frames])
     rows = [_row(model, soft, person, frames, None, height, turn),
             _row(character, moved, changed, frames, None, height, turn),
             _row(character, moved, changed, frames, colors, height, turn)]
@@ -80,6 +82,7 @@ def write_character(path: Path, character: BodyModel, soft: SoftTissue, keys: in
     frames = key_frames(soft.motion, keys)
     fixed, changed = moving_character(character, soft, frames)
     most = deformation(character.template.faces, fixed, changed).max(axis=0)
+    changed = Creases(at_rest(character), character.skeleton).smoothed(changed, soft.motion.poses[frames])
     rate = soft.motion.rate * max(len(frames) - 1, 1) / max(len(soft.motion.poses) - 1, 1)
     write_animated_glb(path, character.template.faces, changed, rate, heat(most, 0.0, FULL),
                        upright(character.template)[0], keys)

@@ -4,9 +4,9 @@
     SCAPEKIT_DATA=... python tests/benchmarks/mosh_characters.py -m PEOPLE.npz --c3d FILE.c3d -o OUT
 
 The template is registered to each figure once and kept in OUT. Whose motion it is comes from `mosh`: an embedded man
-who walks, or a file. Counted are triangles that face the other way than their part does, against how they face at rest,
-on the character and on the person, and how far the joints lie from those that the figure was made with. Pictures and
-animated GLB are written beside the figures.
+who walks, or a file. Counted are triangles that have turned over against the rotations of the parts around them
+(`Creases`) on the character and on the person, and how far the joints lie from those that the figure was made with.
+Pictures and animated GLB are written beside the figures.
 """
 from __future__ import annotations
 
@@ -24,6 +24,7 @@ from completion.moshing.capture import mosh
 from completion.moshing.cartoons import CARTOONS, Cartoon, cartoon
 from completion.moshing.character_pictures import picture_transfer, write_character
 from completion.moshing.characters import deformation, moving_character, retarget_soft_tissue
+from completion.moshing.creases import Creases, at_rest
 from completion.moshing.results import SoftTissue
 from model.body import BodyModel
 from model.posing.character_mesh import Character, register_character
@@ -75,18 +76,6 @@ def joints_off(model: BodyModel, figure: Cartoon, found: Character) -> list[floa
     return [float(np.linalg.norm(found.joints[j] - at)) for j, at in pairs]
 
 
-def turned_over(model: BodyModel, rest: np.ndarray, bodies: np.ndarray, poses: np.ndarray) -> np.ndarray:
-    """(n, F) bool: triangles that face away from where the rotation of their part turns them from rest."""
-    faces, part = model.template.faces, model.skeleton.part_of_face
-
-    def normals(vertices: np.ndarray) -> np.ndarray:
-        corner = vertices[..., faces, :]
-        return np.cross(corner[..., 1, :] - corner[..., 0, :], corner[..., 2, :] - corner[..., 0, :])
-
-    R = model.skeleton.part_rotations(poses)[:, part]
-    return np.einsum("tfi,tfij,fj->tf", normals(bodies), R, normals(rest)) < 0
-
-
 def walking_man(model: BodyModel, frames: int, rate: float) -> tuple[MarkerSequence, MarkerLayout]:
     """Markers of an embedded man who walks, and their layout on the model's template."""
     person = Person(SUBJECT)
@@ -98,20 +87,26 @@ def walking_man(model: BodyModel, frames: int, rate: float) -> tuple[MarkerSeque
 
 
 def measure(model: BodyModel, found: Character, soft: SoftTissue, factor: float, frames: np.ndarray) -> dict:
-    """Triangles turned over, feet, and deformation on a character, with the soft tissue so many times."""
+    """Triangles turned over, before and after creases are smoothed, and deformation, with soft tissue so many times."""
     moved = retarget_soft_tissue(soft, model, found.model, factor)
     fixed, changed = moving_character(found.model, moved, frames)
-    rest = found.model.vertices(np.zeros_like(soft.motion.poses[0]), np.zeros(1))
-    own_rest = model.vertices(np.zeros_like(soft.motion.poses[0]), soft.motion.betas)
     _, person = moving_character(model, soft, frames)
-    poses = soft.motion.poses[frames]
-    theirs, ours = turned_over(model, own_rest, person, poses), turned_over(model, rest, changed, poses)
+    poses, row = soft.motion.poses[frames], {"factor": factor, "frames": len(frames)}
+    creases = {"": Creases(at_rest(found.model), model.skeleton), " of own part": Creases(at_rest(found.model),
+                                                                                        model.skeleton, 0)}
+    start = time.process_time()
+    smooth = creases[""].smoothed(changed, poses)
+    row["smoothing_ms"] = MM * (time.process_time() - start) / len(frames)
+    row["smoothing_moved_mm"] = MM * float(np.linalg.norm(smooth - changed, axis=2).max())
+    theirs = Creases(at_rest(model, soft.motion.betas), model.skeleton).turned_over(person, poses)
+    row["turned_on_person"] = int(theirs.sum())
+    for kind, each in creases.items():
+        before, after = each.turned_over(changed, poses), each.turned_over(smooth, poses)
+        row |= {f"turned{kind}": int(before.sum()), f"turned{kind}, smoothed": int(after.sum())}
+    row["worst_frame"] = int(creases[""].turned_over(changed, poses).sum(axis=1).max())
     share = deformation(model.template.faces, fixed, changed)
-    return {"factor": factor, "frames": len(frames), "turned_over": int(ours.sum()),
-            "worst_frame": int(ours.sum(axis=1).max()), "triangles": int(ours.any(axis=0).sum()),
-            "of_person": int(theirs.sum()), "deformed_mean": float(share.mean()),
-            "deformed_most": float(np.percentile(share, 99.9)),
-            "moved_by_soft_tissue_mm": float(MM * np.linalg.norm(changed - fixed, axis=2).mean())}
+    return row | {"deformed_mean": float(share.mean()), "deformed_most": float(np.percentile(share, 99.9)),
+                  "moved_by_soft_tissue_mm": float(MM * np.linalg.norm(changed - fixed, axis=2).mean())}
 
 
 def main() -> None:

@@ -1,0 +1,91 @@
+"""Creases of posed bodies laid smooth where triangles have turned over."""
+from __future__ import annotations
+
+import numpy as np
+from scipy.sparse import csc_array, csr_array, diags_array
+
+from model.body import BodyModel
+from scanprep.geometry.mesh import Mesh
+from scanprep.geometry.sparse import factor
+from scanprep.skeleton.tree import Skeleton
+
+REACH = (1, 2, 2, 3, 3, 4)           # rings around turned triangles that are laid anew, one round each
+BLEND = 6                            # rings over which the rotation of one part passes into that of the next
+
+
+class Creases:
+    """Where triangles of a posed body have turned over, and the body without.
+
+    A triangle is turned over when it faces away from where the rotations of the parts around it turn it, those of
+    neighbouring parts mixed over some rings: at a raised shoulder the skin rightly faces away from its own part.
+
+    Parameters
+    ----------
+    rest : Mesh
+        The body at rest.
+    skeleton : Skeleton
+    blend : int
+        Rings over which rotations are mixed; with 0 it is the own part's alone.
+    """
+
+    def __init__(self, rest: Mesh, skeleton: Skeleton, blend: int = BLEND) -> None:
+        self.rest, self.skeleton = rest, skeleton
+        self._near = csr_array(rest.vertex_adjacency, dtype=np.float64)
+        self._shares = np.eye(len(skeleton.parents))[skeleton.part_of_face]
+        if blend:
+            own = np.eye(len(skeleton.parents))[skeleton.part_of_vertex(rest)]
+            spread = diags_array(1 / (1 + np.asarray(self._near.sum(axis=1)).ravel()))
+            for _ in range(blend):
+                own = spread @ (own + self._near @ own)
+            self._shares = own[rest.faces].mean(axis=1)
+
+    def turned_over(self, bodies: np.ndarray, poses: np.ndarray) -> np.ndarray:
+        """(..., F) bool: triangles of bodies (..., N, 3) in poses (..., J, 3) that face the wrong way."""
+        corners = bodies[..., self.rest.faces, :]
+        now = np.cross(corners[..., 1, :] - corners[..., 0, :], corners[..., 2, :] - corners[..., 0, :])
+        R = np.tensordot(self._shares, self.skeleton.part_rotations(poses), axes=(1, -3))
+        R = np.moveaxis(R, 0, -3)
+        return np.asarray((now * (R @ self.rest.face_normals[..., None])[..., 0]).sum(axis=-1) < 0)
+
+    def smoothed(self, bodies: np.ndarray, poses: np.ndarray) -> np.ndarray:
+        """Bodies (n, N, 3) in poses (n, J, 3) whose turned triangles are laid as smoothly as their surroundings allow.
+
+        Where thick limbs bend sharply, as those of a character do, the skin of the hollow has no room and folds over.
+        Small patches are laid there instead, wider ones while triangles are turned; nothing else moves, and patches
+        that leave more triangles turned than there were are not taken.
+        """
+        out = np.array(bodies)
+        for t in range(len(out)):
+            bad = self.turned_over(out[t], poses[t])
+            for rings in REACH:
+                if not bad.any():
+                    break
+                trial = _laid(self._near, out[t], self.rest.faces[bad].ravel(), rings)
+                left = self.turned_over(trial, poses[t])
+                if left.sum() < bad.sum():
+                    out[t], bad = trial, left
+        return out
+
+
+def at_rest(model: BodyModel, betas: np.ndarray | None = None) -> Mesh:
+    """The body with betas (k,), else the mean person or character, in zero pose."""
+    pose = np.zeros((len(model.skeleton.parents), 3))
+    return model.template.with_vertices(model.vertices(pose, np.zeros(min(1, model.n_betas)) if betas is None
+                                                       else betas))
+
+
+def _laid(adjacency: csr_array, x: np.ndarray, seeds: np.ndarray, rings: int) -> np.ndarray:
+    """Vertices (N, 3) where those within so many rings of some lie in the middle of their neighbours."""
+    free = np.zeros(len(x))
+    free[seeds] = 1
+    for _ in range(rings - 1):
+        free = (free + adjacency @ free > 0).astype(float)
+    mine = np.flatnonzero(free)
+    if len(mine) == len(x):
+        return x
+    A = adjacency[mine]
+    inside = csc_array(diags_array(np.asarray(A.sum(axis=1)).ravel()) - A[:, mine])
+    around = A @ np.where(free[:, None] > 0, 0.0, x)
+    x = x.copy()
+    x[mine] = factor(inside)(around)
+    return x
