@@ -73,7 +73,7 @@ class MarkerSets:
         for i, group in enumerate(groups):
             self._rows[:, i, :r * len(group)] = linear.rows[:, group].reshape(Z, -1, P)
             gaps[:, i, :r * len(group)] = linear.gaps[:, group].reshape(Z, -1)
-        members = [c for i in np.flatnonzero(self.inside) for c in groups[i]]
+        members = [c for group, inside in zip(groups, self.inside, strict=True) if inside for c in group]
         B = linear.rows[:, members].reshape(Z, -1, P)
         self._gram = linear.gram
         self._C = np.linalg.inv(np.swapaxes(B, -1, -2) @ B + linear.precision)
@@ -146,7 +146,7 @@ def walk(sets: MarkerSets, sign: int, movable: np.ndarray, until: int, through: 
     tell : callable, optional
         Called with the count after each step.
     """
-    start, steps = np.flatnonzero(sets.inside), []
+    start, steps = np.flatnonzero(sets.inside), list[int]()
     counts, rmse = [sets.count], [sets.rmse]
     while True:
         open_ = np.flatnonzero(movable & (sets.inside == (sign == REMOVE)))

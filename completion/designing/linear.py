@@ -130,15 +130,15 @@ def fit_bodies(model: BodyModel, bodies: np.ndarray, candidates: MarkerLayout, c
     ValueError
         A model without betas, bodies of another shape or not finite, a layout of another body.
     """
-    bodies, n_betas = _checked(model, bodies, candidates, config)
+    bodies, n_betas = check_bodies(model, bodies), _check(model, candidates, config)
     tell = progress or (lambda done, total: None)
     template, total = model.template.vertices, 2 * len(bodies)
     few = spread_vertices(template, config.fit_surface)
     weights = share_of_vertices(template, few) * len(few) / (len(template) * config.marker_sd**2)
     start = rough_poses(model, bodies, n_betas)
-    x = fit_points(BodyPoints(model.points(few, None, n_betas)), bodies[:, few], weights, prior_around(model, start, config),
-                   start, config.fit_iterations, lambda done: tell(done, total))
-    ids, shares = _support(candidates)
+    x = fit_points(BodyPoints(model.points(few, None, n_betas)), bodies[:, few], weights,
+                   prior_around(model, start, config), start, config.fit_iterations, lambda done: tell(done, total))
+    ids, shares = support(candidates)
     markers, prior = BodyPoints(model.points(ids, shares, n_betas)), prior_around(model, x, config)
     places = np.einsum("lk,zlkd->zld", shares, bodies[:, ids])
     some = spread_vertices(template, config.surface)
@@ -149,24 +149,29 @@ def fit_bodies(model: BodyModel, bodies: np.ndarray, candidates: MarkerLayout, c
     return WholeFits(x, markers, places, prior, linear)
 
 
-def _checked(model: BodyModel, bodies: np.ndarray, candidates: MarkerLayout, config: DesignConfig
-             ) -> tuple[np.ndarray, int]:
+def check_bodies(model: BodyModel, bodies: np.ndarray) -> np.ndarray:
+    """The bodies (Z, N, 3) as an array, or ValueError; also for a model without betas."""
     if not model.n_betas:
         raise ValueError("model: expected one with betas, this one knows its template's body only")
-    n_betas = model.n_betas if config.n_betas is None else config.n_betas
-    if not 0 < n_betas <= model.n_betas:
-        raise ValueError(f"n_betas: expected 1..{model.n_betas}, got {n_betas}")
     bodies, wanted = np.asarray(bodies), model.template.vertices.shape
     if bodies.ndim != 3 or not len(bodies) or bodies.shape[1:] != wanted or not np.isfinite(bodies).all():
         raise ValueError(f"bodies: expected finite numbers of shape (Z, {wanted[0]}, 3), got shape {bodies.shape}")
-    outside = int(np.max(candidates.vertices, initial=0))
-    if not candidates.labels or outside >= wanted[0]:
-        raise ValueError(f"candidates: expected markers on vertices 0..{wanted[0] - 1}, got {len(candidates.labels)} "
-                         f"markers up to vertex {outside}")
-    return bodies, n_betas
+    return bodies
 
 
-def _support(layout: MarkerLayout) -> tuple[np.ndarray, np.ndarray]:
+def _check(model: BodyModel, candidates: MarkerLayout, config: DesignConfig) -> int:
+    """How many betas are estimated."""
+    n_betas = model.n_betas if config.n_betas is None else config.n_betas
+    if not 0 < n_betas <= model.n_betas:
+        raise ValueError(f"n_betas: expected 1..{model.n_betas}, got {n_betas}")
+    N, most = len(model.template.vertices), int(np.max(candidates.vertices, initial=0))
+    if not candidates.labels or most >= N:
+        raise ValueError(f"candidates: expected markers on vertices 0..{N - 1}, got {len(candidates.labels)} markers "
+                         f"up to vertex {most}")
+    return n_betas
+
+
+def support(layout: MarkerLayout) -> tuple[np.ndarray, np.ndarray]:
     """Vertices and weights (C, k) of the points of the skin under the markers."""
     ids = layout.vertices.reshape(len(layout.labels), -1)
     return ids, np.ones(ids.shape) if layout.weights is None else layout.weights

@@ -3,28 +3,34 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
+import numpy as np
 
-def symmetric_groups(labels: Sequence[str], pairs: Sequence[tuple[str, str]] | None = None
-                     ) -> tuple[tuple[int, ...], ...]:
+from ..markers.symmetry import label_pairs
+
+
+def symmetric_groups(labels: Sequence[str], partners: np.ndarray | None = None) -> tuple[tuple[int, ...], ...]:
     """Numbers of the markers of each pair, and of each marker alone.
 
     Parameters
     ----------
-    labels : strings
-    pairs : (left, right), optional
-        Without it two markers are a pair whose labels differ in a first L or R alone.
+    labels : L strings
+    partners : (L,) int, optional
+        The marker on the other side, its own number or -1 where there is none: `marker_pairs` of a layout. Without
+        it labels tell, such as LELB and RELB.
 
     Raises
     ------
     ValueError
-        A pair of a marker that is not there, or a marker in two pairs.
+        Another count, or a partner whose partner is another marker.
     """
-    place = {label: i for i, label in enumerate(labels)}
-    if pairs is None:
-        pairs = [(label, "R" + label[1:]) for label in labels if label[:1] == "L" and "R" + label[1:] in place]
-    named = [label for pair in pairs for label in pair]
-    wrong = [label for label in named if label not in place or named.count(label) > 1]
-    if wrong:
-        raise ValueError(f"pairs: expected markers of the candidates, each in one pair, got {wrong[0]!r}")
-    groups = [tuple(sorted((place[a], place[b]))) for a, b in pairs]
-    return tuple(sorted([*groups, *((i,) for label, i in place.items() if label not in named)]))
+    partners = label_pairs(labels) if partners is None else np.asarray(partners, dtype=np.int64)
+    each = np.arange(len(labels))
+    if partners.shape != each.shape or partners.max(initial=-1) >= len(each):
+        raise ValueError(f"partners: expected a marker, or -1, for each of {len(each)}, got shape {partners.shape} "
+                         f"up to {partners.max(initial=-1)}")
+    other = np.where(partners < 0, each, partners)
+    wrong = np.flatnonzero(other[other] != each)
+    if len(wrong):
+        raise ValueError(f"partners: expected that the partner of {labels[other[wrong[0]]]} is {labels[wrong[0]]}, got "
+                         f"{labels[other[other[wrong[0]]]]}")
+    return tuple((int(i),) if i == j else (int(i), int(j)) for i, j in enumerate(other) if i <= j)

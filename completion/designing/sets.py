@@ -41,7 +41,7 @@ class Choice:
 
 def design_markers(model: BodyModel, bodies: np.ndarray, candidates: MarkerLayout, config: DesignConfig | None = None,
                    progress: Progress | None = None, *, keep: Sequence[str] = (),
-                   pairs: Sequence[tuple[str, str]] | None = None, people: np.ndarray | None = None) -> MarkerDesign:
+                   partners: np.ndarray | None = None, people: np.ndarray | None = None) -> MarkerDesign:
     """The set of markers from which the model estimates the whole surface of some bodies best.
 
     Every body is estimated from each set by itself, with the priors of shape and pose and with markers where the
@@ -60,8 +60,9 @@ def design_markers(model: BodyModel, bodies: np.ndarray, candidates: MarkerLayou
         Called with (done, total).
     keep : labels, optional
         Candidates that stay in the set, with their partners.
-    pairs : (left, right) labels, optional
-        Markers that come and go together; see `symmetric_groups`.
+    partners : (C,) int, optional
+        The candidate on the other side, which comes and goes with it, as `marker_pairs` finds it by place; without it
+        labels tell.
     people : (Z,) int, optional
         Whose body each is; else the first half of the bodies are other people than the second.
 
@@ -75,7 +76,7 @@ def design_markers(model: BodyModel, bodies: np.ndarray, candidates: MarkerLayou
     [MoSh] Eq. 27
     """
     config = config or DesignConfig()
-    groups = symmetric_groups(candidates.labels, pairs)
+    groups = symmetric_groups(candidates.labels, partners)
     kept = _kept(candidates, groups, keep, config)
     if config.joint and people is None:
         raise ValueError("people: expected whose body each is, for betas that are common to a person's bodies")
@@ -94,12 +95,13 @@ def design_markers(model: BodyModel, bodies: np.ndarray, candidates: MarkerLayou
     other = _other_half(linear, halves, groups, kept, config)
     tell(total, total)
     chosen = _members(groups, choice.groups)
-    full, checks = None, ()
+    full, checks = None, tuple[Check, ...]()
     if not config.joint:
         full = _refitted(model, bodies, fits, chosen, config)
         checks = tuple(_check(model, bodies, fits, groups, choice, count, config) for count in config.checks)
     curves = tuple(_curve(name, path, groups, candidates.labels) for name, path in choice.paths.items())
-    return MarkerDesign(candidates.select([candidates.labels[i] for i in chosen]), choice.rmse, full,
+    gone = [label for i, label in enumerate(candidates.labels) if i not in chosen]
+    return MarkerDesign(candidates.without(gone), choice.rmse, full,
                         float(np.sqrt(fits.linear.rest.mean())), other, curves, checks, choice.exchanged)
 
 
