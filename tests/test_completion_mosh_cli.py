@@ -64,7 +64,8 @@ def place(tmp_path_factory):
 
 
 def run(place, *words, quick=QUICK):
-    return main(["mosh", *map(str, words), "-m", str(place / "model.npz"), "--layout", str(place / "layout.json"), *quick])
+    return main(["mosh", *map(str, words), "-m", str(place / "model.npz"), "--layout", str(place / "layout.json"),
+                 *quick])
 
 
 def told(folder):

@@ -20,7 +20,8 @@ from ..animation.work import choose_layout, key_frames, write_glb
 from ..markers.files import MarkerSequence, read_markers
 from ..markers.layout import MarkerLayout
 from .capture import mosh
-from .characters import moving_character, retarget_soft_tissue, write_character
+from .character_pictures import picture_transfer, write_character
+from .characters import retarget_soft_tissue
 from .charts import MM
 from .outputs import filled_in, write_person, write_take
 from .recordings import Actor, Recording
@@ -218,14 +219,12 @@ def _character(character: BodyModel, take: Take, folder: Path, page: Page, keys:
         moving = retarget_soft_tissue(take.soft, take.model, character, factor)
         moving.save(folder / "character.npz")
         write_character(folder / "character.glb", character, moving, keys)
-        frames = key_frames(moving.motion, 8)
-        _, bodies = moving_character(character, moving, frames)
-        motion, body = moving.motion, character.subject(np.zeros(moving.changes.shape[1]))
-    else:
-        body = character.subject(np.zeros(character.n_betas))
-        motion = retarget(take.motion, take.subject, body)
-        motion.save(folder / "character.npz")
-        write_glb(folder / "character.glb", motion, body, keys)
-        frames = key_frames(motion, 8)
-        bodies = motion.vertices(body, frames)
-    page.picture(morph_frames(motion, body, bodies, frames))
+        page.picture(picture_transfer(take.model, take.soft, character, moving),
+                     "the person, the character, and how far the character's skin is stretched or squeezed")
+        return
+    body = character.subject(np.zeros(character.n_betas))
+    motion = retarget(take.motion, take.subject, body)
+    motion.save(folder / "character.npz")
+    write_glb(folder / "character.glb", motion, body, keys)
+    frames = key_frames(motion, 8)
+    page.picture(morph_frames(motion, body, motion.vertices(body, frames), frames))
