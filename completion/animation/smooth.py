@@ -87,10 +87,10 @@ def _window_step(body: MarkedBody, inertia: np.ndarray, x: np.ndarray, gradient:
         gradient[i:T - 2 + i] += D[i] * inertia * bend
         for j in range(i, 3):
             band[j - i, i:T - 2 + i] += D[i] * D[j] * inertia
-    return -_solve_banded(hessian, band, gradient)
+    return -solve_banded(hessian, band, gradient)
 
 
-def _solve_banded(hessian: np.ndarray, band: np.ndarray, rhs: np.ndarray) -> np.ndarray:
+def solve_banded(hessian: np.ndarray, band: np.ndarray, rhs: np.ndarray) -> np.ndarray:
     """Solve the block system: dense blocks (T, P, P) on the diagonal, diagonal blocks beside it."""
     T, P = rhs.shape
     lower = np.zeros((2 * P + 1, T * P))

@@ -50,11 +50,11 @@ class PersonConfig:
 
     frames: int = 12
     choice: Literal["spread", "random"] = "spread"
-    n_betas: int = 40
+    n_betas: int = 80
     attachment: Attachment = "triangle"
     data: float = 0.75
     surface: float = 100.0
-    initial: float = 0.25
+    initial: float = 1.0
     shape: float = 1.0
     pose: float = 0.25
     loose: float = 0.0025
@@ -82,9 +82,9 @@ class FollowConfig:
         See `gaussian_prior`.
     """
 
-    data: float = 0.75
-    pose: float = 1.0
-    velocity: float = 6.25
+    data: float = 2.0
+    pose: float = 0.3
+    velocity: float = 57600.0
     outlier: float = 0.06
     prior_shrinkage: float = 0.3
 
@@ -92,6 +92,9 @@ class FollowConfig:
 @dataclass(frozen=True)
 class SoftTissueConfig:
     """Settings of `follow_soft_tissue`.
+
+    Weights are in the paper's units. Its own are pose = 1, velocity = 6.25, skin = steadiness = 0: here the pose prior is
+    a narrow one, which at 1 keeps poses from their markers, and the shape would bend to make up for it.
 
     Attributes
     ----------
@@ -101,18 +104,22 @@ class SoftTissueConfig:
         As in `FollowConfig`.
     change : float
         Weight on the squared change of betas from the person's own.
+    skin : float
+        Weight on the squared distance, in centimetres, that the change moves the skin: the mean over the surface.
     steadiness : float
-        Weight on the squared second difference of that change over time.
+        Weight on the squared second difference of the change from frame to frame, 120 frames a second, against that of
+        the change itself.
     iterations : int
         Rounds over the whole sequence.
     """
 
     n_betas: int = 200
     data: float = 0.75
-    pose: float = 1.0
-    velocity: float = 6.25
+    pose: float = 0.1
+    velocity: float = 40000.0
     change: float = 0.25
-    steadiness: float = 0.0
+    skin: float = 10.0
+    steadiness: float = 20.0
     outlier: float = 0.06
     prior_shrinkage: float = 0.3
     iterations: int = 3

@@ -16,10 +16,10 @@ System = tuple[np.ndarray, np.ndarray, np.ndarray]
 
 
 class SwayingBody:
-    """A person with markers whose shape changes by betas Δ (K,) around their own.
+    """A person with markers whose betas change by Δ = z @ directions around their own.
 
-    Markers are affine in Δ, `y(θ) + D(θ) Δ`, and D (3L, K) is a linear function of products of features and
-    rotations: for a batch of poses it is one matrix product.
+    Markers are affine in z, `y(θ) + D(θ) z`, and D (3L, K) is a linear function of products of features and rotations:
+    for a batch of poses it is one matrix product. The derivative by the pose is that of the person's own shape.
 
     Parameters
     ----------
@@ -27,23 +27,24 @@ class SwayingBody:
     betas : (k,) float
         The person's own.
     layout : MarkerLayout
-    n_betas : int
-        K, components in which the shape may change.
+    directions : (K, K) float
+        In which the betas change.
     prior_weight, prior_shrinkage : float
         See `MarkedBody`.
     poses : (T, J, 3) float, radians
         Some that occur: the normals of the skin are followed best near them.
     """
 
-    def __init__(self, model: BodyModel, betas: np.ndarray, layout: MarkerLayout, n_betas: int, prior_weight: float,
-                 prior_shrinkage: float, poses: np.ndarray) -> None:
+    def __init__(self, model: BodyModel, betas: np.ndarray, layout: MarkerLayout, directions: np.ndarray,
+                 prior_weight: float, prior_shrinkage: float, poses: np.ndarray) -> None:
         self.marked = MarkedBody(model.subject(betas), layout, prior_weight, prior_shrinkage)
-        self.count, self.n_betas = self.marked.count, n_betas
+        self.directions = directions
+        self.count, self.n_betas = self.marked.count, len(directions)
         self.terms = model.terms
         self._flat = self._slopes(model, betas, layout, poses)
 
     def _slopes(self, model: BodyModel, betas: np.ndarray, layout: MarkerLayout, poses: np.ndarray) -> np.ndarray:
-        """(3M, K L): the change of the markers with betas, normals included."""
+        """(3M, K L): the change of the markers along the directions, normals included."""
         ids, weights = supports(model.template, layout)
         distances = np.asarray(layout.distances)
         if not distances.any():
@@ -60,31 +61,34 @@ class SwayingBody:
             for i, p in enumerate(part):
                 row = np.flatnonzero(plain & (self.terms.part == p))[0]
                 basis[:, row, i] += distances[i] * turning[i].T
-        return np.ascontiguousarray(basis.transpose(1, 3, 0, 2)).reshape(3 * basis.shape[1], -1)
+        K, M, L, _ = basis.shape
+        along = (self.directions @ basis.reshape(K, -1)).reshape(K, M, L, 3)
+        return np.ascontiguousarray(along.transpose(1, 3, 0, 2)).reshape(3 * M, -1)
 
     def slopes(self, pose: np.ndarray) -> np.ndarray:
-        """Derivative (B, K, 3, L) of the markers by betas at poses (B, J, 3), metres."""
+        """Derivative (B, K, 3, L) of the markers by z at poses (B, J, 3), metres."""
         D = posed_product(self.terms, self._flat, pose)
         return D.reshape(len(pose), 3, self.n_betas, self.count).swapaxes(1, 2)
 
-    def positions(self, x: np.ndarray, changes: np.ndarray) -> np.ndarray:
-        """Where the body puts the markers (T, L, 3), metres, for unknowns (T, P) and changes (T, K)."""
+    def positions(self, x: np.ndarray, z: np.ndarray) -> np.ndarray:
+        """Where the body puts the markers (T, L, 3), metres, for unknowns (T, P) and changes z (T, K)."""
         pose, trans, _ = self.marked.body.split(x)
         y = np.empty((len(x), self.count, 3))
         for start in range(0, len(x), BATCH):
             some = slice(start, start + BATCH)
             D = self.slopes(pose[some])
             y[some] = np.swapaxes(self.marked.shapes.evaluate(pose[some], trans[some]), 1, 2)
-            y[some] += np.einsum("bk,bkdl->bld", changes[some], D)
+            moved = z[some, None] @ D.reshape(len(D), self.n_betas, -1)
+            y[some] += np.swapaxes(moved.reshape(len(D), 3, -1), 1, 2)
         return y
 
-    def system(self, x: np.ndarray, changes: np.ndarray, targets: np.ndarray, weights: np.ndarray) -> System:
+    def system(self, x: np.ndarray, z: np.ndarray, targets: np.ndarray, weights: np.ndarray) -> System:
         """Markers and pose prior: energy (B,), half its gradient (B, P + K) and Gauss-Newton matrix.
 
         Parameters
         ----------
         x : (B, P) float
-        changes : (B, K) float
+        z : (B, K) float
         targets : (B, L, 3) float, metres
             NaN where a marker was not seen.
         weights : (B, L) float
@@ -93,11 +97,9 @@ class SwayingBody:
         pose, trans, _ = self.marked.body.split(x)
         y, by_turn = self.marked.shapes.columns(pose, trans)
         D = self.slopes(pose)
-        y += (changes[:, None] @ D.reshape(len(x), self.n_betas, -1)).reshape(y.shape)
+        y += (z[:, None] @ D.reshape(len(x), self.n_betas, -1)).reshape(y.shape)
         (B, n), P, L = by_turn.shape[:2], x.shape[1], self.count
-        missing = np.isnan(targets[..., 0])
-        root = np.sqrt(np.where(missing, 0.0, weights))[:, None]
-        residual = (root * np.where(missing[:, None], 0.0, y - np.swapaxes(targets, -1, -2))).reshape(B, -1)
+        root, residual = _weighed(y, targets, weights)
         A = np.empty((B, P + self.n_betas, 3, L))
         np.multiply(by_turn, root[:, None], out=A[:, :n])
         A[:, n:P] = np.eye(3)[:, :, None] * root[:, None]
@@ -108,6 +110,20 @@ class SwayingBody:
         gradient[:, :n] += prior[1]
         hessian[:, :n, :n] += prior[2]
         return energy + prior[0], gradient, hessian
+
+    def change_system(self, x: np.ndarray, targets: np.ndarray, weights: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Half the gradient (B, K) of the markers by z, at z = 0, and its matrix (B, K, K); as for `system`."""
+        pose, trans, _ = self.marked.body.split(x)
+        root, residual = _weighed(self.marked.shapes.evaluate(pose, trans), targets, weights)
+        A = (self.slopes(pose) * root[:, None]).reshape(len(x), self.n_betas, -1)
+        return (A @ residual[..., None])[..., 0], A @ A.swapaxes(1, 2)
+
+
+def _weighed(y: np.ndarray, targets: np.ndarray, weights: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Roots of the weights (B, 1, L), 0 where nothing was seen, and the residuals (B, 3L) of places (B, 3, L)."""
+    missing = np.isnan(targets[..., 0])
+    root = np.sqrt(np.where(missing, 0.0, weights))[:, None]
+    return root, (root * np.where(missing[:, None], 0.0, y - np.swapaxes(targets, -1, -2))).reshape(len(y), -1)
 
 
 def normal_slopes(supports: np.ndarray, slopes: np.ndarray, R: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -140,3 +156,14 @@ def normal_slopes(supports: np.ndarray, slopes: np.ndarray, R: np.ndarray) -> tu
     local = np.swapaxes(R, -1, -2)[:, :, None] @ n[:, None, ..., None]                    # (S, J, L, 3, 1)
     part = local.var(axis=0).sum(axis=(-1, -2)).argmin(axis=0)
     return part, (np.swapaxes(R, -1, -2)[:, part] @ dn).mean(axis=0)
+
+
+def skin_metric(model: BodyModel, n_betas: int) -> np.ndarray:
+    """(K, K): `Δ @ metric @ Δ` is how far the skin moves when betas change by Δ, squared, square metres.
+
+    The mean over the surface of the mean person in the mean pose.
+    """
+    areas = model.template.vertex_areas
+    D = model.shape_jacobian(model.pose_mean)[..., :n_betas]
+    D = (np.sqrt(areas / areas.sum())[:, None, None] * D).reshape(-1, n_betas)
+    return np.asarray(D.T @ D)
