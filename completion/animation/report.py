@@ -96,18 +96,21 @@ def animated_picture(motion: Motion, subject: Subject, frames_per_second: float 
 
 
 def moving_picture(bodies: np.ndarray, subject: Subject, rate: float, width: int = 300, height: int = 400,
-                   faces: np.ndarray | None = None) -> bytes:
+                   faces: np.ndarray | None = None, pose: np.ndarray | None = None) -> bytes:
     """Meshes (n, N, 3) as an endless GIF of `rate` pictures a second, the camera following them over the ground.
 
     Parameters
     ----------
     faces : (f, 3) int, optional
         Triangles of the meshes, where they are not the subject's.
+    pose : (J, 3) float, radians, optional
+        Of a body that the camera sees from its front; else that at rest.
     """
     centred = bodies - bodies.mean(axis=1, keepdims=True)
     up, _ = upright(subject.template)
     centred[..., up] = bodies[..., up]
-    camera = look_around(subject.template, centred, (35,))[0]
+    camera = look_around(subject.template, centred, (35,))[0] if pose is None else \
+        facing(subject, pose, centred.reshape(-1, 3), 35.0)
     faces = subject.template.faces if faces is None else faces
     images = [render(Mesh(v, faces), camera, width, height, ground=True) for v in centred]
     return gif_bytes(images, rate)

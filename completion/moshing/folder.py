@@ -20,7 +20,7 @@ from .recordings import TABLE, Actor, write_table
 from .report import PICTURE
 from .work import ERRORS, Work, mosh_person
 
-_STYLE = """.person { display: grid; grid-template-columns: minmax(12rem, 1fr) 2fr; gap: 1rem; margin: 1.6rem 0; }
+_STYLE = """.person { display: grid; grid-template-columns: minmax(17rem, 1fr) 2fr; gap: 1rem; margin: 1.6rem 0; }
 .person img { width: 100%; } .person p { margin: .2rem 0; }"""
 
 

@@ -88,7 +88,7 @@ def every(count: int, most: int = SHEET) -> int:
         power *= 10
 
 
-def contact_sheet(take: Take, frames: np.ndarray, columns: int = 8, height: int = 190) -> np.ndarray:
+def contact_sheet(take: Take, frames: np.ndarray, columns: int = 8, width: int = 122) -> np.ndarray:
     """Frames of a sequence, most of them at one scale, the camera going along, the measured markers as dots."""
     motion, bodies = take.shown, take.bodies(frames)
     cameras = [facing(take.subject, motion.poses[t], body, 35.0) for t, body in zip(frames, bodies, strict=True)]
@@ -98,7 +98,7 @@ def contact_sheet(take: Take, frames: np.ndarray, columns: int = 8, height: int 
     for t, body, camera in zip(frames, bodies, cameras, strict=True):
         even = replace(camera, height=max(tall, camera.height), width=max(wide, camera.width))
         shapes: list[Shape] = [take.light.mesh(body), marker_dots(take, int(t), 0.019, coarse=True)]
-        images.append(render(shapes, even, round(height * wide / tall), height))
+        images.append(render(shapes, even, width, round(width * tall / wide)))
     return side_by_side(images, [f"{t} · {t / motion.rate:.2f} s" for t in frames], gap=4, columns=columns)
 
 
@@ -180,7 +180,8 @@ def moving(take: Take, seconds: float = 4.0, rate: float = 6.0) -> bytes:
     span = max(1, min(len(motion.poses), round(seconds * motion.rate)))
     frames = np.arange(0, span, max(1, round(motion.rate / rate)))
     shown = take.bodies(frames)[:, take.light.vertex_ids]
-    return moving_picture(shown, take.subject, motion.rate * len(frames) / span, 240, 320, take.light.faces)
+    return moving_picture(shown, take.subject, motion.rate * len(frames) / span, 240, 320, take.light.faces,
+                          motion.poses[frames[len(frames) // 2]])
 
 
 def change_of_place(body: Mesh, layout: MarkerLayout, found: MarkerLayout) -> tuple[np.ndarray, np.ndarray]:

@@ -25,7 +25,7 @@ PICTURE = "picture.png"
 COLORS = ("Dots are the measured markers: red where they are believed, orange where they are seen but not believed, "
           "green for held-out markers, which no stage has seen.")
 WORST, CHANGED = 7, 5                # frames in the pictures of the worst and of those that change most
-_STYLE = """.take { display: grid; grid-template-columns: minmax(12rem, 1fr) 2fr; gap: 1rem; margin: 1.4rem 0; }
+_STYLE = """.take { display: grid; grid-template-columns: minmax(17rem, 1fr) 2fr; gap: 1rem; margin: 1.4rem 0; }
 .take img { width: 100%; } .take p { margin: .2rem 0; }"""
 
 
