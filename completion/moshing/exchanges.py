@@ -10,7 +10,7 @@ from .settings import FaultConfig
 from .tracks import Tracks
 
 AWAY = 8.0                           # most that a marker away from its place counts, in half squared deviations
-MINORITY = 1e-3                      # what a frame of exchanged labels counts, so that of two ways the shorter is taken
+MINORITY = 2.0                       # times the doubt of a change that a whole sequence of exchanged labels counts
 WORTH = 2.0                          # least gain for which labels are exchanged
 PASSES = 12                          # in which longer cycles come apart into pairs
 
@@ -25,10 +25,12 @@ class Evidence:
         As they came.
     levels : (T, L, L) float
         What it counts that the label of a column is the marker of a row, in one frame, zero where nothing is known.
+    rate : float, frames per second
     """
 
     positions: np.ndarray
     levels: np.ndarray
+    rate: float
 
 
 def marker_levels(places: np.ndarray, positions: np.ndarray, config: FaultConfig, rate: float) -> np.ndarray:
@@ -56,32 +58,35 @@ def find_order(evidence: Evidence, config: FaultConfig) -> np.ndarray:
     """
     T, L = evidence.positions.shape[:2]
     order = np.tile(np.arange(L), (T, 1))
+    tracks = Tracks(evidence.positions, evidence.rate, config.floor, config.jump)
+    levels, touched = evidence.levels.copy(), set(range(L))
     for _ in range(PASSES):
-        found = _best_spans(evidence, order, config)
-        if not found:
-            break
-        touched: set[int] = set()
+        found = _best_spans(tracks, levels, touched, config)
+        touched = set()
         for _, a, b, swapped in sorted(found, key=lambda f: -f[0]):
             if not touched & {a, b}:
                 order[np.ix_(swapped, [a, b])] = order[np.ix_(swapped, [b, a])]
+                levels[np.ix_(swapped, np.arange(L), [a, b])] = levels[np.ix_(swapped, np.arange(L), [b, a])]
                 touched |= {a, b}
+        if not touched:
+            break
+        columns = np.array(sorted(touched))
+        tracks.changed(columns, np.take_along_axis(evidence.positions, order[:, columns, None], axis=1))
     return order
 
 
-def _best_spans(evidence: Evidence, order: np.ndarray, config: FaultConfig
+def _best_spans(tracks: Tracks, levels: np.ndarray, touched: set[int], config: FaultConfig
                 ) -> list[tuple[float, int, int, np.ndarray]]:
-    """Gain, pair and frames (n,) of all pairs that gain by being exchanged."""
-    tracks = Tracks(np.take_along_axis(evidence.positions, order[..., None], axis=1), config.floor, config.jump)
-    levels = np.take_along_axis(evidence.levels, order[:, None, :], axis=2)
+    """Gain, pair and frames (n,) of all pairs with a label of `touched` that gain by being exchanged."""
     own = np.einsum("tll->tl", levels)
     free = tracks.jumped | tracks.open
     out = []
-    for a, b in sorted(_pairs_that_jump(tracks, free) | _pairs_that_fit(own, levels, config)):
+    for a, b in sorted(_pairs_that_jump(tracks, free, touched) | _pairs_that_fit(own, levels, touched, config)):
         loose = free[:, a] & free[:, b]
         loose &= ~(tracks.open[:, a] & tracks.open[:, b] & np.append(loose[1:], False))    # of a gap its end alone
         loose[0] = False
         times = np.flatnonzero(loose)
-        gain = own[:, a] + own[:, b] - levels[:, a, b] - levels[:, b, a] - MINORITY
+        gain = own[:, a] + own[:, b] - levels[:, a, b] - levels[:, b, a] - MINORITY * config.doubt / len(own)
         stay, switch = (tracks.links(times, np.array([[a], [b]]), np.array(after)).sum(axis=0)
                         for after in ([[a], [b]], [[b], [a]]))
         begins = np.r_[0, times]
@@ -91,26 +96,31 @@ def _best_spans(evidence: Evidence, order: np.ndarray, config: FaultConfig
     return out
 
 
-def _pairs_that_jump(tracks: Tracks, free: np.ndarray) -> set[tuple[int, int]]:
+def _pairs_that_jump(tracks: Tracks, free: np.ndarray, touched: set[int]) -> set[tuple[int, int]]:
     """Pairs of labels that once go on where the other one was, better than where they were themselves."""
     pairs: set[tuple[int, int]] = set()
-    for t in np.flatnonzero(tracks.jumped.any(axis=1)):
+    for t in np.flatnonzero(tracks.jumped[:, sorted(touched)].any(axis=1)):
         some = np.flatnonzero(free[t])
         cost = tracks.links(np.full((1, 1), t), some[:, None], some[None])
         stay = np.diag(cost)
         better = cost + cost.T < stay[:, None] + stay - 1
         better &= tracks.jumped[t, some][:, None] | tracks.jumped[t, some]
         pairs |= {(int(some[i]), int(some[j])) for i, j in np.argwhere(np.triu(better, 1))}
-    return pairs
+    return {pair for pair in pairs if touched & set(pair)}
 
 
-def _pairs_that_fit(own: np.ndarray, levels: np.ndarray, config: FaultConfig) -> set[tuple[int, int]]:
+def _pairs_that_fit(own: np.ndarray, levels: np.ndarray, touched: set[int], config: FaultConfig
+                    ) -> set[tuple[int, int]]:
     """Pairs of labels that over some stretch lie where the body has the other one."""
-    a, b = np.triu_indices(own.shape[1], 1)
-    total = np.zeros((len(own) + 1, len(a)))
-    np.cumsum(own[:, a] + own[:, b] - levels[:, a, b] - levels[:, b, a], axis=0, out=total[1:])
-    best = (total - np.minimum.accumulate(total, axis=0)).max(axis=0)
-    return {(int(a[i]), int(b[i])) for i in np.flatnonzero(best > config.doubt + WORTH)}
+    pairs: set[tuple[int, int]] = set()
+    if not levels.any():
+        return pairs
+    for a in touched:
+        total = np.zeros((len(own) + 1, own.shape[1]))
+        np.cumsum(own[:, [a]] + own - levels[:, a] - levels[:, :, a], axis=0, out=total[1:])
+        best = (total - np.minimum.accumulate(total, axis=0)).max(axis=0)
+        pairs |= {(min(a, int(b)), max(a, int(b))) for b in np.flatnonzero(best > config.doubt + WORTH) if b != a}
+    return pairs
 
 
 def _two_states(gains: np.ndarray, stay: np.ndarray, switch: np.ndarray, doubt: float) -> tuple[float, np.ndarray]:
@@ -123,9 +133,9 @@ def _two_states(gains: np.ndarray, stay: np.ndarray, switch: np.ndarray, doubt: 
     stay, switch : (n,) float
         Costs of remaining as it is, or of changing, between two stretches.
     doubt : float
-        Further cost of each change, and of beginning exchanged.
+        Further cost of each change.
     """
-    value, came = np.array([0.0, gains[0] - doubt]), np.zeros((len(stay), 2), dtype=int)
+    value, came = np.array([0.0, gains[0]]), np.zeros((len(stay), 2), dtype=int)
     for i, (remain, change) in enumerate(zip(stay, switch, strict=True)):
         onward = np.stack([value - remain, value[::-1] - change - doubt])
         came[i] = onward.argmax(axis=0)

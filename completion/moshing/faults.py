@@ -83,7 +83,7 @@ class _Search:
         self.config, self.markers = config, markers
         self.body = Simulation(subject, markers, layout, config.follow)
         T, L = markers.positions.shape[:2]
-        self.order = find_order(Evidence(markers.positions, np.zeros((T, L, L), dtype=np.float32)), config)
+        self.order = find_order(Evidence(markers.positions, np.zeros((T, L, L)), markers.rate), config)
         self.bad: tuple[BadSpan, ...] = ()
         self.unsure = (self.order != np.arange(L)).mean(axis=0) > UNSURE
         self.solved: np.ndarray | None = None
@@ -126,8 +126,8 @@ class _Search:
         simulated = self.body.positions(self.x)
         places[:, rows] = self._usual(simulated)
         levels = marker_levels(places, self.markers.positions, self.config, self.markers.rate)
-        self.order = find_order(Evidence(self.markers.positions, levels), self.config)
-        tracks = Tracks(self.ordered[:, rows], self.config.floor, self.config.jump)
+        self.order = find_order(Evidence(self.markers.positions, levels, self.markers.rate), self.config)
+        tracks = Tracks(self.ordered[:, rows], self.markers.rate, self.config.floor, self.config.jump)
         off = tracks.positions - simulated
         mine, alone = (self.body.local(v, self.x) for v in (off, self.body.alone(off, self.x)))
         jumps = np.where(tracks.jumped, tracks.off, 0)

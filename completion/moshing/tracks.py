@@ -4,7 +4,8 @@ from __future__ import annotations
 import numpy as np
 from scipy.ndimage import median_filter
 
-STEPS = 3                            # differences from frame to frame that make a velocity, on either side
+ACCELERATION = 30.0                  # metres per second squared, of a marker that is out of sight
+LONGEST = 0.25                       # seconds out of sight, beyond which a track tells nothing
 NEAR = 12                            # frames on either side from which the usual jump of a track is taken
 USUAL = 1.5                          # standard deviations to a median distance, nearly
 JUMPS = 5.0                          # standard deviations that are a jump
@@ -20,6 +21,7 @@ class Tracks:
     Parameters
     ----------
     positions : (T, L, 3) float, metres
+    rate : float, frames per second
     floor : float, metres
         Least standard deviation of a track around its prediction.
     jump : float, metres
@@ -35,17 +37,26 @@ class Tracks:
         The track does not go on here; it is not known whether it does.
     """
 
-    def __init__(self, positions: np.ndarray, floor: float, jump: float) -> None:
-        self.positions = positions
+    def __init__(self, positions: np.ndarray, rate: float, floor: float, jump: float) -> None:
+        self.positions, self.rate, self.floor, self.least = positions, rate, floor, jump
         steps = np.diff(positions, axis=0)
         missing = np.full((1, *positions.shape[1:]), np.nan)
         self._after = np.concatenate([_median_of_next(steps), missing])
         self._before = np.concatenate([missing, _median_of_next(steps[::-1])[::-1]])
+        seen = np.isfinite(positions[..., 0])
+        self._last = np.maximum.accumulate(np.where(seen, np.arange(len(positions))[:, None], -1), axis=0)
         self.off = np.full(positions.shape[:2], np.nan)
         self.off[1:] = _length(steps - _mean_of_known(self._before[:-1], self._after[1:]))
         self.sd = self._usual(floor)
         self.open = np.isnan(self.off)
         self.jumped = np.nan_to_num(self.off) > np.maximum(jump, JUMPS * self.sd)
+
+    def changed(self, columns: np.ndarray, positions: np.ndarray) -> None:
+        """Have other positions (T, n, 3) in some columns (n,)."""
+        other = Tracks(positions, self.rate, self.floor, self.least)
+        self.positions = self.positions.copy()
+        for name in ("positions", "_after", "_before", "_last", "off", "sd", "open", "jumped"):
+            getattr(self, name)[:, columns] = getattr(other, name)
 
     def _usual(self, floor: float) -> np.ndarray:
         """The usual size (T, L) of what is off: around that time, and no less than over all of it."""
@@ -54,26 +65,28 @@ class Tracks:
         return np.maximum(floor, USUAL * np.maximum(near, whole))
 
     def links(self, times: np.ndarray, before: np.ndarray, after: np.ndarray) -> np.ndarray:
-        """What it counts that labels `after` go on, in frames `times`, where labels `before` were in those before.
+        """What it counts that labels `after` go on, in frames `times`, where labels `before` were until then.
 
         Half squared standard deviations, no more than `TORN`; as much for one that appears, nothing where no label
-        `after` is seen. The three are arrays of one shape, after broadcasting.
+        `after` is seen. Over a gap a track may have taken another way, the farther the longer it was. The three are
+        arrays of one shape, after broadcasting.
         """
-        step = self.positions[times, after] - self.positions[times - 1, before]
-        off = _length(step - _mean_of_known(self._before[times - 1, before], self._after[times, after]))
-        sd = np.maximum(self.sd[times, before], self.sd[times, after])
-        cost = np.minimum(np.nan_to_num(off**2 / (2 * sd**2), nan=TORN), TORN)
+        last = self._last[times - 1, before]
+        gap = times - last
+        way = gap[..., None] * _mean_of_known(self._before[last, before], self._after[times, after])
+        off = _length(self.positions[times, after] - self.positions[last, before] - way)
+        usual = np.maximum(self.sd[last, before], self.sd[times, after])
+        sd = gap * usual + 0.5 * ACCELERATION * ((gap - 1) / self.rate)**2
+        cost = np.nan_to_num(off**2 / (2 * sd**2), nan=TORN) + 3 * np.log(sd / usual)
+        cost = np.where((last < 0) | (gap > LONGEST * self.rate + 1), TORN, np.minimum(cost, TORN))
         return np.where(np.isnan(self.positions[times, after, 0]), 0.0, cost)
 
 
 def _median_of_next(steps: np.ndarray) -> np.ndarray:
-    """The median (T - 1, L, 3) of this and the next steps that are known; NaN without any."""
-    padded = np.concatenate([steps, np.full((STEPS - 1, *steps.shape[1:]), np.nan)])
-    ordered = np.sort(np.stack([padded[i:len(steps) + i] for i in range(STEPS)]), axis=0)           # NaN comes last
-    known = np.isfinite(ordered).sum(axis=0)
-    below = np.take_along_axis(ordered, np.maximum(known - 1, 0)[None] // 2, axis=0)
-    above = np.take_along_axis(ordered, np.minimum(known // 2, STEPS - 1)[None], axis=0)
-    return np.where(known > 0, 0.5 * (below + above)[0], np.nan)
+    """The median (T - 1, L, 3) of this and the next two steps, or one of those that are known; NaN without any."""
+    padded = np.concatenate([steps, np.full((2, *steps.shape[1:]), np.nan)])
+    a, b, c = (padded[i:len(steps) + i] for i in range(3))
+    return np.fmax(np.fmin(a, b), np.fmin(np.fmax(a, b), c))
 
 
 def _mean_of_known(a: np.ndarray, b: np.ndarray) -> np.ndarray:
