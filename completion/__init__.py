@@ -12,9 +12,12 @@ if TYPE_CHECKING:
     from .animation.shape import MarkerShapeConfig, MarkerSubject, subject_from_markers
     from .animation.stream import Frame, MarkerStream
     from .embedded import embedded_model
+    from .markers.candidates import CandidateConfig, candidate_layout
+    from .markers.carry import CarriedLayout, CarryConfig, carry_layout, register_layout
     from .markers.files import MarkerSequence, read_markers, write_markers
     from .markers.layout import MarkerLayout
     from .markers.named import layout_names
+    from .markers.symmetry import SkinMirror, find_skin_mirror
     from .moshing.capture import mosh
     from .moshing.cartoons import Cartoon, CartoonShape, cartoon
     from .moshing.characters import deformation, retarget_soft_tissue
@@ -38,9 +41,12 @@ _ROOMS = {
     "animation.shape": ("MarkerShapeConfig", "MarkerSubject", "subject_from_markers"),
     "animation.stream": ("Frame", "MarkerStream"),
     "embedded": ("embedded_model",),
+    "markers.candidates": ("CandidateConfig", "candidate_layout"),
+    "markers.carry": ("CarriedLayout", "CarryConfig", "carry_layout", "register_layout"),
     "markers.files": ("MarkerSequence", "read_markers", "write_markers"),
     "markers.layout": ("MarkerLayout",),
     "markers.named": ("layout_names",),
+    "markers.symmetry": ("SkinMirror", "find_skin_mirror"),
     "moshing.capture": ("mosh",),
     "moshing.cartoons": ("Cartoon", "CartoonShape", "cartoon"),
     "moshing.characters": ("deformation", "retarget_soft_tissue"),
@@ -59,12 +65,14 @@ _ROOMS = {
 }
 _ROOM_OF = {name: room for room, names in _ROOMS.items() for name in names}
 
-__all__ = ["AnimateConfig", "Cartoon", "CartoonShape", "ColorConfig", "Completion", "CompletionConfig", "Frame",
-           "MarkerLayout", "MarkerSequence", "MarkerShapeConfig", "MarkerStream", "MarkerSubject", "MoshConfig",
-           "MoshResult", "Motion", "PersonConfig", "PersonFit", "SexedMosh", "TrackConfig", "animate", "carry_colors",
-           "cartoon", "complete", "deformation", "embedded_model", "find_person", "follow_soft_tissue", "joint_angles",
-           "joint_centres", "layout_names", "morphed_vertices", "mosh", "mosh_by_sex", "read_markers", "read_mask",
-           "retarget", "retarget_soft_tissue", "subject_from_markers", "track", "write_markers"]
+__all__ = ["AnimateConfig", "CandidateConfig", "CarriedLayout", "CarryConfig", "Cartoon", "CartoonShape", "ColorConfig",
+           "Completion", "CompletionConfig", "Frame", "MarkerLayout", "MarkerSequence", "MarkerShapeConfig",
+           "MarkerStream", "MarkerSubject", "MoshConfig", "MoshResult", "Motion", "PersonConfig", "PersonFit",
+           "SexedMosh", "SkinMirror", "TrackConfig", "animate", "candidate_layout", "carry_colors", "carry_layout",
+           "cartoon", "complete", "deformation", "embedded_model", "find_person", "find_skin_mirror",
+           "follow_soft_tissue", "joint_angles", "joint_centres", "layout_names", "morphed_vertices", "mosh",
+           "mosh_by_sex", "read_markers", "read_mask", "register_layout", "retarget", "retarget_soft_tissue",
+           "subject_from_markers", "track", "write_markers"]
 
 
 def __getattr__(name: str) -> Any:

@@ -14,6 +14,8 @@ COMMANDS = {
     "animate": ("Markers -> the person and a moving body.", "completion.animation.cli:animate_markers"),
     "mosh": ("Markers -> shape, motion and soft tissue; a file, or a folder of people.",
              "completion.moshing.cli:mosh_markers"),
+    "layout": ("Marker sets: look at them, carry them to other bodies, design them.",
+               "completion.markers.cli:group"),
     "track": ("Frames of points -> a moving body, without markers.", "completion.tracking.cli:track_frames"),
 }
 

@@ -213,6 +213,21 @@ class MarkerLayout:
         kept = self.select([label for label in self.labels if label not in gone])
         return replace(kept, aliases={a: label for a, label in self.aliases.items() if label not in gone})
 
+    def pairs(self, template: Mesh | None = None) -> np.ndarray:
+        """(L,) which marker is on the other side of each: its own number in the middle, -1 without a partner.
+
+        Labels tell (LELB and RELB, l_elbow and r_elbow, left elbow and right elbow), and places on a symmetric body
+        where they do not.
+
+        Parameters
+        ----------
+        template : Mesh, optional
+            The body; without it a marker whose label names no side is taken to be in the middle.
+        """
+        from .symmetry import label_pairs, marker_pairs
+
+        return label_pairs(self.labels) if template is None else marker_pairs(self, template)
+
     def moved(self, places: Mapping[str, int]) -> MarkerLayout:
         """The same with some markers on other vertices, {label: vertex}; an alias moves its marker."""
         vertices, weights = self.vertices.copy(), None if self.weights is None else self.weights.copy()

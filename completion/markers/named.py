@@ -32,6 +32,16 @@ def layout_names() -> tuple[str, ...]:
     return tuple(sorted({tree["name"] for _, tree in _files()}))
 
 
+def layout_summaries() -> list[tuple[str, int, str, str]]:
+    """Name, number of markers, what it is, and the bodies it is known on, of every set that comes along."""
+    out = []
+    for name in layout_names():
+        trees = [tree for _, tree in _files() if tree["name"] == name]
+        count = sum(len(markers["indices"]) for markers in trees[0]["markersets"])
+        out.append((name, count, trees[0]["about"], ", ".join(tree["body"]["name"] for tree in trees)))
+    return out
+
+
 def named_layout(name: str, template: Mesh, kept: np.ndarray | None = None) -> MarkerLayout:
     """See `MarkerLayout.named`."""
     from .layout import MarkerLayout

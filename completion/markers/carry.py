@@ -1,0 +1,122 @@
+"""A marker layout on another triangulation, by registration."""
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from scanprep.geometry.mesh import Mesh
+from scanprep.geometry.surface import Surface
+from scanprep.matching.correlated import CorrelatedConfig, find_correspondences
+from scanprep.matching.nonrigid import register
+from scanprep.matching.schedule import RegistrationConfig
+
+from .layout import MarkerLayout
+from .symmetry import skin_points
+
+Landmarks = tuple[np.ndarray, np.ndarray]
+
+
+@dataclass(frozen=True)
+class CarryConfig:
+    """Settings of `carry_layout`.
+
+    Attributes
+    ----------
+    correspond : CorrelatedConfig
+        Of the search for pairs of places, without landmarks.
+    register : RegistrationConfig
+    """
+
+    correspond: CorrelatedConfig = field(default_factory=CorrelatedConfig)
+    register: RegistrationConfig = field(default_factory=RegistrationConfig)
+
+
+@dataclass(frozen=True, eq=False)
+class CarriedLayout:
+    """A layout on another body, and how well the registration that brought it there went.
+
+    Attributes
+    ----------
+    layout : MarkerLayout
+        On triangles of the target.
+    distances : (L,) float, metres
+        From the registered source to the target, at each marker: across the skin, not along it.
+    confidence : (L,) float in [0, 1]
+        Of the registration at each marker.
+    rms : float, metres
+        Of the distances of the registered source from the target.
+    landmark_rms : float, metres
+        NaN without landmarks.
+    missed : float
+        Share of the target that the source does not cover: more than a few per cent says that a limb is wrong, or that
+        the bodies differ, a fist and an open hand.
+    registered : Mesh
+        The source's triangles on the target.
+    """
+
+    layout: MarkerLayout
+    distances: np.ndarray
+    confidence: np.ndarray
+    rms: float
+    landmark_rms: float
+    missed: float
+    registered: Mesh
+
+
+def carry_layout(layout: MarkerLayout, source: Mesh, target: Mesh, landmarks: Landmarks | None = None,
+                 config: CarryConfig | None = None, progress: Callable[[int, int], None] | None = None) -> MarkerLayout:
+    """The layout of one body on another of any triangulation and pose; see `register_layout`, which also tells how it went.
+
+    Returns
+    -------
+    MarkerLayout
+        Three vertices of a triangle of the target for every marker; labels, distances from the skin, aliases and
+        loose markers as they were.
+    """
+    return register_layout(layout, source, target, landmarks, config, progress).layout
+
+
+def register_layout(layout: MarkerLayout, source: Mesh, target: Mesh, landmarks: Landmarks | None = None,
+                    config: CarryConfig | None = None, progress: Callable[[int, int], None] | None = None
+                    ) -> CarriedLayout:
+    """Bring a layout onto another body: the source is registered to the target, and takes its markers along.
+
+    Parameters
+    ----------
+    layout : MarkerLayout
+        Of the source.
+    source, target : Mesh
+        One connected manifold component each.
+    landmarks : (K,) int and (K, 3) float, metres, optional
+        Vertices of the source and where they are on the target. Without them, places that look alike are sought, which
+        cannot tell how far a smooth limb is turned about itself.
+    config : CarryConfig, optional
+    progress : callable, optional
+        Called as progress(done, total).
+
+    Raises
+    ------
+    ValueError
+        A layout of another body than the source, or what `register` raises.
+    """
+    config, tell = config or CarryConfig(), progress or (lambda done, total: None)
+    layout.place(source)                                              # refuses a layout of another body
+    hints = None
+    if landmarks is None:
+        hints = find_correspondences(source, target, config=config.correspond)
+    fit = register(source, target, landmarks, config.register, tell, hints)
+    found = Surface(target).closest(skin_points(layout, fit.mesh))
+    vertices = layout.vertices if layout.weights is None else \
+        layout.vertices[np.arange(len(layout.labels)), layout.weights.argmax(axis=1)]
+    carried = MarkerLayout(layout.labels, target.faces[found.faces], layout.distances, _on_triangle(found.bary),
+                           layout.aliases, layout.loose)
+    return CarriedLayout(carried, found.distances, fit.confidence[vertices], fit.rms, fit.landmark_rms, fit.missed,
+                         fit.mesh)
+
+
+def _on_triangle(bary: np.ndarray) -> np.ndarray:
+    """Barycentric coordinates (n, 3) without the last digits outside of the triangle."""
+    inside = np.clip(bary, 0.0, 1.0)
+    return inside / inside.sum(axis=1, keepdims=True)

@@ -1,0 +1,112 @@
+"""What a marker layout looks like on a body."""
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import Any
+
+import numpy as np
+
+from scanprep.geometry.mesh import Mesh
+from scanprep.geometry.surface import Rays
+from scanprep.pictures.camera import Camera
+from scanprep.pictures.page import Page
+from scanprep.pictures.shading import Dots, Solid, render, side_by_side
+from scanprep.pictures.sheets import font
+from scanprep.pictures.views import look_around
+from scanprep.skeleton.tree import Skeleton
+
+from .layout import MarkerLayout
+from .symmetry import label_pairs
+
+HEIGHT = 1000
+SIDES = ("front", "its left", "back", "its right")
+FIXED, LOOSE = (0.86, 0.24, 0.20), (0.93, 0.62, 0.12)
+INK = (24, 40, 92)
+
+
+def picture_layout(body: Mesh, layout: MarkerLayout, height: int = HEIGHT) -> np.ndarray:
+    """A body from four sides with its markers, each named where it is in sight; loose ones in another colour.
+
+    Parameters
+    ----------
+    body : Mesh
+        Standing.
+    layout : MarkerLayout
+    height : int, pixels
+
+    Returns
+    -------
+    (H, W, 3) uint8
+    """
+    cameras = look_around(body)
+    width = int(height * max(c.width / c.height for c in cameras)) + 100
+    return side_by_side([_side(body, layout, camera, width, height) for camera in cameras], SIDES)
+
+
+def _side(body: Mesh, layout: MarkerLayout, camera: Camera, width: int, height: int) -> np.ndarray:
+    from PIL import Image, ImageDraw
+
+    points = layout.place(body)
+    colors = np.array([LOOSE if label in layout.loose else FIXED for label in layout.labels])
+    radius = 0.0055 * float(np.ptp(body.vertices, axis=0).max())
+    picture = Image.fromarray(render([Solid(body), Dots(points, colors, radius)], camera, width, height))
+    draw = ImageDraw.Draw(picture)
+    towards = camera.position - points
+    towards /= np.linalg.norm(towards, axis=1, keepdims=True)
+    hidden = Rays(body).occluded(points + 1e-4 * towards, towards)
+    taken: list[tuple[float, float, float, float]] = []
+    places = camera.project(points, width, height)
+    for i in np.argsort(places[:, 1]):
+        if not hidden[i]:
+            taken.append(_write(draw, layout.labels[i], places[i], taken))
+    return np.asarray(picture)
+
+
+def _write(draw: Any, label: str, place: np.ndarray, taken: list[tuple[float, float, float, float]]
+           ) -> tuple[float, float, float, float]:
+    """Write a label beside its marker, where no other label is; returns the room it takes."""
+    size = font(12)
+    wide, high = draw.textlength(label, font=size), 13
+    x, y = place
+    spots = [(x + 7, y - 7), (x - 7 - wide, y - 7), (x + 5, y - 20), (x + 5, y + 6), (x - 5 - wide, y - 20),
+             (x - 5 - wide, y + 6)]
+    boxes = [(a, b, a + wide, b + high) for a, b in spots]
+    free = [box for box in boxes if not any(_meet(box, other) for other in taken)]
+    box = (free or boxes)[0]
+    draw.text(box[:2], label, fill=INK, font=size)
+    return box
+
+
+def _meet(a: tuple[float, float, float, float], b: tuple[float, float, float, float]) -> bool:
+    return a[0] < b[2] and b[0] < a[2] and a[1] < b[3] and b[1] < a[3]
+
+
+def marker_rows(body: Mesh, layout: MarkerLayout, skeleton: Skeleton | None = None) -> list[tuple[str, ...]]:
+    """For every marker its label, other labels, part of the body, partner, distance from the skin and kind."""
+    pairs = label_pairs(layout.labels)
+    parts = None if skeleton is None else skeleton.part_of_vertex(body)
+    others: dict[str, list[str]] = {}
+    for alias, label in layout.aliases.items():
+        others.setdefault(label, []).append(alias)
+    vertices = layout.vertices if layout.weights is None else \
+        layout.vertices[np.arange(len(layout.labels)), layout.weights.argmax(axis=1)]
+    rows: list[tuple[str, ...]] = []
+    for i, label in enumerate(layout.labels):
+        partner = "-" if pairs[i] < 0 else "middle" if pairs[i] == i else layout.labels[pairs[i]]
+        part = "" if skeleton is None or parts is None else skeleton.names[parts[vertices[i]]]
+        rows.append((label, ", ".join(others.get(label, [])), part, partner,
+                     f"{1000 * np.asarray(layout.distances)[i]:.1f} mm", "loose" if label in layout.loose else "fixed"))
+    return rows
+
+
+MARKER_HEADER = ("label", "also", "part", "partner", "from the skin", "place")
+
+
+def layout_page(name: str, body: Mesh, layout: MarkerLayout, picture: np.ndarray, figures: Mapping[str, str],
+                skeleton: Skeleton | None = None) -> Page:
+    """The page of `scape layout show`."""
+    page = Page(f"Markers: {name}", "Red markers sit on a point of the anatomy, yellow ones anywhere on their limb.")
+    page.picture(picture, alt="the body from four sides with its markers")
+    page.table(list(figures.items()), ("", ""))
+    page.section("Markers").table(marker_rows(body, layout, skeleton), MARKER_HEADER)
+    return page
