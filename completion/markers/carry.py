@@ -67,7 +67,7 @@ class CarriedLayout:
 
 def carry_layout(layout: MarkerLayout, source: Mesh, target: Mesh, landmarks: Landmarks | None = None,
                  config: CarryConfig | None = None, progress: Callable[[int, int], None] | None = None) -> MarkerLayout:
-    """The layout of one body on another of any triangulation and pose; see `register_layout`, which also tells how it went.
+    """The layout of one body on another of any triangulation and pose; `register_layout` also tells how it went.
 
     Returns
     -------
