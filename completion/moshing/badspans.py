@@ -22,6 +22,7 @@ STRAY_USUAL = 4.0                    # times the usual distance of the markers o
 STRAY_JUMPED = 0.5                   # share of the limit that does where a track jumps away and back
 STRAY_SMOOTH = 3.0                   # times the limit that it takes where no track jumps
 STRAY_LEAP = 0.5                     # share of the displacement that the jump of a track must be
+LOST_LIMB = 0.5                      # share of the markers of a limb that are not all bad at once
 JOINED = 0.1                         # seconds between two spans of a kind that are one
 
 
@@ -60,6 +61,29 @@ def find_bad(off: np.ndarray, alone: np.ndarray, jumps: np.ndarray, labels: tupl
         for kind, bad in kinds:
             out += _spans(label, kind, seen, bad, away, JOINED * rate)
     return tuple(sorted(out, key=lambda s: (s.begin, s.label)))
+
+
+def without_lost_limbs(spans: tuple[BadSpan, ...], near: np.ndarray, labels: tuple[str, ...]) -> tuple[BadSpan, ...]:
+    """Spans but those in which most markers of a limb are bad together: there the body is at fault.
+
+    Parameters
+    ----------
+    near : (L, L) bool
+        Markers on the same part or the next ones, each among its own.
+    labels : L strings
+    """
+    count = len(labels)
+    begin, end = (np.array([getattr(span, name) for span in spans], dtype=int) for name in ("begin", "end"))
+    of = np.array([labels.index(span.label) for span in spans], dtype=int)
+    kept = []
+    for i, span in enumerate(spans):
+        common = np.minimum(end, end[i]) - np.maximum(begin, begin[i]) + 1
+        with_it = 2 * common > np.minimum(end - begin, end[i] - begin[i]) + 1
+        together = np.bincount(of[with_it], minlength=count) > 0
+        limb = near[of[i]]
+        if span.kind == "slipped" or (together & limb).sum() < max(3, LOST_LIMB * limb.sum()):
+            kept.append(span)
+    return tuple(kept)
 
 
 def _jitter(off: np.ndarray) -> np.ndarray:

@@ -79,26 +79,48 @@ def _best_spans(tracks: Tracks, levels: np.ndarray, touched: set[int], config: F
                 ) -> list[tuple[float, int, int, np.ndarray]]:
     """Gain, pair and frames (n,) of all pairs with a label of `touched` that gain by being exchanged."""
     own = np.einsum("tll->tl", levels)
-    free = tracks.jumped | tracks.open
     out = []
-    for a, b in sorted(_pairs_that_jump(tracks, free, touched) | _pairs_that_fit(own, levels, touched, config)):
-        loose = free[:, a] & free[:, b]
-        loose &= ~(tracks.open[:, a] & tracks.open[:, b] & np.append(loose[1:], False))    # of a gap its end alone
-        loose[0] = False
-        times = np.flatnonzero(loose)
-        gain = own[:, a] + own[:, b] - levels[:, a, b] - levels[:, b, a] - MINORITY * config.doubt / len(own)
-        stay, switch = (tracks.links(times, np.array([[a], [b]]), np.array(after)).sum(axis=0)
-                        for after in ([[a], [b]], [[b], [a]]))
-        begins = np.r_[0, times]
-        total, swapped = _two_states(np.add.reduceat(gain, begins), stay, switch, config.doubt)
+    for a, b in sorted(pairs_that_jump(tracks, touched) | _pairs_that_fit(own, levels, touched, config)):
+        begins = loose_ends(tracks, a, b)
+        gain = own[:, a] + own[:, b] - levels[:, a, b] - levels[:, b, a]
+        total, swapped = best_stretches(tracks, a, b, begins, np.add.reduceat(gain, begins), config)
         if total > WORTH:
-            out.append((total, a, b, np.flatnonzero(np.repeat(swapped, np.diff(np.r_[begins, len(gain)])))))
+            out.append((total, a, b, swapped))
     return out
 
 
-def _pairs_that_jump(tracks: Tracks, free: np.ndarray, touched: set[int]) -> set[tuple[int, int]]:
-    """Pairs of labels that once go on where the other one was, better than where they were themselves."""
+def loose_ends(tracks: Tracks, a: int, b: int) -> np.ndarray:
+    """Frames (n,), the first among them, from which on a pair may be exchanged: neither track goes on there."""
+    free = tracks.jumped[:, [a, b]] | tracks.open[:, [a, b]]
+    loose = free.all(axis=1)
+    loose &= ~(tracks.open[:, a] & tracks.open[:, b] & np.append(loose[1:], False))        # of a gap its end alone
+    loose[0] = True
+    return np.flatnonzero(loose)
+
+
+def best_stretches(tracks: Tracks, a: int, b: int, begins: np.ndarray, gains: np.ndarray, config: FaultConfig
+                   ) -> tuple[float, np.ndarray]:
+    """What it gains to exchange a pair, and in which frames (n,).
+
+    Parameters
+    ----------
+    begins : (m,) int
+        Of stretches in which the pair is exchanged or not.
+    gains : (m,) float
+        Of each when it is exchanged, as the places of the markers tell.
+    """
+    lengths = np.diff(np.r_[begins, len(tracks.positions)])
+    gains = gains - MINORITY * config.doubt * lengths / lengths.sum()
+    stay, switch = (tracks.links(begins[1:], np.array([[a], [b]]), np.array(after)).sum(axis=0)
+                    for after in ([[a], [b]], [[b], [a]]))
+    total, swapped = _two_states(gains, stay, switch, config.doubt)
+    return total, np.flatnonzero(np.repeat(swapped, lengths))
+
+
+def pairs_that_jump(tracks: Tracks, touched: set[int]) -> set[tuple[int, int]]:
+    """Pairs with a label of `touched` that once go on where the other was, better than where they were themselves."""
     pairs: set[tuple[int, int]] = set()
+    free = tracks.jumped | tracks.open
     for t in np.flatnonzero(tracks.jumped[:, sorted(touched)].any(axis=1)):
         some = np.flatnonzero(free[t])
         cost = tracks.links(np.full((1, 1), t), some[:, None], some[None])

@@ -11,8 +11,9 @@ from ..animation.trust import marker_weights
 from ..markers.files import MarkerSequence
 from ..markers.layout import MarkerLayout
 from ..motion import Motion
-from .badspans import find_bad
-from .exchanges import Evidence, find_order, listed, marker_levels
+from .badspans import find_bad, without_lost_limbs
+from .doubts import doubtful_pairs, exchanged_after_all
+from .exchanges import Evidence, find_order, listed, marker_levels, pairs_that_jump
 from .results import BadSpan, MarkerFaults
 from .settings import FaultConfig
 from .simulation import Simulation
@@ -87,6 +88,7 @@ class _Search:
         self.bad: tuple[BadSpan, ...] = ()
         self.unsure = (self.order != np.arange(L)).mean(axis=0) > UNSURE
         self.solved: np.ndarray | None = None
+        self.tried = False
         self.out = np.zeros((T, L), dtype=bool)
 
     @property
@@ -119,25 +121,52 @@ class _Search:
         self.solved = self.order
 
     def look(self) -> bool:
-        """Find exchanges and bad spans by where the body has the markers; whether nothing has changed."""
-        before, out = self.order, self.out
-        rows, T = self.body.rows, len(self.x)
+        """Find exchanges, and then bad spans, by where the body has the markers; whether nothing has changed."""
+        before, out, unsure = self.order, self.out, self.unsure.any()
         places = np.full(self.markers.positions.shape, np.nan)
         simulated = self.body.positions(self.x)
-        places[:, rows] = self._usual(simulated)
+        places[:, self.body.rows] = self._usual(simulated)
         levels = marker_levels(places, self.markers.positions, self.config, self.markers.rate)
         self.order = find_order(Evidence(self.markers.positions, levels, self.markers.rate), self.config)
-        tracks = Tracks(self.ordered[:, rows], self.markers.rate, self.config.floor, self.config.jump)
+        self.unsure = np.zeros(len(self.unsure), dtype=bool)
+        if not unsure and not self.tried and (before == self.order).all():
+            self.tried = True
+            self._try_both_ways(places)
+        if (before != self.order).any() or unsure:                     # where labels are wrong, so is the body
+            self.bad, self.out = (), np.zeros_like(out)
+            return False
+        self._find_bad(simulated)
+        return bool((self.out != out)[:, self.body.rows].mean() <= SETTLED)
+
+    def _try_both_ways(self, places: np.ndarray) -> None:
+        """Exchange close markers where the body has followed the wrong ones."""
+        config, rate, L = self.config, self.markers.rate, len(self.markers.labels)
+        raw = Tracks(self.markers.positions, rate, config.floor, config.jump)
+        exchanged = {(min(a, b), max(a, b)) for row in np.unique(self.order, axis=0)
+                     for a, b in enumerate(row.tolist()) if a != b}
+        order, tracks = self.order.copy(), Tracks(self.ordered, rate, config.floor, config.jump)
+        for a, b in doubtful_pairs(pairs_that_jump(raw, set(range(L))) | exchanged, places):
+            swapped = exchanged_after_all(self.body, self.x, tracks, a, b, config)
+            if len(swapped):
+                order[np.ix_(swapped, [a, b])] = order[np.ix_(swapped, [b, a])]
+                columns = np.array((a, b))
+                tracks.changed(columns, np.take_along_axis(self.markers.positions, order[:, columns, None], axis=1))
+        self.order = order
+
+    def _find_bad(self, simulated: np.ndarray) -> None:
+        """Find the bad spans."""
+        config, rate = self.config, self.markers.rate
+        tracks = Tracks(self.ordered[:, self.body.rows], rate, config.floor, config.jump)
         off = tracks.positions - simulated
         mine, alone = (self.body.local(v, self.x) for v in (off, self.body.alone(off, self.x)))
         jumps = np.where(tracks.jumped, tracks.off, 0)
-        self.bad = find_bad(mine, alone, jumps, self.body.labels, self.config, self.markers.rate)
-        self.out = np.zeros((T, len(self.markers.labels)), dtype=bool)
+        found = find_bad(mine, alone, jumps, self.body.labels, config, rate)
+        self.bad = without_lost_limbs(found, self.body.neighbours, self.body.labels)
+        if len(self.bad) < len(found):
+            self.solved = None                                          # a limb is lost: it is looked for anew
+        self.out = np.zeros_like(self.out)
         for span in self.bad:
             self.out[span.begin:span.end + 1, self.markers.labels.index(span.label)] = True
-        changed = (before != self.order) | (self.out != out)
-        unsure, self.unsure = self.unsure.any(), np.zeros(len(self.unsure), dtype=bool)
-        return bool(not unsure and (before == self.order).all() and changed[:, rows].mean() <= SETTLED)
 
     def _usual(self, simulated: np.ndarray) -> np.ndarray:
         """Where markers (T, L, 3) are expected: off the simulated ones as they mostly are in their part's frame."""

@@ -43,7 +43,7 @@ class PersonConfig:
     start_axes : int
         Directions of the training poses along which the pose of each frame is searched.
     iterations : int
-        Most steps of each stage.
+        Most steps of each stage; the last may take three times as many.
     seed : int
         Of the frames drawn at random.
     """
@@ -53,7 +53,7 @@ class PersonConfig:
     n_betas: int = 80
     attachment: Attachment = "triangle"
     data: float = 0.75
-    surface: float = 100.0
+    surface: float = 25.0
     initial: float = 1.0
     shape: float = 1.0
     pose: float = 0.25
@@ -154,7 +154,7 @@ class FaultConfig:
     """
 
     follow: AnimateConfig = field(default_factory=AnimateConfig)
-    rounds: int = 4
+    rounds: int = 6
     floor: float = 0.002
     jump: float = 0.006
     deviation: float = 0.008

@@ -35,6 +35,9 @@ class Simulation(MarkerFollower):
         share = np.ones(base.shape) if selected.weights is None else selected.weights
         nearest = np.take_along_axis(base, share.argmax(axis=1)[:, None], axis=1)[:, 0]
         self.part = subject.skeleton.part_of_vertex(template)[nearest]
+        parents = np.asarray(subject.skeleton.parents)[self.part]
+        hangs = self.part[:, None] == parents
+        self.neighbours = (self.part[:, None] == self.part) | hangs | hangs.T
 
     def find_exchanges(self, x: np.ndarray) -> None:
         """Take the labels as they are."""
