@@ -85,10 +85,20 @@ def test_greedy_is_never_better_than_the_best_subset_and_finds_it_one_step_away(
         sets = MarkerSets(linear, groups, down.set(down.at(count)))
         before = sets.rmse
         exchange(sets, free, 20)
-        assert best[count] * (1 - 1e-9) <= sets.rmse <= before * (1 + 1e-9)
+        assert best[count] * (1 - 1e-6) <= sets.rmse <= before * (1 + 1e-6)
         chosen = np.flatnonzero(sets.inside)
         for out, new in ((o, n) for o in chosen for n in np.flatnonzero(~sets.inside)):       # no exchange is left
-            assert linear.rmse(np.union1d(np.setdiff1d(chosen, [out]), [new])) >= sets.rmse * (1 - 1e-9)
+            assert linear.rmse(np.union1d(np.setdiff1d(chosen, [out]), [new])) >= sets.rmse * (1 - 1e-6)
+
+
+def test_two_single_markers_are_exchanged_for_a_pair_and_back():
+    linear, free = small(C=4), np.ones(3, bool)
+    groups = ((0, 1), (2,), (3,))
+    good, bad = (linear.rmse(list(each)) for each in ((0, 1), (2, 3)))
+    for start in ([0], [1, 2]):
+        sets = MarkerSets(linear, groups, start)
+        exchange(sets, free, 5)
+        assert sets.rmse == pytest.approx(min(good, bad)) and sets.count == 2
 
 
 def test_pairs_come_and_go_together_and_kept_markers_stay():
@@ -182,7 +192,7 @@ def test_wrong_input_is_told():
         design_markers(MODEL, BODIES[0], CANDIDATES, CONFIG)
     with pytest.raises(ValueError, match="keep: NOSE not among the candidates"):
         design_markers(MODEL, BODIES, CANDIDATES, CONFIG, keep=("NOSE",))
-    with pytest.raises(ValueError, match="candidates: expected markers on vertices 0..397"):
+    with pytest.raises(ValueError, match=r"candidates: expected markers on vertices 0\.\.397"):
         design_markers(MODEL, BODIES, MarkerLayout(("A", "B", "C"), [0, 1, 398]), replace(CONFIG, count=3))
     with pytest.raises(ValueError, match="partners: expected that the partner of B is A, got C"):
         symmetric_groups(("A", "B", "C"), np.array([1, 2, 1]))

@@ -10,6 +10,8 @@ from .linear import LinearBodies
 
 Groups = Sequence[tuple[int, ...]]
 ADD, REMOVE = 1, -1
+ANEW = 40                            # steps after which everything is solved for from nothing
+LEAST_GAIN = 1e-6                    # share of the mean squared distance below which nothing is exchanged
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,20 +71,25 @@ class MarkerSets:
         width = r * max(len(group) for group in groups)
         self.sizes = np.array([len(group) for group in groups])
         self.inside = np.isin(np.arange(len(groups)), np.array(sorted(chosen), dtype=np.int64))
-        self._rows, gaps = np.zeros((Z, len(groups), width, P)), np.zeros((Z, len(groups), width))
+        self._linear, self._groups, self._taken = linear, groups, 0
+        self._rows, self._gaps = np.zeros((Z, len(groups), width, P)), np.zeros((Z, len(groups), width))
         for i, group in enumerate(groups):
             self._rows[:, i, :r * len(group)] = linear.rows[:, group].reshape(Z, -1, P)
-            gaps[:, i, :r * len(group)] = linear.gaps[:, group].reshape(Z, -1)
-        members = [c for group, inside in zip(groups, self.inside, strict=True) if inside for c in group]
+            self._gaps[:, i, :r * len(group)] = linear.gaps[:, group].reshape(Z, -1)
+        self._S, self._F = np.empty((2, Z, len(groups), width, width))
+        self._solve()
+
+    def _solve(self) -> None:
+        """Everything from nothing, free of what many updates have rounded."""
+        linear, (Z, _, _, P) = self._linear, self._rows.shape
+        members = [c for group, inside in zip(self._groups, self.inside, strict=True) if inside for c in group]
         B = linear.rows[:, members].reshape(Z, -1, P)
-        self._gram = linear.gram
         self._C = np.linalg.inv(np.swapaxes(B, -1, -2) @ B + linear.precision)
         d = linear.steps(members)
         self.costs = linear.left(d)
         slope = ((linear.gram @ d[..., None])[..., 0] - linear.pull)[..., None]
-        self._rho = gaps - (self._rows @ d[:, None, :, None])[..., 0]
+        self._rho = self._gaps - (self._rows @ d[:, None, :, None])[..., 0]
         self._q = (self._rows @ (self._C @ slope)[:, None])[..., 0]
-        self._S, self._F = np.empty((2, Z, len(groups), width, width))
         for z in range(Z):                               # one body after the other: the products are as large as rows
             W = self._rows[z] @ self._C[z]
             self._S[z] = W @ np.swapaxes(self._rows[z], -1, -2)
@@ -112,7 +119,7 @@ class MarkerSets:
         S, F, rho = self._S[:, group].copy(), self._F[:, group].copy(), self._rho[:, group, :, None].copy()
         M = np.linalg.inv(np.eye(S.shape[-1]) + sign * S)
         k = M @ rho
-        both = np.concatenate([U, U @ self._gram @ self._C], axis=1)
+        both = np.concatenate([U, U @ self._linear.gram @ self._C], axis=1)
         found = self._rows @ np.swapaxes(both, -1, -2)[:, None]
         K, L = np.split(found, 2, axis=-1)                                                # B C Bᵀ, B C G C Bᵀ
         KM = K @ M[:, None]
@@ -126,6 +133,9 @@ class MarkerSets:
         self._F += KM @ F[:, None] @ np.swapaxes(KM, -1, -2) - sign * (cross + np.swapaxes(cross, -1, -2))
         self._C -= sign * (np.swapaxes(U, -1, -2) @ M @ U)
         self.inside[group] = sign == ADD
+        self._taken += 1
+        if self._taken % ANEW == 0:
+            self._solve()
 
 
 def walk(sets: MarkerSets, sign: int, movable: np.ndarray, until: int, through: Collection[int] = (),
@@ -166,25 +176,78 @@ def walk(sets: MarkerSets, sign: int, movable: np.ndarray, until: int, through: 
 
 
 def exchange(sets: MarkerSets, movable: np.ndarray, rounds: int) -> int:
-    """Put every group that may go against all of its size that are out; return how many were exchanged.
+    """Put every group of the set, and single ones two at a time, against all that may take its place.
+
+    A pair may make room for two single markers, and two of these for a pair.
 
     Parameters
     ----------
     sets : MarkerSets
-        Is changed.
+        Is changed; its count is not.
     movable : (n,) bool
+        Groups that may come or go.
     rounds : int
         Most times that every group is tried.
+
+    Returns
+    -------
+    int
+        How many exchanges were made.
     """
     done = 0
     for _ in range(rounds):
         before = done
         for group in np.flatnonzero(movable & sets.inside):
-            sets.take(int(group), REMOVE)
-            others = np.flatnonzero(movable & ~sets.inside & (sets.sizes == sets.sizes[group]))
-            best = int(others[np.argmin(sets.tried(others, ADD))])
-            sets.take(best, ADD)
-            done += best != group
+            if sets.inside[group]:
+                done += _exchanged(sets, movable, [int(group)])
+        for group in np.flatnonzero(movable & sets.inside & (sets.sizes == 1)):
+            others = np.flatnonzero(movable & sets.inside & (sets.sizes == 1))
+            others = others[others != group]
+            if sets.inside[group] and len(others):
+                least = others[np.argmin(sets.tried(others, REMOVE))]
+                done += _exchanged(sets, movable, [int(group), int(least)])
         if done == before:
             break
     return done
+
+
+def _exchanged(sets: MarkerSets, movable: np.ndarray, out: list[int]) -> bool:
+    """Let groups of the set go for what serves best in their place; put them back where nothing is better."""
+    before = sets.costs.mean()
+    for group in out:
+        sets.take(group, REMOVE)
+    new = _filled(sets, movable, int(sets.sizes[out].sum()))
+    if set(new) == set(out):
+        return False
+    if sets.costs.mean() < before * (1 - LEAST_GAIN):
+        return True
+    for group in new:
+        sets.take(group, REMOVE)
+    for group in out:
+        sets.take(group, ADD)
+    return False
+
+
+def _filled(sets: MarkerSets, movable: np.ndarray, size: int) -> list[int]:
+    """Let one group of that size come, or one marker after the other, whichever serves better; which they are."""
+    whole, cost = _best(sets, movable, size)
+    single, _ = _best(sets, movable, 1)
+    if size == 1 or single < 0:
+        sets.take(whole, ADD)
+        return [whole]
+    sets.take(single, ADD)
+    second, together = _best(sets, movable, size - 1)
+    if second >= 0 and together < cost:
+        return [single, *_filled(sets, movable, size - 1)]
+    sets.take(single, REMOVE)
+    sets.take(whole, ADD)
+    return [whole]
+
+
+def _best(sets: MarkerSets, movable: np.ndarray, size: int) -> tuple[int, float]:
+    """The group of that size that would serve best, and the mean squared distance with it; -1 where there is none."""
+    open_ = np.flatnonzero(movable & ~sets.inside & (sets.sizes == size))
+    if not len(open_):
+        return -1, float("inf")
+    costs = sets.tried(open_, ADD)
+    return int(open_[np.argmin(costs)]), float(costs.min())

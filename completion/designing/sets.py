@@ -136,7 +136,8 @@ def choose(linear: LinearBodies, groups: Groups, kept: np.ndarray, config: Desig
     if kept.any():
         alone = MarkerSets(linear, groups, np.flatnonzero(kept))
         paths["kept, removed"] = walk(alone, REMOVE, kept, FEWEST, stops, told)
-    return Choice(paths, np.flatnonzero(sets.inside), sets.rmse, exchanged)
+    chosen = np.flatnonzero(sets.inside)
+    return Choice(paths, chosen, linear.rmse(_members(groups, chosen)), exchanged)
 
 
 def best_path(paths: dict[str, Path], count: int) -> Path:
