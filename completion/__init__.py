@@ -11,6 +11,10 @@ if TYPE_CHECKING:
     from .animation.retarget import morphed_vertices, retarget
     from .animation.shape import MarkerShapeConfig, MarkerSubject, subject_from_markers
     from .animation.stream import Frame, MarkerStream
+    from .designing.frames import FrameConfig, informative_frames
+    from .designing.results import MarkerDesign
+    from .designing.sets import design_markers
+    from .designing.settings import DesignConfig
     from .embedded import embedded_model
     from .markers.candidates import CandidateConfig, candidate_layout
     from .markers.carry import CarriedLayout, CarryConfig, carry_layout, register_layout
@@ -40,6 +44,10 @@ _ROOMS = {
     "animation.retarget": ("morphed_vertices", "retarget"),
     "animation.shape": ("MarkerShapeConfig", "MarkerSubject", "subject_from_markers"),
     "animation.stream": ("Frame", "MarkerStream"),
+    "designing.frames": ("FrameConfig", "informative_frames"),
+    "designing.results": ("MarkerDesign",),
+    "designing.sets": ("design_markers",),
+    "designing.settings": ("DesignConfig",),
     "embedded": ("embedded_model",),
     "markers.candidates": ("CandidateConfig", "candidate_layout"),
     "markers.carry": ("CarriedLayout", "CarryConfig", "carry_layout", "register_layout"),
@@ -65,14 +73,15 @@ _ROOMS = {
 }
 _ROOM_OF = {name: room for room, names in _ROOMS.items() for name in names}
 
-__all__ = ["AnimateConfig", "CandidateConfig", "CarriedLayout", "CarryConfig", "Cartoon", "CartoonShape", "ColorConfig",
-           "Completion", "CompletionConfig", "Frame", "MarkerLayout", "MarkerSequence", "MarkerShapeConfig",
-           "MarkerStream", "MarkerSubject", "MoshConfig", "MoshResult", "Motion", "PersonConfig", "PersonFit",
-           "SexedMosh", "SkinMirror", "TrackConfig", "animate", "candidate_layout", "carry_colors", "carry_layout",
-           "cartoon", "complete", "deformation", "embedded_model", "find_person", "find_skin_mirror",
-           "follow_soft_tissue", "joint_angles", "joint_centres", "layout_names", "morphed_vertices", "mosh",
-           "mosh_by_sex", "read_markers", "read_mask", "register_layout", "retarget", "retarget_soft_tissue",
-           "subject_from_markers", "track", "write_markers"]
+__all__ = ["AnimateConfig", "CandidateConfig", "CarriedLayout", "CarryConfig", "Cartoon", "CartoonShape",
+           "ColorConfig", "Completion", "CompletionConfig", "DesignConfig", "Frame", "FrameConfig", "MarkerDesign",
+           "MarkerLayout", "MarkerSequence", "MarkerShapeConfig", "MarkerStream", "MarkerSubject", "MoshConfig",
+           "MoshResult", "Motion", "PersonConfig", "PersonFit", "SexedMosh", "SkinMirror", "TrackConfig", "animate",
+           "candidate_layout", "carry_colors", "carry_layout", "cartoon", "complete", "deformation", "design_markers",
+           "embedded_model", "find_person", "find_skin_mirror", "follow_soft_tissue", "informative_frames",
+           "joint_angles", "joint_centres", "layout_names", "morphed_vertices", "mosh", "mosh_by_sex", "read_markers",
+           "read_mask", "register_layout", "retarget", "retarget_soft_tissue", "subject_from_markers", "track",
+           "write_markers"]
 
 
 def __getattr__(name: str) -> Any:
