@@ -29,6 +29,7 @@ COMMANDS = {
     "coregister": ("Scans registered with a model as prior, and the model learned again.",
                    "model.coregistration.cli:coregister_scans"),
     "repose": ("A registered body in the poses of a motion.", "model.posing.cli:repose"),
+    "character": ("A character of any triangles as the mean of a model.", "model.posing.cli:character"),
     "export": ("Files for other programs: skinned GLB, BVH, body-model npz, meshes.", "model.export.cli:export"),
 }
 

@@ -105,6 +105,8 @@ def cartoon(shape: CartoonShape | str = "gnome", step: float = 0.008) -> Cartoon
     field = Mirrored(figure.field())
     reach = np.array([0.75, 0.35, 1.05]) * shape.height
     mesh = polygonise(field, np.r_[-reach[:2], -0.05 * shape.height], reach, step * shape.height)
+    if mesh.volume < 0:                                              # coarse triangles lie too deep to tell outside
+        mesh = Mesh(mesh.vertices, mesh.faces[:, ::-1])
     points = {name: project(field, point[None], 12)[0] for name, point in figure.points().items()}
     landmarks = {full: point * sign for name, point in points.items() for full, sign in _both(name)}
     joints = {full: point * sign for name, point in figure.joints.items() for full, sign in _both(name)}

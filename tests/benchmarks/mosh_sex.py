@@ -28,7 +28,7 @@ from scanprep.scanning.embedded import SUBJECT, near_rest, subject_pose
 from scanprep.scanning.people import BodyShape, Person, walk
 
 MM = 1000.0
-RATE = 30.0
+RATE = 20.0
 NAMES = ("neutral", "female", "male")
 
 
@@ -95,7 +95,7 @@ def main() -> None:
     parser.add_argument("--count", type=int, default=48, help="subjects of each strength of sex, women and men in turn")
     parser.add_argument("--strength", type=float, nargs="*", default=[1.0], help="1 all the sex there is, 0 none")
     parser.add_argument("--error", type=float, default=0.005, help="of marker places, metres")
-    parser.add_argument("--frames", type=int, default=40)
+    parser.add_argument("--frames", type=int, default=24)
     parser.add_argument("--both", action="store_true", help="also tell by the residuals of the two models")
     args = parser.parse_args()
     models, rows = learned(args.models), []

@@ -1,0 +1,175 @@
+"""Pose and soft tissue on characters, creases, and the cartoon figures."""
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from completion_bodies import MEAN, worm_with_prior
+from glb_reader import Glb
+
+from completion import CartoonShape, Motion, cartoon, deformation, retarget_soft_tissue
+from completion.animation.retarget import world_up
+from completion.moshing import character_pictures
+from completion.moshing.cartoons import CARTOONS
+from completion.moshing.character_pictures import picture_transfer, write_character
+from completion.moshing.characters import moving_character
+from completion.moshing.creases import Creases, at_rest
+from completion.moshing.results import SoftTissue
+from model.posing.character import CharacterConfig, character_model
+from model.posing.character_mesh import inside
+from scanprep.geometry import rotations
+from scanprep.geometry.surface import Surface
+
+FRAMES = 12
+
+
+@pytest.fixture(scope="module")
+def model():
+    return worm_with_prior()
+
+
+@pytest.fixture(scope="module")
+def soft():
+    """A worm that bends, walks and sways."""
+    t = np.arange(FRAMES) / 12
+    poses = MEAN + np.sin(5 * t[:, None, None] + np.arange(4)[:, None]) * np.array([0.05, 0.3, 0.2])
+    trans = np.stack([t, 0 * t, 0.05 * np.sin(9 * t)], axis=1)
+    motion = Motion(poses, trans, np.array([0.5, -0.4, 0.2]), 12.0, np.zeros((FRAMES, 0)))
+    return SoftTissue(motion, 0.3 * np.sin(7 * t[:, None] + np.arange(3)))
+
+
+@pytest.fixture(scope="module")
+def character(model):
+    own = model.vertices(np.zeros((4, 3)), np.zeros(1))
+    thick = own.mean(axis=0) + (own - own.mean(axis=0)) * [0.6, 1.5, 1.8]
+    return character_model(model, thick, CharacterConfig(pose="rest"))
+
+
+def test_soft_tissue_is_added_to_the_character(model, soft, character):
+    """The skin moves with the betas as the character model says, a factor times as far, and nothing else changes."""
+    still, once, twice = (retarget_soft_tissue(soft, model, character, factor) for factor in (0.0, 1.0, 2.0))
+    frames = np.arange(FRAMES)
+    np.testing.assert_array_equal(once.motion.poses, soft.motion.poses)
+    np.testing.assert_array_equal(once.motion.betas, np.zeros(3))
+    np.testing.assert_array_equal(twice.changes, 2 * soft.changes)
+    fixed, changed = moving_character(character, once, frames)
+    np.testing.assert_allclose(moving_character(character, still, frames)[1] - still.motion.trans[:, None],
+                               fixed - once.motion.trans[:, None], atol=1e-9)
+    further = moving_character(character, twice, frames)[1] - twice.motion.trans[:, None]
+    np.testing.assert_allclose(further - (fixed - once.motion.trans[:, None]), 2 * (changed - fixed), atol=1e-9)
+    for t in range(FRAMES):
+        wanted = character.vertices(soft.motion.poses[t], soft.changes[t], once.motion.trans[t])
+        np.testing.assert_allclose(changed[t], wanted, atol=1e-9)
+
+
+def test_it_reaches_the_ground_when_the_person_does(model, soft, character):
+    """Whatever soft tissue does to the feet, lowest points keep their height over the floor, scaled with the legs."""
+    own = model.subject(soft.motion.betas)
+    up, sign = world_up(soft.motion, own)
+    person, low = (sign * soft.motion.vertices(own)[..., up]).min(axis=1), []
+    for factor in (0.0, 3.0):
+        moved = retarget_soft_tissue(soft, model, character, factor)
+        low.append((sign * moving_character(character, moved, np.arange(FRAMES))[1][..., up]).min(axis=1))
+    np.testing.assert_allclose(low[1], low[0], atol=2e-3)
+    floor = np.percentile(person, 2.0)
+    ratio = (low[0] - floor) / (person - floor)
+    high = person - floor > 0.02
+    np.testing.assert_allclose(ratio[high], np.median(ratio[high]), rtol=1e-6)
+
+
+def test_onto_oneself_it_is_the_same_motion(model, soft):
+    own = replace(soft, motion=replace(soft.motion, betas=np.zeros(3)))
+    moved = retarget_soft_tissue(own, model, model)
+    bodies = own.vertices(model)
+    np.testing.assert_array_equal(moved.changes, own.changes)
+    apart = moving_character(model, moved, np.arange(FRAMES))[1] - bodies
+    up, _ = world_up(soft.motion, model.subject(np.zeros(3)))
+    np.testing.assert_allclose(np.delete(apart, up, axis=2), 0, atol=1e-9)
+    np.testing.assert_allclose(apart - apart[:, :1], 0, atol=1e-9)         # up and down only, as a whole
+
+
+def test_refuses_a_character_of_fewer_betas(model, soft):
+    small = replace(model, shape_space=model.shape_space.first(2))
+    with pytest.raises(ValueError, match="the 3 betas that change, got 2"):
+        retarget_soft_tissue(soft, model, small)
+
+
+def test_deformation_is_the_larger_stretch():
+    rng = np.random.default_rng(0)
+    grid = np.stack(np.meshgrid(np.arange(5.0), np.arange(4.0), indexing="ij"), axis=-1).reshape(-1, 2)
+    flat = np.hstack([grid, np.zeros((20, 1))]) @ rotations.exp(rng.normal(size=3)).T
+    corner = (np.arange(4)[:, None] * 4 + np.arange(3)).ravel()
+    faces = np.stack([corner, corner + 4, corner + 1, corner + 4, corner + 5, corner + 1], axis=1).reshape(-1, 3)
+    for stretch, wanted in (((1.1, 1.0), 0.1), ((1.05, 0.7), 0.3), ((1.0, 1.0), 0.0)):
+        axes = rotations.exp([0, 0, 0.7])[:2, :2]
+        moved = grid @ axes @ np.diag(stretch) @ axes.T
+        moved = np.hstack([moved, np.zeros((20, 1))]) @ rotations.exp(rng.normal(size=3)).T + rng.normal(size=3)
+        np.testing.assert_allclose(deformation(faces, flat, moved), wanted, atol=1e-7)
+        np.testing.assert_allclose(deformation(faces, np.stack([flat, flat]), np.stack([moved, flat])),
+                                   [[wanted] * 20, [0] * 20], atol=1e-7)
+
+
+def test_creases_are_smoothed_and_nothing_else(model):
+    rest = at_rest(model)
+    pose = np.array([[0.2, 0.1, 0.3], [0, 0.3, 0], [0, 0, 0.4], [0, 0.2, 0.3]])
+    body = model.vertices(pose, np.zeros(1))
+    for blend in (0, 6):
+        creases = Creases(rest, model.skeleton, blend)
+        assert not creases.turned_over(body, pose).any()
+        np.testing.assert_array_equal(creases.smoothed(body[None], pose[None])[0], body)
+    folded = body.copy()
+    middle = int(np.argmin(np.abs(rest.vertices - rest.vertices.mean(axis=0)).sum(axis=1)))
+    folded[middle] += 0.14 * np.array([1.0, 0.3, 0]) @ model.skeleton.part_rotations(pose)[0].T
+    turned = creases.turned_over(folded, pose)
+    assert turned.any() and (rest.faces[turned] == middle).any(axis=1).all()
+    smooth = creases.smoothed(np.stack([body, folded]), np.stack([pose, pose]))
+    assert not creases.turned_over(smooth[1], pose).any()
+    moved = np.flatnonzero(np.linalg.norm(smooth[1] - folded, axis=1))
+    assert middle in moved and len(moved) < 30
+    np.testing.assert_array_equal(smooth[0], body)
+
+
+@pytest.mark.parametrize("name", CARTOONS)
+def test_a_figure_is_closed_symmetric_and_has_its_landmarks_on_the_skin(name):
+    figure = cartoon(name, step=0.016)
+    mesh, height = figure.mesh, CARTOONS[name].height
+    assert not mesh.boundary_loops and mesh.volume > 0
+    assert len(mesh.vertices) - len(mesh.edges) + len(mesh.faces) == 2               # one piece, no handles
+    assert mesh.vertices[:, 2].min() == pytest.approx(0, abs=1e-9)
+    assert np.ptp(mesh.vertices[:, 2]) == pytest.approx(height, rel=0.02)
+    surface, points = Surface(mesh), np.array(list(figure.landmarks.values()))
+    off = np.linalg.norm(surface.closest(points).points - points, axis=1) / height
+    assert np.percentile(off, 90) < 0.008 and off.max() < 0.025                     # so coarse, fingertips are lost
+    mirrored = np.linalg.norm(surface.closest(mesh.vertices * [-1, 1, 1]).points - mesh.vertices * [-1, 1, 1], axis=1)
+    assert mirrored.max() < 0.008 * height
+    assert inside(mesh, np.array(list(figure.joints.values()))).all()
+    for part, point in figure.joints.items():
+        if part.startswith("l_"):
+            np.testing.assert_allclose(figure.joints["r" + part[1:]], point * [-1, 1, 1], atol=1e-12)
+
+
+def test_a_figure_of_ones_own():
+    small, large = (cartoon(CartoonShape(height=h), step=0.04).mesh for h in (0.5, 1.0))
+    np.testing.assert_allclose(large.vertices, 2 * small.vertices, atol=5e-3)
+    with pytest.raises(ValueError, match="gnome, beanpole"):
+        cartoon("dwarf")
+
+
+def test_files_and_pictures(model, soft, character, tmp_path, monkeypatch):
+    moved = retarget_soft_tissue(soft, model, character, 2.0)
+    most = write_character(tmp_path / "worm.glb", character, moved, 5)
+    fixed, changed = moving_character(character, moved, np.array([0, 3, 6, 8, 11]))
+    np.testing.assert_allclose(most, deformation(character.template.faces, fixed, changed).max(axis=0))
+    glb = Glb((tmp_path / "worm.glb").read_bytes())
+    np.testing.assert_allclose(glb.array(glb.primitive["attributes"]["POSITION"]), changed[0], atol=1e-6)
+    assert len(glb.primitive["targets"]) == 4 and "COLOR_0" in glb.primitive["attributes"] and most.max() > 0.01
+    seen = []
+
+    def draw(shape, camera, width, height):
+        seen.append(shape)
+        return np.full((height, width, 3), 255, dtype=np.uint8)
+
+    monkeypatch.setattr(character_pictures, "render", draw)
+    sheet = picture_transfer(model, soft, character, moved, 3, 40)
+    assert len(seen) == 9 and sheet.dtype == np.uint8
+    assert [shape.color is None for shape in seen] == [True] * 6 + [False] * 3
+    np.testing.assert_array_equal(seen[3].mesh.vertices, seen[6].mesh.vertices)
