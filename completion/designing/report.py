@@ -82,6 +82,8 @@ def design_page(design: MarkerDesign, model: BodyModel, candidates: MarkerLayout
     page = Page(f"{len(design.layout.labels)} markers", "Chosen so that bodies estimated from them are near the true "
                 "ones over their whole surface. Red: chosen; blue: kept; grey: left out.")
     page.picture(picture_design(design, mean_person(model), candidates, keep))
+    chosen = [label for label in design.layout.labels if label not in keep]
+    page.text(f"Chosen: {', '.join(chosen) or 'none'}." + (f" Kept: {', '.join(keep)}." if keep else ""))
     page.section("Error and number of markers").chart(chart_curve(design), "root mean squared distance of all vertices "
                                                       "of all bodies; linearised, crosses by full refits")
     page.section("Figures").table(rows, ("metric", "value", "unit"))

@@ -133,8 +133,8 @@ def choose(linear: LinearBodies, groups: Groups, kept: np.ndarray, config: Desig
     best = best_path(paths, config.count)
     sets = MarkerSets(linear, groups, best.set(best.at(config.count)))
     exchanged = exchange(sets, free, config.exchanges)
-    if kept.any():
-        alone = MarkerSets(linear, groups, np.flatnonzero(kept))
+    alone = MarkerSets(linear, groups, np.flatnonzero(kept))
+    if alone.count > FEWEST:
         paths["kept, removed"] = walk(alone, REMOVE, kept, FEWEST, stops, told)
     chosen = np.flatnonzero(sets.inside)
     return Choice(paths, chosen, linear.rmse(_members(groups, chosen)), exchanged)
