@@ -1,6 +1,7 @@
 """Pictures and the page of a motion."""
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
@@ -149,21 +150,40 @@ def chart_missing(motion: Motion, seen_columns: np.ndarray) -> Any:
     seen_columns : (L,) bool
         Markers to show.
     """
-    from matplotlib.colors import ListedColormap
-    from matplotlib.figure import Figure
-
     labels = [label for label, shown in zip(motion.labels, seen_columns, strict=True) if shown]
     missing = ~np.isfinite(motion.residuals[:, seen_columns])
     state = np.where(missing, 2, np.where(motion.trusted[:, seen_columns], 0, 1))
+    return chart_states(state, labels, motion.rate, ("#dfe7ee", "#e39b3b", "#8c2f39"))
+
+
+def chart_states(state: np.ndarray, labels: Sequence[str], rate: float, colors: Sequence[str],
+                 names: Sequence[str] = ()) -> Any:
+    """A matplotlib figure: the state of every marker over time, the highest where there are more frames than room.
+
+    Parameters
+    ----------
+    state : (T, L) int
+    rate : float, frames per second
+    colors : of the states
+    names : of the states, optional
+        Those that occur are shown below.
+    """
+    from matplotlib.colors import ListedColormap
+    from matplotlib.figure import Figure
+    from matplotlib.patches import Patch
+
     steps = np.array_split(np.arange(len(state)), min(len(state), 600))
     shown = np.array([state[part].max(axis=0) for part in steps])
     figure = Figure(figsize=(7.5, 0.6 + 0.13 * len(labels)))
     axes = figure.add_subplot()
-    axes.imshow(shown.T, aspect="auto", interpolation="nearest", vmin=0, vmax=2,
-                cmap=ListedColormap(["#dfe7ee", "#e39b3b", "#8c2f39"]),
-                extent=(0, len(state) / motion.rate, len(labels) - 0.5, -0.5))
+    axes.imshow(shown.T, aspect="auto", interpolation="nearest", vmin=0, vmax=len(colors) - 1,
+                cmap=ListedColormap(list(colors)), extent=(0, len(state) / rate, len(labels) - 0.5, -0.5))
     axes.set_yticks(range(len(labels)), labels, fontsize=6)
     axes.set_xlabel("time (s)")
+    if names:
+        patches = [Patch(color=colors[i], label=names[i]) for i in np.unique(state)]
+        axes.legend(handles=patches, frameon=False, fontsize=8, ncols=len(names), loc="upper center",
+                    bbox_to_anchor=(0.5, -0.45 / figure.get_figheight()))
     return figure
 
 

@@ -6,11 +6,14 @@ from typing import Any
 
 import numpy as np
 
+from ..animation.report import chart_states
 from .takes import Take
 
 POINTS = 900                         # most points of a line, and columns of a map
 FIXED, SOFT, HELD = "#7a8794", "#c8452f", "#2f8f4e"
 MM = 1000.0
+STATES = ("believed", "not believed", "missing", "exchanged", "slipped", "noisy", "stray")
+STATE_COLORS = ("#e3eaf0", "#f0c46c", "#9aa3ab", "#2f6db3", "#8557a8", "#b3592f", "#c02a3c")
 
 
 def mean_over(values: np.ndarray, axis: int) -> np.ndarray:
@@ -63,3 +66,19 @@ def chart_map(take: Take) -> Any:
     axes.set_xlabel("time (s)")
     figure.colorbar(drawn, ax=axes, label="distance (mm)", pad=0.015, aspect=40, extend="max")
     return figure
+
+
+def chart_faults(take: Take) -> Any:
+    """When which marker was missing, not believed, exchanged with another, or elsewhere than the body says."""
+    markers, faults = take.markers, take.faults
+    touched = {label for e in faults.exchanges for label in (e.first, e.second)} | {b.label for b in faults.bad}
+    labels = [label for label in markers.labels if label in touched or label in faults.labels]
+    columns = [markers.labels.index(label) for label in labels]
+    doubted = np.isfinite(take.motion.residuals[:, columns]) & ~take.motion.trusted[:, columns]
+    state = np.where(markers.seen[:, columns], doubted.astype(int), STATES.index("missing"))
+    for e in faults.exchanges:
+        for label in (e.first, e.second):
+            state[e.begin:e.end + 1, labels.index(label)] = STATES.index("exchanged")
+    for b in faults.bad:
+        state[b.begin:b.end + 1, labels.index(b.label)] = STATES.index(b.kind)
+    return chart_states(state, labels, markers.rate, STATE_COLORS, STATES)

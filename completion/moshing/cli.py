@@ -67,8 +67,9 @@ def mosh_markers(markers: MarkersArg, output: Output, model: ModelOrNone = None,
     actors = find_actors(markers, grouping, output)
     held = tuple(label for words in hold_out for label in words.split(",") if label)
     loaded, model_name = read_model(model)
-    work = Work(loaded, model_name, _sexes(female, male), None if character is None else _character(character, loaded),
-                layout, held, unit, keys, factor, config)
+    sexes = _sexes(female, male, character)
+    made = None if character is None else _character(character, loaded)
+    work = Work(loaded, model_name, sexes, made, layout, held, unit, keys, factor, config)
     _tell(actors)
     given = {"layout": layout, "model": model, "female": female, "male": male, "character": character,
              "factor": factor, "unit": unit, "keys": keys, "held": held}
@@ -89,9 +90,11 @@ def _tell(actors: list[Actor]) -> None:
         say(f"and {len(actors) - TOLD} more people")
 
 
-def _sexes(female: Path | None, male: Path | None) -> dict[str, BodyModel]:
+def _sexes(female: Path | None, male: Path | None, character: Path | None) -> dict[str, BodyModel]:
     if (female is None) != (male is None):
         raise ValueError("--female and --male: expected both or none")
+    if character is not None and female is not None:
+        raise ValueError("--character: it is made of one model; expected it without --female and --male")
     return {} if female is None or male is None else {"female": load_model(female), "male": load_model(male)}
 
 

@@ -21,7 +21,8 @@ SIDES = ("front", "left", "back", "right")
 STEPS = (1, 2, 5)                    # times powers of ten: every so many frames
 MOST = 85                            # percent of the frames of a contact sheet that are at one scale
 SHEET = 56                           # pictures on a contact sheet
-NAMED = 6                            # markers with their label on one side of the body
+NAMED, FAR = 6, 0.01                 # markers with their label on one side of the body, and metres from which
+LITTLE = 0.005                       # metres: the end of a colour scale that must not make much of nothing
 BEND = "coolwarm"
 
 
@@ -71,7 +72,7 @@ def _named(image: np.ndarray, camera: Camera, body: Mesh, found: np.ndarray, mov
         for where, anchor in (((x + 9, y), "lm"), ((x - 9, y), "rm")):
             box = np.array(draw.textbbox(where, labels[i], font=font(13), anchor=anchor))
             free = not len(taken) or ((box[2:] < taken[:, :2]) | (box[:2] > taken[:, 2:])).any(axis=1).all()
-            if in_sight[i] and free and box[0] > 0 and box[2] < width and len(taken) < NAMED:
+            if in_sight[i] and moved[i] > FAR and free and box[0] > 0 and box[2] < width and len(taken) < NAMED:
                 draw.text(where, labels[i], fill=INK, anchor=anchor, font=font(13), stroke_width=2, stroke_fill="white")
                 taken = np.vstack([taken, box])
                 break
@@ -139,7 +140,7 @@ def picture_soft_map(take: Take, frames: np.ndarray, height: int = 460) -> np.nd
     change = np.sqrt(((take.bodies(frames) - take.rigid(frames))**2).sum(axis=2).mean(axis=0))
     body = take.subject.template.with_vertices(
         take.subject.vertices(take.model.pose_mean).astype(float))
-    end = max(float(np.percentile(change, 99.5)), 1e-4)
+    end = max(float(np.percentile(change, 99.5)), LITTLE)
     images = [render(Solid(body, heat(change, 0, end)), camera, _width(camera, height), height)
               for camera in look_around(body)]
     bar = color_bar(0, end, "change of the skin, root mean square over time")
@@ -149,7 +150,7 @@ def picture_soft_map(take: Take, frames: np.ndarray, height: int = 460) -> np.nd
 def picture_fixed_and_soft(take: Take, frames: np.ndarray, height: int = 400) -> np.ndarray:
     """Frames with the fixed shape above, and below with soft tissue, red where the skin moved out, blue inwards."""
     change, template = soft_change(take, frames), take.subject.template
-    end = max(float(np.percentile(np.abs(change), 99.5)), 1e-4)
+    end = max(float(np.percentile(np.abs(change), 99.5)), LITTLE)
     rows: list[list[np.ndarray]] = [[], []]
     for t, rigid, soft, out in zip(frames, take.rigid(frames), take.bodies(frames), change, strict=True):
         camera = facing(take.subject, take.shown.poses[t], soft, 35.0)

@@ -13,11 +13,11 @@ from scanprep.console import Metric, plain
 from scanprep.pictures.page import Page
 from scanprep.pictures.shading import Dots, Shape, render, side_by_side
 
-from ..animation.report import MARKER, chart_missing, facing, worst_frames
+from ..animation.report import MARKER, facing, worst_frames
 from ..cli import rows
 from ..markers.layout import MarkerLayout
 from . import pictures
-from .charts import MM, chart_frames, chart_map, mean_over
+from .charts import MM, chart_faults, chart_frames, chart_map, mean_over
 from .results import MoshResult
 from .takes import Take
 
@@ -53,7 +53,7 @@ def person_page(name: str, model: BodyModel, result: MoshResult, usual: MarkerLa
     for take in takes:
         _entry(page, take, figures[take.name])
     page.section("Markers before and after", "Blue: where the layout has each marker on this body. Red: where it was "
-                 "found, with a rod from the one to the other. The markers that moved most are named.")
+                 "found, with a rod from the one to the other. Those that moved most are named, from a centimetre on.")
     page.picture(pictures.picture_sides(body, found, before.place(body), labels))
     page.table(_moved_rows(result, before, moved, takes),
                ("marker", "moved (mm)", "up (mm)", "forward (mm)", "to the left (mm)", "off the skin, layout (mm)",
@@ -62,12 +62,11 @@ def person_page(name: str, model: BodyModel, result: MoshResult, usual: MarkerLa
         page.text(f"Loose markers, which may sit anywhere on their limb: {', '.join(before.loose)}.")
     page.section("Frames that shape and markers were found from")
     page.picture(_chosen_frames(model, result, takes))
-    page.section("Figures").table(rows(list(metrics)), ("metric", "value", "unit"))
-    return _settings(page, settings)
+    return closing(page, metrics, settings)
 
 
-def take_page(take: Take, metrics: Sequence[Metric], settings: Mapping[str, Any]) -> Page:
-    """One sequence: the whole of it at a glance, how far the markers are, soft tissue, faults."""
+def take_page(take: Take, metrics: Sequence[Metric]) -> Page:
+    """One sequence: the whole of it at a glance, how far the markers are, soft tissue, faults; see `closing`."""
     step = pictures.every(len(take.motion.poses))
     frames = np.arange(0, len(take.motion.poses), step)
     page = Page(f"{take.name}, with {'soft tissue' if take.soft else 'fixed shape'}", COLORS)
@@ -86,11 +85,12 @@ def take_page(take: Take, metrics: Sequence[Metric], settings: Mapping[str, Any]
     if take.soft is not None:
         _soft_section(page, take, frames)
     _fault_section(page, take)
+    return page
+
+
+def closing(page: Page, metrics: Sequence[Metric], settings: Mapping[str, Any]) -> Page:
+    """The end of a page: all figures and the settings."""
     page.section("Figures").table(rows(list(metrics)), ("metric", "value", "unit"))
-    return _settings(page, settings)
-
-
-def _settings(page: Page, settings: Mapping[str, Any]) -> Page:
     text = escape(json.dumps(plain(settings), indent=1))
     return page.markup(f"<details><summary>All settings</summary><pre><code>{text}</code></pre></details>")
 
@@ -115,8 +115,7 @@ def _fault_section(page: Page, take: Take) -> None:
                    ("fault", "marker", "first frame", "last frame", "lasts (s)", "distance (mm)"))
     else:
         page.text("None was found.")
-    used = np.isfinite(take.motion.residuals).any(axis=0)
-    page.chart(chart_missing(take.motion, used), "light: seen; orange: seen, but not believed; red: missing")
+    page.chart(chart_faults(take), "every marker over time")
 
 
 def _entry(page: Page, take: Take, metrics: Sequence[Metric]) -> None:

@@ -13,6 +13,7 @@ from model.body import BodyModel
 from scanprep.console import Metric, Outcome, Progress, write_report
 from scanprep.pictures.page import Page
 from scanprep.pictures.sheets import save_png
+from scanprep.pictures.views import upright
 
 from ..animation.report import morph_frames
 from ..animation.retarget import retarget
@@ -24,8 +25,9 @@ from .character_pictures import picture_transfer, write_character
 from .characters import retarget_soft_tissue
 from .charts import MM
 from .outputs import filled_in, write_person, write_take
+from .pictures import standing
 from .recordings import Actor, Recording
-from .report import PICTURE, person_page, person_picture, take_page, take_picture
+from .report import PICTURE, closing, person_page, person_picture, take_page, take_picture
 from .results import MoshResult
 from .settings import MoshConfig
 from .sex import mosh_by_sex
@@ -166,10 +168,10 @@ def _write(work: Work, found: _Found, take: Take, folder: Path, command: str, se
     folder.mkdir()
     metrics = [Metric("layout", found.layout_name), *_figures([take])]
     write_take(folder, take, work.keys, work.factor)
-    page = take_page(take, metrics, settings)
+    page = take_page(take, metrics)
     if work.character is not None:
         _character(work.character, take, folder, page, work.keys, work.factor)
-    page.write(folder / "report.html")
+    closing(page, metrics, settings).write(folder / "report.html")
     save_png(folder / PICTURE, take_picture(take))
     write_report(Outcome(folder, metrics, settings), command, time.perf_counter() - start)
     return metrics
@@ -177,7 +179,10 @@ def _write(work: Work, found: _Found, take: Take, folder: Path, command: str, se
 
 def _person_metrics(found: _Found) -> list[Metric]:
     moved, result, frames = MM * found.result.person.moved, found.result, sum(len(t.motion.poses) for t in found.takes)
+    body = standing(found.model, result.betas)
     told = [Metric("layout", found.layout_name), Metric("sequences", len(found.takes)),
+            Metric("height", float(np.ptp(body.vertices[:, upright(body)[0]])), "m"),
+            Metric("volume", 1000 * abs(body.volume), "l"),
             Metric("betas, length", float(np.linalg.norm(result.betas)), "sd"),
             Metric("markers moved, mean", float(moved.mean()), "mm"),
             Metric(f"markers moved, most ({result.layout.labels[int(moved.argmax())]})", float(moved.max()), "mm")]
