@@ -18,6 +18,7 @@ _MAGIC = 0x50
 _BLOCK = 512
 _INTEL, _DEC, _MIPS = 84, 85, 86
 _COMPUTED = ("ANGLES", "FORCES", "MOMENTS", "POWERS", "SCALARS")     # stored among the points, but no positions
+MEASURED = 1.0                       # least residual, in the file's own steps, of a point that was measured
 _Parameters = dict[tuple[str, str], list[Any]]                       # group and name -> values
 
 
@@ -44,9 +45,57 @@ class _Numbers:
         halves = np.frombuffer(data, "<u2").reshape(-1, 2)           # the upper half first, exponent larger by 2
         return halves[:, ::-1].copy().view("<f4")[:, 0].astype(np.float64) / 4
 
+    def encoded(self, values: np.ndarray, kind: str) -> bytes:
+        """Numbers as bytes, floating-point ones ("f4") or whole ones ("i2")."""
+        if kind == "f4" and self.processor == _DEC:
+            return (4 * values.ravel()).astype("<f4").view("<u2").reshape(-1, 2)[:, ::-1].tobytes()
+        return values.astype(self.order + kind).tobytes()
 
-def read_c3d(path: Path, data: bytes) -> RawMarkers:
-    """The points of a C3D file; missing are those with a negative residual.
+
+@dataclass(frozen=True, eq=False)
+class PointTable:
+    """Where in a C3D file its points stand.
+
+    Attributes
+    ----------
+    numbers : _Numbers
+    labels : strings
+        Of all points, those that hold no positions among them.
+    kept : (L,) int
+        The columns that hold positions.
+    start, width : int, bytes
+        Of the first frame, and of each.
+    frames : int
+    scale : float
+        Of whole numbers; negative where the file holds floating-point numbers.
+    rate : float or None
+    unit : str
+    """
+
+    numbers: _Numbers
+    labels: tuple[str, ...]
+    kept: tuple[int, ...]
+    start: int
+    width: int
+    frames: int
+    scale: float
+    rate: float | None
+    unit: str
+
+    @property
+    def kind(self) -> str:
+        """Of a number, as numpy names it."""
+        return "f4" if self.scale < 0 else "i2"
+
+    def words(self, data: bytes) -> np.ndarray:
+        """The four numbers (T, L, 4) of all points: places as they stand there, cameras and residual in one."""
+        body = data[self.start:self.start + self.frames * self.width]
+        rows = self.numbers.floats(body) if self.kind == "f4" else self.numbers.words(body, "i2").astype(np.float64)
+        return rows.reshape(self.frames, -1)[:, :4 * len(self.labels)].reshape(self.frames, len(self.labels), 4)
+
+
+def point_table(path: Path, data: bytes) -> PointTable:
+    """Where the points of a C3D file stand.
 
     Raises
     ------
@@ -66,18 +115,26 @@ def read_c3d(path: Path, data: bytes) -> RawMarkers:
                               f"found {numbers.processor}")
     try:
         parameters = _parameters(data, start + 4, numbers)
-        positions = _positions(data, parameters, numbers)
+        return _table(data, parameters, numbers)
     except _Damaged as problem:
         raise MarkerFileError(f"{path}: {problem}") from None
     except (struct.error, IndexError, ValueError) as error:
         raise MarkerFileError(f"{path}: damaged C3D file ({error})") from None
-    labels = _labels(parameters, positions.shape[1])
-    computed = {label for key in _COMPUTED for label in parameters.get(("POINT", key), ())}
-    kept = [i for i, label in enumerate(labels) if label not in computed]
-    rate = (parameters.get(("POINT", "RATE")) or numbers.floats(data[20:24]).tolist())[0]
-    unit = str((parameters.get(("POINT", "UNITS")) or ["mm"])[0]).lower() or "mm"
-    known_rate = float(rate) if isinstance(rate, float | int) and rate > 0 else None
-    return RawMarkers(positions[:, kept], tuple(labels[i] for i in kept), known_rate, unit)
+
+
+def read_c3d(path: Path, data: bytes) -> RawMarkers:
+    """The points of a C3D file; missing are those with a negative residual.
+
+    Raises
+    ------
+    MarkerFileError
+        Not a C3D file, damaged, truncated, or without points.
+    """
+    table = point_table(path, data)
+    words = table.words(data)[:, list(table.kept)]
+    positions = words[..., :3] * (1.0 if table.kind == "f4" else table.scale)
+    positions[(words[..., 3] < 0) | np.isnan(words).any(axis=2)] = np.nan
+    return RawMarkers(positions, tuple(table.labels[i] for i in table.kept), table.rate, table.unit)
 
 
 def _parameters(data: bytes, place: int, numbers: _Numbers) -> _Parameters:
@@ -115,13 +172,12 @@ def _values(data: bytes, place: int, numbers: _Numbers) -> list[Any]:
     return numbers.words(raw, {1: "i1", 2: "i2"}[kind] if kind in (1, 2) else "i1").tolist()
 
 
-def _positions(data: bytes, parameters: _Parameters, numbers: _Numbers) -> np.ndarray:
-    """(T, L, 3) in the file's unit, NaN where the residual is negative."""
-    _, points, analog, first, last = numbers.words(data[:10], "u2").astype(np.int64)
+def _table(data: bytes, parameters: _Parameters, numbers: _Numbers) -> PointTable:
+    """Where the points stand, by the header and the parameters."""
+    _, points, analog, first, last = (int(n) for n in numbers.words(data[:10], "u2"))
     start = (int(numbers.words(data[16:18], "u2")[0]) - 1) * _BLOCK
     scale = float(numbers.floats(data[12:16])[0])
-    size = 4 if scale < 0 else 2
-    width = (4 * points + analog) * size
+    width = (4 * points + analog) * (4 if scale < 0 else 2)
     frames = _frames(parameters, first, last, (len(data) - start) // width if width else 0)
     if not points or not frames:
         raise _Damaged(f"expected points, the C3D file holds {points} points in {frames} frames")
@@ -130,12 +186,12 @@ def _positions(data: bytes, parameters: _Parameters, numbers: _Numbers) -> np.nd
     if start + frames * width > len(data):
         raise _Damaged(f"truncated: expected {frames} frames in {start + frames * width} bytes, "
                        f"found {len(data)} bytes")
-    body = data[start:start + frames * width]
-    rows = numbers.floats(body) if size == 4 else numbers.words(body, "i2").astype(np.float64)
-    rows = rows.reshape(frames, -1)[:, :4 * points].reshape(frames, points, 4)
-    positions = rows[..., :3] * (1.0 if size == 4 else scale)
-    positions[(rows[..., 3] < 0) | np.isnan(rows).any(axis=2)] = np.nan
-    return positions
+    labels = _labels(parameters, points)
+    computed = {label for key in _COMPUTED for label in parameters.get(("POINT", key), ())}
+    rate = (parameters.get(("POINT", "RATE")) or numbers.floats(data[20:24]).tolist())[0]
+    return PointTable(numbers, tuple(labels), tuple(i for i, label in enumerate(labels) if label not in computed),
+                      start, width, frames, scale, float(rate) if isinstance(rate, float | int) and rate > 0 else None,
+                      str((parameters.get(("POINT", "UNITS")) or ["mm"])[0]).lower() or "mm")
 
 
 def _frames(parameters: _Parameters, first: int, last: int, room: int) -> int:
@@ -162,8 +218,16 @@ def _labels(parameters: _Parameters, count: int) -> list[str]:
     return [label or f"point{i}" for i, label in enumerate(labels)]
 
 
-def write_c3d(path: Path, positions: np.ndarray, labels: tuple[str, ...], rate: float) -> None:
-    """Write positions (T, L, 3), metres, as a C3D file in millimetres; missing points have residual -1."""
+def write_c3d(path: Path, positions: np.ndarray, labels: tuple[str, ...], rate: float,
+              filled: np.ndarray | None = None) -> None:
+    """Write positions (T, L, 3), metres, as a C3D file in millimetres; missing points have residual -1.
+
+    Parameters
+    ----------
+    filled : (T, L) bool, optional
+        Points that were not measured. They get residual 0, as the format has it for computed points, and the others
+        `MEASURED`; without this all get residual 0.
+    """
     try:
         import ezc3d
     except ImportError:
@@ -177,8 +241,8 @@ def write_c3d(path: Path, positions: np.ndarray, labels: tuple[str, ...], rate: 
     points = np.ones((4, L, T))
     points[:3] = 1000 * positions.transpose(2, 1, 0)
     tree["data"]["points"] = points
-    missing = np.isnan(positions[..., 0]).T
-    tree["data"]["meta_points"] = {"residuals": np.where(missing, -1.0, 0.0)[None],
+    residual = np.zeros((T, L)) if filled is None else np.where(filled, 0.0, MEASURED)
+    tree["data"]["meta_points"] = {"residuals": np.where(np.isnan(positions[..., 0]), -1.0, residual).T[None],
                                    "camera_masks": np.zeros((7, L, T), dtype=bool)}
     if T > 65535:
         for key, frame in (("ACTUAL_START_FIELD", 1), ("ACTUAL_END_FIELD", T)):

@@ -78,7 +78,7 @@ def without_lost_limbs(spans: tuple[BadSpan, ...], near: np.ndarray, labels: tup
     kept = []
     for i, span in enumerate(spans):
         common = np.minimum(end, end[i]) - np.maximum(begin, begin[i]) + 1
-        with_it = 2 * common > np.minimum(end - begin, end[i] - begin[i]) + 1
+        with_it = 2 * common > span.end - span.begin + 1
         together = np.bincount(of[with_it], minlength=count) > 0
         limb = near[of[i]]
         if span.kind == "slipped" or (together & limb).sum() < max(3, LOST_LIMB * limb.sum()):

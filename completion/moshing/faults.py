@@ -16,10 +16,11 @@ from .doubts import doubtful_pairs, exchanged_after_all
 from .exchanges import Evidence, find_order, listed, marker_levels, pairs_that_jump
 from .results import BadSpan, MarkerFaults
 from .settings import FaultConfig
-from .simulation import Simulation
+from .simulation import Simulation, bridged, usual_places
 from .tracks import Tracks
 
 Progress = Callable[[int, int], None]
+BRIDGE = 0.5                         # seconds that a marker out of sight takes to its usual place, and from there
 USUAL_PLACE = 0.04                   # metres, most that a marker's usual place is taken to be from its simulation
 UNSURE = 0.25                        # share of the frames in which a label was exchanged, the more likely of two ways
 ENOUGH = 0.6                         # share of the markers that must be left without those
@@ -148,8 +149,8 @@ class _Search:
         for a, b in doubtful_pairs(pairs_that_jump(raw, set(range(L))) | exchanged, places):
             swapped = exchanged_after_all(self.body, self.x, tracks, a, b, config)
             if len(swapped):
-                order[np.ix_(swapped, [a, b])] = order[np.ix_(swapped, [b, a])]
                 columns = np.array((a, b))
+                order[np.ix_(swapped, columns)] = order[np.ix_(swapped, columns[::-1])]
                 tracks.changed(columns, np.take_along_axis(self.markers.positions, order[:, columns, None], axis=1))
         self.order = order
 
@@ -170,14 +171,11 @@ class _Search:
 
     def _usual(self, simulated: np.ndarray) -> np.ndarray:
         """Where markers (T, L, 3) are expected: off the simulated ones as they mostly are in their part's frame."""
-        R = self.body.part_rotations(self.x)
-        off = self.body.local(self.repaired[:, self.body.rows] - simulated, self.x)
-        usual = np.array([np.median(o[np.isfinite(o[:, 0])], axis=0) if np.isfinite(o[:, 0]).any() else np.zeros(3)
-                          for o in np.swapaxes(off, 0, 1)])
+        usual = usual_places(self.body.local(self.repaired[:, self.body.rows] - simulated, self.x))
         usual[self.unsure[self.body.rows]] = 0
         length = np.linalg.norm(usual, axis=1, keepdims=True)
         usual *= np.minimum(1, USUAL_PLACE / np.maximum(length, 1e-12))
-        return simulated + np.einsum("tldc,lc->tld", R, usual)
+        return simulated + np.einsum("tldc,lc->tld", self.body.part_rotations(self.x), usual)
 
     def result(self) -> MarkerFaults:
         """What has been found."""
@@ -185,5 +183,7 @@ class _Search:
         simulated = self.body.positions(self.x)
         targets, sd = repaired[:, self.body.rows], self.config.follow.marker_sd
         weights, _ = marker_weights(simulated, targets, sd, self.config.follow.outlier)
+        off = bridged(self.body.local(targets - simulated, self.x), BRIDGE * self.markers.rate)
+        expected = simulated + np.einsum("tldc,tlc->tld", self.body.part_rotations(self.x), off)
         return MarkerFaults(listed(self.order, self.markers.seen, labels), self.bad, simulated, self.body.labels,
-                            MarkerSequence(repaired, labels, self.markers.rate), weights * sd**2)
+                            MarkerSequence(repaired, labels, self.markers.rate), weights * sd**2, expected, self.order)

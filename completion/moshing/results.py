@@ -154,6 +154,10 @@ class MarkerFaults:
         The sequence with exchanged labels put right and bad spans taken out (NaN).
     weights : (T, L) float in [0, 1]
         How far each marker is believed; 0 where it was not seen.
+    expected : (T, L, 3) float, metres
+        The simulated markers, off by what the measured ones are off around that time: they join them without a step.
+    order : (T, all labels of the sequence) int
+        From which label of the sequence, as it came, each one was taken.
     """
 
     exchanges: tuple[Exchange, ...]
@@ -162,14 +166,16 @@ class MarkerFaults:
     labels: tuple[str, ...]
     repaired: MarkerSequence
     weights: np.ndarray
+    expected: np.ndarray
+    order: np.ndarray
 
     def virtual(self) -> MarkerSequence:
-        """The repaired sequence with every gap of a marker that the layout knows filled by the simulated one."""
+        """The repaired sequence with every gap of a marker that the layout knows filled by `expected`."""
         out = self.repaired.positions.copy()
         for i, label in enumerate(self.labels):
             row = self.repaired.labels.index(label)
             gone = np.isnan(out[:, row, 0])
-            out[gone, row] = self.simulated[gone, i]
+            out[gone, row] = self.expected[gone, i]
         return MarkerSequence(out, self.repaired.labels, self.repaired.rate)
 
 

@@ -106,3 +106,35 @@ def _between(values: np.ndarray, frames: np.ndarray, count: int) -> np.ndarray:
     i = np.clip(np.searchsorted(frames, times, side="right") - 1, 0, len(frames) - 2)
     share = np.clip((times - frames[i]) / (frames[i + 1] - frames[i]), 0, 1).reshape(-1, *[1] * (values.ndim - 1))
     return (1 - share) * values[i] + share * values[i + 1]
+
+
+def usual_places(local: np.ndarray) -> np.ndarray:
+    """The median (L, 3) of what markers are off in the frames of their parts (T, L, 3), zero without any."""
+    return np.array([np.median(off[np.isfinite(off[:, 0])], axis=0) if np.isfinite(off[:, 0]).any() else np.zeros(3)
+                     for off in np.swapaxes(local, 0, 1)])
+
+
+def bridged(local: np.ndarray, reach: float) -> np.ndarray:
+    """What markers are off (T, L, 3) with gaps bridged: straight from end to end, in long ones by way of the usual.
+
+    Parameters
+    ----------
+    local : (T, L, 3) float, metres
+        NaN in gaps.
+    reach : float
+        Frames from an end of a long gap to where a marker is usually.
+    """
+    out = np.repeat(usual_places(local)[None], len(local), axis=0)
+    for i in range(local.shape[1]):
+        seen = np.flatnonzero(np.isfinite(local[:, i, 0]))
+        if not len(seen):
+            continue
+        usual, times = out[0, i].copy(), np.arange(len(local))
+        after = np.searchsorted(seen, times)
+        left, right = seen[np.maximum(after - 1, 0)], seen[np.minimum(after, len(seen) - 1)]
+        span = np.clip(right - left, 1, reach)
+        share = [np.clip(1 - np.abs(times - end) / span, 0, 1)[:, None] for end in (left, right)]
+        share[1][left == right] = 0                                    # before the first, after the last
+        out[:, i] += share[0] * (local[left, i] - usual) + share[1] * (local[right, i] - usual)
+        out[seen, i] = local[seen, i]
+    return out

@@ -1,0 +1,62 @@
+"""Points of a C3D file replaced where they stand: every other byte remains as it was."""
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from .c3d import MEASURED, point_table
+from .common import MARKER_UNITS, MarkerFileError
+
+
+def replace_points(path: Path, data: bytes, columns: np.ndarray, positions: np.ndarray, source: np.ndarray,
+                   unit: str | None = None) -> bytes:
+    """The file with other positions of some points; analog channels, events and all parameters are kept.
+
+    A point that was measured keeps its cameras and its residual, which is made no less than the least that the file
+    can hold; one that was computed has neither, as the format has it; a missing one has residual -1.
+
+    Parameters
+    ----------
+    path : Path
+        For messages.
+    data : bytes
+        The whole file.
+    columns : (L,) int
+        Of the file's points that have positions, which to replace.
+    positions : (T, L, 3) float, metres
+        NaN where a point is missing.
+    source : (T, L) int
+        Which of `columns` a point was measured as, -1 where it was computed.
+    unit : str, optional
+        Unit of the file, where it does not say or says it wrongly.
+
+    Raises
+    ------
+    MarkerFileError
+        Not a C3D file, or damaged; another number of frames; a place that its whole numbers do not reach.
+    """
+    table = point_table(path, data)
+    if len(positions) != table.frames:
+        raise MarkerFileError(f"{path}: expected a file of {len(positions)} frames, found {table.frames}")
+    words, mine = table.words(data), np.array(table.kept)[columns]
+    scale = MARKER_UNITS[unit or table.unit] * (1.0 if table.kind == "f4" else table.scale)
+    fresh = np.empty((*positions.shape[:2], 4))
+    fresh[..., :3] = positions / scale
+    old = np.take_along_axis(words[:, mine, 3], np.maximum(source, 0), axis=1)
+    without = np.floor(old) % 256 == 0                                 # the residual is the lower byte
+    fresh[..., 3] = np.where(source < 0, 0.0, np.where(without, old + MEASURED, old))
+    same = (source == np.arange(len(mine))) & (words[:, mine, 3] >= 0)
+    fresh[same, :3] = words[:, mine][same, :3]                         # not a bit of them changes
+    fresh[np.isnan(positions[..., 0])] = [0, 0, 0, -1]
+    if table.kind == "i2":
+        fresh = np.rint(fresh)
+        if np.abs(fresh).max(initial=0) > 32767:
+            raise MarkerFileError(f"{path}: expected places within {32767 * abs(table.scale):g} {table.unit}, which "
+                                  f"its whole numbers reach, got {np.nanmax(np.abs(positions)):g} m")
+    words[:, mine] = fresh
+    out = np.frombuffer(data, np.uint8).copy()
+    rows = out[table.start:table.start + table.frames * table.width].reshape(table.frames, -1)
+    encoded = np.frombuffer(table.numbers.encoded(words, table.kind), np.uint8)
+    rows[:, :encoded.size // table.frames] = encoded.reshape(table.frames, -1)
+    return out.tobytes()
