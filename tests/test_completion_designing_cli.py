@@ -1,6 +1,7 @@
 """`scape layout design` on a folder of meshes."""
 import csv
 import json
+from itertools import pairwise
 
 import numpy as np
 import pytest
@@ -33,8 +34,8 @@ def folder(tmp_path_factory):
 
 
 def run(folder, *more):
-    return main(["layout", "design", "--bodies", str(folder / "bodies"), "-m", str(folder / "model.npz"), "--candidates",
-                 str(folder / "candidates.json"), "-o", str(folder / "out"), *more])
+    given = {"--bodies": "bodies", "-m": "model.npz", "--candidates": "candidates.json", "-o": "out"}
+    return main(["layout", "design", *(x for key, name in given.items() for x in (key, str(folder / name))), *more])
 
 
 def test_a_layout_a_curve_and_a_page_are_written(folder, capsys):
@@ -47,7 +48,7 @@ def test_a_layout_a_curve_and_a_page_are_written(folder, capsys):
     assert {row["curve"] for row in rows} == {"removed", "added"}
     added = [row for row in rows if row["curve"] == "added"]
     assert [int(row["markers"]) for row in added][-1] == 11 and added[0]["labels"] == ""
-    for before, row in zip(added, added[1:], strict=False):
+    for before, row in pairwise(added):
         assert int(row["markers"]) - int(before["markers"]) == len(row["labels"].split())
     report = json.loads((folder / "out" / "report.json").read_text())
     figures = {name: value for name, value, *_ in (tuple(m.values()) for m in report["metrics"])}
