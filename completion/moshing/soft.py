@@ -85,8 +85,9 @@ class SoftFollower:
         self.rows = np.array([markers.labels.index(label) for label in labels])
         self.targets = markers.positions[:, self.rows]
         K = min(max(config.n_betas, len(motion.betas)), model.n_betas)
-        self.body = SwayingBody(model, motion.betas, layout.select(labels), cheap_directions(model, K, config),
-                                config.pose, config.prior_shrinkage, motion.poses)
+        slopes = model.shape_jacobian(model.pose_mean)[..., :K]
+        self.body = SwayingBody(model, motion.betas, layout.select(labels), cheap_directions(model, slopes, config),
+                                slopes, config.pose, config.prior_shrinkage)
         follow = FollowConfig(config.data, config.pose, config.velocity, config.outlier, config.prior_shrinkage)
         self.inertia = inertia(animate_config(follow), markers.rate, self.body.marked.n_unknowns)
         self.steadiness = config.steadiness * (markers.rate / RATE)**4
@@ -141,14 +142,19 @@ class SoftFollower:
         return self.body.marked.retract(x, share * step), z + share * shift
 
 
-def cheap_directions(model: BodyModel, n_betas: int, config: SoftTissueConfig) -> np.ndarray:
+def cheap_directions(model: BodyModel, slopes: np.ndarray, config: SoftTissueConfig) -> np.ndarray:
     """(K, K) directions of betas, by rows, that each cost one: `Δ = z @ directions` has the energy |z|².
+
+    Parameters
+    ----------
+    model : BodyModel
+    slopes : (N, 3, K) float, metres
+        Derivative of the vertices by betas, in the mean pose.
+    config : SoftTissueConfig
 
     [MoSh] Eq. 24
     """
-    cost = config.change * np.eye(n_betas)
-    if config.skin:
-        cost += config.skin * PER_SQUARE_METRE * skin_metric(model, n_betas)
+    cost = config.change * np.eye(slopes.shape[-1]) + config.skin * PER_SQUARE_METRE * skin_metric(model, slopes)
     return np.asarray(np.linalg.inv(np.linalg.cholesky(cost)))
 
 

@@ -10,8 +10,6 @@ from scanprep.geometry import rotations
 from ..animation.marked import BATCH, MarkedBody, supports
 from ..markers.layout import MarkerLayout
 
-SAMPLES = 12                         # poses over which the turning of the normals by betas is averaged
-
 System = tuple[np.ndarray, np.ndarray, np.ndarray]
 
 
@@ -29,38 +27,35 @@ class SwayingBody:
     layout : MarkerLayout
     directions : (K, K) float
         In which the betas change.
+    slopes : (N, 3, K) float, metres
+        Derivative of all vertices by betas in the mean pose, from which the turning of the skin is known.
     prior_weight, prior_shrinkage : float
         See `MarkedBody`.
-    poses : (T, J, 3) float, radians
-        Some that occur: the normals of the skin are followed best near them.
     """
 
     def __init__(self, model: BodyModel, betas: np.ndarray, layout: MarkerLayout, directions: np.ndarray,
-                 prior_weight: float, prior_shrinkage: float, poses: np.ndarray) -> None:
+                 slopes: np.ndarray, prior_weight: float, prior_shrinkage: float) -> None:
         self.marked = MarkedBody(model.subject(betas), layout, prior_weight, prior_shrinkage)
         self.directions = directions
         self.count, self.n_betas = self.marked.count, len(directions)
         self.terms = model.terms
-        self._flat = self._slopes(model, betas, layout, poses)
+        self._flat = self._along(model, layout, slopes)
 
-    def _slopes(self, model: BodyModel, betas: np.ndarray, layout: MarkerLayout, poses: np.ndarray) -> np.ndarray:
+    def _along(self, model: BodyModel, layout: MarkerLayout, slopes: np.ndarray) -> np.ndarray:
         """(3M, K L): the change of the markers along the directions, normals included."""
         ids, weights = supports(model.template, layout)
+        basis = model.points(ids[::3], weights[::3], self.n_betas).shape_basis
         distances = np.asarray(layout.distances)
-        if not distances.any():
-            ids, weights = ids[::3], weights[::3]
-        shaped = model.points(ids, weights, self.n_betas)
-        basis = shaped.shape_basis
         if distances.any():
-            some = poses[np.linspace(0, len(poses) - 1, min(SAMPLES, len(poses))).round().astype(int)]
-            operator = shaped.operator(np.pad(betas[:self.n_betas], (0, max(0, self.n_betas - len(betas)))))
-            part, turning = normal_slopes(operator.evaluate(some), np.stack([shaped.shape_jacobian(p) for p in some]),
-                                          self.terms.skeleton.part_rotations(some))
-            basis = basis[:, :, ::3].copy()
+            mean = self.marked.body.subject.vertices(model.pose_mean)
+            corners, by_betas = (np.einsum("lk,lk...->l...", weights, of[ids]) for of in (mean, slopes))
+            turning = normal_slopes(corners, by_betas)
+            part = model.skeleton.part_of_vertex(model.template)[ids[::3, 0]]
+            R = model.skeleton.part_rotations(model.pose_mean)
             plain = self.terms.features.constant[self.terms.feature] == 1
             for i, p in enumerate(part):
                 row = np.flatnonzero(plain & (self.terms.part == p))[0]
-                basis[:, row, i] += distances[i] * turning[i].T
+                basis[:, row, i] += distances[i] * (R[p].T @ turning[i]).T
         K, M, L, _ = basis.shape
         along = (self.directions @ basis.reshape(K, -1)).reshape(K, M, L, 3)
         return np.ascontiguousarray(along.transpose(1, 3, 0, 2)).reshape(3 * M, -1)
@@ -126,44 +121,37 @@ def _weighed(y: np.ndarray, targets: np.ndarray, weights: np.ndarray) -> tuple[n
     return root, (root * np.where(missing[:, None], 0.0, y - np.swapaxes(targets, -1, -2))).reshape(len(y), -1)
 
 
-def normal_slopes(supports: np.ndarray, slopes: np.ndarray, R: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """How the normals of the skin turn with betas, in the frame of the part in which that changes least.
+def normal_slopes(corners: np.ndarray, slopes: np.ndarray) -> np.ndarray:
+    """Derivative (L, 3, K) of the unit normals of the skin by betas.
 
     Parameters
     ----------
-    supports : (S, 3L, 3) float, metres
-        Three points of the skin for each marker, as `energy.above_skin` takes them, in some poses.
-    slopes : (S, 3L, 3, K) float
+    corners : (3L, 3) float, metres
+        Three points of the skin for each marker, as `energy.above_skin` takes them.
+    slopes : (3L, 3, K) float
         Their derivative by betas.
-    R : (S, J, 3, 3) float
-        Rotations of the parts.
-
-    Returns
-    -------
-    (L,) int
-        The part.
-    (L, 3, K) float
-        Derivative of the unit normal in its frame, the mean over the poses.
     """
-    p = supports.reshape(len(supports), -1, 3, 3)
+    p = corners.reshape(-1, 3, 3)
     J = slopes.reshape(*p.shape, -1)
-    u, v = p[:, :, 1] - p[:, :, 0], p[:, :, 2] - p[:, :, 0]
+    u, v = p[:, 1] - p[:, 0], p[:, 2] - p[:, 0]
     c = np.cross(u, v)
-    length = np.linalg.norm(c, axis=-1)[..., None]
+    length = np.linalg.norm(c, axis=-1)[:, None]
     n = c / length
-    tangent = (np.eye(3) - n[..., :, None] * n[..., None, :]) / length[..., None]
-    dn = tangent @ (rotations.hat(u) @ (J[:, :, 2] - J[:, :, 0]) - rotations.hat(v) @ (J[:, :, 1] - J[:, :, 0]))
-    local = np.swapaxes(R, -1, -2)[:, :, None] @ n[:, None, ..., None]                    # (S, J, L, 3, 1)
-    part = local.var(axis=0).sum(axis=(-1, -2)).argmin(axis=0)
-    return part, (np.swapaxes(R, -1, -2)[:, part] @ dn).mean(axis=0)
+    tangent = (np.eye(3) - n[:, :, None] * n[:, None, :]) / length[..., None]
+    return np.asarray(tangent @ (rotations.hat(u) @ (J[:, 2] - J[:, 0]) - rotations.hat(v) @ (J[:, 1] - J[:, 0])))
 
 
-def skin_metric(model: BodyModel, n_betas: int) -> np.ndarray:
+def skin_metric(model: BodyModel, slopes: np.ndarray) -> np.ndarray:
     """(K, K): `Δ @ metric @ Δ` is how far the skin moves when betas change by Δ, squared, square metres.
 
-    The mean over the surface of the mean person in the mean pose.
+    The mean over the surface, areas as on the template.
+
+    Parameters
+    ----------
+    model : BodyModel
+    slopes : (N, 3, K) float, metres
+        Derivative of the vertices by betas.
     """
     areas = model.template.vertex_areas
-    D = model.shape_jacobian(model.pose_mean)[..., :n_betas]
-    D = (np.sqrt(areas / areas.sum())[:, None, None] * D).reshape(-1, n_betas)
+    D = (np.sqrt(areas / areas.sum())[:, None, None] * slopes).reshape(-1, slopes.shape[-1])
     return np.asarray(D.T @ D)
