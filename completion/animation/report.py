@@ -183,7 +183,7 @@ def chart_states(state: np.ndarray, labels: Sequence[str], rate: float, colors: 
     if names:
         patches = [Patch(color=colors[i], label=names[i]) for i in np.unique(state)]
         axes.legend(handles=patches, frameon=False, fontsize=8, ncols=len(names), loc="upper center",
-                    bbox_to_anchor=(0.5, -0.45 / figure.get_figheight()))
+                    bbox_to_anchor=(0.5, -0.52 / figure.get_figheight()))
     return figure
 
 

@@ -6,17 +6,15 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from scanprep.console import plain
 from scanprep.geometry import storage
 from scanprep.geometry.storage import writing
 
 from ..animation.outputs import write_joint_angles, write_joint_centres, write_motion_bvh, write_residuals
 from ..animation.work import key_frames, write_glb
-from ..markers.files import write_markers
 from .results import MarkerFaults, MoshResult
 from .takes import Take
+from .virtual import fault_table, write_virtual
 
 
 def write_person(folder: Path, result: MoshResult, about: Mapping[str, Any]) -> None:
@@ -58,27 +56,17 @@ def write_take(folder: Path, take: Take, keys: int, factor: float = 1.0) -> None
         write_residuals(folder / "residuals_soft.csv", soft.motion)
         if factor != 1:
             write_glb(folder / "exaggerated.glb", soft.motion, body, keys, soft.vertices(take.model, shown, factor))
-    write_markers(folder / "virtual.c3d", take.faults.virtual())
-    write_faults(folder, take.faults, motion.rate)
+    c3d = take.path.suffix.lower() == ".c3d"
+    write_virtual(folder / "virtual.c3d", take.faults, take.path if c3d else None, take.who, take.unit)
+    write_faults(folder, take.faults)
 
 
-def write_faults(folder: Path, faults: MarkerFaults, rate: float) -> None:
-    """faults.json and the same as faults.csv: exchanged labels, bad spans, and how much was filled in."""
-    filled = filled_in(faults)
-    storage.write_json(folder / "faults.json", {
-        "rate": rate, "exchanges": [plain(e) for e in faults.exchanges], "bad": [plain(b) for b in faults.bad],
-        "filled": filled})
+def write_faults(folder: Path, faults: MarkerFaults) -> None:
+    """faults.json with exchanged labels, bad spans and how much was filled in, and the spans as faults.csv."""
+    storage.write_json(folder / "faults.json", fault_table(faults))
     exchanged = [("exchanged", f"{e.first} {e.second}", e.begin, e.end, "") for e in faults.exchanges]
     bad = [(b.kind, b.label, b.begin, b.end, f"{b.distance:.4g}") for b in faults.bad]
     with writing(folder / "faults.csv") as beside, open(beside, "w", newline="", encoding="utf-8") as out:
         table = csv.writer(out)
         table.writerow(["fault", "markers", "begin", "end", "distance"])
         table.writerows(sorted([*exchanged, *bad], key=lambda row: (row[2], row[1])))
-
-
-def filled_in(faults: MarkerFaults) -> dict[str, int]:
-    """In how many frames each marker is filled in by the simulated one."""
-    gone = {label: int(np.isnan(faults.repaired.positions[:, faults.repaired.labels.index(label), 0]).sum())
-            for label in faults.labels}
-    return {label: count for label, count in gone.items() if count}
-

@@ -3,6 +3,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 
 import numpy as np
 
@@ -65,7 +66,9 @@ class Take:
     Attributes
     ----------
     name : str
-        Of its file.
+        Of its folder.
+    path : Path
+        The file, and `who` and `unit` as it was read.
     model : BodyModel
     subject : Subject
         The person.
@@ -80,6 +83,9 @@ class Take:
     """
 
     name: str
+    path: Path
+    who: str | None
+    unit: str | None
     model: BodyModel
     subject: Subject
     markers: MarkerSequence

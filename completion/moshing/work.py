@@ -24,7 +24,7 @@ from .capture import mosh
 from .character_pictures import picture_transfer, write_character
 from .characters import retarget_soft_tissue
 from .charts import MM
-from .outputs import filled_in, write_person, write_take
+from .outputs import write_person, write_take
 from .pictures import standing
 from .recordings import Actor, Recording
 from .report import PICTURE, closing, person_page, person_picture, take_page, take_picture
@@ -32,6 +32,7 @@ from .results import MoshResult
 from .settings import MoshConfig
 from .sex import mosh_by_sex
 from .takes import LightMesh, Take, held_out
+from .virtual import fault_table
 
 ERRORS = ("marker error, fixed shape", "marker error, soft tissue", "held-out error, fixed shape",
           "held-out error, soft tissue")
@@ -126,7 +127,7 @@ def mosh_person(work: Work, actor: Actor, folder: Path, command: str, solving: P
 
 
 def _solve(work: Work, actor: Actor, progress: Progress) -> tuple[_Found, list[str]]:
-    names, sequences, failures = _read(work, actor.recordings)
+    recordings, sequences, failures = _read(work, actor.recordings)
     labels = tuple(dict.fromkeys(label for each in sequences for label in each.labels))
     usual, layout_name = choose_layout(work.model, work.layout, labels)
     try:
@@ -141,24 +142,25 @@ def _solve(work: Work, actor: Actor, progress: Progress) -> tuple[_Found, list[s
         result = mosh(model, sequences, layout, work.config, progress)
     subject = model.subject(result.betas)
     light, takes = LightMesh.of(model.template), []
-    for i, (name, markers) in enumerate(zip(names, sequences, strict=True)):
+    for i, (source, markers) in enumerate(zip(recordings, sequences, strict=True)):
         soft = result.soft_tissue[i] if result.soft_tissue else None
         held = held_out(model, usual, work.hold_out, markers, result.motions[i], soft)
-        takes.append(Take(name, model, subject, markers, result.motions[i], soft, result.faults[i], held, light))
+        takes.append(Take(source.name, source.path, source.who, work.unit, model, subject, markers, result.motions[i],
+                          soft, result.faults[i], held, light))
     return _Found(model, sex, result, takes, usual, layout_name), failures
 
 
-def _read(work: Work, recordings: Sequence[Recording]) -> tuple[list[str], list[MarkerSequence], list[str]]:
-    names, sequences, failures = [], [], []
+def _read(work: Work, recordings: Sequence[Recording]) -> tuple[list[Recording], list[MarkerSequence], list[str]]:
+    found, sequences, failures = [], [], []
     for recording in recordings:
         try:
             sequences.append(read_markers(recording.path, work.unit, recording.who))
-            names.append(recording.name)
+            found.append(recording)
         except ValueError as error:
             failures.append(" ".join(str(error).split()))
     if not sequences:
         raise ValueError("; ".join(failures))
-    return names, sequences, failures
+    return found, sequences, failures
 
 
 def _write(work: Work, found: _Found, take: Take, folder: Path, command: str, settings: Mapping[str, Any]
@@ -207,7 +209,7 @@ def _figures(takes: Sequence[Take]) -> list[Metric]:
         if values:
             out.append(Metric(name, MM * float(np.nanmean(np.concatenate([v.ravel() for v in values]))), "mm"))
     missing = sum(int((~t.markers.select(t.faults.labels).seen).sum()) for t in takes)
-    filled = sum(sum(filled_in(t.faults).values()) for t in takes)
+    filled = sum(sum(fault_table(t.faults)["filled"].values()) for t in takes)
     share = 100 / max(sum(t.faults.simulated[..., 0].size for t in takes), 1)
     return [*out, Metric("exchanges", sum(len(t.faults.exchanges) for t in takes)),
             Metric("bad spans", sum(len(t.faults.bad) for t in takes)),
