@@ -18,7 +18,7 @@ _MAGIC = 0x50
 _BLOCK = 512
 _INTEL, _DEC, _MIPS = 84, 85, 86
 _COMPUTED = ("ANGLES", "FORCES", "MOMENTS", "POWERS", "SCALARS")     # stored among the points, but no positions
-MEASURED = 1.0                       # least residual, in the file's own steps, of a point that was measured
+MEASURED = 1.0                       # residual, millimetres, of points that were measured, where others were not
 _Parameters = dict[tuple[str, str], list[Any]]                       # group and name -> values
 
 

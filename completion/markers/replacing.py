@@ -5,8 +5,10 @@ from pathlib import Path
 
 import numpy as np
 
-from .c3d import MEASURED, point_table
+from .c3d import point_table
 from .common import MARKER_UNITS, MarkerFileError
+
+RESIDUAL = 256                       # one step of the residual in the fourth number of a point; below it are cameras
 
 
 def replace_points(path: Path, data: bytes, columns: np.ndarray, positions: np.ndarray, source: np.ndarray,
@@ -44,8 +46,7 @@ def replace_points(path: Path, data: bytes, columns: np.ndarray, positions: np.n
     fresh = np.empty((*positions.shape[:2], 4))
     fresh[..., :3] = positions / scale
     old = np.take_along_axis(words[:, mine, 3], np.maximum(source, 0), axis=1)
-    without = np.floor(old) % 256 == 0                                 # the residual is the lower byte
-    fresh[..., 3] = np.where(source < 0, 0.0, np.where(without, old + MEASURED, old))
+    fresh[..., 3] = np.where(source < 0, 0.0, np.where(old < RESIDUAL, old + RESIDUAL, old))
     same = (source == np.arange(len(mine))) & (words[:, mine, 3] >= 0)
     fresh[same, :3] = words[:, mine][same, :3]                         # not a bit of them changes
     fresh[np.isnan(positions[..., 0])] = [0, 0, 0, -1]
