@@ -109,6 +109,31 @@ class ScapeModel(BodyModel):
         R, posed = self._posed(pose)
         return self.stitching.stitch(posed @ np.swapaxes(R @ self.shape_space.gradients(betas), -1, -2))
 
+    @cached_property
+    def _posed_coefficients(self) -> list[np.ndarray]:
+        """For each part (n_p, F_p * 6): `Q v̂` of its triangles, one row a feature."""
+        return [(self._v_hat[faces] @ np.swapaxes(a.astype(np.float64), -1, -2)).reshape(len(a), -1)
+                for a, faces in zip(self.pose_space.coefficients, self.pose_space.faces_of_part, strict=True)]
+
+    def bodies_of(self, poses: np.ndarray, betas: np.ndarray) -> np.ndarray:
+        """All together, part by part.
+
+        [SCAPE] Eq. 6, Eq. 9
+        """
+        B, R = len(poses), self.skeleton.part_rotations(poses)
+        delta = self.pose_space.features.evaluate(poses)
+        edges = np.zeros((B, len(self.template.faces), 2, 3))
+        shaped = np.empty_like(edges)
+        for p, faces in enumerate(self.pose_space.faces_of_part):
+            posed = delta[:, self.pose_space.features.of_part(p)] @ self._posed_coefficients[p]
+            S = self.shape_space.some_gradients(betas, faces)
+            shaped[:, faces] = posed.reshape(B, -1, 2, 3) @ np.swapaxes(S, -1, -2)
+        for carrier in self.carriers:
+            faces = self.pose_space.faces_of_part[carrier.part][carrier.chosen]
+            turned = shaped[:, faces].reshape(B, -1, 3) @ np.swapaxes(R[:, carrier.turned_by], -1, -2)
+            edges[:, faces] += carrier.weights[:, None, None] * turned.reshape(B, -1, 2, 3)
+        return self.stitching.stitch(edges)
+
     def basis(self, betas: np.ndarray | None = None) -> np.ndarray:
         return build_basis(self.stitching, self.template, self.pose_space, self.shape_space.gradients(betas),
                            self.carriers)

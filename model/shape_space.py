@@ -47,14 +47,24 @@ class ShapeSpace:
         if betas is None:
             return np.broadcast_to(np.eye(3), self.mean.shape).copy()
         betas = np.asarray(betas, dtype=np.float64)
-        if betas.ndim != 1 or len(betas) > self.count:
-            raise ValueError(f"betas: expected at most {self.count} numbers, got shape {betas.shape}")
-        if not np.isfinite(betas).all():
-            raise ValueError("betas: expected finite numbers")
+        self._check(betas, 1)
         S = self.mean.astype(np.float64)
         for beta, component in zip(betas, self.components, strict=False):
             S += np.multiply(beta, component, dtype=np.float64)
         return S
+
+    def some_gradients(self, betas: np.ndarray, faces: np.ndarray) -> np.ndarray:
+        """S (B, f, 3, 3) of some triangles (f,) for betas (B, k) of many people."""
+        self._check(betas, 2)
+        U = self.components[:betas.shape[1], faces].reshape(betas.shape[1], -1).astype(np.float64)
+        return (betas @ U + self.mean[faces].ravel()).reshape(len(betas), len(faces), 3, 3)
+
+    def _check(self, betas: np.ndarray, dimensions: int) -> None:
+        """ValueError for betas (..., k) that this space has not."""
+        if betas.ndim != dimensions or betas.shape[-1] > self.count:
+            raise ValueError(f"betas: expected at most {self.count} numbers, got shape {betas.shape}")
+        if not np.isfinite(betas).all():
+            raise ValueError("betas: expected finite numbers")
 
     def betas_of(self, S: np.ndarray) -> np.ndarray:
         """Betas (P, K) nearest to shape deformations (P, F, 3, 3), by the components' right angles.

@@ -79,10 +79,16 @@ class SoftTissue:
         return own + factor * self.changes
 
     def vertices(self, model: BodyModel, frames: np.ndarray | slice = slice(None), factor: float = 1.0) -> np.ndarray:
-        """The meshes (n, N, 3) of some frames, metres."""
-        from ..animation.retarget import morphed_vertices
+        """The meshes (n, N, 3) of some frames, metres, the change taken `factor` times."""
+        from .changing import changing_bodies
 
-        return morphed_vertices(model, self.motion, self.betas(factor), frames, grounded=False)
+        return changing_bodies(model, self.motion.poses[frames], self.betas(factor)[frames], self.motion.trans[frames])
+
+    def movement(self, model: BodyModel) -> np.ndarray:
+        """How far the change moves every vertex (N,) of the skin, metres: the root of the mean square over time."""
+        from .changing import skin_movement
+
+        return skin_movement(model, self.changes)
 
     def save(self, path: str | Path) -> None:
         """Write a motion file (see `Motion.save`) that also holds the changes, as `shape_changes`."""
