@@ -24,7 +24,8 @@ from .terms import LatentPoints
 
 UNSURE = 5.0                         # how much farther off a loose marker may be before it was looked for
 TOLERANCE = 1e-3                     # fraction of the energy, in all stages but the last
-FINAL = 1e-5                         # the same in the last
+FINAL = 1e-4                         # the same in the last
+LONGER = 3                           # times as many steps in the last
 
 
 @dataclass(frozen=True, eq=False)
@@ -122,7 +123,7 @@ class LatentFit:
     def with_loose_found(self, state: State) -> State:
         """Each loose marker where on its limb it is nearest to what was measured; the others stay."""
         if not self.usual_layout.loose or not self.config.loose_reach:
-            return state
+            return self.reattached(state)
         pose, trans, _ = self.body.split(state.x)
         vertices = self.model.subject(state.betas).vertices(pose, trans)
         found = find_loose(self.model, vertices, self.usual_layout, self.targets, self.config.loose_reach,
@@ -193,7 +194,8 @@ class LatentFit:
                 [Residual(r.values[None], r.jacobian[None]) for r in self.common(z, factor).values()])
             return energies[0], gradients[0], hessians[0]
 
-        end = minimise_arrow(frames, common, state.x, state.z, self.config.iterations, FINAL if last else TOLERANCE)
+        steps, tolerance = (LONGER * self.config.iterations, FINAL) if last else (self.config.iterations, TOLERANCE)
+        end = minimise_arrow(frames, common, state.x, state.z, steps, tolerance)
         return State(end.x, end.z[:K], end.z[K:].reshape(-1, 3)), end
 
     def energies(self, state: State) -> dict[str, float]:
@@ -202,9 +204,11 @@ class LatentFit:
         return {name: float(np.sum(term.energy)) for name, term in both.items()}
 
     def placed_layout(self, state: State) -> MarkerLayout:
-        """The layout with every marker on its nearest triangle at its own distance, exact in the latent pose."""
+        """The layout with every marker on the triangle it hangs on at its own distance, exact in the latent pose."""
         vertices, points = self.latent.at(state.betas), self.places(state)
-        hung = latent_markers(self.model.template.with_vertices(vertices), points)
+        hung = self.markers
+        if hung.kind != "triangle":
+            hung = latent_markers(self.model.template.with_vertices(vertices), points)
         p = vertices[hung.corners]
         c = hung.coefficients(vertices, points)
         along, across = p[:, 1] - p[:, 0], p[:, 2] - p[:, 0]

@@ -19,6 +19,7 @@ from .settings import PersonConfig
 Progress = Callable[[int, int], None]
 START_SD, START_PRIOR = 0.03, 0.3    # metres and factor: the mean person carries the markers only roughly
 LOOK = (1, 3)                        # before these stages loose markers are looked for
+EVERY = 2                            # stages before one of which, and before the last, markers are hung anew
 FEW_SEEN = 0.9                       # of the most markers that any frame has; frames with fewer are not used
 
 
@@ -61,8 +62,12 @@ def find_person(model: BodyModel, sequences: MarkerSequence | Sequence[MarkerSeq
     fit = LatentFit(model, starts.body, known, targets, config)
     state, steps, converged = fit.start(x), 0, False
     for i, factor in enumerate(config.annealing):
-        state = fit.with_loose_found(state) if i in LOOK else fit.reattached(state)
-        state, end = fit.solve(state, factor, last=i == len(config.annealing) - 1)
+        last = i == len(config.annealing) - 1
+        if i in LOOK:
+            state = fit.with_loose_found(state)
+        elif i and (i % EVERY or last):
+            state = fit.reattached(state)
+        state, end = fit.solve(state, factor, last)
         steps, converged = steps + end.iterations, end.converged
         tell(len(chosen) + i + 1, total)
     return _result(fit, state, _whose(positions, chosen), converged, steps)

@@ -55,7 +55,7 @@ class PersonConfig:
     data: float = 0.75
     surface: float = 25.0
     initial: float = 1.0
-    shape: float = 1.0
+    shape: float = 0.3
     pose: float = 0.25
     loose: float = 0.0025
     loose_reach: float = 0.2

@@ -1,0 +1,234 @@
+from dataclasses import replace
+from functools import cache
+
+import numpy as np
+import pytest
+from completion_bodies import worm_with_prior
+
+from completion import MoshConfig, PersonConfig, find_person, mosh
+from completion.animation.follow import animate
+from completion.animation.shared import minimise_arrow
+from completion.markers.files import MarkerSequence
+from completion.markers.layout import MarkerLayout
+from completion.moshing.attachment import latent_markers
+from completion.moshing.person import choose_frames, common_markers
+from completion.moshing.poses import animate_config, follow_poses
+from completion.moshing.settings import FollowConfig
+from scanprep.geometry import rotations
+from scanprep.geometry.surface import Surface
+
+MODEL = worm_with_prior()
+BETAS = np.array([1.4, -1.1, 0.8])
+LABELS = tuple(f"M{i:02d}" for i in range(26))
+INSIDE = np.random.default_rng(9).dirichlet([6, 6, 6], 26)          # markers well inside of triangles
+LAYOUT = MarkerLayout(LABELS, MODEL.template.faces[np.round(np.linspace(8, 788, 26)).astype(int)], 0.0095, INSIDE)
+EXACT = PersonConfig(shape=1e-4, pose=1e-4, data=100.0, start_axes=2, n_betas=3, frames=8, annealing=(100.0, 10.0, 1.0))
+USUAL = PersonConfig(start_axes=2, frames=8, annealing=(10.0, 4.0, 1.0))
+SUBJECT = MODEL.subject(BETAS)
+REST = np.zeros((4, 3))
+
+
+def motion(frames=40, seed=0):
+    """Poses that swing, and a place that drifts."""
+    rng = np.random.default_rng(seed)
+    t = np.arange(frames)[:, None, None] / 12
+    poses = 0.45 * np.sin(t * rng.uniform(1, 2, (4, 3)) + rng.uniform(0, 6, (4, 3)))
+    return poses, np.array([0.3, -0.2, 1.0]) + 0.2 * t[:, 0] * rng.normal(size=3)
+
+
+def sequence(places=None, seed=0, kind="triangle"):
+    """Markers at places (L, 3) on the resting person, as they move with it; where the layout has them if not given."""
+    rest = MODEL.template.with_vertices(SUBJECT.vertices(REST))
+    places = LAYOUT.place(rest) if places is None else places
+    hung = latent_markers(rest, places, kind)
+    vertices = SUBJECT.vertices(*motion(seed=seed))
+    return MarkerSequence(hung.places(vertices, hung.coefficients(rest.vertices, places)), LABELS, 60.0)
+
+
+@cache
+def displaced(by=0.012):
+    """Places on the resting person beside the usual ones, at the usual distance from the skin."""
+    rest = MODEL.template.with_vertices(SUBJECT.vertices(REST))
+    rng = np.random.default_rng(4)
+    found = Surface(rest).closest(LAYOUT.place(rest) + rng.normal(0, by, (26, 3)))
+    return found.points + 0.0095 * rest.face_normals[found.faces]
+
+
+@cache
+def known(attachment="triangle"):
+    return find_person(MODEL, sequence(kind=attachment), LAYOUT, replace(EXACT, attachment=attachment))
+
+
+@cache
+def beside():
+    return find_person(MODEL, sequence(displaced()), LAYOUT, USUAL)
+
+
+def rest_places(layout, betas):
+    return layout.place(MODEL.template.with_vertices(MODEL.vertices(REST, betas)))
+
+
+@pytest.mark.parametrize("attachment", ["triangle", "neighbourhood"])
+def test_markers_without_error_give_back_the_person(attachment):
+    found = known(attachment)
+    np.testing.assert_allclose(found.betas, BETAS, atol=0.02)
+    assert found.converged and found.residual < 3e-4
+    np.testing.assert_allclose(rest_places(found.layout, found.betas), rest_places(LAYOUT, BETAS), atol=1e-3)
+    poses, trans = motion()
+    np.testing.assert_allclose(found.trans, trans[found.frames[:, 1]], atol=2e-3)
+    turned = np.swapaxes(rotations.exp(found.poses), -1, -2) @ rotations.exp(poses[found.frames[:, 1]])
+    assert np.linalg.norm(rotations.log(turned), axis=-1).max() < 0.02
+
+
+def test_markers_beside_their_usual_place_are_found_there():
+    found, at = beside(), displaced()
+    usual = rest_places(LAYOUT, BETAS)
+    off = np.linalg.norm(rest_places(found.layout, found.betas) - at, axis=1)
+    assert off.mean() < 0.5 * np.linalg.norm(usual - at, axis=1).mean()
+    assert found.residual < 5e-3
+    wanted, own = np.linalg.norm(usual - at, axis=1), found.moved
+    assert np.corrcoef(wanted, own)[0, 1] > 0.8
+    np.testing.assert_allclose(found.layout.distances, 0.0095, atol=4e-3)
+
+
+def test_the_body_does_not_shrink_towards_the_mean():
+    """Markers that may slide could take all of the shape upon themselves; they must not."""
+    mean, true = MODEL.vertices(REST, np.zeros(3)), MODEL.vertices(REST, BETAS)
+    found = MODEL.vertices(REST, beside().betas)
+    far = np.linalg.norm(true - mean, axis=1).mean()
+    assert np.linalg.norm(found - mean, axis=1).mean() > 0.9 * far
+    assert np.linalg.norm(found - true, axis=1).mean() < 0.25 * far
+
+
+def test_another_place_and_direction_is_the_same_person():
+    R, t = rotations.exp(np.array([0.5, -1.9, 0.8])), np.array([3.0, -1.0, 0.4])
+    first = sequence(displaced())
+    second = find_person(MODEL, MarkerSequence(first.positions @ R.T + t, LABELS, 60.0), LAYOUT, USUAL)
+    np.testing.assert_array_equal(second.frames, beside().frames)
+    np.testing.assert_allclose(second.betas, beside().betas, atol=0.02)
+    np.testing.assert_allclose(rest_places(second.layout, second.betas),
+                               rest_places(beside().layout, beside().betas), atol=1e-3)
+
+
+def test_the_layout_it_finds_puts_markers_where_it_simulated_them():
+    """The person's layout is an ordinary one: others place markers with it, and `animate` follows it."""
+    found = beside()
+    subject, data = MODEL.subject(found.betas), sequence(displaced())
+    for k, (which, t) in enumerate(found.frames):
+        assert which == 0
+        body = MODEL.template.with_vertices(subject.vertices(found.poses[k], found.trans[k]))
+        off = np.linalg.norm(found.layout.place(body) - data.positions[t], axis=1)
+        # weights of corners stretch with the skin, a frame does not; the worm's triangles are 8 cm wide
+        assert np.abs(off - found.residuals[k]).mean() < 2e-3 and np.abs(off - found.residuals[k]).max() < 1e-2
+
+
+def test_several_sequences_of_one_subject_are_one_person():
+    one, two = sequence(displaced()), sequence(displaced(), seed=3)
+    renamed = MarkerSequence(two.positions[:, ::-1], (*LABELS[:0:-1], "X0"), 60.0)
+    layout = replace(LAYOUT, aliases={"X0": "M00"})
+    both = find_person(MODEL, [one, two], layout, USUAL)
+    aliased = find_person(MODEL, [one, renamed], layout, USUAL)
+    assert set(both.frames[:, 0]) == {0, 1} and both.frames[:, 1].max() < 40
+    np.testing.assert_allclose(aliased.betas, both.betas, atol=1e-9)
+    assert aliased.layout.labels == LABELS and dict(aliased.layout.aliases) == {"X0": "M00"}
+    np.testing.assert_allclose(both.betas, BETAS, atol=0.35)
+
+
+def test_missing_and_wild_markers_change_little():
+    data = np.array(sequence(displaced()).positions)
+    rng = np.random.default_rng(0)
+    data[rng.random(data.shape[:2]) < 0.15] = np.nan
+    data[:, 5] += [0.5, 0.3, -0.4]                                  # as if on something else
+    found = find_person(MODEL, MarkerSequence(data, LABELS, 60.0), LAYOUT, USUAL)
+    np.testing.assert_allclose(found.betas, beside().betas, atol=0.3)
+    assert np.isnan(found.residuals).any() and np.nanmin(found.residuals[:, 5]) > 0.3
+    assert np.nanmean(np.delete(found.residuals, 5, axis=1)) < 5e-3
+
+
+def test_loose_markers_are_looked_for_along_the_limb():
+    row, loose = 14, replace(LAYOUT, loose=("M14",))
+    rest = MODEL.template.with_vertices(SUBJECT.vertices(REST))
+    places = np.array(LAYOUT.place(rest))
+    on = Surface(rest).closest(places[row:row + 1] - [0.15, 0, 0])
+    places[row] = on.points[0] + 0.0095 * rest.face_normals[on.faces[0]]
+    apart = np.linalg.norm(places - rest_places(LAYOUT, BETAS), axis=1)[row]
+    found = find_person(MODEL, sequence(places), loose, USUAL)
+    assert apart > 0.1 and found.moved[row] > 0.8 * apart and found.layout.loose == ()
+    assert np.linalg.norm(rest_places(found.layout, found.betas) - places, axis=1)[row] < 0.02
+
+
+def test_frames_may_be_drawn_at_random():
+    _, positions = common_markers([sequence()], LAYOUT)
+    random = PersonConfig(choice="random", frames=7, seed=3)
+    first = choose_frames(positions, random)
+    np.testing.assert_array_equal(first, choose_frames(positions, random))
+    assert len(set(first)) == 7 and (np.diff(first) > 0).all()
+    assert not np.array_equal(first, choose_frames(positions, replace(random, seed=4)))
+    with pytest.raises(ValueError, match="choice: expected spread or random, got 'first'"):
+        choose_frames(positions, replace(random, choice="first"))
+
+
+@pytest.mark.parametrize(("config", "message"), [
+    (PersonConfig(frames=0), "frames: expected at least 1"),
+    (PersonConfig(annealing=()), "annealing: expected at least one factor"),
+])
+def test_settings_that_make_no_sense(config, message):
+    with pytest.raises(ValueError, match=message):
+        find_person(MODEL, sequence(), LAYOUT, config)
+
+
+def test_what_cannot_be_used_is_named():
+    with pytest.raises(ValueError, match="sequences: expected at least one, got none"):
+        find_person(MODEL, [], LAYOUT)
+    with pytest.raises(ValueError, match="expected at least 3 markers of the layout, found 0"):
+        find_person(MODEL, MarkerSequence(np.zeros((2, 1, 3)), ("Q",), 60.0), LAYOUT)
+    with pytest.raises(ValueError, match="model: expected one with betas"):
+        find_person(worm_with_prior(components=0), sequence(), LAYOUT)
+
+
+def test_weights_of_the_paper_are_those_of_the_engine():
+    """[MoSh] Eq. 17, 21, 22: a residual of 1/√λ costs one."""
+    found = animate_config(FollowConfig(data=0.25, pose=0.7, velocity=4.0))
+    assert found.marker_sd == pytest.approx(0.02) and found.prior_weight == 0.7
+    assert found.angle_acceleration == pytest.approx(0.5 * 120**2)
+    person, data = MODEL.subject(beside().betas), sequence(displaced())
+    one = follow_poses(person, data, beside().layout, FollowConfig(data=0.25, pose=0.7, velocity=4.0))
+    np.testing.assert_array_equal(one.poses, animate(person, data, beside().layout, found).poses)
+
+
+def test_everything_together():
+    """The motion of every frame comes back; residual columns are those of the file."""
+    data = sequence(displaced())
+    more = MarkerSequence(np.concatenate([data.positions, data.positions[:, :1] + 1], axis=1), (*LABELS, "prop"), 60.0)
+    found = mosh(MODEL, more, LAYOUT, MoshConfig(person=USUAL, soft_tissue=False))
+    assert len(found.motions) == len(found.faults) == 1 and found.soft_tissue == ()
+    assert found.motions[0].labels == more.labels and np.isnan(found.motions[0].residuals[:, -1]).all()
+    assert np.nanmean(found.motions[0].residuals) < 5e-3 and not found.faults[0].exchanges
+    poses, trans = motion()
+    body = found.motions[0].vertices(MODEL.subject(found.betas))
+    assert np.linalg.norm(body - SUBJECT.vertices(poses, trans), axis=2).mean() < 0.01
+    np.testing.assert_array_equal(found.betas, found.person.betas)
+
+
+def test_frames_that_share_unknowns_are_solved_as_one_system():
+    """The arrow's step against the dense normal equations of a linear problem, which one step solves."""
+    rng = np.random.default_rng(0)
+    B, n, S = 3, 4, 5
+    A, b, C, d = (rng.normal(size=s) for s in ((B, 9, n + S), (B, 9), (6, S), (6,)))
+
+    def frames(x, z):
+        r = np.einsum("bmp,bp->bm", A, np.concatenate([x, np.tile(z, (B, 1))], axis=1)) - b
+        At = np.swapaxes(A, 1, 2)
+        return (r**2).sum(axis=1), (At @ r[..., None])[..., 0], At @ A
+
+    def common(z):
+        r = C @ z - d
+        return (r**2).sum(), C.T @ r, C.T @ C
+
+    end = minimise_arrow(frames, common, np.zeros((B, n)), np.zeros(S), 30, 1e-14)
+    dense = np.zeros((B * 9 + 6, B * n + S))
+    for i in range(B):
+        dense[9 * i:9 * i + 9, n * i:n * i + n], dense[9 * i:9 * i + 9, B * n:] = A[i, :, :n], A[i, :, n:]
+    dense[B * 9:, B * n:] = C
+    exact = np.linalg.lstsq(dense, np.concatenate([b.ravel(), d]), rcond=None)[0]
+    np.testing.assert_allclose(np.concatenate([end.x.ravel(), end.z]), exact, atol=1e-6)

@@ -1,0 +1,227 @@
+import numpy as np
+import pytest
+from completion_bodies import worm_with_prior
+
+from completion import energy
+from completion.animation.marked import supports
+from completion.bodies import FixedBody
+from completion.energy import MovingPoints
+from completion.markers.layout import MarkerLayout
+from completion.moshing import terms
+from completion.moshing.attachment import above_triangles, latent_markers, signed_distance, simulated
+from completion.moshing.terms import LatentPoints
+from completion.priors import gaussian_prior
+from scanprep.geometry import rotations
+from scanprep.geometry.mesh import Mesh
+
+MODEL = worm_with_prior()
+K, L, REST = MODEL.n_betas, 6, np.zeros((4, 3))
+BODY = FixedBody(MODEL.subject(None))
+LATENT = LatentPoints(MODEL.vertices(REST, np.zeros(K)), MODEL.shape_jacobian(REST))
+LAYOUT = MarkerLayout(tuple("ABCDEF"), np.array([6, 75, 130, 200, 255, 330]), 0.02)
+PRIOR = gaussian_prior(MODEL.pose_mean, MODEL.pose_covariance)
+KINDS = ["triangle", "neighbourhood"]
+
+
+def mean_mesh(betas=None):
+    return MODEL.template.with_vertices(LATENT.at(np.zeros(K) if betas is None else betas))
+
+
+def beside(mesh, seed=0, off=0.02):
+    """Points a little above the skin, beside the vertices of the layout."""
+    return LAYOUT.place(mesh) + np.random.default_rng(seed).normal(0, off, (L, 3))
+
+
+def hung(kind, seed=0):
+    mesh = mean_mesh()
+    markers = latent_markers(mesh, beside(mesh, seed), kind)
+    return markers, markers.coefficients(mesh.vertices, beside(mesh, seed))
+
+
+def shared(seed=1):
+    """Unknowns z: betas, and coefficients near those of the markers."""
+    rng = np.random.default_rng(seed)
+    return lambda c: np.concatenate([rng.normal(0, 1, K), (c + rng.normal(0, 0.004, c.shape)).ravel()])
+
+
+def of_latent(make):
+    """A term of the latent markers of both attachments, as a function of z."""
+    def build(kind):
+        markers, c = hung(kind)
+        at = LATENT.combined(markers.ids, markers.weights)
+        corners = LATENT.combined(markers.corners.reshape(-1, 1), np.ones((3 * L, 1)))
+        usual = LATENT.combined(*supports(MODEL.template, LAYOUT))
+        return lambda z: make(terms.latent_places(kind, at, z), corners.moving(z),
+                              energy.above_skin(usual.moving(z), np.full(L, 0.02))), shared()(c)
+    return build
+
+
+def of_frames(kind):
+    """The simulated markers of one frame against targets, as a function of (pose, trans, z)."""
+    markers, c = hung(kind)
+    points, targets = MODEL.points(markers.ids, markers.weights), np.random.default_rng(7).normal(0, 1, (1, L, 3))
+    targets[:, 2] = np.nan
+    z = shared()(c)
+    x = np.concatenate([np.random.default_rng(2).normal(0, 0.4, 15), z])
+
+    def term(x):
+        pose, trans, betas = x[None, :12].reshape(1, 4, 3), x[None, 12:15], x[15:15 + K]
+        y, d_pose = points.operator(betas).jacobian(pose, trans)
+        moving = energy.moving_points(y, d_pose, points.shape_jacobian(pose))
+        found, frame = simulated(kind, moving, x[15 + K:].reshape(-1, 3))
+        J = np.concatenate([found.jacobian, terms.each_own(frame)], axis=-1)
+        residual = terms.data(MovingPoints(found.positions, J), targets, np.arange(1.0, L + 1))
+        return energy.Residual(residual.values[0], residual.jacobian[0])
+
+    return term, x
+
+
+def of_motion(kind):
+    x = np.random.default_rng(3).normal(0, 0.4, (5, 15))
+    return (lambda flat: terms.velocity(flat.reshape(5, 15), 12, 6.25)), x.ravel()
+
+
+TERMS = {
+    "data": of_frames,
+    "surface": of_latent(lambda m, corners, usual: terms.surface(m, corners, np.full(L, 0.01), np.arange(1.0, L + 1))),
+    "usual_place": of_latent(lambda m, corners, usual: terms.usual_place(m, usual, np.arange(1.0, L + 1))),
+    "shape": lambda kind: ((lambda z: terms.shape(z, K, 2.0)), np.random.default_rng(4).normal(size=K + 3 * L)),
+    "pose": lambda kind: ((lambda x: terms.pose(x, PRIOR, 0.25)), np.random.default_rng(5).normal(size=15)),
+    "velocity": of_motion,
+}
+
+
+@pytest.mark.parametrize("kind", KINDS)
+@pytest.mark.parametrize("name", TERMS)
+def test_jacobian_is_the_finite_difference(name, kind):
+    term, x = TERMS[name](kind)
+    got, h = term(x), 1e-6
+    assert got.jacobian.shape == (len(got.values), len(x)) and np.abs(got.jacobian).max() > 0
+    for i in range(len(x)):
+        step = h * (np.arange(len(x)) == i)
+        slope = (term(x + step).values - term(x - step).values) / (2 * h)
+        np.testing.assert_allclose(got.jacobian[:, i], slope, atol=2e-5, rtol=1e-6)
+
+
+def test_weights_are_per_square_centimetre():
+    """A marker 2 cm from its place costs four times the weight, in every term of distances."""
+    still = np.zeros((1, 3, 1))
+    at, there = MovingPoints(np.array([[0.0, 0.0, 0.03]]), still), MovingPoints(np.array([[0.0, 0.0, 0.01]]), still)
+    corners = MovingPoints(np.array([[-1.0, -1, 0], [1, -1, 0], [0, 2, 0]]), np.zeros((3, 3, 1)))
+    assert terms.data(at, there.positions, np.array([0.75])).energy == pytest.approx(3.0)
+    assert terms.usual_place(at, there, np.array([0.25])).energy == pytest.approx(1.0)
+    assert terms.surface(at, corners, np.array([0.01]), np.array([100.0])).energy == pytest.approx(400.0)
+
+
+def test_constant_velocity_costs_nothing_and_a_turn_back_its_square():
+    x = np.zeros((4, 15))
+    x[:, :12] = np.arange(4)[:, None] * np.arange(12)
+    x[:, 12:] = np.random.default_rng(0).normal(size=(4, 3))                      # the place is free
+    assert terms.velocity(x, 12, 6.25).energy == pytest.approx(0.0, abs=1e-20)
+    x[3, 4] += 0.2
+    assert terms.velocity(x, 12, 6.25).energy == pytest.approx(6.25 * 0.04)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_markers_are_where_they_were_hung_and_move_with_the_body(kind):
+    mesh = mean_mesh()
+    points = beside(mesh)
+    markers = latent_markers(mesh, points, kind)
+    c = markers.coefficients(mesh.vertices, points)
+    np.testing.assert_allclose(markers.places(mesh.vertices, c), points, atol=1e-12)
+    R, t = rotations.exp(np.array([0.4, -1.1, 0.7])), np.array([0.3, 2.0, -1.0])
+    np.testing.assert_allclose(markers.places(mesh.vertices @ R.T + t, c), points @ R.T + t, atol=1e-12)
+    pose = np.random.default_rng(2).normal(0, 0.4, (4, 3))
+    posed = MODEL.vertices(pose, np.zeros(K))
+    supports_ = MovingPoints(markers.supports(posed), np.zeros((3 * L, 3, 1)))
+    np.testing.assert_allclose(simulated(kind, supports_, c)[0].positions, markers.places(posed, c), atol=1e-12)
+
+
+@pytest.mark.parametrize("kind", KINDS)
+def test_hanging_a_marker_anew_keeps_its_place(kind):
+    """Wherever it moved, and on whichever body: the triangle changes, the place does not."""
+    mesh = mean_mesh(np.array([1.5, -1.0, 0.5]))
+    markers, c = hung(kind)
+    moved = c + np.random.default_rng(6).normal(0, 0.06, c.shape)
+    places = markers.places(mesh.vertices, moved)
+    anew = latent_markers(mesh, places, kind)
+    assert (anew.corners != markers.corners).any()
+    np.testing.assert_allclose(anew.places(mesh.vertices, anew.coefficients(mesh.vertices, places)), places,
+                               atol=1e-12)
+    nearest = signed_distance(places, mesh)
+    np.testing.assert_array_equal(anew.corners, mesh.faces[nearest.faces])
+
+
+def test_the_neighbourhood_spreads_over_all_edges_of_the_nearest_vertex():
+    """Its weights are those of least norm that reach the place in the tangent plane: [MoSh] Eq. 3."""
+    mesh = mean_mesh()
+    points = beside(mesh)
+    markers = latent_markers(mesh, points, "neighbourhood")
+    for i, point in enumerate(points):
+        centre = markers.ids[3 * i, 0]
+        corners = mesh.vertices[markers.corners[i]]
+        assert centre == markers.corners[i][np.linalg.norm(corners - point, axis=1).argmin()]
+        ring = np.setdiff1d(markers.ids[3 * i + 1], centre)
+        adjacency = mesh.vertex_adjacency
+        assert set(ring) == set(adjacency.indices[adjacency.indptr[centre]:adjacency.indptr[centre + 1]])
+        sides = markers.supports(mesh.vertices)[3 * i + 1:3 * i + 3] - mesh.vertices[centre]
+        normal = mesh.vertex_normals[centre]
+        flat = sides - (sides @ normal)[:, None] * normal
+        np.testing.assert_allclose(flat @ flat.T, np.eye(2), atol=1e-12)
+        spokes = mesh.vertices[ring] - mesh.vertices[centre]
+        spokes -= (spokes @ normal)[:, None] * normal
+        for row, side in zip(markers.weights[3 * i + 1:3 * i + 3], flat, strict=True):
+            mine = np.array([row[markers.ids[3 * i + 1] == v].sum() for v in ring])
+            least = np.linalg.lstsq(spokes.T, side, rcond=None)[0]
+            np.testing.assert_allclose(mine, least, atol=1e-10)
+    with pytest.raises(ValueError, match="attachment: expected triangle or neighbourhood, got 'glue'"):
+        latent_markers(mesh, points, "glue")
+
+
+def test_signed_distance_of_a_ball_of_triangles():
+    """Near a fine ball it is the distance from the centre less the radius, inside it is negative."""
+    import trimesh
+
+    ball = trimesh.creation.icosphere(4, 0.5)
+    mesh = Mesh(np.array(ball.vertices), np.array(ball.faces))
+    points = np.random.default_rng(0).normal(size=(200, 3))
+    points *= (np.random.default_rng(1).uniform(0.3, 0.9, 200) / np.linalg.norm(points, axis=1))[:, None]
+    found = signed_distance(points, mesh)
+    np.testing.assert_allclose(found.values, np.linalg.norm(points, axis=1) - 0.5, atol=2e-3)
+    radial = points / np.linalg.norm(points, axis=1, keepdims=True)
+    assert np.einsum("nd,nd->n", found.by_points, radial).min() > 0.99
+
+
+def test_derivatives_of_the_signed_distance_are_finite_differences():
+    mesh, h = mean_mesh(), 1e-7
+    points = beside(mesh, 3, 0.03)
+    points[0] = mesh.corners[40].mean(axis=0)                                     # on the surface itself
+    points[1] = mesh.vertices[100] + 0.05 * mesh.vertex_normals[100]              # nearest to a vertex
+    found = signed_distance(points, mesh)
+    assert found.values.min() < 0 < found.values.max() and abs(found.values[0]) < 1e-12
+    for i in range(L):
+        for d in range(3):
+            step = h * (np.arange(3) == d)
+            up, down = (signed_distance(points[i:i + 1] + s * step, mesh).values[0] for s in (1, -1))
+            assert found.by_points[i, d] == pytest.approx((up - down) / (2 * h), abs=1e-5)
+            for c, v in enumerate(mesh.faces[found.faces[i]]):
+                values = []
+                for s in (1, -1):
+                    vertices = mesh.vertices.copy()
+                    vertices[v] += s * step
+                    values.append(signed_distance(points[i:i + 1], mesh.with_vertices(vertices)).values[0])
+                assert found.by_corners[i, c, d] == pytest.approx((values[0] - values[1]) / (2 * h), abs=1e-5)
+
+
+def test_distance_from_the_nearest_triangle_is_that_from_the_surface():
+    mesh = mean_mesh()
+    rng = np.random.default_rng(8)
+    points = np.concatenate([beside(mesh, seed, 0.05) for seed in range(20)]) + rng.normal(0, 0.01, (20 * L, 3))
+    whole = signed_distance(points, mesh)
+    values, by_points, by_corners = above_triangles(points, mesh.corners[whole.faces])
+    outside = whole.values > 1e-6                # beyond a sharp edge the side of one triangle is not that of both
+    np.testing.assert_allclose(np.abs(values), np.abs(whole.values), atol=1e-12)
+    same = outside & (values > 0)
+    assert same.sum() > 0.95 * outside.sum() > 20
+    np.testing.assert_allclose(by_points[same], whole.by_points[same], atol=1e-9)
+    np.testing.assert_allclose(by_corners[same], whole.by_corners[same], atol=1e-9)
