@@ -4,7 +4,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.ndimage import median_filter
 
-ACCELERATION = 30.0                  # metres per second squared, of a marker that is out of sight
+ACCELERATION = 10.0                  # metres per second squared, of a marker that is out of sight
 LONGEST = 0.25                       # seconds out of sight, beyond which a track tells nothing
 NEAR = 12                            # frames on either side from which the usual jump of a track is taken
 USUAL = 1.5                          # standard deviations to a median distance, nearly
@@ -76,7 +76,7 @@ class Tracks:
         way = gap[..., None] * _mean_of_known(self._before[last, before], self._after[times, after])
         off = _length(self.positions[times, after] - self.positions[last, before] - way)
         usual = np.maximum(self.sd[last, before], self.sd[times, after])
-        sd = gap * usual + 0.5 * ACCELERATION * ((gap - 1) / self.rate)**2
+        sd = 0.5 * (gap + 1) * usual + 0.5 * ACCELERATION * ((gap - 1) / self.rate)**2
         cost = np.nan_to_num(off**2 / (2 * sd**2), nan=TORN) + 3 * np.log(sd / usual)
         cost = np.where((last < 0) | (gap > LONGEST * self.rate + 1), TORN, np.minimum(cost, TORN))
         return np.where(np.isnan(self.positions[times, after, 0]), 0.0, cost)
