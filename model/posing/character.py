@@ -33,16 +33,12 @@ class CharacterConfig:
         How much the normals of triangles count beside their edges: they thicken as the triangle grows (SCAPE models).
     rounds : int
         How often what is left of the character is added to its shape (SCAPE models).
-    components : "kept" or "scaled"
-        The shape components as they are, as published, or as large against the character as they were against the
-        mean person: where the character is half as long, betas then lengthen it by half as much (SCAPE models).
     """
 
     pose: Literal["found", "rest"] = "found"
     smoothness: float = 0.0001
     normal: float = 0.3
     rounds: int = 2
-    components: Literal["kept", "scaled"] = "kept"
 
 
 def character_model(model: BodyModel, vertices: np.ndarray, config: CharacterConfig | None = None,
@@ -114,11 +110,7 @@ def _of_triangles(model: ScapeModel, vertices: np.ndarray, pose: np.ndarray, con
     for _ in range(1 + config.rounds):
         S += solver(np.concatenate([wanted, config.normal * _normals(wanted)], axis=1) - with_normals
                     @ np.swapaxes(S, -1, -2))
-    space = model.shape_space
-    U = space.components
-    if config.components == "scaled":
-        U = (U @ np.linalg.solve(space.mean.astype(np.float64), S)).astype(U.dtype)
-    return replace(model, shape_space=replace(space, mean=S.astype(np.float32), components=U))
+    return replace(model, shape_space=replace(model.shape_space, mean=S.astype(np.float32)))
 
 
 def _normals(pairs: np.ndarray) -> np.ndarray:

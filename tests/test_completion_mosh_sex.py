@@ -1,0 +1,76 @@
+"""Sex from markers, and the person with the model of that sex."""
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from completion_bodies import MEAN, worm_with_prior
+
+from completion import MarkerLayout, MarkerSequence, mosh_by_sex
+from completion.moshing.settings import MoshConfig, PersonConfig
+from completion.moshing.sex import checked_models
+from model.learning.sex_plane import PLANE, learn_sex_plane
+
+QUICK = MoshConfig(person=PersonConfig(frames=4, start_axes=1, annealing=(4.0, 1.0), iterations=6), soft_tissue=False)
+SIDE = 1.2                           # of the first beta: a woman's is below zero
+
+
+@pytest.fixture(scope="module")
+def models():
+    """The worm; of everybody with a plane, and of women and men, each with its own mean."""
+    neutral = worm_with_prior()
+    rng = np.random.default_rng(0)
+    betas = rng.normal(size=(24, 3)) * [0.2, 1, 1] + np.repeat([[-SIDE, 0, 0], [SIDE, 0, 0]], 12, axis=0)
+    plane = learn_sex_plane(betas, ["female"] * 12 + ["male"] * 12)
+    found = {"neutral": replace(neutral, info={PLANE: plane.kept(), "sex": "neutral"})}
+    for sex, side in (("female", -SIDE), ("male", SIDE)):
+        space = replace(neutral.shape_space, mean=neutral.shape_space.gradients(np.array([side])))
+        found[sex] = replace(neutral, shape_space=space, info={"sex": sex})
+    return found
+
+
+@pytest.fixture(scope="module")
+def layout(models):
+    vertices = np.random.default_rng(4).choice(396, 34, replace=False)
+    return MarkerLayout(tuple(f"M{i}" for i in range(34)), vertices, 0.012)
+
+
+def markers(models, layout, betas, phase=0.0):
+    """Markers of a worm of the neutral model that bends."""
+    model, t = models["neutral"], np.arange(24) / 30
+    poses = MEAN + np.sin(3 * t[:, None, None] + np.arange(4)[:, None] + phase) * np.array([0.05, 0.3, 0.2])
+    meshes = model.subject(betas).vertices(poses, np.stack([t, 0 * t, 0 * t], axis=1))
+    placed = np.stack([layout.place(model.template.with_vertices(v)) for v in meshes])
+    return MarkerSequence(placed, layout.labels, 30.0)
+
+
+@pytest.mark.parametrize("sex", ["female", "male"])
+def test_the_model_of_the_sex_that_markers_tell_is_used(models, layout, sex):
+    side = -SIDE if sex == "female" else SIDE
+    betas = np.array([side, 0.5, -0.4])
+    found = mosh_by_sex(models, markers(models, layout, betas), layout, QUICK)
+    assert found.guess.sex == sex and found.guess.margin * side > 0 and found.guess.probability > 0.7
+    assert found.model is models[sex]
+    np.testing.assert_allclose(found.neutral.betas, betas, atol=0.5)
+    assert abs(found.result.betas[0]) < 0.6                    # the mean of the sex is near
+    assert [motion.gender for motion in found.result.motions] == [sex]
+    assert np.nanmean(found.result.motions[0].residuals) < 4e-3
+
+
+def test_several_sequences_are_one_person(models, layout):
+    betas = np.array([-SIDE, 0.2, 0.1])
+    both = [markers(models, layout, betas), markers(models, layout, betas, 1.0)]
+    found = mosh_by_sex(models, both, layout, replace(QUICK, soft_tissue=True))
+    assert found.guess.sex == "female"
+    assert [motion.gender for motion in found.result.motions] == ["female"] * 2
+    assert [one.motion.gender for one in found.result.soft_tissue] == ["female"] * 2
+
+
+def test_refuses_models_that_cannot_tell(models, layout):
+    sequence = markers(models, layout, np.zeros(3))
+    for wrong, word in (({"neutral": models["neutral"]}, "female and male missing"),
+                        ({**models, "neutral": models["female"]}, "tells women from men"),
+                        ({**models, "male": replace(models["male"], template=models["male"].template.submesh(
+                            np.arange(700))[0])}, "'male'")):
+        with pytest.raises(ValueError, match=word):
+            mosh_by_sex(wrong, sequence, layout, QUICK)
+    checked_models(models)
