@@ -9,12 +9,14 @@ import numpy as np
 from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.surface import Surface
 from scanprep.matching.correlated import CorrelatedConfig, find_correspondences
-from scanprep.matching.nonrigid import register
+from scanprep.matching.nonrigid import Registration, register
 from scanprep.matching.schedule import RegistrationConfig
 
 from .layout import MarkerLayout
 from .symmetry import skin_points
 
+LOST = 0.3                           # of the target that the source does not cover: it is somewhere else
+DOUBTFUL = 0.05                      # a limb may be wrong
 Landmarks = tuple[np.ndarray, np.ndarray]
 
 
@@ -24,12 +26,13 @@ class CarryConfig:
 
     Attributes
     ----------
-    correspond : CorrelatedConfig
-        Of the search for pairs of places, without landmarks.
+    correspond : CorrelatedConfig or None
+        Of the search for pairs of places, without landmarks; None for bodies that stand alike in the same place, which
+        need no search.
     register : RegistrationConfig
     """
 
-    correspond: CorrelatedConfig = field(default_factory=CorrelatedConfig)
+    correspond: CorrelatedConfig | None = field(default_factory=CorrelatedConfig)
     register: RegistrationConfig = field(default_factory=RegistrationConfig)
 
 
@@ -83,6 +86,8 @@ def register_layout(layout: MarkerLayout, source: Mesh, target: Mesh, landmarks:
                     ) -> CarriedLayout:
     """Bring a layout onto another body: the source is registered to the target, and takes its markers along.
 
+    On a target of the same triangles, in whatever pose and shape, markers stay on their vertices.
+
     Parameters
     ----------
     layout : MarkerLayout
@@ -99,14 +104,18 @@ def register_layout(layout: MarkerLayout, source: Mesh, target: Mesh, landmarks:
     Raises
     ------
     ValueError
-        A layout of another body than the source, or what `register` raises.
+        A layout of another body than the source, a target on which the source was not found, or what `register`
+        raises.
     """
-    config, tell = config or CarryConfig(), progress or (lambda done, total: None)
+    config = config or CarryConfig()
     layout.place(source)                                              # refuses a layout of another body
-    hints = None
-    if landmarks is None:
-        hints = find_correspondences(source, target, config=config.correspond)
-    fit = register(source, target, landmarks, config.register, tell, hints)
+    if np.array_equal(source.faces, target.faces):
+        L = len(layout.labels)
+        return CarriedLayout(layout, np.zeros(L), np.ones(L), 0.0, np.nan, 0.0, target)
+    fit = _registered(source, target, landmarks, config, progress or (lambda done, total: None))
+    if fit.missed > LOST:
+        raise ValueError(f"target: the source could not be brought onto it, {fit.missed:.0%} of it stays uncovered; "
+                         "give landmarks, three at least, spread over the body")
     found = Surface(target).closest(skin_points(layout, fit.mesh))
     vertices = layout.vertices if layout.weights is None else \
         layout.vertices[np.arange(len(layout.labels)), layout.weights.argmax(axis=1)]
@@ -114,6 +123,18 @@ def register_layout(layout: MarkerLayout, source: Mesh, target: Mesh, landmarks:
                            layout.aliases, layout.loose)
     return CarriedLayout(carried, found.distances, fit.confidence[vertices], fit.rms, fit.landmark_rms, fit.missed,
                          fit.mesh)
+
+
+def _registered(source: Mesh, target: Mesh, landmarks: Landmarks | None, config: CarryConfig,
+                tell: Callable[[int, int], None]) -> Registration:
+    """By landmarks; else by places that look alike, and where that leaves much of the target, as both stand."""
+    if landmarks is not None or config.correspond is None:
+        return register(source, target, landmarks, config.register, tell)
+    alike = register(source, target, None, config.register, tell,
+                     find_correspondences(source, target, config=config.correspond))
+    if alike.missed <= DOUBTFUL:
+        return alike
+    return min(alike, register(source, target, None, config.register, tell), key=lambda fit: fit.missed)
 
 
 def _on_triangle(bary: np.ndarray) -> np.ndarray:

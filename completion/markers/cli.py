@@ -21,7 +21,6 @@ from .named import layout_names, layout_summaries
 from .symmetry import label_pairs
 
 LayoutArg = Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="LAYOUT")]
-DOUBTFUL = 0.05                      # of the target that the source does not cover
 
 COMMANDS = {
     "list": ("The marker sets that come along.", "completion.markers.cli:list_layouts"),
@@ -101,7 +100,7 @@ def carry_to(layout: LayoutArg, source: Path, target: Path, output: Output, land
     """
     from scanprep.pictures.shading import save_png
 
-    from .carry import register_layout
+    from .carry import DOUBTFUL, register_layout
     from .pictures import picture_layout
 
     ours, theirs = read_mesh(source), read_mesh(target, unit)

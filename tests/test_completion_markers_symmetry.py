@@ -1,0 +1,104 @@
+"""Left and right: labels, places of the skin, markers."""
+import numpy as np
+import pytest
+
+from completion.markers.layout import MarkerLayout
+from completion.markers.named import layout_names
+from completion.markers.symmetry import (
+    find_skin_mirror,
+    label_pairs,
+    marker_pairs,
+    mirrored_layout,
+    other_side,
+    side_of,
+    skin_points,
+)
+from scanprep.geometry.rotations import exp
+from scanprep.scanning.people import Person
+from scanprep.scanning.people_template import load
+
+PAIRS = [("LELB", "RELB"), ("L.Knee", "R.Knee"), ("left elbow", "right elbow"), ("Left Toe", "Right Toe"),
+         ("LEFT_TOE", "RIGHT_TOE"), ("elbow_l", "elbow_r"), ("KneeL", "KneeR"), ("toe in left leg", "toe in right leg"),
+         ("l_thigh", "r_thigh"), ("L.THIGH.1", "R.THIGH.1"), ("L1", "R1")]
+MIDDLE = ["C7", "STRN", "CLAV", "T10", "V.Sacral", "Rear.Head", "ARIEL", "SJN", "tip of nose", "M.CHEST.1", "leftover",
+          "Lumbar", "navel"]
+
+
+@pytest.fixture(scope="module")
+def person():
+    return Person().mesh
+
+
+@pytest.fixture(scope="module")
+def mirror(person):
+    return find_skin_mirror(person)
+
+
+@pytest.mark.parametrize(("left", "right"), PAIRS)
+def test_labels_name_their_partner(left, right):
+    assert (other_side(left), other_side(right)) == (right, left)
+    assert (side_of(left), side_of(right)) == (1, -1)
+
+
+@pytest.mark.parametrize("label", MIDDLE)
+def test_labels_of_the_middle_name_no_side(label):
+    assert other_side(label) is None and side_of(label) == 0
+
+
+def test_partners_by_label():
+    assert label_pairs(["RELB", "C7", "LELB", "RBAC"]).tolist() == [2, 1, 0, -1]
+
+
+def test_the_mirror_image_is_found_whatever_the_triangulation(person, mirror):
+    true = person.vertices[load().mirror]                           # known there, and not made use of
+    off = np.linalg.norm(mirror.image(person) - true, axis=1)
+    assert off.max() < 0.001 and (mirror.partner == load().mirror).mean() > 0.999 and mirror.returns < 0.0005
+    R, t = exp(np.array([1.0, 0.5, -2.0])), np.array([1.0, 2, 3])
+    turned = person.with_vertices(person.vertices @ R.T + t)
+    again = find_skin_mirror(turned)
+    np.testing.assert_allclose(again.image(turned), mirror.image(person) @ R.T + t, atol=1e-4)
+    np.testing.assert_allclose(np.abs(again.across), np.abs(mirror.across), atol=1e-4)
+
+
+def test_the_mirror_image_moves_with_the_body(person, mirror):
+    raised = np.zeros((16, 3))
+    raised[4] = [0, -0.6, 0]                                         # one arm
+    posed = person.with_vertices(Person().posed(raised))
+    off = np.linalg.norm(mirror.image(posed) - posed.vertices[load().mirror], axis=1)
+    assert off.max() < 0.002 and np.linalg.norm(posed.vertices - person.vertices, axis=1).max() > 0.3
+
+
+def test_who_does_not_stand_symmetrically_needs_landmarks(person):
+    body = person.with_vertices(Person().posed(np.random.default_rng(0).normal(0, 0.4, (16, 3))))
+    with pytest.raises(ValueError, match=r"template: expected one that stands symmetrically, .* landmarks"):
+        find_skin_mirror(body)
+    with pytest.raises(ValueError, match="landmarks: expected at least 3 pairs of left and right, found 1 among"):
+        find_skin_mirror(person, landmarks={"LELB": 3, "RELB": 5, "C7": 9})
+
+
+@pytest.mark.parametrize("name", layout_names())
+def test_places_tell_what_labels_tell(name, person, mirror):
+    layout = MarkerLayout.named(name, person)
+    by_label = label_pairs(layout.labels)
+    np.testing.assert_array_equal(layout.pairs(), by_label)
+    numbered = MarkerLayout(tuple(f"marker {i}" for i in range(len(layout.labels))), layout.vertices)
+    by_place = marker_pairs(numbered, person, mirror)
+    told = by_place >= 0
+    np.testing.assert_array_equal(by_place[by_place[told]], np.flatnonzero(told))               # an involution
+    np.testing.assert_array_equal(by_place[told], by_label[told])
+    assert told.sum() >= len(by_label) - 10                          # those that are meant to be lopsided have none
+
+
+@pytest.mark.parametrize("name", layout_names())
+def test_layouts_of_people_are_their_own_mirror_image(name, person, mirror):
+    layout = MarkerLayout.named(name, person)
+    pairs = layout.pairs()
+    back = mirrored_layout(layout, person, mirror)
+    twice = mirrored_layout(back, person, mirror)
+    assert twice.labels == layout.labels and set(twice.loose) == set(layout.loose)
+    assert np.linalg.norm(skin_points(twice, person) - skin_points(layout, person), axis=1).max() < 0.001
+    both = [i for i in range(len(pairs)) if pairs[i] >= 0 and layout.labels[i][1:] not in ("FRM", "THI", "TIB", "SHN",
+                                                                                         "UPA", ".Shank", ".Thigh")]
+    partner = skin_points(layout, person)[pairs[both]]
+    mirrored = skin_points(back, person)[[back.labels.index(layout.labels[j]) for j in pairs[both]]]
+    assert np.linalg.norm(partner - mirrored, axis=1).max() < 0.001
