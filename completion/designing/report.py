@@ -43,7 +43,7 @@ def picture_design(design: MarkerDesign, body: Mesh, candidates: MarkerLayout, k
 def chart_curve(design: MarkerDesign) -> Any:
     """A matplotlib figure: the error over the number of markers."""
     from matplotlib.figure import Figure
-    from matplotlib.ticker import ScalarFormatter
+    from matplotlib.ticker import NullLocator, ScalarFormatter
 
     figure = Figure(figsize=(7.5, 3.4))
     axes = figure.add_subplot()
@@ -55,8 +55,11 @@ def chart_curve(design: MarkerDesign) -> Any:
                   label="by full refits")
     axes.axhline(1000 * design.floor, color="0.6", linewidth=0.8, linestyle=":", label="whole surface seen")
     axes.set(xlabel="markers", ylabel="RMSE of all vertices (mm)", yscale="log")
+    low, high = axes.get_ylim()
+    axes.set_yticks([tick for power in range(-2, 5) for tick in np.array([1, 1.5, 2, 3, 5, 7]) * 10.0**power
+                     if low <= tick <= high], minor=False)
     axes.yaxis.set_major_formatter(ScalarFormatter())
-    axes.yaxis.set_minor_formatter(ScalarFormatter())
+    axes.yaxis.set_minor_locator(NullLocator())
     axes.legend(frameon=False)
     return figure
 
