@@ -9,6 +9,7 @@ from completion.markers.layout import MarkerLayout
 from completion.markers.named import FOLDER, faces_digest, fitting_layout, layout_names
 from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.rotations import exp
+from scanprep.geometry.surface import Surface
 from scanprep.scanning.people import Person
 
 COUNTS = {"biomech57": 57, "cmu41": 41, "helenhayes29": 29, "mosh67": 67, "plugingait39": 39, "vicon47": 47}
@@ -114,3 +115,42 @@ def test_the_layout_that_knows_most_labels_is_found(person):
         assert fitting_layout(layout.labels, person)[1] == name
     with pytest.raises(ValueError, match="expected at least 3 markers of the layout, found 1"):
         fitting_layout(["C7", "x", "y"], person)
+
+
+ON = {"head": ("FHD", "BHD", "AH", "PH", "ARIEL", "Head"), "chest": ("CLAV", "STRN", "SJN", "SXS", "BAC", "BAK", "PEC"),
+      "upper_arm": ("UPA", "UA", "TRI"), "forearm": ("FRM",), "hand": ("FIN", "THMB", "HM2"),
+      "thigh": ("THI", "TH", "QUA", "HAM", "Thigh"), "shin": ("SHN", "TIB", "SK", "CAL", "TTC", "Shank"),
+      "foot": ("TOE", "HEE", "MT5", "MT1", "FM1", "FM2", "FM5", "DP1", "FCC", "Heel", "Toe"),
+      "pelvis": ("FWT", "BWT", "ASI", "PSI", "IAS", "IPS", "ASIS", "GLU", "V.Sacral")}
+NEIGHBOURS = {"pelvis": ("abdomen", "thigh"), "chest": ("abdomen",)}         # parts end where their borders were drawn
+
+
+@pytest.mark.parametrize("name", COUNTS)
+def test_labels_lie_on_the_part_that_the_anatomy_says(name, person):
+    skeleton = Person().skeleton
+    layout = MarkerLayout.named(name, person)
+    parts = [skeleton.names[p] for p in skeleton.part_of_vertex(person)[layout.vertices]]
+    told = 0
+    for label, part in zip(layout.labels, parts, strict=True):
+        for stem, ends in ON.items():
+            if label in ends or (label not in MIDDLE and label[1:].lstrip(".") in ends):
+                told += 1
+                assert part.split("_", 1)[-1] in (stem, *NEIGHBOURS.get(stem, ())) or stem == part, (label, part)
+                if "_" in part:
+                    assert part[0] == label[0].lower(), (label, part)
+    assert told > 0.35 * len(layout.labels)
+
+
+@pytest.mark.parametrize("name", COUNTS)
+def test_no_marker_is_inside(name, person):
+    layout = MarkerLayout.named(name, person)
+    points = layout.place(person)
+    found = Surface(person).closest(points)
+    above = np.einsum("ld,ld->l", points - found.points, person.face_normals[found.faces])
+    assert above.min() > 0.004 and (above < np.asarray(layout.distances) + 1e-9).all()
+
+
+def test_mosh67_is_vicon47_and_twenty_more(person):
+    few, many = (MarkerLayout.named(name, person) for name in ("vicon47", "mosh67"))
+    assert set(few.labels) < set(many.labels) and many.aliases == few.aliases and not many.loose
+    np.testing.assert_array_equal(many.select(few.labels).vertices, few.vertices)

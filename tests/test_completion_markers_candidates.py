@@ -1,4 +1,6 @@
 """Candidates for marker sets: symmetric, spread out, where a marker can sit."""
+from itertools import pairwise
+
 import numpy as np
 import pytest
 
@@ -57,7 +59,7 @@ def test_candidates_are_spread_over_the_skin(candidates, person):
     assert nearest[47:].min() > 0.05
     gaps = [nearest_before(apart, i) for i in range(47, 114)]                # each as far as the one before, or less
     pairs = candidates.pairs()
-    assert all(b < a + 0.02 for a, b in zip(gaps, gaps[1:], strict=False)) and (pairs[47:] != np.arange(47, 114)).any()
+    assert all(b < a + 0.02 for a, b in pairwise(gaps)) and (pairs[47:] != np.arange(47, 114)).any()
 
 
 def nearest_before(apart, i):

@@ -24,7 +24,7 @@ FIXED, LOOSE = (0.86, 0.24, 0.20), (0.93, 0.62, 0.12)
 INK = (24, 40, 92)
 
 
-def picture_layout(body: Mesh, layout: MarkerLayout, height: int = HEIGHT) -> np.ndarray:
+def picture_layout(body: Mesh, layout: MarkerLayout, height: int | None = None) -> np.ndarray:
     """A body from four sides with its markers, each named where it is in sight; loose ones in another colour.
 
     Parameters
@@ -32,13 +32,13 @@ def picture_layout(body: Mesh, layout: MarkerLayout, height: int = HEIGHT) -> np
     body : Mesh
         Standing.
     layout : MarkerLayout
-    height : int, pixels
+    height : int, pixels, optional
 
     Returns
     -------
     (H, W, 3) uint8
     """
-    cameras = look_around(body)
+    cameras, height = look_around(body), height or HEIGHT
     width = int(height * max(c.width / c.height for c in cameras)) + 100
     return side_by_side([_side(body, layout, camera, width, height) for camera in cameras], SIDES)
 

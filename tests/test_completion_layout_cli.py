@@ -1,0 +1,129 @@
+"""`scape layout`: what is listed, shown and carried, and what is refused in one line."""
+import json
+
+import numpy as np
+import pytest
+from people_bodies import small_people
+
+from completion.__main__ import main
+from completion.markers import carry, pictures
+from completion.markers.layout import MarkerLayout
+from completion.markers.named import layout_names
+from completion.markers.pictures import marker_rows, picture_layout
+from scanprep import read_mesh, write_landmarks, write_mesh
+from scanprep.matching.nonrigid import Registration
+from scanprep.scanning.people import Person
+
+
+@pytest.fixture(autouse=True)
+def small_pictures(monkeypatch):
+    monkeypatch.setattr(pictures, "HEIGHT", 150)
+
+
+@pytest.fixture(scope="module")
+def person():
+    return Person()
+
+
+def test_the_sets_are_listed_with_their_bodies(capsys):
+    assert main(["layout", "list"]) == 0
+    said = capsys.readouterr().out
+    assert all(name in said for name in layout_names()) and "SCAPE and SPRING" in said.replace("\n", " ")
+
+
+def test_a_layout_is_shown_on_a_mesh_and_can_be_used_again(tmp_path, person):
+    write_mesh(tmp_path / "body.ply", person.mesh)
+    assert main(["layout", "show", "vicon47", "--body", str(tmp_path / "body.ply"), "-o", str(tmp_path / "out")]) == 0
+    page = (tmp_path / "out" / "report.html").read_text()
+    layout = MarkerLayout.load(tmp_path / "out" / "layout.json", 9380)
+    assert all(label in page for label in layout.labels) and (tmp_path / "out" / "layout.png").stat().st_size > 5_000
+    figures = {m["metric"]: m["value"] for m in json.loads((tmp_path / "out" / "report.json").read_text())["metrics"]}
+    assert (figures["markers"], figures["pairs of left and right"], figures["without a side"]) == (47, 21, 5)
+    named = MarkerLayout.named("vicon47", person.mesh)
+    assert set(zip(layout.labels, layout.vertices.tolist(), strict=True)) == \
+        set(zip(named.labels, named.vertices.tolist(), strict=True))
+
+
+def test_a_layout_is_shown_on_a_model(tmp_path):
+    small_people().save(tmp_path / "model.npz")
+    assert main(["layout", "show", "mosh67", "-m", str(tmp_path / "model.npz"), "-o", str(tmp_path / "out")]) == 0
+    assert len(MarkerLayout.load(tmp_path / "out" / "layout.json").labels) == 67
+    assert "upper_arm" in (tmp_path / "out" / "report.html").read_text()
+
+
+def test_the_picture_shows_every_marker(person):
+    layout = MarkerLayout.named("helenhayes29", person.mesh)
+    bare = MarkerLayout(layout.labels[:1], layout.vertices[:1])
+    full, one = (picture_layout(person.mesh, x, 220).astype(int) for x in (layout, bare))
+    assert full.shape == one.shape and full.shape[0] > 220
+    assert (np.abs(full - one).sum(axis=2) > 60).sum() > 28 * 25         # balls and words that only one of them has
+
+
+def test_the_table_has_partners_and_parts(person):
+    layout = MarkerLayout.named("cmu41", person.mesh)
+    rows = {row[0]: row for row in marker_rows(person.mesh, layout, person.skeleton)}
+    assert rows["LELB"][3] == "RELB" and rows["C7"][3] == "middle" and rows["RBAC"][3] == "-"
+    assert rows["LTHI"][2] == "l_thigh" and rows["LTHI"][5] == "loose" and rows["LWRA"][4] == "45.0 mm"
+    assert "RBAK" in rows["RBAC"][1]
+
+
+def test_carrying_writes_layout_picture_and_registration(tmp_path, person, monkeypatch):
+    """With a registration that is known: the command passes landmarks on by name and says how it went."""
+    seen = {}
+
+    def perfect(source, target, landmarks, *rest):
+        seen["landmarks"] = landmarks
+        nothing = np.zeros(len(source.vertices))
+        return Registration(source, nothing, nothing == 0, 0.001, 0.002, True, 1, {}, 0, nothing + 1, 0.06)
+
+    monkeypatch.setattr(carry, "register", perfect)
+    body = person.mesh
+    write_mesh(tmp_path / "a.ply", body)
+    write_mesh(tmp_path / "b.ply", type(body)(body.vertices[::-1], len(body.vertices) - 1 - body.faces))
+    write_landmarks(tmp_path / "a.landmarks.json", {"nose": 5, "heel": 9, "toe": 700, "ear": 8})
+    marks = {"toe": 700, "heel": 9, "nose": 5}
+    write_landmarks(tmp_path / "b.json", {name: body.vertices[v] for name, v in marks.items()})
+    out = tmp_path / "b.layout.json"
+    assert main(["layout", "carry", "vicon47", "--source", str(tmp_path / "a.ply"), "--target", str(tmp_path / "b.ply"),
+                 "--landmarks", str(tmp_path / "b.json"), "-o", str(out)]) == 0
+    assert seen["landmarks"][0].tolist() == [5, 9, 700]
+    target = read_mesh(tmp_path / "b.ply")
+    np.testing.assert_allclose(MarkerLayout.load(out, 9380).select(["C7", "LELB"]).place(target),
+                               MarkerLayout.named("vicon47", body).select(["C7", "LELB"]).place(body), atol=2e-3)
+    assert out.with_suffix(".png").exists() and len(read_mesh(out.with_suffix(".registered.ply")).vertices) == 9380
+    figures = {m["metric"]: m["value"] for m in json.loads((tmp_path / "b.layout.report.json").read_text())["metrics"]}
+    assert figures["target not covered"] == pytest.approx(6) and figures["landmarks"] == 3
+
+
+BAD = {
+    "neither name nor file": ("show nobody --body body.ply -o out", ["nobody", "vicon47"]),
+    "another body": ("show vicon47 --body ball.ply -o out", ["vicon47", "9380", "4 vertices"]),
+    "a layout of another body": ("show big.json --body ball.ply -o out", ["big.json", "vertex 77"]),
+    "a mesh that is not there": ("show vicon47 --body none.ply -o out", ["none.ply", "no such file"]),
+    "a body and a model": ("show vicon47 --body body.ply -m model.npz -o out", ["--model", "--body"]),
+    "a source of another body": ("carry vicon47 --source ball.ply --target body.ply -o o.json",
+                                 ["vicon47", "4 vertices"]),
+    "landmarks that do not match": ("carry vicon47 --source body.ply --target ball.ply --landmarks far.json -o o.json",
+                                    ["far.json", "nose", "chin"]),
+    "no landmarks of the source": ("carry vicon47 --source lonely/body.ply --target ball.ply --landmarks far.json "
+                                   "-o o.json", ["body.landmarks.json"]),
+    "a damaged layout": ("show broken.json --body body.ply -o out", ["broken.json", "JSON"]),
+}
+
+
+@pytest.mark.parametrize("case", BAD)
+def test_bad_input_gives_one_line(case, tmp_path, person, monkeypatch, capsys):
+    monkeypatch.chdir(tmp_path)
+    write_mesh("body.ply", person.mesh)
+    write_mesh("lonely/body.ply", person.mesh)
+    ball = np.array([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1.0]])
+    write_mesh("ball.ply", type(person.mesh)(ball, [[0, 2, 1], [0, 1, 3], [0, 3, 2], [1, 2, 3]]))
+    MarkerLayout(("A",), np.array([77])).save("big.json")
+    write_landmarks("body.landmarks.json", {"nose": 5, "heel": 9, "toe": 700})
+    write_landmarks("far.json", {"chin": [0.0, 0, 0]})
+    (tmp_path / "broken.json").write_text("{oops")
+    command, words = BAD[case]
+    assert main(["layout", *command.split()]) == 1
+    said = [line for line in capsys.readouterr().err.splitlines() if line.strip() and "note:" not in line]
+    assert len(said) == 1 and all(word in said[0] for word in words), said
+    assert not (tmp_path / "out").exists() and not (tmp_path / "o.json").exists()

@@ -1,0 +1,80 @@
+"""A layout on another triangulation."""
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from people_bodies import kept, small_people
+
+from completion.markers.carry import CarryConfig, carry_layout, register_layout
+from completion.markers.layout import MarkerLayout
+from completion.markers.symmetry import skin_points
+from scanprep.cleaning.decimate import decimate
+from scanprep.geometry.mesh import Mesh
+from scanprep.geometry.rotations import exp
+from scanprep.matching.schedule import RegistrationConfig
+
+NEAR = CarryConfig(None, replace(RegistrationConfig(), graph=()))          # bodies that lie on each other already
+
+
+@pytest.fixture(scope="module")
+def body():
+    return small_people().template
+
+
+@pytest.fixture(scope="module")
+def layout(body):
+    return MarkerLayout.named("cmu41", body, kept())
+
+
+def renumbered(body, rng):
+    order = rng.permutation(len(body.vertices))
+    return Mesh(body.vertices[order], np.argsort(order)[body.faces][rng.permutation(len(body.faces))]), order
+
+
+def test_on_the_same_triangles_markers_stay_where_they_are(body, layout):
+    model = small_people()
+    posed = body.with_vertices(model.vertices(np.random.default_rng(0).normal(0, 0.5, (16, 3)), np.ones(model.n_betas)))
+    found = register_layout(layout, body, posed)
+    assert found.layout is layout and found.registered is posed and found.rms == 0 and (found.confidence == 1).all()
+
+
+def test_renumbered_vertices_and_triangles_change_nothing(body, layout):
+    target, _ = renumbered(body, np.random.default_rng(1))
+    found = register_layout(layout, body, target, config=NEAR)
+    off = np.linalg.norm(skin_points(found.layout, target) - skin_points(layout, body), axis=1)
+    assert off.mean() < 0.002 and off.max() < 0.012 and found.missed < 0.001 and found.rms < 0.0005
+    assert found.layout.labels == layout.labels and found.layout.loose == layout.loose
+    assert found.layout.aliases == layout.aliases
+    np.testing.assert_array_equal(found.layout.distances, layout.distances)
+    assert (found.layout.weights >= 0).all() and (found.distances < 0.002).all()
+    np.testing.assert_array_equal(np.sort(found.registered.faces, axis=None), np.sort(body.faces, axis=None))
+
+
+def test_fewer_triangles_of_one_body_and_back(body, layout):
+    small = decimate(body, 1400)
+    there = carry_layout(layout, body, small, config=NEAR)
+    off = np.linalg.norm(skin_points(there, small) - skin_points(layout, body), axis=1)
+    back = carry_layout(there, small, body, config=NEAR)
+    returned = np.linalg.norm(skin_points(back, body) - skin_points(layout, body), axis=1)
+    assert off.mean() < 0.005 and returned.mean() < 0.005 and max(off.max(), returned.max()) < 0.03
+
+
+def test_carrying_turns_with_the_bodies(body, layout):
+    target = decimate(body, 1400)
+    R, t = exp(np.array([0.3, -0.8, 1.9])), np.array([1.0, -2, 0.5])
+    turn = lambda mesh: mesh.with_vertices(mesh.vertices @ R.T + t)          # noqa: E731
+    here = carry_layout(layout, body, target, config=NEAR)
+    there = carry_layout(layout, turn(body), turn(target), config=NEAR)
+    off = np.linalg.norm(skin_points(there, turn(target)) - (skin_points(here, target) @ R.T + t), axis=1)
+    assert np.median(off) < 1e-5 and off.mean() < 0.001                      # where points tie, nearest ones may differ
+
+
+def test_what_does_not_fit_is_refused(body, layout):
+    target, _ = renumbered(body, np.random.default_rng(1))
+    far = target.with_vertices(target.vertices + 5)
+    with pytest.raises(ValueError, match=r"target: the source could not be brought onto it, 100% .* give landmarks"):
+        carry_layout(layout, body, far, config=replace(NEAR, register=replace(NEAR.register, settle=None)))
+    with pytest.raises(ValueError, match="marker 'A' sits on vertex 99999"):
+        carry_layout(MarkerLayout(("A",), np.array([99_999])), body, target)
+    with pytest.raises(ValueError, match="landmarks: expected"):
+        carry_layout(layout, body, target, (np.array([1]), np.zeros((1, 3))), NEAR)
