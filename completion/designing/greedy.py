@@ -9,8 +9,8 @@ import numpy as np
 from .linear import LinearBodies
 
 Groups = Sequence[tuple[int, ...]]
+State = tuple[np.ndarray, ...]
 ADD, REMOVE = 1, -1
-ANEW = 40                            # steps after which everything is solved for from nothing
 LEAST_GAIN = 1e-6                    # share of the mean squared distance below which nothing is exchanged
 
 
@@ -71,16 +71,15 @@ class MarkerSets:
         width = r * max(len(group) for group in groups)
         self.sizes = np.array([len(group) for group in groups])
         self.inside = np.isin(np.arange(len(groups)), np.array(sorted(chosen), dtype=np.int64))
-        self._linear, self._groups, self._taken = linear, groups, 0
+        self._linear, self._groups = linear, groups
         self._rows, self._gaps = np.zeros((Z, len(groups), width, P)), np.zeros((Z, len(groups), width))
         for i, group in enumerate(groups):
             self._rows[:, i, :r * len(group)] = linear.rows[:, group].reshape(Z, -1, P)
             self._gaps[:, i, :r * len(group)] = linear.gaps[:, group].reshape(Z, -1)
-        self._S, self._F = np.empty((2, Z, len(groups), width, width))
-        self._solve()
+        self.renew()
 
-    def _solve(self) -> None:
-        """Everything from nothing, free of what many updates have rounded."""
+    def renew(self) -> None:
+        """Solve from nothing, free of what updates have rounded."""
         linear, (Z, _, _, P) = self._linear, self._rows.shape
         members = [c for group, inside in zip(self._groups, self.inside, strict=True) if inside for c in group]
         B = linear.rows[:, members].reshape(Z, -1, P)
@@ -90,6 +89,7 @@ class MarkerSets:
         slope = ((linear.gram @ d[..., None])[..., 0] - linear.pull)[..., None]
         self._rho = self._gaps - (self._rows @ d[:, None, :, None])[..., 0]
         self._q = (self._rows @ (self._C @ slope)[:, None])[..., 0]
+        self._S, self._F = np.empty((2, *self._gaps.shape, self._gaps.shape[-1]))
         for z in range(Z):                               # one body after the other: the products are as large as rows
             W = self._rows[z] @ self._C[z]
             self._S[z] = W @ np.swapaxes(self._rows[z], -1, -2)
@@ -133,9 +133,14 @@ class MarkerSets:
         self._F += KM @ F[:, None] @ np.swapaxes(KM, -1, -2) - sign * (cross + np.swapaxes(cross, -1, -2))
         self._C -= sign * (np.swapaxes(U, -1, -2) @ M @ U)
         self.inside[group] = sign == ADD
-        self._taken += 1
-        if self._taken % ANEW == 0:
-            self._solve()
+
+    def state(self) -> State:
+        """What `put_back` takes to undo steps: updates there and back again would lose digits."""
+        return tuple(a.copy() for a in (self.inside, self.costs, self._C, self._S, self._F, self._rho, self._q))
+
+    def put_back(self, state: State) -> None:
+        """Be again what it was; the state is used up."""
+        self.inside, self.costs, self._C, self._S, self._F, self._rho, self._q = state
 
 
 def walk(sets: MarkerSets, sign: int, movable: np.ndarray, until: int, through: Collection[int] = (),
@@ -213,18 +218,15 @@ def exchange(sets: MarkerSets, movable: np.ndarray, rounds: int) -> int:
 
 def _exchanged(sets: MarkerSets, movable: np.ndarray, out: list[int]) -> bool:
     """Let groups of the set go for what serves best in their place; put them back where nothing is better."""
-    before = sets.costs.mean()
+    before, cost = sets.state(), sets.costs.mean()
     for group in out:
         sets.take(group, REMOVE)
     new = _filled(sets, movable, int(sets.sizes[out].sum()))
-    if set(new) == set(out):
-        return False
-    if sets.costs.mean() < before * (1 - LEAST_GAIN):
-        return True
-    for group in new:
-        sets.take(group, REMOVE)
-    for group in out:
-        sets.take(group, ADD)
+    if set(new) != set(out) and sets.costs.mean() < cost * (1 - LEAST_GAIN):
+        sets.renew()
+        if sets.costs.mean() < cost * (1 - LEAST_GAIN):
+            return True
+    sets.put_back(before)
     return False
 
 
@@ -235,11 +237,12 @@ def _filled(sets: MarkerSets, movable: np.ndarray, size: int) -> list[int]:
     if size == 1 or single < 0:
         sets.take(whole, ADD)
         return [whole]
+    before = sets.state()
     sets.take(single, ADD)
     second, together = _best(sets, movable, size - 1)
     if second >= 0 and together < cost:
         return [single, *_filled(sets, movable, size - 1)]
-    sets.take(single, REMOVE)
+    sets.put_back(before)
     sets.take(whole, ADD)
     return [whole]
 
