@@ -237,8 +237,10 @@ def run_exchanges(model: BodyModel, case: Case, faulty: Faulty, reference: np.nd
     mended = followed(model, case, found.repaired)
     away = [float(np.linalg.norm(surface(s, m) - reference, axis=2).mean())
             for s, m in ((subject, raw), (mended[0], mended[2]))]
+    on_it = animate(mended[0], case.markers, mended[1])               # what the true markers are off on that person
     return scores(found.exchanges, faulty.exchanges, faulty.markers) | {
         "bad": len(found.bad), "raw_mm": 1e3 * away[0], "mended_mm": 1e3 * away[1],
+        "true_markers_mm": 1e3 * float(np.nanmean(on_it.residuals)),
         "frames_per_cpu_s": len(faulty.markers.positions) / seconds}
 
 
@@ -252,11 +254,11 @@ def cases(model: BodyModel, args: argparse.Namespace) -> list[Case]:
         held = spring_split(len(data.shapes))[1] if args.held_out else np.array(
             [j for i, j in enumerate(spring_split(len(data.shapes))[0]) if i % 5 == 0])
         for i, j in enumerate(held[:: max(1, len(held) // args.men)][:args.men]):
-            real = out[i % len(args.files or out)]
+            real = [case for case in out if case.truth is None][i % sum(case.truth is None for case in out)]
             _, _, motion = followed(model, real, real.markers)
             out.append(simulated(model, data.shapes[j], motion, layout, f"man {j} as {real.name}",
                                  np.random.default_rng(int(j))))
-    return out
+    return out if args.real else [case for case in out if case.truth]
 
 
 def main() -> None:
@@ -267,6 +269,7 @@ def main() -> None:
     parser.add_argument("-o", "--output", default="mosh_faults.json")
     parser.add_argument("--files", nargs="*")
     parser.add_argument("--men", type=int, default=4)
+    parser.add_argument("--real", action=argparse.BooleanOptionalAction, default=True, help="the files themselves too")
     parser.add_argument("--held-out", action="store_true", help="the 45 men kept for the end")
     parser.add_argument("--seed", type=int, default=0)
     args = parser.parse_args()
