@@ -16,6 +16,7 @@ from completion.moshing.pictures import every
 from completion.moshing.recordings import Grouping, find_actors
 from completion.moshing.results import SoftTissue
 from completion.moshing.takes import held_out
+from model.learning.sex_plane import SexPlane
 
 FRAMES = 40
 BETAS = {"ann": np.array([0.9, -0.6, 0.4]), "bob": np.array([-0.8, 0.5, -0.3])}
@@ -77,7 +78,8 @@ def done(place, tmp_path_factory):
     """The two recordings of ann, two markers held out."""
     out = tmp_path_factory.mktemp("done") / "out"
     files = [place / "people" / "ann" / f"{name}.csv" for name in ("walk", "run")]
-    assert run(place, *files, "-o", out, "--name", "ann", "--hold-out", "M7,M9", "--factor", "2") == 0
+    assert run(place, *files, "-o", out, "--name", "ann", "--hold-out", "M7,M9", "--factor", "2",
+               "--character", place / "model.npz") == 0
     return out
 
 
@@ -85,7 +87,8 @@ def test_everything_is_written(done):
     assert {p.name for p in done.iterdir()} == {"ann", "report.html", "report.json", "subjects.csv"}
     assert {p.name for p in (done / "ann").iterdir()} == PERSON | {"walk", "run"}
     for name in ("walk", "run"):
-        assert {p.name for p in (done / "ann" / name).iterdir()} == TAKE | {"exaggerated.glb"}
+        assert {p.name for p in (done / "ann" / name).iterdir()} == TAKE | {
+            "exaggerated.glb", "character.glb", "character.npz"}
 
 
 def test_the_body_is_the_one_that_carried_the_markers(done, place):
@@ -217,7 +220,12 @@ def test_who_is_who(tmp_path):
     assert names(find_actors(files, Grouping())) == {"85": ["85_02", "a"]}
     assert names(find_actors(files, Grouping(name="me & you"))) == {"me_you": ["85_02", "a"]}
     assert names(find_actors(files, Grouping("each"))) == {"85_02": ["85_02"], "a": ["a"]}
-    assert names(find_actors([tmp_path], Grouping(), tmp_path / "zoe")).keys() == {"85", "7", "a_b", "a", "Eve", "Adam"}
+    others = {"85", "7", "a_b", "a", "Eve", "Adam"}
+    assert names(find_actors([tmp_path], Grouping(), tmp_path / "zoe")).keys() == others
+    with pytest.raises(ValueError, match="expected a folder for the output that does not hold the recordings"):
+        find_actors([tmp_path], Grouping(), tmp_path.parent)
+    empty(tmp_path / "zoe" / "subjects.csv", tmp_path / "zoe" / "report.html")      # the output of an earlier call
+    assert names(find_actors([tmp_path], Grouping())).keys() == others
 
 
 @pytest.mark.parametrize("ending", ["csv", "json"])
@@ -238,9 +246,24 @@ def test_every_so_many_frames_are_a_round_number(count, step):
     assert every(count) == step
 
 
+def test_the_model_of_the_sex_that_the_markers_tell(place, tmp_path):
+    model = worm_with_prior()
+    model.info["sex_plane"] = SexPlane(np.array([1.0, 0, 0]), 0.0, 40, 0.95, 5.0).kept()
+    model.save(tmp_path / "neutral.npz")
+    shutil.copytree(place / "people", tmp_path / "people", ignore=shutil.ignore_patterns("walk.csv"))
+    words = ["--female", place / "model.npz", "--male", place / "model.npz", "--no-soft-tissue"]
+    assert main(["mosh", str(tmp_path / "people"), "-m", str(tmp_path / "neutral.npz"), "-o", str(tmp_path / "out"),
+                 "--layout", str(place / "layout.json"), *map(str, words), *QUICK]) == 0
+    for person, take, sex in (("ann", "run", "male"), ("bob", "jump", "female")):
+        assert told(tmp_path / "out" / person)["sex"] == sex
+        assert json.loads((tmp_path / "out" / person / "subject.json").read_text())["sex"]["sex"] == sex
+        assert Motion.load(tmp_path / "out" / person / take / "motion.npz").gender == sex
+
+
 @pytest.mark.parametrize("words, message", [
     (("--hold-out", "M99"), "--hold-out: labels: M99 not among M0"),
     (("--female", "model.npz"), "--female and --male: expected both or none"),
+    (("--female", "f.npz", "--male", "m.npz", "--character", "c.npz"), "--character: it is made of one model"),
     (("--subjects", "no.csv"), "no.csv: cannot be read"),
 ])
 def test_wrong_words_are_one_line(place, tmp_path, capsys, words, message):

@@ -68,7 +68,7 @@ def chart_map(take: Take) -> Any:
     return figure
 
 
-def chart_faults(take: Take) -> Any:
+def chart_timeline(take: Take) -> Any:
     """When which marker was missing, not believed, exchanged with another, or elsewhere than the body says."""
     markers, faults = take.markers, take.faults
     touched = {label for e in faults.exchanges for label in (e.first, e.second)} | {b.label for b in faults.bad}

@@ -95,9 +95,13 @@ def find_actors(markers: Iterable[Path], grouping: Grouping, output: Path | None
     Raises
     ------
     ValueError
-        No marker files, no such file, a table that names a file that is not there, one name for several people.
+        No marker files, no such file, an output around the recordings, a table that names a file that is not there,
+        one name for several people.
     """
     given = list(markers)
+    for place in given:
+        if output is not None and place.is_dir() and output.resolve() in (place.resolve(), *place.resolve().parents):
+            raise ValueError(f"{output}: expected a folder for the output that does not hold the recordings, {place}")
     found = list(_files(given, output, grouping.table))
     if not found:
         raise ValueError(f"{', '.join(map(str, given))}: expected files ending in {', '.join(ENDINGS)}, found none")
@@ -144,14 +148,17 @@ class _File:
 def _files(given: list[Path], output: Path | None, table: Path | None) -> Iterator[_File]:
     """The files that were named, and the marker files of the folders that were, each once."""
     seen: set[Path] = {p.resolve() for p in (table,) if p is not None}
-    ours = None if output is None else output.resolve()
+    outputs = {output.resolve()} if output is not None else set()
     for place in given:
         if not place.exists():
             raise ValueError(f"{place}: no such file or folder")
+        if place.is_dir():                             # nor what an earlier call has written
+            outputs |= {found.parent.resolve() for found in place.rglob(TABLE)
+                        if (found.parent / "report.html").exists()}
         for path in sorted(place.rglob("*")) if place.is_dir() else [place]:
             parts, whole = path.relative_to(place).parts, path.resolve()
             if place.is_dir() and (path.suffix.lower() not in ENDINGS or any(part.startswith(".") for part in parts)
-                                   or ours in whole.parents):
+                                   or outputs & set(whole.parents)):
                 continue
             if whole not in seen:
                 seen.add(whole)

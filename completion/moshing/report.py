@@ -1,6 +1,7 @@
 """The pages of `scape mosh`: one for a person, one for each sequence."""
 from __future__ import annotations
 
+import io
 import json
 from collections.abc import Mapping, Sequence
 from html import escape
@@ -17,7 +18,8 @@ from ..animation.report import MARKER, facing, worst_frames
 from ..cli import rows
 from ..markers.layout import MarkerLayout
 from . import pictures
-from .charts import MM, chart_faults, chart_frames, chart_map, mean_over
+from .charts import MM, chart_frames, chart_map, chart_timeline, mean_over
+from .faultchart import chart_faults
 from .results import MoshResult
 from .takes import Take
 
@@ -115,7 +117,18 @@ def _fault_section(page: Page, take: Take) -> None:
                    ("fault", "marker", "first frame", "last frame", "lasts (s)", "distance (mm)"))
     else:
         page.text("None was found.")
-    page.chart(chart_faults(take), "every marker over time")
+    page.chart(chart_timeline(take), "every marker over time")
+    if not {b.label for b in faults.bad}.union(*({e.first, e.second} for e in faults.exchanges)).isdisjoint(
+            faults.labels):
+        page.picture(_drawn(chart_faults(faults, take.markers)), "faulty markers: how far they were from where the "
+                     "body has them, and what is left of it")
+
+
+def _drawn(figure: Any) -> bytes:
+    """A chart as pixels: as lines it would grow with the sequence."""
+    out = io.BytesIO()
+    figure.savefig(out, format="png", dpi=130)
+    return out.getvalue()
 
 
 def _entry(page: Page, take: Take, metrics: Sequence[Metric]) -> None:

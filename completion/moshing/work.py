@@ -10,6 +10,7 @@ from typing import Any
 import numpy as np
 
 from model.body import BodyModel
+from model.learning.sex_plane import SexGuess
 from scanprep.console import Metric, Outcome, Progress, write_report
 from scanprep.pictures.page import Page
 from scanprep.pictures.sheets import save_png
@@ -80,7 +81,7 @@ class _Found:
     """A person."""
 
     model: BodyModel
-    sex: str | None
+    guess: SexGuess | None
     result: MoshResult
     takes: list[Take]
     usual: MarkerLayout
@@ -108,7 +109,7 @@ def mosh_person(work: Work, actor: Actor, folder: Path, command: str, solving: P
     start = time.perf_counter()
     found, failures = _solve(work, actor, solving)
     settings = {"mosh": work.config, "model": work.name, "layout": found.layout_name, "held out": work.hold_out}
-    about = {"model": work.name, "layout": found.layout_name, "held_out": work.hold_out, "sex": found.sex,
+    about = {"model": work.name, "layout": found.layout_name, "held_out": work.hold_out, "sex": found.guess,
              "recordings": [str(r.path) for r in actor.recordings]}
     write_person(folder, found.result, about)
     figures: dict[str, list[Metric]] = {}
@@ -134,10 +135,10 @@ def _solve(work: Work, actor: Actor, progress: Progress) -> tuple[_Found, list[s
         layout = usual.without(work.hold_out) if work.hold_out else usual
     except ValueError as error:
         raise ValueError(f"--hold-out: {error}") from None
-    model, sex = work.model, None
+    model, guess = work.model, None
     if work.sexes:
         told = mosh_by_sex({"neutral": work.model, **work.sexes}, sequences, layout, work.config, progress)
-        model, sex, result = told.model, told.guess.sex, told.result
+        model, guess, result = told.model, told.guess, told.result
     else:
         result = mosh(model, sequences, layout, work.config, progress)
     subject = model.subject(result.betas)
@@ -147,7 +148,7 @@ def _solve(work: Work, actor: Actor, progress: Progress) -> tuple[_Found, list[s
         held = held_out(model, usual, work.hold_out, markers, result.motions[i], soft)
         takes.append(Take(source.name, source.path, source.who, work.unit, model, subject, markers, result.motions[i],
                           soft, result.faults[i], held, light))
-    return _Found(model, sex, result, takes, usual, layout_name), failures
+    return _Found(model, guess, result, takes, usual, layout_name), failures
 
 
 def _read(work: Work, recordings: Sequence[Recording]) -> tuple[list[Recording], list[MarkerSequence], list[str]]:
@@ -188,8 +189,8 @@ def _person_metrics(found: _Found) -> list[Metric]:
             Metric("betas, length", float(np.linalg.norm(result.betas)), "sd"),
             Metric("markers moved, mean", float(moved.mean()), "mm"),
             Metric(f"markers moved, most ({result.layout.labels[int(moved.argmax())]})", float(moved.max()), "mm")]
-    if found.sex is not None:
-        told.insert(1, Metric("sex", found.sex))
+    if found.guess is not None:
+        told[1:1] = [Metric("sex", found.guess.sex), Metric("sex, probability", 100 * found.guess.probability, "%")]
     for stage, seconds in result.seconds.items():
         told.append(Metric(f"{stage}, time", seconds, "s") if stage == "person" else
                     Metric(f"{stage}, speed", frames / max(seconds, 1e-9), "frames/s"))
