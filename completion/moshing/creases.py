@@ -3,6 +3,7 @@ from __future__ import annotations
 
 import numpy as np
 from scipy.sparse import csc_array, csr_array, diags_array
+from scipy.sparse.csgraph import connected_components
 
 from model.body import BodyModel
 from scanprep.geometry.mesh import Mesh
@@ -60,11 +61,31 @@ class Creases:
             for rings in REACH:
                 if not bad.any():
                     break
-                trial = _laid(self._near, out[t], self.rest.faces[bad].ravel(), rings)
-                left = self.turned_over(trial, poses[t])
-                if left.sum() < bad.sum():
-                    out[t], bad = trial, left
+                out[t] = self._laid(out[t], poses[t], bad, rings)
+                bad = self.turned_over(out[t], poses[t])
         return out
+
+    def _laid(self, x: np.ndarray, pose: np.ndarray, bad: np.ndarray, rings: int) -> np.ndarray:
+        """Vertices (N, 3) with patches of so many rings around turned triangles (F,) laid where that turns some back."""
+        free = np.zeros(len(x))
+        free[self.rest.faces[bad]] = 1
+        for _ in range(rings - 1):
+            free = (free + self._near @ free > 0).astype(float)
+        mine = np.flatnonzero(free)
+        if len(mine) == len(x):
+            return x
+        count, patch = connected_components(self._near[mine][:, mine])
+        trial = x.copy()
+        trial[mine] = _membrane(self._near[mine], mine, np.where(free[:, None] > 0, 0.0, x))
+        left = self.turned_over(trial, pose)
+        of_vertex = np.full(len(x), -1)
+        of_vertex[mine] = patch
+        of_face = of_vertex[self.rest.faces].max(axis=1)                      # no triangle touches two patches
+        better = np.bincount(of_face[left & (of_face >= 0)], minlength=count) < np.bincount(of_face[bad],
+                                                                                           minlength=count)
+        kept = mine[~better[patch]]
+        trial[kept] = x[kept]
+        return trial
 
 
 def at_rest(model: BodyModel, betas: np.ndarray | None = None) -> Mesh:
@@ -74,18 +95,13 @@ def at_rest(model: BodyModel, betas: np.ndarray | None = None) -> Mesh:
                                                        else betas))
 
 
-def _laid(adjacency: csr_array, x: np.ndarray, seeds: np.ndarray, rings: int) -> np.ndarray:
-    """Vertices (N, 3) where those within so many rings of some lie in the middle of their neighbours."""
-    free = np.zeros(len(x))
-    free[seeds] = 1
-    for _ in range(rings - 1):
-        free = (free + adjacency @ free > 0).astype(float)
-    mine = np.flatnonzero(free)
-    if len(mine) == len(x):
-        return x
-    A = adjacency[mine]
-    inside = csc_array(diags_array(np.asarray(A.sum(axis=1)).ravel()) - A[:, mine])
-    around = A @ np.where(free[:, None] > 0, 0.0, x)
-    x = x.copy()
-    x[mine] = factor(inside)(around)
-    return x
+def _membrane(adjacency: csr_array, mine: np.ndarray, fixed: np.ndarray) -> np.ndarray:
+    """Places (n, 3) of vertices `mine` in the middle of their neighbours, the rows of `adjacency` (n, N).
+
+    Parameters
+    ----------
+    fixed : (N, 3) float, metres
+        Zero where vertices are free.
+    """
+    inside = csc_array(diags_array(np.asarray(adjacency.sum(axis=1)).ravel()) - adjacency[:, mine])
+    return np.asarray(factor(inside)(adjacency @ fixed))
