@@ -66,7 +66,7 @@ class Creases:
         return out
 
     def _laid(self, x: np.ndarray, pose: np.ndarray, bad: np.ndarray, rings: int) -> np.ndarray:
-        """Vertices (N, 3) with patches of so many rings around turned triangles (F,) laid where that turns some back."""
+        """Vertices (N, 3) with patches of so many rings around turned triangles (F,) laid where that helps."""
         free = np.zeros(len(x))
         free[self.rest.faces[bad]] = 1
         for _ in range(rings - 1):
