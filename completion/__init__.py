@@ -25,11 +25,13 @@ if TYPE_CHECKING:
     from .moshing.capture import mosh
     from .moshing.cartoons import Cartoon, CartoonShape, cartoon
     from .moshing.characters import deformation, retarget_soft_tissue
+    from .moshing.faults import find_faults
     from .moshing.person import find_person
     from .moshing.results import MoshResult, PersonFit
     from .moshing.settings import MoshConfig, PersonConfig
     from .moshing.sex import SexedMosh, mosh_by_sex
     from .moshing.soft import follow_soft_tissue
+    from .moshing.virtual import write_virtual
     from .motion import Motion
     from .partial.colors import ColorConfig, carry_colors
     from .partial.completion import Completion, complete
@@ -58,11 +60,13 @@ _ROOMS = {
     "moshing.capture": ("mosh",),
     "moshing.cartoons": ("Cartoon", "CartoonShape", "cartoon"),
     "moshing.characters": ("deformation", "retarget_soft_tissue"),
+    "moshing.faults": ("find_faults",),
     "moshing.person": ("find_person",),
     "moshing.results": ("MoshResult", "PersonFit"),
     "moshing.settings": ("MoshConfig", "PersonConfig"),
     "moshing.sex": ("SexedMosh", "mosh_by_sex"),
     "moshing.soft": ("follow_soft_tissue",),
+    "moshing.virtual": ("write_virtual",),
     "motion": ("Motion",),
     "partial.colors": ("ColorConfig", "carry_colors"),
     "partial.completion": ("Completion", "complete"),
@@ -78,10 +82,10 @@ __all__ = ["AnimateConfig", "CandidateConfig", "CarriedLayout", "CarryConfig", "
            "MarkerLayout", "MarkerSequence", "MarkerShapeConfig", "MarkerStream", "MarkerSubject", "MoshConfig",
            "MoshResult", "Motion", "PersonConfig", "PersonFit", "SexedMosh", "SkinMirror", "TrackConfig", "animate",
            "candidate_layout", "carry_colors", "carry_layout", "cartoon", "complete", "deformation", "design_markers",
-           "embedded_model", "find_person", "find_skin_mirror", "follow_soft_tissue", "informative_frames",
-           "joint_angles", "joint_centres", "layout_names", "morphed_vertices", "mosh", "mosh_by_sex", "read_markers",
+           "embedded_model", "find_faults", "find_person", "find_skin_mirror", "follow_soft_tissue",
+           "informative_frames", "joint_angles", "joint_centres", "layout_names", "morphed_vertices", "mosh", "mosh_by_sex", "read_markers",
            "read_mask", "register_layout", "retarget", "retarget_soft_tissue", "subject_from_markers", "track",
-           "write_markers"]
+           "write_markers", "write_virtual"]
 
 
 def __getattr__(name: str) -> Any:
