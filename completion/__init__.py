@@ -83,9 +83,9 @@ __all__ = ["AnimateConfig", "CandidateConfig", "CarriedLayout", "CarryConfig", "
            "MoshResult", "Motion", "PersonConfig", "PersonFit", "SexedMosh", "SkinMirror", "TrackConfig", "animate",
            "candidate_layout", "carry_colors", "carry_layout", "cartoon", "complete", "deformation", "design_markers",
            "embedded_model", "find_faults", "find_person", "find_skin_mirror", "follow_soft_tissue",
-           "informative_frames", "joint_angles", "joint_centres", "layout_names", "morphed_vertices", "mosh", "mosh_by_sex", "read_markers",
-           "read_mask", "register_layout", "retarget", "retarget_soft_tissue", "subject_from_markers", "track",
-           "write_markers", "write_virtual"]
+           "informative_frames", "joint_angles", "joint_centres", "layout_names", "morphed_vertices", "mosh",
+           "mosh_by_sex", "read_markers", "read_mask", "register_layout", "retarget", "retarget_soft_tissue",
+           "subject_from_markers", "track", "write_markers", "write_virtual"]
 
 
 def __getattr__(name: str) -> Any:
