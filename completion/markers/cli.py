@@ -123,10 +123,10 @@ def carry_to(layout: LayoutArg, source: Path, target: Path, output: Output, land
     return Outcome(output, [
         *_figures(result.layout, theirs), Metric("landmarks", 0 if pairs is None else len(pairs[0])),
         Metric("distance of the registered source, RMS", MM * result.rms, "mm"),
-        Metric("distance of landmarks, RMS", MM * result.landmark_rms, "mm"),
+        *([] if pairs is None else [Metric("distance of landmarks, RMS", MM * result.landmark_rms, "mm")]),
         Metric("target not covered", 100 * result.missed, "%"),
         Metric("largest distance at a marker", MM * float(result.distances.max()), "mm"),
-        Metric("least confidence at a marker", float(result.confidence.min()))], {"layout": layout})
+        Metric("markers without data below them", int((result.confidence < 0.5).sum()))], {"layout": layout})
 
 
 def read_layout(given: str, body: Mesh, kept: np.ndarray | None) -> MarkerLayout:
