@@ -99,7 +99,7 @@ class SoftTissueConfig:
     Attributes
     ----------
     n_betas : int
-        Components in which the shape may change, more than those of a person; all that the model has, at most.
+        Components in which the shape may change: at least those of the person, all that the model has at most.
     data, pose, velocity, outlier, prior_shrinkage
         As in `FollowConfig`.
     change : float
