@@ -93,8 +93,8 @@ class FollowConfig:
 class SoftTissueConfig:
     """Settings of `follow_soft_tissue`.
 
-    Weights are in the paper's units. Its own are pose = 1, velocity = 6.25, skin = steadiness = 0: here the pose prior is
-    a narrow one, which at 1 keeps poses from their markers, and the shape would bend to make up for it.
+    Weights are in the paper's units. Its own are pose = 1, velocity = 6.25, skin = steadiness = 0: here the pose prior
+    is a narrow one, which at 1 keeps poses from their markers, and the shape would bend to make up for it.
 
     Attributes
     ----------

@@ -7,10 +7,10 @@ error is that of the markers left out (mm, mean), beside that of markers that we
 change held at nothing. Markers sit where stage 1 put them with all of them.
 
 Simulated: a person of random betas moves as in the first file, with 1 mm of noise on the markers. His skin does
-nothing, or swings around the breastbone (0.6 Hz) or around thigh and breastbone (4 and 3 Hz) along those directions of the model
-that move little else. Given are the root mean square over the skin of the true change, of the error of the change that
-was found (both in the mean pose), how much of the true change was found (1 is all), and the mean distance of the whole
-moving skin from the true one (mm).
+nothing, or swings around the breastbone (0.6 Hz) or around thigh and breastbone (4 and 3 Hz) along those directions of
+the model that move little else. Given are the root mean square over the skin of the true change, of the error of the
+change that was found (both in the mean pose), how much of the true change was found (1 is all), and the mean distance
+of the whole moving skin from the true one (mm).
 """
 from __future__ import annotations
 
