@@ -179,8 +179,8 @@ def _against_random_in_full(model: BodyModel, bodies: np.ndarray, fits: WholeFit
     some = slice(None, None, SOME)
     for count, each in sets.items():
         errors = 1e3 * np.array([full_rmse(model, bodies, fits, chosen, config, some) for chosen in each])
-        tell(what="against random sets, full refits", count=count, bodies=len(bodies[some]), greedy_mm=errors[0],
-             exchanged_mm=errors[1], random_median_mm=float(np.median(errors[2:])),
+        tell(what="against random sets, full refits", count=count, bodies=len(bodies[some]), greedy_mm=float(errors[0]),
+             exchanged_mm=float(errors[1]), random_median_mm=float(np.median(errors[2:])),
              random_best_mm=float(errors[2:].min()))
 
 
