@@ -23,15 +23,15 @@ if TYPE_CHECKING:
     from .markers.named import layout_names
     from .markers.symmetry import SkinMirror, find_skin_mirror
     from .moshing.capture import mosh
-    from .moshing.cartoons import Cartoon, CartoonShape, cartoon
-    from .moshing.characters import deformation, retarget_soft_tissue
-    from .moshing.faults import find_faults
+    from .moshing.characters.cartoons import Cartoon, CartoonShape, cartoon
+    from .moshing.characters.transfer import deformation, retarget_soft_tissue
+    from .moshing.faults.search import find_faults
+    from .moshing.faults.virtual import write_virtual
     from .moshing.person import find_person
     from .moshing.results import MoshResult, PersonFit
     from .moshing.settings import MoshConfig, PersonConfig
     from .moshing.sex import SexedMosh, mosh_by_sex
     from .moshing.soft import follow_soft_tissue
-    from .moshing.virtual import write_virtual
     from .motion import Motion
     from .partial.colors import ColorConfig, carry_colors
     from .partial.completion import Completion, complete
@@ -58,15 +58,15 @@ _ROOMS = {
     "markers.named": ("layout_names",),
     "markers.symmetry": ("SkinMirror", "find_skin_mirror"),
     "moshing.capture": ("mosh",),
-    "moshing.cartoons": ("Cartoon", "CartoonShape", "cartoon"),
-    "moshing.characters": ("deformation", "retarget_soft_tissue"),
-    "moshing.faults": ("find_faults",),
+    "moshing.characters.cartoons": ("Cartoon", "CartoonShape", "cartoon"),
+    "moshing.characters.transfer": ("deformation", "retarget_soft_tissue"),
+    "moshing.faults.search": ("find_faults",),
     "moshing.person": ("find_person",),
     "moshing.results": ("MoshResult", "PersonFit"),
     "moshing.settings": ("MoshConfig", "PersonConfig"),
     "moshing.sex": ("SexedMosh", "mosh_by_sex"),
     "moshing.soft": ("follow_soft_tissue",),
-    "moshing.virtual": ("write_virtual",),
+    "moshing.faults.virtual": ("write_virtual",),
     "motion": ("Motion",),
     "partial.colors": ("ColorConfig", "carry_colors"),
     "partial.completion": ("Completion", "complete"),

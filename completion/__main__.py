@@ -13,7 +13,7 @@ COMMANDS = {
     "complete": ("A partial scan, or several views -> the whole body.", "completion.partial.cli:complete_scan"),
     "animate": ("Markers -> the person and a moving body.", "completion.animation.cli:animate_markers"),
     "mosh": ("Markers -> shape, motion and soft tissue; a file, or a folder of people.",
-             "completion.moshing.cli:mosh_markers"),
+             "completion.moshing.command.cli:mosh_markers"),
     "layout": ("Marker sets: look at them, carry them to other bodies, design them.",
                "completion.markers.cli:group"),
     "track": ("Frames of points -> a moving body, without markers.", "completion.tracking.cli:track_frames"),

@@ -8,11 +8,11 @@ from glb_reader import Glb
 
 from completion import CartoonShape, Motion, cartoon, deformation, retarget_soft_tissue
 from completion.animation.retarget import world_up
-from completion.moshing import character_pictures
-from completion.moshing.cartoons import CARTOONS
-from completion.moshing.character_pictures import picture_transfer, write_character
-from completion.moshing.characters import moving_character
-from completion.moshing.creases import Creases, at_rest
+from completion.moshing.characters import pictures
+from completion.moshing.characters.cartoons import CARTOONS
+from completion.moshing.characters.creases import Creases, at_rest
+from completion.moshing.characters.pictures import picture_transfer, write_character
+from completion.moshing.characters.transfer import moving_character
 from completion.moshing.results import SoftTissue
 from model.posing.character import CharacterConfig, character_model
 from model.posing.character_mesh import inside
@@ -168,7 +168,7 @@ def test_files_and_pictures(model, soft, character, tmp_path, monkeypatch):
         seen.append(shape)
         return np.full((height, width, 3), 255, dtype=np.uint8)
 
-    monkeypatch.setattr(character_pictures, "render", draw)
+    monkeypatch.setattr(pictures, "render", draw)
     sheet = picture_transfer(model, soft, character, moved, 3, 40)
     assert len(seen) == 9 and sheet.dtype == np.uint8
     assert [shape.color is None for shape in seen] == [True] * 6 + [False] * 3

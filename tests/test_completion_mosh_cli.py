@@ -11,11 +11,11 @@ from glb_reader import Glb
 from completion import MarkerLayout, MarkerSequence, Motion, read_markers, write_markers
 from completion.__main__ import main
 from completion.animation import report as animation_report
-from completion.moshing import pictures, report
-from completion.moshing.pictures import every
-from completion.moshing.recordings import Grouping, find_actors
+from completion.moshing.command import pictures, report
+from completion.moshing.command.pictures import every
+from completion.moshing.command.recordings import Grouping, find_actors
+from completion.moshing.command.takes import held_out
 from completion.moshing.results import SoftTissue
-from completion.moshing.takes import held_out
 from model.learning.sex_plane import SexPlane
 
 FRAMES = 40

@@ -9,15 +9,15 @@ from completion_bodies import MEAN, worm_with_prior
 from completion.animation.follow import AnimateConfig, animate
 from completion.markers.files import MarkerSequence
 from completion.markers.layout import MarkerLayout
-from completion.moshing.badspans import find_bad, without_lost_limbs
-from completion.moshing.doubts import exchanged_after_all
-from completion.moshing.exchanges import Evidence, _two_states, find_order, listed
-from completion.moshing.faultchart import chart_faults
-from completion.moshing.faults import find_faults
+from completion.moshing.faults.badspans import find_bad, without_lost_limbs
+from completion.moshing.faults.chart import chart_faults
+from completion.moshing.faults.doubts import exchanged_after_all
+from completion.moshing.faults.exchanges import Evidence, _two_states, find_order, listed
+from completion.moshing.faults.search import find_faults
+from completion.moshing.faults.simulation import Simulation, bridged
+from completion.moshing.faults.tracks import TORN, Tracks
 from completion.moshing.results import BadSpan
 from completion.moshing.settings import FaultConfig
-from completion.moshing.simulation import Simulation, bridged
-from completion.moshing.tracks import TORN, Tracks
 from scanprep.geometry import rotations
 
 FRAMES, RATE = 160, 100.0

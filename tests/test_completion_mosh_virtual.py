@@ -7,8 +7,8 @@ import pytest
 from completion.markers.c3d import _Numbers, point_table
 from completion.markers.files import MarkerFileError, MarkerSequence, read_markers
 from completion.markers.replacing import replace_points
+from completion.moshing.faults.virtual import fault_table, write_virtual
 from completion.moshing.results import BadSpan, Exchange, MarkerFaults
-from completion.moshing.virtual import fault_table, write_virtual
 
 ezc3d = pytest.importorskip("ezc3d")
 LABELS = ("LFHD", "RFHD", "C7", "Free")

@@ -12,7 +12,7 @@ from model.body import BodyModel
 
 from ..markers.files import MarkerSequence
 from ..markers.layout import MarkerLayout
-from .faults import find_faults
+from .faults.search import find_faults
 from .person import find_person, one_or_more
 from .poses import follow_poses
 from .results import MoshResult, PersonFit, SoftTissue

@@ -21,10 +21,10 @@ from completion.embedded import embedded_model
 from completion.markers.files import MarkerSequence, read_markers
 from completion.markers.layout import MarkerLayout
 from completion.moshing.capture import mosh
-from completion.moshing.cartoons import CARTOONS, Cartoon, cartoon
-from completion.moshing.character_pictures import picture_transfer, write_character
-from completion.moshing.characters import deformation, moving_character, retarget_soft_tissue
-from completion.moshing.creases import Creases, at_rest
+from completion.moshing.characters.cartoons import CARTOONS, Cartoon, cartoon
+from completion.moshing.characters.creases import Creases, at_rest
+from completion.moshing.characters.pictures import picture_transfer, write_character
+from completion.moshing.characters.transfer import deformation, moving_character, retarget_soft_tissue
 from completion.moshing.results import SoftTissue
 from model.body import BodyModel
 from model.posing.character_mesh import Character, register_character

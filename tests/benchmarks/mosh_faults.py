@@ -23,12 +23,12 @@ from marker_motion import dropped
 from protocols import load_real, machine, spring_split, write_report
 
 from completion import energy
-from completion.animation.follow import animate
 from completion.animation.marked import supports
-from completion.animation.shape import subject_from_markers
 from completion.markers.files import MarkerSequence, read_markers
 from completion.markers.layout import MarkerLayout
-from completion.moshing.faults import find_faults
+from completion.moshing.faults.search import find_faults
+from completion.moshing.person import find_person
+from completion.moshing.poses import follow_poses
 from completion.moshing.results import BadKind, BadSpan, Exchange, MarkerFaults
 from completion.moshing.settings import FaultConfig
 from completion.motion import Motion
@@ -166,9 +166,9 @@ class Case:
 
 def followed(model: BodyModel, case: Case, markers: MarkerSequence) -> tuple[Subject, MarkerLayout, Motion]:
     """The person and the motion of markers as they are."""
-    found = subject_from_markers(model, markers, case.layout)
+    found = find_person(model, markers, case.layout)
     subject = model.subject(found.betas)
-    return subject, found.layout, animate(subject, markers, found.layout)
+    return subject, found.layout, follow_poses(subject, markers, found.layout)
 
 
 def surface(subject: Subject, motion: Motion, every: int = 10) -> np.ndarray:
@@ -228,16 +228,16 @@ def run_case(model: BodyModel, case: Case, config: FaultConfig, seed: int) -> di
 def run_exchanges(model: BodyModel, case: Case, faulty: Faulty, reference: np.ndarray, clean: float,
                   config: FaultConfig) -> dict[str, float]:
     """Find exchanges, and what is left of them in the motion: person and poses from the faulty markers alone."""
-    person = subject_from_markers(model, faulty.markers, case.layout)
+    person = find_person(model, faulty.markers, case.layout)
     subject = model.subject(person.betas)
     start = time.process_time()
     found: MarkerFaults = find_faults(subject, faulty.markers, person.layout, config)
     seconds = time.process_time() - start
-    raw = animate(subject, faulty.markers, person.layout)
+    raw = follow_poses(subject, faulty.markers, person.layout)
     mended = followed(model, case, found.repaired)
     away = [float(np.linalg.norm(surface(s, m) - reference, axis=2).mean())
             for s, m in ((subject, raw), (mended[0], mended[2]))]
-    on_it = animate(mended[0], case.markers, mended[1])               # what the true markers are off on that person
+    on_it = follow_poses(mended[0], case.markers, mended[1])               # what the true markers are off on that person
     return scores(found.exchanges, faulty.exchanges, faulty.markers) | {
         "bad": len(found.bad), "raw_mm": 1e3 * away[0], "mended_mm": 1e3 * away[1],
         "true_markers_mm": 1e3 * float(np.nanmean(on_it.residuals)),

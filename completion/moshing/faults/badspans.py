@@ -6,8 +6,8 @@ from itertools import pairwise
 import numpy as np
 from scipy.ndimage import binary_dilation, median_filter
 
-from .results import BadKind, BadSpan
-from .settings import FaultConfig
+from ..results import BadKind, BadSpan
+from ..settings import FaultConfig
 
 SLIP_WINDOW = 0.1                    # seconds in which a slip is over
 SLIP_SUDDEN = 0.6                    # share of the lasting displacement that comes within that time

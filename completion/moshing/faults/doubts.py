@@ -5,10 +5,10 @@ from functools import partial
 
 import numpy as np
 
-from ..animation.trust import marker_weights
-from ..solve import MinimiseConfig, descend
+from ...animation.trust import marker_weights
+from ...solve import MinimiseConfig, descend
+from ..settings import FaultConfig
 from .exchanges import AWAY, WORTH, best_stretches, loose_ends
-from .settings import FaultConfig
 from .simulation import Simulation
 from .tracks import Tracks
 

@@ -10,11 +10,11 @@ from scanprep.console import plain
 from scanprep.geometry import storage
 from scanprep.geometry.storage import writing
 
-from ..animation.outputs import write_joint_angles, write_joint_centres, write_motion_bvh, write_residuals
-from ..animation.work import key_frames, write_glb
-from .results import MarkerFaults, MoshResult
+from ...animation.outputs import write_joint_angles, write_joint_centres, write_motion_bvh, write_residuals
+from ...animation.work import key_frames, write_glb
+from ..faults.virtual import fault_table, write_virtual
+from ..results import MarkerFaults, MoshResult
 from .takes import Take
-from .virtual import fault_table, write_virtual
 
 
 def write_person(folder: Path, result: MoshResult, about: Mapping[str, Any]) -> None:
@@ -64,9 +64,10 @@ def write_take(folder: Path, take: Take, keys: int, factor: float = 1.0) -> None
 def write_faults(folder: Path, faults: MarkerFaults) -> None:
     """faults.json with exchanged labels, bad spans and how much was filled in, and the spans as faults.csv."""
     storage.write_json(folder / "faults.json", fault_table(faults))
-    exchanged = [("exchanged", f"{e.first} {e.second}", e.begin, e.end, "") for e in faults.exchanges]
-    bad = [(b.kind, b.label, b.begin, b.end, f"{b.distance:.4g}") for b in faults.bad]
+    rows: list[tuple[str, str, int, int, str]] = [
+        *(("exchanged", f"{e.first} {e.second}", e.begin, e.end, "") for e in faults.exchanges),
+        *((b.kind, b.label, b.begin, b.end, f"{b.distance:.4g}") for b in faults.bad)]
     with writing(folder / "faults.csv") as beside, open(beside, "w", newline="", encoding="utf-8") as out:
         table = csv.writer(out)
         table.writerow(["fault", "markers", "begin", "end", "distance"])
-        table.writerows(sorted([*exchanged, *bad], key=lambda row: (row[2], row[1])))
+        table.writerows(sorted(rows, key=lambda row: (row[2], row[1])))

@@ -16,24 +16,24 @@ from scanprep.pictures.page import Page
 from scanprep.pictures.sheets import save_png
 from scanprep.pictures.views import upright
 
-from ..animation.report import morph_frames
-from ..animation.retarget import retarget
-from ..animation.work import choose_layout, key_frames, write_glb
-from ..markers.files import MarkerSequence, read_markers
-from ..markers.layout import MarkerLayout
-from .capture import mosh
-from .character_pictures import picture_transfer, write_character
-from .characters import retarget_soft_tissue
+from ...animation.report import morph_frames
+from ...animation.retarget import retarget
+from ...animation.work import choose_layout, key_frames, write_glb
+from ...markers.files import MarkerSequence, read_markers
+from ...markers.layout import MarkerLayout
+from ..capture import mosh
+from ..characters.pictures import picture_transfer, write_character
+from ..characters.transfer import retarget_soft_tissue
+from ..faults.virtual import fault_table
+from ..results import MoshResult
+from ..settings import MoshConfig
+from ..sex import mosh_by_sex
 from .charts import MM
 from .outputs import write_person, write_take
 from .pictures import standing
 from .recordings import Actor, Recording
 from .report import PICTURE, closing, person_page, person_picture, take_page, take_picture
-from .results import MoshResult
-from .settings import MoshConfig
-from .sex import mosh_by_sex
 from .takes import LightMesh, Take, held_out
-from .virtual import fault_table
 
 ERRORS = ("marker error, fixed shape", "marker error, soft tissue", "held-out error, fixed shape",
           "held-out error, soft tissue")

@@ -12,10 +12,10 @@ from model.files import load_model
 from scanprep.cli import Output, Unit
 from scanprep.console import Outcome, bar, say
 
-from ..cli import ModelOrNone, read_model
+from ...cli import ModelOrNone, read_model
+from ..settings import MoshConfig
 from .folder import Bars, mosh_people, summary
 from .recordings import Actor, By, Grouping, find_actors
-from .settings import MoshConfig
 from .work import Work
 
 MarkersArg = Annotated[tyro.conf.Positional[tuple[Path, ...]], tyro.conf.arg(metavar="MARKERS [MARKERS ...]")]

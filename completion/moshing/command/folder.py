@@ -15,7 +15,7 @@ from scanprep.console import Metric, Progress, plain
 from scanprep.geometry import storage
 from scanprep.pictures.page import Page
 
-from ..animation.work import DONE, contents
+from ...animation.work import DONE, contents
 from .recordings import TABLE, Actor, write_table
 from .report import PICTURE
 from .work import ERRORS, Work, mosh_person

@@ -11,8 +11,8 @@ from typing import Literal, get_args
 
 from scanprep.geometry.storage import writing
 
-from ..markers.common import MarkerFileError
-from ..markers.files import marker_subjects
+from ...markers.common import MarkerFileError
+from ...markers.files import marker_subjects
 
 By = Literal["auto", "name", "label", "each", "all"]
 ENDINGS = (".c3d", ".trc", ".csv")

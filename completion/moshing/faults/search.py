@@ -7,15 +7,15 @@ import numpy as np
 
 from model.linear import Subject
 
-from ..animation.trust import marker_weights
-from ..markers.files import MarkerSequence
-from ..markers.layout import MarkerLayout
-from ..motion import Motion
+from ...animation.trust import marker_weights
+from ...markers.files import MarkerSequence
+from ...markers.layout import MarkerLayout
+from ...motion import Motion
+from ..results import BadSpan, MarkerFaults
+from ..settings import FaultConfig
 from .badspans import find_bad, without_lost_limbs
 from .doubts import doubtful_pairs, exchanged_after_all
 from .exchanges import Evidence, find_order, listed, marker_levels, pairs_that_jump
-from .results import BadSpan, MarkerFaults
-from .settings import FaultConfig
 from .simulation import Simulation, bridged, usual_places
 from .tracks import Tracks
 

@@ -5,8 +5,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from .results import Exchange
-from .settings import FaultConfig
+from ..results import Exchange
+from ..settings import FaultConfig
 from .tracks import Tracks
 
 AWAY = 8.0                           # most that a marker away from its place counts, in half squared deviations
@@ -65,8 +65,9 @@ def find_order(evidence: Evidence, config: FaultConfig) -> np.ndarray:
         touched = set()
         for _, a, b, swapped in sorted(found, key=lambda f: -f[0]):
             if not touched & {a, b}:
-                order[np.ix_(swapped, [a, b])] = order[np.ix_(swapped, [b, a])]
-                levels[np.ix_(swapped, np.arange(L), [a, b])] = levels[np.ix_(swapped, np.arange(L), [b, a])]
+                two, every = np.array([a, b]), np.arange(L)
+                order[np.ix_(swapped, two)] = order[np.ix_(swapped, two[::-1])]
+                levels[np.ix_(swapped, every, two)] = levels[np.ix_(swapped, every, two[::-1])]
                 touched |= {a, b}
         if not touched:
             break

@@ -14,13 +14,13 @@ from scanprep.console import Metric, plain
 from scanprep.pictures.page import Page
 from scanprep.pictures.shading import Dots, Shape, render, side_by_side
 
-from ..animation.report import MARKER, facing, worst_frames
-from ..cli import rows
-from ..markers.layout import MarkerLayout
+from ...animation.report import MARKER, facing, worst_frames
+from ...cli import rows
+from ...markers.layout import MarkerLayout
+from ..faults.chart import chart_faults
+from ..results import MoshResult
 from . import pictures
 from .charts import MM, chart_frames, chart_map, chart_timeline, mean_over
-from .faultchart import chart_faults
-from .results import MoshResult
 from .takes import Take
 
 PICTURE = "picture.png"

@@ -12,12 +12,12 @@ from model.linear import Subject, posed_product
 from scanprep.cleaning.decimate_set import decimate_set
 from scanprep.geometry.mesh import Mesh
 
-from ..animation.marked import supports
-from ..energy import lifted
-from ..markers.files import MarkerSequence
-from ..markers.layout import MarkerLayout
-from ..motion import Motion
-from .results import MarkerFaults, SoftTissue
+from ...animation.marked import supports
+from ...energy import lifted
+from ...markers.files import MarkerSequence
+from ...markers.layout import MarkerLayout
+from ...motion import Motion
+from ..results import MarkerFaults, SoftTissue
 
 LIGHT = 7000                         # triangles of a body in small pictures
 AT_ONCE = 128                        # frames whose changes are held at a time

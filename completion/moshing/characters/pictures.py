@@ -10,11 +10,11 @@ from scanprep.pictures.colors import color_bar, heat
 from scanprep.pictures.shading import Solid, render, side_by_side
 from scanprep.pictures.views import upright
 
-from ..animation.report import facing
-from ..animation.work import key_frames
-from .characters import deformation, moving_character
+from ...animation.report import facing
+from ...animation.work import key_frames
+from ..results import SoftTissue
 from .creases import Creases, at_rest
-from .results import SoftTissue
+from .transfer import deformation, moving_character
 
 FULL = 0.2                           # deformation at the end of the heat map
 TURN = 35.0                          # degrees of the camera beside the front

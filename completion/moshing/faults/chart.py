@@ -5,8 +5,8 @@ from typing import Any
 
 import numpy as np
 
-from ..markers.files import MarkerSequence
-from .results import MarkerFaults
+from ...markers.files import MarkerSequence
+from ..results import MarkerFaults
 
 COLORS = {"exchanged": "#2f6db3", "slipped": "#8557a8", "noisy": "#b3592f", "stray": "#c02a3c"}
 MOST = 400.0                         # millimetres, beyond which a distance is drawn as this

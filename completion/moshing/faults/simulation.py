@@ -5,12 +5,12 @@ import numpy as np
 
 from model.linear import Subject
 
-from ..animation.follow import MarkerFollower
-from ..animation.marked import BATCH
-from ..animation.settings import AnimateConfig
-from ..animation.smooth import smooth_sequence
-from ..markers.files import MarkerSequence
-from ..markers.layout import MarkerLayout
+from ...animation.follow import MarkerFollower
+from ...animation.marked import BATCH
+from ...animation.settings import AnimateConfig
+from ...animation.smooth import smooth_sequence
+from ...markers.files import MarkerSequence
+from ...markers.layout import MarkerLayout
 
 LOOKS = 15.0                         # frames per second in which it is asked how a marker draws the body
 OWN = 0.6                            # most of a displacement that the body is taken to have followed

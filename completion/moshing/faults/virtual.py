@@ -8,11 +8,11 @@ import numpy as np
 
 from scanprep.geometry import storage
 
-from ..markers.c3d import point_table, write_c3d
-from ..markers.common import MarkerFileError
-from ..markers.files import write_markers
-from ..markers.replacing import replace_points
-from .results import MarkerFaults
+from ...markers.c3d import point_table, write_c3d
+from ...markers.common import MarkerFileError
+from ...markers.files import write_markers
+from ...markers.replacing import replace_points
+from ..results import MarkerFaults
 
 
 def write_virtual(path: str | Path, faults: MarkerFaults, original: str | Path | None = None,

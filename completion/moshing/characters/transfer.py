@@ -9,8 +9,8 @@ from scipy.sparse import csr_array
 from model.body import BodyModel
 from model.linear import Subject, posed_product
 
-from ..animation.retarget import AT_ONCE, retarget, world_up
-from .results import SoftTissue
+from ...animation.retarget import AT_ONCE, retarget, world_up
+from ..results import SoftTissue
 
 SOLES = 60                           # points that may touch the ground
 

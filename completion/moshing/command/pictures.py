@@ -12,8 +12,8 @@ from scanprep.pictures.camera import Camera
 from scanprep.pictures.shading import Bones, Dots, Shape, Solid, color_bar, heat, render, side_by_side
 from scanprep.pictures.views import look_around, upright
 
-from ..animation.report import MARKER, facing, moving_picture
-from ..markers.layout import MarkerLayout
+from ...animation.report import MARKER, facing, moving_picture
+from ...markers.layout import MarkerLayout
 from .takes import Take
 
 USUAL, DOUBTED, UNUSED = (0.30, 0.50, 0.72), (0.93, 0.62, 0.16), (0.20, 0.62, 0.32)

@@ -1,0 +1,1 @@
+"""`scape mosh`: folders of recordings, files and pages."""

@@ -1,0 +1,1 @@
+"""What is wrong with markers, and sequences put right."""
