@@ -237,7 +237,7 @@ def run_exchanges(model: BodyModel, case: Case, faulty: Faulty, reference: np.nd
     mended = followed(model, case, found.repaired)
     away = [float(np.linalg.norm(surface(s, m) - reference, axis=2).mean())
             for s, m in ((subject, raw), (mended[0], mended[2]))]
-    on_it = follow_poses(mended[0], case.markers, mended[1])               # what the true markers are off on that person
+    on_it = follow_poses(mended[0], case.markers, mended[1])     # what the true markers are off there
     return scores(found.exchanges, faulty.exchanges, faulty.markers) | {
         "bad": len(found.bad), "raw_mm": 1e3 * away[0], "mended_mm": 1e3 * away[1],
         "true_markers_mm": 1e3 * float(np.nanmean(on_it.residuals)),

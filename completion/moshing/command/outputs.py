@@ -70,4 +70,5 @@ def write_faults(folder: Path, faults: MarkerFaults) -> None:
     with writing(folder / "faults.csv") as beside, open(beside, "w", newline="", encoding="utf-8") as out:
         table = csv.writer(out)
         table.writerow(["fault", "markers", "begin", "end", "distance"])
-        table.writerows(sorted(rows, key=lambda row: (row[2], row[1])))
+        rows.sort(key=lambda row: (row[2], row[1]))
+        table.writerows(rows)
