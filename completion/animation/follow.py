@@ -17,6 +17,7 @@ from .ground import Floor, Standing
 from .lowpass import low_pass
 from .marked import MarkedBody
 from .prediction import inertia
+from .rescue import rescue_limbs
 from .settings import AnimateConfig
 from .smooth import smooth_sequence
 from .stream import Tracker, judge
@@ -157,6 +158,7 @@ class MarkerFollower:
                 floor = None if self.config.floor is None else Floor.given(self.config.floor)
                 self.standing = Standing(self.body, x, self.rate, floor)
             self.find_exchanges(x)
+            x[inside] = rescue_limbs(self.body, x[inside], self.taken(inside), self.config)
             better = smooth_sequence(self, x[inside], inside)
             apart = np.linalg.norm(self.positions(better) - self.positions(x[inside]), axis=2)
             moved[inside], x[inside] = apart.max(axis=1), better
