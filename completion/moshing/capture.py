@@ -12,7 +12,7 @@ from model.body import BodyModel
 
 from ..markers.files import MarkerSequence
 from ..markers.layout import MarkerLayout
-from .faults.search import find_faults
+from .faults.search import by_tracks, find_faults
 from .person import find_person, one_or_more
 from .poses import follow_poses
 from .results import MoshResult, PersonFit, SoftTissue
@@ -21,15 +21,17 @@ from .soft import follow_soft_tissue
 
 Progress = Callable[[int, int], None]
 STEPS = 100                          # of progress, of each stage
+ROUNDS = 3                           # most times that a person is followed and the markers are judged
 
 
 def mosh(model: BodyModel, sequences: MarkerSequence | Sequence[MarkerSequence], layout: MarkerLayout,
          config: MoshConfig | None = None, progress: Progress | None = None) -> MoshResult:
     """Body shape, marker places, poses and soft tissue of one subject from marker sequences.
 
-    The person is found from a few frames of all sequences, then the pose of every frame. The motion tells which
-    labels were exchanged and which markers were not on the body; where that concerns the frames that told of the
-    person, the person is found again. At last the shape may change with time.
+    Labels are put right as far as tracks tell. The person is found from a few frames of all sequences, then the pose of
+    every frame. The motion tells which labels were exchanged and which markers were not on the body; where that
+    concerns the frames that told of the person, the person is found again, and so is what is wrong. At last the shape
+    may change with time.
 
     Parameters
     ----------
@@ -50,25 +52,32 @@ def mosh(model: BodyModel, sequences: MarkerSequence | Sequence[MarkerSequence],
     [MoSh] Eq. 23, Eq. 24
     """
     config, sequences = config or MoshConfig(), one_or_more(sequences)
-    count = len(sequences)
-    bar = _Bar(progress, STEPS * (1 + 2 * count + count * config.soft_tissue))
+    bar = _Bar(progress, STEPS * (1 + len(sequences) * (2 + config.soft_tissue)))
     clock = _Clock()
-    with clock.running("person"):
-        person = find_person(model, sequences, layout, config.person, bar.stage())
-        subject = model.subject(person.betas)
-    with clock.running("poses"):
-        motions = [follow_poses(subject, each, person.layout, config.follow, bar.stage()) for each in sequences]
     with clock.running("faults"):
-        faults = [find_faults(subject, each, person.layout, config.faults, motion, bar.stage())
-                  for each, motion in zip(sequences, motions, strict=True)]
-        mended = [fault.repaired for fault in faults]
-        if _matters(person, sequences, mended):
-            person = find_person(model, mended, layout, config.person)
-            subject = model.subject(person.betas)
-            motions = [follow_poses(subject, each, person.layout, config.follow) for each in mended]
-        else:
-            motions = [motion if same(before, after) else follow_poses(subject, after, person.layout, config.follow)
-                       for motion, before, after in zip(motions, sequences, mended, strict=True)]
+        used = [by_tracks(each, config.faults) for each in sequences]
+    with clock.running("person"):
+        person = find_person(model, used, layout, config.person, bar.stage())
+    bars = [[bar.stage() for _ in sequences] for _ in ("poses", "faults")]
+    for _ in range(ROUNDS):
+        subject = model.subject(person.betas)
+        with clock.running("poses"):
+            motions = [follow_poses(subject, each, person.layout, config.follow, tell)
+                       for each, tell in zip(used, bars[0], strict=True)]
+        with clock.running("faults"):
+            faults = [find_faults(subject, each, person.layout, config.faults, motion, tell)
+                      for each, motion, tell in zip(sequences, motions, bars[1], strict=True)]
+        mended, bars = [fault.repaired for fault in faults], [[None for _ in sequences] for _ in bars]
+        if not _matters(person, used, mended):
+            break
+        used = mended
+        with clock.running("person"):
+            person = find_person(model, used, layout, config.person)
+    with clock.running("poses"):
+        subject = model.subject(person.betas)
+        motions = [motion if same(before, after) and used is not mended
+                   else follow_poses(subject, after, person.layout, config.follow)
+                   for motion, before, after in zip(motions, used, mended, strict=True)]
     soft: list[SoftTissue] = []
     if config.soft_tissue:
         with clock.running("soft tissue"):
@@ -98,7 +107,7 @@ class _Clock:
     def running(self, stage: str) -> Iterator[None]:
         start = time.perf_counter()
         yield
-        self.seconds[stage] = time.perf_counter() - start
+        self.seconds[stage] = self.seconds.get(stage, 0.0) + time.perf_counter() - start
 
 
 @dataclass

@@ -26,11 +26,12 @@ from completion import energy
 from completion.animation.marked import supports
 from completion.markers.files import MarkerSequence, read_markers
 from completion.markers.layout import MarkerLayout
+from completion.moshing.capture import mosh
 from completion.moshing.faults.search import find_faults
 from completion.moshing.person import find_person
 from completion.moshing.poses import follow_poses
-from completion.moshing.results import BadKind, BadSpan, Exchange, MarkerFaults
-from completion.moshing.settings import FaultConfig
+from completion.moshing.results import BadKind, BadSpan, Exchange
+from completion.moshing.settings import FaultConfig, MoshConfig
 from completion.motion import Motion
 from model.body import BodyModel
 from model.files import load_model
@@ -227,14 +228,14 @@ def run_case(model: BodyModel, case: Case, config: FaultConfig, seed: int) -> di
 
 def run_exchanges(model: BodyModel, case: Case, faulty: Faulty, reference: np.ndarray, clean: float,
                   config: FaultConfig) -> dict[str, float]:
-    """Find exchanges, and what is left of them in the motion: person and poses from the faulty markers alone."""
+    """Find exchanges, and what is left of them in the motion: all from the faulty markers alone, seconds too."""
     person = find_person(model, faulty.markers, case.layout)
     subject = model.subject(person.betas)
-    start = time.process_time()
-    found: MarkerFaults = find_faults(subject, faulty.markers, person.layout, config)
-    seconds = time.process_time() - start
     raw = follow_poses(subject, faulty.markers, person.layout)
-    mended = followed(model, case, found.repaired)
+    start = time.process_time()
+    result = mosh(model, faulty.markers, case.layout, MoshConfig(faults=config, soft_tissue=False))
+    seconds, found = time.process_time() - start, result.faults[0]
+    mended = model.subject(result.betas), result.layout, result.motions[0]
     away = [float(np.linalg.norm(surface(s, m) - reference, axis=2).mean())
             for s, m in ((subject, raw), (mended[0], mended[2]))]
     on_it = follow_poses(mended[0], case.markers, mended[1])     # what the true markers are off there

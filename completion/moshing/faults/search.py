@@ -70,6 +70,23 @@ def find_faults(subject: Subject, markers: MarkerSequence, layout: MarkerLayout,
     return search.result()
 
 
+def by_tracks(markers: MarkerSequence, config: FaultConfig | None = None) -> MarkerSequence:
+    """The sequence with labels put right as far as the tracks of the markers alone tell, without a body."""
+    return MarkerSequence(_ordered(markers, _order_by_tracks(markers, config or FaultConfig())), markers.labels,
+                          markers.rate)
+
+
+def _order_by_tracks(markers: MarkerSequence, config: FaultConfig) -> np.ndarray:
+    """Which column (T, L) each marker is to be taken from."""
+    T, L = markers.positions.shape[:2]
+    return find_order(Evidence(markers.positions, np.zeros((T, L, L)), markers.rate), config)
+
+
+def _ordered(markers: MarkerSequence, order: np.ndarray) -> np.ndarray:
+    """The markers (T, L, 3), metres, under the labels that an order (T, L) gives them."""
+    return np.take_along_axis(markers.positions, order[..., None], axis=1)
+
+
 class _Search:
     """The state of the search: labels, bad spans and the body that follows the rest.
 
@@ -85,7 +102,7 @@ class _Search:
         self.config, self.markers = config, markers
         self.body = Simulation(subject, markers, layout, config.follow)
         T, L = markers.positions.shape[:2]
-        self.order = find_order(Evidence(markers.positions, np.zeros((T, L, L)), markers.rate), config)
+        self.order = _order_by_tracks(markers, config)
         self.bad: tuple[BadSpan, ...] = ()
         self.unsure = (self.order != np.arange(L)).mean(axis=0) > UNSURE
         self.solved: np.ndarray | None = None
@@ -100,7 +117,7 @@ class _Search:
     @property
     def ordered(self) -> np.ndarray:
         """The markers (T, L, 3), metres, under their right labels."""
-        return np.take_along_axis(self.markers.positions, self.order[..., None], axis=1)
+        return _ordered(self.markers, self.order)
 
     @property
     def repaired(self) -> np.ndarray:
