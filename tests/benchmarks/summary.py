@@ -14,6 +14,7 @@ from typing import Any
 
 import numpy as np
 from summary_completion import COMPLETION
+from summary_moshing import MOSHING
 from summary_scans import (
     Rows,
     coregistration,
@@ -198,6 +199,7 @@ SECTIONS: dict[str, tuple[str, str, Callable[[dict], str], str]] = {
               "are known. Where we lose: armpits (up to 22 mm from patch to truth); Poisson columns of the patch are "
               "missing as it remeshes everything."),
     **COMPLETION,
+    **MOSHING,
 }
 
 BESIDE = {"half_people": "half_people_poisson"}      # a run with another library, in the same table
