@@ -118,13 +118,16 @@ def again(model: BodyModel, subject: Subject, found: PersonFit, second: PersonFi
     The two are also compared as bodies are with the true one, the pose of one fitted to the other: betas take up some
     of how people hold their limbs.
     """
-    mean, truth = at_rest(model.subject(np.zeros(model.n_betas))), at_rest(subject)
+    mean_person = model.subject(np.zeros(model.n_betas))
+    mean, truth = at_rest(mean_person), at_rest(subject)
     one, two = (at_rest(model.subject(each.betas)) for each in (found, second))
     true = apart(truth, mean)
-    refitted = 1e3 * fit_pose(model.subject(second.betas), one).mean
-    return {"two_bodies_mm": apart(one, two), "two_bodies_refitted_mm": refitted,
-            "true_from_mean_mm": true, "first_share": apart(one, mean) / true,
-            "second_share": apart(two, mean) / true}
+    fitted, first, other = (1e3 * fit_pose(mean_person, body).mean for body in (truth, one, two))
+    return {"two_bodies_mm": apart(one, two), "true_from_mean_mm": true, "first_share": apart(one, mean) / true,
+            "second_share": apart(two, mean) / true,
+            "two_bodies_fitted_mm": 1e3 * fit_pose(model.subject(second.betas), one).mean,
+            "true_from_mean_fitted_mm": fitted, "first_share_fitted": first / fitted,
+            "second_share_fitted": other / fitted}
 
 
 def main() -> None:

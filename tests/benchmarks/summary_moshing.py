@@ -14,13 +14,14 @@ def people(report: dict) -> str:
         errors = [r["error_mm"] for r in report["rows"] if r["markers"] == line["markers"]]
         rows.append((line["markers"], line["men"], line["error_mm"], max(errors), line["residual_mm"], line["moved_mm"],
                      line["beta_rms"], line["cpu_s"]))
-    twice: Rows = [tuple(r[n] for n in ("man", "mean_person_mm", "two_bodies_refitted_mm", "two_bodies_mm",
-                                        "true_from_mean_mm", "first_share", "second_share"))
-                   for r in report["rows"] if "two_bodies_mm" in r]
+    names = ("man", "two_bodies_fitted_mm", "true_from_mean_fitted_mm", "first_share_fitted", "second_share_fitted",
+             "two_bodies_mm", "true_from_mean_mm", "first_share", "second_share")
+    twice: Rows = [tuple(r[n] for n in names) for r in report["rows"] if "two_bodies_mm" in r]
     return table(("markers", "men", "vertices (mm)", "worst man (mm)", "markers (mm)", "markers moved (mm)",
                   "betas (RMS)", "time (s CPU)"), rows) + "\n\n" + table(
-        ("man moved twice", "mean person, pose fitted (mm)", "two bodies, poses fitted (mm)", "two bodies at rest (mm)",
-         "true body from mean person at rest (mm)", "first body's share of that", "second's"), twice)
+        ("man moved twice", "two bodies, poses fitted (mm)", "true body from mean person (mm)",
+         "first body's share of that", "second's", "two bodies at rest (mm)", "true body from mean person at rest (mm)",
+         "first body's share of that", "second's"), twice)
 
 
 def recordings(report: dict) -> str:
