@@ -114,8 +114,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("-o", "--output", type=Path, required=True)
     parser.add_argument("-m", "--model", type=Path, help="of the file's person; else the embedded one")
-    parser.add_argument("--c3d", type=Path)
-    parser.add_argument("--walk", action="store_true")
+    parser.add_argument("--c3d", type=Path, help="whose motion it is; else an embedded man walks")
     parser.add_argument("--frames", type=int, default=60, help="that are measured and shown")
     parser.add_argument("--factors", type=float, nargs="*", default=[0.0, 1.0, 2.0])
     args = parser.parse_args()
@@ -123,7 +122,7 @@ def main() -> None:
 
     args.output.mkdir(parents=True, exist_ok=True)
     model = load_model(args.model) if args.model else embedded_model()
-    markers, layout = walking_man(model, 120, 60.0) if args.walk else \
+    markers, layout = walking_man(model, 120, 60.0) if args.c3d is None else \
         (read_markers(args.c3d), MarkerLayout.named("cmu41", model.template))
     soft = mosh(model, markers, layout).soft_tissue[0]
     frames = np.unique(np.linspace(0, len(soft.motion.poses) - 1, args.frames).round().astype(int))
