@@ -14,6 +14,11 @@ if "PYTEST_XDIST_WORKER" in os.environ:                      # processes do not 
 from scanprep.console import run
 
 
+def pytest_collection_modifyitems(items):
+    """The longest file first, so that the other processes have enough to do beside it."""
+    items.sort(key=lambda item: item.path.name != "test_readme.py")
+
+
 @pytest.fixture(scope="session")
 def demo_folder(tmp_path_factory):
     """The folder of one `scape demo --quick`, run once for all tests that look at it, in whatever process."""
