@@ -125,8 +125,8 @@ MOSHING: dict[str, tuple[str, str, Callable[[dict], str], str]] = {
     "mosh_speed": (
         "How long MoSh takes",
         "python tests/benchmarks/mosh_speed.py FOLDER -m MODEL", speed,
-        "One thread, 41 markers, a person of 80 betas and soft tissue of 80. Three other processes were at work on the two "
-        "cores, so the times of the clock are upper bounds."),
+        "One thread, 41 markers, a person of 80 betas and soft tissue of 80. Three other processes were at work on the "
+        "two cores, so the times of the clock are upper bounds."),
     "mosh_faults": (
         "Faults put into markers",
         "python tests/benchmarks/mosh_faults.py FOLDER -m MODEL --men 3 --held-out --no-real --files basketball 85_02",
