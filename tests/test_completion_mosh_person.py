@@ -210,6 +210,20 @@ def test_everything_together():
     np.testing.assert_array_equal(found.betas, found.person.betas)
 
 
+def test_labels_that_were_exchanged_do_not_spoil_the_person():
+    """Tracks tell it before there is a body: the person is the one of the clean sequence."""
+    data = sequence(displaced())
+    swapped, T = data.positions.copy(), len(data.positions)
+    some = np.arange(T // 3, 2 * T // 3)
+    swapped[np.ix_(some, [0, 7])] = swapped[np.ix_(some, [7, 0])]
+    found = mosh(MODEL, MarkerSequence(swapped, data.labels, data.rate), LAYOUT,
+                 MoshConfig(person=USUAL, soft_tissue=False))
+    swap, = found.faults[0].exchanges
+    assert {swap.first, swap.second} == {LABELS[0], LABELS[7]} and (swap.begin, swap.end) == (some[0], some[-1])
+    np.testing.assert_array_equal(found.betas, beside().betas)
+    assert np.nanmean(found.motions[0].residuals) < 5e-3
+
+
 def test_frames_that_share_unknowns_are_solved_as_one_system():
     """The arrow's step against the dense normal equations of a linear problem, which one step solves."""
     rng = np.random.default_rng(0)
