@@ -102,8 +102,8 @@ COMPLETION: dict[str, tuple[str, str, Callable[[dict], str], str]] = {
     "c3d": (
         "Person and motion from real recordings",
         "python tests/benchmarks/c3d.py FOLDER -m MODEL", recordings,
-        "One layout for four people. Its markers were moved by what was found over these same files, so the figures are "
-        "not of unseen data; markers that the layout calls loose are sought on each person."),
+        "One layout for four people. Its markers were moved by what was found over these same files, so the figures "
+        "are not of unseen data; markers that the layout calls loose are sought on each person."),
     "tracking": (
         "Frames of points without markers",
         "python tests/benchmarks/tracking.py tracking.json", tracking,
