@@ -12,7 +12,7 @@ from scanprep.geometry import rotations
 
 from .. import energy
 from ..bodies import FixedBody
-from ..markers.layout import MarkerLayout
+from ..markers.layout import MarkerLayout, most_used
 from ..priors import GaussianPrior
 from ..solve import MinimiseConfig, minimise
 from ..starts import search
@@ -83,13 +83,6 @@ class FrameStarts:
                                   energy.pose_prior(x, self.prior, self.prior_weight)],
                        x, MinimiseConfig(iterations=20, tolerance=1e-3))
         return end.x[np.argmin(end.energy)]
-
-
-def most_used(layout: MarkerLayout) -> np.ndarray:
-    """(L,) the vertex that has the largest share in each marker's place."""
-    base = layout.vertices.reshape(len(layout.labels), -1)
-    share = np.ones(base.shape) if layout.weights is None else layout.weights
-    return np.take_along_axis(base, share.argmax(axis=1)[:, None], axis=1)[:, 0]
 
 
 def find_loose(model: BodyModel, vertices: np.ndarray, layout: MarkerLayout, targets: np.ndarray, reach: float,

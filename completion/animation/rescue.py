@@ -7,6 +7,7 @@ from .. import energy
 from ..solve import MinimiseConfig, descend
 from .marked import MarkedBody, System
 from .settings import AnimateConfig
+from .trust import misfit
 
 SEVERAL, FAR = 3, 2.0                # markers of a frame that are so many times an outlier's residual away
 SCALES = (1.0, 0.3, 0.1)             # metres, at which a marker has lost three quarters of its weight, in turns
@@ -40,9 +41,9 @@ def rescue_limbs(body: MarkedBody, x: np.ndarray, targets: np.ndarray, config: A
     for start in starts[1:]:
         start[:, root] = x[np.ix_(frames, root)]
     found = np.stack([_from_far(body, start, targets[frames], config) for start in starts])
-    misfit = np.stack([_misfit(_apart(body, end, targets[frames]), config.outlier) for end in found])
-    best = misfit.argmin(axis=0)
-    better = misfit.min(axis=0) < BETTER * _misfit(apart[frames], config.outlier)
+    left = np.stack([misfit(_apart(body, end, targets[frames]), config.outlier) for end in found])
+    best = left.argmin(axis=0)
+    better = left.min(axis=0) < BETTER * misfit(apart[frames], config.outlier)
     out = x.copy()
     out[frames[better]] = found[best, np.arange(len(frames))][better]
     return out
@@ -63,9 +64,3 @@ def _from_far(body: MarkedBody, x: np.ndarray, targets: np.ndarray, config: Anim
 def _apart(body: MarkedBody, x: np.ndarray, targets: np.ndarray) -> np.ndarray:
     """(T, L) metres from the markers to where the body puts them."""
     return np.linalg.norm(body.positions(x) - targets, axis=2)
-
-
-def _misfit(apart: np.ndarray, outlier: float) -> np.ndarray:
-    """(T,) how badly markers fit, of 0 to 1; each outlier counts the same."""
-    squared = apart**2
-    return np.nanmean(squared / (outlier**2 + squared), axis=1)

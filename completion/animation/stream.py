@@ -14,7 +14,7 @@ from .beginning import search
 from .marked import MarkedBody, System
 from .prediction import make_prediction
 from .settings import AnimateConfig
-from .trust import LabelWatch, distances_apart, marker_weights
+from .trust import LabelWatch, distances_apart, marker_weights, misfit
 
 ENOUGH = 0.5                         # share of the markers that a search wants
 BELIED = 0.2                         # share of the markers seen that are outliers on a body gone astray
@@ -142,7 +142,9 @@ class Tracker:
         if not self.wait and there >= max(3, ENOUGH * self.body.count) and self._astray(targets):
             found = search(self.body, targets, self.config)
             places = self.body.positions(found)
-            if _misfit(places, targets, self.config.outlier) < 0.7 * _misfit(self.places, targets, self.config.outlier):
+            apart = np.linalg.norm(np.stack([places, self.places]) - targets, axis=2)
+            new, old = misfit(apart, self.config.outlier)
+            if new < 0.7 * old:
                 self.begin(found)
                 self.places, self.patience = places, PATIENCE * self.rate
                 return found, True
@@ -183,11 +185,3 @@ def judge(positions: np.ndarray, targets: np.ndarray, order: np.ndarray, config:
     residuals = np.linalg.norm(positions - targets, axis=-1)
     squared, scale = distances_apart(positions, targets, config.outlier)
     return residuals, (squared < scale**2) & (order == np.arange(order.shape[-1]))
-
-
-def _misfit(places: np.ndarray, targets: np.ndarray, outlier: float) -> float:
-    """How badly markers (L, 3) fit, of 0 to 1; each outlier counts the same."""
-    squared = ((places - targets)**2).sum(axis=1)
-    return float(np.nanmean(squared / (outlier**2 + squared)))
-
-

@@ -50,6 +50,12 @@ def _median(values: np.ndarray) -> np.ndarray:
     return np.where(seen > 0, 0.5 * (below + above), 0.0)[..., 0]
 
 
+def misfit(apart: np.ndarray, outlier: float) -> np.ndarray:
+    """(...) how badly markers (..., L), metres off, fit, of 0 to 1; each outlier counts the same."""
+    squared = apart**2
+    return np.nanmean(squared / (outlier**2 + squared), axis=-1)
+
+
 def exchangeable(positions: np.ndarray, targets: np.ndarray, outlier: float) -> np.ndarray:
     """Frames (T,) bool in which a `LabelWatch` would exchange some labels, for places and targets (T, L, 3)."""
     squared, scale = distances_apart(positions, targets, outlier)

@@ -12,7 +12,7 @@ from scanprep.matching.correlated import CorrelatedConfig, find_correspondences
 from scanprep.matching.nonrigid import Registration, register
 from scanprep.matching.schedule import RegistrationConfig
 
-from .layout import MarkerLayout
+from .layout import MarkerLayout, most_used
 from .symmetry import skin_points
 
 LOST = 0.3                           # of the target that the source does not cover: it is somewhere else
@@ -117,12 +117,10 @@ def register_layout(layout: MarkerLayout, source: Mesh, target: Mesh, landmarks:
         raise ValueError(f"target: the source could not be brought onto it, {fit.missed:.0%} of it stays uncovered; "
                          "give landmarks, three at least, spread over the body")
     found = Surface(target).closest(skin_points(layout, fit.mesh))
-    vertices = layout.vertices if layout.weights is None else \
-        layout.vertices[np.arange(len(layout.labels)), layout.weights.argmax(axis=1)]
     carried = MarkerLayout(layout.labels, target.faces[found.faces], layout.distances, _on_triangle(found.bary),
                            layout.aliases, layout.loose)
-    return CarriedLayout(carried, found.distances, fit.confidence[vertices], fit.rms, fit.landmark_rms, fit.missed,
-                         fit.mesh)
+    return CarriedLayout(carried, found.distances, fit.confidence[most_used(layout)], fit.rms, fit.landmark_rms,
+                         fit.missed, fit.mesh)
 
 
 def _registered(source: Mesh, target: Mesh, landmarks: Landmarks | None, config: CarryConfig,

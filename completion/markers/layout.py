@@ -267,6 +267,13 @@ class MarkerLayout:
             raise error(f"{what}: marker '{outside[0]}' sits on vertex {place}, the body has 0..{n_vertices - 1}")
 
 
+def most_used(layout: MarkerLayout) -> np.ndarray:
+    """(L,) the vertex that has the largest share in each marker's place."""
+    base = layout.vertices.reshape(len(layout.labels), -1)
+    share = np.ones(base.shape) if layout.weights is None else layout.weights
+    return np.take_along_axis(base, share.argmax(axis=1)[:, None], axis=1)[:, 0]
+
+
 def _rows(path: Path, tree: Any) -> list[tuple[str, Any, float, bool]]:
     """Label, place, distance and looseness of every marker in the file."""
     sets = tree.get("markersets") if isinstance(tree, Mapping) else None

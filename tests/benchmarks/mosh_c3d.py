@@ -24,10 +24,9 @@ import numpy as np
 from c3d import HELD_OUT
 from protocols import machine, write_report
 
-from completion.animation.frame_starts import most_used
 from completion.animation.marked import MarkedBody
 from completion.markers.files import MarkerSequence, read_markers
-from completion.markers.layout import MarkerLayout
+from completion.markers.layout import MarkerLayout, most_used
 from completion.moshing.person import find_person
 from completion.moshing.poses import follow_poses
 from completion.moshing.results import PersonFit

@@ -19,7 +19,7 @@ import numpy as np
 from protocols import load_real, machine, spring_split, write_report
 
 from completion.markers.files import MarkerSequence
-from completion.markers.layout import MarkerLayout
+from completion.markers.layout import MarkerLayout, most_used
 from completion.markers.named import layout_names
 from completion.moshing.person import find_person
 from completion.moshing.results import PersonFit
@@ -51,13 +51,6 @@ def marker_set(model: BodyModel, count: int) -> MarkerLayout:
         far = np.minimum(far, np.linalg.norm(places - places[chosen[-1]], axis=1))
         chosen.append(int(far.argmax()))
     return plain.select([plain.labels[i] for i in sorted(chosen)])
-
-
-def most_used(layout: MarkerLayout) -> np.ndarray:
-    """The vertex of each marker."""
-    if layout.weights is None:
-        return layout.vertices
-    return layout.vertices[np.arange(len(layout.labels)), layout.weights.argmax(axis=1)]
 
 
 def enlarged(model: BodyModel, layout: MarkerLayout, count: int) -> MarkerLayout:
