@@ -9,6 +9,7 @@ import dataclasses
 import importlib
 import importlib.metadata
 import json
+import math
 import os
 import platform
 import sys
@@ -22,6 +23,7 @@ import numpy as np
 
 Progress = Callable[[int, int], None]
 
+TRACEBACK = "SCAPEKIT_TRACEBACK"       # environment variable that shows where an error came from
 LIBRARIES = ("scapekit", "numpy", "scipy", "libigl", "cholespy", "embreex")
 
 
@@ -42,12 +44,16 @@ class Metric:
 
 @dataclasses.dataclass(frozen=True)
 class Outcome:
-    """What a command did: where it wrote, the figures, and what failed on the way."""
+    """What a command did: where it wrote, the figures, and what failed on the way.
+
+    `problem` says in one line why the result means nothing, with the likely cause; the files are there all the same.
+    """
 
     output: Path | None
     metrics: list[Metric]
     settings: Mapping[str, Any] = dataclasses.field(default_factory=dict)
     failures: list[str] = dataclasses.field(default_factory=list)
+    problem: str | None = None
 
 
 @contextlib.contextmanager
@@ -122,10 +128,10 @@ def plain(value: Any) -> Any:
         return {str(k): plain(v) for k, v in value.items()}
     if isinstance(value, (list, tuple)):
         return [plain(v) for v in value]
-    if isinstance(value, np.generic):
-        return value.item()
-    if isinstance(value, np.ndarray):
-        return value.tolist()
+    if isinstance(value, np.generic | np.ndarray):
+        return plain(value.tolist())
+    if isinstance(value, float) and not math.isfinite(value):
+        return None                         # JSON has no NaN
     return str(value) if isinstance(value, Path) else value
 
 
@@ -139,7 +145,7 @@ def write_report(outcome: Outcome, command: str, seconds: float) -> Path | None:
     path = outcome.output / "report.json" if is_folder else outcome.output.with_suffix(".report.json")
     storage.write_json(path, {
         "command": command, "seconds": round(seconds, 2), "versions": versions(),
-        "settings": plain(outcome.settings), "failures": outcome.failures,
+        "settings": plain(outcome.settings), "failures": outcome.failures, "problem": outcome.problem,
         "metrics": [{"metric": m.name, "value": plain(m.value), "unit": m.unit} for m in outcome.metrics]})
     return path
 
@@ -153,26 +159,44 @@ def run(function: Callable[..., Outcome], prog: str, argv: list[str]) -> int:
     import tyro
 
     start = time.perf_counter()
-    with warnings.catch_warnings():
-        warnings.simplefilter("always", UserWarning)
-        warnings.showwarning = lambda message, *_rest, **_named: say(f"{prog}: note: {message}")
+    with _notes(prog):
         try:
             outcome = tyro.cli(function, args=argv, prog=prog)
+            report = write_report(outcome, f"{prog} {' '.join(argv)}", time.perf_counter() - start)
         except KeyboardInterrupt:
             say(f"{prog}: interrupted; the same command goes on where it stopped")
             return 130
-        except (ValueError, OSError, ModuleNotFoundError) as error:
-            if os.environ.get("SCAPEKIT_TRACEBACK"):
+        except Exception as error:
+            if os.environ.get(TRACEBACK):
                 raise
-            say(f"{prog}: {' '.join(str(error).split())}")
+            say(f"{prog}: {_told(error)}")
             return 1
+    if outcome.problem:
+        say(f"{prog}: THE RESULT MEANS NOTHING: {outcome.problem}")
     show([*outcome.metrics, Metric("time", time.perf_counter() - start, "s")])
-    report = write_report(outcome, f"{prog} {' '.join(argv)}", time.perf_counter() - start)
     if outcome.output is not None:
         say(f"written: {outcome.output}" + (f" (figures in {report})" if report else ""))
     for failure in outcome.failures:
         say(f"{prog}: failed: {failure}")
-    return 1 if outcome.failures else 0
+    return 1 if outcome.failures or outcome.problem else 0
+
+
+@contextlib.contextmanager
+def _notes(prog: str) -> Iterator[None]:
+    """Our own warnings as one line each; those of libraries are for their users, not for ours."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        warnings.filterwarnings("always", category=UserWarning, module=r"(scanprep|model|completion)(\.|$)")
+        warnings.showwarning = lambda message, *_rest, **_named: say(f"{prog}: note: {message}")
+        yield
+
+
+def _told(error: Exception) -> str:
+    """One line for what went wrong; with the way to the traceback where nobody foresaw it."""
+    text = " ".join(str(error).split())
+    if isinstance(error, ValueError | OSError | ModuleNotFoundError):
+        return text
+    return f"unforeseen {type(error).__name__}: {text} (this is a fault of scapekit; {TRACEBACK}=1 shows where)"
 
 
 def dispatch(commands: Mapping[str, tuple[str, str]], prog: str, argv: list[str], lead: str) -> int:
