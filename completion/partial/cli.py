@@ -13,7 +13,7 @@ from model.linear import Subject
 from scanprep.cli import Output, Unit
 from scanprep.console import Outcome, bar, say
 from scanprep.geometry.landmarks import read_landmark_vertices
-from scanprep.pipeline import LANDMARK_ENDINGS
+from scanprep.pipeline.scans import LANDMARK_ENDINGS
 
 from ..cli import ModelOrNone, read_model
 from .colors import ColorConfig

@@ -12,7 +12,7 @@ from typing import Any
 
 import numpy as np
 
-from scanprep.batch.tasks import find_scans
+from scanprep.pipeline.scans import find_scans
 from scanprep.console import Metric, Outcome, Progress, plain, write_report
 from scanprep.geometry import storage
 from scanprep.geometry.files import MeshFileError

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from scanprep.batch.tasks import POINT_ENDINGS
+from scanprep.pipeline.scans import POINT_ENDINGS
 from scanprep.geometry.files import PointCloud, read_mesh, read_points
 from scanprep.geometry.mesh import Mesh
 

@@ -1,0 +1,396 @@
+"""An output and what scapekit knows of it: what it wrote there, what is whole, and what must be done anew.
+
+    OUTPUT/.scapekit/lock           held while a run is at work
+                     making/        what is being made; a killed run's is removed at the next start
+                     ready/NAME/    whole, on its way to its place; a killed run's is brought there at the next start
+                     done/NAME.npz  a result: digest of what it depends on, digests of its files, its value
+                     steps/         results that later ones are made of
+                     files.json     digests of files by size and times of change
+
+A file is replaced or removed only when it is as scapekit wrote it.
+"""
+from __future__ import annotations
+
+import contextlib
+import json
+import os
+import shutil
+import tempfile
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Annotated, Any, TypeVar
+from urllib.parse import quote, unquote
+
+from ..geometry import storage
+from .digests import Digests
+from .lock import locked
+from .pool import Failure, Job, Progress, Workers, run_jobs
+from .values import load_header, load_value, save_value
+
+HOME, RECORD = ".scapekit", ".record.npz"
+NOTHING: Any = object()                   # no result; None may be one
+SHOWN = 3                                 # files that a message names
+T = TypeVar("T")
+
+
+class ForeignFileError(ValueError):
+    """Something stands where an output should go, and scapekit did not write it."""
+
+
+@dataclass(frozen=True)
+class Task:
+    """One thing of many, worked on once.
+
+    Attributes
+    ----------
+    name : str
+        Its own in the output.
+    given : frozen dataclass
+        What is worked on; Paths in it count as what the files hold.
+    place : str
+        Folder of its files inside the output.
+    """
+
+    name: str
+    given: Any
+    place: str = ""
+
+
+@dataclass(frozen=True)
+class Results:
+    """What became of tasks.
+
+    Attributes
+    ----------
+    values : name -> what the work returned, in the order of the tasks
+    failures : name -> one line
+    fresh : names of the tasks that were done now; the others had been done before
+    """
+
+    values: dict[str, Any]
+    failures: dict[str, str]
+    fresh: tuple[str, ...]
+
+
+class Workspace:
+    """An output that is open for one run; see `workspace`."""
+
+    def __init__(self, folder: Path, home: Path, force: bool = False, output: Path | None = None) -> None:
+        self.folder, self.home, self.force, self.output = folder, home, force, output
+        self.digests = Digests(home / "files.json")
+        self._made: set[str] = set()
+        self._own: dict[str, set[str]] | None = None
+
+    def run(self, work: Any, tasks: Sequence[Task], workers: Workers | None = None, progress: Progress | None = None,
+            inside: Progress | None = None) -> Results:
+        """Every task whose result is not there, or depends on something that has changed since.
+
+        A task that fails stops no other. Files and value of each take their place when they are whole.
+
+        Parameters
+        ----------
+        work : frozen dataclass with `__call__(given, room)`
+            What tasks have in common; it is sent to every worker once. It reads `given`, writes files into
+            `room.folder` and returns a value that can be kept.
+        progress : callable, optional
+            Called with (done, total) tasks.
+        inside : callable, optional
+            `room.tell` of tasks that are done in this process.
+        """
+        tell = progress or (lambda done, total: None)
+        common = self.digests.of(work)
+        keys = {task.name: self.digests.of(common, task.place, task.given) for task in tasks}
+        assert len(keys) == len(tasks), "names of tasks differ"
+        by_name = {task.name: task for task in tasks}
+        values = {task.name: self._kept(task.name, keys[task.name]) for task in tasks}
+        wanted = [task for task in tasks if values[task.name] is NOTHING]
+        failures = {task.name: line for task in wanted if (line := self._blocked(task))}
+        jobs = [Job(task.name, task.given, self._making(), task.place, self.home / "steps" / _plain(task.name),
+                    self.force) for task in wanted if task.name not in failures]
+        done = len(tasks) - len(jobs)
+        tell(done, len(tasks))
+        try:
+            for job, outcome in run_jobs(work, jobs, workers or Workers(), inside):
+                if isinstance(outcome, Failure):
+                    where = str(self.folder / by_name[job.name].place)
+                    failures[job.name] = outcome.reason.replace(str(job.folder / job.place), where)
+                else:
+                    try:
+                        self._publish(job.name, job.folder, keys[job.name], outcome, common)
+                        values[job.name] = outcome
+                    except ForeignFileError as error:
+                        failures[job.name] = str(error)
+                shutil.rmtree(job.folder, ignore_errors=True)
+                done += 1
+                tell(done, len(tasks))
+        finally:
+            for job in jobs:
+                shutil.rmtree(job.folder, ignore_errors=True)
+        return Results({name: value for name, value in values.items() if name not in failures}, {task.name: failures[task.name] for task in tasks if task.name in failures},
+                       tuple(job.name for job in jobs if job.name not in failures))
+
+    def step(self, name: str, inputs: Any, make: Callable[[Path], T]) -> T:
+        """What `make` returns, or returned when it was last called with the same inputs.
+
+        Parameters
+        ----------
+        inputs : what the result depends on
+        make : callable
+            Gets a folder; files that it writes there take their place in the output.
+        """
+        key = self.digests.of(inputs)
+        kept = self._kept(name, key)
+        if kept is not NOTHING:
+            return kept
+        with self.staging(name, key) as staged:
+            staged.value = make(staged.folder)
+        return staged.value
+
+    @contextlib.contextmanager
+    def staging(self, name: str, key: str = "") -> Iterator[Staged]:
+        """A folder for files that take their place in the output, all of them, when the block ends well."""
+        staged = Staged(self._making())
+        try:
+            yield staged
+            self._publish(name, staged.folder, key, staged.value)
+        finally:
+            shutil.rmtree(staged.folder, ignore_errors=True)
+
+    def drop(self, name: str) -> None:
+        """Remove a result and its files, as far as they are as scapekit wrote them."""
+        for file, digest in (load_header(self._record(name)) or {"files": {}})["files"].items():
+            if self.digests.of_file(self.folder / file) == digest:
+                (self.folder / file).unlink()
+        self.drop_record(name)
+
+    def drop_record(self, name: str) -> None:
+        """Remove what is kept of a result, but none of its files."""
+        self._record(name).unlink(missing_ok=True)
+
+    def names(self, work: Any) -> list[str]:
+        """The results that are kept of some work, with all their files."""
+        common = self.digests.of(work)
+        found = []
+        for path in sorted((self.home / "done").glob("*.npz")):
+            header = load_header(path)
+            if header and header["work"] == common and all((self.folder / f).is_file() for f in header["files"]):
+                found.append(unquote(path.stem))
+        return found
+
+    def value(self, name: str) -> Any:
+        """A result that is kept."""
+        return load_value(self._record(name))
+
+    def is_ours(self, file: str) -> bool:
+        """Whether a file of the output is as scapekit wrote it."""
+        return self.digests.of_file(self.folder / file) in self._written().get(file, ())
+
+    def _kept(self, name: str, key: str) -> Any:
+        """A result made from the same inputs whose files are all there; NOTHING where it must be made anew."""
+        header = load_header(self._record(name))
+        if header is None or header["digest"] != key or (self.force and name not in self._made) \
+                or not all((self.folder / file).is_file() for file in header["files"]):
+            return NOTHING
+        try:
+            return load_value(self._record(name))
+        except storage.StorageError:                        # damaged
+            return NOTHING
+
+    def _blocked(self, task: Task) -> str:
+        """Why a task has no place to write to, before any work is done for it."""
+        place = self.folder / task.place
+        if not task.place or not place.exists() or load_header(self._record(task.name)) is not None:
+            return ""
+        if place.is_dir() and not any(place.iterdir()):
+            return ""
+        return _refusal(place)
+
+    def _making(self) -> Path:
+        (self.home / "making").mkdir(exist_ok=True)
+        return Path(tempfile.mkdtemp(dir=self.home / "making"))
+
+    def _record(self, name: str) -> Path:
+        return self.home / "done" / f"{_plain(name)}.npz"
+
+    def _publish(self, name: str, staged: Path, key: str, value: Any, work: str = "") -> None:
+        """Whole from the moment at which the folder gets its name among the ready ones."""
+        files = {path.relative_to(staged).as_posix(): self.digests.of_file(path)
+                 for path in sorted(staged.rglob("*")) if path.is_file()}
+        self._check_free(files)
+        save_value(staged / RECORD, value, {"digest": key, "work": work, "files": files})
+        ready = self.home / "ready" / _plain(name)
+        ready.parent.mkdir(exist_ok=True)
+        os.replace(staged, ready)
+        self._settle(ready)
+        self._made.add(name)
+
+    def _settle(self, ready: Path) -> None:
+        """Bring the files of a result to their place, and take away those that it had before and has no more."""
+        header = load_header(ready / RECORD)
+        assert header is not None, f"{ready}: results get their name when they are whole"
+        record = self._record(unquote(ready.name))
+        before = (load_header(record) or {"files": {}})["files"]
+        for file in header["files"]:
+            if (ready / file).exists():                     # else it was brought before the run was killed
+                (self.folder / file).parent.mkdir(parents=True, exist_ok=True)
+                os.replace(ready / file, self.folder / file)
+        for file, digest in before.items():
+            if file not in header["files"] and self.digests.of_file(self.folder / file) == digest:
+                (self.folder / file).unlink()
+        self._know(Path(), header["files"])
+        record.parent.mkdir(exist_ok=True)
+        os.replace(ready / RECORD, record)
+        shutil.rmtree(ready)
+
+    def _check_free(self, files: Mapping[str, str]) -> None:
+        taken = []
+        for file, digest in files.items():
+            place = self.folder / file
+            if place.is_dir() or any(p.is_file() for p in place.parents if self.folder in p.parents) \
+                    or (place.exists() and self.digests.of_file(place) != digest and not self.is_ours(file)):
+                taken.append(place)
+        if taken:
+            raise ForeignFileError(_refusal(*taken))
+
+    def _written(self) -> dict[str, set[str]]:
+        """File -> digests that scapekit wrote it with, as results that are kept and reports tell."""
+        if self._own is None:
+            self._own = {}
+            for folder in {self.folder, self.output or self.folder}:
+                place = folder.relative_to(self.folder)
+                for path in (folder / HOME / "done").glob("*.npz"):
+                    self._know(place, (load_header(path) or {"files": {}})["files"])
+            if self.output is not None:
+                report = report_path(self.output)
+                self._know(report.parent.relative_to(self.folder), written_of(report))
+        return self._own
+
+    def _know(self, place: Path, files: Mapping[str, str]) -> None:
+        for file, digest in files.items():
+            self._written().setdefault((place / file).as_posix(), set()).add(digest)
+
+    def _recover(self) -> None:
+        """What a killed run left: results that were whole come to their place, the others go."""
+        for ready in sorted((self.home / "ready").glob("*")):
+            if (ready / RECORD).exists():
+                self._settle(ready)
+            else:                                       # its record, the last to go, had come to its place
+                shutil.rmtree(ready)
+        shutil.rmtree(self.home / "making", ignore_errors=True)
+
+
+class Staged:
+    """Files and value of a result that is being made."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self.value: Any = None
+
+
+FileWorkspace = Annotated[Workspace, "steps of a command whose output is a file; they are kept beside it"]
+_open: dict[Path, Workspace] = {}
+
+
+@contextlib.contextmanager
+def workspace(folder: str | Path, force: bool = False) -> Iterator[Workspace]:
+    """Open an output folder for one run: no other gets in, and what a killed one left is put right.
+
+    Opened again inside, it is the same one.
+
+    Parameters
+    ----------
+    force : bool
+        Take nothing as done.
+
+    Raises
+    ------
+    ValueError
+        Another run is at work in the folder.
+    ForeignFileError
+        A folder with files in it that scapekit did not make.
+    """
+    folder = Path(folder)
+    if (folder / HOME).absolute() in _open:
+        yield _open[(folder / HOME).absolute()]
+        return
+    if folder.exists() and not folder.is_dir():
+        raise ForeignFileError(f"{folder}: expected a folder for the output, found a file")
+    if not (folder / HOME).is_dir():
+        _refuse_any(folder)
+    with _opened(Workspace(folder, folder / HOME, force)) as space:
+        yield space
+
+
+@contextlib.contextmanager
+def beside(output: str | Path, force: bool = False) -> Iterator[Workspace]:
+    """Open an output that is a file, or a folder that is made at once: what is kept meanwhile lies beside it.
+
+    At the end that is removed; what was written is told by the report beside the output.
+
+    Raises
+    ------
+    ValueError, ForeignFileError
+        As `workspace`.
+    """
+    output = Path(output)
+    space = Workspace(output.parent, output.parent / f".{output.name}{HOME}", force, output)
+    if output.is_dir() and not (output / HOME).is_dir() and not written_of(report_path(output)):
+        _refuse_any(output)
+    if output.is_file() and not space.is_ours(output.name):
+        raise ForeignFileError(_refusal(output))
+    with _opened(space):
+        yield space
+
+
+@contextlib.contextmanager
+def _opened(space: Workspace) -> Iterator[Workspace]:
+    """Locked, and put right where an earlier run was killed."""
+    key = space.home.absolute()
+    space.home.mkdir(parents=True, exist_ok=True)
+    with locked(space.home / "lock", space.output or space.folder):
+        space._recover()
+        _open[key] = space
+        try:
+            yield space
+        finally:
+            del _open[key]
+            shutil.rmtree(space.home / "making", ignore_errors=True)
+            if space.output is not None:
+                space.drop_record("output")                 # the report tells what was written
+            if space.output is None or any(space.home.glob("[drs]*/*")):        # done, ready, steps
+                space.digests.save()
+            else:
+                shutil.rmtree(space.home)
+
+
+def report_path(output: Path) -> Path:
+    """Where the report of an output stands: in a folder, beside a file."""
+    return output / "report.json" if output.is_dir() else output.with_suffix(".report.json")
+
+
+def written_of(report: Path) -> dict[str, str]:
+    """File -> digest of all that a command wrote, as its report tells; nothing where there is no such report."""
+    try:
+        told = json.loads(report.read_text(encoding="utf-8"))["written"]
+    except (OSError, ValueError, KeyError, TypeError, RecursionError):
+        return {}
+    return {**told, report.name: Digests().of_file(report)} if isinstance(told, dict) else {}
+
+
+def _refuse_any(folder: Path) -> None:
+    """Refuse a folder that holds anything but hidden files."""
+    inside = sorted(path for path in folder.iterdir() if not path.name.startswith(".")) if folder.is_dir() else []
+    if inside:
+        raise ForeignFileError(_refusal(*inside))
+
+
+def _refusal(*taken: Path) -> str:
+    more = f" and {len(taken) - SHOWN} more" if len(taken) > SHOWN else ""
+    return (f"{', '.join(str(path) for path in taken[:SHOWN])}{more}: in the way of the output, and not as scapekit "
+            "wrote it; nothing was touched: name another output, or move it away")
+
+
+def _plain(name: str) -> str:
+    """A name as that of a file."""
+    return quote(name, safe=" ")
