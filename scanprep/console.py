@@ -17,11 +17,14 @@ import sys
 import time
 import typing
 import warnings
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
+
+if TYPE_CHECKING:               # imported where it is used: help answers at once
+    from .batch.workspace import Results
 
 Progress = Callable[[int, int], None]
 
@@ -58,6 +61,20 @@ class Outcome:
     settings: Mapping[str, Any] = dataclasses.field(default_factory=dict)
     failures: list[str] = dataclasses.field(default_factory=list)
     problem: str | None = None
+
+
+PROBLEM = "problem"                  # name of the row of figures that says why they mean nothing
+
+
+def problem_of(metrics: Iterable[Metric]) -> str | None:
+    """Why a result means nothing, where its figures say so."""
+    return next((str(m.value) for m in metrics if m.name == PROBLEM), None)
+
+
+def failures_of(results: Results) -> list[str]:
+    """One line a task that failed, or of which the result means nothing."""
+    told = {name: f"{name}: {problem}" for name, rows in results.values.items() if (problem := problem_of(rows))}
+    return [*results.failures.values(), *told.values()]
 
 
 @contextlib.contextmanager
@@ -139,7 +156,8 @@ def plain(value: Any) -> Any:
     return str(value) if isinstance(value, Path) else value
 
 
-def write_report(outcome: Outcome, command: str, seconds: float, written: Mapping[str, str] | None = None) -> Path | None:
+def write_report(outcome: Outcome, command: str, seconds: float, written: Mapping[str, str] | None = None
+                 ) -> Path | None:
     """Write `report.json` beside the output: command, settings, versions and the numbers of the closing table.
 
     Parameters

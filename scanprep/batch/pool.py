@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from ..geometry import storage
-from .digests import Digests
+from .digests import Digests, paths_of
 from .values import load_header, load_value, save_value
 
 Progress = Callable[[int, int], None]
@@ -129,8 +129,8 @@ def attempt(work: Any, job: Job, tell: Progress | None = None) -> Any:
         text = " ".join(str(error).split())
         if not isinstance(error, ValueError | OSError | ModuleNotFoundError):
             text = f"{type(error).__name__}: {text}"
-        name = job.name.rpartition("/")[2]
-        return Failure(text if name in text else f"{name}: {text}")
+        files = [str(path) for path in paths_of(job.given)] or [job.name]
+        return Failure(text if any(file in text for file in files) else f"{files[0]}: {text}")
 
 
 def _run_in_processes(work: Any, jobs: Sequence[Job], count: int) -> Iterator[tuple[Job, Any]]:

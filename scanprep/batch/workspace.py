@@ -72,6 +72,19 @@ class Results:
     failures: dict[str, str]
     fresh: tuple[str, ...]
 
+    @property
+    def only(self) -> Any:
+        """The value of the only task.
+
+        Raises
+        ------
+        ValueError
+            It failed.
+        """
+        if self.failures:
+            raise ValueError(*self.failures.values())
+        return next(iter(self.values.values()))
+
 
 class Workspace:
     """An output that is open for one run; see `workspace`."""
@@ -115,6 +128,7 @@ class Workspace:
                 if isinstance(outcome, Failure):
                     where = str(self.folder / by_name[job.name].place)
                     failures[job.name] = outcome.reason.replace(str(job.folder / job.place), where)
+                    self.drop(job.name)             # what was made of other inputs than there are now
                 else:
                     try:
                         self._publish(job.name, job.folder, keys[job.name], outcome, common)
@@ -127,7 +141,8 @@ class Workspace:
         finally:
             for job in jobs:
                 shutil.rmtree(job.folder, ignore_errors=True)
-        return Results({name: value for name, value in values.items() if name not in failures}, {task.name: failures[task.name] for task in tasks if task.name in failures},
+        return Results({name: value for name, value in values.items() if name not in failures},
+                       {task.name: failures[task.name] for task in tasks if task.name in failures},
                        tuple(job.name for job in jobs if job.name not in failures))
 
     def step(self, name: str, inputs: Any, make: Callable[[Path], T]) -> T:

@@ -114,8 +114,6 @@ def prepare(tasks: Sequence[ScanTask], template: Mesh, template_landmarks: Mappi
         try:
             done = space.run(work, [Task(SCANS + task.name, task) for task in tasks], config.workers, progress)
             failures, fresh = {name.removeprefix(SCANS): line for name, line in done.failures.items()}, done.fresh
-            for name in done.failures:
-                space.drop(name)                    # what an earlier run made of other files than there are now
             registered = tables.write(failures)
             _with_skeleton(space, registered, config, skeleton_progress)
         finally:
