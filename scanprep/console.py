@@ -165,7 +165,7 @@ def write_report(outcome: Outcome, command: str, seconds: float, written: Mappin
     written : file -> digest, optional
         All that the command wrote, from the report's folder on.
     """
-    from .batch.workspace import report_path
+    from .batch.ownership import report_path
     from .geometry import storage
 
     if outcome.output is None:

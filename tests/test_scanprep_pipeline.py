@@ -17,8 +17,8 @@ from scipy.spatial.transform import Rotation
 
 from scanprep import Mesh, RegisteredSet, read_mesh, write_mesh
 from scanprep.batch import cluster
+from scanprep.batch.ownership import HOME, ForeignFileError
 from scanprep.batch.pool import Failure, Job, Workers, run_jobs
-from scanprep.batch.workspace import HOME, ForeignFileError
 from scanprep.cleaning.components import CleanScanConfig
 from scanprep.matching.correspondences import Correspondences
 from scanprep.pipeline import scan as scan_module
