@@ -81,13 +81,13 @@ class Digests:
         """Every value with its kind and length before it, so that no two run together."""
         if isinstance(value, Path):
             whole.update(b"file" + self.of_file(value).encode())
-        elif value is None or isinstance(value, bool | int | float | str):
-            told = repr(value).encode()
-            whole.update(f"{type(value).__name__}{len(told)}:".encode() + told)
         elif isinstance(value, np.ndarray | np.generic):
             array = np.ascontiguousarray(value)
             whole.update(f"array{array.dtype.str}{np.shape(value)}".encode())
             whole.update(array.view(np.uint8).data if array.size else b"")
+        elif value is None or isinstance(value, bool | int | float | str):
+            told = repr(value).encode()
+            whole.update(f"{type(value).__name__}{len(told)}:".encode() + told)
         elif isinstance(value, Mapping):
             self._several(whole, "map", sorted(((str(k), v) for k, v in value.items()), key=lambda kv: kv[0]))
         elif isinstance(value, list | tuple):

@@ -221,7 +221,7 @@ class Workspace:
     def _blocked(self, task: Task) -> str:
         """Why a task has no place to write to, before any work is done for it."""
         place = self.folder / task.place
-        if not task.place or not place.exists() or load_header(self._record(task.name)) is not None:
+        if not task.place or not place.exists() or self._record(task.name).exists():
             return ""
         if place.is_dir() and not any(place.iterdir()):
             return ""
