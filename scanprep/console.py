@@ -21,6 +21,8 @@ from typing import Any
 
 import numpy as np
 
+from .threads import one_thread
+
 Progress = Callable[[int, int], None]
 
 TRACEBACK = "SCAPEKIT_TRACEBACK"       # environment variable that shows where an error came from
@@ -159,7 +161,7 @@ def run(function: Callable[..., Outcome], prog: str, argv: list[str]) -> int:
     import tyro
 
     start = time.perf_counter()
-    with _notes(prog):
+    with _notes(prog), one_thread():
         try:
             outcome = tyro.cli(function, args=argv, prog=prog)
             report = write_report(outcome, f"{prog} {' '.join(argv)}", time.perf_counter() - start)

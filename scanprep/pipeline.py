@@ -12,7 +12,7 @@ from pathlib import Path
 from .batch.figures import Failure, ScanFigures, read_failures, read_figures, write_failures, write_figures
 from .batch.lock import locked
 from .batch.page import PICTURES, write_set_page
-from .batch.scan import RegisteredScan, ScanSettings, one_thread, register_scan
+from .batch.scan import RegisteredScan, ScanSettings, register_scan
 from .batch.tasks import LANDMARK_ENDINGS, TABLE, ScanTask, find_scans, read_scan
 from .batch.workers import Outcome, Work, run_in_processes
 from .dataset import RegisteredSet
@@ -21,6 +21,7 @@ from .geometry.landmarks import write_landmarks
 from .geometry.mesh import Mesh, check_template
 from .skeleton.find import find_skeleton
 from .skeleton.parts import SkeletonConfig
+from .threads import one_thread
 
 __all__ = ["LANDMARK_ENDINGS", "TABLE", "PrepareConfig", "Prepared", "ScanFigures", "ScanSettings", "ScanTask",
            "find_scans", "prepare", "read_scan", "register_scan"]

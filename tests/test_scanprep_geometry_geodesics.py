@@ -163,7 +163,7 @@ def test_a_mesh_without_edges_has_paths_of_no_length():
                          ids=["one triangle", "a point", "a line"])
 def test_where_no_heat_spreads_no_distance_is_given(vertices):
     mesh = Mesh(vertices, [[0, 1, 2]])
-    with pytest.raises(ValueError, match="no heat can spread over Mesh.*SurfaceGraph takes any"):
+    with pytest.raises(ValueError, match=r"no heat can spread over Mesh.*SurfaceGraph takes any"):
         HeatGeodesics(mesh).distances(0)
     assert np.isfinite(SurfaceGraph(mesh).distances(0)).all()
 

@@ -20,7 +20,6 @@ from scanprep.batch import cluster
 from scanprep.batch import scan as scan_module
 from scanprep.batch.figures import read_figures
 from scanprep.batch.lock import locked
-from scanprep.batch.scan import one_thread
 from scanprep.batch.workers import Work, run_in_processes
 from scanprep.cleaning.components import CleanScanConfig
 from scanprep.matching.correspondences import Correspondences
@@ -237,21 +236,6 @@ def test_a_process_that_dies_stops_no_other_scan(template):
     outcomes = {task.name: outcome for task, outcome in run_in_processes(Deadly(template, MARKS, QUICK.scan), tasks, 2)}
     assert outcomes["body0"] == "body0" and outcomes["body2"] == "body2"
     assert outcomes["body1"].startswith("/scans/body1.ply: the process at work on it died")
-
-
-def test_one_thread_while_anyone_needs_it():
-    from threadpoolctl import threadpool_info, threadpool_limits
-
-    def threads():
-        return {pool["num_threads"] for pool in threadpool_info()}
-
-    with threadpool_limits(2):
-        before = threads()
-        with one_thread():
-            with one_thread():
-                assert threads() == {1}
-            assert threads() == {1}
-        assert threads() == before
 
 
 def test_bad_scans_stop_no_other(scans, template, tmp_path):

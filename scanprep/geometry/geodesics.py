@@ -146,7 +146,8 @@ class HeatGeodesics:
 
 def _checked(mesh: Mesh, sources: np.ndarray | int) -> np.ndarray:
     vertices = np.asarray(sources)
-    if not np.issubdtype(vertices.dtype, np.integer) or not vertices.size or vertices.min() < 0 or vertices.max() >= len(mesh.vertices):
+    whole = vertices.size and np.issubdtype(vertices.dtype, np.integer)
+    if not whole or vertices.min() < 0 or vertices.max() >= len(mesh.vertices):
         raise ValueError(f"sources: expected vertices of 0..{len(mesh.vertices) - 1}, got {sources}")
     return vertices.astype(np.int64)
 

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial import cKDTree
 
+from ..threads import search_threads
 from .mesh import Mesh
 
 FARTHEST = 1e30                      # metres; the square of what lies beyond, or its float32, is infinite
@@ -80,7 +81,7 @@ class Surface:
         self._tree.init(self._vertices, self._faces)
 
     def closest(self, points: np.ndarray) -> SurfacePoints:
-        """The point of the surface closest to each query point (n, 3), metres; ValueError for one that is not finite."""
+        """The point of the surface closest to each query point (n, 3); ValueError for one that is not finite."""
         points = checked_points(points)
         squared, face, closest = self._tree.squared_distance(self._vertices, self._faces, points)[:3]
         squared, face = np.asarray(squared).reshape(-1), np.asarray(face, dtype=np.int64).reshape(-1)
@@ -156,8 +157,7 @@ class OrientedPoints:
               min_cosine: float = 0.5) -> Matches:
         """The best target of each query (n, 3) with normals (n, 3); ValueError for one that is not finite."""
         points, normals = checked_points(points), checked_points(normals, "normals")
-        workers = -1 if len(points) > 4000 else 1        # threads cost more than they save on few points
-        _, index = self._tree.query(np.hstack([points, self.scale * normals]), workers=workers)
+        _, index = self._tree.query(np.hstack([points, self.scale * normals]), workers=search_threads(len(points)))
         distances = np.linalg.norm(self.points[index] - points, axis=1)
         cosine = np.einsum("nd,nd->n", self.normals[index], normals)
         good = (distances <= max_distance) & (cosine >= min_cosine)
