@@ -28,7 +28,7 @@ LIBIGL = "IGL_NUM_THREADS"
 MANY = 4000                          # points above which threads save more than they cost in a search
 
 _guard = threading.Lock()
-_limits: list[Any] = []
+_before: list[tuple[Any, int]] = []  # libraries, and the threads they had
 _users = 0
 
 
@@ -50,18 +50,20 @@ def one_thread() -> Iterator[None]:
     global _users
     with _guard:
         _users += 1
-        if not _limits and asked() is None:
+        if not _before and asked() is None:
             import scipy.linalg  # noqa: F401  (its own OpenBLAS; what is loaded later would not be limited)
-            from threadpoolctl import threadpool_limits
+            from threadpoolctl import ThreadpoolController
 
-            _limits.append(threadpool_limits(1))
+            _before.extend((library, library.num_threads) for library in ThreadpoolController().lib_controllers)
+            for library, _ in _before:
+                _set(library, 1)
     try:
         yield
     finally:
         with _guard:
             _users -= 1
-            if not _users and _limits:
-                _limits.pop().restore_original_limits()
+            while not _users and _before:
+                _set(*_before.pop())
 
 
 def search_threads(points: int) -> int:
@@ -79,6 +81,11 @@ def begin_worker() -> None:
     for name in (*VARIABLES, LIBIGL):
         os.environ.setdefault(name, str(number))
     threadpool_limits(number)
+
+
+def _set(library: Any, number: int) -> None:
+    """Of itself threadpoolctl (3.8) listens only to the first thread that ever set a limit, and says nothing."""
+    getattr(library, "_real_set_num_threads", library.set_num_threads)(number)
 
 
 def _cores() -> int:

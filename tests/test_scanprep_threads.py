@@ -52,7 +52,7 @@ def test_users_side_by_side_share_one_limit():
             leave.wait()
         seen.append(pools())
 
-    others = [threading.Thread(target=work) for _ in range(2)]
+    others = [threading.Thread(target=work, daemon=True) for _ in range(2)]
     for other in others:
         other.start()
     inside.wait()
@@ -128,7 +128,7 @@ def test_the_same_bytes_whatever_the_threads_of_the_process():
     model = worm_with_prior()
     subject, rng = model.subject(None), np.random.default_rng(0)
     layout = MarkerLayout(tuple(f"M{i}" for i in range(60)), rng.choice(396, 60, replace=False), 0.01)
-    poses = np.cumsum(rng.normal(0, 0.02, (200, 4, 3)), axis=0)
+    poses = np.cumsum(rng.normal(0, 0.02, (60, 4, 3)), axis=0)
     meshes = subject.vertices(poses)
     places = np.stack([layout.place(subject.template.with_vertices(v)) for v in meshes])
 
