@@ -23,6 +23,8 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from .threads import one_thread
+
 if TYPE_CHECKING:               # imported where it is used: help answers at once
     from .batch.workspace import Results
 
@@ -190,7 +192,7 @@ def run(function: Callable[..., Outcome], prog: str, argv: list[str]) -> int:
     """
     start = time.perf_counter()
     call = _Call(function, prog, argv)
-    with _notes(prog):
+    with _notes(prog), one_thread():
         try:
             outcome, report = call.carried_out(start)
         except KeyboardInterrupt:

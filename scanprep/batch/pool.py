@@ -12,6 +12,7 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from ..geometry import storage
+from ..threads import begin_worker, one_thread
 from .digests import Digests, paths_of
 from .values import load_header, load_value, save_value
 
@@ -124,7 +125,8 @@ def attempt(work: Any, job: Job, tell: Progress | None = None) -> Any:
     folder = job.folder / job.place
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        return work(job.given, Room(folder, job.steps, tell, job.force))
+        with one_thread():              # so that bytes do not depend on where it is done
+            return work(job.given, Room(folder, job.steps, tell, job.force))
     except Exception as error:
         text = " ".join(str(error).split())
         if not isinstance(error, ValueError | OSError | ModuleNotFoundError):
@@ -160,8 +162,7 @@ def _in_parallel(work: Any, jobs: Sequence[Job], count: int) -> Generator[tuple[
     from loky import ProcessPoolExecutor, as_completed
     from loky.process_executor import BrokenProcessPool
 
-    pool = ProcessPoolExecutor(min(count, len(jobs)), initializer=_begin, initargs=(work, os.getpid()),
-                               env={"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"})
+    pool = ProcessPoolExecutor(min(count, len(jobs)), initializer=_begin, initargs=(work, os.getpid()))
     try:
         job_of = {pool.submit(_do, job): job for job in jobs}
         for future in as_completed(job_of):
@@ -179,6 +180,7 @@ def _begin(work: Any, parent: int) -> None:
     """A worker keeps what all jobs have in common, says nothing, and goes when the process that wants it goes."""
     global _work
     _work = work
+    begin_worker()
     warnings.simplefilter("ignore")
     threading.Thread(target=_watch, args=(parent,), daemon=True).start()
 

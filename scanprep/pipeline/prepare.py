@@ -19,9 +19,10 @@ from ..geometry.landmarks import write_landmarks
 from ..geometry.mesh import Mesh, check_template
 from ..skeleton.find import find_skeleton
 from ..skeleton.parts import SkeletonConfig
+from ..threads import one_thread
 from .figures import Failure, ScanFigures, write_failures, write_figures
 from .page import PICTURES, write_set_page
-from .scan import ScanSettings, one_thread, register_scan
+from .scan import ScanSettings, register_scan
 from .scans import ScanTask
 
 Progress = Callable[[int, int], None]
