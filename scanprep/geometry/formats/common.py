@@ -2,18 +2,21 @@
 from __future__ import annotations
 
 import gzip
+import io
 import warnings
-import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
+from .. import storage
+
+UNPACKED, RATIO = 2**20, 50          # a gzip file may unpack to this many bytes, and so many for each of its own
 UNITS = {"m": 1.0, "mm": 1e-3, "cm": 1e-2, "in": 0.0254}
 
 
-class MeshFileError(ValueError):
+class MeshFileError(storage.StorageError):
     """A file of a mesh, points or landmarks that cannot be read: which one, what was expected, what came."""
 
 
@@ -45,19 +48,30 @@ def load_bytes(path: Path) -> bytes:
     """
     try:
         data = path.read_bytes()
-        if path.suffix.lower() == ".gz":
-            data = gzip.decompress(data)
     except FileNotFoundError:
         raise MeshFileError(f"{path}: no such file") from None
     except IsADirectoryError:
         raise MeshFileError(f"{path}: expected a file, found a folder") from None
-    except (EOFError, zlib.error, gzip.BadGzipFile) as error:
-        raise MeshFileError(f"{path}: truncated or damaged gzip file ({error})") from None
     except OSError as error:
         raise MeshFileError(f"{path}: cannot be read ({error.strerror or error})") from None
+    if path.suffix.lower() == ".gz":
+        data = _unpacked(path, data)
     if not data:
         raise MeshFileError(f"{path}: the file is empty")
     return data
+
+
+def _unpacked(path: Path, data: bytes) -> bytes:
+    """What a gzip file holds, up to far more than any mesh can be packed."""
+    most = UNPACKED + RATIO * len(data)
+    try:
+        with gzip.GzipFile(fileobj=io.BytesIO(data)) as packed:
+            out = packed.read(most + 1)
+    except Exception as error:                   # gzip lets errors of zlib and of struct through
+        raise MeshFileError(f"{path}: truncated or damaged gzip file ({error})") from None
+    if len(out) > most:
+        raise MeshFileError(f"{path}: expected a packed mesh, found {len(data)} bytes that unpack to more than {most}")
+    return out
 
 
 def metres_per_unit(path: Path, points: np.ndarray, unit: str | None, smallest: float = 0.1) -> float:
@@ -69,7 +83,8 @@ def metres_per_unit(path: Path, points: np.ndarray, unit: str | None, smallest: 
         if unit not in UNITS:
             raise ValueError(f"unit: expected one of {', '.join(UNITS)}, got {unit!r}")
         return UNITS[unit]
-    extent = float(np.ptp(points, axis=0).max()) if len(points) else 0.0
+    with np.errstate(over="ignore"):
+        extent = float(np.ptp(points, axis=0).max()) if len(points) else 0.0
     if extent > 10:
         likely = min(("mm", "cm", "in"), key=lambda u: abs(np.log(extent * UNITS[u] / 1.7)))
         warnings.warn(f"{path}: {extent:.4g} m from end to end when read as metres; "
@@ -152,7 +167,7 @@ class Lines:
             try:
                 for word in words:
                     dtype(word)
-            except ValueError:
+            except (ValueError, OverflowError):
                 return self.fail(row, expected)
         return self.fail(rows[0], expected)
 
