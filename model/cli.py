@@ -8,9 +8,9 @@ import numpy as np
 import tyro
 
 from scanprep.cli import Output, Unit
-from scanprep.console import Metric, Outcome, dispatch, read_json
+from scanprep.console import Metric, Outcome, dispatch
 from scanprep.geometry.files import read_mesh, write_mesh
-from scanprep.geometry.storage import load_arrays
+from scanprep.geometry.storage import load_arrays, read_json
 
 from .body import BodyModel
 from .files import load_model

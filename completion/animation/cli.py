@@ -11,8 +11,9 @@ from model.body import BodyModel
 from model.cli import read_subject
 from model.linear import Subject
 from scanprep.cli import Output, Unit
-from scanprep.console import Metric, Outcome, bar, plain, read_json
+from scanprep.console import Metric, Outcome, bar, plain
 from scanprep.geometry import storage
+from scanprep.geometry.storage import read_json
 
 from ..cli import ModelOrNone, read_model
 from .follow import AnimateConfig

@@ -9,7 +9,7 @@ import tyro
 
 from ..batch.tasks import LANDMARK_ENDINGS, read_scan
 from ..cli import MM, MeshArg, Output, ScanArg, SetArg, Unit, about_mesh
-from ..console import Metric, Outcome, bar, read_json
+from ..console import Metric, Outcome, bar
 from ..dataset import RegisteredSet
 from ..geometry import storage
 from ..geometry.files import UNITS, PointCloud, list_meshes, read_mesh, write_mesh, write_points
@@ -217,7 +217,7 @@ def reduce_set(registered: SetArg, output: Output, faces: int,
 def _read_views(folder: Path, cameras: Path | None, unit: Unit | None) -> list[tuple[Mesh, np.ndarray]]:
     """The range meshes of a folder with the positions of their cameras."""
     given = cameras or folder / "cameras.json"
-    where = read_json(given, "camera positions {name: [x, y, z]}")
+    where = storage.read_json(given, "camera positions {name: [x, y, z]}")
     paths = list_meshes(folder)
     missing = [path.stem for path in paths if np.shape(where.get(path.stem)) != (3,)]
     if missing:

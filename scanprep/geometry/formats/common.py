@@ -13,6 +13,7 @@ import numpy as np
 from .. import storage
 
 UNPACKED, RATIO = 2**20, 50          # a gzip file may unpack to this many bytes, and so many for each of its own
+FARTHEST = 1e9                       # of a coordinate, in whatever unit
 UNITS = {"m": 1.0, "mm": 1e-3, "cm": 1e-2, "in": 0.0254}
 
 
@@ -74,6 +75,14 @@ def _unpacked(path: Path, data: bytes) -> bytes:
     return out
 
 
+def check_extent(path: Path, what: str, points: np.ndarray) -> None:
+    """MeshFileError for coordinates that no scan has, and that have no squares, lengths and areas."""
+    far = np.flatnonzero((np.abs(points) > FARTHEST).any(axis=1) & np.isfinite(points).all(axis=1))
+    if len(far):
+        raise MeshFileError(f"{path}: {what} {far[0]} lies at {points[far[0]].tolist()}, "
+                            f"expected coordinates below {FARTHEST:g}")
+
+
 def metres_per_unit(path: Path, points: np.ndarray, unit: str | None, smallest: float = 0.1) -> float:
     """What to multiply the coordinates of a file with to have metres.
 
@@ -83,8 +92,7 @@ def metres_per_unit(path: Path, points: np.ndarray, unit: str | None, smallest: 
         if unit not in UNITS:
             raise ValueError(f"unit: expected one of {', '.join(UNITS)}, got {unit!r}")
         return UNITS[unit]
-    with np.errstate(over="ignore"):
-        extent = float(np.ptp(points, axis=0).max()) if len(points) else 0.0
+    extent = float(np.ptp(points, axis=0).max()) if len(points) else 0.0
     if extent > 10:
         likely = min(("mm", "cm", "in"), key=lambda u: abs(np.log(extent * UNITS[u] / 1.7)))
         warnings.warn(f"{path}: {extent:.4g} m from end to end when read as metres; "
@@ -147,7 +155,7 @@ class Lines:
         chunk = self.text[inside] if inside else [self.text[row] for row in rows if row < len(self.text)]
         if not rows:
             return np.zeros((0, columns), dtype=dtype)
-        if len(chunk) == len(rows):
+        if not (inside and rows[-1] >= len(self.text)) and len(chunk) == len(rows):
             try:
                 values: np.ndarray = np.loadtxt(chunk, dtype=dtype, ndmin=2, comments=None)
             except ValueError:

@@ -89,7 +89,7 @@ def _contents(columns: dict[str, np.ndarray]) -> Contents:
     if {"normal_x", "normal_y", "normal_z"} <= set(columns):
         normals = np.stack([columns[f"normal_{a}"] for a in "xyz"], axis=1).astype(np.float64)[kept]
     packed = next((columns[name] for name in ("rgb", "rgba") if name in columns), None)
-    if packed is not None and packed.dtype.itemsize == 4 and packed.ndim == 1:       # 0xrrggbb, often in the bits of a float
+    if packed is not None and packed.dtype.itemsize == 4 and packed.ndim == 1:       # 0xrrggbb, maybe in a float
         bits = np.ascontiguousarray(packed).view(np.uint32)[kept]
         colors = np.stack([(bits >> shift) & 255 for shift in (16, 8, 0)], axis=1) / 255
     return Contents(points[kept], None, normals, colors)

@@ -176,11 +176,11 @@ def _binary_rows(path: Path, data: bytes, element: _Element, start: int, order: 
     columns: dict[str, _Column] = {}
     whole = np.frombuffer(data, np.uint8)
     for p, (width, _), size, place in zip(element.properties, ways, sizes, places, strict=True):
-        n, first = np.array(size, dtype=np.int64), np.array(place, dtype=np.int64)
-        before = np.cumsum(n) - n
-        each = np.repeat(first - width * before, n) + width * np.arange(n.sum())        # where every item begins
+        counts, first = np.array(size, dtype=np.int64), np.array(place, dtype=np.int64)
+        before = np.cumsum(counts) - counts
+        each = np.repeat(first - width * before, counts) + width * np.arange(counts.sum())   # where every item begins
         flat = whole[each[:, None] + np.arange(width)].view(order + p.kind)[:, 0]
-        columns[p.name] = (n, flat) if p.length_kind else flat
+        columns[p.name] = (counts, flat) if p.length_kind else flat
     return columns, start
 
 
@@ -232,9 +232,9 @@ def _ascii_rows(lines: Lines, element: _Element, start: int) -> dict[str, _Colum
         except (ValueError, IndexError):
             raise lines.fail(row, f"a row of element {element.name} as its header says") from None
     with storage.taking_apart(lines.path, f"numbers of element {element.name} as its header says", MeshFileError):
-        values = [np.array(each, dtype=np.int64 if p.kind[0] in "iu" else np.float64)
+        found = [np.array(each, dtype=np.int64 if p.kind[0] in "iu" else np.float64)
                   for p, each in zip(element.properties, items, strict=True)]
-    return {p.name: (np.array(sizes[i], dtype=np.int64), values[i]) if p.length_kind else values[i]
+    return {p.name: (np.array(sizes[i], dtype=np.int64), found[i]) if p.length_kind else found[i]
             for i, p in enumerate(element.properties)}
 
 
