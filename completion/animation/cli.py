@@ -135,7 +135,7 @@ def read_betas_to(path: Path, n_betas: int) -> BetasTo:
     try:
         found = {float(s): np.array(betas, dtype=np.float64) for s, betas in
                  (tree if keyed else {0: tree["betas"] if isinstance(tree, dict) else tree}).items()}
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, KeyError, OverflowError):
         found = {}
     if not found or any(b.ndim != 1 or len(b) > n_betas or not np.isfinite(b).all() for b in found.values()):
         raise ValueError(f"{path}: expected {wanted}, at most {n_betas} betas each")

@@ -50,7 +50,8 @@ def load_completion(folder: str | Path) -> Completion:
         found: dict[str, Any] = {name: storage.numbers(arrays, name, *shape) for name, shape in shapes.items()
                                  if name in arrays or name in ("pose", "trans", "seen")}
         facts: dict[str, Any] = {name: float(header[name]) for name in ("rms", "explained", "landmark_rms")}
-        return Completion(completed, predicted, **{"betas": None, **found, "seen": arrays["seen"].astype(bool)}, **facts,
+        found = {"betas": None, **found, "seen": arrays["seen"].astype(bool)}
+        return Completion(completed, predicted, **found, **facts,
                           converged=bool(header["converged"]), iterations=int(header["iterations"]),
                           energies={name: float(value) for name, value in header["energies"].items()},
                           scale=float(header["scale"]) if header["version"] > 1 else 1.0)

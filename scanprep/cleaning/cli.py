@@ -219,8 +219,9 @@ def _read_views(folder: Path, cameras: Path | None, unit: Unit | None) -> list[t
     given = cameras or folder / "cameras.json"
     where = storage.read_json(given, "camera positions {name: [x, y, z]}")
     paths = list_meshes(folder)
-    missing = [path.stem for path in paths if np.shape(where.get(path.stem)) != (3,)]
-    if missing:
-        raise ValueError(f"{given}: expected a camera position [x, y, z] for each view, none for {', '.join(missing)}")
-    scale = UNITS[unit or "m"]
-    return [(read_mesh(path, unit), scale * np.array(where[path.stem], dtype=np.float64)) for path in paths]
+    with storage.taking_apart(given, "camera positions {name: [x, y, z]} in JSON"):
+        missing = [path.stem for path in paths if path.stem not in where]
+        if missing:
+            raise ValueError(f"none for {', '.join(missing)}")
+        places = [UNITS[unit or "m"] * np.array(where[path.stem], dtype=np.float64).reshape(3) for path in paths]
+    return [(read_mesh(path, unit), place) for path, place in zip(paths, places, strict=True)]
