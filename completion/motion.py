@@ -108,7 +108,7 @@ class Motion:
 
 def _restored(path: str | Path, a: dict[str, np.ndarray]) -> Motion:
     """The motion of a file's arrays."""
-    kind = str(a.get("surface_model_type", ""))[:40]
+    kind = storage.text(a, "surface_model_type", "")
     if kind != SURFACE_MODEL:
         raise storage.StorageError(f"{path}: expected surface_model_type '{SURFACE_MODEL}', found '{kind}'")
     rate = a.get("mocap_frame_rate", a.get("mocap_framerate"))
@@ -122,8 +122,8 @@ def _restored(path: str | Path, a: dict[str, np.ndarray]) -> Motion:
     betas = storage.numbers(a, "betas", None).astype(np.float64) if "betas" in a else np.zeros(0)
     residuals = (storage.numbers(a, "marker_residuals", T, len(labels), finite=False) if "marker_residuals" in a
                  else np.full((T, len(labels)), np.nan))
-    converged = storage.numbers(a, "converged", T) if "converged" in a else np.ones(T)
+    converged = storage.numbers(a, "converged", T, kinds="b") if "converged" in a else np.ones(T)
     trusted = a.get("marker_trusted", np.zeros((0, 0)))
     return Motion(poses, storage.numbers(a, "trans", T, 3).astype(np.float64), betas if betas.size else None,
-                  float(rate), residuals, labels, str(a.get("gender", "neutral")), converged.astype(bool),
+                  float(rate), residuals, labels, storage.text(a, "gender", "neutral"), converged.astype(bool),
                   trusted.astype(bool))

@@ -214,9 +214,11 @@ def restored_parts(header: Mapping[str, Any], arrays: Mapping[str, np.ndarray], 
         What is missing, or does not fit the rest.
     """
     J = len(np.atleast_1d(arrays["parents"]))
-    skeleton = Skeleton(storage.numbers(arrays, "part_of_face", None), storage.numbers(arrays, "parents", J),
-                        storage.numbers(arrays, "joints", J, 3), tuple(header["names"]))
-    template = Mesh(storage.numbers(arrays, "vertices", None, 3), storage.numbers(arrays, "faces", None, 3))
+    skeleton = Skeleton(storage.numbers(arrays, "part_of_face", None, kinds="iu"),
+                        storage.numbers(arrays, "parents", J, kinds="iu"),
+                        storage.numbers(arrays, "joints", J, 3, kinds="f"), tuple(header["names"]))
+    template = Mesh(storage.numbers(arrays, "vertices", None, 3, kinds="f"),
+                    storage.numbers(arrays, "faces", None, 3, kinds="iu"))
     if len(skeleton.part_of_face) != len(template.faces):
         raise ValueError(f"part_of_face: expected one of {len(template.faces)} faces, "
                          f"found {len(skeleton.part_of_face)}")
@@ -229,6 +231,15 @@ def restored_parts(header: Mapping[str, Any], arrays: Mapping[str, np.ndarray], 
     return {"template": template, "skeleton": skeleton, "pose_mean": storage.numbers(arrays, "pose_mean", J, 3),
             "pose_covariance": storage.numbers(arrays, "pose_covariance", 3 * J, 3 * J), "info": info,
             "pose_examples": examples}
+
+
+def restored_variances(arrays: Mapping[str, np.ndarray], total: str) -> tuple[np.ndarray, float]:
+    """Variances (K,) of the shape components and the variance in all directions, from a model file."""
+    variances = storage.numbers(arrays, "shape_variances", None)
+    whole = float(storage.numbers(arrays, total))
+    if not (variances >= 0).all() or variances.sum() > 1.01 * whole:
+        raise ValueError(f"{total}: expected the sum of shape_variances or more, found {whole:g}")
+    return variances, whole
 
 
 def versions() -> dict[str, str]:

@@ -10,7 +10,7 @@ import tyro
 from scanprep.cli import Output, Unit
 from scanprep.console import Metric, Outcome, dispatch
 from scanprep.geometry.files import read_mesh, write_mesh
-from scanprep.geometry.storage import load_arrays, read_json, taking_apart
+from scanprep.geometry.storage import load_arrays, numbers, read_json, taking_apart
 
 from .body import BodyModel
 from .files import load_model
@@ -91,7 +91,8 @@ def _read_turns(path: Path) -> dict[str, np.ndarray]:
     wanted = "turns {part: [x, y, z]}"
     tree = read_json(path, wanted)
     with taking_apart(path, f"{wanted} in JSON"):
-        return {name: np.array(turn, dtype=np.float64).reshape(3) for name, turn in tree.items()}
+        turns = {name: np.array(turn, dtype=np.float64) for name, turn in tree.items()}
+        return {name: numbers(turns, name, 3) for name in turns}
 
 
 def read_subject(model: BodyModel, given: Path | None, unit: Unit | None = None) -> Subject:

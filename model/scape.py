@@ -13,7 +13,7 @@ from scanprep.geometry.mesh import Mesh
 from scanprep.skeleton.tree import Skeleton
 
 from .bilinear import ShapedPoints
-from .body import BodyModel, restored_parts, versions
+from .body import BodyModel, restored_parts, restored_variances, versions
 from .carriers import Carrier, build_basis, build_shaped_points, carried_terms, make_carriers, rigid_weights
 from .features import PoseFeatures, Terms, linear_features, restored_features
 from .gradients import edges
@@ -193,10 +193,10 @@ class ScapeModel(BodyModel):
         flat = storage.numbers(a, "pose_coefficients", 9 * int(n @ sizes))
         blocks = np.split(flat, np.cumsum(9 * n * sizes)[:-1])
         coefficients = tuple(b.reshape(k, f, 3, 3) for b, k, f in zip(blocks, n, sizes, strict=True))
-        variances = storage.numbers(a, "shape_variances", None)
+        variances, total = restored_variances(a, "shape_total_variance")
         shapes = ShapeSpace(storage.numbers(a, "shape_mean", F, 3, 3),
                             storage.numbers(a, "shape_components", len(variances), F, 3, 3), variances,
-                            float(storage.numbers(a, "shape_total_variance")))
+                            total)
         return cls(pose_space=PoseSpace(features, coefficients), shape_space=shapes, **parts, **cls._extra(a))
 
     @classmethod

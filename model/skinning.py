@@ -14,7 +14,7 @@ from scanprep.geometry.mesh import Mesh
 from scanprep.skeleton.tree import Skeleton
 
 from .bilinear import ShapedPoints
-from .body import BodyModel, restored_parts, versions
+from .body import BodyModel, restored_parts, restored_variances, versions
 from .features import PoseFeatures, Terms, restored_features
 from .linear import check_points, check_pose
 
@@ -224,7 +224,8 @@ class SkinningModel(BodyModel):
             "joints": self.skeleton.joints, "feature_part": self.features.part, "feature_mix": self.features.mix,
             **{f"lift_{name}": array for name, array in self.features.lift.arrays().items()},
             "pose_examples": self.pose_examples,
-            **{name: getattr(self, name) for name in _STORED}, "shape_total": np.asarray(self.shape_total),
+            **{name: getattr(self, name) for name in _STORED},
+            "shape_variances": self.shape_variances, "shape_total": np.asarray(self.shape_total),
             "pose_mean": self.pose_mean, "pose_covariance": self.pose_covariance}
         storage.save(path, self.kind, VERSION, arrays, header)
 
@@ -235,8 +236,8 @@ class SkinningModel(BodyModel):
         with storage.taking_apart(path, "a whole model"):
             parts = restored_parts(header, a, VERSION)
             stored: dict[str, Any] = {name: storage.numbers(a, name, *(None,) * axes) for name, axes in _STORED.items()}
-            return cls(features=restored_features(parts["skeleton"], header, a),
-                       shape_total=float(storage.numbers(a, "shape_total")), **parts, **stored)
+            stored["shape_variances"], stored["shape_total"] = restored_variances(a, "shape_total")
+            return cls(features=restored_features(parts["skeleton"], header, a), **parts, **stored)
 
 
-_STORED = {"rest": 2, "weights": 2, "correctives": 3, "shape_mean": 2, "shape_components": 3, "shape_variances": 1}
+_STORED = {"rest": 2, "weights": 2, "correctives": 3, "shape_mean": 2, "shape_components": 3}

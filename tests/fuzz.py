@@ -111,8 +111,8 @@ def run(count: int, hours: float, first: int, only: str) -> dict[str, Any]:
             told["longest_s"] = max(told["longest_s"], round(seconds, 2))
             told["largest_MB"] = max(told["largest_MB"], round(megabytes))
             if outcome == "failed":
-                print(f"--- {seed.path.relative_to(folder)}: {text.strip()}\n"
-                      f"    again: python tests/fuzz.py --count 1 --seed {number}" + (f" --only {only}" if only else ""))
+                print(f"--- {seed.path.relative_to(folder)}: {text.strip()}\n    again: python tests/fuzz.py --count 1 "
+                      f"--seed {number}" + (f" --only {only}" if only else ""))
             seed.path.write_bytes(good[which])
             number += 1
     return {**told, "kinds": len(seeds), "next_seed": number}

@@ -103,7 +103,7 @@ def point_table(path: Path, data: bytes) -> PointTable:
     MarkerFileError
         Not a C3D file, damaged, truncated, or without points.
     """
-    start = (data[0] - 1) * _BLOCK
+    start = (data[0] - 1) * _BLOCK if data else 0
     if len(data) < _BLOCK or data[1] != _MAGIC:
         raise MarkerFileError(f"{path}: expected a C3D file, with byte 2 = 80 and a header of {_BLOCK} bytes; "
                               f"found {len(data)} bytes that begin {data[:8]!r}")

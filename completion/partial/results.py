@@ -47,11 +47,11 @@ def load_completion(folder: str | Path) -> Completion:
         N = len(completed.vertices)
         shapes: dict[str, tuple[int | None, ...]] = {"pose": (None, 3), "betas": (None,), "trans": (3,), "seen": (N,),
                                                      "expected_error": (N,), "confidence": (N,)}
-        found: dict[str, Any] = {name: storage.numbers(arrays, name, *shape) for name, shape in shapes.items()
+        found: dict[str, Any] = {name: storage.numbers(arrays, name, *shape, kinds="b" if name == "seen" else "f")
+                                 for name, shape in shapes.items()
                                  if name in arrays or name in ("pose", "trans", "seen")}
         facts: dict[str, Any] = {name: float(header[name]) for name in ("rms", "explained", "landmark_rms")}
-        found = {"betas": None, **found, "seen": arrays["seen"].astype(bool)}
-        return Completion(completed, predicted, **found, **facts,
+        return Completion(completed, predicted, **{"betas": None, **found}, **facts,
                           converged=bool(header["converged"]), iterations=int(header["iterations"]),
                           energies={name: float(value) for name, value in header["energies"].items()},
                           scale=float(header["scale"]) if header["version"] > 1 else 1.0)

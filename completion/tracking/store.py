@@ -48,7 +48,8 @@ class FrameStore:
                     if header["key"] != self.digest or header["first"] != len(done):
                         raise ValueError("of another run")
                     self.problems, P = list(header["problems"]), a["x"].shape[1]
-                    fresh = [storage.numbers(a, name, len(a["x"]), *shape, finite=name not in ("residual", "explained"))
+                    fresh = [storage.numbers(a, name, len(a["x"]), *shape, finite=name not in ("residual", "explained"),
+                                             kinds="b" if name == "found" else "f")
                              for name, shape in zip(_ARRAYS, ((P,), (), (), (), (P,), (P, P)), strict=True)]
                     betas = storage.numbers(a, "betas", None) if header["shaped"] else None
             except storage.StorageError:

@@ -10,7 +10,7 @@ import numpy as np
 from scanprep.cli import Output, Unit
 from scanprep.console import Metric, Outcome, bar
 from scanprep.geometry.files import write_mesh
-from scanprep.geometry.storage import StorageError, load_arrays, numbers, taking_apart
+from scanprep.geometry.storage import StorageError, load_arrays, numbers, taking_apart, text
 from scanprep.pictures.views import upright
 
 from ..body import BodyModel
@@ -105,7 +105,7 @@ def read_motion(path: Path, model: BodyModel) -> _Moves:
     if lacking:
         raise StorageError(f"{path}: expected a motion, it lacks {' and '.join(lacking)}")
     with taking_apart(path, "a whole motion"):
-        made_for = str(stored.get("surface_model_type", model.kind))[:40]
+        made_for = text(stored, "surface_model_type", model.kind)
         if made_for not in (MOTIONS_OF, model.kind):
             raise StorageError(f"{path}: expected surface_model_type '{MOTIONS_OF}', found '{made_for}'")
         J, T = len(model.skeleton.parents), len(np.atleast_1d(stored["poses"]))

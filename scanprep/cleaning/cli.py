@@ -223,5 +223,6 @@ def _read_views(folder: Path, cameras: Path | None, unit: Unit | None) -> list[t
         missing = [path.stem for path in paths if path.stem not in where]
         if missing:
             raise ValueError(f"none for {', '.join(missing)}")
-        places = [UNITS[unit or "m"] * np.array(where[path.stem], dtype=np.float64).reshape(3) for path in paths]
+        where = {name: np.array(place, dtype=np.float64) for name, place in where.items()}
+        places = [UNITS[unit or "m"] * storage.numbers(where, path.stem, 3) for path in paths]
     return [(read_mesh(path, unit), place) for path, place in zip(paths, places, strict=True)]

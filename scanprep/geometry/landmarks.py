@@ -228,7 +228,10 @@ def _slicer(path: Path, markups: list[Any], mesh: Mesh | None, unit: str | None
             for i, point in enumerate(markup["controlPoints"]):
                 if point.get("positionStatus", "defined") == "defined":
                     position = np.array(point["position"], dtype=np.float64)
-                    pairs.append((str(point.get("label", i)), position.reshape(3) * turn))
+                    name = point.get("label", i)
+                    if not isinstance(name, str | int):
+                        raise ValueError(f"point {i} has a label that is no text")
+                    pairs.append((str(name), position.reshape(3) * turn))
     if str(own_unit) not in UNITS and unit is None:
         raise MeshFileError(f"{path}: expected coordinateUnits of {', '.join(UNITS)}, found {own_unit!r}")
     if mesh is not None and pairs and all((np.abs(np.asarray(p)) <= FARTHEST).all() for _, p in pairs):

@@ -22,6 +22,7 @@ import numpy as np
 
 HEADER = "header"
 UNPACKED, RATIO = 2**27, 100         # an archive may hold this many bytes, and so many more for each of its own
+LARGEST = 1e30                       # number that still has a square: what is larger counts as infinite
 LARGEST_TEXT = 2**28                 # bytes of a JSON file or a table
 
 
@@ -99,6 +100,14 @@ def writing_folder(path: str | Path) -> Iterator[Path]:
         os.replace(beside, path)
     finally:
         shutil.rmtree(beside, ignore_errors=True)
+
+
+def text(arrays: Mapping[str, np.ndarray], name: str, usual: str) -> str:
+    """The one text of this name, `usual` where there is none; ValueError for anything else."""
+    value = arrays.get(name, np.array(usual))
+    if value.size != 1 or value.dtype.kind not in "US":
+        raise ValueError(f"{name}: expected one text, found {value.dtype} of shape {value.shape}")
+    return value.item().decode() if value.dtype.kind == "S" else str(value.item())
 
 
 def as_json(value: Any) -> Any:
@@ -302,8 +311,9 @@ def _array(stream: IO[bytes], size: int, name: str) -> np.ndarray:
     return values.reshape(shape[::-1]).T if fortran else values.reshape(shape)
 
 
-def numbers(arrays: Mapping[str, np.ndarray], name: str, *shape: int | None, finite: bool = True) -> np.ndarray:
-    """The array of this name, of this shape (None: any length) and finite.
+def numbers(arrays: Mapping[str, np.ndarray], name: str, *shape: int | None, finite: bool = True, kinds: str = "iuf"
+            ) -> np.ndarray:
+    """The array of this name, of this shape (None: any length), of one of these kinds of numpy, and finite.
 
     Raises
     ------
@@ -311,13 +321,13 @@ def numbers(arrays: Mapping[str, np.ndarray], name: str, *shape: int | None, fin
         Not there, of another shape, not numbers, not finite.
     """
     values = arrays[name]
-    if values.dtype.kind not in "biuf":
+    if values.dtype.kind not in kinds:
         raise ValueError(f"{name}: expected numbers, found {values.dtype}")
     if len(shape) != values.ndim or any(n not in (None, found) for n, found in zip(shape, values.shape, strict=True)):
         wanted = ", ".join("any" if n is None else str(n) for n in shape)
         raise ValueError(f"{name}: expected shape ({wanted}), found {values.shape}")
-    if finite and not np.isfinite(values).all():
-        raise ValueError(f"{name}: {np.count_nonzero(~np.isfinite(values))} values are not finite")
+    if finite and not (np.abs(values) <= LARGEST).all():
+        raise ValueError(f"{name}: {np.count_nonzero(~(np.abs(values) <= LARGEST))} values are not finite")
     return values
 
 

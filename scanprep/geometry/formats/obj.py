@@ -32,7 +32,7 @@ def _vertices(lines: Lines, rows: list[int]) -> np.ndarray:
     """(N, 3) coordinates, or (N, 6) and more where every line has a colour as well."""
     text = _after(lines, rows)
     try:
-        table = np.loadtxt(text, ndmin=2, comments=None)
+        table = np.loadtxt(text, ndmin=2, comments=None) if any(map(bytes.strip, text)) else np.zeros((0, 3))
         if len(table) != len(rows) or table.shape[1] < 3:
             raise ValueError
         return table[:, :6 if table.shape[1] >= 6 else 3]
@@ -53,7 +53,9 @@ def _corners(lines: Lines, v_rows: list[int], f_rows: list[int]) -> tuple[np.nda
     if any(b"/" in line for line in text):           # v/vt/vn: the first number is the vertex
         text = re.sub(rb"/\S*", b"", b"\n".join(text)).split(b"\n")
     try:
-        table: np.ndarray = np.loadtxt(text, dtype=np.int64, ndmin=2, comments=None) if any(text) else np.zeros((0, 3))
+        table: np.ndarray = np.zeros((0, 3))
+        if any(map(bytes.strip, text)):
+            table = np.loadtxt(text, dtype=np.int64, ndmin=2, comments=None)
         if len(table) != len(text):
             raise ValueError
         corners, sizes = table.astype(np.int64).ravel(), np.full(len(text), table.shape[1])

@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
+from .. import storage
 from .common import Contents, Lines, MeshFileError, as_bytes, quote
 
 _KEYS = (b"VERSION", b"FIELDS", b"SIZE", b"TYPE", b"COUNT", b"WIDTH", b"HEIGHT", b"VIEWPOINT", b"POINTS", b"DATA")
@@ -36,7 +37,8 @@ def read(path: Path, data: bytes) -> Contents:
     else:
         raise MeshFileError(f"{path}: expected DATA ascii or binary in the PCD header, found {quote(how)}; "
                             f"save the file as binary")
-    return _contents(columns)
+    with storage.taking_apart(path, "three normals and one colour of each point", MeshFileError):
+        return _contents(columns)
 
 
 def _header(path: Path, data: bytes) -> tuple[dict[bytes, list[bytes]], int, int]:
