@@ -188,6 +188,8 @@ class ScapeModel(BodyModel):
         """The model of a header and the arrays of a file."""
         parts = restored_parts(header, a, VERSION)
         F, skeleton = len(parts["template"].faces), parts["skeleton"]
+        if parts["template"].vertex_component.any():
+            raise ValueError("vertices: expected one connected surface, which alone can be stitched")
         features = _restored_features(skeleton, header, a)
         sizes, n = np.bincount(skeleton.part_of_face), np.bincount(features.part)
         flat = storage.numbers(a, "pose_coefficients", 9 * int(n @ sizes))

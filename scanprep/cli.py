@@ -10,6 +10,7 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import numpy as np
 import tyro
 
+from .batch.pool import Workers
 from .console import Metric, dispatch
 
 if TYPE_CHECKING:               # imported where they are used: this module must answer --help at once
@@ -20,12 +21,14 @@ ScanArg = Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="SCAN")]
 MeshArg = Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="MESH")]
 SetArg = Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="SET")]
 Output = Annotated[Path, tyro.conf.arg(aliases=["-o"])]
+WorkersArg = Annotated[Workers, tyro.conf.arg(name="")]
 MM = 1000.0
 
 COMMANDS = {
-    "run": ("Scans -> registered set with a skeleton; goes on where it was interrupted.", "scanprep.batch.cli:run_all"),
+    "run": ("Scans -> registered set with a skeleton; goes on where it was interrupted.",
+            "scanprep.pipeline.cli:run_all"),
     "page": ("The page of a registered set: every scan with pictures and figures, worst first.",
-             "scanprep.batch.cli:page"),
+             "scanprep.pipeline.cli:page"),
     "clean": ("Floor, furniture and specks off a raw scan.", "scanprep.cleaning.cli:clean"),
     "template": ("Range views with known cameras -> a closed template.", "scanprep.cleaning.cli:template_of_views"),
     "views": ("Bring range views into one frame.", "scanprep.cleaning.cli:align_cameras"),

@@ -8,20 +8,27 @@ import contextlib
 import dataclasses
 import importlib
 import importlib.metadata
+import inspect
 import math
 import os
 import platform
 import sys
 import time
+import typing
 import warnings
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+if TYPE_CHECKING:               # imported where it is used: help answers at once
+    from .batch.workspace import Results
+
 Progress = Callable[[int, int], None]
 
+OUTPUTS, SPACE, FORCE = ("output", "out"), "space", "force"     # parameters of commands that are dealt with here
+FORCE_HELP = "\n    force: Do all anew, whatever is done already.\n"
 TRACEBACK = "SCAPEKIT_TRACEBACK"       # environment variable that shows where an error came from
 LIBRARIES = ("scapekit", "numpy", "scipy", "libigl", "cholespy", "embreex")
 
@@ -53,6 +60,20 @@ class Outcome:
     settings: Mapping[str, Any] = dataclasses.field(default_factory=dict)
     failures: list[str] = dataclasses.field(default_factory=list)
     problem: str | None = None
+
+
+PROBLEM = "problem"                  # name of the row of figures that says why they mean nothing
+
+
+def problem_of(metrics: Iterable[Metric]) -> str | None:
+    """Why a result means nothing, where its figures say so."""
+    return next((str(m.value) for m in metrics if m.name == PROBLEM), None)
+
+
+def failures_of(results: Results) -> list[str]:
+    """One line a task that failed, or of which the result means nothing."""
+    told = {name: f"{name}: {problem}" for name, rows in results.values.items() if (problem := problem_of(rows))}
+    return [*results.failures.values(), *told.values()]
 
 
 @contextlib.contextmanager
@@ -134,18 +155,26 @@ def plain(value: Any) -> Any:
     return str(value) if isinstance(value, Path) else value
 
 
-def write_report(outcome: Outcome, command: str, seconds: float) -> Path | None:
-    """`report.json` beside the output: command, settings, versions and the numbers of the closing table."""
+def write_report(outcome: Outcome, command: str, seconds: float, written: Mapping[str, str] | None = None
+                 ) -> Path | None:
+    """Write `report.json` beside the output: command, settings, versions and the numbers of the closing table.
+
+    Parameters
+    ----------
+    written : file -> digest, optional
+        All that the command wrote, from the report's folder on.
+    """
+    from .batch.ownership import report_path
     from .geometry import storage
 
     if outcome.output is None:
         return None
-    is_folder = outcome.output.is_dir()
-    path = outcome.output / "report.json" if is_folder else outcome.output.with_suffix(".report.json")
+    path = report_path(outcome.output)
     storage.write_json(path, {
         "command": command, "seconds": round(seconds, 2), "versions": versions(),
         "settings": plain(outcome.settings), "failures": outcome.failures, "problem": outcome.problem,
-        "metrics": [{"metric": m.name, "value": plain(m.value), "unit": m.unit} for m in outcome.metrics]})
+        "metrics": [{"metric": m.name, "value": plain(m.value), "unit": m.unit} for m in outcome.metrics],
+        **({} if written is None else {"written": dict(written)})})
     return path
 
 
@@ -154,30 +183,90 @@ def run(function: Callable[..., Outcome], prog: str, argv: list[str]) -> int:
 
     The signature of the function is the command line: names, types, defaults and the docstring.
     0: done; 1: failed, with one line that says why; 2: wrong usage.
-    """
-    import tyro
 
+    A function with a parameter `space: Workspace` works in its output folder and goes on there where it was
+    interrupted. All others write to a folder of their own, from which the output takes its place when it is whole.
+    """
     start = time.perf_counter()
+    call = _Call(function, prog, argv)
     with _notes(prog):
         try:
-            outcome = tyro.cli(function, args=argv, prog=prog)
-            report = write_report(outcome, f"{prog} {' '.join(argv)}", time.perf_counter() - start)
+            outcome, report = call.carried_out(start)
         except KeyboardInterrupt:
-            say(f"{prog}: interrupted; the same command goes on where it stopped")
+            say(f"{prog}: interrupted; " + ("the same command goes on where it stopped" if call.resumes else
+                                            "nothing was written"))
             return 130
         except Exception as error:
             if os.environ.get(TRACEBACK):
                 raise
-            say(f"{prog}: {_told(error)}")
+            say(f"{prog}: {call.real(_told(error))}")
             return 1
     if outcome.problem:
         say(f"{prog}: THE RESULT MEANS NOTHING: {outcome.problem}")
     show([*outcome.metrics, Metric("time", time.perf_counter() - start, "s")])
     if outcome.output is not None:
-        say(f"written: {outcome.output}" + (f" (figures in {report})" if report else ""))
+        say(call.real(f"written: {outcome.output}" + (f" (figures in {report})" if report else "")))
     for failure in outcome.failures:
-        say(f"{prog}: failed: {failure}")
+        say(call.real(f"{prog}: failed: {failure}"))
     return 1 if outcome.failures or outcome.problem else 0
+
+
+class _Call:
+    """A function with what the command line gives it."""
+
+    def __init__(self, function: Callable[..., Outcome], prog: str, argv: list[str]) -> None:
+        import tyro
+
+        self.function, self.command = function, f"{prog} {' '.join(argv)}"
+        hints = typing.get_type_hints(function, include_extras=True)
+        parameters = inspect.signature(function).parameters.values()
+        self.wants_space = any(p.name == SPACE for p in parameters)
+        shown = [p.replace(annotation=hints[p.name]) for p in parameters if p.name != SPACE]
+        self.output_name = next((p.name for p in shown if p.name in OUTPUTS), None)
+        self.resumes = self.wants_space
+        self.beside = self.wants_space and typing.get_origin(hints[SPACE]) is not None      # Annotated: FileWorkspace
+        if self.output_name is not None:
+            force = inspect.Parameter(FORCE, inspect.Parameter.KEYWORD_ONLY, default=False, annotation=bool)
+            shown.append(force)
+
+        def collect(**given: Any) -> dict[str, Any]:
+            return given
+
+        collect.__doc__ = (inspect.getdoc(function) or "") + (FORCE_HELP if self.output_name else "")
+        collect.__annotations__ = {p.name: p.annotation for p in shown}
+        collect.__signature__ = inspect.Signature(shown)                            # type: ignore[attr-defined]
+        self.given: dict[str, Any] = tyro.cli(collect, args=argv, prog=prog)
+        self.force = self.given.pop(FORCE, False)
+        self.output: Path | None = self.given.get(self.output_name or "")
+        self._staged: Path | None = None
+
+    def real(self, text: str) -> str:
+        """A message with the path of the output for that of the folder in which it was made."""
+        staged, output = self._staged, self.output
+        return text if staged is None or output is None else text.replace(str(staged), str(output.parent))
+
+    def carried_out(self, start: float) -> tuple[Outcome, Path | None]:
+        """What the function did, and where its report is."""
+        from .batch.workspace import beside, workspace
+
+        if self.output is None:
+            return self.function(**self.given), None
+        if self.wants_space and not self.beside:
+            with workspace(self.output, self.force) as space:
+                outcome = self.function(**self.given, space=space)
+                with space.staging("report") as staged:
+                    report = write_report(dataclasses.replace(outcome, output=staged.folder), self.command,
+                                          time.perf_counter() - start)
+                return outcome, None if report is None else self.output / report.name
+        with beside(self.output, self.force) as space, space.staging("output") as staged:
+            self._staged = staged.folder
+            given = {**self.given, str(self.output_name): staged.folder / self.output.name}
+            outcome = self.function(**given, **({SPACE: space} if self.wants_space else {}))
+            made = outcome.output or staged.folder / self.output.name
+            top = made if made.is_dir() else made.parent
+            written = {p.relative_to(top).as_posix(): space.digests.of_file(p) for p in sorted(top.rglob("*"))
+                       if p.is_file()}
+            return outcome, write_report(outcome, self.command, time.perf_counter() - start, written)
 
 
 @contextlib.contextmanager

@@ -93,11 +93,7 @@ class RegisteredSet:
                 raise ValueError(f"folder: {folder} holds a set of another template, {old.template}; "
                                  f"expected {template}")
             return old
-        write_mesh(folder / "template.ply", template)
-        _write_rows(folder, ())
-        header = {"kind": KIND, "version": VERSION, "vertices": len(template.vertices),
-                  "faces": len(template.faces), **(info or {})}
-        storage.write_json(folder / "set.json", header)          # last: with it the set exists
+        write_set(folder, template, (), info)
         return RegisteredSet.load(folder)
 
     @staticmethod
@@ -220,6 +216,15 @@ class RegisteredSet:
         """Vertices (S, N, 3), metres, of one mesh of every subject: the one that was added first."""
         first = {entry.subject: entry.name for entry in reversed(self.entries)}
         return self.vertices([first[subject] for subject in self.subjects])
+
+
+def write_set(folder: Path, template: Mesh, entries: Sequence[SetEntry], info: dict[str, Any] | None = None) -> None:
+    """Write all of a set but its meshes and skeleton."""
+    write_mesh(folder / "template.ply", template)
+    _write_rows(folder, entries)
+    header = {"kind": KIND, "version": VERSION, "vertices": len(template.vertices), "faces": len(template.faces),
+              **(info or {})}
+    storage.write_json(folder / "set.json", header)              # last: with it the set exists
 
 
 def _read_header(folder: Path) -> dict[str, Any]:

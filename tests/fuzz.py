@@ -25,7 +25,7 @@ import numpy as np
 from fuzz_mutations import mutated
 from fuzz_seeds import Seed, make_seeds
 
-SECONDS, MEGABYTES, LONGEST_MESSAGE = 2.0, 500.0, 10_000
+SECONDS, MEGABYTES = 2.0, 500.0
 
 
 class Slow(BaseException):
@@ -65,8 +65,7 @@ def try_once(seed: Seed, name: str) -> tuple[str, str]:
             return "failed", "it took too long"
         except Exception:
             return "failed", traceback.format_exc()
-        if outcome == "refused" and (name not in text or "\n" in text or len(text) > LONGEST_MESSAGE
-                                     or "allow_pickle" in text):
+        if outcome == "refused" and (name not in text or "\n" in text or "allow_pickle" in text):
             return "failed", f"refused, but by a message that does not fit: {text[:300]!r}"
         strange = [w for w in said if w.category is UserWarning and name not in str(w.message)]
         if strange:

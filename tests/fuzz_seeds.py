@@ -26,7 +26,6 @@ from model.export.cli import read_motion
 from model.files import load_model
 from model.learning.cli import _read_sexes
 from scanprep import Mesh, RegisteredSet, read_landmarks, read_mesh, write_landmarks, write_mesh
-from scanprep.batch.tasks import find_scans
 from scanprep.cleaning.cli import _read_views
 from scanprep.cleaning.decimate_set import DecimateSetConfig
 from scanprep.cleaning.decimate_set_files import _load_map, write_decimated_set
@@ -35,6 +34,7 @@ from scanprep.geometry.files import PointCloud, read_points, write_points
 from scanprep.geometry.landmarks import read_landmark_vertices
 from scanprep.matching.correspondence_files import read_correspondences, write_correspondences
 from scanprep.matching.correspondences import Correspondences
+from scanprep.pipeline.scans import find_scans
 from scanprep.scanning.embedded import GroundTruth, _write_views, read_views
 from scanprep.scanning.people_anatomy import BodyShape
 from scanprep.scanning.scanner import RangeView, Scan
@@ -59,7 +59,7 @@ def finite(*arrays: np.ndarray | None) -> None:
 
 def good_mesh(mesh: Mesh) -> None:
     finite(mesh.vertices, mesh.colors, mesh.vertex_normals, mesh.face_areas)
-    assert mesh.faces.shape[1:] == (3,) and 0 <= mesh.faces.min() <= mesh.faces.max() < len(mesh.vertices)
+    assert mesh.faces.shape[1:] == (3,) and ((mesh.faces >= 0) & (mesh.faces < len(mesh.vertices))).all()
 
 
 def good_points(cloud: PointCloud) -> None:

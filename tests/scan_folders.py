@@ -8,13 +8,16 @@ import igl
 import numpy as np
 
 from scanprep import Mesh, write_landmarks, write_mesh
+from scanprep.batch.pool import Workers
 from scanprep.matching.nonrigid import GraphStage, RegistrationConfig, ShellStage
-from scanprep.pipeline import PrepareConfig, ScanSettings, find_scans, prepare
+from scanprep.pipeline.prepare import PrepareConfig, prepare
+from scanprep.pipeline.scan import ScanSettings
+from scanprep.pipeline.scans import find_scans
 
 MARKS = {"top": 0, "left": 1, "right": 2, "front": 3, "back": 4}
 QUICK = PrepareConfig(ScanSettings(RegistrationConfig(
     graph=(GraphStage(40, 0.35, 0.035, 0.7, 0.01, 0.2, slide=0.3, rounds=2),),
-    shell=(ShellStage(0.02, 0.007, 0.0002, 0.05),), settle=None), pictures=False), min_poses=99, workers=1)
+    shell=(ShellStage(0.02, 0.007, 0.0002, 0.05),), settle=None), pictures=False), min_poses=99, workers=Workers(1))
 WITH_PICTURES = replace(QUICK, scan=replace(QUICK.scan, pictures=True))
 CHANGING = {"times.csv"}            # the only file that may differ between two runs
 
@@ -40,13 +43,13 @@ def write_scans(folder, template, count=3):
 def contents(folder):
     """Path -> bytes of all files that must not depend on how a run went."""
     return {str(p.relative_to(folder)): p.read_bytes() for p in sorted(folder.rglob("*"))
-            if p.is_file() and p.name not in CHANGING}
+            if p.is_file() and p.name not in CHANGING and ".scapekit" not in p.parts}
 
 
 if __name__ == "__main__":
     signal.signal(signal.SIGINT, signal.default_int_handler)        # a shell ignores it for what it starts behind
     try:
         prepare(find_scans(sys.argv[1]), ball(), MARKS, Path(sys.argv[2]),
-                replace(WITH_PICTURES, workers=int(sys.argv[3])))
+                replace(WITH_PICTURES, workers=Workers(int(sys.argv[3]))))
     except KeyboardInterrupt:
         sys.exit(130)

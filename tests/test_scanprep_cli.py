@@ -12,7 +12,6 @@ from scipy.spatial.transform import Rotation
 
 from completion.__main__ import main
 from scanprep import Mesh, RegisteredSet, Skeleton, read_mesh, read_points, write_landmarks, write_mesh
-from scanprep.batch import cli as batch_cli
 from scanprep.cli import COMMANDS
 from scanprep.geometry.files import PointCloud, write_points
 from scanprep.geometry.storage import StorageError
@@ -20,7 +19,10 @@ from scanprep.matching import cli as matching_cli
 from scanprep.matching.correspondence_files import read_correspondences, write_correspondences
 from scanprep.matching.correspondences import Correspondences
 from scanprep.matching.nonrigid import register
-from scanprep.pipeline import ScanSettings, find_scans, prepare
+from scanprep.pipeline import cli as pipeline_cli
+from scanprep.pipeline.prepare import prepare
+from scanprep.pipeline.scan import ScanSettings
+from scanprep.pipeline.scans import find_scans
 
 ROOT = Path(__file__).parents[1]
 
@@ -50,7 +52,7 @@ def quick(monkeypatch):
     """Registration with few steps, which the command line has no options for."""
     from functools import partial
 
-    monkeypatch.setattr(batch_cli, "ScanSettings", partial(ScanSettings, registration=QUICK.scan.registration))
+    monkeypatch.setattr(pipeline_cli, "ScanSettings", partial(ScanSettings, registration=QUICK.scan.registration))
     monkeypatch.setattr(matching_cli, "register", partial(register, config=QUICK.scan.registration))
 
 
@@ -73,7 +75,7 @@ def test_every_command_explains_itself(command, capsys):
 def test_help_answers_at_once():
     """Nothing that takes long is imported for it; the time itself is for the benchmarks."""
     code = ("import sys\nfrom completion.__main__ import main\nassert main(['prep', '--help']) == 0\n"
-            "slow = {'scipy', 'igl', 'distributed', 'joblib', 'matplotlib', 'PIL', 'trimesh'} & set(sys.modules)\n"
+            "slow = {'scipy', 'igl', 'distributed', 'loky', 'matplotlib', 'PIL', 'trimesh'} & set(sys.modules)\n"
             "assert not slow, slow")
     done = subprocess.run([sys.executable, "-c", code], cwd=ROOT, capture_output=True, text=True)
     assert done.returncode == 0, done.stderr
@@ -81,7 +83,7 @@ def test_help_answers_at_once():
 
 
 def test_dask_is_loaded_for_a_scheduler_alone(place):
-    code = (f"import sys\nsys.path.insert(0, {str(ROOT)!r})\nimport scanprep.pipeline\n"
+    code = (f"import sys\nsys.path.insert(0, {str(ROOT)!r})\nimport scanprep.pipeline.prepare\n"
             "from completion.__main__ import main\nmain(['prep', 'page', 'set'])\n"
             "assert 'distributed' not in sys.modules and 'dask' not in sys.modules")
     done = subprocess.run([sys.executable, "-c", code], cwd=place, capture_output=True, text=True)

@@ -8,8 +8,10 @@ from scan_folders import MARKS, WITH_PICTURES, ball, write_scans
 from scipy.spatial.transform import Rotation
 
 from scanprep import RegisteredSet, write_landmarks, write_mesh
-from scanprep.batch import pictures
-from scanprep.batch.figures import (
+from scanprep.geometry.files import PointCloud, write_points
+from scanprep.matching.confidence import missed_share
+from scanprep.pipeline import pictures
+from scanprep.pipeline.figures import (
     Failure,
     ScanFigures,
     principal_stretches,
@@ -19,13 +21,12 @@ from scanprep.batch.figures import (
     write_failures,
     write_figures,
 )
-from scanprep.batch.page import write_set_page
-from scanprep.batch.review import Limits, review
-from scanprep.geometry.files import PointCloud, write_points
-from scanprep.matching.confidence import missed_share
-from scanprep.pipeline import find_scans, prepare
+from scanprep.pipeline.page import write_set_page
+from scanprep.pipeline.prepare import prepare
+from scanprep.pipeline.review import Limits, review
+from scanprep.pipeline.scans import find_scans
 
-GOOD = ScanFigures("good", "10 landmarks", 0.001, 0.0015, 0.85, 0.85, 0.0, 0.004, 0.002, 0, True, 0.0, "abc", 3.25)
+GOOD = ScanFigures("good", "10 landmarks", 0.001, 0.0015, 0.85, 0.85, 0.0, 0.004, 0.002, 0, True, 0.0, 3.25)
 
 
 @pytest.fixture(scope="module")

@@ -17,14 +17,14 @@ from scipy.spatial.transform import Rotation
 
 from scanprep import Mesh, RegisteredSet, read_mesh, write_mesh
 from scanprep.batch import cluster
-from scanprep.batch import scan as scan_module
-from scanprep.batch.figures import read_figures
-from scanprep.batch.lock import locked
-from scanprep.batch.scan import one_thread
-from scanprep.batch.workers import Work, run_in_processes
+from scanprep.batch.ownership import HOME, ForeignFileError
+from scanprep.batch.pool import Failure, Job, Workers, run_jobs
 from scanprep.cleaning.components import CleanScanConfig
 from scanprep.matching.correspondences import Correspondences
-from scanprep.pipeline import ScanTask, find_scans, prepare
+from scanprep.pipeline import scan as scan_module
+from scanprep.pipeline.prepare import RegisterScan, prepare
+from scanprep.pipeline.scan import one_thread
+from scanprep.pipeline.scans import find_scans
 
 
 @pytest.fixture(scope="module")
@@ -147,7 +147,7 @@ def test_killed_in_the_middle_and_started_again(six, template, tmp_path, sign):
 
 
 def finished(folder):
-    return [f.name for f in read_figures(folder)]
+    return [p.name.removeprefix("scans%2F").removesuffix(".npz") for p in (folder / HOME / "done").glob("scans*.npz")]
 
 
 def test_interrupted_keeps_what_was_done(scans, template, tmp_path):
@@ -165,14 +165,21 @@ def test_interrupted_keeps_what_was_done(scans, template, tmp_path):
 def test_two_runs_in_one_folder(scans, template, tmp_path):
     prepare(find_scans(scans)[:1], template, MARKS, tmp_path / "set", QUICK)
     before = contents(tmp_path / "set")
-    with locked(tmp_path / "set"), pytest.raises(ValueError, match=f"another run is at work .*process {os.getpid()} "):
+    code = ("import sys\nfrom scanprep.batch.workspace import workspace\nwith workspace(sys.argv[1]):\n"
+            "    print('in', flush=True)\n    sys.stdin.read()\n")
+    other = subprocess.Popen([sys.executable, "-c", code, str(tmp_path / "set")], stdin=subprocess.PIPE,
+                             stdout=subprocess.PIPE)
+    assert other.stdout.readline() == b"in\n"
+    with pytest.raises(ValueError, match=f"another run is at work .*process {other.pid} "):
         prepare(find_scans(scans), template, MARKS, tmp_path / "set", QUICK)
-    assert contents(tmp_path / "set") == before and not (tmp_path / "set" / ".lock").exists()
+    other.communicate()
+    assert contents(tmp_path / "set") == before and not (tmp_path / "set" / HOME / "lock").exists()
 
 
 def test_processes_change_nothing(six, template, tmp_path):
     scans, whole = six
-    done = prepare(find_scans(scans), template, MARKS, tmp_path / "set", dataclasses.replace(WITH_PICTURES, workers=2))
+    two = dataclasses.replace(WITH_PICTURES, workers=Workers(2))
+    done = prepare(find_scans(scans), template, MARKS, tmp_path / "set", two)
     assert "body3.ply" in done.failures[0]
     assert contents(tmp_path / "set") == contents(whole)
 
@@ -184,33 +191,34 @@ def test_a_cluster_changes_nothing(six, template, tmp_path, processes, ship):
     scans, whole = six
     layout = {"n_workers": 2, "threads_per_worker": 1} if processes else {"n_workers": 1, "threads_per_worker": 3}
     with LocalCluster(processes=processes, dashboard_address=None, **layout) as local:
-        config = dataclasses.replace(WITH_PICTURES, scheduler=local.scheduler_address, ship=ship)
+        config = dataclasses.replace(WITH_PICTURES, workers=Workers(0, local.scheduler_address, ship))
         prepare(find_scans(scans), template, MARKS, tmp_path / "set", config)
     assert contents(tmp_path / "set") == contents(whole)
 
 
 def test_shipped_files_need_no_folder(scans, template):
-    task, work = find_scans(scans)[0], Work(template, MARKS, QUICK.scan)
-    files, shared = cluster._files(task), pickle.dumps((work, cluster._versions()))
+    task, shared = find_scans(scans)[0], pickle.dumps((RegisterScan(template, MARKS, QUICK.scan), cluster._versions()))
     there = dataclasses.replace(task, scan=Path("/no/such/body0.ply"), landmarks=Path("/no/such/body0.landmarks.json"))
-    shipped = cluster.do_there(shared, pickle.dumps((there, files)))
-    np.testing.assert_array_equal(shipped.vertices, work.do(task).vertices)
-    files[task.scan.name] = files[task.scan.name][:-9]
-    failed = cluster.do_there(shared, pickle.dumps((there, files)))
-    assert failed.startswith("/no/such/body0.ply: ")
+    files = {there.scan: task.scan.read_bytes(), there.landmarks: task.landmarks.read_bytes()}
+    assert cluster._files(task) == {task.scan: files[there.scan], task.landmarks: files[there.landmarks]}
+    figures, made = cluster.do_there(shared, pickle.dumps(("scans/body0", "", there, files)))
+    assert figures.name == "body0" and set(made) == {"meshes/body0.ply"} and figures.distance < 0.001
+    files[there.scan] = files[there.scan][:-9]
+    failed, made = cluster.do_there(shared, pickle.dumps(("scans/body0", "", there, files)))
+    assert failed.reason.startswith("/no/such/body0.ply: ") and not made
 
 
 def test_no_scheduler(scans, template, tmp_path, monkeypatch):
     monkeypatch.setattr(cluster, "ANSWER", 1)
-    config = dataclasses.replace(QUICK, scheduler="tcp://127.0.0.1:1")
+    config = dataclasses.replace(QUICK, workers=Workers(scheduler="tcp://127.0.0.1:1"))
     with pytest.raises(ValueError, match=r"none answers at tcp://127\.0\.0\.1:1"):
         prepare(find_scans(scans), template, MARKS, tmp_path / "set", config)
 
 
 def test_workers_of_another_version(scans, template):
-    shared = pickle.dumps((Work(template, MARKS, QUICK.scan), {"scapekit": "0.0.0", "numpy": "1"}))
+    shared = pickle.dumps((RegisterScan(template, MARKS, QUICK.scan), {"scapekit": "0.0.0", "numpy": "1"}))
     with pytest.raises(RuntimeError, match="the worker has scapekit"):
-        cluster.do_there(shared, pickle.dumps((find_scans(scans)[0], None)))
+        cluster.do_there(shared, pickle.dumps(("body0", "", find_scans(scans)[0], None)))
 
 
 def test_a_scheduler_needs_nothing_of_ours():
@@ -223,20 +231,21 @@ def test_a_scheduler_needs_nothing_of_ours():
     assert done.returncode == 0, done.stderr
 
 
-class Deadly(Work):
-    """Dies of the second scan."""
+@dataclasses.dataclass(frozen=True)
+class Deadly:
+    """Dies of the second job."""
 
-    def do(self, task):
-        if task.name == "body1":
+    def __call__(self, given, room):
+        if given == 1:
             os._exit(9)
-        return task.name
+        return given
 
 
-def test_a_process_that_dies_stops_no_other_scan(template):
-    tasks = [ScanTask(f"body{k}", Path(f"/scans/body{k}.ply")) for k in range(3)]
-    outcomes = {task.name: outcome for task, outcome in run_in_processes(Deadly(template, MARKS, QUICK.scan), tasks, 2)}
-    assert outcomes["body0"] == "body0" and outcomes["body2"] == "body2"
-    assert outcomes["body1"].startswith("/scans/body1.ply: the process at work on it died")
+def test_a_process_that_dies_stops_no_other_job(tmp_path):
+    jobs = [Job(f"body{k}", k, tmp_path / str(k)) for k in range(3)]
+    outcomes = {job.given: outcome for job, outcome in run_jobs(Deadly(), jobs, Workers(2))}
+    assert outcomes[0] == 0 and outcomes[2] == 2
+    assert isinstance(outcomes[1], Failure) and outcomes[1].reason.startswith("body1: the process at work on it died")
 
 
 def test_one_thread_while_anyone_needs_it():
@@ -309,13 +318,56 @@ def test_clutter_is_cleaned_off_when_asked(scans, template, tmp_path):
     assert plain.missed == pytest.approx(0.5, abs=0.01) and clean.missed == 0
 
 
-def test_other_settings_or_template_in_the_folder(scans, template, tmp_path):
-    prepare(find_scans(scans)[:1], template, MARKS, tmp_path / "set", QUICK)
-    other = dataclasses.replace(QUICK, scan=dataclasses.replace(QUICK.scan, unit="mm"))
-    with pytest.raises(ValueError, match="other settings"):
-        prepare(find_scans(scans), template, MARKS, tmp_path / "set", other)
-    with pytest.raises(ValueError, match="another template"):
-        prepare(find_scans(scans), template.with_vertices(2 * template.vertices), MARKS, tmp_path / "set", QUICK)
+def test_other_settings_or_template_do_all_anew(scans, template, tmp_path):
+    tasks = find_scans(scans)
+    prepare(tasks, template, MARKS, tmp_path / "set", QUICK)
+    clean = dataclasses.replace(QUICK, scan=dataclasses.replace(QUICK.scan, clean=CleanScanConfig()))
+    assert prepare(tasks, template, MARKS, tmp_path / "set", clean).fresh == 3
+    wider = template.with_vertices(1.05 * template.vertices)
+    assert prepare(tasks, wider, MARKS, tmp_path / "set", clean).fresh == 3
+    swapped = {**MARKS, "left": MARKS["right"], "right": MARKS["left"]}
+    assert prepare(tasks, wider, swapped, tmp_path / "set", clean).fresh == 3
+    prepare(tasks, wider, swapped, tmp_path / "fresh", clean)
+    assert contents(tmp_path / "set") == {name: data.replace(b"Scans of fresh", b"Scans of set")
+                                          for name, data in contents(tmp_path / "fresh").items()}
+    with pytest.raises(ValueError, match="2 other scans that were registered with another template"):
+        prepare(tasks[:1], template, MARKS, tmp_path / "set", clean)
+
+
+def test_a_vertex_moved_in_the_middle_of_a_file_is_seen(scans, template, tmp_path):
+    prepare(find_scans(scans), template, MARKS, tmp_path / "set", QUICK)
+    data = bytearray((scans / "body1.ply").read_bytes())
+    place, stat = len(data) // 3, (scans / "body1.ply").stat()
+    data[place:place + 4] = bytes(4)
+    (scans / "body1.ply").write_bytes(data)
+    os.utime(scans / "body1.ply", ns=(stat.st_atime_ns, stat.st_mtime_ns))      # size and time as before
+    assert prepare(find_scans(scans), template, MARKS, tmp_path / "set", QUICK).fresh == 1
+
+
+def test_a_table_that_was_corrected_registers_nothing_anew(scans, template, tmp_path):
+    prepare(find_scans(scans), template, MARKS, tmp_path / "set", QUICK)
+    (scans / "scans.csv").write_text("name,subject,sex\nbody0,zoe,female\n")
+    done = prepare(find_scans(scans), template, MARKS, tmp_path / "set", QUICK)
+    assert done.fresh == 0 and done.registered.entries[0].subject == "zoe"
+
+
+def test_what_the_user_put_there_is_left_alone(scans, template, tmp_path):
+    whole = contents(scans)
+    with pytest.raises(ForeignFileError, match="nothing was touched"):
+        prepare(find_scans(scans), template, MARKS, scans, QUICK)
+    assert contents(scans) == whole and not (scans / HOME).exists()
+    prepare(find_scans(scans), template, MARKS, tmp_path / "set", QUICK)
+    mesh, note = tmp_path / "set" / "meshes" / "body1.ply", tmp_path / "set" / "meshes" / ".mine.part.txt"
+    mesh.write_bytes(b"mended by hand")
+    note.write_text("mine")
+    os.utime(scans / "body1.ply")
+    assert prepare(find_scans(scans), template, MARKS, tmp_path / "set", QUICK).fresh == 0
+    marks = json.loads((scans / "body1.landmarks.json").read_text())
+    marks["top"][2] += 0.05
+    (scans / "body1.landmarks.json").write_text(json.dumps(marks))
+    done = prepare(find_scans(scans), template, MARKS, tmp_path / "set", QUICK)
+    assert "body1.ply: in the way" in done.failures[0]
+    assert mesh.read_bytes() == b"mended by hand" and note.read_text() == "mine"
 
 
 def test_template_that_cannot_serve(scans, template, tmp_path):
@@ -328,7 +380,7 @@ def test_template_that_cannot_serve(scans, template, tmp_path):
 def test_relative_paths_from_another_folder(scans, template, tmp_path, monkeypatch):
     """Processes are kept from one call to the next, and were started elsewhere."""
     monkeypatch.chdir(tmp_path)
-    two = dataclasses.replace(QUICK, workers=2)
+    two = dataclasses.replace(QUICK, workers=Workers(2))
     assert not prepare(find_scans("scans"), template, MARKS, "set", two).failures
     (tmp_path / "elsewhere").mkdir()
     shutil.move(tmp_path / "scans", tmp_path / "elsewhere" / "scans")

@@ -23,7 +23,8 @@ from scanprep.geometry.files import read_mesh, write_mesh
 from scanprep.geometry.landmarks import match_landmarks, read_landmark_vertices, read_landmarks, write_landmarks
 from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.storage import read_json
-from scanprep.pipeline import TABLE, PrepareConfig, Prepared, find_scans, prepare
+from scanprep.pipeline.prepare import PrepareConfig, Prepared, prepare
+from scanprep.pipeline.scans import TABLE, find_scans
 from scanprep.scanning.embedded import (
     SUBJECT,
     EmbeddedScan,

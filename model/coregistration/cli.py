@@ -13,7 +13,7 @@ from scanprep.console import Metric, Outcome, bar
 from scanprep.dataset import RegisteredSet
 from scanprep.geometry.landmarks import match_landmarks, read_landmarks, write_landmarks
 from scanprep.geometry.mesh import Mesh
-from scanprep.pipeline import find_scans
+from scanprep.pipeline.scans import find_scans
 
 from ..body import BodyModel
 from ..cli import ModelArg
@@ -51,7 +51,7 @@ def coregister_scans(model: ModelArg, scans: ScansArg, output: Output, landmarks
         workers: Processes; 0 for one a core.
         failed: A scan of which a larger share of points stays unexplained does not teach the model.
     """
-    from scanprep.batch.tasks import read_scan
+    from scanprep.pipeline.scans import read_scan
 
     loaded, tasks = load_model(model), find_scans(scans, landmarks, subject)
     config = CoregistrationConfig(rounds=rounds, workers=workers, failed=failed)

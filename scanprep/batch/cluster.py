@@ -1,37 +1,36 @@
-"""Scans on the workers of a Dask cluster."""
+"""Tasks on the workers of a Dask cluster."""
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 import importlib.metadata
 import pickle
 import tempfile
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import CancelledError
-from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from .tasks import ScanTask
-from .workers import Outcome, Work
+from .digests import paths_of
+from .pool import Failure, Job, attempt
 
 ANSWER, WAIT = 10, 60          # seconds for the scheduler, and for the first worker of a cluster just started
 
 
-def run_on_cluster(address: str, work: Work, tasks: Sequence[ScanTask], ship: bool = False
-                   ) -> Iterator[tuple[ScanTask, Outcome]]:
-    """Each task with its outcome, as they finish.
+def run_on_cluster(address: str, work: Any, jobs: Sequence[Job], ship: bool = False) -> Iterator[tuple[Job, Any]]:
+    """Each job with what the work returned, or a Failure, as they finish.
 
-    The template travels to each worker once. Results come back to this process, which alone writes, so workers
-    need no place to write to. One thread a worker is best (`dask worker --nthreads 1 --nworkers auto`).
+    The work travels to each worker once. Files come back to this process, which alone writes, so workers need no
+    place to write to. One thread a worker is best (`dask worker --nthreads 1 --nworkers auto`).
 
     Parameters
     ----------
     address : str
         Of the scheduler, such as "tcp://host:8786".
     ship : bool
-        Send the files of each scan along, for workers that do not see the folder of the scans.
+        Send the files of each job along, for workers that do not see them under the same path.
 
     Raises
     ------
@@ -41,7 +40,6 @@ def run_on_cluster(address: str, work: Work, tasks: Sequence[ScanTask], ship: bo
         No scheduler at that address, no workers, or workers that cannot run this version.
     """
     Client, as_completed, KilledWorker = _distributed()
-    tasks = [task.absolute() for task in tasks]
     try:
         client = Client(address, timeout=ANSWER, set_as_default=False)
     except (OSError, ValueError) as error:
@@ -52,33 +50,35 @@ def run_on_cluster(address: str, work: Work, tasks: Sequence[ScanTask], ship: bo
         # a task that gives its argument back: unlike scattered data it is made anew where all copies are lost
         shared = client.submit(bytes, pickle.dumps((work, _versions())), pure=False)
         there = _entrance()
-        waiting = iter(tasks)
-        task_of: dict[Any, ScanTask] = {}
+        waiting = iter(jobs)
+        job_of: dict[Any, Job] = {}
         running = as_completed([], loop=client.loop)
 
         def submit() -> None:
-            """The next task; few at a time, so that shipped files do not pile up at the scheduler."""
-            for task in waiting:
-                future = client.submit(there, shared, pickle.dumps((task, _files(task) if ship else None)), pure=False)
-                task_of[future] = task
+            """The next job; few at a time, so that shipped files do not pile up at the scheduler."""
+            for job in waiting:
+                given = _with_paths(job.given, Path.absolute)
+                sent = job.name, job.place, given, _files(given) if ship else None
+                future = client.submit(there, shared, pickle.dumps(sent), pure=False)
+                job_of[future] = job
                 running.add(future)
                 return
 
         for _ in range(2 * sum(client.nthreads().values())):
             submit()
         for future in running:
-            task = task_of.pop(future)
+            job = job_of.pop(future)
             submit()
-            yield task, _outcome(future, task, address, KilledWorker)
+            yield job, _outcome(future, job, address, KilledWorker)
 
 
-def _entrance() -> Callable[[bytes, bytes], Outcome]:
+def _entrance() -> Callable[[bytes, bytes], tuple[Any, dict[str, bytes]]]:
     """What is sent to the workers. Dask sends a function without a name of its own as code, and all else are
     bytes, so that a scheduler needs nothing of ours."""
-    def there(shared: bytes, task: bytes) -> Outcome:
+    def there(shared: bytes, job: bytes) -> tuple[Any, dict[str, bytes]]:
         from scanprep.batch.cluster import do_there
 
-        return do_there(shared, task)
+        return do_there(shared, job)
 
     return there
 
@@ -98,21 +98,26 @@ def _await_workers(client: Any, address: str) -> None:
         raise ValueError(f"scheduler: {address} has no workers; start some with: dask worker {address}") from None
 
 
-def _outcome(future: Any, task: ScanTask, address: str, KilledWorker: type) -> Outcome:
+def _outcome(future: Any, job: Job, address: str, KilledWorker: type) -> Any:
+    """What came of a job, its files written to its folder."""
     try:
         error = future.exception()
     except CancelledError:
         raise ValueError(f"scheduler: {address} has gone; what was done is kept, start again to go on") from None
     if error is None:
-        return future.result()
+        value, files = future.result()
+        for name, data in files.items():
+            (job.folder / name).parent.mkdir(parents=True, exist_ok=True)
+            (job.folder / name).write_bytes(data)
+        return value
     if isinstance(error, KilledWorker):
-        return f"{task.scan}: the workers at work on it died, one after another"
+        return Failure(f"{job.name}: the workers at work on it died, one after another")
     raise ValueError(f"scheduler: a worker of {address} cannot run this ({type(error).__name__}: "
                      f"{' '.join(str(error).split())}); expected {_described(_versions())} on every worker")
 
 
-def do_there(shared: bytes, packed: bytes) -> Outcome:
-    """One scan, on the machine of a worker.
+def do_there(shared: bytes, packed: bytes) -> tuple[Any, dict[str, bytes]]:
+    """One job on the machine of a worker: what the work returned, and the files that it wrote.
 
     Raises
     ------
@@ -122,32 +127,55 @@ def do_there(shared: bytes, packed: bytes) -> Outcome:
     work, versions = pickle.loads(shared)
     if versions != _versions():
         raise RuntimeError(f"the worker has {_described(_versions())}")
-    task, files = pickle.loads(packed)
-    return work.do(task) if files is None else _unpacked(work, task, files)
+    name, place, given, sent = pickle.loads(packed)
+    with tempfile.TemporaryDirectory() as temporary:
+        here = Path(temporary)
+        paths = {} if sent is None else _unpacked(sent, here / "sent")
+        outcome = attempt(work, Job(name, _with_paths(given, lambda path: paths.get(path, path)), here / "made", place))
+        if isinstance(outcome, Failure):
+            reason = outcome.reason
+            for theirs, mine in paths.items():
+                reason = reason.replace(str(mine), str(theirs))
+            return Failure(reason), {}
+        made = {path.relative_to(here / "made").as_posix(): path.read_bytes()
+                for path in sorted((here / "made").rglob("*")) if path.is_file()}
+    return outcome, made
 
 
-def _unpacked(work: Work, task: ScanTask, files: dict[str, bytes]) -> Outcome:
-    """One scan whose files came along."""
-    with tempfile.TemporaryDirectory() as folder:
-        for name, data in files.items():
-            Path(folder, name).write_bytes(data)
-        here = replace(task, scan=Path(folder, task.scan.name),
-                       landmarks=task.landmarks and Path(folder, task.landmarks.name))
-        outcome = work.do(here)
-    if isinstance(outcome, str):
-        for mine, theirs in ((here.scan, task.scan), (here.landmarks, task.landmarks)):
-            outcome = outcome.replace(str(mine), str(theirs))
-    return outcome
+def _with_paths(value: Any, change: Callable[[Path], Path]) -> Any:
+    """The same value with other paths in it."""
+    if isinstance(value, Path):
+        return change(value)
+    if isinstance(value, list | tuple):
+        return type(value)(_with_paths(v, change) for v in value)
+    if isinstance(value, Mapping):
+        return {k: _with_paths(v, change) for k, v in value.items()}
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        fields = {f.name: getattr(value, f.name) for f in dataclasses.fields(value) if f.init}
+        changed = {name: _with_paths(v, change) for name, v in fields.items()}
+        if any(changed[name] is not v for name, v in fields.items()):
+            return dataclasses.replace(value, **changed)
+    return value
 
 
-def _files(task: ScanTask) -> dict[str, bytes]:
-    """Name -> contents of the files of a task; one that cannot be read is left for the worker to miss."""
-    found = {}
-    for path in (task.scan, task.landmarks):
-        if path is not None:
-            with contextlib.suppress(OSError):
-                found[path.name] = path.read_bytes()
+def _files(given: Any) -> dict[Path, bytes]:
+    """Path -> contents of the files of a job; one that cannot be read is left for the worker to miss."""
+    found: dict[Path, bytes] = {}
+    for path in paths_of(given):
+        with contextlib.suppress(OSError):
+            found[path] = path.read_bytes()
     return found
+
+
+def _unpacked(sent: dict[Path, bytes], folder: Path) -> dict[Path, Path]:
+    """Path there -> path here; names stay, as they tell what is in the files."""
+    here = {}
+    for i, (path, data) in enumerate(sent.items()):
+        place = folder / str(i)
+        place.mkdir(parents=True)
+        (place / path.name).write_bytes(data)
+        here[path] = place / path.name
+    return here
 
 
 def _versions() -> dict[str, str]:

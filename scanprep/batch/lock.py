@@ -1,4 +1,4 @@
-"""One run at a time in a folder."""
+"""One run at a time on an output."""
 from __future__ import annotations
 
 import contextlib
@@ -10,28 +10,31 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import IO
 
-NAME = ".lock"
-
 
 @contextlib.contextmanager
-def locked(folder: str | Path) -> Iterator[None]:
-    """Keep other runs out of a folder until the block ends.
+def locked(path: Path, output: Path) -> Iterator[None]:
+    """Keep other runs out of an output until the block ends.
 
     The operating system holds the lock, so that a run that was killed leaves none behind.
+
+    Parameters
+    ----------
+    path : Path
+        Of the file that is locked, in a folder that exists.
+    output : Path
+        For the message.
 
     Raises
     ------
     ValueError
-        Another run is at work in the folder: which, and since when.
+        Another run is at work: which, and since when.
     """
-    path = Path(folder) / NAME
-    path.parent.mkdir(parents=True, exist_ok=True)
     while True:
         with open(path, "a+", encoding="utf-8") as file:
             if not _take(file):
                 file.seek(0)
-                raise ValueError(f"{folder}: another run is at work in this folder ({file.read().strip()}); "
-                                 "wait for it, or name another folder")
+                raise ValueError(f"{output}: another run is at work on this output ({file.read().strip()}); "
+                                 "wait for it, or name another output")
             if not _still_there(file, path):
                 continue                # the run before removed it between our opening and our taking it
             file.truncate(0)

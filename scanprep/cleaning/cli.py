@@ -7,7 +7,6 @@ from typing import Annotated
 import numpy as np
 import tyro
 
-from ..batch.tasks import LANDMARK_ENDINGS, read_scan
 from ..cli import MM, MeshArg, Output, ScanArg, SetArg, Unit, about_mesh
 from ..console import Metric, Outcome, bar
 from ..dataset import RegisteredSet
@@ -15,6 +14,7 @@ from ..geometry import storage
 from ..geometry.files import UNITS, PointCloud, list_meshes, read_mesh, write_mesh, write_points
 from ..geometry.landmarks import read_landmark_vertices, read_landmarks
 from ..geometry.mesh import Mesh
+from ..pipeline.scans import LANDMARK_ENDINGS, read_scan
 from .align_views import AlignViewsConfig, align_views
 from .components import CleanScanConfig, clean_scan
 from .decimate import DecimateConfig, decimate

@@ -7,12 +7,12 @@ from typing import Annotated
 import numpy as np
 import tyro
 
-from ..batch.tasks import read_scan
 from ..cli import MM, MeshArg, Output, ScanArg, Unit, landmarks_beside
 from ..console import Metric, Outcome, bar
 from ..geometry.files import read_mesh, write_mesh
 from ..geometry.landmarks import match_landmarks, read_landmark_vertices, read_landmarks
 from ..geometry.mesh import Mesh
+from ..pipeline.scans import read_scan
 from .correlated import CorrelatedConfig, find_correspondences
 from .correspondence_files import read_correspondences, write_correspondences
 from .functional import find_functional_correspondences

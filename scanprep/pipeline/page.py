@@ -38,8 +38,13 @@ main { max-width: 76rem; }
 """
 
 
-def write_set_page(folder: str | Path, limits: Limits | None = None) -> Path:
+def write_set_page(folder: str | Path, limits: Limits | None = None, to: Path | None = None) -> Path:
     """Write `report.html` into the folder of a set, from what lies there: tables, pictures, skeleton.
+
+    Parameters
+    ----------
+    to : Path, optional
+        Another folder for the page.
 
     Returns
     -------
@@ -62,8 +67,8 @@ def write_set_page(folder: str | Path, limits: Limits | None = None) -> Path:
     if whole.skeleton is not None:
         page.section("Skeleton", f"{len(whole.skeleton.parents)} parts: {', '.join(whole.skeleton.names)}.")
         page.picture(_parts_picture(whole.template, whole.skeleton.part_of_face), "parts, front and back")
-    page.write(folder / PAGE)
-    return folder / PAGE
+    page.write((to or folder) / PAGE)
+    return (to or folder) / PAGE
 
 
 def judge_set(folder: str | Path, limits: Limits | None = None) -> list[Verdict]:

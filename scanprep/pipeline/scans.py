@@ -1,8 +1,7 @@
 """The scans of a folder, their landmark files, and what a table says of them."""
 from __future__ import annotations
 
-import hashlib
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
@@ -15,6 +14,7 @@ LANDMARK_ENDINGS = (".json", ".mrk.json", ".landmarks.json", ".pp", "_picked_poi
 SCAN_ENDINGS = (".ply", ".ply.gz", ".obj", ".stl", ".off", ".glb", ".xyz", ".pcd", ".pts")
 POINT_ENDINGS = (".xyz", ".pcd", ".txt", ".pts")
 TABLE = "scans.csv"
+ABOUT = {"digest": False}         # what is only told in tables: no registration depends on it
 
 
 @dataclass(frozen=True)
@@ -33,31 +33,9 @@ class ScanTask:
     name: str
     scan: Path
     landmarks: Path | None = None
-    subject: str = ""
-    pose: str = ""
-    sex: str = ""
-
-    def absolute(self) -> ScanTask:
-        """With whole paths: a process may have been started in another folder."""
-        return replace(self, scan=self.scan.absolute(), landmarks=self.landmarks and self.landmarks.absolute())
-
-    def fingerprint(self, ends: int = 1 << 16) -> str:
-        """Short text that changes with the files: their sizes, and what stands at both ends of each.
-
-        Empty when a file cannot be read. Whole scans are not read, as a folder may hold gigabytes.
-        """
-        digest = hashlib.sha256()
-        try:
-            for path in (self.scan, self.landmarks):
-                if path is not None:
-                    size = path.stat().st_size
-                    with open(path, "rb") as file:
-                        digest.update(f"{size}:".encode() + file.read(ends))
-                        file.seek(max(size - ends, 0))
-                        digest.update(file.read(ends))
-        except OSError:
-            return ""
-        return digest.hexdigest()[:16]
+    subject: str = field(default="", metadata=ABOUT)
+    pose: str = field(default="", metadata=ABOUT)
+    sex: str = field(default="", metadata=ABOUT)
 
 
 def find_scans(folder: str | Path, landmarks: str | Path | None = None, subject: str = "") -> list[ScanTask]:

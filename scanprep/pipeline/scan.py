@@ -17,7 +17,7 @@ from ..matching.correlated import CorrelatedConfig, find_correspondences
 from ..matching.correspondences import Correspondences
 from ..matching.nonrigid import Registration, RegistrationConfig, register
 from .figures import ScanFigures, stretched_share
-from .tasks import ScanTask, read_scan
+from .scans import ScanTask, read_scan
 
 Guide = Literal["best", "landmarks", "automatic", "pose"]
 
@@ -99,18 +99,6 @@ def register_scan(task: ScanTask, template: Mesh, template_landmarks: dict[str, 
                           picture)
 
 
-def attempt(task: ScanTask, template: Mesh, template_landmarks: dict[str, int], settings: ScanSettings
-            ) -> RegisteredScan | str:
-    """The same, or one line that says which file failed and why; an error in our code stops no other scan."""
-    try:
-        return register_scan(task, template, template_landmarks, settings)
-    except Exception as error:
-        text = " ".join(str(error).split())
-        if not isinstance(error, ValueError | OSError):
-            text = f"{type(error).__name__}: {text}"
-        return text if str(task.scan) in text or str(task.landmarks) in text else f"{task.scan}: {text}"
-
-
 def _landmarks(task: ScanTask, scan: Mesh | np.ndarray, template_landmarks: dict[str, int], settings: ScanSettings
                ) -> Landmarks | None:
     """Vertices of the template and points of the scan, or None where landmarks are not wanted or not there."""
@@ -150,7 +138,7 @@ def _measure(task: ScanTask, template: Mesh, fit: Registration, guide: str) -> S
     return ScanFigures(
         task.name, guide, float(np.nanmean(fit.distances)) if fit.seen.any() else np.nan, fit.rms,
         float(fit.seen.mean()), float(fit.confidence.mean()), fit.missed,
-        stretched_share(template, fit.mesh), fit.landmark_rms, fit.flipped, fit.converged, 0.0, task.fingerprint())
+        stretched_share(template, fit.mesh), fit.landmark_rms, fit.flipped, fit.converged)
 
 
 _guard = threading.Lock()

@@ -9,18 +9,20 @@ from typing import Annotated
 import numpy as np
 import tyro
 
+from ..batch.pool import Workers
+from ..batch.workspace import Workspace, workspace
 from ..cleaning.components import CleanScanConfig
-from ..cli import MM, Output, SetArg, Unit, landmarks_beside
+from ..cli import MM, Output, SetArg, Unit, WorkersArg, landmarks_beside
 from ..console import Metric, Outcome, bar, say
 from ..geometry.files import read_mesh
 from ..geometry.landmarks import read_landmark_vertices
 from ..geometry.mesh import Mesh
-from ..pipeline import PrepareConfig, Prepared, find_scans, prepare
 from .figures import ScanFigures
-from .page import judge_set, write_set_page
+from .page import PAGE, judge_set, write_set_page
+from .prepare import PrepareConfig, Prepared, prepare
 from .review import Limits, Verdict
 from .scan import Guide, ScanSettings
-from .tasks import ScanTask
+from .scans import ScanTask, find_scans
 
 ScansArg = Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="SCANS")]
 LISTED = 5                    # scans that the closing table names
@@ -29,7 +31,7 @@ LISTED = 5                    # scans that the closing table names
 def run_all(scans: ScansArg, template: Path, output: Output, landmarks: Path | None = None,
             template_landmarks: Path | None = None, guide: Guide = "best", clean: bool = False,
             subject: str = "", unit: Unit | None = None, min_poses: int = PrepareConfig.min_poses,
-            workers: int = PrepareConfig.workers, scheduler: str | None = None, ship: bool = False) -> Outcome:
+            workers: WorkersArg = Workers(), *, space: Workspace) -> Outcome:                # noqa: B008
     """Register a template to every scan of a folder, find the skeleton, and write a page of all scans, worst first.
 
     Killed and started again it goes on where it was; scans whose files have changed are registered anew.
@@ -49,16 +51,14 @@ def run_all(scans: ScansArg, template: Path, output: Output, landmarks: Path | N
         subject: Whose scans they are, where scans.csv does not say; else each is a person of its own.
         unit: Unit of the scans and landmarks, where the files cannot tell.
         min_poses: A skeleton is sought when one subject has at least so many scans.
-        workers: Processes on this machine; 0 for one a core.
-        scheduler: Address of a Dask scheduler, whose workers do the work instead, such as tcp://host:8786.
-        ship: Send the scans to those workers, which otherwise read them under the same path.
+        workers: Who does the work.
     """
     body, tasks = read_mesh(template), find_scans(scans, landmarks, subject)
     marks = _template_marks(template, template_landmarks, body, tasks, guide)
     settings = ScanSettings(unit=unit, guide=guide, clean=CleanScanConfig() if clean else None)
-    config = PrepareConfig(settings, min_poses=min_poses, workers=workers, scheduler=scheduler, ship=ship)
+    config = PrepareConfig(settings, min_poses=min_poses, workers=workers)
     with bar("registering scans") as registering, bar("finding the skeleton") as finding:
-        done = prepare(tasks, body, marks, output, config, registering, finding)
+        done = prepare(tasks, body, marks, space.folder, config, registering, finding)
     return Outcome(output, [*_progress_made(done, tasks), *_quality(output, done.figures),
                             Metric("unit assumed", unit or "m")], {"prepare": config}, list(done.failures))
 
@@ -72,7 +72,9 @@ def page(registered: SetArg, limits: Annotated[Limits, tyro.conf.arg(name="")] =
         registered: Folder that scape prep run wrote.
         limits: Limits.
     """
-    say(f"written: {write_set_page(registered, limits)}")
+    with workspace(registered) as space, space.staging("page") as staged:
+        write_set_page(registered, limits, to=staged.folder)
+    say(f"written: {registered / PAGE}")
     verdicts = judge_set(registered, limits)
     figures = [v.figures for v in verdicts if v.figures is not None]
     return Outcome(None, _quality(registered, figures, limits), {"limits": limits})

@@ -42,8 +42,6 @@ class ScanFigures:
     converged : bool
     removed : float
         Share of the scan's points that were cleaned off before.
-    inputs : str
-        Fingerprint of the files of the scan.
     seconds : float
         Kept in `times.csv`, as it is the one figure that differs from run to run.
     """
@@ -60,7 +58,6 @@ class ScanFigures:
     flipped: int
     converged: bool
     removed: float = 0.0
-    inputs: str = ""
     seconds: float = np.nan
 
 

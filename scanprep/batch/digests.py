@@ -1,0 +1,147 @@
+"""What a result depends on, as a short text that changes with it: whole files, models, arrays, tables, settings."""
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import importlib.metadata
+import json
+import time
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ..geometry import storage
+
+LENGTH = 32                    # hexadecimal digits
+SETTLED = 2_000_000_000        # nanoseconds after which a file's time of change tells of every later change
+_STAT = ("st_size", "st_mtime_ns", "st_ctime_ns", "st_ino")
+
+
+class Digests:
+    """Digests of values and files; those of files are remembered as long as size and times of change stay.
+
+    A file that was changed less than two seconds before it was read is read again the next time: clocks of file
+    systems are coarse.
+
+    Parameters
+    ----------
+    path : Path, optional
+        Where digests of files are remembered from run to run.
+    """
+
+    def __init__(self, path: Path | None = None) -> None:
+        self.path = path
+        self._changed = False
+        self._values: dict[int, tuple[Any, bytes]] = {}
+        self._known: dict[str, list[Any]] = {}
+        if path is not None and path.exists():
+            try:
+                known = json.loads(path.read_text(encoding="utf-8"))
+                self._known = known if isinstance(known, dict) else {}
+            except (OSError, ValueError, RecursionError):
+                pass                                 # only a memory: files are read again
+
+    def save(self) -> None:
+        """Remember digests of files for the next run."""
+        if self.path is not None and self._changed:
+            storage.write_json(self.path, self._known)
+            self._changed = False
+
+    def of(self, *values: Any) -> str:
+        """A digest of values: paths count as what the files hold, dataclasses as their fields."""
+        whole = hashlib.sha256(_version())
+        for value in values:
+            self._update(whole, value)
+        return whole.hexdigest()[:LENGTH]
+
+    def of_file(self, path: Path) -> str:
+        """A digest of what a file holds; "missing" where there is none, and of a folder of all files in it."""
+        if path.is_dir():
+            inside = [p for p in sorted(path.rglob("*")) if p.is_file() and not p.name.startswith(".")]
+            return self.of([(p.relative_to(path).as_posix(), p) for p in inside])
+        try:
+            stat = path.stat()
+            now = [getattr(stat, name) for name in _STAT]
+            key = str(path.absolute())
+            known = self._known.get(key)
+            if isinstance(known, list) and known[:-1] == now:
+                return str(known[-1])
+            with open(path, "rb") as file:
+                found = hashlib.file_digest(file, "sha256").hexdigest()[:LENGTH] \
+                    if hasattr(hashlib, "file_digest") else _read_through(file)
+        except OSError:
+            return "missing"
+        if time.time_ns() - max(stat.st_mtime_ns, stat.st_ctime_ns) > SETTLED:
+            self._known[key], self._changed = [*now, found], True
+        return found
+
+    def _update(self, whole: Any, value: Any) -> None:
+        """Every value with its kind and length before it, so that no two run together."""
+        if isinstance(value, Path):
+            whole.update(b"file" + self.of_file(value).encode())
+        elif isinstance(value, np.ndarray | np.generic):
+            array = np.ascontiguousarray(value)
+            whole.update(f"array{array.dtype.str}{np.shape(value)}".encode())
+            whole.update(array.view(np.uint8).data if array.size else b"")
+        elif value is None or isinstance(value, bool | int | float | str):
+            told = repr(value).encode()
+            whole.update(f"{type(value).__name__}{len(told)}:".encode() + told)
+        elif isinstance(value, Mapping):
+            self._several(whole, "map", sorted(((str(k), v) for k, v in value.items()), key=lambda kv: kv[0]))
+        elif isinstance(value, list | tuple):
+            self._several(whole, "list", value)
+        elif isinstance(value, set | frozenset):
+            self._several(whole, "set", sorted(value))
+        elif dataclasses.is_dataclass(value) and not isinstance(value, type):
+            whole.update(self._of_dataclass(value))
+        else:
+            raise TypeError(f"cannot tell when a {type(value).__name__} changes")
+
+    def _several(self, whole: Any, kind: str, values: Any) -> None:
+        whole.update(f"{kind}{len(values)}:".encode())
+        for value in values:
+            self._update(whole, value)
+
+    def _of_dataclass(self, value: Any) -> bytes:
+        """Of the fields; remembered for frozen ones without files in them, as models are large and come often."""
+        known = self._values.get(id(value))
+        if known is not None and known[0] is value:
+            return known[1]
+        own = hashlib.sha256(f"{type(value).__module__}.{type(value).__qualname__}".encode())
+        for field in dataclasses.fields(value):
+            if field.metadata.get("digest", True):
+                self._update(own, field.name)
+                self._update(own, getattr(value, field.name))
+        if type(value).__dataclass_params__.frozen and not any(paths_of(value)):
+            self._values[id(value)] = (value, own.digest())
+        return own.digest()
+
+
+def _read_through(file: Any) -> str:
+    whole = hashlib.sha256()
+    while block := file.read(1 << 20):
+        whole.update(block)
+    return whole.hexdigest()[:LENGTH]
+
+
+def paths_of(value: Any) -> Iterator[Path]:
+    """All paths in a value of paths, tuples, lists, dicts and dataclasses."""
+    if isinstance(value, Path):
+        yield value
+    elif isinstance(value, Mapping):
+        yield from paths_of(tuple(value.values()))
+    elif isinstance(value, list | tuple):
+        for each in value:
+            yield from paths_of(each)
+    elif dataclasses.is_dataclass(value) and not isinstance(value, type):
+        yield from paths_of([getattr(value, field.name) for field in dataclasses.fields(value)])
+
+
+def _version() -> bytes:
+    """Results of another version of this project are done anew."""
+    try:
+        return importlib.metadata.version("scapekit").encode()
+    except importlib.metadata.PackageNotFoundError:
+        return b"not installed"

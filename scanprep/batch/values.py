@@ -1,0 +1,119 @@
+"""Results as files: numbers, text, arrays and the dataclasses of this project, in one `.npz`; never pickle."""
+from __future__ import annotations
+
+import dataclasses
+import importlib
+import json
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ..geometry import storage
+
+KIND, VERSION = "result", 1
+PACKAGES = ("scanprep", "model", "completion")
+_ARRAY = "a{}"
+
+
+def save_value(path: Path, value: Any, header: dict[str, Any]) -> None:
+    """Write a value and what is to be known of it before it is read.
+
+    Parameters
+    ----------
+    value : None, bool, number, text, Path, array, or a tuple, list, dict with text keys, or dataclass of these
+    header : JSON-serialisable
+
+    Raises
+    ------
+    TypeError
+        A value of another kind.
+    """
+    arrays: list[np.ndarray] = []
+    told = json.dumps({"kind": KIND, "version": VERSION, **header, "value": _packed(value, arrays)})
+    with storage.writing(path) as beside, open(beside, "wb") as out:
+        named = {_ARRAY.format(i): array for i, array in enumerate(arrays)}
+        np.savez(out, allow_pickle=False, **{storage.HEADER: np.array(told)}, **named)
+
+
+def load_header(path: Path) -> dict[str, Any] | None:
+    """The header of a file of `save_value`, or None where there is no such file that can be read."""
+    try:
+        with np.load(path, allow_pickle=False) as data:
+            header = json.loads(str(data[storage.HEADER]))
+        return header if (header["kind"], header["version"]) == (KIND, VERSION) else None
+    except Exception:                    # whatever is wrong with the file, the result is made anew
+        return None
+
+
+def load_value(path: Path) -> Any:
+    """The value of a file of `save_value`.
+
+    Raises
+    ------
+    StorageError
+        Missing, damaged, or written by another version of this project.
+    """
+    header, arrays = storage.load(path, KIND, (VERSION,))
+    try:
+        return _unpacked(header["value"], [arrays[_ARRAY.format(i)] for i in range(len(arrays))])
+    except (KeyError, TypeError, ValueError, AttributeError, ImportError, IndexError) as error:
+        raise storage.StorageError(f"{path}: expected a result, cannot read it ({type(error).__name__}: {error})"
+                                   ) from None
+
+
+def _packed(value: Any, arrays: list[np.ndarray]) -> Any:
+    """JSON for a value; arrays are put aside."""
+    if isinstance(value, np.ndarray | np.generic):           # before numbers: some scalars are Python's floats too
+        if value.dtype.hasobject:
+            raise TypeError("arrays of objects are not kept")
+        arrays.append(np.asarray(value))
+        return {"array": len(arrays) - 1, "scalar": isinstance(value, np.generic)}
+    if value is None or isinstance(value, bool | int | float | str):
+        return value
+    if isinstance(value, Path):
+        return {"path": str(value)}
+    if isinstance(value, list):
+        return [_packed(v, arrays) for v in value]
+    if isinstance(value, tuple):
+        return {"tuple": [_packed(v, arrays) for v in value]}
+    if isinstance(value, dict):
+        return {"dict": [[_packed(k, arrays), _packed(v, arrays)] for k, v in value.items()]}
+    if dataclasses.is_dataclass(value) and type(value).__module__.split(".")[0] in PACKAGES:
+        kept = {f.name: _packed(getattr(value, f.name), arrays) for f in dataclasses.fields(value)}
+        return {"class": f"{type(value).__module__}:{type(value).__qualname__}", "fields": kept}
+    raise TypeError(f"cannot keep a {type(value).__name__}")
+
+
+def _unpacked(told: Any, arrays: list[np.ndarray]) -> Any:
+    if isinstance(told, list):
+        return [_unpacked(v, arrays) for v in told]
+    if not isinstance(told, dict):
+        return told
+    if "array" in told:
+        found = arrays[told["array"]]
+        return found[()] if told["scalar"] else found
+    if "path" in told:
+        return Path(told["path"])
+    if "tuple" in told:
+        return tuple(_unpacked(v, arrays) for v in told["tuple"])
+    if "dict" in told:
+        return {_unpacked(k, arrays): _unpacked(v, arrays) for k, v in told["dict"]}
+    return _remade(told["class"], {name: _unpacked(v, arrays) for name, v in told["fields"].items()})
+
+
+def _remade(name: str, values: dict[str, Any]) -> Any:
+    """An object of a dataclass of this project, by its constructor, which checks what it is given."""
+    module, _, qualified = name.partition(":")
+    if module.split(".")[0] not in PACKAGES:
+        raise ValueError(f"{name} is not of this project")
+    kind: Any = importlib.import_module(module)
+    for part in qualified.split("."):
+        kind = getattr(kind, part)
+    if not (isinstance(kind, type) and dataclasses.is_dataclass(kind)):
+        raise ValueError(f"{name} is not a dataclass")
+    made = kind(**{f.name: values[f.name] for f in dataclasses.fields(kind) if f.init})
+    for f in dataclasses.fields(kind):
+        if not f.init:
+            object.__setattr__(made, f.name, values[f.name])
+    return made

@@ -1,0 +1,366 @@
+"""An output and what scapekit knows of it: what it wrote there, what is whole, and what must be done anew.
+
+    OUTPUT/.scapekit/lock           held while a run is at work
+                     making/        what is being made; a killed run's is removed at the next start
+                     ready/NAME/    whole, on its way to its place; a killed run's is brought there at the next start
+                     done/NAME.npz  a result: digest of what it depends on, digests of its files, its value
+                     steps/         results that later ones are made of
+                     files.json     digests of files by size and times of change
+
+A file is replaced or removed only when it is as scapekit wrote it.
+"""
+from __future__ import annotations
+
+import contextlib
+import os
+import shutil
+import tempfile
+from collections.abc import Callable, Iterator, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from pathlib import Path
+from typing import Annotated, Any, TypeVar
+from urllib.parse import quote, unquote
+
+from ..geometry import storage
+from .digests import Digests
+from .lock import locked
+from .ownership import HOME, ForeignFileError, Ownership, refusal, refuse_any, report_path, written_of
+from .pool import Failure, Job, Progress, Workers, run_jobs
+from .values import load_header, load_value, save_value
+
+RECORD = ".record.npz"
+NOTHING: Any = object()                   # no result; None may be one
+T = TypeVar("T")
+
+
+@dataclass(frozen=True)
+class Task:
+    """One thing of many, worked on once.
+
+    Attributes
+    ----------
+    name : str
+        Its own in the output.
+    given : frozen dataclass
+        What is worked on; Paths in it count as what the files hold.
+    place : str
+        Folder of its files inside the output.
+    """
+
+    name: str
+    given: Any
+    place: str = ""
+
+
+@dataclass(frozen=True)
+class Results:
+    """What became of tasks.
+
+    Attributes
+    ----------
+    values : name -> what the work returned, in the order of the tasks
+    failures : name -> one line
+    fresh : names of the tasks that were done now; the others had been done before
+    """
+
+    values: dict[str, Any]
+    failures: dict[str, str]
+    fresh: tuple[str, ...]
+
+    @property
+    def only(self) -> Any:
+        """The value of the only task.
+
+        Raises
+        ------
+        ValueError
+            It failed.
+        """
+        if self.failures:
+            raise ValueError(*self.failures.values())
+        return next(iter(self.values.values()))
+
+
+class Workspace:
+    """An output that is open for one run; see `workspace`."""
+
+    def __init__(self, folder: Path, home: Path, force: bool = False, output: Path | None = None) -> None:
+        self.folder, self.home, self.force, self.output = folder, home, force, output
+        self.digests = Digests(home / "files.json")
+        self._made: set[str] = set()
+
+    @cached_property
+    def _own(self) -> Ownership:
+        found = Ownership(self.folder, self.digests)
+        for place in {self.folder, self.output or self.folder}:
+            for record in (place / HOME / "done").glob("*.npz"):
+                found.add((load_header(record) or {"files": {}})["files"], place)
+        if self.output is not None:
+            report = report_path(self.output)
+            found.add(written_of(report), report.parent)
+        return found
+
+    def run(self, work: Any, tasks: Sequence[Task], workers: Workers | None = None, progress: Progress | None = None,
+            inside: Progress | None = None) -> Results:
+        """Every task whose result is not there, or depends on something that has changed since.
+
+        A task that fails stops no other. Files and value of each take their place when they are whole.
+
+        Parameters
+        ----------
+        work : frozen dataclass with `__call__(given, room)`
+            What tasks have in common; it is sent to every worker once. It reads `given`, writes files into
+            `room.folder` and returns a value that can be kept.
+        progress : callable, optional
+            Called with (done, total) tasks.
+        inside : callable, optional
+            `room.tell` of tasks that are done in this process.
+        """
+        tell = progress or (lambda done, total: None)
+        common = self.digests.of(work)
+        keys = {task.name: self.digests.of(common, task.place, task.given) for task in tasks}
+        assert len(keys) == len(tasks), "names of tasks differ"
+        by_name = {task.name: task for task in tasks}
+        values = {task.name: self._kept(task.name, keys[task.name]) for task in tasks}
+        wanted = [task for task in tasks if values[task.name] is NOTHING]
+        failures = {task.name: line for task in wanted if (line := self._blocked(task))}
+        jobs = [Job(task.name, task.given, self._making(), task.place, self.home / "steps" / _plain(task.name),
+                    self.force) for task in wanted if task.name not in failures]
+        done = len(tasks) - len(jobs)
+        tell(done, len(tasks))
+        try:
+            for job, outcome in run_jobs(work, jobs, workers or Workers(), inside):
+                if isinstance(outcome, Failure):
+                    where = str(self.folder / by_name[job.name].place)
+                    failures[job.name] = outcome.reason.replace(str(job.folder / job.place), where)
+                    self.drop(job.name)             # what was made of other inputs than there are now
+                else:
+                    try:
+                        self._publish(job.name, job.folder, keys[job.name], outcome, common)
+                        values[job.name] = outcome
+                    except ForeignFileError as error:
+                        failures[job.name] = str(error)
+                shutil.rmtree(job.folder, ignore_errors=True)
+                done += 1
+                tell(done, len(tasks))
+        finally:
+            for job in jobs:
+                shutil.rmtree(job.folder, ignore_errors=True)
+        return Results({name: value for name, value in values.items() if name not in failures},
+                       {task.name: failures[task.name] for task in tasks if task.name in failures},
+                       tuple(job.name for job in jobs if job.name not in failures))
+
+    def step(self, name: str, inputs: Any, make: Callable[[Path], T]) -> T:
+        """What `make` returns, or returned when it was last called with the same inputs.
+
+        Parameters
+        ----------
+        inputs : what the result depends on
+        make : callable
+            Gets a folder; files that it writes there take their place in the output.
+        """
+        key = self.digests.of(inputs)
+        kept = self._kept(name, key)
+        if kept is not NOTHING:
+            return kept
+        with self.staging(name, key) as staged:
+            staged.value = make(staged.folder)
+        return staged.value
+
+    @contextlib.contextmanager
+    def staging(self, name: str, key: str = "") -> Iterator[Staged]:
+        """A folder for files that take their place in the output, all of them, when the block ends well."""
+        staged = Staged(self._making())
+        try:
+            yield staged
+            self._publish(name, staged.folder, key, staged.value)
+        finally:
+            shutil.rmtree(staged.folder, ignore_errors=True)
+
+    def drop(self, name: str) -> None:
+        """Remove a result and its files, as far as they are as scapekit wrote them."""
+        for file, digest in (load_header(self._record(name)) or {"files": {}})["files"].items():
+            if self.digests.of_file(self.folder / file) == digest:
+                (self.folder / file).unlink()
+        self.drop_record(name)
+
+    def drop_record(self, name: str) -> None:
+        """Remove what is kept of a result, but none of its files."""
+        self._record(name).unlink(missing_ok=True)
+
+    def names(self, work: Any) -> list[str]:
+        """The results that are kept of some work, with all their files."""
+        common = self.digests.of(work)
+        found = []
+        for path in sorted((self.home / "done").glob("*.npz")):
+            header = load_header(path)
+            if header and header["work"] == common and all((self.folder / f).is_file() for f in header["files"]):
+                found.append(unquote(path.stem))
+        return found
+
+    def is_ours(self, file: str) -> bool:
+        """Whether a file of the output is as scapekit wrote it."""
+        return self._own.has(file)
+
+    def value(self, name: str) -> Any:
+        """A result that is kept."""
+        return load_value(self._record(name))
+
+    def _kept(self, name: str, key: str) -> Any:
+        """A result made from the same inputs whose files are all there; NOTHING where it must be made anew."""
+        header = load_header(self._record(name))
+        if header is None or header["digest"] != key or (self.force and name not in self._made) \
+                or not all((self.folder / file).is_file() for file in header["files"]):
+            return NOTHING
+        try:
+            return load_value(self._record(name))
+        except storage.StorageError:                        # damaged
+            return NOTHING
+
+    def _blocked(self, task: Task) -> str:
+        """Why a task has no place to write to, before any work is done for it."""
+        place = self.folder / task.place
+        if not task.place or not place.exists() or self._record(task.name).exists():
+            return ""
+        if place.is_dir() and not any(place.iterdir()):
+            return ""
+        return refusal(place)
+
+    def _making(self) -> Path:
+        (self.home / "making").mkdir(exist_ok=True)
+        return Path(tempfile.mkdtemp(dir=self.home / "making"))
+
+    def _record(self, name: str) -> Path:
+        return self.home / "done" / f"{_plain(name)}.npz"
+
+    def _publish(self, name: str, staged: Path, key: str, value: Any, work: str = "") -> None:
+        """Whole from the moment at which the folder gets its name among the ready ones."""
+        files = {path.relative_to(staged).as_posix(): self.digests.of_file(path)
+                 for path in sorted(staged.rglob("*")) if path.is_file()}
+        self._own.check_free(files)
+        save_value(staged / RECORD, value, {"digest": key, "work": work, "files": files})
+        ready = self.home / "ready" / _plain(name)
+        ready.parent.mkdir(exist_ok=True)
+        os.replace(staged, ready)
+        self._settle(ready)
+        self._made.add(name)
+
+    def _settle(self, ready: Path) -> None:
+        """Bring the files of a result to their place, and take away those that it had before and has no more."""
+        header = load_header(ready / RECORD)
+        assert header is not None, f"{ready}: results get their name when they are whole"
+        record = self._record(unquote(ready.name))
+        before = (load_header(record) or {"files": {}})["files"]
+        for file in header["files"]:
+            if (ready / file).exists():                     # else it was brought before the run was killed
+                (self.folder / file).parent.mkdir(parents=True, exist_ok=True)
+                os.replace(ready / file, self.folder / file)
+        for file, digest in before.items():
+            if file not in header["files"] and self.digests.of_file(self.folder / file) == digest:
+                (self.folder / file).unlink()
+        self._own.add(header["files"], self.folder)
+        record.parent.mkdir(exist_ok=True)
+        os.replace(ready / RECORD, record)
+        shutil.rmtree(ready)
+
+    def _recover(self) -> None:
+        """What a killed run left: results that were whole come to their place, the others go."""
+        for ready in sorted((self.home / "ready").glob("*")):
+            if (ready / RECORD).exists():
+                self._settle(ready)
+            else:                                       # its record, the last to go, had come to its place
+                shutil.rmtree(ready)
+        shutil.rmtree(self.home / "making", ignore_errors=True)
+
+
+class Staged:
+    """Files and value of a result that is being made."""
+
+    def __init__(self, folder: Path) -> None:
+        self.folder = folder
+        self.value: Any = None
+
+
+FileWorkspace = Annotated[Workspace, "steps of a command whose output is a file; they are kept beside it"]
+_open: dict[Path, Workspace] = {}
+
+
+@contextlib.contextmanager
+def workspace(folder: str | Path, force: bool = False) -> Iterator[Workspace]:
+    """Open an output folder for one run: no other gets in, and what a killed one left is put right.
+
+    Opened again inside, it is the same one.
+
+    Parameters
+    ----------
+    force : bool
+        Take nothing as done.
+
+    Raises
+    ------
+    ValueError
+        Another run is at work in the folder.
+    ForeignFileError
+        A folder with files in it that scapekit did not make.
+    """
+    folder = Path(folder)
+    if (folder / HOME).absolute() in _open:
+        yield _open[(folder / HOME).absolute()]
+        return
+    if folder.exists() and not folder.is_dir():
+        raise ForeignFileError(f"{folder}: expected a folder for the output, found a file")
+    if not (folder / HOME).is_dir():
+        refuse_any(folder)
+    with _opened(Workspace(folder, folder / HOME, force)) as space:
+        yield space
+
+
+@contextlib.contextmanager
+def beside(output: str | Path, force: bool = False) -> Iterator[Workspace]:
+    """Open an output that is a file, or a folder that is made at once: what is kept meanwhile lies beside it.
+
+    At the end that is removed; what was written is told by the report beside the output.
+
+    Raises
+    ------
+    ValueError, ForeignFileError
+        As `workspace`.
+    """
+    output = Path(output)
+    space = Workspace(output.parent, output.parent / f".{output.name}{HOME}", force, output)
+    if output.is_dir() and not (output / HOME).is_dir() and not written_of(report_path(output)):
+        refuse_any(output)
+    if output.is_file() and not space.is_ours(output.name):
+        raise ForeignFileError(refusal(output))
+    with _opened(space):
+        yield space
+
+
+@contextlib.contextmanager
+def _opened(space: Workspace) -> Iterator[Workspace]:
+    """Locked, and put right where an earlier run was killed; of one that came to nothing, nothing is left."""
+    key, made = space.home.absolute(), [p for p in (space.home, *space.home.parents) if not p.exists()]
+    space.home.mkdir(parents=True, exist_ok=True)
+    with locked(space.home / "lock", space.output or space.folder):
+        space._recover()
+        _open[key] = space
+        try:
+            yield space
+        finally:
+            del _open[key]
+            shutil.rmtree(space.home / "making", ignore_errors=True)
+            if space.output is not None:
+                space.drop_record("output")                 # the report tells what was written
+            if any(space.home.glob("[drs]*/*")):            # done, ready, steps
+                space.digests.save()
+            else:
+                shutil.rmtree(space.home)
+                with contextlib.suppress(OSError):          # others have put something there
+                    for folder in made[1:]:
+                        folder.rmdir()
+
+
+def _plain(name: str) -> str:
+    """A name as that of a file."""
+    return quote(name, safe=" ")

@@ -1,0 +1,208 @@
+"""A folder of scans to a registered set: one task a scan, resumable, and one bad scan stops no other.
+
+    scans/name.ply, its landmarks, scans.csv  ->  set/meshes/name.ply, set.csv, skeleton.json,
+                                                  registration.csv, failures.csv, pictures/name.webp, report.html
+"""
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from ..batch.pool import Room, Workers
+from ..batch.workspace import Task, Workspace, workspace
+from ..dataset import RegisteredSet, SetEntry, write_set
+from ..geometry.files import read_mesh, write_mesh
+from ..geometry.landmarks import write_landmarks
+from ..geometry.mesh import Mesh, check_template
+from ..skeleton.find import find_skeleton
+from ..skeleton.parts import SkeletonConfig
+from .figures import Failure, ScanFigures, write_failures, write_figures
+from .page import PICTURES, write_set_page
+from .scan import ScanSettings, one_thread, register_scan
+from .scans import ScanTask
+
+Progress = Callable[[int, int], None]
+SCANS = "scans/"                    # before the names of the results that are registered scans
+
+
+@dataclass(frozen=True)
+class PrepareConfig:
+    """Settings of `prepare`.
+
+    Attributes
+    ----------
+    scan : ScanSettings
+        How each scan is registered.
+    skeleton : SkeletonConfig
+    min_poses : int
+        A skeleton is sought when one subject has at least so many meshes.
+    workers : Workers
+    """
+
+    scan: ScanSettings = field(default_factory=ScanSettings)
+    skeleton: SkeletonConfig = field(default_factory=SkeletonConfig)
+    min_poses: int = 5
+    workers: Workers = field(default_factory=Workers)
+
+
+@dataclass(frozen=True, eq=False)
+class Prepared:
+    """What `prepare` did.
+
+    Attributes
+    ----------
+    registered : RegisteredSet
+    figures : tuple of ScanFigures, of all scans in the set
+    failures : tuple of str
+        One line a scan that could not be registered: which file, and why.
+    fresh : int
+        Scans that were registered now; the others had been before.
+    """
+
+    registered: RegisteredSet
+    figures: tuple[ScanFigures, ...]
+    failures: tuple[str, ...]
+    fresh: int = 0
+
+
+def prepare(tasks: Sequence[ScanTask], template: Mesh, template_landmarks: Mapping[str, int], folder: str | Path,
+            config: PrepareConfig | None = None, progress: Progress | None = None,
+            skeleton_progress: Progress | None = None) -> Prepared:
+    """Register the template to every scan, find the skeleton, and write a page that shows how it went.
+
+    What the folder already holds is done anew only where something that it depends on has changed: a scan, its
+    landmarks, the template, the settings; for the skeleton any mesh of its subject. So the same call goes on where it
+    was interrupted. A scan that cannot be read or registered is listed and the others go on. Scans of earlier calls
+    stay in the set. A skeleton that was edited since it was found stays as it is.
+
+    What is written does not depend on the number of workers, on their order or on interruptions; only `times.csv`
+    does.
+
+    Parameters
+    ----------
+    tasks : from `find_scans`
+    template : Mesh
+        One connected manifold component.
+    template_landmarks : name -> vertex
+        May be empty where no scan has landmarks.
+    folder : path
+        Of the registered set.
+
+    Raises
+    ------
+    ValueError
+        A template that cannot serve, a folder where another run is at work, or that holds other scans registered with
+        another template or settings, a scheduler that does not answer.
+    ForeignFileError
+        A folder with files that scapekit did not make.
+    """
+    config = config or PrepareConfig()
+    check_template(template)
+    with workspace(folder) as space, one_thread():
+        # without what the template has worked out about itself: it is sent around
+        bare = Mesh(template.vertices, template.faces, template.colors)
+        work = RegisterScan(bare, {name: int(v) for name, v in template_landmarks.items()}, config.scan)
+        tables = _Tables(space, work, tasks)
+        if not space.names(work):                   # the first call, or all is to be done anew
+            space.drop("skeleton")
+        tables.write({})
+        failures: dict[str, str] = {}
+        fresh: tuple[str, ...] = ()
+        try:
+            done = space.run(work, [Task(SCANS + task.name, task) for task in tasks], config.workers, progress)
+            failures, fresh = {name.removeprefix(SCANS): line for name, line in done.failures.items()}, done.fresh
+            registered = tables.write(failures)
+            _with_skeleton(space, registered, config, skeleton_progress)
+        finally:
+            tables.write(failures)
+            with space.staging("page") as staged:
+                write_set_page(space.folder, to=staged.folder)
+    figures = tables.figures()
+    return Prepared(RegisteredSet.load(space.folder), tuple(figures[name] for name in sorted(figures)),
+                    tuple(failures[name] for name in sorted(failures)), len(fresh))
+
+
+@dataclass(frozen=True, eq=False)
+class RegisterScan:
+    """The work on each scan: the template brought onto it."""
+
+    template: Mesh
+    landmarks: Mapping[str, int]
+    settings: ScanSettings
+
+    def __call__(self, task: ScanTask, room: Room) -> ScanFigures:
+        found = register_scan(task, self.template, dict(self.landmarks), self.settings)
+        write_mesh(room.folder / mesh_file(task.name), self.template.with_vertices(found.vertices))
+        if found.picture:
+            (room.folder / PICTURES).mkdir()
+            (room.folder / PICTURES / f"{task.name}.webp").write_bytes(found.picture)
+        return found.figures
+
+
+def mesh_file(name: str) -> str:
+    """Where the mesh of a scan stands in a set."""
+    return f"meshes/{name}.ply"
+
+
+@dataclass(frozen=True, eq=False)
+class _Tables:
+    """The tables of a set, made of the results that are there."""
+
+    space: Workspace
+    work: RegisterScan
+    tasks: Sequence[ScanTask]
+
+    def figures(self) -> dict[str, ScanFigures]:
+        """Of every scan that the set holds, by name."""
+        return {name.removeprefix(SCANS): self.space.value(name) for name in self.space.names(self.work)
+                if name.startswith(SCANS)}
+
+    def write(self, failures: Mapping[str, str]) -> RegisteredSet:
+        """Everything in the set but meshes, pictures, skeleton and page."""
+        figures = self.figures()
+        entries = {entry.name: entry for entry in self._before() if entry.name in figures}
+        entries.update({t.name: SetEntry(t.name, t.subject, t.pose, t.sex, mesh_file(t.name))
+                        for t in self.tasks if t.name in figures})
+        with self.space.staging("tables") as staged:
+            write_set(staged.folder, self.work.template, [entries[name] for name in sorted(entries)],
+                      {"settings": asdict(self.work.settings)})
+            write_landmarks(staged.folder / "landmarks.json", dict(self.work.landmarks))
+            write_figures(staged.folder, figures.values())
+            write_failures(staged.folder, [Failure(name, line) for name, line in failures.items()])
+        return RegisteredSet.load(self.space.folder)
+
+    def _before(self) -> Sequence[SetEntry]:
+        """What the set holds of scans that are not among the tasks, if all was made in the same way."""
+        if not (self.space.folder / "set.json").exists():
+            return ()
+        names = {task.name for task in self.tasks}
+        others = [entry for entry in RegisteredSet.load(self.space.folder).entries if entry.name not in names]
+        known = set(self.space.names(self.work))
+        lost = [entry.name for entry in others if SCANS + entry.name not in known]
+        if lost:
+            raise ValueError(f"{self.space.folder}: holds {len(lost)} other scans that were registered with another "
+                             f"template or other settings ({', '.join(lost[:5])}); name another folder")
+        return others
+
+
+def _with_skeleton(space: Workspace, registered: RegisteredSet, config: PrepareConfig, progress: Progress | None
+                   ) -> None:
+    """The skeleton of the subject with the most meshes, found anew when one of them has changed."""
+    path = space.folder / "skeleton.json"
+    if path.exists() and not space.is_ours(path.name):
+        return                                                  # edited by hand: it is the user's now
+    subjects = [entry.subject for entry in registered.entries]
+    most = max(subjects, key=subjects.count, default="")
+    if subjects.count(most) < config.min_poses:
+        space.drop("skeleton")
+        return
+    meshes = [space.folder / entry.file for entry in registered.entries if entry.subject == most]
+
+    def find(folder: Path) -> None:
+        poses = np.stack([read_mesh(mesh, unit="m").vertices for mesh in meshes])
+        find_skeleton(registered.template, poses, config.skeleton, progress=progress).save(folder / path.name)
+
+    space.step("skeleton", (registered.template, meshes, config.skeleton), find)
