@@ -1,7 +1,6 @@
 """A motion: one pose and place a frame, and the file it lives in."""
 from __future__ import annotations
 
-import zipfile
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -99,29 +98,32 @@ class Motion:
         StorageError
             Missing, not a motion, or made for another body model, whose betas mean nothing here.
         """
-        try:
-            with np.load(path, allow_pickle=False) as data:
-                stored = {name: data[name] for name in data.files}
-        except FileNotFoundError:
-            raise storage.StorageError(f"{path}: no such file") from None
-        except (OSError, ValueError, EOFError, zipfile.BadZipFile, AttributeError) as error:
-            raise storage.StorageError(f"{path}: expected a motion (.npz), cannot read it ({error})") from None
+        stored = storage.load_arrays(path, "a motion (.npz)")
         lacking = [name for name in ("poses", "trans") if name not in stored]
         if lacking:
             raise storage.StorageError(f"{path}: expected a motion, it lacks {' and '.join(lacking)}")
-        kind = str(stored.get("surface_model_type", ""))
-        if kind != SURFACE_MODEL:
-            raise storage.StorageError(f"{path}: expected surface_model_type '{SURFACE_MODEL}', found '{kind}'")
-        rate = stored.get("mocap_frame_rate", stored.get("mocap_framerate"))
-        if rate is None:
-            raise storage.StorageError(f"{path}: expected mocap_frame_rate or mocap_framerate")
-        try:
-            poses = stored["poses"].astype(np.float64).reshape(len(stored["poses"]), -1, 3)
-            labels = tuple(str(label) for label in stored.get("marker_labels", ()))
-            betas = stored.get("betas", np.zeros(0)).astype(np.float64)
-            return Motion(poses, stored["trans"].astype(np.float64), betas if betas.size else None, float(rate),
-                          stored.get("marker_residuals", np.zeros((len(poses), 0))), labels,
-                          str(stored.get("gender", "neutral")), stored.get("converged", np.zeros(0, dtype=bool)),
-                          stored.get("marker_trusted", np.zeros((0, 0), dtype=bool)))
-        except (ValueError, TypeError) as error:
-            raise storage.StorageError(f"{path}: {error}") from None
+        with storage.taking_apart(path, "a whole motion"):
+            return _restored(path, stored)
+
+
+def _restored(path: str | Path, a: dict[str, np.ndarray]) -> Motion:
+    """The motion of a file's arrays."""
+    kind = storage.text(a, "surface_model_type", "")
+    if kind != SURFACE_MODEL:
+        raise storage.StorageError(f"{path}: expected surface_model_type '{SURFACE_MODEL}', found '{kind}'")
+    rate = a.get("mocap_frame_rate", a.get("mocap_framerate"))
+    if rate is None:
+        raise storage.StorageError(f"{path}: expected mocap_frame_rate or mocap_framerate")
+    if not 0 < float(rate) < np.inf:
+        raise ValueError(f"mocap_frame_rate: expected a positive number, found {float(rate)}")
+    T, shape = len(a["poses"]), a["poses"].shape[1:]
+    poses = storage.numbers(a, "poses", T, *shape).astype(np.float64).reshape(T, -1, 3)
+    labels = tuple(str(label) for label in a.get("marker_labels", ()))
+    betas = storage.numbers(a, "betas", None).astype(np.float64) if "betas" in a else np.zeros(0)
+    residuals = (storage.numbers(a, "marker_residuals", T, len(labels), finite=False) if "marker_residuals" in a
+                 else np.full((T, len(labels)), np.nan))
+    converged = storage.numbers(a, "converged", T, kinds="b") if "converged" in a else np.ones(T)
+    trusted = a.get("marker_trusted", np.zeros((0, 0)))
+    return Motion(poses, storage.numbers(a, "trans", T, 3).astype(np.float64), betas if betas.size else None,
+                  float(rate), residuals, labels, storage.text(a, "gender", "neutral"), converged.astype(bool),
+                  trusted.astype(bool))

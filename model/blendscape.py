@@ -6,6 +6,8 @@ from typing import Any, ClassVar
 
 import numpy as np
 
+from scanprep.geometry import storage
+
 from .scape import ScapeModel
 
 
@@ -41,4 +43,4 @@ class BlendScapeModel(ScapeModel):
 
     @classmethod
     def _extra(cls, a: dict[str, np.ndarray]) -> dict[str, Any]:
-        return {"blend": a["blend"]}
+        return {"blend": storage.numbers(a, "blend", None, None)}

@@ -10,6 +10,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
+from scanprep.geometry import storage
 from scanprep.geometry.mesh import Mesh
 from scanprep.skeleton.tree import Skeleton
 
@@ -211,20 +212,41 @@ class BodyModel(ABC):
         return Derivatives(y, by_pose, by_shape)
 
 
-def kept_examples(earlier: bool, arrays: Mapping[str, np.ndarray]) -> np.ndarray:
-    """The training poses (M, J, 3) in the arrays of a model file; none in a file of an earlier version.
+def restored_parts(header: Mapping[str, Any], arrays: Mapping[str, np.ndarray], version: int) -> dict[str, Any]:
+    """What every kind of model has, from a file of it; pose examples where it is of this version, earlier had none.
 
     Raises
     ------
-    KeyError, ValueError
-        Missing in a file that must have them, or for another skeleton.
+    KeyError, TypeError, ValueError
+        What is missing, or does not fit the rest.
     """
-    if earlier:
-        return np.zeros((0, *arrays["pose_mean"].shape))
-    examples = arrays["pose_examples"]
-    if len(examples) and examples.shape[1:] != arrays["pose_mean"].shape:
-        raise ValueError(f"pose_examples: expected (M, {len(arrays['pose_mean'])}, 3), got {examples.shape}")
-    return examples
+    J = len(np.atleast_1d(arrays["parents"]))
+    skeleton = Skeleton(storage.numbers(arrays, "part_of_face", None, kinds="iu"),
+                        storage.numbers(arrays, "parents", J, kinds="iu"),
+                        storage.numbers(arrays, "joints", J, 3, kinds="f"), tuple(header["names"]))
+    template = Mesh(storage.numbers(arrays, "vertices", None, 3, kinds="f"),
+                    storage.numbers(arrays, "faces", None, 3, kinds="iu"))
+    if len(skeleton.part_of_face) != len(template.faces):
+        raise ValueError(f"part_of_face: expected one of {len(template.faces)} faces, "
+                         f"found {len(skeleton.part_of_face)}")
+    info, N = header["info"], len(template.vertices)
+    marks = info.get("landmarks") or {}
+    if not all(isinstance(v, int) and 0 <= v < N for v in marks.values()):
+        raise ValueError(f"info: expected landmarks on vertices 0..{N - 1}, found {str(marks)[:60]}")
+    examples = (np.zeros((0, J, 3)) if header["version"] < version or not len(arrays["pose_examples"])
+                else storage.numbers(arrays, "pose_examples", None, J, 3))
+    return {"template": template, "skeleton": skeleton, "pose_mean": storage.numbers(arrays, "pose_mean", J, 3),
+            "pose_covariance": storage.numbers(arrays, "pose_covariance", 3 * J, 3 * J), "info": info,
+            "pose_examples": examples}
+
+
+def restored_variances(arrays: Mapping[str, np.ndarray], total: str) -> tuple[np.ndarray, float]:
+    """Variances (K,) of the shape components and the variance in all directions, from a model file."""
+    variances = storage.numbers(arrays, "shape_variances", None)
+    whole = float(storage.numbers(arrays, total))
+    if not (variances >= 0).all() or variances.sum() > 1.01 * whole:
+        raise ValueError(f"{total}: expected the sum of shape_variances or more, found {whole:g}")
+    return variances, whole
 
 
 def versions() -> dict[str, str]:

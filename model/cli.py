@@ -8,9 +8,9 @@ import numpy as np
 import tyro
 
 from scanprep.cli import Output, Unit
-from scanprep.console import Metric, Outcome, dispatch, read_json
+from scanprep.console import Metric, Outcome, dispatch
 from scanprep.geometry.files import read_mesh, write_mesh
-from scanprep.geometry.storage import load_arrays
+from scanprep.geometry.storage import load_arrays, numbers, read_json, taking_apart
 
 from .body import BodyModel
 from .files import load_model
@@ -69,7 +69,7 @@ def mesh(model: ModelArg, output: Output, pose: Path | None = None, betas: tuple
     """
     loaded = load_model(model)
     turns = np.zeros((len(loaded.skeleton.parents), 3))
-    for name, turn in (read_json(pose, "turns {part: [x, y, z]}") if pose else {}).items():
+    for name, turn in (_read_turns(pose) if pose else {}).items():
         if name not in loaded.skeleton.names:
             raise ValueError(f"{pose}: no part '{name}'; the model has {', '.join(loaded.skeleton.names)}")
         turns[loaded.skeleton.names.index(name)] = turn
@@ -84,6 +84,15 @@ def mesh(model: ModelArg, output: Output, pose: Path | None = None, betas: tuple
     write_mesh(output, loaded.template.with_vertices(vertices))
     return Outcome(output, [Metric("vertices", len(vertices)),
                             Metric("largest extent", float(np.ptp(vertices, axis=0).max()), "m")])
+
+
+def _read_turns(path: Path) -> dict[str, np.ndarray]:
+    """Turns (3,), radians, by the names of parts."""
+    wanted = "turns {part: [x, y, z]}"
+    tree = read_json(path, wanted)
+    with taking_apart(path, f"{wanted} in JSON"):
+        turns = {name: np.array(turn, dtype=np.float64) for name, turn in tree.items()}
+        return {name: numbers(turns, name, 3) for name in turns}
 
 
 def read_subject(model: BodyModel, given: Path | None, unit: Unit | None = None) -> Subject:
@@ -120,7 +129,7 @@ def _read_betas(path: Path) -> np.ndarray:
         found = load_arrays(path).get("betas")
     try:
         betas = np.array(found, dtype=np.float64)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         betas = np.array(np.nan)
     if betas.ndim != 1 or not np.isfinite(betas).all():
         raise ValueError(f"{path}: expected {wanted}, found something else")

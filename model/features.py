@@ -1,13 +1,14 @@
 """What a pose model is linear in: functions of the joint twists, and their products with part rotations."""
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 
-from scanprep.geometry import rotations
+from scanprep.geometry import rotations, storage
 from scanprep.skeleton.tree import Skeleton
 
 _FIRST, _SECOND = np.triu_indices(3)
@@ -138,6 +139,19 @@ def make_lift(kind: str, arrays: dict[str, np.ndarray]) -> Lift:
     if kind == RadialLift.kind:
         return RadialLift(arrays["centres"], arrays["radius"])
     raise ValueError(f"features: '{kind}' is not known here (known: linear, quadratic, radial)")
+
+
+def restored_features(skeleton: Skeleton, header: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> PoseFeatures:
+    """The features of a model file."""
+    J, lift_arrays = len(skeleton.parents), {}
+    if header["lift"] == RadialLift.kind:
+        lift_arrays = {"centres": storage.numbers(arrays, "lift_centres", J, None, 3),
+                       "radius": storage.numbers(arrays, "lift_radius", J)}
+        if not (lift_arrays["radius"] > 0).all():
+            raise ValueError("lift_radius: expected positive numbers")
+    lift, part = make_lift(header["lift"], lift_arrays), storage.numbers(arrays, "feature_part", None)
+    return PoseFeatures(skeleton, lift, part.astype(np.int64),
+                        storage.numbers(arrays, "feature_mix", J, lift.width, len(part)))
 
 
 @dataclass(frozen=True, eq=False)

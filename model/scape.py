@@ -13,9 +13,9 @@ from scanprep.geometry.mesh import Mesh
 from scanprep.skeleton.tree import Skeleton
 
 from .bilinear import ShapedPoints
-from .body import BodyModel, kept_examples, versions
+from .body import BodyModel, restored_parts, restored_variances, versions
 from .carriers import Carrier, build_basis, build_shaped_points, carried_terms, make_carriers, rigid_weights
-from .features import PoseFeatures, Terms, linear_features, make_lift
+from .features import PoseFeatures, Terms, linear_features, restored_features
 from .gradients import edges
 from .linear import check_pose
 from .pose_space import PoseSpace
@@ -180,24 +180,26 @@ class ScapeModel(BodyModel):
     def load(cls, path: str | Path) -> ScapeModel:
         """Read a file of `save`; see `load_model`."""
         header, a = storage.load(path, cls.kind, (1, 2, VERSION))
-        try:
+        with storage.taking_apart(path, "a whole model"):
             return cls._restored(header, a)
-        except (KeyError, ValueError, IndexError) as error:
-            raise storage.StorageError(f"{path}: the model lacks or has a damaged part ({error})") from None
 
     @classmethod
     def _restored(cls, header: dict[str, Any], a: dict[str, np.ndarray]) -> ScapeModel:
         """The model of a header and the arrays of a file."""
-        skeleton = Skeleton(a["part_of_face"], a["parents"], a["joints"], tuple(header["names"]))
+        parts = restored_parts(header, a, VERSION)
+        F, skeleton = len(parts["template"].faces), parts["skeleton"]
+        if parts["template"].vertex_component.any():
+            raise ValueError("vertices: expected one connected surface, which alone can be stitched")
         features = _restored_features(skeleton, header, a)
         sizes, n = np.bincount(skeleton.part_of_face), np.bincount(features.part)
-        blocks = np.split(a["pose_coefficients"], np.cumsum(9 * n * sizes)[:-1])
+        flat = storage.numbers(a, "pose_coefficients", 9 * int(n @ sizes))
+        blocks = np.split(flat, np.cumsum(9 * n * sizes)[:-1])
         coefficients = tuple(b.reshape(k, f, 3, 3) for b, k, f in zip(blocks, n, sizes, strict=True))
-        shapes = ShapeSpace(a["shape_mean"], a["shape_components"], a["shape_variances"],
-                            float(a["shape_total_variance"]))
-        return cls(Mesh(a["vertices"], a["faces"]), skeleton, PoseSpace(features, coefficients), shapes,
-                   a["pose_mean"], a["pose_covariance"], header["info"],
-                   pose_examples=kept_examples(header["version"] < VERSION, a), **cls._extra(a))
+        variances, total = restored_variances(a, "shape_total_variance")
+        shapes = ShapeSpace(storage.numbers(a, "shape_mean", F, 3, 3),
+                            storage.numbers(a, "shape_components", len(variances), F, 3, 3), variances,
+                            total)
+        return cls(pose_space=PoseSpace(features, coefficients), shape_space=shapes, **parts, **cls._extra(a))
 
     @classmethod
     def _extra(cls, a: dict[str, np.ndarray]) -> dict[str, Any]:
@@ -207,7 +209,7 @@ class ScapeModel(BodyModel):
 
 def _restored_features(skeleton: Skeleton, header: dict[str, Any], a: dict[str, np.ndarray]) -> PoseFeatures:
     if header["version"] == 1:
-        cuts = np.cumsum(a["direction_count"])[:-1]
-        return linear_features(skeleton, tuple(np.split(a["directions"].T, cuts, axis=1)))
-    lift = make_lift(header["lift"], {name[5:]: array for name, array in a.items() if name.startswith("lift_")})
-    return PoseFeatures(skeleton, lift, a["feature_part"], a["feature_mix"])
+        count = storage.numbers(a, "direction_count", len(skeleton.parents))
+        directions = storage.numbers(a, "directions", int(count.sum()), 3)
+        return linear_features(skeleton, tuple(np.split(directions.T, np.cumsum(count)[:-1], axis=1)))
+    return restored_features(skeleton, header, a)

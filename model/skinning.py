@@ -14,8 +14,8 @@ from scanprep.geometry.mesh import Mesh
 from scanprep.skeleton.tree import Skeleton
 
 from .bilinear import ShapedPoints
-from .body import BodyModel, kept_examples, versions
-from .features import PoseFeatures, Terms, make_lift
+from .body import BodyModel, restored_parts, restored_variances, versions
+from .features import PoseFeatures, Terms, restored_features
 from .linear import check_points, check_pose
 
 VERSION = 2                          # 1 had no pose examples
@@ -224,23 +224,20 @@ class SkinningModel(BodyModel):
             "joints": self.skeleton.joints, "feature_part": self.features.part, "feature_mix": self.features.mix,
             **{f"lift_{name}": array for name, array in self.features.lift.arrays().items()},
             "pose_examples": self.pose_examples,
-            **{name: np.asarray(getattr(self, name)) for name in _STORED}}
+            **{name: getattr(self, name) for name in _STORED},
+            "shape_variances": self.shape_variances, "shape_total": np.asarray(self.shape_total),
+            "pose_mean": self.pose_mean, "pose_covariance": self.pose_covariance}
         storage.save(path, self.kind, VERSION, arrays, header)
 
     @classmethod
     def load(cls, path: str | Path) -> SkinningModel:
         """Read a file of `save`; see `load_model`."""
         header, a = storage.load(path, cls.kind, (1, VERSION))
-        try:
-            skeleton = Skeleton(a["part_of_face"], a["parents"], a["joints"], tuple(header["names"]))
-            lift = make_lift(header["lift"], {name[5:]: array for name, array in a.items() if name[:5] == "lift_"})
-            features = PoseFeatures(skeleton, lift, a["feature_part"], a["feature_mix"])
-            stored: dict[str, Any] = {**{name: a[name] for name in _STORED}, "shape_total": float(a["shape_total"])}
-            return cls(Mesh(a["vertices"], a["faces"]), skeleton, features=features, info=header["info"],
-                       pose_examples=kept_examples(header["version"] < VERSION, a), **stored)
-        except (KeyError, ValueError, IndexError) as error:
-            raise storage.StorageError(f"{path}: the model lacks or has a damaged part ({error})") from None
+        with storage.taking_apart(path, "a whole model"):
+            parts = restored_parts(header, a, VERSION)
+            stored: dict[str, Any] = {name: storage.numbers(a, name, *(None,) * axes) for name, axes in _STORED.items()}
+            stored["shape_variances"], stored["shape_total"] = restored_variances(a, "shape_total")
+            return cls(features=restored_features(parts["skeleton"], header, a), **parts, **stored)
 
 
-_STORED = ("rest", "weights", "correctives", "shape_mean", "shape_components", "shape_variances", "shape_total",
-           "pose_mean", "pose_covariance")
+_STORED = {"rest": 2, "weights": 2, "correctives": 3, "shape_mean": 2, "shape_components": 3}

@@ -9,7 +9,6 @@ import dataclasses
 import importlib
 import importlib.metadata
 import inspect
-import json
 import math
 import os
 import platform
@@ -313,13 +312,3 @@ def dispatch(commands: Mapping[str, tuple[str, str]], prog: str, argv: list[str]
     if function == "group":
         return target(argv[1:])
     return run(target, f"{prog} {argv[0]}", argv[1:])
-
-
-def read_json(path: Path, what: str) -> Any:
-    """A JSON file, or ValueError naming it and what was expected."""
-    try:
-        return json.loads(path.read_text(encoding="utf-8"))
-    except FileNotFoundError:
-        raise ValueError(f"{path}: no such file, expected {what}") from None
-    except ValueError as error:
-        raise ValueError(f"{path}: expected {what} in JSON, cannot read it ({error})") from None

@@ -3,7 +3,6 @@ from __future__ import annotations
 
 import csv
 import io
-import json
 import re
 from collections.abc import Sequence
 from dataclasses import astuple, dataclass, field, fields
@@ -230,12 +229,7 @@ def write_set(folder: Path, template: Mesh, entries: Sequence[SetEntry], info: d
 
 def _read_header(folder: Path) -> dict[str, Any]:
     path = folder / "set.json"
-    try:
-        info = json.loads(path.read_text(encoding="utf-8"))
-    except (FileNotFoundError, NotADirectoryError):
-        raise storage.StorageError(f"{path}: no such file; expected the folder of a registered set") from None
-    except ValueError as error:
-        raise storage.StorageError(f"{path}: expected JSON, cannot read it ({error})") from None
+    info = storage.read_json(path, "the header of a registered set")
     if not isinstance(info, dict) or info.pop("kind", None) != KIND or not {"vertices", "faces"} <= set(info):
         raise storage.StorageError(f"{path}: expected the header of a registered set, found something else")
     version = info.pop("version", None)
@@ -247,27 +241,17 @@ def _read_header(folder: Path) -> dict[str, Any]:
 
 def _read_rows(folder: Path) -> tuple[SetEntry, ...]:
     path = folder / "set.csv"
-    try:
-        rows = list(csv.reader(io.StringIO(path.read_text(encoding="utf-8-sig"))))
-    except FileNotFoundError:
-        raise storage.StorageError(f"{path}: no such file") from None
-    if not rows or not {"name", "file"} <= set(rows[0]):
-        raise storage.StorageError(f"{path}: line 1: expected the columns {','.join(_COLUMNS)}, "
-                                   f"found {','.join(rows[0]) if rows else 'an empty file'}")
-    entries: list[SetEntry] = []
-    for number, row in enumerate(rows[1:], 2):
-        if not row:
-            continue
-        if len(row) != len(rows[0]):
-            raise storage.StorageError(f"{path}: line {number}: expected {len(rows[0])} values, found {len(row)}")
-        value = dict(zip(rows[0], row, strict=True))
-        entry = SetEntry(**{column: value.get(column, "") for column in _COLUMNS})
-        if not (folder / entry.file).is_file():
-            raise storage.StorageError(f"{path}: line {number}: there is no file {entry.file}")
-        if any(entry.name == other.name for other in entries):
-            raise storage.StorageError(f"{path}: line {number}: the name {entry.name} comes twice")
-        entries.append(entry)
-    return tuple(entries)
+    entries: dict[str, SetEntry] = {}
+    for line, row in storage.read_table(path, _COLUMNS, ("name", "file")):
+        entry = SetEntry(**{column: row[column] for column in _COLUMNS})
+        with storage.taking_apart(path, f"the name of a file in line {line}"):
+            there = (folder / entry.file).is_file()
+        if not there:
+            raise storage.StorageError(f"{path}: line {line}: there is no file {entry.file}")
+        if entry.name in entries:
+            raise storage.StorageError(f"{path}: line {line}: the name {entry.name} comes twice")
+        entries[entry.name] = entry
+    return tuple(entries.values())
 
 
 def _write_rows(folder: Path, rows: Sequence[SetEntry]) -> None:

@@ -264,7 +264,7 @@ def test_the_model_of_the_sex_that_the_markers_tell(place, tmp_path):
     (("--hold-out", "M99"), "--hold-out: labels: M99 not among M0"),
     (("--female", "model.npz"), "--female and --male: expected both or none"),
     (("--female", "f.npz", "--male", "m.npz", "--character", "c.npz"), "--character: it is made of one model"),
-    (("--subjects", "no.csv"), "no.csv: cannot be read"),
+    (("--subjects", "no.csv"), "no.csv: no such file"),
 ])
 def test_wrong_words_are_one_line(place, tmp_path, capsys, words, message):
     code = run(place, place / "people" / "bob" / "jump.csv", "-o", tmp_path / "out", *words)

@@ -139,8 +139,8 @@ def edit_json(folder, **change):
 
 
 @pytest.mark.parametrize(("damage", "says"), [
-    (lambda f: shutil.rmtree(f), r"set\.json: no such file; expected the folder of a registered set"),
-    (lambda f: (f / "set.json").write_text("{"), r"set\.json: expected JSON"),
+    (lambda f: shutil.rmtree(f), r"set\.json: no such file; expected the header of a registered set"),
+    (lambda f: (f / "set.json").write_text("{"), r"set\.json: expected .* in JSON, cannot read it"),
     (lambda f: edit_json(f, kind="model"), r"set\.json: expected the header of a registered set"),
     (lambda f: edit_json(f, version=7), r"set\.json: version 7 .*known: 1"),
     (lambda f: edit_json(f, faces=3), r"template\.ply: found Mesh\(42 vertices, 80 faces\), set\.json says"),

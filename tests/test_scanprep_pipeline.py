@@ -81,7 +81,7 @@ def test_table_that_names_no_scan(scans):
     with pytest.raises(ValueError, match=r"scans\.csv: no scan is called nobody"):
         find_scans(scans)
     (scans / "scans.csv").write_text("scan,subject\nbody0,anna\n")
-    with pytest.raises(ValueError, match="expected a column 'name'"):
+    with pytest.raises(ValueError, match="line 1: expected the columns name,subject"):
         find_scans(scans)
     (scans / "scans.csv").write_text("name,subject\nbody0,anna\nbody0,ben\n")
     with pytest.raises(ValueError, match="body0 comes twice"):

@@ -14,7 +14,8 @@ from model.linear import Subject
 from scanprep.batch.pool import Workers
 from scanprep.batch.workspace import Results, Task, Workspace
 from scanprep.cli import Output, Unit, WorkersArg
-from scanprep.console import Metric, Outcome, bar, failures_of, problem_of, read_json
+from scanprep.console import Metric, Outcome, bar, failures_of, problem_of
+from scanprep.geometry.storage import read_json
 from scanprep.pictures.page import Page
 
 from ..cli import ModelOrNone, read_model
@@ -141,7 +142,7 @@ def read_betas_to(path: Path, n_betas: int) -> BetasTo:
     try:
         found = {float(s): np.array(betas, dtype=np.float64) for s, betas in
                  (tree if keyed else {0: tree["betas"] if isinstance(tree, dict) else tree}).items()}
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, KeyError, OverflowError):
         found = {}
     if not found or any(b.ndim != 1 or len(b) > n_betas or not np.isfinite(b).all() for b in found.values()):
         raise ValueError(f"{path}: expected {wanted}, at most {n_betas} betas each")

@@ -17,12 +17,12 @@ from scipy.spatial import cKDTree
 
 from model import BodyModel, LearnConfig, Subject, fit_pose, learn_scape, load_model
 from scanprep.cleaning.template import TemplateConfig, make_template
-from scanprep.console import read_json
 from scanprep.dataset import RegisteredSet
 from scanprep.geometry import storage
 from scanprep.geometry.files import read_mesh, write_mesh
 from scanprep.geometry.landmarks import match_landmarks, read_landmark_vertices, read_landmarks, write_landmarks
 from scanprep.geometry.mesh import Mesh
+from scanprep.geometry.storage import read_json
 from scanprep.pipeline.prepare import PrepareConfig, Prepared, prepare
 from scanprep.pipeline.scans import TABLE, find_scans
 from scanprep.scanning.embedded import (

@@ -5,6 +5,7 @@ does not know big-endian ones.
 """
 from __future__ import annotations
 
+import math
 import struct
 from dataclasses import dataclass
 from pathlib import Path
@@ -102,7 +103,7 @@ def point_table(path: Path, data: bytes) -> PointTable:
     MarkerFileError
         Not a C3D file, damaged, truncated, or without points.
     """
-    start = (data[0] - 1) * _BLOCK
+    start = (data[0] - 1) * _BLOCK if data else 0
     if len(data) < _BLOCK or data[1] != _MAGIC:
         raise MarkerFileError(f"{path}: expected a C3D file, with byte 2 = 80 and a header of {_BLOCK} bytes; "
                               f"found {len(data)} bytes that begin {data[:8]!r}")
@@ -118,7 +119,7 @@ def point_table(path: Path, data: bytes) -> PointTable:
         return _table(data, parameters, numbers)
     except _Damaged as problem:
         raise MarkerFileError(f"{path}: {problem}") from None
-    except (struct.error, IndexError, ValueError) as error:
+    except (struct.error, IndexError, ValueError, OverflowError) as error:
         raise MarkerFileError(f"{path}: damaged C3D file ({error})") from None
 
 
@@ -140,6 +141,7 @@ def read_c3d(path: Path, data: bytes) -> RawMarkers:
 def _parameters(data: bytes, place: int, numbers: _Numbers) -> _Parameters:
     """All parameters; a group is known by its number, which may come after its parameters."""
     groups: dict[int, str] = {}
+    room = len(data)                     # no byte belongs to two parameters
     found: list[tuple[int, str, list[Any]]] = []
     while place + 2 < len(data) and data[place]:
         length, group = abs(struct.unpack_from("b", data, place)[0]), struct.unpack_from("b", data, place + 1)[0]
@@ -149,27 +151,31 @@ def _parameters(data: bytes, place: int, numbers: _Numbers) -> _Parameters:
         if group < 0:
             groups[-group] = name
         else:
-            found.append((group, name, _values(data, link + 2, numbers)))
+            values, size = _values(data, link + 2, numbers)
+            found.append((group, name, values))
+            room -= size
+            if room < 0:
+                raise _Damaged("damaged: the C3D parameters lie over each other")
         if step == 0:
             break
         place = link + step
     return {(groups.get(group, ""), name): values for group, name, values in found}
 
 
-def _values(data: bytes, place: int, numbers: _Numbers) -> list[Any]:
-    """The values of one parameter: text stripped of blanks, or numbers."""
+def _values(data: bytes, place: int, numbers: _Numbers) -> tuple[list[Any], int]:
+    """The values of one parameter, text stripped of blanks or numbers, and the bytes they take."""
     kind, count = struct.unpack_from("bB", data, place)
     dims = list(data[place + 2:place + 2 + count])
-    total = int(np.prod(dims)) if dims else 1
-    raw = data[place + 2 + count:place + 2 + count + abs(kind) * total]
-    if len(raw) < abs(kind) * total:
+    size = abs(kind) * math.prod(dims)
+    raw = data[place + 2 + count:place + 2 + count + size]
+    if len(raw) < size:
         raise _Damaged("truncated: the C3D parameters end before they should")
     if kind == -1:
         width = dims[0] if dims else 1
-        return [raw[i:i + width].decode("latin-1").strip(" \0") for i in range(0, len(raw), width or 1)]
+        return [raw[i:i + width].decode("latin-1").strip(" \0") for i in range(0, len(raw), width or 1)], size
     if kind == 4:
-        return numbers.floats(raw).tolist()
-    return numbers.words(raw, {1: "i1", 2: "i2"}[kind] if kind in (1, 2) else "i1").tolist()
+        return numbers.floats(raw).tolist(), size
+    return numbers.words(raw, {1: "i1", 2: "i2"}[kind] if kind in (1, 2) else "i1").tolist(), size
 
 
 def _table(data: bytes, parameters: _Parameters, numbers: _Numbers) -> PointTable:
@@ -179,7 +185,7 @@ def _table(data: bytes, parameters: _Parameters, numbers: _Numbers) -> PointTabl
     scale = float(numbers.floats(data[12:16])[0])
     width = (4 * points + analog) * (4 if scale < 0 else 2)
     frames = _frames(parameters, first, last, (len(data) - start) // width if width else 0)
-    if not points or not frames:
+    if not points or frames <= 0:
         raise _Damaged(f"expected points, the C3D file holds {points} points in {frames} frames")
     if start < _BLOCK or not np.isfinite(scale):
         raise _Damaged(f"damaged: the header says that the points begin at byte {start}, their scale is {scale}")

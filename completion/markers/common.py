@@ -6,11 +6,12 @@ from dataclasses import dataclass
 import numpy as np
 
 from scanprep.geometry.formats.common import UNITS
+from scanprep.geometry.storage import StorageError
 
 MARKER_UNITS = UNITS
 
 
-class MarkerFileError(ValueError):
+class MarkerFileError(StorageError):
     """A file of markers or of a marker layout that cannot be read: which one, what was expected, what came."""
 
 

@@ -1,6 +1,7 @@
 """Files of marker sequences: C3D, TRC and CSV."""
 from __future__ import annotations
 
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -8,6 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from scanprep.geometry import storage
+from scanprep.geometry.formats.common import FARTHEST
 
 from .c3d import read_c3d, write_c3d
 from .common import MARKER_UNITS, MarkerFileError, RawMarkers
@@ -43,7 +45,7 @@ class MarkerSequence:
         if positions.ndim != 3 or positions.shape[1:] != (len(labels), 3):
             raise ValueError(f"positions: expected shape (T, {len(labels)}, 3) for {len(labels)} labels, "
                              f"got {positions.shape}")
-        twice = [label for label in dict.fromkeys(labels) if labels.count(label) > 1]
+        twice = [label for label, times in Counter(labels).items() if times > 1]
         if twice:
             raise ValueError(f"labels: expected each once, {', '.join(twice)} comes more often")
         if not (np.isfinite(self.rate) and self.rate > 0):
@@ -147,6 +149,9 @@ def read_markers(path: str | Path, unit: str | None = None, subject: str | None 
     columns, labels = _of_subject(path, raw.labels, subject)
     positions = MARKER_UNITS[own_unit] * raw.positions[:, columns]
     positions[(positions == 0).all(axis=2)] = np.nan
+    if (np.abs(positions) > FARTHEST).any():
+        raise MarkerFileError(f"{path}: expected positions that are finite and below {FARTHEST:g} m, found "
+                              f"{np.nanmax(np.abs(positions)):.3g}")
     try:
         return MarkerSequence(positions, labels, rate or raw.rate or 0.0)
     except ValueError as error:
@@ -168,12 +173,7 @@ def marker_subjects(path: str | Path) -> tuple[str, ...]:
 def _read_raw(path: Path) -> RawMarkers:
     """What a file holds, by its ending."""
     readers = {".c3d": read_c3d, ".trc": read_trc, ".csv": read_csv}
-    try:
-        data = path.read_bytes()
-    except FileNotFoundError:
-        raise MarkerFileError(f"{path}: no such file") from None
-    except OSError as error:
-        raise MarkerFileError(f"{path}: cannot be read ({error.strerror or error})") from None
+    data = storage.read_bytes(path, "a file of markers", MarkerFileError)
     if path.suffix.lower() not in readers:
         raise MarkerFileError(f"{path}: expected a name ending in {', '.join(readers)}, found '{path.suffix}'")
     if not data:

@@ -1,7 +1,7 @@
 """Where on the body the markers sit."""
 from __future__ import annotations
 
-import json
+from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -55,7 +55,7 @@ class MarkerLayout:
         L = len(labels)
         if len(set(labels)) < L:
             raise ValueError(f"labels: expected each once, "
-                             f"{next(x for x in labels if labels.count(x) > 1)} comes more often")
+                             f"{Counter(labels).most_common(1)[0][0]} comes more often")
         wanted = (L,) if self.weights is None else (L, 3)
         if vertices.shape != wanted:
             raise ValueError(f"vertices: expected shape {wanted} for {L} labels, got {vertices.shape}")
@@ -108,29 +108,9 @@ class MarkerLayout:
             Missing, of another form, a label that comes twice, a vertex that the body does not have.
         """
         path = Path(path)
-        try:
-            tree = json.loads(path.read_text(encoding="utf-8"))
-        except FileNotFoundError:
-            raise MarkerFileError(f"{path}: no such file") from None
-        except (ValueError, OSError) as error:
-            raise MarkerFileError(f"{path}: expected a marker layout in JSON, cannot read it ({error})") from None
-        rows = _rows(path, tree)
-        if not rows:
-            raise MarkerFileError(f"{path}: expected markers in the layout, found none")
-        simple = all(isinstance(place, int) for _, place, _, _ in rows)
-        labels, places, distances, loose = zip(*rows, strict=True)
-        free = tuple(label for label, is_loose in zip(labels, loose, strict=True) if is_loose)
-        aliases = tree.get("aliases", {})
-        try:
-            if simple:
-                layout = MarkerLayout(labels, np.array(places), np.array(distances), None, aliases, free)
-            else:
-                pairs = [([p] * 3, [1.0, 0.0, 0.0]) if isinstance(p, int) else (p["vertices"], p["weights"])
-                         for p in places]
-                layout = MarkerLayout(labels, np.array([v for v, _ in pairs]), np.array(distances),
-                                      np.array([w for _, w in pairs]), aliases, free)
-        except (ValueError, KeyError, TypeError, AttributeError) as error:
-            raise MarkerFileError(f"{path}: damaged marker layout ({error})") from None
+        tree = storage.read_json(path, "a marker layout", MarkerFileError)
+        with storage.taking_apart(path, "a whole marker layout", MarkerFileError):
+            layout = _restored(path, tree)
         if n_vertices is not None:
             layout._check(n_vertices, str(path))
         return layout
@@ -274,6 +254,21 @@ def most_used(layout: MarkerLayout) -> np.ndarray:
     return np.take_along_axis(base, share.argmax(axis=1)[:, None], axis=1)[:, 0]
 
 
+def _restored(path: Path, tree: Any) -> MarkerLayout:
+    """The layout of a file."""
+    rows = _rows(path, tree)
+    if not rows:
+        raise MarkerFileError(f"{path}: expected markers in the layout, found none")
+    labels, places, distances, loose = zip(*rows, strict=True)
+    free = tuple(label for label, is_loose in zip(labels, loose, strict=True) if is_loose)
+    aliases = dict(tree.get("aliases", {}))
+    if all(isinstance(place, int) for place in places):
+        return MarkerLayout(labels, np.array(places), np.array(distances), None, aliases, free)
+    pairs = [([p] * 3, [1.0, 0.0, 0.0]) if isinstance(p, int) else (p["vertices"], p["weights"]) for p in places]
+    return MarkerLayout(labels, np.array([v for v, _ in pairs]), np.array(distances), np.array([w for _, w in pairs]),
+                        aliases, free)
+
+
 def _rows(path: Path, tree: Any) -> list[tuple[str, Any, float, bool]]:
     """Label, place, distance and looseness of every marker in the file."""
     sets = tree.get("markersets") if isinstance(tree, Mapping) else None
@@ -288,6 +283,6 @@ def _rows(path: Path, tree: Any) -> list[tuple[str, Any, float, bool]]:
                                   f"'distance_from_skin'")
         for label, place in indices.items():
             if isinstance(place, bool) or not isinstance(place, int | Mapping):
-                raise MarkerFileError(f"{path}: marker '{label}': expected a vertex, found {place!r}")
+                raise MarkerFileError(f"{path}: marker '{label}': expected a vertex, found {str(place)[:40]!r}")
             rows.append((label, place, float(distance), bool(markers.get("loose", False))))
     return rows

@@ -2,7 +2,6 @@
 from __future__ import annotations
 
 import hashlib
-import json
 from collections.abc import Sequence
 from functools import cache
 from pathlib import Path
@@ -10,6 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from scanprep.geometry import storage
 from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.surface import Surface
 
@@ -77,7 +77,7 @@ def _on_kept(layout: MarkerLayout, template: Mesh, kept: np.ndarray) -> MarkerLa
 
 @cache
 def _files() -> tuple[tuple[Path, dict[str, Any]], ...]:
-    return tuple((path, json.loads(path.read_text(encoding="utf-8"))) for path in sorted(FOLDER.glob("*.json")))
+    return tuple((path, storage.read_json(path, "a marker layout")) for path in sorted(FOLDER.glob("*.json")))
 
 
 def fitting_layout(labels: Sequence[str], template: Mesh, kept: np.ndarray | None = None

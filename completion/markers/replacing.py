@@ -41,6 +41,10 @@ def replace_points(path: Path, data: bytes, columns: np.ndarray, positions: np.n
     table = point_table(path, data)
     if len(positions) != table.frames:
         raise MarkerFileError(f"{path}: expected a file of {len(positions)} frames, found {table.frames}")
+    if len(columns) and np.max(columns) >= len(table.kept):
+        raise MarkerFileError(f"{path}: expected a file of more than {np.max(columns)} points, found {len(table.kept)}")
+    if (unit or table.unit) not in MARKER_UNITS:
+        raise MarkerFileError(f"{path}: expected a unit of {', '.join(MARKER_UNITS)}, found '{table.unit}'")
     words, mine = table.words(data), np.array(table.kept)[columns]
     scale = MARKER_UNITS[unit or table.unit] * (1.0 if table.kind == "f4" else table.scale)
     fresh = np.empty((*positions.shape[:2], 4))

@@ -8,6 +8,8 @@ from pathlib import Path
 
 import numpy as np
 
+from scanprep.geometry import storage
+
 from .common import MarkerFileError, RawMarkers
 
 _AXES = ("x", "y", "z")
@@ -29,8 +31,8 @@ def read_trc(path: Path, data: bytes) -> RawMarkers:
     labels = tuple(word.strip() for word in lines[3].split("\t")[2:] if word.strip())
     if len(labels) != count:
         labels = tuple(lines[3].split()[2:])
-    if len(labels) != count:
-        raise MarkerFileError(f"{path}: line 4: expected {count} marker names, found {len(labels)}")
+    if len(labels) != count or not count:
+        raise MarkerFileError(f"{path}: line 4: expected {count or 'some'} marker names, found {len(labels)}")
     rows = [(number, line) for number, line in enumerate(lines[5:], 6) if line.strip()]
     if len(rows) != frames:
         raise MarkerFileError(f"{path}: {'truncated: ' if len(rows) < frames else ''}expected {frames} frames, "
@@ -48,12 +50,12 @@ def read_trc(path: Path, data: bytes) -> RawMarkers:
 
 
 def read_csv(path: Path, data: bytes) -> RawMarkers:
-    """A CSV file with the columns `time` or `frame`, then `LABEL_x, LABEL_y, LABEL_z` of every marker."""
-    try:
-        rows = list(csv.reader(io.StringIO(data.decode("utf-8-sig"))))
-    except (UnicodeDecodeError, csv.Error) as error:
-        raise MarkerFileError(f"{path}: expected a CSV file of markers, cannot read it ({error})") from None
-    head = [word.strip() for word in rows[0]] if rows else []
+    """A CSV file with the columns `time` or `frame`, then `LABEL_x, LABEL_y, LABEL_z` of every marker.
+
+    Where semicolons or tabs separate, numbers may have decimal commas.
+    """
+    separator, rows = storage.table_rows(path, data, MarkerFileError)
+    head = rows[0][1] if rows else []
     clock = [word for word in head if word.lower() in ("time", "frame")]
     columns = {word.lower(): i for i, word in enumerate(head)}
     names = [word for word in head if word not in clock]
@@ -62,7 +64,7 @@ def read_csv(path: Path, data: bytes) -> RawMarkers:
     if not clock or not labels or [n.lower() for n in names] != [w.lower() for w in wanted]:
         raise MarkerFileError(f"{path}: line 1: expected the columns time,LABEL_x,LABEL_y,LABEL_z,..., "
                               f"found {','.join(head)[:80]!r}")
-    body = [(number, row) for number, row in enumerate(rows[1:], 2) if any(cell.strip() for cell in row)]
+    body = rows[1:] if separator == "," else [(n, [cell.replace(",", ".") for cell in row]) for n, row in rows[1:]]
     if not body:
         raise MarkerFileError(f"{path}: expected frames below the first line, found none")
     table = np.array([_numbers(path, number, row, len(head)) for number, row in body])

@@ -104,10 +104,11 @@ class SoftTissue:
             Missing, not a motion, or one of a fixed shape.
         """
         motion, stored = Motion.load(path), storage.load_arrays(path, "a motion")
-        changes = stored.get("shape_changes", np.zeros(0))
-        if changes.ndim != 2 or len(changes) != len(motion.poses):
-            raise storage.StorageError(f"{path}: expected shape_changes, a row for each of {len(motion.poses)} frames, "
-                                       f"found shape {changes.shape}")
+        with storage.taking_apart(path, f"shape_changes, a row for each of {len(motion.poses)} frames"):
+            changes = storage.numbers(stored, "shape_changes", len(motion.poses), None)
+        if motion.betas is None or len(motion.betas) > changes.shape[1]:
+            raise storage.StorageError(f"{path}: expected a person of at most {changes.shape[1]} betas, "
+                                       f"found {0 if motion.betas is None else len(motion.betas)}")
         return SoftTissue(motion, changes.astype(np.float64))
 
 

@@ -1,6 +1,7 @@
 """Clothing and hair: points that hide the body, and the files that say which they are; parts that are left out."""
 from __future__ import annotations
 
+import re
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -8,7 +9,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial import cKDTree
 
-from scanprep.console import read_json
+from scanprep.geometry import storage
 from scanprep.geometry.files import read_points
 from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.surface import OrientedPoints
@@ -114,9 +115,9 @@ def read_mask(path: str | Path, points: np.ndarray, unit: str | None = None) -> 
     path = Path(path)
     ending = path.suffix.lower()
     if ending == ".npy":
-        return _marked(path, _load(path), len(points))
+        return _marked(path, storage.load_array(path), len(points))
     if ending == ".json":
-        found = read_json(path, "booleans or numbers of points")
+        found = storage.read_json(path, "booleans or numbers of points")
         if not isinstance(found, list):
             raise ValueError(f"{path}: expected a list of booleans or of numbers of points, "
                              f"found {type(found).__name__}")
@@ -124,15 +125,6 @@ def read_mask(path: str | Path, points: np.ndarray, unit: str | None = None) -> 
     if ending == ".txt":
         return _marked(path, _words(path), len(points))
     return _painted(path, points, unit)
-
-
-def _load(path: Path) -> np.ndarray:
-    try:
-        return np.asarray(np.load(path, allow_pickle=False))
-    except FileNotFoundError:
-        raise ValueError(f"{path}: no such file") from None
-    except (ValueError, EOFError, OSError) as error:
-        raise ValueError(f"{path}: expected an array of NumPy, cannot read it ({error})") from None
 
 
 def _plain(path: Path, values: Sequence[Any], what: str) -> np.ndarray:
@@ -143,21 +135,18 @@ def _plain(path: Path, values: Sequence[Any], what: str) -> np.ndarray:
         if isinstance(value, bool) or not isinstance(value, int):
             raise ValueError(f"{path}: {what} {i}: expected the number of a point, or true or false for every one, "
                              f"found {value!r}")
-    return np.array(values, dtype=np.int64)
+    with storage.taking_apart(path, "numbers of points"):
+        return np.array(values, dtype=np.int64)
 
 
 def _words(path: Path) -> np.ndarray:
-    try:
-        lines = path.read_text(encoding="utf-8").splitlines()
-    except FileNotFoundError:
-        raise ValueError(f"{path}: no such file") from None
-    except (OSError, UnicodeDecodeError) as error:
-        raise ValueError(f"{path}: expected text, cannot read it ({error})") from None
+    with storage.taking_apart(path, "text"):
+        lines = path.read_text(encoding="utf-8-sig").splitlines()
     known: dict[str, bool] = {"true": True, "false": False}
     values: list[bool | int] = []
     for number, line in enumerate(lines, 1):
         for word in line.split("#", 1)[0].replace(",", " ").split():
-            if word.lower() not in known and not word.isdigit():
+            if word.lower() not in known and not re.fullmatch("[0-9]{1,18}", word):
                 raise ValueError(f"{path}: line {number}: expected numbers of points, or true and false, "
                                  f"found {word[:40]!r}")
             values.append(known[word.lower()] if word.lower() in known else int(word))

@@ -2,11 +2,10 @@
 from __future__ import annotations
 
 from pathlib import Path
-
-import numpy as np
+from typing import Any
 
 from scanprep.geometry import storage
-from scanprep.geometry.files import read_mesh, write_mesh
+from scanprep.geometry.files import check_same_topology, read_mesh, write_mesh
 
 from .completion import Completion
 
@@ -40,12 +39,19 @@ def load_completion(folder: str | Path) -> Completion:
         A file that is missing, damaged or of another kind.
     """
     folder = Path(folder)
-    header, arrays = storage.load(folder / "completion.npz", KIND, (1, VERSION))
-    try:
-        return Completion(read_mesh(folder / "completed.ply", unit="m"), read_mesh(folder / "predicted.ply", unit="m"),
-                          arrays["pose"], arrays.get("betas"), arrays["trans"], np.asarray(arrays["seen"], dtype=bool),
-                          **{name: header[name] for name in (*_FACTS, "energies")},
-                          scale=header["scale"] if header["version"] > 1 else 1.0,
-                          expected_error=arrays.get("expected_error"), confidence=arrays.get("confidence"))
-    except KeyError as error:
-        raise storage.StorageError(f"{folder / 'completion.npz'}: it lacks {error}") from None
+    path = folder / "completion.npz"
+    header, arrays = storage.load(path, KIND, (1, VERSION))
+    with storage.taking_apart(path, "a whole completion"):
+        completed, predicted = (read_mesh(folder / f"{name}.ply", unit="m") for name in ("completed", "predicted"))
+        check_same_topology(folder / "predicted.ply", predicted, folder / "completed.ply", completed)
+        N = len(completed.vertices)
+        shapes: dict[str, tuple[int | None, ...]] = {"pose": (None, 3), "betas": (None,), "trans": (3,), "seen": (N,),
+                                                     "expected_error": (N,), "confidence": (N,)}
+        found: dict[str, Any] = {name: storage.numbers(arrays, name, *shape, kinds="b" if name == "seen" else "f")
+                                 for name, shape in shapes.items()
+                                 if name in arrays or name in ("pose", "trans", "seen")}
+        facts: dict[str, Any] = {name: float(header[name]) for name in ("rms", "explained", "landmark_rms")}
+        return Completion(completed, predicted, **{"betas": None, **found}, **facts,
+                          converged=bool(header["converged"]), iterations=int(header["iterations"]),
+                          energies={name: float(value) for name, value in header["energies"].items()},
+                          scale=float(header["scale"]) if header["version"] > 1 else 1.0)

@@ -44,15 +44,19 @@ class FrameStore:
         for path in sorted(self.folder.glob("*.npz")):
             try:
                 header, a = storage.load(path, KIND, (VERSION,))
+                with storage.taking_apart(path, "frames that go on where the last file ended"):
+                    if header["key"] != self.digest or header["first"] != len(done):
+                        raise ValueError("of another run")
+                    self.problems, P = list(header["problems"]), a["x"].shape[1]
+                    fresh = [storage.numbers(a, name, len(a["x"]), *shape, finite=name not in ("residual", "explained"),
+                                             kinds="b" if name == "found" else "f")
+                             for name, shape in zip(_ARRAYS, ((P,), (), (), (), (P,), (P, P)), strict=True)]
+                    betas = storage.numbers(a, "betas", None) if header["shaped"] else None
             except storage.StorageError:
-                header, a = {}, {}
-            if header.get("key") != self.digest or header.get("first") != len(done):
-                path.unlink()
+                path.unlink()                    # found anew
                 continue
-            self.problems = header["problems"]
-            betas = a["betas"] if header["shaped"] else None
-            done += [TrackedFrame(len(done) + i, *(_plain(a[name][i]) for name in _ARRAYS))
-                     for i in range(len(a["x"]))]
+            done += [TrackedFrame(len(done) + i, *map(_plain, values))
+                     for i, values in enumerate(zip(*fresh, strict=True))]
         return done, betas
 
     def add(self, frame: TrackedFrame, betas: np.ndarray | None, problems: list[str]) -> None:

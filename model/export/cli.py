@@ -10,7 +10,7 @@ import numpy as np
 from scanprep.cli import Output, Unit
 from scanprep.console import Metric, Outcome, bar
 from scanprep.geometry.files import write_mesh
-from scanprep.geometry.storage import StorageError, load_arrays
+from scanprep.geometry.storage import StorageError, load_arrays, numbers, taking_apart, text
 from scanprep.pictures.views import upright
 
 from ..body import BodyModel
@@ -104,21 +104,21 @@ def read_motion(path: Path, model: BodyModel) -> _Moves:
     lacking = [name for name in ("poses", "trans") if name not in stored]
     if lacking:
         raise StorageError(f"{path}: expected a motion, it lacks {' and '.join(lacking)}")
-    made_for = str(stored.get("surface_model_type", model.kind))
-    if made_for not in (MOTIONS_OF, model.kind):
-        raise StorageError(f"{path}: expected surface_model_type '{MOTIONS_OF}', found '{made_for}'")
-    J, T = len(model.skeleton.parents), len(np.atleast_1d(stored["poses"]))
-    if not T or stored["poses"].size != T * 3 * J:
-        raise StorageError(f"{path}: expected frames of the model's {J} parts, found shape {stored['poses'].shape}")
-    betas = stored.get("betas", np.zeros(0))
-    if betas.ndim != 1 or len(betas) > model.n_betas:
-        raise StorageError(f"{path}: expected at most the {model.n_betas} betas of the model, found {betas.shape}")
-    try:
+    with taking_apart(path, "a whole motion"):
+        made_for = text(stored, "surface_model_type", model.kind)
+        if made_for not in (MOTIONS_OF, model.kind):
+            raise StorageError(f"{path}: expected surface_model_type '{MOTIONS_OF}', found '{made_for}'")
+        J, T = len(model.skeleton.parents), len(np.atleast_1d(stored["poses"]))
+        if not T or stored["poses"].size != T * 3 * J:
+            raise StorageError(f"{path}: expected frames of the model's {J} parts, "
+                               f"found shape {stored['poses'].shape}")
+        betas = stored.get("betas", np.zeros(0))
+        if betas.ndim != 1 or len(betas) > model.n_betas:
+            raise StorageError(f"{path}: expected at most the {model.n_betas} betas of the model, found {betas.shape}")
+        betas = numbers({"betas": betas}, "betas", None).astype(np.float64)
         poses, rate = stored["poses"].astype(np.float64).reshape(T, J, 3), float(stored["mocap_frame_rate"])
         poses, trans = check_motion(model.skeleton, poses, stored["trans"], rate)
-        return _Moves(poses, trans, betas.astype(np.float64) if betas.size else None, rate)
-    except (TypeError, ValueError) as error:
-        raise StorageError(f"{path}: {error}") from None
+        return _Moves(poses, trans, betas if betas.size else None, rate)
 
 
 def _kind(output: Path) -> str:

@@ -2,7 +2,6 @@
 from __future__ import annotations
 
 import contextlib
-import csv
 import dataclasses
 import logging
 import re
@@ -19,6 +18,7 @@ from scanprep.dataset import RegisteredSet
 from scanprep.geometry.files import list_meshes, read_registered
 from scanprep.geometry.landmarks import read_landmark_vertices
 from scanprep.geometry.mesh import Mesh
+from scanprep.geometry.storage import read_table
 from scanprep.skeleton.find import find_skeleton
 from scanprep.skeleton.parts import SkeletonConfig
 from scanprep.skeleton.tree import Skeleton
@@ -189,11 +189,7 @@ def _read_sexes(folder: Path, given: Path | None) -> list[str]:
         return [first[subject] for subject in whole.subjects]
     if given is None:
         raise ValueError(f"{folder}: a plain folder does not say the sex; name a CSV name,sex with --sexes")
-    try:
-        with open(given, newline="", encoding="utf-8") as lines:
-            table = {row["name"]: row["sex"] for row in csv.DictReader(lines)}
-    except (OSError, KeyError, UnicodeDecodeError, csv.Error):
-        raise ValueError(f"{given}: expected a CSV with the columns name,sex") from None
+    table = {row["name"]: row["sex"] for _, row in read_table(given, ("name", "sex"))}
     names = [path.name.split(".")[0] for path in list_meshes(folder)]
     if not any(name in table for name in names):
         raise ValueError(f"{given}: none of its names is a mesh of {folder}")

@@ -8,7 +8,7 @@ import numpy as np
 import tyro
 
 from ..cli import MM, MeshArg, Output, ScanArg, SetArg, Unit, about_mesh
-from ..console import Metric, Outcome, bar, read_json
+from ..console import Metric, Outcome, bar
 from ..dataset import RegisteredSet
 from ..geometry import storage
 from ..geometry.files import UNITS, PointCloud, list_meshes, read_mesh, write_mesh, write_points
@@ -217,10 +217,12 @@ def reduce_set(registered: SetArg, output: Output, faces: int,
 def _read_views(folder: Path, cameras: Path | None, unit: Unit | None) -> list[tuple[Mesh, np.ndarray]]:
     """The range meshes of a folder with the positions of their cameras."""
     given = cameras or folder / "cameras.json"
-    where = read_json(given, "camera positions {name: [x, y, z]}")
+    where = storage.read_json(given, "camera positions {name: [x, y, z]}")
     paths = list_meshes(folder)
-    missing = [path.stem for path in paths if np.shape(where.get(path.stem)) != (3,)]
-    if missing:
-        raise ValueError(f"{given}: expected a camera position [x, y, z] for each view, none for {', '.join(missing)}")
-    scale = UNITS[unit or "m"]
-    return [(read_mesh(path, unit), scale * np.array(where[path.stem], dtype=np.float64)) for path in paths]
+    with storage.taking_apart(given, "camera positions {name: [x, y, z]} in JSON"):
+        missing = [path.stem for path in paths if path.stem not in where]
+        if missing:
+            raise ValueError(f"none for {', '.join(missing)}")
+        where = {name: np.array(place, dtype=np.float64) for name, place in where.items()}
+        places = [UNITS[unit or "m"] * storage.numbers(where, path.stem, 3) for path in paths]
+    return [(read_mesh(path, unit), place) for path, place in zip(paths, places, strict=True)]

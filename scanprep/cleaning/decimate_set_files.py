@@ -98,9 +98,13 @@ def _sample(source: RegisteredSet, config: DecimateSetConfig) -> np.ndarray | No
 def _load_map(path: Path, source: RegisteredSet, config: DecimateSetConfig, settings: dict[str, Any]) -> DecimatedSet:
     header, arrays = storage.load(path, KIND, (VERSION,))
     if {key: header.get(key) for key in settings} != storage.as_json(settings):
-        raise ValueError(f"folder: {path.parent} holds a decimation of another set or with other settings")
+        raise ValueError(f"{path}: the folder holds a decimation of another set or with other settings")
     missing = set(_ARRAYS) - set(arrays)
     if missing:
         raise storage.StorageError(f"{path}: expected {', '.join(sorted(missing))}, found {', '.join(arrays)}")
-    vertex_map, owner, face_map, fixed = (arrays[name] for name in _ARRAYS)
-    return assembled(source.template, source.skeleton, vertex_map, owner, face_map, fixed, config)
+    with storage.taking_apart(path, "the maps between two templates"):
+        vertex_map, owner, face_map, fixed = (storage.numbers(arrays, name, None, kinds="biu") for name in _ARRAYS)
+        for name, most in (("vertex_map", len(owner)), ("face_map", len(source.template.faces))):
+            if len(arrays[name]) and not 0 <= arrays[name].min() <= arrays[name].max() < most:
+                raise ValueError(f"{name}: expected numbers 0..{most - 1}")
+        return assembled(source.template, source.skeleton, vertex_map, owner, face_map, fixed, config)

@@ -15,7 +15,7 @@ import numpy as np
 
 from . import storage
 from .formats import glb, obj, off, pcd, ply, stl, xyz
-from .formats.common import UNITS, Contents, MeshFileError, load_bytes, metres_per_unit
+from .formats.common import UNITS, Contents, MeshFileError, check_extent, load_bytes, metres_per_unit
 from .landmarks import match_landmarks, read_landmark_vertices, read_landmarks, write_landmarks
 from .mesh import Mesh
 
@@ -112,7 +112,7 @@ def read_points(path: str | Path, unit: str | None = None) -> PointCloud:
     Returns
     -------
     PointCloud
-        Normals are those of the file, or of the triangles where there are triangles.
+        Normals are those of the file, zero where they are not finite, or of the triangles where there are triangles.
 
     Raises
     ------
@@ -126,6 +126,8 @@ def read_points(path: str | Path, unit: str | None = None) -> PointCloud:
         raise MeshFileError(f"{path}: {len(bad)} points are not finite, the first is point {bad[0]}")
     points = metres_per_unit(path, contents.vertices, unit) * contents.vertices
     normals = contents.normals
+    if normals is not None:
+        normals = np.where(np.isfinite(normals).all(axis=1, keepdims=True), normals, 0.0)
     if normals is None and contents.faces is not None and len(contents.faces):
         normals = Mesh(points, contents.faces).vertex_normals
     return PointCloud(points, normals, contents.colors)
@@ -218,6 +220,9 @@ def _read(path: Path, formats: dict[str, ModuleType]) -> Contents:
     contents: Contents = reader.read(path, data)
     if not len(contents.vertices):
         raise MeshFileError(f"{path}: the file holds no vertices")
+    check_extent(path, "vertex", contents.vertices)
+    if contents.colors is not None and not np.isfinite(contents.colors).all():
+        raise MeshFileError(f"{path}: expected colours that are finite numbers, found others")
     return contents
 
 

@@ -2,6 +2,7 @@
 from __future__ import annotations
 
 import json
+from collections import Counter
 from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
@@ -11,8 +12,10 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from . import storage
-from .formats.common import UNITS, Lines, MeshFileError, load_bytes, metres_per_unit, quote
+from .formats.common import FARTHEST, UNITS, Lines, MeshFileError, load_bytes, metres_per_unit, quote
 from .mesh import Mesh
+
+FAR, NEAR = 0.5, 0.01                # of the size of a surface: farther from it, or closer together, is no landmark
 
 
 def read_landmarks(path: str | Path, mesh: Mesh | None = None, unit: str | None = None) -> dict[str, np.ndarray]:
@@ -53,11 +56,18 @@ def read_landmark_vertices(path: str | Path, mesh: Mesh, unit: str | None = None
     -------
     dict of name to int
         Where the file has coordinates the nearest vertex, where it has a point of a face the nearest corner.
+
+    Raises
+    ------
+    MeshFileError
+        As `read_landmarks`, and for coordinates that are not on the mesh: see `check_on_surface`.
     """
     path = Path(path)
     entries = _entries(path, mesh, unit)
     tree = cKDTree(mesh.vertices)
     points = {name: _place(path, name, value, mesh) for name, value in entries.items()}
+    check_on_surface(path, {name: points[name] for name, value in entries.items() if isinstance(value, np.ndarray)},
+                     mesh.vertices)
     out = {}
     for name, value in entries.items():
         if isinstance(value, int):
@@ -68,6 +78,24 @@ def read_landmark_vertices(path: str | Path, mesh: Mesh, unit: str | None = None
         else:
             out[name] = int(tree.query(points[name])[1])
     return out
+
+
+def check_on_surface(path: str | Path, landmarks: Mapping[str, np.ndarray], surface: np.ndarray) -> None:
+    """Refuse points that cannot have been picked on a surface (n, 3), whatever its shape.
+
+    Raises
+    ------
+    MeshFileError
+        A landmark half the size of the surface away from it, or several so near to each other that they are all on
+        one spot of it: landmarks and surface are in different units, or do not belong together.
+    """
+    points, size = np.array(list(landmarks.values())).reshape(-1, 3), np.linalg.norm(np.ptp(surface, axis=0))
+    far = cKDTree(surface).query(points)[0]
+    span = np.linalg.norm(np.ptp(points, axis=0)) if len(points) > 2 else size
+    if not (far <= FAR * size).all() or span < NEAR * size:
+        raise MeshFileError(f"{path}: expected landmarks on the surface, which is {size:.3g} m from corner to corner; "
+                            f"they span {span:.3g} m, and '{list(landmarks)[far.argmax()]}' is {far.max():.3g} m from "
+                            "it; are both in the same unit?")
 
 
 def write_landmarks(path: str | Path, landmarks: Mapping[str, np.ndarray | int]) -> None:
@@ -116,28 +144,31 @@ def _entries(path: Path, mesh: Mesh | None, unit: str | None) -> dict[str, _Entr
     suffix = path.suffix.lower()
     own_unit = None
     pairs: list[tuple[str, _Entry]]
-    if suffix == ".json":
-        tree = _json(path, data)
-        if isinstance(tree.get("markups"), list):
-            own_unit, pairs = _slicer(path, tree["markups"], mesh, unit)
+    with storage.taking_apart(path, "landmarks", MeshFileError):
+        if suffix == ".json":
+            tree = _json(path, data)
+            if isinstance(tree.get("markups"), list):
+                own_unit, pairs = _slicer(path, tree["markups"], mesh, unit)
+            else:
+                pairs = [(name, _json_entry(path, name, value)) for name, value in tree.items()]
+        elif suffix == ".pp":
+            pairs = _picked_points(path, data)
+        elif suffix == ".lnd":
+            own_unit, pairs = "mm", _caesar(path, data)
         else:
-            pairs = [(name, _json_entry(path, name, value)) for name, value in tree.items()]
-    elif suffix == ".pp":
-        pairs = _picked_points(path, data)
-    elif suffix == ".lnd":
-        own_unit, pairs = "mm", _caesar(path, data)
-    else:
-        pairs = _text(path, data)
+            pairs = _text(path, data)
     if not pairs:
         raise MeshFileError(f"{path}: expected landmarks, found none")
     entries = dict(pairs)
     if len(entries) < len(pairs):
-        names = [name for name, _ in pairs]
-        raise MeshFileError(f"{path}: landmark '{next(n for n in names if names.count(n) > 1)}' comes twice")
+        twice = Counter(name for name, _ in pairs).most_common(1)[0][0]
+        raise MeshFileError(f"{path}: landmark '{twice}' comes twice")
     points = [v for v in entries.values() if isinstance(v, np.ndarray)]
     for name, value in entries.items():
-        if isinstance(value, np.ndarray) and not np.isfinite(value).all():
-            raise MeshFileError(f"{path}: landmark '{name}' is not finite: {value.tolist()}")
+        if isinstance(value, np.ndarray):
+            if not (np.abs(value) <= FARTHEST).all():
+                problem = f"lies beyond {FARTHEST:g}" if np.isfinite(value).all() else "is not finite"
+                raise MeshFileError(f"{path}: landmark '{name}' {problem}: {value.tolist()}")
     scale = metres_per_unit(path, np.array(points).reshape(-1, 3), unit or own_unit, smallest=0.0)
     return {name: scale * v if isinstance(v, np.ndarray) else v for name, v in entries.items()}
 
@@ -156,10 +187,7 @@ def _place(path: Path, name: str, value: _Entry, mesh: Mesh | None) -> np.ndarra
 
 
 def _json(path: Path, data: bytes) -> dict[str, Any]:
-    try:
-        tree = json.loads(data)
-    except ValueError as error:
-        raise MeshFileError(f"{path}: expected landmarks in JSON, cannot read it ({error})") from None
+    tree = storage.parse_json(path, data, "landmarks", MeshFileError, nan=True)      # refused below, by name
     if not isinstance(tree, dict):
         raise MeshFileError(f"{path}: expected landmarks in JSON {{name: [x, y, z]}}, "
                             f"found a {type(tree).__name__}")
@@ -183,7 +211,7 @@ def _json_entry(path: Path, name: str, value: Any) -> _Entry:
 def _numbers(value: Any) -> np.ndarray | None:
     try:
         point = np.array(value, dtype=np.float64)
-    except (TypeError, ValueError):
+    except (TypeError, ValueError, OverflowError):
         return None
     return point if point.shape == (3,) else None
 
@@ -192,21 +220,21 @@ def _slicer(path: Path, markups: list[Any], mesh: Mesh | None, unit: str | None
             ) -> tuple[str, list[tuple[str, _Entry]]]:
     pairs: list[tuple[str, _Entry]] = []
     own_unit = "mm"
-    for markup in markups:
-        try:
+    with storage.taking_apart(path, "a markups file of 3D Slicer", MeshFileError):
+        for markup in markups:
             units = markup.get("coordinateUnits", "mm")
             own_unit = units[0] if isinstance(units, list) else units
             turn = {"LPS": (1, 1, 1), "RAS": (-1, -1, 1)}[markup.get("coordinateSystem", "LPS")]
             for i, point in enumerate(markup["controlPoints"]):
                 if point.get("positionStatus", "defined") == "defined":
                     position = np.array(point["position"], dtype=np.float64)
-                    pairs.append((str(point.get("label", i)), position.reshape(3) * turn))
-        except (KeyError, TypeError, ValueError, AttributeError, IndexError) as error:
-            raise MeshFileError(f"{path}: expected a markups file of 3D Slicer, cannot read it "
-                                f"({type(error).__name__}: {error})") from None
-    if own_unit not in UNITS and unit is None:
+                    name = point.get("label", i)
+                    if not isinstance(name, str | int):
+                        raise ValueError(f"point {i} has a label that is no text")
+                    pairs.append((str(name), position.reshape(3) * turn))
+    if str(own_unit) not in UNITS and unit is None:
         raise MeshFileError(f"{path}: expected coordinateUnits of {', '.join(UNITS)}, found {own_unit!r}")
-    if mesh is not None and pairs:
+    if mesh is not None and pairs and all((np.abs(np.asarray(p)) <= FARTHEST).all() for _, p in pairs):
         points = UNITS[unit or own_unit] * np.array([p for _, p in pairs])
         tree, flip = cKDTree(mesh.vertices), np.array([-1, -1, 1])
         if tree.query(points * flip)[0].sum() < tree.query(points)[0].sum():
@@ -216,13 +244,10 @@ def _slicer(path: Path, markups: list[Any], mesh: Mesh | None, unit: str | None
 
 def _picked_points(path: Path, data: bytes) -> list[tuple[str, _Entry]]:
     """Points of MeshLab's PickPoints; those of a template that were not picked are inactive and left out."""
-    try:
+    with storage.taking_apart(path, "picked points of MeshLab with x, y, z and name", MeshFileError):
         root = ElementTree.fromstring(data)
         return [(point.attrib["name"], np.array([float(point.attrib[axis]) for axis in "xyz"]))
                 for point in root.iter("point") if point.attrib.get("active", "1") != "0"]
-    except (ElementTree.ParseError, KeyError, ValueError) as error:
-        raise MeshFileError(f"{path}: expected picked points of MeshLab with x, y, z and name, cannot read it "
-                            f"({error})") from None
 
 
 def _caesar(path: Path, data: bytes) -> list[tuple[str, _Entry]]:

@@ -1,23 +1,67 @@
-"""One file = named arrays and a JSON header with kind and version; never pickle."""
+"""The one place of stored files: arrays with a JSON header, JSON, tables.
+
+Arrays: one `.npz` file = named arrays and a JSON header with kind and version; never pickle. Whatever is wrong with
+a file is a StorageError that names it, and a small file never asks for much memory.
+"""
 from __future__ import annotations
 
 import contextlib
+import csv
+import io
 import json
+import math
 import os
 import re
 import shutil
 import zipfile
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import IO, Any
 
 import numpy as np
 
 HEADER = "header"
+UNPACKED, RATIO = 2**27, 100         # an archive may hold this many bytes, and so many more for each of its own
+LARGEST = 1e30                       # number that still has a square: what is larger counts as infinite
+LARGEST_TEXT = 2**28                 # bytes of a JSON file or a table
 
 
 class StorageError(ValueError):
-    """A stored file that is missing, damaged, or of another kind or version."""
+    """A file that is missing, damaged, or of another kind or version: which one, what was expected, what came."""
+
+
+@contextlib.contextmanager
+def taking_apart(path: str | Path, what: str, error: type[StorageError] = StorageError) -> Iterator[None]:
+    """Whatever goes wrong inside while a file is taken apart is an `error` that names it.
+
+    Damaged files fail in more ways than a list of exceptions foresees (numpy alone raises eight kinds).
+    """
+    try:
+        yield
+    except StorageError:                 # says already which file
+        raise
+    except FileNotFoundError:
+        raise error(f"{path}: no such file; expected {what}") from None
+    except Exception as problem:
+        raise error(f"{path}: expected {what}, {_reason(problem)}") from problem
+
+
+def _reason(problem: Exception) -> str:
+    """What went wrong, in one short line."""
+    if isinstance(problem, KeyError):
+        return f"it lacks {problem}"
+    if isinstance(problem, RecursionError):
+        return "it is nested too deeply"
+    if isinstance(problem, MemoryError):
+        return "it needs more memory than there is"
+    text = (getattr(problem, "strerror", None) or " ".join(str(problem).split()))[:200]
+    return f"cannot read it ({text or type(problem).__name__})"
+
+
+def read_bytes(path: str | Path, what: str = "a file", error: type[StorageError] = StorageError) -> bytes:
+    """All of a file, or an `error` that names it."""
+    with taking_apart(path, what, error):
+        return Path(path).read_bytes()
 
 
 @contextlib.contextmanager
@@ -58,15 +102,142 @@ def writing_folder(path: str | Path) -> Iterator[Path]:
         shutil.rmtree(beside, ignore_errors=True)
 
 
+def text(arrays: Mapping[str, np.ndarray], name: str, usual: str) -> str:
+    """The one text of this name, `usual` where there is none; ValueError for anything else."""
+    value = arrays.get(name, np.array(usual))
+    if value.size != 1 or value.dtype.kind not in "US":
+        raise ValueError(f"{name}: expected one text, found {value.dtype} of shape {value.shape}")
+    return value.item().decode() if value.dtype.kind == "S" else str(value.item())
+
+
 def as_json(value: Any) -> Any:
-    """A value as it comes back from a JSON file: tuples as lists, keys as strings."""
-    return json.loads(json.dumps(value))
+    """A value as it comes back from a JSON file: tuples as lists, keys as strings, None for what is not finite."""
+    return json.loads(_json(value))
 
 
 def write_json(path: str | Path, value: Any) -> None:
-    """Write JSON, whole or not at all."""
+    """Write JSON, whole or not at all, null for what is not finite."""
     with writing(path) as beside:
-        beside.write_text(json.dumps(value, indent=1) + "\n", encoding="utf-8")
+        beside.write_text(_json(value, 1) + "\n", encoding="utf-8")
+
+
+def _json(value: Any, indent: int | None = None) -> str:
+    try:
+        return json.dumps(value, indent=indent, allow_nan=False)
+    except ValueError:
+        return json.dumps(_finite(value), indent=indent, allow_nan=False)
+
+
+def _finite(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {key: _finite(v) for key, v in value.items()}
+    if isinstance(value, list | tuple):
+        return [_finite(v) for v in value]
+    return None if isinstance(value, float) and not math.isfinite(value) else value
+
+
+def read_json(path: str | Path, what: str, error: type[StorageError] = StorageError) -> Any:
+    """A JSON file of finite numbers.
+
+    Parameters
+    ----------
+    what : str
+        What was expected, for the error.
+
+    Raises
+    ------
+    StorageError, or the one given
+        Missing, not JSON, not in UTF-8, nested too deeply, too large, a number that is not finite.
+    """
+    return parse_json(path, read_bytes(path, what, error), what, error)
+
+
+def parse_json(path: str | Path, data: bytes, what: str, error: type[StorageError] = StorageError, nan: bool = False
+               ) -> Any:
+    """The same of bytes that were read; `nan`: numbers need not be finite."""
+    with taking_apart(path, f"{what} in JSON", error):
+        if len(data) > LARGEST_TEXT:
+            raise ValueError(f"{len(data)} bytes, more than {LARGEST_TEXT}")
+        try:
+            text = data.decode("utf-16" if data[:2] in _UTF_16 else "utf-8-sig")
+        except UnicodeDecodeError as problem:
+            raise ValueError(f"it is not saved as UTF-8: byte {problem.start}") from None
+        return json.loads(text) if nan else json.loads(text, parse_constant=_number, parse_float=_number)
+
+
+_UTF_16 = (b"\xff\xfe", b"\xfe\xff")
+
+
+def _number(text: str) -> float:
+    value = float(text)
+    if not math.isfinite(value):
+        raise ValueError(f"{text} is not a finite number")
+    return value
+
+
+def read_table(path: str | Path, columns: Sequence[str], needed: Sequence[str] | None = None
+               ) -> list[tuple[int, dict[str, str]]]:
+    """A CSV table with a heading, as spreadsheets save it: see `table_rows`.
+
+    Parameters
+    ----------
+    columns : names
+        Those that are wanted.
+    needed : names, optional
+        Those of them that must be there; all, when not given.
+
+    Returns
+    -------
+    list of (line, {column: text})
+        Every one of `columns`, empty where the table does not have it; other columns too.
+
+    Raises
+    ------
+    StorageError
+        Missing, not a table, a column that is not there or comes twice, a line of another length.
+    """
+    _, rows = table_rows(path, read_bytes(path, f"a table with the columns {','.join(columns)}"))
+    head = rows[0][1] if rows else []
+    if not set(columns if needed is None else needed) <= set(head) or len(set(head)) < len(head):
+        raise StorageError(f"{path}: line 1: expected the columns {','.join(columns)}, each once, "
+                           f"found {','.join(head)[:80] or 'an empty file'}")
+    for line, cells in rows:
+        if len(cells) != len(head):
+            raise StorageError(f"{path}: line {line}: expected {len(head)} values, found {len(cells)}")
+    return [(line, {**dict.fromkeys(columns, ""), **dict(zip(head, cells, strict=True))}) for line, cells in rows[1:]]
+
+
+def table_rows(path: str | Path, data: bytes, error: type[StorageError] = StorageError
+               ) -> tuple[str, list[tuple[int, list[str]]]]:
+    """The separator of a CSV table, and the number and cells of each line that is not empty.
+
+    UTF-8 with or without a mark, UTF-16 with one, or the Windows alphabet of western Europe; commas, semicolons or
+    tabs. Empty cells beyond the end of the first line are left out.
+    """
+    with taking_apart(path, "a CSV table", error):
+        if len(data) > LARGEST_TEXT:
+            raise ValueError(f"{len(data)} bytes, more than {LARGEST_TEXT}")
+        text = _text(data)
+        separator = max(",;\t", key=text.split("\n", 1)[0].count)
+        reader = csv.reader(io.StringIO(text, newline=""), delimiter=separator)
+        rows = [(reader.line_num, [cell.strip() for cell in cells]) for cells in reader]
+    width = 0
+    for _, cells in rows:
+        while len(cells) > width and not cells[-1]:
+            cells.pop()
+        width = width or len(cells)
+    return separator, [(line, cells) for line, cells in rows if any(cells)]
+
+
+def _text(data: bytes) -> str:
+    if data[:2] in _UTF_16:
+        return data.decode("utf-16")
+    if b"\0" in data:
+        raise ValueError("it is not text")
+    for encoding in ("utf-8-sig", "cp1252"):
+        with contextlib.suppress(UnicodeDecodeError):
+            return data.decode(encoding)
+    return data.decode("latin-1")
 
 
 def save(path: str | Path, kind: str, version: int, arrays: dict[str, np.ndarray],
@@ -88,37 +259,86 @@ def save(path: str | Path, kind: str, version: int, arrays: dict[str, np.ndarray
 
 def load_arrays(path: str | Path, what: str = "an .npz file") -> dict[str, np.ndarray]:
     """All arrays of an `.npz` file, or StorageError when it is missing, damaged or holds objects."""
-    try:
-        with np.load(path, allow_pickle=False) as data:
-            return {name: data[name] for name in data.files}
-    except FileNotFoundError:
-        raise StorageError(f"{path}: no such file") from None
-    except (OSError, ValueError, EOFError, KeyError, AttributeError, zipfile.BadZipFile) as error:
-        raise StorageError(f"{path}: expected {what}, cannot read it ({error})") from None
+    return _arrays(path, what, None)
+
+
+def load_array(path: str | Path, what: str = "an array of NumPy") -> np.ndarray:
+    """The array of an `.npy` file, or StorageError when it is missing, damaged or holds objects."""
+    with taking_apart(path, what), open(path, "rb") as stream:
+        return _array(stream, os.fstat(stream.fileno()).st_size, "")
 
 
 def kind_of(path: str | Path) -> str:
     """The kind of a file of `save`, read from its header alone, or StorageError."""
+    header = _header(path, "scapekit", _arrays(path, "an .npz file with a header", HEADER).get(HEADER))
+    return str(header.get("kind"))
+
+
+def _arrays(path: str | Path, what: str, only: str | None) -> dict[str, np.ndarray]:
+    """The arrays of an archive, or the one of this name; numpy's own reader believes what a header promises."""
+    with taking_apart(path, what), zipfile.ZipFile(path) as archive:
+        members = {info.filename[:-4]: info for info in archive.infolist() if info.filename.endswith(".npy")}
+        unpacked, packed = sum(info.file_size for info in members.values()), os.path.getsize(path)
+        if unpacked > UNPACKED + RATIO * packed or len(members) > packed // 64:
+            raise ValueError(f"{packed} bytes that would unpack to {len(members)} arrays of {unpacked} bytes")
+        found = {}
+        for name, info in members.items():
+            if info.compress_type not in (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED):
+                raise ValueError(f"array {name}: packed in a way that is not read here")
+            if only is None or name == only:
+                with archive.open(info) as stream:
+                    found[name] = _array(stream, info.file_size, name)
+        return found
+
+
+def _array(stream: IO[bytes], size: int, name: str) -> np.ndarray:
+    """An array in numpy's format, whose header must promise what `size` bytes can hold."""
     try:
-        with np.load(path, allow_pickle=False) as data:
-            return str(_header(path, "scapekit", data[HEADER] if HEADER in data.files else None)["kind"])
-    except FileNotFoundError:
-        raise StorageError(f"{path}: no such file") from None
-    except StorageError:
-        raise
-    except (OSError, ValueError, EOFError, KeyError, AttributeError, zipfile.BadZipFile) as error:
-        raise StorageError(f"{path}: expected an .npz file with a header, cannot read it ({error})") from None
+        version = np.lib.format.read_magic(stream)
+        read = {(1, 0): np.lib.format.read_array_header_1_0, (2, 0): np.lib.format.read_array_header_2_0}[version]
+        shape, fortran, kind = read(stream)
+    except Exception:                    # numpy's words advise to allow pickles
+        raise ValueError(f"array {name}: its header is damaged") from None
+    if kind.kind not in "biufcSU":
+        raise ValueError(f"array {name}: expected numbers or text, found {kind}")
+    count = math.prod(shape)
+    if min(shape, default=0) < 0 or count * max(kind.itemsize, 1) != size - stream.tell():
+        raise ValueError(f"array {name}: expected {count} of {kind}, found {size - stream.tell()} bytes")
+    data = bytearray(stream.read(size))
+    if len(data) != count * kind.itemsize:
+        raise ValueError(f"array {name}: truncated")
+    values: np.ndarray = np.frombuffer(data, kind, count) if count else np.zeros(shape, kind)
+    return values.reshape(shape[::-1]).T if fortran else values.reshape(shape)
+
+
+def numbers(arrays: Mapping[str, np.ndarray], name: str, *shape: int | None, finite: bool = True, kinds: str = "iuf"
+            ) -> np.ndarray:
+    """The array of this name, of this shape (None: any length), of one of these kinds of numpy, and finite.
+
+    Raises
+    ------
+    KeyError, ValueError
+        Not there, of another shape, not numbers, not finite.
+    """
+    values = arrays[name]
+    if values.dtype.kind not in kinds:
+        raise ValueError(f"{name}: expected numbers, found {values.dtype}")
+    if len(shape) != values.ndim or any(n not in (None, found) for n, found in zip(shape, values.shape, strict=True)):
+        wanted = ", ".join("any" if n is None else str(n) for n in shape)
+        raise ValueError(f"{name}: expected shape ({wanted}), found {values.shape}")
+    if finite and not (np.abs(values) <= LARGEST).all():
+        raise ValueError(f"{name}: {np.count_nonzero(~(np.abs(values) <= LARGEST))} values are not finite")
+    return values
 
 
 def _header(path: str | Path, kind: str, stored: np.ndarray | None) -> dict[str, Any]:
     if stored is None:
         raise StorageError(f"{path}: expected a {kind} file, found an .npz without a header")
-    try:
-        header = json.loads(str(stored))
-    except ValueError as error:
-        raise StorageError(f"{path}: expected a {kind} file, its header is damaged ({error})") from None
+    what = f"a {kind} file with a header in JSON"
+    with taking_apart(path, what):
+        header = parse_json(path, str(stored).encode("utf-8"), what, nan=True)
     if not isinstance(header, dict):
-        raise StorageError(f"{path}: expected a {kind} file, its header is damaged (not a table)")
+        raise StorageError(f"{path}: expected a {kind} file, its header is damaged")
     return header
 
 

@@ -5,12 +5,12 @@
 """
 from __future__ import annotations
 
-import json
 from pathlib import Path
 
 import numpy as np
 
 from ..geometry import storage
+from ..geometry.formats.common import FARTHEST
 from .correspondences import Correspondences
 
 KIND, VERSION = "correspondences", 1
@@ -35,24 +35,21 @@ def read_correspondences(path: str | Path) -> Correspondences:
         Missing, damaged, or something else.
     """
     expected = "expected correspondences in JSON"
-    try:
-        stored = json.loads(Path(path).read_text(encoding="utf-8"))
-    except FileNotFoundError:
-        raise storage.StorageError(f"{path}: no such file") from None
-    except ValueError as error:
-        raise storage.StorageError(f"{path}: {expected}, cannot read it ({error})") from None
+    stored = storage.read_json(path, "correspondences")
     if not isinstance(stored, dict) or stored.get("kind") != KIND:
         raise storage.StorageError(f"{path}: {expected}, found something else")
     if stored.get("version") != VERSION:
         raise storage.StorageError(f"{path}: version {stored.get('version')} of correspondences is not known here "
                                    f"(known: {VERSION})")
-    try:
+    with storage.taking_apart(path, "correspondences in JSON with vertex, point and confidence"):
         pairs = stored["pairs"]
-        return Correspondences(np.array([pair["vertex"] for pair in pairs], dtype=np.int64),
-                               np.array([pair["point"] for pair in pairs], dtype=np.float64).reshape(len(pairs), 3),
-                               np.array([pair.get("confidence", 1.0) for pair in pairs], dtype=np.float64),
-                               str(stored.get("method", "")), dict(stored.get("energies", {})),
-                               bool(stored.get("converged", True)))
-    except (KeyError, TypeError, ValueError) as error:
-        raise storage.StorageError(f"{path}: {expected} with vertex, point and confidence "
-                                   f"({type(error).__name__}: {error})") from None
+        found = Correspondences(np.array([pair["vertex"] for pair in pairs], dtype=np.int64),
+                                np.array([pair["point"] for pair in pairs], dtype=np.float64).reshape(len(pairs), 3),
+                                np.array([pair.get("confidence", 1.0) for pair in pairs], dtype=np.float64),
+                                str(stored.get("method", "")),
+                                {name: np.nan if value is None else float(value)
+                                 for name, value in stored.get("energies", {}).items()},
+                                bool(stored.get("converged", True)))
+        if (found.template_vertices < 0).any() or not (np.abs(found.scan_points) <= FARTHEST).all():
+            raise ValueError("a vertex below 0, or a point without end")
+        return found

@@ -8,7 +8,7 @@ from typing import Literal
 import numpy as np
 
 from ..cleaning.components import CleanScanConfig, clean_scan
-from ..geometry.landmarks import match_landmarks, read_landmarks
+from ..geometry.landmarks import check_on_surface, match_landmarks, read_landmarks
 from ..geometry.mesh import Mesh
 from ..matching.correlated import CorrelatedConfig, find_correspondences
 from ..matching.correspondences import Correspondences
@@ -105,6 +105,7 @@ def _landmarks(task: ScanTask, scan: Mesh | np.ndarray, template_landmarks: dict
     if task.landmarks is None:
         raise ValueError(f"{task.scan}: expected a landmark file of the name {task.name}, found none")
     found = read_landmarks(task.landmarks, scan if isinstance(scan, Mesh) else None, settings.unit)
+    check_on_surface(task.landmarks, found, scan.vertices if isinstance(scan, Mesh) else scan)
     try:
         return match_landmarks(template_landmarks, found)[1:]
     except ValueError as error:

@@ -1,14 +1,12 @@
 """The scans of a folder, their landmark files, and what a table says of them."""
 from __future__ import annotations
 
-import csv
-import io
-from collections.abc import Iterable
 from dataclasses import dataclass, field
 from pathlib import Path
 
 import numpy as np
 
+from ..geometry import storage
 from ..geometry.files import MeshFileError, read_mesh, read_points
 from ..geometry.mesh import Mesh
 
@@ -122,20 +120,9 @@ def _is_scan(path: Path) -> bool:
 def _read_table(path: Path) -> dict[str, dict[str, str]]:
     if not path.exists():
         return {}
-    rows = list(csv.DictReader(io.StringIO(path.read_text(encoding="utf-8-sig"))))
-    if rows and "name" not in rows[0]:
-        raise ValueError(f"{path}: line 1: expected a column 'name' beside subject, pose and sex, "
-                         f"found {', '.join(map(str, rows[0]))}")
-    twice = _repeated(row["name"] for row in rows)
-    if twice:
-        raise ValueError(f"{path}: the name {twice} comes twice")
-    return {row["name"]: row for row in rows}
-
-
-def _repeated(names: Iterable[str]) -> str | None:
-    seen: set[str] = set()
-    for name in names:
-        if name in seen:
-            return name
-        seen.add(name)
-    return None
+    about: dict[str, dict[str, str]] = {}
+    for line, row in storage.read_table(path, ("name", "subject", "pose", "sex"), ("name",)):
+        if row["name"] in about:
+            raise storage.StorageError(f"{path}: line {line}: the name {row['name']} comes twice")
+        about[row["name"]] = row
+    return about

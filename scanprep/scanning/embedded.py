@@ -64,8 +64,16 @@ class GroundTruth:
         StorageError
             Missing, damaged, or of another kind or version.
         """
-        header, arrays = storage.load(path, "ground truth", (VERSION,))
-        return GroundTruth(BodyShape(**header["shape"]), **arrays)
+        header, a = storage.load(path, "ground truth", (VERSION,))
+        with storage.taking_apart(path, "a whole ground truth"):
+            J = len(a["joints"])
+            mesh = Mesh(storage.numbers(a, "vertices", None, 3), storage.numbers(a, "faces", None, 3))
+            part = storage.numbers(a, "part_of_face", len(mesh.faces))
+            if not np.isin(part, np.arange(J)).all():
+                raise ValueError(f"part_of_face: expected parts 0..{J - 1}")
+            return GroundTruth(BodyShape(**header["shape"]), storage.numbers(a, "pose", J, 3),
+                               storage.numbers(a, "trans", 3), a["vertices"], a["faces"], part,
+                               storage.numbers(a, "joints", J, 3))
 
 
 def stand(person: Person, pose: np.ndarray) -> GroundTruth:
@@ -142,9 +150,16 @@ def read_views(path: str | Path) -> list[RangeView]:
         Missing, damaged, or of another kind or version.
     """
     header, a = storage.load(path, "range views", (VERSION,))
-    return [RangeView(Mesh(a[f"points{k}"], a[f"faces{k}"]), a[f"normals{k}"], a[f"T_world_camera{k}"][:3, 3],
-                      a[f"T_world_camera{k}"], a[f"depth{k}"],
-                      a[f"intrinsics{k}"]) for k in range(header["views"])]
+    with storage.taking_apart(path, "whole range views"):
+        return [_view(a, k) for k in range(header["views"])]
+
+
+def _view(a: dict[str, np.ndarray], k: int) -> RangeView:
+    mesh = Mesh(storage.numbers(a, f"points{k}", None, 3), storage.numbers(a, f"faces{k}", None, 3))
+    T = storage.numbers(a, f"T_world_camera{k}", 4, 4)
+    return RangeView(mesh, storage.numbers(a, f"normals{k}", len(mesh.vertices), 3), T[:3, 3], T,
+                     storage.numbers(a, f"depth{k}", None, None, finite=False),
+                     storage.numbers(a, f"intrinsics{k}", 3, 3))
 
 
 @dataclass(frozen=True)

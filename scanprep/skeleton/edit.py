@@ -229,12 +229,7 @@ def read_edits(path: str | Path) -> list[dict[str, Any]]:
     StorageError
         Missing, or not a list of edits in JSON.
     """
-    try:
-        stored = json.loads(Path(path).read_text(encoding="utf-8"))
-    except FileNotFoundError:
-        raise storage.StorageError(f"{path}: no such file") from None
-    except ValueError as error:
-        raise storage.StorageError(f"{path}: expected a list of edits in JSON, cannot read it ({error})") from None
+    stored = storage.read_json(path, "a list of edits")
     if not isinstance(stored, list):
         raise storage.StorageError(f"{path}: expected a list of edits in JSON, found something else")
     return stored

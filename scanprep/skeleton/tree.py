@@ -1,7 +1,6 @@
 """The articulated skeleton: parts of the surface, a tree over them, and a joint for every link."""
 from __future__ import annotations
 
-import json
 from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
@@ -47,8 +46,10 @@ class Skeleton:
         parents = np.array(self.parents, dtype=np.int64)
         joints = np.array(self.joints, dtype=np.float64)
         J = len(parents)
-        if joints.shape != (J, 3):
+        if parents.ndim != 1 or joints.shape != (J, 3):
             raise ValueError(f"joints: expected shape ({J}, 3) for {J} parents, got {joints.shape}")
+        if not np.isfinite(joints).all():
+            raise ValueError("joints: expected finite numbers")
         if not J or parents[0] != -1:
             raise ValueError("parents: expected part 0 to be the root, with parent -1")
         wrong = np.flatnonzero((parents[1:] < 0) | (parents[1:] >= np.arange(1, J))) + 1
@@ -59,7 +60,7 @@ class Skeleton:
             raise ValueError(f"part_of_face: expected every part of 0..{J - 1} to have triangles, "
                              f"found {np.unique(part_of_face).tolist()}")
         names = tuple(self.names) or tuple(f"part{j}" for j in range(J))
-        if len(names) != J or len(set(names)) != J:
+        if len(names) != J or len(set(names)) != J or not all(isinstance(name, str) for name in names):
             raise ValueError(f"names: expected {J} different names, got {list(names)}")
         for name, value in (("part_of_face", part_of_face), ("parents", parents), ("joints", joints)):
             value.flags.writeable = False
@@ -172,23 +173,14 @@ class Skeleton:
         StorageError
             Missing, not a skeleton, or a version that is not known.
         """
-        try:
-            stored = json.loads(Path(path).read_text(encoding="utf-8"))
-        except FileNotFoundError:
-            raise storage.StorageError(f"{path}: no such file") from None
-        except ValueError as error:
-            raise storage.StorageError(f"{path}: expected a skeleton in JSON, cannot read it ({error})") from None
+        stored = storage.read_json(path, "a skeleton")
         if not isinstance(stored, dict) or stored.get("kind") != "skeleton":
             raise storage.StorageError(f"{path}: expected a skeleton in JSON, found something else")
         if stored.get("version") != VERSION:
             raise storage.StorageError(f"{path}: skeleton version {stored.get('version')} is not known here "
                                        f"(known: {VERSION})")
-        try:
+        with storage.taking_apart(path, "a whole skeleton"):
             return Skeleton(stored["part_of_face"], stored["parents"], stored["joints"], tuple(stored["names"]))
-        except (KeyError, TypeError) as error:
-            raise storage.StorageError(f"{path}: skeleton lacks or has a damaged field ({error})") from None
-        except ValueError as error:
-            raise storage.StorageError(f"{path}: {error}") from None
 
 
 def _affine_weights(points: np.ndarray, target: np.ndarray) -> np.ndarray:

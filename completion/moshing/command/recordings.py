@@ -2,14 +2,13 @@
 from __future__ import annotations
 
 import csv
-import json
 import re
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Literal, get_args
 
-from scanprep.geometry.storage import writing
+from scanprep.geometry import storage
 
 from ...markers.common import MarkerFileError
 from ...markers.files import marker_subjects
@@ -126,7 +125,7 @@ def find_actors(markers: Iterable[Path], grouping: Grouping, output: Path | None
 
 def write_table(path: Path, actors: Iterable[Actor]) -> None:
     """Who is who as CSV, in the form that `Grouping.table` takes."""
-    with writing(path) as beside, open(beside, "w", newline="", encoding="utf-8") as out:
+    with storage.writing(path) as beside, open(beside, "w", newline="", encoding="utf-8") as out:
         table = csv.writer(out)
         table.writerow(["file", "subject", "rule"])
         table.writerows([r.path, actor.name, actor.rule] for actor in actors for r in actor.recordings)
@@ -219,19 +218,13 @@ def _read_table(table: Path, found: list[Path]) -> dict[Path, str]:
 
 
 def _table_rows(table: Path) -> list[tuple[str, str]]:
-    try:
-        text = table.read_text(encoding="utf-8-sig")
-    except OSError as error:
-        raise ValueError(f"{table}: cannot be read ({error.strerror or error})") from None
     if table.suffix.lower() == ".json":
-        try:
-            tree = json.loads(text)
-        except ValueError as error:
-            raise ValueError(f"{table}: expected JSON {{file: subject}}, cannot read it ({error})") from None
+        tree = storage.read_json(table, "the subjects {file: subject}")
         if not isinstance(tree, dict) or not all(isinstance(v, str | int) for v in tree.values()):
             raise ValueError(f"{table}: expected JSON {{file: subject}}, found something else")
         return [(file, str(subject)) for file, subject in tree.items()]
-    rows = list(csv.DictReader(text.splitlines()))
-    if not rows or not {"file", "subject"} <= set(rows[0]) or any(not r["file"] or not r["subject"] for r in rows):
-        raise ValueError(f"{table}: expected CSV with the columns file and subject, both filled in every row")
-    return [(row["file"], row["subject"]) for row in rows]
+    rows = storage.read_table(table, ("file", "subject"))
+    empty = [line for line, row in rows if not row["file"] or not row["subject"]]
+    if empty or not rows:
+        raise storage.StorageError(f"{table}: line {(empty or [2])[0]}: expected a file and its subject, found neither")
+    return [(row["file"], row["subject"]) for _, row in rows]

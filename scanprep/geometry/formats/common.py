@@ -2,18 +2,22 @@
 from __future__ import annotations
 
 import gzip
+import io
 import warnings
-import zlib
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
+from .. import storage
+
+UNPACKED, RATIO = 2**20, 50          # a gzip file may unpack to this many bytes, and so many for each of its own
+FARTHEST = 1e9                       # of a coordinate, in whatever unit
 UNITS = {"m": 1.0, "mm": 1e-3, "cm": 1e-2, "in": 0.0254}
 
 
-class MeshFileError(ValueError):
+class MeshFileError(storage.StorageError):
     """A file of a mesh, points or landmarks that cannot be read: which one, what was expected, what came."""
 
 
@@ -45,19 +49,38 @@ def load_bytes(path: Path) -> bytes:
     """
     try:
         data = path.read_bytes()
-        if path.suffix.lower() == ".gz":
-            data = gzip.decompress(data)
     except FileNotFoundError:
         raise MeshFileError(f"{path}: no such file") from None
     except IsADirectoryError:
         raise MeshFileError(f"{path}: expected a file, found a folder") from None
-    except (EOFError, zlib.error, gzip.BadGzipFile) as error:
-        raise MeshFileError(f"{path}: truncated or damaged gzip file ({error})") from None
     except OSError as error:
         raise MeshFileError(f"{path}: cannot be read ({error.strerror or error})") from None
+    if path.suffix.lower() == ".gz":
+        data = _unpacked(path, data)
     if not data:
         raise MeshFileError(f"{path}: the file is empty")
     return data
+
+
+def _unpacked(path: Path, data: bytes) -> bytes:
+    """What a gzip file holds, up to far more than any mesh can be packed."""
+    most = UNPACKED + RATIO * len(data)
+    try:
+        with gzip.GzipFile(fileobj=io.BytesIO(data)) as packed:
+            out = packed.read(most + 1)
+    except Exception as error:                   # gzip lets errors of zlib and of struct through
+        raise MeshFileError(f"{path}: truncated or damaged gzip file ({error})") from None
+    if len(out) > most:
+        raise MeshFileError(f"{path}: expected a packed mesh, found {len(data)} bytes that unpack to more than {most}")
+    return out
+
+
+def check_extent(path: Path, what: str, points: np.ndarray) -> None:
+    """MeshFileError for coordinates that no scan has, and that have no squares, lengths and areas."""
+    far = np.flatnonzero((np.abs(points) > FARTHEST).any(axis=1) & np.isfinite(points).all(axis=1))
+    if len(far):
+        raise MeshFileError(f"{path}: {what} {far[0]} lies at {points[far[0]].tolist()}, "
+                            f"expected coordinates below {FARTHEST:g}")
 
 
 def metres_per_unit(path: Path, points: np.ndarray, unit: str | None, smallest: float = 0.1) -> float:
@@ -132,7 +155,7 @@ class Lines:
         chunk = self.text[inside] if inside else [self.text[row] for row in rows if row < len(self.text)]
         if not rows:
             return np.zeros((0, columns), dtype=dtype)
-        if len(chunk) == len(rows):
+        if not (inside and rows[-1] >= len(self.text)) and len(chunk) == len(rows):
             try:
                 values: np.ndarray = np.loadtxt(chunk, dtype=dtype, ndmin=2, comments=None)
             except ValueError:
@@ -152,7 +175,7 @@ class Lines:
             try:
                 for word in words:
                     dtype(word)
-            except ValueError:
+            except (ValueError, OverflowError):
                 return self.fail(row, expected)
         return self.fail(rows[0], expected)
 

@@ -9,11 +9,13 @@ from typing import Any
 
 import numpy as np
 
+from .. import storage
 from .common import Contents, MeshFileError, as_colors, quote
 
 _COMPONENTS = {5120: "i1", 5121: "u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
-_WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT4": 16}
+_WIDTHS = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}
 _TRIANGLES, _STRIP, _FAN = 4, 5, 6
+_VALUES, _REPEATS = 10**6, 4         # vertices and corners of a scene, and so many more for each byte
 
 
 def read(path: Path, data: bytes) -> Contents:
@@ -22,38 +24,41 @@ def read(path: Path, data: bytes) -> Contents:
     A mesh that hangs on joints is taken as it is stored, in its bind pose.
     """
     tree, binary = _chunks(path, data)
+    with storage.taking_apart(path, "a whole GLB file", MeshFileError), np.errstate(all="ignore"):
+        return _scene(path, tree, binary)
+
+
+def _scene(path: Path, tree: dict[str, Any], binary: bytes) -> Contents:
     needed = tree.get("extensionsRequired", [])
     if any("draco" in name.lower() or "meshopt" in name.lower() for name in needed):
         raise MeshFileError(f"{path}: expected a GLB file that is not compressed, it needs {', '.join(needed)}")
     vertices: list[np.ndarray] = []
     faces: list[np.ndarray] = []
     colors: list[np.ndarray | None] = []
-    start = 0
-    try:
-        for node, matrix in _nodes(tree):
-            if "mesh" not in node:
+    start, most = 0, _VALUES + _REPEATS * len(binary)    # many nodes may show one mesh, but not without end
+    for node, matrix in _nodes(tree):
+        if "mesh" not in node:
+            continue
+        matrix = np.eye(4) if "skin" in node else matrix
+        placed: dict[int, int] = {}                      # primitives may share their vertices
+        for primitive in _item(tree["meshes"], node["mesh"])["primitives"]:
+            if primitive.get("mode", _TRIANGLES) not in (_TRIANGLES, _STRIP, _FAN):
                 continue
-            matrix = np.eye(4) if "skin" in node else matrix
-            placed: dict[int, int] = {}                  # primitives may share their vertices
-            for primitive in tree["meshes"][node["mesh"]]["primitives"]:
-                if primitive.get("mode", _TRIANGLES) not in (_TRIANGLES, _STRIP, _FAN):
-                    continue
-                points = primitive["attributes"]["POSITION"]
-                if points not in placed:
-                    local = _accessor(tree, binary, points).astype(np.float64)
-                    placed[points] = start
-                    with np.errstate(invalid="ignore"):          # what is not finite is refused later
-                        vertices.append(local @ matrix[:3, :3].T + matrix[:3, 3])
-                    colors.append(_colors(tree, binary, primitive))
-                    start += len(local)
-                corners = _triangles(tree, binary, primitive, tree["accessors"][points]["count"])
-                if np.linalg.det(matrix[:3, :3]) < 0:
-                    corners = corners[:, ::-1]
-                faces.append(_in_range(path, corners, tree["accessors"][points]["count"]) + placed[points])
-    except (KeyError, IndexError, TypeError, AttributeError, RecursionError) as error:
-        raise MeshFileError(f"{path}: damaged GLB file ({type(error).__name__}: {error})") from None
-    except _Short as error:
-        raise MeshFileError(f"{path}: truncated GLB file: {error}") from None
+            points = primitive["attributes"]["POSITION"]
+            if points not in placed:
+                local = _accessor(tree, binary, points, "VEC3").astype(np.float64)
+                placed[points] = start
+                vertices.append(local @ matrix[:3, :3].T + matrix[:3, 3])      # what is not finite is refused later
+                colors.append(_colors(tree, binary, primitive, len(local)))
+                start += len(local)
+            count = tree["accessors"][points]["count"]
+            corners = _triangles(tree, binary, primitive, count)
+            if np.linalg.det(matrix[:3, :3]) < 0:
+                corners = corners[:, ::-1]
+            faces.append(_in_range(path, corners, count) + placed[points])
+            most -= count + 3 * len(corners) + 1
+            if most < 0:
+                raise ValueError("it shows its meshes too often")
     if not faces:
         raise MeshFileError(f"{path}: expected a mesh, found a GLB file without triangles")
     shades = [c for c in colors if c is not None]
@@ -61,8 +66,11 @@ def read(path: Path, data: bytes) -> Contents:
                     np.concatenate(shades) if len(shades) == len(colors) else None)
 
 
-class _Short(Exception):
-    """Data that end before they should."""
+def _item(values: list[Any], number: Any) -> Any:
+    """The entry of this number, which JSON may have as anything."""
+    if isinstance(number, bool) or not isinstance(number, int) or not 0 <= number < len(values):
+        raise ValueError(f"it refers to number {number!r} of {len(values)}")
+    return values[number]
 
 
 def _chunks(path: Path, data: bytes) -> tuple[dict[str, Any], bytes]:
@@ -79,28 +87,31 @@ def _chunks(path: Path, data: bytes) -> tuple[dict[str, Any], bytes]:
         size, kind = struct.unpack_from("<I4s", data, place)
         chunks.setdefault(kind, data[place + 8:place + 8 + size])
         place += 8 + size
-    try:
-        return json.loads(chunks[b"JSON"]), chunks.get(b"BIN\0", b"")
-    except (KeyError, ValueError) as error:
-        raise MeshFileError(f"{path}: damaged GLB file, its JSON cannot be read ({error})") from None
+    tree = storage.parse_json(path, chunks.get(b"JSON", b""), "a GLB file with a header", MeshFileError)
+    if not isinstance(tree, dict):
+        raise MeshFileError(f"{path}: damaged GLB file, its JSON is not a table")
+    return tree, chunks.get(b"BIN\0", b"")
 
 
 def _nodes(tree: dict[str, Any]) -> Iterator[tuple[dict[str, Any], np.ndarray]]:
     """Every node of the scene with its matrix (4, 4) to the scene; all root nodes where there is no scene."""
     nodes = tree.get("nodes", [])
     if tree.get("scenes"):
-        roots = tree["scenes"][tree.get("scene", 0)].get("nodes", [])
+        roots = _item(tree["scenes"], tree.get("scene", 0)).get("nodes", [])
     else:
         inner = {child for node in nodes for child in node.get("children", [])}
         roots = [i for i in range(len(nodes)) if i not in inner]
-    open_nodes = [(i, np.eye(4), 0) for i in reversed(roots)]
+    open_nodes = [(i, np.eye(4)) for i in reversed(roots)]
+    seen: set[int] = set()
     while open_nodes:
-        i, above, depth = open_nodes.pop()
-        if depth > len(nodes):
-            raise RecursionError("a node is its own ancestor")
-        matrix = above @ _matrix(nodes[i])
-        yield nodes[i], matrix
-        open_nodes += [(child, matrix, depth + 1) for child in reversed(nodes[i].get("children", []))]
+        i, above = open_nodes.pop()
+        node = _item(nodes, i)
+        if i in seen:
+            raise ValueError(f"node {i} hangs below two nodes")
+        seen.add(i)
+        matrix = above @ _matrix(node)
+        yield node, matrix
+        open_nodes += [(child, matrix) for child in reversed(node.get("children", []))]
 
 
 def _matrix(node: dict[str, Any]) -> np.ndarray:
@@ -116,23 +127,26 @@ def _matrix(node: dict[str, Any]) -> np.ndarray:
     return out
 
 
-def _accessor(tree: dict[str, Any], binary: bytes, number: int) -> np.ndarray:
-    """(count, width) the values of an accessor."""
-    accessor = tree["accessors"][number]
+def _accessor(tree: dict[str, Any], binary: bytes, number: int, *types: str) -> np.ndarray:
+    """(count, width) the values of an accessor of one of these types."""
+    accessor = _item(tree["accessors"], number)
     kind, count = np.dtype(_COMPONENTS[accessor["componentType"]]), accessor["count"]
-    width = _WIDTHS[accessor["type"]]
+    if accessor["type"] not in types:
+        raise ValueError(f"accessor {number} is of type {accessor['type']!r}, expected {' or '.join(types)}")
     if "sparse" in accessor:
-        raise KeyError("sparse accessors are not read here")
-    view = tree["bufferViews"][accessor["bufferView"]]
+        raise ValueError("sparse accessors are not read here")
+    view, size = _item(tree["bufferViews"], accessor["bufferView"]), kind.itemsize * _WIDTHS[accessor["type"]]
     start = view.get("byteOffset", 0) + accessor.get("byteOffset", 0)
-    stride = view.get("byteStride", kind.itemsize * width)
-    if count and start + stride * (count - 1) + kind.itemsize * width > len(binary):
-        raise _Short(f"accessor {number} needs {start + stride * count} bytes, found {len(binary)}")
-    return np.ndarray((count, width), kind, binary, start, (stride, kind.itemsize)).copy()
+    stride = view.get("byteStride", size)
+    if start < 0 or count < 0 or stride < size:
+        raise ValueError(f"accessor {number}: {count} elements of {size} bytes from byte {start}, one every {stride}")
+    if count and start + stride * (count - 1) + size > len(binary):
+        raise ValueError(f"truncated: accessor {number} needs {start + stride * count} bytes, found {len(binary)}")
+    return np.ndarray((count, _WIDTHS[accessor["type"]]), kind, binary, start, (stride, kind.itemsize)).copy()
 
 
 def _triangles(tree: dict[str, Any], binary: bytes, primitive: dict[str, Any], count: int) -> np.ndarray:
-    line = (_accessor(tree, binary, primitive["indices"])[:, 0].astype(np.int64) if "indices" in primitive
+    line = (_accessor(tree, binary, primitive["indices"], "SCALAR")[:, 0].astype(np.int64) if "indices" in primitive
             else np.arange(count))
     mode = primitive.get("mode", _TRIANGLES)
     if mode == _TRIANGLES:
@@ -145,18 +159,20 @@ def _triangles(tree: dict[str, Any], binary: bytes, primitive: dict[str, Any], c
 
 
 def _in_range(path: Path, corners: np.ndarray, count: int) -> np.ndarray:
-    outside = np.flatnonzero((corners >= count).any(axis=1))
+    outside = np.flatnonzero(((corners < 0) | (corners >= count)).any(axis=1))
     if len(outside):
         raise MeshFileError(f"{path}: face {outside[0]} refers to vertex {corners[outside[0]].max()}, "
                             f"expected 0..{count - 1}")
     return corners
 
 
-def _colors(tree: dict[str, Any], binary: bytes, primitive: dict[str, Any]) -> np.ndarray | None:
+def _colors(tree: dict[str, Any], binary: bytes, primitive: dict[str, Any], count: int) -> np.ndarray | None:
     """The vertex colours as they are seen on a screen: glTF stores them linear in light."""
     if "COLOR_0" not in primitive["attributes"]:
         return None
-    values = _accessor(tree, binary, primitive["attributes"]["COLOR_0"])
+    values = _accessor(tree, binary, primitive["attributes"]["COLOR_0"], "VEC3", "VEC4")
+    if len(values) != count:
+        raise ValueError(f"{len(values)} colours of {count} vertices")
     linear = as_colors(values[:, :3], values.dtype)
     return np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * np.maximum(linear, 1e-9) ** (1 / 2.4) - 0.055)
 

@@ -32,7 +32,10 @@ def _vertices(lines: Lines, rows: list[int]) -> np.ndarray:
     """(N, 3) coordinates, or (N, 6) and more where every line has a colour as well."""
     text = _after(lines, rows)
     try:
-        return np.loadtxt(text, ndmin=2, comments=None)[:, :6 if len(text[0].split()) >= 6 else 3]
+        table = np.loadtxt(text, ndmin=2, comments=None) if any(map(bytes.strip, text)) else np.zeros((0, 3))
+        if len(table) != len(rows) or table.shape[1] < 3:
+            raise ValueError
+        return table[:, :6 if table.shape[1] >= 6 else 3]
     except ValueError:               # lines of unequal length, or one that is wrong
         out = []
         for row, line in zip(rows, text, strict=True):
@@ -50,13 +53,15 @@ def _corners(lines: Lines, v_rows: list[int], f_rows: list[int]) -> tuple[np.nda
     if any(b"/" in line for line in text):           # v/vt/vn: the first number is the vertex
         text = re.sub(rb"/\S*", b"", b"\n".join(text)).split(b"\n")
     try:
-        table: np.ndarray = np.loadtxt(text, dtype=np.int64, ndmin=2, comments=None) if text else np.zeros((0, 3))
+        table: np.ndarray = np.zeros((0, 3))
+        if any(map(bytes.strip, text)):
+            table = np.loadtxt(text, dtype=np.int64, ndmin=2, comments=None)
         if len(table) != len(text):
             raise ValueError
         corners, sizes = table.astype(np.int64).ravel(), np.full(len(text), table.shape[1])
-    except ValueError:               # polygons of several sizes, or one that is wrong
+    except (ValueError, OverflowError):      # polygons of several sizes, or one that is wrong
         words = [line.split() for line in text]
-        bad = next((i for i, w in enumerate(words) if not all(x.lstrip(b"+-").isdigit() for x in w)), None)
+        bad = next((i for i, w in enumerate(words) if not all(re.fullmatch(rb"[+-]?\d{1,18}", x) for x in w)), None)
         if bad is not None:
             raise lines.fail(f_rows[bad], "a face 'f v v v' of vertex numbers") from None
         corners = np.array([x for w in words for x in w], dtype=np.int64)

@@ -19,7 +19,7 @@ def read(path: Path, data: bytes) -> Contents:
     if head[1:2] == [b"BINARY"]:
         raise MeshFileError(f"{path}: expected an ascii OFF file, found a binary one")
     counts, place = (head[1:], 1) if len(head) > 1 else (lines.text[1].split() if len(lines) > 1 else [], 2)
-    if len(counts) < 2 or not all(word.isdigit() for word in counts[:2]):
+    if len(counts) < 2 or not all(word.isdigit() and len(word) < 10 for word in counts[:2]):
         raise lines.fail(place - 1, "the numbers of vertices, faces and edges")
     n, f = int(counts[0]), int(counts[1])
     normals_at = 3 if kind[3] else None
@@ -46,7 +46,7 @@ def _faces(lines: Lines, start: int, count: int) -> tuple[np.ndarray, np.ndarray
         table: np.ndarray = np.loadtxt(text, dtype=np.int64, ndmin=2, comments=None) if text else np.zeros((0, 4))
         if (table[:, 0] == table.shape[1] - 1).all() and len(table) == count:
             return table[:, 0], table[:, 1:].ravel()
-    except ValueError:
+    except (ValueError, OverflowError):
         pass
     rows = [line.split() for line in text]
     try:
@@ -55,10 +55,10 @@ def _faces(lines: Lines, start: int, count: int) -> tuple[np.ndarray, np.ndarray
         if any(len(c) != size for c, size in zip(corners, sizes.tolist(), strict=True)):
             raise ValueError
         return sizes, np.array([word for c in corners for word in c], dtype=np.int64)
-    except ValueError:
+    except (ValueError, OverflowError):
         for i, row in enumerate(rows):
-            size = int(row[0]) if row[0].isdigit() else -1
-            if size < 0 or len(row) <= size or not all(w.lstrip(b"-").isdigit() for w in row[1:size + 1]):
+            size = int(row[0]) if row[0].isdigit() and len(row[0]) < 10 else -1
+            if size < 0 or len(row) <= size or not all(re.fullmatch(rb"-?\d{1,18}", w) for w in row[1:size + 1]):
                 raise lines.fail(start + i, "a face 'n v1 ... vn'") from None
         raise
 

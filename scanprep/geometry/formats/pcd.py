@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
+from .. import storage
 from .common import Contents, Lines, MeshFileError, as_bytes, quote
 
 _KEYS = (b"VERSION", b"FIELDS", b"SIZE", b"TYPE", b"COUNT", b"WIDTH", b"HEIGHT", b"VIEWPOINT", b"POINTS", b"DATA")
@@ -17,7 +18,9 @@ def read(path: Path, data: bytes) -> Contents:
     try:
         row = _row(header)
         count = int(header[b"POINTS"][0])
-    except (KeyError, IndexError, ValueError, TypeError) as error:
+        if count < 0 or any(row[name].shape for name in ("x", "y", "z") if name in (row.names or ())):
+            raise ValueError("one x, y, z for each of POINTS")
+    except (KeyError, IndexError, ValueError, TypeError, OverflowError, MemoryError) as error:
         raise MeshFileError(f"{path}: expected FIELDS, SIZE, TYPE, COUNT and POINTS that agree in the PCD header "
                             f"({error})") from None
     if not {b"x", b"y", b"z"} <= set(names):
@@ -34,7 +37,8 @@ def read(path: Path, data: bytes) -> Contents:
     else:
         raise MeshFileError(f"{path}: expected DATA ascii or binary in the PCD header, found {quote(how)}; "
                             f"save the file as binary")
-    return _contents(columns)
+    with storage.taking_apart(path, "three normals and one colour of each point", MeshFileError):
+        return _contents(columns)
 
 
 def _header(path: Path, data: bytes) -> tuple[dict[bytes, list[bytes]], int, int]:
@@ -84,10 +88,10 @@ def _contents(columns: dict[str, np.ndarray]) -> Contents:
     points = np.stack([columns[name] for name in "xyz"], axis=1).astype(np.float64)
     kept = np.isfinite(points).all(axis=1)
     normals = colors = None
-    if "normal_x" in columns:
+    if {"normal_x", "normal_y", "normal_z"} <= set(columns):
         normals = np.stack([columns[f"normal_{a}"] for a in "xyz"], axis=1).astype(np.float64)[kept]
     packed = next((columns[name] for name in ("rgb", "rgba") if name in columns), None)
-    if packed is not None and packed.dtype.itemsize == 4:       # 0xrrggbb, often in the bits of a float
+    if packed is not None and packed.dtype.itemsize == 4 and packed.ndim == 1:       # 0xrrggbb, maybe in a float
         bits = np.ascontiguousarray(packed).view(np.uint32)[kept]
         colors = np.stack([(bits >> shift) & 255 for shift in (16, 8, 0)], axis=1) / 255
     return Contents(points[kept], None, normals, colors)

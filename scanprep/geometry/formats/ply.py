@@ -1,16 +1,20 @@
 """PLY: ascii and binary of either byte order, with colours and normals; everything else is skipped."""
 from __future__ import annotations
 
+from array import array
 from dataclasses import dataclass
 from pathlib import Path
+from struct import Struct
 
 import numpy as np
 
+from .. import storage
 from .common import Contents, Lines, MeshFileError, as_bytes, as_colors, polygons, quote
 
 _TYPES = {"char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4", "float": "f4",
           "double": "f8", "int8": "i1", "uint8": "u1", "int16": "i2", "uint16": "u2", "int32": "i4",
           "uint32": "u4", "int64": "i8", "uint64": "u8", "float32": "f4", "float64": "f8"}
+_LETTERS = {"i1": "b", "u1": "B", "i2": "h", "u2": "H", "i4": "i", "u4": "I", "i8": "q", "u8": "Q"}
 _ORDERS = {b"ascii": "=", b"binary_little_endian": "<", b"binary_big_endian": ">"}
 _CORNERS = ("vertex_indices", "vertex_index")
 _COLORS = (("red", "green", "blue"), ("r", "g", "b"), ("diffuse_red", "diffuse_green", "diffuse_blue"))
@@ -37,6 +41,8 @@ def read(path: Path, data: bytes) -> Contents:
     """The vertices, triangles, normals and colours of a PLY file."""
     order, elements, start, first_line = _header(path, data)
     names = [e.name for e in elements]
+    if len(set(names)) < len(names):
+        raise MeshFileError(f"{path}: expected each element once in the PLY header, found {', '.join(names)}")
     if "vertex" not in names:
         raise MeshFileError(f"{path}: expected an element vertex, the header has {names}")
     lines = Lines(path, data[start:], first_line) if order == "=" else None
@@ -98,6 +104,8 @@ def _count(word: bytes) -> int:
 def _property(words: list[bytes]) -> _Property:
     text = [w.decode() for w in words]
     if text[1] == "list":
+        if _TYPES[text[2]][0] == "f":
+            raise ValueError
         return _Property(text[4], _TYPES[text[3]], _TYPES[text[2]])
     return _Property(text[2], _TYPES[text[1]])
 
@@ -149,27 +157,30 @@ def _first_lengths(data: bytes, element: _Element, start: int, order: str) -> di
 
 def _binary_rows(path: Path, data: bytes, element: _Element, start: int, order: str
                  ) -> tuple[dict[str, _Column], int]:
-    kinds = [(np.dtype(order + p.kind), np.dtype(order + p.length_kind) if p.length_kind else None)
-             for p in element.properties]
-    sizes: list[list[int]] = [[] for _ in kinds]
-    items: list[list[np.ndarray]] = [[] for _ in kinds]
+    ways = [(np.dtype(order + p.kind).itemsize, Struct(order + _LETTERS[p.length_kind]) if p.length_kind else None)
+            for p in element.properties]
+    sizes, places = [array("q") for _ in ways], [array("q") for _ in ways]
     for row in range(element.count):
-        for i, (kind, length_kind) in enumerate(kinds):
+        for (width, length), size, place in zip(ways, sizes, places, strict=True):
             n = 1
-            if length_kind is not None:
-                if start + length_kind.itemsize > len(data):
+            if length is not None:
+                if start + length.size > len(data):
                     raise _truncated(path, element, row)
-                n = int(np.frombuffer(data, length_kind, 1, start)[0])
-                start += length_kind.itemsize
-            if n < 0 or start + n * kind.itemsize > len(data):
+                n = length.unpack_from(data, start)[0]
+                start += length.size
+            if n < 0 or start + n * width > len(data):
                 raise _truncated(path, element, row)
-            sizes[i].append(n)
-            items[i].append(np.frombuffer(data, kind, n, start))
-            start += n * kind.itemsize
+            size.append(n)
+            place.append(start)
+            start += n * width
     columns: dict[str, _Column] = {}
-    for i, p in enumerate(element.properties):
-        flat = np.concatenate(items[i]) if items[i] else np.zeros(0, p.kind)
-        columns[p.name] = (np.array(sizes[i], dtype=np.int64), flat) if p.length_kind else flat
+    whole = np.frombuffer(data, np.uint8)
+    for p, (width, _), size, place in zip(element.properties, ways, sizes, places, strict=True):
+        counts, first = np.array(size, dtype=np.int64), np.array(place, dtype=np.int64)
+        before = np.cumsum(counts) - counts
+        each = np.repeat(first - width * before, counts) + width * np.arange(counts.sum())   # where every item begins
+        flat = whole[each[:, None] + np.arange(width)].view(order + p.kind)[:, 0]
+        columns[p.name] = (counts, flat) if p.length_kind else flat
     return columns, start
 
 
@@ -220,8 +231,11 @@ def _ascii_rows(lines: Lines, element: _Element, start: int) -> dict[str, _Colum
                 place += n
         except (ValueError, IndexError):
             raise lines.fail(row, f"a row of element {element.name} as its header says") from None
-    return {p.name: (np.array(sizes[i], dtype=np.int64), np.array(items[i])) if p.length_kind
-            else np.array(items[i]) for i, p in enumerate(element.properties)}
+    with storage.taking_apart(lines.path, f"numbers of element {element.name} as its header says", MeshFileError):
+        found = [np.array(each, dtype=np.int64 if p.kind[0] in "iu" else np.float64)
+                  for p, each in zip(element.properties, items, strict=True)]
+    return {p.name: (np.array(sizes[i], dtype=np.int64), found[i]) if p.length_kind else found[i]
+            for i, p in enumerate(element.properties)}
 
 
 def _contents(path: Path, vertex: _Element, found: dict[str, dict[str, _Column]]) -> Contents:
