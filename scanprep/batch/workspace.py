@@ -115,6 +115,7 @@ class Workspace:
                 if isinstance(outcome, Failure):
                     where = str(self.folder / by_name[job.name].place)
                     failures[job.name] = outcome.reason.replace(str(job.folder / job.place), where)
+                    self.drop(job.name)             # what was made of other inputs than there are now
                 else:
                     try:
                         self._publish(job.name, job.folder, keys[job.name], outcome, common)
@@ -278,6 +279,8 @@ class Workspace:
             else:                                       # its record, the last to go, had come to its place
                 shutil.rmtree(ready)
         shutil.rmtree(self.home / "making", ignore_errors=True)
+        for half in (self.home / "steps").glob("*/.*"):
+            half.unlink()
 
 
 class Staged:
