@@ -20,7 +20,7 @@ from model.learning.sex_plane import SexPlane
 
 FRAMES = 40
 BETAS = {"ann": np.array([0.9, -0.6, 0.4]), "bob": np.array([-0.8, 0.5, -0.3])}
-PERSON = {"subject.json", "layout.json", "report.html", "report.json", "done.json", "picture.png"}
+PERSON = {"subject.json", "layout.json", "report.html", "report.json", "picture.png"}
 TAKE = {"motion.npz", "soft_tissue.npz", "animation.glb", "motion.bvh", "joint_angles.csv", "joint_centres.csv",
         "residuals.csv", "residuals_soft.csv", "virtual.c3d", "faults.json", "faults.csv", "report.html", "report.json",
         "picture.png"}
