@@ -161,8 +161,7 @@ class Workspace:
     def drop(self, name: str) -> None:
         """Remove a result and its files, as far as they are as scapekit wrote them."""
         for file, digest in (load_header(self._record(name)) or {"files": {}})["files"].items():
-            if self.digests.of_file(self.folder / file) == digest:
-                (self.folder / file).unlink()
+            self._remove(file, digest)
         self.drop_record(name)
 
     def drop_record(self, name: str) -> None:
@@ -237,12 +236,23 @@ class Workspace:
                 (self.folder / file).parent.mkdir(parents=True, exist_ok=True)
                 os.replace(ready / file, self.folder / file)
         for file, digest in before.items():
-            if file not in header["files"] and self.digests.of_file(self.folder / file) == digest:
-                (self.folder / file).unlink()
+            if file not in header["files"]:
+                self._remove(file, digest)
         self._know(Path(), header["files"])
         record.parent.mkdir(exist_ok=True)
         os.replace(ready / RECORD, record)
         shutil.rmtree(ready)
+
+    def _remove(self, file: str, digest: str) -> None:
+        """Take away a file that is as it was written, and the folders that are empty then."""
+        path = self.folder / file
+        if self.digests.of_file(path) != digest:
+            return
+        path.unlink()
+        for place in path.parents:
+            if place == self.folder or any(place.iterdir()):
+                break
+            place.rmdir()
 
     def _check_free(self, files: Mapping[str, str]) -> None:
         taken = []
