@@ -198,7 +198,7 @@ def _write(work: Work, found: _Found, take: Take, room: Room, settings: Mapping[
     room.files(f"{take.name} files", (solved, take.path, take.who, take.unit, work.keys, work.factor), files)
     shown = None if work.character is None else room.files(
         f"{take.name} character", (solved, work.character, work.keys, work.factor), character)
-    room.files(f"{take.name} page", (solved, metrics, settings, shown, work.factor), page)
+    room.files(f"{take.name} page", (solved, metrics, settings, shown and (shown, work.factor)), page)
     return metrics
 
 
