@@ -58,8 +58,8 @@ def write_people(place):
 
 
 def run(place, *words, quick=QUICK):
-    return main(["mosh", *map(str, words), "-m", str(place / "model.npz"), "--layout", str(place / "layout.json"),
-                 *(() if "--workers" in words else ("--workers", "1")), *quick])
+    return main(["mosh", *quick, "-m", str(place / "model.npz"), "--layout", str(place / "layout.json"),
+                 "--workers", "1", *map(str, words)])
 
 
 @contextmanager

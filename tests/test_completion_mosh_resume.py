@@ -112,10 +112,10 @@ def test_two_workers_write_what_one_does(place, tmp_path):
 def test_a_recording_less_takes_its_folder_away(place, tmp_path):
     people, out = tmp_path / "people", tmp_path / "out"
     shutil.copytree(place / "people", people)
-    assert run(place, people / "ann", "--name", "ann", "-o", out, "--no-soft-tissue") == 0
+    assert run(place, people / "ann", "--by", "all", "--name", "ann", "-o", out, "--no-soft-tissue") == 0
     (out / "ann" / "walk" / "notes.txt").write_text("mine")
     (people / "ann" / "run.csv").unlink()
-    assert run(place, people / "ann", "--name", "ann", "-o", out, "--no-soft-tissue") == 0
+    assert run(place, people / "ann", "--by", "all", "--name", "ann", "-o", out, "--no-soft-tissue") == 0
     assert not (out / "ann" / "run").exists() and (out / "ann" / "walk" / "notes.txt").read_text() == "mine"
 
 
