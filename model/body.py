@@ -175,7 +175,14 @@ class BodyModel(ABC):
             None is the template's own body.
         dtype
             float64, or float32 for speed.
+
+        Raises
+        ------
+        ValueError
+            Another type: metres would be cut.
         """
+        if np.dtype(dtype) not in (np.float32, np.float64):
+            raise ValueError(f"dtype: expected float32 or float64, got {np.dtype(dtype)}")
         kept = None if betas is None else np.array(betas, dtype=np.float64)
         return Subject(self.template, self.skeleton, kept, self.terms, self.basis(betas).astype(dtype, copy=False),
                        self.skeleton.joints[0], self.pose_mean, self.pose_covariance, self.pose_examples)

@@ -8,6 +8,8 @@ from functools import cached_property
 import numpy as np
 from scipy.spatial import cKDTree
 
+from scanprep.threads import one_thread
+
 from .bilinear import ShapedPoints
 from .body import BodyModel
 from .features import twists
@@ -72,6 +74,7 @@ class ShapeFit(PoseFit):
     betas: np.ndarray
 
 
+@one_thread()
 def fit_pose(subject: Subject, vertices: np.ndarray, config: FitConfig | None = None) -> PoseFit:
     """Pose and place of a known body from all its vertices.
 
@@ -130,6 +133,7 @@ class PoseFitter:
         return PoseFit(pose, trans, fitted, *_distances(fitted, vertices), best.converged, steps)
 
 
+@one_thread()
 def fit_shape(model: BodyModel, vertices: np.ndarray, config: FitConfig | None = None) -> ShapeFit:
     """Shape, pose and place of an unknown body from all its vertices.
 

@@ -25,7 +25,8 @@ WorkersArg = Annotated[Workers, tyro.conf.arg(name="")]
 MM = 1000.0
 
 COMMANDS = {
-    "run": ("Scans -> registered set with a skeleton; goes on where it was interrupted.", "scanprep.pipeline.cli:run_all"),
+    "run": ("Scans -> registered set with a skeleton; goes on where it was interrupted.",
+            "scanprep.pipeline.cli:run_all"),
     "page": ("The page of a registered set: every scan with pictures and figures, worst first.",
              "scanprep.pipeline.cli:page"),
     "clean": ("Floor, furniture and specks off a raw scan.", "scanprep.cleaning.cli:clean"),

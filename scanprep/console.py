@@ -17,11 +17,16 @@ import sys
 import time
 import typing
 import warnings
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterable, Iterator, Mapping
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
+
+from .threads import one_thread
+
+if TYPE_CHECKING:               # imported where it is used: help answers at once
+    from .batch.workspace import Results
 
 Progress = Callable[[int, int], None]
 
@@ -58,6 +63,20 @@ class Outcome:
     settings: Mapping[str, Any] = dataclasses.field(default_factory=dict)
     failures: list[str] = dataclasses.field(default_factory=list)
     problem: str | None = None
+
+
+PROBLEM = "problem"                  # name of the row of figures that says why they mean nothing
+
+
+def problem_of(metrics: Iterable[Metric]) -> str | None:
+    """Why a result means nothing, where its figures say so."""
+    return next((str(m.value) for m in metrics if m.name == PROBLEM), None)
+
+
+def failures_of(results: Results) -> list[str]:
+    """One line a task that failed, or of which the result means nothing."""
+    told = {name: f"{name}: {problem}" for name, rows in results.values.items() if (problem := problem_of(rows))}
+    return [*results.failures.values(), *told.values()]
 
 
 @contextlib.contextmanager
@@ -139,7 +158,8 @@ def plain(value: Any) -> Any:
     return str(value) if isinstance(value, Path) else value
 
 
-def write_report(outcome: Outcome, command: str, seconds: float, written: Mapping[str, str] | None = None) -> Path | None:
+def write_report(outcome: Outcome, command: str, seconds: float, written: Mapping[str, str] | None = None
+                 ) -> Path | None:
     """Write `report.json` beside the output: command, settings, versions and the numbers of the closing table.
 
     Parameters
@@ -147,7 +167,7 @@ def write_report(outcome: Outcome, command: str, seconds: float, written: Mappin
     written : file -> digest, optional
         All that the command wrote, from the report's folder on.
     """
-    from .batch.workspace import report_path
+    from .batch.ownership import report_path
     from .geometry import storage
 
     if outcome.output is None:
@@ -172,7 +192,7 @@ def run(function: Callable[..., Outcome], prog: str, argv: list[str]) -> int:
     """
     start = time.perf_counter()
     call = _Call(function, prog, argv)
-    with _notes(prog):
+    with _notes(prog), one_thread():
         try:
             outcome, report = call.carried_out(start)
         except KeyboardInterrupt:

@@ -78,7 +78,7 @@ def test_two_coloured_views_make_one_body_and_a_page(place, tmp_path, capsys):
     page = (out / "report.html").read_text()
     for wanted in ("From all sides", "Colours", "Distance of the scan", "clothing or hair", "scan points explained"):
         assert wanted in page
-    assert len(re.findall("<img", page)) >= 5 and not list(out.glob(".*"))
+    assert len(re.findall("<img", page)) >= 5 and [p.name for p in out.glob(".*")] == [".scapekit"]
     assert "distance of the scan" in capsys.readouterr().out
 
 
@@ -156,12 +156,12 @@ def test_a_folder_is_completed_scan_by_scan(folder):
         assert load_completion(out / name).seen.any() and (out / name / "report.html").is_file()
     page = (out / "report.html").read_text()
     assert 'href="a/report.html"' in page and 'src="b/picture.png"' in page and "c.ply" in page
-    assert sorted(p.name for p in out.iterdir()) == ["a", "b", "report.html", "report.json"]
+    assert sorted(p.name for p in out.iterdir() if p.name != ".scapekit") == ["a", "b", "report.html", "report.json"]
 
 
 def test_what_is_finished_is_skipped_and_what_changed_is_done_anew(place, folder, capsys):
     scans, out, _ = folder
-    (out / ".a.77.part").mkdir()                                     # left by a run that was killed
+    (out / ".scapekit" / "making" / "left").mkdir(parents=True)     # by a run that was killed
     before = {name: (out / name / "completed.ply").stat().st_mtime_ns for name in ("a", "b")}
 
     def fresh(*more):
@@ -170,7 +170,7 @@ def test_what_is_finished_is_skipped_and_what_changed_is_done_anew(place, folder
 
     assert fresh() == 0
     assert before == {name: (out / name / "completed.ply").stat().st_mtime_ns for name in ("a", "b")}
-    assert not list(out.glob(".*"))
+    assert not (out / ".scapekit" / "making").exists() and [p.name for p in out.glob(".*")] == [".scapekit"]
     marks = json.loads((scans / "b.landmarks.json").read_text())
     write_landmarks(scans / "b.landmarks.json", {n: np.array(p) + 0.001 for n, p in marks.items()})
     assert fresh() == 1 and fresh() == 0                             # a changed input

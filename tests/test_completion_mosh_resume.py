@@ -10,6 +10,8 @@ from mosh_folders import QuietWork, contents, counted, run, write_people
 from completion import MarkerLayout, MarkerSequence, read_markers, write_markers
 from completion.moshing.command import cli
 from model import load_model
+from scanprep.batch import pool
+from scanprep.batch.pool import Room
 from scanprep.batch.workspace import HOME
 
 HERE = Path()
@@ -107,6 +109,13 @@ def test_two_workers_write_what_one_does(place, tmp_path):
         assert run(place, place / "people", "-o", tmp_path / count, "--workers", count, "--no-soft-tissue") == 0
     one = contents(tmp_path / "1")
     assert {"ann/walk/motion.npz", "bob/jump/report.html"} <= set(one) and contents(tmp_path / "2") == one
+
+
+def test_workers_of_a_cluster_keep_no_steps_and_write_the_same(copied, monkeypatch):
+    monkeypatch.setattr(pool, "Room", lambda folder, steps, tell, force: Room(folder, None, tell, force))
+    assert run(HERE, *BOB, "-o", "cluster") == 0
+    assert contents(copied / "cluster") == contents(copied / "whole")
+    assert not (copied / "cluster" / HOME / "steps").exists()
 
 
 def test_a_recording_less_takes_its_folder_away(place, tmp_path):

@@ -317,3 +317,59 @@ def test_a_motion_keeps_which_markers_were_trusted(tmp_path):
     np.testing.assert_array_equal(Motion.load(tmp_path / "m.npz").trusted, doubted.trusted)
     with pytest.raises(ValueError, match="trusted: expected shape"):
         replace(motion, trusted=np.ones((2, 3), dtype=bool))
+
+
+@pytest.fixture(scope="module")
+def passing(walker):
+    """A person who walks through 60 markers, 60 frames a second."""
+    subject, layout, motions = walker
+    truth = subject.vertices(*motions["walk"])
+    return subject, layout, truth, truth[:, layout.vertices] + np.random.default_rng(1).normal(0, 0.003, (60, 90, 3))
+
+
+WRONG = {"times 1000": lambda p: 1000 * p, "half of it": lambda p: p * np.where(np.arange(90) % 2, 1000, 1)[:, None],
+         "all in one place": lambda p: 0 * p, "5 m away": lambda p: p + 5, "infinite": lambda p: p * np.inf,
+         "1e300": lambda p: 1e300 * p, "turned round": lambda p: p * [-1, -1, 1],
+         "mixed up": lambda p: p[np.random.default_rng(0).permutation(90)]}
+
+
+@pytest.mark.parametrize("kind", ["velocity", "kalman"])
+@pytest.mark.parametrize("wrong", WRONG.values(), ids=WRONG)
+def test_one_frame_that_no_body_makes_is_passed_over(passing, wrong, kind):
+    subject, layout, truth, positions = passing
+    broken, config = positions.copy(), replace(CONFIG, prediction=kind)
+    broken[30] = wrong(positions[30])
+    frames = pushed(MarkerStream(subject, layout, layout.labels, 60.0, config), broken)
+    clean = pushed(MarkerStream(subject, layout, layout.labels, 60.0, config), positions)
+    assert not frames[30].trusted.any() and not frames[30].converged
+    assert errors(subject, frames, truth)[30:].max() < errors(subject, clean, truth).max() + 0.015
+    for there, other in zip(frames[31:], clean[31:], strict=True):
+        assert other.converged and there.converged
+        np.testing.assert_array_equal(there.trusted, other.trusted)
+
+
+def test_a_stream_does_not_begin_with_a_frame_that_no_body_makes(passing):
+    subject, layout, truth, positions = passing
+    broken = positions[:20].copy()
+    broken[:3] *= 1000
+    frames = pushed(MarkerStream(subject, layout, layout.labels, 60.0, CONFIG), broken)
+    assert all(np.isnan(f.pose).all() and not f.trusted.any() and not f.converged for f in frames[:3])
+    assert errors(subject, frames[3:], truth[3:20]).max() < 0.01
+
+
+def test_a_body_far_from_every_frame_is_followed_in_the_end_and_trusts_none(passing):
+    subject, layout, _, positions = passing
+    frames = pushed(MarkerStream(subject, layout, layout.labels, 60.0, CONFIG), 1.5 * positions[:30])
+    assert not any(f.trusted.any() for f in frames)
+    assert np.isfinite([f.pose for f in frames[-5:]]).all()
+
+
+@pytest.mark.parametrize("wrong", ["times 1000", "half of it"])
+def test_one_frame_that_no_body_makes_leaves_the_others_of_a_sequence(passing, wrong):
+    subject, layout, truth, positions = passing
+    broken = positions.copy()
+    broken[33] = WRONG[wrong](positions[33])
+    motion = animate(subject, MarkerSequence(broken, layout.labels, 60.0), layout, CONFIG)
+    apart = np.linalg.norm(motion.vertices(subject) - truth, axis=2).mean(axis=1)
+    assert apart.max() < 0.015
+    assert motion.trusted[33].sum() < 30 and motion.trusted[np.arange(60) != 33].all()

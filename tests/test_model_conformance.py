@@ -68,6 +68,13 @@ def test_fast_path_is_the_exact_one(model, rng, betas, size):
     np.testing.assert_allclose(single, exact, rtol=0, atol=2e-6)
 
 
+@BODIES
+@pytest.mark.parametrize("dtype", [np.int32, np.float16, bool, complex, str])
+def test_a_subject_of_whole_metres_is_refused(model, betas, dtype):
+    with pytest.raises(ValueError, match="dtype: expected float32 or float64, got "):
+        model.subject(betas, dtype=dtype)
+
+
 def test_batch_is_the_loop(model, rng):
     poses, trans = at_random(model, rng, 3)
     betas = rng.normal(size=(3, 3))

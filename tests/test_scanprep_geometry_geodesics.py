@@ -146,3 +146,29 @@ def test_what_is_refused():
         graph.distances(9)
     with pytest.raises(ValueError, match=r"count: expected 1\.\.5, got 6"):
         graph.farthest_points(6)
+
+
+def test_a_mesh_without_edges_has_paths_of_no_length():
+    for count in (0, 1, 3):
+        bare = Mesh(np.zeros((count, 3)), np.zeros((0, 3), dtype=int))
+        graph = SurfaceGraph(bare)
+        with pytest.raises(ValueError, match="mesh: expected "):
+            HeatGeodesics(bare)
+        if count:
+            assert graph.distances(0).tolist() == [0.0] + [np.inf] * (count - 1)
+            assert sorted(graph.farthest_points(count)) == list(range(count))
+
+
+@pytest.mark.parametrize("vertices", [np.eye(3), np.zeros((3, 3)), np.outer([0, 1, 2], [1, 0, 0])],
+                         ids=["one triangle", "a point", "a line"])
+def test_where_no_heat_spreads_no_distance_is_given(vertices):
+    mesh = Mesh(vertices, [[0, 1, 2]])
+    with pytest.raises(ValueError, match=r"no heat can spread over Mesh.*SurfaceGraph takes any"):
+        HeatGeodesics(mesh).distances(0)
+    assert np.isfinite(SurfaceGraph(mesh).distances(0)).all()
+
+
+@pytest.mark.parametrize("source", [np.nan, 0.7, -1, 642, []])
+def test_a_source_is_a_vertex(source):
+    with pytest.raises(ValueError, match=r"sources: expected vertices of 0\.\.641"):
+        SurfaceGraph(ball()).distances(source)

@@ -34,9 +34,18 @@ def test_right_hand_sides_may_lie_in_memory_in_any_way(layout):
     np.testing.assert_allclose(factor(A)(np.ascontiguousarray(b)), solved, atol=1e-9)
 
 
-def test_a_singular_matrix_is_refused():
-    with pytest.raises(ValueError, match="no unique solution"):
-        factor(csc_array(np.diag([1.0, 0.0, 1.0])))
+@pytest.mark.parametrize("solver", [factor, Factored])
+@pytest.mark.parametrize("matrix", [np.diag([1.0, 0.0, 1.0]), np.diag([1.0, np.nan, 1.0]), np.full((3, 3), np.inf)],
+                         ids=["singular", "NaN", "infinite"])
+def test_what_has_no_one_solution_is_refused(solver, matrix):
+    with pytest.raises(ValueError, match="matrix: "):
+        solver(csc_array(matrix))
+
+
+def test_an_empty_system_is_refused_or_solved():
+    with pytest.raises(ValueError, match="matrix: expected finite entries, got a 0 x 0"):
+        Factored(csc_array((0, 0)))
+    assert factor(csc_array((0, 0)))(np.zeros(0)).shape == (0,)
 
 
 def test_a_factored_system_can_be_sent_to_another_process():

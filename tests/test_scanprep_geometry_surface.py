@@ -1,8 +1,12 @@
 """Closest points, compatible matches and rays against brute force."""
+import warnings
+
 import numpy as np
 import pytest
 import trimesh
 
+from completion.moshing.attachment import signed_distance
+from model.posing.character_mesh import inside
 from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.surface import OrientedPoints, Rays, Surface, barycentric
 
@@ -116,3 +120,45 @@ def test_a_ray_reaches_only_so_far():
     assert rays.occluded(origin, down, reach=1.6).all() and not rays.occluded(origin, down, reach=1.4).any()
     assert rays.cast(origin, down)[1][0] == pytest.approx(1.5, abs=1e-5)
     assert not rays.occluded(origin, -down).any()
+
+
+QUERIES = {
+    "closest": lambda bad: Surface(ball()).closest(bad),
+    "match": lambda bad: OrientedPoints(ball().vertices, ball().vertex_normals).match(bad, np.zeros((3, 3))),
+    "match, normals": lambda bad: OrientedPoints(ball().vertices, ball().vertex_normals).match(np.zeros((3, 3)), bad),
+    "match, among": lambda bad: OrientedPoints(bad, np.zeros((3, 3))),
+    "cast": lambda bad: Rays(ball()).cast(bad, np.array([0, 0, 1.0])),
+    "cast, directions": lambda bad: Rays(ball()).cast(np.zeros((3, 3)), bad),
+    "occluded": lambda bad: Rays(ball()).occluded(bad, np.array([0, 0, 1.0])),
+    "signed distance": lambda bad: signed_distance(bad, ball()),
+    "inside": lambda bad: inside(ball(), bad)}
+
+
+@pytest.mark.parametrize("query", QUERIES.values(), ids=QUERIES)
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf, 1e200])
+def test_no_query_answers_for_a_point_that_is_nowhere(query, value):
+    query(np.zeros((3, 3)))
+    with pytest.raises(ValueError, match=r"expected finite coordinates below 1e\+30 m, got 1 of 3 .* number 1: "):
+        query(np.array([[0, 0, 0.1], [0, value, 0], [0.1, 0, 0]]))
+
+
+@pytest.mark.parametrize("vertices", [0, 1])
+def test_without_triangles_nothing_is_nearest_and_nothing_is_hit(vertices):
+    bare = Mesh(np.zeros((vertices, 3)), np.zeros((0, 3), dtype=int))
+    points = np.array([[0, 0, 1.0]])
+    for ask in (lambda: Surface(bare), lambda: signed_distance(points, bare), lambda: inside(bare, points)):
+        with pytest.raises(ValueError, match=rf"mesh: expected at least one triangle, got Mesh\({vertices} vertices"):
+            ask()
+    with pytest.raises(ValueError, match="points: expected at least one to search among, got none"):
+        OrientedPoints(points[:0], points[:0])
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        face, distance = Rays(bare).cast(points, -points)
+    assert face.tolist() == [-1] and np.isnan(distance).all()
+
+
+def test_no_points_have_no_answers_and_one_point_is_no_row_of_points():
+    none = np.zeros((0, 3))
+    assert len(Surface(ball()).closest(none).faces) == len(Rays(ball()).cast(none, none)[0]) == 0
+    with pytest.raises(ValueError, match=r"points: expected shape \(n, 3\), got \(3,\)"):
+        Surface(ball()).closest(np.zeros(3))

@@ -17,13 +17,12 @@ from scipy.spatial.transform import Rotation
 
 from scanprep import Mesh, RegisteredSet, read_mesh, write_mesh
 from scanprep.batch import cluster
+from scanprep.batch.ownership import HOME, ForeignFileError
 from scanprep.batch.pool import Failure, Job, Workers, run_jobs
-from scanprep.batch.workspace import HOME, ForeignFileError
 from scanprep.cleaning.components import CleanScanConfig
 from scanprep.matching.correspondences import Correspondences
 from scanprep.pipeline import scan as scan_module
 from scanprep.pipeline.prepare import RegisterScan, prepare
-from scanprep.pipeline.scan import one_thread
 from scanprep.pipeline.scans import find_scans
 
 
@@ -246,21 +245,6 @@ def test_a_process_that_dies_stops_no_other_job(tmp_path):
     outcomes = {job.given: outcome for job, outcome in run_jobs(Deadly(), jobs, Workers(2))}
     assert outcomes[0] == 0 and outcomes[2] == 2
     assert isinstance(outcomes[1], Failure) and outcomes[1].reason.startswith("body1: the process at work on it died")
-
-
-def test_one_thread_while_anyone_needs_it():
-    from threadpoolctl import threadpool_info, threadpool_limits
-
-    def threads():
-        return {pool["num_threads"] for pool in threadpool_info()}
-
-    with threadpool_limits(2):
-        before = threads()
-        with one_thread():
-            with one_thread():
-                assert threads() == {1}
-            assert threads() == {1}
-        assert threads() == before
 
 
 def test_bad_scans_stop_no_other(scans, template, tmp_path):

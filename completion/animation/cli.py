@@ -1,8 +1,9 @@
 """The command `scape animate`."""
 from __future__ import annotations
 
+from html import escape
 from pathlib import Path
-from typing import Annotated, Any
+from typing import Annotated
 
 import numpy as np
 import tyro
@@ -10,14 +11,16 @@ import tyro
 from model.body import BodyModel
 from model.cli import read_subject
 from model.linear import Subject
-from scanprep.cli import Output, Unit
-from scanprep.console import Metric, Outcome, bar, plain, read_json
-from scanprep.geometry import storage
+from scanprep.batch.pool import Workers
+from scanprep.batch.workspace import Results, Task, Workspace
+from scanprep.cli import Output, Unit, WorkersArg
+from scanprep.console import Metric, Outcome, bar, failures_of, problem_of, read_json
+from scanprep.pictures.page import Page
 
 from ..cli import ModelOrNone, read_model
 from .follow import AnimateConfig
 from .shape import MarkerShapeConfig
-from .work import DONE, ENDINGS, BetasTo, Work, animate_file, settings_key
+from .work import ENDINGS, MEAN_ERROR, BetasTo, Work, layout_or_file
 
 MarkersArg = Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="MARKERS")]
 
@@ -26,7 +29,8 @@ def animate_markers(markers: MarkersArg, output: Output, model: ModelOrNone = No
                     subject: str | None = None, unit: Unit | None = None, who: str | None = None,
                     onto: Path | None = None, betas_to: Path | None = None, keys: int = 120,
                     config: Annotated[AnimateConfig, tyro.conf.arg(name="")] = AnimateConfig(),   # noqa: B008
-                    shape: MarkerShapeConfig = MarkerShapeConfig()) -> Outcome:                   # noqa: B008
+                    shape: MarkerShapeConfig = MarkerShapeConfig(),                               # noqa: B008
+                    workers: WorkersArg = Workers(), *, space: Workspace) -> Outcome:              # noqa: B008
     """The motion of a person from markers, and the person.
 
     A folder is worked through file by file, each into a folder of its name; called again, it goes on where it was,
@@ -55,46 +59,49 @@ def animate_markers(markers: MarkersArg, output: Output, model: ModelOrNone = No
         keys: Largest number of key frames in a GLB.
         config: Settings.
         shape: Settings of the subject from markers.
+        workers: Who works through the files of a folder.
     """
     found = _marker_files(markers)
     loaded, name = read_model(model)
-    work = Work(loaded, name, layout, _subject(loaded, subject, unit),
+    work = Work(loaded, name, None if layout is None else layout_or_file(layout), _subject(loaded, subject, unit),
                 None if onto is None else read_subject(loaded, onto, unit),
                 None if betas_to is None else read_betas_to(betas_to, loaded.n_betas), unit, who, keys, config, shape)
     settings = {"animate": config, "shape": shape, "model": name}
-    with bar("finding the subject") as finding, bar("following the markers") as following:
-        if markers.is_file():
-            return Outcome(output, animate_file(work, markers, output, finding, following), settings)
-    given = {"layout": layout, "subject": subject, "unit": unit, "who": who, "onto": onto, "betas_to": betas_to,
-             "keys": keys, "model": model}
-    return _folder(work, found, output, given, settings)
+    if markers.is_file():
+        with bar("following the markers") as following:
+            done = space.run(work, [Task("motion", markers)], inside=following).only
+        return Outcome(output, done, settings, problem=problem_of(done))
+    with bar("files") as progress:
+        results = space.run(work, [Task(path.stem, path, path.stem) for path in found], workers, progress)
+    with space.staging("page") as staged:
+        _folder_page(results).write(staged.folder / "report.html")
+    return Outcome(output, _summary(results, len(found)), settings, failures_of(results))
 
 
-def _folder(work: Work, found: list[Path], output: Path, given: dict[str, Any], settings: dict[str, Any]) -> Outcome:
-    """Every file into a folder of its name, those that are done with the same settings left alone."""
-    means, failures, before = [], [], 0
-    with bar("files") as files, bar("finding the subject") as finding, bar("following the markers") as following:
-        for i, path in enumerate(found):
-            place, key = output / path.stem, settings_key(work, path, given)
-            done = read_json(place / DONE, "the state of a file") if (place / DONE).exists() else {}
-            if done.get("key") == key:
-                before += 1
-            else:
-                try:
-                    metrics = animate_file(work, path, place, finding, following)
-                except (ValueError, OSError) as error:
-                    failures.append(f"{path.name}: {error}")
-                    continue
-                finally:
-                    files(i + 1, len(found))
-                done = {"key": key, "metrics": [[m.name, plain(m.value), m.unit] for m in metrics]}
-                storage.write_json(place / DONE, done)
-            means.append({name: value for name, value, _ in done["metrics"]}["distance of markers, mean"])
-    rows = [Metric("files", len(found)), Metric("done before", before), Metric("failed", len(failures))]
-    if means:
-        rows += [Metric("distance of markers, mean of the files", float(np.mean(means)), "mm"),
-                 Metric("the same, worst file", float(np.max(means)), "mm")]
-    return Outcome(output, rows, settings, failures)
+def _summary(results: Results, count: int) -> list[Metric]:
+    off = {name: _error(metrics) for name, metrics in results.values.items()}
+    rows = [Metric("files", count), Metric("done before", len(off) - len(results.fresh)),
+            Metric("failed", len(results.failures))]
+    if off:
+        rows += [Metric("distance of markers, mean of the files", float(np.mean(list(off.values()))), "mm"),
+                 Metric(f"the same, worst file ({max(off, key=off.__getitem__)})", max(off.values()), "mm")]
+    return rows
+
+
+def _error(metrics: list[Metric]) -> float:
+    return next(float(m.value) for m in metrics if m.name == MEAN_ERROR)
+
+
+def _folder_page(results: Results) -> Page:
+    """The files, worst first."""
+    page = Page(f"{len(results.values)} marker files followed", "Worst first; each name leads to the page of its file.")
+    if results.failures:
+        page.section("Failed").table([(line,) for line in results.failures.values()])
+    page.section("Distance of the markers to where the body puts them, mean")
+    for name in sorted(results.values, key=lambda name: -_error(results.values[name])):
+        page.markup(f'<p><a href="{escape(name)}/report.html">{escape(name)}</a>: '
+                    f'{_error(results.values[name]):.1f} mm</p>')
+    return page
 
 
 def _marker_files(markers: Path) -> list[Path]:

@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from model.linear import Subject
+from scanprep.threads import one_thread
 
 from ..energy import MovingPoints
 from ..markers.files import MarkerSequence
@@ -31,6 +32,7 @@ KEY_STEPS = 8                        # most steps for a key frame
 STILL = 0.005                        # metres that the last round moves any marker of a frame that has settled
 
 
+@one_thread()
 def animate(subject: Subject, markers: MarkerSequence, layout: MarkerLayout, config: AnimateConfig | None = None,
             progress: Progress | None = None) -> Motion:
     """The motion of a body that carries markers.

@@ -19,6 +19,9 @@ from .trust import LabelWatch, distances_apart, marker_weights, misfit
 ENOUGH = 0.5                         # share of the markers that a search wants
 BELIED = 0.2                         # share of the markers seen that are outliers on a body gone astray
 PATIENCE = 0.25                      # seconds from a search that found nothing to the next; then twice as many
+DOUBT = 0.25                         # seconds for which frames that no body explains are taken for wrong
+FASTEST = 10.0                       # metres per second that the markers of a body together stray from the expected
+FARTHEST = 1e6                       # metres; a coordinate beyond it is no place
 
 
 @dataclass(frozen=True, eq=False)
@@ -33,9 +36,9 @@ class Frame:
     residuals : (L,) float, metres
         Distance of each marker from where the body puts it; NaN where it was not seen or is in no layout.
     trusted : (L,) bool
-        Seen, and believed under its own label.
+        Seen, and believed under its own label; none in a frame that no body explains.
     converged : bool
-        The solution settled.
+        The solution settled. It did not where a frame that no body makes was passed over: the pose is the expected one.
     """
 
     pose: np.ndarray
@@ -87,17 +90,18 @@ class MarkerStream:
         Parameters
         ----------
         positions : (L, 3) float, metres
-            NaN where a marker is out of sight.
+            NaN where a marker is out of sight, as one is that is infinitely far.
         """
         positions = np.asarray(positions, dtype=np.float64)
         if positions.shape != (self.n_labels, 3):
             raise ValueError(f"positions: expected shape ({self.n_labels}, 3), got {positions.shape}")
+        positions = np.where((np.abs(positions) < FARTHEST).all(axis=1, keepdims=True), positions, np.nan)
         tracker, targets = self.tracker, positions[self.rows]
         x, settled = tracker.push(targets)
         residuals, trusted = np.full(self.n_labels, np.nan), np.zeros(self.n_labels, dtype=bool)
         residuals[self.rows], trusted[self.rows] = judge(tracker.places, targets, tracker.watch.order, tracker.config)
         pose, trans, _ = tracker.body.body.split(x)
-        return Frame(pose, trans, residuals, trusted, settled)
+        return Frame(pose, trans, residuals, trusted & tracker.believed, settled)
 
 
 class Tracker:
@@ -116,41 +120,81 @@ class Tracker:
         self.prediction = make_prediction(body, config, rate)
         self.wait, self.patience, self.started = 0, PATIENCE * rate, False
         self.places = np.full((body.count, 3), np.nan)                  # of the markers on the body of the last frame
+        self.believed, self.since, self.doubts = False, 0, 0            # frames since one was believed, and doubted
+        self.leapt = self.places                                        # where the last frame would have had the body
 
     def begin(self, x: np.ndarray) -> None:
         """Continue from these unknowns (P,), at rest."""
         self.prediction.begin(x)
         self.watch.forget()
-        self.started = True
+        self.started, self.since, self.doubts = True, 0, 0
 
     def push(self, targets: np.ndarray) -> tuple[np.ndarray, bool]:
         """Unknowns (P,) of the next frame, NaN before the first that could be solved, and whether it settled."""
         there = int((~np.isnan(targets[:, 0])).sum())
-        self.wait = max(0, self.wait - 1)
-        if not self.started:
-            if there < max(3, ENOUGH * self.body.count):
+        enough = there >= max(3, ENOUGH * self.body.count)
+        self.wait, self.since, self.believed = max(0, self.wait - 1), self.since + 1, False
+        fresh = not self.started
+        if fresh:
+            if not enough:
                 return np.full(self.body.n_unknowns, np.nan), False
+            doubts = self.doubts
             self.begin(search(self.body, targets, self.config))
+            self.doubts = doubts
         expected, information = self.prediction.expect()
-        self.places = self.body.positions(expected)
+        self.places = before = self.body.positions(expected)
         if not there:
             self.prediction.update(expected, 0 * information)
             return expected, False
-        targets = targets[self.watch.update(self.places, targets)]
-        end = self.solve(targets, expected, information)
-        self.places = self.body.positions(end.x[0])
-        if not self.wait and there >= max(3, ENOUGH * self.body.count) and self._astray(targets):
-            found = search(self.body, targets, self.config)
-            places = self.body.positions(found)
-            apart = np.linalg.norm(np.stack([places, self.places]) - targets, axis=2)
-            new, old = misfit(apart, self.config.outlier)
-            if new < 0.7 * old:
-                self.begin(found)
-                self.places, self.patience = places, PATIENCE * self.rate
-                return found, True
-            self.wait, self.patience = round(self.patience), 2 * self.patience
-        self.prediction.update(end.x[0], end.hessian[0] - information)
-        return end.x[0], bool(end.converged[0])
+        order = self.watch.order.copy()
+        taken = targets[self.watch.update(before, targets)]
+        end = self.solve(taken, expected, information)
+        x, settled, found = end.x[0], bool(end.converged[0]), None
+        self.places = self.body.positions(x)
+        if not self.wait and enough and not fresh and self._astray(taken):
+            found = self._found(taken)
+            if found is not None:
+                x, settled = found, True
+                self.places = self.body.positions(x)
+        if self._doubtful(taken, before):
+            self.watch.order, self.places = order, before
+            if fresh:
+                self.started = False
+                return np.full(self.body.n_unknowns, np.nan), False
+            self.prediction.update(expected, 0 * information)
+            return expected, False
+        if found is not None:
+            self.begin(x)
+        else:
+            self.prediction.update(x, end.hessian[0] - information)
+        return x, settled
+
+    def _found(self, targets: np.ndarray) -> np.ndarray | None:
+        """Unknowns (P,) that a search finds and that fit much better than the body at `places`, or None."""
+        found = search(self.body, targets, self.config)
+        apart = np.linalg.norm(np.stack([self.body.positions(found), self.places]) - targets, axis=2)
+        new, old = misfit(apart, self.config.outlier)
+        if new < 0.7 * old:
+            self.patience = PATIENCE * self.rate
+            return found
+        self.wait, self.patience = round(self.patience), 2 * self.patience
+        return None
+
+    def _doubtful(self, targets: np.ndarray, before: np.ndarray) -> bool:
+        """Whether the markers (L, 3) are to be passed over, the body at `places` having been expected at `before`.
+
+        No body explains them, or it would have leapt there: that is believed when the next frame says the same, and
+        anything when it goes on for long.
+        """
+        near = self.config.lost + FASTEST * self.since / self.rate
+        lost = bool(np.nanmedian(np.linalg.norm(self.places - targets, axis=1)) > self.config.lost)
+        leapt, self.leapt = self.leapt, np.full_like(before, np.nan) if lost else self.places
+        self.believed = not lost and min(_apart(self.places, before), _apart(self.places, leapt)) <= near
+        if self.believed:
+            self.since = self.doubts = 0
+            return False
+        self.doubts += 1
+        return self.doubts <= DOUBT * self.rate
 
     def _astray(self, targets: np.ndarray) -> bool:
         """The body has lost its markers (L, 3), or many of them."""
@@ -170,6 +214,12 @@ class Tracker:
             return cost + step @ pull, gradient + pull, hessian + information
 
         return descend(system, expected[None], MinimiseConfig(config.iterations, 1e-4, 1e-2), body.retract)
+
+
+def _apart(a: np.ndarray, b: np.ndarray) -> float:
+    """The median distance of points (L, 3), metres; infinite where some are not known."""
+    apart = float(np.median(np.linalg.norm(a - b, axis=1)))
+    return np.inf if np.isnan(apart) else apart
 
 
 def judge(positions: np.ndarray, targets: np.ndarray, order: np.ndarray, config: AnimateConfig

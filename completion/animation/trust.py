@@ -3,6 +3,7 @@ from __future__ import annotations
 
 import numpy as np
 
+WIDEST = 0.5                         # metres; a marker farther off is an outlier on however bad a fit
 ENTER, LEAVE = 0.5, 1.0              # share of the distance that remains when labels are exchanged, and put back
 
 
@@ -38,7 +39,7 @@ def distances_apart(positions: np.ndarray, targets: np.ndarray, outlier: float) 
     off = positions - targets
     off = off - _median(np.swapaxes(off, -1, -2))[..., None, :]
     squared = np.einsum("...d,...d->...", off, off)
-    return squared, np.maximum(outlier, 3 * np.sqrt(_median(squared)))[..., None]
+    return squared, np.maximum(outlier, np.minimum(3 * np.sqrt(_median(squared)), WIDEST))[..., None]
 
 
 def _median(values: np.ndarray) -> np.ndarray:

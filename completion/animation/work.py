@@ -1,18 +1,16 @@
 """One marker file: whose body, its motion, and all that is written of it."""
 from __future__ import annotations
 
-import hashlib
-import json
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 
 from model.body import BodyModel
 from model.linear import Subject
+from scanprep.batch.pool import Room
 from scanprep.cli import MM
-from scanprep.console import Metric, Progress, plain
+from scanprep.console import Metric
 from scanprep.geometry import storage
 from scanprep.pictures.page import Page
 
@@ -29,7 +27,7 @@ from .shape import MarkerShapeConfig, subject_from_markers
 
 BetasTo = dict[float, np.ndarray] | np.ndarray      # keys over seconds, or betas at the end
 ENDINGS = (".c3d", ".trc", ".csv")
-DONE = "done.json"
+MEAN_ERROR = "distance of markers, mean"
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,7 +39,7 @@ class Work:
     model : BodyModel
     name : str
         Of the model, for the output.
-    layout : str, optional
+    layout : str or Path, optional
         A named layout or a file; else the named one that fits the labels best.
     subject : Subject, optional
         Whose body; else it is found from the markers.
@@ -57,7 +55,7 @@ class Work:
 
     model: BodyModel
     name: str
-    layout: str | None
+    layout: str | Path | None
     subject: Subject | None
     onto: Subject | None
     betas_to: BetasTo | None
@@ -67,12 +65,16 @@ class Work:
     animate: AnimateConfig
     shape: MarkerShapeConfig
 
+    def __call__(self, path: Path, room: Room) -> list[Metric]:
+        """Follow the markers of a file; the figures."""
+        return animate_file(self, path, room)
+
     def read_layout(self, labels: tuple[str, ...]) -> tuple[MarkerLayout, str]:
         """The layout for these labels, and its name."""
         return choose_layout(self.model, self.layout, labels)
 
 
-def choose_layout(model: BodyModel, given: str | None, labels: tuple[str, ...]) -> tuple[MarkerLayout, str]:
+def choose_layout(model: BodyModel, given: str | Path | None, labels: tuple[str, ...]) -> tuple[MarkerLayout, str]:
     """The layout that is named, or in a file, or the named one that fits some labels best; and its name.
 
     Raises
@@ -84,25 +86,43 @@ def choose_layout(model: BodyModel, given: str | None, labels: tuple[str, ...]) 
     of_people = None if kept is None else np.array(kept)
     if given is None:
         return fitting_layout(labels, model.template, of_people)
-    if given in layout_names():
-        return MarkerLayout.named(given, model.template, of_people), given
+    named = layout_or_file(given)
+    if isinstance(named, str):
+        return MarkerLayout.named(named, model.template, of_people), named
+    return MarkerLayout.load(named, len(model.template.vertices)), str(named)
+
+
+def layout_or_file(given: str | Path) -> str | Path:
+    """What `--layout` names: a layout of ours as text, or a file as Path, on whose contents results depend.
+
+    Raises
+    ------
+    ValueError
+        Neither.
+    """
+    if str(given) in layout_names():
+        return str(given)
     if not Path(given).exists():
         raise ValueError(f"--layout: expected a file or one of {', '.join(layout_names())}, got '{given}'")
-    return MarkerLayout.load(given, len(model.template.vertices)), given
+    return Path(given)
 
 
-def animate_file(work: Work, path: Path, output: Path, finding: Progress, following: Progress) -> list[Metric]:
-    """Follow the markers of a file, write everything into a folder, and return the figures."""
+def animate_file(work: Work, path: Path, room: Room) -> list[Metric]:
+    """Follow the markers of a file, write everything into the folder of a room, and return the figures."""
     sequence = read_markers(path, work.unit, work.who)
     layout, name = work.read_layout(sequence.labels)
     metrics = [Metric("model", work.name), Metric("layout", name)]
     body, found = work.subject, None
     if body is None:
-        found = subject_from_markers(work.model, sequence, layout, work.shape, finding)
+        found = room.step("subject", (work.model, sequence, layout, work.shape),
+                          lambda: subject_from_markers(work.model, sequence, layout, work.shape, room.tell))
         body, layout = work.model.subject(found.betas), found.layout
         metrics.append(Metric("subject", f"{len(found.betas)} betas from {len(found.frames)} frames"))
-    motion = animate(body, sequence, layout, work.animate, following)
-    output.mkdir(parents=True, exist_ok=True)
+    # a person found from a model: what it was found from tells as much as its body, and sooner
+    whose = work.subject if found is None else (work.model, found.betas)
+    motion = room.step("motion", (whose, sequence, layout, work.animate),
+                       lambda: animate(body, sequence, layout, work.animate, room.tell))
+    output = room.folder
     if found is not None:
         storage.write_json(output / "subject.json", {"betas": found.betas.tolist(), "frames": found.frames.tolist()})
         layout.save(output / "layout.json")
@@ -125,7 +145,7 @@ def figures(motion: Motion, markers: MarkerSequence) -> list[Metric]:
     return [
         Metric("frames", len(motion.poses)), Metric("rate", motion.rate, "1/s"),
         Metric("markers used", f"{int(seen.any(axis=0).sum())} of {len(markers.labels)}"),
-        Metric("distance of markers, mean", float(off.mean()), "mm"),
+        Metric(MEAN_ERROR, float(off.mean()), "mm"),
         Metric("distance of markers, 95th percentile", float(np.percentile(off, 95)), "mm"),
         Metric("distance of markers, mean of the worst frame", float(frame.max()), "mm"),
         Metric("markers missing", 100 * float(1 - seen[:, seen.any(axis=0)].mean()), "%"),
@@ -198,17 +218,3 @@ def morph_keys(given: BetasTo, motion: Motion) -> dict[float, np.ndarray]:
     if motion.betas is None:
         raise ValueError("--betas-to: the subject has no betas to begin with; give keys {seconds: betas}")
     return {0.0: motion.betas, float(motion.times[-1]): given}
-
-
-def settings_key(work: Work, path: Path, given: dict[str, Any]) -> str:
-    """A digest of all that the output of a file depends on: settings, the file, and files that settings name."""
-    told = {"given": {name: contents(value) for name, value in given.items()}, "animate": plain(work.animate),
-            "shape": plain(work.shape), "model": work.name, "file": contents(path)}
-    return hashlib.sha256(json.dumps(told, sort_keys=True).encode()).hexdigest()[:16]
-
-
-def contents(value: Any) -> Any:
-    """A setting, or what is in it when it names a file."""
-    if value is None or not Path(str(value)).is_file():
-        return None if value is None else str(value)
-    return hashlib.sha256(Path(str(value)).read_bytes()).hexdigest()

@@ -11,7 +11,7 @@ import numpy as np
 
 from scanprep.geometry import rotations
 from scanprep.geometry.mesh import Mesh
-from scanprep.geometry.surface import Surface, barycentric
+from scanprep.geometry.surface import Surface, barycentric, checked_points, checked_surface
 
 from ..energy import MovingPoints
 from .settings import Attachment
@@ -194,14 +194,18 @@ def signed_distance(points: np.ndarray, mesh: Mesh) -> SignedDistances:
     The nearest point stays where it is on the surface to first order, so the derivative by a corner is that by the
     point, backwards, times the corner's share in the nearest point.
 
+    Raises
+    ------
+    ValueError
+        A point that is not finite, a mesh without triangles.
+
     [MoSh] Eq. 18
     """
     import igl
 
-    points = np.ascontiguousarray(points, dtype=np.float64)
+    points = checked_points(points)
     values, face, nearest, normals = igl.signed_distance(
-        points, np.ascontiguousarray(mesh.vertices), np.ascontiguousarray(mesh.faces),
-        sign_type=igl.SIGNED_DISTANCE_TYPE_PSEUDONORMAL)
+        points, *checked_surface(mesh), sign_type=igl.SIGNED_DISTANCE_TYPE_PSEUDONORMAL)
     off = points - nearest
     far = np.abs(values) > 1e-9
     direction = np.where(far[:, None], off / np.where(far, values, 1.0)[:, None], normals)

@@ -12,6 +12,7 @@ import numpy as np
 from model.body import BodyModel
 from model.linear import Subject
 from scanprep.batch.pool import Step, once, under
+from scanprep.threads import one_thread
 
 from ..markers.files import MarkerSequence
 from ..markers.layout import MarkerLayout
@@ -28,6 +29,7 @@ STEPS = 100                          # of progress, of each stage
 ROUNDS = 3                           # most times that a person is followed and the markers are judged
 
 
+@one_thread()
 def mosh(model: BodyModel, sequences: MarkerSequence | Sequence[MarkerSequence], layout: MarkerLayout,
          config: MoshConfig | None = None, progress: Progress | None = None, step: Step = once) -> MoshResult:
     """Body shape, marker places, poses and soft tissue of one subject from marker sequences.

@@ -9,6 +9,7 @@ import numpy as np
 from model.body import BodyModel
 from scanprep.batch.pool import Step, once
 from scanprep.geometry import rotations
+from scanprep.threads import one_thread
 
 from ..animation.frame_starts import FrameStarts
 from ..animation.shape import spread_frames
@@ -25,6 +26,7 @@ EVERY = 2                            # stages before one of which, and before th
 FEW_SEEN = 0.9                       # of the most markers that any frame has; frames with fewer are not used
 
 
+@one_thread()
 def find_person(model: BodyModel, sequences: MarkerSequence | Sequence[MarkerSequence], layout: MarkerLayout,
                 config: PersonConfig | None = None, progress: Progress | None = None, step: Step = once
                 ) -> PersonFit:

@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 from model.body import BodyModel
 from model.learning.sex_plane import SexGuess, guess_sex, sex_plane
 from scanprep.batch.pool import Step, once, under
+from scanprep.threads import one_thread
 
 from ..markers.files import MarkerSequence
 from ..markers.layout import MarkerLayout
@@ -39,6 +40,7 @@ class SexedMosh:
     result: MoshResult
 
 
+@one_thread()
 def mosh_by_sex(models: Mapping[str, BodyModel], sequences: MarkerSequence | Sequence[MarkerSequence],
                 layout: MarkerLayout, config: MoshConfig | None = None, progress: Progress | None = None,
                 step: Step = once) -> SexedMosh:

@@ -7,6 +7,7 @@ from dataclasses import replace
 import numpy as np
 
 from model.body import BodyModel
+from scanprep.threads import one_thread
 
 from ..animation.marked import BATCH
 from ..animation.prediction import inertia
@@ -26,6 +27,7 @@ PER_SQUARE_METRE = 1e4               # of a weight on square centimetres
 STILL = 0.002                        # metres that the last round moves any marker of a frame that has settled
 
 
+@one_thread()
 def follow_soft_tissue(model: BodyModel, motion: Motion, markers: MarkerSequence, layout: MarkerLayout,
                        config: SoftTissueConfig | None = None, progress: Progress | None = None) -> SoftTissue:
     """A motion in which the person's shape changes with time, as the markers tell.

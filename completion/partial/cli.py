@@ -1,7 +1,7 @@
 """The command `scape complete`."""
 from __future__ import annotations
 
-import shutil
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
 
@@ -10,16 +10,18 @@ import tyro
 from model.body import BodyModel
 from model.cli import read_subject
 from model.linear import Subject
-from scanprep.cli import Output, Unit
-from scanprep.console import Outcome, bar, say
+from scanprep.batch.pool import Workers
+from scanprep.batch.workspace import Task, Workspace
+from scanprep.cli import Output, Unit, WorkersArg
+from scanprep.console import Outcome, bar, failures_of, problem_of, say
 from scanprep.geometry.landmarks import read_landmark_vertices
 from scanprep.pipeline.scans import LANDMARK_ENDINGS
 
 from ..cli import ModelOrNone, read_model
 from .colors import ColorConfig
-from .folder import complete_folder, file_digest, folder_inputs, settings_key, stale, summary
+from .folder import folder_inputs, folder_page, summary
 from .settings import CompletionConfig
-from .work import Inputs, Work, complete_files
+from .work import Inputs, Work
 
 ScansArg = Annotated[tyro.conf.Positional[tuple[Path, ...]], tyro.conf.arg(metavar="SCAN [SCAN ...]")]
 
@@ -27,8 +29,8 @@ ScansArg = Annotated[tyro.conf.Positional[tuple[Path, ...]], tyro.conf.arg(metav
 def complete_scan(scans: ScansArg, output: Output, model: ModelOrNone = None, landmarks: Path | None = None,
                   subject: str | None = None, template_landmarks: Path | None = None, mask: tuple[Path, ...] = (),
                   unit: Unit | None = None, fill_colors: bool = False,
-                  config: Annotated[CompletionConfig, tyro.conf.arg(name="")] = CompletionConfig()  # noqa: B008
-                  ) -> Outcome:
+                  config: Annotated[CompletionConfig, tyro.conf.arg(name="")] = CompletionConfig(),  # noqa: B008
+                  workers: WorkersArg = Workers(), *, space: Workspace) -> Outcome:                 # noqa: B008
     """The whole body from a scan of some of it.
 
     Several scans are views of one body in one frame. A folder is completed scan by scan, each into a folder of its
@@ -52,6 +54,7 @@ def complete_scan(scans: ScansArg, output: Output, model: ModelOrNone = None, la
         unit: Unit of the scan and landmarks; --free-scale when nobody knows it.
         fill_colors: Spread the scan's colours over what was not seen, which else is grey.
         config: Settings.
+        workers: Who completes the scans of a folder.
     """
     if not scans:
         raise ValueError("SCAN: expected at least one scan, or a folder of scans")
@@ -67,18 +70,19 @@ def complete_scan(scans: ScansArg, output: Output, model: ModelOrNone = None, la
     wanted = any(one.landmarks for one in found.values()) if folder else inputs.landmarks is not None
     marks = _template_landmarks(loaded, template_landmarks, name) if wanted else {}
     work = Work(body, name, marks, config, unit, ColorConfig(fill=fill_colors))
+    settings = {"complete": config, "model": name}
     if folder is None:
         if inputs.landmarks is None:
             say("note: no landmarks; the search starts from typical poses, look at report.html for limbs mixed up")
         with bar("completing") as progress:
-            return Outcome(output, complete_files(work, inputs, output, progress), {"complete": config, "model": name})
-    for left in stale(output):
-        shutil.rmtree(left)
-    key = settings_key(config, work.colors, unit, marks, name if model is None else file_digest(model), subject,
-                       file_digest(Path(subject)) if subject else "")
+            done = space.run(work, [Task("completion", inputs)], inside=progress).only
+        return Outcome(output, done, settings, problem=problem_of(done))
+    work = replace(work, command=f"scape complete {folder}")
     with bar("completing scans") as progress:
-        done = complete_folder(work, found, output, key, f"scape complete {folder}", progress)
-    return Outcome(output, summary(done, len(found)), {"complete": config, "model": name}, done.failures)
+        results = space.run(work, [Task(name, one, name) for name, one in found.items()], workers, progress)
+    with space.staging("page") as staged:
+        folder_page(results.values, list(results.failures.values())).write(staged.folder / "report.html")
+    return Outcome(output, summary(results.values, len(results.fresh), len(found)), settings, failures_of(results))
 
 
 def _only(masks: tuple[Path, ...]) -> Path | None:

@@ -10,6 +10,7 @@ import numpy as np
 from model.body import BodyModel
 from model.linear import Subject
 from scanprep.geometry.mesh import Mesh
+from scanprep.threads import one_thread
 
 from ..bodies import as_body
 from .alternation import follow_alternating, model_for_turns
@@ -77,6 +78,7 @@ class Completion:
     confidence: np.ndarray | None = None
 
 
+@one_thread()
 def complete(body: BodyModel | Subject, scan: View | Sequence[View],
              landmarks: tuple[np.ndarray, np.ndarray] | None = None, config: CompletionConfig | None = None,
              progress: Progress | None = None, masked: np.ndarray | None = None) -> Completion:

@@ -6,6 +6,8 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import breadth_first_order, connected_components, minimum_spanning_tree
 from scipy.spatial import cKDTree
 
+from scanprep.threads import search_threads
+
 COARSE = 2000                        # points that show the form at large
 WIDE = 0.12                          # metres: at this scale a body is convex enough to tell in from out
 AGREE = 0.95                         # share of neighbours that must agree for given normals to be of one sign
@@ -71,7 +73,7 @@ def turn_outward(points: np.ndarray, normals: np.ndarray, near: np.ndarray, dist
             if out[i] @ out[before[i]] < 0:
                 out[i] = -out[i]
     coarse = points[spread(points, COARSE)] if n > COARSE else points
-    far, around = cKDTree(coarse).query(points, 48, distance_upper_bound=WIDE, workers=-1)
+    far, around = cKDTree(coarse).query(points, 48, distance_upper_bound=WIDE, workers=search_threads(len(points)))
     found = np.isfinite(far)
     total = np.where(found[:, :, None], coarse[np.where(found, around, 0)] - points[:, None], 0).sum(axis=1)
     bulge = -np.einsum("nd,nd->n", out, total)

@@ -10,6 +10,7 @@ from scipy.spatial import cKDTree
 
 from scanprep.geometry.files import PointCloud
 from scanprep.geometry.mesh import Mesh
+from scanprep.threads import search_threads
 
 from .normals import completed_normals, one_sign, plane_normals, spread, turn_outward
 
@@ -193,7 +194,7 @@ def _prepare_view(scan: View, viewpoint: np.ndarray | None, name: str) -> ScanPo
     if not np.isfinite(points).all():
         bad = np.flatnonzero(~np.isfinite(points).all(axis=1))
         raise ValueError(f"{name}: {len(bad)} points are not finite, the first is point {bad[0]}")
-    distance, near = cKDTree(points).query(points, NEIGHBOURS, workers=-1)
+    distance, near = cKDTree(points).query(points, NEIGHBOURS, workers=search_threads(len(points)))
     spacing = float(np.median(distance[:, 1:5].mean(axis=1)))
     every = np.arange(len(points))
     if isinstance(scan, Mesh) and len(scan.faces):

@@ -5,9 +5,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from scanprep.pipeline.scans import POINT_ENDINGS
 from scanprep.geometry.files import PointCloud, read_mesh, read_points
 from scanprep.geometry.mesh import Mesh
+from scanprep.pipeline.scans import POINT_ENDINGS
 
 from .textures import Texture, read_texture
 

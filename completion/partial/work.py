@@ -1,6 +1,7 @@
 """One scan of `scape complete`: read, completed, coloured, written with its page."""
 from __future__ import annotations
 
+import time
 import warnings
 from dataclasses import dataclass, field, replace
 from pathlib import Path
@@ -9,8 +10,9 @@ import numpy as np
 
 from model.body import BodyModel
 from model.linear import Subject
+from scanprep.batch.pool import Room
 from scanprep.cli import MM, Unit
-from scanprep.console import Metric, Progress
+from scanprep.console import Metric, Outcome, write_report
 from scanprep.geometry.landmarks import match_landmarks, read_landmarks
 from scanprep.geometry.mesh import Mesh
 from scanprep.pictures.sheets import save_png
@@ -38,6 +40,7 @@ class Work:
     config : CompletionConfig
     unit : of the scans and landmarks, where the files cannot tell
     colors : ColorConfig
+    command : for the report of each scan of a folder; one scan's is written by the console
     """
 
     body: BodyModel | Subject
@@ -46,6 +49,16 @@ class Work:
     config: CompletionConfig
     unit: Unit | None = None
     colors: ColorConfig = field(default_factory=ColorConfig)
+    command: str = field(default="", metadata={"digest": False})
+
+    def __call__(self, inputs: Inputs, room: Room) -> list[Metric]:
+        """Complete the scan of some files; the figures."""
+        start = time.perf_counter()
+        metrics = complete_files(self, inputs, room)
+        if self.command:
+            write_report(Outcome(room.folder, metrics, {"complete": self.config}), self.command,
+                         time.perf_counter() - start)
+        return metrics
 
 
 @dataclass(frozen=True)
@@ -62,8 +75,8 @@ class Inputs:
         return ", ".join(path.name for path in self.scans)
 
 
-def complete_files(work: Work, inputs: Inputs, output: Path, progress: Progress | None = None) -> list[Metric]:
-    """Complete the scan of some files into a folder, report.html in it; the figures.
+def complete_files(work: Work, inputs: Inputs, room: Room) -> list[Metric]:
+    """Complete the scan of some files into the folder of a room, report.html in it; the figures.
 
     Raises
     ------
@@ -77,7 +90,9 @@ def complete_files(work: Work, inputs: Inputs, output: Path, progress: Progress 
         landmarks = _landmarks(work, inputs, files)
         masked = read_masks(inputs.masks, files, work.unit)
     views = list(files.views)
-    done = complete(work.body, views, landmarks, work.config, progress, masked)
+    done = room.step("completion", (work.body, work.marks, work.config, work.unit, inputs),
+                     lambda: complete(work.body, views, landmarks, work.config, room.tell, masked))
+    output = room.folder
     if files.colored:
         done = _with_colors(work, files, done, output)
     save_completion(output, done)
@@ -149,7 +164,6 @@ def _with_colors(work: Work, files: ScanFiles, done: Completion, output: Path) -
     colors = carry_colors(mesh, done.seen, views, work.colors, work.config.viewpoint, done.scale, files.textures)
     if any(texture is not None for texture in files.textures):
         known = colored_views(views, work.config.viewpoint, done.scale, files.textures)
-        output.mkdir(parents=True, exist_ok=True)
         write_textured(output / "completed.glb",
                        bake(mesh, lambda places, normals: blend(known, places, normals, work.colors), colors))
     return replace(done, completed=Mesh(mesh.vertices, mesh.faces, colors))

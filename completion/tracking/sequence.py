@@ -9,6 +9,7 @@ import numpy as np
 from model.body import BodyModel
 from model.linear import Subject
 from scanprep.geometry.mesh import Mesh
+from scanprep.threads import one_thread
 
 from ..motion import Motion
 from .dynamics import inertia, smoothed
@@ -20,6 +21,7 @@ Progress = Callable[[int, int], None]
 Surfaces = Callable[[int, Mesh], None]
 
 
+@one_thread()
 def track(body: BodyModel | Subject, frames: Iterable[Frame], config: TrackConfig | None = None,
           landmarks: tuple[np.ndarray, np.ndarray] | None = None, progress: Progress | None = None,
           rate: float = 30.0, viewpoints: Any = None, surfaces: Surfaces | None = None) -> Motion:

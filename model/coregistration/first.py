@@ -14,6 +14,7 @@ from scanprep.matching.schedule import RegistrationConfig
 from scanprep.skeleton.find import find_skeleton
 from scanprep.skeleton.parts import SkeletonConfig
 from scanprep.skeleton.tree import Skeleton
+from scanprep.threads import one_thread
 
 from ..learning.scape import learn_scape
 from ..scape import ScapeModel
@@ -69,6 +70,7 @@ class FirstModel:
     coregistration: Coregistration
 
 
+@one_thread()
 def learn_from_scans(template: Mesh, scans: Sequence[Mesh | np.ndarray], landmarks: Sequence[Landmarks | None],
                      skeleton: Skeleton | None = None, config: FirstConfig | None = None,
                      progress: Progress | None = None) -> FirstModel:

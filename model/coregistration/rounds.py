@@ -11,6 +11,7 @@ import numpy as np
 from scanprep.geometry.mesh import Mesh
 from scanprep.skeleton.find import find_skeleton
 from scanprep.skeleton.tree import Skeleton
+from scanprep.threads import one_thread
 
 from ..body import BodyModel
 from ..learning.scape import BlendConfig, learn_blendscape, learn_scape
@@ -83,6 +84,7 @@ class Store(Protocol):
     def keep_model(self, turn: int, model: BodyModel) -> None: ...
 
 
+@one_thread()
 def coregister(model: BodyModel, scans: Sequence[Scan], landmarks: Sequence[Landmarks | None] | None = None,
                config: CoregistrationConfig | None = None, starts: Sequence[np.ndarray | None] | None = None,
                subjects: Sequence[str] | None = None, progress: Progress | None = None, store: Store | None = None

@@ -10,6 +10,7 @@ import numpy as np
 from scanprep.geometry.mesh import Mesh
 from scanprep.matching.matches import target_of
 from scanprep.matching.nonrigid import register
+from scanprep.threads import one_thread
 
 from ..body import BodyModel
 from ..linear import Subject
@@ -72,6 +73,7 @@ class ModelRegistration:
     starts: int
 
 
+@one_thread()
 def register_with_model(body: BodyModel | Subject, scan: Mesh | np.ndarray, landmarks: Landmarks | None = None,
                         start: np.ndarray | None = None, config: CoregistrationConfig | None = None,
                         progress: Callable[[int, int], None] | None = None) -> ModelRegistration:

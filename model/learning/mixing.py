@@ -13,6 +13,7 @@ import numpy as np
 
 from scanprep.geometry.mesh import Mesh, check_template
 from scanprep.skeleton.tree import Skeleton
+from scanprep.threads import one_thread
 
 from ..carriers import rigid_weights
 from ..digests import body_digests, digest
@@ -81,6 +82,7 @@ class MixConfig(RegressionConfig):
             raise ValueError(f"held_out: expected more than 0 and at most 0.5, got {self.held_out}")
 
 
+@one_thread()
 def learn_scape_mix(template: Mesh, bodies: np.ndarray, subjects: Sequence[Hashable], skeleton: Skeleton,
                     config: MixConfig | None = None, progress: Progress | None = None) -> ScapeModel:
     """Learn a body model from any people in any poses.

@@ -12,6 +12,7 @@ from scanprep.geometry.mesh import Mesh
 from scanprep.skeleton.find import find_skeleton
 from scanprep.skeleton.parts import SkeletonConfig
 from scanprep.skeleton.tree import Skeleton
+from scanprep.threads import one_thread
 
 from ..carriers import rigid_weights
 from .carriage import Carriage
@@ -58,6 +59,7 @@ class ChosenSkeleton:
     errors: dict[int, float]
 
 
+@one_thread()
 def choose_skeleton(template: Mesh, poses: np.ndarray, config: PartsConfig | None = None,
                     learning: PoseConfig | None = None, progress: Progress | None = None) -> ChosenSkeleton:
     """A skeleton with as many parts as help to predict poses that were left out.

@@ -12,6 +12,7 @@ import numpy as np
 
 from scanprep.geometry.mesh import Mesh, check_template
 from scanprep.skeleton.tree import Skeleton
+from scanprep.threads import one_thread
 
 from ..blendscape import BlendScapeModel
 from ..borders import face_weights
@@ -55,6 +56,7 @@ class BlendConfig(LearnConfig):
     width: float = 0.01
 
 
+@one_thread()
 def learn_scape(template: Mesh, poses: np.ndarray, shapes: np.ndarray | None, skeleton: Skeleton,
                 config: LearnConfig | None = None, progress: Progress | None = None) -> ScapeModel:
     """Learn a body model from one person in many poses and many people in about one pose.

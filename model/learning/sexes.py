@@ -8,6 +8,7 @@ import numpy as np
 
 from scanprep.geometry.mesh import Mesh, check_template
 from scanprep.skeleton.tree import Skeleton
+from scanprep.threads import one_thread
 
 from ..carriers import rigid_weights
 from ..scape import ScapeModel
@@ -30,6 +31,7 @@ SEXES = ("female", "male")
 FEWEST = 2                           # people that span a space of shapes
 
 
+@one_thread()
 def learn_by_sex(template: Mesh, poses: np.ndarray, shapes: np.ndarray, sexes: Sequence[str], skeleton: Skeleton,
                  config: LearnConfig | None = None, progress: Progress | None = None) -> dict[str, ScapeModel]:
     """Learn a model of everybody and one of each sex: one pose space, and a space of shapes a group.

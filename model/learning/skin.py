@@ -9,6 +9,7 @@ import numpy as np
 
 from scanprep.geometry.mesh import Mesh, check_template
 from scanprep.skeleton.tree import Skeleton
+from scanprep.threads import one_thread
 
 from ..features import Lift, LinearLift, PoseFeatures, QuadraticLift
 from ..fitting import FitConfig, PoseFitter
@@ -69,6 +70,7 @@ class SkinConfig:
     people_rounds: int = 3
 
 
+@one_thread()
 def learn_skinning(template: Mesh, poses: np.ndarray, shapes: np.ndarray | None, skeleton: Skeleton,
                    config: SkinConfig | None = None, progress: Progress | None = None) -> SkinningModel:
     """Learn a skinning model from one person in many poses and many people in about one pose.

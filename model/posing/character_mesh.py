@@ -8,6 +8,7 @@ import numpy as np
 
 from scanprep.geometry.landmarks import match_landmarks
 from scanprep.geometry.mesh import Mesh
+from scanprep.geometry.surface import checked_points, checked_surface
 from scanprep.matching.nonrigid import Registration, register
 from scanprep.matching.schedule import RegistrationConfig
 
@@ -136,9 +137,8 @@ def _spread(points: np.ndarray) -> float:
 
 
 def inside(mesh: Mesh, points: np.ndarray) -> np.ndarray:
-    """Which points (n, 3) lie inside a closed mesh."""
+    """Which points (n, 3) lie inside a closed mesh; ValueError for one that is not finite."""
     import igl
 
-    turns = igl.fast_winding_number(np.ascontiguousarray(mesh.vertices), np.ascontiguousarray(mesh.faces),
-                                    np.ascontiguousarray(points))
+    turns = igl.fast_winding_number(*checked_surface(mesh), checked_points(points))
     return np.asarray(np.abs(turns) > 0.5)

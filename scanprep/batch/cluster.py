@@ -13,6 +13,7 @@ from typing import Any
 
 import numpy as np
 
+from .digests import paths_of
 from .pool import Failure, Job, attempt
 
 ANSWER, WAIT = 10, 60          # seconds for the scheduler, and for the first worker of a cluster just started
@@ -160,13 +161,9 @@ def _with_paths(value: Any, change: Callable[[Path], Path]) -> Any:
 def _files(given: Any) -> dict[Path, bytes]:
     """Path -> contents of the files of a job; one that cannot be read is left for the worker to miss."""
     found: dict[Path, bytes] = {}
-
-    def take(path: Path) -> Path:
+    for path in paths_of(given):
         with contextlib.suppress(OSError):
             found[path] = path.read_bytes()
-        return path
-
-    _with_paths(given, take)
     return found
 
 

@@ -6,7 +6,7 @@ import hashlib
 import importlib.metadata
 import json
 import time
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
 
@@ -81,13 +81,13 @@ class Digests:
         """Every value with its kind and length before it, so that no two run together."""
         if isinstance(value, Path):
             whole.update(b"file" + self.of_file(value).encode())
-        elif value is None or isinstance(value, bool | int | float | str):
-            told = repr(value).encode()
-            whole.update(f"{type(value).__name__}{len(told)}:".encode() + told)
         elif isinstance(value, np.ndarray | np.generic):
             array = np.ascontiguousarray(value)
             whole.update(f"array{array.dtype.str}{np.shape(value)}".encode())
             whole.update(array.view(np.uint8).data if array.size else b"")
+        elif value is None or isinstance(value, bool | int | float | str):
+            told = repr(value).encode()
+            whole.update(f"{type(value).__name__}{len(told)}:".encode() + told)
         elif isinstance(value, Mapping):
             self._several(whole, "map", sorted(((str(k), v) for k, v in value.items()), key=lambda kv: kv[0]))
         elif isinstance(value, list | tuple):
@@ -114,7 +114,7 @@ class Digests:
             if field.metadata.get("digest", True):
                 self._update(own, field.name)
                 self._update(own, getattr(value, field.name))
-        if type(value).__dataclass_params__.frozen and not _has_path(value):
+        if type(value).__dataclass_params__.frozen and not any(paths_of(value)):
             self._values[id(value)] = (value, own.digest())
         return own.digest()
 
@@ -126,16 +126,17 @@ def _read_through(file: Any) -> str:
     return whole.hexdigest()[:LENGTH]
 
 
-def _has_path(value: Any) -> bool:
+def paths_of(value: Any) -> Iterator[Path]:
+    """All paths in a value of paths, tuples, lists, dicts and dataclasses."""
     if isinstance(value, Path):
-        return True
-    if isinstance(value, Mapping):
-        return any(map(_has_path, value.values()))
-    if isinstance(value, list | tuple):
-        return any(map(_has_path, value))
-    if dataclasses.is_dataclass(value) and not isinstance(value, type):
-        return any(_has_path(getattr(value, f.name)) for f in dataclasses.fields(value))
-    return False
+        yield value
+    elif isinstance(value, Mapping):
+        yield from paths_of(tuple(value.values()))
+    elif isinstance(value, list | tuple):
+        for each in value:
+            yield from paths_of(each)
+    elif dataclasses.is_dataclass(value) and not isinstance(value, type):
+        yield from paths_of([getattr(value, field.name) for field in dataclasses.fields(value)])
 
 
 def _version() -> bytes:

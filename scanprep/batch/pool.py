@@ -13,7 +13,8 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from ..geometry import storage
-from .digests import Digests
+from ..threads import begin_worker, one_thread
+from .digests import Digests, paths_of
 from .values import load_header, load_value, save_value
 
 Progress = Callable[[int, int], None]
@@ -167,13 +168,14 @@ def attempt(work: Any, job: Job, tell: Progress | None = None) -> Any:
     folder = job.folder / job.place
     try:
         folder.mkdir(parents=True, exist_ok=True)
-        return work(job.given, Room(folder, job.steps, tell, job.force))
+        with one_thread():              # so that bytes do not depend on where it is done
+            return work(job.given, Room(folder, job.steps, tell, job.force))
     except Exception as error:
         text = " ".join(str(error).split())
         if not isinstance(error, ValueError | OSError | ModuleNotFoundError):
             text = f"{type(error).__name__}: {text}"
-        name = job.name.rpartition("/")[2]
-        return Failure(text if name in text else f"{name}: {text}")
+        files = [str(path) for path in paths_of(job.given)] or [job.name]
+        return Failure(text if any(file in text for file in files) else f"{files[0]}: {text}")
 
 
 def _run_in_processes(work: Any, jobs: Sequence[Job], count: int) -> Iterator[tuple[Job, Any]]:
@@ -203,8 +205,7 @@ def _in_parallel(work: Any, jobs: Sequence[Job], count: int) -> Generator[tuple[
     from loky import ProcessPoolExecutor, as_completed
     from loky.process_executor import BrokenProcessPool
 
-    pool = ProcessPoolExecutor(min(count, len(jobs)), initializer=_begin, initargs=(work, os.getpid()),
-                               env={"OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "MKL_NUM_THREADS": "1"})
+    pool = ProcessPoolExecutor(min(count, len(jobs)), initializer=_begin, initargs=(work, os.getpid()))
     try:
         job_of = {pool.submit(_do, job): job for job in jobs}
         for future in as_completed(job_of):
@@ -222,6 +223,7 @@ def _begin(work: Any, parent: int) -> None:
     """A worker keeps what all jobs have in common, says nothing, and goes when the process that wants it goes."""
     global _work
     _work = work
+    begin_worker()
     warnings.simplefilter("ignore")
     threading.Thread(target=_watch, args=(parent,), daemon=True).start()
 

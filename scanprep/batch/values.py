@@ -64,13 +64,13 @@ def load_value(path: Path) -> Any:
 
 def _packed(value: Any, arrays: list[np.ndarray]) -> Any:
     """JSON for a value; arrays are put aside."""
-    if value is None or isinstance(value, bool | int | float | str):
-        return value
-    if isinstance(value, np.ndarray | np.generic):
+    if isinstance(value, np.ndarray | np.generic):           # before numbers: some scalars are Python's floats too
         if value.dtype.hasobject:
             raise TypeError("arrays of objects are not kept")
         arrays.append(np.asarray(value))
         return {"array": len(arrays) - 1, "scalar": isinstance(value, np.generic)}
+    if value is None or isinstance(value, bool | int | float | str):
+        return value
     if isinstance(value, Path):
         return {"path": str(value)}
     if isinstance(value, list):

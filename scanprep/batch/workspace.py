@@ -12,12 +12,12 @@ A file is replaced or removed only when it is as scapekit wrote it.
 from __future__ import annotations
 
 import contextlib
-import json
 import os
 import shutil
 import tempfile
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from functools import cached_property
 from pathlib import Path
 from typing import Annotated, Any, TypeVar
 from urllib.parse import quote, unquote
@@ -25,17 +25,13 @@ from urllib.parse import quote, unquote
 from ..geometry import storage
 from .digests import Digests
 from .lock import locked
+from .ownership import HOME, ForeignFileError, Ownership, refusal, refuse_any, report_path, written_of
 from .pool import Failure, Job, Progress, Workers, run_jobs
 from .values import load_header, load_value, save_value
 
-HOME, RECORD = ".scapekit", ".record.npz"
+RECORD = ".record.npz"
 NOTHING: Any = object()                   # no result; None may be one
-SHOWN = 3                                 # files that a message names
 T = TypeVar("T")
-
-
-class ForeignFileError(ValueError):
-    """Something stands where an output should go, and scapekit did not write it."""
 
 
 @dataclass(frozen=True)
@@ -72,6 +68,19 @@ class Results:
     failures: dict[str, str]
     fresh: tuple[str, ...]
 
+    @property
+    def only(self) -> Any:
+        """The value of the only task.
+
+        Raises
+        ------
+        ValueError
+            It failed.
+        """
+        if self.failures:
+            raise ValueError(*self.failures.values())
+        return next(iter(self.values.values()))
+
 
 class Workspace:
     """An output that is open for one run; see `workspace`."""
@@ -80,7 +89,17 @@ class Workspace:
         self.folder, self.home, self.force, self.output = folder, home, force, output
         self.digests = Digests(home / "files.json")
         self._made: set[str] = set()
-        self._own: dict[str, set[str]] | None = None
+
+    @cached_property
+    def _own(self) -> Ownership:
+        found = Ownership(self.folder, self.digests)
+        for place in {self.folder, self.output or self.folder}:
+            for record in (place / HOME / "done").glob("*.npz"):
+                found.add((load_header(record) or {"files": {}})["files"], place)
+        if self.output is not None:
+            report = report_path(self.output)
+            found.add(written_of(report), report.parent)
+        return found
 
     def run(self, work: Any, tasks: Sequence[Task], workers: Workers | None = None, progress: Progress | None = None,
             inside: Progress | None = None) -> Results:
@@ -128,7 +147,8 @@ class Workspace:
         finally:
             for job in jobs:
                 shutil.rmtree(job.folder, ignore_errors=True)
-        return Results({name: value for name, value in values.items() if name not in failures}, {task.name: failures[task.name] for task in tasks if task.name in failures},
+        return Results({name: value for name, value in values.items() if name not in failures},
+                       {task.name: failures[task.name] for task in tasks if task.name in failures},
                        tuple(job.name for job in jobs if job.name not in failures))
 
     def step(self, name: str, inputs: Any, make: Callable[[Path], T]) -> T:
@@ -178,13 +198,13 @@ class Workspace:
                 found.append(unquote(path.stem))
         return found
 
+    def is_ours(self, file: str) -> bool:
+        """Whether a file of the output is as scapekit wrote it."""
+        return self._own.has(file)
+
     def value(self, name: str) -> Any:
         """A result that is kept."""
         return load_value(self._record(name))
-
-    def is_ours(self, file: str) -> bool:
-        """Whether a file of the output is as scapekit wrote it."""
-        return self.digests.of_file(self.folder / file) in self._written().get(file, ())
 
     def _kept(self, name: str, key: str) -> Any:
         """A result made from the same inputs whose files are all there; NOTHING where it must be made anew."""
@@ -200,11 +220,11 @@ class Workspace:
     def _blocked(self, task: Task) -> str:
         """Why a task has no place to write to, before any work is done for it."""
         place = self.folder / task.place
-        if not task.place or not place.exists() or load_header(self._record(task.name)) is not None:
+        if not task.place or not place.exists() or self._record(task.name).exists():
             return ""
         if place.is_dir() and not any(place.iterdir()):
             return ""
-        return _refusal(place)
+        return refusal(place)
 
     def _making(self) -> Path:
         (self.home / "making").mkdir(exist_ok=True)
@@ -217,7 +237,7 @@ class Workspace:
         """Whole from the moment at which the folder gets its name among the ready ones."""
         files = {path.relative_to(staged).as_posix(): self.digests.of_file(path)
                  for path in sorted(staged.rglob("*")) if path.is_file()}
-        self._check_free(files)
+        self._own.check_free(files)
         save_value(staged / RECORD, value, {"digest": key, "work": work, "files": files})
         ready = self.home / "ready" / _plain(name)
         ready.parent.mkdir(exist_ok=True)
@@ -238,7 +258,7 @@ class Workspace:
         for file, digest in before.items():
             if file not in header["files"]:
                 self._remove(file, digest)
-        self._know(Path(), header["files"])
+        self._own.add(header["files"], self.folder)
         record.parent.mkdir(exist_ok=True)
         os.replace(ready / RECORD, record)
         shutil.rmtree(ready)
@@ -253,33 +273,6 @@ class Workspace:
             if place == self.folder or any(place.iterdir()):
                 break
             place.rmdir()
-
-    def _check_free(self, files: Mapping[str, str]) -> None:
-        taken = []
-        for file, digest in files.items():
-            place = self.folder / file
-            if place.is_dir() or any(p.is_file() for p in place.parents if self.folder in p.parents) \
-                    or (place.exists() and self.digests.of_file(place) != digest and not self.is_ours(file)):
-                taken.append(place)
-        if taken:
-            raise ForeignFileError(_refusal(*taken))
-
-    def _written(self) -> dict[str, set[str]]:
-        """File -> digests that scapekit wrote it with, as results that are kept and reports tell."""
-        if self._own is None:
-            self._own = {}
-            for folder in {self.folder, self.output or self.folder}:
-                place = folder.relative_to(self.folder)
-                for path in (folder / HOME / "done").glob("*.npz"):
-                    self._know(place, (load_header(path) or {"files": {}})["files"])
-            if self.output is not None:
-                report = report_path(self.output)
-                self._know(report.parent.relative_to(self.folder), written_of(report))
-        return self._own
-
-    def _know(self, place: Path, files: Mapping[str, str]) -> None:
-        for file, digest in files.items():
-            self._written().setdefault((place / file).as_posix(), set()).add(digest)
 
     def _recover(self) -> None:
         """What a killed run left: results that were whole come to their place, the others go."""
@@ -330,7 +323,7 @@ def workspace(folder: str | Path, force: bool = False) -> Iterator[Workspace]:
     if folder.exists() and not folder.is_dir():
         raise ForeignFileError(f"{folder}: expected a folder for the output, found a file")
     if not (folder / HOME).is_dir():
-        _refuse_any(folder)
+        refuse_any(folder)
     with _opened(Workspace(folder, folder / HOME, force)) as space:
         yield space
 
@@ -349,17 +342,17 @@ def beside(output: str | Path, force: bool = False) -> Iterator[Workspace]:
     output = Path(output)
     space = Workspace(output.parent, output.parent / f".{output.name}{HOME}", force, output)
     if output.is_dir() and not (output / HOME).is_dir() and not written_of(report_path(output)):
-        _refuse_any(output)
+        refuse_any(output)
     if output.is_file() and not space.is_ours(output.name):
-        raise ForeignFileError(_refusal(output))
+        raise ForeignFileError(refusal(output))
     with _opened(space):
         yield space
 
 
 @contextlib.contextmanager
 def _opened(space: Workspace) -> Iterator[Workspace]:
-    """Locked, and put right where an earlier run was killed."""
-    key = space.home.absolute()
+    """Locked, and put right where an earlier run was killed; of one that came to nothing, nothing is left."""
+    key, made = space.home.absolute(), [p for p in (space.home, *space.home.parents) if not p.exists()]
     space.home.mkdir(parents=True, exist_ok=True)
     with locked(space.home / "lock", space.output or space.folder):
         space._recover()
@@ -371,37 +364,13 @@ def _opened(space: Workspace) -> Iterator[Workspace]:
             shutil.rmtree(space.home / "making", ignore_errors=True)
             if space.output is not None:
                 space.drop_record("output")                 # the report tells what was written
-            if space.output is None or any(space.home.glob("[drs]*/*")):        # done, ready, steps
+            if any(space.home.glob("[drs]*/*")):            # done, ready, steps
                 space.digests.save()
             else:
                 shutil.rmtree(space.home)
-
-
-def report_path(output: Path) -> Path:
-    """Where the report of an output stands: in a folder, beside a file."""
-    return output / "report.json" if output.is_dir() else output.with_suffix(".report.json")
-
-
-def written_of(report: Path) -> dict[str, str]:
-    """File -> digest of all that a command wrote, as its report tells; nothing where there is no such report."""
-    try:
-        told = json.loads(report.read_text(encoding="utf-8"))["written"]
-    except (OSError, ValueError, KeyError, TypeError, RecursionError):
-        return {}
-    return {**told, report.name: Digests().of_file(report)} if isinstance(told, dict) else {}
-
-
-def _refuse_any(folder: Path) -> None:
-    """Refuse a folder that holds anything but hidden files."""
-    inside = sorted(path for path in folder.iterdir() if not path.name.startswith(".")) if folder.is_dir() else []
-    if inside:
-        raise ForeignFileError(_refusal(*inside))
-
-
-def _refusal(*taken: Path) -> str:
-    more = f" and {len(taken) - SHOWN} more" if len(taken) > SHOWN else ""
-    return (f"{', '.join(str(path) for path in taken[:SHOWN])}{more}: in the way of the output, and not as scapekit "
-            "wrote it; nothing was touched: name another output, or move it away")
+                with contextlib.suppress(OSError):          # others have put something there
+                    for folder in made[1:]:
+                        folder.rmdir()
 
 
 def _plain(name: str) -> str:

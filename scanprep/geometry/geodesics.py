@@ -109,8 +109,8 @@ class HeatGeodesics:
         unused = len(mesh.vertices) - len(np.unique(mesh.faces))
         if unused:
             raise ValueError(f"mesh: expected every vertex to belong to a triangle, {unused} do not")
-        if (mesh.edge_use > 2).any():
-            raise ValueError("mesh: expected at most two triangles at every edge")
+        if not len(mesh.faces) or (mesh.edge_use > 2).any():
+            raise ValueError(f"mesh: expected at most two triangles at every edge, and at least one, got {mesh}")
         self.mesh = mesh
         self._solve = igl.heat_geodesics_solve
         self._data = igl.HeatGeodesicsData()
@@ -118,8 +118,11 @@ class HeatGeodesics:
         self._data.use_intrinsic_delaunay = True
         across = 1.5 * float(np.linalg.norm(np.ptp(mesh.vertices, axis=0)))
         time = max(mesh.mean_edge, across / self.REACH) ** 2
-        igl.heat_geodesics_precompute(np.ascontiguousarray(mesh.vertices), np.ascontiguousarray(mesh.faces), time,
-                                      self._data)
+        try:
+            igl.heat_geodesics_precompute(np.ascontiguousarray(mesh.vertices), np.ascontiguousarray(mesh.faces), time,
+                                          self._data)
+        except RuntimeError as error:
+            raise ValueError(f"mesh: no heat can spread over {mesh} ({error}); SurfaceGraph takes any") from None
 
     def distances(self, sources: np.ndarray | int) -> np.ndarray:
         """Distance (N,), metres, of every vertex to the nearest of the sources (S,).
@@ -132,6 +135,9 @@ class HeatGeodesics:
         found = np.asarray(self._solve(self._data, sources)).reshape(-1)
         for p in np.unique(piece[sources]):
             inside = piece == p
+            if not np.isfinite(found[inside]).all():
+                raise ValueError(f"mesh: no heat can spread over {self.mesh}, as where triangles have no area; "
+                                 "SurfaceGraph takes any")
             mine = sources[piece[sources] == p]
             out[inside] = np.maximum(found[inside] - found[mine].min(), 0)
         out[sources] = 0.0
@@ -139,10 +145,11 @@ class HeatGeodesics:
 
 
 def _checked(mesh: Mesh, sources: np.ndarray | int) -> np.ndarray:
-    vertices = np.asarray(sources, dtype=np.int64)
-    if not vertices.size or vertices.min() < 0 or vertices.max() >= len(mesh.vertices):
+    vertices = np.asarray(sources)
+    whole = vertices.size and np.issubdtype(vertices.dtype, np.integer)
+    if not whole or vertices.min() < 0 or vertices.max() >= len(mesh.vertices):
         raise ValueError(f"sources: expected vertices of 0..{len(mesh.vertices) - 1}, got {sources}")
-    return vertices
+    return vertices.astype(np.int64)
 
 
 def _with_diagonals(mesh: Mesh) -> csr_array:
@@ -154,7 +161,7 @@ def _with_diagonals(mesh: Mesh) -> csr_array:
     lengths = np.maximum(np.r_[mesh.edge_lengths, across], 1e-15)   # a stored zero would mean no edge
     keys = np.minimum(rows, columns) * n + np.maximum(rows, columns)
     order = np.lexsort((lengths, keys))                   # of two ways between the same vertices the shorter
-    first = order[np.r_[True, keys[order][1:] != keys[order][:-1]]]
+    first = order[np.diff(keys[order], prepend=-1) != 0]
     return csr_array(coo_array((lengths[first], (rows[first], columns[first])), shape=(n, n)))
 
 

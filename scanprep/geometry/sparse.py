@@ -25,7 +25,7 @@ def factor(matrix: csc_array) -> Callable[[np.ndarray], np.ndarray]:
     Raises
     ------
     ValueError
-        The matrix is singular.
+        The matrix is singular or not finite.
     """
     try:
         lu = splu(csc_array(matrix), permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0,
@@ -40,6 +40,11 @@ class Factored:
 
     Slower to factor than `factor`, several times faster to solve with three or more columns. Pickled, it is the matrix,
     and factored again where it is read.
+
+    Raises
+    ------
+    ValueError
+        The matrix is empty, not finite or not positive definite.
     """
 
     LIMIT = 128                      # columns cholespy takes in one call
@@ -50,8 +55,13 @@ class Factored:
         self._matrix = matrix
         entries = coo_array(matrix)
         self.size = entries.shape[0]
-        self._solver = CholeskySolverD(self.size, entries.row.astype(np.int32), entries.col.astype(np.int32),
-                                       entries.data.astype(np.float64), MatrixType.COO)
+        if not self.size or not np.isfinite(entries.data).all():
+            raise ValueError(f"matrix: expected finite entries, got a {self.size} x {self.size} matrix without")
+        try:
+            self._solver = CholeskySolverD(self.size, entries.row.astype(np.int32), entries.col.astype(np.int32),
+                                           entries.data.astype(np.float64), MatrixType.COO)
+        except ValueError as error:
+            raise ValueError(f"matrix: the system has no unique solution ({error})") from None
 
     def __reduce__(self) -> tuple[type[Factored], tuple[csc_array]]:
         return Factored, (self._matrix,)

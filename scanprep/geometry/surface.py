@@ -6,7 +6,35 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial import cKDTree
 
+from ..threads import search_threads
 from .mesh import Mesh
+
+FARTHEST = 1e30                      # metres; the square of what lies beyond, or its float32, is infinite
+
+
+def checked_points(points: np.ndarray, name: str = "points") -> np.ndarray:
+    """Query points (n, 3) as float64, in one block; beyond what is finite no library says which triangle is nearest.
+
+    Raises
+    ------
+    ValueError
+        Another shape, a coordinate that is NaN, infinite or above 1e30.
+    """
+    points = np.ascontiguousarray(points, dtype=np.float64)
+    if points.ndim != 2 or points.shape[1] != 3:
+        raise ValueError(f"{name}: expected shape (n, 3), got {points.shape}")
+    bad = np.flatnonzero(~(np.abs(points) < FARTHEST).all(axis=1))
+    if len(bad):
+        raise ValueError(f"{name}: expected finite coordinates below {FARTHEST:g} m, got {len(bad)} of {len(points)} "
+                         f"without, the first is number {bad[0]}: {points[bad[0]].tolist()}")
+    return points
+
+
+def checked_surface(mesh: Mesh) -> tuple[np.ndarray, np.ndarray]:
+    """Vertices and faces of a mesh that has some, in one block each; ValueError without a triangle."""
+    if not len(mesh.faces):
+        raise ValueError(f"mesh: expected at least one triangle, got {mesh}")
+    return checked_points(mesh.vertices, "mesh"), np.ascontiguousarray(mesh.faces)
 
 
 @dataclass(frozen=True)
@@ -37,20 +65,24 @@ class Surface:
     Parameters
     ----------
     mesh : Mesh
+
+    Raises
+    ------
+    ValueError
+        A mesh without triangles.
     """
 
     def __init__(self, mesh: Mesh) -> None:
         import igl
 
         self.mesh = mesh
-        self._vertices = np.ascontiguousarray(mesh.vertices)
-        self._faces = np.ascontiguousarray(mesh.faces)
+        self._vertices, self._faces = checked_surface(mesh)
         self._tree = igl.AABB()
         self._tree.init(self._vertices, self._faces)
 
     def closest(self, points: np.ndarray) -> SurfacePoints:
-        """The point of the surface closest to each query point (n, 3)."""
-        points = np.ascontiguousarray(points, dtype=np.float64)
+        """The point of the surface closest to each query point (n, 3); ValueError for one that is not finite."""
+        points = checked_points(points)
         squared, face, closest = self._tree.squared_distance(self._vertices, self._faces, points)[:3]
         squared, face = np.asarray(squared).reshape(-1), np.asarray(face, dtype=np.int64).reshape(-1)
         closest = np.asarray(closest).reshape(-1, 3)
@@ -108,17 +140,24 @@ class OrientedPoints:
     normals : (m, 3) float, unit
     scale : float, metres
         How much distance a difference of normals weighs.
+
+    Raises
+    ------
+    ValueError
+        No points at all, or one that is not finite.
     """
 
     def __init__(self, points: np.ndarray, normals: np.ndarray, scale: float = 0.05) -> None:
-        self.points, self.normals, self.scale = points, normals, scale
+        if not len(points):
+            raise ValueError("points: expected at least one to search among, got none")
+        self.points, self.normals, self.scale = checked_points(points), checked_points(normals, "normals"), scale
         self._tree = cKDTree(np.hstack([points, scale * normals]))
 
     def match(self, points: np.ndarray, normals: np.ndarray, max_distance: float = np.inf,
               min_cosine: float = 0.5) -> Matches:
-        """The best target of each query (n, 3) with normals (n, 3)."""
-        workers = -1 if len(points) > 4000 else 1        # threads cost more than they save on few points
-        _, index = self._tree.query(np.hstack([points, self.scale * normals]), workers=workers)
+        """The best target of each query (n, 3) with normals (n, 3); ValueError for one that is not finite."""
+        points, normals = checked_points(points), checked_points(normals, "normals")
+        _, index = self._tree.query(np.hstack([points, self.scale * normals]), workers=search_threads(len(points)))
         distances = np.linalg.norm(self.points[index] - points, axis=1)
         cosine = np.einsum("nd,nd->n", self.normals[index], normals)
         good = (distances <= max_distance) & (cosine >= min_cosine)
@@ -138,7 +177,7 @@ class Rays:
         from embreex.mesh_construction import TriangleMesh
 
         # Embree works in float32: centre the mesh so that no accuracy is lost far from the origin.
-        self._origin = mesh.vertices.mean(axis=0)
+        self._origin = mesh.vertices.mean(axis=0) if len(mesh.vertices) else np.zeros(3)
         self._scene = rtcore_scene.EmbreeScene()
         self._mesh = TriangleMesh(self._scene, (mesh.vertices - self._origin)[mesh.faces].astype(np.float32))
 
@@ -158,9 +197,15 @@ class Rays:
             Triangle, -1 for none.
         (n,) float, metres
             Distance, NaN for none.
+
+        Raises
+        ------
+        ValueError
+            An origin or a direction that is not finite: it would seem to hit nothing.
         """
+        origins = checked_points(origins, "origins")
+        along = checked_points(np.broadcast_to(directions, origins.shape), "directions").astype(np.float32)
         start = np.ascontiguousarray(origins - self._origin, dtype=np.float32)
-        along = np.ascontiguousarray(np.broadcast_to(directions, origins.shape), dtype=np.float32)
         hit = self._scene.run(start, along, np.full(len(start), reach, dtype=np.float32), output=True)
         face = np.asarray(hit["primID"], dtype=np.int64)
         return face, np.where(face >= 0, np.asarray(hit["tfar"], dtype=np.float64), np.nan)

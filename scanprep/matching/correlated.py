@@ -15,6 +15,7 @@ import numpy as np
 
 from ..geometry.geodesics import SurfaceGraph
 from ..geometry.mesh import Mesh, check_template
+from ..threads import one_thread
 from .correlated_search import BeliefLevel, CorrelatedConfig, Search
 from .correlated_sheet import Sheet
 from .correspondences import Correspondences, checked_pairs
@@ -24,6 +25,7 @@ from .seeds import find_seeds
 __all__ = ["BeliefLevel", "CorrelatedConfig", "find_correspondences"]
 
 
+@one_thread()
 def find_correspondences(template: Mesh, scan: Mesh | np.ndarray, seeds: tuple[np.ndarray, np.ndarray] | None = None,
                          config: CorrelatedConfig | None = None,
                          progress: Callable[[int, int], None] | None = None) -> Correspondences:

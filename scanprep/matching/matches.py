@@ -8,6 +8,7 @@ from scipy.spatial import cKDTree
 
 from ..geometry.mesh import Mesh
 from ..geometry.surface import OrientedPoints
+from ..threads import search_threads
 from .energies import Pull, pull
 from .thinning import thin
 
@@ -60,7 +61,7 @@ def target_of(scan: Mesh | np.ndarray, neighbours: int = 16, name: str = "scan")
         used = np.unique(scan.faces)
         points, normals = points[used], scan.vertex_normals[used]
     oriented = normals is not None
-    near = cKDTree(points).query(points, min(neighbours, len(points)), workers=-1)[1]
+    near = cKDTree(points).query(points, min(neighbours, len(points)), workers=search_threads(len(points)))[1]
     if normals is not None:
         agree = np.einsum("nkd,nd->nk", normals[near], normals) > 0
         normals = _unit(np.einsum("nk,nkd->nd", agree, normals[near]))
@@ -194,9 +195,8 @@ class Described:
 
     def matched(self, others: Described, reach: float, like: Likeness) -> tuple[np.ndarray, np.ndarray]:
         """For each point the best of others, -1 where it is beyond the limits; and how far apart they are."""
-        workers = -1 if len(self.points) > 4000 else 1          # threads cost more than they save on few points
         mine, theirs = self.columns(like), others.columns(like)
-        _, index = cKDTree(theirs).query(mine, workers=workers)
+        _, index = cKDTree(theirs).query(mine, workers=search_threads(len(mine)))
         apart = np.linalg.norm(others.points[index] - self.points, axis=1)
         good = apart <= reach
         if like.place:

@@ -15,6 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..geometry.mesh import Mesh, check_template
+from ..threads import one_thread
 from .anchors import hints_of
 from .confidence import evidence, missed_share
 from .correspondences import Correspondences, checked_pairs
@@ -73,6 +74,7 @@ class Registration:
     missed: float
 
 
+@one_thread()
 def register(template: Mesh, scan: Mesh | np.ndarray, landmarks: tuple[np.ndarray, np.ndarray] | None = None,
              config: RegistrationConfig | None = None, progress: Callable[[int, int], None] | None = None,
              correspondences: Correspondences | None = None) -> Registration:

@@ -8,6 +8,7 @@ from scipy.spatial import cKDTree
 
 from ..geometry import rotations
 from ..geometry.mesh import Mesh
+from ..threads import search_threads
 from .matches import target_of
 
 
@@ -118,7 +119,7 @@ def align_rigid(source: Mesh | np.ndarray, target: Mesh | np.ndarray,
     settled, rounds, rms, inliers = False, 0, np.nan, 0
     while rounds < config.iterations and not settled:
         moved = apply(T, moving)
-        distance, near = tree.query(moved, workers=-1)
+        distance, near = tree.query(moved, workers=search_threads(len(moved)))
         good = (distance <= config.reach) & (distance <= np.quantile(distance, config.keep)) & ~goal.border[near]
         inliers = int(good.sum())
         if inliers < 6:

@@ -9,6 +9,7 @@ import numpy as np
 
 from ..geometry.geodesics import SurfaceGraph
 from ..geometry.mesh import Mesh, check_template
+from ..threads import one_thread
 from .correlated_search import BeliefLevel, CorrelatedConfig, Search
 from .correlated_sheet import Sheet
 from .correspondences import Correspondences
@@ -49,6 +50,7 @@ class SeedConfig:
     check: CorrelatedConfig = field(default_factory=lambda: QUICK)
 
 
+@one_thread()
 def find_seeds(template: Mesh, scan: Mesh | np.ndarray, config: SeedConfig | None = None) -> Correspondences:
     """The ends of the limbs on template and scan, with no click.
 

@@ -8,6 +8,7 @@ from scipy.spatial import cKDTree
 
 from ..geometry.mesh import Mesh
 from ..geometry.surface import OrientedPoints
+from ..threads import search_threads
 from .energies import Pull, pull
 from .matches import Target, orient
 
@@ -44,7 +45,7 @@ def skin_of(target: Target, width: float, neighbours: int = 40) -> Skin:
         Points count by a Gaussian of this standard deviation.
     """
     P, n = target.points, target.normals
-    apart, near = cKDTree(P).query(P, min(neighbours, len(P)), workers=-1)
+    apart, near = cKDTree(P).query(P, min(neighbours, len(P)), workers=search_threads(len(P)))
     agree = np.einsum("nkd,nd->nk", n[near], n)
     w = np.exp(-0.5 * (apart / width) ** 2) * np.maximum(agree, 0)
     side = np.cross(n, np.eye(3)[np.argmin(np.abs(n), axis=1)])

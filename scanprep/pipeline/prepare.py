@@ -19,9 +19,10 @@ from ..geometry.landmarks import write_landmarks
 from ..geometry.mesh import Mesh, check_template
 from ..skeleton.find import find_skeleton
 from ..skeleton.parts import SkeletonConfig
+from ..threads import one_thread
 from .figures import Failure, ScanFigures, write_failures, write_figures
 from .page import PICTURES, write_set_page
-from .scan import ScanSettings, one_thread, register_scan
+from .scan import ScanSettings, register_scan
 from .scans import ScanTask
 
 Progress = Callable[[int, int], None]
@@ -114,8 +115,6 @@ def prepare(tasks: Sequence[ScanTask], template: Mesh, template_landmarks: Mappi
         try:
             done = space.run(work, [Task(SCANS + task.name, task) for task in tasks], config.workers, progress)
             failures, fresh = {name.removeprefix(SCANS): line for name, line in done.failures.items()}, done.fresh
-            for name in done.failures:
-                space.drop(name)                    # what an earlier run made of other files than there are now
             registered = tables.write(failures)
             _with_skeleton(space, registered, config, skeleton_progress)
         finally:

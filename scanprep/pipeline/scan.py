@@ -1,12 +1,9 @@
 """One scan of a folder: read, registered, measured, its picture taken."""
 from __future__ import annotations
 
-import contextlib
-import threading
 import time
-from collections.abc import Iterator
 from dataclasses import dataclass, field, replace
-from typing import Any, Literal
+from typing import Literal
 
 import numpy as np
 
@@ -16,6 +13,7 @@ from ..geometry.mesh import Mesh
 from ..matching.correlated import CorrelatedConfig, find_correspondences
 from ..matching.correspondences import Correspondences
 from ..matching.nonrigid import Registration, RegistrationConfig, register
+from ..threads import one_thread
 from .figures import ScanFigures, stretched_share
 from .scans import ScanTask, read_scan
 
@@ -138,31 +136,3 @@ def _measure(task: ScanTask, template: Mesh, fit: Registration, guide: str) -> S
         task.name, guide, float(np.nanmean(fit.distances)) if fit.seen.any() else np.nan, fit.rms,
         float(fit.seen.mean()), float(fit.confidence.mean()), fit.missed,
         stretched_share(template, fit.mesh), fit.landmark_rms, fit.flipped, fit.converged)
-
-
-_guard = threading.Lock()
-_limits: list[Any] = []
-_users = 0
-
-
-@contextlib.contextmanager
-def one_thread() -> Iterator[None]:
-    """One thread for linear algebra in this process.
-
-    Scans in parallel do not take each other's cores, and the order of sums, and with it the last digits, do not
-    depend on where a scan is registered. The first of several users sets the limit, the last lifts it.
-    """
-    from threadpoolctl import threadpool_limits
-
-    global _users
-    with _guard:
-        _users += 1
-        if not _limits:
-            _limits.append(threadpool_limits(1))
-    try:
-        yield
-    finally:
-        with _guard:
-            _users -= 1
-            if not _users:
-                _limits.pop().restore_original_limits()

@@ -6,6 +6,7 @@ from collections.abc import Callable
 import numpy as np
 
 from ..geometry.mesh import Mesh
+from ..threads import one_thread
 from .parts import SkeletonConfig
 from .search import search_skeleton
 from .tree import Skeleton
@@ -13,6 +14,7 @@ from .tree import Skeleton
 __all__ = ["SkeletonConfig", "find_skeleton"]
 
 
+@one_thread()
 def find_skeleton(template: Mesh, poses: np.ndarray, config: SkeletonConfig | None = None,
                   progress: Callable[[int, int], None] | None = None) -> Skeleton:
     """Rigid parts, the tree over them, and the joints, from registered poses of one body.

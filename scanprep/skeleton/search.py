@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from ..geometry.mesh import Mesh, check_template
+from ..threads import one_thread
 from .bands import dissolve_bands, passages
 from .joints import (
     LOOP_SEPARATION,
@@ -104,6 +105,7 @@ class SkeletonSearch:
         return len(self.energies)
 
 
+@one_thread()
 def search_skeleton(template: Mesh, poses: np.ndarray, config: SkeletonConfig | None = None,
                     progress: Callable[[int, int], None] | None = None) -> SkeletonSearch:
     """The skeleton of `find_skeleton`, with the loops, the symmetry and the restarts it came from.

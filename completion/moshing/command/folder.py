@@ -10,14 +10,13 @@ import numpy as np
 
 from scanprep.batch.pool import Progress, Workers
 from scanprep.batch.workspace import Task, Workspace
-from scanprep.console import Metric
+from scanprep.console import PROBLEM, Metric
 from scanprep.pictures.page import Page
 
 from .recordings import TABLE, Actor, write_table
 from .report import PICTURE
 from .work import ERRORS, Work
 
-PROBLEM = "problem"                  # the row that says why the figures of a person mean nothing
 _STYLE = """.person { display: grid; grid-template-columns: minmax(17rem, 1fr) 2fr; gap: 1rem; margin: 1.6rem 0; }
 .person img { width: 100%; } .person p { margin: .2rem 0; }"""
 

@@ -15,7 +15,6 @@ from scanprep.batch.pool import Room
 from scanprep.console import Metric, Outcome, write_report
 from scanprep.pictures.sheets import save_png
 from scanprep.pictures.views import upright
-from scanprep.pipeline.scan import one_thread
 
 from ...animation.report import morph_frames
 from ...animation.retarget import retarget
@@ -81,8 +80,7 @@ class Work:
     command: str = field(metadata={"digest": False})
 
     def __call__(self, actor: Actor, room: Room) -> tuple[list[Metric], list[str]]:
-        with one_thread():
-            return mosh_person(self, actor, room)
+        return mosh_person(self, actor, room)
 
 
 @dataclass(frozen=True, eq=False)
@@ -176,17 +174,17 @@ def _write(work: Work, found: _Found, take: Take, room: Room, settings: Mapping[
     solved = found.model, take.markers, take.motion, take.soft, take.faults, take.held
 
     def files(folder: Path) -> None:
-        (folder / take.name).mkdir()
+        (folder / take.name).mkdir(exist_ok=True)
         write_take(folder / take.name, take, work.keys, work.factor)
 
     def character(folder: Path) -> tuple[Any, str]:
-        (folder / take.name).mkdir()
+        (folder / take.name).mkdir(exist_ok=True)
         assert work.character is not None, "asked for"
         return _character(work.character, take, folder / take.name, work.keys, work.factor)
 
     def page(folder: Path) -> None:
         start, place = time.perf_counter(), folder / take.name
-        place.mkdir()
+        place.mkdir(exist_ok=True)
         page = take_page(take, metrics)
         if shown is not None:
             page.section("On a character", "The same turns of the joints, and feet on the ground when those of the "

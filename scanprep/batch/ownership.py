@@ -1,0 +1,81 @@
+"""What in an output is scapekit's own, and what is not and is left alone."""
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping
+from pathlib import Path
+
+from .digests import Digests
+
+HOME = ".scapekit"
+SHOWN = 3                                 # files that a message names
+
+
+class ForeignFileError(ValueError):
+    """Something stands where an output should go, and scapekit did not write it."""
+
+
+class Ownership:
+    """Which files of a folder are as scapekit wrote them.
+
+    Parameters
+    ----------
+    folder : Path
+    digests : Digests
+    """
+
+    def __init__(self, folder: Path, digests: Digests) -> None:
+        self.folder, self.digests = folder, digests
+        self._written: dict[str, set[str]] = {}
+
+    def add(self, files: Mapping[str, str], place: Path) -> None:
+        """Files, from a place in the folder on, with the digests that they were written with."""
+        for file, digest in files.items():
+            self._written.setdefault((place.relative_to(self.folder) / file).as_posix(), set()).add(digest)
+
+    def has(self, file: str) -> bool:
+        """Whether a file was written by scapekit and has not been changed since."""
+        return self.digests.of_file(self.folder / file) in self._written.get(file, ())
+
+    def check_free(self, files: Mapping[str, str]) -> None:
+        """Refuse to write files with these digests where something else stands.
+
+        Raises
+        ------
+        ForeignFileError
+        """
+        taken = []
+        for file, digest in files.items():
+            place = self.folder / file
+            if place.is_dir() or any(p.is_file() for p in place.parents if self.folder in p.parents) \
+                    or (place.exists() and self.digests.of_file(place) != digest and not self.has(file)):
+                taken.append(place)
+        if taken:
+            raise ForeignFileError(refusal(*taken))
+
+
+def report_path(output: Path) -> Path:
+    """Where the report of an output stands: in a folder, beside a file."""
+    return output / "report.json" if output.is_dir() else output.with_suffix(".report.json")
+
+
+def written_of(report: Path) -> dict[str, str]:
+    """File -> digest of all that a command wrote, as its report tells; nothing where there is no such report."""
+    try:
+        told = json.loads(report.read_text(encoding="utf-8"))["written"]
+    except (OSError, ValueError, KeyError, TypeError, RecursionError):
+        return {}
+    return {**told, report.name: Digests().of_file(report)} if isinstance(told, dict) else {}
+
+
+def refuse_any(folder: Path) -> None:
+    """Refuse a folder that holds anything but hidden files."""
+    inside = sorted(path for path in folder.iterdir() if not path.name.startswith(".")) if folder.is_dir() else []
+    if inside:
+        raise ForeignFileError(refusal(*inside))
+
+
+def refusal(*taken: Path) -> str:
+    more = f" and {len(taken) - SHOWN} more" if len(taken) > SHOWN else ""
+    return (f"{', '.join(str(path) for path in taken[:SHOWN])}{more}: in the way of the output, and not as scapekit "
+            "wrote it; nothing was touched: name another output, or move it away")

@@ -1,0 +1,354 @@
+"""Work that is done once: what is kept, what is done anew, what is whole, and what is left alone."""
+import dataclasses
+import json
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from scanprep import Mesh, console
+from scanprep.batch import digests as digests_module
+from scanprep.batch import workspace as room
+from scanprep.batch.digests import Digests
+from scanprep.batch.ownership import HOME, ForeignFileError
+from scanprep.batch.pool import Job, Workers, attempt
+from scanprep.batch.values import load_value, save_value
+from scanprep.batch.workspace import FileWorkspace, Task, Workspace, beside, workspace
+from scanprep.cli import Output
+from scanprep.console import Metric, Outcome
+from scanprep.geometry import storage
+
+TRIANGLE = Mesh(np.eye(3), [[0, 1, 2]])
+
+
+@dataclasses.dataclass(frozen=True)
+class Copy:
+    """Copies files in capitals, and counts how often in a file of its own."""
+
+    count: Path = dataclasses.field(metadata={"digest": False})
+    ending: str = "!"
+
+    def __call__(self, given, room):
+        with open(self.count, "a") as out:
+            out.write("x")
+        text = given.read_text()
+        if "bad" in text:
+            raise ValueError(f"{given}: bad")
+        length = room.step("length", given, lambda: len(text))
+        (room.folder / "copy.txt").write_text(text.upper() + self.ending)
+        return length
+
+
+@pytest.fixture
+def texts(tmp_path):
+    (tmp_path / "in").mkdir()
+    for name in ("a", "b", "c"):
+        (tmp_path / "in" / f"{name}.txt").write_text(f"text of {name}")
+    return sorted((tmp_path / "in").iterdir())
+
+
+def copied(tmp_path, texts, ending="!", workers=1, force=False):
+    """Results, and how many were made."""
+    (tmp_path / "count").write_text("")
+    with workspace(tmp_path / "out", force) as space:
+        done = space.run(Copy(tmp_path / "count", ending), [Task(p.stem, p, p.stem) for p in texts], Workers(workers))
+    return done, len((tmp_path / "count").read_text())
+
+
+def tree(folder):
+    return {str(p.relative_to(folder)): p.read_bytes() for p in sorted(folder.rglob("*"))
+            if p.is_file() and HOME not in p.parts}
+
+
+@pytest.mark.parametrize("value", [
+    None, True, 3, 0.1, float("nan"), "text", [1, "a"], (1, (2.5, None)), {"a": [1], 2: "b"}, Path("a/b"),
+    np.arange(6.0).reshape(2, 3), np.float32(0.1), np.zeros((0, 3)), np.array(["a", "bc"]), TRIANGLE,
+    [Metric("distance", np.float64(1.5), "mm")]], ids=lambda v: type(v).__name__)
+def test_a_value_comes_back_as_it_was(tmp_path, value):
+    save_value(tmp_path / "v.npz", value, {})
+    back = load_value(tmp_path / "v.npz")
+    digests = Digests()
+    assert type(back) is type(value)
+    if not isinstance(value, Path):
+        assert digests.of(back) == digests.of(value)
+    else:
+        assert back == value
+
+
+def test_values_of_other_kinds_are_refused(tmp_path):
+    for wrong in (object(), np.array([None]), pytest):
+        with pytest.raises(TypeError):
+            save_value(tmp_path / "v.npz", wrong, {})
+    assert not list(tmp_path.iterdir())
+
+
+def test_a_stored_value_can_name_no_class_of_others(tmp_path):
+    told = {"class": "subprocess:Popen", "fields": {}}
+    header = json.dumps({"kind": "result", "version": 1, "value": told})
+    np.savez(tmp_path / "v.npz", header=np.array(header))
+    with pytest.raises(storage.StorageError, match="not of this project"):
+        load_value(tmp_path / "v.npz")
+
+
+def test_digests_change_with_everything(tmp_path):
+    file = tmp_path / "f"
+    file.write_bytes(b"one")
+    values = [1, 1.0, "1", True, None, [1], [1, 1], [[1], 1], {"a": 1}, {"b": 1}, np.ones(1), np.ones(2),
+              np.ones((1, 2)), np.ones(1, dtype=np.float32), file, TRIANGLE, Metric("a", 1), Metric("a", 2),
+              ("ab", "c"), ("a", "bc")]
+    digests = Digests()
+    found = [digests.of(value) for value in values]
+    assert len(set(found)) == len(values)
+    assert found == [Digests().of(value) for value in values]
+    file.write_bytes(b"two")
+    assert digests.of(file) not in found
+
+
+def test_a_file_is_read_once_until_it_changes(tmp_path, monkeypatch):
+    file = tmp_path / "f"
+    file.write_bytes(b"one")
+    first = Digests(tmp_path / "known.json")
+    one = first.of_file(file)
+    first.save()
+    assert not (tmp_path / "known.json").exists()                # it had just been written: clocks are coarse
+    monkeypatch.setattr(digests_module, "SETTLED", -10**12)
+    first.of_file(file)
+    first.save()
+    again = Digests(tmp_path / "known.json")
+    stat = os.stat(file)
+    monkeypatch.setattr("builtins.open", None)                   # it is not read
+    assert again.of_file(file) == one
+    monkeypatch.undo()
+    file.write_bytes(b"two")                                     # of the same size
+    os.utime(file, ns=(stat.st_atime_ns, stat.st_mtime_ns))      # and, as they say, of the same time
+    assert again.of_file(file) != one
+
+
+def test_only_what_depends_on_a_change_is_done_anew(tmp_path, texts):
+    done, made = copied(tmp_path, texts)
+    assert made == 3 and done.values == {"a": 9, "b": 9, "c": 9} and done.fresh == ("a", "b", "c")
+    before = tree(tmp_path / "out")
+    assert copied(tmp_path, texts)[1] == 0
+    texts[1].write_text("longer text of b")
+    done, made = copied(tmp_path, texts)
+    assert made == 1 and done.values["b"] == 16 and done.fresh == ("b",)
+    assert {n for n, data in tree(tmp_path / "out").items() if data != before[n]} == {"b/copy.txt"}
+    assert copied(tmp_path, texts, "?")[1] == 3                  # a setting
+    assert copied(tmp_path, texts, "?", force=True)[1] == 3
+    shutil.move(tmp_path / "out", tmp_path / "elsewhere")
+    shutil.move(tmp_path / "elsewhere", tmp_path / "out")
+    (tmp_path / "out" / "a" / "copy.txt").unlink()
+    assert copied(tmp_path, texts, "?")[1] == 1                  # a file that is gone
+    record = tmp_path / "out" / HOME / "done" / "c.npz"
+    record.write_bytes(record.read_bytes()[:-40])
+    assert copied(tmp_path, texts, "?")[1] == 1                  # a result that is damaged
+
+
+def test_processes_change_nothing(tmp_path, texts):
+    copied(tmp_path, texts)
+    one = tree(tmp_path / "out")
+    shutil.rmtree(tmp_path / "out")
+    assert copied(tmp_path, texts, workers=2)[0].values == {"a": 9, "b": 9, "c": 9}
+    assert tree(tmp_path / "out") == one
+
+
+def test_a_failure_stops_no_other_and_nothing_stale_stays(tmp_path, texts):
+    copied(tmp_path, texts)
+    texts[0].write_text("bad")
+    done, _ = copied(tmp_path, texts)
+    assert done.failures == {"a": f"{texts[0]}: bad"} and set(done.values) == {"b", "c"}
+    assert set(tree(tmp_path / "out")) == {"b/copy.txt", "c/copy.txt"}
+    assert attempt(Copy(tmp_path / "count"), Job("n", tmp_path / "none.txt", tmp_path / "x")).reason.startswith(
+        "[Errno 2] No such file or directory") and str(tmp_path / "none.txt")
+
+
+def test_what_is_not_ours_stays(tmp_path, texts):
+    with pytest.raises(ForeignFileError, match="nothing was touched"), workspace(tmp_path / "in"):
+        pass
+    assert sorted(p.name for p in (tmp_path / "in").iterdir()) == ["a.txt", "b.txt", "c.txt"]
+    copied(tmp_path, texts[:2])
+    (tmp_path / "out" / "c").mkdir()
+    (tmp_path / "out" / "c" / "mine.txt").write_text("mine")
+    (tmp_path / "out" / "a" / "notes.txt").write_text("mine too")
+    (tmp_path / "out" / "b" / "copy.txt").write_text("edited")
+    for path in texts:
+        path.write_text("changed")
+    done, made = copied(tmp_path, texts)
+    assert set(done.failures) == {"b", "c"} and made == 2
+    assert str(tmp_path / "out" / "c") in done.failures["c"] and "copy.txt" in done.failures["b"]
+    assert tree(tmp_path / "out") == {"a/copy.txt": b"CHANGED!", "a/notes.txt": b"mine too", "b/copy.txt": b"edited",
+                                      "c/mine.txt": b"mine"}
+
+
+@pytest.mark.parametrize("at", range(12))
+def test_killed_between_any_two_moves(tmp_path, texts, monkeypatch, at):
+    """A run that ends between any two renames leaves what the next run puts right."""
+    copied(tmp_path, texts)
+    for path in texts:
+        path.write_text("changed " + path.name)
+    calls = []
+
+    class Killed(BaseException):
+        pass
+
+    def replace(source, target):
+        calls.append(source)
+        if len(calls) == at + 1:
+            raise Killed
+        os.rename(source, target)
+
+    monkeypatch.setattr(room.os, "replace", replace)
+    monkeypatch.setattr(room.shutil, "rmtree", lambda *args, **named: None)        # nobody tidies up
+    try:
+        copied(tmp_path, texts)
+    except Killed:
+        pass
+    monkeypatch.undo()
+    done, made = copied(tmp_path, texts)
+    assert not done.failures and made <= 3
+    assert tree(tmp_path / "out") == {f"{p.stem}/copy.txt": f"CHANGED {p.name.upper()}!".encode() for p in texts}
+    assert not any((tmp_path / "out" / HOME / place).exists() and os.listdir(tmp_path / "out" / HOME / place)
+                   for place in ("ready", "making"))
+
+
+def test_files_that_a_result_has_no_more_go(tmp_path):
+    with workspace(tmp_path / "out") as space:
+        space.step("s", 1, lambda folder: [(folder / n).write_text(n) for n in ("x", "y")])
+        (tmp_path / "out" / "y").write_text("edited")
+        space.step("s", 2, lambda folder: (folder / "z").write_text("z"))
+    assert set(tree(tmp_path / "out")) == {"y", "z"}
+
+
+def test_a_second_run_is_told_and_leaves(tmp_path):
+    code = ("import sys\nfrom scanprep.batch.workspace import workspace\nwith workspace(sys.argv[1]):\n"
+            "    print('in', flush=True)\n    sys.stdin.read()\n")
+    other = subprocess.Popen([sys.executable, "-c", code, str(tmp_path / "out")], stdin=subprocess.PIPE,
+                             stdout=subprocess.PIPE)
+    assert other.stdout.readline() == b"in\n"
+    with pytest.raises(ValueError, match=f"another run is at work .*process {other.pid} "), \
+            workspace(tmp_path / "out"):
+        pass
+    other.communicate()
+    assert not (tmp_path / "out").exists()                       # neither of them did anything
+
+
+def test_workers_go_when_the_run_is_killed(tmp_path):
+    code = ("import os, sys, time\nfrom scanprep.batch.pool import Job, Workers, run_jobs\nfrom pathlib import Path\n"
+            "from test_scanprep_batch import Sleep\n"
+            "place = Path(sys.argv[1])\n"
+            "list(run_jobs(Sleep(), [Job(str(i), place, place) for i in range(2)], Workers(2)))")
+    run = subprocess.Popen([sys.executable, "-c", code, str(tmp_path)], cwd=Path(__file__).parent)
+    while len(pids := [int(p.name) for p in tmp_path.glob("[0-9]*")]) < 2:
+        assert run.poll() is None
+    run.kill()
+    run.wait()
+    for _ in range(100):
+        if not any(Path(f"/proc/{pid}").exists() and "Z" not in Path(f"/proc/{pid}/stat").read_text().split()[2]
+                   for pid in pids):
+            break
+        subprocess.run(["sleep", "0.1"], check=True)
+    else:
+        pytest.fail("workers outlive the run")
+
+
+@dataclasses.dataclass(frozen=True)
+class Sleep:
+    """Says which process it is, and sleeps."""
+
+    def __call__(self, given, room):
+        (given / str(os.getpid())).touch()
+        subprocess.run(["sleep", "60"], check=True)
+
+
+def write(output: Output, text: str = "text") -> Outcome:
+    """Write."""
+    if text == "fail":
+        output.write_text("half")
+        raise ValueError(f"{output}: failed")
+    output.write_text(text)
+    output.with_suffix(".more.txt").write_text(text)
+    return Outcome(output, [Metric("letters", len(text))])
+
+
+def write_folder(output: Output) -> Outcome:
+    """Write a folder."""
+    (output / "inner").mkdir(parents=True)
+    (output / "inner" / "a.txt").write_text("a")
+    return Outcome(output, [])
+
+
+def resumed(output: Output, text: str = "text", *, space: Workspace) -> Outcome:
+    """Write in steps."""
+    length = space.step("s", text, lambda folder: (folder / "a.txt").write_text(text))
+    return Outcome(output, [Metric("letters", length)])
+
+
+def learned(output: Output, text: str = "text", *, space: FileWorkspace) -> Outcome:
+    """Write a file in steps."""
+    length = space.step("s", text, lambda folder: len(text))
+    output.write_text(text)
+    return Outcome(output, [Metric("letters", length)])
+
+
+def command(function, output, *words):
+    return console.run(function, "scape x", ["--output", str(output), *words])
+
+
+def test_an_output_file_that_is_not_ours_stays(tmp_path, capsys):
+    out = tmp_path / "a.txt"
+    assert command(write, out) == 0 and out.read_text() == "text"
+    assert command(write, out, "--text", "other") == 0 and out.read_text() == "other"
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["a.more.txt", "a.report.json", "a.txt"]
+    report = json.loads((tmp_path / "a.report.json").read_text())
+    assert set(report["written"]) == {"a.txt", "a.more.txt"}
+    for name in ("a.txt", "a.more.txt"):
+        before = {**tree(tmp_path), name: b"edited"}
+        (tmp_path / name).write_text("edited")
+        assert command(write, out, "--text", "third") == 1
+        assert f"{tmp_path / name}: in the way of the output" in capsys.readouterr().err
+        assert tree(tmp_path) == before
+        (tmp_path / name).write_text("other")
+
+
+def test_a_command_that_fails_writes_nothing(tmp_path, capsys):
+    assert command(write, tmp_path / "new" / "a.txt", "--text", "fail") == 1
+    assert capsys.readouterr().err == f"scape x: {tmp_path / 'new' / 'a.txt'}: failed\n"
+    assert not list(tmp_path.iterdir())
+
+
+def test_an_output_folder_that_is_not_ours_stays(tmp_path, capsys):
+    out = tmp_path / "out"
+    assert command(write_folder, out) == 0 and command(write_folder, out) == 0
+    assert set(tree(out)) == {"inner/a.txt", "report.json"} and sorted(os.listdir(tmp_path)) == ["out"]
+    foreign = tmp_path / "mine"
+    (foreign / "inner").mkdir(parents=True)
+    (foreign / "note.txt").write_text("mine")
+    for function in (write_folder, resumed):
+        assert command(function, foreign) == 1
+        assert tree(foreign) == {"note.txt": b"mine"} and not (foreign / HOME).exists()
+    assert "in the way of the output" in capsys.readouterr().err
+
+
+def test_a_report_in_the_way_is_one_line(tmp_path, capsys):
+    assert command(resumed, tmp_path / "out") == 0
+    shutil.rmtree(tmp_path / "out" / "report.json", ignore_errors=True)
+    (tmp_path / "out" / "report.json").unlink()
+    (tmp_path / "out" / "report.json").mkdir()
+    assert command(resumed, tmp_path / "out") == 1
+    assert "report.json: in the way of the output" in capsys.readouterr().err
+
+
+def test_steps_of_a_file_are_kept_beside_it(tmp_path):
+    out = tmp_path / "m.npz"
+    assert command(learned, out) == 0
+    home = tmp_path / f".m.npz{HOME}"
+    when = (home / "done" / "s.npz").stat().st_mtime_ns
+    assert command(learned, out) == 0 and (home / "done" / "s.npz").stat().st_mtime_ns == when
+    assert command(learned, out, "--force") == 0 and (home / "done" / "s.npz").stat().st_mtime_ns != when
+    with beside(out) as space:
+        space.drop_record("s")
+    assert not home.exists() and out.exists()
