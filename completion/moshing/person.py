@@ -2,10 +2,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from functools import partial
 
 import numpy as np
 
 from model.body import BodyModel
+from scanprep.batch.pool import Step, once
 from scanprep.geometry import rotations
 from scanprep.threads import one_thread
 
@@ -26,7 +28,8 @@ FEW_SEEN = 0.9                       # of the most markers that any frame has; f
 
 @one_thread()
 def find_person(model: BodyModel, sequences: MarkerSequence | Sequence[MarkerSequence], layout: MarkerLayout,
-                config: PersonConfig | None = None, progress: Progress | None = None) -> PersonFit:
+                config: PersonConfig | None = None, progress: Progress | None = None, step: Step = once
+                ) -> PersonFit:
     """The betas of a person and the places of the markers on the skin, from some frames of one or more sequences.
 
     Betas, latent markers and the pose and place in each frame are solved for together, at first held close to the
@@ -42,6 +45,8 @@ def find_person(model: BodyModel, sequences: MarkerSequence | Sequence[MarkerSeq
     config : PersonConfig, optional
     progress : callable, optional
         Called with (done, total).
+    step : callable, optional
+        Keeps the person, and what leads there, as `Room.step` does.
 
     Raises
     ------
@@ -54,13 +59,19 @@ def find_person(model: BodyModel, sequences: MarkerSequence | Sequence[MarkerSeq
     config, sequences = config or PersonConfig(), one_or_more(sequences)
     _check(model, config)
     known, positions = common_markers(sequences, layout)
+    return step("person", (model, known, positions, config),
+                lambda: _find(model, known, positions, config, progress or (lambda done, total: None), step))
+
+
+def _find(model: BodyModel, known: MarkerLayout, positions: Sequence[np.ndarray], config: PersonConfig, tell: Progress,
+          step: Step) -> PersonFit:
     chosen = choose_frames(positions, config)
     targets = np.concatenate(positions)[chosen]
     total = len(chosen) + len(config.annealing)
-    tell = progress or (lambda done, total: None)
+    given = model, known, targets, config
     starts = FrameStarts(model.subject(np.zeros(min(config.n_betas, model.n_betas))), known, START_SD, START_PRIOR,
                          config.prior_shrinkage, config.start_axes)
-    x = starts.find(targets, lambda done: tell(done, total))
+    x = step("person, start", given, lambda: starts.find(targets, lambda done: tell(done, total)))
     fit = LatentFit(model, starts.body, known, targets, config)
     state, steps, converged = fit.start(x), 0, False
     for i, factor in enumerate(config.annealing):
@@ -69,7 +80,7 @@ def find_person(model: BodyModel, sequences: MarkerSequence | Sequence[MarkerSeq
             state = fit.with_loose_found(state)
         elif i and (i % EVERY or last):
             state = fit.reattached(state)
-        state, end = fit.solve(state, factor, last)
+        state, end = step(f"person, stage {i}", given, partial(fit.solve, state, factor, last))
         steps, converged = steps + end.iterations, end.converged
         tell(len(chosen) + i + 1, total)
     return _result(fit, state, _whose(positions, chosen), converged, steps)

@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 
 from model.body import BodyModel
 from model.learning.sex_plane import SexGuess, guess_sex, sex_plane
+from scanprep.batch.pool import Step, once, under
 from scanprep.threads import one_thread
 
 from ..markers.files import MarkerSequence
@@ -41,7 +42,8 @@ class SexedMosh:
 
 @one_thread()
 def mosh_by_sex(models: Mapping[str, BodyModel], sequences: MarkerSequence | Sequence[MarkerSequence],
-                layout: MarkerLayout, config: MoshConfig | None = None, progress: Progress | None = None) -> SexedMosh:
+                layout: MarkerLayout, config: MoshConfig | None = None, progress: Progress | None = None,
+                step: Step = once) -> SexedMosh:
     """As `mosh`, with the model of the person's sex.
 
     The neutral model finds a body, its betas tell the sex, and all is done with the model of that sex.
@@ -50,7 +52,7 @@ def mosh_by_sex(models: Mapping[str, BodyModel], sequences: MarkerSequence | Seq
     ----------
     models : {"neutral", "female", "male": BodyModel}
         As `learn_by_sex` makes them, of one topology; the neutral one keeps what tells women from men.
-    sequences, layout, config, progress
+    sequences, layout, config, progress, step
         As for `mosh`.
 
     Raises
@@ -65,9 +67,9 @@ def mosh_by_sex(models: Mapping[str, BodyModel], sequences: MarkerSequence | Seq
 
     checked_models(models)
     config = config or MoshConfig()
-    neutral = find_person(models["neutral"], sequences, layout, config.person)
+    neutral = find_person(models["neutral"], sequences, layout, config.person, None, under(step, "neutral "))
     guess = guess_sex(models["neutral"], neutral.betas)
-    result = mosh(models[guess.sex], sequences, layout, config, progress)
+    result = mosh(models[guess.sex], sequences, layout, config, progress, step)
     motions = tuple(replace(motion, gender=guess.sex) for motion in result.motions)
     soft = tuple(replace(one, motion=replace(one.motion, gender=guess.sex)) for one in result.soft_tissue)
     return SexedMosh(guess, models[guess.sex], neutral, replace(result, motions=motions, soft_tissue=soft))

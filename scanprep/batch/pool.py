@@ -3,6 +3,7 @@ from __future__ import annotations
 
 import contextlib
 import os
+import shutil
 import threading
 import time
 import warnings
@@ -17,6 +18,7 @@ from .digests import Digests, paths_of
 from .values import load_header, load_value, save_value
 
 Progress = Callable[[int, int], None]
+Step = Callable[[str, Any, Callable[[], Any]], Any]         # as `Room.step`
 T = TypeVar("T")
 WATCH = 0.2                    # seconds between two looks whether the process that wants the work is still there
 
@@ -99,10 +101,51 @@ class Room:
         if (not self._force or name in self._made) and (load_header(path) or {}).get("digest") == key:
             with contextlib.suppress(storage.StorageError):
                 return load_value(path)
-        value = make()
-        save_value(path, value, {"digest": key})
+        save_value(path, make(), {"digest": key})
         self._made.add(name)
+        return load_value(path)          # arrays as they are stored: their order in memory tells in the last digits
+
+    def files(self, name: str, inputs: Any, make: Callable[[Path], T]) -> T:
+        """As `step`; `make` gets a folder, and what it writes there comes into `self.folder`."""
+        if self._steps is None:
+            return make(self.folder)
+        kept = self._steps / f"{name}.files"
+
+        def made() -> tuple[T, dict[str, str]]:
+            shutil.rmtree(kept, ignore_errors=True)
+            kept.mkdir(parents=True)
+            return make(kept), self._held(kept)
+
+        value, files = self.step(name, inputs, made)
+        if self._held(kept) != files:                    # other ones than those of the step
+            (self._steps / f"{name}.npz").unlink()
+            value, files = self.step(name, inputs, made)
+        for file in files:
+            (self.folder / file).parent.mkdir(parents=True, exist_ok=True)
+            _link(kept / file, self.folder / file)
         return value
+
+    def _held(self, folder: Path) -> dict[str, str]:
+        return {path.relative_to(folder).as_posix(): self._digests.of_file(path)
+                for path in sorted(folder.rglob("*")) if path.is_file()}
+
+
+def once(name: str, inputs: Any, make: Callable[[], T]) -> T:
+    """As `Room.step` where nothing is kept."""
+    return make()
+
+
+def under(step: Step, prefix: str) -> Step:
+    """A step whose names begin with a prefix."""
+    return lambda name, inputs, make: step(f"{prefix}{name}", inputs, make)
+
+
+def _link(path: Path, place: Path) -> None:
+    """The same file under another name, or a copy where that cannot be."""
+    try:
+        os.link(path, place)
+    except OSError:
+        shutil.copyfile(path, place)
 
 
 def run_jobs(work: Any, jobs: Sequence[Job], workers: Workers, inside: Progress | None = None

@@ -181,8 +181,7 @@ class Workspace:
     def drop(self, name: str) -> None:
         """Remove a result and its files, as far as they are as scapekit wrote them."""
         for file, digest in (load_header(self._record(name)) or {"files": {}})["files"].items():
-            if self.digests.of_file(self.folder / file) == digest:
-                (self.folder / file).unlink()
+            self._remove(file, digest)
         self.drop_record(name)
 
     def drop_record(self, name: str) -> None:
@@ -257,12 +256,23 @@ class Workspace:
                 (self.folder / file).parent.mkdir(parents=True, exist_ok=True)
                 os.replace(ready / file, self.folder / file)
         for file, digest in before.items():
-            if file not in header["files"] and self.digests.of_file(self.folder / file) == digest:
-                (self.folder / file).unlink()
+            if file not in header["files"]:
+                self._remove(file, digest)
         self._own.add(header["files"], self.folder)
         record.parent.mkdir(exist_ok=True)
         os.replace(ready / RECORD, record)
         shutil.rmtree(ready)
+
+    def _remove(self, file: str, digest: str) -> None:
+        """Take away a file that is as it was written, and the folders that are empty then."""
+        path = self.folder / file
+        if self.digests.of_file(path) != digest:
+            return
+        path.unlink()
+        for place in path.parents:
+            if place == self.folder or any(place.iterdir()):
+                break
+            place.rmdir()
 
     def _recover(self) -> None:
         """What a killed run left: results that were whole come to their place, the others go."""
@@ -272,6 +282,8 @@ class Workspace:
             else:                                       # its record, the last to go, had come to its place
                 shutil.rmtree(ready)
         shutil.rmtree(self.home / "making", ignore_errors=True)
+        for half in (self.home / "steps").glob("*/.*"):
+            half.unlink()
 
 
 class Staged:

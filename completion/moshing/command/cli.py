@@ -9,12 +9,15 @@ import tyro
 
 from model.body import BodyModel
 from model.files import load_model
-from scanprep.cli import Output, Unit
+from scanprep.batch.pool import Workers
+from scanprep.batch.workspace import Workspace
+from scanprep.cli import Output, Unit, WorkersArg
 from scanprep.console import Outcome, bar, say
 
+from ...animation.work import choose_layout
 from ...cli import ModelOrNone, read_model
 from ..settings import MoshConfig
-from .folder import Bars, mosh_people, summary
+from .folder import keep_table, mosh_people, summary
 from .recordings import Actor, By, Grouping, find_actors
 from .work import Work
 
@@ -26,13 +29,14 @@ def mosh_markers(markers: MarkersArg, output: Output, model: ModelOrNone = None,
                  subjects: Path | None = None, by: By = "auto", name: str | None = None, who: str | None = None,
                  hold_out: tuple[str, ...] = (), female: Path | None = None, male: Path | None = None,
                  character: Path | None = None, factor: float = 1.0, unit: Unit | None = None, keys: int = 120,
-                 config: Annotated[MoshConfig, tyro.conf.arg(name="")] = MoshConfig()) -> Outcome:    # noqa: B008
+                 config: Annotated[MoshConfig, tyro.conf.arg(name="")] = MoshConfig(),               # noqa: B008
+                 workers: WorkersArg = Workers(), *, space: Workspace) -> Outcome:                   # noqa: B008
     """Body shape, marker places, motion and soft tissue of people from markers alone.
 
     Files that are named are of one person. In a folder every sub-folder is a person; of files that lie side by side
     those are, whose names begin with the same number, as 85_02.c3d and 85_03.c3d, or else whose labels begin with the
     same `Subject:`. What was found is printed, and kept in subjects.csv, which --subjects takes when it is mended.
-    Called again, the command leaves alone what is done and has not changed.
+    Called again, the command leaves alone what is done and has not changed; killed, it goes on where it was.
 
     Example: scape mosh 85_02.c3d 85_03.c3d -m model.npz --layout cmu41 -o out
 
@@ -60,6 +64,7 @@ def mosh_markers(markers: MarkersArg, output: Output, model: ModelOrNone = None,
         unit: Unit of the markers, where the file cannot tell.
         keys: Largest number of key frames in a GLB.
         config: Settings.
+        workers: Who does the work, a person at a time.
     """
     if not markers:
         raise ValueError("MARKERS: expected at least one file or folder")
@@ -67,15 +72,14 @@ def mosh_markers(markers: MarkersArg, output: Output, model: ModelOrNone = None,
     actors = find_actors(markers, grouping, output)
     held = tuple(label for words in hold_out for label in words.split(",") if label)
     loaded, model_name = read_model(model)
-    sexes = _sexes(female, male, character)
-    made = None if character is None else _character(character, loaded)
-    work = Work(loaded, model_name, sexes, made, layout, held, unit, keys, factor, config)
+    work = Work(loaded, model_name, _sexes(female, male, character),
+                None if character is None else _character(character, loaded),
+                None if layout is None else choose_layout(loaded, layout, ()), held, unit, keys, factor, config,
+                f"scape mosh {' '.join(sys.argv[2:])}")
+    keep_table(space, actors, subjects is not None)
     _tell(actors)
-    given = {"layout": layout, "model": model, "female": female, "male": male, "character": character,
-             "factor": factor, "unit": unit, "keys": keys, "held": held}
-    command = f"scape mosh {' '.join(sys.argv[2:])}"
-    with bar("people") as people, bar("finding shape and motion") as solving, bar("files and pictures") as writing:
-        done = mosh_people(work, actors, output, given, command, Bars(people, solving, writing))
+    with bar("people") as people, bar("one of them") as inside:
+        done = mosh_people(work, actors, space, workers, people, inside)
     settings = {"mosh": config, "model": model_name, "layout": layout, "held out": held}
     return Outcome(output, summary(done, len(actors)), settings, done.failures)
 

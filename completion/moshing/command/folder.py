@@ -1,36 +1,24 @@
-"""One person after the other; what is finished is skipped when the same is asked again."""
+"""The people of a call: who is who, their figures, and the page of all of them, worst first."""
 from __future__ import annotations
 
-import hashlib
-import json
+import warnings
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from html import escape
-from pathlib import Path
-from typing import Any
 
 import numpy as np
 
-from scanprep.console import Metric, Progress, plain
-from scanprep.geometry import storage
+from scanprep.batch.pool import Progress, Workers
+from scanprep.batch.workspace import Task, Workspace
+from scanprep.console import PROBLEM, Metric
 from scanprep.pictures.page import Page
 
-from ...animation.work import DONE, contents
 from .recordings import TABLE, Actor, write_table
 from .report import PICTURE
-from .work import ERRORS, Work, mosh_person
+from .work import ERRORS, Work
 
 _STYLE = """.person { display: grid; grid-template-columns: minmax(17rem, 1fr) 2fr; gap: 1rem; margin: 1.6rem 0; }
 .person img { width: 100%; } .person p { margin: .2rem 0; }"""
-
-
-@dataclass(frozen=True)
-class Bars:
-    """What tells of progress: people, the solution of one, and its files and pictures."""
-
-    people: Progress
-    solving: Progress
-    writing: Progress
 
 
 @dataclass(frozen=True)
@@ -42,7 +30,7 @@ class Finished:
     metrics : name of the person -> the rows of its table
     before : int
         People that had been done before.
-    failures : one line for each person or file that failed
+    failures : one line for each person or file that failed, and for each person whose figures mean nothing
     """
 
     metrics: dict[str, list[Metric]]
@@ -50,48 +38,40 @@ class Finished:
     failures: list[str]
 
 
-def mosh_people(work: Work, actors: Sequence[Actor], output: Path, given: Mapping[str, Any], command: str, bars: Bars
-                ) -> Finished:
-    """Every person into a folder of its name; one that fails stops no other.
+def mosh_people(work: Work, actors: Sequence[Actor], space: Workspace, workers: Workers | None = None,
+                progress: Progress | None = None, inside: Progress | None = None) -> Finished:
+    """Every person into a folder of its name; one that fails stops no other."""
+    done = space.run(work, [Task(actor.name, actor, actor.name) for actor in actors], workers, progress, inside)
+    failures = [line if line.startswith(f"{name}: ") else f"{name}: {line}" for name, line in done.failures.items()]
+    for name, (rows, failed) in done.values.items():
+        failures += [f"{name}: {line}" for line in [*(str(m.value) for m in rows if m.name == PROBLEM), *failed]]
+    metrics = {name: [m for m in rows if m.name != PROBLEM] for name, (rows, _) in done.values.items()}
+    with space.staging("page") as staged:
+        _page(actors, metrics, failures).write(staged.folder / "report.html")
+    return Finished(metrics, len(metrics) - len(done.fresh), failures)
 
-    A person is done again when recordings, settings, or files that settings name have changed. What is written takes
-    its place when it is whole.
+
+def keep_table(space: Workspace, actors: Sequence[Actor], named: bool) -> None:
+    """Who is who into subjects.csv; one that was mended stays as it is.
 
     Parameters
     ----------
-    given : what the output depends on beside the recordings and `work.config`
-        Names of files stand for what they hold.
-    command : str
-        For report.json.
+    named : bool
+        The user said who is who in a table.
+
+    Raises
+    ------
+    ValueError
+        A table that was mended, and is not named.
     """
-    output.mkdir(parents=True, exist_ok=True)
-    write_table(output / TABLE, actors)
-    metrics: dict[str, list[Metric]] = {}
-    failures: list[str] = []
-    before = 0
-    settings = {"given": {name: contents(value) for name, value in given.items()}, "config": plain(work.config),
-                "model": work.name}
-    for number, actor in enumerate(actors, 1):
-        place, key = output / actor.name, _key(settings, actor)
-        done = _known(place / DONE)
-        if done.get("key") == key:
-            before += 1
-        else:
-            try:
-                with storage.writing_folder(place) as beside:
-                    rows, failed = mosh_person(work, actor, beside, command, bars.solving, bars.writing)
-                    done = {"key": key, "metrics": [[m.name, plain(m.value), m.unit] for m in rows],
-                            "failures": failed}
-                    storage.write_json(beside / DONE, done)
-            except (ValueError, OSError) as error:
-                failures.append(f"{actor.name}: {' '.join(str(error).split())}")
-                bars.people(number, len(actors))
-                continue
-        metrics[actor.name] = [Metric(*row) for row in done["metrics"]]
-        failures += [f"{actor.name}: {line}" for line in done["failures"]]
-        bars.people(number, len(actors))
-    _index(output, actors, metrics, failures)
-    return Finished(metrics, before, failures)
+    table = space.folder / TABLE
+    if not table.exists() or space.is_ours(TABLE):
+        with space.staging("people") as staged:
+            write_table(staged.folder / TABLE, actors)
+    elif named:
+        warnings.warn(f"{table}: left as it was mended", stacklevel=2)
+    else:
+        raise ValueError(f"{table}: was mended; go by it with --subjects {table}, or move it away")
 
 
 def summary(done: Finished, count: int) -> list[Metric]:
@@ -113,35 +93,19 @@ def summary(done: Finished, count: int) -> list[Metric]:
     return rows
 
 
-def _known(path: Path) -> dict[str, Any]:
-    """What a finished person's folder says; nothing where it cannot be read."""
-    try:
-        tree = json.loads(path.read_text(encoding="utf-8"))
-        return tree if isinstance(tree, dict) else {}
-    except (OSError, ValueError):
-        return {}
-
-
-def _key(settings: Mapping[str, Any], actor: Actor) -> str:
-    """A digest of all that a person's output depends on."""
-    told = {**settings, "recordings": [[r.name, r.who, contents(r.path)] for r in actor.recordings]}
-    return hashlib.sha256(json.dumps(told, sort_keys=True).encode()).hexdigest()[:24]
-
-
-def _index(output: Path, actors: Sequence[Actor], metrics: Mapping[str, Sequence[Metric]], failures: Sequence[str]
-           ) -> None:
-    """The page of all people."""
-    page = Page(f"{len(metrics)} {'person' if len(metrics) == 1 else 'people'} from markers",
+def _page(actors: Sequence[Actor], metrics: Mapping[str, Sequence[Metric]], failures: Sequence[str]) -> Page:
+    """All people, those with the largest error first."""
+    page = Page(f"{len(metrics)} {'person' if len(metrics) == 1 else 'people'} from markers, worst first",
                 "Each picture leads to the page of the person, and that to the sequences.")
     if failures:
         page.section("Failed").table([(line,) for line in failures])
-    for actor in actors:
-        if actor.name not in metrics:
-            continue
-        told = [f"{m.name}: {m.text()} {m.unit}" for m in metrics[actor.name]
+    error = {name: float(next(m.value for m in rows if m.name == ERRORS[0])) for name, rows in metrics.items()}
+    rules = {actor.name: actor.rule for actor in actors}
+    for name in sorted(metrics, key=lambda name: (-error[name], name)):
+        told = [f"{m.name}: {m.text()} {m.unit}" for m in metrics[name]
                 if m.name in (*ERRORS, "sequences", "frames", "sex")]
-        lines = "".join(f"<p>{escape(line)}</p>" for line in (*told, f"recordings put together: {actor.rule}"))
-        link = escape(actor.name)
+        lines = "".join(f"<p>{escape(line)}</p>" for line in (*told, f"recordings put together: {rules[name]}"))
+        link = escape(name)
         page.markup(f'<div class="person"><div><a href="{link}/report.html"><b>{link}</b></a>{lines}</div>'
                     f'<a href="{link}/report.html"><img src="{link}/{PICTURE}" alt="{link}"></a></div>', _STYLE)
-    page.write(output / "report.html")
+    return page

@@ -4,10 +4,11 @@ from __future__ import annotations
 import csv
 import re
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Literal, get_args
 
+from scanprep.batch.workspace import HOME
 from scanprep.geometry import storage
 
 from ...markers.common import MarkerFileError
@@ -51,7 +52,7 @@ class Actor:
 
     name: str
     recordings: tuple[Recording, ...]
-    rule: str
+    rule: str = field(metadata={"digest": False})
 
 
 @dataclass(frozen=True)
@@ -153,7 +154,7 @@ def _files(given: list[Path], output: Path | None, table: Path | None) -> Iterat
             raise ValueError(f"{place}: no such file or folder")
         if place.is_dir():                             # nor what an earlier call has written
             outputs |= {found.parent.resolve() for found in place.rglob(TABLE)
-                        if (found.parent / "report.html").exists()}
+                        if (found.parent / "report.html").exists() or (found.parent / HOME).exists()}
         for path in sorted(place.rglob("*")) if place.is_dir() else [place]:
             parts, whole = path.relative_to(place).parts, path.resolve()
             if place.is_dir() and (path.suffix.lower() not in ENDINGS or any(part.startswith(".") for part in parts)

@@ -3,7 +3,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
@@ -11,8 +11,8 @@ import numpy as np
 
 from model.body import BodyModel
 from model.learning.sex_plane import SexGuess
-from scanprep.console import Metric, Outcome, Progress, write_report
-from scanprep.pictures.page import Page
+from scanprep.batch.pool import Room
+from scanprep.console import Metric, Outcome, write_report
 from scanprep.pictures.sheets import save_png
 from scanprep.pictures.views import upright
 
@@ -37,11 +37,12 @@ from .takes import LightMesh, Take, held_out
 
 ERRORS = ("marker error, fixed shape", "marker error, soft tissue", "held-out error, fixed shape",
           "held-out error, soft tissue")
+HALF = 100                           # of progress: finding shape and motion, then files and pictures
 
 
 @dataclass(frozen=True, eq=False)
 class Work:
-    """What is the same for all people of a call.
+    """The work on each person of a call.
 
     Attributes
     ----------
@@ -52,8 +53,8 @@ class Work:
         Models for the sex that `model` tells; empty to do without.
     character : BodyModel, optional
         Whose body makes the motions too.
-    layout : str, optional
-        A named layout or a file; else the named one that fits the labels best.
+    layout : MarkerLayout and its name, optional
+        Else the named one that fits the labels best.
     hold_out : strings
         Markers that no stage sees.
     unit : str, optional
@@ -62,18 +63,24 @@ class Work:
         Largest number of key frames in a GLB.
     factor : float
         On soft tissue, in exaggerated.glb and on the character.
+    command : str
+        For report.json.
     """
 
     model: BodyModel
     name: str
     sexes: Mapping[str, BodyModel]
     character: BodyModel | None
-    layout: str | None
+    layout: tuple[MarkerLayout, str] | None
     hold_out: tuple[str, ...]
     unit: str | None
     keys: int
     factor: float
     config: MoshConfig
+    command: str = field(metadata={"digest": False})
+
+    def __call__(self, actor: Actor, room: Room) -> tuple[list[Metric], list[str]]:
+        return mosh_person(self, actor, room)
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,59 +95,56 @@ class _Found:
     layout_name: str
 
 
-def mosh_person(work: Work, actor: Actor, folder: Path, command: str, solving: Progress, writing: Progress
-                ) -> tuple[list[Metric], list[str]]:
-    """Everything of one person into a folder: the figures, and what failed.
+def mosh_person(work: Work, actor: Actor, room: Room) -> tuple[list[Metric], list[str]]:
+    """Everything of one person into the folder of a room: the figures, and what failed.
 
     A recording that cannot be read is left out and told.
-
-    Parameters
-    ----------
-    command : str
-        For report.json.
-    solving, writing : callables
-        Called with (done, total).
 
     Raises
     ------
     ValueError
         No recording that can be read, or as `mosh`.
     """
-    start = time.perf_counter()
-    found, failures = _solve(work, actor, solving)
+    start, folder = time.perf_counter(), room.folder
+    found, failures = _solve(work, actor, room)
     settings = {"mosh": work.config, "model": work.name, "layout": found.layout_name, "held out": work.hold_out}
     about = {"model": work.name, "layout": found.layout_name, "held_out": work.hold_out, "sex": found.guess,
-             "recordings": [str(r.path) for r in actor.recordings]}
+             "recordings": [r.path.name for r in actor.recordings]}
     write_person(folder, found.result, about)
     figures: dict[str, list[Metric]] = {}
     total = len(found.takes) + 1
     for i, take in enumerate(found.takes):
-        writing(i, total)
-        figures[take.name] = _write(work, found, take, folder / take.name, command, settings)
-    writing(total - 1, total)
+        room.tell(HALF + HALF * i // total, 2 * HALF)
+        figures[take.name] = _write(work, found, take, room, settings)
+    room.tell(HALF + HALF * (total - 1) // total, 2 * HALF)
     metrics = [Metric("model", work.name), *_person_metrics(found), *_figures(found.takes)]
     person_page(actor.name, found.model, found.result, found.usual, found.takes, metrics, figures,
                 settings).write(folder / "report.html")
     save_png(folder / PICTURE, person_picture(found.model, found.result))
-    write_report(Outcome(folder, metrics, settings, failures), command, time.perf_counter() - start)
-    writing(total, total)
+    metrics += _speeds(found)                    # not on the page: it is the same however often it is made
+    write_report(Outcome(folder, metrics, settings, failures), work.command, time.perf_counter() - start)
+    room.tell(2 * HALF, 2 * HALF)
     return metrics, failures
 
 
-def _solve(work: Work, actor: Actor, progress: Progress) -> tuple[_Found, list[str]]:
+def _solve(work: Work, actor: Actor, room: Room) -> tuple[_Found, list[str]]:
     recordings, sequences, failures = _read(work, actor.recordings)
     labels = tuple(dict.fromkeys(label for each in sequences for label in each.labels))
-    usual, layout_name = choose_layout(work.model, work.layout, labels)
+    usual, layout_name = work.layout or choose_layout(work.model, None, labels)
     try:
         layout = usual.without(work.hold_out) if work.hold_out else usual
     except ValueError as error:
         raise ValueError(f"--hold-out: {error}") from None
     model, guess = work.model, None
+
+    def progress(done: int, total: int) -> None:
+        room.tell(HALF * done // total, 2 * HALF)
+
     if work.sexes:
-        told = mosh_by_sex({"neutral": work.model, **work.sexes}, sequences, layout, work.config, progress)
+        told = mosh_by_sex({"neutral": work.model, **work.sexes}, sequences, layout, work.config, progress, room.step)
         model, guess, result = told.model, told.guess, told.result
     else:
-        result = mosh(model, sequences, layout, work.config, progress)
+        result = mosh(model, sequences, layout, work.config, progress, room.step)
     subject = model.subject(result.betas)
     light, takes = LightMesh.of(model.template), []
     for i, (source, markers) in enumerate(zip(recordings, sequences, strict=True)):
@@ -158,30 +162,46 @@ def _read(work: Work, recordings: Sequence[Recording]) -> tuple[list[Recording],
             sequences.append(read_markers(recording.path, work.unit, recording.who))
             found.append(recording)
         except ValueError as error:
-            failures.append(" ".join(str(error).split()))
+            failures.append(" ".join(str(error).replace(str(recording.path), recording.path.name).split()))
     if not sequences:
         raise ValueError("; ".join(failures))
     return found, sequences, failures
 
 
-def _write(work: Work, found: _Found, take: Take, folder: Path, command: str, settings: Mapping[str, Any]
-           ) -> list[Metric]:
+def _write(work: Work, found: _Found, take: Take, room: Room, settings: Mapping[str, Any]) -> list[Metric]:
     """A sequence into its folder; the figures."""
-    start = time.perf_counter()
-    folder.mkdir()
     metrics = [Metric("layout", found.layout_name), *_figures([take])]
-    write_take(folder, take, work.keys, work.factor)
-    page = take_page(take, metrics)
-    if work.character is not None:
-        _character(work.character, take, folder, page, work.keys, work.factor)
-    closing(page, metrics, settings).write(folder / "report.html")
-    save_png(folder / PICTURE, take_picture(take))
-    write_report(Outcome(folder, metrics, settings), command, time.perf_counter() - start)
+    solved = found.model, take.markers, take.motion, take.soft, take.faults, take.held
+
+    def files(folder: Path) -> None:
+        (folder / take.name).mkdir(exist_ok=True)
+        write_take(folder / take.name, take, work.keys, work.factor)
+
+    def character(folder: Path) -> tuple[Any, str]:
+        (folder / take.name).mkdir(exist_ok=True)
+        assert work.character is not None, "asked for"
+        return _character(work.character, take, folder / take.name, work.keys, work.factor)
+
+    def page(folder: Path) -> None:
+        start, place = time.perf_counter(), folder / take.name
+        place.mkdir(exist_ok=True)
+        page = take_page(take, metrics)
+        if shown is not None:
+            page.section("On a character", "The same turns of the joints, and feet on the ground when those of the "
+                         f"person are; soft tissue taken {work.factor:g} times.").picture(*shown)
+        closing(page, metrics, settings).write(place / "report.html")
+        save_png(place / PICTURE, take_picture(take))
+        write_report(Outcome(place, metrics, settings), work.command, time.perf_counter() - start)
+
+    room.files(f"{take.name} files", (solved, take.path, take.who, take.unit, work.keys, work.factor), files)
+    shown = None if work.character is None else room.files(
+        f"{take.name} character", (solved, work.character, work.keys, work.factor), character)
+    room.files(f"{take.name} page", (solved, metrics, settings, shown and (shown, work.factor)), page)
     return metrics
 
 
 def _person_metrics(found: _Found) -> list[Metric]:
-    moved, result, frames = MM * found.result.person.moved, found.result, sum(len(t.motion.poses) for t in found.takes)
+    moved, result = MM * found.result.person.moved, found.result
     body = standing(found.model, result.betas)
     told = [Metric("layout", found.layout_name), Metric("sequences", len(found.takes)),
             Metric("height", float(np.ptp(body.vertices[:, upright(body)[0]])), "m"),
@@ -191,10 +211,14 @@ def _person_metrics(found: _Found) -> list[Metric]:
             Metric(f"markers moved, most ({result.layout.labels[int(moved.argmax())]})", float(moved.max()), "mm")]
     if found.guess is not None:
         told[1:1] = [Metric("sex", found.guess.sex), Metric("sex, probability", 100 * found.guess.probability, "%")]
-    for stage, seconds in result.seconds.items():
-        told.append(Metric(f"{stage}, time", seconds, "s") if stage == "person" else
-                    Metric(f"{stage}, speed", frames / max(seconds, 1e-9), "frames/s"))
     return told
+
+
+def _speeds(found: _Found) -> list[Metric]:
+    frames = sum(len(take.motion.poses) for take in found.takes)
+    return [Metric(f"{stage}, time", seconds, "s") if stage == "person" else
+            Metric(f"{stage}, speed", frames / max(seconds, 1e-9), "frames/s")
+            for stage, seconds in found.result.seconds.items()]
 
 
 def _figures(takes: Sequence[Take]) -> list[Metric]:
@@ -219,20 +243,18 @@ def _figures(takes: Sequence[Take]) -> list[Metric]:
             Metric("gaps filled in", filled, "positions")]
 
 
-def _character(character: BodyModel, take: Take, folder: Path, page: Page, keys: int, factor: float) -> None:
-    """The motion on a character: character.npz, character.glb, and its pictures."""
-    page.section("On a character", "The same turns of the joints, and feet on the ground when those of the person are; "
-                 f"soft tissue taken {factor:g} times.")
+def _character(character: BodyModel, take: Take, folder: Path, keys: int, factor: float
+               ) -> tuple[np.ndarray, str]:
+    """The motion on a character: character.npz, character.glb; a picture, and what it shows."""
     if take.soft is not None:
         moving = retarget_soft_tissue(take.soft, take.model, character, factor)
         moving.save(folder / "character.npz")
         write_character(folder / "character.glb", character, moving, keys)
-        page.picture(picture_transfer(take.model, take.soft, character, moving),
-                     "the person, the character, and how far the character's skin is stretched or squeezed")
-        return
+        return (picture_transfer(take.model, take.soft, character, moving),
+                "the person, the character, and how far the character's skin is stretched or squeezed")
     body = character.subject(np.zeros(character.n_betas))
     motion = retarget(take.motion, take.subject, body)
     motion.save(folder / "character.npz")
     write_glb(folder / "character.glb", motion, body, keys)
     frames = key_frames(motion, 8)
-    page.picture(morph_frames(motion, body, motion.vertices(body, frames), frames))
+    return morph_frames(motion, body, motion.vertices(body, frames), frames), ""

@@ -1,0 +1,138 @@
+"""Folders of tiny recordings for `scape mosh`; as a program it does one and is killed: PLACE STAGE CALL WORDS."""
+import hashlib
+import importlib
+import json
+import os
+import signal
+import sys
+from contextlib import contextmanager
+from pathlib import Path
+
+import numpy as np
+import pytest
+from completion_bodies import MEAN, worm_with_prior
+
+from completion import MarkerLayout, MarkerSequence, write_markers
+from completion.__main__ import main
+from completion.animation import report as animation_report
+from completion.moshing.command import cli, pictures, report
+from completion.moshing.command.work import Work
+from scanprep.batch.workspace import HOME
+
+FRAMES = 40
+BETAS = {"ann": np.array([0.9, -0.6, 0.4]), "bob": np.array([-0.8, 0.5, -0.3])}
+TAKES = (("ann", "walk", 0.0), ("ann", "run", 1.0), ("bob", "jump", 0.5))
+QUICK = ("--keys", "5", "--person.frames", "4", "--person.start-axes", "1", "--person.annealing", "4", "1",
+         "--person.iterations", "4")
+STAGES = {"start": "completion.moshing.person.FrameStarts.find", "solve": "completion.moshing.person.LatentFit.solve",
+          "poses": "completion.moshing.capture.follow_poses", "faults": "completion.moshing.capture.find_faults",
+          "soft": "completion.moshing.capture.follow_soft_tissue",
+          "files": "completion.moshing.command.work.write_take", "page": "completion.moshing.command.work.take_page",
+          "person page": "completion.moshing.command.work.person_page"}
+TIMES = ("s", "frames/s")            # units of figures that differ between two runs
+
+
+def recorded(model, layout, betas, phase):
+    """Markers (T, L, 3) on a worm that bends, and its meshes."""
+    t = np.arange(FRAMES) / 60
+    poses = MEAN + np.sin(3 * t[:, None, None] + np.arange(4)[:, None] + phase) * np.array([0.05, 0.3, 0.2])
+    meshes = model.subject(betas).vertices(poses, np.stack([t, 0 * t, 0 * t], axis=1))
+    return np.stack([layout.place(model.template.with_vertices(v)) for v in meshes]), meshes
+
+
+def write_people(place):
+    """A model, a layout, and two people: ann with two recordings, bob with one."""
+    model = worm_with_prior()
+    model.save(place / "model.npz")
+    vertices = np.random.default_rng(4).choice(396, 34, replace=False)
+    layout = MarkerLayout(tuple(f"M{i}" for i in range(34)), vertices, 0.012)
+    layout.save(place / "layout.json")
+    truth = {}
+    for person, name, phase in TAKES:
+        positions, truth[name] = recorded(model, layout, BETAS[person], phase)
+        positions[5:9, 3] = np.nan
+        (place / "people" / person).mkdir(parents=True, exist_ok=True)
+        write_markers(place / "people" / person / f"{name}.csv", MarkerSequence(positions, layout.labels, 60.0))
+    np.savez(place / "truth.npz", **truth)
+    return place
+
+
+def run(place, *words, quick=QUICK):
+    return main(["mosh", *quick, "-m", str(place / "model.npz"), "--layout", str(place / "layout.json"),
+                 "--workers", "1", *map(str, words)])
+
+
+@contextmanager
+def small_pictures():
+    """Nobody looks at them here."""
+    with pytest.MonkeyPatch.context() as patch:
+        for module in (report, pictures, animation_report):
+            patch.setattr(module, "render", lambda *_rest, **_named: np.full((30, 20, 3), 255, dtype=np.uint8))
+        yield
+
+
+class QuietWork(Work):
+    """The work with small pictures, in other processes too."""
+
+    def __call__(self, actor, room):
+        with small_pictures():
+            return super().__call__(actor, room)
+
+
+def contents(output):
+    """File -> what it holds, without what differs between two runs."""
+    found = {}
+    for path in sorted(p for p in output.rglob("*") if p.is_file() and HOME not in p.parts):
+        data = path.read_bytes()
+        if path.name == "report.json":
+            tree = json.loads(data)
+            kept = [m for m in tree["metrics"] if m["unit"] not in TIMES and m["metric"] != "done before"]
+            data = json.dumps([tree["settings"], tree["failures"], kept]).encode()
+        found[path.relative_to(output).as_posix()] = hashlib.sha256(data).hexdigest()
+    return found
+
+
+@contextmanager
+def counted(before=lambda stage, call: None):
+    """How often each stage is called; `before` is called with its name and which call it is."""
+    calls = dict.fromkeys(STAGES, 0)
+    with pytest.MonkeyPatch.context() as patch:
+        for stage, target in STAGES.items():
+            patch.setattr(target, _telling(stage, _found(target), calls, before))
+        yield calls
+
+
+def _telling(stage, function, calls, before):
+    def told(*given, **named):
+        calls[stage] += 1
+        before(stage, calls[stage])
+        return function(*given, **named)
+
+    return told
+
+
+def _found(target):
+    parts = target.split(".")
+    for k in range(len(parts), 0, -1):
+        try:
+            found = importlib.import_module(".".join(parts[:k]))
+            break
+        except ModuleNotFoundError:
+            continue
+    for part in parts[k:]:
+        found = getattr(found, part)
+    return found
+
+
+def _killed(place, stage, call, *words):
+    def kill(now, number):
+        if (now, number) == (stage, int(call)):
+            os.kill(os.getpid(), signal.SIGKILL)
+
+    cli.Work = QuietWork
+    with counted(kill):
+        sys.exit(run(Path(place), *words))
+
+
+if __name__ == "__main__":
+    _killed(*sys.argv[1:])

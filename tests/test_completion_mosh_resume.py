@@ -1,0 +1,181 @@
+"""`scape mosh` that is killed, called again, called with something changed, and called where others are."""
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+from mosh_folders import QuietWork, contents, counted, run, write_people
+
+from completion import MarkerLayout, MarkerSequence, read_markers, write_markers
+from completion.moshing.command import cli
+from model import load_model
+from scanprep.batch import pool
+from scanprep.batch.pool import Room
+from scanprep.batch.workspace import HOME
+
+HERE = Path()
+BOB = ("people/bob", "--name", "bob")
+PERSON = {"start", "solve"}
+ALL = PERSON | {"poses", "faults", "soft", "files", "page", "person page"}
+
+
+@pytest.fixture(scope="module", autouse=True)
+def quiet():
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(cli, "Work", QuietWork)
+        yield
+
+
+@pytest.fixture(scope="module")
+def place(tmp_path_factory):
+    return write_people(tmp_path_factory.mktemp("mosh"))
+
+
+@pytest.fixture(scope="module")
+def whole(place):
+    """Bob's recording, undisturbed."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(place)
+        assert run(HERE, *BOB, "-o", "whole") == 0
+    return place / "whole"
+
+
+@pytest.fixture
+def copied(place, whole, tmp_path, monkeypatch):
+    """All of that once more, to be changed; the working folder."""
+    shutil.copytree(place, tmp_path / "here")
+    monkeypatch.chdir(tmp_path / "here")
+    return tmp_path / "here"
+
+
+@pytest.mark.parametrize("stage, call, kept", [
+    ("solve", 2, {"start"}), ("soft", 1, PERSON | {"poses", "faults"}), ("page", 1, ALL - {"page", "person page"}),
+    ("person page", 1, ALL - {"person page"})])
+def test_killed_in_the_middle_of_a_recording_it_goes_on(copied, stage, call, kept):
+    out, program = copied / "killed", Path(__file__).with_name("mosh_folders.py")
+    words = [sys.executable, program, HERE, stage, str(call), *BOB, "-o", "killed"]
+    assert subprocess.run(words).returncode == -9
+    assert {p.name for p in out.iterdir()} <= {HOME, "subjects.csv"}
+    with counted() as calls:
+        assert run(HERE, *BOB, "-o", "killed") == 0
+    assert {name for name, count in calls.items() if not count} == kept
+    if stage == "solve":
+        assert calls["solve"] == 1                                   # of two, of which the first had been done
+    assert contents(out) == contents(copied / "whole")
+    assert not (out / HOME / "making").exists() and not list((out / HOME).rglob(".*"))
+
+
+@pytest.mark.parametrize("words, anew", [
+    ((), set()), (("--keys", "6"), {"files", "person page"}), (("--factor", "1.5"), {"files", "person page"}),
+    (("--soft.change", "0.5"), {"soft", "files", "page", "person page"}),
+    (("--follow.pose", "0.2"), ALL - PERSON), (("--person.shape", "0.4"), ALL), (("--hold-out", "M7"), ALL),
+    (("--force",), ALL)])
+def test_what_depends_on_a_changed_setting_is_done_anew(copied, words, anew):
+    check(copied, anew, words)
+
+
+@pytest.mark.parametrize("what", ["model", "layout", "recording"])
+def test_what_depends_on_a_changed_file_is_done_anew(copied, what):
+    if what == "model":
+        model = load_model(copied / "model.npz")
+        model.pose_mean[1] += 0.01
+        model.save(copied / "model.npz")
+    elif what == "layout":
+        layout = MarkerLayout.load(copied / "layout.json")
+        MarkerLayout(layout.labels, layout.vertices, 0.013).save(copied / "layout.json")
+    else:
+        path = copied / "people" / "bob" / "jump.csv"
+        markers = read_markers(path)
+        positions = markers.positions.copy()
+        positions[20, 5] += 0.001
+        write_markers(path, MarkerSequence(positions, markers.labels, markers.rate))
+    # one marker in one frame: the frames that tell of the person are the same
+    check(copied, ALL - PERSON if what == "recording" else ALL)
+
+
+def check(copied, anew, words=()):
+    """What is done anew is what was expected, and comes to what a first call comes to."""
+    with counted() as calls:
+        assert run(HERE, *BOB, "-o", "whole", *words) == 0
+    assert {name for name, count in calls.items() if count} == anew
+    if anew:
+        assert run(HERE, *BOB, "-o", "fresh", *words) == 0
+        assert contents(copied / "whole") == contents(copied / "fresh")
+
+
+def test_two_workers_write_what_one_does(place, tmp_path):
+    for count in ("1", "2"):
+        assert run(place, place / "people", "-o", tmp_path / count, "--workers", count, "--no-soft-tissue") == 0
+    one = contents(tmp_path / "1")
+    assert {"ann/walk/motion.npz", "bob/jump/report.html"} <= set(one) and contents(tmp_path / "2") == one
+
+
+def test_workers_of_a_cluster_keep_no_steps_and_write_the_same(copied, monkeypatch):
+    monkeypatch.setattr(pool, "Room", lambda folder, steps, tell, force: Room(folder, None, tell, force))
+    assert run(HERE, *BOB, "-o", "cluster") == 0
+    assert contents(copied / "cluster") == contents(copied / "whole")
+    assert not (copied / "cluster" / HOME / "steps").exists()
+
+
+def test_a_recording_less_takes_its_folder_away(place, tmp_path):
+    people, out = tmp_path / "people", tmp_path / "out"
+    shutil.copytree(place / "people", people)
+    assert run(place, people / "ann", "--by", "all", "--name", "ann", "-o", out, "--no-soft-tissue") == 0
+    (out / "ann" / "walk" / "notes.txt").write_text("mine")
+    (people / "ann" / "run.csv").unlink()
+    assert run(place, people / "ann", "--by", "all", "--name", "ann", "-o", out, "--no-soft-tissue") == 0
+    assert not (out / "ann" / "run").exists() and (out / "ann" / "walk" / "notes.txt").read_text() == "mine"
+
+
+def test_what_is_not_of_scapekit_stays(copied, capsys):
+    out = copied / "whole"
+    (out / "bob" / "jump" / "animation.glb").write_bytes(b"mine")
+    before = contents(out)
+    with counted() as calls:
+        assert run(HERE, *BOB, "-o", "whole", "--keys", "6") == 1
+    assert "animation.glb: in the way of the output" in capsys.readouterr().err and not calls["start"]
+    after = contents(out)
+    assert {name for name in after if after[name] != before[name]} <= {"report.html", "report.json"}
+    assert run(HERE, *BOB, "-o", "people/ann") == 1
+    assert "nothing was touched" in capsys.readouterr().err
+    assert sorted(p.name for p in (copied / "people" / "ann").iterdir()) == ["run.csv", "walk.csv"]
+
+
+def test_a_mended_table_is_never_overwritten(copied, capsys):
+    out = copied / "whole"
+    table = out / "subjects.csv"
+    mended = table.read_text().replace(",bob,", ",rob,")
+    table.write_text(mended)
+    before = contents(out)
+    assert run(HERE, *BOB, "-o", "whole") == 1
+    assert "whole/subjects.csv: was mended; go by it with --subjects whole/subjects.csv" in capsys.readouterr().err
+    assert contents(out) == before
+    assert run(HERE, "people/bob", "-o", "whole", "--subjects", table, "--no-soft-tissue") == 0
+    assert table.read_text() == mended and (out / "rob" / "jump" / "motion.npz").exists()
+
+
+def test_a_second_run_leaves(copied, capsys):
+    out = copied / "whole"
+    before = contents(out)
+    code = ("import sys\nfrom scanprep.batch.workspace import workspace\nwith workspace(sys.argv[1]):\n"
+            "    print('in', flush=True)\n    sys.stdin.read()\n")
+    other = subprocess.Popen([sys.executable, "-c", code, out], stdin=subprocess.PIPE, stdout=subprocess.PIPE)
+    assert other.stdout.readline() == b"in\n"
+    assert run(HERE, *BOB, "-o", "whole", "--keys", "6") == 1
+    assert "another run is at work on this output" in capsys.readouterr().err
+    other.communicate()
+    assert contents(out) == before
+
+
+def test_figures_that_mean_nothing_are_a_failure(place, tmp_path, monkeypatch, capsys):
+    from completion.moshing.command import work
+    from scanprep.console import Metric
+
+    done = work.mosh_person
+    monkeypatch.setattr(work, "mosh_person", lambda *given: (
+        [Metric("problem", "half the body was missed: unit?"), *(found := done(*given))[0]], found[1]))
+    assert run(place, place / "people" / "bob", "--name", "bob", "-o", tmp_path / "out", "--no-soft-tissue") == 1
+    assert "failed: bob: half the body was missed: unit?" in capsys.readouterr().err
+    assert (tmp_path / "out" / "bob" / "jump" / "motion.npz").exists()
+    assert "half the body was missed" in (tmp_path / "out" / "report.html").read_text()
