@@ -127,9 +127,12 @@ class Page:
         return self
 
     def chart(self, figure: Any, caption: str = "", alt: str = "") -> Page:
-        """A matplotlib figure, as vector graphics."""
+        """A matplotlib figure, as vector graphics; the same figure gives the same bytes."""
+        from matplotlib import rc_context
+
         out = io.BytesIO()
-        figure.savefig(out, format="svg", bbox_inches="tight")
+        with rc_context({"svg.hashsalt": "scapekit"}):
+            figure.savefig(out, format="svg", bbox_inches="tight", metadata={"Date": None})
         return self.picture(out.getvalue(), caption, alt)
 
     def download(self, name: str, data: bytes, text: str = "") -> Page:
