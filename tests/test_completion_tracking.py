@@ -123,7 +123,7 @@ def test_frames_are_taken_one_by_one(model, known):
 def test_a_tracker_that_goes_on_from_what_another_knew_ends_the_same(model, tmp_path):
     """Before the shape is known, right after, and between frames that are searched from scratch."""
     bodies = bodies_of(model, BETAS)
-    settings = replace(SETTINGS, shape_frames=3, search_every=2)
+    settings = replace(SETTINGS, shape_frames=3, search_every=2, start=replace(QUICK, draws=3))
     frames = [None, *record(bodies[:8])]
     frames[4:8] = [[view * [1, 1, 0.3] for view in views] for views in frames[4:8]]     # nothing the body could be
     marks = MARKS, bodies[0].vertices[MARKS]
@@ -135,15 +135,17 @@ def test_a_tracker_that_goes_on_from_what_another_knew_ends_the_same(model, tmp_
     done += first.finish()
     assert [f.found for f in done] == [False, *[True] * 3, *[False] * 4, True]
     assert states[2].kept and not states[2].shape_known and states[3].shape_known
-    assert states[3].draws is None and states[4].draws != states[6].draws != states[8].draws
-    for cut in (1, 2, 3, 6):
+    assert states[4].draws != states[6].draws != states[8].draws
+    for cut, end in ((1, 4), (2, 4), (6, 9)):
         save_value(tmp_path / "state.npz", states[cut], {})
         other = Tracker(model, settings, RATE, marks)
         other.resume(load_value(tmp_path / "state.npz"))
-        rest = [f for frame in frames[cut:] for f in other.push(frame)] + other.finish()
-        for ours, theirs in zip(rest, done[-len(rest):], strict=True):
-            same(ours, theirs)
+        rest = [f for frame in frames[cut:end] for f in other.push(frame)] + other.finish()
+        assert rest[-1].number == end - 1
+        for found in rest:
+            same(found, done[found.number])
         np.testing.assert_array_equal(other.betas, first.betas)
+        assert other.state.draws == states[end].draws
 
 
 def same(ours, theirs):
