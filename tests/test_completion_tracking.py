@@ -12,6 +12,8 @@ from completion.tracking import person
 from completion.tracking.dynamics import difference, inertia, moved, predicted, smoothed
 from completion.tracking.frames import prepare_frame
 from completion.tracking.person import shared_shape, spread_poses
+from completion.tracking.tracker import Tracker
+from scanprep.batch.values import load_value, save_value
 from scanprep.geometry import rotations
 from scanprep.geometry.files import PointCloud
 from scanprep.geometry.mesh import Mesh
@@ -116,6 +118,40 @@ def test_frames_are_taken_one_by_one(model, known):
     track(model.subject(None), camera(), replace(SETTINGS, smoothing=0), (MARKS, bodies[0].vertices[MARKS]),
           progress=lambda i, total: done.append((i, total, len(taken))))
     assert done == [(i, i, i) for i in range(1, 5)]
+
+
+def test_a_tracker_that_goes_on_from_what_another_knew_ends_the_same(model, tmp_path):
+    """Before the shape is known, right after, and between frames that are searched from scratch."""
+    bodies = bodies_of(model, BETAS)
+    settings = replace(SETTINGS, shape_frames=3, search_every=2, start=replace(QUICK, draws=3))
+    frames = [None, *record(bodies[:8])]
+    frames[4:8] = [[view * [1, 1, 0.3] for view in views] for views in frames[4:8]]     # nothing the body could be
+    marks = MARKS, bodies[0].vertices[MARKS]
+    first = Tracker(model, settings, RATE, marks)
+    done, states = [], [first.state]
+    for frame in frames:
+        done += first.push(frame)
+        states.append(first.state)
+    done += first.finish()
+    assert [f.found for f in done] == [False, *[True] * 3, *[False] * 4, True]
+    assert states[2].kept and not states[2].shape_known and states[3].shape_known
+    assert states[4].draws != states[6].draws != states[8].draws
+    for cut, end in ((1, 4), (2, 4), (6, 9)):
+        save_value(tmp_path / "state.npz", states[cut], {})
+        other = Tracker(model, settings, RATE, marks)
+        other.resume(load_value(tmp_path / "state.npz"))
+        rest = [f for frame in frames[cut:end] for f in other.push(frame)] + other.finish()
+        assert rest[-1].number == end - 1
+        for found in rest:
+            same(found, done[found.number])
+        np.testing.assert_array_equal(other.betas, first.betas)
+        assert other.state.draws == states[end].draws
+
+
+def same(ours, theirs):
+    """Bit by bit."""
+    for name in ("number", "x", "found", "residual", "explained", "gradient", "precision"):
+        np.testing.assert_array_equal(getattr(ours, name), getattr(theirs, name), name)
 
 
 def test_a_sequence_without_anything_is_refused(model):

@@ -1,22 +1,35 @@
 import json
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import time
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
 import pytest
-from completion_bodies import half_view, worm_with_prior
-from test_completion_partial import MARKS
-from test_completion_tracking import SETTINGS, motion
+from completion_bodies import worm_with_prior
+from recordings import FRAMES, arguments, quick_page, track, write_recording
 
 from completion import Motion
 from completion.tracking import cli
 from completion.tracking.folder import FrameFolder
 from completion.tracking.report import _ranges
-from completion.tracking.store import AT_ONCE, FrameStore
-from completion.tracking.tracker import TrackedFrame, Tracker
+from completion.tracking.tracker import Tracker
+from model import load_model
+from scanprep.batch.workspace import HOME
 from scanprep.console import run
-from scanprep.geometry.files import PointCloud, read_mesh, write_points
+from scanprep.geometry.files import PointCloud, read_mesh, read_points, write_points
 
-FRAMES = 9
+KNOWN = "--subject", "template", "--surfaces"
+
+
+def contents(folder):
+    """Path -> bytes of all files but the report, which holds times."""
+    return {p.relative_to(folder).as_posix(): p.read_bytes() for p in sorted(folder.rglob("*"))
+            if p.is_file() and p.name != "report.json" and HOME not in p.parts}
 
 
 def touch(folder, *names):
@@ -72,69 +85,25 @@ def test_a_bad_file_is_a_camera_that_saw_nothing_and_is_named_once(tmp_path):
     assert len(found.problems) == 1 and "2.ply" in found.problems[0]
 
 
-def tracked(number):
-    rng = np.random.default_rng(number)
-    return TrackedFrame(number, rng.normal(size=9), bool(number % 3), float(rng.random()), 0.5, rng.normal(size=9),
-                        rng.normal(size=(9, 9)))
-
-
-def test_stored_frames_come_back_and_others_are_removed(tmp_path):
-    frames, betas = [tracked(i) for i in range(AT_ONCE + 7)], np.array([0.5, -1])
-    store = FrameStore(tmp_path, {"rate": 30})
-    for frame in frames:
-        store.add(frame, betas, ["a.ply: bad"])
-    assert len(list(tmp_path.iterdir())) == 1
-    store.write(betas, ["a.ply: bad"])
-    again = FrameStore(tmp_path, {"rate": 30})
-    loaded, found = again.load()
-    assert again.problems == ["a.ply: bad"] and len(loaded) == len(frames)
-    np.testing.assert_array_equal(found, betas)
-    for a, b in zip(loaded, frames, strict=True):
-        assert (a.number, a.found, a.residual, a.explained) == (b.number, b.found, b.residual, b.explained)
-        np.testing.assert_array_equal(a.precision, b.precision)
-    sorted(tmp_path.iterdir())[1].write_bytes(b"broken")
-    assert len(FrameStore(tmp_path, {"rate": 30}).load()[0]) == AT_ONCE
-    assert FrameStore(tmp_path, {"rate": 60}).load() == ([], None) and not list(tmp_path.iterdir())
-
-
 def test_runs_of_numbers_are_told_as_ranges():
     assert _ranges(np.array([3, 4, 5, 9, 11, 12])) == "3 to 5, 9, 11 to 12"
 
 
 @pytest.fixture(scope="module")
 def recording(tmp_path_factory):
-    """A model file, frames of two cameras, and landmarks of the first frame."""
-    folder, model = tmp_path_factory.mktemp("recording"), worm_with_prior()
-    poses, trans = motion(FRAMES)
-    model = replace(model, info={**model.info, "landmarks": {f"m{v}": int(v) for v in MARKS}})
-    model.save(folder / "model.npz")
-    bodies = [model.template.with_vertices(v) for v in model.subject(None).vertices(poses, trans)]
-    for i, body in enumerate(bodies):
-        for name, side in (("front", [0.2, -1, 0.4]), ("back", [-0.3, 1, 0.3])):
-            if i != 5:
-                (folder / "frames" / name).mkdir(parents=True, exist_ok=True)
-                seen = half_view(body, np.array(side), 700)[0]
-                write_points(folder / "frames" / name / f"{i:03d}.ply", PointCloud(seen))
-    (folder / "marks.json").write_text(json.dumps({f"m{v}": bodies[0].vertices[v].tolist() for v in MARKS}))
-    return folder, bodies
+    """Where a recording is, and its bodies."""
+    folder = tmp_path_factory.mktemp("recording")
+    return folder, write_recording(folder)
 
 
 def call(recording, output, *more):
-    folder, _ = recording
-
-    def track_quickly(frames: cli.FramesArg, output: cli.Output, model: cli.ModelOrNone, landmarks: cli.Path,
-                      subject: str | None = None, surfaces: bool = False) -> cli.Outcome:
-        return cli.track_frames(frames, output, model, 25.0, landmarks=landmarks, subject=subject, unit="m",
-                                surfaces=surfaces, keys=6, config=replace(SETTINGS, shape_frames=3))
-
-    return run(track_quickly, "scape track", [str(folder / "frames"), "-m", str(folder / "model.npz"), "-o",
-                                              str(output), "--landmarks", str(folder / "marks.json"), *more])
+    return track(*arguments(recording[0], output, *more))
 
 
 @pytest.fixture(scope="module")
 def output(recording, tmp_path_factory):
     out = tmp_path_factory.mktemp("out")
-    assert call(recording, out, "--subject", "template", "--surfaces") == 0
+    assert call(recording, out, *KNOWN) == 0
     return out
 
 
@@ -158,44 +127,140 @@ def test_the_command_writes_all_it_promises(recording, output):
     assert len(read_mesh(surfaces[0], "m").faces) == len(model.template.faces)
 
 
-def test_an_interrupted_run_goes_on_to_the_same_end(recording, output, tmp_path, monkeypatch):
-    push, calls = Tracker.push, []
+def test_killed_in_the_first_frames_and_started_again(recording, tmp_path, capfd, monkeypatch):
+    """The shape is found from frames of two chunks; the run is killed after the first."""
+    monkeypatch.setattr(cli, "_page", quick_page)
+    out, shaped = tmp_path / "out", ("--shape-frames", 7)
+    assert call(recording, tmp_path / "whole", *shaped) == 0
+    program = [sys.executable, str(Path(__file__).with_name("recordings.py")), *arguments(recording[0], out, *shaped)]
+    child = subprocess.Popen(program, start_new_session=True, stderr=subprocess.DEVNULL)
+    deadline = time.monotonic() + 120
+    while not (out / HOME / "done" / "frames%2F00000000.npz").exists():
+        assert child.poll() is None and time.monotonic() < deadline
+        time.sleep(0.005)
+    os.kill(child.pid, signal.SIGSTOP)                  # it still holds the output
+    capfd.readouterr()
+    assert call(recording, out, *shaped) == 1 and "another run is at work" in capfd.readouterr().err
+    os.kill(child.pid, signal.SIGKILL)
+    child.wait()
+    assert not (out / "motion.npz").exists()
+    assert call(recording, out, *shaped) == 0
+    assert f"5 of {FRAMES} frames were tracked before" in capfd.readouterr().err
+    assert contents(out) == contents(tmp_path / "whole")
+    betas = Motion.load(out / "motion.npz").betas
+    assert betas.shape == (3,) and np.abs(betas).max() > 0
 
-    def interrupted(self, frame):
-        calls.append(1)
-        if len(calls) == 7:
-            raise KeyboardInterrupt
+
+@pytest.fixture
+def again(recording, output, tmp_path, monkeypatch):
+    """The recording and what came of it, to be changed; how often a frame is followed."""
+    folder, out, numbers, push = tmp_path / "recording", tmp_path / "out", [], Tracker.push
+    shutil.copytree(recording[0], folder)
+    shutil.copytree(output, out)
+    monkeypatch.setattr(cli, "_page", quick_page)
+
+    def counted(self, frame):
+        numbers.append(self.state.number)
         return push(self, frame)
 
+    monkeypatch.setattr(Tracker, "push", counted)
+    assert track(*arguments(folder, out, *KNOWN)) == 0 and not numbers          # the page names where the model is
+    return folder, out, numbers
+
+
+def changed(before, after):
+    return {name for name in before.keys() | after.keys() if before.get(name) != after.get(name)}
+
+
+@pytest.mark.parametrize("given, files", [
+    ((), set()), (("--keys", 4), {"animation.glb"}),
+    (("--smoothing", 0), {"motion.npz", "motion.bvh", "joint_angles.csv", "joint_centres.csv", "animation.glb",
+                          "report.html"})])
+def test_what_is_made_of_frames_does_not_follow_them_again(again, given, files):
+    folder, out, numbers = again
+    before = contents(out)
+    assert track(*arguments(folder, out, *KNOWN, *given)) == 0
+    assert not numbers and changed(before, contents(out)) == files
+
+
+def test_a_changed_frame_is_followed_anew_with_those_after_it(again):
+    folder, out, numbers = again
+    before, path = contents(out), folder / "frames" / "front" / "007.ply"
+    cloud = read_points(path, "m")
+    write_points(path, PointCloud(cloud.points + [0.01, 0, 0]))
+    assert track(*arguments(folder, out, *KNOWN)) == 0
+    assert numbers == [5, 6, 7, 8]
+    assert {n for n in changed(before, contents(out)) if n[:8] == "surfaces"} == {
+        "surfaces/000007.ply", "surfaces/000008.ply"}
+    assert track(*arguments(folder, out.with_name("anew"), *KNOWN)) == 0
+    assert contents(out) == contents(out.with_name("anew"))
+
+
+def test_damaged_frames_are_followed_again_and_nothing_else(again):
+    folder, out, numbers = again
+    before, kept = contents(out), out / HOME / "done" / "frames%2F00000000.npz"
+    kept.write_bytes(kept.read_bytes()[:-200])
+    assert track(*arguments(folder, out, *KNOWN)) == 0
+    assert numbers == [0, 1, 2, 3, 4] and contents(out) == before
+
+
+def test_a_shorter_recording_leaves_nothing_behind(again):
+    folder, out, numbers = again
+    for path in (folder / "frames").glob("*/00[4-8].ply"):
+        path.unlink()
+    assert track(*arguments(folder, out, *KNOWN)) == 0
+    assert numbers == [0, 1, 2, 3] and len(list((out / "surfaces").iterdir())) == 4
+    assert sorted(p.name for p in (out / HOME / "done").glob("frames*")) == ["frames%2F00000000.npz",
+                                                                            "frames%2Fend.npz"]
+
+
+@pytest.mark.parametrize("what", ["model", "shifted", "landmarks", "rate", "subject", "force"])
+def test_all_is_followed_anew_when_it_depends_on_what_changed(again, monkeypatch, what):
+    folder, out, _ = again
+    given = {"rate": ["--rate", 26], "force": ["--force"]}.get(what, [])
+    if what == "model":
+        model = load_model(folder / "model.npz")            # of the same training set
+        replace(model, pose_mean=1.01 * model.pose_mean).save(folder / "model.npz")
+    elif what == "shifted":
+        for path in (folder / "frames").glob("*/000.ply"):
+            path.unlink()
+    elif what == "landmarks":
+        marks = json.loads((folder / "marks.json").read_text())
+        (folder / "marks.json").write_text(json.dumps({n: [x + 0.01, y, z] for n, (x, y, z) in marks.items()}))
+
+    def interrupted(self, frame):
+        assert self.state.number == 0
+        raise KeyboardInterrupt
+
     monkeypatch.setattr(Tracker, "push", interrupted)
-    monkeypatch.setattr(cli, "_page", lambda *_: None)
-    assert call(recording, tmp_path, "--subject", "template", "--surfaces") == 130
-    assert not (tmp_path / "motion.npz").exists()
-    assert call(recording, tmp_path, "--subject", "template", "--surfaces") == 0
-    assert len(calls) == 7 + FRAMES - 6
-    whole, pieced = (Motion.load(folder / "motion.npz") for folder in (output, tmp_path))
-    np.testing.assert_allclose(pieced.poses, whole.poses, atol=1e-9)
-    np.testing.assert_allclose(pieced.trans, whole.trans, atol=1e-9)
-    assert len(list((tmp_path / "surfaces").iterdir())) == FRAMES
+    assert track(*arguments(folder, out, *(KNOWN if what != "subject" else KNOWN[2:]), *given)) == 130
 
 
-def test_the_shape_is_kept_with_the_frames(recording, tmp_path, monkeypatch):
-    monkeypatch.setattr(cli, "_page", lambda *_: None)
-    assert call(recording, tmp_path) == 0
-    monkeypatch.setattr(Tracker, "push", lambda *_: pytest.fail("tracked again"))
-    first = Motion.load(tmp_path / "motion.npz")
-    assert call(recording, tmp_path) == 0
-    np.testing.assert_array_equal(Motion.load(tmp_path / "motion.npz").betas, first.betas)
-    assert first.betas.shape == (3,) and np.abs(first.betas).max() > 0
+def test_what_others_put_into_the_output_stays(recording, tmp_path, capfd):
+    (tmp_path / "surfaces").mkdir()
+    (tmp_path / "surfaces" / "000000.ply").write_text("mine")
+    assert call(recording, tmp_path, *KNOWN) == 1
+    assert "surfaces: in the way of the output" in capfd.readouterr().err
+    assert contents(tmp_path) == {"surfaces/000000.ply": b"mine"}
+
+
+def test_a_file_that_cannot_be_read_is_told_again(again, capfd):
+    folder, out, numbers = again
+    (folder / "frames" / "back" / "006.ply").write_text("ply\nhalf a header")
+    for followed in ([5, 6, 7, 8], []):
+        del numbers[:]
+        assert track(*arguments(folder, out, *KNOWN)) == 1
+        assert numbers == followed and capfd.readouterr().err.count(f"failed: {folder}/frames/back/006.ply: ") == 1
 
 
 def test_what_is_wrong_is_said_in_a_line(recording, tmp_path, capfd):
     folder, _ = recording
     (tmp_path / "marks.json").write_text('{"m6": [0, 0, 0]}')
-    assert run(cli.track_frames, "scape track", [str(folder / "frames"), "-m", str(folder / "model.npz"), "-o",
-                                                 str(tmp_path), "--landmarks", str(tmp_path / "marks.json")]) == 1
+    given = ["-m", str(folder / "model.npz"), "-o", str(tmp_path / "out")]
+    assert run(cli.track_frames, "scape track", [str(folder / "frames"), *given, "--landmarks",
+                                                 str(tmp_path / "marks.json")]) == 1
     assert "marks.json" in capfd.readouterr().err
-    assert run(cli.track_frames, "scape track", [str(tmp_path / "none"), "-o", str(tmp_path)]) == 1
+    assert run(cli.track_frames, "scape track", [str(tmp_path / "none"), *given]) == 1
     assert "no such folder" in capfd.readouterr().err
     with pytest.raises(SystemExit):
         run(cli.track_frames, "scape track", ["--help"])

@@ -88,3 +88,17 @@ def test_pictures_are_checked(image):
 
 def test_missing_numbers_show_as_a_dash():
     assert "<td class=\"number\">–</td>" in Page("x").table([(float("nan"),)]).html()
+
+
+def test_a_chart_gives_the_same_bytes_every_time():
+    from matplotlib.figure import Figure
+
+    def page():
+        figure = Figure()
+        axes = figure.subplots()
+        axes.plot([1, 2], [3, 4], label="a")
+        axes.fill_between([1, 2], 0, 1)
+        axes.legend()
+        return Page("a").chart(figure).html()
+
+    assert page() == page()

@@ -1,6 +1,7 @@
 """The command `scape track`."""
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -10,16 +11,17 @@ import tyro
 from model.body import BodyModel
 from model.cli import read_subject
 from model.linear import Subject
+from scanprep.batch.workspace import Workspace
 from scanprep.cli import MM, Output, Unit
-from scanprep.console import Metric, Outcome, bar, plain, say
+from scanprep.console import Metric, Outcome, bar, say
 
 from ..cli import ModelOrNone, read_landmark_pairs, read_model, rows
 from ..motion import Motion
+from .chunks import follow_folder
 from .folder import FrameFolder
-from .sequence import as_motion, without_points
+from .sequence import as_motion
 from .settings import TrackConfig
-from .store import FrameStore
-from .tracker import TrackedFrame, Tracker
+from .tracker import Tracker
 
 FramesArg = Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="FRAMES")]
 
@@ -27,14 +29,15 @@ FramesArg = Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="FRAMES"
 def track_frames(frames: FramesArg, output: Output, model: ModelOrNone = None, rate: float = 30.0,
                  cameras: str | None = None, landmarks: Path | None = None, subject: str | None = None,
                  template_landmarks: Path | None = None, unit: Unit | None = None, surfaces: bool = False,
-                 keys: int = 120, config: Annotated[TrackConfig, tyro.conf.arg(name="")] = TrackConfig()  # noqa: B008
-                 ) -> Outcome:
+                 keys: int = 120, config: Annotated[TrackConfig, tyro.conf.arg(name="")] = TrackConfig(),  # noqa: B008
+                 *, space: Workspace) -> Outcome:
     """The motion of a person from frames of points, without markers.
 
     Example: scape track frames -m model.npz --rate 30 -o walk
 
     Frames are in the order of the numbers in their names; a number that is left out is a frame in which nothing was
-    seen. Interrupted, the same command goes on where it stopped.
+    seen. Interrupted, the same command goes on where it stopped. A frame that has changed is tracked anew, with all
+    that follow it.
 
     Args:
         frames: Folder of meshes or point clouds, one for each frame; or with one such folder for each camera, all
@@ -53,62 +56,32 @@ def track_frames(frames: FramesArg, output: Output, model: ModelOrNone = None, r
         keys: Largest number of key frames in the GLB.
         config: Settings.
     """
+    from ..animation.work import write_glb
+
     found = FrameFolder(frames, cameras, unit)
     loaded, name = read_model(model)
     body: BodyModel | Subject = loaded
     if subject is not None or not loaded.n_betas:
         body = read_subject(loaded, None if subject in (None, "template") else Path(str(subject)), unit)
     marked = None if landmarks is None else read_landmark_pairs(loaded, name, landmarks, template_landmarks, unit)
-    key = {"settings": plain(config), "model": name, "digest": loaded.info.get("digest"), "rate": rate, "unit": unit,
-           "subject": subject, "landmarks": None if marked is None else [m.tolist() for m in marked],
-           "surfaces": surfaces, "frames": str(frames.resolve()), "cameras": found.cameras,
-           "first": [(p.name, p.stat().st_size) for p in found.paths(0)]}
-    store = FrameStore(output / "tracked", key)
-    tracker = Tracker(body, config, rate, marked)
-    done, before = _follow(tracker, found, store, output / "surfaces" if surfaces else None)
-    motion = as_motion(done, tracker.betas, rate, config)
+    whose = Path(subject) if subject not in (None, "template") else subject
+    key = space.digests.of(model or loaded, whose, marked, unit, replace(config, smoothing=0), rate, surfaces)
+    with bar("following the body") as progress:
+        done = follow_folder(Tracker(body, config, rate, marked), found, space, key, surfaces, progress)
+    if done.fresh < len(found):
+        say(f"{len(found) - done.fresh} of {len(found)} frames were tracked before")
+    motion = as_motion(done.frames, done.state.betas, rate, config)
     person = body if isinstance(body, Subject) else loaded.subject(motion.betas)
     metrics = [Metric("model", name), Metric("cameras", len(found.cameras)), *_figures(motion)]
-    if before:
-        metrics.append(Metric("frames tracked before", before))
-    _write(output, motion, person, keys)
-    _page(output, motion, person, found, frames.name, metrics)
-    return Outcome(output, metrics, {"track": config, "rate": rate, "model": name}, found.problems)
 
+    def write(folder: Path) -> None:
+        _write(folder, motion, person)
+        _page(folder, motion, person, found, frames.name, metrics)
 
-def _follow(tracker: Tracker, frames: FrameFolder, store: FrameStore, surfaces: Path | None
-            ) -> tuple[list[TrackedFrame], int]:
-    """All frames, those that were tracked before first, and how many these were."""
-    done, betas = store.load()
-    before = len(done)
-    if before:
-        tracker.resume(done, betas)
-        say(f"{before} frames were tracked before")
-    frames.problems += store.problems
-
-    def keep(ready: list[TrackedFrame]) -> None:
-        for frame in ready:
-            if surfaces is not None:
-                _write_surface(surfaces, tracker, frame)
-            done.append(without_points(frame))
-            store.add(done[-1], tracker.betas, frames.problems)
-            progress(len(done), len(frames))
-
-    with bar("following the body") as progress:
-        try:
-            for i in range(before, len(frames)):
-                keep(tracker.push(frames[i]))
-            keep(tracker.finish())
-        finally:                                     # after an interruption too
-            store.write(tracker.betas, frames.problems)
-    return done, before
-
-
-def _write_surface(folder: Path, tracker: Tracker, frame: TrackedFrame) -> None:
-    from scanprep.geometry.files import write_mesh
-
-    folder.mkdir(parents=True, exist_ok=True)
-    write_mesh(folder / f"{frame.number:06d}.ply", tracker.surface(frame), "single")
+    of_motion = done.key, config.smoothing
+    space.step("motion", (of_motion, rows(metrics), frames.name), write)
+    space.step("animation", (of_motion, keys), lambda folder: write_glb(folder / "animation.glb", motion, person, keys))
+    return Outcome(output, metrics, {"track": config, "rate": rate, "model": name}, found.problems, problem=None)
 
 
 def _figures(motion: Motion) -> list[Metric]:
@@ -120,12 +93,10 @@ def _figures(motion: Motion) -> list[Metric]:
             Metric("the same, worst frame", MM * float(shown.max()), "mm")]
 
 
-def _write(output: Path, motion: Motion, person: Subject, keys: int) -> None:
+def _write(output: Path, motion: Motion, person: Subject) -> None:
     from ..animation.outputs import write_joint_angles, write_joint_centres, write_motion_bvh, write_residuals
-    from ..animation.work import write_glb
 
     motion.save(output / "motion.npz")
-    write_glb(output / "animation.glb", motion, person, keys)
     write_motion_bvh(output / "motion.bvh", motion, person)
     write_joint_angles(output / "joint_angles.csv", motion, person.skeleton.names)
     write_joint_centres(output / "joint_centres.csv", motion, person)

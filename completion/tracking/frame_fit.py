@@ -2,6 +2,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -63,6 +64,15 @@ class FrameFit:
     def on(self, cloud: ScanPoints) -> ScanFit:
         """The same fit with another frame."""
         return self._fit.on(cloud)
+
+    @property
+    def draws(self) -> dict[str, Any]:
+        """State of the random numbers of searches from scratch."""
+        return dict(self._fit.rng.bit_generator.state)
+
+    @draws.setter
+    def draws(self, state: dict[str, Any]) -> None:
+        self._fit.rng.bit_generator.state = state
 
     def good(self, found: Settled) -> bool:
         """Whether a frame is not lost."""

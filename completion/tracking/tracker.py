@@ -3,6 +3,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -53,6 +54,37 @@ class TrackedFrame:
     cloud: ScanPoints | None = None
 
 
+@dataclass(frozen=True, eq=False)
+class TrackerState:
+    """All that a tracker knows after some frames: another one goes on from there to the very same end.
+
+    Attributes
+    ----------
+    number : int
+        Frames taken.
+    lost : int
+        How many of the last ones were lost, one after the other.
+    betas : (K,) float, or None
+        Those found so far.
+    shape_known : bool
+        Whether they stay.
+    past : up to two (P,) float
+        Where the body was, the last frame first.
+    kept : tuple of TrackedFrame
+        Frames that may still change, with their points.
+    draws : dict, or None
+        State of the random numbers that a search from scratch draws.
+    """
+
+    number: int
+    lost: int
+    betas: np.ndarray | None
+    shape_known: bool
+    past: tuple[np.ndarray, ...]
+    kept: tuple[TrackedFrame, ...]
+    draws: dict[str, Any] | None
+
+
 class Tracker:
     """Follows one body through frames that are handed over one by one.
 
@@ -80,19 +112,27 @@ class Tracker:
         self.betas = body.betas if isinstance(body, Subject) else None
         self.body: FixedBody | None = None if isinstance(self.whole, ShapedBody) else self.whole
         self._fit: FrameFit | None = None
+        self._draws: dict[str, Any] | None = None           # those that the next fit begins with
         self._past: list[np.ndarray] = []
         self._number, self._lost = 0, 0
         self._kept: list[TrackedFrame] = []
         self._shape_known = not isinstance(self.whole, ShapedBody)
 
-    def resume(self, frames: list[TrackedFrame], betas: np.ndarray | None) -> None:
-        """Go on after frames that were tracked before, with the shape that was found."""
+    @property
+    def state(self) -> TrackerState:
+        """What is known after the frames taken so far."""
+        draws = self._draws if self._fit is None else self._fit.draws
+        return TrackerState(self._number, self._lost, self.betas, self._shape_known, tuple(self._past),
+                            tuple(self._kept), draws)
+
+    def resume(self, state: TrackerState) -> None:
+        """Go on where a tracker of the same body and settings was."""
         if isinstance(self.whole, ShapedBody):
-            assert betas is not None, "a shape was found"
-            self.betas, self.body, self._shape_known = betas, FixedBody(self.whole.model.subject(betas)), True
-        self._past = [frame.x for frame in frames[:-3:-1]]
-        self._number = frames[-1].number + 1
-        self._lost = next((i for i, frame in enumerate(reversed(frames)) if frame.found), len(frames))
+            self.betas = state.betas
+            self.body = None if state.betas is None else FixedBody(self.whole.model.subject(state.betas))
+        self._number, self._lost, self._shape_known = state.number, state.lost, state.shape_known
+        self._past, self._kept = list(state.past), list(state.kept)
+        self._fit, self._draws = None, state.draws
 
     def push(self, frame: Frame) -> list[TrackedFrame]:
         """Take the next frame; returns those that are done, which may be none or several."""
@@ -165,6 +205,8 @@ class Tracker:
         if self._fit is None:
             assert self.body is not None
             self._fit = FrameFit(self.body, cloud, self.config, self.rate)
+            if self._draws is not None:
+                self._fit.draws = self._draws
         return self._fit
 
     def _mesh(self, x: np.ndarray) -> Mesh:
@@ -207,7 +249,7 @@ class Tracker:
         clouds = [f.cloud for f in chosen if f.cloud is not None]
         person = shared_shape(self.whole, clouds, np.stack([f.x for f in chosen]), self.betas, self.config)
         self.betas, self.body = person.betas, FixedBody(self.whole.model.subject(person.betas))
-        self._fit = None
+        self._fit, self._draws = None, None
         self._kept = [self._refined(f) for f in self._kept]
         self._past = [f.x for f in self._kept[:-3:-1]]
 

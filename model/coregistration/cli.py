@@ -1,6 +1,8 @@
 """`scape model coregister`: a folder of scans registered with a model, and the model learned again."""
 from __future__ import annotations
 
+import csv
+import io
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated
@@ -8,22 +10,27 @@ from typing import Annotated
 import numpy as np
 import tyro
 
-from scanprep.cli import Output, Unit
+from scanprep.batch.pool import Workers
+from scanprep.batch.workspace import Workspace
+from scanprep.cli import Output, Unit, WorkersArg
 from scanprep.console import Metric, Outcome, bar
-from scanprep.dataset import RegisteredSet
+from scanprep.dataset import RegisteredSet, SetEntry, write_set
+from scanprep.geometry.files import write_mesh
 from scanprep.geometry.landmarks import match_landmarks, read_landmarks, write_landmarks
 from scanprep.geometry.mesh import Mesh
-from scanprep.pipeline.scans import find_scans
+from scanprep.pipeline.prepare import mesh_file
+from scanprep.pipeline.scans import ScanTask, find_scans
 
 from ..body import BodyModel
 from ..cli import ModelArg
 from ..files import load_model
 from .config import CoregistrationConfig
-from .folder import TABLE, RoundsFolder, write_table
 from .rounds import Coregistration, coregister
 from .single import Landmarks
 
 MM = 1000.0
+TABLE = "coregistration.csv"
+FIGURES = ("rms", "explained", "apart", "landmark_rms", "flipped", "score", "starts")
 OWN = "template"                     # whose scans they are where nothing says it
 
 ScansArg = Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="SCANS")]
@@ -31,11 +38,12 @@ ScansArg = Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="SCANS")]
 
 def coregister_scans(model: ModelArg, scans: ScansArg, output: Output, landmarks: Path | None = None,
                      first: Path | None = None, subject: str = OWN, unit: Unit | None = None,
-                     rounds: int = CoregistrationConfig.rounds, workers: int = CoregistrationConfig.workers,
-                     failed: float = CoregistrationConfig.failed) -> Outcome:
+                     rounds: int = CoregistrationConfig.rounds, workers: WorkersArg = Workers(),  # noqa: B008
+                     failed: float = CoregistrationConfig.failed, *, space: Workspace) -> Outcome:
     """Register every scan of a folder with a model as prior, learn the model again, and so on until it settles.
 
-    Writes a registered set with model.npz in it. Killed and started again it goes on where it was.
+    Writes a registered set with model.npz in it. Killed and started again it goes on where it was. Of a scan that has
+    changed the first registration is made anew, and of all others those after it, as the model has learned from it.
 
     Example: scape model coregister model.npz scans --first set -o better
 
@@ -48,7 +56,7 @@ def coregister_scans(model: ModelArg, scans: ScansArg, output: Output, landmarks
         subject: Whose scans they are, where scans.csv does not say; else all of the template's person.
         unit: Unit of the scans and landmarks, where the files cannot tell.
         rounds: Most times that all scans are registered and the model is learned.
-        workers: Processes; 0 for one a core.
+        workers: Who does the work.
         failed: A scan of which a larger share of points stays unexplained does not teach the model.
     """
     from scanprep.pipeline.scans import read_scan
@@ -70,23 +78,42 @@ def coregister_scans(model: ModelArg, scans: ScansArg, output: Output, landmarks
         raise ValueError(f"{scans}: none of {len(tasks)} scans can be read; the first: {failures[0]}")
     names = [task.name for task in kept]
     starts = _starts(first, loaded, names)
-    store = RoundsFolder(output / "rounds", loaded, names, [task.fingerprint() for task in kept], config)
     with bar("co-registering") as progress:
-        done = coregister(loaded, read, marks, config, starts, [task.subject for task in kept], progress, store)
-    registered = RegisteredSet.create(output, loaded.template)
-    for task, found in zip(kept, done.registrations, strict=True):
-        registered = registered.add(task.name, found.mesh, task.subject, task.pose, task.sex)
-    registered.with_skeleton(done.model.skeleton)
-    write_landmarks(output / "landmarks.json", loaded.info.get("landmarks", {}))
-    write_table(output / TABLE, names, done.registrations, done.good)
-    done.model.save(output / "model.npz")
-    return Outcome(output, _figures(done, names), {"coregistration": config}, failures)
+        done = coregister(loaded, read, marks, config, starts, [task.subject for task in kept], progress, names, space)
+    with space.staging("set") as staged:
+        write_coregistered(staged.folder, loaded, kept, done)
+    return Outcome(output, _figures(done, names), {"coregistration": config}, [*failures, *done.failures.values()],
+                   problem=None)
+
+
+def write_coregistered(folder: Path, first: BodyModel, tasks: Sequence[ScanTask], done: Coregistration) -> None:
+    """A registered set of the scans, the model learned from it, and a table of figures."""
+    registered = {task: r for task, r in zip(tasks, done.registrations, strict=True) if r is not None}
+    write_set(folder, first.template, [SetEntry(t.name, t.subject, t.pose, t.sex, mesh_file(t.name))
+                                       for t in registered])
+    for task, r in registered.items():
+        write_mesh(folder / mesh_file(task.name), r.mesh)
+    done.model.skeleton.save(folder / "skeleton.json")
+    write_landmarks(folder / "landmarks.json", first.info.get("landmarks", {}))
+    write_table(folder / TABLE, tasks, done)
+    done.model.save(folder / "model.npz")
+
+
+def write_table(path: Path, tasks: Sequence[ScanTask], done: Coregistration) -> None:
+    """A row of figures for every scan that could be registered, in metres."""
+    text = io.StringIO()
+    table = csv.writer(text, lineterminator="\n")
+    table.writerow(["name", "good", *FIGURES])
+    for task, fine, r in zip(tasks, done.good, done.registrations, strict=True):
+        if r is not None:
+            table.writerow([task.name, bool(fine), *(getattr(r, figure) for figure in FIGURES)])
+    path.write_text(text.getvalue(), encoding="utf-8")
 
 
 def _figures(done: Coregistration, names: Sequence[str]) -> list[Metric]:
-    found = done.registrations
+    found = [r for r in done.registrations if r is not None]
     bad = [name for name, fine in zip(names, done.good, strict=True) if not fine]
-    return [Metric("scans registered", f"{int(done.good.sum())} of {len(found)}"),
+    return [Metric("scans registered", f"{int(done.good.sum())} of {len(done.good)}"),
             Metric("failed", ", ".join(bad) or "none"),
             Metric("rounds", done.rounds), Metric("converged", done.converged),
             *(Metric(f"round {i}: failed", turn.failed) for i, turn in enumerate(done.history, 1)),

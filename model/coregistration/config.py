@@ -3,6 +3,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
+from scanprep.batch.pool import Workers
 from scanprep.matching.schedule import GraphStage, RegistrationConfig
 from scanprep.skeleton.parts import SkeletonConfig
 
@@ -122,8 +123,7 @@ class CoregistrationConfig:
         A scan of which a larger share of points stays unexplained has failed, and does not teach the model.
     skeleton : SkeletonConfig, optional
         Find the skeleton again in every round; without it the model keeps the one it has.
-    workers : int
-        Processes; 0 for one a core.
+    workers : Workers
     """
 
     fit: ModelFitConfig = field(default_factory=ModelFitConfig)
@@ -135,4 +135,4 @@ class CoregistrationConfig:
     explained: float = 0.006
     failed: float = 0.015
     skeleton: SkeletonConfig | None = None
-    workers: int = 0
+    workers: Workers = field(default_factory=Workers)

@@ -1,16 +1,18 @@
 """A first model from scans alone: plain registration, a skeleton, and learning from what came out well."""
 from __future__ import annotations
 
-import os
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 
 import numpy as np
 
+from scanprep.batch.pool import Room
+from scanprep.batch.workspace import Task, Workspace
 from scanprep.geometry.mesh import Mesh
 from scanprep.matching.matches import orient, target_of
 from scanprep.matching.nonrigid import register
 from scanprep.matching.schedule import RegistrationConfig
+from scanprep.pipeline.scan import one_thread
 from scanprep.skeleton.find import find_skeleton
 from scanprep.skeleton.parts import SkeletonConfig
 from scanprep.skeleton.tree import Skeleton
@@ -20,7 +22,7 @@ from ..learning.scape import learn_scape
 from ..scape import ScapeModel
 from .attraction import apart
 from .config import CoregistrationConfig
-from .rounds import Coregistration, coregister
+from .rounds import Coregistration, coregister, kept_or_not
 from .single import Landmarks
 
 Progress = Callable[[int, int], None]
@@ -70,10 +72,29 @@ class FirstModel:
     coregistration: Coregistration
 
 
+@dataclass(frozen=True, eq=False)
+class PlainScan:
+    """A scan and its landmarks."""
+
+    scan: Mesh | np.ndarray
+    landmarks: Landmarks | None
+
+
+@dataclass(frozen=True, eq=False)
+class RegisterPlainly:
+    """The work on each scan before there is a model."""
+
+    template: Mesh
+    config: RegistrationConfig
+
+    def __call__(self, given: PlainScan, room: Room) -> np.ndarray:
+        return register(self.template, given.scan, given.landmarks, self.config).mesh.vertices
+
+
 @one_thread()
 def learn_from_scans(template: Mesh, scans: Sequence[Mesh | np.ndarray], landmarks: Sequence[Landmarks | None],
                      skeleton: Skeleton | None = None, config: FirstConfig | None = None,
-                     progress: Progress | None = None) -> FirstModel:
+                     progress: Progress | None = None, space: Workspace | None = None) -> FirstModel:
     """A body model from scans of one person in many poses, whose first registrations may fail for some.
 
     Parameters
@@ -87,28 +108,27 @@ def learn_from_scans(template: Mesh, scans: Sequence[Mesh | np.ndarray], landmar
     config : FirstConfig, optional
     progress : callable, optional
         Called as progress(done, total), with scans registered.
+    space : Workspace, optional
+        Where work is kept and found again, as by `coregister`.
 
     Raises
     ------
     ValueError
         Lists of different length, scans that cannot be used, too few good registrations to find a skeleton.
     """
-    from joblib import Parallel, delayed, parallel_config
-
     config = config or FirstConfig()
     if len(landmarks) != len(scans):
         raise ValueError(f"landmarks: expected {len(scans)}, one a scan, got {len(landmarks)}")
     n, tell = len(scans), progress or (lambda done, total: None)
     total = n * (1 + config.rounds.rounds)
-    workers = min(config.rounds.workers or os.cpu_count() or 1, max(n, 1))
-    jobs = (delayed(_registered)(template, scan, marks, config.registration)
-            for scan, marks in zip(scans, landmarks, strict=True))
-    first = []
-    with parallel_config("loky" if workers > 1 else "sequential", n_jobs=workers):
-        for vertices in Parallel(return_as="generator", batch_size=1)(jobs):
-            first.append(vertices)
-            tell(len(first), total)
-    registered = np.stack(first)
+    tasks = [Task(f"without a model/scan {i}", PlainScan(scan, marks))
+             for i, (scan, marks) in enumerate(zip(scans, landmarks, strict=True))]
+    with kept_or_not(space) as kept, one_thread():
+        first = kept.run(RegisterPlainly(template, config.registration), tasks, config.rounds.workers,
+                         lambda done, _: tell(done, total))
+    if first.failures:
+        raise ValueError(f"scans: {next(iter(first.failures.values()))}")
+    registered = np.stack(list(first.values.values()))
     share = np.array([explained_share(template.with_vertices(v), scan, config.rounds)
                       for v, scan in zip(registered, scans, strict=True)])
     good = share >= 1 - config.rounds.failed
@@ -118,7 +138,7 @@ def learn_from_scans(template: Mesh, scans: Sequence[Mesh | np.ndarray], landmar
     tree = find_skeleton(template, bodies, config.skeleton) if skeleton is None else skeleton
     model = learn_scape(template, bodies, None, tree, config.rounds.learn)
     found = coregister(model, scans, landmarks, config.rounds, list(registered),
-                       progress=lambda done, _: tell(n + done, total))
+                       progress=lambda done, _: tell(n + done, total), space=space)
     return FirstModel(registered, share, good, model, found)
 
 
@@ -128,8 +148,3 @@ def explained_share(mesh: Mesh, scan: Mesh | np.ndarray, config: CoregistrationC
     limit = config.explained * size
     target = orient(target_of(scan).thinned(DETAIL * size), mesh, config.fit.normal_weight * size)
     return float((apart(mesh, target, limit) < limit).mean())
-
-
-def _registered(template: Mesh, scan: Mesh | np.ndarray, marks: Landmarks | None, config: RegistrationConfig
-                ) -> np.ndarray:
-    return register(template, scan, marks, config).mesh.vertices

@@ -1,14 +1,18 @@
 """Rounds of registering all scans with a model and learning the model again from what comes of it."""
 from __future__ import annotations
 
-import os
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass, replace
-from typing import Protocol
+import contextlib
+import tempfile
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from functools import cached_property
 
 import numpy as np
 
+from scanprep.batch.pool import Room
+from scanprep.batch.workspace import Task, Workspace, workspace
 from scanprep.geometry.mesh import Mesh
+from scanprep.pipeline.scan import one_thread
 from scanprep.skeleton.find import find_skeleton
 from scanprep.skeleton.tree import Skeleton
 from scanprep.threads import one_thread
@@ -21,6 +25,7 @@ from .single import Landmarks, ModelRegistration, register_with_model
 
 Progress = Callable[[int, int], None]
 Scan = Mesh | np.ndarray
+Lessons = tuple[np.ndarray, np.ndarray | None]       # poses (M, N, 3) of the template's person, shapes (S, N, 3)
 
 
 @dataclass(frozen=True)
@@ -51,45 +56,71 @@ class Coregistration:
 
     Attributes
     ----------
-    registrations : ModelRegistration of every scan
+    registrations : ModelRegistration of every scan, or None
+        None where the scan could not be registered at all.
     good : (n,) bool
         Scans that have not failed; the model was learned from these.
     model : BodyModel
     rounds : int
     converged : bool
     history : tuple of Round
+    failures : name -> why a scan could not be registered at all
     """
 
-    registrations: tuple[ModelRegistration, ...]
+    registrations: tuple[ModelRegistration | None, ...]
     good: np.ndarray
     model: BodyModel
     rounds: int
     converged: bool
     history: tuple[Round, ...]
+    failures: Mapping[str, str] = field(default_factory=dict)
 
 
-class Store(Protocol):
-    """Where the work of every round is kept, so that it can go on when it was interrupted."""
+@dataclass(frozen=True, eq=False)
+class RegisterWithModel:
+    """The work on each scan of a round.
 
-    def found(self, turn: int, scan: int) -> ModelRegistration | None:
-        """What is kept of a scan in a round."""
-        ...
+    Attributes
+    ----------
+    model : BodyModel
+    config : CoregistrationConfig
+        What one registration depends on; all else is at its defaults.
+    """
 
-    def keep(self, turn: int, scan: int, registration: ModelRegistration) -> None: ...
+    model: BodyModel
+    config: CoregistrationConfig
 
-    def model(self, turn: int) -> BodyModel | None:
-        """What was learned in a round."""
-        ...
+    @cached_property
+    def person(self) -> Subject:
+        """The template's own body, made once for all scans."""
+        return self.model.subject()
 
-    def keep_model(self, turn: int, model: BodyModel) -> None: ...
+    def __call__(self, given: OneScan, room: Room) -> ModelRegistration:
+        body = self.person if given.own or not self.model.n_betas else self.model
+        return register_with_model(body, given.scan, given.landmarks, given.start, self.config)
+
+
+@dataclass(frozen=True, eq=False)
+class OneScan:
+    """A scan and what is known of it before a round; `own` tells that it is of the template's person."""
+
+    scan: Scan
+    landmarks: Landmarks | None
+    start: np.ndarray | None
+    own: bool
 
 
 @one_thread()
 def coregister(model: BodyModel, scans: Sequence[Scan], landmarks: Sequence[Landmarks | None] | None = None,
                config: CoregistrationConfig | None = None, starts: Sequence[np.ndarray | None] | None = None,
-               subjects: Sequence[str] | None = None, progress: Progress | None = None, store: Store | None = None
-               ) -> Coregistration:
+               subjects: Sequence[str] | None = None, progress: Progress | None = None,
+               names: Sequence[str] | None = None, space: Workspace | None = None) -> Coregistration:
     """Register every scan with the model as prior, learn the model again from that, until it settles.
+
+    With a `space` all work is kept there and found again. A registration depends on the scan, its landmarks, its
+    start and the model of its round, and a model on the registrations that taught it. So a scan that has changed is
+    alone registered anew in the first round; from the second on all are, if it taught the model. A scan that cannot
+    be registered stops no other.
 
     Parameters
     ----------
@@ -105,38 +136,59 @@ def coregister(model: BodyModel, scans: Sequence[Scan], landmarks: Sequence[Land
         each of the others teaches the shapes. Without labels all scans are of the template's person.
     progress : callable, optional
         Called as progress(done, total), with scans registered of all rounds.
-    store : Store, optional
-        Where work is kept and found again.
+    names : n labels, no two alike, optional
+        Of the scans, for messages and what is kept; numbers without.
+    space : Workspace, optional
 
     Raises
     ------
     ValueError
-        Lists of different length, a model that cannot be learned again, scans that cannot be used; fewer than two
-        scans of the template's person that have not failed.
+        Lists of different length, a model that cannot be learned again; fewer than two scans of the template's person
+        that have not failed.
 
     [BlendSCAPE]
     """
     config = config or CoregistrationConfig()
     n = len(scans)
-    for name, given in (("landmarks", landmarks), ("starts", starts), ("subjects", subjects)):
+    for name, given in (("landmarks", landmarks), ("starts", starts), ("subjects", subjects), ("names", names)):
         if given is not None and len(given) != n:
             raise ValueError(f"{name}: expected {n}, one a scan, got {len(given)}")
     if model.kind not in ("scape", "blendscape"):
         raise ValueError(f"model: expected one of the kind scape or blendscape, got {model.kind}")
+    labels = [f"scan {i}" for i in range(n)] if names is None else list(names)
     marks = list(landmarks) if landmarks is not None else [None for _ in scans]
-    before: Sequence[np.ndarray | None] = list(starts) if starts is not None else [None for _ in scans]
-    own = _own(subjects, n)
-    history: list[Round] = []
-    good, registrations = np.zeros(n, dtype=bool), list[ModelRegistration]()
-    while len(history) < config.rounds and not _settled(history, model, config):
-        turn, last = len(history), registrations
-        registrations = _register_all(model, scans, marks, before, own, config, turn, store, progress)
-        good = np.array([r.explained >= 1 - config.failed for r in registrations])
-        history.append(_summary(registrations, good, last))
-        model = _taught(model, registrations, good, own, subjects, config, turn, store)
-        before = [r.mesh.vertices for r in registrations]
+    before: list[np.ndarray | None] = list(starts) if starts is not None else [None for _ in scans]
+    own, history = _own(subjects, n), list[Round]()
+    good, registrations, failures = np.zeros(n, dtype=bool), list[ModelRegistration | None](), dict[str, str]()
+    with kept_or_not(space) as kept:
+        while len(history) < config.rounds and not _settled(history, model, config):
+            turn, last = len(history), registrations
+            ready = [OneScan(scans[i], marks[i], before[i], bool(own[i])) for i in range(n)]
+            registrations, failures = _registered(kept, model, ready, labels, config, turn, progress)
+            good = np.array([r is not None and r.explained >= 1 - config.failed for r in registrations], dtype=bool)
+            lessons = _lessons(registrations, good, own, subjects, failures)
+            history.append(_summary(registrations, good, last))
+            model = _taught(kept, model, lessons, config, turn)
+            before = [start if r is None else r.mesh.vertices for r, start in zip(registrations, before, strict=True)]
     return Coregistration(tuple(registrations), good, model, len(history), _settled(history, model, config),
-                          tuple(history))
+                          tuple(history), failures)
+
+
+def task_name(turn: int, name: str) -> str:
+    """What the registration of a scan is called among the results of a workspace; rounds count from 0."""
+    return f"round {turn + 1}/{name}"
+
+
+@contextlib.contextmanager
+def kept_or_not(space: Workspace | None) -> Iterator[Workspace]:
+    """A workspace, or one that is gone at the end."""
+    with contextlib.ExitStack() as stack:
+        yield space or stack.enter_context(workspace(stack.enter_context(tempfile.TemporaryDirectory())))
+
+
+def _of_one(config: CoregistrationConfig) -> CoregistrationConfig:
+    return CoregistrationConfig(fit=config.fit, registration=config.registration, alignments=config.alignments,
+                                explained=config.explained)
 
 
 def learn_again(model: BodyModel, poses: np.ndarray, shapes: np.ndarray | None, config: CoregistrationConfig
@@ -163,69 +215,50 @@ def _own(subjects: Sequence[str] | None, n: int) -> np.ndarray:
     return np.array([subject == most for subject in subjects])
 
 
-def _register_all(model: BodyModel, scans: Sequence[Scan], marks: Sequence[Landmarks | None],
-                  starts: Sequence[np.ndarray | None], own: np.ndarray, config: CoregistrationConfig, turn: int,
-                  store: Store | None, progress: Progress | None) -> list[ModelRegistration]:
-    """One round of registrations, in the order of the scans."""
-    out = {i: store.found(turn, i) if store else None for i in range(len(scans))}
-    missing = [i for i, found in out.items() if found is None]
-    tell = progress or (lambda done, total: None)
-    done, total = (turn + 1) * len(scans) - len(missing), config.rounds * len(scans)
-    tell(done, total)
-    person: BodyModel | Subject = model.subject() if missing else model
-    jobs = [(i, person if own[i] or not model.n_betas else model, scans[i], marks[i], starts[i], config)
-            for i in missing]
-    for i, found in _in_parallel(jobs, config.workers):
-        out[i] = found
-        if store:
-            store.keep(turn, i, found)
-        done += 1
-        tell(done, total)
-    return [found for found in out.values() if found is not None]
+def _registered(space: Workspace, model: BodyModel, given: Sequence[OneScan], names: Sequence[str],
+                config: CoregistrationConfig, turn: int, progress: Progress | None
+                ) -> tuple[list[ModelRegistration | None], dict[str, str]]:
+    """One round of registrations, in the order of the scans, and by name why some could not be registered."""
+    def tell(done: int, total: int) -> None:
+        if progress is not None:
+            progress(turn * total + done, config.rounds * total)
+
+    tasks = {name: Task(task_name(turn, name), one) for name, one in zip(names, given, strict=True)}
+    with one_thread():
+        found = space.run(RegisterWithModel(model, _of_one(config)), list(tasks.values()), config.workers, tell)
+    return ([found.values.get(task.name) for task in tasks.values()],
+            {name: found.failures[task.name] for name, task in tasks.items() if task.name in found.failures})
 
 
-def _in_parallel(jobs: Sequence[tuple[int, BodyModel | Subject, Scan, Landmarks | None, np.ndarray | None,
-                                      CoregistrationConfig]], workers: int) -> Iterator[tuple[int, ModelRegistration]]:
-    from joblib import Parallel, delayed, parallel_config
-
-    workers = min(workers or os.cpu_count() or 1, max(len(jobs), 1))
-    if workers == 1:
-        yield from (_numbered(*job) for job in jobs)
-        return
-    # one thread for linear algebra in each process, so that they do not take each other's cores
-    with parallel_config("loky", n_jobs=workers, inner_max_num_threads=1):
-        yield from Parallel(return_as="generator_unordered", batch_size=1)(delayed(_numbered)(*job) for job in jobs)
+def _taught(space: Workspace, model: BodyModel, lessons: Lessons, config: CoregistrationConfig, turn: int
+            ) -> BodyModel:
+    """The model of a round."""
+    return space.step(f"model of round {turn + 1}", (model, lessons, config.learn, config.skeleton),
+                      lambda _: learn_again(model, *lessons, config))
 
 
-def _numbered(i: int, body: BodyModel | Subject, scan: Scan, marks: Landmarks | None, start: np.ndarray | None,
-              config: CoregistrationConfig) -> tuple[int, ModelRegistration]:
-    return i, register_with_model(body, scan, marks, start, config)
-
-
-def _taught(model: BodyModel, registrations: Sequence[ModelRegistration], good: np.ndarray, own: np.ndarray,
-            subjects: Sequence[str] | None, config: CoregistrationConfig, turn: int, store: Store | None) -> BodyModel:
-    """The model of a round, from its registrations that have not failed."""
-    kept = store.model(turn) if store else None
-    if kept is not None:
-        return kept
-    poses = [registrations[i].mesh.vertices for i in np.flatnonzero(good & own).tolist()]
+def _lessons(registrations: Sequence[ModelRegistration | None], good: np.ndarray, own: np.ndarray,
+             subjects: Sequence[str] | None, failures: Mapping[str, str]) -> Lessons:
+    """What teaches the model."""
+    vertices = {i: r.mesh.vertices for i, r in enumerate(registrations) if r is not None and good[i]}
+    poses = [v for i, v in vertices.items() if own[i]]
     if len(poses) < 2:
+        first = "".join(f"; {line}" for line in list(failures.values())[:1])
         raise ValueError(f"scans: only {len(poses)} of {int(own.sum())} of the template's person could be registered; "
-                         "at least 2 are needed to learn from")
+                         f"at least 2 are needed to learn from{first}")
     others = {subjects[i]: i for i in np.flatnonzero(good & ~own)[::-1].tolist()} if subjects is not None else {}
-    shapes = np.stack([registrations[i].mesh.vertices for i in others.values()]) if len(others) > 1 else None
-    learned = learn_again(model, np.stack(poses), shapes, config)
-    if store:
-        store.keep_model(turn, learned)
-    return learned
+    shapes = np.stack([vertices[i] for i in others.values()]) if len(others) > 1 else None
+    return np.stack(poses), shapes
 
 
-def _summary(registrations: Sequence[ModelRegistration], good: np.ndarray, before: Sequence[ModelRegistration]
-             ) -> Round:
-    moved = [float(np.linalg.norm(registrations[i].mesh.vertices - before[i].mesh.vertices, axis=1).mean())
-             for i in np.flatnonzero(good).tolist()] if before else []
-    return Round(int((~good).sum()), float(np.mean([r.explained for r in registrations])),
-                 float(np.median([r.apart for r in registrations])), float(np.mean(moved)) if moved else np.nan)
+def _summary(registrations: Sequence[ModelRegistration | None], good: np.ndarray,
+             before: Sequence[ModelRegistration | None]) -> Round:
+    there = [r for r in registrations if r is not None]
+    moved = [float(np.linalg.norm(r.mesh.vertices - b.mesh.vertices, axis=1).mean())
+             for r, b, fine in zip(registrations, before, good, strict=False)
+             if fine and r is not None and b is not None]
+    return Round(int((~good).sum()), float(np.mean([r.explained for r in there])),
+                 float(np.median([r.apart for r in there])), float(np.mean(moved)) if moved else np.nan)
 
 
 def _settled(history: Sequence[Round], model: BodyModel, config: CoregistrationConfig) -> bool:

@@ -15,7 +15,7 @@ import contextlib
 import os
 import shutil
 import tempfile
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
@@ -187,6 +187,12 @@ class Workspace:
     def drop_record(self, name: str) -> None:
         """Remove what is kept of a result, but none of its files."""
         self._record(name).unlink(missing_ok=True)
+
+    def drop_others(self, start: str, names: Collection[str]) -> None:
+        """Remove the results whose names begin so, but for those named."""
+        for path in sorted((self.home / "done").glob(f"{_plain(start)}*.npz")):
+            if unquote(path.stem) not in names:
+                self.drop(unquote(path.stem))
 
     def names(self, work: Any) -> list[str]:
         """The results that are kept of some work, with all their files."""

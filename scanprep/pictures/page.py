@@ -127,11 +127,11 @@ class Page:
         return self
 
     def chart(self, figure: Any, caption: str = "", alt: str = "") -> Page:
-        """A matplotlib figure, as vector graphics, the same whenever it is drawn."""
+        """A matplotlib figure, as vector graphics; the same figure gives the same bytes."""
         from matplotlib import rc_context
 
         out = io.BytesIO()
-        with rc_context({"svg.hashsalt": self.title}):
+        with rc_context({"svg.hashsalt": "scapekit"}):
             figure.savefig(out, format="svg", bbox_inches="tight", metadata={"Date": None})
         return self.picture(out.getvalue(), caption, alt)
 

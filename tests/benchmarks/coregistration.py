@@ -14,6 +14,7 @@ triangles, made by one vertex map, keep it short; --faces 0 takes the bodies as 
 from __future__ import annotations
 
 import argparse
+import tempfile
 import time
 from dataclasses import replace
 from pathlib import Path
@@ -27,9 +28,11 @@ from scipy.spatial import cKDTree
 from model import learn_scape
 from model.coregistration.config import CoregistrationConfig
 from model.coregistration.first import explained_share
-from model.coregistration.rounds import coregister
-from model.coregistration.single import ModelRegistration, register_with_model
+from model.coregistration.rounds import coregister, task_name
+from model.coregistration.single import register_with_model
 from model.learning.scape import LearnConfig
+from scanprep.batch.pool import Workers
+from scanprep.batch.workspace import workspace
 from scanprep.cleaning.decimate import decimate
 from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.surface import Surface
@@ -86,27 +89,6 @@ class Story:
                        if k != "each_mm"), flush=True)
 
 
-class Told:
-    """A store that keeps nothing and tells the story after each round."""
-
-    def __init__(self, story: Story) -> None:
-        self.story, self.now = story, dict[int, ModelRegistration]()
-
-    def found(self, turn: int, scan: int) -> None:
-        return None
-
-    def keep(self, turn: int, scan: int, registration: ModelRegistration) -> None:
-        self.now[scan] = registration
-
-    def model(self, turn: int) -> None:
-        return None
-
-    def keep_model(self, turn: int, model: Any) -> None:
-        self.story.tell(f"round {turn + 1}", {i: r.mesh.vertices for i, r in self.now.items()},
-                        sum(r.flipped for r in self.now.values()))
-        self.story.tell(f"round {turn + 1}, predicted", {i: r.predicted.vertices for i, r in self.now.items()})
-
-
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--landmarks", choices=MARKS, default="7")
@@ -124,7 +106,7 @@ def main() -> None:
     poses = (*shown, *BESIDE[:args.beside])
     data = coarse(whole, args.faces)
     story = Story(data, [test_scan(whole, "pose", i) for i in poses], poses, shown)
-    config = CoregistrationConfig(rounds=args.rounds, workers=args.workers, learn=LearnConfig(refinements=1))
+    config = CoregistrationConfig(rounds=args.rounds, workers=Workers(args.workers), learn=LearnConfig(refinements=1))
 
     plain = [register(data.template, s.scan, m) for s, m in zip(story.scans, story.marks(args.landmarks), strict=True)]
     first = np.stack([r.mesh.vertices for r in plain])
@@ -135,8 +117,15 @@ def main() -> None:
     bodies = np.concatenate([data.template.vertices[None], first[good]])
     skeleton = find_skeleton(data.template, bodies)
     model = learn_scape(data.template, bodies, None, skeleton, config.learn)
-    done = coregister(model, [s.scan for s in story.scans], story.marks(args.again or args.landmarks), config,
-                      list(first), store=Told(story))
+    names = [str(pose) for pose in poses]
+    with tempfile.TemporaryDirectory() as folder, workspace(folder) as space:
+        done = coregister(model, [s.scan for s in story.scans], story.marks(args.again or args.landmarks), config,
+                          list(first), names=names, space=space)
+        for turn in range(done.rounds):
+            now = {i: space.value(task_name(turn, name)) for i, name in enumerate(names) if name not in done.failures}
+            story.tell(f"round {turn + 1}", {i: r.mesh.vertices for i, r in now.items()},
+                       sum(r.flipped for r in now.values()))
+            story.tell(f"round {turn + 1}, predicted", {i: r.predicted.vertices for i, r in now.items()})
     if args.clickless:
         free = replace(config, fit=replace(config.fit, up=(0.0, 0.0, 1.0)))
         person = done.model.subject()
