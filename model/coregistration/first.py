@@ -12,7 +12,6 @@ from scanprep.geometry.mesh import Mesh
 from scanprep.matching.matches import orient, target_of
 from scanprep.matching.nonrigid import register
 from scanprep.matching.schedule import RegistrationConfig
-from scanprep.pipeline.scan import one_thread
 from scanprep.skeleton.find import find_skeleton
 from scanprep.skeleton.parts import SkeletonConfig
 from scanprep.skeleton.tree import Skeleton

@@ -12,7 +12,6 @@ import numpy as np
 from scanprep.batch.pool import Room
 from scanprep.batch.workspace import Task, Workspace, workspace
 from scanprep.geometry.mesh import Mesh
-from scanprep.pipeline.scan import one_thread
 from scanprep.skeleton.find import find_skeleton
 from scanprep.skeleton.tree import Skeleton
 from scanprep.threads import one_thread
