@@ -168,6 +168,12 @@ class Workspace:
         """Remove what is kept of a result, but none of its files."""
         self._record(name).unlink(missing_ok=True)
 
+    def forget(self, beginning: str) -> None:
+        """Drop all results whose names begin so."""
+        for path in sorted((self.home / "done").glob("*.npz")):
+            if unquote(path.stem).startswith(beginning):
+                self.drop(unquote(path.stem))
+
     def names(self, work: Any) -> list[str]:
         """The results that are kept of some work, with all their files."""
         common = self.digests.of(work)
