@@ -6,11 +6,12 @@ found in turns [SCAPE-patent], and so are the part rotations R, which Procrustes
 from __future__ import annotations
 
 from collections.abc import Hashable, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from typing import Any, Literal
 
 import numpy as np
 
+from scanprep.batch.steps import Step, at_once, inside
 from scanprep.geometry.mesh import Mesh, check_template
 from scanprep.skeleton.tree import Skeleton
 
@@ -20,7 +21,7 @@ from ..fitting import FitConfig, ShapeFitter
 from ..gradients import GradientSystem, ShapeSolver, pose_gradients
 from ..pose_space import PoseSpace
 from ..scape import ScapeModel
-from ..shape_space import learn_shape_space
+from ..shape_space import ShapeSpace, learn_shape_space
 from .carriage import Carriage
 from .condense import condense
 from .pose import Progress, Ticks, fit_poses
@@ -82,7 +83,8 @@ class MixConfig(RegressionConfig):
 
 
 def learn_scape_mix(template: Mesh, bodies: np.ndarray, subjects: Sequence[Hashable], skeleton: Skeleton,
-                    config: MixConfig | None = None, progress: Progress | None = None) -> ScapeModel:
+                    config: MixConfig | None = None, progress: Progress | None = None, step: Step = at_once
+                    ) -> ScapeModel:
     """Learn a body model from any people in any poses.
 
     In every round the part rotations are fitted to the model, the pose model is regressed with the people's shapes
@@ -106,6 +108,8 @@ def learn_scape_mix(template: Mesh, bodies: np.ndarray, subjects: Sequence[Hasha
     config : MixConfig, optional
     progress : callable, optional
         Called with the work done and the whole.
+    step : callable, optional
+        Keeps every round, as `scanprep.batch.steps.Step`.
 
     Raises
     ------
@@ -122,22 +126,30 @@ def learn_scape_mix(template: Mesh, bodies: np.ndarray, subjects: Sequence[Hasha
     who = number_people(subjects, len(bodies))
     mix = Mix(Carriage(template, skeleton, rigid_weights(skeleton)), bodies, who, config)
     tick = Ticks(progress, 2 * config.rounds * len(bodies))
-    with timed("how many rounds"):
-        errors = held_out_errors(mix, tick)
+    inputs = mix.carriage, bodies, who, config
+
+    def count() -> list[float]:
+        with timed("how many rounds"):
+            return held_out_errors(mix, tick, inside(step, "how many rounds"))
+
+    errors = tick.over(config.rounds * len(bodies), lambda: step("how many rounds", inputs, count))
     rounds = 1 + int(np.argmin(errors))
-    tick((config.rounds - len(errors)) * len(bodies))
-    state = start(mix)
-    with timed("poses and shapes in turns"):
-        for number in range(rounds):
-            state = next_round(mix, state, number, tick)
-    tick((config.rounds - rounds) * len(bodies))
+
+    def learn() -> tuple[State, ShapeSpace]:
+        with timed("poses and shapes in turns"):
+            state = start(mix)
+            for number in range(rounds):
+                state = kept_round(mix, state, number, tick, inside(step, "poses and shapes in turns"))
+            return replace(state, S=np.zeros((0, 3, 3))), learn_shape_space(state.S, config.components)
+
+    state, shapes = tick.over(config.rounds * len(bodies), lambda: step("poses and shapes in turns", inputs, learn))
     assert state.design is not None
     info: dict[str, Any] = {
         "settings": asdict(config), "bodies": len(bodies), "people": mix.people, "rounds": rounds,
         "held_out_errors": errors, "pruning": state.design.pruning, "ridge": state.design.ridge,
         "features": state.space.features.count, "digest": digest(template, bodies, None),
         "digests": body_digests(bodies)}
-    return make_model(mix, state, info)
+    return make_model(mix, state, shapes, info)
 
 
 @dataclass(frozen=True, eq=False)
@@ -181,6 +193,13 @@ def start(mix: Mix) -> State:
     return State(poses, PoseSpace.identity(skeleton), S, None)
 
 
+def kept_round(mix: Mix, state: State, number: int, tick: Ticks, step: Step) -> State:
+    """The next round, in a step."""
+    return tick.over(len(mix.bodies), lambda: step(
+        f"round {number}", (mix.carriage, mix.bodies, mix.who, mix.config, number),
+        lambda: next_round(mix, state, number, tick)))
+
+
 def next_round(mix: Mix, state: State, number: int, tick: Ticks) -> State:
     """Part rotations with the model held, then the pose model with the shapes held, then the shapes."""
     S, poses = _simplified(state.S, mix.config.stiff * 2**number), state.poses.copy()
@@ -193,9 +212,8 @@ def next_round(mix: Mix, state: State, number: int, tick: Ticks) -> State:
     return State(poses, space, people_shapes(mix, poses, space), design)
 
 
-def make_model(mix: Mix, state: State, info: dict[str, Any]) -> ScapeModel:
+def make_model(mix: Mix, state: State, shapes: ShapeSpace, info: dict[str, Any]) -> ScapeModel:
     """The model that a round has reached."""
-    shapes = learn_shape_space(state.S, mix.config.components)
     template, skeleton = mix.carriage.template, mix.carriage.skeleton
     examples = pose_examples(template, skeleton, state.poses)
     return ScapeModel(template, skeleton, state.space, shapes, *pose_prior(examples, len(examples)), info,
@@ -283,15 +301,20 @@ def _simplified(S: np.ndarray, count: int) -> np.ndarray:
     return space.mean + (betas @ flat).reshape(S.shape)
 
 
-def held_out_errors(mix: Mix, tick: Ticks) -> list[float]:
+def held_out_errors(mix: Mix, tick: Ticks, step: Step = at_once) -> list[float]:
     """Mean error, metres, of bodies that are held out, after each round until it stops falling."""
     held = held_out_bodies(mix.who, mix.config.held_out)
     train = mix.some(np.setdiff1d(np.arange(len(mix.bodies)), held))
     state, errors = start(train), list[float]()
+
+    def error() -> float:
+        model = make_model(train, state, learn_shape_space(state.S, mix.config.components), {})
+        fitter = ShapeFitter(model, FitConfig(sample=400, polish=0))
+        return float(np.mean([fitter.fit(y).mean for y in mix.bodies[held]]))
+
     for number in range(mix.config.rounds):
-        state = next_round(train, state, number, tick)
-        fitter = ShapeFitter(make_model(train, state, {}), FitConfig(sample=400, polish=0))
-        errors.append(float(np.mean([fitter.fit(y).mean for y in mix.bodies[held]])))
+        state = kept_round(train, state, number, tick, step)
+        errors.append(step(f"error of round {number}", (mix.carriage, mix.bodies, mix.who, mix.config, number), error))
         tick(len(held))
         if number and errors[-1] > (1 - mix.config.tolerance) * min(errors[:-1]):
             break
