@@ -112,22 +112,19 @@ def learn_skinning(template: Mesh, poses: np.ndarray, shapes: np.ndarray | None,
         model = _start(template, skeleton, config)
         with timed("pose space"):
             for correctives in ("none", config.correctives) if config.correctives != "none" else ("none",):
-                model, at = _learn_pose(model, at, poses, replace(config, correctives=correctives), tick,
-                                        inside(step, "pose space"))
+                settings = replace(config, correctives=correctives)
+                model, at = _learn_pose(model, at, poses, settings, tick, inside(step, "pose space"))
         return model, at
 
     def learn_shapes() -> SkinningModel:
         with timed("shape components"):
-            return learn_people(model, bodies, config.components, config.people_rounds, tick,
-                                inside(step, "shape components"))
+            return learn_people(model, bodies, *of_people, tick, inside(step, "shape components"))
 
-    # of the poses, nothing depends on what is only about people
-    bare = replace(config, components=SkinConfig.components, people_rounds=SkinConfig.people_rounds)
-    model, at = tick.over(tick.total - later, lambda: step("pose space", (template, skeleton, poses, bare), learn))
+    of_poses = template, skeleton, poses, replace(config, components=0, people_rounds=0)
+    model, at = tick.over(tick.total - later, lambda: step("pose space", of_poses, learn))
     if shapes is not None:
-        bodies = shapes
-        model = tick.over(later, lambda: step(
-            "shape components", (model, bodies, config.components, config.people_rounds), learn_shapes))
+        bodies, of_people = shapes, (config.components, config.people_rounds)
+        model = tick.over(later, lambda: step("shape components", (model, bodies, of_people), learn_shapes))
     examples = pose_examples(template, skeleton, at, shapes)
     mean, covariance = pose_prior(examples, len(at))
     info: dict[str, Any] = {

@@ -1,9 +1,8 @@
 """The shapes of other people, seen through a skinning model of one person's poses."""
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import replace
-from functools import cache, partial
+from functools import partial
 
 import numpy as np
 
@@ -24,7 +23,7 @@ def learn_people(model: SkinningModel, shapes: np.ndarray, components: int, roun
     for turn in range(rounds):
         quick = FitConfig(polish=0, n_betas=min(20, model.n_betas) or None)
         people = np.empty(shapes.shape)
-        fitter = cache(partial(ShapeFitter, model, quick) if turn else partial(PoseFitter, model.subject(), quick))
+        fitter = ShapeFitter(model, quick) if turn else PoseFitter(model.subject(), quick)
         for i, body in enumerate(shapes):
             people[i] = step(f"round {turn}, person {body_digest(body)}", (model, quick, turn, body),
                              partial(_fitted, model, fitter, body))
@@ -35,9 +34,9 @@ def learn_people(model: SkinningModel, shapes: np.ndarray, components: int, roun
     return model
 
 
-def _fitted(model: SkinningModel, fitter: Callable[[], ShapeFitter | PoseFitter], body: np.ndarray) -> np.ndarray:
+def _fitted(model: SkinningModel, fitter: ShapeFitter | PoseFitter, body: np.ndarray) -> np.ndarray:
     """(N, 3) rest vertices of a person whose pose is fitted."""
-    return unposed_person(model, fitter().fit(body).pose, body)
+    return unposed_person(model, fitter.fit(body).pose, body)
 
 
 def unposed_person(model: SkinningModel, pose: np.ndarray, body: np.ndarray) -> np.ndarray:

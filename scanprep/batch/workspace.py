@@ -168,11 +168,15 @@ class Workspace:
         """Remove what is kept of a result, but none of its files."""
         self._record(name).unlink(missing_ok=True)
 
+    def kept(self, beginning: str) -> list[str]:
+        """The results that are kept and whose names begin so."""
+        names = (unquote(path.stem) for path in sorted((self.home / "done").glob("*.npz")))
+        return [name for name in names if name.startswith(beginning)]
+
     def forget(self, beginning: str) -> None:
         """Drop all results whose names begin so."""
-        for path in sorted((self.home / "done").glob("*.npz")):
-            if unquote(path.stem).startswith(beginning):
-                self.drop(unquote(path.stem))
+        for name in self.kept(beginning):
+            self.drop(name)
 
     def names(self, work: Any) -> list[str]:
         """The results that are kept of some work, with all their files."""
