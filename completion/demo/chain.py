@@ -4,122 +4,51 @@
 """
 from __future__ import annotations
 
-import csv
-import io
 from collections.abc import Callable
 from contextlib import AbstractContextManager
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from pathlib import Path
 
 import numpy as np
-from scipy.spatial import cKDTree
 
-from model import BodyModel, LearnConfig, Subject, fit_pose, learn_scape, load_model
-from scanprep.batch.pool import Room
+from model import BodyModel, Subject, fit_pose, learn_scape, load_model
 from scanprep.batch.steps import KeptSteps, inside
 from scanprep.batch.workspace import Task, Workspace, workspace
 from scanprep.cleaning.template import TemplateConfig, make_template
 from scanprep.dataset import RegisteredSet
-from scanprep.geometry import storage
 from scanprep.geometry.files import read_mesh, write_mesh
 from scanprep.geometry.landmarks import match_landmarks, read_landmark_vertices, read_landmarks, write_landmarks
 from scanprep.geometry.mesh import Mesh
 from scanprep.pipeline.prepare import SCANS, PrepareConfig, Prepared, prepare
 from scanprep.pipeline.scan import one_thread
-from scanprep.pipeline.scans import TABLE, find_scans
+from scanprep.pipeline.scans import find_scans
 from scanprep.scanning.embedded import (
     SUBJECT,
     EmbeddedScan,
     GroundTruth,
     click_landmarks,
     embedded_plan,
-    embedded_scan,
     read_views,
     stand,
     write_scan,
 )
-from scanprep.scanning.people import MARKERS, Person, random_pose, walk
+from scanprep.scanning.people import Person, random_pose, walk
 from scanprep.scanning.scanner import ScannerConfig, scan
 from scanprep.skeleton.find import SkeletonConfig
 
 from ..animation.follow import animate
-from ..markers.files import MarkerSequence, read_markers, write_markers
-from ..markers.layout import DISTANCE, MarkerLayout
+from ..markers.files import MarkerSequence, read_markers
+from ..markers.layout import MarkerLayout
 from ..motion import Motion
 from ..partial.completion import Completion, complete
 from ..partial.results import load_completion, save_completion
+from .recording import ScanPerson, record_walk
+from .settings import DemoConfig, write_settings
 from .truth import TruthMap
 
 MODEL, HALF, MOTION = Path("model.npz"), Path("half_view/half_view.ply"), Path("animation/motion.npz")
 Bar = Callable[[str], AbstractContextManager[Callable[[int, int], None]]]
-
-
-@dataclass(frozen=True)
-class DemoConfig:
-    """How much of everything.
-
-    Attributes
-    ----------
-    poses, subjects : int
-        Scans of one subject in many poses, and of other people.
-    faces : int
-        Triangles of the template.
-    parts : int
-        Of the skeleton. Left to itself, the search finds rings at the shoulders too, which move with the skin.
-    resolution, template_resolution : float, metres
-        Spacing of the scanner's rays, for the scans and for the careful one that the template is made of.
-    template_views : int
-        Sides from which the careful scan is taken.
-    held_out : int
-        Poses of the subject that the model never saw.
-    landmarks : int
-        That are marked on the half view.
-    frames, rate : int, frames per second
-        Of the walk.
-    marker_noise : float, metres
-    seed : int
-
-    Raises
-    ------
-    ValueError
-        A seed below 0.
-    """
-
-    poses: int = 20
-    subjects: int = 12
-    faces: int = 14000
-    parts: int = 16
-    resolution: float = 0.0068
-    template_resolution: float = 0.004
-    template_views: int = 12
-    held_out: int = 5
-    landmarks: int = 7
-    frames: int = 132
-    rate: float = 60.0
-    marker_noise: float = 0.001
-    seed: int = 0
-    learn: LearnConfig = field(default_factory=LearnConfig)
-
-    def __post_init__(self) -> None:
-        if self.seed < 0:
-            raise ValueError(f"seed: expected 0 or more, got {self.seed}")
-
-
-QUICK = DemoConfig(poses=8, subjects=3, faces=7000, resolution=0.011, template_resolution=0.006, held_out=2, frames=66,
-                   rate=30.0)
-
-
-@dataclass(frozen=True)
-class ScanPerson:
-    """The work on each scan: an embedded person made and scanned."""
-
-    seed: int
-    scanner: ScannerConfig
-
-    def __call__(self, which: tuple[int, bool], room: Room) -> EmbeddedScan:
-        found = embedded_scan(room.folder / "scans", self.seed, *which, self.scanner)
-        return replace(found, folder=Path("scans"))
 
 
 @dataclass(frozen=True)
@@ -161,7 +90,7 @@ class Demo:
             self.space.drop(name)
         scans = [replace(done.values[task.name], folder=self.folder / "scans") for task in tasks]
         rows = [(s.name, s.subject, s.pose, s.sex) for s in scans]
-        self.space.step("settings", (self.config, rows), partial(_write_settings, self.config, rows))
+        self.space.step("settings", (self.config, rows), partial(write_settings, self.config, rows))
         return scans
 
     @cached_property
@@ -302,32 +231,15 @@ class Demo:
         """Markers of a walking subject, where they sit on the template, and the true vertices (T, N, 3)."""
         poses, trans = walk(self.config.frames, self.config.rate)
         bodies = np.stack([self.person.posed(pose, place) for pose, place in zip(poses, trans, strict=True)])
-        template = self.template
+        template, config = self.template, self.config
 
         def make(folder: Path) -> None:
             with self.bar("recording a walk") as progress:
-                self._record(folder / "markers", bodies, progress)
+                record_walk(folder / "markers", bodies, self.rest, template, config, progress)
 
-        config = self.config
         self.space.step("markers", (config.seed, config.frames, config.rate, config.marker_noise, template), make)
         layout = MarkerLayout.load(self.folder / "markers" / "layout.json", len(template.vertices))
         return read_markers(self.folder / "markers" / "walk.c3d"), layout, bodies
-
-    def _record(self, folder: Path, bodies: np.ndarray, progress: Callable[[int, int], None]) -> None:
-        rng = np.random.default_rng([self.config.seed, 9])
-        labels, places = tuple(MARKERS), np.array(list(MARKERS.values()))
-        faces, out = self.person.mesh.faces, []
-        for i, body in enumerate(bodies):
-            out.append(body[places] + DISTANCE * Mesh(body, faces).vertex_normals[places])
-            progress(i + 1, len(bodies))
-        positions = np.stack(out) + rng.normal(0, self.config.marker_noise, (len(bodies), len(labels), 3))
-        positions[rng.random(positions.shape[:2]) < 0.03] = np.nan
-        # as on a real subject: the layout is read off the scan at rest, on which the markers can be seen
-        _, vertices = cKDTree(self.template.vertices).query(self.rest.vertices[places])
-        MarkerLayout(labels, vertices, DISTANCE).save(folder / "layout.json")
-        sequence = MarkerSequence(positions, labels, self.config.rate)
-        write_markers(folder / "walk.csv", sequence)
-        write_markers(folder / "walk.c3d", sequence)
 
     @cached_property
     def motion(self) -> Motion:
@@ -345,14 +257,3 @@ class Demo:
     def truth_map(self) -> TruthMap:
         """Where the template's vertices truly lie."""
         return TruthMap.of(self.template, self.rest)
-
-
-def _write_settings(config: DemoConfig, rows: list[tuple[str, str, str, str]], folder: Path) -> None:
-    """What the folder holds, and who is in the scans."""
-    storage.write_json(folder / "demo.json", storage.as_json(asdict(config)))
-    text = io.StringIO()
-    table = csv.writer(text, lineterminator="\n")
-    table.writerow(["name", "subject", "pose", "sex"])
-    table.writerows(rows)
-    (folder / "scans").mkdir()
-    (folder / "scans" / TABLE).write_text(text.getvalue(), encoding="utf-8")

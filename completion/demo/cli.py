@@ -8,7 +8,8 @@ from scanprep.batch.workspace import Workspace
 from scanprep.console import Outcome, bar, say
 
 from ..cli import Out
-from .chain import QUICK, Demo, DemoConfig
+from .chain import Demo
+from .settings import QUICK, DemoConfig
 
 
 def demo(out: Out = Path("scape_demo"), quick: bool = False, seed: int = DemoConfig.seed, *, space: Workspace

@@ -30,8 +30,9 @@ def write_page(demo: Demo, metrics: list[Metric], tell: Callable[[int, int], Non
     page = Page("From raw scans to a moving person",
                 "Every stage of the chain on embedded people, whose true shape, pose and correspondence are known.")
     page.table([(m.name, m.text(), m.unit) for m in metrics], ("against the ground truth", "value", "unit"))
-    stages = (_scans, _template, _registration, _skeleton, _shapes, _poses, partial(_completion, to=to),
-              partial(_animation, to=to))
+    stages: tuple[Callable[[Demo, Page], None], ...] = (
+        _scans, _template, _registration, _skeleton, _shapes, _poses, partial(_completion, to=to),
+        partial(_animation, to=to))
     for i, stage in enumerate(stages):
         stage(demo, page)
         tell(i + 1, len(stages))
