@@ -153,7 +153,7 @@ def _find_skeleton(body: Mesh, posed: np.ndarray, parts: int | None, step: KeptS
 
 def _times(seconds: dict[str, float], found: list[str]) -> list[Metric]:
     """Seconds of every step; of one that had been begun before, of what was left."""
-    begun = {name.split("/")[0] for name in found}
+    begun = {name.split("/")[-2] for name in found if "/" in name}
     return [*[Metric(f"time: {name}", "done before") for name in found if "/" not in name],
             *[Metric(f"time: {name}", value, "s, of what was left" if name in begun else "s")
               for name, value in seconds.items()]]

@@ -165,7 +165,8 @@ def from_shapes(carriage: Carriage, space: PoseSpace, shapes: np.ndarray, config
     """
     def make() -> T:
         with timed("shape of every person"):
-            S = shape_deformations(carriage, space, shapes, config.smoothness, tick, inside(step, "shape components"))
+            each = inside(step, "shape components/shape of every person")
+            S = shape_deformations(carriage, space, shapes, config.smoothness, tick, each)
         with timed("shape components"):
             return learn(S)
 
