@@ -117,7 +117,7 @@ def test_killed_and_started_again_it_goes_on_and_ends_with_the_same_bytes(bodies
     assert anew(counted, since) == {"people": 2, "components": 1, "pictures": 1}
     assert sorted(p.name for p in bodies.glob(".b.npz.scapekit/done/*")) == [
         "pose space.npz", "shape components.npz"]            # what later ones are made of has gone
-    assert not list(bodies.glob(".b.npz.scapekit/making/*")) and not list(bodies.glob("*.part*"))
+    assert not list(bodies.glob(".b.npz.scapekit/making/*")) and not list(bodies.glob(".*.part*"))
 
 
 def test_killed_twice_in_the_poses(bodies, monkeypatch):

@@ -38,24 +38,28 @@ class KeptSteps:
     ----------
     space : Workspace
     found : list of str
-        The steps that had been done before.
+        The steps that had been done before this run.
+    made : set of str
+        Those that were done now.
     """
 
     space: Workspace
     found: list[str] = field(default_factory=list)
+    made: set[str] = field(default_factory=set)
 
     def __call__(self, name: str, inputs: Any, make: Callable[[], T]) -> T:
-        made = False
+        fresh = False
 
         def now(folder: Path) -> T:
-            nonlocal made
-            made = True
+            nonlocal fresh
+            fresh = True
             return make()
 
         value = self.space.step(name, inputs, now)
-        if made:                            # as it is read later: the layout of arrays decides the last digits of sums
+        if fresh:                           # as it is read later: the layout of arrays decides the last digits of sums
             value = self.space.value(name)
-        else:
+            self.made.add(name)
+        elif name not in self.made:
             self.found.append(name)
         self.space.forget(f"{name}/")
         return value

@@ -240,7 +240,7 @@ class Workspace:
         header = load_header(ready / RECORD)
         assert header is not None, f"{ready}: results get their name when they are whole"
         record = self._record(unquote(ready.name))
-        before = (load_header(record) or {"files": {}})["files"]
+        before = self._before(unquote(ready.name))
         for file in header["files"]:
             if (ready / file).exists():                     # else it was brought before the run was killed
                 (self.folder / file).parent.mkdir(parents=True, exist_ok=True)
@@ -252,6 +252,15 @@ class Workspace:
         record.parent.mkdir(exist_ok=True)
         os.replace(ready / RECORD, record)
         shutil.rmtree(ready)
+
+    def _before(self, name: str) -> dict[str, str]:
+        """File -> digest of what a result wrote when it was last made."""
+        record = load_header(self._record(name))
+        if record is not None or name != "output" or self.output is None:
+            return dict((record or {"files": {}})["files"])
+        report = report_path(self.output)                   # an output that is a file keeps no record of it
+        place = report.parent.relative_to(self.folder)
+        return {(place / file).as_posix(): digest for file, digest in written_of(report).items()}
 
     def _check_free(self, files: Mapping[str, str]) -> None:
         taken = []
