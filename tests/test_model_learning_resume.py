@@ -135,7 +135,7 @@ def test_killed_twice_in_the_poses(bodies, monkeypatch):
     ("skinning", skin, "_with_joints", 2), ("skinning", skin_people, "unposed_person", 3),
     ("blendscape", scape, "shape_gradients", 2)])
 def test_every_kind_goes_on(bodies, kind, module, name, after):
-    given = ["--kind", kind, "--other.skin.rounds", 2, "--other.skin.people-rounds", 2]
+    given = ["--kind", kind, "--skin.rounds", 2, "--skin.people-rounds", 2]
     undisturbed = learned(bodies, "a.npz", *given)
     killed(module, name, after, words(bodies, "b.npz", *given))
     assert learned(bodies, "b.npz", *given) == undisturbed
@@ -152,14 +152,13 @@ def test_the_search_for_a_skeleton_goes_on(tmp_path, monkeypatch):
 
     assert run(learn, "scape learn", given("a.npz")) == 0
     killed(search, "_searched", 1, given("b.npz"))                                # after the first restart
-    killed(parts, "_left_out_error", 1, given("b.npz"))                           # with the second count of parts
-    calls = []
-    real = parts._left_out_error
-    monkeypatch.setattr(parts, "_left_out_error", lambda *given: calls.append(1) or real(*given))
-    monkeypatch.setattr(search, "_searched", None)                                # all restarts are there
+    killed(parts, "_left_out_error", 0, given("b.npz"))                           # after the last
+    killed(parts, "find_skeleton", 1, given("b.npz"))                             # before more parts are tried
+    tried, real = [], parts.find_skeleton
+    monkeypatch.setattr(parts, "find_skeleton", lambda *given, **named: tried.append(given[2]) or real(*given, **named))
     assert run(learn, "scape learn", given("b.npz")) == 0
     assert (tmp_path / "a.npz").read_bytes() == (tmp_path / "b.npz").read_bytes()
-    assert calls
+    assert tried and all(settings.parts is not None for settings in tried)
 
 
 @pytest.mark.parametrize("more, done", [
@@ -254,7 +253,7 @@ def test_a_mix_goes_on(tmp_path):
         for i, body in enumerate(subject.vertices(random_poses(truth, 4, rng, 0.3))):
             whole = whole.add(f"p{person}_{i}", body, subject=f"p{person}")
     whole.with_skeleton(truth.skeleton)
-    given = ["--poses", str(tmp_path / "set"), "--mixed", "--other.mix.rounds", "2", "--components", "2"]
+    given = ["--poses", str(tmp_path / "set"), "--mixed", "--mix.rounds", "2", "--components", "2"]
     assert run(learn, "scape learn", [*given, "-o", str(tmp_path / "a.npz")]) == 0
     argv = [*given, "-o", str(tmp_path / "b.npz")]
     killed(mix_rounds, "people_shapes", 1, argv)
