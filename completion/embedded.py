@@ -14,8 +14,10 @@ import numpy as np
 from model.body import BodyModel, versions
 from model.files import load_model
 from model.learning.scape import LearnConfig, learn_scape
+from model.scape import ScapeModel
+from scanprep.batch.digests import Digests
+from scanprep.batch.lock import locked
 from scanprep.cleaning.decimate_set import DecimatedSet, decimate_set
-from scanprep.geometry.storage import StorageError
 from scanprep.scanning.embedded import SUBJECT, near_rest, subject_pose
 from scanprep.scanning.people import BodyShape, Person
 from scanprep.scanning.people_marks import landmarks, markers
@@ -23,6 +25,7 @@ from scanprep.scanning.people_marks import landmarks, markers
 Progress = Callable[[int, int], None]
 
 CACHE = "SCAPEKIT_CACHE"             # environment variable that names another folder
+SEAL = "seal"                        # its place in the model's info
 VERSION = 2                          # raised when the same recipe makes another model
 
 
@@ -83,16 +86,38 @@ def embedded_model(progress: Progress | None = None, recipe: EmbeddedRecipe | No
     """
     recipe = recipe or EmbeddedRecipe()
     path = embedded_path(recipe)
+    model = _cached(path, recipe)
+    if model is not None:
+        return model
     try:
-        return load_model(path)
-    except StorageError:                 # not there yet, or damaged: made anew in either case
-        model = build_embedded(recipe, progress)
-    try:
-        model.save(path)                 # beside and renamed: processes that start at once do not disturb each other
+        path.parent.mkdir(parents=True, exist_ok=True)
+        with locked(path.with_name(f".{path.name}.lock"), path, wait=True):
+            model = _cached(path, recipe)                   # another process may have built it meanwhile
+            if model is None:
+                for left in path.parent.glob(f".{path.stem}.*.part.npz"):       # by one that was killed
+                    left.unlink()
+                model = build_embedded(recipe, progress)
+                model = replace(model, info={**model.info, SEAL: _seal(model, recipe)})
+                model.save(path)
     except OSError as error:
         raise ValueError(f"{path.parent}: cannot keep the model of the embedded people there ({error}); "
                          f"name another folder in {CACHE}, or a model with -m") from None
     return model
+
+
+def _cached(path: Path, recipe: EmbeddedRecipe) -> ScapeModel | None:
+    """The model of a recipe as it was built, or None where it is not there, damaged, or something else."""
+    try:
+        model = load_model(path)
+        return model if isinstance(model, ScapeModel) and model.info.get(SEAL) == _seal(model, recipe) else None
+    except Exception:                    # whatever is wrong with the file, it is made anew
+        return None
+
+
+def _seal(model: ScapeModel, recipe: EmbeddedRecipe) -> str:
+    """A digest of a model, by which it is known to be whole and of the recipe."""
+    info = {name: value for name, value in model.info.items() if name != SEAL}
+    return Digests().of(recipe.digest, replace(model, info=info))
 
 
 def embedded_path(recipe: EmbeddedRecipe | None = None) -> Path:
@@ -112,7 +137,7 @@ def cache_folder() -> Path:
     return user_cache_path("scapekit", appauthor=False)
 
 
-def build_embedded(recipe: EmbeddedRecipe, progress: Progress | None = None) -> BodyModel:
+def build_embedded(recipe: EmbeddedRecipe, progress: Progress | None = None) -> ScapeModel:
     """Learn the model of a recipe, without the cache."""
     rng = np.random.default_rng(recipe.seed)
     made, learning = recipe.poses + recipe.people, (recipe.learn.refinements + 1) * recipe.poses + recipe.people

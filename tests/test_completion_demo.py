@@ -2,14 +2,24 @@
 import json
 import re
 import shutil
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from completion import Motion
+from completion.demo import chain
+from completion.demo import figures as measuring
+from completion.demo.chain import Demo
 from completion.demo.cli import demo
+from completion.demo.settings import QUICK, DemoConfig
 from model import load_model
-from scanprep import RegisteredSet
+from scanprep import RegisteredSet, console
+from scanprep.batch.workspace import workspace
 from scanprep.console import run
 from scanprep.geometry.mesh import template_problem
 
@@ -81,6 +91,131 @@ def test_goes_on_where_it_was(demo_folder, tmp_path, figures):
     assert {name: again[name] for name in same} == {name: figures[name] for name in same}
 
 
-def test_other_settings_in_the_same_folder(demo_folder, capsys):
-    assert run(demo, "scape demo", ["--out", str(demo_folder)]) == 1
-    assert "other settings" in capsys.readouterr().err
+def files(folder, *but):
+    return {p.relative_to(folder).as_posix(): p.read_bytes() for p in folder.rglob("*")
+            if p.is_file() and ".scapekit" not in p.parts and p.name not in but}
+
+
+@pytest.fixture
+def counted(monkeypatch):
+    """Calls of the long stages after the scans."""
+    calls = {name: 0 for name in ("make_template", "prepare", "learn_scape", "complete", "record_walk", "animate")}
+
+    def count(name, real):
+        def counting(*given, **named):
+            calls[name] += 1
+            return real(*given, **named)
+        return counting
+
+    for name in calls:
+        monkeypatch.setattr(chain, name, count(name, getattr(chain, name)))
+    return calls
+
+
+def test_another_setting_does_anew_what_depends_on_it(demo_folder, tmp_path, counted):
+    """Other noise of the markers: another recording and another motion, and nothing else."""
+    folder = tmp_path / "again"
+    shutil.copytree(demo_folder, folder)
+    before = files(folder)
+    with workspace(folder) as space:
+        measuring.figures(Demo(space, replace(QUICK, marker_noise=0.002), console.bar))
+    changed = {name for name, data in files(folder).items() if before[name] != data}
+    done = {name: calls for name, calls in counted.items() if calls}
+    assert done == {"prepare": 1, "record_walk": 1, "animate": 1}        # `prepare` looks for itself what is to be done
+    assert changed >= {"demo.json", "markers/walk.c3d", "animation/motion.npz"}
+    assert not [name for name in changed if name.startswith(("scans/", "set/meshes", "template", "model", "comp"))]
+
+
+TINY = replace(QUICK, poses=3, subjects=2, resolution=0.03)
+
+
+def scans(folder, config):
+    with workspace(folder) as space:
+        return [s.name for s in Demo(space, config, console.bar).scans]
+
+
+def test_fewer_scans_of_another_person_leave_no_old_one(tmp_path):
+    scans(tmp_path / "a", TINY)
+    other = replace(TINY, poses=2, subjects=1, seed=3)
+    names = scans(tmp_path / "a", other)
+    assert names == scans(tmp_path / "b", other) and len(names) == 3
+    assert files(tmp_path / "a") == files(tmp_path / "b")
+    again = {p: p.stat().st_mtime_ns for p in (tmp_path / "a" / "scans").rglob("*.ply")}
+    scans(tmp_path / "a", other)
+    assert again == {p: p.stat().st_mtime_ns for p in (tmp_path / "a" / "scans").rglob("*.ply")}
+
+
+def test_a_set_with_more_scans_becomes_one_with_fewer(tmp_path, monkeypatch):
+    """Registered here without any effort: what is kept of the set matters."""
+    monkeypatch.setattr(chain, "prepare", lambda tasks, *_: prepared([t.name for t in tasks]))
+    held = []
+
+    def prepared(names):
+        held.append(sorted(space.kept(chain.SCANS)))
+        with space.staging("tables") as staged:
+            (staged.folder / "set.csv").write_text("\n".join(names))
+        for name in names:
+            with space.staging(chain.SCANS + name):
+                pass
+        return SimpleNamespace(failures=())
+
+    for config in (TINY, replace(TINY, poses=2)):
+        with workspace(tmp_path) as outer, workspace(tmp_path / "set") as space:
+            demo = Demo(outer, config, console.bar)
+            demo.__dict__.update(template=None, template_landmarks={})
+            assert demo.prepared
+    assert len(held[1]) == 4 and not held[0]
+
+
+def test_a_bad_seed_leaves_the_folder_as_it_was(tmp_path, capsys):
+    scans(tmp_path / "a", TINY)
+    before = files(tmp_path / "a")
+    assert run(demo, "scape demo", ["--quick", "--seed", "-1", "--out", str(tmp_path / "a")]) in (1, 2)
+    assert "seed" in capsys.readouterr().err
+    assert files(tmp_path / "a") == before
+    scans(tmp_path / "a", TINY)
+    assert files(tmp_path / "a") == before
+
+
+def test_what_is_not_ours_stays(tmp_path, capsys):
+    (tmp_path / "report.html").write_text("mine")
+    assert run(demo, "scape demo", ["--quick", "--out", str(tmp_path)]) == 1
+    assert "report.html" in capsys.readouterr().err and [p.name for p in tmp_path.iterdir()] == ["report.html"]
+
+
+KILLED = """
+import os, sys
+from completion.demo import chain, settings
+from completion.demo.recording import ScanPerson
+from scanprep.batch import pool
+from scanprep.batch.workspace import workspace
+from scanprep.console import bar
+
+config = settings.QUICK.__class__(poses=3, subjects=2, resolution=0.03)
+real, calls = pool.attempt, []
+
+def dying(*given):
+    calls.append(1)
+    if len(calls) > 2:
+        os.kill(os.getpid(), 9)
+    return real(*given)
+
+pool.attempt = dying
+os.cpu_count = lambda: 1
+with workspace(sys.argv[1]) as space:
+    chain.Demo(space, config, bar).scans
+"""
+
+
+def test_scans_go_on_after_a_kill(tmp_path):
+    ended = subprocess.run([sys.executable, "-c", KILLED, str(tmp_path / "a")], cwd=Path(__file__).parents[1],
+                           capture_output=True, check=False)
+    assert ended.returncode == -9, ended.stderr.decode()
+    first = {p: p.stat().st_mtime_ns for p in (tmp_path / "a" / "scans").glob("*.ply")}
+    assert len(first) == 2
+    config = DemoConfig(poses=3, subjects=2, resolution=0.03)
+    assert len(scans(tmp_path / "a", config)) == 5
+    assert {p: p.stat().st_mtime_ns for p in first} == first
+    scans(tmp_path / "b", config)
+    assert files(tmp_path / "a") == files(tmp_path / "b")
+    assert not list(tmp_path.rglob("*.part*")) and not list(tmp_path.glob("a/.scapekit/making/*"))

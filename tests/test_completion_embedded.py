@@ -1,5 +1,11 @@
+import shutil
+import time
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import replace
+
 import numpy as np
 import pytest
+from model_bodies import worm_model
 
 from completion import embedded
 from completion.cli import read_landmark_pairs, read_model
@@ -50,17 +56,67 @@ def test_it_is_built_once(cache, built, monkeypatch):
     assert [p.name for p in cache.iterdir()] == [embedded_path(SMALL).name]
 
 
-def test_another_recipe_or_a_damaged_file_is_built_anew(cache, built, monkeypatch):
+def test_another_recipe_is_built_anew(cache, built, monkeypatch):
     calls = []
     monkeypatch.setattr(embedded, "build_embedded", lambda recipe, progress: calls.append(recipe) or built[1])
     other = EmbeddedRecipe(seed=6)
     assert embedded_path(other) != embedded_path(SMALL)
-    embedded_model(recipe=other)
-    embedded_path(other).write_bytes(b"half a file")
-    embedded_model(recipe=other)
-    embedded_model(recipe=other)
-    assert calls == [other, other]
+    for _ in range(2):
+        embedded_model(recipe=other)
+    assert calls == [other]
     embedded_path(other).unlink()
+
+
+def other_numbers(model):
+    return replace(model, shape_space=replace(model.shape_space, mean=1.01 * model.shape_space.mean))
+
+
+@pytest.mark.parametrize("damaged", [
+    lambda path, model: path.write_bytes(b"half a file"),
+    lambda path, model: path.write_bytes(path.read_bytes()[:-2000]),
+    lambda path, model: path.write_bytes(path.read_bytes()[:5000] + b"xxxx" + path.read_bytes()[5004:]),
+    lambda path, model: other_numbers(model).save(path),
+    lambda path, model: replace(model, info={**model.info, "landmarks": {}}).save(path),
+    lambda path, model: worm_model().save(path)], ids=["text", "cut", "bytes", "numbers", "landmarks", "other"])
+def test_a_damaged_or_wrong_model_is_built_anew(built, tmp_path, monkeypatch, damaged):
+    monkeypatch.setenv("SCAPEKIT_CACHE", str(tmp_path))
+    shutil.copy(built[0] / embedded_path(SMALL).name, embedded_path(SMALL))
+    calls = []
+    monkeypatch.setattr(embedded, "build_embedded", lambda recipe, progress: calls.append(recipe) or built[1])
+    embedded_model(recipe=SMALL)
+    assert not calls
+    damaged(embedded_path(SMALL), built[1])
+    for _ in range(2):
+        model = embedded_model(recipe=SMALL)
+        np.testing.assert_array_equal(model.shape_space.mean, built[1].shape_space.mean)
+    assert calls == [SMALL]
+
+
+def test_processes_that_start_at_once_build_it_once(built, tmp_path, monkeypatch):
+    """Threads here, which the lock keeps apart in the same way."""
+    monkeypatch.setenv("SCAPEKIT_CACHE", str(tmp_path))
+    calls = []
+
+    def slow(recipe, progress):
+        calls.append(recipe)
+        time.sleep(0.5)
+        return built[1]
+
+    monkeypatch.setattr(embedded, "build_embedded", slow)
+    with ThreadPoolExecutor(3) as pool:
+        models = list(pool.map(lambda _: embedded_model(recipe=SMALL), range(3)))
+    assert len(models) == 3 and calls == [SMALL]
+    assert [p.name for p in tmp_path.iterdir()] == [embedded_path(SMALL).name]
+
+
+def test_only_what_is_ours_goes_from_the_cache(built, tmp_path, monkeypatch):
+    monkeypatch.setenv("SCAPEKIT_CACHE", str(tmp_path))
+    monkeypatch.setattr(embedded, "build_embedded", lambda recipe, progress: built[1])
+    stem = embedded_path(SMALL).stem
+    for name in (f".{stem}.123.part.npz", ".other.123.part.npz", f"{stem}.txt", "mine.npz"):
+        (tmp_path / name).write_text("mine")
+    embedded_model(recipe=SMALL)
+    assert {p.name for p in tmp_path.iterdir()} == {f"{stem}.npz", ".other.123.part.npz", f"{stem}.txt", "mine.npz"}
 
 
 def test_a_cache_that_cannot_be_written_is_named(tmp_path, built, monkeypatch):

@@ -12,6 +12,7 @@ from model.learning.mixing import MixConfig
 from model.learning.parts import PartsConfig, choose_skeleton
 from model.learning.skin import SkinConfig
 from scanprep import RegisteredSet, write_mesh
+from scanprep.batch.workspace import beside
 
 QUICK = LearnConfig(refinements=1, steps=1, components=4, prunings=(0.01,), ridges=(1e-3,))
 OTHER = Other(skin=SkinConfig(rounds=2, people_rounds=1), mix=MixConfig(rounds=1))
@@ -44,11 +45,17 @@ def folder(truth, tmp_path_factory):
     return place
 
 
+def learned(poses, output, *given, **named):
+    """The command without its console."""
+    with beside(output) as space:
+        return learn(poses, output, *given, **named, space=space)
+
+
 @pytest.mark.parametrize("kind", ["scape", "blendscape", "skinning"])
 def test_every_kind_is_learned_and_read_again(folder, truth, tmp_path, kind):
     path = tmp_path / f"{kind}.npz"
-    outcome = learn(folder / "set", path, folder / "set", kind=kind, config=QUICK, other=OTHER,
-                    pictures=kind == "scape")
+    outcome = learned(folder / "set", path, folder / "set", kind=kind, config=QUICK, other=OTHER,
+                      pictures=kind == "scape")
     model = load_model(path)
     assert model.kind == kind and model.n_betas == 4 and model.skeleton.parents.tolist() == [-1, 0, 0, 2]
     figures = {m.name: m.value for m in outcome.metrics}
@@ -63,26 +70,27 @@ def test_every_kind_is_learned_and_read_again(folder, truth, tmp_path, kind):
 
 
 def test_models_by_sex_stand_beside_the_neutral_one(folder, tmp_path):
-    outcome = learn(folder / "set", tmp_path / "m.npz", folder / "set", by_sex=True, config=QUICK, pictures=False)
+    outcome = learned(folder / "set", tmp_path / "m.npz", folder / "set", by_sex=True, config=QUICK, pictures=False)
     count = {name: load_model(tmp_path / f"m{name}.npz").info["shapes"] for name in ("", ".female", ".male")}
     assert count == {"": 7, ".female": 4, ".male": 2}                     # anna counts, the unknown one in none
     assert {m.name: m.value for m in outcome.metrics}["people of the male model"] == 2
 
 
 def test_sexes_of_a_plain_folder_come_from_a_table(folder, tmp_path):
-    learn(folder / "poses", tmp_path / "m.npz", folder / "people", skeleton=folder / "skeleton.json", by_sex=True,
-          sexes=folder / "sexes.csv", config=QUICK, pictures=False)
+    learned(folder / "poses", tmp_path / "m.npz", folder / "people", skeleton=folder / "skeleton.json", by_sex=True,
+            sexes=folder / "sexes.csv", config=QUICK, pictures=False)
     assert load_model(tmp_path / "m.female.npz").info["shapes"] == 3
     with pytest.raises(ValueError, match="--sexes"):
-        learn(folder / "poses", tmp_path / "m.npz", folder / "people", skeleton=folder / "skeleton.json", by_sex=True)
+        learned(folder / "poses", tmp_path / "m.npz", folder / "people", skeleton=folder / "skeleton.json",
+                by_sex=True)
     (tmp_path / "other.csv").write_text("name,sex\nnobody,male\n")
     with pytest.raises(ValueError, match="none of its names"):
-        learn(folder / "poses", tmp_path / "m.npz", folder / "people", skeleton=folder / "skeleton.json", by_sex=True,
+        learned(folder / "poses", tmp_path / "m.npz", folder / "people", skeleton=folder / "skeleton.json", by_sex=True,
               sexes=tmp_path / "other.csv")
 
 
 def test_a_mix_takes_every_mesh_of_the_set(folder, tmp_path):
-    learn(folder / "set", tmp_path / "mix.npz", mixed=True, config=QUICK, other=OTHER, pictures=False)
+    learned(folder / "set", tmp_path / "mix.npz", mixed=True, config=QUICK, other=OTHER, pictures=False)
     model = load_model(tmp_path / "mix.npz")
     assert model.info["bodies"] == 18 and model.info["people"] == 7 and model.n_betas == 4
 
@@ -92,16 +100,16 @@ def test_a_mix_takes_every_mesh_of_the_set(folder, tmp_path):
     ({"by_sex": True}, "--by-sex")])
 def test_ways_of_learning_that_exclude_each_other(folder, tmp_path, given, words):
     with pytest.raises(ValueError, match=words):
-        learn(folder / "set", tmp_path / "m.npz", **given)
+        learned(folder / "set", tmp_path / "m.npz", **given)
 
 
 def test_a_mix_wants_a_set_and_a_skeleton(folder, tmp_path):
     with pytest.raises(ValueError, match="registered set"):
-        learn(folder / "poses", tmp_path / "m.npz", mixed=True)
+        learned(folder / "poses", tmp_path / "m.npz", mixed=True)
 
 
 def test_parts_are_found_where_none_are_given(folder, tmp_path):
-    outcome = learn(folder / "poses", tmp_path / "m.npz", parts=3, config=QUICK, pictures=False)
+    outcome = learned(folder / "poses", tmp_path / "m.npz", parts=3, config=QUICK, pictures=False)
     assert {m.name: m.value for m in outcome.metrics}["parts"] == 3
     assert json.loads(json.dumps(load_model(tmp_path / "m.npz").info))["shapes"] == 0
 

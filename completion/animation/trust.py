@@ -3,7 +3,7 @@ from __future__ import annotations
 
 import numpy as np
 
-WIDEST = 0.5                         # metres; a marker farther off is an outlier on however bad a fit
+WIDEST = 5.0                         # metres; a marker farther off is an outlier on however bad a fit
 ENTER, LEAVE = 0.5, 1.0              # share of the distance that remains when labels are exchanged, and put back
 
 

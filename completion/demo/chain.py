@@ -1,99 +1,54 @@
-"""The stages of the demonstration; each leaves files behind and is skipped when they are there.
+"""The stages of the demonstration; each is done when something that it depends on has changed since it was done.
 
     scans -> template -> registered set with skeleton -> model -> held-out poses, completion, animation
 """
 from __future__ import annotations
 
-import csv
-import io
 from collections.abc import Callable
 from contextlib import AbstractContextManager
-from dataclasses import asdict, dataclass, field, replace
-from functools import cached_property
+from dataclasses import dataclass, replace
+from functools import cached_property, partial
 from pathlib import Path
 
 import numpy as np
-from scipy.spatial import cKDTree
 
-from model import BodyModel, LearnConfig, Subject, fit_pose, learn_scape, load_model
+from model import BodyModel, Subject, fit_pose, learn_scape, load_model
+from scanprep.batch.steps import KeptSteps, inside
+from scanprep.batch.workspace import Task, Workspace, workspace
 from scanprep.cleaning.template import TemplateConfig, make_template
 from scanprep.dataset import RegisteredSet
-from scanprep.geometry import storage
 from scanprep.geometry.files import read_mesh, write_mesh
 from scanprep.geometry.landmarks import match_landmarks, read_landmark_vertices, read_landmarks, write_landmarks
 from scanprep.geometry.mesh import Mesh
-from scanprep.geometry.storage import read_json
-from scanprep.pipeline.prepare import PrepareConfig, Prepared, prepare
-from scanprep.pipeline.scans import TABLE, find_scans
+from scanprep.pipeline.prepare import SCANS, PrepareConfig, Prepared, prepare
+from scanprep.pipeline.scans import find_scans
 from scanprep.scanning.embedded import (
     SUBJECT,
     EmbeddedScan,
     GroundTruth,
     click_landmarks,
-    embedded_dataset,
+    embedded_plan,
     read_views,
     stand,
     write_scan,
 )
-from scanprep.scanning.people import MARKERS, Person, random_pose, walk
+from scanprep.scanning.people import Person, random_pose, walk
 from scanprep.scanning.scanner import ScannerConfig, scan
 from scanprep.skeleton.find import SkeletonConfig
+from scanprep.threads import one_thread
 
 from ..animation.follow import animate
-from ..markers.files import MarkerSequence, read_markers, write_markers
-from ..markers.layout import DISTANCE, MarkerLayout
+from ..markers.files import MarkerSequence, read_markers
+from ..markers.layout import MarkerLayout
 from ..motion import Motion
 from ..partial.completion import Completion, complete
 from ..partial.results import load_completion, save_completion
+from .recording import ScanPerson, record_walk
+from .settings import DemoConfig, write_settings
 from .truth import TruthMap
 
+MODEL, HALF, MOTION = Path("model.npz"), Path("half_view/half_view.ply"), Path("animation/motion.npz")
 Bar = Callable[[str], AbstractContextManager[Callable[[int, int], None]]]
-
-
-@dataclass(frozen=True)
-class DemoConfig:
-    """How much of everything.
-
-    Attributes
-    ----------
-    poses, subjects : int
-        Scans of one subject in many poses, and of other people.
-    faces : int
-        Triangles of the template.
-    parts : int
-        Of the skeleton. Left to itself, the search finds rings at the shoulders too, which move with the skin.
-    resolution, template_resolution : float, metres
-        Spacing of the scanner's rays, for the scans and for the careful one that the template is made of.
-    template_views : int
-        Sides from which the careful scan is taken.
-    held_out : int
-        Poses of the subject that the model never saw.
-    landmarks : int
-        That are marked on the half view.
-    frames, rate : int, frames per second
-        Of the walk.
-    marker_noise : float, metres
-    seed : int
-    """
-
-    poses: int = 20
-    subjects: int = 12
-    faces: int = 14000
-    parts: int = 16
-    resolution: float = 0.0068
-    template_resolution: float = 0.004
-    template_views: int = 12
-    held_out: int = 5
-    landmarks: int = 7
-    frames: int = 132
-    rate: float = 60.0
-    marker_noise: float = 0.001
-    seed: int = 0
-    learn: LearnConfig = field(default_factory=LearnConfig)
-
-
-QUICK = DemoConfig(poses=8, subjects=3, faces=7000, resolution=0.011, template_resolution=0.006, held_out=2, frames=66,
-                   rate=30.0)
 
 
 @dataclass(frozen=True)
@@ -102,30 +57,20 @@ class Demo:
 
     Attributes
     ----------
-    folder : Path
+    space : Workspace
     config : DemoConfig
     bar : callable
         `bar(title)` is a context manager that yields a progress callback.
     """
 
-    folder: Path
+    space: Workspace
     config: DemoConfig
     bar: Bar
 
-    def begin(self) -> None:
-        """Claim the folder, or make sure that it holds a run with the same settings.
-
-        Raises
-        ------
-        ValueError
-            A run with other settings.
-        """
-        path, settings = self.folder / "demo.json", storage.as_json(asdict(self.config))
-        if path.exists() and read_json(path, "settings of a demo") != settings:
-            raise ValueError(f"{self.folder}: holds a demo with other settings; name another folder with --out, "
-                             "or remove it")
-        self.folder.mkdir(parents=True, exist_ok=True)
-        storage.write_json(path, settings)
+    @property
+    def folder(self) -> Path:
+        """Where all is."""
+        return self.space.folder
 
     @cached_property
     def scanner(self) -> ScannerConfig:
@@ -135,39 +80,43 @@ class Demo:
     @cached_property
     def scans(self) -> list[EmbeddedScan]:
         """Scans of one subject in many poses and of many subjects."""
-        folder = self.folder / "scans"
-        with self.bar("scanning embedded people") as progress:
-            scans = embedded_dataset(folder, self.config.seed, self.config.poses, self.config.subjects, self.scanner,
-                                     progress=progress)
-        text = io.StringIO()
-        table = csv.writer(text, lineterminator="\n")
-        table.writerow(["name", "subject", "pose", "sex"])
-        table.writerows([s.name, s.subject, s.pose, s.sex] for s in scans)
-        with storage.writing(folder / TABLE) as beside:
-            beside.write_text(text.getvalue(), encoding="utf-8")
+        tasks = [Task(f"{SCANS}{'pose' if which[1] else 'person'} {which[0]}", which)
+                 for which in embedded_plan(self.config.poses, self.config.subjects)]
+        with self.bar("scanning embedded people") as progress, one_thread():
+            done = self.space.run(ScanPerson(self.config.seed, self.scanner), tasks, progress=progress)
+        if done.failures:
+            raise ValueError("; ".join(done.failures.values()))
+        for name in set(self.space.kept(SCANS)) - set(done.values):         # of a run with more scans
+            self.space.drop(name)
+        scans = [replace(done.values[task.name], folder=self.folder / "scans") for task in tasks]
+        rows = [(s.name, s.subject, s.pose, s.sex) for s in scans]
+        self.space.step("settings", (self.config, rows), partial(write_settings, self.config, rows))
         return scans
 
     @cached_property
     def template(self) -> Mesh:
         """A careful scan of the subject at rest from more sides, merged, its holes filled, decimated."""
-        folder, path = self.folder / "template_scan", self.folder / "template.ply"
-        if not path.exists():
+        # from above and below too, and into places that a fixed scanner does not reach: hands have fingers
+        scanner = ScannerConfig(views=self.config.template_views, resolution=self.config.template_resolution,
+                                height=1.2, blind_reach=0.01)
+        settings = TemplateConfig()
+        settings = replace(settings, merge=replace(settings.merge, voxel=self.config.template_resolution))
+
+        def make(folder: Path) -> None:
             rng = np.random.default_rng([self.config.seed, 6])
             with self.bar("making the template") as progress:
-                # from above and below too, and into places that a fixed scanner does not reach: hands have fingers
-                scanner = ScannerConfig(views=self.config.template_views, resolution=self.config.template_resolution,
-                                        height=1.2, blind_reach=0.01)
                 careful = scan(self.rest.mesh, scanner, rng)
                 marks = click_landmarks(self.rest, rng, seen=careful.merged.vertices)
-                write_scan(folder, "rest", careful, self.rest, marks)
-                settings = TemplateConfig()
-                settings = replace(settings, merge=replace(settings.merge, voxel=self.config.template_resolution))
-                views = read_views(folder / "views" / "rest.npz")
+                place = folder / "template_scan"
+                write_scan(place, "rest", careful, self.rest, marks)
+                views = read_views(place / "views" / "rest.npz")
                 mesh = make_template(views, self.config.faces, settings, progress)
-            landmarks = read_landmark_vertices(folder / "rest.landmarks.json", mesh)
-            write_landmarks(self.folder / "template.landmarks.json", landmarks)
-            write_mesh(path, mesh)
-        return read_mesh(path)
+            landmarks = read_landmark_vertices(place / "rest.landmarks.json", mesh)
+            write_landmarks(folder / "template.landmarks.json", landmarks)
+            write_mesh(folder / "template.ply", mesh)
+
+        self.space.step("template", (self.config.seed, self.config.faces, scanner, settings), make)
+        return read_mesh(self.folder / "template.ply")
 
     @cached_property
     def rest(self) -> GroundTruth:
@@ -193,8 +142,14 @@ class Demo:
         config = PrepareConfig(skeleton=SkeletonConfig(parts=self.config.parts, tolerance=0.003))
         template, marks, _ = self.template, self.template_landmarks, self.scans
         tasks = find_scans(self.folder / "scans")
-        with self.bar("registering scans") as first, self.bar("finding the skeleton") as second:
-            done = prepare(tasks, template, marks, self.folder / "set", config, first, second)
+        with workspace(self.folder / "set", self.space.force) as space:
+            stale = set(space.kept(SCANS)) - {SCANS + task.name for task in tasks}
+            if stale:                                           # first what tells of them
+                space.drop("tables")
+            for name in stale:
+                space.drop(name)
+            with self.bar("registering scans") as first, self.bar("finding the skeleton") as second:
+                done = prepare(tasks, template, marks, space.folder, config, first, second)
         if done.failures:
             raise ValueError("; ".join(done.failures))
         return done
@@ -202,15 +157,18 @@ class Demo:
     @cached_property
     def model(self) -> BodyModel:
         """The body model."""
-        path = self.folder / "model.npz"
-        if not path.exists():
-            registered: RegisteredSet = self.prepared.registered
-            assert registered.skeleton is not None, "the subject has enough poses for a skeleton"
+        registered: RegisteredSet = self.prepared.registered
+        assert registered.skeleton is not None, "the subject has enough poses for a skeleton"
+        bodies = registered.template, registered.poses("subject"), registered.shapes(), registered.skeleton
+
+        def make(folder: Path) -> None:
             with self.bar("learning the model") as progress:
-                model = learn_scape(registered.template, registered.poses("subject"), registered.shapes(),
-                                    registered.skeleton, self.config.learn, progress)
-            replace(model, info={**model.info, "landmarks": self.template_landmarks}).save(path)
-        return load_model(path)
+                model = learn_scape(*bodies, self.config.learn, progress, inside(KeptSteps(self.space), "model"))
+            replace(model, info={**model.info, "landmarks": self.template_landmarks}).save(folder / MODEL)
+
+        self.space.step("model", (bodies, self.config.learn, self.template_landmarks), make)
+        self.space.drop_others("model/")
+        return load_model(self.folder / MODEL)
 
     @cached_property
     def subject(self) -> Subject:
@@ -240,67 +198,60 @@ class Demo:
     @cached_property
     def half_scan(self) -> tuple[Mesh, dict[str, np.ndarray], GroundTruth]:
         """What one camera sees of the first held-out pose, a few landmarks on it, and the truth."""
-        folder, truth = self.folder / "half_view", self.held_out[0]
-        path = folder / "half_view.ply"
-        if not path.exists():
+        truth, scanner = self.held_out[0], replace(self.scanner, views=1, azimuth=-30.0)
+
+        def make(folder: Path) -> None:
             rng = np.random.default_rng([self.config.seed, 8])
-            seen = scan(truth.mesh, replace(self.scanner, views=1, azimuth=-30.0), rng)
+            seen = scan(truth.mesh, scanner, rng)
             marks = click_landmarks(truth, rng, seen=seen.merged.vertices)
             few = np.unique(np.linspace(0, len(marks) - 1, self.config.landmarks).round().astype(int))
-            write_scan(folder, "half_view", seen, truth, {name: marks[name] for name in np.array(list(marks))[few]},
-                       views=False)
-        return read_mesh(path), read_landmarks(folder / "half_view.landmarks.json"), truth
+            write_scan(folder / HALF.parent, HALF.stem, seen, truth,
+                       {name: marks[name] for name in np.array(list(marks))[few]}, views=False)
+
+        self.space.step("half view", (self.config.seed, scanner, self.config.landmarks), make)
+        half = self.folder / HALF
+        return read_mesh(half), read_landmarks(half.with_suffix(".landmarks.json")), truth
 
     @cached_property
     def completion(self) -> Completion:
         """The whole body from the half view."""
-        folder = self.folder / "completed"
-        if not (folder / "completion.npz").exists():
-            half, marks, _ = self.half_scan
+        half, marks, _ = self.half_scan
+        subject = self.subject
+
+        def make(folder: Path) -> None:
             _, vertices, points = match_landmarks(self.template_landmarks, marks)
-            subject = self.subject
             with self.bar("completing a half view") as progress:
-                save_completion(folder, complete(subject, half, (vertices, points), progress=progress))
-        return load_completion(folder)
+                save_completion(folder / "completed", complete(subject, half, (vertices, points), progress=progress))
+
+        self.space.step("completion", (self.folder / MODEL, self.folder / HALF, self.template_landmarks, marks), make)
+        return load_completion(self.folder / "completed")
 
     @cached_property
     def walk(self) -> tuple[MarkerSequence, MarkerLayout, np.ndarray]:
         """Markers of a walking subject, where they sit on the template, and the true vertices (T, N, 3)."""
-        folder = self.folder / "markers"
         poses, trans = walk(self.config.frames, self.config.rate)
         bodies = np.stack([self.person.posed(pose, place) for pose, place in zip(poses, trans, strict=True)])
-        if not (folder / "walk.c3d").exists():
-            with self.bar("recording a walk") as progress:
-                self._record(folder, bodies, progress)
-        layout = MarkerLayout.load(folder / "layout.json", len(self.template.vertices))
-        return read_markers(folder / "walk.c3d"), layout, bodies
+        template, config = self.template, self.config
 
-    def _record(self, folder: Path, bodies: np.ndarray, progress: Callable[[int, int], None]) -> None:
-        rng = np.random.default_rng([self.config.seed, 9])
-        labels, places = tuple(MARKERS), np.array(list(MARKERS.values()))
-        faces, out = self.person.mesh.faces, []
-        for i, body in enumerate(bodies):
-            out.append(body[places] + DISTANCE * Mesh(body, faces).vertex_normals[places])
-            progress(i + 1, len(bodies))
-        positions = np.stack(out) + rng.normal(0, self.config.marker_noise, (len(bodies), len(labels), 3))
-        positions[rng.random(positions.shape[:2]) < 0.03] = np.nan
-        # as on a real subject: the layout is read off the scan at rest, on which the markers can be seen
-        _, vertices = cKDTree(self.template.vertices).query(self.rest.vertices[places])
-        MarkerLayout(labels, vertices, DISTANCE).save(folder / "layout.json")
-        sequence = MarkerSequence(positions, labels, self.config.rate)
-        write_markers(folder / "walk.csv", sequence)
-        write_markers(folder / "walk.c3d", sequence)
+        def make(folder: Path) -> None:
+            with self.bar("recording a walk") as progress:
+                record_walk(folder / "markers", bodies, self.rest, template, config, progress)
+
+        self.space.step("markers", (config.seed, config.frames, config.rate, config.marker_noise, template), make)
+        layout = MarkerLayout.load(self.folder / "markers" / "layout.json", len(template.vertices))
+        return read_markers(self.folder / "markers" / "walk.c3d"), layout, bodies
 
     @cached_property
     def motion(self) -> Motion:
         """The walk followed by the model."""
-        path = self.folder / "animation" / "motion.npz"
-        if not path.exists():
-            sequence, layout, _ = self.walk
-            subject = self.subject
+        (sequence, layout, _), subject = self.walk, self.subject
+
+        def make(folder: Path) -> None:
             with self.bar("following the markers") as progress:
-                animate(subject, sequence, layout, progress=progress).save(path)
-        return Motion.load(path)
+                animate(subject, sequence, layout, progress=progress).save(folder / MOTION)
+
+        self.space.step("animation", (self.folder / MODEL, self.folder / "markers"), make)
+        return Motion.load(self.folder / MOTION)
 
     @cached_property
     def truth_map(self) -> TruthMap:

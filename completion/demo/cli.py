@@ -4,18 +4,21 @@ from __future__ import annotations
 from dataclasses import replace
 from pathlib import Path
 
+from scanprep.batch.workspace import Workspace
 from scanprep.console import Outcome, bar, say
 
 from ..cli import Out
-from .chain import QUICK, Demo, DemoConfig
+from .chain import Demo
+from .settings import QUICK, DemoConfig
 
 
-def demo(out: Out = Path("scape_demo"), quick: bool = False, seed: int = DemoConfig.seed) -> Outcome:
+def demo(out: Out = Path("scape_demo"), quick: bool = False, seed: int = DemoConfig.seed, *, space: Workspace
+         ) -> Outcome:
     """The whole chain on embedded people: scans, registration, skeleton, model, completion, animation.
 
     Example: scape demo --quick
 
-    Interrupted and started again, it goes on where it was.
+    Interrupted and started again, it goes on where it was; with other settings it does anew what depends on them.
 
     Args:
         out: Folder to write to; report.html in it is the page to open.
@@ -25,10 +28,9 @@ def demo(out: Out = Path("scape_demo"), quick: bool = False, seed: int = DemoCon
     from .figures import figures
     from .page import write_page
 
-    run = Demo(out, replace(QUICK if quick else DemoConfig(), seed=seed), bar)
-    run.begin()
+    run = Demo(space, replace(QUICK if quick else DemoConfig(), seed=seed), bar)
     metrics = figures(run)
-    with bar("drawing the report") as progress:
-        write_page(run, metrics, progress)
+    with bar("drawing the report") as progress, space.staging("page") as staged:
+        write_page(run, metrics, progress, staged.folder)
     say(f"open {out / 'report.html'} in a browser; {out / 'animation' / 'walk.glb'} in any 3D viewer")
     return Outcome(out, metrics, {"demo": run.config})

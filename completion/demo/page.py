@@ -2,6 +2,8 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import partial
+from pathlib import Path
 
 import numpy as np
 
@@ -23,17 +25,19 @@ from .truth import surface_error
 FAR = 0.01                 # metres at the end of the heat maps
 
 
-def write_page(demo: Demo, metrics: list[Metric], tell: Callable[[int, int], None]) -> None:
-    """Write `report.html`, the animated GLB and `overview.png` into the folder of the demo."""
+def write_page(demo: Demo, metrics: list[Metric], tell: Callable[[int, int], None], to: Path) -> None:
+    """Write `report.html`, the animated GLB and pictures into a folder."""
     page = Page("From raw scans to a moving person",
                 "Every stage of the chain on embedded people, whose true shape, pose and correspondence are known.")
     page.table([(m.name, m.text(), m.unit) for m in metrics], ("against the ground truth", "value", "unit"))
-    stages = (_scans, _template, _registration, _skeleton, _shapes, _poses, _completion, _animation)
+    stages: tuple[Callable[[Demo, Page], None], ...] = (
+        _scans, _template, _registration, _skeleton, _shapes, _poses, partial(_completion, to=to),
+        partial(_animation, to=to))
     for i, stage in enumerate(stages):
         stage(demo, page)
         tell(i + 1, len(stages))
-    save_png(demo.folder / "overview.png", overview(demo))
-    page.write(demo.folder / "report.html")
+    save_png(to / "overview.png", overview(demo))
+    page.write(to / "report.html")
 
 
 def overview(demo: Demo, height: int = 400) -> np.ndarray:
@@ -134,12 +138,12 @@ def _poses(demo: Demo, page: Page) -> None:
     page.picture(side_by_side(images, columns=3), "heat from 0 (light) to 30 mm (dark)")
 
 
-def _completion(demo: Demo, page: Page) -> None:
+def _completion(demo: Demo, page: Page, to: Path) -> None:
     page.section("Completion", "One camera saw the person from one side, in a pose that is in no training scan. Blue "
                  "was measured, yellow was filled in by the model.")
     half, marks, truth = demo.half_scan
     image = picture_completion(half, demo.completion, demo.template)
-    save_png(demo.folder / "completed" / "completion.png", image)
+    save_png(to / "completed" / "completion.png", image)
     error = np.linalg.norm(demo.completion.completed.vertices - demo.truth_map.vertices(truth), axis=1)
     views = look_around(demo.template, demo.completion.completed.vertices, (-30, 150))
     page.picture(image, f"{len(marks)} landmarks, then the scan itself")
@@ -147,13 +151,13 @@ def _completion(demo: Demo, page: Page) -> None:
                                   title="distance of corresponding points"))
 
 
-def _animation(demo: Demo, page: Page) -> None:
+def _animation(demo: Demo, page: Page, to: Path) -> None:
     sequence, _, _ = demo.walk
     motion, subject = demo.motion, demo.subject
     page.section("Animation", f"{len(sequence.labels)} markers of a walk, 3% of them missing at any time, and the body "
                  "that follows them.")
     glb = animated_glb(subject.template.faces, motion.vertices(subject), motion.rate, up=upright(subject.template)[0])
-    with storage.writing(demo.folder / "animation" / "walk.glb") as beside:
+    with storage.writing(to / "animation" / "walk.glb") as beside:
         beside.write_bytes(glb)
     page.picture(picture_frames(motion, subject, sequence), "some frames with the measured markers")
     page.picture(animated_picture(motion, subject), "the walk")

@@ -11,7 +11,7 @@ import numpy as np
 
 from model.body import BodyModel
 from model.linear import Subject
-from scanprep.batch.pool import Step, once, under
+from scanprep.batch.steps import Step, inside, once
 from scanprep.threads import one_thread
 
 from ..markers.files import MarkerSequence
@@ -80,7 +80,7 @@ def mosh(model: BodyModel, sequences: MarkerSequence | Sequence[MarkerSequence],
             break
         used = mended
         with clock.running("person"):
-            person = find_person(model, used, layout, config.person, None, under(clock.step, f"again {n} "))
+            person = find_person(model, used, layout, config.person, None, inside(clock.step, f"again {n}"))
     with clock.running("poses"):
         motions = [motion if same(before, after) and used is not mended
                    else stages.poses(f"poses last {i}", person, after)

@@ -7,7 +7,7 @@ from functools import partial
 import numpy as np
 
 from model.body import BodyModel
-from scanprep.batch.pool import Step, once
+from scanprep.batch.steps import Step, once
 from scanprep.geometry import rotations
 from scanprep.threads import one_thread
 

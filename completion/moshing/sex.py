@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 
 from model.body import BodyModel
 from model.learning.sex_plane import SexGuess, guess_sex, sex_plane
-from scanprep.batch.pool import Step, once, under
+from scanprep.batch.steps import Step, inside, once
 from scanprep.threads import one_thread
 
 from ..markers.files import MarkerSequence
@@ -67,7 +67,7 @@ def mosh_by_sex(models: Mapping[str, BodyModel], sequences: MarkerSequence | Seq
 
     checked_models(models)
     config = config or MoshConfig()
-    neutral = find_person(models["neutral"], sequences, layout, config.person, None, under(step, "neutral "))
+    neutral = find_person(models["neutral"], sequences, layout, config.person, None, inside(step, "neutral"))
     guess = guess_sex(models["neutral"], neutral.betas)
     result = mosh(models[guess.sex], sequences, layout, config, progress, step)
     motions = tuple(replace(motion, gender=guess.sex) for motion in result.motions)

@@ -12,6 +12,8 @@ from typing import Annotated, Literal
 import numpy as np
 import tyro
 
+from scanprep.batch.steps import KeptSteps, inside
+from scanprep.batch.workspace import FileWorkspace
 from scanprep.cli import Output, Unit, read_poses
 from scanprep.console import Metric, Outcome, bar
 from scanprep.dataset import RegisteredSet
@@ -26,7 +28,7 @@ from scanprep.skeleton.tree import Skeleton
 from ..body import BodyModel
 from .mixing import MixConfig, learn_scape_mix
 from .parts import choose_skeleton
-from .scape import BlendConfig, LearnConfig, learn_blendscape, learn_scape, timed
+from .scape import BlendConfig, LearnConfig, Progress, learn_blendscape, learn_scape, timed
 from .sexes import learn_by_sex
 from .skin import SkinConfig, learn_skinning
 
@@ -58,8 +60,10 @@ def learn(poses: Path, output: Output, shapes: Path | None = None, template: Pat
           unit: Unit | None = None, parts: int | None = None, kind: Kind = "scape", mixed: bool = False,
           by_sex: bool = False, sexes: Path | None = None, pictures: bool = True,
           config: Annotated[LearnConfig, tyro.conf.arg(name="")] = LearnConfig(),  # noqa: B008
-          other: Annotated[Other, tyro.conf.arg(name="")] = Other()) -> Outcome:
+          other: Annotated[Other, tyro.conf.arg(name="")] = Other(), *, space: FileWorkspace) -> Outcome:
     """Learn a body model from one person in many poses and many people in about one pose, or from a mix.
+
+    Killed and started again it goes on where it was; what does not depend on a change is not learned again.
 
     Example: scape learn --poses set --shapes set -o model.npz
 
@@ -91,29 +95,30 @@ def learn(poses: Path, output: Output, shapes: Path | None = None, template: Pat
     known = None if not by_sex or shapes is None else _read_sexes(shapes, sexes)
     tree = None if parts is not None else _read_skeleton(skeleton, poses, body)
     marks = _read_marks(landmarks, poses, body)
+    step = KeptSteps(space)
     with _timed() as seconds:
         if tree is None:
             if mixed:
                 raise ValueError(f"{poses}: a mix of people shows no skeleton; name one with --skeleton")
-            with bar("finding the skeleton") as progress, timed("skeleton"):
-                tree = choose_skeleton(body, posed, progress=progress).skeleton if parts is None \
-                    else find_skeleton(body, posed, SkeletonConfig(parts=parts), progress)
+            with bar("finding the skeleton") as progress:
+                tree = step("skeleton", (body, posed, parts),
+                            lambda: _find_skeleton(body, posed, parts, step, progress))
         with bar("learning the model") as progress:
             if mixed:
                 mixing = dataclasses.replace(other.mix, components=config.components)
                 who = [entry.subject or entry.name for entry in RegisteredSet.load(poses).entries]
-                models: Whole = {"neutral": learn_scape_mix(body, posed, who, tree, mixing, progress)}
+                models: Whole = {"neutral": learn_scape_mix(body, posed, who, tree, mixing, progress, step)}
             elif known is not None:
                 assert people is not None
-                models = {**learn_by_sex(body, posed, people, known, tree, config, progress)}
+                models = {**learn_by_sex(body, posed, people, known, tree, config, progress, step)}
             elif kind == "blendscape":
                 settings = BlendConfig(**vars(config), width=other.width)
-                models = {"neutral": learn_blendscape(body, posed, people, tree, settings, progress)}
+                models = {"neutral": learn_blendscape(body, posed, people, tree, settings, progress, step)}
             elif kind == "skinning":
                 skin = dataclasses.replace(other.skin, components=config.components)
-                models = {"neutral": learn_skinning(body, posed, people, tree, skin, progress)}
+                models = {"neutral": learn_skinning(body, posed, people, tree, skin, progress, step)}
             else:
-                models = {"neutral": learn_scape(body, posed, people, tree, config, progress)}
+                models = {"neutral": learn_scape(body, posed, people, tree, config, progress, step)}
     for name, model in models.items():
         path = output if name == "neutral" else output.with_suffix(f".{name}.npz")
         kept = dataclasses.replace(model, info={**model.info, "landmarks": marks})     # type: ignore[type-var]
@@ -125,7 +130,7 @@ def learn(poses: Path, output: Output, shapes: Path | None = None, template: Pat
         Metric("people", 0 if people is None else len(people)), Metric("triangles", len(body.faces)),
         Metric("parts", len(tree.parents)), *about(models["neutral"]),
         *[Metric(f"people of the {name} model", model.info["shapes"]) for name, model in models.items() if by_sex],
-        *[Metric(f"time: {step}", value, "s") for step, value in seconds.items()]],
+        *_times(seconds, step.found)],
         {"learn": config, "other": other})
 
 
@@ -136,6 +141,22 @@ def about(model: BodyModel) -> list[Metric]:
     if model.n_betas:
         rows.append(Metric("variance of shape they explain", 100 * float(model.explained[-1]), "%"))
     return rows
+
+
+def _find_skeleton(body: Mesh, posed: np.ndarray, parts: int | None, step: KeptSteps, progress: Progress) -> Skeleton:
+    within = inside(step, "skeleton")
+    with timed("skeleton"):
+        if parts is None:
+            return choose_skeleton(body, posed, progress=progress, step=within).skeleton
+        return find_skeleton(body, posed, SkeletonConfig(parts=parts), progress, within)
+
+
+def _times(seconds: dict[str, float], found: list[str]) -> list[Metric]:
+    """Seconds of every step; of one that had been begun before, of what was left."""
+    begun = {name.split("/")[-2] for name in found if "/" in name}
+    return [*[Metric(f"time: {name}", "done before") for name in found if "/" not in name],
+            *[Metric(f"time: {name}", value, "s, of what was left" if name in begun else "s")
+              for name, value in seconds.items()]]
 
 
 @contextlib.contextmanager

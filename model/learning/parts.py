@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial import cKDTree
 
+from scanprep.batch.steps import Step, once
 from scanprep.cleaning.decimate import decimate
 from scanprep.geometry.mesh import Mesh
 from scanprep.skeleton.find import find_skeleton
@@ -61,7 +62,8 @@ class ChosenSkeleton:
 
 @one_thread()
 def choose_skeleton(template: Mesh, poses: np.ndarray, config: PartsConfig | None = None,
-                    learning: PoseConfig | None = None, progress: Progress | None = None) -> ChosenSkeleton:
+                    learning: PoseConfig | None = None, progress: Progress | None = None, step: Step = once
+                    ) -> ChosenSkeleton:
     """A skeleton with as many parts as help to predict poses that were left out.
 
     The search for rigid parts stops where surfaces no longer meet in a joint. A trunk or a shoulder bends without
@@ -78,6 +80,8 @@ def choose_skeleton(template: Mesh, poses: np.ndarray, config: PartsConfig | Non
         Settings with which the models are learned that are compared; by default quick ones.
     progress : callable, optional
         Called with the skeletons done and their largest number.
+    step : callable, optional
+        Keeps every skeleton and its error, as `scanprep.batch.steps.Step`.
 
     Raises
     ------
@@ -89,23 +93,36 @@ def choose_skeleton(template: Mesh, poses: np.ndarray, config: PartsConfig | Non
     poses = np.asarray(poses, dtype=np.float64)
     vertices, coarse = coarse_copy(template, config.vertices)
 
-    def error(skeleton: Skeleton) -> float:
-        return _left_out_error(poses[:, vertices], coarse_skeleton(skeleton, template, coarse), coarse, learning)
+    def tried(settings: SkeletonConfig) -> tuple[Skeleton, float] | None:
+        """A skeleton and its error; None where there is no tree of so many parts, or parts are too small to compare."""
+        try:
+            found = find_skeleton(template, poses, settings, step=step)
+            left_out = _left_out_error(poses[:, vertices], coarse_skeleton(found, template, coarse), coarse, learning)
+        except ValueError:
+            if settings.parts is None:
+                raise
+            return None
+        return found, left_out
 
-    best = find_skeleton(template, poses)
-    errors = {len(best.parents): error(best)}
+    def kept(settings: SkeletonConfig) -> tuple[Skeleton, float] | None:
+        name = "best parts" if settings.parts is None else f"{settings.parts} parts"
+        return step(name, (template, poses, settings, learning, config.vertices), lambda: tried(settings))
+
+    first = kept(SkeletonConfig())
+    assert first is not None, "what goes wrong without a count of parts is raised"
+    best, least = first
+    errors = {len(best.parents): least}
     tell(1, 1 + config.steps)
     for done in range(config.steps):
         wanted = len(best.parents) + config.step
-        try:
-            finer = find_skeleton(template, poses, SkeletonConfig(parts=wanted, restarts=1))
-            errors[wanted] = error(finer)
-        except ValueError:                        # no tree of so many parts, or parts too small to compare
+        finer = kept(SkeletonConfig(parts=wanted, restarts=1))
+        if finer is None:
             break
+        errors[wanted] = finer[1]
         tell(2 + done, 1 + config.steps)
         if errors[wanted] > (1 - config.gain) * errors[len(best.parents)]:
             break
-        best = finer
+        best = finer[0]
     tell(1 + config.steps, 1 + config.steps)
     return ChosenSkeleton(best, errors)
 

@@ -2,9 +2,13 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, fields, replace
+from functools import cache, partial
+from typing import TypeVar
 
 import numpy as np
+
+from scanprep.batch.steps import Step, once
 
 from ..fitting import FitConfig, PoseFitter
 from ..gradients import GradientSystem, pose_gradients
@@ -15,6 +19,7 @@ from .condense import condense
 from .regression import Design, RegressionConfig, choose_design
 
 Progress = Callable[[int, int], None]
+T = TypeVar("T")
 
 
 @dataclass(frozen=True)
@@ -39,6 +44,11 @@ class PoseConfig(RegressionConfig):
     steps: int = 3
     detail: float = 0.03
 
+    @property
+    def of_poses(self) -> PoseConfig:
+        """The settings of the pose space alone, where there are more of them."""
+        return PoseConfig(**{field.name: getattr(self, field.name) for field in fields(PoseConfig)})
+
 
 @dataclass(frozen=True, eq=False)
 class LearnedPose:
@@ -58,7 +68,8 @@ class LearnedPose:
     design: Design
 
 
-def learn_pose(carriage: Carriage, bodies: np.ndarray, config: PoseConfig, tick: Ticks) -> LearnedPose:
+def learn_pose(carriage: Carriage, bodies: np.ndarray, config: PoseConfig, tick: Ticks, step: Step = once
+               ) -> LearnedPose:
     """The pose space, first as in the paper, then refined on the stitched surface.
 
     Stitching sees only what neighbouring triangles agree on, and Eq. 4 does not know it. So, with the part
@@ -69,24 +80,47 @@ def learn_pose(carriage: Carriage, bodies: np.ndarray, config: PoseConfig, tick:
 
     [SCAPE] Eq. 4, Eq. 5
     """
+    template = carriage.template
+
+    @cache
+    def gradients() -> GradientSystem:
+        return GradientSystem(template, config.smoothness, carriage.skeleton.part_of_face)
+
+    inputs = carriage, bodies, config.of_poses
+    learned = tick.over(len(bodies), partial(step, "first fit", inputs, lambda: _first(
+        carriage, bodies, config, gradients())))
+    for number in range(config.refinements):
+        refine = partial(_refined, carriage, bodies, config, gradients, learned, tick, choosing=number == 0)
+        learned = tick.over(len(bodies), partial(step, f"refinement {number}", inputs, refine))
+    return replace(learned, space=condense(learned.space, learned.poses, template, config.detail * template.mean_edge))
+
+
+def _first(carriage: Carriage, bodies: np.ndarray, config: PoseConfig, gradients: GradientSystem) -> LearnedPose:
+    """Q of every body from the rotations of Procrustes, regressed.
+
+    [SCAPE] Eq. 4, Eq. 5
+    """
     template, skeleton = carriage.template, carriage.skeleton
-    gradients = GradientSystem(template, config.smoothness, skeleton.part_of_face)
     poses = skeleton.pose_of(skeleton.fit_rotations(template, bodies))
     Q = pose_gradients(gradients, carriage.local_edges(bodies, poses))
     design = choose_design(template, skeleton, poses, Q, config, _by_edges(carriage, Q))
-    space = design.fit(poses, Q)
-    tick(len(bodies))
-    for number in range(config.refinements):
-        poses = fit_poses(carriage.subject(space), bodies, poses, tick)
-        for step in range(config.steps):
-            left = bodies - carriage.subject(space).vertices(poses)
-            Q = space.gradients(poses)
-            Q += pose_gradients(gradients, carriage.v_hat + carriage.local_edges(left, poses)) - np.eye(3)
-            if number == step == 0:
-                design = choose_design(template, skeleton, poses, Q, config, _by_vertices(carriage, bodies, poses),
-                                       design)
-            space = design.fit(poses, Q)
-    return LearnedPose(condense(space, poses, template, config.detail * template.mean_edge), poses, design)
+    return LearnedPose(design.fit(poses, Q), poses, design)
+
+
+def _refined(carriage: Carriage, bodies: np.ndarray, config: PoseConfig, gradients: Callable[[], GradientSystem],
+             learned: LearnedPose, tick: Ticks, choosing: bool) -> LearnedPose:
+    """The part rotations fitted anew, and Q regressed again on what the stitched model leaves."""
+    space, design = learned.space, learned.design
+    poses = fit_poses(carriage.subject(space), bodies, learned.poses, tick)
+    for number in range(config.steps):
+        left = bodies - carriage.subject(space).vertices(poses)
+        Q = space.gradients(poses)
+        Q += pose_gradients(gradients(), carriage.v_hat + carriage.local_edges(left, poses)) - np.eye(3)
+        if choosing and number == 0:
+            design = choose_design(carriage.template, carriage.skeleton, poses, Q, config,
+                                   _by_vertices(carriage, bodies, poses), design)
+        space = design.fit(poses, Q)
+    return LearnedPose(space, poses, design)
 
 
 def fit_poses(subject: Subject, bodies: np.ndarray, poses: np.ndarray, tick: Ticks) -> np.ndarray:
@@ -107,8 +141,15 @@ class Ticks:
 
     def __call__(self, more: int) -> None:
         self.done += more
-        if self.progress:
+        if self.progress and more:
             self.progress(self.done, self.total)
+
+    def over(self, count: int, work: Callable[[], T]) -> T:
+        """What some work returns; it counts so much, whether it is done now or was done before."""
+        goal = self.done + count
+        value = work()
+        self(goal - self.done)
+        return value
 
 
 def _by_edges(carriage: Carriage, Q: np.ndarray) -> Callable[[np.ndarray], float]:

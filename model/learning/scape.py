@@ -6,10 +6,12 @@ import logging
 import time
 from collections.abc import Callable, Iterator
 from dataclasses import asdict, dataclass
-from typing import Any
+from functools import partial
+from typing import Any, TypeVar
 
 import numpy as np
 
+from scanprep.batch.steps import Step, inside, once
 from scanprep.geometry.mesh import Mesh, check_template
 from scanprep.skeleton.tree import Skeleton
 from scanprep.threads import one_thread
@@ -17,7 +19,7 @@ from scanprep.threads import one_thread
 from ..blendscape import BlendScapeModel
 from ..borders import face_weights
 from ..carriers import rigid_weights
-from ..digests import body_digests, digest
+from ..digests import body_digest, body_digests, digest
 from ..features import twists
 from ..gradients import GradientSystem, shape_gradients
 from ..pose_space import PoseSpace
@@ -27,6 +29,7 @@ from .carriage import Carriage
 from .pose import LearnedPose, PoseConfig, Ticks, learn_pose
 
 Progress = Callable[[int, int], None]
+T = TypeVar("T")
 LOG = logging.getLogger(__name__)
 
 
@@ -58,7 +61,8 @@ class BlendConfig(LearnConfig):
 
 @one_thread()
 def learn_scape(template: Mesh, poses: np.ndarray, shapes: np.ndarray | None, skeleton: Skeleton,
-                config: LearnConfig | None = None, progress: Progress | None = None) -> ScapeModel:
+                config: LearnConfig | None = None, progress: Progress | None = None, step: Step = once
+                ) -> ScapeModel:
     """Learn a body model from one person in many poses and many people in about one pose.
 
     Parameters
@@ -73,6 +77,8 @@ def learn_scape(template: Mesh, poses: np.ndarray, shapes: np.ndarray | None, sk
     config : LearnConfig, optional
     progress : callable, optional
         Called with the work done and the whole.
+    step : callable, optional
+        Keeps what was worked out on the way, as `scanprep.batch.steps.Step`.
 
     Raises
     ------
@@ -85,12 +91,13 @@ def learn_scape(template: Mesh, poses: np.ndarray, shapes: np.ndarray | None, sk
     check_template(template)
     check_skeleton(template, skeleton)
     carriage = Carriage(template, skeleton, rigid_weights(skeleton))
-    space, shape_space, mean, covariance, info, examples = _learn(carriage, poses, shapes, config, progress)
+    space, shape_space, mean, covariance, info, examples = _learn(carriage, poses, shapes, config, progress, step)
     return ScapeModel(template, skeleton, space, shape_space, mean, covariance, info, pose_examples=examples)
 
 
 def learn_blendscape(template: Mesh, poses: np.ndarray, shapes: np.ndarray | None, skeleton: Skeleton,
-                     config: BlendConfig | None = None, progress: Progress | None = None) -> BlendScapeModel:
+                     config: BlendConfig | None = None, progress: Progress | None = None, step: Step = once
+                     ) -> BlendScapeModel:
     """Learn a body model whose rotations blend across the borders of parts.
 
     All is as in `learn_scape`, with `R` a mixture of rotations for triangles near a border. A mixture is no rotation;
@@ -98,7 +105,7 @@ def learn_blendscape(template: Mesh, poses: np.ndarray, shapes: np.ndarray | Non
 
     Parameters
     ----------
-    template, poses, shapes, skeleton, progress
+    template, poses, shapes, skeleton, progress, step
         As for `learn_scape`.
     config : BlendConfig, optional
 
@@ -114,30 +121,59 @@ def learn_blendscape(template: Mesh, poses: np.ndarray, shapes: np.ndarray | Non
     check_skeleton(template, skeleton)
     blend = face_weights(template, skeleton, config.width * float(np.linalg.norm(np.ptp(template.vertices, axis=0))))
     carriage = Carriage(template, skeleton, blend)
-    space, shape_space, mean, covariance, info, examples = _learn(carriage, poses, shapes, config, progress)
+    space, shape_space, mean, covariance, info, examples = _learn(carriage, poses, shapes, config, progress, step)
     return BlendScapeModel(template, skeleton, space, shape_space, mean, covariance, info, pose_examples=examples,
                            blend=blend)
 
 
 def _learn(carriage: Carriage, poses: np.ndarray, shapes: np.ndarray | None, config: LearnConfig,
-           progress: Progress | None
+           progress: Progress | None, step: Step
            ) -> tuple[PoseSpace, ShapeSpace, np.ndarray, np.ndarray, dict[str, Any], np.ndarray]:
     """Pose space, shape space, mean and covariance of the poses, how they came about, and the poses."""
     template = carriage.template
     poses = checked_bodies(template, poses, "poses")
     shapes = None if shapes is None else checked_bodies(template, shapes, "shapes")
     tick = Ticks(progress, (config.refinements + 1) * len(poses) + (0 if shapes is None else len(shapes)))
-    with timed("pose space"):
-        learned = learn_pose(carriage, poses, config, tick)
+    learned = pose_space(carriage, poses, config, tick, step)
     shape_space = ShapeSpace.empty(len(template.faces))
     if shapes is not None:
-        with timed("shape of every person"):
-            S = shape_deformations(carriage, learned.space, shapes, config.smoothness, tick)
-        with timed("shape components"):
-            shape_space = learn_shape_space(S, config.components)
+        shape_space = from_shapes(carriage, learned.space, shapes, config, tick, step, None,
+                                  lambda S: learn_shape_space(S, config.components))
     examples = pose_examples(template, carriage.skeleton, learned.poses, shapes)
     return (learned.space, shape_space, *pose_prior(examples, len(poses)),
             how_learned(template, learned, poses, shapes, config), examples)
+
+
+def pose_space(carriage: Carriage, poses: np.ndarray, config: LearnConfig, tick: Ticks, step: Step) -> LearnedPose:
+    """What is learned of the poses, in a step and its steps."""
+    def learn() -> LearnedPose:
+        with timed("pose space"):
+            return learn_pose(carriage, poses, config, tick, inside(step, "pose space"))
+
+    return tick.over((config.refinements + 1) * len(poses),
+                     lambda: step("pose space", (carriage, poses, config.of_poses), learn))
+
+
+def from_shapes(carriage: Carriage, space: PoseSpace, shapes: np.ndarray, config: LearnConfig, tick: Ticks, step: Step,
+                inputs: Any, learn: Callable[[np.ndarray], T]) -> T:
+    """What is learned of the shape deformations S (P, F, 3, 3) of people (P, N, 3), in a step and one a person.
+
+    Parameters
+    ----------
+    inputs
+        What it depends on beside them and the settings.
+    learn : callable
+        Gets S.
+    """
+    def make() -> T:
+        with timed("shape of every person"):
+            each = inside(step, "shape components/shape of every person")
+            S = shape_deformations(carriage, space, shapes, config.smoothness, tick, each)
+        with timed("shape components"):
+            return learn(S)
+
+    return tick.over(len(shapes), lambda: step(
+        "shape components", (carriage, space, shapes, config.smoothness, config.components, inputs), make))
 
 
 def how_learned(template: Mesh, learned: LearnedPose, poses: np.ndarray, shapes: np.ndarray | None, config: LearnConfig
@@ -198,8 +234,8 @@ def timed(step: str) -> Iterator[None]:
     LOG.info("%s: %.2f s", step, time.perf_counter() - begun)
 
 
-def shape_deformations(carriage: Carriage, space: PoseSpace, shapes: np.ndarray, smoothness: float, tick: Ticks
-                       ) -> np.ndarray:
+def shape_deformations(carriage: Carriage, space: PoseSpace, shapes: np.ndarray, smoothness: float, tick: Ticks,
+                       step: Step = once) -> np.ndarray:
     """S (P, F, 3, 3) of every person, in float32 to halve the memory.
 
     Poses are those of Procrustes. Fitting each part to the template in the pose found, again and again, left the same
@@ -209,11 +245,15 @@ def shape_deformations(carriage: Carriage, space: PoseSpace, shapes: np.ndarray,
     """
     template, skeleton = carriage.template, carriage.skeleton
     system = GradientSystem(template, smoothness)
-    S = np.empty((len(shapes), len(template.faces), 3, 3), dtype=np.float32)
-    for i, y in enumerate(shapes):
+
+    def deformation(y: np.ndarray) -> np.ndarray:
         pose = skeleton.pose_of(skeleton.fit_rotations(template, y))
         posed = carriage.v_hat @ np.swapaxes(space.gradients(pose), -1, -2)
-        S[i] = shape_gradients(system, posed, carriage.local_edges(y[None], pose[None])[0])
+        return shape_gradients(system, posed, carriage.local_edges(y[None], pose[None])[0]).astype(np.float32)
+
+    S = np.empty((len(shapes), len(template.faces), 3, 3), dtype=np.float32)
+    for i, y in enumerate(shapes):
+        S[i] = step(f"person {body_digest(y)}", (carriage, space, smoothness, y), partial(deformation, y))
         tick(1)
     return S
 

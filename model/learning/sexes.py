@@ -2,30 +2,32 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
+from typing import Any
 
 import numpy as np
 
+from scanprep.batch.steps import Step, once
 from scanprep.geometry.mesh import Mesh, check_template
 from scanprep.skeleton.tree import Skeleton
 from scanprep.threads import one_thread
 
 from ..carriers import rigid_weights
 from ..scape import ScapeModel
-from ..shape_space import learn_shape_space
+from ..shape_space import ShapeSpace, learn_shape_space
 from .carriage import Carriage
-from .pose import Ticks, learn_pose
+from .pose import Ticks
 from .scape import (
     LearnConfig,
     Progress,
     check_skeleton,
     checked_bodies,
+    from_shapes,
     how_learned,
     pose_examples,
     pose_prior,
-    shape_deformations,
+    pose_space,
 )
-from .sex_plane import PLANE, learn_sex_plane
+from .sex_plane import PLANE, SexPlane, learn_sex_plane
 
 SEXES = ("female", "male")
 FEWEST = 2                           # people that span a space of shapes
@@ -33,12 +35,13 @@ FEWEST = 2                           # people that span a space of shapes
 
 @one_thread()
 def learn_by_sex(template: Mesh, poses: np.ndarray, shapes: np.ndarray, sexes: Sequence[str], skeleton: Skeleton,
-                 config: LearnConfig | None = None, progress: Progress | None = None) -> dict[str, ScapeModel]:
+                 config: LearnConfig | None = None, progress: Progress | None = None, step: Step = once
+                 ) -> dict[str, ScapeModel]:
     """Learn a model of everybody and one of each sex: one pose space, and a space of shapes a group.
 
     Parameters
     ----------
-    template, poses, shapes, skeleton, config, progress
+    template, poses, shapes, skeleton, config, progress, step
         As for `learn_scape`.
     sexes : S strings
         "female", "male", or "" where it is not known; those count in the model of everybody alone.
@@ -64,26 +67,28 @@ def learn_by_sex(template: Mesh, poses: np.ndarray, shapes: np.ndarray, sexes: S
     groups = _groups(sexes, len(shapes))
     carriage = Carriage(template, skeleton, rigid_weights(skeleton))
     tick = Ticks(progress, (config.refinements + 1) * len(poses) + len(shapes))
-    learned = learn_pose(carriage, poses, config, tick)
-    S = shape_deformations(carriage, learned.space, shapes, config.smoothness, tick)
+    learned = pose_space(carriage, poses, config, tick, step)
+
+    def learn(S: np.ndarray) -> tuple[dict[str, ShapeSpace], dict[str, Any] | None]:
+        spaces = {sex: learn_shape_space(S[chosen], config.components) for sex, chosen in groups.items()}
+        return spaces, _plane(spaces["neutral"], S, sexes).kept() if all(sex in groups for sex in SEXES) else None
+
+    spaces, plane = from_shapes(carriage, learned.space, shapes, config, tick, step, list(sexes), learn)
     examples = pose_examples(template, skeleton, learned.poses, shapes)
     prior = pose_prior(examples, len(poses))
     models = {}
     for sex, chosen in groups.items():
         info = {**how_learned(template, learned, poses, shapes[chosen], config), "sex": sex}
-        models[sex] = ScapeModel(template, skeleton, learned.space, learn_shape_space(S[chosen], config.components),
-                                 *prior, info, pose_examples=examples)
-    if all(sex in models for sex in SEXES):
-        models["neutral"] = _with_plane(models["neutral"], S, sexes)
+        if sex == "neutral" and plane is not None:
+            info[PLANE] = plane
+        models[sex] = ScapeModel(template, skeleton, learned.space, spaces[sex], *prior, info, pose_examples=examples)
     return models
 
 
-def _with_plane(model: ScapeModel, S: np.ndarray, sexes: Sequence[str]) -> ScapeModel:
-    """The model with what tells its people's sexes apart."""
+def _plane(space: ShapeSpace, S: np.ndarray, sexes: Sequence[str]) -> SexPlane:
+    """What tells the sexes of people (P, F, 3, 3) apart."""
     known = np.isin(np.array(list(sexes), dtype=object), SEXES)
-    betas = model.shape_space.betas_of(S[known])
-    plane = learn_sex_plane(betas, [sex for sex in sexes if sex in SEXES])
-    return replace(model, info={**model.info, PLANE: plane.kept()})
+    return learn_sex_plane(space.betas_of(S[known]), [sex for sex in sexes if sex in SEXES])
 
 
 def _groups(sexes: Sequence[str], count: int) -> dict[str, np.ndarray]:

@@ -3,10 +3,12 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
 
+from scanprep.batch.steps import Step, inside, once
 from scanprep.geometry.mesh import Mesh, check_template
 from scanprep.skeleton.tree import Skeleton
 from scanprep.threads import one_thread
@@ -16,7 +18,7 @@ from ..fitting import FitConfig, PoseFitter
 from ..pose_space import kept_directions
 from ..skinning import SkinningModel
 from .pose import Ticks
-from .scape import check_skeleton, checked_bodies, digest, pose_examples, pose_prior
+from .scape import check_skeleton, checked_bodies, digest, pose_examples, pose_prior, timed
 from .skin_people import learn_people, unblended
 from .skin_weights import diffused, diffused_weights, fit_weights, kept_weights
 
@@ -72,7 +74,8 @@ class SkinConfig:
 
 @one_thread()
 def learn_skinning(template: Mesh, poses: np.ndarray, shapes: np.ndarray | None, skeleton: Skeleton,
-                   config: SkinConfig | None = None, progress: Progress | None = None) -> SkinningModel:
+                   config: SkinConfig | None = None, progress: Progress | None = None, step: Step = once
+                   ) -> SkinningModel:
     """Learn a skinning model from one person in many poses and many people in about one pose.
 
     Parameters
@@ -88,6 +91,8 @@ def learn_skinning(template: Mesh, poses: np.ndarray, shapes: np.ndarray | None,
     config : SkinConfig, optional
     progress : callable, optional
         Called with the work done and the whole.
+    step : callable, optional
+        Keeps every round, as `scanprep.batch.steps.Step`.
 
     Raises
     ------
@@ -103,13 +108,25 @@ def learn_skinning(template: Mesh, poses: np.ndarray, shapes: np.ndarray | None,
     shapes = None if shapes is None else checked_bodies(template, shapes, "shapes")
     later = 0 if shapes is None else config.people_rounds * len(shapes)
     tick = Ticks(progress, (1 + (config.correctives != "none")) * config.rounds * len(poses) + later)
-    at = skeleton.pose_of(skeleton.fit_rotations(template, poses))
-    model = _start(template, skeleton, config)
-    for correctives in ("none", config.correctives) if config.correctives != "none" else ("none",):
-        model, at = _learn_pose(model, at, poses, replace(config, correctives=correctives), tick)
-    tick(tick.total - tick.done - later)
+
+    def learn() -> tuple[SkinningModel, np.ndarray]:
+        at = skeleton.pose_of(skeleton.fit_rotations(template, poses))
+        model = _start(template, skeleton, config)
+        with timed("pose space"):
+            for correctives in ("none", config.correctives) if config.correctives != "none" else ("none",):
+                settings = replace(config, correctives=correctives)
+                model, at = _learn_pose(model, at, poses, settings, tick, inside(step, "pose space"))
+        return model, at
+
+    def learn_shapes() -> SkinningModel:
+        with timed("shape components"):
+            return learn_people(model, bodies, *of_people, tick, inside(step, "shape components"))
+
+    of_poses = template, skeleton, poses, replace(config, components=0, people_rounds=0)
+    model, at = tick.over(tick.total - later, lambda: step("pose space", of_poses, learn))
     if shapes is not None:
-        model = learn_people(model, shapes, config.components, config.people_rounds, tick)
+        bodies, of_people = shapes, (config.components, config.people_rounds)
+        model = tick.over(later, lambda: step("shape components", (model, bodies, of_people), learn_shapes))
     examples = pose_examples(template, skeleton, at, shapes)
     mean, covariance = pose_prior(examples, len(at))
     info: dict[str, Any] = {
@@ -128,25 +145,34 @@ def _start(template: Mesh, skeleton: Skeleton, config: SkinConfig) -> SkinningMo
                          np.zeros((J, 3)), np.zeros((3 * J, 3 * J)))
 
 
-def _learn_pose(model: SkinningModel, poses: np.ndarray, bodies: np.ndarray, config: SkinConfig, tick: Ticks
-                ) -> tuple[SkinningModel, np.ndarray]:
+def _learn_pose(model: SkinningModel, poses: np.ndarray, bodies: np.ndarray, config: SkinConfig, tick: Ticks,
+                step: Step) -> tuple[SkinningModel, np.ndarray]:
     """Poses, weights, joints, rest vertices and correctives in turn, while left-out poses are met better."""
     allowed = diffused_weights(model.template, model.skeleton, 2 * config.width) > 0
     model = replace(model, info={"left_out_error": np.inf})
-    for _turn in range(config.rounds):
-        fitter, fitted = PoseFitter(model.subject(), QUICK), []
-        for body, pose in zip(bodies, poses, strict=True):
-            fitted.append(fitter.fit(body, pose).pose)
-            tick(1)
-        tried = _with_weights(model, np.stack(fitted), bodies, allowed, config)
-        tried = _with_joints(tried, np.stack(fitted), bodies)
-        tried = _with_correctives(tried, np.stack(fitted), bodies, config)
+    for turn in range(config.rounds):
+        tried, fitted = tick.over(len(bodies), partial(
+            step, f"{config.correctives} correctives, round {turn}", (model, poses, bodies, config),
+            partial(_next_round, model, poses, bodies, allowed, config, tick)))
         gain = 1 - tried.info["left_out_error"] / model.info["left_out_error"]
         if gain > 0:
-            model, poses = tried, np.stack(fitted)
+            model, poses = tried, fitted
         if gain < ENOUGH:
             break
     return model, poses
+
+
+def _next_round(model: SkinningModel, poses: np.ndarray, bodies: np.ndarray, allowed: np.ndarray, config: SkinConfig,
+                tick: Ticks) -> tuple[SkinningModel, np.ndarray]:
+    """Poses, weights, joints, rest vertices and correctives, each fitted to the others once."""
+    fitter, found = PoseFitter(model.subject(), QUICK), []
+    for body, pose in zip(bodies, poses, strict=True):
+        found.append(fitter.fit(body, pose).pose)
+        tick(1)
+    fitted = np.stack(found)
+    tried = _with_weights(model, fitted, bodies, allowed, config)
+    tried = _with_joints(tried, fitted, bodies)
+    return _with_correctives(tried, fitted, bodies, config), fitted
 
 
 def _carried(model: SkinningModel, pose: np.ndarray, body: np.ndarray) -> np.ndarray:

@@ -2,9 +2,13 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 
+from scanprep.batch.steps import Step, once
+
+from ..digests import body_digest
 from ..fitting import FitConfig, PoseFitter, ShapeFitter
 from ..shape_space import learn_shape_space
 from ..skinning import SkinningModel
@@ -13,20 +17,26 @@ from .pose import Ticks
 SOFTEST = 0.2                        # a mean of rotations that shrinks further is not undone
 
 
-def learn_people(model: SkinningModel, shapes: np.ndarray, components: int, rounds: int, tick: Ticks
-                 ) -> SkinningModel:
+def learn_people(model: SkinningModel, shapes: np.ndarray, components: int, rounds: int, tick: Ticks,
+                 step: Step = once) -> SkinningModel:
     """The model with the shape components of people whose poses are fitted and undone in turn."""
     for turn in range(rounds):
         quick = FitConfig(polish=0, n_betas=min(20, model.n_betas) or None)
         people = np.empty(shapes.shape)
         fitter = ShapeFitter(model, quick) if turn else PoseFitter(model.subject(), quick)
         for i, body in enumerate(shapes):
-            people[i] = unposed_person(model, fitter.fit(body).pose, body)
+            people[i] = step(f"round {turn}, person {body_digest(body)}", (model, quick, turn, body),
+                             partial(_fitted, model, fitter, body))
             tick(1)
         space = learn_shape_space(people, components)
         model = replace(model, shape_mean=space.mean.astype(np.float64), shape_components=space.components,
                         shape_variances=space.variances, shape_total=space.total_variance)
     return model
+
+
+def _fitted(model: SkinningModel, fitter: ShapeFitter | PoseFitter, body: np.ndarray) -> np.ndarray:
+    """(N, 3) rest vertices of a person whose pose is fitted."""
+    return unposed_person(model, fitter.fit(body).pose, body)
 
 
 def unposed_person(model: SkinningModel, pose: np.ndarray, body: np.ndarray) -> np.ndarray:

@@ -131,7 +131,8 @@ def do_there(shared: bytes, packed: bytes) -> tuple[Any, dict[str, bytes]]:
     with tempfile.TemporaryDirectory() as temporary:
         here = Path(temporary)
         paths = {} if sent is None else _unpacked(sent, here / "sent")
-        outcome = attempt(work, Job(name, _with_paths(given, lambda path: paths.get(path, path)), here / "made", place))
+        job = Job(name, _with_paths(given, lambda path: paths.get(path, path)), here / "made", place, here / "steps")
+        outcome = attempt(work, job)
         if isinstance(outcome, Failure):
             reason = outcome.reason
             for theirs, mine in paths.items():

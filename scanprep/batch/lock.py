@@ -10,9 +10,10 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import IO
 
+LOOK = 0.2                     # seconds between two looks whether the other run has ended
 
 @contextlib.contextmanager
-def locked(path: Path, output: Path) -> Iterator[None]:
+def locked(path: Path, output: Path, wait: bool = False) -> Iterator[None]:
     """Keep other runs out of an output until the block ends.
 
     The operating system holds the lock, so that a run that was killed leaves none behind.
@@ -23,6 +24,8 @@ def locked(path: Path, output: Path) -> Iterator[None]:
         Of the file that is locked, in a folder that exists.
     output : Path
         For the message.
+    wait : bool
+        Wait for the other run instead.
 
     Raises
     ------
@@ -32,6 +35,9 @@ def locked(path: Path, output: Path) -> Iterator[None]:
     while True:
         with open(path, "a+", encoding="utf-8") as file:
             if not _take(file):
+                if wait:
+                    time.sleep(LOOK)
+                    continue
                 file.seek(0)
                 raise ValueError(f"{output}: another run is at work on this output ({file.read().strip()}); "
                                  "wait for it, or name another output")

@@ -11,6 +11,7 @@ from collections.abc import Callable, Generator, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, TypeVar
+from urllib.parse import quote
 
 from ..geometry import storage
 from ..threads import begin_worker, one_thread
@@ -18,7 +19,6 @@ from .digests import Digests, paths_of
 from .values import load_header, load_value, save_value
 
 Progress = Callable[[int, int], None]
-Step = Callable[[str, Any, Callable[[], Any]], Any]         # as `Room.step`
 T = TypeVar("T")
 WATCH = 0.2                    # seconds between two looks whether the process that wants the work is still there
 
@@ -97,7 +97,7 @@ class Room:
         """What `make` returns, or returned when it was last called with the same inputs."""
         if self._steps is None:
             return make()
-        path, key = self._steps / f"{name}.npz", self._digests.of(inputs)
+        path, key = self._step_file(name), self._digests.of(inputs)
         if (not self._force or name in self._made) and (load_header(path) or {}).get("digest") == key:
             with contextlib.suppress(storage.StorageError):
                 return load_value(path)
@@ -109,7 +109,7 @@ class Room:
         """As `step`; `make` gets a folder, and what it writes there comes into `self.folder`."""
         if self._steps is None:
             return make(self.folder)
-        kept = self._steps / f"{name}.files"
+        kept = self._step_file(name).with_suffix(".files")
 
         def made() -> tuple[T, dict[str, str]]:
             shutil.rmtree(kept, ignore_errors=True)
@@ -118,26 +118,20 @@ class Room:
 
         value, files = self.step(name, inputs, made)
         if self._held(kept) != files:                    # other ones than those of the step
-            (self._steps / f"{name}.npz").unlink()
+            self._step_file(name).unlink()
             value, files = self.step(name, inputs, made)
         for file in files:
             (self.folder / file).parent.mkdir(parents=True, exist_ok=True)
             _link(kept / file, self.folder / file)
         return value
 
+    def _step_file(self, name: str) -> Path:
+        assert self._steps is not None, "steps are kept"
+        return self._steps / f"{quote(name, safe=' ')}.npz"
+
     def _held(self, folder: Path) -> dict[str, str]:
         return {path.relative_to(folder).as_posix(): self._digests.of_file(path)
                 for path in sorted(folder.rglob("*")) if path.is_file()}
-
-
-def once(name: str, inputs: Any, make: Callable[[], T]) -> T:
-    """As `Room.step` where nothing is kept."""
-    return make()
-
-
-def under(step: Step, prefix: str) -> Step:
-    """A step whose names begin with a prefix."""
-    return lambda name, inputs, make: step(f"{prefix}{name}", inputs, make)
 
 
 def _link(path: Path, place: Path) -> None:

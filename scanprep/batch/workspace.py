@@ -138,7 +138,7 @@ class Workspace:
                 else:
                     try:
                         self._publish(job.name, job.folder, keys[job.name], outcome, common)
-                        values[job.name] = outcome
+                        values[job.name] = self.value(job.name)
                     except ForeignFileError as error:
                         failures[job.name] = str(error)
                 shutil.rmtree(job.folder, ignore_errors=True)
@@ -166,7 +166,7 @@ class Workspace:
             return kept
         with self.staging(name, key) as staged:
             staged.value = make(staged.folder)
-        return staged.value
+        return self.value(name)
 
     @contextlib.contextmanager
     def staging(self, name: str, key: str = "") -> Iterator[Staged]:
@@ -188,11 +188,15 @@ class Workspace:
         """Remove what is kept of a result, but none of its files."""
         self._record(name).unlink(missing_ok=True)
 
-    def drop_others(self, start: str, names: Collection[str]) -> None:
+    def kept(self, start: str) -> list[str]:
+        """The results that are kept and whose names begin so."""
+        return [unquote(path.stem) for path in sorted((self.home / "done").glob(f"{_plain(start)}*.npz"))]
+
+    def drop_others(self, start: str, names: Collection[str] = ()) -> None:
         """Remove the results whose names begin so, but for those named."""
-        for path in sorted((self.home / "done").glob(f"{_plain(start)}*.npz")):
-            if unquote(path.stem) not in names:
-                self.drop(unquote(path.stem))
+        for name in self.kept(start):
+            if name not in names:
+                self.drop(name)
 
     def names(self, work: Any) -> list[str]:
         """The results that are kept of some work, with all their files."""
@@ -209,7 +213,7 @@ class Workspace:
         return self._own.has(file)
 
     def value(self, name: str) -> Any:
-        """A result that is kept."""
+        """A result as it is kept: how arrays lie in memory decides the last digits of sums."""
         return load_value(self._record(name))
 
     def _kept(self, name: str, key: str) -> Any:
@@ -256,7 +260,7 @@ class Workspace:
         header = load_header(ready / RECORD)
         assert header is not None, f"{ready}: results get their name when they are whole"
         record = self._record(unquote(ready.name))
-        before = (load_header(record) or {"files": {}})["files"]
+        before = self._before(unquote(ready.name))
         for file in header["files"]:
             if (ready / file).exists():                     # else it was brought before the run was killed
                 (self.folder / file).parent.mkdir(parents=True, exist_ok=True)
@@ -280,6 +284,15 @@ class Workspace:
                 break
             place.rmdir()
 
+    def _before(self, name: str) -> dict[str, str]:
+        """File -> digest of what a result wrote when it was last made."""
+        record = load_header(self._record(name))
+        if record is not None or name != "output" or self.output is None:
+            return dict((record or {"files": {}})["files"])
+        report = report_path(self.output)                   # an output that is a file keeps no record of it
+        place = report.parent.relative_to(self.folder)
+        return {(place / file).as_posix(): digest for file, digest in written_of(report).items()}
+
     def _recover(self) -> None:
         """What a killed run left: results that were whole come to their place, the others go."""
         for ready in sorted((self.home / "ready").glob("*")):
@@ -288,7 +301,7 @@ class Workspace:
             else:                                       # its record, the last to go, had come to its place
                 shutil.rmtree(ready)
         shutil.rmtree(self.home / "making", ignore_errors=True)
-        for half in (self.home / "steps").glob("*/.*"):
+        for half in (self.home / "steps").glob("*/.*.part*"):
             half.unlink()
 
 

@@ -172,17 +172,32 @@ class EmbeddedScan:
     subject : "subject" for the one in many poses, else "person00", ...
     pose : name of the pose
     sex : "male" or "female"
-    path, landmarks, views, truth : where its files are
+    folder : Path
+        Where its files are.
     """
 
     name: str
     subject: str
     pose: str
     sex: str
-    path: Path
-    landmarks: Path
-    views: Path
-    truth: Path
+    folder: Path
+
+    @property
+    def path(self) -> Path:
+        """The mesh of all views."""
+        return self.folder / f"{self.name}.ply"
+
+    @property
+    def landmarks(self) -> Path:
+        return self.folder / f"{self.name}.landmarks.json"
+
+    @property
+    def views(self) -> Path:
+        return self.folder / VIEWS / f"{self.name}.npz"
+
+    @property
+    def truth(self) -> Path:
+        return self.folder / TRUTH / f"{self.name}.npz"
 
 
 SUBJECT = BodyShape(sex=1.0, stature=1.78, weight=-0.3, muscle=0.9, shoulder_width=0.4)
@@ -210,14 +225,18 @@ def embedded_dataset(folder: str | Path, seed: int = 0, subject_poses: int = 20,
         Standard deviation of every coordinate of a landmark.
     progress : called with (done, total)
     """
-    folder = Path(folder)
-    plan = [(k, True) for k in range(subject_poses)] + [(k, False) for k in range(subjects)]
+    plan = embedded_plan(subject_poses, subjects)
     out = []
-    for done, (k, is_pose) in enumerate(plan):
-        out.append(_embedded_scan(folder, seed, k, is_pose, config or ScannerConfig(), click_error))
+    for done, which in enumerate(plan):
+        out.append(embedded_scan(Path(folder), seed, *which, config or ScannerConfig(), click_error))
         if progress is not None:
             progress(done + 1, len(plan))
     return out
+
+
+def embedded_plan(subject_poses: int, subjects: int) -> list[tuple[int, bool]]:
+    """The scans of a data set: the number of each, and whether it is of the one subject."""
+    return [(k, True) for k in range(subject_poses)] + [(k, False) for k in range(subjects)]
 
 
 @lru_cache(maxsize=1)
@@ -225,8 +244,9 @@ def _person(shape: BodyShape) -> Person:
     return Person(shape)
 
 
-def _embedded_scan(folder: Path, seed: int, k: int, is_pose: bool, config: ScannerConfig, click_error: float
-                   ) -> EmbeddedScan:
+def embedded_scan(folder: Path, seed: int, k: int, is_pose: bool, config: ScannerConfig, click_error: float = 0.003
+                  ) -> EmbeddedScan:
+    """One scan of `embedded_plan`, made unless its files are there."""
     rng = np.random.default_rng([seed, int(is_pose), k])
     if is_pose:
         label, pose = subject_pose(k, rng)
@@ -235,9 +255,7 @@ def _embedded_scan(folder: Path, seed: int, k: int, is_pose: bool, config: Scann
         shape = BodyShape.random(rng, sex=-1.0 if k % 2 == 0 else 1.0)
         pose, label, subject = near_rest(rng), "rest", f"person{k:02d}"
         name = f"person_{k:02d}_{'female' if k % 2 == 0 else 'male'}"
-    entry = EmbeddedScan(name, subject, label, "male" if shape.sex > 0 else "female", folder / f"{name}.ply",
-                         folder / f"{name}.landmarks.json", folder / VIEWS / f"{name}.npz",
-                         folder / TRUTH / f"{name}.npz")
+    entry = EmbeddedScan(name, subject, label, "male" if shape.sex > 0 else "female", folder)
     if not entry.path.exists():
         truth = stand(_person(shape), pose)
         scanned = scan(truth.mesh, config, rng)

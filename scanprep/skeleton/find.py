@@ -5,6 +5,7 @@ from collections.abc import Callable
 
 import numpy as np
 
+from ..batch.steps import Step, once
 from ..geometry.mesh import Mesh
 from ..threads import one_thread
 from .parts import SkeletonConfig
@@ -16,7 +17,7 @@ __all__ = ["SkeletonConfig", "find_skeleton"]
 
 @one_thread()
 def find_skeleton(template: Mesh, poses: np.ndarray, config: SkeletonConfig | None = None,
-                  progress: Callable[[int, int], None] | None = None) -> Skeleton:
+                  progress: Callable[[int, int], None] | None = None, step: Step = once) -> Skeleton:
     """Rigid parts, the tree over them, and the joints, from registered poses of one body.
 
     Parts that never move against each other in the poses cannot be told apart. Of a symmetric body left and right
@@ -29,6 +30,8 @@ def find_skeleton(template: Mesh, poses: np.ndarray, config: SkeletonConfig | No
         The template's vertices in at least three poses.
     config : SkeletonConfig, optional
     progress : callable(done, total), optional
+    step : callable, optional
+        Keeps what was found on the way, as `scanprep.batch.steps.Step`.
 
     Returns
     -------
@@ -43,4 +46,4 @@ def find_skeleton(template: Mesh, poses: np.ndarray, config: SkeletonConfig | No
 
     [SCAPE] §3
     """
-    return search_skeleton(template, poses, config, progress).skeleton
+    return search_skeleton(template, poses, config, progress, step).skeleton

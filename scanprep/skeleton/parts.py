@@ -89,6 +89,10 @@ class PartSearch:
         self.floor = config.tolerance**2 * surface.area
         self.width = config.smoothness * BORDER_WIDTH / np.sqrt(surface.area)
         self.patch = cover(surface, min(config.patches, len(surface.face_weights)), self.sides, rng)
+        self.forget()
+
+    def forget(self) -> None:
+        """Forget what was worked out on the way, whose last digits depend on the way."""
         self._cuts: dict[bytes, tuple[np.ndarray, float]] = {}
         self._gains: dict[bytes, float] = {}
 

@@ -3,9 +3,11 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
+from ..batch.steps import Step, once
 from ..geometry.mesh import Mesh, check_template
 from ..threads import one_thread
 from .bands import dissolve_bands, passages
@@ -27,6 +29,7 @@ from .symmetry import Symmetry, find_symmetry
 from .tree import Skeleton, reorder
 
 LEAST_GAIN = 0.005               # of the score: less is no improvement
+Tree = tuple[np.ndarray, np.ndarray, list[Loop]]
 LOOSE = 0.85                     # of the energy: where sides let go find so much less, the body is not symmetric
 
 
@@ -107,7 +110,7 @@ class SkeletonSearch:
 
 @one_thread()
 def search_skeleton(template: Mesh, poses: np.ndarray, config: SkeletonConfig | None = None,
-                    progress: Callable[[int, int], None] | None = None) -> SkeletonSearch:
+                    progress: Callable[[int, int], None] | None = None, step: Step = once) -> SkeletonSearch:
     """The skeleton of `find_skeleton`, with the loops, the symmetry and the restarts it came from.
 
     Parameters
@@ -117,6 +120,8 @@ def search_skeleton(template: Mesh, poses: np.ndarray, config: SkeletonConfig | 
         The template's vertices in at least three poses.
     config : SkeletonConfig, optional
     progress : callable(done, total), optional
+    step : callable, optional
+        Keeps every restart, as `scanprep.batch.steps.Step`.
 
     Raises
     ------
@@ -135,9 +140,11 @@ def search_skeleton(template: Mesh, poses: np.ndarray, config: SkeletonConfig | 
     wanted = symmetry.holds if config.symmetric is None else config.symmetric
     if wanted and (symmetry.left.all() or not symmetry.left.any()):
         raise ValueError("symmetric: this template has no two sides")
-    runs = _best_of(surface, config, symmetry if wanted else None, ticks)
+    # a restart knows nothing of the count of parts or of the other restarts
+    kept = partial(step, inputs=(template, poses, replace(config, parts=None, restarts=1)))
+    runs = _best_of(surface, config, symmetry if wanted else None, ticks, kept)
     if wanted and config.symmetric is None and _held_back(runs[0]):
-        runs, wanted = _best_of(surface, config, None, ticks), False
+        runs, wanted = _best_of(surface, config, None, ticks, kept), False
     best = runs[0]
     label, links = best.label, best.links
     if config.parts is not None:
@@ -183,19 +190,26 @@ def _checked_poses(template: Mesh, poses: np.ndarray) -> np.ndarray:
     return poses
 
 
-def _best_of(surface: PosedSurface, config: SkeletonConfig, symmetry: Symmetry | None, ticks: _Ticks
-             ) -> list[Restart]:
+def _best_of(surface: PosedSurface, config: SkeletonConfig, symmetry: Symmetry | None, ticks: _Ticks,
+             kept: Callable[..., Tree]) -> list[Restart]:
     """All restarts, the best first."""
     rng = np.random.default_rng(config.seed)
     runs = []
-    for _ in range(config.restarts):
+    for number in range(config.restarts):
         search = PartSearch(surface, config, symmetry, rng)
-        label, links, loops = to_tree(search, dissolve_bands(search, find_parts(search)))
-        label, links = _settled(search, *_improved(search, label, links))
+        label, links, loops = kept(f"{'free' if symmetry is None else 'symmetric'} restart {number}",
+                                   make=partial(_searched, search))
+        search.forget()
         runs.append(Restart(label, links, tuple(loops), search.energy(label) / surface.area, _score(search, label),
                             search))
         ticks.tick()
     return sorted(runs, key=lambda run: run.score)
+
+
+def _searched(search: PartSearch) -> Tree:
+    """Labels and links of a tree, and the loops that were opened for it."""
+    label, links, loops = to_tree(search, dissolve_bands(search, find_parts(search)))
+    return *_settled(search, *_improved(search, label, links)), loops
 
 
 def _score(search: PartSearch, label: np.ndarray) -> float:

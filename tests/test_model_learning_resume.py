@@ -1,0 +1,263 @@
+"""`scape learn` killed, started again, and with inputs that change: nothing lost, nothing stale, nothing done twice."""
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from model_bodies import random_poses, worm_model
+
+from model import load_model
+from model.learning import cli, mix_rounds, parts, pose, scape, skin, skin_people
+from model.learning.cli import learn
+from scanprep import read_mesh, write_mesh
+from scanprep.batch.workspace import beside
+from scanprep.console import run
+from scanprep.skeleton import search
+
+STAGES = {"skeleton": (cli, "find_skeleton"), "poses": (scape, "learn_pose"), "people": (scape, "shape_gradients"),
+          "components": (scape, "learn_shape_space"), "pictures": (cli, "_draw")}
+QUICK = ["--refinements", "1", "--steps", "1", "--components", "4", "--prunings", "0.01",
+         "--ridges", "1e-3"]
+ALL = {"skeleton": 1, "poses": 1, "people": 6, "components": 1, "pictures": 1}
+
+KILLED = """
+import os, sys
+import {package} as module
+from model.learning.cli import learn
+from scanprep.console import run
+
+real, calls = module.{name}, []
+
+def dying(*given, **named):
+    calls.append(1)
+    if len(calls) > {after}:
+        os.kill(os.getpid(), 9)
+    return real(*given, **named)
+
+module.{name} = dying
+run(learn, "scape learn", sys.argv[1:])
+"""
+
+
+@pytest.fixture
+def bodies(tmp_path):
+    """Plain folders of one worm in eight poses and of six others."""
+    truth, rng = worm_model(), np.random.default_rng(0)
+    poses = random_poses(truth, 8, rng, 0.4)
+    poses[0] = 0
+    for i, body in enumerate(truth.subject().vertices(poses)):
+        write_mesh(tmp_path / "poses" / f"pose{i}.ply", truth.template.with_vertices(body))
+    for i in range(6):
+        body = truth.vertices(random_poses(truth, 1, rng, 0.1)[0], rng.normal(size=3))
+        write_mesh(tmp_path / "people" / f"person{i}.ply", truth.template.with_vertices(body))
+    truth.skeleton.save(tmp_path / "skeleton.json")
+    return tmp_path
+
+
+@pytest.fixture
+def counted(monkeypatch):
+    """Calls of the stages."""
+    calls = dict.fromkeys(STAGES, 0)
+
+    def count(stage, real):
+        def counting(*given, **named):
+            calls[stage] += 1
+            return real(*given, **named)
+        return counting
+
+    for stage, (module, name) in STAGES.items():
+        monkeypatch.setattr(module, name, count(stage, getattr(module, name)))
+    return calls
+
+
+@pytest.fixture
+def searched(monkeypatch):
+    """A search for a skeleton that takes no time, for words with --parts."""
+    monkeypatch.setattr(cli, "find_skeleton", lambda *given: worm_model().skeleton)
+
+
+def words(bodies, output, *more):
+    known = [] if "--parts" in more else ["--skeleton", str(bodies / "skeleton.json")]
+    return ["--poses", str(bodies / "poses"), "--shapes", str(bodies / "people"), "-o", str(bodies / output), *QUICK,
+            *known, *map(str, more)]
+
+
+def learned(bodies, output, *more):
+    """The bytes of the model."""
+    assert run(learn, "scape learn", words(bodies, output, *more)) == 0
+    return (bodies / output).read_bytes()
+
+
+def killed(module, name, after, argv):
+    script = KILLED.format(package=module.__name__, name=name, after=after)
+    ended = subprocess.run([sys.executable, "-c", script, *argv], capture_output=True, check=False,
+                           cwd=Path(__file__).parents[1])
+    assert ended.returncode == -9, ended.stderr.decode()
+
+
+def moved(path):
+    mesh = read_mesh(path)
+    write_mesh(path, mesh.with_vertices(mesh.vertices * [1, 1, 1.01]))
+
+
+def anew(counted, since):
+    """What was done since the calls were copied."""
+    return {stage: calls - since[stage] for stage, calls in counted.items() if calls > since[stage]}
+
+
+def test_killed_and_started_again_it_goes_on_and_ends_with_the_same_bytes(bodies, counted):
+    undisturbed = learned(bodies, "a.npz")
+    assert counted == {**ALL, "skeleton": 0}
+    since = dict(counted)
+    killed(scape, "shape_gradients", 4, words(bodies, "b.npz"))
+    assert not (bodies / "b.npz").exists()
+    assert learned(bodies, "b.npz") == undisturbed
+    assert anew(counted, since) == {"people": 2, "components": 1, "pictures": 1}
+    assert sorted(p.name for p in bodies.glob(".b.npz.scapekit/done/*")) == [
+        "pose space.npz", "shape components.npz"]            # what later ones are made of has gone
+    assert not list(bodies.glob(".b.npz.scapekit/making/*")) and not list(bodies.glob(".*.part*"))
+
+
+def test_killed_twice_in_the_poses(bodies, monkeypatch):
+    undisturbed = learned(bodies, "a.npz", "--refinements", 3)
+    killed(pose, "_refined", 1, words(bodies, "b.npz", "--refinements", 3))       # after the first refinement
+    killed(pose, "_refined", 1, words(bodies, "b.npz", "--refinements", 3))       # after the second
+    real, calls = pose._refined, []
+    monkeypatch.setattr(pose, "_refined", lambda *given, **named: calls.append(1) or real(*given, **named))
+    monkeypatch.setattr(pose, "_first", None)
+    assert learned(bodies, "b.npz", "--refinements", 3) == undisturbed
+    assert len(calls) == 1
+
+
+@pytest.mark.parametrize("kind, module, name, after", [
+    ("skinning", skin, "_with_joints", 2), ("skinning", skin_people, "unposed_person", 3),
+    ("blendscape", scape, "shape_gradients", 2)])
+def test_every_kind_goes_on(bodies, kind, module, name, after):
+    given = ["--kind", kind, "--skin.rounds", 2, "--skin.people-rounds", 2]
+    undisturbed = learned(bodies, "a.npz", *given)
+    killed(module, name, after, words(bodies, "b.npz", *given))
+    assert learned(bodies, "b.npz", *given) == undisturbed
+
+
+def test_the_search_for_a_skeleton_goes_on(tmp_path, monkeypatch):
+    truth = worm_model()
+    bodies = truth.subject().vertices(random_poses(truth, 5, np.random.default_rng(0), 0.4))
+    for i, body in enumerate(bodies):
+        write_mesh(tmp_path / "poses" / f"pose{i}.ply", truth.template.with_vertices(body))
+
+    def given(name):
+        return ["--poses", str(tmp_path / "poses"), "-o", str(tmp_path / name), *QUICK]
+
+    assert run(learn, "scape learn", given("a.npz")) == 0
+    killed(search, "_searched", 1, given("b.npz"))                                # after the first restart
+    killed(parts, "_left_out_error", 0, given("b.npz"))                           # after the last
+    killed(parts, "find_skeleton", 1, given("b.npz"))                             # before more parts are tried
+    tried, real = [], parts.find_skeleton
+    monkeypatch.setattr(parts, "find_skeleton", lambda *given, **named: tried.append(given[2]) or real(*given, **named))
+    assert run(learn, "scape learn", given("b.npz")) == 0
+    assert (tmp_path / "a.npz").read_bytes() == (tmp_path / "b.npz").read_bytes()
+    assert tried and all(settings.parts is not None for settings in tried)
+
+
+@pytest.mark.parametrize("more, done", [
+    ([], {"pictures": 1}),
+    (["--no-pictures"], {}),
+    (["--landmarks"], {"pictures": 1}),
+    (["--components", 2], {"people": 6, "components": 1, "pictures": 1}),
+    (["--steps", 2], {"poses": 1, "people": 6, "components": 1, "pictures": 1}),
+    (["--parts", 4], {"skeleton": 1, "pictures": 1}),           # the same skeleton was found: nothing follows from it
+    (["--force"], ALL)])
+def test_a_setting_that_changes(bodies, searched, counted, more, done):
+    learned(bodies, "m.npz", "--parts", 3)
+    since = dict(counted)
+    if "--landmarks" in more:
+        (bodies / "marks.json").write_text('{"nose": 3}')
+        more = ["--landmarks", bodies / "marks.json"]
+    more = more if "--parts" in more else ["--parts", 3, *more]
+    found = learned(bodies, "m.npz", *more)
+    assert anew(counted, since) == done
+    assert found == learned(bodies, "fresh.npz", *more)
+
+
+@pytest.mark.parametrize("file, done", [
+    ("poses/pose3.ply", ALL), ("people/person3.ply", {"people": 6, "components": 1, "pictures": 1})])
+def test_a_mesh_that_changes(bodies, searched, counted, file, done):
+    learned(bodies, "m.npz", "--parts", 3)
+    since = dict(counted)
+    moved(bodies / file)
+    found = learned(bodies, "m.npz", "--parts", 3)
+    assert anew(counted, since) == done
+    assert found == learned(bodies, "fresh.npz", "--parts", 3)
+
+
+def test_a_person_that_changes_while_learning_is_interrupted(bodies, counted):
+    killed(scape, "learn_shape_space", 0, words(bodies, "m.npz"))
+    moved(bodies / "people/person3.ply")
+    shutil.copy(bodies / "people/person0.ply", bodies / "people/another.ply")      # the same person comes twice now
+    found = learned(bodies, "m.npz")
+    assert counted["people"] == 1 and counted["poses"] == 0
+    assert found == learned(bodies, "fresh.npz")
+
+
+def test_times_tell_what_was_done_before(bodies, searched, capsys):
+    learned(bodies, "m.npz", "--parts", 3)
+    assert "done before" not in capsys.readouterr().out
+    learned(bodies, "m.npz", "--parts", 3)
+    assert capsys.readouterr().out.count("done before") == 3
+
+
+@pytest.mark.parametrize("step", ["skeleton", "pose space", "shape components"])
+def test_a_damaged_step_is_made_anew(bodies, searched, counted, step):
+    undisturbed, since = learned(bodies, "m.npz", "--parts", 3), dict(counted)
+    path = bodies / ".m.npz.scapekit/done" / f"{step}.npz"
+    data = bytearray(path.read_bytes())
+    data[len(data) // 2] ^= 255
+    path.write_bytes(data)
+    assert learned(bodies, "m.npz", "--parts", 3) == undisturbed
+    assert set(anew(counted, since)) >= {{"skeleton": "skeleton", "pose space": "poses"}.get(step, "components")}
+
+
+def test_what_is_not_ours_stays(bodies, capsys):
+    for name in ("m.npz", "m.parts.png"):
+        (bodies / name).write_text("mine")
+        assert run(learn, "scape learn", words(bodies, "m.npz")) == 1
+        assert name in capsys.readouterr().err and (bodies / name).read_text() == "mine"
+        assert not (bodies / "m.report.json").exists()
+        (bodies / name).unlink()
+    learned(bodies, "m.npz")
+
+
+def test_pictures_of_another_run_go_and_come(bodies):
+    learned(bodies, "m.npz")
+    learned(bodies, "m.npz", "--no-pictures")
+    assert not list(bodies.glob("*.png"))
+    learned(bodies, "m.npz", "--components", 2)
+    assert {p.name for p in bodies.glob("*.png")} == {"m.parts.png", "m.components.png"}
+
+
+def test_a_second_run_on_one_output_leaves(bodies, capsys):
+    with beside(bodies / "m.npz"):
+        assert run(learn, "scape learn", words(bodies, "m.npz")) == 1
+    assert "another run" in capsys.readouterr().err
+    learned(bodies, "m.npz")
+
+
+def test_a_mix_goes_on(tmp_path):
+    from scanprep import RegisteredSet
+    truth, rng = worm_model(), np.random.default_rng(0)
+    whole = RegisteredSet.create(tmp_path / "set", truth.template)
+    for person in range(3):
+        subject = truth.subject(rng.normal(size=3))
+        for i, body in enumerate(subject.vertices(random_poses(truth, 4, rng, 0.3))):
+            whole = whole.add(f"p{person}_{i}", body, subject=f"p{person}")
+    whole.with_skeleton(truth.skeleton)
+    given = ["--poses", str(tmp_path / "set"), "--mixed", "--mix.rounds", "2", "--components", "2"]
+    assert run(learn, "scape learn", [*given, "-o", str(tmp_path / "a.npz")]) == 0
+    argv = [*given, "-o", str(tmp_path / "b.npz")]
+    killed(mix_rounds, "people_shapes", 1, argv)
+    killed(mix_rounds, "people_shapes", 1, argv)
+    assert run(learn, "scape learn", argv) == 0
+    assert (tmp_path / "b.npz").read_bytes() == (tmp_path / "a.npz").read_bytes()
+    assert load_model(tmp_path / "b.npz").info["people"] == 3
