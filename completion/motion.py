@@ -9,6 +9,7 @@ import numpy as np
 
 from model.linear import Subject
 from scanprep.geometry import storage
+from scanprep.ranges import BETAS, TINY, TURNS, Range
 
 SURFACE_MODEL = "scape"
 
@@ -119,6 +120,9 @@ class Motion:
             poses = stored["poses"].astype(np.float64).reshape(len(stored["poses"]), -1, 3)
             labels = tuple(str(label) for label in stored.get("marker_labels", ()))
             betas = stored.get("betas", np.zeros(0)).astype(np.float64)
+            BETAS.check(betas, "betas")
+            TURNS.check(poses, "poses")
+            Range(TINY).check(float(rate), "mocap_frame_rate")
             return Motion(poses, stored["trans"].astype(np.float64), betas if betas.size else None, float(rate),
                           stored.get("marker_residuals", np.zeros((len(poses), 0))), labels,
                           str(stored.get("gender", "neutral")), stored.get("converged", np.zeros(0, dtype=bool)),

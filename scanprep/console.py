@@ -21,6 +21,8 @@ from typing import Any
 
 import numpy as np
 
+from . import ranges
+
 Progress = Callable[[int, int], None]
 
 TRACEBACK = "SCAPEKIT_TRACEBACK"       # environment variable that shows where an error came from
@@ -158,10 +160,12 @@ def run(function: Callable[..., Outcome], prog: str, argv: list[str]) -> int:
     """
     import tyro
 
-    start = time.perf_counter()
+    start, wrong = time.perf_counter(), 2
     with _notes(prog):
         try:
-            outcome = tyro.cli(function, args=argv, prog=prog)
+            work = ranges.read(function, lambda read: tyro.cli(read, args=argv, prog=prog))
+            wrong = 1
+            outcome = work()
             report = write_report(outcome, f"{prog} {' '.join(argv)}", time.perf_counter() - start)
         except KeyboardInterrupt:
             say(f"{prog}: interrupted; the same command goes on where it stopped")
@@ -170,7 +174,7 @@ def run(function: Callable[..., Outcome], prog: str, argv: list[str]) -> int:
             if os.environ.get(TRACEBACK):
                 raise
             say(f"{prog}: {_told(error)}")
-            return 1
+            return wrong
     if outcome.problem:
         say(f"{prog}: THE RESULT MEANS NOTHING: {outcome.problem}")
     show([*outcome.metrics, Metric("time", time.perf_counter() - start, "s")])

@@ -19,6 +19,7 @@ from .dataset import RegisteredSet
 from .geometry import storage
 from .geometry.landmarks import write_landmarks
 from .geometry.mesh import Mesh, check_template
+from .ranges import Count, Settings, Workers
 from .skeleton.find import find_skeleton
 from .skeleton.parts import SkeletonConfig
 
@@ -29,7 +30,7 @@ Progress = Callable[[int, int], None]
 
 
 @dataclass(frozen=True)
-class PrepareConfig:
+class PrepareConfig(Settings):
     """Settings of `prepare`.
 
     Attributes
@@ -49,8 +50,8 @@ class PrepareConfig:
 
     scan: ScanSettings = field(default_factory=ScanSettings)
     skeleton: SkeletonConfig = field(default_factory=SkeletonConfig)
-    min_poses: int = 5
-    workers: int = 0
+    min_poses: Count = 5
+    workers: Workers = 0
     scheduler: str | None = None
     ship: bool = False
 

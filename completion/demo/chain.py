@@ -24,6 +24,7 @@ from scanprep.geometry.files import read_mesh, write_mesh
 from scanprep.geometry.landmarks import match_landmarks, read_landmark_vertices, read_landmarks, write_landmarks
 from scanprep.geometry.mesh import Mesh
 from scanprep.pipeline import TABLE, PrepareConfig, Prepared, find_scans, prepare
+from scanprep.ranges import Cell, Count, Faces, Positive, Seed, Settings
 from scanprep.scanning.embedded import (
     SUBJECT,
     EmbeddedScan,
@@ -50,7 +51,7 @@ Bar = Callable[[str], AbstractContextManager[Callable[[int, int], None]]]
 
 
 @dataclass(frozen=True)
-class DemoConfig:
+class DemoConfig(Settings):
     """How much of everything.
 
     Attributes
@@ -75,19 +76,19 @@ class DemoConfig:
     seed : int
     """
 
-    poses: int = 20
-    subjects: int = 12
-    faces: int = 14000
-    parts: int = 16
-    resolution: float = 0.0068
-    template_resolution: float = 0.004
-    template_views: int = 12
+    poses: Count = 20
+    subjects: Count = 12
+    faces: Faces = 14000
+    parts: Count = 16
+    resolution: Cell = 0.0068
+    template_resolution: Cell = 0.004
+    template_views: Count = 12
     held_out: int = 5
-    landmarks: int = 7
-    frames: int = 132
-    rate: float = 60.0
+    landmarks: Count = 7
+    frames: Count = 132
+    rate: Positive = 60.0
     marker_noise: float = 0.001
-    seed: int = 0
+    seed: Seed = 0
     learn: LearnConfig = field(default_factory=LearnConfig)
 
 

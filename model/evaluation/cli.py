@@ -16,6 +16,7 @@ from scanprep.console import Metric, Outcome, bar
 from scanprep.dataset import RegisteredSet
 from scanprep.geometry import storage
 from scanprep.geometry.files import read_registered, write_mesh
+from scanprep.ranges import Count, Seed
 
 from ..body import BodyModel
 from ..cli import ModelArg, read_subject
@@ -30,8 +31,8 @@ SHOWN = 8                            # random bodies on the page
 
 
 def evaluate(model: ModelArg, output: Output, poses: Path | None = None, shapes: Path | None = None,
-             counts: tuple[int, ...] = (10, 20, 40), train_shapes: Path | None = None, subject: Path | None = None,
-             seed: int = 0, unit: Unit | None = None) -> Outcome:
+             counts: tuple[Count, ...] = (10, 20, 40), train_shapes: Path | None = None, subject: Path | None = None,
+             seed: Seed = 0, unit: Unit | None = None) -> Outcome:
     """Errors of a model on bodies that it was not trained on, with a page of curves and pictures.
 
     Example: scape model evaluate model.npz --poses held_poses --shapes held_people -o evaluation
@@ -83,8 +84,8 @@ def evaluate(model: ModelArg, output: Output, poses: Path | None = None, shapes:
 
 
 def sample(model: ModelArg, output: Output,
-           count: Annotated[int, tyro.conf.arg(aliases=["-n"])] = 9, seed: int = 0,
-           pose_too: bool = False, betas: int | None = None) -> Outcome:
+           count: Annotated[Count, tyro.conf.arg(aliases=["-n"])] = 9, seed: Seed = 0,
+           pose_too: bool = False, betas: Count | None = None) -> Outcome:
     """Write random bodies of a model, a sheet of their pictures, and their betas and poses.
 
     Example: scape model sample model.npz -n 9 -o random

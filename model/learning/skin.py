@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from scanprep.geometry.mesh import Mesh, check_template
+from scanprep.ranges import Count, Positive, Settings
 from scanprep.skeleton.tree import Skeleton
 
 from ..features import Lift, LinearLift, PoseFeatures, QuadraticLift
@@ -26,7 +27,7 @@ QUICK = FitConfig(sample=400, iterations=20, polish=0, tolerance=1e-4)     # of 
 
 
 @dataclass(frozen=True)
-class SkinConfig:
+class SkinConfig(Settings):
     """Settings of `learn_skinning`.
 
     Parameters
@@ -57,14 +58,14 @@ class SkinConfig:
     """
 
     correctives: str = "linear"
-    joints: int = 2
+    joints: Count = 2
     pruning: float = 0.01
-    ridges: tuple[float, ...] = (1e-4, 1e-3, 3e-3, 0.01, 0.03, 0.1, 0.3)
-    width: float = 0.05
+    ridges: tuple[Positive, ...] = (1e-4, 1e-3, 3e-3, 0.01, 0.03, 0.1, 0.3)
+    width: Positive = 0.05
     fading: float = 0.05
     smoothness: float = 0.005
-    parts: int = 4
-    rounds: int = 8
+    parts: Count = 4
+    rounds: Count = 8
     components: int = 40
     people_rounds: int = 3
 

@@ -10,6 +10,7 @@ from scanprep.geometry.landmarks import match_landmarks
 from scanprep.geometry.mesh import Mesh
 from scanprep.matching.nonrigid import Registration, register
 from scanprep.matching.schedule import RegistrationConfig
+from scanprep.ranges import Count, Settings
 
 from ..body import BodyModel
 from .character import CharacterConfig, character_model, character_pose
@@ -18,7 +19,7 @@ Progress = Callable[[int, int], None]
 
 
 @dataclass(frozen=True)
-class CharacterMeshConfig:
+class CharacterMeshConfig(Settings):
     """Settings of `register_character`.
 
     Attributes
@@ -37,13 +38,9 @@ class CharacterMeshConfig:
         Less than one round.
     """
 
-    rounds: int = 2
+    rounds: Count = 2
     register: RegistrationConfig = field(default_factory=RegistrationConfig)
     character: CharacterConfig = field(default_factory=CharacterConfig)
-
-    def __post_init__(self) -> None:
-        if self.rounds < 1:
-            raise ValueError(f"rounds: expected at least 1, got {self.rounds}")
 
 
 @dataclass(frozen=True, eq=False)

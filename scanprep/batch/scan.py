@@ -16,6 +16,7 @@ from ..geometry.mesh import Mesh
 from ..matching.correlated import CorrelatedConfig, find_correspondences
 from ..matching.correspondences import Correspondences
 from ..matching.nonrigid import Registration, RegistrationConfig, register
+from ..ranges import Settings
 from .figures import ScanFigures, stretched_share
 from .tasks import ScanTask, read_scan
 
@@ -25,7 +26,7 @@ Landmarks = tuple[np.ndarray, np.ndarray]
 
 
 @dataclass(frozen=True)
-class ScanSettings:
+class ScanSettings(Settings):
     """How one scan is registered.
 
     Attributes

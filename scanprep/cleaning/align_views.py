@@ -10,6 +10,7 @@ import numpy as np
 from ..geometry import rotations
 from ..geometry.mesh import Mesh
 from ..geometry.surface import OrientedPoints
+from ..ranges import Cosine, Count, Positive, Settings, Share
 from .merge import border_distance, mesh_and_camera
 from .place_features import place_by_features
 from .place_views import fit_of_views, place_by_landmarks
@@ -17,7 +18,7 @@ from .remesh import smooth
 
 
 @dataclass(frozen=True)
-class AlignViewsConfig:
+class AlignViewsConfig(Settings):
     """Settings of `align_views`.
 
     Attributes
@@ -42,15 +43,15 @@ class AlignViewsConfig:
         Share of a view that others may look through before its place is not trusted.
     """
 
-    iterations: int = 60
-    points: int = 4000
-    reach: float = 0.08
-    min_cosine: float = 0.8
+    iterations: Count = 60
+    points: Count = 4000
+    reach: Positive = 0.08
+    min_cosine: Cosine = 0.8
     border: float = 0.02
     smoothing: int = 10
     tolerance: float = 5e-5
-    min_overlap: float = 0.15
-    max_conflict: float = 0.03
+    min_overlap: Share = 0.15
+    max_conflict: Share = 0.03
 
 
 @dataclass(frozen=True, eq=False)

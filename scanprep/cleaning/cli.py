@@ -15,6 +15,7 @@ from ..geometry import storage
 from ..geometry.files import UNITS, PointCloud, list_meshes, read_mesh, write_mesh, write_points
 from ..geometry.landmarks import read_landmark_vertices, read_landmarks
 from ..geometry.mesh import Mesh
+from ..ranges import Faces
 from .align_views import AlignViewsConfig, align_views
 from .components import CleanScanConfig, clean_scan
 from .decimate import DecimateConfig, decimate
@@ -27,7 +28,7 @@ from .template import make_template
 ViewsArg = Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="VIEWS")]
 
 
-def template_of_views(views: ViewsArg, output: Output, cameras: Path | None = None, faces: int = 14000,
+def template_of_views(views: ViewsArg, output: Output, cameras: Path | None = None, faces: Faces = 14000,
                       unit: Unit | None = None) -> Outcome:
     """Merge range views, close the holes, and decimate to a template.
 
@@ -171,7 +172,7 @@ def fill(mesh: MeshArg, output: Output, views: Path | None = None, cameras: Path
         *about_mesh(after)], {"fill": config})
 
 
-def reduce(mesh: MeshArg, output: Output, faces: int, landmarks: Path | None = None, unit: Unit | None = None,
+def reduce(mesh: MeshArg, output: Output, faces: Faces, landmarks: Path | None = None, unit: Unit | None = None,
            config: Annotated[DecimateConfig, tyro.conf.arg(name="")] = DecimateConfig()) -> Outcome:  # noqa: B008
     """Fewer triangles for the same surface.
 
@@ -193,7 +194,7 @@ def reduce(mesh: MeshArg, output: Output, faces: int, landmarks: Path | None = N
     return Outcome(output, [Metric("triangles before", len(before.faces)), *about_mesh(after)], {"decimate": config})
 
 
-def reduce_set(registered: SetArg, output: Output, faces: int,
+def reduce_set(registered: SetArg, output: Output, faces: Faces,
                config: Annotated[DecimateSetConfig, tyro.conf.arg(name="")] = DecimateSetConfig()  # noqa: B008
                ) -> Outcome:
     """A registered set in fewer triangles: template, meshes, skeleton and landmarks stay in step.

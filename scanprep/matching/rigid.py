@@ -8,11 +8,12 @@ from scipy.spatial import cKDTree
 
 from ..geometry import rotations
 from ..geometry.mesh import Mesh
+from ..ranges import Count, Positive, Settings, SomeShare
 from .matches import target_of
 
 
 @dataclass(frozen=True)
-class RigidConfig:
+class RigidConfig(Settings):
     """Settings of `align_rigid`.
 
     Attributes
@@ -21,7 +22,7 @@ class RigidConfig:
         Most rounds of matching.
     keep : float
         Share of the matches, the nearest ones, that count.
-    reach : float, metres
+    reach : float, metres, optional
         Farthest match that counts.
     neighbours : int
         Points whose spread gives the normals of a cloud.
@@ -29,10 +30,10 @@ class RigidConfig:
         Settled when a round moves the points by less than this share of their spread.
     """
 
-    iterations: int = 60
-    keep: float = 0.8
-    reach: float = np.inf
-    neighbours: int = 16
+    iterations: Count = 60
+    keep: SomeShare = 0.8
+    reach: Positive | None = None
+    neighbours: Count = 16
     tolerance: float = 1e-6
 
 
@@ -108,6 +109,7 @@ def align_rigid(source: Mesh | np.ndarray, target: Mesh | np.ndarray,
         Empty input, values that are not finite, fewer than three landmarks.
     """
     config = config or RigidConfig()
+    reach = np.inf if config.reach is None else config.reach
     moving = _points(source.vertices if isinstance(source, Mesh) else source, "source")
     goal = target_of(target, config.neighbours, name="target")
     T = np.eye(4) if start is None else np.array(start, dtype=np.float64)
@@ -119,7 +121,7 @@ def align_rigid(source: Mesh | np.ndarray, target: Mesh | np.ndarray,
     while rounds < config.iterations and not settled:
         moved = apply(T, moving)
         distance, near = tree.query(moved, workers=-1)
-        good = (distance <= config.reach) & (distance <= np.quantile(distance, config.keep)) & ~goal.border[near]
+        good = (distance <= reach) & (distance <= np.quantile(distance, config.keep)) & ~goal.border[near]
         inliers = int(good.sum())
         if inliers < 6:
             break
