@@ -5,12 +5,13 @@ from dataclasses import replace
 from pathlib import Path
 
 from scanprep.console import Outcome, bar, say
+from scanprep.ranges import Seed
 
 from ..cli import Out
 from .chain import QUICK, Demo, DemoConfig
 
 
-def demo(out: Out = Path("scape_demo"), quick: bool = False, seed: int = DemoConfig.seed) -> Outcome:
+def demo(out: Out = Path("scape_demo"), quick: bool = False, seed: Seed = DemoConfig.seed) -> Outcome:
     """The whole chain on embedded people: scans, registration, skeleton, model, completion, animation.
 
     Example: scape demo --quick

@@ -12,6 +12,7 @@ from model.cli import read_subject
 from model.linear import Subject
 from scanprep.cli import MM, Output, Unit
 from scanprep.console import Metric, Outcome, bar, plain, say
+from scanprep.ranges import Count, Positive
 
 from ..cli import ModelOrNone, read_landmark_pairs, read_model, rows
 from ..motion import Motion
@@ -24,10 +25,10 @@ from .tracker import TrackedFrame, Tracker
 FramesArg = Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="FRAMES")]
 
 
-def track_frames(frames: FramesArg, output: Output, model: ModelOrNone = None, rate: float = 30.0,
+def track_frames(frames: FramesArg, output: Output, model: ModelOrNone = None, rate: Positive = 30.0,
                  cameras: str | None = None, landmarks: Path | None = None, subject: str | None = None,
                  template_landmarks: Path | None = None, unit: Unit | None = None, surfaces: bool = False,
-                 keys: int = 120, config: Annotated[TrackConfig, tyro.conf.arg(name="")] = TrackConfig()  # noqa: B008
+                 keys: Count = 120, config: Annotated[TrackConfig, tyro.conf.arg(name="")] = TrackConfig()  # noqa: B008
                  ) -> Outcome:
     """The motion of a person from frames of points, without markers.
 

@@ -14,6 +14,7 @@ from scanprep.dataset import RegisteredSet
 from scanprep.geometry.landmarks import match_landmarks, read_landmarks, write_landmarks
 from scanprep.geometry.mesh import Mesh
 from scanprep.pipeline import find_scans
+from scanprep.ranges import Count, Share, Workers
 
 from ..body import BodyModel
 from ..cli import ModelArg
@@ -31,8 +32,8 @@ ScansArg = Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="SCANS")]
 
 def coregister_scans(model: ModelArg, scans: ScansArg, output: Output, landmarks: Path | None = None,
                      first: Path | None = None, subject: str = OWN, unit: Unit | None = None,
-                     rounds: int = CoregistrationConfig.rounds, workers: int = CoregistrationConfig.workers,
-                     failed: float = CoregistrationConfig.failed) -> Outcome:
+                     rounds: Count = CoregistrationConfig.rounds, workers: Workers = CoregistrationConfig.workers,
+                     failed: Share = CoregistrationConfig.failed) -> Outcome:
     """Register every scan of a folder with a model as prior, learn the model again, and so on until it settles.
 
     Writes a registered set with model.npz in it. Killed and started again it goes on where it was.

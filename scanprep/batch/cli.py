@@ -16,6 +16,7 @@ from ..geometry.files import read_mesh
 from ..geometry.landmarks import read_landmark_vertices
 from ..geometry.mesh import Mesh
 from ..pipeline import PrepareConfig, Prepared, find_scans, prepare
+from ..ranges import Count, Workers
 from .figures import ScanFigures
 from .page import judge_set, write_set_page
 from .review import Limits, Verdict
@@ -28,8 +29,8 @@ LISTED = 5                    # scans that the closing table names
 
 def run_all(scans: ScansArg, template: Path, output: Output, landmarks: Path | None = None,
             template_landmarks: Path | None = None, guide: Guide = "best", clean: bool = False,
-            subject: str = "", unit: Unit | None = None, min_poses: int = PrepareConfig.min_poses,
-            workers: int = PrepareConfig.workers, scheduler: str | None = None, ship: bool = False) -> Outcome:
+            subject: str = "", unit: Unit | None = None, min_poses: Count = PrepareConfig.min_poses,
+            workers: Workers = PrepareConfig.workers, scheduler: str | None = None, ship: bool = False) -> Outcome:
     """Register a template to every scan of a folder, find the skeleton, and write a page of all scans, worst first.
 
     Killed and started again it goes on where it was; scans whose files have changed are registered anew.

@@ -11,6 +11,7 @@ from model.body import BodyModel
 from model.files import load_model
 from scanprep.cli import Output, Unit
 from scanprep.console import Outcome, bar, say
+from scanprep.ranges import Count
 
 from ...cli import ModelOrNone, read_model
 from ..settings import MoshConfig
@@ -25,7 +26,7 @@ TOLD = 20                            # people that are listed before the work be
 def mosh_markers(markers: MarkersArg, output: Output, model: ModelOrNone = None, layout: str | None = None,
                  subjects: Path | None = None, by: By = "auto", name: str | None = None, who: str | None = None,
                  hold_out: tuple[str, ...] = (), female: Path | None = None, male: Path | None = None,
-                 character: Path | None = None, factor: float = 1.0, unit: Unit | None = None, keys: int = 120,
+                 character: Path | None = None, factor: float = 1.0, unit: Unit | None = None, keys: Count = 120,
                  config: Annotated[MoshConfig, tyro.conf.arg(name="")] = MoshConfig()) -> Outcome:    # noqa: B008
     """Body shape, marker places, motion and soft tissue of people from markers alone.
 
