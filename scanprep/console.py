@@ -38,7 +38,9 @@ class Metric:
     unit: str = ""
 
     def text(self) -> str:
-        """The value as printed: three significant digits for a fraction."""
+        """The value as printed: three significant digits for a fraction, "none" where there is no value."""
+        if isinstance(self.value, float) and not math.isfinite(self.value):
+            return "none"
         if isinstance(self.value, float):
             return f"{self.value:.0f}" if abs(self.value) >= 1000 else f"{self.value:.3g}"
         return str(self.value)

@@ -12,17 +12,15 @@ from scanprep.batch import pictures
 from scanprep.batch.figures import (
     Failure,
     ScanFigures,
-    principal_stretches,
     read_failures,
     read_figures,
-    stretched_share,
     write_failures,
     write_figures,
 )
 from scanprep.batch.page import write_set_page
 from scanprep.batch.review import Limits, review
 from scanprep.geometry.files import PointCloud, write_points
-from scanprep.matching.confidence import missed_share
+from scanprep.matching.confidence import missed_share, principal_stretches, stretched_share
 from scanprep.pipeline import find_scans, prepare
 
 GOOD = ScanFigures("good", "10 landmarks", 0.001, 0.0015, 0.85, 0.85, 0.0, 0.004, 0.002, 0, True, 0.0, "abc", 3.25)

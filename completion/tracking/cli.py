@@ -17,7 +17,7 @@ from scanprep.ranges import Count, Positive
 from ..cli import ModelOrNone, read_landmark_pairs, read_model, rows
 from ..motion import Motion
 from .folder import FrameFolder
-from .sequence import as_motion, without_points
+from .sequence import as_motion, tracking_problem, without_points
 from .settings import TrackConfig
 from .store import FrameStore
 from .tracker import TrackedFrame, Tracker
@@ -74,7 +74,8 @@ def track_frames(frames: FramesArg, output: Output, model: ModelOrNone = None, r
         metrics.append(Metric("frames tracked before", before))
     _write(output, motion, person, keys)
     _page(output, motion, person, found, frames.name, metrics)
-    return Outcome(output, metrics, {"track": config, "rate": rate, "model": name}, found.problems)
+    return Outcome(output, metrics, {"track": config, "rate": rate, "model": name}, found.problems,
+                   tracking_problem(motion))
 
 
 def _follow(tracker: Tracker, frames: FrameFolder, store: FrameStore, surfaces: Path | None

@@ -9,6 +9,7 @@ from typing import Protocol
 import numpy as np
 
 from scanprep.geometry.mesh import Mesh
+from scanprep.meaning import extent, unit_problem
 from scanprep.skeleton.find import find_skeleton
 from scanprep.skeleton.tree import Skeleton
 
@@ -20,6 +21,7 @@ from .single import Landmarks, ModelRegistration, register_with_model
 
 Progress = Callable[[int, int], None]
 Scan = Mesh | np.ndarray
+LOST = 0.5                           # mean share of the scans explained below which they mean nothing
 
 
 @dataclass(frozen=True)
@@ -229,3 +231,14 @@ def _summary(registrations: Sequence[ModelRegistration], good: np.ndarray, befor
 def _settled(history: Sequence[Round], model: BodyModel, config: CoregistrationConfig) -> bool:
     size = float(np.sqrt(model.template.face_areas.sum()))
     return bool(history and history[-1].change <= config.tolerance * size)
+
+
+def coregistration_problem(done: Coregistration, scans: Sequence[Scan]) -> str | None:
+    """Why co-registered scans mean nothing, with the likely cause; None where they mean something."""
+    explained = float(np.mean([r.explained for r in done.registrations]))
+    if done.good.any() and explained >= LOST:
+        return None
+    spans = [extent(scan.vertices if isinstance(scan, Mesh) else scan) for scan in scans]
+    cause = unit_problem(float(np.median(spans)), extent(done.model.template.vertices), "the scans are", 0.05)
+    return (f"{int(done.good.sum())} of {len(done.good)} scans fit the model, which explains {100 * explained:.0f}% of "
+            f"them; {cause or 'scans of something else, another model, or landmarks of other places?'}")

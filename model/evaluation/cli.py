@@ -22,7 +22,7 @@ from ..body import BodyModel
 from ..cli import ModelArg, read_subject
 from ..digests import digest, trained_on
 from ..files import load_model
-from .errors import Errors, compactness, pose_errors, shape_errors
+from .errors import Errors, compactness, errors_problem, pose_errors, shape_errors
 from .page import MM, Findings, evaluation_page, generalisation_rows, picture_samples
 from .sampling import sample_bodies, specificity
 
@@ -80,7 +80,17 @@ def evaluate(model: ModelArg, output: Output, poses: Path | None = None, shapes:
                                                            if m.name != "note"], notes, progress)
     page.write(output / "report.html")
     return Outcome(output, metrics, {"model": model, "poses": poses, "shapes": shapes, "counts": counts,
-                                     "train_shapes": train_shapes, "subject": subject, "seed": seed})
+                                     "train_shapes": train_shapes, "subject": subject, "seed": seed},
+                   problem=_problem(loaded, found))
+
+
+def _problem(model: BodyModel, found: Findings) -> str | None:
+    told = []
+    if found.poses is not None and found.pose_bodies is not None:
+        told.append(errors_problem(found.poses.errors, found.pose_bodies, model))
+    if found.shapes is not None and found.shape_bodies is not None:
+        told.append(errors_problem(found.shapes.errors[-1], found.shape_bodies, model))
+    return "; ".join(problem for problem in told if problem) or None
 
 
 def sample(model: ModelArg, output: Output,

@@ -17,6 +17,8 @@ from .character import CharacterConfig, character_model, character_pose
 
 Progress = Callable[[int, int], None]
 
+LOST = 0.5                  # share of the character missed, or of joints outside it, that means nothing
+
 
 @dataclass(frozen=True)
 class CharacterMeshConfig(Settings):
@@ -139,3 +141,13 @@ def inside(mesh: Mesh, points: np.ndarray) -> np.ndarray:
     turns = igl.fast_winding_number(np.ascontiguousarray(mesh.vertices), np.ascontiguousarray(mesh.faces),
                                     np.ascontiguousarray(points))
     return np.asarray(np.abs(turns) > 0.5)
+
+
+def character_problem(found: Character) -> str | None:
+    """Why a character means nothing, with the likely cause; None where it means something."""
+    missed = 0.0 if found.registration is None else found.registration.missed
+    if missed <= LOST and found.inside.mean() >= LOST:
+        return None
+    return (f"{100 * missed:.0f}% of the character lies off the template and {found.inside.sum()} of "
+            f"{len(found.inside)} joints inside it; landmarks of other places, left and right exchanged, or a mesh "
+            "that is no body?")

@@ -13,11 +13,12 @@ import numpy as np
 from ..cleaning.components import CleanScanConfig, clean_scan
 from ..geometry.landmarks import match_landmarks, read_landmarks
 from ..geometry.mesh import Mesh
+from ..matching.confidence import stretched_share
 from ..matching.correlated import CorrelatedConfig, find_correspondences
 from ..matching.correspondences import Correspondences
-from ..matching.nonrigid import Registration, RegistrationConfig, register
+from ..matching.nonrigid import Registration, RegistrationConfig, register, registration_problem
 from ..ranges import Settings
-from .figures import ScanFigures, stretched_share
+from .figures import ScanFigures
 from .tasks import ScanTask, read_scan
 
 Guide = Literal["best", "landmarks", "automatic", "pose"]
@@ -78,7 +79,7 @@ def register_scan(task: ScanTask, template: Mesh, template_landmarks: dict[str, 
     Raises
     ------
     ValueError
-        A file that cannot be read, landmarks that do not match.
+        A file that cannot be read, landmarks that do not match, a registration that means nothing.
     """
     settings = settings or ScanSettings()
     start = time.perf_counter()
@@ -88,6 +89,9 @@ def register_scan(task: ScanTask, template: Mesh, template_landmarks: dict[str, 
         scan, removed = _cleaned(scan, landmarks, settings.clean)
         pairs = _correspondences(template, scan, landmarks, settings)
         fit = register(template, scan, landmarks, settings.registration, correspondences=pairs)
+        problem = registration_problem(template, scan, fit, landmarks is not None)
+        if problem:
+            raise ValueError(f"{task.scan}: the template is not on it: {problem}")
         picture = b""
         if settings.pictures:
             from .pictures import strip

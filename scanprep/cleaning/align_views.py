@@ -125,7 +125,7 @@ def align_views(views: Sequence[Any], config: AlignViewsConfig | None = None,
     pairs = [_moved(pair, T) for pair, T in zip(pairs, start, strict=True)]
     samples = [_oriented(mesh, config, rng) for mesh, _ in pairs]
     poses = np.tile(np.eye(4), (len(pairs), 1, 1))
-    reach, rms, settled, rounds = config.reach, 0.0, len(pairs) == 1, 0
+    reach, rms, settled, rounds = config.reach, np.nan, len(pairs) == 1, 0
     while rounds < config.iterations and not settled:
         placed = [(p @ T[:3, :3].T + T[:3, 3], n @ T[:3, :3].T)
                   for T, (p, n, _) in zip(poses, samples, strict=True)]
@@ -202,3 +202,11 @@ def _solve(placed: list[tuple[np.ndarray, np.ndarray]],
     T[:, :3, :3] = rotations.exp(step[:, :3])
     T[:, :3, 3] = step[:, 3:] + centre - np.einsum("vij,j->vi", T[:, :3, :3], centre)
     return T, np.concatenate(residuals)
+
+
+def views_problem(found: AlignedViews) -> str | None:
+    """Why aligned views mean nothing; None where some are in place."""
+    if found.trusted.any():
+        return None
+    return (f"no view is in its place, they share {100 * float(found.overlap.max()):.0f}% of their surface at most; "
+            "the wrong cameras, another unit (--unit), or a start that is too far off (--landmarks, --features)?")

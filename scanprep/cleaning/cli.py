@@ -16,7 +16,7 @@ from ..geometry.files import UNITS, PointCloud, list_meshes, read_mesh, write_me
 from ..geometry.landmarks import read_landmark_vertices, read_landmarks
 from ..geometry.mesh import Mesh
 from ..ranges import Faces
-from .align_views import AlignViewsConfig, align_views
+from .align_views import AlignViewsConfig, align_views, views_problem
 from .components import CleanScanConfig, clean_scan
 from .decimate import DecimateConfig, decimate
 from .decimate_set import DecimateSetConfig
@@ -109,7 +109,7 @@ def align_cameras(views: ViewsArg, output: Output, cameras: Path | None = None, 
         Metric("largest shift of a camera", MM * max(shifts), "mm"),
         Metric("seen by others too, least of a view", 100 * float(found.overlap.min()), "%"),
         Metric("looked through by others, most of a view", 100 * float(found.conflict.max()), "%")],
-        {"views": config}, [f"{name}: its place is not to be trusted" for name in doubtful])
+        {"views": config}, [f"{name}: its place is not to be trusted" for name in doubtful], views_problem(found))
 
 
 def _view_landmarks(folder: Path, name: str, view: Mesh, unit: Unit | None) -> dict[str, np.ndarray]:

@@ -8,9 +8,12 @@ from scipy.spatial import cKDTree
 
 from ..geometry import rotations
 from ..geometry.mesh import Mesh
+from ..meaning import extent, unit_problem
 from ..ranges import Count, Positive, Settings, SomeShare
 from .matches import target_of
 
+LEAST = 6                   # matches that determine a motion
+ASTRAY = 0.025              # of the smaller extent: surfaces so far apart do not lie on each other
 
 @dataclass(frozen=True)
 class RigidConfig(Settings):
@@ -123,7 +126,7 @@ def align_rigid(source: Mesh | np.ndarray, target: Mesh | np.ndarray,
         distance, near = tree.query(moved, workers=-1)
         good = (distance <= reach) & (distance <= np.quantile(distance, config.keep)) & ~goal.border[near]
         inliers = int(good.sum())
-        if inliers < 6:
+        if inliers < LEAST:
             break
         step, residual = _plane_step(moved[good], goal.points[near[good]], goal.normals[near[good]])
         T = step @ T
@@ -164,3 +167,13 @@ def _points(points: np.ndarray, name: str) -> np.ndarray:
     if not np.isfinite(points).all():
         raise ValueError(f"{name}: {(~np.isfinite(points).all(axis=1)).sum()} points are not finite")
     return points
+
+
+def alignment_problem(source: np.ndarray, target: np.ndarray, found: RigidAlignment) -> str | None:
+    """Why a rigid alignment of points (n, 3) to others means nothing; None where it means something."""
+    ours, theirs = extent(source), extent(target)
+    if found.inliers >= LEAST and found.rms <= ASTRAY * min(ours, theirs):
+        return None
+    off = f"the surfaces are {1000 * found.rms:.0f} mm apart" if found.inliers >= LEAST else "the surfaces do not meet"
+    return f"{off}; " + (unit_problem(ours, theirs, "the source is", 0.05) or
+                         "a start far from the target, which needs landmarks, or something else?")

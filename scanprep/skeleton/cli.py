@@ -15,7 +15,7 @@ from ..geometry.mesh import Mesh
 from ..ranges import Signed
 from .edit import apply_edits, read_edits
 from .parts import SkeletonConfig
-from .search import SkeletonSearch, search_skeleton
+from .search import SkeletonSearch, search_skeleton, skeleton_problem
 from .tree import Skeleton
 
 PosesArg = Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="POSES")]
@@ -42,7 +42,8 @@ def skeleton(poses: PosesArg, output: Output, template: Path | None = None, subj
         search = search_skeleton(body, vertices, config, progress=progress)
     search.skeleton.save(output)
     return Outcome(output, [Metric("poses", len(vertices)), Metric("parts", len(search.skeleton.parents)),
-                            *_facts(search), *_shares(search.skeleton, body)], {"skeleton": config})
+                            *_facts(search), *_shares(search.skeleton, body)], {"skeleton": config},
+                   problem=skeleton_problem(search, config.parts))
 
 
 def _facts(search: SkeletonSearch) -> list[Metric]:

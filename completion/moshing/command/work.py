@@ -18,6 +18,7 @@ from scanprep.pictures.views import upright
 
 from ...animation.report import morph_frames
 from ...animation.retarget import retarget
+from ...animation.trust import motion_problem
 from ...animation.work import choose_layout, key_frames, write_glb
 from ...markers.files import MarkerSequence, read_markers
 from ...markers.layout import MarkerLayout
@@ -92,7 +93,8 @@ def mosh_person(work: Work, actor: Actor, folder: Path, command: str, solving: P
                 ) -> tuple[list[Metric], list[str]]:
     """Everything of one person into a folder: the figures, and what failed.
 
-    A recording that cannot be read is left out and told.
+    A recording that cannot be read is left out and told. The first figure is called "problem" where a motion means
+    nothing, and says why.
 
     Parameters
     ----------
@@ -118,7 +120,11 @@ def mosh_person(work: Work, actor: Actor, folder: Path, command: str, solving: P
         writing(i, total)
         figures[take.name] = _write(work, found, take, folder / take.name, command, settings)
     writing(total - 1, total)
+    problems = [(take.name, _problem(found, take)) for take in found.takes]
     metrics = [Metric("model", work.name), *_person_metrics(found), *_figures(found.takes)]
+    if any(problem for _, problem in problems):
+        told = "; ".join(f"{name}: {problem}" for name, problem in problems if problem)
+        metrics.insert(0, Metric("problem", told))
     person_page(actor.name, found.model, found.result, found.usual, found.takes, metrics, figures,
                 settings).write(folder / "report.html")
     save_png(folder / PICTURE, person_picture(found.model, found.result))
@@ -176,8 +182,14 @@ def _write(work: Work, found: _Found, take: Take, folder: Path, command: str, se
         _character(work.character, take, folder, page, work.keys, work.factor)
     closing(page, metrics, settings).write(folder / "report.html")
     save_png(folder / PICTURE, take_picture(take))
-    write_report(Outcome(folder, metrics, settings), command, time.perf_counter() - start)
+    write_report(Outcome(folder, metrics, settings, problem=_problem(found, take)), command,
+                 time.perf_counter() - start)
     return metrics
+
+
+def _problem(found: _Found, take: Take) -> str | None:
+    """Why the motion of a sequence means nothing."""
+    return motion_problem(take.motion, take.subject.template, found.result.layout, take.markers)
 
 
 def _person_metrics(found: _Found) -> list[Metric]:
