@@ -73,5 +73,5 @@ def correspondences_problem(found: Correspondences) -> str | None:
     sure = float(np.median(found.confidence)) if len(found) else 0.0
     if sure >= SURE:
         return None
-    return (f"{len(found)} pairs were found with a median confidence of {sure:.2f}; a scan of something else, too little "
-            "of the body, or landmarks of other places?")
+    return (f"{len(found)} pairs were found with a median confidence of {sure:.2f}; a scan of something else, too "
+            "little of the body, or landmarks of other places?")
