@@ -69,7 +69,7 @@ NOTHING = {
     "a ball": (REGISTER.format("ball"), ["of the scan lies off the template", "a scan of something else"]),
     "ten points": (REGISTER.format("ten"), ["0% of the template has data", "a scan of something else"]),
     "another unit": (REGISTER.format("large") + " --landmarks large.json", ["--unit", "times as large"]),
-    "a ball to align": ("prep align ball_mesh.ply good.ply -o out.ply", ["a start far from the target", "something else"]),
+    "a ball to align": ("prep align ball_mesh.ply good.ply -o out.ply", ["a start far from the target"]),
     "another unit to align": ("prep align large.ply good.ply -o out.ply", ["--unit", "times as large"]),
 }
 GOOD = {"a scan": REGISTER.format("good"), "with landmarks": REGISTER.format("good") + " --landmarks good.json",
