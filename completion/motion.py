@@ -8,6 +8,7 @@ import numpy as np
 
 from model.linear import Subject
 from scanprep.geometry import storage
+from scanprep.ranges import BETAS, TINY, TURNS, Range
 
 SURFACE_MODEL = "scape"
 
@@ -114,12 +115,13 @@ def _restored(path: str | Path, a: dict[str, np.ndarray]) -> Motion:
     rate = a.get("mocap_frame_rate", a.get("mocap_framerate"))
     if rate is None:
         raise storage.StorageError(f"{path}: expected mocap_frame_rate or mocap_framerate")
-    if not 0 < float(rate) < np.inf:
-        raise ValueError(f"mocap_frame_rate: expected a positive number, found {float(rate)}")
+    Range(TINY).check(float(rate), "mocap_frame_rate")
     T, shape = len(a["poses"]), a["poses"].shape[1:]
     poses = storage.numbers(a, "poses", T, *shape).astype(np.float64).reshape(T, -1, 3)
     labels = tuple(str(label) for label in a.get("marker_labels", ()))
     betas = storage.numbers(a, "betas", None).astype(np.float64) if "betas" in a else np.zeros(0)
+    BETAS.check(betas, "betas")
+    TURNS.check(poses, "poses")
     residuals = (storage.numbers(a, "marker_residuals", T, len(labels), finite=False) if "marker_residuals" in a
                  else np.full((T, len(labels)), np.nan))
     converged = storage.numbers(a, "converged", T, kinds="b") if "converged" in a else np.ones(T)

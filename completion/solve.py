@@ -6,6 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from scanprep.ranges import Count, Settings
+
 from .energy import Residual
 
 Energy = Callable[[np.ndarray], Sequence[Residual]]
@@ -14,7 +16,7 @@ Move = Callable[[np.ndarray, np.ndarray], np.ndarray]
 
 
 @dataclass(frozen=True)
-class MinimiseConfig:
+class MinimiseConfig(Settings):
     """Settings of Levenberg-Marquardt.
 
     Attributes
@@ -27,7 +29,7 @@ class MinimiseConfig:
         Stop when a step lowers the energy by less than this fraction.
     """
 
-    iterations: int = 30
+    iterations: Count = 30
     damping: float = 1e-3
     tolerance: float = 1e-5
 

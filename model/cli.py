@@ -11,6 +11,7 @@ from scanprep.cli import Output, Unit
 from scanprep.console import Metric, Outcome, dispatch
 from scanprep.geometry.files import read_mesh, write_mesh
 from scanprep.geometry.storage import load_arrays, numbers, read_json, taking_apart
+from scanprep.ranges import BETAS, TURNS, Beta
 
 from .body import BodyModel
 from .files import load_model
@@ -53,7 +54,7 @@ def info(model: ModelArg) -> Outcome:
         *about(loaded), Metric("landmarks", len(loaded.info.get("landmarks", {}))), *facts])
 
 
-def mesh(model: ModelArg, output: Output, pose: Path | None = None, betas: tuple[float, ...] = (),
+def mesh(model: ModelArg, output: Output, pose: Path | None = None, betas: tuple[Beta, ...] = (),
          subject: Path | None = None, own_body: bool = False) -> Outcome:
     """Write the mesh of one pose and shape.
 
@@ -72,7 +73,11 @@ def mesh(model: ModelArg, output: Output, pose: Path | None = None, betas: tuple
     for name, turn in (_read_turns(pose) if pose else {}).items():
         if name not in loaded.skeleton.names:
             raise ValueError(f"{pose}: no part '{name}'; the model has {', '.join(loaded.skeleton.names)}")
-        turns[loaded.skeleton.names.index(name)] = turn
+        try:
+            turns[loaded.skeleton.names.index(name)] = turn
+        except (TypeError, ValueError):
+            raise ValueError(f"{pose}: {name}: expected [x, y, z] in radians, got {turn}") from None
+    TURNS.check(turns, f"{pose}: turns")
     if (subject is not None) + bool(betas) + own_body > 1:
         raise ValueError("--betas, --subject and --own-body: expected one of them")
     if subject is not None or own_body:
@@ -133,4 +138,5 @@ def _read_betas(path: Path) -> np.ndarray:
         betas = np.array(np.nan)
     if betas.ndim != 1 or not np.isfinite(betas).all():
         raise ValueError(f"{path}: expected {wanted}, found something else")
+    BETAS.check(betas, f"{path}: betas")
     return betas

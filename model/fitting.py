@@ -8,6 +8,7 @@ from functools import cached_property
 import numpy as np
 from scipy.spatial import cKDTree
 
+from scanprep.ranges import Count, Settings
 from scanprep.threads import one_thread
 
 from .bilinear import ShapedPoints
@@ -19,7 +20,7 @@ from .pullback import pull_back
 
 
 @dataclass(frozen=True)
-class FitConfig:
+class FitConfig(Settings):
     """Settings of `fit_pose` and `fit_shape`.
 
     Parameters
@@ -36,8 +37,8 @@ class FitConfig:
         Use the first of the model's shape components only (`fit_shape`).
     """
 
-    sample: int = 800
-    iterations: int = 60
+    sample: Count = 800
+    iterations: Count = 60
     polish: int = 10
     tolerance: float = 1e-5
     n_betas: int | None = None

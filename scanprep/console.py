@@ -22,6 +22,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
+from . import ranges
 from .threads import one_thread
 
 if TYPE_CHECKING:               # imported where it is used: help answers at once
@@ -44,7 +45,9 @@ class Metric:
     unit: str = ""
 
     def text(self) -> str:
-        """The value as printed: three significant digits for a fraction."""
+        """The value as printed: three significant digits for a fraction, "none" where there is no value."""
+        if isinstance(self.value, float) and not math.isfinite(self.value):
+            return "none"
         if isinstance(self.value, float):
             return f"{self.value:.0f}" if abs(self.value) >= 1000 else f"{self.value:.3g}"
         return str(self.value)
@@ -189,23 +192,25 @@ def run(function: Callable[..., Outcome], prog: str, argv: list[str]) -> int:
     A function with a parameter `space: Workspace` works in its output folder and goes on there where it was
     interrupted. All others write to a folder of their own, from which the output takes its place when it is whole.
     """
-    start = time.perf_counter()
-    call = _Call(function, prog, argv)
+    start, wrong, call = time.perf_counter(), 2, None
     with _notes(prog), one_thread():
         try:
+            call = _Call(function, prog, argv)
+            wrong = 1
             outcome, report = call.carried_out(start)
         except KeyboardInterrupt:
-            say(f"{prog}: interrupted; " + ("the same command goes on where it stopped" if call.resumes else
+            say(f"{prog}: interrupted; " + ("the same command goes on where it stopped" if call and call.resumes else
                                             "nothing was written"))
             return 130
         except Exception as error:
             if os.environ.get(TRACEBACK):
                 raise
-            say(f"{prog}: {call.real(_told(error))}")
-            return 1
+            told = _told(error)
+            say(f"{prog}: {told if call is None else call.real(told)}")
+            return wrong
     if outcome.problem:
         say(f"{prog}: THE RESULT MEANS NOTHING: {outcome.problem}")
-    show([*outcome.metrics, Metric("time", time.perf_counter() - start, "s")])
+    show([*(m for m in outcome.metrics if m.name != PROBLEM), Metric("time", time.perf_counter() - start, "s")])
     if outcome.output is not None:
         say(call.real(f"written: {outcome.output}" + (f" (figures in {report})" if report else "")))
     for failure in outcome.failures:
@@ -231,13 +236,17 @@ class _Call:
             force = inspect.Parameter(FORCE, inspect.Parameter.KEYWORD_ONLY, default=False, annotation=bool)
             shown.append(force)
 
-        def collect(**given: Any) -> dict[str, Any]:
-            return given
+        signature = inspect.Signature(shown)
+
+        def collect(*args: Any, **named: Any) -> dict[str, Any]:
+            given = signature.bind(*args, **named)
+            given.apply_defaults()
+            return given.arguments
 
         collect.__doc__ = (inspect.getdoc(function) or "") + (FORCE_HELP if self.output_name else "")
         collect.__annotations__ = {p.name: p.annotation for p in shown}
-        collect.__signature__ = inspect.Signature(shown)                            # type: ignore[attr-defined]
-        self.given: dict[str, Any] = tyro.cli(collect, args=argv, prog=prog)
+        collect.__signature__ = signature                            # type: ignore[attr-defined]
+        self.given: dict[str, Any] = ranges.read(collect, lambda read: tyro.cli(read, args=argv, prog=prog))()
         self.force = self.given.pop(FORCE, False)
         self.output: Path | None = self.given.get(self.output_name or "")
         self._staged: Path | None = None

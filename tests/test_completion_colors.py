@@ -95,7 +95,7 @@ def test_what_was_not_seen_is_grey_or_filled(person, views):
 def test_a_scan_without_colours_is_refused(person, views):
     with pytest.raises(ValueError, match="expected colours at its points, found none"):
         carry_colors(person, views[2], [Mesh(views[0][0].vertices, views[0][0].faces), np.zeros((40, 3))])
-    with pytest.raises(ValueError, match="expected reach > 0"):
+    with pytest.raises(ValueError, match="reach: expected above 0"):
         ColorConfig(reach=0)
 
 

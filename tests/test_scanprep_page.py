@@ -9,15 +9,13 @@ from scipy.spatial.transform import Rotation
 
 from scanprep import RegisteredSet, write_landmarks, write_mesh
 from scanprep.geometry.files import PointCloud, write_points
-from scanprep.matching.confidence import missed_share
+from scanprep.matching.confidence import missed_share, principal_stretches, stretched_share
 from scanprep.pipeline import pictures
 from scanprep.pipeline.figures import (
     Failure,
     ScanFigures,
-    principal_stretches,
     read_failures,
     read_figures,
-    stretched_share,
     write_failures,
     write_figures,
 )

@@ -17,6 +17,7 @@ from scanprep.cli import Output, Unit, WorkersArg
 from scanprep.console import Metric, Outcome, bar, failures_of, problem_of
 from scanprep.geometry.storage import read_json
 from scanprep.pictures.page import Page
+from scanprep.ranges import BETAS, Count
 
 from ..cli import ModelOrNone, read_model
 from .follow import AnimateConfig
@@ -28,7 +29,7 @@ MarkersArg = Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="MARKER
 
 def animate_markers(markers: MarkersArg, output: Output, model: ModelOrNone = None, layout: str | None = None,
                     subject: str | None = None, unit: Unit | None = None, who: str | None = None,
-                    onto: Path | None = None, betas_to: Path | None = None, keys: int = 120,
+                    onto: Path | None = None, betas_to: Path | None = None, keys: Count = 120,
                     config: Annotated[AnimateConfig, tyro.conf.arg(name="")] = AnimateConfig(),   # noqa: B008
                     shape: MarkerShapeConfig = MarkerShapeConfig(),                               # noqa: B008
                     workers: WorkersArg = Workers(), *, space: Workspace) -> Outcome:              # noqa: B008
@@ -146,4 +147,6 @@ def read_betas_to(path: Path, n_betas: int) -> BetasTo:
         found = {}
     if not found or any(b.ndim != 1 or len(b) > n_betas or not np.isfinite(b).all() for b in found.values()):
         raise ValueError(f"{path}: expected {wanted}, at most {n_betas} betas each")
+    for betas in found.values():
+        BETAS.check(betas, f"{path}: betas")
     return found if keyed else found[0.0]

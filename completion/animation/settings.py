@@ -4,9 +4,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
+from scanprep.ranges import Count, Positive, Settings, Share, Signed
+
 
 @dataclass(frozen=True)
-class AnimateConfig:
+class AnimateConfig(Settings):
     """Settings of `animate` and `MarkerStream`.
 
     Attributes
@@ -47,19 +49,19 @@ class AnimateConfig:
         A unit normal that points up, and the height of the floor along it, metres; else both come from the motion.
     """
 
-    marker_sd: float = 0.01
-    outlier: float = 0.06
+    marker_sd: Positive = 0.01
+    outlier: Positive = 0.06
     prior_weight: float = 0.3
-    prior_shrinkage: float = 0.3
+    prior_shrinkage: Share = 0.3
     start_axes: int = 6
     prediction: Literal["velocity", "kalman"] = "kalman"
-    angle_acceleration: float = 60.0
-    place_acceleration: float = 15.0
-    momentum: float = 0.95
-    iterations: int = 3
-    lost: float = 0.08
-    key_interval: float = 0.1
+    angle_acceleration: Positive = 60.0
+    place_acceleration: Positive = 15.0
+    momentum: Share = 0.95
+    iterations: Count = 3
+    lost: Positive = 0.08
+    key_interval: Positive = 0.1
     smoothing: int = 2
     low_pass: float = 0.0
     ground: bool = False
-    floor: tuple[float, float, float, float] | None = None
+    floor: tuple[Signed, Signed, Signed, Signed] | None = None

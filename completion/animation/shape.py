@@ -8,6 +8,7 @@ import numpy as np
 
 from model.body import BodyModel
 from scanprep.geometry import rotations
+from scanprep.ranges import Count, Positive, Settings, Share
 
 from ..markers.files import MarkerSequence
 from ..markers.layout import MarkerLayout
@@ -20,7 +21,7 @@ LOOK = (1, 3)                        # before these rounds loose markers are loo
 
 
 @dataclass(frozen=True)
-class MarkerShapeConfig:
+class MarkerShapeConfig(Settings):
     """Settings of `subject_from_markers`.
 
     Attributes
@@ -49,15 +50,15 @@ class MarkerShapeConfig:
     """
 
     n_betas: int = 40
-    frames: int = 12
-    marker_sd: float = 0.01
-    outlier: float = 0.06
+    frames: Count = 12
+    marker_sd: Positive = 0.01
+    outlier: Positive = 0.06
     shape_weight: float = 1.0
     prior_weight: float = 0.3
-    prior_shrinkage: float = 0.3
+    prior_shrinkage: Share = 0.3
     start_axes: int = 6
-    iterations: int = 12
-    loose_reach: float = 0.2
+    iterations: Count = 12
+    loose_reach: Positive = 0.2
 
 
 @dataclass(frozen=True, eq=False)

@@ -3,6 +3,14 @@ from __future__ import annotations
 
 import numpy as np
 
+from scanprep.geometry.mesh import Mesh
+from scanprep.meaning import extent, size, unit_problem
+
+from ..markers.files import MarkerSequence
+from ..markers.layout import MarkerLayout
+from ..motion import Motion
+
+ASTRAY = 0.025                       # of the body's size, 34 mm on a man; with exchanged sides it is 50
 WIDEST = 5.0                         # metres; a marker farther off is an outlier on however bad a fit
 ENTER, LEAVE = 0.5, 1.0              # share of the distance that remains when labels are exchanged, and put back
 
@@ -131,3 +139,29 @@ class LabelWatch:
                 taken[[a, b]] = taken[[b, a]]
                 apart[:, [i, j]] = apart[:, [j, i]]
         return self.order
+
+
+def motion_problem(motion: Motion, body: Mesh, layout: MarkerLayout, markers: MarkerSequence) -> str | None:
+    """Why a motion from markers means nothing, with the likely cause; None where it means something.
+
+    Parameters
+    ----------
+    body : Mesh
+        Template of the person's model.
+    layout : MarkerLayout
+        That the markers were followed with.
+    """
+    seen = np.isfinite(motion.residuals)
+    if not seen.any():
+        return "no marker of the layout was ever seen: markers of another layout?"
+    known = layout.matched(markers.labels, 0)
+    columns = [markers.labels.index(label) for label in known]
+    spans = [extent(frame) for frame in markers.positions[:: max(1, len(seen) // 50), columns]]
+    wrong = unit_problem(float(np.nanmax(spans)), extent(layout.select(known).place(body)), "the markers span a box")
+    off, far = float(motion.residuals[seen].mean()), ASTRAY * size(body)
+    if wrong is None and off <= far:
+        return None
+    believed = 100 * float(motion.trusted[seen].mean())
+    return (f"the markers are {1000 * off:.0f} mm from where the body has them, {100 * motion.converged.mean():.0f}% "
+            f"of the frames settled and {believed:.0f}% of the markers are believed; "
+            + (wrong or "labels of left and right exchanged, another layout, or another model?"))

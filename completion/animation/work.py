@@ -24,6 +24,7 @@ from .outputs import write_joint_angles, write_joint_centres, write_motion_bvh, 
 from .report import motion_page
 from .retarget import morphed_vertices, retarget
 from .shape import MarkerShapeConfig, subject_from_markers
+from .trust import motion_problem
 
 BetasTo = dict[float, np.ndarray] | np.ndarray      # keys over seconds, or betas at the end
 ENDINGS = (".c3d", ".trc", ".csv")
@@ -108,7 +109,10 @@ def layout_or_file(given: str | Path) -> str | Path:
 
 
 def animate_file(work: Work, path: Path, room: Room) -> list[Metric]:
-    """Follow the markers of a file, write everything into the folder of a room, and return the figures."""
+    """Follow the markers of a file, write everything into the folder of a room, and return the figures.
+
+    The first is called "problem" where the motion means nothing, and says why.
+    """
     sequence = read_markers(path, work.unit, work.who)
     layout, name = work.read_layout(sequence.labels)
     metrics = [Metric("model", work.name), Metric("layout", name)]
@@ -126,7 +130,8 @@ def animate_file(work: Work, path: Path, room: Room) -> list[Metric]:
     if found is not None:
         storage.write_json(output / "subject.json", {"betas": found.betas.tolist(), "frames": found.frames.tolist()})
         layout.save(output / "layout.json")
-    metrics += figures(motion, sequence)
+    problem = motion_problem(motion, body.template, layout, sequence)
+    metrics = [*([Metric("problem", problem)] if problem else []), *metrics, *figures(motion, sequence)]
     _write(work, output, motion, body)
     page = motion_page(motion, body, sequence, path.name, rows(metrics))
     if work.onto is not None:
@@ -140,7 +145,7 @@ def animate_file(work: Work, path: Path, room: Room) -> list[Metric]:
 def figures(motion: Motion, markers: MarkerSequence) -> list[Metric]:
     """What a motion is judged by."""
     seen = np.isfinite(motion.residuals)
-    off = MM * motion.residuals[seen]
+    off = MM * motion.residuals[seen] if seen.any() else np.array([np.nan])
     frame = MM * np.where(seen, motion.residuals, 0).sum(axis=1) / np.maximum(seen.sum(axis=1), 1)
     return [
         Metric("frames", len(motion.poses)), Metric("rate", motion.rate, "1/s"),
@@ -148,7 +153,7 @@ def figures(motion: Motion, markers: MarkerSequence) -> list[Metric]:
         Metric(MEAN_ERROR, float(off.mean()), "mm"),
         Metric("distance of markers, 95th percentile", float(np.percentile(off, 95)), "mm"),
         Metric("distance of markers, mean of the worst frame", float(frame.max()), "mm"),
-        Metric("markers missing", 100 * float(1 - seen[:, seen.any(axis=0)].mean()), "%"),
+        Metric("markers missing", 100 * float(1 - seen[:, seen.any(axis=0)].mean()) if seen.any() else 100.0, "%"),
         Metric("frames that settled", 100 * float(motion.converged.mean()), "%")]
 
 

@@ -6,13 +6,14 @@ from pathlib import Path
 
 from scanprep.batch.workspace import Workspace
 from scanprep.console import Outcome, bar, say
+from scanprep.ranges import Seed
 
 from ..cli import Out
 from .chain import Demo
 from .settings import QUICK, DemoConfig
 
 
-def demo(out: Out = Path("scape_demo"), quick: bool = False, seed: int = DemoConfig.seed, *, space: Workspace
+def demo(out: Out = Path("scape_demo"), quick: bool = False, seed: Seed = DemoConfig.seed, *, space: Workspace
          ) -> Outcome:
     """The whole chain on embedded people: scans, registration, skeleton, model, completion, animation.
 

@@ -9,10 +9,11 @@ from pathlib import Path
 from model import LearnConfig
 from scanprep.geometry import storage
 from scanprep.pipeline.scans import TABLE
+from scanprep.ranges import Cell, Count, Faces, Positive, Seed, Settings
 
 
 @dataclass(frozen=True)
-class DemoConfig:
+class DemoConfig(Settings):
     """How much of everything.
 
     Attributes
@@ -35,31 +36,22 @@ class DemoConfig:
         Of the walk.
     marker_noise : float, metres
     seed : int
-
-    Raises
-    ------
-    ValueError
-        A seed below 0.
     """
 
-    poses: int = 20
-    subjects: int = 12
-    faces: int = 14000
-    parts: int = 16
-    resolution: float = 0.0068
-    template_resolution: float = 0.004
-    template_views: int = 12
+    poses: Count = 20
+    subjects: Count = 12
+    faces: Faces = 14000
+    parts: Count = 16
+    resolution: Cell = 0.0068
+    template_resolution: Cell = 0.004
+    template_views: Count = 12
     held_out: int = 5
-    landmarks: int = 7
-    frames: int = 132
-    rate: float = 60.0
+    landmarks: Count = 7
+    frames: Count = 132
+    rate: Positive = 60.0
     marker_noise: float = 0.001
-    seed: int = 0
+    seed: Seed = 0
     learn: LearnConfig = field(default_factory=LearnConfig)
-
-    def __post_init__(self) -> None:
-        if self.seed < 0:
-            raise ValueError(f"seed: expected 0 or more, got {self.seed}")
 
 
 QUICK = DemoConfig(poses=8, subjects=3, faces=7000, resolution=0.011, template_resolution=0.006, held_out=2, frames=66,

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from model.body import BodyModel
+from scanprep.ranges import Count, Positive, Settings, Share
 
 from ..markers.layout import MarkerLayout
 from ..priors import gaussian_prior
@@ -14,7 +15,7 @@ from .points import BodyPoints
 
 
 @dataclass(frozen=True)
-class FrameConfig:
+class FrameConfig(Settings):
     """Settings of `informative_frames`.
 
     Attributes
@@ -34,11 +35,11 @@ class FrameConfig:
     """
 
     n_betas: int = 40
-    marker_sd: float = 0.005
-    place_sd: float = 0.01
+    marker_sd: Positive = 0.005
+    place_sd: Positive = 0.01
     prior_weight: float = 1.0
-    prior_shrinkage: float = 0.3
-    candidates: int = 120
+    prior_shrinkage: Share = 0.3
+    candidates: Count = 120
 
 
 class FrameInformation:

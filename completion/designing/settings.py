@@ -4,11 +4,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
+from scanprep.ranges import Count, Positive, Settings, Share
+
 Direction = Literal["both", "remove", "add"]
 
 
 @dataclass(frozen=True)
-class DesignConfig:
+class DesignConfig(Settings):
     """Settings of `design_markers`.
 
     Eq. 26 has no prior; without one fewer markers than a third of the unknowns have no answer. So betas are held to
@@ -46,17 +48,17 @@ class DesignConfig:
         Counts at which the set of the curve is estimated again without linearising.
     """
 
-    count: int = 47
-    through: tuple[int, ...] = ()
+    count: Count = 47
+    through: tuple[Count, ...] = ()
     direction: Direction = "both"
     n_betas: int | None = None
     joint: bool = False
-    marker_sd: float = 0.005
+    marker_sd: Positive = 0.005
     shape_weight: float = 1.0
     prior_weight: float = 1.0
-    prior_shrinkage: float = 0.3
-    surface: int = 1000
-    fit_surface: int = 400
-    fit_iterations: int = 20
+    prior_shrinkage: Share = 0.3
+    surface: Count = 1000
+    fit_surface: Count = 400
+    fit_iterations: Count = 20
     exchanges: int = 1
-    checks: tuple[int, ...] = ()
+    checks: tuple[Count, ...] = ()

@@ -10,6 +10,7 @@ from scipy.sparse import coo_array, csr_array, diags_array
 from scanprep.geometry.geodesics import SurfaceGraph
 from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.surface import Rays
+from scanprep.ranges import Positive, Settings
 from scanprep.skeleton.tree import Skeleton
 
 from .layout import DISTANCE, MarkerLayout
@@ -23,7 +24,7 @@ CONE = 0.5                           # cosine of the directions inwards along wh
 
 
 @dataclass(frozen=True)
-class CandidateConfig:
+class CandidateConfig(Settings):
     """Where markers can sit; lengths are shares of the body's length.
 
     Attributes
@@ -45,7 +46,7 @@ class CandidateConfig:
         Places nearer to the middle than this are taken in the middle, alone.
     """
 
-    reach: float = 0.06
+    reach: Positive = 0.06
     open: float = 0.75
     margin: float = 0.035
     thick: float = 0.022

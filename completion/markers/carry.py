@@ -11,6 +11,7 @@ from scanprep.geometry.surface import Surface
 from scanprep.matching.correlated import CorrelatedConfig, find_correspondences
 from scanprep.matching.nonrigid import Registration, register
 from scanprep.matching.schedule import RegistrationConfig
+from scanprep.ranges import Settings
 
 from .layout import MarkerLayout, most_used
 from .symmetry import skin_points
@@ -21,7 +22,7 @@ Landmarks = tuple[np.ndarray, np.ndarray]
 
 
 @dataclass(frozen=True)
-class CarryConfig:
+class CarryConfig(Settings):
     """Settings of `carry_layout`.
 
     Attributes

@@ -4,13 +4,15 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from typing import Literal
 
+from scanprep.ranges import Count, Positive, Seed, Settings, Share
+
 from ..animation.settings import AnimateConfig
 
 Attachment = Literal["triangle", "neighbourhood"]
 
 
 @dataclass(frozen=True)
-class PersonConfig:
+class PersonConfig(Settings):
     """Settings of `find_person`: the shape of a person and where the markers really sit, from some frames.
 
     Weights are those of the paper: on squared distances in centimetres, on squared standard deviations of betas and
@@ -48,7 +50,7 @@ class PersonConfig:
         Of the frames drawn at random.
     """
 
-    frames: int = 12
+    frames: Count = 12
     choice: Literal["spread", "random"] = "spread"
     n_betas: int = 80
     attachment: Attachment = "triangle"
@@ -58,17 +60,17 @@ class PersonConfig:
     shape: float = 0.3
     pose: float = 0.25
     loose: float = 0.0025
-    loose_reach: float = 0.2
-    annealing: tuple[float, ...] = (40.0, 20.0, 10.0, 4.0, 2.0, 1.0)
-    outlier: float = 0.06
-    prior_shrinkage: float = 0.3
+    loose_reach: Positive = 0.2
+    annealing: tuple[Positive, ...] = (40.0, 20.0, 10.0, 4.0, 2.0, 1.0)
+    outlier: Positive = 0.06
+    prior_shrinkage: Share = 0.3
     start_axes: int = 6
-    iterations: int = 8
-    seed: int = 0
+    iterations: Count = 8
+    seed: Seed = 0
 
 
 @dataclass(frozen=True)
-class FollowConfig:
+class FollowConfig(Settings):
     """Settings of the poses of every frame of a person whose shape and markers are known.
 
     Attributes
@@ -85,12 +87,12 @@ class FollowConfig:
     data: float = 2.0
     pose: float = 0.3
     velocity: float = 57600.0
-    outlier: float = 0.06
-    prior_shrinkage: float = 0.3
+    outlier: Positive = 0.06
+    prior_shrinkage: Share = 0.3
 
 
 @dataclass(frozen=True)
-class SoftTissueConfig:
+class SoftTissueConfig(Settings):
     """Settings of `follow_soft_tissue`.
 
     Weights are in the paper's units. Its own are pose = 1, velocity = 6.25, skin = steadiness = 0: here the pose prior
@@ -120,13 +122,13 @@ class SoftTissueConfig:
     change: float = 0.25
     skin: float = 10.0
     steadiness: float = 20.0
-    outlier: float = 0.06
-    prior_shrinkage: float = 0.3
-    iterations: int = 3
+    outlier: Positive = 0.06
+    prior_shrinkage: Share = 0.3
+    iterations: Count = 3
 
 
 @dataclass(frozen=True)
-class FaultConfig:
+class FaultConfig(Settings):
     """Settings of `find_faults`.
 
     Attributes
@@ -166,7 +168,7 @@ class FaultConfig:
 
 
 @dataclass(frozen=True)
-class MoshConfig:
+class MoshConfig(Settings):
     """Settings of `mosh`.
 
     Attributes

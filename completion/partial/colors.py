@@ -12,6 +12,7 @@ from scanprep.geometry import sparse
 from scanprep.geometry.files import PointCloud
 from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.surface import Surface
+from scanprep.ranges import Cosine, Positive, Settings, Share
 
 from .scan import View, as_views, check_viewpoints, in_metres, prepare_scan
 from .sight import find_sight
@@ -23,7 +24,7 @@ SQUARE = 2                           # power of the cosine at which a view looke
 
 
 @dataclass(frozen=True)
-class ColorConfig:
+class ColorConfig(Settings):
     """Settings of `carry_colors`.
 
     Attributes
@@ -37,15 +38,10 @@ class ColorConfig:
     grey : float in [0, 1]
     """
 
-    reach: float = 0.02
-    min_cosine: float = 0.5
+    reach: Positive = 0.02
+    min_cosine: Cosine = 0.5
     fill: bool = False
-    grey: float = 0.6
-
-    def __post_init__(self) -> None:
-        if not (self.reach > 0 and -1 <= self.min_cosine <= 1 and 0 <= self.grey <= 1):
-            raise ValueError("ColorConfig: expected reach > 0, min_cosine in [-1, 1] and grey in [0, 1], got "
-                             f"{self.reach}, {self.min_cosine}, {self.grey}")
+    grey: Share = 0.6
 
 
 class ColoredView:

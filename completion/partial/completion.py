@@ -10,6 +10,7 @@ import numpy as np
 from model.body import BodyModel
 from model.linear import Subject
 from scanprep.geometry.mesh import Mesh
+from scanprep.meaning import HAND, extent, size, unit_problem
 from scanprep.threads import one_thread
 
 from ..bodies import as_body
@@ -24,6 +25,9 @@ from .settings import CompletionConfig
 from .surface import free_surface
 
 Progress = Callable[[int, int], None]
+
+LOST = 0.5                           # share of a scan explained below which a completion means nothing
+ASTRAY, ENOUGH = 0.016, 0.9          # so far landmarks, of the size, and so little explained: left and right exchanged
 
 
 @dataclass(frozen=True, eq=False)
@@ -136,3 +140,23 @@ def complete(body: BodyModel | Subject, scan: View | Sequence[View],
     return Completion(completed, predicted, pose, shape, trans, seen, rms, float(used.mean()),
                       landmark_rms, converged, rounds, energies, given.metres, error,
                       probability_within(error, config.tolerance))
+
+
+def completion_problem(done: Completion, points: np.ndarray, free_scale: bool = False) -> str | None:
+    """Why a completion means nothing, with the likely cause; None where it means something.
+
+    Parameters
+    ----------
+    points : (n, 3) float, metres
+        The scan, in whatever unit it was taken to be.
+    free_scale : bool
+        Whether its unit was sought, and so cannot be wrong.
+    """
+    off, most = done.landmark_rms / size(done.predicted), done.explained
+    if done.seen.any() and most >= LOST and not (off > HAND or (off > ASTRAY and most < ENOUGH)):
+        return None
+    wrong = None if free_scale else unit_problem(extent(points), extent(done.predicted.vertices), "the scan is", 0.05)
+    marks = "" if np.isnan(done.landmark_rms) else f", the landmarks are {1000 * done.landmark_rms:.0f} mm off"
+    return (f"the body explains {100 * done.explained:.0f}% of the scan, {100 * done.seen.mean():.2g}% of it has "
+            f"data{marks}; " + (wrong or ("landmarks of other places, left and right exchanged, or " if marks else "")
+                                + "a scan of something else, another model?"))

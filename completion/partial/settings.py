@@ -4,13 +4,15 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Literal
 
+from scanprep.ranges import Cosine, Count, Positive, Seed, Settings, Share, Signed
+
 from ..priors import PosePrior
 
 Method = Literal["joint", "alternation"]
 
 
 @dataclass(frozen=True)
-class CompletionConfig:
+class CompletionConfig(Settings):
     """Settings of `complete`.
 
     Attributes
@@ -89,32 +91,32 @@ class CompletionConfig:
 
     surface_weight: float = 1.0
     twist_weight: float = 1.0
-    landmark_sd: float = 0.01
-    scan_sd: float = 0.008
+    landmark_sd: Positive = 0.01
+    scan_sd: Positive = 0.008
     evidence: float = 400.0
     prior_weight: float = 1.0
-    prior_shrinkage: float = 0.3
+    prior_shrinkage: Share = 0.3
     pose_prior: PosePrior = "gaussian"
     joint_limits: bool = False
     start_axes: int = 4
     correspondences: bool = False
-    candidates: int = 3
-    reach: float = 0.2
-    final_reach: float = 0.03
-    rounds: int = 8
-    min_cosine: float = 0.6
-    scan_points: int = 2500
-    model_points: int = 1200
-    surface_reach: float = 0.03
+    candidates: Count = 3
+    reach: Positive = 0.2
+    final_reach: Positive = 0.03
+    rounds: Count = 8
+    min_cosine: Cosine = 0.6
+    scan_points: Count = 2500
+    model_points: Count = 1200
+    surface_reach: Positive = 0.03
     surface_rounds: int = 4
     draws: int = 60
-    seed: int = 0
+    seed: Seed = 0
     silhouette_weight: float = 0.5
-    silhouette_tolerance: float = 0.03
+    silhouette_tolerance: Positive = 0.03
     contact_weight: float = 0.5
-    viewpoint: tuple[float, float, float] | tuple[tuple[float, float, float], ...] | None = None
+    viewpoint: tuple[Signed, Signed, Signed] | tuple[tuple[Signed, Signed, Signed], ...] | None = None
     cover_weight: float = 1.0
-    cover_sd: float = 0.06
+    cover_sd: Positive = 0.06
     ignored_parts: tuple[str, ...] = ()
     method: Method = "joint"
     twist_damping: float = 1.0

@@ -18,7 +18,7 @@ from scanprep.geometry.mesh import Mesh
 from scanprep.pictures.sheets import save_png
 
 from .colors import ColorConfig, blend, carry_colors, colored_views
-from .completion import Completion, complete
+from .completion import Completion, complete, completion_problem
 from .masks import read_mask
 from .report import completion_page, picture_completion
 from .results import save_completion
@@ -78,6 +78,8 @@ class Inputs:
 def complete_files(work: Work, inputs: Inputs, room: Room) -> list[Metric]:
     """Complete the scan of some files into the folder of a room, report.html in it; the figures.
 
+    The first is called "problem" where the completion means nothing, and says why.
+
     Raises
     ------
     ValueError
@@ -96,7 +98,8 @@ def complete_files(work: Work, inputs: Inputs, room: Room) -> list[Metric]:
     if files.colored:
         done = _with_colors(work, files, done, output)
     save_completion(output, done)
-    metrics = figures(work, inputs, done, landmarks, masked)
+    problem = completion_problem(done, all_points(files.views), work.config.free_scale)
+    metrics = [*([Metric("problem", problem)] if problem else []), *figures(work, inputs, done, landmarks, masked)]
     picture = picture_completion(views, done, work.body.template, masked=masked)
     save_png(output / "picture.png", picture)
     rows = [(m.name, m.value, m.unit) for m in metrics]

@@ -14,22 +14,23 @@ from model.linear import Subject
 from scanprep.batch.workspace import Workspace
 from scanprep.cli import MM, Output, Unit
 from scanprep.console import Metric, Outcome, bar, say
+from scanprep.ranges import Count, Positive
 
 from ..cli import ModelOrNone, read_landmark_pairs, read_model, rows
 from ..motion import Motion
 from .chunks import follow_folder
 from .folder import FrameFolder
-from .sequence import as_motion
+from .sequence import as_motion, tracking_problem
 from .settings import TrackConfig
 from .tracker import Tracker
 
 FramesArg = Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="FRAMES")]
 
 
-def track_frames(frames: FramesArg, output: Output, model: ModelOrNone = None, rate: float = 30.0,
+def track_frames(frames: FramesArg, output: Output, model: ModelOrNone = None, rate: Positive = 30.0,
                  cameras: str | None = None, landmarks: Path | None = None, subject: str | None = None,
                  template_landmarks: Path | None = None, unit: Unit | None = None, surfaces: bool = False,
-                 keys: int = 120, config: Annotated[TrackConfig, tyro.conf.arg(name="")] = TrackConfig(),  # noqa: B008
+                 keys: Count = 120, config: Annotated[TrackConfig, tyro.conf.arg(name="")] = TrackConfig(),  # noqa: B008
                  *, space: Workspace) -> Outcome:
     """The motion of a person from frames of points, without markers.
 
@@ -81,7 +82,8 @@ def track_frames(frames: FramesArg, output: Output, model: ModelOrNone = None, r
     of_motion = done.key, config.smoothing
     space.step("motion", (of_motion, rows(metrics), frames.name), write)
     space.step("animation", (of_motion, keys), lambda folder: write_glb(folder / "animation.glb", motion, person, keys))
-    return Outcome(output, metrics, {"track": config, "rate": rate, "model": name}, found.problems, problem=None)
+    return Outcome(output, metrics, {"track": config, "rate": rate, "model": name}, found.problems,
+                   tracking_problem(motion))
 
 
 def _figures(motion: Motion) -> list[Metric]:

@@ -130,5 +130,5 @@ def _numbers(found: set[int]) -> list[int]:
     order = sorted(found)
     steps = np.diff(order)
     step = int(np.gcd.reduce(steps)) if len(steps) else 1
-    filled = list(range(order[0], order[-1] + 1, step))
-    return filled if len(filled) <= SPARSE * len(order) else order
+    filled = (order[-1] - order[0]) // step + 1
+    return list(range(order[0], order[-1] + 1, step)) if filled <= SPARSE * len(order) else order

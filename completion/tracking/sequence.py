@@ -17,6 +17,7 @@ from .frames import Frame
 from .settings import TrackConfig
 from .tracker import TrackedFrame, Tracker, follow_frames
 
+FOUND = 0.1                          # share of the frames in which the body must be found
 Progress = Callable[[int, int], None]
 Surfaces = Callable[[int, Mesh], None]
 
@@ -95,3 +96,14 @@ def as_motion(frames: list[TrackedFrame], betas: np.ndarray | None, rate: float,
     residuals = np.array([[frame.residual] for frame in frames])
     return Motion(x[:, :-3].reshape(len(x), -1, 3), x[:, -3:].copy(), betas, rate, residuals, ("surface",),
                   converged=np.array([frame.found for frame in frames]))
+
+
+def tracking_problem(motion: Motion) -> str | None:
+    """Why the motion of tracked frames means nothing, with the likely cause; None where it means something."""
+    found = float(motion.converged.mean())
+    if found >= FOUND:
+        return None
+    seen = motion.residuals[np.isfinite(motion.residuals)]
+    off = f"the points are {1000 * float(seen.mean()):.0f} mm from the body" if len(seen) else "no frame shows anything"
+    return (f"the body was found in {100 * found:.0f}% of the frames, {off}; the wrong unit (--unit), frames of "
+            "something else, or another model?")

@@ -3,11 +3,13 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 
+from scanprep.ranges import Count, Positive, Settings, Share
+
 from ..partial.settings import CompletionConfig
 
 
 @dataclass(frozen=True)
-class TrackConfig:
+class TrackConfig(Settings):
     """Settings of `track`.
 
     Attributes
@@ -56,25 +58,25 @@ class TrackConfig:
         How the first frame is completed, and one that is searched from scratch.
     """
 
-    frame_points: int = 2000
-    body_points: int = 1000
-    normal_points: int = 24
-    reach: float = 0.1
-    final_reach: float = 0.03
-    rounds: int = 5
+    frame_points: Count = 2000
+    body_points: Count = 1000
+    normal_points: Count = 24
+    reach: Positive = 0.1
+    final_reach: Positive = 0.03
+    rounds: Count = 5
     settled: float = 1e-3
     evidence: float = 400.0
     prior_weight: float = 1.0
     silhouette_weight: float = 0.0
-    angle_acceleration: float = 60.0
-    place_acceleration: float = 15.0
-    momentum: float = 0.9
-    lost: float = 0.03
-    explained: float = 0.7
-    search_every: int = 10
-    shape_frames: int = 24
-    shape_views: int = 8
-    shape_rounds: int = 4
+    angle_acceleration: Positive = 60.0
+    place_acceleration: Positive = 15.0
+    momentum: Share = 0.9
+    lost: Positive = 0.03
+    explained: Share = 0.7
+    search_every: Count = 10
+    shape_frames: Count = 24
+    shape_views: Count = 8
+    shape_rounds: Count = 4
     smoothing: int = 2
     start: CompletionConfig = field(default_factory=CompletionConfig)
 

@@ -20,12 +20,13 @@ from scanprep.geometry.landmarks import match_landmarks, read_landmarks, write_l
 from scanprep.geometry.mesh import Mesh
 from scanprep.pipeline.prepare import mesh_file
 from scanprep.pipeline.scans import ScanTask, find_scans
+from scanprep.ranges import Count, Share
 
 from ..body import BodyModel
 from ..cli import ModelArg
 from ..files import load_model
 from .config import CoregistrationConfig
-from .rounds import Coregistration, coregister
+from .rounds import Coregistration, coregister, coregistration_problem
 from .single import Landmarks
 
 MM = 1000.0
@@ -38,8 +39,8 @@ ScansArg = Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="SCANS")]
 
 def coregister_scans(model: ModelArg, scans: ScansArg, output: Output, landmarks: Path | None = None,
                      first: Path | None = None, subject: str = OWN, unit: Unit | None = None,
-                     rounds: int = CoregistrationConfig.rounds, workers: WorkersArg = Workers(),  # noqa: B008
-                     failed: float = CoregistrationConfig.failed, *, space: Workspace) -> Outcome:
+                     rounds: Count = CoregistrationConfig.rounds, workers: WorkersArg = Workers(),  # noqa: B008
+                     failed: Share = CoregistrationConfig.failed, *, space: Workspace) -> Outcome:
     """Register every scan of a folder with a model as prior, learn the model again, and so on until it settles.
 
     Writes a registered set with model.npz in it. Killed and started again it goes on where it was. Of a scan that has
@@ -83,7 +84,7 @@ def coregister_scans(model: ModelArg, scans: ScansArg, output: Output, landmarks
     with space.staging("set") as staged:
         write_coregistered(staged.folder, loaded, kept, done)
     return Outcome(output, _figures(done, names), {"coregistration": config}, [*failures, *done.failures.values()],
-                   problem=None)
+                   coregistration_problem(done, read))
 
 
 def write_coregistered(folder: Path, first: BodyModel, tasks: Sequence[ScanTask], done: Coregistration) -> None:

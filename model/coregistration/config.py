@@ -5,13 +5,14 @@ from dataclasses import dataclass, field
 
 from scanprep.batch.pool import Workers
 from scanprep.matching.schedule import GraphStage, RegistrationConfig
+from scanprep.ranges import Cell, Count, Positive, Settings, Share, Signed
 from scanprep.skeleton.parts import SkeletonConfig
 
 from ..learning.scape import LearnConfig
 
 
 @dataclass(frozen=True)
-class PoseStage:
+class PoseStage(Settings):
     """One stage of bringing the model to a scan by its pose and betas alone. Lengths are shares of √area.
 
     Attributes
@@ -32,17 +33,17 @@ class PoseStage:
         Vertices of the model that are matched.
     """
 
-    reach: float
+    reach: Positive
     slide: float
-    prior: float
+    prior: Positive
     landmarks: float
-    rounds: int = 5
-    detail: float = 0.02
-    sample: int = 600
+    rounds: Count = 5
+    detail: Cell = 0.02
+    sample: Count = 600
 
 
 @dataclass(frozen=True)
-class ModelFitConfig:
+class ModelFitConfig(Settings):
     """Settings of bringing the model to a scan.
 
     Attributes
@@ -80,15 +81,15 @@ class ModelFitConfig:
         PoseStage(0.04, 0.05, 0.0007, 0.01),
     )
     axes: int = 6
-    turns: int = 8
-    up: tuple[float, float, float] | None = None
+    turns: Count = 8
+    up: tuple[Signed, Signed, Signed] | None = None
     normal_weight: float = 0.05
     n_betas: int = 20
-    shape_prior: float = 0.0005
-    least: int = 2
-    agreed: int = 4
-    near: float = 0.02
-    enough: float = 0.98
+    shape_prior: Positive = 0.0005
+    least: Count = 2
+    agreed: Count = 4
+    near: Positive = 0.02
+    enough: Share = 0.98
 
 
 # the predicted mesh lies near already: fine stages only, whose stiffness is relative to the prediction's own shape
@@ -101,7 +102,7 @@ NEAR = RegistrationConfig(graph=(
 
 
 @dataclass(frozen=True)
-class CoregistrationConfig:
+class CoregistrationConfig(Settings):
     """Settings of `register_with_model` and `coregister`.
 
     Attributes
@@ -128,11 +129,11 @@ class CoregistrationConfig:
 
     fit: ModelFitConfig = field(default_factory=ModelFitConfig)
     registration: RegistrationConfig = NEAR
-    alignments: int = 1
+    alignments: Count = 1
     learn: LearnConfig = field(default_factory=LearnConfig)
-    rounds: int = 3
+    rounds: Count = 3
     tolerance: float = 0.0007
-    explained: float = 0.006
-    failed: float = 0.015
+    explained: Positive = 0.006
+    failed: Share = 0.015
     skeleton: SkeletonConfig | None = None
     workers: Workers = field(default_factory=Workers)

@@ -12,6 +12,7 @@ from scanprep.geometry.mesh import Mesh
 from scanprep.matching.matches import orient, target_of
 from scanprep.matching.nonrigid import register
 from scanprep.matching.schedule import RegistrationConfig
+from scanprep.ranges import Settings
 from scanprep.skeleton.find import find_skeleton
 from scanprep.skeleton.parts import SkeletonConfig
 from scanprep.skeleton.tree import Skeleton
@@ -29,7 +30,7 @@ DETAIL = 0.01                        # share of √area to which scans are thinn
 
 
 @dataclass(frozen=True)
-class FirstConfig:
+class FirstConfig(Settings):
     """Settings of `learn_from_scans`.
 
     Attributes

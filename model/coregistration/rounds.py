@@ -12,6 +12,7 @@ import numpy as np
 from scanprep.batch.pool import Room
 from scanprep.batch.workspace import Task, Workspace, workspace
 from scanprep.geometry.mesh import Mesh
+from scanprep.meaning import extent, unit_problem
 from scanprep.skeleton.find import find_skeleton
 from scanprep.skeleton.tree import Skeleton
 from scanprep.threads import one_thread
@@ -25,6 +26,7 @@ from .single import Landmarks, ModelRegistration, register_with_model
 Progress = Callable[[int, int], None]
 Scan = Mesh | np.ndarray
 Lessons = tuple[np.ndarray, np.ndarray | None]       # poses (M, N, 3) of the template's person, shapes (S, N, 3)
+LOST = 0.5                           # mean share of the scans explained below which they mean nothing
 
 
 @dataclass(frozen=True)
@@ -263,3 +265,14 @@ def _summary(registrations: Sequence[ModelRegistration | None], good: np.ndarray
 def _settled(history: Sequence[Round], model: BodyModel, config: CoregistrationConfig) -> bool:
     size = float(np.sqrt(model.template.face_areas.sum()))
     return bool(history and history[-1].change <= config.tolerance * size)
+
+
+def coregistration_problem(done: Coregistration, scans: Sequence[Scan]) -> str | None:
+    """Why co-registered scans mean nothing, with the likely cause; None where they mean something."""
+    explained = float(np.mean([0.0 if r is None else r.explained for r in done.registrations]))
+    if done.good.any() and explained >= LOST:
+        return None
+    spans = [extent(scan.vertices if isinstance(scan, Mesh) else scan) for scan in scans]
+    cause = unit_problem(float(np.median(spans)), extent(done.model.template.vertices), "the scans are", 0.05)
+    return (f"{int(done.good.sum())} of {len(done.good)} scans fit the model, which explains {100 * explained:.0f}% of "
+            f"them; {cause or 'scans of something else, another model, or landmarks of other places?'}")

@@ -16,12 +16,13 @@ from scanprep.console import Metric, Outcome, bar
 from scanprep.dataset import RegisteredSet
 from scanprep.geometry import storage
 from scanprep.geometry.files import read_registered, write_mesh
+from scanprep.ranges import Count, Seed
 
 from ..body import BodyModel
 from ..cli import ModelArg, read_subject
 from ..digests import digest, trained_on
 from ..files import load_model
-from .errors import Errors, compactness, pose_errors, shape_errors
+from .errors import Errors, compactness, errors_problem, pose_errors, shape_errors
 from .page import MM, Findings, evaluation_page, generalisation_rows, picture_samples
 from .sampling import sample_bodies, specificity
 
@@ -30,8 +31,8 @@ SHOWN = 8                            # random bodies on the page
 
 
 def evaluate(model: ModelArg, output: Output, poses: Path | None = None, shapes: Path | None = None,
-             counts: tuple[int, ...] = (10, 20, 40), train_shapes: Path | None = None, subject: Path | None = None,
-             seed: int = 0, unit: Unit | None = None) -> Outcome:
+             counts: tuple[Count, ...] = (10, 20, 40), train_shapes: Path | None = None, subject: Path | None = None,
+             seed: Seed = 0, unit: Unit | None = None) -> Outcome:
     """Errors of a model on bodies that it was not trained on, with a page of curves and pictures.
 
     Example: scape model evaluate model.npz --poses held_poses --shapes held_people -o evaluation
@@ -79,12 +80,22 @@ def evaluate(model: ModelArg, output: Output, poses: Path | None = None, shapes:
                                                            if m.name != "note"], notes, progress)
     page.write(output / "report.html")
     return Outcome(output, metrics, {"model": model, "poses": poses, "shapes": shapes, "counts": counts,
-                                     "train_shapes": train_shapes, "subject": subject, "seed": seed})
+                                     "train_shapes": train_shapes, "subject": subject, "seed": seed},
+                   problem=_problem(loaded, found))
+
+
+def _problem(model: BodyModel, found: Findings) -> str | None:
+    told = []
+    if found.poses is not None and found.pose_bodies is not None:
+        told.append(errors_problem(found.poses.errors, found.pose_bodies, model))
+    if found.shapes is not None and found.shape_bodies is not None:
+        told.append(errors_problem(found.shapes.errors[-1], found.shape_bodies, model))
+    return "; ".join(problem for problem in told if problem) or None
 
 
 def sample(model: ModelArg, output: Output,
-           count: Annotated[int, tyro.conf.arg(aliases=["-n"])] = 9, seed: int = 0,
-           pose_too: bool = False, betas: int | None = None) -> Outcome:
+           count: Annotated[Count, tyro.conf.arg(aliases=["-n"])] = 9, seed: Seed = 0,
+           pose_too: bool = False, betas: Count | None = None) -> Outcome:
     """Write random bodies of a model, a sheet of their pictures, and their betas and poses.
 
     Example: scape model sample model.npz -n 9 -o random

@@ -9,6 +9,8 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from scanprep.meaning import HAND, extent, size, unit_problem
+
 from ..body import BodyModel
 from ..fitting import FitConfig, PoseFitter, ShapeFit, ShapeFitter
 from ..linear import Subject
@@ -284,3 +286,13 @@ def checked_bodies(model: BodyModel, bodies: np.ndarray, name: str) -> np.ndarra
     if not np.isfinite(bodies).all():
         raise ValueError(f"{name}: expected finite numbers")
     return bodies
+
+
+def errors_problem(errors: Errors, bodies: np.ndarray, model: BodyModel) -> str | None:
+    """Why the errors of bodies (M, N, 3) mean nothing, with the likely cause; None where they mean something."""
+    if errors.overall <= HAND * size(model.template):
+        return None
+    spans = [extent(body) for body in bodies]
+    cause = unit_problem(float(np.median(spans)), extent(model.template.vertices), "the bodies are")
+    return (f"the model is {1000 * errors.overall:.0f} mm from the bodies on average; "
+            f"{cause or 'bodies whose vertices have another order, or another model?'}")

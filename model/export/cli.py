@@ -12,6 +12,7 @@ from scanprep.console import Metric, Outcome, bar
 from scanprep.geometry.files import write_mesh
 from scanprep.geometry.storage import StorageError, load_arrays, numbers, taking_apart, text
 from scanprep.pictures.views import upright
+from scanprep.ranges import BETAS, Beta
 
 from ..body import BodyModel
 from ..cli import ModelArg
@@ -43,7 +44,7 @@ class _Moves:
     rate: float
 
 
-def export(model: ModelArg, output: Output, betas: tuple[float, ...] = (), own_body: bool = False,
+def export(model: ModelArg, output: Output, betas: tuple[Beta, ...] = (), own_body: bool = False,
            motion: Path | None = None, shapes: int | None = None, correctives: int = 0,
            unit: Unit | None = None, up: Literal[0, 1, 2] | None = None) -> Outcome:
     """Write a model for other programs; what is written follows from the name of the output.
@@ -116,6 +117,7 @@ def read_motion(path: Path, model: BodyModel) -> _Moves:
         if betas.ndim != 1 or len(betas) > model.n_betas:
             raise StorageError(f"{path}: expected at most the {model.n_betas} betas of the model, found {betas.shape}")
         betas = numbers({"betas": betas}, "betas", None).astype(np.float64)
+        BETAS.check(betas, "betas")
         poses, rate = stored["poses"].astype(np.float64).reshape(T, J, 3), float(stored["mocap_frame_rate"])
         poses, trans = check_motion(model.skeleton, poses, stored["trans"], rate)
         return _Moves(poses, trans, betas if betas.size else None, rate)

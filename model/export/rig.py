@@ -8,6 +8,7 @@ import numpy as np
 from scanprep.geometry import rotations
 from scanprep.geometry.mesh import Mesh
 from scanprep.pictures.gltf import UPRIGHT
+from scanprep.ranges import TURNS
 from scanprep.skeleton.tree import Skeleton
 
 from ..body import BodyModel
@@ -180,6 +181,7 @@ def check_motion(skeleton: Skeleton, poses: np.ndarray, trans: np.ndarray | None
     bad = np.flatnonzero(~(np.isfinite(poses).all(axis=(1, 2)) & np.isfinite(trans).all(axis=1)))
     if len(bad):
         raise ValueError(f"poses, trans: {len(bad)} frames are not finite, the first is frame {bad[0]}")
+    TURNS.check(poses, "poses")
     if not (np.isfinite(rate) and rate > 0):
         raise ValueError(f"rate: expected a positive number of frames a second, got {rate}")
     return poses, trans

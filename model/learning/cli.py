@@ -21,6 +21,7 @@ from scanprep.geometry.files import list_meshes, read_registered
 from scanprep.geometry.landmarks import read_landmark_vertices
 from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.storage import read_table
+from scanprep.ranges import Count, Settings
 from scanprep.skeleton.find import find_skeleton
 from scanprep.skeleton.parts import SkeletonConfig
 from scanprep.skeleton.tree import Skeleton
@@ -37,7 +38,7 @@ Whole = dict[str, BodyModel]
 
 
 @dataclasses.dataclass(frozen=True)
-class Other:
+class Other(Settings):
     """Settings of what only some ways of learning need.
 
     Parameters
@@ -57,7 +58,7 @@ class Other:
 
 def learn(poses: Path, output: Output, shapes: Path | None = None, template: Path | None = None,
           skeleton: Path | None = None, landmarks: Path | None = None, subject: str | None = None,
-          unit: Unit | None = None, parts: int | None = None, kind: Kind = "scape", mixed: bool = False,
+          unit: Unit | None = None, parts: Count | None = None, kind: Kind = "scape", mixed: bool = False,
           by_sex: bool = False, sexes: Path | None = None, pictures: bool = True,
           config: Annotated[LearnConfig, tyro.conf.arg(name="")] = LearnConfig(),  # noqa: B008
           other: Annotated[Other, tyro.conf.arg(name="")] = Other(), *, space: FileWorkspace) -> Outcome:

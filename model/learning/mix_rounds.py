@@ -2,11 +2,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Annotated, Literal
 
 import numpy as np
 
 from scanprep.batch.steps import Step
+from scanprep.ranges import TINY, Count, Positive, Range
 
 from ..gradients import GradientSystem, ShapeSolver, pose_gradients
 from ..pose_space import PoseSpace
@@ -51,23 +52,20 @@ class MixConfig(RegressionConfig):
     """
 
     features: Literal["linear", "quadratic", "radial"] = "quadratic"
-    ridges: tuple[float, ...] = (1e-4, 3e-4, 1e-3, 3e-3, 0.01, 0.03, 0.1)
+    ridges: tuple[Positive, ...] = (1e-4, 3e-4, 1e-3, 3e-3, 0.01, 0.03, 0.1)
     smoothness: float = 0.001
     detail: float = 0.005
     components: int = 40
     stiff: int = 20
     steps: int = 2
-    rounds: int = 6
-    held_out: float = 0.2
+    rounds: Count = 6
+    held_out: Annotated[float, Range(TINY, 0.5)] = 0.2
     tolerance: float = 0.01
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         if self.regressor != "ridge":
             raise ValueError(f"regressor: expected 'ridge' for a mix, got {self.regressor!r}")
-        if self.rounds < 1:
-            raise ValueError(f"rounds: expected at least 1, got {self.rounds}")
-        if not 0 < self.held_out <= 0.5:
-            raise ValueError(f"held_out: expected more than 0 and at most 0.5, got {self.held_out}")
 
 
 @dataclass(frozen=True, eq=False)

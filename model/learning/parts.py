@@ -10,6 +10,7 @@ from scipy.spatial import cKDTree
 from scanprep.batch.steps import Step, once
 from scanprep.cleaning.decimate import decimate
 from scanprep.geometry.mesh import Mesh
+from scanprep.ranges import Count, Settings
 from scanprep.skeleton.find import find_skeleton
 from scanprep.skeleton.parts import SkeletonConfig
 from scanprep.skeleton.tree import Skeleton
@@ -24,7 +25,7 @@ QUICK = PoseConfig(prunings=(0.01,), ridges=(1e-3, 1e-2), refinements=1, steps=2
 
 
 @dataclass(frozen=True)
-class PartsConfig:
+class PartsConfig(Settings):
     """Settings of `choose_skeleton`.
 
     Parameters
@@ -39,10 +40,10 @@ class PartsConfig:
         The models that are compared are learned on so many vertices.
     """
 
-    step: int = 4
+    step: Count = 4
     steps: int = 3
     gain: float = 0.03
-    vertices: int = 2500
+    vertices: Count = 2500
 
 
 @dataclass(frozen=True, eq=False)

@@ -8,6 +8,7 @@ from typing import Literal
 import numpy as np
 
 from scanprep.geometry.mesh import Mesh
+from scanprep.ranges import Positive, Settings
 from scanprep.skeleton.tree import Skeleton
 
 from ..features import Lift, LinearLift, PoseFeatures, QuadraticLift, RadialLift, twists
@@ -17,7 +18,7 @@ Judge = Callable[[np.ndarray], float]
 
 
 @dataclass(frozen=True)
-class RegressionConfig:
+class RegressionConfig(Settings):
     """Settings of the regression of Q.
 
     Parameters
@@ -39,8 +40,8 @@ class RegressionConfig:
     features: Literal["linear", "quadratic", "radial"] = "linear"
     regressor: Literal["ridge", "svr"] = "ridge"
     prunings: tuple[float, ...] = (0.003, 0.01, 0.03)
-    ridges: tuple[float, ...] = (1e-4, 1e-3, 3e-3, 0.01, 0.03, 0.1)
-    radii: tuple[float, ...] = (0.5, 0.7, 1.0)
+    ridges: tuple[Positive, ...] = (1e-4, 1e-3, 3e-3, 0.01, 0.03, 0.1)
+    radii: tuple[Positive, ...] = (0.5, 0.7, 1.0)
     tube: float = 2e-4
 
 

@@ -13,10 +13,12 @@ import numpy as np
 
 from scanprep.batch.steps import Step, inside, once
 from scanprep.geometry.mesh import Mesh, check_template
+from scanprep.meaning import HAND, extent, size, unit_problem
 from scanprep.skeleton.tree import Skeleton
 from scanprep.threads import one_thread
 
 from ..blendscape import BlendScapeModel
+from ..body import BodyModel
 from ..borders import face_weights
 from ..carriers import rigid_weights
 from ..digests import body_digest, body_digests, digest
@@ -278,3 +280,20 @@ def checked_bodies(template: Mesh, bodies: np.ndarray, name: str) -> np.ndarray:
     if len(bodies) < 2:
         raise ValueError(f"{name}: expected at least 2 bodies, got {len(bodies)}")
     return bodies
+
+
+def learning_problem(model: BodyModel, people: np.ndarray | None = None) -> str | None:
+    """Why a model that was learned means nothing, with the likely cause; None where it means something.
+
+    Parameters
+    ----------
+    people : (S, N, 3) float, metres, optional
+        That taught the shapes.
+    """
+    error, body = float(model.info.get("left_out_error", 0.0)), model.template
+    spans = [extent(person) for person in people] if people is not None else [extent(body.vertices)]
+    wrong = unit_problem(float(np.median(spans)), extent(body.vertices), "the people are")
+    if error <= HAND * size(body) and wrong is None:
+        return None
+    return (f"a pose that was left out is predicted {1000 * error:.0f} mm off; "
+            f"{wrong or 'too few poses, or meshes whose vertices have another order?'}")

@@ -10,6 +10,7 @@ import numpy as np
 
 from scanprep.batch.steps import Step, inside, once
 from scanprep.geometry.mesh import Mesh, check_template
+from scanprep.ranges import Count, Positive, Settings
 from scanprep.skeleton.tree import Skeleton
 from scanprep.threads import one_thread
 
@@ -29,7 +30,7 @@ QUICK = FitConfig(sample=400, iterations=20, polish=0, tolerance=1e-4)     # of 
 
 
 @dataclass(frozen=True)
-class SkinConfig:
+class SkinConfig(Settings):
     """Settings of `learn_skinning`.
 
     Parameters
@@ -60,14 +61,14 @@ class SkinConfig:
     """
 
     correctives: str = "linear"
-    joints: int = 2
+    joints: Count = 2
     pruning: float = 0.01
-    ridges: tuple[float, ...] = (1e-4, 1e-3, 3e-3, 0.01, 0.03, 0.1, 0.3)
-    width: float = 0.05
+    ridges: tuple[Positive, ...] = (1e-4, 1e-3, 3e-3, 0.01, 0.03, 0.1, 0.3)
+    width: Positive = 0.05
     fading: float = 0.05
     smoothness: float = 0.005
-    parts: int = 4
-    rounds: int = 8
+    parts: Count = 4
+    rounds: Count = 8
     components: int = 40
     people_rounds: int = 3
 

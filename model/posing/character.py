@@ -7,6 +7,8 @@ from typing import Literal
 
 import numpy as np
 
+from scanprep.ranges import Settings
+
 from ..body import BodyModel
 from ..gradients import GradientSystem, ShapeSolver, edges
 from ..learning.sex_plane import PLANE
@@ -19,7 +21,7 @@ OWN_CHARACTER = "character"          # its place in a model's info
 
 
 @dataclass(frozen=True)
-class CharacterConfig:
+class CharacterConfig(Settings):
     """Settings of `character_model`.
 
     Attributes

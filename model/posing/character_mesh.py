@@ -11,15 +11,18 @@ from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.surface import checked_points, checked_surface
 from scanprep.matching.nonrigid import Registration, register
 from scanprep.matching.schedule import RegistrationConfig
+from scanprep.ranges import Count, Settings
 
 from ..body import BodyModel
 from .character import CharacterConfig, character_model, character_pose
 
 Progress = Callable[[int, int], None]
 
+LOST = 0.5                  # share of the character missed, or of joints outside it, that means nothing
+
 
 @dataclass(frozen=True)
-class CharacterMeshConfig:
+class CharacterMeshConfig(Settings):
     """Settings of `register_character`.
 
     Attributes
@@ -38,13 +41,9 @@ class CharacterMeshConfig:
         Less than one round.
     """
 
-    rounds: int = 2
+    rounds: Count = 2
     register: RegistrationConfig = field(default_factory=RegistrationConfig)
     character: CharacterConfig = field(default_factory=CharacterConfig)
-
-    def __post_init__(self) -> None:
-        if self.rounds < 1:
-            raise ValueError(f"rounds: expected at least 1, got {self.rounds}")
 
 
 @dataclass(frozen=True, eq=False)
@@ -142,3 +141,13 @@ def inside(mesh: Mesh, points: np.ndarray) -> np.ndarray:
 
     turns = igl.fast_winding_number(*checked_surface(mesh), checked_points(points))
     return np.asarray(np.abs(turns) > 0.5)
+
+
+def character_problem(found: Character) -> str | None:
+    """Why a character means nothing, with the likely cause; None where it means something."""
+    missed = 0.0 if found.registration is None else found.registration.missed
+    if missed <= LOST and found.inside.mean() >= LOST:
+        return None
+    return (f"{100 * missed:.0f}% of the character lies off the template and {found.inside.sum()} of "
+            f"{len(found.inside)} joints inside it; landmarks of other places, left and right exchanged, or a mesh "
+            "that is no body?")

@@ -11,13 +11,14 @@ from scanprep.cli import Output, Unit
 from scanprep.console import Metric, Outcome, bar
 from scanprep.geometry.files import read_mesh
 from scanprep.geometry.landmarks import read_landmark_vertices, read_landmarks
+from scanprep.meaning import HAND, size
 
 from ..body import BodyModel
 from ..cli import ModelArg
 from ..export.cli import read_motion
 from ..export.meshes import write_frames
 from ..files import load_model
-from .character_mesh import Character, CharacterMeshConfig, register_character
+from .character_mesh import Character, CharacterMeshConfig, character_problem, register_character
 from .transfer import TransferConfig, own_body
 
 MM = 1000.0
@@ -51,7 +52,9 @@ def repose(model: ModelArg, body: BodyArg, poses: Path, output: Output, unit: Un
     return Outcome(output, [
         Metric("meshes", len(written)),
         Metric("distance from the body in its own pose, mean", MM * found.mean, "mm"),
-        Metric("distance from the body in its own pose, largest", MM * found.largest, "mm")], {"repose": config})
+        Metric("distance from the body in its own pose, largest", MM * found.largest, "mm")], {"repose": config},
+        problem=None if found.mean <= HAND * size(loaded.template) else
+        f"the body is {MM * found.mean:.0f} mm from the model's; registered otherwise, or the wrong unit (--unit)?")
 
 
 def character(mesh: CharacterArg, model: Annotated[Path, tyro.conf.arg(aliases=["-m"])], output: Output,
@@ -92,7 +95,7 @@ def character(mesh: CharacterArg, model: Annotated[Path, tyro.conf.arg(aliases=[
         from .character_picture import picture_character
 
         save_png(output.with_suffix(".png"), picture_character(found))
-    return Outcome(output, _about(loaded, found), {"character": config})
+    return Outcome(output, _about(loaded, found), {"character": config}, problem=character_problem(found))
 
 
 def _about(model: BodyModel, found: Character) -> list[Metric]:

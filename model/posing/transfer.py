@@ -6,6 +6,8 @@ from functools import singledispatch
 
 import numpy as np
 
+from scanprep.ranges import Settings
+
 from ..body import BodyModel
 from ..carriers import build_basis
 from ..features import Terms
@@ -17,7 +19,7 @@ from ..skinning import SkinningModel
 
 
 @dataclass(frozen=True)
-class TransferConfig:
+class TransferConfig(Settings):
     """Settings of `subject_from_body` and `repose`.
 
     Parameters

@@ -11,6 +11,7 @@ from scipy.spatial import cKDTree
 from scanprep.cleaning.decimate import DecimateConfig, decimate
 from scanprep.geometry.mesh import Mesh, check_template
 from scanprep.geometry.surface import Surface
+from scanprep.ranges import Count, Settings
 from scanprep.skeleton.tree import Skeleton
 
 from ..blendscape import BlendScapeModel
@@ -26,7 +27,7 @@ ASTRAY = 2.0                         # mean edges of the coarser surface that th
 
 
 @dataclass(frozen=True)
-class ResolutionConfig:
+class ResolutionConfig(Settings):
     """Settings of `change_resolution`.
 
     Parameters
@@ -40,8 +41,8 @@ class ResolutionConfig:
         How often each is corrected; none for a fast and rougher answer.
     """
 
-    poses: int = 40
-    shape_poses: int = 8
+    poses: Count = 40
+    shape_poses: Count = 8
     rounds: int = 2
 
 

@@ -10,6 +10,7 @@ import tyro
 from scanprep.cli import Output, Unit
 from scanprep.console import Metric, Outcome, bar
 from scanprep.geometry.files import read_mesh
+from scanprep.ranges import Faces
 
 from ..cli import ModelArg
 from ..files import load_model
@@ -20,7 +21,7 @@ MM = 1000.0
 MEASURED = 20                        # poses in which the two models are compared
 
 
-def resample_model(model: ModelArg, output: Output, template: Path | None = None, vertices: int | None = None,
+def resample_model(model: ModelArg, output: Output, template: Path | None = None, vertices: Faces | None = None,
                    unit: Unit | None = None, config: Annotated[ResolutionConfig, tyro.conf.arg(name="")]
                    = ResolutionConfig()) -> Outcome:  # noqa: B008
     """Carry a model to fewer or more triangles; poses, betas and places keep their meaning.

@@ -14,6 +14,7 @@ from typing import Any, TypeVar
 from urllib.parse import quote
 
 from ..geometry import storage
+from ..ranges import Processes, Settings
 from ..threads import begin_worker, one_thread
 from .digests import Digests, paths_of
 from .values import load_header, load_value, save_value
@@ -24,7 +25,7 @@ WATCH = 0.2                    # seconds between two looks whether the process t
 
 
 @dataclass(frozen=True)
-class Workers:
+class Workers(Settings):
     """Who does the work.
 
     Parameters
@@ -37,7 +38,7 @@ class Workers:
         Send the files of each task to those workers, which otherwise read them under the same path.
     """
 
-    workers: int = 0
+    workers: Processes = 0
     scheduler: str | None = None
     ship: bool = False
 

@@ -10,6 +10,7 @@ import numpy as np
 from ..geometry import rotations
 from ..geometry.mesh import Mesh
 from ..geometry.surface import OrientedPoints
+from ..ranges import Cosine, Count, Positive, Settings, Share
 from .merge import border_distance, mesh_and_camera
 from .place_features import place_by_features
 from .place_views import fit_of_views, place_by_landmarks
@@ -17,7 +18,7 @@ from .remesh import smooth
 
 
 @dataclass(frozen=True)
-class AlignViewsConfig:
+class AlignViewsConfig(Settings):
     """Settings of `align_views`.
 
     Attributes
@@ -42,15 +43,15 @@ class AlignViewsConfig:
         Share of a view that others may look through before its place is not trusted.
     """
 
-    iterations: int = 60
-    points: int = 4000
-    reach: float = 0.08
-    min_cosine: float = 0.8
+    iterations: Count = 60
+    points: Count = 4000
+    reach: Positive = 0.08
+    min_cosine: Cosine = 0.8
     border: float = 0.02
     smoothing: int = 10
     tolerance: float = 5e-5
-    min_overlap: float = 0.15
-    max_conflict: float = 0.03
+    min_overlap: Share = 0.15
+    max_conflict: Share = 0.03
 
 
 @dataclass(frozen=True, eq=False)
@@ -124,7 +125,7 @@ def align_views(views: Sequence[Any], config: AlignViewsConfig | None = None,
     pairs = [_moved(pair, T) for pair, T in zip(pairs, start, strict=True)]
     samples = [_oriented(mesh, config, rng) for mesh, _ in pairs]
     poses = np.tile(np.eye(4), (len(pairs), 1, 1))
-    reach, rms, settled, rounds = config.reach, 0.0, len(pairs) == 1, 0
+    reach, rms, settled, rounds = config.reach, np.nan, len(pairs) == 1, 0
     while rounds < config.iterations and not settled:
         placed = [(p @ T[:3, :3].T + T[:3, 3], n @ T[:3, :3].T)
                   for T, (p, n, _) in zip(poses, samples, strict=True)]
@@ -201,3 +202,11 @@ def _solve(placed: list[tuple[np.ndarray, np.ndarray]],
     T[:, :3, :3] = rotations.exp(step[:, :3])
     T[:, :3, 3] = step[:, 3:] + centre - np.einsum("vij,j->vi", T[:, :3, :3], centre)
     return T, np.concatenate(residuals)
+
+
+def views_problem(found: AlignedViews) -> str | None:
+    """Why aligned views mean nothing; None where some are in place."""
+    if found.trusted.any():
+        return None
+    return (f"no view is in its place, they share {100 * float(found.overlap.max()):.0f}% of their surface at most; "
+            "the wrong cameras, another unit (--unit), or a start that is too far off (--landmarks, --features)?")

@@ -15,7 +15,8 @@ from ..geometry.files import UNITS, PointCloud, list_meshes, read_mesh, write_me
 from ..geometry.landmarks import read_landmark_vertices, read_landmarks
 from ..geometry.mesh import Mesh
 from ..pipeline.scans import LANDMARK_ENDINGS, read_scan
-from .align_views import AlignViewsConfig, align_views
+from ..ranges import Faces
+from .align_views import AlignViewsConfig, align_views, views_problem
 from .components import CleanScanConfig, clean_scan
 from .decimate import DecimateConfig, decimate
 from .decimate_set import DecimateSetConfig
@@ -27,7 +28,7 @@ from .template import make_template
 ViewsArg = Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="VIEWS")]
 
 
-def template_of_views(views: ViewsArg, output: Output, cameras: Path | None = None, faces: int = 14000,
+def template_of_views(views: ViewsArg, output: Output, cameras: Path | None = None, faces: Faces = 14000,
                       unit: Unit | None = None) -> Outcome:
     """Merge range views, close the holes, and decimate to a template.
 
@@ -108,7 +109,7 @@ def align_cameras(views: ViewsArg, output: Output, cameras: Path | None = None, 
         Metric("largest shift of a camera", MM * max(shifts), "mm"),
         Metric("seen by others too, least of a view", 100 * float(found.overlap.min()), "%"),
         Metric("looked through by others, most of a view", 100 * float(found.conflict.max()), "%")],
-        {"views": config}, [f"{name}: its place is not to be trusted" for name in doubtful])
+        {"views": config}, [f"{name}: its place is not to be trusted" for name in doubtful], views_problem(found))
 
 
 def _view_landmarks(folder: Path, name: str, view: Mesh, unit: Unit | None) -> dict[str, np.ndarray]:
@@ -171,7 +172,7 @@ def fill(mesh: MeshArg, output: Output, views: Path | None = None, cameras: Path
         *about_mesh(after)], {"fill": config})
 
 
-def reduce(mesh: MeshArg, output: Output, faces: int, landmarks: Path | None = None, unit: Unit | None = None,
+def reduce(mesh: MeshArg, output: Output, faces: Faces, landmarks: Path | None = None, unit: Unit | None = None,
            config: Annotated[DecimateConfig, tyro.conf.arg(name="")] = DecimateConfig()) -> Outcome:  # noqa: B008
     """Fewer triangles for the same surface.
 
@@ -193,7 +194,7 @@ def reduce(mesh: MeshArg, output: Output, faces: int, landmarks: Path | None = N
     return Outcome(output, [Metric("triangles before", len(before.faces)), *about_mesh(after)], {"decimate": config})
 
 
-def reduce_set(registered: SetArg, output: Output, faces: int,
+def reduce_set(registered: SetArg, output: Output, faces: Faces,
                config: Annotated[DecimateSetConfig, tyro.conf.arg(name="")] = DecimateSetConfig()  # noqa: B008
                ) -> Outcome:
     """A registered set in fewer triangles: template, meshes, skeleton and landmarks stay in step.

@@ -9,6 +9,7 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from ..geometry.mesh import Mesh
+from ..ranges import Settings
 from .floor import FloorConfig, Plane, find_plane, floor_points
 
 LARGEST, LANDMARKS, NEAR = "the largest piece", "the piece with the landmarks", "near the body"
@@ -16,7 +17,7 @@ FAR, SPECKS, FLOOR = "apart from the body", "specks", "a plane with all on one s
 
 
 @dataclass(frozen=True)
-class CleanScanConfig:
+class CleanScanConfig(Settings):
     """Settings of `clean_scan`.
 
     Attributes

@@ -10,6 +10,7 @@ from scipy.spatial import cKDTree
 
 from ..geometry.mesh import Mesh
 from ..geometry.surface import Surface
+from ..ranges import Settings
 from .decimate_begin import begin
 from .decimate_mend import fast_collapses
 from .decimate_quadrics import sum_at
@@ -20,7 +21,7 @@ METHODS = ("quadric", "even", "fast", "open3d", "pymeshlab")
 
 
 @dataclass(frozen=True)
-class DecimateConfig:
+class DecimateConfig(Settings):
     """Settings of `decimate`.
 
     Attributes

@@ -6,6 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ..ranges import Cosine, Settings, Share, SomeShare
 from .decimate_quadrics import lowest, value
 
 FREE, CURVE, FIXED = 0, 1, 2
@@ -14,7 +15,7 @@ STUCK = 1e-3, 5                      # where so many rounds take less of the tri
 
 
 @dataclass(frozen=True)
-class RoundsConfig:
+class RoundsConfig(Settings):
     """Settings of `Rounds`.
 
     Attributes
@@ -35,9 +36,9 @@ class RoundsConfig:
         Collapse onto one of the two vertices instead of to the point of least error.
     """
 
-    share: float = 0.3
-    min_cosine: float = 0.3
-    min_quality: float = 0.1
+    share: SomeShare = 0.3
+    min_cosine: Cosine = 0.3
+    min_quality: Share = 0.1
     hold: float = 3e-4
     wall: float = 30.0
     seam: float = 3.0

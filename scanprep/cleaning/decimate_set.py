@@ -9,6 +9,7 @@ import numpy as np
 
 from ..geometry import rotations
 from ..geometry.mesh import Mesh, check_template
+from ..ranges import Count, Settings
 from ..skeleton.tree import Skeleton
 from .decimate_begin import begin, checked_vertices, held_curves, kept_curves
 from .decimate_quadrics import lowest, sum_at, surface_quadrics
@@ -19,7 +20,7 @@ PLACEMENTS = ("vertices", "solved")
 
 
 @dataclass(frozen=True)
-class DecimateSetConfig:
+class DecimateSetConfig(Settings):
     """Settings of `decimate_set`.
 
     Attributes
@@ -37,7 +38,7 @@ class DecimateSetConfig:
         Settings of the collapses.
     """
 
-    meshes: int = 8
+    meshes: Count = 8
     placement: Literal["vertices", "solved"] = "vertices"
     anchor: float = 0.03
     rounds: RoundsConfig = field(default_factory=RoundsConfig)

@@ -2,6 +2,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 from scipy.sparse import coo_array, csc_array, csr_array, diags_array
@@ -9,6 +10,7 @@ from scipy.sparse import coo_array, csc_array, csr_array, diags_array
 from ..geometry.mesh import Mesh
 from ..geometry.sparse import factor
 from ..geometry.surface import Surface
+from ..ranges import Positive, Range, Settings
 from .carve import SeenSpace
 from .merge import zero_surface
 
@@ -16,7 +18,7 @@ EMPTY_ROUNDS = 6
 
 
 @dataclass(frozen=True)
-class DiffusionConfig:
+class DiffusionConfig(Settings):
     """Settings of `diffused_surface`.
 
     Attributes
@@ -31,8 +33,8 @@ class DiffusionConfig:
         Space counts as seen to be empty this far in front of what was seen.
     """
 
-    voxels: int = 12
-    band: float = 3.0
+    voxels: Annotated[int, Range(2, 1000)] = 12
+    band: Positive = 3.0
     margin: float = 5.0
     empty: float = 0.01
 

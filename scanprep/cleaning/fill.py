@@ -3,12 +3,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import numpy as np
 
 from ..geometry.mesh import Mesh, template_problem
 from ..geometry.surface import Rays, Surface
+from ..ranges import Count, Positive, Range, Settings
 from .carve import SeenSpace
 from .diffusion import DiffusionConfig, diffused_surface
 from .intersections import intersecting_faces
@@ -21,7 +22,7 @@ PULL, PULL_ROUNDS = 3e3, 4           # of the diffused surface on a patch, for a
 
 
 @dataclass(frozen=True)
-class FillConfig:
+class FillConfig(Settings):
     """Settings of `fill_holes`.
 
     Attributes
@@ -47,13 +48,13 @@ class FillConfig:
     """
 
     method: Literal["auto", "fair", "diffusion", "poisson-open3d", "poisson-pymeshlab"] = "auto"
-    max_edges: int | None = None
-    density: float = 2 ** 0.5
+    max_edges: Count | None = None
+    density: Positive = 2 ** 0.5
     fair_rounds: int = 0
     exact_edges: int = 120
     join: bool = True
     diffusion: DiffusionConfig = field(default_factory=DiffusionConfig)
-    poisson_depth: int = 8
+    poisson_depth: Annotated[int, Range(1, 16)] = 8
 
 
 @dataclass(frozen=True, eq=False)

@@ -7,9 +7,11 @@ import numpy as np
 from scipy import ndimage
 from scipy.spatial import cKDTree
 
+from ..ranges import Count, Positive, Settings, Share
+
 
 @dataclass(frozen=True)
-class FloorConfig:
+class FloorConfig(Settings):
     """Settings of `find_plane` and `floor_points`.
 
     Attributes
@@ -33,13 +35,13 @@ class FloorConfig:
     """
 
     min_area: float = 0.1
-    max_below: float = 0.01
-    tries: int = 150
-    widest: float = 0.03
-    roughest: float = 2.0
-    sigmas: float = 3.5
+    max_below: Share = 0.01
+    tries: Count = 150
+    widest: Positive = 0.03
+    roughest: Positive = 2.0
+    sigmas: Positive = 3.5
     footprint_height: float = 0.03
-    bridge: float = 0.015
+    bridge: Positive = 0.015
 
 
 @dataclass(frozen=True)

@@ -3,13 +3,14 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 from scipy.sparse.csgraph import dijkstra
 
 from ..geometry.mesh import Mesh
 from ..geometry.surface import Rays, barycentric
+from ..ranges import Cell, Cosine, Range, Settings, Share
 from .remesh import smooth
 from .repair import drop_small_components, split_vertices
 
@@ -18,7 +19,7 @@ CORNERS = np.array([(0, 0, 0), (1, 0, 0), (1, 1, 0), (0, 1, 0), (0, 0, 1), (1, 0
 
 
 @dataclass(frozen=True)
-class MergeConfig:
+class MergeConfig(Settings):
     """Settings of `merge_views`.
 
     Attributes
@@ -39,19 +40,13 @@ class MergeConfig:
         Pieces with a smaller share of the vertices of the largest one are dropped.
     """
 
-    voxel: float = 0.004
-    truncation: float = 3.0
-    min_cosine: float = 0.1
+    voxel: Cell = 0.004
+    truncation: Annotated[float, Range(1, BLOCK)] = 3.0
+    min_cosine: Cosine = 0.1
     taper: float = 0.02
     min_weight: float = 0.02
     carving: float = 0.0
-    min_component: float = 0.02
-
-    def __post_init__(self) -> None:
-        if not self.voxel > 0:
-            raise ValueError(f"voxel: expected a positive length in metres, got {self.voxel}")
-        if not 1 <= self.truncation <= BLOCK:
-            raise ValueError(f"truncation: expected 1 to {BLOCK} voxels, got {self.truncation}")
+    min_component: Share = 0.02
 
 
 @dataclass(frozen=True, eq=False)

@@ -8,6 +8,7 @@ from scipy.sparse import coo_array, csr_array
 
 from ..geometry.mesh import Mesh
 from ..geometry.surface import Surface
+from ..ranges import Settings
 
 
 def triangle_quality(mesh: Mesh) -> np.ndarray:
@@ -162,7 +163,7 @@ def smooth(mesh: Mesh, rounds: int = 10, lower: float = 0.5, upper: float = -0.5
 
 
 @dataclass(frozen=True)
-class ImproveConfig:
+class ImproveConfig(Settings):
     """Settings of `improve_triangles`.
 
     Attributes

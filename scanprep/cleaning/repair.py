@@ -9,10 +9,11 @@ from scipy.sparse.csgraph import connected_components
 
 from ..geometry.mesh import Mesh
 from ..geometry.surface import Rays
+from ..ranges import Settings, Share
 
 
 @dataclass(frozen=True)
-class RepairConfig:
+class RepairConfig(Settings):
     """Settings of `repair`.
 
     Attributes
@@ -27,7 +28,7 @@ class RepairConfig:
 
     weld: float = 1e-7
     min_area: float = 1e-12
-    min_component: float = 1.0
+    min_component: Share = 1.0
 
 
 def repair(mesh: Mesh, config: RepairConfig | None = None) -> Mesh:

@@ -9,6 +9,7 @@ import numpy as np
 
 from ..geometry.mesh import Mesh, check_template
 from ..geometry.surface import Surface
+from ..ranges import Settings
 from .decimate import DecimateConfig, decimate
 from .fill import FillConfig, close
 from .merge import MergeConfig, merge_views
@@ -17,7 +18,7 @@ from .repair import drop_thin, peel_border, repair
 
 
 @dataclass(frozen=True)
-class TemplateConfig:
+class TemplateConfig(Settings):
     """Settings of `make_template`.
 
     Attributes

@@ -17,6 +17,7 @@ from scipy.sparse import bsr_array, coo_array, csc_array, diags_array, kron
 
 from ..geometry.mesh import Mesh
 from ..geometry.sparse import Factored, factor
+from ..ranges import Count, Positive, Settings
 from .energies import UNKNOWNS, NodePattern, Pull, Term, bend_term, data_term, stretch_term
 from .graph import DeformationGraph, NodeMotion, build_graph, carry_over, deform, start
 from .shell import conjugate_gradients
@@ -25,7 +26,7 @@ LinkKind = Literal["rigid", "affine"]
 
 
 @dataclass(frozen=True)
-class LinkStage:
+class LinkStage(Settings):
     """One stage of a registration by links. Lengths are multiples of the template's size, √area.
 
     Attributes
@@ -50,13 +51,13 @@ class LinkStage:
     """
 
     kind: LinkKind
-    length: float
+    length: Positive
     landmarks: float
     reach: float
-    rounds: int = 2
+    rounds: Count = 2
     translation: float = 1.0
-    bend: float = 0.1
-    nodes: int = 2000
+    bend: Positive = 0.1
+    nodes: Count = 2000
     slide: float = 1.0
 
 

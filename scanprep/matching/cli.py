@@ -15,9 +15,10 @@ from ..geometry.mesh import Mesh
 from ..pipeline.scans import read_scan
 from .correlated import CorrelatedConfig, find_correspondences
 from .correspondence_files import read_correspondences, write_correspondences
+from .correspondences import correspondences_problem
 from .functional import find_functional_correspondences
-from .nonrigid import register
-from .rigid import RigidConfig, align_landmarks, align_rigid
+from .nonrigid import register, registration_problem
+from .rigid import RigidConfig, align_landmarks, align_rigid, alignment_problem
 
 TargetArg = Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="TARGET")]
 
@@ -43,7 +44,8 @@ def align(source: MeshArg, target: TargetArg, output: Output, landmarks: Path | 
     write_mesh(output, moving.with_vertices(moving.vertices @ T[:3, :3].T + T[:3, 3]))
     return Outcome(output, [
         Metric("RMS distance", MM * found.rms, "mm"), Metric("converged", str(found.converged)),
-        Metric("T_target_source", np.array2string(T, precision=6).replace("\n", " "))], {"align": config})
+        Metric("T_target_source", np.array2string(T, precision=6).replace("\n", " "))], {"align": config},
+        problem=alignment_problem(moving.vertices, fixed.vertices, found))
 
 
 def correspond(scan: ScanArg, template: Path, output: Output, landmarks: Path | None = None,
@@ -74,7 +76,8 @@ def correspond(scan: ScanArg, template: Path, output: Output, landmarks: Path | 
         Metric("method", found.method), Metric("landmarks", len(pairs[0]) if pairs else 0),
         Metric("correspondences", len(found)),
         Metric("confidence, median", float(np.median(found.confidence))),
-        Metric("converged", str(found.converged))], {} if functional else {"correspond": config})
+        Metric("converged", str(found.converged))], {} if functional else {"correspond": config},
+        problem=None if functional else correspondences_problem(found))
 
 
 def register_one(scan: ScanArg, template: Path, output: Output, landmarks: Path | None = None,
@@ -105,7 +108,8 @@ def register_one(scan: ScanArg, template: Path, output: Output, landmarks: Path 
         Metric("confidence, mean", float(fit.confidence.mean())),
         Metric("scan off the template", 100 * fit.missed, "%"),
         Metric("distance of landmarks, RMS", MM * fit.landmark_rms, "mm"),
-        Metric("flipped triangles", fit.flipped), Metric("converged", str(fit.converged))])
+        Metric("flipped triangles", fit.flipped), Metric("converged", str(fit.converged))],
+        problem=registration_problem(body, data, fit, pairs is not None))
 
 
 def _pairs(body: Mesh, data: Mesh | np.ndarray, template: Path, landmarks: Path, template_landmarks: Path | None,

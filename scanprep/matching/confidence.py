@@ -88,3 +88,20 @@ def missed_share(scan: Mesh | np.ndarray, registered: Mesh, far: float, samples:
     points = scan.vertices if isinstance(scan, Mesh) else scan
     points = points[:: max(1, len(points) // samples)]
     return float((Surface(registered).closest(points).distances > far).mean())
+
+
+def stretched_share(template: Mesh, registered: Mesh, factor: float = 2.0) -> float:
+    """Share of the template's area that is longer by `factor`, or shorter, in some direction than the template."""
+    long, short = principal_stretches(template, registered)
+    return float(template.face_areas @ ((long > factor) | (short < 1 / factor)) / template.face_areas.sum())
+
+
+def principal_stretches(template: Mesh, registered: Mesh) -> tuple[np.ndarray, np.ndarray]:
+    """The largest and the smallest stretch (F,) of every triangle."""
+    rest, now = (m.corners[:, 1:] - m.corners[:, :1] for m in (template, registered))
+    # edges of the template in an orthonormal basis of its triangle, as a lower triangular matrix
+    gram = np.einsum("fid,fjd->fij", rest, rest)
+    basis = np.linalg.inv(np.linalg.cholesky(gram + 1e-18 * np.eye(2)))
+    metric = np.einsum("fij,fjd,fkd,flk->fil", basis, now, now, basis)
+    squared = np.linalg.eigvalsh(metric)
+    return np.sqrt(np.maximum(squared[:, 1], 0)), np.sqrt(np.maximum(squared[:, 0], 0))

@@ -5,11 +5,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ..ranges import Positive, Settings
 from .correlated_places import Places
 
 
 @dataclass(frozen=True)
-class PotentialConfig:
+class PotentialConfig(Settings):
     """Widths and weights of the potentials; a width is the error that costs one.
 
     Attributes
@@ -36,13 +37,13 @@ class PotentialConfig:
     """
 
     seed_share: float = 0.10
-    seed_floor: float = 0.014
-    turn: float = 0.4
+    seed_floor: Positive = 0.014
+    turn: Positive = 0.4
     turn_weight: float = 3.0
     length_share: float = 0.08
-    length_floor: float = 0.006
-    lean: float = 0.25
-    direction: float = 0.3
+    length_floor: Positive = 0.006
+    lean: Positive = 0.25
+    direction: Positive = 0.3
     direction_weight: float = 1.0
     place_weight: float = 0.5
     nothing: float = 0.5

@@ -10,6 +10,7 @@ from scipy.spatial import cKDTree
 
 from ..geometry.geodesics import SurfaceGraph
 from ..geometry.mesh import Mesh
+from ..ranges import Cell, Count, Positive, Settings, Share
 from .beliefs import Beliefs, PairField, propagate
 from .correlated_energies import (
     PotentialConfig,
@@ -25,7 +26,7 @@ from .graph import farthest_points
 
 
 @dataclass(frozen=True)
-class BeliefLevel:
+class BeliefLevel(Settings):
     """One level from coarse to fine.
 
     Attributes
@@ -36,12 +37,12 @@ class BeliefLevel:
         Of them, how many a point of the scan may choose from.
     """
 
-    places: int
-    domain: int
+    places: Count
+    domain: Count
 
 
 @dataclass(frozen=True)
-class CorrelatedConfig:
+class CorrelatedConfig(Settings):
     """Settings of `find_correspondences`. Lengths are multiples of the template's size, √area.
 
     Attributes
@@ -74,20 +75,20 @@ class CorrelatedConfig:
         Points of the scan over which its normals are averaged.
     """
 
-    points: int = 240
-    keep: int = 170
-    spacing: float = 0.009
-    links: int = 6
-    frame: float = 0.042
-    bridged: float = 0.3
+    points: Count = 240
+    keep: Count = 170
+    spacing: Cell = 0.009
+    links: Count = 6
+    frame: Positive = 0.042
+    bridged: Share = 0.3
     levels: tuple[BeliefLevel, ...] = (BeliefLevel(2000, 80), BeliefLevel(2000, 60), BeliefLevel(1_000_000, 60))
     potentials: PotentialConfig = field(default_factory=PotentialConfig)
-    iterations: int = 40
-    damping: float = 0.3
-    spread: float = 0.012
-    certain: float = 0.03
-    strained: float = 4.0
-    neighbours: int = 16
+    iterations: Count = 40
+    damping: Share = 0.3
+    spread: Positive = 0.012
+    certain: Positive = 0.03
+    strained: Positive = 4.0
+    neighbours: Count = 16
 
 
 class Search:

@@ -20,6 +20,7 @@ from scipy.spatial import cKDTree
 
 from ..geometry.mesh import Mesh, check_template
 from ..geometry.sparse import factor
+from ..ranges import Cell, Count, Settings
 from .correlated_sheet import Sheet
 from .correspondences import Correspondences, checked_pairs
 from .graph import farthest_points
@@ -27,7 +28,7 @@ from .matches import Target, target_of
 
 
 @dataclass(frozen=True)
-class FunctionalConfig:
+class FunctionalConfig(Settings):
     """Settings of `find_functional_correspondences`.
 
     Attributes
@@ -48,15 +49,15 @@ class FunctionalConfig:
         Points of the scan over which its normals are averaged.
     """
 
-    first: int = 20
-    last: int = 120
-    step: int = 5
-    energies: int = 30
+    first: Count = 20
+    last: Count = 120
+    step: Count = 5
+    energies: Count = 30
     commute: float = 1e-3
-    spacing: float = 0.012
-    sample: int = 1200
-    points: int = 170
-    neighbours: int = 16
+    spacing: Cell = 0.012
+    sample: Count = 1200
+    points: Count = 170
+    neighbours: Count = 16
 
 
 @dataclass(frozen=True, eq=False)

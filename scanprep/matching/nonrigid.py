@@ -15,9 +15,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..geometry.mesh import Mesh, check_template
+from ..meaning import HAND, extent, size, unit_problem
 from ..threads import one_thread
 from .anchors import hints_of
-from .confidence import evidence, missed_share
+from .confidence import evidence, missed_share, stretched_share
 from .correspondences import Correspondences, checked_pairs
 from .fit import Fit
 from .matches import target_of
@@ -29,6 +30,8 @@ __all__ = ["GraphStage", "Registration", "RegistrationConfig", "ShellStage", "re
 
 WIDER = (2,), (2, 3), (3, 4)     # rings of the patches where folds are left
 FAR = 0.01                       # of the template's size: points of the scan farther off were missed
+LOST, UNSEEN = 0.5, 0.01         # shares, of the scan missed and of the template with data, that mean nothing
+ASTRAY = 0.05                    # so much missed and so much stretched: with left and right exchanged 0.13 and 0.10
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,6 +51,7 @@ class Registration:
     landmark_rms : float, metres
         NaN without landmarks.
     converged : bool
+        Never without data.
     iterations : int
         Steps over all stages.
     energies : dict
@@ -124,6 +128,28 @@ def register(template: Mesh, scan: Mesh | np.ndarray, landmarks: tuple[np.ndarra
     return _result(fit, scan)
 
 
+def registration_problem(template: Mesh, scan: Mesh | np.ndarray, fit: Registration, marked: bool) -> str | None:
+    """Why a registration means nothing, with the likely cause; None where it means something.
+
+    Parameters
+    ----------
+    marked : bool
+        Whether landmarks led it.
+    """
+    points = scan.vertices if isinstance(scan, Mesh) else scan
+    far, seen, stretch = fit.missed, float(fit.seen.mean()), stretched_share(template, fit.mesh)
+    off = fit.landmark_rms > HAND * size(template)
+    if not (far > LOST or seen < UNSEEN or (far > ASTRAY and stretch > ASTRAY) or off):
+        return None
+    cause = unit_problem(extent(points), extent(template.vertices), "the scan is", 0.05) or (
+        "landmarks of left and right exchanged, or of other places?" if marked and seen >= UNSEEN else
+        "a scan of something else, or too few points?" if marked else
+        "a scan of something else, or a pose far from the template's, which needs landmarks?")
+    marks = f", its landmarks are {1000 * fit.landmark_rms:.0f} mm off" if marked else ""
+    return (f"{100 * far:.0f}% of the scan lies off the template, {100 * seen:.2g}% of the template has data, "
+            f"{100 * stretch:.0f}% of it is stretched or shrunk to the double or half{marks}; {cause}")
+
+
 def _without_folds(template: Mesh, x: np.ndarray) -> np.ndarray:
     """Vertices (N, 3) where patches around turned triangles were laid anew, wider ones while that leaves fewer."""
     x = unfold(template, x, turns(template, x))
@@ -152,5 +178,5 @@ def _result(fit: Fit, scan: Mesh | np.ndarray) -> Registration:
         landmark_rms = float(np.sqrt(np.mean(apart**2)))
     return Registration(body, distances, seen,
                         float(np.sqrt(np.mean(distances[seen] ** 2))) if seen.any() else np.nan, landmark_rms,
-                        fit.converged, fit.iterations, fit.energies, int(folded.sum()), found.confidence,
-                        missed_share(scan, body, FAR * fit.size))
+                        bool(fit.converged and seen.any()), fit.iterations, fit.energies, int(folded.sum()),
+                        found.confidence, missed_share(scan, body, FAR * fit.size))

@@ -8,12 +8,16 @@ from scipy.spatial import cKDTree
 
 from ..geometry import rotations
 from ..geometry.mesh import Mesh
+from ..meaning import extent, unit_problem
+from ..ranges import Count, Positive, Settings, SomeShare
 from ..threads import search_threads
 from .matches import target_of
 
+LEAST = 6                   # matches that determine a motion
+ASTRAY = 0.025              # of the smaller extent: surfaces so far apart do not lie on each other
 
 @dataclass(frozen=True)
-class RigidConfig:
+class RigidConfig(Settings):
     """Settings of `align_rigid`.
 
     Attributes
@@ -22,7 +26,7 @@ class RigidConfig:
         Most rounds of matching.
     keep : float
         Share of the matches, the nearest ones, that count.
-    reach : float, metres
+    reach : float, metres, optional
         Farthest match that counts.
     neighbours : int
         Points whose spread gives the normals of a cloud.
@@ -30,10 +34,10 @@ class RigidConfig:
         Settled when a round moves the points by less than this share of their spread.
     """
 
-    iterations: int = 60
-    keep: float = 0.8
-    reach: float = np.inf
-    neighbours: int = 16
+    iterations: Count = 60
+    keep: SomeShare = 0.8
+    reach: Positive | None = None
+    neighbours: Count = 16
     tolerance: float = 1e-6
 
 
@@ -109,6 +113,7 @@ def align_rigid(source: Mesh | np.ndarray, target: Mesh | np.ndarray,
         Empty input, values that are not finite, fewer than three landmarks.
     """
     config = config or RigidConfig()
+    reach = np.inf if config.reach is None else config.reach
     moving = _points(source.vertices if isinstance(source, Mesh) else source, "source")
     goal = target_of(target, config.neighbours, name="target")
     T = np.eye(4) if start is None else np.array(start, dtype=np.float64)
@@ -120,9 +125,9 @@ def align_rigid(source: Mesh | np.ndarray, target: Mesh | np.ndarray,
     while rounds < config.iterations and not settled:
         moved = apply(T, moving)
         distance, near = tree.query(moved, workers=search_threads(len(moved)))
-        good = (distance <= config.reach) & (distance <= np.quantile(distance, config.keep)) & ~goal.border[near]
+        good = (distance <= reach) & (distance <= np.quantile(distance, config.keep)) & ~goal.border[near]
         inliers = int(good.sum())
-        if inliers < 6:
+        if inliers < LEAST:
             break
         step, residual = _plane_step(moved[good], goal.points[near[good]], goal.normals[near[good]])
         T = step @ T
@@ -163,3 +168,13 @@ def _points(points: np.ndarray, name: str) -> np.ndarray:
     if not np.isfinite(points).all():
         raise ValueError(f"{name}: {(~np.isfinite(points).all(axis=1)).sum()} points are not finite")
     return points
+
+
+def alignment_problem(source: np.ndarray, target: np.ndarray, found: RigidAlignment) -> str | None:
+    """Why a rigid alignment of points (n, 3) to others means nothing; None where it means something."""
+    ours, theirs = extent(source), extent(target)
+    if found.inliers >= LEAST and found.rms <= ASTRAY * min(ours, theirs):
+        return None
+    off = f"the surfaces are {1000 * found.rms:.0f} mm apart" if found.inliers >= LEAST else "the surfaces do not meet"
+    return f"{off}; " + (unit_problem(ours, theirs, "the source is", 0.05) or
+                         "a start far from the target, which needs landmarks, or something else?")

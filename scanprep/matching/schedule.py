@@ -3,13 +3,14 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field
 
+from ..ranges import Cell, Count, Positive, Settings
 from .affine import LinkStage, allen_stages, amberg_stages, hahnel_stages
 from .settle import SettleConfig
 from .twists import TwistConfig
 
 
 @dataclass(frozen=True)
-class GraphStage:
+class GraphStage(Settings):
     """One stage of the coarse registration. Lengths are multiples of the template's size, √area.
 
     Attributes
@@ -39,15 +40,15 @@ class GraphStage:
         The share of the surface that all given correspondences together weigh as much as.
     """
 
-    nodes: int
-    stretch: float
-    bend: float
-    growth: float
+    nodes: Count
+    stretch: Positive
+    bend: Positive
+    growth: Positive
     landmarks: float
     reach: float
     slide: float = 0.02
-    rounds: int = 2
-    detail: float = 0.02
+    rounds: Count = 2
+    detail: Cell = 0.02
     place: float = 1.0
     paths: float = 0.0
     hints: float = 0.0
@@ -55,7 +56,7 @@ class GraphStage:
 
 
 @dataclass(frozen=True)
-class ShellStage:
+class ShellStage(Settings):
     """One round of the last pass. Lengths are multiples of the template's size, √area.
 
     Attributes
@@ -69,14 +70,14 @@ class ShellStage:
     """
 
     smoothing: float
-    tension: float
+    tension: Positive
     landmarks: float
-    reach: float
+    reach: Positive
     slide: float = 0.02
 
 
 @dataclass(frozen=True)
-class RegistrationConfig:
+class RegistrationConfig(Settings):
     """Settings of `register`.
 
     Attributes
@@ -117,10 +118,10 @@ class RegistrationConfig:
     shell: tuple[ShellStage, ...] = ()
     twists: TwistConfig = field(default_factory=TwistConfig)
     settle: SettleConfig | None = field(default_factory=SettleConfig)
-    path_cell: float = 0.012
-    neighbours: int = 16
+    path_cell: Cell = 0.012
+    neighbours: Count = 16
     normal_weight: float = 0.04
-    near: float = 0.015
+    near: Positive = 0.015
     settled: float = 0.001
 
 

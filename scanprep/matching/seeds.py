@@ -9,6 +9,7 @@ import numpy as np
 
 from ..geometry.geodesics import SurfaceGraph
 from ..geometry.mesh import Mesh, check_template
+from ..ranges import Cell, Count, Positive, Settings
 from ..threads import one_thread
 from .correlated_search import BeliefLevel, CorrelatedConfig, Search
 from .correlated_sheet import Sheet
@@ -20,7 +21,7 @@ QUICK = CorrelatedConfig(points=90, keep=90, links=6, levels=(BeliefLevel(900, 6
 
 
 @dataclass(frozen=True)
-class SeedConfig:
+class SeedConfig(Settings):
     """Settings of `find_seeds`. Lengths are multiples of the template's size, √area.
 
     Attributes
@@ -41,11 +42,11 @@ class SeedConfig:
         Of the trial of every hypothesis.
     """
 
-    ends: int = 5
-    candidates: int = 7
-    apart: float = 0.28
-    spacing: float = 0.009
-    hypotheses: int = 8
+    ends: Count = 5
+    candidates: Count = 7
+    apart: Positive = 0.28
+    spacing: Cell = 0.009
+    hypotheses: Count = 8
     missing: float = 0.12
     check: CorrelatedConfig = field(default_factory=lambda: QUICK)
 

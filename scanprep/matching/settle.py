@@ -9,12 +9,14 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 from scipy.sparse import csc_array, diags_array
 
 from ..geometry.mesh import Mesh, check_template
 from ..geometry.sparse import Factored
+from ..ranges import Count, Positive, Range, Settings
 from .energies import Pull, pull
 from .matches import Target, target_of
 from .settle_data import Skin, Touch, oriented, skin_of, touch
@@ -23,7 +25,7 @@ from .shell import conjugate_gradients
 
 
 @dataclass(frozen=True)
-class SettleRound:
+class SettleRound(Settings):
     """One round of `settle`. Lengths are multiples of the template's size, √area.
 
     Attributes
@@ -36,13 +38,13 @@ class SettleRound:
         Farthest match that counts.
     """
 
-    field: float
-    tension: float
-    reach: float
+    field: Positive
+    tension: Positive
+    reach: Positive
 
 
 @dataclass(frozen=True)
-class SettleConfig:
+class SettleConfig(Settings):
     """Settings of `settle`. Lengths are multiples of the template's size, √area.
 
     Attributes
@@ -76,14 +78,14 @@ class SettleConfig:
         SettleRound(0.015, 0.004, 0.015),
         SettleRound(0.015, 0.004, 0.015),
     )
-    noise_width: float = 0.007
+    noise_width: Positive = 0.007
     slide: float = 0.05
     stay: float = 0.003
     landmarks: float = 0.0002
     normal_weight: float = 0.04
-    neighbours: int = 16
-    limit: float = 4.0
-    stiffer: float = 4.0
+    neighbours: Count = 16
+    limit: Annotated[float, Range(1)] = 4.0
+    stiffer: Annotated[float, Range(1)] = 4.0
     repairs: int = 12
     settled: float = 0.001
 

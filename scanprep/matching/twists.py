@@ -10,11 +10,12 @@ from scipy.spatial import cKDTree
 from ..geometry import rotations
 from ..geometry.geodesics import SurfaceGraph
 from ..geometry.mesh import Mesh
+from ..ranges import Count, Positive, Settings
 from .matches import Target
 
 
 @dataclass(frozen=True)
-class TwistConfig:
+class TwistConfig(Settings):
     """Settings of the search for ends that are turned about themselves.
 
     Attributes
@@ -36,11 +37,11 @@ class TwistConfig:
     """
 
     ends: int = 5
-    radius: float = 0.14
-    angles: tuple[float, ...] = (0.5, 1.0)
-    points: int = 120
+    radius: Positive = 0.14
+    angles: tuple[Positive, ...] = (0.5, 1.0)
+    points: Count = 120
     rounds: int = 8
-    cap: float = 0.035
+    cap: Positive = 0.035
     moved: float = 0.01
 
 

@@ -17,6 +17,7 @@ from ..console import Metric, Outcome, bar, say
 from ..geometry.files import read_mesh
 from ..geometry.landmarks import read_landmark_vertices
 from ..geometry.mesh import Mesh
+from ..ranges import Count
 from .figures import ScanFigures
 from .page import PAGE, judge_set, write_set_page
 from .prepare import PrepareConfig, Prepared, prepare
@@ -30,7 +31,7 @@ LISTED = 5                    # scans that the closing table names
 
 def run_all(scans: ScansArg, template: Path, output: Output, landmarks: Path | None = None,
             template_landmarks: Path | None = None, guide: Guide = "best", clean: bool = False,
-            subject: str = "", unit: Unit | None = None, min_poses: int = PrepareConfig.min_poses,
+            subject: str = "", unit: Unit | None = None, min_poses: Count = PrepareConfig.min_poses,
             workers: WorkersArg = Workers(), *, space: Workspace) -> Outcome:                # noqa: B008
     """Register a template to every scan of a folder, find the skeleton, and write a page of all scans, worst first.
 

@@ -11,8 +11,8 @@ from typing import Any
 import numpy as np
 
 from ..geometry import storage
-from ..geometry.mesh import Mesh
 
+NONE = "none"                  # what a table says where a figure has no value
 FIGURES, TIMES, FAILURES = "registration.csv", "times.csv", "failures.csv"
 
 
@@ -76,25 +76,9 @@ class Failure:
     reason: str
 
 
-def stretched_share(template: Mesh, registered: Mesh, factor: float = 2.0) -> float:
-    """Share of the template's area that is longer by `factor`, or shorter, in some direction than the template."""
-    long, short = principal_stretches(template, registered)
-    return float(template.face_areas @ ((long > factor) | (short < 1 / factor)) / template.face_areas.sum())
-
-
-def principal_stretches(template: Mesh, registered: Mesh) -> tuple[np.ndarray, np.ndarray]:
-    """The largest and the smallest stretch (F,) of every triangle."""
-    rest, now = (m.corners[:, 1:] - m.corners[:, :1] for m in (template, registered))
-    # edges of the template in an orthonormal basis of its triangle, as a lower triangular matrix
-    gram = np.einsum("fid,fjd->fij", rest, rest)
-    basis = np.linalg.inv(np.linalg.cholesky(gram + 1e-18 * np.eye(2)))
-    metric = np.einsum("fij,fjd,fkd,flk->fil", basis, now, now, basis)
-    squared = np.linalg.eigvalsh(metric)
-    return np.sqrt(np.maximum(squared[:, 1], 0)), np.sqrt(np.maximum(squared[:, 0], 0))
-
-
 _TABLED = [f for f in fields(ScanFigures) if f.name != "seconds"]
-_READ: dict[str, Callable[[str], Any]] = {"str": str, "float": float, "int": int, "bool": "True".__eq__}
+_READ: dict[str, Callable[[str], Any]] = {"str": str, "float": lambda text: np.nan if text == NONE else float(text),
+                                          "int": int, "bool": "True".__eq__}
 
 
 def read_figures(folder: Path) -> list[ScanFigures]:
@@ -120,7 +104,11 @@ def write_figures(folder: Path, figures: Iterable[ScanFigures]) -> None:
     rows = sorted(figures, key=lambda f: f.name)
     _write(folder / TIMES, ["name", "seconds"], [[f.name, f"{f.seconds:.2f}"] for f in rows])
     names = [f.name for f in _TABLED]
-    _write(folder / FIGURES, names, [[getattr(row, name) for name in names] for row in rows])
+    _write(folder / FIGURES, names, [[_tabled(getattr(row, name)) for name in names] for row in rows])
+
+
+def _tabled(value: Any) -> Any:
+    return NONE if isinstance(value, float) and np.isnan(value) else value
 
 
 def read_failures(folder: Path) -> list[Failure]:

@@ -17,6 +17,7 @@ from ..dataset import RegisteredSet, SetEntry, write_set
 from ..geometry.files import read_mesh, write_mesh
 from ..geometry.landmarks import write_landmarks
 from ..geometry.mesh import Mesh, check_template
+from ..ranges import Count, Settings
 from ..skeleton.find import find_skeleton
 from ..skeleton.parts import SkeletonConfig
 from ..threads import one_thread
@@ -30,7 +31,7 @@ SCANS = "scans/"                    # before the names of the results that are r
 
 
 @dataclass(frozen=True)
-class PrepareConfig:
+class PrepareConfig(Settings):
     """Settings of `prepare`.
 
     Attributes
@@ -45,7 +46,7 @@ class PrepareConfig:
 
     scan: ScanSettings = field(default_factory=ScanSettings)
     skeleton: SkeletonConfig = field(default_factory=SkeletonConfig)
-    min_poses: int = 5
+    min_poses: Count = 5
     workers: Workers = field(default_factory=Workers)
 
 

@@ -6,11 +6,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ..ranges import Settings
 from .figures import Failure, ScanFigures
 
 
 @dataclass(frozen=True)
-class Limits:
+class Limits(Settings):
     """Where a figure of a registration begins to be suspect.
 
     Lengths are multiples of the template's size, the square root of its area (1.4 m for a man), so that they hold

@@ -10,11 +10,13 @@ import numpy as np
 from ..cleaning.components import CleanScanConfig, clean_scan
 from ..geometry.landmarks import check_on_surface, match_landmarks, read_landmarks
 from ..geometry.mesh import Mesh
+from ..matching.confidence import stretched_share
 from ..matching.correlated import CorrelatedConfig, find_correspondences
 from ..matching.correspondences import Correspondences
-from ..matching.nonrigid import Registration, RegistrationConfig, register
+from ..matching.nonrigid import Registration, RegistrationConfig, register, registration_problem
+from ..ranges import Settings
 from ..threads import one_thread
-from .figures import ScanFigures, stretched_share
+from .figures import ScanFigures
 from .scans import ScanTask, read_scan
 
 Guide = Literal["best", "landmarks", "automatic", "pose"]
@@ -23,7 +25,7 @@ Landmarks = tuple[np.ndarray, np.ndarray]
 
 
 @dataclass(frozen=True)
-class ScanSettings:
+class ScanSettings(Settings):
     """How one scan is registered.
 
     Attributes
@@ -75,7 +77,7 @@ def register_scan(task: ScanTask, template: Mesh, template_landmarks: dict[str, 
     Raises
     ------
     ValueError
-        A file that cannot be read, landmarks that do not match.
+        A file that cannot be read, landmarks that do not match, a registration that means nothing.
     """
     settings = settings or ScanSettings()
     start = time.perf_counter()
@@ -85,6 +87,9 @@ def register_scan(task: ScanTask, template: Mesh, template_landmarks: dict[str, 
         scan, removed = _cleaned(scan, landmarks, settings.clean)
         pairs = _correspondences(template, scan, landmarks, settings)
         fit = register(template, scan, landmarks, settings.registration, correspondences=pairs)
+        problem = registration_problem(template, scan, fit, landmarks is not None)
+        if problem:
+            raise ValueError(f"{task.scan}: the template is not on it: {problem}")
         picture = b""
         if settings.pictures:
             from .pictures import strip

@@ -2,15 +2,17 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 
 from ..geometry.mesh import Mesh
 from ..geometry.surface import Rays
+from ..ranges import Cell, Count, Positive, Range, Settings, Signed
 
 
 @dataclass(frozen=True)
-class ScannerConfig:
+class ScannerConfig(Settings):
     """Settings of the scanner.
 
     Parameters
@@ -35,28 +37,17 @@ class ScannerConfig:
         A value out of its range.
     """
 
-    views: int = 4
-    distance: float = 2.5
-    height: float = 1.2
-    azimuth: float = 45.0
-    resolution: float = 0.0059
+    views: Count = 4
+    distance: Positive = 2.5
+    height: Signed = 1.2
+    azimuth: Signed = 45.0
+    resolution: Cell = 0.0059
     noise: float = 0.002
-    grazing: float = 12.0
-    dropout: float = 0.005
-    depth_jump: float = 5.0
+    grazing: Annotated[float, Range(0, 89.9)] = 12.0
+    dropout: Annotated[float, Range(0, 0.99)] = 0.005
+    depth_jump: Positive = 5.0
     blind_reach: float = 0.05
     min_island: int = 30
-
-    def __post_init__(self) -> None:
-        if self.views < 1:
-            raise ValueError(f"views: expected at least 1, got {self.views}")
-        for name in ("distance", "resolution", "depth_jump"):
-            if not getattr(self, name) > 0:
-                raise ValueError(f"{name}: expected a positive number, got {getattr(self, name)}")
-        if not (self.noise >= 0 and 0 <= self.grazing < 90 and 0 <= self.dropout < 1 and self.blind_reach >= 0):
-            raise ValueError("noise, grazing, dropout, blind_reach: expected noise >= 0, grazing in [0, 90), "
-                             f"dropout in [0, 1) and blind_reach >= 0, got {self.noise}, {self.grazing}, "
-                             f"{self.dropout}, {self.blind_reach}")
 
 
 @dataclass(frozen=True, eq=False)

@@ -12,9 +12,10 @@ from ..console import Metric, Outcome, bar
 from ..dataset import RegisteredSet
 from ..geometry.files import read_mesh
 from ..geometry.mesh import Mesh
+from ..ranges import Signed
 from .edit import apply_edits, read_edits
 from .parts import SkeletonConfig
-from .search import SkeletonSearch, search_skeleton
+from .search import SkeletonSearch, search_skeleton, skeleton_problem
 from .tree import Skeleton
 
 PosesArg = Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="POSES")]
@@ -41,7 +42,8 @@ def skeleton(poses: PosesArg, output: Output, template: Path | None = None, subj
         search = search_skeleton(body, vertices, config, progress=progress)
     search.skeleton.save(output)
     return Outcome(output, [Metric("poses", len(vertices)), Metric("parts", len(search.skeleton.parents)),
-                            *_facts(search), *_shares(search.skeleton, body)], {"skeleton": config})
+                            *_facts(search), *_shares(search.skeleton, body)], {"skeleton": config},
+                   problem=skeleton_problem(search, config.parts))
 
 
 def _facts(search: SkeletonSearch) -> list[Metric]:
@@ -57,7 +59,7 @@ def _facts(search: SkeletonSearch) -> list[Metric]:
 
 def edit(skeleton: SkeletonArg, output: Output, template: Path | None = None, edits: Path | None = None,
          merge: tuple[str, str] | None = None, split: str | None = None, rename: tuple[str, str] | None = None,
-         move_joint: tuple[str, float, float, float] | None = None, unit: Unit | None = None) -> Outcome:
+         move_joint: tuple[str, Signed, Signed, Signed] | None = None, unit: Unit | None = None) -> Outcome:
     """Change a skeleton by hand: merge, split and rename parts, move joints.
 
     Example: scape prep edit-skeleton set --merge chest shoulder_left --rename part3 neck -o set/skeleton.json

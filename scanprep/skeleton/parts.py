@@ -5,6 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ..ranges import Count, Positive, Seed, Settings
 from .motions import Moments, Motions, PosedSurface, fit_motions, rigid_costs, union_costs
 from .patches import agglomerate, cover, halve
 from .sides import Sides, mirror_pairs
@@ -15,7 +16,7 @@ STEADY = 5e-4                    # of the surface: fewer changes of label count 
 
 
 @dataclass(frozen=True)
-class SkeletonConfig:
+class SkeletonConfig(Settings):
     """Settings of `find_skeleton`.
 
     Attributes
@@ -46,27 +47,18 @@ class SkeletonConfig:
         A part dissolves when its neighbours' motions, blended from place to place, explain so much of its own.
     """
 
-    parts: int | None = None
-    separation: float = 5.0
-    tolerance: float = 0.001
-    smallest: float = 0.005
-    smoothness: float = 1.0
-    patches: int = 300
-    start: int = 30
+    parts: Count | None = None
+    separation: Positive = 5.0
+    tolerance: Positive = 0.001
+    smallest: Positive = 0.005
+    smoothness: Positive = 1.0
+    patches: Count = 300
+    start: Count = 30
     symmetric: bool | None = None
-    restarts: int = 3
-    seed: int = 0
-    worth: float = 0.1
-    fading: float = 0.8
-
-    def __post_init__(self) -> None:
-        if self.parts is not None and self.parts < 1:
-            raise ValueError(f"parts: expected at least 1, got {self.parts}")
-        if self.restarts < 1:
-            raise ValueError(f"restarts: expected at least 1, got {self.restarts}")
-        for name in ("separation", "tolerance", "smallest", "smoothness", "worth", "fading"):
-            if not getattr(self, name) > 0:
-                raise ValueError(f"{name}: expected more than 0, got {getattr(self, name)}")
+    restarts: Count = 3
+    seed: Seed = 0
+    worth: Positive = 0.1
+    fading: Positive = 0.8
 
 
 class PartSearch:

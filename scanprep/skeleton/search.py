@@ -317,3 +317,16 @@ def _rooted(links: np.ndarray, root: int, count: int) -> list[int]:
                     parent[there] = part
                     reached.append(int(there))
     return parent
+
+
+def skeleton_problem(found: SkeletonSearch, wanted: int | None) -> str | None:
+    """Why a skeleton means nothing, with the likely cause; None where it means something.
+
+    Parameters
+    ----------
+    wanted : int, optional
+        How many parts were asked for.
+    """
+    if len(found.skeleton.parents) > 1 or wanted == 1:
+        return None
+    return "the body has one part and no joint; the meshes do not differ in pose, or are smaller than their unit says?"

@@ -13,6 +13,7 @@ from scanprep.batch.pool import Workers
 from scanprep.batch.workspace import Workspace
 from scanprep.cli import Output, Unit, WorkersArg
 from scanprep.console import Outcome, bar, say
+from scanprep.ranges import Count
 
 from ...animation.work import choose_layout
 from ...cli import ModelOrNone, read_model
@@ -28,7 +29,7 @@ TOLD = 20                            # people that are listed before the work be
 def mosh_markers(markers: MarkersArg, output: Output, model: ModelOrNone = None, layout: str | None = None,
                  subjects: Path | None = None, by: By = "auto", name: str | None = None, who: str | None = None,
                  hold_out: tuple[str, ...] = (), female: Path | None = None, male: Path | None = None,
-                 character: Path | None = None, factor: float = 1.0, unit: Unit | None = None, keys: int = 120,
+                 character: Path | None = None, factor: float = 1.0, unit: Unit | None = None, keys: Count = 120,
                  config: Annotated[MoshConfig, tyro.conf.arg(name="")] = MoshConfig(),               # noqa: B008
                  workers: WorkersArg = Workers(), *, space: Workspace) -> Outcome:                   # noqa: B008
     """Body shape, marker places, motion and soft tissue of people from markers alone.

@@ -18,6 +18,7 @@ from scanprep.pictures.views import upright
 
 from ...animation.report import morph_frames
 from ...animation.retarget import retarget
+from ...animation.trust import motion_problem
 from ...animation.work import choose_layout, key_frames, write_glb
 from ...markers.files import MarkerSequence, read_markers
 from ...markers.layout import MarkerLayout
@@ -98,7 +99,8 @@ class _Found:
 def mosh_person(work: Work, actor: Actor, room: Room) -> tuple[list[Metric], list[str]]:
     """Everything of one person into the folder of a room: the figures, and what failed.
 
-    A recording that cannot be read is left out and told.
+    A recording that cannot be read is left out and told. The first figure is called "problem" where a motion means
+    nothing, and says why.
 
     Raises
     ------
@@ -117,7 +119,11 @@ def mosh_person(work: Work, actor: Actor, room: Room) -> tuple[list[Metric], lis
         room.tell(HALF + HALF * i // total, 2 * HALF)
         figures[take.name] = _write(work, found, take, room, settings)
     room.tell(HALF + HALF * (total - 1) // total, 2 * HALF)
+    problems = [(take.name, _problem(found, take)) for take in found.takes]
     metrics = [Metric("model", work.name), *_person_metrics(found), *_figures(found.takes)]
+    if any(problem for _, problem in problems):
+        told = "; ".join(f"{name}: {problem}" for name, problem in problems if problem)
+        metrics.insert(0, Metric("problem", told))
     person_page(actor.name, found.model, found.result, found.usual, found.takes, metrics, figures,
                 settings).write(folder / "report.html")
     save_png(folder / PICTURE, person_picture(found.model, found.result))
@@ -191,13 +197,19 @@ def _write(work: Work, found: _Found, take: Take, room: Room, settings: Mapping[
                          f"person are; soft tissue taken {work.factor:g} times.").picture(*shown)
         closing(page, metrics, settings).write(place / "report.html")
         save_png(place / PICTURE, take_picture(take))
-        write_report(Outcome(place, metrics, settings), work.command, time.perf_counter() - start)
+        outcome = Outcome(place, metrics, settings, problem=_problem(found, take))
+        write_report(outcome, work.command, time.perf_counter() - start)
 
     room.files(f"{take.name} files", (solved, take.path, take.who, take.unit, work.keys, work.factor), files)
     shown = None if work.character is None else room.files(
         f"{take.name} character", (solved, work.character, work.keys, work.factor), character)
     room.files(f"{take.name} page", (solved, metrics, settings, shown and (shown, work.factor)), page)
     return metrics
+
+
+def _problem(found: _Found, take: Take) -> str | None:
+    """Why the motion of a sequence means nothing."""
+    return motion_problem(take.motion, take.subject.template, found.result.layout, take.markers)
 
 
 def _person_metrics(found: _Found) -> list[Metric]:

@@ -1,0 +1,37 @@
+"""When a result means nothing: what the functions that tell have in common. Each stands in the room of its result."""
+from __future__ import annotations
+
+import numpy as np
+
+from .geometry.mesh import Mesh
+
+HAND = 0.06                 # of a body's size, the root of its area: a hand's width, 8 cm on a man
+SMALL, LARGE = 0.2, 2.5     # extents that a body may have, as multiples of the one that is expected
+
+
+def size(body: Mesh) -> float:
+    """The root of the surface area of a body, metres."""
+    return float(np.sqrt(body.face_areas.sum()))
+
+
+def extent(points: np.ndarray) -> float:
+    """Diagonal of the box around points (n, 3), in their unit; NaN without any that are finite."""
+    found = points[np.isfinite(points).all(axis=-1)]
+    return float(np.linalg.norm(np.ptp(found, axis=0))) if len(found) else np.nan
+
+
+def unit_problem(found: float, expected: float, what: str, least: float = SMALL) -> str | None:
+    """What an extent says about the unit: None where it may be right.
+
+    Parameters
+    ----------
+    found, expected : float, metres
+        Extents of the data and of the body.
+    what : str
+        The data, as they stand in the sentence.
+    least : float
+        Data of a part of a body may be so small.
+    """
+    if not np.isfinite(found) or least <= found / expected <= LARGE:
+        return None
+    return f"{what} {found / expected:.3g} times as large as the body: the wrong unit? (--unit)"

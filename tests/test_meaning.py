@@ -1,0 +1,183 @@
+"""A result that means nothing is said in a line, with the likely cause and exit code 1; the files are there.
+
+The limits were chosen on real data, see the comments beside them; here is that each is heard where it belongs.
+"""
+import dataclasses
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from completion_bodies import half_view, worm_with_prior
+from scanned_shapes import ball as sphere
+
+from completion import MarkerLayout, MarkerSequence, write_markers
+from completion.__main__ import main
+from completion.animation import report
+from completion.animation.settings import AnimateConfig
+from completion.animation.shape import MarkerShapeConfig
+from completion.animation.trust import motion_problem
+from completion.animation.work import Work as Follow
+from completion.animation.work import animate_file
+from completion.motion import Motion
+from completion.partial.settings import CompletionConfig
+from completion.partial.work import Inputs, Work, complete_files
+from completion.tracking.sequence import tracking_problem
+from scanprep import Mesh, write_landmarks, write_mesh
+from scanprep.console import Metric
+from scanprep.geometry.files import PointCloud, write_points
+from scanprep.matching.correspondences import Correspondences, correspondences_problem
+
+MARKS = {"head": 10, "tail": 380, "left": 100, "right": 200, "middle": 250}
+LABELS = tuple(f"M{i}" for i in range(30))
+ROWS = np.random.default_rng(4).choice(396, 30, replace=False)
+QUICK = CompletionConfig(draws=4, rounds=3, scan_points=600, model_points=300, candidates=1, start_axes=1)
+
+
+@pytest.fixture(scope="module", autouse=True)
+def small_pictures():
+    """Nobody looks at them here."""
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(report, "render", lambda *_rest, **_named: np.full((30, 20, 3), 255, dtype=np.uint8))
+        yield
+
+
+@pytest.fixture
+def place(tmp_path, monkeypatch):
+    """A template and a good scan of it, a ball, too few points, the scan in another unit, and a view of one side."""
+    monkeypatch.chdir(tmp_path)
+    body = worm_with_prior().template
+    write_mesh("template.ply", body)
+    write_landmarks("template.landmarks.json", MARKS)
+    moved = body.with_vertices(body.vertices * [1, 1.05, 0.97] + [0, 0, 0.05])
+    write_mesh("good.ply", moved)
+    write_landmarks("good.json", {name: moved.vertices[v] for name, v in MARKS.items()})
+    directions = np.random.default_rng(0).normal(size=(1500, 3))
+    ball = 0.8 * directions / np.linalg.norm(directions, axis=1)[:, None] + body.vertices.mean(axis=0)
+    write_points("ball.ply", PointCloud(ball))
+    large = sphere(3, 0.8)
+    write_mesh("ball_mesh.ply", Mesh(large.vertices + body.vertices.mean(axis=0), large.faces))
+    write_points("ten.ply", PointCloud(moved.vertices[::40]))
+    write_mesh("large.ply", Mesh(30 * moved.vertices, moved.faces))
+    write_landmarks("large.json", {name: 30 * moved.vertices[v] for name, v in MARKS.items()})
+    write_points("half.ply", PointCloud(half_view(body, np.array([0.0, -1.0, 0.0]))[0]))
+    return tmp_path
+
+
+REGISTER = "prep register {}.ply --template template.ply -o out.ply"
+NOTHING = {
+    "a ball": (REGISTER.format("ball"), ["of the scan lies off the template", "a scan of something else"]),
+    "ten points": (REGISTER.format("ten"), ["0% of the template has data", "a scan of something else"]),
+    "another unit": (REGISTER.format("large") + " --landmarks large.json", ["--unit", "times as large"]),
+    "a ball to align": ("prep align ball_mesh.ply good.ply -o out.ply", ["a start far from the target"]),
+    "another unit to align": ("prep align large.ply good.ply -o out.ply", ["--unit", "times as large"]),
+}
+GOOD = {"a scan": REGISTER.format("good"), "with landmarks": REGISTER.format("good") + " --landmarks good.json",
+        "to align": "prep align good.ply template.ply -o out.ply"}
+
+
+@pytest.mark.parametrize("case", NOTHING)
+def test_a_command_says_that_its_result_means_nothing(place, capsys, case):
+    command, words = NOTHING[case]
+    assert main(command.split()) == 1
+    said = [line for line in capsys.readouterr().err.splitlines() if "THE RESULT MEANS NOTHING" in line]
+    assert len(said) == 1 and all(word in said[0] for word in words), said
+    told = json.loads(Path("out.report.json").read_text())
+    assert Path("out.ply").exists() and told["problem"] in said[0]
+    if case == "ten points":                                        # there is nothing to converge to
+        assert {"metric": "converged", "value": "False", "unit": ""} in told["metrics"]
+        assert {"metric": "distance to the scan, RMS", "value": None, "unit": "mm"} in told["metrics"]
+
+
+@pytest.mark.parametrize("case", GOOD)
+def test_good_results_stay_good(place, capsys, case):
+    assert main(GOOD[case].split()) == 0
+    assert "MEANS NOTHING" not in capsys.readouterr().err
+
+
+def test_a_scan_of_something_else_is_a_failure_of_a_set(place, capsys):
+    Path("scans").mkdir()
+    for name in ("ten", "good"):
+        Path(f"{name}.ply").rename(f"scans/{name}.ply")
+    assert main("prep run scans --template template.ply -o set --guide pose --workers 1".split()) == 1
+    assert "ten.ply: the template is not on it" in capsys.readouterr().err
+    assert "ten" not in Path("set/registration.csv").read_text()
+    assert "nan" not in Path("set/registration.csv").read_text() and "none" in Path("set/registration.csv").read_text()
+
+
+@pytest.mark.parametrize(("scan", "unit", "words"), [
+    ("half", None, None), ("ball", None, ["explains", "a scan of something else"]), ("half", "in", ["--unit"])])
+def test_completions(place, tmp_path, scan, unit, words):
+    model = worm_with_prior()
+    work = Work(model.subject(None), "model.npz", MARKS, QUICK, unit)
+    rows = complete_files(work, Inputs((Path(f"{scan}.ply"),)), tmp_path / "out")
+    check(rows, words)
+    assert (tmp_path / "out" / "completed.ply").exists()
+
+
+def check(rows: list[Metric], words):
+    problems = [row.value for row in rows if row.name == "problem"]
+    if words is None:
+        assert not problems
+    else:
+        assert rows[0].name == "problem" and all(word in rows[0].value for word in words), rows[0]
+
+
+def walk(layout, scale=1.0):
+    """Markers of a layout on a body that bends a little."""
+    model, t = worm_with_prior(), np.arange(12) / 30
+    poses = 0.1 * np.sin(3 * t)[:, None, None] * np.ones((12, 4, 3))
+    bodies = model.subject(None).vertices(poses, np.stack([t, 0 * t, 0 * t], axis=1))
+    positions = np.stack([layout.place(model.template.with_vertices(v)) for v in bodies])
+    return MarkerSequence(scale * positions, layout.labels, 30.0)
+
+
+@pytest.mark.parametrize(("case", "words"), [
+    ("good", None), ("inch", ["--unit"]), ("tenth", ["--unit", "0.1"]), ("shuffled", ["another layout"]),
+    ("mirrored", ["left and right"])])
+def test_motions(tmp_path, case, words):
+    model = worm_with_prior()
+    layout = MarkerLayout(LABELS, ROWS, 0.012)
+    layout.save(tmp_path / "layout.json")
+    markers = walk(layout, {"inch": 39.4, "tenth": 0.1}.get(case, 1.0))
+    if case == "shuffled":
+        markers = dataclasses.replace(markers, labels=tuple(np.random.default_rng(1).permutation(LABELS).tolist()))
+    if case == "mirrored":                                          # head and tail exchanged
+        x = markers.positions[0, :, 0]
+        order, back = np.argsort(x), np.argsort(-x)
+        labels = np.empty(30, dtype=object)
+        labels[order] = np.array(LABELS, dtype=object)[back]
+        markers = dataclasses.replace(markers, labels=tuple(labels))
+    write_markers(tmp_path / "walk.csv", markers)
+    work = Follow(model, "model.npz", str(tmp_path / "layout.json"), model.subject(None), None, None, "m", None, 6,
+                  AnimateConfig(start_axes=1), MarkerShapeConfig())
+    check(animate_file(work, tmp_path / "walk.csv", tmp_path / "out", lambda *_: None, lambda *_: None), words)
+    assert (tmp_path / "out" / "motion.npz").exists()
+
+
+def test_a_motion_without_any_marker_means_nothing():
+    layout = MarkerLayout(LABELS, ROWS, 0.012)
+    markers = walk(layout)
+    empty = Motion(np.zeros((12, 4, 3)), np.zeros((12, 3)), None, 30.0, np.full((12, 30), np.nan), LABELS)
+    assert "no marker" in motion_problem(empty, worm_with_prior().template, layout, markers)
+
+
+def test_a_body_that_is_not_found_in_the_frames_means_nothing():
+    found = np.arange(20) < 1
+    motion = Motion(np.zeros((20, 4, 3)), np.zeros((20, 3)), None, 30.0, np.full((20, 1), 0.2), ("surface",),
+                    converged=found)
+    assert "5% of the frames" in tracking_problem(motion) and "200 mm" in tracking_problem(motion)
+    assert tracking_problem(dataclasses.replace(motion, converged=found[::-1] | (np.arange(20) > 9))) is None
+    nothing = dataclasses.replace(motion, residuals=np.full((20, 1), np.nan))
+    assert "no frame shows anything" in tracking_problem(nothing)
+
+
+def test_unsure_correspondences_mean_nothing():
+    vertices, points = np.arange(5), np.zeros((5, 3))
+    assert correspondences_problem(Correspondences(vertices, points, np.full(5, 0.8))) is None
+    assert "0.30" in correspondences_problem(Correspondences(vertices, points, np.full(5, 0.3)))
+    assert "0 pairs" in correspondences_problem(Correspondences(vertices[:0], points[:0], np.zeros(0)))
+
+
+def test_a_figure_without_a_value_says_none():
+    assert Metric("rms", float("nan"), "mm").text() == "none" and Metric("rms", 0.5).text() == "0.5"
