@@ -5,6 +5,7 @@ The limits were chosen on real data, see the comments beside them; here is that 
 import dataclasses
 import json
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -23,10 +24,16 @@ from completion.motion import Motion
 from completion.partial.settings import CompletionConfig
 from completion.partial.work import Inputs, Work, complete_files
 from completion.tracking.sequence import tracking_problem
+from model.coregistration.rounds import coregistration_problem
+from model.evaluation.errors import Errors, errors_problem
+from model.learning.scape import learning_problem
 from scanprep import Mesh, write_landmarks, write_mesh
+from scanprep.cleaning.align_views import align_views, views_problem
 from scanprep.console import Metric
 from scanprep.geometry.files import PointCloud, write_points
 from scanprep.matching.correspondences import Correspondences, correspondences_problem
+from scanprep.matching.nonrigid import Registration, registration_problem
+from scanprep.skeleton.search import skeleton_problem
 
 MARKS = {"head": 10, "tail": 380, "left": 100, "right": 200, "middle": 250}
 LABELS = tuple(f"M{i}" for i in range(30))
@@ -181,3 +188,65 @@ def test_unsure_correspondences_mean_nothing():
 
 def test_a_figure_without_a_value_says_none():
     assert Metric("rms", float("nan"), "mm").text() == "none" and Metric("rms", 0.5).text() == "0.5"
+
+
+def test_models_mean_nothing_when_their_errors_are_a_hands_width():
+    model = dataclasses.replace(worm_with_prior(), info={"left_out_error": 0.008})
+    body = model.template.vertices
+    assert learning_problem(model) is None and learning_problem(model, body[None] * [[[1.1, 0.9, 1]]]) is None
+    assert "--unit" in learning_problem(model, 1000 * body[None])
+    wrong = dataclasses.replace(model, info={"left_out_error": 0.2})
+    assert "200 mm" in learning_problem(wrong) and "too few poses" in learning_problem(wrong)
+
+
+def test_errors_of_bodies_in_another_unit_mean_nothing():
+    model = worm_with_prior()
+    body = model.template.vertices[None]
+
+    def errors(mean):
+        return Errors(np.array([mean]), np.array([mean]), np.array([mean]), np.zeros(1), np.zeros((1, 4)))
+
+    assert errors_problem(errors(0.01), body, model) is None
+    assert "another order" in errors_problem(errors(0.5), body, model)
+    assert "--unit" in errors_problem(errors(500.0), 1000 * body, model)
+
+
+def test_co_registrations_that_explain_nothing_mean_nothing():
+    model = worm_with_prior()
+    scan = model.template.vertices
+
+    def done(explained, good):
+        found = tuple(SimpleNamespace(explained=share) for share in explained)
+        return SimpleNamespace(registrations=found, good=np.array(good), model=model)
+
+    assert coregistration_problem(done([0.99, 0.2], [True, False]), [scan, scan]) is None
+    assert "0 of 2 scans" in coregistration_problem(done([0.9, 0.9], [False, False]), [scan, scan])
+    assert "--unit" in coregistration_problem(done([0.1, 0.1], [True, False]), [1000 * scan, 1000 * scan])
+
+
+def test_views_of_which_none_is_in_place_mean_nothing():
+    views = [(sphere(2, 0.1), np.zeros(3)), (sphere(2, 0.1), np.zeros(3))]
+    apart = [(Mesh(mesh.vertices + 5 * k, mesh.faces), camera) for k, (mesh, camera) in enumerate(views)]
+    found = align_views(apart)
+    assert not found.converged and np.isnan(found.rms) and "no view is in its place" in views_problem(found)
+
+
+def test_a_skeleton_of_one_part_means_nothing():
+    one = SimpleNamespace(skeleton=SimpleNamespace(parents=np.array([-1])))
+    assert "do not differ in pose" in skeleton_problem(one, None) and skeleton_problem(one, 1) is None
+    assert skeleton_problem(SimpleNamespace(skeleton=SimpleNamespace(parents=np.array([-1, 0]))), None) is None
+
+
+@pytest.mark.parametrize(("far", "seen", "off", "stretch", "words"), [
+    (0.15, 0.8, 0.001, 1.0, None), (0.15, 0.7, 0.03, 2.5, ["left and right exchanged"]),
+    (0.0, 0.9, 0.3, 1.0, ["left and right exchanged"]), (0.9, 0.005, 0.001, 1.0, ["something else"])])
+def test_registrations_by_their_figures(far, seen, off, stretch, words):
+    """Limbs in a wrong place alone need a look; with a tenth of the surface stretched too it is the sides."""
+    body = worm_with_prior().template
+    count = len(body.vertices)
+    drawn = body.vertices.copy()
+    drawn[drawn[:, 0] > 1] *= stretch
+    fit = Registration(Mesh(drawn, body.faces), np.zeros(count), np.arange(count) < seen * count, 0.001, off, True, 1,
+                       {}, 0, np.ones(count), far)
+    told = registration_problem(body, body, fit, True)
+    assert (told is None) if words is None else all(word in told for word in words), told
