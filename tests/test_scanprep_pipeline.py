@@ -309,9 +309,9 @@ def test_other_settings_or_template_do_all_anew(scans, template, tmp_path):
     assert prepare(tasks, template, MARKS, tmp_path / "set", clean).fresh == 3
     wider = template.with_vertices(1.05 * template.vertices)
     assert prepare(tasks, wider, MARKS, tmp_path / "set", clean).fresh == 3
-    swapped = {**MARKS, "left": MARKS["right"], "right": MARKS["left"]}
-    assert prepare(tasks, wider, swapped, tmp_path / "set", clean).fresh == 3
-    prepare(tasks, wider, swapped, tmp_path / "fresh", clean)
+    moved = {**MARKS, "left": int(np.linalg.norm(wider.vertices - wider.vertices[MARKS["left"]], axis=1).argsort()[1])}
+    assert prepare(tasks, wider, moved, tmp_path / "set", clean).fresh == 3
+    prepare(tasks, wider, moved, tmp_path / "fresh", clean)
     assert contents(tmp_path / "set") == {name: data.replace(b"Scans of fresh", b"Scans of set")
                                           for name, data in contents(tmp_path / "fresh").items()}
     with pytest.raises(ValueError, match="2 other scans that were registered with another template"):

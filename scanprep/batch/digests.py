@@ -6,6 +6,7 @@ import hashlib
 import importlib.metadata
 import json
 import time
+import weakref
 from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import Any
@@ -34,7 +35,7 @@ class Digests:
     def __init__(self, path: Path | None = None) -> None:
         self.path = path
         self._changed = False
-        self._values: dict[int, tuple[Any, bytes]] = {}
+        self._values: dict[int, tuple[weakref.ref[Any], bytes]] = {}
         self._known: dict[str, list[Any]] = {}
         if path is not None and path.exists():
             try:
@@ -107,7 +108,7 @@ class Digests:
     def _of_dataclass(self, value: Any) -> bytes:
         """Of the fields; remembered for frozen ones without files in them, as models are large and come often."""
         known = self._values.get(id(value))
-        if known is not None and known[0] is value:
+        if known is not None and known[0]() is value:
             return known[1]
         own = hashlib.sha256(f"{type(value).__module__}.{type(value).__qualname__}".encode())
         for field in dataclasses.fields(value):
@@ -115,7 +116,7 @@ class Digests:
                 self._update(own, field.name)
                 self._update(own, getattr(value, field.name))
         if type(value).__dataclass_params__.frozen and not any(paths_of(value)):
-            self._values[id(value)] = (value, own.digest())
+            self._values[id(value)] = (weakref.ref(value), own.digest())
         return own.digest()
 
 
