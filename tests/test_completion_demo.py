@@ -81,11 +81,15 @@ def test_goes_on_where_it_was(demo_folder, tmp_path, figures):
     shutil.copytree(demo_folder, folder)
     (folder / "model.npz").unlink()
     (folder / "report.html").unlink()
-    before = {p: p.stat().st_mtime_ns for p in (folder / "set").rglob("*.ply")}
-    scans = {p: p.stat().st_mtime_ns for p in (folder / "scans").rglob("*") if p.name != "scans.csv"}
+
+    def touched():
+        kept = [p for part in ("set/meshes", "scans", "half_view") for p in (folder / part).rglob("*")]
+        return {p: p.stat().st_mtime_ns for p in kept}
+
+    before = touched()
     assert run(demo, "scape demo", ["--quick", "--out", str(folder)]) == 0
-    assert before == {p: p.stat().st_mtime_ns for p in (folder / "set").rglob("*.ply")}
-    assert scans == {p: p.stat().st_mtime_ns for p in (folder / "scans").rglob("*") if p.name != "scans.csv"}
+    assert before == touched()
+    assert files(folder, "report.json") == files(demo_folder, "report.json")
     again = {m["metric"]: m["value"] for m in json.loads((folder / "report.json").read_text())["metrics"]}
     same = [name for name in figures if name != "time"]
     assert {name: again[name] for name in same} == {name: figures[name] for name in same}

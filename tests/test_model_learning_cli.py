@@ -81,11 +81,11 @@ def test_sexes_of_a_plain_folder_come_from_a_table(folder, tmp_path):
             sexes=folder / "sexes.csv", config=QUICK, pictures=False)
     assert load_model(tmp_path / "m.female.npz").info["shapes"] == 3
     with pytest.raises(ValueError, match="--sexes"):
-        learned(folder / "poses", tmp_path / "m.npz", folder / "people", skeleton=folder / "skeleton.json",
+        learned(folder / "poses", tmp_path / "n.npz", folder / "people", skeleton=folder / "skeleton.json",
                 by_sex=True)
     (tmp_path / "other.csv").write_text("name,sex\nnobody,male\n")
     with pytest.raises(ValueError, match="none of its names"):
-        learned(folder / "poses", tmp_path / "m.npz", folder / "people", skeleton=folder / "skeleton.json", by_sex=True,
+        learned(folder / "poses", tmp_path / "n.npz", folder / "people", skeleton=folder / "skeleton.json", by_sex=True,
               sexes=tmp_path / "other.csv")
 
 
