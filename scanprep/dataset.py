@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from .geometry import storage
+from .geometry import storage, tables
 from .geometry.files import MeshFileError, check_same_topology, read_mesh, write_mesh
 from .geometry.mesh import Mesh
 from .skeleton.tree import Skeleton
@@ -242,7 +242,7 @@ def _read_header(folder: Path) -> dict[str, Any]:
 def _read_rows(folder: Path) -> tuple[SetEntry, ...]:
     path = folder / "set.csv"
     entries: dict[str, SetEntry] = {}
-    for line, row in storage.read_table(path, _COLUMNS, ("name", "file")):
+    for line, row in tables.read_table(path, _COLUMNS, ("name", "file")):
         entry = SetEntry(**{column: row[column] for column in _COLUMNS})
         with storage.taking_apart(path, f"the name of a file in line {line}"):
             there = (folder / entry.file).is_file()

@@ -5,7 +5,7 @@ import pickle
 import numpy as np
 import pytest
 
-from scanprep.geometry import storage
+from scanprep.geometry import storage, tables
 from scanprep.geometry.storage import StorageError
 
 ARRAYS = {"a": np.arange(6.0).reshape(2, 3), "b": np.array([], dtype=np.int64), "c": np.array(["x", "yz"])}
@@ -112,7 +112,7 @@ TABLE = "name{0}sex{0} note\r\nZoë{0}f{0}\r\n{0}{0}\r\n Ann {0}m{0}x\r\n"
 @pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig", "utf-16", "cp1252", "latin-1"])
 def test_tables_as_spreadsheets_save_them(tmp_path, separator, encoding):
     (tmp_path / "a.csv").write_bytes((TABLE.format(separator)).encode(encoding))
-    rows = storage.read_table(tmp_path / "a.csv", ("name", "sex", "age"), ("name",))
+    rows = tables.read_table(tmp_path / "a.csv", ("name", "sex", "age"), ("name",))
     assert rows == [(2, {"name": "Zoë", "sex": "f", "age": "", "note": ""}),
                     (4, {"name": "Ann", "sex": "m", "age": "", "note": "x"})]
 
@@ -126,7 +126,7 @@ def test_tables_as_spreadsheets_save_them(tmp_path, separator, encoding):
 def test_tables_that_cannot_be_read(tmp_path, content, words):
     (tmp_path / "a.csv").write_text(content)
     with pytest.raises(StorageError, match=rf"a\.csv: {words}"):
-        storage.read_table(tmp_path / "a.csv", ("name", "sex"))
+        tables.read_table(tmp_path / "a.csv", ("name", "sex"))
 
 
 def test_arrays_come_back_as_they_were(tmp_path):

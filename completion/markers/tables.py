@@ -8,7 +8,7 @@ from pathlib import Path
 
 import numpy as np
 
-from scanprep.geometry import storage
+from scanprep.geometry import tables
 
 from .common import MarkerFileError, RawMarkers
 
@@ -54,7 +54,7 @@ def read_csv(path: Path, data: bytes) -> RawMarkers:
 
     Where semicolons or tabs separate, numbers may have decimal commas.
     """
-    separator, rows = storage.table_rows(path, data, MarkerFileError)
+    separator, rows = tables.table_rows(path, data, MarkerFileError)
     head = rows[0][1] if rows else []
     clock = [word for word in head if word.lower() in ("time", "frame")]
     columns = {word.lower(): i for i, word in enumerate(head)}

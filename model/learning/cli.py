@@ -20,7 +20,7 @@ from scanprep.dataset import RegisteredSet
 from scanprep.geometry.files import list_meshes, read_registered
 from scanprep.geometry.landmarks import read_landmark_vertices
 from scanprep.geometry.mesh import Mesh
-from scanprep.geometry.storage import read_table
+from scanprep.geometry.tables import read_table
 from scanprep.ranges import Count, Settings
 from scanprep.skeleton.find import find_skeleton
 from scanprep.skeleton.parts import SkeletonConfig

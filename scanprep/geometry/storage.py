@@ -1,4 +1,4 @@
-"""The one place of stored files: arrays with a JSON header, JSON, tables.
+"""The one place of stored files: arrays with a JSON header, and JSON; tables stand beside it.
 
 Arrays: one `.npz` file = named arrays and a JSON header with kind and version; never pickle. Whatever is wrong with
 a file is a StorageError that names it, and a small file never asks for much memory.
@@ -6,15 +6,11 @@ a file is a StorageError that names it, and a small file never asks for much mem
 from __future__ import annotations
 
 import contextlib
-import csv
-import io
 import json
 import math
 import os
-import re
-import shutil
 import zipfile
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from pathlib import Path
 from typing import IO, Any
 
@@ -80,28 +76,6 @@ def writing(path: str | Path) -> Iterator[Path]:
         beside.unlink(missing_ok=True)
 
 
-@contextlib.contextmanager
-def writing_folder(path: str | Path) -> Iterator[Path]:
-    """A folder beside `path` that takes its place, whatever stood there, when the block ends without an error.
-
-    One that a killed run left half made is removed first.
-    """
-    path = Path(path)
-    path.parent.mkdir(parents=True, exist_ok=True)
-    for left in path.parent.iterdir():
-        if re.fullmatch(rf"\.{re.escape(path.name)}\.\d+\.part", left.name):
-            shutil.rmtree(left, ignore_errors=True)
-    beside = path.with_name(f".{path.name}.{os.getpid()}.part")
-    try:
-        beside.mkdir()
-        yield beside
-        if path.exists():
-            shutil.rmtree(path)
-        os.replace(beside, path)
-    finally:
-        shutil.rmtree(beside, ignore_errors=True)
-
-
 def text(arrays: Mapping[str, np.ndarray], name: str, usual: str) -> str:
     """The one text of this name, `usual` where there is none; ValueError for anything else."""
     value = arrays.get(name, np.array(usual))
@@ -159,13 +133,13 @@ def parse_json(path: str | Path, data: bytes, what: str, error: type[StorageErro
         if len(data) > LARGEST_TEXT:
             raise ValueError(f"{len(data)} bytes, more than {LARGEST_TEXT}")
         try:
-            text = data.decode("utf-16" if data[:2] in _UTF_16 else "utf-8-sig")
+            text = data.decode("utf-16" if data[:2] in UTF_16 else "utf-8-sig")
         except UnicodeDecodeError as problem:
             raise ValueError(f"it is not saved as UTF-8: byte {problem.start}") from None
         return json.loads(text) if nan else json.loads(text, parse_constant=_number, parse_float=_number)
 
 
-_UTF_16 = (b"\xff\xfe", b"\xfe\xff")
+UTF_16 = (b"\xff\xfe", b"\xfe\xff")
 
 
 def _number(text: str) -> float:
@@ -173,71 +147,6 @@ def _number(text: str) -> float:
     if not math.isfinite(value):
         raise ValueError(f"{text} is not a finite number")
     return value
-
-
-def read_table(path: str | Path, columns: Sequence[str], needed: Sequence[str] | None = None
-               ) -> list[tuple[int, dict[str, str]]]:
-    """A CSV table with a heading, as spreadsheets save it: see `table_rows`.
-
-    Parameters
-    ----------
-    columns : names
-        Those that are wanted.
-    needed : names, optional
-        Those of them that must be there; all, when not given.
-
-    Returns
-    -------
-    list of (line, {column: text})
-        Every one of `columns`, empty where the table does not have it; other columns too.
-
-    Raises
-    ------
-    StorageError
-        Missing, not a table, a column that is not there or comes twice, a line of another length.
-    """
-    _, rows = table_rows(path, read_bytes(path, f"a table with the columns {','.join(columns)}"))
-    head = rows[0][1] if rows else []
-    if not set(columns if needed is None else needed) <= set(head) or len(set(head)) < len(head):
-        raise StorageError(f"{path}: line 1: expected the columns {','.join(columns)}, each once, "
-                           f"found {','.join(head)[:80] or 'an empty file'}")
-    for line, cells in rows:
-        if len(cells) != len(head):
-            raise StorageError(f"{path}: line {line}: expected {len(head)} values, found {len(cells)}")
-    return [(line, {**dict.fromkeys(columns, ""), **dict(zip(head, cells, strict=True))}) for line, cells in rows[1:]]
-
-
-def table_rows(path: str | Path, data: bytes, error: type[StorageError] = StorageError
-               ) -> tuple[str, list[tuple[int, list[str]]]]:
-    """The separator of a CSV table, and the number and cells of each line that is not empty.
-
-    UTF-8 with or without a mark, UTF-16 with one, or the Windows alphabet of western Europe; commas, semicolons or
-    tabs. Empty cells beyond the end of the first line are left out.
-    """
-    with taking_apart(path, "a CSV table", error):
-        if len(data) > LARGEST_TEXT:
-            raise ValueError(f"{len(data)} bytes, more than {LARGEST_TEXT}")
-        text = _text(data)
-        separator = max(",;\t", key=text.split("\n", 1)[0].count)
-        reader = csv.reader(io.StringIO(text, newline=""), delimiter=separator)
-        rows = [(reader.line_num, [cell.strip() for cell in cells]) for cells in reader]
-    width = 0
-    for _, cells in rows:
-        while len(cells) > width and not cells[-1]:
-            cells.pop()
-        width = width or len(cells)
-    return separator, [(line, cells) for line, cells in rows if any(cells)]
-
-
-def _text(data: bytes) -> str:
-    if data[:2] in _UTF_16:
-        return data.decode("utf-16")
-    if b"\0" in data:
-        raise ValueError("it is not text")
-    for encoding in ("utf-8-sig", "cp1252"):
-        with contextlib.suppress(UnicodeDecodeError):
-            return data.decode(encoding)
-    return data.decode("latin-1")
 
 
 def save(path: str | Path, kind: str, version: int, arrays: dict[str, np.ndarray],

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from ..geometry import storage
+from ..geometry import storage, tables
 from ..geometry.files import MeshFileError, read_mesh, read_points
 from ..geometry.mesh import Mesh
 
@@ -121,7 +121,7 @@ def _read_table(path: Path) -> dict[str, dict[str, str]]:
     if not path.exists():
         return {}
     about: dict[str, dict[str, str]] = {}
-    for line, row in storage.read_table(path, ("name", "subject", "pose", "sex"), ("name",)):
+    for line, row in tables.read_table(path, ("name", "subject", "pose", "sex"), ("name",)):
         if row["name"] in about:
             raise storage.StorageError(f"{path}: line {line}: the name {row['name']} comes twice")
         about[row["name"]] = row

@@ -9,7 +9,7 @@ from pathlib import Path
 from typing import Literal, get_args
 
 from scanprep.batch.workspace import HOME
-from scanprep.geometry import storage
+from scanprep.geometry import storage, tables
 
 from ...markers.common import MarkerFileError
 from ...markers.files import marker_subjects
@@ -224,7 +224,7 @@ def _table_rows(table: Path) -> list[tuple[str, str]]:
         if not isinstance(tree, dict) or not all(isinstance(v, str | int) for v in tree.values()):
             raise ValueError(f"{table}: expected JSON {{file: subject}}, found something else")
         return [(file, str(subject)) for file, subject in tree.items()]
-    rows = storage.read_table(table, ("file", "subject"))
+    rows = tables.read_table(table, ("file", "subject"))
     empty = [line for line, row in rows if not row["file"] or not row["subject"]]
     if empty or not rows:
         raise storage.StorageError(f"{table}: line {(empty or [2])[0]}: expected a file and its subject, found neither")
