@@ -28,6 +28,7 @@ from model.coregistration.rounds import coregistration_problem
 from model.evaluation.errors import Errors, errors_problem
 from model.learning.scape import learning_problem
 from scanprep import Mesh, write_landmarks, write_mesh
+from scanprep.batch.pool import Room
 from scanprep.cleaning.align_views import align_views, views_problem
 from scanprep.console import Metric
 from scanprep.geometry.files import PointCloud, write_points
@@ -117,7 +118,7 @@ def test_a_scan_of_something_else_is_a_failure_of_a_set(place, capsys):
 def test_completions(place, tmp_path, scan, unit, words):
     model = worm_with_prior()
     work = Work(model.subject(None), "model.npz", MARKS, QUICK, unit)
-    rows = complete_files(work, Inputs((Path(f"{scan}.ply"),)), tmp_path / "out")
+    rows = complete_files(work, Inputs((Path(f"{scan}.ply"),)), Room(tmp_path / "out"))
     check(rows, words)
     assert (tmp_path / "out" / "completed.ply").exists()
 
@@ -158,7 +159,7 @@ def test_motions(tmp_path, case, words):
     write_markers(tmp_path / "walk.csv", markers)
     work = Follow(model, "model.npz", str(tmp_path / "layout.json"), model.subject(None), None, None, "m", None, 6,
                   AnimateConfig(start_axes=1), MarkerShapeConfig())
-    check(animate_file(work, tmp_path / "walk.csv", tmp_path / "out", lambda *_: None, lambda *_: None), words)
+    check(animate_file(work, tmp_path / "walk.csv", Room(tmp_path / "out")), words)
     assert (tmp_path / "out" / "motion.npz").exists()
 
 

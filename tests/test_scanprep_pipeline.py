@@ -264,6 +264,17 @@ def test_bad_scans_stop_no_other(scans, template, tmp_path):
     assert not again.failures and again.fresh == 2 and not (tmp_path / "set" / "failures.csv").exists()
 
 
+def test_a_scan_in_another_unit_is_refused_at_once(scans, template, tmp_path):
+    for name, factor in (("body0", 1000), ("body1", 0.001)):
+        body = read_mesh(scans / f"{name}.ply")
+        write_mesh(scans / f"{name}.ply", body.with_vertices(factor * body.vertices))
+    with pytest.warns(UserWarning, match="when read as metres"):
+        done = prepare(find_scans(scans), template, MARKS, tmp_path / "set", QUICK)
+    assert done.registered.names == ("body2",)
+    assert "e+03 times as large as the template: the wrong unit?" in done.failures[0]
+    assert "body1.ply: it is 0.00" in done.failures[1]
+
+
 def test_what_leads_the_template(scans, template, tmp_path):
     (scans / "body0.landmarks.json").unlink()
     settings = {guide: dataclasses.replace(QUICK, scan=dataclasses.replace(QUICK.scan, guide=guide))

@@ -192,7 +192,7 @@ class Tracker:
         fit = fitter.on(cloud)
         found = fitter.settle(fit, expected, None if self._lost else expected)
         if not fitter.good(found):
-            scratch = self._lost % self.config.search_every == 1
+            scratch = (self._lost - 1) % self.config.search_every == 0
             anew = fitter.again(fit, [expected, self._past[0]], scratch)
             found = anew if fit.misfit(anew.x) < fit.misfit(found.x) else found
         return (found.x if fitter.good(found) else expected), found

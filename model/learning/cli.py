@@ -29,7 +29,7 @@ from scanprep.skeleton.tree import Skeleton
 from ..body import BodyModel
 from .mixing import MixConfig, learn_scape_mix
 from .parts import choose_skeleton
-from .scape import BlendConfig, LearnConfig, Progress, learn_blendscape, learn_scape, timed
+from .scape import BlendConfig, LearnConfig, Progress, learn_blendscape, learn_scape, learning_problem, timed
 from .sexes import learn_by_sex
 from .skin import SkinConfig, learn_skinning
 
@@ -132,7 +132,7 @@ def learn(poses: Path, output: Output, shapes: Path | None = None, template: Pat
         Metric("parts", len(tree.parents)), *about(models["neutral"]),
         *[Metric(f"people of the {name} model", model.info["shapes"]) for name, model in models.items() if by_sex],
         *_times(seconds, step.found)],
-        {"learn": config, "other": other})
+        {"learn": config, "other": other}, problem=learning_problem(models["neutral"], people))
 
 
 def about(model: BodyModel) -> list[Metric]:

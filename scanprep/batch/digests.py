@@ -60,8 +60,8 @@ class Digests:
     def of_file(self, path: Path) -> str:
         """A digest of what a file holds; "missing" where there is none, and of a folder of all files in it."""
         if path.is_dir():
-            inside = [p for p in sorted(path.rglob("*")) if p.is_file() and not p.name.startswith(".")]
-            return self.of([(p.relative_to(path).as_posix(), p) for p in inside])
+            names = [p.relative_to(path).as_posix() for p in sorted(path.rglob("*")) if p.is_file()]
+            return self.of([(name, path / name) for name in names if not f"/{name}".count("/.")])
         try:
             stat = path.stat()
             now = [getattr(stat, name) for name in _STAT]

@@ -109,8 +109,9 @@ def _ends(points: np.ndarray, distances: Callable[[np.ndarray], np.ndarray], cou
     """Places farther from the rest than all around them, most pronounced first, and the ways between them."""
     sample = farthest_points(points, min(64, len(points)))
     ways = distances(sample)
-    ways = np.where(np.isfinite(ways), ways, np.nan)
-    mean = np.nanmean(ways, axis=0)
+    there = np.isfinite(ways)
+    mean = np.full(ways.shape[1], np.nan)                     # of pieces that no sample reaches
+    np.divide(np.where(there, ways, 0).sum(axis=0), there.sum(axis=0), out=mean, where=there.any(axis=0))
     chosen: list[int] = []
     todo = mean - np.nanmin(mean)
     while len(chosen) < count and np.nanmax(todo) > 0:

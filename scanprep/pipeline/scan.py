@@ -14,6 +14,7 @@ from ..matching.confidence import stretched_share
 from ..matching.correlated import CorrelatedConfig, find_correspondences
 from ..matching.correspondences import Correspondences
 from ..matching.nonrigid import Registration, RegistrationConfig, register, registration_problem
+from ..meaning import extent
 from ..ranges import Settings
 from ..threads import one_thread
 from .figures import ScanFigures
@@ -21,6 +22,7 @@ from .scans import ScanTask, read_scan
 
 Guide = Literal["best", "landmarks", "automatic", "pose"]
 
+OTHER_UNIT = 30                # times larger or smaller than the template: a scan in inches, centimetres, millimetres
 Landmarks = tuple[np.ndarray, np.ndarray]
 
 
@@ -83,6 +85,7 @@ def register_scan(task: ScanTask, template: Mesh, template_landmarks: dict[str, 
     start = time.perf_counter()
     with one_thread():
         scan = read_scan(task.scan, settings.unit)
+        _check_unit(task, scan, template)
         landmarks = _landmarks(task, scan, template_landmarks, settings)
         scan, removed = _cleaned(scan, landmarks, settings.clean)
         pairs = _correspondences(template, scan, landmarks, settings)
@@ -100,6 +103,13 @@ def register_scan(task: ScanTask, template: Mesh, template_landmarks: dict[str, 
     figures = _measure(task, template, fit, guide)
     return RegisteredScan(fit.mesh.vertices, replace(figures, removed=removed, seconds=time.perf_counter() - start),
                           picture)
+
+
+def _check_unit(task: ScanTask, scan: Mesh | np.ndarray, template: Mesh) -> None:
+    """Refuse a scan in another unit before minutes of work; a room around the body, or a hand alone, is none."""
+    found = extent(scan.vertices if isinstance(scan, Mesh) else scan) / extent(template.vertices)
+    if not 1 / OTHER_UNIT < found < OTHER_UNIT:
+        raise ValueError(f"{task.scan}: it is {found:.3g} times as large as the template: the wrong unit? (--unit)")
 
 
 def _landmarks(task: ScanTask, scan: Mesh | np.ndarray, template_landmarks: dict[str, int], settings: ScanSettings

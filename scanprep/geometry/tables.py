@@ -1,0 +1,75 @@
+"""Tables as spreadsheets save them."""
+from __future__ import annotations
+
+import contextlib
+import csv
+import io
+from collections.abc import Sequence
+from pathlib import Path
+
+from .storage import LARGEST_TEXT, UTF_16, StorageError, read_bytes, taking_apart
+
+
+def read_table(path: str | Path, columns: Sequence[str], needed: Sequence[str] | None = None
+               ) -> list[tuple[int, dict[str, str]]]:
+    """A CSV table with a heading, as spreadsheets save it: see `table_rows`.
+
+    Parameters
+    ----------
+    columns : names
+        Those that are wanted.
+    needed : names, optional
+        Those of them that must be there; all, when not given.
+
+    Returns
+    -------
+    list of (line, {column: text})
+        Every one of `columns`, empty where the table does not have it; other columns too.
+
+    Raises
+    ------
+    StorageError
+        Missing, not a table, a column that is not there or comes twice, a line of another length.
+    """
+    _, rows = table_rows(path, read_bytes(path, f"a table with the columns {','.join(columns)}"))
+    head = rows[0][1] if rows else []
+    if not set(columns if needed is None else needed) <= set(head) or len(set(head)) < len(head):
+        raise StorageError(f"{path}: line 1: expected the columns {','.join(columns)}, each once, "
+                           f"found {','.join(head)[:80] or 'an empty file'}")
+    for line, cells in rows:
+        if len(cells) != len(head):
+            raise StorageError(f"{path}: line {line}: expected {len(head)} values, found {len(cells)}")
+    return [(line, {**dict.fromkeys(columns, ""), **dict(zip(head, cells, strict=True))}) for line, cells in rows[1:]]
+
+
+def table_rows(path: str | Path, data: bytes, error: type[StorageError] = StorageError
+               ) -> tuple[str, list[tuple[int, list[str]]]]:
+    """The separator of a CSV table, and the number and cells of each line that is not empty.
+
+    UTF-8 with or without a mark, UTF-16 with one, or the Windows alphabet of western Europe; commas, semicolons or
+    tabs. Empty cells beyond the end of the first line are left out.
+    """
+    with taking_apart(path, "a CSV table", error):
+        if len(data) > LARGEST_TEXT:
+            raise ValueError(f"{len(data)} bytes, more than {LARGEST_TEXT}")
+        text = _text(data)
+        separator = max(",;\t", key=text.split("\n", 1)[0].count)
+        reader = csv.reader(io.StringIO(text, newline=""), delimiter=separator)
+        rows = [(reader.line_num, [cell.strip() for cell in cells]) for cells in reader]
+    width = 0
+    for _, cells in rows:
+        while len(cells) > width and not cells[-1]:
+            cells.pop()
+        width = width or len(cells)
+    return separator, [(line, cells) for line, cells in rows if any(cells)]
+
+
+def _text(data: bytes) -> str:
+    if data[:2] in UTF_16:
+        return data.decode("utf-16")
+    if b"\0" in data:
+        raise ValueError("it is not text")
+    for encoding in ("utf-8-sig", "cp1252"):
+        with contextlib.suppress(UnicodeDecodeError):
+            return data.decode(encoding)
+    return data.decode("latin-1")
