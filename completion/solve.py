@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from scanprep.ranges import Count, Settings
+from scanprep.ranges import Settings
 
 from .energy import Residual
 
@@ -29,7 +29,7 @@ class MinimiseConfig(Settings):
         Stop when a step lowers the energy by less than this fraction.
     """
 
-    iterations: Count = 30
+    iterations: int = 30
     damping: float = 1e-3
     tolerance: float = 1e-5
 

@@ -168,13 +168,13 @@ def test_frames_may_be_drawn_at_random():
         choose_frames(positions, replace(random, choice="first"))
 
 
-@pytest.mark.parametrize(("config", "message"), [
-    (PersonConfig(frames=0), "frames: expected at least 1"),
-    (PersonConfig(annealing=()), "annealing: expected at least one factor"),
+@pytest.mark.parametrize(("settings", "message"), [
+    ({"frames": 0}, "frames: expected 1 to"),
+    ({"annealing": ()}, "annealing: expected at least one factor"),
 ])
-def test_settings_that_make_no_sense(config, message):
+def test_settings_that_make_no_sense(settings, message):
     with pytest.raises(ValueError, match=message):
-        find_person(MODEL, sequence(), LAYOUT, config)
+        find_person(MODEL, sequence(), LAYOUT, PersonConfig(**settings))
 
 
 def test_what_cannot_be_used_is_named():

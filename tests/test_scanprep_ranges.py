@@ -79,7 +79,7 @@ def needed(function):
     words, seen = [], inspect.signature(function).parameters
     hints = typing.get_type_hints(function, include_extras=True)
     for name, parameter in seen.items():
-        if parameter.default is inspect.Parameter.empty:
+        if parameter.default is inspect.Parameter.empty and name != console.SPACE:
             if "Positional" in str(hints[name]):
                 words.insert(0, "nowhere")
             else:

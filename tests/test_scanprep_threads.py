@@ -19,7 +19,7 @@ from scanprep.threads import VARIABLES, begin_worker, one_thread, search_threads
 
 
 def pools():
-    return {pool["num_threads"] for pool in threadpool_info()}
+    return {pool["num_threads"] for pool in threadpool_info() if pool["user_api"] == "blas"}
 
 
 @pytest.fixture(autouse=True)

@@ -58,7 +58,7 @@ class MarkerShapeConfig(Settings):
     prior_shrinkage: Share = 0.3
     start_axes: int = 6
     iterations: Count = 12
-    loose_reach: Positive = 0.2
+    loose_reach: float = 0.2
 
 
 @dataclass(frozen=True, eq=False)

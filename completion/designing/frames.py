@@ -36,7 +36,7 @@ class FrameConfig(Settings):
 
     n_betas: int = 40
     marker_sd: Positive = 0.005
-    place_sd: Positive = 0.01
+    place_sd: float = 0.01
     prior_weight: float = 1.0
     prior_shrinkage: Share = 0.3
     candidates: Count = 120

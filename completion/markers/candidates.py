@@ -10,7 +10,7 @@ from scipy.sparse import coo_array, csr_array, diags_array
 from scanprep.geometry.geodesics import SurfaceGraph
 from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.surface import Rays
-from scanprep.ranges import Positive, Settings
+from scanprep.ranges import Cosine, Positive, Settings
 from scanprep.skeleton.tree import Skeleton
 
 from .layout import DISTANCE, MarkerLayout
@@ -51,7 +51,7 @@ class CandidateConfig(Settings):
     margin: float = 0.035
     thick: float = 0.022
     ends: float = 0.025
-    flat: float = 0.75
+    flat: Cosine = 0.75
     middle: float = 0.012
 
 
