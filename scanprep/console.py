@@ -258,7 +258,7 @@ class _Call:
 
     def carried_out(self, start: float) -> tuple[Outcome, Path | None]:
         """What the function did, and where its report is."""
-        from .batch.workspace import beside, workspace
+        from .batch.opening import beside, workspace
 
         if self.output is None:
             return self.function(**self.given), None

@@ -19,7 +19,7 @@ from completion.demo.cli import demo
 from completion.demo.settings import QUICK, DemoConfig
 from model import load_model
 from scanprep import RegisteredSet, console
-from scanprep.batch.workspace import workspace
+from scanprep.batch.opening import workspace
 from scanprep.console import run
 from scanprep.geometry.mesh import template_problem
 
@@ -192,7 +192,7 @@ import os, sys
 from completion.demo import chain, settings
 from completion.demo.recording import ScanPerson
 from scanprep.batch import pool
-from scanprep.batch.workspace import workspace
+from scanprep.batch.opening import workspace
 from scanprep.console import bar
 
 config = settings.QUICK.__class__(poses=3, subjects=2, resolution=0.03)

@@ -11,7 +11,7 @@ from completion import MarkerLayout, MarkerSequence, read_markers, write_markers
 from completion.moshing.command import cli
 from model import load_model
 from scanprep.batch import pool
-from scanprep.batch.pool import Room
+from scanprep.batch.room import Room
 from scanprep.batch.workspace import HOME
 
 HERE = Path()
@@ -158,7 +158,7 @@ def test_a_mended_table_is_never_overwritten(copied, capsys):
 def test_a_second_run_leaves(copied, capsys):
     out = copied / "whole"
     before = contents(out)
-    code = ("import sys\nfrom scanprep.batch.workspace import workspace\nwith workspace(sys.argv[1]):\n"
+    code = ("import sys\nfrom scanprep.batch.opening import workspace\nwith workspace(sys.argv[1]):\n"
             "    print('in', flush=True)\n    sys.stdin.read()\n")
     other = subprocess.Popen([sys.executable, "-c", code, out], stdin=subprocess.PIPE, stdout=subprocess.PIPE)
     assert other.stdout.readline() == b"in\n"

@@ -28,7 +28,7 @@ from model.coregistration.rounds import coregistration_problem
 from model.evaluation.errors import Errors, errors_problem
 from model.learning.scape import learning_problem
 from scanprep import Mesh, write_landmarks, write_mesh
-from scanprep.batch.pool import Room
+from scanprep.batch.room import Room
 from scanprep.cleaning.align_views import align_views, views_problem
 from scanprep.console import Metric
 from scanprep.geometry.files import PointCloud, write_points

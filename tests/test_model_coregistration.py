@@ -26,7 +26,8 @@ from model.coregistration.modelfit import ModelFit
 from model.coregistration.posed import posed_points, typical_poses, whitening
 from scanprep import RegisteredSet, write_mesh
 from scanprep.batch.digests import Digests
-from scanprep.batch.workspace import HOME, workspace
+from scanprep.batch.opening import workspace
+from scanprep.batch.workspace import HOME
 from scanprep.geometry.landmarks import write_landmarks
 from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.surface import Surface

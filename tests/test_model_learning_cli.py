@@ -12,7 +12,7 @@ from model.learning.mixing import MixConfig
 from model.learning.parts import PartsConfig, choose_skeleton
 from model.learning.skin import SkinConfig
 from scanprep import RegisteredSet, write_mesh
-from scanprep.batch.workspace import beside
+from scanprep.batch.opening import beside
 
 QUICK = LearnConfig(refinements=1, steps=1, components=4, prunings=(0.01,), ridges=(1e-3,))
 OTHER = Other(skin=SkinConfig(rounds=2, people_rounds=1), mix=MixConfig(rounds=1))

@@ -12,7 +12,7 @@ from model import load_model
 from model.learning import cli, mix_rounds, parts, pose, scape, skin, skin_people
 from model.learning.cli import learn
 from scanprep import read_mesh, write_mesh
-from scanprep.batch.workspace import beside
+from scanprep.batch.opening import beside
 from scanprep.console import run
 from scanprep.skeleton import search
 

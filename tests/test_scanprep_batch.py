@@ -14,10 +14,12 @@ from scanprep import Mesh, console
 from scanprep.batch import digests as digests_module
 from scanprep.batch import workspace as room
 from scanprep.batch.digests import Digests
+from scanprep.batch.opening import FileWorkspace, beside, workspace
 from scanprep.batch.ownership import HOME, ForeignFileError
-from scanprep.batch.pool import Job, Workers, attempt
+from scanprep.batch.pool import Workers
+from scanprep.batch.room import Job, attempt
 from scanprep.batch.values import load_value, save_value
-from scanprep.batch.workspace import FileWorkspace, Task, Workspace, beside, workspace
+from scanprep.batch.workspace import Task, Workspace
 from scanprep.cli import Output
 from scanprep.console import Metric, Outcome
 from scanprep.geometry import storage
@@ -224,7 +226,7 @@ def test_files_that_a_result_has_no_more_go(tmp_path):
 
 
 def test_a_second_run_is_told_and_leaves(tmp_path):
-    code = ("import sys\nfrom scanprep.batch.workspace import workspace\nwith workspace(sys.argv[1]):\n"
+    code = ("import sys\nfrom scanprep.batch.opening import workspace\nwith workspace(sys.argv[1]):\n"
             "    print('in', flush=True)\n    sys.stdin.read()\n")
     other = subprocess.Popen([sys.executable, "-c", code, str(tmp_path / "out")], stdin=subprocess.PIPE,
                              stdout=subprocess.PIPE)
@@ -237,7 +239,8 @@ def test_a_second_run_is_told_and_leaves(tmp_path):
 
 
 def test_workers_go_when_the_run_is_killed(tmp_path):
-    code = ("import os, sys, time\nfrom scanprep.batch.pool import Job, Workers, run_jobs\nfrom pathlib import Path\n"
+    code = ("import os, sys, time\nfrom scanprep.batch.pool import Workers, run_jobs\nfrom scanprep.batch.room import Job\n"
+            "from pathlib import Path\n"
             "from test_scanprep_batch import Sleep\n"
             "place = Path(sys.argv[1])\n"
             "list(run_jobs(Sleep(), [Job(str(i), place, place) for i in range(2)], Workers(2)))")

@@ -18,7 +18,8 @@ from scipy.spatial.transform import Rotation
 from scanprep import Mesh, RegisteredSet, read_mesh, write_mesh
 from scanprep.batch import cluster
 from scanprep.batch.ownership import HOME, ForeignFileError
-from scanprep.batch.pool import Failure, Job, Workers, run_jobs
+from scanprep.batch.pool import Workers, run_jobs
+from scanprep.batch.room import Failure, Job
 from scanprep.cleaning.components import CleanScanConfig
 from scanprep.matching.correspondences import Correspondences
 from scanprep.pipeline import scan as scan_module
@@ -164,7 +165,7 @@ def test_interrupted_keeps_what_was_done(scans, template, tmp_path):
 def test_two_runs_in_one_folder(scans, template, tmp_path):
     prepare(find_scans(scans)[:1], template, MARKS, tmp_path / "set", QUICK)
     before = contents(tmp_path / "set")
-    code = ("import sys\nfrom scanprep.batch.workspace import workspace\nwith workspace(sys.argv[1]):\n"
+    code = ("import sys\nfrom scanprep.batch.opening import workspace\nwith workspace(sys.argv[1]):\n"
             "    print('in', flush=True)\n    sys.stdin.read()\n")
     other = subprocess.Popen([sys.executable, "-c", code, str(tmp_path / "set")], stdin=subprocess.PIPE,
                              stdout=subprocess.PIPE)

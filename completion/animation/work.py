@@ -8,7 +8,7 @@ import numpy as np
 
 from model.body import BodyModel
 from model.linear import Subject
-from scanprep.batch.pool import Room
+from scanprep.batch.room import Room
 from scanprep.cli import MM
 from scanprep.console import Metric
 from scanprep.geometry import storage

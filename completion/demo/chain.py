@@ -13,8 +13,9 @@ from pathlib import Path
 import numpy as np
 
 from model import BodyModel, Subject, fit_pose, learn_scape, load_model
+from scanprep.batch.opening import workspace
 from scanprep.batch.steps import KeptSteps, inside
-from scanprep.batch.workspace import Task, Workspace, workspace
+from scanprep.batch.workspace import Task, Workspace
 from scanprep.cleaning.template import TemplateConfig, make_template
 from scanprep.dataset import RegisteredSet
 from scanprep.geometry.files import read_mesh, write_mesh

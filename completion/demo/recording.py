@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial import cKDTree
 
-from scanprep.batch.pool import Room
+from scanprep.batch.room import Room
 from scanprep.geometry.mesh import Mesh
 from scanprep.scanning.embedded import EmbeddedScan, GroundTruth, embedded_scan
 from scanprep.scanning.people import MARKERS

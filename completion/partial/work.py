@@ -10,7 +10,7 @@ import numpy as np
 
 from model.body import BodyModel
 from model.linear import Subject
-from scanprep.batch.pool import Room
+from scanprep.batch.room import Room
 from scanprep.cli import MM, Unit
 from scanprep.console import Metric, Outcome, write_report
 from scanprep.geometry.landmarks import match_landmarks, read_landmarks

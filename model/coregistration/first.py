@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from scanprep.batch.pool import Room
+from scanprep.batch.room import Room
 from scanprep.batch.workspace import Task, Workspace
 from scanprep.geometry.mesh import Mesh
 from scanprep.matching.matches import orient, target_of

@@ -9,8 +9,9 @@ from functools import cached_property
 
 import numpy as np
 
-from scanprep.batch.pool import Room
-from scanprep.batch.workspace import Task, Workspace, workspace
+from scanprep.batch.opening import workspace
+from scanprep.batch.room import Room
+from scanprep.batch.workspace import Task, Workspace
 from scanprep.geometry.mesh import Mesh
 from scanprep.meaning import extent, unit_problem
 from scanprep.skeleton.find import find_skeleton

@@ -12,8 +12,8 @@ from typing import Annotated, Literal
 import numpy as np
 import tyro
 
+from scanprep.batch.opening import FileWorkspace
 from scanprep.batch.steps import KeptSteps, inside
-from scanprep.batch.workspace import FileWorkspace
 from scanprep.cli import Output, Unit, read_poses
 from scanprep.console import Metric, Outcome, bar
 from scanprep.dataset import RegisteredSet

@@ -1,7 +1,8 @@
-"""Work that is done once: tasks side by side, steps that are kept, one run at a time in a folder, nothing lost.
+"""Work that is done once: tasks side by side, steps that are kept, one run at a time in an output, nothing lost.
 
-    workspace   an output: what scapekit wrote there, what is whole, what must be done anew; tasks and steps in it
-    digests     what a result depends on: whole files, models, tables, settings
-    values      results as files, without pickle
+    opening     an output for one run: locked, foreign files left alone, what a killed run left put right
+    workspace   what is whole in an output, and what must be done anew: tasks and steps;  ownership  whose a file is
+    room        where one task is worked on;  steps  of long work, kept
     pool        tasks in processes of this machine;  cluster  on the workers of Dask;  lock  one run at a time
+    digests     what a result depends on: whole files, models, tables, settings;  values  results as files, no pickle
 """

@@ -14,7 +14,7 @@ from typing import Any
 import numpy as np
 
 from .digests import paths_of
-from .pool import Failure, Job, attempt
+from .room import Failure, Job, attempt
 
 ANSWER, WAIT = 10, 60          # seconds for the scheduler, and for the first worker of a cluster just started
 

@@ -9,8 +9,9 @@ from typing import Annotated
 import numpy as np
 import tyro
 
+from ..batch.opening import workspace
 from ..batch.pool import Workers
-from ..batch.workspace import Workspace, workspace
+from ..batch.workspace import Workspace
 from ..cleaning.components import CleanScanConfig
 from ..cli import MM, Output, SetArg, Unit, WorkersArg, landmarks_beside
 from ..console import Metric, Outcome, bar, say

@@ -11,8 +11,10 @@ from pathlib import Path
 
 import numpy as np
 
-from ..batch.pool import Room, Workers
-from ..batch.workspace import Task, Workspace, workspace
+from ..batch.opening import workspace
+from ..batch.pool import Workers
+from ..batch.room import Room
+from ..batch.workspace import Task, Workspace
 from ..dataset import RegisteredSet, SetEntry, write_set
 from ..geometry.files import read_mesh, write_mesh
 from ..geometry.landmarks import write_landmarks

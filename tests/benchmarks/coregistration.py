@@ -31,8 +31,8 @@ from model.coregistration.first import explained_share
 from model.coregistration.rounds import coregister, task_name
 from model.coregistration.single import register_with_model
 from model.learning.scape import LearnConfig
+from scanprep.batch.opening import workspace
 from scanprep.batch.pool import Workers
-from scanprep.batch.workspace import workspace
 from scanprep.cleaning.decimate import decimate
 from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.surface import Surface

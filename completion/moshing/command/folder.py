@@ -8,7 +8,8 @@ from html import escape
 
 import numpy as np
 
-from scanprep.batch.pool import Progress, Workers
+from scanprep.batch.pool import Workers
+from scanprep.batch.room import Progress
 from scanprep.batch.workspace import Task, Workspace
 from scanprep.console import PROBLEM, Metric
 from scanprep.pictures.page import Page

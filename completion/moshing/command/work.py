@@ -11,7 +11,7 @@ import numpy as np
 
 from model.body import BodyModel
 from model.learning.sex_plane import SexGuess
-from scanprep.batch.pool import Room
+from scanprep.batch.room import Room
 from scanprep.console import Metric, Outcome, write_report
 from scanprep.pictures.sheets import save_png
 from scanprep.pictures.views import upright
