@@ -105,9 +105,9 @@ def _registration(demo: Demo, page: Page) -> None:
                                    [name, "registered", f"{1000 * errors[name].mean():.1f} mm from the truth"]))
     page.text("The four worst, with heat from 0 (light) to 10 mm (dark).")
     page.picture(side_by_side(images[:2])).picture(side_by_side(images[2:]))
-    page.table([(f.name, 1000 * f.distance, 1000 * float(errors[f.name].mean()), 100 * f.seen, f.seconds)
+    page.table([(f.name, 1000 * f.distance, 1000 * float(errors[f.name].mean()), 100 * f.seen)
                 for f in sorted(demo.prepared.figures, key=lambda f: -errors[f.name].mean())],
-               ("scan", "to the scan (mm)", "to the truth (mm)", "with data (%)", "time (s)"))
+               ("scan", "to the scan (mm)", "to the truth (mm)", "with data (%)"))
 
 
 def _skeleton(demo: Demo, page: Page) -> None:
