@@ -239,8 +239,8 @@ def test_a_second_run_is_told_and_leaves(tmp_path):
 
 
 def test_workers_go_when_the_run_is_killed(tmp_path):
-    code = ("import os, sys, time\nfrom scanprep.batch.pool import Workers, run_jobs\nfrom scanprep.batch.room import Job\n"
-            "from pathlib import Path\n"
+    code = ("import sys\nfrom pathlib import Path\nfrom scanprep.batch.pool import Workers, run_jobs\n"
+            "from scanprep.batch.room import Job\n"
             "from test_scanprep_batch import Sleep\n"
             "place = Path(sys.argv[1])\n"
             "list(run_jobs(Sleep(), [Job(str(i), place, place) for i in range(2)], Workers(2)))")
