@@ -10,7 +10,7 @@ from mosh_folders import QuietWork, contents, counted, run, write_people
 from completion import MarkerLayout, MarkerSequence, read_markers, write_markers
 from completion.moshing.command import cli
 from model import load_model
-from scanprep.batch import pool
+from scanprep.batch import room
 from scanprep.batch.room import Room
 from scanprep.batch.workspace import HOME
 
@@ -112,7 +112,7 @@ def test_two_workers_write_what_one_does(place, tmp_path):
 
 
 def test_workers_of_a_cluster_keep_no_steps_and_write_the_same(copied, monkeypatch):
-    monkeypatch.setattr(pool, "Room", lambda folder, steps, tell, force: Room(folder, None, tell, force))
+    monkeypatch.setattr(room, "Room", lambda folder, steps, tell, force: Room(folder, None, tell, force))
     assert run(HERE, *BOB, "-o", "cluster") == 0
     assert contents(copied / "cluster") == contents(copied / "whole")
     assert not (copied / "cluster" / HOME / "steps").exists()
