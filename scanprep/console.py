@@ -199,7 +199,8 @@ def run(function: Callable[..., Outcome], prog: str, argv: list[str]) -> int:
             wrong = 1
             outcome, report = call.carried_out(start)
         except KeyboardInterrupt:
-            say(f"{prog}: interrupted; " + ("the same command goes on where it stopped" if call and call.resumes else
+            goes_on = call is not None and call.wants_space
+            say(f"{prog}: interrupted; " + ("the same command goes on where it stopped" if goes_on else
                                             "nothing was written"))
             return 130
         except Exception as error:
@@ -230,7 +231,6 @@ class _Call:
         self.wants_space = any(p.name == SPACE for p in parameters)
         shown = [p.replace(annotation=hints[p.name]) for p in parameters if p.name != SPACE]
         self.output_name = next((p.name for p in shown if p.name in OUTPUTS), None)
-        self.resumes = self.wants_space
         self.beside = self.wants_space and typing.get_origin(hints[SPACE]) is not None      # Annotated: FileWorkspace
         if self.output_name is not None:
             force = inspect.Parameter(FORCE, inspect.Parameter.KEYWORD_ONLY, default=False, annotation=bool)

@@ -164,8 +164,9 @@ def test_a_failure_stops_no_other_and_nothing_stale_stays(tmp_path, texts):
     done, _ = copied(tmp_path, texts)
     assert done.failures == {"a": f"{texts[0]}: bad"} and set(done.values) == {"b", "c"}
     assert set(tree(tmp_path / "out")) == {"b/copy.txt", "c/copy.txt"}
-    assert attempt(Copy(tmp_path / "count"), Job("n", tmp_path / "none.txt", tmp_path / "x")).reason.startswith(
-        "[Errno 2] No such file or directory") and str(tmp_path / "none.txt")
+    missing = tmp_path / "none.txt"
+    lost = attempt(Copy(tmp_path / "count"), Job("n", missing, tmp_path / "x"))
+    assert "No such file" in lost.reason and str(missing) in lost.reason
 
 
 def test_what_is_not_ours_stays(tmp_path, texts):
@@ -315,6 +316,32 @@ def test_an_output_file_that_is_not_ours_stays(tmp_path, capsys):
         assert f"{tmp_path / name}: in the way of the output" in capsys.readouterr().err
         assert tree(tmp_path) == before
         (tmp_path / name).write_text("other")
+
+
+@pytest.mark.parametrize("at", range(8))
+def test_a_command_killed_between_any_two_moves(tmp_path, monkeypatch, at):
+    out, calls, replace = tmp_path / "a.txt", [], os.replace
+    assert command(write, out) == 0
+
+    class Killed(BaseException):
+        pass
+
+    def moving(source, target):
+        calls.append(source)
+        if len(calls) == at + 1:
+            raise Killed
+        replace(source, target)
+
+    monkeypatch.setattr(os, "replace", moving)
+    monkeypatch.setattr(room.shutil, "rmtree", lambda *args, **named: None)
+    try:
+        command(write, out, "--text", "other")
+    except Killed:
+        pass
+    monkeypatch.undo()
+    assert command(write, out, "--text", "other") == 0
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["a.more.txt", "a.report.json", "a.txt"]
+    assert out.read_text() == (tmp_path / "a.more.txt").read_text() == "other"
 
 
 def test_a_command_that_fails_writes_nothing(tmp_path, capsys):

@@ -58,11 +58,11 @@ def beside(output: str | Path, force: bool = False) -> Iterator[Workspace]:
     """
     output = Path(output)
     space = Workspace(output.parent, output.parent / f".{output.name}{HOME}", force, output)
-    if output.is_dir() and not (output / HOME).is_dir() and not written_of(report_path(output)):
-        refuse_any(output)
-    if output.is_file() and not space.is_ours(output.name):
-        raise ForeignFileError(refusal(output))
-    with _opened(space):
+    with _opened(space):                    # first what a killed run had finished comes to its place, and is ours
+        if output.is_dir() and not (output / HOME).is_dir() and not written_of(report_path(output)):
+            refuse_any(output)
+        if output.is_file() and not space.is_ours(output.name):
+            raise ForeignFileError(refusal(output))
         yield space
 
 
