@@ -1,0 +1,63 @@
+"""A statue on disk: the control model, the images over its chart, and how it stands."""
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from scanprep.geometry import storage
+
+from .control_files import load_control, save_control
+from .displacement_files import read_map, write_map
+from .statue import Statue
+
+KIND, VERSION = "statue", 1
+CONTROL, ABOUT, TEXTURE = "control.npz", "statue.json", "texture.png"
+
+
+def save_statue(folder: str | Path, statue: Statue) -> None:
+    """Write control.npz, statue.json, the images of the map and texture.png into a folder."""
+    from PIL import Image
+
+    folder = Path(folder)
+    folder.mkdir(parents=True, exist_ok=True)
+    save_control(folder / CONTROL, statue.control)
+    write_map(folder, statue.map)
+    if statue.texture is not None:
+        with storage.writing(folder / TEXTURE) as beside:
+            Image.fromarray(statue.texture).save(beside)
+    storage.write_json(folder / ABOUT, {"kind": KIND, "version": VERSION, "pose": statue.pose.tolist(),
+                                        "texture": statue.texture is not None})
+
+
+def load_statue(folder: str | Path, edited: str | Path | None = None) -> Statue:
+    """Read a folder of `save_statue`.
+
+    Parameters
+    ----------
+    edited : path, optional
+        An edited copy of displacement.png: where it differs from the image of the folder, its heights count.
+
+    Raises
+    ------
+    StorageError
+        Missing, not a statue, a version that is not known, an image of another size or depth.
+    """
+    from PIL import Image
+
+    folder = Path(folder)
+    about = storage.read_json(folder / ABOUT, "a folder of scape statue fit")
+    if not isinstance(about, dict) or about.get("kind") != KIND:
+        raise storage.StorageError(f"{folder / ABOUT}: expected a statue in JSON, found something else")
+    if about.get("version") != VERSION:
+        raise storage.StorageError(f"{folder / ABOUT}: statue version {about.get('version')} is not known here "
+                                   f"(known: {VERSION})")
+    control = load_control(folder / CONTROL)
+    texture = None
+    with storage.taking_apart(folder / ABOUT, "a whole statue"):
+        pose = storage.numbers({"pose": np.array(about["pose"], dtype=np.float64)}, "pose",
+                               len(control.skeleton.parents), 3)
+    if about.get("texture"):
+        with storage.taking_apart(folder / TEXTURE, "the texture of the statue"), Image.open(folder / TEXTURE) as image:
+            texture = np.asarray(image.convert("RGB"))
+    return Statue(control, pose, read_map(folder, edited), texture)
