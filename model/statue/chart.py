@@ -6,12 +6,14 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 
 from scanprep.geometry.mesh import Mesh
+from scanprep.skeleton.tree import Skeleton
+
+from .seams import cut, extended, find_seams
 
 MARGIN = 6 / 1024                    # of the image, left free around the chart
+FINE = 1 / 3                         # of the mean density, in length: coarser triangles ask for one more seam
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,29 +99,32 @@ def make_chart(mesh: Mesh, seams: Sequence[np.ndarray]) -> Chart:
     return chart
 
 
-def cut(mesh: Mesh, seams: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-    """Triangles (F, 3) of the mesh opened along seams, and the vertex (M,) that each of the new ones was.
+def automatic_chart(mesh: Mesh, skeleton: Skeleton, rounds: int = 10) -> Chart:
+    """A chart along the seams of `find_seams`, which go on to where the chart is crowded: between fingers, to ears.
 
-    Raises
-    ------
-    ValueError
-        A seam that leaves the edges.
+    Parameters
+    ----------
+    rounds : int
+        Charts at most; done when no triangle is drawn smaller than `FINE` of the mean, in length.
     """
-    number = {edge: k for k, edge in enumerate(map(tuple, mesh.edges.tolist()))}
-    open_edge = np.zeros(len(mesh.edges), dtype=bool)
-    for seam in seams:
-        for a, b in zip(seam[:-1].tolist(), seam[1:].tolist(), strict=True):
-            if (min(a, b), max(a, b)) not in number:
-                raise ValueError(f"seams: vertices {a} and {b} follow each other but no edge joins them")
-            open_edge[number[min(a, b), max(a, b)]] = True
-    order = np.argsort(mesh.face_edges.ravel(), kind="stable").reshape(-1, 2)    # the two sides at every edge
-    p, q = order[~open_edge].T
-    end = [k - k % 3 + (k + 1) % 3 for k in (p, q)]
-    rows, columns = np.r_[p, end[0]], np.r_[end[1], q]                 # sides run in opposite directions
-    n = mesh.faces.size
-    _, label = connected_components(coo_array((np.ones(len(rows)), (rows, columns)), shape=(n, n)), directed=False)
-    _, first, fan = np.unique(label, return_index=True, return_inverse=True)
-    return fan.reshape(-1, 3), mesh.faces.ravel()[first]
+    seams = find_seams(mesh, skeleton)
+    chart = make_chart(mesh, seams)
+    for _ in range(rounds - 1):
+        density = densities(mesh, chart)
+        worst = int(density.argmin())
+        if density[worst] >= FINE:
+            break
+        longer = extended(mesh, seams, int(mesh.faces[worst][0]))
+        if len(longer) == len(seams):
+            break
+        seams, chart = longer, make_chart(mesh, longer)
+    return chart
+
+
+def densities(mesh: Mesh, chart: Chart) -> np.ndarray:
+    """(F,) how large each triangle is drawn against the mean of the surface, in length."""
+    drawn = _twice_area(*chart.uv[chart.faces].swapaxes(0, 1)) / 2
+    return np.sqrt(drawn / mesh.face_areas * mesh.face_areas.sum() / drawn.sum())
 
 
 def fill_square(uv: np.ndarray, mesh: Mesh) -> np.ndarray:

@@ -1,0 +1,112 @@
+"""Motions of other skeletons, carried over to a statue: of the synthetic people and of BVH files."""
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from scanprep.geometry.storage import load_arrays, numbers, taking_apart
+
+from ..export.bvh_read import BvhMotion
+from ..export.rig import check_motion, joint_places
+from .control import ControlModel
+from .retarget import MotionConfig, Pairing, StatueMotion, retargeted
+
+
+def own_motion(control: ControlModel, path: str | Path) -> StatueMotion:
+    """A motion file (`poses`, `trans`, `mocap_frame_rate`) of the statue's own parts.
+
+    Raises
+    ------
+    StorageError
+        Missing, not a motion, or of other parts.
+    """
+    stored = load_arrays(path, "a motion (.npz)")
+    J, names = len(control.skeleton.parents), control.skeleton.names
+    with taking_apart(path, f"a motion of the statue's {J} parts"):
+        T = len(stored["poses"])
+        poses = numbers({"poses": stored["poses"].reshape(T, -1)}, "poses", None, 3 * J).reshape(T, J, 3)
+        rate = stored["mocap_frame_rate" if "mocap_frame_rate" in stored else "mocap_framerate"]
+        poses, trans = check_motion(control.skeleton, poses, numbers(stored, "trans", T, 3), float(rate))
+        return StatueMotion(poses, trans, float(rate), dict(zip(names, names, strict=True)))
+
+
+def people_motion(control: ControlModel, pose: np.ndarray, poses: np.ndarray, trans: np.ndarray | None = None,
+                  rate: float = 60.0, up: np.ndarray | None = None, config: MotionConfig | None = None
+                  ) -> StatueMotion:
+    """A motion of the synthetic people.
+
+    The generic control model rests as they do, so the rotations of the parts in the world carry over; abdomen and
+    chest become the one rotation that brings neck and shoulders nearest to where those two bring them.
+
+    Parameters
+    ----------
+    control : ControlModel
+        Fitted.
+    pose : (J, 3) float, radians
+        `Statue.pose`.
+    poses : (T, 16, 3) float, radians
+    trans : (T, 3) float, metres, optional
+        For the average person; scaled by the length of the legs.
+    rate : float, frames a second
+    up : (3,) float, optional
+        As for `bvh_motion`.
+    config : MotionConfig, optional
+
+    Raises
+    ------
+    ValueError
+        A motion of other parts or not finite.
+    """
+    from scanprep.scanning.people import Person
+
+    skeleton = Person().skeleton
+    poses, trans = check_motion(skeleton, poses, trans, rate)
+    offsets = skeleton.joints - np.where(skeleton.parents[:, None] < 0, 0, skeleton.joints[skeleton.parents])
+    moving = BvhMotion(skeleton.names, skeleton.parents, offsets, {}, skeleton.part_rotations(poses),
+                       joint_places(skeleton, poses, trans), rate)
+    return retargeted(Pairing(control, pose, moving, None, up), True, config or MotionConfig())
+
+
+def bvh_motion(control: ControlModel, pose: np.ndarray, bvh: BvhMotion, reference: int | None = None,
+               names: Mapping[str, str] | None = None, up: np.ndarray | None = None,
+               config: MotionConfig | None = None) -> StatueMotion:
+    """The motion of a BVH file, by the names of its joints and the directions of its bones.
+
+    A part follows the rotation of its joint against the rest of the file, whatever that is: bones of arms and legs
+    then point where those of the file do, hands continue the forearms as at rest, and trunk, head and feet keep
+    their angle to the facing direction. The trunk of the file, of any number of joints, becomes one rotation that
+    brings neck and shoulders nearest to where it brings them. Travel is scaled by the length of the legs; the
+    statue starts where the scan stands, facing as the scan does where the file's rest faces forward, and its lowest
+    vertex in the motion is as low as in the scan.
+
+    Parameters
+    ----------
+    control : ControlModel
+        Fitted.
+    pose : (J, 3) float, radians
+        `Statue.pose`.
+    bvh : BvhMotion
+    reference : int, optional
+        A frame in which the person stands upright with straight limbs, in the place of the rest of the file: for
+        files whose offsets all point the same way.
+    names : {H-Anim name: name in the file}, optional
+        Where the names say something else than `find_roles` finds.
+    up : (3,) float, optional
+        Upwards in the scan; else the axis nearest to the direction from feet to head.
+    config : MotionConfig, optional
+
+    Raises
+    ------
+    ValueError
+        Names that say too little; a frame that does not exist.
+    """
+    if reference is not None:
+        if not 0 <= reference < len(bvh.places):
+            raise ValueError(f"reference: expected a frame of 0 to {len(bvh.places) - 1}, got {reference}")
+        R, rest = bvh.rotations[reference], bvh.places[reference]
+        bvh = replace(bvh, offsets=rest - np.where(bvh.parents[:, None] < 0, 0, rest[bvh.parents]),
+                      rotations=bvh.rotations @ np.swapaxes(R, -1, -2))
+    return retargeted(Pairing(control, pose, bvh, names, up), False, config or MotionConfig())
