@@ -13,11 +13,13 @@ from scanprep.pictures.camera import Camera
 from scanprep.pictures.page import Page
 from scanprep.pictures.shading import Bones, Dots, Shape, Solid, color_bar, heat, part_colors, render, side_by_side
 
+from .reconstruction import Reconstruction
 from .statue import FOLDED, HOLE, MEASURED, OUTSIDE, DisplacementMap, Statue
 
 HEIGHT = 520
 SIDES = ("front", "left", "back", "right")
 WORST = 0.003                        # metres: the end of the colours of errors
+MOVING = 3                           # level of the pictures in motion
 KINDS = {MEASURED: (0.62, 0.70, 0.78), FOLDED: (0.86, 0.36, 0.22), HOLE: (0.93, 0.75, 0.42), OUTSIDE: (1.0, 1.0, 1.0)}
 
 
@@ -174,3 +176,28 @@ def _row(shown: Sequence[tuple[Shape | Sequence[Shape], Camera]], labels: Sequen
 
 def _picture(shapes: Shape | Sequence[Shape], camera: Camera) -> np.ndarray:
     return render(shapes, camera, int(HEIGHT * camera.width / camera.height) + 10, HEIGHT)
+
+
+def parts_without_data(statue: Statue) -> list[str]:
+    """Names of the parts of which less than half was measured."""
+    kind = coverage_of_vertices(statue)
+    part = statue.control.skeleton.part_of_vertex(statue.control.mesh)
+    hole = np.bincount(part, kind == HOLE) / np.maximum(np.bincount(part), 1)
+    return [name for name, share in zip(statue.control.skeleton.names, hole, strict=True) if share > 0.5]
+
+
+def in_motion(statue: Statue) -> list[tuple[str, Mesh]]:
+    """The statue in a walk, a squat and with its arms overhead; none for a control model with other joints."""
+    from scanprep.scanning.people import named_pose, walk
+
+    from .humanoid import humanoid
+    from .motion import people_motion
+
+    if statue.control.skeleton.names != humanoid().skeleton.names:
+        return []
+    poses = np.stack([walk(80)[0][20], named_pose("squat"), named_pose("arms_up")])
+    moved = people_motion(statue.control, statue.pose, poses)
+    detailed = Reconstruction(statue.control, statue.map, subdivide(statue.control.mesh, statue.control.chart, MOVING))
+    bodies = statue.control.rig.vertices(moved.poses, moved.trans)
+    return [(name, detailed.mesh(body)) for name, body in zip(("walking", "squatting", "arms overhead"), bodies,
+                                                              strict=True)]
