@@ -15,6 +15,7 @@ from scanprep.pictures.shading import Bones, Dots, Shape, Solid, color_bar, heat
 
 from .reconstruction import Reconstruction
 from .statue import FOLDED, HOLE, MEASURED, OUTSIDE, DisplacementMap, Statue
+from .subdivision import subdivide
 
 HEIGHT = 520
 SIDES = ("front", "left", "back", "right")
