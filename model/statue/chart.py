@@ -144,7 +144,7 @@ def chart_problem(mesh: Mesh, chart: Chart) -> str | None:
     A chart is one disk inside the unit square, no triangle turned over, whose border does not meet itself: then it
     is one-to-one.
     """
-    from .flatten import crossings
+    from .flatten import crossings, orientation
 
     if chart.faces.shape != mesh.faces.shape:
         return f"it has {len(chart.faces)} triangles, the mesh {len(mesh.faces)}"
@@ -157,7 +157,7 @@ def chart_problem(mesh: Mesh, chart: Chart) -> str | None:
     if not flat.is_edge_manifold or len(flat.boundary_loops) != 1:
         return f"expected one border, it has {len(flat.boundary_loops)}"
     corners = chart.uv[chart.faces]
-    turned = np.flatnonzero(_twice_area(*corners.swapaxes(0, 1)) <= 0)
+    turned = np.flatnonzero(orientation(*corners.swapaxes(0, 1)) <= 0)
     if len(turned):
         return f"{len(turned)} triangles are turned over, the first is face {turned[0]}"
     if crossings(chart.uv[flat.boundary_loops[0]]):
