@@ -9,14 +9,12 @@ import pytest
 from animal_bodies import Animal
 
 from model.export.glb import skinned_glb, write_skinned_glb
-from model.export.rig import joint_places
 from model.statue.chart import Chart, automatic_chart, chart_problem, densities, make_chart
-from model.statue.control import ControlModel, control_problem
+from model.statue.control import control_problem
 from model.statue.control_files import read_control
 from model.statue.flatten import _derivatives, _energy, _rest, crossings, orientation
-from model.statue.humanoid import LIMITS, NAMES, STORED, humanoid, humanoid_markers
+from model.statue.humanoid import NAMES, STORED, humanoid, humanoid_markers
 from model.statue.seams import cut, find_seams
-from scanprep.geometry import rotations
 from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.storage import StorageError
 from scanprep.scanning.people import LANDMARKS, MARKERS
@@ -224,10 +222,15 @@ def test_a_chart_that_is_not_one_to_one_is_told():
     mesh, chart = humanoid().mesh, humanoid().chart
     assert "turned over" in chart_problem(mesh, replace(chart, uv=chart.uv[:, ::-1]))
     assert "leaves" in chart_problem(mesh, replace(chart, uv=chart.uv + 0.5))
-    hand = np.unique(chart.faces[humanoid().skeleton.part_of_face == NAMES.index("l_wrist")])
-    uv = chart.uv * 0.5
-    uv[hand] += 0.4
-    assert chart_problem(mesh, Chart(uv, chart.faces)) is not None
+    turn = np.linspace(0, 2.3 * np.pi, 60)                          # a ribbon that runs over its own beginning
+    ribbon = 0.5 + 0.4 * np.concatenate([r * np.stack([np.cos(turn), np.sin(turn)], axis=1) for r in (0.7, 1.0)])
+    i = np.arange(59)
+    strip = np.vstack([np.stack([i, i + 60, i + 1], axis=1), np.stack([i + 1, i + 60, i + 61], axis=1)])
+    assert "crosses" in chart_problem(Chart(ribbon, strip).flat, Chart(ribbon, strip))
+    short = strip[(strip % 60 < 50).all(axis=1)]
+    used, short = np.unique(short, return_inverse=True)
+    part = Chart(ribbon[used], short.reshape(-1, 3))
+    assert chart_problem(part.flat, part) is None
     faces = chart.faces.copy()                                      # one triangle on its own
     faces[7] = len(chart.uv) + np.arange(3)
     assert "2 charts" in chart_problem(mesh, Chart(np.vstack([chart.uv, chart.uv[chart.faces[7]]]), faces))
@@ -276,8 +279,8 @@ def test_a_skinned_glb_becomes_the_same_control_model(glb):
     np.testing.assert_allclose(again.chart.uv[again.chart.faces], control.chart.uv[control.chart.faces], atol=1e-6)
     np.testing.assert_allclose(again.weights[again.mesh.faces], control.weights[control.mesh.faces], atol=1e-6)
     pose = 0.3 * np.random.default_rng(3).normal(size=(17, 3))
-    np.testing.assert_allclose(again.rig.vertices(pose)[again.mesh.faces], control.rig.vertices(pose)[control.mesh.faces],
-                               atol=1e-5)
+    np.testing.assert_allclose(again.rig.vertices(pose)[again.mesh.faces],
+                               control.rig.vertices(pose)[control.mesh.faces], atol=1e-5)
 
 
 def test_a_skinned_glb_is_read_as_it_stands_in_the_scene(glb):

@@ -130,8 +130,8 @@ def densities(mesh: Mesh, chart: Chart) -> np.ndarray:
 def fill_square(uv: np.ndarray, mesh: Mesh) -> np.ndarray:
     """Turned and scaled so that the smallest square around it is the unit square without its margin."""
     angles = np.radians(np.arange(0, 90, 0.5))
-    turned = np.stack([np.stack([np.cos(angles), -np.sin(angles)], 1), np.stack([np.sin(angles), np.cos(angles)], 1)], 1)
-    places = np.einsum("aij,nj->ani", turned, uv)
+    cos, sin = np.cos(angles), np.sin(angles)
+    places = np.einsum("ija,nj->ani", np.array([[cos, -sin], [sin, cos]]), uv)
     extent = np.ptp(places, axis=1).max(axis=1)
     best = places[extent.argmin()]
     middle = (best.min(axis=0) + best.max(axis=0)) / 2

@@ -1,4 +1,4 @@
-"""A cut surface laid flat in one piece: no triangle turned over, no overlap, areas and angles as even as they can be."""
+"""A cut surface laid flat in one piece: no triangle turned over, no overlap, areas and angles nearly kept."""
 from __future__ import annotations
 
 from fractions import Fraction

@@ -189,7 +189,7 @@ def _smoothstep(x: np.ndarray) -> np.ndarray:
 def hidden_seams(mesh: Mesh, a: Anatomy) -> list[np.ndarray]:
     """Seams out of sight: crown to crotch behind, under the arms and round the hand to the thumb, inside of the legs to
     the heel and round the sole; the right side mirrors the left."""
-    g, j, e = a.scale, a.joints, a.ends
+    g, j = a.scale, a.joints
     fu, ff, fl, ft = a.upper_arm_frame, a.forearm_frame, a.leg_frame, a.foot_frame
     L, foot = a.width["hand"] / 0.19, a.width["foot"]
 
