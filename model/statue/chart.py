@@ -99,8 +99,8 @@ def make_chart(mesh: Mesh, seams: Sequence[np.ndarray]) -> Chart:
     return chart
 
 
-def automatic_chart(mesh: Mesh, skeleton: Skeleton, rounds: int = 10) -> Chart:
-    """A chart along the seams of `find_seams`, which go on to where the chart is crowded: between fingers, to ears.
+def automatic_chart(mesh: Mesh, skeleton: Skeleton, rounds: int = 4) -> Chart:
+    """A chart along the seams of `find_seams`, which go on to where it is crowded, such as the tips of fingers.
 
     Parameters
     ----------
@@ -110,15 +110,23 @@ def automatic_chart(mesh: Mesh, skeleton: Skeleton, rounds: int = 10) -> Chart:
     seams = find_seams(mesh, skeleton)
     chart = make_chart(mesh, seams)
     for _ in range(rounds - 1):
-        density = densities(mesh, chart)
-        worst = int(density.argmin())
-        if density[worst] >= FINE:
-            break
-        longer = extended(mesh, seams, int(mesh.faces[worst][0]))
+        crowded = crowded_places(mesh, densities(mesh, chart))
+        longer = seams
+        for vertex in crowded:
+            longer = extended(mesh, longer, vertex)
         if len(longer) == len(seams):
             break
         seams, chart = longer, make_chart(mesh, longer)
     return chart
+
+
+def crowded_places(mesh: Mesh, density: np.ndarray) -> list[int]:
+    """A vertex of the smallest triangle of every region that is drawn smaller than `FINE`."""
+    crowded = np.flatnonzero(density < FINE)
+    part, old = mesh.submesh(crowded)
+    region = part.vertex_component[part.faces[:, 0]]
+    return [int(old[part.faces[np.flatnonzero(region == k)[density[crowded][region == k].argmin()], 0]])
+            for k in np.unique(region)]
 
 
 def densities(mesh: Mesh, chart: Chart) -> np.ndarray:
