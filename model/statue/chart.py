@@ -99,8 +99,8 @@ def make_chart(mesh: Mesh, seams: Sequence[np.ndarray]) -> Chart:
     return chart
 
 
-def automatic_chart(mesh: Mesh, skeleton: Skeleton, rounds: int = 10) -> Chart:
-    """A chart along the seams of `find_seams`, which go on to where the chart is crowded: between fingers, to ears.
+def automatic_chart(mesh: Mesh, skeleton: Skeleton, rounds: int = 4) -> Chart:
+    """A chart along the seams of `find_seams`, which go on to where it is crowded, such as the tips of fingers.
 
     Parameters
     ----------
@@ -110,15 +110,23 @@ def automatic_chart(mesh: Mesh, skeleton: Skeleton, rounds: int = 10) -> Chart:
     seams = find_seams(mesh, skeleton)
     chart = make_chart(mesh, seams)
     for _ in range(rounds - 1):
-        density = densities(mesh, chart)
-        worst = int(density.argmin())
-        if density[worst] >= FINE:
-            break
-        longer = extended(mesh, seams, int(mesh.faces[worst][0]))
+        crowded = crowded_places(mesh, densities(mesh, chart))
+        longer = seams
+        for vertex in crowded:
+            longer = extended(mesh, longer, vertex)
         if len(longer) == len(seams):
             break
         seams, chart = longer, make_chart(mesh, longer)
     return chart
+
+
+def crowded_places(mesh: Mesh, density: np.ndarray) -> list[int]:
+    """A vertex of the smallest triangle of every region that is drawn smaller than `FINE`."""
+    crowded = np.flatnonzero(density < FINE)
+    part, old = mesh.submesh(crowded)
+    region = part.vertex_component[part.faces[:, 0]]
+    return [int(old[part.faces[np.flatnonzero(region == k)[density[crowded][region == k].argmin()], 0]])
+            for k in np.unique(region)]
 
 
 def densities(mesh: Mesh, chart: Chart) -> np.ndarray:
@@ -130,8 +138,8 @@ def densities(mesh: Mesh, chart: Chart) -> np.ndarray:
 def fill_square(uv: np.ndarray, mesh: Mesh) -> np.ndarray:
     """Turned and scaled so that the smallest square around it is the unit square without its margin."""
     angles = np.radians(np.arange(0, 90, 0.5))
-    turned = np.stack([np.stack([np.cos(angles), -np.sin(angles)], 1), np.stack([np.sin(angles), np.cos(angles)], 1)], 1)
-    places = np.einsum("aij,nj->ani", turned, uv)
+    cos, sin = np.cos(angles), np.sin(angles)
+    places = np.einsum("ija,nj->ani", np.array([[cos, -sin], [sin, cos]]), uv)
     extent = np.ptp(places, axis=1).max(axis=1)
     best = places[extent.argmin()]
     middle = (best.min(axis=0) + best.max(axis=0)) / 2
@@ -144,7 +152,7 @@ def chart_problem(mesh: Mesh, chart: Chart) -> str | None:
     A chart is one disk inside the unit square, no triangle turned over, whose border does not meet itself: then it
     is one-to-one.
     """
-    from .flatten import crossings
+    from .flatten import crossings, orientation
 
     if chart.faces.shape != mesh.faces.shape:
         return f"it has {len(chart.faces)} triangles, the mesh {len(mesh.faces)}"
@@ -157,7 +165,7 @@ def chart_problem(mesh: Mesh, chart: Chart) -> str | None:
     if not flat.is_edge_manifold or len(flat.boundary_loops) != 1:
         return f"expected one border, it has {len(flat.boundary_loops)}"
     corners = chart.uv[chart.faces]
-    turned = np.flatnonzero(_twice_area(*corners.swapaxes(0, 1)) <= 0)
+    turned = np.flatnonzero(orientation(*corners.swapaxes(0, 1)) <= 0)
     if len(turned):
         return f"{len(turned)} triangles are turned over, the first is face {turned[0]}"
     if crossings(chart.uv[flat.boundary_loops[0]]):

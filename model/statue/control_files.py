@@ -25,8 +25,8 @@ def read_control(path: str | Path) -> ControlModel:
     Raises
     ------
     StorageError
-        Missing, neither of the two, damaged; a mesh that is open, not manifold or in several pieces, without weights, or
-        with texture coordinates that are not one chart.
+        Missing, neither of the two, damaged; a mesh that is open, not manifold or in several pieces, without weights,
+        or with texture coordinates that are not one chart.
     """
     path = Path(path)
     if path.suffix.lower() == ".npz":

@@ -192,22 +192,22 @@ def _with_triangles(mesh: Mesh, weights: np.ndarray, parents: np.ndarray
     for j in range(len(parents)):
         while heir[j] >= 0 and not own[heir[j]]:
             heir[j] = parents[heir[j]]
-    depth = np.zeros(len(parents), dtype=np.int64)
-    for j in range(len(parents)):
-        up = parents[j]
-        while up >= 0:
-            depth[j], up = depth[j] + 1, parents[up]
     size = np.bincount(wanted.argmax(axis=1), minlength=len(parents))
     tops = [j for j in np.flatnonzero(own) if parents[j] < 0 or heir[parents[j]] < 0]
     root = max(tops, key=lambda j: size[j])
-    kept = np.array(sorted(np.flatnonzero(own), key=lambda j: (j != root, depth[j])))
+    above = {j: -1 if j == root else root if j in tops else heir[parents[j]] for j in np.flatnonzero(own).tolist()}
+    order, ahead = [], [root]
+    while ahead:                                                       # in the order of the file, parents first
+        order.append(ahead.pop())
+        ahead += [j for j in reversed(above) if above[j] == order[-1]]
+    kept = np.array(order)
     index = np.full(len(parents), -1)
     index[kept] = np.arange(len(kept))
     heir[heir < 0] = root
-    above = np.array([-1 if j == root else 0 if j in tops else index[heir[parents[j]]] for j in kept])
+    tree = np.array([-1 if j == root else index[above[j]] for j in order])
     gathered = np.zeros((len(weights), len(kept)))
     np.add.at(gathered.T, index[heir], weights.T)
-    return kept, above, gathered, index[wanted.argmax(axis=1)]
+    return kept, tree, gathered, index[wanted.argmax(axis=1)]
 
 
 def _distinct(names: list[str]) -> tuple[str, ...]:

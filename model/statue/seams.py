@@ -79,10 +79,10 @@ def limb_tips(mesh: Mesh, skeleton: Skeleton) -> list[int]:
         mine = np.flatnonzero(part == p)
         if not len(mine):
             continue
-        joint = skeleton.joints[children[0] if p == 0 and len(children) else p]
-        start = skeleton.ring(mesh, int(children[0]) if p == 0 and len(children) else p) if len(parents) > 1 else mine[:1]
+        joint = int(children[0]) if p == 0 and len(children) else p   # where it meets its neighbour
+        start = skeleton.ring(mesh, joint) if joint else mine[:0]
         if not len(start):
-            start = mine[[np.linalg.norm(mesh.vertices[mine] - joint, axis=1).argmin()]]
+            start = mine[[np.linalg.norm(mesh.vertices[mine] - skeleton.joints[joint], axis=1).argmin()]]
         far = dijkstra(graph, directed=False, indices=start, min_only=True)
         tips.append(int(mine[far[mine].argmax()]))
     return sorted(set(tips))
