@@ -20,12 +20,13 @@ CAP, NORMALS = 0.08, 0.05        # metres: of a distance, and what a difference 
 UNSEEN = 0.3                     # weight of the body's distances to the scan, which may show a part only
 HEADINGS = 8
 PART = 0.85                      # of the model's height: lower scans may be of a part of a person
-TRIED = 8                        # starts that are bent a little
+TRIED, ARMS_BENT = 8, 3          # starts of the body, and of an arm, that are bent a little
+RIVAL = 1.3                      # a stand that fits worse by this factor is no more than the other facing
 ASTRAY = 0.01                    # share of a scan off the body, by more than a hand: a limb is in a wrong place
-# Outwards, frontwards, upwards: where an arm may point, from the shoulder and from the elbow.
-ARMS = (((0.5, 0, -1), (0.4, 0.1, -1)), ((1, 0, 0), (1, 0, 0)), ((0.2, 1, 0), (0.1, 1, 0)), ((0.3, 0, 1), (0.2, 0, 1)),
-        ((0.6, 0.2, -0.8), (-0.3, 0.9, 0.3)), ((0.8, 0.2, 0), (0, 0.2, 1)), ((0.8, 0.3, -0.6), (-0.9, 0.5, -0.1)),
-        ((0.4, -0.6, -0.8), (0.2, -0.5, -0.8)))
+# Outwards, frontwards, upwards: where an upper arm may point, and a forearm, which else goes on straight.
+UPPER_ARMS = ((0.4, 0, -1), (0.7, 0.4, -0.7), (0.6, -0.6, -0.7), (1, 0, 0), (0.8, 0.6, 0.2), (0.2, 1, 0), (0.8, 0, 0.7),
+              (0.2, 0, 1), (0.2, 0.7, 0.7))
+FOREARMS = ((0, 1, 0), (-0.75, 0.1, 0.65), (0.1, 0.1, 1), (-1, 0.4, 0))
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,7 +73,10 @@ def find_person(search: PoseSearch, target: Target, metres: float) -> list[Stand
     bent = sorted((bend(search, target, T, search.start, COARSE) for T in rough_stands(search, target, metres)[:TRIED]),
                   key=lambda stand: stand.misfit)
     best = bent[:1] + [s for s in bent[1:] if _facing(search, s) @ _facing(search, bent[0]) < 0.5][:1]
-    return sorted((_with_limbs(search, target, stand) for stand in best), key=lambda stand: stand.misfit)
+    best = [bend(search, target, stand.T, stand.posed, FINE) for stand in best]
+    least = min(stand.misfit for stand in best)
+    return sorted((with_arms(search, target, stand) if stand.misfit < RIVAL * least else stand for stand in best),
+                  key=lambda stand: stand.misfit)
 
 
 def bend(search: PoseSearch, target: Target, T: np.ndarray, posed: Posed, stages: tuple) -> Stand:
@@ -131,7 +135,8 @@ def _placements(body: Mesh, points: np.ndarray, metres: float) -> Iterator[tuple
         if metres * tall < PART * (highest - lowest):
             ways += [(metres, False), (metres, True)]
         for k in range(HEADINGS if ways else 0):
-            turn = rotations.exp(np.array([0, 0, 2 * np.pi * k / HEADINGS])) @ np.array([right, np.cross(up, right), up])
+            heading = rotations.exp(np.array([0, 0, 2 * np.pi * k / HEADINGS]))
+            turn = heading @ np.array([right, np.cross(up, right), up])
             for scale, hangs in ways:
                 placed = scale * points @ turn.T
                 level = highest - placed[:, 2].max() if hangs else lowest - placed[:, 2].min()
@@ -140,20 +145,22 @@ def _placements(body: Mesh, points: np.ndarray, metres: float) -> Iterator[tuple
                 yield T, turn
 
 
-def _with_limbs(search: PoseSearch, target: Target, stand: Stand) -> Stand:
-    """The same stand, bent all the way; while much of the scan lies off the body its arms are tried elsewhere."""
-    stand = bend(search, target, stand.T, stand.posed, FINE)
+def with_arms(search: PoseSearch, target: Target, stand: Stand) -> Stand:
+    """The same stand, with arms tried elsewhere while much of the scan lies off the body."""
     goal = moved(target, stand.T).thinned(0.02)
+    coarse = goal.thinned(0.05)
     for base, middle, end in limbs(search.model):
-        if end is None or not _is_arm(search, base):
-            continue
         off = Surface(search.mesh(stand.posed)).closest(goal.points).distances
         if (off > CAP).mean() < ASTRAY:
             break
-        starts = [_pointed(search, stand.posed, base, middle, end, *arm) for arm in ARMS]
-        tried = min((bend(search, target, stand.T, start, COARSE[1:]) for start in starts), key=lambda s: s.misfit)
-        tried = bend(search, target, stand.T, tried.posed, FINE)
-        stand = min(stand, tried, key=lambda s: s.misfit)
+        if end is None or not _is_arm(search, base):
+            continue
+        starts = [_pointed(search, stand.posed, base, middle, end, np.array([upper, fore]))
+                  for upper in UPPER_ARMS for fore in (upper, *FOREARMS)]
+        starts.sort(key=lambda posed: misfit(search.mesh(posed), coarse))
+        # No coarser: from afar a hand beside the head is drawn to the head.
+        stand = min([stand, *(bend(search, target, stand.T, posed, FINE) for posed in starts[:ARMS_BENT])],
+                    key=lambda s: s.misfit)
     return stand
 
 
@@ -163,13 +170,13 @@ def _is_arm(search: PoseSearch, base: int) -> bool:
     return bool(o[base, 2] > 0.5 * (z.min() + z.max()))
 
 
-def _pointed(search: PoseSearch, posed: Posed, base: int, middle: int, end: int, upper: tuple, fore: tuple) -> Posed:
+def _pointed(search: PoseSearch, posed: Posed, base: int, middle: int, end: int, arm: np.ndarray) -> Posed:
     """The same pose but for one arm, whose two bones point outwards, frontwards and upwards as told."""
     model, x = search.model, posed.x.copy()
     skeleton = model.control.skeleton
     side = np.sign(skeleton.joints[base, 0]) or 1.0
     above = model.frames(x).R[skeleton.parents[base]]
-    goal = np.array([[side * out, -front, up] for out, front, up in (upper, fore)]) @ model.frames(x).R[0].T @ above
+    goal = arm * [side, -1, 1] @ model.frames(x).R[0].T @ above
     of_base, hinge = model.joint_of == base, model.joint_of == middle
     angles = model.split(x)[0]
     angles[np.isin(model.joint_of, np.flatnonzero(skeleton.descends[:, middle]))] = 0

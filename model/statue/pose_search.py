@@ -86,7 +86,8 @@ class PoseSearch:
     def points(self, girth: np.ndarray) -> Points:
         """All vertices of a body so thick, in the default pose."""
         mesh = self.model.control.mesh
-        return Points(self.model.control.weights, mesh.vertices + (self.segments @ girth)[:, None] * mesh.vertex_normals)
+        thicker = (self.segments @ girth)[:, None] * mesh.vertex_normals
+        return Points(self.model.control.weights, mesh.vertices + thicker)
 
     def mesh(self, posed: Posed) -> Mesh:
         """The control mesh as it lies."""
@@ -109,8 +110,9 @@ class PoseSearch:
         wanted = match_both_ways(mesh, self.sample, self.area, goal, stage.reach, stage.slide,
                                  Likeness(normals=self.normals)).wanted
         D = model.derivatives(frames, points)
-        H = np.einsum("nip,nij,njq->pq", D, wanted.A, D, optimize=True)
-        g = np.einsum("nip,ni->p", D, np.einsum("nij,nj->ni", wanted.A, mesh.vertices) - wanted.b)
+        rows = D.reshape(-1, len(x))
+        H = rows.T @ (wanted.A @ D).reshape(-1, len(x))
+        g = rows.T @ (np.einsum("nij,nj->ni", wanted.A, mesh.vertices) - wanted.b).ravel()
         A, S = len(model.axes), len(model.lengths)
         hold, centre = np.zeros(len(x)), model.rest.copy()
         hold[:A] = self.area * stage.prior**2 * (model.joint_of != 0)
