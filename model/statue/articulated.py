@@ -184,19 +184,24 @@ class Articulated:
     def derivatives(self, frames: Frames, points: Points) -> np.ndarray:
         """(n, 3, P) of the positions by the parameters."""
         skeleton, w = self.control.skeleton, points.weights
-        carried = w[..., None] * self._by_part(frames, points)
-        below = np.einsum("npd,pj->njd", carried, skeleton.descends.astype(float))
-        arm = below - (w @ skeleton.descends)[..., None] * frames.joints
-        by_angle = np.cross(frames.turns, arm[:, self.joint_of])                              # (n, A, 3)
+        n, J = w.shape
+        below = skeleton.descends.astype(float)
+        carried = (w[..., None] * self._by_part(frames, points)).transpose(0, 2, 1) @ below          # (n, 3, J)
+        arm = carried - (w @ below)[:, None] * frames.joints.T
+        by_angle = np.cross(frames.turns, arm.transpose(0, 2, 1)[:, self.joint_of]).transpose(0, 2, 1)
         d = w[..., None] * (points.rest[:, None] - skeleton.joints)
-        along = np.einsum("pij,pjk,npk->npi", frames.R, self.along, d, optimize=True)
-        across = np.einsum("pij,npj->ni", frames.R, d) - along.sum(axis=1)
-        by_length = (np.einsum("nj,jsd->nsd", w, frames.shifts) + np.einsum("npd,ps->nsd", along, self.is_of)
-                     + self.shares[:, None] * across[:, None])
-        by_place = np.broadcast_to(np.eye(3), (len(w), 3, 3))
-        return np.concatenate([by_angle, by_length, by_place], axis=1).transpose(0, 2, 1)
+        along = _each(frames.R @ self.along, d)
+        across = (_each(frames.R, d) - along).sum(axis=1)
+        by_length = (w @ frames.shifts.reshape(J, -1)).reshape(n, -1, 3).transpose(0, 2, 1)
+        by_length = by_length + along.transpose(0, 2, 1) @ self.is_of + across[..., None] * self.shares
+        return np.concatenate([by_angle, by_length, np.broadcast_to(np.eye(3), (n, 3, 3))], axis=2)
 
     def _by_part(self, frames: Frames, points: Points) -> np.ndarray:
         """(n, J, 3) where each part alone would carry each point."""
         d = points.rest[:, None] - self.control.skeleton.joints
-        return frames.joints + np.einsum("jab,njb->nja", frames.R @ frames.shapes, d, optimize=True)
+        return frames.joints + _each(frames.R @ frames.shapes, d)
+
+
+def _each(M: np.ndarray, d: np.ndarray) -> np.ndarray:
+    """(n, J, 3): the matrices M (J, 3, 3) of the parts, each times its vectors in d (n, J, 3)."""
+    return (d.transpose(1, 0, 2) @ M.transpose(0, 2, 1)).transpose(1, 0, 2)

@@ -207,7 +207,7 @@ def _features(control: ControlModel, joints: Mapping[str, np.ndarray], points: M
                   np.concatenate([control.skeleton.joints[parts], control.mesh.vertices[vertices]])), goal
 
 
-def _limbs(model: Articulated) -> list[tuple[int, int, int | None]]:
+def limbs(model: Articulated) -> list[tuple[int, int, int | None]]:
     """Base, middle and end joint of every limb: a joint of three axes, on it one of one axis, and what it carries."""
     freedom = np.bincount(model.joint_of, minlength=len(model.control.axes))
     parents = model.control.skeleton.parents
@@ -223,7 +223,7 @@ def _limbs(model: Articulated) -> list[tuple[int, int, int | None]]:
 def _place(model: Articulated, features: Points, joints: Mapping[str, np.ndarray], goal: np.ndarray) -> np.ndarray:
     """The similarity (4, 4) of the trunk, from the bases of the limbs where they suffice, else from all features."""
     names = list(joints)
-    bases = [model.control.skeleton.names[base] for base, _, _ in _limbs(model)]
+    bases = [model.control.skeleton.names[base] for base, _, _ in limbs(model)]
     trunk = [names.index(name) for name in bases if name in names]
     for rows in (trunk, list(range(len(goal)))):
         if len(rows) < 3 or _on_a_line(goal[rows]) or _on_a_line(features.rest[rows]):
@@ -251,15 +251,31 @@ def _start(model: Articulated, at: Mapping[str, np.ndarray]) -> np.ndarray:
                 np.linalg.norm(at[names[c]] - at[names[p]]) / max(np.linalg.norm(o[c] - o[p]), 1e-9)))
     for s, values in ratios.items():
         factors[s] = np.mean(values)
-    for base, middle, end in _limbs(model):
+    for base, middle, end in limbs(model):
         if names[base] in at and names[middle] in at:
-            base_of, hinge = model.joint_of == base, model.joint_of == middle
-            far = at[names[end]] if end is not None and names[end] in at else None
-            goal = np.array([at[names[middle]] - at[names[base]], *([] if far is None else [far - at[names[middle]]])])
-            rest = np.array([o[middle] - o[base], *([] if far is None else [o[end] - o[middle]])])
-            angles[base_of], angles[hinge] = _limb(_unit(rest), _unit(goal), model.axes[base_of], model.axes[hinge][0],
-                                                   model.limits[base_of], model.limits[hinge][0])
+            goal = [at[names[middle]] - at[names[base]]]
+            if end is not None and names[end] in at:
+                goal.append(at[names[end]] - at[names[middle]])
+            angles[model.joint_of == base], angles[model.joint_of == middle] = limb_angles(
+                model, base, middle, end, np.array(goal))
     return x
+
+
+def limb_angles(model: Articulated, base: int, middle: int, end: int | None, goal: np.ndarray
+                ) -> tuple[np.ndarray, float]:
+    """Angles (3,) of the base joint and that of the middle one that point one or two bones along directions.
+
+    Parameters
+    ----------
+    base, middle, end : int
+        Joints; `end` counts with two directions.
+    goal : (1 or 2, 3) float
+        In the axes of the part that the base joint is on.
+    """
+    o, of_base, hinge = model.control.skeleton.joints, model.joint_of == base, model.joint_of == middle
+    rest = np.array([o[middle] - o[base], *([o[end] - o[middle]] if len(goal) == 2 else [])])
+    return _limb(_unit(rest), _unit(goal), model.axes[of_base], model.axes[hinge][0], model.limits[of_base],
+                 model.limits[hinge][0])
 
 
 def _limb(rest: np.ndarray, goal: np.ndarray, axes: np.ndarray, hinge: np.ndarray, limits: np.ndarray,

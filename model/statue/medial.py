@@ -48,8 +48,8 @@ class MedialAxis:
         self._origin = vertices.min(axis=0) - 1.5 * voxel
         shape = np.ceil(np.ptp(vertices, axis=0) / voxel) + 4
         if np.prod(shape) > MOST:
-            raise ValueError(f"voxel: {voxel} m gives {np.prod(shape):.3g} voxels, at most {MOST:.0e} are worked on; is "
-                             "the mesh in metres?")
+            raise ValueError(f"voxel: {voxel} m gives {np.prod(shape):.3g} voxels, at most {MOST:.0e} are worked "
+                             "on; is the mesh in metres?")
         cells = np.indices(shape.astype(int)).reshape(3, -1).T
         winding = igl.fast_winding_number(vertices, faces, self._origin + voxel * (cells + 0.5))
         self.inside = (np.asarray(winding) > INSIDE).reshape(shape.astype(int))

@@ -5,11 +5,15 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from scanprep.geometry.mesh import Mesh
 from scanprep.matching.matches import Likeness, Target, match_both_ways
 from scanprep.matching.thinning import thin
 from scanprep.ranges import Cell, Count, Positive, Settings
 
-from .articulated import Articulated
+from .articulated import Articulated, Points
+
+BOUNDS = 0.6, 1.6               # of a length, as multiples of the default one
+GIRTH = -0.03, 0.12             # metres off the default surface
 
 
 @dataclass(frozen=True)
@@ -44,45 +48,83 @@ FINE = (PoseStage(0.2, 0.015, 0.1, 0.15, 0.03, 6), PoseStage(0.12, 0.01, 0.08, 0
         PoseStage(0.08, 0.006, 0.05, 0.03, 0.02, 6))
 
 
+@dataclass(frozen=True, eq=False)
+class Posed:
+    """A control model on its way to a scan.
+
+    Attributes
+    ----------
+    x : (P,) float
+        Parameters.
+    girth : (S,) float, metres
+        How far the surface of every segment stands off the default one: people are not equally thick.
+    """
+
+    x: np.ndarray
+    girth: np.ndarray
+
+
 class PoseSearch:
-    """A control model, prepared to be posed onto scans."""
+    """A control model, prepared to be posed onto scans.
+
+    Matches in both directions draw its surface; what they want of the parameters is solved for within the limits of
+    the joints, one Gauss-Newton step a round. Between the steps every segment grows thicker or thinner.
+    """
 
     def __init__(self, model: Articulated, normals: float = 0.06) -> None:
         self.model, self.normals = model, normals
         mesh = model.control.mesh
         self.area = float(mesh.face_areas.sum())
         self.sample = thin(mesh.vertices, 0.03)
-        S = len(model.lengths)
-        self.bounds = np.concatenate([model.limits, [[0.6, 1.6]] * S, [[-np.inf, np.inf]] * 3])
+        self.segments = model.control.weights @ model.is_of
+        self.bounds = np.concatenate([model.limits, [BOUNDS] * len(model.lengths), [[-np.inf, np.inf]] * 3])
 
-    def run(self, x: np.ndarray, target: Target, stages: tuple[PoseStage, ...]) -> np.ndarray:
-        """Parameters (P,) that bring the control model onto the target, from a start (P,)."""
+    @property
+    def start(self) -> Posed:
+        return Posed(self.model.rest, np.zeros(len(self.model.lengths)))
+
+    def points(self, girth: np.ndarray) -> Points:
+        """All vertices of a body so thick, in the default pose."""
+        mesh = self.model.control.mesh
+        thicker = (self.segments @ girth)[:, None] * mesh.vertex_normals
+        return Points(self.model.control.weights, mesh.vertices + thicker)
+
+    def mesh(self, posed: Posed) -> Mesh:
+        """The control mesh as it lies."""
+        vertices = self.model.positions(self.model.frames(posed.x), self.points(posed.girth))
+        return self.model.control.mesh.with_vertices(vertices)
+
+    def run(self, posed: Posed, target: Target, stages: tuple[PoseStage, ...]) -> Posed:
+        """Bring the control model onto a target that has its size and stands near it."""
         for stage in stages:
             goal = target.thinned(stage.detail)
             for _ in range(stage.rounds):
-                x = self.step(x, goal, stage)
-        return x
+                posed = self.step(posed, goal, stage)
+        return posed
 
-    def step(self, x: np.ndarray, goal: Target, stage: PoseStage) -> np.ndarray:
-        """One round of matching, and one Gauss-Newton step within the limits."""
-        model = self.model
-        frames = model.frames(x)
-        vertices = model.positions(frames, model.vertices)
-        wanted = match_both_ways(model.control.mesh.with_vertices(vertices), self.sample, self.area, goal,
-                                 stage.reach, stage.slide, Likeness(normals=self.normals)).wanted
-        D = model.derivatives(frames, model.vertices)
-        H = np.einsum("nip,nij,njq->pq", D, wanted.A, D, optimize=True)
-        g = np.einsum("nip,ni->p", D, np.einsum("nij,nj->ni", wanted.A, vertices) - wanted.b)
+    def step(self, posed: Posed, goal: Target, stage: PoseStage) -> Posed:
+        """One round of matching, one step of the parameters, then of the girth."""
+        model, x = self.model, posed.x
+        frames, points = model.frames(x), self.points(posed.girth)
+        mesh = model.control.mesh.with_vertices(model.positions(frames, points))
+        wanted = match_both_ways(mesh, self.sample, self.area, goal, stage.reach, stage.slide,
+                                 Likeness(normals=self.normals)).wanted
+        D = model.derivatives(frames, points)
+        rows = D.reshape(-1, len(x))
+        H = rows.T @ (wanted.A @ D).reshape(-1, len(x))
+        g = rows.T @ (np.einsum("nij,nj->ni", wanted.A, mesh.vertices) - wanted.b).ravel()
         A, S = len(model.axes), len(model.lengths)
-        hold = np.zeros(len(x))
-        hold[:A] = self.area * stage.prior**2
+        hold, centre = np.zeros(len(x)), model.rest.copy()
+        hold[:A] = self.area * stage.prior**2 * (model.joint_of != 0)
         hold[A:A + S] = self.area * stage.growth**2
-        hold[:A][model.joint_of == 0] = 0
-        centre = model.rest.copy()
         centre[A:A + S] = model.size(x)
-        g += hold * (x - centre)
         H += np.diag(hold) + 1e-9 * np.trace(H) / len(x) * np.eye(len(x))
-        return _bounded_step(x, H, g, self.bounds)
+        moved = _bounded_step(x, H, g + hold * (x - centre), self.bounds)
+        off = wanted.b - np.einsum("nij,nj->ni", wanted.A, mesh.vertices + D @ (moved - x))
+        outward = mesh.vertex_normals
+        weight = np.einsum("ni,nij,nj->n", outward, wanted.A, outward)
+        more = (self.segments.T @ np.einsum("ni,ni->n", outward, off)) / (self.segments.T @ weight + 0.02 * self.area)
+        return Posed(moved, np.clip(posed.girth + more, *GIRTH))
 
 
 def _bounded_step(x: np.ndarray, H: np.ndarray, g: np.ndarray, bounds: np.ndarray) -> np.ndarray:

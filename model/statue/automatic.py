@@ -1,0 +1,132 @@
+"""Joint centres and facial points of a person who stands upright, without a click."""
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from scanprep.geometry.formats.common import UNITS
+from scanprep.geometry.mesh import Mesh
+from scanprep.matching.confidence import stretched_share
+from scanprep.matching.matches import target_of
+from scanprep.matching.nonrigid import Registration, RegistrationConfig, register
+from scanprep.threads import one_thread
+
+from .articulated import Articulated
+from .control import ControlModel
+from .features import FeatureFit, fit_features
+from .person_search import Stand, find_person
+from .pose_search import PoseSearch
+
+HEIGHTS = 0.45, 2.6              # metres, end to end: a part of a person, or one with the arms raised
+SHOWN = 0.3                      # share of the vertices around a joint that have data
+
+
+@dataclass(frozen=True, eq=False)
+class Features:
+    """What was found on a scan, in the scan's own axes and unit.
+
+    Attributes
+    ----------
+    joints, points : {name: (3,) float}
+        Joint centres and landmarks of the control model with data around them; empty where no person was found.
+    missing : names
+        Joints and landmarks that the scan does not show.
+    registered : Mesh or None
+        The control mesh on the scan.
+    fit : FeatureFit or None
+        Of the control model to these features.
+    unit : str
+        The first of m, mm, cm and in in which a person, or part of one, would be as large as the scan.
+    up, front : (3,) float, unit
+        Upwards, and to where the person faces.
+    misfit : float, metres
+        Between the scan and the control model in its pose: see `Stand`.
+    margin : float
+        How many times larger it is for the best start that faces another way.
+    missed, stretched : float
+        What `Registration.missed` and `stretched_share` say of the registered mesh.
+    problem : str or None
+        Why the features should not be trusted.
+    """
+
+    joints: dict[str, np.ndarray]
+    points: dict[str, np.ndarray]
+    missing: tuple[str, ...]
+    registered: Mesh | None
+    fit: FeatureFit | None
+    unit: str
+    up: np.ndarray
+    front: np.ndarray
+    misfit: float
+    margin: float
+    missed: float
+    stretched: float
+    problem: str | None
+
+
+@one_thread()
+def find_features(control: ControlModel, scan: Mesh) -> Features:
+    """Joint centres and landmarks of a person who stands upright.
+
+    Neither unit nor axes of the scan need to be known. The control model, z up and facing -y, is placed in many ways,
+    the best are bent onto the scan, and the best of them is registered; front and back, and with them left and right,
+    are told by what fits better.
+
+    Parameters
+    ----------
+    control : ControlModel
+        A humanoid.
+    scan : Mesh
+        May have holes, several components, or show a part of a person.
+
+    Raises
+    ------
+    ValueError
+        Fewer than 100 points.
+    """
+    if len(scan.vertices) < 100:
+        raise ValueError(f"scan: expected a person of at least 100 points, got {scan}")
+    search = PoseSearch(Articulated(control))
+    scan = outward(scan)
+    unit = likely_unit(scan.vertices)
+    target = target_of(scan)
+    stands = find_person(search, target, UNITS[unit])
+    best = stands[0]
+    margin = stands[1].misfit / best.misfit if len(stands) > 1 else np.inf
+    start = search.mesh(best.posed)
+    found = register(start, Mesh(scan.vertices @ best.T[:3, :3].T + best.T[:3, 3], scan.faces),
+                     config=RegistrationConfig(graph=RegistrationConfig().graph[-2:]))
+    joints, points, missing = _features(control, best, found)
+    fit = fit_features(control, joints, points) if len(joints) + len(points) > 2 else None
+    return Features(joints, points, missing, control.mesh.with_vertices(best.to_scan(found.mesh.vertices)), fit, unit,
+                    best.direction(search, np.array([0.0, 0, 1])), best.direction(search, np.array([0.0, -1, 0])),
+                    best.misfit, margin, found.missed, stretched_share(start, found.mesh), None)
+
+
+def likely_unit(points: np.ndarray) -> str:
+    """The first of m, mm, cm and in in which points (n, 3) span as much as a person or a part of one."""
+    spread = points - points.mean(axis=0)
+    longest = float(np.ptp(spread @ np.linalg.svd(spread[:: max(1, len(spread) // 5000)], full_matrices=False)[2][0]))
+    return next((unit for unit in ("m", "mm", "cm", "in") if HEIGHTS[0] <= UNITS[unit] * longest <= HEIGHTS[1]), "m")
+
+
+def outward(scan: Mesh) -> Mesh:
+    """The same scan with its triangles seen from outside, if most of them were seen from inside."""
+    centre = scan.vertices.mean(axis=0)
+    inside_out = Mesh(scan.vertices - centre, scan.faces).volume < 0
+    return Mesh(scan.vertices, scan.faces[:, ::-1], scan.colors) if inside_out else scan
+
+
+def _features(control: ControlModel, stand: Stand, found: Registration
+              ) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray], tuple[str, ...]]:
+    """Joints and points with data around them, in the axes of the scan, and the names of the others."""
+    x, seen = found.mesh.vertices, found.confidence
+    centres = stand.to_scan(control.skeleton.joint_regressor(control.mesh) @ x)
+    around = (control.mesh.vertex_adjacency @ seen + seen) / (control.mesh.vertex_adjacency.sum(axis=1) + 1)
+    joints = {name: centres[j] for j, name in enumerate(control.skeleton.names)
+              if seen[control.skeleton.joint_weights(control.mesh, j)[0]].mean() > SHOWN}
+    places = stand.to_scan(x)
+    points = {name: places[v] for name, v in control.landmarks.items() if around[v] > SHOWN}
+    names = [*control.skeleton.names, *control.landmarks]
+    return joints, points, tuple(name for name in names if name not in joints and name not in points)
