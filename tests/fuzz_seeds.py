@@ -20,7 +20,6 @@ from completion.motion import Motion
 from completion.partial.completion import Completion
 from completion.partial.masks import read_mask
 from completion.partial.results import load_completion, save_completion
-from completion.partial.textures import Texture, read_texture, write_textured
 from model.cli import _read_betas, _read_turns
 from model.export.cli import read_motion
 from model.files import load_model
@@ -34,6 +33,7 @@ from scanprep.geometry.files import PointCloud, read_points, write_points
 from scanprep.geometry.landmarks import read_landmark_vertices
 from scanprep.matching.correspondence_files import read_correspondences, write_correspondences
 from scanprep.matching.correspondences import Correspondences
+from scanprep.pictures.textures import Texture, read_texture, write_textured
 from scanprep.pipeline.scans import find_scans
 from scanprep.scanning.embedded import GroundTruth, _write_views, read_views
 from scanprep.scanning.people_anatomy import BodyShape

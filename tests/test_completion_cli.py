@@ -9,13 +9,14 @@ import pytest
 from completion_bodies import half_view, worm_with_prior
 
 from completion.__main__ import main
-from completion.partial import report, textures
+from completion.partial import report
 from completion.partial.results import load_completion
-from completion.partial.textures import read_texture
 from completion.partial.views import read_view
 from scanprep.geometry.files import PointCloud, read_mesh, write_mesh, write_points
 from scanprep.geometry.landmarks import write_landmarks
 from scanprep.geometry.mesh import Mesh
+from scanprep.pictures import textures
+from scanprep.pictures.textures import read_texture
 
 POSE = np.array([[0.3, -0.5, 0.8], [0.2, 0.5, -0.4], [-0.1, -0.6, 0.3], [0.3, 0.1, 0.5]])
 TRANS = np.array([0.4, -0.3, 1.1])

@@ -4,11 +4,11 @@ import warnings
 import numpy as np
 import pytest
 
-from completion.partial.colors import ColorConfig, blend, carry_colors, colored_views, fill_colors
-from completion.partial.textures import Texture, bake, read_texture, write_textured
+from completion.partial.colors import ColorConfig, blend, carry_colors, colored_views
 from scanprep.geometry.files import PointCloud
 from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.surface import Surface
+from scanprep.pictures.textures import Texture, bake, read_texture, write_textured
 from scanprep.scanning.people import Person
 from scanprep.scanning.scanner import ScannerConfig, scan
 
@@ -69,18 +69,6 @@ def test_the_view_that_looked_squarely_counts_most():
     assert weight[0] == pytest.approx(1 + np.cos(1.2)**2)
     away = blend(found, np.array([[0, 0, 0.05], [0, 0, 0]]), np.array([[0, 0, 1.0], [0, 0, -1]]), ColorConfig())
     np.testing.assert_array_equal(away[1], 0)                        # too far, and the other side
-
-
-def test_filled_colours_are_means_of_their_neighbours(person):
-    known = person.vertices[:, 2] > 1
-    colors = np.where(known[:, None], np.clip(paint(person.vertices), 0, 1), 0.6)
-    filled = fill_colors(person, colors, known)
-    np.testing.assert_array_equal(filled[known], colors[known])
-    near = person.vertex_adjacency
-    means = (near @ filled) / near.sum(axis=1)[:, None]
-    np.testing.assert_allclose(filled[~known], means[~known], atol=1e-9)
-    assert (filled.max(axis=0) <= colors[known].max(axis=0) + 1e-9).all()
-    assert (filled.min(axis=0) >= colors[known].min(axis=0) - 1e-9).all()
 
 
 def test_what_was_not_seen_is_grey_or_filled(person, views):

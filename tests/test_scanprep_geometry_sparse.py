@@ -4,8 +4,10 @@ import pickle
 import numpy as np
 import pytest
 from scipy.sparse import csc_array, eye_array, random_array
+from scipy.spatial import ConvexHull
 
-from scanprep.geometry.sparse import Factored, factor
+from scanprep.geometry.mesh import Mesh
+from scanprep.geometry.sparse import Factored, factor, harmonic
 
 
 def system(n=80, seed=0):
@@ -51,3 +53,19 @@ def test_an_empty_system_is_refused_or_solved():
 def test_a_factored_system_can_be_sent_to_another_process():
     A, b = system(), np.random.default_rng(3).normal(size=(80, 3))
     np.testing.assert_array_equal(pickle.loads(pickle.dumps(Factored(A))).solve(b), Factored(A).solve(b))
+
+
+def test_harmonic_values_are_means_of_their_neighbours():
+    rng = np.random.default_rng(3)
+    points = rng.normal(size=(300, 3))
+    points /= np.linalg.norm(points, axis=1)[:, None]
+    faces = ConvexHull(points).simplices
+    two = Mesh(np.concatenate([points, points + 5]), np.concatenate([faces, faces + len(points)]))
+    values = rng.random((len(two.vertices), 2))
+    known = two.vertices[:, 2] * (two.vertices[:, 2] < 2) > 0.3                       # nothing of the second piece
+    filled = harmonic(two.vertex_adjacency, values, known)
+    untouched = known | (two.vertices[:, 2] > 2)
+    np.testing.assert_array_equal(filled[untouched], values[untouched])
+    means = (two.vertex_adjacency @ filled) / two.vertex_adjacency.sum(axis=1)[:, None]
+    np.testing.assert_allclose(filled[~untouched], means[~untouched], atol=1e-9)
+    assert filled[~untouched].max() <= values[known].max() and filled[~untouched].min() >= values[known].min()

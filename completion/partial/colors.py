@@ -5,18 +5,17 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.sparse import csc_array, diags_array
 from scipy.spatial import cKDTree
 
 from scanprep.geometry import sparse
 from scanprep.geometry.files import PointCloud
 from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.surface import Surface
+from scanprep.pictures.textures import Texture
 from scanprep.ranges import Cosine, Positive, Settings, Share
 
 from .scan import View, as_views, check_viewpoints, in_metres, prepare_scan
 from .sight import find_sight
-from .textures import Texture
 
 NEIGHBOURS = 3                       # points of a cloud that make the colour of a place
 RIM = 0.015                          # metres: towards its border a view counts less and less
@@ -132,7 +131,7 @@ def carry_colors(body: Mesh, seen: np.ndarray, scan: View | Sequence[View], conf
     closed = seen | (near @ seen.astype(float) > 0.5 * near.sum(axis=1))     # single gaps amid what was seen
     known = closed & (weight > 0)
     out = np.where(known[:, None], colors, config.grey)
-    return fill_colors(body, out, known) if config.fill and known.any() else out
+    return np.clip(sparse.harmonic(near, out, known), 0, 1) if config.fill and known.any() else out
 
 
 def colored_views(scan: View | Sequence[View], viewpoint: object = None, metres: float = 1.0,
@@ -168,20 +167,3 @@ def blend(views: Sequence[ColoredView], places: np.ndarray, normals: np.ndarray,
         total += counts[:, None] * colors
         weight += counts
     return total / np.maximum(weight, 1e-12)[:, None], weight
-
-
-def fill_colors(mesh: Mesh, colors: np.ndarray, known: np.ndarray) -> np.ndarray:
-    """Colours (N, 3) that go over smoothly from the known ones (N,): harmonic, each the mean of its neighbours'.
-
-    A piece of the mesh without any known colour keeps what it has.
-    """
-    pieces = mesh.vertex_component
-    reached = np.isin(pieces, np.unique(pieces[known]))
-    free, fixed = np.flatnonzero(~known & reached), np.flatnonzero(known)
-    if not len(free):
-        return colors
-    near = mesh.vertex_adjacency
-    L = csc_array(diags_array(near.sum(axis=1)) - near)
-    out = colors.copy()
-    out[free] = sparse.factor(csc_array(L[free][:, free]))(-L[free][:, fixed] @ colors[fixed])
-    return np.clip(out, 0, 1)

@@ -7,9 +7,8 @@ from pathlib import Path
 
 from scanprep.geometry.files import PointCloud, read_mesh, read_points
 from scanprep.geometry.mesh import Mesh
+from scanprep.pictures.textures import Texture, read_texture
 from scanprep.pipeline.scans import POINT_ENDINGS
-
-from .textures import Texture, read_texture
 
 
 @dataclass(frozen=True, eq=False)

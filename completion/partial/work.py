@@ -16,6 +16,7 @@ from scanprep.console import Metric, Outcome, write_report
 from scanprep.geometry.landmarks import match_landmarks, read_landmarks
 from scanprep.geometry.mesh import Mesh
 from scanprep.pictures.sheets import save_png
+from scanprep.pictures.textures import bake, write_textured
 
 from .colors import ColorConfig, blend, carry_colors, colored_views
 from .completion import Completion, complete, completion_problem
@@ -24,7 +25,6 @@ from .report import completion_page, picture_completion
 from .results import save_completion
 from .scan import all_points, point_count
 from .settings import CompletionConfig
-from .textures import bake, write_textured
 from .views import ScanFiles, read_views
 
 

@@ -4,7 +4,8 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import numpy as np
-from scipy.sparse import coo_array, csc_array
+from scipy.sparse import coo_array, csc_array, csr_array, diags_array
+from scipy.sparse.csgraph import connected_components
 from scipy.sparse.linalg import splu
 
 
@@ -76,3 +77,22 @@ class Factored:
             self._solver.solve(part, x)
             out[:, start:start + self.LIMIT] = x
         return out.reshape(rhs.shape)
+
+
+def harmonic(near: csr_array, values: np.ndarray, known: np.ndarray) -> np.ndarray:
+    """Values (N, k) that go over smoothly from the known ones (N,) bool: each other the mean of its neighbours'.
+
+    So none lies beyond the known ones. A piece without any known value keeps what it has.
+
+    Parameters
+    ----------
+    near : (N, N) sparse, symmetric
+        How much each counts for the other; zero where they are not neighbours.
+    """
+    _, piece = connected_components(near, directed=False)
+    free, fixed = np.flatnonzero(~known & np.isin(piece, np.unique(piece[known]))), np.flatnonzero(known)
+    out = np.array(values, dtype=np.float64)
+    if len(free):
+        L = csr_array(diags_array(near.sum(axis=1)) - near)[free]
+        out[free] = factor(csc_array(L[:, free]))(-L[:, fixed] @ out[fixed])
+    return out

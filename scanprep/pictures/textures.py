@@ -1,4 +1,4 @@
-"""Textures: read with a scan, baked onto a completed body, written as GLB."""
+"""Textures: read with a scan, baked onto a body, written as GLB."""
 from __future__ import annotations
 
 import io
@@ -46,18 +46,25 @@ class Texture:
 
     def sample(self, faces: np.ndarray, bary: np.ndarray) -> np.ndarray:
         """Colours (n, 3) at points on triangles, interpolated between pixels."""
-        height, width = self.image.shape[:2]
-        u, v = np.einsum("nc,ncd->nd", bary, self.uv[self.mesh.faces[faces]]).T
-        x, y = (u % 1.0000001) * width - 0.5, (1 - v % 1.0000001) * height - 0.5
-        left, top = np.floor(x), np.floor(y)
-        out = np.zeros((len(x), 3))
-        for dx in (0, 1):
-            for dy in (0, 1):
-                share = np.abs(1 - dx - (x - left)) * np.abs(1 - dy - (y - top))
-                row = np.clip(top + dy, 0, height - 1).astype(int)
-                column = np.clip(left + dx, 0, width - 1).astype(int)
-                out += share[:, None] * self.image[row, column]
-        return out
+        return bilinear(self.image, np.einsum("nc,ncd->nd", bary, self.uv[self.mesh.faces[faces]]) % 1.0000001)
+
+
+def bilinear(image: np.ndarray, uv: np.ndarray) -> np.ndarray:
+    """Values (n,) or (n, C) of an image (H, W) or (H, W, C) at places (n, 2), interpolated between pixels.
+
+    (0, 0) is the lower left corner of the image, (1, 1) its upper right one; rows from the top.
+    """
+    height, width = image.shape[:2]
+    x, y = uv[:, 0] * width - 0.5, (1 - uv[:, 1]) * height - 0.5
+    left, top = np.floor(x), np.floor(y)
+    out = np.zeros((len(uv), *image.shape[2:]))
+    for dx in (0, 1):
+        for dy in (0, 1):
+            share = np.abs(1 - dx - (x - left)) * np.abs(1 - dy - (y - top))
+            row = np.clip(top + dy, 0, height - 1).astype(int)
+            column = np.clip(left + dx, 0, width - 1).astype(int)
+            out += share.reshape(-1, *[1] * (image.ndim - 2)) * image[row, column]
+    return out
 
 
 def read_texture(path: str | Path, unit: str | None = None) -> Texture | None:
@@ -131,7 +138,7 @@ def bake(body: Mesh, look: Look, unseen: np.ndarray, size: int | None = None) ->
     colors, weight = look(places, normals / np.maximum(np.linalg.norm(normals, axis=1), 1e-12)[:, None])
     image = np.full((size * size, 3), unseen.mean())
     image[covered] = np.where(weight[:, None] > 0, colors, plain)
-    return Texture(Mesh(body.vertices[kept], faces), uv, _padded(image.reshape(size, size, 3),
+    return Texture(Mesh(body.vertices[kept], faces), uv, padded(image.reshape(size, size, 3),
                                                                  (face >= 0).reshape(size, size)))
 
 
@@ -159,7 +166,7 @@ def unwrap(mesh: Mesh) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     return kept.astype(np.int64), faces.astype(np.int64), uv.astype(np.float64)
 
 
-def _padded(image: np.ndarray, covered: np.ndarray) -> np.ndarray:
+def padded(image: np.ndarray, covered: np.ndarray) -> np.ndarray:
     """The picture with the colours of charts going on a little beyond them, so that seams do not show."""
     from scipy.ndimage import distance_transform_edt
 

@@ -1,0 +1,186 @@
+"""The displacement map of a scan over a control model, and where the scan is not one-to-one with it [Statues].
+
+Every pixel is a place of the control mesh; its height is where the interpolated normal there crosses the scan: Eq. 19
+solved at the pixel itself. The paper solves it at the scan's vertices and interpolates between them, which is the
+same where the scan's triangles are small against the control mesh's, and depends on their shape where they are not.
+"""
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Annotated
+
+import numpy as np
+from scipy.sparse import coo_array
+from scipy.sparse.csgraph import connected_components
+
+from scanprep.geometry import sparse
+from scanprep.geometry.mesh import Mesh
+from scanprep.geometry.surface import Rays, Surface
+from scanprep.ranges import Cosine, Positive, Range, Settings
+
+from .control import ControlModel
+from .crossings import Crossings, find_crossings, limits, unturned
+from .lattice import Lattice
+from .normal_volume import interpolate
+from .statue import FOLDED, HOLE, MEASURED, OUTSIDE, DisplacementMap
+from .texels import Texels, find_texels
+
+Progress = Callable[[int, int], None]
+FILL_LEVEL = 3                       # of the subdivision on which holes are filled: edges of some 5 mm
+
+
+@dataclass(frozen=True)
+class DisplacementConfig(Settings):
+    """Settings of `bake`.
+
+    Attributes
+    ----------
+    size : int
+        Pixels of the image, each way.
+    reach : float, metres
+        Largest height, up or down.
+    min_cosine : float
+        Least cosine between the normals of control mesh and scan.
+    slope : float
+        Heights of neighbouring pixels that differ by more than this times their distance are a fold.
+    island : float, square metres
+        Patches between folds that are smaller are left out and filled.
+    vectors : bool
+        Displacements of any direction where the surface is not one-to-one.
+    """
+
+    size: Annotated[int, Range(16, 8192)] = 1024
+    reach: Positive = 0.05
+    min_cosine: Cosine = 0.1
+    slope: Positive = 3.0
+    island: Positive = 1e-4
+    vectors: bool = False
+
+
+def bake(control: ControlModel, scan: Mesh, config: DisplacementConfig | None = None,
+         progress: Progress | None = None) -> DisplacementMap:
+    """The displacement map of a scan over a control model that has been fitted to it.
+
+    Parameters
+    ----------
+    control : ControlModel
+    scan : Mesh
+    config : DisplacementConfig, optional
+    progress : (done, total), optional
+
+    Raises
+    ------
+    ValueError
+        A scan without triangles, or a chart that covers no pixel.
+
+    [Statues] Eq. 19, 20, 21
+    """
+    config, tell = config or DisplacementConfig(), progress or (lambda done, total: None)
+    if not len(scan.faces):
+        raise ValueError(f"scan: expected at least one triangle, got {scan}")
+    texels = find_texels(control.mesh, control.chart, config.size)
+    if not texels.inside.any():
+        raise ValueError(f"size: {config.size} pixels are too few, no pixel's centre lies in the chart")
+    tell(1, 5)
+    heights, several = _measure(control.mesh, scan, texels, config)
+    tell(2, 5)
+    known, folded = _sort(control, texels, heights, several, config)
+    empty = ~known & ~folded
+    folded[empty] = ~_without_data(control.mesh, scan, texels, empty, config.reach)
+    tell(3, 5)
+    heights = _filled(control, texels, heights, known)
+    coverage = np.where(folded, FOLDED, np.where(known, MEASURED, HOLE)).astype(np.uint8)
+    coverage[~texels.inside] = OUTSIDE
+    tell(5, 5)
+    return DisplacementMap(texels.image(heights.astype(np.float32)), texels.image(coverage, OUTSIDE))
+
+
+def _measure(mesh: Mesh, scan: Mesh, texels: Texels, config: DisplacementConfig) -> tuple[np.ndarray, np.ndarray]:
+    """Heights (n,) of pixels, NaN where there is none, and which (n,) had several to choose from."""
+    points, normals = interpolate(mesh, texels.faces, texels.bary)
+    found = find_crossings(scan, Rays(scan), points, normals, config.reach)
+    low, high = limits(mesh, points, normals, config.reach)
+    of = found.normal
+    far = found.heights * np.linalg.norm(normals[of], axis=1)
+    found = found.pick((found.cosines > config.min_cosine) & (far >= low[of]) & (far <= high[of])
+                       & unturned(mesh, texels.faces[of], texels.bary[of], found.heights))
+    several = np.bincount(found.normal, minlength=len(points)) > 1
+    return _choose(found, several, texels.neighbours()), several
+
+
+def _choose(found: Crossings, several: np.ndarray, pairs: np.ndarray) -> np.ndarray:
+    """Of several crossings that which goes on from the neighbouring pixels, from those with one crossing inwards."""
+    heights = np.full(len(several), np.nan)
+    single = ~several[found.normal]
+    heights[found.normal[single]] = found.heights[single]
+    rest = found.pick(~single)
+    pairs = np.concatenate([pairs, pairs[:, ::-1]])
+    pairs = pairs[several[pairs[:, 0]]]
+    while len(rest.normal):
+        usable = np.isnan(heights[pairs[:, 0]]) & ~np.isnan(heights[pairs[:, 1]])
+        a, b = pairs[usable].T
+        count = np.bincount(a, minlength=len(several))
+        if not count.any():
+            wanted, ready = np.zeros(len(several)), np.isnan(heights)           # a patch that no single one touches
+        else:
+            wanted = np.bincount(a, heights[b], len(several)) / np.maximum(count, 1)
+            ready = count > 0
+        now = rest.pick(ready[rest.normal])
+        order = np.argsort(-np.abs(now.heights - wanted[now.normal]), kind="stable")        # the best written last
+        heights[now.normal[order]] = now.heights[order]
+        rest = rest.pick(~ready[rest.normal])
+        pairs = pairs[np.isnan(heights[pairs[:, 0]])]
+    return heights
+
+
+def _sort(control: ControlModel, texels: Texels, heights: np.ndarray, several: np.ndarray, config: DisplacementConfig
+          ) -> tuple[np.ndarray, np.ndarray]:
+    """Which pixels (n,) keep their height, and which lie in folds."""
+    points, _ = interpolate(control.mesh, texels.faces, texels.bary)
+    a, b = texels.neighbours().T
+    both = ~np.isnan(heights[a]) & ~np.isnan(heights[b])
+    a, b = a[both], b[both]
+    apart = np.linalg.norm(points[a] - points[b], axis=1)
+    jump = np.abs(heights[a] - heights[b]) > config.slope * np.maximum(apart, 1e-5)
+    count = len(heights)
+    joined = coo_array((np.ones((~jump).sum()), (a[~jump], b[~jump])), shape=(count, count))
+    _, patch = connected_components(joined, directed=False)
+    beside = np.zeros(count, dtype=bool)
+    beside[a[jump]] = beside[b[jump]] = True
+    area = np.bincount(patch, texel_areas(control, texels))
+    torn = np.bincount(patch, beside) > 0
+    dropped = (torn & (area < config.island))[patch] & ~np.isnan(heights)
+    known = ~np.isnan(heights) & ~dropped
+    return known, dropped | (known & (beside | several))
+
+
+def texel_areas(control: ControlModel, texels: Texels) -> np.ndarray:
+    """(n,) square metres of the control mesh that each pixel stands for."""
+    pixel = control.chart.flat.face_areas * texels.size**2
+    return (control.mesh.face_areas / np.maximum(pixel, 1e-12))[texels.faces]
+
+
+def _without_data(mesh: Mesh, scan: Mesh, texels: Texels, empty: np.ndarray, reach: float) -> np.ndarray:
+    """(n of empty,) bool: the scan is out of reach, or ends at what is nearest."""
+    points, _ = interpolate(mesh, texels.faces[empty], texels.bary[empty])
+    nearest = Surface(scan).closest(points)
+    border = np.zeros(len(scan.vertices), dtype=bool)
+    border[scan.boundary_vertices] = True
+    return (nearest.distances > reach) | border[scan.faces[nearest.faces]].any(axis=1)
+
+
+def _filled(control: ControlModel, texels: Texels, heights: np.ndarray, known: np.ndarray) -> np.ndarray:
+    """Heights where none is known, from around them: harmonic on the control surface, so across seams too."""
+    lattice = Lattice(control.mesh, control.chart, FILL_LEVEL)
+    values, sure = lattice.gather(texels, heights, known)
+    values = sparse.harmonic(lattice.fine.vertex_adjacency, values[:, None], sure)[:, 0]
+    return np.where(known, heights, lattice.sample(values, texels.faces, texels.bary))
+
+
+def coverage_shares(control: ControlModel, map: DisplacementMap) -> dict[str, float]:
+    """Shares of the control mesh's area that are measured, folded and holes."""
+    texels = find_texels(control.mesh, control.chart, len(map.coverage))
+    kind, area = map.coverage.ravel()[texels.pixels[texels.inside]], texel_areas(control, texels)[texels.inside]
+    return {name: float(area[kind == value].sum() / area.sum())
+            for name, value in (("measured", MEASURED), ("folded", FOLDED), ("hole", HOLE))}

@@ -1,0 +1,187 @@
+"""The scan's surface on a control mesh, wherever that has moved, and how far it is from the scan [Statues]."""
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.sparse import csr_array, diags_array, hstack
+
+from scanprep.geometry.mesh import Mesh
+from scanprep.geometry.surface import Surface
+from scanprep.pictures.textures import bilinear
+
+from .chart import Chart
+from .control import ControlModel
+from .normal_volume import from_normal_volume, interpolate, to_normal_volume
+from .statue import MEASURED, DisplacementMap
+from .subdivision import Displaced, Subdivision
+
+SEED = 14                            # of the places at which errors are measured
+
+
+def chart_places(chart: Chart, faces: np.ndarray, bary: np.ndarray) -> np.ndarray:
+    """Texture coordinates (n, 2) of places on triangles.
+
+    [Statues] Eq. 21
+    """
+    return np.einsum("nc,ncd->nd", bary, chart.uv[chart.faces[faces]])
+
+
+class Reconstruction:
+    """Vertices of the detailed surface for any vertices of the control mesh.
+
+    Everything that does not change from frame to frame is computed once. Heights follow the interpolated normal of
+    the moved mesh. The rest of a vector displacement, if there is any, turns with the control surface around it: by
+    the rotation that best turns the edges around each control vertex, interpolated over triangles.
+
+    Parameters
+    ----------
+    control : ControlModel
+        Fitted to the scan.
+    map : DisplacementMap
+    subdivision : Subdivision
+        Of its mesh.
+    dtype : np.float64 or np.float32
+        Of the vertices; float32 is twice as fast and within a thousandth of a millimetre.
+
+    [Statues] Eq. 19, 20
+    """
+
+    def __init__(self, control: ControlModel, map: DisplacementMap, subdivision: Subdivision,
+                 dtype: type = np.float64) -> None:
+        self.faces, self.control, self.dtype = subdivision.faces, control, dtype
+        mesh, rows = control.mesh, np.arange(len(subdivision.parent))
+        uv = chart_places(control.chart, subdivision.parent, subdivision.bary)
+        heights, rest = _parts(control.mesh, map, subdivision.parent, subdivision.bary, uv)
+        size = (len(rows), len(mesh.vertices))
+        corners = mesh.faces[subdivision.parent]
+        share = csr_array((subdivision.bary.ravel(), (np.repeat(rows, 3), corners.ravel())), shape=size)
+        share.eliminate_zeros()
+        self._spread = csr_array(hstack([share, diags_array(heights) @ share]), dtype=dtype)
+        self._around = _around(mesh)
+        self._turning = np.flatnonzero(np.linalg.norm(rest, axis=1) > 1e-9)
+        self._rest, self._share = rest[self._turning].astype(dtype), csr_array(share[self._turning], dtype=dtype)
+
+    def __call__(self, control_vertices: np.ndarray) -> np.ndarray:
+        """(n, 3) metres, the detailed surface on control vertices (N, 3)."""
+        v = np.asarray(control_vertices, dtype=np.float64)
+        if v.shape != self.control.mesh.vertices.shape:
+            raise ValueError(f"control_vertices: expected shape {self.control.mesh.vertices.shape}, got {v.shape}")
+        out = self._spread @ np.concatenate([v, self._normals(v)]).astype(self.dtype)
+        if len(self._turning):
+            R = vertex_rotations(self.control.mesh, v).reshape(-1, 9).astype(self.dtype)
+            out[self._turning] += np.einsum("nij,nj->ni", (self._share @ R).reshape(-1, 3, 3), self._rest)
+        return out
+
+    def mesh(self, control_vertices: np.ndarray | None = None) -> Mesh:
+        """The detailed surface, where the scan stood if no vertices are given."""
+        return Mesh(self(self.control.mesh.vertices if control_vertices is None else control_vertices), self.faces)
+
+    def _normals(self, v: np.ndarray) -> np.ndarray:
+        a, b, c = (v[column] for column in self.control.mesh.faces.T)
+        total = self._around @ np.cross(b - a, c - a)
+        return total / np.maximum(np.linalg.norm(total, axis=1), 1e-300)[:, None]
+
+
+def displaced_surface(control: ControlModel, map: DisplacementMap) -> Displaced:
+    """Where the detailed surface is above any places of the control mesh, for `subdivide_adaptive`."""
+    def displaced(faces: np.ndarray, bary: np.ndarray) -> np.ndarray:
+        p, n = interpolate(control.mesh, faces, bary)
+        heights, rest = _parts(control.mesh, map, faces, bary, chart_places(control.chart, faces, bary))
+        return p + heights[:, None] * n + rest
+    return displaced
+
+
+def _parts(mesh: Mesh, map: DisplacementMap, faces: np.ndarray, bary: np.ndarray, uv: np.ndarray
+           ) -> tuple[np.ndarray, np.ndarray]:
+    """Heights (n,) along the interpolated normal and what is left (n, 3) of vector displacements, in the world."""
+    heights = bilinear(map.heights, uv)
+    if map.vectors is None:
+        return heights, np.zeros((len(uv), 3))
+    vectors = bilinear(map.vectors, uv)
+    _, n = interpolate(mesh, faces, bary)
+    along = np.einsum("nd,nd->n", vectors, n) / np.maximum(np.einsum("nd,nd->n", n, n), 1e-12)
+    rest = vectors - along[:, None] * n
+    rest[np.linalg.norm(rest, axis=1) < ALONG] = 0
+    return along, rest
+
+
+ALONG = 2e-5                         # metres off the normal that are rounding of single numbers and of pixels
+
+
+def _around(mesh: Mesh) -> csr_array:
+    """(N, F) sparse, 1 where a triangle has a vertex."""
+    faces = np.repeat(np.arange(len(mesh.faces)), 3)
+    return csr_array((np.ones(len(faces)), (mesh.faces.ravel(), faces)), shape=(len(mesh.vertices), len(mesh.faces)))
+
+
+def vertex_rotations(rest: Mesh, vertices: np.ndarray) -> np.ndarray:
+    """(N, 3, 3) rotations that best turn the edges around each vertex of a mesh at rest to where they are now.
+
+    Edges with the normals in them, so that a ring of edges in a plane has one answer.
+    """
+    moved = rest.with_vertices(vertices)
+    a, b = np.concatenate([rest.edges, rest.edges[:, ::-1]]).T
+    products = np.einsum("ei,ej->eij", vertices[a] - vertices[b], rest.vertices[a] - rest.vertices[b]).reshape(-1, 9)
+    count = len(rest.vertices)
+    S = (csr_array((np.ones(len(a)), (a, np.arange(len(a)))), shape=(count, len(a))) @ products).reshape(-1, 3, 3)
+    S += np.einsum("ni,nj->nij", moved.vertex_normals, rest.vertex_normals) * rest.mean_edge**2
+    U, _, Vt = np.linalg.svd(S)
+    U[:, :, 2] *= np.linalg.det(U @ Vt)[:, None]
+    return U @ Vt
+
+
+@dataclass(frozen=True)
+class SurfaceError:
+    """Distances from one surface to another, over the area of the first, metres."""
+
+    mean: float
+    rms: float
+    max: float
+
+
+def surface_error(reconstructed: Mesh, scan: Mesh, count: int = 200_000) -> SurfaceError:
+    """Distance from a reconstructed surface to the scan, one way, at so many places spread evenly.
+
+    [Statues] Eq. 22, 23
+    """
+    points = reconstructed.sample(count, np.random.default_rng(SEED))[0]
+    return _error(Surface(scan).closest(points).distances)
+
+
+def remaining_error(control: ControlModel, map: DisplacementMap, scan: Mesh, count: int = 20_000,
+                    reach: float = 0.03) -> SurfaceError:
+    """Distance of places on the scan to what the map makes of them, where it is one-to-one: e of the paper's tables.
+
+    NaN where no place of the scan is mapped one-to-one.
+    """
+    points = scan.sample(count, np.random.default_rng(SEED))[0]
+    found = to_normal_volume(control.mesh, points, reach)
+    uv = chart_places(control.chart, np.maximum(found.faces, 0), found.bary)
+    height, width = map.coverage.shape
+    column, row = (np.clip(at.astype(int), 0, size - 1) for at, size in
+                   ((uv[:, 0] * width, width), ((1 - uv[:, 1]) * height, height)))
+    good = found.inside & (found.solutions == 1) & (map.coverage[row, column] == MEASURED)
+    if not good.any():
+        return SurfaceError(np.nan, np.nan, np.nan)
+    stored = from_normal_volume(control.mesh, type(found)(found.faces[good], found.bary[good],
+                                                          bilinear(map.heights, uv[good]), found.solutions[good]))
+    return _error(np.linalg.norm(stored - points[good], axis=1))
+
+
+def inverted_triangles(control: ControlModel, vertices: np.ndarray, subdivision: Subdivision, detailed: np.ndarray
+                       ) -> np.ndarray:
+    """Fine triangles, ascending, whose normal opposes that of their control triangle on control vertices (N, 3).
+
+    Parameters
+    ----------
+    detailed : (n, 3) float, metres
+        Vertices of the detailed surface.
+    """
+    fine = Mesh(detailed, subdivision.faces).face_normals
+    coarse = control.mesh.with_vertices(vertices).face_normals[subdivision.face_parent]
+    return np.flatnonzero(np.einsum("fd,fd->f", fine, coarse) < 0)
+
+
+def _error(distances: np.ndarray) -> SurfaceError:
+    return SurfaceError(float(distances.mean()), float(np.sqrt(np.mean(distances**2))), float(distances.max()))

@@ -1,0 +1,208 @@
+"""Control meshes split at their edges: everywhere alike, or where the surface asks for it; without a crack [Statues].
+
+A new vertex lies in the middle of an edge, so every vertex is a place on a control triangle, and it belongs to all
+triangles around it: where the chart has a seam there is one vertex and one place, taken from one of the sides.
+A closed mesh of V vertices without handles has 4 V - 6 after a split of every edge.
+"""
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import numpy as np
+
+from scanprep.geometry.mesh import Mesh
+
+from .chart import Chart
+
+# Places of a triangle by number: corners 0, 1, 2 and the middles 3 of 01, 4 of 12, 5 of 20. For each set of split
+# sides (bits 1, 2, 4) the triangles that take its place; with two split sides there is a diagonal to choose.
+_PATTERNS = {
+    0: [(0, 1, 2)], 1: [(0, 3, 2), (3, 1, 2)], 2: [(0, 1, 4), (0, 4, 2)], 4: [(0, 1, 5), (5, 1, 2)],
+    3: [(3, 1, 4), (0, 3, 4), (0, 4, 2)], 6: [(4, 2, 5), (1, 4, 5), (1, 5, 0)], 5: [(5, 0, 3), (2, 5, 3), (2, 3, 1)],
+    7: [(0, 3, 5), (3, 1, 4), (5, 4, 2), (3, 4, 5)],
+    8 + 3: [(3, 1, 4), (0, 3, 2), (3, 4, 2)], 8 + 6: [(4, 2, 5), (1, 4, 0), (4, 5, 0)],
+    8 + 5: [(5, 0, 3), (2, 5, 1), (5, 3, 1)]}
+_DIAGONALS = {3: ((0, 4), (3, 2)), 6: ((1, 5), (4, 0)), 5: ((2, 3), (5, 1))}        # of the two ways
+PROBES = np.arange(1, 8) / 8                                # places along an edge where its displacement is looked at
+INNER = np.array([(2, 2, 2), (4, 1, 1), (1, 4, 1), (1, 1, 4)]) / 6      # and in a triangle
+
+# places: triangles (n,) of the control mesh and barycentric coordinates (n, 3) -> points (n, 3), metres
+Displaced = Callable[[np.ndarray, np.ndarray], np.ndarray]
+
+
+@dataclass(frozen=True, eq=False)
+class Subdivision:
+    """A finer triangulation of a control mesh.
+
+    Attributes
+    ----------
+    faces : (f, 3) int
+    parent : (n,) int
+        A triangle of the control mesh on which each vertex lies.
+    bary : (n, 3) float
+        Its place there.
+    face_parent : (f,) int
+        The control triangle of every triangle.
+    chart : Chart
+        The finer triangles in the image; vertices on a seam have several places in it.
+    """
+
+    faces: np.ndarray
+    parent: np.ndarray
+    bary: np.ndarray
+    face_parent: np.ndarray
+    chart: Chart
+
+    def points(self, mesh: Mesh) -> np.ndarray:
+        """(n, 3) the vertices on a control mesh, not displaced."""
+        return np.einsum("nc,ncd->nd", self.bary, mesh.vertices[mesh.faces[self.parent]])
+
+    def mesh(self, mesh: Mesh) -> Mesh:
+        """The same surface as a control mesh, in more triangles."""
+        return Mesh(self.points(mesh), self.faces)
+
+
+@dataclass(frozen=True, eq=False)
+class _Corners:
+    """Triangles by their corners: vertex (f, k), row of the chart (f, k) and place on the parent (f, k, 3)."""
+
+    vertex: np.ndarray
+    row: np.ndarray
+    bary: np.ndarray
+    parent: np.ndarray
+    uv: np.ndarray
+
+
+def subdivide(mesh: Mesh, chart: Chart, level: int) -> Subdivision:
+    """Every triangle in four, `level` times over.
+
+    Parameters
+    ----------
+    mesh, chart : Mesh, Chart
+        Of a control model.
+    level : int
+        0 leaves the mesh as it is.
+
+    Raises
+    ------
+    ValueError
+        A level below 0, or a chart of another mesh.
+    """
+    now = _begin(mesh, chart, level)
+    for _ in range(level):
+        now = _split(now, np.ones(now.vertex.shape, dtype=bool), mesh)
+    return _finish(now)
+
+
+def subdivide_adaptive(mesh: Mesh, chart: Chart, displaced: Displaced, tolerance: float, level: int) -> Subdivision:
+    """Edges split where the displaced surface bends away from them.
+
+    An edge is split if the surface is farther from it than the tolerance anywhere along it, or at a place inside a
+    triangle beside it: a decision of the edge, the same for both sides, so that no vertex lies on a neighbour's edge.
+
+    Parameters
+    ----------
+    mesh, chart : Mesh, Chart
+    displaced : places -> points
+        Where the surface is, such as `displaced_surface` of `reconstruction`.
+    tolerance : float, metres
+    level : int
+        How often an edge of the control mesh may be split.
+    """
+    if not 0 < tolerance < np.inf:
+        raise ValueError(f"tolerance: expected a length above 0, got {tolerance}")
+    now = _begin(mesh, chart, level)
+    for _ in range(level):
+        marked = _bent(now, displaced, tolerance)
+        if not marked.any():
+            break
+        now = _split(now, marked, mesh)
+    return _finish(now)
+
+
+def _begin(mesh: Mesh, chart: Chart, level: int) -> _Corners:
+    if chart.faces.shape != mesh.faces.shape:
+        raise ValueError(f"chart: expected one of {len(mesh.faces)} triangles as the mesh has, got {len(chart.faces)}")
+    if level < 0:
+        raise ValueError(f"level: expected 0 or more, got {level}")
+    return _Corners(mesh.faces, chart.faces, np.tile(np.eye(3), (len(mesh.faces), 1, 1)), np.arange(len(mesh.faces)),
+                    chart.uv)
+
+
+def _finish(now: _Corners) -> Subdivision:
+    count = now.vertex.max(initial=-1) + 1
+    _, first = np.unique(now.vertex, return_index=True)     # the first triangle around a vertex places it
+    assert len(first) == count, "a split makes no vertex that no triangle uses"
+    return Subdivision(now.vertex, now.parent[first // 3], now.bary.reshape(-1, 3)[first], now.parent,
+                       Chart(now.uv, now.row))
+
+
+def _sides(vertex: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Where every edge first occurs among the 3 f sides, and which edge each side (f, 3) is."""
+    a, b = vertex, np.roll(vertex, -1, axis=1)
+    key = np.minimum(a, b) * (vertex.max() + 1) + np.maximum(a, b)
+    _, first, edge = np.unique(key, return_index=True, return_inverse=True)
+    return first, edge.reshape(-1, 3)
+
+
+def _split(now: _Corners, marked: np.ndarray, mesh: Mesh) -> _Corners:
+    """The triangles with their marked sides (f, 3) split."""
+    middle = 0.5 * (now.bary + np.roll(now.bary, -1, axis=1))
+    vertex, _ = _with_middles(now.vertex, marked)
+    row, halved = _with_middles(now.row, marked)
+    uv = np.concatenate([now.uv, 0.5 * now.uv[halved].sum(axis=1)])
+    bary = np.concatenate([now.bary, middle], axis=1)
+    pattern = _pattern(marked, bary, now.parent, mesh)
+    parts = []
+    for number, triangles in _PATTERNS.items():
+        which = np.flatnonzero(pattern == number)
+        for triangle in triangles if len(which) else ():
+            pick = np.array(triangle)
+            parts.append((which, vertex[which][:, pick], row[which][:, pick], bary[which][:, pick]))
+    face = np.concatenate([which for which, *_ in parts])
+    order = np.argsort(face, kind="stable")                 # the parts of a triangle side by side
+    v, r, b = (np.concatenate([part[i] for part in parts])[order] for i in (1, 2, 3))
+    return _Corners(v, r, b, now.parent[face[order]], uv)
+
+
+def _with_middles(faces: np.ndarray, marked: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Triangles (f, 6) by corners and middles, -1 where a side stays whole; and the ends (m, 2) of the split edges."""
+    first, edge = _sides(faces)
+    count = faces.max() + 1
+    split = marked.ravel()[first]
+    number = np.where(split, count + np.cumsum(split) - 1, -1)
+    ends = np.stack([faces.ravel(), np.roll(faces, -1, axis=1).ravel()], axis=1)[first[split]]
+    return np.concatenate([faces, number[edge]], axis=1), ends
+
+
+def _pattern(marked: np.ndarray, bary: np.ndarray, parent: np.ndarray, mesh: Mesh) -> np.ndarray:
+    """(f,) which of the patterns each triangle takes; of two diagonals the shorter."""
+    pattern = marked @ np.array([1, 2, 4])
+    for number, ways in _DIAGONALS.items():
+        which = np.flatnonzero(pattern == number)
+        points = np.einsum("fkc,fcd->fkd", bary[which], mesh.corners[parent[which]])
+        one, other = (np.linalg.norm(points[:, a] - points[:, b], axis=1) for a, b in ways)
+        pattern[which] += 8 * (other < one)
+    return pattern
+
+
+def _bent(now: _Corners, displaced: Displaced, tolerance: float) -> np.ndarray:
+    """(f, 3) sides along which the displaced surface is farther than the tolerance from the edge, or beside which."""
+    first, edge = _sides(now.vertex)
+    face, side = np.divmod(first, 3)
+    ends = np.stack([now.bary[face, side], now.bary[face, (side + 1) % 3]], axis=1)
+    along = np.stack([1 - PROBES, PROBES], axis=1)
+    bent = _deviation(ends, now.parent[face], along, displaced) > tolerance
+    inside = _deviation(now.bary, now.parent, INNER, displaced) > tolerance
+    bent[edge[inside]] = True
+    return bent[edge]
+
+
+def _deviation(corners: np.ndarray, parent: np.ndarray, probes: np.ndarray, displaced: Displaced) -> np.ndarray:
+    """(m,) how far the surface is, at most, from edges or triangles whose corners (m, k, 3) are on it."""
+    count, k, p = len(corners), corners.shape[1], len(probes)
+    at = displaced(np.repeat(parent, k), corners.reshape(-1, 3)).reshape(count, k, 3)
+    between = np.einsum("pk,mkc->mpc", probes, corners).reshape(-1, 3)
+    true = displaced(np.repeat(parent, p), between).reshape(count, p, 3)
+    return np.linalg.norm(true - np.einsum("pk,mkd->mpd", probes, at), axis=2).max(axis=1)
