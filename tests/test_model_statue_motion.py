@@ -3,15 +3,18 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from model_bodies import worm, worm_model
 
 from model.export.bvh import write_bvh
 from model.export.bvh_read import BvhMotion, read_bvh
 from model.export.rig import joint_places
 from model.statue.bone_names import find_roles, trunk
+from model.statue.follow import Follower, _bound
 from model.statue.humanoid import humanoid
 from model.statue.motion import MotionConfig, bvh_motion, own_motion, people_motion
 from scanprep.geometry import rotations
 from scanprep.geometry.storage import StorageError
+from scanprep.geometry.surface import Surface
 from scanprep.scanning.people import PARTS, Person, named_pose, walk
 
 GENERIC = np.zeros((17, 3))
@@ -226,3 +229,66 @@ def test_a_trunk_is_found_by_the_tree():
     parents = np.array([-1, 0, 1, 2, 3, 4, 3, 3, 0])
     assert trunk(parents, find_roles(names)) == (1, 3)
     assert trunk(np.array([-1, 0, 1, 2, 3, 4, 0, 0, 0]), find_roles(names)) == (0, 0)
+
+
+@pytest.fixture(scope="module")
+def learned():
+    """A model of bodies that is no skinned mesh, and a coarse control mesh around it in a bent pose."""
+    model = worm_model()
+    rng = np.random.default_rng(3)
+    subject, pose, trans = model.subject(np.array([0.5, -1.0, 0.3])), rng.normal(0, 0.2, (4, 3)), rng.normal(size=3)
+    body = model.template.with_vertices(subject.vertices(pose, trans))
+    coarse = worm(17, 6)
+    near = Surface(model.template).closest(coarse.vertices)
+    off = rng.uniform(-0.01, 0.02, len(coarse.vertices))[:, None] * coarse.vertex_normals
+    return subject, pose, trans, coarse.with_vertices(near.carried(body.vertices, body.faces) + off)
+
+
+def test_a_control_mesh_follows_a_model(learned):
+    subject, pose, trans, control = learned
+    follower = Follower(control, subject, pose, trans)
+    assert np.abs(follower.vertices(pose, trans) - control.vertices).max() < 1e-9, "the scan's own pose gives it back"
+    # the whole body turns and travels: the control mesh does so too
+    turn, moved = np.array([0.4, -0.8, 1.1]), pose.copy()
+    moved[0] = rotations.log(rotations.exp(turn) @ rotations.exp(pose[0]))
+    about = subject.template.vertices[subject.skeleton.part_of_vertex(subject.template) == 0].mean(axis=0)
+    rigid = (control.vertices - trans - about) @ rotations.exp(turn).T + about - trans
+    assert np.abs(follower.vertices(moved, -trans) - rigid).max() < 1e-9
+    # many poses at once; each vertex keeps its distance from the skin
+    poses = np.random.default_rng(4).normal(0, 0.25, (40, 4, 3))
+    several = follower.vertices(poses, np.zeros((40, 3)))
+    before = Surface(subject.template.with_vertices(subject.vertices(pose, trans))).closest(control.vertices).distances
+    for t in (0, 35):
+        assert np.abs(several[t] - follower.vertices(poses[t])).max() < 1e-12
+        after = Surface(subject.template.with_vertices(subject.vertices(poses[t]))).closest(several[t]).distances
+        assert np.abs(after - before).max() < 0.004
+
+
+def test_points_of_the_skin_follow_exactly_and_a_registered_scan_says_which(learned):
+    subject, pose, trans, control = learned
+    body = subject.template.with_vertices(subject.vertices(pose, trans))
+    slid = body.with_vertices(body.vertices + [0.3, 0, 0])               # stands elsewhere than the model has it
+    on = Surface(body).closest(control.vertices)
+    mesh = control.with_vertices(on.carried(slid.vertices, body.faces))
+    follower = Follower(mesh, subject, pose, trans, slid.vertices)
+    assert np.abs(follower.vertices(pose, trans) - mesh.vertices).max() < 1e-9
+    straight = Follower(control.with_vertices(on.points), subject, pose, trans)
+    poses = np.random.default_rng(5).normal(0, 0.3, (2, 4, 3))
+    for t, x in enumerate(straight.vertices(poses)):
+        assert np.abs(x - on.carried(subject.vertices(poses[t]), body.faces)).max() < 1e-9
+    off = follower.vertices(poses[0]) - straight.vertices(poses[0])
+    assert np.abs(np.linalg.norm(off, axis=1) - 0.3).max() < 1e-9, "the offset turns with the skin"
+    with pytest.raises(ValueError, match=r"registered: expected shape \(398, 3\)"):
+        Follower(mesh, subject, pose, trans, slid.vertices[:5])
+
+
+def test_a_vertex_is_bound_to_its_own_side(learned):
+    """Where a thin part is nearer than the skin that a vertex belongs to, its normal says where it belongs."""
+    subject, _, _, control = learned
+    rest = subject.template.with_vertices(subject.vertices(np.zeros((4, 3))))
+    squeezed = control.with_vertices(Surface(rest).closest(worm(17, 6).vertices).points)
+    low = int(squeezed.vertices[:, 2].argmin())
+    vertices = squeezed.vertices.copy()
+    vertices[low, 2] += 0.8 * np.ptp(rest.vertices[:, 2])                # up through the body, still facing down
+    bound = _bound(squeezed.with_vertices(vertices), rest)[[low]]
+    assert (bound @ rest.vertex_normals)[0, 2] < -0.3
