@@ -79,8 +79,9 @@ def bvh_motion(control: ControlModel, pose: np.ndarray, bvh: BvhMotion, referenc
     then point where those of the file do, hands continue the forearms as at rest, and trunk, head and feet keep
     their angle to the facing direction. The trunk of the file, of any number of joints, becomes one rotation that
     brings neck and shoulders nearest to where it brings them. Travel is scaled by the length of the legs; the
-    statue starts where the scan stands, facing as the scan does where the file's rest faces forward, and its lowest
-    vertex in the motion is as low as in the scan.
+    statue starts where the scan stands, it faces as the scan does where a person of the file faces as at rest, and its
+    lowest vertex in the motion is as low as in the scan. Upwards is the axis of the file that is nearest to the trunk
+    at rest: y, as BVH says, but some programs write z.
 
     Parameters
     ----------

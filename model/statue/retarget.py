@@ -31,7 +31,7 @@ class MotionConfig(Settings):
         clavicle.
     """
 
-    girdle: Share = 1 / 3
+    girdle: Share = 0.2
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,8 +90,7 @@ class Pairing:
         self.axes = _axes(self.joints, self.ours)
         feet = [skeleton.joints[self.ours[r]] for r in ("l_ankle", "r_ankle", "l_hip", "r_hip") if r in self.ours]
         high = skeleton.joints[self.ours.get("skullbase", self.ours["l_shoulder"])] - np.mean(feet[:2], axis=0)
-        main = int(np.abs(high).argmax())
-        self.up = np.eye(3)[main] * np.sign(high[main]) if up is None else np.asarray(up) / np.linalg.norm(up)
+        self.up = _nearest_axis(high) if up is None else np.asarray(up) / np.linalg.norm(up)
 
     def alignment(self, aligned: bool) -> dict[int, np.ndarray]:
         """For each part the rotation from the axes of the generic model to those of the motion at rest.
@@ -99,7 +98,7 @@ class Pairing:
         The smallest turn that brings our bone to theirs, after that of the part above it.
         """
         J = len(self.control.skeleton.parents)
-        whole = np.eye(3) if aligned else _axes(self.moving.rest, self.theirs) @ self.axes.T
+        whole = self.whole(aligned)
         A = dict.fromkeys(range(J), whole)
         for side in "lr" if not aligned else "":
             for chain in _CHAINS:
@@ -128,10 +127,12 @@ class Pairing:
     def world(self, aligned: bool) -> np.ndarray:
         """The rotation (3, 3) from the axes of the motion to those of the scan: upwards to upwards, and forwards
         at rest to where the scan faces."""
-        up = np.eye(3)[2 if aligned else 1]
-        whole = np.eye(3) if aligned else _axes(self.moving.rest, self.theirs) @ self.axes.T
-        there, here = whole @ self.axes[:, 2], self.P[0] @ self.axes[:, 2]
-        return _upright_axes(here, self.up) @ _upright_axes(there, up).T
+        _, up, there = (self.whole(aligned) @ self.axes).T
+        return _upright_axes(self.P[0] @ self.axes[:, 2], self.up) @ _upright_axes(there, _nearest_axis(up)).T
+
+    def whole(self, aligned: bool) -> np.ndarray:
+        """The rotation (3, 3) from the axes of the generic model to those of the motion, of the bodies at rest."""
+        return np.eye(3) if aligned else _axes(self.moving.rest, self.theirs) @ self.axes.T
 
 
 def retargeted(pair: Pairing, aligned: bool, config: MotionConfig) -> StatueMotion:
@@ -205,7 +206,7 @@ def _leg(joints: np.ndarray, roles: Mapping[str, int], others: Mapping[str, int]
 def _axes(joints: np.ndarray, roles: Mapping[str, int]) -> np.ndarray:
     """(3, 3) columns: to the left, upwards and forwards of a body at rest, from its hips and shoulders."""
     hips, shoulders = ([joints[roles[f"{side}_{name}"]] for side in "lr"] for name in ("hip", "shoulder"))
-    across = sum((a - b) / np.linalg.norm(a - b) for a, b in (hips, shoulders))
+    across = sum((a - b) / max(float(np.linalg.norm(a - b)), 1e-12) for a, b in (hips, shoulders))
     high = np.mean(shoulders, axis=0) - np.mean(hips, axis=0)
     forwards = np.cross(across, high)
     size = np.linalg.norm(forwards)
@@ -214,6 +215,11 @@ def _axes(joints: np.ndarray, roles: Mapping[str, int]) -> np.ndarray:
                          "such rest needs a reference frame)")
     return np.stack([np.cross(high, forwards) / np.linalg.norm(high) / size, high / np.linalg.norm(high),
                      forwards / size], axis=1)
+
+
+def _nearest_axis(direction: np.ndarray) -> np.ndarray:
+    main = int(np.abs(direction).argmax())
+    return np.eye(3)[main] * np.sign(direction[main])
 
 
 def _upright_axes(forwards: np.ndarray, up: np.ndarray) -> np.ndarray:
