@@ -25,9 +25,11 @@ from .lattice import Lattice
 from .normal_volume import interpolate
 from .statue import FOLDED, HOLE, MEASURED, OUTSIDE, DisplacementMap
 from .texels import Texels, find_texels
+from .vectors import bend_over_folds
 
 Progress = Callable[[int, int], None]
 FILL_LEVEL = 3                       # of the subdivision on which holes are filled: edges of some 5 mm
+VECTOR_LEVEL = 4                     # of that whose vertices are drawn onto the scan in folds
 
 
 @dataclass(frozen=True)
@@ -92,8 +94,11 @@ def bake(control: ControlModel, scan: Mesh, config: DisplacementConfig | None = 
     heights = _filled(control, texels, heights, known)
     coverage = np.where(folded, FOLDED, np.where(known, MEASURED, HOLE)).astype(np.uint8)
     coverage[~texels.inside] = OUTSIDE
+    tell(4, 5)
+    vectors = _vectors(control, scan, texels, heights, known, folded, config) if config.vectors else None
     tell(5, 5)
-    return DisplacementMap(texels.image(heights.astype(np.float32)), texels.image(coverage, OUTSIDE))
+    return DisplacementMap(texels.image(heights.astype(np.float32)), texels.image(coverage, OUTSIDE),
+                           None if vectors is None else texels.image(vectors.astype(np.float32)))
 
 
 def _measure(mesh: Mesh, scan: Mesh, texels: Texels, config: DisplacementConfig) -> tuple[np.ndarray, np.ndarray]:
@@ -176,6 +181,23 @@ def _filled(control: ControlModel, texels: Texels, heights: np.ndarray, known: n
     values, sure = lattice.gather(texels, heights, known)
     values = sparse.harmonic(lattice.fine.vertex_adjacency, values[:, None], sure)[:, 0]
     return np.where(known, heights, lattice.sample(values, texels.faces, texels.bary))
+
+
+def _vectors(control: ControlModel, scan: Mesh, texels: Texels, heights: np.ndarray, known: np.ndarray,
+             folded: np.ndarray, config: DisplacementConfig) -> np.ndarray:
+    """Displacements (n, 3) of pixels: heights along the normals, and drawn onto the scan in and around folds."""
+    lattice = Lattice(control.mesh, control.chart, VECTOR_LEVEL)
+    near = lattice.fine.vertex_adjacency
+    values, sure = lattice.gather(texels, heights, known)
+    _, no_fold = lattice.gather(texels, heights, ~folded)
+    smooth = sparse.harmonic(near, values[:, None], sure)[:, 0]
+    drawn, u = bend_over_folds(lattice, scan, smooth, ~no_fold, config.reach)
+    out = np.zeros((len(heights), 3))
+    vertex, _ = lattice.places(texels.faces, texels.bary)
+    which = np.flatnonzero(drawn[vertex].any(axis=1))
+    faces, bary = texels.faces[which], texels.bary[which]
+    out[which] = lattice.sample(u, faces, bary) - heights[which, None] * interpolate(control.mesh, faces, bary)[1]
+    return out
 
 
 def coverage_shares(control: ControlModel, map: DisplacementMap) -> dict[str, float]:

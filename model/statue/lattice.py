@@ -20,6 +20,8 @@ class Lattice:
 
     Attributes
     ----------
+    mesh : Mesh
+        The control mesh.
     subdivision : Subdivision
     fine : Mesh
         Its vertices on the control mesh.
@@ -28,7 +30,7 @@ class Lattice:
     def __init__(self, mesh: Mesh, chart: Chart, level: int) -> None:
         self.subdivision = subdivide(mesh, chart, level)
         self.fine = self.subdivision.mesh(mesh)
-        self._chart, self._steps = chart, 2**level
+        self.mesh, self._chart, self._steps = mesh, chart, 2**level
         uv_corners = chart.uv[chart.faces]
         fine_uv = self.subdivision.chart.uv[self.subdivision.chart.faces]
         parent = self.subdivision.face_parent[:, None]

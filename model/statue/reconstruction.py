@@ -59,8 +59,9 @@ class Reconstruction:
         share.eliminate_zeros()
         self._spread = csr_array(hstack([share, diags_array(heights) @ share]), dtype=dtype)
         self._around = _around(mesh)
-        self._turning = np.flatnonzero(np.linalg.norm(rest, axis=1) > 1e-9)
-        self._rest, self._share = rest[self._turning].astype(dtype), csr_array(share[self._turning], dtype=dtype)
+        self._turning = np.flatnonzero(rest.any(axis=1))
+        self._rest: np.ndarray = rest[self._turning].astype(dtype)
+        self._share = csr_array(share[self._turning], dtype=dtype)
 
     def __call__(self, control_vertices: np.ndarray) -> np.ndarray:
         """(n, 3) metres, the detailed surface on control vertices (N, 3)."""
@@ -69,7 +70,7 @@ class Reconstruction:
             raise ValueError(f"control_vertices: expected shape {self.control.mesh.vertices.shape}, got {v.shape}")
         out = self._spread @ np.concatenate([v, self._normals(v)]).astype(self.dtype)
         if len(self._turning):
-            R = vertex_rotations(self.control.mesh, v).reshape(-1, 9).astype(self.dtype)
+            R: np.ndarray = vertex_rotations(self.control.mesh, v).reshape(-1, 9).astype(self.dtype)
             out[self._turning] += np.einsum("nij,nj->ni", (self._share @ R).reshape(-1, 3, 3), self._rest)
         return out
 
@@ -94,19 +95,15 @@ def displaced_surface(control: ControlModel, map: DisplacementMap) -> Displaced:
 
 def _parts(mesh: Mesh, map: DisplacementMap, faces: np.ndarray, bary: np.ndarray, uv: np.ndarray
            ) -> tuple[np.ndarray, np.ndarray]:
-    """Heights (n,) along the interpolated normal and what is left (n, 3) of vector displacements, in the world."""
+    """Heights (n,) along the interpolated normal and, where there are vectors, what is off it (n, 3)."""
     heights = bilinear(map.heights, uv)
-    if map.vectors is None:
-        return heights, np.zeros((len(uv), 3))
-    vectors = bilinear(map.vectors, uv)
-    _, n = interpolate(mesh, faces, bary)
-    along = np.einsum("nd,nd->n", vectors, n) / np.maximum(np.einsum("nd,nd->n", n, n), 1e-12)
-    rest = vectors - along[:, None] * n
-    rest[np.linalg.norm(rest, axis=1) < ALONG] = 0
-    return along, rest
-
-
-ALONG = 2e-5                         # metres off the normal that are rounding of single numbers and of pixels
+    rest = np.zeros((len(uv), 3)) if map.vectors is None else bilinear(map.vectors, uv)
+    some = np.flatnonzero(rest.any(axis=1))
+    _, n = interpolate(mesh, faces[some], bary[some])
+    along = np.einsum("nd,nd->n", rest[some], n) / np.maximum(np.einsum("nd,nd->n", n, n), 1e-12)
+    heights[some] += along
+    rest[some] -= along[:, None] * n
+    return heights, rest
 
 
 def _around(mesh: Mesh) -> csr_array:
@@ -171,16 +168,21 @@ def remaining_error(control: ControlModel, map: DisplacementMap, scan: Mesh, cou
 
 def inverted_triangles(control: ControlModel, vertices: np.ndarray, subdivision: Subdivision, detailed: np.ndarray
                        ) -> np.ndarray:
-    """Fine triangles, ascending, whose normal opposes that of their control triangle on control vertices (N, 3).
+    """Fine triangles, ascending, whose normal opposes that of the control surface below them.
+
+    That is its interpolated normal: on it the heights stand, and a steep flank is not inverted because the control
+    mesh has an edge there.
 
     Parameters
     ----------
+    vertices : (N, 3) float, metres
+        Of the control mesh.
     detailed : (n, 3) float, metres
-        Vertices of the detailed surface.
+        Of the detailed surface.
     """
-    fine = Mesh(detailed, subdivision.faces).face_normals
-    coarse = control.mesh.with_vertices(vertices).face_normals[subdivision.face_parent]
-    return np.flatnonzero(np.einsum("fd,fd->f", fine, coarse) < 0)
+    _, n = interpolate(control.mesh.with_vertices(vertices), subdivision.parent, subdivision.bary)
+    below = n[subdivision.faces].sum(axis=1)
+    return np.flatnonzero(np.einsum("fd,fd->f", Mesh(detailed, subdivision.faces).face_normals, below) < 0)
 
 
 def _error(distances: np.ndarray) -> SurfaceError:

@@ -11,6 +11,7 @@ from scanprep.geometry.surface import Surface
 from .chart import Chart
 
 PADDING = 4                          # pixels that the surface is continued beyond the border of a chart
+MARGIN = 16                          # pixels more that the last value is repeated
 
 
 @dataclass(frozen=True, eq=False)
@@ -36,19 +37,22 @@ class Texels:
     inside: np.ndarray
 
     def image(self, values: np.ndarray, beyond: float | None = None) -> np.ndarray:
-        """An image (size, size, ...) of values (n, ...) of the pixels; elsewhere a number, or the nearest pixel's."""
+        """An image (size, size, ...) of values (n, ...) of the pixels.
+
+        Elsewhere a number; or that of the nearest pixel as far as smaller copies of the image look, and 0 beyond.
+        """
         out = np.full((self.size**2, *values.shape[1:]), 0 if beyond is None else beyond, dtype=values.dtype)
         out[self.pixels] = values
         out = out.reshape(self.size, self.size, *values.shape[1:])
-        if beyond is not None:
-            return out
-        from scipy.ndimage import distance_transform_edt
+        if beyond is None:
+            from scipy.ndimage import distance_transform_edt
 
-        empty = np.ones(self.size**2, dtype=bool)
-        empty[self.pixels] = False
-        row, column = distance_transform_edt(empty.reshape(self.size, self.size), return_distances=False,
-                                             return_indices=True)
-        return out[row, column]
+            empty = np.ones(self.size**2, dtype=bool)
+            empty[self.pixels] = False
+            far, (row, column) = distance_transform_edt(empty.reshape(self.size, self.size), return_indices=True)
+            around = (far > 0) & (far <= MARGIN)
+            out[around] = out[row[around], column[around]]
+        return out
 
     def neighbours(self) -> np.ndarray:
         """(m, 2) pairs of pixels, as numbers in these arrays, that lie side by side in the image."""
