@@ -11,9 +11,8 @@ import tyro
 from scanprep.batch.pool import Workers
 from scanprep.batch.workspace import Task, Workspace
 from scanprep.cli import MM, Output, ScanArg, Unit, WorkersArg
-from scanprep.console import Metric, Outcome, bar, dispatch, failures_of, problem_of, say
+from scanprep.console import Metric, Outcome, bar, dispatch, failures_of, problem_of
 from scanprep.geometry.files import write_mesh
-from scanprep.geometry.mesh import Mesh
 from scanprep.pipeline.scans import SCAN_ENDINGS
 
 from .control import ControlModel
@@ -21,7 +20,7 @@ from .files import load_statue
 from .fit import StatueConfig
 from .humanoid import humanoid
 from .reconstruction import Reconstruction, displaced_surface
-from .subdivision import Subdivision, subdivide, subdivide_adaptive
+from .subdivision import subdivide, subdivide_adaptive
 from .work import Inputs, Work
 
 StatueArg = Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="STATUE")]

@@ -1,4 +1,4 @@
-"""A statue on disk: the control model, the images over its chart, and how it stands."""
+"""A statue on disk: the control model, the images over its chart, and the files for other commands."""
 from __future__ import annotations
 
 from pathlib import Path
@@ -7,12 +7,17 @@ import numpy as np
 
 from scanprep.geometry import storage
 
-from .control_files import load_control, save_control
+from .body import body_model, people_poses
+from .control import ControlModel
 from .displacement_files import read_map, write_map
+from .humanoid import humanoid, humanoid_markers
+from .motion import people_motion
 from .statue import Statue
 
 KIND, VERSION = "statue", 1
 CONTROL, ABOUT, TEXTURE = "control.npz", "statue.json", "texture.png"
+BODY, MARKERS = "body.npz", "markers.json"
+SKIN = 0.0095                        # metres from the skin to the middle of a marker [MoSh]
 
 
 def save_statue(folder: str | Path, statue: Statue) -> None:
@@ -21,7 +26,7 @@ def save_statue(folder: str | Path, statue: Statue) -> None:
 
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
-    save_control(folder / CONTROL, statue.control)
+    statue.control.save(folder / CONTROL)
     write_map(folder, statue.map)
     if statue.texture is not None:
         with storage.writing(folder / TEXTURE) as beside:
@@ -52,7 +57,7 @@ def load_statue(folder: str | Path, edited: str | Path | None = None) -> Statue:
     if about.get("version") != VERSION:
         raise storage.StorageError(f"{folder / ABOUT}: statue version {about.get('version')} is not known here "
                                    f"(known: {VERSION})")
-    control = load_control(folder / CONTROL)
+    control = ControlModel.load(folder / CONTROL)
     texture = None
     with storage.taking_apart(folder / ABOUT, "a whole statue"):
         pose = storage.numbers({"pose": np.array(about["pose"], dtype=np.float64)}, "pose",
@@ -61,3 +66,13 @@ def load_statue(folder: str | Path, edited: str | Path | None = None) -> Statue:
         with storage.taking_apart(folder / TEXTURE, "the texture of the statue"), Image.open(folder / TEXTURE) as image:
             texture = np.asarray(image.convert("RGB"))
     return Statue(control, pose, read_map(folder, edited), texture)
+
+
+def write_body(folder: Path, statue: Statue) -> None:
+    """Write body.npz, a model that markers and points drive, and for the humanoid markers.json, a layout of markers."""
+    control, poses = statue.control, None
+    if control.skeleton.names == humanoid().skeleton.names:
+        poses = people_motion(control, statue.pose, people_poses()).poses
+        storage.write_json(folder / MARKERS, {"markersets": [{
+            "type": "body", "distance_from_skin": SKIN, "indices": humanoid_markers()}]})
+    body_model(control, poses).save(folder / BODY)

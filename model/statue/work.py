@@ -6,8 +6,6 @@ import warnings
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
-import numpy as np
-
 from scanprep.batch.room import Room
 from scanprep.cleaning.components import clean_scan
 from scanprep.cli import MM, Unit
@@ -19,9 +17,10 @@ from scanprep.pictures.sheets import save_png
 from scanprep.pictures.textures import Texture, read_texture
 
 from .automatic import Features, find_features
+from .colors import bake_texture, scan_look
 from .control import ControlModel
 from .displacement import bake, coverage_shares
-from .files import save_statue, write_extras
+from .files import save_statue, write_body
 from .fit import Posed, StatueConfig, fitted_control, posed_automatically, posed_by_features
 from .read_features import read_features
 from .reconstruction import Reconstruction, displaced_surface, inverted_triangles, remaining_error, surface_error
@@ -29,7 +28,6 @@ from .report import Level, in_motion, parts_without_data, statue_page, statue_pi
 from .statue import Statue
 from .subdivision import Subdivision, subdivide, subdivide_adaptive
 from .surface_fit import SurfaceFit, fit_surface
-from .texture import bake_texture
 
 LEVELS = 4                           # 0 to 3 are measured, the last is written
 TOLERANCE = 0.0005                   # metres: of adaptive subdivision in the report
@@ -90,7 +88,8 @@ class Work:
         map_ = room.step("map", same, lambda: bake(control, scan, self.config.displacement, room.tell))
         statue = Statue(control, posed.features.pose, map_)
         if texture is not None or scan.colors is not None:
-            statue = replace(statue, texture=room.step("texture", same, lambda: bake_texture(statue, scan, texture)))
+            image = room.step("texture", same, lambda: bake_texture(control, map_, scan_look(texture or scan)))
+            statue = replace(statue, texture=image)
         return self._written(statue, scan, surface, [*dropped, *rows, *_posed(posed)], inputs, room)
 
     def _written(self, statue: Statue, scan: Mesh, surface: SurfaceFit, rows: list[Metric], inputs: Inputs, room: Room
@@ -100,7 +99,7 @@ class Work:
         levels, fine = measured_levels(statue, scan)
         adaptive = _adaptive(statue, scan)
         write_mesh(folder / "reconstruction.ply", levels[-1].mesh)
-        write_extras(folder, statue, levels[-1].mesh, fine)
+        write_body(folder, statue)
         rows = [*rows, *_figures(statue, scan, surface, levels, adaptive, fine), *_sizes(folder, scan)]
         problem = statue_problem(statue)
         rows = [*([Metric("problem", problem)] if problem else []), *rows]
