@@ -3,14 +3,15 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property
+from pathlib import Path
 
 import numpy as np
 
-from scanprep.geometry.mesh import Mesh
+from scanprep.geometry.mesh import Mesh, template_problem
 from scanprep.skeleton.tree import Skeleton
 
-from ..export.rig import Rig
-from .chart import Chart
+from ..export.rig import CARRIERS, Rig
+from .chart import Chart, chart_problem
 
 
 @dataclass(frozen=True, eq=False)
@@ -51,6 +52,25 @@ class ControlModel:
     segments: tuple[str, ...]
     segment_of_part: np.ndarray
 
+    def save(self, path: str | Path) -> None:
+        """Write one `.npz` file, which `load` and `read_control` read."""
+        from .control_files import save
+
+        save(self, path)
+
+    @staticmethod
+    def load(path: str | Path) -> ControlModel:
+        """Read a file of `save`.
+
+        Raises
+        ------
+        StorageError
+            Missing, damaged, of another kind or version, or what it holds is no control model.
+        """
+        from .control_files import load
+
+        return load(path)
+
     @cached_property
     def rig(self) -> Rig:
         """For linear blend skinning [Statues] Eq. 1."""
@@ -59,3 +79,35 @@ class ControlModel:
     def fitted(self, vertices: np.ndarray, joints: np.ndarray) -> ControlModel:
         """The same model on other vertices (N, 3) and joint centres (J, 3), whose pose becomes the default pose."""
         return replace(self, mesh=self.mesh.with_vertices(vertices), skeleton=replace(self.skeleton, joints=joints))
+
+
+def control_problem(control: ControlModel) -> str | None:
+    """Why a control model is not usable, or None when it is."""
+    mesh, J, N = control.mesh, len(control.skeleton.parents), len(control.mesh.vertices)
+    problem = surface_problem(mesh) or chart_problem(mesh, control.chart)
+    if problem:
+        return problem
+    if control.weights.shape != (N, J):
+        return f"expected weights of shape {(N, J)}, it has {control.weights.shape}"
+    carriers = (control.weights > 0).sum(axis=1).max()
+    if not (control.weights >= 0).all() or not np.allclose(control.weights.sum(axis=1), 1, atol=1e-6) \
+            or carriers > CARRIERS:
+        return f"expected weights of at least 0 that sum to 1, at most {CARRIERS} a vertex, found up to {carriers}"
+    if [len(axes) for axes in control.axes] != [len(limits) for limits in control.limits] or len(control.axes) != J:
+        return f"expected axes and limits of {J} joints"
+    if max(map(len, control.axes)) > 3 or not np.allclose(np.linalg.norm(np.concatenate(control.axes), axis=1), 1):
+        return "expected at most three axes of unit length at a joint"
+    if not (np.diff(np.concatenate(control.limits), axis=1) >= 0).all():
+        return "expected limits with the least angle first"
+    if not set(control.segment_of_part.tolist()) == set(range(len(control.segments))):
+        return f"expected every one of {len(control.segments)} segments to have parts"
+    bad = [name for name, vertex in control.landmarks.items() if not 0 <= vertex < N]
+    return f"landmark {bad[0]} is not on the mesh" if bad else None
+
+
+def surface_problem(mesh: Mesh) -> str | None:
+    """Why a mesh cannot be a control mesh, or None when it can."""
+    problem = template_problem(mesh)
+    if problem is None and not mesh.is_closed:
+        problem = f"it is open: {(mesh.edge_use == 1).sum()} edges have one triangle only, expected a closed surface"
+    return problem or (None if mesh.volume > 0 else "it is inside out")

@@ -1,0 +1,208 @@
+"""A cut surface laid flat in one piece: no triangle turned over, no overlap, areas and angles nearly kept."""
+from __future__ import annotations
+
+from fractions import Fraction
+
+import numpy as np
+from scipy.sparse import coo_array, csc_array, diags_array
+
+from scanprep.geometry.mesh import Mesh
+from scanprep.geometry.sparse import factor
+
+ROUNDS, ENOUGH = 300, 1e-5           # Newton steps at most; done when one lowers the energy by so little of it
+GAP = 0.012                          # of the chart's size: nearer than this, pieces of its border push each other off
+PUSH = 0.02                          # of the energy at rest, for how much that counts
+ROUNDING = 1e-15                     # of the two products of an area: below, its sign is worked out in fractions
+
+
+def flatten(mesh: Mesh) -> np.ndarray:
+    """Places in the plane (N, 2) of a surface with one border, scaled to its area, one-to-one.
+
+    Begins with an embedding of Tutte, the border on a circle, and lowers the symmetric Dirichlet energy
+    |J|² + |J⁻¹|², J the derivative of the map, by Newton's method with definite Hessians of the triangles. No step
+    turns a triangle over or lets the border cross itself, so every stage is one-to-one.
+    """
+    rest = _rest(mesh)
+    areas = mesh.face_areas / mesh.face_areas.sum()
+    border = mesh.boundary_loops[0]
+    uv = tutte(mesh, border)
+    uv *= np.sqrt(mesh.face_areas.sum() / abs(_signed_areas(uv, mesh.faces).sum()))
+    gap = GAP * np.sqrt(mesh.face_areas.sum())
+    energy = _energy(uv, mesh.faces, rest, areas, border, gap)
+    for _ in range(ROUNDS):
+        gradient, hessian = _derivatives(uv, mesh.faces, rest, areas, border, gap)
+        ridge = diags_array(np.full(2 * len(uv), 1e-9 * hessian.diagonal().mean()))
+        step = -factor((hessian + ridge).tocsc())(gradient).reshape(-1, 2)
+        slope, length = float(gradient @ step.ravel()), min(1.0, 0.9 * _until_flat(uv, step, mesh.faces))
+        before = energy
+        while length > 1e-12:
+            trial = uv + length * step
+            energy = _energy(trial, mesh.faces, rest, areas, border, gap)
+            if energy <= before + 1e-4 * length * slope and not crossings(trial[border]):
+                uv = trial
+                break
+            length /= 2
+        else:
+            return uv
+        if before - energy < ENOUGH * energy:
+            break
+    return uv
+
+
+def tutte(mesh: Mesh, border: np.ndarray) -> np.ndarray:
+    """The embedding (N, 2) with the border on a circle and every other vertex in the mean of its neighbours."""
+    sides = np.linalg.norm(mesh.vertices[border] - np.roll(mesh.vertices[border], -1, axis=0), axis=1)
+    angle = 2 * np.pi * np.r_[0, np.cumsum(sides)[:-1]] / sides.sum()
+    uv = np.zeros((len(mesh.vertices), 2))
+    uv[border] = np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    A = mesh.vertex_adjacency
+    inner = np.setdiff1d(np.arange(len(uv)), border)
+    L = (diags_array(A.sum(axis=1)) - A).tocsr()
+    solve = factor(L[inner][:, inner].tocsc())
+    uv[inner] = solve(-(L[inner][:, border] @ uv[border]))
+    return uv
+
+
+def crossings(loop: np.ndarray) -> bool:
+    """Whether a closed polygon (n, 2) meets itself other than where its sides follow each other, exactly."""
+    a, b = loop, np.roll(loop, -1, axis=0)
+    n = len(loop)
+    low, high = np.minimum(a, b), np.maximum(a, b)
+    near = (low[:, None] <= high[None]).all(axis=2) & (low[None] <= high[:, None]).all(axis=2)
+    i, j = np.nonzero(np.triu(near, 2))
+    apart = (j - i) % n != n - 1
+    i, j = i[apart], j[apart]
+
+    met = _across(a[i], b[i], a[j], b[j]) <= 0
+    i, j = i[met], j[met]
+    return bool((_across(a[j], b[j], a[i], b[i]) <= 0).any())
+
+
+def _across(a: np.ndarray, b: np.ndarray, c: np.ndarray, d: np.ndarray) -> np.ndarray:
+    """(n,) -1 where c and d lie on different sides of the line ab, 0 where one of them lies on it, else 1."""
+    return orientation(a, b, c) * orientation(a, b, d)
+
+
+def orientation(a: np.ndarray, b: np.ndarray, c: np.ndarray) -> np.ndarray:
+    """(n,) the exact sign of the area of triangles in the plane: 1 counter-clockwise, 0 without area, -1 clockwise."""
+    first = (b[:, 0] - a[:, 0]) * (c[:, 1] - a[:, 1])
+    second = (b[:, 1] - a[:, 1]) * (c[:, 0] - a[:, 0])
+    sign = np.sign(first - second).astype(int)
+    for k in np.flatnonzero(np.abs(first - second) <= ROUNDING * (np.abs(first) + np.abs(second))):
+        (ax, ay), (bx, by), (cx, cy) = (map(Fraction, map(float, p[k])) for p in (a, b, c))
+        area = (bx - ax) * (cy - ay) - (by - ay) * (cx - ax)
+        sign[k] = (area > 0) - (area < 0)
+    return sign
+
+
+def _rest(mesh: Mesh) -> np.ndarray:
+    """(F, 2, 2) inverse of the two sides of every triangle in its own plane, the sides as columns."""
+    c = mesh.corners
+    u, v = c[:, 1] - c[:, 0], c[:, 2] - c[:, 0]
+    x = np.linalg.norm(u, axis=1)
+    along = np.einsum("fd,fd->f", u, v) / x
+    flat = np.zeros((len(c), 2, 2))
+    flat[:, 0, 0], flat[:, 0, 1], flat[:, 1, 1] = x, along, 2 * mesh.face_areas / x
+    return np.linalg.inv(flat)
+
+
+def _signed_areas(uv: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    u, v = uv[faces[:, 1]] - uv[faces[:, 0]], uv[faces[:, 2]] - uv[faces[:, 0]]
+    return (u[:, 0] * v[:, 1] - u[:, 1] * v[:, 0]) / 2
+
+
+def _jacobians(uv: np.ndarray, faces: np.ndarray, rest: np.ndarray) -> np.ndarray:
+    """(F, 4) derivative of the map, row by row."""
+    sides = np.stack([uv[faces[:, 1]] - uv[faces[:, 0]], uv[faces[:, 2]] - uv[faces[:, 0]]], axis=2)
+    return (sides @ rest).reshape(-1, 4)
+
+
+def _energy(uv: np.ndarray, faces: np.ndarray, rest: np.ndarray, areas: np.ndarray, border: np.ndarray, gap: float
+            ) -> float:
+    x = _jacobians(uv, faces, rest)
+    d = x[:, 0] * x[:, 3] - x[:, 1] * x[:, 2]
+    if not (d > 0).all():
+        return np.inf
+    squared = (x * x).sum(axis=1)
+    return float(areas @ (squared + squared / d**2)) + _pushing(uv, border, gap)[0]
+
+
+def _derivatives(uv: np.ndarray, faces: np.ndarray, rest: np.ndarray, areas: np.ndarray, border: np.ndarray, gap: float
+                 ) -> tuple[np.ndarray, csc_array]:
+    """Gradient (2N,) and a definite Hessian (2N, 2N) of the energy."""
+    x = _jacobians(uv, faces, rest)
+    d = x[:, 0] * x[:, 3] - x[:, 1] * x[:, 2]
+    squared = (x * x).sum(axis=1)
+    cofactor = x[:, [3, 2, 1, 0]] * [1, -1, -1, 1]
+    swap = np.zeros((4, 4))
+    swap[[0, 1, 2, 3], [3, 2, 1, 0]] = [1, -1, -1, 1]
+    first = 2 * (1 + 1 / d**2)[:, None] * x - (2 * squared / d**3)[:, None] * cofactor
+    outer = x[:, :, None] * cofactor[:, None]
+    second = (2 * (1 + 1 / d**2)[:, None, None] * np.eye(4) - 4 / d[:, None, None]**3 * (outer + outer.swapaxes(1, 2))
+              + (6 * squared / d**4)[:, None, None] * cofactor[:, :, None] * cofactor[:, None]
+              - (2 * squared / d**3)[:, None, None] * swap)
+    values, vectors = np.linalg.eigh(second)
+    second = (vectors * np.maximum(values, 1e-9)[:, None]) @ vectors.swapaxes(1, 2)
+    # x = B q with q the six coordinates of a triangle's corners
+    B = np.zeros((len(faces), 4, 6))
+    for k in range(2):
+        for axis in range(2):
+            B[:, 2 * axis + k, 2 + axis], B[:, 2 * axis + k, 4 + axis] = rest[:, 0, k], rest[:, 1, k]
+            B[:, 2 * axis + k, axis] = -rest[:, 0, k] - rest[:, 1, k]
+    places = (2 * faces[:, :, None] + np.arange(2)).reshape(-1, 6)
+    size = 2 * len(uv)
+    gradient = np.bincount(places.ravel(), (areas[:, None] * np.einsum("fab,fa->fb", B, first)).ravel(), size)
+    blocks = areas[:, None, None] * (B.swapaxes(1, 2) @ second @ B)
+    rows, columns = np.repeat(places, 6, axis=1).ravel(), np.tile(places, (1, 6)).ravel()
+    _, pushed, (r, c, values) = _pushing(uv, border, gap)
+    hessian = coo_array((np.r_[blocks.ravel(), values], (np.r_[rows, r], np.r_[columns, c])), shape=(size, size))
+    return gradient + pushed, csc_array(hessian)
+
+
+def _pushing(uv: np.ndarray, border: np.ndarray, gap: float
+             ) -> tuple[float, np.ndarray, tuple[np.ndarray, np.ndarray, np.ndarray]]:
+    """Energy, gradient (2N,) and Hessian (rows, columns, values) of (gap/distance - 1)² of border points and sides."""
+    p, n = uv[border], len(border)
+    following = np.roll(np.arange(n), -1)
+    a, side = p, p[following] - p
+    w = p[:, None] - a[None]
+    t = np.clip(np.einsum("ijd,jd->ij", w, side) / np.maximum((side**2).sum(axis=1), 1e-300), 0, 1)
+    away = w - t[:, :, None] * side
+    squared = (away**2).sum(axis=2)
+    index = np.arange(n)
+    squared[index, index] = squared[following, index] = np.inf
+    i, j = np.nonzero(squared < gap**2)
+    size = 2 * len(uv)
+    if not len(i):
+        none = np.zeros(0, dtype=np.int64)
+        return 0.0, np.zeros(size), (none, none, np.zeros(0))
+    far, t = np.sqrt(squared[i, j]), t[i, j]
+    unit = away[i, j] / far[:, None]
+    share = np.stack([np.ones_like(t), t - 1, -t], axis=1)            # of the point and the side's two ends
+    first = -2 * (gap / far - 1) * gap / far**2
+    second = np.maximum(6 * gap**2 / far**4 - 4 * gap / far**3, 0)
+    q = (share[:, :, None] * unit[:, None]).reshape(-1, 6)
+    corners = np.stack([border[i], border[j], border[following[j]]], axis=1)
+    places = (2 * corners[:, :, None] + np.arange(2)).reshape(-1, 6)
+    scale = PUSH / n
+    gradient = np.bincount(places.ravel(), (scale * first[:, None] * q).ravel(), size)
+    blocks = scale * second[:, None, None] * q[:, :, None] * q[:, None]
+    return (scale * float(((gap / far - 1)**2).sum()), gradient,
+            (np.repeat(places, 6, axis=1).ravel(), np.tile(places, (1, 6)).ravel(), blocks.ravel()))
+
+
+def _until_flat(uv: np.ndarray, step: np.ndarray, faces: np.ndarray) -> float:
+    """How many steps until the first triangle has no area."""
+    u, v = uv[faces[:, 1]] - uv[faces[:, 0]], uv[faces[:, 2]] - uv[faces[:, 0]]
+    s, r = step[faces[:, 1]] - step[faces[:, 0]], step[faces[:, 2]] - step[faces[:, 0]]
+
+    def cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+        return a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]
+
+    a, b, c = cross(s, r), cross(u, r) + cross(s, v), cross(u, v)
+    with np.errstate(all="ignore"):
+        root = np.sqrt(b * b - 4 * a * c)
+        low = -0.5 * (b + np.where(b < 0, -root, root))
+        times = np.stack([low / a, c / low])
+    times = times[np.isfinite(times) & (times > 0)]
+    return float(times.min()) if len(times) else np.inf
