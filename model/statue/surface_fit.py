@@ -5,7 +5,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Annotated, Literal
 
 import numpy as np
@@ -47,6 +47,9 @@ class SurfaceFitConfig(Settings):
         Root of the final temperature.
     most : int
         Steps at one temperature at most.
+    cover : float
+        Weight of the other direction, in which points of the scan draw the nearest point of the control mesh, so that
+        it covers tips of limbs; all of them together weigh as much as this many times all vertices. The paper has none.
     polish : int
         Rounds at the end in which vertices are drawn to the surface between the points of the scan; 0 leaves them out.
     tight : float
@@ -64,9 +67,10 @@ class SurfaceFitConfig(Settings):
     rate: Annotated[float, Range(1e-6, 1)] = 0.5
     tolerance: Positive = 0.001
     most: Count = 100
+    cover: float = 1.0
     polish: int = 6
     tight: Positive = 100.0
-    slide: float = 0.0
+    slide: float = 0.05
 
 
 @dataclass(frozen=True, eq=False)
@@ -136,7 +140,7 @@ def fit_surface(rest: Mesh, start: np.ndarray, scan: Mesh, config: SurfaceFitCon
                          f"{int((~np.isfinite(start)).sum())} that are not")
     if not len(scan.faces):
         raise ValueError(f"scan: expected at least one triangle, got {scan}")
-    fit = _Fit(rest, start, target_of(scan, name="scan"), config)
+    fit = _Fit(rest, start, _target(scan), config)
     temperatures = fit.schedule()
     total = len(temperatures) + config.polish
     for k, T in enumerate(temperatures):
@@ -223,27 +227,41 @@ class _Fit:
         data = seen[:, None] * (wanted - self.x)
         if self.config.step == "explicit":
             return data + self.config.shape * self.shape.published_force(self.x)
-        return data - 0.5 * self.config.shape * self.shape.gradient(self.x)
+        C, y = self.covering()
+        cover = self.config.cover * len(self.x) / max(len(y), 1) * (C.T @ (y - C @ self.x))
+        return data + cover - 0.5 * self.config.shape * self.shape.gradient(self.x)
 
-    def minimised(self, A: np.ndarray, wanted: np.ndarray, rounds: int = 1) -> np.ndarray:
-        """Vertices after Gauss-Newton steps on the local shape and Σ (x - y)ᵀ A (x - y), A (N, 3, 3)."""
+    def covering(self) -> tuple[csc_array, np.ndarray]:
+        """Points of the scan (P, 3) and where the control mesh is nearest to them, as sparse (P, N) of its vertices."""
+        mesh, points = self.mesh, self.points
+        found = Surface(mesh).closest(points.points)
+        corners = mesh.faces[found.faces]
+        normals = np.einsum("pc,pcd->pd", found.bary, mesh.vertex_normals[corners])
+        good = np.flatnonzero(np.einsum("pd,pd->p", normals, points.normals) > 0.3)
+        rows = np.repeat(np.arange(len(good)), 3)
+        C = csc_array((found.bary[good].ravel(), (rows, corners[good].ravel())), shape=(len(good), len(self.x)))
+        return C, points.points[good]
+
+    def minimised(self, A: np.ndarray, wanted: np.ndarray) -> np.ndarray:
+        """Vertices after a Gauss-Newton step on the local shape, Σ (x - y)ᵀ A (x - y), A (N, 3, 3), and the cover."""
         shape, w, lam, x = self.shape, self.shape.weights[:, None], self.config.shape, self.x
-        nearly = Factored(csc_array(lam * self.stiffness + diags_array(np.linalg.eigvalsh(A)[:, 2] + 1e-6 * lam)))
+        C, y = self.covering()
+        share = self.config.cover * len(x) / max(len(y), 1)
+        CC = share * (C.T @ C)
+        nearly = Factored(csc_array(lam * self.stiffness + CC + diags_array(np.linalg.eigvalsh(A)[:, 2] + 1e-6 * lam)))
 
         def energy(x: np.ndarray) -> float:
-            return lam * shape.energy(x) + float(np.einsum("ni,nij,nj->", x - wanted, A, x - wanted))
+            return (lam * shape.energy(x) + float(np.einsum("ni,nij,nj->", x - wanted, A, x - wanted))
+                    + share * float(((C @ x - y) ** 2).sum()))
 
-        for _ in range(rounds):
-            at = x
-            force = np.einsum("nij,nj->ni", A, wanted - x) - 0.5 * lam * shape.gradient(x)
-            d = conjugate_gradients(
-                lambda d: lam * shape.transposed(at, w * shape.derivative(at, d)) + np.einsum("nij,nj->ni", A, d),
-                force, nearly.solve, 30, 1e-2)
-            before, length = energy(x), 1.0
-            while energy(x + length * d) > before and length > 1e-3:
-                length /= 2
-            x = x + length * d
-        return x
+        force = np.einsum("nij,nj->ni", A, wanted - x) - 0.5 * lam * shape.gradient(x) + share * (C.T @ (y - C @ x))
+        d = conjugate_gradients(
+            lambda d: lam * shape.transposed(x, w * shape.derivative(x, d)) + np.einsum("nij,nj->ni", A, d) + CC @ d,
+            force, nearly.solve, 30, 1e-2)
+        before, length = energy(x), 1.0
+        while energy(x + length * d) > before and length > 1e-3:
+            length /= 2
+        return x + length * d
 
     def polish(self, surface: Surface) -> None:
         """One round in which the vertices are drawn to the tangent planes of the surface itself."""
@@ -283,6 +301,13 @@ class _Fit:
         elif abs(cell - self.cell) > 0.1 * self.cell or self.points is self.everything:
             thinned = self.target.thinned(cell)
             self.points, self.cell = ScanPoints(thinned.points, thinned.normals), cell
+
+
+def _target(scan: Mesh) -> Target:
+    """Points with smooth normals; the borders are those of the mesh, for tips of limbs look one-sided as well."""
+    border = np.zeros(len(scan.vertices), dtype=bool)
+    border[scan.boundary_vertices] = True
+    return replace(target_of(scan, name="scan"), border=border[np.unique(scan.faces)])
 
 
 def distortion(rest: Mesh, x: np.ndarray) -> float:
