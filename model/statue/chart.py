@@ -6,12 +6,14 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
-from scipy.sparse import coo_array
-from scipy.sparse.csgraph import connected_components
 
 from scanprep.geometry.mesh import Mesh
+from scanprep.skeleton.tree import Skeleton
+
+from .seams import cut, extended, find_seams
 
 MARGIN = 6 / 1024                    # of the image, left free around the chart
+FINE = 1 / 3                         # of the mean density, in length: coarser triangles ask for one more seam
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,36 +99,47 @@ def make_chart(mesh: Mesh, seams: Sequence[np.ndarray]) -> Chart:
     return chart
 
 
-def cut(mesh: Mesh, seams: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-    """Triangles (F, 3) of the mesh opened along seams, and the vertex (M,) that each of the new ones was.
+def automatic_chart(mesh: Mesh, skeleton: Skeleton, rounds: int = 4) -> Chart:
+    """A chart along the seams of `find_seams`, which go on to where it is crowded, such as the tips of fingers.
 
-    Raises
-    ------
-    ValueError
-        A seam that leaves the edges.
+    Parameters
+    ----------
+    rounds : int
+        Charts at most; done when no triangle is drawn smaller than `FINE` of the mean, in length.
     """
-    number = {edge: k for k, edge in enumerate(map(tuple, mesh.edges.tolist()))}
-    open_edge = np.zeros(len(mesh.edges), dtype=bool)
-    for seam in seams:
-        for a, b in zip(seam[:-1].tolist(), seam[1:].tolist(), strict=True):
-            if (min(a, b), max(a, b)) not in number:
-                raise ValueError(f"seams: vertices {a} and {b} follow each other but no edge joins them")
-            open_edge[number[min(a, b), max(a, b)]] = True
-    order = np.argsort(mesh.face_edges.ravel(), kind="stable").reshape(-1, 2)    # the two sides at every edge
-    p, q = order[~open_edge].T
-    end = [k - k % 3 + (k + 1) % 3 for k in (p, q)]
-    rows, columns = np.r_[p, end[0]], np.r_[end[1], q]                 # sides run in opposite directions
-    n = mesh.faces.size
-    _, label = connected_components(coo_array((np.ones(len(rows)), (rows, columns)), shape=(n, n)), directed=False)
-    _, first, fan = np.unique(label, return_index=True, return_inverse=True)
-    return fan.reshape(-1, 3), mesh.faces.ravel()[first]
+    seams = find_seams(mesh, skeleton)
+    chart = make_chart(mesh, seams)
+    for _ in range(rounds - 1):
+        crowded = crowded_places(mesh, densities(mesh, chart))
+        longer = seams
+        for vertex in crowded:
+            longer = extended(mesh, longer, vertex)
+        if len(longer) == len(seams):
+            break
+        seams, chart = longer, make_chart(mesh, longer)
+    return chart
+
+
+def crowded_places(mesh: Mesh, density: np.ndarray) -> list[int]:
+    """A vertex of the smallest triangle of every region that is drawn smaller than `FINE`."""
+    crowded = np.flatnonzero(density < FINE)
+    part, old = mesh.submesh(crowded)
+    region = part.vertex_component[part.faces[:, 0]]
+    return [int(old[part.faces[np.flatnonzero(region == k)[density[crowded][region == k].argmin()], 0]])
+            for k in np.unique(region)]
+
+
+def densities(mesh: Mesh, chart: Chart) -> np.ndarray:
+    """(F,) how large each triangle is drawn against the mean of the surface, in length."""
+    drawn = _twice_area(*chart.uv[chart.faces].swapaxes(0, 1)) / 2
+    return np.sqrt(drawn / mesh.face_areas * mesh.face_areas.sum() / drawn.sum())
 
 
 def fill_square(uv: np.ndarray, mesh: Mesh) -> np.ndarray:
     """Turned and scaled so that the smallest square around it is the unit square without its margin."""
     angles = np.radians(np.arange(0, 90, 0.5))
-    turned = np.stack([np.stack([np.cos(angles), -np.sin(angles)], 1), np.stack([np.sin(angles), np.cos(angles)], 1)], 1)
-    places = np.einsum("aij,nj->ani", turned, uv)
+    cos, sin = np.cos(angles), np.sin(angles)
+    places = np.einsum("ija,nj->ani", np.array([[cos, -sin], [sin, cos]]), uv)
     extent = np.ptp(places, axis=1).max(axis=1)
     best = places[extent.argmin()]
     middle = (best.min(axis=0) + best.max(axis=0)) / 2
@@ -139,7 +152,7 @@ def chart_problem(mesh: Mesh, chart: Chart) -> str | None:
     A chart is one disk inside the unit square, no triangle turned over, whose border does not meet itself: then it
     is one-to-one.
     """
-    from .flatten import crossings
+    from .flatten import crossings, orientation
 
     if chart.faces.shape != mesh.faces.shape:
         return f"it has {len(chart.faces)} triangles, the mesh {len(mesh.faces)}"
@@ -152,7 +165,7 @@ def chart_problem(mesh: Mesh, chart: Chart) -> str | None:
     if not flat.is_edge_manifold or len(flat.boundary_loops) != 1:
         return f"expected one border, it has {len(flat.boundary_loops)}"
     corners = chart.uv[chart.faces]
-    turned = np.flatnonzero(_twice_area(*corners.swapaxes(0, 1)) <= 0)
+    turned = np.flatnonzero(orientation(*corners.swapaxes(0, 1)) <= 0)
     if len(turned):
         return f"{len(turned)} triangles are turned over, the first is face {turned[0]}"
     if crossings(chart.uv[flat.boundary_loops[0]]):

@@ -15,6 +15,29 @@ from .control import ControlModel, control_problem
 KIND, VERSION = "control model", 1
 
 
+def read_control(path: str | Path) -> ControlModel:
+    """A control model: a file of `ControlModel.save`, or a skinned mesh in a GLB file as Blender exports it.
+
+    Of a skinned mesh the pose of the file is the default pose, turned so that z is up; vertices that stand at one place
+    are one; joints turn about three axes with wide limits, every part is a segment of its own, and there are no
+    landmarks. Joints that carry no triangle are left out. Without texture coordinates a chart is made.
+
+    Raises
+    ------
+    StorageError
+        Missing, neither of the two, damaged; a mesh that is open, not manifold or in several pieces, without weights,
+        or with texture coordinates that are not one chart.
+    """
+    path = Path(path)
+    if path.suffix.lower() == ".npz":
+        return load(path)
+    if path.suffix.lower() == ".glb":
+        from .control_glb import read_skinned
+
+        return read_skinned(path)
+    raise storage.StorageError(f"{path}: expected a control model in .npz or a skinned mesh in .glb")
+
+
 def save(control: ControlModel, path: str | Path) -> None:
     """`ControlModel.save`."""
     skeleton = control.skeleton

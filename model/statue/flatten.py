@@ -1,5 +1,7 @@
-"""A cut surface laid flat in one piece: no triangle turned over, no overlap, areas and angles as even as they can be."""
+"""A cut surface laid flat in one piece: no triangle turned over, no overlap, areas and angles nearly kept."""
 from __future__ import annotations
+
+from fractions import Fraction
 
 import numpy as np
 from scipy.sparse import coo_array, csc_array, diags_array
@@ -9,7 +11,8 @@ from scanprep.geometry.sparse import factor
 
 ROUNDS, ENOUGH = 300, 1e-5           # Newton steps at most; done when one lowers the energy by so little of it
 GAP = 0.012                          # of the chart's size: nearer than this, pieces of its border push each other off
-PUSH = 0.02
+PUSH = 0.02                          # of the energy at rest, for how much that counts
+ROUNDING = 1e-15                     # of the two products of an area: below, its sign is worked out in fractions
 
 
 def flatten(mesh: Mesh) -> np.ndarray:
@@ -61,7 +64,7 @@ def tutte(mesh: Mesh, border: np.ndarray) -> np.ndarray:
 
 
 def crossings(loop: np.ndarray) -> bool:
-    """Whether a closed polygon (n, 2) meets itself other than where its sides follow each other."""
+    """Whether a closed polygon (n, 2) meets itself other than where its sides follow each other, exactly."""
     a, b = loop, np.roll(loop, -1, axis=0)
     n = len(loop)
     low, high = np.minimum(a, b), np.maximum(a, b)
@@ -70,11 +73,26 @@ def crossings(loop: np.ndarray) -> bool:
     apart = (j - i) % n != n - 1
     i, j = i[apart], j[apart]
 
-    def side(p: np.ndarray, q: np.ndarray, r: np.ndarray) -> np.ndarray:
-        return (q[:, 0] - p[:, 0]) * (r[:, 1] - p[:, 1]) - (q[:, 1] - p[:, 1]) * (r[:, 0] - p[:, 0])
+    met = _across(a[i], b[i], a[j], b[j]) <= 0
+    i, j = i[met], j[met]
+    return bool((_across(a[j], b[j], a[i], b[i]) <= 0).any())
 
-    return bool(((side(a[i], b[i], a[j]) * side(a[i], b[i], b[j]) <= 0)
-                 & (side(a[j], b[j], a[i]) * side(a[j], b[j], b[i]) <= 0)).any())
+
+def _across(a: np.ndarray, b: np.ndarray, c: np.ndarray, d: np.ndarray) -> np.ndarray:
+    """(n,) -1 where c and d lie on different sides of the line ab, 0 where one of them lies on it, else 1."""
+    return orientation(a, b, c) * orientation(a, b, d)
+
+
+def orientation(a: np.ndarray, b: np.ndarray, c: np.ndarray) -> np.ndarray:
+    """(n,) the exact sign of the area of triangles in the plane: 1 counter-clockwise, 0 without area, -1 clockwise."""
+    first = (b[:, 0] - a[:, 0]) * (c[:, 1] - a[:, 1])
+    second = (b[:, 1] - a[:, 1]) * (c[:, 0] - a[:, 0])
+    sign = np.sign(first - second).astype(int)
+    for k in np.flatnonzero(np.abs(first - second) <= ROUNDING * (np.abs(first) + np.abs(second))):
+        (ax, ay), (bx, by), (cx, cy) = (map(Fraction, map(float, p[k])) for p in (a, b, c))
+        area = (bx - ax) * (cy - ay) - (by - ay) * (cx - ax)
+        sign[k] = (area > 0) - (area < 0)
+    return sign
 
 
 def _rest(mesh: Mesh) -> np.ndarray:

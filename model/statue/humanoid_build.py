@@ -4,7 +4,8 @@ from __future__ import annotations
 from collections.abc import Callable
 
 import numpy as np
-from scipy.sparse import coo_array
+from scipy.optimize import linear_sum_assignment
+from scipy.sparse import coo_array, csr_array, diags_array
 from scipy.sparse.csgraph import dijkstra
 from scipy.spatial import cKDTree
 
@@ -12,7 +13,8 @@ from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.surface import Surface
 from scanprep.scanning import people_head, people_parts
 from scanprep.scanning.people_anatomy import Anatomy
-from scanprep.scanning.people_field import Field, Group, Loft, Mirrored, RoundCone
+from scanprep.scanning.people_field import Field, Group, Loft, Mirrored, RoundCone, project
+from scanprep.scanning.people_marks import landmarks, markers
 from scanprep.scanning.people_parts import cross_sections
 from scanprep.scanning.people_remesh import mirror, polygonise, remesh
 from scanprep.scanning.people_template import CANONICAL, blending, load
@@ -31,6 +33,7 @@ def build_mesh(anatomy: Anatomy, step: float = 0.006) -> Mesh:
     half = polygonise(field, np.array([0.0, -0.30, -0.02]), high, step)
     half = half.submesh(half.vertex_component[half.faces[:, 0]] == 0)[0]
     mesh, _ = mirror(remesh(half, field, sizing(anatomy), 30))
+    mesh = with_marks(mesh, field)
     order = np.lexsort((np.round(mesh.vertices[:, 0], 4), np.round(mesh.vertices[:, 2], 3)))
     place = np.argsort(order)
     return Mesh(mesh.vertices[order], place[mesh.faces])
@@ -43,7 +46,8 @@ def coarse_body(a: Anatomy) -> Field:
     leg, head = people_parts.leg(a), people_head.head(a)
     assert isinstance(leg, Group) and isinstance(head, Group)
     leg = Group([leg.members[0], (shoe(a), leg.members[1][1])], leg.bumps, leg.bounds)
-    head = Group(head.members[:4], bounds=head.bounds)                # skull and face, eyes, nose
+    nose = RoundCone(a.eye + a.front(0, 0.084, 0.012), a.eye + a.front(0, 0.101, -0.036), 0.008, 0.0125)
+    head = Group([*head.members[:2], (nose, 0.008)], bounds=head.bounds)              # skull and face, eyes
     left = Group([(Group([*torso, (leg, 0.035 * g)]), 0), *shoulders, (people_parts.arm(a), 0.048 * g)],
                  people_parts.trunk_bumps(a))
     return Mirrored(Group([(left, 0), (head, 0.012), (mitten(a), 0.012)]))
@@ -70,7 +74,7 @@ def shoe(a: Anatomy) -> Field:
     from scanprep.scanning.people_tables import FOOT as TABLE
 
     length, frame, ankle = a.width["foot"], a.foot_frame, a.joints[12]
-    toes = np.array([[0.66, -0.014, 0.160, -0.050, 0.135], [0.73, -0.050, 0.095, -0.072, 0.130]])
+    toes = np.array([[0.66, -0.020, 0.150, -0.045, 0.138], [0.72, -0.045, 0.110, -0.055, 0.136]])
     t, shift, half, top, bottom = (np.vstack([TABLE, toes]) * length).T
     origin = np.array([ankle[0], ankle[1], 0.140 * length])
     keys = cross_sections(t, half, half, (top + bottom) / 2, (top + bottom) / 2, 2.8, shift, (top - bottom) / 2)
@@ -86,6 +90,8 @@ def sizing(a: Anatomy) -> Callable[[np.ndarray], np.ndarray]:
              (RoundCone(j[4], j[5], 0.02, 0.08), LIMB), (RoundCone(j[5], j[6], 0.08, 0.05), 0.8 * LIMB),
              (RoundCone(j[10] - [0, 0, 0.1], j[11], 0.12, 0.10), 1.1 * BODY),
              (RoundCone(j[11], j[12], 0.10, 0.08), LIMB),
+             (RoundCone(e[12] - [0, 0, 0.05], a.front(0.13, 0.15, 0.03), 0.04, 0.04), 0.85 * FOOT),
+             (RoundCone(a.front(0, 0, a.at(-0.22)), a.front(0, 0, a.at(-0.20)), 0.05, 0.05), 0.7 * BODY),
              (RoundCone(face, face + 1e-3, 0.045, 0.045), FACE), (RoundCone(j[3], e[3], 0.08, 0.12), HEAD)]
 
     def size(points: np.ndarray) -> np.ndarray:
@@ -127,6 +133,34 @@ def part_weights(mesh: Mesh, a: Anatomy) -> np.ndarray:
     return strongest(weights)
 
 
+def with_marks(mesh: Mesh, field: Field, rounds: int = 12) -> Mesh:
+    """The mesh slid over the surface until a vertex lies at every landmark and marker of the people."""
+    people, twin = load(), mirrored_vertices(mesh)
+    marks = [v if people.mesh.vertices[v, 0] > -1e-4 else people.mirror[v] for v in (*landmarks().values(),
+                                                                                     *markers().values())]
+    goals = project(field, people.mesh.vertices[np.unique(marks)], 6)
+    goals[np.abs(goals[:, 0]) < 0.004, 0] = 0
+    far = np.linalg.norm(mesh.vertices[:, None] - goals, axis=2)
+    far[(mesh.vertices[:, 0] > 0)[:, None] != (goals[:, 0] > 0)] = np.inf
+    pinned, at = linear_sum_assignment(np.minimum(far, 1.0)**2)
+    free = np.setdiff1d(np.arange(len(twin)), np.r_[pinned, twin[pinned]])
+    x, A = mesh.vertices, mesh.vertex_adjacency
+    mean = csr_array(diags_array(1 / A.sum(axis=1)) @ A)
+    wanted = x - mean @ x
+    for done in range(1, rounds + 1):
+        x = x.copy()
+        x[pinned] += (goals[at] - x[pinned]) * done / rounds
+        x[twin[pinned]] = x[pinned] * [-1, 1, 1]
+        normal = mesh.with_vertices(x).vertex_normals
+        for _ in range(8):
+            step = mean @ x + 0.7 * wanted - x
+            step -= np.einsum("nd,nd->n", step, normal)[:, None] * normal
+            x[free] += 0.5 * step[free]
+        x[free] = project(field, x[free], 2)
+        x = 0.5 * (x + x[twin] * [-1, 1, 1])
+    return mesh.with_vertices(x)
+
+
 def nearest_marks(mesh: Mesh, marks: dict[str, int]) -> dict[str, int]:
     """The vertices nearest to marked vertices of the people; left and right are mirror images."""
     twin, people = mirrored_vertices(mesh), load()
@@ -155,7 +189,7 @@ def _smoothstep(x: np.ndarray) -> np.ndarray:
 def hidden_seams(mesh: Mesh, a: Anatomy) -> list[np.ndarray]:
     """Seams out of sight: crown to crotch behind, under the arms and round the hand to the thumb, inside of the legs to
     the heel and round the sole; the right side mirrors the left."""
-    g, j, e = a.scale, a.joints, a.ends
+    g, j = a.scale, a.joints
     fu, ff, fl, ft = a.upper_arm_frame, a.forearm_frame, a.leg_frame, a.foot_frame
     L, foot = a.width["hand"] / 0.19, a.width["foot"]
 

@@ -13,7 +13,7 @@ from .. import storage
 from .common import Contents, MeshFileError, as_colors, quote
 
 _COMPONENTS = {5120: "i1", 5121: "u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
-_WIDTHS = {"SCALAR": 1, "VEC3": 3, "VEC4": 4}
+_WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT4": 16}
 _TRIANGLES, _STRIP, _FAN = 4, 5, 6
 _VALUES, _REPEATS = 10**6, 4         # vertices and corners of a scene, and so many more for each byte
 
@@ -23,7 +23,7 @@ def read(path: Path, data: bytes) -> Contents:
 
     A mesh that hangs on joints is taken as it is stored, in its bind pose.
     """
-    tree, binary = _chunks(path, data)
+    tree, binary = chunks_of(path, data)
     with storage.taking_apart(path, "a whole GLB file", MeshFileError), np.errstate(all="ignore"):
         return _scene(path, tree, binary)
 
@@ -36,23 +36,23 @@ def _scene(path: Path, tree: dict[str, Any], binary: bytes) -> Contents:
     faces: list[np.ndarray] = []
     colors: list[np.ndarray | None] = []
     start, most = 0, _VALUES + _REPEATS * len(binary)    # many nodes may show one mesh, but not without end
-    for node, matrix in _nodes(tree):
+    for _, node, matrix in nodes_of(tree):
         if "mesh" not in node:
             continue
         matrix = np.eye(4) if "skin" in node else matrix
         placed: dict[int, int] = {}                      # primitives may share their vertices
-        for primitive in _item(tree["meshes"], node["mesh"])["primitives"]:
+        for primitive in item(tree["meshes"], node["mesh"])["primitives"]:
             if primitive.get("mode", _TRIANGLES) not in (_TRIANGLES, _STRIP, _FAN):
                 continue
             points = primitive["attributes"]["POSITION"]
             if points not in placed:
-                local = _accessor(tree, binary, points, "VEC3").astype(np.float64)
+                local = accessor(tree, binary, points, "VEC3").astype(np.float64)
                 placed[points] = start
                 vertices.append(local @ matrix[:3, :3].T + matrix[:3, 3])      # what is not finite is refused later
                 colors.append(_colors(tree, binary, primitive, len(local)))
                 start += len(local)
             count = tree["accessors"][points]["count"]
-            corners = _triangles(tree, binary, primitive, count)
+            corners = triangles_of(tree, binary, primitive, count)
             if np.linalg.det(matrix[:3, :3]) < 0:
                 corners = corners[:, ::-1]
             faces.append(_in_range(path, corners, count) + placed[points])
@@ -66,14 +66,15 @@ def _scene(path: Path, tree: dict[str, Any], binary: bytes) -> Contents:
                     np.concatenate(shades) if len(shades) == len(colors) else None)
 
 
-def _item(values: list[Any], number: Any) -> Any:
+def item(values: list[Any], number: Any) -> Any:
     """The entry of this number, which JSON may have as anything."""
     if isinstance(number, bool) or not isinstance(number, int) or not 0 <= number < len(values):
         raise ValueError(f"it refers to number {number!r} of {len(values)}")
     return values[number]
 
 
-def _chunks(path: Path, data: bytes) -> tuple[dict[str, Any], bytes]:
+def chunks_of(path: Path, data: bytes) -> tuple[dict[str, Any], bytes]:
+    """The tree of JSON and the binary buffer of a GLB file."""
     if data[:4] != b"glTF" or len(data) < 20:
         raise MeshFileError(f"{path}: expected a GLB file that begins with 'glTF', found {quote(data[:20])}")
     version, length = struct.unpack_from("<II", data, 4)
@@ -93,11 +94,14 @@ def _chunks(path: Path, data: bytes) -> tuple[dict[str, Any], bytes]:
     return tree, chunks.get(b"BIN\0", b"")
 
 
-def _nodes(tree: dict[str, Any]) -> Iterator[tuple[dict[str, Any], np.ndarray]]:
-    """Every node of the scene with its matrix (4, 4) to the scene; all root nodes where there is no scene."""
+def nodes_of(tree: dict[str, Any]) -> Iterator[tuple[int, dict[str, Any], np.ndarray]]:
+    """Every node of the scene, its number and its matrix (4, 4) to the scene; all root nodes where there is no scene.
+
+    A node comes before those below it.
+    """
     nodes = tree.get("nodes", [])
     if tree.get("scenes"):
-        roots = _item(tree["scenes"], tree.get("scene", 0)).get("nodes", [])
+        roots = item(tree["scenes"], tree.get("scene", 0)).get("nodes", [])
     else:
         inner = {child for node in nodes for child in node.get("children", [])}
         roots = [i for i in range(len(nodes)) if i not in inner]
@@ -105,12 +109,12 @@ def _nodes(tree: dict[str, Any]) -> Iterator[tuple[dict[str, Any], np.ndarray]]:
     seen: set[int] = set()
     while open_nodes:
         i, above = open_nodes.pop()
-        node = _item(nodes, i)
+        node = item(nodes, i)
         if i in seen:
             raise ValueError(f"node {i} hangs below two nodes")
         seen.add(i)
         matrix = above @ _matrix(node)
-        yield node, matrix
+        yield i, node, matrix
         open_nodes += [(child, matrix) for child in reversed(node.get("children", []))]
 
 
@@ -127,26 +131,27 @@ def _matrix(node: dict[str, Any]) -> np.ndarray:
     return out
 
 
-def _accessor(tree: dict[str, Any], binary: bytes, number: int, *types: str) -> np.ndarray:
+def accessor(tree: dict[str, Any], binary: bytes, number: int, *types: str) -> np.ndarray:
     """(count, width) the values of an accessor of one of these types."""
-    accessor = _item(tree["accessors"], number)
-    kind, count = np.dtype(_COMPONENTS[accessor["componentType"]]), accessor["count"]
-    if accessor["type"] not in types:
-        raise ValueError(f"accessor {number} is of type {accessor['type']!r}, expected {' or '.join(types)}")
-    if "sparse" in accessor:
+    entry = item(tree["accessors"], number)
+    kind, count = np.dtype(_COMPONENTS[entry["componentType"]]), entry["count"]
+    if entry["type"] not in types:
+        raise ValueError(f"accessor {number} is of type {entry['type']!r}, expected {' or '.join(types)}")
+    if "sparse" in entry:
         raise ValueError("sparse accessors are not read here")
-    view, size = _item(tree["bufferViews"], accessor["bufferView"]), kind.itemsize * _WIDTHS[accessor["type"]]
-    start = view.get("byteOffset", 0) + accessor.get("byteOffset", 0)
+    view, size = item(tree["bufferViews"], entry["bufferView"]), kind.itemsize * _WIDTHS[entry["type"]]
+    start = view.get("byteOffset", 0) + entry.get("byteOffset", 0)
     stride = view.get("byteStride", size)
     if start < 0 or count < 0 or stride < size:
         raise ValueError(f"accessor {number}: {count} elements of {size} bytes from byte {start}, one every {stride}")
     if count and start + stride * (count - 1) + size > len(binary):
         raise ValueError(f"truncated: accessor {number} needs {start + stride * count} bytes, found {len(binary)}")
-    return np.ndarray((count, _WIDTHS[accessor["type"]]), kind, binary, start, (stride, kind.itemsize)).copy()
+    return np.ndarray((count, _WIDTHS[entry["type"]]), kind, binary, start, (stride, kind.itemsize)).copy()
 
 
-def _triangles(tree: dict[str, Any], binary: bytes, primitive: dict[str, Any], count: int) -> np.ndarray:
-    line = (_accessor(tree, binary, primitive["indices"], "SCALAR")[:, 0].astype(np.int64) if "indices" in primitive
+def triangles_of(tree: dict[str, Any], binary: bytes, primitive: dict[str, Any], count: int) -> np.ndarray:
+    """(F, 3) the corners of the triangles, strips or fans of a primitive of `count` vertices."""
+    line = (accessor(tree, binary, primitive["indices"], "SCALAR")[:, 0].astype(np.int64) if "indices" in primitive
             else np.arange(count))
     mode = primitive.get("mode", _TRIANGLES)
     if mode == _TRIANGLES:
@@ -170,7 +175,7 @@ def _colors(tree: dict[str, Any], binary: bytes, primitive: dict[str, Any], coun
     """The vertex colours as they are seen on a screen: glTF stores them linear in light."""
     if "COLOR_0" not in primitive["attributes"]:
         return None
-    values = _accessor(tree, binary, primitive["attributes"]["COLOR_0"], "VEC3", "VEC4")
+    values = accessor(tree, binary, primitive["attributes"]["COLOR_0"], "VEC3", "VEC4")
     if len(values) != count:
         raise ValueError(f"{len(values)} colours of {count} vertices")
     linear = as_colors(values[:, :3], values.dtype)

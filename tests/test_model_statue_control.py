@@ -1,0 +1,369 @@
+"""The control model of Animated Statues: the generic humanoid, charts, and control models of other programs."""
+import json
+import struct
+from dataclasses import replace
+from fractions import Fraction
+
+import numpy as np
+import pytest
+from animal_bodies import Animal
+
+from model.export.glb import skinned_glb, write_skinned_glb
+from model.statue.chart import Chart, automatic_chart, chart_problem, densities, make_chart
+from model.statue.control import control_problem
+from model.statue.control_files import read_control
+from model.statue.flatten import _derivatives, _energy, _rest, crossings, orientation
+from model.statue.humanoid import NAMES, STORED, humanoid, humanoid_markers
+from model.statue.seams import cut, find_seams
+from scanprep.geometry.mesh import Mesh
+from scanprep.geometry.storage import StorageError
+from scanprep.scanning.people import LANDMARKS, MARKERS
+from scanprep.scanning.people_template import load
+from scanprep.skeleton.tree import Skeleton
+
+MIRROR = np.array([-1, 1, 1])
+
+
+@pytest.fixture(scope="module")
+def glb(tmp_path_factory):
+    path = tmp_path_factory.mktemp("glb") / "person.glb"
+    write_skinned_glb(path, humanoid().rig)
+    return path
+
+
+def changed(path, change):
+    """The GLB file with its JSON changed, beside the first."""
+    data = path.read_bytes()
+    size = struct.unpack_from("<I", data, 12)[0]
+    tree = json.loads(data[20:20 + size])
+    rest = bytearray(data[20 + size:])
+    change(tree, rest)
+    text = json.dumps(tree).encode()
+    text += b" " * (-len(text) % 4)
+    out = path.with_name("changed.glb")
+    out.write_bytes(data[:8] + struct.pack("<II", 20 + len(text) + len(rest), len(text)) + b"JSON" + text + bytes(rest))
+    return out
+
+
+def with_uv(path, chart, mesh):
+    """The GLB file of the mesh with the chart as texture coordinates, its vertices repeated along the seams."""
+    vertex = np.zeros(len(chart.uv), dtype=int)
+    vertex[chart.faces.ravel()] = mesh.faces.ravel()
+
+    def change(tree, rest):
+        views, accessors = tree["bufferViews"], tree["accessors"]
+        primitive = tree["meshes"][0]["primitives"][0]
+
+        def add(values, like, kind, component):
+            rest.extend(b"\0" * (-(len(rest) - 8) % 4))
+            views.append({"buffer": 0, "byteOffset": len(rest) - 8, "byteLength": values.nbytes})
+            rest.extend(values.tobytes())
+            accessors.append({"bufferView": len(views) - 1, "componentType": component, "count": len(values),
+                              "type": kind})
+            return len(accessors) - 1
+
+        for name, number in list(primitive["attributes"].items()):
+            entry = accessors[number]
+            view, width = views[entry["bufferView"]], {"VEC3": 3, "VEC4": 4}[entry["type"]]
+            dtype = {5126: "<f4", 5121: "u1"}[entry["componentType"]]
+            values = np.frombuffer(bytes(rest), dtype, entry["count"] * width, 8 + view["byteOffset"])
+            primitive["attributes"][name] = add(values.reshape(-1, width)[vertex], name, entry["type"],
+                                                entry["componentType"])
+        uv = (chart.uv * [1, -1] + [0, 1]).astype("<f4")
+        primitive["attributes"]["TEXCOORD_0"] = add(uv, "uv", "VEC2", 5126)
+        primitive["indices"] = add(chart.faces.astype("<u4").reshape(-1, 1), "indices", "SCALAR", 5125)
+        tree["buffers"][0]["byteLength"] = len(rest) - 8
+        struct.pack_into("<I", rest, 0, len(rest) - 8)
+
+    return changed(path, change)
+
+
+def test_the_humanoid_is_one_closed_symmetric_surface_of_even_triangles():
+    mesh = humanoid().mesh
+    assert 950 <= len(mesh.vertices) <= 1150
+    assert control_problem(humanoid()) is None
+    assert mesh.is_closed and mesh.vertex_component.max() == 0
+    assert len(mesh.vertices) - len(mesh.edges) + len(mesh.faces) == 2
+    far = np.linalg.norm(mesh.vertices[:, None] * MIRROR - mesh.vertices, axis=2)
+    twin = far.argmin(axis=1)
+    assert far.min(axis=1).max() < 1e-12
+    triangles = {tuple(sorted(f)) for f in mesh.faces.tolist()}
+    assert triangles == {tuple(sorted(f)) for f in twin[mesh.faces].tolist()}
+    sides = np.linalg.norm(mesh.corners - np.roll(mesh.corners, 1, axis=1), axis=2)
+    quality = 4 * 3**0.5 * mesh.face_areas / (sides**2).sum(axis=1)         # 1 for equal sides
+    assert quality.min() > 0.5 and np.median(quality) > 0.95
+    assert STORED.stat().st_size < 150_000
+
+
+def test_the_humanoid_turns_and_stretches_as_in_the_paper():
+    control = humanoid()
+    freedom = dict(zip(NAMES, map(len, control.axes), strict=True))
+    assert sum(freedom.values()) + 3 == 38 and len(control.segments) == 9
+    assert [freedom[n] for n in ("vl5", "l_hip", "r_shoulder", "l_sternoclavicular", "r_wrist", "l_elbow", "r_knee",
+                                 "l_ankle")] == [3, 3, 3, 2, 2, 1, 1, 1]
+    for name, axes, limits in zip(NAMES, control.axes, control.limits, strict=True):
+        np.testing.assert_allclose(axes @ axes.T, np.eye(len(axes)), atol=1e-12)
+        assert (limits[:, 0] < 0).all() and (limits[:, 1] > 0).all()
+        if name.startswith("l_"):                                   # an axis of rotation mirrors the other way round
+            right = control.axes[NAMES.index("r" + name[1:])]
+            np.testing.assert_allclose(right, axes * [1, -1, -1], atol=1e-12)
+    joints, parents = control.skeleton.joints, control.skeleton.parents
+    for limb in ("elbow", "knee"):
+        axis, j = control.axes[NAMES.index(f"l_{limb}")][0], NAMES.index(f"l_{limb}")
+        assert abs(axis @ (joints[j] - joints[parents[j]])) < 1e-9 and abs(axis @ (joints[j + 1] - joints[j])) < 1e-9
+
+
+@pytest.mark.parametrize(("joint", "axis", "towards"), [
+    ("elbow", 0, "front"), ("knee", 0, "back"), ("hip", 1, "front"), ("shoulder", 1, "front"), ("shoulder", 0, "up"),
+    ("hip", 0, "out"), ("sternoclavicular", 0, "up"), ("sternoclavicular", 1, "front"), ("ankle", 0, "down"),
+    ("wrist", 0, "in"), ("wrist", 1, "front")])
+def test_a_positive_angle_moves_a_limb_as_its_name_says(joint, axis, towards):
+    control = humanoid()
+    for side, out in (("l", 1), ("r", -1)):
+        way = {"front": (0, -1, 0), "back": (0, 1, 0), "up": (0, 0, 1), "down": (0, 0, -1), "out": (out, 0, 0),
+               "in": (-out, 0, 0)}[towards]
+        j = NAMES.index(f"{side}_{joint}")
+        pose = np.zeros((17, 3))
+        pose[j] = 0.3 * control.axes[j][axis]
+        mine = control.weights[:, j] > 0.99
+        if joint == "sternoclavicular":
+            mine = control.weights[:, j + 1] > 0.99
+        moved = (control.rig.vertices(pose) - control.mesh.vertices)[mine].mean(axis=0)
+        assert moved @ way > 0.6 * np.linalg.norm(moved)
+
+
+def test_the_joints_lie_inside_and_every_part_carries_what_is_near():
+    import igl
+
+    control = humanoid()
+    mesh, joints = control.mesh, control.skeleton.joints
+    assert np.allclose(igl.winding_number(mesh.vertices, mesh.faces, joints), 1, atol=1e-6)
+    in_root = control.skeleton.part_of_vertex(mesh) == 0
+    np.testing.assert_allclose(joints[0], mesh.vertices[in_root].mean(axis=0), atol=1e-12)
+    regressor = control.skeleton.joint_regressor(mesh)
+    np.testing.assert_allclose(regressor @ mesh.vertices, joints, atol=1e-9)
+    assert np.abs(regressor.toarray()).max() < 0.5                  # no joint is reached by extrapolation
+    assert (control.weights > 0).sum(axis=1).max() <= 4
+    x, y = mesh.edges.T                                             # smooth: neighbours are carried alike
+    assert np.abs(control.weights[x] - control.weights[y]).sum(axis=1).max() / 2 < 0.75
+    pose = np.zeros((17, 3))
+    np.testing.assert_allclose(control.rig.vertices(pose), mesh.vertices, atol=1e-12)
+
+
+def test_landmarks_and_markers_are_where_people_have_them():
+    control, people = humanoid(), load()
+    assert set(control.landmarks) == set(LANDMARKS) and set(humanoid_markers()) == set(MARKERS)
+    for mine, theirs in ((control.landmarks, LANDMARKS), (humanoid_markers(), MARKERS)):
+        assert len(set(mine.values())) == len(mine)
+        for name, vertex in mine.items():
+            away = np.linalg.norm(control.mesh.vertices[vertex] - people.mesh.vertices[theirs[name]])
+            assert away < 0.015, name                            # not where people have ears and toes
+
+
+def test_the_chart_is_one_to_one_and_even():
+    control = humanoid()
+    assert chart_problem(control.mesh, control.chart) is None
+    density = densities(control.mesh, control.chart)
+    assert density.min() > 0.5 and density.max() < 2
+    assert control.chart.uv.min() > 5 / 1024 and control.chart.uv.max() < 1 - 5 / 1024
+    rows, columns, faces, bary = control.chart.texels(300)
+    assert len(rows) / 300**2 > 0.45
+    assert len(np.unique(rows * 300 + columns)) == len(rows)
+    back = np.einsum("nc,ncd->nd", bary, control.chart.uv[control.chart.faces[faces]])
+    centres = np.column_stack([columns + 0.5, 300 - rows - 0.5]) / 300
+    np.testing.assert_allclose(back, centres, atol=1e-12)
+    inside = np.zeros((300, 300), dtype=bool)                       # even-odd rule on the border, point by point
+    inside[rows, columns] = True
+    loop = control.chart.uv[control.chart.flat.boundary_loops[0]]
+    a, b = loop, np.roll(loop, -1, axis=0)
+    x, y = (np.random.default_rng(0).integers(0, 300, (400, 2)) + 0.5).T / 300
+    across = (a[:, 1] > y[:, None]) != (b[:, 1] > y[:, None])
+    with np.errstate(divide="ignore", invalid="ignore"):
+        at = a[:, 0] + (y[:, None] - a[:, 1]) / (b[:, 1] - a[:, 1]) * (b[:, 0] - a[:, 0])
+    wanted = (across & (at > x[:, None])).sum(axis=1) % 2 == 1
+    assert (inside[(300 - 300 * y).astype(int), (300 * x).astype(int)] == wanted).all()
+
+
+def test_signs_of_areas_and_crossings_are_exact():
+    rng = np.random.default_rng(1)
+    a, b = rng.random((2, 60, 2))
+    c = a + rng.random((60, 1)) * (b - a)                           # on the line but for rounding
+    exact = [np.sign((Fraction(q[0]) - Fraction(p[0])) * (Fraction(r[1]) - Fraction(p[1]))
+                     - (Fraction(q[1]) - Fraction(p[1])) * (Fraction(r[0]) - Fraction(p[0])))
+             for p, q, r in zip(a.tolist(), b.tolist(), c.tolist(), strict=True)]
+    np.testing.assert_array_equal(orientation(a, b, c), np.array(exact, dtype=int))
+    assert len(set(exact)) > 1
+    square = np.array([[0, 0], [1, 0], [1, 1], [0, 1.0]])
+    assert not crossings(square) and crossings(square[[0, 2, 1, 3]])
+    assert crossings(np.array([[0, 0], [2, 0], [2, 1], [1, 0], [0, 1.0]]))      # touches a side with a corner
+
+
+def test_the_energy_of_the_chart_has_the_derivatives_it_says():
+    control = humanoid()
+    rng = np.random.default_rng(2)
+    chart = control.chart
+    flat, faces = chart.uv + 1e-4 * rng.normal(size=chart.uv.shape), chart.faces[:400]
+    used, faces = np.unique(faces, return_inverse=True)
+    uv, faces = flat[used], faces.reshape(-1, 3)
+    rest, areas = _rest(control.mesh.submesh(np.arange(400))[0]), rng.random(400)
+    border = np.arange(40)                                          # some pairs nearer than the gap of 0.02
+    gradient, _ = _derivatives(uv, faces, rest, areas, border, 0.02)
+    for _ in range(5):
+        way = rng.normal(size=uv.shape)
+        up, down = (_energy(uv + h * way, faces, rest, areas, border, 0.02) for h in (1e-8, -1e-8))
+        assert (up - down) / 2e-8 == pytest.approx(gradient @ way.ravel(), rel=1e-4)
+
+
+def test_a_chart_that_is_not_one_to_one_is_told():
+    mesh, chart = humanoid().mesh, humanoid().chart
+    assert "turned over" in chart_problem(mesh, replace(chart, uv=chart.uv[:, ::-1]))
+    assert "leaves" in chart_problem(mesh, replace(chart, uv=chart.uv + 0.5))
+    turn = np.linspace(0, 2.3 * np.pi, 60)                          # a ribbon that runs over its own beginning
+    ribbon = 0.5 + 0.4 * np.concatenate([r * np.stack([np.cos(turn), np.sin(turn)], axis=1) for r in (0.7, 1.0)])
+    i = np.arange(59)
+    strip = np.vstack([np.stack([i, i + 60, i + 1], axis=1), np.stack([i + 1, i + 60, i + 61], axis=1)])
+    assert "crosses" in chart_problem(Chart(ribbon, strip).flat, Chart(ribbon, strip))
+    short = strip[(strip % 60 < 50).all(axis=1)]
+    used, short = np.unique(short, return_inverse=True)
+    part = Chart(ribbon[used], short.reshape(-1, 3))
+    assert chart_problem(part.flat, part) is None
+    faces = chart.faces.copy()                                      # one triangle on its own
+    faces[7] = len(chart.uv) + np.arange(3)
+    assert "2 charts" in chart_problem(mesh, Chart(np.vstack([chart.uv, chart.uv[chart.faces[7]]]), faces))
+    with pytest.raises(ValueError, match="one disk"):
+        make_chart(mesh, [])
+    with pytest.raises(ValueError, match="no edge joins"):
+        make_chart(mesh, [np.array([0, len(mesh.vertices) - 1])])
+
+
+def test_an_animal_gets_a_chart():
+    animal = Animal()
+    chart = automatic_chart(animal.mesh, animal.skeleton)
+    assert chart_problem(animal.mesh, chart) is None
+    assert densities(animal.mesh, chart).min() > 1 / 3
+
+
+def test_seams_go_on_to_what_the_skeleton_does_not_know():
+    """All of the animal one part: its legs and head are found because they come out small."""
+    mesh = Animal().mesh
+    whole = Skeleton(np.zeros(len(mesh.faces)), [-1], mesh.vertices.mean(axis=0)[None])
+    first = densities(mesh, make_chart(mesh, find_seams(mesh, whole)))
+    assert first.min() < 1 / 3
+    density = densities(mesh, automatic_chart(mesh, whole))
+    assert density.min() > 1 / 3
+
+
+def test_files_give_back_what_was_saved(tmp_path):
+    control = humanoid()
+    control.save(tmp_path / "a.npz")
+    again = read_control(tmp_path / "a.npz")
+    for one, other in ((control.mesh.vertices, again.mesh.vertices), (control.mesh.faces, again.mesh.faces),
+                       (control.weights, again.weights), (control.chart.uv, again.chart.uv),
+                       (control.chart.faces, again.chart.faces), (control.skeleton.joints, again.skeleton.joints),
+                       (control.segment_of_part, again.segment_of_part),
+                       (np.concatenate(control.axes), np.concatenate(again.axes)),
+                       (np.concatenate(control.limits), np.concatenate(again.limits))):
+        np.testing.assert_array_equal(one, other)
+    assert (control.landmarks, control.segments, NAMES) == (again.landmarks, again.segments, again.skeleton.names)
+    (tmp_path / "b.npz").write_bytes((tmp_path / "a.npz").read_bytes()[:9000])
+    for damaged in ("b.npz", "missing.npz", "a.obj", "missing.glb"):
+        with pytest.raises(StorageError, match=damaged):
+            read_control(tmp_path / damaged)
+    replace(control, weights=control.weights * 2).save(tmp_path / "c.npz")
+    with pytest.raises(StorageError, match=r"c\.npz.*weights"):
+        read_control(tmp_path / "c.npz")
+
+
+def test_a_skinned_glb_becomes_the_same_control_model(glb):
+    control = humanoid()
+    again = read_control(with_uv(glb, control.chart, control.mesh))
+    np.testing.assert_allclose(again.skeleton.joints, control.skeleton.joints, atol=1e-6)
+    assert again.skeleton.names == NAMES == again.segments and again.landmarks == {}
+    np.testing.assert_array_equal(again.skeleton.parents, control.skeleton.parents)
+    assert len(again.mesh.vertices) == len(control.mesh.vertices)
+    np.testing.assert_allclose(again.mesh.corners, control.mesh.corners, atol=1e-6)      # welded, triangles in order
+    np.testing.assert_allclose(again.chart.uv[again.chart.faces], control.chart.uv[control.chart.faces], atol=1e-6)
+    np.testing.assert_allclose(again.weights[again.mesh.faces], control.weights[control.mesh.faces], atol=1e-6)
+    pose = 0.3 * np.random.default_rng(3).normal(size=(17, 3))
+    np.testing.assert_allclose(again.rig.vertices(pose)[again.mesh.faces],
+                               control.rig.vertices(pose)[control.mesh.faces], atol=1e-5)
+
+
+def test_a_skinned_glb_is_read_as_it_stands_in_the_scene(glb):
+    """An armature that is scaled and turned, a bone without skin between two others, and a helper bone on top."""
+    control = humanoid()
+
+    def change(tree, rest):
+        nodes = tree["nodes"]
+        j = 1 + NAMES.index("l_elbow")
+        nodes[1 + NAMES.index("l_shoulder")]["children"] = [len(nodes)]
+        nodes.append({"name": "twist", "children": [j]})
+        nodes.append({"name": "armature", "children": [1], "scale": [2, 2, 2]})
+        tree["scenes"][0]["nodes"] = [0, len(nodes) - 1]
+
+    again = read_control(changed(glb, change))
+    assert again.skeleton.names == NAMES
+    np.testing.assert_allclose(again.mesh.vertices, 2 * control.mesh.vertices, atol=1e-6)
+    np.testing.assert_allclose(again.skeleton.joints, 2 * control.skeleton.joints, atol=1e-6)
+    assert chart_problem(again.mesh, again.chart) is None
+
+
+def drop_weights(tree, rest):
+    for name in ("WEIGHTS_0", "JOINTS_0"):
+        del tree["meshes"][0]["primitives"][0]["attributes"][name]
+
+
+def open_it(tree, rest):
+    tree["accessors"][tree["meshes"][0]["primitives"][0]["indices"]]["count"] -= 3
+
+
+def drop_skin(tree, rest):
+    del tree["nodes"][0]["skin"]
+
+
+def not_a_number(tree, rest):
+    view = tree["bufferViews"][tree["accessors"][tree["meshes"][0]["primitives"][0]["attributes"]["POSITION"]]
+                               ["bufferView"]]
+    struct.pack_into("<f", rest, 8 + view.get("byteOffset", 0), np.nan)
+
+
+def second_body(tree, rest):
+    tree["scenes"][0]["nodes"].append(len(tree["nodes"]))
+    tree["nodes"].append({"name": "other", "mesh": 0, "skin": 0})
+
+
+def lost_joint(tree, rest):
+    tree["skins"][0]["joints"][3] = 999
+
+
+@pytest.mark.parametrize(("change", "reason"), [
+    (drop_weights, "WEIGHTS_0"), (open_it, "open"), (drop_skin, "0 meshes that hang on joints"),
+    (not_a_number, "not finite"), (second_body, "2 meshes that hang on joints"), (lost_joint, "999")])
+def test_a_glb_that_is_no_control_model_is_refused_by_name(glb, change, reason):
+    with pytest.raises(StorageError, match=rf"changed\.glb.*{reason}"):
+        read_control(changed(glb, change))
+
+
+def test_texture_coordinates_in_two_charts_are_refused(glb):
+    control = humanoid()
+    faces, vertex = cut(control.mesh, [])
+    half = control.mesh.corners[:, :, 0].mean(axis=1) > 0
+    faces = np.where(half[:, None], faces + len(vertex), faces)
+    uv = np.vstack([control.mesh.vertices[vertex][:, [0, 2]] / 4 + [0.2, 0.1],
+                    control.mesh.vertices[vertex][:, [0, 2]] / 4 + [0.7, 0.1]])
+    used, faces = np.unique(faces, return_inverse=True)
+    with pytest.raises(StorageError, match=r"changed\.glb.*2 charts.*without any, a chart is made"):
+        read_control(with_uv(glb, Chart(uv[used], faces.reshape(-1, 3)), control.mesh))
+
+
+def test_two_bodies_in_one_mesh_are_refused(tmp_path):
+    control = humanoid()
+    n = len(control.mesh.vertices)
+    rig = replace(control.rig, mesh=Mesh(np.vstack([control.mesh.vertices, control.mesh.vertices + [2, 0, 0]]),
+                                         np.vstack([control.mesh.faces, control.mesh.faces + n])),
+                  weights=np.vstack([control.weights] * 2), shapes=np.zeros((0, 2 * n, 3)),
+                  skeleton=Skeleton(np.tile(control.skeleton.part_of_face, 2), control.skeleton.parents,
+                                    control.skeleton.joints, NAMES))
+    (tmp_path / "two.glb").write_bytes(skinned_glb(rig))
+    with pytest.raises(StorageError, match=r"two\.glb.*2 components"):
+        read_control(tmp_path / "two.glb")
