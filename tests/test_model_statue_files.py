@@ -1,5 +1,7 @@
 """Statues for other programs: GLB with images, X3D; read back by readers of their own."""
 import io
+from dataclasses import replace
+from xml.etree import ElementTree
 
 import numpy as np
 import pytest
@@ -13,6 +15,7 @@ from model.statue.motion import people_motion
 from model.statue.normal_image import chart_tangents, normal_image, vertex_of_row
 from model.statue.statue_glb import write_statue_glb
 from model.statue.subdivision import subdivide
+from model.statue.x3d import write_x3d
 from scanprep.geometry import rotations
 from scanprep.geometry.mesh import Mesh
 from scanprep.scanning.people import walk
@@ -129,3 +132,72 @@ def test_vertices_of_another_level_are_refused(detailed, tmp_path):
     with pytest.raises(ValueError, match=r"vertices: expected shape \(16898, 3\), got \(5, 3\)"):
         write_statue_glb(tmp_path / "a.glb", control, vertices[:5], fine)
     assert not list(tmp_path.iterdir())
+
+
+def numbers(node, name, width):
+    return np.array(node.get(name).replace(",", " ").split(), dtype=float).reshape(-1, width)
+
+
+def played(tree, key):
+    """The skin of the one humanoid at a key of its interpolators, as H-Anim says: joints turn about their centres."""
+    person = tree.find("Scene/HAnimHumanoid")
+    nodes = {node.get("DEF"): node for node in tree.iter() if node.get("DEF")}
+    values = {}
+    for route in tree.iter("ROUTE"):
+        source = nodes[route.get("fromNode")]
+        if route.get("toNode") in nodes and source.get("keyValue"):
+            width = 4 if source.tag == "OrientationInterpolator" else 3
+            values[route.get("toNode"), route.get("toField")] = numbers(source, "keyValue", width)[key]
+    points = numbers(person.find("Coordinate[@containerField='skinCoord']"), "point", 3)
+    out, listed = np.zeros_like(points), []
+
+    def below(node, above):
+        M, name, center = np.eye(4), node.get("DEF"), numbers(node, "center", 3)[0]
+        if (name, "set_rotation") in values:
+            turn = values[name, "set_rotation"]
+            M[:3, :3] = rotations.exp(turn[:3] * turn[3])
+        M[:3, 3] = center - M[:3, :3] @ center + values.get((name, "set_translation"), 0)
+        M = above @ M
+        index = numbers(node, "skinCoordIndex", 1)[:, 0].astype(int)
+        moved = points[index] @ M[:3, :3].T + M[:3, 3]
+        np.add.at(out, index, numbers(node, "skinCoordWeight", 1) * moved)
+        listed.append(name)
+        for child in node.findall("HAnimJoint"):
+            below(child, M)
+
+    below(person.find("HAnimJoint[@containerField='skeleton']"), np.eye(4))
+    assert sorted(listed) == sorted(n.get("USE") for n in person.findall("HAnimJoint[@containerField='joints']"))
+    return out
+
+
+def test_x3d_moves_the_skin_as_the_statue(detailed, motion, tmp_path):
+    control, (fine, vertices) = humanoid(), detailed
+    texture = np.random.default_rng(0).integers(0, 255, (16, 16, 3), dtype=np.uint8)
+    write_x3d(tmp_path / "a.x3d", control, texture=texture, motion=motion)
+    tree = ElementTree.parse(tmp_path / "a.x3d").getroot()
+    assert (tree.get("version"), tree.find("Scene/HAnimHumanoid").get("version")) == ("3.3", "1.0")
+    for t in range(4):
+        expected = control.rig.vertices(motion.poses[t], motion.trans[t]) @ turn_up(2).T
+        assert np.abs(played(tree, t) - expected).max() < 2e-6
+    surface = next(tree.iter("IndexedFaceSet"))
+    assert np.array_equal(numbers(surface, "coordIndex", 4)[:, :3], control.mesh.faces)
+    uv = numbers(surface.find("TextureCoordinate"), "point", 2)[numbers(surface, "texCoordIndex", 4)[:, :3].astype(int)]
+    assert np.abs(uv - control.chart.uv[control.chart.faces]).max() < 1e-6
+    assert surface.find("Coordinate").get("USE") == tree.find("Scene/HAnimHumanoid/Coordinate").get("DEF")
+    (url,) = (node.get("url") for node in tree.iter("ImageTexture"))
+    assert np.array_equal(np.asarray(Image.open(tmp_path / url.strip('"'))), texture)
+    names = [node.get("DEF") for node in tree.iter() if node.get("DEF")]
+    assert len(names) == len(set(names)) and set(control.skeleton.names) < set(names)
+    write_x3d(tmp_path / "b.x3d", control, vertices, fine, up=1)
+    still = ElementTree.parse(tmp_path / "b.x3d").getroot()
+    assert np.abs(played(still, 0) - vertices).max() < 2e-6 and not list(still.iter("ImageTexture"))
+
+
+def test_x3d_takes_any_names(tmp_path):
+    control = humanoid()
+    odd = replace(control, skeleton=replace(control.skeleton, names=(
+        "Bip01 Pelvis", "Bip01:Pelvis", "2nd", "<&>", *control.skeleton.names[4:])))
+    write_x3d(tmp_path / "a.x3d", odd)
+    person = ElementTree.parse(tmp_path / "a.x3d").getroot().find("Scene/HAnimHumanoid")
+    names = [node.get("USE") for node in person.findall("HAnimJoint[@containerField='joints']")]
+    assert names[:4] == ["Bip01_Pelvis_0", "Bip01_Pelvis_1", "part_2nd", "part____"] and len(set(names)) == 17
