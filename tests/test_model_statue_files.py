@@ -175,7 +175,9 @@ def test_x3d_moves_the_skin_as_the_statue(detailed, motion, tmp_path):
     texture = np.random.default_rng(0).integers(0, 255, (16, 16, 3), dtype=np.uint8)
     write_x3d(tmp_path / "a.x3d", control, texture=texture, motion=motion)
     tree = ElementTree.parse(tmp_path / "a.x3d").getroot()
-    assert (tree.get("version"), tree.find("Scene/HAnimHumanoid").get("version")) == ("3.3", "1.0")
+    assert (tree.get("version"), tree.find("Scene/HAnimHumanoid").get("version")) == ("4.0", "2.0")
+    called = {node.get("DEF"): node.get("name") for node in tree.iter("HAnimJoint") if node.get("DEF")}
+    assert (called["l_wrist"], called["r_ankle"], called["vl5"]) == ("l_radiocarpal", "r_talocrural", "vl5")
     for t in range(4):
         expected = control.rig.vertices(motion.poses[t], motion.trans[t]) @ turn_up(2).T
         assert np.abs(played(tree, t) - expected).max() < 2e-6

@@ -16,17 +16,18 @@ from .control import ControlModel
 from .retarget import StatueMotion
 from .subdivision import Subdivision, subdivide
 
-_DOCTYPE = ('<?xml version="1.0" encoding="UTF-8"?>\n<!DOCTYPE X3D PUBLIC "ISO//Web3D//DTD X3D 3.3//EN" '
-            '"http://www.web3d.org/specifications/x3d-3.3.dtd">\n')
+_DOCTYPE = ('<?xml version="1.0" encoding="UTF-8"?>\n<!DOCTYPE X3D PUBLIC "ISO//Web3D//DTD X3D 4.0//EN" '
+            '"https://www.web3d.org/specifications/x3d-4.0.dtd">\n')
+_RENAMED = {"wrist": "radiocarpal", "ankle": "talocrural"}       # joints that H-Anim 2.0 calls otherwise than 1.0
 
 
 def write_x3d(path: str | Path, control: ControlModel, vertices: np.ndarray | None = None,
               subdivision: Subdivision | None = None, texture: np.ndarray | None = None,
               motion: StatueMotion | None = None, up: int = 2) -> None:
-    """Write a statue as an `HAnimHumanoid` of X3D 3.3, and its texture as a PNG of the same name beside it.
+    """Write a statue as an `HAnimHumanoid` of X3D 4.0, and its texture as a PNG of the same name beside it.
 
-    Joints have the names of the control model's parts (those of H-Anim 1.0 for the generic humanoid) and their centres
-    in the pose of the scan, where no joint is turned. Coordinates are shared by the skin and its joints.
+    Joints have the names of H-Anim 2.0 where the control model's parts have those of 1.0, as the generic humanoid's,
+    and their centres in the pose of the scan, where no joint is turned. Skin and joints share their coordinates.
 
     Parameters
     ----------
@@ -56,12 +57,12 @@ def write_x3d(path: str | Path, control: ControlModel, vertices: np.ndarray | No
     if np.shape(vertices) != (len(subdivision.parent), 3):
         raise ValueError(f"vertices: expected shape ({len(subdivision.parent)}, 3), got {np.shape(vertices)}")
     U = turn_up(up).T
-    root = xml.Element("X3D", profile="Full", version="3.3")
+    root = xml.Element("X3D", profile="Full", version="4.0")
     head = xml.SubElement(root, "head")
     xml.SubElement(head, "meta", name="generator", content="scapekit")
     scene = xml.SubElement(root, "Scene")
     names = _names(control)
-    person = xml.SubElement(scene, "HAnimHumanoid", DEF="statue", name="statue", version="1.0")
+    person = xml.SubElement(scene, "HAnimHumanoid", DEF="statue", name="statue", version="2.0")
     weights = np.einsum("nc,ncj->nj", subdivision.bary, control.weights[control.mesh.faces[subdivision.parent]])
     _skeleton(person, control, names, strongest(weights), U)
     for name in names:
@@ -90,7 +91,8 @@ def _skeleton(person: xml.Element, control: ControlModel, names: list[str], weig
     for j, parent in enumerate(control.skeleton.parents):
         carried = np.flatnonzero(weights[:, j])
         nodes.append(xml.SubElement(
-            nodes[parent] if j else person, "HAnimJoint", DEF=names[j], name=names[j],
+            nodes[parent] if j else person, "HAnimJoint", DEF=names[j],
+            name=re.sub("^([lr]_)(wrist|ankle)$", lambda found: found[1] + _RENAMED[found[2]], names[j]),
             containerField="children" if j else "skeleton", center=_row(control.skeleton.joints[j] @ U),
             skinCoordIndex=" ".join(map(str, carried)), skinCoordWeight=_row(weights[carried, j])))
 
