@@ -3,11 +3,13 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import replace
+from functools import lru_cache
 from pathlib import Path
 
 import numpy as np
 
 from scanprep.geometry.storage import load_arrays, numbers, taking_apart
+from scanprep.skeleton.tree import Skeleton
 
 from ..export.bvh_read import BvhMotion
 from ..export.rig import check_motion, joint_places
@@ -60,9 +62,7 @@ def people_motion(control: ControlModel, pose: np.ndarray, poses: np.ndarray, tr
     ValueError
         A motion of other parts or not finite.
     """
-    from scanprep.scanning.people import Person
-
-    skeleton = Person().skeleton
+    skeleton = _average_person()
     poses, trans = check_motion(skeleton, poses, trans, rate)
     offsets = skeleton.joints - np.where(skeleton.parents[:, None] < 0, 0, skeleton.joints[skeleton.parents])
     moving = BvhMotion(skeleton.names, skeleton.parents, offsets, {}, skeleton.part_rotations(poses),
@@ -111,3 +111,10 @@ def bvh_motion(control: ControlModel, pose: np.ndarray, bvh: BvhMotion, referenc
         bvh = replace(bvh, offsets=rest - np.where(bvh.parents[:, None] < 0, 0, rest[bvh.parents]),
                       rotations=bvh.rotations @ np.swapaxes(R, -1, -2))
     return retargeted(Pairing(control, pose, bvh, names, up), False, config or MotionConfig())
+
+
+@lru_cache(maxsize=1)
+def _average_person() -> Skeleton:
+    from scanprep.scanning.people import Person
+
+    return Person().skeleton
