@@ -11,20 +11,31 @@ import tyro
 from scanprep.batch.pool import Workers
 from scanprep.batch.workspace import Task, Workspace
 from scanprep.cli import MM, Output, ScanArg, Unit, WorkersArg
-from scanprep.console import Metric, Outcome, bar, dispatch, failures_of, problem_of
-from scanprep.geometry.files import write_mesh
+from scanprep.console import Metric, Outcome, Progress, bar, dispatch, failures_of, problem_of
+from scanprep.geometry.files import read_mesh, write_mesh
+from scanprep.geometry.storage import writing
+from scanprep.pictures.animation import write_animated_glb, write_gif
 from scanprep.pipeline.scans import SCAN_ENDINGS
 
+from ..export.cli import read_motion
+from ..files import load_model
+from .animate import follower_of, read_statue_motion
 from .control import ControlModel
+from .control_files import read_control
 from .files import load_statue
 from .fit import StatueConfig
 from .humanoid import humanoid
-from .reconstruction import Reconstruction, displaced_surface
-from .subdivision import subdivide, subdivide_adaptive
+from .reconstruction import Reconstruction, displaced_surface, inverted_triangles
+from .report import motion_pictures, upright_axis
+from .retarget import StatueMotion
+from .statue import Statue
+from .statue_glb import write_statue_glb
+from .subdivision import Subdivision, subdivide, subdivide_adaptive
 from .work import Inputs, Work
 
 StatueArg = Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="STATUE")]
 MotionArg = Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="MOTION")]
+KEYS, GIF_FRAMES = 120, 24           # frames of an animated GLB of meshes, and of the preview
 LevelArg = Literal[0, 1, 2, 3, 4]
 FEATURE_ENDINGS = (".features.json", ".json", ".pp", ".mrk.json")
 
@@ -92,7 +103,7 @@ def reconstruct(statue: StatueArg, output: Output, level: LevelArg = 3, toleranc
 
     Args:
         statue: Folder of scape statue fit.
-        output: Mesh to write.
+        output: Mesh to write; a .glb hangs on the skeleton and has the texture.
         level: How often the triangles of the control mesh are divided by four.
         tolerance: Divide only where the detail is off by more than this, millimetres; at most as often as the level.
         image: Edited copy of the statue's displacement.png, of the same size and depth.
@@ -102,7 +113,10 @@ def reconstruct(statue: StatueArg, output: Output, level: LevelArg = 3, toleranc
     fine = subdivide(control.mesh, control.chart, level) if tolerance is None else subdivide_adaptive(
         control.mesh, control.chart, displaced_surface(control, loaded.map), tolerance / MM, level)
     mesh = Reconstruction(control, loaded.map, fine).mesh()
-    write_mesh(output, mesh)
+    if output.suffix.lower() == ".glb":
+        write_statue_glb(output, control, mesh.vertices, fine, loaded.texture, up=upright_axis(loaded))
+    else:
+        write_mesh(output, mesh)
     rows = [Metric("vertices", len(mesh.vertices)), Metric("triangles", len(mesh.faces)),
             Metric("closed", "yes" if mesh.is_closed else "no")]
     if image is not None:
@@ -113,9 +127,95 @@ def reconstruct(statue: StatueArg, output: Output, level: LevelArg = 3, toleranc
     return Outcome(output, rows)
 
 
-def _control(path: Path | None) -> ControlModel:
-    from .control_files import read_control
+def animate(statue: StatueArg, motion: MotionArg, output: Output, model: Path | None = None,
+            registered: Path | None = None, level: LevelArg = 2, meshes: bool = False) -> Outcome:
+    """A statue in motion: its skeleton moves the control mesh, the detail stands on the moving normals.
 
+    The motion is BVH; or .npz of the synthetic people, or of the statue's own body.npz, as scape animate writes it from
+    markers. With --model the control mesh follows a learned model instead of plain skinning, with all that the model
+    knows of how skin moves; the motion is then one of that model.
+
+    Example: scape statue animate statue walk.bvh -o walking
+
+    Args:
+        statue: Folder of scape statue fit.
+        motion: .bvh, or .npz with poses, trans and mocap_frame_rate.
+        output: Folder to write: statue.glb, motion.npz, motion.gif, and meshes on demand.
+        model: Learned model (.npz) that the control mesh follows.
+        registered: The model's template on the scan, in its triangles; else it is brought there.
+        level: Level of detail of the files.
+        meshes: Write the exact mesh of every frame.
+    """
+    loaded = load_statue(statue)
+    control = loaded.control
+    fine = subdivide(control.mesh, control.chart, level)
+    detailed = Reconstruction(control, loaded.map, fine)
+    if model is None:
+        if registered is not None:
+            raise ValueError("--registered: expected --model with it")
+        moved = read_statue_motion(loaded, motion)
+        bodies, rate = control.rig.vertices(moved.poses, moved.trans), moved.rate
+        rows = _write_skinned(output, loaded, fine, detailed, moved)
+    else:
+        bodies, rate = _following(loaded, motion, model, registered)
+        with bar("writing frames") as progress:
+            frames = _frames(detailed, bodies, range(0, len(bodies), max(1, len(bodies) // KEYS)), progress)
+        write_animated_glb(output / "statue.glb", fine.faces, frames, rate * len(frames) / len(bodies),
+                           up=upright_axis(loaded), keys=len(frames))
+        rows = [Metric("follows", str(model))]
+    shown = range(0, len(bodies), max(1, len(bodies) // GIF_FRAMES))
+    with bar("rendering") as progress:
+        write_gif(output / "motion.gif", motion_pictures(loaded, detailed, bodies[list(shown)], progress),
+                  rate * len(shown) / len(bodies))
+    if meshes:
+        with bar("writing meshes") as progress:
+            for t, body in enumerate(bodies):
+                write_mesh(output / "meshes" / f"{t:05d}.ply", detailed.mesh(body))
+                progress(t + 1, len(bodies))
+    turned = [len(inverted_triangles(control, body, fine, detailed(body))) for body in bodies[list(shown)]]
+    return Outcome(output, [Metric("frames", len(bodies)), Metric("rate", rate, "1/s"), *rows,
+                            Metric("inverted triangles in a frame, most", max(turned))], {"level": level})
+
+
+def _following(statue: Statue, motion: Path, model: Path, registered: Path | None) -> tuple[np.ndarray, float]:
+    """The control mesh (T, N, 3) in a motion of a learned model, and its rate."""
+    learned = load_model(model)
+    moves = read_motion(motion, learned)
+    there = None
+    if registered is not None:
+        body = read_mesh(registered)
+        if not np.array_equal(body.faces, learned.template.faces):
+            raise ValueError(f"{registered}: expected the triangles of the model ({learned.template}), found {body}")
+        there = body.vertices
+    with bar("registering the model") as progress:
+        follower = follower_of(statue, learned, there, progress)
+    return follower.vertices(moves.poses, moves.trans), moves.rate
+
+
+def _write_skinned(output: Path, statue: Statue, fine: Subdivision, detailed: Reconstruction, moved: StatueMotion
+                   ) -> list[Metric]:
+    """statue.glb with skeleton, images and motion, and motion.npz; figures of the retargeting."""
+    control = statue.control
+    output.mkdir(parents=True, exist_ok=True)
+    write_statue_glb(output / "statue.glb", control, detailed(control.mesh.vertices), fine, statue.texture,
+                     motion=moved, up=upright_axis(statue))
+    with writing(output / "motion.npz") as beside, open(beside, "wb") as out:
+        np.savez_compressed(out, poses=moved.poses.reshape(len(moved.poses), -1), trans=moved.trans,
+                            betas=np.zeros(0), gender=np.array("neutral"), mocap_frame_rate=np.array(moved.rate),
+                            surface_model_type=np.array("scape"))
+    return [Metric("joints that follow the motion", len(moved.matched)),
+            *([Metric("joints without one in the motion", ", ".join(moved.lacking))] if moved.lacking else [])]
+
+
+def _frames(detailed: Reconstruction, bodies: np.ndarray, chosen: range, progress: Progress) -> np.ndarray:
+    out = np.empty((len(chosen), *detailed(bodies[0]).shape))
+    for k, t in enumerate(chosen):
+        out[k] = detailed(bodies[t])
+        progress(k + 1, len(chosen))
+    return out
+
+
+def _control(path: Path | None) -> ControlModel:
     return humanoid() if path is None else read_control(path)
 
 

@@ -12,7 +12,11 @@ from .control import ControlModel
 from .displacement_files import read_map, write_map
 from .humanoid import humanoid, humanoid_markers
 from .motion import people_motion
+from .normal_image import normal_image
 from .statue import Statue
+from .statue_glb import write_statue_glb
+from .subdivision import Subdivision
+from .x3d import write_x3d
 
 KIND, VERSION = "statue", 1
 CONTROL, ABOUT, TEXTURE = "control.npz", "statue.json", "texture.png"
@@ -76,3 +80,17 @@ def write_body(folder: Path, statue: Statue) -> None:
         storage.write_json(folder / MARKERS, {"markersets": [{
             "type": "body", "distance_from_skin": SKIN, "indices": humanoid_markers()}]})
     body_model(control, poses).save(folder / BODY)
+
+
+def write_for_programs(folder: Path, statue: Statue, vertices: np.ndarray, fine: Subdivision, up: int) -> None:
+    """Write statue.glb, the control mesh with skin and all images, and statue.x3d, the same as H-Anim.
+
+    Parameters
+    ----------
+    vertices : (n, 3) float, metres
+        The detailed surface, whose normals become the normal image.
+    """
+    normals = normal_image(statue.control, vertices, fine)
+    write_statue_glb(folder / "statue.glb", statue.control, texture=statue.texture, normals=normals,
+                     heights=statue.map.heights, up=up)
+    write_x3d(folder / "statue.x3d", statue.control, texture=statue.texture, up=up)

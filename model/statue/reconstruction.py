@@ -13,7 +13,7 @@ from scanprep.pictures.textures import bilinear
 from .chart import Chart
 from .control import ControlModel
 from .normal_volume import from_normal_volume, interpolate, to_normal_volume
-from .statue import MEASURED, DisplacementMap
+from .statue import MEASURED, OUTSIDE, DisplacementMap
 from .subdivision import Displaced, Subdivision
 
 SEED = 14                            # of the places at which errors are measured
@@ -82,6 +82,16 @@ class Reconstruction:
         a, b, c = (v[column] for column in self.control.mesh.faces.T)
         total = self._around @ np.cross(b - a, c - a)
         return total / np.maximum(np.linalg.norm(total, axis=1), 1e-300)[:, None]
+
+
+def coverage_at(control: ControlModel, map: DisplacementMap, faces: np.ndarray, bary: np.ndarray) -> np.ndarray:
+    """(n,) what the map says at places on triangles: MEASURED, FOLDED or HOLE; at a rim what the pixel beside says."""
+    uv = chart_places(control.chart, faces, bary)
+    height, width = map.coverage.shape
+    column, row = (np.clip(at.astype(int), 0, size - 1) for at, size in
+                   ((uv[:, 0] * width, width), ((1 - uv[:, 1]) * height, height)))
+    found = map.coverage[row, column]
+    return np.where(found == OUTSIDE, MEASURED, found)
 
 
 def displaced_surface(control: ControlModel, map: DisplacementMap) -> Displaced:
@@ -154,11 +164,9 @@ def remaining_error(control: ControlModel, map: DisplacementMap, scan: Mesh, cou
     """
     points = scan.sample(count, np.random.default_rng(SEED))[0]
     found = to_normal_volume(control.mesh, points, reach)
-    uv = chart_places(control.chart, np.maximum(found.faces, 0), found.bary)
-    height, width = map.coverage.shape
-    column, row = (np.clip(at.astype(int), 0, size - 1) for at, size in
-                   ((uv[:, 0] * width, width), ((1 - uv[:, 1]) * height, height)))
-    good = found.inside & (found.solutions == 1) & (map.coverage[row, column] == MEASURED)
+    faces = np.maximum(found.faces, 0)
+    uv = chart_places(control.chart, faces, found.bary)
+    good = found.inside & (found.solutions == 1) & (coverage_at(control, map, faces, found.bary) == MEASURED)
     if not good.any():
         return SurfaceError(np.nan, np.nan, np.nan)
     stored = from_normal_volume(control.mesh, type(found)(found.faces[good], found.bary[good],

@@ -1,7 +1,7 @@
 """The page of a statue: what was fitted, the map, the error at every level, and the character in motion."""
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -13,11 +13,11 @@ from scanprep.pictures.camera import Camera
 from scanprep.pictures.page import Page
 from scanprep.pictures.shading import Bones, Dots, Shape, Solid, color_bar, heat, part_colors, render, side_by_side
 
-from .reconstruction import Reconstruction
+from .reconstruction import Reconstruction, coverage_at
 from .statue import FOLDED, HOLE, MEASURED, OUTSIDE, DisplacementMap, Statue
 from .subdivision import subdivide
 
-HEIGHT = 520
+HEIGHT, SMALL = 520, 360            # pixels of the pictures, and of animated ones
 SIDES = ("front", "left", "back", "right")
 WORST = 0.003                        # metres: the end of the colours of errors
 MOVING = 3                           # level of the pictures in motion
@@ -33,13 +33,21 @@ class Level:
     name : str
     mesh : Mesh
     mean, rms : float, metres
-        From the reconstruction to the scan [Statues] Eq. 22, 23.
+        From the reconstruction to the scan, where that has no hole [Statues] Eq. 22, 23.
+    shown : (f,) bool
+        Triangles that are not in a hole of the scan.
     """
 
     name: str
     mesh: Mesh
     mean: float
     rms: float
+    shown: np.ndarray
+
+
+def upright_axis(statue: Statue) -> int:
+    """0, 1 or 2: the axis of the scan nearest to the upward direction of the person's trunk."""
+    return int(np.abs(statue.control.skeleton.part_rotations(statue.pose)[0][:, 2]).argmax())
 
 
 def cameras(statue: Statue, subject: Any, turns: Sequence[float] = (0, 90, 180, 270)) -> list[Camera]:
@@ -51,8 +59,8 @@ def cameras(statue: Statue, subject: Any, turns: Sequence[float] = (0, 90, 180, 
         What has to fit into the picture.
     """
     R = statue.control.skeleton.part_rotations(statue.pose)[0]
-    up, front = R[:, 2], -R[:, 1]
-    axis = int(np.abs(up).argmax())
+    front = -R[:, 1]
+    axis = upright_axis(statue)
     first, second = np.eye(3)[[(axis + 1) % 3, (axis + 2) % 3]]
     azimuth = float(np.degrees(np.arctan2(front @ second, front @ first)))
     return [Camera.around(subject, azimuth + turn, up=axis) for turn in turns]
@@ -130,12 +138,13 @@ def _map(page: Page, statue: Statue, scan: Mesh) -> None:
 
 
 def _errors(page: Page, scan: Mesh, statue: Statue, levels: Sequence[Level]) -> None:
-    page.section("Distance to the scan", "From the reconstruction at each level to the scan.")
+    page.section("Distance to the scan", "From the reconstruction at each level to the scan; grey in its holes, which "
+                 "do not count.")
     page.table([(one.name, len(one.mesh.vertices), f"{1000 * one.mean:.2f}", f"{1000 * one.rms:.2f}")
                 for one in levels], ("level", "vertices", "mean, mm", "RMS, mm"))
     surface, camera = Surface(scan), cameras(statue, scan, (20,))[0]
-    colored = [(Solid(one.mesh, heat(surface.closest(one.mesh.vertices).distances, 0.0, WORST)), camera)
-               for one in levels]
+    colored = [(Solid(one.mesh, heat(np.where(one.shown, surface.closest(one.mesh.corners.mean(axis=1)).distances,
+                                              np.nan), 0.0, WORST), smooth=False), camera) for one in levels]
     page.picture(side_by_side([_row(colored, [one.name for one in levels]),
                                color_bar(0.0, WORST, "distance to the scan")], columns=1))
 
@@ -161,14 +170,8 @@ def coverage_picture(map_: DisplacementMap, size: int = 640) -> np.ndarray:
 
 def coverage_of_vertices(statue: Statue) -> np.ndarray:
     """(N,) what the map says at each vertex of the control mesh: MEASURED, FOLDED or HOLE."""
-    chart, map_ = statue.control.chart, statue.map
-    uv = np.zeros((len(statue.control.mesh.vertices), 2))
-    uv[statue.control.mesh.faces] = chart.uv[chart.faces]
-    height, width = map_.coverage.shape
-    row = np.clip(((1 - uv[:, 1]) * height).astype(int), 0, height - 1)
-    column = np.clip((uv[:, 0] * width).astype(int), 0, width - 1)
-    found = map_.coverage[row, column]
-    return np.where(found == OUTSIDE, MEASURED, found)
+    whole = subdivide(statue.control.mesh, statue.control.chart, 0)
+    return coverage_at(statue.control, statue.map, whole.parent, whole.bary)
 
 
 def _row(shown: Sequence[tuple[Shape | Sequence[Shape], Camera]], labels: Sequence[str]) -> np.ndarray:
@@ -202,3 +205,14 @@ def in_motion(statue: Statue) -> list[tuple[str, Mesh]]:
     bodies = statue.control.rig.vertices(moved.poses, moved.trans)
     return [(name, detailed.mesh(body)) for name, body in zip(("walking", "squatting", "arms overhead"), bodies,
                                                               strict=True)]
+
+
+def motion_pictures(statue: Statue, detailed: Reconstruction, bodies: np.ndarray,
+                    progress: Callable[[int, int], None] | None = None) -> list[np.ndarray]:
+    """A picture of each of some frames of control vertices (T, N, 3), all seen from one place in front."""
+    camera, out = cameras(statue, bodies.reshape(-1, 3), (25,))[0], []
+    for t, body in enumerate(bodies):
+        out.append(render(detailed.mesh(body), camera, int(SMALL * camera.width / camera.height) + 10, SMALL))
+        if progress:
+            progress(t + 1, len(bodies))
+    return out

@@ -6,6 +6,8 @@ import warnings
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
+import numpy as np
+
 from scanprep.batch.room import Room
 from scanprep.cleaning.components import clean_scan
 from scanprep.cli import MM, Unit
@@ -20,12 +22,20 @@ from .automatic import Features, find_features
 from .colors import bake_texture, scan_look
 from .control import ControlModel
 from .displacement import bake, coverage_shares
-from .files import save_statue, write_body
+from .files import save_statue, write_body, write_for_programs
 from .fit import Posed, StatueConfig, fitted_control, posed_automatically, posed_by_features
 from .read_features import read_features
-from .reconstruction import Reconstruction, displaced_surface, inverted_triangles, remaining_error, surface_error
-from .report import Level, in_motion, parts_without_data, statue_page, statue_picture
-from .statue import Statue
+from .reconstruction import (
+    Reconstruction,
+    SurfaceError,
+    coverage_at,
+    displaced_surface,
+    inverted_triangles,
+    remaining_error,
+    surface_error,
+)
+from .report import Level, in_motion, parts_without_data, statue_page, statue_picture, upright_axis
+from .statue import HOLE, MEASURED, Statue
 from .subdivision import Subdivision, subdivide, subdivide_adaptive
 from .surface_fit import SurfaceFit, fit_surface
 
@@ -100,6 +110,7 @@ class Work:
         adaptive = _adaptive(statue, scan)
         write_mesh(folder / "reconstruction.ply", levels[-1].mesh)
         write_body(folder, statue)
+        write_for_programs(folder, statue, levels[-1].mesh.vertices, fine, upright_axis(statue))
         rows = [*rows, *_figures(statue, scan, surface, levels, adaptive, fine), *_sizes(folder, scan)]
         problem = statue_problem(statue)
         rows = [*([Metric("problem", problem)] if problem else []), *rows]
@@ -140,8 +151,14 @@ def measured_levels(statue: Statue, scan: Mesh) -> tuple[list[Level], Subdivisio
 
 def _level(name: str, statue: Statue, fine: Subdivision, scan: Mesh) -> Level:
     mesh = Reconstruction(statue.control, statue.map, fine).mesh()
-    error = surface_error(mesh, scan)
-    return Level(name, mesh, error.mean, error.rms)
+    shown = (_kinds(statue, fine) != HOLE).any(axis=1)
+    error = surface_error(mesh.submesh(shown)[0], scan) if shown.any() else SurfaceError(np.nan, np.nan, np.nan)
+    return Level(name, mesh, error.mean, error.rms, shown)
+
+
+def _kinds(statue: Statue, fine: Subdivision) -> np.ndarray:
+    """(f, 3) what the map says at the corners of fine triangles."""
+    return coverage_at(statue.control, statue.map, fine.parent, fine.bary)[fine.faces]
 
 
 def _adaptive(statue: Statue, scan: Mesh) -> Level:
@@ -198,6 +215,7 @@ def _figures(statue: Statue, scan: Mesh, surface: SurfaceFit, levels: list[Level
     shares = coverage_shares(statue.control, statue.map)
     left = remaining_error(statue.control, statue.map, scan)
     turned = inverted_triangles(statue.control, statue.control.mesh.vertices, fine, levels[-1].mesh.vertices)
+    beside_folds = (_kinds(statue, fine)[turned] == MEASURED).all(axis=1)
     lacking = parts_without_data(statue)
     return [Metric("control mesh to the scan, RMS", MM * surface.rms, "mm"),
             Metric("inverted triangles of the control mesh", surface.inverted),
@@ -209,7 +227,8 @@ def _figures(statue: Statue, scan: Mesh, surface: SurfaceFit, levels: list[Level
             *(Metric(f"{one.name} to the scan, {what}", MM * value, "mm") for one in [*levels, adaptive]
               for what, value in (("mean", one.mean), ("RMS", one.rms))),
             Metric("triangles of the adaptive subdivision", len(adaptive.mesh.faces)),
-            Metric(f"inverted triangles at {levels[-1].name}", len(turned))]
+            Metric(f"inverted triangles at {levels[-1].name}", len(turned)),
+            Metric("of these outside folds and holes", int(beside_folds.sum()))]
 
 
 def _sizes(folder: Path, scan: Mesh) -> list[Metric]:
