@@ -13,7 +13,7 @@ from scanprep.geometry.surface import Surface
 from scanprep.matching.matches import Target
 from scanprep.matching.thinning import thin
 
-from .features import limb_angles, limbs
+from .limbs import limb_angles, limbs
 from .pose_search import COARSE, FINE, Posed, PoseSearch
 
 CAP, NORMALS = 0.08, 0.05        # metres: of a distance, and what a difference of normals of one is worth
