@@ -1,16 +1,18 @@
 """Joint centres and facial points of a person who stands upright, without a click."""
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from scanprep.geometry.formats.common import UNITS
 from scanprep.geometry.mesh import Mesh
 from scanprep.matching.confidence import stretched_share
-from scanprep.matching.matches import target_of
+from scanprep.matching.matches import Target, target_of
 from scanprep.matching.nonrigid import Registration, RegistrationConfig, register
-from scanprep.threads import one_thread
+from scanprep.matching.thinning import thin
+from scanprep.threads import one_thread, search_threads
 
 from .articulated import Articulated
 from .control import ControlModel
@@ -21,6 +23,7 @@ from .pose_search import PoseSearch
 STATURE = 1.7                    # metres
 NOBODY, EITHER = 0.042, 1.05     # misfit, and margin, of what is no person
 DOUBTED = 0.025, 1.2, 0.05       # misfit, margin and share missed of a person with a limb in a wrong place
+MANY, SPACING = 40_000, 0.007    # points of a scan, and to how many metres apart more of them are thinned
 SHOWN = 0.3                      # share of the vertices around a joint that have data
 
 
@@ -92,7 +95,11 @@ def find_features(control: ControlModel, scan: Mesh) -> Features:
     search = PoseSearch(Articulated(control))
     scan = outward(scan)
     unit = likely_unit(scan.vertices)
-    stands = find_person(search, target_of(scan), UNITS[unit])
+    data = scan if len(scan.vertices) < MANY else scan.vertices[thin(scan.vertices, SPACING / UNITS[unit])]
+    target = target_of(data)
+    if data is not scan:
+        target = _facing_as(target, scan)
+    stands = find_person(search, target, UNITS[unit])
     best = stands[0]
     margin = stands[1].misfit / best.misfit if len(stands) > 1 else np.inf
     up, front = (best.direction(search, np.array(axis)) for axis in ((0.0, 0, 1), (0.0, -1, 0)))
@@ -101,7 +108,8 @@ def find_features(control: ControlModel, scan: Mesh) -> Features:
         return Features({}, {}, (*control.skeleton.names, *control.landmarks), None, None, unit, up, front, best.off,
                         margin, np.nan, np.nan, problem)
     start = search.mesh(best.posed)
-    found = register(start, Mesh(scan.vertices @ best.T[:3, :3].T + best.T[:3, 3], scan.faces),
+    placed = (data.vertices if isinstance(data, Mesh) else data) @ best.T[:3, :3].T + best.T[:3, 3]
+    found = register(start, Mesh(placed, data.faces) if isinstance(data, Mesh) else placed,
                      config=RegistrationConfig(graph=RegistrationConfig().graph[-2:]), start=np.eye(4))
     joints, points, missing = _features(control, best, found)
     fit = fit_features(control, joints, points) if len(joints) + len(points) > 2 else None
@@ -140,6 +148,13 @@ def outward(scan: Mesh) -> Mesh:
     centre = scan.vertices.mean(axis=0)
     inside_out = Mesh(scan.vertices - centre, scan.faces).volume < 0
     return Mesh(scan.vertices, scan.faces[:, ::-1], scan.colors) if inside_out else scan
+
+
+def _facing_as(target: Target, scan: Mesh) -> Target:
+    """Points of a scan with the sign of their normals from its triangles."""
+    _, nearest = cKDTree(scan.vertices).query(target.points, workers=search_threads(len(target.points)))
+    inward = np.einsum("nd,nd->n", target.normals, scan.vertex_normals[nearest]) < 0
+    return replace(target, normals=np.where(inward[:, None], -1, 1) * target.normals, oriented=len(scan.faces) > 0)
 
 
 def _features(control: ControlModel, stand: Stand, found: Registration
