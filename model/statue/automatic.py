@@ -1,16 +1,18 @@
 """Joint centres and facial points of a person who stands upright, without a click."""
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from scanprep.geometry.formats.common import UNITS
 from scanprep.geometry.mesh import Mesh
 from scanprep.matching.confidence import stretched_share
-from scanprep.matching.matches import target_of
+from scanprep.matching.matches import Target, target_of
 from scanprep.matching.nonrigid import Registration, RegistrationConfig, register
-from scanprep.threads import one_thread
+from scanprep.matching.thinning import thin
+from scanprep.threads import one_thread, search_threads
 
 from .articulated import Articulated
 from .control import ControlModel
@@ -18,7 +20,10 @@ from .features import FeatureFit, fit_features
 from .person_search import Stand, find_person
 from .pose_search import PoseSearch
 
-HEIGHTS = 0.45, 2.6              # metres, end to end: a part of a person, or one with the arms raised
+STATURE = 1.7                    # metres
+NOBODY, EITHER = 0.042, 1.05     # misfit, and margin, of what is no person
+DOUBTED = 0.025, 1.2, 0.05       # misfit, margin and share missed of a person with a limb in a wrong place
+MANY, SPACING = 40_000, 0.007    # points of a scan, and to how many metres apart more of them are thinned
 SHOWN = 0.3                      # share of the vertices around a joint that have data
 
 
@@ -37,7 +42,7 @@ class Features:
     fit : FeatureFit or None
         Of the control model to these features.
     unit : str
-        The first of m, mm, cm and in in which a person, or part of one, would be as large as the scan.
+        Of m, mm, cm and in the one in which the scan would be most nearly as long as a person is tall.
     up, front : (3,) float, unit
         Upwards, and to where the person faces.
     misfit : float, metres
@@ -90,25 +95,52 @@ def find_features(control: ControlModel, scan: Mesh) -> Features:
     search = PoseSearch(Articulated(control))
     scan = outward(scan)
     unit = likely_unit(scan.vertices)
-    target = target_of(scan)
+    data = scan if len(scan.vertices) < MANY else scan.vertices[thin(scan.vertices, SPACING / UNITS[unit])]
+    target = target_of(data)
+    if data is not scan:
+        target = _facing_as(target, scan)
     stands = find_person(search, target, UNITS[unit])
     best = stands[0]
     margin = stands[1].misfit / best.misfit if len(stands) > 1 else np.inf
+    up, front = (best.direction(search, np.array(axis)) for axis in ((0.0, 0, 1), (0.0, -1, 0)))
+    problem = nobody_problem(best.off, margin, unit)
+    if problem:
+        return Features({}, {}, (*control.skeleton.names, *control.landmarks), None, None, unit, up, front, best.off,
+                        margin, np.nan, np.nan, problem)
     start = search.mesh(best.posed)
-    found = register(start, Mesh(scan.vertices @ best.T[:3, :3].T + best.T[:3, 3], scan.faces),
-                     config=RegistrationConfig(graph=RegistrationConfig().graph[-2:]))
+    placed = (data.vertices if isinstance(data, Mesh) else data) @ best.T[:3, :3].T + best.T[:3, 3]
+    found = register(start, Mesh(placed, data.faces) if isinstance(data, Mesh) else placed,
+                     config=RegistrationConfig(graph=RegistrationConfig().graph[-2:]), start=np.eye(4))
     joints, points, missing = _features(control, best, found)
     fit = fit_features(control, joints, points) if len(joints) + len(points) > 2 else None
-    return Features(joints, points, missing, control.mesh.with_vertices(best.to_scan(found.mesh.vertices)), fit, unit,
-                    best.direction(search, np.array([0.0, 0, 1])), best.direction(search, np.array([0.0, -1, 0])),
-                    best.misfit, margin, found.missed, stretched_share(start, found.mesh), None)
+    registered = control.mesh.with_vertices(best.to_scan(found.mesh.vertices))
+    return Features(joints, points, missing, registered, fit, unit, up, front, best.off, margin, found.missed,
+                    stretched_share(start, found.mesh), doubts(best.off, margin, found.missed))
+
+
+def nobody_problem(off: float, margin: float, unit: str) -> str | None:
+    """Why there is no person in a scan, or none that stands upright; None where there is one."""
+    if off <= NOBODY and margin >= EITHER:
+        return None
+    return (f"no person who stands upright was found (the unit taken for {unit}): a body bent onto the scan stays "
+            f"{1000 * off:.0f} mm off, and {margin:.2f} times as far when it faces another way; something else, or a "
+            "pose that needs clicks?")
+
+
+def doubts(off: float, margin: float, missed: float) -> str | None:
+    """Why features should not be trusted; None where they may be."""
+    reasons = [text for text, wrong in (
+        (f"the posed body stays {1000 * off:.0f} mm off the scan", off > DOUBTED[0]),
+        (f"facing another way it fits only {margin:.2f} times worse", margin < DOUBTED[1]),
+        (f"{100 * missed:.0f}% of the scan lies off the registered one", missed > DOUBTED[2])) if wrong]
+    return "; ".join(reasons) + ": look at it, or click" if reasons else None
 
 
 def likely_unit(points: np.ndarray) -> str:
-    """The first of m, mm, cm and in in which points (n, 3) span as much as a person or a part of one."""
+    """The unit in which points (n, 3) span most nearly as much as a person."""
     spread = points - points.mean(axis=0)
     longest = float(np.ptp(spread @ np.linalg.svd(spread[:: max(1, len(spread) // 5000)], full_matrices=False)[2][0]))
-    return next((unit for unit in ("m", "mm", "cm", "in") if HEIGHTS[0] <= UNITS[unit] * longest <= HEIGHTS[1]), "m")
+    return min(UNITS, key=lambda unit: abs(np.log(max(longest, 1e-12) * UNITS[unit] / STATURE)))
 
 
 def outward(scan: Mesh) -> Mesh:
@@ -116,6 +148,13 @@ def outward(scan: Mesh) -> Mesh:
     centre = scan.vertices.mean(axis=0)
     inside_out = Mesh(scan.vertices - centre, scan.faces).volume < 0
     return Mesh(scan.vertices, scan.faces[:, ::-1], scan.colors) if inside_out else scan
+
+
+def _facing_as(target: Target, scan: Mesh) -> Target:
+    """Points of a scan with the sign of their normals from its triangles."""
+    _, nearest = cKDTree(scan.vertices).query(target.points, workers=search_threads(len(target.points)))
+    inward = np.einsum("nd,nd->n", target.normals, scan.vertex_normals[nearest]) < 0
+    return replace(target, normals=np.where(inward[:, None], -1, 1) * target.normals, oriented=len(scan.faces) > 0)
 
 
 def _features(control: ControlModel, stand: Stand, found: Registration

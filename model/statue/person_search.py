@@ -13,7 +13,7 @@ from scanprep.geometry.surface import Surface
 from scanprep.matching.matches import Target
 from scanprep.matching.thinning import thin
 
-from .features import limb_angles, limbs
+from .limbs import limb_angles, limbs
 from .pose_search import COARSE, FINE, Posed, PoseSearch
 
 CAP, NORMALS = 0.08, 0.05        # metres: of a distance, and what a difference of normals of one is worth
@@ -22,7 +22,7 @@ HEADINGS = 8
 PART = 0.85                      # of the model's height: lower scans may be of a part of a person
 TRIED, ARMS_BENT = 8, 3          # starts of the body, and of an arm, that are bent a little
 RIVAL = 1.3                      # a stand that fits worse by this factor is no more than the other facing
-ASTRAY = 0.01                    # share of a scan off the body, by more than a hand: a limb is in a wrong place
+ASTRAY = 0.01, 0.25              # shares of a scan off the body, by more than a hand: arms are in a wrong place
 # Outwards, frontwards, upwards: where an upper arm may point, and a forearm, which else goes on straight.
 UPPER_ARMS = ((0.4, 0, -1), (0.7, 0.4, -0.7), (0.6, -0.6, -0.7), (1, 0, 0), (0.8, 0.6, 0.2), (0.2, 1, 0), (0.8, 0, 0.7),
               (0.2, 0, 1), (0.2, 0.7, 0.7))
@@ -38,12 +38,15 @@ class Stand:
     T : (4, 4) float
         Similarity from the scan to the axes and the size of the control model.
     posed : Posed
+    off : float, metres
+        Root mean square distance of the scan from the body, at most `CAP` each, turned normals counted in.
     misfit : float, metres
-        Root mean square distance between scan and body, each at most `CAP`, turned normals counted in.
+        The same with the distances of the body from the scan, which count less: what the best stand is chosen by.
     """
 
     T: np.ndarray
     posed: Posed
+    off: float
     misfit: float
 
     @property
@@ -83,7 +86,7 @@ def bend(search: PoseSearch, target: Target, T: np.ndarray, posed: Posed, stages
     """The stand that a start leads to."""
     goal = moved(target, T).thinned(0.02)
     posed = search.run(posed, goal, stages)
-    return Stand(T, posed, misfit(search.mesh(posed), goal))
+    return Stand(T, posed, *misfit(search.mesh(posed), goal))
 
 
 def moved(target: Target, T: np.ndarray) -> Target:
@@ -92,15 +95,16 @@ def moved(target: Target, T: np.ndarray) -> Target:
     return replace(target, points=target.points @ T[:3, :3].T + T[:3, 3], normals=target.normals @ turn.T)
 
 
-def misfit(body: Mesh, goal: Target) -> float:
-    """How far apart a body and a scan are: see `Stand`."""
+def misfit(body: Mesh, goal: Target) -> tuple[float, float]:
+    """How far apart a body and a scan are: `off` and `misfit` of a `Stand`."""
     there = Surface(body).closest(goal.points)
     facing = np.einsum("nd,nd->n", body.face_normals[there.faces], goal.normals)
     facing = facing if goal.oriented else np.abs(facing)
     off = np.minimum(there.distances**2 + NORMALS**2 * (1 - facing), CAP**2)
     near = cKDTree(np.hstack([goal.points, NORMALS * goal.normals]))
     back = np.minimum(near.query(np.hstack([body.vertices, NORMALS * body.vertex_normals]))[0] ** 2, CAP**2)
-    return float(np.sqrt(off.mean() + UNSEEN * (back @ body.vertex_areas) / body.vertex_areas.sum()))
+    unseen = float(back @ body.vertex_areas) / float(body.vertex_areas.sum())
+    return float(np.sqrt(off.mean())), float(np.sqrt(off.mean() + UNSEEN * unseen))
 
 
 def rough_stands(search: PoseSearch, target: Target, metres: float) -> list[np.ndarray]:
@@ -150,14 +154,14 @@ def with_arms(search: PoseSearch, target: Target, stand: Stand) -> Stand:
     goal = moved(target, stand.T).thinned(0.02)
     coarse = goal.thinned(0.05)
     for base, middle, end in limbs(search.model):
-        off = Surface(search.mesh(stand.posed)).closest(goal.points).distances
-        if (off > CAP).mean() < ASTRAY:
+        astray = (Surface(search.mesh(stand.posed)).closest(goal.points).distances > CAP).mean()
+        if not ASTRAY[0] < astray < ASTRAY[1]:
             break
         if end is None or not _is_arm(search, base):
             continue
         starts = [_pointed(search, stand.posed, base, middle, end, np.array([upper, fore]))
                   for upper in UPPER_ARMS for fore in (upper, *FOREARMS)]
-        starts.sort(key=lambda posed: misfit(search.mesh(posed), coarse))
+        starts.sort(key=lambda posed: misfit(search.mesh(posed), coarse)[1])
         # No coarser: from afar a hand beside the head is drawn to the head.
         stand = min([stand, *(bend(search, target, stand.T, posed, FINE) for posed in starts[:ARMS_BENT])],
                     key=lambda s: s.misfit)

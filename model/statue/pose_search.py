@@ -6,7 +6,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from scanprep.geometry.mesh import Mesh
-from scanprep.matching.matches import Likeness, Target, match_both_ways
+from scanprep.matching.energies import Pull, pull
+from scanprep.matching.matches import Described, Likeness, Target, orient, tukey
 from scanprep.matching.thinning import thin
 from scanprep.ranges import Cell, Count, Positive, Settings
 
@@ -107,8 +108,7 @@ class PoseSearch:
         model, x = self.model, posed.x
         frames, points = model.frames(x), self.points(posed.girth)
         mesh = model.control.mesh.with_vertices(model.positions(frames, points))
-        wanted = match_both_ways(mesh, self.sample, self.area, goal, stage.reach, stage.slide,
-                                 Likeness(normals=self.normals)).wanted
+        wanted = self.wanted(mesh, goal, stage)
         D = model.derivatives(frames, points)
         rows = D.reshape(-1, len(x))
         H = rows.T @ (wanted.A @ D).reshape(-1, len(x))
@@ -125,6 +125,28 @@ class PoseSearch:
         weight = np.einsum("ni,nij,nj->n", outward, wanted.A, outward)
         more = (self.segments.T @ np.einsum("ni,ni->n", outward, off)) / (self.segments.T @ weight + 0.02 * self.area)
         return Posed(moved, np.clip(posed.girth + more, *GIRTH))
+
+    def wanted(self, mesh: Mesh, goal: Target, stage: PoseStage) -> Pull:
+        """What matches in both directions want of the vertices.
+
+        A match of a vertex counts where its point of the scan, in turn, chooses a vertex nearby on the body: a forearm
+        that was not scanned is not drawn to the hip.
+        """
+        goal = orient(goal, mesh, self.normals)
+        like, N = Likeness(normals=self.normals), len(mesh.vertices)
+        mine = Described(mesh.vertices, mesh.vertex_normals)
+        theirs = Described(goal.points, goal.normals)
+        chosen, far = theirs.matched(mine, stage.reach, like)
+        p = np.flatnonzero(chosen >= 0)
+        wanted = pull(N, chosen[p], goal.points[p], self.area / len(goal.points) * tukey(far[p], stage.reach),
+                      goal.normals[p], stage.slide)
+        found, far = mine.of(self.sample).matched(theirs, stage.reach, like)
+        rest = self.model.control.mesh.vertices
+        apart = np.linalg.norm(rest[self.sample] - rest[chosen[found]], axis=1)
+        good = (found >= 0) & (chosen[found] >= 0) & ~goal.border[found] & (apart < stage.reach)
+        weights = self.area / len(self.sample) * tukey(far[good], stage.reach)
+        return wanted + pull(N, self.sample[good], goal.points[found[good]], weights, goal.normals[found[good]],
+                             stage.slide)
 
 
 def _bounded_step(x: np.ndarray, H: np.ndarray, g: np.ndarray, bounds: np.ndarray) -> np.ndarray:
