@@ -208,6 +208,21 @@ def test_a_motion_comes_back_from_another_rest_pose_and_other_axes(table, Q):
     assert np.abs(given.poses - found.poses).max() < 1e-9
 
 
+def test_feet_are_flat_at_rest_or_square_to_legs_that_are_apart():
+    still = np.zeros((1, 17, 3))
+    for apart in (0.05, 0.3):
+        bvh = in_t_pose(still, MIXAMO, Y_UP)
+        shanks = {bvh.names.index(MIXAMO[f"{side}_ankle"]): sign for side, sign in (("l", 1), ("r", -1))}
+        offsets = bvh.offsets.copy()
+        for ankle, sign in shanks.items():
+            offsets[ankle] = np.linalg.norm(offsets[ankle]) * np.array([sign * np.sin(apart), -np.cos(apart), 0])
+        found = bvh_motion(humanoid(), GENERIC, replace(bvh, offsets=offsets))
+        R = world(humanoid(), found)[0]
+        for name, sign in (("l_ankle", 1), ("r_ankle", -1)):
+            tilt = sign * (apart if apart > 0.1 else 0)
+            assert np.abs(R[NAMES.index(name)] - rotations.exp(np.array([0, -tilt, 0]))).max() < 1e-9
+
+
 def test_a_frame_may_stand_for_the_rest():
     """Files whose offsets say nothing about the rest pose."""
     rng = np.random.default_rng(2)
