@@ -7,11 +7,14 @@ from model_bodies import worm, worm_model
 
 from model.export.bvh import write_bvh
 from model.export.bvh_read import BvhMotion, read_bvh
+from model.export.cli import read_motion
 from model.export.rig import joint_places
+from model.features import linear_features
+from model.skinning import SkinningModel
 from model.statue.bone_names import find_roles, trunk
 from model.statue.follow import Follower, _bound
 from model.statue.humanoid import humanoid
-from model.statue.motion import MotionConfig, bvh_motion, own_motion, people_motion
+from model.statue.motion import MotionConfig, bvh_motion, own_motion, people_motion, write_motion
 from scanprep.geometry import rotations
 from scanprep.geometry.storage import StorageError
 from scanprep.geometry.surface import Surface
@@ -43,7 +46,17 @@ def test_a_motion_of_its_own_parts(tmp_path):
     good = {"poses": poses.reshape(4, -1), "trans": trans, "mocap_frame_rate": np.array(25.0)}
     np.savez(tmp_path / "a.npz", **good)
     found = own_motion(control, tmp_path / "a.npz")
-    assert np.array_equal(found.poses, poses) and np.array_equal(found.trans, trans) and found.rate == 25
+    assert np.array_equal(found.poses, poses) and found.rate == 25
+    rest = control.mesh.vertices
+    model = SkinningModel(control.mesh, control.skeleton, rest, control.weights,
+                          linear_features(control.skeleton, (np.zeros((3, 0)),) * 17), np.zeros((0, *rest.shape)), rest,
+                          np.zeros((0, *rest.shape)), np.zeros(0), 0.0, np.zeros((17, 3)), np.eye(51))
+    assert np.abs(control.rig.vertices(found.poses, found.trans) - model.vertices(poses, None, trans)).max() < 1e-9
+    assert np.linalg.norm(found.trans - trans, axis=1).max() > 1e-3, "skinning moves the middle of the root part"
+    write_motion(tmp_path / "again.npz", control, found)
+    again = own_motion(control, tmp_path / "again.npz")
+    assert np.array_equal(again.poses, poses) and np.abs(again.trans - found.trans).max() < 1e-12 and again.rate == 25
+    assert np.abs(read_motion(tmp_path / "again.npz", model).trans - trans).max() < 1e-12
     for change, words in (({"poses": np.zeros((4, 48))}, "17 parts"), ({"trans": np.zeros((3, 3))}, "trans"),
                           ({"trans": trans * np.nan}, "finite"), ({"mocap_frame_rate": np.array(0.0)}, "rate")):
         np.savez(tmp_path / "b.npz", **{**good, **change})
@@ -193,6 +206,21 @@ def test_a_motion_comes_back_from_another_rest_pose_and_other_axes(table, Q):
         bvh_motion(control, GENERIC, odd)
     given = bvh_motion(control, GENERIC, odd, names={"l_hip": "Peter"})
     assert np.abs(given.poses - found.poses).max() < 1e-9
+
+
+def test_feet_are_flat_at_rest_or_square_to_legs_that_are_apart():
+    still = np.zeros((1, 17, 3))
+    for apart in (0.05, 0.3):
+        bvh = in_t_pose(still, MIXAMO, Y_UP)
+        shanks = {bvh.names.index(MIXAMO[f"{side}_ankle"]): sign for side, sign in (("l", 1), ("r", -1))}
+        offsets = bvh.offsets.copy()
+        for ankle, sign in shanks.items():
+            offsets[ankle] = np.linalg.norm(offsets[ankle]) * np.array([sign * np.sin(apart), -np.cos(apart), 0])
+        found = bvh_motion(humanoid(), GENERIC, replace(bvh, offsets=offsets))
+        R = world(humanoid(), found)[0]
+        for name, sign in (("l_ankle", 1), ("r_ankle", -1)):
+            tilt = sign * (apart if apart > 0.1 else 0)
+            assert np.abs(R[NAMES.index(name)] - rotations.exp(np.array([0, -tilt, 0]))).max() < 1e-9
 
 
 def test_a_frame_may_stand_for_the_rest():

@@ -8,7 +8,8 @@ from pathlib import Path
 
 import numpy as np
 
-from scanprep.geometry.storage import load_arrays, numbers, taking_apart
+from scanprep.geometry.mesh import Mesh
+from scanprep.geometry.storage import load_arrays, numbers, taking_apart, writing
 from scanprep.skeleton.tree import Skeleton
 
 from ..export.bvh_read import BvhMotion
@@ -19,6 +20,9 @@ from .retarget import MotionConfig, Pairing, StatueMotion, retargeted
 
 def own_motion(control: ControlModel, path: str | Path) -> StatueMotion:
     """A motion file (`poses`, `trans`, `mocap_frame_rate`) of the statue's own parts.
+
+    In such files trans is the travel of the middle of part 0, as body models place themselves; here that of the root's
+    joint, as in a rig. Skinning moves the one a little against the other.
 
     Raises
     ------
@@ -32,7 +36,25 @@ def own_motion(control: ControlModel, path: str | Path) -> StatueMotion:
         poses = numbers({"poses": stored["poses"].reshape(T, -1)}, "poses", None, 3 * J).reshape(T, J, 3)
         rate = stored["mocap_frame_rate" if "mocap_frame_rate" in stored else "mocap_framerate"]
         poses, trans = check_motion(control.skeleton, poses, numbers(stored, "trans", T, 3), float(rate))
-        return StatueMotion(poses, trans, float(rate), dict(zip(names, names, strict=True)))
+        return StatueMotion(poses, trans - middle_drift(control, poses), float(rate),
+                            dict(zip(names, names, strict=True)))
+
+
+def write_motion(path: str | Path, control: ControlModel, motion: StatueMotion) -> None:
+    """Write a motion as `own_motion` reads it, with the array names that body-model files use."""
+    arrays = {"poses": motion.poses.reshape(len(motion.poses), -1),
+              "trans": motion.trans + middle_drift(control, motion.poses), "betas": np.zeros(0),
+              "mocap_frame_rate": np.array(float(motion.rate)), "surface_model_type": np.array("skinning")}
+    with writing(path) as beside, open(beside, "wb") as out:
+        np.savez_compressed(out, allow_pickle=False, **arrays)  # type: ignore[arg-type]
+
+
+def middle_drift(control: ControlModel, poses: np.ndarray) -> np.ndarray:
+    """(T, 3) how far skinning moves the middle of part 0 from the root's joint in poses (T, J, 3), metres."""
+    ids, share = control.skeleton.joint_weights(control.mesh, 0)
+    some = replace(control.rig, mesh=Mesh(control.mesh.vertices[ids], np.zeros((0, 3), dtype=np.int64)),
+                   weights=control.weights[ids], shapes=np.zeros((0, len(ids), 3)))
+    return np.asarray(share @ some.vertices(poses) - control.skeleton.joints[0])
 
 
 def people_motion(control: ControlModel, pose: np.ndarray, poses: np.ndarray, trans: np.ndarray | None = None,

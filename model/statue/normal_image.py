@@ -64,18 +64,22 @@ def normal_image(control: ControlModel, vertices: np.ndarray, subdivision: Subdi
     rows, columns, face, bary = control.chart.texels(size)
     N = np.einsum("nc,ncd->nd", bary, control.mesh.vertex_normals[control.mesh.faces[face]])
     T = np.einsum("nc,ncd->nd", bary, chart_tangents(control.mesh, control.chart)[control.chart.faces[face]])
-    B = np.cross(N, T[:, :3]) * np.sign(T[:, 3:])
-    frame = np.stack([T[:, :3], B, N], axis=2)
+    T, side = T[:, :3], np.sign(T[:, 3:])
+    B = np.cross(N, T) * side
     detail, at = Mesh(vertices, subdivision.faces), np.full((size, size), -1)
     there = subdivision.chart.texels(size)
     at[there[0], there[1]] = np.arange(len(there[0]))
     known = at[rows, columns] >= 0
     fine_face, fine_bary = there[2][at[rows, columns][known]], there[3][at[rows, columns][known]]
     fine = np.einsum("nc,ncd->nd", fine_bary, detail.vertex_normals[detail.faces[fine_face]])
-    local = _unit(np.linalg.solve(frame[known], fine[..., None])[..., 0])
+    rows, columns = rows[known], columns[known]
+    T, B, N, side = T[known], B[known], N[known], side[known]
+    # T, B and N are not quite perpendicular: fine = x T + y B + z N is solved, up to its length
+    local = side * _unit(np.stack([np.einsum("nd,nd->n", fine, np.cross(*pair)) for pair in ((B, N), (N, T), (T, B))],
+                                  axis=1))
     out, covered = np.full((size, size, 3), (128, 128, 255), dtype=np.uint8), np.zeros((size, size), dtype=bool)
-    out[rows[known], columns[known]] = np.round(127.5 * (local + 1))
-    covered[rows[known], columns[known]] = True
+    out[rows, columns] = np.round(127.5 * (local + 1))
+    covered[rows, columns] = True
     return padded(out, covered)
 
 

@@ -18,6 +18,7 @@ from .control import ControlModel
 _CHAINS = (("shoulder", "elbow", "wrist"), ("hip", "knee", "ankle"))
 _ON_THE_FLOOR = 5                    # percentile of the lowest vertex over the frames: some frames may err
 _AT_ONCE = 200                       # frames
+_APART = np.radians(10)              # from the vertical, of a shank at rest beyond which a foot is tilted with it
 
 
 @dataclass(frozen=True)
@@ -95,7 +96,8 @@ class Pairing:
     def alignment(self, aligned: bool) -> dict[int, np.ndarray]:
         """For each part the rotation from the axes of the generic model to those of the motion at rest.
 
-        The smallest turn that brings our bone to theirs, after that of the part above it.
+        The smallest turn that brings our bone to theirs, after that of the part above it. Feet stand flat, but where
+        the legs are far apart at rest (as in the CMU files) they are taken to be square to the shanks from the front.
         """
         J = len(self.control.skeleton.parents)
         whole = self.whole(aligned)
@@ -112,6 +114,12 @@ class Pairing:
                         A[self.ours[role]] = turn
                 if chain[2] == "wrist" and roles[2] in self.ours:
                     A[self.ours[roles[2]]] = turn                       # a hand continues the forearm
+                elif {*roles[1:]} <= self.ours.keys() & self.theirs.keys():
+                    knee, ankle = self.moving.rest[[self.theirs[role] for role in roles[1:]]]
+                    left, down, _ = self.standing(False).T @ (ankle - knee) * [1, -1, 1]
+                    aside = np.arctan2(left, down)
+                    if abs(aside) > _APART:
+                        A[self.ours[roles[2]]] = rotations.exp(aside * self.standing(False)[:, 2]) @ whole
         return A
 
     def trunk(self) -> np.ndarray:
@@ -127,12 +135,19 @@ class Pairing:
     def world(self, aligned: bool) -> np.ndarray:
         """The rotation (3, 3) from the axes of the motion to those of the scan: upwards to upwards, and forwards
         at rest to where the scan faces."""
-        _, up, there = (self.whole(aligned) @ self.axes).T
-        return _upright_axes(self.P[0] @ self.axes[:, 2], self.up) @ _upright_axes(there, _nearest_axis(up)).T
+        return _upright(self.P[0] @ self.axes[:, 2], self.up) @ self.standing(aligned).T
 
     def whole(self, aligned: bool) -> np.ndarray:
-        """The rotation (3, 3) from the axes of the generic model to those of the motion, of the bodies at rest."""
-        return np.eye(3) if aligned else _axes(self.moving.rest, self.theirs) @ self.axes.T
+        """The rotation (3, 3) from the axes of the generic model to those of the motion, both standing at rest."""
+        return self.standing(aligned) @ self.standing(True).T
+
+    def standing(self, ours: bool) -> np.ndarray:
+        """(3, 3) to the left, upwards and forwards in the rest of the generic model or of the motion.
+
+        Upwards is the axis next to the trunk: joints of a person who stands upright need not lie above each other.
+        """
+        _, high, forwards = (self.axes if ours else _axes(self.moving.rest, self.theirs)).T
+        return _upright(forwards, _nearest_axis(high))
 
 
 def retargeted(pair: Pairing, aligned: bool, config: MotionConfig) -> StatueMotion:
@@ -222,7 +237,7 @@ def _nearest_axis(direction: np.ndarray) -> np.ndarray:
     return np.eye(3)[main] * np.sign(direction[main])
 
 
-def _upright_axes(forwards: np.ndarray, up: np.ndarray) -> np.ndarray:
+def _upright(forwards: np.ndarray, up: np.ndarray) -> np.ndarray:
     """(3, 3) columns: to the left, upwards and, level, forwards."""
     level = forwards - (forwards @ up) * up
     if np.linalg.norm(level) < 0.1:                                     # lies on the back or on the face
