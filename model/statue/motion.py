@@ -97,12 +97,15 @@ def bvh_motion(control: ControlModel, pose: np.ndarray, bvh: BvhMotion, referenc
                config: MotionConfig | None = None) -> StatueMotion:
     """The motion of a BVH file, by the names of its joints and the directions of its bones.
 
-    A part follows the rotation of its joint against the rest of the file, whatever that is: bones of arms and legs
-    then point where those of the file do, hands continue the forearms as at rest, and trunk, head and feet keep
-    their angle to the facing direction. The trunk of the file, of any number of joints, becomes one rotation that
-    brings neck and shoulders nearest to where it brings them. Travel is scaled by the length of the legs; the
-    statue starts where the scan stands, it faces as the scan does where a person of the file faces as at rest, and its
-    lowest vertex in the motion is as low as in the scan. Upwards is the axis of the file that is nearest to the trunk
+    A part follows the rotation of its joint against the rest of the file, in which somebody stands upright: bones of
+    arms and legs then point where those of the file do, hands continue the forearms as at rest, and trunk, head and
+    feet are level where those of the file are turned as at rest. The trunk of the file, of any number of joints,
+    becomes one rotation that brings neck and shoulders nearest to where it brings them. Joints between two that are
+    matched count with the rotations below them.
+
+    Travel is scaled by the length of the legs, so the unit of the file does not matter. The statue starts where the
+    scan stands, it faces as the scan does where a person of the file faces as at rest, and its lowest vertex is as low
+    as in the scan in all but a twentieth of the frames. Upwards is the axis of the file that is nearest to the trunk
     at rest: y, as BVH says, but some programs write z.
 
     Parameters
