@@ -79,7 +79,7 @@ class PoseSearch:
         self.area = float(mesh.face_areas.sum())
         self.sample = thin(mesh.vertices, 0.03)
         self.segments = model.control.weights @ model.is_of
-        self.bounds = np.concatenate([model.limits, [BOUNDS] * len(model.lengths), [[-np.inf, np.inf]] * 3])
+        self.bounds = np.concatenate([model.limits, np.tile(BOUNDS, (len(model.lengths), 1)), [[-np.inf, np.inf]] * 3])
 
     @property
     def start(self) -> Posed:
