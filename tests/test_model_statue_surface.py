@@ -7,7 +7,8 @@ from scipy.special import logsumexp
 
 from model.statue.local_shape import local_shape
 from model.statue.soft_assignment import ScanPoints, assign
-from model.statue.surface_fit import SurfaceFitConfig, distortion, fit_surface
+from model.statue.surface_data import distortion
+from model.statue.surface_fit import SurfaceFitConfig, fit_surface
 from scanprep.geometry import rotations
 from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.sparse import Factored

@@ -13,7 +13,7 @@ from scipy.sparse import csc_array, diags_array, eye_array
 
 from scanprep.geometry.mesh import Mesh, check_template
 from scanprep.geometry.sparse import Factored
-from scanprep.geometry.surface import Surface
+from scanprep.geometry.surface import Surface, checked_points
 from scanprep.matching.matches import Target, target_of
 from scanprep.matching.shell import conjugate_gradients, flipped, unfold
 from scanprep.matching.turns import turns
@@ -22,8 +22,10 @@ from scanprep.threads import one_thread
 
 from .local_shape import LocalShape, local_shape
 from .soft_assignment import ScanPoints, Slack, SoftAssignment, assign
+from .surface_data import SurfaceData, distortion
 
 AGREE = 0.3              # least cosine between normals of the scan and the mesh, for points that draw the mesh
+BACK = 10                # times that vertices go back from the surface because a triangle turned over
 SAMPLE = 10              # such points of the scan for each vertex
 
 
@@ -88,8 +90,8 @@ class SurfaceFit:
         Triangles that face against their surroundings.
     distortion : float
         Root mean square over the area of the logarithm of the stretches against the rest shape.
-    energies : {"shape", "data", "entropy": float}
-        Terms of Eq. 16 after the last step at the last temperature, square metres.
+    energies : {"shape", "data", "entropy", "cover": float}
+        Terms of Eq. 16, and our own, after the last step at the last temperature, square metres.
     temperatures : (K,) float, square metres
     steps : (K,) int
         Steps at each of them.
@@ -135,10 +137,9 @@ def fit_surface(rest: Mesh, start: np.ndarray, scan: Mesh, config: SurfaceFitCon
     """
     config = config or SurfaceFitConfig()
     check_template(rest, "rest")
-    start = np.array(start, dtype=np.float64)
-    if start.shape != rest.vertices.shape or not np.isfinite(start).all():
-        raise ValueError(f"start: expected finite vertices of shape {rest.vertices.shape}, got {start.shape} with "
-                         f"{int((~np.isfinite(start)).sum())} that are not")
+    start = checked_points(start, "start")
+    if start.shape != rest.vertices.shape:
+        raise ValueError(f"start: expected shape {rest.vertices.shape}, got {start.shape}")
     if not len(scan.faces):
         raise ValueError(f"scan: expected at least one triangle, got {scan}")
     fit = _Fit(rest, start, _target(scan), float(scan.face_areas.sum()), config)
@@ -158,33 +159,6 @@ def fit_surface(rest: Mesh, start: np.ndarray, scan: Mesh, config: SurfaceFitCon
     return fit.result(surface, temperatures)
 
 
-@dataclass(frozen=True, eq=False)
-class _Data:
-    """A data term: Σ (x - y)ᵀ A (x - y) + share · |C x - z|², vertices and points of the scan that draw the mesh."""
-
-    A: np.ndarray
-    y: np.ndarray
-    C: csc_array
-    z: np.ndarray
-    share: float
-
-    def energy(self, x: np.ndarray) -> float:
-        return (float(np.einsum("ni,nij,nj->", x - self.y, self.A, x - self.y))
-                + self.share * float(((self.C @ x - self.z) ** 2).sum()))
-
-    def force(self, x: np.ndarray) -> np.ndarray:
-        """(N, 3) minus half the gradient."""
-        return np.einsum("nij,nj->ni", self.A, self.y - x) + self.share * (self.C.T @ (self.z - self.C @ x))
-
-    def applied(self, d: np.ndarray) -> np.ndarray:
-        return np.einsum("nij,nj->ni", self.A, d) + self.share * (self.C.T @ (self.C @ d))
-
-    @property
-    def bound(self) -> csc_array:
-        """(N, N) the same for each coordinate, at least as stiff."""
-        return csc_array(diags_array(np.linalg.eigvalsh(self.A)[:, 2]) + self.share * (self.C.T @ self.C))
-
-
 class _Fit:
     """A control mesh on its way."""
 
@@ -192,8 +166,7 @@ class _Fit:
         self.rest, self.x, self.target, self.config = rest, start, target, config
         self.shape: LocalShape = local_shape(rest)
         self.points = ScanPoints(target.points, target.normals, target.border)
-        self.W = diags_array(self.shape.weights)
-        self.stiffness = csc_array(self.shape.plane.T @ self.W @ self.shape.plane)
+        self.stiffness = csc_array(self.shape.plane.T @ diags_array(self.shape.weights) @ self.shape.plane)
         self.sample = target.thinned(max(float(np.sqrt(area / (SAMPLE * len(start)))), 1e-4))
         self.nothing = csc_array((0, len(start))), np.zeros((0, 3)), 0.0
         self.steps: list[int] = []
@@ -215,23 +188,23 @@ class _Fit:
 
     def anneal(self, T: float) -> None:
         """Steps at one temperature until the gradient lies within the region of matching."""
+        explicit = self.config.step == "explicit"
         for count in range(self.config.most + 1):
             matches, A = self.assignment(T)
             wanted = matches.matches @ self.points.points
-            if self.config.step == "explicit":
-                data = _Data(A, wanted, *self.nothing)
+            if explicit:
+                data = SurfaceData(A, wanted, *self.nothing)
                 force = data.force(self.x) + self.config.shape * self.shape.published_force(self.x)
-                x = self.x + self.config.rate * force                                     # Eq. 18
             else:
                 data = self.drawn(A, wanted)
                 force = self.force(data)
-            if np.linalg.norm(force, axis=1).max() <= np.sqrt(T) and count:
+            self.converged = bool(np.linalg.norm(force, axis=1).max() <= np.sqrt(T))
+            if (self.converged and count) or count == self.config.most:
                 break
-            if count < self.config.most:
-                self.x = x if self.config.step == "explicit" else self.stepped(data, force)
-        self.converged = bool(np.linalg.norm(force, axis=1).max() <= np.sqrt(T))
+            self.x = self.x + self.config.rate * force if explicit else self.stepped(data, force)     # Eq. 18
         misfit, entropy = matches.energy(self.x, self.points.points, T)
-        self.energies = {"shape": self.config.shape * self.shape.energy(self.x), "data": misfit, "entropy": entropy}
+        self.energies = {"shape": self.config.shape * self.shape.energy(self.x), "data": misfit, "entropy": entropy,
+                         "cover": data.cover(self.x)}
         self.steps.append(count)
 
     def assignment(self, T: float) -> tuple[SoftAssignment, np.ndarray]:
@@ -260,25 +233,24 @@ class _Fit:
         nearest = self.points.nearest(self.x, self.mesh.vertex_normals, 1)[0][:, 0]
         return self.beside_data(nearest), nearest
 
-    def drawn(self, A: np.ndarray, wanted: np.ndarray) -> _Data:
-        """The data term that draws vertices to `wanted` (N, 3) by A (N, 3, 3), and points of the scan the mesh to them.
-        """
+    def drawn(self, A: np.ndarray, wanted: np.ndarray) -> SurfaceData:
+        """The data term that draws vertices to `wanted` (N, 3) by A (N, 3, 3), and the mesh to points of the scan."""
         mesh = self.mesh
         if not self.config.cover:
-            return _Data(A, wanted, *self.nothing)
+            return SurfaceData(A, wanted, *self.nothing)
         found = Surface(mesh).closest(self.sample.points)
         corners = mesh.faces[found.faces]
         normals = np.einsum("pc,pcd->pd", found.bary, mesh.vertex_normals[corners])
         good = np.flatnonzero(np.einsum("pd,pd->p", normals, self.sample.normals) > AGREE)
         rows = np.repeat(np.arange(len(good)), 3)
         C = csc_array((found.bary[good].ravel(), (rows, corners[good].ravel())), shape=(len(good), len(self.x)))
-        return _Data(A, wanted, C, self.sample.points[good], self.config.cover * len(self.x) / len(found.faces))
+        return SurfaceData(A, wanted, C, self.sample.points[good], self.config.cover * len(self.x) / len(found.faces))
 
-    def force(self, data: _Data) -> np.ndarray:
+    def force(self, data: SurfaceData) -> np.ndarray:
         """(N, 3) minus half the exact gradient."""
         return data.force(self.x) - 0.5 * self.config.shape * self.shape.gradient(self.x)
 
-    def stepped(self, data: _Data, force: np.ndarray) -> np.ndarray:
+    def stepped(self, data: SurfaceData, force: np.ndarray) -> np.ndarray:
         """Vertices after a Gauss-Newton step on local shape and data."""
         shape, w, lam, x = self.shape, self.shape.weights[:, None], self.config.shape, self.x
         nearly = Factored(csc_array(lam * self.stiffness + data.bound + 1e-6 * lam * eye_array(len(x))))
@@ -303,12 +275,18 @@ class _Fit:
 
     def settle_down(self, surface: Surface) -> None:
         """Vertices with data onto the surface, where that turns no triangle over."""
-        normals = self.mesh.vertex_normals
-        seen, _ = self.seen()
+        self.x = unfold(self.rest, self.x, turns(self.rest, self.x))
+        normals, (free, _) = self.mesh.vertex_normals, self.seen()
         found = surface.closest(self.x)
-        agrees = np.einsum("nd,nd->n", surface.mesh.face_normals[found.faces], normals) > 0
-        y = np.where((seen & agrees)[:, None], found.points, self.x)
-        self.x = unfold(self.rest, y, turns(self.rest, y))
+        free &= np.einsum("nd,nd->n", surface.mesh.face_normals[found.faces], normals) > 0
+        already = flipped(self.rest, self.x, turns(self.rest, self.x))
+        for _ in range(BACK):
+            y = np.where(free[:, None], found.points, self.x)
+            turned = flipped(self.rest, y, turns(self.rest, y)) & ~already
+            if not turned.any():
+                break
+            free[self.rest.faces[turned]] = False
+        self.x = y
 
     def result(self, surface: Surface, temperatures: np.ndarray) -> SurfaceFit:
         """What was reached."""
@@ -326,17 +304,3 @@ def _target(scan: Mesh) -> Target:
     border[scan.boundary_vertices] = True
     border |= scan.vertex_adjacency @ border.astype(float) > 0       # the nearest point may lie one step farther in
     return replace(target_of(scan, name="scan"), border=border[np.unique(scan.faces)])
-
-
-def distortion(rest: Mesh, x: np.ndarray) -> float:
-    """Root mean square over the area at rest of the logarithm of the stretches of the triangles."""
-    def flat(c: np.ndarray) -> np.ndarray:
-        e, f = c[:, 1] - c[:, 0], c[:, 2] - c[:, 0]
-        length = np.maximum(np.linalg.norm(e, axis=1), 1e-12)
-        along = np.einsum("fd,fd->f", e, f) / length
-        height = np.linalg.norm(np.cross(e, f), axis=1) / length
-        return np.stack([np.stack([length, along], axis=1), np.stack([np.zeros_like(length), height], axis=1)], axis=1)
-
-    s = np.linalg.svd(flat(x[rest.faces]) @ np.linalg.inv(flat(rest.corners)), compute_uv=False)
-    stretch = (np.log(np.maximum(s, 1e-6)) ** 2).mean(axis=1)
-    return float(np.sqrt(np.average(stretch, weights=rest.face_areas)))
