@@ -60,17 +60,20 @@ class Reconstruction:
         self._spread = csr_array(hstack([share, diags_array(heights) @ share]), dtype=dtype)
         self._around = _around(mesh)
         self._turning = np.flatnonzero(rest.any(axis=1))
+        self._carriers = np.unique(corners[self._turning])
+        self._rotations = VertexRotations(mesh, self._carriers)
         self._rest: np.ndarray = rest[self._turning].astype(dtype)
-        self._share = csr_array(share[self._turning], dtype=dtype)
+        self._share = csr_array(share[self._turning][:, self._carriers], dtype=dtype)
 
     def __call__(self, control_vertices: np.ndarray) -> np.ndarray:
         """(n, 3) metres, the detailed surface on control vertices (N, 3)."""
         v = np.asarray(control_vertices, dtype=np.float64)
         if v.shape != self.control.mesh.vertices.shape:
             raise ValueError(f"control_vertices: expected shape {self.control.mesh.vertices.shape}, got {v.shape}")
-        out = self._spread @ np.concatenate([v, self._normals(v)]).astype(self.dtype)
+        n = self._normals(v)
+        out = self._spread @ np.concatenate([v, n]).astype(self.dtype)
         if len(self._turning):
-            R: np.ndarray = vertex_rotations(self.control.mesh, v).reshape(-1, 9).astype(self.dtype)
+            R: np.ndarray = self._rotations(v, n).reshape(-1, 9).astype(self.dtype)
             out[self._turning] += np.einsum("nij,nj->ni", (self._share @ R).reshape(-1, 3, 3), self._rest)
         return out
 
@@ -112,20 +115,36 @@ def _around(mesh: Mesh) -> csr_array:
     return csr_array((np.ones(len(faces)), (mesh.faces.ravel(), faces)), shape=(len(mesh.vertices), len(mesh.faces)))
 
 
-def vertex_rotations(rest: Mesh, vertices: np.ndarray) -> np.ndarray:
-    """(N, 3, 3) rotations that best turn the edges around each vertex of a mesh at rest to where they are now.
+class VertexRotations:
+    """Rotations that best turn the edges around some vertices of a mesh at rest to where they are now.
 
-    Edges with the normals in them, so that a ring of edges in a plane has one answer.
+    The normals are turned with the edges, so that a ring of edges in a plane has one answer.
+
+    Parameters
+    ----------
+    rest : Mesh
+    which : (k,) int
+        Vertices.
     """
-    moved = rest.with_vertices(vertices)
-    a, b = np.concatenate([rest.edges, rest.edges[:, ::-1]]).T
-    products = np.einsum("ei,ej->eij", vertices[a] - vertices[b], rest.vertices[a] - rest.vertices[b]).reshape(-1, 9)
-    count = len(rest.vertices)
-    S = (csr_array((np.ones(len(a)), (a, np.arange(len(a)))), shape=(count, len(a))) @ products).reshape(-1, 3, 3)
-    S += np.einsum("ni,nj->nij", moved.vertex_normals, rest.vertex_normals) * rest.mean_edge**2
-    U, _, Vt = np.linalg.svd(S)
-    U[:, :, 2] *= np.linalg.det(U @ Vt)[:, None]
-    return U @ Vt
+
+    def __init__(self, rest: Mesh, which: np.ndarray) -> None:
+        number = np.full(len(rest.vertices), -1)
+        number[which] = np.arange(len(which))
+        ends = np.concatenate([rest.edges, rest.edges[:, ::-1]])
+        self._a, self._b = ends[number[ends[:, 0]] >= 0].T
+        self._edges = rest.vertices[self._a] - rest.vertices[self._b]
+        self._normals, self._which = rest.vertex_normals[which] * rest.mean_edge**2, which
+        rows = np.arange(len(self._a))
+        self._sum = csr_array((np.ones(len(rows)), (number[self._a], rows)), shape=(len(which), len(rows)))
+
+    def __call__(self, vertices: np.ndarray, normals: np.ndarray) -> np.ndarray:
+        """(k, 3, 3) for vertices (N, 3) with unit normals (N, 3)."""
+        edges = vertices[self._a] - vertices[self._b]
+        S = (self._sum @ (edges[:, :, None] * self._edges[:, None]).reshape(-1, 9)).reshape(-1, 3, 3)
+        S = S + normals[self._which][:, :, None] * self._normals[:, None]
+        U, _, Vt = np.linalg.svd(S)
+        U[:, :, 2] *= np.linalg.det(U @ Vt)[:, None]
+        return U @ Vt
 
 
 @dataclass(frozen=True)
