@@ -20,9 +20,9 @@ from .lattice import Lattice
 from .normal_volume import interpolate
 
 RINGS = 5                            # vertices around a fold that are drawn with it
-STIFFNESS = (1000.0, 300.0, 100.0, 30.0, 10.0, 3.0, 1.0, 0.3, 0.1, 0.03)        # of the thin plate against the data
+STIFFNESS = (100.0, 30.0, 10.0, 3.0, 1.0, 0.3, 0.1, 0.03)   # of the thin plate against the data
 LOOSE = 0.001                        # weight of staying where nothing matches
-STEPS = 2                            # at each
+STEPS = 3                            # at each
 SPACING = 0.002                      # metres between the places of the scan that are matched
 SCALE = 0.01                         # metres that a turn of the normal by 60 degrees is worth in a match
 
