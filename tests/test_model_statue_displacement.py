@@ -19,6 +19,7 @@ from model.statue.reconstruction import (
     VertexRotations,
     chart_places,
     displaced_surface,
+    in_folds,
     inverted_triangles,
     remaining_error,
     surface_error,
@@ -252,6 +253,11 @@ def test_vectors_mend_an_overhang_and_nothing_else(control, mushroom):
     fine = subdivide(control.mesh, control.chart, 4)
     plain, bent = (Reconstruction(control, m, fine).mesh() for m in (replace(found, vectors=None), found))
     assert surface_error(bent, mushroom, 50_000).rms < 0.6 * surface_error(plain, mushroom, 50_000).rms
+    inverted = inverted_triangles(control, control.mesh.vertices, fine, bent.vertices)
+    assert len(inverted)                                     # the underside of the cap
+    folds = in_folds(control, found, fine)
+    assert folds[inverted].all()
+    assert in_folds(control, replace(found, vectors=None), fine).mean() < folds.mean() < 0.05
     shelf = mushroom.vertices[np.hypot(mushroom.vertices[:, 0], mushroom.vertices[:, 1]) > 0.0165]
     shelf = shelf[shelf[:, 2] > 0.205]                       # the cap's rim, beyond what heights can say
     far = [Surface(mesh).closest(shelf).distances.mean() for mesh in (plain, bent)]
@@ -260,10 +266,10 @@ def test_vectors_mend_an_overhang_and_nothing_else(control, mushroom):
 
 
 def test_a_control_mesh_that_is_folded_inside_the_scan_is_drawn_out(control, scan):
-    near = np.linalg.norm(control.mesh.vertices - [0, R, 0], axis=1) < 0.5 * R
+    near = np.linalg.norm(control.mesh.vertices - [0, R, 0], axis=1) < 0.35 * R
     dented = replace(control, mesh=control.mesh.with_vertices(
         control.mesh.vertices - np.where(near[:, None], [0, 0.8 * R, 0], 0)))
-    config = DisplacementConfig(size=SIZE)
+    config = DisplacementConfig(size=128)
     out = unfold_control(dented, scan, config)
     rms, folded = [], []
     for one in (dented, out):

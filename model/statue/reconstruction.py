@@ -13,10 +13,11 @@ from scanprep.pictures.textures import bilinear
 from .chart import Chart
 from .control import ControlModel
 from .normal_volume import from_normal_volume, interpolate, to_normal_volume
-from .statue import MEASURED, DisplacementMap
+from .statue import FOLDED, HOLE, MEASURED, OUTSIDE, DisplacementMap
 from .subdivision import Displaced, Subdivision
 
 SEED = 14                            # of the places at which errors are measured
+BESIDE = 3                           # pixels each way that count as one place
 
 
 def chart_places(chart: Chart, faces: np.ndarray, bary: np.ndarray) -> np.ndarray:
@@ -174,10 +175,7 @@ def remaining_error(control: ControlModel, map: DisplacementMap, scan: Mesh, cou
     points = scan.sample(count, np.random.default_rng(SEED))[0]
     found = to_normal_volume(control.mesh, points, reach)
     uv = chart_places(control.chart, np.maximum(found.faces, 0), found.bary)
-    height, width = map.coverage.shape
-    column, row = (np.clip(at.astype(int), 0, size - 1) for at, size in
-                   ((uv[:, 0] * width, width), ((1 - uv[:, 1]) * height, height)))
-    good = found.inside & (found.solutions == 1) & (map.coverage[row, column] == MEASURED)
+    good = found.inside & (found.solutions == 1) & (map.coverage[_pixels(map, uv)] == MEASURED)
     if not good.any():
         return SurfaceError(np.nan, np.nan, np.nan)
     stored = from_normal_volume(control.mesh, type(found)(found.faces[good], found.bary[good],
@@ -202,6 +200,29 @@ def inverted_triangles(control: ControlModel, vertices: np.ndarray, subdivision:
     _, n = interpolate(control.mesh.with_vertices(vertices), subdivision.parent, subdivision.bary)
     below = n[subdivision.faces].sum(axis=1)
     return np.flatnonzero(np.einsum("fd,fd->f", Mesh(detailed, subdivision.faces).face_normals, below) < 0)
+
+
+def in_folds(control: ControlModel, map: DisplacementMap, subdivision: Subdivision) -> np.ndarray:
+    """(f,) bool: fine triangles with a corner or their middle on, or beside, a pixel in a fold or hole.
+
+    With vectors also where these take part, some way around folds.
+    """
+    from scipy.ndimage import maximum_filter
+
+    bad = (map.coverage == FOLDED) | (map.coverage == HOLE)
+    if map.vectors is not None:
+        bad |= map.vectors.any(axis=2) & (map.coverage != OUTSIDE)
+    bad = maximum_filter(bad, BESIDE)
+    corners = subdivision.chart.uv[subdivision.chart.faces]
+    uv = np.concatenate([corners, corners.mean(axis=1, keepdims=True)], axis=1).reshape(-1, 2)
+    return bad[_pixels(map, uv)].reshape(-1, 4).any(axis=1)
+
+
+def _pixels(map: DisplacementMap, uv: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Rows and columns (n,) of the pixels at places (n, 2)."""
+    height, width = map.coverage.shape
+    return (np.clip(((1 - uv[:, 1]) * height).astype(int), 0, height - 1),
+            np.clip((uv[:, 0] * width).astype(int), 0, width - 1))
 
 
 def _error(distances: np.ndarray) -> SurfaceError:
