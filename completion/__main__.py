@@ -16,6 +16,7 @@ COMMANDS = {
              "completion.moshing.command.cli:mosh_markers"),
     "layout": ("Marker sets: look at them, carry them to other bodies, design them.",
                "completion.markers.cli:group"),
+    "statue": ("One scan -> a layered character that moves, with all its detail.", "model.statue.cli:group"),
     "track": ("Frames of points -> a moving body, without markers.", "completion.tracking.cli:track_frames"),
 }
 

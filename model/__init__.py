@@ -15,6 +15,7 @@ if TYPE_CHECKING:
     from .evaluation.errors import PoseErrors, ShapeErrors, compactness, pose_errors, shape_errors
     from .evaluation.sampling import Samples, Specificity, sample_bodies, specificity
     from .export.bvh import write_bvh
+    from .export.bvh_read import read_bvh
     from .export.correctives import motion_correctives
     from .export.glb import write_skinned_glb
     from .export.npz import write_body_npz
@@ -36,6 +37,11 @@ if TYPE_CHECKING:
     from .resolution.change import ResolutionConfig, change_resolution
     from .scape import ScapeModel
     from .skinning import SkinningModel
+    from .statue.control import ControlModel
+    from .statue.files import load_statue, save_statue
+    from .statue.fit import StatueConfig, fit_statue
+    from .statue.humanoid import humanoid
+    from .statue.statue import DisplacementMap, Statue
 
 _ROOMS = {
     "body": ("BodyModel", "Derivatives"),
@@ -46,6 +52,7 @@ _ROOMS = {
     "evaluation.errors": ("PoseErrors", "ShapeErrors", "compactness", "pose_errors", "shape_errors"),
     "evaluation.sampling": ("Samples", "Specificity", "sample_bodies", "specificity"),
     "export.bvh": ("write_bvh",),
+    "export.bvh_read": ("read_bvh",),
     "export.correctives": ("motion_correctives",),
     "export.glb": ("write_skinned_glb",),
     "export.npz": ("write_body_npz",),
@@ -68,19 +75,26 @@ _ROOMS = {
     "resolution.change": ("ResolutionConfig", "change_resolution"),
     "scape": ("ScapeModel",),
     "skinning": ("SkinningModel",),
+    "statue.control": ("ControlModel",),
+    "statue.files": ("load_statue", "save_statue"),
+    "statue.fit": ("StatueConfig", "fit_statue"),
+    "statue.humanoid": ("humanoid",),
+    "statue.statue": ("DisplacementMap", "Statue"),
 }
 _ROOM_OF = {name: room for room, names in _ROOMS.items() for name in names}
 
-__all__ = ["BlendConfig", "BlendScapeModel", "BodyModel", "CharacterConfig", "ChosenSkeleton", "Coregistration",
-           "CoregistrationConfig", "Derivatives", "FirstModel", "FitConfig", "JointLimits", "LearnConfig", "Mirror",
-           "MixConfig", "ModelRegistration", "PartsConfig", "PointOperator", "PoseErrors", "PoseFit",
-           "ResolutionConfig", "Rig", "Samples", "ScapeModel", "SexGuess", "ShapeErrors", "ShapeFit", "SkinConfig",
-           "SkinningModel", "Specificity", "Subject", "TransferConfig", "change_resolution", "character_model",
-           "choose_skeleton", "compactness", "coregister", "find_mirror", "fit_pose", "fit_shape", "guess_sex",
-           "learn_blendscape", "learn_by_sex", "learn_from_scans", "learn_scape", "learn_scape_mix", "learn_skinning",
-           "load_model", "make_rig", "mirror_pose", "motion_correctives", "pose_errors", "pose_from_angles",
-           "register_with_model", "repose", "sample_bodies", "sample_poses", "shape_errors", "skin_weights",
-           "specificity", "subject_from_body", "turn", "write_body_npz", "write_bvh", "write_skinned_glb"]
+__all__ = ["BlendConfig", "BlendScapeModel", "BodyModel", "CharacterConfig", "ChosenSkeleton", "ControlModel",
+           "Coregistration", "CoregistrationConfig", "Derivatives", "DisplacementMap", "FirstModel", "FitConfig",
+           "JointLimits", "LearnConfig", "Mirror", "MixConfig", "ModelRegistration", "PartsConfig", "PointOperator",
+           "PoseErrors", "PoseFit", "ResolutionConfig", "Rig", "Samples", "ScapeModel", "SexGuess", "ShapeErrors",
+           "ShapeFit", "SkinConfig", "SkinningModel", "Specificity", "Statue", "StatueConfig", "Subject",
+           "TransferConfig", "change_resolution", "character_model", "choose_skeleton", "compactness", "coregister",
+           "find_mirror", "fit_pose", "fit_shape", "fit_statue", "guess_sex", "humanoid", "learn_blendscape",
+           "learn_by_sex", "learn_from_scans", "learn_scape", "learn_scape_mix", "learn_skinning", "load_model",
+           "load_statue", "make_rig", "mirror_pose", "motion_correctives", "pose_errors", "pose_from_angles",
+           "read_bvh", "register_with_model", "repose", "sample_bodies", "sample_poses", "save_statue", "shape_errors",
+           "skin_weights", "specificity", "subject_from_body", "turn", "write_body_npz", "write_bvh",
+           "write_skinned_glb"]
 
 
 def __getattr__(name: str) -> Any:

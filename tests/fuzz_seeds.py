@@ -21,6 +21,8 @@ from completion.partial.completion import Completion
 from completion.partial.masks import read_mask
 from completion.partial.results import load_completion, save_completion
 from model.cli import _read_betas, _read_turns
+from model.export.bvh import write_bvh
+from model.export.bvh_read import read_bvh
 from model.export.cli import read_motion
 from model.files import load_model
 from model.learning.cli import _read_sexes
@@ -229,6 +231,8 @@ def _add_models(rng: np.random.Generator, place: Any, add: Any) -> None:
     add(path, Motion.load, good_motion)
     motion.save(path := place("theirs.npz"))
     add(path, lambda path: read_motion(path, model), lambda found: finite(found.poses, found.trans, found.betas))
+    write_bvh(path := place("motion.bvh"), model.skeleton, motion.poses, motion.trans, unit="m", body=model.template)
+    add(path, lambda path: read_bvh(path, "m"), lambda found: finite(found.rotations, found.places, found.rest))
     SoftTissue(motion, rng.normal(0, 1, (5, 3))).save(path := place("soft.npz"))
     add(path, SoftTissue.load, lambda found: finite(found.changes, found.betas()))
     motion.save(path := place("betas.npz"))

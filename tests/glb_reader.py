@@ -6,7 +6,7 @@ import numpy as np
 
 from scanprep.geometry import rotations
 
-WIDTH = {"SCALAR": 1, "VEC3": 3, "VEC4": 4, "MAT4": 16}
+WIDTH = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT4": 16}
 NUMBERS = {5126: "<f4", 5125: "<u4", 5123: "<u2", 5121: "u1"}
 
 

@@ -7,6 +7,7 @@ from glb_reader import Glb
 from model_bodies import random_poses, worm_model
 
 from model.export.bvh import part_ends, write_bvh
+from model.export.bvh_read import read_bvh
 from model.export.cli import export, read_motion
 from model.export.correctives import motion_correctives
 from model.export.glb import continuous_quaternions, skinned_glb, write_skinned_glb
@@ -213,6 +214,103 @@ def test_bvh_holds_the_motion_of_the_joints(rig, motion, tmp_path, up, unit, met
         found = bvh.positions(t)
         for name, place in zip(rig.skeleton.names, places, strict=True):
             assert np.abs(found[name] / metre - place).max() < 1e-6
+
+
+@pytest.mark.parametrize("unit", ["m", "in"])
+def test_bvh_that_was_written_is_read_back(rig, motion, tmp_path, unit):
+    poses, trans = motion
+    write_bvh(tmp_path / "a.bvh", rig.skeleton, poses, trans, 4.0, unit, up=2, body=rig.mesh)
+    bvh, U = read_bvh(tmp_path / "a.bvh", unit), turn_up(2)
+    order = [bvh.names.index(name) for name in rig.skeleton.names]
+    assert bvh.rate == pytest.approx(4.0, abs=1e-6) and not bvh.offsets[0].any()
+    assert np.abs(bvh.places[:, order] - joint_places(rig.skeleton, poses, trans) @ U.T).max() < 1e-6
+    assert np.abs(bvh.rotations[:, order] - U @ rig.skeleton.part_rotations(poses) @ U.T).max() < 1e-6
+    rest = bvh.rest[order] @ U
+    assert np.abs(rest - rest[0] - rig.skeleton.joints + rig.skeleton.joints[0]).max() < 1e-6
+    ends = {bvh.names[j]: end for j, end in bvh.ends.items()}
+    assert set(ends) == {"part1", "part3"}
+    assert np.abs(ends["part3"] @ U - part_ends(rig.skeleton, rig.mesh)[3] + rig.skeleton.joints[3]).max() < 1e-6
+
+
+MIXED = """HIERARCHY
+ROOT Left Hip {
+\tOFFSET 1 2 3
+\tCHANNELS 6 Zposition Xposition Yposition Yrotation Xrotation Zrotation
+\tJOINT a
+\t{
+\t\tOFFSET 0 10 0
+\t\tCHANNELS 1 Xrotation
+\t\tEnd Site
+\t\t{
+\t\t\tOFFSET 0 1 0
+\t\t}
+\t}
+\tJOINT b
+\t{
+\t\tOFFSET 4 0 0
+\t\tCHANNELS 5 Xposition Yposition Zposition Zrotation Yrotation
+\t}
+\tJOINT c
+\t{
+\t\tOFFSET 4 0 0
+\t\tCHANNELS 3 xposition yposition zposition
+\t}
+}
+MOTION
+Frames : 3
+Frame Time:\t0.05
+
+30 10 20  40 50 60 70  4.5 0 0 80 90  0.5 0 0
+30\t10 20  0 0 0  -70  4.5 0 0 0 0  0.5 0 0
+30 10 20  0 0 0  0  4 0 0 0 0  0 0 0
+"""
+
+
+@pytest.mark.parametrize("end", ["\n", "\r\n"])
+def test_bvh_of_other_programs(tmp_path, end):
+    (tmp_path / "a.bvh").write_bytes(("\ufeff" + MIXED.replace("60 70", "60\n70").replace("\n", end)).encode())
+    bvh = read_bvh(tmp_path / "a.bvh", "cm")
+    assert bvh.names == ("Left Hip", "a", "b", "c") and bvh.parents.tolist() == [-1, 0, 0, 0] and bvh.rate == 20
+
+    def about(axis, degrees):
+        return rotations.exp(np.radians(degrees) * np.eye(3)[axis])
+
+    root = about(1, 40) @ about(0, 50) @ about(2, 60)
+    turned = [root, root @ about(0, 70), root @ about(2, 80) @ about(1, 90), root]
+    assert np.abs(bvh.rotations[0] - turned).max() < 1e-12
+    assert np.abs(bvh.rotations[1, 1] - about(0, -70)).max() < 1e-12
+    # b writes its offset itself, c the change of it; the root's place is added to its offset
+    steps = np.array([[0, 10, 0], [4.5, 0, 0], [4.5, 0, 0]]) / 100
+    start = np.array([11, 22, 33]) / 100
+    assert np.abs(bvh.places[0] - np.vstack([start, start + steps @ root.T])).max() < 1e-12
+    assert np.array_equal(bvh.ends[1], [0, 0.01, 0])
+
+
+@pytest.mark.parametrize(("change", "words"), [
+    (("Frames : 3", "Frames : 4"), "a.bvh: expected 4 frames of 15 numbers, found 3 lines with 45 numbers"),
+    (("0.5 0 0\n30\t", "0.5 0\n30 "), "a.bvh, line 29: expected the 15 numbers of a frame, found 14"),
+    (("-70", "nan"), "a.bvh, line 30: expected finite numbers, found 'nan'"),
+    (("-70", "x7"), "a.bvh, line 30: expected finite numbers, found 'x7'"),
+    (("OFFSET 0 10 0", "OFFSET 0 10"), "a.bvh, line 8: expected a number of the OFFSET, found 'CHANNELS'"),
+    (("CHANNELS 1 X", "CHANNELS 2 X"), "a.bvh, line 9: expected a channel as Xposition or Zrotation, found 'End'"),
+    (("JOINT c", "JOINT b"), "a.bvh, line 19: expected joints with names that differ, found 'b'"),
+    (("0.05", "0"), "a.bvh, line 27: expected the seconds of a frame, found '0'"),
+    (("Frames : 3", "Frames : 900000000"), "expected frames of joints with channels, found 900000000"),
+    (("MOTION", ""), "expected MOTION, found 'Frames'"),
+    ((MIXED, "HIERARCHY"), "expected ROOT, the file ends at line 1"),
+    ((MIXED, "\x00\xff"), "expected HIERARCHY")])
+def test_damaged_bvh_is_refused(tmp_path, change, words):
+    assert change[0] in MIXED
+    (tmp_path / "a.bvh").write_text(MIXED.replace(*change))
+    with pytest.raises(StorageError, match=words):
+        read_bvh(tmp_path / "a.bvh", "cm")
+
+
+def test_bvh_without_a_file_or_a_unit_is_refused(tmp_path):
+    with pytest.raises(StorageError, match=r"no\.bvh: no such file; expected a BVH file"):
+        read_bvh(tmp_path / "no.bvh", "cm")
+    with pytest.raises(ValueError, match="unit: expected one of m, cm, mm, in, got 'ft'"):
+        read_bvh(tmp_path / "no.bvh", "ft")
 
 
 def test_bvh_turns_do_not_jump(rig, tmp_path):

@@ -1,6 +1,7 @@
-"""A skinned body as glTF 2.0: joints, weights, shapes as morph targets, and a motion."""
+"""A skinned body as glTF 2.0: joints, weights, shapes as morph targets, images, and a motion."""
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
@@ -15,8 +16,38 @@ from .correctives import Correctives
 from .rig import CARRIERS, Rig, check_motion, turn_up
 
 
+@dataclass(frozen=True, eq=False)
+class Material:
+    """What the surface of a rig looks like, whose vertices are repeated where the chart of the images has a seam.
+
+    Parameters
+    ----------
+    uv : (N, 2) float
+        (0, 0) is the lower left corner of the images, (1, 1) their upper right one.
+    normals : (N, 3) float, unit
+        The same at all vertices of one place.
+    tangents : (N, 4) float, optional
+        Unit vectors along the image's rows, and 1 where the image's upwards is their left as seen from outside, -1
+        where it is their right; needed for `relief`.
+    color : (H, W, 3) uint8, optional
+    relief : (H, W, 3) uint8, optional
+        Normals in the frames of `tangents` and `normals`: the normal texture of glTF.
+    heights : (H, W) float, metres, optional
+        A displacement along the normal. glTF has no place for it: it becomes a grey image of two bytes, which the
+        material names in its `extras` with the heights of black and of white.
+    """
+
+    uv: np.ndarray
+    normals: np.ndarray
+    tangents: np.ndarray | None = None
+    color: np.ndarray | None = None
+    relief: np.ndarray | None = None
+    heights: np.ndarray | None = None
+
+
 def write_skinned_glb(path: str | Path, rig: Rig, poses: np.ndarray | None = None, trans: np.ndarray | None = None,
-                      rate: float = 30.0, correctives: Correctives | None = None, up: int = 2) -> None:
+                      rate: float = 30.0, correctives: Correctives | None = None, up: int = 2,
+                      material: Material | None = None) -> None:
     """Write a body that hangs on joints, for any glTF 2.0 viewer, animation program or game engine.
 
     One node for every joint, where the joint is at rest and with the axes of the world; morph targets `beta 1`,
@@ -36,6 +67,8 @@ def write_skinned_glb(path: str | Path, rig: Rig, poses: np.ndarray | None = Non
         What skinning lacks in this motion, as further morph targets that the motion drives.
     up : int
         0, 1 or 2: the axis of the body that points up.
+    material : Material, optional
+        Else one dull colour.
 
     Raises
     ------
@@ -43,13 +76,13 @@ def write_skinned_glb(path: str | Path, rig: Rig, poses: np.ndarray | None = Non
         A motion of other parts, empty, not finite or of another length than the correctives; a rate that is
         not positive; an axis that does not exist.
     """
-    data = skinned_glb(rig, poses, trans, rate, correctives, up)
+    data = skinned_glb(rig, poses, trans, rate, correctives, up, material)
     with writing(path) as beside:
         beside.write_bytes(data)
 
 
 def skinned_glb(rig: Rig, poses: np.ndarray | None = None, trans: np.ndarray | None = None, rate: float = 30.0,
-                correctives: Correctives | None = None, up: int = 2) -> bytes:
+                correctives: Correctives | None = None, up: int = 2, material: Material | None = None) -> bytes:
     """The bytes of `write_skinned_glb`."""
     U = turn_up(up).T
     rig, glb = rig.turned(up), Glb()
@@ -58,11 +91,11 @@ def skinned_glb(rig: Rig, poses: np.ndarray | None = None, trans: np.ndarray | N
     if correctives is not None:
         names += [f"corrective {k + 1}" for k in range(len(correctives.shapes))]
         targets = np.concatenate([targets, correctives.shapes @ U])
-    mesh: dict[str, Any] = {"name": "body", "primitives": [_primitive(glb, rig, targets)]}
+    mesh: dict[str, Any] = {"name": "body", "primitives": [_primitive(glb, rig, targets, material, U)]}
     if names:
         mesh |= {"weights": [0] * len(names), "extras": {"targetNames": names}}
     document = {"scene": 0, "scenes": [{"nodes": [0, 1]}], "nodes": _nodes(rig), "meshes": [mesh],
-                "skins": [_skin(glb, rig)], "materials": [skin_material()]}
+                "skins": [_skin(glb, rig)], **_materials(glb, material)}
     if poses is not None:
         poses, trans = check_motion(rig.skeleton, poses, trans, rate)
         animation = _animation(glb, rig, poses @ U, trans @ U, rate)
@@ -97,19 +130,49 @@ def continuous_quaternions(poses: np.ndarray) -> np.ndarray:
     return q
 
 
-def _primitive(glb: Glb, rig: Rig, targets: np.ndarray) -> dict[str, Any]:
-    base, normals = rig.mesh.vertices, some_normal(rig.mesh)
+def _primitive(glb: Glb, rig: Rig, targets: np.ndarray, material: Material | None, U: np.ndarray) -> dict[str, Any]:
+    base, normals = rig.mesh.vertices, some_normal(rig.mesh) if material is None else material.normals @ U
     joints, weights = four_carriers(rig.weights)
     out: dict[str, Any] = {
         "attributes": {"POSITION": glb.add(base, "VEC3", VERTICES, bounds=True),
                        "NORMAL": glb.add(normals, "VEC3", VERTICES), "JOINTS_0": glb.add_joints(joints),
                        "WEIGHTS_0": glb.add(weights, "VEC4", VERTICES)},
         "indices": glb.add_indices(rig.mesh.faces), "material": 0}
+    if material is not None:
+        out["attributes"]["TEXCOORD_0"] = glb.add(material.uv * [1, -1] + [0, 1], "VEC2", VERTICES)
+        if material.tangents is not None:
+            tangents = np.column_stack([material.tangents[:, :3] @ U, material.tangents[:, 3]])
+            out["attributes"]["TANGENT"] = glb.add(tangents, "VEC4", VERTICES)
     if len(targets):
         out["targets"] = [{"POSITION": glb.add(change, "VEC3", VERTICES, bounds=True),
                            "NORMAL": glb.add(some_normal(Mesh(base + change, rig.mesh.faces)) - normals, "VEC3",
                                              VERTICES)} for change in targets]
     return out
+
+
+def _materials(glb: Glb, material: Material | None) -> dict[str, Any]:
+    """The material with its images."""
+    out = skin_material() if material is None or material.color is None else skin_material((1, 1, 1))
+    images: list[dict[str, Any]] = []
+
+    def texture(image: np.ndarray, name: str) -> dict[str, int]:
+        images.append(glb.add_image(image, name))
+        return {"index": len(images) - 1}
+
+    if material is not None and material.color is not None:
+        out["pbrMetallicRoughness"]["baseColorTexture"] = texture(material.color, "color")
+    if material is not None and material.relief is not None:
+        out["normalTexture"] = texture(material.relief, "normal")
+    if material is not None and material.heights is not None:
+        low, high = float(material.heights.min()), float(material.heights.max())
+        grey = np.round(65535 * (material.heights - low) / max(high - low, 1e-12)).astype(np.uint16)
+        out["extras"] = {"displacementTexture": texture(grey, "displacement"), "displacementBlack": low,
+                         "displacementWhite": high, "displacementUnit": "metre"}
+    if not images:
+        return {"materials": [out]}
+    edges = {"wrapS": 33071, "wrapT": 33071, "magFilter": 9729, "minFilter": 9987}
+    textures = [{"name": image["name"], "sampler": 0, "source": k} for k, image in enumerate(images)]
+    return {"materials": [out], "images": images, "textures": textures, "samplers": [edges]}
 
 
 def _nodes(rig: Rig) -> list[dict[str, Any]]:

@@ -88,6 +88,12 @@ class Reconstruction:
         return total / np.maximum(np.linalg.norm(total, axis=1), 1e-300)[:, None]
 
 
+def coverage_at(control: ControlModel, map: DisplacementMap, faces: np.ndarray, bary: np.ndarray) -> np.ndarray:
+    """(n,) what the map says at places on triangles: MEASURED, FOLDED or HOLE; at a rim what the pixel beside says."""
+    found = map.coverage[_pixels(map, chart_places(control.chart, faces, bary))]
+    return np.where(found == OUTSIDE, MEASURED, found)
+
+
 def displaced_surface(control: ControlModel, map: DisplacementMap) -> Displaced:
     """Where the detailed surface is above any places of the control mesh, for `subdivide_adaptive`."""
     def displaced(faces: np.ndarray, bary: np.ndarray) -> np.ndarray:
@@ -174,8 +180,9 @@ def remaining_error(control: ControlModel, map: DisplacementMap, scan: Mesh, cou
     """
     points = scan.sample(count, np.random.default_rng(SEED))[0]
     found = to_normal_volume(control.mesh, points, reach)
-    uv = chart_places(control.chart, np.maximum(found.faces, 0), found.bary)
-    good = found.inside & (found.solutions == 1) & (map.coverage[_pixels(map, uv)] == MEASURED)
+    faces = np.maximum(found.faces, 0)
+    uv = chart_places(control.chart, faces, found.bary)
+    good = found.inside & (found.solutions == 1) & (coverage_at(control, map, faces, found.bary) == MEASURED)
     if not good.any():
         return SurfaceError(np.nan, np.nan, np.nan)
     stored = from_normal_volume(control.mesh, type(found)(found.faces[good], found.bary[good],

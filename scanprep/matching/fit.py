@@ -11,7 +11,8 @@ from .affine import Links, LinkStage, build_links
 from .anchors import Hints, mark_both, path_anchors, place_by_marks
 from .descent import Stiffness, minimise, terms
 from .energies import NodePattern, Pull, pull
-from .graph import build_graph, carry_over, deform, start
+from .graph import build_graph, carry_over, deform
+from .graph import start as start_motion
 from .matches import Likeness, Matching, Target, match_both_ways, orient
 from .rigid import align_landmarks, align_rigid
 from .schedule import GraphStage, RegistrationConfig, ShellStage
@@ -27,7 +28,8 @@ class Fit:
     """A registration under way: where the template lies, its graph, what has been counted."""
 
     def __init__(self, template: Mesh, target: Target, landmarks: tuple[np.ndarray, np.ndarray] | None,
-                 hints: Hints | None, config: RegistrationConfig, progress: Callable[[int, int], None]) -> None:
+                 hints: Hints | None, config: RegistrationConfig, progress: Callable[[int, int], None],
+                 start: np.ndarray | None = None) -> None:
         self.template, self.landmarks, self.hints, self.config = template, landmarks, hints, config
         self.size = float(np.sqrt(template.face_areas.sum()))
         self.all = np.arange(len(template.vertices))
@@ -40,7 +42,7 @@ class Fit:
             self.marks, theirs = mark_both(template, target, anchors, config.path_cell * self.size, self.size)
             target = replace(target, marks=theirs)
         self.target = target
-        self.T = self.placed()
+        self.T = self.placed() if start is None else start
         self.stages = [s for s in config.graph if s.place == 1 or self.marks is not None]
         self.total = sum(stage.rounds for stage in self.stages) + len(config.shell) \
             + sum(stage.rounds for stage in config.links) + (config.settle is not None)
@@ -48,7 +50,7 @@ class Fit:
         self.nodes = self.stages[0].nodes if self.stages else FEW
         self.graph = build_graph(template, self.nodes)
         self.pattern = NodePattern(self.graph)
-        self.motion = start(self.graph, self.T)
+        self.motion = start_motion(self.graph, self.T)
         self.shell: Shell | None = None
         self.links: Links | None = None
         self.kind = ""

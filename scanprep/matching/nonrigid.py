@@ -81,7 +81,7 @@ class Registration:
 @one_thread()
 def register(template: Mesh, scan: Mesh | np.ndarray, landmarks: tuple[np.ndarray, np.ndarray] | None = None,
              config: RegistrationConfig | None = None, progress: Callable[[int, int], None] | None = None,
-             correspondences: Correspondences | None = None) -> Registration:
+             correspondences: Correspondences | None = None, start: np.ndarray | None = None) -> Registration:
     """Bring a template onto a scan.
 
     Parameters
@@ -96,6 +96,9 @@ def register(template: Mesh, scan: Mesh | np.ndarray, landmarks: tuple[np.ndarra
         Called as progress(done, total).
     correspondences : Correspondences, optional
         Hints, some of which may be wrong: they draw softly, and less the farther they are from all others.
+    start : (4, 4) float, optional
+        The similarity that brings the template near the scan, where it is known: else landmarks tell, or the whole is
+        aligned, which a scan of a part leads astray.
 
     Returns
     -------
@@ -113,7 +116,7 @@ def register(template: Mesh, scan: Mesh | np.ndarray, landmarks: tuple[np.ndarra
     if landmarks is not None:
         landmarks = checked_pairs(template, *landmarks, "landmarks")
     hints = None if correspondences is None else hints_of(template, correspondences)
-    fit = Fit(template, target, landmarks, hints, config, progress or (lambda done, total: None))
+    fit = Fit(template, target, landmarks, hints, config, progress or (lambda done, total: None), start)
     for stage in fit.stages:
         fit.bend_graph(stage)
         if stage.twists:

@@ -9,6 +9,7 @@ from typing import Any
 import numpy as np
 
 from ..geometry.mesh import Mesh
+from .sheets import png_bytes
 
 # Turns that bring each axis to +y, the upward axis of glTF: quaternions x, y, z, w.
 _HALF = 0.5 ** 0.5
@@ -31,7 +32,7 @@ class Glb:
         Parameters
         ----------
         array : (n, ...) float
-        kind : "SCALAR", "VEC3", "VEC4" or "MAT4"
+        kind : "SCALAR", "VEC2", "VEC3", "VEC4" or "MAT4"
             What a row is; a matrix is stored column after column, as the caller has to lay it out.
         target : VERTICES or None
             `VERTICES` for what vertices have.
@@ -53,6 +54,13 @@ class Glb:
         """An accessor of the four joints (n, 4) of every vertex, in one or two bytes; its index."""
         kind = "|u1" if joints.max(initial=0) < 256 else "<u2"
         return self._append(np.ascontiguousarray(joints, dtype=kind), len(joints), "VEC4", VERTICES, {})
+
+    def add_image(self, image: np.ndarray, name: str) -> dict[str, Any]:
+        """An entry of `images`: a picture (H, W), (H, W, 3) or (H, W, 4) of one or two bytes a value, as PNG inside."""
+        data = png_bytes(image)
+        self._views.append({"buffer": 0, "byteOffset": len(self._data), "byteLength": len(data)})
+        self._data += data + b"\0" * (-len(data) % 4)
+        return {"name": name, "mimeType": "image/png", "bufferView": len(self._views) - 1}
 
     def _append(self, values: np.ndarray, count: int, kind: str, target: int | None, extra: dict[str, Any]) -> int:
         view: dict[str, Any] = {"buffer": 0, "byteOffset": len(self._data), "byteLength": values.nbytes}

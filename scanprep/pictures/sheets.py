@@ -67,7 +67,7 @@ def side_by_side(images: Sequence[np.ndarray], labels: Sequence[str] | None = No
 
 
 def png_bytes(image: np.ndarray) -> bytes:
-    """A picture (H, W, 3 or 4) uint8 as PNG."""
+    """A picture (H, W, 3 or 4) uint8, or grey (H, W) uint8 or uint16, as PNG."""
     from PIL import Image
 
     out = io.BytesIO()

@@ -1,0 +1,171 @@
+"""Joint centres and facial points of a person who stands upright, without a click."""
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from scanprep.geometry.formats.common import UNITS
+from scanprep.geometry.mesh import Mesh
+from scanprep.matching.confidence import stretched_share
+from scanprep.matching.matches import Target, target_of
+from scanprep.matching.nonrigid import Registration, RegistrationConfig, register
+from scanprep.matching.thinning import thin
+from scanprep.threads import one_thread, search_threads
+
+from .articulated import Articulated
+from .control import ControlModel
+from .features import FeatureFit, fit_features
+from .person_search import Stand, find_person
+from .pose_search import PoseSearch
+
+STATURE = 1.7                    # metres
+NOBODY, EITHER = 0.042, 1.05     # misfit, and margin, of what is no person
+DOUBTED = 0.025, 1.2, 0.05       # misfit, margin and share missed of a person with a limb in a wrong place
+MANY, SPACING = 40_000, 0.007    # points of a scan, and to how many metres apart more of them are thinned
+SHOWN = 0.3                      # share of the vertices around a joint that have data
+
+
+@dataclass(frozen=True, eq=False)
+class Features:
+    """What was found on a scan, in the scan's own axes and unit.
+
+    Attributes
+    ----------
+    joints, points : {name: (3,) float}
+        Joint centres and landmarks of the control model with data around them; empty where no person was found.
+    missing : names
+        Joints and landmarks that the scan does not show.
+    registered : Mesh or None
+        The control mesh on the scan.
+    fit : FeatureFit or None
+        Of the control model to these features.
+    unit : str
+        Of m, mm, cm and in the one in which the scan would be most nearly as long as a person is tall.
+    up, front : (3,) float, unit
+        Upwards, and to where the person faces.
+    misfit : float, metres
+        Between the scan and the control model in its pose: see `Stand`.
+    margin : float
+        How many times larger it is for the best start that faces another way.
+    missed, stretched : float
+        What `Registration.missed` and `stretched_share` say of the registered mesh.
+    problem : str or None
+        Why the features should not be trusted.
+    """
+
+    joints: dict[str, np.ndarray]
+    points: dict[str, np.ndarray]
+    missing: tuple[str, ...]
+    registered: Mesh | None
+    fit: FeatureFit | None
+    unit: str
+    up: np.ndarray
+    front: np.ndarray
+    misfit: float
+    margin: float
+    missed: float
+    stretched: float
+    problem: str | None
+
+
+@one_thread()
+def find_features(control: ControlModel, scan: Mesh) -> Features:
+    """Joint centres and landmarks of a person who stands upright.
+
+    Neither unit nor axes of the scan need to be known. The control model, z up and facing -y, is placed in many ways,
+    the best are bent onto the scan, and the best of them is registered; front and back, and with them left and right,
+    are told by what fits better.
+
+    Parameters
+    ----------
+    control : ControlModel
+        A humanoid.
+    scan : Mesh
+        May have holes, several components, or show a part of a person.
+
+    Raises
+    ------
+    ValueError
+        Fewer than 100 points.
+    """
+    if len(scan.vertices) < 100:
+        raise ValueError(f"scan: expected a person of at least 100 points, got {scan}")
+    search = PoseSearch(Articulated(control))
+    scan = outward(scan)
+    unit = likely_unit(scan.vertices)
+    data = scan if len(scan.vertices) < MANY else scan.vertices[thin(scan.vertices, SPACING / UNITS[unit])]
+    target = target_of(data)
+    if data is not scan:
+        target = _facing_as(target, scan)
+    stands = find_person(search, target, UNITS[unit])
+    best = stands[0]
+    margin = stands[1].misfit / best.misfit if len(stands) > 1 else np.inf
+    up, front = (best.direction(search, np.array(axis)) for axis in ((0.0, 0, 1), (0.0, -1, 0)))
+    problem = nobody_problem(best.off, margin, unit)
+    if problem:
+        return Features({}, {}, (*control.skeleton.names, *control.landmarks), None, None, unit, up, front, best.off,
+                        margin, np.nan, np.nan, problem)
+    start = search.mesh(best.posed)
+    placed = (data.vertices if isinstance(data, Mesh) else data) @ best.T[:3, :3].T + best.T[:3, 3]
+    found = register(start, Mesh(placed, data.faces) if isinstance(data, Mesh) else placed,
+                     config=RegistrationConfig(graph=RegistrationConfig().graph[-2:]), start=np.eye(4))
+    joints, points, missing = _features(control, best, found)
+    fit = fit_features(control, joints, points) if len(joints) + len(points) > 2 else None
+    registered = control.mesh.with_vertices(best.to_scan(found.mesh.vertices))
+    return Features(joints, points, missing, registered, fit, unit, up, front, best.off, margin, found.missed,
+                    stretched_share(start, found.mesh), doubts(best.off, margin, found.missed))
+
+
+def nobody_problem(off: float, margin: float, unit: str) -> str | None:
+    """Why there is no person in a scan, or none that stands upright; None where there is one."""
+    if off <= NOBODY and margin >= EITHER:
+        return None
+    return (f"no person who stands upright was found (the unit taken for {unit}): a body bent onto the scan stays "
+            f"{1000 * off:.0f} mm off, and {margin:.2f} times as far when it faces another way; something else, or a "
+            "pose that needs clicks?")
+
+
+def doubts(off: float, margin: float, missed: float) -> str | None:
+    """Why features should not be trusted; None where they may be."""
+    reasons = [text for text, wrong in (
+        (f"the posed body stays {1000 * off:.0f} mm off the scan", off > DOUBTED[0]),
+        (f"facing another way it fits only {margin:.2f} times worse", margin < DOUBTED[1]),
+        (f"{100 * missed:.0f}% of the scan lies off the registered one", missed > DOUBTED[2])) if wrong]
+    return "; ".join(reasons) + ": look at it, or click" if reasons else None
+
+
+def likely_unit(points: np.ndarray) -> str:
+    """The unit in which points (n, 3) span most nearly as much as a person."""
+    spread = points - points.mean(axis=0)
+    longest = float(np.ptp(spread @ np.linalg.svd(spread[:: max(1, len(spread) // 5000)], full_matrices=False)[2][0]))
+    return min(UNITS, key=lambda unit: abs(np.log(max(longest, 1e-12) * UNITS[unit] / STATURE)))
+
+
+def outward(scan: Mesh) -> Mesh:
+    """The same scan with its triangles seen from outside, if most of them were seen from inside."""
+    centre = scan.vertices.mean(axis=0)
+    inside_out = Mesh(scan.vertices - centre, scan.faces).volume < 0
+    return Mesh(scan.vertices, scan.faces[:, ::-1], scan.colors) if inside_out else scan
+
+
+def _facing_as(target: Target, scan: Mesh) -> Target:
+    """Points of a scan with the sign of their normals from its triangles."""
+    _, nearest = cKDTree(scan.vertices).query(target.points, workers=search_threads(len(target.points)))
+    inward = np.einsum("nd,nd->n", target.normals, scan.vertex_normals[nearest]) < 0
+    return replace(target, normals=np.where(inward[:, None], -1, 1) * target.normals, oriented=len(scan.faces) > 0)
+
+
+def _features(control: ControlModel, stand: Stand, found: Registration
+              ) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray], tuple[str, ...]]:
+    """Joints and points with data around them, in the axes of the scan, and the names of the others."""
+    x, seen = found.mesh.vertices, found.confidence
+    centres = stand.to_scan(control.skeleton.joint_regressor(control.mesh) @ x)
+    around = (control.mesh.vertex_adjacency @ seen + seen) / (control.mesh.vertex_adjacency.sum(axis=1) + 1)
+    joints = {name: centres[j] for j, name in enumerate(control.skeleton.names)
+              if seen[control.skeleton.joint_weights(control.mesh, j)[0]].mean() > SHOWN}
+    places = stand.to_scan(x)
+    points = {name: places[v] for name, v in control.landmarks.items() if around[v] > SHOWN}
+    names = [*control.skeleton.names, *control.landmarks]
+    return joints, points, tuple(name for name in names if name not in joints and name not in points)

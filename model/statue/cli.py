@@ -1,0 +1,230 @@
+"""`scape statue`: one scan of one person becomes a layered character that moves, with all its detail."""
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+from typing import Annotated, Literal
+
+import numpy as np
+import tyro
+
+from scanprep.batch.pool import Workers
+from scanprep.batch.workspace import Task, Workspace
+from scanprep.cli import MM, Output, ScanArg, Unit, WorkersArg
+from scanprep.console import Metric, Outcome, Progress, bar, dispatch, failures_of, problem_of
+from scanprep.geometry.files import read_mesh, write_mesh
+from scanprep.geometry.storage import writing
+from scanprep.pictures.animation import write_animated_glb, write_gif
+from scanprep.pipeline.scans import SCAN_ENDINGS
+
+from ..export.cli import read_motion
+from ..files import load_model
+from .animate import follower_of, read_statue_motion
+from .control import ControlModel
+from .control_files import read_control
+from .files import load_statue
+from .fit import StatueConfig
+from .humanoid import humanoid
+from .reconstruction import Reconstruction, displaced_surface, inverted_triangles
+from .report import motion_pictures, upright_axis
+from .retarget import StatueMotion
+from .statue import Statue
+from .statue_glb import write_statue_glb
+from .subdivision import Subdivision, subdivide, subdivide_adaptive
+from .work import Inputs, Work
+
+StatueArg = Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="STATUE")]
+MotionArg = Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="MOTION")]
+KEYS, GIF_FRAMES = 120, 24           # frames of an animated GLB of meshes, and of the preview
+LevelArg = Literal[0, 1, 2, 3, 4]
+FEATURE_ENDINGS = (".features.json", ".json", ".pp", ".mrk.json")
+
+COMMANDS = {
+    "fit": ("A scan -> control model, displacement map and texture.", "model.statue.cli:fit"),
+    "reconstruct": ("The detailed surface of a statue at any level, of an edited map too.",
+                    "model.statue.cli:reconstruct"),
+    "animate": ("A statue in motion: of markers, BVH, or a learned model.", "model.statue.cli:animate"),
+}
+
+
+def group(argv: list[str]) -> int:
+    """The commands of `scape statue`."""
+    return dispatch(COMMANDS, "scape statue", argv,
+                    "One scan of one person becomes a layered character that moves, with all its detail.")
+
+
+def fit(scan: ScanArg, output: Output, features: Path | None = None, control: Path | None = None,
+        unit: Unit | None = None, size: Annotated[int, tyro.conf.arg(metavar="PIXELS")] = 2048, vectors: bool = False,
+        workers: WorkersArg = Workers(), *, space: Workspace) -> Outcome:                            # noqa: B008
+    """A scan of one person becomes a statue: a control model that moves, with the detail of the scan as an image.
+
+    A person who stands upright is found by itself. For other poses and other bodies, name joint centres and points of
+    the face with --features. A folder of scans is fitted scan by scan, each into a folder of its name.
+
+    Example: scape statue fit scan.ply -o statue
+
+    Args:
+        scan: Mesh of the whole body, or a folder of such scans.
+        output: Folder to write: control.npz, displacement.png and .tif, texture.png, statue.glb, report.html.
+        features: Joint centres and points of the surface by name, any landmark file; for a folder of scans, the folder
+            of such files.
+        control: Control model of your own: a skinned GLB, or control.npz of another statue; else the generic humanoid.
+        unit: Unit of the scan and the features; else that in which the body would have a plausible height.
+        size: Pixels of the images, each way.
+        vectors: Store displacements of any direction, which also hold where the scan is folded.
+        workers: Who fits the scans of a folder.
+    """
+    config = StatueConfig()
+    config = replace(config, displacement=replace(config.displacement, size=size, vectors=vectors))
+    work = Work(_control(control), config, unit)
+    if not scan.is_dir():
+        if features is None and control is not None:
+            raise ValueError("--control: expected --features with the joints of that control model; only the generic "
+                             "humanoid is found by itself")
+        with bar("fitting the statue") as progress:
+            done = space.run(work, [Task("statue", Inputs(scan, features))], inside=progress).only
+        return Outcome(output, done, {"statue": config}, problem=problem_of(done))
+    work = replace(work, command=f"scape statue fit {scan}")
+    found = {path.name.split(".")[0]: Inputs(path, _features_of(path, features)) for path in sorted(scan.iterdir())
+             if path.name.lower().endswith(SCAN_ENDINGS)}
+    if not found:
+        raise ValueError(f"{scan}: expected scans ({', '.join(SCAN_ENDINGS)}), found none")
+    with bar("fitting statues") as progress:
+        results = space.run(work, [Task(name, one, name) for name, one in found.items()], workers, progress)
+    return Outcome(output, [Metric("scans", len(found)), Metric("statues", len(results.values))], {"statue": config},
+                   failures_of(results))
+
+
+def reconstruct(statue: StatueArg, output: Output, level: LevelArg = 3, tolerance: float | None = None,
+                image: Path | None = None) -> Outcome:
+    """The surface of a statue with its detail, as a mesh at any level.
+
+    Example: scape statue reconstruct statue --level 4 -o detailed.ply
+
+    Args:
+        statue: Folder of scape statue fit.
+        output: Mesh to write; a .glb hangs on the skeleton and has the texture.
+        level: How often the triangles of the control mesh are divided by four.
+        tolerance: Divide only where the detail is off by more than this, millimetres; at most as often as the level.
+        image: Edited copy of the statue's displacement.png, of the same size and depth.
+    """
+    loaded = load_statue(statue, image)
+    control = loaded.control
+    fine = subdivide(control.mesh, control.chart, level) if tolerance is None else subdivide_adaptive(
+        control.mesh, control.chart, displaced_surface(control, loaded.map), tolerance / MM, level)
+    mesh = Reconstruction(control, loaded.map, fine).mesh()
+    if output.suffix.lower() == ".glb":
+        write_statue_glb(output, control, mesh.vertices, fine, loaded.texture, up=upright_axis(loaded))
+    else:
+        write_mesh(output, mesh)
+    rows = [Metric("vertices", len(mesh.vertices)), Metric("triangles", len(mesh.faces)),
+            Metric("closed", "yes" if mesh.is_closed else "no")]
+    if image is not None:
+        before = Reconstruction(control, load_statue(statue).map, fine)(control.mesh.vertices)
+        moved = np.linalg.norm(mesh.vertices - before, axis=1)
+        rows += [Metric("vertices moved by the edited image", int((moved > 1e-6).sum())),
+                 Metric("largest of these moves", MM * float(moved.max()), "mm")]
+    return Outcome(output, rows)
+
+
+def animate(statue: StatueArg, motion: MotionArg, output: Output, model: Path | None = None,
+            registered: Path | None = None, level: LevelArg = 2, meshes: bool = False) -> Outcome:
+    """A statue in motion: its skeleton moves the control mesh, the detail stands on the moving normals.
+
+    The motion is BVH; or .npz of the synthetic people, or of the statue's own body.npz, as scape animate writes it from
+    markers. With --model the control mesh follows a learned model instead of plain skinning, with all that the model
+    knows of how skin moves; the motion is then one of that model.
+
+    Example: scape statue animate statue walk.bvh -o walking
+
+    Args:
+        statue: Folder of scape statue fit.
+        motion: .bvh, or .npz with poses, trans and mocap_frame_rate.
+        output: Folder to write: statue.glb, motion.npz, motion.gif, and meshes on demand.
+        model: Learned model (.npz) that the control mesh follows.
+        registered: The model's template on the scan, in its triangles; else it is brought there.
+        level: Level of detail of the files.
+        meshes: Write the exact mesh of every frame.
+    """
+    loaded = load_statue(statue)
+    control = loaded.control
+    fine = subdivide(control.mesh, control.chart, level)
+    detailed = Reconstruction(control, loaded.map, fine)
+    if model is None:
+        if registered is not None:
+            raise ValueError("--registered: expected --model with it")
+        moved = read_statue_motion(loaded, motion)
+        bodies, rate = control.rig.vertices(moved.poses, moved.trans), moved.rate
+        rows = _write_skinned(output, loaded, fine, detailed, moved)
+    else:
+        bodies, rate = _following(loaded, motion, model, registered)
+        with bar("writing frames") as progress:
+            frames = _frames(detailed, bodies, range(0, len(bodies), max(1, len(bodies) // KEYS)), progress)
+        write_animated_glb(output / "statue.glb", fine.faces, frames, rate * len(frames) / len(bodies),
+                           up=upright_axis(loaded), keys=len(frames))
+        rows = [Metric("follows", str(model))]
+    shown = range(0, len(bodies), max(1, len(bodies) // GIF_FRAMES))
+    with bar("rendering") as progress:
+        write_gif(output / "motion.gif", motion_pictures(loaded, detailed, bodies[list(shown)], progress),
+                  rate * len(shown) / len(bodies))
+    if meshes:
+        with bar("writing meshes") as progress:
+            for t, body in enumerate(bodies):
+                write_mesh(output / "meshes" / f"{t:05d}.ply", detailed.mesh(body))
+                progress(t + 1, len(bodies))
+    turned = [len(inverted_triangles(control, body, fine, detailed(body))) for body in bodies[list(shown)]]
+    return Outcome(output, [Metric("frames", len(bodies)), Metric("rate", rate, "1/s"), *rows,
+                            Metric("inverted triangles in a frame, most", max(turned))], {"level": level})
+
+
+def _following(statue: Statue, motion: Path, model: Path, registered: Path | None) -> tuple[np.ndarray, float]:
+    """The control mesh (T, N, 3) in a motion of a learned model, and its rate."""
+    learned = load_model(model)
+    moves = read_motion(motion, learned)
+    there = None
+    if registered is not None:
+        body = read_mesh(registered)
+        if not np.array_equal(body.faces, learned.template.faces):
+            raise ValueError(f"{registered}: expected the triangles of the model ({learned.template}), found {body}")
+        there = body.vertices
+    with bar("registering the model") as progress:
+        follower = follower_of(statue, learned, there, progress)
+    return follower.vertices(moves.poses, moves.trans), moves.rate
+
+
+def _write_skinned(output: Path, statue: Statue, fine: Subdivision, detailed: Reconstruction, moved: StatueMotion
+                   ) -> list[Metric]:
+    """statue.glb with skeleton, images and motion, and motion.npz; figures of the retargeting."""
+    control = statue.control
+    output.mkdir(parents=True, exist_ok=True)
+    write_statue_glb(output / "statue.glb", control, detailed(control.mesh.vertices), fine, statue.texture,
+                     motion=moved, up=upright_axis(statue))
+    with writing(output / "motion.npz") as beside, open(beside, "wb") as out:
+        np.savez_compressed(out, poses=moved.poses.reshape(len(moved.poses), -1), trans=moved.trans,
+                            betas=np.zeros(0), gender=np.array("neutral"), mocap_frame_rate=np.array(moved.rate),
+                            surface_model_type=np.array("scape"))
+    return [Metric("joints that follow the motion", len(moved.matched)),
+            *([Metric("joints without one in the motion", ", ".join(moved.lacking))] if moved.lacking else [])]
+
+
+def _frames(detailed: Reconstruction, bodies: np.ndarray, chosen: range, progress: Progress) -> np.ndarray:
+    out = np.empty((len(chosen), *detailed(bodies[0]).shape))
+    for k, t in enumerate(chosen):
+        out[k] = detailed(bodies[t])
+        progress(k + 1, len(chosen))
+    return out
+
+
+def _control(path: Path | None) -> ControlModel:
+    return humanoid() if path is None else read_control(path)
+
+
+def _features_of(scan: Path, features: Path | None) -> Path | None:
+    """The file of a scan's name in a folder of features."""
+    if features is None:
+        return None
+    if not features.is_dir():
+        raise ValueError(f"--features: expected a folder for a folder of scans, got {features}")
+    stem = scan.name.split(".")[0]
+    return next((features / (stem + ending) for ending in FEATURE_ENDINGS if (features / (stem + ending)).is_file()),
+                None)

@@ -1,0 +1,229 @@
+"""Registration of the control model by features: pose, segment lengths and place, then the shape of the head."""
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+
+import numpy as np
+
+from scanprep.geometry import rotations
+from scanprep.matching.rigid import align_landmarks
+from scanprep.ranges import Count, Positive, Settings
+
+from .articulated import Articulated, Points
+from .control import ControlModel
+from .limbs import analytic_start, limbs
+
+PLANE = 0.02                     # of the widest spread of points: flatter ones say nothing across their plane
+
+
+@dataclass(frozen=True)
+class FeatureConfig(Settings):
+    """Settings of `fit_features`.
+
+    Attributes
+    ----------
+    prior : float, metres
+        Misfit of a feature that an angle of one radian from the default pose, or a length twice the default one, is
+        worth. It decides only what the features leave open.
+    shortest, longest : float
+        Bounds of a segment length, as multiples of the default length of a body of that size.
+    iterations : int
+        Most steps of the solver.
+    """
+
+    prior: Positive = 0.001
+    shortest: Positive = 0.6
+    longest: Positive = 1.6
+    iterations: Count = 2000
+
+
+@dataclass(frozen=True, eq=False)
+class FeatureFit:
+    """The control model in the pose, with the lengths and at the place of a scan.
+
+    Attributes
+    ----------
+    pose : (J, 3) float, radians
+        Rotation vector of every part in its parent, as `Skeleton.part_rotations` takes them.
+    lengths : (S,) float, metres
+        Of the segments.
+    size : float
+        Of the body against the default one; its thickness grows by it.
+    trans : (3,) float, metres
+        From the default place of the root's joint to where it stands.
+    vertices : (N, 3) float, metres
+    joints : (J, 3) float, metres
+    joint_rms, point_rms : float, metres
+        Misfit of the features; NaN without any of the kind.
+    converged : bool
+    iterations : int
+    """
+
+    pose: np.ndarray
+    lengths: np.ndarray
+    size: float
+    trans: np.ndarray
+    vertices: np.ndarray
+    joints: np.ndarray
+    joint_rms: float
+    point_rms: float
+    converged: bool
+    iterations: int
+
+
+def fit_features(control: ControlModel, joints: Mapping[str, np.ndarray],
+                 points: Mapping[str, np.ndarray] | None = None, config: FeatureConfig | None = None) -> FeatureFit:
+    """Pose, segment lengths and place of a control model that bring its features to those of a scan.
+
+    Features that are not given are not in the sum. What the given ones leave open (the twist of an arm with a
+    straight elbow, the length of a hand) a weak prior keeps near the default pose and lengths. The result turns,
+    moves and scales with the features. How lengths stretch the surface: see `Articulated`.
+
+    Parameters
+    ----------
+    joints : {name of a part: (3,) float, metres}
+        Centres of joints.
+    points : {name of a landmark: (3,) float, metres}, optional
+        Points of the surface.
+
+    Raises
+    ------
+    ValueError
+        Names that the control model does not have, places that are not finite, fewer than three features that are
+        not on one line.
+
+    [Statues] Eq. 4
+    """
+    from scipy.optimize import minimize
+
+    config = config or FeatureConfig()
+    model = Articulated(control)
+    features, goal = _features(control, joints, points or {})
+    T = _place(model, features, joints, goal)
+    scale = float(np.cbrt(np.linalg.det(T[:3, :3])))
+    R = T[:3, :3] / scale
+    goal = (goal - T[:3, 3]) @ R / scale                        # in the axes and the size of the control model
+    bounds = np.concatenate([model.limits, [[config.shortest, config.longest]] * len(model.lengths),
+                             [[-np.inf, np.inf]] * 3])
+    at = {name: goal[k] for k, name in enumerate(joints)}
+    start = np.clip(analytic_start(model, at), *bounds.T)
+    # Each unknown is measured by what it moves: a hand and the whole body alike, in millimetres.
+    reach = np.linalg.norm(model.derivatives(model.frames(start), features), axis=(0, 1))
+    unit = 1e-3 / np.maximum(reach, 0.03 * reach.max())
+
+    def energy(z: np.ndarray) -> tuple[float, np.ndarray]:
+        x = unit * z
+        value, slope = misfit(model, x, features, goal)
+        off = (x - model.rest)[:-3]
+        off[:3] = 0                                             # the way the body stands is nobody's default
+        slope[:-3] += 2 * config.prior**2 * off
+        return 1e6 * (value + config.prior**2 * float(off @ off)), 1e6 * unit * slope
+
+    found = minimize(energy, start / unit, jac=True, method="L-BFGS-B", bounds=bounds / unit[:, None],
+                     options={"maxiter": config.iterations, "maxfun": 2 * config.iterations, "ftol": 1e-9,
+                              "gtol": 1e-6, "maxcor": 50})
+    x = np.clip(unit * found.x, *bounds.T)
+    frames = model.frames(x)
+    pose = model.pose(x)
+    pose[0] = rotations.log(R @ rotations.exp(pose[0]))
+    centres = scale * frames.joints @ R.T + T[:3, 3]
+    apart = scale * np.linalg.norm(model.positions(frames, features) - goal, axis=1)
+    return FeatureFit(
+        pose, scale * model.split(x)[1] * model.lengths, scale * model.size(x), centres[0] - control.skeleton.joints[0],
+        scale * model.positions(frames, model.vertices) @ R.T + T[:3, 3], centres, _rms(apart[:len(joints)]),
+        _rms(apart[len(joints):]), bool(found.success), int(found.nit))
+
+
+def misfit(model: Articulated, x: np.ndarray, features: Points, goal: np.ndarray) -> tuple[float, np.ndarray]:
+    """Sum of squares between features and where they are wanted (n, 3), and its gradient (P,).
+
+    [Statues] Eq. 4
+    """
+    frames = model.frames(x)
+    off = model.positions(frames, features) - goal
+    return float(np.sum(off**2)), 2 * np.einsum("nd,ndp->p", off, model.derivatives(frames, features))
+
+
+def warp(vertices: np.ndarray, from_points: np.ndarray, to_points: np.ndarray, share: np.ndarray | None = None
+         ) -> np.ndarray:
+    """Carry vertices along with points, by the smoothest displacement of space (φ(p) = |p|³ with an affine part).
+
+    The paper prints φ(p_k^H - p_k^C), a constant; interpolation needs φ(p - p_k^C).
+
+    Parameters
+    ----------
+    vertices : (N, 3) float, metres
+    from_points, to_points : (n, 3) float, metres
+        Where points of the surface are and where they shall be. The displacement is exact there, where `share` is 1.
+    share : (N,) float, optional
+        How much of the displacement each vertex takes.
+
+    Raises
+    ------
+    ValueError
+        Fewer than four points or points in one plane: the affine part would be anything across it, and the back of a
+        head would go anywhere. Two points at one place.
+
+    [Statues] Eq. 5
+    """
+    from scipy.interpolate import RBFInterpolator
+
+    source, goal = np.asarray(from_points, dtype=np.float64), np.asarray(to_points, dtype=np.float64)
+    if source.ndim != 2 or source.shape[1] != 3 or goal.shape != source.shape:
+        raise ValueError(f"from_points, to_points: expected two arrays (n, 3), got {source.shape} and {goal.shape}")
+    if not (np.isfinite(source).all() and np.isfinite(goal).all()):
+        raise ValueError("from_points, to_points: expected finite numbers")
+    spread = np.linalg.svd(source - source.mean(axis=0), compute_uv=False) if len(source) > 3 else np.zeros(3)
+    if spread[2] <= PLANE * spread[0]:
+        raise ValueError(f"from_points: expected at least 4 points that are not in one plane, got {len(source)}")
+    if len(np.unique(source, axis=0)) < len(source):
+        raise ValueError("from_points: expected different points, two are at one place")
+    moved = RBFInterpolator(source, goal - source, kernel="cubic", degree=1)(vertices)
+    return vertices + (moved if share is None else np.asarray(share)[:, None] * moved)
+
+
+def head_share(control: ControlModel, part: str = "skullbase") -> np.ndarray:
+    """(N,) from 1 on a part to 0 beyond it: w²(3 - 2w) of its skinning weight, flat at both ends of the neck."""
+    w = control.weights[:, control.skeleton.names.index(part)]
+    return w * w * (3 - 2 * w)
+
+
+def _features(control: ControlModel, joints: Mapping[str, np.ndarray], points: Mapping[str, np.ndarray]
+              ) -> tuple[Points, np.ndarray]:
+    """The features on the control model and where they are wanted (n, 3): joints first."""
+    names = control.skeleton.names
+    for what, given, known in (("joints", joints, names), ("points", points, control.landmarks)):
+        unknown = [name for name in given if name not in known]
+        if unknown:
+            raise ValueError(f"{what}: the control model has no {', '.join(map(repr, unknown))}, it has "
+                             f"{', '.join(known)}")
+    parts = [names.index(name) for name in joints]
+    vertices = [control.landmarks[name] for name in points]
+    for name, place in {**joints, **points}.items():
+        if np.shape(place) != (3,) or not np.isfinite(place).all():
+            raise ValueError(f"{name}: expected three finite numbers, got {place!r}")
+    goal = np.array([*joints.values(), *points.values()], dtype=np.float64).reshape(-1, 3)
+    return Points(np.concatenate([np.eye(len(names))[parts], control.weights[vertices]]),
+                  np.concatenate([control.skeleton.joints[parts], control.mesh.vertices[vertices]])), goal
+
+
+def _place(model: Articulated, features: Points, joints: Mapping[str, np.ndarray], goal: np.ndarray) -> np.ndarray:
+    """The similarity (4, 4) of the trunk, from the bases of the limbs where they suffice, else from all features."""
+    names = list(joints)
+    bases = [model.control.skeleton.names[base] for base, _, _ in limbs(model)]
+    trunk = [names.index(name) for name in bases if name in names]
+    for rows in (trunk, list(range(len(goal)))):
+        if len(rows) < 3 or _on_a_line(goal[rows]) or _on_a_line(features.rest[rows]):
+            continue
+        return align_landmarks(features.rest[rows], goal[rows], scale=True).T_target_source
+    raise ValueError(f"joints, points: expected at least three features that are not on one line, got {len(goal)}")
+
+
+def _on_a_line(points: np.ndarray) -> bool:
+    spread = np.linalg.svd(points - points.mean(axis=0), compute_uv=False)
+    return bool(spread[1] <= 0.01 * spread[0])
+
+
+def _rms(distances: np.ndarray) -> float:
+    return float(np.sqrt(np.mean(distances**2))) if len(distances) else np.nan

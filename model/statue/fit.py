@@ -1,0 +1,122 @@
+"""From one scan to a statue: registration by features, shape-constrained fit, displacement map."""
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field
+
+import numpy as np
+
+from scanprep.geometry.mesh import Mesh
+from scanprep.ranges import Settings
+
+from .automatic import Features, find_features
+from .control import ControlModel
+from .displacement import DisplacementConfig, bake
+from .features import FeatureConfig, FeatureFit, fit_features, head_share, warp
+from .humanoid import humanoid
+from .statue import Statue
+from .surface_fit import SurfaceFit, SurfaceFitConfig, fit_surface
+
+Progress = Callable[[int, int], None]
+FACE = ("left eye", "right eye", "nose tip", "mouth", "chin", "left ear", "right ear", "top of head")
+
+
+@dataclass(frozen=True)
+class StatueConfig(Settings):
+    """Settings of `fit_statue`.
+
+    Attributes
+    ----------
+    features : FeatureConfig
+    surface : SurfaceFitConfig
+    displacement : DisplacementConfig
+    """
+
+    features: FeatureConfig = field(default_factory=FeatureConfig)
+    surface: SurfaceFitConfig = field(default_factory=SurfaceFitConfig)
+    displacement: DisplacementConfig = field(default_factory=DisplacementConfig)
+
+
+@dataclass(frozen=True, eq=False)
+class Posed:
+    """A control model in the pose of a scan, before its surface is fitted.
+
+    Attributes
+    ----------
+    features : FeatureFit
+    start : (N, 3) float, metres
+        Its vertices after the warp of the head.
+    """
+
+    features: FeatureFit
+    start: np.ndarray
+
+
+def fit_statue(scan: Mesh, joints: Mapping[str, np.ndarray] | None = None,
+               points: Mapping[str, np.ndarray] | None = None, control: ControlModel | None = None,
+               config: StatueConfig | None = None, progress: Progress | None = None) -> Statue:
+    """One scan of one person as a character that moves, with all its detail.
+
+    Parameters
+    ----------
+    scan : Mesh, metres
+        One body, floor and furniture taken off (`clean_scan`); it may have holes, which the map then has too.
+    joints : {name of a joint: (3,) float, metres}, optional
+        Joint centres. Without any, a person who stands upright is found by `find_features`.
+    points : {name of a landmark: (3,) float, metres}, optional
+        Points of the face and of the rest of the surface.
+    control : ControlModel, optional
+        `humanoid()` when not given.
+    config : StatueConfig, optional
+    progress : callable, optional
+        Called as progress(done, total).
+
+    Raises
+    ------
+    ValueError
+        A scan without triangles, one in which no person is found, features that say too little.
+
+    [Statues]
+    """
+    control, config = control or humanoid(), config or StatueConfig()
+    if joints is None and points is None:
+        found = find_features(control, scan)
+        posed = posed_automatically(control, found, config.features)
+    else:
+        posed = posed_by_features(control, joints or {}, points or {}, config.features)
+    surface = fit_surface(control.mesh, posed.start, scan, config.surface, progress)
+    fitted = fitted_control(control, posed.features, surface)
+    return Statue(fitted, posed.features.pose, bake(fitted, scan, config.displacement, progress))
+
+
+def posed_by_features(control: ControlModel, joints: Mapping[str, np.ndarray], points: Mapping[str, np.ndarray],
+                      config: FeatureConfig | None = None) -> Posed:
+    """The control model posed by features, and its head warped to those of the face.
+
+    [Statues] Eq. 4, 5
+    """
+    fit = fit_features(control, joints, points, config)
+    face = [name for name in FACE if name in points]
+    if len(face) < 4 or "skullbase" not in control.skeleton.names:
+        return Posed(fit, fit.vertices)
+    own = fit.vertices[[control.landmarks[name] for name in face]]
+    try:
+        return Posed(fit, warp(fit.vertices, own, np.array([points[name] for name in face]), head_share(control)))
+    except ValueError:                   # points in one plane say nothing of the shape of a head
+        return Posed(fit, fit.vertices)
+
+
+def posed_automatically(control: ControlModel, found: Features, config: FeatureConfig | None = None) -> Posed:
+    """The control model where `find_features` found the person; its surface is then near the scan already."""
+    if found.fit is None:
+        raise ValueError(f"scan: {found.problem}")
+    return Posed(found.fit, found.fit.vertices if found.registered is None else found.registered.vertices)
+
+
+def fitted_control(control: ControlModel, posed: FeatureFit, surface: SurfaceFit) -> ControlModel:
+    """The control model on the scan, its joints where the features put them."""
+    joints = posed.joints.copy()
+    fitted = control.mesh.with_vertices(surface.vertices)
+    root = control.skeleton.part_of_vertex(fitted) == 0
+    joints[0] = surface.vertices[root].mean(axis=0)
+    return control.fitted(surface.vertices, joints)

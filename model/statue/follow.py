@@ -1,0 +1,118 @@
+"""A control mesh that follows a learned body model: motion as the model knows it, on the shape of the statue."""
+from __future__ import annotations
+
+import numpy as np
+from scipy.sparse import coo_array, csr_array, diags_array, eye_array
+
+from scanprep.geometry import rotations
+from scanprep.geometry.mesh import Mesh
+from scanprep.geometry.surface import OrientedPoints, Surface
+
+from ..linear import Subject
+
+_SAME_SIDE = 0.3                     # cosine of normals below which the nearest triangle is of another limb or side
+_RINGS = 4                           # of the model's vertices, over which its turns are averaged
+_AT_ONCE = 32                        # frames
+
+
+class Follower:
+    """A control mesh bound to a model's surface in the pose of the scan.
+
+    Each control vertex keeps its offset from the point of the model's surface that it is bound to, in axes that turn
+    with the surface there: the rotations that best carry the edges around that point. In the scan's own pose it is
+    where it was.
+
+    Parameters
+    ----------
+    mesh : Mesh
+        The control mesh, fitted to the scan.
+    subject : Subject
+        The person, for example `model.subject(fit.betas)` after `fit_shape`.
+    pose : (J, 3) float, radians
+        Of the model in the scan.
+    trans : (3,) float, metres
+    registered : (N, 3) float, metres, optional
+        The model's template as registered to the scan: nearer to it than the model, to find the point for each vertex.
+
+    Raises
+    ------
+    ValueError
+        Vertices of another count than the model's.
+    """
+
+    def __init__(self, mesh: Mesh, subject: Subject, pose: np.ndarray, trans: np.ndarray | None = None,
+                 registered: np.ndarray | None = None) -> None:
+        self.mesh, self.subject = mesh, subject
+        body = subject.template.with_vertices(subject.vertices(pose, trans))
+        near = body if registered is None else body.with_vertices(_checked(registered, body))
+        self._bind = _bound(mesh, near)
+        self._around = csr_array(self._bind @ _averaging(body))
+        used = np.unique(self._around.indices)
+        self._around, self._edges = self._around[:, used], body.edges[used]
+        self._before = self._edge(body.vertices)
+        self._offset = mesh.vertices - self._bind @ body.vertices
+
+    def _edge(self, vertices: np.ndarray) -> np.ndarray:
+        return vertices[self._edges[:, 1]] - vertices[self._edges[:, 0]]
+
+    def vertices(self, poses: np.ndarray, trans: np.ndarray | None = None) -> np.ndarray:
+        """The control mesh in poses of the model.
+
+        Parameters
+        ----------
+        poses : (J, 3) or (T, J, 3) float, radians
+        trans : (3,) or (T, 3) float, metres
+
+        Returns
+        -------
+        (n, 3) or (T, n, 3) float, metres
+        """
+        poses = np.asarray(poses, dtype=np.float64)
+        if poses.ndim == 2:
+            return self._moved(self.subject.vertices(poses, trans))
+        out = np.empty((len(poses), *self.mesh.vertices.shape))
+        trans = np.broadcast_to(np.zeros(3) if trans is None else trans, (len(poses), 3))
+        for k in range(0, len(poses), _AT_ONCE):
+            for t, body in enumerate(self.subject.vertices(poses[k:k + _AT_ONCE], trans[k:k + _AT_ONCE]), start=k):
+                out[t] = self._moved(body)
+        return out
+
+    def _moved(self, body: np.ndarray) -> np.ndarray:
+        body = np.asarray(body, dtype=np.float64)
+        outer = np.einsum("ea,eb->eab", self._edge(body), self._before).reshape(-1, 9)
+        R = rotations.project((self._around @ outer).reshape(-1, 3, 3))
+        return np.asarray(self._bind @ body + np.einsum("nab,nb->na", R, self._offset))
+
+
+def _checked(vertices: np.ndarray, body: Mesh) -> np.ndarray:
+    if np.shape(vertices) != body.vertices.shape:
+        raise ValueError(f"registered: expected shape {body.vertices.shape}, got {np.shape(vertices)}")
+    return vertices
+
+
+def _bound(mesh: Mesh, body: Mesh) -> csr_array:
+    """(n, N) barycentric weights of the point of the body for each control vertex, with a compatible normal."""
+    close = Surface(body).closest(mesh.vertices)
+    corners, weights = body.faces[close.faces].copy(), close.bary.copy()
+    facing = np.einsum("nd,nd->n", np.einsum("nc,ncd->nd", weights, body.vertex_normals[corners]), mesh.vertex_normals)
+    wrong = np.flatnonzero(facing < _SAME_SIDE)
+    if len(wrong):
+        there = OrientedPoints(body.vertices, body.vertex_normals)
+        found = there.match(mesh.vertices[wrong], mesh.vertex_normals[wrong], min_cosine=_SAME_SIDE)
+        wrong, vertex = wrong[found.valid], found.index[found.valid]
+        corners[wrong], weights[wrong] = vertex[:, None], [1, 0, 0]
+    n = len(mesh.vertices)
+    return csr_array(coo_array((weights.ravel(), (np.repeat(np.arange(n), 3), corners.ravel())),
+                               shape=(n, len(body.vertices))))
+
+
+def _averaging(body: Mesh) -> csr_array:
+    """(N, E) how much the turn of each edge counts around each vertex."""
+    N, edges = len(body.vertices), body.edges
+    ends = csr_array(coo_array((np.ones(2 * len(edges)), (edges.T.ravel(), np.tile(np.arange(len(edges)), 2))),
+                               shape=(N, len(edges))))
+    ring = (body.vertex_adjacency != 0).astype(float) + eye_array(N)
+    ring = csr_array(diags_array(1 / ring.sum(axis=1)) @ ring)
+    for _ in range(_RINGS - 1):
+        ends = ring @ ends
+    return csr_array(ends)

@@ -1,0 +1,167 @@
+"""Local shape of a triangle mesh: where every vertex lies in the frames of the triangles around it.
+
+The frame of a triangle is the larger triangle of the three vertices opposite across its sides. Each corner of the
+central triangle has barycentric coordinates and a height there. What the paper leaves open, and what is done here:
+
+- Heights are not free of scale. Here they are multiples of √(2 · area) of the frame, so that the local shape is
+  invariant under any similarity and people of any size are as welcome as those of the generic one's.
+- A triangle at a border has no frame. It is left out: its vertices are held by the triangles farther inside, and as
+  corners of their frames. (A control mesh is closed.)
+- A frame whose corners nearly lie on one line says nothing safe about height or place: at a vertex of three triangles
+  two of its corners are even the same vertex. Frames flatter than FLATTEST, or where a barycentric coordinate is above
+  FARTHEST, are left out as well.
+- N_i, the valence, is the number of frames that hold the vertex: on a closed mesh with sound frames they are the same.
+- Eq. 12 is not the gradient of Eq. 10: a vertex that moves also moves the frames of which it is a corner, and the
+  factor 2 is missing. Both are here: `published_force`, and `gradient`, which is exact.
+
+[Statues] section 4.1
+"""
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from scipy.sparse import csr_array
+
+from scanprep.geometry.mesh import Mesh
+
+FLATTEST = 0.05          # height of a frame over its longest side
+FARTHEST = 4.0           # barycentric coordinate
+FLOOR = 1e-6             # of its area at rest: a frame that has become smaller counts as this large
+
+
+@dataclass(frozen=True, eq=False)
+class LocalShape:
+    """The rest shape of a mesh in the frames of its triangles; R rows, one for a vertex in one frame.
+
+    Attributes
+    ----------
+    count : int
+        Vertices of the mesh, N.
+    held : (R,) int
+        The vertex.
+    corners : (R, 3) int
+        Vertices of the frame.
+    bary : (R, 3) float
+        Its barycentric coordinates 1 - α - β, α, β in the plane of the frame.
+    heights : (R,) float
+        Its height h over that plane, in multiples of √(2 · area) of the frame.
+    smallest : (R,) float, square metres
+        Least double area that a frame counts as.
+
+    [Statues] Eq. 10
+    """
+
+    count: int
+    held: np.ndarray
+    corners: np.ndarray
+    bary: np.ndarray
+    heights: np.ndarray
+    smallest: np.ndarray
+
+    @cached_property
+    def weights(self) -> np.ndarray:
+        """(R,) 1 / N_i of the vertex of each row."""
+        return 1 / np.bincount(self.held, minlength=self.count)[self.held]
+
+    @cached_property
+    def plane(self) -> csr_array:
+        """(R, N) sparse: x_i minus its foot in the plane of the frame, from vertices."""
+        R = len(self.held)
+        rows = np.tile(np.arange(R), 4)
+        columns = np.concatenate([self.held, *self.corners.T])
+        return csr_array((np.concatenate([np.ones(R), *-self.bary.T]), (rows, columns)), shape=(R, self.count))
+
+    def raised(self, x: np.ndarray) -> np.ndarray:
+        """(R, 3) what the height adds to the foot, on vertices (N, 3)."""
+        _, _, c, size = self._frames(x)
+        return (self.heights / np.sqrt(size))[:, None] * c
+
+    def residuals(self, x: np.ndarray) -> np.ndarray:
+        """(R, 3) x_i - x(α, β, h), metres."""
+        return self.plane @ x - self.raised(x)
+
+    def energy(self, x: np.ndarray) -> float:
+        """S(x) of vertices (N, 3), square metres: 0 for every similar copy of the rest shape.
+
+        [Statues] Eq. 10
+        """
+        return float(self.weights @ (self.residuals(x) ** 2).sum(axis=1))
+
+    def published_force(self, x: np.ndarray) -> np.ndarray:
+        """(N, 3) mean over its frames of what would bring each vertex where they want it, the frames standing still.
+
+        [Statues] Eq. 12
+        """
+        return -self._summed(self.held, self.weights[:, None] * self.residuals(x))
+
+    def gradient(self, x: np.ndarray) -> np.ndarray:
+        """(N, 3) exact gradient of `energy`, with what a vertex does to the frames of others."""
+        return 2 * self.transposed(x, self.weights[:, None] * self.residuals(x))
+
+    def transposed(self, x: np.ndarray, r: np.ndarray) -> np.ndarray:
+        """The transposed derivative of the residuals at vertices x (N, 3), applied to rows r (R, 3)."""
+        e, f, c, size = self._frames(x)
+        q = self._scaled(c, size, r)
+        to_1, to_2 = np.cross(f, q), np.cross(q, e)
+        rows = np.concatenate([to_1 + to_2, -to_1, -to_2])
+        return self.plane.T @ r + self._summed(self.corners.T.ravel(), rows)
+
+    def derivative(self, x: np.ndarray, d: np.ndarray) -> np.ndarray:
+        """(R, 3) how the residuals at vertices x (N, 3) change when these move by d (N, 3)."""
+        e, f, c, size = self._frames(x)
+        d0, d1, d2 = (d[corner] for corner in self.corners.T)
+        return self.plane @ d - self._scaled(c, size, np.cross(d1 - d0, f) + np.cross(e, d2 - d0))
+
+    def _frames(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """Two sides of every frame, their cross product and the double area."""
+        p0, p1, p2 = (x[corner] for corner in self.corners.T)
+        e, f = p1 - p0, p2 - p0
+        c = np.cross(e, f)
+        return e, f, c, np.maximum(np.linalg.norm(c, axis=1), self.smallest)
+
+    def _scaled(self, c: np.ndarray, size: np.ndarray, v: np.ndarray) -> np.ndarray:
+        """The (symmetric) derivative of h c / √|c| by c, applied to v (R, 3)."""
+        along = np.where(size > self.smallest, np.einsum("rd,rd->r", c, v) / (2 * size**2), 0.0)
+        return (self.heights / np.sqrt(size))[:, None] * (v - along[:, None] * c)
+
+    def _summed(self, vertex: np.ndarray, rows: np.ndarray) -> np.ndarray:
+        return np.stack([np.bincount(vertex, column, self.count) for column in rows.T], axis=1)
+
+
+def local_shape(rest: Mesh) -> LocalShape:
+    """The local shape of a mesh at rest.
+
+    Raises
+    ------
+    ValueError
+        A mesh that is not edge-manifold or without a single sound frame.
+
+    [Statues] section 4.1
+    """
+    if not rest.is_edge_manifold:
+        raise ValueError(f"rest: expected every edge between two triangles that agree on the outside, got {rest}")
+    x, whole = rest.vertices, np.flatnonzero((rest.edge_use[rest.face_edges] == 2).all(axis=1))
+    # The two triangles at an edge name four corners; those not on the edge are opposite across it.
+    totals = np.bincount(rest.face_edges.ravel(), np.repeat(rest.faces.sum(axis=1), 3), len(rest.edges)).astype(int)
+    face = rest.faces[whole]
+    both = face + np.roll(face, -1, axis=1)
+    frames = totals[rest.face_edges[whole]] - 2 * both - np.roll(face, -2, axis=1)
+    p = x[frames]
+    c = np.cross(p[:, 1] - p[:, 0], p[:, 2] - p[:, 0])
+    size = np.linalg.norm(c, axis=1)
+    longest = ((p - np.roll(p, 1, axis=1)) ** 2).sum(axis=2).max(axis=1)
+    safe = size > FLATTEST * longest
+    corners, c, size, held = (np.repeat(a[safe], 3, axis=0) for a in (frames, c, size, face))
+    held = face[safe].ravel()
+    w = x[held] - x[corners[:, 0]]
+    e, f = x[corners[:, 1]] - x[corners[:, 0]], x[corners[:, 2]] - x[corners[:, 0]]
+    alpha = np.einsum("rd,rd->r", np.cross(w, f), c) / size**2
+    beta = np.einsum("rd,rd->r", np.cross(e, w), c) / size**2
+    bary = np.stack([1 - alpha - beta, alpha, beta], axis=1)
+    near = np.repeat((np.abs(bary) <= FARTHEST).all(axis=1).reshape(-1, 3).all(axis=1), 3)
+    if not near.any():
+        raise ValueError(f"rest: expected triangles with neighbours across all three sides, got {rest} without")
+    heights = np.einsum("rd,rd->r", w, c) / size**1.5
+    return LocalShape(len(x), held[near], corners[near], bary[near], heights[near], FLOOR * size[near])

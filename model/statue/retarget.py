@@ -1,0 +1,259 @@
+"""Retargeting: poses and travel of one skeleton for another, by the directions of bones."""
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from itertools import pairwise
+
+import numpy as np
+
+from scanprep.geometry import rotations
+from scanprep.ranges import Settings, Share
+
+from ..export.bvh_read import BvhMotion
+from ..export.rig import check_motion
+from .bone_names import above, find_roles, trunk
+from .control import ControlModel
+
+_CHAINS = (("shoulder", "elbow", "wrist"), ("hip", "knee", "ankle"))
+_ON_THE_FLOOR = 5                    # percentile of the lowest vertex over the frames: some frames may err
+_AT_ONCE = 200                       # frames
+_APART = np.radians(10)              # from the vertical, of a shank at rest beyond which a foot is tilted with it
+
+
+@dataclass(frozen=True)
+class MotionConfig(Settings):
+    """Settings of `people_motion` and `bvh_motion`.
+
+    Parameters
+    ----------
+    girdle : float, 0 to 1
+        Share of the upper arm's angle above the horizontal that the clavicle is raised, where the motion has no
+        clavicle.
+    """
+
+    girdle: Share = 0.2
+
+
+@dataclass(frozen=True, eq=False)
+class StatueMotion:
+    """A motion of a statue, by the conventions of the body models.
+
+    Attributes
+    ----------
+    poses : (T, J, 3) float, radians
+        Against the default pose, which is that of the scan.
+    trans : (T, 3) float, metres
+        Travel of the root's joint.
+    rate : float, frames a second
+    matched : {part of the statue: joint that it follows}
+    lacking : the statue's parts that go with the part above them, because the motion has no such joint
+    unmatched : joints of the motion that no part follows, not even by what hangs on them
+    """
+
+    poses: np.ndarray
+    trans: np.ndarray
+    rate: float
+    matched: dict[str, str]
+    lacking: tuple[str, ...] = ()
+    unmatched: tuple[str, ...] = ()
+
+
+class Pairing:
+    """A statue and a skeleton that moves, both at rest.
+
+    Attributes
+    ----------
+    P : (J, 3, 3)
+        How the generic model's parts were turned to the pose of the scan.
+    joints : (J, 3)
+        Of the statue in the generic default pose, in the axes of the generic model.
+    ours, theirs : {H-Anim name: part or joint}
+    """
+
+    def __init__(self, control: ControlModel, pose: np.ndarray, moving: BvhMotion, names: Mapping[str, str] | None,
+                 up: np.ndarray | None) -> None:
+        self.control, self.moving = control, moving
+        skeleton = control.skeleton
+        self.P = skeleton.part_rotations(check_motion(skeleton, np.asarray(pose)[None], None, 1.0)[0][0])
+        self.joints = skeleton.joints.copy()
+        for j, p in enumerate(skeleton.parents[1:], start=1):
+            self.joints[j] = self.joints[p] + self.P[p].T @ (skeleton.joints[j] - skeleton.joints[p])
+        self.ours = find_roles(skeleton.names)
+        self.theirs = find_roles(moving.names, names)
+        wanted = ("humanoid_root", "l_hip", "r_hip", "l_shoulder", "r_shoulder")
+        for what, found, all_names in (("control model", self.ours, skeleton.names),
+                                       ("motion", self.theirs, moving.names)):
+            missing = [role for role in wanted if role not in found]
+            if missing:
+                raise ValueError(f"{what}: expected joints named like {', '.join(missing)}, found only "
+                                 f"{', '.join(all_names)}")
+        self.axes = _axes(self.joints, self.ours)
+        feet = [skeleton.joints[self.ours[r]] for r in ("l_ankle", "r_ankle", "l_hip", "r_hip") if r in self.ours]
+        high = skeleton.joints[self.ours.get("skullbase", self.ours["l_shoulder"])] - np.mean(feet[:2], axis=0)
+        self.up = _nearest_axis(high) if up is None else np.asarray(up) / np.linalg.norm(up)
+
+    def alignment(self, aligned: bool) -> dict[int, np.ndarray]:
+        """For each part the rotation from the axes of the generic model to those of the motion at rest.
+
+        The smallest turn that brings our bone to theirs, after that of the part above it. Feet stand flat, but where
+        the legs are far apart at rest (as in the CMU files) they are taken to be square to the shanks from the front.
+        """
+        J = len(self.control.skeleton.parents)
+        whole = self.whole(aligned)
+        A = dict.fromkeys(range(J), whole)
+        for side in "lr" if not aligned else "":
+            for chain in _CHAINS:
+                roles = [f"{side}_{name}" for name in chain]
+                turn = whole
+                for role, following in pairwise(roles):
+                    if {role, following} <= self.ours.keys() & self.theirs.keys():
+                        own = self.joints[self.ours[following]] - self.joints[self.ours[role]]
+                        other = self.moving.rest[self.theirs[following]] - self.moving.rest[self.theirs[role]]
+                        turn = _smallest_turn(turn @ own, other) @ turn
+                        A[self.ours[role]] = turn
+                if chain[2] == "wrist" and roles[2] in self.ours:
+                    A[self.ours[roles[2]]] = turn                       # a hand continues the forearm
+                elif {*roles[1:]} <= self.ours.keys() & self.theirs.keys():
+                    knee, ankle = self.moving.rest[[self.theirs[role] for role in roles[1:]]]
+                    left, down, _ = self.standing(False).T @ (ankle - knee) * [1, -1, 1]
+                    aside = np.arctan2(left, down)
+                    if abs(aside) > _APART:
+                        A[self.ours[roles[2]]] = rotations.exp(aside * self.standing(False)[:, 2]) @ whole
+        return A
+
+    def trunk(self) -> np.ndarray:
+        """(T, 3, 3) of the one joint that stands for the trunk of the motion."""
+        moving, theirs = self.moving, self.theirs
+        low, top = trunk(moving.parents, theirs)
+        rest, R, y = moving.rest, moving.rotations, moving.places
+        roles = [role for role in ("l_shoulder", "r_shoulder", "skullbase") if role in theirs]
+        points = rest[[theirs[role] for role in roles]]
+        there = np.einsum("tab,kb->tka", R[:, top], points - rest[top]) + (y[:, top] - y[:, low])[:, None]
+        return rotations.project(np.einsum("tka,kb->tab", there, points - rest[low]))
+
+    def world(self, aligned: bool) -> np.ndarray:
+        """The rotation (3, 3) from the axes of the motion to those of the scan: upwards to upwards, and forwards
+        at rest to where the scan faces."""
+        return _upright(self.P[0] @ self.axes[:, 2], self.up) @ self.standing(aligned).T
+
+    def whole(self, aligned: bool) -> np.ndarray:
+        """The rotation (3, 3) from the axes of the generic model to those of the motion, both standing at rest."""
+        return self.standing(aligned) @ self.standing(True).T
+
+    def standing(self, ours: bool) -> np.ndarray:
+        """(3, 3) to the left, upwards and forwards in the rest of the generic model or of the motion.
+
+        Upwards is the axis next to the trunk: joints of a person who stands upright need not lie above each other.
+        """
+        _, high, forwards = (self.axes if ours else _axes(self.moving.rest, self.theirs)).T
+        return _upright(forwards, _nearest_axis(high))
+
+
+def retargeted(pair: Pairing, aligned: bool, config: MotionConfig) -> StatueMotion:
+    """The motion of the pair's skeleton on its statue; `aligned`: the generic model rests as that skeleton does."""
+    moving, skeleton = pair.moving, pair.control.skeleton
+    A = pair.alignment(aligned)
+    role_of = {part: role for role, part in pair.ours.items()}
+    M = np.empty((len(moving.places), len(skeleton.parents), 3, 3))     # from the generic model's axes to the world
+    lacking, matched = [], {}
+    for j, name in enumerate(skeleton.names):
+        role = role_of.get(j, "")
+        if role == "vl5":
+            low, top = trunk(moving.parents, pair.theirs)
+            M[:, j] = pair.trunk() @ A[j]
+            matched[name] = moving.names[low] if low == top else f"{moving.names[low]} to {moving.names[top]}"
+        elif role in pair.theirs:
+            M[:, j] = moving.rotations[:, pair.theirs[role]] @ A[j]
+            matched[name] = moving.names[pair.theirs[role]]
+        else:
+            lacking.append(name)
+            M[:, j] = M[:, skeleton.parents[j]] if j else np.eye(3)
+    _raise_clavicles(pair, M, config.girdle)
+    V = pair.world(aligned)
+    R = V @ M @ np.swapaxes(pair.P, -1, -2)
+    poses = skeleton.pose_of(R)
+    used = {j for i in pair.theirs.values() for j in above(moving.parents, i)}
+    unmatched = tuple(name for j, name in enumerate(moving.names) if j not in used)
+    return StatueMotion(poses, _travel(pair, V, R, poses), moving.rate, matched, tuple(lacking), unmatched)
+
+
+def _raise_clavicles(pair: Pairing, M: np.ndarray, share: float) -> None:
+    """Where the motion has no clavicles, raise ours by a share of what the upper arms are above the horizontal."""
+    left, high, _ = pair.axes.T
+    for side, outwards in (("l", left), ("r", -left)):
+        parts = [pair.ours.get(f"{side}_{name}") for name in ("sternoclavicular", "shoulder", "elbow")]
+        if None in parts or f"{side}_sternoclavicular" in pair.theirs:
+            continue
+        clavicle, arm, elbow = parts
+        own = pair.joints[elbow] - pair.joints[arm]
+        own = own / np.linalg.norm(own)
+        sine = np.einsum("tab,a,tbc,c->t", np.swapaxes(M[:, clavicle], -1, -2), high, M[:, arm], own)
+        angle = share * np.maximum(np.arcsin(np.clip(sine, -1, 1)), 0)
+        M[:, clavicle] = M[:, clavicle] @ rotations.exp(angle[:, None] * np.cross(outwards, high))
+
+
+def _travel(pair: Pairing, V: np.ndarray, R: np.ndarray, poses: np.ndarray) -> np.ndarray:
+    """(T, 3) travel of the root's joint, with the middle between the hips where that of the motion is, scaled."""
+    control, up = pair.control, pair.up
+    joints = control.skeleton.joints
+    ours = [pair.ours["l_hip"], pair.ours["r_hip"]]
+    theirs = [pair.theirs["l_hip"], pair.theirs["r_hip"]]
+    middle = joints[ours].mean(axis=0)
+    scale = _leg(joints, pair.ours, pair.theirs) / _leg(pair.moving.rest, pair.theirs, pair.ours)
+    place = scale * pair.moving.places[:, theirs].mean(axis=1) @ V.T
+    place = place - place[0] + middle
+    trans = place + R[:, 0] @ (joints[0] - middle) - joints[0]
+    lowest = np.concatenate([(control.rig.vertices(poses[k:k + _AT_ONCE], trans[k:k + _AT_ONCE]) @ up).min(axis=1)
+                             for k in range(0, len(poses), _AT_ONCE)])
+    return trans + ((control.mesh.vertices @ up).min() - np.percentile(lowest, _ON_THE_FLOOR)) * up
+
+
+def _leg(joints: np.ndarray, roles: Mapping[str, int], others: Mapping[str, int]) -> float:
+    """Mean length of the legs, as far as both skeletons have them; without knees that of the trunk."""
+    chains = [[roles[f"{side}_{name}"] for name in ("hip", "knee", "ankle") if f"{side}_{name}" in roles.keys()
+               & others.keys()] for side in "lr"]
+    if min(map(len, chains)) < 2:
+        chains = [[roles[f"{side}_hip"], roles[f"{side}_shoulder"]] for side in "lr"]
+    return float(np.mean([np.linalg.norm(np.diff(joints[chain], axis=0), axis=1).sum() for chain in chains]))
+
+
+def _axes(joints: np.ndarray, roles: Mapping[str, int]) -> np.ndarray:
+    """(3, 3) columns: to the left, upwards and forwards of a body at rest, from its hips and shoulders."""
+    hips, shoulders = ([joints[roles[f"{side}_{name}"]] for side in "lr"] for name in ("hip", "shoulder"))
+    across = sum((a - b) / max(float(np.linalg.norm(a - b)), 1e-12) for a, b in (hips, shoulders))
+    high = np.mean(shoulders, axis=0) - np.mean(hips, axis=0)
+    forwards = np.cross(across, high)
+    size = np.linalg.norm(forwards)
+    if not size > 1e-6 * np.linalg.norm(across) * np.linalg.norm(high):
+        raise ValueError("joints: expected hips and shoulders that are not in one line at rest (a motion that has no "
+                         "such rest needs a reference frame)")
+    return np.stack([np.cross(high, forwards) / np.linalg.norm(high) / size, high / np.linalg.norm(high),
+                     forwards / size], axis=1)
+
+
+def _nearest_axis(direction: np.ndarray) -> np.ndarray:
+    main = int(np.abs(direction).argmax())
+    return np.eye(3)[main] * np.sign(direction[main])
+
+
+def _upright(forwards: np.ndarray, up: np.ndarray) -> np.ndarray:
+    """(3, 3) columns: to the left, upwards and, level, forwards."""
+    level = forwards - (forwards @ up) * up
+    if np.linalg.norm(level) < 0.1:                                     # lies on the back or on the face
+        level = np.eye(3)[np.abs(up).argmin()]
+        level = level - (level @ up) * up
+    level = level / np.linalg.norm(level)
+    return np.stack([np.cross(up, level), up, level], axis=1)
+
+
+def _smallest_turn(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """The rotation (3, 3) by the smallest angle that brings direction a (3,) to direction b."""
+    axis = np.cross(a, b)
+    size = np.linalg.norm(axis)
+    if size < 1e-12 * np.linalg.norm(a) * np.linalg.norm(b):
+        if a @ b >= 0:
+            return np.eye(3)
+        axis = np.cross(a, np.eye(3)[np.abs(a).argmin()])
+        size = np.linalg.norm(axis)
+    return rotations.exp(axis / size * np.arctan2(np.linalg.norm(np.cross(a, b)), a @ b))

@@ -1,0 +1,173 @@
+"""Annealed soft assignment of the vertices of a model to the points of a scan.
+
+Every vertex is assigned to several points at once, the nearer ones more; no point is assigned more than once in sum.
+What the paper leaves open, and what is done here:
+
+- The closest subset: the `neighbours` nearest points whose normals lie in the half-space of the vertex normal.
+- The slack of a point starts as the smallest of its matches. Balanced to the end, with far more points than vertices,
+  this takes distance out of the assignment: m_ij becomes proportional to exp((d_max² - d_ij²) / T) with d_max the
+  distance of the farthest vertex that knows the point, and a point that only one vertex knows counts the same however
+  far it lies. That is `slack="published"`. With `slack="rest"` the slack is whatever remains of a point, and costs
+  nothing: m is the minimum of Eq. 15 under Σ_i m_ij <= 1, and for T → 0 it assigns the closest points, as the paper
+  says it should.
+- Where vertices outnumber the points that they know, Eq. 14 has no solution. Rows come last, so they always sum to 1;
+  `excess` tells by how much a point is assigned more than once.
+- Everything is done with logarithms: at small T the matches of the paper's Eq. 17 are zero in floating point.
+
+[Statues] Eq. 13-17
+"""
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from scipy.sparse import csr_array
+from scipy.spatial import cKDTree
+
+from scanprep.threads import search_threads
+
+Slack = Literal["rest", "published"]
+
+
+@dataclass(frozen=True, eq=False)
+class SoftAssignment:
+    """How much every vertex is assigned to every point.
+
+    Attributes
+    ----------
+    matches : (I, J) sparse
+        Rows sum to 1; the row of a vertex that knows no point is empty.
+    slack : (J,) float
+        What is left of each point: 1 for a point that no vertex knows.
+    excess : float
+        Most that a point is assigned beyond 1.
+    """
+
+    matches: csr_array
+    slack: np.ndarray
+    excess: float
+
+    @property
+    def seen(self) -> np.ndarray:
+        """(I,) bool: vertices that know a point."""
+        return np.diff(self.matches.indptr) > 0
+
+    def energy(self, x: np.ndarray, points: np.ndarray, temperature: float) -> tuple[float, float]:
+        """The data term Σ m |y - x|² and the entropy term T Σ m (log m - 1), square metres.
+
+        [Statues] Eq. 15
+        """
+        i, j = np.repeat(np.arange(len(x)), np.diff(self.matches.indptr)), self.matches.indices
+        m = self.matches.data
+        apart = ((points[j] - x[i]) ** 2).sum(axis=1)
+        return float(m @ apart), float(temperature * (m @ (np.log(np.maximum(m, 1e-300)) - 1)))
+
+
+class ScanPoints:
+    """Points of a scan with normals, searched for the nearest ones that face the same way.
+
+    Parameters
+    ----------
+    points : (J, 3) float, metres
+    normals : (J, 3) float, unit
+    """
+
+    def __init__(self, points: np.ndarray, normals: np.ndarray) -> None:
+        self.points, self.normals = points, normals
+        self._tree = cKDTree(points)
+
+    def nearest(self, x: np.ndarray, normals: np.ndarray, neighbours: int) -> tuple[np.ndarray, np.ndarray]:
+        """The nearest points whose normals lie in the half-space of the vertex normal.
+
+        Parameters
+        ----------
+        x, normals : (I, 3) float
+        neighbours : int
+
+        Returns
+        -------
+        (I, K) int
+            Points, the nearest first; -1 where there are no more.
+        (I, K) float, square metres
+            Squared distances; inf where there are no more.
+        """
+        index, squared = self._facing(x, normals, 2 * neighbours)
+        alone = np.flatnonzero(index[:, 0] < 0)          # deep inside a limb the other side may be nearer
+        if len(alone):
+            wide = self._facing(x[alone], normals[alone], 32 * neighbours)
+            index[alone], squared[alone] = (a[:, :index.shape[1]] for a in wide)
+        return index[:, :neighbours], squared[:, :neighbours]
+
+    def _facing(self, x: np.ndarray, normals: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
+        near = np.arange(1, min(count, len(self.points)) + 1)
+        apart, index = self._tree.query(x, near, workers=search_threads(len(x)))
+        facing = np.einsum("ikd,id->ik", self.normals[index], normals) > 0
+        order = np.argsort(~facing, axis=1, kind="stable")
+        facing = np.take_along_axis(facing, order, axis=1)
+        return (np.where(facing, np.take_along_axis(index, order, axis=1), -1),
+                np.where(facing, np.take_along_axis(apart, order, axis=1) ** 2, np.inf))
+
+
+def assign(near: np.ndarray, squared: np.ndarray, count: int, temperature: float, slack: Slack = "rest",
+           tolerance: float = 0.01, most: int = 5) -> SoftAssignment:
+    """Balanced soft assignment at one temperature.
+
+    Parameters
+    ----------
+    near : (I, K) int
+        The points that each vertex knows, -1 for none.
+    squared : (I, K) float, square metres
+        Their squared distances.
+    count : int
+        Points of the scan, J.
+    temperature : float, square metres
+    slack : "rest" or "published"
+    tolerance : float
+        Balanced when no share of a point changes by more than this part of itself.
+    most : int
+        Times twenty alternations at most.
+
+    [Statues] Eq. 14, 17
+    """
+    known = near >= 0
+    row, point = np.nonzero(known)[0], near[known]
+    used, column = np.unique(point, return_inverse=True)
+    log_k = -squared[known] / temperature                # Eq. 17
+    log_s = np.zeros(len(used))
+    np.minimum.at(log_s, column, log_k)                  # the smallest match of each point
+    u, v = np.zeros(len(near)), np.zeros(len(used))
+    for _ in range(most):
+        # Rows first, with logarithms; then plain factors, which are fast, for as long as they are no extreme numbers.
+        top = np.full(len(near), -np.inf)
+        np.maximum.at(top, row, log_k + v[column])
+        u = -np.where(np.isfinite(top), top, 0.0)
+        M = csr_array((np.exp(log_k + u[row] + v[column]), (row, column)), shape=(len(near), len(used)))
+        a, b, changed = _balanced(M, np.exp(np.minimum(-v, 50.0)) if slack == "rest" else None, log_s + v, tolerance)
+        u, v = u + np.log(a), v + np.log(b)
+        if changed <= tolerance:
+            break
+    m = np.exp(log_k + u[row] + v[column])
+    matches = csr_array((m, (row, point)), shape=(len(near), count))
+    left = 1 - matches.sum(axis=0)
+    return SoftAssignment(matches, np.maximum(left, 0), float(max(0, -left.min())))
+
+
+def _balanced(M: csr_array, most: np.ndarray | None, log_s: np.ndarray, tolerance: float, turns: int = 20
+              ) -> tuple[np.ndarray, np.ndarray, float]:
+    """Factors of rows (I,) and columns (J,), rows last, and the largest relative change in the last turn.
+
+    Columns come to 1 together with a slack of exp(log_s); or at most to 1, by factors of at most `most`.
+    """
+    T = csr_array(M.T)
+    empty = np.diff(M.indptr) == 0
+    b, changed = np.ones(M.shape[1]), np.inf
+    a = 1 / np.where(empty, 1.0, M @ b)
+    for _ in range(turns):
+        total, before = np.maximum(T @ a, 1e-250), b
+        b = np.minimum(most, 1 / total) if most is not None else 1 / (np.exp(np.minimum(log_s, 300.0)) + total)
+        a = 1 / np.where(empty, 1.0, M @ b)
+        changed = float(np.max(np.abs(b / before - 1), initial=0.0))
+        if changed <= tolerance or max(a.max(), 1 / b.min()) > 1e100:
+            break
+    return a, b, changed

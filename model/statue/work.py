@@ -1,0 +1,237 @@
+"""One scan of `scape statue fit`: read, fitted, mapped, written with its page."""
+from __future__ import annotations
+
+import time
+import warnings
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+
+import numpy as np
+
+from scanprep.batch.room import Room
+from scanprep.cleaning.components import clean_scan
+from scanprep.cli import MM, Unit
+from scanprep.console import Metric, Outcome, write_report
+from scanprep.geometry.files import read_mesh, write_mesh
+from scanprep.geometry.formats.common import UNITS
+from scanprep.geometry.mesh import Mesh
+from scanprep.pictures.sheets import save_png
+from scanprep.pictures.textures import Texture, read_texture
+
+from .automatic import Features, find_features
+from .colors import bake_texture, scan_look
+from .control import ControlModel
+from .displacement import bake, coverage_shares
+from .files import save_statue, write_body, write_for_programs
+from .fit import Posed, StatueConfig, fitted_control, posed_automatically, posed_by_features
+from .read_features import read_features
+from .reconstruction import (
+    Reconstruction,
+    SurfaceError,
+    coverage_at,
+    displaced_surface,
+    inverted_triangles,
+    remaining_error,
+    surface_error,
+)
+from .report import Level, in_motion, parts_without_data, statue_page, statue_picture, upright_axis
+from .statue import HOLE, MEASURED, Statue
+from .subdivision import Subdivision, subdivide, subdivide_adaptive
+from .surface_fit import SurfaceFit, fit_surface
+
+LEVELS = 4                           # 0 to 3 are measured, the last is written
+TOLERANCE = 0.0005                   # metres: of adaptive subdivision in the report
+LOST = 0.5                           # share of the control mesh without data that means nothing
+
+
+@dataclass(frozen=True)
+class Inputs:
+    """The files of one scan."""
+
+    scan: Path
+    features: Path | None = None
+
+
+@dataclass(frozen=True, eq=False)
+class Work:
+    """What the scans of one call have in common.
+
+    Attributes
+    ----------
+    control : ControlModel
+    config : StatueConfig
+    unit : of the scans and features, where the files cannot tell
+    command : for the report of each scan of a folder; one scan's is written by the console
+    """
+
+    control: ControlModel
+    config: StatueConfig
+    unit: Unit | None = None
+    command: str = field(default="", metadata={"digest": False})
+
+    def __call__(self, inputs: Inputs, room: Room) -> list[Metric]:
+        """Fit the statue of some files into the folder of a room; the figures."""
+        start = time.perf_counter()
+        metrics = self._fit(inputs, room)
+        if self.command:
+            write_report(Outcome(room.folder, metrics, {"statue": self.config}), self.command,
+                         time.perf_counter() - start)
+        return metrics
+
+    def _fit(self, inputs: Inputs, room: Room) -> list[Metric]:
+        scan, texture, dropped = _read(inputs, self.unit)
+        same = (self.control, self.config, self.unit, inputs)
+        if inputs.features is None:
+            found = room.step("features", (self.control, self.unit, inputs), lambda: find_features(self.control, scan))
+            metre = 1.0 if self.unit else UNITS[found.unit]
+            if metre != 1:
+                scan, texture = scan.with_vertices(metre * scan.vertices), texture and texture.scaled(metre)
+                found = in_metres(found, metre)
+            posed, rows = posed_automatically(self.control, found, self.config.features), _found(found, self.unit)
+        else:
+            joints, points = read_features(inputs.features, self.control, scan, self.unit)
+            posed = posed_by_features(self.control, joints, points, self.config.features)
+            rows = [Metric("joints given", len(joints)), Metric("surface points given", len(points))]
+        surface = room.step("surface", same, lambda: fit_surface(self.control.mesh, posed.start, scan,
+                                                                 self.config.surface, room.tell))
+        control = fitted_control(self.control, posed.features, surface)
+        map_ = room.step("map", same, lambda: bake(control, scan, self.config.displacement, room.tell))
+        statue = Statue(control, posed.features.pose, map_)
+        if texture is not None or scan.colors is not None:
+            image = room.step("texture", same, lambda: bake_texture(control, map_, scan_look(texture or scan)))
+            statue = replace(statue, texture=image)
+        return self._written(statue, scan, surface, [*dropped, *rows, *_posed(posed)], inputs, room)
+
+    def _written(self, statue: Statue, scan: Mesh, surface: SurfaceFit, rows: list[Metric], inputs: Inputs, room: Room
+                 ) -> list[Metric]:
+        folder = room.folder
+        save_statue(folder, statue)
+        levels, fine = measured_levels(statue, scan)
+        adaptive = _adaptive(statue, scan)
+        write_mesh(folder / "reconstruction.ply", levels[-1].mesh)
+        write_body(folder, statue)
+        write_for_programs(folder, statue, levels[-1].mesh.vertices, fine, upright_axis(statue))
+        rows = [*rows, *_figures(statue, scan, surface, levels, adaptive, fine), *_sizes(folder, scan)]
+        problem = statue_problem(statue)
+        rows = [*([Metric("problem", problem)] if problem else []), *rows]
+        picture = statue_picture(scan, statue, levels[-1])
+        save_png(folder / "picture.png", picture)
+        page = statue_page(inputs.scan.name, scan, statue, levels, [(m.name, m.value, m.unit) for m in rows], adaptive,
+                           in_motion(statue), picture)
+        page.write(folder / "report.html")
+        return rows
+
+
+def in_metres(found: Features, metre: float) -> Features:
+    """Features of a scan in another unit, in metres."""
+    def scaled(mesh: Mesh | None) -> Mesh | None:
+        return None if mesh is None else mesh.with_vertices(metre * mesh.vertices)
+
+    fit = found.fit
+    if fit is not None:
+        fit = replace(fit, lengths=metre * fit.lengths, size=metre * fit.size, trans=metre * fit.trans,
+                      vertices=metre * fit.vertices, joints=metre * fit.joints, joint_rms=metre * fit.joint_rms,
+                      point_rms=metre * fit.point_rms)
+    return replace(found, joints={name: metre * place for name, place in found.joints.items()},
+                   points={name: metre * place for name, place in found.points.items()},
+                   registered=scaled(found.registered), fit=fit)
+
+
+def measured_levels(statue: Statue, scan: Mesh) -> tuple[list[Level], Subdivision]:
+    """The reconstruction at every level with its distance to the scan, and the finest subdivision.
+
+    [Statues] Eq. 22, 23
+    """
+    levels = []
+    for number in range(LEVELS):
+        fine = subdivide(statue.control.mesh, statue.control.chart, number)
+        levels.append(_level(f"level {number}", statue, fine, scan))
+    return levels, fine
+
+
+def _level(name: str, statue: Statue, fine: Subdivision, scan: Mesh) -> Level:
+    mesh = Reconstruction(statue.control, statue.map, fine).mesh()
+    shown = (_kinds(statue, fine) != HOLE).any(axis=1)
+    error = surface_error(mesh.submesh(shown)[0], scan) if shown.any() else SurfaceError(np.nan, np.nan, np.nan)
+    return Level(name, mesh, error.mean, error.rms, shown)
+
+
+def _kinds(statue: Statue, fine: Subdivision) -> np.ndarray:
+    """(f, 3) what the map says at the corners of fine triangles."""
+    return coverage_at(statue.control, statue.map, fine.parent, fine.bary)[fine.faces]
+
+
+def _adaptive(statue: Statue, scan: Mesh) -> Level:
+    control = statue.control
+    fine = subdivide_adaptive(control.mesh, control.chart, displaced_surface(control, statue.map), TOLERANCE, LEVELS)
+    return _level(f"adaptive, {MM * TOLERANCE:g} mm", statue, fine, scan)
+
+
+def statue_problem(statue: Statue) -> str | None:
+    """Why a statue means nothing; None where it means something."""
+    shares = coverage_shares(statue.control, statue.map)
+    if shares["measured"] >= LOST:
+        return None
+    return (f"only {100 * shares['measured']:.0f}% of the control mesh has data of the scan one-to-one, "
+            f"{100 * shares['hole']:.0f}% are holes; the control model is not where the person is, or most of the "
+            "person is not in the scan; features given by hand (--features) may help")
+
+
+def _read(inputs: Inputs, unit: Unit | None) -> tuple[Mesh, Texture | None, list[Metric]]:
+    """The body of a scan in metres (as far as the unit is known), its texture, and what was left out."""
+    with warnings.catch_warnings():
+        warnings.filterwarnings("ignore", ".*when read as metres", UserWarning)     # the unit is looked for later
+        scan, texture = read_mesh(inputs.scan, unit), read_texture(inputs.scan, unit)
+    if not len(scan.faces):
+        raise ValueError(f"{inputs.scan}: expected a mesh, found {len(scan.vertices)} points without triangles; "
+                         "a surface through them comes from scape prep merge, or another program")
+    cleaned = clean_scan(scan)
+    left = 1 - float(cleaned.kept.mean())
+    rows = [Metric("scan, triangles", len(scan.faces))]
+    if left > 0:
+        rows.append(Metric("left out as floor, furniture, specks", 100 * left, "% of the points"))
+    return cleaned.mesh, texture, rows
+
+
+def _found(found: Features, unit: Unit | None) -> list[Metric]:
+    """What was found without a click."""
+    rows = [Metric("unit of the scan", unit or f"{found.unit}, from the height of the body")]
+    if found.missing:
+        rows.append(Metric("not seen in the scan", ", ".join(found.missing)))
+    if found.problem:
+        rows.append(Metric("look at it", found.problem))
+    return rows
+
+
+def _posed(posed: Posed) -> list[Metric]:
+    fit = posed.features
+    return [Metric("joints of the posed control model to the features, RMS", MM * fit.joint_rms, "mm"),
+            Metric("surface points of it, RMS", MM * fit.point_rms, "mm")]
+
+
+def _figures(statue: Statue, scan: Mesh, surface: SurfaceFit, levels: list[Level], adaptive: Level,
+             fine: Subdivision) -> list[Metric]:
+    """The rows of the closing table."""
+    shares = coverage_shares(statue.control, statue.map)
+    left = remaining_error(statue.control, statue.map, scan)
+    turned = inverted_triangles(statue.control, statue.control.mesh.vertices, fine, levels[-1].mesh.vertices)
+    beside_folds = (_kinds(statue, fine)[turned] == MEASURED).all(axis=1)
+    lacking = parts_without_data(statue)
+    return [Metric("control mesh to the scan, RMS", MM * surface.rms, "mm"),
+            Metric("inverted triangles of the control mesh", surface.inverted),
+            Metric("one-to-one", 100 * shares["measured"], "% of the surface"),
+            Metric("folded", 100 * shares["folded"], "% of the surface"),
+            Metric("holes", 100 * shares["hole"], "% of the surface"),
+            *([Metric("parts without data", ", ".join(lacking))] if lacking else []),
+            Metric("error left by the map where it is one-to-one, mean", MM * left.mean, "mm"),
+            *(Metric(f"{one.name} to the scan, {what}", MM * value, "mm") for one in [*levels, adaptive]
+              for what, value in (("mean", one.mean), ("RMS", one.rms))),
+            Metric("triangles of the adaptive subdivision", len(adaptive.mesh.faces)),
+            Metric(f"inverted triangles at {levels[-1].name}", len(turned)),
+            Metric("of these outside folds and holes", int(beside_folds.sum()))]
+
+
+def _sizes(folder: Path, scan: Mesh) -> list[Metric]:
+    stored = sum((folder / name).stat().st_size for name in ("control.npz", "displacement.png", "coverage.png"))
+    return [Metric("control model and map on disk", stored / 1e6, "MB"),
+            Metric("scan on disk as binary PLY", (12 * len(scan.vertices) + 13 * len(scan.faces)) / 1e6, "MB")]

@@ -1,0 +1,161 @@
+"""`scape statue`: a scan becomes a folder that reconstructs, takes edits and moves; bad input is refused by name."""
+import json
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from completion.__main__ import main
+from model import load_model
+from model.statue.files import load_statue
+from model.statue.statue import HOLE, MEASURED
+from scanprep import Mesh, read_mesh, write_mesh
+from scanprep.scanning.people import LANDMARKS, BodyShape, Person, walk
+
+JOINTS = {"vl5": 1, "skullbase": 3, "l_shoulder": 4, "l_elbow": 5, "l_wrist": 6, "r_shoulder": 7, "r_elbow": 8,
+          "r_wrist": 9, "l_hip": 10, "l_knee": 11, "l_ankle": 12, "r_hip": 13, "r_knee": 14, "r_ankle": 15}
+
+
+def run(*words):
+    return main(["statue", *map(str, words)])
+
+
+@pytest.fixture(scope="module")
+def person():
+    return Person(BodyShape(sex=1.0, stature=1.82))
+
+
+@pytest.fixture(scope="module")
+def made(tmp_path_factory, person):
+    """A statue of a person in millimetres, with colours, without the lower right arm."""
+    folder = tmp_path_factory.mktemp("statue")
+    mesh = person.mesh
+    arm = np.isin(person.part_of_face, (8, 9))
+    scan, _ = Mesh(1000 * mesh.vertices, mesh.faces, np.clip(mesh.vertices / 2 + 0.5, 0, 1)).submesh(~arm)
+    write_mesh(folder / "scan.ply", scan)
+    joints = {name: (1000 * person.joints[j]).tolist() for name, j in JOINTS.items() if j not in (8, 9)}
+    marks = {name: (1000 * mesh.vertices[v]).tolist() for name, v in LANDMARKS.items()
+             if name in ("nose tip", "chin", "left eye", "right eye", "top of head", "left middle finger", "left toe")}
+    (folder / "features.json").write_text(json.dumps({**joints, **marks}))
+    code = run("fit", folder / "scan.ply", "-o", folder / "statue", "--features", folder / "features.json",
+               "--unit", "mm", "--size", 512)
+    assert code == 0
+    return folder
+
+
+def figures(path):
+    return {m["metric"]: m["value"] for m in json.loads(path.read_text())["metrics"]}
+
+
+def test_the_surface_comes_back_and_the_missing_arm_is_a_hole(made, person):
+    found = figures(made / "statue" / "report.json")
+    assert found["level 3 to the scan, mean"] < 0.4 and found["level 3 to the scan, RMS"] < 1.2
+    assert found["level 3 to the scan, mean"] < 0.3 * found["level 1 to the scan, mean"]
+    assert "r_elbow" in found["parts without data"] and "r_wrist" in found["parts without data"]
+    assert "l_elbow" not in found["parts without data"] and found["holes"] > 2
+    assert found["error left by the map where it is one-to-one, mean"] < 0.1
+    statue = load_statue(made / "statue")
+    off = np.linalg.norm(statue.control.skeleton.joints[4] - person.joints[4])
+    assert statue.control.skeleton.names[4] == "l_shoulder" and off < 0.01
+    assert statue.texture is not None and {HOLE, MEASURED} <= set(np.unique(statue.map.coverage).tolist())
+    for name in ("report.html", "statue.glb", "statue.x3d", "displacement.png", "reconstruction.ply"):
+        assert (made / "statue" / name).stat().st_size > 1000
+
+
+def test_the_texture_has_the_colours_of_the_scan(made):
+    statue = load_statue(made / "statue")
+    chart, mesh = statue.control.chart, statue.control.mesh
+    size = len(statue.texture)
+    rows, columns, faces, bary = chart.texels(size)
+    seen = statue.map.coverage[rows, columns] == MEASURED
+    places = np.einsum("nc,ncd->nd", bary, mesh.corners[faces])[seen]
+    off = statue.texture[rows, columns][seen] / 255 - np.clip(places / 2 + 0.5, 0, 1)
+    assert np.median(np.abs(off)) < 0.01                                 # the control mesh is near, not on, the skin
+
+
+def test_reconstruction_at_every_level_is_closed(made, tmp_path):
+    counts = []
+    for level in (0, 2):
+        assert run("reconstruct", made / "statue", "-o", tmp_path / f"{level}.ply", "--level", level) == 0
+        mesh = read_mesh(tmp_path / f"{level}.ply")
+        assert mesh.is_closed
+        counts.append(len(mesh.vertices))
+    assert counts[1] == 4 * (4 * counts[0] - 6) - 6
+    assert run("reconstruct", made / "statue", "-o", tmp_path / "adaptive.ply", "--tolerance", 1.0) == 0
+    adaptive = read_mesh(tmp_path / "adaptive.ply")
+    assert adaptive.is_closed and counts[0] < len(adaptive.vertices) < 4 * counts[1]
+    assert run("reconstruct", made / "statue", "-o", tmp_path / "skinned.glb") == 0
+
+
+def test_an_edited_image_moves_the_surface_there_and_nowhere_else(made, tmp_path):
+    about = json.loads((made / "statue" / "displacement.json").read_text())
+    image = np.array(Image.open(made / "statue" / "displacement.png"))
+    statue = load_statue(made / "statue")
+    spot = statue.control.chart.uv[statue.control.chart.faces].mean(axis=1)[700]
+    row, column = int((1 - spot[1]) * len(image)), int(spot[0] * len(image))
+    edited = image.copy()
+    edited[row - 6:row + 7, column - 6:column + 7] += round(0.002 / about["scale"])
+    Image.fromarray(edited).save(tmp_path / "edited.png")
+    assert run("reconstruct", made / "statue", "-o", tmp_path / "plain.ply", "--level", 4) == 0
+    assert run("reconstruct", made / "statue", "-o", tmp_path / "edited.ply", "--level", 4, "--image",
+               tmp_path / "edited.png") == 0
+    before, after = read_mesh(tmp_path / "plain.ply"), read_mesh(tmp_path / "edited.ply")
+    moved = np.linalg.norm(after.vertices - before.vertices, axis=1)
+    assert 0.0015 < moved.max() < 0.0021
+    there = before.vertices[moved > 1e-6]
+    assert np.ptp(there, axis=0).max() < 0.08 and (moved > 1e-6).mean() < 0.01
+    small = image[::2, ::2]
+    Image.fromarray(small.copy()).save(tmp_path / "small.png")
+    assert run("reconstruct", made / "statue", "-o", tmp_path / "x.ply", "--image", tmp_path / "small.png") == 1
+    assert not (tmp_path / "x.ply").exists()
+
+
+def test_a_walk_moves_the_statue(made, tmp_path):
+    poses, trans = walk(6, 12.0)
+    np.savez(tmp_path / "walk.npz", poses=poses.reshape(6, -1), trans=trans, mocap_frame_rate=12.0)
+    assert run("animate", made / "statue", tmp_path / "walk.npz", "-o", tmp_path / "walking", "--level", 1,
+               "--meshes") == 0
+    found = figures(tmp_path / "walking" / "report.json")
+    assert found["frames"] == 6 and (tmp_path / "walking" / "motion.gif").exists()
+    body = read_mesh(tmp_path / "walking" / "meshes" / "00003.ply")
+    assert body.is_closed and 1.6 < np.ptp(body.vertices, axis=0).max() < 1.9
+    # the motion that was written is one of the statue's own parts, and gives the same meshes again
+    assert run("animate", made / "statue", tmp_path / "walking" / "motion.npz", "-o", tmp_path / "again", "--level", 1,
+               "--meshes") == 0
+    again = read_mesh(tmp_path / "again" / "meshes" / "00003.ply")
+    assert np.abs(again.vertices - body.vertices).max() < 1e-6
+
+
+def test_the_statue_is_a_body_model_that_markers_can_drive(made):
+    body = load_model(made / "statue" / "body.npz")
+    statue = load_statue(made / "statue")
+    rest = body.vertices(np.zeros((17, 3)))
+    assert np.abs(rest - statue.control.mesh.vertices).max() < 1e-9
+    layout = json.loads((made / "statue" / "markers.json").read_text())["markersets"][0]["indices"]
+    assert len(layout) == 41 and max(layout.values()) < len(rest)
+
+
+def test_bad_input_is_refused_by_name(made, tmp_path, capsys):
+    cloud = tmp_path / "cloud.ply"
+    write_mesh(cloud, Mesh(np.random.default_rng(0).normal(size=(50, 3)), np.zeros((0, 3), dtype=np.int64)))
+    strange = tmp_path / "strange.json"
+    strange.write_text(json.dumps({"left antenna": [0, 0, 1]}))
+    (tmp_path / "empty").mkdir()
+    np.savez(tmp_path / "motion.npz", poses=np.zeros((2, 15)), trans=np.zeros((2, 3)), mocap_frame_rate=30.0)
+    scan = made / "scan.ply"
+    for words, reason in (
+            (("fit", cloud), "without triangles"), (("fit", scan, "--features", strange), "left antenna"),
+            (("fit", tmp_path / "empty"), "found none"), (("reconstruct", tmp_path / "empty"), "statue.json"),
+            (("animate", made / "statue", tmp_path / "motion.npz"), "17 parts"),
+            (("animate", made / "statue", tmp_path / "none.bvh"), "none.bvh")):
+        assert run(*words, "-o", tmp_path / "out.ply" if words[0] == "reconstruct" else tmp_path / "out") == 1
+        told = " ".join(capsys.readouterr().err.split())
+        assert reason in told, (words, told)
+        assert not (tmp_path / "out" / "report.html").exists()
+
+
+def test_what_is_done_is_not_done_again(made, capsys):
+    before = (made / "statue" / "statue.glb").stat().st_mtime_ns
+    assert run("fit", made / "scan.ply", "-o", made / "statue", "--features", made / "features.json", "--unit", "mm",
+               "--size", 512) == 0
+    assert (made / "statue" / "statue.glb").stat().st_mtime_ns == before

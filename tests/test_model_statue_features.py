@@ -1,0 +1,252 @@
+"""Registration of the control model by features: known poses come back, derivatives are right, clicks find depths."""
+import numpy as np
+import pytest
+
+from model.statue.articulated import Articulated, Points
+from model.statue.automatic import find_features, likely_unit
+from model.statue.features import FeatureConfig, fit_features, head_share, misfit, warp
+from model.statue.humanoid import humanoid
+from model.statue.medial import MedialAxis
+from scanprep.geometry import rotations
+from scanprep.geometry.mesh import Mesh
+from scanprep.scanning.people import BodyShape, Person, compose
+
+FACE = ("nose tip", "chin", "left eye", "right eye", "left ear", "right ear", "top of head")
+
+
+@pytest.fixture(scope="module")
+def control():
+    return humanoid()
+
+
+@pytest.fixture(scope="module")
+def model(control):
+    return Articulated(control)
+
+
+def drawn(model, rng, share=0.7):
+    """Random parameters inside the limits, the body anyhow in space."""
+    x = model.rest.copy()
+    angles, factors, place = model.split(x)
+    low, high = np.where(np.isfinite(model.limits), model.limits, [-3, 3]).T
+    angles[:] = rng.uniform(share * low, share * high)
+    factors[:] = rng.uniform(0.85, 1.15, len(factors))
+    place[:] = rng.normal(size=3)
+    return x
+
+
+def features_of(control, model, x):
+    """Joints and points of the posed model by name."""
+    frames = model.frames(x)
+    vertices = model.positions(frames, model.vertices)
+    return (dict(zip(control.skeleton.names[1:], frames.joints[1:], strict=True)),
+            {name: vertices[control.landmarks[name]] for name in FACE})
+
+
+def test_with_default_lengths_it_is_linear_blend_skinning(control, model):
+    x = drawn(model, np.random.default_rng(0))
+    model.split(x)[1][:] = 1
+    skinned = control.rig.vertices(model.pose(x), model.split(x)[2])
+    assert np.abs(model.positions(model.frames(x), model.vertices) - skinned).max() < 1e-12
+
+
+def test_a_length_moves_the_joints_beyond_it_and_stretches_its_own_vertices_only(control, model):
+    x, names = model.rest.copy(), control.skeleton.names
+    model.split(x)[1][control.segments.index("forearm")] = 1.2
+    elbow, wrist = names.index("l_elbow"), names.index("l_wrist")
+    o, moved = control.skeleton.joints, model.frames(x).joints
+    np.testing.assert_allclose(moved[wrist] - moved[elbow], 1.2 * (o[wrist] - o[elbow]))
+    others = [j for j, name in enumerate(names) if "wrist" not in name]
+    np.testing.assert_allclose(moved[others], o[others])
+    bone = (o[wrist] - o[elbow]) / np.linalg.norm(o[wrist] - o[elbow])
+    rigid = np.flatnonzero(control.weights[:, elbow] > 1 - 1e-9)
+    d, now = (control.mesh.vertices[rigid] - o[elbow],
+              model.positions(model.frames(x), model.vertices)[rigid] - moved[elbow])
+    np.testing.assert_allclose(now @ bone, 1.2 * d @ bone, atol=1e-12)
+    across = np.eye(3) - np.outer(bone, bone)
+    np.testing.assert_allclose(now @ across, model.size(x) * d @ across, atol=1e-12)
+
+
+def test_derivatives_are_finite_differences(control, model):
+    rng = np.random.default_rng(1)
+    x, some = drawn(model, rng), rng.choice(len(control.mesh.vertices), 40)
+    points = Points(control.weights[some], control.mesh.vertices[some])
+    goal, h = rng.normal(size=(40, 3)), 1e-5
+    steps = h * np.eye(len(x))
+    by_point = np.stack([(model.positions(model.frames(x + d), points) - model.positions(model.frames(x - d), points))
+                         / (2 * h) for d in steps], axis=2)
+    found = model.derivatives(model.frames(x), points)
+    assert np.abs(found - by_point).max() < 1e-8 * np.abs(found).max()
+    slope = misfit(model, x, points, goal)[1]
+    numeric = [(misfit(model, x + d, points, goal)[0] - misfit(model, x - d, points, goal)[0]) / (2 * h) for d in steps]
+    assert np.abs(slope - numeric).max() < 1e-8 * np.abs(slope).max()
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_features_of_random_poses_are_met_and_noise_stays_within_the_limits(control, model, seed):
+    rng = np.random.default_rng(seed)
+    x = drawn(model, rng)
+    joints, points = features_of(control, model, x)
+    fit = fit_features(control, joints, points)
+    assert fit.converged
+    assert max(np.linalg.norm(fit.joints[1:] - list(joints.values()), axis=1)) < 1e-4
+    assert max(np.linalg.norm(fit.vertices[control.landmarks[name]] - p) for name, p in points.items()) < 1e-4
+    noise = 0.02
+    rough = fit_features(control, {name: p + noise * rng.normal(size=3) for name, p in joints.items()},
+                         {name: p + noise * rng.normal(size=3) for name, p in points.items()})
+    assert rough.joint_rms < 2 * noise
+    assert np.linalg.norm(rough.vertices - fit.vertices, axis=1).mean() < 3 * noise
+    for pose, axes, limits in zip(rough.pose[1:], control.axes[1:], control.limits[1:], strict=True):
+        angles = pose @ np.linalg.pinv(np.reshape(axes, (-1, 3)))
+        assert (angles >= limits[:, 0] - 1e-9).all() and (angles <= limits[:, 1] + 1e-9).all()
+
+
+def test_the_fit_turns_moves_and_scales_with_its_features(control, model):
+    joints, points = features_of(control, model, drawn(model, np.random.default_rng(2), 0.4))
+    R, t, s = rotations.exp(np.array([2.0, -1, 1.5])), np.array([3.0, 1, -2]), 1000.0
+    fit = fit_features(control, joints, points)
+    joints, points = ({name: s * (R @ p + t) for name, p in given.items()} for given in (joints, points))
+    turned = fit_features(control, joints, points)
+    np.testing.assert_allclose(turned.vertices, s * (fit.vertices @ R.T + t), atol=1e-5 * s)
+    np.testing.assert_allclose(turned.lengths, s * fit.lengths, rtol=1e-4)
+    # pose and trans are those of the skeleton: root rotation, then every part in its parent
+    np.testing.assert_allclose(turned.joints[0], control.skeleton.joints[0] + turned.trans)
+    np.testing.assert_allclose(rotations.exp(turned.pose[0]), R @ rotations.exp(fit.pose[0]), atol=1e-4)
+
+
+def test_what_the_features_leave_open_stays_at_its_default(control, model):
+    x = model.rest.copy()
+    joints, _ = features_of(control, model, x)
+    trunk = {name: joints[name] for name in ("l_shoulder", "r_shoulder", "l_hip", "r_hip")}
+    fit = fit_features(control, trunk)
+    assert np.abs(fit.vertices - control.mesh.vertices).max() < 1e-3
+    assert np.isnan(fit.point_rms) and fit.joint_rms < 1e-4
+    # a straight arm says nothing of its twist
+    along = joints["l_elbow"] - joints["l_shoulder"]
+    straight = {**joints, "l_wrist": joints["l_elbow"] + 0.9 * along}
+    twist = fit_features(control, straight).pose[control.skeleton.names.index("l_shoulder")] @ along
+    assert abs(twist) / np.linalg.norm(along) < np.radians(10)
+
+
+def test_features_that_do_not_suffice_or_exist_are_refused(control, model):
+    joints, _ = features_of(control, model, model.rest)
+    with pytest.raises(ValueError, match="three features"):
+        fit_features(control, {name: joints[name] for name in ("l_hip", "r_hip")})
+    with pytest.raises(ValueError, match="'l_tail'"):
+        fit_features(control, {**joints, "l_tail": np.zeros(3)})
+    with pytest.raises(ValueError, match="l_hip: expected three finite"):
+        fit_features(control, {**joints, "l_hip": np.array([np.nan, 0, 0])})
+    with pytest.raises(ValueError, match="longest"):
+        FeatureConfig(longest=0.0)
+
+
+def test_the_warp_is_equation_5(control):
+    rng = np.random.default_rng(3)
+    p, goal = rng.normal(size=(9, 3)), rng.normal(size=(9, 3))
+    q = rng.normal(size=(50, 3))
+
+    def phi(a, b):
+        return np.linalg.norm(a[:, None] - b[None], axis=2) ** 3
+
+    affine = np.column_stack([p, np.ones(9)])
+    K = np.block([[phi(p, p), affine], [affine.T, np.zeros((4, 4))]])
+    c = np.linalg.solve(K, np.vstack([goal - p, np.zeros((4, 3))]))
+    by_hand = q + phi(q, p) @ c[:9] + np.column_stack([q, np.ones(50)]) @ c[9:]
+    np.testing.assert_allclose(warp(q, p, goal), by_hand, rtol=1e-8, atol=1e-8)
+    np.testing.assert_allclose(warp(p, p, goal), goal, atol=1e-9)
+    with pytest.raises(ValueError, match="one plane"):
+        warp(q, p * [1, 1, 0], goal)
+    with pytest.raises(ValueError, match="one plane"):
+        warp(q, p[:3], goal[:3])
+
+
+def test_the_warp_of_the_head_fades_over_the_neck(control):
+    v, share = control.mesh.vertices, head_share(control)
+    marks = v[[control.landmarks[name] for name in FACE]]
+    moved = warp(v, marks, marks + [0, -0.02, 0.01], share) - v
+    weight = control.weights[:, control.skeleton.names.index("skullbase")]
+    assert np.abs(moved[weight == 0]).max() == 0
+    assert np.abs(moved[weight > 1 - 1e-9] - [0, -0.02, 0.01]).max() < 1e-9
+    assert ((weight > 0.01) & (weight < 0.99)).sum() > 10
+    assert np.abs(share - weight).max() < 0.1
+
+
+def cylinder(radius, length, around=40):
+    angle = np.linspace(0, 2 * np.pi, around, endpoint=False)
+    ring = radius * np.column_stack([np.cos(angle), np.sin(angle)])
+    v = np.vstack([np.column_stack([ring, np.full(around, z)]) for z in (0, length)] + [[[0, 0, 0], [0, 0, length]]])
+    i, j = np.arange(around), (np.arange(around) + 1) % around
+    top, bottom = np.full(around, 2 * around + 1), np.full(around, 2 * around)
+    faces = [np.column_stack(f) for f in ((i, j, j + around), (i, j + around, i + around), (bottom, j, i),
+                                          (i + around, j + around, top))]
+    return Mesh(v, np.vstack(faces))
+
+
+def test_a_click_on_a_cylinder_finds_its_axis_though_it_has_holes():
+    whole = cylinder(0.06, 0.5)
+    pierced = whole.submesh(np.arange(len(whole.faces)) % 37 != 5)[0]
+    for mesh in (whole, pierced):
+        medial = MedialAxis(mesh, 0.01)
+        for way in ([1.0, 0, 0], [0.6, 0.8, 0], [2.0, 1, 0.5]):
+            along = np.array(way) / np.linalg.norm(way)
+            origin = np.array([0.004, 0, 0.25]) - 3 * along
+            found = medial.nearest_to_ray(origin, way)
+            assert np.linalg.norm(found[:2]) < 0.015
+            np.testing.assert_allclose(np.cross(found - origin, along), 0, atol=1e-9)
+            np.testing.assert_allclose(medial.nearest_to_ray(origin, way, 0.03), found + 0.03 * along)
+    with pytest.raises(ValueError, match="does not meet"):
+        medial.nearest_to_ray(np.array([1.0, 1, 5]), np.array([1.0, 0, 0]))
+    with pytest.raises(ValueError, match="metres"):
+        MedialAxis(whole.with_vertices(1000 * whole.vertices))
+
+
+def test_a_click_on_a_limb_finds_its_bone(control):
+    medial, o, names = MedialAxis(control.mesh), control.skeleton.joints, control.skeleton.names
+    for first, second in (("l_shoulder", "l_elbow"), ("r_elbow", "r_wrist"), ("l_knee", "l_ankle")):
+        middle = 0.5 * (o[names.index(first)] + o[names.index(second)])
+        for way in (np.array([0.0, 1, 0]), np.array([0.3, -1, 0.1])):
+            assert np.linalg.norm(medial.nearest_to_ray(middle - 2 * way, way) - middle) < 0.015
+
+
+@pytest.mark.parametrize(("length", "unit"), [(1.8, "m"), (0.8, "m"), (1750, "mm"), (171, "cm"), (70, "in")])
+def test_the_unit_is_told_by_the_height(length, unit):
+    points = length * (Person().mesh.vertices @ rotations.exp(np.array([0.4, 1.0, 0])).T) / 1.75
+    assert likely_unit(points) == unit
+
+
+def test_a_person_is_found_upside_down_in_millimetres_with_holes_and_without_an_arm(control):
+    person = Person(BodyShape(sex=-1, stature=1.62, weight=1.0))
+    pose = compose(left_arm={"direction": (0.8, 0.5, -0.3), "elbow": 40}, back={"turn": 15}, right_leg={"knee": 20})
+    vertices, joints = person.posed(pose), person.posed_joints(pose)
+    rng = np.random.default_rng(4)
+    centres = vertices[person.mesh.faces].mean(axis=1)
+    keep = ~np.isin(person.part_of_face, [8, 9])                              # the right forearm and hand are hidden
+    for hole in rng.choice(len(centres), 8):
+        keep &= np.linalg.norm(centres - centres[hole], axis=1) > 0.05
+    R = rotations.exp(np.array([0, 0, 0.7])) @ np.diag([1.0, -1, -1])
+
+    def seen(points):
+        return 1000 * (points @ R.T + [2, -1, 3])
+
+    scan, _ = Mesh(seen(vertices), person.mesh.faces).submesh(keep)
+    found = find_features(control, scan)
+    assert found.unit == "mm" and found.problem is None
+    assert found.up @ R @ [0, 0, 1] > 0.9 and found.front @ R @ [0, -1, 0] > 0.9
+    assert {"r_wrist", "right middle finger", "right wrist"} <= set(found.missing)
+    for name, part in {"l_elbow": 5, "l_wrist": 6, "l_hip": 10, "l_knee": 11, "r_knee": 14, "skullbase": 3}.items():
+        assert np.linalg.norm(found.joints[name] - seen(joints[part])) < 40, name
+    from scanprep.scanning import people
+
+    apart = [np.linalg.norm(found.points[name] - seen(vertices[people.LANDMARKS[name]])) for name in FACE]
+    assert np.mean(apart) < 25
+    assert found.fit.joint_rms < 25
+
+
+def test_a_ball_is_no_person(control):
+    t, z = np.meshgrid(np.linspace(0, 2 * np.pi, 40, endpoint=False), np.linspace(-0.98, 0.98, 30))
+    r = np.sqrt(1 - z**2)
+    points = 0.8 * np.stack([r * np.cos(t), r * np.sin(t), z], axis=-1).reshape(-1, 3)
+    found = find_features(control, Mesh(points, np.zeros((0, 3), dtype=int)))
+    assert "no person" in found.problem and not found.joints and not found.points
+    with pytest.raises(ValueError, match="100 points"):
+        find_features(control, Mesh(points[:50], np.zeros((0, 3), dtype=int)))

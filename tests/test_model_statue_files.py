@@ -1,0 +1,205 @@
+"""Statues for other programs: GLB with images, X3D; read back by readers of their own."""
+import io
+from dataclasses import replace
+from xml.etree import ElementTree
+
+import numpy as np
+import pytest
+from glb_reader import Glb
+from PIL import Image
+
+from model.export.rig import turn_up
+from model.statue.chart import Chart
+from model.statue.humanoid import humanoid
+from model.statue.motion import people_motion
+from model.statue.normal_image import chart_tangents, normal_image, vertex_of_row
+from model.statue.statue_glb import write_statue_glb
+from model.statue.subdivision import subdivide
+from model.statue.x3d import write_x3d
+from scanprep.geometry import rotations
+from scanprep.geometry.mesh import Mesh
+from scanprep.scanning.people import walk
+
+
+@pytest.fixture(scope="module")
+def motion():
+    return people_motion(humanoid(), np.zeros((17, 3)), *walk(4, 4), 4.0)
+
+
+@pytest.fixture(scope="module")
+def detailed():
+    """Two levels, with waves on the skin."""
+    control = humanoid()
+    fine = subdivide(control.mesh, control.chart, 2)
+    smooth = fine.mesh(control.mesh)
+    return fine, smooth.vertices + 0.004 * np.sin(60 * smooth.vertices[:, [2]]) * smooth.vertex_normals
+
+
+def picture(glb, texture):
+    view = glb.json["bufferViews"][glb.json["images"][glb.json["textures"][texture]["source"]]["bufferView"]]
+    return np.asarray(Image.open(io.BytesIO(glb.buffer[view["byteOffset"]:view["byteOffset"] + view["byteLength"]])))
+
+
+def places(image, uv):
+    """Rows and columns of glTF's texture coordinates, whose (0, 0) is the upper left corner."""
+    return np.clip((uv[:, ::-1] * image.shape[:2]).astype(int), 0, np.array(image.shape[:2]) - 1).T
+
+
+def test_the_detailed_statue_moves_and_wears_its_texture(detailed, motion, tmp_path):
+    control, (fine, vertices) = humanoid(), detailed
+    rows, columns, face, bary = control.chart.texels(256)
+    texture = np.zeros((256, 256, 3), np.uint8)
+    texture[rows, columns] = 40 + 100 * np.einsum("nc,ncd->nd", bary, np.abs(control.mesh.corners[face]))
+    write_statue_glb(tmp_path / "a.glb", control, vertices, fine, texture, motion=motion)
+    glb = Glb((tmp_path / "a.glb").read_bytes())
+    row = vertex_of_row(Mesh(vertices, fine.faces), fine.chart)
+    assert len(row) > len(vertices) and np.array_equal(row[glb.faces], fine.faces)
+    assert np.abs(glb.skinned() - vertices[row] @ turn_up(2).T).max() < 1e-6
+    # joints carry the detail as they carry the control mesh below it
+    corners = control.mesh.faces[fine.parent]
+    for t in range(4):
+        moved = glb.skinned(t) @ turn_up(2)
+        below = np.einsum("nc,ncd->nd", fine.bary,
+                          control.rig.vertices(motion.poses[t], motion.trans[t])[corners])[row]
+        assert np.abs(moved - below).max() < 0.025 and np.linalg.norm(moved - below, axis=1).mean() < 0.006
+    primitive = glb.primitive["attributes"]
+    uv = glb.array(primitive["TEXCOORD_0"]).astype(float)
+    image = picture(glb, glb.json["materials"][0]["pbrMetallicRoughness"]["baseColorTexture"]["index"])
+    assert np.array_equal(image, texture) and glb.json["images"][0]["mimeType"] == "image/png"
+    seen = image[tuple(places(image, uv))]
+    inside = seen.any(axis=1)
+    on = 40 + 100 * np.abs(fine.points(control.mesh)[row])
+    assert inside.mean() > 0.7 and np.median(np.abs(seen - on)[inside]) < 1.5
+    # both sides of a seam shine alike
+    normals = glb.array(primitive["NORMAL"])
+    assert np.abs(normals - Mesh(vertices, fine.faces).vertex_normals[row] @ turn_up(2).T).max() < 1e-6
+
+
+def test_the_control_mesh_with_images_of_detail(detailed, tmp_path):
+    control, (fine, vertices) = humanoid(), detailed
+    rng = np.random.default_rng(0)
+    normals, heights = normal_image(control, vertices, fine, 256), rng.normal(0, 0.01, (32, 32)).astype(np.float32)
+    write_statue_glb(tmp_path / "a.glb", control, normals=normals, heights=heights, up=1)
+    glb = Glb((tmp_path / "a.glb").read_bytes())
+    material = glb.json["materials"][0]
+    assert np.array_equal(picture(glb, material["normalTexture"]["index"]), normals)
+    extras = material["extras"]
+    grey = picture(glb, extras["displacementTexture"]["index"]).astype(float)
+    found = extras["displacementBlack"] + grey / 65535 * (extras["displacementWhite"] - extras["displacementBlack"])
+    assert np.abs(found - heights).max() < 1e-6 and extras["displacementUnit"] == "metre"
+    # with nothing but the file, the normals of the detail come back
+    uv, n, t = (glb.array(glb.primitive["attributes"][name]).astype(float)
+                for name in ("TEXCOORD_0", "NORMAL", "TANGENT"))
+    chart = Chart(uv * [1, -1] + [0, 1], glb.faces)
+    rows, columns, face, bary = chart.texels(256)
+    N, T = (np.einsum("nc,ncd->nd", bary, w[glb.faces[face]]) for w in (n, t))
+    B = np.cross(N, T[:, :3]) * np.sign(T[:, 3:])
+    x, y, z = (normals[rows, columns].astype(float) / 127.5 - 1).T[..., None]
+    shaded = x * T[:, :3] + y * B + z * N
+    there = fine.chart.texels(256)
+    detail = Mesh(vertices, fine.faces)
+    exact = np.zeros((256, 256, 3))
+    exact[there[0], there[1]] = np.einsum("nc,ncd->nd", there[3], detail.vertex_normals[detail.faces[there[2]]])
+    cosine = np.einsum("nd,nd->n", shaded, exact[rows, columns])
+    cosine /= np.linalg.norm(shaded, axis=1) * np.maximum(np.linalg.norm(exact[rows, columns], axis=1), 1e-9)
+    flat = np.einsum("nd,nd->n", N, exact[rows, columns]) / np.linalg.norm(N, axis=1)
+    assert np.degrees(np.arccos(np.clip(np.percentile(cosine, 1), -1, 1))) < 2
+    assert np.degrees(np.arccos(np.clip(np.median(flat), -1, 1))) > 5, "there is detail that the mesh has not"
+
+
+def test_a_surface_without_detail_has_an_even_normal_image():
+    control = humanoid()
+    image = normal_image(control, control.mesh.vertices, subdivide(control.mesh, control.chart, 0), 128)
+    assert np.abs(image.astype(int) - [128, 128, 255]).max() <= 1
+
+
+def test_tangents_go_along_the_rows_of_the_image():
+    mesh = Mesh(np.array([[0, 0, 0], [2, 0, 0], [2, 1, 0], [0, 1, 0.0]]), np.array([[0, 1, 2], [0, 2, 3]]))
+    turn = rotations.exp(np.array([0.3, -1, 2]))
+    for uv, direction, sign in ((mesh.vertices[:, :2] / 2, [1, 0, 0], 1), (1 - mesh.vertices[:, :2] / 2, [-1, 0, 0], 1),
+                                (mesh.vertices[:, [1, 0]] / 2, [0, 1, 0], -1)):
+        found = chart_tangents(mesh.with_vertices(mesh.vertices @ turn.T), Chart(uv, mesh.faces))
+        assert np.abs(found[:, :3] - turn @ direction).max() < 1e-12 and (found[:, 3] == sign).all()
+        upwards = turn.T @ np.cross(turn[:, 2], found[0, :3]) * sign
+        grows = np.linalg.lstsq(mesh.vertices[:, :2], uv[:, 1] - uv[0, 1], rcond=None)[0]
+        assert upwards[:2] @ grows > 0.4, "the way in which v grows"
+
+
+def test_vertices_of_another_level_are_refused(detailed, tmp_path):
+    control, (fine, vertices) = humanoid(), detailed
+    with pytest.raises(ValueError, match="vertices, subdivision: expected both or none"):
+        write_statue_glb(tmp_path / "a.glb", control, vertices)
+    with pytest.raises(ValueError, match=r"vertices: expected shape \(16898, 3\), got \(5, 3\)"):
+        write_statue_glb(tmp_path / "a.glb", control, vertices[:5], fine)
+    assert not list(tmp_path.iterdir())
+
+
+def numbers(node, name, width):
+    return np.array(node.get(name).replace(",", " ").split(), dtype=float).reshape(-1, width)
+
+
+def played(tree, key):
+    """The skin of the one humanoid at a key of its interpolators, as H-Anim says: joints turn about their centres."""
+    person = tree.find("Scene/HAnimHumanoid")
+    nodes = {node.get("DEF"): node for node in tree.iter() if node.get("DEF")}
+    values = {}
+    for route in tree.iter("ROUTE"):
+        source = nodes[route.get("fromNode")]
+        if route.get("toNode") in nodes and source.get("keyValue"):
+            width = 4 if source.tag == "OrientationInterpolator" else 3
+            values[route.get("toNode"), route.get("toField")] = numbers(source, "keyValue", width)[key]
+    points = numbers(person.find("Coordinate[@containerField='skinCoord']"), "point", 3)
+    out, listed = np.zeros_like(points), []
+
+    def below(node, above):
+        M, name, center = np.eye(4), node.get("DEF"), numbers(node, "center", 3)[0]
+        if (name, "set_rotation") in values:
+            turn = values[name, "set_rotation"]
+            M[:3, :3] = rotations.exp(turn[:3] * turn[3])
+        M[:3, 3] = center - M[:3, :3] @ center + values.get((name, "set_translation"), 0)
+        M = above @ M
+        index = numbers(node, "skinCoordIndex", 1)[:, 0].astype(int)
+        moved = points[index] @ M[:3, :3].T + M[:3, 3]
+        np.add.at(out, index, numbers(node, "skinCoordWeight", 1) * moved)
+        listed.append(name)
+        for child in node.findall("HAnimJoint"):
+            below(child, M)
+
+    below(person.find("HAnimJoint[@containerField='skeleton']"), np.eye(4))
+    assert sorted(listed) == sorted(n.get("USE") for n in person.findall("HAnimJoint[@containerField='joints']"))
+    return out
+
+
+def test_x3d_moves_the_skin_as_the_statue(detailed, motion, tmp_path):
+    control, (fine, vertices) = humanoid(), detailed
+    texture = np.random.default_rng(0).integers(0, 255, (16, 16, 3), dtype=np.uint8)
+    write_x3d(tmp_path / "a.x3d", control, texture=texture, motion=motion)
+    tree = ElementTree.parse(tmp_path / "a.x3d").getroot()
+    assert (tree.get("version"), tree.find("Scene/HAnimHumanoid").get("version")) == ("4.0", "2.0")
+    called = {node.get("DEF"): node.get("name") for node in tree.iter("HAnimJoint") if node.get("DEF")}
+    assert (called["l_wrist"], called["r_ankle"], called["vl5"]) == ("l_radiocarpal", "r_talocrural", "vl5")
+    for t in range(4):
+        expected = control.rig.vertices(motion.poses[t], motion.trans[t]) @ turn_up(2).T
+        assert np.abs(played(tree, t) - expected).max() < 2e-6
+    surface = next(tree.iter("IndexedFaceSet"))
+    assert np.array_equal(numbers(surface, "coordIndex", 4)[:, :3], control.mesh.faces)
+    uv = numbers(surface.find("TextureCoordinate"), "point", 2)[numbers(surface, "texCoordIndex", 4)[:, :3].astype(int)]
+    assert np.abs(uv - control.chart.uv[control.chart.faces]).max() < 1e-6
+    assert surface.find("Coordinate").get("USE") == tree.find("Scene/HAnimHumanoid/Coordinate").get("DEF")
+    (url,) = (node.get("url") for node in tree.iter("ImageTexture"))
+    assert np.array_equal(np.asarray(Image.open(tmp_path / url.strip('"'))), texture)
+    names = [node.get("DEF") for node in tree.iter() if node.get("DEF")]
+    assert len(names) == len(set(names)) and set(control.skeleton.names) < set(names)
+    write_x3d(tmp_path / "b.x3d", control, vertices, fine, up=1)
+    still = ElementTree.parse(tmp_path / "b.x3d").getroot()
+    assert np.abs(played(still, 0) - vertices).max() < 2e-6 and not list(still.iter("ImageTexture"))
+
+
+def test_x3d_takes_any_names(tmp_path):
+    control = humanoid()
+    odd = replace(control, skeleton=replace(control.skeleton, names=(
+        "Bip01 Pelvis", "Bip01:Pelvis", "2nd", "<&>", *control.skeleton.names[4:])))
+    write_x3d(tmp_path / "a.x3d", odd)
+    person = ElementTree.parse(tmp_path / "a.x3d").getroot().find("Scene/HAnimHumanoid")
+    names = [node.get("USE") for node in person.findall("HAnimJoint[@containerField='joints']")]
+    assert names[:4] == ["Bip01_Pelvis_0", "Bip01_Pelvis_1", "part_2nd", "part____"] and len(set(names)) == 17

@@ -1,0 +1,322 @@
+"""A statue in motion: motions of its own parts, of the synthetic people, of BVH files and of learned models."""
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from model_bodies import worm, worm_model
+
+from model.export.bvh import write_bvh
+from model.export.bvh_read import BvhMotion, read_bvh
+from model.export.cli import read_motion
+from model.export.rig import joint_places
+from model.features import linear_features
+from model.skinning import SkinningModel
+from model.statue.bone_names import find_roles, trunk
+from model.statue.follow import Follower, _bound
+from model.statue.humanoid import humanoid
+from model.statue.motion import MotionConfig, bvh_motion, own_motion, people_motion, write_motion
+from scanprep.geometry import rotations
+from scanprep.geometry.storage import StorageError
+from scanprep.geometry.surface import Surface
+from scanprep.scanning.people import PARTS, Person, named_pose, walk
+
+GENERIC = np.zeros((17, 3))
+NAMES = humanoid().skeleton.names
+SHARED = {"humanoid_root": 0, "skullbase": 3, "l_shoulder": 4, "l_elbow": 5, "l_wrist": 6, "r_shoulder": 7,
+          "r_elbow": 8, "r_wrist": 9, "l_hip": 10, "l_knee": 11, "l_ankle": 12, "r_hip": 13, "r_knee": 14,
+          "r_ankle": 15}
+
+
+def scanned(turn=(0, 0, 0)):
+    """The humanoid as fitted to a scan in another pose and place, and how its parts were turned."""
+    control = humanoid()
+    pose = people_motion(control, GENERIC, named_pose("lunge_left")[None]).poses[0]
+    pose[0] = rotations.log(rotations.exp(np.array(turn, float)) @ rotations.exp(pose[0]))
+    trans = np.array([2.0, -1.0, 0.5])
+    return control.fitted(control.rig.vertices(pose, trans), joint_places(control.skeleton, pose, trans)), pose
+
+
+def world(control, motion):
+    return control.skeleton.part_rotations(motion.poses)
+
+
+def test_a_motion_of_its_own_parts(tmp_path):
+    control, rng = humanoid(), np.random.default_rng(0)
+    poses, trans = rng.normal(0, 0.3, (4, 17, 3)), rng.normal(size=(4, 3))
+    good = {"poses": poses.reshape(4, -1), "trans": trans, "mocap_frame_rate": np.array(25.0)}
+    np.savez(tmp_path / "a.npz", **good)
+    found = own_motion(control, tmp_path / "a.npz")
+    assert np.array_equal(found.poses, poses) and found.rate == 25
+    rest = control.mesh.vertices
+    model = SkinningModel(control.mesh, control.skeleton, rest, control.weights,
+                          linear_features(control.skeleton, (np.zeros((3, 0)),) * 17), np.zeros((0, *rest.shape)), rest,
+                          np.zeros((0, *rest.shape)), np.zeros(0), 0.0, np.zeros((17, 3)), np.eye(51))
+    assert np.abs(control.rig.vertices(found.poses, found.trans) - model.vertices(poses, None, trans)).max() < 1e-9
+    assert np.linalg.norm(found.trans - trans, axis=1).max() > 1e-3, "skinning moves the middle of the root part"
+    write_motion(tmp_path / "again.npz", control, found)
+    again = own_motion(control, tmp_path / "again.npz")
+    assert np.array_equal(again.poses, poses) and np.abs(again.trans - found.trans).max() < 1e-12 and again.rate == 25
+    assert np.abs(read_motion(tmp_path / "again.npz", model).trans - trans).max() < 1e-12
+    for change, words in (({"poses": np.zeros((4, 48))}, "17 parts"), ({"trans": np.zeros((3, 3))}, "trans"),
+                          ({"trans": trans * np.nan}, "finite"), ({"mocap_frame_rate": np.array(0.0)}, "rate")):
+        np.savez(tmp_path / "b.npz", **{**good, **change})
+        with pytest.raises(StorageError, match=words):
+            own_motion(control, tmp_path / "b.npz")
+
+
+def test_parts_turn_in_the_world_as_those_of_the_people():
+    control, person = humanoid(), Person()
+    poses = np.stack([named_pose("lunge_left"), named_pose("surrender")])
+    poses[1, 2] = 0                                             # the trunk turns in one joint
+    found = people_motion(control, GENERIC, poses)
+    R, theirs = world(control, found), person.skeleton.part_rotations(poses)
+    for name, part in SHARED.items():
+        assert np.abs(R[:, NAMES.index(name)] - theirs[:, part]).max() < 1e-9, name
+        assert found.matched[name] == PARTS[part]
+    assert np.abs(R[1, NAMES.index("vl5")] - theirs[1, 2]).max() < 1e-9
+    assert found.lacking == ("l_sternoclavicular", "r_sternoclavicular") and not found.unmatched
+
+
+def test_a_trunk_of_two_joints_carries_the_shoulders_nearly_as_far():
+    person, poses = Person(), named_pose("left_arm_up")[None].copy()
+    poses[:, [0, *range(3, 16)]] = 0
+    poses[:, 1:3] *= 2                                          # 24 degrees aside
+    R = world(humanoid(), people_motion(humanoid(), GENERIC, poses))[0, 1]
+    J, (one, two) = person.joints, person.skeleton.part_rotations(poses)[0, 1:3]
+    for end in (J[4], J[7], J[3]):
+        exact = one @ (J[2] - J[1]) + two @ (end - J[2])
+        off = np.linalg.norm(R @ (end - J[1]) - exact)
+        assert off < 0.02 < np.linalg.norm(two @ (end - J[1]) - exact)
+
+
+def test_clavicles_rise_with_arms_above_the_horizontal():
+    control = humanoid()
+    poses = np.stack([named_pose(name) for name in ("rest", "t_pose", "arms_up")])
+    found = {share: people_motion(control, GENERIC, poses, config=MotionConfig(girdle=share)) for share in (0.0, 0.2)}
+    for side in "lr":
+        clavicle, arm, elbow = (NAMES.index(f"{side}_{n}") for n in ("sternoclavicular", "shoulder", "elbow"))
+        assert not found[0.0].poses[:, clavicle].any() and not found[0.2].poses[:2, clavicle].round(9).any()
+        places = {share: joint_places(control.skeleton, m.poses)[2] for share, m in found.items()}
+        bone = places[0.2][elbow] - places[0.2][arm]
+        trunk_up = (places[0.0][[4, 8]] - places[0.0][[11, 14]]).mean(axis=0)
+        above = np.arcsin(bone @ trunk_up / np.linalg.norm(bone) / np.linalg.norm(trunk_up))
+        assert np.linalg.norm(found[0.2].poses[2, clavicle]) == pytest.approx(0.2 * above)
+        assert np.abs(bone - places[0.0][elbow] + places[0.0][arm]).max() < 1e-9, "the arm points where it did"
+        assert places[0.2][arm, 2] > places[0.0][arm, 2] + 0.02
+
+
+@pytest.mark.parametrize("turn", [(0, 0, 0.7), (np.pi / 2, 0, 0)])
+def test_the_pose_of_the_scan_does_not_matter(turn):
+    """Joints go the same ways, in the scan's axes, whatever the pose that the statue was scanned in."""
+    poses, trans = walk(20, 20)
+    plain = people_motion(humanoid(), GENERIC, poses, trans, 20)
+    control, pose = scanned(turn)
+    found = people_motion(control, pose, poses, trans, 20)
+    ways = joint_places(control.skeleton, found.poses, found.trans)
+    expected = joint_places(humanoid().skeleton, plain.poses, plain.trans)
+    steps, R = np.diff(expected, axis=0), rotations.exp(np.array(turn, float))
+    lunge = people_motion(humanoid(), GENERIC, named_pose("lunge_left")[None]).poses[0, 0]
+    heading = rotations.exp(lunge) @ [0, -1, 0]                 # walks where the scan faces
+    about = np.arctan2(heading[0], -heading[1])
+    R = R @ rotations.exp(np.array([0, 0, about]))
+    assert np.abs(np.diff(ways, axis=0) - steps @ R.T).max() < 1e-9
+    up = R[:, 2]
+    lowest = (control.rig.vertices(found.poses, found.trans) @ up).min(axis=1)
+    assert np.percentile(lowest, 5) == pytest.approx((control.mesh.vertices @ up).min(), abs=1e-9)
+    hips = control.skeleton.joints[[11, 14]].mean(axis=0)
+    off = ways[0, [11, 14]].mean(axis=0) - hips
+    assert np.abs(off - (off @ up) * up).max() < 1e-9
+
+
+MIXAMO = {"humanoid_root": "mixamorig:Hips", "vl5": "mixamorig:Spine", "skullbase": "mixamorig:Head",
+          **{f"{s}_{ours}": f"mixamorig:{side}{theirs}" for s, side in (("l", "Left"), ("r", "Right"))
+             for ours, theirs in (("sternoclavicular", "Shoulder"), ("shoulder", "Arm"), ("elbow", "ForeArm"),
+                                  ("wrist", "Hand"), ("hip", "UpLeg"), ("knee", "Leg"), ("ankle", "Foot"))}}
+MAX = {"humanoid_root": "Hips", "vl5": "Chest", "skullbase": "Head",
+       **{f"{s}_{ours}": f"{side}{theirs}" for s, side in (("l", "Left"), ("r", "Right")) for ours, theirs in
+          (("sternoclavicular", "Collar"), ("shoulder", "Shoulder"), ("elbow", "Elbow"), ("wrist", "Wrist"),
+           ("hip", "Hip"), ("knee", "Knee"), ("ankle", "Ankle"))}}
+BIPED = {"humanoid_root": "Bip01 Pelvis", "vl5": "Bip01 Spine", "skullbase": "Bip01 Head",
+         **{f"{s}_{ours}": f"Bip01 {s.upper()} {theirs}" for s in "lr" for ours, theirs in
+            (("sternoclavicular", "Clavicle"), ("shoulder", "UpperArm"), ("elbow", "Forearm"), ("wrist", "Hand"),
+             ("hip", "Thigh"), ("knee", "Calf"), ("ankle", "Foot"))}}
+SIDE_LAST = {"humanoid_root": "pelvis", "vl5": "spine_01", "skullbase": "head",
+             **{f"{s}_{ours}": f"{theirs}_{s}" for s in "lr" for ours, theirs in
+                (("sternoclavicular", "clavicle"), ("shoulder", "upperarm"), ("elbow", "lowerarm"), ("wrist", "hand"),
+                 ("hip", "thigh"), ("knee", "calf"), ("ankle", "foot"))}}
+HANIM = {name: name for name in NAMES}
+
+
+@pytest.mark.parametrize("table", [MIXAMO, MAX, BIPED, SIDE_LAST, HANIM])
+def test_names_of_other_programs(table):
+    names = [*table.values(), "Neck", "LeftToeBase", "LHipJoint", "rThumb1", "LeftForeArmRoll"]
+    assert find_roles(names) == {role: k for k, role in enumerate(table)}
+    assert find_roles(names, {"skullbase": "Neck", "vl5": ""})["skullbase"] == 17
+    assert "vl5" not in find_roles(names, {"vl5": ""})
+    with pytest.raises(ValueError, match="got 'Nose' for 'skullbase'"):
+        find_roles(names, {"skullbase": "Nose"})
+
+
+def in_t_pose(poses, table, Q, size=1.0):
+    """The humanoid's own motion as somebody else has it: at rest with arms level, in axes Q, with more joints."""
+    skeleton = humanoid().skeleton
+    A = np.tile(np.eye(3), (17, 1, 1))
+    for side, sign in (("l", 1), ("r", -1)):
+        arm, elbow, wrist = (NAMES.index(f"{side}_{n}") for n in ("shoulder", "elbow", "wrist"))
+        bone = skeleton.joints[elbow] - skeleton.joints[arm]
+        A[[arm, elbow, wrist]] = rotations.exp(np.array([0, -sign * np.arctan2(-bone[2], abs(bone[0])), 0]))
+    M = skeleton.part_rotations(poses)
+    rest = joint_places(skeleton, skeleton.pose_of(A)) * size
+    moved = joint_places(skeleton, poses) * size
+    names, parents = [table[name] for name in NAMES], skeleton.parents.copy()
+    offsets = rest - np.where(parents[:, None] < 0, 0, rest[parents])
+    R = M @ np.swapaxes(A, -1, -2)
+    # a finger that nobody follows, and a joint between pelvis and thigh that is turned but stands for nothing
+    names += ["LHipJoint", "LThumb"]
+    parents = np.r_[parents, 0, 6]
+    parents[NAMES.index("l_hip")] = 17
+    offsets = np.vstack([offsets, np.zeros(3), [[0.1, 0, 0]]])
+    R = np.concatenate([R, R[:, :1] @ rotations.exp(np.array([0.3, 0.2, 0.1])), R[:, 6:7]], axis=1)
+    y = np.concatenate([moved, moved[:, :1], moved[:, 6:7] + R[:, 6:7] @ [0.1, 0, 0]], axis=1)
+    order = [0, 17, *range(1, 17), 18]
+    number = np.argsort(order)
+    above = np.array([-1 if parents[j] < 0 else number[parents[j]] for j in order])
+    return BvhMotion(tuple(names[j] for j in order), above, (offsets @ Q.T)[order], {}, (Q @ R @ Q.T)[:, order],
+                     (y @ Q.T)[:, order], 30.0)
+
+
+Y_UP = np.array([[1.0, 0, 0], [0, 0, 1], [0, -1, 0]])
+
+
+@pytest.mark.parametrize(("table", "Q"), [(MIXAMO, Y_UP), (MAX, rotations.exp(np.array([0, 2.0, 0])) @ Y_UP),
+                                          (HANIM, np.eye(3))])
+def test_a_motion_comes_back_from_another_rest_pose_and_other_axes(table, Q):
+    control, rng = humanoid(), np.random.default_rng(1)
+    poses = rng.normal(0, 0.3, (6, 17, 3))
+    found = bvh_motion(control, GENERIC, in_t_pose(poses, table, Q, 0.4))
+    assert np.abs(rotations.exp(found.poses) - rotations.exp(poses)).max() < 1e-9
+    assert found.matched == table and found.unmatched == ("LThumb",) and not found.lacking
+    ways = joint_places(control.skeleton, poses) - joint_places(control.skeleton, found.poses, found.trans)
+    hips = ways[:, [11, 14]].mean(axis=1)
+    assert np.abs(hips - hips[0]).max() < 1e-9, "legs as long as the statue's, whatever the unit"
+    bvh = in_t_pose(poses, table, Q)
+    renamed = {table["l_hip"]: "Peter", "LHipJoint": "Paul"}
+    odd = replace(bvh, names=tuple(renamed.get(name, name) for name in bvh.names))
+    with pytest.raises(ValueError, match="motion: expected joints named like l_hip, found only"):
+        bvh_motion(control, GENERIC, odd)
+    given = bvh_motion(control, GENERIC, odd, names={"l_hip": "Peter"})
+    assert np.abs(given.poses - found.poses).max() < 1e-9
+
+
+def test_feet_are_flat_at_rest_or_square_to_legs_that_are_apart():
+    still = np.zeros((1, 17, 3))
+    for apart in (0.05, 0.3):
+        bvh = in_t_pose(still, MIXAMO, Y_UP)
+        shanks = {bvh.names.index(MIXAMO[f"{side}_ankle"]): sign for side, sign in (("l", 1), ("r", -1))}
+        offsets = bvh.offsets.copy()
+        for ankle, sign in shanks.items():
+            offsets[ankle] = np.linalg.norm(offsets[ankle]) * np.array([sign * np.sin(apart), -np.cos(apart), 0])
+        found = bvh_motion(humanoid(), GENERIC, replace(bvh, offsets=offsets))
+        R = world(humanoid(), found)[0]
+        for name, sign in (("l_ankle", 1), ("r_ankle", -1)):
+            tilt = sign * (apart if apart > 0.1 else 0)
+            assert np.abs(R[NAMES.index(name)] - rotations.exp(np.array([0, -tilt, 0]))).max() < 1e-9
+
+
+def test_a_frame_may_stand_for_the_rest():
+    """Files whose offsets say nothing about the rest pose."""
+    rng = np.random.default_rng(2)
+    poses = rng.normal(0, 0.3, (4, 17, 3))
+    poses[2] = 0
+    bvh = in_t_pose(poses, MIXAMO, Y_UP)
+    bare = np.linalg.norm(bvh.offsets, axis=1)[:, None] * [1, 0, 0]
+    frames = np.swapaxes(rotations.exp(rng.normal(size=(19, 3))), -1, -2)          # axes of their own in every joint
+    bvh = replace(bvh, offsets=bare, rotations=bvh.rotations @ frames)
+    found = bvh_motion(humanoid(), GENERIC, bvh, reference=2)
+    assert np.abs(rotations.exp(found.poses) - rotations.exp(poses)).max() < 1e-9
+    with pytest.raises(ValueError, match="not in one line at rest"):
+        bvh_motion(humanoid(), GENERIC, bvh)
+    with pytest.raises(ValueError, match="reference: expected a frame of 0 to 3, got 4"):
+        bvh_motion(humanoid(), GENERIC, bvh, reference=4)
+
+
+def test_a_bvh_that_was_exported_drives_the_statue(tmp_path):
+    control, person = humanoid(), Person()
+    poses, trans = walk(12, 12)
+    write_bvh(tmp_path / "walk.bvh", person.skeleton, poses, trans, 12, "in", body=person.mesh)
+    found = bvh_motion(control, GENERIC, read_bvh(tmp_path / "walk.bvh", "in"))
+    direct = people_motion(control, GENERIC, poses, trans, 12)
+    turned = np.swapaxes(world(control, found), -1, -2) @ world(control, direct)
+    angles = np.degrees(np.linalg.norm(rotations.log(turned), axis=-1))
+    assert angles.max() < 5, "the rest poses differ by as much as the two skeletons do"
+    assert np.abs(found.trans - direct.trans).max() < 0.02
+
+
+def test_a_trunk_is_found_by_the_tree():
+    names = ("Hips", "LowerBack", "Spine", "Spine1", "Neck", "Head", "LeftArm", "RightArm", "LeftUpLeg")
+    parents = np.array([-1, 0, 1, 2, 3, 4, 3, 3, 0])
+    assert trunk(parents, find_roles(names)) == (1, 3)
+    assert trunk(np.array([-1, 0, 1, 2, 3, 4, 0, 0, 0]), find_roles(names)) == (0, 0)
+
+
+@pytest.fixture(scope="module")
+def learned():
+    """A model of bodies that is no skinned mesh, and a coarse control mesh around it in a bent pose."""
+    model = worm_model()
+    rng = np.random.default_rng(3)
+    subject, pose, trans = model.subject(np.array([0.5, -1.0, 0.3])), rng.normal(0, 0.2, (4, 3)), rng.normal(size=3)
+    body = model.template.with_vertices(subject.vertices(pose, trans))
+    coarse = worm(17, 6)
+    near = Surface(model.template).closest(coarse.vertices)
+    off = rng.uniform(-0.01, 0.02, len(coarse.vertices))[:, None] * coarse.vertex_normals
+    return subject, pose, trans, coarse.with_vertices(near.carried(body.vertices, body.faces) + off)
+
+
+def test_a_control_mesh_follows_a_model(learned):
+    subject, pose, trans, control = learned
+    follower = Follower(control, subject, pose, trans)
+    assert np.abs(follower.vertices(pose, trans) - control.vertices).max() < 1e-9, "the scan's own pose gives it back"
+    # the whole body turns and travels: the control mesh does so too
+    turn, moved = np.array([0.4, -0.8, 1.1]), pose.copy()
+    moved[0] = rotations.log(rotations.exp(turn) @ rotations.exp(pose[0]))
+    about = subject.template.vertices[subject.skeleton.part_of_vertex(subject.template) == 0].mean(axis=0)
+    rigid = (control.vertices - trans - about) @ rotations.exp(turn).T + about - trans
+    assert np.abs(follower.vertices(moved, -trans) - rigid).max() < 1e-9
+    # many poses at once; each vertex keeps its distance from the skin
+    poses = np.random.default_rng(4).normal(0, 0.25, (40, 4, 3))
+    several = follower.vertices(poses, np.zeros((40, 3)))
+    before = Surface(subject.template.with_vertices(subject.vertices(pose, trans))).closest(control.vertices).distances
+    for t in (0, 35):
+        assert np.abs(several[t] - follower.vertices(poses[t])).max() < 1e-12
+        after = Surface(subject.template.with_vertices(subject.vertices(poses[t]))).closest(several[t]).distances
+        assert np.abs(after - before).max() < 0.004
+
+
+def test_points_of_the_skin_follow_exactly_and_a_registered_scan_says_which(learned):
+    subject, pose, trans, control = learned
+    body = subject.template.with_vertices(subject.vertices(pose, trans))
+    slid = body.with_vertices(body.vertices + [0.3, 0, 0])               # stands elsewhere than the model has it
+    on = Surface(body).closest(control.vertices)
+    mesh = control.with_vertices(on.carried(slid.vertices, body.faces))
+    follower = Follower(mesh, subject, pose, trans, slid.vertices)
+    assert np.abs(follower.vertices(pose, trans) - mesh.vertices).max() < 1e-9
+    straight = Follower(control.with_vertices(on.points), subject, pose, trans)
+    poses = np.random.default_rng(5).normal(0, 0.3, (2, 4, 3))
+    for t, x in enumerate(straight.vertices(poses)):
+        assert np.abs(x - on.carried(subject.vertices(poses[t]), body.faces)).max() < 1e-9
+    off = follower.vertices(poses[0]) - straight.vertices(poses[0])
+    assert np.abs(np.linalg.norm(off, axis=1) - 0.3).max() < 1e-9, "the offset turns with the skin"
+    with pytest.raises(ValueError, match=r"registered: expected shape \(398, 3\)"):
+        Follower(mesh, subject, pose, trans, slid.vertices[:5])
+
+
+def test_a_vertex_is_bound_to_its_own_side(learned):
+    """Where a thin part is nearer than the skin that a vertex belongs to, its normal says where it belongs."""
+    subject, _, _, control = learned
+    rest = subject.template.with_vertices(subject.vertices(np.zeros((4, 3))))
+    squeezed = control.with_vertices(Surface(rest).closest(worm(17, 6).vertices).points)
+    low = int(squeezed.vertices[:, 2].argmin())
+    vertices = squeezed.vertices.copy()
+    vertices[low, 2] += 0.8 * np.ptp(rest.vertices[:, 2])                # up through the body, still facing down
+    bound = _bound(squeezed.with_vertices(vertices), rest)[[low]]
+    assert (bound @ rest.vertex_normals)[0, 2] < -0.3
