@@ -11,17 +11,18 @@ from scipy.spatial.transform import Rotation
 from model.statue.chart import make_chart
 from model.statue.colors import bake_texture, scan_look
 from model.statue.control import ControlModel
-from model.statue.displacement import DisplacementConfig, bake, coverage_shares
+from model.statue.displacement import DisplacementConfig, bake, coverage_shares, unfold_control
 from model.statue.displacement_files import read_map, write_map
 from model.statue.normal_volume import from_normal_volume, interpolate, solve_triangles, to_normal_volume
 from model.statue.reconstruction import (
     Reconstruction,
+    VertexRotations,
     chart_places,
     displaced_surface,
+    in_folds,
     inverted_triangles,
     remaining_error,
     surface_error,
-    vertex_rotations,
 )
 from model.statue.statue import FOLDED, HOLE, MEASURED, OUTSIDE, DisplacementMap
 from model.statue.subdivision import subdivide, subdivide_adaptive
@@ -252,11 +253,35 @@ def test_vectors_mend_an_overhang_and_nothing_else(control, mushroom):
     fine = subdivide(control.mesh, control.chart, 4)
     plain, bent = (Reconstruction(control, m, fine).mesh() for m in (replace(found, vectors=None), found))
     assert surface_error(bent, mushroom, 50_000).rms < 0.6 * surface_error(plain, mushroom, 50_000).rms
+    inverted = inverted_triangles(control, control.mesh.vertices, fine, bent.vertices)
+    assert len(inverted)                                     # the underside of the cap
+    folds = in_folds(control, found, fine)
+    assert folds[inverted].all()
+    assert in_folds(control, replace(found, vectors=None), fine).mean() < folds.mean() < 0.05
     shelf = mushroom.vertices[np.hypot(mushroom.vertices[:, 0], mushroom.vertices[:, 1]) > 0.0165]
     shelf = shelf[shelf[:, 2] > 0.205]                       # the cap's rim, beyond what heights can say
     far = [Surface(mesh).closest(shelf).distances.mean() for mesh in (plain, bent)]
     assert far[0] > 0.002
     assert far[1] < 0.6 * far[0]
+
+
+def test_a_control_mesh_that_is_folded_inside_the_scan_is_drawn_out(control, scan):
+    near = np.linalg.norm(control.mesh.vertices - [0, R, 0], axis=1) < 0.35 * R
+    dented = replace(control, mesh=control.mesh.with_vertices(
+        control.mesh.vertices - np.where(near[:, None], [0, 0.8 * R, 0], 0)))
+    config = DisplacementConfig(size=128)
+    out = unfold_control(dented, scan, config)
+    rms, folded = [], []
+    for one in (dented, out):
+        found = bake(one, scan, config)
+        folded.append(coverage_shares(one, found)["folded"])
+        built = Reconstruction(one, found, subdivide(one.mesh, one.chart, 3)).mesh()
+        rms.append(surface_error(built, scan, 20_000).rms)
+    assert folded[1] < 0.2 * folded[0]
+    assert rms[1] < 0.1 * rms[0]
+    moved = np.linalg.norm(out.mesh.vertices - dented.mesh.vertices, axis=1) > 0
+    assert not moved[control.mesh.vertices[:, 1] < 0].any()
+    assert (unfold_control(control, scan, config).mesh.vertices == control.mesh.vertices).all()
 
 
 # ---- subdivision
@@ -332,8 +357,9 @@ def test_detail_turns_and_moves_with_the_control_mesh(control, mushroom):
     turn, shift = Rotation.from_rotvec([0.3, -1, 2]), np.array([1, 2, 3.0])
     rest, v = build(control.mesh.vertices), np.array(control.mesh.vertices)
     np.testing.assert_allclose(build(turn.apply(v) + shift), turn.apply(rest) + shift, atol=1e-9)
-    np.testing.assert_allclose(vertex_rotations(control.mesh, turn.apply(v)), np.tile(turn.as_matrix(), (len(v), 1, 1)),
-                               atol=1e-9)
+    rotations = VertexRotations(control.mesh, np.arange(0, len(v), 3))
+    turned = rotations(turn.apply(v), turn.apply(np.array(control.mesh.vertex_normals)))
+    np.testing.assert_allclose(turned, np.tile(turn.as_matrix(), (len(turned), 1, 1)), atol=1e-9)
     single = Reconstruction(control, found, fine, np.float32)(v)
     assert single.dtype == np.float32
     np.testing.assert_allclose(single, rest, atol=1e-6)

@@ -7,7 +7,7 @@ same where the scan's triangles are small against the control mesh's, and depend
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Annotated
 
 import numpy as np
@@ -29,6 +29,7 @@ from .vectors import bend_over_folds
 
 Progress = Callable[[int, int], None]
 FILL_LEVEL = 3                       # of the subdivision on which holes are filled: edges of some 5 mm
+UNFOLD_SIZE = 512                    # pixels each way while control vertices are moved out of folds
 VECTOR_LEVEL = 4                     # of that whose vertices are drawn onto the scan in folds
 
 
@@ -53,7 +54,7 @@ class DisplacementConfig(Settings):
     """
 
     size: Annotated[int, Range(16, 8192)] = 1024
-    reach: Positive = 0.05
+    reach: Positive = 0.1
     min_cosine: Cosine = 0.1
     slope: Positive = 3.0
     island: Positive = 1e-4
@@ -79,26 +80,74 @@ def bake(control: ControlModel, scan: Mesh, config: DisplacementConfig | None = 
     [Statues] Eq. 19, 20, 21
     """
     config, tell = config or DisplacementConfig(), progress or (lambda done, total: None)
+    found = find_heights(control, scan, config)
+    tell(1, 2)
+    texels, heights = found.texels, found.heights
+    coverage = np.where(found.folded, FOLDED, np.where(found.known, MEASURED, HOLE)).astype(np.uint8)
+    coverage[~texels.inside] = OUTSIDE
+    vectors = _vectors(control, scan, found, config.reach) if config.vectors else None
+    tell(2, 2)
+    return DisplacementMap(texels.image(heights.astype(np.float32)), texels.image(coverage, OUTSIDE),
+                           None if vectors is None else texels.image(vectors.astype(np.float32)))
+
+
+@dataclass(frozen=True, eq=False)
+class Heights:
+    """Heights of the pixels of a chart: `heights` (n,) metres, `known` (n,) bool, not filled; `folded` (n,) bool."""
+
+    texels: Texels
+    heights: np.ndarray
+    known: np.ndarray
+    folded: np.ndarray
+
+
+def find_heights(control: ControlModel, scan: Mesh, config: DisplacementConfig) -> Heights:
+    """Measured, sorted and filled heights; arguments and errors as of `bake`."""
     if not len(scan.faces):
         raise ValueError(f"scan: expected at least one triangle, got {scan}")
     texels = find_texels(control.mesh, control.chart, config.size)
     if not texels.inside.any():
         raise ValueError(f"size: {config.size} pixels are too few, no pixel's centre lies in the chart")
-    tell(1, 5)
     heights, several = _measure(control.mesh, scan, texels, config)
-    tell(2, 5)
     known, folded = _sort(control, texels, heights, several, config)
     empty = ~known & ~folded
-    folded[empty] = ~_without_data(control.mesh, scan, texels, empty, config.reach)
-    tell(3, 5)
-    heights = _filled(control, texels, heights, known)
-    coverage = np.where(folded, FOLDED, np.where(known, MEASURED, HOLE)).astype(np.uint8)
-    coverage[~texels.inside] = OUTSIDE
-    tell(4, 5)
-    vectors = _vectors(control, scan, texels, heights, known, folded, config) if config.vectors else None
-    tell(5, 5)
-    return DisplacementMap(texels.image(heights.astype(np.float32)), texels.image(coverage, OUTSIDE),
-                           None if vectors is None else texels.image(vectors.astype(np.float32)))
+    if empty.any():
+        folded[empty] = ~_without_data(control.mesh, scan, texels, empty, config.reach)
+    return Heights(texels, _filled(control, texels, heights, known), known, folded)
+
+
+def unfold_control(control: ControlModel, scan: Mesh, config: DisplacementConfig | None = None, rounds: int = 2
+                   ) -> ControlModel:
+    """A control model whose vertices in folds are moved to where the surface drawn over them lies on the scan.
+
+    Where a fit left the control mesh inside the scan, such as an armpit that it put too high, no height reaches the
+    surface. A round counts only if less of the control mesh than before is folded or a hole.
+
+    Parameters
+    ----------
+    control : ControlModel
+        Fitted.
+    scan : Mesh
+    config : DisplacementConfig, optional
+        As for `bake`; the pixels may be larger here.
+    rounds : int
+    """
+    config = config or DisplacementConfig()
+    config = replace(config, size=min(config.size, UNFOLD_SIZE))
+    best, before = control, np.inf
+    for number in range(rounds + 1):
+        found = find_heights(control, scan, config)
+        bad = (found.folded | ~found.known) & found.texels.inside
+        without = float(texel_areas(control, found.texels)[bad].sum() / control.mesh.face_areas.sum())
+        if without >= before:
+            break
+        best, before = control, without
+        if number < rounds and without > 0:
+            drawn, u = _over_folds(Lattice(control.mesh, control.chart, FILL_LEVEL), scan, found, config.reach)
+            count = len(control.mesh.vertices)                   # the first of the lattice
+            moved = np.where(drawn[:count, None], u[:count], 0)
+            control = replace(control, mesh=control.mesh.with_vertices(control.mesh.vertices + moved))
+    return best
 
 
 def _measure(mesh: Mesh, scan: Mesh, texels: Texels, config: DisplacementConfig) -> tuple[np.ndarray, np.ndarray]:
@@ -183,20 +232,24 @@ def _filled(control: ControlModel, texels: Texels, heights: np.ndarray, known: n
     return np.where(known, heights, lattice.sample(values, texels.faces, texels.bary))
 
 
-def _vectors(control: ControlModel, scan: Mesh, texels: Texels, heights: np.ndarray, known: np.ndarray,
-             folded: np.ndarray, config: DisplacementConfig) -> np.ndarray:
-    """Displacements (n, 3) of pixels: heights along the normals, and drawn onto the scan in and around folds."""
-    lattice = Lattice(control.mesh, control.chart, VECTOR_LEVEL)
-    near = lattice.fine.vertex_adjacency
-    values, sure = lattice.gather(texels, heights, known)
-    _, no_fold = lattice.gather(texels, heights, ~folded)
-    smooth = sparse.harmonic(near, values[:, None], sure)[:, 0]
-    drawn, u = bend_over_folds(lattice, scan, smooth, ~no_fold, config.reach)
-    out = np.zeros((len(heights), 3))
+def _over_folds(lattice: Lattice, scan: Mesh, found: Heights, reach: float) -> tuple[np.ndarray, np.ndarray]:
+    """Which vertices (n,) of a lattice are drawn onto the scan, and the displacements (n, 3) of all."""
+    values, sure = lattice.gather(found.texels, found.heights, found.known)
+    _, no_fold = lattice.gather(found.texels, found.heights, ~found.folded)
+    smooth = sparse.harmonic(lattice.fine.vertex_adjacency, values[:, None], sure)[:, 0]
+    return bend_over_folds(lattice, scan, smooth, ~no_fold, reach)
+
+
+def _vectors(control: ControlModel, scan: Mesh, found: Heights, reach: float) -> np.ndarray:
+    """What is to be added (n, 3) to the heights of pixels in and around folds."""
+    lattice, texels = Lattice(control.mesh, control.chart, VECTOR_LEVEL), found.texels
+    drawn, u = _over_folds(lattice, scan, found, reach)
+    out = np.zeros((len(found.heights), 3))
     vertex, _ = lattice.places(texels.faces, texels.bary)
     which = np.flatnonzero(drawn[vertex].any(axis=1))
     faces, bary = texels.faces[which], texels.bary[which]
-    out[which] = lattice.sample(u, faces, bary) - heights[which, None] * interpolate(control.mesh, faces, bary)[1]
+    _, n = interpolate(control.mesh, faces, bary)
+    out[which] = lattice.sample(u, faces, bary) - found.heights[which, None] * n
     return out
 
 

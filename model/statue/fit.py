@@ -11,7 +11,7 @@ from scanprep.ranges import Settings
 
 from .automatic import Features, find_features
 from .control import ControlModel
-from .displacement import DisplacementConfig, bake
+from .displacement import DisplacementConfig, bake, unfold_control
 from .features import FeatureConfig, FeatureFit, fit_features, head_share, warp
 from .humanoid import humanoid
 from .statue import Statue
@@ -85,7 +85,7 @@ def fit_statue(scan: Mesh, joints: Mapping[str, np.ndarray] | None = None,
     else:
         posed = posed_by_features(control, joints or {}, points or {}, config.features)
     surface = fit_surface(control.mesh, posed.start, scan, config.surface, progress)
-    fitted = fitted_control(control, posed.features, surface)
+    fitted = unfold_control(fitted_control(control, posed.features, surface), scan, config.displacement)
     return Statue(fitted, posed.features.pose, bake(fitted, scan, config.displacement, progress))
 
 

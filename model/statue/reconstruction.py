@@ -13,10 +13,11 @@ from scanprep.pictures.textures import bilinear
 from .chart import Chart
 from .control import ControlModel
 from .normal_volume import from_normal_volume, interpolate, to_normal_volume
-from .statue import MEASURED, OUTSIDE, DisplacementMap
+from .statue import FOLDED, HOLE, MEASURED, OUTSIDE, DisplacementMap
 from .subdivision import Displaced, Subdivision
 
 SEED = 14                            # of the places at which errors are measured
+BESIDE = 3                           # pixels each way that count as one place
 
 
 def chart_places(chart: Chart, faces: np.ndarray, bary: np.ndarray) -> np.ndarray:
@@ -60,17 +61,20 @@ class Reconstruction:
         self._spread = csr_array(hstack([share, diags_array(heights) @ share]), dtype=dtype)
         self._around = _around(mesh)
         self._turning = np.flatnonzero(rest.any(axis=1))
+        self._carriers = np.unique(corners[self._turning])
+        self._rotations = VertexRotations(mesh, self._carriers)
         self._rest: np.ndarray = rest[self._turning].astype(dtype)
-        self._share = csr_array(share[self._turning], dtype=dtype)
+        self._share = csr_array(share[self._turning][:, self._carriers], dtype=dtype)
 
     def __call__(self, control_vertices: np.ndarray) -> np.ndarray:
         """(n, 3) metres, the detailed surface on control vertices (N, 3)."""
         v = np.asarray(control_vertices, dtype=np.float64)
         if v.shape != self.control.mesh.vertices.shape:
             raise ValueError(f"control_vertices: expected shape {self.control.mesh.vertices.shape}, got {v.shape}")
-        out = self._spread @ np.concatenate([v, self._normals(v)]).astype(self.dtype)
+        n = self._normals(v)
+        out = self._spread @ np.concatenate([v, n]).astype(self.dtype)
         if len(self._turning):
-            R: np.ndarray = vertex_rotations(self.control.mesh, v).reshape(-1, 9).astype(self.dtype)
+            R: np.ndarray = self._rotations(v, n).reshape(-1, 9).astype(self.dtype)
             out[self._turning] += np.einsum("nij,nj->ni", (self._share @ R).reshape(-1, 3, 3), self._rest)
         return out
 
@@ -86,11 +90,7 @@ class Reconstruction:
 
 def coverage_at(control: ControlModel, map: DisplacementMap, faces: np.ndarray, bary: np.ndarray) -> np.ndarray:
     """(n,) what the map says at places on triangles: MEASURED, FOLDED or HOLE; at a rim what the pixel beside says."""
-    uv = chart_places(control.chart, faces, bary)
-    height, width = map.coverage.shape
-    column, row = (np.clip(at.astype(int), 0, size - 1) for at, size in
-                   ((uv[:, 0] * width, width), ((1 - uv[:, 1]) * height, height)))
-    found = map.coverage[row, column]
+    found = map.coverage[_pixels(map, chart_places(control.chart, faces, bary))]
     return np.where(found == OUTSIDE, MEASURED, found)
 
 
@@ -122,20 +122,36 @@ def _around(mesh: Mesh) -> csr_array:
     return csr_array((np.ones(len(faces)), (mesh.faces.ravel(), faces)), shape=(len(mesh.vertices), len(mesh.faces)))
 
 
-def vertex_rotations(rest: Mesh, vertices: np.ndarray) -> np.ndarray:
-    """(N, 3, 3) rotations that best turn the edges around each vertex of a mesh at rest to where they are now.
+class VertexRotations:
+    """Rotations that best turn the edges around some vertices of a mesh at rest to where they are now.
 
-    Edges with the normals in them, so that a ring of edges in a plane has one answer.
+    The normals are turned with the edges, so that a ring of edges in a plane has one answer.
+
+    Parameters
+    ----------
+    rest : Mesh
+    which : (k,) int
+        Vertices.
     """
-    moved = rest.with_vertices(vertices)
-    a, b = np.concatenate([rest.edges, rest.edges[:, ::-1]]).T
-    products = np.einsum("ei,ej->eij", vertices[a] - vertices[b], rest.vertices[a] - rest.vertices[b]).reshape(-1, 9)
-    count = len(rest.vertices)
-    S = (csr_array((np.ones(len(a)), (a, np.arange(len(a)))), shape=(count, len(a))) @ products).reshape(-1, 3, 3)
-    S += np.einsum("ni,nj->nij", moved.vertex_normals, rest.vertex_normals) * rest.mean_edge**2
-    U, _, Vt = np.linalg.svd(S)
-    U[:, :, 2] *= np.linalg.det(U @ Vt)[:, None]
-    return U @ Vt
+
+    def __init__(self, rest: Mesh, which: np.ndarray) -> None:
+        number = np.full(len(rest.vertices), -1)
+        number[which] = np.arange(len(which))
+        ends = np.concatenate([rest.edges, rest.edges[:, ::-1]])
+        self._a, self._b = ends[number[ends[:, 0]] >= 0].T
+        self._edges = rest.vertices[self._a] - rest.vertices[self._b]
+        self._normals, self._which = rest.vertex_normals[which] * rest.mean_edge**2, which
+        rows = np.arange(len(self._a))
+        self._sum = csr_array((np.ones(len(rows)), (number[self._a], rows)), shape=(len(which), len(rows)))
+
+    def __call__(self, vertices: np.ndarray, normals: np.ndarray) -> np.ndarray:
+        """(k, 3, 3) for vertices (N, 3) with unit normals (N, 3)."""
+        edges = vertices[self._a] - vertices[self._b]
+        S = (self._sum @ (edges[:, :, None] * self._edges[:, None]).reshape(-1, 9)).reshape(-1, 3, 3)
+        S = S + normals[self._which][:, :, None] * self._normals[:, None]
+        U, _, Vt = np.linalg.svd(S)
+        U[:, :, 2] *= np.linalg.det(U @ Vt)[:, None]
+        return U @ Vt
 
 
 @dataclass(frozen=True)
@@ -191,6 +207,29 @@ def inverted_triangles(control: ControlModel, vertices: np.ndarray, subdivision:
     _, n = interpolate(control.mesh.with_vertices(vertices), subdivision.parent, subdivision.bary)
     below = n[subdivision.faces].sum(axis=1)
     return np.flatnonzero(np.einsum("fd,fd->f", Mesh(detailed, subdivision.faces).face_normals, below) < 0)
+
+
+def in_folds(control: ControlModel, map: DisplacementMap, subdivision: Subdivision) -> np.ndarray:
+    """(f,) bool: fine triangles with a corner or their middle on, or beside, a pixel in a fold or hole.
+
+    With vectors also where these take part, some way around folds.
+    """
+    from scipy.ndimage import maximum_filter
+
+    bad = (map.coverage == FOLDED) | (map.coverage == HOLE)
+    if map.vectors is not None:
+        bad |= map.vectors.any(axis=2) & (map.coverage != OUTSIDE)
+    bad = maximum_filter(bad, BESIDE)
+    corners = subdivision.chart.uv[subdivision.chart.faces]
+    uv = np.concatenate([corners, corners.mean(axis=1, keepdims=True)], axis=1).reshape(-1, 2)
+    return bad[_pixels(map, uv)].reshape(-1, 4).any(axis=1)
+
+
+def _pixels(map: DisplacementMap, uv: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Rows and columns (n,) of the pixels at places (n, 2)."""
+    height, width = map.coverage.shape
+    return (np.clip(((1 - uv[:, 1]) * height).astype(int), 0, height - 1),
+            np.clip((uv[:, 0] * width).astype(int), 0, width - 1))
 
 
 def _error(distances: np.ndarray) -> SurfaceError:

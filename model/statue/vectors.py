@@ -20,10 +20,10 @@ from .lattice import Lattice
 from .normal_volume import interpolate
 
 RINGS = 5                            # vertices around a fold that are drawn with it
-STIFFNESS = (100.0, 30.0, 10.0, 3.0, 1.0, 0.3, 0.1, 0.03, 0.01)     # of the thin plate against the data
-LOOSE = 0.01                         # weight of staying where nothing matches
+STIFFNESS = (100.0, 30.0, 10.0, 3.0, 1.0, 0.3, 0.1, 0.03)   # of the thin plate against the data
+LOOSE = 0.001                        # weight of staying where nothing matches
 STEPS = 3                            # at each
-SPACING = 0.001                      # metres between the places of the scan that are matched
+SPACING = 0.002                      # metres between the places of the scan that are matched
 SCALE = 0.01                         # metres that a turn of the normal by 60 degrees is worth in a match
 
 
@@ -93,11 +93,10 @@ def _better(lattice: Lattice, scan: Mesh, before: np.ndarray, after: np.ndarray,
 
 def _places(scan: Mesh, points: np.ndarray, reach: float) -> tuple[np.ndarray, np.ndarray]:
     """Places (m, 3) spread over the scan within reach of points, one for a square of SPACING, with normals (m, 3)."""
-    size = np.linalg.norm(scan.corners - scan.corners.mean(axis=1, keepdims=True), axis=2).max(axis=1)
-    tree = cKDTree(points)
     middle = scan.corners.mean(axis=1)
-    apart, _ = tree.query(middle, workers=search_threads(len(middle)))
-    around = scan.submesh(np.flatnonzero(apart <= reach + size))[0]
+    far = reach + np.sqrt(((scan.corners[:, 0] - middle)**2).sum(axis=1).max())
+    apart, _ = cKDTree(points).query(middle, distance_upper_bound=far, workers=search_threads(len(middle)))
+    around = scan.submesh(np.flatnonzero(np.isfinite(apart)))[0]
     if not len(around.faces) or not around.face_areas.sum():
         return np.zeros((0, 3)), np.zeros((0, 3))
     count = int(np.ceil(around.face_areas.sum() / SPACING**2))
