@@ -33,8 +33,8 @@ class FeatureConfig(Settings):
     """
 
     prior: Positive = 0.001
-    shortest: Positive = 0.6
-    longest: Positive = 1.6
+    shortest: Positive = 0.4
+    longest: Positive = 2.5
     iterations: Count = 2000
 
 

@@ -90,7 +90,8 @@ class Reconstruction:
 
 def coverage_at(control: ControlModel, map: DisplacementMap, faces: np.ndarray, bary: np.ndarray) -> np.ndarray:
     """(n,) what the map says at places on triangles: MEASURED, FOLDED or HOLE; at a rim what the pixel beside says."""
-    found = map.coverage[_pixels(map, chart_places(control.chart, faces, bary))]
+    inwards = 0.9 * bary + 0.1 / 3                              # a pixel at a seam may lie outside the chart
+    found = map.coverage[_pixels(map, chart_places(control.chart, faces, inwards))]
     return np.where(found == OUTSIDE, MEASURED, found)
 
 

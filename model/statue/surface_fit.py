@@ -53,6 +53,9 @@ class SurfaceFitConfig(Settings):
     cover : float
         Weight of the other direction, in which points of the scan draw the nearest point of the control mesh, so that
         it covers tips of limbs; all of them together weigh as much as this many times all vertices. The paper has none.
+    reach : float
+        Vertices farther from the scan have no data and are carried by the shape: an arm that was not scanned stays
+        where it was posed. A multiple of the root of the mesh's area; the paper has none.
     polish : int
         Rounds at the end in which vertices are drawn to the surface between the points of the scan; 0 leaves them out.
     tight : float
@@ -70,6 +73,7 @@ class SurfaceFitConfig(Settings):
     tolerance: Positive = 0.001
     most: Count = 10
     cover: float = 3.0
+    reach: Positive = 0.06
     polish: int = 6
     tight: Positive = 100.0
     slide: float = 0.05
@@ -169,6 +173,7 @@ class _Fit:
         self.stiffness = csc_array(self.shape.plane.T @ diags_array(self.shape.weights) @ self.shape.plane)
         self.sample = target.thinned(max(float(np.sqrt(area / (SAMPLE * len(start)))), 1e-4))
         self.nothing = csc_array((0, len(start))), np.zeros((0, 3)), 0.0
+        self.reach = config.reach * float(np.sqrt(rest.with_vertices(start).face_areas.sum()))
         self.steps: list[int] = []
         self.converged = False
         self.energies: dict[str, float] = {}
@@ -223,6 +228,7 @@ class _Fit:
     def beside_data(self, nearest: np.ndarray) -> np.ndarray:
         """(N,) bool: not beyond the edge of a hole, where the nearest point says nothing."""
         points, beside = self.points, nearest >= 0
+        beside &= np.linalg.norm(points.points[nearest] - self.x, axis=1) <= self.reach
         for at in (nearest, points.tree.query(self.x)[1]):                  # of those that face the same way; of all
             offset = np.cross(points.normals[at], self.x - points.points[at])
             beside &= ~points.border[at] | (np.linalg.norm(offset, axis=1) <= points.spacing)

@@ -21,7 +21,7 @@ from scanprep.pictures.textures import Texture, read_texture
 from .automatic import Features, find_features
 from .colors import bake_texture, scan_look
 from .control import ControlModel
-from .displacement import bake, coverage_shares
+from .displacement import bake, coverage_shares, unfold_control
 from .files import save_statue, write_body, write_for_programs
 from .fit import Posed, StatueConfig, fitted_control, posed_automatically, posed_by_features
 from .read_features import read_features
@@ -94,7 +94,8 @@ class Work:
             rows = [Metric("joints given", len(joints)), Metric("surface points given", len(points))]
         surface = room.step("surface", same, lambda: fit_surface(self.control.mesh, posed.start, scan,
                                                                  self.config.surface, room.tell))
-        control = fitted_control(self.control, posed.features, surface)
+        control = room.step("control", same, lambda: unfold_control(
+            fitted_control(self.control, posed.features, surface), scan, self.config.displacement))
         map_ = room.step("map", same, lambda: bake(control, scan, self.config.displacement, room.tell))
         statue = Statue(control, posed.features.pose, map_)
         if texture is not None or scan.colors is not None:
@@ -151,7 +152,7 @@ def measured_levels(statue: Statue, scan: Mesh) -> tuple[list[Level], Subdivisio
 
 def _level(name: str, statue: Statue, fine: Subdivision, scan: Mesh) -> Level:
     mesh = Reconstruction(statue.control, statue.map, fine).mesh()
-    shown = (_kinds(statue, fine) != HOLE).any(axis=1)
+    shown = (_kinds(statue, fine) != HOLE).all(axis=1)
     error = surface_error(mesh.submesh(shown)[0], scan) if shown.any() else SurfaceError(np.nan, np.nan, np.nan)
     return Level(name, mesh, error.mean, error.rms, shown)
 
