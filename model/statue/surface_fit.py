@@ -1,11 +1,15 @@
 """Fit of a control mesh to a scan: a shape-constrained deformable surface under annealed soft assignment.
 
+Beyond the paper: points of the scan draw the mesh as well (`cover`), without which it leaves tips of limbs empty; at the
+end vertices are drawn to the surface between the points (`polish`); at the edge of a hole the data draw only across the
+surface, and beyond it not at all. `SurfaceFitConfig(step="explicit", polish=0)` has nothing of the first two.
+
 [Statues] section 4
 """
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Annotated, Literal
 
 import numpy as np
@@ -14,7 +18,7 @@ from scipy.sparse import csc_array, diags_array, eye_array
 from scanprep.geometry.mesh import Mesh, check_template
 from scanprep.geometry.sparse import Factored
 from scanprep.geometry.surface import Surface, checked_points
-from scanprep.matching.matches import Target, target_of
+from scanprep.matching.matches import Target
 from scanprep.matching.shell import conjugate_gradients, flipped, unfold
 from scanprep.matching.turns import turns
 from scanprep.ranges import Count, Positive, Range, Settings
@@ -22,7 +26,7 @@ from scanprep.threads import one_thread
 
 from .local_shape import LocalShape, local_shape
 from .soft_assignment import ScanPoints, Slack, SoftAssignment, assign
-from .surface_data import SurfaceData, distortion
+from .surface_data import SurfaceData, distortion, scan_target
 
 AGREE = 0.3              # least cosine between normals of the scan and the mesh, for points that draw the mesh
 BACK = 10                # times that vertices go back from the surface because a triangle turned over
@@ -68,7 +72,7 @@ class SurfaceFitConfig(Settings):
     cooling: Annotated[float, Range(0.01, 0.99)] = 0.5
     rate: Annotated[float, Range(1e-6, 1)] = 0.5
     tolerance: Positive = 0.001
-    most: Count = 10
+    most: Count = 5
     cover: float = 3.0
     polish: int = 6
     tight: Positive = 100.0
@@ -142,7 +146,7 @@ def fit_surface(rest: Mesh, start: np.ndarray, scan: Mesh, config: SurfaceFitCon
         raise ValueError(f"start: expected shape {rest.vertices.shape}, got {start.shape}")
     if not len(scan.faces):
         raise ValueError(f"scan: expected at least one triangle, got {scan}")
-    fit = _Fit(rest, start, _target(scan), float(scan.face_areas.sum()), config)
+    fit = _Fit(rest, start, scan_target(scan), float(scan.face_areas.sum()), config)
     temperatures = fit.schedule()
     total = len(temperatures) + config.polish
     for k, T in enumerate(temperatures):
@@ -240,7 +244,7 @@ class _Fit:
             return SurfaceData(A, wanted, *self.nothing)
         found = Surface(mesh).closest(self.sample.points)
         corners = mesh.faces[found.faces]
-        normals = np.einsum("pc,pcd->pd", found.bary, mesh.vertex_normals[corners])
+        normals = found.carried(mesh.vertex_normals, mesh.faces)
         good = np.flatnonzero(np.einsum("pd,pd->p", normals, self.sample.normals) > AGREE)
         rows = np.repeat(np.arange(len(good)), 3)
         C = csc_array((found.bary[good].ravel(), (rows, corners[good].ravel())), shape=(len(good), len(self.x)))
@@ -256,8 +260,12 @@ class _Fit:
         nearly = Factored(csc_array(lam * self.stiffness + data.bound + 1e-6 * lam * eye_array(len(x))))
         d = conjugate_gradients(lambda d: lam * shape.transposed(x, w * shape.derivative(x, d)) + data.applied(d),
                                 force, nearly.solve, 30, 1e-2)
-        before, length = lam * shape.energy(x) + data.energy(x), 1.0
-        while lam * shape.energy(x + length * d) + data.energy(x + length * d) > before and length > 1e-3:
+
+        def energy(x: np.ndarray) -> float:
+            return lam * shape.energy(x) + data.energy(x)
+
+        length = 1.0
+        while energy(x + length * d) > energy(x) and length > 1e-3:
             length /= 2
         return x + length * d
 
@@ -296,11 +304,3 @@ class _Fit:
         return SurfaceFit(self.x, seen, float(np.sqrt(np.mean(apart**2))) if seen.any() else np.nan,
                           float(apart.max(initial=0.0)), int(inverted.sum()), distortion(self.rest, self.x),
                           self.energies, temperatures, np.array(self.steps), bool(self.converged and seen.any()))
-
-
-def _target(scan: Mesh) -> Target:
-    """Points with smooth normals; the borders are those of the mesh, for tips of limbs look one-sided as well."""
-    border = np.zeros(len(scan.vertices), dtype=bool)
-    border[scan.boundary_vertices] = True
-    border |= scan.vertex_adjacency @ border.astype(float) > 0       # the nearest point may lie one step farther in
-    return replace(target_of(scan, name="scan"), border=border[np.unique(scan.faces)])
