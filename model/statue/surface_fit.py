@@ -1,8 +1,8 @@
 """Fit of a control mesh to a scan: a shape-constrained deformable surface under annealed soft assignment.
 
-Beyond the paper: points of the scan draw the mesh as well (`cover`), without which it leaves tips of limbs empty; at the
-end vertices are drawn to the surface between the points (`polish`); at the edge of a hole the data draw only across the
-surface, and beyond it not at all. `SurfaceFitConfig(step="explicit", polish=0)` has nothing of the first two.
+Beyond the paper: points of the scan draw the mesh as well (`cover`), without which it leaves tips of limbs empty; at
+the end vertices are drawn to the surface between the points (`polish`); at the edge of a hole the data draw only across
+the surface, and beyond it not at all. `SurfaceFitConfig(step="explicit", polish=0)` has nothing of the first two.
 
 [Statues] section 4
 """
@@ -30,6 +30,7 @@ from .surface_data import SurfaceData, distortion, scan_target
 
 AGREE = 0.3              # least cosine between normals of the scan and the mesh, for points that draw the mesh
 BACK = 10                # times that vertices go back from the surface because a triangle turned over
+LAST = 10                # times as many steps at the last temperature
 SAMPLE = 10              # such points of the scan for each vertex
 
 
@@ -53,7 +54,7 @@ class SurfaceFitConfig(Settings):
     tolerance : float, metres
         Root of the final temperature.
     most : int
-        Steps at one temperature at most.
+        Steps at one temperature at most; ten times as many at the last.
     cover : float
         Weight of the other direction, in which points of the scan draw the nearest point of the control mesh, so that
         it covers tips of limbs; all of them together weigh as much as this many times all vertices. The paper has none.
@@ -150,7 +151,7 @@ def fit_surface(rest: Mesh, start: np.ndarray, scan: Mesh, config: SurfaceFitCon
     temperatures = fit.schedule()
     total = len(temperatures) + config.polish
     for k, T in enumerate(temperatures):
-        fit.anneal(T)
+        fit.anneal(T, config.most * (LAST if k == len(temperatures) - 1 else 1))
         if progress:
             progress(k + 1, total)
     surface = Surface(scan)
@@ -186,14 +187,14 @@ class _Fit:
         """Temperatures from the largest squared distance of a vertex to its nearest point down to the tolerance."""
         final = self.config.tolerance**2
         near, squared = self.points.nearest(self.x, self.mesh.vertex_normals, 1)
-        first = max(float(squared[self.beside_data(near[:, 0]), 0].max(initial=0.0)), final)
+        first = max(float(squared[self.points.beside(self.x, near[:, 0]), 0].max(initial=0.0)), final)
         stages = int(np.ceil(np.log(final / first) / np.log(self.config.cooling))) + 1
         return np.geomspace(first, final, stages)
 
-    def anneal(self, T: float) -> None:
+    def anneal(self, T: float, most: int) -> None:
         """Steps at one temperature until the gradient lies within the region of matching."""
         explicit = self.config.step == "explicit"
-        for count in range(self.config.most + 1):
+        for count in range(most + 1):
             matches, A = self.assignment(T)
             wanted = matches.matches @ self.points.points
             if explicit:
@@ -203,7 +204,7 @@ class _Fit:
                 data = self.drawn(A, wanted)
                 force = self.force(data)
             self.converged = bool(np.linalg.norm(force, axis=1).max() <= np.sqrt(T))
-            if (self.converged and count) or count == self.config.most:
+            if (self.converged and count) or count == most:
                 break
             self.x = self.x + self.config.rate * force if explicit else self.stepped(data, force)     # Eq. 18
         misfit, entropy = matches.energy(self.x, self.points.points, T)
@@ -217,25 +218,17 @@ class _Fit:
         At the edge of a hole all points lie to one side: their mean would draw the mesh off the hole.
         """
         near, squared = self.points.nearest(self.x, self.mesh.vertex_normals, self.config.neighbours)
-        near[~self.beside_data(near[:, 0])] = -1
+        near[~self.points.beside(self.x, near[:, 0])] = -1
         found = assign(near, squared, len(self.points.points), T, self.config.slack)
         n = self.points.normals[near[:, 0]]
         edge = (self.points.border[near] & (near >= 0)).any(axis=1)
         A = np.where(edge[:, None, None], np.einsum("ni,nj->nij", n, n), np.eye(3))
         return found, found.seen[:, None, None] * A
 
-    def beside_data(self, nearest: np.ndarray) -> np.ndarray:
-        """(N,) bool: not beyond the edge of a hole, where the nearest point says nothing."""
-        points, beside = self.points, nearest >= 0
-        for at in (nearest, points.tree.query(self.x)[1]):                  # of those that face the same way; of all
-            offset = np.cross(points.normals[at], self.x - points.points[at])
-            beside &= ~points.border[at] | (np.linalg.norm(offset, axis=1) <= points.spacing)
-        return beside
-
     def seen(self) -> tuple[np.ndarray, np.ndarray]:
         """Vertices with data, and the nearest point of the whole scan."""
         nearest = self.points.nearest(self.x, self.mesh.vertex_normals, 1)[0][:, 0]
-        return self.beside_data(nearest), nearest
+        return self.points.beside(self.x, nearest), nearest
 
     def drawn(self, A: np.ndarray, wanted: np.ndarray) -> SurfaceData:
         """The data term that draws vertices to `wanted` (N, 3) by A (N, 3, 3), and the mesh to points of the scan."""
