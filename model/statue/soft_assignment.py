@@ -110,6 +110,14 @@ class ScanPoints:
             index[alone], squared[alone] = (a[:, :index.shape[1]] for a in wide)
         return index[:, :neighbours], squared[:, :neighbours]
 
+    def beside(self, x: np.ndarray, nearest: np.ndarray) -> np.ndarray:
+        """(I,) bool: vertices (I, 3) not beyond the edge of a hole, where their nearest points (I,) say nothing."""
+        beside = nearest >= 0
+        for at in (nearest, self.tree.query(x)[1]):                  # of those that face the same way; of all
+            offset = np.cross(self.normals[at], x - self.points[at])
+            beside &= ~self.border[at] | (np.linalg.norm(offset, axis=1) <= self.spacing)
+        return beside
+
     def _facing(self, x: np.ndarray, normals: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
         near = np.arange(1, min(count, len(self.points)) + 1)
         apart, index = self.tree.query(x, near, workers=search_threads(len(x)))

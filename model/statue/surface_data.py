@@ -1,12 +1,13 @@
-"""The data term of a surface fit, and how far a fit has stretched its mesh."""
+"""What a surface fit takes from a scan, its data term, and how far a fit has stretched its mesh."""
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from scipy.sparse import csc_array, diags_array
 
 from scanprep.geometry.mesh import Mesh
+from scanprep.matching.matches import Target, target_of
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,6 +57,14 @@ class SurfaceData:
     def bound(self) -> csc_array:
         """(N, N) the same for each coordinate, at least as stiff."""
         return csc_array(diags_array(np.linalg.eigvalsh(self.A)[:, 2]) + self.share * (self.C.T @ self.C))
+
+
+def scan_target(scan: Mesh) -> Target:
+    """Points with smooth normals; the borders are those of the mesh, for tips of limbs look one-sided as well."""
+    border = np.zeros(len(scan.vertices), dtype=bool)
+    border[scan.boundary_vertices] = True
+    border |= scan.vertex_adjacency @ border.astype(float) > 0       # the nearest point may lie one step farther in
+    return replace(target_of(scan, name="scan"), border=border[np.unique(scan.faces)])
 
 
 def distortion(rest: Mesh, x: np.ndarray) -> float:

@@ -1,11 +1,15 @@
 """Fit of a control mesh to a scan: a shape-constrained deformable surface under annealed soft assignment.
 
+Beyond the paper: points of the scan draw the mesh as well (`cover`), without which it leaves tips of limbs empty; at
+the end vertices are drawn to the surface between the points (`polish`); at the edge of a hole the data draw only across
+the surface, and beyond it not at all. `SurfaceFitConfig(step="explicit", polish=0)` has nothing of the first two.
+
 [Statues] section 4
 """
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Annotated, Literal
 
 import numpy as np
@@ -14,7 +18,7 @@ from scipy.sparse import csc_array, diags_array, eye_array
 from scanprep.geometry.mesh import Mesh, check_template
 from scanprep.geometry.sparse import Factored
 from scanprep.geometry.surface import Surface, checked_points
-from scanprep.matching.matches import Target, target_of
+from scanprep.matching.matches import Target
 from scanprep.matching.shell import conjugate_gradients, flipped, unfold
 from scanprep.matching.turns import turns
 from scanprep.ranges import Count, Positive, Range, Settings
@@ -22,10 +26,11 @@ from scanprep.threads import one_thread
 
 from .local_shape import LocalShape, local_shape
 from .soft_assignment import ScanPoints, Slack, SoftAssignment, assign
-from .surface_data import SurfaceData, distortion
+from .surface_data import SurfaceData, distortion, scan_target
 
 AGREE = 0.3              # least cosine between normals of the scan and the mesh, for points that draw the mesh
 BACK = 10                # times that vertices go back from the surface because a triangle turned over
+LAST = 10                # times as many steps at the last temperature
 SAMPLE = 10              # such points of the scan for each vertex
 
 
@@ -49,7 +54,7 @@ class SurfaceFitConfig(Settings):
     tolerance : float, metres
         Root of the final temperature.
     most : int
-        Steps at one temperature at most.
+        Steps at one temperature at most; ten times as many at the last.
     cover : float
         Weight of the other direction, in which points of the scan draw the nearest point of the control mesh, so that
         it covers tips of limbs; all of them together weigh as much as this many times all vertices. The paper has none.
@@ -71,7 +76,7 @@ class SurfaceFitConfig(Settings):
     cooling: Annotated[float, Range(0.01, 0.99)] = 0.5
     rate: Annotated[float, Range(1e-6, 1)] = 0.5
     tolerance: Positive = 0.001
-    most: Count = 10
+    most: Count = 5
     cover: float = 3.0
     reach: Positive = 0.06
     polish: int = 6
@@ -146,11 +151,11 @@ def fit_surface(rest: Mesh, start: np.ndarray, scan: Mesh, config: SurfaceFitCon
         raise ValueError(f"start: expected shape {rest.vertices.shape}, got {start.shape}")
     if not len(scan.faces):
         raise ValueError(f"scan: expected at least one triangle, got {scan}")
-    fit = _Fit(rest, start, _target(scan), float(scan.face_areas.sum()), config)
+    fit = _Fit(rest, start, scan_target(scan), float(scan.face_areas.sum()), config)
     temperatures = fit.schedule()
     total = len(temperatures) + config.polish
     for k, T in enumerate(temperatures):
-        fit.anneal(T)
+        fit.anneal(T, config.most * (LAST if k == len(temperatures) - 1 else 1))
         if progress:
             progress(k + 1, total)
     surface = Surface(scan)
@@ -187,14 +192,14 @@ class _Fit:
         """Temperatures from the largest squared distance of a vertex to its nearest point down to the tolerance."""
         final = self.config.tolerance**2
         near, squared = self.points.nearest(self.x, self.mesh.vertex_normals, 1)
-        first = max(float(squared[self.beside_data(near[:, 0]), 0].max(initial=0.0)), final)
+        first = max(float(squared[self.points.beside(self.x, near[:, 0]), 0].max(initial=0.0)), final)
         stages = int(np.ceil(np.log(final / first) / np.log(self.config.cooling))) + 1
         return np.geomspace(first, final, stages)
 
-    def anneal(self, T: float) -> None:
+    def anneal(self, T: float, most: int) -> None:
         """Steps at one temperature until the gradient lies within the region of matching."""
         explicit = self.config.step == "explicit"
-        for count in range(self.config.most + 1):
+        for count in range(most + 1):
             matches, A = self.assignment(T)
             wanted = matches.matches @ self.points.points
             if explicit:
@@ -204,7 +209,7 @@ class _Fit:
                 data = self.drawn(A, wanted)
                 force = self.force(data)
             self.converged = bool(np.linalg.norm(force, axis=1).max() <= np.sqrt(T))
-            if (self.converged and count) or count == self.config.most:
+            if (self.converged and count) or count == most:
                 break
             self.x = self.x + self.config.rate * force if explicit else self.stepped(data, force)     # Eq. 18
         misfit, entropy = matches.energy(self.x, self.points.points, T)
@@ -218,13 +223,14 @@ class _Fit:
         At the edge of a hole all points lie to one side: their mean would draw the mesh off the hole.
         """
         near, squared = self.points.nearest(self.x, self.mesh.vertex_normals, self.config.neighbours)
-        near[~self.beside_data(near[:, 0])] = -1
+        near[~self.points.beside(self.x, near[:, 0])] = -1
         found = assign(near, squared, len(self.points.points), T, self.config.slack)
         n = self.points.normals[near[:, 0]]
         edge = (self.points.border[near] & (near >= 0)).any(axis=1)
         A = np.where(edge[:, None, None], np.einsum("ni,nj->nij", n, n), np.eye(3))
         return found, found.seen[:, None, None] * A
 
+<<<<<<< HEAD
     def beside_data(self, nearest: np.ndarray) -> np.ndarray:
         """(N,) bool: not beyond the edge of a hole, where the nearest point says nothing."""
         points, beside = self.points, nearest >= 0
@@ -234,10 +240,12 @@ class _Fit:
             beside &= ~points.border[at] | (np.linalg.norm(offset, axis=1) <= points.spacing)
         return beside
 
+=======
+>>>>>>> helpC
     def seen(self) -> tuple[np.ndarray, np.ndarray]:
         """Vertices with data, and the nearest point of the whole scan."""
         nearest = self.points.nearest(self.x, self.mesh.vertex_normals, 1)[0][:, 0]
-        return self.beside_data(nearest), nearest
+        return self.points.beside(self.x, nearest), nearest
 
     def drawn(self, A: np.ndarray, wanted: np.ndarray) -> SurfaceData:
         """The data term that draws vertices to `wanted` (N, 3) by A (N, 3, 3), and the mesh to points of the scan."""
@@ -246,7 +254,7 @@ class _Fit:
             return SurfaceData(A, wanted, *self.nothing)
         found = Surface(mesh).closest(self.sample.points)
         corners = mesh.faces[found.faces]
-        normals = np.einsum("pc,pcd->pd", found.bary, mesh.vertex_normals[corners])
+        normals = found.carried(mesh.vertex_normals, mesh.faces)
         good = np.flatnonzero(np.einsum("pd,pd->p", normals, self.sample.normals) > AGREE)
         rows = np.repeat(np.arange(len(good)), 3)
         C = csc_array((found.bary[good].ravel(), (rows, corners[good].ravel())), shape=(len(good), len(self.x)))
@@ -262,8 +270,12 @@ class _Fit:
         nearly = Factored(csc_array(lam * self.stiffness + data.bound + 1e-6 * lam * eye_array(len(x))))
         d = conjugate_gradients(lambda d: lam * shape.transposed(x, w * shape.derivative(x, d)) + data.applied(d),
                                 force, nearly.solve, 30, 1e-2)
-        before, length = lam * shape.energy(x) + data.energy(x), 1.0
-        while lam * shape.energy(x + length * d) + data.energy(x + length * d) > before and length > 1e-3:
+
+        def energy(x: np.ndarray) -> float:
+            return lam * shape.energy(x) + data.energy(x)
+
+        length = 1.0
+        while energy(x + length * d) > energy(x) and length > 1e-3:
             length /= 2
         return x + length * d
 
@@ -302,11 +314,3 @@ class _Fit:
         return SurfaceFit(self.x, seen, float(np.sqrt(np.mean(apart**2))) if seen.any() else np.nan,
                           float(apart.max(initial=0.0)), int(inverted.sum()), distortion(self.rest, self.x),
                           self.energies, temperatures, np.array(self.steps), bool(self.converged and seen.any()))
-
-
-def _target(scan: Mesh) -> Target:
-    """Points with smooth normals; the borders are those of the mesh, for tips of limbs look one-sided as well."""
-    border = np.zeros(len(scan.vertices), dtype=bool)
-    border[scan.boundary_vertices] = True
-    border |= scan.vertex_adjacency @ border.astype(float) > 0       # the nearest point may lie one step farther in
-    return replace(target_of(scan, name="scan"), border=border[np.unique(scan.faces)])
