@@ -24,6 +24,7 @@ STATURE = 1.7                    # metres
 NOBODY, EITHER = 0.042, 1.05     # misfit, and margin, of what is no person
 DOUBTED = 0.025, 1.2, 0.05       # misfit, margin and share missed of a person with a limb in a wrong place
 MANY, SPACING = 40_000, 0.007    # points of a scan, and to how many metres apart more of them are thinned
+AROUND = 60                      # points, 3 cm apart: wider than a limb, and not as wide as the trunk
 SHOWN = 0.3                      # share of the vertices around a joint that have data
 
 
@@ -97,11 +98,11 @@ def find_features(control: ControlModel, scan: Mesh) -> Features:
     unit = likely_unit(scan.vertices)
     data = scan if len(scan.vertices) < MANY else scan.vertices[thin(scan.vertices, SPACING / UNITS[unit])]
     target = target_of(data)
-    if data is not scan:
-        target = _facing_as(target, scan)
+    if data is not scan or not len(scan.faces):
+        target = _facing_outward(target, scan, 0.03 / UNITS[unit])
     stands = find_person(search, target, UNITS[unit])
     best = stands[0]
-    margin = stands[1].misfit / best.misfit if len(stands) > 1 else np.inf
+    margin = stands[1].off / best.off if len(stands) > 1 else np.inf
     up, front = (best.direction(search, np.array(axis)) for axis in ((0.0, 0, 1), (0.0, -1, 0)))
     problem = nobody_problem(best.off, margin, unit)
     if problem:
@@ -150,11 +151,17 @@ def outward(scan: Mesh) -> Mesh:
     return Mesh(scan.vertices, scan.faces[:, ::-1], scan.colors) if inside_out else scan
 
 
-def _facing_as(target: Target, scan: Mesh) -> Target:
-    """Points of a scan with the sign of their normals from its triangles."""
-    _, nearest = cKDTree(scan.vertices).query(target.points, workers=search_threads(len(target.points)))
-    inward = np.einsum("nd,nd->n", target.normals, scan.vertex_normals[nearest]) < 0
-    return replace(target, normals=np.where(inward[:, None], -1, 1) * target.normals, oriented=len(scan.faces) > 0)
+def _facing_outward(target: Target, scan: Mesh, spacing: float) -> Target:
+    """Points of a scan with the sign of their normals from its triangles; without any, away from those around."""
+    if len(scan.faces):
+        nearest = cKDTree(scan.vertices).query(target.points, workers=search_threads(len(target.points)))[1]
+        outward = scan.vertex_normals[nearest]
+    else:
+        some = target.points[thin(target.points, spacing)]
+        around = cKDTree(some).query(target.points, min(AROUND, len(some)))[1]
+        outward = target.points - some[around].mean(axis=1)
+    inward = np.einsum("nd,nd->n", target.normals, outward) < 0
+    return replace(target, normals=np.where(inward[:, None], -1, 1) * target.normals, oriented=True)
 
 
 def _features(control: ControlModel, stand: Stand, found: Registration

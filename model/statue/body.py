@@ -10,7 +10,7 @@ from ..features import linear_features
 from ..skinning import SkinningModel
 from .control import ControlModel
 
-POSES = 400                          # random poses of the synthetic people that make the pose prior
+POSES = 100                          # random poses of the synthetic people that make the pose prior
 WIDEST = 1.0                         # radians: standard deviation of the turns of a joint without such poses
 
 

@@ -13,7 +13,6 @@ from scanprep.batch.workspace import Task, Workspace
 from scanprep.cli import MM, Output, ScanArg, Unit, WorkersArg
 from scanprep.console import Metric, Outcome, Progress, bar, dispatch, failures_of, problem_of
 from scanprep.geometry.files import read_mesh, write_mesh
-from scanprep.geometry.storage import writing
 from scanprep.pictures.animation import write_animated_glb, write_gif
 from scanprep.pipeline.scans import SCAN_ENDINGS
 
@@ -25,6 +24,7 @@ from .control_files import read_control
 from .files import load_statue
 from .fit import StatueConfig
 from .humanoid import humanoid
+from .motion import write_motion
 from .reconstruction import Reconstruction, displaced_surface, inverted_triangles
 from .report import motion_pictures, upright_axis
 from .retarget import StatueMotion
@@ -199,10 +199,7 @@ def _write_skinned(output: Path, statue: Statue, fine: Subdivision, detailed: Re
     output.mkdir(parents=True, exist_ok=True)
     write_statue_glb(output / "statue.glb", control, detailed(control.mesh.vertices), fine, statue.texture,
                      motion=moved, up=upright_axis(statue))
-    with writing(output / "motion.npz") as beside, open(beside, "wb") as out:
-        np.savez_compressed(out, poses=moved.poses.reshape(len(moved.poses), -1), trans=moved.trans,
-                            betas=np.zeros(0), gender=np.array("neutral"), mocap_frame_rate=np.array(moved.rate),
-                            surface_model_type=np.array("scape"))
+    write_motion(output / "motion.npz", control, moved)
     return [Metric("joints that follow the motion", len(moved.matched)),
             *([Metric("joints without one in the motion", ", ".join(moved.lacking))] if moved.lacking else [])]
 

@@ -90,7 +90,7 @@ def write_for_programs(folder: Path, statue: Statue, vertices: np.ndarray, fine:
     vertices : (n, 3) float, metres
         The detailed surface, whose normals become the normal image.
     """
-    normals = normal_image(statue.control, vertices, fine)
+    normals = normal_image(statue.control, vertices, fine, len(statue.map.heights))
     write_statue_glb(folder / "statue.glb", statue.control, texture=statue.texture, normals=normals,
                      heights=statue.map.heights, up=up)
     write_x3d(folder / "statue.x3d", statue.control, texture=statue.texture, up=up)

@@ -20,7 +20,7 @@ CAP, NORMALS = 0.08, 0.05        # metres: of a distance, and what a difference 
 UNSEEN = 0.3                     # weight of the body's distances to the scan, which may show a part only
 HEADINGS = 8
 PART = 0.85                      # of the model's height: lower scans may be of a part of a person
-TRIED, ARMS_BENT = 8, 3          # starts of the body, and of an arm, that are bent a little
+TRIED, ARMS_BENT = 8, 6          # starts of the body, and of an arm, that are bent a little
 RIVAL = 1.3                      # a stand that fits worse by this factor is no more than the other facing
 ASTRAY = 0.01, 0.25              # shares of a scan off the body, by more than a hand: arms are in a wrong place
 # Outwards, frontwards, upwards: where an upper arm may point, and a forearm, which else goes on straight.
@@ -76,10 +76,12 @@ def find_person(search: PoseSearch, target: Target, metres: float) -> list[Stand
     bent = sorted((bend(search, target, T, search.start, COARSE) for T in rough_stands(search, target, metres)[:TRIED]),
                   key=lambda stand: stand.misfit)
     best = bent[:1] + [s for s in bent[1:] if _facing(search, s) @ _facing(search, bent[0]) < 0.5][:1]
-    best = [bend(search, target, stand.T, stand.posed, FINE) for stand in best]
-    least = min(stand.misfit for stand in best)
-    return sorted((with_arms(search, target, stand) if stand.misfit < RIVAL * least else stand for stand in best),
-                  key=lambda stand: stand.misfit)
+    best = sorted((bend(search, target, s.T, s.posed, FINE) for s in best), key=lambda stand: stand.misfit)
+    found = [with_arms(search, target, best[0])]
+    for rival in best[1:]:
+        close = rival.misfit < RIVAL * found[0].misfit
+        found.append(with_arms(search, target, rival) if close else rival)
+    return sorted(found, key=lambda stand: stand.misfit)
 
 
 def bend(search: PoseSearch, target: Target, T: np.ndarray, posed: Posed, stages: tuple) -> Stand:
@@ -163,8 +165,9 @@ def with_arms(search: PoseSearch, target: Target, stand: Stand) -> Stand:
                   for upper in UPPER_ARMS for fore in (upper, *FOREARMS)]
         starts.sort(key=lambda posed: misfit(search.mesh(posed), coarse)[1])
         # No coarser: from afar a hand beside the head is drawn to the head.
-        stand = min([stand, *(bend(search, target, stand.T, posed, FINE) for posed in starts[:ARMS_BENT])],
+        tried = min((bend(search, target, stand.T, posed, FINE[1:]) for posed in starts[:ARMS_BENT]),
                     key=lambda s: s.misfit)
+        stand = min(stand, bend(search, target, stand.T, tried.posed, FINE), key=lambda s: s.misfit)
     return stand
 
 

@@ -15,6 +15,7 @@ from .articulated import Articulated, Points
 
 BOUNDS = 0.6, 1.6               # of a length, as multiples of the default one
 GIRTH = -0.03, 0.12             # metres off the default surface
+ELSEWHERE = 0.25                 # metres between places on the body that are not taken for each other
 
 
 @dataclass(frozen=True)
@@ -143,7 +144,7 @@ class PoseSearch:
         found, far = mine.of(self.sample).matched(theirs, stage.reach, like)
         rest = self.model.control.mesh.vertices
         apart = np.linalg.norm(rest[self.sample] - rest[chosen[found]], axis=1)
-        good = (found >= 0) & (chosen[found] >= 0) & ~goal.border[found] & (apart < stage.reach)
+        good = (found >= 0) & (chosen[found] >= 0) & ~goal.border[found] & (apart < max(2 * stage.reach, ELSEWHERE))
         weights = self.area / len(self.sample) * tukey(far[good], stage.reach)
         return wanted + pull(N, self.sample[good], goal.points[found[good]], weights, goal.normals[found[good]],
                              stage.slide)

@@ -71,11 +71,22 @@ class ScanPoints:
     ----------
     points : (J, 3) float, metres
     normals : (J, 3) float, unit
+    border : (J,) bool
+        On the edge of a hole.
+
+    Attributes
+    ----------
+    tree : cKDTree
+        Of the points.
+    spacing : float, metres
+        Between neighbouring points.
     """
 
-    def __init__(self, points: np.ndarray, normals: np.ndarray) -> None:
-        self.points, self.normals = points, normals
-        self._tree = cKDTree(points)
+    def __init__(self, points: np.ndarray, normals: np.ndarray, border: np.ndarray) -> None:
+        self.points, self.normals, self.border = points, normals, border
+        self.tree = cKDTree(points)
+        some = points[::-(-len(points) // 1000)]
+        self.spacing = float(np.median(self.tree.query(some, min(5, len(points)))[0][:, -1]))
 
     def nearest(self, x: np.ndarray, normals: np.ndarray, neighbours: int) -> tuple[np.ndarray, np.ndarray]:
         """The nearest points whose normals lie in the half-space of the vertex normal.
@@ -101,7 +112,7 @@ class ScanPoints:
 
     def _facing(self, x: np.ndarray, normals: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
         near = np.arange(1, min(count, len(self.points)) + 1)
-        apart, index = self._tree.query(x, near, workers=search_threads(len(x)))
+        apart, index = self.tree.query(x, near, workers=search_threads(len(x)))
         facing = np.einsum("ikd,id->ik", self.normals[index], normals) > 0
         order = np.argsort(~facing, axis=1, kind="stable")
         facing = np.take_along_axis(facing, order, axis=1)

@@ -182,9 +182,6 @@ def _read(inputs: Inputs, unit: Unit | None) -> tuple[Mesh, Texture | None, list
     with warnings.catch_warnings():
         warnings.filterwarnings("ignore", ".*when read as metres", UserWarning)     # the unit is looked for later
         scan, texture = read_mesh(inputs.scan, unit), read_texture(inputs.scan, unit)
-    if not len(scan.faces):
-        raise ValueError(f"{inputs.scan}: expected a mesh, found {len(scan.vertices)} points without triangles; "
-                         "a surface through them comes from scape prep merge, or another program")
     cleaned = clean_scan(scan)
     left = 1 - float(cleaned.kept.mean())
     rows = [Metric("scan, triangles", len(scan.faces))]

@@ -10,6 +10,7 @@ import numpy as np
 from ..geometry.storage import writing
 
 INK = (58, 62, 68)
+LARGE = 4_000_000                    # numbers: above, a picture is not packed as tightly as it could be
 
 
 def font(size: int):
@@ -71,7 +72,7 @@ def png_bytes(image: np.ndarray) -> bytes:
     from PIL import Image
 
     out = io.BytesIO()
-    Image.fromarray(image).save(out, format="PNG", optimize=True)
+    Image.fromarray(image).save(out, format="PNG", optimize=image.size < LARGE)
     return out.getvalue()
 
 

@@ -1,0 +1,224 @@
+"""The shape-constrained deformable surface: local shape, soft assignment, fit."""
+import numpy as np
+import pytest
+from scipy.sparse import csc_array, diags_array, eye_array
+from scipy.spatial import ConvexHull
+from scipy.special import logsumexp
+
+from model.statue.local_shape import local_shape
+from model.statue.soft_assignment import ScanPoints, assign
+from model.statue.surface_data import distortion
+from model.statue.surface_fit import SurfaceFitConfig, fit_surface
+from scanprep.geometry import rotations
+from scanprep.geometry.mesh import Mesh
+from scanprep.geometry.sparse import Factored
+from scanprep.geometry.surface import Surface
+from scanprep.matching.rigid import align_landmarks, apply
+from scanprep.matching.shell import conjugate_gradients
+
+
+def ball(count: int, seed: int) -> Mesh:
+    """An irregular triangulation of the unit sphere: the hull of points on a spiral, shaken a little."""
+    k = np.arange(count) + 0.5
+    turn, z = np.pi * (1 + 5**0.5) * k, 1 - 2 * k / count
+    p = np.stack([np.sqrt(1 - z**2) * np.cos(turn), np.sqrt(1 - z**2) * np.sin(turn), z], axis=1)
+    p += 0.8 / np.sqrt(count) * (np.random.default_rng(seed).random((count, 3)) - 0.5)
+    p /= np.linalg.norm(p, axis=1, keepdims=True)
+    f = ConvexHull(p).simplices
+    outward = np.einsum("fd,fd->f", np.cross(p[f[:, 1]] - p[f[:, 0]], p[f[:, 2]] - p[f[:, 0]]), p[f[:, 0]]) > 0
+    return Mesh(p, np.where(outward[:, None], f, f[:, ::-1]))
+
+
+def bumpy(p: np.ndarray) -> np.ndarray:
+    """Points of the unit sphere on a body of 0.3 m that is neither round nor symmetric."""
+    wave = 1 + 0.12 * np.sin(3 * p[:, 0] + 1) * np.cos(2 * p[:, 1]) + 0.1 * p[:, 2]
+    return 0.3 * wave[:, None] * p * [1.0, 0.8, 1.2]
+
+
+@pytest.fixture(scope="module")
+def body() -> Mesh:
+    mesh = ball(300, 1)
+    return mesh.with_vertices(bumpy(mesh.vertices))
+
+
+def restored(shape, x, steps):
+    """Gauss-Newton on the local shape alone."""
+    w = shape.weights[:, None]
+    K = shape.plane.T @ diags_array(shape.weights) @ shape.plane
+    nearly = Factored(csc_array(K + 1e-6 * eye_array(shape.count)))
+    for _ in range(steps):
+        x = x + conjugate_gradients(lambda d, x=x: shape.transposed(x, w * shape.derivative(x, d)) + 1e-9 * d,
+                                    -shape.gradient(x) / 2, nearly.solve, 200)
+    return x
+
+
+def test_every_similar_copy_of_the_rest_shape_is_at_rest(body):
+    shape = local_shape(body)
+    R = rotations.exp(np.array([0.4, -1.1, 0.7]))
+    copy = 2.5 * body.vertices @ R.T + [1.0, -2.0, 0.5]
+    assert len(shape.held) > 0.95 * 3 * len(body.faces)
+    assert shape.energy(copy) < 1e-25
+    assert np.abs(shape.gradient(copy)).max() < 1e-12
+    moved = body.vertices + 0.01 * np.random.default_rng(0).standard_normal(body.vertices.shape)
+    assert shape.energy(2.5 * moved @ R.T + 1) == pytest.approx(2.5**2 * shape.energy(moved), rel=1e-9)
+    assert shape.published_force(moved @ R.T) == pytest.approx(shape.published_force(moved) @ R.T, abs=1e-12)
+
+
+def test_gradient_is_the_finite_difference_of_the_energy_and_the_published_force_is_not(body):
+    shape, rng = local_shape(body), np.random.default_rng(2)
+    x = body.vertices + 0.01 * rng.standard_normal(body.vertices.shape)
+    for _ in range(3):
+        d, h = rng.standard_normal(x.shape), 1e-6
+        slope = (shape.energy(x + h * d) - shape.energy(x - h * d)) / (2 * h)
+        assert (shape.gradient(x) * d).sum() == pytest.approx(slope, rel=1e-5)
+        ahead = (shape.residuals(x + h * d) - shape.residuals(x - h * d)) / (2 * h)
+        assert shape.derivative(x, d) == pytest.approx(ahead, abs=1e-6 * np.abs(ahead).max())
+        r = rng.standard_normal(ahead.shape)
+        assert (shape.transposed(x, r) * d).sum() == pytest.approx((shape.derivative(x, d) * r).sum(), rel=1e-9)
+    exact, published = -shape.gradient(x) / 2, shape.published_force(x)
+    assert np.abs(exact - published).max() > 0.1 * np.abs(exact).max()
+    # With all frames held still it would be: the residual of each vertex, averaged over its frames.
+    v = 17
+    rows = shape.held == v
+    assert published[v] == pytest.approx(-shape.residuals(x)[rows].mean(axis=0), abs=1e-15)
+
+
+def test_borders_and_flat_frames_hold_nothing(body):
+    open_mesh, _ = body.submesh(body.faces.min(axis=1) > 20)
+    shape = local_shape(open_mesh)
+    inner = (open_mesh.edge_use[open_mesh.face_edges] == 2).all(axis=1)
+    assert 0.9 * 3 * inner.sum() < len(shape.held) <= 3 * inner.sum()
+    # A vertex of three triangles: the frames of its triangles have two corners in one place.
+    a, b, c = body.faces[0]
+    new = len(body.vertices)
+    faces = np.vstack([body.faces[1:], [[a, b, new], [b, c, new], [c, a, new]]])
+    pointed = Mesh(np.vstack([body.vertices, body.corners[0].mean(axis=0) * 1.02]), faces)
+    shape = local_shape(pointed)
+    assert new not in shape.held and new in shape.corners
+    assert np.isfinite(shape.gradient(pointed.vertices + 0.01)).all()
+    with pytest.raises(ValueError, match="three sides"):
+        local_shape(Mesh(np.eye(3), np.array([[0, 1, 2]])))
+
+
+def test_the_constraint_alone_takes_noise_away(body):
+    """[Statues] Fig. 6: exactly by the exact energy; the published evolution is quick, then very slow."""
+    shape, x = local_shape(body), body.vertices
+    noisy = x + 0.1 * body.mean_edge * np.random.default_rng(3).standard_normal(x.shape)
+
+    def off(y):
+        return np.sqrt(np.mean((apply(align_landmarks(y, x, scale=True).T_target_source, y) - x) ** 2))
+
+    y = noisy
+    for _ in range(200):
+        y = y + 0.5 * shape.published_force(y)                # Eq. 12
+    assert shape.energy(y) < 0.02 * shape.energy(noisy)
+    assert off(y) < 0.5 * off(noisy)
+    assert off(restored(shape, noisy, 6)) < 1e-3 * off(noisy)
+
+
+@pytest.mark.parametrize("slack", ["rest", "published"])
+@pytest.mark.parametrize("temperature", [0.3, 0.03, 0.01])
+def test_soft_assignment_agrees_with_a_dense_one(slack, temperature):
+    rng = np.random.default_rng(4)
+    x, y = rng.random((20, 3)), rng.random((50, 3))
+    up = np.tile([0.0, 0.0, 1.0], (50, 1))
+    near, squared = ScanPoints(y, up, np.zeros(50, bool)).nearest(x, up[:20], 12)
+    found = assign(near, squared, 50, temperature, slack, tolerance=1e-9, most=500)
+    logs = np.full((20, 50), -np.inf)
+    logs[np.arange(20)[:, None], near] = -((x[:, None] - y[near]) ** 2).sum(axis=2) / temperature
+    least = np.where(np.isinf(logs), 0, logs).min(axis=0)
+    v = np.zeros(50)
+    for _ in range(3000):
+        u = -logsumexp(logs + v, axis=1)
+        total = logsumexp(logs + u[:, None], axis=0)
+        v = np.minimum(-total, 0) if slack == "rest" else -np.logaddexp(total, least)
+    dense = np.exp(logs - logsumexp(logs + v, axis=1)[:, None] + v)
+    m = found.matches.toarray()
+    assert m == pytest.approx(dense, abs=1e-5)
+    assert m.sum(axis=1) == pytest.approx(np.ones(20), abs=1e-12)
+    assert m.sum(axis=0) + found.slack == pytest.approx(np.ones(50), abs=1e-5)
+    assert m.min() >= 0 and found.excess < 1e-5
+
+
+def test_cold_assignment_is_that_of_the_closest_points_on_the_same_side(body):
+    rng = np.random.default_rng(5)
+    points, face, _ = body.sample(4000, rng)
+    normals = body.face_normals[face]
+    x, n = 0.9 * body.vertices, body.vertex_normals
+    near, squared = ScanPoints(points, normals, np.zeros(4000, bool)).nearest(x, n, 12)
+    assert (np.einsum("ikd,id->ik", normals[near], n)[near >= 0] > 0).all()
+    agree = np.where(normals @ n.T > 0, ((points[:, None] - x) ** 2).sum(axis=2), np.inf)
+    closest = agree.argmin(axis=0)
+    assert (near[:, 0] == closest).all()
+    cold = assign(near, squared, 4000, 1e-12)
+    assert cold.excess < 1e-6
+    alone = np.bincount(closest, minlength=4000)[closest] == 1   # several vertices cannot share one point
+    assert cold.matches.toarray()[np.flatnonzero(alone), closest[alone]] == pytest.approx(1, abs=1e-6)
+    published = assign(near, squared, 4000, 1e-4, "published", most=200).matches.toarray()
+    assert (assign(near, squared, 4000, 1e-4).matches.toarray().argmax(axis=1) == closest)[alone].mean() > 0.9
+    assert (published.argmax(axis=1) == closest).mean() < 0.5    # why it is not the default
+
+
+def test_a_vertex_that_knows_no_point_and_more_vertices_than_points():
+    near = np.array([[0, 1], [0, 1], [1, 0], [-1, -1]])
+    squared = np.array([[0.0, 1.0], [0.1, 0.9], [0.0, 1.2], [np.inf, np.inf]])
+    found = assign(near, squared, 2, 0.05)
+    assert found.seen.tolist() == [True, True, True, False]
+    assert found.matches.sum(axis=1) == pytest.approx([1, 1, 1, 0])
+    assert found.excess == pytest.approx(0.5, abs=0.5) and found.excess > 0.1        # Eq. 14 has no solution
+
+
+@pytest.fixture(scope="module")
+def scanned() -> Mesh:
+    fine = ball(2500, 7)
+    return fine.with_vertices(bumpy(fine.vertices))
+
+
+@pytest.mark.parametrize("step", ["implicit", "explicit"])
+def test_fit_lies_on_the_scan_without_inverted_triangles(body, scanned, step):
+    """From an ellipsoid of another size, turned and moved: every vertex has data."""
+    rest = body.with_vertices(0.3 * ball(300, 1).vertices * [1.0, 0.8, 1.2])
+    start = rest.vertices @ rotations.exp(np.array([0.0, 0.05, 0.08])).T * 1.08 + [0.01, 0.0, -0.01]
+    calls = []
+    fit = fit_surface(rest, start, scanned, SurfaceFitConfig(step=step), lambda *done: calls.append(done))
+    assert fit.converged and fit.seen.all() and fit.inverted == 0
+    assert fit.rms < 2e-5 and fit.largest < 1e-4
+    assert fit.rms == pytest.approx(np.sqrt(np.mean(Surface(scanned).closest(fit.vertices).distances**2)))
+    assert fit.distortion < 0.12 and fit.distortion == distortion(rest, fit.vertices)
+    assert calls == [(k + 1, len(calls)) for k in range(len(calls))]
+    assert np.sqrt(fit.temperatures[-1]) == pytest.approx(0.001) and len(fit.steps) == len(fit.temperatures)
+    nearest = np.sqrt(((start[:, None] - scanned.vertices) ** 2).sum(axis=2).min(axis=1)).max()
+    assert np.sqrt(fit.temperatures[0]) == pytest.approx(nearest, rel=0.05)
+
+
+def test_holes_are_crossed_by_the_shape(body, scanned):
+    """Data cut away on one side: the rest shape, which is the right one here, closes the hole."""
+    side = scanned.corners.mean(axis=1)[:, 0] > 0.15
+    holed, _ = scanned.submesh(~side)
+    fit = fit_surface(body, 1.05 * body.vertices, holed)
+    assert 0.1 < (~fit.seen).mean() < 0.3 and fit.inverted == 0
+    over_hole = body.vertices[:, 0] > 0.21
+    assert not fit.seen[over_hole].any()
+    sag = Surface(scanned).closest(body.corners.mean(axis=1)).distances.max()        # flat triangles on a round body
+    off = Surface(scanned).closest(fit.vertices).distances
+    assert off[fit.seen].max() < sag and off[over_hole].max() < 1.5 * sag
+    assert fit.largest < 1e-4                                  # of those seen
+
+
+def test_fit_moves_with_the_scan_and_the_mesh(body, scanned):
+    R, t = rotations.exp(np.array([1.0, -0.5, 2.0])), np.array([3.0, -1.0, 2.0])
+    rest, start = body, 1.05 * body.vertices
+    config = SurfaceFitConfig(cover=0)                         # the thinning for the cover depends on the axes
+    here = fit_surface(rest, start, scanned, config)
+    there = fit_surface(rest, start @ R.T + t, scanned.with_vertices(scanned.vertices @ R.T + t), config)
+    assert there.vertices == pytest.approx(here.vertices @ R.T + t, abs=1e-5)
+
+
+def test_what_cannot_be_fitted_is_told(body, scanned):
+    with pytest.raises(ValueError, match="start"):
+        fit_surface(body, body.vertices[:-1], scanned)
+    with pytest.raises(ValueError, match="scan"):
+        fit_surface(body, body.vertices, Mesh(scanned.vertices, np.zeros((0, 3), int)))
+    slow = SurfaceFitConfig(most=1, rate=1e-3, step="explicit", polish=0)
+    short = fit_surface(body, 1.2 * body.vertices, scanned, slow)
+    assert not short.converged and short.rms > 0.01
