@@ -2,7 +2,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 
 import numpy as np
 
@@ -85,7 +85,9 @@ def fit_statue(scan: Mesh, joints: Mapping[str, np.ndarray] | None = None,
     else:
         posed = posed_by_features(control, joints or {}, points or {}, config.features)
     surface = fit_surface(control.mesh, posed.start, scan, config.surface, progress)
-    fitted = unfold_control(fitted_control(control, posed.features, surface), scan, config.displacement)
+    fitted = fitted_control(control, posed.features, surface)
+    unfolded = unfold_control(fitted, scan, config.displacement).mesh.vertices
+    fitted = fitted_control(control, posed.features, replace(surface, vertices=unfolded))
     return Statue(fitted, posed.features.pose, bake(fitted, scan, config.displacement, progress))
 
 
