@@ -192,7 +192,7 @@ class _Fit:
         """Temperatures from the largest squared distance of a vertex to its nearest point down to the tolerance."""
         final = self.config.tolerance**2
         near, squared = self.points.nearest(self.x, self.mesh.vertex_normals, 1)
-        first = max(float(squared[self.points.beside(self.x, near[:, 0]), 0].max(initial=0.0)), final)
+        first = max(float(squared[self.beside_data(near[:, 0]), 0].max(initial=0.0)), final)
         stages = int(np.ceil(np.log(final / first) / np.log(self.config.cooling))) + 1
         return np.geomspace(first, final, stages)
 
@@ -223,29 +223,22 @@ class _Fit:
         At the edge of a hole all points lie to one side: their mean would draw the mesh off the hole.
         """
         near, squared = self.points.nearest(self.x, self.mesh.vertex_normals, self.config.neighbours)
-        near[~self.points.beside(self.x, near[:, 0])] = -1
+        near[~self.beside_data(near[:, 0])] = -1
         found = assign(near, squared, len(self.points.points), T, self.config.slack)
         n = self.points.normals[near[:, 0]]
         edge = (self.points.border[near] & (near >= 0)).any(axis=1)
         A = np.where(edge[:, None, None], np.einsum("ni,nj->nij", n, n), np.eye(3))
         return found, found.seen[:, None, None] * A
 
-<<<<<<< HEAD
     def beside_data(self, nearest: np.ndarray) -> np.ndarray:
-        """(N,) bool: not beyond the edge of a hole, where the nearest point says nothing."""
-        points, beside = self.points, nearest >= 0
-        beside &= np.linalg.norm(points.points[nearest] - self.x, axis=1) <= self.reach
-        for at in (nearest, points.tree.query(self.x)[1]):                  # of those that face the same way; of all
-            offset = np.cross(points.normals[at], self.x - points.points[at])
-            beside &= ~points.border[at] | (np.linalg.norm(offset, axis=1) <= points.spacing)
-        return beside
+        """(N,) bool: within reach of the nearest point, and not beyond the edge of a hole, where it says nothing."""
+        near = np.linalg.norm(self.points.points[nearest] - self.x, axis=1) <= self.reach
+        return near & self.points.beside(self.x, nearest)
 
-=======
->>>>>>> helpC
     def seen(self) -> tuple[np.ndarray, np.ndarray]:
         """Vertices with data, and the nearest point of the whole scan."""
         nearest = self.points.nearest(self.x, self.mesh.vertex_normals, 1)[0][:, 0]
-        return self.points.beside(self.x, nearest), nearest
+        return self.beside_data(nearest), nearest
 
     def drawn(self, A: np.ndarray, wanted: np.ndarray) -> SurfaceData:
         """The data term that draws vertices to `wanted` (N, 3) by A (N, 3, 3), and the mesh to points of the scan."""
