@@ -129,7 +129,7 @@ def test_vertices_of_another_level_are_refused(detailed, tmp_path):
     control, (fine, vertices) = humanoid(), detailed
     with pytest.raises(ValueError, match="vertices, subdivision: expected both or none"):
         write_statue_glb(tmp_path / "a.glb", control, vertices)
-    with pytest.raises(ValueError, match=r"vertices: expected shape \(16898, 3\), got \(5, 3\)"):
+    with pytest.raises(ValueError, match=rf"vertices: expected shape \({len(vertices)}, 3\), got \(5, 3\)"):
         write_statue_glb(tmp_path / "a.glb", control, vertices[:5], fine)
     assert not list(tmp_path.iterdir())
 

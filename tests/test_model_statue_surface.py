@@ -180,7 +180,7 @@ def test_fit_lies_on_the_scan_without_inverted_triangles(body, scanned, step):
     rest = body.with_vertices(0.3 * ball(300, 1).vertices * [1.0, 0.8, 1.2])
     start = rest.vertices @ rotations.exp(np.array([0.0, 0.05, 0.08])).T * 1.08 + [0.01, 0.0, -0.01]
     calls = []
-    fit = fit_surface(rest, start, scanned, SurfaceFitConfig(step=step), lambda *done: calls.append(done))
+    fit = fit_surface(rest, start, scanned, SurfaceFitConfig(step=step, reach=1.0), lambda *done: calls.append(done))
     assert fit.converged and fit.seen.all() and fit.inverted == 0
     assert fit.rms < 2e-5 and fit.largest < 1e-4
     assert fit.rms == pytest.approx(np.sqrt(np.mean(Surface(scanned).closest(fit.vertices).distances**2)))
