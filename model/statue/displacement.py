@@ -29,6 +29,7 @@ from .vectors import bend_over_folds
 
 Progress = Callable[[int, int], None]
 FILL_LEVEL = 3                       # of the subdivision on which holes are filled: edges of some 5 mm
+CLOSE = 0.01                         # metres: a surface so near to a place outside the scan is that place's
 UNFOLD_SIZE = 512                    # pixels each way while control vertices are moved out of folds
 VECTOR_LEVEL = 4                     # of that whose vertices are drawn onto the scan in folds
 
@@ -216,12 +217,20 @@ def texel_areas(control: ControlModel, texels: Texels) -> np.ndarray:
 
 
 def _without_data(mesh: Mesh, scan: Mesh, texels: Texels, empty: np.ndarray, reach: float) -> np.ndarray:
-    """(n of empty,) bool: the scan is out of reach, or ends at what is nearest."""
+    """(n of empty,) bool: the scan is out of reach, or ends at what is nearest, or that is another body part.
+
+    A place inside the scan, however deep, is a fold of the control mesh. Outside the scan the surface is missing unless
+    it passes close by.
+    """
+    import igl
+
     points, _ = interpolate(mesh, texels.faces[empty], texels.bary[empty])
     nearest = Surface(scan).closest(points)
     border = np.zeros(len(scan.vertices), dtype=bool)
     border[scan.boundary_vertices] = True
-    return (nearest.distances > reach) | border[scan.faces[nearest.faces]].any(axis=1)
+    inside = np.asarray(igl.fast_winding_number(scan.vertices, scan.faces, points)).ravel() > 0.5
+    return ((nearest.distances > reach) | border[scan.faces[nearest.faces]].any(axis=1)
+            | (~inside & (nearest.distances > CLOSE)))
 
 
 def _filled(control: ControlModel, texels: Texels, heights: np.ndarray, known: np.ndarray) -> np.ndarray:
