@@ -360,9 +360,6 @@ def test_detail_turns_and_moves_with_the_control_mesh(control, mushroom):
     rotations = VertexRotations(control.mesh, np.arange(0, len(v), 3))
     turned = rotations(turn.apply(v), turn.apply(np.array(control.mesh.vertex_normals)))
     np.testing.assert_allclose(turned, np.tile(turn.as_matrix(), (len(turned), 1, 1)), atol=1e-9)
-    single = Reconstruction(control, found, fine, np.float32)(v)
-    assert single.dtype == np.float32
-    np.testing.assert_allclose(single, rest, atol=1e-6)
     displaced = displaced_surface(control, found)(fine.parent, fine.bary)
     np.testing.assert_allclose(rest, displaced, atol=1e-9)
     with pytest.raises(ValueError, match="control_vertices"):

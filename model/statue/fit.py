@@ -2,7 +2,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, field
 
 import numpy as np
 
@@ -85,9 +85,7 @@ def fit_statue(scan: Mesh, joints: Mapping[str, np.ndarray] | None = None,
     else:
         posed = posed_by_features(control, joints or {}, points or {}, config.features)
     surface = fit_surface(control.mesh, posed.start, scan, config.surface, progress)
-    fitted = fitted_control(control, posed.features, surface)
-    unfolded = unfold_control(fitted, scan, config.displacement).mesh.vertices
-    fitted = fitted_control(control, posed.features, replace(surface, vertices=unfolded))
+    fitted = fitted_control(control, posed.features, surface, scan, config.displacement)
     return Statue(fitted, posed.features.pose, bake(fitted, scan, config.displacement, progress))
 
 
@@ -115,10 +113,12 @@ def posed_automatically(control: ControlModel, found: Features, config: FeatureC
     return Posed(found.fit, found.fit.vertices if found.registered is None else found.registered.vertices)
 
 
-def fitted_control(control: ControlModel, posed: FeatureFit, surface: SurfaceFit) -> ControlModel:
-    """The control model on the scan, its joints where the features put them."""
-    joints = posed.joints.copy()
-    fitted = control.mesh.with_vertices(surface.vertices)
-    root = control.skeleton.part_of_vertex(fitted) == 0
-    joints[0] = surface.vertices[root].mean(axis=0)
-    return control.fitted(surface.vertices, joints)
+def fitted_control(control: ControlModel, posed: FeatureFit, surface: SurfaceFit, scan: Mesh,
+                   config: DisplacementConfig | None = None) -> ControlModel:
+    """The control model on the scan, drawn out of folds, its joints where the features put them."""
+    root = control.skeleton.part_of_vertex(control.mesh) == 0
+
+    def on(vertices: np.ndarray) -> ControlModel:
+        return control.fitted(vertices, np.concatenate([vertices[root].mean(axis=0)[None], posed.joints[1:]]))
+
+    return on(unfold_control(on(surface.vertices), scan, config).mesh.vertices)

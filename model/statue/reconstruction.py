@@ -42,15 +42,12 @@ class Reconstruction:
     map : DisplacementMap
     subdivision : Subdivision
         Of its mesh.
-    dtype : np.float64 or np.float32
-        Of the vertices; float32 is twice as fast and within a thousandth of a millimetre.
 
     [Statues] Eq. 19, 20
     """
 
-    def __init__(self, control: ControlModel, map: DisplacementMap, subdivision: Subdivision,
-                 dtype: type = np.float64) -> None:
-        self.faces, self.control, self.dtype = subdivision.faces, control, dtype
+    def __init__(self, control: ControlModel, map: DisplacementMap, subdivision: Subdivision) -> None:
+        self.faces, self.control = subdivision.faces, control
         mesh, rows = control.mesh, np.arange(len(subdivision.parent))
         uv = chart_places(control.chart, subdivision.parent, subdivision.bary)
         heights, rest = _parts(control.mesh, map, subdivision.parent, subdivision.bary, uv)
@@ -58,13 +55,13 @@ class Reconstruction:
         corners = mesh.faces[subdivision.parent]
         share = csr_array((subdivision.bary.ravel(), (np.repeat(rows, 3), corners.ravel())), shape=size)
         share.eliminate_zeros()
-        self._spread = csr_array(hstack([share, diags_array(heights) @ share]), dtype=dtype)
+        self._spread = csr_array(hstack([share, diags_array(heights) @ share]))
         self._around = _around(mesh)
         self._turning = np.flatnonzero(rest.any(axis=1))
         self._carriers = np.unique(corners[self._turning])
         self._rotations = VertexRotations(mesh, self._carriers)
-        self._rest: np.ndarray = rest[self._turning].astype(dtype)
-        self._share = csr_array(share[self._turning][:, self._carriers], dtype=dtype)
+        self._rest = rest[self._turning]
+        self._share = csr_array(share[self._turning][:, self._carriers])
 
     def __call__(self, control_vertices: np.ndarray) -> np.ndarray:
         """(n, 3) metres, the detailed surface on control vertices (N, 3)."""
@@ -72,9 +69,9 @@ class Reconstruction:
         if v.shape != self.control.mesh.vertices.shape:
             raise ValueError(f"control_vertices: expected shape {self.control.mesh.vertices.shape}, got {v.shape}")
         n = self._normals(v)
-        out = self._spread @ np.concatenate([v, n]).astype(self.dtype)
+        out = self._spread @ np.concatenate([v, n])
         if len(self._turning):
-            R: np.ndarray = self._rotations(v, n).reshape(-1, 9).astype(self.dtype)
+            R = self._rotations(v, n).reshape(-1, 9)
             out[self._turning] += np.einsum("nij,nj->ni", (self._share @ R).reshape(-1, 3, 3), self._rest)
         return out
 

@@ -21,7 +21,7 @@ from scanprep.pictures.textures import Texture, read_texture
 from .automatic import Features, find_features
 from .colors import bake_texture, scan_look
 from .control import ControlModel
-from .displacement import bake, coverage_shares, unfold_control
+from .displacement import bake, coverage_shares
 from .files import save_statue, write_body, write_for_programs
 from .fit import Posed, StatueConfig, fitted_control, posed_automatically, posed_by_features
 from .read_features import read_features
@@ -30,12 +30,13 @@ from .reconstruction import (
     SurfaceError,
     coverage_at,
     displaced_surface,
+    in_folds,
     inverted_triangles,
     remaining_error,
     surface_error,
 )
 from .report import Level, in_motion, parts_without_data, statue_page, statue_picture, upright_axis
-from .statue import HOLE, MEASURED, Statue
+from .statue import HOLE, Statue
 from .subdivision import Subdivision, subdivide, subdivide_adaptive
 from .surface_fit import SurfaceFit, fit_surface
 
@@ -94,8 +95,8 @@ class Work:
             rows = [Metric("joints given", len(joints)), Metric("surface points given", len(points))]
         surface = room.step("surface", same, lambda: fit_surface(self.control.mesh, posed.start, scan,
                                                                  self.config.surface, room.tell))
-        control = room.step("control", same, lambda: unfold_control(
-            fitted_control(self.control, posed.features, surface), scan, self.config.displacement))
+        control = room.step("control", same, lambda: fitted_control(self.control, posed.features, surface, scan,
+                                                                    self.config.displacement))
         map_ = room.step("map", same, lambda: bake(control, scan, self.config.displacement, room.tell))
         statue = Statue(control, posed.features.pose, map_)
         if texture is not None or scan.colors is not None:
@@ -213,7 +214,7 @@ def _figures(statue: Statue, scan: Mesh, surface: SurfaceFit, levels: list[Level
     shares = coverage_shares(statue.control, statue.map)
     left = remaining_error(statue.control, statue.map, scan)
     turned = inverted_triangles(statue.control, statue.control.mesh.vertices, fine, levels[-1].mesh.vertices)
-    beside_folds = (_kinds(statue, fine)[turned] == MEASURED).all(axis=1)
+    outside = ~in_folds(statue.control, statue.map, fine)[turned]
     lacking = parts_without_data(statue)
     return [Metric("control mesh to the scan, RMS", MM * surface.rms, "mm"),
             Metric("inverted triangles of the control mesh", surface.inverted),
@@ -226,7 +227,7 @@ def _figures(statue: Statue, scan: Mesh, surface: SurfaceFit, levels: list[Level
               for what, value in (("mean", one.mean), ("RMS", one.rms))),
             Metric("triangles of the adaptive subdivision", len(adaptive.mesh.faces)),
             Metric(f"inverted triangles at {levels[-1].name}", len(turned)),
-            Metric("of these outside folds and holes", int(beside_folds.sum()))]
+            Metric("of these outside folds and holes", int(outside.sum()))]
 
 
 def _sizes(folder: Path, scan: Mesh) -> list[Metric]:
