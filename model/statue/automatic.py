@@ -170,9 +170,14 @@ def _features(control: ControlModel, stand: Stand, found: Registration
     x, seen = found.mesh.vertices, found.confidence
     centres = stand.to_scan(control.skeleton.joint_regressor(control.mesh) @ x)
     around = (control.mesh.vertex_adjacency @ seen + seen) / (control.mesh.vertex_adjacency.sum(axis=1) + 1)
-    joints = {name: centres[j] for j, name in enumerate(control.skeleton.names)
-              if seen[control.skeleton.joint_weights(control.mesh, j)[0]].mean() > SHOWN}
+    skeleton = control.skeleton
+    shown = np.array([seen[skeleton.joint_weights(control.mesh, j)[0]].mean() > SHOWN for j in range(len(centres))])
+    for j, parent in enumerate(skeleton.parents):
+        shown[j] &= parent <= 0 or shown[parent]                # a hand on the thigh, where no elbow is, is the thigh
+    part = control.weights.argmax(axis=1)
+    joints = {name: centres[j] for j, name in enumerate(skeleton.names) if shown[j]}
     places = stand.to_scan(x)
-    points = {name: places[v] for name, v in control.landmarks.items() if around[v] > SHOWN}
+    points = {name: places[v] for name, v in control.landmarks.items()
+              if around[v] > SHOWN and (shown[part[v]] or part[v] == 0)}
     names = [*control.skeleton.names, *control.landmarks]
     return joints, points, tuple(name for name in names if name not in joints and name not in points)

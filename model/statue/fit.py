@@ -46,10 +46,13 @@ class Posed:
     features : FeatureFit
     start : (N, 3) float, metres
         Its vertices after the warp of the head.
+    hidden : (N,) bool
+        Vertices of parts that the scan does not show.
     """
 
     features: FeatureFit
     start: np.ndarray
+    hidden: np.ndarray
 
 
 def fit_statue(scan: Mesh, joints: Mapping[str, np.ndarray] | None = None,
@@ -84,7 +87,7 @@ def fit_statue(scan: Mesh, joints: Mapping[str, np.ndarray] | None = None,
         posed = posed_automatically(control, found, config.features)
     else:
         posed = posed_by_features(control, joints or {}, points or {}, config.features)
-    surface = fit_surface(control.mesh, posed.start, scan, config.surface, progress)
+    surface = fit_surface(control.mesh, posed.start, scan, config.surface, progress, posed.hidden)
     fitted = fitted_control(control, posed.features, surface, scan, config.displacement)
     return Statue(fitted, posed.features.pose, bake(fitted, scan, config.displacement, progress))
 
@@ -96,21 +99,29 @@ def posed_by_features(control: ControlModel, joints: Mapping[str, np.ndarray], p
     [Statues] Eq. 4, 5
     """
     fit = fit_features(control, joints, points, config)
+    shown = np.zeros(len(fit.vertices), dtype=bool)
     face = [name for name in FACE if name in points]
     if len(face) < 4 or "skullbase" not in control.skeleton.names:
-        return Posed(fit, fit.vertices)
+        return Posed(fit, fit.vertices, shown)
     own = fit.vertices[[control.landmarks[name] for name in face]]
     try:
-        return Posed(fit, warp(fit.vertices, own, np.array([points[name] for name in face]), head_share(control)))
+        goal = np.array([points[name] for name in face])
+        return Posed(fit, warp(fit.vertices, own, goal, head_share(control)), shown)
     except ValueError:                   # points in one plane say nothing of the shape of a head
-        return Posed(fit, fit.vertices)
+        return Posed(fit, fit.vertices, shown)
 
 
 def posed_automatically(control: ControlModel, found: Features, config: FeatureConfig | None = None) -> Posed:
-    """The control model where `find_features` found the person; its surface is then near the scan already."""
-    if found.fit is None:
+    """The control model where `find_features` found the person.
+
+    Its surface is then near the scan already; parts whose joint the scan does not show stand as the pose says.
+    """
+    if found.fit is None or found.registered is None:
         raise ValueError(f"scan: {found.problem}")
-    return Posed(found.fit, found.fit.vertices if found.registered is None else found.registered.vertices)
+    names = control.skeleton.names
+    lacking = control.weights[:, [j for j, name in enumerate(names) if name in found.missing]].sum(axis=1)[:, None]
+    start = found.registered.vertices + lacking * (found.fit.vertices - found.registered.vertices)
+    return Posed(found.fit, start, lacking[:, 0] > 0.5)
 
 
 def fitted_control(control: ControlModel, posed: FeatureFit, surface: SurfaceFit, scan: Mesh,

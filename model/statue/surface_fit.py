@@ -123,7 +123,7 @@ class SurfaceFit:
 
 @one_thread()
 def fit_surface(rest: Mesh, start: np.ndarray, scan: Mesh, config: SurfaceFitConfig | None = None,
-                progress: Callable[[int, int], None] | None = None) -> SurfaceFit:
+                progress: Callable[[int, int], None] | None = None, hidden: np.ndarray | None = None) -> SurfaceFit:
     """Deform a control mesh until it lies on a scan, keeping its local shape and parameterisation.
 
     Parameters
@@ -136,6 +136,8 @@ def fit_surface(rest: Mesh, start: np.ndarray, scan: Mesh, config: SurfaceFitCon
         May have holes.
     progress : callable, optional
         Called as progress(done, total).
+    hidden : (N,) bool, optional
+        Vertices that the scan does not show: nothing draws them but the shape.
 
     Raises
     ------
@@ -151,7 +153,7 @@ def fit_surface(rest: Mesh, start: np.ndarray, scan: Mesh, config: SurfaceFitCon
         raise ValueError(f"start: expected shape {rest.vertices.shape}, got {start.shape}")
     if not len(scan.faces):
         raise ValueError(f"scan: expected at least one triangle, got {scan}")
-    fit = _Fit(rest, start, scan_target(scan), float(scan.face_areas.sum()), config)
+    fit = _Fit(rest, start, scan_target(scan), float(scan.face_areas.sum()), config, hidden)
     temperatures = fit.schedule()
     total = len(temperatures) + config.polish
     for k, T in enumerate(temperatures):
@@ -171,13 +173,15 @@ def fit_surface(rest: Mesh, start: np.ndarray, scan: Mesh, config: SurfaceFitCon
 class _Fit:
     """A control mesh on its way."""
 
-    def __init__(self, rest: Mesh, start: np.ndarray, target: Target, area: float, config: SurfaceFitConfig) -> None:
+    def __init__(self, rest: Mesh, start: np.ndarray, target: Target, area: float, config: SurfaceFitConfig,
+                 hidden: np.ndarray | None) -> None:
         self.rest, self.x, self.target, self.config = rest, start, target, config
         self.shape: LocalShape = local_shape(rest)
         self.points = ScanPoints(target.points, target.normals, target.border)
         self.stiffness = csc_array(self.shape.plane.T @ diags_array(self.shape.weights) @ self.shape.plane)
         self.sample = target.thinned(max(float(np.sqrt(area / (SAMPLE * len(start)))), 1e-4))
         self.nothing = csc_array((0, len(start))), np.zeros((0, 3)), 0.0
+        self.shown = np.ones(len(start), dtype=bool) if hidden is None else ~np.asarray(hidden)
         self.reach = config.reach * float(np.sqrt(rest.with_vertices(start).face_areas.sum()))
         self.steps: list[int] = []
         self.converged = False
@@ -231,9 +235,9 @@ class _Fit:
         return found, found.seen[:, None, None] * A
 
     def beside_data(self, nearest: np.ndarray) -> np.ndarray:
-        """(N,) bool: within reach of the nearest point, and not beyond the edge of a hole, where it says nothing."""
+        """(N,) bool: shown, within reach of the nearest point, not past the edge of a hole where it says nothing."""
         near = np.linalg.norm(self.points.points[nearest] - self.x, axis=1) <= self.reach
-        return near & self.points.beside(self.x, nearest)
+        return self.shown & near & self.points.beside(self.x, nearest)
 
     def seen(self) -> tuple[np.ndarray, np.ndarray]:
         """Vertices with data, and the nearest point of the whole scan."""
@@ -248,7 +252,8 @@ class _Fit:
         found = Surface(mesh).closest(self.sample.points)
         corners = mesh.faces[found.faces]
         normals = found.carried(mesh.vertex_normals, mesh.faces)
-        good = np.flatnonzero(np.einsum("pd,pd->p", normals, self.sample.normals) > AGREE)
+        facing = np.einsum("pd,pd->p", normals, self.sample.normals) > AGREE
+        good = np.flatnonzero(facing & self.shown[corners].all(axis=1))
         rows = np.repeat(np.arange(len(good)), 3)
         C = csc_array((found.bary[good].ravel(), (rows, corners[good].ravel())), shape=(len(good), len(self.x)))
         return SurfaceData(A, wanted, C, self.sample.points[good], self.config.cover * len(self.x) / len(found.faces))

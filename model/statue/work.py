@@ -42,7 +42,7 @@ from .surface_fit import SurfaceFit, fit_surface
 
 LEVELS = 4                           # 0 to 3 are measured, the last is written
 TOLERANCE = 0.0005                   # metres: of adaptive subdivision in the report
-LOST = 0.5                           # share of the control mesh without data that means nothing
+LOST, EMPTY = 0.25, 0.1              # share of the control mesh in folds, and with data, that mean nothing
 
 
 @dataclass(frozen=True)
@@ -94,7 +94,7 @@ class Work:
             posed = posed_by_features(self.control, joints, points, self.config.features)
             rows = [Metric("joints given", len(joints)), Metric("surface points given", len(points))]
         surface = room.step("surface", same, lambda: fit_surface(self.control.mesh, posed.start, scan,
-                                                                 self.config.surface, room.tell))
+                                                                 self.config.surface, room.tell, posed.hidden))
         control = room.step("control", same, lambda: fitted_control(self.control, posed.features, surface, scan,
                                                                     self.config.displacement))
         map_ = room.step("map", same, lambda: bake(control, scan, self.config.displacement, room.tell))
@@ -172,11 +172,11 @@ def _adaptive(statue: Statue, scan: Mesh) -> Level:
 def statue_problem(statue: Statue) -> str | None:
     """Why a statue means nothing; None where it means something."""
     shares = coverage_shares(statue.control, statue.map)
-    if shares["measured"] >= LOST:
+    if shares["folded"] <= LOST and shares["measured"] >= EMPTY:
         return None
-    return (f"only {100 * shares['measured']:.0f}% of the control mesh has data of the scan one-to-one, "
-            f"{100 * shares['hole']:.0f}% are holes; the control model is not where the person is, or most of the "
-            "person is not in the scan; features given by hand (--features) may help")
+    return (f"{100 * shares['folded']:.0f}% of the control mesh is folded against the scan, "
+            f"{100 * shares['measured']:.0f}% has data one-to-one; the control model is not where the person is; "
+            "features given by hand (--features) may help")
 
 
 def _read(inputs: Inputs, unit: Unit | None) -> tuple[Mesh, Texture | None, list[Metric]]:
