@@ -206,6 +206,17 @@ def test_beside_the_chart_the_surface_goes_on(control):
     assert (ahead > 0).all()
 
 
+def test_overlapping_views_are_one_surface(control, scan):
+    """Two sheets 2 mm apart, nothing seen from inside between them: their mean, not a fold."""
+    both = Mesh(np.concatenate([scan.vertices, 1.01 * scan.vertices]),
+                np.concatenate([scan.faces, scan.faces + len(scan.vertices)]))
+    lower, upper, found = (bake(control, one, DisplacementConfig(size=SIZE))
+                           for one in (scan, scan.with_vertices(1.01 * scan.vertices), both))
+    assert coverage_shares(control, found)["folded"] == 0
+    inside = found.coverage == MEASURED
+    np.testing.assert_allclose(found.heights[inside], 0.5 * (lower.heights + upper.heights)[inside], atol=1e-6)
+
+
 def test_a_hole_is_told_and_filled_from_around_it(control, scan):
     cut = scan.submesh(scan.corners.mean(axis=1)[:, 0] < 0.15)[0]
     found = bake(control, cut, DisplacementConfig(size=SIZE))

@@ -41,6 +41,7 @@ def place(demo_folder, tmp_path_factory):
                            ("half_view/half_view.landmarks.json", "half_view.landmarks.json"),
                            ("markers/layout.json", "layout.json")):
         shutil.copy(demo / source, folder / target)
+    shutil.copy(demo / "scans" / f"{mine[0].split(',')[0]}.ply", folder / "standing.ply")
     shutil.copy(demo / "scans" / f"{mine[1].split(',')[0]}.ply", folder / "anna.ply")
     cameras = {}
     for k, view in enumerate(read_views(demo / "template_scan" / "views" / "rest.npz")):
@@ -75,6 +76,7 @@ def test_commands(place, monkeypatch):
         words = ["own.ply" if w == "template.ply" and "views" in words else w for w in words]
         assert main(words[1:]) == 0, line
     assert (place / "completed" / "report.html").exists() and (place / "walk" / "animation.glb").exists()
+    assert (place / "walking" / "statue.glb").exists() and (place / "detailed.ply").exists()
     assert (place / "first_answer" / "completed.ply").exists() and (place / "tracked" / "motion.npz").exists()
 
 

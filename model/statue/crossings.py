@@ -12,6 +12,7 @@ from .normal_volume import interpolate
 
 SKIP = 2e-5                          # metres: a ray goes on this far behind what it met
 SAME = 1e-6                          # metres: two crossings nearer to each other are one, met on a shared edge
+OVERLAP = 0.01                       # metres: farther apart, two views have not met the same surface
 LAYERS = 30                          # crossings of one normal that are looked for
 NEAREST = 0.003                      # metres: crossings up to this height are never those of another body part
 THICK = 0.75                         # share of the way to the other side of a limb, or across a gap, that heights go
@@ -40,6 +41,23 @@ class Crossings:
     def pick(self, keep: np.ndarray) -> Crossings:
         """Only some of them."""
         return Crossings(self.normal[keep], self.heights[keep], self.cosines[keep], self.faces[keep])
+
+
+def outer_layers(found: Crossings) -> Crossings:
+    """The crossings that meet the scan from outside, sheets of overlapping views as one at their mean height.
+
+    Two layers of a fold have one between them that is met from inside; two views of one surface have not.
+    """
+    outside = found.cosines > 0
+    layer = np.cumsum(~outside)[outside]
+    front = found.pick(outside)
+    begins = np.ones(len(front.normal), dtype=bool)
+    begins[1:] = ((front.normal[1:] != front.normal[:-1]) | (layer[1:] != layer[:-1])
+                  | (front.heights[1:] - front.heights[:-1] > OVERLAP))
+    group = np.cumsum(begins) - 1
+    count = np.maximum(np.bincount(group), 1)
+    return Crossings(front.normal[begins], np.bincount(group, front.heights) / count,
+                     np.bincount(group, front.cosines) / count, front.faces[begins])
 
 
 def find_crossings(scan: Mesh, rays: Rays, points: np.ndarray, normals: np.ndarray, reach: float) -> Crossings:

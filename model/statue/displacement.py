@@ -20,7 +20,7 @@ from scanprep.geometry.surface import Rays, Surface
 from scanprep.ranges import Cosine, Positive, Range, Settings
 
 from .control import ControlModel
-from .crossings import Crossings, find_crossings, limits, unturned
+from .crossings import Crossings, find_crossings, limits, outer_layers, unturned
 from .lattice import Lattice
 from .normal_volume import interpolate
 from .statue import FOLDED, HOLE, MEASURED, OUTSIDE, DisplacementMap
@@ -28,6 +28,7 @@ from .texels import Texels, find_texels
 from .vectors import bend_over_folds
 
 Progress = Callable[[int, int], None]
+STEP = 0.003                         # metres: smaller steps are noise, or views that differ
 FILL_LEVEL = 3                       # of the subdivision on which holes are filled: edges of some 5 mm
 CLOSE = 0.01                         # metres: a surface so near to a place outside the scan is that place's
 UNFOLD_SIZE = 512                    # pixels each way while control vertices are moved out of folds
@@ -154,7 +155,7 @@ def unfold_control(control: ControlModel, scan: Mesh, config: DisplacementConfig
 def _measure(mesh: Mesh, scan: Mesh, texels: Texels, config: DisplacementConfig) -> tuple[np.ndarray, np.ndarray]:
     """Heights (n,) of pixels, NaN where there is none, and which (n,) had several to choose from."""
     points, normals = interpolate(mesh, texels.faces, texels.bary)
-    found = find_crossings(scan, Rays(scan), points, normals, config.reach)
+    found = outer_layers(find_crossings(scan, Rays(scan), points, normals, config.reach))
     low, high = limits(mesh, points, normals, config.reach)
     of = found.normal
     far = found.heights * np.linalg.norm(normals[of], axis=1)
@@ -197,7 +198,7 @@ def _sort(control: ControlModel, texels: Texels, heights: np.ndarray, several: n
     both = ~np.isnan(heights[a]) & ~np.isnan(heights[b])
     a, b = a[both], b[both]
     apart = np.linalg.norm(points[a] - points[b], axis=1)
-    jump = np.abs(heights[a] - heights[b]) > config.slope * np.maximum(apart, 1e-5)
+    jump = np.abs(heights[a] - heights[b]) > np.maximum(config.slope * apart, STEP)
     count = len(heights)
     joined = coo_array((np.ones((~jump).sum()), (a[~jump], b[~jump])), shape=(count, count))
     _, patch = connected_components(joined, directed=False)
