@@ -29,6 +29,7 @@ from summary_scans import (
     skeletons,
     table,
 )
+from summary_statues import STATUES
 
 HERE = Path(__file__).parent
 
@@ -200,6 +201,7 @@ SECTIONS: dict[str, tuple[str, str, Callable[[dict], str], str]] = {
               "missing as it remeshes everything."),
     **COMPLETION,
     **MOSHING,
+    **STATUES,
 }
 
 BESIDE = {"half_people": "half_people_poisson"}      # a run with another library, in the same table
