@@ -2,9 +2,9 @@
 
     python tests/benchmarks/statues.py SCAN... [--size 2048] [--json FILE]
 
-Scans stand upright, in metres; each is fitted without clicks, with and without vector displacement. Distances leave holes
-of the scan out. `e` is the error left by the map where it is one-to-one. Relief on smooth scans, 1 to 3 mm with wrinkles,
-is put there by `--emboss`.
+Scans stand upright, in metres; each is fitted without clicks, with and without vector displacement. Distances leave
+holes of the scan out. `e` is the error left by the map where it is one-to-one. Relief on smooth scans, 1 to 3 mm with
+wrinkles, is put there by `--emboss`.
 """
 from __future__ import annotations
 
@@ -19,7 +19,6 @@ from protocols import machine, write_report
 from model.statue.displacement import DisplacementConfig, coverage_shares
 from model.statue.fit import StatueConfig, fit_statue
 from model.statue.reconstruction import Reconstruction, in_folds, inverted_triangles, remaining_error
-from model.statue.subdivision import subdivide
 from model.statue.work import measured_levels
 from scanprep import Mesh, read_mesh
 

@@ -28,10 +28,10 @@ def surface_fits(report: dict) -> str:
 
 STATUES = {
     "statues": ("Animated Statues", "python tests/benchmarks/statues.py SCAN...", statues,
-                "No clicks. Scans with known relief of 1 to 3 mm: two SCAPE poses, two SPRING men, a synthetic man and a "
-                "synthetic woman through the virtual scanner. Where we lose: fists and hands, folded against the mittens "
-                "of the control mesh; in scape038 (arms up, knees bent) one hand was not found, which the fit flags."),
+                "No clicks. Scans with known relief of 1 to 3 mm: two SCAPE poses, two SPRING men, a synthetic man and "
+                "woman through the virtual scanner. Where we lose: fists and hands, folded against the mittens of the "
+                "control mesh; in scape038 (arms up, knees bent) one hand was not found, which the fit flags."),
     "statue_fit": ("Statues: fit of the control mesh", "python tests/benchmarks/statue_fit.py", surface_fits,
-                   "Fig. 7 of the paper. `published` are its Euler steps and its own slack where said. Where we lose: time "
-                   "to the last pass of registration alone."),
+                   "Fig. 7 of the paper. `published` are its Euler steps, and its own slack where said. Where we lose: "
+                   "time, to the last pass of registration alone."),
 }
