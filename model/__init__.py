@@ -37,10 +37,10 @@ if TYPE_CHECKING:
     from .resolution.change import ResolutionConfig, change_resolution
     from .scape import ScapeModel
     from .skinning import SkinningModel
-    from .statue.control import ControlModel
+    from .statue.control.humanoid import humanoid
+    from .statue.control.model import ControlModel
     from .statue.files import load_statue, save_statue
     from .statue.fit import StatueConfig, fit_statue
-    from .statue.humanoid import humanoid
     from .statue.statue import DisplacementMap, Statue
 
 _ROOMS = {
@@ -75,10 +75,10 @@ _ROOMS = {
     "resolution.change": ("ResolutionConfig", "change_resolution"),
     "scape": ("ScapeModel",),
     "skinning": ("SkinningModel",),
-    "statue.control": ("ControlModel",),
+    "statue.control.model": ("ControlModel",),
     "statue.files": ("load_statue", "save_statue"),
     "statue.fit": ("StatueConfig", "fit_statue"),
-    "statue.humanoid": ("humanoid",),
+    "statue.control.humanoid": ("humanoid",),
     "statue.statue": ("DisplacementMap", "Statue"),
 }
 _ROOM_OF = {name: room for room, names in _ROOMS.items() for name in names}

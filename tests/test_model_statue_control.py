@@ -9,12 +9,12 @@ import pytest
 from animal_bodies import Animal
 
 from model.export.glb import skinned_glb, write_skinned_glb
-from model.statue.chart import Chart, automatic_chart, chart_problem, densities, make_chart
-from model.statue.control import control_problem
-from model.statue.control_files import read_control
-from model.statue.flatten import _derivatives, _energy, _rest, crossings, orientation
-from model.statue.humanoid import NAMES, STORED, humanoid, humanoid_markers
-from model.statue.seams import cut, find_seams
+from model.statue.control.chart import Chart, automatic_chart, chart_problem, densities, make_chart
+from model.statue.control.files import read_control
+from model.statue.control.flatten import _derivatives, _energy, _rest, crossings, orientation
+from model.statue.control.humanoid import NAMES, STORED, humanoid, humanoid_markers
+from model.statue.control.model import control_problem
+from model.statue.control.seams import cut, find_seams
 from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.storage import StorageError
 from scanprep.scanning.people import LANDMARKS, MARKERS

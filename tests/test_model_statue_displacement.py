@@ -8,13 +8,13 @@ from PIL import Image
 from scipy.optimize import brentq
 from scipy.spatial.transform import Rotation
 
-from model.statue.chart import make_chart
-from model.statue.colors import bake_texture, scan_look
-from model.statue.control import ControlModel
-from model.statue.displacement import DisplacementConfig, bake, coverage_shares, unfold_control
-from model.statue.displacement_files import read_map, write_map
-from model.statue.normal_volume import from_normal_volume, interpolate, solve_triangles, to_normal_volume
-from model.statue.reconstruction import (
+from model.statue.control.chart import make_chart
+from model.statue.control.model import ControlModel
+from model.statue.detail.colors import bake_texture, scan_look
+from model.statue.detail.displacement import DisplacementConfig, bake, coverage_shares, unfold_control
+from model.statue.detail.images import read_map, write_map
+from model.statue.detail.normal_volume import from_normal_volume, interpolate, solve_triangles, to_normal_volume
+from model.statue.detail.reconstruction import (
     Reconstruction,
     VertexRotations,
     chart_places,
@@ -24,9 +24,9 @@ from model.statue.reconstruction import (
     remaining_error,
     surface_error,
 )
+from model.statue.detail.subdivision import subdivide, subdivide_adaptive
+from model.statue.detail.texels import continue_chart, find_texels
 from model.statue.statue import FOLDED, HOLE, MEASURED, OUTSIDE, DisplacementMap
-from model.statue.subdivision import subdivide, subdivide_adaptive
-from model.statue.texels import continue_chart, find_texels
 from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.storage import StorageError
 from scanprep.geometry.surface import Surface

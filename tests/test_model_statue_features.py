@@ -2,11 +2,11 @@
 import numpy as np
 import pytest
 
-from model.statue.articulated import Articulated, Points
-from model.statue.automatic import find_features, likely_unit
-from model.statue.features import FeatureConfig, fit_features, head_share, misfit, warp
-from model.statue.humanoid import humanoid
-from model.statue.medial import MedialAxis
+from model.statue.control.humanoid import humanoid
+from model.statue.registration.articulated import Articulated, Points
+from model.statue.registration.automatic import find_features, likely_unit
+from model.statue.registration.features import FeatureConfig, fit_features, head_share, misfit, warp
+from model.statue.registration.medial import MedialAxis
 from scanprep.geometry import rotations
 from scanprep.geometry.mesh import Mesh
 from scanprep.scanning.people import BodyShape, Person, compose

@@ -11,10 +11,10 @@ from model.export.cli import read_motion
 from model.export.rig import joint_places
 from model.features import linear_features
 from model.skinning import SkinningModel
-from model.statue.bone_names import find_roles, trunk
-from model.statue.follow import Follower, _bound
-from model.statue.humanoid import humanoid
-from model.statue.motion import MotionConfig, bvh_motion, own_motion, people_motion, write_motion
+from model.statue.control.humanoid import humanoid
+from model.statue.motion.bone_names import find_roles, trunk
+from model.statue.motion.follow import Follower, _bound
+from model.statue.motion.motions import MotionConfig, bvh_motion, own_motion, people_motion, write_motion
 from scanprep.geometry import rotations
 from scanprep.geometry.storage import StorageError
 from scanprep.geometry.surface import Surface

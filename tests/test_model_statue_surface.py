@@ -5,10 +5,10 @@ from scipy.sparse import csc_array, diags_array, eye_array
 from scipy.spatial import ConvexHull
 from scipy.special import logsumexp
 
-from model.statue.local_shape import local_shape
-from model.statue.soft_assignment import ScanPoints, assign
-from model.statue.surface_data import distortion
-from model.statue.surface_fit import SurfaceFitConfig, fit_surface
+from model.statue.registration.local_shape import local_shape
+from model.statue.registration.soft_assignment import ScanPoints, assign
+from model.statue.registration.surface_data import distortion
+from model.statue.registration.surface_fit import SurfaceFitConfig, fit_surface
 from scanprep.geometry import rotations
 from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.sparse import Factored

@@ -1,6 +1,10 @@
 """Animated Statues: one scan becomes a control mesh, a displacement map over it and a skeleton that moves both.
 
-control model -> registration by features -> shape-constrained fit -> displacement map -> reconstruction, animation
+control       the control model: mesh, skeleton, chart; the generic humanoid
+registration  features, found or clicked, then the shape-constrained surface
+detail        displacement map, texture, subdivision, reconstruction
+motion        motions of other skeletons, and of learned models
+fit.py        all of it in one function; work, report, files, cli: the command
 
 [Statues]
 """

@@ -8,7 +8,7 @@ from scanprep.skeleton.tree import Skeleton
 
 from ..features import linear_features
 from ..skinning import SkinningModel
-from .control import ControlModel
+from .control.model import ControlModel
 
 POSES = 100                          # random poses of the synthetic people that make the pose prior
 WIDEST = 1.0                         # radians: standard deviation of the turns of a joint without such poses

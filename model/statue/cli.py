@@ -18,19 +18,19 @@ from scanprep.pipeline.scans import SCAN_ENDINGS
 
 from ..export.cli import read_motion
 from ..files import load_model
-from .animate import follower_of, read_statue_motion
-from .control import ControlModel
-from .control_files import read_control
+from .control.files import read_control
+from .control.humanoid import humanoid
+from .control.model import ControlModel
+from .detail.reconstruction import Reconstruction, displaced_surface, inverted_triangles
+from .detail.subdivision import Subdivision, subdivide, subdivide_adaptive
 from .files import load_statue
 from .fit import StatueConfig
-from .humanoid import humanoid
-from .motion import write_motion
-from .reconstruction import Reconstruction, displaced_surface, inverted_triangles
+from .motion.animate import follower_of, read_statue_motion
+from .motion.motions import write_motion
+from .motion.retarget import StatueMotion
 from .report import motion_pictures, upright_axis
-from .retarget import StatueMotion
 from .statue import Statue
 from .statue_glb import write_statue_glb
-from .subdivision import Subdivision, subdivide, subdivide_adaptive
 from .work import Inputs, Work
 
 StatueArg = Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="STATUE")]

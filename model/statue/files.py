@@ -8,14 +8,14 @@ import numpy as np
 from scanprep.geometry import storage
 
 from .body import body_model, people_poses
-from .control import ControlModel
-from .displacement_files import read_map, write_map
-from .humanoid import humanoid, humanoid_markers
-from .motion import people_motion
-from .normal_image import normal_image
+from .control.humanoid import humanoid, humanoid_markers
+from .control.model import ControlModel
+from .detail.images import read_map, write_map
+from .detail.normal_image import normal_image
+from .detail.subdivision import Subdivision
+from .motion.motions import people_motion
 from .statue import Statue
 from .statue_glb import write_statue_glb
-from .subdivision import Subdivision
 from .x3d import write_x3d
 
 KIND, VERSION = "statue", 1

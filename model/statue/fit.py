@@ -9,13 +9,13 @@ import numpy as np
 from scanprep.geometry.mesh import Mesh
 from scanprep.ranges import Settings
 
-from .automatic import Features, find_features
-from .control import ControlModel
-from .displacement import DisplacementConfig, bake, unfold_control
-from .features import FeatureConfig, FeatureFit, fit_features, head_share, warp
-from .humanoid import humanoid
+from .control.humanoid import humanoid
+from .control.model import ControlModel
+from .detail.displacement import DisplacementConfig, bake, unfold_control
+from .registration.automatic import Features, find_features
+from .registration.features import FeatureConfig, FeatureFit, fit_features, head_share, warp
+from .registration.surface_fit import SurfaceFit, SurfaceFitConfig, fit_surface
 from .statue import Statue
-from .surface_fit import SurfaceFit, SurfaceFitConfig, fit_surface
 
 Progress = Callable[[int, int], None]
 FACE = ("left eye", "right eye", "nose tip", "mouth", "chin", "left ear", "right ear", "top of head")

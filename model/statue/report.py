@@ -13,9 +13,9 @@ from scanprep.pictures.camera import Camera
 from scanprep.pictures.page import Page
 from scanprep.pictures.shading import Bones, Dots, Shape, Solid, color_bar, heat, part_colors, render, side_by_side
 
-from .reconstruction import Reconstruction, coverage_at
+from .detail.reconstruction import Reconstruction, coverage_at
+from .detail.subdivision import subdivide
 from .statue import FOLDED, HOLE, MEASURED, OUTSIDE, DisplacementMap, Statue
-from .subdivision import subdivide
 
 HEIGHT, SMALL = 520, 360            # pixels of the pictures, and of animated ones
 SIDES = ("front", "left", "back", "right")
@@ -194,8 +194,8 @@ def in_motion(statue: Statue) -> list[tuple[str, Mesh]]:
     """The statue in a walk, a squat and with its arms overhead; none for a control model with other joints."""
     from scanprep.scanning.people import named_pose, walk
 
-    from .humanoid import humanoid
-    from .motion import people_motion
+    from .control.humanoid import humanoid
+    from .motion.motions import people_motion
 
     if statue.control.skeleton.names != humanoid().skeleton.names:
         return []

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from .control import ControlModel
+from .control.model import ControlModel
 
 OUTSIDE, HOLE, FOLDED, MEASURED = 0, 85, 170, 255      # grey values of the coverage image
 

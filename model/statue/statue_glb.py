@@ -9,10 +9,10 @@ from scanprep.geometry.mesh import Mesh
 
 from ..export.glb import Material, write_skinned_glb
 from ..export.rig import Rig, strongest
-from .control import ControlModel
-from .normal_image import chart_tangents, vertex_of_row
-from .retarget import StatueMotion
-from .subdivision import Subdivision, subdivide
+from .control.model import ControlModel
+from .detail.normal_image import chart_tangents, vertex_of_row
+from .detail.subdivision import Subdivision, subdivide
+from .motion.retarget import StatueMotion
 
 
 def write_statue_glb(path: str | Path, control: ControlModel, vertices: np.ndarray | None = None,

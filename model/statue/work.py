@@ -18,14 +18,10 @@ from scanprep.geometry.mesh import Mesh
 from scanprep.pictures.sheets import save_png
 from scanprep.pictures.textures import Texture, read_texture
 
-from .automatic import Features, find_features
-from .colors import bake_texture, scan_look
-from .control import ControlModel
-from .displacement import bake, coverage_shares
-from .files import save_statue, write_body, write_for_programs
-from .fit import Posed, StatueConfig, fitted_control, posed_automatically, posed_by_features
-from .read_features import read_features
-from .reconstruction import (
+from .control.model import ControlModel
+from .detail.colors import bake_texture, scan_look
+from .detail.displacement import bake, coverage_shares
+from .detail.reconstruction import (
     Reconstruction,
     SurfaceError,
     coverage_at,
@@ -35,10 +31,14 @@ from .reconstruction import (
     remaining_error,
     surface_error,
 )
+from .detail.subdivision import Subdivision, subdivide, subdivide_adaptive
+from .files import save_statue, write_body, write_for_programs
+from .fit import Posed, StatueConfig, fitted_control, posed_automatically, posed_by_features
+from .registration.automatic import Features, find_features
+from .registration.read_features import read_features
+from .registration.surface_fit import SurfaceFit, fit_surface
 from .report import Level, in_motion, parts_without_data, statue_page, statue_picture, upright_axis
 from .statue import HOLE, Statue
-from .subdivision import Subdivision, subdivide, subdivide_adaptive
-from .surface_fit import SurfaceFit, fit_surface
 
 LEVELS = 4                           # 0 to 3 are measured, the last is written
 TOLERANCE = 0.0005                   # metres: of adaptive subdivision in the report

@@ -12,9 +12,9 @@ from scanprep.geometry.storage import writing
 from scanprep.pictures.sheets import save_png
 
 from ..export.rig import check_motion, strongest, turn_up
-from .control import ControlModel
-from .retarget import StatueMotion
-from .subdivision import Subdivision, subdivide
+from .control.model import ControlModel
+from .detail.subdivision import Subdivision, subdivide
+from .motion.retarget import StatueMotion
 
 _DOCTYPE = ('<?xml version="1.0" encoding="UTF-8"?>\n<!DOCTYPE X3D PUBLIC "ISO//Web3D//DTD X3D 4.0//EN" '
             '"https://www.web3d.org/specifications/x3d-4.0.dtd">\n')

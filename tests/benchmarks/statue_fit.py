@@ -21,10 +21,10 @@ import numpy as np
 from protocols import data_folder, load_real, machine, write_report
 from scipy.sparse import csc_array, diags_array, eye_array
 
-from model.statue.humanoid import humanoid
-from model.statue.local_shape import LocalShape, local_shape
-from model.statue.surface_data import distortion
-from model.statue.surface_fit import SurfaceFitConfig, fit_surface
+from model.statue.control.humanoid import humanoid
+from model.statue.registration.local_shape import LocalShape, local_shape
+from model.statue.registration.surface_data import distortion
+from model.statue.registration.surface_fit import SurfaceFitConfig, fit_surface
 from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.sparse import Factored
 from scanprep.geometry.surface import Surface

@@ -16,9 +16,9 @@ from pathlib import Path
 import numpy as np
 from protocols import machine, write_report
 
-from model.statue.displacement import DisplacementConfig, coverage_shares
+from model.statue.detail.displacement import DisplacementConfig, coverage_shares
+from model.statue.detail.reconstruction import Reconstruction, in_folds, inverted_triangles, remaining_error
 from model.statue.fit import StatueConfig, fit_statue
-from model.statue.reconstruction import Reconstruction, in_folds, inverted_triangles, remaining_error
 from model.statue.work import measured_levels
 from scanprep import Mesh, read_mesh
 

@@ -14,8 +14,8 @@ from scanprep.matching.nonrigid import Registration, RegistrationConfig, registe
 from scanprep.matching.thinning import thin
 from scanprep.threads import one_thread, search_threads
 
+from ..control.model import ControlModel
 from .articulated import Articulated
-from .control import ControlModel
 from .features import FeatureFit, fit_features
 from .person_search import Stand, find_person
 from .pose_search import PoseSearch

@@ -12,9 +12,9 @@ from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.storage import load_arrays, numbers, taking_apart, writing
 from scanprep.skeleton.tree import Skeleton
 
-from ..export.bvh_read import BvhMotion
-from ..export.rig import check_motion, joint_places
-from .control import ControlModel
+from ...export.bvh_read import BvhMotion
+from ...export.rig import check_motion, joint_places
+from ..control.model import ControlModel
 from .retarget import MotionConfig, Pairing, StatueMotion, retargeted
 
 

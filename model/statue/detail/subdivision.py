@@ -13,7 +13,7 @@ import numpy as np
 
 from scanprep.geometry.mesh import Mesh
 
-from .chart import Chart
+from ..control.chart import Chart
 
 # Places of a triangle by number: corners 0, 1, 2 and the middles 3 of 01, 4 of 12, 5 of 20. For each set of split
 # sides (bits 1, 2, 4) the triangles that take its place; with two split sides there is a diagonal to choose.

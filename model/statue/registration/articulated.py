@@ -8,7 +8,7 @@ import numpy as np
 
 from scanprep.geometry import rotations
 
-from .control import ControlModel
+from ..control.model import ControlModel
 
 
 @dataclass(frozen=True, eq=False)

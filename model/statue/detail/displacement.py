@@ -19,11 +19,11 @@ from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.surface import Rays, Surface
 from scanprep.ranges import Cosine, Positive, Range, Settings
 
-from .control import ControlModel
+from ..control.model import ControlModel
+from ..statue import FOLDED, HOLE, MEASURED, OUTSIDE, DisplacementMap
 from .crossings import Crossings, find_crossings, limits, outer_layers, unturned
 from .lattice import Lattice
 from .normal_volume import interpolate
-from .statue import FOLDED, HOLE, MEASURED, OUTSIDE, DisplacementMap
 from .texels import Texels, find_texels
 from .vectors import bend_over_folds
 

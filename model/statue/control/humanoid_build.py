@@ -19,7 +19,7 @@ from scanprep.scanning.people_parts import cross_sections
 from scanprep.scanning.people_remesh import mirror, polygonise, remesh
 from scanprep.scanning.people_template import CANONICAL, blending, load
 
-from ..export.rig import strongest
+from ...export.rig import strongest
 
 BODY, LIMB, HEAD, FACE, HAND, FOOT = 0.074, 0.048, 0.042, 0.0215, 0.0175, 0.0275     # metres, wanted edges
 # of the 16 parts of the people, pelvis first, the part here

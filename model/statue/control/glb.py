@@ -13,9 +13,9 @@ from scanprep.geometry.formats.common import MeshFileError
 from scanprep.geometry.mesh import Mesh
 from scanprep.skeleton.tree import Skeleton
 
-from ..export.rig import strongest, turn_up
+from ...export.rig import strongest, turn_up
 from .chart import Chart, automatic_chart, chart_problem
-from .control import ControlModel, control_problem, surface_problem
+from .model import ControlModel, control_problem, surface_problem
 
 WHAT = "a GLB file with one mesh that hangs on joints"
 TRIANGLES = 4                        # of the modes of glTF

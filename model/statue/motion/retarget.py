@@ -10,10 +10,10 @@ import numpy as np
 from scanprep.geometry import rotations
 from scanprep.ranges import Settings, Share
 
-from ..export.bvh_read import BvhMotion
-from ..export.rig import check_motion
+from ...export.bvh_read import BvhMotion
+from ...export.rig import check_motion
+from ..control.model import ControlModel
 from .bone_names import above, find_roles, trunk
-from .control import ControlModel
 
 _CHAINS = (("shoulder", "elbow", "wrist"), ("hip", "knee", "ankle"))
 _ON_THE_FLOOR = 5                    # percentile of the lowest vertex over the frames: some frames may err

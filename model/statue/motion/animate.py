@@ -12,15 +12,15 @@ from scanprep.geometry.storage import StorageError, load_arrays
 from scanprep.matching.correlated import find_correspondences
 from scanprep.matching.nonrigid import Registration, register, registration_problem
 
-from ..body import BodyModel
-from ..export.bvh_read import read_bvh
-from ..fitting import fit_shape
+from ...body import BodyModel
+from ...export.bvh_read import read_bvh
+from ...fitting import fit_shape
+from ..detail.reconstruction import Reconstruction
+from ..detail.subdivision import subdivide
+from ..statue import Statue
 from .follow import Follower
-from .motion import bvh_motion, own_motion, people_motion
-from .reconstruction import Reconstruction
+from .motions import bvh_motion, own_motion, people_motion
 from .retarget import StatueMotion
-from .statue import Statue
-from .subdivision import subdivide
 
 Progress = Callable[[int, int], None]
 REGISTERED_ON = 2                    # level of the reconstruction that a learned model is registered to

@@ -6,8 +6,8 @@ import numpy as np
 from scanprep.geometry.mesh import Mesh
 from scanprep.pictures.textures import padded
 
-from .chart import Chart
-from .control import ControlModel
+from ..control.chart import Chart
+from ..control.model import ControlModel
 from .subdivision import Subdivision
 
 SIZE = 2048                          # pixels of a side

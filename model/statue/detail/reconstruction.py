@@ -10,10 +10,10 @@ from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.surface import Surface
 from scanprep.pictures.textures import bilinear
 
-from .chart import Chart
-from .control import ControlModel
+from ..control.chart import Chart
+from ..control.model import ControlModel
+from ..statue import FOLDED, HOLE, MEASURED, OUTSIDE, DisplacementMap
 from .normal_volume import from_normal_volume, interpolate, to_normal_volume
-from .statue import FOLDED, HOLE, MEASURED, OUTSIDE, DisplacementMap
 from .subdivision import Displaced, Subdivision
 
 SEED = 14                            # of the places at which errors are measured

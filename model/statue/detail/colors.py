@@ -8,11 +8,11 @@ from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.surface import Surface
 from scanprep.pictures.textures import Look, Texture
 
-from .control import ControlModel
+from ..control.model import ControlModel
+from ..statue import DisplacementMap
 from .displacement import FILL_LEVEL
 from .lattice import Lattice
 from .normal_volume import interpolate
-from .statue import DisplacementMap
 from .texels import find_texels
 
 REACH = 0.01                         # metres: farther from a place the scan does not say its colour

@@ -5,7 +5,7 @@ import numpy as np
 
 from scanprep.geometry.mesh import Mesh
 
-from .chart import Chart
+from ..control.chart import Chart
 from .subdivision import subdivide
 from .texels import Texels
 

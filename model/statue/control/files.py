@@ -10,7 +10,7 @@ from scanprep.geometry.mesh import Mesh
 from scanprep.skeleton.tree import Skeleton
 
 from .chart import Chart
-from .control import ControlModel, control_problem
+from .model import ControlModel, control_problem
 
 KIND, VERSION = "control model", 1
 
@@ -32,7 +32,7 @@ def read_control(path: str | Path) -> ControlModel:
     if path.suffix.lower() == ".npz":
         return load(path)
     if path.suffix.lower() == ".glb":
-        from .control_glb import read_skinned
+        from .glb import read_skinned
 
         return read_skinned(path)
     raise storage.StorageError(f"{path}: expected a control model in .npz or a skinned mesh in .glb")

@@ -8,7 +8,7 @@ from scanprep.geometry import rotations
 from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.surface import OrientedPoints, Surface
 
-from ..linear import Subject
+from ...linear import Subject
 
 _SAME_SIDE = 0.3                     # cosine of normals below which the nearest triangle is of another limb or side
 _RINGS = 4                           # of the model's vertices, over which its turns are averaged

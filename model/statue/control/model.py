@@ -10,7 +10,7 @@ import numpy as np
 from scanprep.geometry.mesh import Mesh, template_problem
 from scanprep.skeleton.tree import Skeleton
 
-from ..export.rig import CARRIERS, Rig
+from ...export.rig import CARRIERS, Rig
 from .chart import Chart, chart_problem
 
 
@@ -54,7 +54,7 @@ class ControlModel:
 
     def save(self, path: str | Path) -> None:
         """Write one `.npz` file, which `load` and `read_control` read."""
-        from .control_files import save
+        from .files import save
 
         save(self, path)
 
@@ -67,7 +67,7 @@ class ControlModel:
         StorageError
             Missing, damaged, of another kind or version, or what it holds is no control model.
         """
-        from .control_files import load
+        from .files import load
 
         return load(path)
 

@@ -8,7 +8,7 @@ import numpy as np
 from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.surface import Surface
 
-from .chart import Chart
+from ..control.chart import Chart
 
 PADDING = 4                          # pixels that the surface is continued beyond the border of a chart
 MARGIN = 16                          # pixels more that the last value is repeated

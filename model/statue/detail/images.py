@@ -20,7 +20,7 @@ import numpy as np
 from scanprep.geometry.storage import StorageError, read_json, taking_apart, write_json, writing
 from scanprep.pictures import png16
 
-from .statue import FOLDED, HOLE, MEASURED, OUTSIDE, DisplacementMap
+from ..statue import FOLDED, HOLE, MEASURED, OUTSIDE, DisplacementMap
 
 HEADER, HEIGHTS, IMAGE = "displacement.json", "displacement.tif", "displacement.png"
 COVERAGE, VECTORS = "coverage.png", "vectors.tif"

@@ -10,7 +10,7 @@ import numpy as np
 from scanprep.scanning.people_anatomy import Anatomy
 from scanprep.skeleton.tree import Skeleton
 
-from .control import ControlModel
+from .model import ControlModel
 
 STORED = Path(__file__).with_name("humanoid.npz")
 NAMES = ("humanoid_root", "vl5", "skullbase", "l_sternoclavicular", "l_shoulder", "l_elbow", "l_wrist",

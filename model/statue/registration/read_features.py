@@ -11,7 +11,7 @@ from scanprep.geometry.landmarks import read_landmarks
 from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.storage import StorageError, numbers, read_json, taking_apart
 
-from .control import ControlModel
+from ..control.model import ControlModel
 from .medial import MedialAxis
 
 WANTED = 'features {name: [x, y, z]} or {name: {"ray": [[x, y, z], [x, y, z]], "depth": d}}'

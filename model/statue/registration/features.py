@@ -10,8 +10,8 @@ from scanprep.geometry import rotations
 from scanprep.matching.rigid import align_landmarks
 from scanprep.ranges import Count, Positive, Settings
 
+from ..control.model import ControlModel
 from .articulated import Articulated, Points
-from .control import ControlModel
 from .limbs import analytic_start, limbs
 
 PLANE = 0.02                     # of the widest spread of points: flatter ones say nothing across their plane

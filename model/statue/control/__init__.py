@@ -1,0 +1,1 @@
+"""The control model: mesh, skeleton, chart; the generic humanoid; control models of others."""
