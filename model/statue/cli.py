@@ -15,12 +15,14 @@ from scanprep.console import Metric, Outcome, Progress, bar, dispatch, failures_
 from scanprep.geometry.files import read_mesh, write_mesh
 from scanprep.pictures.animation import write_animated_glb, write_gif
 from scanprep.pipeline.scans import SCAN_ENDINGS
+from scanprep.ranges import Positive
 
 from ..export.cli import read_motion
 from ..files import load_model
 from .control.files import read_control
 from .control.humanoid import humanoid
 from .control.model import ControlModel
+from .detail.displacement import Pixels
 from .detail.reconstruction import Reconstruction, displaced_surface, inverted_triangles
 from .detail.subdivision import Subdivision, subdivide, subdivide_adaptive
 from .files import load_statue
@@ -54,7 +56,7 @@ def group(argv: list[str]) -> int:
 
 
 def fit(scan: ScanArg, output: Output, features: Path | None = None, control: Path | None = None,
-        unit: Unit | None = None, size: Annotated[int, tyro.conf.arg(metavar="PIXELS")] = 2048, vectors: bool = False,
+        unit: Unit | None = None, size: Pixels = 2048, vectors: bool = False,
         workers: WorkersArg = Workers(), *, space: Workspace) -> Outcome:                            # noqa: B008
     """A scan of one person becomes a statue: a control model that moves, with the detail of the scan as an image.
 
@@ -95,7 +97,7 @@ def fit(scan: ScanArg, output: Output, features: Path | None = None, control: Pa
                    failures_of(results))
 
 
-def reconstruct(statue: StatueArg, output: Output, level: LevelArg = 3, tolerance: float | None = None,
+def reconstruct(statue: StatueArg, output: Output, level: LevelArg = 3, tolerance: Positive | None = None,
                 image: Path | None = None) -> Outcome:
     """The surface of a statue with its detail, as a mesh at any level.
 

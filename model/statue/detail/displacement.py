@@ -28,6 +28,7 @@ from .texels import Texels, find_texels
 from .vectors import bend_over_folds
 
 Progress = Callable[[int, int], None]
+Pixels = Annotated[int, Range(16, 8192)]
 STEP = 0.003                         # metres: smaller steps are noise, or views that differ
 FILL_LEVEL = 3                       # of the subdivision on which holes are filled: edges of some 5 mm
 CLOSE = 0.01                         # metres: a surface so near to a place outside the scan is that place's
@@ -55,7 +56,7 @@ class DisplacementConfig(Settings):
         Displacements of any direction where the surface is not one-to-one.
     """
 
-    size: Annotated[int, Range(16, 8192)] = 1024
+    size: Pixels = 1024
     reach: Positive = 0.1
     min_cosine: Cosine = 0.1
     slope: Positive = 3.0
