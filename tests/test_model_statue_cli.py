@@ -9,6 +9,7 @@ from completion.__main__ import main
 from model import load_model
 from model.statue.files import load_statue
 from model.statue.statue import HOLE, MEASURED
+from model.statue.work import Inputs, read_scan
 from scanprep import Mesh, read_mesh, write_mesh
 from scanprep.scanning.people import LANDMARKS, BodyShape, Person, walk
 
@@ -152,6 +153,20 @@ def test_bad_input_is_refused_by_name(made, tmp_path, capsys):
         told = " ".join(capsys.readouterr().err.split())
         assert reason in told, (words, told)
         assert not (tmp_path / "out" / "report.html").exists()
+
+
+def test_a_scan_in_millimetres_on_a_floor_becomes_a_body_in_metres(person, tmp_path):
+    x, y = np.meshgrid(np.arange(-0.75, 0.75, 0.02), np.arange(-0.75, 0.75, 0.02))
+    at = np.arange(x.size).reshape(x.shape)
+    corners = np.stack([at[:-1, :-1], at[:-1, 1:], at[1:, 1:], at[1:, :-1]], axis=-1).reshape(-1, 4)
+    floor = np.column_stack([x.ravel(), y.ravel(), np.full(x.size, -0.001)])
+    faces = np.concatenate([person.mesh.faces, np.concatenate([corners[:, :3], corners[:, [0, 2, 3]]])
+                            + len(person.mesh.vertices)])
+    write_mesh(tmp_path / "scan.ply", Mesh(1000 * np.concatenate([person.mesh.vertices, floor]), faces))
+    body, texture, rows = read_scan(Inputs(tmp_path / "scan.ply"), None)
+    assert texture is None and np.ptp(body.vertices[:, 2]) == pytest.approx(1.82, abs=0.01)
+    assert np.abs(len(body.vertices) / len(person.mesh.vertices) - 1) < 0.02
+    assert any("mm" in str(row.value) for row in rows) and any("floor" in row.name for row in rows)
 
 
 def test_what_is_done_is_not_done_again(made, capsys):

@@ -71,7 +71,8 @@ def fit(scan: ScanArg, output: Output, features: Path | None = None, control: Pa
         features: Joint centres and points of the surface by name, any landmark file; for a folder of scans, the folder
             of such files.
         control: Control model of your own: a skinned GLB, or control.npz of another statue; else the generic humanoid.
-        unit: Unit of the scan and the features; else that in which the body would have a plausible height.
+        unit: Unit of the scan and the features; else metres with --features, and without them that in which the body
+            would be as tall as a person.
         size: Pixels of the images, each way.
         vectors: Store displacements of any direction, which also hold where the scan is folded.
         workers: Who fits the scans of a folder.

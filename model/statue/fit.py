@@ -48,11 +48,14 @@ class Posed:
         Its vertices after the warp of the head.
     hidden : (N,) bool
         Vertices of parts that the scan does not show.
+    face : int
+        Points of the face that shaped the head: none where fewer than four are known or all lie in one plane.
     """
 
     features: FeatureFit
     start: np.ndarray
     hidden: np.ndarray
+    face: int = 0
 
 
 def fit_statue(scan: Mesh, joints: Mapping[str, np.ndarray] | None = None,
@@ -84,7 +87,7 @@ def fit_statue(scan: Mesh, joints: Mapping[str, np.ndarray] | None = None,
     control, config = control or humanoid(), config or StatueConfig()
     if joints is None and points is None:
         found = find_features(control, scan)
-        posed = posed_automatically(control, found, config.features)
+        posed = posed_automatically(control, found)
     else:
         posed = posed_by_features(control, joints or {}, points or {}, config.features)
     surface = fit_surface(control.mesh, posed.start, scan, config.surface, progress, posed.hidden)
@@ -106,12 +109,12 @@ def posed_by_features(control: ControlModel, joints: Mapping[str, np.ndarray], p
     own = fit.vertices[[control.landmarks[name] for name in face]]
     try:
         goal = np.array([points[name] for name in face])
-        return Posed(fit, warp(fit.vertices, own, goal, head_share(control)), shown)
+        return Posed(fit, warp(fit.vertices, own, goal, head_share(control)), shown, len(face))
     except ValueError:                   # points in one plane say nothing of the shape of a head
         return Posed(fit, fit.vertices, shown)
 
 
-def posed_automatically(control: ControlModel, found: Features, config: FeatureConfig | None = None) -> Posed:
+def posed_automatically(control: ControlModel, found: Features) -> Posed:
     """The control model where `find_features` found the person.
 
     Its surface is then near the scan already; parts whose joint the scan does not show stand as the pose says.

@@ -34,7 +34,7 @@ from .detail.reconstruction import (
 from .detail.subdivision import Subdivision, subdivide, subdivide_adaptive
 from .files import save_statue, write_body, write_for_programs
 from .fit import Posed, StatueConfig, fitted_control, posed_automatically, posed_by_features
-from .registration.automatic import Features, find_features
+from .registration.automatic import Features, find_features, likely_unit
 from .registration.read_features import read_features
 from .registration.surface_fit import SurfaceFit, fit_surface
 from .report import Level, in_motion, parts_without_data, statue_page, statue_picture, upright_axis
@@ -80,19 +80,16 @@ class Work:
         return metrics
 
     def _fit(self, inputs: Inputs, room: Room) -> list[Metric]:
-        scan, texture, dropped = _read(inputs, self.unit)
+        scan, texture, rows = read_scan(inputs, self.unit)
         same = (self.control, self.config, self.unit, inputs)
         if inputs.features is None:
             found = room.step("features", (self.control, self.unit, inputs), lambda: find_features(self.control, scan))
-            metre = 1.0 if self.unit else UNITS[found.unit]
-            if metre != 1:
-                scan, texture = scan.with_vertices(metre * scan.vertices), texture and texture.scaled(metre)
-                found = in_metres(found, metre)
-            posed, rows = posed_automatically(self.control, found, self.config.features), _found(found, self.unit)
+            posed, more = posed_automatically(self.control, found), _found(found)
         else:
             joints, points = read_features(inputs.features, self.control, scan, self.unit)
             posed = posed_by_features(self.control, joints, points, self.config.features)
-            rows = [Metric("joints given", len(joints)), Metric("surface points given", len(points))]
+            more = [Metric("joints given", len(joints)), Metric("surface points given", len(points)),
+                    Metric("points of the face that shaped the head", posed.face)]
         surface = room.step("surface", same, lambda: fit_surface(self.control.mesh, posed.start, scan,
                                                                  self.config.surface, room.tell, posed.hidden))
         control = room.step("control", same, lambda: fitted_control(self.control, posed.features, surface, scan,
@@ -102,7 +99,7 @@ class Work:
         if texture is not None or scan.colors is not None:
             image = room.step("texture", same, lambda: bake_texture(control, map_, scan_look(texture or scan)))
             statue = replace(statue, texture=image)
-        return self._written(statue, scan, surface, [*dropped, *rows, *_posed(posed)], inputs, room)
+        return self._written(statue, scan, surface, [*rows, *more, *_posed(posed)], inputs, room)
 
     def _written(self, statue: Statue, scan: Mesh, surface: SurfaceFit, rows: list[Metric], inputs: Inputs, room: Room
                  ) -> list[Metric]:
@@ -122,21 +119,6 @@ class Work:
                            in_motion(statue), picture)
         page.write(folder / "report.html")
         return rows
-
-
-def in_metres(found: Features, metre: float) -> Features:
-    """Features of a scan in another unit, in metres."""
-    def scaled(mesh: Mesh | None) -> Mesh | None:
-        return None if mesh is None else mesh.with_vertices(metre * mesh.vertices)
-
-    fit = found.fit
-    if fit is not None:
-        fit = replace(fit, lengths=metre * fit.lengths, size=metre * fit.size, trans=metre * fit.trans,
-                      vertices=metre * fit.vertices, joints=metre * fit.joints, joint_rms=metre * fit.joint_rms,
-                      point_rms=metre * fit.point_rms)
-    return replace(found, joints={name: metre * place for name, place in found.joints.items()},
-                   points={name: metre * place for name, place in found.points.items()},
-                   registered=scaled(found.registered), fit=fit)
 
 
 def measured_levels(statue: Statue, scan: Mesh) -> tuple[list[Level], Subdivision]:
@@ -179,27 +161,34 @@ def statue_problem(statue: Statue) -> str | None:
             "features given by hand (--features) may help")
 
 
-def _read(inputs: Inputs, unit: Unit | None) -> tuple[Mesh, Texture | None, list[Metric]]:
-    """The body of a scan in metres (as far as the unit is known), its texture, and what was left out."""
+def read_scan(inputs: Inputs, unit: Unit | None) -> tuple[Mesh, Texture | None, list[Metric]]:
+    """The body of a scan and its texture in metres, and what was left out.
+
+    Without a unit it is metres where features are given, which may be on anything, else that of a person.
+    """
+    sought = unit is None and inputs.features is None
     with warnings.catch_warnings():
-        warnings.filterwarnings("ignore", ".*when read as metres", UserWarning)     # the unit is looked for later
+        if sought:
+            warnings.filterwarnings("ignore", ".*when read as metres", UserWarning)
         scan, texture = read_mesh(inputs.scan, unit), read_texture(inputs.scan, unit)
-    cleaned = clean_scan(scan)
-    left = 1 - float(cleaned.kept.mean())
     rows = [Metric("scan, triangles", len(scan.faces))]
+    metre = UNITS[likely_unit(scan.vertices)] if sought else 1.0
+    cleaned = clean_scan(scan.with_vertices(metre * scan.vertices))
+    body = cleaned.mesh
+    if sought:                               # once more of the body alone: a floor may be of any size
+        likely = likely_unit(body.vertices / metre)
+        body, metre = body.with_vertices(UNITS[likely] / metre * body.vertices), UNITS[likely]
+        rows.append(Metric("unit of the scan", f"{likely}, from the height of the body"))
+    left = 1 - float(cleaned.kept.mean())
     if left > 0:
         rows.append(Metric("left out as floor, furniture, specks", 100 * left, "% of the points"))
-    return cleaned.mesh, texture, rows
+    return body, texture and texture.scaled(metre), rows
 
 
-def _found(found: Features, unit: Unit | None) -> list[Metric]:
+def _found(found: Features) -> list[Metric]:
     """What was found without a click."""
-    rows = [Metric("unit of the scan", unit or f"{found.unit}, from the height of the body")]
-    if found.missing:
-        rows.append(Metric("not seen in the scan", ", ".join(found.missing)))
-    if found.problem:
-        rows.append(Metric("look at it", found.problem))
-    return rows
+    return [*([Metric("not seen in the scan", ", ".join(found.missing))] if found.missing else []),
+            *([Metric("look at it", found.problem)] if found.problem else [])]
 
 
 def _posed(posed: Posed) -> list[Metric]:
