@@ -8,8 +8,8 @@ import numpy as np
 from scanprep.geometry import storage
 
 from .body import body_model, people_poses
+from .control.files import read_control, write_control
 from .control.humanoid import humanoid, humanoid_markers
-from .control.model import ControlModel
 from .detail.images import read_map, write_map
 from .detail.normal_image import normal_image
 from .detail.subdivision import Subdivision
@@ -30,7 +30,7 @@ def save_statue(folder: str | Path, statue: Statue) -> None:
 
     folder = Path(folder)
     folder.mkdir(parents=True, exist_ok=True)
-    statue.control.save(folder / CONTROL)
+    write_control(statue.control, folder / CONTROL)
     write_map(folder, statue.map)
     if statue.texture is not None:
         with storage.writing(folder / TEXTURE) as beside:
@@ -61,7 +61,7 @@ def load_statue(folder: str | Path, edited: str | Path | None = None) -> Statue:
     if about.get("version") != VERSION:
         raise storage.StorageError(f"{folder / ABOUT}: statue version {about.get('version')} is not known here "
                                    f"(known: {VERSION})")
-    control = ControlModel.load(folder / CONTROL)
+    control = read_control(folder / CONTROL)
     texture = None
     with storage.taking_apart(folder / ABOUT, "a whole statue"):
         pose = storage.numbers({"pose": np.array(about["pose"], dtype=np.float64)}, "pose",

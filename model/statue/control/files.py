@@ -16,7 +16,7 @@ KIND, VERSION = "control model", 1
 
 
 def read_control(path: str | Path) -> ControlModel:
-    """A control model: a file of `ControlModel.save`, or a skinned mesh in a GLB file as Blender exports it.
+    """A control model: a file of `write_control`, or a skinned mesh in a GLB file as Blender exports it.
 
     Of a skinned mesh the pose of the file is the default pose, turned so that z is up; vertices that stand at one place
     are one; joints turn about three axes with wide limits, every part is a segment of its own, and there are no
@@ -30,7 +30,7 @@ def read_control(path: str | Path) -> ControlModel:
     """
     path = Path(path)
     if path.suffix.lower() == ".npz":
-        return load(path)
+        return _load(path)
     if path.suffix.lower() == ".glb":
         from .glb import read_skinned
 
@@ -38,8 +38,8 @@ def read_control(path: str | Path) -> ControlModel:
     raise storage.StorageError(f"{path}: expected a control model in .npz or a skinned mesh in .glb")
 
 
-def save(control: ControlModel, path: str | Path) -> None:
-    """`ControlModel.save`."""
+def write_control(control: ControlModel, path: str | Path) -> None:
+    """Write one `.npz` file, which `read_control` reads."""
     skeleton = control.skeleton
     storage.save(path, KIND, VERSION, {
         "vertices": control.mesh.vertices, "faces": control.mesh.faces.astype(np.int32),
@@ -51,8 +51,8 @@ def save(control: ControlModel, path: str | Path) -> None:
         {"names": list(skeleton.names), "segments": list(control.segments), "landmarks": list(control.landmarks)})
 
 
-def load(path: str | Path) -> ControlModel:
-    """`ControlModel.load`."""
+def _load(path: str | Path) -> ControlModel:
+    """A file of `write_control`."""
     header, arrays = storage.load(path, KIND, (VERSION,))
     with storage.taking_apart(path, "a whole control model"):
         freedom = storage.numbers(arrays, "freedom", None, kinds="iu")

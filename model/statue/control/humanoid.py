@@ -10,6 +10,7 @@ import numpy as np
 from scanprep.scanning.people_anatomy import Anatomy
 from scanprep.skeleton.tree import Skeleton
 
+from .files import read_control
 from .model import ControlModel
 
 STORED = Path(__file__).with_name("humanoid.npz")
@@ -39,7 +40,7 @@ def humanoid() -> ControlModel:
 
     [Statues] Section 3.1
     """
-    return ControlModel.load(STORED)
+    return read_control(STORED)
 
 
 @lru_cache(maxsize=1)
@@ -53,7 +54,7 @@ def humanoid_markers() -> dict[str, int]:
 
 
 def build() -> ControlModel:
-    """The humanoid from scratch, half a minute; `build().save(STORED)` keeps it."""
+    """The humanoid from scratch, half a minute; `write_control(build(), STORED)` keeps it."""
     from scanprep.scanning.people_marks import landmarks
     from scanprep.scanning.people_template import CANONICAL
 

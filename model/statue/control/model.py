@@ -3,7 +3,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import cached_property
-from pathlib import Path
 
 import numpy as np
 
@@ -51,25 +50,6 @@ class ControlModel:
     limits: tuple[np.ndarray, ...]
     segments: tuple[str, ...]
     segment_of_part: np.ndarray
-
-    def save(self, path: str | Path) -> None:
-        """Write one `.npz` file, which `load` and `read_control` read."""
-        from .files import save
-
-        save(self, path)
-
-    @staticmethod
-    def load(path: str | Path) -> ControlModel:
-        """Read a file of `save`.
-
-        Raises
-        ------
-        StorageError
-            Missing, damaged, of another kind or version, or what it holds is no control model.
-        """
-        from .files import load
-
-        return load(path)
 
     @cached_property
     def rig(self) -> Rig:
