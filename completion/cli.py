@@ -22,7 +22,7 @@ def read_model(path: Path | None) -> tuple[BodyModel, str]:
     """
     from model.files import load_model
 
-    from .embedded import embedded_model, embedded_path
+    from .synthetic_model import embedded_model, embedded_path
 
     if path is not None:
         return load_model(path), str(path)

@@ -4,7 +4,7 @@ from __future__ import annotations
 import numpy as np
 from scipy.sparse import csc_array, diags_array
 
-from scanprep.cleaning.remesh import clamped_cotangents
+from scanprep.decimation.remeshing import clamped_cotangents
 from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.sparse import factor
 from scanprep.skeleton.tree import Skeleton

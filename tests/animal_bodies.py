@@ -10,12 +10,12 @@ from functools import cached_property, lru_cache
 
 import numpy as np
 
-from scanprep.cleaning.decimate import decimate
+from scanprep.decimation.decimate import decimate
 from scanprep.geometry import rotations
 from scanprep.geometry.mesh import Mesh
-from scanprep.scanning.people_field import Field, Group, RoundCone, project
-from scanprep.scanning.people_remesh import polygonise
 from scanprep.skeleton.tree import Skeleton
+from scanprep.synthetic.implicit_surface import Field, Group, RoundCone, project
+from scanprep.synthetic.triangulation import polygonise
 
 NAMES = ("barrel", "neck", "head", "tail", "fore left", "fore left cannon", "fore right", "fore right cannon",
          "hind left", "hind left cannon", "hind right", "hind right cannon")

@@ -9,7 +9,7 @@ from model.coregistration.config import CoregistrationConfig, ModelFitConfig
 from model.learning.scape import LearnConfig
 from scanprep import console
 from scanprep.batch.pool import Workers
-from scanprep.matching.schedule import GraphStage, RegistrationConfig, ShellStage
+from scanprep.registration.schedule import GraphStage, RegistrationConfig, ShellStage
 
 QUICK = CoregistrationConfig(
     fit=ModelFitConfig(axes=2, turns=2),

@@ -12,10 +12,10 @@ from conformance_bodies import KINDS
 from model_bodies import random_poses, worm, worm_skeleton
 
 from completion import MarkerLayout, MarkerSequence, read_markers, write_markers
-from completion.animation.cli import read_betas_to
-from completion.markers.replacing import replace_points
-from completion.moshing.command.recordings import _table_rows
-from completion.moshing.results import SoftTissue
+from completion.mocap.animate.cli import read_betas_to
+from completion.mocap.files.c3d_points import replace_points
+from completion.mocap.mosh.recordings import _table_rows
+from completion.mocap.results import SoftTissue
 from completion.motion import Motion
 from completion.partial.completion import Completion
 from completion.partial.masks import read_mask
@@ -28,20 +28,20 @@ from model.files import load_model
 from model.learning.cli import _read_sexes
 from scanprep import Mesh, RegisteredSet, read_landmarks, read_mesh, write_landmarks, write_mesh
 from scanprep.cleaning.cli import _read_views
-from scanprep.cleaning.decimate_set import DecimateSetConfig
-from scanprep.cleaning.decimate_set_files import _load_map, write_decimated_set
+from scanprep.correspondence.correspondences import Correspondences
+from scanprep.correspondence.files import read_correspondences, write_correspondences
+from scanprep.decimation.registered_set import DecimateSetConfig
+from scanprep.decimation.registered_set_files import _load_map, write_decimated_set
 from scanprep.geometry import storage
 from scanprep.geometry.files import PointCloud, read_points, write_points
 from scanprep.geometry.landmarks import read_landmark_vertices
-from scanprep.matching.correspondence_files import read_correspondences, write_correspondences
-from scanprep.matching.correspondences import Correspondences
 from scanprep.pictures.textures import Texture, read_texture, write_textured
 from scanprep.pipeline.scans import find_scans
-from scanprep.scanning.embedded import GroundTruth, _write_views, read_views
-from scanprep.scanning.people_anatomy import BodyShape
-from scanprep.scanning.scanner import RangeView, Scan
 from scanprep.skeleton.edit import read_edits
 from scanprep.skeleton.tree import Skeleton
+from scanprep.synthetic.anatomy import BodyShape
+from scanprep.synthetic.data_set import GroundTruth, _write_views, read_views
+from scanprep.synthetic.scanner import RangeView, Scan
 
 MARKS = {"nose": 3, "left": 100, "right": 200, "tail": 380}
 

@@ -14,9 +14,9 @@ from completion_bodies import MEAN, worm_with_prior
 
 from completion import MarkerLayout, MarkerSequence, write_markers
 from completion.__main__ import main
-from completion.animation import report as animation_report
-from completion.moshing.command import cli, pictures, report
-from completion.moshing.command.work import Work
+from completion.mocap.animate import report as animation_report
+from completion.mocap.mosh import cli, pictures, report
+from completion.mocap.mosh.work import Work
 from scanprep.batch.workspace import HOME
 
 FRAMES = 40
@@ -24,11 +24,12 @@ BETAS = {"ann": np.array([0.9, -0.6, 0.4]), "bob": np.array([-0.8, 0.5, -0.3])}
 TAKES = (("ann", "walk", 0.0), ("ann", "run", 1.0), ("bob", "jump", 0.5))
 QUICK = ("--keys", "5", "--person.frames", "4", "--person.start-axes", "1", "--person.annealing", "4", "1",
          "--person.iterations", "4")
-STAGES = {"start": "completion.moshing.person.FrameStarts.find", "solve": "completion.moshing.person.LatentFit.solve",
-          "poses": "completion.moshing.capture.follow_poses", "faults": "completion.moshing.capture.find_faults",
-          "soft": "completion.moshing.capture.follow_soft_tissue",
-          "files": "completion.moshing.command.work.write_take", "page": "completion.moshing.command.work.take_page",
-          "person page": "completion.moshing.command.work.person_page"}
+STAGES = {"start": "completion.mocap.subject.person.FrameStarts.find",
+          "solve": "completion.mocap.subject.person.LatentFit.solve",
+          "poses": "completion.mocap.mosh.mosh.follow_poses", "faults": "completion.mocap.mosh.mosh.find_faults",
+          "soft": "completion.mocap.mosh.mosh.follow_soft_tissue",
+          "files": "completion.mocap.mosh.work.write_take", "page": "completion.mocap.mosh.work.take_page",
+          "person page": "completion.mocap.mosh.work.person_page"}
 TIMES = ("s", "frames/s")            # units of figures that differ between two runs
 
 

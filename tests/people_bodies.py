@@ -5,7 +5,7 @@ from functools import lru_cache
 
 import numpy as np
 
-from completion.embedded import EmbeddedRecipe, build_embedded
+from completion.synthetic_model import EmbeddedRecipe, build_embedded
 from model.body import BodyModel
 from model.learning.scape import LearnConfig
 

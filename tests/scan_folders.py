@@ -9,10 +9,10 @@ import numpy as np
 
 from scanprep import Mesh, write_landmarks, write_mesh
 from scanprep.batch.pool import Workers
-from scanprep.matching.nonrigid import GraphStage, RegistrationConfig, ShellStage
 from scanprep.pipeline.prepare import PrepareConfig, prepare
 from scanprep.pipeline.scan import ScanSettings
 from scanprep.pipeline.scans import find_scans
+from scanprep.registration.nonrigid import GraphStage, RegistrationConfig, ShellStage
 
 MARKS = {"top": 0, "left": 1, "right": 2, "front": 3, "back": 4}
 QUICK = PrepareConfig(ScanSettings(RegistrationConfig(

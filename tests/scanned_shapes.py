@@ -8,7 +8,7 @@ from scanprep.pictures.glyphs import sphere
 
 def ball(divisions: int = 4, radius: float = 0.1) -> Mesh:
     """A closed sphere with vertices on the exact surface."""
-    from scanprep.cleaning.repair import weld
+    from scanprep.repair.manifold import weld
 
     vertices, faces = sphere(divisions)
     return weld(Mesh(radius * vertices, faces), 1e-9)

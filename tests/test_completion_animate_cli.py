@@ -7,9 +7,9 @@ from completion_bodies import MEAN, worm_with_prior
 from glb_reader import Glb
 
 from completion.__main__ import main
-from completion.animation import report
-from completion.markers.files import MarkerSequence, write_markers
-from completion.markers.layout import MarkerLayout
+from completion.mocap.animate import report
+from completion.mocap.files.markers import MarkerSequence, write_markers
+from completion.mocap.marker_sets.layout import MarkerLayout
 from completion.motion import Motion
 
 FRAMES = 30

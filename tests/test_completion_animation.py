@@ -4,11 +4,11 @@ from completion_bodies import MEAN, worm_with_prior
 from scipy.linalg import block_diag
 
 from completion import energy
-from completion.animation.follow import AnimateConfig, MarkerFollower, animate
-from completion.animation.marked import supports
-from completion.animation.smooth import smooth_sequence
-from completion.markers.files import MarkerSequence
-from completion.markers.layout import MarkerLayout
+from completion.mocap.files.markers import MarkerSequence
+from completion.mocap.marker_sets.layout import MarkerLayout
+from completion.mocap.pose.follow import AnimateConfig, MarkerFollower, animate
+from completion.mocap.pose.marked_body import supports
+from completion.mocap.pose.smooth import smooth_sequence
 from completion.motion import Motion
 from scanprep.geometry import rotations
 from scanprep.geometry.storage import StorageError
@@ -133,8 +133,8 @@ def test_windows_agree_with_the_whole(subject, layout, walk, monkeypatch):
     follower = MarkerFollower(subject, walk[1], layout, PLAIN)
     x = np.random.default_rng(0).normal(0, 0.02, (FRAMES, 15))
     whole = smooth_sequence(follower, x)
-    monkeypatch.setattr("completion.animation.smooth.WINDOW", 20)
-    monkeypatch.setattr("completion.animation.smooth.OVERLAP", 15)
+    monkeypatch.setattr("completion.mocap.pose.smooth.WINDOW", 20)
+    monkeypatch.setattr("completion.mocap.pose.smooth.OVERLAP", 15)
     assert np.abs(smooth_sequence(follower, x) - whole).max() < 0.02 * np.abs(whole - x).max()
 
 

@@ -9,8 +9,8 @@ from scanprep.geometry.files import PointCloud
 from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.surface import Surface
 from scanprep.pictures.textures import Texture, bake, read_texture, write_textured
-from scanprep.scanning.people import Person
-from scanprep.scanning.scanner import ScannerConfig, scan
+from scanprep.synthetic.people import Person
+from scanprep.synthetic.scanner import ScannerConfig, scan
 
 
 def paint(points):

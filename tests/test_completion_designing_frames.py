@@ -3,9 +3,9 @@ import numpy as np
 import pytest
 from completion_bodies import worm_with_prior
 
-from completion.designing.frames import FrameConfig, FrameInformation, informative_frames
-from completion.designing.points import BodyPoints
-from completion.markers.layout import MarkerLayout
+from completion.mocap.marker_selection.frames import FrameConfig, FrameInformation, informative_frames
+from completion.mocap.marker_selection.points import BodyPoints
+from completion.mocap.marker_sets.layout import MarkerLayout
 from completion.priors import gaussian_prior
 from model.fitting import spread_vertices
 

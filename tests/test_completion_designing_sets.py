@@ -6,15 +6,15 @@ import numpy as np
 import pytest
 from completion_bodies import worm_with_prior
 
-from completion.designing.fits import prior_around, rough_poses, vertex_errors
-from completion.designing.greedy import ADD, REMOVE, MarkerSets, exchange, walk
-from completion.designing.joint import shared_shape
-from completion.designing.linear import LinearBodies, fit_bodies
-from completion.designing.pairs import symmetric_groups
-from completion.designing.points import BodyPoints
-from completion.designing.sets import design_markers
-from completion.designing.settings import DesignConfig
-from completion.markers.layout import MarkerLayout
+from completion.mocap.marker_selection.fits import prior_around, rough_poses, vertex_errors
+from completion.mocap.marker_selection.greedy import ADD, REMOVE, MarkerSets, exchange, walk
+from completion.mocap.marker_selection.joint import shared_shape
+from completion.mocap.marker_selection.linear import LinearBodies, fit_bodies
+from completion.mocap.marker_selection.pairs import symmetric_groups
+from completion.mocap.marker_selection.points import BodyPoints
+from completion.mocap.marker_selection.sets import design_markers
+from completion.mocap.marker_selection.settings import DesignConfig
+from completion.mocap.marker_sets.layout import MarkerLayout
 from model.fitting import spread_vertices
 from scanprep.geometry import rotations
 

@@ -7,13 +7,13 @@ import numpy as np
 import pytest
 from model_bodies import worm_model
 
-from completion import embedded
+from completion import synthetic_model as embedded
 from completion.cli import read_landmark_pairs, read_model
-from completion.embedded import EmbeddedRecipe, cache_folder, embedded_model, embedded_path
+from completion.synthetic_model import EmbeddedRecipe, cache_folder, embedded_model, embedded_path
 from model import LearnConfig, fit_pose
-from scanprep.scanning.embedded import SUBJECT
-from scanprep.scanning.people import Person, random_pose
-from scanprep.scanning.people_marks import landmarks, markers
+from scanprep.synthetic.data_set import SUBJECT
+from scanprep.synthetic.landmarks import landmarks, markers
+from scanprep.synthetic.people import Person, random_pose
 
 SMALL = EmbeddedRecipe(poses=6, people=3, faces=2400, learn=LearnConfig(components=2, refinements=0, steps=0))
 

@@ -6,13 +6,14 @@ import pytest
 from people_bodies import small_people
 
 from completion.__main__ import main
-from completion.markers import carry, pictures
-from completion.markers.layout import MarkerLayout
-from completion.markers.named import layout_names
-from completion.markers.pictures import marker_rows, picture_layout
+from completion.mocap.marker_sets import pictures
+from completion.mocap.marker_sets import transfer as carry
+from completion.mocap.marker_sets.layout import MarkerLayout
+from completion.mocap.marker_sets.named import layout_names
+from completion.mocap.marker_sets.pictures import marker_rows, picture_layout
 from scanprep import read_mesh, write_landmarks, write_mesh
-from scanprep.matching.nonrigid import Registration
-from scanprep.scanning.people import Person
+from scanprep.registration.nonrigid import Registration
+from scanprep.synthetic.people import Person
 
 
 @pytest.fixture(autouse=True)

@@ -5,12 +5,12 @@ import numpy as np
 import pytest
 from people_bodies import kept, small_people
 
-from completion.markers.layout import MarkerLayout
-from completion.markers.named import FOLDER, faces_digest, fitting_layout, layout_names
+from completion.mocap.marker_sets.layout import MarkerLayout
+from completion.mocap.marker_sets.named import FOLDER, faces_digest, fitting_layout, layout_names
 from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.rotations import exp
 from scanprep.geometry.surface import Surface
-from scanprep.scanning.people import Person
+from scanprep.synthetic.people import Person
 
 COUNTS = {"biomech57": 57, "cmu41": 41, "helenhayes29": 29, "mosh67": 67, "plugingait39": 39, "vicon47": 47}
 MIDDLE = {"C7", "T10", "CLAV", "STRN", "CV7", "TV2", "TV7", "SJN", "SXS", "Top.Head", "Front.Head", "Rear.Head",

@@ -5,12 +5,12 @@ import numpy as np
 import pytest
 from people_bodies import kept, small_people
 
-from completion.animation.follow import AnimateConfig, animate
-from completion.animation.shape import MarkerShapeConfig, spread_frames, subject_from_markers
-from completion.animation.shared import minimise_shared
-from completion.markers.files import MarkerSequence
-from completion.markers.layout import MarkerLayout
-from scanprep.scanning.people import BodyShape, Person, walk
+from completion.mocap.files.markers import MarkerSequence
+from completion.mocap.marker_sets.layout import MarkerLayout
+from completion.mocap.pose.follow import AnimateConfig, animate
+from completion.mocap.subject.marker_shape import MarkerShapeConfig, spread_frames, subject_from_markers
+from completion.mocap.subject.shared import minimise_shared
+from scanprep.synthetic.people import BodyShape, Person, walk
 
 BETAS = np.array([1.2, -0.8, 0.6, -0.5])
 CONFIG = MarkerShapeConfig(frames=6)

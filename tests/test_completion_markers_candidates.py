@@ -4,14 +4,14 @@ from itertools import pairwise
 import numpy as np
 import pytest
 
-from completion.markers.candidates import CandidateConfig, candidate_layout, sitting_room
-from completion.markers.layout import DISTANCE, MarkerLayout
-from completion.markers.symmetry import find_skin_mirror
+from completion.mocap.marker_selection.candidates import CandidateConfig, candidate_layout, sitting_room
+from completion.mocap.marker_sets.layout import DISTANCE, MarkerLayout
+from completion.mocap.marker_sets.symmetry import find_skin_mirror
 from scanprep.geometry.geodesics import SurfaceGraph
 from scanprep.geometry.rotations import exp
-from scanprep.scanning.people import Person
-from scanprep.scanning.people_marks import landmarks
-from scanprep.scanning.people_template import load
+from scanprep.synthetic.landmarks import landmarks
+from scanprep.synthetic.people import Person
+from scanprep.synthetic.topology import load
 
 
 @pytest.fixture(scope="module")

@@ -5,13 +5,13 @@ import numpy as np
 import pytest
 from people_bodies import kept, small_people
 
-from completion.markers.carry import CarryConfig, carry_layout, register_layout
-from completion.markers.layout import MarkerLayout
-from completion.markers.symmetry import skin_points
-from scanprep.cleaning.decimate import decimate
+from completion.mocap.marker_sets.layout import MarkerLayout
+from completion.mocap.marker_sets.symmetry import skin_points
+from completion.mocap.marker_sets.transfer import CarryConfig, carry_layout, register_layout
+from scanprep.decimation.decimate import decimate
 from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.rotations import exp
-from scanprep.matching.schedule import RegistrationConfig
+from scanprep.registration.schedule import RegistrationConfig
 
 NEAR = CarryConfig(None, replace(RegistrationConfig(), graph=()))          # bodies that lie on each other already
 

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from completion.markers.files import MarkerFileError, MarkerSequence, read_markers, write_markers
+from completion.mocap.files.markers import MarkerFileError, MarkerSequence, read_markers, write_markers
 
 ezc3d = pytest.importorskip("ezc3d")
 

@@ -4,8 +4,8 @@ import json
 import numpy as np
 import pytest
 
-from completion.markers.files import MarkerFileError
-from completion.markers.layout import MarkerLayout
+from completion.mocap.files.markers import MarkerFileError
+from completion.mocap.marker_sets.layout import MarkerLayout
 from scanprep.geometry.mesh import Mesh
 
 MESH = Mesh([[0, 0, 0], [1, 0, 0], [1, 1, 0], [0, 1, 0]], [[0, 1, 2], [0, 2, 3]])       # faces +z

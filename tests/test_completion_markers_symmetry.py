@@ -2,9 +2,9 @@
 import numpy as np
 import pytest
 
-from completion.markers.layout import MarkerLayout
-from completion.markers.named import layout_names
-from completion.markers.symmetry import (
+from completion.mocap.marker_sets.layout import MarkerLayout
+from completion.mocap.marker_sets.named import layout_names
+from completion.mocap.marker_sets.symmetry import (
     find_skin_mirror,
     label_pairs,
     marker_pairs,
@@ -14,8 +14,8 @@ from completion.markers.symmetry import (
     skin_points,
 )
 from scanprep.geometry.rotations import exp
-from scanprep.scanning.people import Person
-from scanprep.scanning.people_template import load
+from scanprep.synthetic.people import Person
+from scanprep.synthetic.topology import load
 
 PAIRS = [("LELB", "RELB"), ("L.Knee", "R.Knee"), ("left elbow", "right elbow"), ("Left Toe", "Right Toe"),
          ("LEFT_TOE", "RIGHT_TOE"), ("elbow_l", "elbow_r"), ("KneeL", "KneeR"), ("toe in left leg", "toe in right leg"),

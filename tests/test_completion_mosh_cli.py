@@ -11,10 +11,10 @@ from mosh_folders import FRAMES, QUICK, run, small_pictures, write_people
 
 from completion import MarkerLayout, MarkerSequence, Motion, read_markers, write_markers
 from completion.__main__ import main
-from completion.moshing.command.pictures import every
-from completion.moshing.command.recordings import Grouping, find_actors
-from completion.moshing.command.takes import held_out
-from completion.moshing.results import SoftTissue
+from completion.mocap.mosh.pictures import every
+from completion.mocap.mosh.recordings import Grouping, find_actors
+from completion.mocap.mosh.takes import held_out
+from completion.mocap.results import SoftTissue
 from model.learning.sex_plane import SexPlane
 
 PERSON = {"subject.json", "layout.json", "report.html", "report.json", "picture.png"}

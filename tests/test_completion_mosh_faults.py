@@ -6,18 +6,18 @@ import numpy as np
 import pytest
 from completion_bodies import MEAN, worm_with_prior
 
-from completion.animation.follow import AnimateConfig, animate
-from completion.markers.files import MarkerSequence
-from completion.markers.layout import MarkerLayout
-from completion.moshing.faults.badspans import find_bad, without_lost_limbs
-from completion.moshing.faults.chart import chart_faults
-from completion.moshing.faults.doubts import exchanged_after_all
-from completion.moshing.faults.exchanges import Evidence, _two_states, find_order, listed
-from completion.moshing.faults.search import find_faults
-from completion.moshing.faults.simulation import Simulation, bridged
-from completion.moshing.faults.tracks import TORN, Tracks
-from completion.moshing.results import BadSpan
-from completion.moshing.settings import FaultConfig
+from completion.mocap.artefacts.ambiguous_swaps import exchanged_after_all
+from completion.mocap.artefacts.chart import chart_faults
+from completion.mocap.artefacts.find import find_faults
+from completion.mocap.artefacts.simulated import Simulation, bridged
+from completion.mocap.artefacts.slips import find_bad, without_lost_limbs
+from completion.mocap.artefacts.swaps import Evidence, _two_states, find_order, listed
+from completion.mocap.artefacts.tracks import TORN, Tracks
+from completion.mocap.files.markers import MarkerSequence
+from completion.mocap.marker_sets.layout import MarkerLayout
+from completion.mocap.pose.follow import AnimateConfig, animate
+from completion.mocap.results import BadSpan
+from completion.mocap.settings import FaultConfig
 from scanprep.geometry import rotations
 
 FRAMES, RATE = 160, 100.0

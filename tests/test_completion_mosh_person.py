@@ -6,14 +6,14 @@ import pytest
 from completion_bodies import worm_with_prior
 
 from completion import MoshConfig, PersonConfig, find_person, mosh
-from completion.animation.follow import animate
-from completion.animation.shared import minimise_arrow
-from completion.markers.files import MarkerSequence
-from completion.markers.layout import MarkerLayout
-from completion.moshing.attachment import latent_markers
-from completion.moshing.person import choose_frames, common_markers
-from completion.moshing.poses import animate_config, follow_poses
-from completion.moshing.settings import FollowConfig
+from completion.mocap.files.markers import MarkerSequence
+from completion.mocap.marker_sets.layout import MarkerLayout
+from completion.mocap.pose.follow import animate
+from completion.mocap.pose.mosh_poses import animate_config, follow_poses
+from completion.mocap.settings import FollowConfig
+from completion.mocap.subject.attachment import latent_markers
+from completion.mocap.subject.person import choose_frames, common_markers
+from completion.mocap.subject.shared import minimise_arrow
 from scanprep.geometry import rotations
 from scanprep.geometry.surface import Surface
 

@@ -8,7 +8,7 @@ import pytest
 from mosh_folders import QuietWork, contents, counted, run, write_people
 
 from completion import MarkerLayout, MarkerSequence, read_markers, write_markers
-from completion.moshing.command import cli
+from completion.mocap.mosh import cli
 from model import load_model
 from scanprep.batch import room
 from scanprep.batch.room import Room
@@ -169,7 +169,7 @@ def test_a_second_run_leaves(copied, capsys):
 
 
 def test_figures_that_mean_nothing_are_a_failure(place, tmp_path, monkeypatch, capsys):
-    from completion.moshing.command import work
+    from completion.mocap.mosh import work
     from scanprep.console import Metric
 
     done = work.mosh_person

@@ -6,8 +6,8 @@ import pytest
 from completion_bodies import MEAN, worm_with_prior
 
 from completion import MarkerLayout, MarkerSequence, mosh_by_sex
-from completion.moshing.settings import MoshConfig, PersonConfig
-from completion.moshing.sex import checked_models
+from completion.mocap.settings import MoshConfig, PersonConfig
+from completion.mocap.subject.sex import checked_models
 from model.learning.sex_plane import PLANE, learn_sex_plane
 
 QUICK = MoshConfig(person=PersonConfig(frames=4, start_axes=1, annealing=(4.0, 1.0), iterations=6), soft_tissue=False)

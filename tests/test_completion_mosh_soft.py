@@ -9,14 +9,14 @@ import pytest
 from conformance_bodies import KINDS
 
 from completion import MarkerLayout, MarkerSequence, Motion, follow_soft_tissue
-from completion.animation.marked import supports
 from completion.energy import lifted
-from completion.moshing.changing import changing_bodies, skin_movement
-from completion.moshing.results import SoftTissue
-from completion.moshing.settings import SoftTissueConfig
-from completion.moshing.soft import SoftFollower, cheap_directions
-from completion.moshing.steadiness import steady_changes
-from completion.moshing.swaying import SwayingBody, skin_metric
+from completion.mocap.pose.marked_body import supports
+from completion.mocap.results import SoftTissue
+from completion.mocap.settings import SoftTissueConfig
+from completion.mocap.soft_tissue.changing_bodies import changing_bodies, skin_movement
+from completion.mocap.soft_tissue.equations import SwayingBody, skin_metric
+from completion.mocap.soft_tissue.soft_tissue import SoftFollower, cheap_directions
+from completion.mocap.soft_tissue.temporal_smoothness import steady_changes
 from model.body import BodyModel
 from scanprep.geometry import rotations
 from scanprep.geometry.storage import StorageError

@@ -3,13 +3,13 @@ import pytest
 from completion_bodies import worm_with_prior
 
 from completion import energy
-from completion.animation.marked import supports
 from completion.bodies import FixedBody
 from completion.energy import MovingPoints
-from completion.markers.layout import MarkerLayout
-from completion.moshing import terms
-from completion.moshing.attachment import above_triangles, latent_markers, signed_distance, simulated
-from completion.moshing.terms import LatentPoints
+from completion.mocap.marker_sets.layout import MarkerLayout
+from completion.mocap.pose.marked_body import supports
+from completion.mocap.subject import terms
+from completion.mocap.subject.attachment import above_triangles, latent_markers, signed_distance, simulated
+from completion.mocap.subject.terms import LatentPoints
 from completion.priors import gaussian_prior
 from scanprep.geometry import rotations
 from scanprep.geometry.mesh import Mesh

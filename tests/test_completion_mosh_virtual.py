@@ -4,11 +4,11 @@ import struct
 import numpy as np
 import pytest
 
-from completion.markers.c3d import _Numbers, point_table
-from completion.markers.files import MarkerFileError, MarkerSequence, read_markers
-from completion.markers.replacing import replace_points
-from completion.moshing.faults.virtual import fault_table, write_virtual
-from completion.moshing.results import BadSpan, Exchange, MarkerFaults
+from completion.mocap.artefacts.virtual import fault_table, write_virtual
+from completion.mocap.files.c3d import _Numbers, point_table
+from completion.mocap.files.c3d_points import replace_points
+from completion.mocap.files.markers import MarkerFileError, MarkerSequence, read_markers
+from completion.mocap.results import BadSpan, Exchange, MarkerFaults
 
 ezc3d = pytest.importorskip("ezc3d")
 LABELS = ("LFHD", "RFHD", "C7", "Free")

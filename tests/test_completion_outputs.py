@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from completion_bodies import MEAN, worm_with_prior
 
-from completion.animation.outputs import (
+from completion.mocap.files.motion_tables import (
     joint_angles,
     joint_centres,
     rest_skeleton,
@@ -14,7 +14,7 @@ from completion.animation.outputs import (
     write_motion_bvh,
     write_residuals,
 )
-from completion.animation.retarget import betas_over_time, lowest, morphed_vertices, retarget, world_up
+from completion.mocap.retargeting.retarget import betas_over_time, lowest, morphed_vertices, retarget, world_up
 from completion.motion import Motion
 from scanprep.geometry.rotations import exp
 from scanprep.pictures.views import upright

@@ -5,8 +5,8 @@ from completion_bodies import half_view, worm_with_prior
 from completion import energy
 from completion.bodies import FixedBody
 from completion.partial.completion import complete
-from completion.partial.contact import Contact
 from completion.partial.draws import limbs, redrawn
+from completion.partial.self_intersection import Contact
 from completion.partial.settings import CompletionConfig
 from completion.priors import gaussian_prior
 from scanprep.geometry import rotations

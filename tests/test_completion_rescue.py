@@ -3,10 +3,10 @@ import numpy as np
 import pytest
 from completion_bodies import MEAN, worm_with_prior
 
-from completion.animation.marked import MarkedBody
-from completion.animation.rescue import rescue_limbs
-from completion.animation.settings import AnimateConfig
-from completion.markers.layout import MarkerLayout
+from completion.mocap.marker_sets.layout import MarkerLayout
+from completion.mocap.pose.marked_body import MarkedBody
+from completion.mocap.pose.reinitialise import rescue_limbs
+from completion.mocap.pose.settings import AnimateConfig
 
 CONFIG = AnimateConfig(prior_weight=1e-3)
 LOST = np.arange(10, 16)

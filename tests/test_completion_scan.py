@@ -2,8 +2,8 @@ import numpy as np
 import pytest
 from completion_bodies import half_view, worm_with_prior
 
+from completion.partial.free_space import find_sight
 from completion.partial.scan import prepare_scan, spread
-from completion.partial.sight import find_sight
 from completion.starts import distinct
 from scanprep.geometry import rotations
 from scanprep.geometry.mesh import Mesh

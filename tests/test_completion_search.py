@@ -8,10 +8,10 @@ from completion.bodies import FixedBody
 from completion.partial.completion import complete
 from completion.partial.draws import examples_of
 from completion.partial.fit import ScanFit
+from completion.partial.free_space import find_sight
 from completion.partial.scan import prepare_scan
 from completion.partial.search import Outside, all_turns, from_nothing, placements, starting_poses, varied
 from completion.partial.settings import CompletionConfig
-from completion.partial.sight import find_sight
 from scanprep.geometry import rotations
 from scanprep.geometry.surface import Surface
 

@@ -4,7 +4,7 @@ from completion_bodies import worm_with_prior
 from scipy.sparse import csr_array
 
 from completion.energy import Residual
-from completion.partial.surface import FreeSurface, edge_matrix
+from completion.partial.free_surface import FreeSurface, edge_matrix
 from completion.solve import MinimiseConfig, minimise
 from model.gradients import edges
 

@@ -5,24 +5,24 @@ import pytest
 from completion_bodies import MEAN, worm_with_prior
 
 from completion import energy
-from completion.animation.follow import AnimateConfig, animate
-from completion.animation.ground import Floor, Standing
-from completion.animation.lowpass import low_pass
-from completion.animation.marked import MarkedBody, supports
-from completion.animation.points import PartShapes
-from completion.animation.prediction import KalmanPrediction, inertia
-from completion.animation.stream import MarkerStream
-from completion.animation.trust import LabelWatch, marker_weights
-from completion.animation.turns import compose, exp
-from completion.markers.files import MarkerSequence
-from completion.markers.layout import MarkerLayout
+from completion.mocap.artefacts.robust import LabelWatch, marker_weights
+from completion.mocap.files.markers import MarkerSequence
+from completion.mocap.marker_sets.layout import MarkerLayout
+from completion.mocap.pose.fast_rotations import compose, exp
+from completion.mocap.pose.follow import AnimateConfig, animate
+from completion.mocap.pose.foot_contact import Floor, Standing
+from completion.mocap.pose.lowpass import low_pass
+from completion.mocap.pose.marked_body import MarkedBody, supports
+from completion.mocap.pose.marker_points import PartShapes
+from completion.mocap.pose.prediction import KalmanPrediction, inertia
+from completion.mocap.pose.stream import MarkerStream
 from completion.motion import Motion
 from model.features import linear_features
 from model.pose_space import PoseSpace
 from model.scape import ScapeModel
 from model.shape_space import ShapeSpace
 from scanprep.geometry import rotations
-from scanprep.scanning.people import Person, walk
+from scanprep.synthetic.people import Person, walk
 
 FRAMES = 50
 CONFIG = AnimateConfig(start_axes=1)

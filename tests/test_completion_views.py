@@ -7,9 +7,9 @@ from completion_bodies import MARKS, POSE, QUICK, TRANS, half_view, worm_with_pr
 
 from completion.bodies import as_body
 from completion.partial.completion import complete
+from completion.partial.free_space import Sights, find_sights
 from completion.partial.scale import LOOSE, ScaledBody, landmark_scale, rough_scale
 from completion.partial.scan import as_views, prepare_scan
-from completion.partial.sight import Sights, find_sights
 from scanprep.geometry.files import PointCloud
 from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.surface import Surface

@@ -14,12 +14,12 @@ from scanned_shapes import ball as sphere
 
 from completion import MarkerLayout, MarkerSequence, write_markers
 from completion.__main__ import main
-from completion.animation import report
-from completion.animation.settings import AnimateConfig
-from completion.animation.shape import MarkerShapeConfig
-from completion.animation.trust import motion_problem
-from completion.animation.work import Work as Follow
-from completion.animation.work import animate_file
+from completion.mocap.animate import report
+from completion.mocap.animate.work import Work as Follow
+from completion.mocap.animate.work import animate_file
+from completion.mocap.artefacts.robust import motion_problem
+from completion.mocap.pose.settings import AnimateConfig
+from completion.mocap.subject.marker_shape import MarkerShapeConfig
 from completion.motion import Motion
 from completion.partial.settings import CompletionConfig
 from completion.partial.work import Inputs, Work, complete_files
@@ -28,12 +28,12 @@ from model.coregistration.rounds import coregistration_problem
 from model.evaluation.errors import Errors, errors_problem
 from model.learning.scape import learning_problem
 from scanprep import Mesh, write_landmarks, write_mesh
+from scanprep.alignment.views import align_views, views_problem
 from scanprep.batch.room import Room
-from scanprep.cleaning.align_views import align_views, views_problem
 from scanprep.console import Metric
+from scanprep.correspondence.correspondences import Correspondences, correspondences_problem
 from scanprep.geometry.files import PointCloud, write_points
-from scanprep.matching.correspondences import Correspondences, correspondences_problem
-from scanprep.matching.nonrigid import Registration, registration_problem
+from scanprep.registration.nonrigid import Registration, registration_problem
 from scanprep.skeleton.search import skeleton_problem
 
 MARKS = {"head": 10, "tail": 380, "left": 100, "right": 200, "middle": 250}

@@ -14,7 +14,7 @@ from model.posing.character import CharacterConfig, character_model, character_p
 from model.posing.character_mesh import CharacterMeshConfig, inside, register_character
 from scanprep import Mesh, write_landmarks, write_mesh
 from scanprep.geometry import rotations
-from scanprep.matching.schedule import RegistrationConfig
+from scanprep.registration.schedule import RegistrationConfig
 
 REST, MEAN = np.zeros((4, 3)), np.zeros(1)
 

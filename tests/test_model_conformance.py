@@ -5,9 +5,9 @@ from completion_bodies import half_view
 from conformance_bodies import KINDS, stiff_bodies
 from model_bodies import random_poses
 
-from completion.animation.follow import AnimateConfig, animate
-from completion.markers.files import MarkerSequence
-from completion.markers.layout import MarkerLayout
+from completion.mocap.files.markers import MarkerSequence
+from completion.mocap.marker_sets.layout import MarkerLayout
+from completion.mocap.pose.follow import AnimateConfig, animate
 from completion.partial.completion import complete
 from completion.partial.settings import CompletionConfig
 from model.body import BodyModel

@@ -31,9 +31,9 @@ from scanprep.batch.workspace import HOME
 from scanprep.geometry.landmarks import write_landmarks
 from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.surface import Surface
-from scanprep.matching.matches import target_of
-from scanprep.matching.nonrigid import register
-from scanprep.matching.schedule import GraphStage
+from scanprep.registration.matches import target_of
+from scanprep.registration.nonrigid import register
+from scanprep.registration.schedule import GraphStage
 from scanprep.skeleton.tree import Skeleton
 
 PLAIN = replace(QUICK.registration, graph=(GraphStage(80, 0.2, 0.02, 0.7, 0.01, 0.21),

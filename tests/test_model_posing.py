@@ -6,7 +6,7 @@ from model_bodies import random_poses, worm, worm_model, worm_skeleton
 from posing_bodies import skinned, symmetric_worm
 
 from model.posing.angles import pose_from_angles, sample_poses, turn
-from model.posing.limits import JointLimits
+from model.posing.joint_limits import JointLimits
 from model.posing.mirroring import find_mirror, mirror_pose
 from scanprep.geometry import rotations
 from scanprep.skeleton.tree import Skeleton

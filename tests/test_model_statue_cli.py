@@ -11,7 +11,7 @@ from model.statue.files import load_statue
 from model.statue.statue import HOLE, MEASURED
 from model.statue.work import Inputs, read_scan
 from scanprep import Mesh, read_mesh, write_mesh
-from scanprep.scanning.people import LANDMARKS, BodyShape, Person, walk
+from scanprep.synthetic.people import LANDMARKS, BodyShape, Person, walk
 
 JOINTS = {"vl5": 1, "skullbase": 3, "l_shoulder": 4, "l_elbow": 5, "l_wrist": 6, "r_shoulder": 7, "r_elbow": 8,
           "r_wrist": 9, "l_hip": 10, "l_knee": 11, "l_ankle": 12, "r_hip": 13, "r_knee": 14, "r_ankle": 15}

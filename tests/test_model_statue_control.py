@@ -17,9 +17,9 @@ from model.statue.control.model import control_problem
 from model.statue.control.seams import cut, find_seams
 from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.storage import StorageError
-from scanprep.scanning.people import LANDMARKS, MARKERS
-from scanprep.scanning.people_template import load
 from scanprep.skeleton.tree import Skeleton
+from scanprep.synthetic.people import LANDMARKS, MARKERS
+from scanprep.synthetic.topology import load
 
 MIRROR = np.array([-1, 1, 1])
 

@@ -9,7 +9,7 @@ from model.statue.registration.features import FeatureConfig, fit_features, head
 from model.statue.registration.medial import MedialAxis
 from scanprep.geometry import rotations
 from scanprep.geometry.mesh import Mesh
-from scanprep.scanning.people import BodyShape, Person, compose
+from scanprep.synthetic.people import BodyShape, Person, compose
 
 FACE = ("nose tip", "chin", "left eye", "right eye", "left ear", "right ear", "top of head")
 
@@ -235,7 +235,7 @@ def test_a_person_is_found_upside_down_in_millimetres_with_holes_and_without_an_
     assert {"r_wrist", "right middle finger", "right wrist"} <= set(found.missing)
     for name, part in {"l_elbow": 5, "l_wrist": 6, "l_hip": 10, "l_knee": 11, "r_knee": 14, "skullbase": 3}.items():
         assert np.linalg.norm(found.joints[name] - seen(joints[part])) < 40, name
-    from scanprep.scanning import people
+    from scanprep.synthetic import people
 
     apart = [np.linalg.norm(found.points[name] - seen(vertices[people.LANDMARKS[name]])) for name in FACE]
     assert np.mean(apart) < 25

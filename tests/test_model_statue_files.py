@@ -18,7 +18,7 @@ from model.statue.statue_glb import write_statue_glb
 from model.statue.x3d import write_x3d
 from scanprep.geometry import rotations
 from scanprep.geometry.mesh import Mesh
-from scanprep.scanning.people import walk
+from scanprep.synthetic.people import walk
 
 
 @pytest.fixture(scope="module")

@@ -18,7 +18,7 @@ from model.statue.motion.motions import MotionConfig, bvh_motion, own_motion, pe
 from scanprep.geometry import rotations
 from scanprep.geometry.storage import StorageError
 from scanprep.geometry.surface import Surface
-from scanprep.scanning.people import PARTS, Person, named_pose, walk
+from scanprep.synthetic.people import PARTS, Person, named_pose, walk
 
 GENERIC = np.zeros((17, 3))
 NAMES = humanoid().skeleton.names

@@ -11,7 +11,7 @@ from completion import Motion
 from completion.__main__ import main
 from model import load_model
 from scanprep import write_mesh
-from scanprep.scanning.embedded import read_views
+from scanprep.synthetic.data_set import read_views
 
 ROOT = Path(__file__).parents[1]
 README = (ROOT / "README.md").read_text(encoding="utf-8")

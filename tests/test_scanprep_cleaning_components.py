@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 from scanned_shapes import ball
 
-from scanprep.cleaning.components import (
+from scanprep.cleaning.clean_scan import (
     FAR,
     FLOOR,
     LANDMARKS,
@@ -16,7 +16,7 @@ from scanprep.cleaning.components import (
 from scanprep.cleaning.floor import FloorConfig, find_plane, floor_points, inside_outline, local_noise
 from scanprep.geometry import rotations
 from scanprep.geometry.mesh import Mesh
-from scanprep.scanning.people import Person
+from scanprep.synthetic.people import Person
 
 NOISE = 0.002
 

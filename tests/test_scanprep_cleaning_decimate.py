@@ -5,20 +5,20 @@ import numpy as np
 import pytest
 from scanned_shapes import SIX, bumpy, view
 
-from scanprep.cleaning.decimate import DecimateConfig, collapse, decimate
-from scanprep.cleaning.decimate_mend import fast_collapses
-from scanprep.cleaning.decimate_quadrics import lowest, plane_quadrics, point_quadrics, value
-from scanprep.cleaning.decimate_rounds import RoundsConfig
-from scanprep.cleaning.intersections import intersecting_faces
-from scanprep.cleaning.merge import MergeConfig
-from scanprep.cleaning.open3d_filters import MissingLibrary
-from scanprep.cleaning.remesh import triangle_quality
-from scanprep.cleaning.repair import weld
-from scanprep.cleaning.template import TemplateConfig, make_template
+from scanprep.adapters.open3d_filters import MissingLibrary
+from scanprep.decimation.decimate import DecimateConfig, collapse, decimate
+from scanprep.decimation.edge_collapse import RoundsConfig
+from scanprep.decimation.quadrics import lowest, plane_quadrics, point_quadrics, value
+from scanprep.decimation.remeshing import triangle_quality
+from scanprep.decimation.safe_collapses import fast_collapses
+from scanprep.fusion.tsdf import MergeConfig
 from scanprep.geometry.files import read_mesh
 from scanprep.geometry.mesh import Mesh, template_problem
 from scanprep.geometry.surface import Surface
-from scanprep.scanning.scanner import ScannerConfig, scan
+from scanprep.pipeline.template import TemplateConfig, make_template
+from scanprep.repair.intersections import intersecting_faces
+from scanprep.repair.manifold import weld
+from scanprep.synthetic.scanner import ScannerConfig, scan
 
 
 @pytest.mark.parametrize("method", ["quadric", "even", "fast"])

@@ -3,10 +3,10 @@ import pytest
 from matching_bodies import bent, crab
 from scanned_shapes import bumpy
 
-from scanprep.cleaning import decimate_set_files
-from scanprep.cleaning.decimate_set import DecimateSetConfig, decimate_set
-from scanprep.cleaning.decimate_set_files import write_decimated_set
 from scanprep.dataset import RegisteredSet
+from scanprep.decimation import registered_set_files as decimate_set_files
+from scanprep.decimation.registered_set import DecimateSetConfig, decimate_set
+from scanprep.decimation.registered_set_files import write_decimated_set
 from scanprep.geometry.distance import surface_distance
 from scanprep.geometry.landmarks import read_landmark_vertices, write_landmarks
 from scanprep.geometry.mesh import template_problem

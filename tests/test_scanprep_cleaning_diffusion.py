@@ -2,12 +2,12 @@ import numpy as np
 import pytest
 from scanned_shapes import ball, bumpy, view
 
-from scanprep.cleaning.carve import SeenSpace
-from scanprep.cleaning.diffusion import DiffusionConfig, diffused_surface, signed_distance
-from scanprep.cleaning.fill import FillConfig, fill_holes, fill_report
 from scanprep.geometry import rotations
 from scanprep.geometry.mesh import Mesh, template_problem
+from scanprep.geometry.seen_space import SeenSpace
 from scanprep.geometry.surface import Surface
+from scanprep.repair.hole_filling import FillConfig, fill_holes, fill_report
+from scanprep.repair.volumetric_diffusion import DiffusionConfig, diffused_surface, signed_distance
 
 
 def pierced(mesh, centre, radius):

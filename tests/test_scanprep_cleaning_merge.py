@@ -2,8 +2,8 @@ import numpy as np
 import pytest
 from scanned_shapes import SIX, ball, bumpy, view
 
-from scanprep.cleaning.align_views import align_views
-from scanprep.cleaning.merge import MergeConfig, merge_views
+from scanprep.alignment.views import align_views
+from scanprep.fusion.tsdf import MergeConfig, merge_views
 from scanprep.geometry import rotations
 from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.surface import Surface

@@ -2,8 +2,10 @@ import numpy as np
 import pytest
 from scanned_shapes import ball, bumpy
 
-from scanprep.cleaning.remesh import flip_edges, improve_triangles, smooth, triangle_quality
-from scanprep.cleaning.repair import (
+from scanprep.decimation.remeshing import flip_edges, improve_triangles, smooth, triangle_quality
+from scanprep.geometry.mesh import Mesh, template_problem
+from scanprep.geometry.surface import Surface
+from scanprep.repair.manifold import (
     RepairConfig,
     drop_small_components,
     orient,
@@ -12,8 +14,6 @@ from scanprep.cleaning.repair import (
     split_vertices,
     weld,
 )
-from scanprep.geometry.mesh import Mesh, template_problem
-from scanprep.geometry.surface import Surface
 
 
 def joined(*meshes):

@@ -13,16 +13,16 @@ from scipy.spatial.transform import Rotation
 from completion.__main__ import main
 from scanprep import Mesh, RegisteredSet, Skeleton, read_mesh, read_points, write_landmarks, write_mesh
 from scanprep.cli import COMMANDS
+from scanprep.correspondence.correspondences import Correspondences
+from scanprep.correspondence.files import read_correspondences, write_correspondences
 from scanprep.geometry.files import PointCloud, write_points
 from scanprep.geometry.storage import StorageError
-from scanprep.matching import cli as matching_cli
-from scanprep.matching.correspondence_files import read_correspondences, write_correspondences
-from scanprep.matching.correspondences import Correspondences
-from scanprep.matching.nonrigid import register
 from scanprep.pipeline import cli as pipeline_cli
 from scanprep.pipeline.prepare import prepare
 from scanprep.pipeline.scan import ScanSettings
 from scanprep.pipeline.scans import find_scans
+from scanprep.registration import cli as matching_cli
+from scanprep.registration.nonrigid import register
 
 ROOT = Path(__file__).parents[1]
 

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from completion.moshing.attachment import signed_distance
+from completion.mocap.subject.attachment import signed_distance
 from model.posing.character_mesh import inside
 from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.surface import OrientedPoints, Rays, Surface, barycentric

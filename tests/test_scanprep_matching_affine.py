@@ -8,7 +8,7 @@ import pytest
 from matching_bodies import bent, crab
 
 from scanprep.geometry import rotations
-from scanprep.matching.affine import (
+from scanprep.registration.affine import (
     AffineLinks,
     LinkStage,
     RigidLinks,
@@ -17,7 +17,7 @@ from scanprep.matching.affine import (
     build_links,
     hahnel_stages,
 )
-from scanprep.matching.energies import pull
+from scanprep.registration.energies import pull
 
 AFFINE = LinkStage("affine", 0.2, 0.1, 0.1)
 RIGID = LinkStage("rigid", 0.1, 0.1, 0.1, nodes=80)

@@ -6,7 +6,7 @@ from itertools import product
 import numpy as np
 import pytest
 
-from scanprep.matching.beliefs import PairField, propagate
+from scanprep.correspondence.belief_propagation import PairField, propagate
 
 TREE = np.array([[0, 1], [2, 1], [1, 3], [3, 4]])
 LOOPY = np.array([[0, 1], [1, 2], [0, 2], [2, 3], [3, 4], [4, 0]])

@@ -6,17 +6,17 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from scanprep.correspondence import potentials as ce
+from scanprep.correspondence.correlated import find_correspondences
+from scanprep.correspondence.places import Places, gradients
+from scanprep.correspondence.search import BeliefLevel, CorrelatedConfig
+from scanprep.correspondence.seeds import SeedConfig, find_seeds, matched_ends
+from scanprep.correspondence.sheet import Sheet
 from scanprep.geometry import rotations
 from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.surface import Surface
-from scanprep.matching import correlated_energies as ce
-from scanprep.matching.correlated import find_correspondences
-from scanprep.matching.correlated_places import Places, gradients
-from scanprep.matching.correlated_search import BeliefLevel, CorrelatedConfig
-from scanprep.matching.correlated_sheet import Sheet
-from scanprep.matching.matches import Target, target_of
-from scanprep.matching.seeds import SeedConfig, find_seeds, matched_ends
-from scanprep.scanning.people import Person, named_pose
+from scanprep.registration.matches import Target, target_of
+from scanprep.synthetic.people import Person, named_pose
 
 SMALL = CorrelatedConfig(points=100, keep=80, levels=(BeliefLevel(1200, 60), BeliefLevel(10**6, 40)))
 

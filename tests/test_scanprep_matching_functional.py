@@ -5,9 +5,7 @@ import numpy as np
 import pytest
 from matching_bodies import bent, crab
 
-from scanprep.geometry.mesh import Mesh
-from scanprep.matching.correlated_sheet import Sheet
-from scanprep.matching.functional import (
+from scanprep.correspondence.functional import (
     FunctionalConfig,
     find_functional_correspondences,
     first_map,
@@ -15,7 +13,9 @@ from scanprep.matching.functional import (
     spectrum,
     zoom_out,
 )
-from scanprep.matching.matches import Target
+from scanprep.correspondence.sheet import Sheet
+from scanprep.geometry.mesh import Mesh
+from scanprep.registration.matches import Target
 
 SMALL = FunctionalConfig(first=12, last=50, spacing=0.02, sample=400, points=120)
 

@@ -13,8 +13,10 @@ from matching_bodies import bent, crab
 from scanprep.geometry import rotations
 from scanprep.geometry.mesh import Mesh, template_problem
 from scanprep.geometry.surface import Surface
-from scanprep.matching import descent, energies, graph, nonrigid, shell
-from scanprep.matching.nonrigid import GraphStage, RegistrationConfig, register
+from scanprep.registration import deformation_graph as graph
+from scanprep.registration import energies, nonrigid, shell
+from scanprep.registration import levenberg_marquardt as descent
+from scanprep.registration.nonrigid import GraphStage, RegistrationConfig, register
 
 LEFT, RIGHT = np.array([0.0, 0.0, 1.2]), np.array([0.0, 1.4, 0.0])
 MARKS = np.array([820, 821, 9 * 20, 9 * 20 + 10, 20 * 20, 20 * 20 + 10, 31 * 20 + 5, 31 * 20 + 15])
@@ -64,7 +66,7 @@ def test_holes_are_reported_and_filled_with_volume(truth, found):
 
 
 def test_a_mesh_gives_the_same_as_its_points(truth):
-    from scanprep.matching.matches import orient, target_of
+    from scanprep.registration.matches import orient, target_of
     mesh, cloud = target_of(truth), target_of(truth.vertices)
     cloud = orient(cloud, truth, 0.05)
     assert (np.einsum("nd,nd->n", mesh.normals, cloud.normals) > 0.7).mean() > 0.97

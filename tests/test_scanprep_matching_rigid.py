@@ -5,8 +5,8 @@ import numpy as np
 import pytest
 from matching_bodies import crab
 
+from scanprep.alignment.icp import RigidConfig, align_landmarks, align_rigid, apply
 from scanprep.geometry import rotations
-from scanprep.matching.rigid import RigidConfig, align_landmarks, align_rigid, apply
 
 
 def transform(twist, translation, scale=1.0):

@@ -10,10 +10,10 @@ from matching_bodies import bent, crab
 from scanprep.geometry import rotations
 from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.surface import Surface
-from scanprep.matching.matches import target_of
-from scanprep.matching.settle import SettleConfig, SettleRound, settle
-from scanprep.matching.settle_data import skin_of
-from scanprep.matching.settle_field import Triangles
+from scanprep.registration.final_fit import SettleConfig, SettleRound, settle
+from scanprep.registration.final_fit_data import skin_of
+from scanprep.registration.final_fit_field import Triangles
+from scanprep.registration.matches import target_of
 
 LEFT, RIGHT = np.array([0.0, 0.0, 0.7]), np.array([0.0, 0.7, 0.0])
 NOISE = 0.002

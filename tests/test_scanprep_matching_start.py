@@ -7,18 +7,18 @@ import numpy as np
 import pytest
 from matching_bodies import bent, crab
 
+from scanprep.correspondence.correspondences import Correspondences
 from scanprep.geometry import rotations
 from scanprep.geometry.geodesics import SurfaceGraph
 from scanprep.geometry.mesh import Mesh
-from scanprep.matching.anchors import Hints, mark_both, path_anchors, place_by_marks
-from scanprep.matching.confidence import evidence
-from scanprep.matching.correspondences import Correspondences
-from scanprep.matching.matches import Likeness, match_both_ways, target_of
-from scanprep.matching.nonrigid import RegistrationConfig, register
-from scanprep.matching.paths import path_lengths, path_marks
-from scanprep.matching.schedule import published
-from scanprep.matching.turns import turns
-from scanprep.matching.twists import TwistConfig, find_ends, turned_end
+from scanprep.registration.anchors import Hints, mark_both, path_anchors, place_by_marks
+from scanprep.registration.confidence import evidence
+from scanprep.registration.limb_twists import TwistConfig, find_ends, turned_end
+from scanprep.registration.matches import Likeness, match_both_ways, target_of
+from scanprep.registration.nonrigid import RegistrationConfig, register
+from scanprep.registration.paths import path_lengths, path_marks
+from scanprep.registration.schedule import published
+from scanprep.registration.vertex_rotations import turns
 
 BEND = np.array([0.0, 0.0, 1.2]), np.array([0.0, 1.4, 0.0])
 

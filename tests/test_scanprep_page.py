@@ -9,7 +9,6 @@ from scipy.spatial.transform import Rotation
 
 from scanprep import RegisteredSet, write_landmarks, write_mesh
 from scanprep.geometry.files import PointCloud, write_points
-from scanprep.matching.confidence import missed_share, principal_stretches, stretched_share
 from scanprep.pipeline import pictures
 from scanprep.pipeline.figures import (
     Failure,
@@ -23,6 +22,7 @@ from scanprep.pipeline.page import write_set_page
 from scanprep.pipeline.prepare import prepare
 from scanprep.pipeline.review import Limits, review
 from scanprep.pipeline.scans import find_scans
+from scanprep.registration.confidence import missed_share, principal_stretches, stretched_share
 
 GOOD = ScanFigures("good", "10 landmarks", 0.001, 0.0015, 0.85, 0.85, 0.0, 0.004, 0.002, 0, True, 0.0, 3.25)
 

@@ -20,8 +20,8 @@ from scanprep.batch import cluster
 from scanprep.batch.ownership import HOME, ForeignFileError
 from scanprep.batch.pool import Workers, run_jobs
 from scanprep.batch.room import Failure, Job
-from scanprep.cleaning.components import CleanScanConfig
-from scanprep.matching.correspondences import Correspondences
+from scanprep.cleaning.clean_scan import CleanScanConfig
+from scanprep.correspondence.correspondences import Correspondences
 from scanprep.pipeline import scan as scan_module
 from scanprep.pipeline.prepare import RegisterScan, prepare
 from scanprep.pipeline.scans import find_scans

@@ -15,7 +15,7 @@ import completion
 import model
 import scanprep
 from completion.__main__ import COMMANDS
-from completion.moshing.settings import MoshConfig, PersonConfig
+from completion.mocap.settings import MoshConfig, PersonConfig
 from scanprep import console
 from scanprep.console import Metric, Outcome
 from scanprep.ranges import LARGE, OutOfRange, Range, Settings, ranges

@@ -7,9 +7,10 @@ import pytest
 
 from scanprep.geometry import rotations, storage
 from scanprep.geometry.mesh import Mesh, template_problem
-from scanprep.scanning import people, people_template
-from scanprep.scanning.people import NAMED_POSES, PARENTS, PARTS, BodyShape, Person
-from scanprep.scanning.people_muscles import COLUMNS, masks
+from scanprep.synthetic import people
+from scanprep.synthetic import topology as people_template
+from scanprep.synthetic.muscles import COLUMNS, masks
+from scanprep.synthetic.people import NAMED_POSES, PARENTS, PARTS, BodyShape, Person
 
 MAN = BodyShape()
 WOMAN = BodyShape(sex=-1.0, stature=1.63)

@@ -9,9 +9,10 @@ import pytest
 from scanprep.geometry.files import read_mesh
 from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.surface import Surface
-from scanprep.scanning import embedded, people
-from scanprep.scanning.people import BodyShape, Person
-from scanprep.scanning.scanner import ScannerConfig, scan
+from scanprep.synthetic import data_set as embedded
+from scanprep.synthetic import people
+from scanprep.synthetic.people import BodyShape, Person
+from scanprep.synthetic.scanner import ScannerConfig, scan
 
 COARSE = ScannerConfig(resolution=0.014)
 

@@ -5,8 +5,6 @@ import numpy as np
 import pytest
 
 from scanprep.geometry.storage import StorageError
-from scanprep.scanning.people import Person
-from scanprep.scanning.people_motion import named_pose
 from scanprep.skeleton.edit import (
     apply_edits,
     merge_parts,
@@ -17,6 +15,8 @@ from scanprep.skeleton.edit import (
     split_part,
 )
 from scanprep.skeleton.labels import pieces
+from scanprep.synthetic.people import Person
+from scanprep.synthetic.poses import named_pose
 
 
 @pytest.fixture(scope="module")

@@ -5,10 +5,10 @@ from animal_bodies import Animal, Build
 
 from scanprep.geometry import rotations
 from scanprep.geometry.mesh import Mesh
-from scanprep.scanning.people import BodyShape, Person
 from scanprep.skeleton.edit import merge_parts, split_part
 from scanprep.skeleton.names import name_parts
 from scanprep.skeleton.tree import Skeleton
+from scanprep.synthetic.people import BodyShape, Person
 
 
 def expected(name):

@@ -7,8 +7,6 @@ from animal_bodies import ODD, Animal, Build, random_pose
 
 from scanprep.geometry import rotations
 from scanprep.geometry.mesh import Mesh
-from scanprep.scanning.people import Person
-from scanprep.scanning.people_anatomy import MIRROR_PART
 from scanprep.skeleton.bands import dissolve_bands, passages
 from scanprep.skeleton.joints import to_tree, without_weak
 from scanprep.skeleton.motions import PosedSurface, fit_motions, rigid_costs
@@ -18,6 +16,8 @@ from scanprep.skeleton.patches import cover
 from scanprep.skeleton.search import search_skeleton
 from scanprep.skeleton.sides import Sides, closure, mirror_pairs
 from scanprep.skeleton.symmetry import find_symmetry
+from scanprep.synthetic.anatomy import MIRROR_PART
+from scanprep.synthetic.people import Person
 
 CONFIG = SkeletonConfig(restarts=1, patches=120, start=20)
 

@@ -16,14 +16,15 @@ from model import BodyModel, Subject, fit_pose, learn_scape, load_model
 from scanprep.batch.opening import workspace
 from scanprep.batch.steps import KeptSteps, inside
 from scanprep.batch.workspace import Task, Workspace
-from scanprep.cleaning.template import TemplateConfig, make_template
 from scanprep.dataset import RegisteredSet
 from scanprep.geometry.files import read_mesh, write_mesh
 from scanprep.geometry.landmarks import match_landmarks, read_landmark_vertices, read_landmarks, write_landmarks
 from scanprep.geometry.mesh import Mesh
 from scanprep.pipeline.prepare import SCANS, PrepareConfig, Prepared, prepare
 from scanprep.pipeline.scans import find_scans
-from scanprep.scanning.embedded import (
+from scanprep.pipeline.template import TemplateConfig, make_template
+from scanprep.skeleton.find import SkeletonConfig
+from scanprep.synthetic.data_set import (
     SUBJECT,
     EmbeddedScan,
     GroundTruth,
@@ -33,14 +34,13 @@ from scanprep.scanning.embedded import (
     stand,
     write_scan,
 )
-from scanprep.scanning.people import Person, random_pose, walk
-from scanprep.scanning.scanner import ScannerConfig, scan
-from scanprep.skeleton.find import SkeletonConfig
+from scanprep.synthetic.people import Person, random_pose, walk
+from scanprep.synthetic.scanner import ScannerConfig, scan
 from scanprep.threads import one_thread
 
-from ..animation.follow import animate
-from ..markers.files import MarkerSequence, read_markers
-from ..markers.layout import MarkerLayout
+from ..mocap.files.markers import MarkerSequence, read_markers
+from ..mocap.marker_sets.layout import MarkerLayout
+from ..mocap.pose.follow import animate
 from ..motion import Motion
 from ..partial.completion import Completion, complete
 from ..partial.results import load_completion, save_completion

@@ -17,7 +17,7 @@ from scanprep.pictures.shading import Shape, Solid, heat, part_colors, render, s
 from scanprep.pictures.sheets import save_png
 from scanprep.pictures.views import look_around, upright
 
-from ..animation.report import animated_picture, chart_residuals, picture_frames
+from ..mocap.animate.report import animated_picture, chart_residuals, picture_frames
 from ..partial.report import COMPLETED, HEIGHT, MEASURED, picture_completion, picture_distance
 from .chain import Demo
 from .truth import surface_error

@@ -10,12 +10,12 @@ from scipy.spatial import cKDTree
 
 from scanprep.batch.room import Room
 from scanprep.geometry.mesh import Mesh
-from scanprep.scanning.embedded import EmbeddedScan, GroundTruth, embedded_scan
-from scanprep.scanning.people import MARKERS
-from scanprep.scanning.scanner import ScannerConfig
+from scanprep.synthetic.data_set import EmbeddedScan, GroundTruth, embedded_scan
+from scanprep.synthetic.people import MARKERS
+from scanprep.synthetic.scanner import ScannerConfig
 
-from ..markers.files import MarkerSequence, write_markers
-from ..markers.layout import DISTANCE, MarkerLayout
+from ..mocap.files.markers import MarkerSequence, write_markers
+from ..mocap.marker_sets.layout import DISTANCE, MarkerLayout
 from .settings import DemoConfig
 
 

@@ -7,8 +7,8 @@ import numpy as np
 
 from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.surface import Surface, SurfacePoints
-from scanprep.scanning.embedded import GroundTruth
 from scanprep.skeleton.tree import Skeleton
+from scanprep.synthetic.data_set import GroundTruth
 
 
 @dataclass(frozen=True, eq=False)

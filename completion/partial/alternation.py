@@ -24,8 +24,8 @@ from scanprep.geometry.mesh import Mesh
 from scanprep.skeleton.tree import Skeleton
 
 from .fit import SETTLED, ScanFit
+from .free_surface import FreeSurface
 from .settings import CompletionConfig
-from .surface import FreeSurface
 
 MORE = 3                             # times as many rounds as the joint method: each block gives way only a little
 

@@ -14,8 +14,8 @@ from scanprep.geometry.surface import Surface
 from scanprep.pictures.textures import Texture
 from scanprep.ranges import Cosine, Positive, Settings, Share
 
+from .free_space import find_sight
 from .scan import View, as_views, check_viewpoints, in_metres, prepare_scan
-from .sight import find_sight
 
 NEIGHBOURS = 3                       # points of a cloud that make the colour of a place
 RIM = 0.015                          # metres: towards its border a view counts less and less

@@ -17,12 +17,12 @@ from ..bodies import as_body
 from .alternation import follow_alternating, model_for_turns
 from .confidence import distance_to_seen, expected_error, posterior_error, probability_within
 from .fit import ScanFit
-from .given import in_metres
-from .restarts import best_start, first_starts, redraw_limbs
+from .free_surface import free_surface
+from .inputs import in_metres
+from .reinitialise import best_start, first_starts, redraw_limbs
 from .scale import ScaledBody
 from .scan import View
 from .settings import CompletionConfig
-from .surface import free_surface
 
 Progress = Callable[[int, int], None]
 

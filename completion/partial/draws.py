@@ -12,8 +12,8 @@ from .. import energy
 from ..bodies import FixedBody, Follow
 from ..priors import GaussianPrior, unbranched
 from ..solve import normal_equations
-from .contact import Contact
 from .scan import spread
+from .self_intersection import Contact
 
 if TYPE_CHECKING:
     from .fit import ScanFit

@@ -13,11 +13,11 @@ from .. import energy
 from ..bodies import FixedBody
 from ..priors import GaussianPrior, choose_prior, gaussian_prior, joint_limits
 from ..solve import Energy, MinimiseConfig, minimise, normal_equations
-from .contact import Contact
+from .free_space import find_sights
 from .masks import Cover, part_vertices
 from .scan import ScanPoints, spread
+from .self_intersection import Contact
 from .settings import CompletionConfig
-from .sight import find_sights
 
 Denial = tuple[np.ndarray, np.ndarray, np.ndarray]
 

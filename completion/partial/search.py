@@ -9,8 +9,8 @@ from scanprep.geometry import rotations
 
 from ..priors import typical_poses
 from ..starts import distinct
+from .free_space import Sight, Sights
 from .scan import ScanPoints, spread
-from .sight import Sight, Sights
 
 if TYPE_CHECKING:
     from .fit import ScanFit

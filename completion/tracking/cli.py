@@ -57,7 +57,7 @@ def track_frames(frames: FramesArg, output: Output, model: ModelOrNone = None, r
         keys: Largest number of key frames in the GLB.
         config: Settings.
     """
-    from ..animation.work import write_glb
+    from ..mocap.animate.work import write_glb
 
     found = FrameFolder(frames, cameras, unit)
     loaded, name = read_model(model)
@@ -96,7 +96,7 @@ def _figures(motion: Motion) -> list[Metric]:
 
 
 def _write(output: Path, motion: Motion, person: Subject) -> None:
-    from ..animation.outputs import write_joint_angles, write_joint_centres, write_motion_bvh, write_residuals
+    from ..mocap.files.motion_tables import write_joint_angles, write_joint_centres, write_motion_bvh, write_residuals
 
     motion.save(output / "motion.npz")
     write_motion_bvh(output / "motion.bvh", motion, person)

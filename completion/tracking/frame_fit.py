@@ -11,7 +11,7 @@ from scanprep.geometry.surface import Surface
 from .. import energy
 from ..bodies import FixedBody
 from ..partial.fit import ScanFit
-from ..partial.restarts import approach, best_start, first_starts, redraw_limbs
+from ..partial.reinitialise import approach, best_start, first_starts, redraw_limbs
 from ..partial.scan import ScanPoints
 from ..solve import Energy, MinimiseConfig, minimise, normal_equations
 from .dynamics import inertia

@@ -13,8 +13,8 @@ from scanprep.geometry.mesh import Mesh
 
 from ..bodies import FixedBody, ShapedBody, as_body
 from ..partial.completion import complete
+from ..partial.free_surface import free_surface
 from ..partial.scan import ScanPoints
-from ..partial.surface import free_surface
 from .dynamics import predicted
 from .frame_fit import FrameFit, Settled
 from .frames import Frame, as_views, prepare_frame

@@ -7,7 +7,7 @@ import numpy as np
 
 from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.surface import OrientedPoints, Surface
-from scanprep.matching.matches import Target, tukey
+from scanprep.registration.matches import Target, tukey
 
 
 @dataclass(frozen=True, eq=False)

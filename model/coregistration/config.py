@@ -4,8 +4,8 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 from scanprep.batch.pool import Workers
-from scanprep.matching.schedule import GraphStage, RegistrationConfig
 from scanprep.ranges import Cell, Count, Positive, Settings, Share, Signed
+from scanprep.registration.schedule import GraphStage, RegistrationConfig
 from scanprep.skeleton.parts import SkeletonConfig
 
 from ..learning.scape import LearnConfig

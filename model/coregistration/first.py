@@ -9,10 +9,10 @@ import numpy as np
 from scanprep.batch.room import Room
 from scanprep.batch.workspace import Task, Workspace
 from scanprep.geometry.mesh import Mesh
-from scanprep.matching.matches import orient, target_of
-from scanprep.matching.nonrigid import register
-from scanprep.matching.schedule import RegistrationConfig
 from scanprep.ranges import Settings
+from scanprep.registration.matches import orient, target_of
+from scanprep.registration.nonrigid import register
+from scanprep.registration.schedule import RegistrationConfig
 from scanprep.skeleton.find import find_skeleton
 from scanprep.skeleton.parts import SkeletonConfig
 from scanprep.skeleton.tree import Skeleton

@@ -8,8 +8,8 @@ from dataclasses import dataclass
 import numpy as np
 
 from scanprep.geometry.mesh import Mesh
-from scanprep.matching.matches import target_of
-from scanprep.matching.nonrigid import register
+from scanprep.registration.matches import target_of
+from scanprep.registration.nonrigid import register
 from scanprep.threads import one_thread
 
 from ..body import BodyModel

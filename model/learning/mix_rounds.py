@@ -13,7 +13,7 @@ from ..gradients import GradientSystem, ShapeSolver, pose_gradients
 from ..pose_space import PoseSpace
 from ..shape_space import learn_shape_space
 from .carriage import Carriage
-from .condense import condense
+from .compress import condense
 from .pose import Ticks, fit_poses
 from .regression import Design, RegressionConfig
 from .within import choose_within, fit_within

@@ -8,7 +8,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from scanprep.batch.steps import Step, once
-from scanprep.cleaning.decimate import decimate
+from scanprep.decimation.decimate import decimate
 from scanprep.geometry.mesh import Mesh
 from scanprep.ranges import Count, Settings
 from scanprep.skeleton.find import find_skeleton

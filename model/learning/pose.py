@@ -15,7 +15,7 @@ from ..gradients import GradientSystem, pose_gradients
 from ..linear import Subject
 from ..pose_space import PoseSpace
 from .carriage import Carriage
-from .condense import condense
+from .compress import condense
 from .regression import Design, RegressionConfig, choose_design
 
 Progress = Callable[[int, int], None]

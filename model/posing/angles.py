@@ -11,7 +11,7 @@ from scanprep.skeleton.tree import Skeleton
 
 from ..body import BodyModel
 from ..linear import check_pose
-from .limits import JointLimits
+from .joint_limits import JointLimits
 
 Frame = Literal["parent", "world", "own"]
 

@@ -9,9 +9,9 @@ import numpy as np
 from scanprep.geometry.landmarks import match_landmarks
 from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.surface import checked_points, checked_surface
-from scanprep.matching.nonrigid import Registration, register
-from scanprep.matching.schedule import RegistrationConfig
 from scanprep.ranges import Count, Settings
+from scanprep.registration.nonrigid import Registration, register
+from scanprep.registration.schedule import RegistrationConfig
 
 from ..body import BodyModel
 from .character import CharacterConfig, character_model, character_pose

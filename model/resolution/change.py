@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial import cKDTree
 
-from scanprep.cleaning.decimate import DecimateConfig, decimate
+from scanprep.decimation.decimate import DecimateConfig, decimate
 from scanprep.geometry.mesh import Mesh, check_template
 from scanprep.geometry.surface import Surface
 from scanprep.ranges import Count, Settings

@@ -3,8 +3,8 @@ from __future__ import annotations
 
 import numpy as np
 
-from scanprep.scanning import people
 from scanprep.skeleton.tree import Skeleton
+from scanprep.synthetic import people
 
 from ..features import linear_features
 from ..skinning import SkinningModel

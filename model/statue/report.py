@@ -192,7 +192,7 @@ def parts_without_data(statue: Statue) -> list[str]:
 
 def in_motion(statue: Statue) -> list[tuple[str, Mesh]]:
     """The statue in a walk, a squat and with its arms overhead; none for a control model with other joints."""
-    from scanprep.scanning.people import named_pose, walk
+    from scanprep.synthetic.people import named_pose, walk
 
     from .control.humanoid import humanoid
     from .motion.motions import people_motion

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from scanprep.batch.room import Room
-from scanprep.cleaning.components import clean_scan
+from scanprep.cleaning.clean_scan import clean_scan
 from scanprep.cli import MM, Unit
 from scanprep.console import Metric, Outcome, write_report
 from scanprep.geometry.files import read_mesh, write_mesh

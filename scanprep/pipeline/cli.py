@@ -12,7 +12,7 @@ import tyro
 from ..batch.opening import workspace
 from ..batch.pool import Workers
 from ..batch.workspace import Workspace
-from ..cleaning.components import CleanScanConfig
+from ..cleaning.clean_scan import CleanScanConfig
 from ..cli import MM, Output, SetArg, Unit, WorkersArg, landmarks_beside
 from ..console import Metric, Outcome, bar, say
 from ..geometry.files import read_mesh

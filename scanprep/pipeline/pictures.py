@@ -8,12 +8,12 @@ from scipy.sparse import eye_array
 
 from ..geometry import rotations
 from ..geometry.mesh import Mesh
-from ..matching.matches import thin
-from ..matching.nonrigid import Registration
 from ..pictures.camera import Camera
 from ..pictures.colors import heat
 from ..pictures.shading import CLAY, Dots, Shape, Solid, render
 from ..pictures.views import upright
+from ..registration.matches import thin
+from ..registration.nonrigid import Registration
 
 WIDTH, HEIGHT = 150, 216
 FAR = 0.005                 # of the template's size: the dark end of the distances

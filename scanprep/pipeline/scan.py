@@ -7,15 +7,15 @@ from typing import Literal
 
 import numpy as np
 
-from ..cleaning.components import CleanScanConfig, clean_scan
+from ..cleaning.clean_scan import CleanScanConfig, clean_scan
+from ..correspondence.correlated import CorrelatedConfig, find_correspondences
+from ..correspondence.correspondences import Correspondences
 from ..geometry.landmarks import check_on_surface, match_landmarks, read_landmarks
 from ..geometry.mesh import Mesh
-from ..matching.confidence import stretched_share
-from ..matching.correlated import CorrelatedConfig, find_correspondences
-from ..matching.correspondences import Correspondences
-from ..matching.nonrigid import Registration, RegistrationConfig, register, registration_problem
 from ..meaning import extent
 from ..ranges import Settings
+from ..registration.confidence import stretched_share
+from ..registration.nonrigid import Registration, RegistrationConfig, register, registration_problem
 from ..threads import one_thread
 from .figures import ScanFigures
 from .scans import ScanTask, read_scan

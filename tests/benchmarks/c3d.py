@@ -16,10 +16,10 @@ from pathlib import Path
 import numpy as np
 from protocols import machine, write_report
 
-from completion.animation.follow import AnimateConfig, animate
-from completion.animation.shape import MarkerShapeConfig, MarkerSubject, subject_from_markers
-from completion.markers.files import MarkerSequence, read_markers
-from completion.markers.layout import MarkerLayout
+from completion.mocap.files.markers import MarkerSequence, read_markers
+from completion.mocap.marker_sets.layout import MarkerLayout
+from completion.mocap.pose.follow import AnimateConfig, animate
+from completion.mocap.subject.marker_shape import MarkerShapeConfig, MarkerSubject, subject_from_markers
 from completion.motion import Motion
 from model.body import BodyModel
 from model.files import load_model
@@ -51,7 +51,7 @@ def follow(model: BodyModel, markers: MarkerSequence, layout: MarkerLayout, shap
 def picture(model: BodyModel, found: MarkerSubject, motion: Motion, markers: MarkerSequence, every: int, path: Path
             ) -> None:
     """Every so many frames with the markers as dots, from two sides."""
-    from completion.animation.report import picture_frames
+    from completion.mocap.animate.report import picture_frames
     from scanprep.pictures.sheets import save_png
 
     few = Motion(motion.poses[::every], motion.trans[::every], motion.betas, motion.rate / every,

@@ -15,15 +15,15 @@ from holes import HoledBody, distances, embedded_body, real_body
 from protocols import RealData, load_real, machine, write_report
 from scans import HELD_MEN, HELD_POSES, TUNING_MEN, TUNING_POSES
 
-from scanprep.cleaning.align_views import align_views
-from scanprep.cleaning.fill import FillConfig, fill_report
-from scanprep.cleaning.intersections import intersecting_faces
-from scanprep.cleaning.merge import merge_views
+from scanprep.alignment.views import align_views
+from scanprep.fusion.tsdf import merge_views
 from scanprep.geometry import rotations
 from scanprep.geometry.distance import surface_distance
 from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.surface import Surface
-from scanprep.scanning.scanner import RangeView, scan
+from scanprep.repair.hole_filling import FillConfig, fill_report
+from scanprep.repair.intersections import intersecting_faces
+from scanprep.synthetic.scanner import RangeView, scan
 
 SEEN = 0.007           # metres: true surface with a scan point this close was seen
 
@@ -50,7 +50,7 @@ def merge_errors(merged: Mesh, truth: Mesh, points: np.ndarray, free: bool) -> d
     """
     from scipy.spatial import cKDTree
 
-    from scanprep.matching.rigid import align_rigid
+    from scanprep.alignment.icp import align_rigid
 
     if free:
         T = align_rigid(merged.vertices[::7], truth).T_target_source
@@ -144,7 +144,7 @@ def merge_peers(views: list[RangeView], truth: Mesh) -> Iterator[tuple[str, dict
 
 def fillers() -> dict[str, Callable[[Mesh], tuple[Mesh, bool]]]:
     """Name -> function to a filled mesh and whether the triangles of the old one come first in it."""
-    from scanprep.cleaning.open3d_filters import poisson
+    from scanprep.adapters.open3d_filters import poisson
 
     def ours(method: str) -> Callable[[Mesh], tuple[Mesh, bool]]:
         return lambda mesh: (fill_report(mesh, FillConfig(method=method)).mesh, True)     # type: ignore[arg-type]

@@ -33,10 +33,10 @@ from model.coregistration.single import register_with_model
 from model.learning.scape import LearnConfig
 from scanprep.batch.opening import workspace
 from scanprep.batch.pool import Workers
-from scanprep.cleaning.decimate import decimate
+from scanprep.decimation.decimate import decimate
 from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.surface import Surface
-from scanprep.matching.nonrigid import register
+from scanprep.registration.nonrigid import register
 from scanprep.skeleton.find import find_skeleton
 
 TOO_FAR = 25.0                       # mm

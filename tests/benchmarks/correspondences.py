@@ -17,12 +17,12 @@ import numpy as np
 from protocols import RealData, load_real, machine, write_report
 from scans import HELD_MEN, HELD_POSES, TUNING_MEN, TUNING_POSES, TestScan, test_scan
 
+from scanprep.correspondence.correlated import find_correspondences
+from scanprep.correspondence.correspondences import Correspondences
+from scanprep.correspondence.functional import find_functional_correspondences
 from scanprep.geometry.geodesics import SurfaceGraph
 from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.surface import Surface
-from scanprep.matching.correlated import find_correspondences
-from scanprep.matching.correspondences import Correspondences
-from scanprep.matching.functional import find_functional_correspondences
 
 
 def other_side(data: RealData) -> np.ndarray:

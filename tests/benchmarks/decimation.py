@@ -17,12 +17,12 @@ import numpy as np
 from protocols import RealData, load_real, machine, write_report
 from scipy.spatial import cKDTree
 
-from scanprep.cleaning.decimate import DecimateConfig, decimate
-from scanprep.cleaning.decimate_set import DecimateSetConfig, decimate_set
-from scanprep.cleaning.intersections import intersecting_faces
+from scanprep.decimation.decimate import DecimateConfig, decimate
+from scanprep.decimation.registered_set import DecimateSetConfig, decimate_set
 from scanprep.geometry.distance import surface_distance
 from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.surface import Surface
+from scanprep.repair.intersections import intersecting_faces
 
 Method = Callable[[Mesh, int], Mesh]
 PEERS = {"fast-simplification": "fast_simplification", "pyfqmr": "pyfqmr", "igl.decimate": "igl", "igl.qslim": "igl",
@@ -69,9 +69,9 @@ def peer(name: str) -> Method:
             call = igl.qslim if name == "igl.qslim" else igl.decimate
             return Mesh(*call(np.asfortranarray(v), np.asfortranarray(f), faces)[:2])
         if name == "open3d":
-            from scanprep.cleaning.open3d_filters import quadric_decimation
+            from scanprep.adapters.open3d_filters import quadric_decimation
         else:
-            from scanprep.cleaning.pymeshlab_filters import quadric_decimation  # type: ignore[assignment]
+            from scanprep.adapters.pymeshlab_filters import quadric_decimation  # type: ignore[assignment]
         return quadric_decimation(mesh, faces)
 
     return run

@@ -78,9 +78,9 @@ def real_body(data: RealData, kind: str, index: int, scale: float = 1.0) -> Hole
 
 def embedded_body(seed: int, scale: float = 1.0) -> HoledBody:
     """A procedural person near the rest pose."""
-    from scanprep.scanning import people
-    from scanprep.scanning.embedded import near_rest, stand
-    from scanprep.scanning.people_anatomy import BodyShape
+    from scanprep.synthetic import people
+    from scanprep.synthetic.anatomy import BodyShape
+    from scanprep.synthetic.data_set import near_rest, stand
 
     rng = np.random.default_rng(seed)
     person = people.Person(BodyShape.random(rng))

@@ -11,8 +11,8 @@ from functools import cached_property
 import numpy as np
 from protocols import RealData, scape_fold
 
-from completion.markers.files import MarkerSequence
-from completion.markers.layout import MarkerLayout
+from completion.mocap.files.markers import MarkerSequence
+from completion.mocap.marker_sets.layout import MarkerLayout
 from model.body import BodyModel
 from model.fitting import fit_pose
 from model.linear import Subject

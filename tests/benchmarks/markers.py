@@ -19,11 +19,11 @@ import numpy as np
 from marker_motion import HeldOutMotion, dropped, held_out_motion, strayed, swapped
 from protocols import RealData, load_real, machine, scape_fold, write_report
 
-from completion.animation.follow import AnimateConfig, animate
-from completion.animation.shape import subject_from_markers
-from completion.animation.stream import MarkerStream
-from completion.markers.files import MarkerSequence, read_markers
-from completion.markers.layout import MarkerLayout
+from completion.mocap.files.markers import MarkerSequence, read_markers
+from completion.mocap.marker_sets.layout import MarkerLayout
+from completion.mocap.pose.follow import AnimateConfig, animate
+from completion.mocap.pose.stream import MarkerStream
+from completion.mocap.subject.marker_shape import subject_from_markers
 from completion.motion import Motion
 from model.body import BodyModel
 from model.files import load_model

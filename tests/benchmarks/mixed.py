@@ -20,8 +20,8 @@ from model.fitting import FitConfig, PoseFitter, ShapeFitter
 from model.learning import LearnConfig, learn_scape
 from model.learning.mixing import MixConfig, learn_scape_mix
 from scanprep.geometry.mesh import Mesh
-from scanprep.scanning.people import BodyShape, Person, random_pose
 from scanprep.skeleton.tree import Skeleton
+from scanprep.synthetic.people import BodyShape, Person, random_pose
 
 NEARLY_ONE_POSE = 0.15               # share of a random pose in which the people of the separated design stand
 FIT = FitConfig(sample=400, polish=0)

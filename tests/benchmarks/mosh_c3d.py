@@ -24,14 +24,14 @@ import numpy as np
 from c3d import HELD_OUT
 from protocols import machine, write_report
 
-from completion.animation.marked import MarkedBody
-from completion.markers.files import MarkerSequence, read_markers
-from completion.markers.layout import MarkerLayout, most_used
-from completion.moshing.person import find_person
-from completion.moshing.poses import follow_poses
-from completion.moshing.results import PersonFit
-from completion.moshing.settings import MoshConfig
-from completion.moshing.soft import follow_soft_tissue
+from completion.mocap.files.markers import MarkerSequence, read_markers
+from completion.mocap.marker_sets.layout import MarkerLayout, most_used
+from completion.mocap.pose.marked_body import MarkedBody
+from completion.mocap.pose.mosh_poses import follow_poses
+from completion.mocap.results import PersonFit
+from completion.mocap.settings import MoshConfig
+from completion.mocap.soft_tissue.soft_tissue import follow_soft_tissue
+from completion.mocap.subject.person import find_person
 from completion.motion import Motion
 from model.body import BodyModel
 from model.files import load_model
@@ -79,7 +79,7 @@ def follow(model: BodyModel, markers: MarkerSequence, layout: MarkerLayout, conf
 def picture(model: BodyModel, motion: Motion, markers: MarkerSequence, every: int, path: Path, columns: int = 10
             ) -> None:
     """Every so many frames with the markers as dots."""
-    from completion.animation.report import picture_frames
+    from completion.mocap.animate.report import picture_frames
     from scanprep.pictures.sheets import save_png
 
     subject, rows, step = model.subject(motion.betas), [], every * columns

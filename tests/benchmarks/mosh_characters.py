@@ -17,21 +17,21 @@ from pathlib import Path
 import numpy as np
 from protocols import load_real, machine, write_report
 
-from completion.embedded import embedded_model
-from completion.markers.files import MarkerSequence, read_markers
-from completion.markers.layout import MarkerLayout
-from completion.moshing.capture import mosh
-from completion.moshing.characters.cartoons import CARTOONS, Cartoon, cartoon
-from completion.moshing.characters.creases import Creases, at_rest
-from completion.moshing.characters.pictures import picture_transfer, write_character
-from completion.moshing.characters.transfer import deformation, moving_character, retarget_soft_tissue
-from completion.moshing.results import SoftTissue
+from completion.mocap.files.markers import MarkerSequence, read_markers
+from completion.mocap.marker_sets.layout import MarkerLayout
+from completion.mocap.mosh.mosh import mosh
+from completion.mocap.results import SoftTissue
+from completion.mocap.retargeting.cartoons import CARTOONS, Cartoon, cartoon
+from completion.mocap.retargeting.creases import Creases, at_rest
+from completion.mocap.retargeting.pictures import picture_transfer, write_character
+from completion.mocap.retargeting.soft_tissue import deformation, moving_character, retarget_soft_tissue
+from completion.synthetic_model import embedded_model
 from model.body import BodyModel
 from model.posing.character_mesh import Character, register_character
 from scanprep.geometry.mesh import Mesh
 from scanprep.pictures.shading import save_png
-from scanprep.scanning.embedded import SUBJECT
-from scanprep.scanning.people import Person, walk
+from scanprep.synthetic.data_set import SUBJECT
+from scanprep.synthetic.people import Person, walk
 
 MM = 1000.0
 OF_SCAPE = {                         # names of the landmarks of the SCAPE template

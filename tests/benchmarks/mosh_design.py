@@ -17,15 +17,15 @@ from pathlib import Path
 import numpy as np
 from protocols import load_real, machine, spring_split, write_report
 
-from completion.designing.fits import vertex_errors
-from completion.designing.greedy import Groups, MarkerSets, exchange
-from completion.designing.linear import LinearBodies, WholeFits, fit_bodies
-from completion.designing.pairs import symmetric_groups
-from completion.designing.posed import in_poses
-from completion.designing.sets import Choice, best_path, choose
-from completion.designing.settings import DesignConfig
-from completion.markers.candidates import candidate_layout
-from completion.markers.layout import MarkerLayout
+from completion.mocap.marker_selection.candidates import candidate_layout
+from completion.mocap.marker_selection.fits import vertex_errors
+from completion.mocap.marker_selection.greedy import Groups, MarkerSets, exchange
+from completion.mocap.marker_selection.linear import LinearBodies, WholeFits, fit_bodies
+from completion.mocap.marker_selection.pairs import symmetric_groups
+from completion.mocap.marker_selection.posed import in_poses
+from completion.mocap.marker_selection.sets import Choice, best_path, choose
+from completion.mocap.marker_selection.settings import DesignConfig
+from completion.mocap.marker_sets.layout import MarkerLayout
 from model.body import BodyModel
 from model.files import load_model
 

@@ -23,15 +23,15 @@ from marker_motion import dropped
 from protocols import load_real, machine, spring_split, write_report
 
 from completion import energy
-from completion.animation.marked import supports
-from completion.markers.files import MarkerSequence, read_markers
-from completion.markers.layout import MarkerLayout
-from completion.moshing.capture import mosh
-from completion.moshing.faults.search import find_faults
-from completion.moshing.person import find_person
-from completion.moshing.poses import follow_poses
-from completion.moshing.results import BadKind, BadSpan, Exchange
-from completion.moshing.settings import FaultConfig, MoshConfig
+from completion.mocap.artefacts.find import find_faults
+from completion.mocap.files.markers import MarkerSequence, read_markers
+from completion.mocap.marker_sets.layout import MarkerLayout
+from completion.mocap.mosh.mosh import mosh
+from completion.mocap.pose.marked_body import supports
+from completion.mocap.pose.mosh_poses import follow_poses
+from completion.mocap.results import BadKind, BadSpan, Exchange
+from completion.mocap.settings import FaultConfig, MoshConfig
+from completion.mocap.subject.person import find_person
 from completion.motion import Motion
 from model.body import BodyModel
 from model.files import load_model

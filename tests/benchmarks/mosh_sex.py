@@ -15,17 +15,17 @@ from pathlib import Path
 import numpy as np
 from protocols import machine, write_report
 
-from completion.embedded import EmbeddedRecipe, _decimated
-from completion.markers.files import MarkerSequence
-from completion.markers.layout import MarkerLayout
-from completion.moshing.person import find_person
+from completion.mocap.files.markers import MarkerSequence
+from completion.mocap.marker_sets.layout import MarkerLayout
+from completion.mocap.subject.person import find_person
+from completion.synthetic_model import EmbeddedRecipe, _decimated
 from model.body import BodyModel
 from model.files import load_model
 from model.learning.sex_plane import guess_sex, sex_plane
 from model.learning.sexes import learn_by_sex
 from scanprep.geometry.surface import Surface
-from scanprep.scanning.embedded import SUBJECT, near_rest, subject_pose
-from scanprep.scanning.people import BodyShape, Person, walk
+from scanprep.synthetic.data_set import SUBJECT, near_rest, subject_pose
+from scanprep.synthetic.people import BodyShape, Person, walk
 
 MM = 1000.0
 RATE = 20.0

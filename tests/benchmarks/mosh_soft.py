@@ -22,15 +22,15 @@ import numpy as np
 from protocols import machine, write_report
 from scipy.linalg import eigh
 
-from completion.animation.marked import supports
 from completion.energy import lifted
-from completion.markers.files import MarkerSequence, read_markers
-from completion.markers.layout import MarkerLayout
-from completion.moshing.changing import changing_bodies
-from completion.moshing.person import find_person
-from completion.moshing.poses import follow_poses
-from completion.moshing.settings import SoftTissueConfig
-from completion.moshing.soft import SoftFollower, follow_soft_tissue
+from completion.mocap.files.markers import MarkerSequence, read_markers
+from completion.mocap.marker_sets.layout import MarkerLayout
+from completion.mocap.pose.marked_body import supports
+from completion.mocap.pose.mosh_poses import follow_poses
+from completion.mocap.settings import SoftTissueConfig
+from completion.mocap.soft_tissue.changing_bodies import changing_bodies
+from completion.mocap.soft_tissue.soft_tissue import SoftFollower, follow_soft_tissue
+from completion.mocap.subject.person import find_person
 from completion.motion import Motion
 from model.body import BodyModel
 from model.files import load_model

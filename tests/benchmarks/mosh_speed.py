@@ -19,12 +19,12 @@ from typing import TypeVar
 import numpy as np
 from protocols import machine, write_report
 
-from completion.markers.files import MarkerSequence, read_markers
-from completion.markers.layout import MarkerLayout
-from completion.moshing.person import find_person
-from completion.moshing.poses import follow_poses
-from completion.moshing.settings import MoshConfig
-from completion.moshing.soft import follow_soft_tissue
+from completion.mocap.files.markers import MarkerSequence, read_markers
+from completion.mocap.marker_sets.layout import MarkerLayout
+from completion.mocap.pose.mosh_poses import follow_poses
+from completion.mocap.settings import MoshConfig
+from completion.mocap.soft_tissue.soft_tissue import follow_soft_tissue
+from completion.mocap.subject.person import find_person
 from model.body import BodyModel
 from model.files import load_model
 

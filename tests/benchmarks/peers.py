@@ -28,7 +28,7 @@ from protocols import RealData, load_real, machine, write_report
 from scans import TestScan, errors, test_scan
 from scipy.spatial import cKDTree
 
-from scanprep.matching.rigid import align_landmarks
+from scanprep.alignment.icp import align_landmarks
 
 
 class Missing(Exception):
@@ -98,7 +98,7 @@ def classic_drift(data: RealData, item: TestScan, _: argparse.Namespace) -> np.n
     need("pycpd")
     from pycpd import DeformableRegistration
 
-    from scanprep.matching.graph import farthest_points
+    from scanprep.registration.deformation_graph import farthest_points
 
     start = placed(data, item)
     mine = farthest_points(start, 2000)

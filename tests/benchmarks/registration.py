@@ -15,7 +15,7 @@ import numpy as np
 from protocols import RealData, load_real, machine, write_report
 from scans import HELD_MEN, HELD_POSES, TUNING_MEN, TUNING_POSES, TestScan, errors, test_scan
 
-from scanprep.matching.nonrigid import Registration, register
+from scanprep.registration.nonrigid import Registration, register
 
 SETS = {"tuning": (TUNING_POSES, TUNING_MEN), "held": (HELD_POSES, HELD_MEN)}
 COLUMNS = ("all_mm", "seen_mm", "unseen_mm", "beyond_50mm", "surface_seen_mm", "max_mm", "flipped", "cpu_s", "wall_s")
@@ -26,7 +26,7 @@ def registered(data: RealData, item: TestScan, marks: str) -> Registration:
     landmarks = item.landmarks(data, marks)
     if landmarks is not None:
         return register(data.template, item.scan, landmarks)
-    from scanprep.matching.correlated import find_correspondences
+    from scanprep.correspondence.correlated import find_correspondences
 
     return register(data.template, item.scan, correspondences=find_correspondences(data.template, item.scan))
 

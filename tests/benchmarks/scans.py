@@ -10,7 +10,7 @@ import numpy as np
 from protocols import RealData
 
 from scanprep.geometry.mesh import Mesh
-from scanprep.scanning.scanner import RangeView, ScannerConfig, scan
+from scanprep.synthetic.scanner import RangeView, ScannerConfig, scan
 
 HELD_POSES = (2, 7, 17, 22, 32, 37, 47, 52, 62, 67)
 HELD_MEN = (2, 27, 52, 77, 97, 122, 147, 172, 197, 222)
@@ -49,9 +49,9 @@ class TestScan:
     def merged(self) -> Mesh:
         """One closed surface of even triangles, for tools that need one: merged, largest piece, holes filled."""
         from scanprep import decimate, fill_holes, merge_views
-        from scanprep.cleaning.decimate import DecimateConfig
-        from scanprep.cleaning.merge import MergeConfig
-        from scanprep.cleaning.repair import repair
+        from scanprep.decimation.decimate import DecimateConfig
+        from scanprep.fusion.tsdf import MergeConfig
+        from scanprep.repair.manifold import repair
 
         closed = fill_holes(repair(merge_views(self.views, MergeConfig(voxel=0.006, min_component=0.5))))
         return decimate(closed, 30_000, DecimateConfig("even"))

@@ -20,7 +20,7 @@ from scipy.sparse import csc_array, diags_array
 from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.sparse import Factored
 from scanprep.geometry.surface import Surface
-from scanprep.matching.nonrigid import register
+from scanprep.registration.nonrigid import register
 
 SCALES = (0.006, 0.012, 0.02, 0.035)        # metres
 SLIDE = 0.004                               # metres, RMS of each coordinate

@@ -25,14 +25,14 @@ from model.statue.control.humanoid import humanoid
 from model.statue.registration.local_shape import LocalShape, local_shape
 from model.statue.registration.surface_data import distortion
 from model.statue.registration.surface_fit import SurfaceFitConfig, fit_surface
+from scanprep.alignment.icp import align_landmarks, apply
 from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.sparse import Factored
 from scanprep.geometry.surface import Surface
-from scanprep.matching.nonrigid import RegistrationConfig, register
-from scanprep.matching.rigid import align_landmarks, apply
-from scanprep.matching.settle import settle
-from scanprep.matching.shell import conjugate_gradients, flipped, unfold
-from scanprep.matching.turns import turns
+from scanprep.registration.final_fit import settle
+from scanprep.registration.nonrigid import RegistrationConfig, register
+from scanprep.registration.shell import conjugate_gradients, flipped, unfold
+from scanprep.registration.vertex_rotations import turns
 
 # Landmarks of the control model and their names on the real bodies.
 NAMES = {"right toe": "toe in right leg", "left toe": "toe in left leg", "right knee": "knee in right leg",
@@ -130,7 +130,7 @@ def figure_7(picture: str | None) -> list[dict[str, object]]:
     """A regular sphere to a head: closest points, closest points with the shape, soft assignment with the shape."""
     import igl
 
-    from scanprep.scanning.people import Person
+    from scanprep.synthetic.people import Person
 
     person = Person()
     keep = person.part_of_face == person.names.index("head")

@@ -26,13 +26,13 @@ from pathlib import Path
 import numpy as np
 from protocols import half_view, machine, write_report
 
-from completion.embedded import embedded_model, embedded_path
-from completion.markers.files import MarkerSequence, write_markers
-from completion.markers.layout import MarkerLayout
+from completion.mocap.files.markers import MarkerSequence, write_markers
+from completion.mocap.marker_sets.layout import MarkerLayout
+from completion.synthetic_model import embedded_model, embedded_path
 from model.body import BodyModel
 from scanprep.geometry.files import PointCloud, write_mesh, write_points
 from scanprep.geometry.landmarks import write_landmarks
-from scanprep.scanning.people import BodyShape, Person, walk
+from scanprep.synthetic.people import BodyShape, Person, walk
 
 VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 TIMED = ("report.json", ".report.json", ".html", "times.csv", ".png", ".webp")      # what changes from run to run

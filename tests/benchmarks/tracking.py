@@ -18,14 +18,14 @@ from protocols import load_real, machine, scape_fold, write_report
 from scipy.spatial.transform import Rotation, Slerp
 
 from completion import TrackConfig, track
-from completion.embedded import embedded_model
+from completion.synthetic_model import embedded_model
 from model import Subject, fit_pose, load_model
 from model.body import BodyModel
 from model.posing.transfer import subject_from_body
 from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.surface import Surface
-from scanprep.scanning.people import BodyShape, Person, walk
-from scanprep.scanning.scanner import ScannerConfig, scan
+from scanprep.synthetic.people import BodyShape, Person, walk
+from scanprep.synthetic.scanner import ScannerConfig, scan
 
 CAMERAS = ScannerConfig(views=2, azimuth=30.0, height=0.3, resolution=0.008, noise=0.005)
 RATE, FRAMES, SEED = 30.0, 120, 77

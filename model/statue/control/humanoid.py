@@ -7,8 +7,8 @@ from pathlib import Path
 
 import numpy as np
 
-from scanprep.scanning.people_anatomy import Anatomy
 from scanprep.skeleton.tree import Skeleton
+from scanprep.synthetic.anatomy import Anatomy
 
 from .files import read_control
 from .model import ControlModel
@@ -46,7 +46,7 @@ def humanoid() -> ControlModel:
 @lru_cache(maxsize=1)
 def humanoid_markers() -> dict[str, int]:
     """Label -> vertex of 41 motion-capture markers, labelled as in the CMU recordings."""
-    from scanprep.scanning.people_marks import markers
+    from scanprep.synthetic.landmarks import markers
 
     from .humanoid_build import nearest_marks
 
@@ -55,8 +55,8 @@ def humanoid_markers() -> dict[str, int]:
 
 def build() -> ControlModel:
     """The humanoid from scratch, half a minute; `write_control(build(), STORED)` keeps it."""
-    from scanprep.scanning.people_marks import landmarks
-    from scanprep.scanning.people_template import CANONICAL
+    from scanprep.synthetic.landmarks import landmarks
+    from scanprep.synthetic.topology import CANONICAL
 
     from . import humanoid_build as made
     from .chart import make_chart

@@ -11,13 +11,14 @@ from scipy.spatial import cKDTree
 
 from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.surface import Surface
-from scanprep.scanning import people_head, people_parts
-from scanprep.scanning.people_anatomy import Anatomy
-from scanprep.scanning.people_field import Field, Group, Loft, Mirrored, RoundCone, project
-from scanprep.scanning.people_marks import landmarks, markers
-from scanprep.scanning.people_parts import cross_sections
-from scanprep.scanning.people_remesh import mirror, polygonise, remesh
-from scanprep.scanning.people_template import CANONICAL, blending, load
+from scanprep.synthetic import body_parts as people_parts
+from scanprep.synthetic import head as people_head
+from scanprep.synthetic.anatomy import Anatomy
+from scanprep.synthetic.body_parts import cross_sections
+from scanprep.synthetic.implicit_surface import Field, Group, Loft, Mirrored, RoundCone, project
+from scanprep.synthetic.landmarks import landmarks, markers
+from scanprep.synthetic.topology import CANONICAL, blending, load
+from scanprep.synthetic.triangulation import mirror, polygonise, remesh
 
 from ...export.rig import strongest
 
@@ -71,7 +72,7 @@ def mitten(a: Anatomy) -> Field:
 
 def shoe(a: Anatomy) -> Field:
     """The foot with its toes in one."""
-    from scanprep.scanning.people_tables import FOOT as TABLE
+    from scanprep.synthetic.profiles import FOOT as TABLE
 
     length, frame, ankle = a.width["foot"], a.foot_frame, a.joints[12]
     toes = np.array([[0.66, -0.020, 0.150, -0.045, 0.138], [0.72, -0.045, 0.110, -0.055, 0.136]])

@@ -6,11 +6,11 @@ from pathlib import Path
 
 import numpy as np
 
+from scanprep.correspondence.correlated import find_correspondences
 from scanprep.geometry.landmarks import match_landmarks
 from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.storage import StorageError, load_arrays
-from scanprep.matching.correlated import find_correspondences
-from scanprep.matching.nonrigid import Registration, register, registration_problem
+from scanprep.registration.nonrigid import Registration, register, registration_problem
 
 from ...body import BodyModel
 from ...export.bvh_read import read_bvh

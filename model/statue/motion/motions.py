@@ -140,6 +140,6 @@ def bvh_motion(control: ControlModel, pose: np.ndarray, bvh: BvhMotion, referenc
 
 @lru_cache(maxsize=1)
 def _average_person() -> Skeleton:
-    from scanprep.scanning.people import Person
+    from scanprep.synthetic.people import Person
 
     return Person().skeleton

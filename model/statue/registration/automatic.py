@@ -8,10 +8,10 @@ from scipy.spatial import cKDTree
 
 from scanprep.geometry.formats.common import UNITS
 from scanprep.geometry.mesh import Mesh
-from scanprep.matching.confidence import stretched_share
-from scanprep.matching.matches import Target, target_of
-from scanprep.matching.nonrigid import Registration, RegistrationConfig, register
-from scanprep.matching.thinning import thin
+from scanprep.geometry.thinning import thin
+from scanprep.registration.confidence import stretched_share
+from scanprep.registration.matches import Target, target_of
+from scanprep.registration.nonrigid import Registration, RegistrationConfig, register
 from scanprep.threads import one_thread, search_threads
 
 from ..control.model import ControlModel

@@ -6,8 +6,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from scanprep.alignment.icp import align_landmarks
 from scanprep.geometry import rotations
-from scanprep.matching.rigid import align_landmarks
 from scanprep.ranges import Count, Positive, Settings
 
 from ..control.model import ControlModel

@@ -10,8 +10,8 @@ from scipy.spatial import cKDTree
 from scanprep.geometry import rotations
 from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.surface import Surface
-from scanprep.matching.matches import Target
-from scanprep.matching.thinning import thin
+from scanprep.geometry.thinning import thin
+from scanprep.registration.matches import Target
 
 from .limbs import limb_angles, limbs
 from .pose_search import COARSE, FINE, Posed, PoseSearch

@@ -18,10 +18,10 @@ from scipy.sparse import csc_array, diags_array, eye_array
 from scanprep.geometry.mesh import Mesh, check_template
 from scanprep.geometry.sparse import Factored
 from scanprep.geometry.surface import Surface, checked_points
-from scanprep.matching.matches import Target
-from scanprep.matching.shell import conjugate_gradients, flipped, unfold
-from scanprep.matching.turns import turns
 from scanprep.ranges import Count, Positive, Range, Settings
+from scanprep.registration.matches import Target
+from scanprep.registration.shell import conjugate_gradients, flipped, unfold
+from scanprep.registration.vertex_rotations import turns
 from scanprep.threads import one_thread
 
 from .local_shape import LocalShape, local_shape

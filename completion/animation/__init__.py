@@ -1,1 +1,0 @@
-"""Markers of a person move a body."""

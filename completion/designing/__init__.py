@@ -1,1 +1,0 @@
-"""Which markers, and which frames, tell most about a body [MoSh]."""

@@ -1,0 +1,152 @@
+"""The command `scape animate`."""
+from __future__ import annotations
+
+from html import escape
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+import tyro
+
+from model.body import BodyModel
+from model.cli import read_subject
+from model.linear import Subject
+from scanprep.batch.pool import Workers
+from scanprep.batch.workspace import Results, Task, Workspace
+from scanprep.cli import Output, Unit, WorkersArg
+from scanprep.console import Metric, Outcome, bar, failures_of, problem_of
+from scanprep.geometry.storage import read_json
+from scanprep.pictures.page import Page
+from scanprep.ranges import BETAS, Count
+
+from ...cli import ModelOrNone, read_model
+from ..pose.follow import AnimateConfig
+from ..subject.marker_shape import MarkerShapeConfig
+from .work import ENDINGS, MEAN_ERROR, BetasTo, Work, layout_or_file
+
+MarkersArg = Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="MARKERS")]
+
+
+def animate_markers(markers: MarkersArg, output: Output, model: ModelOrNone = None, layout: str | None = None,
+                    subject: str | None = None, unit: Unit | None = None, who: str | None = None,
+                    onto: Path | None = None, betas_to: Path | None = None, keys: Count = 120,
+                    config: Annotated[AnimateConfig, tyro.conf.arg(name="")] = AnimateConfig(),   # noqa: B008
+                    shape: MarkerShapeConfig = MarkerShapeConfig(),                               # noqa: B008
+                    workers: WorkersArg = Workers(), *, space: Workspace) -> Outcome:              # noqa: B008
+    """The motion of a person from markers, and the person.
+
+    A folder is worked through file by file, each into a folder of its name; called again, it goes on where it was,
+    and does anew what has changed.
+
+    Example: scape animate walk.c3d -m model.npz --layout cmu41 -o walk
+
+    Written are motion.npz (poses, trans, betas, rate), animation.glb, motion.bvh, joint_angles.csv (rotation vectors
+    of every part against its parent, in degrees), joint_centres.csv (metres), residuals.csv and report.html; of a
+    subject that was found also subject.json and layout.json, with loose markers where they are on this person.
+
+    Args:
+        markers: C3D, TRC or CSV, or a folder of these.
+        output: Folder to write to.
+        model: Model of `scape learn`; without it that of the embedded people, which is made on first use.
+        layout: Where the markers sit: cmu41, plugingait39, biomech57, helenhayes29, or a JSON file {"markersets":
+            [{"distance_from_skin": metres, "indices": {label: vertex}}]}. Without it the named one that fits best.
+        subject: Whose body it is: "markers" to find it from them, "template" for the one the model's poses were learned
+            from, betas in JSON or .npz, or a mesh in the model's triangles. Without it "markers" where the model has
+            betas.
+        unit: Unit of the markers, where the file cannot tell.
+        who: Whose markers, in a C3D file with several people.
+        onto: Another person who makes the motion too, as betas or a mesh: onto.npz, onto.glb.
+        betas_to: Betas into which the body changes, in JSON: those at the end [b1, b2, ...], or keys in seconds
+            {"0": [...], "2.5": [...]}: morph.glb.
+        keys: Largest number of key frames in a GLB.
+        config: Settings.
+        shape: Settings of the subject from markers.
+        workers: Who works through the files of a folder.
+    """
+    found = _marker_files(markers)
+    loaded, name = read_model(model)
+    work = Work(loaded, name, None if layout is None else layout_or_file(layout), _subject(loaded, subject, unit),
+                None if onto is None else read_subject(loaded, onto, unit),
+                None if betas_to is None else read_betas_to(betas_to, loaded.n_betas), unit, who, keys, config, shape)
+    settings = {"animate": config, "shape": shape, "model": name}
+    if markers.is_file():
+        with bar("following the markers") as following:
+            done = space.run(work, [Task("motion", markers)], inside=following).only
+        return Outcome(output, done, settings, problem=problem_of(done))
+    with bar("files") as progress:
+        results = space.run(work, [Task(path.stem, path, path.stem) for path in found], workers, progress)
+    with space.staging("page") as staged:
+        _folder_page(results).write(staged.folder / "report.html")
+    return Outcome(output, _summary(results, len(found)), settings, failures_of(results))
+
+
+def _summary(results: Results, count: int) -> list[Metric]:
+    off = {name: _error(metrics) for name, metrics in results.values.items()}
+    rows = [Metric("files", count), Metric("done before", len(off) - len(results.fresh)),
+            Metric("failed", len(results.failures))]
+    if off:
+        rows += [Metric("distance of markers, mean of the files", float(np.mean(list(off.values()))), "mm"),
+                 Metric(f"the same, worst file ({max(off, key=off.__getitem__)})", max(off.values()), "mm")]
+    return rows
+
+
+def _error(metrics: list[Metric]) -> float:
+    return next(float(m.value) for m in metrics if m.name == MEAN_ERROR)
+
+
+def _folder_page(results: Results) -> Page:
+    """The files, worst first."""
+    page = Page(f"{len(results.values)} marker files followed", "Worst first; each name leads to the page of its file.")
+    if results.failures:
+        page.section("Failed").table([(line,) for line in results.failures.values()])
+    page.section("Distance of the markers to where the body puts them, mean")
+    for name in sorted(results.values, key=lambda name: -_error(results.values[name])):
+        page.markup(f'<p><a href="{escape(name)}/report.html">{escape(name)}</a>: '
+                    f'{_error(results.values[name]):.1f} mm</p>')
+    return page
+
+
+def _marker_files(markers: Path) -> list[Path]:
+    """The file, or the marker files of a folder; files of one name would be written over each other."""
+    if not markers.is_dir():
+        return [markers]
+    found = sorted(p for p in markers.iterdir() if p.suffix.lower() in ENDINGS)
+    if not found:
+        raise ValueError(f"{markers}: expected files ending in {', '.join(ENDINGS)}, found none")
+    names = [p.stem for p in found]
+    twice = sorted({name for name in names if names.count(name) > 1})
+    if twice:
+        raise ValueError(f"{markers}: expected files of different names, {twice[0]} comes with several endings")
+    return found
+
+
+def _subject(model: BodyModel, given: str | None, unit: Unit | None) -> Subject | None:
+    """Whose body it is; None when it is to be found from the markers."""
+    if given is None:
+        return None if model.n_betas else model.subject(None)
+    if given == "markers":
+        return None
+    return read_subject(model, None if given == "template" else Path(given), unit)
+
+
+def read_betas_to(path: Path, n_betas: int) -> BetasTo:
+    """Betas at the end, [b1, b2, ...] or {"betas": [...]}, or keys {"seconds": [b1, b2, ...]}, from JSON.
+
+    Raises
+    ------
+    ValueError
+        Another form, more betas than the model has.
+    """
+    wanted = 'betas at the end, [b1, b2, ...], or keys {"0": [b1, ...], "2.5": [...]} in seconds'
+    tree = read_json(path, wanted)
+    keyed = isinstance(tree, dict) and "betas" not in tree
+    try:
+        found = {float(s): np.array(betas, dtype=np.float64) for s, betas in
+                 (tree if keyed else {0: tree["betas"] if isinstance(tree, dict) else tree}).items()}
+    except (TypeError, ValueError, KeyError, OverflowError):
+        found = {}
+    if not found or any(b.ndim != 1 or len(b) > n_betas or not np.isfinite(b).all() for b in found.values()):
+        raise ValueError(f"{path}: expected {wanted}, at most {n_betas} betas each")
+    for betas in found.values():
+        BETAS.check(betas, f"{path}: betas")
+    return found if keyed else found[0.0]

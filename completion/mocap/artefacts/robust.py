@@ -1,0 +1,167 @@
+"""Which markers are believed: weights that outliers lose, and labels that two markers have exchanged."""
+from __future__ import annotations
+
+import numpy as np
+
+from scanprep.geometry.mesh import Mesh
+from scanprep.meaning import extent, size, unit_problem
+
+from ...motion import Motion
+from ..files.markers import MarkerSequence
+from ..marker_sets.layout import MarkerLayout
+
+ASTRAY = 0.025                       # of the size, 34 mm on a man; good motions 4 to 25, sides exchanged 36 to 60
+WIDEST = 5.0                         # metres; a marker farther off is an outlier on however bad a fit
+ENTER, LEAVE = 0.5, 1.0              # share of the distance that remains when labels are exchanged, and put back
+
+
+def marker_weights(positions: np.ndarray, targets: np.ndarray, sd: float, outlier: float
+                   ) -> tuple[np.ndarray, np.ndarray]:
+    """Weights of the markers of frames, low for outliers, and whether each is believed.
+
+    What is common to all markers does not make an outlier: the body may be a step behind.
+
+    Parameters
+    ----------
+    positions : (..., L, 3) float, metres
+        Where the body puts them.
+    targets : (..., L, 3) float, metres
+        NaN where a marker was not seen.
+    sd, outlier : float, metres
+        See `AnimateConfig`.
+
+    Returns
+    -------
+    (..., L) float
+        Factors on the squared distance, zero where nothing was seen.
+    (..., L) bool
+        Seen, and of more than a quarter of the full weight.
+    """
+    squared, scale = distances_apart(positions, targets, outlier)
+    share = np.where(np.isnan(squared), 0.0, (scale**2 / (scale**2 + squared))**2)
+    return share / sd**2, share > 0.25
+
+
+def distances_apart(positions: np.ndarray, targets: np.ndarray, outlier: float) -> tuple[np.ndarray, np.ndarray]:
+    """Squared distances (..., L) without what is common to all, and the length (..., 1) that makes an outlier."""
+    off = positions - targets
+    off = off - _median(np.swapaxes(off, -1, -2))[..., None, :]
+    squared = np.einsum("...d,...d->...", off, off)
+    return squared, np.maximum(outlier, np.minimum(3 * np.sqrt(_median(squared)), WIDEST))[..., None]
+
+
+def _median(values: np.ndarray) -> np.ndarray:
+    """The median (...) of values (..., n) that are not NaN, 0 without any; on few values much faster than numpy's."""
+    ordered = np.sort(values, axis=-1)                                  # NaN comes last
+    seen = (~np.isnan(ordered)).sum(axis=-1)[..., None]
+    below = np.take_along_axis(ordered, np.maximum((seen - 1) // 2, 0), axis=-1)
+    above = np.take_along_axis(ordered, np.minimum(seen // 2, ordered.shape[-1] - 1), axis=-1)
+    return np.where(seen > 0, 0.5 * (below + above), 0.0)[..., 0]
+
+
+def misfit(apart: np.ndarray, outlier: float) -> np.ndarray:
+    """(...) how badly markers (..., L), metres off, fit, of 0 to 1; each outlier counts the same."""
+    squared = apart**2
+    return np.nanmean(squared / (outlier**2 + squared), axis=-1)
+
+
+def exchangeable(positions: np.ndarray, targets: np.ndarray, outlier: float) -> np.ndarray:
+    """Frames (T,) bool in which a `LabelWatch` would exchange some labels, for places and targets (T, L, 3)."""
+    squared, scale = distances_apart(positions, targets, outlier)
+    suspect = squared > (0.5 * scale)**2
+    out = np.zeros(len(targets), dtype=bool)
+    for t in np.flatnonzero(suspect.sum(axis=1) > 1):
+        some = np.flatnonzero(suspect[t])
+        off = positions[t] - targets[t]
+        out[t] = bool(_gains(positions[t, some] - _median(off.T), targets[t, some], scale[t, 0]).any())
+    return out
+
+
+def _gains(places: np.ndarray, targets: np.ndarray, scale: float) -> np.ndarray:
+    """Pairs (n, n) bool that would fit well if they exchanged their targets, and do not as they are."""
+    apart = np.linalg.norm(places[:, None] - targets, axis=2)
+    own = np.diag(apart)
+    return (apart + apart.T < ENTER * (own[:, None] + own)) & (np.maximum(apart, apart.T) < 0.5 * scale)
+
+
+class LabelWatch:
+    """Finds pairs of markers that have exchanged their labels, and remembers them from frame to frame.
+
+    A pair is exchanged when that removes most of the distance of both from where the body would put them,
+    and put back when the labels as they came fit better again: in between nothing changes.
+
+    Parameters
+    ----------
+    count : int
+        L, the number of markers.
+    outlier : float, metres
+        See `AnimateConfig`.
+    """
+
+    def __init__(self, count: int, outlier: float) -> None:
+        self.outlier = outlier
+        self.order = np.arange(count)
+
+    def forget(self) -> None:
+        """Take the labels as they come."""
+        self.order = np.arange(len(self.order))
+
+    @property
+    def idle(self) -> bool:
+        """No labels are exchanged at present."""
+        return bool((self.order == np.arange(len(self.order))).all())
+
+    def update(self, positions: np.ndarray, targets: np.ndarray) -> np.ndarray:
+        """Which column (L,) each marker is taken from.
+
+        Parameters
+        ----------
+        positions : (L, 3) float, metres
+            Where the body puts the markers.
+        targets : (L, 3) float, metres
+            As they came.
+        """
+        taken = targets[self.order]
+        squared, scale = distances_apart(positions, taken, self.outlier)
+        suspect = squared > (0.5 * scale)**2                            # never of NaN
+        changed = self.order != np.arange(len(self.order))
+        if suspect.sum() < 2 and not changed.any():
+            return self.order
+        shift = _median((positions - taken).T)
+        some = np.flatnonzero((suspect | changed) & ~np.isnan(squared))
+        apart = np.linalg.norm(positions[some, None] - shift - taken[some], axis=2)
+        for i, j in zip(*np.triu_indices(len(some), 1), strict=True):
+            now, then = apart[i, i] + apart[j, j], apart[i, j] + apart[j, i]
+            a, b = some[i], some[j]
+            back = self.order[a] == b
+            if then < (LEAVE if back else ENTER) * now and (back or max(apart[i, j], apart[j, i]) < 0.5 * scale[0]):
+                self.order[[a, b]] = self.order[[b, a]]
+                taken[[a, b]] = taken[[b, a]]
+                apart[:, [i, j]] = apart[:, [j, i]]
+        return self.order
+
+
+def motion_problem(motion: Motion, body: Mesh, layout: MarkerLayout, markers: MarkerSequence) -> str | None:
+    """Why a motion from markers means nothing, with the likely cause; None where it means something.
+
+    Parameters
+    ----------
+    body : Mesh
+        Template of the person's model.
+    layout : MarkerLayout
+        That the markers were followed with.
+    """
+    seen = np.isfinite(motion.residuals)
+    if not seen.any():
+        return "no marker of the layout was ever seen: markers of another layout?"
+    known = layout.matched(markers.labels, 0)
+    columns = [markers.labels.index(label) for label in known]
+    spans = [extent(frame) for frame in markers.positions[:: max(1, len(seen) // 50), columns]]
+    wrong = unit_problem(float(np.nanmax(spans)), extent(layout.select(known).place(body)), "the markers span a box")
+    off, far = float(motion.residuals[seen].mean()), ASTRAY * size(body)
+    if wrong is None and off <= far:
+        return None
+    believed = 100 * float(motion.trusted[seen].mean())
+    return (f"the markers are {1000 * off:.0f} mm from where the body has them, {100 * motion.converged.mean():.0f}% "
+            f"of the frames settled and {believed:.0f}% of the markers are believed; "
+            + (wrong or "labels of left and right exchanged, another layout, or another model?"))

@@ -1,0 +1,140 @@
+"""The simulated markers of a sequence: where the body has them, and what each marker is off by the others' account."""
+from __future__ import annotations
+
+import numpy as np
+
+from model.linear import Subject
+
+from ..files.markers import MarkerSequence
+from ..marker_sets.layout import MarkerLayout
+from ..pose.follow import MarkerFollower
+from ..pose.marked_body import BATCH
+from ..pose.settings import AnimateConfig
+from ..pose.smooth import smooth_sequence
+
+LOOKS = 15.0                         # frames per second in which it is asked how a marker draws the body
+OWN = 0.6                            # most of a displacement that the body is taken to have followed
+
+
+class Simulation(MarkerFollower):
+    """A body that follows markers whose labels are taken as they are.
+
+    Parameters
+    ----------
+    subject : Subject
+    markers : MarkerSequence
+    layout : MarkerLayout
+    config : AnimateConfig
+    """
+
+    def __init__(self, subject: Subject, markers: MarkerSequence, layout: MarkerLayout, config: AnimateConfig) -> None:
+        super().__init__(subject, markers, layout, config)
+        self.labels = tuple(markers.labels[row] for row in self.rows)
+        template, selected = subject.template, layout.select(self.labels)
+        base = selected.vertices.reshape(len(self.labels), -1)
+        share = np.ones(base.shape) if selected.weights is None else selected.weights
+        nearest = np.take_along_axis(base, share.argmax(axis=1)[:, None], axis=1)[:, 0]
+        self.part = subject.skeleton.part_of_vertex(template)[nearest]
+        parents = np.asarray(subject.skeleton.parents)[self.part]
+        hangs = self.part[:, None] == parents
+        self.neighbours = (self.part[:, None] == self.part) | hangs | hangs.T
+
+    def find_exchanges(self, x: np.ndarray) -> None:
+        """Take the labels as they are."""
+        self.order[:] = np.arange(self.body.count)
+
+    def solve(self, targets: np.ndarray, near: np.ndarray | None = None) -> np.ndarray:
+        """Unknowns (T, P) of the body that follows markers (T, L, 3), metres, from others that are near or anew."""
+        self.targets = targets
+        x = self.between_keys(self.first_frame()) if near is None else near.copy()
+        self.find_exchanges(x)
+        some = np.flatnonzero(np.isfinite(targets[..., 0]).any(axis=1))
+        inside = np.arange(some[0], some[-1] + 1)
+        for _ in range(max(self.config.smoothing, 1)):
+            x[inside] = smooth_sequence(self, x[inside], inside)
+        return x
+
+    def alone(self, off: np.ndarray, x: np.ndarray) -> np.ndarray:
+        """What markers would be off (T, L, 3), metres, if the body x (T, P) followed the others alone.
+
+        The body has gone after a displaced marker a little. Its own part in the normal equations is taken back.
+
+        Parameters
+        ----------
+        off : (T, L, 3) float, metres
+            From the simulated markers to the measured ones.
+        """
+        T, every = len(x), max(1, round(self.rate / LOOKS))
+        frames = np.arange(min(every // 2, T - 1), T, every)
+        freed = _between(self._freed(x[frames], frames), frames, T)
+        return (freed @ off[..., None])[..., 0]
+
+    def local(self, vectors: np.ndarray, x: np.ndarray) -> np.ndarray:
+        """Vectors (T, L, 3) of markers in the frames of their parts, the body being at x (T, P)."""
+        return np.einsum("tldc,tld->tlc", self.part_rotations(x), vectors)
+
+    def part_rotations(self, x: np.ndarray) -> np.ndarray:
+        """Rotations (T, L, 3, 3) of the markers' parts, from the part to the world."""
+        pose, _, _ = self.body.body.split(x)
+        return self.body.body.skeleton.part_rotations(pose)[:, self.part]
+
+    def _freed(self, x: np.ndarray, frames: np.ndarray) -> np.ndarray:
+        """Matrices (n, L, 3, 3) from what is left of a displacement to the whole of it, at unknowns (n, P)."""
+        weights = self.weights(frames, self.positions(x))
+        out = np.empty((*weights.shape, 3, 3))
+        for start in range(0, len(x), BATCH):
+            some = slice(start, start + BATCH)
+            _, _, hessian = self.body.system(x[some], self.taken(frames[some]), weights[some])
+            pose, trans, _ = self.body.body.split(x[some])
+            _, by_turn = self.body.shapes.columns(pose, trans)                                    # (B, n, 3, L)
+            columns = np.concatenate([by_turn, np.broadcast_to(np.eye(3)[None, :, :, None],
+                                                               (len(pose), 3, 3, self.body.count))], axis=1)
+            B, P = columns.shape[:2]
+            hessian += 1e-9 * np.trace(hessian, axis1=1, axis2=2)[:, None, None] * np.eye(P)
+            answer = np.linalg.solve(hessian, columns.reshape(B, P, -1)).reshape(columns.shape)
+            followed = np.einsum("bpcl,bpdl->blcd", columns, answer) * weights[some][..., None, None]
+            share, axes = np.linalg.eigh(followed)
+            out[some] = (axes / (1 - np.clip(share, 0, OWN))[..., None, :]) @ np.swapaxes(axes, -1, -2)
+        return out
+
+
+def _between(values: np.ndarray, frames: np.ndarray, count: int) -> np.ndarray:
+    """Values (n, ...) of some frames for all of them (count, ...), straight between."""
+    if len(frames) == 1:
+        return np.repeat(values, count, axis=0)
+    times = np.arange(count)
+    i = np.clip(np.searchsorted(frames, times, side="right") - 1, 0, len(frames) - 2)
+    share = np.clip((times - frames[i]) / (frames[i + 1] - frames[i]), 0, 1).reshape(-1, *[1] * (values.ndim - 1))
+    return (1 - share) * values[i] + share * values[i + 1]
+
+
+def usual_places(local: np.ndarray) -> np.ndarray:
+    """The median (L, 3) of what markers are off in the frames of their parts (T, L, 3), zero without any."""
+    return np.array([np.median(off[np.isfinite(off[:, 0])], axis=0) if np.isfinite(off[:, 0]).any() else np.zeros(3)
+                     for off in np.swapaxes(local, 0, 1)])
+
+
+def bridged(local: np.ndarray, reach: float) -> np.ndarray:
+    """What markers are off (T, L, 3) with gaps bridged: straight from end to end, in long ones by way of the usual.
+
+    Parameters
+    ----------
+    local : (T, L, 3) float, metres
+        NaN in gaps.
+    reach : float
+        Frames from an end of a long gap to where a marker is usually.
+    """
+    out = np.repeat(usual_places(local)[None], len(local), axis=0)
+    for i in range(local.shape[1]):
+        seen = np.flatnonzero(np.isfinite(local[:, i, 0]))
+        if not len(seen):
+            continue
+        usual, times = out[0, i].copy(), np.arange(len(local))
+        after = np.searchsorted(seen, times)
+        left, right = seen[np.maximum(after - 1, 0)], seen[np.minimum(after, len(seen) - 1)]
+        span = np.clip(right - left, 1, reach)
+        share = [np.clip(1 - np.abs(times - end) / span, 0, 1)[:, None] for end in (left, right)]
+        share[1][left == right] = 0                                    # before the first, after the last
+        out[:, i] += share[0] * (local[left, i] - usual) + share[1] * (local[right, i] - usual)
+        out[seen, i] = local[seen, i]
+    return out

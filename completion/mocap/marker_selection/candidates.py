@@ -1,0 +1,276 @@
+"""Symmetric places for markers, spread over the skin, of which a marker set may be chosen."""
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import TYPE_CHECKING
+
+import numpy as np
+from scipy.sparse import coo_array, csr_array, diags_array
+
+from scanprep.geometry.geodesics import SurfaceGraph
+from scanprep.geometry.mesh import Mesh
+from scanprep.geometry.surface import Rays
+from scanprep.ranges import Cosine, Positive, Settings
+from scanprep.skeleton.tree import Skeleton
+
+from ..marker_sets.layout import DISTANCE, MarkerLayout
+from ..marker_sets.symmetry import SkinMirror, find_skin_mirror, other_side, side_of
+
+if TYPE_CHECKING:
+    from model.body import BodyModel
+
+RAYS = 48                            # directions that are tried from every place
+CONE = 0.5                           # cosine of the directions inwards along which thickness is measured
+
+
+@dataclass(frozen=True)
+class CandidateConfig(Settings):
+    """Where markers can sit; lengths are shares of the body's length.
+
+    Attributes
+    ----------
+    reach : float
+        Skin that is nearer hides a marker from cameras.
+    open : float
+        Share of the directions outwards that must be free, averaged within `thick`: armpits, crotch and the skin
+        between fingers have less.
+    margin : float
+        Distance along the skin from places that are less open.
+    thick : float
+        Least thickness of the body below a marker: fingers, toes and ears have less.
+    ends : float
+        The outermost places at both ends, as far as they face outwards there, are left out: the soles, the crown.
+    flat : float
+        Least mean cosine between the normal and those around it, within `thick`.
+    middle : float
+        Places nearer to the middle than this are taken in the middle, alone.
+    """
+
+    reach: Positive = 0.06
+    open: float = 0.75
+    margin: float = 0.035
+    thick: float = 0.022
+    ends: float = 0.025
+    flat: Cosine = 0.75
+    middle: float = 0.012
+
+
+def candidate_layout(body: BodyModel | Mesh, base: MarkerLayout, count: int = 114,
+                     config: CandidateConfig | None = None, mirror: SkinMirror | None = None,
+                     skeleton: Skeleton | None = None) -> MarkerLayout:
+    """A marker set and more markers, each as far along the skin from all others as can be, the same left and right.
+
+    A marker that the base has on one side only gets its partner first. New markers are called after the part that
+    they sit on, with L, R or M in front.
+
+    Parameters
+    ----------
+    body : BodyModel or Mesh
+        Of a model the mean person in the pose of the template, and its skeleton.
+    base : MarkerLayout
+        Its labels tell left from right.
+    count : int
+        Markers altogether, those of the base included.
+    config : CandidateConfig, optional
+    mirror : SkinMirror, optional
+        Of `find_skin_mirror`; found when not given.
+    skeleton : Skeleton, optional
+        For the names, where `body` is a mesh.
+
+    Returns
+    -------
+    MarkerLayout
+        The markers of the base first.
+
+    Raises
+    ------
+    ValueError
+        Fewer than the base has, no room for so many, a body that is not symmetric, a base without sides.
+
+    [MoSh] Eq. 25
+    """
+    config = config or CandidateConfig()
+    if not isinstance(body, Mesh):
+        skeleton = skeleton or body.skeleton
+        pose = np.zeros((len(skeleton.parents), 3))
+        body = body.template.with_vertices(body.vertices(pose, np.zeros(body.n_betas)) if body.n_betas
+                                           else body.vertices(pose, None))
+    mirror = mirror or find_skin_mirror(body)
+    room = _Room(body, base, config, mirror)
+    whole = _with_partners(base, mirror)
+    if count < len(whole.labels):
+        raise ValueError(f"count: expected at least the {len(whole.labels)} markers of the base with their partners, "
+                         f"got {count}")
+    places = room.spread(count - len(whole.labels), _vertices(whole))
+    return _joined(whole, places, _names(body, skeleton, places))
+
+
+def sitting_room(body: Mesh, mirror: SkinMirror, config: CandidateConfig | None = None) -> np.ndarray:
+    """(N,) bool where a marker can sit: open to cameras, flat, on a thick enough limb, not on the soles.
+
+    Parameters
+    ----------
+    body : Mesh
+        In a pose with limbs apart.
+    mirror : SkinMirror
+        Says which direction is across; the body's length is the largest extent along the others.
+    """
+    config = config or CandidateConfig()
+    axis, length = _long_axis(body, mirror)
+    along = body.vertices @ axis
+    outward = body.vertex_normals @ axis
+    near_end = np.minimum(along - along.min(), along.max() - along) < config.ends * length
+    at_end = near_end & (np.abs(outward) > 0.5)
+    reach = config.reach * length
+    around = _around(body, config.thick * length)
+    flatness = np.einsum("nd,nd->n", body.vertex_normals, around @ body.vertex_normals)
+    closed = np.flatnonzero(around @ _openness(body, reach) < config.open)
+    away = SurfaceGraph(body).nearest(closed)[0] if len(closed) else np.inf
+    return (away > config.margin * length) & (_thickness(body, reach) >= config.thick * length) \
+        & (flatness >= config.flat) & ~at_end
+
+
+class _Room:
+    """Where on a body markers can be added."""
+
+    def __init__(self, body: Mesh, base: MarkerLayout, config: CandidateConfig, mirror: SkinMirror) -> None:
+        vertices = _vertices(base)
+        sides = np.array([side_of(label) for label in base.labels])
+        turn = float(np.sign((sides * mirror.across[vertices]).sum()))
+        if turn == 0:
+            raise ValueError("base: expected labels that tell left from right, such as LELB and RELB, found "
+                             f"{', '.join(base.labels[:6])}")
+        across = turn * mirror.across
+        length = _long_axis(body, mirror)[1]
+        self.graph, self.partner = SurfaceGraph(body), mirror.partner
+        free = sitting_room(body, mirror, config)
+        free &= free[self.partner]
+        edge = float(np.linalg.norm(np.diff(body.vertices[body.edges], axis=1), axis=-1).mean())
+        on_line = np.abs(across) < edge
+        from_line = self.graph.nearest(np.flatnonzero(on_line))[0]
+        self.apart = 2 * from_line                                   # of a place from its partner, along the skin
+        self.left = free & (across > 0) & (from_line > config.middle * length)
+        self.line = free & on_line
+
+    def spread(self, count: int, taken: np.ndarray) -> list[tuple[int, ...]]:
+        """Places one by one, (left, right) or (middle,), until there are `count` vertices."""
+        near = self.graph.nearest(taken)[0]
+        found: list[tuple[int, ...]] = []
+        while (left := count - sum(map(len, found))) > 0:
+            both = np.where(self.left, np.minimum(np.minimum(near, near[self.partner]), self.apart), 0.0)
+            alone = np.where(self.line, near, 0.0)
+            v = int(both.argmax()) if left > 1 and both.max() >= alone.max() else int(alone.argmax())
+            if max(both[v], alone[v]) <= 0:
+                raise ValueError(f"count: no room on the body for {left} more markers")
+            place = (v, int(self.partner[v])) if left > 1 and both.max() >= alone.max() else (v,)
+            near = np.minimum(near, self.graph.nearest(np.array(place))[0])
+            found.append(place)
+        return found
+
+
+def _with_partners(base: MarkerLayout, mirror: SkinMirror) -> MarkerLayout:
+    """The base, and the partners that are missing in it."""
+    lonely = [i for i, label in enumerate(base.labels) if (o := other_side(label)) and o not in base.labels]
+    others = [other_side(base.labels[i]) or "" for i in lonely]
+    places: list[tuple[int, ...]] = [(int(mirror.partner[_vertices(base)[i]]),) for i in lonely]
+    free = {base.labels[i] for i in lonely} & set(base.loose)
+    joined = _joined(base, places, others)
+    aliases = {a: label for a, label in joined.aliases.items() if a not in others}
+    return MarkerLayout(joined.labels, joined.vertices, joined.distances, joined.weights, aliases,
+                        (*base.loose, *(o for i, o in zip(lonely, others, strict=True) if base.labels[i] in free)))
+
+
+def _joined(base: MarkerLayout, places: list[tuple[int, ...]], labels: list[str]) -> MarkerLayout:
+    """The base, and markers on single vertices."""
+    v = np.array([v for place in places for v in place], dtype=np.int64)
+    distances = np.r_[np.asarray(base.distances), np.full(len(v), DISTANCE)]
+    all_labels = (*base.labels, *labels)
+    aliases = {a: label for a, label in base.aliases.items() if a not in labels}
+    if base.weights is None:
+        return MarkerLayout(all_labels, np.r_[base.vertices, v], distances, None, aliases, base.loose)
+    weights = np.vstack([base.weights, np.tile([1.0, 0.0, 0.0], (len(v), 1))])
+    return MarkerLayout(all_labels, np.vstack([base.vertices, np.repeat(v[:, None], 3, axis=1)]), distances, weights,
+                        aliases, base.loose)
+
+
+def _vertices(layout: MarkerLayout) -> np.ndarray:
+    """(L,) the vertex of every marker, or that of the largest weight."""
+    if layout.weights is None:
+        return layout.vertices
+    return layout.vertices[np.arange(len(layout.labels)), layout.weights.argmax(axis=1)]
+
+
+def _names(body: Mesh, skeleton: Skeleton | None, places: list[tuple[int, ...]]) -> list[str]:
+    """Labels of new markers: side, part, number."""
+    parts = None if skeleton is None else skeleton.part_of_vertex(body)
+    counts: dict[str, int] = {}
+    labels = []
+    for place in places:
+        stem = ""
+        if skeleton is not None and parts is not None:
+            words = skeleton.names[parts[place[0]]].replace(".", "_").split("_")
+            stem = "_".join(w for w in words if w.lower() not in ("left", "right", "l", "r")).upper() + "."
+        key = f"{'M' if len(place) == 1 else 'LR'}.{stem}"
+        counts[key] = counts.get(key, 0) + 1
+        labels += [f"{side}.{stem}{counts[key]}" for side in ("M" if len(place) == 1 else "LR")]
+    return labels
+
+
+def _long_axis(body: Mesh, mirror: SkinMirror) -> tuple[np.ndarray, float]:
+    """The direction in the plane of symmetry along which the body is longest, and its extent, metres."""
+    across = (body.vertices - mirror.image(body)).T @ mirror.across
+    across /= np.linalg.norm(across)
+    x = body.vertices - body.vertices.mean(axis=0)
+    x = x - np.outer(x @ across, across)
+    axis = np.linalg.eigh((x * body.vertex_areas[:, None]).T @ x)[1][:, -1]
+    return axis, float(np.ptp(body.vertices @ axis))
+
+
+def _openness(body: Mesh, reach: float) -> np.ndarray:
+    """(N,) the share of the directions outwards in which no skin is within reach, those along the normal weigh more."""
+    origins, directions = _fans(body)
+    rays = Rays(body)
+    lifted = origins + 1e-4 * reach * np.repeat(body.vertex_normals, RAYS, axis=0)
+    return 1 - rays.occluded(lifted, directions, reach).reshape(-1, RAYS).mean(axis=1)
+
+
+def _thickness(body: Mesh, reach: float) -> np.ndarray:
+    """(N,) how far the skin on the other side is, metres: the median of directions inwards, at most `reach`."""
+    k = np.arange(RAYS // 3)
+    z = 1 - (1 - CONE) * (k + 0.5) / len(k)
+    origins, directions = _fans(body, z)
+    inward = np.repeat(body.vertex_normals, len(k), axis=0)
+    hit = Rays(body).cast(origins - 1e-4 * reach * inward, -directions, reach)[1]
+    return np.median(np.minimum(np.where(np.isfinite(hit), hit, reach), reach).reshape(-1, len(k)), axis=1)
+
+
+def _fans(body: Mesh, z: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
+    """Origins and unit directions (N·n, 3) about the normal of every vertex; `z` (n,) their cosines with it."""
+    if z is None:
+        z = np.sqrt((np.arange(RAYS) + 0.5) / RAYS)                  # as many as the skin there sees of a lit sky
+    turn = np.arange(len(z)) * np.pi * (3 - np.sqrt(5))
+    local = np.stack([np.sqrt(1 - z**2) * np.cos(turn), np.sqrt(1 - z**2) * np.sin(turn), z], axis=1)
+    n = body.vertex_normals
+    first = body.vertices[_a_neighbour(body)] - body.vertices          # turns with the body
+    first = first - np.einsum("nd,nd->n", first, n)[:, None] * n
+    first /= np.maximum(np.linalg.norm(first, axis=1, keepdims=True), 1e-12)
+    frames = np.stack([first, np.cross(n, first), n], axis=1)
+    return np.repeat(body.vertices, len(z), axis=0), np.einsum("kc,ncd->nkd", local, frames).reshape(-1, 3)
+
+
+def _a_neighbour(body: Mesh) -> np.ndarray:
+    """(N,) one neighbour of every vertex."""
+    out = np.zeros(len(body.vertices), dtype=np.int64)
+    out[body.edges[:, 0]], out[body.edges[:, 1]] = body.edges[:, 1], body.edges[:, 0]
+    return out
+
+
+def _around(body: Mesh, radius: float) -> csr_array:
+    """(N, N) weights of the vertices within a radius of every vertex, by their areas; rows sum to 1."""
+    from scipy.spatial import cKDTree
+
+    i, j = cKDTree(body.vertices).query_pairs(radius, output_type="ndarray").T
+    each = np.arange(len(body.vertices))
+    i, j = np.r_[i, j, each], np.r_[j, i, each]
+    near = coo_array((body.vertex_areas[j], (i, j)), shape=(len(each), len(each))).tocsr()
+    return diags_array(1 / np.maximum(near.sum(axis=1), 1e-30)) @ near

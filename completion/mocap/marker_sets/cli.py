@@ -1,0 +1,179 @@
+"""`scape layout`: which marker sets there are, what they look like, and on other bodies."""
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+import tyro
+
+from model.body import BodyModel
+from scanprep.cli import MM, Output, Unit, landmarks_beside
+from scanprep.console import Metric, Outcome, bar, dispatch, say
+from scanprep.geometry.files import read_mesh, write_mesh
+from scanprep.geometry.landmarks import match_landmarks, read_landmark_vertices, read_landmarks
+from scanprep.geometry.mesh import Mesh
+from scanprep.skeleton.tree import Skeleton
+
+from ...cli import ModelOrNone, read_model
+from .layout import MarkerLayout
+from .named import layout_names, layout_summaries
+from .symmetry import label_pairs
+
+LayoutArg = Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="LAYOUT")]
+
+COMMANDS = {
+    "list": ("The marker sets that come along.", "completion.mocap.marker_sets.cli:list_layouts"),
+    "show": ("A layout on a body: pictures from four sides and a table.",
+             "completion.mocap.marker_sets.cli:show_layout"),
+    "carry": ("A layout on another triangulation, by registration.", "completion.mocap.marker_sets.cli:carry_to"),
+    "design": ("Which markers to put on: the set from which bodies are estimated best.",
+               "completion.mocap.marker_selection.cli:design"),
+}
+
+
+def group(argv: list[str]) -> int:
+    """The commands of `scape layout`."""
+    return dispatch(COMMANDS, "scape layout", argv, "Where on the body the markers sit.")
+
+
+def list_layouts() -> Outcome:
+    """The marker sets that come along, and the bodies they are known on.
+
+    Example: scape layout list
+    """
+    return Outcome(None, [Metric(name, count, f"markers; {about} On {bodies}.")
+                          for name, count, about, bodies in layout_summaries()])
+
+
+def show_layout(layout: LayoutArg, output: Output, model: ModelOrNone = None, body: Path | None = None,
+                unit: Unit | None = None) -> Outcome:
+    """A layout on a body: pictures from four sides with the labels, and a table of all markers.
+
+    Example: scape layout show vicon47 -m model.npz -o markers
+
+    Written are layout.png, report.html and layout.json (for --layout of other commands).
+
+    Args:
+        layout: One of `scape layout list`, or a file.
+        output: Folder to write to.
+        model: Model of `scape learn`, whose mean person is shown; without it, and without --body, that of the embedded
+            people.
+        body: Mesh to show it on, instead of a model.
+        unit: Unit of the mesh.
+    """
+    from scanprep.pictures.shading import save_png
+
+    from .pictures import layout_page, picture_layout
+
+    if model is not None and body is not None:
+        raise ValueError("--model and --body: expected one of them")
+    shown, skeleton, kept, name = _body(model, body, unit)
+    found = read_layout(layout, shown, kept)
+    figures = _figures(found, shown)
+    picture = picture_layout(shown, found)
+    output.mkdir(parents=True, exist_ok=True)
+    save_png(output / "layout.png", picture)
+    found.save(output / "layout.json")
+    layout_page(layout, shown, found, picture, {m.name: f"{m.text()} {m.unit}" for m in figures}, skeleton
+                ).write(output / "report.html")
+    return Outcome(output, [Metric("body", name), *figures], {"layout": layout})
+
+
+def carry_to(layout: LayoutArg, source: Path, target: Path, output: Output, landmarks: Path | None = None,
+             source_landmarks: Path | None = None, unit: Unit | None = None) -> Outcome:
+    """A layout on another triangulation: the source body is registered to the target and takes its markers along.
+
+    Example: scape layout carry vicon47 --source template.ply --target mine.ply -o mine.layout.json
+
+    Without landmarks, places that look alike are sought; they cannot tell how far a smooth limb is turned about
+    itself, so look at the picture beside the output, and name landmarks where it is wrong: ends of the limbs, inner
+    and outer sides of knees, elbows, wrists.
+
+    Args:
+        layout: One of `scape layout list`, or a file.
+        source: Mesh that the layout is for.
+        target: Mesh to bring it to, in any pose.
+        output: Layout file to write; pictures and the registered source are written beside it.
+        landmarks: Landmarks of the target.
+        source_landmarks: Landmarks of the source, of the same names; else the file of its name beside it.
+        unit: Unit of the target and its landmarks.
+    """
+    from scanprep.pictures.shading import save_png
+
+    from .pictures import picture_layout
+    from .transfer import DOUBTFUL, register_layout
+
+    ours, theirs = read_mesh(source), read_mesh(target, unit)
+    found = read_layout(layout, ours, None)
+    pairs = None
+    if landmarks is not None:
+        marks = read_landmark_vertices(source_landmarks or landmarks_beside(source), ours)
+        try:
+            pairs = match_landmarks(marks, read_landmarks(landmarks, theirs, unit))[1:]
+        except ValueError as error:
+            raise ValueError(f"{landmarks}: {error}") from None
+    with bar("registering") as progress:
+        result = register_layout(found, ours, theirs, pairs, progress=progress)
+    result.layout.save(output)
+    save_png(output.with_suffix(".png"), picture_layout(theirs, result.layout))
+    write_mesh(output.with_suffix(".registered.ply"), result.registered)
+    if result.missed > DOUBTFUL:
+        say(f"note: {result.missed:.0%} of {target} is not covered by the source; look at "
+            f"{output.with_suffix('.png')}, and name landmarks if limbs are wrong")
+    return Outcome(output, [
+        *_figures(result.layout, theirs), Metric("landmarks", 0 if pairs is None else len(pairs[0])),
+        Metric("distance of the registered source, RMS", MM * result.rms, "mm"),
+        *([] if pairs is None else [Metric("distance of landmarks, RMS", MM * result.landmark_rms, "mm")]),
+        Metric("target not covered", 100 * result.missed, "%"),
+        Metric("largest distance at a marker", MM * float(result.distances.max()), "mm"),
+        Metric("markers without data below them", int((result.confidence < 0.5).sum()))], {"layout": layout})
+
+
+def read_layout(given: str, body: Mesh, kept: np.ndarray | None) -> MarkerLayout:
+    """The layout that is named, or in a file, for a body.
+
+    Raises
+    ------
+    ValueError
+        Neither a name nor a file, another body.
+    """
+    if given in layout_names():
+        return MarkerLayout.named(given, body, kept)
+    if not Path(given).exists():
+        raise ValueError(f"layout: expected a file or one of {', '.join(layout_names())}, got '{given}'")
+    return MarkerLayout.load(given, len(body.vertices))
+
+
+def mean_body(model: BodyModel) -> Mesh:
+    """The mean person in the pose of the template, or the template's own body of a model without betas."""
+    pose = np.zeros((len(model.skeleton.parents), 3))
+    return model.template.with_vertices(model.vertices(pose, np.zeros(model.n_betas) if model.n_betas else None))
+
+
+def _body(model: Path | None, body: Path | None, unit: Unit | None
+          ) -> tuple[Mesh, Skeleton | None, np.ndarray | None, str]:
+    """The body to show, its skeleton, the vertices of the embedded people it kept, and its name."""
+    if body is not None:
+        return read_mesh(body, unit), None, None, str(body)
+    loaded, name = read_model(model)
+    kept = loaded.info.get("people_vertices")
+    return mean_body(loaded), loaded.skeleton, None if kept is None else np.array(kept), name
+
+
+def _figures(layout: MarkerLayout, body: Mesh) -> list[Metric]:
+    """Counts, and how near the two nearest markers are."""
+    from scipy.spatial import cKDTree
+
+    pairs = label_pairs(layout.labels)
+    own = np.arange(len(pairs))
+    points = layout.place(body)
+    metrics = [Metric("markers", len(own)), Metric("pairs of left and right", int((pairs > own).sum())),
+               Metric("without a side", int((pairs == own).sum())),
+               Metric("without their partner", int((pairs < 0).sum())), Metric("loose", len(layout.loose))]
+    if len(own) > 1:
+        apart, other = cKDTree(points).query(points, 2)
+        i = int(apart[:, 1].argmin())
+        metrics.append(Metric(f"least distance ({layout.labels[i]}, {layout.labels[other[i, 1]]})",
+                              MM * float(apart[i, 1]), "mm"))
+    return metrics

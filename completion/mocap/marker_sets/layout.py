@@ -1,0 +1,288 @@
+"""Where on the body the markers sit."""
+from __future__ import annotations
+
+from collections import Counter
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from scanprep.geometry import storage
+from scanprep.geometry.mesh import Mesh
+
+from ..files.common import MarkerFileError
+
+DISTANCE = 0.0095        # metres from the skin to the centre of a common marker
+
+
+@dataclass(frozen=True, eq=False)
+class MarkerLayout:
+    """Markers on the skin of a body, or a little above it.
+
+    Parameters
+    ----------
+    labels : L strings, each different
+    vertices : (L,) int, or (L, 3) int
+        The vertex below each marker, or three vertices whose weighted mean is the point of the skin.
+    distances : (L,) float, metres, or one number
+        From the skin to the marker's centre, along the normal.
+    weights : (L, 3) float, optional
+        For three vertices; each row sums to 1.
+    aliases : {label: label}
+        Other labels for the same places, where files differ.
+    loose : strings
+        Labels of markers that sit anywhere on their limb, not on a point of the anatomy: `vertices` has them where
+        they usually are, `subject_from_markers` finds where they are on one person.
+
+    Raises
+    ------
+    ValueError
+        Shapes that do not agree, a label that comes twice, a negative vertex, an alias of an unknown label, an
+        unknown loose label.
+    """
+
+    labels: tuple[str, ...]
+    vertices: np.ndarray
+    distances: np.ndarray | float = DISTANCE
+    weights: np.ndarray | None = None
+    aliases: Mapping[str, str] = field(default_factory=dict)
+    loose: tuple[str, ...] = ()
+
+    def __post_init__(self) -> None:
+        labels, vertices = tuple(self.labels), np.array(self.vertices, dtype=np.int64)
+        L = len(labels)
+        if len(set(labels)) < L:
+            raise ValueError(f"labels: expected each once, "
+                             f"{Counter(labels).most_common(1)[0][0]} comes more often")
+        wanted = (L,) if self.weights is None else (L, 3)
+        if vertices.shape != wanted:
+            raise ValueError(f"vertices: expected shape {wanted} for {L} labels, got {vertices.shape}")
+        if (vertices < 0).any():
+            raise ValueError(f"vertices: expected numbers from 0, got {vertices.min()}")
+        try:
+            distances = np.broadcast_to(np.asarray(self.distances, dtype=np.float64), (L,)).copy()
+        except ValueError:
+            raise ValueError(f"distances: expected one number or {L}, got {np.shape(self.distances)}") from None
+        if not np.isfinite(distances).all():
+            raise ValueError("distances: expected finite numbers")
+        values: dict[str, Any] = {"labels": labels, "vertices": vertices, "distances": distances}
+        if self.weights is not None:
+            weights = np.array(self.weights, dtype=np.float64)
+            if weights.shape != (L, 3) or not np.allclose(weights.sum(axis=1), 1, atol=1e-6):
+                raise ValueError(f"weights: expected shape ({L}, 3) with rows that sum to 1, got {weights.shape}")
+            values["weights"] = weights
+        wrong = [alias for alias, label in self.aliases.items() if label not in labels or alias in labels]
+        if wrong:
+            raise ValueError(f"aliases: expected new labels for markers of the layout, got {wrong[0]!r} for "
+                             f"{self.aliases[wrong[0]]!r}")
+        unknown = [label for label in self.loose if label not in labels]
+        if unknown:
+            raise ValueError(f"loose: {', '.join(unknown)} not among {', '.join(labels)}")
+        values["loose"] = tuple(self.loose)
+        for name, value in values.items():
+            if isinstance(value, np.ndarray):
+                value.flags.writeable = False
+            object.__setattr__(self, name, value)
+
+    def __repr__(self) -> str:
+        return f"MarkerLayout({len(self.labels)} markers)"
+
+    @staticmethod
+    def load(path: str | Path, n_vertices: int | None = None) -> MarkerLayout:
+        """Read a layout of `save`, or of the same form from elsewhere.
+
+        The form is `{"markersets": [{"type": ..., "distance_from_skin": 0.0095, "indices": {label: vertex}}]}`;
+        in place of a vertex there may be `{"vertices": [a, b, c], "weights": [u, v, w]}`, a set may be `"loose": true`,
+        and beside the sets there may be `"aliases": {other label: label}`.
+
+        Parameters
+        ----------
+        n_vertices : int, optional
+            Of the body, to refuse a layout that was made for another one.
+
+        Raises
+        ------
+        MarkerFileError
+            Missing, of another form, a label that comes twice, a vertex that the body does not have.
+        """
+        path = Path(path)
+        tree = storage.read_json(path, "a marker layout", MarkerFileError)
+        with storage.taking_apart(path, "a whole marker layout", MarkerFileError):
+            layout = _restored(path, tree)
+        if n_vertices is not None:
+            layout._check(n_vertices, str(path))
+        return layout
+
+    @staticmethod
+    def named(name: str, template: Mesh, kept: np.ndarray | None = None) -> MarkerLayout:
+        """A usual marker set on a body that is known here: the triangles of SCAPE and SPRING, or the embedded people.
+
+        Parameters
+        ----------
+        name : str
+            One of `layout_names()`, such as "cmu41".
+        template : Mesh
+            Known by its triangles, whatever its shape and pose.
+        kept : (N,) int, optional
+            The vertices of the embedded people that a template with fewer triangles kept,
+            `info["people_vertices"]` of their model.
+
+        Raises
+        ------
+        ValueError
+            A set that does not come along, or a body on which it is not known.
+        """
+        from .named import named_layout
+
+        return named_layout(name, template, kept)
+
+    def save(self, path: str | Path) -> None:
+        """Write as JSON, one marker set for each distance from the skin, whole or not at all."""
+        sets: dict[tuple[float, bool], dict[str, Any]] = {}
+        for i, (label, distance) in enumerate(zip(self.labels, np.asarray(self.distances).tolist(), strict=True)):
+            place: Any = self.vertices[i].tolist()
+            if self.weights is not None:
+                place = {"vertices": place, "weights": self.weights[i].tolist()}
+            sets.setdefault((distance, label in self.loose), {})[label] = place
+        tree: dict[str, Any] = {"markersets": [
+            {"type": "body", "distance_from_skin": distance} | ({"loose": True} if loose else {})
+            | {"indices": indices} for (distance, loose), indices in sets.items()]}
+        storage.write_json(path, tree | ({"aliases": dict(self.aliases)} if self.aliases else {}))
+
+    def matched(self, labels: Sequence[str], minimum: int = 3) -> tuple[str, ...]:
+        """Those of the labels that the layout knows, in their own order; an alias only where its marker is not there.
+
+        Raises
+        ------
+        ValueError
+            Fewer than `minimum`; both lists are in the message.
+        """
+        names = [label if label in self.labels else self.aliases.get(label) for label in labels]
+        found = tuple(label for i, label in enumerate(labels)
+                      if names[i] is not None and (names[i] == label or names[i] not in [*labels, *names[:i]]))
+        if len(found) < minimum:
+            raise ValueError(f"labels: expected at least {minimum} markers of the layout, found {len(found)}; "
+                             f"layout: {', '.join(self.labels)}; sequence: {', '.join(labels) or 'none'}")
+        return found
+
+    def select(self, labels: Sequence[str]) -> MarkerLayout:
+        """The markers of these labels, in this order; an alias becomes the label."""
+        unknown = [label for label in labels if label not in self.labels and label not in self.aliases]
+        if unknown:
+            raise ValueError(f"labels: {', '.join(unknown)} not among {', '.join(self.labels)}")
+        rows = [self.labels.index(self.aliases.get(label, label)) for label in labels]
+        loose = tuple(label for label, row in zip(labels, rows, strict=True) if self.labels[row] in self.loose)
+        return MarkerLayout(tuple(labels), self.vertices[rows], np.asarray(self.distances)[rows],
+                            None if self.weights is None else self.weights[rows], loose=loose)
+
+    def without(self, labels: Sequence[str]) -> MarkerLayout:
+        """All markers but these; an alias takes its marker out, and aliases of markers that go, go too.
+
+        Raises
+        ------
+        ValueError
+            An unknown label.
+        """
+        known = {**{label: label for label in self.labels}, **self.aliases}
+        unknown = [label for label in labels if label not in known]
+        if unknown:
+            raise ValueError(f"labels: {', '.join(unknown)} not among {', '.join(self.labels)}")
+        gone = {known[label] for label in labels}
+        kept = self.select([label for label in self.labels if label not in gone])
+        return replace(kept, aliases={a: label for a, label in self.aliases.items() if label not in gone})
+
+    def pairs(self, template: Mesh | None = None) -> np.ndarray:
+        """(L,) which marker is on the other side of each: its own number in the middle, -1 without a partner.
+
+        Labels tell (LELB and RELB, l_elbow and r_elbow, left elbow and right elbow), and places on a symmetric body
+        where they do not.
+
+        Parameters
+        ----------
+        template : Mesh, optional
+            The body; without it a marker whose label names no side is taken to be in the middle.
+        """
+        from .symmetry import label_pairs, marker_pairs
+
+        return label_pairs(self.labels) if template is None else marker_pairs(self, template)
+
+    def moved(self, places: Mapping[str, int]) -> MarkerLayout:
+        """The same with some markers on other vertices, {label: vertex}; an alias moves its marker."""
+        vertices, weights = self.vertices.copy(), None if self.weights is None else self.weights.copy()
+        for label, vertex in places.items():
+            row = self.labels.index(self.aliases.get(label, label))
+            vertices[row] = vertex
+            if weights is not None:
+                weights[row] = [1.0, 0.0, 0.0]
+        return MarkerLayout(self.labels, vertices, self.distances, weights, self.aliases, self.loose)
+
+    def place(self, mesh: Mesh) -> np.ndarray:
+        """Where the markers are on a body (L, 3), metres: the point of the skin, and out along the normal there.
+
+        The normal is that of the vertex or of the triangle on which a marker sits.
+
+        Raises
+        ------
+        ValueError
+            A layout of another body.
+        """
+        self._check(len(mesh.vertices), "vertices")
+        vertices, normals = mesh.vertices[self.vertices], mesh.vertex_normals[self.vertices]
+        if self.weights is not None:
+            corners, smooth = vertices, normals
+            vertices = np.einsum("lc,lcd->ld", self.weights, corners)
+            normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+            normals *= np.where(np.einsum("ld,lcd->l", normals, smooth) < 0, -1.0, 1.0)[:, None]
+            length = np.linalg.norm(normals, axis=1, keepdims=True)
+            normals = np.divide(normals, length, out=smooth[:, 0].copy(), where=length > 0)
+        return vertices + np.asarray(self.distances)[:, None] * normals
+
+    def _check(self, n_vertices: int, what: str) -> None:
+        outside = [label for label, v in zip(self.labels, self.vertices, strict=True) if np.max(v) >= n_vertices]
+        if outside:
+            place = self.vertices[self.labels.index(outside[0])].tolist()
+            error = ValueError if what == "vertices" else MarkerFileError
+            raise error(f"{what}: marker '{outside[0]}' sits on vertex {place}, the body has 0..{n_vertices - 1}")
+
+
+def most_used(layout: MarkerLayout) -> np.ndarray:
+    """(L,) the vertex that has the largest share in each marker's place."""
+    base = layout.vertices.reshape(len(layout.labels), -1)
+    share = np.ones(base.shape) if layout.weights is None else layout.weights
+    return np.take_along_axis(base, share.argmax(axis=1)[:, None], axis=1)[:, 0]
+
+
+def _restored(path: Path, tree: Any) -> MarkerLayout:
+    """The layout of a file."""
+    rows = _rows(path, tree)
+    if not rows:
+        raise MarkerFileError(f"{path}: expected markers in the layout, found none")
+    labels, places, distances, loose = zip(*rows, strict=True)
+    free = tuple(label for label, is_loose in zip(labels, loose, strict=True) if is_loose)
+    aliases = dict(tree.get("aliases", {}))
+    if all(isinstance(place, int) for place in places):
+        return MarkerLayout(labels, np.array(places), np.array(distances), None, aliases, free)
+    pairs = [([p] * 3, [1.0, 0.0, 0.0]) if isinstance(p, int) else (p["vertices"], p["weights"]) for p in places]
+    return MarkerLayout(labels, np.array([v for v, _ in pairs]), np.array(distances), np.array([w for _, w in pairs]),
+                        aliases, free)
+
+
+def _rows(path: Path, tree: Any) -> list[tuple[str, Any, float, bool]]:
+    """Label, place, distance and looseness of every marker in the file."""
+    sets = tree.get("markersets") if isinstance(tree, Mapping) else None
+    if not isinstance(sets, list):
+        raise MarkerFileError(f"{path}: expected a marker layout {{\"markersets\": [...]}}, found something else")
+    rows = []
+    for markers in sets:
+        indices = markers.get("indices") if isinstance(markers, Mapping) else None
+        distance = markers.get("distance_from_skin", DISTANCE) if isinstance(markers, Mapping) else None
+        if not isinstance(indices, Mapping) or not isinstance(distance, int | float):
+            raise MarkerFileError(f"{path}: expected marker sets with 'indices' {{label: vertex}} and a number "
+                                  f"'distance_from_skin'")
+        for label, place in indices.items():
+            if isinstance(place, bool) or not isinstance(place, int | Mapping):
+                raise MarkerFileError(f"{path}: marker '{label}': expected a vertex, found {str(place)[:40]!r}")
+            rows.append((label, place, float(distance), bool(markers.get("loose", False))))
+    return rows

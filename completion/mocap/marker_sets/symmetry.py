@@ -1,0 +1,201 @@
+"""Left and right: which marker and which place of the skin is the mirror image of which."""
+from __future__ import annotations
+
+import re
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from scanprep.geometry.mesh import Mesh
+from scanprep.geometry.surface import Surface
+
+from .layout import MarkerLayout
+
+FAR = 0.06                           # metres: a marker of no telling label has no partner beyond it
+_WORDS = re.compile(r"(?<![A-Za-z])(left|right)(?![A-Za-z])", re.IGNORECASE)
+_LETTER = re.compile(r"^[LR](?=[A-Z0-9._ ])|^[lr](?=[._ ])|(?<=[._ ])[LRlr]$|(?<=[a-z0-9])[LR]$")
+_OTHER = {"L": "R", "R": "L", "l": "r", "r": "l", "left": "right", "right": "left"}
+
+
+@dataclass(frozen=True, eq=False)
+class SkinMirror:
+    """Where the mirror image of every vertex lies on the skin.
+
+    Attributes
+    ----------
+    faces : (N,) int
+        The triangle it lies on.
+    bary : (N, 3) float
+        Where on it.
+    partner : (N,) int
+        The vertex nearest to it; for most, but not all, of an odd triangulation the partner's partner is the vertex
+        itself.
+    across : (N,) float, metres
+        How far each vertex is from its image, 0 in the middle, negative on one side; on which, only landmarks tell:
+        with them it is positive on the left.
+    returns : float, metres
+        How far from where it was a vertex comes to lie that is mirrored twice, the mean.
+    """
+
+    faces: np.ndarray
+    bary: np.ndarray
+    partner: np.ndarray
+    across: np.ndarray
+    returns: float
+
+    def image(self, mesh: Mesh) -> np.ndarray:
+        """(N, 3) the mirror images of all vertices on the skin of a body of these triangles, in any pose, metres."""
+        return np.einsum("nc,ncd->nd", self.bary, mesh.vertices[mesh.faces[self.faces]])
+
+
+def other_side(label: str) -> str | None:
+    """The label of the same place on the other side, or None for a label that names no side.
+
+    Sides are an L or R in front (LELB, L.Knee), one at the end (elbow_l, KneeR), or the words left and right.
+    """
+    if _WORDS.search(label):
+        return _WORDS.sub(lambda found: _like(found[0]), label, count=1)
+    if _LETTER.search(label):
+        return _LETTER.sub(lambda found: _OTHER[found[0]], label, count=1)
+    return None
+
+
+def side_of(label: str) -> int:
+    """1 for a label of the left, -1 for the right, 0 for one that names no side."""
+    found = _WORDS.search(label) or _LETTER.search(label)
+    return 0 if found is None else 1 if found[0][0] in "lL" else -1
+
+
+def _like(word: str) -> str:
+    """The other word, in the same case."""
+    other = _OTHER[word.lower()]
+    return other.upper() if word.isupper() else other.capitalize() if word[0].isupper() else other
+
+
+def label_pairs(labels: Sequence[str]) -> np.ndarray:
+    """(L,) the place of each label's partner: its own for a label that names no side, -1 where it is missing."""
+    rows = {label: i for i, label in enumerate(labels)}
+    others = [other_side(label) for label in labels]
+    return np.array([i if other is None else rows.get(other, -1) for i, other in enumerate(others)], dtype=np.int64)
+
+
+def marker_pairs(layout: MarkerLayout, template: Mesh, mirror: SkinMirror | None = None) -> np.ndarray:
+    """The marker on the other side of every marker, by label, and by place where labels do not tell.
+
+    Parameters
+    ----------
+    layout : MarkerLayout
+    template : Mesh
+        A body that the layout is for.
+    mirror : SkinMirror, optional
+        Of `find_skin_mirror`; found when not given.
+
+    Returns
+    -------
+    (L,) int
+        Its own number for a marker in the middle, -1 where there is no partner; the partner's partner is the marker.
+    """
+    pairs = label_pairs(layout.labels)
+    pairs[[other_side(label) is None for label in layout.labels]] = -1
+    untold = np.flatnonzero([other_side(label) is None for label in layout.labels])
+    if len(untold) == 0:
+        return pairs
+    mirror = mirror or find_skin_mirror(template)
+    skin = skin_points(layout, template)[untold]
+    image = mirrored_points(layout, template, mirror)[untold]
+    apart = np.linalg.norm(image[:, None] - skin[None], axis=-1)
+    apart = apart + apart.T                                                    # there and back
+    for i, row in enumerate(untold):
+        j = int(apart[i].argmin())
+        if int(apart[j].argmin()) == i and apart[i, j] < 2 * FAR:
+            pairs[row] = untold[j]
+    return pairs
+
+
+def skin_points(layout: MarkerLayout, mesh: Mesh) -> np.ndarray:
+    """(L, 3) the points of the skin below the markers, metres."""
+    if layout.weights is None:
+        return mesh.vertices[layout.vertices]
+    return np.einsum("lc,lcd->ld", layout.weights, mesh.vertices[layout.vertices])
+
+
+def mirrored_points(layout: MarkerLayout, mesh: Mesh, mirror: SkinMirror) -> np.ndarray:
+    """(L, 3) where the mirror images of the markers lie on the skin, metres."""
+    image = mirror.image(mesh)
+    return image[layout.vertices] if layout.weights is None else np.einsum(
+        "lc,lcd->ld", layout.weights, image[layout.vertices])
+
+
+def mirrored_layout(layout: MarkerLayout, template: Mesh, mirror: SkinMirror) -> MarkerLayout:
+    """The layout with left and right exchanged: every marker on the other side, with the label of that side."""
+    found = Surface(template).closest(mirrored_points(layout, template, mirror))
+    labels = tuple(other_side(label) or label for label in layout.labels)
+    aliases = {other_side(a) or a: other_side(label) or label for a, label in layout.aliases.items()}
+    return MarkerLayout(labels, template.faces[found.faces], layout.distances, found.bary, aliases,
+                        tuple(other_side(label) or label for label in layout.loose))
+
+
+def find_skin_mirror(template: Mesh, poses: np.ndarray | None = None, landmarks: Mapping[str, int] | None = None
+                     ) -> SkinMirror:
+    """Where the mirror image of every vertex lies, whatever the triangulation.
+
+    The mirror image of the template is bent onto the template. Nothing is taken from the numbers of vertices.
+
+    Parameters
+    ----------
+    template : Mesh
+        Standing nearly symmetrically, or with landmarks.
+    poses : (M, N, 3) float, metres, optional
+        The most symmetric of them serves if the template does not stand symmetrically.
+    landmarks : {name: vertex}, optional
+        Names that tell the sides, such as "left elbow" or "LELB"; they place the mirror image, in any pose.
+
+    Raises
+    ------
+    ValueError
+        Not symmetric; landmarks without three pairs of sides.
+    """
+    if landmarks is None:
+        body, image, normal = _by_symmetry(template, poses)
+    else:
+        body, image, normal = _by_landmarks(template, landmarks)
+    found = Surface(body).closest(image)
+    again = np.einsum("nc,ncd->nd", found.bary, found.points[body.faces[found.faces]])
+    partner = cKDTree(body.vertices).query(found.points)[1]
+    return SkinMirror(found.faces, found.bary, partner, (body.vertices - found.points) @ normal,
+                      float(np.average(np.linalg.norm(again - body.vertices, axis=1), weights=body.vertex_areas)))
+
+
+def _by_symmetry(template: Mesh, poses: np.ndarray | None) -> tuple[Mesh, np.ndarray, np.ndarray]:
+    """The body in the pose that serves, the images (N, 3) of its vertices, and the normal of the plane."""
+    from scanprep.skeleton.symmetry import find_symmetry
+
+    found = find_symmetry(template, poses)
+    if not found.holds:
+        raise ValueError("template: expected one that stands symmetrically, its mirror image is "
+                         f"{found.distance:.1%} of its size away; give landmarks whose names tell the sides")
+    body = template if found.pose < 0 or poses is None else template.with_vertices(poses[found.pose])
+    return body, found.image, found.normal
+
+
+def _by_landmarks(template: Mesh, landmarks: Mapping[str, int]) -> tuple[Mesh, np.ndarray, np.ndarray]:
+    """As `_by_symmetry`, from landmarks on both sides; the normal points to the left."""
+    from scanprep.registration.nonrigid import register
+
+    pairs = [(v, landmarks[other]) for name, v in landmarks.items()
+             if side_of(name) == 1 and (other := other_side(name)) is not None and other in landmarks]
+    if len(pairs) < 3:
+        raise ValueError(f"landmarks: expected at least 3 pairs of left and right, found {len(pairs)} among "
+                         f"{', '.join(landmarks) or 'none'}")
+    middle = [v for name, v in landmarks.items() if side_of(name) == 0]
+    left, right = np.array(pairs).T
+    x, y = template.vertices[np.r_[left, right, middle]], template.vertices[np.r_[right, left, middle]]
+    centre = x.mean(axis=0)
+    cross = (x - centre).T @ (y - y.mean(axis=0))
+    normal = np.linalg.eigh(cross + cross.T)[1][:, 0]
+    normal = normal * np.sign(((template.vertices[left] - template.vertices[right]) @ normal).sum())
+    start = template.vertices - 2 * ((template.vertices - centre) @ normal)[:, None] * normal
+    marks = np.r_[left, right, middle].astype(np.int64), y
+    return template, register(Mesh(start, template.faces[:, ::-1]), template, marks).mesh.vertices, normal

@@ -1,0 +1,231 @@
+"""Which marker files belong to whom."""
+from __future__ import annotations
+
+import csv
+import re
+from collections.abc import Iterable, Iterator
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Literal, get_args
+
+from scanprep.batch.workspace import HOME
+from scanprep.geometry import storage, tables
+
+from ..files.common import MarkerFileError
+from ..files.markers import marker_subjects
+
+By = Literal["auto", "name", "label", "each", "all"]
+ENDINGS = (".c3d", ".trc", ".csv")
+TABLE = "subjects.csv"
+
+
+@dataclass(frozen=True)
+class Recording:
+    """One sequence of one person.
+
+    Attributes
+    ----------
+    path : Path
+    name : str
+        Of the folder that its output goes to.
+    who : str, optional
+        Whose markers, in a C3D file.
+    """
+
+    path: Path
+    name: str
+    who: str | None = None
+
+
+@dataclass(frozen=True)
+class Actor:
+    """A person and the recordings of it.
+
+    Attributes
+    ----------
+    name : str
+        Fit for a folder.
+    recordings : tuple of Recording
+    rule : str
+        Why these are thought to be of one person.
+    """
+
+    name: str
+    recordings: tuple[Recording, ...]
+    rule: str = field(metadata={"digest": False})
+
+
+@dataclass(frozen=True)
+class Grouping:
+    """How recordings are given to people.
+
+    Attributes
+    ----------
+    by : str
+        "name": what stands before the first _, - or blank of the file name; "label": the `Subject:` before the
+        labels; "each": every file is of another person; "all": all are of one. "auto": of files that were named
+        "all"; of a folder its sub-folders, and of files that lie side by side "name" where the name is two numbers,
+        as in 85_02, else "label", else "each".
+    table : Path, optional
+        CSV with the columns file and subject, or JSON {file: subject}, which goes before any rule.
+    name : str, optional
+        Of the only person.
+    who : str, optional
+        Whose markers, in C3D files with several people.
+    """
+
+    by: By = "auto"
+    table: Path | None = None
+    name: str | None = None
+    who: str | None = None
+
+    def __post_init__(self) -> None:
+        if self.by not in get_args(By):
+            raise ValueError(f"by: expected one of {', '.join(get_args(By))}, got '{self.by}'")
+
+
+def find_actors(markers: Iterable[Path], grouping: Grouping, output: Path | None = None) -> list[Actor]:
+    """The people of some files and folders.
+
+    Parameters
+    ----------
+    output : Path, optional
+        Where results go: what lies there is no recording.
+
+    Raises
+    ------
+    ValueError
+        No marker files, no such file, an output around the recordings, a table that names a file that is not there,
+        one name for several people.
+    """
+    given = list(markers)
+    for place in given:
+        if output is not None and place.is_dir() and output.resolve() in (place.resolve(), *place.resolve().parents):
+            raise ValueError(f"{output}: expected a folder for the output that does not hold the recordings, {place}")
+    found = list(_files(given, output, grouping.table))
+    if not found:
+        raise ValueError(f"{', '.join(map(str, given))}: expected files ending in {', '.join(ENDINGS)}, found none")
+    whole = grouping.by == "all" or (grouping.by == "auto" and all(path.is_file() for path in given))
+    if grouping.table is not None:
+        said = _read_table(grouping.table, [f.path for f in found])
+        rows = [(folder_name(said[f.path]), f, grouping.who, f"as {grouping.table} says")
+                for f in found if f.path in said]
+    elif whole:
+        name = next(_people(found[0], grouping))[0] if grouping.name is None else grouping.name
+        rows = [(folder_name(name), f, grouping.who, "files that were named together") for f in found]
+    else:
+        rows = [(folder_name(name), f, who, rule) for f in found for name, who, rule in _people(f, grouping)]
+    people = sorted({name for name, *_ in rows})
+    if grouping.name is not None:
+        if len(people) > 1:
+            raise ValueError(f"--name: expected one person for one name, found {', '.join(people)}")
+        people, rows = [grouping.name], [(grouping.name, f, who, rule) for _, f, who, rule in rows]
+    return [Actor(folder_name(person), _named(person, [(f, who) for name, f, who, _ in rows if name == person]),
+                  next(rule for name, *_, rule in rows if name == person)) for person in people]
+
+
+def write_table(path: Path, actors: Iterable[Actor]) -> None:
+    """Who is who as CSV, in the form that `Grouping.table` takes."""
+    with storage.writing(path) as beside, open(beside, "w", newline="", encoding="utf-8") as out:
+        table = csv.writer(out)
+        table.writerow(["file", "subject", "rule"])
+        table.writerows([r.path, actor.name, actor.rule] for actor in actors for r in actor.recordings)
+
+
+def folder_name(text: str) -> str:
+    """A text as the name of a folder: letters, digits and - _ . only."""
+    return re.sub(r"[^\w.-]+", "_", text).strip("._") or "person"
+
+
+@dataclass(frozen=True)
+class _File:
+    """A marker file, and the folders it lies in below the one that was given."""
+
+    path: Path
+    folders: tuple[str, ...]
+
+
+def _files(given: list[Path], output: Path | None, table: Path | None) -> Iterator[_File]:
+    """The files that were named, and the marker files of the folders that were, each once."""
+    seen: set[Path] = {p.resolve() for p in (table,) if p is not None}
+    outputs = {output.resolve()} if output is not None else set()
+    for place in given:
+        if not place.exists():
+            raise ValueError(f"{place}: no such file or folder")
+        if place.is_dir():                             # nor what an earlier call has written
+            outputs |= {found.parent.resolve() for found in place.rglob(TABLE)
+                        if (found.parent / "report.html").exists() or (found.parent / HOME).exists()}
+        for path in sorted(place.rglob("*")) if place.is_dir() else [place]:
+            parts, whole = path.relative_to(place).parts, path.resolve()
+            if place.is_dir() and (path.suffix.lower() not in ENDINGS or any(part.startswith(".") for part in parts)
+                                   or outputs & set(whole.parents)):
+                continue
+            if whole not in seen:
+                seen.add(whole)
+                yield _File(path, parts[:-1])
+
+
+def _people(file: _File, grouping: Grouping) -> Iterator[tuple[str, str | None, str]]:
+    """Name, C3D subject and rule of the people in a file."""
+    by, own = grouping.by, file.path.stem
+    numbers = re.fullmatch(r"(\d+)[_-]\d+", own)
+    if by == "auto" and file.folders:
+        yield file.folders[0], grouping.who, "by the sub-folder"
+    elif by == "name" or (by == "auto" and numbers):
+        yield re.split(r"[_\-\s]", own)[0], grouping.who, "by the file name" + (", NUMBER_NUMBER" if numbers else "")
+    elif by != "each" and grouping.who is None and (people := _labelled(file.path)):
+        for who in people:
+            yield who, who if len(people) > 1 else None, "by what stands before the labels"
+    else:
+        yield own if grouping.who is None or by == "each" else grouping.who, grouping.who, "a file by itself"
+
+
+def _labelled(path: Path) -> tuple[str, ...]:
+    try:
+        return marker_subjects(path)
+    except MarkerFileError:              # told when the file is read in earnest
+        return ()
+
+
+def _named(person: str, files: list[tuple[_File, str | None]]) -> tuple[Recording, ...]:
+    """The recordings of a person, each named as its file, with its ending where that is not enough."""
+    def name(file: _File, ending: bool) -> str:
+        folders = file.folders[1:] if file.folders and folder_name(file.folders[0]) == person else file.folders
+        return folder_name("_".join((*folders, file.path.name if ending else file.path.stem)))
+
+    short = [name(file, False) for file, _ in files]
+    names = [name(file, short.count(s) > 1) for s, (file, _) in zip(short, files, strict=True)]
+    for one in names:
+        if names.count(one) > 1:
+            paths = " and ".join(str(f.path) for n, (f, _) in zip(names, files, strict=True) if n == one)
+            raise ValueError(f"{paths}: expected files of different names for one person, {person}")
+    return tuple(Recording(f.path, n, who) for n, (f, who) in zip(names, files, strict=True))
+
+
+def _read_table(table: Path, found: list[Path]) -> dict[Path, str]:
+    """Whose each file is, of those that the table names by path, by name or without ending."""
+    said = dict(_table_rows(table))
+    out: dict[Path, str] = {}
+    for file, subject in said.items():
+        wanted = Path(file)
+        hits = [path for path in found if path == wanted or path.parts[-len(wanted.parts):] == wanted.parts
+                or path.with_suffix("").parts[-len(wanted.parts):] == wanted.parts]
+        if not hits:
+            raise ValueError(f"{table}: no marker file '{file}' among those that were given")
+        if len(hits) > 1:
+            raise ValueError(f"{table}: '{file}' may be {' or '.join(map(str, hits))}; write more of the path")
+        out[hits[0]] = subject
+    return out
+
+
+def _table_rows(table: Path) -> list[tuple[str, str]]:
+    if table.suffix.lower() == ".json":
+        tree = storage.read_json(table, "the subjects {file: subject}")
+        if not isinstance(tree, dict) or not all(isinstance(v, str | int) for v in tree.values()):
+            raise ValueError(f"{table}: expected JSON {{file: subject}}, found something else")
+        return [(file, str(subject)) for file, subject in tree.items()]
+    rows = tables.read_table(table, ("file", "subject"))
+    empty = [line for line, row in rows if not row["file"] or not row["subject"]]
+    if empty or not rows:
+        raise storage.StorageError(f"{table}: line {(empty or [2])[0]}: expected a file and its subject, found neither")
+    return [(row["file"], row["subject"]) for _, row in rows]

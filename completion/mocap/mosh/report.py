@@ -1,0 +1,223 @@
+"""The pages of `scape mosh`: one for a person, one for each sequence."""
+from __future__ import annotations
+
+import io
+import json
+from collections.abc import Mapping, Sequence
+from html import escape
+from typing import Any
+
+import numpy as np
+
+from model.body import BodyModel
+from scanprep.console import Metric, plain
+from scanprep.pictures.page import Page
+from scanprep.pictures.shading import Dots, Shape, render, side_by_side
+
+from ...cli import rows
+from ..animate.report import MARKER, facing, worst_frames
+from ..artefacts.chart import chart_faults
+from ..marker_sets.layout import MarkerLayout
+from ..results import MoshResult
+from . import pictures
+from .charts import MM, chart_frames, chart_map, chart_timeline, mean_over
+from .takes import Take
+
+PICTURE = "picture.png"
+COLORS = ("Dots are the measured markers: red where they are believed, orange where they are seen but not believed, "
+          "green for held-out markers, which no stage has seen.")
+WORST, CHANGED = 7, 5                # frames in the pictures of the worst and of those that change most
+_STYLE = """.take { display: grid; grid-template-columns: minmax(17rem, 1fr) 2fr; gap: 1rem; margin: 1.4rem 0; }
+.take img { width: 100%; } .take p { margin: .2rem 0; }"""
+
+
+def person_page(name: str, model: BodyModel, result: MoshResult, usual: MarkerLayout, takes: Sequence[Take],
+                metrics: Sequence[Metric], figures: Mapping[str, Sequence[Metric]], settings: Mapping[str, Any]
+                ) -> Page:
+    """Shape and markers of a person, and the way to its sequences.
+
+    Parameters
+    ----------
+    usual : MarkerLayout
+        The one that was given.
+    metrics : of the person
+    figures : name of the sequence -> its figures
+    """
+    body = pictures.standing(model, result.betas)
+    labels = result.layout.labels
+    before = usual.select(labels)
+    found, moved = pictures.change_of_place(body, before, result.layout)
+    page = Page(f"{name}: body shape and markers",
+                f"Found from the markers of {len(takes)} {'sequence' if len(takes) == 1 else 'sequences'} alone.")
+    page.picture(pictures.picture_sides(body, found),
+                 "the body from four sides, in the mean pose of the model's people; red: where the markers sat")
+    page.section("Sequences")
+    for take in takes:
+        _entry(page, take, figures[take.name])
+    page.section("Markers before and after", "Blue: where the layout has each marker on this body. Red: where it was "
+                 "found, with a rod from the one to the other. Those that moved most are named, from a centimetre on.")
+    page.picture(pictures.picture_sides(body, found, before.place(body), labels))
+    page.table(_moved_rows(result, before, moved, takes),
+               ("marker", "moved (mm)", "up (mm)", "forward (mm)", "to the left (mm)", "off the skin, layout (mm)",
+                "found (mm)", "distance left, fixed shape (mm)"))
+    if before.loose:
+        page.text(f"Loose markers, which may sit anywhere on their limb: {', '.join(before.loose)}.")
+    page.section("Frames that shape and markers were found from")
+    page.picture(_chosen_frames(model, result, takes))
+    return closing(page, metrics, settings)
+
+
+def take_page(take: Take, metrics: Sequence[Metric]) -> Page:
+    """One sequence: the whole of it at a glance, how far the markers are, soft tissue, faults; see `closing`."""
+    step = pictures.every(len(take.motion.poses))
+    frames = np.arange(0, len(take.motion.poses), step)
+    page = Page(f"{take.name}, with {'soft tissue' if take.soft else 'fixed shape'}", COLORS)
+    page.table(rows([m for m in metrics if m.unit == "mm" or m.name in ("frames", "exchanges", "bad spans")]))
+    page.section("The whole sequence", f"Every {_th(step)} frame; below each its number and time.")
+    page.picture(pictures.contact_sheet(take, frames))
+    page.picture(pictures.moving(take), "the first seconds")
+    page.section("Distance of the markers", "From where the body has them to where they were measured.")
+    page.chart(chart_frames(take), "mean of the markers, over time")
+    page.chart(chart_map(take), "every marker over time, the worst first; white where it was not seen, or taken out "
+                                "as bad")
+    page.picture(pictures.picture_large(take, worst_frames(take.shown, WORST)), "the frames in which they are farthest")
+    page.table(_marker_rows(take), ("marker", "fixed shape (mm)", "soft tissue (mm)", "95th percentile (mm)",
+                                    "seen (%)", "believed (%)"))
+    _unused(page, take)
+    if take.soft is not None:
+        _soft_section(page, take, frames)
+    _fault_section(page, take)
+    return page
+
+
+def closing(page: Page, metrics: Sequence[Metric], settings: Mapping[str, Any]) -> Page:
+    """The end of a page: all figures and the settings."""
+    page.section("Figures").table(rows(list(metrics)), ("metric", "value", "unit"))
+    text = escape(json.dumps(plain(settings), indent=1))
+    return page.markup(f"<details><summary>All settings</summary><pre><code>{text}</code></pre></details>")
+
+
+def _soft_section(page: Page, take: Take, frames: np.ndarray) -> None:
+    page.section("Soft tissue", "The shape may change in every frame, as flesh does and as a pose model with one fixed "
+                 "shape cannot. What it takes up may also be markers that slide with the skin.")
+    page.picture(pictures.picture_soft_map(take, frames), "where the body changes most")
+    page.picture(pictures.picture_fixed_and_soft(take, pictures.most_changed(take, frames, CHANGED)),
+                 "frames that change most; above with the person's own shape, below with soft tissue")
+
+
+def _fault_section(page: Page, take: Take) -> None:
+    faults, rate = take.faults, take.motion.rate
+    page.section("Faults of the markers", "The body says where each marker should be: one that is elsewhere was "
+                 "exchanged with another, has slipped, jitters or strays.")
+    found = [("exchanged", f"{e.first} and {e.second}", e.begin, e.end, (e.end - e.begin + 1) / rate, np.nan)
+             for e in faults.exchanges]
+    found += [(b.kind, b.label, b.begin, b.end, (b.end - b.begin + 1) / rate, MM * b.distance) for b in faults.bad]
+    if found:
+        page.table(sorted(found, key=lambda row: row[2]),
+                   ("fault", "marker", "first frame", "last frame", "lasts (s)", "distance (mm)"))
+    else:
+        page.text("None was found.")
+    page.chart(chart_timeline(take), "every marker over time")
+    if not {b.label for b in faults.bad}.union(*({e.first, e.second} for e in faults.exchanges)).isdisjoint(
+            faults.labels):
+        page.picture(_drawn(chart_faults(faults, take.markers)), "faulty markers: how far they were from where the "
+                     "body has them, and what is left of it")
+
+
+def _drawn(figure: Any) -> bytes:
+    """A chart as pixels: as lines it would grow with the sequence."""
+    out = io.BytesIO()
+    figure.savefig(out, format="png", dpi=130)
+    return out.getvalue()
+
+
+def _entry(page: Page, take: Take, metrics: Sequence[Metric]) -> None:
+    """A sequence on the page of its person, leading to its own."""
+    told = "".join(f"<p>{escape(m.name)}: {escape(m.text())} {escape(m.unit)}</p>" for m in metrics
+                   if m.unit == "mm" or m.name in ("frames", "exchanges", "bad spans"))
+    link = f"{escape(take.name)}/report.html"
+    page.markup(f'<div class="take"><div><a href="{link}"><b>{escape(take.name)}</b></a>{told}</div>'
+                f'<a href="{link}"><img src="{escape(take.name)}/{PICTURE}" alt="{escape(take.name)}"></a></div>',
+                _STYLE)
+
+
+def person_picture(model: BodyModel, result: MoshResult) -> np.ndarray:
+    """A person from four sides with the markers, for the page of all people."""
+    body = pictures.standing(model, result.betas)
+    return pictures.picture_sides(body, result.layout.place(body), height=360)
+
+
+def take_picture(take: Take, count: int = 6) -> np.ndarray:
+    """Some frames of a sequence, for the page of its person."""
+    frames = np.unique(np.linspace(0, len(take.motion.poses) - 1, count + 2).round().astype(int)[1:-1])
+    return pictures.picture_large(take, frames, 260)
+
+
+def _chosen_frames(model: BodyModel, result: MoshResult, takes: Sequence[Take], height: int = 220) -> np.ndarray:
+    person, subject = result.person, takes[0].subject
+    images, labels = [], []
+    for (number, t), pose, trans in zip(person.frames.tolist(), person.poses, person.trans, strict=True):
+        vertices = subject.vertices(pose, trans).astype(float)
+        shapes: list[Shape] = [model.template.with_vertices(vertices),
+                               Dots(takes[number].markers.select(_there(takes[number], result)).positions[t], MARKER,
+                                    0.015)]
+        images.append(render(shapes, facing(subject, pose, vertices, 35.0), 160, height))
+        labels.append(str(t) if len(takes) == 1 else f"{number + 1}: {t}")
+    return side_by_side(images, labels, columns=6)
+
+
+def _there(take: Take, result: MoshResult) -> list[str]:
+    return [label for label in take.markers.labels if label in result.layout.matched(take.markers.labels, 0)]
+
+
+def _moved_rows(result: MoshResult, before: MarkerLayout, moved: np.ndarray, takes: Sequence[Take]
+                ) -> list[tuple[Any, ...]]:
+    """The markers, that which moved most first."""
+    left: dict[str, list[np.ndarray]] = {}
+    for take in takes:
+        for label, column in zip(take.motion.labels, take.motion.residuals.T, strict=True):
+            left.setdefault(label, []).append(column)
+    out = []
+    for i, label in enumerate(before.labels):
+        off = np.concatenate(left.get(label, [np.array([np.nan])]))
+        out.append((label, MM * float(result.person.moved[i]), *(MM * moved[i]).round(1).tolist(),
+                    MM * float(np.asarray(before.distances)[i]), MM * float(np.asarray(result.layout.distances)[i]),
+                    MM * float(mean_over(off, 0))))
+    return sorted(out, key=lambda row: -row[1])
+
+
+def _marker_rows(take: Take) -> list[tuple[Any, ...]]:
+    """The markers, the worst first, held-out ones above all."""
+    out = []
+    fixed = take.motion.residuals
+    soft = np.full(fixed.shape, np.nan) if take.soft is None else take.soft.motion.residuals
+    for i in np.flatnonzero(np.isfinite(fixed).any(axis=0)).tolist():
+        seen = np.isfinite(fixed[:, i])
+        shown = (fixed if take.soft is None else soft)[seen, i]
+        out.append((take.motion.labels[i], MM * float(fixed[seen, i].mean()), MM * float(mean_over(soft[:, i], 0)),
+                    MM * float(np.nanpercentile(shown, 95)), 100 * float(seen.mean()),
+                    100 * float(take.motion.trusted[seen, i].mean())))
+    out.sort(key=lambda row: -row[1])
+    if take.held is None:
+        return out
+    held = []
+    for i, label in enumerate(take.held.labels):
+        seen = np.isfinite(take.held.fixed[:, i])
+        soft_off = np.nan if take.held.soft is None else float(mean_over(take.held.soft[:, i], 0))
+        shown = (take.held.fixed if take.held.soft is None else take.held.soft)[seen, i]
+        held.append((f"{label} (held out)", MM * float(mean_over(take.held.fixed[:, i], 0)), MM * soft_off,
+                     MM * float(np.percentile(shown, 95)) if len(shown) else np.nan, 100 * float(seen.mean()), np.nan))
+    return [*sorted(held, key=lambda row: -row[1]), *out]
+
+
+def _unused(page: Page, take: Take) -> None:
+    held = () if take.held is None else take.held.labels
+    used = np.isfinite(take.motion.residuals).any(axis=0)
+    unused = [label for label, is_used in zip(take.motion.labels, used, strict=True)
+              if not is_used and label not in held]
+    if unused:
+        page.text(f"Not used, because the layout does not know them or they were never seen: {', '.join(unused)}.")
+
+
+def _th(number: int) -> str:
+    return "" if number == 1 else f"{number}th"

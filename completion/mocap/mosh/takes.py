@@ -1,0 +1,153 @@
+"""One sequence of a person with all that was found of it, for files and pictures."""
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+
+import numpy as np
+
+from model.body import BodyModel
+from model.linear import Subject, posed_product
+from scanprep.decimation.registered_set import decimate_set
+from scanprep.geometry.mesh import Mesh
+
+from ...energy import lifted
+from ...motion import Motion
+from ..files.markers import MarkerSequence
+from ..marker_sets.layout import MarkerLayout
+from ..pose.marked_body import supports
+from ..results import MarkerFaults, SoftTissue
+
+LIGHT = 7000                         # triangles of a body in small pictures
+AT_ONCE = 128                        # frames whose changes are held at a time
+
+
+@dataclass(frozen=True, eq=False)
+class LightMesh:
+    """Some of the vertices (n,) of a body and triangles (f, 3) between them, for small pictures."""
+
+    vertex_ids: np.ndarray
+    faces: np.ndarray
+
+    @staticmethod
+    def of(template: Mesh) -> LightMesh:
+        """At most `LIGHT` triangles; of a body that has no more its own."""
+        if len(template.faces) <= LIGHT:
+            return LightMesh(np.arange(len(template.vertices)), template.faces)
+        small = decimate_set(template, None, LIGHT)
+        return LightMesh(small.vertex_map, small.template.faces)
+
+    def mesh(self, vertices: np.ndarray) -> Mesh:
+        """The small mesh of a large one's vertices (N, 3)."""
+        return Mesh(vertices[self.vertex_ids], self.faces)
+
+
+@dataclass(frozen=True, eq=False)
+class HeldOut:
+    """Markers that no stage has seen, and how far the body is from them where the layout has them.
+
+    Attributes
+    ----------
+    labels : H strings
+    fixed, soft : (T, H) float, metres
+        With the shape fixed, and changing in time; NaN where one was not seen. `soft` is None without soft tissue.
+    """
+
+    labels: tuple[str, ...]
+    fixed: np.ndarray
+    soft: np.ndarray | None
+
+
+@dataclass(frozen=True, eq=False)
+class Take:
+    """One sequence of a person.
+
+    Attributes
+    ----------
+    name : str
+        Of its folder.
+    path : Path
+        The file, and `who` and `unit` as it was read.
+    model : BodyModel
+    subject : Subject
+        The person.
+    markers : MarkerSequence
+    motion : Motion
+        With the shape fixed.
+    soft : SoftTissue, optional
+    faults : MarkerFaults
+    held : HeldOut, optional
+    light : LightMesh
+        Of the body, for small pictures.
+    """
+
+    name: str
+    path: Path
+    who: str | None
+    unit: str | None
+    model: BodyModel
+    subject: Subject
+    markers: MarkerSequence
+    motion: Motion
+    soft: SoftTissue | None
+    faults: MarkerFaults
+    held: HeldOut | None
+    light: LightMesh
+    _kept: dict[int, np.ndarray] = field(default_factory=dict)
+
+    @property
+    def shown(self) -> Motion:
+        """The motion that pictures show: with soft tissue where there is one."""
+        return self.motion if self.soft is None else self.soft.motion
+
+    def bodies(self, frames: Sequence[int] | np.ndarray) -> np.ndarray:
+        """The meshes (n, N, 3) of some frames, metres, with soft tissue where there is one; made once each."""
+        new = np.array([t for t in map(int, frames) if t not in self._kept], dtype=int)
+        if len(new):
+            made = self.motion.vertices(self.subject, new) if self.soft is None else \
+                self.soft.vertices(self.model, new)
+            self._kept.update(zip(new.tolist(), made.astype(np.float32), strict=True))
+        return np.stack([self._kept[int(t)] for t in frames]).astype(float)
+
+    def rigid(self, frames: Sequence[int] | np.ndarray) -> np.ndarray:
+        """The meshes (n, N, 3) of the same poses with the person's own shape."""
+        return self.shown.vertices(self.subject, np.asarray(frames)).astype(float)
+
+
+def held_out(model: BodyModel, layout: MarkerLayout, labels: Sequence[str], markers: MarkerSequence, motion: Motion,
+             soft: SoftTissue | None) -> HeldOut | None:
+    """How far a motion is from markers that it was not made from; None where the sequence has none of them.
+
+    Parameters
+    ----------
+    layout : MarkerLayout
+        Where these markers usually sit.
+    labels : strings
+        Of the layout, or aliases of it.
+    """
+    wanted = {layout.aliases.get(label, label) for label in labels}
+    known = layout.matched(markers.labels, 0)
+    names = tuple(label for label in known if layout.aliases.get(label, label) in wanted)
+    if not names:
+        return None
+    places = layout.select(names)
+    ids, weights = supports(model.template, places)
+    lift, seen = np.asarray(places.distances), markers.select(names).positions
+    assert motion.betas is not None, "a person of a shape space"
+    if soft is None:
+        points = model.points(ids, weights, len(motion.betas)).operator(motion.betas)
+        fixed = lifted(points.evaluate(motion.poses, motion.trans), lift)
+        return HeldOut(names, np.linalg.norm(fixed - seen, axis=2), None)
+    shaped = model.points(ids, weights, max(len(motion.betas), soft.changes.shape[1]))
+    points = shaped.operator(motion.betas)
+    fixed = lifted(points.evaluate(motion.poses, motion.trans), lift)
+    moving = points.evaluate(soft.motion.poses, soft.motion.trans)
+    K, M, L, _ = shaped.shape_basis.shape
+    flat = np.ascontiguousarray(shaped.shape_basis.transpose(1, 3, 0, 2)).reshape(3 * M, K * L)
+    changes = np.pad(soft.changes, ((0, 0), (0, K - soft.changes.shape[1])))
+    for start in range(0, len(moving), AT_ONCE):
+        some = slice(start, start + AT_ONCE)
+        by_beta = posed_product(shaped.terms, flat, soft.motion.poses[some]).reshape(-1, 3, K, L)
+        moving[some] += np.einsum("tk,tdkl->tld", changes[some], by_beta)
+    return HeldOut(names, np.linalg.norm(fixed - seen, axis=2), np.linalg.norm(lifted(moving, lift) - seen, axis=2))

@@ -1,0 +1,237 @@
+"""Markers as they come: one frame in, one pose out, from nothing but the frames before."""
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from model.linear import Subject
+
+from ...solve import MinimiseConfig, Minimum, descend
+from ..artefacts.robust import LabelWatch, distances_apart, marker_weights, misfit
+from ..marker_sets.layout import MarkerLayout
+from .first_frame import search
+from .marked_body import MarkedBody, System
+from .prediction import make_prediction
+from .settings import AnimateConfig
+
+ENOUGH = 0.5                         # share of the markers that a search wants
+BELIED = 0.2                         # share of the markers seen that are outliers on a body gone astray
+PATIENCE = 0.25                      # seconds from a search that found nothing to the next; then twice as many
+DOUBT = 0.25                         # seconds for which frames that no body explains are taken for wrong
+FASTEST = 10.0                       # metres per second that the markers of a body together stray from the expected
+FARTHEST = 1e6                       # metres; a coordinate beyond it is no place
+
+
+@dataclass(frozen=True, eq=False)
+class Frame:
+    """What one frame of markers tells.
+
+    Attributes
+    ----------
+    pose : (J, 3) float, radians
+        NaN as long as no frame has shown enough markers to begin with.
+    trans : (3,) float, metres
+    residuals : (L,) float, metres
+        Distance of each marker from where the body puts it; NaN where it was not seen or is in no layout.
+    trusted : (L,) bool
+        Seen, and believed under its own label; none in a frame that no body explains.
+    converged : bool
+        The solution settled. It did not where a frame that no body makes was passed over: the pose is the expected one.
+    """
+
+    pose: np.ndarray
+    trans: np.ndarray
+    residuals: np.ndarray
+    trusted: np.ndarray
+    converged: bool
+
+
+class MarkerStream:
+    """The motion of a body from markers, frame by frame as they arrive.
+
+    Parameters
+    ----------
+    subject : Subject
+        The person, of known shape.
+    layout : MarkerLayout
+        Where on the body the markers sit.
+    labels : strings
+        Of the markers that `push` will be given, in this order; those that the layout does not know are left out.
+    rate : float, frames per second
+    config : AnimateConfig, optional
+
+    Raises
+    ------
+    ValueError
+        Fewer than 3 labels in the layout, a layout of another body, a rate that is not above zero, settings
+        that need later frames.
+
+    [SCAPE] §8
+    """
+
+    def __init__(self, subject: Subject, layout: MarkerLayout, labels: Sequence[str], rate: float,
+                 config: AnimateConfig | None = None) -> None:
+        config = config or AnimateConfig()
+        if config.ground or config.low_pass:
+            raise ValueError("config: expected ground=False and low_pass=0 for a stream, both need later frames")
+        if not rate > 0:
+            raise ValueError(f"rate: expected a number above 0, got {rate}")
+        known = layout.matched(labels)
+        self.rows = np.array([list(labels).index(label) for label in known])
+        self.n_labels = len(labels)
+        body = MarkedBody(subject, layout.select(known), config.prior_weight, config.prior_shrinkage)
+        self.tracker = Tracker(body, config, rate)
+
+    def push(self, positions: np.ndarray) -> Frame:
+        """The next frame.
+
+        Parameters
+        ----------
+        positions : (L, 3) float, metres
+            NaN where a marker is out of sight, as one is that is infinitely far.
+        """
+        positions = np.asarray(positions, dtype=np.float64)
+        if positions.shape != (self.n_labels, 3):
+            raise ValueError(f"positions: expected shape ({self.n_labels}, 3), got {positions.shape}")
+        positions = np.where((np.abs(positions) < FARTHEST).all(axis=1, keepdims=True), positions, np.nan)
+        tracker, targets = self.tracker, positions[self.rows]
+        x, settled = tracker.push(targets)
+        residuals, trusted = np.full(self.n_labels, np.nan), np.zeros(self.n_labels, dtype=bool)
+        residuals[self.rows], trusted[self.rows] = judge(tracker.places, targets, tracker.watch.order, tracker.config)
+        pose, trans, _ = tracker.body.body.split(x)
+        return Frame(pose, trans, residuals, trusted & tracker.believed, settled)
+
+
+class Tracker:
+    """The state of a stream of markers (L, 3) that all belong to the body.
+
+    Parameters
+    ----------
+    body : MarkedBody
+    config : AnimateConfig
+    rate : float, frames per second
+    """
+
+    def __init__(self, body: MarkedBody, config: AnimateConfig, rate: float) -> None:
+        self.body, self.config, self.rate = body, config, rate
+        self.watch = LabelWatch(body.count, config.outlier)
+        self.prediction = make_prediction(body, config, rate)
+        self.wait, self.patience, self.started = 0, PATIENCE * rate, False
+        self.places = np.full((body.count, 3), np.nan)                  # of the markers on the body of the last frame
+        self.believed, self.since, self.doubts = False, 0, 0            # frames since one was believed, and doubted
+        self.leapt = self.places                                        # where the last frame would have had the body
+
+    def begin(self, x: np.ndarray) -> None:
+        """Continue from these unknowns (P,), at rest."""
+        self.prediction.begin(x)
+        self.watch.forget()
+        self.started, self.since, self.doubts = True, 0, 0
+
+    def push(self, targets: np.ndarray) -> tuple[np.ndarray, bool]:
+        """Unknowns (P,) of the next frame, NaN before the first that could be solved, and whether it settled."""
+        there = int((~np.isnan(targets[:, 0])).sum())
+        enough = there >= max(3, ENOUGH * self.body.count)
+        self.wait, self.since, self.believed = max(0, self.wait - 1), self.since + 1, False
+        fresh = not self.started
+        if fresh:
+            if not enough:
+                return np.full(self.body.n_unknowns, np.nan), False
+            doubts = self.doubts
+            self.begin(search(self.body, targets, self.config))
+            self.doubts = doubts
+        expected, information = self.prediction.expect()
+        self.places = before = self.body.positions(expected)
+        if not there:
+            self.prediction.update(expected, 0 * information)
+            return expected, False
+        order = self.watch.order.copy()
+        taken = targets[self.watch.update(before, targets)]
+        end = self.solve(taken, expected, information)
+        x, settled, found = end.x[0], bool(end.converged[0]), None
+        self.places = self.body.positions(x)
+        if not self.wait and enough and not fresh and self._astray(taken):
+            found = self._found(taken)
+            if found is not None:
+                x, settled = found, True
+                self.places = self.body.positions(x)
+        if self._doubtful(taken, before):
+            self.watch.order, self.places = order, before
+            if fresh:
+                self.started = False
+                return np.full(self.body.n_unknowns, np.nan), False
+            self.prediction.update(expected, 0 * information)
+            return expected, False
+        if found is not None:
+            self.begin(x)
+        else:
+            self.prediction.update(x, end.hessian[0] - information)
+        return x, settled
+
+    def _found(self, targets: np.ndarray) -> np.ndarray | None:
+        """Unknowns (P,) that a search finds and that fit much better than the body at `places`, or None."""
+        found = search(self.body, targets, self.config)
+        apart = np.linalg.norm(np.stack([self.body.positions(found), self.places]) - targets, axis=2)
+        new, old = misfit(apart, self.config.outlier)
+        if new < 0.7 * old:
+            self.patience = PATIENCE * self.rate
+            return found
+        self.wait, self.patience = round(self.patience), 2 * self.patience
+        return None
+
+    def _doubtful(self, targets: np.ndarray, before: np.ndarray) -> bool:
+        """Whether the markers (L, 3) are to be passed over, the body at `places` having been expected at `before`.
+
+        No body explains them, or it would have leapt there: that is believed when the next frame says the same, and
+        anything when it goes on for long.
+        """
+        near = self.config.lost + FASTEST * self.since / self.rate
+        lost = bool(np.nanmedian(np.linalg.norm(self.places - targets, axis=1)) > self.config.lost)
+        leapt, self.leapt = self.leapt, np.full_like(before, np.nan) if lost else self.places
+        self.believed = not lost and min(_apart(self.places, before), _apart(self.places, leapt)) <= near
+        if self.believed:
+            self.since = self.doubts = 0
+            return False
+        self.doubts += 1
+        return self.doubts <= DOUBT * self.rate
+
+    def _astray(self, targets: np.ndarray) -> bool:
+        """The body has lost its markers (L, 3), or many of them."""
+        apart = np.linalg.norm(self.places - targets, axis=1)
+        apart = apart[~np.isnan(apart)]
+        return bool(np.median(apart) > self.config.lost or (apart > self.config.outlier).mean() > BELIED)
+
+    def solve(self, targets: np.ndarray, expected: np.ndarray, information: np.ndarray) -> Minimum:
+        """The best unknowns of a frame near the expected ones, which put the markers where `places` says."""
+        config, body = self.config, self.body
+        weights, _ = marker_weights(self.places, targets, config.marker_sd, config.outlier)
+
+        def system(x: np.ndarray) -> System:
+            cost, gradient, hessian = body.system(x, targets[None], weights[None])
+            step = body.step_to(expected, x[0])
+            pull = information @ step
+            return cost + step @ pull, gradient + pull, hessian + information
+
+        return descend(system, expected[None], MinimiseConfig(config.iterations, 1e-4, 1e-2), body.retract)
+
+
+def _apart(a: np.ndarray, b: np.ndarray) -> float:
+    """The median distance of points (L, 3), metres; infinite where some are not known."""
+    apart = float(np.median(np.linalg.norm(a - b, axis=1)))
+    return np.inf if np.isnan(apart) else apart
+
+
+def judge(positions: np.ndarray, targets: np.ndarray, order: np.ndarray, config: AnimateConfig
+          ) -> tuple[np.ndarray, np.ndarray]:
+    """Residuals (..., L), metres, of the markers as they came, and which were believed under their own label.
+
+    Parameters
+    ----------
+    positions, targets : (..., L, 3) float, metres
+    order : (..., L) int
+        Which column each marker was taken from.
+    """
+    residuals = np.linalg.norm(positions - targets, axis=-1)
+    squared, scale = distances_apart(positions, targets, config.outlier)
+    return residuals, (squared < scale**2) & (order == np.arange(order.shape[-1]))

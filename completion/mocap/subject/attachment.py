@@ -1,0 +1,246 @@
+"""Latent markers: where on the skin a marker hangs, and how it follows the skin from the latent pose into others.
+
+A marker hangs on three supports, points of the skin, with three coefficients. Nothing of it depends on betas but the
+supports, so coefficients are what is solved for: the place in the latent coordinate system follows from them.
+"""
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from scanprep.geometry import rotations
+from scanprep.geometry.mesh import Mesh
+from scanprep.geometry.surface import Surface, barycentric, checked_points, checked_surface
+
+from ...energy import MovingPoints
+from ..settings import Attachment
+
+
+@dataclass(frozen=True, eq=False)
+class LatentMarkers:
+    """Markers that hang on a surface.
+
+    Attributes
+    ----------
+    kind : "triangle" or "neighbourhood"
+    ids, weights : (3 L, k)
+        The three supports of every marker as combinations of vertices, as `BodyModel.points` takes them.
+    corners : (L, 3) int
+        Vertices of the triangle nearest to each marker.
+    """
+
+    kind: Attachment
+    ids: np.ndarray
+    weights: np.ndarray
+    corners: np.ndarray
+
+    @property
+    def count(self) -> int:
+        """L."""
+        return len(self.corners)
+
+    def supports(self, vertices: np.ndarray) -> np.ndarray:
+        """The supports (..., 3L, 3) on a surface with vertices (..., N, 3)."""
+        return np.einsum("lk,...lkd->...ld", self.weights, vertices[..., self.ids, :])
+
+    def coefficients(self, vertices: np.ndarray, points: np.ndarray) -> np.ndarray:
+        """Coefficients (L, 3) that put markers at points (L, 3) of the latent coordinate system.
+
+        [MoSh] Eq. 16
+        """
+        origin, frame = _frames(self.kind, self.supports(vertices))
+        return np.linalg.solve(frame, (points - origin)[..., None])[..., 0]
+
+    def places(self, vertices: np.ndarray, coefficients: np.ndarray) -> np.ndarray:
+        """Where the markers are (..., L, 3) on a surface with vertices (..., N, 3).
+
+        [MoSh] Eq. 16
+        """
+        origin, frame = _frames(self.kind, self.supports(vertices))
+        return origin + (frame @ coefficients[..., None])[..., 0]
+
+
+def latent_markers(mesh: Mesh, points: np.ndarray, kind: Attachment = "triangle") -> LatentMarkers:
+    """Hang points on the surface to which they are nearest.
+
+    Parameters
+    ----------
+    mesh : Mesh
+        The body in the latent pose.
+    points : (L, 3) float, metres
+    kind : "triangle" or "neighbourhood"
+        In the frame of the nearest triangle: its normal, a normalised edge and the cross product of the two; or as a
+        sum of the edges that leave the nearest vertex, of least norm, and the normal there.
+
+    Raises
+    ------
+    ValueError
+        No such kind.
+
+    [MoSh] Eq. 1, Eq. 15
+    """
+    found = Surface(mesh).closest(points)
+    corners = np.asarray(mesh.faces[found.faces])
+    if kind == "triangle":
+        return LatentMarkers(kind, corners.reshape(-1, 1), np.ones((corners.size, 1)), corners)
+    if kind != "neighbourhood":
+        raise ValueError(f"attachment: expected triangle or neighbourhood, got {kind!r}")
+    off = np.linalg.norm(mesh.vertices[corners] - points[:, None], axis=2)
+    nearest = np.take_along_axis(corners, off.argmin(axis=1)[:, None], axis=1)[:, 0]
+    rows = [row for centre in nearest for row in _ring_supports(mesh, int(centre))]
+    width = max(len(ids) for ids, _ in rows)
+    ids = np.array([np.pad(i, (0, width - len(i)), mode="edge") for i, _ in rows])
+    return LatentMarkers(kind, ids, np.array([np.pad(w, (0, width - len(w))) for _, w in rows]), corners)
+
+
+def _ring_supports(mesh: Mesh, centre: int) -> list[tuple[np.ndarray, np.ndarray]]:
+    """A vertex, and the sums of least norm of its edges that reach a unit to either side of its normal.
+
+    [MoSh] Eq. 2, Eq. 3
+    """
+    adjacency = mesh.vertex_adjacency
+    ring = adjacency.indices[adjacency.indptr[centre]:adjacency.indptr[centre + 1]]
+    normal = mesh.vertex_normals[centre]
+    u = np.cross(normal, np.eye(3)[np.argmin(np.abs(normal))])
+    u /= np.linalg.norm(u)
+    plane = (mesh.vertices[ring] - mesh.vertices[centre]) @ np.stack([u, np.cross(normal, u)]).T     # (n, 2)
+    shares = np.linalg.pinv(plane).T                                                                 # (n, 2)
+    ids = np.concatenate([[centre], ring])
+    rows = [(ids[:1], np.ones(1))]
+    return rows + [(ids, np.concatenate([[1 - share.sum()], share])) for share in shares.T]
+
+
+def _frames(kind: Attachment, supports: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Origins (..., L, 3) and frames (..., L, 3, 3), axes in columns, of supports (..., 3L, 3)."""
+    p = supports.reshape(*supports.shape[:-2], -1, 3, 3)
+    a, b = p[..., 1, :] - p[..., 0, :], p[..., 2, :] - p[..., 0, :]
+    c = np.cross(a, b)
+    n = c / np.linalg.norm(c, axis=-1, keepdims=True)
+    if kind == "triangle":
+        a = a / np.linalg.norm(a, axis=-1, keepdims=True)
+        b = np.cross(n, a)
+    return p[..., 0, :], np.stack([a, b, n], axis=-1)
+
+
+def simulated(kind: Attachment, supports: MovingPoints, coefficients: np.ndarray) -> tuple[MovingPoints, np.ndarray]:
+    """The simulated markers, and their derivative by the coefficients of each.
+
+    Parameters
+    ----------
+    kind : "triangle" or "neighbourhood"
+    supports : 3 L points
+    coefficients : (L, 3) float, metres
+
+    Returns
+    -------
+    L points
+        Derivatives by what moves the supports.
+    (..., L, 3, 3) float
+        Derivatives by the coefficients: the axes of the frame, in columns.
+
+    [MoSh] Eq. 4, Eq. 16
+    """
+    origin, frame = _frames(kind, supports.positions)
+    by_supports = _by_supports(kind, supports.positions, frame, coefficients)
+    J = supports.jacobian
+    J = by_supports @ J.reshape(*J.shape[:-3], -1, 9, J.shape[-1])
+    return MovingPoints(origin + (frame @ coefficients[..., None])[..., 0], J), frame
+
+
+def _by_supports(kind: Attachment, supports: np.ndarray, frame: np.ndarray, c: np.ndarray) -> np.ndarray:
+    """Derivative (..., L, 3, 9) of the markers by their three supports (..., 3L, 3)."""
+    p = supports.reshape(*supports.shape[:-2], -1, 3, 3)
+    a, b = p[..., 1, :] - p[..., 0, :], p[..., 2, :] - p[..., 0, :]
+    eye, n = np.eye(3), frame[..., :, 2]
+    area = np.linalg.norm(np.cross(a, b), axis=-1)[..., None, None]
+    tangent = (eye - n[..., :, None] * n[..., None, :]) / area
+    n_a, n_b = -tangent @ rotations.hat(b), tangent @ rotations.hat(a)                   # normal by the two edges
+    c1, c2, c3 = (c[..., i, None, None] for i in range(3))
+    if kind == "triangle":
+        e = frame[..., :, 0]
+        e_a = (eye - e[..., :, None] * e[..., None, :]) / np.linalg.norm(a, axis=-1)[..., None, None]
+        lift = c3 * eye - c2 * rotations.hat(e)                                          # n × e by n is -hat(e)
+        by_a = (c1 * eye + c2 * rotations.hat(n)) @ e_a + lift @ n_a
+        by_b = lift @ n_b
+    else:
+        by_a, by_b = c1 * eye + c3 * n_a, c2 * eye + c3 * n_b
+    return np.concatenate([eye - by_a - by_b, by_a, by_b], axis=-1)
+
+
+@dataclass(frozen=True, eq=False)
+class SignedDistances:
+    """Distances of points from a surface, positive outside, and their derivatives.
+
+    Attributes
+    ----------
+    values : (n,) float, metres
+    faces : (n,) int
+        The nearest triangles.
+    by_points : (n, 3) float
+    by_corners : (n, 3, 3) float
+        By the corners of the nearest triangle; all other vertices do not matter.
+    """
+
+    values: np.ndarray
+    faces: np.ndarray
+    by_points: np.ndarray
+    by_corners: np.ndarray
+
+
+def signed_distance(points: np.ndarray, mesh: Mesh) -> SignedDistances:
+    """The signed distance r(x, S) of points (n, 3) from a surface, with its derivatives.
+
+    The nearest point stays where it is on the surface to first order, so the derivative by a corner is that by the
+    point, backwards, times the corner's share in the nearest point.
+
+    Raises
+    ------
+    ValueError
+        A point that is not finite, a mesh without triangles.
+
+    [MoSh] Eq. 18
+    """
+    import igl
+
+    points = checked_points(points)
+    values, face, nearest, normals = igl.signed_distance(
+        points, *checked_surface(mesh), sign_type=igl.SIGNED_DISTANCE_TYPE_PSEUDONORMAL)
+    off = points - nearest
+    far = np.abs(values) > 1e-9
+    direction = np.where(far[:, None], off / np.where(far, values, 1.0)[:, None], normals)
+    share = barycentric(nearest, mesh.corners[face])
+    return SignedDistances(values, face, direction, -share[..., None] * direction[:, None])
+
+
+def above_triangles(points: np.ndarray, corners: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Signed distances (n,) of points (n, 3) from one triangle each, and their derivatives by point and corners.
+
+    What `signed_distance` is as long as the triangle is the nearest.
+
+    Parameters
+    ----------
+    points : (n, 3) float, metres
+    corners : (n, 3, 3) float, metres
+        Of the triangles, counter-clockwise seen from outside.
+    """
+    share = barycentric(points, corners)
+    nearest = np.einsum("nc,ncd->nd", share, corners)
+    best = np.where((share >= 0).all(axis=1), np.linalg.norm(points - nearest, axis=1), np.inf)
+    inside = np.isfinite(best)
+    for i, j in ((0, 1), (1, 2), (2, 0)):
+        edge = corners[:, j] - corners[:, i]
+        t = np.einsum("nd,nd->n", points - corners[:, i], edge) / np.einsum("nd,nd->n", edge, edge)
+        t = np.clip(t, 0, 1)
+        far = np.linalg.norm(points - corners[:, i] - t[:, None] * edge, axis=1)
+        better = (far < best) & ~inside
+        best = np.where(better, far, best)
+        share[better] = 0
+        share[better, i], share[better, j] = 1 - t[better], t[better]
+    off = points - np.einsum("nc,ncd->nd", share, corners)
+    normal = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
+    normal /= np.linalg.norm(normal, axis=1, keepdims=True)
+    values = np.where(np.einsum("nd,nd->n", off, normal) < 0, -best, best)
+    far = best > 1e-9
+    direction = np.where(far[:, None], off / np.where(far, values, 1.0)[:, None], normal)
+    return values, direction, -share[..., None] * direction[:, None]

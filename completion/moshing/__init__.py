@@ -1,1 +1,0 @@
-"""Shape, pose and soft tissue of people from markers alone [MoSh]."""

@@ -1,1 +1,0 @@
-"""Motions and soft tissue on characters."""

@@ -1,1 +1,0 @@
-"""`scape mosh`: folders of recordings, files and pages."""

@@ -1,1 +1,0 @@
-"""What is wrong with markers, and sequences put right."""

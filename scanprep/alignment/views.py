@@ -1,0 +1,212 @@
+"""Range views with rough camera poses brought together, all at once."""
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from ..decimation.remeshing import smooth
+from ..fusion.tsdf import border_distance, mesh_and_camera
+from ..geometry import rotations
+from ..geometry.mesh import Mesh
+from ..geometry.surface import OrientedPoints
+from ..ranges import Cosine, Count, Positive, Settings, Share
+from .view_features import place_by_features
+from .view_landmarks import fit_of_views, place_by_landmarks
+
+
+@dataclass(frozen=True)
+class AlignViewsConfig(Settings):
+    """Settings of `align_views`.
+
+    Attributes
+    ----------
+    iterations : int
+        Most rounds of matching.
+    points : int
+        Points of each view that look for matches.
+    reach : float, metres
+        Farthest match of the first round; later ones keep three times the median distance.
+    min_cosine : float
+        Matches whose normals differ more do not count.
+    border : float, metres
+        Points nearer to the border of their view do not count.
+    smoothing : int
+        Rounds of smoothing before normals are taken.
+    tolerance : float, metres
+        Settled when no view's points move further in a round.
+    min_overlap : float
+        Share of a view that others must have seen as well for its place to be trusted.
+    max_conflict : float
+        Share of a view that others may look through before its place is not trusted.
+    """
+
+    iterations: Count = 60
+    points: Count = 4000
+    reach: Positive = 0.08
+    min_cosine: Cosine = 0.8
+    border: float = 0.02
+    smoothing: int = 10
+    tolerance: float = 5e-5
+    min_overlap: Share = 0.15
+    max_conflict: Share = 0.03
+
+
+@dataclass(frozen=True, eq=False)
+class AlignedViews:
+    """Views after `align_views`.
+
+    Attributes
+    ----------
+    views : list of (Mesh, (3,)) pairs
+        Moved surfaces and camera positions, ready for `merge_views`.
+    T_world_view : (V, 4, 4) float
+        The motion of each view; the first one stays.
+    rms : float, metres
+        Of the distances between matched points and planes, in the end.
+    converged : bool
+    iterations : int
+    overlap : (V,) float
+        Share of each view that others saw as well.
+    conflict : (V,) float
+        Share of each view that others look through, which cannot be where views are in place.
+    trusted : (V,) bool
+        Views that came to rest, overlap with others and do not contradict them; where one is False the result
+        should not be merged.
+    """
+
+    views: list[tuple[Mesh, np.ndarray]]
+    T_world_view: np.ndarray
+    rms: float
+    converged: bool
+    iterations: int
+    overlap: np.ndarray
+    conflict: np.ndarray
+    trusted: np.ndarray
+
+
+def align_views(views: Sequence[Any], config: AlignViewsConfig | None = None,
+                rng: np.random.Generator | None = None,
+                landmarks: Sequence[Mapping[str, np.ndarray]] | None = None, features: bool = False) -> AlignedViews:
+    """Refine rough camera poses by point-to-plane matching between all pairs of views together.
+
+    Parameters
+    ----------
+    views : sequence of RangeView, or of (Mesh, camera position (3,)) pairs
+        A few centimetres and degrees from where they belong, unless landmarks or features place them first.
+    config : AlignViewsConfig, optional
+    rng : numpy.random.Generator, optional
+        Draws the points that look for matches.
+    landmarks : sequence of mappings name -> (3,) point, one for each view, optional
+        Clicked points or markers, each in two views or more; they bring the views to where matching can begin.
+    features : bool
+        Find the places of the views from their shapes alone, without any knowledge of the cameras.
+
+    Returns
+    -------
+    AlignedViews
+
+    Raises
+    ------
+    ValueError
+        No views.
+    """
+    config, rng = config or AlignViewsConfig(), rng or np.random.default_rng(0)
+    pairs = [mesh_and_camera(view) for view in views]
+    if not pairs:
+        raise ValueError("views: expected at least one, got none")
+    start = np.tile(np.eye(4), (len(pairs), 1, 1))
+    if landmarks is not None:
+        start = place_by_landmarks(landmarks, len(pairs))
+    elif features:
+        start = place_by_features(pairs, rng)
+    pairs = [_moved(pair, T) for pair, T in zip(pairs, start, strict=True)]
+    samples = [_oriented(mesh, config, rng) for mesh, _ in pairs]
+    poses = np.tile(np.eye(4), (len(pairs), 1, 1))
+    reach, rms, settled, rounds = config.reach, np.nan, len(pairs) == 1, 0
+    while rounds < config.iterations and not settled:
+        placed = [(p @ T[:3, :3].T + T[:3, 3], n @ T[:3, :3].T)
+                  for T, (p, n, _) in zip(poses, samples, strict=True)]
+        matches = _match(placed, [inner for _, _, inner in samples], reach, config)
+        if not matches:
+            break
+        steps, residual = _solve(placed, matches)
+        moved = max(float(np.linalg.norm(p @ S[:3, :3].T + S[:3, 3] - p, axis=1).mean())
+                    for S, (p, _) in zip(steps, placed, strict=True))
+        poses = steps @ poses
+        rms, settled, rounds = float(np.sqrt(np.mean(residual**2))), moved < config.tolerance, rounds + 1
+        distances = np.concatenate([d for *_, d in matches])
+        reach = min(reach, max(3 * float(np.median(distances)), 0.005))
+    out = [_moved(pair, T) for pair, T in zip(pairs, poses, strict=True)]
+    overlap, conflict = fit_of_views(out)
+    trusted = settled & (overlap >= config.min_overlap) & (conflict <= config.max_conflict) | (len(out) == 1)
+    return AlignedViews(out, poses @ start, rms, settled, rounds, overlap, conflict, trusted)
+
+
+def _moved(view: tuple[Mesh, np.ndarray], T: np.ndarray) -> tuple[Mesh, np.ndarray]:
+    mesh, camera = view
+    return mesh.with_vertices(mesh.vertices @ T[:3, :3].T + T[:3, 3]), T[:3, :3] @ camera + T[:3, 3]
+
+
+def _oriented(mesh: Mesh, config: AlignViewsConfig, rng: np.random.Generator
+              ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """Points of a view, their normals, and which of them lie well inside."""
+    even = smooth(mesh, config.smoothing)
+    inner = border_distance(mesh, config.border) >= config.border
+    chosen = rng.permutation(len(mesh.vertices))[:4 * config.points]
+    return even.vertices[chosen], even.vertex_normals[chosen], inner[chosen]
+
+
+def _match(placed: list[tuple[np.ndarray, np.ndarray]], inner: list[np.ndarray], reach: float,
+           config: AlignViewsConfig) -> list[tuple[int, int, np.ndarray, np.ndarray, np.ndarray]]:
+    """For every pair of views (i, j): points of i, their matches in j, distances."""
+    found = []
+    for j, (points, normals) in enumerate(placed):
+        target = OrientedPoints(points, normals)
+        for i, (mine, my_normals) in enumerate(placed):
+            if i == j:
+                continue
+            rows = np.flatnonzero(inner[i][:config.points])
+            match = target.match(mine[rows], my_normals[rows], reach, config.min_cosine)
+            good = match.valid & inner[j][np.maximum(match.index, 0)]
+            if good.sum() >= 30:
+                found.append((i, j, rows[good], match.index[good], match.distances[good]))
+    return found
+
+
+def _solve(placed: list[tuple[np.ndarray, np.ndarray]],
+           matches: list[tuple[int, int, np.ndarray, np.ndarray, np.ndarray]]) -> tuple[np.ndarray, np.ndarray]:
+    """Small motions (V, 4, 4) of all views but the first that lessen the point-to-plane distances most."""
+    count = len(placed)
+    A, b, residuals = np.zeros((6 * count, 6 * count)), np.zeros(6 * count), []
+    centre = np.concatenate([p for p, _ in placed]).mean(axis=0)
+    for i, j, rows, targets, _ in matches:
+        x, y, n = placed[i][0][rows] - centre, placed[j][0][targets] - centre, placed[j][1][targets]
+        residual = np.einsum("nd,nd->n", n, x - y)
+        J = np.concatenate([np.cross(x, n), n], axis=1)
+        JJ, Jr = J.T @ J, J.T @ residual
+        a, c = slice(6 * i, 6 * i + 6), slice(6 * j, 6 * j + 6)
+        A[a, a] += JJ
+        A[c, c] += JJ
+        A[a, c] -= JJ
+        A[c, a] -= JJ
+        b[a] -= Jr
+        b[c] += Jr
+        residuals.append(residual)
+    A += 1e-6 * np.trace(A) / len(A) * np.eye(len(A))         # a view without matches stays
+    step = np.zeros((count, 6))
+    step[1:] = np.linalg.solve(A[6:, 6:], b[6:]).reshape(-1, 6)
+    T = np.tile(np.eye(4), (count, 1, 1))
+    T[:, :3, :3] = rotations.exp(step[:, :3])
+    T[:, :3, 3] = step[:, 3:] + centre - np.einsum("vij,j->vi", T[:, :3, :3], centre)
+    return T, np.concatenate(residuals)
+
+
+def views_problem(found: AlignedViews) -> str | None:
+    """Why aligned views mean nothing; None where some are in place."""
+    if found.trusted.any():
+        return None
+    return (f"no view is in its place, they share {100 * float(found.overlap.max()):.0f}% of their surface at most; "
+            "the wrong cameras, another unit (--unit), or a start that is too far off (--landmarks, --features)?")

@@ -1,0 +1,152 @@
+"""Seeds that nobody clicked: the ends of the limbs on template and scan, matched by the ways between them."""
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from itertools import permutations
+
+import numpy as np
+
+from ..geometry.geodesics import SurfaceGraph
+from ..geometry.mesh import Mesh, check_template
+from ..ranges import Cell, Count, Positive, Settings
+from ..registration.deformation_graph import farthest_points
+from ..registration.matches import target_of
+from ..threads import one_thread
+from .correspondences import Correspondences
+from .search import BeliefLevel, CorrelatedConfig, Search
+from .sheet import Sheet
+
+QUICK = CorrelatedConfig(points=90, keep=90, links=6, levels=(BeliefLevel(900, 60),), iterations=25)
+
+
+@dataclass(frozen=True)
+class SeedConfig(Settings):
+    """Settings of `find_seeds`. Lengths are multiples of the template's size, √area.
+
+    Attributes
+    ----------
+    ends : int
+        Most ends that are looked for on the template.
+    candidates : int
+        Most ends of the scan that may be among them.
+    apart : float
+        An end is the farthest place within this distance along the surface.
+    spacing : float
+        Distance that the scan is thinned to.
+    hypotheses : int
+        Ways to match the ends that are tried by correlated correspondence.
+    missing : float
+        Cost of an end of the template that the scan does not show, as the share by which a way may be wrong.
+    check : CorrelatedConfig
+        Of the trial of every hypothesis.
+    """
+
+    ends: Count = 5
+    candidates: Count = 7
+    apart: Positive = 0.28
+    spacing: Cell = 0.009
+    hypotheses: Count = 8
+    missing: float = 0.12
+    check: CorrelatedConfig = field(default_factory=lambda: QUICK)
+
+
+@one_thread()
+def find_seeds(template: Mesh, scan: Mesh | np.ndarray, config: SeedConfig | None = None) -> Correspondences:
+    """The ends of the limbs on template and scan, with no click.
+
+    Ends are places farther from the rest of the surface than all around them: head, hands and feet of a person
+    whose limbs do not hide in each other. They are matched by the lengths of the ways between them; left and
+    right, front and back are told by trying the best matches: the right one keeps the surface the same way
+    round, and its short edges. Nothing is assumed about which way is up.
+
+    Parameters
+    ----------
+    template : Mesh
+        One connected manifold component, its limbs away from its body.
+    scan : Mesh or (n, 3) float, metres
+
+    Returns
+    -------
+    Correspondences
+        At most as many as the template has ends. The confidence is how much worse the next hypothesis is.
+
+    Raises
+    ------
+    ValueError
+        A template that is not one manifold component or has fewer than three ends; a scan with fewer than three.
+    """
+    config = config or SeedConfig()
+    check_template(template)
+    size = float(np.sqrt(template.face_areas.sum()))
+    surface = SurfaceGraph(template)
+    ends, ways = _ends(template.vertices, surface.distances, config.ends, config.apart * size)
+    if len(ends) < 3:
+        raise ValueError(f"template: expected at least three limbs, found {len(ends)} ends")
+    sheet = Sheet(target_of(scan, config.check.neighbours), config.spacing * size)
+    seen, seen_ways = _ends(sheet.points, sheet.distances, config.candidates, config.apart * size)
+    if len(seen) < 3:
+        raise ValueError(f"scan: expected at least three ends of limbs, found {len(seen)}")
+    hypotheses = matched_ends(ways, seen_ways, config)
+    trials = []
+    for image in hypotheses:
+        there = image >= 0
+        search = Search(template, sheet, surface, (ends[there], sheet.points[seen[image[there]]]), config.check)
+        for level in config.check.levels:
+            search.descend(level)
+        trials.append(search.energy / len(search.chosen) + 2.0 * float((~there).sum()))
+    order = np.argsort(trials)
+    best = hypotheses[order[0]]
+    there = best >= 0
+    margin = 1.0 if len(trials) < 2 else 1 - np.exp(trials[order[0]] - trials[order[1]])
+    energies = {f"hypothesis {k}": float(trials[h]) for k, h in enumerate(order)}
+    return Correspondences(ends[there], sheet.points[seen[best[there]]], np.full(int(there.sum()), float(margin)),
+                           "ends of limbs", energies, bool(margin > 0.2))
+
+
+def _ends(points: np.ndarray, distances: Callable[[np.ndarray], np.ndarray], count: int, apart: float
+          ) -> tuple[np.ndarray, np.ndarray]:
+    """Places farther from the rest than all around them, most pronounced first, and the ways between them."""
+    sample = farthest_points(points, min(64, len(points)))
+    ways = distances(sample)
+    there = np.isfinite(ways)
+    mean = np.full(ways.shape[1], np.nan)                     # of pieces that no sample reaches
+    np.divide(np.where(there, ways, 0).sum(axis=0), there.sum(axis=0), out=mean, where=there.any(axis=0))
+    chosen: list[int] = []
+    todo = mean - np.nanmin(mean)
+    while len(chosen) < count and np.nanmax(todo) > 0:
+        top = int(np.nanargmax(todo))
+        ring = distances(np.array([top]))[0]
+        near = ring < apart
+        if mean[top] >= np.nanmax(mean[near]) and mean[top] - np.nanmin(mean[near]) > 0.5 * apart:
+            chosen.append(top)
+        todo = np.where(near, -1.0, todo)
+    ends = np.array(chosen, dtype=np.int64)
+    return ends, distances(ends)[:, ends] if len(ends) else np.zeros((0, 0))
+
+
+def matched_ends(template: np.ndarray, scan: np.ndarray, config: SeedConfig) -> list[np.ndarray]:
+    """The matches of the ends that keep the ways between them best, best first.
+
+    Parameters
+    ----------
+    template, scan : (E, E) and (F, F) float, metres
+        Ways between the ends.
+
+    Returns
+    -------
+    list of (E,) int
+        The scan's end for every end of the template, -1 for none.
+    """
+    E, F = len(template), len(scan)
+    hidden = max(0, min(E - 3, 2))
+    images = np.array(sorted(set(permutations([*range(F), *([-1] * hidden)], E))))
+    images = images[(images >= 0).sum(axis=1) >= 3]
+    a, b = np.triu_indices(E, 1)
+    both = (images[:, a] >= 0) & (images[:, b] >= 0)
+    ratio = scan[images[:, a], images[:, b]] / template[a, b]
+    log_ratio = np.where(both & np.isfinite(ratio) & (ratio > 0), np.log(np.where(ratio > 0, ratio, 1.0)), np.nan)
+    scale = np.clip(np.nanmedian(log_ratio, axis=1), -0.35, 0.35)
+    wrong = np.where(both, np.minimum(np.nan_to_num(np.abs(log_ratio - scale[:, None]), nan=0.5), 0.5), 0.0)
+    cost = wrong.sum(axis=1) / np.maximum(both.sum(axis=1), 1) + config.missing * (images < 0).sum(axis=1)
+    return list(images[np.argsort(cost, kind="stable")[:config.hypotheses]])

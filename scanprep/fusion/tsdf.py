@@ -1,0 +1,276 @@
+"""Range views fused into one surface [VRIP]."""
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+from dataclasses import dataclass
+from typing import Annotated, Any
+
+import numpy as np
+from scipy.sparse.csgraph import dijkstra
+
+from ..decimation.remeshing import smooth
+from ..geometry.mesh import Mesh
+from ..geometry.surface import Rays, barycentric
+from ..ranges import Cell, Cosine, Range, Settings, Share
+from ..repair.manifold import drop_small_components, split_vertices
+
+BLOCK = 4                      # voxels along the side of a block; the smallest piece of the volume that is stored
+CORNERS = np.array([(0, 0, 0), (1, 0, 0), (1, 1, 0), (0, 1, 0), (0, 0, 1), (1, 0, 1), (1, 1, 1), (0, 1, 1)])
+
+
+@dataclass(frozen=True)
+class MergeConfig(Settings):
+    """Settings of `merge_views`.
+
+    Attributes
+    ----------
+    voxel : float, metres
+        Edge of the cells; the triangles of the result are of this size.
+    truncation : float, voxels
+        How far from a view's surface it speaks about the volume, at most 4.
+    min_cosine : float
+        Surface seen at a flatter angle than this cosine has no weight.
+    taper : float, metres
+        The weight of a view rises from 0 at its border to its full value at this distance from it.
+    min_weight : float
+        Total weight below which a voxel counts as not seen.
+    carving : float
+        Weight with which a view declares empty the space in front of its surface; 0 for never.
+    min_component : float
+        Pieces with a smaller share of the vertices of the largest one are dropped.
+    """
+
+    voxel: Cell = 0.004
+    truncation: Annotated[float, Range(1, BLOCK)] = 3.0
+    min_cosine: Cosine = 0.1
+    taper: float = 0.02
+    min_weight: float = 0.02
+    carving: float = 0.0
+    min_component: Share = 0.02
+
+
+@dataclass(frozen=True, eq=False)
+class _View:
+    mesh: Mesh
+    camera: np.ndarray
+    rays: Rays
+    cosines: np.ndarray        # (N,) between normals and lines of sight, at the vertices
+    weights: np.ndarray        # (N,)
+
+    def look(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+        """The triangle behind or before each point, or -1; how far in front of its plane; weight; bary."""
+        along = points - self.camera
+        depth = np.linalg.norm(along, axis=1)
+        along /= depth[:, None]
+        face, hit = self.rays.cast(self.camera[None].repeat(len(points), axis=0), along)
+        seen = face >= 0
+        where = self.camera + hit[seen, None] * along[seen]
+        bary = np.zeros((len(points), 3))
+        bary[seen] = np.clip(barycentric(where, self.mesh.corners[face[seen]]), 0, 1)
+        corners = self.mesh.faces[face]
+        weight = np.einsum("nc,nc->n", bary, self.weights[corners])
+        cosine = np.einsum("nc,nc->n", bary, self.cosines[corners])
+        return face, (hit - depth) * cosine, weight, bary
+
+
+def merge_views(views: Sequence[Any], config: MergeConfig | None = None,
+                progress: Callable[[int, int], None] | None = None) -> Mesh:
+    """One surface from several range views with known cameras.
+
+    Every view measures, along its lines of sight, how far each voxel near its surface lies in front of it or
+    behind it, and turns this into a distance from the surface. The weighted mean of these distances changes sign
+    on the merged surface, which stays open where no view saw anything.
+
+    Parameters
+    ----------
+    views : sequence of RangeView, or of (Mesh, camera position (3,)) pairs
+        All in one coordinate frame (see `align_views` when they are not quite).
+    config : MergeConfig, optional
+    progress : callback(done, total), optional
+
+    Returns
+    -------
+    Mesh
+        Borders do not touch themselves. With colours when all views have them.
+
+    Raises
+    ------
+    ValueError
+        No views, or nothing left of them.
+
+    [VRIP] volumetric integration, tapered weights
+    """
+    config = config or MergeConfig()
+    prepared = [_prepare(mesh, camera, config) for mesh, camera in map(mesh_and_camera, views)]
+    if not prepared:
+        raise ValueError("views: expected at least one, got none")
+    ends = [end for view in prepared for end in (view.mesh.vertices.min(axis=0), view.mesh.vertices.max(axis=0))]
+    grid = _Grid.around(np.min(ends, axis=0), np.max(ends, axis=0), config.voxel)
+    near = [grid.near(view.mesh) for view in prepared]
+    keys = _distinct(np.concatenate(near))
+    points = grid.points(keys)
+    total, weight = np.zeros(len(keys)), np.zeros(len(keys))
+    for number, view in enumerate(prepared):
+        mine = np.arange(len(keys)) if config.carving else np.searchsorted(keys, near[number])
+        for part in _chunks(len(mine)):
+            _integrate(view, points, mine[part], total, weight, config)
+        if progress:
+            progress(number + 1, len(prepared))
+    seen = weight > config.min_weight
+    distance = np.divide(total, weight, out=np.zeros_like(total), where=seen)
+    mesh = _zero_surface(grid, keys[seen], points[seen], distance[seen])
+    mesh = drop_small_components(split_vertices(mesh), config.min_component)
+    if not len(mesh.faces):
+        raise ValueError("views: no surface is left after merging; is every camera on the outer side of its view?")
+    return _with_colors(mesh, prepared)
+
+
+def mesh_and_camera(view: Any) -> tuple[Mesh, np.ndarray]:
+    """The surface and the camera position of a RangeView or a pair."""
+    mesh, camera = view if isinstance(view, tuple) else (view.mesh, view.camera)
+    camera = np.asarray(camera, dtype=float)
+    if not isinstance(mesh, Mesh) or camera.shape != (3,) or not np.isfinite(camera).all():
+        raise ValueError("views: expected RangeViews or pairs of a Mesh and a camera position (3,)")
+    return mesh, camera
+
+
+def border_distance(mesh: Mesh, limit: float) -> np.ndarray:
+    """Distance (N,) in metres of every vertex from the border along the edges, at most `limit`."""
+    border = mesh.boundary_vertices
+    if not len(border):
+        return np.full(len(mesh.vertices), limit)
+    lengths = mesh.vertex_adjacency.copy().tocoo()
+    apart = mesh.vertices[lengths.row] - mesh.vertices[lengths.col]
+    lengths.data = np.maximum(np.linalg.norm(apart, axis=1), 1e-12)
+    return np.minimum(dijkstra(lengths.tocsr(), indices=border, min_only=True, limit=limit), limit)
+
+
+def _prepare(mesh: Mesh, camera: np.ndarray, config: MergeConfig) -> _View:
+    towards = camera - mesh.vertices
+    towards /= np.maximum(np.linalg.norm(towards, axis=1, keepdims=True), 1e-12)
+    normals = smooth(mesh, 5).vertex_normals                  # noise tilts the single triangles
+    cosine = np.einsum("nd,nd->n", normals, towards)
+    angle = np.clip((cosine - config.min_cosine) / (1 - config.min_cosine), 0, 1)
+    border = border_distance(mesh, config.taper) / config.taper if config.taper > 0 else 1.0
+    return _View(mesh, camera, Rays(mesh), np.clip(cosine, config.min_cosine, 1), angle * border)
+
+
+@dataclass(frozen=True, eq=False)
+class _Grid:
+    """Voxels numbered row by row in a box, of which only those in blocks near a surface are ever stored."""
+
+    origin: np.ndarray
+    blocks: tuple[int, ...]
+    voxel: float
+    block: int = BLOCK
+
+    @classmethod
+    def around(cls, low: np.ndarray, high: np.ndarray, voxel: float) -> _Grid:
+        side = BLOCK * voxel
+        first = np.floor(low / side).astype(np.int64) - 1
+        count = np.floor(high / side).astype(np.int64) - first + 2
+        return cls(first * side, tuple(count.tolist()), voxel)
+
+    @property
+    def shape(self) -> tuple[int, ...]:
+        return tuple(self.block * count for count in self.blocks)
+
+    def points(self, keys: np.ndarray) -> np.ndarray:
+        return self.origin + self.voxel * np.stack(np.unravel_index(keys, self.shape), axis=1)
+
+    def near(self, mesh: Mesh) -> np.ndarray:
+        """Sorted numbers of the voxels in the blocks that hold a surface, and in those around them."""
+        side = BLOCK * self.voxel
+        blocks = np.floor((_dense_points(mesh, side / 2) - self.origin) / side).astype(np.int64)
+        flat = _distinct(np.ravel_multi_index(tuple(blocks.T), self.blocks))
+        for axis in range(3):                       # one axis after the other is cheap
+            step = int(np.prod(self.blocks[axis + 1:]))
+            flat = _distinct(np.concatenate([flat - step, flat, flat + step]))
+        blocks = np.stack(np.unravel_index(flat, self.blocks), axis=1)
+        inside = np.stack(np.meshgrid(*[np.arange(BLOCK)] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
+        voxels = (BLOCK * blocks[:, None] + inside).reshape(-1, 3)
+        return np.sort(np.ravel_multi_index(tuple(voxels.T), self.shape))
+
+
+def _dense_points(mesh: Mesh, spacing: float) -> np.ndarray:
+    """Points that leave no triangle further than about `spacing` from one of them."""
+    points = [mesh.vertices[np.unique(mesh.faces)]]
+    corners = mesh.corners
+    while len(corners):
+        sides = np.linalg.norm(corners - np.roll(corners, 1, axis=1), axis=2).max(axis=1)
+        corners = corners[sides > spacing]
+        a, b, c = corners.transpose(1, 0, 2)
+        p, q, r = (a + b) / 2, (b + c) / 2, (c + a) / 2
+        points += [p, q, r]
+        corners = np.concatenate([np.stack(t, axis=1) for t in ((a, p, r), (p, b, q), (r, q, c), (p, q, r))])
+    return np.concatenate(points)
+
+
+def _integrate(view: _View, points: np.ndarray, which: np.ndarray, total: np.ndarray, weight: np.ndarray,
+               config: MergeConfig) -> None:
+    """Add to `total` and `weight` what a view says about some of the voxels.
+
+    Behind the surface the weight falls to 0, so that it does not disturb the opposite side of a thin limb.
+    """
+    reach = config.truncation * config.voxel
+    _, ahead, w, _ = view.look(points[which])
+    ahead = np.nan_to_num(ahead, nan=-np.inf, neginf=-np.inf)
+    w = np.where(ahead > reach, config.carving * w, w * np.clip(2 + 2 * ahead / reach, 0, 1))
+    use = w > 0
+    total[which[use]] += w[use] * np.clip(ahead[use], -reach, reach)
+    weight[which[use]] += w[use]
+
+
+def _zero_surface(grid: _Grid, keys: np.ndarray, points: np.ndarray, distance: np.ndarray) -> Mesh:
+    """Marching cubes in the cells whose eight corners were all seen."""
+    import igl
+
+    shape, voxel = grid.shape, grid.voxel
+    step = np.array([shape[1] * shape[2], shape[2], 1])
+    place = np.searchsorted(keys, keys[:, None] + CORNERS @ step)
+    place = np.minimum(place, max(len(keys) - 1, 0))
+    whole = (keys[place] == keys[:, None] + CORNERS @ step).all(axis=1)
+    whole &= np.all([at < size - 1 for at, size in zip(np.unravel_index(keys, shape), shape, strict=True)], axis=0)
+    cells = place[whole]
+    inside = (distance < 0)[cells].sum(axis=1)
+    cells = cells[(inside > 0) & (inside < 8)]
+    if not len(cells):
+        return Mesh(np.empty((0, 3)), np.empty((0, 3), int))
+    used = _distinct(cells.ravel())
+    local = np.searchsorted(used, cells)
+    values = distance[used]
+    values[np.abs(values) < 1e-4 * voxel] = 1e-4 * voxel   # a surface through a corner would make flat triangles
+    vertices, faces, _ = igl.marching_cubes(values, np.ascontiguousarray(points[used]),
+                                            np.ascontiguousarray(local, dtype=np.int64), 0.0)
+    return Mesh(vertices, faces)
+
+
+def zero_surface(points: np.ndarray, values: np.ndarray, shape: tuple[int, ...]) -> Mesh:
+    """Where values (N,) on a full grid (N, 3) of a shape change sign, by marching cubes."""
+    grid = _Grid(np.zeros(3), tuple(shape), 1.0, block=1)
+    return _zero_surface(grid, np.arange(len(values)), points, values / max(float(np.abs(values).max()), 1e-30))
+
+
+def _with_colors(mesh: Mesh, views: Sequence[_View]) -> Mesh:
+    """The views' colours, with the same weights as their distances."""
+    if any(view.mesh.colors is None for view in views):
+        return mesh
+    total, weight = np.zeros_like(mesh.vertices), np.full(len(mesh.vertices), 1e-12)
+    near = 2 * mesh.mean_edge
+    for view in views:
+        face, signed, w, bary = view.look(mesh.vertices)
+        use = (face >= 0) & (np.abs(signed) < near)
+        colors = np.einsum("nc,ncd->nd", bary[use], np.asarray(view.mesh.colors)[view.mesh.faces[face[use]]])
+        total[use] += w[use, None] * colors
+        weight[use] += w[use]
+    return Mesh(mesh.vertices, mesh.faces, np.clip(total / weight[:, None], 0, 1))
+
+
+def _distinct(numbers: np.ndarray) -> np.ndarray:
+    """Sorted distinct integers; for millions of them faster than np.unique."""
+    numbers = np.sort(numbers)
+    return numbers[np.r_[True, numbers[1:] != numbers[:-1]][:len(numbers)]]
+
+
+def _chunks(count: int, size: int = 500_000) -> Iterable[slice]:
+    return (slice(start, start + size) for start in range(0, count, size))

@@ -1,0 +1,120 @@
+"""`scape prep align`, `correspond` and `register`: one mesh onto another."""
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+import tyro
+
+from ..alignment.icp import RigidConfig, align_landmarks, align_rigid, alignment_problem
+from ..cli import MM, MeshArg, Output, ScanArg, Unit, landmarks_beside
+from ..console import Metric, Outcome, bar
+from ..correspondence.correlated import CorrelatedConfig, find_correspondences
+from ..correspondence.correspondences import correspondences_problem
+from ..correspondence.files import read_correspondences, write_correspondences
+from ..correspondence.functional import find_functional_correspondences
+from ..geometry.files import read_mesh, write_mesh
+from ..geometry.landmarks import match_landmarks, read_landmark_vertices, read_landmarks
+from ..geometry.mesh import Mesh
+from ..pipeline.scans import read_scan
+from .nonrigid import register, registration_problem
+
+TargetArg = Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="TARGET")]
+
+
+def align(source: MeshArg, target: TargetArg, output: Output, landmarks: Path | None = None,
+          target_landmarks: Path | None = None, unit: Unit | None = None,
+          config: Annotated[RigidConfig, tyro.conf.arg(name="")] = RigidConfig()) -> Outcome:  # noqa: B008
+    """Move a mesh rigidly onto another: by landmarks where both have them, then by their surfaces.
+
+    Example: scape prep align front.ply back.ply -o front_aligned.ply
+    """
+    moving, fixed = read_mesh(source, unit), read_mesh(target, unit)
+    T = np.eye(4)
+    if landmarks or target_landmarks:
+        if not (landmarks and target_landmarks):
+            raise ValueError("landmarks: expected --landmarks and --target-landmarks together")
+        _, mine, theirs = match_landmarks(read_landmarks(landmarks, moving, unit),
+                                          read_landmarks(target_landmarks, fixed, unit))
+        T = align_landmarks(mine, theirs).T_target_source
+    placed = moving.with_vertices(moving.vertices @ T[:3, :3].T + T[:3, 3])
+    found = align_rigid(placed, fixed, config=config)
+    T = found.T_target_source @ T
+    write_mesh(output, moving.with_vertices(moving.vertices @ T[:3, :3].T + T[:3, 3]))
+    return Outcome(output, [
+        Metric("RMS distance", MM * found.rms, "mm"), Metric("converged", str(found.converged)),
+        Metric("T_target_source", np.array2string(T, precision=6).replace("\n", " "))], {"align": config},
+        problem=alignment_problem(moving.vertices, fixed.vertices, found))
+
+
+def correspond(scan: ScanArg, template: Path, output: Output, landmarks: Path | None = None,
+               template_landmarks: Path | None = None, functional: bool = False, unit: Unit | None = None,
+               config: Annotated[CorrelatedConfig, tyro.conf.arg(name="")] = CorrelatedConfig()) -> Outcome:  # noqa: B008
+    """From a few landmarks, or none, to nearly two hundred pairs of places on template and scan.
+
+    Example: scape prep correspond scan.ply --template template.ply --landmarks scan.json -o pairs.json
+
+    Args:
+        scan: Mesh or point cloud.
+        template: Mesh to find on the scan.
+        output: JSON file of vertices of the template, points of the scan in metres, and confidence.
+        landmarks: Landmarks of the scan: three at least, spread over the body; without them the ends of the limbs
+            are looked for.
+        template_landmarks: Landmarks of the template; else the file of its name beside it.
+        functional: By a functional map instead of beliefs; the settings below then do not apply.
+        unit: Unit of the scan and its landmarks.
+        config: Settings; lengths are multiples of the root of the template's area.
+    """
+    body, data = read_mesh(template), read_scan(scan, unit)
+    pairs = _pairs(body, data, template, landmarks, template_landmarks, unit) if landmarks else None
+    with bar("finding correspondences") as progress:
+        found = (find_functional_correspondences(body, data, pairs) if functional else
+                 find_correspondences(body, data, pairs, config, progress))
+    write_correspondences(output, found)
+    return Outcome(output, [
+        Metric("method", found.method), Metric("landmarks", len(pairs[0]) if pairs else 0),
+        Metric("correspondences", len(found)),
+        Metric("confidence, median", float(np.median(found.confidence))),
+        Metric("converged", str(found.converged))], {} if functional else {"correspond": config},
+        problem=None if functional else correspondences_problem(found))
+
+
+def register_one(scan: ScanArg, template: Path, output: Output, landmarks: Path | None = None,
+                 template_landmarks: Path | None = None, correspondences: Path | None = None,
+                 unit: Unit | None = None) -> Outcome:
+    """Bend the template onto one scan.
+
+    Example: scape prep register scan.ply --template template.ply --landmarks scan.json -o registered.ply
+
+    Args:
+        scan: Mesh or point cloud.
+        template: Mesh to bring onto it.
+        output: Mesh to write.
+        landmarks: Landmarks of the scan. With neither these nor correspondences it must be near the template's pose.
+        template_landmarks: Landmarks of the template; else the file of its name beside it.
+        correspondences: File of scape prep correspond; wrong pairs among them do little harm.
+        unit: Unit of the scan and its landmarks.
+    """
+    body, data = read_mesh(template), read_scan(scan, unit)
+    pairs = _pairs(body, data, template, landmarks, template_landmarks, unit) if landmarks else None
+    hints = read_correspondences(correspondences) if correspondences else None
+    with bar("registering") as progress:
+        fit = register(body, data, pairs, progress=progress, correspondences=hints)
+    write_mesh(output, fit.mesh)
+    return Outcome(output, [
+        Metric("distance to the scan, RMS", MM * fit.rms, "mm"),
+        Metric("vertices with data", 100 * float(fit.seen.mean()), "%"),
+        Metric("confidence, mean", float(fit.confidence.mean())),
+        Metric("scan off the template", 100 * fit.missed, "%"),
+        Metric("distance of landmarks, RMS", MM * fit.landmark_rms, "mm"),
+        Metric("flipped triangles", fit.flipped), Metric("converged", str(fit.converged))],
+        problem=registration_problem(body, data, fit, pairs is not None))
+
+
+def _pairs(body: Mesh, data: Mesh | np.ndarray, template: Path, landmarks: Path, template_landmarks: Path | None,
+           unit: Unit | None) -> tuple[np.ndarray, np.ndarray]:
+    """Vertices of the template and points of the scan that carry the same names."""
+    marks = read_landmark_vertices(template_landmarks or landmarks_beside(template), body)
+    found = read_landmarks(landmarks, data if isinstance(data, Mesh) else None, unit)
+    return match_landmarks(marks, found)[1:]

@@ -1,0 +1,121 @@
+"""The surface continued through holes in a volume [Davis]."""
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Annotated
+
+import numpy as np
+from scipy.sparse import coo_array, csc_array, csr_array, diags_array
+
+from ..fusion.tsdf import zero_surface
+from ..geometry.mesh import Mesh
+from ..geometry.seen_space import SeenSpace
+from ..geometry.sparse import factor
+from ..geometry.surface import Surface
+from ..ranges import Positive, Range, Settings
+
+EMPTY_ROUNDS = 6
+
+
+@dataclass(frozen=True)
+class DiffusionConfig(Settings):
+    """Settings of `diffused_surface`.
+
+    Attributes
+    ----------
+    voxels : int
+        Most voxels along the longest side of a hole; they are never finer than the mesh.
+    band : float, voxels
+        How far from the existing surface its distance is known.
+    margin : float, voxels
+        Volume beyond the hole on every side.
+    empty : float, metres
+        Space counts as seen to be empty this far in front of what was seen.
+    """
+
+    voxels: Annotated[int, Range(2, 1000)] = 12
+    band: Positive = 3.0
+    margin: float = 5.0
+    empty: float = 0.01
+
+
+def diffused_surface(mesh: Mesh, rim: np.ndarray, config: DiffusionConfig | None = None,
+                     seen: SeenSpace | None = None) -> Mesh:
+    """The zero level of the signed distance, diffused from the existing surface into the space about holes.
+
+    Near the surface the distance is known. Elsewhere it takes the steady state of diffusion; that of second order,
+    in which the level sets run on in their direction instead of taking the shortest way. Space that was seen to
+    be empty keeps a positive distance.
+
+    Parameters
+    ----------
+    mesh : Mesh
+        With the holes.
+    rim : (n,) int
+        Vertices on their borders.
+    config : DiffusionConfig, optional
+    seen : SeenSpace, optional
+        Lines of sight.
+
+    Returns
+    -------
+    Mesh
+        Existing surface and patches together, as far as the volume reaches; of the size of the voxels.
+
+    [Davis] volumetric diffusion, line-of-sight constraints
+    """
+    config = config or DiffusionConfig()
+    points = mesh.vertices[rim]
+    extent = np.ptp(points, axis=0).max()
+    voxel = max(float(extent) / config.voxels, mesh.mean_edge)
+    low = points.min(axis=0) - config.margin * voxel
+    shape = np.ceil((np.ptp(points, axis=0) + 2 * config.margin * voxel) / voxel).astype(int) + 1
+    grid = low + voxel * np.stack(np.unravel_index(np.arange(np.prod(shape)), shape), axis=1)
+    distance, sure = signed_distance(mesh, grid)
+    known = sure & (np.abs(distance) <= config.band * voxel)
+    operator = _roughness(tuple(shape.tolist()))
+    values = _spread(operator, known, distance)
+    if seen is not None:
+        empty = ~known & (seen.ahead(grid) > max(config.empty, voxel))
+        for _ in range(EMPTY_ROUNDS):
+            wrong = empty & ~known & (values < voxel)
+            if not wrong.any():
+                break
+            known, distance = known | wrong, np.where(wrong, voxel, distance)
+            values = _spread(operator, known, distance)
+    return zero_surface(grid, values, tuple(shape.tolist()))
+
+
+def signed_distance(mesh: Mesh, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Distances (n,) in metres of points from a surface with borders, and (n,) bool where they can be trusted.
+
+    Beyond a border inside and outside are not defined: there the closest point lies on the border.
+    """
+    at = Surface(mesh).closest(points)
+    corners = mesh.faces[at.faces]
+    normal = np.einsum("nc,ncd->nd", at.bary, mesh.vertex_normals[corners])
+    sign = np.where(np.einsum("nd,nd->n", points - at.points, normal) < 0, -1.0, 1.0)
+    border = np.zeros(len(mesh.vertices), dtype=bool)
+    border[mesh.boundary_vertices] = True
+    inner = (at.bary * ~border[corners]).sum(axis=1) > 1e-3
+    return sign * at.distances, inner
+
+
+def _roughness(shape: tuple[int, ...]) -> csr_array:
+    """(N, N) squared Laplacian of a grid whose sides let nothing through."""
+    number = np.arange(np.prod(shape)).reshape(shape)
+    ends = [(number.take(np.arange(size - 1), axis).ravel(), number.take(np.arange(1, size), axis).ravel())
+            for axis, size in enumerate(shape)]
+    a, b = (np.concatenate(side) for side in zip(*ends, strict=True))
+    near = coo_array((np.ones(2 * len(a)), (np.r_[a, b], np.r_[b, a])), shape=(number.size, number.size)).tocsr()
+    laplacian = diags_array(np.asarray(near.sum(axis=1)).ravel()) - near
+    return csr_array(laplacian @ laplacian)
+
+
+def _spread(operator: csr_array, known: np.ndarray, values: np.ndarray) -> np.ndarray:
+    """Values (N,) that are as smooth as possible and keep those that are known."""
+    free, fixed = np.flatnonzero(~known), np.flatnonzero(known)
+    out = np.array(values)
+    rows = operator[free]
+    out[free] = factor(csc_array(rows[:, free]))(-(rows[:, fixed] @ values[fixed]))
+    return out

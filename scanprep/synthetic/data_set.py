@@ -1,0 +1,289 @@
+"""The embedded data set: scans of one subject in many poses and of many subjects, truth kept beside them."""
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, fields
+from functools import lru_cache
+from pathlib import Path
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from ..geometry import storage
+from ..geometry.mesh import Mesh
+from .landmarks import landmarks as landmark_vertices
+from .people import NAMED_POSES, BodyShape, Person, mirrored_pose, named_pose, random_pose
+from .scanner import RangeView, Scan, ScannerConfig, scan
+
+VERSION = 1
+TRUTH, VIEWS = "truth", "views"
+
+
+@dataclass(frozen=True, eq=False)
+class GroundTruth:
+    """What really stood in the scanner; for evaluation, used by no stage.
+
+    Attributes
+    ----------
+    shape : BodyShape
+    pose : (16, 3) float, radians
+    trans : (3,) float, metres
+    vertices : (N, 3) float, metres
+        On the topology shared by all people.
+    faces : (F, 3) int
+    part_of_face : (F,) int
+    joints : (16, 3) float, metres
+        In the pose.
+    """
+
+    shape: BodyShape
+    pose: np.ndarray
+    trans: np.ndarray
+    vertices: np.ndarray
+    faces: np.ndarray
+    part_of_face: np.ndarray
+    joints: np.ndarray
+
+    @property
+    def mesh(self) -> Mesh:
+        """The true surface."""
+        return Mesh(self.vertices, self.faces)
+
+    def save(self, path: str | Path) -> None:
+        """Write as .npz."""
+        arrays = {f.name: getattr(self, f.name) for f in fields(self) if f.name != "shape"}
+        shape = {f.name: getattr(self.shape, f.name) for f in fields(self.shape)}
+        storage.save(path, "ground truth", VERSION, arrays, {"shape": shape})
+
+    @staticmethod
+    def load(path: str | Path) -> GroundTruth:
+        """Read a file of `save`.
+
+        Raises
+        ------
+        StorageError
+            Missing, damaged, or of another kind or version.
+        """
+        header, a = storage.load(path, "ground truth", (VERSION,))
+        with storage.taking_apart(path, "a whole ground truth"):
+            J = len(a["joints"])
+            mesh = Mesh(storage.numbers(a, "vertices", None, 3), storage.numbers(a, "faces", None, 3))
+            part = storage.numbers(a, "part_of_face", len(mesh.faces))
+            if not np.isin(part, np.arange(J)).all():
+                raise ValueError(f"part_of_face: expected parts 0..{J - 1}")
+            return GroundTruth(BodyShape(**header["shape"]), storage.numbers(a, "pose", J, 3),
+                               storage.numbers(a, "trans", 3), a["vertices"], a["faces"], part,
+                               storage.numbers(a, "joints", J, 3))
+
+
+def stand(person: Person, pose: np.ndarray) -> GroundTruth:
+    """A person in a pose with the lowest point on the floor, z = 0."""
+    vertices = person.posed(pose)
+    trans = np.array([0.0, 0.0, -vertices[:, 2].min()])
+    return GroundTruth(person.shape, np.asarray(pose, dtype=np.float64), trans, vertices + trans,
+                       person.mesh.faces,
+                       person.part_of_face, person.posed_joints(pose, trans))
+
+
+def click_landmarks(truth: GroundTruth, rng: np.random.Generator, error: float = 0.003,
+                    seen: np.ndarray | None = None, reach: float = 0.012) -> dict[str, np.ndarray]:
+    """Landmarks as a person would click them on the scan.
+
+    Parameters
+    ----------
+    error : float, metres
+        Standard deviation of every coordinate.
+    seen : (n, 3) float, metres, optional
+        Points of the scan; landmarks without one within `reach` are left out.
+    """
+    names = landmark_vertices()
+    true = {name: truth.vertices[v] for name, v in names.items()}
+    noise = {name: error * rng.normal(size=3) for name in names}
+    if seen is not None:
+        distances, _ = cKDTree(seen).query(np.stack(list(true.values())))
+        true = {name: point for (name, point), d in zip(true.items(), distances, strict=True) if d < reach}
+    return {name: point + noise[name] for name, point in true.items()}
+
+
+def write_scan(folder: str | Path, name: str, scanned: Scan, truth: GroundTruth | None = None,
+               landmarks: dict[str, np.ndarray] | None = None, views: bool = True) -> Path:
+    """Store a scan: `name.ply` with all views' triangles, and beside it what is known.
+
+    Landmarks go to `name.landmarks.json`, the views to `views/name.npz`, the truth to `truth/name.npz`. The
+    PLY is written last, so where it is, the rest is too.
+
+    Returns
+    -------
+    Path of the PLY.
+    """
+    from ..geometry.files import write_mesh
+
+    folder = Path(folder)
+    if truth is not None:
+        truth.save(folder / TRUTH / f"{name}.npz")
+    if views:
+        _write_views(folder / VIEWS / f"{name}.npz", scanned)
+    if landmarks is not None:
+        storage.write_json(folder / f"{name}.landmarks.json",
+                           {key: np.round(point, 6).tolist() for key, point in landmarks.items()})
+    path = folder / f"{name}.ply"
+    with storage.writing(path) as beside:
+        write_mesh(beside, scanned.merged)
+    return path
+
+
+def _write_views(path: Path, scanned: Scan) -> None:
+    arrays = {}
+    for k, view in enumerate(scanned.views):
+        arrays.update({f"points{k}": view.points, f"faces{k}": view.mesh.faces, f"normals{k}": view.normals,
+                       f"T_world_camera{k}": view.T_world_camera, f"depth{k}": view.depth,
+                       f"intrinsics{k}": view.intrinsics})
+    storage.save(path, "range views", VERSION, arrays, {"views": len(scanned.views)})
+
+
+def read_views(path: str | Path) -> list[RangeView]:
+    """The views of one scan, from `views/name.npz`.
+
+    Raises
+    ------
+    StorageError
+        Missing, damaged, or of another kind or version.
+    """
+    header, a = storage.load(path, "range views", (VERSION,))
+    with storage.taking_apart(path, "whole range views"):
+        return [_view(a, k) for k in range(header["views"])]
+
+
+def _view(a: dict[str, np.ndarray], k: int) -> RangeView:
+    mesh = Mesh(storage.numbers(a, f"points{k}", None, 3), storage.numbers(a, f"faces{k}", None, 3))
+    T = storage.numbers(a, f"T_world_camera{k}", 4, 4)
+    return RangeView(mesh, storage.numbers(a, f"normals{k}", len(mesh.vertices), 3), T[:3, 3], T,
+                     storage.numbers(a, f"depth{k}", None, None, finite=False),
+                     storage.numbers(a, f"intrinsics{k}", 3, 3))
+
+
+@dataclass(frozen=True)
+class EmbeddedScan:
+    """One scan of the embedded data set.
+
+    Attributes
+    ----------
+    name : file name without ending
+    subject : "subject" for the one in many poses, else "person00", ...
+    pose : name of the pose
+    sex : "male" or "female"
+    folder : Path
+        Where its files are.
+    """
+
+    name: str
+    subject: str
+    pose: str
+    sex: str
+    folder: Path
+
+    @property
+    def path(self) -> Path:
+        """The mesh of all views."""
+        return self.folder / f"{self.name}.ply"
+
+    @property
+    def landmarks(self) -> Path:
+        return self.folder / f"{self.name}.landmarks.json"
+
+    @property
+    def views(self) -> Path:
+        return self.folder / VIEWS / f"{self.name}.npz"
+
+    @property
+    def truth(self) -> Path:
+        return self.folder / TRUTH / f"{self.name}.npz"
+
+
+SUBJECT = BodyShape(sex=1.0, stature=1.78, weight=-0.3, muscle=0.9, shoulder_width=0.4)
+
+
+def embedded_dataset(folder: str | Path, seed: int = 0, subject_poses: int = 20, subjects: int = 12,
+                     config: ScannerConfig | None = None, click_error: float = 0.003,
+                     progress: Callable[[int, int], None] | None = None) -> list[EmbeddedScan]:
+    """Scan one subject in many poses and many subjects near the rest pose.
+
+    The first scan, `subject_00_rest`, is the one to make the template from. Scans that are there already are
+    kept, and every scan has its own random numbers, so an interrupted run goes on and ends with the same
+    files.
+
+    Parameters
+    ----------
+    folder : path
+    seed : int
+    subject_poses : int
+        Scans of the one subject, the rest pose included.
+    subjects : int
+        Other people, women and men in turn.
+    config : ScannerConfig, optional
+    click_error : float, metres
+        Standard deviation of every coordinate of a landmark.
+    progress : called with (done, total)
+    """
+    plan = embedded_plan(subject_poses, subjects)
+    out = []
+    for done, which in enumerate(plan):
+        out.append(embedded_scan(Path(folder), seed, *which, config or ScannerConfig(), click_error))
+        if progress is not None:
+            progress(done + 1, len(plan))
+    return out
+
+
+def embedded_plan(subject_poses: int, subjects: int) -> list[tuple[int, bool]]:
+    """The scans of a data set: the number of each, and whether it is of the one subject."""
+    return [(k, True) for k in range(subject_poses)] + [(k, False) for k in range(subjects)]
+
+
+@lru_cache(maxsize=1)
+def _person(shape: BodyShape) -> Person:
+    return Person(shape)
+
+
+def embedded_scan(folder: Path, seed: int, k: int, is_pose: bool, config: ScannerConfig, click_error: float = 0.003
+                  ) -> EmbeddedScan:
+    """One scan of `embedded_plan`, made unless its files are there."""
+    rng = np.random.default_rng([seed, int(is_pose), k])
+    if is_pose:
+        label, pose = subject_pose(k, rng)
+        shape, subject, name = SUBJECT, "subject", f"subject_{k:02d}_{label}"
+    else:
+        shape = BodyShape.random(rng, sex=-1.0 if k % 2 == 0 else 1.0)
+        pose, label, subject = near_rest(rng), "rest", f"person{k:02d}"
+        name = f"person_{k:02d}_{'female' if k % 2 == 0 else 'male'}"
+    entry = EmbeddedScan(name, subject, label, "male" if shape.sex > 0 else "female", folder)
+    if not entry.path.exists():
+        truth = stand(_person(shape), pose)
+        scanned = scan(truth.mesh, config, rng)
+        write_scan(folder, name, scanned, truth, click_landmarks(truth, rng, click_error, scanned.merged.vertices))
+    return entry
+
+
+def subject_pose(k: int, rng: np.random.Generator) -> tuple[str, np.ndarray]:
+    """The k-th pose (16, 3) of the subject: rest, then the named poses, then random ones, each a little loosened."""
+    if k == 0:
+        return "rest", np.zeros((16, 3))
+    order = [name for name in NAMED_POSES if name != "rest"]
+    step = 11                                     # spreads kinds of pose evenly over a short list
+    if k <= len(order):
+        name = order[(k * step) % len(order)]
+        loose = 0.08 * rng.normal(size=(16, 3))
+        loose[[0, 5, 8, 11, 14]] *= 0.3
+        loose[[6, 9]] *= 4.5                      # hands and feet held in all ways, or none could tell where they begin
+        loose[[12, 15]] *= 3.0
+        pose = named_pose(name) + loose
+        return name, mirrored_pose(pose) if rng.random() < 0.4 else pose
+    return f"random{k}", random_pose(rng)
+
+
+def near_rest(rng: np.random.Generator) -> np.ndarray:
+    """A pose (16, 3) near rest, as people who are asked to stand still take it."""
+    loose = 0.05 * rng.normal(size=(16, 3))
+    loose[0] *= 0.3
+    loose[[5, 8]] = np.abs(loose[[5, 8]]) * [[-1, 0, -1], [-1, 0, 1]]
+    loose[[11, 14]] = np.abs(loose[[11, 14]]) * [1, 0, 0]
+    return loose

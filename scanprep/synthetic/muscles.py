@@ -1,0 +1,172 @@
+"""Muscles and folds: where the surface rises or sinks, and which angle of which joint makes it do so."""
+from __future__ import annotations
+
+from collections.abc import Callable
+from functools import lru_cache
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from ..geometry import rotations
+from .anatomy import Anatomy
+from .topology import blending, load
+
+Put = Callable[[str, str, float], None]
+
+# name, part, place along the bone (0 joint, 1 end), direction in the bone's (out, front) plane in degrees
+# from the front towards outside, widths along the bone (m) and around it (degrees), height (m)
+LIMB_MUSCLES = (
+    ("biceps", 4, 0.60, 0, 0.055, 55, 0.015), ("triceps", 4, 0.50, 180, 0.065, 55, 0.008),
+    ("elbow_fold", 4, 0.95, 10, 0.022, 45, -0.008), ("olecranon", 4, 1.02, 180, 0.022, 40, 0.008),
+    ("flexors", 5, 0.17, 0, 0.045, 65, 0.009), ("brachioradialis", 5, 0.18, 70, 0.045, 45, 0.005),
+    ("deltoid", 4, 0.20, 90, 0.055, 70, 0.012), ("shoulder_cap", 4, 0.02, 95, 0.032, 60, 0.009),
+    ("quadriceps", 10, 0.55, 0, 0.10, 60, 0.010), ("hamstrings", 10, 0.70, 180, 0.075, 55, 0.016),
+    ("groin", 10, 0.06, 0, 0.035, 70, 0.012), ("knee_cap", 10, 0.985, 0, 0.030, 40, 0.010),
+    ("adductors", 10, 0.22, -90, 0.07, 50, 0.008), ("buttock_fold", 10, 0.14, 180, 0.045, 70, 0.014),
+    ("calf", 11, 0.28, 180, 0.070, 60, 0.012), ("soleus", 11, 0.50, 150, 0.060, 60, 0.005),
+    ("knee_hollow", 11, 0.04, 180, 0.028, 45, 0.008), ("shin", 11, 0.3, 30, 0.07, 40, 0.004),
+    ("instep", 12, 0.10, 0, 0.030, 80, 0.004),
+)
+# name, side (0 middle), front (1) or back (-1), sideways, level of the trunk, widths, height
+TRUNK_MUSCLES = (
+    ("belly", 0, 1, 0.0, 0.30, 0.10, 0.075, 0.022), ("belly_fold", 0, 1, 0.0, 0.36, 0.14, 0.016, -0.012),
+    ("loin", 0, -1, 0.0, 0.28, 0.07, 0.07, 0.010), ("upper_back", 0, -1, 0.0, 0.72, 0.07, 0.10, 0.010),
+    ("pectoral", 1, 1, 0.075, 0.78, 0.050, 0.050, 0.013), ("scapula_in", 1, -1, 0.075, 0.84, 0.030, 0.045, 0.010),
+    ("scapula_out", 1, -1, 0.135, 0.80, 0.028, 0.045, 0.014), ("lat", 1, -1, 0.15, 0.62, 0.045, 0.075, 0.012),
+    ("trapezius", 1, -1, 0.07, 1.07, 0.035, 0.030, 0.012), ("flank", 1, 0, 0.15, 0.30, 0.08, 0.050, 0.016),
+    ("gluteus", 1, -1, 0.080, -0.06, 0.060, 0.060, 0.020), ("gluteus_medius", 1, 0, 0.16, 0.10, 0.06, 0.050,
+                                                            0.010),
+    ("sternomastoid", 1, 1, 0.040, 1.16, 0.014, 0.045, 0.006), ("throat", 0, 1, 0.0, 1.26, 0.03, 0.020, 0.008),
+)
+
+
+def _columns() -> list[tuple[str, str]]:
+    limbs = [(name, side) for name, *_ in LIMB_MUSCLES for side in "lr"]
+    trunk = [(name, side) for name, paired, *_ in TRUNK_MUSCLES for side in ("lr" if paired else "m")]
+    return limbs + trunk
+
+
+COLUMNS = {key: i for i, key in enumerate(_columns())}
+
+
+@lru_cache(maxsize=1)
+def masks() -> np.ndarray:
+    """(N, muscles) rise in metres of every vertex at full action of every muscle."""
+    template = load()
+    v, a = template.mesh.vertices, template.anatomy
+    weights = blending()[0]
+    columns = []
+    for _, part, along, direction, wide, spread, height in LIMB_MUSCLES:
+        left = _limb_mask(v, a, weights, part, along, direction, wide, spread) * height
+        columns += [left, left[template.mirror]]
+    normals = template.mesh.vertex_normals
+    for _, paired, facing, sideways, level, wx, wz, height in TRUNK_MUSCLES:
+        d = (v[:, 0] - sideways) / wx, (v[:, 2] - a.at(level)) / wz
+        mask = np.exp(-0.5 * (d[0]**2 + d[1]**2)) * (1 - weights[:, [5, 6, 8, 9, 11, 14]].sum(axis=1))
+        mask *= np.clip(0.5 - 0.9 * facing * normals[:, 1], 0, 1) if facing else 1
+        columns += [mask * height] + ([mask[template.mirror] * height] if paired else [])
+    return np.stack(columns, axis=1)
+
+
+def _limb_mask(v: np.ndarray, a: Anatomy, weights: np.ndarray, part: int, along: float, direction: float,
+               wide: float, spread: float) -> np.ndarray:
+    axis = a.ends[part] - a.joints[part]
+    length = np.linalg.norm(axis)
+    axis = axis / length
+    frame = {4: a.upper_arm_frame, 5: a.forearm_frame, 10: a.leg_frame, 11: a.leg_frame, 12: a.foot_frame}[part]
+    local = v - a.joints[part]
+    t = local @ axis
+    angle = np.degrees(np.arctan2(local @ frame[0], local @ frame[1]))
+    off = (angle - direction + 180) % 360 - 180
+    near = weights[:, part] + weights[:, part - 1] * (part not in (4, 10))
+    if part in (4, 10):
+        near = near + weights[:, [0, 1, 2]].sum(axis=1) * (v[:, 0] > 0.05)
+    if part in (4, 5, 10, 11):
+        near = near + weights[:, part + 1]
+    return np.exp(-0.5 * (((t - along * length) / wide)**2 + (off / spread)**2)) * np.clip(near, 0, 1)
+
+
+def drivers(anatomy: Anatomy, axes: np.ndarray, relative: np.ndarray) -> np.ndarray:
+    """How far every muscle acts (muscles,) in a pose given by relative rotations (16, 3, 3); zero at rest."""
+    s = anatomy.shape
+    strong = np.clip(1 + 0.35 * s.muscle + 0.15 * (s.sex - 0.0), 0.4, 2.4)
+    soft = np.clip(1 + 0.35 * s.weight, 0.45, 2.2)
+    out = np.zeros(len(COLUMNS))
+
+    def put(name: str, side: str, value: float) -> None:
+        out[COLUMNS[name, side]] += anatomy.scale * value
+
+    for side, sign, arm, leg in (("l", 1, 4, 10), ("r", -1, 7, 13)):
+        _arm_drivers(put, side, sign, axes, relative, arm, strong, soft)
+        _leg_drivers(put, side, sign, axes, relative, leg, strong, soft)
+    spine = relative[1] @ relative[2] @ np.array([0, 0, 1.0])
+    bend, lean = -spine[1], spine[0]
+    put("belly", "m", soft * (0.8 * max(bend, 0) + 0.6 * min(bend, 0)))
+    put("belly_fold", "m", soft * max(bend, 0))
+    put("loin", "m", 0.8 * strong * max(-bend, 0) - 0.3 * max(bend, 0))
+    put("upper_back", "m", 0.6 * max(bend, 0))
+    put("flank", "l", soft * lean)
+    put("flank", "r", -soft * lean)
+    look = relative[3] @ np.array([0, -1.0, 0])
+    put("sternomastoid", "l", -1.2 * look[0])
+    put("sternomastoid", "r", 1.2 * look[0])
+    put("throat", "m", -1.2 * soft * look[2])
+    return out
+
+
+def _bend(axes: np.ndarray, relative: np.ndarray, parent: int, part: int) -> float:
+    """Change of the angle between two bones against rest, radians."""
+    rest = np.arccos(np.clip(axes[parent] @ axes[part], -1, 1))
+    return float(np.arccos(np.clip(axes[parent] @ relative[part] @ axes[part], -1, 1)) - rest)
+
+
+def _arm_drivers(put: Put, side: str, sign: int, axes: np.ndarray, relative: np.ndarray, arm: int, strong: float,
+                 soft: float) -> None:
+    flexion = _bend(axes, relative, arm, arm + 1)
+    f = np.sin(np.clip(flexion, -0.5, 2.6) / 2) * 1.15
+    put("biceps", side, strong * f)
+    put("triceps", side, -0.5 * strong * f)
+    put("elbow_fold", side, max(f, 0))
+    put("olecranon", side, f)
+    put("flexors", side, 0.8 * (0.5 * strong + 0.5 * soft) * f)
+    change = relative[arm] @ axes[arm] - axes[arm]
+    up, fore, across = change[2], -change[1], -sign * change[0]
+    rotvec = rotations.log(relative[arm + 2])
+    put("brachioradialis", side, -0.7 * sign * twist_about(rotvec, axes[arm + 1]) * strong)
+    put("deltoid", side, strong * up / 1.3)
+    put("shoulder_cap", side, up / 1.5)
+    put("pectoral", side, strong * (0.8 * fore + 0.3 * across - 0.45 * up))
+    put("scapula_in", side, -0.8 * up - 0.4 * fore)
+    put("scapula_out", side, 0.8 * up + 0.3 * fore)
+    put("lat", side, strong * 0.7 * up)
+    put("trapezius", side, strong * 0.7 * up)
+
+
+def _leg_drivers(put: Put, side: str, sign: int, axes: np.ndarray, relative: np.ndarray, leg: int, strong: float,
+                 soft: float) -> None:
+    knee = _bend(axes, relative, leg, leg + 1)
+    k = np.sin(np.clip(knee, 0, 2.6) / 2) * 1.15
+    firm = 0.5 * strong + 0.5 * soft
+    put("quadriceps", side, -0.6 * strong * k)
+    put("hamstrings", side, firm * k)
+    put("knee_cap", side, k)
+    put("calf", side, firm * k)
+    put("knee_hollow", side, 0.8 * soft * k)
+    change = relative[leg] @ axes[leg] - axes[leg]
+    fore, out = -change[1], sign * change[0]
+    put("groin", side, soft * max(fore, 0))
+    put("gluteus", side, -1.0 * max(fore, 0) * soft + 0.9 * strong * max(-fore, 0))
+    put("buttock_fold", side, -0.6 * fore)
+    put("gluteus_medius", side, strong * max(out, 0) + 0.6 * max(-out, 0))
+    put("adductors", side, 0.7 * strong * out)
+    point = _bend(axes, relative, leg + 1, leg + 2)
+    put("calf", side, -0.7 * strong * point)
+    put("soleus", side, -strong * point)
+    put("shin", side, strong * max(point, 0))
+    put("instep", side, max(point, 0))
+
+
+def twist_about(rotvec: np.ndarray, axis: np.ndarray) -> float:
+    """The angle of the part of a rotation that turns about an axis (swing-twist)."""
+    q = Rotation.from_rotvec(rotvec).as_quat()
+    return float(2 * np.arctan2(q[:3] @ axis, q[3])) if q[3] >= 0 else float(2 * np.arctan2(-q[:3] @ axis, -q[3]))

@@ -1,0 +1,114 @@
+"""Embedded subjects: procedural people with a known shape, skeleton and pose.
+
+z is up, a person faces -y, stands on z = 0 and has the left side at +x; at rest the arms hang about 36
+degrees away from the body. All people share one closed triangulation, and vertex i is the same anatomical
+place on everybody. Posing is no linear blend skinning: see `people_posing`.
+"""
+from __future__ import annotations
+
+from functools import cached_property
+
+import numpy as np
+
+from ..geometry.mesh import Mesh
+from ..skeleton.tree import Skeleton
+from .anatomy import PARENTS, PARTS, BodyShape
+from .landmarks import landmarks, markers
+from .poses import NAMED_POSES, compose, mirrored_pose, named_pose, random_pose
+from .posing import Poser, part_of_vertex
+from .topology import carry, load
+from .walk import walk
+
+__all__ = ["NAMED_POSES", "PARENTS", "PARTS", "BodyShape", "Person", "compose", "mirrored_pose", "named_pose",
+           "random_pose", "walk"]
+
+
+class Person:
+    """One person: the surface at rest, the skeleton, and the surface in any pose.
+
+    Parameters
+    ----------
+    shape : BodyShape
+
+    Attributes
+    ----------
+    mesh : Mesh
+        At rest.
+    part_of_face : (F,) int
+    part_of_vertex : (N,) int
+    parents : (16,) int
+    joints : (16, 3) float, metres
+        Where every part turns in its parent, at rest; `joints[0]` is the centroid of the vertices of part 0.
+    names : the 16 names of the parts
+    """
+
+    parents = PARENTS
+    names = PARTS
+
+    def __init__(self, shape: BodyShape | None = None) -> None:
+        self.shape = shape or BodyShape()
+        template = load()
+        vertices, self.anatomy = carry(self.shape)
+        self.mesh = Mesh(vertices, template.mesh.faces)
+        self.part_of_face = template.part_of_face
+        self.part_of_vertex = part_of_vertex()
+        self.joints = self.anatomy.joints.copy()
+        self.joints[0] = self.mesh.vertices[self.part_of_vertex == 0].mean(axis=0)
+
+    def __repr__(self) -> str:
+        return f"Person({self.shape})"
+
+    @cached_property
+    def skeleton(self) -> Skeleton:
+        """The true parts, tree and joints."""
+        return Skeleton(self.part_of_face, self.parents, self.joints, self.names)
+
+    @cached_property
+    def _poser(self) -> Poser:
+        return Poser(self.anatomy, self.mesh.vertices, self.joints[0])
+
+    def posed(self, pose: np.ndarray, trans: np.ndarray | None = None) -> np.ndarray:
+        """The vertices in a pose.
+
+        Parameters
+        ----------
+        pose : (16, 3) float, radians
+            Rotation vector of every part against its parent; `pose[0]` turns the body about `joints[0]`.
+        trans : (3,) float, metres, optional
+
+        Returns
+        -------
+        (N, 3) float, metres
+        """
+        pose = _checked(pose)
+        return self._poser(pose) + (0 if trans is None else np.asarray(trans, dtype=np.float64))
+
+    def posed_joints(self, pose: np.ndarray, trans: np.ndarray | None = None) -> np.ndarray:
+        """The joints (16, 3) in a pose, metres; shoulders move in the chest as the arms are raised.
+
+        `posed_joints(pose)[0]` is `joints[0] + trans`.
+        """
+        pose = _checked(pose)
+        joints = self._poser.part_motion(pose)[1] + self._poser.settling(pose)
+        joints[0] = self.joints[0]
+        return joints + (0 if trans is None else np.asarray(trans, dtype=np.float64))
+
+    def part_rotations(self, pose: np.ndarray) -> np.ndarray:
+        """World rotations (16, 3, 3) of the parts in a pose."""
+        return self._poser.part_motion(_checked(pose))[0]
+
+
+def _checked(pose: np.ndarray) -> np.ndarray:
+    pose = np.asarray(pose, dtype=np.float64)
+    if pose.shape != (len(PARTS), 3) or not np.isfinite(pose).all():
+        raise ValueError(f"pose: expected finite rotation vectors ({len(PARTS)}, 3), got shape {pose.shape}")
+    return pose
+
+
+def __getattr__(name: str) -> dict[str, int]:
+    """LANDMARKS and MARKERS, name -> vertex on the shared topology, built when first asked for."""
+    if name == "LANDMARKS":
+        return landmarks()
+    if name == "MARKERS":
+        return markers()
+    raise AttributeError(f"module {__name__!r} has no attribute {name!r}")

@@ -1,0 +1,223 @@
+"""Posing: dual-quaternion blending with twist spread along the limbs, a moving shoulder girdle, muscles that
+bulge with the angles of the joints, and a last pass that gives back detail the blending smeared."""
+from __future__ import annotations
+
+from functools import lru_cache
+
+import numpy as np
+from scipy.spatial.transform import Rotation
+
+from ..geometry import rotations
+from ..geometry.mesh import Mesh
+from .anatomy import PARENTS, Anatomy
+from .muscles import drivers, masks, twist_about
+from .topology import blending, load, neighbour_mean
+
+
+class Poser:
+    """Everything about one person that posing needs.
+
+    Parameters
+    ----------
+    anatomy : Anatomy
+    vertices : (N, 3) float, metres
+        The person at rest on the shared topology.
+    root : (3,) float, metres
+        What part 0 turns about, the centroid of its vertices.
+    """
+
+    def __init__(self, anatomy: Anatomy, vertices: np.ndarray, root: np.ndarray) -> None:
+        template = load()
+        self.anatomy, self.rest, self.root = anatomy, vertices, root
+        self.weights = blending()[1]
+        self.normals = Mesh(vertices, template.mesh.faces).vertex_normals
+        self.main = self.weights.argmax(axis=1)
+        self.joints = anatomy.joints
+        self.axes = anatomy.ends - anatomy.joints
+        self.axes = self.axes / np.linalg.norm(self.axes, axis=1, keepdims=True)
+        smooth = _smoothed(vertices)
+        self._coordinates = np.einsum("nij,ni->nj", _detail_frames(smooth, template.mesh.faces), vertices - smooth)
+        self._root_vertices = np.flatnonzero(part_of_vertex() == 0)
+
+    def part_motion(self, pose: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """World rotations (16, 3, 3) of the parts and the places (16, 3) of their joints."""
+        relative = rotations.exp(pose)
+        shift = self.girdle(relative)
+        R, place = np.empty((16, 3, 3)), np.empty((16, 3))
+        R[0], place[0] = relative[0], self.root + relative[0] @ (self.joints[0] - self.root)
+        for j in range(1, 16):
+            p = PARENTS[j]
+            R[j] = R[p] @ relative[j]
+            place[j] = place[p] + R[p] @ (self.joints[j] - self.joints[p] + shift[j])
+        return R, place
+
+    def girdle(self, relative: np.ndarray) -> np.ndarray:
+        """How far the shoulder joints (16, 3) move in the chest as the arms are raised, metres."""
+        shift = np.zeros((16, 3))
+        for arm, side in ((4, 1), (7, -1)):
+            change = relative[arm] @ self.axes[arm] - self.axes[arm]
+            up, across, fore = change[2], -side * change[0], -change[1]
+            shift[arm] = self.anatomy.scale * np.array([-side * (0.006 * up + 0.006 * across), -0.011 * fore,
+                                                        0.018 * up - 0.002 * abs(across)])
+        return shift
+
+    def __call__(self, pose: np.ndarray) -> np.ndarray:
+        """Vertices (N, 3) in a pose (16, 3), part 0 centred where it was at rest."""
+        x = self._moved(pose)
+        return x + (self.root - x[self._root_vertices].mean(axis=0))
+
+    def settling(self, pose: np.ndarray) -> np.ndarray:
+        """The shift (3,) that brings the centroid of part 0 back to where it was at rest, metres."""
+        return self.root - self._moved(pose)[self._root_vertices].mean(axis=0)
+
+    def _moved(self, pose: np.ndarray) -> np.ndarray:
+        relative = rotations.exp(pose)
+        x = self._bulged(relative)
+        x = self._twisted(x, pose)
+        shift = self.girdle(relative)
+        for arm, field in zip((4, 7), girdle_masks(), strict=True):
+            x = x + (field * self.weights[:, 2])[:, None] * shift[arm]
+        R, place = self.part_motion(pose)
+        x = _dual_quaternion_blend(x, self.weights, self.main, R, place - np.einsum("pij,pj->pi", R, self.joints))
+        smooth = _smoothed(x)
+        mushed = smooth + np.einsum("nij,nj->ni", _detail_frames(smooth, load().mesh.faces), self._coordinates)
+        blend = mush_mask()[:, None]
+        return x + blend * (mushed - x)
+
+    def _bulged(self, relative: np.ndarray) -> np.ndarray:
+        amounts = drivers(self.anatomy, self.axes, relative)
+        return self.rest + (masks() @ amounts)[:, None] * self.normals
+
+    def _twisted(self, x: np.ndarray, pose: np.ndarray) -> np.ndarray:
+        """Turn the skin about the bones, so that a twist spreads along a limb."""
+        for part, share in twist_shares():
+            axis = self.axes[part if part not in (6, 9) else part - 1]
+            twist = twist_about(pose[part], axis)
+            base = self.joints[part]
+            angle = -share * twist
+            near = np.abs(angle) > 1e-9
+            if near.any():
+                turn = Rotation.from_rotvec(angle[near, None] * axis)
+                x = x.copy()
+                x[near] = base + turn.apply(x[near] - base)
+        return x
+
+
+@lru_cache(maxsize=1)
+def part_of_vertex() -> np.ndarray:
+    """(N,) the part of most triangles around each vertex."""
+    template = load()
+    votes = np.zeros((len(template.mesh.vertices), 16), dtype=np.int64)
+    for corner in range(3):
+        np.add.at(votes, (template.mesh.faces[:, corner], template.part_of_face), 1)
+    return votes.argmax(axis=1)
+
+
+@lru_cache(maxsize=1)
+def twist_shares() -> list[tuple[int, np.ndarray]]:
+    """For each part whose twist is spread: how much of it the skin takes back (N,).
+
+    Near the shoulder and the hip the skin lags behind the bone; a turn of the hand is already begun by the
+    forearm.
+    """
+    template = load()
+    v, a = template.mesh.vertices, template.anatomy
+    weights = blending()[1]
+    shares = []
+    for part, reach in ((4, 0.5), (7, 0.5), (10, 0.45), (13, 0.45)):
+        axis = a.ends[part] - a.joints[part]
+        s = (v - a.joints[part]) @ axis / (axis @ axis)
+        chain = weights[:, part]
+        shares.append((part, chain * (1 - _smoothstep(s / reach))))
+    for part in (6, 9):
+        axis = a.joints[part] - a.joints[part - 1]
+        s = (v - a.joints[part - 1]) @ axis / (axis @ axis)
+        chain = weights[:, part - 1]
+        shares.append((part, -chain * _smoothstep((s - 0.15) / 0.85)))
+    return shares
+
+
+@lru_cache(maxsize=1)
+def girdle_masks() -> tuple[np.ndarray, np.ndarray]:
+    """(N,) for the left and the right shoulder: how far the skin of the chest goes with it."""
+    template = load()
+    v, a = template.mesh.vertices, template.anatomy
+    out = []
+    for arm, side in ((4, 1), (7, -1)):
+        d = v - (a.joints[arm] + np.array([-side * 0.02, 0.0, -0.02]))
+        across = _smoothstep((side * v[:, 0]) / 0.10)
+        out.append(across * np.exp(-0.5 * ((d[:, 0] / 0.085)**2 + (d[:, 2] / 0.10)**2)))
+    return out[0], out[1]
+
+
+@lru_cache(maxsize=1)
+def mush_mask() -> np.ndarray:
+    """(N,) where detail is given back after smoothing: near the joints, not on fingers, toes and face."""
+    weights = blending()[1]
+    mixed = 1 - weights.max(axis=1)
+    mask = np.minimum(1, mixed / 0.08)
+    mean = neighbour_mean()
+    for _ in range(4):
+        mask = 0.5 * mask + 0.5 * (mean @ mask)
+    return mask
+
+
+def _smoothstep(x: np.ndarray) -> np.ndarray:
+    x = np.clip(x, 0, 1)
+    return x * x * (3 - 2 * x)
+
+
+def _smoothed(x: np.ndarray, rounds: int = 8) -> np.ndarray:
+    mean = neighbour_mean()
+    for _ in range(rounds):
+        x = 0.4 * x + 0.6 * (mean @ x)
+    return x
+
+
+def _detail_frames(x: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    """Frames (N, 3, 3), columns: normal and two directions that turn with the surface."""
+    normal = Mesh(x, faces).vertex_normals
+    first = _first_neighbour()
+    along = x[first] - x
+    along -= np.einsum("nd,nd->n", along, normal)[:, None] * normal
+    along /= np.maximum(np.linalg.norm(along, axis=1, keepdims=True), 1e-12)
+    return np.stack([normal, along, np.cross(normal, along)], axis=2)
+
+
+@lru_cache(maxsize=1)
+def _first_neighbour() -> np.ndarray:
+    """(N,) one neighbour of every vertex, mirror images for mirror images, on the middle line for its own."""
+    template = load()
+    twin, adjacency = template.mirror, template.mesh.vertex_adjacency
+    owner = np.repeat(np.arange(len(twin)), np.diff(adjacency.indptr))
+    middle = twin == np.arange(len(twin))
+    first = adjacency.indices[adjacency.indptr[:-1]].astype(np.int64)
+    along = middle[owner] & middle[adjacency.indices]
+    first[owner[along]] = adjacency.indices[along]
+    right = template.mesh.vertices[:, 0] < -1e-9
+    first[right] = twin[first[twin[right]]]
+    return first
+
+
+def _dual_quaternion_blend(x: np.ndarray, weights: np.ndarray, main: np.ndarray, R: np.ndarray, t: np.ndarray
+                           ) -> np.ndarray:
+    """Points moved by blends of rigid motions `x -> R x + t` that stay rigid."""
+    real = Rotation.from_matrix(R).as_quat()                           # x, y, z, w
+    real *= np.where(real @ real[0] < 0, -1, 1)[:, None]
+    for p in range(1, len(real)):
+        if real[p] @ real[PARENTS[p]] < 0:
+            real[p] *= -1
+    dual = 0.5 * np.stack([
+        t[:, 0] * real[:, 3] + t[:, 1] * real[:, 2] - t[:, 2] * real[:, 1],
+        -t[:, 0] * real[:, 2] + t[:, 1] * real[:, 3] + t[:, 2] * real[:, 0],
+        t[:, 0] * real[:, 1] - t[:, 1] * real[:, 0] + t[:, 2] * real[:, 3],
+        -(t * real[:, :3]).sum(axis=1)], axis=1)
+    sign = np.where(real[main] @ real.T < 0, -1.0, 1.0)
+    w = weights * sign
+    b, d = w @ real, w @ dual
+    length = np.linalg.norm(b, axis=1, keepdims=True)
+    b, d = b / length, d / length
+    v, s = b[:, :3], b[:, 3:]
+    dv, ds = d[:, :3], d[:, 3:]
+    turned = x + 2 * np.cross(v, np.cross(v, x) + s * x)
+    return turned + 2 * (s * dv - ds * v + np.cross(v, dv))

@@ -1,0 +1,255 @@
+"""The topology that all people share, and how it is carried onto another body."""
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import lru_cache
+from pathlib import Path
+
+import numpy as np
+from scipy.sparse import csr_array, diags_array
+
+from ..geometry import storage
+from ..geometry.mesh import Mesh
+from ..geometry.sparse import factor
+from .anatomy import PARENTS, Anatomy, BodyShape
+from .implicit_surface import Field, project, value_and_gradient
+
+STORED = Path(__file__).with_name("topology.npz")
+CANONICAL = BodyShape(sex=0.0, stature=1.69)
+VERSION = 1
+
+
+@dataclass(frozen=True, eq=False)
+class Template:
+    """The shared triangulation on the canonical body.
+
+    Attributes
+    ----------
+    mesh : Mesh
+    mirror : (N,) int
+        The vertex at the mirrored place.
+    part_of_face : (F,) int
+    anatomy : Anatomy of the canonical body
+    """
+
+    mesh: Mesh
+    mirror: np.ndarray
+    part_of_face: np.ndarray
+    anatomy: Anatomy
+
+
+def sizing(anatomy: Anatomy) -> Callable[[np.ndarray], np.ndarray]:
+    """Wanted edge length in metres at points (n, 3): fine on face, ears, hands and toes."""
+    hand = anatomy.joints[6] + 0.6 * (anatomy.ends[6] - anatomy.joints[6])
+    foot = anatomy.joints[12] + 0.75 * anatomy.width["foot"] * anatomy.foot_frame[2] * [1, 1, 0]
+    foot[2] = 0.01
+    face = anatomy.eye + np.array([0, -0.095, -0.035])
+    ear = anatomy.eye + np.array([0.08, 0.008, -0.01])
+    spots = [(hand, 0.0068, 0.09), (foot, 0.0085, 0.05), (face, 0.0062, 0.05), (anatomy.eye, 0.0110, 0.12),
+             (ear, 0.0055, 0.036)]
+
+    def size(points: np.ndarray) -> np.ndarray:
+        wanted = np.full(len(points), 0.0235)
+        for centre, fine, radius in spots:
+            folded = np.abs(points[:, :1]) if centre[0] > 0 else points[:, :1]
+            d = np.linalg.norm(np.hstack([folded, points[:, 1:]]) - centre, axis=1)
+            wanted = np.minimum(wanted, fine + 0.16 * np.maximum(d - radius, 0))
+        return wanted
+
+    return size
+
+
+def build(step: float = 0.0035) -> Template:
+    """Polygonise and remesh the canonical body from scratch (about two minutes)."""
+    from .triangulation import mirror, polygonise, remesh
+
+    anatomy = Anatomy(CANONICAL)
+    high = np.array([anatomy.ends[6, 0] + 0.08, 0.22, CANONICAL.stature + 0.03])
+    half = polygonise(anatomy.field, np.array([0.0, -0.30, -0.02]), high, step)
+    keep = half.vertex_component[half.faces[:, 0]] == 0
+    half = remesh(half.submesh(keep)[0], anatomy.field, sizing(anatomy))
+    mesh, twin = mirror(half)
+    order = np.lexsort((np.round(mesh.vertices[:, 0], 4), np.round(mesh.vertices[:, 2], 3)))
+    place = np.argsort(order)
+    mesh = Mesh(mesh.vertices[order], place[mesh.faces])
+    return Template(mesh, place[twin[order]], label_faces(mesh, anatomy), anatomy)
+
+
+def store(template: Template, path: Path = STORED) -> None:
+    """Keep a built template beside the code."""
+    storage.save(path, "people template", VERSION, {
+        "vertices": np.round(template.mesh.vertices * 1e5).astype(np.int32),
+        "mirror": template.mirror.astype(np.uint16),
+        "faces": template.mesh.faces.astype(np.uint16)})
+
+
+@lru_cache(maxsize=1)
+def load() -> Template:
+    """The stored template."""
+    _, arrays = storage.load(STORED, "people template", (VERSION,))
+    anatomy = Anatomy(CANONICAL)
+    vertices = arrays["vertices"] / 1e5
+    mirror = arrays["mirror"].astype(np.int64)
+    vertices = project(anatomy.field, vertices, 2)
+    vertices = 0.5 * (vertices + vertices[mirror] * [-1, 1, 1])
+    mesh = Mesh(vertices, arrays["faces"].astype(np.int64))
+    return Template(mesh, mirror, label_faces(mesh, anatomy), anatomy)
+
+
+def label_faces(mesh: Mesh, anatomy: Anatomy) -> np.ndarray:
+    """Part of every triangle (F,): cut by a plane through each joint, across the surface only."""
+    from .body_parts import arm, hand, trunk
+
+    c = mesh.corners.mean(axis=1)
+    j = anatomy.joints
+    part = np.zeros(len(c), dtype=np.int64)
+
+    def beyond(joint: int, normal: np.ndarray) -> np.ndarray:
+        return (c - j[joint]) @ normal > 0
+
+    folded = np.abs(c * [1, 0, 0]) + c * [0, 1, 1]
+    of_arm = np.minimum(arm(anatomy)(folded), hand(anatomy)(folded)) < 0.02
+    of_arm &= trunk(anatomy)[0][0][0](c) > 0.012 * anatomy.scale
+    part[c[:, 2] > j[1, 2]] = 1
+    part[c[:, 2] > j[2, 2]] = 2
+    neck = np.array([0, -0.35, 1.0])
+    part[beyond(3, neck / np.linalg.norm(neck)) & (np.abs(c[:, 0]) < 0.12)] = 3
+    for side, upper, leg in ((1, 4, 10), (-1, 7, 13)):
+        flip = np.array([side, 1, 1])
+        up = flip * anatomy.upper_arm_frame[2]
+        out = up * 0.75 + 0.66 * np.array([side, 0, 0.25])
+        armpit = j[upper] + 0.012 * anatomy.scale * flip * [-1, 0, 0]
+        mine = ((c - armpit) @ out > 0) & (c[:, 0] * side > 0.10 * anatomy.scale) & of_arm
+        fore = up + flip * anatomy.forearm_frame[2]
+        part[mine] = upper
+        part[mine & beyond(upper + 1, fore)] = upper + 1
+        part[mine & beyond(upper + 2, flip * anatomy.forearm_frame[2])] = upper + 2
+        cut = np.array([0.72 * side, -0.0, -1.0])
+        top = j[leg] + np.array([0.0, 0, -0.012 * anatomy.scale])
+        mine = ((c - top) @ cut > 0) & (c[:, 0] * side > 0) & (c[:, 2] < j[0, 2] + 0.02) & (part < 3)
+        part[mine] = leg
+        part[mine & (c[:, 2] < j[leg + 1, 2])] = leg + 1
+        heel = np.array([0, -0.5, -1.0])
+        part[mine & beyond(leg + 2, heel)] = leg + 2
+    return part
+
+
+@lru_cache(maxsize=1)
+def blending() -> tuple[np.ndarray, np.ndarray]:
+    """Smooth part weights (N, 16) on the shared topology: for carrying, and for posing."""
+    template = load()
+    mesh = template.mesh
+    n = len(mesh.vertices)
+    share = np.zeros((n, len(PARENTS)))
+    for corner in range(3):
+        np.add.at(share, (mesh.faces[:, corner], template.part_of_face), mesh.face_areas / 3)
+    share /= share.sum(axis=1, keepdims=True)
+    a, b = mesh.edges.T
+    width = _blend_width(template)
+    results = []
+    for spread in (1.3, 1.0):
+        w = (spread * 0.5 * (width[a] + width[b]) / mesh.edge_lengths)**2 / 6
+        A = csr_array((np.r_[w, w], (np.r_[a, b], np.r_[b, a])), shape=(n, n))
+        solve = factor((diags_array(1 + A.sum(axis=1)) - A).tocsc())
+        weights = solve(solve(share))
+        results.append(weights / weights.sum(axis=1, keepdims=True))
+    return results[0], results[1]
+
+
+def _blend_width(template: Template) -> np.ndarray:
+    """Over how many metres (N,) the motion of one part passes into that of the next."""
+    wide = {1: 0.075, 2: 0.075, 3: 0.040, 4: 0.052, 5: 0.030, 6: 0.020, 10: 0.060, 11: 0.034, 12: 0.020}
+    v = np.abs(template.mesh.vertices * [1, 0, 0]) + template.mesh.vertices * [0, 1, 1]
+    d = np.stack([np.linalg.norm(v - template.anatomy.joints[j], axis=1) for j in wide], axis=1)
+    near = np.exp(-0.5 * ((d - d.min(axis=1, keepdims=True)) / 0.04)**2)
+    return near @ np.array(list(wide.values())) / near.sum(axis=1)
+
+
+@lru_cache(maxsize=1)
+def neighbour_mean() -> csr_array:
+    """(N, N) the mean of a vertex's neighbours."""
+    A = load().mesh.vertex_adjacency
+    return csr_array(diags_array(1 / A.sum(axis=1)) @ A)
+
+
+def frames(anatomy: Anatomy) -> np.ndarray:
+    """(16, 3, 3) affine frames of the bones: columns across (2) and along, lengths included."""
+    g = anatomy.scale
+    out = np.zeros((16, 3, 3))
+    along = anatomy.ends - anatomy.joints
+    for p in range(16):
+        z = along[p]
+        front = np.array([0, -1.0, 0]) if p not in (12, 15) else np.array([0, 0, 1.0])
+        length = np.linalg.norm(z)
+        y = front - (front @ z) * z / length**2
+        y /= np.linalg.norm(y)
+        x = np.cross(y, z / length)
+        thick = anatomy.head_scale if p == 3 else anatomy.width["hand"] / 0.19 if p in (6, 9) else \
+            anatomy.width["foot"] / 0.26 if p in (12, 15) else g
+        if p in (0, 1, 2):
+            thick = anatomy.joints[4, 0] / 0.176
+        out[p] = np.stack([x * thick, y * thick, z], axis=1)
+    return out
+
+
+def carry(shape: BodyShape, stages: int = 3) -> tuple[np.ndarray, Anatomy]:
+    """The template's vertices (N, 3) on the body of another shape, metres, and that body's anatomy.
+
+    Moved with the skeleton, projected on the implicit surface and evened out in it, in a few stages from
+    the canonical body to the wanted one.
+    """
+    template = load()
+    weights, _ = blending()
+    at, goal = CANONICAL.array(), shape.array()
+    before, vertices = template.anatomy, template.mesh.vertices
+    x0 = template.mesh.vertices
+    mean = neighbour_mean()
+    offset = x0 - mean @ x0
+    for stage in range(1, stages + 1):
+        now = Anatomy(BodyShape.from_array(at + (goal - at) * stage / stages))
+        change = frames(now) @ np.linalg.inv(frames(before))
+        shift = now.joints - np.einsum("pij,pj->pi", change, before.joints)
+        blend = np.einsum("np,pij->nij", weights, change)
+        vertices = np.einsum("nij,nj->ni", blend, vertices) + weights @ shift
+        total = frames(now) @ np.linalg.inv(frames(template.anatomy))
+        wanted = np.einsum("np,pij,nj->ni", weights, total, offset)
+        gradient = None
+        for _ in range(2):
+            vertices, gradient = _settle(now.field, vertices, wanted, gradient)
+        before = now
+    value, gradient = _symmetric(now.field, vertices)
+    step = np.clip(value / np.maximum((gradient**2).sum(axis=1), 0.1), -0.005, 0.005)
+    vertices = vertices - step[:, None] * gradient
+    return 0.5 * (vertices + vertices[template.mirror] * [-1, 1, 1]), now
+
+
+def _symmetric(field: Field, vertices: np.ndarray, gradient: np.ndarray | None = None
+               ) -> tuple[np.ndarray, np.ndarray]:
+    """Field (N,) and gradient (N, 3), worked out on the left half; a known gradient is kept."""
+    twin = load().mirror
+    left = np.flatnonzero(load().mesh.vertices[:, 0] >= -1e-9)
+    value = np.empty(len(vertices))
+    if gradient is None:
+        gradient = np.empty_like(vertices)
+        value[left], gradient[left] = value_and_gradient(field, vertices[left])
+        gradient[twin[left]] = gradient[left] * [-1, 1, 1]
+    else:
+        value[left] = field(vertices[left])
+    value[twin[left]] = value[left]
+    return value, gradient
+
+
+def _settle(field: Field, vertices: np.ndarray, wanted: np.ndarray, gradient: np.ndarray | None
+            ) -> tuple[np.ndarray, np.ndarray]:
+    """One Newton step onto the surface, then tangential steps towards the canonical neighbourhoods."""
+    value, gradient = _symmetric(field, vertices, gradient)
+    length = np.sqrt(np.maximum((gradient**2).sum(axis=1), 0.05))
+    normal = gradient / length[:, None]
+    vertices = vertices - np.clip(value / length, -0.03, 0.03)[:, None] * normal
+    mean = neighbour_mean()
+    for _ in range(6):
+        step = mean @ vertices + wanted - vertices
+        step -= np.einsum("nd,nd->n", step, normal)[:, None] * normal
+        vertices = vertices + 0.5 * step
+    return vertices, gradient
