@@ -10,7 +10,6 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import numpy as np
 import tyro
 
-from .batch.pool import Workers
 from .console import Metric, dispatch
 
 if TYPE_CHECKING:               # imported where they are used: this module must answer --help at once
@@ -21,7 +20,6 @@ ScanArg = Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="SCAN")]
 MeshArg = Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="MESH")]
 SetArg = Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="SET")]
 Output = Annotated[Path, tyro.conf.arg(aliases=["-o"])]
-WorkersArg = Annotated[Workers, tyro.conf.arg(name="")]
 MM = 1000.0
 
 COMMANDS = {

@@ -4,6 +4,7 @@ Together with the `cli.py` files this is the only place that writes to the termi
 """
 from __future__ import annotations
 
+import argparse
 import contextlib
 import dataclasses
 import importlib
@@ -22,7 +23,7 @@ from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
-from . import ranges
+from . import config_files, ranges
 from .threads import one_thread
 
 if TYPE_CHECKING:               # imported where it is used: help answers at once
@@ -31,7 +32,12 @@ if TYPE_CHECKING:               # imported where it is used: help answers at onc
 Progress = Callable[[int, int], None]
 
 OUTPUTS, SPACE, FORCE = ("output", "out"), "space", "force"     # parameters of commands that are dealt with here
-FORCE_HELP = "\n    force: Do all anew, whatever is done already.\n"
+FORCE_HELP = "\n    force: Do all anew, whatever is done already."
+CONFIG_HELP = """
+    config: TOML file with settings that have no flag.
+    write_config: Print such a file, with the values in force and what each setting means, and do nothing else."""
+PRESET_HELP = "\n    preset: Where settings begin: ours, or the values of the paper."
+WRITE_CONFIG = "--write-config"
 TRACEBACK = "SCAPEKIT_TRACEBACK"       # environment variable that shows where an error came from
 LIBRARIES = ("scapekit", "numpy", "scipy", "libigl", "cholespy", "embreex")
 
@@ -195,6 +201,9 @@ def run(function: Callable[..., Outcome], prog: str, argv: list[str]) -> int:
     start, wrong, call = time.perf_counter(), 2, None
     with _notes(prog), one_thread():
         try:
+            if (text := settings_file(function, argv)) is not None:
+                sys.stdout.write(text + "\n")
+                return 0
             call = _Call(function, prog, argv)
             wrong = 1
             outcome, report = call.carried_out(start)
@@ -219,6 +228,63 @@ def run(function: Callable[..., Outcome], prog: str, argv: list[str]) -> int:
     return 1 if outcome.failures or outcome.problem else 0
 
 
+def settings_file(function: Callable[..., Outcome], argv: list[str]) -> str | None:
+    """The file of settings that `--write-config` asks for, or None where it does not."""
+    found = {p.name: p.default for p in inspect.signature(function).parameters.values()
+             if isinstance(p.default, ranges.Settings)}
+    return config_files.write(_Settings(found, argv).values) if found and WRITE_CONFIG in argv else None
+
+
+class _Settings:
+    """The settings of a command: marked fields are flags, all others come from a file."""
+
+    def __init__(self, values: dict[str, ranges.Settings], argv: list[str]) -> None:
+        early = argparse.ArgumentParser(add_help=False, allow_abbrev=False, exit_on_error=False)
+        early.add_argument("--config", type=Path)
+        early.add_argument("--preset", default="default")
+        self.presets = any(hasattr(value, "published") for value in values.values())
+        self.values = values
+        if not values or {"-h", "--help"} & {*argv}:
+            return
+        with contextlib.suppress(argparse.ArgumentError):               # said by the parser of the whole line
+            given = early.parse_known_args(argv)[0]
+            if self.presets and given.preset == "published":
+                self.values = {name: getattr(value, "published", lambda value=value: value)()
+                               for name, value in values.items()}
+            if given.config is not None:
+                self.values = config_files.read(given.config, self.values)
+
+    def parameters(self) -> list[inspect.Parameter]:
+        """The flags of the command line."""
+        def keyword(name: str, default: Any, annotation: Any) -> inspect.Parameter:
+            return inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=annotation)
+
+        if not self.values:
+            return []
+        shown = [keyword(name, flag.value, flag.annotation) for name, flag in config_files.flags(self.values).items()]
+        if self.presets:
+            shown.append(keyword("preset", "default", typing.Literal["default", "published"]))
+        return [*shown, keyword("config", None, Path | None), keyword("write_config", False, bool)]
+
+    def help(self) -> str:
+        """What the docstring of the command says of them."""
+        if not self.values:
+            return ""
+        told = "".join(f"\n    {name}: {flag.sentence}" for name, flag in config_files.flags(self.values).items())
+        return told + (PRESET_HELP if self.presets else "") + CONFIG_HELP
+
+    def taken_from(self, given: dict[str, Any]) -> dict[str, Any]:
+        """The arguments of the command's function: settings in place of flags."""
+        values = dict(self.values)
+        for name, flag in (config_files.flags(values) if values else {}).items():
+            first, *rest = flag.path
+            values[first] = config_files.replaced(values[first], tuple(rest), given.pop(name))
+        for name in ("preset", "config", "write_config"):
+            if values:
+                given.pop(name, None)
+        return {**given, **values}
+
+
 class _Call:
     """A function with what the command line gives it."""
 
@@ -229,13 +295,15 @@ class _Call:
         hints = typing.get_type_hints(function, include_extras=True)
         parameters = inspect.signature(function).parameters.values()
         self.wants_space = any(p.name == SPACE for p in parameters)
-        shown = [p.replace(annotation=hints[p.name]) for p in parameters if p.name != SPACE]
+        self.settings = _Settings({p.name: p.default for p in parameters if isinstance(p.default, ranges.Settings)},
+                                  argv)
+        shown = [p.replace(annotation=hints[p.name]) for p in parameters
+                 if p.name != SPACE and p.name not in self.settings.values]
         self.output_name = next((p.name for p in shown if p.name in OUTPUTS), None)
         self.beside = self.wants_space and typing.get_origin(hints[SPACE]) is not None      # Annotated: FileWorkspace
+        shown = [*shown, *self.settings.parameters()]
         if self.output_name is not None:
-            force = inspect.Parameter(FORCE, inspect.Parameter.KEYWORD_ONLY, default=False, annotation=bool)
-            shown.append(force)
-
+            shown.append(inspect.Parameter(FORCE, inspect.Parameter.KEYWORD_ONLY, default=False, annotation=bool))
         signature = inspect.Signature(shown)
 
         def collect(*args: Any, **named: Any) -> dict[str, Any]:
@@ -243,10 +311,12 @@ class _Call:
             given.apply_defaults()
             return given.arguments
 
-        collect.__doc__ = (inspect.getdoc(function) or "") + (FORCE_HELP if self.output_name else "")
+        collect.__doc__ = (inspect.getdoc(function) or "") + self.settings.help() + (
+            FORCE_HELP if self.output_name else "")
         collect.__annotations__ = {p.name: p.annotation for p in shown}
         collect.__signature__ = signature                            # type: ignore[attr-defined]
-        self.given: dict[str, Any] = ranges.read(collect, lambda read: tyro.cli(read, args=argv, prog=prog))()
+        self.given = self.settings.taken_from(
+            ranges.read(collect, lambda read: tyro.cli(read, args=argv, prog=prog))())
         self.force = self.given.pop(FORCE, False)
         self.output: Path | None = self.given.get(self.output_name or "")
         self._staged: Path | None = None

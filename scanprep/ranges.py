@@ -15,6 +15,7 @@ import numpy as np
 
 Result = TypeVar("Result")
 
+FLAG = "flag"                           # marks a field of settings that is a flag of the command line too
 TINY, LARGE = 1e-12, 1e9                # nearer to 0, or larger, is no setting of anything: their squares overflow
 
 
@@ -61,6 +62,7 @@ Seed = Annotated[int, Range(0, 2**32 - 1)]
 Processes = Annotated[int, Range(0, 1000)]
 
 
+@dataclasses.dataclass(frozen=True)
 class Settings:
     """Base of settings: a frozen dataclass whose numbers are in their ranges, or it is not made."""
 
@@ -114,14 +116,14 @@ def ranges(owner: Any) -> dict[str, tuple[Range, bool]]:
     """Of every argument of a function or field of settings: its range, and whether flags leave its name out."""
     found = {}
     for name, annotation in get_type_hints(owner, include_extras=True).items():
-        marks = list(_marks(annotation))
-        found[name] = (next((m for m in marks if isinstance(m, Range)), NOT_NEGATIVE),
-                       any(getattr(m, "name", None) == "" for m in marks))
+        told = list(marks(annotation))
+        found[name] = (next((m for m in told if isinstance(m, Range)), NOT_NEGATIVE),
+                       any(getattr(m, "name", None) == "" for m in told))
     return found
 
 
-def _marks(annotation: Any) -> Iterator[Any]:
+def marks(annotation: Any) -> Iterator[Any]:
     """What stands beside the types in an annotation, at any depth."""
     yield from getattr(annotation, "__metadata__", ())
     for part in get_args(annotation):
-        yield from _marks(part)
+        yield from marks(part)

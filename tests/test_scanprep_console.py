@@ -2,20 +2,22 @@
 import dataclasses
 import json
 from pathlib import Path
+from typing import Annotated
 
 import numpy as np
 import pytest
 
 from scanprep import console
 from scanprep.console import Metric, Outcome
+from scanprep.ranges import FLAG, Settings
 
 
 @dataclasses.dataclass(frozen=True)
-class Settings:
-    weight: float = 0.5
+class Choices(Settings):
+    weight: Annotated[float, FLAG] = 0.5
 
 
-def work(out: Path, times: int = 2, settings: Settings = Settings()) -> Outcome:
+def work(out: Path, times: int = 2, settings: Choices = Choices()) -> Outcome:
     """Do the work."""
     if times > 99:
         raise ValueError(f"times: expected a count,\n got {times}")
@@ -26,7 +28,7 @@ def work(out: Path, times: int = 2, settings: Settings = Settings()) -> Outcome:
 
 def test_done(tmp_path, capsys):
     out = tmp_path / "a.txt"
-    assert console.run(work, "scape work", ["--out", str(out), "--settings.weight", "0.25"]) == 0
+    assert console.run(work, "scape work", ["--out", str(out), "--weight", "0.25"]) == 0
     assert "0.00123" in capsys.readouterr().out
     report = json.loads((tmp_path / "a.report.json").read_text())
     assert report["settings"]["settings"] == {"weight": 0.25}
@@ -60,6 +62,6 @@ def test_help_imports_nothing(capsys):
 
 
 def test_plain_survives_json():
-    value = {"a": np.float64(1.5), "b": np.arange(3), "c": Settings(), "d": (Path("x"), None)}
+    value = {"a": np.float64(1.5), "b": np.arange(3), "c": Choices(), "d": (Path("x"), None)}
     assert json.loads(json.dumps(console.plain(value))) == {
         "a": 1.5, "b": [0, 1, 2], "c": {"weight": 0.5}, "d": ["x", None]}

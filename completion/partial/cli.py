@@ -12,7 +12,7 @@ from model.cli import read_subject
 from model.linear import Subject
 from scanprep.batch.pool import Workers
 from scanprep.batch.workspace import Task, Workspace
-from scanprep.cli import Output, Unit, WorkersArg
+from scanprep.cli import Output, Unit
 from scanprep.console import Outcome, bar, failures_of, problem_of, say
 from scanprep.geometry.landmarks import read_landmark_vertices
 from scanprep.pipeline.scans import LANDMARK_ENDINGS
@@ -29,8 +29,8 @@ ScansArg = Annotated[tyro.conf.Positional[tuple[Path, ...]], tyro.conf.arg(metav
 def complete_scan(scans: ScansArg, output: Output, model: ModelOrNone = None, landmarks: Path | None = None,
                   subject: str | None = None, template_landmarks: Path | None = None, mask: tuple[Path, ...] = (),
                   unit: Unit | None = None, fill_colors: bool = False,
-                  config: Annotated[CompletionConfig, tyro.conf.arg(name="")] = CompletionConfig(),  # noqa: B008
-                  workers: WorkersArg = Workers(), *, space: Workspace) -> Outcome:                 # noqa: B008
+                  config: CompletionConfig = CompletionConfig(),  # noqa: B008
+                  workers: Workers = Workers(), *, space: Workspace) -> Outcome:                 # noqa: B008
     """The whole body from a scan of some of it.
 
     Several scans are views of one body in one frame. A folder is completed scan by scan, each into a folder of its

@@ -30,7 +30,7 @@ FramesArg = Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="FRAMES"
 def track_frames(frames: FramesArg, output: Output, model: ModelOrNone = None, rate: Positive = 30.0,
                  cameras: str | None = None, landmarks: Path | None = None, subject: str | None = None,
                  template_landmarks: Path | None = None, unit: Unit | None = None, surfaces: bool = False,
-                 keys: Count = 120, config: Annotated[TrackConfig, tyro.conf.arg(name="")] = TrackConfig(),  # noqa: B008
+                 keys: Count = 120, config: TrackConfig = TrackConfig(),  # noqa: B008
                  *, space: Workspace) -> Outcome:
     """The motion of a person from frames of points, without markers.
 

@@ -12,7 +12,7 @@ import tyro
 
 from scanprep.batch.pool import Workers
 from scanprep.batch.workspace import Workspace
-from scanprep.cli import Output, Unit, WorkersArg
+from scanprep.cli import Output, Unit
 from scanprep.console import Metric, Outcome, bar
 from scanprep.dataset import RegisteredSet, SetEntry, write_set
 from scanprep.geometry.files import write_mesh
@@ -39,7 +39,7 @@ ScansArg = Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="SCANS")]
 
 def coregister_scans(model: ModelArg, scans: ScansArg, output: Output, landmarks: Path | None = None,
                      first: Path | None = None, subject: str = OWN, unit: Unit | None = None,
-                     rounds: Count = CoregistrationConfig.rounds, workers: WorkersArg = Workers(),  # noqa: B008
+                     rounds: Count = CoregistrationConfig.rounds, workers: Workers = Workers(),  # noqa: B008
                      failed: Share = CoregistrationConfig.failed, *, space: Workspace) -> Outcome:
     """Register every scan of a folder with a model as prior, learn the model again, and so on until it settles.
 

@@ -7,10 +7,9 @@ import logging
 import re
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Annotated, Literal
+from typing import Literal
 
 import numpy as np
-import tyro
 
 from scanprep.batch.opening import FileWorkspace
 from scanprep.batch.steps import KeptSteps, inside
@@ -60,8 +59,8 @@ def learn(poses: Path, output: Output, shapes: Path | None = None, template: Pat
           skeleton: Path | None = None, landmarks: Path | None = None, subject: str | None = None,
           unit: Unit | None = None, parts: Count | None = None, kind: Kind = "scape", mixed: bool = False,
           by_sex: bool = False, sexes: Path | None = None, pictures: bool = True,
-          config: Annotated[LearnConfig, tyro.conf.arg(name="")] = LearnConfig(),  # noqa: B008
-          other: Annotated[Other, tyro.conf.arg(name="")] = Other(), *, space: FileWorkspace) -> Outcome:
+          config: LearnConfig = LearnConfig(),  # noqa: B008
+          other: Other = Other(), *, space: FileWorkspace) -> Outcome:
     """Learn a body model from one person in many poses and many people in about one pose, or from a mix.
 
     Killed and started again it goes on where it was; what does not depend on a change is not learned again.

@@ -28,7 +28,7 @@ BodyArg = Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="BODY")]
 
 
 def repose(model: ModelArg, body: BodyArg, poses: Path, output: Output, unit: Unit | None = None,
-           config: Annotated[TransferConfig, tyro.conf.arg(name="")] = TransferConfig()) -> Outcome:  # noqa: B008
+           config: TransferConfig = TransferConfig()) -> Outcome:  # noqa: B008
     """Put one registered body, with all its detail, into the poses of a motion.
 
     Example: scape model repose model.npz man.ply --poses walk/motion.npz -o walking
@@ -60,7 +60,7 @@ def repose(model: ModelArg, body: BodyArg, poses: Path, output: Output, unit: Un
 def character(mesh: CharacterArg, model: Annotated[Path, tyro.conf.arg(aliases=["-m"])], output: Output,
               landmarks: Path | None = None, template_landmarks: Path | None = None, unit: Unit | None = None,
               pictures: bool = True,
-              config: Annotated[CharacterMeshConfig, tyro.conf.arg(name="")] = CharacterMeshConfig()  # noqa: B008
+              config: CharacterMeshConfig = CharacterMeshConfig()  # noqa: B008
               ) -> Outcome:
     """A character of any triangles as the mean of a model: it moves as people do, betas are offsets from it.
 

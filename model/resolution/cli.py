@@ -2,10 +2,8 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
 
 import numpy as np
-import tyro
 
 from scanprep.cli import Output, Unit
 from scanprep.console import Metric, Outcome, bar
@@ -22,7 +20,7 @@ MEASURED = 20                        # poses in which the two models are compare
 
 
 def resample_model(model: ModelArg, output: Output, template: Path | None = None, vertices: Faces | None = None,
-                   unit: Unit | None = None, config: Annotated[ResolutionConfig, tyro.conf.arg(name="")]
+                   unit: Unit | None = None, config: ResolutionConfig
                    = ResolutionConfig()) -> Outcome:  # noqa: B008
     """Carry a model to fewer or more triangles; poses, betas and places keep their meaning.
 

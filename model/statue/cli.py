@@ -10,7 +10,7 @@ import tyro
 
 from scanprep.batch.pool import Workers
 from scanprep.batch.workspace import Task, Workspace
-from scanprep.cli import MM, Output, ScanArg, Unit, WorkersArg
+from scanprep.cli import MM, Output, ScanArg, Unit
 from scanprep.console import Metric, Outcome, Progress, bar, dispatch, failures_of, problem_of
 from scanprep.geometry.files import read_mesh, write_mesh
 from scanprep.pictures.animation import write_animated_glb, write_gif
@@ -57,7 +57,7 @@ def group(argv: list[str]) -> int:
 
 def fit(scan: ScanArg, output: Output, features: Path | None = None, control: Path | None = None,
         unit: Unit | None = None, size: Pixels = 2048, vectors: bool = False,
-        workers: WorkersArg = Workers(), *, space: Workspace) -> Outcome:                            # noqa: B008
+        workers: Workers = Workers(), *, space: Workspace) -> Outcome:                            # noqa: B008
     """A scan of one person becomes a statue: a control model that moves, with the detail of the scan as an image.
 
     A person who stands upright is found by itself. For other poses and other bodies, name joint centres and points of

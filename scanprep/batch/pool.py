@@ -8,9 +8,9 @@ import time
 import warnings
 from collections.abc import Generator, Iterator, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Annotated, Any
 
-from ..ranges import Processes, Settings
+from ..ranges import FLAG, Processes, Settings
 from ..threads import begin_worker
 from .room import Failure, Job, Progress, attempt
 
@@ -21,7 +21,7 @@ WATCH = 0.2                    # seconds between two looks whether the process t
 class Workers(Settings):
     """Who does the work.
 
-    Parameters
+    Attributes
     ----------
     workers : int
         Processes on this machine; 0 for one a core.
@@ -31,9 +31,9 @@ class Workers(Settings):
         Send the files of each task to those workers, which otherwise read them under the same path.
     """
 
-    workers: Processes = 0
-    scheduler: str | None = None
-    ship: bool = False
+    workers: Annotated[Processes, FLAG] = 0
+    scheduler: Annotated[str | None, FLAG] = None
+    ship: Annotated[bool, FLAG] = False
 
 
 def run_jobs(work: Any, jobs: Sequence[Job], workers: Workers, inside: Progress | None = None

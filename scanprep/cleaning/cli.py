@@ -49,7 +49,7 @@ def template_of_views(views: ViewsArg, output: Output, cameras: Path | None = No
 
 
 def clean(scan: ScanArg, output: Output, landmarks: Path | None = None, unit: Unit | None = None,
-          config: Annotated[CleanScanConfig, tyro.conf.arg(name="")] = CleanScanConfig()) -> Outcome:  # noqa: B008
+          config: CleanScanConfig = CleanScanConfig()) -> Outcome:  # noqa: B008
     """Keep the body of a raw scan; floor, furniture and specks go.
 
     Example: scape prep clean raw.ply -o body.ply
@@ -77,7 +77,7 @@ def clean(scan: ScanArg, output: Output, landmarks: Path | None = None, unit: Un
 
 def align_cameras(views: ViewsArg, output: Output, cameras: Path | None = None, landmarks: Path | None = None,
                   features: bool = False, unit: Unit | None = None,
-                  config: Annotated[AlignViewsConfig, tyro.conf.arg(name="")] = AlignViewsConfig()  # noqa: B008
+                  config: AlignViewsConfig = AlignViewsConfig()  # noqa: B008
                   ) -> Outcome:
     """Bring range views into one frame, all of them together.
 
@@ -121,7 +121,7 @@ def _view_landmarks(folder: Path, name: str, view: Mesh, unit: Unit | None) -> d
 
 
 def merge(views: ViewsArg, output: Output, cameras: Path | None = None, unit: Unit | None = None,
-          config: Annotated[MergeConfig, tyro.conf.arg(name="")] = MergeConfig()) -> Outcome:  # noqa: B008
+          config: MergeConfig = MergeConfig()) -> Outcome:  # noqa: B008
     """Merge range views into one surface, open where nothing was seen.
 
     Example: scape prep merge views -o body.ply
@@ -142,7 +142,7 @@ def merge(views: ViewsArg, output: Output, cameras: Path | None = None, unit: Un
 
 def fill(mesh: MeshArg, output: Output, views: Path | None = None, cameras: Path | None = None,
          unit: Unit | None = None,
-         config: Annotated[FillConfig, tyro.conf.arg(name="")] = FillConfig()) -> Outcome:  # noqa: B008
+         config: FillConfig = FillConfig()) -> Outcome:  # noqa: B008
     """Close the holes of a mesh; what was there stays as it was.
 
     Example: scape prep fill body.ply -o closed.ply
@@ -173,7 +173,7 @@ def fill(mesh: MeshArg, output: Output, views: Path | None = None, cameras: Path
 
 
 def reduce(mesh: MeshArg, output: Output, faces: Faces, landmarks: Path | None = None, unit: Unit | None = None,
-           config: Annotated[DecimateConfig, tyro.conf.arg(name="")] = DecimateConfig()) -> Outcome:  # noqa: B008
+           config: DecimateConfig = DecimateConfig()) -> Outcome:  # noqa: B008
     """Fewer triangles for the same surface.
 
     Example: scape prep decimate closed.ply --faces 14000 -o template.ply
@@ -195,7 +195,7 @@ def reduce(mesh: MeshArg, output: Output, faces: Faces, landmarks: Path | None =
 
 
 def reduce_set(registered: SetArg, output: Output, faces: Faces,
-               config: Annotated[DecimateSetConfig, tyro.conf.arg(name="")] = DecimateSetConfig()  # noqa: B008
+               config: DecimateSetConfig = DecimateSetConfig()  # noqa: B008
                ) -> Outcome:
     """A registered set in fewer triangles: template, meshes, skeleton and landmarks stay in step.
 

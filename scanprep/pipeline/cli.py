@@ -13,7 +13,7 @@ from ..batch.opening import workspace
 from ..batch.pool import Workers
 from ..batch.workspace import Workspace
 from ..cleaning.clean_scan import CleanScanConfig
-from ..cli import MM, Output, SetArg, Unit, WorkersArg, landmarks_beside
+from ..cli import MM, Output, SetArg, Unit, landmarks_beside
 from ..console import Metric, Outcome, bar, say
 from ..geometry.files import read_mesh
 from ..geometry.landmarks import read_landmark_vertices
@@ -33,7 +33,7 @@ LISTED = 5                    # scans that the closing table names
 def run_all(scans: ScansArg, template: Path, output: Output, landmarks: Path | None = None,
             template_landmarks: Path | None = None, guide: Guide = "best", clean: bool = False,
             subject: str = "", unit: Unit | None = None, min_poses: Count = PrepareConfig.min_poses,
-            workers: WorkersArg = Workers(), *, space: Workspace) -> Outcome:                # noqa: B008
+            workers: Workers = Workers(), *, space: Workspace) -> Outcome:                # noqa: B008
     """Register a template to every scan of a folder, find the skeleton, and write a page of all scans, worst first.
 
     Killed and started again it goes on where it was; scans whose files have changed are registered anew.
@@ -65,7 +65,7 @@ def run_all(scans: ScansArg, template: Path, output: Output, landmarks: Path | N
                             Metric("unit assumed", unit or "m")], {"prepare": config}, list(done.failures))
 
 
-def page(registered: SetArg, limits: Annotated[Limits, tyro.conf.arg(name="")] = Limits()) -> Outcome:  # noqa: B008
+def page(registered: SetArg, limits: Limits = Limits()) -> Outcome:  # noqa: B008
     """Write the page of a registered set again, with other limits for what needs a look.
 
     Example: scape prep page set --missed 0.05

@@ -3,10 +3,11 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 
-from ..ranges import Settings
+from ..ranges import FLAG, Settings
 from .figures import Failure, ScanFigures
 
 
@@ -36,13 +37,13 @@ class Limits(Settings):
         that alone.
     """
 
-    missed: float = 0.005
-    distance: float = 0.002
-    unseen: float = 0.15
-    stretch: float = 0.02
-    flipped: float = 0.001
-    landmarks: float = 0.015
-    unsettled: float = 0.5
+    missed: Annotated[float, FLAG] = 0.005
+    distance: Annotated[float, FLAG] = 0.002
+    unseen: Annotated[float, FLAG] = 0.15
+    stretch: Annotated[float, FLAG] = 0.02
+    flipped: Annotated[float, FLAG] = 0.001
+    landmarks: Annotated[float, FLAG] = 0.015
+    unsettled: Annotated[float, FLAG] = 0.5
 
 
 @dataclass(frozen=True)

@@ -25,7 +25,7 @@ TargetArg = Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="TARGET"
 
 def align(source: MeshArg, target: TargetArg, output: Output, landmarks: Path | None = None,
           target_landmarks: Path | None = None, unit: Unit | None = None,
-          config: Annotated[RigidConfig, tyro.conf.arg(name="")] = RigidConfig()) -> Outcome:  # noqa: B008
+          config: RigidConfig = RigidConfig()) -> Outcome:  # noqa: B008
     """Move a mesh rigidly onto another: by landmarks where both have them, then by their surfaces.
 
     Example: scape prep align front.ply back.ply -o front_aligned.ply
@@ -50,7 +50,7 @@ def align(source: MeshArg, target: TargetArg, output: Output, landmarks: Path | 
 
 def correspond(scan: ScanArg, template: Path, output: Output, landmarks: Path | None = None,
                template_landmarks: Path | None = None, functional: bool = False, unit: Unit | None = None,
-               config: Annotated[CorrelatedConfig, tyro.conf.arg(name="")] = CorrelatedConfig()) -> Outcome:  # noqa: B008
+               config: CorrelatedConfig = CorrelatedConfig()) -> Outcome:  # noqa: B008
     """From a few landmarks, or none, to nearly two hundred pairs of places on template and scan.
 
     Example: scape prep correspond scan.ply --template template.ply --landmarks scan.json -o pairs.json

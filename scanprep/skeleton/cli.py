@@ -24,7 +24,7 @@ SkeletonArg = Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="SKELE
 
 def skeleton(poses: PosesArg, output: Output, template: Path | None = None, subject: str | None = None,
              unit: Unit | None = None,
-             config: Annotated[SkeletonConfig, tyro.conf.arg(name="")] = SkeletonConfig()) -> Outcome:  # noqa: B008
+             config: SkeletonConfig = SkeletonConfig()) -> Outcome:  # noqa: B008
     """Rigid parts, joints and a tree from meshes of one person that share their triangles.
 
     Example: scape prep skeleton set -o skeleton.json

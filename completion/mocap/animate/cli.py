@@ -13,7 +13,7 @@ from model.cli import read_subject
 from model.linear import Subject
 from scanprep.batch.pool import Workers
 from scanprep.batch.workspace import Results, Task, Workspace
-from scanprep.cli import Output, Unit, WorkersArg
+from scanprep.cli import Output, Unit
 from scanprep.console import Metric, Outcome, bar, failures_of, problem_of
 from scanprep.geometry.storage import read_json
 from scanprep.pictures.page import Page
@@ -30,9 +30,9 @@ MarkersArg = Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="MARKER
 def animate_markers(markers: MarkersArg, output: Output, model: ModelOrNone = None, layout: str | None = None,
                     subject: str | None = None, unit: Unit | None = None, who: str | None = None,
                     onto: Path | None = None, betas_to: Path | None = None, keys: Count = 120,
-                    config: Annotated[AnimateConfig, tyro.conf.arg(name="")] = AnimateConfig(),   # noqa: B008
+                    config: AnimateConfig = AnimateConfig(),   # noqa: B008
                     shape: MarkerShapeConfig = MarkerShapeConfig(),                               # noqa: B008
-                    workers: WorkersArg = Workers(), *, space: Workspace) -> Outcome:              # noqa: B008
+                    workers: Workers = Workers(), *, space: Workspace) -> Outcome:              # noqa: B008
     """The motion of a person from markers, and the person.
 
     A folder is worked through file by file, each into a folder of its name; called again, it goes on where it was,

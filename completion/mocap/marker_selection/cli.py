@@ -2,10 +2,8 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Annotated
 
 import numpy as np
-import tyro
 
 from model.body import BodyModel
 from scanprep.cli import Output, Unit
@@ -31,7 +29,7 @@ USUAL = "vicon47"                    # around which candidates are made where no
 
 def design(bodies: Path, output: Output, model: ModelOrNone = None, candidates: str | None = None,
            keep: str | None = None, poses: int = 0, unit: Unit | None = None,
-           config: Annotated[DesignConfig, tyro.conf.arg(name="")] = DesignConfig()) -> Outcome:      # noqa: B008
+           config: DesignConfig = DesignConfig()) -> Outcome:      # noqa: B008
     """Choose the markers from which bodies are estimated best.
 
     Of the candidates markers are taken away, and added, one by one or in pairs of left and right, always the one that

@@ -11,7 +11,7 @@ from model.body import BodyModel
 from model.files import load_model
 from scanprep.batch.pool import Workers
 from scanprep.batch.workspace import Workspace
-from scanprep.cli import Output, Unit, WorkersArg
+from scanprep.cli import Output, Unit
 from scanprep.console import Outcome, bar, say
 from scanprep.ranges import Count
 
@@ -30,8 +30,8 @@ def mosh_markers(markers: MarkersArg, output: Output, model: ModelOrNone = None,
                  subjects: Path | None = None, by: By = "auto", name: str | None = None, who: str | None = None,
                  hold_out: tuple[str, ...] = (), female: Path | None = None, male: Path | None = None,
                  character: Path | None = None, factor: float = 1.0, unit: Unit | None = None, keys: Count = 120,
-                 config: Annotated[MoshConfig, tyro.conf.arg(name="")] = MoshConfig(),               # noqa: B008
-                 workers: WorkersArg = Workers(), *, space: Workspace) -> Outcome:                   # noqa: B008
+                 config: MoshConfig = MoshConfig(),               # noqa: B008
+                 workers: Workers = Workers(), *, space: Workspace) -> Outcome:                   # noqa: B008
     """Body shape, marker places, motion and soft tissue of people from markers alone.
 
     Files that are named are of one person. In a folder every sub-folder is a person; of files that lie side by side

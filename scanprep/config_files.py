@@ -1,0 +1,219 @@
+"""Settings in files: what has no flag on the command line is set by `--config FILE`, in TOML.
+
+The names are those of the settings' dataclasses. A command with one dataclass has its fields at the top of the file;
+one with several has a table for each, named as the parameter of the Python function.
+"""
+from __future__ import annotations
+
+import dataclasses
+import difflib
+import inspect
+import re
+import textwrap
+import types
+import typing
+from collections.abc import Iterator, Mapping
+from pathlib import Path
+from typing import Any
+
+from .ranges import FLAG, OutOfRange, Settings, marks
+
+Path_ = tuple[str, ...]              # of a field: the parameter, then the names of nested settings down to it
+
+
+@dataclasses.dataclass(frozen=True)
+class Flag:
+    """A field of settings that is a flag of the command line too: where it stands, its type, value and sentence."""
+
+    path: Path_
+    annotation: Any
+    value: Any
+    sentence: str
+
+
+def flags(settings: Mapping[str, Settings]) -> dict[str, Flag]:
+    """The marked fields of settings by the names of their flags, which are those of the fields."""
+    found: dict[str, Flag] = {}
+    for parameter, config in settings.items():
+        for flag in _flags((parameter,), config):
+            assert flag.path[-1] not in found, f"two settings have a flag {flag.path[-1]}"
+            found[flag.path[-1]] = flag
+    return found
+
+
+def _flags(path: Path_, config: Settings) -> Iterator[Flag]:
+    told, hints = sentences(type(config)), _hints(type(config))
+    for field in dataclasses.fields(config):
+        value = getattr(config, field.name)
+        if FLAG in marks(hints[field.name]):
+            yield Flag((*path, field.name), hints[field.name], value, told.get(field.name, ""))
+        elif isinstance(value, Settings):
+            yield from _flags((*path, field.name), value)
+
+
+def replaced(config: Settings, path: Path_, value: Any) -> Settings:
+    """Settings with another value at a path of field names."""
+    first, *rest = path
+    inner = replaced(getattr(config, first), tuple(rest), value) if rest else value
+    return dataclasses.replace(config, **{first: inner})
+
+
+def sentences(cls: type[Settings]) -> dict[str, str]:
+    """What the docstrings of settings, and of those that they extend, say of each field."""
+    fields, found = {field.name for field in dataclasses.fields(cls)}, dict[str, list[str]]()
+    for owner in reversed(cls.__mro__):
+        names: list[str] = []
+        listed = re.split(r"(?:Attributes|Parameters)\n *-+\n", inspect.cleandoc(owner.__doc__ or ""))[-1]
+        for line in listed.splitlines():
+            if line and not line.startswith(" "):
+                names = [name for name in re.split(r",\s*", line.partition(" :")[0]) if name in fields]
+                found.update((name, []) for name in names)
+            else:
+                for name in names:
+                    found[name].append(line.strip())
+    return {name: " ".join(lines).strip() for name, lines in found.items()}
+
+
+def write(settings: Mapping[str, Settings]) -> str:
+    """Settings as a file that `read` takes: every field with its sentence."""
+    kept = _of_files(settings)
+    return "\n\n".join("\n".join(_lines(config, (name,) if len(kept) > 1 else ())) for name, config in kept.items())
+
+
+def _of_files(settings: Mapping[str, Settings]) -> dict[str, Settings]:
+    """Those of which something has no flag."""
+    return {name: config for name, config in settings.items()
+            if any(FLAG not in marks(hint) for hint in _hints(type(config)).values())}
+
+
+def _hints(cls: type) -> dict[str, Any]:
+    return typing.get_type_hints(cls, include_extras=True)
+
+
+def _lines(config: Any, table: Path_) -> Iterator[str]:
+    """Fields first, then tables, as TOML wants it."""
+    import tomlkit
+
+    told, inner = sentences(type(config)), []
+    if table:
+        yield f"[{'.'.join(table)}]"
+    for field in dataclasses.fields(config):
+        value = getattr(config, field.name)
+        if dataclasses.is_dataclass(value):
+            inner.append((value, (*table, field.name)))
+            continue
+        if isinstance(value, tuple) and value and dataclasses.is_dataclass(value[0]):
+            items = ", ".join(_inline(item) for item in value)
+            text: str | None = f"[{items}]"
+        else:
+            text = None if value is None else tomlkit.item(list(value) if isinstance(value, tuple) else value
+                                                          ).as_string()
+        yield from (f"# {line}" for line in textwrap.wrap(told.get(field.name, ""), 100))
+        yield f"# {field.name} = (not set)" if text is None else f"{field.name} = {text}"
+    for value, name in inner:
+        yield ""
+        yield from _lines(value, name)
+
+
+def _inline(item: Any) -> str:
+    import tomlkit
+
+    parts = ", ".join(f"{f.name} = {tomlkit.item(getattr(item, f.name)).as_string()}"
+                      for f in dataclasses.fields(item) if getattr(item, f.name) is not None)
+    return "{" + parts + "}"
+
+
+def read(path: Path, settings: Mapping[str, Settings]) -> dict[str, Settings]:
+    """Settings with what a file changes in them.
+
+    Raises
+    ------
+    ValueError
+        No TOML, an unknown name, a wrong type, a value out of its range: file, line, what was expected, and the
+        nearest name.
+    """
+    import tomlkit
+    from tomlkit.exceptions import ParseError
+
+    text = path.read_text(encoding="utf-8")
+    try:
+        tree = tomlkit.parse(text).unwrap()
+    except ParseError as error:
+        raise ValueError(f"{path}:{error.line}: expected TOML: {error}") from None
+    place = _Place(path, text)
+    kept = _of_files(settings)
+    if len(kept) == 1:
+        name, config = next(iter(kept.items()))
+        return {**settings, name: _changed(config, tree, (), place)}
+    for name in tree:
+        place.check_name(name, kept, (), "table")
+    changed = {name: _changed(config, tree.get(name, {}), (name,), place) for name, config in kept.items()}
+    return {**settings, **changed}
+
+
+@dataclasses.dataclass(frozen=True)
+class _Place:
+    """Where in a file something is wrong."""
+
+    path: Path
+    text: str
+
+    def error(self, name: str, table: Path_, problem: str) -> ValueError:
+        return ValueError(f"{self.path}:{self._line(name, table)}: {'.'.join((*table, name))}: {problem}")
+
+    def check_name(self, name: str, known: Any, table: Path_, what: str) -> None:
+        if name not in known:
+            near = difflib.get_close_matches(name, list(known), 1, 0.5)
+            names = f"; did you mean {near[0]}?" if near else f"; there are: {', '.join(known)}"
+            raise self.error(name, table, f"expected a {what} of this command{names}")
+
+    def _line(self, name: str, table: Path_) -> int:
+        """The line of a key in a table, or of the table itself."""
+        at: Path_ = ()
+        for i, line in enumerate(self.text.splitlines(), 1):
+            if header := re.match(r"\s*\[+([^\]]+)\]", line):
+                at = tuple(part.strip(" \"'") for part in header[1].split("."))
+                if at[:len(table) + 1] == (*table, name):
+                    return i
+            elif at == table and re.match(rf"\s*[\"']?{re.escape(name)}[\"']?\s*[.=]", line):
+                return i
+            elif re.match(rf"\s*{re.escape('.'.join((*table, name)))}\s*=", line):
+                return i
+        return 1
+
+
+def _changed(config: Settings, tree: Any, table: Path_, place: _Place) -> Settings:
+    """Settings with the values of a table."""
+    if not isinstance(tree, dict):
+        raise place.error(table[-1], table[:-1], f"expected a table, got {tree!r}")
+    hints, names = _hints(type(config)), [f.name for f in dataclasses.fields(config)]
+    for name, value in tree.items():
+        place.check_name(name, names, table, "setting")
+        now = getattr(config, name)
+        inner = now if isinstance(now, Settings) else _optional_settings(hints[name])
+        try:
+            new = _changed(inner, value, (*table, name), place) if inner is not None else _converted(value, hints[name])
+            config = dataclasses.replace(config, **{name: new})
+        except OutOfRange as error:
+            raise place.error(name, table, str(error).partition(": ")[2] or str(error)) from None
+        except TypeError as error:
+            raise place.error(name, table, str(error)) from None
+    return config
+
+
+def _optional_settings(hint: Any) -> Settings | None:
+    """Default settings of a field that may hold some, or None."""
+    for option in typing.get_args(hint) if typing.get_origin(hint) in (typing.Union, types.UnionType) else ():
+        if isinstance(option, type) and issubclass(option, Settings):
+            return option()
+    return None
+
+
+def _converted(value: Any, hint: Any) -> Any:
+    """A value of TOML in the type of a field; TypeError says what was expected."""
+    import msgspec
+
+    try:
+        return msgspec.convert(value, hint)
+    except msgspec.ValidationError as error:
+        raise TypeError(str(error).replace("`", "").replace("$", "value")) from None
