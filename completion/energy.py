@@ -11,27 +11,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from scanprep.geometry import rotations
+from scanprep.geometry.least_squares import Residual
 
 from .priors import GaussianPrior, JointLimits
-
-
-@dataclass(frozen=True, eq=False)
-class Residual:
-    """Values whose squares are summed, and their derivative with respect to the unknowns.
-
-    Attributes
-    ----------
-    values : (..., m) float
-    jacobian : (..., m, P) float
-    """
-
-    values: np.ndarray
-    jacobian: np.ndarray
-
-    @property
-    def energy(self) -> np.ndarray:
-        """(...) the sum of squares."""
-        return np.einsum("...m,...m->...", self.values, self.values)
 
 
 @dataclass(frozen=True, eq=False)

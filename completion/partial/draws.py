@@ -5,13 +5,13 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from scanprep.geometry.least_squares import normal_equations
 from scanprep.geometry.surface import OrientedPoints
 from scanprep.skeleton.tree import Skeleton
 
 from .. import energy
 from ..bodies import FixedBody, Follow
 from ..priors import GaussianPrior, unbranched
-from ..solve import normal_equations
 from .scan import spread
 from .self_intersection import Contact
 
@@ -31,7 +31,7 @@ def around(body: FixedBody, follow: Follow, x: np.ndarray, targets: np.ndarray, 
     weights = np.full(len(targets), sd**-2)
     terms = [energy.point_to_point(follow(x[None]), targets, weights), energy.pose_prior(x[None], prior)]
     free = body.n_angles + 3
-    precision = normal_equations(terms)[2][0, :free, :free] + 1e-6 * np.eye(free)
+    precision = normal_equations(terms).hessian[0, :free, :free] + 1e-6 * np.eye(free)
     drawn = np.repeat(x[None], count, axis=0)
     drawn[:, :free] += np.linalg.solve(np.linalg.cholesky(precision).T, rng.normal(size=(free, count))).T
     return drawn

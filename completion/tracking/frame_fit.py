@@ -6,14 +6,14 @@ from typing import Any
 
 import numpy as np
 
+from scanprep.geometry.least_squares import Residual, levenberg_marquardt, normal_equations
 from scanprep.geometry.surface import Surface
 
 from .. import energy
 from ..bodies import FixedBody
-from ..partial.fit import ScanFit
+from ..partial.fit import Energy, ScanFit
 from ..partial.reinitialise import approach, best_start, first_starts, redraw_limbs
 from ..partial.scan import ScanPoints
-from ..solve import Energy, MinimiseConfig, minimise, normal_equations
 from .dynamics import inertia
 from .settings import TrackConfig
 
@@ -105,8 +105,8 @@ class FrameFit:
         data = scan_terms(fit, x, reach)
         held = 0 * self.inertia if expected is None else self.inertia / PREDICTION
         goal = x if expected is None else expected
-        best = minimise(lambda at: [*data(at), energy.stay_near(at, goal, held)], x[None],
-                        MinimiseConfig(iterations=1, tolerance=1e-3)).x
+        best = levenberg_marquardt(lambda at: normal_equations([*data(at), energy.stay_near(at, goal, held)]), x[None],
+                                   iterations=1, tolerance=1e-3).x
         _, gradient, precision = normal_equations(data(best))
         return best[0], gradient[0], precision[0]
 
@@ -131,7 +131,7 @@ def scan_terms(fit: ScanFit, x: np.ndarray, reach: float) -> Energy:
     count = len(ids)
     prior = fit.habit.near(fit.body.split(x)[0])
 
-    def terms(at: np.ndarray) -> list[energy.Residual]:
+    def terms(at: np.ndarray) -> list[Residual]:
         points = follow(at)
         free, denied = points[:count], points[count:]
         return [energy.pose_prior(at, prior, fit.config.prior_weight),

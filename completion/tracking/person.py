@@ -7,11 +7,12 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from scanprep.geometry.least_squares import normal_equations
+
 from .. import energy
 from ..bodies import ShapedBody
 from ..partial.fit import ScanFit
 from ..partial.scan import ScanPoints
-from ..solve import normal_equations
 from .frame_fit import NOTHING, scan_terms
 from .settings import TrackConfig
 
