@@ -13,6 +13,7 @@ import numpy as np
 from ..geometry import storage
 
 NONE = "none"                  # what a table says where a figure has no value
+EARLIER = {"guide": "init", "flipped": "inverted"}      # names of columns in tables written before
 FIGURES, TIMES, FAILURES = "registration.csv", "times.csv", "failures.csv"
 
 
@@ -23,7 +24,7 @@ class ScanFigures:
     Attributes
     ----------
     name : str
-    guide : str
+    init : str
         What led the template there: "10 landmarks", "160 correspondences", "pose".
     distance, rms : float, metres
         Of the vertices with data to the surface of the scan.
@@ -37,7 +38,7 @@ class ScanFigures:
         Share of the template's surface that is more than twice, or less than half, as long in some direction.
     landmarks : float, metres
         RMS distance of the landmarks; NaN without.
-    flipped : int
+    inverted : int
         Triangles that face against their surroundings.
     converged : bool
     removed : float
@@ -47,7 +48,7 @@ class ScanFigures:
     """
 
     name: str
-    guide: str
+    init: str
     distance: float
     rms: float
     seen: float
@@ -55,7 +56,7 @@ class ScanFigures:
     missed: float
     stretch: float
     landmarks: float
-    flipped: int
+    inverted: int
     converged: bool
     removed: float = 0.0
     seconds: float = np.nan
@@ -90,7 +91,7 @@ def read_figures(folder: Path) -> list[ScanFigures]:
         A table with other columns or values.
     """
     seconds = {row["name"]: float(row["seconds"]) for row in _read(folder / TIMES)}
-    rows = _read(folder / FIGURES)
+    rows = [{EARLIER.get(name, name): text for name, text in row.items()} for row in _read(folder / FIGURES)]
     try:
         return [ScanFigures(**{f.name: _READ[str(f.type)](row[f.name]) for f in _TABLED},
                             seconds=seconds.get(row["name"], np.nan)) for row in rows]
