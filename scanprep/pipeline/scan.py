@@ -57,30 +57,16 @@ class ScanSettings(Settings):
 
 @dataclass(frozen=True, eq=False)
 class RegisteredScan:
-    """What a scan became.
+    """What a scan became."""
 
-    Attributes
-    ----------
-    vertices : (N, 3) float, metres
-    figures : ScanFigures
-    picture : bytes
-        A strip of small pictures as a WebP file; empty where none were asked for.
-    """
-
-    vertices: np.ndarray
+    vertices: np.ndarray            # (N, 3), metres
     figures: ScanFigures
-    picture: bytes = b""
+    picture: bytes = b""            # a strip of small pictures as a WebP file; empty where none were asked for
 
 
 def register_scan(task: ScanTask, template: Mesh, template_landmarks: dict[str, int],
                   settings: ScanSettings | None = None) -> RegisteredScan:
-    """Read and register one scan.
-
-    Raises
-    ------
-    ValueError
-        A file that cannot be read, landmarks that do not match, a registration that means nothing.
-    """
+    """Read and register one scan; ValueError for files that cannot be read, or a registration that means nothing."""
     settings = settings or ScanSettings()
     start = time.perf_counter()
     with one_thread():
