@@ -168,7 +168,7 @@ def plain(value: Any) -> Any:
 
 def write_report(outcome: Outcome, command: str, seconds: float, written: Mapping[str, str] | None = None
                  ) -> Path | None:
-    """Write `report.json` beside the output: command, settings, versions, figures, and the digests of all files written."""
+    """Write `report.json` beside the output: command, settings, versions, figures, digests of all files written."""
     from .batch.ownership import report_path
     from .geometry import storage
 

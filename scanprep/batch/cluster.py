@@ -20,7 +20,7 @@ ANSWER, WAIT = 10, 60          # seconds for the scheduler, and for the first wo
 
 
 def run_on_cluster(address: str, work: Any, jobs: Sequence[Job], ship: bool = False) -> Iterator[tuple[Job, Any]]:
-    """Each job with what the work returned, or a Failure, as they finish; ValueError where the scheduler does not serve.
+    """Each job with what the work returned, or a Failure, as they finish; ValueError where no scheduler serves.
 
     The work travels to each worker once. Files come back to this process, which alone writes, so workers need no
     place to write to. One thread a worker is best (`dask worker --nthreads 1 --nworkers auto`). With `ship` the files

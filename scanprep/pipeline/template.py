@@ -43,7 +43,7 @@ class TemplateConfig(Settings):
 
 def make_template(views: Sequence[Any], faces: int = 14000, config: TemplateConfig | None = None,
                   progress: Callable[[int, int], None] | None = None) -> Mesh:
-    """Range views of one subject to a closed manifold mesh with well-shaped triangles: merge, repair, smooth, fill, decimate.
+    """Range views of one subject to a closed manifold mesh: merge, repair, smooth, fill, decimate.
 
     Views are RangeViews or pairs of a Mesh and a camera position (3,). ValueError where they give no surface that can
     serve as a template.
