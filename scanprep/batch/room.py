@@ -41,7 +41,8 @@ class Failure:
 class Room:
     """Where one task is worked on.
 
-    `folder` takes its files, `step` keeps results that are found again when the task was interrupted, `tell(done, total)` reports progress. With `force` no step of an earlier run counts as done.
+    `folder` takes its files, `step` keeps results that are found again when the task was interrupted,
+    `tell(done, total)` reports progress. With `force` no step of an earlier run counts as done.
     """
 
     def __init__(self, folder: Path, steps: Path | None = None, tell: Progress | None = None, force: bool = False
