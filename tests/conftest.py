@@ -15,8 +15,8 @@ from scanprep.console import run
 
 
 def pytest_collection_modifyitems(items):
-    """The longest file first, so that the other processes have enough to do beside it."""
-    items.sort(key=lambda item: item.path.name != "test_readme.py")
+    """The longest files first, so that the other processes have enough to do beside them."""
+    items.sort(key=lambda item: not item.path.name.startswith("test_readme"))
 
 
 @pytest.fixture(scope="session")

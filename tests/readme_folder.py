@@ -1,0 +1,81 @@
+"""The files that the READMEs name, in a folder of a user, and the commands and snippets that use them."""
+import json
+import re
+import shlex
+import shutil
+from pathlib import Path
+
+from completion import Motion
+from completion.__main__ import main
+from model import load_model
+from scanprep import write_mesh
+from scanprep.synthetic.data_set import read_views
+
+ROOT = Path(__file__).parents[1]
+SET_UP = {"pip install . && scape demo", 'pip install ".[test]" && pytest'}
+
+
+def blocks(readme, kind):
+    """The texts of one kind, "bash" or "python", in a README."""
+    return re.findall(rf"```{kind}\n(.*?)```", (ROOT / readme).read_text(encoding="utf-8"), re.DOTALL)
+
+
+def commands(readme):
+    return [line for text in blocks(readme, "bash") for line in text.splitlines() if line]
+
+
+def run_commands(readme):
+    """Every command of a README in its order, as each uses what the one before it wrote."""
+    wanted = [line for line in commands(readme) if line not in SET_UP]
+    assert wanted
+    for line in wanted:
+        words = shlex.split(line)
+        assert words[0] == "scape"
+        words = ["own.ply" if w == "template.ply" and "views" in words else w for w in words]    # it is there already
+        assert main(words[1:]) == 0, line
+
+
+def user_folder(demo, folder):
+    """Five scans, a template, a half view, a recording, frames of a walk, registered meshes, range views."""
+    shutil.copytree(demo, folder / "scape_demo")
+    demo = folder / "scape_demo"
+    (folder / "scans").mkdir()
+    rows = (demo / "scans" / "scans.csv").read_text().splitlines()
+    mine = [row for row in rows[1:] if row.split(",")[1] == "subject"][:5]
+    others = [row for row in rows[1:] if row.split(",")[1] != "subject"][:1]
+    (folder / "scans" / "scans.csv").write_text("\n".join([rows[0], *mine, *others]) + "\n")
+    for row in [*mine, *others]:
+        for ending in (".ply", ".landmarks.json"):
+            shutil.copy(demo / "scans" / (row.split(",")[0] + ending), folder / "scans")
+    for source, target in (("template.ply", "template.ply"), ("template.landmarks.json", "template.landmarks.json"),
+                           ("half_view/half_view.ply", "half_view.ply"), ("markers/walk.c3d", "walk.c3d"),
+                           ("half_view/half_view.landmarks.json", "half_view.landmarks.json"),
+                           ("markers/layout.json", "layout.json")):
+        shutil.copy(demo / source, folder / target)
+    shutil.copy(demo / "scans" / f"{mine[0].split(',')[0]}.ply", folder / "standing.ply")
+    shutil.copy(demo / "scans" / f"{mine[1].split(',')[0]}.ply", folder / "anna.ply")
+    cameras = {}
+    for k, view in enumerate(read_views(demo / "template_scan" / "views" / "rest.npz")):
+        write_mesh(folder / "views" / f"view{k}.ply", view.mesh)
+        cameras[f"view{k}"] = view.camera.tolist()
+    (folder / "views" / "cameras.json").write_text(json.dumps(cameras))
+    model, motion = load_model(demo / "model.npz"), Motion.load(demo / "animation" / "motion.npz")
+    for t, vertices in enumerate(motion.vertices(model.subject(None), slice(0, 8, 2))):
+        write_mesh(folder / "frames" / f"{t:04d}.ply", model.template.with_vertices(vertices))
+    for part, names in (("poses", mine), ("people", others + mine[:1])):
+        (folder / "registered" / part).mkdir(parents=True)
+        for row in names:
+            shutil.copy(demo / "set" / "meshes" / f"{row.split(',')[0]}.ply", folder / "registered" / part)
+    return folder
+
+
+def with_results(folder):
+    """What the commands of the README leave behind, for those of the packages."""
+    demo = folder / "scape_demo"
+    shutil.copy(demo / "model.npz", folder / "model.npz")
+    model = load_model(demo / "model.npz")
+    write_mesh(folder / "heavier.ply", model.template.with_vertices(model.vertices(None, [1.5])))
+    (folder / "walk").mkdir()
+    shutil.copy(demo / "animation" / "motion.npz", folder / "walk")
+    shutil.copy(demo / "animation" / "motion.bvh", folder / "walk.bvh")
+    return folder
