@@ -7,8 +7,8 @@ import numpy as np
 
 from scanprep.geometry.least_squares import Minimum, levenberg_marquardt
 
+from ..pose.robust import marker_weights
 from ..settings import FaultConfig
-from .robust import marker_weights
 from .simulated import Simulation
 from .swaps import AWAY, WORTH, best_stretches, loose_ends
 from .tracks import Tracks

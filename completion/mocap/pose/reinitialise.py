@@ -6,8 +6,8 @@ import numpy as np
 from scanprep.geometry.least_squares import Dense, levenberg_marquardt
 
 from ... import energy
-from ..artefacts.robust import misfit
 from .marked_body import MarkedBody
+from .robust import misfit
 from .settings import AnimateConfig
 
 SEVERAL, FAR = 3, 2.0                # markers of a frame that are so many times an outlier's residual away
