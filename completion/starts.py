@@ -19,22 +19,9 @@ def search(body: FixedBody, follow: Follow, targets: np.ndarray, sd: float, prio
            ) -> tuple[np.ndarray, np.ndarray]:
     """Likely bodies that bring points to their targets, from many starts at once.
 
-    Parameters
-    ----------
-    follow : x (B, P) -> L moving points
-    targets : (L, 3) float, metres
-        NaN where there is none; at least 3 are needed.
-    sd : float, metres
-        How far a point may be from its target.
-    axes : int
-        See `typical_poses`.
-
-    Returns
-    -------
-    (n, P) float
-        Unknowns of every start, best first; betas stay zero.
-    (n,) float
-        Their energies.
+    `follow` x (B, P) -> L moving points; `targets` (L, 3), metres, naN where there is none; at least 3 are needed;
+    `sd`, metres, how far a point may be from its target.
+    Returns (n, P), unknowns of every start, best first; betas stay zero; (n,), their energies.
     """
     poses = typical_poses(body.pose_mean, body.pose_covariance, axes)
     x = np.concatenate([_placed(body, follow, targets, pose) for pose in poses])

@@ -50,22 +50,11 @@ class FitConfig(Settings):
 
 @dataclass(frozen=True, eq=False)
 class PoseFit:
-    """A fitted pose.
+    """A fitted pose."""
 
-    Attributes
-    ----------
-    pose : (J, 3) float, radians
-    trans : (3,) float, metres
-    vertices : (N, 3) float, metres
-    rms, mean : float, metres
-        Of the distances of corresponding vertices.
-    converged : bool
-    iterations : int
-    """
-
-    pose: np.ndarray
-    trans: np.ndarray
-    vertices: np.ndarray
+    pose: np.ndarray        # (J, 3), radians
+    trans: np.ndarray       # (3,), metres
+    vertices: np.ndarray    # (N, 3), metres
     rms: float
     mean: float
     converged: bool
@@ -98,13 +87,7 @@ def fit_pose(subject: Subject, vertices: np.ndarray, config: FitConfig | None = 
 
 
 class PoseFitter:
-    """`fit_pose` for many scans of one subject: what does not depend on the scan is prepared once.
-
-    Parameters
-    ----------
-    subject : Subject
-    config : FitConfig, optional
-    """
+    """`fit_pose` for many scans of one subject: what does not depend on the scan is prepared once."""
 
     def __init__(self, subject: Subject, config: FitConfig | None = None) -> None:
         self.subject, self.config = subject, config or FitConfig()
@@ -158,14 +141,7 @@ def fit_shape(model: BodyModel, vertices: np.ndarray, config: FitConfig | None =
 
 
 class ShapeFitter:
-    """`fit_shape` for many scans: what does not depend on the scan is prepared once.
-
-    Parameters
-    ----------
-    model : BodyModel
-        With shape components.
-    config : FitConfig, optional
-    """
+    """`fit_shape` for many scans: what does not depend on the scan is prepared once."""
 
     def __init__(self, model: BodyModel, config: FitConfig | None = None) -> None:
         self.model, self.config = model, config or FitConfig()

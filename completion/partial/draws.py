@@ -84,13 +84,7 @@ def near_points(fit: ScanFit, x: np.ndarray, moved: np.ndarray, points: np.ndarr
 
 
 def quick_misfits(fit: ScanFit, x: np.ndarray, moved: np.ndarray | None = None, cap: float = 0.1) -> np.ndarray:
-    """How badly bodies (n, P) explain the scan, on few vertices whose normals turn with their parts.
-
-    Parameters
-    ----------
-    moved : ints, optional
-        The parts in which the bodies differ; only these are tested for passing through others.
-    """
+    """How badly bodies (n, P) explain the scan, on few vertices whose normals turn with their parts."""
     body, config = fit.body, fit.config
     ids = spread(body.template.vertices, VERTICES)
     few = slice(None, None, 3)

@@ -30,14 +30,7 @@ SETTLED = 5e-4                       # metres, root mean square over the vertice
 class ScanFit:
     """One scan and one body, with what stays the same between the stages.
 
-    Parameters
-    ----------
-    body : FixedBody
-    cloud : ScanPoints
-    vertices : (L,) int
-    points : (L, 3) float, metres
-        The landmarks.
-    config : CompletionConfig
+    `vertices` (L,) int; `points` (L, 3), metres, the landmarks.
     """
 
     def __init__(self, body: FixedBody, cloud: ScanPoints, vertices: np.ndarray, points: np.ndarray,

@@ -31,10 +31,6 @@ class ScaledBody(FixedBody):
 
     The last unknown stands with the betas, so their prior holds it too: x[-1] = log(factor) / LOOSE, where lengths
     of the scan times `factor` are metres.
-
-    Parameters
-    ----------
-    inner : FixedBody
     """
 
     def __init__(self, inner: FixedBody) -> None:

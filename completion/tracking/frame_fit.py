@@ -24,37 +24,17 @@ NOTHING = (np.zeros(0, dtype=np.int64), np.zeros((0, 3)))
 
 @dataclass(frozen=True, eq=False)
 class Settled:
-    """Where the fit of a frame ended.
+    """Where the fit of a frame ended."""
 
-    Attributes
-    ----------
-    x : (P,) float
-    gradient, precision : (P,) and (P, P) float
-        Of half the energy of the data and the pose prior at x, the prediction not among them.
-    residual : float, metres
-        Mean distance of the points to the surface.
-    explained : float
-        Share of the points that have the surface near.
-    """
-
-    x: np.ndarray
+    x: np.ndarray           # (P,)
     gradient: np.ndarray
     precision: np.ndarray
-    residual: float
-    explained: float
+    residual: float         # metres, mean distance of the points to the surface
+    explained: float        # share of the points that have the surface near
 
 
 class FrameFit:
-    """A body of known shape, and what stays the same from frame to frame.
-
-    Parameters
-    ----------
-    body : FixedBody
-    cloud : ScanPoints
-        Any frame.
-    config : TrackConfig
-    rate : float, frames per second
-    """
+    """A body of known shape, and what stays the same from frame to frame."""
 
     def __init__(self, body: FixedBody, cloud: ScanPoints, config: TrackConfig, rate: float) -> None:
         self.body, self.config = body, config

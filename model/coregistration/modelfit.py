@@ -37,13 +37,7 @@ class Candidate:
 class ModelFit:
     """One body and one scan: searches for the pose, place and betas.
 
-    Parameters
-    ----------
-    body : BodyModel or Subject
-        A model where the shape is unknown, a subject where it is known.
-    target : Target
-    landmarks : (L,) int and (L, 3) float, metres, optional
-    config : ModelFitConfig
+    `landmarks` (L,) int and (L, 3), metres.
     """
 
     def __init__(self, body: BodyModel | Subject, target: Target, landmarks: tuple[np.ndarray, np.ndarray] | None,
@@ -73,13 +67,7 @@ class ModelFit:
         return points.J3 + 3 + points.n_betas
 
     def settle(self, x: np.ndarray, points: PosedPoints, wanted: Attraction, prior: float, steps: int) -> np.ndarray:
-        """Least squares over x of what is wanted of the points, the pose prior and that of the betas.
-
-        Parameters
-        ----------
-        prior : float
-            As in `PoseStage`.
-        """
+        """Least squares over x of what is wanted of the points, the pose prior and that of the betas."""
         J3, W = points.J3, prior * self.size * self.whitening
         mean, b = self.pose_mean.ravel(), self.config.shape_prior * self.size
         by_prior = np.zeros((len(x), len(W) + points.n_betas))
