@@ -13,10 +13,10 @@ from ..batch.opening import workspace
 from ..batch.pool import Workers
 from ..batch.workspace import Workspace
 from ..cleaning.clean_scan import CleanScanConfig
-from ..cli import MM, Output, SetArg, Unit, landmarks_beside
+from ..cli import MM, Output, SetArg, Unit
 from ..console import Metric, Outcome, bar, say
 from ..geometry.files import read_mesh
-from ..geometry.landmarks import read_landmark_vertices
+from ..geometry.landmarks import read_template_landmarks
 from ..geometry.mesh import Mesh
 from ..ranges import Count
 from .figures import ScanFigures
@@ -95,7 +95,7 @@ def _template_marks(template: Path, given: Path | None, body: Mesh, tasks: Seque
     if without and guide == "best":
         say(f"note: no landmarks for {len(without)} of {len(tasks)} scans ({', '.join(without[:LISTED])}); "
             "look at the page for those turned round or mirrored")
-    return read_landmark_vertices(given or landmarks_beside(template), body)
+    return read_template_landmarks(template, body, given)
 
 
 def _progress_made(done: Prepared, tasks: Sequence[ScanTask]) -> list[Metric]:

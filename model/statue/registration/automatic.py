@@ -8,10 +8,11 @@ from scipy.spatial import cKDTree
 
 from scanprep.geometry.formats.common import UNITS
 from scanprep.geometry.mesh import Mesh
+from scanprep.geometry.target import Target, target_of
 from scanprep.geometry.thinning import thin
 from scanprep.registration.confidence import stretched_share
-from scanprep.registration.matches import Target, target_of
-from scanprep.registration.nonrigid import Registration, RegistrationConfig, register
+from scanprep.registration.nonrigid import Registration, register
+from scanprep.registration.schedule import RegistrationConfig
 from scanprep.threads import one_thread, search_threads
 
 from ..control.model import ControlModel
@@ -51,7 +52,7 @@ class Features:
     margin : float
         How many times larger it is for the best start that faces another way.
     missed, stretched : float
-        What `Registration.missed` and `stretched_share` say of the registered mesh.
+        What `Registration.uncovered` and `stretched_share` say of the registered mesh.
     problem : str or None
         Why the features should not be trusted.
     """
@@ -115,8 +116,8 @@ def find_features(control: ControlModel, scan: Mesh) -> Features:
     joints, points, missing = _features(control, best, found)
     fit = fit_features(control, joints, points) if len(joints) + len(points) > 2 else None
     registered = control.mesh.with_vertices(best.to_scan(found.mesh.vertices))
-    return Features(joints, points, missing, registered, fit, unit, up, front, best.off, margin, found.missed,
-                    stretched_share(start, found.mesh), doubts(best.off, margin, found.missed))
+    return Features(joints, points, missing, registered, fit, unit, up, front, best.off, margin, found.uncovered,
+                    stretched_share(start, found.mesh), doubts(best.off, margin, found.uncovered))
 
 
 def nobody_problem(off: float, margin: float, unit: str) -> str | None:

@@ -7,7 +7,7 @@ import numpy as np
 from scipy.sparse import csc_array, diags_array
 
 from scanprep.geometry.mesh import Mesh
-from scanprep.registration.matches import Target, target_of
+from scanprep.geometry.target import Target, target_of
 
 
 @dataclass(frozen=True, eq=False)
