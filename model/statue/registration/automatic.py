@@ -8,10 +8,11 @@ from scipy.spatial import cKDTree
 
 from scanprep.geometry.formats.common import UNITS
 from scanprep.geometry.mesh import Mesh
+from scanprep.geometry.target import Target, target_of
 from scanprep.geometry.thinning import thin
 from scanprep.registration.confidence import stretched_share
-from scanprep.registration.matches import Target, target_of
-from scanprep.registration.nonrigid import Registration, RegistrationConfig, register
+from scanprep.registration.nonrigid import Registration, register
+from scanprep.registration.schedule import RegistrationConfig
 from scanprep.threads import one_thread, search_threads
 
 from ..control.model import ControlModel
@@ -45,8 +46,8 @@ class Features:
     front: np.ndarray              # (3,) unit, upwards, and to where the person faces
     misfit: float                  # metres, between the scan and the control model in its pose: see `Stand`
     margin: float                  # how many times larger it is for the best start that faces another way
-    missed: float                  # what `Registration.missed` and `stretched_share` say of the registered mesh
-    stretched: float               # what `Registration.missed` and `stretched_share` say of the registered mesh
+    missed: float                  # what `Registration.uncovered` and `stretched_share` say of the registered mesh
+    stretched: float               # what `Registration.uncovered` and `stretched_share` say of the registered mesh
     problem: str | None            # why the features should not be trusted
 
 
@@ -94,8 +95,8 @@ def find_features(control: ControlModel, scan: Mesh) -> Features:
     joints, points, missing = _features(control, best, found)
     fit = fit_features(control, joints, points) if len(joints) + len(points) > 2 else None
     registered = control.mesh.with_vertices(best.to_scan(found.mesh.vertices))
-    return Features(joints, points, missing, registered, fit, unit, up, front, best.off, margin, found.missed,
-                    stretched_share(start, found.mesh), doubts(best.off, margin, found.missed))
+    return Features(joints, points, missing, registered, fit, unit, up, front, best.off, margin, found.uncovered,
+                    stretched_share(start, found.mesh), doubts(best.off, margin, found.uncovered))
 
 
 def nobody_problem(off: float, margin: float, unit: str) -> str | None:

@@ -10,8 +10,8 @@ from scipy.spatial import cKDTree
 from scanprep.geometry import rotations
 from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.surface import Surface
+from scanprep.geometry.target import Target
 from scanprep.geometry.thinning import thin
-from scanprep.registration.matches import Target
 
 from .features import limb_angles, limbs
 from .pose_search import COARSE, FINE, Posed, PoseSearch

@@ -6,10 +6,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from scanprep.geometry.mesh import Mesh
+from scanprep.geometry.target import Target, orient
 from scanprep.geometry.thinning import thin
 from scanprep.ranges import Cell, Count, Positive, Settings
 from scanprep.registration.energies import Pull, pull
-from scanprep.registration.matches import Described, Likeness, Target, orient, tukey
+from scanprep.registration.matches import Described, Likeness, tukey
 
 from .articulated import Articulated, Points
 

@@ -16,12 +16,11 @@ import numpy as np
 from scipy.sparse import csc_array, diags_array, eye_array
 
 from scanprep.geometry.mesh import Mesh, check_template
-from scanprep.geometry.sparse import Factored
+from scanprep.geometry.sparse import Factored, conjugate_gradients
 from scanprep.geometry.surface import Surface, checked_points
+from scanprep.geometry.target import Target, target_of
 from scanprep.ranges import Count, Positive, Range, Settings
-from scanprep.registration.matches import Target, target_of
-from scanprep.registration.shell import conjugate_gradients, flipped, unfold
-from scanprep.registration.vertex_rotations import turns
+from scanprep.registration.inverted_triangles import inverted_triangles, unfold
 from scanprep.threads import one_thread
 
 from .local_shape import LocalShape, local_shape
@@ -273,14 +272,14 @@ class _Fit:
 
     def settle_down(self, surface: Surface) -> None:
         """Vertices with data onto the surface, where that turns no triangle over."""
-        self.x = unfold(self.rest, self.x, turns(self.rest, self.x))
+        self.x = unfold(self.rest, self.x)
         normals, (free, _) = self.mesh.vertex_normals, self.seen()
         found = surface.closest(self.x)
         free &= np.einsum("nd,nd->n", surface.mesh.face_normals[found.faces], normals) > 0
-        already = flipped(self.rest, self.x, turns(self.rest, self.x))
+        already = inverted_triangles(self.rest, self.x)
         for _ in range(BACK):
             y = np.where(free[:, None], found.points, self.x)
-            turned = flipped(self.rest, y, turns(self.rest, y)) & ~already
+            turned = inverted_triangles(self.rest, y) & ~already
             if not turned.any():
                 break
             free[self.rest.faces[turned]] = False
@@ -290,7 +289,7 @@ class _Fit:
         """What was reached."""
         seen, _ = self.seen()
         apart = surface.closest(self.x).distances[seen]
-        inverted = flipped(self.rest, self.x, turns(self.rest, self.x))
+        inverted = inverted_triangles(self.rest, self.x)
         return SurfaceFit(self.x, seen, float(np.sqrt(np.mean(apart**2))) if seen.any() else np.nan,
                           float(apart.max(initial=0.0)), int(inverted.sum()), distortion(self.rest, self.x),
                           self.energies, temperatures, np.array(self.steps), bool(self.converged and seen.any()))

@@ -1,4 +1,4 @@
-"""How a template turns and stretches from place to place: measured, smoothed, and laid out again."""
+"""How a template rotates and stretches from place to place: measured, smoothed, and laid out again."""
 from __future__ import annotations
 
 from dataclasses import dataclass
@@ -13,13 +13,9 @@ from ..geometry.sparse import Factored
 
 @dataclass(frozen=True, eq=False)
 class Field:
-    """The turn and the stretch of every triangle; its gradient is `R S`.
+    """The rotation R and the stretch S (F, 3, 3) of every triangle; its gradient is `R S`.
 
-    Attributes
-    ----------
-    R : (F, 3, 3) float
-    S : (F, 3, 3) float
-        Symmetric, in the template's axes; along the normal it is the mean stretch within the triangle.
+    S is symmetric, in the template's axes; along the normal it is the mean stretch within the triangle.
     """
 
     R: np.ndarray
@@ -32,12 +28,7 @@ class Field:
 
 
 class Triangles:
-    """The triangles of a template at rest, ready to measure gradients and to lay wanted ones out.
-
-    Parameters
-    ----------
-    template : Mesh
-    """
+    """The triangles of a template at rest, ready to measure gradients and to lay wanted ones out."""
 
     def __init__(self, template: Mesh) -> None:
         c = template.corners
@@ -49,23 +40,22 @@ class Triangles:
         u = e[:, 2] / np.maximum(np.linalg.norm(e[:, 2], axis=1, keepdims=True), 1e-300)
         self.frames = np.stack([u, np.cross(n, u), n], axis=1)
         self._stiffness = self.stiffness(self.areas)
-        self._smoother: dict[float, Factored] = {}
 
     def measured(self, x: np.ndarray) -> Field:
-        """The turns and stretches of vertices (N, 3)."""
+        """The rotations and stretches of vertices (N, 3)."""
         flat = np.einsum("fad,fae,fke->fdk", x[self.mesh.faces], self.hats, self.frames[:, :2], optimize=True)
         C = np.matmul(flat.transpose(0, 2, 1), flat)
         area = np.sqrt(np.maximum(C[:, 0, 0] * C[:, 1, 1] - C[:, 0, 1] ** 2, 1e-12))
         trace = np.sqrt(C[:, 0, 0] + C[:, 1, 1] + 2 * area)
         U = (C + area[:, None, None] * np.eye(2)) / trace[:, None, None]
         inverse = (np.eye(2) * np.einsum("fii->f", U)[:, None, None] - U) / area[:, None, None]
-        turned = np.empty((len(U), 3, 3))
-        turned[:, :, :2] = flat @ inverse
-        turned[:, :, 2] = self.mesh.with_vertices(x).face_normals
+        rotated = np.empty((len(U), 3, 3))
+        rotated[:, :, :2] = flat @ inverse
+        rotated[:, :, 2] = self.mesh.with_vertices(x).face_normals
         full = np.zeros((len(U), 3, 3))
         full[:, :2, :2], full[:, 2, 2] = U, np.sqrt(area)
         B = self.frames
-        return Field(turned @ B, B.transpose(0, 2, 1) @ full @ B)
+        return Field(rotated @ B, B.transpose(0, 2, 1) @ full @ B)
 
     def smoothed(self, field: Field, length: float, weights: np.ndarray) -> Field:
         """The field that varies little over `length` (metres), where triangles count by weights (F,)."""

@@ -6,29 +6,38 @@ from scipy.sparse import coo_array, csr_array
 from scipy.sparse.csgraph import connected_components, dijkstra
 from scipy.spatial import cKDTree
 
+from ..geometry.mesh import Mesh
+from ..geometry.target import Target
 from ..geometry.thinning import thin
+
+
+def describe_both(template: Mesh, target: Target, anchors: tuple[np.ndarray, np.ndarray], cell: float, size: float
+                  ) -> tuple[np.ndarray, np.ndarray]:
+    """Descriptors (N, L) of the template's vertices and (n, L) of the scan's points by their paths to the anchors.
+
+    Both surfaces are thinned to the same spacing, `cell` metres, and linked by the same rule, so that what a path along
+    links is longer than the true one is the same on both.
+    """
+    vertices, points = anchors
+    mine = path_lengths(template.vertices, template.vertex_normals, template.vertices[vertices], cell)
+    theirs = path_lengths(target.points, target.normals, points, cell, target.oriented)
+    return descriptors(mine, size), descriptors(theirs, size)
+
+
+def descriptors(lengths: np.ndarray, size: float) -> np.ndarray:
+    """Lengths (n, L) to compare: near landmarks tell more precisely than far ones, so logarithms.
+
+    Divided by the root of their number: the distance of two descriptors is the root mean square over landmarks.
+    """
+    return np.log(lengths / size + 0.1) / np.sqrt(lengths.shape[1])
 
 
 def path_lengths(points: np.ndarray, normals: np.ndarray, sources: np.ndarray, cell: float, oriented: bool = True
                  ) -> np.ndarray:
-    """Lengths of the shortest paths from sources to all points of a surface, holes bridged.
+    """Lengths (n, L), metres, of the shortest paths from sources (L, 3) to all points of a surface, holes bridged.
 
-    Template and scan are thinned to the same spacing and linked by the same rule, so that what a path along
-    links is longer than the true one is the same on both.
-
-    Parameters
-    ----------
-    points, normals : (n, 3) float
-    sources : (L, 3) float, metres
-    cell : float, metres
-        Spacing to which the points are thinned.
-    oriented : bool
-        Whether the normals point outward; if so, paths do not jump between skins that touch.
-
-    Returns
-    -------
-    (n, L) float, metres
-        Small pieces far from everything take the way to the nearest point of the rest as the crow flies.
+    Where the normals point outward, `oriented`, paths do not jump between skins that touch. Small pieces far from
+    everything take the way to the nearest point of the rest as the crow flies.
     """
     keep = thin(points, cell)
     p, n = points[keep], normals[keep]
@@ -38,14 +47,6 @@ def path_lengths(points: np.ndarray, normals: np.ndarray, sources: np.ndarray, c
     lengths = dijkstra(graph, directed=False, indices=joined[at]).T[joined] + near
     apart, nearest = tree.query(points)
     return lengths[nearest] + apart[:, None]
-
-
-def path_marks(lengths: np.ndarray, size: float) -> np.ndarray:
-    """Lengths (n, L) as marks to compare: near landmarks tell more precisely than far ones, so logarithms.
-
-    Divided by the root of their number: the distance of two marks is the root mean square over landmarks.
-    """
-    return np.log(lengths / size + 0.1) / np.sqrt(lengths.shape[1])
 
 
 def _links(p: np.ndarray, n: np.ndarray, cell: float, oriented: bool, neighbours: int = 10) -> csr_array:

@@ -1,4 +1,4 @@
-"""A small jointed body with a known deformation, for the tests of `scanprep.matching`."""
+"""A small jointed body with a known deformation, for the tests of registration."""
 from __future__ import annotations
 
 import numpy as np

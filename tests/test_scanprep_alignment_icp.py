@@ -3,7 +3,7 @@ from __future__ import annotations
 
 import numpy as np
 import pytest
-from matching_bodies import crab
+from jointed_bodies import crab
 
 from scanprep.alignment.icp import RigidConfig, align_landmarks, align_rigid, apply
 from scanprep.geometry import rotations

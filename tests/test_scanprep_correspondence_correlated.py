@@ -15,7 +15,7 @@ from scanprep.correspondence.sheet import Sheet
 from scanprep.geometry import rotations
 from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.surface import Surface
-from scanprep.registration.matches import Target, target_of
+from scanprep.geometry.target import Target, target_of
 from scanprep.synthetic.people import Person, named_pose
 
 SMALL = CorrelatedConfig(points=100, keep=80, levels=(BeliefLevel(1200, 60), BeliefLevel(10**6, 40)))

@@ -8,14 +8,16 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from matching_bodies import bent, crab
+from jointed_bodies import bent, crab
 
 from scanprep.geometry import rotations
 from scanprep.geometry.mesh import Mesh, template_problem
 from scanprep.geometry.surface import Surface
 from scanprep.registration import deformation_graph as graph
-from scanprep.registration import energies, nonrigid, shell
-from scanprep.registration.nonrigid import GraphStage, RegistrationConfig, register
+from scanprep.registration import energies
+from scanprep.registration import inverted_triangles as inverted
+from scanprep.registration.nonrigid import register
+from scanprep.registration.schedule import RegistrationConfig
 
 LEFT, RIGHT = np.array([0.0, 0.0, 1.2]), np.array([0.0, 1.4, 0.0])
 MARKS = np.array([820, 821, 9 * 20, 9 * 20 + 10, 20 * 20, 20 * 20 + 10, 31 * 20 + 5, 31 * 20 + 15])
@@ -52,7 +54,7 @@ def test_large_bends_come_back_from_a_cloud_with_holes(truth, found):
     apart = np.linalg.norm(found.mesh.vertices - truth.vertices, axis=1)
     assert apart.mean() < 0.008 and apart.max() < 0.06
     assert Surface(truth).closest(found.mesh.vertices).distances.mean() < 0.0015
-    assert found.flipped == 0 and found.landmark_rms < 0.01
+    assert found.inverted == 0 and found.landmark_rms < 0.01
 
 
 def test_holes_are_reported_and_filled_with_volume(truth, found):
@@ -65,14 +67,14 @@ def test_holes_are_reported_and_filled_with_volume(truth, found):
 
 
 def test_a_mesh_gives_the_same_as_its_points(truth):
-    from scanprep.registration.matches import orient, target_of
+    from scanprep.geometry.target import orient, target_of
     mesh, cloud = target_of(truth), target_of(truth.vertices)
     cloud = orient(cloud, truth, 0.05)
     assert (np.einsum("nd,nd->n", mesh.normals, cloud.normals) > 0.7).mean() > 0.97
 
 
 def test_moves_and_scales_with_the_input(truth):
-    config = replace(small(), settle=None)
+    config = replace(small(), final_fit=None)
     scan = scan_of(truth, np.random.default_rng(1), 2500)
     first = register(crab(), scan, (MARKS, truth.vertices[MARKS]), config).mesh.vertices
     s, R, t = 7.0, rotations.exp(np.array([0.3, -1.0, 2.0])), np.array([4.0, -2.0, 1.0])
@@ -101,8 +103,7 @@ def test_without_landmarks_a_near_pose_is_found():
 
 def test_progress_ends_at_its_total_and_the_result_repeats(truth):
     calls = []
-    config = replace(small(), graph=(GraphStage(60, 0.5, 0.05, 1.0, 1.0, 0.0, rounds=5),
-                                     GraphStage(60, 0.2, 0.02, 0.7, 0.01, 0.2)))
+    config = replace(small(), graph=small().graph[2:4])
     args = crab(), truth, (MARKS, truth.vertices[MARKS]), config
     first = register(*args, progress=lambda done, total: calls.append((done, total)))
     assert calls[-1][0] == calls[-1][1] and [c[0] for c in calls] == sorted(c[0] for c in calls)
@@ -115,9 +116,9 @@ def test_a_folded_patch_is_laid_flat_again():
     x[[405, 406]] = x[[406, 405]]                                # two neighbours have changed places
     x[700] += 0.05 * body.vertex_normals[700] + 0.05 * (body.vertices[721] - body.vertices[700]) / 0.02
     upright = np.broadcast_to(np.eye(3), (len(x), 3, 3))
-    assert shell.flipped(body, x, upright).sum() >= 2
-    laid = shell.unfold(body, x, upright)
-    assert not shell.flipped(body, laid, upright).any()
+    assert inverted.inverted_triangles(body, x, upright).sum() >= 2
+    laid = inverted.unfold(body, x, upright)
+    assert not inverted.inverted_triangles(body, laid, upright).any()
     np.testing.assert_allclose(laid, body.vertices, atol=1e-12)
 
 
@@ -130,24 +131,25 @@ def small_graph():
 def random_motion(g, rng, size=0.3):
     M = len(g.node_vertices)
     step = size * rng.normal(size=(M, 7)) * [1, 1, 1, 0.3, 0.1, 0.1, 0.1]
-    return graph.start(g, np.eye(4)).moved(step)
+    return graph.start_motion(g, np.eye(4)).moved(step)
 
 
 @pytest.mark.parametrize("mended", [True, False])
-def test_wider_patches_are_kept_only_where_they_leave_fewer_turned_triangles(monkeypatch, mended):
+def test_wider_patches_are_kept_only_where_they_leave_fewer_inverted_triangles(monkeypatch, mended):
     body = crab()
     few, more = body.vertices.copy(), body.vertices.copy()
     few[410], more[[205, 410, 615]] = -few[410], -more[[205, 410, 615]]
     wide = body.vertices if mended else more
-    monkeypatch.setattr(nonrigid, "unfold", lambda template, x, linear, rings=None: wide if rings else few)
-    np.testing.assert_array_equal(nonrigid._without_folds(body, few), wide if mended else few)
+    monkeypatch.setattr(inverted, "unfold", lambda template, x, rings=None: wide if rings else few)
+    np.testing.assert_array_equal(inverted.without_inverted(body, few), wide if mended else few)
 
 
 def test_a_similarity_is_free_and_exact():
     g = small_graph()
     T = np.eye(4)
     T[:3, :3], T[:3, 3] = rotations.exp(np.array([1.0, 2.0, -0.5])), [1, 2, 3]
-    motion = graph.start(g, T, 1.3)
+    motion = replace(graph.start_motion(g, T), log_scale=np.full(len(g.nodes), np.log(1.3)),
+                     positions=1.3 * g.nodes @ T[:3, :3].T + T[:3, 3])
     np.testing.assert_allclose(graph.deform(g, motion), 1.3 * crab().vertices @ T[:3, :3].T + T[:3, 3], atol=1e-12)
     for term in (energies.stretch_term, energies.bend_term, energies.growth_term):
         assert term(g, motion, 1.0).value < 1e-20
@@ -165,7 +167,7 @@ def test_inner_links_cross_the_body():
 def test_a_finer_graph_takes_the_motion_over():
     coarse, fine = small_graph(), graph.build_graph(crab(), 150)
     motion = random_motion(coarse, np.random.default_rng(5), 0.05)
-    after = graph.deform(fine, graph.carry_over(coarse, motion, fine))
+    after = graph.deform(fine, graph.transferred(coarse, motion, fine))
     assert np.linalg.norm(after - graph.deform(coarse, motion), axis=1).mean() < 0.003
 
 
