@@ -14,7 +14,7 @@ from .dataset import RegisteredSet as RegisteredSet
 from .decimation.decimate import decimate as decimate
 from .decimation.registered_set import DecimateSetConfig as DecimateSetConfig
 from .decimation.registered_set import decimate_set as decimate_set
-from .decimation.registered_set_files import write_decimated_set as write_decimated_set
+from .decimation.registered_set import write_decimated_set as write_decimated_set
 from .fusion.tsdf import merge_views as merge_views
 from .geometry.files import (
     MeshFileError as MeshFileError,

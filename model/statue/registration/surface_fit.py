@@ -232,7 +232,7 @@ class _Fit:
             return SurfaceData(A, wanted, *self.nothing)
         found = Surface(mesh).closest(self.sample.points)
         corners = mesh.faces[found.faces]
-        normals = found.carried(mesh.vertex_normals, mesh.faces)
+        normals = found.transferred(mesh.vertex_normals, mesh.faces)
         facing = np.einsum("pd,pd->p", normals, self.sample.normals) > AGREE
         good = np.flatnonzero(facing & self.shown[corners].all(axis=1))
         rows = np.repeat(np.arange(len(good)), 3)

@@ -2,6 +2,7 @@ import numpy as np
 import pytest
 from scanned_shapes import ball
 
+from scanprep.cleaning import floor as floor_finding
 from scanprep.cleaning.clean_scan import (
     FAR,
     FLOOR,
@@ -13,7 +14,7 @@ from scanprep.cleaning.clean_scan import (
     clean_scan,
     pieces,
 )
-from scanprep.cleaning.floor import FloorConfig, find_plane, floor_points, inside_outline, local_noise
+from scanprep.cleaning.floor import find_plane, floor_points, inside_outline, local_noise
 from scanprep.geometry import rotations
 from scanprep.geometry.mesh import Mesh
 from scanprep.synthetic.people import Person
@@ -161,12 +162,12 @@ def test_a_fitted_plane_is_the_true_one():
     R = rotations.exp(rng.normal(size=3))
     flat = np.c_[rng.uniform(-1, 1, (5000, 2)), 0.003 * rng.normal(size=5000)]
     above = np.c_[rng.uniform(-0.2, 0.2, (3000, 2)), rng.uniform(0.02, 1, 3000)]
-    plane = find_plane(np.concatenate([flat, above]) @ R.T + 7)
+    plane = find_plane(np.concatenate([flat, above]) @ R.T + 7, 0.1, rng)
     assert plane.normal @ R[:, 2] > 1 - 1e-5                       # towards what stands on it
     assert plane.offset == pytest.approx(R[:, 2] @ [7, 7, 7], abs=5e-4)
     assert plane.noise == pytest.approx(0.003, rel=0.1)
     # With as much behind as in front it is no floor.
-    assert find_plane(np.concatenate([flat, above, above * [1, 1, -1]]) @ R.T) is None
+    assert find_plane(np.concatenate([flat, above, above * [1, 1, -1]]) @ R.T, 0.1, rng) is None
 
 
 def test_noise_is_measured_on_a_curved_surface():
@@ -187,16 +188,17 @@ def test_outlines_with_gaps_are_filled():
 def test_what_lies_under_the_floor_goes_with_it():
     rng = np.random.default_rng(5)
     plane = find_plane(np.concatenate([np.c_[rng.uniform(-1, 1, (5000, 2)), 0.001 * rng.normal(size=5000)],
-                                       [[0, 0, 1.0]]]), FloorConfig())
+                                       [[0, 0, 1.0]]]), 0.1, rng)
     points = np.array([[0, 0, -0.2], [0, 0, 0], [0.3, 0, 0], [0, 0, 0.5]])
     body = np.array([[x, y, 0.015] for x in np.linspace(-0.05, 0.05, 11) for y in np.linspace(-0.05, 0.05, 11)])
     assert list(floor_points(points, plane, body)) == [True, False, True, False]
 
 
-def test_nothing_is_an_error():
+def test_nothing_is_an_error(monkeypatch):
     with pytest.raises(ValueError, match="scan: expected points"):
         clean_scan(np.zeros((0, 3)))
     rng = np.random.default_rng(6)
     bare = np.c_[rng.uniform(-1, 1, (5000, 2)), 0.001 * rng.normal(size=5000)]
+    monkeypatch.setattr(floor_finding, "SIGMAS", 10)
     with pytest.raises(ValueError, match="nothing is left"):
-        clean_scan(bare, CleanScanConfig(floor=FloorConfig(sigmas=10)))
+        clean_scan(bare, CleanScanConfig())

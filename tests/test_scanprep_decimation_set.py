@@ -2,12 +2,11 @@ import numpy as np
 import pytest
 from jointed_bodies import bent, crab
 from scanned_shapes import bumpy
+from surface_distances import surface_distance
 
 from scanprep.dataset import RegisteredSet
-from scanprep.decimation import registered_set_files as decimate_set_files
-from scanprep.decimation.registered_set import DecimateSetConfig, decimate_set
-from scanprep.decimation.registered_set_files import write_decimated_set
-from scanprep.geometry.distance import surface_distance
+from scanprep.decimation import registered_set as decimate_set_files
+from scanprep.decimation.registered_set import DecimateSetConfig, decimate_set, write_decimated_set
 from scanprep.geometry.landmarks import read_landmark_vertices, write_landmarks
 from scanprep.geometry.mesh import template_problem
 from scanprep.skeleton.tree import Skeleton
@@ -41,7 +40,7 @@ def test_one_topology_for_all(body, poses, skeleton, placement):
     assert set(KEEP) <= set(small.vertex_map)
     assert np.array_equal(small.owner[small.vertex_map], np.arange(len(small.vertex_map)))
     assert np.array_equal(small.template.faces, small.owner[body.faces[small.face_map]])
-    carried = small.carry(poses)
+    carried = small.transfer(poses)
     assert carried.shape == (len(poses), len(small.vertex_map), 3)
     for before, after in zip(poses, carried, strict=True):
         assert np.array_equal(after[small.owner[KEEP]], before[KEEP])
@@ -52,7 +51,7 @@ def test_one_topology_for_all(body, poses, skeleton, placement):
 
 def test_the_map_is_exact(body, poses, skeleton):
     small = decimate_set(body, poses, 500, None, KEEP, skeleton)
-    assert np.array_equal(small.carry(poses), poses[:, small.vertex_map])
+    assert np.array_equal(small.transfer(poses), poses[:, small.vertex_map])
     assert np.array_equal(small.template.vertices, body.vertices[small.vertex_map])
 
 
@@ -120,7 +119,7 @@ def test_arguments_are_checked(body, poses, skeleton):
     with pytest.raises(ValueError, match="skeleton: expected"):
         decimate_set(bumpy(2), None, 100, skeleton=skeleton)
     with pytest.raises(ValueError, match="vertices: expected shape"):
-        decimate_set(body, None, 500).carry(poses[:, :-1])
+        decimate_set(body, None, 500).transfer(poses[:, :-1])
 
 
 @pytest.fixture

@@ -1,15 +1,13 @@
 import numpy as np
 import pytest
-from scanned_shapes import ball, bumpy
+from scanned_shapes import ball, bumpy, triangle_quality
 
-from scanprep.decimation.remeshing import flip_edges, improve_triangles, smooth, triangle_quality
 from scanprep.geometry.mesh import Mesh, template_problem
+from scanprep.geometry.remeshing import flip_edges, improve_triangles, smooth
 from scanprep.geometry.surface import Surface
 from scanprep.repair.manifold import (
-    RepairConfig,
     drop_small_components,
     orient,
-    peel_border,
     repair,
     split_vertices,
     weld,
@@ -129,7 +127,7 @@ def three_sheets():
 
 
 def test_sheets_that_meet_in_a_line_are_parted():
-    good = repair(three_sheets(), RepairConfig(min_component=0.0))
+    good = repair(three_sheets(), min_component=0.0)
     assert good.is_edge_manifold and good.is_vertex_manifold
     assert len(good.faces) >= 20                                       # two of the three sheets and the tie
 
@@ -162,18 +160,7 @@ def test_pieces_are_dropped_by_size():
     sizes = [len(ball(d).vertices) for d in (3, 2, 0)]
     for share, kept in ((0.0, sizes), (0.1, sizes[:2]), (1.0, sizes[:1])):
         assert len(drop_small_components(mesh, share).vertices) == sum(kept)
-    assert len(repair(mesh, RepairConfig(min_component=0.1)).vertices) == sum(sizes[:2])
-
-
-def test_peeling_takes_rings_from_large_borders_only():
-    mesh = ball(4)
-    far = mesh.corners.mean(axis=1)
-    holed = mesh.submesh((far[:, 0] < 0.08) & (np.linalg.norm(far + [0.1, 0, 0], axis=1) > 0.012))[0]
-    large, small = (len(loop) for loop in holed.boundary_loops)
-    assert small < 20 < large
-    peeled = peel_border(holed, 2, smallest=20)
-    assert small in [len(loop) for loop in peeled.boundary_loops]
-    assert peeled.vertices[:, 0].max() < holed.vertices[:, 0].max() - mesh.mean_edge
+    assert len(repair(mesh, min_component=0.1).vertices) == sum(sizes[:2])
 
 
 def test_turned_edges_of_a_plane_are_delaunay():

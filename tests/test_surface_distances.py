@@ -2,8 +2,8 @@
 import numpy as np
 import pytest
 import trimesh
+from surface_distances import surface_distance
 
-from scanprep.geometry.distance import surface_distance
 from scanprep.geometry.mesh import Mesh
 
 

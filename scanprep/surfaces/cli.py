@@ -8,12 +8,12 @@ import numpy as np
 import tyro
 
 from ..alignment.views import AlignViewsConfig, align_views, views_problem
+from ..cleaning.clean_scan import CleanScanConfig, clean_scan
 from ..cli import MM, MeshArg, Output, ScanArg, SetArg, Unit, about_mesh
 from ..console import Metric, Outcome, bar
 from ..dataset import RegisteredSet
 from ..decimation.decimate import DecimateConfig, decimate
-from ..decimation.registered_set import DecimateSetConfig
-from ..decimation.registered_set_files import write_decimated_set
+from ..decimation.registered_set import DecimateSetConfig, write_decimated_set
 from ..fusion.tsdf import MergeConfig, merge_views
 from ..geometry import storage
 from ..geometry.files import UNITS, PointCloud, list_meshes, read_mesh, read_scan, write_mesh, write_points
@@ -22,7 +22,6 @@ from ..geometry.mesh import Mesh
 from ..pipeline.template import make_template
 from ..ranges import Faces
 from ..repair.hole_filling import FillConfig, FilledHole, fill_holes, fill_report
-from .clean_scan import CleanScanConfig, clean_scan
 
 ViewsArg = Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="VIEWS")]
 

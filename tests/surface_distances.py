@@ -1,12 +1,12 @@
-"""How far two surfaces lie apart."""
+"""How far two surfaces lie apart, for tests and benchmarks."""
 from __future__ import annotations
 
 from dataclasses import dataclass
 
 import numpy as np
 
-from .mesh import Mesh
-from .surface import Surface
+from scanprep.geometry.mesh import Mesh
+from scanprep.geometry.surface import Surface
 
 
 @dataclass(frozen=True)

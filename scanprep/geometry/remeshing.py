@@ -1,38 +1,18 @@
 """Better triangles on the same surface: edges flipped, vertices moved along it."""
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 from scipy.sparse import coo_array, csr_array
 
-from ..geometry.mesh import Mesh
-from ..geometry.surface import Surface
-from ..ranges import Settings
-
-
-def triangle_quality(mesh: Mesh) -> np.ndarray:
-    """(F,) 1 for an equilateral triangle, 0 for one without area: 4√3 area over the sum of squared sides."""
-    squares = ((mesh.corners - np.roll(mesh.corners, -1, axis=1)) ** 2).sum(axis=(1, 2))
-    return np.divide(4 * 3 ** 0.5 * mesh.face_areas, squares, out=np.zeros(len(squares)), where=squares > 0)
+from .mesh import Mesh
+from .surface import Surface
 
 
 def flip_edges(mesh: Mesh, allowed: np.ndarray | None = None, rounds: int = 20, min_cosine: float = 0.7) -> Mesh:
-    """Edges turned until, as far as the surface allows, opposite angles sum to at most 180 degrees.
+    """Edges flipped until, as far as the surface allows, opposite angles sum to at most 180 degrees.
 
-    Parameters
-    ----------
-    mesh : Mesh
-    allowed : (F,) bool, optional
-        Triangles that may change; an edge is turned only between two of them.
-    rounds : int
-    min_cosine : float
-        Edges whose triangles meet at a sharper angle stay, and no turn makes a sharper one; -1 turns all.
-
-    Returns
-    -------
-    Mesh
-        The same vertices; triangles keep their rows.
+    Only triangles `allowed` (F,) change, and triangles keep their rows. Edges whose triangles meet at a sharper angle
+    than `min_cosine` stay, and no flip makes a sharper one; -1 flips all.
     """
     faces = np.array(mesh.faces)
     allowed = np.ones(len(faces), dtype=bool) if allowed is None else allowed
@@ -108,38 +88,23 @@ def mean_of_neighbours(mesh: Mesh) -> csr_array:
     return csr_array(adjacency.multiply(1 / degree[:, None]))
 
 
-def relax(mesh: Mesh, surface: Surface | None = None, rounds: int = 5, step: float = 0.5,
-          fixed: np.ndarray | None = None) -> Mesh:
-    """Vertices moved towards the middle of their neighbours, along the surface only.
-
-    Parameters
-    ----------
-    mesh : Mesh
-    surface : Surface, optional
-        What vertices are put back onto after every round.
-    rounds : int
-    step : float
-    fixed : (n,) int or (N,) bool, optional
-        Vertices that stay; those on the border always do.
-    """
+def relax(mesh: Mesh, surface: Surface, rounds: int = 5) -> Mesh:
+    """Vertices moved towards the middle of their neighbours along a surface, all but those on the border."""
     free = np.ones(len(mesh.vertices), dtype=bool)
     free[mesh.boundary_vertices] = False
-    if fixed is not None:
-        free[fixed] = False
     mean = mean_of_neighbours(mesh)
     for _ in range(rounds):
-        move = step * (mean @ mesh.vertices - mesh.vertices)
+        move = 0.5 * (mean @ mesh.vertices - mesh.vertices)
         normal = mesh.vertex_normals
         move -= _dot(move, normal)[:, None] * normal
         move[~free] = 0
         vertices = mesh.vertices + move
-        if surface is not None:
-            vertices[free] = surface.closest(vertices[free]).points
+        vertices[free] = surface.closest(vertices[free]).points
         mesh = mesh.with_vertices(vertices)
     return mesh
 
 
-def smooth(mesh: Mesh, rounds: int = 10, lower: float = 0.5, upper: float = -0.53) -> Mesh:
+def smooth(mesh: Mesh, rounds: int = 10) -> Mesh:
     """Noise taken off without shrinking, by steps forward and back [Taubin].
 
     A border is smoothed as the curve it is.
@@ -157,38 +122,16 @@ def smooth(mesh: Mesh, rounds: int = 10, lower: float = 0.5, upper: float = -0.5
     free = degree > 0
     vertices = np.array(mesh.vertices)
     for _ in range(rounds):
-        for step in (lower, upper):
+        for step in (0.5, -0.53):
             vertices[free] += step * (mean @ vertices - vertices)[free]
     return mesh.with_vertices(vertices)
 
 
-@dataclass(frozen=True)
-class ImproveConfig(Settings):
-    """Settings of `improve_triangles`.
-
-    Attributes
-    ----------
-    rounds : int
-        Passes of turning edges and moving vertices.
-    """
-
-    rounds: int = 6
-
-
-def improve_triangles(mesh: Mesh, surface: Surface | None = None, config: ImproveConfig | None = None) -> Mesh:
-    """Slivers turned into well-shaped triangles; the number of vertices and triangles stays.
-
-    Parameters
-    ----------
-    mesh : Mesh
-    surface : Surface, optional
-        What the vertices stay on; the mesh itself when not given.
-    config : ImproveConfig, optional
-    """
+def improve_triangles(mesh: Mesh, surface: Surface | None = None) -> Mesh:
+    """Slivers turned into well-shaped triangles on a surface, or on the mesh itself; their number stays."""
     surface = surface or Surface(mesh)
-    for _ in range((config or ImproveConfig()).rounds):
-        mesh = flip_edges(mesh, rounds=8)
-        mesh = relax(mesh, surface, rounds=2)
+    for _ in range(6):
+        mesh = relax(flip_edges(mesh, rounds=8), surface, rounds=2)
     return flip_edges(mesh)
 
 

@@ -7,7 +7,7 @@ from scanprep.geometry.mesh import Mesh, template_problem
 from scanprep.geometry.seen_space import SeenSpace
 from scanprep.geometry.surface import Surface
 from scanprep.repair.hole_filling import FillConfig, fill_holes, fill_report
-from scanprep.repair.volumetric_diffusion import DiffusionConfig, diffused_surface, signed_distance
+from scanprep.repair.volumetric_diffusion import diffused_surface, signed_distance
 
 
 def pierced(mesh, centre, radius):
@@ -83,7 +83,7 @@ def test_seen_space_stays_empty():
 
 def test_finer_voxels_find_the_same_surface():
     holed = pierced(ball(5), [0, 0, 0.1], 0.05)
-    coarse, fine = (diffused_surface(holed, holed.boundary_vertices, DiffusionConfig(voxels=n)) for n in (10, 14))
+    coarse, fine = (diffused_surface(holed, holed.boundary_vertices, voxels=n) for n in (10, 14))
     inner = fine.vertices[np.linalg.norm(fine.vertices - [0, 0, 0.1], axis=1) < 0.05]
     assert Surface(coarse).closest(inner).distances.max() < 0.004
     assert len(fine.faces) > 1.5 * len(coarse.faces)

@@ -162,7 +162,7 @@ def test_a_border_of_hundreds_of_edges():
     whole = ball(6, 0.5)
     holed = pierced(whole, [0.5, 0, 0], 0.35)
     assert len(holed.boundary_loops[0]) > 200
-    filled = fill_holes(holed, FillConfig(exact_edges=120))
+    filled = fill_holes(holed)
     assert filled.is_closed and template_problem(filled) is None
     new = filled.vertices[len(holed.vertices):]
     assert np.abs(np.linalg.norm(new, axis=1) - 0.5).max() < 0.05

@@ -3,14 +3,12 @@ from pathlib import Path
 
 import numpy as np
 import pytest
-from scanned_shapes import SIX, bumpy, view
+from scanned_shapes import SIX, bumpy, triangle_quality, view
 
 from scanprep.adapters.open3d_filters import MissingLibrary
-from scanprep.decimation.decimate import DecimateConfig, collapse, decimate
-from scanprep.decimation.edge_collapse import RoundsConfig
+from scanprep.decimation import edge_collapse
+from scanprep.decimation.decimate import DecimateConfig, collapse, decimate, fast_collapses
 from scanprep.decimation.quadrics import lowest, plane_quadrics, point_quadrics, value
-from scanprep.decimation.remeshing import triangle_quality
-from scanprep.decimation.safe_collapses import fast_collapses
 from scanprep.fusion.tsdf import MergeConfig
 from scanprep.geometry.files import read_mesh
 from scanprep.geometry.mesh import Mesh, template_problem
@@ -93,10 +91,10 @@ def test_a_ball_ends_as_a_manifold_however_few_triangles_are_wanted():
     assert len(small.faces) < 40
 
 
-def test_the_count_is_reached_where_only_thin_triangles_are_left():
+def test_the_count_is_reached_where_only_thin_triangles_are_left(monkeypatch):
     mesh = bumpy(3)
-    strict = DecimateConfig(rounds=RoundsConfig(min_quality=0.999))
-    thin = decimate(mesh, 200, strict)
+    monkeypatch.setattr(edge_collapse, "THINNEST", 0.999)
+    thin = decimate(mesh, 200)
     assert len(thin.faces) == 200 and thin.is_closed and thin.is_vertex_manifold
 
 
