@@ -1,4 +1,4 @@
-"""A small model of the embedded people, for those who have no model of their own: built on first use, then kept."""
+"""A small model of the synthetic people, for those who have no model of their own: built on first use, then kept."""
 from __future__ import annotations
 
 import datetime
@@ -30,8 +30,8 @@ VERSION = 2                          # raised when the same recipe makes another
 
 
 @dataclass(frozen=True)
-class EmbeddedRecipe:
-    """What the model of the embedded people is made of.
+class SyntheticRecipe:
+    """What the model of the synthetic people is made of.
 
     Attributes
     ----------
@@ -40,7 +40,7 @@ class EmbeddedRecipe:
     people : int
         Women and men in turn, near rest.
     faces : int
-        Triangles; the vertices are some of those that all embedded people share.
+        Triangles; the vertices are some of those that all synthetic people share.
     learn : LearnConfig
     seed : int
     """
@@ -58,10 +58,10 @@ class EmbeddedRecipe:
         return hashlib.sha256(json.dumps(told, sort_keys=True).encode()).hexdigest()[:12]
 
 
-def embedded_model(progress: Progress | None = None, recipe: EmbeddedRecipe | None = None) -> BodyModel:
-    """The model of the embedded people, from the cache or built now, which takes most of a minute.
+def synthetic_model(progress: Progress | None = None, recipe: SyntheticRecipe | None = None) -> BodyModel:
+    """The model of the synthetic people, from the cache or built now, which takes most of a minute.
 
-    All embedded people share one triangulation and their skeleton is known, so nothing has to be registered.
+    All synthetic people share one triangulation and their skeleton is known, so nothing has to be registered.
     `info` says when it was built ("built") and names landmarks and markers of its template; "people_vertices" are
     the vertices of `Person` that it kept.
 
@@ -69,13 +69,13 @@ def embedded_model(progress: Progress | None = None, recipe: EmbeddedRecipe | No
     ----------
     progress : callable, optional
         Called with (done, total) while the model is built.
-    recipe : EmbeddedRecipe, optional
+    recipe : SyntheticRecipe, optional
 
     Notes
     -----
-    Embedded people are made, not measured: the model gives a first answer, no more. Of a half view of one real man
+    Synthetic people are made, not measured: the model gives a first answer, no more. Of a half view of one real man
     (SPRING), the completed mesh lay 15 mm from the true surface on average and 27 mm where nothing had been seen; of
-    an embedded woman not among those it was learned from, 1 and 2 mm.
+    a synthetic woman not among those it was learned from, 1 and 2 mm.
 
     Raises
     ------
@@ -84,8 +84,8 @@ def embedded_model(progress: Progress | None = None, recipe: EmbeddedRecipe | No
 
     [SCAPE] §5
     """
-    recipe = recipe or EmbeddedRecipe()
-    path = embedded_path(recipe)
+    recipe = recipe or SyntheticRecipe()
+    path = synthetic_path(recipe)
     model = _cached(path, recipe)
     if model is not None:
         return model
@@ -96,16 +96,16 @@ def embedded_model(progress: Progress | None = None, recipe: EmbeddedRecipe | No
             if model is None:
                 for left in path.parent.glob(f".{path.stem}.*.part.npz"):       # by one that was killed
                     left.unlink()
-                model = build_embedded(recipe, progress)
+                model = build_synthetic(recipe, progress)
                 model = replace(model, info={**model.info, SEAL: _seal(model, recipe)})
                 model.save(path)
     except OSError as error:
-        raise ValueError(f"{path.parent}: cannot keep the model of the embedded people there ({error}); "
+        raise ValueError(f"{path.parent}: cannot keep the model of the synthetic people there ({error}); "
                          f"name another folder in {CACHE}, or a model with -m") from None
     return model
 
 
-def _cached(path: Path, recipe: EmbeddedRecipe) -> ScapeModel | None:
+def _cached(path: Path, recipe: SyntheticRecipe) -> ScapeModel | None:
     """The model of a recipe as it was built, or None where it is not there, damaged, or something else."""
     try:
         model = load_model(path)
@@ -114,15 +114,15 @@ def _cached(path: Path, recipe: EmbeddedRecipe) -> ScapeModel | None:
         return None
 
 
-def _seal(model: ScapeModel, recipe: EmbeddedRecipe) -> str:
+def _seal(model: ScapeModel, recipe: SyntheticRecipe) -> str:
     """A digest of a model, by which it is known to be whole and of the recipe."""
     info = {name: value for name, value in model.info.items() if name != SEAL}
     return Digests().of(recipe.digest, replace(model, info=info))
 
 
-def embedded_path(recipe: EmbeddedRecipe | None = None) -> Path:
+def synthetic_path(recipe: SyntheticRecipe | None = None) -> Path:
     """Where the model of a recipe is kept."""
-    return cache_folder() / f"embedded-people-{(recipe or EmbeddedRecipe()).digest}.npz"
+    return cache_folder() / f"synthetic-people-{(recipe or SyntheticRecipe()).digest}.npz"
 
 
 def cache_folder() -> Path:
@@ -137,7 +137,7 @@ def cache_folder() -> Path:
     return user_cache_path("scapekit", appauthor=False)
 
 
-def build_embedded(recipe: EmbeddedRecipe, progress: Progress | None = None) -> ScapeModel:
+def build_synthetic(recipe: SyntheticRecipe, progress: Progress | None = None) -> ScapeModel:
     """Learn the model of a recipe, without the cache."""
     rng = np.random.default_rng(recipe.seed)
     made, learning = recipe.poses + recipe.people, (recipe.learn.refinements + 1) * recipe.poses + recipe.people
@@ -155,7 +155,7 @@ def build_embedded(recipe: EmbeddedRecipe, progress: Progress | None = None) -> 
     model = learn_scape(small.template, small.transfer(np.stack(poses)), small.transfer(np.stack(shapes)),
                         small.skeleton, recipe.learn, lambda done, total: tell(made + done, made + total))
     return replace(model, info={
-        **model.info, "name": "embedded people", "built": datetime.date.today().isoformat(),
+        **model.info, "name": "synthetic people", "built": datetime.date.today().isoformat(),
         "landmarks": small.landmarks(landmarks()), "markers": small.landmarks(markers()),
         "people_vertices": small.vertex_map.tolist()})
 

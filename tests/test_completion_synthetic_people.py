@@ -7,15 +7,15 @@ import numpy as np
 import pytest
 from model_bodies import worm_model
 
-from completion import synthetic_model as embedded
+from completion import synthetic_people
 from completion.cli import read_landmark_pairs, read_model
-from completion.synthetic_model import EmbeddedRecipe, cache_folder, embedded_model, embedded_path
+from completion.synthetic_people import SyntheticRecipe, cache_folder, synthetic_model, synthetic_path
 from model import LearnConfig, fit_pose
 from scanprep.synthetic.data_set import SUBJECT
 from scanprep.synthetic.landmarks import landmarks, markers
 from scanprep.synthetic.people import Person, random_pose
 
-SMALL = EmbeddedRecipe(poses=6, people=3, faces=2400, learn=LearnConfig(components=2, refinements=0, steps=0))
+SMALL = SyntheticRecipe(poses=6, people=3, faces=2400, learn=LearnConfig(components=2, refinements=0, steps=0))
 
 
 @pytest.fixture(scope="module")
@@ -23,7 +23,7 @@ def built(tmp_path_factory):
     folder, ticks = tmp_path_factory.mktemp("cache"), []
     with pytest.MonkeyPatch.context() as patch:
         patch.setenv("SCAPEKIT_CACHE", str(folder))
-        model = embedded_model(lambda done, total: ticks.append((done, total)), SMALL)
+        model = synthetic_model(lambda done, total: ticks.append((done, total)), SMALL)
     return folder, model, ticks
 
 
@@ -33,7 +33,7 @@ def cache(built, monkeypatch):
     return built[0]
 
 
-def test_the_model_is_that_of_the_embedded_people(built):
+def test_the_model_is_that_of_the_synthetic_people(built):
     _, model, ticks = built
     person, rng = Person(SUBJECT), np.random.default_rng(3)
     kept = np.array(model.info["people_vertices"])
@@ -49,22 +49,22 @@ def test_the_model_is_that_of_the_embedded_people(built):
 
 
 def test_it_is_built_once(cache, built, monkeypatch):
-    monkeypatch.setattr(embedded, "build_embedded", lambda *_: pytest.fail("built again"))
-    again = embedded_model(recipe=SMALL)
+    monkeypatch.setattr(synthetic_people, "build_synthetic", lambda *_: pytest.fail("built again"))
+    again = synthetic_model(recipe=SMALL)
     np.testing.assert_array_equal(again.template.vertices, built[1].template.vertices)
     assert again.info["built"] == built[1].info["built"]
-    assert [p.name for p in cache.iterdir()] == [embedded_path(SMALL).name]
+    assert [p.name for p in cache.iterdir()] == [synthetic_path(SMALL).name]
 
 
 def test_another_recipe_is_built_anew(cache, built, monkeypatch):
     calls = []
-    monkeypatch.setattr(embedded, "build_embedded", lambda recipe, progress: calls.append(recipe) or built[1])
-    other = EmbeddedRecipe(seed=6)
-    assert embedded_path(other) != embedded_path(SMALL)
+    monkeypatch.setattr(synthetic_people, "build_synthetic", lambda recipe, progress: calls.append(recipe) or built[1])
+    other = SyntheticRecipe(seed=6)
+    assert synthetic_path(other) != synthetic_path(SMALL)
     for _ in range(2):
-        embedded_model(recipe=other)
+        synthetic_model(recipe=other)
     assert calls == [other]
-    embedded_path(other).unlink()
+    synthetic_path(other).unlink()
 
 
 def other_numbers(model):
@@ -80,14 +80,14 @@ def other_numbers(model):
     lambda path, model: worm_model().save(path)], ids=["text", "cut", "bytes", "numbers", "landmarks", "other"])
 def test_a_damaged_or_wrong_model_is_built_anew(built, tmp_path, monkeypatch, damaged):
     monkeypatch.setenv("SCAPEKIT_CACHE", str(tmp_path))
-    shutil.copy(built[0] / embedded_path(SMALL).name, embedded_path(SMALL))
+    shutil.copy(built[0] / synthetic_path(SMALL).name, synthetic_path(SMALL))
     calls = []
-    monkeypatch.setattr(embedded, "build_embedded", lambda recipe, progress: calls.append(recipe) or built[1])
-    embedded_model(recipe=SMALL)
+    monkeypatch.setattr(synthetic_people, "build_synthetic", lambda recipe, progress: calls.append(recipe) or built[1])
+    synthetic_model(recipe=SMALL)
     assert not calls
-    damaged(embedded_path(SMALL), built[1])
+    damaged(synthetic_path(SMALL), built[1])
     for _ in range(2):
-        model = embedded_model(recipe=SMALL)
+        model = synthetic_model(recipe=SMALL)
         np.testing.assert_array_equal(model.shape_space.mean, built[1].shape_space.mean)
     assert calls == [SMALL]
 
@@ -102,29 +102,29 @@ def test_processes_that_start_at_once_build_it_once(built, tmp_path, monkeypatch
         time.sleep(0.5)
         return built[1]
 
-    monkeypatch.setattr(embedded, "build_embedded", slow)
+    monkeypatch.setattr(synthetic_people, "build_synthetic", slow)
     with ThreadPoolExecutor(3) as pool:
-        models = list(pool.map(lambda _: embedded_model(recipe=SMALL), range(3)))
+        models = list(pool.map(lambda _: synthetic_model(recipe=SMALL), range(3)))
     assert len(models) == 3 and calls == [SMALL]
-    assert [p.name for p in tmp_path.iterdir()] == [embedded_path(SMALL).name]
+    assert [p.name for p in tmp_path.iterdir()] == [synthetic_path(SMALL).name]
 
 
 def test_only_what_is_ours_goes_from_the_cache(built, tmp_path, monkeypatch):
     monkeypatch.setenv("SCAPEKIT_CACHE", str(tmp_path))
-    monkeypatch.setattr(embedded, "build_embedded", lambda recipe, progress: built[1])
-    stem = embedded_path(SMALL).stem
+    monkeypatch.setattr(synthetic_people, "build_synthetic", lambda recipe, progress: built[1])
+    stem = synthetic_path(SMALL).stem
     for name in (f".{stem}.123.part.npz", ".other.123.part.npz", f"{stem}.txt", "mine.npz"):
         (tmp_path / name).write_text("mine")
-    embedded_model(recipe=SMALL)
+    synthetic_model(recipe=SMALL)
     assert {p.name for p in tmp_path.iterdir()} == {f"{stem}.npz", ".other.123.part.npz", f"{stem}.txt", "mine.npz"}
 
 
 def test_a_cache_that_cannot_be_written_is_named(tmp_path, built, monkeypatch):
     (tmp_path / "file").write_text("")
     monkeypatch.setenv("SCAPEKIT_CACHE", str(tmp_path / "file" / "inner"))
-    monkeypatch.setattr(embedded, "build_embedded", lambda *_: built[1])
+    monkeypatch.setattr(synthetic_people, "build_synthetic", lambda *_: built[1])
     with pytest.raises(ValueError, match=r"inner.*SCAPEKIT_CACHE"):
-        embedded_model(recipe=SMALL)
+        synthetic_model(recipe=SMALL)
 
 
 def test_without_the_variable_it_is_the_users_cache(monkeypatch):
@@ -134,9 +134,9 @@ def test_without_the_variable_it_is_the_users_cache(monkeypatch):
 
 
 def test_commands_name_the_model(cache, built, tmp_path, monkeypatch):
-    monkeypatch.setattr(embedded, "EmbeddedRecipe", lambda: SMALL)
+    monkeypatch.setattr(synthetic_people, "SyntheticRecipe", lambda: SMALL)
     model, name = read_model(None)
-    assert name == f"embedded people, built {built[1].info['built']}, cached at {embedded_path(SMALL)}"
+    assert name == f"synthetic people, built {built[1].info['built']}, cached at {synthetic_path(SMALL)}"
     model.save(tmp_path / "own.npz")
     assert read_model(tmp_path / "own.npz")[1] == str(tmp_path / "own.npz")
 
