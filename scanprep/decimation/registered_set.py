@@ -168,7 +168,117 @@ def _different_meshes(template: Mesh, poses: np.ndarray | None, count: int) -> n
     if np.ndim(poses) != 3 or np.shape(poses)[1:] != template.vertices.shape:
         raise ValueError(f"poses: expected shape (M, {len(template.vertices)}, 3), got {np.shape(poses)}")
     R, t = rotations.procrustes(poses, np.broadcast_to(centred, poses.shape))[:2]
-from ..dataset import RegisteredSet
-from ..geometry import rotations, storage
-from ..geometry.farthest_points import farthest_points
-from ..geometry.landmarks import read_landmark_vertices, write_landmarks
+    placed = np.concatenate([centred[None], np.einsum("mij,mnj->mni", R, poses) + t[:, None]])
+    return placed[farthest_points(
+        placed, count, 0, lambda i, _: np.sqrt(((placed - placed[i]) ** 2).sum(axis=2).mean(axis=1)), least=1e-9)]
+
+
+def _assembled(source: Mesh, skeleton: Skeleton | None, vertex_map: np.ndarray, owner: np.ndarray,
+               face_map: np.ndarray, fixed: np.ndarray, config: DecimateSetConfig) -> DecimatedSet:
+    """The result of `decimate_set` from its maps and the original template and skeleton."""
+    labels = None if skeleton is None else skeleton.part_of_face
+    small = Mesh(source.vertices[vertex_map], owner[source.faces[face_map]],
+                 None if source.colors is None else source.colors[vertex_map])
+    out = DecimatedSet(small, vertex_map, owner, face_map, None, source, labels, fixed, config)
+    small = small.with_vertices(out.transfer(source.vertices))
+    return replace(out, template=small,
+                   skeleton=None if skeleton is None else _smaller_skeleton(skeleton, face_map, small))
+
+
+def _smaller_skeleton(skeleton: Skeleton, face_map: np.ndarray, template: Mesh) -> Skeleton:
+    """The same parts and joints on fewer triangles; ValueError where a part lost all of its own."""
+    parts = skeleton.part_of_face[face_map]
+    lost = np.setdiff1d(np.arange(len(skeleton.parents)), parts)
+    if len(lost):
+        raise ValueError(f"faces: {len(template.faces)} are too few, no triangle is left of part "
+                         f"{skeleton.names[lost[0]]}")
+    small = Skeleton(parts, skeleton.parents, skeleton.joints, skeleton.names)
+    joints = np.array(skeleton.joints)
+    joints[0] = template.vertices[small.part_of_vertex(template) == 0].mean(axis=0)
+    return replace(small, joints=joints)
+
+
+def write_decimated_set(source: Path | str | RegisteredSet, folder: Path | str, faces: int,
+                        config: DecimateSetConfig | None = None, progress: Progress | None = None) -> RegisteredSet:
+    """Write a registered set with fewer triangles: template, meshes, skeleton, landmarks and the map.
+
+    Every file is written whole or not at all and the map first, so that a run that was interrupted goes on where
+    it was; meshes that are there are not written again.
+
+    Parameters
+    ----------
+    source : path or RegisteredSet
+        Landmarks in `landmarks.json` of its folder stay on their vertices.
+    folder : path
+        New, or that of an earlier run with the same source and settings.
+    faces : int
+    config : DecimateSetConfig, optional
+    progress : callback(done, total), optional
+        Called after every mesh.
+
+    Returns
+    -------
+    RegisteredSet
+
+    Raises
+    ------
+    ValueError
+        The folder is that of the source, or holds something else.
+    """
+    config = config or DecimateSetConfig()
+    source = source if isinstance(source, RegisteredSet) else RegisteredSet.load(source)
+    folder = Path(folder)
+    if folder.resolve() == source.folder.resolve():
+        raise ValueError(f"folder: expected another one than that of the source, got {folder}")
+    named = source.folder / "landmarks.json"
+    landmarks = read_landmark_vertices(named, source.template) if named.exists() else {}
+    settings = {"faces": faces, "config": dataclasses.asdict(config), "source": _fingerprint(source, landmarks)}
+    path = folder / "decimation.npz"
+    if path.exists():
+        done = _load_map(path, source, config, settings)
+    elif (folder / "set.json").exists():
+        raise ValueError(f"folder: {folder} holds a registered set that is no decimation")
+    else:
+        step = max(-(-len(source.names) // MOST_READ), 1)
+        some = source.names[::step] if config.meshes > 1 else ()
+        done = decimate_set(source.template, source.vertices(some) if some else None, faces, config,
+                            np.array(list(landmarks.values()), dtype=np.int64), source.skeleton)
+        storage.save(path, KIND, VERSION, {name: getattr(done, name) for name in _MAPS}, settings)
+    if landmarks:
+        write_landmarks(folder / "landmarks.json", done.landmarks(landmarks))
+    info = {**source.info, "decimated_from": {"vertices": len(source.template.vertices),
+                                              "faces": len(source.template.faces)}}
+    out = RegisteredSet.create(folder, done.template, info)
+    if done.skeleton is not None:
+        out = out.with_skeleton(done.skeleton)
+    for number, entry in enumerate(source.entries, 1):
+        if entry.name not in out.names:
+            out = out.add(entry.name, done.transfer(source.vertices([entry.name])[0]), entry.subject, entry.pose,
+                          entry.sex)
+        if progress is not None:
+            progress(number, len(source.entries))
+    return out
+
+
+def _fingerprint(source: RegisteredSet, landmarks: dict[str, int]) -> str:
+    """What a decimation depends on, apart from its settings and the meshes there were when it was made."""
+    parts = np.zeros(0, dtype=np.int64) if source.skeleton is None else source.skeleton.part_of_face
+    kept = np.array(list(landmarks.values()), dtype=np.int64)
+    digest = hashlib.sha256()
+    for array in (source.template.vertices, source.template.faces, kept, parts):
+        digest.update(np.ascontiguousarray(array).tobytes())
+    return digest.hexdigest()
+
+
+def _load_map(path: Path, source: RegisteredSet, config: DecimateSetConfig, settings: dict[str, Any]) -> DecimatedSet:
+    header, arrays = storage.load(path, KIND, (VERSION,))
+    if isinstance(header.get("config"), dict):
+        header["config"].pop("rounds", None)             # settings that older files hold and that are constants now
+    if {key: header.get(key) for key in settings} != storage.as_json(settings):
+        raise ValueError(f"{path}: the folder holds a decimation of another set or with other settings")
+    with storage.taking_apart(path, "the maps between two templates"):
+        vertex_map, owner, face_map, fixed = (storage.numbers(arrays, name, None, kinds="biu") for name in _MAPS)
+        for name, most in (("vertex_map", len(owner)), ("face_map", len(source.template.faces))):
+            if len(arrays[name]) and not 0 <= arrays[name].min() <= arrays[name].max() < most:
+                raise ValueError(f"{name}: expected numbers 0..{most - 1}")
+        return _assembled(source.template, source.skeleton, vertex_map, owner, face_map, fixed, config)
