@@ -1,7 +1,7 @@
 """What a pose model is linear in: functions of the joint twists, and their products with part rotations."""
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, Protocol
@@ -230,26 +230,30 @@ class PoseFeatures:
         return np.swapaxes(by_joint, -2, -3)
 
 
-def linear_features(skeleton: Skeleton, directions: tuple[np.ndarray, ...]) -> PoseFeatures:
-    """The features of the paper: for every part a constant and the kept twist directions of its joints.
-
-    Parameters
-    ----------
-    directions : J arrays (3, k_j)
-        Orthonormal twist directions of each joint that are kept; none for the root.
+def part_features(skeleton: Skeleton, lift: Lift, axes: Sequence[np.ndarray],
+                  joints_of_part: Sequence[Sequence[int]] | None = None) -> PoseFeatures:
+    """For every part a constant, and the mixtures `axes` (J arrays (m, k_j)) of the lifted twists of its joints.
 
     [SCAPE] Eq. 3
     """
     J = len(skeleton.parents)
     part, columns = [], []
-    for p, joints in enumerate(skeleton.joints_of_part):
-        kept = [(j, direction) for j in joints for direction in directions[j].T]
-        part += [p] * (1 + len(kept))
-        columns.append(np.zeros((J, 3)))
-        for j, direction in kept:
-            columns.append(np.zeros((J, 3)))
-            columns[-1][j] = direction
-    return PoseFeatures(skeleton, LinearLift(), np.array(part), np.stack(columns, axis=-1))
+    for p, joints in enumerate(skeleton.joints_of_part if joints_of_part is None else joints_of_part):
+        part += [p] * (1 + sum(axes[j].shape[1] for j in joints))
+        columns.append(np.zeros((J, lift.width, 1)))
+        for j in joints:
+            column = np.zeros((J, lift.width, axes[j].shape[1]))
+            column[j] = axes[j]
+            columns.append(column)
+    return PoseFeatures(skeleton, lift, np.array(part), np.concatenate(columns, axis=-1))
+
+
+def linear_features(skeleton: Skeleton, directions: Sequence[np.ndarray]) -> PoseFeatures:
+    """The features of the paper: for every part a constant and the twist directions (3, k_j) of its joints.
+
+    [SCAPE] Eq. 3
+    """
+    return part_features(skeleton, LinearLift(), directions)
 
 
 @dataclass(frozen=True, eq=False)

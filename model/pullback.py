@@ -36,8 +36,8 @@ def pull_back(model: BodyModel, force: np.ndarray, pose: np.ndarray, betas: np.n
 
 @pull_back.register
 def _(model: ScapeModel, force: np.ndarray, pose: np.ndarray, betas: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    skeleton, space, weights = model.skeleton, model.pose_space, model.rotation_weights
-    R, v_hat, Q = skeleton.part_rotations(pose), model._v_hat, space.gradients(pose)
+    skeleton, space, weights = model.skeleton, model.pose_space, model.blend_weights
+    R, v_hat, Q = skeleton.part_rotations(pose), model.parts.v_hat, space.gradients(pose)
     pulled = (model.stitching.edge_operator @ model.stitching.solve_adjoint(force)).reshape(-1, 2, 3)
     S, posed = model.shape_space.gradients(betas), v_hat @ np.swapaxes(Q, -1, -2)                 # rows (Q v̂)ᵀ
     local = pulled @ np.tensordot(weights, R, axes=1)                                            # rows (Rᵀ z)ᵀ

@@ -6,15 +6,14 @@ from dataclasses import replace
 
 import numpy as np
 from completion_bodies import MEAN, SD
+from model.learning.skin import SkinConfig, corrective_features
 from model_bodies import worm, worm_model, worm_skeleton
 
-from model.blendscape import BlendScapeModel
 from model.body import BodyModel
 from model.features import Lift, PoseFeatures, QuadraticLift, RadialLift
-from model.learning.skin import SkinConfig, corrective_features
 from model.learning.skin_weights import diffused_weights
 from model.pose_space import PoseSpace
-from model.scape import ScapeModel
+from model.scape import BlendScapeModel, ScapeModel
 from model.skinning import SkinningModel
 from scanprep.geometry.mesh import Mesh
 from scanprep.skeleton.tree import Skeleton

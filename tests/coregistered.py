@@ -6,7 +6,7 @@ from unittest import mock
 
 from model.coregistration import cli
 from model.coregistration.config import CoregistrationConfig, ModelFitConfig
-from model.learning.scape import LearnConfig
+from model.learning.config import LearnConfig
 from scanprep import console
 from scanprep.batch.pool import Workers
 from scanprep.registration.schedule import GraphStage, RegistrationConfig, ShellStage

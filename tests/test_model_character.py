@@ -7,11 +7,11 @@ from model_bodies import random_poses, worm_model
 from posing_bodies import skinned, symmetric_worm
 
 from model import load_model
-from model.blendscape import BlendScapeModel
 from model.cli import group
 from model.learning.sex_plane import PLANE
 from model.posing.character import CharacterConfig, character_model, character_pose
 from model.posing.character_mesh import CharacterMeshConfig, inside, register_character
+from model.scape import BlendScapeModel
 from scanprep import Mesh, write_landmarks, write_mesh
 from scanprep.geometry import rotations
 from scanprep.registration.schedule import RegistrationConfig

@@ -4,13 +4,13 @@ from itertools import pairwise
 
 import numpy as np
 import pytest
+from model.learning.skin import SkinConfig
 from model_bodies import random_poses, worm_model
 
 from model import LearnConfig, load_model
 from model.learning.cli import Other, learn
 from model.learning.mixing import MixConfig
 from model.learning.parts import PartsConfig, choose_skeleton
-from model.learning.skin import SkinConfig
 from scanprep import RegisteredSet, write_mesh
 from scanprep.batch.opening import beside
 

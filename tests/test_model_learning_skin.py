@@ -3,9 +3,6 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from conformance_bodies import skinned_worm
-from model_bodies import random_poses, worm, worm_skeleton
-
-from model.fitting import fit_pose, fit_shape
 from model.learning.skin import (
     SkinConfig,
     _with_joints,
@@ -15,6 +12,9 @@ from model.learning.skin import (
     learn_skinning,
 )
 from model.learning.skin_people import unposed_person
+from model_bodies import random_poses, worm, worm_skeleton
+
+from model.fitting import fit_pose, fit_shape
 from model.learning.skin_weights import _onto_simplex, diffused_weights, fit_weights, kept_weights
 from scanprep.geometry import rotations
 from scanprep.geometry.mesh import Mesh

@@ -4,8 +4,8 @@ import numpy as np
 import pytest
 from model_bodies import random_poses, worm_model, worm_skeleton
 
+from model import LearnConfig, learn_scape
 from model.fitting import fit_pose, fit_shape
-from model.learning import LearnConfig, learn_scape
 from model.learning.mixing import MixConfig, learn_scape_mix
 from model.learning.within import Within
 

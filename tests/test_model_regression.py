@@ -1,9 +1,9 @@
 import numpy as np
 import pytest
+from model.learning.compress import condense
 from model_bodies import random_poses, worm_model
 
 from model.features import PoseFeatures, QuadraticLift
-from model.learning.compress import condense
 from model.learning.regression import Design, RegressionConfig, choose_design
 from model.pose_space import PoseSpace
 

@@ -21,7 +21,7 @@ from scanprep.threads import one_thread
 from ..learning.scape import learn_scape
 from ..scape import ScapeModel
 from .attraction import apart
-from .config import CoregistrationConfig
+from .config import EXPLAINED, CoregistrationConfig
 from .rounds import Coregistration, coregister, kept_or_not
 from .single import Landmarks
 
@@ -145,6 +145,6 @@ def learn_from_scans(template: Mesh, scans: Sequence[Mesh | np.ndarray], landmar
 def explained_share(mesh: Mesh, scan: Mesh | np.ndarray, config: CoregistrationConfig) -> float:
     """Share of the points of a scan that lie near a registered mesh and do not face away from it."""
     size = float(np.sqrt(mesh.face_areas.sum()))
-    limit = config.explained * size
+    limit = EXPLAINED * size
     target = orient(target_of(scan).thinned(DETAIL * size), mesh, config.fit.normal_weight * size)
     return float((apart(mesh, target, limit) < limit).mean())

@@ -14,12 +14,11 @@ from scanprep.batch.room import Room
 from scanprep.batch.workspace import Task, Workspace
 from scanprep.geometry.mesh import Mesh
 from scanprep.meaning import extent, unit_problem
-from scanprep.skeleton.find import find_skeleton
-from scanprep.skeleton.tree import Skeleton
 from scanprep.threads import one_thread
 
 from ..body import BodyModel
-from ..learning.scape import BlendConfig, learn_blendscape, learn_scape
+from ..learning.config import LearnConfig
+from ..learning.scape import learn_blendscape, learn_scape
 from ..linear import Subject
 from .config import CoregistrationConfig
 from .single import Landmarks, ModelRegistration, register_with_model
@@ -188,23 +187,11 @@ def kept_or_not(space: Workspace | None) -> Iterator[Workspace]:
         yield space or stack.enter_context(workspace(stack.enter_context(tempfile.TemporaryDirectory())))
 
 
-def _of_one(config: CoregistrationConfig) -> CoregistrationConfig:
-    return CoregistrationConfig(fit=config.fit, registration=config.registration, alignments=config.alignments,
-                                explained=config.explained)
-
-
-def learn_again(model: BodyModel, poses: np.ndarray, shapes: np.ndarray | None, config: CoregistrationConfig
-                ) -> BodyModel:
+def learn_again(model: BodyModel, poses: np.ndarray, shapes: np.ndarray | None, config: LearnConfig) -> BodyModel:
     """A model of the same kind from registered poses (M, N, 3) of the template's person and others (S, N, 3)."""
-    template = model.template
-    skeleton: Skeleton = model.skeleton if config.skeleton is None \
-        else find_skeleton(template, poses, config.skeleton)
-    bodies = np.concatenate([template.vertices[None], poses])
-    if model.kind == "blendscape":
-        blend = config.learn if isinstance(config.learn, BlendConfig) else BlendConfig(**vars(config.learn))
-        learned: BodyModel = learn_blendscape(template, bodies, shapes, skeleton, blend)
-    else:
-        learned = learn_scape(template, bodies, shapes, skeleton, config.learn)
+    bodies = np.concatenate([model.template.vertices[None], poses])
+    learn = learn_blendscape if model.kind == "blendscape" else learn_scape
+    learned: BodyModel = learn(model.template, bodies, shapes, model.skeleton, config)
     marks = {"landmarks": model.info["landmarks"]} if "landmarks" in model.info else {}
     return replace(learned, info={**learned.info, **marks})                                 # type: ignore[type-var]
 
@@ -227,7 +214,7 @@ def _registered(space: Workspace, model: BodyModel, given: Sequence[OneScan], na
 
     tasks = {name: Task(task_name(turn, name), one) for name, one in zip(names, given, strict=True)}
     with one_thread():
-        found = space.run(RegisterWithModel(model, _of_one(config)), list(tasks.values()), config.workers, tell)
+        found = space.run(RegisterWithModel(model, CoregistrationConfig(fit=config.fit, registration=config.registration)), list(tasks.values()), config.workers, tell)
     return ([found.values.get(task.name) for task in tasks.values()],
             {name: found.failures[task.name] for name, task in tasks.items() if task.name in found.failures})
 
@@ -235,8 +222,8 @@ def _registered(space: Workspace, model: BodyModel, given: Sequence[OneScan], na
 def _taught(space: Workspace, model: BodyModel, lessons: Lessons, config: CoregistrationConfig, turn: int
             ) -> BodyModel:
     """The model of a round."""
-    return space.step(f"model of round {turn + 1}", (model, lessons, config.learn, config.skeleton),
-                      lambda _: learn_again(model, *lessons, config))
+    return space.step(f"model of round {turn + 1}", (model, lessons, config.learn),
+                      lambda _: learn_again(model, *lessons, config.learn))
 
 
 def _lessons(registrations: Sequence[ModelRegistration | None], good: np.ndarray, own: np.ndarray,

@@ -9,7 +9,7 @@ import numpy as np
 from scanprep.geometry.landmarks import match_landmarks
 from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.surface import checked_points, checked_surface
-from scanprep.ranges import Count, Settings
+from scanprep.ranges import Settings
 from scanprep.registration.nonrigid import Registration, register
 from scanprep.registration.schedule import RegistrationConfig
 
@@ -18,6 +18,8 @@ from .character import CharacterConfig, character_model, character_pose
 
 Progress = Callable[[int, int], None]
 
+# a character is farther from people than people are from each other, and one registration does not stretch so far
+ROUNDS = 2
 LOST = 0.5                  # share of the character missed, or of joints outside it, that means nothing
 
 
@@ -27,21 +29,12 @@ class CharacterMeshConfig(Settings):
 
     Attributes
     ----------
-    rounds : int
-        Times that the template is registered, each time from where it came: a character is farther from people than
-        people are from each other, and one registration does not stretch so far.
     register : RegistrationConfig
         Of every round.
     character : CharacterConfig
         How the character becomes the mean of the model.
-
-    Raises
-    ------
-    ValueError
-        Less than one round.
     """
 
-    rounds: Count = 2
     register: RegistrationConfig = field(default_factory=RegistrationConfig)
     character: CharacterConfig = field(default_factory=CharacterConfig)
 
@@ -121,9 +114,9 @@ def _registered(template: Mesh, mesh: Mesh, vertices: np.ndarray, points: np.nda
     tell = progress or (lambda done, total: None)
     size = _spread(template.vertices[vertices]) / _spread(points)
     start = template.with_vertices(template.vertices / size)
-    for k in range(config.rounds):
+    for k in range(ROUNDS):
         def told(done: int, total: int, before: int = k) -> None:
-            tell(before * total + done, config.rounds * total)
+            tell(before * total + done, ROUNDS * total)
 
         fit = register(start, mesh, (vertices, points), config.register, told)
         start = fit.mesh

@@ -30,7 +30,7 @@ from model.coregistration.config import CoregistrationConfig
 from model.coregistration.first import explained_share
 from model.coregistration.rounds import coregister, task_name
 from model.coregistration.single import register_with_model
-from model.learning.scape import LearnConfig
+from model.learning.config import LearnConfig
 from scanprep.batch.opening import workspace
 from scanprep.batch.pool import Workers
 from scanprep.decimation.decimate import decimate

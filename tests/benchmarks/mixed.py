@@ -15,9 +15,9 @@ import time
 import numpy as np
 from protocols import machine, write_report
 
+from model import LearnConfig, learn_scape
 from model.body import BodyModel
 from model.fitting import FitConfig, PoseFitter, ShapeFitter
-from model.learning import LearnConfig, learn_scape
 from model.learning.mixing import MixConfig, learn_scape_mix
 from scanprep.geometry.mesh import Mesh
 from scanprep.skeleton.tree import Skeleton

@@ -12,9 +12,9 @@ import time
 from pathlib import Path
 
 import numpy as np
+from model.carriers import rigid_weights
 from protocols import load_real, machine, scape_fold, write_report
 
-from model.carriers import rigid_weights
 from model.fitting import PoseFitter
 from model.learning import Carriage, Ticks
 from model.learning.parts import coarse_copy, coarse_skeleton
