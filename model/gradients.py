@@ -31,25 +31,6 @@ def edges(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
     return np.stack([vertices[..., faces[:, 1], :] - first, vertices[..., faces[:, 2], :] - first], axis=-2)
 
 
-def local_edges(vertices: np.ndarray, faces: np.ndarray, R: np.ndarray) -> np.ndarray:
-    """The edges of an instance seen from the frame of each triangle's part, `Rᵀ v`.
-
-    Parameters
-    ----------
-    vertices : (..., N, 3) float, metres
-    faces : (F, 3) int
-    R : (..., F, 3, 3) float
-        Rotation of the part of every triangle.
-
-    Returns
-    -------
-    (..., F, 2, 3) float, metres
-
-    [SCAPE] Eq. 1
-    """
-    return edges(vertices, faces) @ R
-
-
 @dataclass(frozen=True, eq=False)
 class GradientSystem:
     """The least-squares systems of Eq. 5 and Eq. 8 over the triangles of one template.

@@ -71,7 +71,7 @@ class ShapeSpace:
 
         [SCAPE] Eq. 7
         """
-        flat = self.components.reshape(self.count, -1)
+        flat = self.components.reshape(self.count, self.mean.size)
         return np.stack([flat @ (one - self.mean).ravel() for one in S]) / (flat**2).sum(axis=1)
 
     def first(self, count: int | None) -> ShapeSpace:

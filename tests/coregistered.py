@@ -1,7 +1,5 @@
 """Co-registration in haste; started as a program it is `scape model coregister` with one round."""
 import sys
-from dataclasses import replace
-from functools import partial
 from unittest import mock
 
 from model.coregistration import cli
@@ -16,12 +14,13 @@ QUICK = CoregistrationConfig(
     registration=RegistrationConfig(graph=(GraphStage(80, 0.09, 0.009, 0.7, 0.01, 0.08),
                                            GraphStage(80, 0.06, 0.006, 0.7, 0.01, 0.05)),
                                     shell=(ShellStage(0.02, 0.007, 0.0002, 0.02),), settle=None),
-    learn=LearnConfig(refinements=1, steps=1), rounds=2, workers=Workers(1))
+    learn=LearnConfig(refinements=1), rounds=2, workers=Workers(1))
 
 
 def run(argv):
     """Exit code of the command."""
-    with mock.patch.object(cli, "CoregistrationConfig", partial(replace, QUICK)):
+    quick = (*cli.coregister_scans.__defaults__[:-1], QUICK)
+    with mock.patch.object(cli.coregister_scans, "__defaults__", quick):
         return console.run(cli.coregister_scans, "scape model coregister", ["--rounds", "1", "--failed", "0.05", *argv])
 
 

@@ -304,11 +304,11 @@ def test_only_what_depends_on_a_change_is_made_anew(story, asked, tmp_path, what
         elif what == "the model":
             model = replace(first, pose_mean=first.pose_mean + 1e-9)        # of the same training set
         elif what == "settings":
-            config = replace(config, explained=0.9 * QUICK.explained)
+            config = replace(config, fit=replace(QUICK.fit, axes=3))
         elif what == "what fails":
             config = replace(config, failed=0.5 * QUICK.failed)
         elif what == "learning":
-            config = replace(config, learn=replace(QUICK.learn, steps=2))
+            config = replace(config, learn=replace(QUICK.learn, refinements=2))
         elif what == "more rounds":
             config = replace(config, rounds=3)
         again = coregister(model, scans, marks, config, starts, space=space)

@@ -92,7 +92,7 @@ class ModelFitConfig(Settings):
     enough: Share = 0.98
 
 
-EXPLAINED = 0.006                    # share of √area: a scan point nearer to the mesh, and not facing away, is explained
+EXPLAINED = 0.006                    # share of √area: scan points so near to the mesh, facing alike, are explained
 
 # the predicted mesh lies near already: fine stages only, whose stiffness is relative to the prediction's own shape
 NEAR = RegistrationConfig(graph=(

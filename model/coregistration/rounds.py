@@ -204,7 +204,7 @@ def _own(subjects: Sequence[str] | None, n: int) -> np.ndarray:
     return np.array([subject == most for subject in subjects])
 
 
-def _registered(space: Workspace, model: BodyModel, given: Sequence[OneScan], names: Sequence[str],
+def _registered(space: Workspace, model: BodyModel, scans: Sequence[OneScan], names: Sequence[str],
                 config: CoregistrationConfig, turn: int, progress: Progress | None
                 ) -> tuple[list[ModelRegistration | None], dict[str, str]]:
     """One round of registrations, in the order of the scans, and by name why some could not be registered."""
@@ -212,9 +212,10 @@ def _registered(space: Workspace, model: BodyModel, given: Sequence[OneScan], na
         if progress is not None:
             progress(turn * total + done, config.rounds * total)
 
-    tasks = {name: Task(task_name(turn, name), one) for name, one in zip(names, given, strict=True)}
+    tasks = {name: Task(task_name(turn, name), given) for name, given in zip(names, scans, strict=True)}
     with one_thread():
-        found = space.run(RegisterWithModel(model, CoregistrationConfig(fit=config.fit, registration=config.registration)), list(tasks.values()), config.workers, tell)
+        one = CoregistrationConfig(fit=config.fit, registration=config.registration)
+        found = space.run(RegisterWithModel(model, one), list(tasks.values()), config.workers, tell)
     return ([found.values.get(task.name) for task in tasks.values()],
             {name: found.failures[task.name] for name, task in tasks.items() if task.name in found.failures})
 
