@@ -1,4 +1,4 @@
-"""The pages of the reference, written when the site is built: every command's help, every public name, every equation."""
+"""The pages of the reference, written when the site is built: help of commands, public names, equations."""
 from __future__ import annotations
 
 import ast
@@ -61,8 +61,8 @@ def equations() -> dict[tuple[str, int], set[str]]:
     for package in PACKAGES:
         for path in sorted((ROOT / package).rglob("*.py")):
             text = path.read_text(encoding="utf-8")
-            owners = sorted((node.lineno, node.end_lineno or node.lineno, node.name) for node in ast.walk(ast.parse(text))
-                            if isinstance(node, ast.FunctionDef | ast.ClassDef))
+            nodes = [n for n in ast.walk(ast.parse(text)) if isinstance(n, ast.FunctionDef | ast.ClassDef)]
+            owners = sorted((node.lineno, node.end_lineno or node.lineno, node.name) for node in nodes)
             for i, line in enumerate(text.splitlines(), 1):
                 for key, numbers in re.findall(r"\[([A-Za-z-]+)\] Eq\. (\d+(?:(?:-|, | and )\d+)*)", line):
                     around = [name for first, last, name in owners if first <= i <= last]

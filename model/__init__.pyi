@@ -62,9 +62,9 @@ from .scape import ScapeModel as ScapeModel
 from .skinning import SkinningModel as SkinningModel
 from .statue.control.humanoid import humanoid as humanoid
 from .statue.control.model import ControlModel as ControlModel
+from .statue.control.model import DisplacementMap as DisplacementMap
+from .statue.control.model import Statue as Statue
 from .statue.files import load_statue as load_statue
 from .statue.files import save_statue as save_statue
 from .statue.fit import StatueConfig as StatueConfig
 from .statue.fit import fit_statue as fit_statue
-from .statue.statue import DisplacementMap as DisplacementMap
-from .statue.statue import Statue as Statue

@@ -11,7 +11,8 @@ import pytest
 ROOT = Path(__file__).parents[1]
 PACKAGES = ("scanprep", "model", "completion")          # each may import itself and those before it
 MODULES = sorted(path for package in PACKAGES for path in (ROOT / package).rglob("*.py"))
-PAPERS = set(re.findall(r"\[([A-Za-z-]+)\]", (ROOT / "README.md").read_text(encoding="utf-8").split("## References")[1]))
+REFERENCES = (ROOT / "README.md").read_text(encoding="utf-8").split("## References")[1]
+PAPERS = set(re.findall(r"\[([A-Za-z-]+)\]", REFERENCES))
 WITH_EQUATIONS = {"SCAPE": 11, "Statues": 23, "MoSh": 27}  # the papers at hand, and their last equation
 HEAVY = {"open3d", "pymeshlab", "matplotlib", "PIL", "trimesh", "ezc3d", "igl", "cholespy", "embreex", "pygltflib",
          "fast_simplification", "tyro", "rich", "skimage", "sklearn"}
