@@ -231,10 +231,7 @@ class BodyModel(ABC):
 def restored_parts(header: Mapping[str, Any], arrays: Mapping[str, np.ndarray], version: int) -> dict[str, Any]:
     """What every kind of model has, from a file of it; pose examples where it is of this version, earlier had none.
 
-    Raises
-    ------
-    KeyError, TypeError, ValueError
-        What is missing, or does not fit the rest.
+    KeyError, TypeError or ValueError for what is missing or does not fit the rest.
     """
     J = len(np.atleast_1d(arrays["parents"]))
     skeleton = Skeleton(storage.numbers(arrays, "part_of_face", None, kinds="iu"),

@@ -27,12 +27,7 @@ def twists(pose: np.ndarray) -> np.ndarray:
 class Lift(Protocol):
     """A fixed map of the twists of each joint to a few numbers a joint, in which a regression is linear.
 
-    Attributes
-    ----------
-    kind : str
-        The name of the map in files.
-    width : int
-        m, the numbers of each joint.
+    Its kind names it in files; width is m, the numbers of each joint.
     """
 
     kind: str
@@ -94,13 +89,7 @@ class QuadraticLift:
 
 @dataclass(frozen=True, eq=False)
 class RadialLift:
-    """The twist, and Gaussian bells around twists that were seen.
-
-    Parameters
-    ----------
-    centres : (J, m, 3) float, radians
-    radius : (J,) float, radians
-        Standard deviation of the bells of each joint.
+    """The twist, and Gaussian bells of standard deviation `radius` (J,) around twists `centres` (J, m, 3), radians.
 
     [SCAPE-patent] §0087
     """
@@ -158,14 +147,8 @@ def restored_features(skeleton: Skeleton, header: Mapping[str, Any], arrays: Map
 class PoseFeatures:
     """What Q is linear in: for every part a constant, and mixtures of the lifted twists of its joints.
 
-    Parameters
-    ----------
-    skeleton : Skeleton
-    lift : Lift
-    part : (A,) int
-        The part of every feature, in rising order; the first feature of each part is its constant.
-    mix : (J, m, A) float
-        How much each lifted number counts in each feature; zero for the constants.
+    `part` (A,) is the part of every feature, rising, the first of each its constant; `mix` (J, m, A) is how much each lifted
+    number counts in each feature, zero for the constants.
 
     [SCAPE] Eq. 3
     """
@@ -258,15 +241,7 @@ def linear_features(skeleton: Skeleton, directions: Sequence[np.ndarray]) -> Pos
 
 @dataclass(frozen=True, eq=False)
 class Terms:
-    """The products of a feature and a part's rotation in which the vertices of a fixed body are linear.
-
-    Parameters
-    ----------
-    features : PoseFeatures
-    part : (M,) int
-        Whose rotation.
-    feature : (M,) int
-    """
+    """The products of a `feature` (M,) and the rotation of a `part` (M,) in which the vertices of a fixed body are linear."""
 
     features: PoseFeatures
     part: np.ndarray

@@ -33,16 +33,8 @@ LOST = 0.5                           # mean share of the scans explained below w
 class Round:
     """What one round brought.
 
-    Attributes
-    ----------
-    failed : int
-        Scans that the template does not explain.
-    explained : float
-        Mean share of the points of a scan that it explains.
-    apart : float, metres
-        Median over the scans of the root mean square distance from mesh to model.
-    change : float, metres
-        How far the mean vertex of the scans that have not failed moved since the round before; NaN in the first.
+    How many scans failed, the mean share of a scan's points that is explained, the median distance from mesh to model (root
+    mean square, metres), and how far the mean vertex moved since the round before, metres; NaN in the first.
     """
 
     failed: int
@@ -79,14 +71,7 @@ class Coregistration:
 
 @dataclass(frozen=True, eq=False)
 class RegisterWithModel:
-    """The work on each scan of a round.
-
-    Attributes
-    ----------
-    model : BodyModel
-    config : CoregistrationConfig
-        What one registration depends on; all else is at its defaults.
-    """
+    """The work on each scan of a round, with what one registration depends on; all else is at its defaults."""
 
     model: BodyModel
     config: CoregistrationConfig

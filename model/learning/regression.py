@@ -22,18 +22,8 @@ TUBE = 2e-4                          # metres: smaller errors of an edge cost no
 class Design:
     """What each triangle regresses on, chosen once; fitting it again to other poses and Q is cheap.
 
-    Attributes
-    ----------
-    template : Mesh
-    features : PoseFeatures
-        Before they are made few: every part has all the numbers of all its joints.
-    groups : list of (part, features (n,), faces (f,))
-        Triangles of one part that regress on the same two joints.
-    regressor : {"ridge", "svr"}
-    pruning, radius, ridge : float
-        What was chosen.
-    left_out_error : float, metres
-        What predictions of left-out poses are off.
+    The features are those before they are made few: every part has all the numbers of all its joints. A group is a part, its
+    features (n,), and the triangles (f,) that regress on the same two joints. Of the errors of left-out poses, metres.
     """
 
     template: Mesh

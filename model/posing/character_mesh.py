@@ -41,22 +41,8 @@ class CharacterMeshConfig(Settings):
 
 @dataclass(frozen=True, eq=False)
 class Character:
-    """A character as a body model.
-
-    Attributes
-    ----------
-    model : BodyModel
-        With the character as its mean.
-    mesh : Mesh
-        The template on the character, as it stands.
-    pose : (J, 3) float, radians
-        How it stands.
-    joints : (J, 3) float, metres
-        Where it bends, on `mesh`.
-    inside : (J,) bool
-        Joints that lie inside the character.
-    registration : Registration or None
-        How the template lies on the character; None for a mesh that had the template's triangles.
+    """A character as the mean of a body model, the template on it as it stands, its pose (J, 3), its joints (J, 3), metres, which
+    of them lie inside, and how the template was registered to it, None for a mesh that had the template's triangles.
     """
 
     model: BodyModel
@@ -72,24 +58,9 @@ def register_character(model: BodyModel, mesh: Mesh, landmarks: Mapping[str, np.
                        progress: Progress | None = None) -> Character:
     """Make a model of a character from its mesh: register the template to it, then `character_model`.
 
-    Parameters
-    ----------
-    model : BodyModel
-    mesh : Mesh
-        Of any size, in any place and direction, about in the template's pose; with the template's triangles it is
-        taken as it is, and nothing is registered.
-    landmarks : {name: (3,) float, metres}, optional
-        On the mesh. A dozen spread over the body are enough: tips of hands and feet, elbows, knees, head, trunk.
-    template_landmarks : {name: vertex}, optional
-        Of the template; else those that the model keeps.
-    config : CharacterMeshConfig, optional
-    progress : callable, optional
-        Called as progress(done, total).
-
-    Raises
-    ------
-    ValueError
-        Fewer than four landmarks with the same names, or none for a mesh of other triangles.
+    The mesh has any size, place and direction, and is about in the template's pose; a mesh with the template's triangles is
+    taken as it is. A dozen landmarks spread over the body are enough: tips of hands and feet, elbows, knees, head, trunk.
+    ValueError for fewer than four of the same names.
 
     [MoSh]
     """

@@ -162,11 +162,6 @@ def read_subject(model: BodyModel, given: Path | None, unit: Unit | None = None)
     """The subject named on the command line: betas in JSON or a motion file, or a mesh in the model's topology.
 
     Without a name it is the template's own body; of a mesh it has all the detail, which betas have not.
-
-    Raises
-    ------
-    ValueError
-        A file that is neither, a mesh of another topology.
     """
     if given is None:
         return model.subject(None)

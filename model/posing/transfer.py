@@ -19,18 +19,8 @@ ROUNDS = 2                           # of adding what is left of the body to its
 
 @dataclass(frozen=True, eq=False)
 class OwnBody:
-    """A registered body as a subject of its own.
-
-    Attributes
-    ----------
-    subject : Subject
-    pose : (J, 3) float, radians
-        In which the body was registered.
-    trans : (3,) float, metres
-    vertices : (N, 3) float, metres
-        The subject in that pose and place.
-    mean, largest : float, metres
-        Distances of its vertices from the registered ones.
+    """A registered body as a subject of its own, the pose (J, 3) and place (3,) in which it was registered, the subject there
+    (N, 3), and how far its vertices are from the registered ones, metres.
     """
 
     subject: Subject

@@ -169,19 +169,9 @@ def carry_info(model: BodyModel, template: Mesh) -> dict[str, Any]:
 
 def resolution_gap(model: BodyModel, changed: BodyModel, poses: np.ndarray, betas: np.ndarray | None = None
                    ) -> np.ndarray:
-    """How far two resolutions of a model are apart, at the vertices of the second.
+    """(B,) mean distance, metres, of two resolutions of a model at the vertices of the second, in poses (B, J, 3).
 
-    Parameters
-    ----------
-    model, changed : BodyModel
-    poses : (B, J, 3) float, radians
-    betas : (B, k) float, optional
-        None is the template's own body.
-
-    Returns
-    -------
-    (B,) float, metres
-        Mean over the vertices.
+    With betas (B, k), or of the template's own body.
     """
     follow, gaps = Follower(model.template, changed.template), []
     for b, pose in enumerate(poses):

@@ -21,13 +21,7 @@ SHRINK = 1e-3                        # of the mean square: holds what the poses 
 
 
 class Follower:
-    """The vertices of one triangulation as points that ride on another one.
-
-    Parameters
-    ----------
-    ridden, rider : Mesh
-        At rest.
-    """
+    """The vertices of one triangulation as points that ride on another one, both at rest."""
 
     def __init__(self, ridden: Mesh, rider: Mesh) -> None:
         self._on = Surface(ridden).closest(rider.vertices)
@@ -63,21 +57,10 @@ def _frames(corners: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True, eq=False)
 class Distillation:
-    """Lowers what a carried model leaves of the model it was made of.
+    """Lowers what a carried model leaves of the model it was made of, in rounds.
 
-    The way is that of learning: what is left of every body, as edges in the frames of the parts, is regressed and
-    added to what the triangles have.
-
-    Parameters
-    ----------
-    model : ScapeModel
-        To be imitated.
-    follow : Follower
-        The imitation's vertices on the model's.
-    rounds : int
-        How often.
-    progress : callable, optional
-        Called with the work done and the whole.
+    The way is that of learning: what is left of every body, as edges in the frames of the parts, is regressed and added to
+    what the triangles have. `follow` puts the imitation's vertices on the model's.
     """
 
     model: ScapeModel
