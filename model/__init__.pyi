@@ -2,8 +2,6 @@
 from .body import BodyModel as BodyModel
 from .body import Derivatives as Derivatives
 from .coregistration.config import CoregistrationConfig as CoregistrationConfig
-from .coregistration.first import FirstModel as FirstModel
-from .coregistration.first import learn_from_scans as learn_from_scans
 from .coregistration.rounds import Coregistration as Coregistration
 from .coregistration.rounds import coregister as coregister
 from .coregistration.single import ModelRegistration as ModelRegistration

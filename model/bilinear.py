@@ -14,8 +14,8 @@ from .linear import PointOperator, posed_product
 class ShapedPoints:
     """Surface points as a function of pose, betas and place, with derivatives.
 
-    T of every term (M, L, 3), metres, for the template's own body and the mean person, and its change (K, M, L, 3) for one
-    standard deviation of each beta.
+    T of every term (M, L, 3), metres, for the template's own body and the mean person, and its change (K, M, L, 3) for
+    one standard deviation of each beta.
     """
 
     terms: Terms

@@ -147,8 +147,8 @@ def restored_features(skeleton: Skeleton, header: Mapping[str, Any], arrays: Map
 class PoseFeatures:
     """What Q is linear in: for every part a constant, and mixtures of the lifted twists of its joints.
 
-    `part` (A,) is the part of every feature, rising, the first of each its constant; `mix` (J, m, A) is how much each lifted
-    number counts in each feature, zero for the constants.
+    `part` (A,) is the part of every feature, rising, the first of each its constant; `mix` (J, m, A) is how much each
+    lifted number counts in each feature, zero for the constants.
 
     [SCAPE] Eq. 3
     """
@@ -241,7 +241,9 @@ def linear_features(skeleton: Skeleton, directions: Sequence[np.ndarray]) -> Pos
 
 @dataclass(frozen=True, eq=False)
 class Terms:
-    """The products of a `feature` (M,) and the rotation of a `part` (M,) in which the vertices of a fixed body are linear."""
+    """The products of a `feature` (M,) and the rotation of a `part` (M,) in which the vertices of a fixed body are
+    linear.
+    """
 
     features: PoseFeatures
     part: np.ndarray

@@ -26,8 +26,8 @@ def edges(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
 class GradientSystem:
     """The least-squares systems of Eq. 5 and Eq. 8 over the triangles of one template.
 
-    One row of a gradient is three unknowns a triangle; the three rows share the matrix. With `parts` (F,), neighbours in
-    different parts are not smoothed over. The smoothness times the mean edge length in metres is w_s.
+    One row of a gradient is three unknowns a triangle; the three rows share the matrix. With `parts` (F,), neighbours
+    in different parts are not smoothed over. The smoothness times the mean edge length in metres is w_s.
 
     [SCAPE] Eq. 5
     """
@@ -90,7 +90,8 @@ def pose_gradients(system: GradientSystem, local: np.ndarray) -> np.ndarray:
 
 
 def shape_gradients(system: GradientSystem, posed: np.ndarray, local: np.ndarray) -> np.ndarray:
-    """S (F, 3, 3) of one person from edges `local` in the frames of the parts and `posed`, `Q v̂`, both (F, 2, 3), metres.
+    """S (F, 3, 3) of one person from edges `local` in the frames of the parts and `posed`, `Q v̂`, both (F, 2, 3),
+    metres.
 
     Or (F, 2n, 3) for n scans of one person together.
 

@@ -33,8 +33,8 @@ LOST = 0.5                           # mean share of the scans explained below w
 class Round:
     """What one round brought.
 
-    How many scans failed, the mean share of a scan's points that is explained, the median distance from mesh to model (root
-    mean square, metres), and how far the mean vertex moved since the round before, metres; NaN in the first.
+    How many scans failed, the mean share of a scan's points that is explained, the median distance from mesh to model
+    (root mean square, metres), and how far the mean vertex moved since the round before, metres; NaN in the first.
     """
 
     failed: int

@@ -20,8 +20,8 @@ Progress = Callable[[int, int], None]
 
 @dataclass(frozen=True, eq=False)
 class Errors:
-    """Distances of corresponding vertices, metres: of each body (M,) the mean, 95th percentile and worst, the mean at each
-    vertex (N,), and the mean of each part of each body (M, J).
+    """Distances of corresponding vertices, metres: of each body (M,) the mean, 95th percentile and worst, the mean at
+    each vertex (N,), and the mean of each part of each body (M, J).
     """
 
     mean: np.ndarray

@@ -38,7 +38,8 @@ class Findings:
 
 def evaluation_page(name: str, model: BodyModel, found: Findings, rows: Sequence[tuple[str, Any, str]],
                     notes: Sequence[str] = (), tell: Tell | None = None) -> Page:
-    """The page, self-contained: the closing table (metric, value, unit), what a reader must know, pictures and curves."""
+    """The page, self-contained: the closing table (metric, value, unit), what a reader must know, pictures and curves.
+    """
     page = Page(f"{name}, evaluated", f"A model of kind {model.kind} with {len(model.skeleton.parents)} parts and "
                 f"{model.n_betas} shape components, measured on bodies given to it.")
     for note in notes:

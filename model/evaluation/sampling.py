@@ -141,8 +141,8 @@ def unposed(model: BodyModel, people: np.ndarray, config: FitConfig | None = Non
             ) -> np.ndarray:
     """People (S, N, 3) at rest: `fit_shape` with all components, then the fitted body at zero pose.
 
-    What the fit leaves at every vertex is rotated back with the vertex's part and added, so that it is the person, not the
-    model's idea of the person, that comes to rest.
+    What the fit leaves at every vertex is rotated back with the vertex's part and added, so that it is the person, not
+    the model's idea of the person, that comes to rest.
     """
     fitter, part = ShapeFitter(model, config), model.skeleton.part_of_vertex(model.template)
     rest = np.zeros((len(model.skeleton.parents), 3))

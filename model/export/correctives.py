@@ -14,8 +14,8 @@ STIFF = 0.1                          # share of a blended rotation below which i
 
 @dataclass(frozen=True, eq=False)
 class Correctives:
-    """The changes of the rest mesh that make a skinned motion exact: shapes (C, N, 3), metres, the largest first, and their
-    weights (T, C), of mean square 1.
+    """The changes of the rest mesh that make a skinned motion exact: shapes (C, N, 3), metres, the largest first, and
+    their weights (T, C), of mean square 1.
     """
 
     shapes: np.ndarray

@@ -29,9 +29,10 @@ def body_arrays(model: BodyModel, weights: np.ndarray | None = None, draws: int 
     """A model as linear blend skinning with shape and pose directions.
 
     Posed by `Σ_j weights_j G_j (v_template + shapedirs @ betas + posedirs @ vec(R_1 - I, ..., R_{J-1} - I))`, where G_j
-    rotates about `J_regressor @ (v_template + shapedirs @ betas)` and R_j is the rotation of part j against its parent, row
-    by row. With betas of zero it is the mean person, or the template's own body where the model has no betas. No kind of
-    model here is linear in R - I, so the pose directions are fitted to so many draws from the prior; with 0 there are none.
+    rotates about `J_regressor @ (v_template + shapedirs @ betas)` and R_j is the rotation of part j against its parent,
+    row by row. With betas of zero it is the mean person, or the template's own body where the model has no betas. No
+    kind of model here is linear in R - I, so the pose directions are fitted to so many draws from the prior; with 0
+    there are none.
     """
     mean = np.zeros(1) if model.n_betas else None
     rig = make_rig(model, mean, model.n_betas, weights)
@@ -55,7 +56,9 @@ def pose_features(poses: np.ndarray) -> np.ndarray:
 
 
 def pose_directions(rig: Rig, poses: np.ndarray, exact: np.ndarray) -> np.ndarray:
-    """(N, 3, 9 (J - 1)) changes of the rest mesh by `pose_features` that bring skinning nearest to exact bodies (T, N, 3)."""
+    """(N, 3, 9 (J - 1)) changes of the rest mesh by `pose_features` that bring skinning nearest to exact bodies (T, N,
+    3).
+    """
     X = pose_features(poses)
     changes = rest_corrections(rig, poses, exact).reshape(len(X), -1)
     B = np.linalg.solve(X.T @ X + RIDGE * len(X) * np.eye(X.shape[1]), X.T @ changes)

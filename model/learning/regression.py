@@ -22,8 +22,9 @@ TUBE = 2e-4                          # metres: smaller errors of an edge cost no
 class Design:
     """What each triangle regresses on, chosen once; fitting it again to other poses and Q is cheap.
 
-    The features are those before they are made few: every part has all the numbers of all its joints. A group is a part, its
-    features (n,), and the triangles (f,) that regress on the same two joints. Of the errors of left-out poses, metres.
+    The features are those before they are made few: every part has all the numbers of all its joints. A group is a
+    part, its features (n,), and the triangles (f,) that regress on the same two joints. Of the errors of left-out
+    poses, metres.
     """
 
     template: Mesh

@@ -19,9 +19,9 @@ SOFTNESS = (0.003, 0.01, 0.03, 0.1, 0.3, 1.0)        # C of the support vectors,
 class SexPlane:
     """A plane between the betas of women and men.
 
-    `weights` (K,) is its unit normal, towards the men; `weights @ betas + bias` the signed distance. `accuracy` is the share
-    of the `count` people that planes learned without them told right, and `1 / (1 + exp(-slope distance))` the probability
-    of a man, by the same planes.
+    `weights` (K,) is its unit normal, towards the men; `weights @ betas + bias` the signed distance. `accuracy` is the
+    share of the `count` people that planes learned without them told right, and `1 / (1 + exp(-slope distance))` the
+    probability of a man, by the same planes.
     """
 
     weights: np.ndarray

@@ -41,8 +41,9 @@ class CharacterMeshConfig(Settings):
 
 @dataclass(frozen=True, eq=False)
 class Character:
-    """A character as the mean of a body model, the template on it as it stands, its pose (J, 3), its joints (J, 3), metres, which
-    of them lie inside, and how the template was registered to it, None for a mesh that had the template's triangles.
+    """A character as the mean of a body model, the template on it as it stands, its pose (J, 3), its joints (J, 3),
+    metres, which of them lie inside, and how the template was registered to it, None for a mesh that had the template's
+    triangles.
     """
 
     model: BodyModel
@@ -58,9 +59,9 @@ def register_character(model: BodyModel, mesh: Mesh, landmarks: Mapping[str, np.
                        progress: Progress | None = None) -> Character:
     """Make a model of a character from its mesh: register the template to it, then `character_model`.
 
-    The mesh has any size, place and direction, and is about in the template's pose; a mesh with the template's triangles is
-    taken as it is. A dozen landmarks spread over the body are enough: tips of hands and feet, elbows, knees, head, trunk.
-    ValueError for fewer than four of the same names.
+    The mesh has any size, place and direction, and is about in the template's pose; a mesh with the template's
+    triangles is taken as it is. A dozen landmarks spread over the body are enough: tips of hands and feet, elbows,
+    knees, head, trunk. ValueError for fewer than four of the same names.
 
     [MoSh]
     """

@@ -19,8 +19,8 @@ ROUNDS = 2                           # of adding what is left of the body to its
 
 @dataclass(frozen=True, eq=False)
 class OwnBody:
-    """A registered body as a subject of its own, the pose (J, 3) and place (3,) in which it was registered, the subject there
-    (N, 3), and how far its vertices are from the registered ones, metres.
+    """A registered body as a subject of its own, the pose (J, 3) and place (3,) in which it was registered, the subject
+    there (N, 3), and how far its vertices are from the registered ones, metres.
     """
 
     subject: Subject

@@ -59,8 +59,8 @@ def _frames(corners: np.ndarray) -> np.ndarray:
 class Distillation:
     """Lowers what a carried model leaves of the model it was made of, in rounds.
 
-    The way is that of learning: what is left of every body, as edges in the frames of the parts, is regressed and added to
-    what the triangles have. `follow` puts the imitation's vertices on the model's.
+    The way is that of learning: what is left of every body, as edges in the frames of the parts, is regressed and added
+    to what the triangles have. `follow` puts the imitation's vertices on the model's.
     """
 
     model: ScapeModel

@@ -77,11 +77,12 @@ class Piece:
         return (self._mean @ values.reshape(len(values), -1)).reshape(-1, *values.shape[1:])
 
     def edges(self, action: np.ndarray) -> np.ndarray:
-        """The edges (n, g, 2, 3), metres, of the new triangles when the old ones alone are deformed by `action` (n, f, 3, 3).
+        """The edges (n, g, 2, 3), metres, of the new triangles when the old ones alone are deformed by `action` (n, f,
+        3, 3).
 
-        Stitching takes from the edges of a part only what is the gradient of some displacement of that part: all the rest
-        vanishes in the normal equations. So the part is stitched on its own, without loss, and the new vertices are carried
-        along with the triangles on which, or nearest to which, they lie.
+        Stitching takes from the edges of a part only what is the gradient of some displacement of that part: all the
+        rest vanishes in the normal equations. So the part is stitched on its own, without loss, and the new vertices
+        are carried along with the triangles on which, or nearest to which, they lie.
         """
         G, normal = self._stitch
         wanted = edges(self.before.vertices, self.before.faces) @ np.swapaxes(action, -1, -2)     # (n, f, 2, 3)
