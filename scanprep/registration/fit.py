@@ -13,9 +13,8 @@ from .affine import Links, LinkStage, build_links
 from .anchors import Hints, mark_both, path_anchors, place_by_marks
 from .deformation_graph import build_graph, carry_over, deform
 from .deformation_graph import start as start_motion
-from .energies import NodePattern, Pull, pull
+from .energies import NodePattern, Pull, Stiffness, follow_pull, pull, terms
 from .final_fit import SettleConfig, settle
-from .levenberg_marquardt import Stiffness, minimise, terms
 from .limb_twists import find_ends, mismatch, turned_end
 from .matches import Likeness, Matching, Target, match_both_ways, orient
 from .schedule import GraphStage, RegistrationConfig, ShellStage
@@ -92,8 +91,9 @@ class Fit:
                 if self.hints is not None and stage.hints:
                     wanted += self.hints.wanted(self.x, stage.reach * self.size, stage.hints * self.size**2)
             if wanted.A.any():
-                found = minimise(self.graph, self.pattern, self.motion, wanted, self.stiffness(stage), steps, 1e-3)
-                self.motion, self.energies = found.motion, found.energies
+                found = follow_pull(self.graph, self.pattern, self.motion, wanted, self.stiffness(stage), steps)
+                now = terms(self.graph, found.x, wanted, self.stiffness(stage))
+                self.motion, self.energies = found.x, {name: term.value for name, term in now.items()}
                 self.iterations += found.iterations
             self.x = deform(self.graph, self.motion)
 
@@ -109,9 +109,9 @@ class Fit:
             before = self.x, self.motion, self.energies
             value = self.misfit(target, twists.cap * size, stage)
             drawn = pull(len(self.x), end.vertices, turned, self.template.vertex_areas[end.vertices])
-            found = minimise(self.graph, self.pattern, self.motion, drawn + self.landmark_pull(stage.landmarks),
-                             self.stiffness(stage), 8, 1e-3)
-            self.motion, self.x = found.motion, deform(self.graph, found.motion)
+            found = follow_pull(self.graph, self.pattern, self.motion, drawn + self.landmark_pull(stage.landmarks),
+                                self.stiffness(stage), steps=8)
+            self.motion, self.x = found.x, deform(self.graph, found.x)
             self.rounds(replace(stage, hints=0.0, paths=0.0))
             if self.misfit(target, twists.cap * size, stage) >= value:
                 self.x, self.motion, self.energies = before
