@@ -26,11 +26,11 @@ from scanprep.pipeline.template import TemplateConfig, make_template
 from scanprep.skeleton.find import SkeletonConfig
 from scanprep.synthetic.data_set import (
     SUBJECT,
-    SyntheticScan,
     GroundTruth,
+    SyntheticScan,
     click_landmarks,
-    scan_plan,
     read_views,
+    scan_plan,
     stand,
     write_scan,
 )
