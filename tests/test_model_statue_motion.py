@@ -14,7 +14,7 @@ from model.skinning import SkinningModel
 from model.statue.control.humanoid import humanoid
 from model.statue.motion.bone_names import find_roles, trunk
 from model.statue.motion.follow import Follower, _bound
-from model.statue.motion.motions import MotionConfig, bvh_motion, own_motion, people_motion, write_motion
+from model.statue.motion.motions import bvh_motion, own_motion, people_motion, write_motion
 from scanprep.geometry import rotations
 from scanprep.geometry.storage import StorageError
 from scanprep.geometry.surface import Surface
@@ -92,7 +92,7 @@ def test_a_trunk_of_two_joints_carries_the_shoulders_nearly_as_far():
 def test_clavicles_rise_with_arms_above_the_horizontal():
     control = humanoid()
     poses = np.stack([named_pose(name) for name in ("rest", "t_pose", "arms_up")])
-    found = {share: people_motion(control, GENERIC, poses, config=MotionConfig(girdle=share)) for share in (0.0, 0.2)}
+    found = {share: people_motion(control, GENERIC, poses, girdle=share) for share in (0.0, 0.2)}
     for side in "lr":
         clavicle, arm, elbow = (NAMES.index(f"{side}_{n}") for n in ("sternoclavicular", "shoulder", "elbow"))
         assert not found[0.0].poses[:, clavicle].any() and not found[0.2].poses[:2, clavicle].round(9).any()

@@ -22,13 +22,14 @@ from ..files import load_model
 from .control.files import read_control
 from .control.humanoid import humanoid
 from .control.model import ControlModel, Statue
-from .detail.displacement import Pixels
-from .detail.reconstruction import Reconstruction, displaced_surface, inverted_triangles
+from .detail.displacement import DisplacementConfig
+from .detail.errors import inverted_triangles
+from .detail.reconstruction import Reconstruction, displaced_surface
 from .detail.subdivision import Subdivision, subdivide, subdivide_adaptive
 from .files import load_statue
 from .fit import StatueConfig
-from .motion.follow import follower_of, read_statue_motion
-from .motion.motions import write_motion
+from .motion.follow import follower_of
+from .motion.motions import read_statue_motion, write_motion
 from .motion.retarget import StatueMotion
 from .report import motion_pictures, upright_axis
 from .skins import write_statue_glb
@@ -36,8 +37,8 @@ from .work import Inputs, Work
 
 StatueArg = Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="STATUE")]
 MotionArg = Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="MOTION")]
-KEYS, GIF_FRAMES = 120, 24           # frames of an animated GLB of meshes, and of the preview
 LevelArg = Literal[0, 1, 2, 3, 4]
+FINE = StatueConfig(displacement=DisplacementConfig(size=2048))
 FEATURE_ENDINGS = (".features.json", ".json", ".pp", ".mrk.json")
 
 COMMANDS = {
@@ -55,8 +56,8 @@ def group(argv: list[str]) -> int:
 
 
 def fit(scan: ScanArg, output: Output, features: Path | None = None, control: Path | None = None,
-        unit: Unit | None = None, size: Pixels = 2048, vectors: bool = False,
-        workers: Workers = Workers(), *, space: Workspace) -> Outcome:                            # noqa: B008
+        unit: Unit | None = None, config: StatueConfig = FINE, workers: Workers = Workers(), *,           # noqa: B008
+        space: Workspace) -> Outcome:
     """A scan of one person becomes a statue: a control model that moves, with the detail of the scan as an image.
 
     A person who stands upright is found by itself. For other poses and other bodies, name joint centres and points of
@@ -72,12 +73,8 @@ def fit(scan: ScanArg, output: Output, features: Path | None = None, control: Pa
         control: Control model of your own: a skinned GLB, or control.npz of another statue; else the generic humanoid.
         unit: Unit of the scan and the features; else metres with --features, and without them that in which the body
             would be as tall as a person.
-        size: Pixels of the images, each way.
-        vectors: Store displacements of any direction, which also hold where the scan is folded.
         workers: Who fits the scans of a folder.
     """
-    config = StatueConfig()
-    config = replace(config, displacement=replace(config.displacement, size=size, vectors=vectors))
     work = Work(_control(control), config, unit)
     if not scan.is_dir():
         if features is None and control is not None:
@@ -161,11 +158,11 @@ def animate(statue: StatueArg, motion: MotionArg, output: Output, model: Path | 
     else:
         bodies, rate = _following(loaded, motion, model, registered)
         with bar("writing frames") as progress:
-            frames = _frames(detailed, bodies, range(0, len(bodies), max(1, len(bodies) // KEYS)), progress)
+            frames = _frames(detailed, bodies, range(0, len(bodies), max(1, len(bodies) // 120)), progress)
         write_animated_glb(output / "statue.glb", fine.faces, frames, rate * len(frames) / len(bodies),
                            up=upright_axis(loaded), keys=len(frames))
         rows = [Metric("follows", str(model))]
-    shown = range(0, len(bodies), max(1, len(bodies) // GIF_FRAMES))
+    shown = range(0, len(bodies), max(1, len(bodies) // 24))
     with bar("rendering") as progress:
         write_gif(output / "motion.gif", motion_pictures(loaded, detailed, bodies[list(shown)], progress),
                   rate * len(shown) / len(bodies))

@@ -6,7 +6,6 @@ from pathlib import Path
 import numpy as np
 
 from scanprep.geometry import storage
-from scanprep.skeleton.tree import Skeleton
 from scanprep.synthetic import people
 
 from ..features import linear_features
@@ -22,8 +21,6 @@ from .skins import write_statue_glb, write_x3d
 
 KIND, VERSION = "statue", 1
 CONTROL, ABOUT, TEXTURE = "control.npz", "statue.json", "texture.png"
-BODY, MARKERS = "body.npz", "markers.json"
-SKIN = 0.0095                        # metres from the skin to the middle of a marker [MoSh]
 
 
 def save_statue(folder: str | Path, statue: Statue) -> None:
@@ -75,13 +72,37 @@ def load_statue(folder: str | Path, edited: str | Path | None = None) -> Statue:
 
 
 def write_body(folder: Path, statue: Statue) -> None:
-    """Write body.npz, a model that markers and points drive, and for the humanoid markers.json, a layout of markers."""
+    """Write body.npz, a model that markers and points drive, and for the humanoid markers.json, a layout of markers.
+
+    What random poses of the synthetic people do with these joints makes the pose prior of the humanoid.
+    """
     control, poses = statue.control, None
     if control.skeleton.names == humanoid().skeleton.names:
-        poses = people_motion(control, statue.pose, people_poses()).poses
-        storage.write_json(folder / MARKERS, {"markersets": [{
-            "type": "body", "distance_from_skin": SKIN, "indices": humanoid_markers()}]})
-    body_model(control, poses).save(folder / BODY)
+        rng = np.random.default_rng(0)
+        poses = people_motion(control, statue.pose, np.array([people.random_pose(rng) for _ in range(100)])).poses
+        storage.write_json(folder / "markers.json", {"markersets": [{
+            "type": "body", "distance_from_skin": 0.0095, "indices": humanoid_markers()}]})      # [MoSh]
+    body_model(control, poses).save(folder / "body.npz")
+
+
+def body_model(control: ControlModel, poses: np.ndarray | None = None) -> SkinningModel:
+    """The control model under linear blend skinning as a model of one person, without betas. The poses (M, J, 3) that
+    people take make the pose prior; without any all rotations are about as likely. [Statues] Eq. 1
+    """
+    skeleton, N = control.skeleton, len(control.mesh.vertices)
+    J = len(skeleton.parents)
+    if poses is None:
+        mean, covariance, poses = np.zeros((J, 3)), np.eye(3 * J), np.zeros((0, J, 3))
+        covariance[:3, :3] = 0
+    else:
+        poses = poses.copy()
+        poses[:, 0] = 0
+        mean, covariance = poses.mean(axis=0), np.cov(poses.reshape(len(poses), -1).T)
+    no_correctives = linear_features(skeleton, (np.zeros((3, 0)),) * J)
+    return SkinningModel(
+        control.mesh, skeleton, control.mesh.vertices, control.weights, no_correctives,
+        np.zeros((0, N, 3)), control.mesh.vertices, np.zeros((0, N, 3)), np.zeros(0), 0.0, mean, covariance,
+        {"made of": "a statue", "landmarks": dict(control.landmarks)}, pose_examples=poses)
 
 
 def write_for_programs(folder: Path, statue: Statue, vertices: np.ndarray, fine: Subdivision, up: int) -> None:
@@ -92,36 +113,3 @@ def write_for_programs(folder: Path, statue: Statue, vertices: np.ndarray, fine:
     write_statue_glb(folder / "statue.glb", statue.control, texture=statue.texture, normals=normals,
                      heights=statue.map.heights, up=up)
     write_x3d(folder / "statue.x3d", statue.control, texture=statue.texture, up=up)
-
-
-POSES = 100                          # random poses of the synthetic people that make the pose prior
-WIDEST = 1.0                         # radians: standard deviation of the turns of a joint without such poses
-
-
-def body_model(control: ControlModel, poses: np.ndarray | None = None) -> SkinningModel:
-    """The control model under linear blend skinning as a model of one person, without betas. The poses (M, J, 3) that
-    people take make the pose prior; without any all rotations are about as likely. [Statues] Eq. 1
-    """
-    skeleton, N = control.skeleton, len(control.mesh.vertices)
-    J = len(skeleton.parents)
-    if poses is None:
-        mean, covariance, poses = np.zeros((J, 3)), WIDEST**2 * np.eye(3 * J), np.zeros((0, J, 3))
-        covariance[:3, :3] = 0
-    else:
-        poses = poses.copy()
-        poses[:, 0] = 0
-        mean, covariance = poses.mean(axis=0), np.cov(poses.reshape(len(poses), -1).T)
-    return SkinningModel(
-        control.mesh, skeleton, control.mesh.vertices, control.weights, _no_correctives(skeleton),
-        np.zeros((0, N, 3)), control.mesh.vertices, np.zeros((0, N, 3)), np.zeros(0), 0.0, mean, covariance,
-        {"made of": "a statue", "landmarks": dict(control.landmarks)}, pose_examples=poses)
-
-
-def people_poses(count: int = POSES, seed: int = 0) -> np.ndarray:
-    """Random poses (count, 16, 3), radians, of the synthetic people."""
-    rng = np.random.default_rng(seed)
-    return np.array([people.random_pose(rng) for _ in range(count)])
-
-
-def _no_correctives(skeleton: Skeleton):  # type: ignore[no-untyped-def]
-    return linear_features(skeleton, tuple(np.zeros((3, 0)) for _ in skeleton.parents))

@@ -12,7 +12,6 @@ from scanprep.skeleton.tree import Skeleton
 
 from .seams import cut, extended, find_seams
 
-MARGIN = 6 / 1024                    # of the image, left free around the chart
 FINE = 1 / 3                         # of the mean density, in length: coarser triangles ask for one more seam
 
 
@@ -108,7 +107,7 @@ def fill_square(uv: np.ndarray, mesh: Mesh) -> np.ndarray:
     extent = np.ptp(places, axis=1).max(axis=1)
     best = places[extent.argmin()]
     middle = (best.min(axis=0) + best.max(axis=0)) / 2
-    return 0.5 + (best - middle) * (1 - 2 * MARGIN) / extent.min()
+    return 0.5 + (best - middle) * (1 - 2 * 6 / 1024) / extent.min()    # left free around the chart
 
 
 def chart_problem(mesh: Mesh, chart: Chart) -> str | None:

@@ -78,8 +78,6 @@ def _load(path: str | Path) -> ControlModel:
 
 
 WHAT = "a GLB file with one mesh that hangs on joints"
-TRIANGLES = 4                        # of the modes of glTF
-WIDE = np.pi                         # radians either way: the limits of joints that nobody described
 
 
 @dataclass(frozen=True, eq=False)
@@ -132,7 +130,7 @@ def _corners(tree: dict[str, Any], binary: bytes, mesh: dict[str, Any], joints: 
 
 
 def _primitive(tree: dict[str, Any], binary: bytes, primitive: dict[str, Any], joints: int) -> _Corners:
-    if primitive.get("mode", TRIANGLES) != TRIANGLES:
+    if primitive.get("mode", 4) != 4:    # the mode of triangles
         raise ValueError(f"expected triangles, found a primitive of mode {primitive['mode']}")
     attributes = primitive["attributes"]
 
@@ -210,7 +208,7 @@ def _control(corners: _Corners, places: np.ndarray, parents: np.ndarray, names: 
     skeleton = Skeleton(part_of_face, parents, joints, skeleton.names)
     J = len(parents)
     control = ControlModel(mesh, skeleton, strongest(weights), chart or automatic_chart(mesh, skeleton), {},
-                           (np.eye(3),) * J, (np.array([[-WIDE, WIDE]] * 3),) * J, skeleton.names, np.arange(J))
+                           (np.eye(3),) * J, (np.array([[-np.pi, np.pi]] * 3),) * J, skeleton.names, np.arange(J))
     problem = control_problem(control)
     assert problem is None, problem
     return control

@@ -9,11 +9,6 @@ from scipy.sparse import coo_array, csc_array, diags_array
 from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.sparse import factor
 
-ROUNDS, ENOUGH = 300, 1e-5           # Newton steps at most; done when one lowers the energy by so little of it
-GAP = 0.012                          # of the chart's size: nearer than this, pieces of its border push each other off
-PUSH = 0.02                          # of the energy at rest, for how much that counts
-ROUNDING = 1e-15                     # of the two products of an area: below, its sign is worked out in fractions
-
 
 def flatten(mesh: Mesh) -> np.ndarray:
     """Places in the plane (N, 2) of a surface with one border, scaled to its area, one-to-one.
@@ -27,9 +22,9 @@ def flatten(mesh: Mesh) -> np.ndarray:
     border = mesh.boundary_loops[0]
     uv = tutte(mesh, border)
     uv *= np.sqrt(mesh.face_areas.sum() / abs(_signed_areas(uv, mesh.faces).sum()))
-    gap = GAP * np.sqrt(mesh.face_areas.sum())
+    gap = 0.012 * np.sqrt(mesh.face_areas.sum())    # nearer than this, pieces of the border push each other off
     energy = _energy(uv, mesh.faces, rest, areas, border, gap)
-    for _ in range(ROUNDS):
+    for _ in range(300):
         gradient, hessian = _derivatives(uv, mesh.faces, rest, areas, border, gap)
         ridge = diags_array(np.full(2 * len(uv), 1e-9 * hessian.diagonal().mean()))
         step = -factor((hessian + ridge).tocsc())(gradient).reshape(-1, 2)
@@ -44,7 +39,7 @@ def flatten(mesh: Mesh) -> np.ndarray:
             length /= 2
         else:
             return uv
-        if before - energy < ENOUGH * energy:
+        if before - energy < 1e-5 * energy:
             break
     return uv
 
@@ -88,7 +83,8 @@ def orientation(a: np.ndarray, b: np.ndarray, c: np.ndarray) -> np.ndarray:
     first = (b[:, 0] - a[:, 0]) * (c[:, 1] - a[:, 1])
     second = (b[:, 1] - a[:, 1]) * (c[:, 0] - a[:, 0])
     sign = np.sign(first - second).astype(int)
-    for k in np.flatnonzero(np.abs(first - second) <= ROUNDING * (np.abs(first) + np.abs(second))):
+    # else the sign is worked out in fractions
+    for k in np.flatnonzero(np.abs(first - second) <= 1e-15 * (np.abs(first) + np.abs(second))):
         (ax, ay), (bx, by), (cx, cy) = (map(Fraction, map(float, p[k])) for p in (a, b, c))
         area = (bx - ax) * (cy - ay) - (by - ay) * (cx - ax)
         sign[k] = (area > 0) - (area < 0)
@@ -184,7 +180,7 @@ def _pushing(uv: np.ndarray, border: np.ndarray, gap: float
     q = (share[:, :, None] * unit[:, None]).reshape(-1, 6)
     corners = np.stack([border[i], border[j], border[following[j]]], axis=1)
     places = (2 * corners[:, :, None] + np.arange(2)).reshape(-1, 6)
-    scale = PUSH / n
+    scale = 0.02 / n
     gradient = np.bincount(places.ravel(), (scale * first[:, None] * q).ravel(), size)
     blocks = scale * second[:, None, None] * q[:, :, None] * q[:, None]
     return (scale * float(((gap / far - 1)**2).sum()), gradient,

@@ -11,9 +11,6 @@ from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.surface import Rays
 from scanprep.skeleton.tree import Skeleton
 
-RAYS = 48                            # from every vertex, to see how much of it is hidden
-IN_SIGHT = 2.0                       # an edge in full sight counts as so much longer than a hidden one
-
 
 def find_seams(mesh: Mesh, skeleton: Skeleton) -> list[np.ndarray]:
     """A tree of seams, each the vertices (k,) that it passes, to the tips of all limbs, rather where the surface is
@@ -99,8 +96,8 @@ def cut(mesh: Mesh, seams: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray
 
 def _costs(mesh: Mesh) -> csr_array:
     """Lengths of the edges, those in sight counted longer."""
-    k = np.arange(RAYS) + 0.5                                          # evenly over the sphere
-    z, turn = 1 - 2 * k / RAYS, np.pi * (1 + 5**0.5) * k
+    k = np.arange(48) + 0.5                                          # evenly over the sphere
+    z, turn = 1 - 2 * k / 48, np.pi * (1 + 5**0.5) * k
     directions = np.stack([np.sqrt(1 - z * z) * np.cos(turn), np.sqrt(1 - z * z) * np.sin(turn), z], axis=1)
     cosine = np.maximum(mesh.vertex_normals @ directions.T, 0)
     vertex, ray = np.nonzero(cosine)
@@ -110,5 +107,5 @@ def _costs(mesh: Mesh) -> csr_array:
     n = len(mesh.vertices)
     seen = np.bincount(vertex, weight * free, n) / np.maximum(np.bincount(vertex, weight, n), 1e-12)
     x, y = mesh.edges.T
-    return csr_array(coo_array((mesh.edge_lengths * (1 + (IN_SIGHT - 1) * (seen[x] + seen[y]) / 2), (x, y)),
+    return csr_array(coo_array((mesh.edge_lengths * (1 + (2.0 - 1) * (seen[x] + seen[y]) / 2), (x, y)),
                                shape=(n, n)))

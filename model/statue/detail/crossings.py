@@ -10,10 +10,6 @@ from scanprep.geometry.surface import Rays
 
 from .normal_volume import interpolate
 
-SKIP = 2e-5                          # metres: a ray goes on this far behind what it met
-SAME = 1e-6                          # metres: two crossings nearer to each other are one, met on a shared edge
-OVERLAP = 0.01                       # metres: farther apart, two views have not met the same surface
-LAYERS = 30                          # crossings of one normal that are looked for
 NEAREST = 0.003                      # metres: crossings up to this height are never those of another body part
 THICK = 0.75                         # share of the way to the other side of a limb, or across a gap, that heights go
 
@@ -42,7 +38,8 @@ def outer_layers(found: Crossings) -> Crossings:
     front = found.pick(outside)
     begins = np.ones(len(front.normal), dtype=bool)
     begins[1:] = ((front.normal[1:] != front.normal[:-1]) | (layer[1:] != layer[:-1])
-                  | (front.heights[1:] - front.heights[:-1] > OVERLAP))
+                  # metres: farther apart, two views have not met the same surface
+                  | (front.heights[1:] - front.heights[:-1] > 0.01))
     group = np.cumsum(begins) - 1
     count = np.maximum(np.bincount(group), 1)
     return Crossings(front.normal[begins], np.bincount(group, front.heights) / count,
@@ -58,11 +55,11 @@ def find_crossings(scan: Mesh, rays: Rays, points: np.ndarray, normals: np.ndarr
     along = normals / length[:, None]
     active, at = np.arange(len(points)), np.full(len(points), -reach)
     found: list[tuple[np.ndarray, np.ndarray]] = []
-    for _ in range(LAYERS):
+    for _ in range(30):
         face, far = rays.cast(points[active] + at[active, None] * along[active], along[active], 2 * reach)
         met = face >= 0
         active, face, far = active[met], face[met], far[met]
-        at[active] += far + SKIP
+        at[active] += far + 2e-5    # metres behind what was met
         inside = at[active] < reach
         active, face = active[inside], face[inside]
         if not len(active):
@@ -78,7 +75,8 @@ def find_crossings(scan: Mesh, rays: Rays, points: np.ndarray, normals: np.ndarr
     order = np.lexsort((height, normal))
     normal, height, cosine, face, steep = (v[order] for v in (normal, height, cosine, face, steep))
     again = np.zeros(len(normal), dtype=bool)
-    again[1:] = (normal[1:] == normal[:-1]) & (height[1:] - height[:-1] < SAME) & (cosine[1:] * cosine[:-1] > 0)
+    # metres: met twice on a shared edge
+    again[1:] = (normal[1:] == normal[:-1]) & (height[1:] - height[:-1] < 1e-6) & (cosine[1:] * cosine[:-1] > 0)
     keep = ~again & ~steep & (np.abs(height) <= reach)
     return Crossings(normal[keep], (height / length[normal])[keep], cosine[keep], face[keep])
 

@@ -25,7 +25,6 @@ from ..control.model import FOLDED, HOLE, MEASURED, OUTSIDE, DisplacementMap
 HEADER, HEIGHTS, IMAGE = "displacement.json", "displacement.tif", "displacement.png"
 COVERAGE, VECTORS = "coverage.png", "vectors.tif"
 ZERO, LARGEST = 32768, 65535
-FINEST = 1e-7                        # metres for a step of grey: a flat map has no extent to divide by
 LEVELS = {"measured": MEASURED, "folded": FOLDED, "hole": HOLE, "outside": OUTSIDE}
 
 
@@ -95,7 +94,7 @@ def read_edited(path: str | Path, size: tuple[int, ...]) -> np.ndarray:
 def _scale(map: DisplacementMap) -> float:
     """Metres for a step of grey, so that all heights in the chart have a value."""
     inside = np.abs(map.heights[map.coverage != OUTSIDE])
-    return max(float(inside.max(initial=0)) / (LARGEST - ZERO), FINEST)
+    return max(float(inside.max(initial=0)) / (LARGEST - ZERO), 1e-7)    # a flat map has no extent to divide by
 
 
 def _grey(heights: np.ndarray, scale: float) -> np.ndarray:

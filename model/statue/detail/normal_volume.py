@@ -19,10 +19,6 @@ from scipy.spatial import cKDTree
 from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.surface import checked_points
 
-EDGE = 1e-9                          # barycentric coordinates this far below zero still lie in a triangle
-PAIRS = 250_000                      # points with triangles that are solved at once
-STEPS = 60                           # of a search between two signs: each at least halves it, most stop after 8
-
 
 @dataclass(frozen=True, eq=False)
 class NormalCoordinates:
@@ -94,7 +90,7 @@ def solve_triangles(mesh: Mesh, faces: np.ndarray, points: np.ndarray, reach: fl
     b = np.stack([np.einsum("nd,nd->n", np.cross(w[:, i - 2], w[:, i - 1]), N) for i in range(3)], axis=1)
     b /= np.maximum(b.sum(axis=1), 1e-300)[:, None]
     upright = np.einsum("nd,nd->n", N, np.einsum("nc,ncd->nd", b, n[pair])) > 0
-    good = upright & (b >= -EDGE).all(axis=1)
+    good = upright & (b >= -1e-9).all(axis=1)    # a little below zero is still in the triangle
     b = np.clip(b[good], 0, None)
     return pair[good], reach * d[good], b / b.sum(axis=1, keepdims=True)
 
@@ -125,7 +121,7 @@ def _roots(c: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     low, high, c = ends[cubic, piece], ends[cubic, piece + 1], c[cubic]
     rising = at[cubic, piece] < 0
     x = 0.5 * (low + high)
-    for _ in range(STEPS):
+    for _ in range(60):    # each at least halves the interval, most stop after 8
         value = _value(c, x)
         above = (value > 0) == rising
         low, high = np.where(above, low, x), np.where(above, x, high)
@@ -166,7 +162,7 @@ def _near(mesh: Mesh, points: np.ndarray, reach: float) -> Iterator[tuple[np.nda
             which = which[((at > low[face]) & (at < high[face])).all(axis=1)]
         held.append((which, np.full(len(which), face)))
         total += len(which)
-        if total and (total > PAIRS or face == len(center) - 1):
+        if total and (total > 250_000 or face == len(center) - 1):    # so many are solved at once
             yield np.concatenate([w for w, _ in held]), np.concatenate([f for _, f in held])
             held, total = [], 0
 

@@ -11,9 +11,6 @@ from scanprep.geometry.surface import Surface
 from ..control.chart import Chart
 from .subdivision import subdivide
 
-PADDING = 4                          # pixels that the surface is continued beyond the border of a chart
-MARGIN = 16                          # pixels more that the last value is repeated
-
 
 @dataclass(frozen=True, eq=False)
 class Texels:
@@ -40,7 +37,7 @@ class Texels:
             empty = np.ones(self.size**2, dtype=bool)
             empty[self.pixels] = False
             far, (row, column) = distance_transform_edt(empty.reshape(self.size, self.size), return_indices=True)
-            around = (far > 0) & (far <= MARGIN)
+            around = (far > 0) & (far <= 16)
             out[around] = out[row[around], column[around]]
         return out
 
@@ -73,7 +70,7 @@ def _beside(pixels: np.ndarray, size: int) -> np.ndarray:
     empty = np.ones(size**2, dtype=bool)
     empty[pixels] = False
     far = distance_transform_edt(empty.reshape(size, size))
-    return np.flatnonzero((far > 0) & (far <= PADDING))
+    return np.flatnonzero((far > 0) & (far <= 4))
 
 
 def continue_chart(mesh: Mesh, chart: Chart, uv: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

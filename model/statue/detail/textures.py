@@ -15,10 +15,6 @@ from .normal_volume import interpolate
 from .subdivision import Subdivision
 from .texels import Lattice, find_texels
 
-REACH = 0.01                         # metres: farther from a place the scan does not say its colour
-MIN_COSINE = 0.0                     # between the normals of both
-GREY = 0.6                           # where nothing at all is known
-
 
 def scan_look(scan: Mesh | Texture) -> Look:
     """The colours of a scan, of its vertices or its picture, at the closest place of its surface, and a weight: 0 where
@@ -37,7 +33,8 @@ def scan_look(scan: Mesh | Texture) -> Look:
             assert mesh.colors is not None, "a scan without colours was refused"
             colors = np.einsum("nc,ncd->nd", found.bary, mesh.colors[mesh.faces[found.faces]])
         facing = np.einsum("nd,nd->n", mesh.face_normals[found.faces], normals)
-        return colors, ((found.distances < REACH) & (facing > MIN_COSINE)).astype(float)
+        # metres: farther away the scan does not say
+        return colors, ((found.distances < 0.01) & (facing > 0)).astype(float)
     return look
 
 
@@ -56,7 +53,8 @@ def bake_texture(control: ControlModel, map: DisplacementMap, look: Look) -> np.
         lattice = Lattice(control.mesh, control.chart, FILL_LEVEL)
         found = [lattice.gather(texels, colors[:, k], known) for k in range(3)]
         values, sure = np.stack([value for value, _ in found], axis=1), found[0][1]
-        values = sparse.harmonic(lattice.fine.vertex_adjacency, np.where(sure[:, None], values, GREY), sure)
+        # where nothing at all is known
+        values = sparse.harmonic(lattice.fine.vertex_adjacency, np.where(sure[:, None], values, 0.6), sure)
         colors = np.where(known[:, None], colors, lattice.sample(values, texels.faces, texels.bary))
     return texels.image((255 * np.clip(colors, 0, 1) + 0.5).astype(np.uint8))
 

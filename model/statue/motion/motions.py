@@ -9,13 +9,34 @@ from pathlib import Path
 import numpy as np
 
 from scanprep.geometry.mesh import Mesh
-from scanprep.geometry.storage import load_arrays, numbers, taking_apart, writing
+from scanprep.geometry.storage import StorageError, load_arrays, numbers, taking_apart, writing
 from scanprep.skeleton.tree import Skeleton
 
-from ...export.bvh_read import BvhMotion
+from ...export.bvh_read import BvhMotion, read_bvh
 from ...export.rig import check_motion, joint_places
-from ..control.model import ControlModel
-from .retarget import MotionConfig, Pairing, StatueMotion, retargeted
+from ..control.model import ControlModel, Statue
+from .retarget import Pairing, StatueMotion, retargeted
+
+
+def read_statue_motion(statue: Statue, path: Path) -> StatueMotion:
+    """A motion for the skeleton of a statue: BVH, or `.npz` of its own parts or of the synthetic people; StorageError
+    where it is damaged or of other parts.
+    """
+    if path.suffix.lower() == ".bvh":
+        return bvh_motion(statue.control, statue.pose, read_bvh(path, "cm"))     # travel is scaled by the legs
+    stored = load_arrays(path, "a motion (.npz) or BVH")
+    if "poses" not in stored:
+        raise StorageError(f"{path}: expected a motion, it lacks poses")
+    count = stored["poses"].size // max(3 * len(np.atleast_1d(stored["poses"])), 1)
+    own, people = len(statue.control.skeleton.parents), 16
+    if count == own:
+        return own_motion(statue.control, path)
+    if count != people:
+        raise StorageError(f"{path}: expected the {own} parts of the statue or the {people} of the synthetic people, "
+                           f"found {count}; for a motion of a learned model name it with --model")
+    rate = stored.get("mocap_frame_rate", stored.get("mocap_framerate", np.array(60.0)))
+    poses = stored["poses"].astype(np.float64).reshape(-1, people, 3)
+    return people_motion(statue.control, statue.pose, poses, stored.get("trans"), float(rate))
 
 
 def own_motion(control: ControlModel, path: str | Path) -> StatueMotion:
@@ -53,8 +74,7 @@ def middle_drift(control: ControlModel, poses: np.ndarray) -> np.ndarray:
 
 
 def people_motion(control: ControlModel, pose: np.ndarray, poses: np.ndarray, trans: np.ndarray | None = None,
-                  rate: float = 60.0, up: np.ndarray | None = None, config: MotionConfig | None = None
-                  ) -> StatueMotion:
+                  rate: float = 60.0, up: np.ndarray | None = None, girdle: float = 0.2) -> StatueMotion:
     """A motion of the synthetic people, poses (T, 16, 3) and trans (T, 3) of the average person; `pose` is that of the
     statue.
 
@@ -66,12 +86,12 @@ def people_motion(control: ControlModel, pose: np.ndarray, poses: np.ndarray, tr
     offsets = skeleton.joints - np.where(skeleton.parents[:, None] < 0, 0, skeleton.joints[skeleton.parents])
     moving = BvhMotion(skeleton.names, skeleton.parents, offsets, {}, skeleton.part_rotations(poses),
                        joint_places(skeleton, poses, trans), rate)
-    return retargeted(Pairing(control, pose, moving, None, up), True, config or MotionConfig())
+    return retargeted(Pairing(control, pose, moving, None, up), True, girdle)
 
 
 def bvh_motion(control: ControlModel, pose: np.ndarray, bvh: BvhMotion, reference: int | None = None,
                names: Mapping[str, str] | None = None, up: np.ndarray | None = None,
-               config: MotionConfig | None = None) -> StatueMotion:
+               girdle: float = 0.2) -> StatueMotion:
     """The motion of a BVH file, by the names of its joints and the directions of its bones.
 
     A part follows the rotation of its joint against the rest of the file, in which somebody stands upright: bones of
@@ -99,7 +119,8 @@ def bvh_motion(control: ControlModel, pose: np.ndarray, bvh: BvhMotion, referenc
         Where the names say something else than `find_roles` finds.
     up : (3,) float, optional
         Upwards in the scan; else the axis nearest to the direction from feet to head.
-    config : MotionConfig, optional
+    girdle : float
+        As for `retargeted`.
 
     Raises
     ------
@@ -112,7 +133,7 @@ def bvh_motion(control: ControlModel, pose: np.ndarray, bvh: BvhMotion, referenc
         R, rest = bvh.rotations[reference], bvh.places[reference]
         bvh = replace(bvh, offsets=rest - np.where(bvh.parents[:, None] < 0, 0, rest[bvh.parents]),
                       rotations=bvh.rotations @ np.swapaxes(R, -1, -2))
-    return retargeted(Pairing(control, pose, bvh, names, up), False, config or MotionConfig())
+    return retargeted(Pairing(control, pose, bvh, names, up), False, girdle)
 
 
 @lru_cache(maxsize=1)

@@ -8,31 +8,11 @@ from itertools import pairwise
 import numpy as np
 
 from scanprep.geometry import rotations
-from scanprep.ranges import Settings, Share
 
 from ...export.bvh_read import BvhMotion
 from ...export.rig import check_motion
 from ..control.model import ControlModel
 from .bone_names import above, find_roles, trunk
-
-_CHAINS = (("shoulder", "elbow", "wrist"), ("hip", "knee", "ankle"))
-_ON_THE_FLOOR = 5                    # percentile of the lowest vertex over the frames: some frames may err
-_AT_ONCE = 200                       # frames
-_APART = np.radians(10)              # from the vertical, of a shank at rest beyond which a foot is tilted with it
-
-
-@dataclass(frozen=True)
-class MotionConfig(Settings):
-    """Settings of `people_motion` and `bvh_motion`.
-
-    Parameters
-    ----------
-    girdle : float, 0 to 1
-        Share of the upper arm's angle above the horizontal that the clavicle is raised, where the motion has no
-        clavicle.
-    """
-
-    girdle: Share = 0.2
 
 
 @dataclass(frozen=True, eq=False)
@@ -87,7 +67,7 @@ class Pairing:
         whole = self.whole(aligned)
         A = dict.fromkeys(range(J), whole)
         for side in "lr" if not aligned else "":
-            for chain in _CHAINS:
+            for chain in (("shoulder", "elbow", "wrist"), ("hip", "knee", "ankle")):
                 roles = [f"{side}_{name}" for name in chain]
                 turn = whole
                 for role, following in pairwise(roles):
@@ -102,7 +82,7 @@ class Pairing:
                     knee, ankle = self.moving.rest[[self.theirs[role] for role in roles[1:]]]
                     left, down, _ = self.standing(False).T @ (ankle - knee) * [1, -1, 1]
                     aside = np.arctan2(left, down)
-                    if abs(aside) > _APART:
+                    if abs(aside) > np.radians(10):
                         A[self.ours[roles[2]]] = rotations.exp(aside * self.standing(False)[:, 2]) @ whole
         return A
 
@@ -134,8 +114,11 @@ class Pairing:
         return _upright(forwards, _nearest_axis(high))
 
 
-def retargeted(pair: Pairing, aligned: bool, config: MotionConfig) -> StatueMotion:
-    """The motion of the pair's skeleton on its statue; `aligned`: the generic model rests as that skeleton does."""
+def retargeted(pair: Pairing, aligned: bool, girdle: float = 0.2) -> StatueMotion:
+    """The motion of the pair's skeleton on its statue; `aligned`: the generic model rests as that skeleton does.
+
+    Where the motion has no clavicles, ours are raised by a share `girdle` of the upper arms' angle above the level.
+    """
     moving, skeleton = pair.moving, pair.control.skeleton
     A = pair.alignment(aligned)
     role_of = {part: role for role, part in pair.ours.items()}
@@ -153,7 +136,7 @@ def retargeted(pair: Pairing, aligned: bool, config: MotionConfig) -> StatueMoti
         else:
             lacking.append(name)
             M[:, j] = M[:, skeleton.parents[j]] if j else np.eye(3)
-    _raise_clavicles(pair, M, config.girdle)
+    _raise_clavicles(pair, M, girdle)
     V = pair.world(aligned)
     R = V @ M @ np.swapaxes(pair.P, -1, -2)
     poses = skeleton.pose_of(R)
@@ -188,9 +171,10 @@ def _travel(pair: Pairing, V: np.ndarray, R: np.ndarray, poses: np.ndarray) -> n
     place = scale * pair.moving.places[:, theirs].mean(axis=1) @ V.T
     place = place - place[0] + middle
     trans = place + R[:, 0] @ (joints[0] - middle) - joints[0]
-    lowest = np.concatenate([(control.rig.vertices(poses[k:k + _AT_ONCE], trans[k:k + _AT_ONCE]) @ up).min(axis=1)
-                             for k in range(0, len(poses), _AT_ONCE)])
-    return trans + ((control.mesh.vertices @ up).min() - np.percentile(lowest, _ON_THE_FLOOR)) * up
+    lowest = np.concatenate([(control.rig.vertices(poses[k:k + 200], trans[k:k + 200]) @ up).min(axis=1)
+                             for k in range(0, len(poses), 200)])
+    # percentile: some frames may err
+    return trans + ((control.mesh.vertices @ up).min() - np.percentile(lowest, 5)) * up
 
 
 def _leg(joints: np.ndarray, roles: Mapping[str, int], others: Mapping[str, int]) -> float:

@@ -66,10 +66,6 @@ def _places(path: Path, rays: dict[str, Any], unit: str | None) -> dict[str, np.
     return {name: UNITS[unit or "m"] * place for name, place in places.items()}
 
 
-INSIDE = 0.5                     # winding number; around a hole it falls smoothly from 1 to 0
-MOST = 60_000_000                # voxels that are still worked on
-
-
 class MedialAxis:
     """Voxels inside a mesh, thinned to their medial axis, whose `points` (n, 3) are the centres. [Statues]
 
@@ -87,12 +83,13 @@ class MedialAxis:
         self.voxel = float(voxel)
         self._origin = vertices.min(axis=0) - 1.5 * voxel
         shape = np.ceil(np.ptp(vertices, axis=0) / voxel) + 4
-        if np.prod(shape) > MOST:
-            raise ValueError(f"voxel: {voxel} m gives {np.prod(shape):.3g} voxels, at most {MOST:.0e} are worked "
+        if np.prod(shape) > 60_000_000:
+            raise ValueError(f"voxel: {voxel} m gives {np.prod(shape):.3g} voxels, at most {60_000_000:.0e} are worked "
                              "on; is the mesh in metres?")
         cells = np.indices(shape.astype(int)).reshape(3, -1).T
         winding = igl.fast_winding_number(vertices, faces, self._origin + voxel * (cells + 0.5))
-        self.inside = (np.asarray(winding) > INSIDE).reshape(shape.astype(int))
+        # around a hole it falls smoothly from 1 to 0
+        self.inside = (np.asarray(winding) > 0.5).reshape(shape.astype(int))
         self.points = self._origin + voxel * (np.argwhere(skeletonize(self.inside, method="lee")) + 0.5)
         if not len(self.points):
             raise ValueError(f"mesh: no voxel of {voxel} m is inside; is it open, inside out, or in another unit?")

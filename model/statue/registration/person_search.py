@@ -17,11 +17,6 @@ from .features import limb_angles, limbs
 from .pose_search import COARSE, FINE, Posed, PoseSearch
 
 CAP, NORMALS = 0.08, 0.05        # metres: of a distance, and what a difference of normals of one is worth
-UNSEEN = 0.3                     # weight of the body's distances to the scan, which may show a part only
-HEADINGS = 8
-PART = 0.85                      # of the model's height: lower scans may be of a part of a person
-TRIED, ARMS_BENT = 8, 6          # starts of the body, and of an arm, that are bent a little
-RIVAL = 1.3                      # a stand that fits worse by this factor is no more than the other facing
 ASTRAY = 0.01, 0.25              # shares of a scan off the body, by more than a hand: arms are in a wrong place
 # Outwards, frontwards, upwards: where an upper arm may point, and a forearm, which else goes on straight.
 UPPER_ARMS = ((0.4, 0, -1), (0.7, 0.4, -0.7), (0.6, -0.6, -0.7), (1, 0, 0), (0.8, 0.6, 0.2), (0.2, 1, 0), (0.8, 0, 0.7),
@@ -57,13 +52,13 @@ def find_person(search: PoseSearch, target: Target, metres: float) -> list[Stand
     """The best stand in a scan and the best one that faces another way, best first. The scan is in its own unit, of so
     many `metres`.
     """
-    bent = sorted((bend(search, target, T, search.start, COARSE) for T in rough_stands(search, target, metres)[:TRIED]),
+    bent = sorted((bend(search, target, T, search.start, COARSE) for T in rough_stands(search, target, metres)[:8]),
                   key=lambda stand: stand.misfit)
     best = bent[:1] + [s for s in bent[1:] if _facing(search, s) @ _facing(search, bent[0]) < 0.5][:1]
     best = sorted((bend(search, target, s.T, s.posed, FINE) for s in best), key=lambda stand: stand.misfit)
     found = [with_arms(search, target, best[0])]
     for rival in best[1:]:
-        close = rival.misfit < RIVAL * found[0].misfit
+        close = rival.misfit < 1.3 * found[0].misfit    # what fits worse is no more than the other facing
         found.append(with_arms(search, target, rival) if close else rival)
     return sorted(found, key=lambda stand: stand.misfit)
 
@@ -90,7 +85,7 @@ def misfit(body: Mesh, goal: Target) -> tuple[float, float]:
     near = cKDTree(np.hstack([goal.points, NORMALS * goal.normals]))
     back = np.minimum(near.query(np.hstack([body.vertices, NORMALS * body.vertex_normals]))[0] ** 2, CAP**2)
     unseen = float(back @ body.vertex_areas) / float(body.vertex_areas.sum())
-    return float(np.sqrt(off.mean())), float(np.sqrt(off.mean() + UNSEEN * unseen))
+    return float(np.sqrt(off.mean())), float(np.sqrt(off.mean() + 0.3 * unseen))      # it may show a part only
 
 
 def rough_stands(search: PoseSearch, target: Target, metres: float) -> list[np.ndarray]:
@@ -122,10 +117,10 @@ def _placements(body: Mesh, points: np.ndarray, metres: float) -> Iterator[tuple
         tall = float(np.ptp(points @ up))
         whole = (highest - lowest) / tall
         ways = [(whole, False)] if 0.7 < metres / whole < 1.3 else []
-        if metres * tall < PART * (highest - lowest):
+        if metres * tall < 0.85 * (highest - lowest):    # lower scans may be of a part of a person
             ways += [(metres, False), (metres, True)]
-        for k in range(HEADINGS if ways else 0):
-            heading = rotations.exp(np.array([0, 0, 2 * np.pi * k / HEADINGS]))
+        for k in range(8 if ways else 0):
+            heading = rotations.exp(np.array([0, 0, 2 * np.pi * k / 8]))
             turn = heading @ np.array([right, np.cross(up, right), up])
             for scale, hangs in ways:
                 placed = scale * points @ turn.T
@@ -149,7 +144,7 @@ def with_arms(search: PoseSearch, target: Target, stand: Stand) -> Stand:
                   for upper in UPPER_ARMS for fore in (upper, *FOREARMS)]
         starts.sort(key=lambda posed: misfit(search.mesh(posed), coarse)[1])
         # No coarser: from afar a hand beside the head is drawn to the head.
-        tried = min((bend(search, target, stand.T, posed, FINE[1:]) for posed in starts[:ARMS_BENT]),
+        tried = min((bend(search, target, stand.T, posed, FINE[1:]) for posed in starts[:6]),
                     key=lambda s: s.misfit)
         stand = min(stand, bend(search, target, stand.T, tried.posed, FINE), key=lambda s: s.misfit)
     return stand

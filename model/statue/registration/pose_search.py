@@ -2,12 +2,12 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
 
 from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.thinning import thin
-from scanprep.ranges import Cell, Count, Positive, Settings
 from scanprep.registration.energies import Pull, pull
 from scanprep.registration.matches import Described, Likeness, Target, orient, tukey
 
@@ -15,34 +15,17 @@ from .articulated import Articulated, Points
 
 BOUNDS = 0.6, 1.6               # of a length, as multiples of the default one
 GIRTH = -0.03, 0.12             # metres off the default surface
-ELSEWHERE = 0.25                 # metres between places on the body that are not taken for each other
 
 
-@dataclass(frozen=True)
-class PoseStage(Settings):
-    """Rounds of matching at one reach. Lengths are those of the control model.
+class PoseStage(NamedTuple):
+    """Rounds of matching at one reach; lengths, metres, are those of the control model."""
 
-    Attributes
-    ----------
-    reach : float, metres
-        Farthest match that counts.
-    prior : float, metres
-        Distance to the data that an angle of one radian is worth.
-    growth : float, metres
-        Distance to the data that a length twice the default one is worth.
-    slide : float
-        Force of a match along the surface, as a share of that across it.
-    detail : float, metres
-        Spacing to which the scan is thinned.
-    rounds : int
-    """
-
-    reach: Positive
-    prior: Positive
-    growth: Positive
-    slide: float
-    detail: Cell
-    rounds: Count
+    reach: float   # farthest match that counts
+    prior: float   # distance to the data that an angle of one radian is worth
+    growth: float  # distance to the data that a length twice the default one is worth
+    slide: float   # force of a match along the surface, as a share of that across it
+    detail: float  # spacing to which the scan is thinned
+    rounds: int
 
 
 COARSE = (PoseStage(0.5, 0.05, 0.2, 0.5, 0.05, 5), PoseStage(0.3, 0.03, 0.15, 0.3, 0.04, 5))
@@ -137,7 +120,8 @@ class PoseSearch:
         found, far = mine.of(self.sample).matched(theirs, stage.reach, like)
         rest = self.model.control.mesh.vertices
         apart = np.linalg.norm(rest[self.sample] - rest[chosen[found]], axis=1)
-        good = (found >= 0) & (chosen[found] >= 0) & ~goal.border[found] & (apart < max(2 * stage.reach, ELSEWHERE))
+        # metres: not taken for each other
+        good = (found >= 0) & (chosen[found] >= 0) & ~goal.border[found] & (apart < max(2 * stage.reach, 0.25))
         weights = self.area / len(self.sample) * tukey(far[good], stage.reach)
         return wanted + pull(N, self.sample[good], goal.points[found[good]], weights, goal.normals[found[good]],
                              stage.slide)
