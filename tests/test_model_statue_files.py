@@ -13,8 +13,8 @@ from model.statue.control.chart import Chart
 from model.statue.control.humanoid import humanoid
 from model.statue.detail.subdivision import subdivide
 from model.statue.detail.textures import chart_tangents, normal_image, vertex_of_row
+from model.statue.files import write_statue_glb, write_x3d
 from model.statue.motion.motions import people_motion
-from model.statue.skins import write_statue_glb, write_x3d
 from scanprep.geometry import rotations
 from scanprep.geometry.mesh import Mesh
 from scanprep.synthetic.people import walk

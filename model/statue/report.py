@@ -23,16 +23,11 @@ WORST = 0.003                        # metres: the end of the colours of errors
 KINDS = {MEASURED: (0.62, 0.70, 0.78), FOLDED: (0.86, 0.36, 0.22), HOLE: (0.93, 0.75, 0.42), OUTSIDE: (1.0, 1.0, 1.0)}
 
 
-def upright_axis(statue: Statue) -> int:
-    """0, 1 or 2: the axis of the scan nearest to the upward direction of the person's trunk."""
-    return int(np.abs(statue.control.skeleton.part_rotations(statue.pose)[0][:, 2]).argmax())
-
-
 def cameras(statue: Statue, subject: Any, turns: Sequence[float] = (0, 90, 180, 270)) -> list[Camera]:
     """Cameras around a subject (Mesh or points) from the front on; the front is where the control model looks."""
     R = statue.control.skeleton.part_rotations(statue.pose)[0]
     front = -R[:, 1]
-    axis = upright_axis(statue)
+    axis = statue.upright_axis
     first, second = np.eye(3)[[(axis + 1) % 3, (axis + 2) % 3]]
     azimuth = float(np.degrees(np.arctan2(front @ second, front @ first)))
     return [Camera.around(subject, azimuth + turn, up=axis) for turn in turns]

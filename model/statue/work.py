@@ -25,7 +25,7 @@ from .files import save_statue, write_body, write_for_programs
 from .fit import FittedStatue, StatueConfig, fit_statue
 from .registration.automatic import likely_unit
 from .registration.clicks import read_features
-from .report import in_motion, parts_without_data, statue_page, statue_picture, upright_axis
+from .report import in_motion, parts_without_data, statue_page, statue_picture
 
 
 @dataclass(frozen=True)
@@ -72,7 +72,7 @@ def write_statue(folder: Path, name: str, scan: Mesh, statue: FittedStatue, rows
     adaptive = adaptive_level(statue, scan)
     write_mesh(folder / "reconstruction.ply", levels[-1].mesh)
     write_body(folder, statue)
-    write_for_programs(folder, statue, levels[-1].mesh.vertices, fine, upright_axis(statue))
+    write_for_programs(folder, statue, levels[-1].mesh.vertices, fine, statue.upright_axis)
     problem = statue_problem(statue)
     rows = [*([Metric("problem", problem)] if problem else []), *rows, *_of_the_fit(statue),
             *_of_the_map(statue, scan, levels, adaptive, fine), *_sizes(folder, scan)]

@@ -19,8 +19,7 @@ FINE = 1 / 3                         # of the mean density, in length: coarser t
 class Chart:
     """Texture coordinates of a mesh in one connected piece. [Statues] Eq. 21"""
 
-    uv: np.ndarray     # (M, 2) in [0, 1], (0, 0) is the lower left corner of the image, (1, 1) its upper right one. A
-                       # vertex on a seam has several
+    uv: np.ndarray     # (M, 2) in [0, 1], from the lower left corner of the image; a vertex on a seam has several
     faces: np.ndarray  # (F, 3), the rows of `uv` at the corners of every triangle of the mesh, in its order
 
     @cached_property
@@ -39,9 +38,7 @@ class Chart:
         face = np.repeat(np.arange(len(boxes)), boxes)
         within = np.arange(len(face)) - np.repeat(np.cumsum(boxes) - boxes, boxes)
         at = low[face] + np.stack(np.divmod(within, np.maximum(count[face, 1], 1)), axis=1)
-        a, b, c = (corners[face, k] for k in range(3))
-        bary = np.stack([_twice_area(at, b, c), _twice_area(at, c, a), _twice_area(at, a, b)], axis=1)
-        bary /= _twice_area(a, b, c)[:, None]
+        bary = barycentric(at, *corners[face].swapaxes(0, 1))
         inside = (bary >= -1e-12).all(axis=1)
         pixel = (size - 1 - at[inside, 1]) * size + at[inside, 0]
         pixel, first = np.unique(pixel, return_index=True)             # a centre on an edge lies in two triangles
@@ -140,3 +137,9 @@ def chart_problem(mesh: Mesh, chart: Chart) -> str | None:
 def _twice_area(a: np.ndarray, b: np.ndarray, c: np.ndarray) -> np.ndarray:
     """Twice the signed area (n,) of triangles in the plane."""
     return (b[:, 0] - a[:, 0]) * (c[:, 1] - a[:, 1]) - (b[:, 1] - a[:, 1]) * (c[:, 0] - a[:, 0])
+
+
+def barycentric(points: np.ndarray, a: np.ndarray, b: np.ndarray, c: np.ndarray) -> np.ndarray:
+    """(n, 3) where points lie in triangles of the plane, negative outside."""
+    parts = np.stack([_twice_area(points, b, c), _twice_area(points, c, a), _twice_area(points, a, b)], axis=1)
+    return parts / _twice_area(a, b, c)[:, None]

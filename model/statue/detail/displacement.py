@@ -20,8 +20,7 @@ from scanprep.geometry.surface import Rays, Surface
 from scanprep.ranges import FLAG, Positive, Range, Settings
 
 from ..control.model import FOLDED, HOLE, MEASURED, OUTSIDE, ControlModel, DisplacementMap
-from .crossings import Crossings, find_crossings, limits, outer_layers, unturned
-from .normal_volume import interpolate
+from .normal_volume import Crossings, find_crossings, interpolate, limits, outer_layers, unturned
 from .texels import Lattice, Texels, find_texels
 from .vectors import bend_over_folds
 

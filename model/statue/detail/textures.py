@@ -59,9 +59,6 @@ def bake_texture(control: ControlModel, map: DisplacementMap, look: Look) -> np.
     return texels.image((255 * np.clip(colors, 0, 1) + 0.5).astype(np.uint8))
 
 
-SIZE = 2048                          # pixels of a side
-
-
 def vertex_of_row(mesh: Mesh, chart: Chart) -> np.ndarray:
     """(M,) the vertex of every row of a chart's `uv`."""
     out = np.zeros(len(chart.uv), dtype=np.int64)
@@ -92,7 +89,7 @@ def chart_tangents(mesh: Mesh, chart: Chart) -> np.ndarray:
     return np.column_stack([tangents, np.where(sign < 0, -1, 1)])
 
 
-def normal_image(control: ControlModel, vertices: np.ndarray, subdivision: Subdivision, size: int = SIZE) -> np.ndarray:
+def normal_image(control: ControlModel, vertices: np.ndarray, subdivision: Subdivision, size: int) -> np.ndarray:
     """(size, size, 3) uint8, the normals of the detailed surface, vertices (n, 3), in the frames of the control mesh: x
     to the right in the image, y upwards, z outwards; -1 to 1 are 0 to 255, as glTF has them.
     """

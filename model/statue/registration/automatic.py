@@ -16,8 +16,7 @@ from scanprep.threads import one_thread, search_threads
 from ..control.model import ControlModel
 from .articulated import Articulated
 from .features import FeatureFit, fit_features
-from .person_search import Stand, find_person
-from .pose_search import PoseSearch
+from .person_search import PoseSearch, Stand, find_person
 
 SHOWN = 0.3                      # share of the vertices around a joint that have data
 
