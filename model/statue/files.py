@@ -114,9 +114,7 @@ def body_model(control: ControlModel, poses: np.ndarray | None = None) -> Skinni
 
 
 def write_for_programs(folder: Path, statue: Statue, vertices: np.ndarray, fine: Subdivision, up: int) -> None:
-    """Write statue.glb, the control mesh with skin and all images, and statue.x3d, the same as H-Anim; `vertices` are
-    those of the detailed surface, whose normals become the normal image.
-    """
+    """Write statue.glb and statue.x3d (H-Anim); the normals of the detailed `vertices` become an image."""
     normals = normal_image(statue.control, vertices, fine, len(statue.map.heights))
     write_statue_glb(folder / "statue.glb", statue.control, texture=statue.texture, normals=normals,
                      heights=statue.map.heights, up=up)

@@ -43,22 +43,19 @@ def statue_picture(scan: Mesh, statue: Statue, level: Level) -> np.ndarray:
 
 
 def statue_page(name: str, scan: Mesh, statue: Statue, levels: Sequence[Level], rows: list[tuple[str, Any, str]],
-                adaptive: Level | None = None, frames: Sequence[tuple[str, Mesh]] = (),
-                picture: np.ndarray | None = None) -> Page:
-    """The page of `scape statue fit`: levels are the coarsest first, rows (metric, value, unit) of the table, frames
-    the statue in other poses.
-    """
+                adaptive: Level, frames: Sequence[tuple[str, Mesh]], picture: np.ndarray) -> Page:
+    """The page of `scape statue fit`: levels, coarsest first, rows of the table, the statue in other poses."""
     finest = levels[-1]
     page = Page(f"{name}, a statue that moves", "A control mesh with a skeleton was fitted to the scan; the detail of "
                 "the scan is an image over it.")
-    page.picture(statue_picture(scan, statue, finest) if picture is None else picture)
+    page.picture(picture)
     page.table(rows, ("metric", "value", "unit"))
     _fit(page, scan, statue)
     _map(page, statue, scan)
     _errors(page, scan, statue, levels)
     page.section("Level of detail", "The same map on ever fewer triangles, and on triangles that are small only where "
                  "the displacement asks for it.")
-    shown = [*reversed(levels), *([adaptive] if adaptive else [])]
+    shown = [*reversed(levels), adaptive]
     camera = cameras(statue, scan, (20,))[0]
     page.picture(_row([(Solid(one.mesh, smooth=one is not finest), camera) for one in shown],
                       [f"{one.name}: {len(one.mesh.faces):,} triangles" for one in shown]))

@@ -32,8 +32,6 @@ def read_control(path: str | Path) -> ControlModel:
     if path.suffix.lower() == ".npz":
         return _load(path)
     if path.suffix.lower() == ".glb":
-        from .files import read_skinned
-
         return read_skinned(path)
     raise storage.StorageError(f"{path}: expected a control model in .npz or a skinned mesh in .glb")
 
@@ -202,8 +200,9 @@ def _control(corners: _Corners, places: np.ndarray, parents: np.ndarray, names: 
     up = turn_up(2)                                                    # z up, as the people
     mesh, places = mesh.with_vertices(mesh.vertices @ up), places @ up
     kept, parents, weights, part_of_face = _with_triangles(mesh, weights, parents)
-    joints = places[kept]
-    skeleton = Skeleton(part_of_face, parents, joints, _distinct([names[j] for j in kept]))
+    joints, names = places[kept], [names[j] for j in kept]
+    distinct = tuple(name if names.count(name) == 1 else f"{name} {k}" for k, name in enumerate(names))
+    skeleton = Skeleton(part_of_face, parents, joints, distinct)
     joints[0] = mesh.vertices[skeleton.part_of_vertex(mesh) == 0].mean(axis=0)
     skeleton = Skeleton(part_of_face, parents, joints, skeleton.names)
     J = len(parents)
@@ -266,7 +265,3 @@ def _with_triangles(mesh: Mesh, weights: np.ndarray, parents: np.ndarray
     gathered = np.zeros((len(weights), len(kept)))
     np.add.at(gathered.T, index[heir], weights.T)
     return kept, tree, gathered, index[wanted.argmax(axis=1)]
-
-
-def _distinct(names: list[str]) -> tuple[str, ...]:
-    return tuple(name if names.count(name) == 1 else f"{name} {k}" for k, name in enumerate(names))

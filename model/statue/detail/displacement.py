@@ -20,7 +20,7 @@ from scanprep.geometry.surface import Rays, Surface
 from scanprep.ranges import FLAG, Positive, Range, Settings
 
 from ..control.model import FOLDED, HOLE, MEASURED, OUTSIDE, ControlModel, DisplacementMap
-from .normal_volume import Crossings, find_crossings, interpolate, limits, outer_layers, unturned
+from .normal_volume import Crossings, find_crossings, interpolate, limits, not_inverted, outer_layers
 from .texels import Lattice, Texels, find_texels
 from .vectors import bend_over_folds
 
@@ -51,17 +51,7 @@ def bake(control: ControlModel, scan: Mesh, config: DisplacementConfig | None = 
          progress: Progress | None = None) -> DisplacementMap:
     """The displacement map of a scan over a control model that has been fitted to it.
 
-    Parameters
-    ----------
-    control : ControlModel
-    scan : Mesh
-    config : DisplacementConfig, optional
-    progress : (done, total), optional
-
-    Raises
-    ------
-    ValueError
-        A scan without triangles, or a chart that covers no pixel.
+    ValueError for a scan without triangles, or a chart that covers no pixel.
 
     [Statues] Eq. 19, 20, 21
     """
@@ -135,7 +125,7 @@ def _measure(mesh: Mesh, scan: Mesh, texels: Texels, reach: float) -> tuple[np.n
     of = found.normal
     far = found.heights * np.linalg.norm(normals[of], axis=1)
     found = found.pick((found.cosines > 0.1) & (far >= low[of]) & (far <= high[of])
-                       & unturned(mesh, texels.faces[of], texels.bary[of], found.heights))
+                       & not_inverted(mesh, texels.faces[of], texels.bary[of], found.heights))
     several = np.bincount(found.normal, minlength=len(points)) > 1
     return _choose(found, several, texels.neighbours()), several
 

@@ -71,9 +71,7 @@ def read_map(folder: str | Path, edited: str | Path | None = None) -> Displaceme
 
 
 def read_edited(path: str | Path, size: tuple[int, ...]) -> np.ndarray:
-    """(H, W) uint16 grey values of an image that an editor saved, 16 bits of grey or of three equal channels;
-    StorageError for another size or depth, or colours.
-    """
+    """(H, W) uint16 grey values of an image that an editor saved: 16 bits of grey, or three equal channels."""
     expected = f"an image of {size[1]} x {size[0]} pixels with 16 bits of grey"
     with taking_apart(path, expected):
         image, depth = _decoded(Path(path))

@@ -26,10 +26,8 @@ class NormalCoordinates:
 
     faces: np.ndarray      # (n,), triangle of the control mesh, -1 where a point lies in the volume of none
     bary: np.ndarray       # (n, 3), barycentric coordinates; zero where there is no triangle
-    heights: np.ndarray    # (n,) metres, along the interpolated normal, which is shorter than 1; NaN where there is no
-                           # triangle
-    solutions: np.ndarray  # (n,), how many places of the mesh reach the point: 0 outside the volume, 1 where it is one-
-                           # to-one
+    heights: np.ndarray    # (n,) metres, along the interpolated normal; NaN where there is no triangle
+    solutions: np.ndarray  # (n,), how many places of the mesh reach the point: 1 where it is one-to-one
 
     @property
     def inside(self) -> np.ndarray:
@@ -51,35 +49,28 @@ def from_normal_volume(mesh: Mesh, coordinates: NormalCoordinates) -> np.ndarray
 
 
 def to_normal_volume(mesh: Mesh, points: np.ndarray, reach: float) -> NormalCoordinates:
-    """Every point's (n, 3) triangle, place and least height, at most `reach` metres up or down, among all triangles of
-    a control mesh. [Statues] Eq. 19, 20
-    """
+    """Every point's (n, 3) triangle, place and least height, at most `reach` up or down. [Statues] Eq. 19, 20"""
     points = checked_points(points)
     if not 0 < reach < np.inf:
         raise ValueError(f"reach: expected a length above 0, got {reach}")
     count = len(points)
-    face, bary = np.full(count, -1), np.zeros((count, 3))
-    height, solutions = np.full(count, np.nan), np.zeros(count, dtype=np.int64)
-    best = np.full(count, np.inf)
-    places: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = []
+    face, bary, height = np.full(count, -1), np.zeros((count, 3)), np.full(count, np.nan)
+    found: list[tuple[np.ndarray, ...]] = [(np.zeros(0, int), np.zeros(0), np.zeros((0, 3)), np.zeros(0, int))]
     for which, triangle in _near(mesh, points, reach):
         pair, d, b = solve_triangles(mesh, triangle, points[which], reach)
-        who = which[pair]
-        places.append((who, np.einsum("nc,ncd->nd", b, mesh.corners[triangle[pair]]), d))
-        order = np.argsort(-np.abs(d), kind="stable")           # of several the least is written last
-        who, d, b, of = who[order], d[order], b[order], triangle[pair][order]
-        better = np.abs(d) < best[who]
-        who, d, b, of = who[better], d[better], b[better], of[better]
-        best[who] = np.inf
-        face[who], bary[who], height[who], best[who] = of, b, d, np.abs(d)
-    if places:
-        solutions = _count_places(count, *(np.concatenate(part) for part in zip(*places, strict=True)))
+        found.append((which[pair], d, b, triangle[pair]))
+    who, d, b, of = (np.concatenate(part) for part in zip(*found, strict=True))
+    solutions = _count_places(count, who, np.einsum("nc,ncd->nd", b, mesh.corners[of]), d)
+    order = np.argsort(np.abs(d), kind="stable")
+    _, first = np.unique(who[order], return_index=True)
+    best = order[first]                                                 # of several the least height
+    face[who[best]], bary[who[best]], height[who[best]] = of[best], b[best], d[best]
     return NormalCoordinates(face, bary, height, solutions)
 
 
 def solve_triangles(mesh: Mesh, faces: np.ndarray, points: np.ndarray, reach: float
                     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Heights at which points (n, 3) lie in given triangles (n,), displaced; only where these are not turned over.
+    """Heights at which points (n, 3) lie in given triangles (n,), displaced; only where these are not inverted.
     Which pair each solution is of (k,), its height (k,) in metres, its bary (k, 3).
     """
     v = mesh.corners[faces] - points[:, None]
@@ -260,8 +251,8 @@ def limits(control: Mesh, points: np.ndarray, normals: np.ndarray, reach: float)
     return -ends[0], ends[1]
 
 
-def unturned(control: Mesh, faces: np.ndarray, bary: np.ndarray, heights: np.ndarray) -> np.ndarray:
-    """(n,) bool: up to these heights the displaced triangles are nowhere turned over.
+def not_inverted(control: Mesh, faces: np.ndarray, bary: np.ndarray, heights: np.ndarray) -> np.ndarray:
+    """(n,) bool: up to these heights the displaced triangles are nowhere inverted.
 
     The area of the displaced triangle, as seen along the normal, is a quadratic in the height, and 1 at height 0.
     """

@@ -17,9 +17,7 @@ from .texels import Lattice, find_texels
 
 
 def scan_look(scan: Mesh | Texture) -> Look:
-    """The colours of a scan, of its vertices or its picture, at the closest place of its surface, and a weight: 0 where
-    the scan does not say; ValueError for a scan without colours.
-    """
+    """The colours of a scan, of its vertices or its picture, at the closest place; weight 0 where it has none."""
     mesh = scan.mesh if isinstance(scan, Texture) else scan
     if not isinstance(scan, Texture) and mesh.colors is None:
         raise ValueError("scan: expected colours of its vertices or a texture, found neither")

@@ -50,7 +50,7 @@ def bend_over_folds(lattice: Lattice, scan: Mesh, heights: np.ndarray, folded: n
     surface = start.copy()
     for stiffness in (100.0, 30.0, 10.0, 3.0, 1.0, 0.3, 0.1, 0.03):    # of the thin plate
         for _ in range(3):
-            normals = _normals(surface, fine.faces[used])[free]
+            normals = Mesh(surface, fine.faces[used]).vertex_normals[free]
             match = target.match(surface[free], normals, reach, 0.3)
             onto = _onto(places[match.index], facing[match.index], surface[free])
             w = np.where(match.valid, 1.0, 0.001)[:, None]    # lightly held where nothing matches
@@ -94,11 +94,3 @@ def _onto(q: np.ndarray, m: np.ndarray, points: np.ndarray) -> np.ndarray:
     off = points - q
     slip = off - np.einsum("nd,nd->n", off, m)[:, None] * m
     return q + slip * np.minimum(1, SPACING / np.maximum(np.linalg.norm(slip, axis=1), 1e-12))[:, None]
-
-
-def _normals(points: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """(n, 3) area-weighted unit normals of those vertices that the triangles (f, 3) use."""
-    a, b, c = (points[column] for column in faces.T)
-    cross = np.cross(b - a, c - a)
-    total = np.stack([np.bincount(faces.ravel(), np.repeat(cross[:, k], 3), len(points)) for k in range(3)], axis=1)
-    return total / np.maximum(np.linalg.norm(total, axis=1), 1e-300)[:, None]

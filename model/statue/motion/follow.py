@@ -102,9 +102,7 @@ def _averaging(body: Mesh) -> csr_array:
 
 def follower_of(statue: Statue, model: BodyModel, registered: np.ndarray | None = None,
                 progress: Callable[[int, int], None] | None = None) -> Follower:
-    """The control mesh bound to a learned model, whose template is registered to the statue first, by the landmarks
-    that both have or by correspondences; `registered` (N, 3) where that is known. ValueError where it fails.
-    """
+    """The control mesh bound to a learned model, whose template, if not `registered`, is registered first."""
     if registered is None:
         surface = Reconstruction(statue.control, statue.map,
                                  subdivide(statue.control.mesh, statue.control.chart, 2)).mesh()

@@ -18,9 +18,7 @@ from .retarget import Pairing, StatueMotion, retargeted
 
 
 def read_statue_motion(statue: Statue, path: Path) -> StatueMotion:
-    """A motion for the skeleton of a statue: BVH, or `.npz` of its own parts or of the synthetic people; StorageError
-    where it is damaged or of other parts.
-    """
+    """A motion for the skeleton of a statue: BVH, or `.npz` of its own parts or of the synthetic people."""
     if path.suffix.lower() == ".bvh":
         return bvh_motion(statue.control, statue.pose, read_bvh(path, "cm"))     # travel is scaled by the legs
     stored = load_arrays(path, "a motion (.npz) or BVH")

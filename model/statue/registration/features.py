@@ -21,8 +21,7 @@ PRIOR = 0.001
 class FeatureFit:
     """The control model in the pose, with the lengths and at the place of a scan."""
 
-    pose: np.ndarray      # (J, 3) radians, rotation vector of every part in its parent, as `Skeleton.part_rotations`
-                          # takes them
+    pose: np.ndarray      # (J, 3) radians, as `Skeleton.part_rotations` takes it
     lengths: np.ndarray   # (S,) metres, of the segments
     size: float           # of the body against the default one; its thickness grows by it
     trans: np.ndarray     # (3,) metres, from the default place of the root's joint to where it stands
@@ -36,24 +35,12 @@ class FeatureFit:
 
 def fit_features(control: ControlModel, joints: Mapping[str, np.ndarray],
                  points: Mapping[str, np.ndarray] | None = None) -> FeatureFit:
-    """Pose, segment lengths and place of a control model that bring its features to those of a scan.
+    """Pose, segment lengths and place of a control model that bring its features, by name, to those of a scan.
 
-    Features that are not given are not in the sum. What the given ones leave open (the twist of an arm with a
-    straight elbow, the length of a hand) a weak prior keeps near the default pose and lengths. The result turns,
-    moves and scales with the features. How lengths stretch the surface: see `Articulated`.
-
-    Parameters
-    ----------
-    joints : {name of a part: (3,) float, metres}
-        Centres of joints.
-    points : {name of a landmark: (3,) float, metres}, optional
-        Points of the surface.
-
-    Raises
-    ------
-    ValueError
-        Names that the control model does not have, places that are not finite, fewer than three features that are
-        not on one line.
+    Features that are not given are not in the sum. What the given ones leave open (the twist of an arm with a straight
+    elbow, the length of a hand) a weak prior keeps near the default pose and lengths. The result turns, moves and
+    scales with the features. How lengths stretch the surface: see `Articulated`. ValueError for unknown names, places
+    that are not finite, fewer than three features that are not on one line.
 
     [Statues] Eq. 4
     """
@@ -65,8 +52,7 @@ def fit_features(control: ControlModel, joints: Mapping[str, np.ndarray],
     scale = float(np.cbrt(np.linalg.det(T[:3, :3])))
     R = T[:3, :3] / scale
     goal = (goal - T[:3, 3]) @ R / scale                        # in the axes and the size of the control model
-    bounds = np.concatenate([model.limits, [[0.4, 2.5]] * len(model.lengths),
-                             [[-np.inf, np.inf]] * 3])
+    bounds = np.concatenate([model.limits, [[0.4, 2.5]] * len(model.lengths), [[-np.inf, np.inf]] * 3])
     at = {name: goal[k] for k, name in enumerate(joints)}
     start = np.clip(analytic_start(model, at), *bounds.T)
     # Each unknown is measured by what it moves: a hand and the whole body alike, in millimetres.
@@ -82,8 +68,7 @@ def fit_features(control: ControlModel, joints: Mapping[str, np.ndarray],
         return 1e6 * (value + PRIOR**2 * float(off @ off)), 1e6 * unit * slope
 
     found = minimize(energy, start / unit, jac=True, method="L-BFGS-B", bounds=bounds / unit[:, None],
-                     options={"maxiter": 2000, "maxfun": 4000, "ftol": 1e-9,
-                              "gtol": 1e-6, "maxcor": 50})
+                     options={"maxiter": 2000, "maxfun": 4000, "ftol": 1e-9, "gtol": 1e-6, "maxcor": 50})
     x = np.clip(unit * found.x, *bounds.T)
     frames = model.frames(x)
     pose = model.pose(x)
@@ -212,9 +197,7 @@ def analytic_start(model: Articulated, at: Mapping[str, np.ndarray]) -> np.ndarr
 
 def limb_angles(model: Articulated, base: int, middle: int, end: int | None, goal: np.ndarray
                 ) -> tuple[np.ndarray, float]:
-    """Angles (3,) of the base joint and that of the middle one that point one or two bones along directions (1 or 2, 3)
-    in the axes of the part that the base joint is on.
-    """
+    """Angles (3,) of the base joint and of the middle one that point bones along goals, in the axes above."""
     o, of_base, hinge = model.control.skeleton.joints, model.joint_of == base, model.joint_of == middle
     rest = np.array([o[middle] - o[base], *([o[end] - o[middle]] if len(goal) == 2 else [])])
     return _limb(_unit(rest), _unit(goal), model.axes[of_base], model.axes[hinge][0], model.limits[of_base],

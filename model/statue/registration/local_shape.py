@@ -105,9 +105,7 @@ class LocalShape:
 
 
 def local_shape(rest: Mesh) -> LocalShape:
-    """The local shape of a mesh at rest; ValueError where that is not edge-manifold or has not one sound frame.
-    [Statues] section 4.1
-    """
+    """The local shape of an edge-manifold mesh at rest. [Statues] section 4.1"""
     if not rest.is_edge_manifold:
         raise ValueError(f"rest: expected every edge between two triangles that agree on the outside, got {rest}")
     x, whole = rest.vertices, np.flatnonzero((rest.edge_use[rest.face_edges] == 2).all(axis=1))

@@ -43,8 +43,7 @@ class Posed:
     """A control model on its way to a scan."""
 
     x: np.ndarray      # (P,), parameters
-    girth: np.ndarray  # (S,) metres, how far the surface of every segment stands off the default one: people are not
-                       # equally thick
+    girth: np.ndarray  # (S,) metres, how far the surface of every segment stands off the default one
 
 
 class PoseSearch:
@@ -180,12 +179,13 @@ class Stand:
 
 
 def find_person(search: PoseSearch, target: Target, metres: float) -> list[Stand]:
-    """The best stand in a scan and the best one that faces another way, best first. The scan is in its own unit, of so
-    many `metres`.
-    """
+    """The best stand in a scan whose unit is so many `metres`, and the best that faces another way."""
+    def facing(stand: Stand) -> np.ndarray:
+        return stand.direction(search, np.array([0.0, -1, 0]))
+
     bent = sorted((bend(search, target, T, search.start, COARSE) for T in rough_stands(search, target, metres)[:8]),
                   key=lambda stand: stand.misfit)
-    best = bent[:1] + [s for s in bent[1:] if _facing(search, s) @ _facing(search, bent[0]) < 0.5][:1]
+    best = bent[:1] + [s for s in bent[1:] if facing(s) @ facing(bent[0]) < 0.5][:1]
     best = sorted((bend(search, target, s.T, s.posed, FINE) for s in best), key=lambda stand: stand.misfit)
     found = [with_arms(search, target, best[0])]
     for rival in best[1:]:
@@ -265,11 +265,12 @@ def with_arms(search: PoseSearch, target: Target, stand: Stand) -> Stand:
     """The same stand, with arms tried elsewhere while much of the scan lies off the body."""
     goal = moved(target, stand.T).thinned(0.02)
     coarse = goal.thinned(0.05)
+    o, z = search.model.control.skeleton.joints, search.model.control.mesh.vertices[:, 2]
     for base, middle, end in limbs(search.model):
         astray = (Surface(search.mesh(stand.posed)).closest(goal.points).distances > CAP).mean()
         if not ASTRAY[0] < astray < ASTRAY[1]:
             break
-        if end is None or not _is_arm(search, base):
+        if end is None or o[base, 2] <= 0.5 * (z.min() + z.max()):      # a leg
             continue
         starts = [_pointed(search, stand.posed, base, middle, end, np.array([upper, fore]))
                   for upper in UPPER_ARMS for fore in (upper, *FOREARMS)]
@@ -279,12 +280,6 @@ def with_arms(search: PoseSearch, target: Target, stand: Stand) -> Stand:
                     key=lambda s: s.misfit)
         stand = min(stand, bend(search, target, stand.T, tried.posed, FINE), key=lambda s: s.misfit)
     return stand
-
-
-def _is_arm(search: PoseSearch, base: int) -> bool:
-    """A limb whose base lies in the upper half."""
-    o, z = search.model.control.skeleton.joints, search.model.control.mesh.vertices[:, 2]
-    return bool(o[base, 2] > 0.5 * (z.min() + z.max()))
 
 
 def _pointed(search: PoseSearch, posed: Posed, base: int, middle: int, end: int, arm: np.ndarray) -> Posed:
@@ -301,7 +296,3 @@ def _pointed(search: PoseSearch, posed: Posed, base: int, middle: int, end: int,
     A = len(angles)
     x[:A] = np.clip(x[:A], *model.limits.T)
     return Posed(x, posed.girth)
-
-
-def _facing(search: PoseSearch, stand: Stand) -> np.ndarray:
-    return stand.direction(search, np.array([0.0, -1, 0]))
