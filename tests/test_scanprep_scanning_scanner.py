@@ -9,8 +9,7 @@ import pytest
 from scanprep.geometry.files import read_mesh
 from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.surface import Surface
-from scanprep.synthetic import data_set
-from scanprep.synthetic import people
+from scanprep.synthetic import data_set, people
 from scanprep.synthetic.people import BodyShape, Person
 from scanprep.synthetic.scanner import ScannerConfig, scan
 

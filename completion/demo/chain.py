@@ -26,11 +26,11 @@ from scanprep.pipeline.template import TemplateConfig, make_template
 from scanprep.skeleton.find import SkeletonConfig
 from scanprep.synthetic.data_set import (
     SUBJECT,
-    SyntheticScan,
     GroundTruth,
+    SyntheticScan,
     click_landmarks,
-    scan_plan,
     read_views,
+    scan_plan,
     stand,
     write_scan,
 )
@@ -54,19 +54,11 @@ Bar = Callable[[str], AbstractContextManager[Callable[[int, int], None]]]
 
 @dataclass(frozen=True)
 class Demo:
-    """One run of the demonstration in its folder.
-
-    Attributes
-    ----------
-    space : Workspace
-    config : DemoConfig
-    bar : callable
-        `bar(title)` is a context manager that yields a progress callback.
-    """
+    """One run of the demonstration in its folder."""
 
     space: Workspace
     config: DemoConfig
-    bar: Bar
+    bar: Bar  # `bar(title)` is a context manager that yields a progress callback
 
     @property
     def folder(self) -> Path:
@@ -131,13 +123,7 @@ class Demo:
 
     @cached_property
     def prepared(self) -> Prepared:
-        """The registered set, with its skeleton.
-
-        Raises
-        ------
-        ValueError
-            A scan that could not be registered.
-        """
+        """The registered set, with its skeleton."""
         # registration slides some millimetres along the skin: less than that is not motion. The value was chosen
         # on these very scans, so the agreement with the true parts shows what can be reached, not what to expect.
         config = PrepareConfig(skeleton=SkeletonConfig(parts=self.config.parts, tolerance=0.003))

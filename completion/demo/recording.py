@@ -10,7 +10,7 @@ from scipy.spatial import cKDTree
 
 from scanprep.batch.room import Room
 from scanprep.geometry.mesh import Mesh
-from scanprep.synthetic.data_set import SyntheticScan, GroundTruth, synthetic_scan
+from scanprep.synthetic.data_set import GroundTruth, SyntheticScan, synthetic_scan
 from scanprep.synthetic.people import MARKERS
 from scanprep.synthetic.scanner import ScannerConfig
 

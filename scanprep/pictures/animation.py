@@ -20,23 +20,6 @@ def write_animated_glb(path: str | Path, faces: np.ndarray, frames: np.ndarray, 
 
     Every key frame is a morph target with its own normals; the animation blends from one to the next. Nothing
     but the core of glTF is used.
-
-    Parameters
-    ----------
-    path : str or Path
-    faces : (F, 3) int
-    frames : (T, N, 3) float, metres
-    rate : float, frames a second
-    colors : (N, 3) float in [0, 1], optional
-    up : int
-        0, 1 or 2: the axis that points up.
-    keys : int
-        Largest number of key frames; of a longer motion evenly spaced frames are kept.
-
-    Raises
-    ------
-    ValueError
-        Arrays of a wrong shape, no frames, frames that are not finite, a rate that is not positive.
     """
     data = animated_glb(faces, frames, rate, colors, up, keys)
     with writing(path) as beside:

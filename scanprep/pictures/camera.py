@@ -11,49 +11,19 @@ from ..geometry.mesh import Mesh
 
 @dataclass(frozen=True, eq=False)
 class Camera:
-    """A view of the scene; the picture is scaled so that `width` × `height` metres fit into it.
+    """A view of the scene; the picture is scaled so that `width` × `height` metres fit into it."""
 
-    Attributes
-    ----------
-    target : (3,) float, metres
-        What stands in the middle of the picture.
-    axes : (3, 3) float
-        Rows: right, up and back (towards the camera), unit and perpendicular.
-    vertical : (3,) float
-        Unit vector that points away from the ground.
-    width, height : float, metres
-        Extent to be visible at the target.
-    distance : float, metres
-        From the camera to the target; inf for parallel rays.
-    """
-
-    target: np.ndarray
-    axes: np.ndarray
-    vertical: np.ndarray
-    width: float
-    height: float
-    distance: float = np.inf
+    target: np.ndarray  # (3,) float, metres: what stands in the middle of the picture
+    axes: np.ndarray  # (3, 3) float: rows: right, up and back (towards the camera), unit and perpendicular
+    vertical: np.ndarray  # (3,) float: unit vector that points away from the ground
+    width: float  # metres: extent to be visible at the target
+    height: float  # metres: extent to be visible at the target
+    distance: float = np.inf  # metres: from the camera to the target; inf for parallel rays
 
     @classmethod
     def around(cls, subject: Any, azimuth: float = 0.0, elevation: float = 8.0,
                up: int = 2, lens: float = 6.0, margin: float = 1.06) -> Camera:
-        """A camera that holds the whole subject.
-
-        Parameters
-        ----------
-        subject : Mesh, Solid, a sequence of them, or points (n, 3); two points are the corners of a box
-        azimuth : float, degrees
-            Counter-clockwise about the upward axis. At 0 the camera stands on the +x side when z is up, on the
-            +z side when y is up.
-        elevation : float, degrees
-            Height of the camera above the horizon.
-        up : int
-            0, 1 or 2: the axis that points up.
-        lens : float
-            Distance of the camera in sizes of the subject; inf for parallel rays.
-        margin : float
-            Extent of the picture over that of the subject.
-        """
+        """A camera that holds the whole subject."""
         points = _points(subject)
         middle = (points.min(axis=0) + points.max(axis=0)) / 2
         a, e = np.radians(azimuth), np.radians(elevation)

@@ -27,18 +27,7 @@ class Glb:
         self._accessors: list[dict[str, Any]] = []
 
     def add(self, array: np.ndarray, kind: str, target: int | None, bounds: bool = False) -> int:
-        """An accessor of float32 numbers; its index.
-
-        Parameters
-        ----------
-        array : (n, ...) float
-        kind : "SCALAR", "VEC2", "VEC3", "VEC4" or "MAT4"
-            What a row is; a matrix is stored column after column, as the caller has to lay it out.
-        target : VERTICES or None
-            `VERTICES` for what vertices have.
-        bounds : bool
-            Say the least and the greatest row, which glTF wants of positions and times.
-        """
+        """An accessor of float32 numbers; its index."""
         values = np.ascontiguousarray(array, dtype="<f4")
         extra: dict[str, Any] = {}
         if bounds:

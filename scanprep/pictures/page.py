@@ -52,14 +52,7 @@ pre { background: var(--tint); border: 1px solid var(--line); border-radius: 8px
 
 
 class Page:
-    """A page built from top to bottom; every method returns the page, so that calls can be chained.
-
-    Parameters
-    ----------
-    title : str
-    lead : str
-        What the page shows, in a sentence or two.
-    """
+    """A page built from top to bottom; every method returns the page, so that calls can be chained."""
 
     def __init__(self, title: str, lead: str = "") -> None:
         self.title, self.lead = title, lead
@@ -91,26 +84,12 @@ class Page:
         return self
 
     def picture(self, image: np.ndarray | bytes, caption: str = "", alt: str = "") -> Page:
-        """A picture.
-
-        Parameters
-        ----------
-        image : (H, W, 3 or 4) uint8, or the bytes of a PNG, GIF, WebP, JPEG or SVG file
-        caption : str
-        alt : str
-            What the picture shows, for readers who do not see it; the caption when not given.
-        """
+        """A picture."""
         self._parts.append(_figure(image, caption, alt))
         return self
 
     def pictures(self, images: Sequence[np.ndarray | bytes], captions: Sequence[str] = ()) -> Page:
-        """Pictures in a row that wraps on narrow screens.
-
-        Raises
-        ------
-        ValueError
-            Captions that are not one for each image.
-        """
+        """Pictures in a row that wraps on narrow screens."""
         if captions and len(captions) != len(images):
             raise ValueError(f"captions: expected {len(images)}, one for each image, got {len(captions)}")
         figures = [_figure(image, caption, "") for image, caption in

@@ -27,64 +27,35 @@ WHITE = (1.0, 1.0, 1.0)
 
 @dataclass(frozen=True, eq=False)
 class Solid:
-    """A mesh and how it looks.
-
-    Attributes
-    ----------
-    mesh : Mesh
-    color : (3,), (N, 3) per vertex or (F, 3) per triangle, in [0, 1], optional
-        The mesh's own colours, else clay, when not given.
-    opacity : float
-        Below 1 what lies behind shines through.
-    smooth : bool
-        Interpolate normals; False shows the single triangles.
-    """
+    """A mesh and how it looks."""
 
     mesh: Mesh
+    # (3,), (N, 3) per vertex or (F, 3) per triangle, in [0, 1], optional; The mesh's own colours, else clay, when not
+    # given
     color: np.ndarray | Sequence[float] | None = None
-    opacity: float = 1.0
-    smooth: bool = True
+    opacity: float = 1.0  # below 1 what lies behind shines through
+    smooth: bool = True  # interpolate normals: false shows the single triangles
 
 
 @dataclass(frozen=True, eq=False)
 class Dots:
-    """Small balls: markers, joints, landmarks.
+    """Small balls: markers, joints, landmarks."""
 
-    Attributes
-    ----------
-    points : (n, 3) float, metres
-        Points that are not finite are left out.
-    color : (3,) or (n, 3) in [0, 1]
-    radius : float, metres
-    on_top : bool
-        Seen through the meshes in front of them.
-    coarse : bool
-        Balls of few triangles, for pictures in which they are a few pixels wide.
-    """
-
-    points: np.ndarray
-    color: np.ndarray | Sequence[float] = ACCENT
-    radius: float = 0.012
-    on_top: bool = False
-    coarse: bool = False
+    points: np.ndarray  # (n, 3) float, metres: points that are not finite are left out
+    color: np.ndarray | Sequence[float] = ACCENT  # (3,) or (n, 3) in [0, 1]
+    radius: float = 0.012  # metres
+    on_top: bool = False  # seen through the meshes in front of them
+    coarse: bool = False  # balls of few triangles, for pictures in which they are a few pixels wide
 
 
 @dataclass(frozen=True, eq=False)
 class Bones:
-    """Straight rods with round ends.
+    """Straight rods with round ends."""
 
-    Attributes
-    ----------
-    starts, ends : (n, 3) float, metres
-    color : (3,) or (n, 3) in [0, 1]
-    radius : float, metres
-    on_top : bool
-    """
-
-    starts: np.ndarray
-    ends: np.ndarray
-    color: np.ndarray | Sequence[float] = (0.25, 0.30, 0.38)
-    radius: float = 0.006
+    starts: np.ndarray  # (n, 3) float, metres
+    ends: np.ndarray  # (n, 3) float, metres
+    color: np.ndarray | Sequence[float] = (0.25, 0.30, 0.38)  # (3,) or (n, 3) in [0, 1]
+    radius: float = 0.006  # metres
     on_top: bool = False
 
 

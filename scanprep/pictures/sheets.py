@@ -22,26 +22,7 @@ def font(size: int):
 
 def side_by_side(images: Sequence[np.ndarray], labels: Sequence[str] | None = None, gap: int = 8,
                  columns: int | None = None) -> np.ndarray:
-    """A contact sheet of pictures with a line of text below each.
-
-    Parameters
-    ----------
-    images : sequence of (H, W, 3) uint8
-        Of any sizes; each is centred in its cell, and every row is as high as its highest picture.
-    labels : sequence of str, optional
-    gap : int, pixels
-    columns : int, optional
-        All in one row when not given.
-
-    Returns
-    -------
-    (H, W, 3) uint8
-
-    Raises
-    ------
-    ValueError
-        No images, or another number of labels.
-    """
+    """A contact sheet of pictures with a line of text below each."""
     from PIL import Image, ImageDraw
 
     if not len(images):

@@ -24,21 +24,12 @@ Look = Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]
 
 @dataclass(frozen=True, eq=False)
 class Texture:
-    """A picture laid on a mesh.
+    """A picture laid on a mesh."""
 
-    Attributes
-    ----------
-    mesh : Mesh
-        Its vertices are repeated where charts meet.
-    uv : (N, 2) float
-        Place of each vertex in the picture: (0, 0) is its lower left corner, (1, 1) its upper right one.
-    image : (H, W, 3) float in [0, 1]
-        Rows from the top.
-    """
-
-    mesh: Mesh
+    mesh: Mesh  # its vertices are repeated where charts meet
+    # (N, 2) float: place of each vertex in the picture: (0, 0) is its lower left corner, (1, 1) its upper right one
     uv: np.ndarray
-    image: np.ndarray
+    image: np.ndarray  # (H, W, 3) float in [0, 1]: rows from the top
 
     def scaled(self, factor: float) -> Texture:
         """All lengths of the mesh times a factor."""
@@ -113,16 +104,7 @@ def _picture(material: Any) -> np.ndarray | None:
 
 
 def bake(body: Mesh, look: Look, unseen: np.ndarray, size: int | None = None) -> Texture:
-    """A texture of a body: what `look` says of each of its pixels, elsewhere the colours of its vertices.
-
-    Parameters
-    ----------
-    body : Mesh
-    look : (places (n, 3), normals (n, 3)) -> colours (n, 3), weights (n,)
-    unseen : (N, 3) float in [0, 1]
-        Colours where the weight is zero.
-    size : int, pixels, optional
-    """
+    """A texture of a body: what `look` says of each of its pixels, elsewhere the colours of its vertices."""
     size = size or SIZE
     kept, faces, uv = unwrap(body)
     flat = Mesh(np.column_stack([uv, np.zeros(len(uv))]), faces)
@@ -143,21 +125,7 @@ def bake(body: Mesh, look: Look, unseen: np.ndarray, size: int | None = None) ->
 
 
 def unwrap(mesh: Mesh) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """A mesh cut into flat charts.
-
-    Returns
-    -------
-    (n,) int
-        The vertex that each vertex of the cut mesh was.
-    (F, 3) int
-        Its triangles, in the old order.
-    (n, 2) float in [0, 1]
-
-    Raises
-    ------
-    ModuleNotFoundError
-        xatlas is not installed.
-    """
+    """A mesh cut into flat charts."""
     try:
         import xatlas
     except ModuleNotFoundError:

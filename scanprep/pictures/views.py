@@ -29,16 +29,7 @@ def upright(mesh: Mesh) -> tuple[int, float]:
 
 def look_around(body: Mesh, poses: np.ndarray | None = None, turns: tuple[float, ...] = (0, 90, 180, 270),
                 elevation: float = 8.0) -> list[Camera]:
-    """Cameras around a body: by default from its front, its left, its back and its right.
-
-    Parameters
-    ----------
-    body : Mesh
-        Says which way is up and where the front is; standing.
-    poses : (..., 3) float, metres, optional
-        What has to fit into the picture, when it is not the body itself.
-    turns : degrees, from the front
-    """
+    """Cameras around a body: by default from its front, its left, its back and its right."""
     up, front = upright(body)
     subject = body.vertices if poses is None else np.asarray(poses, dtype=float).reshape(-1, 3)
     return [Camera.around(subject, azimuth=front + turn, elevation=elevation, up=up) for turn in turns]

@@ -32,20 +32,9 @@ def cover(surface: PosedSurface, count: int, sides: Sides, rng: np.random.Genera
 
 
 def agglomerate(moments: Moments, contacts: np.ndarray, count: int, partner: np.ndarray | None = None) -> np.ndarray:
-    """Join sets that touch, each time the pair whose union costs least more, until `count` are left.
+    """The new number (P,) of every set after those that touch were joined, the cheapest union first, down to `count`.
 
-    Parameters
-    ----------
-    moments : Moments of P sets
-    contacts : (n, 2) int
-    count : int
-        A set and its partner count as one.
-    partner : (P,) int, optional
-        The mirror image of every set: mirror images are joined together.
-
-    Returns
-    -------
-    (P,) int, the new number of every set, from 0
+    A set and its `partner` (P,), the mirror image with which it is joined too, count as one.
     """
     moments = moments[np.arange(len(moments.w))]
     cost = rigid_costs(moments)
@@ -87,19 +76,10 @@ def agglomerate(moments: Moments, contacts: np.ndarray, count: int, partner: np.
 
 
 def halve(moments: Moments, contacts: np.ndarray, group: np.ndarray) -> np.ndarray:
-    """What `agglomerate` down to two sets does, for many groups of sets side by side.
+    """What `agglomerate` down to two sets does, for many groups (P,) of sets side by side.
 
-    Parameters
-    ----------
-    moments : Moments of P sets
-    contacts : (n, 2) int
-        Pairs of sets of one group.
-    group : (P,) int, 0..G-1
-
-    Returns
-    -------
-    (P,) int
-        A set of those that became one; of every group two are left, or as many pieces as it is in.
+    Contacts (n, 2) are of sets of one group. Returns (P,) a set of those that became one; of every group two are left,
+    or as many pieces as it is in.
     """
     moments = moments[np.arange(len(moments.w))]
     cost, owner, pairs = rigid_costs(moments), np.arange(len(group)), contacts

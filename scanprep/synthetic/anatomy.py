@@ -83,15 +83,7 @@ class BodyShape:
 
     @staticmethod
     def random(rng: np.random.Generator, sex: float | None = None, spread: float = 1.0) -> BodyShape:
-        """A plausible person: stature from the population, the rest normal within its range.
-
-        Parameters
-        ----------
-        sex : -1 to 1, optional
-            A man or a woman at equal chance when not given.
-        spread : float
-            Factor on the standard deviations.
-        """
+        """A plausible person: stature from the population, the rest normal within its range."""
         if sex is None:
             sex = 1.0 if rng.random() < 0.5 else -1.0
         man = (sex + 1) / 2
@@ -110,16 +102,7 @@ RANGES = {"sex": (-1.0, 1.0), "stature": (1.45, 2.05), "weight": (-1.8, 3.0), "m
 
 
 class Anatomy:
-    """Joints, frames and the implicit surface of one person at rest.
-
-    Attributes
-    ----------
-    joints : (16, 3) float, metres
-        Centre of rotation of every part; of part 0 the middle between the hips.
-    ends : (16, 3) float, metres
-        The far end of every part's bone.
-    field : the implicit surface
-    """
+    """Joints, frames and the implicit surface of one person at rest."""
 
     def __init__(self, shape: BodyShape) -> None:
         self.shape = s = shape

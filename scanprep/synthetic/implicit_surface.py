@@ -19,19 +19,7 @@ class Field(Protocol):
 
 
 class Loft:
-    """Superelliptic cross-sections along an axis, closed by rounded caps.
-
-    Parameters
-    ----------
-    origin : (3,) float, metres
-    frame : (3, 3) float
-        Rows: the sideways direction, the front direction, the axis.
-    keys : (k, 8) float
-        Position on the axis, centre sideways, centre frontwards, extents to +side, -side, front and back,
-        all in metres, and the exponent of the superellipse.
-    caps : (2,) float, metres
-        How far the rounded ends reach beyond the first and the last key.
-    """
+    """Superelliptic cross-sections along an axis, closed by rounded caps."""
 
     _TABLE = 400
 
@@ -66,13 +54,7 @@ class Loft:
 
 
 class RoundCone:
-    """The hull of two spheres.
-
-    Parameters
-    ----------
-    a, b : (3,) float, metres
-    radius_a, radius_b : float, metres
-    """
+    """The hull of two spheres."""
 
     def __init__(self, a: np.ndarray, b: np.ndarray, radius_a: float, radius_b: float) -> None:
         self.a, self.b, self.ra, self.rb = np.asarray(a), np.asarray(b), radius_a, radius_b
@@ -86,13 +68,7 @@ class RoundCone:
 
 
 class Ellipsoid:
-    """An ellipsoid, its radii along the rows of a frame.
-
-    Parameters
-    ----------
-    centre, radii : (3,) float, metres
-    frame : (3, 3) float, optional
-    """
+    """An ellipsoid, its radii along the rows of a frame."""
 
     def __init__(self, centre: np.ndarray, radii: np.ndarray, frame: np.ndarray | None = None) -> None:
         self.centre, self.radii = np.asarray(centre), np.asarray(radii, dtype=np.float64)
@@ -107,21 +83,12 @@ class Ellipsoid:
 
 @dataclass(frozen=True)
 class Bump:
-    """A soft rise (height > 0) or hollow (height < 0) of the surface around a point.
+    """A soft rise (height > 0) or hollow (height < 0) of the surface around a point."""
 
-    Parameters
-    ----------
-    centre : (3,) float, metres
-    height : float, metres
-    widths : (3,) float, metres
-        Standard deviations along the rows of `frame`.
-    frame : (3, 3) float, optional
-    """
-
-    centre: np.ndarray
-    height: float
-    widths: Sequence[float] | np.ndarray
-    frame: np.ndarray | None = None
+    centre: np.ndarray  # (3,) float, metres
+    height: float  # metres
+    widths: Sequence[float] | np.ndarray  # (3,) float, metres: standard deviations along the rows of `frame`
+    frame: np.ndarray | None = None  # (3, 3) float, optional
 
     def __call__(self, points: np.ndarray) -> np.ndarray:
         out = np.zeros(len(points))
@@ -141,16 +108,7 @@ def smooth_union(a: np.ndarray, b: np.ndarray, k: float) -> np.ndarray:
 
 
 class Group:
-    """Fields joined one after the other, evaluated only near themselves.
-
-    Parameters
-    ----------
-    members : (field, k) pairs
-        `k` rounds the seam with the members before, metres.
-    bumps : Bump
-    bounds : (3,) and (3,) ends, and radius, metres, optional
-        Points outside this capsule get their distance to it.
-    """
+    """Fields joined one after the other, evaluated only near themselves."""
 
     MARGIN = 0.06
 

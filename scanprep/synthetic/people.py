@@ -68,18 +68,7 @@ class Person:
         return Poser(self.anatomy, self.mesh.vertices, self.joints[0])
 
     def posed(self, pose: np.ndarray, trans: np.ndarray | None = None) -> np.ndarray:
-        """The vertices in a pose.
-
-        Parameters
-        ----------
-        pose : (16, 3) float, radians
-            Rotation vector of every part against its parent; `pose[0]` turns the body about `joints[0]`.
-        trans : (3,) float, metres, optional
-
-        Returns
-        -------
-        (N, 3) float, metres
-        """
+        """The vertices in a pose."""
         pose = _checked(pose)
         return self._poser(pose) + (0 if trans is None else np.asarray(trans, dtype=np.float64))
 

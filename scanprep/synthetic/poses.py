@@ -33,17 +33,7 @@ def _towards(axis: np.ndarray, direction: np.ndarray, twist: float) -> np.ndarra
 def arm(direction: tuple[float, float, float], elbow: float = 0, twist: float = 0, turn: float = 0,
         wrist: float = 0,
         side: int = 1) -> np.ndarray:
-    """Rotation vectors (3, 3) of upper arm, forearm and hand.
-
-    Parameters
-    ----------
-    direction : outwards, frontwards, upwards
-        Where the upper arm points, seen from the chest.
-    elbow, twist, turn, wrist : degrees
-        Flexion beyond rest; rotation of the upper arm about itself, positive inwards; pronation of the
-        hand; flexion of the wrist towards the palm.
-    side : 1 left, -1 right
-    """
+    """Rotation vectors (3, 3) of upper arm, forearm and hand."""
     a = average()
     out, front, up = direction
     upper, fore = a.upper_arm_frame, a.forearm_frame
@@ -57,15 +47,7 @@ def arm(direction: tuple[float, float, float], elbow: float = 0, twist: float = 
 
 def leg(direction: tuple[float, float, float], knee: float = 0, twist: float = 0, foot: float = 0, side: int = 1
         ) -> np.ndarray:
-    """Rotation vectors (3, 3) of thigh, shin and foot.
-
-    Parameters
-    ----------
-    direction : outwards, frontwards, upwards
-        Where the thigh points, seen from the pelvis.
-    knee, twist, foot : degrees
-        Flexion; rotation of the thigh about itself, positive outwards; raising of the toes.
-    """
+    """Rotation vectors (3, 3) of thigh, shin and foot."""
     a = average()
     out, front, up = direction
     axis = a.leg_frame[2]
@@ -186,13 +168,7 @@ NAMED_POSES = tuple(_NAMED)
 
 
 def named_pose(name: str) -> np.ndarray:
-    """A pose (16, 3), radians, by its name in `NAMED_POSES`.
-
-    Raises
-    ------
-    ValueError
-        A name that is not known.
-    """
+    """A pose (16, 3), radians, by its name in `NAMED_POSES`."""
     if name not in _NAMED:
         raise ValueError(f"name: no pose '{name}', expected one of {', '.join(NAMED_POSES)}")
     return compose(**_NAMED[name])
@@ -203,13 +179,7 @@ JITTER = np.radians(np.array([4, 4, 4, 7, 8, 6, 9, 8, 6, 9, 4, 4, 5, 4, 4, 5.0])
 
 
 def random_pose(rng: np.random.Generator, spread: float = 1.0) -> np.ndarray:
-    """A plausible pose (16, 3): arms, legs, back and neck each drawn from the named poses, loosened.
-
-    Parameters
-    ----------
-    spread : float
-        How far from rest: 0 gives rest, 1 poses as varied as the named ones.
-    """
+    """A plausible pose (16, 3): arms, legs, back and neck each drawn from the named poses, loosened."""
     pose = np.zeros((16, 3))
     for group in _GROUPS:
         name = NAMED_POSES[rng.integers(len(NAMED_POSES))]

@@ -52,28 +52,14 @@ class ScannerConfig(Settings):
 
 @dataclass(frozen=True, eq=False)
 class RangeView:
-    """What one camera saw.
+    """What one camera saw."""
 
-    Attributes
-    ----------
-    mesh : Mesh
-        The triangulated range image; its vertices are `points`.
-    normals : (n, 3) float
-        Of the triangulated points, unit, outwards.
-    camera : (3,) float, metres
-    T_world_camera : (4, 4) float
-        Camera axes are right, down, ahead.
-    depth : (H, W) float, metres
-        Distance along the optical axis, NaN where nothing was measured.
-    intrinsics : (3, 3) float, pixels
-    """
-
-    mesh: Mesh
-    normals: np.ndarray
-    camera: np.ndarray
-    T_world_camera: np.ndarray
-    depth: np.ndarray
-    intrinsics: np.ndarray
+    mesh: Mesh  # the triangulated range image; its vertices are `points`
+    normals: np.ndarray  # (n, 3) float: of the triangulated points, unit, outwards
+    camera: np.ndarray  # (3,) float, metres
+    T_world_camera: np.ndarray  # (4, 4) float: camera axes are right, down, ahead
+    depth: np.ndarray  # (H, W) float, metres: distance along the optical axis, NaN where nothing was measured
+    intrinsics: np.ndarray  # (3, 3) float, pixels
 
     @property
     def points(self) -> np.ndarray:
@@ -93,17 +79,10 @@ class RangeView:
 
 @dataclass(frozen=True, eq=False)
 class Scan:
-    """All views of one body.
+    """All views of one body."""
 
-    Attributes
-    ----------
-    views : RangeView of every camera
-    merged : Mesh
-        The triangles of all views side by side.
-    """
-
-    views: tuple[RangeView, ...]
-    merged: Mesh
+    views: tuple[RangeView, ...]  # of every camera
+    merged: Mesh  # the triangles of all views side by side
 
 
 def pixel_rays(shape: tuple[int, ...], intrinsics: np.ndarray, R_world_camera: np.ndarray) -> np.ndarray:

@@ -22,21 +22,12 @@ VERSION = 1
 
 @dataclass(frozen=True, eq=False)
 class Template:
-    """The shared triangulation on the canonical body.
-
-    Attributes
-    ----------
-    mesh : Mesh
-    mirror : (N,) int
-        The vertex at the mirrored place.
-    part_of_face : (F,) int
-    anatomy : Anatomy of the canonical body
-    """
+    """The shared triangulation on the canonical body."""
 
     mesh: Mesh
-    mirror: np.ndarray
-    part_of_face: np.ndarray
-    anatomy: Anatomy
+    mirror: np.ndarray  # (N,) int: the vertex at the mirrored place
+    part_of_face: np.ndarray  # (F,) int
+    anatomy: Anatomy  # anatomy of the canonical body
 
 
 def sizing(anatomy: Anatomy) -> Callable[[np.ndarray], np.ndarray]:

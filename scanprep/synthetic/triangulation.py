@@ -18,11 +18,6 @@ def polygonise(field: Field, low: np.ndarray, high: np.ndarray, step: float) -> 
     """The zero surface in a box by marching cubes; open where the box cuts it.
 
     Only cells near the surface are evaluated finely.
-
-    Parameters
-    ----------
-    low, high : (3,) float, metres
-    step : float, metres
     """
     import igl
 
@@ -68,14 +63,7 @@ def remesh(mesh: Mesh, field: Field, sizing: Sizing, rounds: int = 12) -> Mesh:
 
 
 def mirror(half: Mesh) -> tuple[Mesh, np.ndarray]:
-    """A half body (x >= 0, its border at x = 0) and its mirror image as one mesh.
-
-    Returns
-    -------
-    Mesh
-    (N,) int
-        The mirror image of every vertex; itself in the middle.
-    """
+    """A half body (x >= 0, its border at x = 0) and its mirror image as one mesh."""
     n = len(half.vertices)
     middle = np.zeros(n, dtype=bool)
     middle[half.boundary_vertices] = True

@@ -17,21 +17,7 @@ _ANKLE = np.array([0, -4, 3, 7, 10, 8, -14, -8, 0, 2, 0.0])
 
 
 def walk(frames: int, rate: float = 60.0, speed: float = 1.0) -> tuple[np.ndarray, np.ndarray]:
-    """A walk straight ahead.
-
-    Parameters
-    ----------
-    frames : int
-    rate : float, frames a second
-    speed : float
-        1 is a gait cycle of 1.1 seconds.
-
-    Returns
-    -------
-    (frames, 16, 3) float, radians
-    (frames, 3) float, metres
-        The place of the root against rest, so that the lower foot stays on the floor.
-    """
+    """A walk straight ahead."""
     t = np.arange(frames) / rate * speed / 1.1
     poses = np.stack([_stride(phase) for phase in t % 1.0])
     fine = 120
