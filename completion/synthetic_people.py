@@ -152,8 +152,8 @@ def build_synthetic(recipe: SyntheticRecipe, progress: Progress | None = None) -
         tell(recipe.poses + k + 1, made + learning)
     small = _decimated(person, np.stack(poses), recipe.faces)
     assert small.skeleton is not None, "a skeleton was given"
-    model = learn_scape(small.template, small.carry(np.stack(poses)), small.carry(np.stack(shapes)), small.skeleton,
-                        recipe.learn, lambda done, total: tell(made + done, made + total))
+    model = learn_scape(small.template, small.transfer(np.stack(poses)), small.transfer(np.stack(shapes)),
+                        small.skeleton, recipe.learn, lambda done, total: tell(made + done, made + total))
     return replace(model, info={
         **model.info, "name": "synthetic people", "built": datetime.date.today().isoformat(),
         "landmarks": small.landmarks(landmarks()), "markers": small.landmarks(markers()),

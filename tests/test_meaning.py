@@ -17,7 +17,7 @@ from completion.__main__ import main
 from completion.mocap.animate import report
 from completion.mocap.animate.work import Work as Follow
 from completion.mocap.animate.work import animate_file
-from completion.mocap.artefacts.robust import motion_problem
+from completion.mocap.pose.robust import motion_problem
 from completion.mocap.pose.settings import AnimateConfig
 from completion.mocap.subject.marker_shape import MarkerShapeConfig
 from completion.motion import Motion

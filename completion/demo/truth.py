@@ -32,7 +32,7 @@ class TruthMap:
 
     def vertices(self, truth: GroundTruth) -> np.ndarray:
         """True places (N, 3) of the template's vertices, metres."""
-        return self.places.carried(truth.vertices, truth.faces)
+        return self.places.transferred(truth.vertices, truth.faces)
 
 
 def surface_error(mesh: Mesh, truth: GroundTruth) -> np.ndarray:

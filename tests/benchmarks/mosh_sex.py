@@ -44,7 +44,7 @@ def learned(folder: Path) -> dict[str, BodyModel]:
         shapes = np.stack([Person(BodyShape.random(rng, sex=1.0 if sex == "male" else -1.0)).posed(near_rest(rng))
                            for sex in sexes])
         small = _decimated(man, poses, recipe.faces)
-        found = learn_by_sex(small.template, small.carry(poses), small.carry(shapes), sexes, small.skeleton,
+        found = learn_by_sex(small.template, small.transfer(poses), small.transfer(shapes), sexes, small.skeleton,
                              recipe.learn)
         for name, model in found.items():
             model.info["people_vertices"] = small.vertex_map.tolist()

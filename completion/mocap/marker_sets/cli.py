@@ -8,10 +8,10 @@ import numpy as np
 import tyro
 
 from model.body import BodyModel
-from scanprep.cli import MM, Output, Unit, landmarks_beside
+from scanprep.cli import MM, Output, Unit
 from scanprep.console import Metric, Outcome, bar, dispatch, say
 from scanprep.geometry.files import read_mesh, write_mesh
-from scanprep.geometry.landmarks import match_landmarks, read_landmark_vertices, read_landmarks
+from scanprep.geometry.landmarks import match_landmarks, read_landmarks, read_template_landmarks
 from scanprep.geometry.mesh import Mesh
 from scanprep.skeleton.tree import Skeleton
 
@@ -108,7 +108,7 @@ def carry_to(layout: LayoutArg, source: Path, target: Path, output: Output, land
     found = read_layout(layout, ours, None)
     pairs = None
     if landmarks is not None:
-        marks = read_landmark_vertices(source_landmarks or landmarks_beside(source), ours)
+        marks = read_template_landmarks(source, ours, source_landmarks, "--source-landmarks")
         try:
             pairs = match_landmarks(marks, read_landmarks(landmarks, theirs, unit))[1:]
         except ValueError as error:
