@@ -11,11 +11,11 @@ from model.report import picture_components, picture_parts
 from scanprep.console import Metric
 from scanprep.geometry import storage
 from scanprep.geometry.files import read_mesh
-from scanprep.pictures.animation import animated_glb
+from scanprep.pictures.camera import look_around, upright
+from scanprep.pictures.gltf import animated_glb
 from scanprep.pictures.page import Page
 from scanprep.pictures.shading import Shape, Solid, heat, part_colors, render, side_by_side
 from scanprep.pictures.sheets import save_png
-from scanprep.pictures.views import look_around, upright
 
 from ..mocap.animate.report import animated_picture, chart_residuals, picture_frames
 from ..partial.report import COMPLETED, HEIGHT, MEASURED, picture_completion, picture_distance

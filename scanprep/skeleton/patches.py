@@ -5,6 +5,7 @@ import numpy as np
 from scipy.sparse import coo_array, csr_array
 from scipy.sparse.csgraph import dijkstra
 
+from ..geometry.farthest_points import farthest_points
 from .motions import Moments, PosedSurface, rigid_costs, union_costs
 from .sides import Sides, closure
 
@@ -20,13 +21,12 @@ def cover(surface: PosedSurface, count: int, sides: Sides, rng: np.random.Genera
     a, b = sides.pairs.T
     step = np.linalg.norm(centre[a] - centre[b], axis=1)
     graph = csr_array(coo_array((np.r_[step, step], (np.r_[a, b], np.r_[b, a])), shape=(n, n)))
-    distance, patch = np.full(n, np.inf), np.zeros(n, dtype=np.int64)
     seed = int(np.linalg.norm(centre, axis=1).argmax()) if rng is None else int(rng.integers(n))
-    for k in range(min(-(-count // 2) if sides.tied else count, n)):
-        ahead = dijkstra(graph, indices=seed, limit=distance.max())
-        nearer = ahead < distance
-        patch[nearer], distance[nearer] = k, ahead[nearer]
-        seed = int(distance.argmax())
+    seeds = farthest_points(centre, -(-count // 2) if sides.tied else count, seed,
+                            lambda i, limit: dijkstra(graph, indices=i, limit=limit))
+    nearest = dijkstra(graph, indices=seeds, min_only=True, return_predecessors=True)[2]
+    order = np.argsort(seeds)
+    patch = order[np.searchsorted(seeds, nearest, sorter=order)]
     K = int(patch.max()) + 1
     return np.unique(sides.spread(patch, np.r_[np.arange(K) + K, np.arange(K)]), return_inverse=True)[1]
 
