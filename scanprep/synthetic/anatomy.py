@@ -5,12 +5,13 @@ as (sideways, frontwards, up) and mirrored.
 """
 from __future__ import annotations
 
+import json
 from dataclasses import dataclass, fields
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Any
 
 import numpy as np
-
-from . import profiles as tables
-from .implicit_surface import Field, Group, Mirrored
 
 PARTS = ("pelvis", "abdomen", "chest", "head",
          "l_upper_arm", "l_forearm", "l_hand", "r_upper_arm", "r_forearm", "r_hand",
@@ -18,6 +19,21 @@ PARTS = ("pelvis", "abdomen", "chest", "head",
 PARENTS = np.array([-1, 0, 1, 2, 2, 4, 5, 2, 7, 8, 0, 10, 11, 0, 13, 14])
 MIRROR_PART = np.array([0, 1, 2, 3, 7, 8, 9, 4, 5, 6, 13, 14, 15, 10, 11, 12])
 ARM_ANGLE, ELBOW_ANGLE, LEG_ANGLE, TOE_OUT = np.radians([36.0, 14.0, 4.5, 9.0])
+
+
+def _tables() -> SimpleNamespace:
+    """The tables of `anatomy.json`, where it says what their columns are: arrays, or as they stand."""
+    stored = json.loads(Path(__file__).with_name("anatomy.json").read_text(encoding="utf-8"))
+    rows: dict[str, Any] = {name: table["rows"] for name, table in stored.items() if name != "about"}
+    for name, value in rows.items():
+        if isinstance(value, list) and not name.endswith("muscles"):
+            rows[name] = np.array(value)
+    rows["leg_woman"] = rows["leg_man"] + rows["leg_woman_difference"]
+    rows["trunk_fat_woman"] = rows["trunk_fat"] * rows["trunk_fat_woman"]
+    return SimpleNamespace(**rows)
+
+
+tables = _tables()
 
 
 @dataclass(frozen=True)
@@ -102,16 +118,19 @@ RANGES = {"sex": (-1.0, 1.0), "stature": (1.45, 2.05), "weight": (-1.8, 3.0), "m
 
 
 class Anatomy:
-    """Joints, frames and the implicit surface of one person at rest."""
+    """Joints and frames of one person at rest.
+
+    `joints` (16, 3), metres, are the centres of rotation of the parts, of part 0 the middle between the hips, `ends`
+    (16, 3) the far ends of their bones.
+    """
 
     def __init__(self, shape: BodyShape) -> None:
         self.shape = s = shape
         self.man = w = (s.sex + 1) / 2
         self.fat = s.weight + 0.45 * w + 0.70 * (1 - w)       # the tables are of lean people
-        self.scale = s.stature / (w * tables.MAN + (1 - w) * tables.WOMAN)
+        self.scale = s.stature / (w * tables.stature["man"] + (1 - w) * tables.stature["woman"])
         self._levels()
         self._place_joints()
-        self._build_field()
 
     def mix(self, man: np.ndarray | float, woman: np.ndarray | float) -> np.ndarray:
         """Between the man's and the woman's value, scaled with stature."""
@@ -119,10 +138,10 @@ class Anatomy:
 
     def _levels(self) -> None:
         s = self.shape
-        level = {name: float(self.mix(tables.LEVELS["man"][name], tables.LEVELS["woman"][name]))
-                 for name in tables.LEVELS["man"]}
-        width = {name: float(self.mix(tables.WIDTHS["man"][name], tables.WIDTHS["woman"][name]))
-                 for name in tables.WIDTHS["man"]}
+        level = {name: float(self.mix(tables.levels["man"][name], tables.levels["woman"][name]))
+                 for name in tables.levels["man"]}
+        width = {name: float(self.mix(tables.widths["man"][name], tables.widths["woman"][name]))
+                 for name in tables.widths["man"]}
         self.head_scale = float(self.man + (1 - self.man) * 0.945) * self.scale**0.5 * (1 + 0.022 * s.head_size)
         leg = 1 + 0.03 * s.leg_length
         for name in ("ankle", "knee", "hip"):
@@ -179,16 +198,6 @@ class Anatomy:
         for left, right in ((4, 7), (5, 8), (6, 9), (10, 13), (11, 14), (12, 15)):
             joints[right], ends[right] = joints[left] * [-1, 1, 1], ends[left] * [-1, 1, 1]
         self.joints, self.ends = joints, ends
-
-    def _build_field(self) -> None:
-        from .body_parts import arm, hand, leg, trunk, trunk_bumps
-        from .head import head
-
-        torso, shoulders = trunk(self)
-        body: list[tuple[Field, float]] = [*torso, (leg(self), 0.035 * self.scale)]
-        left = Group([(Group(body), 0), *shoulders, (arm(self), 0.048 * self.scale)], trunk_bumps(self))
-        members: list[tuple[Field, float]] = [(left, 0), (head(self), 0.012), (hand(self), 0.012)]
-        self.field: Field = Mirrored(Group(members))
 
     def front(self, side: float, front: float, up: float) -> np.ndarray:
         """World point of (sideways, frontwards, up)."""

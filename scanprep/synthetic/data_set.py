@@ -1,7 +1,6 @@
 """The synthetic data set: scans of one subject in many poses and of many subjects, truth kept beside them."""
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, fields
 from functools import lru_cache
 from pathlib import Path
@@ -154,24 +153,6 @@ class SyntheticScan:
 
 
 SUBJECT = BodyShape(sex=1.0, stature=1.78, weight=-0.3, muscle=0.9, shoulder_width=0.4)
-
-
-def synthetic_dataset(folder: str | Path, seed: int = 0, subject_poses: int = 20, subjects: int = 12,
-                     config: ScannerConfig | None = None, click_error: float = 0.003,
-                     progress: Callable[[int, int], None] | None = None) -> list[SyntheticScan]:
-    """Scan one subject in many poses and many subjects near the rest pose.
-
-    The first scan, `subject_00_rest`, is the one to make the template from. Scans that are there already are
-    kept, and every scan has its own random numbers, so an interrupted run goes on and ends with the same
-    files.
-    """
-    plan = scan_plan(subject_poses, subjects)
-    out = []
-    for done, which in enumerate(plan):
-        out.append(synthetic_scan(Path(folder), seed, *which, config or ScannerConfig(), click_error))
-        if progress is not None:
-            progress(done + 1, len(plan))
-    return out
 
 
 def scan_plan(subject_poses: int, subjects: int) -> list[tuple[int, bool]]:
