@@ -1,18 +1,67 @@
-"""The shared triangulation: one half of the canonical body polygonised, remeshed evenly, and mirrored.
+"""How the triangulation that all synthetic people share is made: done once, its result is stored in the package.
 
-Run once by `people_template.build`; its result is stored beside the code.
+One half of the canonical body is polygonised, remeshed evenly, and mirrored. `python tests/people_maker.py` makes the
+file anew, in two minutes.
 """
 from __future__ import annotations
 
 from collections.abc import Callable
+from pathlib import Path
 
 import numpy as np
 
-from ..geometry.mesh import Mesh
-from .implicit_surface import Field, polygonise, project
+from scanprep.geometry import storage
+from scanprep.geometry.mesh import Mesh
+from scanprep.synthetic.anatomy import Anatomy
+from scanprep.synthetic.body_parts import body_surface
+from scanprep.synthetic.implicit_surface import Field, polygonise, project
+from scanprep.synthetic.topology import CANONICAL, STORED, VERSION, Template, label_faces
 
-__all__ = ["mirror", "polygonise", "remesh"]
 Sizing = Callable[[np.ndarray], np.ndarray]
+
+
+def sizing(anatomy: Anatomy) -> Sizing:
+    """Wanted edge length in metres at points (n, 3): fine on face, ears, hands and toes."""
+    hand = anatomy.joints[6] + 0.6 * (anatomy.ends[6] - anatomy.joints[6])
+    foot = anatomy.joints[12] + 0.75 * anatomy.width["foot"] * anatomy.foot_frame[2] * [1, 1, 0]
+    foot[2] = 0.01
+    face = anatomy.eye + np.array([0, -0.095, -0.035])
+    ear = anatomy.eye + np.array([0.08, 0.008, -0.01])
+    spots = [(hand, 0.0068, 0.09), (foot, 0.0085, 0.05), (face, 0.0062, 0.05), (anatomy.eye, 0.0110, 0.12),
+             (ear, 0.0055, 0.036)]
+
+    def size(points: np.ndarray) -> np.ndarray:
+        wanted = np.full(len(points), 0.0235)
+        for centre, fine, radius in spots:
+            folded = np.abs(points[:, :1]) if centre[0] > 0 else points[:, :1]
+            d = np.linalg.norm(np.hstack([folded, points[:, 1:]]) - centre, axis=1)
+            wanted = np.minimum(wanted, fine + 0.16 * np.maximum(d - radius, 0))
+        return wanted
+
+    return size
+
+
+def build(step: float = 0.0035) -> Template:
+    """Polygonise and remesh the canonical body from scratch (about two minutes)."""
+    anatomy = Anatomy(CANONICAL)
+    field = body_surface(anatomy)
+    high = np.array([anatomy.ends[6, 0] + 0.08, 0.22, CANONICAL.stature + 0.03])
+    half = polygonise(field, np.array([0.0, -0.30, -0.02]), high, step)
+    keep = half.vertex_component[half.faces[:, 0]] == 0
+    half = remesh(half.submesh(keep)[0], field, sizing(anatomy))
+    mesh, twin = mirror(half)
+    order = np.lexsort((np.round(mesh.vertices[:, 0], 4), np.round(mesh.vertices[:, 2], 3)))
+    place = np.argsort(order)
+    mesh = Mesh(mesh.vertices[order], place[mesh.faces])
+    return Template(mesh, place[twin[order]], label_faces(mesh, anatomy), anatomy)
+
+
+def store(template: Template, path: Path = STORED) -> None:
+    """Keep a built template beside the code."""
+    storage.save(path, "people template", VERSION, {
+        "vertices": np.round(template.mesh.vertices * 1e5).astype(np.int32),
+        "mirror": template.mirror.astype(np.uint16),
+        "faces": template.mesh.faces.astype(np.uint16)})
 
 
 def remesh(mesh: Mesh, field: Field, sizing: Sizing, rounds: int = 12) -> Mesh:
@@ -166,3 +215,7 @@ def _relax(vertices: np.ndarray, faces: np.ndarray, field: Field, sizing: Sizing
     moved = project(field, moved, 2, 0.004)
     moved[border, 0] = 0
     return moved
+
+
+if __name__ == "__main__":
+    store(build())
