@@ -9,9 +9,11 @@ import json
 from dataclasses import dataclass, fields
 from pathlib import Path
 from types import SimpleNamespace
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
+
+from ..ranges import Range, Settings, ranges
 
 PARTS = ("pelvis", "abdomen", "chest", "head",
          "l_upper_arm", "l_forearm", "l_hand", "r_upper_arm", "r_forearm", "r_hand",
@@ -37,7 +39,7 @@ tables = _tables()
 
 
 @dataclass(frozen=True)
-class BodyShape:
+class BodyShape(Settings):
     """What makes one person's build differ from another's.
 
     Except for sex and stature, 0 is the average of the sex and 1 a standard deviation above it.
@@ -64,29 +66,26 @@ class BodyShape:
         A value outside its range.
     """
 
-    sex: float = 1.0
-    stature: float = 1.75
-    weight: float = 0.0
-    muscle: float = 0.0
-    leg_length: float = 0.0
-    arm_length: float = 0.0
-    shoulder_width: float = 0.0
-    hip_width: float = 0.0
-    belly: float = 0.0
-    chest: float = 0.0
-    neck: float = 0.0
-    head_size: float = 0.0
-    limbs: float = 0.0
-    extremities: float = 0.0
-    nose: float = 0.0
+    sex: Annotated[float, Range(-1, 1)] = 1.0
+    stature: Annotated[float, Range(1.45, 2.05)] = 1.75
+    weight: Annotated[float, Range(-1.8, 3)] = 0.0
+    muscle: Annotated[float, Range(-2, 3)] = 0.0
+    leg_length: Annotated[float, Range(-2.5, 2.5)] = 0.0
+    arm_length: Annotated[float, Range(-2.5, 2.5)] = 0.0
+    shoulder_width: Annotated[float, Range(-2.5, 2.5)] = 0.0
+    hip_width: Annotated[float, Range(-2.5, 2.5)] = 0.0
+    belly: Annotated[float, Range(-1.5, 3)] = 0.0
+    chest: Annotated[float, Range(-2, 3)] = 0.0
+    neck: Annotated[float, Range(-2.5, 2.5)] = 0.0
+    head_size: Annotated[float, Range(-2.5, 2.5)] = 0.0
+    limbs: Annotated[float, Range(-2, 2)] = 0.0
+    extremities: Annotated[float, Range(-2.5, 2.5)] = 0.0
+    nose: Annotated[float, Range(-2, 2.5)] = 0.0
 
     def __post_init__(self) -> None:
         for field in fields(self):
-            low, high = RANGES[field.name]
-            value = float(getattr(self, field.name))
-            if not low <= value <= high:
-                raise ValueError(f"{field.name}: expected {low} to {high}, got {value}")
-            object.__setattr__(self, field.name, value)
+            object.__setattr__(self, field.name, float(getattr(self, field.name)))
+        super().__post_init__()
 
     def array(self) -> np.ndarray:
         """(15,) the values in the order of the fields."""
@@ -108,13 +107,8 @@ class BodyShape:
         scale = {"weight": 0.9, "muscle": 0.8, "belly": 0.7, "chest": 0.8, "limbs": 0.7}
         for field in fields(BodyShape)[2:]:
             values[field.name] = spread * scale.get(field.name, 0.9) * rng.normal()
-        return BodyShape(**{name: float(np.clip(v, *RANGES[name])) for name, v in values.items()})
-
-
-RANGES = {"sex": (-1.0, 1.0), "stature": (1.45, 2.05), "weight": (-1.8, 3.0), "muscle": (-2.0, 3.0),
-          "leg_length": (-2.5, 2.5), "arm_length": (-2.5, 2.5), "shoulder_width": (-2.5, 2.5),
-          "hip_width": (-2.5, 2.5), "belly": (-1.5, 3.0), "chest": (-2.0, 3.0), "neck": (-2.5, 2.5),
-          "head_size": (-2.5, 2.5), "limbs": (-2.0, 2.0), "extremities": (-2.5, 2.5), "nose": (-2.0, 2.5)}
+        allowed = {name: (found.low, found.high) for name, (found, _) in ranges(BodyShape).items()}
+        return BodyShape(**{name: float(np.clip(v, *allowed[name])) for name, v in values.items()})
 
 
 class Anatomy:
