@@ -21,23 +21,14 @@ from .mocap.marker_selection.sets import design_markers as design_markers
 from .mocap.marker_selection.settings import DesignConfig as DesignConfig
 from .mocap.marker_sets.layout import MarkerLayout as MarkerLayout
 from .mocap.marker_sets.named import layout_names as layout_names
+from .mocap.marker_sets.named import named_layout as named_layout
 from .mocap.marker_sets.symmetry import SkinMirror as SkinMirror
 from .mocap.marker_sets.symmetry import find_skin_mirror as find_skin_mirror
-from .mocap.marker_sets.transfer import (
-    CarriedLayout as CarriedLayout,
-)
-from .mocap.marker_sets.transfer import (
-    CarryConfig as CarryConfig,
-)
-from .mocap.marker_sets.transfer import (
-    carry_layout as carry_layout,
-)
-from .mocap.marker_sets.transfer import (
-    register_layout as register_layout,
-)
+from .mocap.marker_sets.transfer import TransferredLayout as TransferredLayout
+from .mocap.marker_sets.transfer import transfer_layout as transfer_layout
 from .mocap.mosh.mosh import mosh as mosh
-from .mocap.pose.follow import AnimateConfig as AnimateConfig
 from .mocap.pose.follow import animate as animate
+from .mocap.pose.settings import AnimateConfig as AnimateConfig
 from .mocap.pose.stream import Frame as Frame
 from .mocap.pose.stream import MarkerStream as MarkerStream
 from .mocap.results import MoshResult as MoshResult

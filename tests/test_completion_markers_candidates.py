@@ -6,7 +6,8 @@ import pytest
 
 from completion.mocap.marker_selection.candidates import CandidateConfig, candidate_layout, sitting_room
 from completion.mocap.marker_sets.layout import DISTANCE, MarkerLayout
-from completion.mocap.marker_sets.symmetry import find_skin_mirror
+from completion.mocap.marker_sets.named import named_layout
+from completion.mocap.marker_sets.symmetry import find_skin_mirror, label_pairs
 from scanprep.geometry.geodesics import SurfaceGraph
 from scanprep.geometry.rotations import exp
 from scanprep.synthetic.landmarks import landmarks
@@ -26,7 +27,7 @@ def mirror(person):
 
 @pytest.fixture(scope="module")
 def base(person):
-    return MarkerLayout.named("vicon47", person)
+    return named_layout("vicon47", person)
 
 
 @pytest.fixture(scope="module")
@@ -42,7 +43,7 @@ def test_there_are_as_many_as_wanted_and_the_base_is_first(candidates, base):
 
 
 def test_every_candidate_has_its_mirror_image(candidates, person):
-    pairs = candidates.pairs()
+    pairs = label_pairs(candidates.labels)
     assert (pairs >= 0).all() and (pairs[pairs] == np.arange(114)).all()
     image = person.vertices[load().mirror[candidates.vertices]]              # the true one
     assert np.linalg.norm(image - person.vertices[candidates.vertices[pairs]], axis=1)[47:].max() < 0.03
@@ -58,7 +59,7 @@ def test_candidates_are_spread_over_the_skin(candidates, person):
     nearest = apart.min(axis=1)
     assert nearest[47:].min() > 0.05
     gaps = [nearest_before(apart, i) for i in range(47, 114)]                # each as far as the one before, or less
-    pairs = candidates.pairs()
+    pairs = label_pairs(candidates.labels)
     assert all(b < a + 0.02 for a, b in pairwise(gaps)) and (pairs[47:] != np.arange(47, 114)).any()
 
 

@@ -158,7 +158,7 @@ def test_motions(tmp_path, case, words):
         markers = dataclasses.replace(markers, labels=tuple(labels))
     write_markers(tmp_path / "walk.csv", markers)
     work = Follow(model, "model.npz", str(tmp_path / "layout.json"), model.subject(None), None, None, "m", None, 6,
-                  AnimateConfig(start_axes=1), MarkerShapeConfig())
+                  AnimateConfig(), MarkerShapeConfig())
     check(animate_file(work, tmp_path / "walk.csv", Room(tmp_path / "out")), words)
     assert (tmp_path / "out" / "motion.npz").exists()
 

@@ -18,6 +18,7 @@ from protocols import machine, write_report
 
 from completion.mocap.files.markers import MarkerSequence, read_markers
 from completion.mocap.marker_sets.layout import MarkerLayout
+from completion.mocap.marker_sets.named import named_layout
 from completion.mocap.pose.follow import AnimateConfig, animate
 from completion.mocap.subject.marker_shape import MarkerShapeConfig, MarkerSubject, subject_from_markers
 from completion.motion import Motion
@@ -73,7 +74,7 @@ def main() -> None:
     args = parser.parse_args()
     model = load_model(args.model)
     people = model.info.get("people_vertices")
-    layout = MarkerLayout.named(args.layout, model.template, None if people is None else np.array(people))
+    layout = named_layout(args.layout, model.template, None if people is None else np.array(people))
     shape, config = MarkerShapeConfig(), AnimateConfig(key_interval=args.key_interval)
     rows = []
     for path in sorted(args.folder.glob("*.c3d")):

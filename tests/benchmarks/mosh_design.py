@@ -26,6 +26,7 @@ from completion.mocap.marker_selection.posed import in_poses
 from completion.mocap.marker_selection.sets import Choice, best_path, choose
 from completion.mocap.marker_selection.settings import DesignConfig
 from completion.mocap.marker_sets.layout import MarkerLayout
+from completion.mocap.marker_sets.named import named_layout
 from model.body import BodyModel
 from model.files import load_model
 
@@ -99,7 +100,7 @@ def main() -> None:
         bodies = in_poses(model, data.shapes[men], poses).reshape(-1, *model.template.vertices.shape)
         if given.bodies:
             np.savez(given.bodies, bodies=bodies)
-    base = MarkerLayout.named("vicon47", model.template)
+    base = named_layout("vicon47", model.template)
     candidates = candidate_layout(model, base, 114)
     groups = symmetric_groups(candidates.labels)
     report: dict[str, object] = {"machine": machine(), "model": str(given.model), "men": given.men,
@@ -152,7 +153,7 @@ def _with_others(candidates: MarkerLayout, model: BodyModel) -> tuple[MarkerLayo
     labels, vertices = list(candidates.labels), candidates.vertices.tolist()
     rows = {}
     for name in OTHERS:
-        layout = MarkerLayout.named(name, model.template)
+        layout = named_layout(name, model.template)
         rows[name] = list(range(len(labels), len(labels) + len(layout.labels)))
         labels += [f"{name} {label}" for label in layout.labels]
         vertices += layout.vertices.tolist()

@@ -19,7 +19,7 @@ from ...motion import Motion
 from ..files.markers import MarkerSequence, read_markers
 from ..files.motion_tables import write_joint_angles, write_joint_centres, write_motion_bvh, write_residuals
 from ..marker_sets.layout import MarkerLayout
-from ..marker_sets.named import fitting_layout, layout_names
+from ..marker_sets.named import fitting_layout, layout_names, named_layout
 from ..pose.follow import AnimateConfig, animate
 from ..pose.robust import motion_problem
 from ..retargeting.retarget import morphed_vertices, retarget
@@ -89,7 +89,7 @@ def choose_layout(model: BodyModel, given: str | Path | None, labels: tuple[str,
         return fitting_layout(labels, model.template, of_people)
     named = layout_or_file(given)
     if isinstance(named, str):
-        return MarkerLayout.named(named, model.template, of_people), named
+        return named_layout(named, model.template, of_people), named
     return MarkerLayout.load(named, len(model.template.vertices)), str(named)
 
 

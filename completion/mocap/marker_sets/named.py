@@ -5,7 +5,7 @@ import hashlib
 from collections.abc import Sequence
 from functools import cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
@@ -13,8 +13,7 @@ from scanprep.geometry import storage
 from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.surface import Surface
 
-if TYPE_CHECKING:
-    from .layout import MarkerLayout
+from .layout import MarkerLayout
 
 FOLDER = Path(__file__).parent / "layouts"
 EMBEDDED = "embedded people"
@@ -43,9 +42,23 @@ def layout_summaries() -> list[tuple[str, int, str, str]]:
 
 
 def named_layout(name: str, template: Mesh, kept: np.ndarray | None = None) -> MarkerLayout:
-    """See `MarkerLayout.named`."""
-    from .layout import MarkerLayout
+    """A usual marker set on a body that is known here: the triangles of SCAPE and SPRING, or the synthetic people.
 
+    Parameters
+    ----------
+    name : str
+        One of `layout_names()`, such as "cmu41".
+    template : Mesh
+        Known by its triangles, whatever its shape and pose.
+    kept : (N,) int, optional
+        The vertices of the synthetic people that a template with fewer triangles kept,
+        `info["people_vertices"]` of their model.
+
+    Raises
+    ------
+    ValueError
+        A set that does not come along, or a body on which it is not known.
+    """
     if name not in layout_names():
         raise ValueError(f"name: expected a marker layout of {', '.join(layout_names())}, got {name!r}; for another, "
                          + OWN)
@@ -64,10 +77,8 @@ def named_layout(name: str, template: Mesh, kept: np.ndarray | None = None) -> M
 
 
 def _on_kept(layout: MarkerLayout, template: Mesh, kept: np.ndarray) -> MarkerLayout:
-    """The layout of the embedded people on a template that kept only some of their vertices."""
+    """The layout of the synthetic people on a template that kept only some of their vertices."""
     from scanprep.synthetic.topology import load
-
-    from .layout import MarkerLayout
 
     whole = load().mesh.vertices
     found = Surface(Mesh(whole[kept], template.faces)).closest(whole[layout.vertices])
@@ -82,13 +93,7 @@ def _files() -> tuple[tuple[Path, dict[str, Any]], ...]:
 
 def fitting_layout(labels: Sequence[str], template: Mesh, kept: np.ndarray | None = None
                    ) -> tuple[MarkerLayout, str]:
-    """The named layout that knows most of some labels, and its name.
-
-    Raises
-    ------
-    ValueError
-        A body on which none is known, or labels of which none knows three.
-    """
+    """The named layout that knows most of some labels, and its name; ValueError where none knows three of them."""
     found = {name: named_layout(name, template, kept) for name in layout_names()}
     best = max(found, key=lambda name: (len(found[name].matched(labels, 0)), -len(found[name].labels)))
     found[best].matched(labels)
