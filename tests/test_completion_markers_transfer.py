@@ -42,7 +42,7 @@ def test_renumbered_vertices_and_triangles_change_nothing(body, layout):
     target, _ = renumbered(body, np.random.default_rng(1))
     found = transfer_layout(layout, body, target, config=NEAR, search=False)
     off = np.linalg.norm(found.layout.skin_points(target.vertices) - layout.skin_points(body.vertices), axis=1)
-    assert off.mean() < 0.002 and off.max() < 0.012 and found.missed < 0.001 and found.rms < 0.0005
+    assert off.mean() < 0.002 and off.max() < 0.012 and found.uncovered < 0.001 and found.rms < 0.0005
     assert found.layout.labels == layout.labels and found.layout.loose == layout.loose
     assert found.layout.aliases == layout.aliases
     np.testing.assert_array_equal(found.layout.distances, layout.distances)
@@ -74,7 +74,7 @@ def test_what_does_not_fit_is_refused(body, layout):
     target, _ = renumbered(body, np.random.default_rng(1))
     far = target.with_vertices(target.vertices + 5)
     with pytest.raises(ValueError, match=r"target: the source could not be brought onto it, 100% .* give landmarks"):
-        transfer_layout(layout, body, far, config=replace(NEAR, settle=None), search=False)
+        transfer_layout(layout, body, far, config=replace(NEAR, final_fit=None), search=False)
     with pytest.raises(ValueError, match="marker 'A' sits on vertex 99999"):
         transfer_layout(MarkerLayout(("A",), np.array([99_999])), body, target)
     with pytest.raises(ValueError, match="landmarks: expected"):

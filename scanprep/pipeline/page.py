@@ -39,18 +39,7 @@ main { max-width: 76rem; }
 
 
 def write_set_page(folder: str | Path, limits: Limits | None = None, to: Path | None = None) -> Path:
-    """Write `report.html` into the folder of a set, from what lies there: tables, pictures, skeleton.
-
-    Parameters
-    ----------
-    to : Path, optional
-        Another folder for the page.
-
-    Returns
-    -------
-    Path
-        Of the page.
-    """
+    """Write `report.html` of a set, from what lies in its folder, there or into another folder; returns its path."""
     folder, limits = Path(folder), limits or Limits()
     whole, verdicts = RegisteredSet.load(folder), judge_set(folder, limits)
     size = float(np.sqrt(whole.template.face_areas.sum()))

@@ -47,21 +47,11 @@ class Limits(Settings):
 
 @dataclass(frozen=True)
 class Verdict:
-    """What is to be thought of one scan.
-
-    Attributes
-    ----------
-    name : str
-    badness : float
-        The largest multiple of a limit; from 1 on the scan needs a look. Infinite for one that failed.
-    reasons : tuple of str
-        What is over its limit, worst first; for a scan that failed, why.
-    figures : ScanFigures or None
-    """
+    """What is to be thought of one scan."""
 
     name: str
-    badness: float
-    reasons: tuple[str, ...]
+    badness: float                  # the largest multiple of a limit; from 1 on it needs a look; infinite: it failed
+    reasons: tuple[str, ...]        # what is over its limit, worst first; for a scan that failed, why
     figures: ScanFigures | None = None
 
     @property
@@ -77,19 +67,9 @@ class Verdict:
 
 def review(figures: Sequence[ScanFigures], failures: Sequence[Failure], size: float, faces: int,
            limits: Limits | None = None) -> list[Verdict]:
-    """Judge all scans of a set.
+    """Judge all scans of a set, worst first: failures, then by falling badness.
 
-    Parameters
-    ----------
-    size : float, metres
-        Of the template: the root of its area.
-    faces : int
-        Triangles of the template.
-
-    Returns
-    -------
-    list of Verdict
-        Worst first: failures, then by falling badness.
+    `size` is the root of the template's area in metres, `faces` its number of triangles.
     """
     limits = limits or Limits()
     usual = float(np.median([1 - f.seen for f in figures])) if figures else 0.0

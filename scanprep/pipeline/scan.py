@@ -10,15 +10,17 @@ import numpy as np
 from ..cleaning.clean_scan import CleanScanConfig, clean_scan
 from ..correspondence.correlated import CorrelatedConfig, find_correspondences
 from ..correspondence.correspondences import Correspondences
+from ..geometry.files import read_scan
 from ..geometry.landmarks import check_on_surface, match_landmarks, read_landmarks
 from ..geometry.mesh import Mesh
 from ..meaning import extent
 from ..ranges import FLAG, Settings
 from ..registration.confidence import stretched_share
-from ..registration.nonrigid import Registration, RegistrationConfig, register, registration_problem
+from ..registration.nonrigid import Registration, register, registration_problem
+from ..registration.schedule import RegistrationConfig
 from ..threads import one_thread
 from .figures import ScanFigures
-from .scans import ScanTask, read_scan
+from .scans import ScanTask
 
 Init = Literal["best", "landmarks", "automatic", "pose"]
 
@@ -57,30 +59,16 @@ class ScanSettings(Settings):
 
 @dataclass(frozen=True, eq=False)
 class RegisteredScan:
-    """What a scan became.
+    """What a scan became."""
 
-    Attributes
-    ----------
-    vertices : (N, 3) float, metres
-    figures : ScanFigures
-    picture : bytes
-        A strip of small pictures as a WebP file; empty where none were asked for.
-    """
-
-    vertices: np.ndarray
+    vertices: np.ndarray            # (N, 3), metres
     figures: ScanFigures
-    picture: bytes = b""
+    picture: bytes = b""            # a strip of small pictures as a WebP file; empty where none were asked for
 
 
 def register_scan(task: ScanTask, template: Mesh, template_landmarks: dict[str, int],
                   settings: ScanSettings | None = None) -> RegisteredScan:
-    """Read and register one scan.
-
-    Raises
-    ------
-    ValueError
-        A file that cannot be read, landmarks that do not match, a registration that means nothing.
-    """
+    """Read and register one scan; ValueError for files that cannot be read, or a registration that means nothing."""
     settings = settings or ScanSettings()
     start = time.perf_counter()
     with one_thread():
@@ -150,5 +138,5 @@ def _cleaned(scan: Mesh | np.ndarray, landmarks: Landmarks | None, config: Clean
 def _measure(task: ScanTask, template: Mesh, fit: Registration, init: str) -> ScanFigures:
     return ScanFigures(
         task.name, init, float(np.nanmean(fit.distances)) if fit.seen.any() else np.nan, fit.rms,
-        float(fit.seen.mean()), float(fit.confidence.mean()), fit.missed,
-        stretched_share(template, fit.mesh), fit.landmark_rms, fit.flipped, fit.converged)
+        float(fit.seen.mean()), float(fit.confidence.mean()), fit.uncovered,
+        stretched_share(template, fit.mesh), fit.landmark_rms, fit.inverted, fit.converged)

@@ -8,10 +8,10 @@ import numpy as np
 import tyro
 
 from model.body import BodyModel
-from scanprep.cli import MM, Output, Unit, landmarks_beside
+from scanprep.cli import MM, Output, Unit
 from scanprep.console import Metric, Outcome, bar, dispatch, say
 from scanprep.geometry.files import read_mesh, write_mesh
-from scanprep.geometry.landmarks import match_landmarks, read_landmark_vertices, read_landmarks
+from scanprep.geometry.landmarks import match_landmarks, read_landmarks, read_template_landmarks
 from scanprep.geometry.mesh import Mesh
 from scanprep.skeleton.tree import Skeleton
 
@@ -58,7 +58,7 @@ def show_layout(layout: LayoutArg, output: Output, model: ModelOrNone = None, bo
     Args:
         layout: One of `scape layout list`, or a file.
         output: Folder to write to.
-        model: Model of `scape learn`, whose mean person is shown; without it, and without --body, that of the embedded
+        model: Model of `scape learn`, whose mean person is shown; without it, and without --body, that of the synthetic
             people.
         body: Mesh to show it on, instead of a model.
         unit: Unit of the mesh.
@@ -109,7 +109,7 @@ def transfer_to(layout: LayoutArg, source: Path, target: Path, output: Output, l
     found = read_layout(layout, ours, None)
     pairs = None
     if landmarks is not None:
-        marks = read_landmark_vertices(source_landmarks or landmarks_beside(source), ours)
+        marks = read_template_landmarks(source, ours, source_landmarks, "--source-landmarks")
         try:
             pairs = match_landmarks(marks, read_landmarks(landmarks, theirs, unit))[1:]
         except ValueError as error:
@@ -119,14 +119,14 @@ def transfer_to(layout: LayoutArg, source: Path, target: Path, output: Output, l
     result.layout.save(output)
     save_png(output.with_suffix(".png"), picture_layout(theirs, result.layout))
     write_mesh(output.with_suffix(".registered.ply"), result.registered)
-    if result.missed > DOUBTFUL:
-        say(f"note: {result.missed:.0%} of {target} is not covered by the source; look at "
+    if result.uncovered > DOUBTFUL:
+        say(f"note: {result.uncovered:.0%} of {target} is not covered by the source; look at "
             f"{output.with_suffix('.png')}, and name landmarks if limbs are wrong")
     return Outcome(output, [
         *_figures(result.layout, theirs), Metric("landmarks", 0 if pairs is None else len(pairs[0])),
         Metric("distance of the registered source, RMS", MM * result.rms, "mm"),
         *([] if pairs is None else [Metric("distance of landmarks, RMS", MM * result.landmark_rms, "mm")]),
-        Metric("target not covered", 100 * result.missed, "%"),
+        Metric("target not covered", 100 * result.uncovered, "%"),
         Metric("largest distance at a marker", MM * float(result.distances.max()), "mm"),
         Metric("markers without data below them", int((result.confidence < 0.5).sum()))], {"layout": layout})
 
@@ -154,7 +154,7 @@ def mean_body(model: BodyModel) -> Mesh:
 
 def _body(model: Path | None, body: Path | None, unit: Unit | None
           ) -> tuple[Mesh, Skeleton | None, np.ndarray | None, str]:
-    """The body to show, its skeleton, the vertices of the embedded people it kept, and its name."""
+    """The body to show, its skeleton, the vertices of the synthetic people it kept, and its name."""
     if body is not None:
         return read_mesh(body, unit), None, None, str(body)
     loaded, name = read_model(model)

@@ -35,7 +35,7 @@ class TransferredLayout:
         Of the distances of the registered source from the target.
     landmark_rms : float, metres
         NaN without landmarks.
-    missed : float
+    uncovered : float
         Share of the target that the source does not cover: more than a few per cent says that a limb is wrong, or that
         the bodies differ, a fist and an open hand.
     registered : Mesh
@@ -47,7 +47,7 @@ class TransferredLayout:
     confidence: np.ndarray
     rms: float
     landmark_rms: float
-    missed: float
+    uncovered: float
     registered: Mesh
 
 
@@ -86,15 +86,15 @@ def transfer_layout(layout: MarkerLayout, source: Mesh, target: Mesh, landmarks:
         return TransferredLayout(layout, np.zeros(L), np.ones(L), 0.0, np.nan, 0.0, target)
     fit = _registered(source, target, landmarks, config or RegistrationConfig(), search,
                       progress or (lambda done, total: None))
-    if fit.missed > LOST:
-        raise ValueError(f"target: the source could not be brought onto it, {fit.missed:.0%} of it stays uncovered; "
+    if fit.uncovered > LOST:
+        raise ValueError(f"target: the source could not be brought onto it, {fit.uncovered:.0%} of it stays uncovered; "
                          "give landmarks, three at least, spread over the body")
     found = Surface(target).closest(layout.skin_points(fit.mesh.vertices))
     inside = np.clip(found.bary, 0.0, 1.0)                            # without the last digits outside of the triangle
     there = MarkerLayout(layout.labels, target.faces[found.faces], layout.distances,
                          inside / inside.sum(axis=1, keepdims=True), layout.aliases, layout.loose)
     return TransferredLayout(there, found.distances, fit.confidence[layout.nearest], fit.rms, fit.landmark_rms,
-                             fit.missed, fit.mesh)
+                             fit.uncovered, fit.mesh)
 
 
 def _registered(source: Mesh, target: Mesh, landmarks: Landmarks | None, config: RegistrationConfig, search: bool,
@@ -103,6 +103,6 @@ def _registered(source: Mesh, target: Mesh, landmarks: Landmarks | None, config:
     if landmarks is not None or not search:
         return register(source, target, landmarks, config, tell)
     alike = register(source, target, None, config, tell, find_correspondences(source, target))
-    if alike.missed <= DOUBTFUL:
+    if alike.uncovered <= DOUBTFUL:
         return alike
-    return min(alike, register(source, target, None, config, tell), key=lambda fit: fit.missed)
+    return min(alike, register(source, target, None, config, tell), key=lambda fit: fit.uncovered)

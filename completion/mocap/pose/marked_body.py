@@ -15,6 +15,7 @@ import numpy as np
 from model.features import twists
 from model.linear import PointOperator, Subject
 from scanprep.geometry import rotations
+from scanprep.geometry.least_squares import Dense
 from scanprep.geometry.mesh import Mesh
 from scanprep.skeleton.tree import Skeleton
 
@@ -54,7 +55,7 @@ class MarkedBody:
             y[some] = self.shapes.evaluate(pose[some], trans[some])
         return np.swapaxes(y, -1, -2).reshape(*x.shape[:-1], self.count, 3)
 
-    def system(self, x: np.ndarray, targets: np.ndarray, weights: np.ndarray, stiff: float = 1.0) -> System:
+    def system(self, x: np.ndarray, targets: np.ndarray, weights: np.ndarray, stiff: float = 1.0) -> Dense:
         """Markers and pose prior: energy (B,), half its gradient (B, P) and Gauss-Newton matrix (B, P, P).
 
         For unknowns (B, P), markers (B, L, 3), metres, NaN where not seen, and factors on their squared distances
@@ -68,7 +69,7 @@ class MarkedBody:
         prior = self.prior_system(pose, stiff)
         gradient[:, :n] += prior[1]
         hessian[:, :n, :n] += prior[2]
-        return energy + prior[0], gradient, hessian
+        return Dense(energy + prior[0], gradient, hessian)
 
     def prior_system(self, pose: np.ndarray, stiff: float = 1.0) -> System:
         """The pose prior at poses (B, J, 3): energy (B,), half its gradient (B, 3J), its matrix (B, 3J, 3J)."""

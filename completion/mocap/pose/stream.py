@@ -7,11 +7,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from model.linear import Subject
+from scanprep.geometry.least_squares import Dense, Minimum, levenberg_marquardt
 
-from ...solve import MinimiseConfig, Minimum, descend
 from ..marker_sets.layout import MarkerLayout
 from .initialise import search
-from .marked_body import MarkedBody, System
+from .marked_body import MarkedBody
 from .prediction import prediction_of
 from .robust import LabelWatch, judge, marker_weights, misfit
 from .settings import AnimateConfig
@@ -162,21 +162,21 @@ class Tracker:
         if found is not None:
             self.begin(x)
         else:
-            self.prediction.update(x, end.hessian[0] - information)
+            self.prediction.update(x, end.equations.hessian[0] - information)
         return x, settled
 
-    def _solve(self, targets: np.ndarray, expected: np.ndarray, information: np.ndarray) -> Minimum:
+    def _solve(self, targets: np.ndarray, expected: np.ndarray, information: np.ndarray) -> Minimum[np.ndarray]:
         """The best unknowns of a frame near the expected ones, which put the markers where `places` says."""
         body, config = self.body, self.config
         weights, _ = marker_weights(self.places, targets, config.marker_sd, config.outlier)
 
-        def system(x: np.ndarray) -> System:
+        def system(x: np.ndarray) -> Dense:
             cost, gradient, hessian = body.system(x, targets[None], weights[None])
             step = body.step_to(expected, x[0])
             pull = information @ step
-            return cost + step @ pull, gradient + pull, hessian + information
+            return Dense(cost + step @ pull, gradient + pull, hessian + information)
 
-        return descend(system, expected[None], MinimiseConfig(self.steps, 1e-4, 1e-2), body.retract)
+        return levenberg_marquardt(system, expected[None], self.steps, 1e-2, 1e-4, retract=body.retract)
 
     def _found(self, targets: np.ndarray) -> np.ndarray | None:
         """Unknowns (P,) that a search finds and that fit much better than the body at `places`, or None."""
