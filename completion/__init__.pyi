@@ -10,8 +10,8 @@ from .mocap.files.markers import (
 from .mocap.files.markers import (
     write_markers as write_markers,
 )
-from .mocap.files.motion_tables import joint_angles as joint_angles
-from .mocap.files.motion_tables import joint_centres as joint_centres
+from .mocap.files.motion_files import joint_angles as joint_angles
+from .mocap.files.motion_files import joint_centres as joint_centres
 from .mocap.marker_selection.candidates import CandidateConfig as CandidateConfig
 from .mocap.marker_selection.candidates import candidate_layout as candidate_layout
 from .mocap.marker_selection.frames import FrameConfig as FrameConfig

@@ -6,8 +6,8 @@ import pytest
 from completion_bodies import MEAN, worm_with_prior
 from glb_reader import Glb
 
+from completion import motion_pictures
 from completion.__main__ import main
-from completion.mocap.animate import report
 from completion.mocap.files.markers import MarkerSequence, write_markers
 from completion.mocap.marker_sets.layout import MarkerLayout
 from completion.motion import Motion
@@ -23,7 +23,7 @@ QUICK = ("--start-axes", "1", "--keys", "6", "--shape.frames", "4", "--shape.sta
 def small_pictures():
     """Nobody looks at them here."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(report, "render", lambda *_rest, **_named: np.full((30, 20, 3), 255, dtype=np.uint8))
+        patch.setattr(motion_pictures, "render", lambda *_rest, **_named: np.full((30, 20, 3), 255, dtype=np.uint8))
         yield
 
 
@@ -62,7 +62,7 @@ def test_a_person_and_the_motion_from_markers(place, tmp_path):
     (tmp_path / "to.json").write_text(json.dumps({"0": [0, 0, 0], "0.4": [2.0, 0, 0]}))
     (tmp_path / "onto.json").write_text("[-1, 1, 0.5]")
     out = tmp_path / "out"
-    assert run(place, place / "walk.csv", "-o", out, "--onto", tmp_path / "onto.json", "--betas-to",
+    assert run(place, place / "walk.csv", "-o", out, "--retarget-to", tmp_path / "onto.json", "--betas-to",
                tmp_path / "to.json") == 0
     assert {p.name for p in out.iterdir()} >= WRITTEN | {"subject.json", "layout.json", "onto.npz", "onto.glb",
                                                          "morph.glb", "report.json"}

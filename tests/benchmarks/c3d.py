@@ -52,13 +52,14 @@ def follow(model: BodyModel, markers: MarkerSequence, layout: MarkerLayout, shap
 def picture(model: BodyModel, found: MarkerSubject, motion: Motion, markers: MarkerSequence, every: int, path: Path
             ) -> None:
     """Every so many frames with the markers as dots, from two sides."""
-    from completion.mocap.animate.report import picture_frames
+    from completion.motion_pictures import picture_frames
     from scanprep.pictures.sheets import save_png
 
     few = Motion(motion.poses[::every], motion.trans[::every], motion.betas, motion.rate / every,
                  motion.residuals[::every], motion.labels)
     some = markers.frames(slice(None, None, every))
-    sides = [picture_frames(few, model.subject(found.betas), some, len(few.poses), 300, turn) for turn in (35.0, 215.0)]
+    sides = [picture_frames(few, model.subject(found.betas), some.positions, len(few.poses), 300, turn)
+             for turn in (35.0, 215.0)]
     save_png(path, np.concatenate(sides))
 
 

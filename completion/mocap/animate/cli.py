@@ -20,16 +20,17 @@ from scanprep.pictures.page import Page
 from scanprep.ranges import BETAS, Count
 
 from ...cli import ModelOrNone, read_model
+from ..marker_sets.named import layout_or_file
 from ..pose.follow import AnimateConfig
 from ..subject.marker_shape import MarkerShapeConfig
-from .work import ENDINGS, MEAN_ERROR, BetasTo, Work, layout_or_file
+from .work import ENDINGS, MEAN_ERROR, BetasTo, Work
 
 MarkersArg = Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="MARKERS")]
 
 
 def animate_markers(markers: MarkersArg, output: Output, model: ModelOrNone = None, layout: str | None = None,
                     subject: str | None = None, unit: Unit | None = None, who: str | None = None,
-                    onto: Path | None = None, betas_to: Path | None = None, keys: Count = 120,
+                    retarget_to: Path | None = None, betas_to: Path | None = None, keys: Count = 120,
                     config: AnimateConfig = AnimateConfig(),   # noqa: B008
                     shape: MarkerShapeConfig = MarkerShapeConfig(),                               # noqa: B008
                     workers: Workers = Workers(), *, space: Workspace) -> Outcome:              # noqa: B008
@@ -55,7 +56,7 @@ def animate_markers(markers: MarkersArg, output: Output, model: ModelOrNone = No
             betas.
         unit: Unit of the markers, where the file cannot tell.
         who: Whose markers, in a C3D file with several people.
-        onto: Another person who makes the motion too, as betas or a mesh: onto.npz, onto.glb.
+        retarget_to: Another person who makes the motion too, as betas or a mesh: onto.npz, onto.glb.
         betas_to: Betas into which the body changes, in JSON: those at the end [b1, b2, ...], or keys in seconds
             {"0": [...], "2.5": [...]}: morph.glb.
         keys: Largest number of key frames in a GLB.
@@ -66,7 +67,7 @@ def animate_markers(markers: MarkersArg, output: Output, model: ModelOrNone = No
     found = _marker_files(markers)
     loaded, name = read_model(model)
     work = Work(loaded, name, None if layout is None else layout_or_file(layout), _subject(loaded, subject, unit),
-                None if onto is None else read_subject(loaded, onto, unit),
+                None if retarget_to is None else read_subject(loaded, retarget_to, unit),
                 None if betas_to is None else read_betas_to(betas_to, loaded.n_betas), unit, who, keys, config, shape)
     settings = {"animate": config, "shape": shape, "model": name}
     if markers.is_file():

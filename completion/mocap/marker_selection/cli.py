@@ -13,8 +13,8 @@ from scanprep.geometry import storage
 from scanprep.geometry.files import read_registered
 
 from ...cli import ModelOrNone, read_model, rows
-from ..animate.work import choose_layout
 from ..marker_sets.layout import MarkerLayout
+from ..marker_sets.named import choose_layout
 from ..marker_sets.symmetry import label_pairs, marker_pairs
 from .candidates import candidate_layout
 from .linear import check_bodies

@@ -17,7 +17,7 @@ from scanprep.skeleton.tree import Skeleton
 
 from ...cli import ModelOrNone, read_model
 from .layout import MarkerLayout
-from .named import layout_names, layout_summaries, named_layout
+from .named import layout_summaries, read_layout
 from .symmetry import label_pairs
 
 LayoutArg = Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="LAYOUT")]
@@ -129,21 +129,6 @@ def transfer_to(layout: LayoutArg, source: Path, target: Path, output: Output, l
         Metric("target not covered", 100 * result.uncovered, "%"),
         Metric("largest distance at a marker", MM * float(result.distances.max()), "mm"),
         Metric("markers without data below them", int((result.confidence < 0.5).sum()))], {"layout": layout})
-
-
-def read_layout(given: str, body: Mesh, kept: np.ndarray | None) -> MarkerLayout:
-    """The layout that is named, or in a file, for a body.
-
-    Raises
-    ------
-    ValueError
-        Neither a name nor a file, another body.
-    """
-    if given in layout_names():
-        return named_layout(given, body, kept)
-    if not Path(given).exists():
-        raise ValueError(f"layout: expected a file or one of {', '.join(layout_names())}, got '{given}'")
-    return MarkerLayout.load(given, len(body.vertices))
 
 
 def mean_body(model: BodyModel) -> Mesh:

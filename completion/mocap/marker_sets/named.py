@@ -9,6 +9,7 @@ from typing import Any
 
 import numpy as np
 
+from model.body import BodyModel
 from scanprep.geometry import storage
 from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.surface import Surface
@@ -98,3 +99,28 @@ def fitting_layout(labels: Sequence[str], template: Mesh, kept: np.ndarray | Non
     best = max(found, key=lambda name: (len(found[name].matched(labels, 0)), -len(found[name].labels)))
     found[best].matched(labels)
     return found[best], best
+
+
+def choose_layout(model: BodyModel, given: str | Path | None, labels: Sequence[str]) -> tuple[MarkerLayout, str]:
+    """The layout that is named, or in a file, or the named one that fits some labels best; and its name."""
+    kept = model.info.get("people_vertices")
+    of_people = None if kept is None else np.array(kept)
+    if given is None:
+        return fitting_layout(labels, model.template, of_people)
+    return read_layout(given, model.template, of_people), str(given)
+
+
+def read_layout(given: str | Path, template: Mesh, kept: np.ndarray | None = None) -> MarkerLayout:
+    """The layout for a body that is named, or in a file."""
+    named = layout_or_file(given)
+    return named_layout(named, template, kept) if isinstance(named, str) else \
+        MarkerLayout.load(named, len(template.vertices))
+
+
+def layout_or_file(given: str | Path) -> str | Path:
+    """What a command line names: a layout of ours as text, or a file as Path, on whose contents results depend."""
+    if str(given) in layout_names():
+        return str(given)
+    if not Path(given).exists():
+        raise ValueError(f"layout: expected a file or one of {', '.join(layout_names())}, got '{given}'")
+    return Path(given)
