@@ -12,13 +12,10 @@ from .mocap.files.markers import (
 )
 from .mocap.files.motion_files import joint_angles as joint_angles
 from .mocap.files.motion_files import joint_centres as joint_centres
-from .mocap.marker_selection.candidates import CandidateConfig as CandidateConfig
 from .mocap.marker_selection.candidates import candidate_layout as candidate_layout
-from .mocap.marker_selection.frames import FrameConfig as FrameConfig
-from .mocap.marker_selection.frames import informative_frames as informative_frames
-from .mocap.marker_selection.results import MarkerDesign as MarkerDesign
-from .mocap.marker_selection.sets import design_markers as design_markers
-from .mocap.marker_selection.settings import DesignConfig as DesignConfig
+from .mocap.marker_selection.design import MarkerDesign as MarkerDesign
+from .mocap.marker_selection.design import design_markers as design_markers
+from .mocap.marker_selection.fits import DesignConfig as DesignConfig
 from .mocap.marker_sets.layout import MarkerLayout as MarkerLayout
 from .mocap.marker_sets.named import layout_names as layout_names
 from .mocap.marker_sets.named import named_layout as named_layout

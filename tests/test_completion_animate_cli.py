@@ -4,6 +4,7 @@ import json
 import numpy as np
 import pytest
 from completion_bodies import MEAN, worm_with_prior
+from config_files import config_file
 from glb_reader import Glb
 
 from completion import motion_pictures
@@ -16,7 +17,6 @@ FRAMES = 30
 BETAS = np.array([0.9, -0.6, 0.4])
 WRITTEN = {"motion.npz", "animation.glb", "motion.bvh", "joint_angles.csv", "joint_centres.csv", "residuals.csv",
            "report.html"}
-QUICK = ("--start-axes", "1", "--keys", "6", "--shape.frames", "4", "--shape.start-axes", "1")
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -33,6 +33,7 @@ def place(tmp_path_factory):
     place = tmp_path_factory.mktemp("animate")
     model = worm_with_prior()
     model.save(place / "model.npz")
+    config_file(place, shape={"frames": 4, "start_axes": 1})
     vertices = np.random.default_rng(4).choice(396, 30, replace=False)
     layout = MarkerLayout(tuple(f"M{i}" for i in range(30)), vertices, 0.012)
     layout.save(place / "layout.json")
@@ -51,7 +52,7 @@ def place(tmp_path_factory):
 
 def run(place, *words):
     return main(["animate", *map(str, words), "-m", str(place / "model.npz"), "--layout", str(place / "layout.json"),
-                 *QUICK])
+                 "--keys", "6", "--config", str(place / "config.toml")])
 
 
 def told(folder):
@@ -112,7 +113,7 @@ def test_a_folder_goes_on_where_it_was(place, tmp_path, capsys):
 
 @pytest.mark.parametrize("words, message", [
     (("--betas-to", "bad.json"), "expected betas at the end"),
-    (("--layout", "cmu40"), "--layout: expected a file or one of biomech57, cmu41"),
+    (("--layout", "cmu40"), "layout: expected a file or one of biomech57, cmu41"),
     (("--layout", "cmu41"), "template: expected a body on which 'cmu41' is known"),
 ])
 def test_wrong_words_are_one_line(place, tmp_path, capsys, words, message):

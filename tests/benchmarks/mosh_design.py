@@ -18,13 +18,10 @@ import numpy as np
 from protocols import load_real, machine, spring_split, write_report
 
 from completion.mocap.marker_selection.candidates import candidate_layout
-from completion.mocap.marker_selection.fits import vertex_errors
-from completion.mocap.marker_selection.greedy import Groups, MarkerSets, exchange
-from completion.mocap.marker_selection.linear import LinearBodies, WholeFits, fit_bodies
-from completion.mocap.marker_selection.pairs import symmetric_groups
-from completion.mocap.marker_selection.posed import in_poses
-from completion.mocap.marker_selection.sets import Choice, best_path, choose
-from completion.mocap.marker_selection.settings import DesignConfig
+from completion.mocap.marker_selection.design import Choice, best_path, choose
+from completion.mocap.marker_selection.fits import DesignConfig, vertex_errors
+from completion.mocap.marker_selection.greedy import Groups, MarkerSets, exchange, symmetric_groups
+from completion.mocap.marker_selection.linear import LinearBodies, WholeFits, fit_bodies, in_poses
 from completion.mocap.marker_sets.layout import MarkerLayout
 from completion.mocap.marker_sets.named import named_layout
 from model.body import BodyModel

@@ -131,13 +131,7 @@ def _subject(model: BodyModel, given: str | None, unit: Unit | None) -> Subject 
 
 
 def read_betas_to(path: Path, n_betas: int) -> BetasTo:
-    """Betas at the end, [b1, b2, ...] or {"betas": [...]}, or keys {"seconds": [b1, b2, ...]}, from JSON.
-
-    Raises
-    ------
-    ValueError
-        Another form, more betas than the model has.
-    """
+    """Betas at the end, [b1, b2, ...] or {"betas": [...]}, or keys {"seconds": [b1, b2, ...]}, from JSON."""
     wanted = 'betas at the end, [b1, b2, ...], or keys {"0": [b1, ...], "2.5": [...]} in seconds'
     tree = read_json(path, wanted)
     keyed = isinstance(tree, dict) and "betas" not in tree

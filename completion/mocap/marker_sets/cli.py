@@ -7,7 +7,6 @@ from typing import Annotated
 import numpy as np
 import tyro
 
-from model.body import BodyModel
 from scanprep.cli import MM, Output, Unit
 from scanprep.console import Metric, Outcome, bar, dispatch, say
 from scanprep.geometry.files import read_mesh, write_mesh
@@ -18,6 +17,7 @@ from scanprep.skeleton.tree import Skeleton
 from ...cli import ModelOrNone, read_model
 from .layout import MarkerLayout
 from .named import layout_summaries, read_layout
+from .pictures import mean_body
 from .symmetry import label_pairs
 
 LayoutArg = Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="LAYOUT")]
@@ -129,12 +129,6 @@ def transfer_to(layout: LayoutArg, source: Path, target: Path, output: Output, l
         Metric("target not covered", 100 * result.uncovered, "%"),
         Metric("largest distance at a marker", MM * float(result.distances.max()), "mm"),
         Metric("markers without data below them", int((result.confidence < 0.5).sum()))], {"layout": layout})
-
-
-def mean_body(model: BodyModel) -> Mesh:
-    """The mean person in the pose of the template, or the template's own body of a model without betas."""
-    pose = np.zeros((len(model.skeleton.parents), 3))
-    return model.template.with_vertices(model.vertices(pose, np.zeros(model.n_betas) if model.n_betas else None))
 
 
 def _body(model: Path | None, body: Path | None, unit: Unit | None
