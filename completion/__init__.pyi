@@ -30,9 +30,6 @@ from .mocap.pose.stream import Frame as Frame
 from .mocap.pose.stream import MarkerStream as MarkerStream
 from .mocap.results import MoshResult as MoshResult
 from .mocap.results import PersonFit as PersonFit
-from .mocap.retargeting.cartoons import Cartoon as Cartoon
-from .mocap.retargeting.cartoons import CartoonShape as CartoonShape
-from .mocap.retargeting.cartoons import cartoon as cartoon
 from .mocap.retargeting.retarget import morphed_vertices as morphed_vertices
 from .mocap.retargeting.retarget import retarget as retarget
 from .mocap.retargeting.soft_tissue import deformation as deformation

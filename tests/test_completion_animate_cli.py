@@ -33,7 +33,7 @@ def place(tmp_path_factory):
     place = tmp_path_factory.mktemp("animate")
     model = worm_with_prior()
     model.save(place / "model.npz")
-    config_file(place, shape={"frames": 4, "start_axes": 1})
+    config_file(place, glb={"keys": 6}, shape={"frames": 4, "start_axes": 1})
     vertices = np.random.default_rng(4).choice(396, 30, replace=False)
     layout = MarkerLayout(tuple(f"M{i}" for i in range(30)), vertices, 0.012)
     layout.save(place / "layout.json")
@@ -52,7 +52,7 @@ def place(tmp_path_factory):
 
 def run(place, *words):
     return main(["animate", *map(str, words), "-m", str(place / "model.npz"), "--layout", str(place / "layout.json"),
-                 "--keys", "6", "--config", str(place / "config.toml")])
+                 "--config", str(place / "config.toml")])
 
 
 def told(folder):

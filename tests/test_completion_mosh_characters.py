@@ -3,12 +3,12 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from cartoons import CARTOONS, CartoonShape, cartoon
 from completion_bodies import MEAN, worm_with_prior
 from glb_reader import Glb
 
-from completion import CartoonShape, Motion, cartoon, deformation, motion_pictures, retarget_soft_tissue
+from completion import Motion, deformation, motion_pictures, retarget_soft_tissue
 from completion.mocap.results import SoftTissue
-from completion.mocap.retargeting.cartoons import CARTOONS
 from completion.mocap.retargeting.creases import Creases, at_rest
 from completion.mocap.retargeting.pictures import picture_transfer, write_character
 from completion.mocap.retargeting.retarget import world_up

@@ -11,6 +11,7 @@ Pictures and animated GLB are written beside the figures.
 from __future__ import annotations
 
 import argparse
+import sys
 import time
 from pathlib import Path
 
@@ -22,7 +23,6 @@ from completion.mocap.marker_sets.layout import MarkerLayout
 from completion.mocap.marker_sets.named import named_layout
 from completion.mocap.mosh.mosh import mosh
 from completion.mocap.results import SoftTissue
-from completion.mocap.retargeting.cartoons import CARTOONS, Cartoon, cartoon
 from completion.mocap.retargeting.creases import Creases, at_rest
 from completion.mocap.retargeting.pictures import picture_transfer, write_character
 from completion.mocap.retargeting.soft_tissue import deformation, moving_character, retarget_soft_tissue
@@ -33,6 +33,9 @@ from scanprep.geometry.mesh import Mesh
 from scanprep.pictures.shading import save_png
 from scanprep.synthetic.data_set import SUBJECT
 from scanprep.synthetic.people import Person, walk
+
+sys.path.append(str(Path(__file__).parents[1]))
+from cartoons import CARTOONS, Cartoon, cartoon
 
 MM = 1000.0
 OF_SCAPE = {                         # names of the landmarks of the SCAPE template

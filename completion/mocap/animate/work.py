@@ -13,6 +13,7 @@ from scanprep.cli import MM
 from scanprep.console import Metric
 from scanprep.geometry import storage
 from scanprep.pictures.page import Page
+from scanprep.ranges import Count, Settings
 
 from ...cli import rows
 from ...motion import Motion, spread_frames
@@ -31,6 +32,19 @@ ENDINGS = (".c3d", ".trc", ".csv")
 MEAN_ERROR = "distance of markers, mean"
 
 
+@dataclass(frozen=True)
+class GlbConfig(Settings):
+    """Settings of animated GLB files.
+
+    Attributes
+    ----------
+    keys : int
+        Largest number of key frames.
+    """
+
+    keys: Count = 120
+
+
 @dataclass(frozen=True, eq=False)
 class Work:
     """What is the same for all files of a call; without a subject it is found from the markers."""
@@ -43,9 +57,9 @@ class Work:
     betas_to: BetasTo | None             # how the body changes in the motion
     unit: str | None                     # as `read_markers` takes it, and whose markers
     who: str | None
-    keys: int                            # largest number of key frames in a GLB
     animate: AnimateConfig
     shape: MarkerShapeConfig
+    glb: GlbConfig
 
     def __call__(self, path: Path, room: Room) -> list[Metric]:
         """Follow the markers of a file; the figures."""
@@ -77,7 +91,7 @@ def animate_file(work: Work, path: Path, room: Room) -> list[Metric]:
     problem = motion_problem(motion, body.template, layout, sequence)
     metrics = [*([Metric("problem", problem)] if problem else []), *metrics, *figures(motion, sequence)]
     write_motion(output, motion, body)
-    write_glb(output / "animation.glb", motion, body, work.keys)
+    write_glb(output / "animation.glb", motion, body, work.glb.keys)
     page = motion_page(motion, body, sequence, path.name, rows(metrics))
     if work.retarget_to is not None:
         _other_person(work, work.retarget_to, output, motion, body, page)
@@ -105,16 +119,16 @@ def figures(motion: Motion, markers: MarkerSequence) -> list[Metric]:
 def _other_person(work: Work, person: Subject, output: Path, motion: Motion, body: Subject, page: Page) -> None:
     other = retarget(motion, body, person)
     other.save(output / "onto.npz")
-    write_glb(output / "onto.glb", other, person, work.keys)
+    write_glb(output / "onto.glb", other, person, work.glb.keys)
     page.section("On another person", "The same rotations of the joints; the way over the ground is as much longer as "
                  "the legs are, and the feet are on the ground when those of the first are.")
     page.picture(picture_frames(other, person, None))
 
 
 def _changing_body(work: Work, goal: BetasTo, output: Path, motion: Motion, body: Subject, page: Page) -> None:
-    shown = spread_frames(len(motion.poses), work.keys)
+    shown = spread_frames(len(motion.poses), work.glb.keys)
     bodies = morphed_vertices(work.model, motion, morph_keys(goal, motion), shown)
-    write_glb(output / "morph.glb", motion, body, work.keys, bodies)
+    write_glb(output / "morph.glb", motion, body, work.glb.keys, bodies)
     some = spread_frames(len(bodies), 24)
     page.section("With a body that changes", "Betas change from key to key, straight over time.")
     page.picture(picture_bodies(motion, body, bodies, shown)).picture(moving_picture(bodies[some], body, 8.0))

@@ -49,7 +49,7 @@ class AnimateConfig(Settings):
     prediction: Literal["velocity", "kalman"] = "kalman"
     angle_acceleration: Positive = 60.0
     smoothing: int = 2
-    low_pass: Annotated[float, FLAG] = 0.0
+    low_pass: float = 0.0
     ground: Annotated[bool, FLAG] = False
     floor: tuple[Signed, Signed, Signed, Signed] | None = None
 
