@@ -8,9 +8,10 @@ from scipy.spatial import cKDTree
 
 from scanprep.geometry.formats.common import UNITS
 from scanprep.geometry.mesh import Mesh
+from scanprep.geometry.target import Target, target_of
 from scanprep.geometry.thinning import thin
-from scanprep.registration.matches import Target, target_of
-from scanprep.registration.nonrigid import Registration, RegistrationConfig, register
+from scanprep.registration.nonrigid import Registration, register
+from scanprep.registration.schedule import RegistrationConfig
 from scanprep.threads import one_thread, search_threads
 
 from ..control.model import ControlModel
@@ -67,7 +68,7 @@ def find_features(control: ControlModel, scan: Mesh) -> Features:
     joints, points, missing = _features(control, best, found)
     fit = fit_features(control, joints, points) if len(joints) + len(points) > 2 else None
     registered = control.mesh.with_vertices(best.to_scan(found.mesh.vertices))
-    problem = why_uncertain(best.off, margin, found.missed)
+    problem = why_uncertain(best.off, margin, found.uncovered)
     return Features(joints, points, missing, registered, fit, unit, up, front, problem)
 
 

@@ -11,9 +11,10 @@ from scipy.spatial import cKDTree
 from scanprep.geometry import rotations
 from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.surface import Surface
+from scanprep.geometry.target import Target, orient
 from scanprep.geometry.thinning import thin
 from scanprep.registration.energies import Pull, pull
-from scanprep.registration.matches import Described, Likeness, Target, orient, tukey
+from scanprep.registration.matches import Described, Likeness, tukey
 
 from .articulated import Articulated, Points
 from .features import limb_angles, limbs

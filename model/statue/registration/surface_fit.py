@@ -16,12 +16,11 @@ import numpy as np
 from scipy.sparse import csc_array, diags_array, eye_array
 
 from scanprep.geometry.mesh import Mesh, check_template
-from scanprep.geometry.sparse import Factored
+from scanprep.geometry.sparse import Factored, conjugate_gradients
 from scanprep.geometry.surface import Surface, checked_points
+from scanprep.geometry.target import Target, target_of
 from scanprep.ranges import Count, Positive, Range, Settings
-from scanprep.registration.matches import Target, target_of
-from scanprep.registration.shell import conjugate_gradients, flipped, unfold
-from scanprep.registration.vertex_rotations import turns
+from scanprep.registration.inverted_triangles import inverted_triangles, unfold
 from scanprep.threads import one_thread
 
 from .local_shape import local_shape
@@ -134,10 +133,10 @@ def fit_surface(rest: Mesh, start: np.ndarray, scan: Mesh, config: SurfaceFitCon
     if config.polish:
         x = fit.onto_the_surface(x)
     seen, _ = fit.seen(x)
-    apart = fit.surface.closest(x).distances[seen]
+    apart, inverted = fit.surface.closest(x).distances[seen], int(inverted_triangles(rest, x).sum())
     return SurfaceFit(x, seen, float(np.sqrt(np.mean(apart**2))) if seen.any() else np.nan,
-                      float(apart.max(initial=0.0)), int(fit.inverted(x).sum()), annealed.energies, temperatures,
-                      np.array(steps), bool(annealed.converged and seen.any()))
+                      float(apart.max(initial=0.0)), inverted, annealed.energies, temperatures, np.array(steps),
+                      bool(annealed.converged and seen.any()))
 
 
 class _Annealed(NamedTuple):
@@ -166,10 +165,6 @@ class _Fit:
     def normals(self, x: np.ndarray) -> np.ndarray:
         """(N, 3) of the vertices."""
         return self.rest.with_vertices(x).vertex_normals
-
-    def inverted(self, x: np.ndarray) -> np.ndarray:
-        """(F,) bool: triangles that face against their surroundings."""
-        return flipped(self.rest, x, turns(self.rest, x))
 
     def schedule(self, x: np.ndarray) -> np.ndarray:
         """Temperatures (K,), from the largest squared distance of a vertex to its nearest point down to (1 mm)²."""
@@ -229,7 +224,7 @@ class _Fit:
         mesh = self.rest.with_vertices(x)
         found = Surface(mesh).closest(self.sample.points)
         corners = mesh.faces[found.faces]
-        normals = found.carried(mesh.vertex_normals, mesh.faces)
+        normals = found.transferred(mesh.vertex_normals, mesh.faces)
         facing = np.einsum("pd,pd->p", normals, self.sample.normals) > 0.3
         good = np.flatnonzero(facing & self.shown[corners].all(axis=1))
         rows = np.repeat(np.arange(len(good)), 3)
@@ -263,14 +258,14 @@ class _Fit:
 
     def onto_the_surface(self, x: np.ndarray) -> np.ndarray:
         """Vertices with data moved onto the surface, where that inverts no triangle."""
-        x = unfold(self.rest, x, turns(self.rest, x))
+        x = unfold(self.rest, x)
         free, _ = self.seen(x)
         found = self.surface.closest(x)
         free &= np.einsum("nd,nd->n", self.surface.mesh.face_normals[found.faces], self.normals(x)) > 0
-        already = self.inverted(x)
+        already = inverted_triangles(self.rest, x)
         for _ in range(10):
             y = np.where(free[:, None], found.points, x)
-            inverted = self.inverted(y) & ~already
+            inverted = inverted_triangles(self.rest, y) & ~already
             if not inverted.any():
                 break
             free[self.rest.faces[inverted]] = False
