@@ -3,10 +3,8 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
-from typing import Annotated, Literal
 
 import numpy as np
-import tyro
 
 from scanprep.batch.pool import Workers
 from scanprep.batch.workspace import Task, Workspace
@@ -19,6 +17,7 @@ from scanprep.ranges import Positive
 
 from ..export.cli import read_motion
 from ..files import load_model
+from .cli import LevelArg, MotionArg, StatueArg
 from .control.files import read_control
 from .control.humanoid import humanoid
 from .control.model import Statue
@@ -33,9 +32,6 @@ from .motion.motions import read_statue_motion, write_motion
 from .report import motion_pictures
 from .work import Inputs, Work
 
-StatueArg = Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="STATUE")]
-MotionArg = Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="MOTION")]
-LevelArg = Literal[0, 1, 2, 3, 4]
 FINE = StatueConfig(displacement=DisplacementConfig(size=2048))
 
 
