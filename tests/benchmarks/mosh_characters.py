@@ -20,11 +20,11 @@ from protocols import load_real, machine, write_report
 from completion.mocap.files.markers import MarkerSequence, read_markers
 from completion.mocap.marker_sets.layout import MarkerLayout
 from completion.mocap.mosh.mosh import mosh
-from completion.mocap.results import SoftTissue
 from completion.mocap.retargeting.cartoons import CARTOONS, Cartoon, cartoon
 from completion.mocap.retargeting.creases import Creases, at_rest
 from completion.mocap.retargeting.pictures import picture_transfer, write_character
 from completion.mocap.retargeting.soft_tissue import deformation, moving_character, retarget_soft_tissue
+from completion.mocap.soft_tissue.soft_tissue import SoftTissue
 from completion.synthetic_model import embedded_model
 from model.body import BodyModel
 from model.posing.character_mesh import Character, register_character

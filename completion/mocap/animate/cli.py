@@ -21,7 +21,7 @@ from scanprep.ranges import BETAS, Count
 
 from ...cli import ModelOrNone, read_model
 from ..pose.follow import AnimateConfig
-from ..subject.marker_shape import MarkerShapeConfig
+from ..subject.person import PersonConfig
 from .work import ENDINGS, MEAN_ERROR, BetasTo, Work, layout_or_file
 
 MarkersArg = Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="MARKERS")]
@@ -31,7 +31,7 @@ def animate_markers(markers: MarkersArg, output: Output, model: ModelOrNone = No
                     subject: str | None = None, unit: Unit | None = None, who: str | None = None,
                     onto: Path | None = None, betas_to: Path | None = None, keys: Count = 120,
                     config: AnimateConfig = AnimateConfig(),   # noqa: B008
-                    shape: MarkerShapeConfig = MarkerShapeConfig(),                               # noqa: B008
+                    person: PersonConfig = PersonConfig(),                                         # noqa: B008
                     workers: Workers = Workers(), *, space: Workspace) -> Outcome:              # noqa: B008
     """The motion of a person from markers, and the person.
 
@@ -60,15 +60,15 @@ def animate_markers(markers: MarkersArg, output: Output, model: ModelOrNone = No
             {"0": [...], "2.5": [...]}: morph.glb.
         keys: Largest number of key frames in a GLB.
         config: Settings.
-        shape: Settings of the subject from markers.
+        person: Settings of the person from markers.
         workers: Who works through the files of a folder.
     """
     found = _marker_files(markers)
     loaded, name = read_model(model)
     work = Work(loaded, name, None if layout is None else layout_or_file(layout), _subject(loaded, subject, unit),
                 None if onto is None else read_subject(loaded, onto, unit),
-                None if betas_to is None else read_betas_to(betas_to, loaded.n_betas), unit, who, keys, config, shape)
-    settings = {"animate": config, "shape": shape, "model": name}
+                None if betas_to is None else read_betas_to(betas_to, loaded.n_betas), unit, who, keys, config, person)
+    settings = {"animate": config, "person": person, "model": name}
     if markers.is_file():
         with bar("following the markers") as following:
             done = space.run(work, [Task("motion", markers)], inside=following).only

@@ -12,7 +12,7 @@ from scanprep.pictures.views import upright
 
 from ..animate.report import facing
 from ..animate.work import key_frames
-from ..results import SoftTissue
+from ..soft_tissue.soft_tissue import SoftTissue
 from .creases import Creases, at_rest
 from .soft_tissue import deformation, moving_character
 
