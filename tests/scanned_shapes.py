@@ -47,4 +47,10 @@ def view(mesh: Mesh, towards: np.ndarray, rng=None, noise: float = 0.0, spacing:
     return Mesh(points[seen], corners.reshape(-1, 3)), back
 
 
+def triangle_quality(mesh: Mesh) -> np.ndarray:
+    """(F,) 1 for an equilateral triangle, 0 for one without area: 4√3 area over the sum of squared sides."""
+    squares = ((mesh.corners - np.roll(mesh.corners, -1, axis=1)) ** 2).sum(axis=(1, 2))
+    return np.divide(4 * 3 ** 0.5 * mesh.face_areas, squares, out=np.zeros(len(squares)), where=squares > 0)
+
+
 SIX = np.concatenate([np.eye(3), -np.eye(3)])

@@ -12,6 +12,7 @@ from completion.mocap.subject.attachment import above_triangles, latent_markers,
 from completion.mocap.subject.latent_fit import LatentPoints
 from completion.priors import gaussian_prior
 from scanprep.geometry import rotations
+from scanprep.geometry.least_squares import Residual
 
 MODEL = worm_with_prior()
 K, L, REST = MODEL.n_betas, 6, np.zeros((4, 3))
@@ -77,7 +78,7 @@ def of_frames(kind):
         found, frame = simulated(kind, moving, x[15 + K:].reshape(-1, 3))
         J = np.concatenate([found.jacobian, terms.each_own(frame)], axis=-1)
         residual = terms.data_term(MovingPoints(found.positions, J), targets, np.arange(1.0, L + 1))
-        return energy.Residual(residual.values[0], residual.jacobian[0])
+        return Residual(residual.values[0], residual.jacobian[0])
 
     return term, x
 

@@ -8,13 +8,13 @@ from typing import Any
 import numpy as np
 
 from ..decimation.decimate import DecimateConfig, decimate
-from ..decimation.remeshing import improve_triangles, smooth
 from ..fusion.tsdf import MergeConfig, merge_views
 from ..geometry.mesh import Mesh, check_template
+from ..geometry.remeshing import improve_triangles, smooth
 from ..geometry.surface import Surface
 from ..ranges import Settings
 from ..repair.hole_filling import FillConfig, close
-from ..repair.manifold import drop_thin, peel_border, repair
+from ..repair.manifold import drop_thin, repair
 
 
 @dataclass(frozen=True)
@@ -26,47 +26,31 @@ class TemplateConfig(Settings):
     merge : MergeConfig
     fill : FillConfig
     decimate : DecimateConfig
-    peel : int
-        Rings of triangles removed along the borders of holes before they are filled; takes hands and feet that
-        were seen in part with it.
     smoothing : int
         Rounds of smoothing, once before the holes are filled and once after.
+    thinnest : float, metres
+        What is thinner, as fingers are that were hardly seen, is taken off.
     """
 
     merge: MergeConfig = field(default_factory=lambda: MergeConfig(voxel=0.004, truncation=2.0, min_cosine=0.15))
     fill: FillConfig = field(default_factory=FillConfig)
     decimate: DecimateConfig = field(default_factory=lambda: DecimateConfig(method="quadric", improve=True))
-    peel: int = 0
     smoothing: int = 6
     thinnest: float = 0.007
 
 
 def make_template(views: Sequence[Any], faces: int = 14000, config: TemplateConfig | None = None,
                   progress: Callable[[int, int], None] | None = None) -> Mesh:
-    """Merge, repair, smooth, fill and decimate.
+    """Range views of one subject to a closed manifold mesh: merge, repair, smooth, fill, decimate.
 
-    Parameters
-    ----------
-    views : sequence of RangeView, or of (Mesh, camera position (3,)) pairs
-    faces : int
-    config : TemplateConfig, optional
-    progress : callback(done, total), optional
-
-    Returns
-    -------
-    Mesh
-        Closed, one component, manifold, with well-shaped triangles.
-
-    Raises
-    ------
-    ValueError
-        The views do not give a surface that can serve as a template.
+    Views are RangeViews or pairs of a Mesh and a camera position (3,). ValueError where they give no surface that can
+    serve as a template.
     """
     config = config or TemplateConfig()
     tell = progress or (lambda done, total: None)
     mesh = merge_views(views, config.merge)
     tell(1, 4)
-    mesh = peel_border(smooth(repair(mesh), config.smoothing), config.peel)      # smooth rims make fair patches
+    mesh = smooth(repair(mesh), config.smoothing)      # smooth rims make fair patches
     tell(2, 4)
     mesh = close(mesh, config.fill)
     mesh = smooth(close(drop_thin(mesh, config.thinnest), config.fill), config.smoothing)

@@ -49,7 +49,7 @@ def coarse(data: RealData, faces: int) -> RealData:
         return data
     small = decimate(data.template, faces)
     on = Surface(data.template).closest(small.vertices)
-    poses = np.stack([on.carried(p, data.template.faces) for p in data.poses])
+    poses = np.stack([on.transferred(p, data.template.faces) for p in data.poses])
     near = cKDTree(poses[0]).query(data.template.vertices[list(data.landmarks.values())])[1]
     return RealData(Mesh(poses[0], small.faces), poses, poses[:0],
                     dict(zip(data.landmarks, near.tolist(), strict=True)))

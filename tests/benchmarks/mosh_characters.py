@@ -25,7 +25,7 @@ from completion.mocap.retargeting.creases import Creases, at_rest
 from completion.mocap.retargeting.pictures import picture_transfer, write_character
 from completion.mocap.retargeting.soft_tissue import deformation, moving_character, retarget_soft_tissue
 from completion.mocap.soft_tissue.soft_tissue import SoftTissue
-from completion.synthetic_model import embedded_model
+from completion.synthetic_people import synthetic_model
 from model.body import BodyModel
 from model.posing.character_mesh import Character, register_character
 from scanprep.geometry.mesh import Mesh
@@ -121,7 +121,7 @@ def main() -> None:
     from model.files import load_model
 
     args.output.mkdir(parents=True, exist_ok=True)
-    model = load_model(args.model) if args.model else embedded_model()
+    model = load_model(args.model) if args.model else synthetic_model()
     markers, layout = walking_man(model, 120, 60.0) if args.c3d is None else \
         (read_markers(args.c3d), MarkerLayout.named("cmu41", model.template))
     soft = mosh(model, markers, layout).soft_tissue[0]

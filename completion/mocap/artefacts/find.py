@@ -8,9 +8,9 @@ from functools import partial
 import numpy as np
 
 from model.linear import Subject
+from scanprep.geometry.least_squares import Minimum, levenberg_marquardt
 
 from ...motion import Motion
-from ...solve import MinimiseConfig, descend
 from ..files.markers import MarkerSequence
 from ..marker_sets.layout import MarkerLayout
 from ..pose.robust import marker_weights
@@ -225,18 +225,22 @@ def ambiguous_swap(body: Simulation, x: np.ndarray, tracks: Tracks, a: int, b: i
 
 def _gains(body: Simulation, x: np.ndarray, positions: np.ndarray, a: int, b: int) -> np.ndarray:
     """What it gains (n,), in half squared deviations, to swap a pair in frames with unknowns (n, P)."""
-    steps = MinimiseConfig(iterations=8, tolerance=1e-3)
     targets = positions[:, body.rows]
     own = [int(np.flatnonzero(body.rows == label)[0]) for label in (a, b)]
     weights, _ = marker_weights(body.positions(x), targets, FOLLOW.marker_sd, FOLLOW.outlier)
     without, full = weights.copy(), weights
     without[:, own], full[:, own] = 0, FOLLOW.marker_sd**-2
-    start = descend(partial(body.body.system, targets=targets, weights=without), x, steps, body.body.retract).x
+    start = _solved(body, x, targets, without).x
     other = targets.copy()
     other[:, own] = targets[:, own[::-1]]
-    costs = [descend(partial(body.body.system, targets=way, weights=full), start, steps, body.body.retract).energy
-             for way in (targets, other)]
+    costs = [_solved(body, start, way, full).energy for way in (targets, other)]
     return 0.5 * (costs[0] - costs[1])
+
+
+def _solved(body: Simulation, x: np.ndarray, targets: np.ndarray, weights: np.ndarray) -> Minimum[np.ndarray]:
+    """Frames (n, P) after a few steps towards targets (n, L, 3)."""
+    return levenberg_marquardt(partial(body.body.system, targets=targets, weights=weights), x, iterations=8,
+                               tolerance=1e-3, retract=body.body.retract)
 
 
 def _result(body: Simulation, markers: MarkerSequence, state: _State) -> MarkerArtefacts:

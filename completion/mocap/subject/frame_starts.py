@@ -10,8 +10,8 @@ from scipy.spatial import cKDTree
 from model.body import BodyModel
 from model.linear import Subject
 from scanprep.geometry import rotations
+from scanprep.geometry.least_squares import levenberg_marquardt
 
-from ...solve import MinimiseConfig, descend
 from ..marker_sets.layout import MarkerLayout, most_used
 from ..pose.first_frame import search
 from ..pose.marked_body import MarkedBody
@@ -52,7 +52,7 @@ def _from_found(body: MarkedBody, found: Sequence[np.ndarray], targets: np.ndarr
     x = x[np.argsort(off)[:most]]
     weights = np.full((len(x), len(targets)), MEAN_PERSON.marker_sd**-2)
     system = partial(body.system, targets=np.broadcast_to(targets, (len(x), *targets.shape)), weights=weights)
-    end = descend(system, x, MinimiseConfig(iterations=20, tolerance=1e-3), body.retract)
+    end = levenberg_marquardt(system, x, iterations=20, tolerance=1e-3, retract=body.retract)
     return end.x[np.argmin(end.energy)]
 
 

@@ -12,17 +12,16 @@ import numpy as np
 
 from model.bilinear import ShapedPoints
 from model.body import BodyModel
+from scanprep.geometry.least_squares import Arrow, Residual, levenberg_marquardt, normal_equations
 from scanprep.ranges import Count, Positive, Seed, Settings
 
 from ... import energy
-from ...energy import MovingPoints, Residual
+from ...energy import MovingPoints
 from ...priors import gaussian_prior
-from ...solve import normal_equations
 from ..marker_sets.layout import MarkerLayout
 from ..pose.marked_body import supports
 from .attachment import Attachment, LatentMarkers, above_triangles, latent_markers, simulated
 from .frame_starts import find_loose
-from .shared import Equations, SharedMinimum, minimise_arrow
 
 CENTIMETRES = 100.0                  # in a metre
 LOOSE = 0.0025                       # weight of the usual place of a marker that the layout calls loose: 20 cm
@@ -214,10 +213,15 @@ class State:
         """The latent markers (L, 3) in the latent coordinate system, metres."""
         return latent_places(self.hung.markers.kind, self.hung.supports, self.z).positions
 
-    def moved(self, end: SharedMinimum) -> State:
-        """The state at the end of a stage."""
-        K = len(self.betas)
-        return replace(self, x=end.x, betas=end.z[:K], coefficients=end.z[K:].reshape(-1, 3))
+    @property
+    def rows(self) -> np.ndarray:
+        """(B, 3J + 3 + K + 3L) all unknowns, those that frames share in every row."""
+        return np.concatenate([self.x, np.tile(self.z, (len(self.x), 1))], axis=1)
+
+    def moved(self, rows: np.ndarray) -> State:
+        """The state with other unknowns."""
+        n, K = self.x.shape[1], len(self.betas)
+        return replace(self, x=rows[:, :n], betas=rows[0, n:n + K], coefficients=rows[0, n + K:].reshape(-1, 3))
 
 
 class LatentFit:
@@ -287,20 +291,19 @@ class LatentFit:
         share = energy.geman_mcclure(np.nan_to_num(off), np.maximum(self.config.outlier, 3 * usual))
         return self.config.data * share / np.where(self.loose & (not state.looked), UNSURE, 1.0)**2
 
-    def solve(self, state: State, factor: float, last: bool) -> SharedMinimum:
-        """One stage of [MoSh] Eq. 23: everything together by Levenberg-Marquardt."""
-        weights, usual = self.weights(state), self._usual(state.layout)
+    def solve(self, state: State, factor: float, last: bool) -> tuple[np.ndarray, bool, int]:
+        """One stage of [MoSh] Eq. 23, everything together: unknowns as `State.rows`, whether it settled, and steps."""
+        weights, usual, n = self.weights(state), self._usual(state.layout), state.x.shape[1]
 
-        def frames(x: np.ndarray, z: np.ndarray) -> Equations:
-            return normal_equations(list(self.of_frames(state, x, z, weights, factor).values()))
-
-        def common(z: np.ndarray) -> Equations:
-            energies, gradients, hessians = normal_equations(
-                [Residual(r.values[None], r.jacobian[None]) for r in self.shared(state, usual, z, factor).values()])
-            return energies[0], gradients[0], hessians[0]
+        def equations(rows: np.ndarray) -> Arrow:
+            x, z = rows[:, :n], rows[0, n:]
+            common = [Residual(r.values[None], r.jacobian[None]) for r in self.shared(state, usual, z, factor).values()]
+            return Arrow(normal_equations(list(self.of_frames(state, x, z, weights, factor).values())), len(z),
+                         normal_equations(common))
 
         steps, tolerance = (LAST_STEPS, LAST_TOLERANCE) if last else (STEPS, TOLERANCE)
-        return minimise_arrow(frames, common, state.x, state.z, steps, tolerance)
+        end = levenberg_marquardt(equations, state.rows, steps, tolerance)
+        return end.x, bool(end.converged[0]), end.iterations
 
     def of_frames(self, state: State, x: np.ndarray, z: np.ndarray, weights: np.ndarray, factor: float
                   ) -> dict[str, Residual]:

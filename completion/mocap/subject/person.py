@@ -119,8 +119,9 @@ def _find(model: BodyModel, known: MarkerLayout, positions: Sequence[np.ndarray]
         last = i == stages - 1
         if i and (i in LOOK or i % EVERY or last):
             state = fit.hung_anew(state, i in LOOK)                                         # [MoSh] Eq. 16
-        end = step(f"person, stage {i}", given, partial(fit.solve, state, factor, last))    # [MoSh] Eq. 23
-        state, steps, converged = state.moved(end), steps + end.iterations, end.converged
+        rows, converged, taken = step(f"person, stage {i}", given,
+                                      partial(fit.solve, state, factor, last))              # [MoSh] Eq. 23
+        state, steps = state.moved(rows), steps + taken
         tell(len(chosen) + i + 1, total)
     return _result(fit, state, _whose(positions, chosen), converged, steps)
 
