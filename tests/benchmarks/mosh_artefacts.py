@@ -27,6 +27,7 @@ from completion.mocap.artefacts.find import find_artefacts
 from completion.mocap.artefacts.results import ArtefactConfig, BadKind, BadSpan, Swap
 from completion.mocap.files.markers import MarkerSequence, read_markers
 from completion.mocap.marker_sets.layout import MarkerLayout
+from completion.mocap.marker_sets.named import named_layout
 from completion.mocap.mosh.mosh import MoshConfig, mosh
 from completion.mocap.pose.follow import animate
 from completion.mocap.pose.marked_body import supports
@@ -247,7 +248,7 @@ def run_exchanges(model: BodyModel, case: Case, faulty: Faulty, reference: np.nd
 
 def cases(model: BodyModel, args: argparse.Namespace) -> list[Case]:
     """The real files, and men moved as in them."""
-    layout = MarkerLayout.named("cmu41", model.template)
+    layout = named_layout("cmu41", model.template)
     out = [Case(path.stem, read_markers(path), layout, None) for path in sorted(args.folder.glob("*.c3d"))
            if not args.files or path.stem in args.files]
     if args.men:

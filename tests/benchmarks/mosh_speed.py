@@ -21,6 +21,7 @@ from protocols import machine, write_report
 
 from completion.mocap.files.markers import MarkerSequence, read_markers
 from completion.mocap.marker_sets.layout import MarkerLayout
+from completion.mocap.marker_sets.named import named_layout
 from completion.mocap.mosh.mosh import MoshConfig
 from completion.mocap.pose.follow import animate
 from completion.mocap.soft_tissue.soft_tissue import follow_soft_tissue
@@ -72,7 +73,7 @@ def main() -> None:
     args = parser.parse_args()
     model, config = load_model(args.model), MoshConfig()
     people = model.info.get("people_vertices")
-    layout = MarkerLayout.named(args.layout, model.template, None if people is None else np.array(people))
+    layout = named_layout(args.layout, model.template, None if people is None else np.array(people))
     rows = []
     for path in sorted(args.folder.glob("*.c3d")):
         rows.append({"file": path.name, **measure(model, read_markers(path), layout, config)})

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from ..animate.report import chart_states
+from ...motion_pictures import chart_states
 from ..artefacts.results import MarkerArtefacts
 from ..files.markers import MarkerSequence
 from .takes import Take

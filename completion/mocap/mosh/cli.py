@@ -20,7 +20,7 @@ from scanprep.console import PROBLEM, Metric, Outcome, bar, say
 from scanprep.pictures.page import Page
 
 from ...cli import read_model
-from ..animate.work import choose_layout
+from ..marker_sets.named import choose_layout
 from .mosh import MoshConfig
 from .recordings import TABLE, Actor, Grouping, find_actors, write_table
 from .report import PICTURE

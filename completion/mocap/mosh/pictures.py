@@ -12,7 +12,7 @@ from scanprep.pictures.camera import Camera
 from scanprep.pictures.shading import Bones, Dots, Shape, Solid, color_bar, heat, render, side_by_side
 from scanprep.pictures.views import look_around, upright
 
-from ..animate.report import MARKER, facing, moving_picture
+from ...motion_pictures import MARKER, facing, moving_picture
 from ..marker_sets.layout import MarkerLayout
 from .takes import Take
 

@@ -18,13 +18,14 @@ from scanprep.geometry import storage
 from scanprep.pictures.sheets import save_png
 from scanprep.pictures.views import upright
 
-from ..animate.report import morph_frames
-from ..animate.work import choose_layout, key_frames, write_glb
+from ...motion import spread_frames
+from ...motion_pictures import picture_bodies
 from ..artefacts.results import MarkerArtefacts
 from ..artefacts.virtual import artefact_table, write_virtual
 from ..files.markers import MarkerSequence, read_markers
-from ..files.motion_tables import write_joint_angles, write_joint_centres, write_motion_bvh, write_residuals
+from ..files.motion_files import write_glb, write_motion, write_residuals
 from ..marker_sets.layout import MarkerLayout
+from ..marker_sets.named import choose_layout
 from ..pose.robust import motion_problem
 from ..retargeting.pictures import picture_transfer, write_character
 from ..retargeting.retarget import retarget
@@ -213,12 +214,8 @@ def _write_person(folder: Path, result: MoshResult, about: Mapping[str, Any]) ->
 def write_take(folder: Path, take: Take, factor: float = 1.0) -> None:
     """All files of a sequence but its page; exaggerated.glb where the factor on the change of shape is not 1."""
     motion, body, soft = take.motion, take.subject, take.soft
-    motion.save(folder / "motion.npz")
-    write_motion_bvh(folder / "motion.bvh", motion, body)
-    write_joint_angles(folder / "joint_angles.csv", motion, body.skeleton.names)
-    write_joint_centres(folder / "joint_centres.csv", motion, body)
-    write_residuals(folder / "residuals.csv", motion)
-    shown = key_frames(motion, KEYS)
+    write_motion(folder, motion, body)
+    shown = spread_frames(len(motion.poses), KEYS)
     write_glb(folder / "animation.glb", motion, body, KEYS, None if soft is None else take.bodies(shown))
     if soft is not None:
         soft.save(folder / "soft_tissue.npz")
@@ -256,8 +253,8 @@ def _character(character: BodyModel, take: Take, folder: Path, factor: float) ->
     motion = retarget(take.motion, take.subject, body)
     motion.save(folder / "character.npz")
     write_glb(folder / "character.glb", motion, body, KEYS)
-    frames = key_frames(motion, 8)
-    return morph_frames(motion, body, motion.vertices(body, frames), frames), ""
+    frames = spread_frames(len(motion.poses), 8)
+    return picture_bodies(motion, body, motion.vertices(body, frames), frames), ""
 
 
 def _person_metrics(found: _Found) -> list[Metric]:

@@ -9,6 +9,7 @@ import numpy as np
 
 from model.body import BodyModel
 from scanprep.geometry import storage
+from scanprep.geometry.sparse import overlapping_windows, solve_smooth
 from scanprep.ranges import Positive, Settings
 from scanprep.threads import one_thread
 
@@ -16,15 +17,13 @@ from ...motion import Motion
 from ..files.markers import MarkerSequence
 from ..marker_sets.layout import MarkerLayout
 from ..pose.marked_body import BATCH
-from ..pose.prediction import inertia
 from ..pose.robust import marker_weights
-from ..pose.settings import AnimateConfig
-from ..pose.smooth import FURTHEST, coupled_steps, solve_banded
+from ..pose.settings import RATE, AnimateConfig
+from ..pose.smooth import FURTHEST, coupled_steps, inertia
 from .changing_body import ChangingBody, changing_bodies, skin_metric, skin_movement
 
 Progress = Callable[[int, int], None]
 PER_SQUARE_METRE = 1e4               # of a weight on square centimetres
-RATE = 120.0                         # frames per second for which weights on changes in time are meant
 ROUNDS = 3                           # Gauss-Newton steps over the whole sequence, which begins near its end
 STILL = 0.002                        # metres that the last round moves any marker of a frame that has settled
 WINDOW, OVERLAP = 400, 40            # frames smoothed at once, and those that each side lends to its neighbour
@@ -252,24 +251,15 @@ def smooth_changes(body: ChangingBody, x: np.ndarray, targets: np.ndarray, weigh
     markers say little it is a low-pass filter; the poses were found with changes free of each other, and filtering
     these hardly moves a marker.
     """
-    T, K = len(x), body.n_betas
-    z = np.empty((T, K))
-    D = np.array([1.0, -2.0, 1.0])
-    for start in range(0, T, WINDOW):
-        near = slice(max(0, min(start - OVERLAP, T - 3)), min(T, start + WINDOW + OVERLAP))
-        n = near.stop - near.start
-        gradient, hessian = np.empty((n, K)), np.empty((n, K, K))
-        for first in range(0, n, BATCH):
+    z, eye = np.empty((len(x), body.n_betas)), np.eye(body.n_betas)
+    for near, kept, where in overlapping_windows(len(x), WINDOW, OVERLAP):
+        gradient = np.empty((near.stop - near.start, body.n_betas))
+        hessian = np.empty((*gradient.shape, body.n_betas))
+        for first in range(0, len(gradient), BATCH):
             some = slice(near.start + first, min(near.stop, near.start + first + BATCH))
             mine = slice(first, first + BATCH)
             gradient[mine], hessian[mine] = body.change_system(x[some], targets[some], weights[some])
-        band = np.zeros((3, n, K))                   # of a frame with itself, the next and the one after
-        band[0] = 1.0
-        for i in range(3):
-            for j in range(i, 3):
-                band[j - i, i:n - 2 + i] += smoothness * D[i] * D[j]
-        kept = slice(start - near.start, min(start + WINDOW, T) - near.start)
-        z[start:start + WINDOW] = -solve_banded(hessian, band, gradient)[kept]
+        z[where] = -solve_smooth(hessian + eye, smoothness, gradient)[kept]
     return z
 
 

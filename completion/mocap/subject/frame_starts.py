@@ -12,8 +12,8 @@ from model.linear import Subject
 from scanprep.geometry import rotations
 from scanprep.geometry.least_squares import levenberg_marquardt
 
-from ..marker_sets.layout import MarkerLayout, most_used
-from ..pose.first_frame import search
+from ..marker_sets.layout import MarkerLayout
+from ..pose.initialise import search
 from ..pose.marked_body import MarkedBody
 from ..pose.settings import AnimateConfig
 
@@ -61,7 +61,7 @@ def find_loose(model: BodyModel, vertices: np.ndarray, layout: MarkerLayout, tar
 
     `vertices` (B, N, 3) are the body in all frames, `targets` (B, L, 3) the markers, NaN where not seen; metres.
     """
-    template, distances, usual = model.template, np.asarray(layout.distances), most_used(layout)
+    template, distances, usual = model.template, np.asarray(layout.distances), layout.nearest
     meshes, found = [template.with_vertices(v) for v in vertices], {}
     tree, part = cKDTree(template.vertices), model.skeleton.part_of_vertex(template)
     for row in np.flatnonzero(np.isin(layout.labels, layout.loose)):
