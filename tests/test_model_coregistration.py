@@ -23,7 +23,8 @@ from model import ModelRegistration, coregister, learn_scape, load_model, regist
 from model.coregistration.attraction import apart, attraction, towards
 from model.coregistration.first import FirstConfig, explained_share, learn_from_scans
 from model.coregistration.modelfit import ModelFit
-from model.coregistration.posed import posed_points, typical_poses, whitening
+from model.coregistration.posed import posed_points
+from model.priors import typical_poses, whitening
 from scanprep import RegisteredSet, write_mesh
 from scanprep.batch.digests import Digests
 from scanprep.batch.opening import workspace

@@ -4,24 +4,24 @@ import re
 import shutil
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+from config_files import config_file
 from scan_folders import MARKS, QUICK, ball, write_scans
 from scipy.spatial.transform import Rotation
 
 from completion.__main__ import main
-from scanprep import Mesh, RegisteredSet, Skeleton, read_mesh, read_points, write_landmarks, write_mesh
+from scanprep import Mesh, RegisteredSet, Skeleton, config_files, read_mesh, read_points, write_landmarks, write_mesh
 from scanprep.cli import COMMANDS
 from scanprep.correspondence.correspondences import Correspondences
 from scanprep.correspondence.files import read_correspondences, write_correspondences
 from scanprep.geometry.files import PointCloud, write_points
 from scanprep.geometry.landmarks import LANDMARK_ENDINGS, read_landmarks
 from scanprep.geometry.storage import StorageError
-from scanprep.pipeline import cli as pipeline_cli
 from scanprep.pipeline.prepare import prepare
-from scanprep.pipeline.scan import ScanSettings
 from scanprep.pipeline.scans import find_scans
 from scanprep.registration import cli as registration_cli
 from scanprep.registration.nonrigid import register
@@ -50,13 +50,14 @@ def place(tmp_path_factory, template):
 
 
 @pytest.fixture
-def quick(monkeypatch):
-    """Registration with few steps, which the command line has no options for."""
-    from functools import partial
-
-    monkeypatch.setattr(pipeline_cli, "ScanSettings", partial(ScanSettings, registration=QUICK.scan.registration))
-    monkeypatch.setattr(registration_cli, "register", lambda *given, **named: register(
-        *given, **named | {"config": QUICK.scan.registration}))
+def quick(tmp_path, monkeypatch):
+    """A file of settings for a registration with few steps."""
+    monkeypatch.setattr(registration_cli, "register", lambda *given, config, **named: register(
+        *given, config=QUICK.scan.registration, **named))
+    path = tmp_path / "quick.toml"
+    config = replace(QUICK, min_poses=5, scan=replace(QUICK.scan, pictures=True))
+    path.write_text(config_files.write({"config": config}))
+    return path
 
 
 def run(*words):
@@ -95,7 +96,7 @@ def test_dask_is_loaded_for_a_scheduler_alone(place):
 
 def test_run(place, tmp_path, capsys, quick):
     (place / "scans" / "broken.ply").write_text("nothing")
-    code = run("run", place / "scans", "--template", place / "template.ply", "-o", tmp_path / "set", "--workers", 1)
+    code = run("run", place / "scans", "--template", place / "template.ply", "-o", tmp_path / "set", "--config", quick)
     (place / "scans" / "broken.ply").unlink()
     shown = capsys.readouterr()
     assert code == 1 and "broken.ply" in shown.err and "needs a look" not in shown.err
@@ -109,10 +110,10 @@ def test_run(place, tmp_path, capsys, quick):
 
 def test_page_with_other_limits(place, capsys):
     page = place / "set" / "report.html"
-    assert run("page", place / "set", "--unseen", 0.5) == 0
+    assert run("page", place / "set", "--config", config_file(place, unseen=0.5)) == 0
     assert re.search(r"scans that need a look\W+0\b", capsys.readouterr().out)
     assert page.read_text().count('class="scan fine"') == 3
-    assert run("page", place / "set", "--distance", 1e-9) == 0
+    assert run("page", place / "set", "--config", config_file(place, distance=1e-9)) == 0
     shown = capsys.readouterr()
     assert re.search(r"scans that need a look\W+3\b", shown.out) and str(page) in shown.err
     assert page.read_text().count('class="scan look"') == 3
@@ -121,10 +122,10 @@ def test_page_with_other_limits(place, capsys):
 def test_no_landmarks_wanted(place, tmp_path, capsys, quick):
     scans = write_scans(tmp_path / "scans", ball(), 1)
     (tmp_path / "bare.ply").write_bytes((place / "template.ply").read_bytes())
-    words = ["run", scans, "--template", tmp_path / "bare.ply", "-o", tmp_path / "set", "--workers", 1]
+    words = ["run", scans, "--template", tmp_path / "bare.ply", "-o", tmp_path / "set", "--config", quick]
     assert run(*words) == 1
     assert "expected its landmarks in bare.landmarks.json" in capsys.readouterr().err
-    assert run(*words, "--guide", "pose") == 0
+    assert run(*words, "--init", "pose") == 0
     assert report(tmp_path / "set" / "report.json")["led by pose"] == 1
 
 

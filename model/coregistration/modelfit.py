@@ -17,9 +17,10 @@ from ..features import twists
 from ..fitting import share_of_vertices, spread_vertices
 from ..linear import Subject
 from ..minimise import minimise
+from ..priors import typical_poses, whitening
 from .attraction import Attraction, apart, attraction, towards
 from .config import ModelFitConfig, PoseStage
-from .posed import PosedPoints, posed_points, typical_poses, whitening
+from .posed import PosedPoints, posed_points
 
 STEPS = 2                            # of Levenberg-Marquardt between matchings
 ALIKE = 0.005                        # share of √area: searches that end nearer to each other have found the same

@@ -3,6 +3,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
 from functools import lru_cache
+from typing import Annotated
 
 import numpy as np
 from scipy.sparse import coo_array, csr_array
@@ -11,7 +12,7 @@ from scipy.spatial import cKDTree
 from ..geometry.farthest_points import farthest_points
 from ..geometry.geodesics import SurfaceGraph
 from ..geometry.mesh import Mesh
-from ..ranges import Cell, Count, Positive, Settings, Share
+from ..ranges import FLAG, Cell, Count, Positive, Settings, Share
 from .belief_propagation import Beliefs, PairField, propagate
 from .correspondences import Correspondences
 from .places import Places, turns_between
@@ -69,7 +70,7 @@ class CorrelatedConfig(Settings):
         Points of the scan over which its normals are averaged.
     """
 
-    points: Count = 240
+    points: Annotated[Count, FLAG] = 240
     keep: Count = 170
     spacing: Cell = 0.009
     links: Count = 6

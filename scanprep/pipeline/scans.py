@@ -15,16 +15,7 @@ ABOUT = {"digest": False}         # what is only told in tables: no registration
 
 @dataclass(frozen=True)
 class ScanTask:
-    """One scan of a folder and what is known of it.
-
-    Attributes
-    ----------
-    name : str
-    scan : Path
-    landmarks : Path or None
-    subject, pose, sex : str
-        Empty where not known.
-    """
+    """One scan of a folder and what is known of it; empty where nothing is."""
 
     name: str
     scan: Path
@@ -35,29 +26,12 @@ class ScanTask:
 
 
 def find_scans(folder: str | Path, landmarks: str | Path | None = None, subject: str = "") -> list[ScanTask]:
-    """The scans of a folder, their landmark files, and what `scans.csv` says of them.
+    """The scans of a folder sorted by name, their landmark files, and what `scans.csv` says of them.
 
-    Parameters
-    ----------
-    folder : path
-        Meshes or point clouds, not those of the folders inside it; a scan that consists of several views is
-        merged first. `scans.csv`, where there is one, has the columns name, subject, pose, sex (any of the last
-        three may be missing).
-    landmarks : path, optional
-        Folder of the landmark files, by default `landmarks` inside the folder or the folder itself. A file
-        belongs to the scan of the same name.
-    subject : str
-        Whose scans they are, where `scans.csv` does not say; when empty, every scan is a subject of its own.
-
-    Returns
-    -------
-    list of ScanTask
-        Sorted by name: the part of the file name before its first dot.
-
-    Raises
-    ------
-    ValueError
-        No such folder, no scans, two scans of one name, a table without names or with unknown ones.
+    The name is the part of the file name before its first dot; a landmark file has the same name, in `landmarks`, in
+    the folder `landmarks` inside, or beside the scan. `scans.csv` has the columns name, subject, pose, sex. Where it
+    does not say whose scan it is, it is of `subject`, or when that is empty of a person of its own. ValueError for no
+    scans, two scans of one name, a table with unknown names.
     """
     folder = Path(folder)
     paths = _list_scans(folder)

@@ -23,8 +23,7 @@ from scipy.sparse import csc_array, diags_array, eye_array
 
 from model.statue.control.humanoid import humanoid
 from model.statue.registration.local_shape import LocalShape, local_shape
-from model.statue.registration.surface_data import distortion
-from model.statue.registration.surface_fit import SurfaceFitConfig, fit_surface
+from model.statue.registration.surface_fit import SurfaceFitConfig, distortion, fit_surface
 from scanprep.alignment.icp import align_landmarks, apply
 from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.sparse import Factored, conjugate_gradients

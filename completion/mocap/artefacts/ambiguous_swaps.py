@@ -6,8 +6,8 @@ from functools import partial
 import numpy as np
 
 from ...solve import MinimiseConfig, descend
+from ..pose.robust import marker_weights
 from ..settings import FaultConfig
-from .robust import marker_weights
 from .simulated import Simulation
 from .swaps import AWAY, WORTH, best_stretches, loose_ends
 from .tracks import Tracks

@@ -10,8 +10,8 @@ from scanprep.geometry import rotations
 from ...priors import typical_poses
 from ...solve import MinimiseConfig, Minimum, descend
 from ...starts import ANNEALING
-from ..artefacts.robust import marker_weights
 from .marked_body import MarkedBody
+from .robust import marker_weights
 from .settings import AnimateConfig
 
 STARTS = 2                           # of a search that are followed to their end

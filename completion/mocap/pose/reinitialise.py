@@ -5,8 +5,8 @@ import numpy as np
 
 from ... import energy
 from ...solve import MinimiseConfig, descend
-from ..artefacts.robust import misfit
 from .marked_body import MarkedBody, System
+from .robust import misfit
 from .settings import AnimateConfig
 
 SEVERAL, FAR = 3, 2.0                # markers of a frame that are so many times an outlier's residual away

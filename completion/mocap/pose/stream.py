@@ -9,11 +9,11 @@ import numpy as np
 from model.linear import Subject
 
 from ...solve import MinimiseConfig, Minimum, descend
-from ..artefacts.robust import LabelWatch, distances_apart, marker_weights, misfit
 from ..marker_sets.layout import MarkerLayout
 from .first_frame import search
 from .marked_body import MarkedBody, System
 from .prediction import make_prediction
+from .robust import LabelWatch, distances_apart, marker_weights, misfit
 from .settings import AnimateConfig
 
 ENOUGH = 0.5                         # share of the markers that a search wants

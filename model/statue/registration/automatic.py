@@ -31,45 +31,24 @@ SHOWN = 0.3                      # share of the vertices around a joint that hav
 
 @dataclass(frozen=True, eq=False)
 class Features:
-    """What was found on a scan, in the scan's own axes and unit.
+    """What was found on a scan, in the scan's own axes and unit."""
 
-    Attributes
-    ----------
-    joints, points : {name: (3,) float}
-        Joint centres and landmarks of the control model with data around them; empty where no person was found.
-    missing : names
-        Joints and landmarks that the scan does not show.
-    registered : Mesh or None
-        The control mesh on the scan.
-    fit : FeatureFit or None
-        Of the control model to these features.
-    unit : str
-        Of m, mm, cm and in the one in which the scan would be most nearly as long as a person is tall.
-    up, front : (3,) float, unit
-        Upwards, and to where the person faces.
-    misfit : float, metres
-        Between the scan and the control model in its pose: see `Stand`.
-    margin : float
-        How many times larger it is for the best start that faces another way.
-    missed, stretched : float
-        What `Registration.uncovered` and `stretched_share` say of the registered mesh.
-    problem : str or None
-        Why the features should not be trusted.
-    """
-
-    joints: dict[str, np.ndarray]
-    points: dict[str, np.ndarray]
-    missing: tuple[str, ...]
-    registered: Mesh | None
-    fit: FeatureFit | None
-    unit: str
-    up: np.ndarray
-    front: np.ndarray
-    misfit: float
-    margin: float
-    missed: float
-    stretched: float
-    problem: str | None
+    joints: dict[str, np.ndarray]  # {name: (3,) }, joint centres and landmarks of the control model with data around
+                                   # them; empty where no person was found
+    points: dict[str, np.ndarray]  # {name: (3,) }, joint centres and landmarks of the control model with data around
+                                   # them; empty where no person was found
+    missing: tuple[str, ...]       # joints and landmarks that the scan does not show
+    registered: Mesh | None        # the control mesh on the scan
+    fit: FeatureFit | None         # of the control model to these features
+    unit: str                      # of m, mm, cm and in the one in which the scan would be most nearly as long as a
+                                   # person is tall
+    up: np.ndarray                 # (3,) unit, upwards, and to where the person faces
+    front: np.ndarray              # (3,) unit, upwards, and to where the person faces
+    misfit: float                  # metres, between the scan and the control model in its pose: see `Stand`
+    margin: float                  # how many times larger it is for the best start that faces another way
+    missed: float                  # what `Registration.uncovered` and `stretched_share` say of the registered mesh
+    stretched: float               # what `Registration.uncovered` and `stretched_share` say of the registered mesh
+    problem: str | None            # why the features should not be trusted
 
 
 @one_thread()

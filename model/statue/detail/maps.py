@@ -20,7 +20,7 @@ import numpy as np
 from scanprep.geometry.storage import StorageError, read_json, taking_apart, write_json, writing
 from scanprep.pictures import png16
 
-from ..statue import FOLDED, HOLE, MEASURED, OUTSIDE, DisplacementMap
+from ..control.model import FOLDED, HOLE, MEASURED, OUTSIDE, DisplacementMap
 
 HEADER, HEIGHTS, IMAGE = "displacement.json", "displacement.tif", "displacement.png"
 COVERAGE, VECTORS = "coverage.png", "vectors.tif"
@@ -30,14 +30,7 @@ LEVELS = {"measured": MEASURED, "folded": FOLDED, "hole": HOLE, "outside": OUTSI
 
 
 def write_map(folder: str | Path, map: DisplacementMap) -> None:
-    """Write a displacement map into a folder; each file whole or not at all.
-
-    Parameters
-    ----------
-    folder : path
-        Made if it is not there.
-    map : DisplacementMap
-    """
+    """Write a displacement map into a folder, which is made if it is not there; each file whole or not at all."""
     folder = Path(folder)
     scale = _scale(map)
     _write_tiff(folder / HEIGHTS, map.heights)
@@ -52,20 +45,10 @@ def write_map(folder: str | Path, map: DisplacementMap) -> None:
 
 
 def read_map(folder: str | Path, edited: str | Path | None = None) -> DisplacementMap:
-    """Read a displacement map.
+    """Read a displacement map from a folder; StorageError for a file that is missing or damaged.
 
-    Parameters
-    ----------
-    folder : path
-        That `write_map` wrote.
-    edited : path, optional
-        `displacement.png` after editing, 16 bits of grey and of the same size. Where a pixel has another value than
-        the stored one, its height changes by the difference; all others keep theirs to the last digit.
-
-    Raises
-    ------
-    StorageError
-        A file that is missing or damaged, or an edited image of another size or depth.
+    `edited` is `displacement.png` after editing, 16 bits of grey and of the same size. Where a pixel has another value
+    than the stored one, its height changes by the difference; all others keep theirs to the last digit.
     """
     folder = Path(folder)
     header = read_json(folder / HEADER, "a displacement map's header")
@@ -92,12 +75,8 @@ def edit(map: DisplacementMap, stored: np.ndarray, edited: np.ndarray, scale: fl
 
 
 def read_edited(path: str | Path, size: tuple[int, ...]) -> np.ndarray:
-    """(H, W) uint16 grey values of an image that an editor saved: 16 bits of grey, or of three equal channels.
-
-    Raises
-    ------
-    StorageError
-        Another size or depth, or colours.
+    """(H, W) uint16 grey values of an image that an editor saved, 16 bits of grey or of three equal channels;
+    StorageError for another size or depth, or colours.
     """
     expected = f"an image of {size[1]} x {size[0]} pixels with 16 bits of grey"
     with taking_apart(path, expected):

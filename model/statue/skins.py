@@ -1,4 +1,4 @@
-"""H-Anim as X3D: the statue's skin on its joints, for browsers of X3D."""
+"""A statue for other programs: glTF 2.0 with skin, images and motion, and X3D with an H-Anim skeleton."""
 from __future__ import annotations
 
 import re
@@ -11,10 +11,50 @@ from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.storage import writing
 from scanprep.pictures.sheets import save_png
 
-from ..export.rig import check_motion, strongest, turn_up
+from ..export.glb import Material, write_skinned_glb
+from ..export.rig import Rig, check_motion, strongest, turn_up
 from .control.model import ControlModel
 from .detail.subdivision import Subdivision, subdivide
+from .detail.textures import chart_tangents, vertex_of_row
 from .motion.retarget import StatueMotion
+
+
+def write_statue_glb(path: str | Path, control: ControlModel, vertices: np.ndarray | None = None,
+                     subdivision: Subdivision | None = None, texture: np.ndarray | None = None,
+                     normals: np.ndarray | None = None, heights: np.ndarray | None = None,
+                     motion: StatueMotion | None = None, up: int = 2) -> None:
+    """Write a statue for any glTF 2.0 viewer, animation program or game engine; the axis `up` points up.
+
+    glTF knows linear blend skinning only: joints carry the detailed vertices themselves, while `Reconstruction` moves
+    the control mesh and sets the detail upon it anew. The rest pose is that of the scan. Without `vertices` (n, 3) of a
+    subdivision it is the control mesh itself, which `normals` (`normal_image`) and `heights` detail; glTF has no place
+    for heights, so they are an image that the material's `extras` name.
+    """
+    rig, material = statue_rig(control, vertices, subdivision, texture, normals, heights)
+    if motion is None:
+        write_skinned_glb(path, rig, up=up, material=material)
+    else:
+        write_skinned_glb(path, rig, motion.poses, motion.trans, motion.rate, up=up, material=material)
+
+
+def statue_rig(control: ControlModel, vertices: np.ndarray | None, subdivision: Subdivision | None,
+               texture: np.ndarray | None = None, normals: np.ndarray | None = None, heights: np.ndarray | None = None
+               ) -> tuple[Rig, Material]:
+    """The skin with its vertices repeated along the seams of the chart, and its material."""
+    if (vertices is None) != (subdivision is None):
+        raise ValueError("vertices, subdivision: expected both or none")
+    if subdivision is None or vertices is None:
+        subdivision, vertices = subdivide(control.mesh, control.chart, 0), control.mesh.vertices
+    if np.shape(vertices) != (len(subdivision.parent), 3):
+        raise ValueError(f"vertices: expected shape ({len(subdivision.parent)}, 3), got {np.shape(vertices)}")
+    mesh, chart = Mesh(vertices, subdivision.faces), subdivision.chart
+    weights = np.einsum("nc,ncj->nj", subdivision.bary, control.weights[control.mesh.faces[subdivision.parent]])
+    row = vertex_of_row(mesh, chart)
+    split = Mesh(mesh.vertices[row], chart.faces)
+    tangents = None if normals is None else chart_tangents(mesh, chart)
+    material = Material(chart.uv, mesh.vertex_normals[row], tangents, texture, normals, heights)
+    return Rig(split, control.skeleton, strongest(weights)[row], np.zeros((0, *split.vertices.shape))), material
+
 
 _DOCTYPE = ('<?xml version="1.0" encoding="UTF-8"?>\n<!DOCTYPE X3D PUBLIC "ISO//Web3D//DTD X3D 4.0//EN" '
             '"https://www.web3d.org/specifications/x3d-4.0.dtd">\n')
@@ -28,26 +68,6 @@ def write_x3d(path: str | Path, control: ControlModel, vertices: np.ndarray | No
 
     Joints have the names of H-Anim 2.0 where the control model's parts have those of 1.0, as the generic humanoid's,
     and their centres in the pose of the scan, where no joint is turned. Skin and joints share their coordinates.
-
-    Parameters
-    ----------
-    path : str or Path
-    control : ControlModel
-        Fitted.
-    vertices : (n, 3) float, metres, optional
-        The detailed surface in the default pose; else the control mesh.
-    subdivision : Subdivision, optional
-        Its triangles; with `vertices`.
-    texture : (H, W, 3) uint8, optional
-    motion : StatueMotion, optional
-        Played in a loop.
-    up : int
-        0, 1 or 2: the axis of the statue that points up, turned to y as X3D has it.
-
-    Raises
-    ------
-    ValueError
-        Vertices of another count than the subdivision's, or one of the two alone; a motion of other parts.
     """
     path = Path(path)
     if (vertices is None) != (subdivision is None):
