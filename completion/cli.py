@@ -34,22 +34,7 @@ def read_model(path: Path | None) -> tuple[BodyModel, str]:
 
 def read_landmark_pairs(model: BodyModel, name: str, scan: Path, template: Path | None, unit: str | None
                         ) -> tuple[np.ndarray, np.ndarray]:
-    """Vertices (L,) and points (L, 3) of the landmarks that a file and the model have in common.
-
-    Parameters
-    ----------
-    name : str
-        Of the model, for messages.
-    scan : Path
-        Named points.
-    template : Path, optional
-        Where they are on the template; else those kept in the model.
-
-    Raises
-    ------
-    ValueError
-        A model that keeps none, fewer than three in common.
-    """
+    """Vertices (L,) and points (L, 3) of the landmarks that a file and the model have in common."""
     from scanprep.geometry.landmarks import match_landmarks, read_landmark_vertices, read_landmarks
 
     kept = model.info.get("landmarks") if template is None else read_landmark_vertices(template, model.template)

@@ -52,8 +52,8 @@ def place(tmp_path_factory, template):
 @pytest.fixture
 def quick(tmp_path, monkeypatch):
     """A file of settings for a registration with few steps."""
-    monkeypatch.setattr(registration_cli, "register", lambda *given, config, **named: register(
-        *given, config=QUICK.scan.registration, **named))
+    monkeypatch.setattr(registration_cli, "register", lambda *given, **named: register(
+        *given, **named | {"config": QUICK.scan.registration}))
     path = tmp_path / "quick.toml"
     config = replace(QUICK, min_poses=5, scan=replace(QUICK.scan, pictures=True))
     path.write_text(config_files.write({"config": config}))

@@ -16,7 +16,6 @@ from scanprep.geometry.surface import Surface
 from scanprep.registration import deformation_graph as graph
 from scanprep.registration import energies
 from scanprep.registration import inverted_triangles as inverted
-from scanprep.registration import levenberg_marquardt as descent
 from scanprep.registration.nonrigid import register
 from scanprep.registration.schedule import RegistrationConfig
 
@@ -185,12 +184,12 @@ def test_gradient_matches_finite_differences(name):
     rng = np.random.default_rng(7)
     g = small_graph()
     motion, wanted = random_motion(g, rng), wanted_pull(rng)
-    stiffness = descent.Stiffness(0.7, 0.5, 0.3)
-    term = descent.terms(g, motion, wanted, stiffness)[name]
+    stiffness = energies.Stiffness(0.7, 0.5, 0.3)
+    term = energies.terms(g, motion, wanted, stiffness)[name]
     blocks, half = term.normal(energies.NodePattern(g))
     for _ in range(4):
         direction = rng.normal(size=half.shape)
-        ahead, behind = (descent.terms(g, motion.moved(h * direction), wanted, stiffness)[name].value
+        ahead, behind = (energies.terms(g, motion.moved(h * direction), wanted, stiffness)[name].value
                          for h in (1e-5, -1e-5))
         expected = (ahead - behind) / 2e-5
         np.testing.assert_allclose(2 * np.sum(half * direction), expected, rtol=1e-6, atol=1e-7 * abs(term.value))

@@ -69,11 +69,7 @@ def all_turns(count: int) -> np.ndarray:
 class Outside:
     """A table of how far places stand where a camera would have seen them.
 
-    Parameters
-    ----------
-    sight : Sight or Sights
-    tolerance : float, metres
-        See `Sight.trespass`.
+    `tolerance`, metres, see `Sight.trespass`.
     """
 
     def __init__(self, sight: Sight | Sights, tolerance: float) -> None:

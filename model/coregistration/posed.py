@@ -12,24 +12,12 @@ from ..linear import PointOperator, Subject
 
 @dataclass(frozen=True, eq=False)
 class PosedPoints:
-    """Points of a body whose pose, place and perhaps shape are unknown: x = (pose (3J), trans (3), betas (K)).
+    """Points of a body whose pose, place and perhaps shape are unknown: x = (pose (3J), trans (3), betas (K))."""
 
-    Attributes
-    ----------
-    source : PointOperator or ShapedPoints
-        Of a body of known shape, or of one whose betas are unknown.
-    n_betas : int
-        K, zero where the shape is known.
-    parts : (L,) int
-        The part of each point.
-    rest_normals : (L, 3) float
-        On the template.
-    """
-
-    source: PointOperator | ShapedPoints
-    n_betas: int
-    parts: np.ndarray
-    rest_normals: np.ndarray
+    source: PointOperator | ShapedPoints  # PointOperator or ShapedPoints
+    n_betas: int            # K, zero where the shape is known
+    parts: np.ndarray       # (L,) int, the part of each point
+    rest_normals: np.ndarray  # (L, 3), on the template
 
     @property
     def J3(self) -> int:

@@ -14,6 +14,7 @@ import numpy as np
 from scipy.sparse import bsr_array, coo_array, csc_array, csr_array
 
 from ..geometry import rotations
+from ..geometry.least_squares import Minimum, Sparse, levenberg_marquardt
 from .deformation_graph import DeformationGraph, NodeMotion, arms
 
 UNKNOWNS = 7
@@ -204,6 +205,39 @@ def growth_term(graph: DeformationGraph, motion: NodeMotion, stiffness: float) -
     Ji[..., 3], Jj[..., 3] = -1, 1
     return EdgeTerm(graph.edges, (motion.log_scale[j] - motion.log_scale[i])[:, None], Ji, Jj,
                     stiffness**2 * graph.edge_area)
+
+
+@dataclass(frozen=True)
+class Stiffness:
+    """How much the nodes resist, each in metres of distance to the data."""
+
+    stretch: float
+    bend: float
+    growth: float
+
+
+def terms(graph: DeformationGraph, motion: NodeMotion, wanted: Pull, stiffness: Stiffness) -> dict[str, Term]:
+    """All terms of the energy at one state."""
+    return {"data": data_term(graph, motion, wanted),
+            "stretch": stretch_term(graph, motion, stiffness.stretch),
+            "bend": bend_term(graph, motion, stiffness.bend),
+            "growth": growth_term(graph, motion, stiffness.growth)}
+
+
+def follow_pull(graph: DeformationGraph, pattern: NodePattern, motion: NodeMotion, wanted: Pull, stiffness: Stiffness,
+           steps: int) -> Minimum[NodeMotion]:
+    """The motion of all nodes of least energy near a motion."""
+    def equations(at: NodeMotion) -> Sparse:
+        now = terms(graph, at, wanted, stiffness).values()
+
+        def assemble() -> tuple[np.ndarray, csc_array]:
+            blocks, half = zip(*(term.normal(pattern) for term in now), strict=True)
+            return np.sum(half, axis=0).reshape(-1), pattern.matrix(np.sum(blocks, axis=0))
+
+        return Sparse(sum(term.value for term in now), assemble)
+
+    return levenberg_marquardt(equations, motion, steps, tolerance=1e-3, damping=1e-5,
+                               retract=lambda at, step: at.moved(step.reshape(-1, UNKNOWNS)))
 
 
 def _sum_to(index: np.ndarray, values: np.ndarray, count: int) -> np.ndarray:

@@ -9,9 +9,8 @@ import numpy as np
 from ..geometry.target import Target, orient
 from ..geometry.thinning import thin
 from .deformation_graph import DeformationGraph, NodeMotion, build_graph, deform, start_motion, transferred
-from .energies import Pull, node_pattern, pull
+from .energies import Pull, Stiffness, follow_pull, node_pattern, pull, terms
 from .inputs import Inputs
-from .levenberg_marquardt import Stiffness, minimise, terms
 from .limb_ends import RADIUS, End, RigidFit, find_ends, rotated_end
 from .matches import Likeness, match_both_ways
 from .schedule import GraphStage
@@ -39,8 +38,9 @@ class GraphFit:
         """The fit nearer to what matches and landmarks want, against the resistance of the nodes."""
         if not wanted.A.any():
             return self
-        found = minimise(self.graph, node_pattern(self.graph), self.motion, wanted, stiffness, steps, 1e-3)
-        return replace(self, x=deform(self.graph, found.motion), motion=found.motion, energies=found.energies,
+        found = follow_pull(self.graph, node_pattern(self.graph), self.motion, wanted, stiffness, steps)
+        now = {name: term.value for name, term in terms(self.graph, found.x, wanted, stiffness).items()}
+        return replace(self, x=deform(self.graph, found.x), motion=found.x, energies=now,
                        iterations=self.iterations + found.iterations)
 
     def refined(self, given: Inputs, nodes: int) -> GraphFit:

@@ -3,52 +3,10 @@ import pytest
 from completion_bodies import worm_with_prior
 from scipy.sparse import csr_array
 
-from completion.energy import Residual
 from completion.partial.free_surface import FreeSurface, edge_matrix
-from completion.solve import MinimiseConfig, minimise
 from model.gradients import edges
 
 RNG = np.random.default_rng(0)
-
-
-def linear(A, b):
-    return lambda x: [Residual(x @ A.T - b, np.broadcast_to(A, (*x.shape[:-1], *A.shape)))]
-
-
-def valley(x):
-    """Rosenbrock's: the minimum is 0 at (1, 1)."""
-    values = np.stack([10 * (x[:, 1] - x[:, 0]**2), 1 - x[:, 0]], axis=1)
-    zero = np.zeros(len(x))
-    J = np.stack([np.stack([-20 * x[:, 0], zero + 10], axis=1), np.stack([zero - 1, zero], axis=1)], axis=1)
-    return [Residual(values, J)]
-
-
-def test_a_linear_problem_ends_at_the_least_squares_solution():
-    A, b = RNG.normal(size=(9, 4)), RNG.normal(size=9)
-    end = minimise(linear(A, b), np.zeros((1, 4)), MinimiseConfig(tolerance=1e-14))
-    np.testing.assert_allclose(end.x[0], np.linalg.lstsq(A, b, rcond=None)[0], atol=1e-8)
-    assert end.converged.all()
-
-
-def test_a_curved_valley_is_followed_to_its_end():
-    end = minimise(valley, np.array([[-1.2, 1.0], [3.0, -2.0]]), MinimiseConfig(iterations=200, tolerance=1e-12))
-    np.testing.assert_allclose(end.x, 1, atol=1e-5)
-    assert (end.energy < 1e-10).all() and end.converged.all()
-
-
-def test_batch_is_the_loop():
-    starts = RNG.normal(size=(4, 2))
-    config = MinimiseConfig(iterations=6)
-    together = minimise(valley, starts, config)
-    for b in range(4):
-        np.testing.assert_allclose(together.x[b], minimise(valley, starts[b:b + 1], config).x[0], atol=1e-10)
-
-
-def test_not_converging_is_a_fact_of_the_result_and_energy_never_rises():
-    start = np.array([[-1.2, 1.0]])
-    energies = [minimise(valley, start, MinimiseConfig(iterations=i)).energy[0] for i in range(8)]
-    assert (np.diff(energies) <= 0).all()
-    assert not minimise(valley, start, MinimiseConfig(iterations=2)).converged[0]
 
 
 @pytest.fixture(scope="module")
