@@ -6,7 +6,8 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from scanprep.correspondence.correlated import CorrelatedConfig, find_correspondences
+from scanprep.correspondence.correlated import find_correspondences
+from scanprep.correspondence.search import CorrelatedConfig
 from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.surface import Surface
 from scanprep.ranges import Settings
