@@ -8,8 +8,8 @@ from typing import Annotated
 import tyro
 
 from model.body import BodyModel
-from model.cli import read_subject
 from model.linear import Subject
+from model.posing.cli import read_subject
 from scanprep.batch.pool import Workers
 from scanprep.batch.workspace import Task, Workspace
 from scanprep.cli import Output, Unit
@@ -41,7 +41,7 @@ def complete_scan(scans: ScansArg, output: Output, model: ModelOrNone = None, la
         scans: Mesh or point cloud, the views of one body, or a folder of scans.
         output: Folder to write completed.ply, predicted.ply, completion.npz and report.html to; completed.glb for a
             scan with a texture.
-        model: Model of `scape learn`; without it that of the embedded people, which is made on first use.
+        model: Model of `scape learn`; without it that of the synthetic people, which is made on first use.
         landmarks: 4 to 10 named points on the scan; else the file of the scan's name beside it. Without any the
             search starts from typical poses. For a folder of scans, the folder of such files.
         subject: Whose body it is: "template" for the one the model's poses were learned from, betas in JSON or .npz,

@@ -6,9 +6,9 @@ from collections.abc import Mapping, Sequence
 import numpy as np
 from scipy.spatial import cKDTree
 
-from ..decimation.remeshing import smooth
 from ..geometry import rotations
 from ..geometry.mesh import Mesh
+from ..geometry.remeshing import smooth
 from ..geometry.seen_space import SeenSpace
 from ..geometry.surface import OrientedPoints
 from .icp import landmark_motion, transform

@@ -57,7 +57,7 @@ def show_layout(layout: LayoutArg, output: Output, model: ModelOrNone = None, bo
     Args:
         layout: One of `scape layout list`, or a file.
         output: Folder to write to.
-        model: Model of `scape learn`, whose mean person is shown; without it, and without --body, that of the embedded
+        model: Model of `scape learn`, whose mean person is shown; without it, and without --body, that of the synthetic
             people.
         body: Mesh to show it on, instead of a model.
         unit: Unit of the mesh.
@@ -153,7 +153,7 @@ def mean_body(model: BodyModel) -> Mesh:
 
 def _body(model: Path | None, body: Path | None, unit: Unit | None
           ) -> tuple[Mesh, Skeleton | None, np.ndarray | None, str]:
-    """The body to show, its skeleton, the vertices of the embedded people it kept, and its name."""
+    """The body to show, its skeleton, the vertices of the synthetic people it kept, and its name."""
     if body is not None:
         return read_mesh(body, unit), None, None, str(body)
     loaded, name = read_model(model)

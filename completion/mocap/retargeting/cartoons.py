@@ -1,7 +1,7 @@
 """Cartoon figures with their landmarks: characters for those who have none at hand.
 
 z is up, a figure faces -y, stands on z = 0, has the left side at +x and its arms 36 degrees away from the body, as the
-embedded people at rest.
+synthetic people at rest.
 """
 from __future__ import annotations
 
@@ -10,8 +10,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from scanprep.geometry.mesh import Mesh
-from scanprep.synthetic.implicit_surface import Bump, Ellipsoid, Field, Group, Mirrored, RoundCone, project
-from scanprep.synthetic.triangulation import polygonise
+from scanprep.synthetic.implicit_surface import Bump, Ellipsoid, Field, Group, Mirrored, RoundCone, polygonise, project
 
 ARM_ANGLE, ELBOW_ANGLE = np.radians([36.0, 14.0])
 FINGERS = ((0.30, 1.00, 0.30), (0.0, 1.10, 0.31), (-0.30, 0.95, 0.29))    # across the palm, length, thickness
@@ -72,9 +71,9 @@ class Cartoon:
     mesh : Mesh
         Closed, with triangles of its own.
     landmarks : {name: (3,) float, metres}
-        On its skin, named as those of the embedded people.
+        On its skin, named as those of the synthetic people.
     joints : {name: (3,) float, metres}
-        Where it bends, named as the parts of the embedded people that turn there.
+        Where it bends, named as the parts of the synthetic people that turn there.
     """
 
     mesh: Mesh
