@@ -4,8 +4,8 @@ import json
 import numpy as np
 import pytest
 
-from scanprep.geometry.files import (
-    MeshFileError,
+from scanprep.geometry.files import MeshFileError
+from scanprep.geometry.landmarks import (
     match_landmarks,
     read_landmark_vertices,
     read_landmarks,

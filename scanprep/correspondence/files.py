@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 
 from ..geometry import storage
-from ..geometry.formats.common import FARTHEST
+from ..geometry.format_common import FARTHEST
 from .correspondences import Correspondences
 
 KIND, VERSION = "correspondences", 1

@@ -10,10 +10,11 @@ from typing import Any
 
 import numpy as np
 
-from scanprep.geometry.formats.common import UNITS
 from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.storage import writing
 from scanprep.geometry.surface import Rays, barycentric
+
+from ..geometry.format_common import UNITS
 
 SIZE = 1024                          # pixels of a baked texture, each way
 PADDING = 8                          # pixels that colours go on beyond the border of a chart
