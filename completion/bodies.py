@@ -17,12 +17,7 @@ Follow = Callable[[np.ndarray], MovingPoints]
 
 
 class FixedBody:
-    """A body of known shape; unknowns are x = (pose (3J), trans (3)).
-
-    Parameters
-    ----------
-    subject : Subject
-    """
+    """A body of known shape; unknowns are x = (pose (3J), trans (3))."""
 
     n_betas = 0
 
@@ -57,13 +52,7 @@ class FixedBody:
         return self.subject.vertices(pose, trans).astype(np.float64)
 
     def follow(self, vertex_ids: np.ndarray, x: np.ndarray, weights: np.ndarray | None = None) -> Follow:
-        """Surface points as a function of the unknowns (B, P), valid near x (P,).
-
-        Parameters
-        ----------
-        vertex_ids, weights
-            As for `Subject.points`.
-        """
+        """Surface points as a function of the unknowns (B, P), valid near x (P,)."""
         operator = self.subject.points(vertex_ids, weights)
 
         def move(x: np.ndarray) -> MovingPoints:
@@ -81,13 +70,7 @@ class ShapedBody(FixedBody):
     and along with the joint it hangs on. The derivative by the pose is that of the last subject that was built. Only
     derivatives are approximate in this way; at x itself the places are those of the model.
 
-    Parameters
-    ----------
-    model : BodyModel
-    renew : float
-        Length of the step in betas, in standard deviations, after which the subject is rebuilt.
-    turn : float, radians
-        How far a part may turn before D is stitched anew.
+    `turn` radians, how far a part may turn before D is stitched anew.
     """
 
     def __init__(self, model: BodyModel, renew: float = 2.0, turn: float = 0.7) -> None:
@@ -143,10 +126,7 @@ class Anchor:
     A vertex keeps its place in the frame of its part, and the part hangs on its joint. Stitching costs a quarter of
     a second, carrying a millisecond; with joints turned by half a radian it is off by a twentieth.
 
-    Parameters
-    ----------
-    model : BodyModel
-    pose : (J, 3) float, radians
+    `pose` (J, 3), radians.
     """
 
     def __init__(self, model: BodyModel, pose: np.ndarray) -> None:
@@ -175,13 +155,7 @@ class Anchor:
 
 
 def as_body(body: BodyModel | Subject) -> FixedBody:
-    """The face for a model (shape unknown) or a subject (shape known).
-
-    Raises
-    ------
-    ValueError
-        Neither of the two.
-    """
+    """The face for a model (shape unknown) or a subject (shape known)."""
     if isinstance(body, Subject):
         return FixedBody(body)
     if isinstance(body, BodyModel):

@@ -11,42 +11,17 @@ from dataclasses import dataclass
 import numpy as np
 
 from scanprep.geometry import rotations
+from scanprep.geometry.least_squares import Residual
 
 from .priors import GaussianPrior, JointLimits
 
 
 @dataclass(frozen=True, eq=False)
-class Residual:
-    """Values whose squares are summed, and their derivative with respect to the unknowns.
-
-    Attributes
-    ----------
-    values : (..., m) float
-    jacobian : (..., m, P) float
-    """
-
-    values: np.ndarray
-    jacobian: np.ndarray
-
-    @property
-    def energy(self) -> np.ndarray:
-        """(...) the sum of squares."""
-        return np.einsum("...m,...m->...", self.values, self.values)
-
-
-@dataclass(frozen=True, eq=False)
 class MovingPoints:
-    """Points that move with a body.
+    """Points that move with a body."""
 
-    Attributes
-    ----------
-    positions : (..., L, 3) float, metres
-    jacobian : (..., L, 3, P) float
-        With respect to the unknowns x.
-    """
-
-    positions: np.ndarray
-    jacobian: np.ndarray
+    positions: np.ndarray   # (..., L, 3), metres
+    jacobian: np.ndarray    # (..., L, 3, P), with respect to the unknowns x
 
     def __getitem__(self, some: slice) -> MovingPoints:
         """Some of the points."""
@@ -56,11 +31,7 @@ class MovingPoints:
 def moving_points(positions: np.ndarray, d_pose: np.ndarray, d_betas: np.ndarray | None = None) -> MovingPoints:
     """Join the derivatives with respect to pose, trans (the identity) and betas.
 
-    Parameters
-    ----------
-    positions : (..., L, 3) float, metres
-    d_pose : (..., L, 3, 3J) float
-    d_betas : (..., L, 3, K) float, optional
+    `positions` (..., L, 3), metres; `d_pose` (..., L, 3, 3J); `d_betas` (..., L, 3, K).
     """
     blocks = [d_pose, np.broadcast_to(np.eye(3), (*positions.shape, 3))]
     if d_betas is not None:
@@ -71,11 +42,7 @@ def moving_points(positions: np.ndarray, d_pose: np.ndarray, d_betas: np.ndarray
 def above_skin(supports: MovingPoints, distance: np.ndarray) -> MovingPoints:
     """Points at a distance from the skin, along a normal that moves with the body.
 
-    Parameters
-    ----------
-    supports : 3 L points
-        For every point the one on the skin and two others around it, counter-clockwise seen from outside.
-    distance : (L,) float, metres
+    `distance` (L,), metres.
     """
     p = supports.positions.reshape(*supports.positions.shape[:-2], -1, 3, 3)
     J = supports.jacobian.reshape(*p.shape, -1)
@@ -100,12 +67,7 @@ def lifted(supports: np.ndarray, distance: np.ndarray) -> np.ndarray:
 def point_to_point(points: MovingPoints, targets: np.ndarray, weights: np.ndarray) -> Residual:
     """Distance of points to their targets; a target that is NaN (not seen) counts nothing.
 
-    Parameters
-    ----------
-    points : L points
-    targets : (..., L, 3) float, metres
-    weights : (..., L) float
-        Factor on the squared distance.
+    `targets` (..., L, 3), metres; `weights` (..., L), factor on the squared distance.
     """
     missing = np.isnan(targets).any(axis=-1)
     root = np.where(missing, 0.0, np.sqrt(weights))[..., None]

@@ -68,14 +68,7 @@ class Motion:
         return np.arange(len(self.poses)) / self.rate
 
     def vertices(self, subject: Subject, frames: np.ndarray | slice = slice(None)) -> np.ndarray:
-        """The meshes (n, N, 3) of some frames, metres.
-
-        Parameters
-        ----------
-        subject : Subject
-            Whose body moves: the one that was followed, or another.
-        frames : indices or slice, optional
-        """
+        """The meshes (n, N, 3) of some frames, metres."""
         return subject.vertices(self.poses[frames], self.trans[frames])
 
     def save(self, path: str | Path, **more: np.ndarray) -> None:
@@ -92,13 +85,7 @@ class Motion:
 
     @staticmethod
     def load(path: str | Path) -> Motion:
-        """Read a file of `save`, or a body-model motion file of the same kind from elsewhere.
-
-        Raises
-        ------
-        StorageError
-            Missing, not a motion, or made for another body model, whose betas mean nothing here.
-        """
+        """Read a file of `save`, or a body-model motion file of the same kind from elsewhere."""
         stored = storage.load_arrays(path, "a motion (.npz)")
         lacking = [name for name in ("poses", "trans") if name not in stored]
         if lacking:

@@ -15,17 +15,10 @@ MARGIN, GIVE = 0.2, 0.1              # radians beyond the range that was seen, a
 
 @dataclass(frozen=True, eq=False)
 class GaussianPrior:
-    """A Gaussian over the joint angles of a pose; the root turns freely.
+    """A Gaussian over the joint angles of a pose; the root turns freely."""
 
-    Attributes
-    ----------
-    mean : (3J,) float, radians
-    whitening : (3J-3, 3J) float, 1 / radians
-        `whitening @ (pose - mean)` has unit covariance.
-    """
-
-    mean: np.ndarray
-    whitening: np.ndarray
+    mean: np.ndarray        # (3J,), radians
+    whitening: np.ndarray   # (3J-3, 3J), 1 / radians, `whitening @ (pose - mean)` has unit covariance
 
     @property
     def free(self) -> int:
@@ -48,26 +41,13 @@ class MixturePrior:
     A pose may take its left arm from one training pose and its right leg from another. The kernels of a limb share
     one covariance, the shrunk one of all poses made narrower, and their centres are drawn towards the mean so that
     the whole keeps its covariance.
-
-    Attributes
-    ----------
-    limbs : tuple of (a,) int
-        Angles, of the 3J, of each limb; those of the root are in none.
-    centres : tuple of (M, a) float, radians
-        Of the kernels of each limb.
-    whitenings : tuple of (a, a) float, 1 / radians
-        Of the kernels of each limb.
-    size : int
-        3J.
-    sharp : bool
-        The nearest kernel of each limb counts alone.
     """
 
-    limbs: tuple[np.ndarray, ...]
-    centres: tuple[np.ndarray, ...]
-    whitenings: tuple[np.ndarray, ...]
-    size: int
-    sharp: bool = False
+    limbs: tuple[np.ndarray, ...]  # tuple of (a,) int
+    centres: tuple[np.ndarray, ...]  # tuple of (M, a), radians, of the kernels of each limb
+    whitenings: tuple[np.ndarray, ...]  # tuple of (a, a), 1 / radians, of the kernels of each limb
+    size: int               # 3J
+    sharp: bool = False     # the nearest kernel of each limb counts alone
 
     def near(self, pose: np.ndarray) -> GaussianPrior:
         """The Gaussian (J, 3) whose energy touches that of the mixture at a pose from above, up to a constant.
@@ -99,30 +79,16 @@ class MixturePrior:
 
 @dataclass(frozen=True, eq=False)
 class JointLimits:
-    """How far joints were seen to turn, and a margin.
-
-    Attributes
-    ----------
-    low, high : (3J,) float, radians
-        Infinite for the root, which turns freely.
-    give : float, radians
-        Overrun that costs as much as one standard deviation.
-    """
+    """How far joints were seen to turn, and a margin."""
 
     low: np.ndarray
     high: np.ndarray
-    give: float = GIVE
+    give: float = GIVE      # radians, overrun that costs as much as one standard deviation
 
 
 def choose_prior(kind: PosePrior, mean: np.ndarray, covariance: np.ndarray, examples: np.ndarray,
                  parents: np.ndarray, shrinkage: float = 0.3) -> GaussianPrior | MixturePrior:
-    """The prior of that kind; a model that keeps no examples (M < 2, an older file) has the Gaussian.
-
-    Raises
-    ------
-    ValueError
-        No such kind.
-    """
+    """The prior of that kind; a model that keeps no examples (M < 2, an older file) has the Gaussian."""
     if kind not in ("gaussian", "mixture", "nearest"):
         raise ValueError(f"pose_prior: expected gaussian, mixture or nearest, got {kind!r}")
     if kind == "gaussian" or len(examples) < 2:
@@ -134,22 +100,7 @@ def mixture_prior(examples: np.ndarray, parents: np.ndarray, shrinkage: float = 
                   floor: float = 0.05, sharp: bool = False) -> MixturePrior:
     """The mixture around training poses.
 
-    Parameters
-    ----------
-    examples : (M, J, 3) float, radians
-        At least 2.
-    parents : (J,) int
-    shrinkage, floor
-        As for `gaussian_prior`.
-    width : float in (0, 1]
-        Standard deviation of a kernel against that of all poses; 1 gives one Gaussian a limb.
-    sharp : bool
-        Only the nearest kernel of each limb counts.
-
-    Raises
-    ------
-    ValueError
-        Fewer than 2 examples, values that are not finite, a width that is not in (0, 1].
+    `examples` (M, J, 3), radians, at least 2; `parents` (J,) int; `width` float in (0, 1].
     """
     examples = np.asarray(examples, dtype=np.float64)
     if examples.ndim != 3 or len(examples) < 2 or not np.isfinite(examples).all():
@@ -197,20 +148,8 @@ def gaussian_prior(mean: np.ndarray, covariance: np.ndarray, shrinkage: float = 
                    ) -> GaussianPrior:
     """The prior from moments of a few training poses, made safe to invert and to extrapolate with.
 
-    Parameters
-    ----------
-    mean : (J, 3) float, radians
-    covariance : (3J, 3J) float
-        The rows of the root are not used.
-    shrinkage : float in [0, 1]
-        How far the covariance moves towards its diagonal: few poses make many chance correlations.
-    floor : float, radians
-        Standard deviation added to every angle.
-
-    Raises
-    ------
-    ValueError
-        Shapes that do not agree, values that are not finite.
+    `mean` (J, 3), radians; `covariance` (3J, 3J), the rows of the root are not used; `floor` radians, standard
+    deviation added to every angle.
     """
     mean = np.asarray(mean, dtype=np.float64).reshape(-1)
     covariance = np.asarray(covariance, dtype=np.float64)
@@ -228,19 +167,8 @@ def gaussian_prior(mean: np.ndarray, covariance: np.ndarray, shrinkage: float = 
 def typical_poses(mean: np.ndarray, covariance: np.ndarray, axes: int, deviation: float = 1.5) -> np.ndarray:
     """Poses to start a search from: the mean, and a step each way along the main directions of variation.
 
-    Parameters
-    ----------
-    mean : (J, 3) float, radians
-    covariance : (3J, 3J) float
-    axes : int
-        Number of directions, those of largest variance.
-    deviation : float
-        Length of the step in standard deviations.
-
-    Returns
-    -------
-    (1 + 2 axes, J, 3) float, radians
-        The root is not turned.
+    `mean` (J, 3), radians; `covariance` (3J, 3J).
+    Returns (1 + 2 axes, J, 3), radians, The root is not turned.
     """
     mean = np.array(mean, dtype=np.float64)
     mean[0] = 0

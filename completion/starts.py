@@ -1,14 +1,16 @@
 """Where a search begins that has nothing but a few named points."""
 from __future__ import annotations
 
+from functools import partial
+
 import numpy as np
 
 from scanprep.geometry import rotations
+from scanprep.geometry.least_squares import Dense, levenberg_marquardt, normal_equations
 
 from . import energy
 from .bodies import FixedBody, Follow
 from .priors import GaussianPrior, typical_poses
-from .solve import Energy, MinimiseConfig, minimise
 
 ANNEALING = (10.0, 3.0, 1.0)         # weight of the pose prior: first near the usual poses, then free
 
@@ -17,22 +19,9 @@ def search(body: FixedBody, follow: Follow, targets: np.ndarray, sd: float, prio
            ) -> tuple[np.ndarray, np.ndarray]:
     """Likely bodies that bring points to their targets, from many starts at once.
 
-    Parameters
-    ----------
-    follow : x (B, P) -> L moving points
-    targets : (L, 3) float, metres
-        NaN where there is none; at least 3 are needed.
-    sd : float, metres
-        How far a point may be from its target.
-    axes : int
-        See `typical_poses`.
-
-    Returns
-    -------
-    (n, P) float
-        Unknowns of every start, best first; betas stay zero.
-    (n,) float
-        Their energies.
+    `follow` x (B, P) -> L moving points; `targets` (L, 3), metres, naN where there is none; at least 3 are needed;
+    `sd`, metres, how far a point may be from its target.
+    Returns (n, P), unknowns of every start, best first; betas stay zero; (n,), their energies.
     """
     poses = typical_poses(body.pose_mean, body.pose_covariance, axes)
     x = np.concatenate([_placed(body, follow, targets, pose) for pose in poses])
@@ -40,12 +29,12 @@ def search(body: FixedBody, follow: Follow, targets: np.ndarray, sd: float, prio
     still = np.zeros(x.shape[1])
     still[body.n_angles + 3:] = 1e6
 
-    def energies(stiff: float) -> Energy:
-        return lambda x: [energy.point_to_point(follow(x), targets, weights),
-                          energy.pose_prior(x, prior, stiff), energy.stay_near(x, 0 * x, still)]
+    def equations(x: np.ndarray, stiff: float) -> Dense:
+        return normal_equations([energy.point_to_point(follow(x), targets, weights), energy.pose_prior(x, prior, stiff),
+                                 energy.stay_near(x, 0 * x, still)])
 
     for stiff in ANNEALING:
-        end = minimise(energies(stiff), x, MinimiseConfig(iterations=8, tolerance=1e-3))
+        end = levenberg_marquardt(partial(equations, stiff=stiff), x, 8, 1e-3)
         x = end.x
     order = np.argsort(end.energy)
     return x[order], end.energy[order]

@@ -1,13 +1,17 @@
 """Pose and shape of a body from its registered vertices, by Levenberg-Marquardt."""
 from __future__ import annotations
 
+from collections.abc import Callable
 from copy import copy
 from dataclasses import dataclass, replace
 from functools import cached_property
 
 import numpy as np
+from scipy.optimize import OptimizeResult, minimize
 from scipy.spatial import cKDTree
 
+from scanprep.geometry.farthest_points import farthest_points
+from scanprep.geometry.least_squares import Dense, Minimum, levenberg_marquardt
 from scanprep.ranges import Count, Settings
 from scanprep.threads import one_thread
 
@@ -15,8 +19,9 @@ from .bilinear import ShapedPoints
 from .body import BodyModel
 from .features import twists
 from .linear import PointOperator, Subject
-from .minimise import Derive, Evaluate, Minimum, Slope, descend, minimise
 from .pullback import pull_back
+
+EXACT = 1e-15                        # square metres, over all points: a step that gains less is none
 
 
 @dataclass(frozen=True)
@@ -46,22 +51,11 @@ class FitConfig(Settings):
 
 @dataclass(frozen=True, eq=False)
 class PoseFit:
-    """A fitted pose.
+    """A fitted pose."""
 
-    Attributes
-    ----------
-    pose : (J, 3) float, radians
-    trans : (3,) float, metres
-    vertices : (N, 3) float, metres
-    rms, mean : float, metres
-        Of the distances of corresponding vertices.
-    converged : bool
-    iterations : int
-    """
-
-    pose: np.ndarray
-    trans: np.ndarray
-    vertices: np.ndarray
+    pose: np.ndarray        # (J, 3), radians
+    trans: np.ndarray       # (3,), metres
+    vertices: np.ndarray    # (N, 3), metres
     rms: float
     mean: float
     converged: bool
@@ -94,13 +88,7 @@ def fit_pose(subject: Subject, vertices: np.ndarray, config: FitConfig | None = 
 
 
 class PoseFitter:
-    """`fit_pose` for many scans of one subject: what does not depend on the scan is prepared once.
-
-    Parameters
-    ----------
-    subject : Subject
-    config : FitConfig, optional
-    """
+    """`fit_pose` for many scans of one subject: what does not depend on the scan is prepared once."""
 
     def __init__(self, subject: Subject, config: FitConfig | None = None) -> None:
         self.subject, self.config = subject, config or FitConfig()
@@ -116,22 +104,22 @@ class PoseFitter:
         subject, config, chosen = self.subject, self.config, self._chosen
         vertices = _checked_vertices(vertices, subject.n_vertices)
         J = len(subject.skeleton.parents)
-        energy = _pose_energy(self._sample, vertices[chosen])
-        best: Minimum | None = None
+        best: Minimum[np.ndarray] | None = None
         for x in _starts(subject, vertices) if start is None else [_placed(subject, vertices, start)]:
-            found = minimise(*energy, x, J, config.tolerance, config.iterations)
-            if best is None or found.energy < best.energy:
+            found = _solved(_pose_equations(self._sample, vertices[chosen]), x[None], J, config.iterations,
+                            config.tolerance)
+            if best is None or found.energy[0] < best.energy[0]:
                 best = found
-            if np.sqrt(found.energy / len(chosen)) < 0.02 * np.ptp(vertices, axis=0).max():
+            if np.sqrt(found.energy[0] / len(chosen)) < 0.02 * np.ptp(vertices, axis=0).max():
                 break
         assert best is not None
-        steps = best.steps
+        steps = best.iterations
         if len(chosen) < subject.n_vertices and config.polish:
-            best = minimise(*_pose_energy(self._everything, vertices), best.x, J, config.tolerance, config.polish)
-            steps += best.steps
-        pose, trans = best.x[:3 * J].reshape(J, 3), best.x[3 * J:]
+            best = _solved(_pose_equations(self._everything, vertices), best.x, J, config.polish, config.tolerance)
+            steps += best.iterations
+        pose, trans = best.x[0, :3 * J].reshape(J, 3), best.x[0, 3 * J:]
         fitted = np.asarray(subject.vertices(pose, trans), dtype=np.float64)
-        return PoseFit(pose, trans, fitted, *_distances(fitted, vertices), best.converged, steps)
+        return PoseFit(pose, trans, fitted, *_distances(fitted, vertices), bool(best.converged[0]), steps)
 
 
 @one_thread()
@@ -154,14 +142,7 @@ def fit_shape(model: BodyModel, vertices: np.ndarray, config: FitConfig | None =
 
 
 class ShapeFitter:
-    """`fit_shape` for many scans: what does not depend on the scan is prepared once.
-
-    Parameters
-    ----------
-    model : BodyModel
-        With shape components.
-    config : FitConfig, optional
-    """
+    """`fit_shape` for many scans: what does not depend on the scan is prepared once."""
 
     def __init__(self, model: BodyModel, config: FitConfig | None = None) -> None:
         self.model, self.config = model, config or FitConfig()
@@ -194,32 +175,21 @@ class ShapeFitter:
         start = start or self._mean_person.fit(vertices)
         betas = start.betas[:K] if isinstance(start, ShapeFit) else np.zeros(K)
         x = np.concatenate([start.pose.ravel(), start.trans, betas])
-        evaluate, derive = _shape_energy(self._points, vertices[self._chosen], np.sqrt(self._share))
-        best = minimise(evaluate, derive, x, J, config.tolerance, config.iterations)
-        steps = best.steps
+        best = _solved(_shape_equations(self._points, vertices[self._chosen], np.sqrt(self._share)), x[None], J,
+                       config.iterations, config.tolerance)
+        x, converged, steps = best.x[0], bool(best.converged[0]), best.iterations
         if len(self._chosen) < len(vertices) and config.polish:
-            columns = derive(best.x)[1]
-            best = descend(*_whole_energy(model, vertices), columns @ columns.T, best.x, config.tolerance,
-                           config.polish)
-            steps += best.steps
-        pose, trans, betas = twists(best.x[:3 * J].reshape(J, 3)), best.x[3 * J:3 * J + 3], np.zeros(model.n_betas)
-        betas[:K] = best.x[3 * J + 3:]
+            x, converged, more = _polished(model, vertices, x, best.equations.hessian[0], config)
+            steps += more
+        pose, trans, betas = twists(x[:3 * J].reshape(J, 3)), x[3 * J:3 * J + 3], np.zeros(model.n_betas)
+        betas[:K] = x[3 * J + 3:]
         fitted = model.vertices(pose, betas, trans)
-        return ShapeFit(pose, trans, fitted, *_distances(fitted, vertices), best.converged, steps, betas)
+        return ShapeFit(pose, trans, fitted, *_distances(fitted, vertices), converged, steps, betas)
 
 
 def spread_vertices(vertices: np.ndarray, count: int) -> np.ndarray:
     """Indices (≤ count,) of vertices spread evenly, each next one farthest from those before."""
-    if count >= len(vertices):
-        return np.arange(len(vertices))
-    chosen = np.empty(count, dtype=np.int64)
-    far = np.full(len(vertices), np.inf)
-    at = int(((vertices - vertices.mean(axis=0)) ** 2).sum(axis=1).argmax())
-    for i in range(count):
-        chosen[i] = at
-        far = np.minimum(far, ((vertices - vertices[at]) ** 2).sum(axis=1))
-        at = int(far.argmax())
-    return np.sort(chosen)
+    return np.arange(len(vertices)) if count >= len(vertices) else np.sort(farthest_points(vertices, count))
 
 
 def share_of_vertices(vertices: np.ndarray, chosen: np.ndarray) -> np.ndarray:
@@ -246,49 +216,69 @@ def _placed(subject: Subject, vertices: np.ndarray, pose: np.ndarray) -> np.ndar
     return np.concatenate([pose.ravel(), (vertices - posed).mean(axis=0)])
 
 
-def _pose_energy(operator: PointOperator, target: np.ndarray) -> tuple[Evaluate, Derive]:
-    """Residual (3L,) of the points against their targets, and its derivatives (3J + 3, 3L)."""
+def _solved(equations: Callable[[np.ndarray], Dense], x: np.ndarray, J: int, iterations: int, tolerance: float
+            ) -> Minimum[np.ndarray]:
+    """Unknowns (1, P) whose first are a pose, which is kept below π."""
+    def retract(x: np.ndarray, step: np.ndarray) -> np.ndarray:
+        out = x + step
+        out[0, :3 * J] = twists(out[0, :3 * J].reshape(J, 3)).ravel()
+        return out
+
+    return levenberg_marquardt(equations, x, iterations, tolerance, exact=EXACT, retract=retract)
+
+
+def _pose_columns(operator: PointOperator, target: np.ndarray, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Residual (3L,) of the points at x (3J + 3,) against their targets (L, 3), and its derivatives (3J + 3, 3L)."""
     J3 = 3 * len(operator.terms.skeleton.parents)
     place = np.broadcast_to(np.eye(3)[:, None], (3, operator.count, 3)).reshape(3, -1)
-
-    def evaluate(x: np.ndarray) -> np.ndarray:
-        return (operator.evaluate(x[:J3].reshape(-1, 3), x[J3:]) - target).ravel()
-
-    def derive(x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        y, columns = operator.columns(x[:J3].reshape(-1, 3), x[J3:])
-        return (y - target).ravel(), np.concatenate([columns.reshape(J3, -1), place])
-
-    return evaluate, derive
+    y, columns = operator.columns(x[:J3].reshape(-1, 3), x[J3:])
+    return (y - target).ravel(), np.concatenate([columns.reshape(J3, -1), place])
 
 
-def _shape_energy(points: ShapedPoints, target: np.ndarray, weights: np.ndarray) -> tuple[Evaluate, Derive]:
-    """As `_pose_energy`, with betas behind pose and place; residuals are times the weights (L,) of their points."""
+def _pose_equations(operator: PointOperator, target: np.ndarray) -> Callable[[np.ndarray], Dense]:
+    """The normal equations of pose and place, for points that are to be at their targets (L, 3)."""
+    return lambda x: _dense(*_pose_columns(operator, target, x[0]))
+
+
+def _shape_equations(points: ShapedPoints, target: np.ndarray, weights: np.ndarray) -> Callable[[np.ndarray], Dense]:
+    """As `_pose_equations`, with betas behind pose and place; residuals are times the weights (L,) of their points."""
     J3, each = 3 * len(points.terms.skeleton.parents), np.repeat(weights, 3)
 
-    def evaluate(x: np.ndarray) -> np.ndarray:
-        return each * _pose_energy(points.operator(x[J3 + 3:]), target)[0](x[:J3 + 3])
+    def equations(x: np.ndarray) -> Dense:
+        residual, columns = _pose_columns(points.operator(x[0, J3 + 3:]), target, x[0, :J3 + 3])
+        by_shape = np.moveaxis(points.shape_jacobian(x[0, :J3].reshape(-1, 3)), -1, 0)
+        return _dense(each * residual, each * np.concatenate([columns, by_shape.reshape(len(by_shape), -1)]))
 
-    def derive(x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        residual, columns = _pose_energy(points.operator(x[J3 + 3:]), target)[1](x[:J3 + 3])
-        by_shape = np.moveaxis(points.shape_jacobian(x[:J3].reshape(-1, 3)), -1, 0)
-        return each * residual, each * np.concatenate([columns, by_shape.reshape(len(by_shape), -1)])
-
-    return evaluate, derive
+    return equations
 
 
-def _whole_energy(model: BodyModel, target: np.ndarray) -> tuple[Evaluate, Slope]:
-    """Residuals of all vertices, and half the gradient of their squares, with unknowns as `_shape_energy` has."""
-    J3 = 3 * len(model.skeleton.parents)
+def _dense(residual: np.ndarray, columns: np.ndarray) -> Dense:
+    """One problem from residuals (m,) and their derivatives (P, m)."""
+    return Dense(np.array([residual @ residual]), (columns @ residual)[None], (columns @ columns.T)[None])
 
-    def evaluate(x: np.ndarray) -> np.ndarray:
-        return (model.vertices(x[:J3].reshape(-1, 3), x[J3 + 3:], x[J3:J3 + 3]) - target).ravel()
 
-    def slope(x: np.ndarray, residual: np.ndarray) -> np.ndarray:
-        force = residual.reshape(-1, 3)
+def _polished(model: BodyModel, target: np.ndarray, x: np.ndarray, matrix: np.ndarray, config: FitConfig
+              ) -> tuple[np.ndarray, bool, int]:
+    """The unknowns (P,) at the minimum over all vertices, near that of a sample with a Gauss-Newton matrix (P, P).
+
+    By gradients alone, the matrix is where BFGS begins: whether it converged, and how many steps it took.
+    """
+    J3, lowest = 3 * len(model.skeleton.parents), [np.inf]
+
+    def energy(x: np.ndarray) -> tuple[float, np.ndarray]:
+        force = model.vertices(x[:J3].reshape(-1, 3), x[J3 + 3:], x[J3:J3 + 3]) - target
         by_pose, by_betas = pull_back(model, force, x[:J3].reshape(-1, 3), x[J3 + 3:])
-        return np.concatenate([by_pose, force.sum(axis=0), by_betas])
+        return 0.5 * float((force**2).sum()), np.concatenate([by_pose, force.sum(axis=0), by_betas])
 
-    return evaluate, slope
+    def settled(intermediate_result: OptimizeResult) -> None:
+        before, lowest[0] = lowest[0], intermediate_result.fun
+        if before - lowest[0] <= config.tolerance * lowest[0]:
+            raise StopIteration
+
+    start = np.linalg.inv(matrix + 1e-6 * np.diag(np.diag(matrix)))
+    end = minimize(energy, x, jac=True, method="BFGS", callback=settled,
+                   options={"hess_inv0": 0.5 * (start + start.T), "maxiter": config.polish, "gtol": 0.0})
+    return end.x, end.nit < config.polish, end.nit
 
 
 def _distances(fitted: np.ndarray, vertices: np.ndarray) -> tuple[float, float]:

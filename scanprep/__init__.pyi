@@ -41,8 +41,8 @@ from .geometry.landmarks import (
     write_landmarks as write_landmarks,
 )
 from .geometry.mesh import Mesh as Mesh
-from .registration.nonrigid import RegistrationConfig as RegistrationConfig
 from .registration.nonrigid import register as register
+from .registration.schedule import RegistrationConfig as RegistrationConfig
 from .repair.hole_filling import fill_holes as fill_holes
 from .skeleton.edit import (
     apply_edits as apply_edits,

@@ -66,18 +66,6 @@ def read_poses(folder: Path, template: Path | None, subject: str | None, unit: U
     return body, found.vertices
 
 
-def landmarks_beside(template: Path) -> Path:
-    """The landmark file of a template: that of its name, or `landmarks.json`, beside it."""
-    stem = template.name.split(".")[0]
-    for ending in (".landmarks.json", ".json", ".pp", "_picked_points.pp", ".mrk.json"):
-        if (template.parent / (stem + ending)).is_file():
-            return template.parent / (stem + ending)
-    if (template.parent / "landmarks.json").is_file():
-        return template.parent / "landmarks.json"
-    raise ValueError(f"{template}: expected its landmarks in {stem}.landmarks.json beside it; "
-                     "name the file with --template-landmarks")
-
-
 def about_mesh(mesh: Mesh) -> list[Metric]:
     """The rows of the closing table that describe a mesh."""
     from .geometry.mesh import template_problem

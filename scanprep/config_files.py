@@ -124,14 +124,7 @@ def _inline(item: Any) -> str:
 
 
 def read(path: Path, settings: Mapping[str, Settings]) -> dict[str, Settings]:
-    """Settings with what a file changes in them.
-
-    Raises
-    ------
-    ValueError
-        No TOML, an unknown name, a wrong type, a value out of its range: file, line, what was expected, and the
-        nearest name.
-    """
+    """Settings with what a file changes in them; ValueError names file, line, what was expected, the nearest name."""
     import tomlkit
     from tomlkit.exceptions import ParseError
 

@@ -168,13 +168,7 @@ def plain(value: Any) -> Any:
 
 def write_report(outcome: Outcome, command: str, seconds: float, written: Mapping[str, str] | None = None
                  ) -> Path | None:
-    """Write `report.json` beside the output: command, settings, versions and the numbers of the closing table.
-
-    Parameters
-    ----------
-    written : file -> digest, optional
-        All that the command wrote, from the report's folder on.
-    """
+    """Write `report.json` beside the output: command, settings, versions, figures, digests of all files written."""
     from .batch.ownership import report_path
     from .geometry import storage
 
@@ -369,13 +363,10 @@ def _told(error: Exception) -> str:
 
 
 def dispatch(commands: Mapping[str, tuple[str, str]], prog: str, argv: list[str], lead: str) -> int:
-    """Hand the arguments on to the command named first.
+    """Hand the arguments on to the command named first; `commands` is name -> (one line of help, "module:function").
 
-    Parameters
-    ----------
-    commands : name -> (one line of help, "module:function")
-        The module is imported when its command is called, so that help answers at once. A function that
-        takes `argv` alone is a group of commands of its own.
+    A module is imported when its command is called, so that help answers at once. A function called `group` has
+    commands of its own.
     """
     if not argv or argv[0] in ("-h", "--help"):
         width = max(map(len, commands))

@@ -21,16 +21,9 @@ def extent(points: np.ndarray) -> float:
 
 
 def unit_problem(found: float, expected: float, what: str, least: float = SMALL) -> str | None:
-    """What an extent says about the unit: None where it may be right.
+    """What the extents of data and body (metres) say about the unit: None where it may be right.
 
-    Parameters
-    ----------
-    found, expected : float, metres
-        Extents of the data and of the body.
-    what : str
-        The data, as they stand in the sentence.
-    least : float
-        Data of a part of a body may be so small.
+    `what` is the data as they stand in the sentence; `least` is how small data of a part of a body may be.
     """
     if not np.isfinite(found) or least <= found / expected <= LARGE:
         return None

@@ -74,15 +74,8 @@ class Settings:
 def read(function: Callable[..., Result], parse: Callable[[Callable[..., Any]], Any]) -> Callable[[], Result]:
     """The call that a command line stands for, with every number in its range and nothing done yet.
 
-    Parameters
-    ----------
-    parse : function -> what it returns
-        Calls the function that it gets, which has the signature of `function`, with what the user wrote.
-
-    Raises
-    ------
-    OutOfRange
-        Naming the option.
+    `parse` calls the function that it gets, which has the signature of `function`, with what the user wrote.
+    OutOfRange names the option.
     """
     @functools.wraps(function)
     def later(*args: Any, **named: Any) -> Any:

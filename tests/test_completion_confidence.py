@@ -6,7 +6,7 @@ from completion import energy
 from completion.bodies import FixedBody, ShapedBody
 from completion.partial.confidence import distance_to_seen, expected_error, posterior_error, probability_within
 from completion.priors import gaussian_prior
-from completion.solve import normal_equations
+from scanprep.geometry.least_squares import normal_equations
 
 MODEL = worm_with_prior()
 PRIOR = gaussian_prior(MODEL.pose_mean, MODEL.pose_covariance)
@@ -18,7 +18,7 @@ def precision(body, x, ids):
     targets = body.vertices(x)[ids]
     terms = [energy.point_to_point(follow(x[None]), targets, weights), energy.pose_prior(x[None], PRIOR),
              energy.shape_prior(x[None], body.n_angles + 3)]
-    return normal_equations(terms)[2][0]
+    return normal_equations(terms).hessian[0]
 
 
 @pytest.mark.parametrize("body", [FixedBody(MODEL.subject(None)), ShapedBody(MODEL)], ids=["known", "unknown"])

@@ -9,7 +9,6 @@ from completion.mocap.files.markers import MarkerSequence
 from completion.mocap.marker_sets.layout import MarkerLayout
 from completion.mocap.pose.follow import AnimateConfig, animate
 from completion.mocap.subject.marker_shape import MarkerShapeConfig, spread_frames, subject_from_markers
-from completion.mocap.subject.shared import minimise_shared
 from scanprep.synthetic.people import BodyShape, Person, walk
 
 BETAS = np.array([1.2, -0.8, 0.6, -0.5])
@@ -130,24 +129,6 @@ def test_frames_are_spread_over_what_happens():
     assert (frames < 155).sum() == 1 and len(frames) == 5 and not ((frames >= 180) & (frames < 185)).any()
     assert frames.max() >= 197 and np.diff(np.clip(frames, 150, None)).min() >= 5
     assert len(spread_frames(np.broadcast_to(positions[:1], (30, 4, 3)), 5)) == 1
-
-
-def test_rows_that_share_unknowns_are_solved_as_one_system():
-    rng = np.random.default_rng(0)
-    A, b = rng.normal(size=(3, 8, 5)), rng.normal(size=(3, 8))       # 3 own and 2 shared unknowns in 3 rows
-
-    def equations(x):
-        r = np.einsum("bmp,bp->bm", A, x) - b
-        return (r**2).sum(axis=1), np.einsum("bmp,bm->bp", A, r), np.swapaxes(A, 1, 2) @ A
-
-    x, settled, _ = minimise_shared(equations, np.zeros((3, 5)), 2, 40)
-    whole = np.zeros((24, 11))
-    for i in range(3):
-        whole[8 * i:8 * i + 8, 3 * i:3 * i + 3], whole[8 * i:8 * i + 8, 9:] = A[i, :, :3], A[i, :, 3:]
-    best = np.linalg.lstsq(whole, b.ravel(), rcond=None)[0]
-    assert settled
-    np.testing.assert_allclose(x[:, :3].ravel(), best[:9], atol=1e-4)
-    np.testing.assert_allclose(x[:, 3:], np.tile(best[9:], (3, 1)), atol=1e-4)
 
 
 def test_what_cannot_be_done_is_said(model, layout):

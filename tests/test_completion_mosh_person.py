@@ -13,7 +13,6 @@ from completion.mocap.pose.mosh_poses import animate_config, follow_poses
 from completion.mocap.settings import FollowConfig
 from completion.mocap.subject.attachment import latent_markers
 from completion.mocap.subject.person import choose_frames, common_markers
-from completion.mocap.subject.shared import minimise_arrow
 from scanprep.geometry import rotations
 from scanprep.geometry.surface import Surface
 
@@ -222,27 +221,3 @@ def test_labels_that_were_exchanged_do_not_spoil_the_person():
     assert {swap.first, swap.second} == {LABELS[0], LABELS[7]} and (swap.begin, swap.end) == (some[0], some[-1])
     np.testing.assert_array_equal(found.betas, beside().betas)
     assert np.nanmean(found.motions[0].residuals) < 5e-3
-
-
-def test_frames_that_share_unknowns_are_solved_as_one_system():
-    """The arrow's step against the dense normal equations of a linear problem, which one step solves."""
-    rng = np.random.default_rng(0)
-    B, n, S = 3, 4, 5
-    A, b, C, d = (rng.normal(size=s) for s in ((B, 9, n + S), (B, 9), (6, S), (6,)))
-
-    def frames(x, z):
-        r = np.einsum("bmp,bp->bm", A, np.concatenate([x, np.tile(z, (B, 1))], axis=1)) - b
-        At = np.swapaxes(A, 1, 2)
-        return (r**2).sum(axis=1), (At @ r[..., None])[..., 0], At @ A
-
-    def common(z):
-        r = C @ z - d
-        return (r**2).sum(), C.T @ r, C.T @ C
-
-    end = minimise_arrow(frames, common, np.zeros((B, n)), np.zeros(S), 30, 1e-14)
-    dense = np.zeros((B * 9 + 6, B * n + S))
-    for i in range(B):
-        dense[9 * i:9 * i + 9, n * i:n * i + n], dense[9 * i:9 * i + 9, B * n:] = A[i, :, :n], A[i, :, n:]
-    dense[B * 9:, B * n:] = C
-    exact = np.linalg.lstsq(dense, np.concatenate([b.ravel(), d]), rcond=None)[0]
-    np.testing.assert_allclose(np.concatenate([end.x.ravel(), end.z]), exact, atol=1e-6)

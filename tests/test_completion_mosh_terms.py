@@ -12,6 +12,7 @@ from completion.mocap.subject.attachment import above_triangles, latent_markers,
 from completion.mocap.subject.terms import LatentPoints
 from completion.priors import gaussian_prior
 from scanprep.geometry import rotations
+from scanprep.geometry.least_squares import Residual
 from scanprep.geometry.mesh import Mesh
 
 MODEL = worm_with_prior()
@@ -71,7 +72,7 @@ def of_frames(kind):
         found, frame = simulated(kind, moving, x[15 + K:].reshape(-1, 3))
         J = np.concatenate([found.jacobian, terms.each_own(frame)], axis=-1)
         residual = terms.data(MovingPoints(found.positions, J), targets, np.arange(1.0, L + 1))
-        return energy.Residual(residual.values[0], residual.jacobian[0])
+        return Residual(residual.values[0], residual.jacobian[0])
 
     return term, x
 

@@ -5,7 +5,6 @@ import pytest
 from completion_bodies import MEAN, worm_with_prior
 
 from completion import energy
-from completion.mocap.artefacts.robust import LabelWatch, marker_weights
 from completion.mocap.files.markers import MarkerSequence
 from completion.mocap.marker_sets.layout import MarkerLayout
 from completion.mocap.pose.fast_rotations import compose, exp
@@ -15,6 +14,7 @@ from completion.mocap.pose.lowpass import low_pass
 from completion.mocap.pose.marked_body import MarkedBody, supports
 from completion.mocap.pose.marker_points import PartShapes
 from completion.mocap.pose.prediction import KalmanPrediction, inertia
+from completion.mocap.pose.robust import LabelWatch, marker_weights
 from completion.mocap.pose.stream import MarkerStream
 from completion.motion import Motion
 from model.features import linear_features
@@ -237,7 +237,7 @@ def test_a_low_pass_keeps_slow_turns_and_takes_fast_ones():
 
 @pytest.fixture(scope="module")
 def walker():
-    """An embedded person whose parts are rigid."""
+    """A synthetic person whose parts are rigid."""
     person = Person()
     skeleton, J = person.skeleton, len(person.parents)
     features = linear_features(skeleton, tuple(np.zeros((3, 0)) for _ in range(J)))

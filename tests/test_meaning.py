@@ -17,7 +17,7 @@ from completion.__main__ import main
 from completion.mocap.animate import report
 from completion.mocap.animate.work import Work as Follow
 from completion.mocap.animate.work import animate_file
-from completion.mocap.artefacts.robust import motion_problem
+from completion.mocap.pose.robust import motion_problem
 from completion.mocap.pose.settings import AnimateConfig
 from completion.mocap.subject.marker_shape import MarkerShapeConfig
 from completion.motion import Motion
@@ -107,7 +107,7 @@ def test_a_scan_of_something_else_is_a_failure_of_a_set(place, capsys):
     Path("scans").mkdir()
     for name in ("ten", "good"):
         Path(f"{name}.ply").rename(f"scans/{name}.ply")
-    assert main("prep run scans --template template.ply -o set --guide pose --workers 1".split()) == 1
+    assert main("prep run scans --template template.ply -o set --init pose --workers 1".split()) == 1
     assert "ten.ply: the template is not on it" in capsys.readouterr().err
     assert "ten" not in Path("set/registration.csv").read_text()
     assert "nan" not in Path("set/registration.csv").read_text() and "none" in Path("set/registration.csv").read_text()

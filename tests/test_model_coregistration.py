@@ -14,7 +14,7 @@ import numpy as np
 import pytest
 from coregistered import QUICK
 from coregistered import run as run_coregistration
-from matching_bodies import bent, crab
+from jointed_bodies import bent, crab
 from model_bodies import random_poses, worm_model
 
 import model.coregistration.first as first_module
@@ -23,7 +23,8 @@ from model import ModelRegistration, coregister, learn_scape, load_model, regist
 from model.coregistration.attraction import apart, attraction, towards
 from model.coregistration.first import FirstConfig, explained_share, learn_from_scans
 from model.coregistration.modelfit import ModelFit
-from model.coregistration.posed import posed_points, typical_poses, whitening
+from model.coregistration.posed import posed_points
+from model.priors import typical_poses, whitening
 from scanprep import RegisteredSet, write_mesh
 from scanprep.batch.digests import Digests
 from scanprep.batch.opening import workspace
@@ -31,7 +32,7 @@ from scanprep.batch.workspace import HOME
 from scanprep.geometry.landmarks import write_landmarks
 from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.surface import Surface
-from scanprep.registration.matches import target_of
+from scanprep.geometry.target import target_of
 from scanprep.registration.nonrigid import register
 from scanprep.registration.schedule import GraphStage
 from scanprep.skeleton.tree import Skeleton

@@ -4,7 +4,7 @@ import pytest
 from model_bodies import random_poses, worm, worm_model, worm_skeleton
 
 from model.export.correctives import motion_correctives, rest_corrections
-from model.export.rig import Rig, joint_places, make_rig, skin_weights, strongest, turn_up, typical_poses
+from model.export.rig import Rig, joint_places, make_rig, skin_weights, strongest, turn_up
 from model.features import linear_features
 from model.skinning import SkinningModel
 from scanprep.geometry import rotations
@@ -177,15 +177,3 @@ def test_correctives_lead_to_the_exact_motion(model, rig):
     assert error[0] > 0.01 > 2e-3 > error[3] and error == sorted(error, reverse=True)
     few = motion_correctives(rig, subject, poses, 3, frames=3)
     assert few.weights.shape == (6, 3), "every frame has weights for shapes found in some of them"
-
-
-def test_typical_poses_have_the_moments_of_the_prior(model):
-    rng = np.random.default_rng(5)
-    root = rng.normal(0, 0.2, (12, 12))
-    root[:3] = 0
-    object.__setattr__(other := worm_model(), "pose_covariance", root @ root.T)
-    object.__setattr__(other, "pose_mean", rng.normal(size=(4, 3)))
-    drawn = typical_poses(other, 20000)
-    assert np.abs(drawn.mean(axis=0) - other.pose_mean).max() < 0.03
-    assert np.abs(np.cov(drawn.reshape(len(drawn), -1).T) - other.pose_covariance).max() < 0.03
-    assert np.array_equal(drawn[:5], typical_poses(other, 20000)[:5])

@@ -5,9 +5,9 @@ import pytest
 from model_bodies import random_poses, worm, worm_model, worm_skeleton
 from posing_bodies import skinned, symmetric_worm
 
-from model.posing.angles import pose_from_angles, sample_poses, turn
-from model.posing.joint_limits import JointLimits
+from model.posing.angles import pose_from_angles, rotate_joint
 from model.posing.mirroring import find_mirror, mirror_pose
+from model.priors import JointLimits, sample_poses
 from scanprep.geometry import rotations
 from scanprep.skeleton.tree import Skeleton
 
@@ -100,10 +100,10 @@ def test_turns_about_the_axes_of_each_frame():
     expected = {"world": more @ R[:, 4], "own": R[:, 4] @ more,
                 "parent": above @ more @ np.swapaxes(above, -1, -2) @ R[:, 4]}
     for frame, wanted in expected.items():
-        turned = turn(skeleton, poses, "right end", w, frame)
+        turned = rotate_joint(skeleton, poses, "right end", w, frame)
         np.testing.assert_allclose(skeleton.part_rotations(turned)[:, 4], wanted, atol=1e-12)
         np.testing.assert_array_equal(np.delete(turned, 4, axis=-2), np.delete(poses, 4, axis=-2))
-    root = turn(skeleton, poses, 0, ("z", 30), "world")
+    root = rotate_joint(skeleton, poses, 0, ("z", 30), "world")
     np.testing.assert_allclose(skeleton.part_rotations(root), rotations.exp([0, 0, np.pi / 6]) @ R, atol=1e-12)
 
 
@@ -111,24 +111,23 @@ def test_turned_there_and_back():
     skeleton = symmetric_worm()[1]
     pose = np.random.default_rng(0).normal(0, 0.8, (5, 3))
     for frame in ("parent", "world", "own"):
-        there = turn(skeleton, pose, 3, ("y", 40), frame)
-        np.testing.assert_allclose(turn(skeleton, there, 3, ("y", -40), frame), pose, atol=1e-12)
+        there = rotate_joint(skeleton, pose, 3, ("y", 40), frame)
+        np.testing.assert_allclose(rotate_joint(skeleton, there, 3, ("y", -40), frame), pose, atol=1e-12)
     with pytest.raises(ValueError, match="frame"):
-        turn(skeleton, pose, 3, ("y", 40), "sideways")
+        rotate_joint(skeleton, pose, 3, ("y", 40), "sideways")
     with pytest.raises(ValueError, match="pose"):
-        turn(skeleton, pose[:3], 3, ("y", 40))
+        rotate_joint(skeleton, pose[:3], 3, ("y", 40))
 
 
 @pytest.fixture(scope="module")
 def limits():
     """A hinge about (1, 1, 0), a ball joint around a bent position, and two that hardly move."""
-    skeleton = symmetric_worm()[1]
     rng = np.random.default_rng(3)
     poses = rng.normal(0, 0.01, (300, 5, 3))
     poses[:, 0] = rng.normal(0, 2, (300, 3))
     poses[:, 1] += rng.uniform(0, 2, (300, 1)) * np.array([1, 1, 0]) / np.sqrt(2)
     poses[:, 2] = rotations.log(rotations.exp([3.0, 0, 0]) @ rotations.exp(rng.uniform(-0.5, 0.5, (300, 3))))
-    return JointLimits.from_poses(skeleton, poses, coverage=1.0, slack=0.05), poses
+    return JointLimits.from_poses(poses, coverage=1.0, slack=0.05), poses
 
 
 def test_limits_hold_what_they_were_made_of(limits):
@@ -181,13 +180,16 @@ def test_the_residual_is_the_excess_and_its_slope_a_difference(limits):
         step = 1e-6 * np.eye(15).reshape(15, 5, 3)
         slope = np.stack([bounds.residual(pose + s)[0] - bounds.residual(pose - s)[0] for s in step], axis=1) / 2e-6
         np.testing.assert_allclose(dr, slope, atol=1e-7)
+    poses = np.random.default_rng(1).normal(0, 0.9, (5, 5, 3))
+    each = [bounds.residual(pose) for pose in poses]
+    np.testing.assert_allclose(bounds.residual(poses)[0], [r for r, _ in each], atol=1e-12)
+    np.testing.assert_allclose(bounds.residual(poses)[1], [dr for _, dr in each], atol=1e-12)
 
 
 def test_coverage_leaves_out_what_is_rare():
-    skeleton = symmetric_worm()[1]
     poses = np.random.default_rng(0).normal(0, 0.2, (400, 5, 3))
     poses[0, 1] = [2.5, 0, 0]
-    every, most = (JointLimits.from_poses(skeleton, poses, coverage, 0.0) for coverage in (1.0, 0.95))
+    every, most = (JointLimits.from_poses(poses, coverage, 0.0) for coverage in (1.0, 0.95))
     assert every.high[1].max() > 2 or every.low[1].min() < -2
     assert (most.high - most.low)[1:].max() < 0.9
     inside = (most.excess(poses)[:, 1:] == 0).mean(axis=0)
@@ -195,13 +197,12 @@ def test_coverage_leaves_out_what_is_rare():
 
 
 def test_limits_refuse_too_little():
-    skeleton = symmetric_worm()[1]
-    with pytest.raises(ValueError, match="at least 5 poses"):
-        JointLimits.from_poses(skeleton, np.zeros((4, 5, 3)))
+    with pytest.raises(ValueError, match="at least 5 finite poses"):
+        JointLimits.from_poses(np.zeros((4, 5, 3)))
     with pytest.raises(ValueError, match="coverage"):
-        JointLimits.from_poses(skeleton, np.zeros((9, 5, 3)), coverage=0)
+        JointLimits.from_poses(np.zeros((9, 5, 3)), coverage=0)
     with pytest.raises(ValueError, match="finite"):
-        JointLimits.from_poses(skeleton, np.full((9, 5, 3), np.nan))
+        JointLimits.from_poses(np.full((9, 5, 3), np.nan))
 
 
 def test_sampled_poses_follow_the_prior_and_the_limits():
@@ -216,6 +217,6 @@ def test_sampled_poses_follow_the_prior_and_the_limits():
     np.testing.assert_allclose(np.cov(flat.T), A @ A.T, atol=0.01)
     assert not poses[:, 0].any()
     np.testing.assert_array_equal(poses, sample_poses(model, 20000, np.random.default_rng(1)))
-    limits = JointLimits.from_poses(model.skeleton, random_poses(model, 50, rng, 0.1))
+    limits = JointLimits.from_poses(random_poses(model, 50, rng, 0.1))
     within = sample_poses(model, 200, np.random.default_rng(1), limits)
     assert limits.excess(poses[:200]).max() > 0.1 and limits.excess(within).max() < 1e-9

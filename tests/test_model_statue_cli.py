@@ -7,8 +7,8 @@ from PIL import Image
 
 from completion.__main__ import main
 from model import load_model
+from model.statue.control.model import HOLE, MEASURED
 from model.statue.files import load_statue
-from model.statue.statue import HOLE, MEASURED
 from model.statue.work import Inputs, read_scan
 from scanprep import Mesh, read_mesh, write_mesh
 from scanprep.synthetic.people import LANDMARKS, BodyShape, Person, walk

@@ -9,10 +9,9 @@ from scipy.optimize import brentq
 from scipy.spatial.transform import Rotation
 
 from model.statue.control.chart import make_chart
-from model.statue.control.model import ControlModel
-from model.statue.detail.colors import bake_texture, scan_look
+from model.statue.control.model import FOLDED, HOLE, MEASURED, OUTSIDE, ControlModel, DisplacementMap
 from model.statue.detail.displacement import DisplacementConfig, bake, coverage_shares, unfold_control
-from model.statue.detail.images import read_map, write_map
+from model.statue.detail.maps import read_map, write_map
 from model.statue.detail.normal_volume import from_normal_volume, interpolate, solve_triangles, to_normal_volume
 from model.statue.detail.reconstruction import (
     Reconstruction,
@@ -26,7 +25,7 @@ from model.statue.detail.reconstruction import (
 )
 from model.statue.detail.subdivision import subdivide, subdivide_adaptive
 from model.statue.detail.texels import continue_chart, find_texels
-from model.statue.statue import FOLDED, HOLE, MEASURED, OUTSIDE, DisplacementMap
+from model.statue.detail.textures import bake_texture, scan_look
 from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.storage import StorageError
 from scanprep.geometry.surface import Surface

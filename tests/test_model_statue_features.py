@@ -5,8 +5,8 @@ import pytest
 from model.statue.control.humanoid import humanoid
 from model.statue.registration.articulated import Articulated, Points
 from model.statue.registration.automatic import find_features, likely_unit
+from model.statue.registration.clicks import MedialAxis
 from model.statue.registration.features import FeatureConfig, fit_features, head_share, misfit, warp
-from model.statue.registration.medial import MedialAxis
 from scanprep.geometry import rotations
 from scanprep.geometry.mesh import Mesh
 from scanprep.synthetic.people import BodyShape, Person, compose

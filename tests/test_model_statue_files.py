@@ -11,11 +11,10 @@ from PIL import Image
 from model.export.rig import turn_up
 from model.statue.control.chart import Chart
 from model.statue.control.humanoid import humanoid
-from model.statue.detail.normal_image import chart_tangents, normal_image, vertex_of_row
 from model.statue.detail.subdivision import subdivide
+from model.statue.detail.textures import chart_tangents, normal_image, vertex_of_row
 from model.statue.motion.motions import people_motion
-from model.statue.statue_glb import write_statue_glb
-from model.statue.x3d import write_x3d
+from model.statue.skins import write_statue_glb, write_x3d
 from scanprep.geometry import rotations
 from scanprep.geometry.mesh import Mesh
 from scanprep.synthetic.people import walk

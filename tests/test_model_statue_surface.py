@@ -7,14 +7,12 @@ from scipy.special import logsumexp
 
 from model.statue.registration.local_shape import local_shape
 from model.statue.registration.soft_assignment import ScanPoints, assign
-from model.statue.registration.surface_data import distortion
-from model.statue.registration.surface_fit import SurfaceFitConfig, fit_surface
+from model.statue.registration.surface_fit import SurfaceFitConfig, distortion, fit_surface
 from scanprep.alignment.icp import align_landmarks, apply
 from scanprep.geometry import rotations
 from scanprep.geometry.mesh import Mesh
-from scanprep.geometry.sparse import Factored
+from scanprep.geometry.sparse import Factored, conjugate_gradients
 from scanprep.geometry.surface import Surface
-from scanprep.registration.shell import conjugate_gradients
 
 
 def ball(count: int, seed: int) -> Mesh:

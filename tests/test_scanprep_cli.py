@@ -1,27 +1,29 @@
 """The commands of `scape prep`: each explains itself, and hands files from one to the next."""
 import json
 import re
+import shutil
 import subprocess
 import sys
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
+from config_files import config_file
 from scan_folders import MARKS, QUICK, ball, write_scans
 from scipy.spatial.transform import Rotation
 
 from completion.__main__ import main
-from scanprep import Mesh, RegisteredSet, Skeleton, read_mesh, read_points, write_landmarks, write_mesh
+from scanprep import Mesh, RegisteredSet, Skeleton, config_files, read_mesh, read_points, write_landmarks, write_mesh
 from scanprep.cli import COMMANDS
 from scanprep.correspondence.correspondences import Correspondences
 from scanprep.correspondence.files import read_correspondences, write_correspondences
 from scanprep.geometry.files import PointCloud, write_points
+from scanprep.geometry.landmarks import LANDMARK_ENDINGS, read_landmarks
 from scanprep.geometry.storage import StorageError
-from scanprep.pipeline import cli as pipeline_cli
 from scanprep.pipeline.prepare import prepare
-from scanprep.pipeline.scan import ScanSettings
 from scanprep.pipeline.scans import find_scans
-from scanprep.registration import cli as matching_cli
+from scanprep.registration import cli as registration_cli
 from scanprep.registration.nonrigid import register
 
 ROOT = Path(__file__).parents[1]
@@ -48,12 +50,14 @@ def place(tmp_path_factory, template):
 
 
 @pytest.fixture
-def quick(monkeypatch):
-    """Registration with few steps, which the command line has no options for."""
-    from functools import partial
-
-    monkeypatch.setattr(pipeline_cli, "ScanSettings", partial(ScanSettings, registration=QUICK.scan.registration))
-    monkeypatch.setattr(matching_cli, "register", partial(register, config=QUICK.scan.registration))
+def quick(tmp_path, monkeypatch):
+    """A file of settings for a registration with few steps."""
+    monkeypatch.setattr(registration_cli, "register", lambda *given, **named: register(
+        *given, **named | {"config": QUICK.scan.registration}))
+    path = tmp_path / "quick.toml"
+    config = replace(QUICK, min_poses=5, scan=replace(QUICK.scan, pictures=True))
+    path.write_text(config_files.write({"config": config}))
+    return path
 
 
 def run(*words):
@@ -92,7 +96,7 @@ def test_dask_is_loaded_for_a_scheduler_alone(place):
 
 def test_run(place, tmp_path, capsys, quick):
     (place / "scans" / "broken.ply").write_text("nothing")
-    code = run("run", place / "scans", "--template", place / "template.ply", "-o", tmp_path / "set", "--workers", 1)
+    code = run("run", place / "scans", "--template", place / "template.ply", "-o", tmp_path / "set", "--config", quick)
     (place / "scans" / "broken.ply").unlink()
     shown = capsys.readouterr()
     assert code == 1 and "broken.ply" in shown.err and "needs a look" not in shown.err
@@ -106,10 +110,10 @@ def test_run(place, tmp_path, capsys, quick):
 
 def test_page_with_other_limits(place, capsys):
     page = place / "set" / "report.html"
-    assert run("page", place / "set", "--unseen", 0.5) == 0
+    assert run("page", place / "set", "--config", config_file(place, unseen=0.5)) == 0
     assert re.search(r"scans that need a look\W+0\b", capsys.readouterr().out)
     assert page.read_text().count('class="scan fine"') == 3
-    assert run("page", place / "set", "--distance", 1e-9) == 0
+    assert run("page", place / "set", "--config", config_file(place, distance=1e-9)) == 0
     shown = capsys.readouterr()
     assert re.search(r"scans that need a look\W+3\b", shown.out) and str(page) in shown.err
     assert page.read_text().count('class="scan look"') == 3
@@ -118,10 +122,10 @@ def test_page_with_other_limits(place, capsys):
 def test_no_landmarks_wanted(place, tmp_path, capsys, quick):
     scans = write_scans(tmp_path / "scans", ball(), 1)
     (tmp_path / "bare.ply").write_bytes((place / "template.ply").read_bytes())
-    words = ["run", scans, "--template", tmp_path / "bare.ply", "-o", tmp_path / "set", "--workers", 1]
+    words = ["run", scans, "--template", tmp_path / "bare.ply", "-o", tmp_path / "set", "--config", quick]
     assert run(*words) == 1
     assert "expected its landmarks in bare.landmarks.json" in capsys.readouterr().err
-    assert run(*words, "--guide", "pose") == 0
+    assert run(*words, "--init", "pose") == 0
     assert report(tmp_path / "set" / "report.json")["led by pose"] == 1
 
 
@@ -227,10 +231,11 @@ def test_correspondences_in_a_file(place, tmp_path, capsys, quick):
     assert len(found) == report(tmp_path / "pairs.report.json")["correspondences"] > 5
     assert 0 <= found.template_vertices.min() and found.template_vertices.max() < 642
     assert ((found.confidence >= 0) & (found.confidence <= 1)).all()
-    assert run(*words, "--functional", "-o", tmp_path / "map.json") == 0
-    by_map = read_correspondences(tmp_path / "map.json")
-    assert by_map.method != found.method and len(by_map) > 5
-    assert run("correspond", scan, "--template", place / "template.ply", "-o", tmp_path / "none.json") == 1
+    beside = [*words[:4], "--points", 40]                    # the file of its name beside the scan
+    assert run(*beside, "-o", tmp_path / "beside.json") == 1
+    assert (tmp_path / "beside.json").read_bytes() == (tmp_path / "pairs.json").read_bytes()
+    capsys.readouterr()
+    assert run(*beside, "--ignore-landmarks", "-o", tmp_path / "none.json") == 1
     assert "at least three limbs" in capsys.readouterr().err
     few = read_mesh(scan).vertices[::90]
     write_correspondences(tmp_path / "few.json", Correspondences(np.arange(642)[::90], few, np.ones(len(few))))
@@ -256,3 +261,30 @@ def test_files_of_correspondences(tmp_path):
             read_correspondences(tmp_path / "c.json")
     with pytest.raises(StorageError, match="no such file"):
         read_correspondences(tmp_path / "none.json")
+
+
+@pytest.mark.parametrize("ending", LANDMARK_ENDINGS)
+def test_register_finds_the_landmarks_beside_the_scan(place, tmp_path, ending, quick):
+    scan = tmp_path / "scan.ply"
+    shutil.copy(place / "scans" / "body0.ply", scan)
+    points = read_landmarks(place / "scans" / "body0.landmarks.json")
+    (tmp_path / f"scan{ending}").write_text(landmark_file(ending, points))
+    assert run("register", scan, "--template", place / "template.ply", "-o", tmp_path / "out.ply") == 0
+    figures = report(tmp_path / "out.report.json")
+    assert figures["landmarks"] == len(MARKS) and figures["landmark file"] == f"scan{ending}"
+    assert figures["distance of landmarks, RMS"] < 30
+
+
+def landmark_file(ending, points):
+    if ending == ".mrk.json":
+        return json.dumps({"markups": [{"coordinateUnits": "m", "controlPoints": [
+            {"label": name, "position": list(p)} for name, p in points.items()]}]})
+    if ending.endswith(".json"):
+        return json.dumps({name: list(p) for name, p in points.items()})
+    if ending.endswith(".pp"):
+        rows = "".join(f'<point x="{x}" y="{y}" z="{z}" name="{name}"/>' for name, (x, y, z) in points.items())
+        return f"<PickedPoints>{rows}</PickedPoints>"
+    if ending == ".lnd":
+        return "".join(f"{i} 0 {i} 0 {1000 * x} {1000 * y} {1000 * z} {name}\n"
+                       for i, (name, (x, y, z)) in enumerate(points.items()))
+    return "".join(f"{x} {y} {z} {name}\n" for name, (x, y, z) in points.items())

@@ -1,6 +1,6 @@
 import numpy as np
 import pytest
-from matching_bodies import bent, crab
+from jointed_bodies import bent, crab
 from scanned_shapes import bumpy
 from surface_distances import surface_distance
 

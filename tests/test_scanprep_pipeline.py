@@ -95,7 +95,7 @@ def test_registers_all(scans, template, tmp_path):
     assert not done.failures and done.registered.names == ("body0", "body1", "body2") and done.fresh == 3
     assert calls[0] == (0, 3) and calls[-1] == (3, 3)
     assert all(f.distance < 0.001 and f.seen > 0.6 and f.missed < 0.01 for f in done.figures)
-    assert {f.guide for f in done.figures} == {"5 landmarks"}
+    assert {f.init for f in done.figures} == {"5 landmarks"}
     again = RegisteredSet.load(tmp_path / "set")
     assert again.subjects == ("anna", "ben") and len(again.poses()) == 2
     assert json.loads((tmp_path / "set" / "landmarks.json").read_text()) == MARKS
@@ -278,14 +278,14 @@ def test_a_scan_in_another_unit_is_refused_at_once(scans, template, tmp_path):
 
 def test_what_leads_the_template(scans, template, tmp_path):
     (scans / "body0.landmarks.json").unlink()
-    settings = {guide: dataclasses.replace(QUICK, scan=dataclasses.replace(QUICK.scan, guide=guide))
-                for guide in ("landmarks", "pose")}
+    settings = {init: dataclasses.replace(QUICK, scan=dataclasses.replace(QUICK.scan, init=init))
+                for init in ("landmarks", "pose")}
     asked = prepare(find_scans(scans), template, MARKS, tmp_path / "asked", settings["landmarks"])
     assert asked.registered.names == ("body1", "body2") and "body0" in asked.failures[0]
     best = prepare(find_scans(scans), template, MARKS, tmp_path / "best", QUICK)
-    assert best.registered.names == ("body1", "body2") and "or the guide 'pose'" in best.failures[0]  # it has no limbs
+    assert best.registered.names == ("body1", "body2") and "or --init pose" in best.failures[0]  # it has no limbs
     near = prepare(find_scans(scans)[:2], template, {}, tmp_path / "near", settings["pose"])
-    assert [f.guide for f in near.figures] == ["pose", "pose"] and np.isnan(near.figures[0].landmarks)
+    assert [f.init for f in near.figures] == ["pose", "pose"] and np.isnan(near.figures[0].landmarks)
 
 
 def test_correspondences_lead_where_there_are_no_landmarks(scans, template, tmp_path, monkeypatch):
@@ -297,7 +297,7 @@ def test_correspondences_lead_where_there_are_no_landmarks(scans, template, tmp_
     pairs = Correspondences(some, turned.vertices[some], np.ones(len(some)))
     monkeypatch.setattr(scan_module, "find_correspondences", lambda *args, **named: pairs)
     done = prepare(find_scans(scans), template, MARKS, tmp_path / "set", QUICK)
-    assert [f.guide for f in done.figures] == ["22 correspondences", "5 landmarks", "5 landmarks"]
+    assert [f.init for f in done.figures] == ["22 correspondences", "5 landmarks", "5 landmarks"]
     found = done.registered.vertices(["body0"])[0]
     assert np.linalg.norm(found - turned.vertices, axis=1).max() < 0.05
 

@@ -31,14 +31,7 @@ MORE = 3                             # times as many rounds as the joint method:
 
 
 def model_for_turns(body: BodyModel | Subject, config: CompletionConfig) -> ScapeModel | None:
-    """The model that the alternation works on; None when the settings ask for the joint method.
-
-    Raises
-    ------
-    ValueError
-        Another method than these; for the alternation a body that is not made of R, S and Q triangle by triangle, or
-        a scan of unknown scale.
-    """
+    """The model that the alternation works on; None when the settings ask for the joint method."""
     if config.method == "joint":
         return None
     if config.method != "alternation":
@@ -54,47 +47,24 @@ def model_for_turns(body: BodyModel | Subject, config: CompletionConfig) -> Scap
 
 @dataclass(frozen=True, eq=False)
 class Markers:
-    """The measured points of Eq. 10.
+    """The measured points of Eq. 10."""
 
-    Parameters
-    ----------
-    vertices : (L,) int
-        y_l is one of the vertices.
-    points : (L, 3) float, metres
-        z_l.
-    weights : (L,) float
-        w_Z of each.
-    """
-
-    vertices: np.ndarray
-    points: np.ndarray
-    weights: np.ndarray
+    vertices: np.ndarray    # (L,) int, y_l is one of the vertices
+    points: np.ndarray      # (L, 3), metres, z_l
+    weights: np.ndarray     # (L,), w_Z of each
 
 
 @dataclass(frozen=True, eq=False)
 class Blocks:
-    """The variables of Eq. 10.
+    """The variables of Eq. 10."""
 
-    Attributes
-    ----------
-    R : (J, 3, 3) float
-        Rotations of the parts.
-    Y : (N, 3) float, metres
-    betas : (K,) float
-    """
-
-    R: np.ndarray
-    Y: np.ndarray
-    betas: np.ndarray
+    R: np.ndarray           # (J, 3, 3), rotations of the parts
+    Y: np.ndarray           # (N, 3), metres
+    betas: np.ndarray       # (K,)
 
 
 class Alternation:
-    """The three steps for one model.
-
-    Parameters
-    ----------
-    model : ScapeModel
-    """
+    """The three steps for one model."""
 
     def __init__(self, model: ScapeModel) -> None:
         self.model, self.skeleton = model, model.skeleton
@@ -170,11 +140,7 @@ def damped_twists(skeleton: Skeleton, part: np.ndarray, e: np.ndarray, v: np.nda
 
     Minimises Σ |(I + t̂) e - v|² + w_T Σ_adj |t_a - t_b|².
 
-    Parameters
-    ----------
-    part : (F,) int
-    e, v : (F, 2, 3) float, metres
-    w_T : float, square metres
+    `part` (F,) int; `e, v` (F, 2, 3), metres; `w_T` square metres.
 
     [SCAPE] Eq. 11
     """

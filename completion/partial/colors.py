@@ -46,13 +46,7 @@ class ColorConfig(Settings):
 class ColoredView:
     """What one view says of the colours of places near it.
 
-    Parameters
-    ----------
-    view : Mesh or PointCloud with colours, metres
-    camera : (3,) float, metres, optional
-        Where it was seen from.
-    texture : Texture, optional
-        Instead of the colours.
+    `view` Mesh or PointCloud with colours, metres; `camera` (3,), metres, where it was seen from.
     """
 
     def __init__(self, view: Mesh | PointCloud, camera: np.ndarray | None = None, texture: Texture | None = None
@@ -136,13 +130,7 @@ def carry_colors(body: Mesh, seen: np.ndarray, scan: View | Sequence[View], conf
 
 def colored_views(scan: View | Sequence[View], viewpoint: object = None, metres: float = 1.0,
                   textures: Sequence[Texture | None] = ()) -> list[ColoredView]:
-    """The views that have colours, or a texture.
-
-    Raises
-    ------
-    ValueError
-        None has.
-    """
+    """The views that have colours, or a texture."""
     views = [in_metres(view, metres) for view in as_views(scan)]
     cameras = check_viewpoints(viewpoint, len(views), metres)
     found = []

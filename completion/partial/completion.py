@@ -145,12 +145,7 @@ def complete(body: BodyModel | Subject, scan: View | Sequence[View],
 def completion_problem(done: Completion, points: np.ndarray, free_scale: bool = False) -> str | None:
     """Why a completion means nothing, with the likely cause; None where it means something.
 
-    Parameters
-    ----------
-    points : (n, 3) float, metres
-        The scan, in whatever unit it was taken to be.
-    free_scale : bool
-        Whether its unit was sought, and so cannot be wrong.
+    `points` (n, 3), metres, the scan, in whatever unit it was taken to be.
     """
     off, most = done.landmark_rms / size(done.predicted), done.explained
     if done.seen.any() and most >= LOST and not (off > HAND or (off > ASTRAY and most < ENOUGH)):

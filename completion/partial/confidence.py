@@ -24,10 +24,7 @@ def posterior_error(body: FixedBody, x: np.ndarray, precision: np.ndarray) -> np
     approximation), is pushed through the derivatives of the vertices: what the data leave open in the pose shows in
     the hand that nobody saw.
 
-    Parameters
-    ----------
-    x : (P,) float
-    precision : (P, P) float
+    `x` (P,); `precision` (P, P).
     """
     ridge = 1e-9 * np.diag(precision).max()
     root = np.linalg.inv(np.linalg.cholesky(precision + ridge * np.eye(len(x))))      # rootᵀ root is the covariance
@@ -50,14 +47,8 @@ def expected_error(posterior: np.ndarray, away: np.ndarray, rms: float) -> np.nd
     mesh. Away from it two things add up, as squares: what pose and shape leave open, and what no pose and shape of
     the model can follow. Near the scan the free surface carries the data over, so both set in gradually.
 
-    Parameters
-    ----------
-    posterior : (N,) float, metres
-        See `posterior_error`.
-    away : (N,) float, metres
-        Distance from what was seen, along the surface.
-    rms : float, metres
-        Distance of the scan points that were used to the completed mesh.
+    `posterior` (N,), metres, see `posterior_error`; `away` (N,), metres, distance from what was seen, along the
+    surface; `rms`, metres, distance of the scan points that were used to the completed mesh.
     """
     sets_in = 1 - np.exp(-away / FADES)
     near = max(NEAREST, 0.0 if np.isnan(rms) else rms)

@@ -5,13 +5,13 @@ from typing import TYPE_CHECKING
 
 import numpy as np
 
+from scanprep.geometry.least_squares import normal_equations
 from scanprep.geometry.surface import OrientedPoints
 from scanprep.skeleton.tree import Skeleton
 
 from .. import energy
 from ..bodies import FixedBody, Follow
 from ..priors import GaussianPrior, unbranched
-from ..solve import normal_equations
 from .scan import spread
 from .self_intersection import Contact
 
@@ -31,7 +31,7 @@ def around(body: FixedBody, follow: Follow, x: np.ndarray, targets: np.ndarray, 
     weights = np.full(len(targets), sd**-2)
     terms = [energy.point_to_point(follow(x[None]), targets, weights), energy.pose_prior(x[None], prior)]
     free = body.n_angles + 3
-    precision = normal_equations(terms)[2][0, :free, :free] + 1e-6 * np.eye(free)
+    precision = normal_equations(terms).hessian[0, :free, :free] + 1e-6 * np.eye(free)
     drawn = np.repeat(x[None], count, axis=0)
     drawn[:, :free] += np.linalg.solve(np.linalg.cholesky(precision).T, rng.normal(size=(free, count))).T
     return drawn
@@ -84,13 +84,7 @@ def near_points(fit: ScanFit, x: np.ndarray, moved: np.ndarray, points: np.ndarr
 
 
 def quick_misfits(fit: ScanFit, x: np.ndarray, moved: np.ndarray | None = None, cap: float = 0.1) -> np.ndarray:
-    """How badly bodies (n, P) explain the scan, on few vertices whose normals turn with their parts.
-
-    Parameters
-    ----------
-    moved : ints, optional
-        The parts in which the bodies differ; only these are tested for passing through others.
-    """
+    """How badly bodies (n, P) explain the scan, on few vertices whose normals turn with their parts."""
     body, config = fit.body, fit.config
     ids = spread(body.template.vertices, VERTICES)
     few = slice(None, None, 3)

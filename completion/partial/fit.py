@@ -1,24 +1,25 @@
 """Pose, place and shape of a body from a scan: matches, robust weights, and a search that escapes wrong limbs."""
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from copy import copy
 
 import numpy as np
 
+from scanprep.geometry.least_squares import Residual, levenberg_marquardt, normal_equations
 from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.surface import OrientedPoints
 
 from .. import energy
 from ..bodies import FixedBody
 from ..priors import GaussianPrior, choose_prior, gaussian_prior, joint_limits
-from ..solve import Energy, MinimiseConfig, minimise, normal_equations
 from .free_space import find_sights
 from .masks import Cover, part_vertices
 from .scan import ScanPoints, spread
 from .self_intersection import Contact
 from .settings import CompletionConfig
 
+Energy = Callable[[np.ndarray], Sequence[Residual]]
 Denial = tuple[np.ndarray, np.ndarray, np.ndarray]
 
 TERMS = ("landmarks", "pose_prior", "joint_limits", "shape_prior", "scan_planes", "scan_points", "trespass")
@@ -29,14 +30,7 @@ SETTLED = 5e-4                       # metres, root mean square over the vertice
 class ScanFit:
     """One scan and one body, with what stays the same between the stages.
 
-    Parameters
-    ----------
-    body : FixedBody
-    cloud : ScanPoints
-    vertices : (L,) int
-    points : (L, 3) float, metres
-        The landmarks.
-    config : CompletionConfig
+    `vertices` (L,) int; `points` (L, 3), metres, the landmarks.
     """
 
     def __init__(self, body: FixedBody, cloud: ScanPoints, vertices: np.ndarray, points: np.ndarray,
@@ -130,16 +124,16 @@ class ScanFit:
         held[:3] = held[self.body.n_angles:] = 0
         terms = self.terms(x, scan, reach)
 
-        def energies(at: np.ndarray) -> list[energy.Residual]:
+        def energies(at: np.ndarray) -> list[Residual]:
             return [*terms(at), energy.stay_near(at, x, held)]
 
-        best = minimise(energies, x[None], MinimiseConfig(iterations=2, tolerance=1e-3)).x
+        best = levenberg_marquardt(lambda at: normal_equations(energies(at)), x[None], 2, 1e-3).x
         return best[0], {n: float(r.energy[0]) for n, r in zip((*TERMS, "twists"), energies(best), strict=True)}
 
     def precision(self, x: np.ndarray) -> np.ndarray:
         """(P, P) how sharply scan, landmarks and priors together determine unknowns (P,): the Gauss-Newton matrix."""
         terms = self.terms(x, self.thin, self.config.final_reach)
-        return normal_equations(terms(x[None]))[2][0]
+        return normal_equations(terms(x[None])).hessian[0]
 
     def terms(self, x: np.ndarray, scan: ScanPoints, reach: float) -> Energy:
         """The energies `TERMS` of unknowns (B, P) near x (P,), for the matches at x."""
@@ -153,7 +147,7 @@ class ScanFit:
         prior, limit = self.habit.near(body.split(x)[0]), config.prior_weight * config.joint_limits
         stiff = max(1.0, reach / LIKELY)             # far matches are often wrong, and shape gives way before pose does
 
-        def energies(at: np.ndarray) -> list[energy.Residual]:
+        def energies(at: np.ndarray) -> list[Residual]:
             points = follow(at)
             marked, free, denied = points[:count], points[count:end], points[end:]
             return [energy.point_to_point(marked, self.points, landmark_weights),

@@ -19,20 +19,7 @@ MEANS = ("distance of the scan to the completed mesh, RMS", "scan points explain
 
 
 def folder_inputs(folder: Path, landmarks: Path | None, masks: Path | None) -> dict[str, Inputs]:
-    """The scans of a folder by name, with their landmarks and masks.
-
-    Parameters
-    ----------
-    landmarks : Path, optional
-        Folder of the landmark files; else `landmarks` in the folder, or the folder itself.
-    masks : Path, optional
-        Folder of the masks: a file belongs to the scan of its name.
-
-    Raises
-    ------
-    ValueError
-        No scans, no such folder of landmarks or masks.
-    """
+    """The scans of a folder by name, with their landmarks and masks."""
     if masks is not None and not masks.is_dir():
         raise ValueError(f"--mask: expected a folder of masks for a folder of scans, there is none at {masks}")
     found = {}

@@ -17,16 +17,10 @@ FEW = 2000                           # points that are enough to find the viewpo
 
 @dataclass(frozen=True, eq=False)
 class Sight:
-    """A scan as one camera saw it.
+    """A scan as one camera saw it."""
 
-    Attributes
-    ----------
-    viewpoint : (3,) float, metres
-    points : (n, 3) float, metres
-    """
-
-    viewpoint: np.ndarray
-    points: np.ndarray
+    viewpoint: np.ndarray   # (3,), metres
+    points: np.ndarray      # (n, 3), metres
 
     @cached_property
     def _rays(self) -> tuple[np.ndarray, np.ndarray, cKDTree]:
@@ -37,20 +31,9 @@ class Sight:
     def trespass(self, vertices: np.ndarray, tolerance: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """How far vertices stand where the camera saw nothing, or in front of what it saw.
 
-        Parameters
-        ----------
-        vertices : (n, 3) float, metres
-        tolerance : float, metres
-            What is allowed for the rim that scanners lose and for an inexact viewpoint.
-
-        Returns
-        -------
-        (n,) float, metres
-            Beyond the tolerance; zero where there is nothing to object to.
-        (n, 3) float
-            The way out, from the vertex's side: the normal of the plane it should reach.
-        (n, 3) float, metres
-            A point of that plane.
+        `vertices` (n, 3), metres; `tolerance` metres.
+        Returns (n,), metres, beyond the tolerance; zero where there is nothing to object to; (n, 3), the way out,
+        from the vertex's side: the normal of the plane it should reach; (n, 3), metres, a point of that plane.
         """
         depth, direction, tree = self._rays
         away = vertices - self.viewpoint
@@ -69,14 +52,9 @@ class Sight:
 
 @dataclass(frozen=True, eq=False)
 class Sights:
-    """A scan as several cameras saw it.
+    """A scan as several cameras saw it."""
 
-    Attributes
-    ----------
-    cameras : Sight of each view whose viewpoint is known
-    """
-
-    cameras: tuple[Sight, ...]
+    cameras: tuple[Sight, ...]  # Sight of each view whose viewpoint is known
 
     @property
     def points(self) -> np.ndarray:
@@ -108,13 +86,7 @@ def find_sights(cloud: ScanPoints) -> Sight | Sights | None:
 def find_sight(cloud: ScanPoints, viewpoint: np.ndarray | None = None, share: float = 0.97) -> Sight | None:
     """The camera of a scan, or None when no single viewpoint faces nearly all of it.
 
-    Parameters
-    ----------
-    viewpoint : (3,) float, metres, optional
-        Where it is known. Otherwise it is the one that the fewest normals turn away from; its direction is
-        good to a few degrees, its distance is not.
-    share : float
-        Of the points, that must face it.
+    `viewpoint` (3,), metres.
     """
     if viewpoint is None:
         viewpoint = _facing_point(cloud)

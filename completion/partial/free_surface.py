@@ -18,11 +18,6 @@ class FreeSurface:
     The model's own energy E_H has its minimum at the predicted vertices, and it is quadratic with the
     matrix L = GᵀG of the triangulation, so E_H[Y] = E_H[Ŷ] + tr (Y - Ŷ)ᵀ L (Y - Ŷ) holds exactly: neither
     R, S nor Q are needed again.
-
-    Parameters
-    ----------
-    mesh : Mesh
-        The triangulation.
     """
 
     def __init__(self, mesh: Mesh) -> None:
@@ -33,16 +28,8 @@ class FreeSurface:
               ) -> np.ndarray:
         """Vertices (N, 3) that minimise E_H[Y] + w_Z Σ |y_l - z_l|².
 
-        Parameters
-        ----------
-        predicted : (N, 3) float, metres
-            The model's vertices Ŷ, the minimum of E_H.
-        weights : (L, N) sparse
-            The points y_l = weights @ Y on the surface, by barycentric coordinates.
-        targets : (L, 3) float, metres
-            Where they were measured, z_l.
-        data_weight : (L,) float
-            w_Z for each.
+        `predicted` (N, 3), metres, the model's vertices Ŷ, the minimum of E_H; `weights` (L, N) sparse; `targets`
+        (L, 3), metres, where they were measured, z_l; `data_weight` (L,), w_Z for each.
 
         [SCAPE] Eq. 10
         """

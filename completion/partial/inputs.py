@@ -16,22 +16,12 @@ from .settings import CompletionConfig
 
 @dataclass(frozen=True, eq=False)
 class Given:
-    """A scan and its landmarks.
+    """A scan and its landmarks."""
 
-    Attributes
-    ----------
-    cloud : ScanPoints
-    vertices : (L,) int
-    points : (L, 3) float, metres
-        The landmarks.
-    metres : float
-        Of one unit of the scan as it was given.
-    """
-
-    cloud: ScanPoints
-    vertices: np.ndarray
-    points: np.ndarray
-    metres: float = 1.0
+    cloud: ScanPoints       # ScanPoints
+    vertices: np.ndarray    # (L,) int
+    points: np.ndarray      # (L, 3), metres, the landmarks
+    metres: float = 1.0     # of one unit of the scan as it was given
 
     def scaled(self, factor: float) -> Given:
         """All lengths times a factor."""
@@ -41,13 +31,7 @@ class Given:
 
 def in_metres(body: FixedBody, scan: View | Sequence[View], landmarks: tuple[np.ndarray, np.ndarray] | None,
               masked: np.ndarray | None, config: CompletionConfig) -> Given:
-    """A scan made ready for matching; of unknown scale, as nearly in metres as can be told before the fit.
-
-    Raises
-    ------
-    ValueError
-        A scan, landmarks or a mask that cannot be used.
-    """
+    """A scan made ready for matching; of unknown scale, as nearly in metres as can be told before the fit."""
     metres = 1.0
     if config.free_scale:
         every = all_points(scan)
@@ -63,14 +47,7 @@ def in_metres(body: FixedBody, scan: View | Sequence[View], landmarks: tuple[np.
 
 
 def check_landmarks(landmarks: tuple[np.ndarray, np.ndarray], template: Mesh) -> tuple[np.ndarray, np.ndarray]:
-    """Landmark vertices (L,) and points (L, 3) as arrays.
-
-    Raises
-    ------
-    ValueError
-        Fewer than 3, lists of different length, vertices that do not exist, points that are not finite or of
-        another scale than the template.
-    """
+    """Landmark vertices (L,) and points (L, 3) as arrays."""
     count = len(template.vertices)
     vertices, points = (np.asarray(part) for part in landmarks)
     if vertices.ndim != 1 or points.shape != (len(vertices), 3):

@@ -25,12 +25,7 @@ NEAR = 6e-4                          # of the scan's extent: from a point of a m
 class Cover:
     """What lies over the skin: the body is inside it.
 
-    Parameters
-    ----------
-    scan : ScanPoints
-        The points of clothing and hair.
-    tolerance : float, metres
-        How far skin may stick out, for noise.
+    `tolerance`, metres, how far skin may stick out, for noise.
     """
 
     def __init__(self, scan: ScanPoints, tolerance: float = 0.003) -> None:
@@ -40,18 +35,9 @@ class Cover:
     def trespass(self, places: np.ndarray, normals: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """How far vertices stick out of it.
 
-        Parameters
-        ----------
-        places, normals : (n, 3) float
-
-        Returns
-        -------
-        (n,) float, metres
-            Beyond the tolerance; zero inside, and where no clothing is.
-        (n, 3) float
-            Normal of the plane to reach.
-        (n, 3) float, metres
-            A point of that plane.
+        `places, normals` (n, 3).
+        Returns (n,), metres, beyond the tolerance; zero inside, and where no clothing is; (n, 3), normal of the plane
+        to reach; (n, 3), metres, a point of that plane.
         """
         over, out, near = self._over(places, normals)
         depth = np.where(over, np.maximum(out - self.tolerance, 0), 0.0)
@@ -73,13 +59,7 @@ class Cover:
 
 
 def part_vertices(template: Mesh, skeleton: Skeleton, names: Sequence[str]) -> np.ndarray:
-    """(N,) bool: vertices of the parts of these names.
-
-    Raises
-    ------
-    ValueError
-        A part that the body has not, or all of its parts.
-    """
+    """(N,) bool: vertices of the parts of these names."""
     unknown = [name for name in names if name not in skeleton.names]
     if unknown:
         raise ValueError(f"ignored_parts: expected names of {', '.join(skeleton.names)}; got {', '.join(unknown)}")

@@ -31,12 +31,7 @@ def picture_completion(scan: View | Sequence[View], completion: Completion, temp
                        height: int | None = None, masked: np.ndarray | None = None) -> np.ndarray:
     """The scan, and the completed body in two colours from the side that was seen and from behind.
 
-    Parameters
-    ----------
-    template : Mesh
-        At rest: says which axis is up.
-    masked : (n,) bool, optional
-        Points of the scan that are clothing or hair, shown in another colour.
+    `masked` (n,) bool.
     """
     views = [sides(completion, template)[turn] for turn in (0, 2)]
     body, colors = completion.completed, _two_colors(completion)
@@ -102,17 +97,9 @@ def completion_page(scan: View | Sequence[View], completion: Completion, templat
                     ) -> Page:
     """The page of `scape complete`.
 
-    Parameters
-    ----------
-    name : str
-        Of the scan, for the title.
-    rows : (metric, value, unit) of the table
-    masked : (n,) bool, optional
-        As for `complete`.
-    landmarks : ((L,) int, (L, 3) float), optional
-        As for `complete`, in the unit of the scan.
-    picture : (H, W, 3) uint8, optional
-        That of `picture_completion`, where it is there already.
+    `rows` (metric, value, unit) of the table; `masked` (n,) bool, as for `complete`; `landmarks` ((L,) int, (L,
+    3)), as for `complete`, in the unit of the scan; `picture` (H, W, 3) uint8, that of `picture_completion`, where
+    it is there already.
     """
     cameras = sides(completion, template)
     body = completion.completed

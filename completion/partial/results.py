@@ -17,9 +17,7 @@ _FACTS = ("rms", "explained", "landmark_rms", "converged", "iterations")
 def save_completion(folder: str | Path, completion: Completion) -> Path:
     """Write `completed.ply`, `predicted.ply` and `completion.npz` (the arrays and figures).
 
-    Returns
-    -------
-    The folder. `completion.npz` is written last, so where it is, the meshes are too.
+    Returns The folder. `completion.npz` is written last, so where it is, the meshes are too.
     """
     folder = Path(folder)
     write_mesh(folder / "completed.ply", completion.completed)
@@ -31,13 +29,7 @@ def save_completion(folder: str | Path, completion: Completion) -> Path:
 
 
 def load_completion(folder: str | Path) -> Completion:
-    """Read a folder of `save_completion`.
-
-    Raises
-    ------
-    StorageError, MeshFileError
-        A file that is missing, damaged or of another kind.
-    """
+    """Read a folder of `save_completion`."""
     folder = Path(folder)
     path = folder / "completion.npz"
     header, arrays = storage.load(path, KIND, (1, VERSION))

@@ -2,17 +2,18 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 from scipy.spatial import cKDTree
 
 from scanprep.geometry import rotations
+from scanprep.geometry.least_squares import Dense, levenberg_marquardt, normal_equations
 
 from .. import energy
 from ..bodies import FixedBody, Follow
 from ..energy import MovingPoints
 from ..priors import gaussian_prior, typical_poses
-from ..solve import Energy, MinimiseConfig, minimise
 from .scan import spread
 from .search import all_turns
 from .settings import CompletionConfig
@@ -30,10 +31,6 @@ class ScaledBody(FixedBody):
 
     The last unknown stands with the betas, so their prior holds it too: x[-1] = log(factor) / LOOSE, where lengths
     of the scan times `factor` are metres.
-
-    Parameters
-    ----------
-    inner : FixedBody
     """
 
     def __init__(self, inner: FixedBody) -> None:
@@ -137,11 +134,11 @@ def landmark_scale(body: FixedBody, vertices: np.ndarray, points: np.ndarray, co
     follow = scaled.follow(vertices, np.r_[x[0, :-1 - body.n_betas], np.zeros(body.n_betas + 1)])
     weights = np.full(len(points), config.landmark_sd**-2)
 
-    def energies(stiff: float) -> Energy:
-        return lambda x: [energy.point_to_point(follow(x), points, weights), energy.pose_prior(x, prior, stiff),
-                          energy.shape_prior(x, body.n_angles + 3)]
+    def equations(x: np.ndarray, stiff: float) -> Dense:
+        return normal_equations([energy.point_to_point(follow(x), points, weights), energy.pose_prior(x, prior, stiff),
+                                 energy.shape_prior(x, body.n_angles + 3)])
 
     for stiff in (10.0, 3.0, 1.0):
-        found = minimise(energies(stiff), x, MinimiseConfig(iterations=8, tolerance=1e-3))
+        found = levenberg_marquardt(partial(equations, stiff=stiff), x, 8, 1e-3)
         x = found.x
     return float(np.exp(LOOSE * x[np.argmin(found.energy), -1]))

@@ -21,34 +21,16 @@ View = Mesh | PointCloud | np.ndarray
 
 @dataclass(frozen=True, eq=False)
 class ScanPoints:
-    """Oriented points of a scan, of one view or of several.
+    """Oriented points of a scan, of one view or of several."""
 
-    Attributes
-    ----------
-    points : (n, 3) float, metres
-    normals : (n, 3) float, unit, outward
-    border : (n,) bool
-        On the border of what the views show together; all false for bare points.
-    spacing : float, metres
-        Median distance of neighbouring points.
-    view : (n,) int
-        Which view each point belongs to.
-    index : (n,) int
-        Its number among all points that were given, one view after the other.
-    masked : ScanPoints, optional
-        The points that are clothing or hair; they are not among `points`.
-    viewpoints : (views, 3) float, metres, optional
-        Where each view was seen from, when that was told.
-    """
-
-    points: np.ndarray
-    normals: np.ndarray
-    border: np.ndarray
-    spacing: float
-    view: np.ndarray
-    index: np.ndarray
-    masked: ScanPoints | None = None
-    viewpoints: np.ndarray | None = None
+    points: np.ndarray      # (n, 3), metres
+    normals: np.ndarray     # (n, 3), unit, outward
+    border: np.ndarray      # (n,) bool, on the border of what the views show together; all false for bare points
+    spacing: float          # metres, median distance of neighbouring points
+    view: np.ndarray        # (n,) int, which view each point belongs to
+    index: np.ndarray       # (n,) int, its number among all points that were given, one view after the other
+    masked: ScanPoints | None = None  # the points that are clothing or hair; they are not among `points`
+    viewpoints: np.ndarray | None = None  # (views, 3), metres, where each view was seen from, when that was told
 
     @property
     def views(self) -> int:
@@ -81,23 +63,8 @@ def prepare_scan(scan: View | Sequence[View], viewpoint: Any = None, masked: np.
                  metres: float = 1.0) -> ScanPoints:
     """Points and normals of a scan.
 
-    Parameters
-    ----------
-    scan : Mesh, PointCloud, (n, 3) or (n, 6) float, metres, or a sequence of these
-        A sequence holds several views in one frame. A mesh brings its normals, as do a point cloud that has some
-        and the last three columns of six; where their sign is mixed they are turned outward. For bare points
-        normals are estimated from neighbours and turned outward.
-    viewpoint : (3,) float, metres, or one for each view, optional
-        Where bare points were seen from; their normals are turned towards it.
-    masked : (n,) bool, optional
-        Points, one view after the other, that are clothing or hair.
-    metres : float
-        Of one unit of the scan and its viewpoints.
-
-    Raises
-    ------
-    ValueError
-        Too few points, points that are not finite, a mask or viewpoints that do not fit the scan.
+    `scan` Mesh, PointCloud, (n, 3) or (n, 6), metres, or a sequence of these; `viewpoint` (3,), metres, or one for
+    each view; `masked` (n,) bool, points, one view after the other, that are clothing or hair.
     """
     views = [in_metres(view, metres) for view in as_views(scan)]
     from_where = check_viewpoints(viewpoint, len(views), metres)
@@ -113,13 +80,7 @@ def prepare_scan(scan: View | Sequence[View], viewpoint: Any = None, masked: np.
 
 
 def as_views(scan: View | Sequence[View]) -> list[View]:
-    """The views of a scan: a list of one for a single mesh or cloud.
-
-    Raises
-    ------
-    ValueError
-        No view at all.
-    """
+    """The views of a scan: a list of one for a single mesh or cloud."""
     if isinstance(scan, Mesh | PointCloud | np.ndarray):
         return [scan]
     views = list(scan)
@@ -153,13 +114,7 @@ def all_points(scan: View | Sequence[View]) -> np.ndarray:
 
 
 def check_viewpoints(viewpoint: Any, views: int, metres: float = 1.0) -> np.ndarray | None:
-    """Viewpoints (views, 3), or None.
-
-    Raises
-    ------
-    ValueError
-        Neither one point nor one for each view.
-    """
+    """Viewpoints (views, 3), or None."""
     if viewpoint is None:
         return None
     given = np.asarray(viewpoint, dtype=np.float64)
@@ -170,13 +125,7 @@ def check_viewpoints(viewpoint: Any, views: int, metres: float = 1.0) -> np.ndar
 
 
 def check_mask(masked: np.ndarray, count: int) -> np.ndarray:
-    """A mask (count,) bool.
-
-    Raises
-    ------
-    ValueError
-        Not one boolean for each point, or nothing left to match.
-    """
+    """A mask (count,) bool."""
     masked = np.asarray(masked)
     if masked.dtype != bool or masked.shape != (count,):
         raise ValueError(f"masked: expected {count} booleans, one for each point of the scan, "

@@ -12,13 +12,7 @@ REACH = 0.12                         # metres: nothing on a body is further insi
 class Contact:
     """Some vertices of a body, and which parts may not enter which.
 
-    Parameters
-    ----------
-    skeleton : Skeleton
-    part : (n,) int
-        Part of each vertex.
-    tolerance : float, metres
-        How deep skin may press into skin.
+    `part` (n,) int, part of each vertex; `tolerance`, metres, how deep skin may press into skin.
     """
 
     def __init__(self, skeleton: Skeleton, part: np.ndarray, tolerance: float = 0.015) -> None:
@@ -34,20 +28,9 @@ class Contact:
                    ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """How deep vertices stand inside a part that is not next to theirs.
 
-        Parameters
-        ----------
-        places, normals : (n, 3) float
-        parts : ints, optional
-            Only these parts are looked at.
-
-        Returns
-        -------
-        (n,) float, metres
-            Depth beyond the tolerance; zero outside.
-        (n, 3) float
-            Normal of the plane to reach: the way out.
-        (n, 3) float, metres
-            A point of that plane.
+        `places, normals` (n, 3).
+        Returns (n,), metres, depth beyond the tolerance; zero outside; (n, 3), normal of the plane to reach: the way
+        out; (n, 3), metres, a point of that plane.
         """
         depth, way = np.zeros(len(places)), np.zeros_like(places)
         for p in range(len(self._mine)) if parts is None else parts:

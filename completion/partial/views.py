@@ -5,24 +5,17 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from scanprep.geometry.files import PointCloud, read_mesh, read_points
+from scanprep.geometry.files import POINT_ENDINGS, PointCloud, read_mesh, read_points
 from scanprep.geometry.mesh import Mesh
 from scanprep.pictures.textures import Texture, read_texture
-from scanprep.pipeline.scans import POINT_ENDINGS
 
 
 @dataclass(frozen=True, eq=False)
 class ScanFiles:
-    """The views of one scan.
+    """The views of one scan."""
 
-    Attributes
-    ----------
-    views : Mesh or PointCloud of each file
-    textures : Texture or None of each
-    """
-
-    views: tuple[Mesh | PointCloud, ...]
-    textures: tuple[Texture | None, ...]
+    views: tuple[Mesh | PointCloud, ...]  # Mesh or PointCloud of each file
+    textures: tuple[Texture | None, ...]  # Texture or None of each
 
     @property
     def colored(self) -> bool:
@@ -37,17 +30,7 @@ class ScanFiles:
 
 
 def read_views(paths: Sequence[Path], unit: str | None = None) -> ScanFiles:
-    """Read the views of a scan.
-
-    Parameters
-    ----------
-    unit : 'm', 'mm', 'cm' or 'in', optional
-
-    Raises
-    ------
-    MeshFileError
-        A file that cannot be read.
-    """
+    """Read the views of a scan."""
     views = tuple(read_view(path, unit) for path in paths)
     return ScanFiles(views, tuple(read_texture(path, unit) if isinstance(view, Mesh) else None
                                   for path, view in zip(paths, views, strict=True)))

@@ -30,25 +30,14 @@ from .views import ScanFiles, read_views
 
 @dataclass(frozen=True, eq=False)
 class Work:
-    """What the scans of one call have in common.
+    """What the scans of one call have in common."""
 
-    Attributes
-    ----------
-    body : BodyModel or Subject
-    model : name of the model, for the report
-    marks : name -> vertex of the template
-    config : CompletionConfig
-    unit : of the scans and landmarks, where the files cannot tell
-    colors : ColorConfig
-    command : for the report of each scan of a folder; one scan's is written by the console
-    """
-
-    body: BodyModel | Subject
-    model: str
-    marks: dict[str, int]
-    config: CompletionConfig
-    unit: Unit | None = None
-    colors: ColorConfig = field(default_factory=ColorConfig)
+    body: BodyModel | Subject  # BodyModel or Subject
+    model: str              # name of the model, for the report
+    marks: dict[str, int]   # name -> vertex of the template
+    config: CompletionConfig  # CompletionConfig
+    unit: Unit | None = None  # of the scans and landmarks, where the files cannot tell
+    colors: ColorConfig = field(default_factory=ColorConfig)  # ColorConfig
     command: str = field(default="", metadata={"digest": False})
 
     def __call__(self, inputs: Inputs, room: Room) -> list[Metric]:
@@ -79,11 +68,6 @@ def complete_files(work: Work, inputs: Inputs, room: Room) -> list[Metric]:
     """Complete the scan of some files into the folder of a room, report.html in it; the figures.
 
     The first is called "problem" where the completion means nothing, and says why.
-
-    Raises
-    ------
-    ValueError
-        A file that cannot be read or does not fit: which one, what was expected, what came.
     """
     with warnings.catch_warnings():
         if work.config.free_scale:
@@ -130,13 +114,7 @@ def figures(work: Work, inputs: Inputs, done: Completion, landmarks: tuple[np.nd
 
 
 def read_masks(paths: tuple[Path, ...], files: ScanFiles, unit: Unit | None) -> np.ndarray | None:
-    """Which points (n,) are clothing or hair, all views one after the other, from one file or one for each view.
-
-    Raises
-    ------
-    ValueError
-        Another number of files, or one that does not fit.
-    """
+    """Which points (n,) are clothing or hair, all views one after the other, from one file or one for each view."""
     if not paths:
         return None
     if len(paths) == 1:

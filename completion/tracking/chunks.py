@@ -20,42 +20,21 @@ SURFACES = "surfaces"
 
 @dataclass(frozen=True, eq=False)
 class Chunk:
-    """What came of some frames.
+    """What came of some frames."""
 
-    Attributes
-    ----------
-    ready : tuple of TrackedFrame
-        Those that were done with them: none while the shape is not known, then all from the first on.
-    state : TrackerState
-        After them.
-    problems : tuple of str
-        What was wrong with their files, the folder left out.
-    """
-
-    ready: tuple[TrackedFrame, ...]
-    state: TrackerState
-    problems: tuple[str, ...]
+    ready: tuple[TrackedFrame, ...]  # tuple of TrackedFrame
+    state: TrackerState     # TrackerState, after them
+    problems: tuple[str, ...]  # tuple of str, what was wrong with their files, the folder left out
 
 
 @dataclass(frozen=True, eq=False)
 class Followed:
-    """All frames of a folder.
+    """All frames of a folder."""
 
-    Attributes
-    ----------
-    frames : list of TrackedFrame
-    state : TrackerState
-        At the end.
-    key : str
-        Changes with everything they depend on.
-    fresh : int
-        Frames that were followed now; the others had been before.
-    """
-
-    frames: list[TrackedFrame]
-    state: TrackerState
-    key: str
-    fresh: int
+    frames: list[TrackedFrame]  # list of TrackedFrame
+    state: TrackerState     # TrackerState, at the end
+    key: str                # changes with everything they depend on
+    fresh: int              # frames that were followed now; the others had been before
 
 
 def follow_folder(tracker: Tracker, frames: FrameFolder, space: Workspace, key: str, surfaces: bool = False,
@@ -65,15 +44,6 @@ def follow_folder(tracker: Tracker, frames: FrameFolder, space: Workspace, key: 
     Frames are followed one from the other, and the shape is found from several, so what is kept of a chunk depends
     on every file up to its last frame, and nothing after it. The state of the tracker is kept with it: when a chunk
     is missing or damaged, or a frame in it has changed, the tracker goes on from the end of the one before.
-
-    Parameters
-    ----------
-    key : str
-        A digest of all else that the frames depend on.
-    surfaces : bool
-        Write the completed surface of every frame to `SURFACES`.
-    progress : callable, optional
-        Called with (done, total) frames.
     """
     done: list[TrackedFrame] = []
     state, fresh, names = tracker.state, 0, []

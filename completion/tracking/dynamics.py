@@ -14,12 +14,7 @@ WINDOW, OVERLAP = 600, 60            # frames smoothed at once, and those that e
 def predicted(past: Sequence[np.ndarray], momentum: float) -> np.ndarray:
     """Unknowns (P,) of the next frame from those of one or two before, the nearest first.
 
-    Parameters
-    ----------
-    past : (P,) float each
-        Pose (3J) and trans (3).
-    momentum : float in [0, 1]
-        Share of the velocity that is kept.
+    `past` (P,) each, pose (3J) and trans (3).
     """
     near = past[0].copy()
     turn = rotations.exp(near[:-3].reshape(-1, 3))
@@ -45,15 +40,8 @@ def smoothed(x: np.ndarray, gradient: np.ndarray, precision: np.ndarray, weights
     Frames are no longer needed: near its own optimum a frame is its gradient and its Gauss-Newton matrix. Unknowns
     of the step are small turns of every joint from the right, so that nothing happens at a half turn.
 
-    Parameters
-    ----------
-    x : (T, P) float
-        Pose and trans of every frame, where the quadratics were made.
-    gradient, precision : (T, P) and (T, P, P) float
-        Of half the energy of a frame's data; zero for frames that showed nothing.
-    weights : (P,) float
-        See `inertia`.
-    rounds : int
+    `x` (T, P), pose and trans of every frame, where the quadratics were made; `gradient, precision` (T, P) and (T,
+    P, P); `weights` (P,), see `inertia`.
     """
     T = len(x)
     if T < 3:

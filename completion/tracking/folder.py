@@ -19,24 +19,6 @@ class FrameFolder:
 
     A folder holds a file for each frame, or a subfolder of such files for each camera, or, with a pattern, the files
     of all cameras. A number that is left out is a frame in which nothing was seen.
-
-    Parameters
-    ----------
-    folder : Path
-    pattern : str, optional
-        File names with {camera} and {frame} in them, such as "cam{camera}_{frame}.ply".
-    unit : 'm', 'mm', 'cm' or 'in', optional
-
-    Attributes
-    ----------
-    names : str of every frame
-    cameras : str of every camera; one without a name where there is one
-    problems : str, files that could not be read so far and why
-
-    Raises
-    ------
-    ValueError
-        No such folder, no frames in it, files whose number is missing or comes twice.
     """
 
     def __init__(self, folder: Path, pattern: str | None = None, unit: str | None = None) -> None:

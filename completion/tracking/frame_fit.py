@@ -6,14 +6,14 @@ from typing import Any
 
 import numpy as np
 
+from scanprep.geometry.least_squares import Residual, levenberg_marquardt, normal_equations
 from scanprep.geometry.surface import Surface
 
 from .. import energy
 from ..bodies import FixedBody
-from ..partial.fit import ScanFit
+from ..partial.fit import Energy, ScanFit
 from ..partial.reinitialise import approach, best_start, first_starts, redraw_limbs
 from ..partial.scan import ScanPoints
-from ..solve import Energy, MinimiseConfig, minimise, normal_equations
 from .dynamics import inertia
 from .settings import TrackConfig
 
@@ -24,37 +24,17 @@ NOTHING = (np.zeros(0, dtype=np.int64), np.zeros((0, 3)))
 
 @dataclass(frozen=True, eq=False)
 class Settled:
-    """Where the fit of a frame ended.
+    """Where the fit of a frame ended."""
 
-    Attributes
-    ----------
-    x : (P,) float
-    gradient, precision : (P,) and (P, P) float
-        Of half the energy of the data and the pose prior at x, the prediction not among them.
-    residual : float, metres
-        Mean distance of the points to the surface.
-    explained : float
-        Share of the points that have the surface near.
-    """
-
-    x: np.ndarray
+    x: np.ndarray           # (P,)
     gradient: np.ndarray
     precision: np.ndarray
-    residual: float
-    explained: float
+    residual: float         # metres, mean distance of the points to the surface
+    explained: float        # share of the points that have the surface near
 
 
 class FrameFit:
-    """A body of known shape, and what stays the same from frame to frame.
-
-    Parameters
-    ----------
-    body : FixedBody
-    cloud : ScanPoints
-        Any frame.
-    config : TrackConfig
-    rate : float, frames per second
-    """
+    """A body of known shape, and what stays the same from frame to frame."""
 
     def __init__(self, body: FixedBody, cloud: ScanPoints, config: TrackConfig, rate: float) -> None:
         self.body, self.config = body, config
@@ -105,8 +85,8 @@ class FrameFit:
         data = scan_terms(fit, x, reach)
         held = 0 * self.inertia if expected is None else self.inertia / PREDICTION
         goal = x if expected is None else expected
-        best = minimise(lambda at: [*data(at), energy.stay_near(at, goal, held)], x[None],
-                        MinimiseConfig(iterations=1, tolerance=1e-3)).x
+        best = levenberg_marquardt(lambda at: normal_equations([*data(at), energy.stay_near(at, goal, held)]), x[None],
+                                   iterations=1, tolerance=1e-3).x
         _, gradient, precision = normal_equations(data(best))
         return best[0], gradient[0], precision[0]
 
@@ -131,7 +111,7 @@ def scan_terms(fit: ScanFit, x: np.ndarray, reach: float) -> Energy:
     count = len(ids)
     prior = fit.habit.near(fit.body.split(x)[0])
 
-    def terms(at: np.ndarray) -> list[energy.Residual]:
+    def terms(at: np.ndarray) -> list[Residual]:
         points = follow(at)
         free, denied = points[:count], points[count:]
         return [energy.pose_prior(at, prior, fit.config.prior_weight),

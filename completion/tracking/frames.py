@@ -37,22 +37,8 @@ def prepare_frame(frame: Frame, count: int, neighbours: int, viewpoints: Any = N
     sign is that of given normals or of the triangles, or else such that they face the viewpoint, or else that of the
     expected body, or else outward by the form of the cloud alone.
 
-    Parameters
-    ----------
-    frame : Mesh, PointCloud, (n, 3) or (n, 6) float, metres, a sequence of these (cameras), or None
-        Points that are not finite are left out, as depth cameras give such where they saw nothing.
-    count : int
-        How many points to keep, all cameras together.
-    neighbours : int
-        That make one normal.
-    viewpoints : (3,) float, metres, or one for each camera, optional
-    expected : Mesh, optional
-        The body about where it should be.
-
-    Raises
-    ------
-    ValueError
-        Arrays of another shape.
+    `frame` Mesh, PointCloud, (n, 3) or (n, 6), metres, a sequence of these (cameras), or None; `viewpoints` (3,),
+    metres, or one for each camera.
     """
     views = [] if frame is None else [frame] if isinstance(frame, Mesh | PointCloud | np.ndarray) else list(frame)
     given = None if viewpoints is None else np.broadcast_to(np.asarray(viewpoints, float), (len(views), 3))

@@ -7,28 +7,23 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from scanprep.geometry.farthest_points import farthest_points
+from scanprep.geometry.least_squares import normal_equations
+
 from .. import energy
 from ..bodies import ShapedBody
 from ..partial.fit import ScanFit
 from ..partial.scan import ScanPoints
-from ..solve import normal_equations
 from .frame_fit import NOTHING, scan_terms
 from .settings import TrackConfig
 
 
 @dataclass(frozen=True, eq=False)
 class SharedShape:
-    """One shape in several poses.
+    """One shape in several poses."""
 
-    Attributes
-    ----------
-    betas : (K,) float
-    x : (n, P) float
-        Pose and trans of every frame.
-    """
-
-    betas: np.ndarray
-    x: np.ndarray
+    betas: np.ndarray       # (K,)
+    x: np.ndarray           # (n, P), pose and trans of every frame
 
 
 def shared_shape(body: ShapedBody, clouds: Sequence[ScanPoints], x: np.ndarray, betas: np.ndarray,
@@ -38,14 +33,7 @@ def shared_shape(body: ShapedBody, clouds: Sequence[ScanPoints], x: np.ndarray, 
     Every round matches all frames anew and takes one Gauss-Newton step on all unknowns, in which the poses are
     eliminated frame by frame.
 
-    Parameters
-    ----------
-    body : ShapedBody
-    clouds : n frames
-    x : (n, P) float
-        Pose and trans of each, near the truth.
-    betas : (K,) float
-        To begin with.
+    `x` (n, P), pose and trans of each, near the truth; `betas` (K,), to begin with.
     """
     fit = ScanFit(body, clouds[0], *NOTHING, config.scan)
     fits = [_own_body(fit.on(cloud), body) for cloud in clouds]
@@ -70,11 +58,8 @@ def shared_shape(body: ShapedBody, clouds: Sequence[ScanPoints], x: np.ndarray, 
 def spread_poses(vertices: np.ndarray, count: int) -> np.ndarray:
     """Indices of `count` of the bodies (n, N, 3) that are as unlike as possible, in order, the first among them."""
     shapes = vertices - vertices.mean(axis=1, keepdims=True)
-    chosen, apart = [0], np.linalg.norm(shapes - shapes[0], axis=2).mean(axis=1)
-    while len(chosen) < min(count, len(shapes)):
-        chosen.append(int(np.argmax(apart)))
-        apart = np.minimum(apart, np.linalg.norm(shapes - shapes[chosen[-1]], axis=2).mean(axis=1))
-    return np.sort(chosen)
+    return np.sort(farthest_points(
+        shapes, count, 0, lambda i, _: np.linalg.norm(shapes - shapes[i], axis=2).mean(axis=1)))
 
 
 def _own_body(fit: ScanFit, body: ShapedBody) -> ScanFit:

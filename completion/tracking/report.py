@@ -24,9 +24,7 @@ Cloud = Callable[[int], np.ndarray]
 def picture_tracked(motion: Motion, subject: Subject, cloud: Cloud, count: int = 7, height: int = 340) -> np.ndarray:
     """Some frames: the points that were measured, and the body from two sides; a lost frame is grey.
 
-    Parameters
-    ----------
-    cloud : frame -> (n, 3) float, metres
+    `cloud` frame -> (n, 3), metres.
     """
     frames = np.unique(np.linspace(0, len(motion.poses) - 1, count).round().astype(int))
     measured, bodies = [], []

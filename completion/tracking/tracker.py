@@ -24,85 +24,37 @@ from .settings import TrackConfig
 
 @dataclass(frozen=True, eq=False)
 class TrackedFrame:
-    """One frame of a motion.
+    """One frame of a motion."""
 
-    Attributes
-    ----------
-    number : int
-        From 0.
-    x : (P,) float
-        Pose (3J) and trans (3).
-    found : bool
-        Not lost.
-    residual : float, metres
-        Mean distance of the points to the surface; NaN for a frame without points.
-    explained : float
-        Share of the points that have the surface near.
-    gradient, precision : (P,) and (P, P) float
-        What the frame's data say near x, for smoothing; zero when it is lost.
-    cloud : ScanPoints, optional
-        Its points.
-    """
-
-    number: int
-    x: np.ndarray
-    found: bool
-    residual: float
-    explained: float
+    number: int             # from 0
+    x: np.ndarray           # (P,), pose (3J) and trans (3)
+    found: bool             # not lost
+    residual: float         # metres, mean distance of the points to the surface; NaN for a frame without points
+    explained: float        # share of the points that have the surface near
     gradient: np.ndarray
     precision: np.ndarray
-    cloud: ScanPoints | None = None
+    cloud: ScanPoints | None = None  # its points
 
 
 @dataclass(frozen=True, eq=False)
 class TrackerState:
-    """All that a tracker knows after some frames: another one goes on from there to the very same end.
+    """All that a tracker knows after some frames: another one goes on from there to the very same end."""
 
-    Attributes
-    ----------
-    number : int
-        Frames taken.
-    lost : int
-        How many of the last ones were lost, one after the other.
-    betas : (K,) float, or None
-        Those found so far.
-    shape_known : bool
-        Whether they stay.
-    past : up to two (P,) float
-        Where the body was, the last frame first.
-    kept : tuple of TrackedFrame
-        Frames that may still change, with their points.
-    draws : dict, or None
-        State of the random numbers that a search from scratch draws.
-    """
-
-    number: int
-    lost: int
-    betas: np.ndarray | None
-    shape_known: bool
-    past: tuple[np.ndarray, ...]
-    kept: tuple[TrackedFrame, ...]
-    draws: dict[str, Any] | None
+    number: int             # frames taken
+    lost: int               # how many of the last ones were lost, one after the other
+    betas: np.ndarray | None  # (K,), or None, those found so far
+    shape_known: bool       # whether they stay
+    past: tuple[np.ndarray, ...]  # up to two (P,), where the body was, the last frame first
+    kept: tuple[TrackedFrame, ...]  # tuple of TrackedFrame, frames that may still change, with their points
+    draws: dict[str, Any] | None  # state of the random numbers that a search from scratch draws
 
 
 class Tracker:
     """Follows one body through frames that are handed over one by one.
 
-    Parameters
-    ----------
-    body : BodyModel or Subject
-        A model when the person's shape is unknown: then the first frames are kept until it is found.
-    config : TrackConfig
-    rate : float, frames per second
-    landmarks : ((L,) int, (L, 3) float), optional
-        Of the first frame, as for `complete`.
-    viewpoints : (3,) float, metres, or one for each camera, optional
-        Where bare points were seen from.
-
-    Attributes
-    ----------
-    betas : (K,) float, or None for the template's own body
-        Those found so far.
+    `landmarks` ((L,) int, (L, 3)), of the first frame, as for `complete`; `viewpoints` (3,), metres, or one for
+    each camera, where bare points were seen from; `betas` (K,), or None for the template's own body, those found so
+    far.
     """
 
     def __init__(self, body: BodyModel | Subject, config: TrackConfig, rate: float,

@@ -7,22 +7,16 @@ import numpy as np
 
 from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.surface import OrientedPoints, Surface
-from scanprep.registration.matches import Target, tukey
+from scanprep.geometry.target import Target
+from scanprep.registration.matches import tukey
 
 
 @dataclass(frozen=True, eq=False)
 class Attraction:
-    """A quadratic energy `Σ |root (x - place)|²` of points x (L, 3).
+    """A quadratic energy `Σ |root (x - place)|²` of points x (L, 3)."""
 
-    Attributes
-    ----------
-    root : (L, 3, 3) float
-        Zero for a point that nothing attracts.
-    place : (L, 3) float, metres
-    """
-
-    root: np.ndarray
-    place: np.ndarray
+    root: np.ndarray        # (L, 3, 3), zero for a point that nothing attracts
+    place: np.ndarray       # (L, 3), metres
 
     def residual(self, x: np.ndarray) -> np.ndarray:
         """(3L,)"""
@@ -42,18 +36,8 @@ def attraction(x: np.ndarray, normals: np.ndarray, share: np.ndarray, target: Ta
                scale: float) -> Attraction:
     """What matches with compatible normals want, from the body to the scan and back.
 
-    Parameters
-    ----------
-    x, normals : (L, 3) float
-        Points of the body and their normals.
-    share : (L,) float
-        Of the surface that each stands for, together 1; the points of the scan together weigh as much.
-    reach : float, metres
-        Weights fall to zero towards it.
-    slide : float
-        Force along the surface, as a share of that across it.
-    scale : float, metres
-        How much distance a difference of normals weighs.
+    `x, normals` (L, 3), points of the body and their normals; `share` (L,); `reach`, metres, weights fall to zero
+    towards it; `scale`, metres, how much distance a difference of normals weighs.
     """
     forward = OrientedPoints(target.points, target.normals, scale).match(x, normals, reach)
     i = np.flatnonzero(forward.valid & ~target.border[forward.index])

@@ -60,7 +60,7 @@ def coregister_scans(model: ModelArg, scans: ScansArg, output: Output, landmarks
         workers: Who does the work.
         failed: A scan of which a larger share of points stays unexplained does not teach the model.
     """
-    from scanprep.pipeline.scans import read_scan
+    from scanprep.geometry.files import read_scan
 
     loaded, tasks = load_model(model), find_scans(scans, landmarks, subject)
     config = CoregistrationConfig(rounds=rounds, workers=workers, failed=failed)

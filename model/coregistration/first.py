@@ -9,8 +9,8 @@ import numpy as np
 from scanprep.batch.room import Room
 from scanprep.batch.workspace import Task, Workspace
 from scanprep.geometry.mesh import Mesh
+from scanprep.geometry.target import orient, target_of
 from scanprep.ranges import Settings
-from scanprep.registration.matches import orient, target_of
 from scanprep.registration.nonrigid import register
 from scanprep.registration.schedule import RegistrationConfig
 from scanprep.skeleton.find import find_skeleton

@@ -9,17 +9,18 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from scanprep.geometry import rotations
+from scanprep.geometry.least_squares import Dense, levenberg_marquardt
 from scanprep.geometry.mesh import Mesh
-from scanprep.registration.matches import Target, orient
+from scanprep.geometry.target import Target, orient
 
 from ..body import BodyModel
 from ..features import twists
 from ..fitting import share_of_vertices, spread_vertices
 from ..linear import Subject
-from ..minimise import minimise
+from ..priors import typical_poses, whitening
 from .attraction import Attraction, apart, attraction, towards
 from .config import ModelFitConfig, PoseStage
-from .posed import PosedPoints, posed_points, typical_poses, whitening
+from .posed import PosedPoints, posed_points
 
 STEPS = 2                            # of Levenberg-Marquardt between matchings
 ALIKE = 0.005                        # share of √area: searches that end nearer to each other have found the same
@@ -36,13 +37,7 @@ class Candidate:
 class ModelFit:
     """One body and one scan: searches for the pose, place and betas.
 
-    Parameters
-    ----------
-    body : BodyModel or Subject
-        A model where the shape is unknown, a subject where it is known.
-    target : Target
-    landmarks : (L,) int and (L, 3) float, metres, optional
-    config : ModelFitConfig
+    `landmarks` (L,) int and (L, 3), metres.
     """
 
     def __init__(self, body: BodyModel | Subject, target: Target, landmarks: tuple[np.ndarray, np.ndarray] | None,
@@ -72,13 +67,7 @@ class ModelFit:
         return points.J3 + 3 + points.n_betas
 
     def settle(self, x: np.ndarray, points: PosedPoints, wanted: Attraction, prior: float, steps: int) -> np.ndarray:
-        """Least squares over x of what is wanted of the points, the pose prior and that of the betas.
-
-        Parameters
-        ----------
-        prior : float
-            As in `PoseStage`.
-        """
+        """Least squares over x of what is wanted of the points, the pose prior and that of the betas."""
         J3, W = points.J3, prior * self.size * self.whitening
         mean, b = self.pose_mean.ravel(), self.config.shape_prior * self.size
         by_prior = np.zeros((len(x), len(W) + points.n_betas))
@@ -88,15 +77,15 @@ class ModelFit:
         def priors(x: np.ndarray) -> np.ndarray:
             return np.r_[W @ (x[:J3] - mean), b * x[J3 + 3:]]
 
-        def evaluate(x: np.ndarray) -> np.ndarray:
-            return np.r_[wanted.residual(points.positions(x)), priors(x)]
-
-        def derive(x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-            y, columns = points.columns(x)
+        def equations(at: np.ndarray) -> Dense:
+            y, columns = points.columns(at[0])
             by_data = np.einsum("lij,plj->pli", wanted.root, columns, optimize=True).reshape(len(x), -1)
-            return np.r_[wanted.residual(y), priors(x)], np.concatenate([by_data, by_prior], axis=1)
+            r, A = np.r_[wanted.residual(y), priors(at[0])], np.concatenate([by_data, by_prior], axis=1)
+            return Dense(np.array([r @ r]), (A @ r)[None], (A @ A.T)[None])
 
-        return minimise(evaluate, derive, x, J3 // 3, 1e-5, steps).x
+        out = levenberg_marquardt(equations, x[None], steps, 1e-5).x[0]
+        out[:J3] = twists(out[:J3].reshape(-1, 3)).ravel()
+        return out
 
     def follow(self, x: np.ndarray, stage: PoseStage) -> np.ndarray:
         """One stage: match, settle, and again."""

@@ -9,29 +9,15 @@ from ..bilinear import ShapedPoints
 from ..body import BodyModel
 from ..linear import PointOperator, Subject
 
-SHRINKAGE, FLOOR = 0.3, 0.15         # of the pose prior: few training poses make chance correlations; radians
-
 
 @dataclass(frozen=True, eq=False)
 class PosedPoints:
-    """Points of a body whose pose, place and perhaps shape are unknown: x = (pose (3J), trans (3), betas (K)).
+    """Points of a body whose pose, place and perhaps shape are unknown: x = (pose (3J), trans (3), betas (K))."""
 
-    Attributes
-    ----------
-    source : PointOperator or ShapedPoints
-        Of a body of known shape, or of one whose betas are unknown.
-    n_betas : int
-        K, zero where the shape is known.
-    parts : (L,) int
-        The part of each point.
-    rest_normals : (L, 3) float
-        On the template.
-    """
-
-    source: PointOperator | ShapedPoints
-    n_betas: int
-    parts: np.ndarray
-    rest_normals: np.ndarray
+    source: PointOperator | ShapedPoints  # PointOperator or ShapedPoints
+    n_betas: int            # K, zero where the shape is known
+    parts: np.ndarray       # (L,) int, the part of each point
+    rest_normals: np.ndarray  # (L, 3), on the template
 
     @property
     def J3(self) -> int:
@@ -70,39 +56,3 @@ def posed_points(body: BodyModel | Subject, vertex_ids: np.ndarray, n_betas: int
     K = min(n_betas, body.n_betas)
     shaped = body.points(vertex_ids, n_betas=K)
     return PosedPoints(shaped if K else shaped.operator(None), K, parts, normals)
-
-
-def whitening(covariance: np.ndarray) -> np.ndarray:
-    """(3J - 3, 3J): takes poses minus their mean to unit covariance; the root is free.
-
-    Parameters
-    ----------
-    covariance : (3J, 3J) float, square radians
-    """
-    inner = covariance[3:, 3:]
-    safe = (1 - SHRINKAGE) * inner + np.diag(SHRINKAGE * np.diag(inner) + FLOOR**2)
-    W = np.zeros((len(inner), len(covariance)))
-    W[:, 3:] = np.linalg.inv(np.linalg.cholesky(safe))
-    return W
-
-
-def typical_poses(mean: np.ndarray, covariance: np.ndarray, axes: int, deviation: float = 1.5) -> np.ndarray:
-    """The mean pose, and a step both ways along each of the main directions of the training poses.
-
-    Parameters
-    ----------
-    mean : (J, 3) float, radians
-    covariance : (3J, 3J) float, square radians
-    axes : int
-        Number of directions.
-    deviation : float
-        Length of a step in standard deviations.
-
-    Returns
-    -------
-    (1 + 2 axes, J, 3) float, radians
-    """
-    variance, direction = np.linalg.eigh(covariance)
-    kept = np.argsort(-variance)[:min(axes, int((variance > 1e-9).sum()))]
-    step = deviation * (np.sqrt(variance[kept]) * direction[:, kept]).T.reshape(-1, *mean.shape)
-    return mean + np.concatenate([np.zeros((1, *mean.shape)), step, -step])

@@ -8,6 +8,7 @@ import numpy as np
 
 from ..body import BodyModel
 from ..fitting import FitConfig, ShapeFitter
+from ..priors import sample_poses
 from .errors import checked_bodies, checked_counts
 
 Progress = Callable[[int, int], None]
@@ -60,10 +61,7 @@ def sample_bodies(model: BodyModel, count: int, rng: np.random.Generator, pose_t
         raise ValueError("n_betas: the model has no shape components, so only poses can be random (pose_too)")
     betas, poses = rng.normal(size=(count, K)), np.zeros((count, J, 3))
     if pose_too:
-        # the covariance is singular: the root and pruned joints do not turn
-        variances, directions = np.linalg.eigh(model.pose_covariance)
-        spread = directions * np.sqrt(np.maximum(variances, 0))
-        poses = model.pose_mean + (rng.normal(size=(count, 3 * J)) @ spread.T).reshape(count, J, 3)
+        poses = sample_poses(model, count, rng)
     return Samples(betas, poses, model.vertices(poses, betas if model.n_betas else None))
 
 

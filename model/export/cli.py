@@ -17,12 +17,13 @@ from scanprep.ranges import BETAS, Beta
 from ..body import BodyModel
 from ..cli import ModelArg
 from ..files import load_model
+from ..priors import sample_poses
 from .bvh import write_bvh
 from .correctives import motion_correctives, spaced
 from .glb import write_skinned_glb
 from .meshes import write_frames
 from .npz import pose_features, write_body_npz
-from .rig import Rig, check_motion, joint_places, make_rig, typical_poses
+from .rig import Rig, check_motion, joint_places, make_rig
 
 MM = 1000.0
 SHAPES = 10                          # morph targets where nobody says how many
@@ -156,7 +157,8 @@ def _person(path: Path, model: BodyModel, betas: tuple[float, ...], own_body: bo
 def _npz(output: Path, model: BodyModel) -> list[Metric]:
     arrays = write_body_npz(output, model)
     mean = np.zeros(1) if model.n_betas else None
-    rig, poses = make_rig(model, mean), typical_poses(model, MEASURED, seed=1)   # not the poses of the fit
+    rig = make_rig(model, mean)
+    poses = sample_poses(model, MEASURED, np.random.default_rng(1))      # not those of the fit
     exact = model.subject(mean).vertices(poses)
     changes = np.tensordot(pose_features(poses), arrays["posedirs"], axes=(1, 2))
     return [_size(output), Metric("joints", len(model.skeleton.parents)), Metric("shape directions", model.n_betas),
@@ -213,7 +215,7 @@ def _glb(output: Path, model: BodyModel, person: np.ndarray | None, rig: Rig, mo
 def _measured(model: BodyModel, moves: _Moves | None) -> tuple[np.ndarray, str]:
     """Poses in which a skinned body is compared with the exact one, and where they are from."""
     if moves is None:
-        return typical_poses(model, MEASURED), f"{MEASURED} poses of the prior"
+        return sample_poses(model, MEASURED, np.random.default_rng(0)), f"{MEASURED} poses of the prior"
     chosen = spaced(len(moves.poses), MEASURED)
     return moves.poses[chosen], f"{len(chosen)} frames of the motion"
 

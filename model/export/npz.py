@@ -9,8 +9,9 @@ from scanprep.geometry import rotations
 from scanprep.geometry.storage import writing
 
 from ..body import BodyModel
+from ..priors import sample_poses
 from .correctives import rest_corrections
-from .rig import Rig, make_rig, typical_poses
+from .rig import Rig, make_rig
 
 RIDGE = 1e-3                         # mean square of a pose feature that counts as nothing
 
@@ -60,7 +61,7 @@ def body_arrays(model: BodyModel, weights: np.ndarray | None = None, draws: int 
         "part_names": np.array(model.skeleton.names, dtype=str), "betas_unit": np.array("standard deviation"),
         "length_unit": np.array("metre")}
     if draws and J > 1:
-        poses = typical_poses(model, draws)
+        poses = sample_poses(model, draws, np.random.default_rng(0))
         arrays["posedirs"] = pose_directions(rig, poses, model.subject(mean).vertices(poses)).astype(np.float32)
     return arrays
 

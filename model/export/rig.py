@@ -160,14 +160,6 @@ def joint_places(skeleton: Skeleton, poses: np.ndarray, trans: np.ndarray | None
     return out
 
 
-def typical_poses(model: BodyModel, count: int, seed: int = 0) -> np.ndarray:
-    """Poses (count, J, 3), radians, drawn from the model's prior: like those that it was learned from."""
-    variance, directions = np.linalg.eigh(model.pose_covariance)
-    root = directions * np.sqrt(np.maximum(variance, 0))
-    draws = np.random.default_rng(seed).normal(size=(count, len(root))) @ root.T
-    return model.pose_mean + draws.reshape(count, -1, 3)
-
-
 def check_motion(skeleton: Skeleton, poses: np.ndarray, trans: np.ndarray | None, rate: float
                  ) -> tuple[np.ndarray, np.ndarray]:
     """Poses (T, J, 3) and trans (T, 3) of a motion, or ValueError."""

@@ -1,4 +1,4 @@
-"""Poses by hand: from joint angles, by turning a part, and drawn from the prior of a model."""
+"""Poses by hand: from joint angles, and by rotating a joint."""
 from __future__ import annotations
 
 from collections.abc import Mapping
@@ -8,10 +8,6 @@ import numpy as np
 
 from scanprep.geometry import rotations
 from scanprep.skeleton.tree import Skeleton
-
-from ..body import BodyModel
-from ..linear import check_pose
-from .joint_limits import JointLimits
 
 Frame = Literal["parent", "world", "own"]
 
@@ -48,8 +44,9 @@ def pose_from_angles(skeleton: Skeleton, angles: Mapping[str | int, Any]) -> np.
     return pose
 
 
-def turn(skeleton: Skeleton, pose: np.ndarray, part: str | int, rotation: Any, frame: Frame = "parent") -> np.ndarray:
-    """Turn one part, and what hangs below it, further from where it is.
+def rotate_joint(skeleton: Skeleton, pose: np.ndarray, part: str | int, rotation: Any, frame: Frame = "parent"
+                 ) -> np.ndarray:
+    """Rotate one part, and what hangs below it, further from where it is.
 
     Parameters
     ----------
@@ -87,30 +84,6 @@ def turn(skeleton: Skeleton, pose: np.ndarray, part: str | int, rotation: Any, f
         raise ValueError(f"frame: expected 'parent', 'world' or 'own', got {frame!r}")
     pose[..., j, :] = rotations.log(turned)
     return pose
-
-
-def sample_poses(model: BodyModel, count: int, rng: np.random.Generator, limits: JointLimits | None = None
-                 ) -> np.ndarray:
-    """Poses drawn from the model's Gaussian prior, and brought within the limits of the joints.
-
-    Parameters
-    ----------
-    model : BodyModel
-    count : int
-    rng : np.random.Generator
-    limits : JointLimits, optional
-
-    Returns
-    -------
-    (count, J, 3) float, radians
-        The root at rest.
-    """
-    if count < 0:
-        raise ValueError(f"count: expected 0 or more, got {count}")
-    variances, axes = np.linalg.eigh(model.pose_covariance)
-    unit = rng.normal(size=(count, len(variances))) * np.sqrt(np.maximum(variances, 0))
-    poses = check_pose(model.skeleton, model.pose_mean + (unit @ axes.T).reshape(count, -1, 3), None)[0]
-    return poses if limits is None else limits.clip(poses)
 
 
 def part_number(skeleton: Skeleton, part: str | int) -> int:

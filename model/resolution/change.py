@@ -17,10 +17,11 @@ from scanprep.skeleton.tree import Skeleton
 from ..blendscape import BlendScapeModel
 from ..body import BodyModel
 from ..pose_space import PoseSpace, faces_of_part
+from ..priors import sample_poses
 from ..scape import ScapeModel
 from ..shape_space import ShapeSpace
 from ..skinning import SkinningModel
-from .distil import Distillation, Follower, Progress, drawn_poses, enough_poses
+from .distil import Distillation, Follower, Progress, enough_poses
 from .pieces import Piece, carry_skeleton, gradients_of
 
 ASTRAY = 2.0                         # mean edges of the coarser surface that the two may lie apart
@@ -100,7 +101,8 @@ def _carry_scape(model: ScapeModel, template: Mesh, config: ResolutionConfig, pr
         shape_space=_carry_shape_space(model, pieces), info=carry_info(model, template), **_carry_blend(model, pieces))
     if not config.rounds:
         return carried
-    poses = drawn_poses(model, enough_poses(model, config.poses))
+    poses = sample_poses(model, enough_poses(model, config.poses), np.random.default_rng(0))
+    poses[0] = model.pose_mean
     teacher = Distillation(model, Follower(model.template, template), config.rounds, progress)
     return teacher.shape_space(teacher.pose_space(carried, poses), poses[:config.shape_poses])
 

@@ -12,7 +12,7 @@ from scanprep.ranges import Faces
 
 from ..cli import ModelArg
 from ..files import load_model
-from ..posing.angles import sample_poses
+from ..priors import sample_poses
 from .change import ResolutionConfig, change_resolution, resample, resolution_gap
 
 MM = 1000.0

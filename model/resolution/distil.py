@@ -152,14 +152,6 @@ def _people(model: ScapeModel, pose: np.ndarray) -> tuple[np.ndarray, np.ndarray
     return model.vertices(pose, np.zeros(model.n_betas)), np.moveaxis(model.shape_jacobian(pose), -1, 0)
 
 
-def drawn_poses(model: ScapeModel, count: int) -> np.ndarray:
-    """Poses (count, J, 3), radians, of the model's prior, the mean first, the same ones every time."""
-    variances, axes = np.linalg.eigh(model.pose_covariance)
-    unit = np.random.default_rng(0).normal(size=(count, len(variances)))
-    unit[:1] = 0
-    return model.pose_mean + ((unit * np.sqrt(np.maximum(variances, 0))) @ axes.T).reshape(count, -1, 3)
-
-
 def enough_poses(model: ScapeModel, least: int) -> int:
     """How many poses settle the features of every part."""
     return max(least, PER_FEATURE * int(np.bincount(model.pose_space.features.part).max()))

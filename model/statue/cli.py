@@ -21,18 +21,17 @@ from ..export.cli import read_motion
 from ..files import load_model
 from .control.files import read_control
 from .control.humanoid import humanoid
-from .control.model import ControlModel
+from .control.model import ControlModel, Statue
 from .detail.displacement import Pixels
 from .detail.reconstruction import Reconstruction, displaced_surface, inverted_triangles
 from .detail.subdivision import Subdivision, subdivide, subdivide_adaptive
 from .files import load_statue
 from .fit import StatueConfig
-from .motion.animate import follower_of, read_statue_motion
+from .motion.follow import follower_of, read_statue_motion
 from .motion.motions import write_motion
 from .motion.retarget import StatueMotion
 from .report import motion_pictures, upright_axis
-from .statue import Statue
-from .statue_glb import write_statue_glb
+from .skins import write_statue_glb
 from .work import Inputs, Work
 
 StatueArg = Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="STATUE")]

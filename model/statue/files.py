@@ -6,17 +6,19 @@ from pathlib import Path
 import numpy as np
 
 from scanprep.geometry import storage
+from scanprep.skeleton.tree import Skeleton
+from scanprep.synthetic import people
 
-from .body import body_model, people_poses
+from ..features import linear_features
+from ..skinning import SkinningModel
 from .control.files import read_control, write_control
 from .control.humanoid import humanoid, humanoid_markers
-from .detail.images import read_map, write_map
-from .detail.normal_image import normal_image
+from .control.model import ControlModel, Statue
+from .detail.maps import read_map, write_map
 from .detail.subdivision import Subdivision
+from .detail.textures import normal_image
 from .motion.motions import people_motion
-from .statue import Statue
-from .statue_glb import write_statue_glb
-from .x3d import write_x3d
+from .skins import write_statue_glb, write_x3d
 
 KIND, VERSION = "statue", 1
 CONTROL, ABOUT, TEXTURE = "control.npz", "statue.json", "texture.png"
@@ -83,14 +85,43 @@ def write_body(folder: Path, statue: Statue) -> None:
 
 
 def write_for_programs(folder: Path, statue: Statue, vertices: np.ndarray, fine: Subdivision, up: int) -> None:
-    """Write statue.glb, the control mesh with skin and all images, and statue.x3d, the same as H-Anim.
-
-    Parameters
-    ----------
-    vertices : (n, 3) float, metres
-        The detailed surface, whose normals become the normal image.
+    """Write statue.glb, the control mesh with skin and all images, and statue.x3d, the same as H-Anim; `vertices` are
+    those of the detailed surface, whose normals become the normal image.
     """
     normals = normal_image(statue.control, vertices, fine, len(statue.map.heights))
     write_statue_glb(folder / "statue.glb", statue.control, texture=statue.texture, normals=normals,
                      heights=statue.map.heights, up=up)
     write_x3d(folder / "statue.x3d", statue.control, texture=statue.texture, up=up)
+
+
+POSES = 100                          # random poses of the synthetic people that make the pose prior
+WIDEST = 1.0                         # radians: standard deviation of the turns of a joint without such poses
+
+
+def body_model(control: ControlModel, poses: np.ndarray | None = None) -> SkinningModel:
+    """The control model under linear blend skinning as a model of one person, without betas. The poses (M, J, 3) that
+    people take make the pose prior; without any all rotations are about as likely. [Statues] Eq. 1
+    """
+    skeleton, N = control.skeleton, len(control.mesh.vertices)
+    J = len(skeleton.parents)
+    if poses is None:
+        mean, covariance, poses = np.zeros((J, 3)), WIDEST**2 * np.eye(3 * J), np.zeros((0, J, 3))
+        covariance[:3, :3] = 0
+    else:
+        poses = poses.copy()
+        poses[:, 0] = 0
+        mean, covariance = poses.mean(axis=0), np.cov(poses.reshape(len(poses), -1).T)
+    return SkinningModel(
+        control.mesh, skeleton, control.mesh.vertices, control.weights, _no_correctives(skeleton),
+        np.zeros((0, N, 3)), control.mesh.vertices, np.zeros((0, N, 3)), np.zeros(0), 0.0, mean, covariance,
+        {"made of": "a statue", "landmarks": dict(control.landmarks)}, pose_examples=poses)
+
+
+def people_poses(count: int = POSES, seed: int = 0) -> np.ndarray:
+    """Random poses (count, 16, 3), radians, of the synthetic people."""
+    rng = np.random.default_rng(seed)
+    return np.array([people.random_pose(rng) for _ in range(count)])
+
+
+def _no_correctives(skeleton: Skeleton):  # type: ignore[no-untyped-def]
+    return linear_features(skeleton, tuple(np.zeros((3, 0)) for _ in skeleton.parents))

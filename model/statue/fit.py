@@ -10,12 +10,11 @@ from scanprep.geometry.mesh import Mesh
 from scanprep.ranges import Settings
 
 from .control.humanoid import humanoid
-from .control.model import ControlModel
+from .control.model import ControlModel, Statue
 from .detail.displacement import DisplacementConfig, bake, unfold_control
 from .registration.automatic import Features, find_features
 from .registration.features import FeatureConfig, FeatureFit, fit_features, head_share, warp
 from .registration.surface_fit import SurfaceFit, SurfaceFitConfig, fit_surface
-from .statue import Statue
 
 Progress = Callable[[int, int], None]
 FACE = ("left eye", "right eye", "nose tip", "mouth", "chin", "left ear", "right ear", "top of head")
@@ -39,23 +38,13 @@ class StatueConfig(Settings):
 
 @dataclass(frozen=True, eq=False)
 class Posed:
-    """A control model in the pose of a scan, before its surface is fitted.
-
-    Attributes
-    ----------
-    features : FeatureFit
-    start : (N, 3) float, metres
-        Its vertices after the warp of the head.
-    hidden : (N,) bool
-        Vertices of parts that the scan does not show.
-    face : int
-        Points of the face that shaped the head: none where fewer than four are known or all lie in one plane.
-    """
+    """A control model in the pose of a scan, before its surface is fitted."""
 
     features: FeatureFit
-    start: np.ndarray
-    hidden: np.ndarray
-    face: int = 0
+    start: np.ndarray   # (N, 3) metres, its vertices after the warp of the head
+    hidden: np.ndarray  # (N,), vertices of parts that the scan does not show
+    face: int = 0       # points of the face that shaped the head: none where fewer than four are known or all lie in
+                        # one plane
 
 
 def fit_statue(scan: Mesh, joints: Mapping[str, np.ndarray] | None = None,
@@ -97,10 +86,7 @@ def fit_statue(scan: Mesh, joints: Mapping[str, np.ndarray] | None = None,
 
 def posed_by_features(control: ControlModel, joints: Mapping[str, np.ndarray], points: Mapping[str, np.ndarray],
                       config: FeatureConfig | None = None) -> Posed:
-    """The control model posed by features, and its head warped to those of the face.
-
-    [Statues] Eq. 4, 5
-    """
+    """The control model posed by features, and its head warped to those of the face. [Statues] Eq. 4, 5"""
     fit = fit_features(control, joints, points, config)
     shown = np.zeros(len(fit.vertices), dtype=bool)
     face = [name for name in FACE if name in points]

@@ -13,9 +13,9 @@ from scanprep.pictures.camera import Camera
 from scanprep.pictures.page import Page
 from scanprep.pictures.shading import Bones, Dots, Shape, Solid, color_bar, heat, part_colors, render, side_by_side
 
+from .control.model import FOLDED, HOLE, MEASURED, OUTSIDE, DisplacementMap, Statue
 from .detail.reconstruction import Reconstruction, coverage_at
 from .detail.subdivision import subdivide
-from .statue import FOLDED, HOLE, MEASURED, OUTSIDE, DisplacementMap, Statue
 
 HEIGHT, SMALL = 520, 360            # pixels of the pictures, and of animated ones
 SIDES = ("front", "left", "back", "right")
@@ -26,23 +26,13 @@ KINDS = {MEASURED: (0.62, 0.70, 0.78), FOLDED: (0.86, 0.36, 0.22), HOLE: (0.93, 
 
 @dataclass(frozen=True, eq=False)
 class Level:
-    """A reconstruction and how far it lies from the scan.
-
-    Attributes
-    ----------
-    name : str
-    mesh : Mesh
-    mean, rms : float, metres
-        From the reconstruction to the scan, where that has no hole [Statues] Eq. 22, 23.
-    shown : (f,) bool
-        Triangles that are not in a hole of the scan.
-    """
+    """A reconstruction and how far it lies from the scan."""
 
     name: str
     mesh: Mesh
-    mean: float
-    rms: float
-    shown: np.ndarray
+    mean: float        # metres, from the reconstruction to the scan, where that has no hole [Statues] Eq. 22, 23
+    rms: float         # metres, from the reconstruction to the scan, where that has no hole [Statues] Eq. 22, 23
+    shown: np.ndarray  # (f,), triangles that are not in a hole of the scan
 
 
 def upright_axis(statue: Statue) -> int:
@@ -51,13 +41,7 @@ def upright_axis(statue: Statue) -> int:
 
 
 def cameras(statue: Statue, subject: Any, turns: Sequence[float] = (0, 90, 180, 270)) -> list[Camera]:
-    """Cameras around a person from the front on; the front is where the control model looks.
-
-    Parameters
-    ----------
-    subject : Mesh or points (n, 3)
-        What has to fit into the picture.
-    """
+    """Cameras around a subject (Mesh or points) from the front on; the front is where the control model looks."""
     R = statue.control.skeleton.part_rotations(statue.pose)[0]
     front = -R[:, 1]
     axis = upright_axis(statue)
@@ -78,18 +62,8 @@ def statue_picture(scan: Mesh, statue: Statue, level: Level) -> np.ndarray:
 def statue_page(name: str, scan: Mesh, statue: Statue, levels: Sequence[Level], rows: list[tuple[str, Any, str]],
                 adaptive: Level | None = None, frames: Sequence[tuple[str, Mesh]] = (),
                 picture: np.ndarray | None = None) -> Page:
-    """The page of `scape statue fit`.
-
-    Parameters
-    ----------
-    scan : Mesh, metres
-        As it was fitted, in the frame of the statue.
-    levels : coarsest first
-    rows : (metric, value, unit) of the table
-    adaptive : Level, optional
-        Subdivided where the displacement asks for it.
-    frames : (name, mesh), optional
-        The statue in other poses.
+    """The page of `scape statue fit`: levels are the coarsest first, rows (metric, value, unit) of the table, frames
+    the statue in other poses.
     """
     finest = levels[-1]
     page = Page(f"{name}, a statue that moves", "A control mesh with a skeleton was fitted to the scan; the detail of "

@@ -18,8 +18,7 @@ from scanprep.geometry.mesh import Mesh
 from scanprep.pictures.sheets import save_png
 from scanprep.pictures.textures import Texture, read_texture
 
-from .control.model import ControlModel
-from .detail.colors import bake_texture, scan_look
+from .control.model import HOLE, ControlModel, Statue
 from .detail.displacement import bake, coverage_shares
 from .detail.reconstruction import (
     Reconstruction,
@@ -32,13 +31,13 @@ from .detail.reconstruction import (
     surface_error,
 )
 from .detail.subdivision import Subdivision, subdivide, subdivide_adaptive
+from .detail.textures import bake_texture, scan_look
 from .files import save_statue, write_body, write_for_programs
 from .fit import Posed, StatueConfig, fitted_control, posed_automatically, posed_by_features
 from .registration.automatic import Features, find_features, likely_unit
-from .registration.read_features import read_features
+from .registration.clicks import read_features
 from .registration.surface_fit import SurfaceFit, fit_surface
 from .report import Level, in_motion, parts_without_data, statue_page, statue_picture, upright_axis
-from .statue import HOLE, Statue
 
 LEVELS = 4                           # 0 to 3 are measured, the last is written
 TOLERANCE = 0.0005                   # metres: of adaptive subdivision in the report
@@ -55,20 +54,14 @@ class Inputs:
 
 @dataclass(frozen=True, eq=False)
 class Work:
-    """What the scans of one call have in common.
-
-    Attributes
-    ----------
-    control : ControlModel
-    config : StatueConfig
-    unit : of the scans and features, where the files cannot tell
-    command : for the report of each scan of a folder; one scan's is written by the console
-    """
+    """What the scans of one call have in common."""
 
     control: ControlModel
     config: StatueConfig
-    unit: Unit | None = None
-    command: str = field(default="", metadata={"digest": False})
+    unit: Unit | None = None                                      # of the scans and features, where the files cannot
+                                                                  # tell
+    command: str = field(default="", metadata={"digest": False})  # for the report of each scan of a folder; one scan's
+                                                                  # is written by the console
 
     def __call__(self, inputs: Inputs, room: Room) -> list[Metric]:
         """Fit the statue of some files into the folder of a room; the figures."""
@@ -122,9 +115,7 @@ class Work:
 
 
 def measured_levels(statue: Statue, scan: Mesh) -> tuple[list[Level], Subdivision]:
-    """The reconstruction at every level with its distance to the scan, and the finest subdivision.
-
-    [Statues] Eq. 22, 23
+    """The reconstruction at every level with its distance to the scan, and the finest subdivision. [Statues] Eq. 22, 23
     """
     levels = []
     for number in range(LEVELS):

@@ -20,24 +20,11 @@ ANSWER, WAIT = 10, 60          # seconds for the scheduler, and for the first wo
 
 
 def run_on_cluster(address: str, work: Any, jobs: Sequence[Job], ship: bool = False) -> Iterator[tuple[Job, Any]]:
-    """Each job with what the work returned, or a Failure, as they finish.
+    """Each job with what the work returned, or a Failure, as they finish; ValueError where no scheduler serves.
 
     The work travels to each worker once. Files come back to this process, which alone writes, so workers need no
-    place to write to. One thread a worker is best (`dask worker --nthreads 1 --nworkers auto`).
-
-    Parameters
-    ----------
-    address : str
-        Of the scheduler, such as "tcp://host:8786".
-    ship : bool
-        Send the files of each job along, for workers that do not see them under the same path.
-
-    Raises
-    ------
-    ModuleNotFoundError
-        Dask is not installed.
-    ValueError
-        No scheduler at that address, no workers, or workers that cannot run this version.
+    place to write to. One thread a worker is best (`dask worker --nthreads 1 --nworkers auto`). With `ship` the files
+    of each job travel along, for workers that do not see them under the same path.
     """
     Client, as_completed, KilledWorker = _distributed()
     try:
@@ -117,13 +104,7 @@ def _outcome(future: Any, job: Job, address: str, KilledWorker: type) -> Any:
 
 
 def do_there(shared: bytes, packed: bytes) -> tuple[Any, dict[str, bytes]]:
-    """One job on the machine of a worker: what the work returned, and the files that it wrote.
-
-    Raises
-    ------
-    RuntimeError
-        Other versions here than where the work comes from.
-    """
+    """One job on the machine of a worker: what the work returned, and the files that it wrote."""
     work, versions = pickle.loads(shared)
     if versions != _versions():
         raise RuntimeError(f"the worker has {_described(_versions())}")

@@ -21,15 +21,11 @@ _STAT = ("st_size", "st_mtime_ns", "st_ctime_ns", "st_ino")
 
 
 class Digests:
-    """Digests of values and files; those of files are remembered as long as size and times of change stay.
+    """Digests of values and files; those of files are remembered as long as size and times of change stay, from run to
+    run in the file at `path`.
 
     A file that was changed less than two seconds before it was read is read again the next time: clocks of file
     systems are coarse.
-
-    Parameters
-    ----------
-    path : Path, optional
-        Where digests of files are remembered from run to run.
     """
 
     def __init__(self, path: Path | None = None) -> None:

@@ -14,23 +14,9 @@ LOOK = 0.2                     # seconds between two looks whether the other run
 
 @contextlib.contextmanager
 def locked(path: Path, output: Path, wait: bool = False) -> Iterator[None]:
-    """Keep other runs out of an output until the block ends.
+    """Keep other runs out of an output until the block ends: ValueError, or wait for them.
 
-    The operating system holds the lock, so that a run that was killed leaves none behind.
-
-    Parameters
-    ----------
-    path : Path
-        Of the file that is locked, in a folder that exists.
-    output : Path
-        For the message.
-    wait : bool
-        Wait for the other run instead.
-
-    Raises
-    ------
-    ValueError
-        Another run is at work: which, and since when.
+    The operating system holds the lock, so that a run that was killed leaves none behind. `output` is for the message.
     """
     while True:
         with open(path, "a+", encoding="utf-8") as file:

@@ -19,19 +19,8 @@ _open: dict[Path, Workspace] = {}
 def workspace(folder: str | Path, force: bool = False) -> Iterator[Workspace]:
     """Open an output folder for one run: no other gets in, and what a killed one left is put right.
 
-    Opened again inside, it is the same one.
-
-    Parameters
-    ----------
-    force : bool
-        Take nothing as done.
-
-    Raises
-    ------
-    ValueError
-        Another run is at work in the folder.
-    ForeignFileError
-        A folder with files in it that scapekit did not make.
+    Opened again inside, it is the same one. With `force` nothing counts as done. ValueError where another run is at
+    work, ForeignFileError where files are in it that scapekit did not make.
     """
     folder = Path(folder)
     if (folder / HOME).absolute() in _open:
@@ -49,12 +38,7 @@ def workspace(folder: str | Path, force: bool = False) -> Iterator[Workspace]:
 def beside(output: str | Path, force: bool = False) -> Iterator[Workspace]:
     """Open an output that is a file, or a folder that is made at once: what is kept meanwhile lies beside it.
 
-    At the end that is removed; what was written is told by the report beside the output.
-
-    Raises
-    ------
-    ValueError, ForeignFileError
-        As `workspace`.
+    At the end that is removed; what was written is told by the report beside the output. Errors as `workspace`.
     """
     output = Path(output)
     space = Workspace(output.parent, output.parent / f".{output.name}{HOME}", force, output)

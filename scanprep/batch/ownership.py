@@ -16,13 +16,7 @@ class ForeignFileError(ValueError):
 
 
 class Ownership:
-    """Which files of a folder are as scapekit wrote them.
-
-    Parameters
-    ----------
-    folder : Path
-    digests : Digests
-    """
+    """Which files of a folder are as scapekit wrote them."""
 
     def __init__(self, folder: Path, digests: Digests) -> None:
         self.folder, self.digests = folder, digests
@@ -38,12 +32,7 @@ class Ownership:
         return self.digests.of_file(self.folder / file) in self._written.get(file, ())
 
     def check_free(self, files: Mapping[str, str]) -> None:
-        """Refuse to write files with these digests where something else stands.
-
-        Raises
-        ------
-        ForeignFileError
-        """
+        """ForeignFileError where something else stands in the places of files with these digests."""
         taken = []
         for file, digest in files.items():
             place = self.folder / file

@@ -21,26 +21,14 @@ T = TypeVar("T")
 
 @dataclass(frozen=True, eq=False)
 class Job:
-    """A task on its way to a worker.
-
-    Attributes
-    ----------
-    name, given, place
-        As in `Task`.
-    folder : Path
-        Where it is made; its files are in `folder / place`.
-    steps : Path, optional
-        Where its steps are kept.
-    force : bool
-        Take no step as done.
-    """
+    """A `Task` on its way to a worker."""
 
     name: str
     given: Any
-    folder: Path
+    folder: Path                    # where it is made; its files are in `folder / place`
     place: str = ""
-    steps: Path | None = None
-    force: bool = False
+    steps: Path | None = None       # where its steps are kept
+    force: bool = False             # take no step as done
 
 
 @dataclass(frozen=True)
@@ -51,18 +39,10 @@ class Failure:
 
 
 class Room:
-    """Where a task is worked on.
+    """Where one task is worked on.
 
-    Parameters
-    ----------
-    folder : Path
-        For its files.
-    steps : Path, optional
-        For results of its steps, which are found again when the task was interrupted.
-    tell : callable
-        Called with (done, total).
-    force : bool
-        Take no step as done that an earlier run made.
+    `folder` takes its files, `step` keeps results that are found again when the task was interrupted,
+    `tell(done, total)` reports progress. With `force` no step of an earlier run counts as done.
     """
 
     def __init__(self, folder: Path, steps: Path | None = None, tell: Progress | None = None, force: bool = False

@@ -32,20 +32,11 @@ def inside(step: Step, outer: str) -> Step:
 
 @dataclass(frozen=True, eq=False)
 class KeptSteps:
-    """Steps that are kept in an output; when a step is done, those `inside` it are forgotten.
-
-    Attributes
-    ----------
-    space : Workspace
-    found : list of str
-        The steps that had been done before this run.
-    made : set of str
-        Those that were done now.
-    """
+    """Steps that are kept in an output; when a step is done, those `inside` it are forgotten."""
 
     space: Workspace
-    found: list[str] = field(default_factory=list)
-    made: set[str] = field(default_factory=set)
+    found: list[str] = field(default_factory=list)          # the steps that had been done before this run
+    made: set[str] = field(default_factory=set)             # those that were done now
 
     def __call__(self, name: str, inputs: Any, make: Callable[[], T]) -> T:
         fresh = False

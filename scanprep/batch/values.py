@@ -17,17 +17,9 @@ _ARRAY = "a{}"
 
 
 def save_value(path: Path, value: Any, header: dict[str, Any]) -> None:
-    """Write a value and what is to be known of it before it is read.
+    """Write a value and a JSON header that can be read without it.
 
-    Parameters
-    ----------
-    value : None, bool, number, text, Path, array, or a tuple, list, dict with text keys, or dataclass of these
-    header : JSON-serialisable
-
-    Raises
-    ------
-    TypeError
-        A value of another kind.
+    Values are None, bool, number, text, Path, array, and tuples, lists, dicts with text keys and dataclasses of these.
     """
     arrays: list[np.ndarray] = []
     told = json.dumps({"kind": KIND, "version": VERSION, **header, "value": _packed(value, arrays)})
@@ -47,13 +39,7 @@ def load_header(path: Path) -> dict[str, Any] | None:
 
 
 def load_value(path: Path) -> Any:
-    """The value of a file of `save_value`.
-
-    Raises
-    ------
-    StorageError
-        Missing, damaged, or written by another version of this project.
-    """
+    """The value of a file of `save_value`; StorageError where it is missing, damaged or of another version."""
     header, arrays = storage.load(path, KIND, (VERSION,))
     try:
         return _unpacked(header["value"], [arrays[_ARRAY.format(i)] for i in range(len(arrays))])

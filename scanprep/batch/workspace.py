@@ -35,47 +35,24 @@ T = TypeVar("T")
 
 @dataclass(frozen=True)
 class Task:
-    """One thing of many, worked on once.
+    """One thing of many, worked on once."""
 
-    Attributes
-    ----------
-    name : str
-        Its own in the output.
-    given : frozen dataclass
-        What is worked on; Paths in it count as what the files hold.
-    place : str
-        Folder of its files inside the output.
-    """
-
-    name: str
-    given: Any
-    place: str = ""
+    name: str               # its own in the output
+    given: Any              # frozen dataclass that is worked on; Paths in it count as what the files hold
+    place: str = ""         # folder of its files inside the output
 
 
 @dataclass(frozen=True)
 class Results:
-    """What became of tasks.
+    """What became of tasks, by their names."""
 
-    Attributes
-    ----------
-    values : name -> what the work returned, in the order of the tasks
-    failures : name -> one line
-    fresh : names of the tasks that were done now; the others had been done before
-    """
-
-    values: dict[str, Any]
-    failures: dict[str, str]
-    fresh: tuple[str, ...]
+    values: dict[str, Any]          # what the work returned, in the order of the tasks
+    failures: dict[str, str]        # one line each
+    fresh: tuple[str, ...]          # those that were done now; the others had been done before
 
     @property
     def only(self) -> Any:
-        """The value of the only task.
-
-        Raises
-        ------
-        ValueError
-            It failed.
-        """
+        """The value of the only task; ValueError where it failed."""
         if self.failures:
             raise ValueError(*self.failures.values())
         return next(iter(self.values.values()))
@@ -153,11 +130,7 @@ class Workspace:
     def step(self, name: str, inputs: Any, make: Callable[[Path], T]) -> T:
         """What `make` returns, or returned when it was last called with the same inputs.
 
-        Parameters
-        ----------
-        inputs : what the result depends on
-        make : callable
-            Gets a folder; files that it writes there take their place in the output.
+        It gets a folder; files that it writes there take their place in the output.
         """
         key = self.digests.of(inputs)
         kept = self._kept(name, key)

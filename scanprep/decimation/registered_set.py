@@ -12,6 +12,7 @@ import numpy as np
 
 from ..dataset import RegisteredSet
 from ..geometry import rotations, storage
+from ..geometry.farthest_points import farthest_points
 from ..geometry.landmarks import read_landmark_vertices, write_landmarks
 from ..geometry.mesh import Mesh, check_template
 from ..ranges import FLAG, Count, Settings
@@ -162,21 +163,14 @@ def decimate_set(template: Mesh, poses: np.ndarray | None, faces: int, config: D
 def _different_meshes(template: Mesh, poses: np.ndarray | None, count: int) -> np.ndarray:
     """(m, N, 3) the template and those meshes that are least like the ones before, placed as the template is."""
     centred = template.vertices - template.vertices.mean(axis=0)
-    chosen = [centred]
     if poses is None or count == 1:
-        return np.stack(chosen)
+        return centred[None]
     if np.ndim(poses) != 3 or np.shape(poses)[1:] != template.vertices.shape:
         raise ValueError(f"poses: expected shape (M, {len(template.vertices)}, 3), got {np.shape(poses)}")
-    R, t = rotations.procrustes(poses, np.broadcast_to(centred, poses.shape))[:2]
-    placed = np.einsum("mij,mnj->mni", R, poses) + t[:, None]
-    nearest = np.full(len(placed), np.inf)
-    while len(chosen) < min(count, 1 + len(placed)):
-        nearest = np.minimum(nearest, np.sqrt(((placed - chosen[-1]) ** 2).sum(axis=2).mean(axis=1)))
-        if nearest.max() <= 1e-9:
-            break
-        chosen.append(placed[nearest.argmax()])
-    return np.stack(chosen)
-
+    R, t = rotations.procrustes(poses, np.broadcast_to(centred, poses.shape))
+    placed = np.concatenate([centred[None], np.einsum("mij,mnj->mni", R, poses) + t[:, None]])
+    return placed[farthest_points(
+        placed, count, 0, lambda i, _: np.sqrt(((placed - placed[i]) ** 2).sum(axis=2).mean(axis=1)), least=1e-9)]
 
 def _assembled(source: Mesh, skeleton: Skeleton | None, vertex_map: np.ndarray, owner: np.ndarray,
                face_map: np.ndarray, fixed: np.ndarray, config: DecimateSetConfig) -> DecimatedSet:

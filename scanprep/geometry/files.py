@@ -18,10 +18,11 @@ from .format_common import UNITS, Contents, MeshFileError, check_extent, load_by
 from .mesh import Mesh
 
 __all__ = ["UNITS", "MeshFileError", "PointCloud", "Registered", "list_meshes", "read_mesh", "read_points",
-           "read_registered", "write_mesh", "write_points"]
+           "read_registered", "read_scan", "write_mesh", "write_points"]
 
 Precision = Literal["double", "single"]
 
+POINT_ENDINGS = (".xyz", ".pcd", ".txt", ".pts")
 _MESHES: dict[str, ModuleType] = {".ply": format_ply, ".obj": format_obj, ".stl": format_stl, ".off": format_off,
                                   ".glb": format_glb}
 _POINTS: dict[str, ModuleType] = {".ply": format_ply, ".pcd": format_pcd, ".xyz": format_xyz, ".txt": format_xyz,
@@ -123,6 +124,18 @@ def read_points(path: str | Path, unit: str | None = None) -> PointCloud:
     if normals is None and contents.faces is not None and len(contents.faces):
         normals = Mesh(points, contents.faces).vertex_normals
     return PointCloud(points, normals, contents.colors)
+
+
+def read_scan(path: str | Path, unit: str | None = None) -> Mesh | np.ndarray:
+    """A scan as a mesh, or as points (n, 3) where the file has no triangles."""
+    if Path(path).suffix.lower() in POINT_ENDINGS:
+        return read_points(path, unit).points
+    try:
+        return read_mesh(path, unit)
+    except ValueError as error:
+        if "no faces" in str(error):
+            return read_points(path, unit).points
+        raise
 
 
 def write_points(path: str | Path, cloud: PointCloud, precision: Precision = "double") -> None:

@@ -5,6 +5,7 @@ import numpy as np
 from scipy.sparse import coo_array, csr_array
 from scipy.sparse.csgraph import dijkstra
 
+from .farthest_points import farthest_points
 from .mesh import Mesh
 
 
@@ -46,14 +47,8 @@ class SurfaceGraph:
         """
         if not 1 <= count <= len(self.mesh.vertices):
             raise ValueError(f"count: expected 1..{len(self.mesh.vertices)}, got {count}")
-        chosen = [int(_checked(self.mesh, first))]
-        nearest = self.distances(chosen[0])
-        while len(chosen) < count:
-            nearest[chosen] = -1.0                       # never twice, even where all are at distance zero
-            chosen.append(int(nearest.argmax()))
-            reach = nearest[chosen[-1]]
-            nearest = np.minimum(nearest, self.distances(chosen[-1], limit=reach if reach > 0 else np.inf))
-        return np.array(chosen)
+        return farthest_points(self.mesh.vertices, count, int(_checked(self.mesh, first)),
+                               lambda i, limit: self.distances(i, limit=limit or np.inf), least=-0.5)
 
 
 def _checked(mesh: Mesh, sources: np.ndarray | int) -> np.ndarray:

@@ -74,3 +74,23 @@ def harmonic(near: csr_array, values: np.ndarray, known: np.ndarray) -> np.ndarr
         L = csr_array(diags_array(near.sum(axis=1)) - near)[free]
         out[free] = factor(csc_array(L[:, free]))(-L[:, fixed] @ out[fixed])
     return out
+
+
+def conjugate_gradients(apply: Callable[[np.ndarray], np.ndarray], force: np.ndarray,
+                        precondition: Callable[[np.ndarray], np.ndarray], iterations: int = 40,
+                        tolerance: float = 1e-4) -> np.ndarray:
+    """Solve `apply(d) = force` for arrays of any shape, with a symmetric positive definite `apply`."""
+    d, r = np.zeros_like(force), force.copy()
+    z = precondition(r)
+    p, rz = z, float(np.sum(r * z))
+    first = rz
+    for _ in range(iterations):
+        if rz <= tolerance**2 * first or not rz:
+            break
+        Ap = apply(p)
+        a = rz / float(np.sum(p * Ap))
+        d, r = d + a * p, r - a * Ap
+        z = precondition(r)
+        rz, last = float(np.sum(r * z)), rz
+        p = z + rz / last * p
+    return d

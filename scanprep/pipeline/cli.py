@@ -3,6 +3,7 @@ from __future__ import annotations
 
 from collections import Counter
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated
 
@@ -10,20 +11,18 @@ import numpy as np
 import tyro
 
 from ..batch.opening import workspace
-from ..batch.pool import Workers
 from ..batch.workspace import Workspace
 from ..cleaning.clean_scan import CleanScanConfig
-from ..cli import MM, Output, SetArg, Unit, landmarks_beside
+from ..cli import MM, Output, SetArg
 from ..console import Metric, Outcome, bar, say
 from ..geometry.files import read_mesh
-from ..geometry.landmarks import read_landmark_vertices
+from ..geometry.landmarks import read_template_landmarks
 from ..geometry.mesh import Mesh
-from ..ranges import Count
 from .figures import ScanFigures
 from .page import PAGE, judge_set, write_set_page
 from .prepare import PrepareConfig, Prepared, prepare
 from .review import Limits, Verdict
-from .scan import Guide, ScanSettings
+from .scan import Init
 from .scans import ScanTask, find_scans
 
 ScansArg = Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="SCANS")]
@@ -31,9 +30,8 @@ LISTED = 5                    # scans that the closing table names
 
 
 def run_all(scans: ScansArg, template: Path, output: Output, landmarks: Path | None = None,
-            template_landmarks: Path | None = None, guide: Guide = "best", clean: bool = False,
-            subject: str = "", unit: Unit | None = None, min_poses: Count = PrepareConfig.min_poses,
-            workers: Workers = Workers(), *, space: Workspace) -> Outcome:                # noqa: B008
+            template_landmarks: Path | None = None, clean: bool = False, subject: str = "",
+            config: PrepareConfig = PrepareConfig(), *, space: Workspace) -> Outcome:                # noqa: B008
     """Register a template to every scan of a folder, find the skeleton, and write a page of all scans, worst first.
 
     Killed and started again it goes on where it was; scans whose files have changed are registered anew.
@@ -46,33 +44,26 @@ def run_all(scans: ScansArg, template: Path, output: Output, landmarks: Path | N
         output: Folder of the registered set; open report.html in it.
         landmarks: Folder of landmark files with the names of the scans; else scans/landmarks, or beside the scans.
         template_landmarks: Landmarks of the template; else the file of its name beside it.
-        guide: What leads the template to a scan: its landmarks, correspondences that are found without any, or only
-            its pose, which must then be near the template's; best takes landmarks where there are some and
-            correspondences elsewhere.
         clean: Take floor, furniture and specks off each scan before.
         subject: Whose scans they are, where scans.csv does not say; else each is a person of its own.
-        unit: Unit of the scans and landmarks, where the files cannot tell.
-        min_poses: A skeleton is sought when one subject has at least so many scans.
-        workers: Who does the work.
     """
     body, tasks = read_mesh(template), find_scans(scans, landmarks, subject)
-    marks = _template_marks(template, template_landmarks, body, tasks, guide)
-    settings = ScanSettings(unit=unit, guide=guide, clean=CleanScanConfig() if clean else None)
-    config = PrepareConfig(settings, min_poses=min_poses, workers=workers)
+    if clean and config.scan.clean is None:
+        config = replace(config, scan=replace(config.scan, clean=CleanScanConfig()))
+    marks = _template_marks(template, template_landmarks, body, tasks, config.scan.init)
     with bar("registering scans") as registering, bar("finding the skeleton") as finding:
         done = prepare(tasks, body, marks, space.folder, config, registering, finding)
     return Outcome(output, [*_progress_made(done, tasks), *_quality(output, done.figures),
-                            Metric("unit assumed", unit or "m")], {"prepare": config}, list(done.failures))
+                            Metric("unit assumed", config.scan.unit or "m")], {"prepare": config}, list(done.failures))
 
 
 def page(registered: SetArg, limits: Limits = Limits()) -> Outcome:  # noqa: B008
     """Write the page of a registered set again, with other limits for what needs a look.
 
-    Example: scape prep page set --missed 0.05
+    Example: scape prep page set --config limits.toml
 
     Args:
         registered: Folder that scape prep run wrote.
-        limits: Limits.
     """
     with workspace(registered) as space, space.staging("page") as staged:
         write_set_page(registered, limits, to=staged.folder)
@@ -82,20 +73,20 @@ def page(registered: SetArg, limits: Limits = Limits()) -> Outcome:  # noqa: B00
     return Outcome(None, _quality(registered, figures, limits), {"limits": limits})
 
 
-def _template_marks(template: Path, given: Path | None, body: Mesh, tasks: Sequence[ScanTask], guide: Guide
+def _template_marks(template: Path, given: Path | None, body: Mesh, tasks: Sequence[ScanTask], init: Init
                     ) -> dict[str, int]:
     """The landmarks of the template, where any scan is led by landmarks."""
     without = [task.name for task in tasks if task.landmarks is None]
-    if guide == "pose":
+    if init == "pose":
         say("note: no landmarks are used; all scans must be near the template's pose")
         return {}
-    if guide == "automatic" or (guide == "best" and len(without) == len(tasks)):
+    if init == "automatic" or (init == "best" and len(without) == len(tasks)):
         say("note: no landmarks are used; look at the page for scans turned round or mirrored")
         return {}
-    if without and guide == "best":
+    if without and init == "best":
         say(f"note: no landmarks for {len(without)} of {len(tasks)} scans ({', '.join(without[:LISTED])}); "
             "look at the page for those turned round or mirrored")
-    return read_landmark_vertices(given or landmarks_beside(template), body)
+    return read_template_landmarks(template, body, given)
 
 
 def _progress_made(done: Prepared, tasks: Sequence[ScanTask]) -> list[Metric]:
@@ -121,7 +112,7 @@ def _quality(folder: Path, figures: Sequence[ScanFigures], limits: Limits | None
             Metric("vertices with data, mean", 100 * mean("seen"), "%"),
             Metric("scan off the template, mean", 100 * mean("missed"), "%"),
             Metric("distance of landmarks, mean RMS", MM * mean("landmarks"), "mm"),
-            Metric("flipped triangles", sum(f.flipped for f in figures)),
+            Metric("inverted triangles", sum(f.inverted for f in figures)),
             Metric("scans that need a look", len(suspects)),
             *(Metric(f"  {v.name}", _short(v)) for v in suspects[:LISTED])]
 
@@ -132,4 +123,4 @@ def _short(verdict: Verdict) -> str:
 
 def _way(figures: ScanFigures) -> str:
     """Landmarks, correspondences or pose, without their number."""
-    return figures.guide.lstrip("0123456789 ")
+    return figures.init.lstrip("0123456789 ")

@@ -13,64 +13,32 @@ import numpy as np
 from ..geometry import storage
 
 NONE = "none"                  # what a table says where a figure has no value
+EARLIER = {"guide": "init", "flipped": "inverted"}      # names of columns in tables written before
 FIGURES, TIMES, FAILURES = "registration.csv", "times.csv", "failures.csv"
 
 
 @dataclass(frozen=True)
 class ScanFigures:
-    """How well the template lies on one scan: a row of `registration.csv`.
-
-    Attributes
-    ----------
-    name : str
-    guide : str
-        What led the template there: "10 landmarks", "160 correspondences", "pose".
-    distance, rms : float, metres
-        Of the vertices with data to the surface of the scan.
-    seen : float
-        Share of the vertices with data.
-    confidence : float
-        Mean over all vertices, from 0 to 1.
-    missed : float
-        Share of the scan's points that lie off the registered template: a limb it does not cover, or clutter.
-    stretch : float
-        Share of the template's surface that is more than twice, or less than half, as long in some direction.
-    landmarks : float, metres
-        RMS distance of the landmarks; NaN without.
-    flipped : int
-        Triangles that face against their surroundings.
-    converged : bool
-    removed : float
-        Share of the scan's points that were cleaned off before.
-    seconds : float
-        Kept in `times.csv`, as it is the one figure that differs from run to run.
-    """
+    """How well the template lies on one scan: a row of `registration.csv`."""
 
     name: str
-    guide: str
-    distance: float
-    rms: float
-    seen: float
-    confidence: float
-    missed: float
-    stretch: float
-    landmarks: float
-    flipped: int
+    init: str               # what led the template there: "10 landmarks", "160 correspondences", "pose"
+    distance: float         # metres, mean of the vertices with data to the surface of the scan
+    rms: float              # metres, of the same
+    seen: float             # share of the vertices with data
+    confidence: float       # mean over all vertices, from 0 to 1
+    missed: float           # share of the scan's points off the template: a limb it does not cover, or clutter
+    stretch: float          # share of the surface more than twice, or less than half, as long in some direction
+    landmarks: float        # metres, RMS distance of the landmarks; NaN without
+    inverted: int           # triangles that face against their surroundings
     converged: bool
-    removed: float = 0.0
-    seconds: float = np.nan
+    removed: float = 0.0    # share of the scan's points that were cleaned off before
+    seconds: float = np.nan         # in `times.csv`, as it is the one figure that differs from run to run
 
 
 @dataclass(frozen=True)
 class Failure:
-    """A scan that could not be registered: a row of `failures.csv`.
-
-    Attributes
-    ----------
-    name : str
-    reason : str
-        One line, which names the file.
-    """
+    """A scan that could not be registered, and one line that says why and names the file: a row of `failures.csv`."""
 
     name: str
     reason: str
@@ -82,15 +50,9 @@ _READ: dict[str, Callable[[str], Any]] = {"str": str, "float": lambda text: np.n
 
 
 def read_figures(folder: Path) -> list[ScanFigures]:
-    """The figures of all scans of a set, as they stand in its tables.
-
-    Raises
-    ------
-    ValueError
-        A table with other columns or values.
-    """
+    """The figures of all scans of a set, as they stand in its tables; ValueError for other columns or values."""
     seconds = {row["name"]: float(row["seconds"]) for row in _read(folder / TIMES)}
-    rows = _read(folder / FIGURES)
+    rows = [{EARLIER.get(name, name): text for name, text in row.items()} for row in _read(folder / FIGURES)]
     try:
         return [ScanFigures(**{f.name: _READ[str(f.type)](row[f.name]) for f in _TABLED},
                             seconds=seconds.get(row["name"], np.nan)) for row in rows]

@@ -39,18 +39,7 @@ main { max-width: 76rem; }
 
 
 def write_set_page(folder: str | Path, limits: Limits | None = None, to: Path | None = None) -> Path:
-    """Write `report.html` into the folder of a set, from what lies there: tables, pictures, skeleton.
-
-    Parameters
-    ----------
-    to : Path, optional
-        Another folder for the page.
-
-    Returns
-    -------
-    Path
-        Of the page.
-    """
+    """Write `report.html` of a set, from what lies in its folder, there or into another folder; returns its path."""
     folder, limits = Path(folder), limits or Limits()
     whole, verdicts = RegisteredSet.load(folder), judge_set(folder, limits)
     size = float(np.sqrt(whole.template.face_areas.sum()))
@@ -91,7 +80,7 @@ def _summary(verdicts: Sequence[Verdict]) -> list[tuple[str, float, float, str]]
     known = [v.figures for v in verdicts if v.figures is not None and not v.failed]
     rows = (("distance to the scan, mean", 1000, "distance", "mm", max), ("vertices with data", 100, "seen", "%", min),
             ("scan off the template", 100, "missed", "%", max), ("stretched or shrunk", 100, "stretch", "%", max),
-            ("flipped triangles", 1, "flipped", "", max), ("landmarks off, RMS", 1000, "landmarks", "mm", max))
+            ("inverted triangles", 1, "inverted", "", max), ("landmarks off, RMS", 1000, "landmarks", "mm", max))
     out = []
     for text, scale, name, unit, worst in rows:
         values = [scale * float(getattr(f, name)) for f in known]
@@ -109,8 +98,8 @@ def _explanation(limits: Limits, size: float) -> str:
         f"not cover, or clutter), {1000 * limits.distance * size:.1f} mm mean distance where there are data, "
         f"{100 * limits.unseen:.3g} points more surface without data than is usual in this set, "
         f"{100 * limits.stretch:.3g}% of the surface stretched to the double or shrunk to the half, "
-        f"{100 * limits.flipped:.3g}% of the triangles flipped, landmarks {1000 * limits.landmarks * size:.0f} mm "
-        f"off. A registration that did not settle counts {limits.unsettled:.3g}.\n\n"
+        f"{100 * limits.inverted:.3g}% of the triangles inverted, landmarks {1000 * limits.landmarks * size:.0f} mm "
+        f"off. A registration that did not converge counts {limits.not_converged:.3g}.\n\n"
         "To mend a scan, correct its landmarks or click more of them where it went wrong and run the same command "
         "again: only scans whose files have changed are registered anew.")
 
@@ -133,7 +122,7 @@ def _index(verdicts: Sequence[Verdict], entries: dict[str, SetEntry]) -> str:
 def _card(folder: Path, verdict: Verdict, entry: SetEntry | None) -> str:
     path = folder / PICTURES / f"{verdict.name}.webp"
     about = " · ".join(filter(None, [entry.subject if entry and entry.subject != verdict.name else "",
-                                     entry.pose if entry else "", verdict.figures.guide if verdict.figures else ""]))
+                                     entry.pose if entry else "", verdict.figures.init if verdict.figures else ""]))
     badness = "failed" if verdict.failed else f"{verdict.badness:.1f}"
     reasons = "".join(f"<li>{escape(reason)}</li>" for reason in verdict.reasons)
     shown = ""
@@ -156,9 +145,9 @@ def _figure_table(f: ScanFigures) -> str:
     rows = (("distance, mean", f"{1000 * f.distance:.2f} mm"), ("distance, RMS", f"{1000 * f.rms:.2f} mm"),
             ("with data", f"{100 * f.seen:.0f}%"), ("confidence, mean", f"{f.confidence:.2f}"),
             ("scan off the template", f"{100 * f.missed:.1f}%"),
-            ("stretched or shrunk", f"{100 * f.stretch:.1f}%"), ("flipped triangles", f"{f.flipped}"),
+            ("stretched or shrunk", f"{100 * f.stretch:.1f}%"), ("inverted triangles", f"{f.inverted}"),
             ("landmarks off, RMS", "–" if np.isnan(f.landmarks) else f"{1000 * f.landmarks:.1f} mm"),
-            ("settled", "yes" if f.converged else "no"))
+            ("converged", "yes" if f.converged else "no"))
     return "<table>" + "".join(f'<tr><td>{name}</td><td class="number">{value}</td></tr>'
                                for name, value in rows) + "</table>"
 

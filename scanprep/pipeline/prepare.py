@@ -54,22 +54,12 @@ class PrepareConfig(Settings):
 
 @dataclass(frozen=True, eq=False)
 class Prepared:
-    """What `prepare` did.
-
-    Attributes
-    ----------
-    registered : RegisteredSet
-    figures : tuple of ScanFigures, of all scans in the set
-    failures : tuple of str
-        One line a scan that could not be registered: which file, and why.
-    fresh : int
-        Scans that were registered now; the others had been before.
-    """
+    """What `prepare` did."""
 
     registered: RegisteredSet
-    figures: tuple[ScanFigures, ...]
-    failures: tuple[str, ...]
-    fresh: int = 0
+    figures: tuple[ScanFigures, ...]    # of all scans in the set
+    failures: tuple[str, ...]           # one line a scan that could not be registered: which file, and why
+    fresh: int = 0                      # scans that were registered now; the others had been before
 
 
 def prepare(tasks: Sequence[ScanTask], template: Mesh, template_landmarks: Mapping[str, int], folder: str | Path,
@@ -77,31 +67,12 @@ def prepare(tasks: Sequence[ScanTask], template: Mesh, template_landmarks: Mappi
             skeleton_progress: Progress | None = None) -> Prepared:
     """Register the template to every scan, find the skeleton, and write a page that shows how it went.
 
-    What the folder already holds is done anew only where something that it depends on has changed: a scan, its
-    landmarks, the template, the settings; for the skeleton any mesh of its subject. So the same call goes on where it
-    was interrupted. A scan that cannot be read or registered is listed and the others go on. Scans of earlier calls
-    stay in the set. A skeleton that was edited since it was found stays as it is.
-
-    What is written does not depend on the number of workers, on their order or on interruptions; only `times.csv`
-    does.
-
-    Parameters
-    ----------
-    tasks : from `find_scans`
-    template : Mesh
-        One connected manifold component.
-    template_landmarks : name -> vertex
-        May be empty where no scan has landmarks.
-    folder : path
-        Of the registered set.
-
-    Raises
-    ------
-    ValueError
-        A template that cannot serve, a folder where another run is at work, or that holds other scans registered with
-        another template or settings, a scheduler that does not answer.
-    ForeignFileError
-        A folder with files that scapekit did not make.
+    What the folder already holds is done again only where something that it depends on has changed: a scan, its
+    landmarks, the template, the settings; for the skeleton any mesh of its subject. A scan that cannot be read or
+    registered is listed and the others go on. Scans of earlier calls stay in the set. A skeleton that was edited since
+    it was found stays as it is. Nothing that is written depends on the number of workers, their order or interruptions,
+    but for `times.csv`. ValueError for a template that cannot serve, or a folder that holds other scans registered
+    with another template or settings.
     """
     config = config or PrepareConfig()
     check_template(template)

@@ -3,11 +3,10 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Annotated
 
 import numpy as np
 
-from ..ranges import FLAG, Settings
+from ..ranges import Settings
 from .figures import Failure, ScanFigures
 
 
@@ -28,41 +27,31 @@ class Limits(Settings):
         Share of vertices without data, above what is usual in the set (its median).
     stretch : float
         Share of the surface stretched or shrunk to the double or half.
-    flipped : float
+    inverted : float
         Share of the triangles that face against their surroundings.
     landmarks : float
         RMS distance of the landmarks, over the size.
-    unsettled : float
+    not_converged : float
         What a registration that did not converge counts, as a multiple of a limit; below 1 it is not suspect for
         that alone.
     """
 
-    missed: Annotated[float, FLAG] = 0.005
-    distance: Annotated[float, FLAG] = 0.002
-    unseen: Annotated[float, FLAG] = 0.15
-    stretch: Annotated[float, FLAG] = 0.02
-    flipped: Annotated[float, FLAG] = 0.001
-    landmarks: Annotated[float, FLAG] = 0.015
-    unsettled: Annotated[float, FLAG] = 0.5
+    missed: float = 0.005
+    distance: float = 0.002
+    unseen: float = 0.15
+    stretch: float = 0.02
+    inverted: float = 0.001
+    landmarks: float = 0.015
+    not_converged: float = 0.5
 
 
 @dataclass(frozen=True)
 class Verdict:
-    """What is to be thought of one scan.
-
-    Attributes
-    ----------
-    name : str
-    badness : float
-        The largest multiple of a limit; from 1 on the scan needs a look. Infinite for one that failed.
-    reasons : tuple of str
-        What is over its limit, worst first; for a scan that failed, why.
-    figures : ScanFigures or None
-    """
+    """What is to be thought of one scan."""
 
     name: str
-    badness: float
-    reasons: tuple[str, ...]
+    badness: float                  # the largest multiple of a limit; from 1 on it needs a look; infinite: it failed
+    reasons: tuple[str, ...]        # what is over its limit, worst first; for a scan that failed, why
     figures: ScanFigures | None = None
 
     @property
@@ -78,19 +67,9 @@ class Verdict:
 
 def review(figures: Sequence[ScanFigures], failures: Sequence[Failure], size: float, faces: int,
            limits: Limits | None = None) -> list[Verdict]:
-    """Judge all scans of a set.
+    """Judge all scans of a set, worst first: failures, then by falling badness.
 
-    Parameters
-    ----------
-    size : float, metres
-        Of the template: the root of its area.
-    faces : int
-        Triangles of the template.
-
-    Returns
-    -------
-    list of Verdict
-        Worst first: failures, then by falling badness.
+    `size` is the root of the template's area in metres, `faces` its number of triangles.
     """
     limits = limits or Limits()
     usual = float(np.median([1 - f.seen for f in figures])) if figures else 0.0
@@ -110,9 +89,9 @@ def _judge(f: ScanFigures, size: float, faces: int, usual: float, limits: Limits
             (1 - f.seen - usual) / limits.unseen,
         f"{100 * f.stretch:.1f}% of the surface stretched or shrunk to the double or half":
             f.stretch / limits.stretch,
-        f"{f.flipped} triangles flipped": f.flipped / faces / limits.flipped,
+        f"{f.inverted} triangles inverted": f.inverted / faces / limits.inverted,
         f"landmarks {1000 * f.landmarks:.0f} mm off": f.landmarks / (limits.landmarks * size),
-        "not converged": 0.0 if f.converged else limits.unsettled,
+        "not converged": 0.0 if f.converged else limits.not_converged,
         "nowhere near the scan": 0.0 if f.seen else 100.0}
     over = {reason: value for reason, value in over.items() if np.isfinite(value)}
     reasons = sorted((reason for reason, value in over.items() if value >= 1), key=lambda reason: -over[reason])

@@ -3,24 +3,26 @@ from __future__ import annotations
 
 import time
 from dataclasses import dataclass, field, replace
-from typing import Literal
+from typing import Annotated, Literal
 
 import numpy as np
 
 from ..cleaning.clean_scan import CleanScanConfig, clean_scan
 from ..correspondence.correlated import CorrelatedConfig, find_correspondences
 from ..correspondence.correspondences import Correspondences
+from ..geometry.files import read_scan
 from ..geometry.landmarks import check_on_surface, match_landmarks, read_landmarks
 from ..geometry.mesh import Mesh
 from ..meaning import extent
-from ..ranges import Settings
+from ..ranges import FLAG, Settings
 from ..registration.confidence import stretched_share
-from ..registration.nonrigid import Registration, RegistrationConfig, register, registration_problem
+from ..registration.nonrigid import Registration, register, registration_problem
+from ..registration.schedule import RegistrationConfig
 from ..threads import one_thread
 from .figures import ScanFigures
-from .scans import ScanTask, read_scan
+from .scans import ScanTask
 
-Guide = Literal["best", "landmarks", "automatic", "pose"]
+Init = Literal["best", "landmarks", "automatic", "pose"]
 
 OTHER_UNIT = 30                # times larger or smaller than the template: a scan in inches, centimetres, millimetres
 Landmarks = tuple[np.ndarray, np.ndarray]
@@ -35,7 +37,7 @@ class ScanSettings(Settings):
     registration : RegistrationConfig
     unit : 'm', 'mm', 'cm' or 'in', optional
         Of the scan and its landmarks, where the files cannot tell.
-    guide : 'best', 'landmarks', 'automatic' or 'pose'
+    init : 'best', 'landmarks', 'automatic' or 'pose'
         What leads the template to the scan: its landmark file (a scan without is a failure); correspondences that
         are found with no landmarks; or nothing but the pose, which must be near that of the template. 'best' takes
         landmarks where there are some and correspondences elsewhere.
@@ -48,8 +50,8 @@ class ScanSettings(Settings):
     """
 
     registration: RegistrationConfig = field(default_factory=RegistrationConfig)
-    unit: str | None = None
-    guide: Guide = "best"
+    unit: Annotated[Literal["m", "mm", "cm", "in"] | None, FLAG] = None
+    init: Annotated[Init, FLAG] = "best"
     correspondences: CorrelatedConfig = field(default_factory=CorrelatedConfig)
     clean: CleanScanConfig | None = None
     pictures: bool = True
@@ -57,30 +59,16 @@ class ScanSettings(Settings):
 
 @dataclass(frozen=True, eq=False)
 class RegisteredScan:
-    """What a scan became.
+    """What a scan became."""
 
-    Attributes
-    ----------
-    vertices : (N, 3) float, metres
-    figures : ScanFigures
-    picture : bytes
-        A strip of small pictures as a WebP file; empty where none were asked for.
-    """
-
-    vertices: np.ndarray
+    vertices: np.ndarray            # (N, 3), metres
     figures: ScanFigures
-    picture: bytes = b""
+    picture: bytes = b""            # a strip of small pictures as a WebP file; empty where none were asked for
 
 
 def register_scan(task: ScanTask, template: Mesh, template_landmarks: dict[str, int],
                   settings: ScanSettings | None = None) -> RegisteredScan:
-    """Read and register one scan.
-
-    Raises
-    ------
-    ValueError
-        A file that cannot be read, landmarks that do not match, a registration that means nothing.
-    """
+    """Read and register one scan; ValueError for files that cannot be read, or a registration that means nothing."""
     settings = settings or ScanSettings()
     start = time.perf_counter()
     with one_thread():
@@ -98,9 +86,9 @@ def register_scan(task: ScanTask, template: Mesh, template_landmarks: dict[str, 
             from .pictures import strip
 
             picture = strip(template, scan, fit)
-    guide = (f"{len(landmarks[0])} landmarks" if landmarks is not None else
+    init = (f"{len(landmarks[0])} landmarks" if landmarks is not None else
              f"{len(pairs)} correspondences" if pairs is not None else "pose")
-    figures = _measure(task, template, fit, guide)
+    figures = _measure(task, template, fit, init)
     return RegisteredScan(fit.mesh.vertices, replace(figures, removed=removed, seconds=time.perf_counter() - start),
                           picture)
 
@@ -115,7 +103,7 @@ def _check_unit(task: ScanTask, scan: Mesh | np.ndarray, template: Mesh) -> None
 def _landmarks(task: ScanTask, scan: Mesh | np.ndarray, template_landmarks: dict[str, int], settings: ScanSettings
                ) -> Landmarks | None:
     """Vertices of the template and points of the scan, or None where landmarks are not wanted or not there."""
-    if settings.guide in ("automatic", "pose") or (task.landmarks is None and settings.guide == "best"):
+    if settings.init in ("automatic", "pose") or (task.landmarks is None and settings.init == "best"):
         return None
     if task.landmarks is None:
         raise ValueError(f"{task.scan}: expected a landmark file of the name {task.name}, found none")
@@ -130,12 +118,12 @@ def _landmarks(task: ScanTask, scan: Mesh | np.ndarray, template_landmarks: dict
 def _correspondences(template: Mesh, scan: Mesh | np.ndarray, landmarks: Landmarks | None, settings: ScanSettings
                      ) -> Correspondences | None:
     """What leads the template where landmarks do not, or None where its pose is to do."""
-    if landmarks is not None or settings.guide == "pose":
+    if landmarks is not None or settings.init == "pose":
         return None
     try:
         return find_correspondences(template, scan, config=settings.correspondences)
     except ValueError as error:
-        raise ValueError(f"{error} (a landmark file, or the guide 'pose', needs no ends of limbs)") from None
+        raise ValueError(f"{error} (a landmark file, or --init pose, needs no ends of limbs)") from None
 
 
 def _cleaned(scan: Mesh | np.ndarray, landmarks: Landmarks | None, config: CleanScanConfig | None
@@ -147,8 +135,8 @@ def _cleaned(scan: Mesh | np.ndarray, landmarks: Landmarks | None, config: Clean
     return found.scan, 1 - float(found.kept.mean())
 
 
-def _measure(task: ScanTask, template: Mesh, fit: Registration, guide: str) -> ScanFigures:
+def _measure(task: ScanTask, template: Mesh, fit: Registration, init: str) -> ScanFigures:
     return ScanFigures(
-        task.name, guide, float(np.nanmean(fit.distances)) if fit.seen.any() else np.nan, fit.rms,
-        float(fit.seen.mean()), float(fit.confidence.mean()), fit.missed,
-        stretched_share(template, fit.mesh), fit.landmark_rms, fit.flipped, fit.converged)
+        task.name, init, float(np.nanmean(fit.distances)) if fit.seen.any() else np.nan, fit.rms,
+        float(fit.seen.mean()), float(fit.confidence.mean()), fit.uncovered,
+        stretched_share(template, fit.mesh), fit.landmark_rms, fit.inverted, fit.converged)

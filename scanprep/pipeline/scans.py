@@ -4,31 +4,18 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from pathlib import Path
 
-import numpy as np
-
 from ..geometry import storage, tables
-from ..geometry.files import MeshFileError, read_mesh, read_points
-from ..geometry.mesh import Mesh
+from ..geometry.files import MeshFileError
+from ..geometry.landmarks import landmarks_beside
 
-LANDMARK_ENDINGS = (".json", ".mrk.json", ".landmarks.json", ".pp", "_picked_points.pp", ".lnd", ".landmarks.txt")
 SCAN_ENDINGS = (".ply", ".ply.gz", ".obj", ".stl", ".off", ".glb", ".xyz", ".pcd", ".pts")
-POINT_ENDINGS = (".xyz", ".pcd", ".txt", ".pts")
 TABLE = "scans.csv"
 ABOUT = {"digest": False}         # what is only told in tables: no registration depends on it
 
 
 @dataclass(frozen=True)
 class ScanTask:
-    """One scan of a folder and what is known of it.
-
-    Attributes
-    ----------
-    name : str
-    scan : Path
-    landmarks : Path or None
-    subject, pose, sex : str
-        Empty where not known.
-    """
+    """One scan of a folder and what is known of it; empty where nothing is."""
 
     name: str
     scan: Path
@@ -39,29 +26,12 @@ class ScanTask:
 
 
 def find_scans(folder: str | Path, landmarks: str | Path | None = None, subject: str = "") -> list[ScanTask]:
-    """The scans of a folder, their landmark files, and what `scans.csv` says of them.
+    """The scans of a folder sorted by name, their landmark files, and what `scans.csv` says of them.
 
-    Parameters
-    ----------
-    folder : path
-        Meshes or point clouds, not those of the folders inside it; a scan that consists of several views is
-        merged first. `scans.csv`, where there is one, has the columns name, subject, pose, sex (any of the last
-        three may be missing).
-    landmarks : path, optional
-        Folder of the landmark files, by default `landmarks` inside the folder or the folder itself. A file
-        belongs to the scan of the same name.
-    subject : str
-        Whose scans they are, where `scans.csv` does not say; when empty, every scan is a subject of its own.
-
-    Returns
-    -------
-    list of ScanTask
-        Sorted by name: the part of the file name before its first dot.
-
-    Raises
-    ------
-    ValueError
-        No such folder, no scans, two scans of one name, a table without names or with unknown ones.
+    The name is the part of the file name before its first dot; a landmark file has the same name, in `landmarks`, in
+    the folder `landmarks` inside, or beside the scan. `scans.csv` has the columns name, subject, pose, sex. Where it
+    does not say whose scan it is, it is of `subject`, or when that is empty of a person of its own. ValueError for no
+    scans, two scans of one name, a table with unknown names.
     """
     folder = Path(folder)
     paths = _list_scans(folder)
@@ -75,22 +45,10 @@ def find_scans(folder: str | Path, landmarks: str | Path | None = None, subject:
     tasks = []
     for name, path in sorted(paths.items()):
         row = about.get(name, {})
-        candidates = [place / (name + ending) for place in places for ending in LANDMARK_ENDINGS]
-        tasks.append(ScanTask(name, path, next((c for c in candidates if c.is_file()), None),
+        beside = (landmarks_beside(path, place) for place in places)
+        tasks.append(ScanTask(name, path, next(filter(None, beside), None),
                               row.get("subject") or subject or name, row.get("pose") or "", row.get("sex") or ""))
     return tasks
-
-
-def read_scan(path: str | Path, unit: str | None = None) -> Mesh | np.ndarray:
-    """A scan as a mesh, or as points (n, 3) where the file has no triangles."""
-    if Path(path).suffix.lower() in POINT_ENDINGS:
-        return read_points(path, unit).points
-    try:
-        return read_mesh(path, unit)
-    except ValueError as error:
-        if "no faces" in str(error):
-            return read_points(path, unit).points
-        raise
 
 
 def _list_scans(folder: Path) -> dict[str, Path]:

@@ -41,24 +41,10 @@ class TemplateConfig(Settings):
 
 def make_template(views: Sequence[Any], faces: int = 14000, config: TemplateConfig | None = None,
                   progress: Callable[[int, int], None] | None = None) -> Mesh:
-    """Merge, repair, smooth, fill and decimate.
+    """Range views of one subject to a closed manifold mesh: merge, repair, smooth, fill, decimate.
 
-    Parameters
-    ----------
-    views : sequence of RangeView, or of (Mesh, camera position (3,)) pairs
-    faces : int
-    config : TemplateConfig, optional
-    progress : callback(done, total), optional
-
-    Returns
-    -------
-    Mesh
-        Closed, one component, manifold, with well-shaped triangles.
-
-    Raises
-    ------
-    ValueError
-        The views do not give a surface that can serve as a template.
+    Views are RangeViews or pairs of a Mesh and a camera position (3,). ValueError where they give no surface that can
+    serve as a template.
     """
     config = config or TemplateConfig()
     tell = progress or (lambda done, total: None)

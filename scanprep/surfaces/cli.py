@@ -16,10 +16,9 @@ from ..decimation.decimate import DecimateConfig, decimate
 from ..decimation.registered_set import DecimateSetConfig, write_decimated_set
 from ..fusion.tsdf import MergeConfig, merge_views
 from ..geometry import storage
-from ..geometry.files import UNITS, PointCloud, list_meshes, read_mesh, write_mesh, write_points
-from ..geometry.landmarks import read_landmark_vertices, read_landmarks
+from ..geometry.files import UNITS, PointCloud, list_meshes, read_mesh, read_scan, write_mesh, write_points
+from ..geometry.landmarks import landmarks_beside, read_landmark_vertices, read_landmarks
 from ..geometry.mesh import Mesh
-from ..pipeline.scans import LANDMARK_ENDINGS, read_scan
 from ..pipeline.template import make_template
 from ..ranges import Faces
 from ..repair.hole_filling import FillConfig, FilledHole, fill_holes, fill_report
@@ -113,10 +112,8 @@ def align_cameras(views: ViewsArg, output: Output, cameras: Path | None = None, 
 
 def _view_landmarks(folder: Path, name: str, view: Mesh, unit: Unit | None) -> dict[str, np.ndarray]:
     """The landmarks of one view; none where it has no file."""
-    for ending in LANDMARK_ENDINGS:
-        if (folder / (name + ending)).is_file():
-            return read_landmarks(folder / (name + ending), view, unit)
-    return {}
+    path = landmarks_beside(name, folder)
+    return read_landmarks(path, view, unit) if path else {}
 
 
 def merge(views: ViewsArg, output: Output, cameras: Path | None = None, unit: Unit | None = None,

@@ -23,16 +23,16 @@ from scipy.sparse import csc_array, diags_array, eye_array
 
 from model.statue.control.humanoid import humanoid
 from model.statue.registration.local_shape import LocalShape, local_shape
-from model.statue.registration.surface_data import distortion
-from model.statue.registration.surface_fit import SurfaceFitConfig, fit_surface
+from model.statue.registration.surface_fit import SurfaceFitConfig, distortion, fit_surface
 from scanprep.alignment.icp import align_landmarks, apply
 from scanprep.geometry.mesh import Mesh
-from scanprep.geometry.sparse import Factored
+from scanprep.geometry.sparse import Factored, conjugate_gradients
 from scanprep.geometry.surface import Surface
-from scanprep.registration.final_fit import settle
-from scanprep.registration.nonrigid import RegistrationConfig, register
-from scanprep.registration.shell import conjugate_gradients, flipped, unfold
-from scanprep.registration.vertex_rotations import turns
+from scanprep.geometry.target import target_of
+from scanprep.registration.final_fit import final_fit
+from scanprep.registration.inverted_triangles import inverted_triangles, unfold
+from scanprep.registration.nonrigid import register
+from scanprep.registration.schedule import RegistrationConfig
 
 # Landmarks of the control model and their names on the real bodies.
 NAMES = {"right toe": "toe in right leg", "left toe": "toe in left leg", "right knee": "knee in right leg",
@@ -60,7 +60,7 @@ def quality(rest: Mesh, x: np.ndarray, scan: Mesh) -> dict[str, float]:
     return {"vertices_rms_mm": 1e3 * np.sqrt(np.mean(own**2)), "vertices_p99_mm": 1e3 * np.quantile(own, 0.99),
             "vertices_max_mm": 1e3 * own.max(), "scan_rms_mm": 1e3 * np.sqrt(np.mean(found.distances**2)),
             "scan_max_mm": 1e3 * found.distances.max(), "distortion": distortion(rest, x),
-            "inverted": float(flipped(rest, x, turns(rest, x)).sum()), "scan_against_percent": 100 * against.mean()}
+            "inverted": float(inverted_triangles(rest, x).sum()), "scan_against_percent": 100 * against.mean()}
 
 
 def timed(make: Callable[[], np.ndarray]) -> tuple[np.ndarray, dict[str, float]]:
@@ -81,14 +81,14 @@ def fits(name: str, body: Mesh, marks: tuple[np.ndarray, np.ndarray]) -> list[di
 
     rest = humanoid().mesh
     scan = Mesh(*igl.loop(body.vertices, body.faces, 1))
-    start = register(rest, body, marks, RegistrationConfig(shell=(), settle=None)).mesh.vertices
+    start = register(rest, body, marks, RegistrationConfig(final_fit=None)).mesh.vertices
 
-    def settled() -> np.ndarray:
-        x = settle(rest, start, scan).vertices
-        return unfold(rest, x, turns(rest, x))
+    def finally_fitted() -> np.ndarray:
+        x = final_fit(rest, start, target_of(scan)).vertices
+        return unfold(rest, x)
 
     made = {"start": (start, {}), "register": timed(lambda: register(rest, scan, marks).mesh.vertices),
-            "settle": timed(settled)}
+            "final fit": timed(finally_fitted)}
     for way, config in WAYS.items():
         made[way] = timed(partial(fitted, rest, start, scan, config))
     return [{"scan": name, "way": way, **quality(rest, x, scan), **seconds} for way, (x, seconds) in made.items()]

@@ -16,12 +16,12 @@ from scanprep.pictures.page import Page
 
 from ...cli import rows
 from ...motion import Motion
-from ..artefacts.robust import motion_problem
 from ..files.markers import MarkerSequence, read_markers
 from ..files.motion_tables import write_joint_angles, write_joint_centres, write_motion_bvh, write_residuals
 from ..marker_sets.layout import MarkerLayout
 from ..marker_sets.named import fitting_layout, layout_names
 from ..pose.follow import AnimateConfig, animate
+from ..pose.robust import motion_problem
 from ..retargeting.retarget import morphed_vertices, retarget
 from ..subject.marker_shape import MarkerShapeConfig, subject_from_markers
 from .report import motion_page

@@ -5,16 +5,16 @@ from functools import partial
 
 import numpy as np
 
-from ...solve import MinimiseConfig, descend
+from scanprep.geometry.least_squares import Minimum, levenberg_marquardt
+
+from ..pose.robust import marker_weights
 from ..settings import FaultConfig
-from .robust import marker_weights
 from .simulated import Simulation
 from .swaps import AWAY, WORTH, best_stretches, loose_ends
 from .tracks import Tracks
 
 CLOSE = 0.25                         # metres between markers whose exchange a body can follow
 SAMPLES = 3                          # frames of a stretch in which both ways are tried
-STEPS = MinimiseConfig(iterations=8, tolerance=1e-3)
 
 
 def doubtful_pairs(pairs: set[tuple[int, int]], places: np.ndarray) -> list[tuple[int, int]]:
@@ -65,9 +65,14 @@ def _gains(body: Simulation, x: np.ndarray, positions: np.ndarray, a: int, b: in
     weights, _ = marker_weights(body.positions(x), targets, body.config.marker_sd, body.config.outlier)
     without, full = weights.copy(), weights
     without[:, own], full[:, own] = 0, body.config.marker_sd**-2
-    start = descend(partial(body.body.system, targets=targets, weights=without), x, STEPS, body.body.retract).x
+    start = _solved(body, x, targets, without).x
     other = targets.copy()
     other[:, own] = targets[:, own[::-1]]
-    costs = [descend(partial(body.body.system, targets=way, weights=full), start, STEPS, body.body.retract).energy
-             for way in (targets, other)]
+    costs = [_solved(body, start, way, full).energy for way in (targets, other)]
     return 0.5 * (costs[0] - costs[1])
+
+
+def _solved(body: Simulation, x: np.ndarray, targets: np.ndarray, weights: np.ndarray) -> Minimum[np.ndarray]:
+    """Frames (n, P) after a few steps towards targets (n, L, 3)."""
+    return levenberg_marquardt(partial(body.body.system, targets=targets, weights=weights), x, iterations=8,
+                               tolerance=1e-3, retract=body.body.retract)

@@ -10,10 +10,10 @@ from model.linear import Subject
 from ...motion import Motion
 from ..files.markers import MarkerSequence
 from ..marker_sets.layout import MarkerLayout
+from ..pose.robust import marker_weights
 from ..results import BadSpan, MarkerFaults
 from ..settings import FaultConfig
 from .ambiguous_swaps import doubtful_pairs, exchanged_after_all
-from .robust import marker_weights
 from .simulated import Simulation, bridged, usual_places
 from .slips import find_bad, without_lost_limbs
 from .swaps import Evidence, find_order, listed, marker_levels, pairs_that_jump

@@ -8,9 +8,9 @@ import numpy as np
 
 from model.body import BodyModel
 from scanprep.geometry import rotations
+from scanprep.geometry.least_squares import Dense, levenberg_marquardt
 
 from ...priors import gaussian_prior
-from ...solve import MinimiseConfig, descend
 from .points import BodyPoints
 from .settings import DesignConfig
 
@@ -82,17 +82,16 @@ def fit_points(points: BodyPoints, targets: np.ndarray, weights: np.ndarray, pri
         some = slice(begin, begin + size)
         goal, known = targets[some], prior.of(some)
 
-        def system(x: np.ndarray, goal: np.ndarray = goal, known: Prior = known
-                   ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        def system(x: np.ndarray, goal: np.ndarray = goal, known: Prior = known) -> Dense:
             at = points.follow(x)
             residual = (root * (at.positions - goal)).reshape(len(x), -1, 1)
             J = (root[..., None] * at.jacobian).reshape(len(x), -1, x.shape[1])
             transposed = np.swapaxes(J, -1, -2)
             energy, slope = known.system(x)
-            return (residual**2).sum(axis=(1, 2)) + energy, (transposed @ residual)[..., 0] + slope, \
-                transposed @ J + known.precision
+            return Dense((residual**2).sum(axis=(1, 2)) + energy, (transposed @ residual)[..., 0] + slope,
+                         transposed @ J + known.precision)
 
-        found[some] = descend(system, start[some], MinimiseConfig(iterations, tolerance=1e-4)).x
+        found[some] = levenberg_marquardt(system, start[some], iterations, 1e-4).x
         if tell is not None:
             tell(min(begin + size, len(start)))
     return found

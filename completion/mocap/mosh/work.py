@@ -18,10 +18,10 @@ from scanprep.pictures.views import upright
 
 from ..animate.report import morph_frames
 from ..animate.work import choose_layout, key_frames, write_glb
-from ..artefacts.robust import motion_problem
 from ..artefacts.virtual import fault_table
 from ..files.markers import MarkerSequence, read_markers
 from ..marker_sets.layout import MarkerLayout
+from ..pose.robust import motion_problem
 from ..results import MoshResult
 from ..retargeting.pictures import picture_transfer, write_character
 from ..retargeting.retarget import retarget

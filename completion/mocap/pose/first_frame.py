@@ -6,18 +6,16 @@ from functools import partial
 import numpy as np
 
 from scanprep.geometry import rotations
+from scanprep.geometry.least_squares import Minimum, levenberg_marquardt
 
 from ...priors import typical_poses
-from ...solve import MinimiseConfig, Minimum, descend
 from ...starts import ANNEALING
-from ..artefacts.robust import marker_weights
 from .marked_body import MarkedBody
+from .robust import marker_weights
 from .settings import AnimateConfig
 
 STARTS = 2                           # of a search that are followed to their end
 ROUNDS = 5                           # in which outliers of a search are found
-ROUGH = MinimiseConfig(iterations=8, tolerance=1e-3)
-SETTLED = MinimiseConfig(iterations=30)
 
 
 def search(body: MarkedBody, targets: np.ndarray, config: AnimateConfig) -> np.ndarray:
@@ -28,22 +26,23 @@ def search(body: MarkedBody, targets: np.ndarray, config: AnimateConfig) -> np.n
     x = _laid_on(body, typical_poses(body.body.pose_mean, body.body.pose_covariance, config.start_axes), targets)
     weights = np.full(body.count, config.marker_sd**-2)
     for stiff in ANNEALING:
-        end = _descend(body, x, targets, weights, ROUGH, stiff / config.prior_weight if config.prior_weight else 0.0)
+        end = _solved(body, x, targets, weights, stiff / config.prior_weight if config.prior_weight else 0.0,
+                      iterations=8, tolerance=1e-3)
         x = end.x
     x = x[np.argsort(end.energy)[:STARTS]]
     for _ in range(ROUNDS):                                             # with all markers, then with the likely ones
-        end = _descend(body, x, targets, weights, SETTLED)
+        end = _solved(body, x, targets, weights)
         x = end.x[np.argmin(end.energy)][None]
         weights, _ = marker_weights(body.positions(x[0]), targets, config.marker_sd, config.outlier)
     return x[0]
 
 
-def _descend(body: MarkedBody, x: np.ndarray, targets: np.ndarray, weights: np.ndarray, config: MinimiseConfig,
-             stiff: float = 1.0) -> Minimum:
+def _solved(body: MarkedBody, x: np.ndarray, targets: np.ndarray, weights: np.ndarray, stiff: float = 1.0,
+            iterations: int = 30, tolerance: float = 1e-5) -> Minimum[np.ndarray]:
     """All starts (n, P) on the same markers; `stiff` is a factor on the pose prior."""
     system = partial(body.system, targets=np.broadcast_to(targets, (len(x), *targets.shape)),
                      weights=np.broadcast_to(weights, (len(x), len(weights))), stiff=stiff)
-    return descend(system, x, config, body.retract)
+    return levenberg_marquardt(system, x, iterations, tolerance, retract=body.retract)
 
 
 def _laid_on(body: MarkedBody, poses: np.ndarray, targets: np.ndarray) -> np.ndarray:

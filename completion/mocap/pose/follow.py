@@ -11,7 +11,6 @@ from scanprep.threads import one_thread
 
 from ...energy import MovingPoints
 from ...motion import Motion
-from ..artefacts.robust import LabelWatch, exchangeable, marker_weights
 from ..files.markers import MarkerSequence
 from ..marker_sets.layout import MarkerLayout
 from .first_frame import search
@@ -20,6 +19,7 @@ from .lowpass import low_pass
 from .marked_body import MarkedBody
 from .prediction import inertia
 from .reinitialise import rescue_limbs
+from .robust import LabelWatch, exchangeable, marker_weights
 from .settings import AnimateConfig
 from .smooth import smooth_sequence
 from .stream import Tracker, judge

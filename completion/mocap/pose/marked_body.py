@@ -6,6 +6,7 @@ import numpy as np
 from model.features import twists
 from model.linear import Subject
 from scanprep.geometry import rotations
+from scanprep.geometry.least_squares import Dense
 from scanprep.geometry.mesh import Mesh
 
 from ...bodies import FixedBody
@@ -61,7 +62,7 @@ class MarkedBody:
         return moving_points(np.swapaxes(y, -1, -2),
                              by_pose.transpose(0, 3, 2, 1, 4).reshape(B, self.count, 3, 3 * J))
 
-    def system(self, x: np.ndarray, targets: np.ndarray, weights: np.ndarray, stiff: float = 1.0) -> System:
+    def system(self, x: np.ndarray, targets: np.ndarray, weights: np.ndarray, stiff: float = 1.0) -> Dense:
         """Markers and pose prior: energy (B,), half its gradient (B, P) and Gauss-Newton matrix (B, P, P).
 
         Parameters
@@ -82,7 +83,7 @@ class MarkedBody:
         prior = self.prior_system(pose, stiff)
         gradient[:, :n] += prior[1]
         hessian[:, :n, :n] += prior[2]
-        return energy + prior[0], gradient, hessian
+        return Dense(energy + prior[0], gradient, hessian)
 
     def prior_system(self, pose: np.ndarray, stiff: float = 1.0) -> System:
         """The pose prior at poses (B, J, 3): energy (B,), half its gradient (B, 3J), its matrix (B, 3J, 3J)."""

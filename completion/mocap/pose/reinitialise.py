@@ -3,10 +3,11 @@ from __future__ import annotations
 
 import numpy as np
 
+from scanprep.geometry.least_squares import Dense, levenberg_marquardt
+
 from ... import energy
-from ...solve import MinimiseConfig, descend
-from ..artefacts.robust import misfit
-from .marked_body import MarkedBody, System
+from .marked_body import MarkedBody
+from .robust import misfit
 from .settings import AnimateConfig
 
 SEVERAL, FAR = 3, 2.0                # markers of a frame that are so many times an outlier's residual away
@@ -54,10 +55,10 @@ def _from_far(body: MarkedBody, x: np.ndarray, targets: np.ndarray, config: Anim
     for scale in SCALES:
         weights = energy.geman_mcclure(np.nan_to_num(_apart(body, x, targets)), scale) / config.marker_sd**2
 
-        def system(x: np.ndarray, weights: np.ndarray = weights) -> System:
+        def system(x: np.ndarray, weights: np.ndarray = weights) -> Dense:
             return body.system(x, targets, weights)
 
-        x = descend(system, x, MinimiseConfig(STEPS, 1e-3, 1e-3), body.retract).x
+        x = levenberg_marquardt(system, x, STEPS, 1e-3, 1e-3, retract=body.retract).x
     return x
 
 

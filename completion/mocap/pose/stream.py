@@ -7,13 +7,13 @@ from dataclasses import dataclass
 import numpy as np
 
 from model.linear import Subject
+from scanprep.geometry.least_squares import Dense, Minimum, levenberg_marquardt
 
-from ...solve import MinimiseConfig, Minimum, descend
-from ..artefacts.robust import LabelWatch, distances_apart, marker_weights, misfit
 from ..marker_sets.layout import MarkerLayout
 from .first_frame import search
-from .marked_body import MarkedBody, System
+from .marked_body import MarkedBody
 from .prediction import make_prediction
+from .robust import LabelWatch, distances_apart, marker_weights, misfit
 from .settings import AnimateConfig
 
 ENOUGH = 0.5                         # share of the markers that a search wants
@@ -166,7 +166,7 @@ class Tracker:
         if found is not None:
             self.begin(x)
         else:
-            self.prediction.update(x, end.hessian[0] - information)
+            self.prediction.update(x, end.equations.hessian[0] - information)
         return x, settled
 
     def _found(self, targets: np.ndarray) -> np.ndarray | None:
@@ -202,18 +202,19 @@ class Tracker:
         apart = apart[~np.isnan(apart)]
         return bool(np.median(apart) > self.config.lost or (apart > self.config.outlier).mean() > BELIED)
 
-    def solve(self, targets: np.ndarray, expected: np.ndarray, information: np.ndarray) -> Minimum:
+    def solve(self, targets: np.ndarray, expected: np.ndarray, information: np.ndarray) -> Minimum[np.ndarray]:
         """The best unknowns of a frame near the expected ones, which put the markers where `places` says."""
         config, body = self.config, self.body
         weights, _ = marker_weights(self.places, targets, config.marker_sd, config.outlier)
 
-        def system(x: np.ndarray) -> System:
+        def system(x: np.ndarray) -> Dense:
             cost, gradient, hessian = body.system(x, targets[None], weights[None])
             step = body.step_to(expected, x[0])
             pull = information @ step
-            return cost + step @ pull, gradient + pull, hessian + information
+            return Dense(cost + step @ pull, gradient + pull, hessian + information)
 
-        return descend(system, expected[None], MinimiseConfig(config.iterations, 1e-4, 1e-2), body.retract)
+        return levenberg_marquardt(system, expected[None], config.iterations, 1e-2, 1e-4,
+                                   retract=body.retract)
 
 
 def _apart(a: np.ndarray, b: np.ndarray) -> float:

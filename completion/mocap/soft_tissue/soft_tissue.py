@@ -10,12 +10,12 @@ from model.body import BodyModel
 from scanprep.threads import one_thread
 
 from ...motion import Motion
-from ..artefacts.robust import marker_weights
 from ..files.markers import MarkerSequence
 from ..marker_sets.layout import MarkerLayout
 from ..pose.marked_body import BATCH
 from ..pose.mosh_poses import RATE, animate_config
 from ..pose.prediction import inertia
+from ..pose.robust import marker_weights
 from ..pose.smooth import FURTHEST, coupled_steps
 from ..results import SoftTissue
 from ..settings import FollowConfig, SoftTissueConfig

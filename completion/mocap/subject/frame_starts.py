@@ -9,11 +9,11 @@ from scipy.spatial import cKDTree
 from model.body import BodyModel
 from model.linear import Subject
 from scanprep.geometry import rotations
+from scanprep.geometry.least_squares import Residual, levenberg_marquardt, normal_equations
 
 from ... import energy
 from ...bodies import FixedBody
 from ...priors import GaussianPrior
-from ...solve import MinimiseConfig, minimise
 from ...starts import search
 from ..marker_sets.layout import MarkerLayout, most_used
 from ..pose.marked_body import MarkedBody
@@ -79,9 +79,12 @@ class FrameStarts:
     def _settled(self, x: np.ndarray, targets: np.ndarray) -> np.ndarray:
         """The best (3J + 3,) that the mean person reaches from starts (n, 3J + 3)."""
         weights = np.full(len(targets), self.sd**-2)
-        end = minimise(lambda x: [energy.point_to_point(self.person.follow(x), targets, weights),
-                                  energy.pose_prior(x, self.prior, self.prior_weight)],
-                       x, MinimiseConfig(iterations=20, tolerance=1e-3))
+
+        def energies(x: np.ndarray) -> list[Residual]:
+            return [energy.point_to_point(self.person.follow(x), targets, weights),
+                    energy.pose_prior(x, self.prior, self.prior_weight)]
+
+        end = levenberg_marquardt(lambda x: normal_equations(energies(x)), x, iterations=20, tolerance=1e-3)
         return end.x[np.argmin(end.energy)]
 
 

@@ -7,19 +7,18 @@ import numpy as np
 
 from model.bilinear import ShapedPoints
 from model.body import BodyModel
+from scanprep.geometry.least_squares import Arrow, Minimum, Residual, levenberg_marquardt, normal_equations
 
 from ... import energy
 from ...bodies import FixedBody
-from ...energy import MovingPoints, Residual
+from ...energy import MovingPoints
 from ...priors import gaussian_prior
-from ...solve import normal_equations
 from ..marker_sets.layout import MarkerLayout
 from ..pose.marked_body import supports
 from ..settings import PersonConfig
 from . import terms
 from .attachment import LatentMarkers, latent_markers, simulated
 from .frame_starts import find_loose
-from .shared import Equations, SharedMinimum, minimise_arrow
 from .terms import LatentPoints
 
 UNSURE = 5.0                         # how much farther off a loose marker may be before it was looked for
@@ -179,24 +178,24 @@ class LatentFit:
         return {"data": terms.data(self.simulated(x, z), self.targets, weights),
                 "pose": terms.pose(whole, self.prior, factor * self.config.pose)}
 
-    def solve(self, state: State, factor: float, last: bool) -> tuple[State, SharedMinimum]:
+    def solve(self, state: State, factor: float, last: bool) -> tuple[State, Minimum[np.ndarray]]:
         """One stage: everything together by Levenberg-Marquardt.
 
         [MoSh] Eq. 23
         """
         weights, K = self.weights(state), self.n_betas
+        n, shared = state.x.shape[1], len(state.z)
 
-        def frames(x: np.ndarray, z: np.ndarray) -> Equations:
-            return normal_equations(list(self.frames(x, z, weights, factor).values()))
-
-        def common(z: np.ndarray) -> Equations:
-            energies, gradients, hessians = normal_equations(
-                [Residual(r.values[None], r.jacobian[None]) for r in self.common(z, factor).values()])
-            return energies[0], gradients[0], hessians[0]
+        def equations(rows: np.ndarray) -> Arrow:
+            x, z = rows[:, :n], rows[0, n:]
+            common = [Residual(r.values[None], r.jacobian[None]) for r in self.common(z, factor).values()]
+            return Arrow(normal_equations(list(self.frames(x, z, weights, factor).values())), shared,
+                         normal_equations(common))
 
         steps, tolerance = (LONGER * self.config.iterations, FINAL) if last else (self.config.iterations, TOLERANCE)
-        end = minimise_arrow(frames, common, state.x, state.z, steps, tolerance)
-        return State(end.x, end.z[:K], end.z[K:].reshape(-1, 3)), end
+        rows = np.concatenate([state.x, np.tile(state.z, (len(state.x), 1))], axis=1)
+        end = levenberg_marquardt(equations, rows, steps, tolerance)
+        return State(end.x[:, :n], end.x[0, n:n + K], end.x[0, n + K:].reshape(-1, 3)), end
 
     def energies(self, state: State) -> dict[str, float]:
         """What each term is, weights included."""

@@ -81,7 +81,7 @@ def _find(model: BodyModel, known: MarkerLayout, positions: Sequence[np.ndarray]
         elif i and (i % EVERY or last):
             state = fit.reattached(state)
         state, end = step(f"person, stage {i}", given, partial(fit.solve, state, factor, last))
-        steps, converged = steps + end.iterations, end.converged
+        steps, converged = steps + end.iterations, bool(end.converged[0])
         tell(len(chosen) + i + 1, total)
     return _result(fit, state, _whose(positions, chosen), converged, steps)
 

@@ -8,16 +8,15 @@ import numpy as np
 
 from model.bilinear import ShapedPoints
 from model.body import BodyModel
+from scanprep.geometry.least_squares import Arrow, Residual, levenberg_marquardt, normal_equations
 
 from ... import energy
 from ...bodies import FixedBody
-from ...energy import MovingPoints, Residual
+from ...energy import MovingPoints
 from ...priors import GaussianPrior, gaussian_prior
-from ...solve import normal_equations
 from ..marker_sets.layout import MarkerLayout
 from ..pose.marked_body import supports
 from .frame_starts import FrameStarts, find_loose
-from .shared import minimise_shared
 
 if TYPE_CHECKING:
     from .marker_shape import MarkerShapeConfig
@@ -93,4 +92,6 @@ class ShapeFit:
                     energy.pose_prior(x, self.prior, self.config.prior_weight),
                     energy.shape_prior(x, x.shape[1] - self.n_betas, self.config.shape_weight)]
 
-        return minimise_shared(lambda x: normal_equations(energies(x)), x, self.n_betas, self.config.iterations)
+        end = levenberg_marquardt(lambda x: Arrow(normal_equations(energies(x)), self.n_betas), x,
+                                  self.config.iterations)
+        return end.x, bool(end.converged[0]), end.iterations

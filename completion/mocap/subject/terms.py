@@ -9,8 +9,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from scanprep.geometry.least_squares import Residual
+
 from ... import energy
-from ...energy import MovingPoints, Residual
+from ...energy import MovingPoints
 from ...priors import GaussianPrior
 from ..settings import Attachment
 from .attachment import above_triangles, simulated

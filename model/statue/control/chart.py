@@ -18,20 +18,11 @@ FINE = 1 / 3                         # of the mean density, in length: coarser t
 
 @dataclass(frozen=True, eq=False)
 class Chart:
-    """Texture coordinates of a mesh in one connected piece.
+    """Texture coordinates of a mesh in one connected piece. [Statues] Eq. 21"""
 
-    Parameters
-    ----------
-    uv : (M, 2) float in [0, 1]
-        (0, 0) is the lower left corner of the image, (1, 1) its upper right one. A vertex on a seam has several.
-    faces : (F, 3) int
-        The rows of `uv` at the corners of every triangle of the mesh, in its order.
-
-    [Statues] Eq. 21
-    """
-
-    uv: np.ndarray
-    faces: np.ndarray
+    uv: np.ndarray     # (M, 2) in [0, 1], (0, 0) is the lower left corner of the image, (1, 1) its upper right one. A
+                       # vertex on a seam has several
+    faces: np.ndarray  # (F, 3), the rows of `uv` at the corners of every triangle of the mesh, in its order
 
     @cached_property
     def flat(self) -> Mesh:
@@ -39,20 +30,8 @@ class Chart:
         return Mesh(np.column_stack([self.uv, np.zeros(len(self.uv))]), self.faces)
 
     def texels(self, size: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """The pixels of a square image whose centres lie in the chart, and where they lie.
-
-        Parameters
-        ----------
-        size : int, pixels of a side
-
-        Returns
-        -------
-        rows, columns : (n,) int
-            Row 0 is the upper one.
-        faces : (n,) int
-        bary : (n, 3) float
-
-        [Statues] Eq. 21
+        """The pixels of a square image of so many pixels a side whose centres lie in the chart: rows (n,), 0 the upper
+        one, columns (n,), and the faces (n,) and bary (n, 3) where they lie. [Statues] Eq. 21
         """
         corners = self.uv[self.faces] * size - 0.5                     # pixel centres have whole numbers here
         low = np.maximum(np.ceil(corners.min(axis=1)).astype(np.int64), 0)
@@ -72,18 +51,8 @@ class Chart:
 
 
 def make_chart(mesh: Mesh, seams: Sequence[np.ndarray]) -> Chart:
-    """A closed mesh cut along seams and laid flat in the unit square.
-
-    Parameters
-    ----------
-    mesh : Mesh
-    seams : paths over edges, each the vertices (k,) that it passes
-        Together a tree.
-
-    Raises
-    ------
-    ValueError
-        Seams that do not cut the mesh into one disk.
+    """A closed mesh cut along seams and laid flat in the unit square. Each seam is the vertices (k,) that it passes;
+    ValueError where the seams, together a tree, do not cut the mesh into one disk.
     """
     from .flatten import flatten
 
@@ -100,12 +69,8 @@ def make_chart(mesh: Mesh, seams: Sequence[np.ndarray]) -> Chart:
 
 
 def automatic_chart(mesh: Mesh, skeleton: Skeleton, rounds: int = 4) -> Chart:
-    """A chart along the seams of `find_seams`, which go on to where it is crowded, such as the tips of fingers.
-
-    Parameters
-    ----------
-    rounds : int
-        Charts at most; done when no triangle is drawn smaller than `FINE` of the mean, in length.
+    """A chart along the seams of `find_seams`, which go on to where it is crowded, such as the tips of fingers;
+    `rounds` charts at most.
     """
     seams = find_seams(mesh, skeleton)
     chart = make_chart(mesh, seams)

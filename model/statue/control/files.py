@@ -1,16 +1,21 @@
 """Files of control models: our own, and skinned meshes of other programs."""
 from __future__ import annotations
 
+from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
+from scanprep.geometry import format_glb as glb
 from scanprep.geometry import storage
+from scanprep.geometry.format_common import MeshFileError
 from scanprep.geometry.mesh import Mesh
 from scanprep.skeleton.tree import Skeleton
 
-from .chart import Chart
-from .model import ControlModel, control_problem
+from ...export.rig import strongest, turn_up
+from .chart import Chart, automatic_chart, chart_problem
+from .model import ControlModel, control_problem, surface_problem
 
 KIND, VERSION = "control model", 1
 
@@ -20,19 +25,14 @@ def read_control(path: str | Path) -> ControlModel:
 
     Of a skinned mesh the pose of the file is the default pose, turned so that z is up; vertices that stand at one place
     are one; joints turn about three axes with wide limits, every part is a segment of its own, and there are no
-    landmarks. Joints that carry no triangle are left out. Without texture coordinates a chart is made.
-
-    Raises
-    ------
-    StorageError
-        Missing, neither of the two, damaged; a mesh that is open, not manifold or in several pieces, without weights,
-        or with texture coordinates that are not one chart.
+    landmarks. Joints that carry no triangle are left out. Without texture coordinates a chart is made. StorageError
+    says what is wrong with a file.
     """
     path = Path(path)
     if path.suffix.lower() == ".npz":
         return _load(path)
     if path.suffix.lower() == ".glb":
-        from .glb import read_skinned
+        from .files import read_skinned
 
         return read_skinned(path)
     raise storage.StorageError(f"{path}: expected a control model in .npz or a skinned mesh in .glb")
@@ -75,3 +75,200 @@ def _load(path: str | Path) -> ControlModel:
         if problem:
             raise ValueError(problem)
     return control
+
+
+WHAT = "a GLB file with one mesh that hangs on joints"
+TRIANGLES = 4                        # of the modes of glTF
+WIDE = np.pi                         # radians either way: the limits of joints that nobody described
+
+
+@dataclass(frozen=True, eq=False)
+class _Corners:
+    """Vertices as a file has them, repeated where normals or texture coordinates part."""
+
+    points: np.ndarray
+    weights: np.ndarray
+    uv: np.ndarray | None
+    faces: np.ndarray
+
+
+def read_skinned(path: Path) -> ControlModel:
+    """The control model of a GLB file, as `read_control`."""
+    data = storage.read_bytes(path, WHAT, MeshFileError)
+    tree, binary = glb.chunks_of(path, data)
+    with storage.taking_apart(path, WHAT, MeshFileError):
+        mesh_node, skin = _skinned(tree)
+        places = {number: matrix for number, _, matrix in glb.nodes_of(tree)}
+        missing = [number for number in skin["joints"] if number not in places]
+        if missing:
+            raise ValueError(f"joint {_name(tree, missing[0])} does not stand in the scene")
+        matrices = np.stack([places[number] for number in skin["joints"]])
+        corners = _corners(tree, binary, glb.item(tree["meshes"], mesh_node["mesh"]), len(matrices))
+        return _control(_as_it_stands(tree, binary, skin, matrices, corners), matrices[:, :3, 3],
+                        _parents(tree, skin["joints"]), [_name(tree, number) for number in skin["joints"]])
+
+
+def _skinned(tree: dict[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
+    """The one node with a mesh on joints, and its skin."""
+    found = [node for _, node, _ in glb.nodes_of(tree) if "mesh" in node and "skin" in node]
+    if len(found) != 1:
+        names = ", ".join(str(node.get("name", "unnamed")) for node in found)
+        meshes = sum("mesh" in node for _, node, _ in glb.nodes_of(tree))
+        raise ValueError(f"found {len(found)} meshes that hang on joints{f' ({names})' if names else ''}, "
+                         f"{meshes} meshes in all")
+    return found[0], glb.item(tree["skins"], found[0]["skin"])
+
+
+def _corners(tree: dict[str, Any], binary: bytes, mesh: dict[str, Any], joints: int) -> _Corners:
+    """All primitives of a mesh one after the other: materials do not part a control mesh."""
+    found = [_primitive(tree, binary, primitive, joints) for primitive in mesh["primitives"]]
+    starts = np.cumsum([0] + [len(part.points) for part in found])
+    uv = [part.uv for part in found if part.uv is not None]
+    if 0 < len(uv) < len(found):
+        raise ValueError("some of its primitives have texture coordinates and some have none")
+    return _Corners(np.concatenate([part.points for part in found]), np.concatenate([part.weights for part in found]),
+                    np.concatenate(uv) if uv else None,
+                    np.concatenate([part.faces + start for part, start in zip(found, starts, strict=False)]))
+
+
+def _primitive(tree: dict[str, Any], binary: bytes, primitive: dict[str, Any], joints: int) -> _Corners:
+    if primitive.get("mode", TRIANGLES) != TRIANGLES:
+        raise ValueError(f"expected triangles, found a primitive of mode {primitive['mode']}")
+    attributes = primitive["attributes"]
+
+    def values(name: str, *types: str) -> np.ndarray:
+        got = glb.accessor(tree, binary, attributes[name], *types)
+        return got if got.dtype.kind == "f" or name.startswith("JOINTS") else got / np.iinfo(got.dtype).max
+
+    points = values("POSITION", "VEC3").astype(np.float64)
+    weights = np.zeros((len(points), joints))
+    sets = sorted(name for name in attributes if name.startswith("WEIGHTS_"))
+    if not sets:
+        raise ValueError("it has no weights (WEIGHTS_0): nothing says how the joints move its vertices")
+    for name in sets:
+        carriers, shares = values(name.replace("WEIGHTS", "JOINTS"), "VEC4"), values(name, "VEC4").astype(np.float64)
+        if len(carriers) != len(points) or len(shares) != len(points) or carriers.max(initial=0) >= joints:
+            raise ValueError(f"{name}: expected four of {joints} joints for each of {len(points)} vertices")
+        if not (np.isfinite(shares).all() and (shares >= 0).all()):
+            raise ValueError(f"{name}: expected numbers of at least 0")
+        np.add.at(weights, (np.arange(len(points))[:, None], carriers.astype(np.int64)), shares)
+    bare = np.flatnonzero(weights.sum(axis=1) < 1e-3)
+    if len(bare):
+        raise ValueError(f"{len(bare)} vertices have no weights, the first is vertex {bare[0]}")
+    uv = None
+    if "TEXCOORD_0" in attributes:
+        uv = values("TEXCOORD_0", "VEC2").astype(np.float64) * [1, -1] + [0, 1]      # glTF counts from the upper left
+    faces = glb.triangles_of(tree, binary, primitive, len(points))
+    if len(faces) and (faces.min() < 0 or faces.max() >= len(points)):
+        raise ValueError(f"a triangle refers to vertex {faces.max()}, expected 0..{len(points) - 1}")
+    return _Corners(points, weights / weights.sum(axis=1, keepdims=True), uv, faces)
+
+
+def _as_it_stands(tree: dict[str, Any], binary: bytes, skin: dict[str, Any], matrices: np.ndarray, corners: _Corners
+                  ) -> _Corners:
+    """The vertices where the joints of the scene carry them, which is what every program shows."""
+    motion = matrices
+    if "inverseBindMatrices" in skin:
+        inverse = glb.accessor(tree, binary, skin["inverseBindMatrices"], "MAT4").astype(np.float64)
+        motion = matrices @ inverse.reshape(len(matrices), 4, 4).swapaxes(1, 2)
+    one = np.column_stack([corners.points, np.ones(len(corners.points))])
+    points = np.einsum("nj,jab,nb->na", corners.weights, motion, one, optimize=True)[:, :3]
+    if not np.isfinite(points).all():
+        raise ValueError(f"{(~np.isfinite(points).all(axis=1)).sum()} vertices are not finite")
+    return _Corners(points, corners.weights, corners.uv, corners.faces)
+
+
+def _parents(tree: dict[str, Any], joints: list[int]) -> np.ndarray:
+    """(J,) the joint next above every joint, -1 where there is none."""
+    above = {child: number for number, node in enumerate(tree["nodes"]) for child in node.get("children", [])}
+    index = {number: j for j, number in enumerate(joints)}
+    out = []
+    for number in joints:
+        up = above.get(number)
+        while up is not None and up not in index:
+            up = above.get(up)
+        out.append(-1 if up is None else index[up])
+    return np.array(out)
+
+
+def _name(tree: dict[str, Any], number: int) -> str:
+    return str(glb.item(tree["nodes"], number).get("name", f"joint{number}"))
+
+
+def _control(corners: _Corners, places: np.ndarray, parents: np.ndarray, names: list[str]) -> ControlModel:
+    mesh, weights, chart = _welded(corners)
+    problem = surface_problem(mesh) or (chart_problem(mesh, chart) if chart else None)
+    if problem:
+        raise ValueError(f"not usable as a control mesh: {problem}" if surface_problem(mesh) else
+                         f"its texture coordinates are not usable: {problem}; without any, a chart is made")
+    up = turn_up(2)                                                    # z up, as the people
+    mesh, places = mesh.with_vertices(mesh.vertices @ up), places @ up
+    kept, parents, weights, part_of_face = _with_triangles(mesh, weights, parents)
+    joints = places[kept]
+    skeleton = Skeleton(part_of_face, parents, joints, _distinct([names[j] for j in kept]))
+    joints[0] = mesh.vertices[skeleton.part_of_vertex(mesh) == 0].mean(axis=0)
+    skeleton = Skeleton(part_of_face, parents, joints, skeleton.names)
+    J = len(parents)
+    control = ControlModel(mesh, skeleton, strongest(weights), chart or automatic_chart(mesh, skeleton), {},
+                           (np.eye(3),) * J, (np.array([[-WIDE, WIDE]] * 3),) * J, skeleton.names, np.arange(J))
+    problem = control_problem(control)
+    assert problem is None, problem
+    return control
+
+
+def _welded(corners: _Corners) -> tuple[Mesh, np.ndarray, Chart | None]:
+    """Mesh, weights and chart with one vertex at every place."""
+    _, first, place = np.unique(corners.points.astype(np.float32), axis=0, return_index=True, return_inverse=True)
+    order = np.argsort(np.argsort(first))                              # vertices in the order of the file
+    first, place = np.sort(first), order[place.reshape(-1)]
+    faces = place[corners.faces]
+    whole = (faces != np.roll(faces, 1, axis=1)).all(axis=1)
+    faces, at_corners = faces[whole], corners.faces[whole]
+    used = np.unique(faces)
+    number = np.zeros(len(first), dtype=np.int64)
+    number[used] = np.arange(len(used))
+    mesh = Mesh(corners.points[first[used]], number[faces])
+    chart = None
+    if corners.uv is not None:
+        rows = np.column_stack([place, np.round(corners.uv * 2**20)])
+        _, once, row = np.unique(rows, axis=0, return_index=True, return_inverse=True)
+        chart_faces = row.reshape(-1)[at_corners]
+        kept, renumbered = np.unique(chart_faces, return_inverse=True)
+        chart = Chart(corners.uv[once[kept]], renumbered.reshape(-1, 3))
+    return mesh, corners.weights[first[used]], chart
+
+
+def _with_triangles(mesh: Mesh, weights: np.ndarray, parents: np.ndarray
+                    ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """The joints (k,) that carry some triangle more than any other does, parents first; their parents, weights (N, k)
+    and the part of every triangle.
+
+    What the other joints carry goes to the next one above. Where more than one tree is left, the others hang on the one
+    with most triangles.
+    """
+    wanted = weights[mesh.faces].mean(axis=1)
+    own = np.bincount(wanted.argmax(axis=1), minlength=len(parents)) > 0
+    heir = np.arange(len(parents))
+    for j in range(len(parents)):
+        while heir[j] >= 0 and not own[heir[j]]:
+            heir[j] = parents[heir[j]]
+    size = np.bincount(wanted.argmax(axis=1), minlength=len(parents))
+    tops = [j for j in np.flatnonzero(own) if parents[j] < 0 or heir[parents[j]] < 0]
+    root = max(tops, key=lambda j: size[j])
+    above = {j: -1 if j == root else root if j in tops else heir[parents[j]] for j in np.flatnonzero(own).tolist()}
+    order, ahead = [], [root]
+    while ahead:                                                       # in the order of the file, parents first
+        order.append(ahead.pop())
+        ahead += [j for j in reversed(above) if above[j] == order[-1]]
+    kept = np.array(order)
+    index = np.full(len(parents), -1)
+    index[kept] = np.arange(len(kept))
+    heir[heir < 0] = root
+    tree = np.array([-1 if j == root else index[above[j]] for j in order])
+    gathered = np.zeros((len(weights), len(kept)))
+    np.add.at(gathered.T, index[heir], weights.T)
+    return kept, tree, gathered, index[wanted.argmax(axis=1)]
+
+
+def _distinct(names: list[str]) -> tuple[str, ...]:
+    return tuple(name if names.count(name) == 1 else f"{name} {k}" for k, name in enumerate(names))

@@ -16,21 +16,8 @@ IN_SIGHT = 2.0                       # an edge in full sight counts as so much l
 
 
 def find_seams(mesh: Mesh, skeleton: Skeleton) -> list[np.ndarray]:
-    """A tree of seams to the tips of all limbs, rather where the surface is hidden.
-
-    The tip of a part without children is its vertex farthest over the surface from where it hangs on its parent. Each
-    tip in turn, the nearest first, is joined to the seams there are by the shortest path over the edges.
-
-    Parameters
-    ----------
-    mesh : Mesh
-        Closed, one component.
-    skeleton : Skeleton
-
-    Returns
-    -------
-    list of (k,) int
-        The vertices that each seam passes.
+    """A tree of seams, each the vertices (k,) that it passes, to the tips of all limbs, rather where the surface is
+    hidden. Each tip in turn, the nearest first, is joined to the seams there are by the shortest path over the edges.
     """
     graph = _costs(mesh)
     tips = limb_tips(mesh, skeleton)
@@ -89,12 +76,8 @@ def limb_tips(mesh: Mesh, skeleton: Skeleton) -> list[int]:
 
 
 def cut(mesh: Mesh, seams: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
-    """Triangles (F, 3) of the mesh opened along seams, and the vertex (M,) that each of the new ones was.
-
-    Raises
-    ------
-    ValueError
-        A mesh with a border, a seam that leaves the edges.
+    """Triangles (F, 3) of a closed mesh opened along seams, and the vertex (M,) that each of the new ones was;
+    ValueError for a seam that leaves the edges.
     """
     if not mesh.is_closed:
         raise ValueError("mesh: expected a closed surface")

@@ -20,23 +20,12 @@ THICK = 0.75                         # share of the way to the other side of a l
 
 @dataclass(frozen=True, eq=False)
 class Crossings:
-    """Crossings of normals with a surface, ordered by normal and height.
+    """Crossings of normals with a surface, ordered by normal and height."""
 
-    Attributes
-    ----------
-    normal : (k,) int
-        Which normal.
-    heights : (k,) float, metres
-    cosines : (k,) float
-        Between the normals of both; negative where the surface is met from inside.
-    faces : (k,) int
-        Triangle of the scan.
-    """
-
-    normal: np.ndarray
-    heights: np.ndarray
-    cosines: np.ndarray
-    faces: np.ndarray
+    normal: np.ndarray   # (k,), which normal
+    heights: np.ndarray  # (k,) metres
+    cosines: np.ndarray  # (k,), between the normals of both; negative where the surface is met from inside
+    faces: np.ndarray    # (k,), triangle of the scan
 
     def pick(self, keep: np.ndarray) -> Crossings:
         """Only some of them."""

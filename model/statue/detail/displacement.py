@@ -19,12 +19,10 @@ from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.surface import Rays, Surface
 from scanprep.ranges import Cosine, Positive, Range, Settings
 
-from ..control.model import ControlModel
-from ..statue import FOLDED, HOLE, MEASURED, OUTSIDE, DisplacementMap
+from ..control.model import FOLDED, HOLE, MEASURED, OUTSIDE, ControlModel, DisplacementMap
 from .crossings import Crossings, find_crossings, limits, outer_layers, unturned
-from .lattice import Lattice
 from .normal_volume import interpolate
-from .texels import Texels, find_texels
+from .texels import Lattice, Texels, find_texels
 from .vectors import bend_over_folds
 
 Progress = Callable[[int, int], None]
@@ -121,19 +119,10 @@ def find_heights(control: ControlModel, scan: Mesh, config: DisplacementConfig) 
 
 def unfold_control(control: ControlModel, scan: Mesh, config: DisplacementConfig | None = None, rounds: int = 2
                    ) -> ControlModel:
-    """A control model whose vertices in folds are moved to where the surface drawn over them lies on the scan.
+    """A fitted control model whose vertices in folds are moved to where the surface drawn over them lies on the scan.
 
     Where a fit left the control mesh inside the scan, such as an armpit that it put too high, no height reaches the
     surface. A round counts only if less of the control mesh than before is folded or a hole.
-
-    Parameters
-    ----------
-    control : ControlModel
-        Fitted.
-    scan : Mesh
-    config : DisplacementConfig, optional
-        As for `bake`; the pixels may be larger here.
-    rounds : int
     """
     config = config or DisplacementConfig()
     config = replace(config, size=min(config.size, UNFOLD_SIZE))

@@ -26,26 +26,14 @@ STEPS = 60                           # of a search between two signs: each at le
 
 @dataclass(frozen=True, eq=False)
 class NormalCoordinates:
-    """Points as places on a control mesh with heights above it.
+    """Points as places on a control mesh with heights above it. [Statues] Eq. 19"""
 
-    Attributes
-    ----------
-    faces : (n,) int
-        Triangle of the control mesh, -1 where a point lies in the volume of none.
-    bary : (n, 3) float
-        Barycentric coordinates; zero where there is no triangle.
-    heights : (n,) float, metres
-        Along the interpolated normal, which is shorter than 1; NaN where there is no triangle.
-    solutions : (n,) int
-        How many places of the mesh reach the point: 0 outside the volume, 1 where it is one-to-one.
-
-    [Statues] Eq. 19
-    """
-
-    faces: np.ndarray
-    bary: np.ndarray
-    heights: np.ndarray
-    solutions: np.ndarray
+    faces: np.ndarray      # (n,), triangle of the control mesh, -1 where a point lies in the volume of none
+    bary: np.ndarray       # (n, 3), barycentric coordinates; zero where there is no triangle
+    heights: np.ndarray    # (n,) metres, along the interpolated normal, which is shorter than 1; NaN where there is no
+                           # triangle
+    solutions: np.ndarray  # (n,), how many places of the mesh reach the point: 0 outside the volume, 1 where it is one-
+                           # to-one
 
     @property
     def inside(self) -> np.ndarray:
@@ -54,40 +42,21 @@ class NormalCoordinates:
 
 
 def interpolate(mesh: Mesh, faces: np.ndarray, bary: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Points (n, 3) of a control mesh and its normals there (n, 3), of length up to 1.
-
-    [Statues] Eq. 20
-    """
+    """Points (n, 3) of a control mesh and its normals there (n, 3), of length up to 1. [Statues] Eq. 20"""
     corners = mesh.faces[faces]
     return (np.einsum("nc,ncd->nd", bary, mesh.vertices[corners]),
             np.einsum("nc,ncd->nd", bary, mesh.vertex_normals[corners]))
 
 
 def from_normal_volume(mesh: Mesh, coordinates: NormalCoordinates) -> np.ndarray:
-    """The points (n, 3) of normal coordinates; NaN where they are in no triangle's volume.
-
-    [Statues] Eq. 19
-    """
+    """The points (n, 3) of normal coordinates; NaN where they are in no triangle's volume. [Statues] Eq. 19"""
     p, n = interpolate(mesh, coordinates.faces, coordinates.bary)
     return p + coordinates.heights[:, None] * n
 
 
 def to_normal_volume(mesh: Mesh, points: np.ndarray, reach: float) -> NormalCoordinates:
-    """Every point's triangle, place and least height, among all triangles of a control mesh.
-
-    Parameters
-    ----------
-    mesh : Mesh
-    points : (n, 3) float, metres
-    reach : float, metres
-        Largest height up or down.
-
-    Raises
-    ------
-    ValueError
-        A point that is not finite, or a reach that is not above zero.
-
-    [Statues] Eq. 19, 20
+    """Every point's (n, 3) triangle, place and least height, at most `reach` metres up or down, among all triangles of
+    a control mesh. [Statues] Eq. 19, 20
     """
     points = checked_points(points)
     if not 0 < reach < np.inf:
@@ -114,22 +83,8 @@ def to_normal_volume(mesh: Mesh, points: np.ndarray, reach: float) -> NormalCoor
 
 def solve_triangles(mesh: Mesh, faces: np.ndarray, points: np.ndarray, reach: float
                     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Heights at which points lie in given triangles, displaced; only where these are not turned over.
-
-    Parameters
-    ----------
-    faces : (n,) int
-        The triangle for each point.
-    points : (n, 3) float, metres
-    reach : float, metres
-
-    Returns
-    -------
-    (k,) int
-        Which pair each solution is of.
-    (k,) float, metres
-    (k, 3) float
-        Barycentric coordinates.
+    """Heights at which points (n, 3) lie in given triangles (n,), displaced; only where these are not turned over.
+    Which pair each solution is of (k,), its height (k,) in metres, its bary (k, 3).
     """
     v = mesh.corners[faces] - points[:, None]
     n = mesh.vertex_normals[mesh.faces[faces]]

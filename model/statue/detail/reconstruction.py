@@ -11,8 +11,7 @@ from scanprep.geometry.surface import Surface
 from scanprep.pictures.textures import bilinear
 
 from ..control.chart import Chart
-from ..control.model import ControlModel
-from ..statue import FOLDED, HOLE, MEASURED, OUTSIDE, DisplacementMap
+from ..control.model import FOLDED, HOLE, MEASURED, OUTSIDE, ControlModel, DisplacementMap
 from .normal_volume import from_normal_volume, interpolate, to_normal_volume
 from .subdivision import Displaced, Subdivision
 
@@ -21,29 +20,16 @@ BESIDE = 3                           # pixels each way that count as one place
 
 
 def chart_places(chart: Chart, faces: np.ndarray, bary: np.ndarray) -> np.ndarray:
-    """Texture coordinates (n, 2) of places on triangles.
-
-    [Statues] Eq. 21
-    """
+    """Texture coordinates (n, 2) of places on triangles. [Statues] Eq. 21"""
     return np.einsum("nc,ncd->nd", bary, chart.uv[chart.faces[faces]])
 
 
 class Reconstruction:
     """Vertices of the detailed surface for any vertices of the control mesh.
 
-    Everything that does not change from frame to frame is computed once. Heights follow the interpolated normal of
-    the moved mesh. The rest of a vector displacement, if there is any, turns with the control surface around it: by
-    the rotation that best turns the edges around each control vertex, interpolated over triangles.
-
-    Parameters
-    ----------
-    control : ControlModel
-        Fitted to the scan.
-    map : DisplacementMap
-    subdivision : Subdivision
-        Of its mesh.
-
-    [Statues] Eq. 19, 20
+    Everything that does not change from frame to frame is computed once. Heights follow the interpolated normal of the
+    moved mesh. The rest of a vector displacement, if there is any, turns with the control surface around it: by the
+    rotation that best turns the edges around each control vertex, interpolated over triangles. [Statues] Eq. 19, 20
     """
 
     def __init__(self, control: ControlModel, map: DisplacementMap, subdivision: Subdivision) -> None:
@@ -121,15 +107,8 @@ def _around(mesh: Mesh) -> csr_array:
 
 
 class VertexRotations:
-    """Rotations that best turn the edges around some vertices of a mesh at rest to where they are now.
-
-    The normals are turned with the edges, so that a ring of edges in a plane has one answer.
-
-    Parameters
-    ----------
-    rest : Mesh
-    which : (k,) int
-        Vertices.
+    """Rotations that best turn the edges around some vertices (k,) of a mesh at rest to where they are now; the normals
+    are turned with them, so that a ring of edges in a plane has one answer.
     """
 
     def __init__(self, rest: Mesh, which: np.ndarray) -> None:
@@ -162,9 +141,7 @@ class SurfaceError:
 
 
 def surface_error(reconstructed: Mesh, scan: Mesh, count: int = 200_000) -> SurfaceError:
-    """Distance from a reconstructed surface to the scan, one way, at so many places spread evenly.
-
-    [Statues] Eq. 22, 23
+    """Distance from a reconstructed surface to the scan, one way, at so many places spread evenly. [Statues] Eq. 22, 23
     """
     points = reconstructed.sample(count, np.random.default_rng(SEED))[0]
     return _error(Surface(scan).closest(points).distances)
@@ -190,17 +167,11 @@ def remaining_error(control: ControlModel, map: DisplacementMap, scan: Mesh, cou
 
 def inverted_triangles(control: ControlModel, vertices: np.ndarray, subdivision: Subdivision, detailed: np.ndarray
                        ) -> np.ndarray:
-    """Fine triangles, ascending, whose normal opposes that of the control surface below them.
+    """Fine triangles, ascending, whose normal opposes that of the control surface below them, which has vertices (N,
+    3); `detailed` (n, 3) are those of the fine ones.
 
-    That is its interpolated normal: on it the heights stand, and a steep flank is not inverted because the control
-    mesh has an edge there.
-
-    Parameters
-    ----------
-    vertices : (N, 3) float, metres
-        Of the control mesh.
-    detailed : (n, 3) float, metres
-        Of the detailed surface.
+    That is its interpolated normal: on it the heights stand, and a steep flank is not inverted because the control mesh
+    has an edge there.
     """
     _, n = interpolate(control.mesh.with_vertices(vertices), subdivision.parent, subdivision.bary)
     below = n[subdivision.faces].sum(axis=1)

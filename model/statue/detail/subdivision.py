@@ -33,26 +33,13 @@ Displaced = Callable[[np.ndarray, np.ndarray], np.ndarray]
 
 @dataclass(frozen=True, eq=False)
 class Subdivision:
-    """A finer triangulation of a control mesh.
+    """A finer triangulation of a control mesh."""
 
-    Attributes
-    ----------
-    faces : (f, 3) int
-    parent : (n,) int
-        A triangle of the control mesh on which each vertex lies.
-    bary : (n, 3) float
-        Its place there.
-    face_parent : (f,) int
-        The control triangle of every triangle.
-    chart : Chart
-        The finer triangles in the image; vertices on a seam have several places in it.
-    """
-
-    faces: np.ndarray
-    parent: np.ndarray
-    bary: np.ndarray
-    face_parent: np.ndarray
-    chart: Chart
+    faces: np.ndarray        # (f, 3)
+    parent: np.ndarray       # (n,), A triangle of the control mesh on which each vertex lies
+    bary: np.ndarray         # (n, 3), its place there
+    face_parent: np.ndarray  # (f,), the control triangle of every triangle
+    chart: Chart             # the finer triangles in the image; vertices on a seam have several places in it
 
     def points(self, mesh: Mesh) -> np.ndarray:
         """(n, 3) the vertices on a control mesh, not displaced."""
@@ -75,20 +62,7 @@ class _Corners:
 
 
 def subdivide(mesh: Mesh, chart: Chart, level: int) -> Subdivision:
-    """Every triangle in four, `level` times over.
-
-    Parameters
-    ----------
-    mesh, chart : Mesh, Chart
-        Of a control model.
-    level : int
-        0 leaves the mesh as it is.
-
-    Raises
-    ------
-    ValueError
-        A level below 0, or a chart of another mesh.
-    """
+    """Every triangle in four, `level` times over; ValueError for a level below 0 or a chart of another mesh."""
     now = _begin(mesh, chart, level)
     for _ in range(level):
         now = _split(now, np.ones(now.vertex.shape, dtype=bool), mesh)
@@ -96,19 +70,11 @@ def subdivide(mesh: Mesh, chart: Chart, level: int) -> Subdivision:
 
 
 def subdivide_adaptive(mesh: Mesh, chart: Chart, displaced: Displaced, tolerance: float, level: int) -> Subdivision:
-    """Edges split where the displaced surface bends away from them.
+    """Edges split, at most `level` times, where the displaced surface bends away from them by more than a tolerance,
+    metres.
 
-    An edge is split if the surface is farther from it than the tolerance anywhere along it, or at a place inside a
-    triangle beside it: a decision of the edge, the same for both sides, so that no vertex lies on a neighbour's edge.
-
-    Parameters
-    ----------
-    mesh, chart : Mesh, Chart
-    displaced : places -> points
-        Where the surface is, such as `displaced_surface` of `reconstruction`.
-    tolerance : float, metres
-    level : int
-        How often an edge of the control mesh may be split.
+    An edge is split if the surface is farther from it anywhere along it, or at a place inside a triangle beside it: a
+    decision of the edge, the same for both sides, so that no vertex lies on a neighbour's edge.
     """
     if not 0 < tolerance < np.inf:
         raise ValueError(f"tolerance: expected a length above 0, got {tolerance}")

@@ -9,6 +9,7 @@ from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.surface import Surface
 
 from ..control.chart import Chart
+from .subdivision import subdivide
 
 PADDING = 4                          # pixels that the surface is continued beyond the border of a chart
 MARGIN = 16                          # pixels more that the last value is repeated
@@ -16,25 +17,14 @@ MARGIN = 16                          # pixels more that the last value is repeat
 
 @dataclass(frozen=True, eq=False)
 class Texels:
-    """Pixels of a square image over a chart.
-
-    Attributes
-    ----------
-    size : int
-    pixels : (n,) int
-        Row times size plus column; row 0 is the upper one. Ascending.
-    faces : (n,) int
-        The control triangle of each.
-    bary : (n, 3) float
-    inside : (n,) bool
-        In the chart. The others lie beside it, and stand for the surface on the other side of the seam.
-    """
+    """Pixels of a square image over a chart."""
 
     size: int
-    pixels: np.ndarray
-    faces: np.ndarray
-    bary: np.ndarray
-    inside: np.ndarray
+    pixels: np.ndarray  # (n,), row times size plus column; row 0 is the upper one. Ascending
+    faces: np.ndarray   # (n,), the control triangle of each
+    bary: np.ndarray    # (n, 3)
+    inside: np.ndarray  # (n,), in the chart. The others lie beside it, and stand for the surface on the other side of
+                        # the seam
 
     def image(self, values: np.ndarray, beyond: float | None = None) -> np.ndarray:
         """An image (size, size, ...) of values (n, ...) of the pixels.
@@ -87,17 +77,10 @@ def _beside(pixels: np.ndarray, size: int) -> np.ndarray:
 
 
 def continue_chart(mesh: Mesh, chart: Chart, uv: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Places of the control mesh for points of the image (n, 2) beside the chart.
+    """Places of the control mesh, triangles (n,) and bary (n, 3), for points of the image (n, 2) beside the chart.
 
     The triangle at the nearest border goes on in its plane; what lies beyond the seam is laid onto the triangle on its
     other side, as if that were unfolded into the plane. At a border of the mesh itself the border's place is taken.
-
-    Returns
-    -------
-    (n,) int
-        Triangles.
-    (n, 3) float
-        Barycentric coordinates, not negative.
     """
     flat = chart.flat
     found = Surface(flat).closest(np.column_stack([uv, np.zeros(len(uv))]))
@@ -143,3 +126,63 @@ def _across(mesh: Mesh) -> tuple[np.ndarray, np.ndarray]:
     for a, b in ((one, two), (two, one)):
         other.ravel()[a], turned.ravel()[a] = np.divmod(b, 3)
     return other, turned
+
+
+class Lattice:
+    """A control mesh subdivided evenly, whose fine triangles are found by their place without a search: `subdivision`,
+    and `fine`, its vertices on the control mesh.
+    """
+
+    def __init__(self, mesh: Mesh, chart: Chart, level: int) -> None:
+        self.subdivision = subdivide(mesh, chart, level)
+        self.fine = self.subdivision.mesh(mesh)
+        self.mesh, self._chart, self._steps = mesh, chart, 2**level
+        uv_corners = chart.uv[chart.faces]
+        fine_uv = self.subdivision.chart.uv[self.subdivision.chart.faces]
+        parent = self.subdivision.face_parent[:, None]
+        e, f = (uv_corners[parent, k] - uv_corners[parent, 0] for k in (1, 2))
+        w = fine_uv - uv_corners[parent, 0]
+        area = e[..., 0] * f[..., 1] - e[..., 1] * f[..., 0]
+        i = np.rint((w[..., 0] * f[..., 1] - w[..., 1] * f[..., 0]) / area * self._steps).astype(int)
+        j = np.rint((e[..., 0] * w[..., 1] - e[..., 1] * w[..., 0]) / area * self._steps).astype(int)
+        self._vertex = np.full((len(mesh.faces), self._steps + 2, self._steps + 2), -1)
+        self._vertex[parent, i, j] = self.subdivision.faces
+
+    def places(self, faces: np.ndarray, bary: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """For places of the control mesh the three fine vertices (n, 3) around each, and their shares (n, 3)."""
+        x, y = np.clip(bary[:, 1:] * self._steps, 0, self._steps).T
+        i, j = np.minimum(x.astype(int), self._steps - 1), np.minimum(y.astype(int), self._steps - 1)
+        i, j = np.where(i + j >= self._steps, self._steps - 1 - j, i), j
+        i = np.maximum(i, 0)
+        x, y = x - i, y - j
+        upper = (x + y > 1) & (i + j + 2 <= self._steps)
+        one = np.stack([i + upper, j + upper], axis=1)
+        a = self._vertex[faces, one[:, 0], one[:, 1]]
+        b, c = self._vertex[faces, i + 1, j], self._vertex[faces, i, j + 1]
+        u, v = np.where(upper, 1 - y, x), np.where(upper, 1 - x, y)
+        share = np.clip(np.stack([1 - u - v, u, v], axis=1), 0, 1)
+        return np.stack([a, b, c], axis=1), share / share.sum(axis=1, keepdims=True)
+
+    def sample(self, values: np.ndarray, faces: np.ndarray, bary: np.ndarray) -> np.ndarray:
+        """Values (n,) or (n, k) at places of the control mesh, linear between those of the fine vertices."""
+        vertex, share = self.places(faces, bary)
+        return np.einsum("nc,nc...->n...", share, values[vertex])
+
+    def gather(self, texels: Texels, values: np.ndarray, known: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """What the pixels (n,) say of the fine vertices, and of which they say anything.
+
+        Bilinear, from one side of a seam; a vertex is known where all four pixels around it are.
+        """
+        size = texels.size
+        image, sure = np.zeros(size**2), np.zeros(size**2, dtype=bool)
+        image[texels.pixels], sure[texels.pixels] = np.where(known, values, 0), known
+        corners = self._chart.uv[self._chart.faces[self.subdivision.parent]]
+        x, y = (np.einsum("nc,ncd->nd", self.subdivision.bary, corners) * size - 0.5).T
+        left, low = np.floor(x).astype(int), np.floor(y).astype(int)
+        out, all_known = np.zeros(len(x)), np.ones(len(x), dtype=bool)
+        for dx in (0, 1):
+            for dy in (0, 1):
+                pixel = np.clip(size - 1 - low - dy, 0, size - 1) * size + np.clip(left + dx, 0, size - 1)
+                out += np.abs(1 - dx - (x - left)) * np.abs(1 - dy - (y - low)) * image[pixel]
+                all_known &= sure[pixel]
+        return out, all_known

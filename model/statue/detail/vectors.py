@@ -16,8 +16,8 @@ from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.surface import OrientedPoints, Surface
 from scanprep.threads import search_threads
 
-from .lattice import Lattice
 from .normal_volume import interpolate
+from .texels import Lattice
 
 RINGS = 5                            # vertices around a fold that are drawn with it
 STIFFNESS = (100.0, 30.0, 10.0, 3.0, 1.0, 0.3, 0.1, 0.03)   # of the thin plate against the data
@@ -29,18 +29,8 @@ SCALE = 0.01                         # metres that a turn of the normal by 60 de
 
 def bend_over_folds(lattice: Lattice, scan: Mesh, heights: np.ndarray, folded: np.ndarray, reach: float
                     ) -> tuple[np.ndarray, np.ndarray]:
-    """Which fine vertices (n,) of a lattice are drawn onto the scan, and the displacements (n, 3) of all.
-
-    In metres and the axes of the world.
-
-    Parameters
-    ----------
-    heights : (n,) float, metres
-        Of the fine vertices, smooth across folds.
-    folded : (n,) bool
-        Fine vertices in folds.
-    reach : float, metres
-        Farther matches are none.
+    """Which fine vertices (n,) of a lattice are drawn onto the scan, and the displacements (n, 3) of all, metres in the
+    axes of the world; from `heights` (n,), smooth across folds, and which of them are `folded` (n,).
     """
     fine, mesh = lattice.fine, lattice.mesh
     p, n = interpolate(mesh, lattice.subdivision.parent, lattice.subdivision.bary)

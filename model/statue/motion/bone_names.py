@@ -27,23 +27,10 @@ _AFTER = re.compile(r"(jnt|bone)$")
 
 
 def find_roles(names: Sequence[str], given: Mapping[str, str] | None = None) -> dict[str, int]:
-    """The joints that play the parts of the humanoid.
+    """The joints that play the parts of the humanoid: {H-Anim name: number of the joint}.
 
-    Parameters
-    ----------
-    names : J strings
-        Case, separators and what stands before a colon do not matter.
-    given : {H-Anim name: one of the names}, optional
-        Instead of what the names suggest; an empty name for none.
-
-    Returns
-    -------
-    {H-Anim name: number of the joint}
-
-    Raises
-    ------
-    ValueError
-        A given name that is unknown.
+    Case, separators and what stands before a colon do not matter. `given` names come instead of what the names
+    suggest, an empty one for none.
     """
     plain: dict[str, int] = {}
     for j, name in enumerate(names):

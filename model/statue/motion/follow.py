@@ -1,14 +1,29 @@
 """A control mesh that follows a learned body model: motion as the model knows it, on the shape of the statue."""
 from __future__ import annotations
 
+from collections.abc import Callable
+from pathlib import Path
+
 import numpy as np
 from scipy.sparse import coo_array, csr_array, diags_array, eye_array
 
+from scanprep.correspondence.correlated import find_correspondences
 from scanprep.geometry import rotations
+from scanprep.geometry.landmarks import match_landmarks
 from scanprep.geometry.mesh import Mesh
+from scanprep.geometry.storage import StorageError, load_arrays
 from scanprep.geometry.surface import OrientedPoints, Surface
+from scanprep.registration.nonrigid import Registration, register, registration_problem
 
+from ...body import BodyModel
+from ...export.bvh_read import read_bvh
+from ...fitting import fit_shape
 from ...linear import Subject
+from ..control.model import Statue
+from ..detail.reconstruction import Reconstruction
+from ..detail.subdivision import subdivide
+from .motions import bvh_motion, own_motion, people_motion
+from .retarget import StatueMotion
 
 _SAME_SIDE = 0.3                     # cosine of normals below which the nearest triangle is of another limb or side
 _RINGS = 4                           # of the model's vertices, over which its turns are averaged
@@ -16,28 +31,12 @@ _AT_ONCE = 32                        # frames
 
 
 class Follower:
-    """A control mesh bound to a model's surface in the pose of the scan.
+    """A control mesh bound to the surface of a learned model's person, in the pose and place of the scan.
 
     Each control vertex keeps its offset from the point of the model's surface that it is bound to, in axes that turn
     with the surface there: the rotations that best carry the edges around that point. In the scan's own pose it is
-    where it was.
-
-    Parameters
-    ----------
-    mesh : Mesh
-        The control mesh, fitted to the scan.
-    subject : Subject
-        The person, for example `model.subject(fit.betas)` after `fit_shape`.
-    pose : (J, 3) float, radians
-        Of the model in the scan.
-    trans : (3,) float, metres
-    registered : (N, 3) float, metres, optional
-        The model's template as registered to the scan: nearer to it than the model, to find the point for each vertex.
-
-    Raises
-    ------
-    ValueError
-        Vertices of another count than the model's.
+    where it was. `registered` (N, 3) is the model's template on the scan: nearer to it than the model, to find the
+    point for each vertex.
     """
 
     def __init__(self, mesh: Mesh, subject: Subject, pose: np.ndarray, trans: np.ndarray | None = None,
@@ -56,17 +55,7 @@ class Follower:
         return vertices[self._edges[:, 1]] - vertices[self._edges[:, 0]]
 
     def vertices(self, poses: np.ndarray, trans: np.ndarray | None = None) -> np.ndarray:
-        """The control mesh in poses of the model.
-
-        Parameters
-        ----------
-        poses : (J, 3) or (T, J, 3) float, radians
-        trans : (3,) or (T, 3) float, metres
-
-        Returns
-        -------
-        (n, 3) or (T, n, 3) float, metres
-        """
+        """The control mesh (..., n, 3), metres, in poses (..., J, 3) of the model."""
         poses = np.asarray(poses, dtype=np.float64)
         if poses.ndim == 2:
             return self._moved(self.subject.vertices(poses, trans))
@@ -116,3 +105,58 @@ def _averaging(body: Mesh) -> csr_array:
     for _ in range(_RINGS - 1):
         ends = ring @ ends
     return csr_array(ends)
+
+
+Progress = Callable[[int, int], None]
+REGISTERED_ON = 2                    # level of the reconstruction that a learned model is registered to
+
+
+def read_statue_motion(statue: Statue, path: Path) -> StatueMotion:
+    """A motion for the skeleton of a statue: BVH, or `.npz` of its own parts or of the synthetic people; StorageError
+    where it is damaged or of other parts.
+    """
+    if path.suffix.lower() == ".bvh":
+        return bvh_motion(statue.control, statue.pose, read_bvh(path, "cm"))     # travel is scaled by the legs
+    stored = load_arrays(path, "a motion (.npz) or BVH")
+    if "poses" not in stored:
+        raise StorageError(f"{path}: expected a motion, it lacks poses")
+    count = stored["poses"].size // max(3 * len(np.atleast_1d(stored["poses"])), 1)
+    own, people = len(statue.control.skeleton.parents), 16
+    if count == own:
+        return own_motion(statue.control, path)
+    if count != people:
+        raise StorageError(f"{path}: expected the {own} parts of the statue or the {people} of the synthetic people, "
+                           f"found {count}; for a motion of a learned model name it with --model")
+    rate = stored.get("mocap_frame_rate", stored.get("mocap_framerate", np.array(60.0)))
+    poses = stored["poses"].astype(np.float64).reshape(-1, people, 3)
+    return people_motion(statue.control, statue.pose, poses, stored.get("trans"), float(rate))
+
+
+def follower_of(statue: Statue, model: BodyModel, registered: np.ndarray | None = None,
+                progress: Progress | None = None) -> Follower:
+    """The control mesh bound to a learned model, whose template is registered to the statue first, by the landmarks
+    that both have or by correspondences; `registered` (N, 3) where that is known. ValueError where it fails.
+    """
+    if registered is None:
+        surface = Reconstruction(statue.control, statue.map,
+                                 subdivide(statue.control.mesh, statue.control.chart, REGISTERED_ON)).mesh()
+        registered = _registered(statue, model, surface, progress).mesh.vertices
+    fit = fit_shape(model, registered)
+    subject = model.subject(fit.betas if model.n_betas else None)
+    return Follower(statue.control.mesh, subject, fit.pose, fit.trans, registered)
+
+
+def _registered(statue: Statue, model: BodyModel, surface: Mesh, progress: Progress | None) -> Registration:
+    control, pairs, hints = statue.control, None, None
+    places = {name: control.mesh.vertices[vertex] for name, vertex in control.landmarks.items()}
+    try:
+        pairs = match_landmarks(model.info.get("landmarks") or {}, places, minimum=8)[1:]
+        pairs = pairs[0].astype(np.int64), pairs[1]
+    except ValueError:                   # other names, or none
+        hints = find_correspondences(model.template, surface)
+    fit = register(model.template, surface, pairs, progress=progress, correspondences=hints)
+    problem = registration_problem(model.template, surface, fit, pairs is not None)
+    if problem:
+        raise ValueError(f"model: its template could not be brought onto the statue, {problem}; register it to the "
+                         "scan with landmarks (scape prep register) and name the result with --registered")
+    return fit

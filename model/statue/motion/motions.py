@@ -23,11 +23,6 @@ def own_motion(control: ControlModel, path: str | Path) -> StatueMotion:
 
     In such files trans is the travel of the middle of part 0, as body models place themselves; here that of the root's
     joint, as in a rig. Skinning moves the one a little against the other.
-
-    Raises
-    ------
-    StorageError
-        Missing, not a motion, or of other parts.
     """
     stored = load_arrays(path, "a motion (.npz)")
     J, names = len(control.skeleton.parents), control.skeleton.names
@@ -60,29 +55,11 @@ def middle_drift(control: ControlModel, poses: np.ndarray) -> np.ndarray:
 def people_motion(control: ControlModel, pose: np.ndarray, poses: np.ndarray, trans: np.ndarray | None = None,
                   rate: float = 60.0, up: np.ndarray | None = None, config: MotionConfig | None = None
                   ) -> StatueMotion:
-    """A motion of the synthetic people.
+    """A motion of the synthetic people, poses (T, 16, 3) and trans (T, 3) of the average person; `pose` is that of the
+    statue.
 
-    The generic control model rests as they do, so the rotations of the parts in the world carry over; abdomen and
-    chest become the one rotation that brings neck and shoulders nearest to where those two bring them.
-
-    Parameters
-    ----------
-    control : ControlModel
-        Fitted.
-    pose : (J, 3) float, radians
-        `Statue.pose`.
-    poses : (T, 16, 3) float, radians
-    trans : (T, 3) float, metres, optional
-        For the average person; scaled by the length of the legs.
-    rate : float, frames a second
-    up : (3,) float, optional
-        As for `bvh_motion`.
-    config : MotionConfig, optional
-
-    Raises
-    ------
-    ValueError
-        A motion of other parts or not finite.
+    The generic control model rests as they do, so the rotations of the parts in the world carry over; abdomen and chest
+    become the one rotation that brings neck and shoulders nearest to where those two bring them.
     """
     skeleton = _average_person()
     poses, trans = check_motion(skeleton, poses, trans, rate)

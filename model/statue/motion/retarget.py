@@ -37,38 +37,22 @@ class MotionConfig(Settings):
 
 @dataclass(frozen=True, eq=False)
 class StatueMotion:
-    """A motion of a statue, by the conventions of the body models.
+    """A motion of a statue, by the conventions of the body models."""
 
-    Attributes
-    ----------
-    poses : (T, J, 3) float, radians
-        Against the default pose, which is that of the scan.
-    trans : (T, 3) float, metres
-        Travel of the root's joint.
-    rate : float, frames a second
-    matched : {part of the statue: joint that it follows}
-    lacking : the statue's parts that go with the part above them, because the motion has no such joint
-    unmatched : joints of the motion that no part follows, not even by what hangs on them
-    """
-
-    poses: np.ndarray
-    trans: np.ndarray
-    rate: float
-    matched: dict[str, str]
-    lacking: tuple[str, ...] = ()
-    unmatched: tuple[str, ...] = ()
+    poses: np.ndarray                # (T, J, 3) radians, against the default pose, which is that of the scan
+    trans: np.ndarray                # (T, 3) metres, travel of the root's joint
+    rate: float                      # frames a second
+    matched: dict[str, str]          # {part of the statue: joint that it follows}
+    lacking: tuple[str, ...] = ()    # the statue's parts that go with the part above them, because the motion has no
+                                     # such joint
+    unmatched: tuple[str, ...] = ()  # joints of the motion that no part follows, not even by what hangs on them
 
 
 class Pairing:
     """A statue and a skeleton that moves, both at rest.
 
-    Attributes
-    ----------
-    P : (J, 3, 3)
-        How the generic model's parts were turned to the pose of the scan.
-    joints : (J, 3)
-        Of the statue in the generic default pose, in the axes of the generic model.
-    ours, theirs : {H-Anim name: part or joint}
+    `P` (J, 3, 3) is how the generic model's parts were turned to the pose of the scan, `joints` (J, 3) those of the
+    statue in the generic default pose, `ours` and `theirs` the parts and joints by their H-Anim names.
     """
 
     def __init__(self, control: ControlModel, pose: np.ndarray, moving: BvhMotion, names: Mapping[str, str] | None,

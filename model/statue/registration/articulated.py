@@ -13,42 +13,21 @@ from ..control.model import ControlModel
 
 @dataclass(frozen=True, eq=False)
 class Points:
-    """Points that hang on a control model: joints, landmarks, vertices.
+    """Points that hang on a control model: joints, landmarks, vertices."""
 
-    Parameters
-    ----------
-    weights : (n, J) float
-        How much each part carries each point; rows sum to 1.
-    rest : (n, 3) float, metres
-        In the default pose.
-    """
-
-    weights: np.ndarray
-    rest: np.ndarray
+    weights: np.ndarray  # (n, J), how much each part carries each point; rows sum to 1
+    rest: np.ndarray     # (n, 3) metres, in the default pose
 
 
 @dataclass(frozen=True, eq=False)
 class Frames:
-    """Where the parts are for one set of parameters.
+    """Where the parts are for one set of parameters."""
 
-    Attributes
-    ----------
-    R : (J, 3, 3) float
-        World rotation of every part.
-    joints : (J, 3) float, metres
-    shapes : (J, 3, 3) float
-        The stretch of every part in the axes of the default pose.
-    turns : (A, 3) float
-        World axis about which each angle turns its part and all that hangs on it.
-    shifts : (J, S, 3) float, metres
-        Derivative of the joints by the length factors.
-    """
-
-    R: np.ndarray
-    joints: np.ndarray
-    shapes: np.ndarray
-    turns: np.ndarray
-    shifts: np.ndarray
+    R: np.ndarray       # (J, 3, 3), world rotation of every part
+    joints: np.ndarray  # (J, 3) metres
+    shapes: np.ndarray  # (J, 3, 3), the stretch of every part in the axes of the default pose
+    turns: np.ndarray   # (A, 3), world axis about which each angle turns its part and all that hangs on it
+    shifts: np.ndarray  # (J, S, 3) metres, derivative of the joints by the length factors
 
 
 @dataclass(frozen=True, eq=False)
@@ -152,10 +131,7 @@ class Articulated:
         return float(self.shares @ self.split(x)[1])
 
     def frames(self, x: np.ndarray) -> Frames:
-        """Rotations and joints of all parts.
-
-        [Statues] Eq. 3
-        """
+        """Rotations and joints of all parts. [Statues] Eq. 3"""
         skeleton, segment = self.control.skeleton, self.control.segment_of_part
         _, factors, place = self.split(x)
         pose, o = self.pose(x), skeleton.joints
@@ -175,10 +151,7 @@ class Articulated:
         return Frames(R, joints, shapes, turns, shifts)
 
     def positions(self, frames: Frames, points: Points) -> np.ndarray:
-        """Where points are (n, 3), metres.
-
-        [Statues] Eq. 2
-        """
+        """Where points are (n, 3), metres. [Statues] Eq. 2"""
         return np.einsum("nj,njd->nd", points.weights, self._by_part(frames, points))
 
     def derivatives(self, frames: Frames, points: Points) -> np.ndarray:

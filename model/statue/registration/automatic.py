@@ -8,10 +8,11 @@ from scipy.spatial import cKDTree
 
 from scanprep.geometry.format_common import UNITS
 from scanprep.geometry.mesh import Mesh
+from scanprep.geometry.target import Target, target_of
 from scanprep.geometry.thinning import thin
 from scanprep.registration.confidence import stretched_share
-from scanprep.registration.matches import Target, target_of
-from scanprep.registration.nonrigid import Registration, RegistrationConfig, register
+from scanprep.registration.nonrigid import Registration, register
+from scanprep.registration.schedule import RegistrationConfig
 from scanprep.threads import one_thread, search_threads
 
 from ..control.model import ControlModel
@@ -30,45 +31,24 @@ SHOWN = 0.3                      # share of the vertices around a joint that hav
 
 @dataclass(frozen=True, eq=False)
 class Features:
-    """What was found on a scan, in the scan's own axes and unit.
+    """What was found on a scan, in the scan's own axes and unit."""
 
-    Attributes
-    ----------
-    joints, points : {name: (3,) float}
-        Joint centres and landmarks of the control model with data around them; empty where no person was found.
-    missing : names
-        Joints and landmarks that the scan does not show.
-    registered : Mesh or None
-        The control mesh on the scan.
-    fit : FeatureFit or None
-        Of the control model to these features.
-    unit : str
-        Of m, mm, cm and in the one in which the scan would be most nearly as long as a person is tall.
-    up, front : (3,) float, unit
-        Upwards, and to where the person faces.
-    misfit : float, metres
-        Between the scan and the control model in its pose: see `Stand`.
-    margin : float
-        How many times larger it is for the best start that faces another way.
-    missed, stretched : float
-        What `Registration.missed` and `stretched_share` say of the registered mesh.
-    problem : str or None
-        Why the features should not be trusted.
-    """
-
-    joints: dict[str, np.ndarray]
-    points: dict[str, np.ndarray]
-    missing: tuple[str, ...]
-    registered: Mesh | None
-    fit: FeatureFit | None
-    unit: str
-    up: np.ndarray
-    front: np.ndarray
-    misfit: float
-    margin: float
-    missed: float
-    stretched: float
-    problem: str | None
+    joints: dict[str, np.ndarray]  # {name: (3,) }, joint centres and landmarks of the control model with data around
+                                   # them; empty where no person was found
+    points: dict[str, np.ndarray]  # {name: (3,) }, joint centres and landmarks of the control model with data around
+                                   # them; empty where no person was found
+    missing: tuple[str, ...]       # joints and landmarks that the scan does not show
+    registered: Mesh | None        # the control mesh on the scan
+    fit: FeatureFit | None         # of the control model to these features
+    unit: str                      # of m, mm, cm and in the one in which the scan would be most nearly as long as a
+                                   # person is tall
+    up: np.ndarray                 # (3,) unit, upwards, and to where the person faces
+    front: np.ndarray              # (3,) unit, upwards, and to where the person faces
+    misfit: float                  # metres, between the scan and the control model in its pose: see `Stand`
+    margin: float                  # how many times larger it is for the best start that faces another way
+    missed: float                  # what `Registration.uncovered` and `stretched_share` say of the registered mesh
+    stretched: float               # what `Registration.uncovered` and `stretched_share` say of the registered mesh
+    problem: str | None            # why the features should not be trusted
 
 
 @one_thread()
@@ -115,8 +95,8 @@ def find_features(control: ControlModel, scan: Mesh) -> Features:
     joints, points, missing = _features(control, best, found)
     fit = fit_features(control, joints, points) if len(joints) + len(points) > 2 else None
     registered = control.mesh.with_vertices(best.to_scan(found.mesh.vertices))
-    return Features(joints, points, missing, registered, fit, unit, up, front, best.off, margin, found.missed,
-                    stretched_share(start, found.mesh), doubts(best.off, margin, found.missed))
+    return Features(joints, points, missing, registered, fit, unit, up, front, best.off, margin, found.uncovered,
+                    stretched_share(start, found.mesh), doubts(best.off, margin, found.uncovered))
 
 
 def nobody_problem(off: float, margin: float, unit: str) -> str | None:

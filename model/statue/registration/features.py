@@ -12,7 +12,6 @@ from scanprep.ranges import Count, Positive, Settings
 
 from ..control.model import ControlModel
 from .articulated import Articulated, Points
-from .limbs import analytic_start, limbs
 
 PLANE = 0.02                     # of the widest spread of points: flatter ones say nothing across their plane
 
@@ -40,34 +39,17 @@ class FeatureConfig(Settings):
 
 @dataclass(frozen=True, eq=False)
 class FeatureFit:
-    """The control model in the pose, with the lengths and at the place of a scan.
+    """The control model in the pose, with the lengths and at the place of a scan."""
 
-    Attributes
-    ----------
-    pose : (J, 3) float, radians
-        Rotation vector of every part in its parent, as `Skeleton.part_rotations` takes them.
-    lengths : (S,) float, metres
-        Of the segments.
-    size : float
-        Of the body against the default one; its thickness grows by it.
-    trans : (3,) float, metres
-        From the default place of the root's joint to where it stands.
-    vertices : (N, 3) float, metres
-    joints : (J, 3) float, metres
-    joint_rms, point_rms : float, metres
-        Misfit of the features; NaN without any of the kind.
-    converged : bool
-    iterations : int
-    """
-
-    pose: np.ndarray
-    lengths: np.ndarray
-    size: float
-    trans: np.ndarray
-    vertices: np.ndarray
-    joints: np.ndarray
-    joint_rms: float
-    point_rms: float
+    pose: np.ndarray      # (J, 3) radians, rotation vector of every part in its parent, as `Skeleton.part_rotations`
+                          # takes them
+    lengths: np.ndarray   # (S,) metres, of the segments
+    size: float           # of the body against the default one; its thickness grows by it
+    trans: np.ndarray     # (3,) metres, from the default place of the root's joint to where it stands
+    vertices: np.ndarray  # (N, 3) metres
+    joints: np.ndarray    # (J, 3) metres
+    joint_rms: float      # metres, misfit of the features; NaN without any of the kind
+    point_rms: float      # metres, misfit of the features; NaN without any of the kind
     converged: bool
     iterations: int
 
@@ -136,10 +118,7 @@ def fit_features(control: ControlModel, joints: Mapping[str, np.ndarray],
 
 
 def misfit(model: Articulated, x: np.ndarray, features: Points, goal: np.ndarray) -> tuple[float, np.ndarray]:
-    """Sum of squares between features and where they are wanted (n, 3), and its gradient (P,).
-
-    [Statues] Eq. 4
-    """
+    """Sum of squares between features and where they are wanted (n, 3), and its gradient (P,). [Statues] Eq. 4"""
     frames = model.frames(x)
     off = model.positions(frames, features) - goal
     return float(np.sum(off**2)), 2 * np.einsum("nd,ndp->p", off, model.derivatives(frames, features))
@@ -147,25 +126,11 @@ def misfit(model: Articulated, x: np.ndarray, features: Points, goal: np.ndarray
 
 def warp(vertices: np.ndarray, from_points: np.ndarray, to_points: np.ndarray, share: np.ndarray | None = None
          ) -> np.ndarray:
-    """Carry vertices along with points, by the smoothest displacement of space (φ(p) = |p|³ with an affine part).
+    """Carry vertices (N, 3) along with points (n, 3), by the smoothest displacement of space (φ(p) = |p|³ with an
+    affine part), of which each vertex takes its `share` (N,). [Statues] Eq. 5
 
-    The paper prints φ(p_k^H - p_k^C), a constant; interpolation needs φ(p - p_k^C).
-
-    Parameters
-    ----------
-    vertices : (N, 3) float, metres
-    from_points, to_points : (n, 3) float, metres
-        Where points of the surface are and where they shall be. The displacement is exact there, where `share` is 1.
-    share : (N,) float, optional
-        How much of the displacement each vertex takes.
-
-    Raises
-    ------
-    ValueError
-        Fewer than four points or points in one plane: the affine part would be anything across it, and the back of a
-        head would go anywhere. Two points at one place.
-
-    [Statues] Eq. 5
+    The paper prints φ(p_k^H - p_k^C), a constant; interpolation needs φ(p - p_k^C). ValueError for points in one plane:
+    the affine part would be anything across it, and the back of a head would go anywhere.
     """
     from scipy.interpolate import RBFInterpolator
 
@@ -227,3 +192,84 @@ def _on_a_line(points: np.ndarray) -> bool:
 
 def _rms(distances: np.ndarray) -> float:
     return float(np.sqrt(np.mean(distances**2))) if len(distances) else np.nan
+
+
+def limbs(model: Articulated) -> list[tuple[int, int, int | None]]:
+    """Base, middle and end joint of every limb: a joint of three axes, on it one of one axis, and what it carries."""
+    freedom = np.bincount(model.joint_of, minlength=len(model.control.axes))
+    parents = model.control.skeleton.parents
+    found = []
+    for middle in range(1, len(parents)):
+        base = int(parents[middle])
+        if base > 0 and freedom[middle] == 1 and freedom[base] == 3:
+            ends = np.flatnonzero(parents == middle)
+            found.append((base, middle, int(ends[0]) if len(ends) else None))
+    return found
+
+
+def analytic_start(model: Articulated, at: Mapping[str, np.ndarray]) -> np.ndarray:
+    """Lengths from joints that are neighbours, and each limb from its base, middle and end joints in closed form."""
+    skeleton = model.control.skeleton
+    o, names = skeleton.joints, skeleton.names
+    x = model.rest.copy()
+    angles, factors, _ = model.split(x)
+    ratios: dict[int, list[float]] = {}
+    for c in range(1, len(o)):
+        p = skeleton.parents[c]
+        if names[c] in at and names[p] in at:
+            ratios.setdefault(int(model.control.segment_of_part[p]), []).append(float(
+                np.linalg.norm(at[names[c]] - at[names[p]]) / max(np.linalg.norm(o[c] - o[p]), 1e-9)))
+    for s, values in ratios.items():
+        factors[s] = np.mean(values)
+    for base, middle, end in limbs(model):
+        if names[base] in at and names[middle] in at:
+            goal = [at[names[middle]] - at[names[base]]]
+            if end is not None and names[end] in at:
+                goal.append(at[names[end]] - at[names[middle]])
+            angles[model.joint_of == base], angles[model.joint_of == middle] = limb_angles(
+                model, base, middle, end, np.array(goal))
+    return x
+
+
+def limb_angles(model: Articulated, base: int, middle: int, end: int | None, goal: np.ndarray
+                ) -> tuple[np.ndarray, float]:
+    """Angles (3,) of the base joint and that of the middle one that point one or two bones along directions (1 or 2, 3)
+    in the axes of the part that the base joint is on.
+    """
+    o, of_base, hinge = model.control.skeleton.joints, model.joint_of == base, model.joint_of == middle
+    rest = np.array([o[middle] - o[base], *([o[end] - o[middle]] if len(goal) == 2 else [])])
+    return _limb(_unit(rest), _unit(goal), model.axes[of_base], model.axes[hinge][0], model.limits[of_base],
+                 model.limits[hinge][0])
+
+
+def _limb(rest: np.ndarray, goal: np.ndarray, axes: np.ndarray, hinge: np.ndarray, limits: np.ndarray,
+          hinge_limits: np.ndarray) -> tuple[np.ndarray, float]:
+    """Angles (3,) of the base and that of the hinge that turn one or two bones (1 or 2, 3), unit, to their goals.
+
+    A hinge has two angles at which the bones enclose the right one: of these the one that is farther inside the
+    limits of both joints, or else nearer to the default pose.
+    """
+    bends = _bends(hinge, rest[0], rest[1], float(goal[0] @ goal[1])) if len(goal) == 2 else np.zeros(1)
+    tried = []
+    for bend in bends:
+        allowed = float(np.clip(bend, *hinge_limits))
+        turned = np.concatenate([rest[:1], rest[1:] @ rotations.exp(allowed * hinge).T])
+        # The identity decides how a straight limb is turned about itself.
+        H = goal.T @ turned + 1e-3 * np.eye(3)
+        angles = np.linalg.solve(axes.T, rotations.log(rotations.project(H[None])[0]))
+        beyond = np.abs(angles - np.clip(angles, *limits.T)).sum() + abs(bend - allowed)
+        tried.append((round(float(beyond), 3), abs(allowed), allowed, angles))
+    _, _, bend, angles = min(tried, key=lambda t: t[:2])
+    return angles, bend
+
+
+def _bends(axis: np.ndarray, first: np.ndarray, second: np.ndarray, cosine: float) -> np.ndarray:
+    """The two angles of a hinge at which two bones, unit, enclose an angle of the given cosine, or come nearest."""
+    still = (first @ axis) * (axis @ second)
+    a, b = first @ second - still, first @ np.cross(axis, second)
+    middle, half = np.arctan2(b, a), np.arccos(np.clip((cosine - still) / max(np.hypot(a, b), 1e-12), -1, 1))
+    return (np.array([middle - half, middle + half]) + np.pi) % (2 * np.pi) - np.pi
+
+
+def _unit(v: np.ndarray) -> np.ndarray:
+    return v / np.maximum(np.linalg.norm(v, axis=-1, keepdims=True), 1e-12)

@@ -33,32 +33,15 @@ FLOOR = 1e-6             # of its area at rest: a frame that has become smaller 
 
 @dataclass(frozen=True, eq=False)
 class LocalShape:
-    """The rest shape of a mesh in the frames of its triangles; R rows, one for a vertex in one frame.
-
-    Attributes
-    ----------
-    count : int
-        Vertices of the mesh, N.
-    held : (R,) int
-        The vertex.
-    corners : (R, 3) int
-        Vertices of the frame.
-    bary : (R, 3) float
-        Its barycentric coordinates 1 - α - β, α, β in the plane of the frame.
-    heights : (R,) float
-        Its height h over that plane, in multiples of √(2 · area) of the frame.
-    smallest : (R,) float, square metres
-        Least double area that a frame counts as.
-
-    [Statues] Eq. 10
+    """The rest shape of a mesh in the frames of its triangles; R rows, one for a vertex in one frame. [Statues] Eq. 10
     """
 
-    count: int
-    held: np.ndarray
-    corners: np.ndarray
-    bary: np.ndarray
-    heights: np.ndarray
-    smallest: np.ndarray
+    count: int            # vertices of the mesh, N
+    held: np.ndarray      # (R,), the vertex
+    corners: np.ndarray   # (R, 3), vertices of the frame
+    bary: np.ndarray      # (R, 3), its barycentric coordinates 1 - α - β, α, β in the plane of the frame
+    heights: np.ndarray   # (R,), its height h over that plane, in multiples of √(2 · area) of the frame
+    smallest: np.ndarray  # (R,) square metres, least double area that a frame counts as
 
     @cached_property
     def weights(self) -> np.ndarray:
@@ -83,15 +66,11 @@ class LocalShape:
         return self.plane @ x - self.raised(x)
 
     def energy(self, x: np.ndarray) -> float:
-        """S(x) of vertices (N, 3), square metres: 0 for every similar copy of the rest shape.
-
-        [Statues] Eq. 10
-        """
+        """S(x) of vertices (N, 3), square metres: 0 for every similar copy of the rest shape. [Statues] Eq. 10"""
         return float(self.weights @ (self.residuals(x) ** 2).sum(axis=1))
 
     def published_force(self, x: np.ndarray) -> np.ndarray:
         """(N, 3) mean over its frames of what would bring each vertex where they want it, the frames standing still.
-
         [Statues] Eq. 12
         """
         return -self._summed(self.held, self.weights[:, None] * self.residuals(x))
@@ -131,13 +110,7 @@ class LocalShape:
 
 
 def local_shape(rest: Mesh) -> LocalShape:
-    """The local shape of a mesh at rest.
-
-    Raises
-    ------
-    ValueError
-        A mesh that is not edge-manifold or without a single sound frame.
-
+    """The local shape of a mesh at rest; ValueError where that is not edge-manifold or has not one sound frame.
     [Statues] section 4.1
     """
     if not rest.is_edge_manifold:

@@ -10,10 +10,10 @@ from scipy.spatial import cKDTree
 from scanprep.geometry import rotations
 from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.surface import Surface
+from scanprep.geometry.target import Target
 from scanprep.geometry.thinning import thin
-from scanprep.registration.matches import Target
 
-from .limbs import limb_angles, limbs
+from .features import limb_angles, limbs
 from .pose_search import COARSE, FINE, Posed, PoseSearch
 
 CAP, NORMALS = 0.08, 0.05        # metres: of a distance, and what a difference of normals of one is worth
@@ -31,23 +31,14 @@ FOREARMS = ((0, 1, 0), (-0.75, 0.1, 0.65), (0.1, 0.1, 1), (-1, 0.4, 0))
 
 @dataclass(frozen=True, eq=False)
 class Stand:
-    """A control model that stands in a scan.
+    """A control model that stands in a scan."""
 
-    Attributes
-    ----------
-    T : (4, 4) float
-        Similarity from the scan to the axes and the size of the control model.
-    posed : Posed
-    off : float, metres
-        Root mean square distance of the scan from the body, at most `CAP` each, turned normals counted in.
-    misfit : float, metres
-        The same with the distances of the body from the scan, which count less: what the best stand is chosen by.
-    """
-
-    T: np.ndarray
+    T: np.ndarray  # (4, 4), similarity from the scan to the axes and the size of the control model
     posed: Posed
-    off: float
-    misfit: float
+    off: float     # metres, root mean square distance of the scan from the body, at most `CAP` each, turned normals
+                   # counted in
+    misfit: float  # metres, the same with the distances of the body from the scan, which count less: what the best
+                   # stand is chosen by
 
     @property
     def scale(self) -> float:
@@ -63,15 +54,8 @@ class Stand:
 
 
 def find_person(search: PoseSearch, target: Target, metres: float) -> list[Stand]:
-    """The best stand and the best one that faces another way, best first.
-
-    Parameters
-    ----------
-    search : PoseSearch
-    target : Target
-        The scan, in its own unit.
-    metres : float
-        The scan's unit.
+    """The best stand in a scan and the best one that faces another way, best first. The scan is in its own unit, of so
+    many `metres`.
     """
     bent = sorted((bend(search, target, T, search.start, COARSE) for T in rough_stands(search, target, metres)[:TRIED]),
                   key=lambda stand: stand.misfit)

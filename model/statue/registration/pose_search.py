@@ -6,10 +6,11 @@ from dataclasses import dataclass
 import numpy as np
 
 from scanprep.geometry.mesh import Mesh
+from scanprep.geometry.target import Target, orient
 from scanprep.geometry.thinning import thin
 from scanprep.ranges import Cell, Count, Positive, Settings
 from scanprep.registration.energies import Pull, pull
-from scanprep.registration.matches import Described, Likeness, Target, orient, tukey
+from scanprep.registration.matches import Described, Likeness, tukey
 
 from .articulated import Articulated, Points
 
@@ -52,18 +53,11 @@ FINE = (PoseStage(0.2, 0.015, 0.1, 0.15, 0.03, 6), PoseStage(0.12, 0.01, 0.08, 0
 
 @dataclass(frozen=True, eq=False)
 class Posed:
-    """A control model on its way to a scan.
+    """A control model on its way to a scan."""
 
-    Attributes
-    ----------
-    x : (P,) float
-        Parameters.
-    girth : (S,) float, metres
-        How far the surface of every segment stands off the default one: people are not equally thick.
-    """
-
-    x: np.ndarray
-    girth: np.ndarray
+    x: np.ndarray      # (P,), parameters
+    girth: np.ndarray  # (S,) metres, how far the surface of every segment stands off the default one: people are not
+                       # equally thick
 
 
 class PoseSearch:

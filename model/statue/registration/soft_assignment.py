@@ -32,21 +32,11 @@ Slack = Literal["rest", "published"]
 
 @dataclass(frozen=True, eq=False)
 class SoftAssignment:
-    """How much every vertex is assigned to every point.
+    """How much every vertex is assigned to every point."""
 
-    Attributes
-    ----------
-    matches : (I, J) sparse
-        Rows sum to 1; the row of a vertex that knows no point is empty.
-    slack : (J,) float
-        What is left of each point: 1 for a point that no vertex knows.
-    excess : float
-        Most that a point is assigned beyond 1.
-    """
-
-    matches: csr_array
-    slack: np.ndarray
-    excess: float
+    matches: csr_array  # (I, J), rows sum to 1; the row of a vertex that knows no point is empty
+    slack: np.ndarray   # (J,), what is left of each point: 1 for a point that no vertex knows
+    excess: float       # most that a point is assigned beyond 1
 
     @property
     def seen(self) -> np.ndarray:
@@ -54,10 +44,7 @@ class SoftAssignment:
         return np.diff(self.matches.indptr) > 0
 
     def energy(self, x: np.ndarray, points: np.ndarray, temperature: float) -> tuple[float, float]:
-        """The data term Σ m |y - x|² and the entropy term T Σ m (log m - 1), square metres.
-
-        [Statues] Eq. 15
-        """
+        """The data term Σ m |y - x|² and the entropy term T Σ m (log m - 1), square metres. [Statues] Eq. 15"""
         i, j = np.repeat(np.arange(len(x)), np.diff(self.matches.indptr)), self.matches.indices
         m = self.matches.data
         apart = ((points[j] - x[i]) ** 2).sum(axis=1)
@@ -65,22 +52,7 @@ class SoftAssignment:
 
 
 class ScanPoints:
-    """Points of a scan with normals, searched for the nearest ones that face the same way.
-
-    Parameters
-    ----------
-    points : (J, 3) float, metres
-    normals : (J, 3) float, unit
-    border : (J,) bool
-        On the edge of a hole.
-
-    Attributes
-    ----------
-    tree : cKDTree
-        Of the points.
-    spacing : float, metres
-        Between neighbouring points.
-    """
+    """Points of a scan with normals, searched for the nearest ones that face the same way."""
 
     def __init__(self, points: np.ndarray, normals: np.ndarray, border: np.ndarray) -> None:
         self.points, self.normals, self.border = points, normals, border
@@ -89,19 +61,8 @@ class ScanPoints:
         self.spacing = float(np.median(self.tree.query(some, min(5, len(points)))[0][:, -1]))
 
     def nearest(self, x: np.ndarray, normals: np.ndarray, neighbours: int) -> tuple[np.ndarray, np.ndarray]:
-        """The nearest points whose normals lie in the half-space of the vertex normal.
-
-        Parameters
-        ----------
-        x, normals : (I, 3) float
-        neighbours : int
-
-        Returns
-        -------
-        (I, K) int
-            Points, the nearest first; -1 where there are no more.
-        (I, K) float, square metres
-            Squared distances; inf where there are no more.
+        """The nearest points (I, K) whose normals lie in the half-space of the vertex normal, the nearest first, -1
+        where there are no more; and their squared distances, inf where there are no more.
         """
         index, squared = self._facing(x, normals, 2 * neighbours)
         alone = np.flatnonzero(index[:, 0] < 0)          # deep inside a limb the other side may be nearer
@@ -130,24 +91,9 @@ class ScanPoints:
 
 def assign(near: np.ndarray, squared: np.ndarray, count: int, temperature: float, slack: Slack = "rest",
            tolerance: float = 0.01, most: int = 5) -> SoftAssignment:
-    """Balanced soft assignment at one temperature.
-
-    Parameters
-    ----------
-    near : (I, K) int
-        The points that each vertex knows, -1 for none.
-    squared : (I, K) float, square metres
-        Their squared distances.
-    count : int
-        Points of the scan, J.
-    temperature : float, square metres
-    slack : "rest" or "published"
-    tolerance : float
-        Balanced when no share of a point changes by more than this part of itself.
-    most : int
-        Times twenty alternations at most.
-
-    [Statues] Eq. 14, 17
+    """Balanced soft assignment, at one temperature (m²), of vertices to the points (I, K) that each knows, -1 for none,
+    by their squared distances; done when no share of a point changes by more than `tolerance` of itself. [Statues] Eq.
+    14, 17
     """
     known = near >= 0
     row, point = np.nonzero(known)[0], near[known]

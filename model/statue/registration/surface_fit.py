@@ -9,24 +9,22 @@ the surface, and beyond it not at all. `SurfaceFitConfig(step="explicit", polish
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Annotated, Literal
 
 import numpy as np
 from scipy.sparse import csc_array, diags_array, eye_array
 
 from scanprep.geometry.mesh import Mesh, check_template
-from scanprep.geometry.sparse import Factored
+from scanprep.geometry.sparse import Factored, conjugate_gradients
 from scanprep.geometry.surface import Surface, checked_points
+from scanprep.geometry.target import Target, target_of
 from scanprep.ranges import Count, Positive, Range, Settings
-from scanprep.registration.matches import Target
-from scanprep.registration.shell import conjugate_gradients, flipped, unfold
-from scanprep.registration.vertex_rotations import turns
+from scanprep.registration.inverted_triangles import inverted_triangles, unfold
 from scanprep.threads import one_thread
 
 from .local_shape import LocalShape, local_shape
 from .soft_assignment import ScanPoints, Slack, SoftAssignment, assign
-from .surface_data import SurfaceData, distortion, scan_target
 
 AGREE = 0.3              # least cosine between normals of the scan and the mesh, for points that draw the mesh
 BACK = 10                # times that vertices go back from the surface because a triangle turned over
@@ -86,39 +84,22 @@ class SurfaceFitConfig(Settings):
 
 @dataclass(frozen=True, eq=False)
 class SurfaceFit:
-    """A control mesh on a scan.
+    """A control mesh on a scan."""
 
-    Attributes
-    ----------
-    vertices : (N, 3) float, metres
-    seen : (N,) bool
-        Whether there were data here; the others are carried by the shape.
-    rms, largest : float, metres
-        Distances of the vertices seen to the surface of the scan.
-    inverted : int
-        Triangles that face against their surroundings.
-    distortion : float
-        Root mean square over the area of the logarithm of the stretches against the rest shape.
-    energies : {"shape", "data", "entropy", "cover": float}
-        Terms of Eq. 16, and our own, after the last step at the last temperature, square metres.
-    temperatures : (K,) float, square metres
-    steps : (K,) int
-        Steps at each of them.
-    converged : bool
-        The longest gradient of a vertex fell below √T at the last temperature, and there were data. At a higher
-        one the fit goes on after `most` steps, for the next has another minimum anyway.
-    """
-
-    vertices: np.ndarray
-    seen: np.ndarray
-    rms: float
-    largest: float
-    inverted: int
-    distortion: float
-    energies: dict[str, float]
-    temperatures: np.ndarray
-    steps: np.ndarray
-    converged: bool
+    vertices: np.ndarray        # (N, 3) metres
+    seen: np.ndarray            # (N,), whether there were data here; the others are carried by the shape
+    rms: float                  # metres, distances of the vertices seen to the surface of the scan
+    largest: float              # metres, distances of the vertices seen to the surface of the scan
+    inverted: int               # triangles that face against their surroundings
+    distortion: float           # root mean square over the area of the logarithm of the stretches against the rest
+                                # shape
+    energies: dict[str, float]  # {"shape", "data", "entropy", "cover": }, terms of Eq. 16, and our own, after the last
+                                # step at the last temperature, square metres
+    temperatures: np.ndarray    # (K,) square metres
+    steps: np.ndarray           # (K,), steps at each of them
+    converged: bool             # the longest gradient of a vertex fell below √T at the last temperature, and there were
+                                # data. At a higher one the fit goes on after `most` steps, for the next has another
+                                # minimum anyway
 
 
 @one_thread()
@@ -291,14 +272,14 @@ class _Fit:
 
     def settle_down(self, surface: Surface) -> None:
         """Vertices with data onto the surface, where that turns no triangle over."""
-        self.x = unfold(self.rest, self.x, turns(self.rest, self.x))
+        self.x = unfold(self.rest, self.x)
         normals, (free, _) = self.mesh.vertex_normals, self.seen()
         found = surface.closest(self.x)
         free &= np.einsum("nd,nd->n", surface.mesh.face_normals[found.faces], normals) > 0
-        already = flipped(self.rest, self.x, turns(self.rest, self.x))
+        already = inverted_triangles(self.rest, self.x)
         for _ in range(BACK):
             y = np.where(free[:, None], found.points, self.x)
-            turned = flipped(self.rest, y, turns(self.rest, y)) & ~already
+            turned = inverted_triangles(self.rest, y) & ~already
             if not turned.any():
                 break
             free[self.rest.faces[turned]] = False
@@ -308,7 +289,65 @@ class _Fit:
         """What was reached."""
         seen, _ = self.seen()
         apart = surface.closest(self.x).distances[seen]
-        inverted = flipped(self.rest, self.x, turns(self.rest, self.x))
+        inverted = inverted_triangles(self.rest, self.x)
         return SurfaceFit(self.x, seen, float(np.sqrt(np.mean(apart**2))) if seen.any() else np.nan,
                           float(apart.max(initial=0.0)), int(inverted.sum()), distortion(self.rest, self.x),
                           self.energies, temperatures, np.array(self.steps), bool(self.converged and seen.any()))
+
+
+@dataclass(frozen=True, eq=False)
+class SurfaceData:
+    """A data term Σ (x - y)ᵀ A (x - y) + share · |C x - z|²: vertices are drawn, and points of the scan draw the mesh.
+    [Statues] Eq. 13
+    """
+
+    A: np.ndarray  # (N, 3, 3), weight of each vertex: nothing without data, only across the surface at the edge of a
+                   # hole
+    y: np.ndarray  # (N, 3) metres, where it is drawn
+    C: csc_array   # (P, N), points of the mesh, as barycentric coordinates
+    z: np.ndarray  # (P, 3) metres, the points of the scan that draw them
+    share: float   # weight of each of these
+
+    def energy(self, x: np.ndarray) -> float:
+        """At vertices x (N, 3), square metres."""
+        return (float(np.einsum("ni,nij,nj->", x - self.y, self.A, x - self.y))
+                + self.cover(x))
+
+    def cover(self, x: np.ndarray) -> float:
+        """The part of the points that draw the mesh."""
+        return self.share * float(((self.C @ x - self.z) ** 2).sum())
+
+    def force(self, x: np.ndarray) -> np.ndarray:
+        """(N, 3) minus half the gradient."""
+        return np.einsum("nij,nj->ni", self.A, self.y - x) + self.share * (self.C.T @ (self.z - self.C @ x))
+
+    def applied(self, d: np.ndarray) -> np.ndarray:
+        """(N, 3) half the second derivative, applied to d (N, 3)."""
+        return np.einsum("nij,nj->ni", self.A, d) + self.share * (self.C.T @ (self.C @ d))
+
+    @property
+    def bound(self) -> csc_array:
+        """(N, N) the same for each coordinate, at least as stiff."""
+        return csc_array(diags_array(np.linalg.eigvalsh(self.A)[:, 2]) + self.share * (self.C.T @ self.C))
+
+
+def scan_target(scan: Mesh) -> Target:
+    """Points with smooth normals; the borders are those of the mesh, for tips of limbs look one-sided as well."""
+    border = np.zeros(len(scan.vertices), dtype=bool)
+    border[scan.boundary_vertices] = True
+    border |= scan.vertex_adjacency @ border.astype(float) > 0       # the nearest point may lie one step farther in
+    return replace(target_of(scan, name="scan"), border=border[np.unique(scan.faces)])
+
+
+def distortion(rest: Mesh, x: np.ndarray) -> float:
+    """Root mean square over the area at rest of the logarithm of the stretches of the triangles."""
+    def flat(c: np.ndarray) -> np.ndarray:
+        e, f = c[:, 1] - c[:, 0], c[:, 2] - c[:, 0]
+        length = np.maximum(np.linalg.norm(e, axis=1), 1e-12)
+        along = np.einsum("fd,fd->f", e, f) / length
+        height = np.linalg.norm(np.cross(e, f), axis=1) / length
+        return np.stack([np.stack([length, along], axis=1), np.stack([np.zeros_like(length), height], axis=1)], axis=1)
+
+    s = np.linalg.svd(flat(x[rest.faces]) @ np.linalg.inv(flat(rest.corners)), compute_uv=False)
+    stretch = (np.log(np.maximum(s, 1e-6)) ** 2).mean(axis=1)
+    return float(np.sqrt(np.average(stretch, weights=rest.face_areas)))

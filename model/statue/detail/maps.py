@@ -1,0 +1,149 @@
+"""A displacement map as files: exact numbers, an image that can be edited, and what the grey values mean [Statues].
+
+=====================  =========================================================================================
+displacement.tif       heights in metres, single precision, one channel
+displacement.png       heights in 16 bits of grey: `zero` is the value of height 0, `scale` is metres for a step
+coverage.png           8 bits: 255 measured, 170 folded, 85 hole, 0 outside the chart; so a hole is never a height
+vectors.tif            what is to be added to the heights in folds, in metres, single precision, three channels
+displacement.json      size, zero, scale and these four grey values
+=====================  =========================================================================================
+"""
+from __future__ import annotations
+
+import io
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from scanprep.geometry.storage import StorageError, read_json, taking_apart, write_json, writing
+from scanprep.pictures import png16
+
+from ..control.model import FOLDED, HOLE, MEASURED, OUTSIDE, DisplacementMap
+
+HEADER, HEIGHTS, IMAGE = "displacement.json", "displacement.tif", "displacement.png"
+COVERAGE, VECTORS = "coverage.png", "vectors.tif"
+ZERO, LARGEST = 32768, 65535
+FINEST = 1e-7                        # metres for a step of grey: a flat map has no extent to divide by
+LEVELS = {"measured": MEASURED, "folded": FOLDED, "hole": HOLE, "outside": OUTSIDE}
+
+
+def write_map(folder: str | Path, map: DisplacementMap) -> None:
+    """Write a displacement map into a folder, which is made if it is not there; each file whole or not at all."""
+    folder = Path(folder)
+    scale = _scale(map)
+    _write_tiff(folder / HEIGHTS, map.heights)
+    _write_png(folder / IMAGE, _grey(map.heights, scale))
+    _write_png(folder / COVERAGE, map.coverage)
+    if map.vectors is None:
+        (folder / VECTORS).unlink(missing_ok=True)
+    else:
+        _write_tiff(folder / VECTORS, map.vectors)
+    write_json(folder / HEADER, {"kind": "displacement map", "version": 1, "size": list(map.heights.shape),
+                                 "zero": ZERO, "scale": scale, "coverage": LEVELS})
+
+
+def read_map(folder: str | Path, edited: str | Path | None = None) -> DisplacementMap:
+    """Read a displacement map from a folder; StorageError for a file that is missing or damaged.
+
+    `edited` is `displacement.png` after editing, 16 bits of grey and of the same size. Where a pixel has another value
+    than the stored one, its height changes by the difference; all others keep theirs to the last digit.
+    """
+    folder = Path(folder)
+    header = read_json(folder / HEADER, "a displacement map's header")
+    with taking_apart(folder / HEADER, "size and scale of a displacement map"):
+        size, scale = tuple(header["size"]), float(header["scale"])
+        if not scale > 0:
+            raise ValueError(f"scale: expected a length above 0, got {scale}")
+    heights = _checked(folder / HEIGHTS, _read_tiff(folder / HEIGHTS), size, np.float32)
+    coverage = _checked(folder / COVERAGE, _read_png(folder / COVERAGE), size, np.uint8)
+    vectors = None
+    if (folder / VECTORS).exists():
+        vectors = _checked(folder / VECTORS, _read_tiff(folder / VECTORS), (*size, 3), np.float32)
+    found = DisplacementMap(heights, coverage, vectors)
+    if edited is None:
+        return found
+    stored = _checked(folder / IMAGE, _read_png(folder / IMAGE), size, np.uint16)
+    return edit(found, stored, read_edited(edited, size), scale)
+
+
+def edit(map: DisplacementMap, stored: np.ndarray, edited: np.ndarray, scale: float) -> DisplacementMap:
+    """A map whose heights change where two images (H, W) uint16 differ, by their difference."""
+    change = np.where(edited != stored, scale * (edited.astype(float) - stored), 0)
+    return replace(map, heights=(map.heights + change).astype(np.float32))
+
+
+def read_edited(path: str | Path, size: tuple[int, ...]) -> np.ndarray:
+    """(H, W) uint16 grey values of an image that an editor saved, 16 bits of grey or of three equal channels;
+    StorageError for another size or depth, or colours.
+    """
+    expected = f"an image of {size[1]} x {size[0]} pixels with 16 bits of grey"
+    with taking_apart(path, expected):
+        image, depth = _decoded(Path(path))
+    if image.ndim == 3:
+        image = image[..., :3] if image.shape[2] > 2 else image[..., :1]        # without opacity
+        if (image != image[..., :1]).any():
+            raise StorageError(f"{path}: expected {expected}, got colours: its channels differ")
+        image = image[..., 0]
+    came = f"{image.shape[1]} x {image.shape[0]} pixels with {depth} bits"
+    if depth != 16 or image.shape != tuple(size):
+        raise StorageError(f"{path}: expected {expected}, got {came}")
+    return image
+
+
+def _scale(map: DisplacementMap) -> float:
+    """Metres for a step of grey, so that all heights in the chart have a value."""
+    inside = np.abs(map.heights[map.coverage != OUTSIDE])
+    return max(float(inside.max(initial=0)) / (LARGEST - ZERO), FINEST)
+
+
+def _grey(heights: np.ndarray, scale: float) -> np.ndarray:
+    return np.clip(np.rint(heights.astype(float) / scale) + ZERO, 0, LARGEST).astype(np.uint16)
+
+
+def _write_png(path: Path, image: np.ndarray) -> None:
+    from PIL import Image
+
+    with writing(path) as beside:
+        Image.fromarray(image).save(beside, format="PNG", optimize=True)
+
+
+def _write_tiff(path: Path, image: np.ndarray) -> None:
+    import tifffile
+
+    with writing(path) as beside:
+        tifffile.imwrite(beside, image.astype(np.float32), compression="zlib",
+                         photometric="rgb" if image.ndim == 3 else "minisblack", metadata=None)
+
+
+def _read_tiff(path: Path) -> np.ndarray:
+    import tifffile
+
+    with taking_apart(path, "a TIFF image of single-precision numbers"):
+        return np.asarray(tifffile.imread(path))
+
+
+def _read_png(path: Path) -> np.ndarray:
+    with taking_apart(path, "a PNG image"):
+        return _decoded(path)[0]
+
+
+def _checked(path: Path, image: np.ndarray, size: tuple[int, ...], kind: Any) -> np.ndarray:
+    if image.shape != tuple(size) or image.dtype != kind or not np.isfinite(image).all():
+        raise StorageError(f"{path}: expected {np.dtype(kind).name} numbers of shape {tuple(size)}, all finite, "
+                           f"got {image.dtype} of shape {image.shape}")
+    return image
+
+
+def _decoded(path: Path) -> tuple[np.ndarray, int]:
+    """An image file and its bits per channel."""
+    from PIL import Image
+
+    data = path.read_bytes()
+    if data[:8] == png16.SIGNATURE and png16.depth(data) in ((16, 2), (16, 3), (16, 4)):
+        return png16.decode(data), 16
+    with Image.open(io.BytesIO(data)) as image:
+        if image.mode.startswith("I;16") or (image.mode == "I" and image.format == "PNG"):
+            return np.asarray(image).astype(np.uint16), 16
+        return np.asarray(image), 32 if image.mode in ("I", "F") else 8

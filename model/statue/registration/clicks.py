@@ -1,0 +1,128 @@
+"""Features that somebody clicked: joint centres and points of the surface, and how deep a joint lies behind a click."""
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from scipy.spatial import cKDTree
+
+from scanprep.geometry.format_common import UNITS
+from scanprep.geometry.landmarks import read_landmarks
+from scanprep.geometry.mesh import Mesh
+from scanprep.geometry.storage import StorageError, numbers, read_json, taking_apart
+from scanprep.geometry.surface import checked_surface
+
+from ..control.model import ControlModel
+
+WANTED = 'features {name: [x, y, z]} or {name: {"ray": [[x, y, z], [x, y, z]], "depth": d}}'
+
+
+def read_features(path: Path, control: ControlModel, scan: Mesh, unit: str | None = None
+                  ) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray]]:
+    """Joint centres and surface points, metres, by the names of the control model's joints and landmarks.
+
+    Any landmark file is read, in its `unit`. In JSON a joint may also be a click, `{"ray": [origin, direction],
+    "depth": d}`: its centre is then on the ray, where that is nearest to the medial axis of the scan, and d farther.
+    """
+    rays = _rays(path) if path.suffix == ".json" else {}
+    found = read_landmarks(path, scan, unit) if not rays else _places(path, rays, unit)
+    known = {*control.skeleton.names, *control.landmarks}
+    strange = [name for name in [*rays, *found] if name not in known]
+    if strange:
+        raise ValueError(f"{path}: the control model has no joint or landmark '{strange[0]}'; its joints are "
+                         f"{', '.join(control.skeleton.names)}; its landmarks {', '.join(control.landmarks)}")
+    joints = {name: place for name, place in found.items() if name in control.skeleton.names}
+    if rays:
+        medial, metre = MedialAxis(scan), UNITS[unit or "m"]
+        for name, (origin, direction, depth) in rays.items():
+            try:
+                joints[name] = medial.nearest_to_ray(metre * origin, direction, metre * depth)
+            except ValueError as error:
+                raise ValueError(f"{path}: {name}: {error}") from None
+    return joints, {name: place for name, place in found.items() if name in control.landmarks}
+
+
+def _rays(path: Path) -> dict[str, tuple[np.ndarray, np.ndarray, float]]:
+    tree = read_json(path, WANTED)
+    with taking_apart(path, WANTED):
+        clicks = {name: one for name, one in tree.items() if isinstance(one, dict) and "ray" in one} \
+            if isinstance(tree, dict) else {}
+        return {name: (*_ray(name, one), float(one.get("depth", 0.0))) for name, one in clicks.items()}
+
+
+def _ray(name: str, click: dict[str, Any]) -> tuple[np.ndarray, np.ndarray]:
+    origin, direction = numbers({name: np.array(click["ray"], dtype=np.float64)}, name, 2, 3)
+    return origin, direction
+
+
+def _places(path: Path, rays: dict[str, Any], unit: str | None) -> dict[str, np.ndarray]:
+    """The plain places of a file that has clicks as well."""
+    with taking_apart(path, WANTED):
+        places = {name: numbers({name: np.array(one, dtype=np.float64)}, name, 3)
+                  for name, one in read_json(path, WANTED).items() if name not in rays}
+    if unit is not None and unit not in UNITS:
+        raise StorageError(f"{path}: unknown unit {unit}")
+    return {name: UNITS[unit or "m"] * place for name, place in places.items()}
+
+
+INSIDE = 0.5                     # winding number; around a hole it falls smoothly from 1 to 0
+MOST = 60_000_000                # voxels that are still worked on
+
+
+class MedialAxis:
+    """Voxels inside a mesh, thinned to their medial axis, whose `points` (n, 3) are the centres. [Statues]
+
+    The winding number tells inside from outside although a scan has holes. Thinning leaves curves along limbs and
+    trunk, which serve as a guide only: a joint does not have to lie on them.
+    """
+
+    def __init__(self, mesh: Mesh, voxel: float = 0.01) -> None:
+        import igl
+        from skimage.morphology import skeletonize
+
+        vertices, faces = checked_surface(mesh)
+        if not voxel > 0:
+            raise ValueError(f"voxel: expected a width above 0, got {voxel}")
+        self.voxel = float(voxel)
+        self._origin = vertices.min(axis=0) - 1.5 * voxel
+        shape = np.ceil(np.ptp(vertices, axis=0) / voxel) + 4
+        if np.prod(shape) > MOST:
+            raise ValueError(f"voxel: {voxel} m gives {np.prod(shape):.3g} voxels, at most {MOST:.0e} are worked "
+                             "on; is the mesh in metres?")
+        cells = np.indices(shape.astype(int)).reshape(3, -1).T
+        winding = igl.fast_winding_number(vertices, faces, self._origin + voxel * (cells + 0.5))
+        self.inside = (np.asarray(winding) > INSIDE).reshape(shape.astype(int))
+        self.points = self._origin + voxel * (np.argwhere(skeletonize(self.inside, method="lee")) + 0.5)
+        if not len(self.points):
+            raise ValueError(f"mesh: no voxel of {voxel} m is inside; is it open, inside out, or in another unit?")
+        self._tree = cKDTree(self.points)
+
+    def nearest_to_ray(self, origin: np.ndarray, direction: np.ndarray, depth: float | None = None) -> np.ndarray:
+        """The point (3,) on a ray that is nearest to the medial axis, where the ray first passes through the body, and
+        `depth` metres farther; ValueError for a ray that misses it.
+        """
+        origin, along = np.asarray(origin, dtype=np.float64), np.asarray(direction, dtype=np.float64)
+        if not (np.isfinite(origin).all() and np.isfinite(along).all() and np.linalg.norm(along) > 0):
+            raise ValueError(f"origin, direction: expected finite numbers and a length, got {origin} and {along}")
+        along = along / np.linalg.norm(along)
+        t = self._stretch(origin, along)
+        apart, nearest = self._tree.query(origin + t[:, None] * along)
+        point = self.points[nearest[apart.argmin()]]
+        t_point = np.clip((point - origin) @ along, t[0], t[-1])
+        return np.asarray(origin + (t_point + (depth or 0.0)) * along)
+
+    def _stretch(self, origin: np.ndarray, along: np.ndarray) -> np.ndarray:
+        """Distances along a ray, a quarter of a voxel apart, at which it first is inside the body."""
+        shape = np.array(self.inside.shape)
+        middle = self._origin + 0.5 * self.voxel * shape
+        radius = 0.5 * self.voxel * float(np.linalg.norm(shape))
+        t = np.arange(max((middle - origin) @ along - radius, 0), (middle - origin) @ along + radius, 0.25 * self.voxel)
+        cells = np.floor((origin + t[:, None] * along - self._origin) / self.voxel).astype(int)
+        held = ((cells >= 0) & (cells < shape)).all(axis=1)
+        held[held] = self.inside[tuple(cells[held].T)]
+        if not held.any():
+            raise ValueError("origin, direction: the ray does not meet the body")
+        first = int(held.argmax())
+        last = first + int(np.append(~held[first:], True).argmax())
+        return np.asarray(t[first:last])

@@ -1,0 +1,222 @@
+"""Levenberg-Marquardt: the one loop of least squares, for a batch of problems at once, with rotations as unknowns.
+
+The caller gives the normal equations at a state; their structure solves for the step:
+
+- `Dense`: B independent problems with P unknowns each, every one with its own damping;
+- `Arrow`: many frames with unknowns of their own, coupled by those they share alone;
+- `Sparse`: one large problem with a sparse matrix.
+
+A step is added to the state, unless a `retract` says otherwise: `retract_pose` turns each rotation by its step.
+"""
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any, Generic, NamedTuple, Protocol, TypeVar
+
+import numpy as np
+from scipy.sparse import csc_array, diags_array
+
+from . import rotations, sparse
+
+State = TypeVar("State")
+FLOOR = 1e-9                         # of the largest diagonal entry, added to all: some unknowns may have no data
+STIFF = 1e8                          # damping beyond which no step lowers the energy any more
+
+
+@dataclass(frozen=True, eq=False)
+class Residual:
+    """Values (..., m) whose squares are summed, and their derivative (..., m, P) with respect to the unknowns."""
+
+    values: np.ndarray
+    jacobian: np.ndarray
+
+    @property
+    def energy(self) -> np.ndarray:
+        """(...) the sum of squares."""
+        return np.einsum("...m,...m->...", self.values, self.values)
+
+
+class NormalEquations(Protocol):
+    """An energy near one state: its value (B,), and the step that lowers it."""
+
+    @property
+    def energy(self) -> np.ndarray: ...
+
+    def step(self, damping: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """The step at a damping (B,), and by how much it lowers the quadratic model of the energy (B,)."""
+        ...
+
+
+class Dense(NamedTuple):
+    """Energy (B,), half its gradient (B, P) and the Gauss-Newton matrix (B, P, P) of independent problems."""
+
+    energy: np.ndarray
+    gradient: np.ndarray
+    hessian: np.ndarray
+
+    def step(self, damping: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        diagonal = np.diagonal(self.hessian, axis1=1, axis2=2)
+        ridge = damping[:, None] * diagonal + FLOOR * diagonal.max(axis=1, keepdims=True)
+        step = -np.linalg.solve(self.hessian + ridge[:, :, None] * np.eye(ridge.shape[1]),
+                                self.gradient[..., None])[..., 0]
+        return step, _gain(self.gradient, step, ridge)
+
+
+class Arrow(NamedTuple):
+    """Frames (B, P) as one problem whose last `shared` unknowns are the same in all rows.
+
+    `common` are the equations (a batch of one) of what concerns the shared unknowns alone.
+    """
+
+    rows: Dense
+    shared: int
+    common: Dense | None = None
+
+    @property
+    def energy(self) -> np.ndarray:
+        return self.rows.energy.sum(keepdims=True) + (0.0 if self.common is None else self.common.energy)
+
+    def step(self, damping: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Frames are eliminated from the damped equations, what they share is solved for."""
+        _, gradient, hessian = self.rows
+        n = gradient.shape[1] - self.shared
+        slope, shared = gradient[:, n:].sum(axis=0), hessian[:, n:, n:].sum(axis=0)
+        if self.common is not None:
+            slope, shared = slope + self.common.gradient[0], shared + self.common.hessian[0]
+        own, cross = hessian[:, :n, :n], hessian[:, :n, n:]
+        diagonal = np.diagonal(own, axis1=1, axis2=2)
+        floor = FLOOR * max(diagonal.max(), np.diag(shared).max(initial=0.0))
+        ridge, ridge_shared = damping[0] * diagonal + floor, damping[0] * np.diag(shared) + floor
+        solved = np.linalg.solve(own + ridge[:, :, None] * np.eye(n),
+                                 np.concatenate([cross, gradient[:, :n, None]], axis=2))
+        back = np.swapaxes(cross, 1, 2) @ solved                                       # (B, S, S + 1)
+        dz = -np.linalg.solve(shared + np.diag(ridge_shared) - back[..., :-1].sum(axis=0),
+                              slope - back[..., -1].sum(axis=0))
+        dx = -(solved[..., -1] + solved[..., :-1] @ dz)
+        gain = _gain(gradient[:, :n], dx, ridge).sum() + _gain(slope, dz, ridge_shared)
+        return np.concatenate([dx, np.broadcast_to(dz, (len(dx), self.shared))], axis=1), gain[None]
+
+
+@dataclass(frozen=True, eq=False)
+class Sparse:
+    """One problem with a sparse matrix (P, P); it and half the gradient (P,) are assembled when a step is wanted."""
+
+    value: float
+    assemble: Callable[[], tuple[np.ndarray, csc_array]]
+
+    @property
+    def energy(self) -> np.ndarray:
+        return np.array([self.value])
+
+    @cached_property
+    def _system(self) -> tuple[np.ndarray, csc_array]:
+        return self.assemble()
+
+    def step(self, damping: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        gradient, matrix = self._system
+        diagonal = matrix.diagonal()
+        ridge = damping[0] * diagonal + FLOOR * diagonal.max()
+        step = -sparse.factor(csc_array(matrix + diags_array(ridge)))(gradient)
+        return step, _gain(gradient, step, ridge)[None]
+
+
+def normal_equations(residuals: Sequence[Residual]) -> Dense:
+    """The equations of a sum of residuals with a leading dimension B."""
+    first = residuals[0].jacobian
+    cost = np.zeros(len(first))
+    gradient = np.zeros((len(first), first.shape[-1]))
+    hessian = np.zeros((len(first), first.shape[-1], first.shape[-1]))
+    for term in residuals:
+        transposed = np.swapaxes(term.jacobian, -1, -2)
+        cost += term.energy
+        gradient += (transposed @ term.values[..., None])[..., 0]
+        hessian += transposed @ term.jacobian
+    return Dense(cost, gradient, hessian)
+
+
+def retract_pose(angles: int) -> Callable[[np.ndarray, np.ndarray], np.ndarray]:
+    """A retract of rows (..., P) whose first unknowns are rotation vectors: `R exp(d)`, the rest by addition.
+
+    For equations whose derivatives are by `d` at zero. Rotation vectors come out at most π long.
+    """
+    def retract(x: np.ndarray, step: np.ndarray) -> np.ndarray:
+        out = x + step
+        R, d = (rotations.exp(part[..., :angles].reshape(-1, 3)) for part in (x, step))
+        out[..., :angles] = rotations.log(R @ d).reshape(out[..., :angles].shape)
+        return out
+
+    return retract
+
+
+@dataclass(frozen=True, eq=False)
+class Minimum(Generic[State]):
+    """Where the search ended: the state, its equations, which of the B problems converged, and the steps tried."""
+
+    x: State
+    equations: Any
+    converged: np.ndarray
+    iterations: int
+
+    @property
+    def energy(self) -> np.ndarray:
+        """(B,)"""
+        return np.asarray(self.equations.energy)
+
+
+def levenberg_marquardt(equations: Callable[[State], NormalEquations], start: State, iterations: int = 30,
+                        tolerance: float = 1e-5, damping: float = 1e-3, exact: float = 0.0,
+                        retract: Callable[[Any, np.ndarray], Any] = np.add) -> Minimum[State]:
+    """The state of least energy near a start; a step is taken only where it lowers the energy.
+
+    Parameters
+    ----------
+    equations : state -> NormalEquations
+    start : state
+        (B, P) float for `Dense` and `Arrow`; whatever `retract` takes for `Sparse`.
+    iterations : int
+        Most steps tried.
+    tolerance : float
+        Stop when a step lowers the energy by less than this fraction.
+    damping : float
+        First factor on the diagonal of the matrix.
+    exact : float
+        Also stop when it lowers the energy by less than this.
+    retract : state, step -> state
+        What a step does to the state.
+    """
+    x, now = start, equations(start)
+    factor = np.full(len(now.energy), damping)
+    converged = np.zeros(len(factor), dtype=bool)
+    done = 0
+    while done < iterations and not converged.all():
+        done += 1
+        step, gain = now.step(factor)
+        ahead = retract(x, step)
+        tried = equations(ahead)
+        better = (tried.energy < now.energy) & ~converged
+        least = np.maximum(tolerance * now.energy, max(exact, 1e-300))
+        # a step that failed settles nothing unless there was nothing to gain: it may have been too long
+        settled = (better & (now.energy - tried.energy <= least)) | (gain <= least)
+        converged |= settled | (factor > STIFF)
+        x, now = _taken(better, x, ahead), _taken(better, now, tried)
+        factor = np.where(better, np.maximum(factor / 5, 1e-9), factor * 8)
+    return Minimum(x, now, converged, done)
+
+
+def _gain(gradient: np.ndarray, step: np.ndarray, ridge: np.ndarray) -> np.ndarray:
+    """By how much a step s of (H + ridge) s = -g lowers the energy if it were quadratic: sᵀ ridge s - g·s."""
+    return np.einsum("...p,...p->...", ridge * step - gradient, step)
+
+
+def _taken(better: np.ndarray, old: Any, new: Any) -> Any:
+    """The new rows where they are better; a single problem is taken or left whole."""
+    if better.all():
+        return new
+    if not better.any():
+        return old
+    if isinstance(old, Dense):
+        return Dense(*(_taken(better, a, b) for a, b in zip(old, new, strict=True)))
+    rows = better.reshape(-1, *(1,) * (np.ndim(old) - 1))
+    return np.where(rows, new, old)                                                 

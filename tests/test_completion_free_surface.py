@@ -1,0 +1,60 @@
+import numpy as np
+import pytest
+from completion_bodies import worm_with_prior
+from scipy.sparse import csr_array
+
+from completion.partial.free_surface import FreeSurface, edge_matrix
+from model.gradients import edges
+
+RNG = np.random.default_rng(0)
+
+
+@pytest.fixture(scope="module")
+def body():
+    return worm_with_prior()
+
+
+def test_edge_matrix_is_the_matrix_of_stitching(body):
+    faces, n = body.template.faces, len(body.template.vertices)
+    y = RNG.normal(size=(n, 3))
+    difference = edges(y, faces)
+    np.testing.assert_allclose(np.einsum("nd,nd->", y, edge_matrix(faces, n) @ y), (difference**2).sum())
+
+
+def test_the_free_surface_minimises_equation_10(body):
+    """Against the dense least squares over all edges with R, S and Q spelled out."""
+    rng = np.random.default_rng(1)
+    pose, betas = rng.normal(0, 0.4, (4, 3)), np.array([0.5, -1, 0.2])
+    predicted = body.vertices(pose, betas)
+    faces, n = body.template.faces, len(predicted)
+    R = body.skeleton.part_rotations(pose)[body.skeleton.part_of_face]
+    wanted = edges(body.template.vertices, faces) @ np.swapaxes(
+        R @ body.shape_space.gradients(betas) @ body.pose_space.gradients(pose), -1, -2)
+    rows = rng.choice(len(faces), 40, replace=False)
+    bary = rng.dirichlet(np.ones(3), 40)
+    C = csr_array((bary.ravel(), (np.repeat(np.arange(40), 3), faces[rows].ravel())), shape=(40, n))
+    z, w = C @ predicted + rng.normal(0, 0.02, (40, 3)), rng.random(40)
+    got = FreeSurface(body.template).solve(predicted, C, z, w)
+    G = np.zeros((2 * len(faces), n))
+    k = np.arange(len(faces))
+    for j in (0, 1):
+        np.add.at(G, (2 * k + j, faces[:, j + 1]), 1)
+        np.add.at(G, (2 * k + j, faces[:, 0]), -1)
+    A = np.vstack([G, np.sqrt(w)[:, None] * C.toarray()])
+    dense = np.linalg.lstsq(A, np.vstack([wanted.reshape(-1, 3), np.sqrt(w)[:, None] * z]), rcond=None)[0]
+    np.testing.assert_allclose(got, dense, atol=1e-7)
+
+
+def test_without_data_the_free_surface_is_the_model(body):
+    predicted = body.vertices(np.zeros((4, 3)))
+    none = csr_array((0, len(predicted)))
+    np.testing.assert_array_equal(FreeSurface(body.template).solve(predicted, none, np.zeros((0, 3)), np.zeros(0)),
+                                  predicted)
+
+
+def test_data_moved_as_one_move_the_whole_surface(body):
+    predicted = body.vertices(np.zeros((4, 3)))
+    C = csr_array(np.eye(len(predicted))[:50])
+    shift = np.array([0.01, -0.02, 0.005])
+    got = FreeSurface(body.template).solve(predicted, C, predicted[:50] + shift, np.ones(50))
+    np.testing.assert_allclose(got, predicted + shift, atol=1e-6)
