@@ -13,7 +13,8 @@ import numpy as np
 
 from model.body import BodyModel, versions
 from model.files import load_model
-from model.learning.scape import LearnConfig, learn_scape
+from model.learning.config import LearnConfig
+from model.learning.scape import learn_scape
 from model.scape import ScapeModel
 from scanprep.batch.digests import Digests
 from scanprep.batch.lock import locked

@@ -20,12 +20,12 @@ from completion.motion import Motion
 from completion.partial.completion import Completion
 from completion.partial.masks import read_mask
 from completion.partial.results import load_completion, save_completion
-from model.cli import _read_betas, _read_turns
 from model.export.bvh import write_bvh
 from model.export.bvh_read import read_bvh
 from model.export.cli import read_motion
 from model.files import load_model
 from model.learning.cli import _read_sexes
+from model.posing.cli import _read_betas, _read_turns
 from scanprep import Mesh, RegisteredSet, read_landmarks, read_mesh, write_landmarks, write_mesh
 from scanprep.correspondence.correspondences import Correspondences
 from scanprep.correspondence.files import read_correspondences, write_correspondences
@@ -288,7 +288,7 @@ def _add_tables(body: Mesh, place: Any, add: Any, text: Any) -> None:
             write_mesh(place(f"body{k}.ply"), body)
         text("scans.csv", content, scans)
     write_mesh(place("people/body0.ply"), body)
-    text("sexes.csv", "name,sex\nbody0,female\nbody1,male\n", lambda path: _read_sexes(path.parent / "people", path))
+    text("people/sexes.csv", "name,sex\nbody0,female\nbody1,male\n", lambda path: _read_sexes(path.parent))
     text("subjects.csv", "file;subject\r\nwalk.c3d;Zoë\r\nrun.c3d;Zoë\r\n".encode("cp1252"), _table_rows)
     text("subjects.json", '{"walk.c3d": "ann", "run.c3d": 5}', _table_rows)
     text("betas.json", '{"betas": [0.5, -1, 2e-1]}', _read_betas, finite)

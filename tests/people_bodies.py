@@ -7,7 +7,7 @@ import numpy as np
 
 from completion.synthetic_people import SyntheticRecipe, build_synthetic
 from model.body import BodyModel
-from model.learning.scape import LearnConfig
+from model.learning.config import LearnConfig
 
 
 @lru_cache(maxsize=1)

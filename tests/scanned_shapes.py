@@ -3,7 +3,7 @@ import numpy as np
 
 from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.surface import Rays
-from scanprep.pictures.glyphs import sphere
+from scanprep.pictures.shading import sphere
 
 
 def ball(divisions: int = 4, radius: float = 0.1) -> Mesh:
@@ -54,3 +54,17 @@ def triangle_quality(mesh: Mesh) -> np.ndarray:
 
 
 SIX = np.concatenate([np.eye(3), -np.eye(3)])
+
+
+def distortion(rest: Mesh, x: np.ndarray) -> float:
+    """Root mean square over the area at rest of the logarithm of the stretches of the triangles."""
+    def flat(c: np.ndarray) -> np.ndarray:
+        e, f = c[:, 1] - c[:, 0], c[:, 2] - c[:, 0]
+        length = np.maximum(np.linalg.norm(e, axis=1), 1e-12)
+        along = np.einsum("fd,fd->f", e, f) / length
+        height = np.linalg.norm(np.cross(e, f), axis=1) / length
+        return np.stack([np.stack([length, along], axis=1), np.stack([np.zeros_like(length), height], axis=1)], axis=1)
+
+    s = np.linalg.svd(flat(x[rest.faces]) @ np.linalg.inv(flat(rest.corners)), compute_uv=False)
+    stretch = (np.log(np.maximum(s, 1e-6)) ** 2).mean(axis=1)
+    return float(np.sqrt(np.average(stretch, weights=rest.face_areas)))

@@ -15,7 +15,7 @@ from scanprep.synthetic.data_set import SUBJECT
 from scanprep.synthetic.landmarks import landmarks, markers
 from scanprep.synthetic.people import Person, random_pose
 
-SMALL = SyntheticRecipe(poses=6, people=3, faces=2400, learn=LearnConfig(components=2, refinements=0, steps=0))
+SMALL = SyntheticRecipe(poses=6, people=3, faces=2400, learn=LearnConfig(components=2, refinements=0))
 
 
 @pytest.fixture(scope="module")

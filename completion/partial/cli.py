@@ -8,8 +8,8 @@ from typing import Annotated
 import tyro
 
 from model.body import BodyModel
-from model.cli import read_subject
 from model.linear import Subject
+from model.posing.cli import read_subject
 from scanprep.batch.pool import Workers
 from scanprep.batch.workspace import Task, Workspace
 from scanprep.cli import Output, Unit

@@ -9,8 +9,8 @@ import numpy as np
 import tyro
 
 from model.body import BodyModel
-from model.cli import read_subject
 from model.linear import Subject
+from model.posing.cli import read_subject
 from scanprep.batch.workspace import Workspace
 from scanprep.cli import MM, Output, Unit
 from scanprep.console import Metric, Outcome, bar, say

@@ -172,6 +172,7 @@ def _different_meshes(template: Mesh, poses: np.ndarray | None, count: int) -> n
     return placed[farthest_points(
         placed, count, 0, lambda i, _: np.sqrt(((placed - placed[i]) ** 2).sum(axis=2).mean(axis=1)), least=1e-9)]
 
+
 def _assembled(source: Mesh, skeleton: Skeleton | None, vertex_map: np.ndarray, owner: np.ndarray,
                face_map: np.ndarray, fixed: np.ndarray, config: DecimateSetConfig) -> DecimatedSet:
     """The result of `decimate_set` from its maps and the original template and skeleton."""

@@ -25,9 +25,9 @@ from completion.mocap.pose.follow import AnimateConfig, animate
 from completion.mocap.pose.stream import MarkerStream
 from completion.mocap.subject.marker_shape import subject_from_markers
 from completion.motion import Motion
+from model import learn_scape
 from model.body import BodyModel
 from model.files import load_model
-from model.learning import learn_scape
 from model.learning.parts import choose_skeleton
 from model.linear import Subject
 from model.scape import ScapeModel

@@ -144,9 +144,9 @@ MOSHING: dict[str, tuple[str, str, Callable[[dict], str], str]] = {
     "mosh_characters": (
         "A motion on two cartoon figures",
         "python tests/benchmarks/mosh_characters.py", characters,
-        "The synthetic walk, soft tissue twice. Triangles that turn over against the rotations of their parts, over "
-        "all frames, before and after what pictures and GLB smooth. Where we lose: acrobatics on the template of the "
-        "SCAPE scans turn over tens of triangles a frame, on the person too."),
+        "The synthetic walk, soft tissue twice. Triangles that turn over against the rotations of their parts, all "
+        "frames, before and after what pictures and GLB smooth. Where we lose: acrobatics on the template of the SCAPE "
+        "scans turn over tens of triangles a frame, on the person too."),
     "mosh_design": (
         "Which markers to put on",
         "python tests/benchmarks/mosh_design.py -m MODEL --men held-out", marker_sets,

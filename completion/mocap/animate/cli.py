@@ -9,8 +9,8 @@ import numpy as np
 import tyro
 
 from model.body import BodyModel
-from model.cli import read_subject
 from model.linear import Subject
+from model.posing.cli import read_subject
 from scanprep.batch.pool import Workers
 from scanprep.batch.workspace import Results, Task, Workspace
 from scanprep.cli import Output, Unit

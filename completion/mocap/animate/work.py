@@ -174,8 +174,8 @@ def write_glb(path: Path, motion: Motion, body: Subject, keys: int, vertices: np
     vertices : (n, N, 3) float, metres, optional
         Of the key frames, where the body changes; else it is the subject's.
     """
-    from scanprep.pictures.animation import write_animated_glb
-    from scanprep.pictures.views import upright
+    from scanprep.pictures.camera import upright
+    from scanprep.pictures.gltf import write_animated_glb
 
     chosen = key_frames(motion, keys)
     rate = motion.rate * max(len(chosen) - 1, 1) / max(len(motion.poses) - 1, 1)

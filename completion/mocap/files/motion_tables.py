@@ -10,7 +10,7 @@ import numpy as np
 from model.export.bvh import write_bvh
 from model.linear import PointOperator, Subject
 from scanprep.geometry.storage import writing
-from scanprep.pictures.views import upright
+from scanprep.pictures.camera import upright
 from scanprep.skeleton.tree import Skeleton
 
 from ...motion import Motion

@@ -7,9 +7,9 @@ import numpy as np
 
 from model.body import BodyModel
 from scanprep.geometry.mesh import Mesh
+from scanprep.pictures.camera import look_around
 from scanprep.pictures.page import Page
 from scanprep.pictures.shading import Dots, render, side_by_side
-from scanprep.pictures.views import look_around
 
 from ..marker_sets.layout import MarkerLayout
 from .results import MarkerDesign

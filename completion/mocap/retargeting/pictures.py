@@ -6,9 +6,9 @@ from pathlib import Path
 import numpy as np
 
 from model.body import BodyModel
+from scanprep.pictures.camera import upright
 from scanprep.pictures.colors import color_bar, heat
 from scanprep.pictures.shading import Solid, render, side_by_side
-from scanprep.pictures.views import upright
 
 from ..animate.report import facing
 from ..animate.work import key_frames
@@ -77,7 +77,7 @@ def write_character(path: Path, character: BodyModel, soft: SoftTissue, keys: in
     keys : int
         Largest number of key frames.
     """
-    from scanprep.pictures.animation import write_animated_glb
+    from scanprep.pictures.gltf import write_animated_glb
 
     frames = key_frames(soft.motion, keys)
     fixed, changed = moving_character(character, soft, frames)

@@ -1,31 +1,35 @@
 """Learning a skinning model from registered meshes."""
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import asdict, dataclass, replace
 from functools import partial
-from typing import Any
 
 import numpy as np
 
-from scanprep.batch.steps import Step, inside, once
-from scanprep.geometry.mesh import Mesh, check_template
+from scanprep.batch.steps import Step, once
+from scanprep.geometry.mesh import Mesh
 from scanprep.ranges import Count, Positive, Settings
 from scanprep.skeleton.tree import Skeleton
 from scanprep.threads import one_thread
 
-from ..features import Lift, LinearLift, PoseFeatures, QuadraticLift
-from ..fitting import FitConfig, PoseFitter
+from ..digests import body_digest, digest
+from ..features import LinearLift, PoseFeatures, part_features
+from ..fitting import FitConfig, PoseFitter, ShapeFitter
 from ..pose_space import kept_directions
-from ..skinning import SkinningModel
-from .pose import Ticks
-from .scape import check_skeleton, checked_bodies, digest, pose_examples, pose_prior, timed
-from .skin_people import learn_people, unblended
+from ..shape_space import learn_shape_space
+from ..skinning import SkinningModel, unblended
+from .pose import fit_poses
+from .scape import checked_training, pose_examples, pose_prior
 from .skin_weights import diffused, diffused_weights, fit_weights, kept_weights
+from .work import Progress, Work, timed
 
-Progress = Callable[[int, int], None]
+PRUNING = 0.01                       # square radians: twist directions of smaller variance correct nothing
+RIDGES = (1e-4, 1e-3, 3e-3, 0.01, 0.03, 0.1, 0.3)      # penalties; the one that predicts left-out poses best is taken
+NEAREST = 2                          # joints that correct a vertex: those of its heaviest part that are nearest to it
+FADING = 0.05                        # metres of surface over which the correctives of a joint give way to another's
 LEVELS = 8                           # of how freely a joint corrects a vertex: vertices of one level share a solve
 ENOUGH = 0.005                       # relative gain of a round below which the next is not worth it
+PEOPLE_ROUNDS = 3                    # of fitting the poses of the other people and undoing them
 QUICK = FitConfig(sample=400, iterations=20, polish=0, tolerance=1e-4)     # of poses that will be fitted again
 
 
@@ -33,44 +37,26 @@ QUICK = FitConfig(sample=400, iterations=20, polish=0, tolerance=1e-4)     # of 
 class SkinConfig(Settings):
     """Settings of `learn_skinning`.
 
-    Parameters
+    Attributes
     ----------
-    correctives : str
-        What displaces the rest vertices: `none`, `linear` or `quadratic` functions of the joint twists.
-    joints : int
-        So many joints correct a vertex: those of its heaviest part that are nearest to it.
-    pruning : float, square radians
-        Twist directions of smaller variance are not regressed on.
-    ridges : floats
-        Strengths of the regression's penalty; the one that predicts left-out poses best is taken.
-    width : float, metres
-        Over so much surface the weights pass from part to part before they are fitted.
-    smoothness : float, metres
-        So large an error is as bad as a weight that changes by 1 along an edge.
-    fading : float, metres
-        Over so much surface the correctives of a joint fade where other joints take over.
+    correctives : bool
+        Linear functions of the joint twists displace the rest vertices; without them it is plain linear blend skinning.
     parts : int
         Largest number of parts that a vertex follows.
+    width : float, metres
+        Over so much surface the weights pass from part to part before they are fitted.
     rounds : int
         Largest number of times that poses, weights and joints are fitted in turn, first without correctives and
         then with them.
     components : int
         Shape components to keep, fewer where there are fewer people.
-    people_rounds : int
-        How often the poses of the other people are fitted.
     """
 
-    correctives: str = "linear"
-    joints: Count = 2
-    pruning: float = 0.01
-    ridges: tuple[Positive, ...] = (1e-4, 1e-3, 3e-3, 0.01, 0.03, 0.1, 0.3)
-    width: Positive = 0.05
-    fading: float = 0.05
-    smoothness: float = 0.005
+    correctives: bool = True
     parts: Count = 4
+    width: Positive = 0.05
     rounds: Count = 8
     components: int = 40
-    people_rounds: int = 3
 
 
 @one_thread()
@@ -101,38 +87,27 @@ def learn_skinning(template: Mesh, poses: np.ndarray, shapes: np.ndarray | None,
         Fewer than two poses, vertices of another count or not finite, a skeleton of another template.
     """
     config = config or SkinConfig()
-    if config.correctives not in ("none", "linear", "quadratic"):
-        raise ValueError(f"correctives: expected none, linear or quadratic, got '{config.correctives}'")
-    check_template(template)
-    check_skeleton(template, skeleton)
-    poses = checked_bodies(template, poses, "poses")
-    shapes = None if shapes is None else checked_bodies(template, shapes, "shapes")
-    later = 0 if shapes is None else config.people_rounds * len(shapes)
-    tick = Ticks(progress, (1 + (config.correctives != "none")) * config.rounds * len(poses) + later)
+    poses, shapes = checked_training(template, skeleton, poses, shapes)
+    kinds = (False, True) if config.correctives else (False,)
+    first, later = len(kinds) * config.rounds * len(poses), 0 if shapes is None else PEOPLE_ROUNDS * len(shapes)
+    work = Work(progress, first + later, step)
 
-    def learn() -> tuple[SkinningModel, np.ndarray]:
+    def learn(inner: Work) -> tuple[SkinningModel, np.ndarray]:
         at = skeleton.pose_of(skeleton.fit_rotations(template, poses))
         model = _start(template, skeleton, config)
         with timed("pose space"):
-            for correctives in ("none", config.correctives) if config.correctives != "none" else ("none",):
-                settings = replace(config, correctives=correctives)
-                model, at = _learn_pose(model, at, poses, settings, tick, inside(step, "pose space"))
+            for correctives in kinds:
+                model, at = _learn_pose(model, at, poses, replace(config, correctives=correctives), inner)
         return model, at
 
-    def learn_shapes() -> SkinningModel:
-        with timed("shape components"):
-            return learn_people(model, bodies, *of_people, tick, inside(step, "shape components"))
-
-    of_poses = template, skeleton, poses, replace(config, components=0, people_rounds=0)
-    model, at = tick.over(tick.total - later, lambda: step("pose space", of_poses, learn))
+    model, at = work.step("pose space", (template, skeleton, poses, replace(config, components=0)), first, learn)
     if shapes is not None:
-        bodies, of_people = shapes, (config.components, config.people_rounds)
-        model = tick.over(later, lambda: step("shape components", (model, bodies, of_people), learn_shapes))
+        model = work.step("shape components", (model, shapes, config.components), later,
+                          partial(_learn_people, model, shapes, config.components))
     examples = pose_examples(template, skeleton, at, shapes)
     mean, covariance = pose_prior(examples, len(at))
-    info: dict[str, Any] = {
-        "settings": asdict(config), "poses": len(poses), "shapes": 0 if shapes is None else len(shapes),
-        **model.info, "terms": model.terms.count, "digest": digest(template, poses, shapes)}
+    info = {"settings": asdict(config), "poses": len(poses), "shapes": 0 if shapes is None else len(shapes),
+            **model.info, "terms": model.terms.count, "digest": digest(template, poses, shapes)}
     return replace(model, pose_mean=mean, pose_covariance=covariance, pose_examples=examples, info=info)
 
 
@@ -146,15 +121,14 @@ def _start(template: Mesh, skeleton: Skeleton, config: SkinConfig) -> SkinningMo
                          np.zeros((J, 3)), np.zeros((3 * J, 3 * J)))
 
 
-def _learn_pose(model: SkinningModel, poses: np.ndarray, bodies: np.ndarray, config: SkinConfig, tick: Ticks,
-                step: Step) -> tuple[SkinningModel, np.ndarray]:
+def _learn_pose(model: SkinningModel, poses: np.ndarray, bodies: np.ndarray, config: SkinConfig, work: Work
+                ) -> tuple[SkinningModel, np.ndarray]:
     """Poses, weights, joints, rest vertices and correctives in turn, while left-out poses are met better."""
     allowed = diffused_weights(model.template, model.skeleton, 2 * config.width) > 0
     model = replace(model, info={"left_out_error": np.inf})
-    for turn in range(config.rounds):
-        tried, fitted = tick.over(len(bodies), partial(
-            step, f"{config.correctives} correctives, round {turn}", (model, poses, bodies, config),
-            partial(_next_round, model, poses, bodies, allowed, config, tick)))
+    for k in range(config.rounds):
+        tried, fitted = work.step(f"correctives {config.correctives}, round {k}", (model, poses, bodies, config),
+                                  len(bodies), partial(_next_round, model, poses, bodies, allowed, config))
         gain = 1 - tried.info["left_out_error"] / model.info["left_out_error"]
         if gain > 0:
             model, poses = tried, fitted
@@ -164,13 +138,9 @@ def _learn_pose(model: SkinningModel, poses: np.ndarray, bodies: np.ndarray, con
 
 
 def _next_round(model: SkinningModel, poses: np.ndarray, bodies: np.ndarray, allowed: np.ndarray, config: SkinConfig,
-                tick: Ticks) -> tuple[SkinningModel, np.ndarray]:
+                work: Work) -> tuple[SkinningModel, np.ndarray]:
     """Poses, weights, joints, rest vertices and correctives, each fitted to the others once."""
-    fitter, found = PoseFitter(model.subject(), QUICK), []
-    for body, pose in zip(bodies, poses, strict=True):
-        found.append(fitter.fit(body, pose).pose)
-        tick(1)
-    fitted = np.stack(found)
+    fitted = fit_poses(model.subject(), bodies, poses, work, QUICK)
     tried = _with_weights(model, fitted, bodies, allowed, config)
     tried = _with_joints(tried, fitted, bodies)
     return _with_correctives(tried, fitted, bodies, config), fitted
@@ -189,7 +159,7 @@ def _with_weights(model: SkinningModel, poses: np.ndarray, bodies: np.ndarray, a
                   config: SkinConfig) -> SkinningModel:
     """The model with weights fitted to the bodies at their poses."""
     carried = [_carried(model, p, y) for p, y in zip(poses, bodies, strict=True)]
-    weights = fit_weights(carried, bodies, model.template, model.weights, allowed, config.smoothness)
+    weights = fit_weights(carried, bodies, model.template, model.weights, allowed)
     return replace(model, weights=kept_weights(weights, config.parts))
 
 
@@ -228,11 +198,11 @@ def _with_correctives(model: SkinningModel, poses: np.ndarray, bodies: np.ndarra
                       ) -> SkinningModel:
     """The model with rest vertices and correctives regressed on the unposed bodies."""
     unposed = np.stack([_unposed(model, p, y) for p, y in zip(poses, bodies, strict=True)])
-    features = corrective_features(model.skeleton, poses, config)
-    joints = _acting_joints(model, config.joints, config.fading)
-    errors = [_regress(features, poses, unposed, joints, ridge)[2] for ridge in config.ridges] \
+    features = corrective_features(model.skeleton, poses, config.correctives)
+    joints = _acting_joints(model)
+    errors = [_regress(features, poses, unposed, joints, ridge)[2] for ridge in RIDGES] \
         if features.count > len(features.starts) else [0.0]
-    ridge = config.ridges[int(np.argmin(errors))]
+    ridge = RIDGES[int(np.argmin(errors))]
     rest, correctives, error = _regress(features, poses, unposed, joints, ridge)
     moved = _with_joints_at(replace(model, rest=rest), model.joint_regressor @ model.rest)
     return replace(moved, features=replace(features, skeleton=moved.skeleton), correctives=correctives,
@@ -247,37 +217,22 @@ def _unposed(model: SkinningModel, pose: np.ndarray, body: np.ndarray) -> np.nda
     return model.rest + model.corrections(pose) + moved
 
 
-def corrective_features(skeleton: Skeleton, poses: np.ndarray, config: SkinConfig) -> PoseFeatures:
-    """For every joint a constant, its kept twist directions, and their products where they are asked for."""
+def corrective_features(skeleton: Skeleton, poses: np.ndarray, correctives: bool) -> PoseFeatures:
+    """For every joint a constant, and its kept twist directions where there are correctives."""
     J = len(skeleton.parents)
-    lift: Lift = QuadraticLift() if config.correctives == "quadratic" else LinearLift()
-    part, columns = [], []
-    for j, directions in enumerate(kept_directions(poses, config.pruning)):
-        mine = [np.zeros(lift.width)]
-        if config.correctives != "none":
-            mine += [np.pad(d, (0, lift.width - 3)) for d in directions.T]
-        if config.correctives == "quadratic":
-            a, b = np.triu_indices(3)
-            for m, d in enumerate(directions.T):
-                for e in directions.T[m:]:
-                    product = np.outer(d, e) + np.outer(e, d) * (~np.eye(3, dtype=bool))
-                    mine.append(np.r_[np.zeros(3), product[a, b]])
-        for column in mine:
-            part.append(j)
-            columns.append(np.zeros((J, lift.width)))
-            columns[-1][j] = column
-    return PoseFeatures(skeleton, lift, np.array(part), np.stack(columns, axis=-1))
+    directions = kept_directions(poses, PRUNING) if correctives else [np.zeros((3, 0))] * J
+    return part_features(skeleton, LinearLift(), directions, [[j] for j in range(J)])
 
 
-def _acting_joints(model: SkinningModel, count: int, width: float) -> np.ndarray:
-    """(N, J) how freely each joint corrects each vertex: the nearest ones of its heaviest part, fading over a width."""
+def _acting_joints(model: SkinningModel) -> np.ndarray:
+    """(N, J) how freely each joint corrects each vertex: the nearest ones of its heaviest part, fading."""
     x, joints = model.template.vertices, model.skeleton.joints
     acting = np.zeros(model.weights.shape)
     for p, of_part in enumerate(model.skeleton.joints_of_part):
         mine, near = np.flatnonzero(model.weights.argmax(axis=1) == p), np.array(of_part, dtype=np.int64)
         far = np.linalg.norm(x[mine, None] - joints[near], axis=2)
-        acting[mine[:, None], near[np.argsort(far, axis=1, kind="stable")[:, :count]]] = 1
-    return np.round(LEVELS * diffused(model.template, acting, width)) / LEVELS
+        acting[mine[:, None], near[np.argsort(far, axis=1, kind="stable")[:, :NEAREST]]] = 1
+    return np.round(LEVELS * diffused(model.template, acting, FADING)) / LEVELS
 
 
 def _regress(features: PoseFeatures, poses: np.ndarray, unposed: np.ndarray, acting: np.ndarray, ridge: float
@@ -301,3 +256,22 @@ def _regress(features: PoseFeatures, poses: np.ndarray, unposed: np.ndarray, act
         rest[mine] = (middle - centre @ slope).reshape(-1, 3)
         correctives[np.ix_(used, mine)] = (scale[:, None] * slope).reshape(len(used), mine.sum(), 3)
     return rest, correctives, float(np.sqrt(total / (M * len(rest))))
+
+
+def _learn_people(model: SkinningModel, shapes: np.ndarray, components: int, work: Work) -> SkinningModel:
+    """The model with the shape components of people (P, N, 3) whose poses are fitted and undone in turn."""
+    with timed("shape components"):
+        for k in range(PEOPLE_ROUNDS):
+            quick = FitConfig(polish=0, n_betas=min(20, model.n_betas) or None)
+            fitter = ShapeFitter(model, quick) if k else PoseFitter(model.subject(), quick)
+            people = np.stack([work.step(f"round {k}, person {body_digest(body)}", (model, quick, k, body), 1,
+                                         partial(_unposed_person, model, fitter, body)) for body in shapes])
+            space = learn_shape_space(people, components)
+            model = replace(model, shape_mean=space.mean.astype(np.float64), shape_components=space.components,
+                            shape_variances=space.variances, shape_total=space.total_variance)
+    return model
+
+
+def _unposed_person(model: SkinningModel, fitter: ShapeFitter | PoseFitter, body: np.ndarray, _: Work) -> np.ndarray:
+    """(N, 3) rest vertices of a person whose pose is fitted."""
+    return model.unposed(body, fitter.fit(body).pose)

@@ -1,27 +1,50 @@
-"""How the generic humanoid is made from the synthetic people: done once, its result is stored beside the code."""
+"""How the generic humanoid is made from the synthetic people: done once, its result is stored in the package.
+
+`python tests/humanoid_maker.py` makes both files anew, in a minute.
+"""
 from __future__ import annotations
 
+import json
 from collections.abc import Callable
+from dataclasses import replace
 
 import numpy as np
+from people_maker import mirror, remesh
 from scipy.optimize import linear_sum_assignment
 from scipy.sparse import coo_array, csr_array, diags_array
 from scipy.sparse.csgraph import dijkstra
 from scipy.spatial import cKDTree
 
+from model.export.rig import strongest
+from model.statue.control.chart import make_chart
+from model.statue.control.files import write_control
+from model.statue.control.humanoid import STORED
+from model.statue.control.model import ControlModel
 from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.surface import Surface
+from scanprep.skeleton.tree import Skeleton
 from scanprep.synthetic import body_parts as people_parts
-from scanprep.synthetic import head as people_head
-from scanprep.synthetic.anatomy import Anatomy
+from scanprep.synthetic.anatomy import Anatomy, tables
 from scanprep.synthetic.body_parts import cross_sections
-from scanprep.synthetic.implicit_surface import Field, Group, Loft, Mirrored, RoundCone, project
+from scanprep.synthetic.implicit_surface import Field, Group, Loft, Mirrored, RoundCone, polygonise, project
 from scanprep.synthetic.landmarks import landmarks, markers
 from scanprep.synthetic.topology import CANONICAL, blending, load
-from scanprep.synthetic.triangulation import mirror, polygonise, remesh
 
-from ...export.rig import strongest
-
+NAMES = ("humanoid_root", "vl5", "skullbase", "l_sternoclavicular", "l_shoulder", "l_elbow", "l_wrist",
+         "r_sternoclavicular", "r_shoulder", "r_elbow", "r_wrist", "l_hip", "l_knee", "l_ankle", "r_hip", "r_knee",
+         "r_ankle")
+PARENTS = np.array([-1, 0, 1, 1, 3, 4, 5, 1, 7, 8, 9, 0, 11, 12, 0, 14, 15])
+SEGMENTS = ("spine", "head", "clavicle", "upper_arm", "forearm", "hand", "thigh", "shank", "foot")
+SEGMENT_OF_PART = np.array([0, 0, 1, 2, 3, 4, 5, 2, 3, 4, 5, 6, 7, 8, 6, 7, 8])
+FREE = (-360, 360)
+# degrees from the default pose about the axes of `freedom`, of the left side
+LIMITS = {"humanoid_root": (FREE, FREE, FREE),
+          "vl5": ((-40, 80), (-40, 40), (-50, 50)),                          # forwards, sideways, turn
+          "skullbase": ((-65, 60), (-45, 45), (-80, 80)),
+          "l_sternoclavicular": ((-12, 45), (-30, 35)),                      # up, forwards
+          "l_shoulder": ((-75, 160), (-100, 180), (-100, 100)),              # aside, forwards, twist
+          "l_elbow": ((-20, 138),), "l_wrist": ((-75, 85), (-40, 30)),       # bent; to the palm, to the thumb
+          "l_hip": ((-35, 65), (-35, 130), (-50, 50)), "l_knee": ((-8, 155),), "l_ankle": ((-35, 55),)}
 BODY, LIMB, HEAD, FACE, HAND, FOOT = 0.074, 0.048, 0.042, 0.0215, 0.0175, 0.0275     # metres, wanted edges
 # of the 16 parts of the people, pelvis first, the part here
 PART_OF_PEOPLE = np.array([0, 1, 1, 2, 4, 5, 6, 8, 9, 10, 11, 12, 13, 14, 15, 16])
@@ -44,7 +67,7 @@ def coarse_body(a: Anatomy) -> Field:
     """The surface of the people without toes, fingers and ears, which few triangles cannot follow."""
     g = a.scale
     torso, shoulders = people_parts.trunk(a)
-    leg, head = people_parts.leg(a), people_head.head(a)
+    leg, head = people_parts.leg(a), people_parts.head(a)
     assert isinstance(leg, Group) and isinstance(head, Group)
     leg = Group([leg.members[0], (shoe(a), leg.members[1][1])], leg.bumps, leg.bounds)
     nose = RoundCone(a.eye + a.front(0, 0.084, 0.012), a.eye + a.front(0, 0.101, -0.036), 0.008, 0.0125)
@@ -72,11 +95,10 @@ def mitten(a: Anatomy) -> Field:
 
 def shoe(a: Anatomy) -> Field:
     """The foot with its toes in one."""
-    from scanprep.synthetic.profiles import FOOT as TABLE
 
     length, frame, ankle = a.width["foot"], a.foot_frame, a.joints[12]
     toes = np.array([[0.66, -0.020, 0.150, -0.045, 0.138], [0.72, -0.045, 0.110, -0.055, 0.136]])
-    t, shift, half, top, bottom = (np.vstack([TABLE, toes]) * length).T
+    t, shift, half, top, bottom = (np.vstack([tables.foot, toes]) * length).T
     origin = np.array([ankle[0], ankle[1], 0.140 * length])
     keys = cross_sections(t, half, half, (top + bottom) / 2, (top + bottom) / 2, 2.8, shift, (top - bottom) / 2)
     return Group([(Loft(origin, frame, keys, (0.018 * length, 0.03 * length)), 0)],
@@ -234,3 +256,53 @@ def _path(mesh: Mesh, way: list[np.ndarray], costly: np.ndarray) -> np.ndarray:
         out += back[-2::-1]
         blocked[out] = True
     return np.array(out)
+
+
+def build() -> ControlModel:
+    """The humanoid from scratch, a minute."""
+    anatomy = Anatomy(CANONICAL)
+    mesh = build_mesh(anatomy)
+    weights = part_weights(mesh, anatomy)
+    part_of_face = weights[mesh.faces].mean(axis=1).argmax(axis=1)
+    skeleton = Skeleton(part_of_face, PARENTS, joint_places(anatomy), NAMES)
+    joints = skeleton.joints.copy()
+    joints[0] = mesh.vertices[skeleton.part_of_vertex(mesh) == 0].mean(axis=0)
+    chart = make_chart(mesh, hidden_seams(mesh, anatomy))
+    axes, limits = freedom(anatomy)
+    return ControlModel(mesh, replace(skeleton, joints=joints), weights, chart,
+                        nearest_marks(mesh, landmarks()), axes, limits, SEGMENTS, SEGMENT_OF_PART)
+
+
+def freedom(anatomy: Anatomy) -> tuple[tuple[np.ndarray, ...], tuple[np.ndarray, ...]]:
+    """Axes and limits of every joint, anatomical in the default pose; those of the right mirror those of the left.
+
+    The axes of elbow and knee are square to the limb, and a positive angle bends it. Shoulder and hip have three axes
+    at right angles, the third along the limb.
+    """
+    (arm_out, arm_front, arm), (hand_out, thumb, hand) = anatomy.upper_arm_frame, anatomy.forearm_frame
+    (leg_out, leg_front, leg), (_, instep, toes) = anatomy.leg_frame, anatomy.foot_frame
+    side, front, up = np.diag([1.0, -1.0, 1.0])
+
+    def turning(*pairs: tuple[np.ndarray, np.ndarray]) -> np.ndarray:
+        """The axes (k, 3) about which the first of each pair turns towards the second."""
+        return np.cross(*np.array(pairs).swapaxes(0, 1))
+
+    trunk = np.vstack([turning((up, front), (up, side)), up])
+    left = {"humanoid_root": np.eye(3), "vl5": trunk, "skullbase": trunk,
+            "l_sternoclavicular": turning((side, up), (side, front)),
+            "l_shoulder": np.vstack([turning((arm, arm_out), (arm, arm_front)), arm]),
+            "l_elbow": turning((arm, arm_front)), "l_wrist": turning((hand, -hand_out), (hand, thumb)),
+            "l_hip": np.vstack([turning((leg, leg_out), (leg, leg_front)), leg]),
+            "l_knee": turning((leg, -leg_front)), "l_ankle": turning((toes, -instep))}
+    axes, limits = [], []
+    for name in NAMES:
+        twin = name if name in left else "l_" + name[2:]
+        axes.append(left[twin] * (1.0 if twin == name else np.array([1.0, -1.0, -1.0])))
+        limits.append(np.radians(LIMITS[twin]))
+    return tuple(axes), tuple(limits)
+
+
+if __name__ == "__main__":
+    made = build()
+    write_control(made, STORED)
+    STORED.with_name("humanoid_markers.json").write_text(json.dumps(nearest_marks(made.mesh, markers())) + "\n")
