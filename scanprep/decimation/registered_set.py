@@ -167,7 +167,7 @@ def _different_meshes(template: Mesh, poses: np.ndarray | None, count: int) -> n
         return centred[None]
     if np.ndim(poses) != 3 or np.shape(poses)[1:] != template.vertices.shape:
         raise ValueError(f"poses: expected shape (M, {len(template.vertices)}, 3), got {np.shape(poses)}")
-    R, t = rotations.procrustes(poses, np.broadcast_to(centred, poses.shape))[:2]
+    R, t = rotations.procrustes(poses, np.broadcast_to(centred, poses.shape))
     placed = np.concatenate([centred[None], np.einsum("mij,mnj->mni", R, poses) + t[:, None]])
     return placed[farthest_points(
         placed, count, 0, lambda i, _: np.sqrt(((placed - placed[i]) ** 2).sum(axis=2).mean(axis=1)), least=1e-9)]
