@@ -6,7 +6,7 @@ import pytest
 import trimesh
 
 from completion.mocap.subject.attachment import signed_distance
-from model.posing.character_mesh import inside
+from model.posing.character import inside
 from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.surface import OrientedPoints, Rays, Surface, barycentric
 

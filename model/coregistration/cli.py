@@ -1,8 +1,6 @@
 """`scape model coregister`: a folder of scans registered with a model, and the model learned again."""
 from __future__ import annotations
 
-import csv
-import io
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated
@@ -17,6 +15,7 @@ from scanprep.dataset import RegisteredSet, SetEntry, write_set
 from scanprep.geometry.files import write_mesh
 from scanprep.geometry.landmarks import match_landmarks, read_landmarks, write_landmarks
 from scanprep.geometry.mesh import Mesh
+from scanprep.geometry.tables import write_table
 from scanprep.pipeline.prepare import mesh_file
 from scanprep.pipeline.scans import ScanTask, find_scans
 
@@ -91,19 +90,10 @@ def write_coregistered(folder: Path, first: BodyModel, tasks: Sequence[ScanTask]
         write_mesh(folder / mesh_file(task.name), r.mesh)
     done.model.skeleton.save(folder / "skeleton.json")
     write_landmarks(folder / "landmarks.json", first.info.get("landmarks", {}))
-    write_table(folder / TABLE, tasks, done)
+    write_table(folder / TABLE, ["name", "good", *FIGURES], [
+        [task.name, bool(fine), *(getattr(r, figure) for figure in FIGURES)]
+        for task, fine, r in zip(tasks, done.good, done.registrations, strict=True) if r is not None])
     done.model.save(folder / "model.npz")
-
-
-def write_table(path: Path, tasks: Sequence[ScanTask], done: Coregistration) -> None:
-    """A row of figures for every scan that could be registered, in metres."""
-    text = io.StringIO()
-    table = csv.writer(text, lineterminator="\n")
-    table.writerow(["name", "good", *FIGURES])
-    for task, fine, r in zip(tasks, done.good, done.registrations, strict=True):
-        if r is not None:
-            table.writerow([task.name, bool(fine), *(getattr(r, figure) for figure in FIGURES)])
-    path.write_text(text.getvalue(), encoding="utf-8")
 
 
 def _figures(done: Coregistration, names: Sequence[str]) -> list[Metric]:

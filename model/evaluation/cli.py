@@ -1,9 +1,7 @@
 """`scape model evaluate` and `scape model sample`: how good a model is, and random bodies of it."""
 from __future__ import annotations
 
-import csv
-import io
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any
@@ -16,6 +14,7 @@ from scanprep.console import Metric, Outcome, bar
 from scanprep.dataset import RegisteredSet
 from scanprep.geometry import storage
 from scanprep.geometry.files import read_registered, write_mesh
+from scanprep.geometry.tables import write_table
 from scanprep.ranges import Count, Seed
 
 from ..body import BodyModel
@@ -200,12 +199,12 @@ def _write_tables(output: Path, model: BodyModel, found: Findings) -> None:
     parts = [f"{name}_mm" for name in model.skeleton.names]
     if found.poses is not None:
         rows = _rows(found.pose_names, found.poses.errors, found.poses.converged)
-        _write_csv(output / "poses.csv", ["name", "mean_mm", "p95_mm", "worst_mm", *parts, "converged"], rows)
+        write_table(output / "poses.csv", ["name", "mean_mm", "p95_mm", "worst_mm", *parts, "converged"], rows)
     if found.shapes is not None:
         rows = [[count, *row] for count, errors, converged in
                 zip(found.shapes.counts, found.shapes.errors, found.shapes.converged, strict=True)
                 for row in _rows(found.shape_names, errors, converged)]
-        _write_csv(output / "people.csv", ["components", "name", "mean_mm", "p95_mm", "worst_mm", *parts, "converged"],
+        write_table(output / "people.csv", ["components", "name", "mean_mm", "p95_mm", "worst_mm", *parts, "converged"],
                    rows)
 
 
@@ -213,12 +212,3 @@ def _rows(names: Sequence[str], errors: Errors, converged: np.ndarray) -> list[l
     table = np.column_stack([errors.mean, errors.p95, errors.worst, errors.by_part])
     return [[name, *(f"{MM * value:.4f}" for value in row), "yes" if done else "no"]
             for name, row, done in zip(names, table, converged, strict=True)]
-
-
-def _write_csv(path: Path, header: Sequence[str], rows: Iterable[Sequence[Any]]) -> None:
-    text = io.StringIO()
-    table = csv.writer(text, lineterminator="\n")
-    table.writerow(header)
-    table.writerows(rows)
-    with storage.writing(path) as beside:
-        beside.write_text(text.getvalue(), encoding="utf-8")

@@ -8,7 +8,7 @@ from typing import Literal
 import numpy as np
 
 from scanprep.cli import Output, Unit
-from scanprep.console import Metric, Outcome, bar
+from scanprep.console import Metric, Outcome, Progress, bar
 from scanprep.geometry.files import write_mesh
 from scanprep.geometry.storage import StorageError, load_arrays, numbers, taking_apart, text
 from scanprep.pictures.views import upright
@@ -17,11 +17,11 @@ from scanprep.ranges import BETAS, Beta
 from ..body import BodyModel
 from ..cli import ModelArg
 from ..files import load_model
+from ..linear import Subject
 from ..priors import sample_poses
 from .bvh import write_bvh
 from .correctives import motion_correctives, spaced
 from .glb import write_skinned_glb
-from .meshes import write_frames
 from .npz import pose_features, write_body_npz
 from .rig import Rig, check_motion, joint_places, make_rig
 
@@ -116,6 +116,19 @@ def read_motion(path: Path, model: BodyModel) -> _Moves:
         poses, rate = stored["poses"].astype(np.float64).reshape(T, J, 3), float(stored["mocap_frame_rate"])
         poses, trans = check_motion(model.skeleton, poses, stored["trans"], rate)
         return _Moves(poses, trans, betas if betas.size else None, rate)
+
+
+def write_frames(folder: str | Path, subject: Subject, poses: np.ndarray, trans: np.ndarray | None = None,
+                 ending: str = ".ply", progress: Progress | None = None) -> list[Path]:
+    """Write the exact mesh of every frame, 00000.ply, 00001.ply, ...; the files in the order of the frames."""
+    paths = []
+    for t, pose in enumerate(poses):
+        paths.append(Path(folder) / f"{t:05d}{ending}")
+        vertices = subject.vertices(pose, None if trans is None else trans[t])
+        write_mesh(paths[-1], subject.template.with_vertices(vertices), "single")
+        if progress:
+            progress(t + 1, len(poses))
+    return paths
 
 
 def _kind(output: Path) -> str:

@@ -17,11 +17,10 @@ from scanprep.ranges import BETAS, TURNS, Beta
 
 from ..body import BodyModel
 from ..cli import ModelArg
-from ..export.cli import read_motion
-from ..export.meshes import write_frames
+from ..export.cli import read_motion, write_frames
 from ..files import load_model
 from ..linear import Subject
-from .character_mesh import Character, CharacterMeshConfig, character_problem, register_character
+from .character import Character, CharacterMeshConfig, character_problem, register_character
 from .transfer import own_body, subject_from_body
 
 MM = 1000.0
@@ -93,9 +92,9 @@ def character(mesh: CharacterArg, model: Annotated[Path, tyro.conf.arg(aliases=[
     if pictures:
         from scanprep.pictures.shading import save_png
 
-        from .character_picture import picture_character
+        from ..report import picture_character
 
-        save_png(output.with_suffix(".png"), picture_character(found))
+        save_png(output.with_suffix(".png"), picture_character(found.model))
     return Outcome(output, _about(loaded, found), {"character": config}, problem=character_problem(found))
 
 

@@ -27,7 +27,7 @@ from completion.mocap.retargeting.pictures import picture_transfer, write_charac
 from completion.mocap.retargeting.soft_tissue import deformation, moving_character, retarget_soft_tissue
 from completion.synthetic_model import embedded_model
 from model.body import BodyModel
-from model.posing.character_mesh import Character, register_character
+from model.posing.character import Character, register_character
 from scanprep.geometry.mesh import Mesh
 from scanprep.pictures.shading import save_png
 from scanprep.synthetic.data_set import SUBJECT
