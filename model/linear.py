@@ -20,8 +20,6 @@ from scanprep.skeleton.tree import Skeleton
 
 from .features import Terms
 
-AT_ONCE = 2**24                      # numbers that a batch of derivatives holds at a time
-
 
 def check_pose(skeleton: Skeleton, pose: Any, trans: Any) -> tuple[np.ndarray, np.ndarray]:
     """Pose (..., J, 3) and trans (..., 3), finite and with the same leading shape."""
@@ -46,16 +44,10 @@ def posed_product(terms: Terms, flat: np.ndarray, pose: np.ndarray) -> np.ndarra
 
 @dataclass(frozen=True, eq=False)
 class PointOperator:
-    """Some surface points of a fixed body as a function of pose and place, with derivatives.
+    """Some surface points of a fixed body, T (M, L, 3), metres, as a function of pose and place, with derivatives.
 
-    Built by `Subject.points`; it never touches the mesh.
-
-    Parameters
-    ----------
-    terms : Terms
-    basis : (M, L, 3) float, metres
-    origin : (3,) float, metres
-        Where the root part's centroid stands when trans is zero.
+    Built by `Subject.points`; it never touches the mesh. The root part's centroid stands in `origin` when trans is
+    zero.
     """
 
     terms: Terms
@@ -110,7 +102,8 @@ class PointOperator:
             return y, np.moveaxis(columns, 0, -1)
         B, J, L = len(pose), len(self.terms.skeleton.parents), self.count
         y, d_pose = np.empty((B, L, 3)), np.empty((B, L, 3, 3 * J))
-        step = max(1, AT_ONCE // max(1, 3 * L * (self.terms.count + 4 * J)))
+        # numbers that a batch of derivatives holds at a time
+        step = max(1, 2**24 // max(1, 3 * L * (self.terms.count + 4 * J)))
         for start in range(0, B, step):
             mine = slice(start, start + step)
             y[mine], columns = self.columns(pose[mine], trans[mine])

@@ -26,16 +26,13 @@ from .config import CoregistrationConfig
 from .rounds import Coregistration, coregister, coregistration_problem
 from .single import Landmarks
 
-MM = 1000.0
-TABLE = "coregistration.csv"
 FIGURES = ("rms", "explained", "apart", "landmark_rms", "flipped", "score", "starts")
-OWN = "template"                     # whose scans they are where nothing says it
 
 ScansArg = Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="SCANS")]
 
 
 def coregister_scans(model: ModelArg, scans: ScansArg, output: Output, landmarks: Path | None = None,
-                     first: Path | None = None, subject: str = OWN, unit: Unit | None = None,
+                     first: Path | None = None, subject: str = "template", unit: Unit | None = None,
                      config: CoregistrationConfig = CoregistrationConfig(), *, space: Workspace  # noqa: B008
                      ) -> Outcome:
     """Register every scan of a folder with a model as prior, learn the model again, and so on until it settles.
@@ -90,7 +87,7 @@ def write_coregistered(folder: Path, first: BodyModel, tasks: Sequence[ScanTask]
         write_mesh(folder / mesh_file(task.name), r.mesh)
     done.model.skeleton.save(folder / "skeleton.json")
     write_landmarks(folder / "landmarks.json", first.info.get("landmarks", {}))
-    write_table(folder / TABLE, ["name", "good", *FIGURES], [
+    write_table(folder / "coregistration.csv", ["name", "good", *FIGURES], [
         [task.name, bool(fine), *(getattr(r, figure) for figure in FIGURES)]
         for task, fine, r in zip(tasks, done.good, done.registrations, strict=True) if r is not None])
     done.model.save(folder / "model.npz")
@@ -103,11 +100,11 @@ def _figures(done: Coregistration, names: Sequence[str]) -> list[Metric]:
             Metric("failed", ", ".join(bad) or "none"),
             Metric("rounds", done.rounds), Metric("converged", done.converged),
             *(Metric(f"round {i}: failed", turn.failed) for i, turn in enumerate(done.history, 1)),
-            *(Metric(f"round {i}: mean vertex moved", MM * turn.change, "mm")
+            *(Metric(f"round {i}: mean vertex moved", 1e3 * turn.change, "mm")
               for i, turn in enumerate(done.history, 1) if i > 1),
-            Metric("distance to the scan, median RMS", MM * float(np.median([r.rms for r in found])), "mm"),
+            Metric("distance to the scan, median RMS", 1e3 * float(np.median([r.rms for r in found])), "mm"),
             Metric("scan explained, mean", 100 * float(np.mean([r.explained for r in found])), "%"),
-            Metric("distance from the model, median RMS", MM * float(np.median([r.apart for r in found])), "mm"),
+            Metric("distance from the model, median RMS", 1e3 * float(np.median([r.apart for r in found])), "mm"),
             Metric("flipped triangles", sum(r.flipped for r in found))]
 
 

@@ -26,9 +26,6 @@ from .errors import Errors, compactness, errors_problem, pose_errors, shape_erro
 from .page import MM, Findings, evaluation_page, generalisation_rows, picture_samples
 from .sampling import sample_bodies, specificity
 
-RANDOM = 100                         # random bodies that specificity is measured on
-SHOWN = 8                            # random bodies on the page
-
 
 def evaluate(model: ModelArg, output: Output, poses: Path | None = None, shapes: Path | None = None,
              counts: tuple[Count, ...] = (10, 20, 40), train_shapes: Path | None = None, subject: Path | None = None,
@@ -69,9 +66,11 @@ def evaluate(model: ModelArg, output: Output, poses: Path | None = None, shapes:
     if train is not None:
         with bar("bringing training people to rest") as progress:
             found = replace(found, specificity=specificity(
-                loaded, train, RANDOM, np.random.default_rng(seed), counts, progress=progress))
+                # random bodies that specificity is measured on
+                loaded, train, 100, np.random.default_rng(seed), counts, progress=progress))
     if loaded.n_betas:
-        found = replace(found, samples=sample_bodies(loaded, SHOWN, np.random.default_rng(seed)))
+        # random bodies on the page
+        found = replace(found, samples=sample_bodies(loaded, 8, np.random.default_rng(seed)))
     notes, metrics = _notes(loaded, posed, people), _metrics(loaded, found)
     metrics += [Metric("note", note) for note in notes]
     _write_tables(output, loaded, found)

@@ -25,8 +25,6 @@ from .glb import write_skinned_glb
 from .npz import pose_features, write_body_npz
 from .rig import Rig, check_motion, joint_places, make_rig
 
-MM = 1000.0
-SHAPES = 10                          # morph targets where nobody says how many
 MOTIONS_OF = "scape"                 # what motion files say they are made for
 MEASURED = 40                        # poses in which the files are compared with the exact model
 _MESHES = (".obj", ".ply", ".stl", ".off", ".ply.gz")
@@ -85,7 +83,8 @@ def export(model: ModelArg, output: Output, betas: tuple[Beta, ...] = (), own_bo
     if kind == "folder":
         return Outcome(output, _folder(output, loaded, person, moves))
     if shapes is None:
-        shapes = 0 if person is None or kind == "bvh" else min(SHAPES, loaded.n_betas)
+        # morph targets where nobody says how many
+        shapes = 0 if person is None or kind == "bvh" else min(10, loaded.n_betas)
     rig = make_rig(loaded, person, shapes)
     axis = upright(rig.mesh)[0] if up is None else up
     if kind == "bvh":
@@ -228,7 +227,7 @@ def _measured(model: BodyModel, moves: _Moves | None) -> tuple[np.ndarray, str]:
 
 
 def _distances(what: str, off: np.ndarray) -> list[Metric]:
-    distance = MM * np.linalg.norm(off, axis=-1)
+    distance = 1000.0 * np.linalg.norm(off, axis=-1)
     return [Metric(f"distance from {what}, mean", float(distance.mean()), "mm"),
             Metric("the same, 95th percentile", float(np.percentile(distance, 95)), "mm"),
             Metric("the same, largest", float(distance.max()), "mm")]

@@ -13,8 +13,6 @@ from ..priors import sample_poses
 from .correctives import rest_corrections
 from .rig import Rig, make_rig
 
-RIDGE = 1e-3                         # mean square of a pose feature that counts as nothing
-
 
 def write_body_npz(path: str | Path, model: BodyModel, weights: np.ndarray | None = None, draws: int = 300
                    ) -> dict[str, np.ndarray]:
@@ -70,5 +68,6 @@ def pose_directions(rig: Rig, poses: np.ndarray, exact: np.ndarray) -> np.ndarra
     """
     X = pose_features(poses)
     changes = rest_corrections(rig, poses, exact).reshape(len(X), -1)
-    B = np.linalg.solve(X.T @ X + RIDGE * len(X) * np.eye(X.shape[1]), X.T @ changes)
+    # mean square of a pose feature that counts as nothing
+    B = np.linalg.solve(X.T @ X + 1e-3 * len(X) * np.eye(X.shape[1]), X.T @ changes)
     return np.moveaxis(B.reshape(-1, *rig.mesh.vertices.shape), 0, -1)

@@ -26,8 +26,6 @@ from .config import LearnConfig
 from .pose import LearnedPose, learn_pose
 from .work import Progress, Work, timed
 
-REACH = 0.01                         # of the template's diagonal: so far a rotation blends over the border of its part
-
 
 @one_thread()
 def learn_scape(template: Mesh, poses: np.ndarray, shapes: np.ndarray | None, skeleton: Skeleton,
@@ -91,7 +89,8 @@ def learn_blendscape(template: Mesh, poses: np.ndarray, shapes: np.ndarray | Non
     """
     config = config or LearnConfig()
     poses, shapes = checked_training(template, skeleton, poses, shapes)
-    blend = face_weights(template, skeleton, REACH * float(np.linalg.norm(np.ptp(template.vertices, axis=0))))
+    # a share of the template's diagonal: so far a rotation blends over the border of its part
+    blend = face_weights(template, skeleton, 0.01 * float(np.linalg.norm(np.ptp(template.vertices, axis=0))))
     parts = BlendedTemplate(template, skeleton, blend)
     work = Work(progress, amount(poses, shapes, config), step)
     learned = learn_pose(parts, poses, config, work)

@@ -10,13 +10,13 @@ from scanprep.geometry.sparse import Factored
 from scanprep.skeleton.tree import Skeleton
 
 SMALLEST = 1e-3                      # lighter weights are dropped
-CANDIDATES = 6                       # parts that a vertex may choose from
 
 
 def diffused_weights(template: Mesh, skeleton: Skeleton, width: float) -> np.ndarray:
     """Weights (N, J) that pass from part to part over a width, in metres, along the surface."""
     own = np.eye(len(skeleton.parents))[skeleton.part_of_vertex(template)]
-    return kept_weights(diffused(template, own, width), CANDIDATES)
+    # at most 6 parts that a vertex may choose from
+    return kept_weights(diffused(template, own, width), 6)
 
 
 def diffused(template: Mesh, values: np.ndarray, width: float) -> np.ndarray:

@@ -23,12 +23,8 @@ from .scape import checked_training, pose_examples, pose_prior
 from .skin_weights import diffused, diffused_weights, fit_weights, kept_weights
 from .work import Progress, Work, timed
 
-PRUNING = 0.01                       # square radians: twist directions of smaller variance correct nothing
 RIDGES = (1e-4, 1e-3, 3e-3, 0.01, 0.03, 0.1, 0.3)      # penalties; the one that predicts left-out poses best is taken
-NEAREST = 2                          # joints that correct a vertex: those of its heaviest part that are nearest to it
-FADING = 0.05                        # metres of surface over which the correctives of a joint give way to another's
 LEVELS = 8                           # of how freely a joint corrects a vertex: vertices of one level share a solve
-ENOUGH = 0.005                       # relative gain of a round below which the next is not worth it
 PEOPLE_ROUNDS = 3                    # of fitting the poses of the other people and undoing them
 QUICK = FitConfig(sample=400, iterations=20, polish=0, tolerance=1e-4)     # of poses that will be fitted again
 
@@ -132,7 +128,8 @@ def _learn_pose(model: SkinningModel, poses: np.ndarray, bodies: np.ndarray, con
         gain = 1 - tried.info["left_out_error"] / model.info["left_out_error"]
         if gain > 0:
             model, poses = tried, fitted
-        if gain < ENOUGH:
+        # relative gain of a round below which the next is not worth it
+        if gain < 0.005:
             break
     return model, poses
 
@@ -220,7 +217,8 @@ def _unposed(model: SkinningModel, pose: np.ndarray, body: np.ndarray) -> np.nda
 def corrective_features(skeleton: Skeleton, poses: np.ndarray, correctives: bool) -> PoseFeatures:
     """For every joint a constant, and its kept twist directions where there are correctives."""
     J = len(skeleton.parents)
-    directions = kept_directions(poses, PRUNING) if correctives else [np.zeros((3, 0))] * J
+    # rad²: twist directions of smaller variance correct nothing
+    directions = kept_directions(poses, 0.01) if correctives else [np.zeros((3, 0))] * J
     return part_features(skeleton, LinearLift(), directions, [[j] for j in range(J)])
 
 
@@ -231,8 +229,10 @@ def _acting_joints(model: SkinningModel) -> np.ndarray:
     for p, of_part in enumerate(model.skeleton.joints_of_part):
         mine, near = np.flatnonzero(model.weights.argmax(axis=1) == p), np.array(of_part, dtype=np.int64)
         far = np.linalg.norm(x[mine, None] - joints[near], axis=2)
-        acting[mine[:, None], near[np.argsort(far, axis=1, kind="stable")[:, :NEAREST]]] = 1
-    return np.round(LEVELS * diffused(model.template, acting, FADING)) / LEVELS
+        # two joints correct a vertex: those of its heaviest part that are nearest to it
+        acting[mine[:, None], near[np.argsort(far, axis=1, kind="stable")[:, :2]]] = 1
+    # metres of surface over which the correctives of a joint give way to another's
+    return np.round(LEVELS * diffused(model.template, acting, 0.05)) / LEVELS
 
 
 def _regress(features: PoseFeatures, poses: np.ndarray, unposed: np.ndarray, acting: np.ndarray, ridge: float

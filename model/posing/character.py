@@ -24,10 +24,7 @@ from ..skinning import SkinningModel
 
 Progress = Callable[[int, int], None]
 
-OWN_CHARACTER = "character"          # its place in a model's info
-SMOOTHNESS = 0.0001                  # of Eq. 8: a character's triangles share less of their shape than people's
 NORMAL = 0.3                         # how much normals count beside edges: triangles thicken as they grow
-CORRECTIONS = 2                      # of adding what is left of the character to its shape
 # registrations of the template, each from where the last one left it: one alone does not stretch so far
 REGISTRATIONS = 2
 LOST = 0.5                           # share of the character missed, or of joints outside it, that means nothing
@@ -82,7 +79,8 @@ def character_model(model: BodyModel, vertices: np.ndarray, config: CharacterCon
     pose, _ = check_pose(model.skeleton, pose, None)
     found = recentred(model, vertices, pose)
     kept = {name: value for name, value in model.info.items() if name != PLANE}   # these betas are nobody's
-    return replace(found, info={**kept, OWN_CHARACTER: True})                      # type: ignore[type-var]
+    # its place in a model's info
+    return replace(found, info={**kept, "character": True})                      # type: ignore[type-var]
 
 
 def character_pose(model: BodyModel, vertices: np.ndarray, config: CharacterConfig) -> np.ndarray:
@@ -108,9 +106,11 @@ def _of_triangles(model: ScapeModel, vertices: np.ndarray, pose: np.ndarray) -> 
     """
     posed, wanted = model.posed_edges(pose), model.parts.local_edges(vertices, pose)
     with_normals = np.concatenate([posed, NORMAL * _normals(posed)], axis=1)
-    solver = ShapeSolver(GradientSystem(model.template, SMOOTHNESS), with_normals)
+    # a tenth of the paper's smoothness: a character's triangles share less of their shape than people's
+    solver = ShapeSolver(GradientSystem(model.template, 0.0001), with_normals)
     target, S = np.concatenate([wanted, NORMAL * _normals(wanted)], axis=1), np.zeros((len(posed), 3, 3))
-    for _ in range(1 + CORRECTIONS):
+    # twice what is left of the character is added to its shape
+    for _ in range(3):
         S += solver(target - with_normals @ np.swapaxes(S, -1, -2))
     return replace(model, shape_space=replace(model.shape_space, mean=S.astype(np.float32)))
 

@@ -24,7 +24,6 @@ from .distil import Distillation, Follower, Progress, enough_poses
 from .pieces import Piece, carry_skeleton, gradients_of
 
 POSES, SHAPE_POSES = 40, 8           # of the prior, in which both models are compared and the new one corrected
-ASTRAY = 2.0                         # mean edges of the coarser surface that the two may lie apart
 
 
 @dataclass(frozen=True)
@@ -198,7 +197,8 @@ def resample(mesh: Mesh, vertices: int) -> Mesh:
 
 
 def _check_same_surface(old: Mesh, new: Mesh) -> None:
-    limit = ASTRAY * max(old.mean_edge, new.mean_edge)
+    # mean edges of the coarser surface that the two may lie apart
+    limit = 2.0 * max(old.mean_edge, new.mean_edge)
     for a, b, which in ((new, old, "it lies"), (old, new, "the model's own lies")):
         far = float(Surface(b).closest(a.vertices).distances.max())
         if far > limit:

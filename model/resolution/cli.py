@@ -15,7 +15,6 @@ from ..files import load_model
 from ..priors import sample_poses
 from .change import ResolutionConfig, change_resolution, resample, resolution_gap
 
-MM = 1000.0
 MEASURED = 20                        # poses in which the two models are compared
 
 
@@ -49,6 +48,6 @@ def resample_model(model: ModelArg, output: Output, template: Path | None = None
     return Outcome(output, [
         Metric("vertices before", len(loaded.template.vertices)), Metric("vertices", len(mesh.vertices)),
         Metric("triangles", len(mesh.faces)),
-        *(Metric(f"distance in {MEASURED} random poses, {who}, {what}", MM * float(value), "mm")
+        *(Metric(f"distance in {MEASURED} random poses, {who}, {what}", 1000.0 * float(value), "mm")
           for who, gap in gaps for what, value in (("mean", gap.mean()), ("worst pose", gap.max())))],
         {"resample": config})

@@ -16,7 +16,6 @@ from .pieces import gradients_of
 
 Progress = Callable[[int, int], None]
 
-PER_FEATURE = 3                      # poses for each feature of the part that has most, if that is more
 SHRINK = 1e-3                        # of the mean square: holds what the poses do not show
 
 
@@ -136,4 +135,5 @@ def _people(model: ScapeModel, pose: np.ndarray) -> tuple[np.ndarray, np.ndarray
 
 def enough_poses(model: ScapeModel, least: int) -> int:
     """How many poses settle the features of every part."""
-    return max(least, PER_FEATURE * int(np.bincount(model.pose_space.features.part).max()))
+    # three poses for each feature of the part that has most
+    return max(least, 3 * int(np.bincount(model.pose_space.features.part).max()))
