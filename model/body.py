@@ -121,6 +121,15 @@ class BodyModel(ABC):
         (L, 3, K) float, metres per standard deviation
         """
 
+    def pull_back(self, force: np.ndarray, pose: np.ndarray, betas: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Gradient (3J,), (k,) by pose (J, 3) and betas (k,) of a function with gradient `force` (N, 3) by the
+        vertices.
+
+        It costs about as much as the vertices themselves where a kind of model goes backwards through itself.
+        """
+        found = self.jacobian(pose, betas)
+        return np.einsum("nd,ndp->p", force, found.pose), np.einsum("nd,ndk->k", force, found.betas)
+
     @abstractmethod
     def save(self, path: str | Path) -> None:
         """Write the model into one `.npz` file with a JSON header."""

@@ -11,14 +11,13 @@ import tyro
 
 from scanprep.cli import Output, Unit
 from scanprep.console import Metric, Outcome, bar
-from scanprep.dataset import RegisteredSet
 from scanprep.geometry import storage
-from scanprep.geometry.files import read_registered, write_mesh
+from scanprep.geometry.files import write_mesh
 from scanprep.geometry.tables import write_table
 from scanprep.ranges import Count, Seed
 
 from ..body import BodyModel
-from ..cli import ModelArg
+from ..cli import ModelArg, read_bodies
 from ..digests import digest, trained_on
 from ..files import load_model
 from ..posing.cli import read_subject
@@ -52,9 +51,10 @@ def evaluate(model: ModelArg, output: Output, poses: Path | None = None, shapes:
         raise ValueError("--train-shapes serves to judge people: give --shapes too")
     if shapes is not None and not loaded.n_betas:
         raise ValueError(f"{model}: it has no shape components, so it cannot be measured on people")
-    posed, pose_names = _read_bodies(loaded, poses, unit, one_person=True)
-    people, people_names = _read_bodies(loaded, shapes, unit)
-    train, _ = _read_bodies(loaded, train_shapes, unit)
+    nothing: tuple[None, tuple[str, ...]] = (None, ())
+    posed, pose_names = read_bodies(poses, loaded.template, unit, one_person=True) if poses else nothing
+    people, people_names = read_bodies(shapes, loaded.template, unit) if shapes else nothing
+    train, _ = read_bodies(train_shapes, loaded.template, unit) if train_shapes else nothing
     found = Findings(pose_names=pose_names, pose_bodies=posed, shape_names=people_names, shape_bodies=people)
     if posed is not None:
         with bar("fitting poses") as progress:
@@ -124,29 +124,6 @@ def sample(model: ModelArg, output: Output,
         Metric("bodies", count), Metric("shape components", drawn.betas.shape[1]),
         Metric("largest extent, smallest body", float(extent.min()), "m"),
         Metric("largest extent, largest body", float(extent.max()), "m")], {"seed": seed, "pose_too": pose_too})
-
-
-def _read_bodies(model: BodyModel, folder: Path | None, unit: Unit | None, one_person: bool = False
-                 ) -> tuple[np.ndarray | None, tuple[str, ...]]:
-    """Vertices (n, N, 3) and names of a folder or a set: all of one person, or one of every person."""
-    if folder is None:
-        return None, ()
-    if (folder / "set.json").exists():
-        whole = RegisteredSet.load(folder)
-        faces, subjects = whole.template.faces, [entry.subject for entry in whole.entries]
-        if not subjects:
-            raise ValueError(f"{folder}: the set holds no meshes")
-        most = max(whole.subjects, key=subjects.count)
-        names = tuple(entry.name for i, entry in enumerate(whole.entries) if
-                      (entry.subject == most if one_person else entry.subject not in subjects[:i]))
-        vertices = whole.vertices(names)
-    else:
-        faces, vertices, names = read_registered(folder, unit)
-    if not np.array_equal(faces, model.template.faces):
-        order = ", in another order" if len(faces) == len(model.template.faces) else ""
-        raise ValueError(f"{folder}: expected the triangles of the model ({model.template}); these have {len(faces)} "
-                         f"faces and {vertices.shape[1]} vertices{order}")
-    return vertices, names
 
 
 def _notes(model: BodyModel, posed: np.ndarray | None, people: np.ndarray | None) -> list[str]:
