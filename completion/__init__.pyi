@@ -71,6 +71,6 @@ from .partial.completion import Completion as Completion
 from .partial.completion import complete as complete
 from .partial.masks import read_mask as read_mask
 from .partial.settings import CompletionConfig as CompletionConfig
-from .synthetic_model import embedded_model as embedded_model
+from .synthetic_people import synthetic_model as synthetic_model
 from .tracking.sequence import track as track
 from .tracking.settings import TrackConfig as TrackConfig

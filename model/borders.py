@@ -4,8 +4,8 @@ from __future__ import annotations
 import numpy as np
 from scipy.sparse import csc_array, diags_array
 
-from scanprep.decimation.remeshing import clamped_cotangents
 from scanprep.geometry.mesh import Mesh
+from scanprep.geometry.remeshing import clamped_cotangents
 from scanprep.geometry.sparse import factor
 from scanprep.skeleton.tree import Skeleton
 

@@ -64,37 +64,17 @@ class PointOperator:
         return np.ascontiguousarray(self.basis.transpose(0, 2, 1)).reshape(-1, self.count)
 
     def evaluate(self, pose: np.ndarray, trans: np.ndarray | None = None) -> np.ndarray:
-        """Positions of the points.
-
-        Parameters
-        ----------
-        pose : (J, 3) or (B, J, 3) float, radians
-        trans : (3,) or (B, 3) float, metres
-
-        Returns
-        -------
-        (L, 3) or (B, L, 3) float, metres
-        """
+        """Positions (..., L, 3) of the points at poses (..., J, 3) and trans (..., 3)."""
         pose, trans = check_pose(self.terms.skeleton, pose, trans)
         y = posed_product(self.terms, self._flat, pose)
         y += (self.origin + trans)[..., None].astype(y.dtype)
         return np.swapaxes(y, -1, -2)
 
     def jacobian(self, pose: np.ndarray, trans: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
-        """Positions and their derivatives with respect to the pose parameters.
+        """Positions (..., L, 3) and their derivatives (..., L, 3, 3J) by the pose, metres per radian.
 
-        A pose parameter turns its part and all that hangs below it, and changes the features of its joint.
+        A pose parameter rotates its part and all that hangs below it, and changes the features of its joint.
         The derivative with respect to trans is the identity.
-
-        Parameters
-        ----------
-        pose : (J, 3) or (B, J, 3) float, radians
-        trans : (3,) or (B, 3) float, metres
-
-        Returns
-        -------
-        positions : (L, 3) or (B, L, 3) float, metres
-        d_pose : (L, 3, 3J) or (B, L, 3, 3J) float, metres per radian
         """
         pose, trans = check_pose(self.terms.skeleton, pose, trans)
         if pose.ndim == 2:

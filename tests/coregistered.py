@@ -7,13 +7,12 @@ from model.coregistration.config import CoregistrationConfig, ModelFitConfig
 from model.learning.config import LearnConfig
 from scanprep import console
 from scanprep.batch.pool import Workers
-from scanprep.registration.schedule import GraphStage, RegistrationConfig, ShellStage
+from scanprep.registration.schedule import GraphStage, RegistrationConfig
 
 QUICK = CoregistrationConfig(
     fit=ModelFitConfig(axes=2, turns=2),
     registration=RegistrationConfig(graph=(GraphStage(80, 0.09, 0.009, 0.7, 0.01, 0.08),
-                                           GraphStage(80, 0.06, 0.006, 0.7, 0.01, 0.05)),
-                                    shell=(ShellStage(0.02, 0.007, 0.0002, 0.02),), settle=None),
+                                           GraphStage(80, 0.06, 0.006, 0.7, 0.01, 0.05))),
     learn=LearnConfig(refinements=1), rounds=2, workers=Workers(1))
 
 

@@ -27,11 +27,9 @@ from model.files import load_model
 from model.learning.cli import _read_sexes
 from model.posing.cli import _read_betas, _read_turns
 from scanprep import Mesh, RegisteredSet, read_landmarks, read_mesh, write_landmarks, write_mesh
-from scanprep.cleaning.cli import _read_views
 from scanprep.correspondence.correspondences import Correspondences
 from scanprep.correspondence.files import read_correspondences, write_correspondences
-from scanprep.decimation.registered_set import DecimateSetConfig
-from scanprep.decimation.registered_set_files import _load_map, write_decimated_set
+from scanprep.decimation.registered_set import DecimateSetConfig, _load_map, write_decimated_set
 from scanprep.geometry import storage
 from scanprep.geometry.files import PointCloud, read_points, write_points
 from scanprep.geometry.landmarks import read_landmark_vertices
@@ -39,6 +37,7 @@ from scanprep.pictures.textures import Texture, read_texture, write_textured
 from scanprep.pipeline.scans import find_scans
 from scanprep.skeleton.edit import read_edits
 from scanprep.skeleton.tree import Skeleton
+from scanprep.surfaces.cli import _read_views
 from scanprep.synthetic.anatomy import BodyShape
 from scanprep.synthetic.data_set import GroundTruth, _write_views, read_views
 from scanprep.synthetic.scanner import RangeView, Scan

@@ -70,7 +70,7 @@ def test_a_body_is_known_by_its_triangles_alone(person):
 def test_other_bodies_and_names_are_refused_with_a_way_out(person):
     with pytest.raises(ValueError, match=r"expected a marker layout of biomech57, .* got 'cmu40'; .*markersets"):
         MarkerLayout.named("cmu40", person)
-    with pytest.raises(ValueError, match=r"embedded people \(9380 vertices\), SCAPE and SPRING \(12500 vertices\); "
+    with pytest.raises(ValueError, match=r"synthetic people \(9380 vertices\), SCAPE and SPRING \(12500 vertices\); "
                                          r"got another triangulation with 9380 vertices; .*indices"):
         MarkerLayout.named("cmu41", Mesh(person.vertices, person.faces[:, [1, 2, 0]]))
 

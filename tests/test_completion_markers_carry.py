@@ -73,7 +73,7 @@ def test_what_does_not_fit_is_refused(body, layout):
     target, _ = renumbered(body, np.random.default_rng(1))
     far = target.with_vertices(target.vertices + 5)
     with pytest.raises(ValueError, match=r"target: the source could not be brought onto it, 100% .* give landmarks"):
-        carry_layout(layout, body, far, config=replace(NEAR, register=replace(NEAR.register, settle=None)))
+        carry_layout(layout, body, far, config=replace(NEAR, register=replace(NEAR.register, final_fit=None)))
     with pytest.raises(ValueError, match="marker 'A' sits on vertex 99999"):
         carry_layout(MarkerLayout(("A",), np.array([99_999])), body, target)
     with pytest.raises(ValueError, match="landmarks: expected"):

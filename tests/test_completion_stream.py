@@ -237,7 +237,7 @@ def test_a_low_pass_keeps_slow_turns_and_takes_fast_ones():
 
 @pytest.fixture(scope="module")
 def walker():
-    """An embedded person whose parts are rigid."""
+    """A synthetic person whose parts are rigid."""
     person = Person()
     skeleton, J = person.skeleton, len(person.parents)
     features = linear_features(skeleton, tuple(np.zeros((3, 0)) for _ in range(J)))

@@ -1,4 +1,4 @@
-"""Embedded people: the surface, correspondence, posing, poses and marks."""
+"""Synthetic people: the surface, correspondence, posing, poses and marks."""
 from __future__ import annotations
 
 import igl

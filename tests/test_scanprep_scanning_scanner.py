@@ -1,4 +1,4 @@
-"""The virtual scanner and the embedded data set."""
+"""The virtual scanner and the synthetic data set."""
 from __future__ import annotations
 
 import json
@@ -9,8 +9,7 @@ import pytest
 from scanprep.geometry.files import read_mesh
 from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.surface import Surface
-from scanprep.synthetic import data_set as embedded
-from scanprep.synthetic import people
+from scanprep.synthetic import data_set, people
 from scanprep.synthetic.people import BodyShape, Person
 from scanprep.synthetic.scanner import ScannerConfig, scan
 
@@ -121,16 +120,16 @@ def test_settings_are_checked(body):
         scan(Mesh(np.zeros((3, 3)), np.zeros((0, 3))))
 
 
-def test_embedded_dataset_is_complete_repeatable_and_resumable(tmp_path):
+def test_synthetic_dataset_is_complete_repeatable_and_resumable(tmp_path):
     calls = []
-    first = embedded.embedded_dataset(tmp_path / "a", seed=3, subject_poses=2, subjects=2, config=COARSE,
+    first = data_set.synthetic_dataset(tmp_path / "a", seed=3, subject_poses=2, subjects=2, config=COARSE,
                                       progress=lambda done, total: calls.append((done, total)))
     assert calls == [(1, 4), (2, 4), (3, 4), (4, 4)]
     assert [e.sex for e in first[2:]] == ["female", "male"] and len({e.name for e in first}) == 4
     for entry in first:
         mesh = read_mesh(entry.path)
-        truth = embedded.GroundTruth.load(entry.truth)
-        views = embedded.read_views(entry.views)
+        truth = data_set.GroundTruth.load(entry.truth)
+        views = data_set.read_views(entry.views)
         assert sum(len(v.points) for v in views) == len(mesh.vertices)
         assert Surface(truth.mesh).closest(mesh.vertices).distances.mean() < 0.003
         assert truth.vertices[:, 2].min() == pytest.approx(0, abs=1e-9)
@@ -143,12 +142,12 @@ def test_embedded_dataset_is_complete_repeatable_and_resumable(tmp_path):
     stamps = [entry.path.stat().st_mtime_ns for entry in first]
     bytes_before = first[1].path.read_bytes()
     first[1].path.unlink()
-    again = embedded.embedded_dataset(tmp_path / "a", seed=3, subject_poses=2, subjects=2, config=COARSE)
+    again = data_set.synthetic_dataset(tmp_path / "a", seed=3, subject_poses=2, subjects=2, config=COARSE)
     assert again == first
     assert first[1].path.read_bytes() == bytes_before
     assert again[0].path.stat().st_mtime_ns == stamps[0]
 
 
 def test_first_scan_is_the_rest_pose(tmp_path):
-    entry = embedded.embedded_dataset(tmp_path, subject_poses=1, subjects=0, config=COARSE)[0]
-    assert entry.pose == "rest" and np.abs(embedded.GroundTruth.load(entry.truth).pose).max() == 0
+    entry = data_set.synthetic_dataset(tmp_path, subject_poses=1, subjects=0, config=COARSE)[0]
+    assert entry.pose == "rest" and np.abs(data_set.GroundTruth.load(entry.truth).pose).max() == 0

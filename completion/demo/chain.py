@@ -26,11 +26,11 @@ from scanprep.pipeline.template import TemplateConfig, make_template
 from scanprep.skeleton.find import SkeletonConfig
 from scanprep.synthetic.data_set import (
     SUBJECT,
-    EmbeddedScan,
     GroundTruth,
+    SyntheticScan,
     click_landmarks,
-    embedded_plan,
     read_views,
+    scan_plan,
     stand,
     write_scan,
 )
@@ -79,11 +79,11 @@ class Demo:
         return ScannerConfig(resolution=self.config.resolution)
 
     @cached_property
-    def scans(self) -> list[EmbeddedScan]:
+    def scans(self) -> list[SyntheticScan]:
         """Scans of one subject in many poses and of many subjects."""
         tasks = [Task(f"{SCANS}{'pose' if which[1] else 'person'} {which[0]}", which)
-                 for which in embedded_plan(self.config.poses, self.config.subjects)]
-        with self.bar("scanning embedded people") as progress, one_thread():
+                 for which in scan_plan(self.config.poses, self.config.subjects)]
+        with self.bar("scanning synthetic people") as progress, one_thread():
             done = self.space.run(ScanPerson(self.config.seed, self.scanner), tasks, progress=progress)
         if done.failures:
             raise ValueError("; ".join(done.failures.values()))

@@ -15,7 +15,7 @@ from .settings import QUICK, DemoConfig
 
 def demo(out: Out = Path("scape_demo"), quick: bool = False, seed: Seed = DemoConfig.seed, *, space: Workspace
          ) -> Outcome:
-    """The whole chain on embedded people: scans, registration, skeleton, model, completion, animation.
+    """The whole chain on synthetic people: scans, registration, skeleton, model, completion, animation.
 
     Example: scape demo --quick
 

@@ -28,7 +28,7 @@ FAR = 0.01                 # metres at the end of the heat maps
 def write_page(demo: Demo, metrics: list[Metric], tell: Callable[[int, int], None], to: Path) -> None:
     """Write `report.html`, the animated GLB and pictures into a folder."""
     page = Page("From raw scans to a moving person",
-                "Every stage of the chain on embedded people, whose true shape, pose and correspondence are known.")
+                "Every stage of the chain on synthetic people, whose true shape, pose and correspondence are known.")
     page.table([(m.name, m.text(), m.unit) for m in metrics], ("against the ground truth", "value", "unit"))
     stages: tuple[Callable[[Demo, Page], None], ...] = (
         _scans, _template, _registration, _skeleton, _shapes, _poses, partial(_completion, to=to),

@@ -1,4 +1,4 @@
-"""What is measured of the embedded people: range scans, and the markers of a walk."""
+"""What is measured of the synthetic people: range scans, and the markers of a walk."""
 from __future__ import annotations
 
 from collections.abc import Callable
@@ -10,7 +10,7 @@ from scipy.spatial import cKDTree
 
 from scanprep.batch.room import Room
 from scanprep.geometry.mesh import Mesh
-from scanprep.synthetic.data_set import EmbeddedScan, GroundTruth, embedded_scan
+from scanprep.synthetic.data_set import GroundTruth, SyntheticScan, synthetic_scan
 from scanprep.synthetic.people import MARKERS
 from scanprep.synthetic.scanner import ScannerConfig
 
@@ -21,13 +21,13 @@ from .settings import DemoConfig
 
 @dataclass(frozen=True)
 class ScanPerson:
-    """The work on each scan: an embedded person made and scanned."""
+    """The work on each scan: a synthetic person made and scanned."""
 
     seed: int
     scanner: ScannerConfig
 
-    def __call__(self, which: tuple[int, bool], room: Room) -> EmbeddedScan:
-        found = embedded_scan(room.folder / "scans", self.seed, *which, self.scanner)
+    def __call__(self, which: tuple[int, bool], room: Room) -> SyntheticScan:
+        found = synthetic_scan(room.folder / "scans", self.seed, *which, self.scanner)
         return replace(found, folder=Path("scans"))
 
 

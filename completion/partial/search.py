@@ -6,6 +6,7 @@ from typing import TYPE_CHECKING
 import numpy as np
 
 from scanprep.geometry import rotations
+from scanprep.geometry.farthest_points import farthest_points
 
 from ..priors import typical_poses
 from ..starts import distinct
@@ -51,14 +52,7 @@ def starting_poses(fit: ScanFit) -> np.ndarray:
 
 def varied(poses: np.ndarray, count: int) -> np.ndarray:
     """Those `count` of the poses (M, J, 3), the first among them, that differ most from one another."""
-    if len(poses) <= count:
-        return poses
-    flat, kept = poses.reshape(len(poses), -1), [0]
-    apart = np.linalg.norm(flat - flat[0], axis=1)
-    while len(kept) < count:
-        kept.append(int(np.argmax(apart)))
-        apart = np.minimum(apart, np.linalg.norm(flat - flat[kept[-1]], axis=1))
-    return poses[kept]
+    return poses if len(poses) <= count else poses[farthest_points(poses.reshape(len(poses), -1), count, 0)]
 
 
 def all_turns(count: int) -> np.ndarray:

@@ -5,10 +5,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
-from scanprep.geometry.files import PointCloud, read_mesh, read_points
+from scanprep.geometry.files import POINT_ENDINGS, PointCloud, read_mesh, read_points
 from scanprep.geometry.mesh import Mesh
 from scanprep.pictures.textures import Texture, read_texture
-from scanprep.pipeline.scans import POINT_ENDINGS
 
 
 @dataclass(frozen=True, eq=False)

@@ -26,7 +26,7 @@ from .config import CoregistrationConfig
 from .rounds import Coregistration, coregister, coregistration_problem
 from .single import Landmarks
 
-FIGURES = ("rms", "explained", "apart", "landmark_rms", "flipped", "score", "starts")
+FIGURES = ("rms", "explained", "apart", "landmark_rms", "inverted", "score", "starts")
 
 ScansArg = Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="SCANS")]
 
@@ -52,7 +52,7 @@ def coregister_scans(model: ModelArg, scans: ScansArg, output: Output, landmarks
         unit: Unit of the scans and landmarks, where the files cannot tell.
         config: Settings.
     """
-    from scanprep.pipeline.scans import read_scan
+    from scanprep.geometry.files import read_scan
 
     loaded, tasks = load_model(model), find_scans(scans, landmarks, subject)
     read, marks, kept, failures = [], [], [], []
@@ -105,7 +105,7 @@ def _figures(done: Coregistration, names: Sequence[str]) -> list[Metric]:
             Metric("distance to the scan, median RMS", 1e3 * float(np.median([r.rms for r in found])), "mm"),
             Metric("scan explained, mean", 100 * float(np.mean([r.explained for r in found])), "%"),
             Metric("distance from the model, median RMS", 1e3 * float(np.median([r.apart for r in found])), "mm"),
-            Metric("flipped triangles", sum(r.flipped for r in found))]
+            Metric("inverted triangles", sum(r.inverted for r in found))]
 
 
 def _landmarks(model: BodyModel, path: Path | None, scan: Mesh | np.ndarray, unit: Unit | None) -> Landmarks | None:

@@ -8,7 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from scanprep.geometry.mesh import Mesh
-from scanprep.registration.matches import target_of
+from scanprep.geometry.target import target_of
 from scanprep.registration.nonrigid import register
 from scanprep.threads import one_thread
 
@@ -42,7 +42,7 @@ class ModelRegistration:
         Share of the scan's points that the mesh explains.
     apart : float, metres
         Root mean square distance of mesh and prediction where there were data; much of it tells of a wrong pose.
-    flipped : int
+    inverted : int
         Triangles that face against their surroundings.
     confidence : (N,) float
         From 0, made up by the model, to 1: there were data here.
@@ -61,7 +61,7 @@ class ModelRegistration:
     explained: float
     apart: float
     landmark_rms: float
-    flipped: int
+    inverted: int
     confidence: np.ndarray
     score: float
     starts: int
@@ -100,7 +100,7 @@ def register_with_model(body: BodyModel | Subject, scan: Mesh | np.ndarray, land
     """
     config = config or CoregistrationConfig()
     tell = progress or (lambda done, total: None)
-    fit = ModelFit(body, target_of(scan, config.registration.neighbours), landmarks, config.fit)
+    fit = ModelFit(body, target_of(scan), landmarks, config.fit)
     given = [] if start is None else [_given(fit, start)]
     best, tried = fit.best_of(itertools.chain(given, fit.starts()))
     tell(1, 2)
@@ -113,7 +113,7 @@ def register_with_model(body: BodyModel | Subject, scan: Mesh | np.ndarray, land
     off_marks = np.linalg.norm(mesh.vertices[fit.marks] - fit.marked, axis=1)
     return ModelRegistration(mesh, predicted, pose, trans, betas, seen, aligned.distances, aligned.rms,
                              fit.explained(mesh, 0.01, EXPLAINED), _rms(off_model), _rms(off_marks),
-                             aligned.flipped, aligned.confidence, best.score, tried)
+                             aligned.inverted, aligned.confidence, best.score, tried)
 
 
 def _rms(distances: np.ndarray) -> float:

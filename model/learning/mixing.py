@@ -91,10 +91,8 @@ def learn_scape_mix(template: Mesh, bodies: np.ndarray, subjects: Sequence[Hasha
         On the template.
     config : LearnConfig, optional
         By default `MIX`.
-    progress : callable, optional
-        Called with the work done and the whole.
-    step : callable, optional
-        Keeps every round, as `scanprep.batch.steps.Step`.
+    progress, step
+        As for `learn_scape`.
 
     Raises
     ------

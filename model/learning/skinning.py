@@ -63,24 +63,14 @@ def learn_skinning(template: Mesh, poses: np.ndarray, shapes: np.ndarray | None,
 
     Parameters
     ----------
-    template : Mesh
-        One of the poses.
-    poses : (M, N, 3) float, metres
-        The template's person in M poses.
-    shapes : (S, N, 3) float, metres, or None
-        Other people; None for a model of the template's own body alone.
-    skeleton : Skeleton
-        The parts and where the joints are sought.
+    template, poses, shapes, skeleton, progress, step
+        As for `learn_scape`; joints are sought near those of the skeleton.
     config : SkinConfig, optional
-    progress : callable, optional
-        Called with the work done and the whole.
-    step : callable, optional
-        Keeps every round, as `scanprep.batch.steps.Step`.
 
     Raises
     ------
     ValueError
-        Fewer than two poses, vertices of another count or not finite, a skeleton of another template.
+        As `learn_scape`.
     """
     config = config or SkinConfig()
     poses, shapes = checked_training(template, skeleton, poses, shapes)

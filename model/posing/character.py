@@ -217,7 +217,7 @@ def inside(mesh: Mesh, points: np.ndarray) -> np.ndarray:
 
 def character_problem(found: Character) -> str | None:
     """Why a character means nothing, with the likely cause; None where it means something."""
-    missed = 0.0 if found.registration is None else found.registration.missed
+    missed = 0.0 if found.registration is None else found.registration.uncovered
     if missed <= LOST and found.inside.mean() >= LOST:
         return None
     return (f"{100 * missed:.0f}% of the character lies off the template and {found.inside.sum()} of "

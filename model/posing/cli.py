@@ -99,9 +99,9 @@ def character(mesh: CharacterArg, model: Annotated[Path, tyro.conf.arg(aliases=[
 def _about(model: BodyModel, found: Character) -> list[Metric]:
     rows = [] if found.registration is None else [
         Metric("distance to the character, RMS", 1e3 * found.registration.rms, "mm"),
-        Metric("character off the template", 100 * found.registration.missed, "%"),
+        Metric("character off the template", 100 * found.registration.uncovered, "%"),
         Metric("distance of landmarks, RMS", 1e3 * found.registration.landmark_rms, "mm"),
-        Metric("flipped triangles", found.registration.flipped)]
+        Metric("inverted triangles", found.registration.inverted)]
     outside = [name for name, within in zip(model.skeleton.names, found.inside, strict=True) if not within]
     return [*rows, Metric("height, length or width", float(np.ptp(found.mesh.vertices, axis=0).max()), "m"),
             Metric("joints inside it", f"{found.inside.sum()} of {len(found.inside)}"

@@ -21,7 +21,7 @@ MEASURED = 20                        # poses in which the two models are compare
 def resample_model(model: ModelArg, output: Output, template: Path | None = None, vertices: Faces | None = None,
                    unit: Unit | None = None, config: ResolutionConfig
                    = ResolutionConfig()) -> Outcome:  # noqa: B008
-    """Carry a model to fewer or more triangles; poses, betas and places keep their meaning.
+    """Transfer a model to fewer or more triangles; poses, betas and places keep their meaning.
 
     Example: scape model resample model.npz --vertices 5389 -o coarse.npz
 
@@ -37,7 +37,7 @@ def resample_model(model: ModelArg, output: Output, template: Path | None = None
         raise ValueError("--template and --vertices: expected one of them")
     loaded = load_model(model)
     mesh = resample(loaded.template, vertices) if vertices is not None else read_mesh(Path(str(template)), unit)
-    with bar("carrying the model") as progress:
+    with bar("transferring the model") as progress:
         changed = change_resolution(loaded, mesh, config, progress)
     changed.save(output)
     rng = np.random.default_rng(1)

@@ -1,4 +1,4 @@
-"""What a model carried to another resolution still lacks, found by comparing the two in many poses."""
+"""What a model transferred to another resolution still lacks, found by comparing the two in many poses."""
 from __future__ import annotations
 
 from collections.abc import Callable
@@ -56,7 +56,7 @@ def _frames(corners: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True, eq=False)
 class Distillation:
-    """Lowers what a carried model leaves of the model it was made of, in rounds.
+    """Lowers what a transferred model leaves of the model it was made of, in rounds.
 
     The way is that of learning: what is left of every body, as edges in the frames of the parts, is regressed and added
     to what the triangles have. `follow` puts the imitation's vertices on the model's.

@@ -84,16 +84,9 @@ def inverse_right_jacobian(twist: np.ndarray) -> np.ndarray:
 
 def procrustes(source: np.ndarray, target: np.ndarray, weights: np.ndarray | None = None
                ) -> tuple[np.ndarray, np.ndarray]:
-    """Rotation R (..., 3, 3) and translation t (..., 3) that bring `source` nearest to `target`.
+    """R (..., 3, 3) and t (..., 3) that bring `source` (..., n, 3) nearest to `target`: `target ≈ source @ R.T + t`.
 
-    Parameters
-    ----------
-    source, target : (..., n, 3) float, metres
-    weights : (n,) float, optional
-
-    Returns
-    -------
-    R, t with `target ≈ source @ R.T + t`.
+    Points count by their weights (n,).
     """
     w = np.ones(source.shape[-2]) if weights is None else np.asarray(weights, dtype=np.float64)
     w = w / w.sum()

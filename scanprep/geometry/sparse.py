@@ -10,23 +10,10 @@ from scipy.sparse.linalg import splu
 
 
 def factor(matrix: csc_array) -> Callable[[np.ndarray], np.ndarray]:
-    """Factor a sparse symmetric positive definite matrix with SuperLU.
+    """The solver, (n,) or (n, k) -> the same shape, of a sparse symmetric positive definite matrix, with SuperLU.
 
     Symmetric mode and no pivoting: with its default pivoting SuperLU fills in beyond use on the larger
-    systems of this package.
-
-    Parameters
-    ----------
-    matrix : (n, n) sparse, symmetric positive definite
-
-    Returns
-    -------
-    solve : (n,) or (n, k) -> the same shape
-
-    Raises
-    ------
-    ValueError
-        The matrix is singular or not finite.
+    systems of this package. ValueError for a singular matrix or one that is not finite.
     """
     try:
         lu = splu(csc_array(matrix), permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0,
@@ -40,12 +27,7 @@ class Factored:
     """A factored SPD system for many right-hand sides (CHOLMOD-class supernodal Cholesky from cholespy).
 
     Slower to factor than `factor`, several times faster to solve with three or more columns. Pickled, it is the matrix,
-    and factored again where it is read.
-
-    Raises
-    ------
-    ValueError
-        The matrix is empty, not finite or not positive definite.
+    and factored again where it is read. ValueError as for `factor`, and for an empty matrix.
     """
 
     LIMIT = 128                      # columns cholespy takes in one call
@@ -82,12 +64,8 @@ class Factored:
 def harmonic(near: csr_array, values: np.ndarray, known: np.ndarray) -> np.ndarray:
     """Values (N, k) that go over smoothly from the known ones (N,) bool: each other the mean of its neighbours'.
 
-    So none lies beyond the known ones. A piece without any known value keeps what it has.
-
-    Parameters
-    ----------
-    near : (N, N) sparse, symmetric
-        How much each counts for the other; zero where they are not neighbours.
+    So none lies beyond the known ones. A piece without any known value keeps what it has. `near` (N, N), symmetric,
+    says how much neighbours count for each other.
     """
     _, piece = connected_components(near, directed=False)
     free, fixed = np.flatnonzero(~known & np.isin(piece, np.unique(piece[known]))), np.flatnonzero(known)
@@ -96,3 +74,23 @@ def harmonic(near: csr_array, values: np.ndarray, known: np.ndarray) -> np.ndarr
         L = csr_array(diags_array(near.sum(axis=1)) - near)[free]
         out[free] = factor(csc_array(L[:, free]))(-L[:, fixed] @ out[fixed])
     return out
+
+
+def conjugate_gradients(apply: Callable[[np.ndarray], np.ndarray], force: np.ndarray,
+                        precondition: Callable[[np.ndarray], np.ndarray], iterations: int = 40,
+                        tolerance: float = 1e-4) -> np.ndarray:
+    """Solve `apply(d) = force` for arrays of any shape, with a symmetric positive definite `apply`."""
+    d, r = np.zeros_like(force), force.copy()
+    z = precondition(r)
+    p, rz = z, float(np.sum(r * z))
+    first = rz
+    for _ in range(iterations):
+        if rz <= tolerance**2 * first or not rz:
+            break
+        Ap = apply(p)
+        a = rz / float(np.sum(p * Ap))
+        d, r = d + a * p, r - a * Ap
+        z = precondition(r)
+        rz, last = float(np.sum(r * z)), rz
+        p = z + rz / last * p
+    return d

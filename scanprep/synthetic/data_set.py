@@ -1,4 +1,4 @@
-"""The embedded data set: scans of one subject in many poses and of many subjects, truth kept beside them."""
+"""The synthetic data set: scans of one subject in many poses and of many subjects, truth kept beside them."""
 from __future__ import annotations
 
 from collections.abc import Callable
@@ -163,8 +163,8 @@ def _view(a: dict[str, np.ndarray], k: int) -> RangeView:
 
 
 @dataclass(frozen=True)
-class EmbeddedScan:
-    """One scan of the embedded data set.
+class SyntheticScan:
+    """One scan of the synthetic data set.
 
     Attributes
     ----------
@@ -203,9 +203,9 @@ class EmbeddedScan:
 SUBJECT = BodyShape(sex=1.0, stature=1.78, weight=-0.3, muscle=0.9, shoulder_width=0.4)
 
 
-def embedded_dataset(folder: str | Path, seed: int = 0, subject_poses: int = 20, subjects: int = 12,
+def synthetic_dataset(folder: str | Path, seed: int = 0, subject_poses: int = 20, subjects: int = 12,
                      config: ScannerConfig | None = None, click_error: float = 0.003,
-                     progress: Callable[[int, int], None] | None = None) -> list[EmbeddedScan]:
+                     progress: Callable[[int, int], None] | None = None) -> list[SyntheticScan]:
     """Scan one subject in many poses and many subjects near the rest pose.
 
     The first scan, `subject_00_rest`, is the one to make the template from. Scans that are there already are
@@ -225,16 +225,16 @@ def embedded_dataset(folder: str | Path, seed: int = 0, subject_poses: int = 20,
         Standard deviation of every coordinate of a landmark.
     progress : called with (done, total)
     """
-    plan = embedded_plan(subject_poses, subjects)
+    plan = scan_plan(subject_poses, subjects)
     out = []
     for done, which in enumerate(plan):
-        out.append(embedded_scan(Path(folder), seed, *which, config or ScannerConfig(), click_error))
+        out.append(synthetic_scan(Path(folder), seed, *which, config or ScannerConfig(), click_error))
         if progress is not None:
             progress(done + 1, len(plan))
     return out
 
 
-def embedded_plan(subject_poses: int, subjects: int) -> list[tuple[int, bool]]:
+def scan_plan(subject_poses: int, subjects: int) -> list[tuple[int, bool]]:
     """The scans of a data set: the number of each, and whether it is of the one subject."""
     return [(k, True) for k in range(subject_poses)] + [(k, False) for k in range(subjects)]
 
@@ -244,9 +244,9 @@ def _person(shape: BodyShape) -> Person:
     return Person(shape)
 
 
-def embedded_scan(folder: Path, seed: int, k: int, is_pose: bool, config: ScannerConfig, click_error: float = 0.003
-                  ) -> EmbeddedScan:
-    """One scan of `embedded_plan`, made unless its files are there."""
+def synthetic_scan(folder: Path, seed: int, k: int, is_pose: bool, config: ScannerConfig, click_error: float = 0.003
+                  ) -> SyntheticScan:
+    """One scan of `scan_plan`, made unless its files are there."""
     rng = np.random.default_rng([seed, int(is_pose), k])
     if is_pose:
         label, pose = subject_pose(k, rng)
@@ -255,7 +255,7 @@ def embedded_scan(folder: Path, seed: int, k: int, is_pose: bool, config: Scanne
         shape = BodyShape.random(rng, sex=-1.0 if k % 2 == 0 else 1.0)
         pose, label, subject = near_rest(rng), "rest", f"person{k:02d}"
         name = f"person_{k:02d}_{'female' if k % 2 == 0 else 'male'}"
-    entry = EmbeddedScan(name, subject, label, "male" if shape.sex > 0 else "female", folder)
+    entry = SyntheticScan(name, subject, label, "male" if shape.sex > 0 else "female", folder)
     if not entry.path.exists():
         truth = stand(_person(shape), pose)
         scanned = scan(truth.mesh, config, rng)

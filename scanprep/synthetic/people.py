@@ -1,4 +1,4 @@
-"""Embedded subjects: procedural people with a known shape, skeleton and pose.
+"""Synthetic subjects: procedural people with a known shape, skeleton and pose.
 
 z is up, a person faces -y, stands on z = 0 and has the left side at +x; at rest the arms hang about 36
 degrees away from the body. All people share one closed triangulation, and vertex i is the same anatomical

@@ -1,4 +1,4 @@
-"""Poses of the embedded people: everyday poses by name, and random ones between them."""
+"""Poses of the synthetic people: everyday poses by name, and random ones between them."""
 from __future__ import annotations
 
 from functools import lru_cache

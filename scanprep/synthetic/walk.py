@@ -1,4 +1,4 @@
-"""A walk for the embedded people, from joint angles over the gait cycle."""
+"""A walk for the synthetic people, from joint angles over the gait cycle."""
 from __future__ import annotations
 
 from typing import Any

@@ -50,7 +50,7 @@ def coarse(data: RealData, faces: int) -> RealData:
         return data
     small = decimate(data.template, faces)
     on = Surface(data.template).closest(small.vertices)
-    poses = np.stack([on.carried(p, data.template.faces) for p in data.poses])
+    poses = np.stack([on.transferred(p, data.template.faces) for p in data.poses])
     near = cKDTree(poses[0]).query(data.template.vertices[list(data.landmarks.values())])[1]
     return RealData(Mesh(poses[0], small.faces), poses, poses[:0],
                     dict(zip(data.landmarks, near.tolist(), strict=True)))
@@ -71,7 +71,7 @@ class Story:
         vertices = np.array([self.data.landmarks[name] for name in MARKS[which]], dtype=np.int64)
         return [(vertices, body[vertices]) if len(vertices) else None for body in self.truth]
 
-    def tell(self, what: str, found: dict[int, np.ndarray], flipped: int = -1) -> None:
+    def tell(self, what: str, found: dict[int, np.ndarray], inverted: int = -1) -> None:
         """Measure vertices (N, 3) of some scans, by number, and print a row."""
         which = np.array(list(found))
         apart = [1e3 * np.linalg.norm(found[i] - self.truth[i], axis=1) for i in which]
@@ -82,7 +82,7 @@ class Story:
                "median_mm": float(np.median(mean)), "worst_mm": float(mean.max()),
                "shown_mm": float(mean[shown].mean()), "shown_failed": int((mean[shown] > TOO_FAR).sum()),
                "surface_seen_mm": float(np.mean([o.mean() for o in off])),
-               "beyond_50mm": float(np.mean([(a > 50).mean() for a in apart])), "flipped": flipped,
+               "beyond_50mm": float(np.mean([(a > 50).mean() for a in apart])), "inverted": inverted,
                "cpu_s": time.process_time() - self.begun,
                "each_mm": {self.poses[i]: float(m) for i, m in zip(which, mean, strict=True)}}
         self.rows.append(row)
@@ -118,7 +118,7 @@ def main() -> None:
 
     plain = [register(data.template, s.scan, m) for s, m in zip(story.scans, story.marks(args.landmarks), strict=True)]
     first = np.stack([r.mesh.vertices for r in plain])
-    story.tell("without a model", dict(enumerate(first)), sum(r.flipped for r in plain))
+    story.tell("without a model", dict(enumerate(first)), sum(r.inverted for r in plain))
     good = np.array([explained_share(r.mesh, s.scan) >= 1 - config.failed
                      for r, s in zip(plain, story.scans, strict=True)])
     story.tell("those that explain their scan", {int(i): first[i] for i in np.flatnonzero(good)})
@@ -132,7 +132,7 @@ def main() -> None:
         for turn in range(done.rounds):
             now = {i: space.value(task_name(turn, name)) for i, name in enumerate(names) if name not in done.failures}
             story.tell(f"round {turn + 1}", {i: r.mesh.vertices for i, r in now.items()},
-                       sum(r.flipped for r in now.values()))
+                       sum(r.inverted for r in now.values()))
             story.tell(f"round {turn + 1}, predicted", {i: r.predicted.vertices for i, r in now.items()})
     if args.clickless:
         free = replace(config, fit=replace(config.fit, up=(0.0, 0.0, 1.0)))

@@ -1,4 +1,4 @@
-"""Learning from a random mix of people and poses against the separated design, on embedded people.
+"""Learning from a random mix of people and poses against the separated design, on synthetic people.
 
     python tests/benchmarks/mixed.py -o mixed.json
 
@@ -28,7 +28,7 @@ FIT = FitConfig(sample=400, polish=0)
 
 
 class Stage:
-    """Template, skeleton and bodies of embedded people, on a coarser triangulation of some of their vertices."""
+    """Template, skeleton and bodies of synthetic people, on a coarser triangulation of some of their vertices."""
 
     def __init__(self, faces: int) -> None:
         import igl
@@ -109,7 +109,7 @@ def main() -> None:
     stage = Stage(args.faces)
     runs = [run(stage, seed, args.features, args.held) for seed in args.seeds]
     report: dict[str, object] = {
-        "protocol": "embedded people, 90 meshes, true skeleton", "faces": len(stage.template.faces), "held": args.held,
+        "protocol": "synthetic people, 90 meshes, true skeleton", "faces": len(stage.template.faces), "held": args.held,
         "features": args.features, "config": dataclasses.asdict(MIX), "machine": machine(), "runs": runs}
     for against in [name for name in runs[0] if name.startswith("separated")]:
         for what in ("new_people", "new_people_20_betas", "new_people_29_betas"):

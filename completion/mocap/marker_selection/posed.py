@@ -10,6 +10,7 @@ from model.fitting import FitConfig, ShapeFitter
 from model.linear import check_pose
 from model.posing.transfer import own_body
 from scanprep.geometry import rotations
+from scanprep.geometry.farthest_points import farthest_points
 
 from .linear import check_bodies
 
@@ -26,12 +27,8 @@ def example_poses(model: BodyModel, count: int) -> np.ndarray:
     if not 1 <= count <= len(examples):
         raise ValueError(f"count: expected 1..{len(examples)} poses, those that the model keeps, got {count}")
     turned = rotations.exp(examples).reshape(len(examples), -1)
-    chosen = [int(((turned - turned.mean(axis=0))**2).sum(axis=1).argmin())]
-    far = np.full(len(examples), np.inf)
-    while len(chosen) < count:
-        far = np.minimum(far, ((turned - turned[chosen[-1]])**2).sum(axis=1))
-        chosen.append(int(far.argmax()))
-    return examples[chosen]
+    usual = ((turned - turned.mean(axis=0))**2).sum(axis=1).argmin()
+    return examples[farthest_points(turned, count, usual, least=-0.5)]
 
 
 def in_poses(model: BodyModel, bodies: np.ndarray, poses: np.ndarray,

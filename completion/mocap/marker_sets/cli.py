@@ -8,10 +8,10 @@ import numpy as np
 import tyro
 
 from model.body import BodyModel
-from scanprep.cli import MM, Output, Unit, landmarks_beside
+from scanprep.cli import MM, Output, Unit
 from scanprep.console import Metric, Outcome, bar, dispatch, say
 from scanprep.geometry.files import read_mesh, write_mesh
-from scanprep.geometry.landmarks import match_landmarks, read_landmark_vertices, read_landmarks
+from scanprep.geometry.landmarks import match_landmarks, read_landmarks, read_template_landmarks
 from scanprep.geometry.mesh import Mesh
 from scanprep.skeleton.tree import Skeleton
 
@@ -57,7 +57,7 @@ def show_layout(layout: LayoutArg, output: Output, model: ModelOrNone = None, bo
     Args:
         layout: One of `scape layout list`, or a file.
         output: Folder to write to.
-        model: Model of `scape learn`, whose mean person is shown; without it, and without --body, that of the embedded
+        model: Model of `scape learn`, whose mean person is shown; without it, and without --body, that of the synthetic
             people.
         body: Mesh to show it on, instead of a model.
         unit: Unit of the mesh.
@@ -108,7 +108,7 @@ def carry_to(layout: LayoutArg, source: Path, target: Path, output: Output, land
     found = read_layout(layout, ours, None)
     pairs = None
     if landmarks is not None:
-        marks = read_landmark_vertices(source_landmarks or landmarks_beside(source), ours)
+        marks = read_template_landmarks(source, ours, source_landmarks, "--source-landmarks")
         try:
             pairs = match_landmarks(marks, read_landmarks(landmarks, theirs, unit))[1:]
         except ValueError as error:
@@ -153,7 +153,7 @@ def mean_body(model: BodyModel) -> Mesh:
 
 def _body(model: Path | None, body: Path | None, unit: Unit | None
           ) -> tuple[Mesh, Skeleton | None, np.ndarray | None, str]:
-    """The body to show, its skeleton, the vertices of the embedded people it kept, and its name."""
+    """The body to show, its skeleton, the vertices of the synthetic people it kept, and its name."""
     if body is not None:
         return read_mesh(body, unit), None, None, str(body)
     loaded, name = read_model(model)

@@ -117,7 +117,7 @@ class MarkerLayout:
 
     @staticmethod
     def named(name: str, template: Mesh, kept: np.ndarray | None = None) -> MarkerLayout:
-        """A usual marker set on a body that is known here: the triangles of SCAPE and SPRING, or the embedded people.
+        """A usual marker set on a body that is known here: the triangles of SCAPE and SPRING, or the synthetic people.
 
         Parameters
         ----------
@@ -126,7 +126,7 @@ class MarkerLayout:
         template : Mesh
             Known by its triangles, whatever its shape and pose.
         kept : (N,) int, optional
-            The vertices of the embedded people that a template with fewer triangles kept,
+            The vertices of the synthetic people that a template with fewer triangles kept,
             `info["people_vertices"]` of their model.
 
         Raises

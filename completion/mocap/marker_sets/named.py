@@ -17,7 +17,7 @@ if TYPE_CHECKING:
     from .layout import MarkerLayout
 
 FOLDER = Path(__file__).parent / "layouts"
-EMBEDDED = "embedded people"
+SYNTHETIC = "synthetic people"
 OWN = ('write a file {"markersets": [{"distance_from_skin": 0.0095, "indices": {LABEL: VERTEX, ...}}]} '
        "and load it with MarkerLayout.load (--layout FILE)")
 
@@ -56,7 +56,7 @@ def named_layout(name: str, template: Mesh, kept: np.ndarray | None = None) -> M
             return MarkerLayout.load(path)
     if kept is not None and len(kept) == len(template.vertices):
         for path, body in bodies:
-            if body["name"] == EMBEDDED:
+            if body["name"] == SYNTHETIC:
                 return _on_kept(MarkerLayout.load(path), template, np.asarray(kept))
     known = ", ".join(f"{body['name']} ({body['vertices']} vertices)" for _, body in bodies)
     raise ValueError(f"template: expected a body on which '{name}' is known: {known}; got another triangulation with "
@@ -64,7 +64,7 @@ def named_layout(name: str, template: Mesh, kept: np.ndarray | None = None) -> M
 
 
 def _on_kept(layout: MarkerLayout, template: Mesh, kept: np.ndarray) -> MarkerLayout:
-    """The layout of the embedded people on a template that kept only some of their vertices."""
+    """The layout of the synthetic people on a template that kept only some of their vertices."""
     from scanprep.synthetic.topology import load
 
     from .layout import MarkerLayout

@@ -114,14 +114,14 @@ def register_layout(layout: MarkerLayout, source: Mesh, target: Mesh, landmarks:
         L = len(layout.labels)
         return CarriedLayout(layout, np.zeros(L), np.ones(L), 0.0, np.nan, 0.0, target)
     fit = _registered(source, target, landmarks, config, progress or (lambda done, total: None))
-    if fit.missed > LOST:
-        raise ValueError(f"target: the source could not be brought onto it, {fit.missed:.0%} of it stays uncovered; "
+    if fit.uncovered > LOST:
+        raise ValueError(f"target: the source could not be brought onto it, {fit.uncovered:.0%} of it stays uncovered; "
                          "give landmarks, three at least, spread over the body")
     found = Surface(target).closest(skin_points(layout, fit.mesh))
     carried = MarkerLayout(layout.labels, target.faces[found.faces], layout.distances, _on_triangle(found.bary),
                            layout.aliases, layout.loose)
     return CarriedLayout(carried, found.distances, fit.confidence[most_used(layout)], fit.rms, fit.landmark_rms,
-                         fit.missed, fit.mesh)
+                         fit.uncovered, fit.mesh)
 
 
 def _registered(source: Mesh, target: Mesh, landmarks: Landmarks | None, config: CarryConfig,
@@ -131,9 +131,9 @@ def _registered(source: Mesh, target: Mesh, landmarks: Landmarks | None, config:
         return register(source, target, landmarks, config.register, tell)
     alike = register(source, target, None, config.register, tell,
                      find_correspondences(source, target, config=config.correspond))
-    if alike.missed <= DOUBTFUL:
+    if alike.uncovered <= DOUBTFUL:
         return alike
-    return min(alike, register(source, target, None, config.register, tell), key=lambda fit: fit.missed)
+    return min(alike, register(source, target, None, config.register, tell), key=lambda fit: fit.uncovered)
 
 
 def _on_triangle(bary: np.ndarray) -> np.ndarray:

@@ -6,6 +6,8 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.ndimage import label, uniform_filter1d
 
+from scanprep.geometry.farthest_points import farthest_points
+
 from .marked_body import MarkedBody, System, point_system
 from .marker_points import PartShapes
 
@@ -143,9 +145,4 @@ def _soles(rest: np.ndarray, height: np.ndarray) -> np.ndarray:
     near = np.flatnonzero((height < TOUCH).mean(axis=0) > 0.05)
     if not len(near):
         near = np.array([int(height.min(axis=0).argmin())])
-    chosen = [int(near[height[:, near].mean(axis=0).argmin()])]
-    apart = np.linalg.norm(rest[near] - rest[chosen[0]], axis=1)
-    while len(chosen) < min(SOLES, len(near)):
-        chosen.append(int(near[apart.argmax()]))
-        apart = np.minimum(apart, np.linalg.norm(rest[near] - rest[chosen[-1]], axis=1))
-    return np.array(chosen)
+    return near[farthest_points(rest[near], SOLES, height[:, near].mean(axis=0).argmin())]

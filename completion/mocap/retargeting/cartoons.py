@@ -1,7 +1,7 @@
 """Cartoon figures with their landmarks: characters for those who have none at hand.
 
 z is up, a figure faces -y, stands on z = 0, has the left side at +x and its arms 36 degrees away from the body, as the
-embedded people at rest.
+synthetic people at rest.
 """
 from __future__ import annotations
 
@@ -72,9 +72,9 @@ class Cartoon:
     mesh : Mesh
         Closed, with triangles of its own.
     landmarks : {name: (3,) float, metres}
-        On its skin, named as those of the embedded people.
+        On its skin, named as those of the synthetic people.
     joints : {name: (3,) float, metres}
-        Where it bends, named as the parts of the embedded people that turn there.
+        Where it bends, named as the parts of the synthetic people that turn there.
     """
 
     mesh: Mesh
