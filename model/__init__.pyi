@@ -1,4 +1,5 @@
 # The public names; loaded when they are first used, so that the command line answers at once.
+from .blend_weights import skin_weights as skin_weights
 from .body import BodyModel as BodyModel
 from .coregistration.config import CoregistrationConfig as CoregistrationConfig
 from .coregistration.rounds import Coregistration as Coregistration
@@ -17,7 +18,6 @@ from .export.glb import write_skinned_glb as write_skinned_glb
 from .export.npz import write_body_npz as write_body_npz
 from .export.rig import Rig as Rig
 from .export.rig import make_rig as make_rig
-from .export.rig import skin_weights as skin_weights
 from .files import load_model as load_model
 from .fitting import FitConfig as FitConfig
 from .fitting import PoseFit as PoseFit

@@ -13,9 +13,9 @@ from scanprep.meaning import HAND, extent, size, unit_problem
 from scanprep.skeleton.tree import Skeleton
 from scanprep.threads import one_thread
 
+from ..blend_weights import face_weights
 from ..blending import BlendedTemplate, rigid_weights
 from ..body import BodyModel
-from ..borders import face_weights
 from ..digests import body_digest, body_digests, digest
 from ..features import twists
 from ..gradients import GradientSystem, shape_gradients

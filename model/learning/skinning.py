@@ -12,6 +12,7 @@ from scanprep.ranges import Count, Positive, Settings
 from scanprep.skeleton.tree import Skeleton
 from scanprep.threads import one_thread
 
+from ..blend_weights import diffused, diffused_weights, fit_weights, strongest
 from ..digests import body_digest, digest
 from ..features import LinearLift, PoseFeatures, part_features
 from ..fitting import FitConfig, PoseFitter, ShapeFitter
@@ -20,7 +21,6 @@ from ..shape_space import learn_shape_space
 from ..skinning import SkinningModel, unblended
 from .pose import fit_poses
 from .scape import checked_training, pose_examples, pose_prior
-from .skin_weights import diffused, diffused_weights, fit_weights, kept_weights
 from .work import Progress, Work, timed
 
 RIDGES = (1e-4, 1e-3, 3e-3, 0.01, 0.03, 0.1, 0.3)      # penalties; the one that predicts left-out poses best is taken
@@ -101,7 +101,7 @@ def _start(template: Mesh, skeleton: Skeleton, config: SkinConfig) -> SkinningMo
     """The template itself, with weights that pass smoothly from part to part, and no correctives."""
     J, N = len(skeleton.parents), len(template.vertices)
     constants = PoseFeatures(skeleton, LinearLift(), np.arange(J), np.zeros((J, 3, J)))
-    weights = kept_weights(diffused_weights(template, skeleton, config.width), config.parts)
+    weights = strongest(diffused_weights(template, skeleton, config.width), config.parts, 1e-3)
     return SkinningModel(template, skeleton, template.vertices, weights, constants, np.zeros((0, N, 3), np.float32),
                          template.vertices, np.zeros((0, N, 3), np.float32), np.zeros(0), 0.0,
                          np.zeros((J, 3)), np.zeros((3 * J, 3 * J)))
@@ -147,7 +147,7 @@ def _with_weights(model: SkinningModel, poses: np.ndarray, bodies: np.ndarray, a
     """The model with weights fitted to the bodies at their poses."""
     carried = [_carried(model, p, y) for p, y in zip(poses, bodies, strict=True)]
     weights = fit_weights(carried, bodies, model.template, model.weights, allowed)
-    return replace(model, weights=kept_weights(weights, config.parts))
+    return replace(model, weights=strongest(weights, config.parts, 1e-3))
 
 
 def _with_joints(model: SkinningModel, poses: np.ndarray, bodies: np.ndarray) -> SkinningModel:
