@@ -11,6 +11,7 @@ Pictures and animated GLB are written beside the figures.
 from __future__ import annotations
 
 import argparse
+import sys
 import time
 from pathlib import Path
 
@@ -19,9 +20,9 @@ from protocols import load_real, machine, write_report
 
 from completion.mocap.files.markers import MarkerSequence, read_markers
 from completion.mocap.marker_sets.layout import MarkerLayout
+from completion.mocap.marker_sets.named import named_layout
 from completion.mocap.mosh.mosh import mosh
 from completion.mocap.results import SoftTissue
-from completion.mocap.retargeting.cartoons import CARTOONS, Cartoon, cartoon
 from completion.mocap.retargeting.creases import Creases, at_rest
 from completion.mocap.retargeting.pictures import picture_transfer, write_character
 from completion.mocap.retargeting.soft_tissue import deformation, moving_character, retarget_soft_tissue
@@ -32,6 +33,9 @@ from scanprep.geometry.mesh import Mesh
 from scanprep.pictures.shading import save_png
 from scanprep.synthetic.data_set import SUBJECT
 from scanprep.synthetic.people import Person, walk
+
+sys.path.append(str(Path(__file__).parents[1]))
+from cartoons import CARTOONS, Cartoon, cartoon
 
 MM = 1000.0
 OF_SCAPE = {                         # names of the landmarks of the SCAPE template
@@ -79,11 +83,11 @@ def joints_off(model: BodyModel, figure: Cartoon, found: Character) -> list[floa
 def walking_man(model: BodyModel, frames: int, rate: float) -> tuple[MarkerSequence, MarkerLayout]:
     """Markers of a synthetic man who walks, and their layout on the model's template."""
     person = Person(SUBJECT)
-    layout = MarkerLayout.named("cmu41", person.mesh)
+    layout = named_layout("cmu41", person.mesh)
     poses, trans = walk(frames, rate)
     bodies = [person.mesh.with_vertices(person.posed(p, t)) for p, t in zip(poses, trans, strict=True)]
     markers = MarkerSequence(np.stack([layout.place(body) for body in bodies]), layout.labels, rate)
-    return markers, MarkerLayout.named("cmu41", model.template, np.array(model.info["people_vertices"]))
+    return markers, named_layout("cmu41", model.template, np.array(model.info["people_vertices"]))
 
 
 def measure(model: BodyModel, found: Character, soft: SoftTissue, factor: float, frames: np.ndarray) -> dict:
@@ -123,7 +127,7 @@ def main() -> None:
     args.output.mkdir(parents=True, exist_ok=True)
     model = load_model(args.model) if args.model else synthetic_model()
     markers, layout = walking_man(model, 120, 60.0) if args.c3d is None else \
-        (read_markers(args.c3d), MarkerLayout.named("cmu41", model.template))
+        (read_markers(args.c3d), named_layout("cmu41", model.template))
     soft = mosh(model, markers, layout).soft_tissue[0]
     frames = np.unique(np.linspace(0, len(soft.motion.poses) - 1, args.frames).round().astype(int))
     rows = []

@@ -16,7 +16,7 @@ from scanprep.console import Outcome, bar, say
 from scanprep.ranges import Count
 
 from ...cli import ModelOrNone, read_model
-from ..animate.work import choose_layout
+from ..marker_sets.named import choose_layout
 from ..settings import MoshConfig
 from .folder import keep_table, mosh_people, summary
 from .recordings import Actor, By, Grouping, find_actors
