@@ -15,8 +15,7 @@ from .colors import decode
 from .sheets import png_bytes
 
 # Turns that bring each axis to +y, the upward axis of glTF: quaternions x, y, z, w.
-_HALF = 0.5 ** 0.5
-UPRIGHT = {0: [0.0, 0.0, _HALF, _HALF], 1: [0.0, 0.0, 0.0, 1.0], 2: [-_HALF, 0.0, 0.0, _HALF]}
+UPRIGHT = {0: [0.0, 0.0, 0.5**0.5, 0.5**0.5], 1: [0.0, 0.0, 0.0, 1.0], 2: [-(0.5**0.5), 0.0, 0.0, 0.5**0.5]}
 VERTICES, _INDICES = 34962, 34963                                  # what a graphics card will use the numbers for
 _COMPONENTS = {"<f4": 5126, "<u4": 5125, "<u2": 5123, "|u1": 5121}
 

@@ -17,8 +17,6 @@ from .sides import mirror_pairs, reductions
 
 WEAK_CONTACT = 0.2               # of the longer borders of both parts: thighs that touch are not linked
 LOOP_SEPARATION = 1.5            # times the separation of parts: on a loop, closer ones are merged
-LEAST_PULL = 1e-4                # squared radians: rotations below 0.01 say nothing about where a joint is
-PRIOR_WIDTH = 0.6                # of the border's radius: how far from its centroid a joint is expected
 
 
 def border_lengths(search: PartSearch, label: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -251,10 +249,11 @@ def _meeting_point(dR: np.ndarray, gap: np.ndarray, radius: float) -> np.ndarray
     """
     A = np.einsum("mki,mkj->ij", dR, dR) / len(dR)
     b = np.einsum("mki,mk->i", dR, gap) / len(dR)
-    pull = LEAST_PULL
+    pull = least = 1e-4                          # squared radians: rotations below 0.01 say nothing about a joint
+    expected = 0.6 * radius                      # from the border's centroid
     for _ in range(2):
         c = -np.linalg.solve(A + pull * np.eye(3), b)
-        pull = max(LEAST_PULL, float(((dR @ c + gap)**2).sum(axis=1).mean()) / (PRIOR_WIDTH * radius)**2)
+        pull = max(least, float(((dR @ c + gap)**2).sum(axis=1).mean()) / expected**2)
     return c
 
 

@@ -15,7 +15,6 @@ from .people import NAMED_POSES, BodyShape, Person, mirrored_pose, named_pose, r
 from .scanner import RangeView, Scan, ScannerConfig, scan
 
 VERSION = 1
-TRUTH, VIEWS = "truth", "views"
 
 
 @dataclass(frozen=True, eq=False)
@@ -88,9 +87,9 @@ def write_scan(folder: str | Path, name: str, scanned: Scan, truth: GroundTruth 
 
     folder = Path(folder)
     if truth is not None:
-        truth.save(folder / TRUTH / f"{name}.npz")
+        truth.save(folder / "truth" / f"{name}.npz")
     if views:
-        _write_views(folder / VIEWS / f"{name}.npz", scanned)
+        _write_views(folder / "views" / f"{name}.npz", scanned)
     if landmarks is not None:
         storage.write_json(folder / f"{name}.landmarks.json",
                            {key: np.round(point, 6).tolist() for key, point in landmarks.items()})
@@ -145,11 +144,11 @@ class SyntheticScan:
 
     @property
     def views(self) -> Path:
-        return self.folder / VIEWS / f"{self.name}.npz"
+        return self.folder / "views" / f"{self.name}.npz"
 
     @property
     def truth(self) -> Path:
-        return self.folder / TRUTH / f"{self.name}.npz"
+        return self.folder / "truth" / f"{self.name}.npz"
 
 
 SUBJECT = BodyShape(sex=1.0, stature=1.78, weight=-0.3, muscle=0.9, shoulder_width=0.4)
