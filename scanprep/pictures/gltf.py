@@ -29,7 +29,11 @@ class Glb:
         self._accessors: list[dict[str, Any]] = []
 
     def add(self, array: np.ndarray, kind: str, target: int | None, bounds: bool = False) -> int:
-        """An accessor of float32 numbers; its index."""
+        """An accessor of float32 numbers, one of `kind` a row (a MAT4 column after column); its index.
+
+        `target` is `VERTICES` for what vertices have; `bounds` says the least and the greatest row, which glTF wants
+        of positions and times.
+        """
         values = np.ascontiguousarray(array, dtype="<f4")
         extra: dict[str, Any] = {}
         if bounds:
@@ -91,10 +95,10 @@ def skin_material(color: Sequence[float] = (0.60, 0.57, 0.53)) -> dict[str, Any]
 
 def write_animated_glb(path: str | Path, faces: np.ndarray, frames: np.ndarray, rate: float,
                        colors: np.ndarray | None = None, up: int = 2, keys: int = 60) -> None:
-    """Write a moving mesh that any glTF 2.0 viewer plays.
+    """Write a moving mesh, frames (T, N, 3) at `rate` a second, that any glTF 2.0 viewer plays.
 
-    Every key frame is a morph target with its own normals; the animation blends from one to the next. Nothing
-    but the core of glTF is used.
+    Every key frame is a morph target with its own normals; the animation blends from one to the next. Nothing but the
+    core of glTF is used. Of a longer motion `keys` evenly spaced frames are kept; the axis `up` points up.
     """
     data = animated_glb(faces, frames, rate, colors, up, keys)
     with writing(path) as beside:

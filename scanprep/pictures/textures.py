@@ -103,7 +103,7 @@ def _picture(material: Any) -> np.ndarray | None:
 
 
 def bake(body: Mesh, look: Look, unseen: np.ndarray, size: int | None = None) -> Texture:
-    """A texture of a body: what `look` says of each of its pixels, elsewhere the colours of its vertices."""
+    """A texture of a body: what `look` says of its pixels, where its weight is zero `unseen` (N, 3) of the vertices."""
     size = size or SIZE
     kept, faces, uv = unwrap(body)
     flat = Mesh(np.column_stack([uv, np.zeros(len(uv))]), faces)
@@ -124,7 +124,7 @@ def bake(body: Mesh, look: Look, unseen: np.ndarray, size: int | None = None) ->
 
 
 def unwrap(mesh: Mesh) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """A mesh cut into flat charts."""
+    """A mesh in flat charts: the old vertex of each new one (n,), the triangles in the old order, uv (n, 2)."""
     try:
         import xatlas
     except ModuleNotFoundError:

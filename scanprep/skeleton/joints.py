@@ -22,11 +22,10 @@ LOOP_SEPARATION = 1.5            # times the separation of parts: on a loop, clo
 def border_lengths(search: PartSearch, label: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Pairs of parts that touch (n, 2) and the length of their common border (n,), metres."""
     s = search.surface
-    pairs = search.contacts(label)
     both = np.sort(label[s.pairs], axis=1)
-    number = {(int(a), int(b)): i for i, (a, b) in enumerate(pairs)}
-    of_pair = np.array([number.get((int(a), int(b)), len(pairs)) for a, b in both], dtype=np.int64)
-    return pairs, np.bincount(of_pair, s.pair_lengths, len(pairs) + 1)[:len(pairs)]
+    differ = both[:, 0] != both[:, 1]
+    pairs, number = np.unique(both[differ], axis=0, return_inverse=True)
+    return pairs, np.bincount(number.ravel(), s.pair_lengths[differ], len(pairs))
 
 
 def linked(links: np.ndarray, count: int) -> bool:

@@ -66,7 +66,10 @@ def stand(person: Person, pose: np.ndarray) -> GroundTruth:
 
 def click_landmarks(truth: GroundTruth, rng: np.random.Generator, error: float = 0.003,
                     seen: np.ndarray | None = None, reach: float = 0.012) -> dict[str, np.ndarray]:
-    """Landmarks as a person would click them on the scan."""
+    """Landmarks as a person would click them on the scan, each coordinate off by `error`, metres.
+
+    Those without a point of the scan, `seen` (n, 3), within `reach` are left out.
+    """
     names = landmark_vertices()
     true = {name: truth.vertices[v] for name, v in names.items()}
     noise = {name: error * rng.normal(size=3) for name in names}

@@ -35,7 +35,12 @@ def _towards(axis: np.ndarray, direction: np.ndarray, twist: float) -> np.ndarra
 def arm(direction: tuple[float, float, float], elbow: float = 0, twist: float = 0, turn: float = 0,
         wrist: float = 0,
         side: int = 1) -> np.ndarray:
-    """Rotation vectors (3, 3) of upper arm, forearm and hand."""
+    """Rotation vectors (3, 3) of upper arm, forearm and hand, left (side 1) or right (-1).
+
+    `direction` (outwards, frontwards, upwards) is where the upper arm points, seen from the chest. Degrees: flexion
+    of the elbow beyond rest; twist of the upper arm, positive inwards; pronation of the hand (`turn`); flexion of the
+    wrist towards the palm.
+    """
     a = average()
     out, front, up = direction
     upper, fore = a.upper_arm_frame, a.forearm_frame
@@ -49,7 +54,11 @@ def arm(direction: tuple[float, float, float], elbow: float = 0, twist: float = 
 
 def leg(direction: tuple[float, float, float], knee: float = 0, twist: float = 0, foot: float = 0, side: int = 1
         ) -> np.ndarray:
-    """Rotation vectors (3, 3) of thigh, shin and foot."""
+    """Rotation vectors (3, 3) of thigh, shin and foot, left (side 1) or right (-1).
+
+    `direction` as for `arm`, seen from the pelvis. Degrees: flexion of the knee; twist of the thigh, positive
+    outwards; raising of the toes.
+    """
     a = average()
     out, front, up = direction
     axis = a.leg_frame[2]
@@ -97,7 +106,10 @@ def named_pose(name: str) -> np.ndarray:
 
 
 def random_pose(rng: np.random.Generator, spread: float = 1.0) -> np.ndarray:
-    """A plausible pose (16, 3): arms, legs, back and neck each drawn from the named poses, loosened."""
+    """A plausible pose (16, 3): arms, legs, back and neck each drawn from the named poses, loosened.
+
+    `spread` 0 gives rest, 1 poses as varied as the named ones.
+    """
     limbs = [4, 5, 6], [7, 8, 9], [0, 10, 11, 12, 13, 14, 15], [1, 2], [3]
     looseness = np.radians(np.array([4, 4, 4, 7, 8, 6, 9, 8, 6, 9, 4, 4, 5, 4, 4, 5.0]))
     pose = np.zeros((16, 3))
@@ -118,7 +130,10 @@ def mirrored_pose(pose: np.ndarray) -> np.ndarray:
 
 
 def walk(frames: int, rate: float = 60.0, speed: float = 1.0) -> tuple[np.ndarray, np.ndarray]:
-    """A walk straight ahead."""
+    """A walk straight ahead: poses (frames, 16, 3), radians, places (frames, 3) of the root against rest, metres.
+
+    The lower foot stays on the floor; at speed 1 a gait cycle takes 1.1 seconds.
+    """
     t = np.arange(frames) / rate * speed / 1.1
     poses = np.stack([_stride(phase) for phase in t % 1.0])
     fine = 120
