@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from scanprep.geometry import storage
-from scanprep.geometry.formats.common import FARTHEST
+from scanprep.geometry.format_common import FARTHEST
 
 from .c3d import read_c3d, write_c3d
 from .common import MARKER_UNITS, MarkerFileError, RawMarkers
@@ -159,13 +159,7 @@ def read_markers(path: str | Path, unit: str | None = None, subject: str | None 
 
 
 def marker_subjects(path: str | Path) -> tuple[str, ...]:
-    """Whose markers are in a file: what stands before the colon of its labels; none where there is no colon.
-
-    Raises
-    ------
-    MarkerFileError
-        As `read_markers`.
-    """
+    """Whose markers are in a file: what stands before the colon of its labels; none where there is no colon."""
     split = (label.rpartition(":") for label in _read_raw(Path(path)).labels)
     return tuple(dict.fromkeys(who for who, colon, _ in split if colon))
 
