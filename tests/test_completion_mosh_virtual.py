@@ -5,8 +5,7 @@ import numpy as np
 import pytest
 
 from completion.mocap.artefacts.virtual import fault_table, write_virtual
-from completion.mocap.files.c3d import _Numbers, point_table
-from completion.mocap.files.c3d_points import replace_points
+from completion.mocap.files.c3d import _Numbers, point_table, replace_points
 from completion.mocap.files.markers import MarkerFileError, MarkerSequence, read_markers
 from completion.mocap.results import BadSpan, Exchange, MarkerFaults
 

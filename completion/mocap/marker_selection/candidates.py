@@ -19,7 +19,6 @@ if TYPE_CHECKING:
     from model.body import BodyModel
 
 RAYS = 48                            # directions that are tried from every place
-CONE = 0.5                           # cosine of the directions inwards along which thickness is measured
 
 
 def candidate_layout(body: BodyModel | Mesh, base: MarkerLayout, count: int = 114,
@@ -185,7 +184,7 @@ def _openness(body: Mesh, reach: float) -> np.ndarray:
 def _thickness(body: Mesh, reach: float) -> np.ndarray:
     """(N,) how far the skin on the other side is, metres: the median of directions inwards, at most `reach`."""
     k = np.arange(RAYS // 3)
-    z = 1 - (1 - CONE) * (k + 0.5) / len(k)
+    z = 1 - (1 - 0.5) * (k + 0.5) / len(k)  # cosine of the directions inwards along which thickness is measured
     origins, directions = _fans(body, z)
     inward = np.repeat(body.vertex_normals, len(k), axis=0)
     hit = Rays(body).cast(origins - 1e-4 * reach * inward, -directions, reach)[1]

@@ -27,8 +27,6 @@ from .design import MarkerDesign, design_markers
 from .fits import DesignConfig
 from .linear import check_bodies, example_poses, in_poses
 
-USUAL = "vicon47"                    # around which candidates are made where none are named
-
 
 def design(bodies: Path, output: Output, model: ModelOrNone = None, candidates: str | None = None,
            keep: str | None = None, poses: int = 0, unit: Unit | None = None,
@@ -80,7 +78,8 @@ def design(bodies: Path, output: Output, model: ModelOrNone = None, candidates: 
 def _candidates(model: BodyModel, given: str | None, kept: MarkerLayout | None) -> MarkerLayout:
     """The candidates, those that are kept among them."""
     if given is None:
-        return candidate_layout(model, choose_layout(model, USUAL, ())[0] if kept is None else kept)
+        # around which candidates are made where none are named
+        return candidate_layout(model, choose_layout(model, "vicon47", ())[0] if kept is None else kept)
     among = choose_layout(model, given, ())[0]
     if kept is None or set(kept.labels) <= set(among.labels):
         return among

@@ -23,8 +23,6 @@ __all__ = ["AnimateConfig", "animate", "follow_poses"]
 
 Progress = Callable[[int, int], None]
 KEY_INTERVAL = 0.1                   # seconds between the frames that are solved one after the other
-KEY_STEPS = 8                        # most steps for each of these
-GROUND_ROUNDS = 2                    # over the whole sequence, the feet held
 STILL = 0.005                        # metres that the last round moves any marker of a frame that has settled
 
 
@@ -113,7 +111,7 @@ def follow_whole(body: MarkedBody, targets: np.ndarray, rate: float, config: Ani
     seen = ~np.isnan(targets[..., 0])
     inside = seen_span(targets)
     free = max(config.smoothing, 1)
-    rounds = free + GROUND_ROUNDS * (config.ground and T > 2)
+    rounds = free + 2 * (config.ground and T > 2)                       # the last ones with the feet held
     for i in range(rounds):
         if i == free:
             feet = FootContact(body, x, rate, None if config.floor is None else Floor.given(config.floor))
@@ -132,7 +130,7 @@ def between_keys(body: MarkedBody, targets: np.ndarray, rate: float, config: Ani
     """Unknowns (T, P) on the way from one key frame to the next, which are followed one after the other."""
     T, every = len(targets), max(1, round(KEY_INTERVAL * rate))
     frames = np.unique(np.r_[0, np.arange(_first_frame(targets) % every, T, every), T - 1])
-    keys, _, _ = follow_frames(body, targets, frames, rate / every, config, lambda done, total: None, KEY_STEPS)
+    keys, _, _ = follow_frames(body, targets, frames, rate / every, config, lambda done, total: None, steps=8)
     if len(frames) == 1:
         return keys
     i = np.clip(np.searchsorted(frames, np.arange(T), side="right") - 1, 0, max(0, len(frames) - 2))

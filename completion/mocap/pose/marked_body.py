@@ -28,7 +28,6 @@ from ..marker_sets.layout import MarkerLayout
 System = tuple[np.ndarray, np.ndarray, np.ndarray]                      # energy, half its gradient, Gauss-Newton matrix
 BATCH = 64                           # frames whose parts are held at once
 SAMPLES = 120                        # poses from which the turning of the normals is learned
-RIDGE = 1e-2                         # that holds a normal to its part where the poses say little
 
 
 class MarkedBody:
@@ -238,7 +237,8 @@ def marker_shapes(subject: Subject, vertex_ids: np.ndarray, weights: np.ndarray,
         known = raised[:, joints].reshape(len(poses), -1)
         wanted, middle = local[:, p, i], known.mean(axis=0)
         A = known - middle
-        slope = np.linalg.solve(A.T @ A + RIDGE * len(poses) * np.eye(A.shape[1]), A.T @ (wanted - wanted.mean(axis=0)))
+        # the ridge holds a normal to its part where the poses say little
+        slope = np.linalg.solve(A.T @ A + 1e-2 * len(poses) * np.eye(A.shape[1]), A.T @ (wanted - wanted.mean(axis=0)))
         offsets[i] = distances[i] * (wanted.mean(axis=0) - middle @ slope)
         bends.append(dict(zip(joints, distances[i] * slope.reshape(len(joints), shapes.lift.width, 3), strict=True)))
     shapes.lift_off(part, offsets, bends)

@@ -8,7 +8,6 @@ import numpy as np
 
 from scanprep.ranges import FLAG, Positive, Settings, Share, Signed
 
-CENTIMETRE = 0.01                    # metres
 RATE = 120.0                         # frames per second for which the weight of the velocity is meant
 
 
@@ -77,13 +76,13 @@ class FollowConfig(Settings):
 
 
 def animate_config(config: FollowConfig) -> AnimateConfig:
-    """The settings of `animate` for weights of the terms: each is the inverse of a squared deviation.
+    """The settings of `animate` for weights of the terms: each is the inverse of a squared deviation, in centimetres.
 
     That of the velocity's change from frame to frame is meant for 120 frames per second; at another rate the
     acceleration that it allows is the same.
 
     [MoSh] Eq. 17, Eq. 21, Eq. 22
     """
-    return AnimateConfig(marker_sd=CENTIMETRE / np.sqrt(config.data), prior_weight=config.pose,
+    return AnimateConfig(marker_sd=0.01 / np.sqrt(config.data), prior_weight=config.pose,
                          angle_acceleration=RATE**2 / np.sqrt(config.velocity), outlier=config.outlier,
                          prior_shrinkage=config.prior_shrinkage)
