@@ -63,8 +63,8 @@ from .skeleton.edit import (
     split_part as split_part,
 )
 from .skeleton.find import SkeletonConfig as SkeletonConfig
+from .skeleton.find import SkeletonSearch as SkeletonSearch
 from .skeleton.find import find_skeleton as find_skeleton
+from .skeleton.find import search_skeleton as search_skeleton
 from .skeleton.names import name_parts as name_parts
-from .skeleton.search import SkeletonSearch as SkeletonSearch
-from .skeleton.search import search_skeleton as search_skeleton
 from .skeleton.tree import Skeleton as Skeleton

@@ -33,7 +33,7 @@ from scanprep.console import Metric
 from scanprep.correspondence.correspondences import Correspondences, correspondences_problem
 from scanprep.geometry.files import PointCloud, write_points
 from scanprep.registration.nonrigid import Registration, registration_problem
-from scanprep.skeleton.search import skeleton_problem
+from scanprep.skeleton.find import skeleton_problem
 
 MARKS = {"head": 10, "tail": 380, "left": 100, "right": 200, "middle": 250}
 LABELS = tuple(f"M{i}" for i in range(30))

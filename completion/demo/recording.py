@@ -16,7 +16,7 @@ from scanprep.synthetic.scanner import ScannerConfig
 
 from ..mocap.files.markers import MarkerSequence, write_markers
 from ..mocap.marker_sets.layout import DISTANCE, MarkerLayout
-from .settings import DemoConfig
+from .settings import MARKER_NOISE, DemoConfig
 
 
 @dataclass(frozen=True)
@@ -40,7 +40,7 @@ def record_walk(folder: Path, bodies: np.ndarray, rest: GroundTruth, template: M
     for i, body in enumerate(bodies):
         out.append(body[places] + DISTANCE * Mesh(body, rest.faces).vertex_normals[places])
         tell(i + 1, len(bodies))
-    positions = np.stack(out) + rng.normal(0, config.marker_noise, (len(bodies), len(labels), 3))
+    positions = np.stack(out) + rng.normal(0, MARKER_NOISE, (len(bodies), len(labels), 3))
     positions[rng.random(positions.shape[:2]) < 0.03] = np.nan
     # as on a real subject: the layout is read off the scan at rest, on which the markers can be seen
     _, vertices = cKDTree(template.vertices).query(rest.vertices[places])

@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 
 from scanprep.geometry.mesh import Mesh
+from scanprep.pictures.camera import look_around, upright
 from scanprep.pictures.page import Page
 from scanprep.pictures.shading import Solid, color_bar, heat, render, side_by_side
-from scanprep.pictures.views import look_around, upright
 
 from ..body import BodyModel
 from ..report import picture_components

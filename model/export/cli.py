@@ -11,7 +11,7 @@ from scanprep.cli import Output, Unit
 from scanprep.console import Metric, Outcome, bar
 from scanprep.geometry.files import write_mesh
 from scanprep.geometry.storage import StorageError, load_arrays, numbers, taking_apart, text
-from scanprep.pictures.views import upright
+from scanprep.pictures.camera import upright
 from scanprep.ranges import BETAS, Beta
 
 from ..body import BodyModel

@@ -13,7 +13,8 @@ from scanprep.batch.workspace import Task, Workspace
 from scanprep.cli import MM, Output, ScanArg, Unit
 from scanprep.console import Metric, Outcome, bar, failures_of, problem_of
 from scanprep.geometry.files import read_mesh, write_mesh
-from scanprep.pictures.animation import write_animated_glb, write_gif
+from scanprep.pictures.gltf import write_animated_glb
+from scanprep.pictures.sheets import write_gif
 from scanprep.pipeline.scans import SCAN_ENDINGS
 from scanprep.ranges import Positive
 

@@ -10,7 +10,7 @@ import numpy as np
 from model.export.bvh import write_bvh
 from model.linear import PointOperator, Subject
 from scanprep.geometry.storage import writing
-from scanprep.pictures.views import upright
+from scanprep.pictures.camera import upright
 
 from ...motion import Motion, spread_frames
 
@@ -76,7 +76,7 @@ def write_glb(path: Path, motion: Motion, subject: Subject, keys: int, vertices:
 
     `vertices` (n, N, 3), metres, are of the key frames, where the body changes; else it is the subject's.
     """
-    from scanprep.pictures.animation import write_animated_glb
+    from scanprep.pictures.gltf import write_animated_glb
 
     chosen, mesh = spread_frames(len(motion.poses), keys), subject.template
     rate = motion.rate * max(len(chosen) - 1, 1) / max(len(motion.poses) - 1, 1)

@@ -9,11 +9,10 @@ import numpy as np
 from model.body import BodyModel
 from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.surface import Rays
-from scanprep.pictures.camera import Camera
+from scanprep.pictures.camera import Camera, look_around
 from scanprep.pictures.page import Page
 from scanprep.pictures.shading import Dots, Solid, render, side_by_side
 from scanprep.pictures.sheets import font
-from scanprep.pictures.views import look_around
 from scanprep.skeleton.tree import Skeleton
 
 from .layout import MarkerLayout

@@ -13,8 +13,8 @@ from model.body import BodyModel
 from model.learning.sex_plane import SexGuess
 from scanprep.batch.room import Room
 from scanprep.console import Metric, Outcome, write_report
+from scanprep.pictures.camera import upright
 from scanprep.pictures.sheets import save_png
-from scanprep.pictures.views import upright
 
 from ...motion import spread_frames
 from ...motion_pictures import picture_bodies
