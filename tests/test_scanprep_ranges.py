@@ -15,7 +15,8 @@ import completion
 import model
 import scanprep
 from completion.__main__ import COMMANDS
-from completion.mocap.settings import MoshConfig, PersonConfig
+from completion.mocap.mosh.mosh import MoshConfig
+from completion.mocap.subject.person import PersonConfig
 from scanprep import config_files, console
 from scanprep.console import Metric, Outcome
 from scanprep.ranges import LARGE, OutOfRange, Range, Settings, ranges

@@ -13,36 +13,22 @@ from scanprep.cli import MM
 from scanprep.console import Metric
 from scanprep.geometry import storage
 from scanprep.pictures.page import Page
-from scanprep.ranges import Count, Settings
 
 from ...cli import rows
 from ...motion import Motion, spread_frames
 from ...motion_pictures import moving_picture, picture_bodies, picture_frames
 from ..files.markers import MarkerSequence, read_markers
-from ..files.motion_files import write_glb, write_motion
+from ..files.motion_files import KEYS, write_glb, write_motion
 from ..marker_sets.named import choose_layout
 from ..pose.follow import AnimateConfig, animate
 from ..pose.robust import motion_problem
 from ..retargeting.retarget import morphed_vertices, retarget
-from ..subject.marker_shape import MarkerShapeConfig, subject_from_markers
+from ..subject.person import PersonConfig, find_person
 from .report import motion_page
 
 BetasTo = dict[float, np.ndarray] | np.ndarray      # keys over seconds, or betas at the end
 ENDINGS = (".c3d", ".trc", ".csv")
 MEAN_ERROR = "distance of markers, mean"
-
-
-@dataclass(frozen=True)
-class GlbConfig(Settings):
-    """Settings of animated GLB files.
-
-    Attributes
-    ----------
-    keys : int
-        Largest number of key frames.
-    """
-
-    keys: Count = 120
 
 
 @dataclass(frozen=True, eq=False)
@@ -58,8 +44,7 @@ class Work:
     unit: str | None                     # as `read_markers` takes it, and whose markers
     who: str | None
     animate: AnimateConfig
-    shape: MarkerShapeConfig
-    glb: GlbConfig
+    person: PersonConfig
 
     def __call__(self, path: Path, room: Room) -> list[Metric]:
         """Follow the markers of a file; the figures."""
@@ -76,8 +61,8 @@ def animate_file(work: Work, path: Path, room: Room) -> list[Metric]:
     metrics = [Metric("model", work.name), Metric("layout", name)]
     body, found = work.subject, None
     if body is None:
-        found = room.step("subject", (work.model, sequence, layout, work.shape),
-                          lambda: subject_from_markers(work.model, sequence, layout, work.shape, room.tell))
+        found = room.step("subject", (work.model, sequence, layout, work.person),
+                          lambda: find_person(work.model, sequence, layout, work.person, room.tell))
         body, layout = work.model.subject(found.betas), found.layout
         metrics.append(Metric("subject", f"{len(found.betas)} betas from {len(found.frames)} frames"))
     # a person found from a model: what it was found from tells as much as its body, and sooner
@@ -86,12 +71,13 @@ def animate_file(work: Work, path: Path, room: Room) -> list[Metric]:
                        lambda: animate(body, sequence, layout, work.animate, room.tell))
     output = room.folder
     if found is not None:
-        storage.write_json(output / "subject.json", {"betas": found.betas.tolist(), "frames": found.frames.tolist()})
+        storage.write_json(output / "subject.json", {"betas": found.betas.tolist(),
+                                                     "frames": found.frames[:, 1].tolist()})
         layout.save(output / "layout.json")
     problem = motion_problem(motion, body.template, layout, sequence)
     metrics = [*([Metric("problem", problem)] if problem else []), *metrics, *figures(motion, sequence)]
     write_motion(output, motion, body)
-    write_glb(output / "animation.glb", motion, body, work.glb.keys)
+    write_glb(output / "animation.glb", motion, body)
     page = motion_page(motion, body, sequence, path.name, rows(metrics))
     if work.retarget_to is not None:
         _other_person(work, work.retarget_to, output, motion, body, page)
@@ -119,16 +105,16 @@ def figures(motion: Motion, markers: MarkerSequence) -> list[Metric]:
 def _other_person(work: Work, person: Subject, output: Path, motion: Motion, body: Subject, page: Page) -> None:
     other = retarget(motion, body, person)
     other.save(output / "onto.npz")
-    write_glb(output / "onto.glb", other, person, work.glb.keys)
+    write_glb(output / "onto.glb", other, person)
     page.section("On another person", "The same rotations of the joints; the way over the ground is as much longer as "
                  "the legs are, and the feet are on the ground when those of the first are.")
     page.picture(picture_frames(other, person, None))
 
 
 def _changing_body(work: Work, goal: BetasTo, output: Path, motion: Motion, body: Subject, page: Page) -> None:
-    shown = spread_frames(len(motion.poses), work.glb.keys)
+    shown = spread_frames(len(motion.poses), KEYS)
     bodies = morphed_vertices(work.model, motion, morph_keys(goal, motion), shown)
-    write_glb(output / "morph.glb", motion, body, work.glb.keys, bodies)
+    write_glb(output / "morph.glb", motion, body, bodies)
     some = spread_frames(len(bodies), 24)
     page.section("With a body that changes", "Betas change from key to key, straight over time.")
     page.picture(picture_bodies(motion, body, bodies, shown)).picture(moving_picture(bodies[some], body, 8.0))

@@ -21,7 +21,6 @@ from scanprep.skeleton.tree import Skeleton
 
 from ... import energy
 from ...bodies import FixedBody
-from ...energy import MovingPoints, moving_points
 from ...priors import gaussian_prior
 from ..marker_sets.layout import MarkerLayout
 
@@ -54,16 +53,6 @@ class MarkedBody:
             some = slice(start, start + BATCH)
             y[some] = self.shapes.evaluate(pose[some], trans[some])
         return np.swapaxes(y, -1, -2).reshape(*x.shape[:-1], self.count, 3)
-
-    def follow(self, x: np.ndarray) -> MovingPoints:
-        """The markers for unknowns (B, P), with their derivatives by the unknowns themselves."""
-        pose, trans, _ = self.body.split(x)
-        y, by_rotation = self.shapes.columns(pose, trans)
-        B, J = pose.shape[:2]
-        by_rotation = np.moveaxis(by_rotation.reshape(B, J, 3, 3, self.count), 2, -1)            # (B, J, 3, L, 3)
-        by_pose = by_rotation @ rotations.right_jacobian(pose)[:, :, None]
-        return moving_points(np.swapaxes(y, -1, -2),
-                             by_pose.transpose(0, 3, 2, 1, 4).reshape(B, self.count, 3, 3 * J))
 
     def system(self, x: np.ndarray, targets: np.ndarray, weights: np.ndarray, stiff: float = 1.0) -> Dense:
         """Markers and pose prior: energy (B,), half its gradient (B, P) and Gauss-Newton matrix (B, P, P).

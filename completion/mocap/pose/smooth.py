@@ -17,7 +17,7 @@ FURTHEST = 0.5                       # radians or metres that a step may go
 def inertia(config: AnimateConfig, rate: float, n_unknowns: int) -> np.ndarray:
     """Information (P,) of the change of velocity from frame to frame."""
     out = np.full(n_unknowns, (config.angle_acceleration / rate**2)**-2)
-    out[-3:] = (15.0 / rate**2)**-2                                     # metres per second squared
+    out[-3:] = (config.place_acceleration / rate**2)**-2
     return out
 
 

@@ -12,7 +12,7 @@ from scanprep.pictures.shading import side_by_side
 from ...motion import spread_frames
 from ...motion_pictures import bodies_in_a_row, seconds
 from ..files.motion_files import write_glb
-from ..results import SoftTissue
+from ..soft_tissue.soft_tissue import SoftTissue
 from .creases import Creases, at_rest
 from .soft_tissue import deformation, moving_character
 
@@ -51,5 +51,5 @@ def write_character(path: Path, character: BodyModel, soft: SoftTissue, keys: in
     fixed, changed = moving_character(character, soft, frames)
     most = np.asarray(deformation(character.template.faces, fixed, changed).max(axis=0))
     changed = Creases(at_rest(character), character.skeleton).smoothed(changed, soft.motion.poses[frames])
-    write_glb(path, soft.motion, character.subject(soft.motion.betas), keys, changed, heat(most, 0.0, FULL))
+    write_glb(path, soft.motion, character.subject(soft.motion.betas), changed, heat(most, 0.0, FULL), keys)
     return most
