@@ -99,7 +99,7 @@ def figures(motion: Motion, markers: MarkerSequence) -> list[Metric]:
         Metric("distance of markers, 95th percentile", float(np.percentile(off, 95)), "mm"),
         Metric("distance of markers, mean of the worst frame", float(frame.max()), "mm"),
         Metric("markers missing", 100 * float(1 - seen[:, seen.any(axis=0)].mean()) if seen.any() else 100.0, "%"),
-        Metric("frames that settled", 100 * float(motion.converged.mean()), "%")]
+        Metric("frames that converged", 100 * float(motion.converged.mean()), "%")]
 
 
 def _other_person(work: Work, person: Subject, output: Path, motion: Motion, body: Subject, page: Page) -> None:

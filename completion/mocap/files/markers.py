@@ -93,22 +93,6 @@ class MarkerSequence:
             raise ValueError(f"which: expected a slice that goes forward, got {which}")
         return MarkerSequence(self.positions[which], self.labels, self.rate / step)
 
-    def resampled(self, rate: float) -> MarkerSequence:
-        """The sequence at another rate, straight between frames; missing wherever a neighbour is missing."""
-        if not (np.isfinite(rate) and rate > 0):
-            raise ValueError(f"rate: expected a positive number of frames per second, got {rate}")
-        last = len(self.positions) - 1
-        if last < 1:
-            return MarkerSequence(self.positions, self.labels, rate)
-        place = np.arange(int(np.floor(last * rate / self.rate + 1e-9)) + 1) * (self.rate / rate)
-        nearest = np.rint(place)
-        place = np.clip(np.where(np.abs(place - nearest) < 1e-9, nearest, place), 0, last)
-        before = np.minimum(np.floor(place).astype(np.int64), last)
-        after = np.minimum(before + 1, last)
-        part = (place - before)[:, None, None]
-        between = (1 - part) * self.positions[before] + part * self.positions[after]
-        return MarkerSequence(np.where(part == 0, self.positions[before], between), self.labels, rate)
-
 
 def read_markers(path: str | Path, unit: str | None = None, subject: str | None = None,
                  rate: float | None = None) -> MarkerSequence:

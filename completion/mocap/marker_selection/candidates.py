@@ -11,8 +11,8 @@ from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.surface import Rays
 from scanprep.skeleton.tree import Skeleton
 
+from ...bodies import at_rest
 from ..marker_sets.layout import DISTANCE, MarkerLayout
-from ..marker_sets.pictures import mean_body
 from ..marker_sets.symmetry import SkinMirror, find_skin_mirror, other_side, side_of
 
 if TYPE_CHECKING:
@@ -54,7 +54,7 @@ def candidate_layout(body: BodyModel | Mesh, base: MarkerLayout, count: int = 11
     [MoSh] Eq. 25
     """
     if not isinstance(body, Mesh):
-        skeleton, body = skeleton or body.skeleton, mean_body(body)
+        skeleton, body = skeleton or body.skeleton, at_rest(body)
     mirror = mirror or find_skin_mirror(body)
     room = _Room(body, base, mirror)
     whole = _with_partners(base, mirror)

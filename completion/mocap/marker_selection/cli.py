@@ -13,14 +13,15 @@ from scanprep.dataset import RegisteredSet
 from scanprep.geometry import storage
 from scanprep.geometry.files import read_registered
 from scanprep.geometry.mesh import Mesh
+from scanprep.pictures.camera import look_around
 from scanprep.pictures.page import Page
 from scanprep.pictures.shading import Dots, render, side_by_side
-from scanprep.pictures.views import look_around
 
+from ...bodies import at_rest
 from ...cli import ModelOrNone, read_model, rows
 from ..marker_sets.layout import MarkerLayout
 from ..marker_sets.named import choose_layout
-from ..marker_sets.pictures import SIDES, mean_body
+from ..marker_sets.pictures import SIDES
 from ..marker_sets.symmetry import label_pairs, marker_pairs
 from .candidates import candidate_layout
 from .design import MarkerDesign, design_markers
@@ -177,7 +178,7 @@ def design_page(design: MarkerDesign, model: BodyModel, candidates: MarkerLayout
     """The page of `scape layout design`."""
     page = Page(f"{len(design.layout.labels)} markers", "Chosen so that bodies estimated from them are near the true "
                 "ones over their whole surface. Red: chosen; blue: kept; grey: left out.")
-    page.picture(picture_design(design, mean_body(model), candidates, keep))
+    page.picture(picture_design(design, at_rest(model), candidates, keep))
     chosen = [label for label in design.layout.labels if label not in keep]
     page.text(f"Chosen: {', '.join(chosen) or 'none'}." + (f" Kept: {', '.join(keep)}." if keep else ""))
     page.section("Error and number of markers").chart(chart_curve(design), "root mean squared distance of all vertices "

@@ -6,7 +6,6 @@ from typing import Any
 
 import numpy as np
 
-from model.body import BodyModel
 from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.surface import Rays
 from scanprep.pictures.camera import Camera, look_around
@@ -21,12 +20,6 @@ from .symmetry import label_pairs
 HEIGHT = 1000
 SIDES = ("front", "its left", "back", "its right")
 FIXED, LOOSE = (0.86, 0.24, 0.20), (0.93, 0.62, 0.12)
-
-
-def mean_body(model: BodyModel) -> Mesh:
-    """The mean person in the pose of the template, or the template's own body of a model without betas."""
-    pose = np.zeros((len(model.skeleton.parents), 3))
-    return model.template.with_vertices(model.vertices(pose, np.zeros(model.n_betas) if model.n_betas else None))
 
 
 def picture_layout(body: Mesh, layout: MarkerLayout, height: int | None = None) -> np.ndarray:

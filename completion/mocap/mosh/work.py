@@ -9,13 +9,13 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
-from scanprep.pictures.views import upright
 
 from model.body import BodyModel
 from model.learning.sex_plane import SexGuess
 from scanprep.batch.room import Room
 from scanprep.console import Metric, Outcome, plain, write_report
 from scanprep.geometry import storage
+from scanprep.pictures.camera import upright
 from scanprep.pictures.sheets import save_png
 
 from ...motion import spread_frames

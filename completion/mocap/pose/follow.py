@@ -23,7 +23,7 @@ __all__ = ["AnimateConfig", "animate"]
 
 Progress = Callable[[int, int], None]
 KEY_INTERVAL = 0.1                   # seconds between the frames that are solved one after the other
-STILL = 0.005                        # metres that the last round moves any marker of a frame that has settled
+STILL = 0.005                        # metres that the last round moves any marker of a frame that has converged
 
 
 @one_thread()
@@ -58,9 +58,9 @@ def animate(subject: Subject, markers: MarkerSequence, layout: MarkerLayout, con
     targets, tell = markers.positions[:, columns], progress or (lambda done, total: None)
     body = MarkedBody(subject, layout.select(labels), config.prior_weight, config.prior_shrinkage)
     if config.smoothing or config.ground:
-        x, order, settled = follow_whole(body, targets, markers.rate, config, tell)
+        x, order, converged = follow_whole(body, targets, markers.rate, config, tell)
     else:
-        x, order, settled = follow_frames(body, targets, np.arange(len(targets)), markers.rate, config, tell)
+        x, order, converged = follow_frames(body, targets, np.arange(len(targets)), markers.rate, config, tell)
     pose, trans, _ = body.body.split(x)
     if config.low_pass:
         pose, trans = low_pass(pose, trans, markers.rate, config.low_pass)
@@ -69,17 +69,17 @@ def animate(subject: Subject, markers: MarkerSequence, layout: MarkerLayout, con
     residuals[:, columns], believed[:, columns] = judge(body.positions(body.body.join(pose, trans)), targets, order,
                                                         config.outlier)
     return Motion(pose.copy(), trans.copy(), subject.betas, markers.rate, residuals, markers.labels,
-                  converged=settled, trusted=believed)
+                  converged=converged, trusted=believed)
 
 
 def follow_frames(body: MarkedBody, targets: np.ndarray, frames: np.ndarray, rate: float, config: AnimateConfig,
                   tell: Progress, steps: int = STEPS) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Some frames, `rate` of them a second, each from those before: begins at a whole one and goes both ways.
 
-    Found are unknowns (n, P), which of the markers (T, L, 3) each was taken from (n, L), and which frames settled (n,).
+    Found are unknowns (n, P), which of the markers (T, L, 3) each was taken from (n, L), and which frames converged (n,).
     """
     first = _first_frame(targets)
-    x, settled = np.empty((len(frames), body.n_unknowns)), np.zeros(len(frames), dtype=bool)
+    x, converged = np.empty((len(frames), body.n_unknowns)), np.zeros(len(frames), dtype=bool)
     order = np.tile(np.arange(body.count), (len(frames), 1))
     at, start, done = int(np.searchsorted(frames, first)), search(body, targets[first], config), 0
     ways: tuple[Sequence[int], Sequence[int]] = range(at, len(frames)), range(at - 1, -1, -1)
@@ -87,16 +87,16 @@ def follow_frames(body: MarkedBody, targets: np.ndarray, frames: np.ndarray, rat
         tracker = Tracker(body, config, rate, steps)
         tracker.begin(x[at] if done else start)
         for i in way:
-            x[i], settled[i] = tracker.push(targets[frames[i]])
+            x[i], converged[i] = tracker.push(targets[frames[i]])
             order[i] = tracker.watch.order
             done += 1
             tell(done, len(frames))
-    return x, order, settled
+    return x, order, converged
 
 
 def follow_whole(body: MarkedBody, targets: np.ndarray, rate: float, config: AnimateConfig, tell: Progress
                  ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """All frames together: unknowns (T, P), the order of the labels (T, L), and which frames settled (T,)."""
+    """All frames together: unknowns (T, P), the order of the labels (T, L), and which frames converged (T,)."""
     T, stiffness = len(targets), inertia(config, rate, body.n_unknowns)
     x, moved, feet = between_keys(body, targets, rate, config), np.zeros(T), None
     seen = ~np.isnan(targets[..., 0])

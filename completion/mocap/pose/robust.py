@@ -150,5 +150,5 @@ def motion_problem(motion: Motion, body: Mesh, layout: MarkerLayout, markers: Ma
         return None
     believed = 100 * float(motion.trusted[seen].mean())
     return (f"the markers are {1000 * off:.0f} mm from where the body has them, {100 * motion.converged.mean():.0f}% "
-            f"of the frames settled and {believed:.0f}% of the markers are believed; "
+            f"of the frames converged and {believed:.0f}% of the markers are believed; "
             + (wrong or "labels of left and right swapped, another layout, or another model?"))

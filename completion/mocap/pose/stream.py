@@ -35,7 +35,7 @@ class Frame:
     trusted : (L,) bool
         Seen, and believed under its own label; none in a frame that no body explains.
     converged : bool
-        The solution settled. It did not where a frame that no body makes was passed over: the pose is the expected one.
+        The solution converged. It did not where a frame that no body makes was passed over: the pose is the expected one.
     """
 
     pose: np.ndarray
@@ -94,12 +94,12 @@ class MarkerStream:
             raise ValueError(f"positions: expected shape ({self.n_labels}, 3), got {positions.shape}")
         positions = np.where((np.abs(positions) < 1e6).all(axis=1, keepdims=True), positions, np.nan)
         tracker, targets = self.tracker, positions[self.rows]
-        x, settled = tracker.push(targets)
+        x, converged = tracker.push(targets)
         residuals, trusted = np.full(self.n_labels, np.nan), np.zeros(self.n_labels, dtype=bool)
         residuals[self.rows], trusted[self.rows] = judge(tracker.places, targets, tracker.watch.order,
                                                         tracker.config.outlier)
         pose, trans, _ = tracker.body.body.split(x)
-        return Frame(pose, trans, residuals, trusted & tracker.believed, settled)
+        return Frame(pose, trans, residuals, trusted & tracker.believed, converged)
 
 
 class Tracker:
@@ -121,7 +121,7 @@ class Tracker:
         self.started, self.since, self.passed = True, 0, 0
 
     def push(self, targets: np.ndarray) -> tuple[np.ndarray, bool]:
-        """Unknowns (P,) of the next frame, NaN before the first that could be solved, and whether it settled."""
+        """Unknowns (P,) of the next frame, NaN before the first that could be solved, and whether it converged."""
         there = int((~np.isnan(targets[:, 0])).sum())
         enough = there >= max(3, 0.5 * self.body.count)                 # for a search
         self.wait, self.since, self.believed = max(0, self.wait - 1), self.since + 1, False
@@ -140,12 +140,12 @@ class Tracker:
         order = self.watch.order.copy()
         taken = targets[self.watch.update(before, targets)]
         end = self._solve(taken, expected, information)
-        x, settled, found = end.x[0], bool(end.converged[0]), None
+        x, converged, found = end.x[0], bool(end.converged[0]), None
         self.places = self.body.positions(x)
         if not self.wait and enough and not fresh and self._astray(taken):
             found = self._found(taken)
             if found is not None:
-                x, settled = found, True
+                x, converged = found, True
                 self.places = self.body.positions(x)
         if self._to_pass_over(taken, before):
             self.watch.order, self.places = order, before
@@ -158,7 +158,7 @@ class Tracker:
             self.begin(x)
         else:
             self.prediction.update(x, end.equations.hessian[0] - information)
-        return x, settled
+        return x, converged
 
     def _solve(self, targets: np.ndarray, expected: np.ndarray, information: np.ndarray) -> Minimum[np.ndarray]:
         """The best unknowns of a frame near the expected ones, which put the markers where `places` says."""
