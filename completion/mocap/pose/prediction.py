@@ -81,7 +81,8 @@ class KalmanPrediction:
 
 def prediction_of(body: MarkedBody, config: AnimateConfig, rate: float) -> VelocityPrediction | KalmanPrediction:
     """The prediction that the settings name."""
-    kinds = {"velocity": VelocityPrediction, "kalman": KalmanPrediction}
+    kinds: dict[str, type[VelocityPrediction] | type[KalmanPrediction]] = {
+        "velocity": VelocityPrediction, "kalman": KalmanPrediction}
     if config.prediction not in kinds:
         raise ValueError(f"prediction: expected one of {', '.join(kinds)}, got '{config.prediction}'")
     return kinds[config.prediction](body, config, rate)
