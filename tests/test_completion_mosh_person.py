@@ -8,8 +8,8 @@ from completion_bodies import worm_with_prior
 from completion import MoshConfig, PersonConfig, find_person, mosh
 from completion.mocap.files.markers import MarkerSequence
 from completion.mocap.marker_sets.layout import MarkerLayout
-from completion.mocap.mosh.mosh import pose_settings
-from completion.mocap.pose.follow import AnimateConfig
+from completion.mocap.mosh.mosh import PoseConfig
+from completion.mocap.pose.settings import AnimateConfig
 from completion.mocap.subject.attachment import latent_markers
 from completion.mocap.subject.person import choose_frames, common_markers
 from scanprep.geometry import rotations
@@ -186,7 +186,7 @@ def test_what_cannot_be_used_is_named():
 
 def test_weights_of_the_paper_are_those_of_the_engine():
     """[MoSh] Eq. 17, 21, 22: a residual of 1/√λ costs one."""
-    found = pose_settings(data=0.25, pose=0.7, velocity=4.0)
+    found = PoseConfig.weighted(data=0.25, pose=0.7, velocity=4.0)
     assert found.marker_sd == pytest.approx(0.02) and found.prior_weight == 0.7
     assert found.angle_acceleration == pytest.approx(0.5 * 120**2)
     ours = MoshConfig().poses                    # those of `animate`, but for markers that are held closer

@@ -4,7 +4,6 @@ from __future__ import annotations
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from functools import partial
 from typing import Any, TypeVar
 
 import numpy as np
@@ -21,8 +20,8 @@ from ..artefacts.results import ArtefactConfig, MarkerArtefacts
 from ..files.markers import MarkerSequence
 from ..marker_sets.layout import MarkerLayout
 from ..pose.follow import animate
-from ..pose.settings import AnimateConfig
-from ..soft_tissue.soft_tissue import RATE, SoftTissue, SoftTissueConfig, follow_soft_tissue
+from ..pose.settings import RATE, AnimateConfig
+from ..soft_tissue.soft_tissue import SoftTissue, SoftTissueConfig, follow_soft_tissue
 from ..subject.person import PersonConfig, PersonFit, find_person, one_or_more
 
 Progress = Callable[[int, int], None]
@@ -31,16 +30,23 @@ ROUNDS = 3                           # most times that a person is followed and 
 STEPS = 100                          # of progress, of each stage
 
 
-def pose_settings(data: float, pose: float, velocity: float, **others: Any) -> AnimateConfig:
-    """The settings of `animate` for weights of the terms, on squared centimetres and radians at 120 frames a second.
+@dataclass(frozen=True)
+class PoseConfig(AnimateConfig):
+    """Settings of the poses of a person whose shape and marker places are known: as of `animate`, without a flag."""
 
-    A weight is the inverse of a squared deviation. At another frame rate the acceleration that the weight of the
-    velocity's change allows is the same.
+    ground: bool = False
 
-    [MoSh] Eq. 17, Eq. 21, Eq. 22
-    """
-    return AnimateConfig(marker_sd=0.01 / np.sqrt(data), prior_weight=pose,
-                         angle_acceleration=float(RATE**2 / np.sqrt(velocity)), **others)
+    @classmethod
+    def weighted(cls, data: float, pose: float, velocity: float, outlier: float = 0.06) -> PoseConfig:
+        """Settings of weights on squared centimetres, on the pose prior, and on squared radians.
+
+        A weight is the inverse of a squared deviation. That of the velocity's change from frame to frame is meant for
+        120 frames per second; at another rate the acceleration that it allows is the same.
+
+        [MoSh] Eq. 17, Eq. 21, Eq. 22
+        """
+        return cls(marker_sd=0.01 * data**-0.5, prior_weight=pose, angle_acceleration=RATE**2 * velocity**-0.5,
+                   outlier=outlier)
 
 
 @dataclass(frozen=True)
@@ -51,7 +57,7 @@ class MoshConfig(Settings):
     ----------
     person : PersonConfig
         Shape and marker places, from some frames.
-    poses : AnimateConfig
+    poses : PoseConfig
         Poses of all frames of a person whose shape and marker places are known. Markers are held closer than by
         `animate`, whose layout may be off. In weights of the paper they are 2, the prior 0.3 and the change of
         velocity 57600 instead of 0.75, 1 and 6.25: the prior of a few dozen scans is narrow and must not outweigh
@@ -69,7 +75,7 @@ class MoshConfig(Settings):
     """
 
     person: PersonConfig = field(default_factory=PersonConfig)
-    poses: AnimateConfig = field(default_factory=partial(pose_settings, 2.0, 0.3, 57600.0))
+    poses: PoseConfig = field(default_factory=lambda: PoseConfig.weighted(2.0, 0.3, 57600.0))
     soft: SoftTissueConfig = field(default_factory=SoftTissueConfig)
     artefacts: ArtefactConfig = field(default_factory=ArtefactConfig)
     soft_tissue: bool = True
@@ -79,7 +85,7 @@ class MoshConfig(Settings):
     @classmethod
     def published(cls) -> MoshConfig:
         """The weights of [MoSh], every marker believed alike, nothing repaired and nothing smoothed beyond them."""
-        poses = pose_settings(0.75, 1.0, 6.25, place_acceleration=1e6, outlier=1000.0)
+        poses = PoseConfig.weighted(0.75, 1.0, 6.25, outlier=1000.0)
         return cls(PersonConfig.published(), poses, SoftTissueConfig.published(), repair=False)
 
 

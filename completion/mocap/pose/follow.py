@@ -76,7 +76,8 @@ def follow_frames(body: MarkedBody, targets: np.ndarray, frames: np.ndarray, rat
                   tell: Progress, steps: int = STEPS) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Some frames, `rate` of them a second, each from those before: begins at a whole one and goes both ways.
 
-    Found are unknowns (n, P), which of the markers (T, L, 3) each was taken from (n, L), and which frames converged (n,).
+    Found are unknowns (n, P), from which column of targets (T, L, 3) each marker was taken (n, L), and which frames
+    converged (n,).
     """
     first = _first_frame(targets)
     x, converged = np.empty((len(frames), body.n_unknowns)), np.zeros(len(frames), dtype=bool)

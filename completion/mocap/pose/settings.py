@@ -6,6 +6,8 @@ from typing import Annotated, Literal
 
 from scanprep.ranges import FLAG, Positive, Settings, Share, Signed
 
+RATE = 120.0                         # frames per second for which the weight of the velocity is meant
+
 
 @dataclass(frozen=True)
 class AnimateConfig(Settings):

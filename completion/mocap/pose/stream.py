@@ -35,7 +35,7 @@ class Frame:
     trusted : (L,) bool
         Seen, and believed under its own label; none in a frame that no body explains.
     converged : bool
-        The solution converged. It did not where a frame that no body makes was passed over: the pose is the expected one.
+        The solution settled. It did not where a frame that no body makes was passed over: the pose is the expected one.
     """
 
     pose: np.ndarray

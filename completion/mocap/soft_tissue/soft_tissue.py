@@ -18,13 +18,12 @@ from ..files.markers import MarkerSequence
 from ..marker_sets.layout import MarkerLayout
 from ..pose.marked_body import BATCH
 from ..pose.robust import marker_weights
-from ..pose.settings import AnimateConfig
+from ..pose.settings import RATE, AnimateConfig
 from ..pose.smooth import FURTHEST, coupled_steps, inertia
 from .changing_body import ChangingBody, changing_bodies, skin_metric, skin_movement
 
 Progress = Callable[[int, int], None]
 PER_SQUARE_METRE = 1e4               # of a weight on square centimetres
-RATE = 120.0                         # frames per second for which weights on changes in time are meant
 ROUNDS = 3                           # Gauss-Newton steps over the whole sequence, which begins near its end
 STILL = 0.002                        # metres that the last round moves any marker of a frame that has settled
 WINDOW, OVERLAP = 400, 40            # frames smoothed at once, and those that each side lends to its neighbour
