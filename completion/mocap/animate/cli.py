@@ -29,7 +29,7 @@ MarkersArg = Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="MARKER
 
 
 def animate_markers(markers: MarkersArg, output: Output, model: ModelOrNone = None, layout: str | None = None,
-                    subject: str | None = None, unit: Unit | None = None, who: str | None = None,
+                    subject: str | None = None, unit: Unit | None = None, subject_prefix: str | None = None,
                     retarget_to: Path | None = None, betas_to: Path | None = None,
                     config: AnimateConfig = AnimateConfig(),   # noqa: B008
                     person: PersonConfig = PersonConfig(),                                         # noqa: B008
@@ -55,7 +55,7 @@ def animate_markers(markers: MarkersArg, output: Output, model: ModelOrNone = No
             from, betas in JSON or .npz, or a mesh in the model's triangles. Without it "markers" where the model has
             betas.
         unit: Unit of the markers, where the file cannot tell.
-        who: Whose markers, in a C3D file with several people.
+        subject_prefix: Whose markers, in a C3D file with several people: what stands before the colon of their labels.
         retarget_to: Another person who makes the motion too, as betas or a mesh: onto.npz, onto.glb.
         betas_to: Betas into which the body changes, in JSON: those at the end [b1, b2, ...], or keys in seconds
             {"0": [...], "2.5": [...]}: morph.glb.
@@ -67,7 +67,8 @@ def animate_markers(markers: MarkersArg, output: Output, model: ModelOrNone = No
     loaded, name = read_model(model)
     work = Work(loaded, name, None if layout is None else layout_or_file(layout), _subject(loaded, subject, unit),
                 None if retarget_to is None else read_subject(loaded, retarget_to, unit),
-                None if betas_to is None else read_betas_to(betas_to, loaded.n_betas), unit, who, config, person)
+                None if betas_to is None else read_betas_to(betas_to, loaded.n_betas), unit, subject_prefix, config,
+                person)
     settings = {"animate": config, "person": person, "model": name}
     if markers.is_file():
         with bar("following the markers") as following:
