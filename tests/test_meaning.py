@@ -11,7 +11,6 @@ import numpy as np
 import pytest
 from completion_bodies import half_view, worm_with_prior
 from scanned_shapes import ball as sphere
-from scanprep.skeleton.search import skeleton_problem
 
 from completion import MarkerLayout, MarkerSequence, motion_pictures, write_markers
 from completion.__main__ import main
@@ -34,6 +33,7 @@ from scanprep.console import Metric
 from scanprep.correspondence.correspondences import Correspondences, correspondences_problem
 from scanprep.geometry.files import PointCloud, write_points
 from scanprep.registration.nonrigid import Registration, registration_problem
+from scanprep.skeleton.find import skeleton_problem
 
 MARKS = {"head": 10, "tail": 380, "left": 100, "right": 200, "middle": 250}
 LABELS = tuple(f"M{i}" for i in range(30))
