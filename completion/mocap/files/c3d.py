@@ -13,7 +13,7 @@ from typing import Any
 
 import numpy as np
 
-from scanprep.geometry.formats.common import UNITS
+from scanprep.geometry.format_common import UNITS
 
 from .common import MarkerFileError, RawMarkers
 
