@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from ..geometry import storage
-from ..geometry.formats.common import FARTHEST
+from ..geometry.format_common import FARTHEST
 from ..geometry.mesh import Mesh
 
 SURE = 0.4                  # median confidence: 0.87 between poses of a person, 0.25 to 0.37 on a ball
