@@ -79,21 +79,12 @@ def design(bodies: Path, output: Output, model: ModelOrNone = None, candidates: 
 def _candidates(model: BodyModel, given: str | None, kept: MarkerLayout | None) -> MarkerLayout:
     """The candidates, those that are kept among them."""
     if given is None:
-        # around which candidates are made where none are named
         return candidate_layout(model, choose_layout(model, "vicon47", ())[0] if kept is None else kept)
     among = choose_layout(model, given, ())[0]
     if kept is None or set(kept.labels) <= set(among.labels):
         return among
     own = kept.without([label for label in kept.labels if label in among.labels])
-    (ids, weights), (others, shares) = (_on_triangles(*each.skin) for each in (among, own))
-    return MarkerLayout((*among.labels, *own.labels), np.vstack([ids, others]),
-                        np.r_[np.asarray(among.distances), np.asarray(own.distances)], np.vstack([weights, shares]),
-                        {**own.aliases, **among.aliases}, (*among.loose, *own.loose))
-
-
-def _on_triangles(ids: np.ndarray, weights: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Vertices and weights (L, 3) of skin points of one or three vertices."""
-    return np.broadcast_to(ids, (len(ids), 3)), weights if weights.shape[1] == 3 else np.eye(3)[[0] * len(ids)]
+    return among.joined(own)
 
 
 def _read_bodies(model: BodyModel, folder: Path, unit: Unit | None) -> tuple[np.ndarray, np.ndarray]:
