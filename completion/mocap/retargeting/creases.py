@@ -10,17 +10,16 @@ from scanprep.geometry.sparse import harmonic
 from scanprep.skeleton.tree import Skeleton
 
 REACH = (1, 2, 2, 3, 3, 4)           # rings around inverted triangles that are laid anew, one round each
-BLEND = 6                            # rings over which the rotation of one part passes into that of the next
 
 
 class Creases:
     """Where triangles of a posed body are inverted, and the body without.
 
     A triangle is inverted when it faces away from where the rotations of the parts around it take it, those of
-    neighbouring parts mixed over some rings: at a raised shoulder the skin rightly faces away from its own part.
+    neighbouring parts mixed over `blend` rings: at a raised shoulder the skin rightly faces away from its own part.
     """
 
-    def __init__(self, rest: Mesh, skeleton: Skeleton, blend: int = BLEND) -> None:
+    def __init__(self, rest: Mesh, skeleton: Skeleton, blend: int = 6) -> None:
         self.rest, self.skeleton = rest, skeleton
         self._near = csr_array(rest.vertex_adjacency, dtype=np.float64)
         self._shares = np.eye(len(skeleton.parents))[skeleton.part_of_face]
