@@ -164,6 +164,8 @@ def walk(sets: MarkerSets, sign: int, movable: np.ndarray, until: int, through: 
         gain = (sets.tried(open_, sign) - sets.costs.mean()) / sets.sizes[open_]
         steps.append(int(open_[np.argmin(gain)]))
         sets.take(steps[-1], sign)
+        if sign == ADD and sets.count < 8:           # the first markers know the place a thousand times better
+            sets.renew()                             # than what was before, and updates lose as many digits
         counts.append(sets.count)
         rmse.append(sets.rmse)
         if tell is not None:
