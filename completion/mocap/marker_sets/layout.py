@@ -118,7 +118,7 @@ class MarkerLayout:
     @property
     def skin(self) -> tuple[np.ndarray, np.ndarray]:
         """Vertices and weights (L, k) of the points of the skin below the markers, k 1 or 3."""
-        ids = self.vertices.reshape(len(self.labels), -1)
+        ids = self.vertices if self.vertices.ndim == 2 else self.vertices[:, None]
         return ids, np.ones(ids.shape) if self.weights is None else self.weights
 
     @property
