@@ -14,8 +14,7 @@ from completion.mocap.retargeting.pictures import picture_transfer, write_charac
 from completion.mocap.retargeting.retarget import world_up
 from completion.mocap.retargeting.soft_tissue import moving_character
 from completion.mocap.soft_tissue.soft_tissue import SoftTissue
-from model.posing.character import CharacterConfig, character_model
-from model.posing.character_mesh import inside
+from model.posing.character import CharacterConfig, character_model, inside
 from scanprep.geometry import rotations
 from scanprep.geometry.surface import Surface
 

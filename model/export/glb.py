@@ -12,8 +12,9 @@ from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.storage import writing
 from scanprep.pictures.gltf import VERTICES, Glb, skin_material, some_normal
 
+from ..blend_weights import CARRIERS
 from .correctives import Correctives
-from .rig import CARRIERS, Rig, check_motion, turn_up
+from .rig import Rig, check_motion, turn_up
 
 
 @dataclass(frozen=True, eq=False)

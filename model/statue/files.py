@@ -12,8 +12,9 @@ from scanprep.geometry.mesh import Mesh
 from scanprep.pictures.sheets import save_png
 from scanprep.synthetic import people
 
+from ..blend_weights import strongest
 from ..export.glb import Material, write_skinned_glb
-from ..export.rig import Rig, strongest, turn_up
+from ..export.rig import Rig, turn_up
 from ..features import linear_features
 from ..skinning import SkinningModel
 from .control.chart import Chart

@@ -29,7 +29,7 @@ from completion.mocap.retargeting.soft_tissue import deformation, moving_charact
 from completion.mocap.soft_tissue.soft_tissue import SoftTissue
 from completion.synthetic_people import synthetic_model
 from model.body import BodyModel
-from model.posing.character_mesh import Character, register_character
+from model.posing.character import Character, register_character
 from scanprep.geometry.mesh import Mesh
 from scanprep.pictures.shading import save_png
 from scanprep.synthetic.data_set import SUBJECT

@@ -9,7 +9,8 @@ import numpy as np
 from scanprep.geometry.mesh import Mesh, template_problem
 from scanprep.skeleton.tree import Skeleton
 
-from ...export.rig import CARRIERS, Rig
+from ...blend_weights import CARRIERS
+from ...export.rig import Rig
 from .chart import Chart, chart_problem
 
 
