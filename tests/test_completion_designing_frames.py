@@ -6,8 +6,8 @@ from completion_bodies import worm_with_prior
 from completion.mocap.marker_selection.frames import FrameConfig, FrameInformation, informative_frames
 from completion.mocap.marker_selection.points import BodyPoints
 from completion.mocap.marker_sets.layout import MarkerLayout
-from completion.priors import gaussian_prior
 from model.fitting import spread_vertices
+from model.priors import gaussian_prior
 
 MODEL = worm_with_prior()
 LAYOUT = MarkerLayout(tuple(f"M{i}" for i in range(9)), spread_vertices(MODEL.template.vertices, 9), 0.0)

@@ -10,7 +10,7 @@ from completion.mocap.pose.marked_body import supports
 from completion.mocap.subject import terms
 from completion.mocap.subject.attachment import above_triangles, latent_markers, signed_distance, simulated
 from completion.mocap.subject.terms import LatentPoints
-from completion.priors import gaussian_prior
+from model.priors import gaussian_prior
 from scanprep.geometry import rotations
 from scanprep.geometry.least_squares import Residual
 from scanprep.geometry.mesh import Mesh

@@ -7,10 +7,10 @@ from dataclasses import dataclass
 import numpy as np
 
 from model.body import BodyModel
+from model.priors import gaussian_prior
 from scanprep.geometry import rotations
 from scanprep.geometry.least_squares import Dense, levenberg_marquardt
 
-from ...priors import gaussian_prior
 from .points import BodyPoints
 from .settings import DesignConfig
 

@@ -6,9 +6,9 @@ from dataclasses import dataclass
 import numpy as np
 
 from model.body import BodyModel
+from model.priors import gaussian_prior
 from scanprep.ranges import Count, Positive, Settings, Share
 
-from ...priors import gaussian_prior
 from ..marker_sets.layout import MarkerLayout
 from .linear import support
 from .points import BodyPoints

@@ -5,13 +5,13 @@ import numpy as np
 
 from model.features import twists
 from model.linear import Subject
+from model.priors import gaussian_prior
 from scanprep.geometry import rotations
 from scanprep.geometry.least_squares import Dense
 from scanprep.geometry.mesh import Mesh
 
 from ...bodies import FixedBody
 from ...energy import MovingPoints, moving_points
-from ...priors import gaussian_prior
 from ..marker_sets.layout import MarkerLayout
 from . import fast_rotations as turns
 from .marker_points import PartShapes, marker_shapes

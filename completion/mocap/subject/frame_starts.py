@@ -8,12 +8,12 @@ from scipy.spatial import cKDTree
 
 from model.body import BodyModel
 from model.linear import Subject
+from model.priors import GaussianPrior
 from scanprep.geometry import rotations
 from scanprep.geometry.least_squares import Residual, levenberg_marquardt, normal_equations
 
 from ... import energy
 from ...bodies import FixedBody
-from ...priors import GaussianPrior
 from ...starts import search
 from ..marker_sets.layout import MarkerLayout, most_used
 from ..pose.marked_body import MarkedBody

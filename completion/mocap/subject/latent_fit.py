@@ -7,12 +7,12 @@ import numpy as np
 
 from model.bilinear import ShapedPoints
 from model.body import BodyModel
+from model.priors import gaussian_prior
 from scanprep.geometry.least_squares import Arrow, Minimum, Residual, levenberg_marquardt, normal_equations
 
 from ... import energy
 from ...bodies import FixedBody
 from ...energy import MovingPoints
-from ...priors import gaussian_prior
 from ..marker_sets.layout import MarkerLayout
 from ..pose.marked_body import supports
 from ..settings import PersonConfig

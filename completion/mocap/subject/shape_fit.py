@@ -8,12 +8,12 @@ import numpy as np
 
 from model.bilinear import ShapedPoints
 from model.body import BodyModel
+from model.priors import GaussianPrior, gaussian_prior
 from scanprep.geometry.least_squares import Arrow, Residual, levenberg_marquardt, normal_equations
 
 from ... import energy
 from ...bodies import FixedBody
 from ...energy import MovingPoints
-from ...priors import GaussianPrior, gaussian_prior
 from ..marker_sets.layout import MarkerLayout
 from ..pose.marked_body import supports
 from .frame_starts import FrameStarts, find_loose

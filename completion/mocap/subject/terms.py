@@ -9,11 +9,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from model.priors import GaussianPrior
 from scanprep.geometry.least_squares import Residual
 
 from ... import energy
 from ...energy import MovingPoints
-from ...priors import GaussianPrior
 from ..settings import Attachment
 from .attachment import above_triangles, simulated
 
