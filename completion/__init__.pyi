@@ -10,41 +10,26 @@ from .mocap.files.markers import (
 from .mocap.files.markers import (
     write_markers as write_markers,
 )
-from .mocap.files.motion_tables import joint_angles as joint_angles
-from .mocap.files.motion_tables import joint_centres as joint_centres
-from .mocap.marker_selection.candidates import CandidateConfig as CandidateConfig
+from .mocap.files.motion_files import joint_angles as joint_angles
+from .mocap.files.motion_files import joint_centres as joint_centres
 from .mocap.marker_selection.candidates import candidate_layout as candidate_layout
-from .mocap.marker_selection.frames import FrameConfig as FrameConfig
-from .mocap.marker_selection.frames import informative_frames as informative_frames
-from .mocap.marker_selection.results import MarkerDesign as MarkerDesign
-from .mocap.marker_selection.sets import design_markers as design_markers
-from .mocap.marker_selection.settings import DesignConfig as DesignConfig
+from .mocap.marker_selection.design import MarkerDesign as MarkerDesign
+from .mocap.marker_selection.design import design_markers as design_markers
+from .mocap.marker_selection.fits import DesignConfig as DesignConfig
 from .mocap.marker_sets.layout import MarkerLayout as MarkerLayout
 from .mocap.marker_sets.named import layout_names as layout_names
+from .mocap.marker_sets.named import named_layout as named_layout
 from .mocap.marker_sets.symmetry import SkinMirror as SkinMirror
 from .mocap.marker_sets.symmetry import find_skin_mirror as find_skin_mirror
-from .mocap.marker_sets.transfer import (
-    CarriedLayout as CarriedLayout,
-)
-from .mocap.marker_sets.transfer import (
-    CarryConfig as CarryConfig,
-)
-from .mocap.marker_sets.transfer import (
-    carry_layout as carry_layout,
-)
-from .mocap.marker_sets.transfer import (
-    register_layout as register_layout,
-)
+from .mocap.marker_sets.transfer import TransferredLayout as TransferredLayout
+from .mocap.marker_sets.transfer import transfer_layout as transfer_layout
 from .mocap.mosh.mosh import mosh as mosh
-from .mocap.pose.follow import AnimateConfig as AnimateConfig
 from .mocap.pose.follow import animate as animate
+from .mocap.pose.settings import AnimateConfig as AnimateConfig
 from .mocap.pose.stream import Frame as Frame
 from .mocap.pose.stream import MarkerStream as MarkerStream
 from .mocap.results import MoshResult as MoshResult
 from .mocap.results import PersonFit as PersonFit
-from .mocap.retargeting.cartoons import Cartoon as Cartoon
-from .mocap.retargeting.cartoons import CartoonShape as CartoonShape
-from .mocap.retargeting.cartoons import cartoon as cartoon
 from .mocap.retargeting.retarget import morphed_vertices as morphed_vertices
 from .mocap.retargeting.retarget import retarget as retarget
 from .mocap.retargeting.soft_tissue import deformation as deformation
@@ -71,6 +56,6 @@ from .partial.completion import Completion as Completion
 from .partial.completion import complete as complete
 from .partial.masks import read_mask as read_mask
 from .partial.settings import CompletionConfig as CompletionConfig
-from .synthetic_model import embedded_model as embedded_model
+from .synthetic_people import synthetic_model as synthetic_model
 from .tracking.sequence import track as track
 from .tracking.settings import TrackConfig as TrackConfig

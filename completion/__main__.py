@@ -6,7 +6,7 @@ import sys
 from scanprep.console import dispatch
 
 COMMANDS = {
-    "demo": ("The whole chain on embedded scans; ends with a page to open.", "completion.demo.cli:demo"),
+    "demo": ("The whole chain on synthetic scans; ends with a page to open.", "completion.demo.cli:demo"),
     "prep": ("Scans -> registered meshes and a skeleton; also its single stages.", "scanprep.cli:group"),
     "learn": ("Registered meshes -> a body model.", "model.learning.cli:learn"),
     "model": ("Look into a body model and pose it.", "model.cli:group"),

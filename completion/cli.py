@@ -16,20 +16,20 @@ Out = Annotated[Path, tyro.conf.arg(aliases=["-o"])]
 
 
 def read_model(path: Path | None) -> tuple[BodyModel, str]:
-    """The model of a file, or without one that of the embedded people, and the name that reports give it.
+    """The model of a file, or without one that of the synthetic people, and the name that reports give it.
 
     The latter is built when it is first wanted, with a bar, and kept in the user's cache.
     """
     from model.files import load_model
 
-    from .synthetic_model import embedded_model, embedded_path
+    from .synthetic_people import synthetic_model, synthetic_path
 
     if path is not None:
         return load_model(path), str(path)
-    say("note: no model named; that of the embedded people, who are made and not measured, gives a first answer")
-    with bar("building the embedded people") as progress:
-        model = embedded_model(progress)
-    return model, f"embedded people, built {model.info['built']}, cached at {embedded_path()}"
+    say("note: no model named; that of the synthetic people, who are made and not measured, gives a first answer")
+    with bar("building the synthetic people") as progress:
+        model = synthetic_model(progress)
+    return model, f"synthetic people, built {model.info['built']}, cached at {synthetic_path()}"
 
 
 def read_landmark_pairs(model: BodyModel, name: str, scan: Path, template: Path | None, unit: str | None

@@ -14,14 +14,8 @@ from .linear import PointOperator, posed_product
 class ShapedPoints:
     """Surface points as a function of pose, betas and place, with derivatives.
 
-    Parameters
-    ----------
-    terms : Terms
-    template_basis, mean_basis : (M, L, 3) float, metres
-        The basis of the template's own body and of the mean person.
-    shape_basis : (K, M, L, 3) float, metres
-        Change of the basis for one standard deviation of each beta.
-    origin : (3,) float, metres
+    T of every term (M, L, 3), metres, for the template's own body and the mean person, and its change (K, M, L, 3) for
+    one standard deviation of each beta.
     """
 
     terms: Terms

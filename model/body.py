@@ -15,7 +15,7 @@ from scanprep.geometry.mesh import Mesh
 from scanprep.skeleton.tree import Skeleton
 
 from .bilinear import ShapedPoints
-from .features import Terms
+from .features import PoseFeatures, Terms
 from .linear import Subject, check_pose
 
 HERE_OR_EVERYWHERE = 0.25            # share of the vertices beyond which derivatives are made for all of them
@@ -134,6 +134,22 @@ class BodyModel(ABC):
     def save(self, path: str | Path) -> None:
         """Write the model into one `.npz` file with a JSON header."""
 
+    def _common_arrays(self, features: PoseFeatures) -> dict[str, np.ndarray]:
+        """What the files of all kinds hold."""
+        return {
+            "vertices": self.template.vertices, "faces": self.template.faces.astype(np.int32),
+            "part_of_face": self.skeleton.part_of_face.astype(np.int32), "parents": self.skeleton.parents,
+            "joints": self.skeleton.joints, "feature_part": features.part, "feature_mix": features.mix,
+            **{f"lift_{name}": array for name, array in features.lift.arrays().items()},
+            "pose_mean": self.pose_mean, "pose_covariance": self.pose_covariance,
+            "pose_examples": self.pose_examples}
+
+    def _header(self, features: PoseFeatures) -> dict[str, Any]:
+        """The header of the files of all kinds."""
+        return {"units": {"length": "metre", "angle": "radian", "betas": "standard deviation"},
+                "versions": versions(), "names": list(self.skeleton.names), "lift": features.lift.kind,
+                "info": self.info}
+
     def vertices(self, pose: np.ndarray, betas: np.ndarray | None = None, trans: np.ndarray | None = None
                  ) -> np.ndarray:
         """Vertices for one pose or a batch, the exact way.
@@ -215,10 +231,7 @@ class BodyModel(ABC):
 def restored_parts(header: Mapping[str, Any], arrays: Mapping[str, np.ndarray], version: int) -> dict[str, Any]:
     """What every kind of model has, from a file of it; pose examples where it is of this version, earlier had none.
 
-    Raises
-    ------
-    KeyError, TypeError, ValueError
-        What is missing, or does not fit the rest.
+    KeyError, TypeError or ValueError for what is missing or does not fit the rest.
     """
     J = len(np.atleast_1d(arrays["parents"]))
     skeleton = Skeleton(storage.numbers(arrays, "part_of_face", None, kinds="iu"),

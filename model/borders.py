@@ -4,8 +4,8 @@ from __future__ import annotations
 import numpy as np
 from scipy.sparse import csc_array, diags_array
 
-from scanprep.decimation.remeshing import clamped_cotangents
 from scanprep.geometry.mesh import Mesh
+from scanprep.geometry.remeshing import clamped_cotangents
 from scanprep.geometry.sparse import factor
 from scanprep.skeleton.tree import Skeleton
 
@@ -13,28 +13,11 @@ LEAST = 0.01                         # a weight below is dropped: it would cost 
 
 
 def vertex_weights(template: Mesh, skeleton: Skeleton, width: float) -> np.ndarray:
-    """How much each part carries each vertex, smooth across the borders of parts.
+    """(N, J) how much each part carries each vertex, smooth across the borders of parts, rows sum to 1.
 
-    The labels of the parts are spread over the surface by one step of diffusion. What comes from a part that is
-    not linked to the vertex's own one counts for the part on the way to it, so that a thigh never carries the
-    other one.
-
-    Parameters
-    ----------
-    template : Mesh
-    skeleton : Skeleton
-    width : float, metres
-        How far a label spreads along the surface.
-
-    Returns
-    -------
-    (N, J) float
-        Rows sum to 1.
-
-    Raises
-    ------
-    ValueError
-        A width that is not positive.
+    The labels of the parts spread over a width, metres, of surface by one step of diffusion. What comes from a part
+    that is not linked to the vertex's own one counts for the part on the way to it, so that a thigh never carries the
+    other.
     """
     if not width > 0:
         raise ValueError(f"width: expected a positive length, got {width}")

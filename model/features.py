@@ -1,7 +1,7 @@
 """What a pose model is linear in: functions of the joint twists, and their products with part rotations."""
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from functools import cached_property
 from typing import Any, Protocol
@@ -27,12 +27,7 @@ def twists(pose: np.ndarray) -> np.ndarray:
 class Lift(Protocol):
     """A fixed map of the twists of each joint to a few numbers a joint, in which a regression is linear.
 
-    Attributes
-    ----------
-    kind : str
-        The name of the map in files.
-    width : int
-        m, the numbers of each joint.
+    Its kind names it in files; width is m, the numbers of each joint.
     """
 
     kind: str
@@ -94,13 +89,7 @@ class QuadraticLift:
 
 @dataclass(frozen=True, eq=False)
 class RadialLift:
-    """The twist, and Gaussian bells around twists that were seen.
-
-    Parameters
-    ----------
-    centres : (J, m, 3) float, radians
-    radius : (J,) float, radians
-        Standard deviation of the bells of each joint.
+    """The twist, and Gaussian bells of standard deviation `radius` (J,) around twists `centres` (J, m, 3), radians.
 
     [SCAPE-patent] §0087
     """
@@ -158,14 +147,8 @@ def restored_features(skeleton: Skeleton, header: Mapping[str, Any], arrays: Map
 class PoseFeatures:
     """What Q is linear in: for every part a constant, and mixtures of the lifted twists of its joints.
 
-    Parameters
-    ----------
-    skeleton : Skeleton
-    lift : Lift
-    part : (A,) int
-        The part of every feature, in rising order; the first feature of each part is its constant.
-    mix : (J, m, A) float
-        How much each lifted number counts in each feature; zero for the constants.
+    `part` (A,) is the part of every feature, rising, the first of each its constant; `mix` (J, m, A) is how much each
+    lifted number counts in each feature, zero for the constants.
 
     [SCAPE] Eq. 3
     """
@@ -230,38 +213,36 @@ class PoseFeatures:
         return np.swapaxes(by_joint, -2, -3)
 
 
-def linear_features(skeleton: Skeleton, directions: tuple[np.ndarray, ...]) -> PoseFeatures:
-    """The features of the paper: for every part a constant and the kept twist directions of its joints.
-
-    Parameters
-    ----------
-    directions : J arrays (3, k_j)
-        Orthonormal twist directions of each joint that are kept; none for the root.
+def part_features(skeleton: Skeleton, lift: Lift, axes: Sequence[np.ndarray],
+                  joints_of_part: Sequence[Sequence[int]] | None = None) -> PoseFeatures:
+    """For every part a constant, and the mixtures `axes` (J arrays (m, k_j)) of the lifted twists of its joints.
 
     [SCAPE] Eq. 3
     """
     J = len(skeleton.parents)
     part, columns = [], []
-    for p, joints in enumerate(skeleton.joints_of_part):
-        kept = [(j, direction) for j in joints for direction in directions[j].T]
-        part += [p] * (1 + len(kept))
-        columns.append(np.zeros((J, 3)))
-        for j, direction in kept:
-            columns.append(np.zeros((J, 3)))
-            columns[-1][j] = direction
-    return PoseFeatures(skeleton, LinearLift(), np.array(part), np.stack(columns, axis=-1))
+    for p, joints in enumerate(skeleton.joints_of_part if joints_of_part is None else joints_of_part):
+        part += [p] * (1 + sum(axes[j].shape[1] for j in joints))
+        columns.append(np.zeros((J, lift.width, 1)))
+        for j in joints:
+            column = np.zeros((J, lift.width, axes[j].shape[1]))
+            column[j] = axes[j]
+            columns.append(column)
+    return PoseFeatures(skeleton, lift, np.array(part), np.concatenate(columns, axis=-1))
+
+
+def linear_features(skeleton: Skeleton, directions: Sequence[np.ndarray]) -> PoseFeatures:
+    """The features of the paper: for every part a constant and the twist directions (3, k_j) of its joints.
+
+    [SCAPE] Eq. 3
+    """
+    return part_features(skeleton, LinearLift(), directions)
 
 
 @dataclass(frozen=True, eq=False)
 class Terms:
-    """The products of a feature and a part's rotation in which the vertices of a fixed body are linear.
-
-    Parameters
-    ----------
-    features : PoseFeatures
-    part : (M,) int
-        Whose rotation.
-    feature : (M,) int
+    """The products of a `feature` (M,) and the rotation of a `part` (M,) in which the vertices of a fixed body are
+    linear.
     """
 
     features: PoseFeatures

@@ -8,7 +8,7 @@ from scanprep.geometry import storage
 
 from .body import BodyModel
 
-_KINDS = {"scape": ("scape", "ScapeModel"), "blendscape": ("blendscape", "BlendScapeModel"),
+_KINDS = {"scape": ("scape", "ScapeModel"), "blendscape": ("scape", "BlendScapeModel"),
           "skinning": ("skinning", "SkinningModel")}
 
 

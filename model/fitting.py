@@ -10,6 +10,7 @@ import numpy as np
 from scipy.optimize import OptimizeResult, minimize
 from scipy.spatial import cKDTree
 
+from scanprep.geometry.farthest_points import farthest_points
 from scanprep.geometry.least_squares import Dense, Minimum, levenberg_marquardt
 from scanprep.ranges import Count, Settings
 from scanprep.threads import one_thread
@@ -188,16 +189,7 @@ class ShapeFitter:
 
 def spread_vertices(vertices: np.ndarray, count: int) -> np.ndarray:
     """Indices (≤ count,) of vertices spread evenly, each next one farthest from those before."""
-    if count >= len(vertices):
-        return np.arange(len(vertices))
-    chosen = np.empty(count, dtype=np.int64)
-    far = np.full(len(vertices), np.inf)
-    at = int(((vertices - vertices.mean(axis=0)) ** 2).sum(axis=1).argmax())
-    for i in range(count):
-        chosen[i] = at
-        far = np.minimum(far, ((vertices - vertices[at]) ** 2).sum(axis=1))
-        at = int(far.argmax())
-    return np.sort(chosen)
+    return np.arange(len(vertices)) if count >= len(vertices) else np.sort(farthest_points(vertices, count))
 
 
 def share_of_vertices(vertices: np.ndarray, chosen: np.ndarray) -> np.ndarray:

@@ -14,16 +14,7 @@ SETTLE = 1e-4                        # pull towards I, as a share of w_s: decide
 
 
 def edges(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """The two edges of every triangle from its first vertex.
-
-    Parameters
-    ----------
-    vertices : (..., N, 3) float, metres
-    faces : (F, 3) int
-
-    Returns
-    -------
-    (..., F, 2, 3) float, metres
+    """The two edges (..., F, 2, 3) of every triangle from its first vertex.
 
     [SCAPE] Eq. 1
     """
@@ -31,38 +22,12 @@ def edges(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
     return np.stack([vertices[..., faces[:, 1], :] - first, vertices[..., faces[:, 2], :] - first], axis=-2)
 
 
-def local_edges(vertices: np.ndarray, faces: np.ndarray, R: np.ndarray) -> np.ndarray:
-    """The edges of an instance seen from the frame of each triangle's part, `Rᵀ v`.
-
-    Parameters
-    ----------
-    vertices : (..., N, 3) float, metres
-    faces : (F, 3) int
-    R : (..., F, 3, 3) float
-        Rotation of the part of every triangle.
-
-    Returns
-    -------
-    (..., F, 2, 3) float, metres
-
-    [SCAPE] Eq. 1
-    """
-    return edges(vertices, faces) @ R
-
-
 @dataclass(frozen=True, eq=False)
 class GradientSystem:
     """The least-squares systems of Eq. 5 and Eq. 8 over the triangles of one template.
 
-    One row of a gradient is three unknowns a triangle; the three rows share the matrix.
-
-    Parameters
-    ----------
-    template : Mesh
-    smoothness : float
-        The paper's 0.001; times the mean edge length in metres it is w_s.
-    parts : (F,) int, optional
-        When given, neighbours in different parts are not smoothed over.
+    One row of a gradient is three unknowns a triangle; the three rows share the matrix. With `parts` (F,), neighbours
+    in different parts are not smoothed over. The smoothness times the mean edge length in metres is w_s.
 
     [SCAPE] Eq. 5
     """
@@ -108,18 +73,7 @@ class GradientSystem:
 
 
 def pose_gradients(system: GradientSystem, local: np.ndarray) -> np.ndarray:
-    """Q of every triangle in every pose, all instances from one factorisation.
-
-    Parameters
-    ----------
-    system : GradientSystem
-        With the parts, so that only neighbours in one part are smoothed.
-    local : (M, F, 2, 3) float, metres
-        Edges of the instances in the frames of their parts.
-
-    Returns
-    -------
-    (M, F, 3, 3) float
+    """Q (M, F, 3, 3) of every triangle from edges (M, F, 2, 3) in the frames of the parts, from one factorisation.
 
     [SCAPE] Eq. 5
     """
@@ -136,20 +90,10 @@ def pose_gradients(system: GradientSystem, local: np.ndarray) -> np.ndarray:
 
 
 def shape_gradients(system: GradientSystem, posed: np.ndarray, local: np.ndarray) -> np.ndarray:
-    """S of every triangle of one person.
+    """S (F, 3, 3) of one person from edges `local` in the frames of the parts and `posed`, `Q v̂`, both (F, 2, 3),
+    metres.
 
-    Parameters
-    ----------
-    system : GradientSystem
-        Without parts: all neighbours are smoothed.
-    posed : (F, 2, 3) float, metres
-        `Q v̂` at the person's pose; (F, 2n, 3) for n scans of one person together.
-    local : as posed
-        Edges of the person's scan in the frames of the parts.
-
-    Returns
-    -------
-    (F, 3, 3) float
+    Or (F, 2n, 3) for n scans of one person together.
 
     [SCAPE] Eq. 8
     """
@@ -157,14 +101,7 @@ def shape_gradients(system: GradientSystem, posed: np.ndarray, local: np.ndarray
 
 
 class ShapeSolver:
-    """Eq. 8 for one person, factored once.
-
-    The matrix holds the person's own `Q v̂`, so every person has a factorisation of their own.
-
-    Parameters
-    ----------
-    system, posed
-        As for `shape_gradients`.
+    """Eq. 8 for one person, factored once: the matrix holds the person's own `Q v̂`, as for `shape_gradients`.
 
     [SCAPE] Eq. 8
     """

@@ -84,7 +84,9 @@ class PointOperator:
         (L, 3) or (B, L, 3) float, metres
         """
         pose, trans = check_pose(self.terms.skeleton, pose, trans)
-        return np.swapaxes(posed_product(self.terms, self._flat, pose), -1, -2) + (self.origin + trans)[..., None, :]
+        y = posed_product(self.terms, self._flat, pose)
+        y += (self.origin + trans)[..., None].astype(y.dtype)
+        return np.swapaxes(y, -1, -2)
 
     def jacobian(self, pose: np.ndarray, trans: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
         """Positions and their derivatives with respect to the pose parameters.
@@ -171,8 +173,8 @@ class Subject:
         return self.basis.shape[1]
 
     @cached_property
-    def _flat(self) -> np.ndarray:
-        return np.ascontiguousarray(self.basis.transpose(0, 2, 1)).reshape(-1, self.n_vertices)
+    def _all(self) -> PointOperator:
+        return PointOperator(self.terms, self.basis, self.origin)
 
     def vertices(self, poses: np.ndarray, trans: np.ndarray | None = None) -> np.ndarray:
         """Vertices for one pose or a batch.
@@ -186,10 +188,7 @@ class Subject:
         -------
         (N, 3) or (B, N, 3) float of the subject's dtype, metres
         """
-        poses, trans = check_pose(self.skeleton, poses, trans)
-        y = posed_product(self.terms, self._flat, poses)
-        y += (self.origin + trans)[..., None].astype(y.dtype)
-        return np.swapaxes(y, -1, -2)
+        return self._all.evaluate(poses, trans)
 
     def points(self, vertex_ids: np.ndarray, weights: np.ndarray | None = None) -> PointOperator:
         """Some surface points of the body.

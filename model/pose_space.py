@@ -14,13 +14,7 @@ from .features import PoseFeatures, linear_features, twists
 
 @dataclass(frozen=True, eq=False)
 class PoseSpace:
-    """Q of every triangle as a linear function of the features of its part.
-
-    Parameters
-    ----------
-    features : PoseFeatures
-    coefficients : J arrays (n_p, F_p, 3, 3)
-        For each part: feature × triangle of the part, in the order of the faces.
+    """Q of every triangle as a linear function of the features of its part: J arrays (n_p, F_p, 3, 3) of coefficients.
 
     [SCAPE] Eq. 3
     """
@@ -79,17 +73,7 @@ def nearest_joints(template: Mesh, skeleton: Skeleton, count: int = 2) -> np.nda
 
 
 def kept_directions(poses: np.ndarray, threshold: float) -> tuple[np.ndarray, ...]:
-    """Principal twist directions of every joint whose variance reaches a threshold.
-
-    Parameters
-    ----------
-    poses : (M, J, 3) float, radians
-    threshold : float, square radians
-
-    Returns
-    -------
-    J arrays (3, k_j)
-        Orthonormal, largest variance first; none for the root.
+    """J arrays (3, k_j): principal twist directions of variance at or above a threshold, rad², the largest first.
 
     [SCAPE] §4.2
     """

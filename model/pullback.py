@@ -14,21 +14,9 @@ from .scape import ScapeModel
 @singledispatch
 def pull_back(model: BodyModel, force: np.ndarray, pose: np.ndarray, betas: np.ndarray
               ) -> tuple[np.ndarray, np.ndarray]:
-    """Gradient of a function of the vertices with respect to pose and betas.
+    """Gradient (3J,), (k,) by pose (J, 3) and betas (k,) of a function with gradient `force` (N, 3) by the vertices.
 
     It costs about as much as the vertices themselves, where derivatives of all vertices cost twenty times that.
-
-    Parameters
-    ----------
-    model : BodyModel
-    force : (N, 3) float
-        Gradient with respect to the vertices; its sum over them is that with respect to trans.
-    pose : (J, 3) float, radians
-    betas : (k,) float, k ≤ K
-
-    Returns
-    -------
-    (3J,), (k,) float
     """
     found = model.jacobian(pose, betas)
     return np.einsum("nd,ndp->p", force, found.pose), np.einsum("nd,ndk->k", force, found.betas)
@@ -36,8 +24,8 @@ def pull_back(model: BodyModel, force: np.ndarray, pose: np.ndarray, betas: np.n
 
 @pull_back.register
 def _(model: ScapeModel, force: np.ndarray, pose: np.ndarray, betas: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    skeleton, space, weights = model.skeleton, model.pose_space, model.rotation_weights
-    R, v_hat, Q = skeleton.part_rotations(pose), model._v_hat, space.gradients(pose)
+    skeleton, space, weights = model.skeleton, model.pose_space, model.blend_weights
+    R, v_hat, Q = skeleton.part_rotations(pose), model.parts.v_hat, space.gradients(pose)
     pulled = (model.stitching.edge_operator @ model.stitching.solve_adjoint(force)).reshape(-1, 2, 3)
     S, posed = model.shape_space.gradients(betas), v_hat @ np.swapaxes(Q, -1, -2)                 # rows (Q v̂)ᵀ
     local = pulled @ np.tensordot(weights, R, axes=1)                                            # rows (Rᵀ z)ᵀ

@@ -6,8 +6,8 @@ from collections.abc import Callable
 import numpy as np
 
 from scanprep.geometry.mesh import Mesh
+from scanprep.pictures.camera import look_around
 from scanprep.pictures.shading import Bones, Dots, Shape, Solid, part_colors, render, side_by_side
-from scanprep.pictures.views import look_around
 from scanprep.skeleton.tree import Skeleton
 
 from .body import BodyModel

@@ -1,4 +1,4 @@
-"""SCAPE: rotations of parts, deformation by pose and by person, stitched into a surface."""
+"""SCAPE and BlendSCAPE: rotations of parts, deformation by pose and by person, stitched into a surface."""
 from __future__ import annotations
 
 from dataclasses import dataclass, field
@@ -13,10 +13,9 @@ from scanprep.geometry.mesh import Mesh
 from scanprep.skeleton.tree import Skeleton
 
 from .bilinear import ShapedPoints
-from .body import BodyModel, restored_parts, restored_variances, versions
-from .carriers import Carrier, build_basis, build_shaped_points, carried_terms, make_carriers, rigid_weights
+from .blending import BlendedTemplate, rigid_weights
+from .body import BodyModel, restored_parts, restored_variances
 from .features import PoseFeatures, Terms, linear_features, restored_features
-from .gradients import edges
 from .linear import check_pose
 from .pose_space import PoseSpace
 from .shape_space import ShapeSpace
@@ -68,27 +67,23 @@ class ScapeModel(BodyModel):
         return self.shape_space.explained
 
     @property
-    def rotation_weights(self) -> np.ndarray:
-        """(F, J) how much each rotation carries of each triangle: all of it the one of its own part."""
+    def blend_weights(self) -> np.ndarray:
+        """(F, J) how much each rotation counts for each triangle: only the one of its own part does."""
         return rigid_weights(self.skeleton)
 
     @cached_property
-    def carriers(self) -> list[Carrier]:
-        """Which rotations carry which triangles."""
-        return make_carriers(self.skeleton, self.rotation_weights)
+    def parts(self) -> BlendedTemplate:
+        """The template with the rotations that its triangles follow."""
+        return BlendedTemplate(self.template, self.skeleton, self.blend_weights)
+
+    @property
+    def stitching(self) -> StitchingSystem:
+        """The stitching system of the template, factored once."""
+        return self.parts.stitching
 
     @cached_property
     def terms(self) -> Terms:
-        return carried_terms(self.pose_space.features, self.carriers)
-
-    @cached_property
-    def stitching(self) -> StitchingSystem:
-        """The stitching system of the template, factored once."""
-        return StitchingSystem(self.template, self.skeleton)
-
-    @cached_property
-    def _v_hat(self) -> np.ndarray:
-        return edges(self.template.vertices, self.template.faces)
+        return self.parts.terms(self.pose_space.features)
 
     @cached_property
     def _components_by_face(self) -> np.ndarray:
@@ -96,23 +91,22 @@ class ScapeModel(BodyModel):
         U = self.shape_space.components
         return np.ascontiguousarray(U.transpose(1, 2, 0, 3)).reshape(U.shape[1], -1, 3)
 
-    def _posed(self, pose: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Rotation (F, 3, 3), or mixture of rotations, and `Q v̂` (F, 2, 3) of every triangle at one pose."""
-        R = np.tensordot(self.rotation_weights, self.skeleton.part_rotations(pose), axes=1)
-        return R, self._v_hat @ np.swapaxes(self.pose_space.gradients(pose), -1, -2)
+    def posed_edges(self, pose: np.ndarray) -> np.ndarray:
+        """`Q v̂` (F, 2, 3) of every triangle at one pose (J, 3)."""
+        return self.parts.posed(self.pose_space.gradients(pose))
 
     def vertices_of(self, pose: np.ndarray, betas: np.ndarray | None) -> np.ndarray:
         """By the sparse solve.
 
         [SCAPE] Eq. 6, Eq. 9
         """
-        R, posed = self._posed(pose)
-        return self.stitching.stitch(posed @ np.swapaxes(R @ self.shape_space.gradients(betas), -1, -2))
+        RS = self.parts.rotations(pose) @ self.shape_space.gradients(betas)
+        return self.stitching.stitch(self.posed_edges(pose) @ np.swapaxes(RS, -1, -2))
 
     @cached_property
     def _posed_coefficients(self) -> list[np.ndarray]:
         """For each part (n_p, F_p * 6): `Q v̂` of its triangles, one row a feature."""
-        return [(self._v_hat[faces] @ np.swapaxes(a.astype(np.float64), -1, -2)).reshape(len(a), -1)
+        return [(self.parts.v_hat[faces] @ np.swapaxes(a.astype(np.float64), -1, -2)).reshape(len(a), -1)
                 for a, faces in zip(self.pose_space.coefficients, self.pose_space.faces_of_part, strict=True)]
 
     def bodies_of(self, poses: np.ndarray, betas: np.ndarray) -> np.ndarray:
@@ -128,24 +122,22 @@ class ScapeModel(BodyModel):
             posed = delta[:, self.pose_space.features.of_part(p)] @ self._posed_coefficients[p]
             S = self.shape_space.some_gradients(betas, faces)
             shaped[:, faces] = posed.reshape(B, -1, 2, 3) @ np.swapaxes(S, -1, -2)
-        for carrier in self.carriers:
-            faces = self.pose_space.faces_of_part[carrier.part][carrier.chosen]
-            turned = shaped[:, faces].reshape(B, -1, 3) @ np.swapaxes(R[:, carrier.turned_by], -1, -2)
-            edges[:, faces] += carrier.weights[:, None, None] * turned.reshape(B, -1, 2, 3)
+        for block in self.parts.blocks:
+            faces = self.pose_space.faces_of_part[block.part][block.chosen]
+            rotated = shaped[:, faces].reshape(B, -1, 3) @ np.swapaxes(R[:, block.rotation], -1, -2)
+            edges[:, faces] += block.weights[:, None, None] * rotated.reshape(B, -1, 2, 3)
         return self.stitching.stitch(edges)
 
     def basis(self, betas: np.ndarray | None = None) -> np.ndarray:
-        return build_basis(self.stitching, self.template, self.pose_space, self.shape_space.gradients(betas),
-                           self.carriers)
+        return self.parts.basis(self.pose_space, self.shape_space.gradients(betas))
 
     def points(self, vertex_ids: np.ndarray, weights: np.ndarray | None = None, n_betas: int | None = None
                ) -> ShapedPoints:
-        return build_shaped_points(self.stitching, self.template, self.pose_space, self.shape_space.first(n_betas),
-                                   self.carriers, self.skeleton.joints[0], vertex_ids, weights)
+        return self.parts.points(self.pose_space, self.shape_space.first(n_betas), vertex_ids, weights)
 
     def shape_jacobian(self, pose: np.ndarray, vertex_ids: np.ndarray | None = None) -> np.ndarray:
         pose, _ = check_pose(self.skeleton, pose, None)
-        R, posed = self._posed(pose)
+        R, posed = self.parts.rotations(pose), self.posed_edges(pose)
         K, F = self.n_betas, len(R)
         if not K:
             return np.zeros((self.template.vertices.shape[0] if vertex_ids is None else len(vertex_ids), 3, 0))
@@ -156,25 +148,15 @@ class ScapeModel(BodyModel):
         return y if vertex_ids is None else y[vertex_ids]
 
     def _arrays(self) -> dict[str, np.ndarray]:
-        """What the file holds."""
-        features = self.pose_space.features
         return {
-            "vertices": self.template.vertices, "faces": self.template.faces.astype(np.int32),
-            "part_of_face": self.skeleton.part_of_face.astype(np.int32), "parents": self.skeleton.parents,
-            "joints": self.skeleton.joints, "feature_part": features.part, "feature_mix": features.mix,
-            **{f"lift_{name}": array for name, array in features.lift.arrays().items()},
+            **self._common_arrays(self.pose_space.features),
             "pose_coefficients": np.concatenate([a.ravel() for a in self.pose_space.coefficients]),
             "shape_mean": self.shape_space.mean, "shape_components": self.shape_space.components,
             "shape_variances": self.shape_space.variances,
-            "shape_total_variance": np.array(self.shape_space.total_variance),
-            "pose_mean": self.pose_mean, "pose_covariance": self.pose_covariance,
-            "pose_examples": self.pose_examples}
+            "shape_total_variance": np.array(self.shape_space.total_variance)}
 
     def save(self, path: str | Path) -> None:
-        header = {"units": {"length": "metre", "angle": "radian", "betas": "standard deviation"},
-                  "versions": versions(), "names": list(self.skeleton.names),
-                  "lift": self.pose_space.features.lift.kind, "info": self.info}
-        storage.save(path, self.kind, VERSION, self._arrays(), header)
+        storage.save(path, self.kind, VERSION, self._arrays(), self._header(self.pose_space.features))
 
     @classmethod
     def load(cls, path: str | Path) -> ScapeModel:
@@ -213,3 +195,38 @@ def _restored_features(skeleton: Skeleton, header: dict[str, Any], a: dict[str, 
         directions = storage.numbers(a, "directions", int(count.sum()), 3)
         return linear_features(skeleton, tuple(np.split(directions.T, np.cumsum(count)[:-1], axis=1)))
     return restored_features(skeleton, header, a)
+
+
+@dataclass(frozen=True, eq=False, repr=False)
+class BlendScapeModel(ScapeModel):
+    """A SCAPE model in which triangles near a border follow a mixture of rotations.
+
+    An edge is `Σ_p w_kp R_p S_k Q_k v̂`; all else is as in SCAPE.
+
+    Parameters
+    ----------
+    blend : (F, J) float
+        Weights of the rotations, rows sum to 1; each triangle has a share of its own part.
+
+    [BlendSCAPE]
+    """
+
+    blend: np.ndarray = field(kw_only=True)
+
+    kind: ClassVar[str] = "blendscape"
+
+    def __post_init__(self) -> None:
+        shape = (len(self.template.faces), len(self.skeleton.parents))
+        if self.blend.shape != shape or not np.allclose(self.blend.sum(axis=1), 1, atol=1e-6):
+            raise ValueError(f"blend: expected shape {shape} with rows that sum to 1, got {self.blend.shape}")
+
+    @property
+    def blend_weights(self) -> np.ndarray:
+        return self.blend
+
+    def _arrays(self) -> dict[str, np.ndarray]:
+        return {**super()._arrays(), "blend": self.blend}
+
+    @classmethod
+    def _extra(cls, a: dict[str, np.ndarray]) -> dict[str, Any]:
+        return {"blend": storage.numbers(a, "blend", None, None)}

@@ -8,18 +8,9 @@ import numpy as np
 
 @dataclass(frozen=True, eq=False)
 class ShapeSpace:
-    """S of every triangle as mean plus components.
+    """S of every triangle as mean (F, 3, 3) plus components (K, F, 3, 3), each for one standard deviation of a beta.
 
-    Parameters
-    ----------
-    mean : (F, 3, 3) float
-        The mean person.
-    components : (K, F, 3, 3) float
-        Change of S for one standard deviation of each component.
-    variances : (K,) float
-        Variance of S over the training set along each component, largest first.
-    total_variance : float
-        Variance of S over the training set in all directions.
+    With the variance of S over the training set along each component (K,), largest first, and in all directions.
 
     [SCAPE] Eq. 7
     """
@@ -71,7 +62,7 @@ class ShapeSpace:
 
         [SCAPE] Eq. 7
         """
-        flat = self.components.reshape(self.count, -1)
+        flat = self.components.reshape(self.count, self.mean.size)
         return np.stack([flat @ (one - self.mean).ravel() for one in S]) / (flat**2).sum(axis=1)
 
     def first(self, count: int | None) -> ShapeSpace:
@@ -86,13 +77,7 @@ class ShapeSpace:
 
 
 def learn_shape_space(S: np.ndarray, components: int) -> ShapeSpace:
-    """Principal components of the shape deformations of a set of people.
-
-    Parameters
-    ----------
-    S : (P, F, 3, 3) float
-    components : int
-        Fewer are returned where the people do not span as many.
+    """Principal components of shape deformations (P, F, 3, 3), fewer where the people do not span as many.
 
     [SCAPE] Eq. 7
     """

@@ -14,11 +14,12 @@ from scanprep.geometry.mesh import Mesh
 from scanprep.skeleton.tree import Skeleton
 
 from .bilinear import ShapedPoints
-from .body import BodyModel, restored_parts, restored_variances, versions
+from .body import BodyModel, restored_parts, restored_variances
 from .features import PoseFeatures, Terms, restored_features
 from .linear import check_points, check_pose
 
 VERSION = 2                          # 1 had no pose examples
+SOFTEST = 0.2                        # a mean of rotations that shrinks further is not undone
 
 
 @dataclass(frozen=True, eq=False, repr=False)
@@ -214,20 +215,24 @@ class SkinningModel(BodyModel):
         ids = np.arange(len(self.rest)) if vertex_ids is None else np.asarray(vertex_ids)
         return slope(ids) - np.tensordot(share, slope(ring), axes=1)
 
+    def unposed(self, vertices: np.ndarray, pose: np.ndarray) -> np.ndarray:
+        """(N, 3) rest vertices that the model carries onto a body (N, 3) exactly, joints of their own included.
+
+        The root's joint is where the template has it. `x = B⁻¹ (y - Σ_j below_j turn_j j_j) - c` with joints j = A x is
+        first solved for the joints alone.
+        """
+        back, A, J = unblended(self.blended(pose)), self.joint_regressor, len(pose)
+        bare = np.einsum("nij,nj->ni", back, vertices) - self.corrections(pose)
+        pull = np.einsum("nj,nik,jkl->nijl", self.below, back, self.joint_turns(pose)).reshape(len(vertices), -1)
+        coupling = (A @ pull).reshape(3 * J, 3 * J)
+        joints = np.linalg.solve(np.eye(3 * J) + coupling, (A @ bare).ravel())
+        x = bare - (pull.reshape(-1, 3 * J) @ joints).reshape(-1, 3)
+        return np.asarray(x + self.skeleton.joints[0] - (A @ x)[0])
+
     def save(self, path: str | Path) -> None:
-        header = {"units": {"length": "metre", "angle": "radian", "betas": "standard deviation"},
-                  "versions": versions(), "names": list(self.skeleton.names), "lift": self.features.lift.kind,
-                  "info": self.info}
-        arrays = {
-            "vertices": self.template.vertices, "faces": self.template.faces.astype(np.int32),
-            "part_of_face": self.skeleton.part_of_face.astype(np.int32), "parents": self.skeleton.parents,
-            "joints": self.skeleton.joints, "feature_part": self.features.part, "feature_mix": self.features.mix,
-            **{f"lift_{name}": array for name, array in self.features.lift.arrays().items()},
-            "pose_examples": self.pose_examples,
-            **{name: getattr(self, name) for name in _STORED},
-            "shape_variances": self.shape_variances, "shape_total": np.asarray(self.shape_total),
-            "pose_mean": self.pose_mean, "pose_covariance": self.pose_covariance}
-        storage.save(path, self.kind, VERSION, arrays, header)
+        arrays = {**self._common_arrays(self.features), **{name: getattr(self, name) for name in _STORED},
+                  "shape_variances": self.shape_variances, "shape_total": np.asarray(self.shape_total)}
+        storage.save(path, self.kind, VERSION, arrays, self._header(self.features))
 
     @classmethod
     def load(cls, path: str | Path) -> SkinningModel:
@@ -241,3 +246,13 @@ class SkinningModel(BodyModel):
 
 
 _STORED = {"rest": 2, "weights": 2, "correctives": 3, "shape_mean": 2, "shape_components": 3}
+
+
+def unblended(B: np.ndarray) -> np.ndarray:
+    """Inverses (N, 3, 3) of means of rotations, gently where they have collapsed."""
+    flat = np.linalg.det(B) < SOFTEST
+    if flat.any():
+        U, s, Vt = np.linalg.svd(B[flat])
+        B = B.copy()
+        B[flat] = (U * np.maximum(s, SOFTEST)[:, None]) @ Vt
+    return np.linalg.inv(B)

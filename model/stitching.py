@@ -12,16 +12,10 @@ from scanprep.skeleton.tree import Skeleton
 
 
 class StitchingSystem:
-    """The least-squares fit of vertices to edges, factored once for a triangulation.
+    """The least-squares fit of vertices to edges, factored once for a triangulation of one component.
 
-    Edges say nothing of where the body stands: the root's joint (the centroid of the vertices of part 0) is put
-    in the origin, and callers add the place.
-
-    Parameters
-    ----------
-    template : Mesh
-        One connected component.
-    skeleton : Skeleton
+    Edges say nothing of where the body stands: the root's joint (the centroid of the vertices of part 0) is put in the
+    origin, and callers add the place.
 
     [SCAPE] Eq. 2
     """
@@ -54,16 +48,7 @@ class StitchingSystem:
         return self._factored.solve(pick - np.outer(self.root_weights, pick.sum(axis=0)))
 
     def stitch(self, edges: np.ndarray) -> np.ndarray:
-        """Vertices whose edges come closest to the wanted ones in the least-squares sense.
-
-        Parameters
-        ----------
-        edges : (..., F, 2, 3) float, metres
-
-        Returns
-        -------
-        (..., N, 3) float, metres
-            The root's joint lies in the origin.
+        """Vertices (..., N, 3) whose edges come closest to the wanted ones (..., F, 2, 3) in the least-squares sense.
 
         [SCAPE] Eq. 2, Eq. 9
         """

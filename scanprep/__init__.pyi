@@ -14,7 +14,7 @@ from .dataset import RegisteredSet as RegisteredSet
 from .decimation.decimate import decimate as decimate
 from .decimation.registered_set import DecimateSetConfig as DecimateSetConfig
 from .decimation.registered_set import decimate_set as decimate_set
-from .decimation.registered_set_files import write_decimated_set as write_decimated_set
+from .decimation.registered_set import write_decimated_set as write_decimated_set
 from .fusion.tsdf import merge_views as merge_views
 from .geometry.files import (
     MeshFileError as MeshFileError,
@@ -41,8 +41,8 @@ from .geometry.landmarks import (
     write_landmarks as write_landmarks,
 )
 from .geometry.mesh import Mesh as Mesh
-from .registration.nonrigid import RegistrationConfig as RegistrationConfig
 from .registration.nonrigid import register as register
+from .registration.schedule import RegistrationConfig as RegistrationConfig
 from .repair.hole_filling import fill_holes as fill_holes
 from .skeleton.edit import (
     apply_edits as apply_edits,
@@ -63,8 +63,8 @@ from .skeleton.edit import (
     split_part as split_part,
 )
 from .skeleton.find import SkeletonConfig as SkeletonConfig
+from .skeleton.find import SkeletonSearch as SkeletonSearch
 from .skeleton.find import find_skeleton as find_skeleton
+from .skeleton.find import search_skeleton as search_skeleton
 from .skeleton.names import name_parts as name_parts
-from .skeleton.search import SkeletonSearch as SkeletonSearch
-from .skeleton.search import search_skeleton as search_skeleton
 from .skeleton.tree import Skeleton as Skeleton

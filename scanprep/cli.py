@@ -27,13 +27,13 @@ COMMANDS = {
             "scanprep.pipeline.cli:run_all"),
     "page": ("The page of a registered set: every scan with pictures and figures, worst first.",
              "scanprep.pipeline.cli:page"),
-    "clean": ("Floor, furniture and specks off a raw scan.", "scanprep.cleaning.cli:clean"),
-    "template": ("Range views with known cameras -> a closed template.", "scanprep.cleaning.cli:template_of_views"),
-    "views": ("Bring range views into one frame.", "scanprep.cleaning.cli:align_cameras"),
-    "merge": ("Range views with known cameras -> one surface.", "scanprep.cleaning.cli:merge"),
-    "fill": ("Close the holes of a mesh.", "scanprep.cleaning.cli:fill"),
-    "decimate": ("Fewer triangles for the same surface.", "scanprep.cleaning.cli:reduce"),
-    "decimate-set": ("A registered set in fewer triangles.", "scanprep.cleaning.cli:reduce_set"),
+    "clean": ("Floor, furniture and specks off a raw scan.", "scanprep.surfaces.cli:clean"),
+    "template": ("Range views with known cameras -> a closed template.", "scanprep.surfaces.cli:template_of_views"),
+    "views": ("Bring range views into one frame.", "scanprep.surfaces.cli:align_cameras"),
+    "merge": ("Range views with known cameras -> one surface.", "scanprep.surfaces.cli:merge"),
+    "fill": ("Close the holes of a mesh.", "scanprep.surfaces.cli:fill"),
+    "decimate": ("Fewer triangles for the same surface.", "scanprep.surfaces.cli:reduce"),
+    "decimate-set": ("A registered set in fewer triangles.", "scanprep.surfaces.cli:reduce_set"),
     "align": ("Move one scan rigidly onto another.", "scanprep.registration.cli:align"),
     "correspond": ("From a few landmarks, or none, to nearly two hundred pairs of places.",
                    "scanprep.registration.cli:correspond"),
@@ -64,18 +64,6 @@ def read_poses(folder: Path, template: Path | None, subject: str | None, unit: U
     if not np.array_equal(body.faces, found.faces):
         raise ValueError(f"{template}: expected the triangles of the meshes in {folder}; it has other ones")
     return body, found.vertices
-
-
-def landmarks_beside(template: Path) -> Path:
-    """The landmark file of a template: that of its name, or `landmarks.json`, beside it."""
-    stem = template.name.split(".")[0]
-    for ending in (".landmarks.json", ".json", ".pp", "_picked_points.pp", ".mrk.json"):
-        if (template.parent / (stem + ending)).is_file():
-            return template.parent / (stem + ending)
-    if (template.parent / "landmarks.json").is_file():
-        return template.parent / "landmarks.json"
-    raise ValueError(f"{template}: expected its landmarks in {stem}.landmarks.json beside it; "
-                     "name the file with --template-landmarks")
 
 
 def about_mesh(mesh: Mesh) -> list[Metric]:

@@ -8,13 +8,12 @@ import numpy as np
 from completion_bodies import MEAN, SD
 from model_bodies import worm, worm_model, worm_skeleton
 
-from model.blendscape import BlendScapeModel
 from model.body import BodyModel
 from model.features import Lift, PoseFeatures, QuadraticLift, RadialLift
-from model.learning.skin import SkinConfig, corrective_features
 from model.learning.skin_weights import diffused_weights
+from model.learning.skinning import corrective_features
 from model.pose_space import PoseSpace
-from model.scape import ScapeModel
+from model.scape import BlendScapeModel, ScapeModel
 from model.skinning import SkinningModel
 from scanprep.geometry.mesh import Mesh
 from scanprep.skeleton.tree import Skeleton
@@ -64,12 +63,12 @@ def blendscape_worm() -> BlendScapeModel:
                            m.info, blend=blend)
 
 
-def skinned_worm(correctives: str) -> SkinningModel:
+def skinned_worm(correctives: bool) -> SkinningModel:
     """A skinned worm with random smooth correctives around the joints, and people who are waves on its skin."""
     template, rng = outward(worm()), np.random.default_rng(2)
     skeleton = worm_skeleton(template)
     poses = rng.normal(0, 0.5, (20, 4, 3))
-    features = corrective_features(skeleton, poses, SkinConfig(correctives=correctives))
+    features = corrective_features(skeleton, poses, correctives)
     x = template.vertices
     joint = features.uses[features.constant == 0].argmax(axis=1)
     far = np.linalg.norm(x - skeleton.joints[joint][:, None], axis=2)
@@ -106,6 +105,6 @@ KINDS: dict[str, Callable[[], BodyModel]] = {
     "scape-quadratic": lambda: scape_worm(QuadraticLift()),
     "scape-radial": lambda: scape_worm(radial_lift()),
     "blendscape": blendscape_worm,
-    "skinning-plain": lambda: skinned_worm("none"),
-    "skinning-quadratic": lambda: skinned_worm("quadratic"),
+    "skinning-plain": lambda: skinned_worm(False),
+    "skinning-linear": lambda: skinned_worm(True),
 }

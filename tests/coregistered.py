@@ -1,27 +1,25 @@
 """Co-registration in haste; started as a program it is `scape model coregister` with one round."""
 import sys
-from dataclasses import replace
-from functools import partial
 from unittest import mock
 
 from model.coregistration import cli
 from model.coregistration.config import CoregistrationConfig, ModelFitConfig
-from model.learning.scape import LearnConfig
+from model.learning.config import LearnConfig
 from scanprep import console
 from scanprep.batch.pool import Workers
-from scanprep.registration.schedule import GraphStage, RegistrationConfig, ShellStage
+from scanprep.registration.schedule import GraphStage, RegistrationConfig
 
 QUICK = CoregistrationConfig(
     fit=ModelFitConfig(axes=2, turns=2),
     registration=RegistrationConfig(graph=(GraphStage(80, 0.09, 0.009, 0.7, 0.01, 0.08),
-                                           GraphStage(80, 0.06, 0.006, 0.7, 0.01, 0.05)),
-                                    shell=(ShellStage(0.02, 0.007, 0.0002, 0.02),), settle=None),
-    learn=LearnConfig(refinements=1, steps=1), rounds=2, workers=Workers(1))
+                                           GraphStage(80, 0.06, 0.006, 0.7, 0.01, 0.05))),
+    learn=LearnConfig(refinements=1), rounds=2, workers=Workers(1))
 
 
 def run(argv):
     """Exit code of the command."""
-    with mock.patch.object(cli, "CoregistrationConfig", partial(replace, QUICK)):
+    quick = (*cli.coregister_scans.__defaults__[:-1], QUICK)
+    with mock.patch.object(cli.coregister_scans, "__defaults__", quick):
         return console.run(cli.coregister_scans, "scape model coregister", ["--rounds", "1", "--failed", "0.05", *argv])
 
 

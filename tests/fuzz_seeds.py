@@ -19,18 +19,16 @@ from completion.mocap.results import SoftTissue
 from completion.motion import Motion
 from completion.partial.completion import Completion, load_completion, save_completion
 from completion.partial.masks import read_mask
-from model.cli import _read_betas, _read_turns
 from model.export.bvh import write_bvh
 from model.export.bvh_read import read_bvh
 from model.export.cli import read_motion
 from model.files import load_model
 from model.learning.cli import _read_sexes
+from model.posing.cli import _read_betas, _read_turns
 from scanprep import Mesh, RegisteredSet, read_landmarks, read_mesh, write_landmarks, write_mesh
-from scanprep.cleaning.cli import _read_views
 from scanprep.correspondence.correspondences import Correspondences
 from scanprep.correspondence.files import read_correspondences, write_correspondences
-from scanprep.decimation.registered_set import DecimateSetConfig
-from scanprep.decimation.registered_set_files import _load_map, write_decimated_set
+from scanprep.decimation.registered_set import DecimateSetConfig, _load_map, write_decimated_set
 from scanprep.geometry import storage
 from scanprep.geometry.files import PointCloud, read_points, write_points
 from scanprep.geometry.landmarks import read_landmark_vertices
@@ -38,6 +36,7 @@ from scanprep.pictures.textures import Texture, read_texture, write_textured
 from scanprep.pipeline.scans import find_scans
 from scanprep.skeleton.edit import read_edits
 from scanprep.skeleton.tree import Skeleton
+from scanprep.surfaces.cli import _read_views
 from scanprep.synthetic.anatomy import BodyShape
 from scanprep.synthetic.data_set import GroundTruth, _write_views, read_views
 from scanprep.synthetic.scanner import RangeView, Scan
@@ -288,7 +287,7 @@ def _add_tables(body: Mesh, place: Any, add: Any, text: Any) -> None:
             write_mesh(place(f"body{k}.ply"), body)
         text("scans.csv", content, scans)
     write_mesh(place("people/body0.ply"), body)
-    text("sexes.csv", "name,sex\nbody0,female\nbody1,male\n", lambda path: _read_sexes(path.parent / "people", path))
+    text("people/sexes.csv", "name,sex\nbody0,female\nbody1,male\n", lambda path: _read_sexes(path.parent))
     text("subjects.csv", "file;subject\r\nwalk.c3d;Zoë\r\nrun.c3d;Zoë\r\n".encode("cp1252"), _table_rows)
     text("subjects.json", '{"walk.c3d": "ann", "run.c3d": 5}', _table_rows)
     text("betas.json", '{"betas": [0.5, -1, 2e-1]}', _read_betas, finite)

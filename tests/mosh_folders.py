@@ -12,9 +12,8 @@ import numpy as np
 import pytest
 from completion_bodies import MEAN, worm_with_prior
 
-from completion import MarkerLayout, MarkerSequence, write_markers
+from completion import MarkerLayout, MarkerSequence, motion_pictures, write_markers
 from completion.__main__ import main
-from completion.mocap.animate import report as animation_report
 from completion.mocap.mosh import cli, pictures, report
 from completion.mocap.mosh.work import Work
 from scanprep.batch.workspace import HOME
@@ -67,7 +66,7 @@ def run(place, *words, quick=QUICK):
 def small_pictures():
     """Nobody looks at them here."""
     with pytest.MonkeyPatch.context() as patch:
-        for module in (report, pictures, animation_report):
+        for module in (report, pictures, motion_pictures):
             patch.setattr(module, "render", lambda *_rest, **_named: np.full((30, 20, 3), 255, dtype=np.uint8))
         yield
 

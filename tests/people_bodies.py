@@ -1,19 +1,19 @@
-"""A small model of the embedded people, for the tests of markers: made once a process, in a few seconds."""
+"""A small model of the synthetic people, for the tests of markers: made once a process, in a few seconds."""
 from __future__ import annotations
 
 from functools import lru_cache
 
 import numpy as np
 
-from completion.synthetic_model import EmbeddedRecipe, build_embedded
+from completion.synthetic_people import SyntheticRecipe, build_synthetic
 from model.body import BodyModel
-from model.learning.scape import LearnConfig
+from model.learning.config import LearnConfig
 
 
 @lru_cache(maxsize=1)
 def small_people() -> BodyModel:
     """16 parts, four betas, a thousand vertices."""
-    return build_embedded(EmbeddedRecipe(poses=12, people=8, faces=2000,
+    return build_synthetic(SyntheticRecipe(poses=12, people=8, faces=2000,
                                          learn=LearnConfig(components=4, refinements=0)), None)
 
 

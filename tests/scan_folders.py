@@ -12,12 +12,11 @@ from scanprep.batch.pool import Workers
 from scanprep.pipeline.prepare import PrepareConfig, prepare
 from scanprep.pipeline.scan import ScanSettings
 from scanprep.pipeline.scans import find_scans
-from scanprep.registration.nonrigid import GraphStage, RegistrationConfig, ShellStage
+from scanprep.registration.schedule import RegistrationConfig
 
 MARKS = {"top": 0, "left": 1, "right": 2, "front": 3, "back": 4}
-QUICK = PrepareConfig(ScanSettings(RegistrationConfig(
-    graph=(GraphStage(40, 0.35, 0.035, 0.7, 0.01, 0.2, slide=0.3, rounds=2),),
-    shell=(ShellStage(0.02, 0.007, 0.0002, 0.05),), settle=None), pictures=False), min_poses=99, workers=Workers(1))
+STAGES = tuple(replace(stage, nodes=40) for stage in RegistrationConfig().graph[4:6])        # the scans lie near
+QUICK = PrepareConfig(ScanSettings(RegistrationConfig(STAGES), pictures=False), min_poses=99, workers=Workers(1))
 WITH_PICTURES = replace(QUICK, scan=replace(QUICK.scan, pictures=True))
 CHANGING = {"times.csv"}            # the only file that may differ between two runs
 

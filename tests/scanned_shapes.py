@@ -3,7 +3,7 @@ import numpy as np
 
 from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.surface import Rays
-from scanprep.pictures.glyphs import sphere
+from scanprep.pictures.shading import sphere
 
 
 def ball(divisions: int = 4, radius: float = 0.1) -> Mesh:
@@ -47,4 +47,24 @@ def view(mesh: Mesh, towards: np.ndarray, rng=None, noise: float = 0.0, spacing:
     return Mesh(points[seen], corners.reshape(-1, 3)), back
 
 
+def triangle_quality(mesh: Mesh) -> np.ndarray:
+    """(F,) 1 for an equilateral triangle, 0 for one without area: 4√3 area over the sum of squared sides."""
+    squares = ((mesh.corners - np.roll(mesh.corners, -1, axis=1)) ** 2).sum(axis=(1, 2))
+    return np.divide(4 * 3 ** 0.5 * mesh.face_areas, squares, out=np.zeros(len(squares)), where=squares > 0)
+
+
 SIX = np.concatenate([np.eye(3), -np.eye(3)])
+
+
+def distortion(rest: Mesh, x: np.ndarray) -> float:
+    """Root mean square over the area at rest of the logarithm of the stretches of the triangles."""
+    def flat(c: np.ndarray) -> np.ndarray:
+        e, f = c[:, 1] - c[:, 0], c[:, 2] - c[:, 0]
+        length = np.maximum(np.linalg.norm(e, axis=1), 1e-12)
+        along = np.einsum("fd,fd->f", e, f) / length
+        height = np.linalg.norm(np.cross(e, f), axis=1) / length
+        return np.stack([np.stack([length, along], axis=1), np.stack([np.zeros_like(length), height], axis=1)], axis=1)
+
+    s = np.linalg.svd(flat(x[rest.faces]) @ np.linalg.inv(flat(rest.corners)), compute_uv=False)
+    stretch = (np.log(np.maximum(s, 1e-6)) ** 2).mean(axis=1)
+    return float(np.sqrt(np.average(stretch, weights=rest.face_areas)))

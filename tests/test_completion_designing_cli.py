@@ -8,7 +8,7 @@ import pytest
 from completion_bodies import worm_with_prior
 
 from completion.__main__ import main
-from completion.mocap.marker_selection.posed import example_poses, in_poses
+from completion.mocap.marker_selection.linear import example_poses, in_poses
 from completion.mocap.marker_sets.layout import MarkerLayout
 from model.fitting import spread_vertices
 from scanprep.geometry.files import write_mesh

@@ -6,7 +6,7 @@ import pytest
 from people_bodies import kept, small_people
 
 from completion.mocap.files.markers import MarkerSequence
-from completion.mocap.marker_sets.layout import MarkerLayout
+from completion.mocap.marker_sets.named import named_layout
 from completion.mocap.pose.follow import AnimateConfig, animate
 from completion.mocap.subject.marker_shape import MarkerShapeConfig, spread_frames, subject_from_markers
 from scanprep.synthetic.people import BodyShape, Person, walk
@@ -23,7 +23,7 @@ def model():
 
 @pytest.fixture(scope="module")
 def layout(model):
-    return MarkerLayout.named("cmu41", model.template, kept())
+    return named_layout("cmu41", model.template, kept())
 
 
 def carried(model, layout, betas, frames=FRAMES, seed=0):
@@ -101,7 +101,7 @@ def test_loose_markers_are_found_where_they_are(model, layout):
 
 def test_a_walk_of_somebody_the_model_was_not_learned_from(model, layout):
     person = Person(BodyShape(sex=1.0, stature=1.88, weight=1.0))
-    on_skin = MarkerLayout.named("cmu41", person.mesh)
+    on_skin = named_layout("cmu41", person.mesh)
     poses, trans = walk(40, 40.0)
     bodies = np.stack([person.posed(p, t) for p, t in zip(poses, trans, strict=True)])
     places = np.stack([on_skin.place(person.mesh.with_vertices(v)) for v in bodies])
@@ -110,9 +110,9 @@ def test_a_walk_of_somebody_the_model_was_not_learned_from(model, layout):
     body = model.subject(found.betas)
     stature = np.ptp(rest(model, found.betas)[:, 2])
     assert abs(stature - 1.88) < 0.06 < abs(np.ptp(rest(model, np.zeros(4))[:, 2]) - 1.88)
-    motion = animate(body, sequence, found.layout, AnimateConfig(start_axes=2))
+    motion = animate(body, sequence, found.layout, AnimateConfig())
     off = np.linalg.norm(motion.vertices(body) - bodies[:, kept()], axis=2)
-    wrong = animate(model.subject(np.zeros(4)), sequence, layout, AnimateConfig(start_axes=2))
+    wrong = animate(model.subject(np.zeros(4)), sequence, layout, AnimateConfig())
     assert off.mean() < 0.03 and np.nanmean(motion.residuals) < 0.6 * np.nanmean(wrong.residuals)
 
 

@@ -21,7 +21,7 @@ from completion.mocap.settings import FaultConfig
 from scanprep.geometry import rotations
 
 FRAMES, RATE = 160, 100.0
-CONFIG = FaultConfig(follow=AnimateConfig(start_axes=1))
+CONFIG = FaultConfig(follow=AnimateConfig())
 LABELS = tuple(f"M{i}" for i in range(30))
 
 

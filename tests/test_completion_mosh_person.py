@@ -8,8 +8,8 @@ from completion_bodies import worm_with_prior
 from completion import MoshConfig, PersonConfig, find_person, mosh
 from completion.mocap.files.markers import MarkerSequence
 from completion.mocap.marker_sets.layout import MarkerLayout
-from completion.mocap.pose.follow import animate
-from completion.mocap.pose.mosh_poses import animate_config, follow_poses
+from completion.mocap.pose.follow import animate, follow_poses
+from completion.mocap.pose.settings import animate_config
 from completion.mocap.settings import FollowConfig
 from completion.mocap.subject.attachment import latent_markers
 from completion.mocap.subject.person import choose_frames, common_markers

@@ -12,11 +12,10 @@ import pytest
 from completion_bodies import half_view, worm_with_prior
 from scanned_shapes import ball as sphere
 
-from completion import MarkerLayout, MarkerSequence, write_markers
+from completion import MarkerLayout, MarkerSequence, motion_pictures, write_markers
 from completion.__main__ import main
-from completion.mocap.animate import report
+from completion.mocap.animate.work import GlbConfig, animate_file
 from completion.mocap.animate.work import Work as Follow
-from completion.mocap.animate.work import animate_file
 from completion.mocap.pose.robust import motion_problem
 from completion.mocap.pose.settings import AnimateConfig
 from completion.mocap.subject.marker_shape import MarkerShapeConfig
@@ -34,7 +33,7 @@ from scanprep.console import Metric
 from scanprep.correspondence.correspondences import Correspondences, correspondences_problem
 from scanprep.geometry.files import PointCloud, write_points
 from scanprep.registration.nonrigid import Registration, registration_problem
-from scanprep.skeleton.search import skeleton_problem
+from scanprep.skeleton.find import skeleton_problem
 
 MARKS = {"head": 10, "tail": 380, "left": 100, "right": 200, "middle": 250}
 LABELS = tuple(f"M{i}" for i in range(30))
@@ -46,7 +45,7 @@ QUICK = CompletionConfig(random_starts=4, rounds=3, scan_points=600, model_point
 def small_pictures():
     """Nobody looks at them here."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(report, "render", lambda *_rest, **_named: np.full((30, 20, 3), 255, dtype=np.uint8))
+        patch.setattr(motion_pictures, "render", lambda *_rest, **_named: np.full((30, 20, 3), 255, dtype=np.uint8))
         yield
 
 
@@ -157,8 +156,8 @@ def test_motions(tmp_path, case, words):
         labels[order] = np.array(LABELS, dtype=object)[back]
         markers = dataclasses.replace(markers, labels=tuple(labels))
     write_markers(tmp_path / "walk.csv", markers)
-    work = Follow(model, "model.npz", str(tmp_path / "layout.json"), model.subject(None), None, None, "m", None, 6,
-                  AnimateConfig(start_axes=1), MarkerShapeConfig())
+    work = Follow(model, "model.npz", str(tmp_path / "layout.json"), model.subject(None), None, None, "m", None,
+                  AnimateConfig(), MarkerShapeConfig(), GlbConfig(6))
     check(animate_file(work, tmp_path / "walk.csv", Room(tmp_path / "out")), words)
     assert (tmp_path / "out" / "motion.npz").exists()
 

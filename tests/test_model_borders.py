@@ -2,8 +2,8 @@ import numpy as np
 import pytest
 from model_bodies import worm_model
 
-from model.blendscape import BlendScapeModel
 from model.borders import face_weights, to_neighbours, vertex_weights
+from model.scape import BlendScapeModel
 
 
 @pytest.fixture(scope="module")

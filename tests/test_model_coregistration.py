@@ -14,14 +14,12 @@ import numpy as np
 import pytest
 from coregistered import QUICK
 from coregistered import run as run_coregistration
-from matching_bodies import bent, crab
+from jointed_bodies import bent, crab
 from model_bodies import random_poses, worm_model
 
-import model.coregistration.first as first_module
 import model.coregistration.rounds as rounds_module
 from model import ModelRegistration, coregister, learn_scape, load_model, register_with_model
 from model.coregistration.attraction import apart, attraction, towards
-from model.coregistration.first import FirstConfig, explained_share, learn_from_scans
 from model.coregistration.modelfit import ModelFit
 from model.coregistration.posed import posed_points
 from model.priors import typical_poses, whitening
@@ -32,7 +30,7 @@ from scanprep.batch.workspace import HOME
 from scanprep.geometry.landmarks import write_landmarks
 from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.surface import Surface
-from scanprep.registration.matches import target_of
+from scanprep.geometry.target import target_of
 from scanprep.registration.nonrigid import register
 from scanprep.registration.schedule import GraphStage
 from scanprep.skeleton.tree import Skeleton
@@ -81,7 +79,7 @@ def test_a_scan_that_plain_registration_gets_wrong_is_right_with_the_model(body,
     plain = register(body, scan, config=PLAIN)
     found = register_with_model(crab_model.subject(), scan, start=plain.mesh.vertices, config=QUICK)
     assert mean_mm(plain.mesh.vertices, truth) > 30 and mean_mm(found.mesh.vertices, truth) < 4
-    assert explained_share(plain.mesh, scan, QUICK) < 1 - QUICK.failed < found.explained
+    assert 1 - QUICK.failed < found.explained
     assert found.seen.mean() > 0.8 and found.rms < 1e-3 and found.flipped == 0
 
 
@@ -304,11 +302,11 @@ def test_only_what_depends_on_a_change_is_made_anew(story, asked, tmp_path, what
         elif what == "the model":
             model = replace(first, pose_mean=first.pose_mean + 1e-9)        # of the same training set
         elif what == "settings":
-            config = replace(config, explained=0.9 * QUICK.explained)
+            config = replace(config, fit=replace(QUICK.fit, axes=3))
         elif what == "what fails":
             config = replace(config, failed=0.5 * QUICK.failed)
         elif what == "learning":
-            config = replace(config, learn=replace(QUICK.learn, steps=2))
+            config = replace(config, learn=replace(QUICK.learn, refinements=2))
         elif what == "more rounds":
             config = replace(config, rounds=3)
         again = coregister(model, scans, marks, config, starts, space=space)
@@ -417,18 +415,3 @@ def test_rounds_refuse_what_they_cannot_use(body, crab_model):
     elsewhere = Mesh(np.random.default_rng(0).normal(0, 0.4, (3000, 3)), np.zeros((0, 3), dtype=np.int64))
     with pytest.raises(ValueError, match="only 0 of 2"):
         coregister(crab_model, [elsewhere.vertices, elsewhere.vertices], None, strict)
-
-
-def test_a_model_from_scans_alone_is_found_again(story, body, skeleton, tmp_path, monkeypatch):
-    _, scans, plain, _, _, _ = story
-    config = FirstConfig(PLAIN, rounds=replace(QUICK, rounds=1))
-    told = []
-    with workspace(tmp_path / "kept") as space:
-        done = learn_from_scans(body, scans[:4], [None] * 4, skeleton, config, lambda *made: told.append(made), space)
-        monkeypatch.setattr(first_module, "register", None)
-        monkeypatch.setattr(rounds_module, "register_with_model", None)
-        again = learn_from_scans(body, scans[:4], [None] * 4, skeleton, config, space=space)
-    np.testing.assert_array_equal(done.registered, plain[:4])
-    assert done.good.tolist() == [True, True, True, False] and done.coregistration.good.all()
-    assert digests_of(again.coregistration.model) == digests_of(done.coregistration.model)
-    assert told[0] == (0, 8) and told[-1] == (8, 8)

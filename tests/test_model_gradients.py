@@ -2,8 +2,8 @@ import numpy as np
 import pytest
 from model_bodies import worm, worm_skeleton
 
-from model.gradients import GradientSystem, edges, local_edges, pose_gradients, shape_gradients
-from scanprep.geometry import rotations
+from model.blending import BlendedTemplate, rigid_weights
+from model.gradients import GradientSystem, edges, pose_gradients, shape_gradients
 from scanprep.geometry.mesh import Mesh
 
 
@@ -21,10 +21,12 @@ def test_edges_start_at_the_first_vertex(body):
 
 
 def test_local_edges_undo_the_rotation_of_the_part(body):
-    parts = worm_skeleton(body).part_of_face
-    R = rotations.exp(np.random.default_rng(0).normal(0, 1, (4, 3)))
-    turned = local_edges(body.vertices @ R[2].T, body.faces, R[parts])[parts == 2]
-    np.testing.assert_allclose(turned, edges(body.vertices, body.faces)[parts == 2], atol=1e-14)
+    skeleton = worm_skeleton(body)
+    parts, pose = skeleton.part_of_face == 2, np.random.default_rng(0).normal(0, 1, (2, 4, 3))
+    R = skeleton.part_rotations(pose)[:, 2]
+    blended = BlendedTemplate(body, skeleton, rigid_weights(skeleton))
+    back = blended.local_edges(body.vertices @ np.swapaxes(R, -1, -2), pose)[:, parts]
+    np.testing.assert_allclose(back, np.stack([edges(body.vertices, body.faces)[parts]] * 2), atol=1e-14)
 
 
 def test_a_linear_map_per_part_is_recovered_exactly(body):

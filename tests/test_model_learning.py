@@ -2,8 +2,9 @@ import numpy as np
 import pytest
 from model_bodies import random_poses, worm, worm_model, worm_skeleton
 
+from model import LearnConfig, learn_scape
 from model.fitting import fit_pose, fit_shape
-from model.learning import LearnConfig, learn_scape, pose_examples, pose_prior
+from model.learning.scape import pose_examples, pose_prior
 from model.pose_space import PoseSpace
 from model.scape import ScapeModel
 from scanprep.geometry.mesh import Mesh

@@ -1,5 +1,6 @@
 """`scape learn`: every kind, mixes and sexes, from a registered set and from plain folders."""
 import json
+from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
@@ -7,15 +8,15 @@ import pytest
 from model_bodies import random_poses, worm_model
 
 from model import LearnConfig, load_model
-from model.learning.cli import Other, learn
-from model.learning.mixing import MixConfig
-from model.learning.parts import PartsConfig, choose_skeleton
-from model.learning.skin import SkinConfig
+from model.learning import parts
+from model.learning.cli import learn
+from model.learning.mixing import MIX
+from model.learning.parts import choose_skeleton
+from model.learning.skinning import SkinConfig
 from scanprep import RegisteredSet, write_mesh
 from scanprep.batch.opening import beside
 
-QUICK = LearnConfig(refinements=1, steps=1, components=4, prunings=(0.01,), ridges=(1e-3,))
-OTHER = Other(skin=SkinConfig(rounds=2, people_rounds=1), mix=MixConfig(rounds=1))
+QUICK = LearnConfig(refinements=1, components=4, prunings=(0.01,), ridges=(1e-3,))
 SEXES = ["female", "male", "female", "male", "female", ""]
 
 
@@ -40,7 +41,6 @@ def folder(truth, tmp_path_factory):
         whole = whole.add(f"person{i}", body, subject=f"p{i}", sex=sex)
         write_mesh(place / "people" / f"person{i}.ply", truth.template.with_vertices(body))
     whole.with_skeleton(truth.skeleton)
-    (place / "sexes.csv").write_text("name,sex\n" + "".join(f"person{i},{s}\n" for i, s in enumerate(SEXES)))
     truth.skeleton.save(place / "skeleton.json")
     return place
 
@@ -54,8 +54,8 @@ def learned(poses, output, *given, **named):
 @pytest.mark.parametrize("kind", ["scape", "blendscape", "skinning"])
 def test_every_kind_is_learned_and_read_again(folder, truth, tmp_path, kind):
     path = tmp_path / f"{kind}.npz"
-    outcome = learned(folder / "set", path, folder / "set", kind=kind, config=QUICK, other=OTHER,
-                      pictures=kind == "scape")
+    outcome = learned(folder / "set", path, folder / "set", kind=kind, scape=QUICK,
+                      skinning=SkinConfig(rounds=2, components=4))
     model = load_model(path)
     assert model.kind == kind and model.n_betas == 4 and model.skeleton.parents.tolist() == [-1, 0, 0, 2]
     figures = {m.name: m.value for m in outcome.metrics}
@@ -63,41 +63,40 @@ def test_every_kind_is_learned_and_read_again(folder, truth, tmp_path, kind):
     assert model.info["poses"] == 12 and len(model.info["digest"]) == 64 and model.info["landmarks"] == {}
     if kind != "skinning":
         assert figures["time: pose space"] > 0 and figures["time: shape of every person"] > 0
-    assert (tmp_path / f"{kind}.components.png").exists() == (kind == "scape")
+    assert (tmp_path / f"{kind}.components.png").exists()
     body = truth.subject().vertices(random_poses(truth, 1, np.random.default_rng(3), 0.3)[0])
     off = np.linalg.norm(model.subject().vertices(np.zeros((4, 3))) - truth.template.vertices, axis=1).mean()
     assert off < 0.02 * np.ptp(body, axis=0).max()
 
 
 def test_models_by_sex_stand_beside_the_neutral_one(folder, tmp_path):
-    outcome = learned(folder / "set", tmp_path / "m.npz", folder / "set", by_sex=True, config=QUICK, pictures=False)
+    outcome = learned(folder / "set", tmp_path / "m.npz", folder / "set", by_sex=True, scape=QUICK)
     count = {name: load_model(tmp_path / f"m{name}.npz").info["shapes"] for name in ("", ".female", ".male")}
     assert count == {"": 7, ".female": 4, ".male": 2}                     # anna counts, the unknown one in none
     assert {m.name: m.value for m in outcome.metrics}["people of the male model"] == 2
 
 
 def test_sexes_of_a_plain_folder_come_from_a_table(folder, tmp_path):
+    with pytest.raises(ValueError, match="write sexes"):
+        learned(folder / "poses", tmp_path / "n.npz", folder / "people", skeleton=folder / "skeleton.json", by_sex=True)
+    rows = "".join(f"person{i},{s}\n" for i, s in enumerate(SEXES))
+    (folder / "people" / "sexes.csv").write_text(f"name,sex\n{rows}")
     learned(folder / "poses", tmp_path / "m.npz", folder / "people", skeleton=folder / "skeleton.json", by_sex=True,
-            sexes=folder / "sexes.csv", config=QUICK, pictures=False)
+            scape=QUICK)
     assert load_model(tmp_path / "m.female.npz").info["shapes"] == 3
-    with pytest.raises(ValueError, match="--sexes"):
-        learned(folder / "poses", tmp_path / "n.npz", folder / "people", skeleton=folder / "skeleton.json",
-                by_sex=True)
-    (tmp_path / "other.csv").write_text("name,sex\nnobody,male\n")
+    (folder / "people" / "sexes.csv").write_text("name,sex\nnobody,male\n")
     with pytest.raises(ValueError, match="none of its names"):
-        learned(folder / "poses", tmp_path / "n.npz", folder / "people", skeleton=folder / "skeleton.json", by_sex=True,
-              sexes=tmp_path / "other.csv")
+        learned(folder / "poses", tmp_path / "n.npz", folder / "people", skeleton=folder / "skeleton.json", by_sex=True)
 
 
 def test_a_mix_takes_every_mesh_of_the_set(folder, tmp_path):
-    learned(folder / "set", tmp_path / "mix.npz", mixed=True, config=QUICK, other=OTHER, pictures=False)
+    learned(folder / "set", tmp_path / "mix.npz", kind="mixed", mixed=replace(MIX, refinements=1, components=4))
     model = load_model(tmp_path / "mix.npz")
     assert model.info["bodies"] == 18 and model.info["people"] == 7 and model.n_betas == 4
 
 
 @pytest.mark.parametrize("given, words", [
-    ({"mixed": True, "by_sex": True}, "--mixed"), ({"mixed": True, "kind": "skinning"}, "--mixed"),
-    ({"by_sex": True}, "--by-sex")])
+    ({"kind": "mixed", "by_sex": True}, "--kind mixed"), ({"by_sex": True}, "--by-sex")])
 def test_ways_of_learning_that_exclude_each_other(folder, tmp_path, given, words):
     with pytest.raises(ValueError, match=words):
         learned(folder / "set", tmp_path / "m.npz", **given)
@@ -105,21 +104,23 @@ def test_ways_of_learning_that_exclude_each_other(folder, tmp_path, given, words
 
 def test_a_mix_wants_a_set_and_a_skeleton(folder, tmp_path):
     with pytest.raises(ValueError, match="registered set"):
-        learned(folder / "poses", tmp_path / "m.npz", mixed=True)
+        learned(folder / "poses", tmp_path / "m.npz", kind="mixed")
 
 
 def test_parts_are_found_where_none_are_given(folder, tmp_path):
-    outcome = learned(folder / "poses", tmp_path / "m.npz", parts=3, config=QUICK, pictures=False)
+    outcome = learned(folder / "poses", tmp_path / "m.npz", parts=3, scape=QUICK)
     assert {m.name: m.value for m in outcome.metrics}["parts"] == 3
     assert json.loads(json.dumps(load_model(tmp_path / "m.npz").info))["shapes"] == 0
 
 
-def test_more_parts_are_kept_while_left_out_poses_gain(truth):
+def test_more_parts_are_kept_while_left_out_poses_gain(truth, monkeypatch):
     """A worm that bends everywhere wants more parts than the fewest; what was tried tells why."""
     rng = np.random.default_rng(5)
     poses = truth.subject().vertices(random_poses(truth, 16, rng, 0.5))
     poses[0] = truth.template.vertices
-    found = choose_skeleton(truth.template, poses, PartsConfig(step=2, steps=1, gain=0.03))
+    monkeypatch.setattr(parts, "MORE", 2)
+    monkeypatch.setattr(parts, "TRIES", 1)
+    found = choose_skeleton(truth.template, poses)
     tried, kept = sorted(found.errors), len(found.skeleton.parents)
     assert kept in tried and tried[0] <= kept
     for fewer, more in pairwise(tried):

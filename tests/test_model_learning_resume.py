@@ -6,10 +6,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from config_files import config_file
 from model_bodies import random_poses, worm_model
 
 from model import load_model
-from model.learning import cli, mix_rounds, parts, pose, scape, skin, skin_people
+from model.learning import cli, mixing, parts, pose, scape, skinning
 from model.learning.cli import learn
 from scanprep import read_mesh, write_mesh
 from scanprep.batch.opening import beside
@@ -18,8 +19,8 @@ from scanprep.skeleton import search
 
 STAGES = {"skeleton": (cli, "find_skeleton"), "poses": (scape, "learn_pose"), "people": (scape, "shape_gradients"),
           "components": (scape, "learn_shape_space"), "pictures": (cli, "_draw")}
-QUICK = ["--refinements", "1", "--steps", "1", "--components", "4", "--prunings", "0.01",
-         "--ridges", "1e-3"]
+QUICK = {"refinements": 1, "components": 4, "prunings": [0.01], "ridges": [1e-3]}
+SKIN = {"rounds": 2, "components": 4}
 ALL = {"skeleton": 1, "poses": 1, "people": 6, "components": 1, "pictures": 1}
 
 KILLED = """
@@ -78,15 +79,16 @@ def searched(monkeypatch):
     monkeypatch.setattr(cli, "find_skeleton", lambda *given: worm_model().skeleton)
 
 
-def words(bodies, output, *more):
+def words(bodies, output, *more, **settings):
+    file = config_file(bodies, scape={**QUICK, **settings}, skinning=SKIN)
     known = [] if "--parts" in more else ["--skeleton", str(bodies / "skeleton.json")]
-    return ["--poses", str(bodies / "poses"), "--shapes", str(bodies / "people"), "-o", str(bodies / output), *QUICK,
-            *known, *map(str, more)]
+    return ["--poses", str(bodies / "poses"), "--shapes", str(bodies / "people"), "-o", str(bodies / output),
+            "--config", str(file), *known, *map(str, more)]
 
 
-def learned(bodies, output, *more):
+def learned(bodies, output, *more, **settings):
     """The bytes of the model."""
-    assert run(learn, "scape learn", words(bodies, output, *more)) == 0
+    assert run(learn, "scape learn", words(bodies, output, *more, **settings)) == 0
     return (bodies / output).read_bytes()
 
 
@@ -121,21 +123,21 @@ def test_killed_and_started_again_it_goes_on_and_ends_with_the_same_bytes(bodies
 
 
 def test_killed_twice_in_the_poses(bodies, monkeypatch):
-    undisturbed = learned(bodies, "a.npz", "--refinements", 3)
-    killed(pose, "_refined", 1, words(bodies, "b.npz", "--refinements", 3))       # after the first refinement
-    killed(pose, "_refined", 1, words(bodies, "b.npz", "--refinements", 3))       # after the second
+    undisturbed = learned(bodies, "a.npz", refinements=3)
+    killed(pose, "_refined", 1, words(bodies, "b.npz", refinements=3))       # after the first refinement
+    killed(pose, "_refined", 1, words(bodies, "b.npz", refinements=3))       # after the second
     real, calls = pose._refined, []
     monkeypatch.setattr(pose, "_refined", lambda *given, **named: calls.append(1) or real(*given, **named))
     monkeypatch.setattr(pose, "_first", None)
-    assert learned(bodies, "b.npz", "--refinements", 3) == undisturbed
+    assert learned(bodies, "b.npz", refinements=3) == undisturbed
     assert len(calls) == 1
 
 
 @pytest.mark.parametrize("kind, module, name, after", [
-    ("skinning", skin, "_with_joints", 2), ("skinning", skin_people, "unposed_person", 3),
+    ("skinning", skinning, "_with_joints", 2), ("skinning", skinning, "_unposed_person", 3),
     ("blendscape", scape, "shape_gradients", 2)])
 def test_every_kind_goes_on(bodies, kind, module, name, after):
-    given = ["--kind", kind, "--skin.rounds", 2, "--skin.people-rounds", 2]
+    given = ["--kind", kind]
     undisturbed = learned(bodies, "a.npz", *given)
     killed(module, name, after, words(bodies, "b.npz", *given))
     assert learned(bodies, "b.npz", *given) == undisturbed
@@ -148,7 +150,8 @@ def test_the_search_for_a_skeleton_goes_on(tmp_path, monkeypatch):
         write_mesh(tmp_path / "poses" / f"pose{i}.ply", truth.template.with_vertices(body))
 
     def given(name):
-        return ["--poses", str(tmp_path / "poses"), "-o", str(tmp_path / name), *QUICK]
+        return ["--poses", str(tmp_path / "poses"), "-o", str(tmp_path / name),
+                "--config", str(config_file(tmp_path, scape=QUICK))]
 
     assert run(learn, "scape learn", given("a.npz")) == 0
     killed(search, "_searched", 1, given("b.npz"))                                # after the first restart
@@ -163,10 +166,9 @@ def test_the_search_for_a_skeleton_goes_on(tmp_path, monkeypatch):
 
 @pytest.mark.parametrize("more, done", [
     ([], {"pictures": 1}),
-    (["--no-pictures"], {}),
     (["--landmarks"], {"pictures": 1}),
-    (["--components", 2], {"people": 6, "components": 1, "pictures": 1}),
-    (["--steps", 2], {"poses": 1, "people": 6, "components": 1, "pictures": 1}),
+    ({"components": 2}, {"people": 6, "components": 1, "pictures": 1}),
+    ({"refinements": 2}, {"poses": 1, "people": 6, "components": 1, "pictures": 1}),
     (["--parts", 4], {"skeleton": 1, "pictures": 1}),           # the same skeleton was found: nothing follows from it
     (["--force"], ALL)])
 def test_a_setting_that_changes(bodies, searched, counted, more, done):
@@ -175,10 +177,11 @@ def test_a_setting_that_changes(bodies, searched, counted, more, done):
     if "--landmarks" in more:
         (bodies / "marks.json").write_text('{"nose": 3}')
         more = ["--landmarks", bodies / "marks.json"]
+    settings, more = (more, []) if isinstance(more, dict) else ({}, more)
     more = more if "--parts" in more else ["--parts", 3, *more]
-    found = learned(bodies, "m.npz", *more)
+    found = learned(bodies, "m.npz", *more, **settings)
     assert anew(counted, since) == done
-    assert found == learned(bodies, "fresh.npz", *more)
+    assert found == learned(bodies, "fresh.npz", *more, **settings)
 
 
 @pytest.mark.parametrize("file, done", [
@@ -231,9 +234,12 @@ def test_what_is_not_ours_stays(bodies, capsys):
 
 def test_pictures_of_another_run_go_and_come(bodies):
     learned(bodies, "m.npz")
-    learned(bodies, "m.npz", "--no-pictures")
-    assert not list(bodies.glob("*.png"))
-    learned(bodies, "m.npz", "--components", 2)
+    assert {p.name for p in bodies.glob("*.png")} == {"m.parts.png", "m.components.png"}
+    given = words(bodies, "m.npz")
+    del given[given.index("--shapes"):given.index("--shapes") + 2]
+    assert run(learn, "scape learn", given) == 0
+    assert {p.name for p in bodies.glob("*.png")} == {"m.parts.png"}
+    learned(bodies, "m.npz", components=2)
     assert {p.name for p in bodies.glob("*.png")} == {"m.parts.png", "m.components.png"}
 
 
@@ -253,11 +259,12 @@ def test_a_mix_goes_on(tmp_path):
         for i, body in enumerate(subject.vertices(random_poses(truth, 4, rng, 0.3))):
             whole = whole.add(f"p{person}_{i}", body, subject=f"p{person}")
     whole.with_skeleton(truth.skeleton)
-    given = ["--poses", str(tmp_path / "set"), "--mixed", "--mix.rounds", "2", "--components", "2"]
+    file = config_file(tmp_path, mixed={"refinements": 2, "components": 2})
+    given = ["--poses", str(tmp_path / "set"), "--kind", "mixed", "--config", str(file)]
     assert run(learn, "scape learn", [*given, "-o", str(tmp_path / "a.npz")]) == 0
     argv = [*given, "-o", str(tmp_path / "b.npz")]
-    killed(mix_rounds, "people_shapes", 1, argv)
-    killed(mix_rounds, "people_shapes", 1, argv)
+    killed(mixing, "_learn_people", 1, argv)
+    killed(mixing, "_learn_people", 1, argv)
     assert run(learn, "scape learn", argv) == 0
     assert (tmp_path / "b.npz").read_bytes() == (tmp_path / "a.npz").read_bytes()
     assert load_model(tmp_path / "b.npz").info["people"] == 3

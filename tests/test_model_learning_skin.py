@@ -1,4 +1,5 @@
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
@@ -6,7 +7,9 @@ from conformance_bodies import skinned_worm
 from model_bodies import random_poses, worm, worm_skeleton
 
 from model.fitting import fit_pose, fit_shape
-from model.learning.skin import (
+from model.learning import skinning
+from model.learning.skin_weights import _onto_simplex, diffused_weights, fit_weights, kept_weights
+from model.learning.skinning import (
     SkinConfig,
     _with_joints,
     _with_joints_at,
@@ -14,8 +17,6 @@ from model.learning.skin import (
     corrective_features,
     learn_skinning,
 )
-from model.learning.skin_people import unposed_person
-from model.learning.skin_weights import _onto_simplex, diffused_weights, fit_weights, kept_weights
 from scanprep.geometry import rotations
 from scanprep.geometry.mesh import Mesh
 from scanprep.skeleton.tree import Skeleton
@@ -25,7 +26,7 @@ NARROW = {"width": 0.08, "rounds": 4}
 
 @pytest.fixture(scope="module")
 def truth():
-    return skinned_worm("quadratic")
+    return skinned_worm(True)
 
 
 @pytest.fixture(scope="module")
@@ -40,25 +41,23 @@ def training(truth):
 
 @pytest.fixture(scope="module")
 def learned(truth, training):
-    config = SkinConfig(correctives="quadratic", components=5, people_rounds=2, **NARROW)
+    config = SkinConfig(components=5, **NARROW)
     return learn_skinning(truth.template, *training, truth.skeleton, config)
 
 
 def test_new_poses_of_the_truth_are_met(truth, training, learned):
     """Data a skinning model made come back, best with the correctives they were made with."""
     bodies = truth.subject().vertices(random_poses(truth, 6, np.random.default_rng(1), 0.4))
-    others = [learn_skinning(truth.template, training[0], None, truth.skeleton, SkinConfig(correctives=kind, **NARROW))
-              for kind in ("linear", "none")]
-    quadratic, linear, none = (np.mean([fit_pose(m.subject(), y).mean for y in bodies]) for m in (learned, *others))
-    assert quadratic < 2.2e-3
-    assert quadratic < 0.6 * linear < 0.6 * 0.8 * none
-    assert [m.info["left_out_error"] for m in (learned, *others)] == sorted(
-        m.info["left_out_error"] for m in (learned, *others))
+    plain = learn_skinning(truth.template, training[0], None, truth.skeleton, SkinConfig(correctives=False, **NARROW))
+    linear, none = (np.mean([fit_pose(m.subject(), y).mean for y in bodies]) for m in (learned, plain))
+    assert linear < 2.2e-3
+    assert linear < 0.6 * none
+    assert learned.info["left_out_error"] < plain.info["left_out_error"]
 
 
-def test_weights_and_joints_are_recovered():
+def test_weights_and_joints_are_recovered(monkeypatch):
     """From wrong ones, where the poses, the rest vertices and all else are known."""
-    truth = skinned_worm("none")
+    truth = skinned_worm(False)
     poses = random_poses(truth, 20, np.random.default_rng(2), 0.6)
     bodies = truth.subject().vertices(poses)
     off = truth.skeleton.joints + [[0, 0, 0], [0.03, 0, 0.01], [-0.03, 0.01, 0], [0.02, 0, 0]]
@@ -67,10 +66,11 @@ def test_weights_and_joints_are_recovered():
     for _ in range(3):
         found = _with_joints(found, poses, bodies)
     np.testing.assert_allclose(found.joint_regressor @ found.rest, truth.skeleton.joints, atol=1e-5)
+    monkeypatch.setattr(skinning, "fit_weights", partial(fit_weights, smoothness=0.0))
     wide = replace(truth, weights=diffused_weights(truth.template, truth.skeleton, 0.12))
     assert np.abs(wide.weights - truth.weights).max() > 0.03
     for _ in range(8):
-        wide = _with_weights(wide, poses, bodies, truth.weights > 0, SkinConfig(smoothness=0))
+        wide = _with_weights(wide, poses, bodies, truth.weights > 0, SkinConfig())
     np.testing.assert_allclose(wide.weights, truth.weights, atol=2e-3)
 
 
@@ -85,7 +85,7 @@ def test_new_people_of_the_truth_are_met(truth, learned):
 def test_a_person_is_unposed_exactly(truth):
     rng = np.random.default_rng(4)
     for pose, betas in zip(random_poses(truth, 3, rng, 0.4), rng.normal(size=(3, 3)), strict=True):
-        back = unposed_person(truth, pose, truth.vertices(pose, betas, rng.normal(size=3)))
+        back = truth.unposed(truth.vertices(pose, betas, rng.normal(size=3)), pose)
         x = truth.rest_vertices(betas)
         at = truth.skeleton.joints[0] - (truth.joint_regressor @ x)[0]
         np.testing.assert_allclose(back, x + at, rtol=0, atol=1e-12)
@@ -151,28 +151,27 @@ def test_weights_pass_over_the_width_asked_for():
         assert 0.5 * width < soft.max() < 3 * width
 
 
-@pytest.mark.parametrize("kind, width", [("none", 0), ("linear", 1), ("quadratic", 2)])
-def test_features_are_functions_of_the_kept_directions(kind, width):
-    """Every feature vanishes at rest, and products of kept directions are all there, whatever the directions."""
+@pytest.mark.parametrize("correctives", [False, True])
+def test_features_are_functions_of_the_kept_directions(correctives):
+    """Every feature vanishes at rest, and kept directions are all there, whatever they are."""
     skeleton, rng = worm_skeleton(worm()), np.random.default_rng(8)
     axes = rotations.exp(rng.normal(size=(4, 3)))[..., :2]                    # two directions a joint
     poses = (axes @ rng.normal(0, 0.5, (30, 4, 2, 1)))[..., 0]
-    features = corrective_features(skeleton, poses, SkinConfig(correctives=kind))
+    features = corrective_features(skeleton, poses, correctives)
     free = features.constant == 0
-    assert free.sum() == {"none": 0, "linear": 6, "quadratic": 15}[kind]
+    assert free.sum() == 6 * correctives
     np.testing.assert_allclose(features.evaluate(np.zeros((4, 3)))[free], 0, atol=1e-15)
-    if width:
+    if correctives:
         delta = features.evaluate(poses)
         for j in (1, 2, 3):
-            t = poses[:, j] @ axes[j]
-            wanted = t if width == 1 else np.c_[t, t[:, 0]**2, t[:, 0] * t[:, 1], t[:, 1]**2]
+            wanted = poses[:, j] @ axes[j]
             mine = delta[:, features.of_part(j)][:, 1:]
             assert np.abs(wanted - mine @ np.linalg.lstsq(mine, wanted, rcond=None)[0]).max() < 1e-12
 
 
 def test_rigid_motion_of_the_data_changes_nothing_within(truth, training):
     rng = np.random.default_rng(9)
-    bodies, config = training[0][:12], SkinConfig(correctives="linear", width=0.08, rounds=1)
+    bodies, config = training[0][:12], SkinConfig(width=0.08, rounds=1)
     R = rotations.exp(rng.normal(size=(12, 3)))
     moved = bodies @ np.swapaxes(R, -1, -2) + rng.normal(size=(12, 1, 3))
     a, b = (learn_skinning(truth.template, y, None, truth.skeleton, config) for y in (bodies, moved))
@@ -181,7 +180,7 @@ def test_rigid_motion_of_the_data_changes_nothing_within(truth, training):
 
 
 def test_same_input_gives_the_same_bytes(truth, training):
-    config = SkinConfig(width=0.08, rounds=1, people_rounds=2)
+    config = SkinConfig(width=0.08, rounds=1)
     a, b = (learn_skinning(truth.template, training[0][:8], training[1][:4], truth.skeleton, config) for _ in range(2))
     for name in ("rest", "weights", "correctives", "shape_mean", "shape_components", "pose_covariance"):
         np.testing.assert_array_equal(getattr(a, name), getattr(b, name))
@@ -197,7 +196,7 @@ def test_betas_of_the_training_people_have_unit_variance(learned, training):
 def test_a_body_of_one_part(training):
     template = worm()
     one = Skeleton(np.zeros(len(template.faces), int), [-1], [template.vertices.mean(axis=0)])
-    model = learn_skinning(template, training[0][:3], training[1][:4], one, SkinConfig(rounds=1, people_rounds=1))
+    model = learn_skinning(template, training[0][:3], training[1][:4], one, SkinConfig(rounds=1))
     fit = fit_pose(model.subject(), model.rest + [1.0, 0, 0])
     assert fit.pose.shape == (1, 3) and fit.rms < 1e-6
 
@@ -205,7 +204,7 @@ def test_a_body_of_one_part(training):
 def test_progress_runs_to_its_end(truth, training):
     seen = []
     learn_skinning(truth.template, training[0][:5], training[1][:3], truth.skeleton,
-                   SkinConfig(width=0.08, rounds=2, people_rounds=2), lambda done, total: seen.append((done, total)))
+                   SkinConfig(width=0.08, rounds=2), lambda done, total: seen.append((done, total)))
     assert seen[-1][0] == seen[-1][1] and [d for d, _ in seen] == sorted(d for d, _ in seen)
 
 
@@ -221,8 +220,6 @@ def test_refuses_bad_input(truth, training):
             learn_skinning(template, poses, bad, skeleton)
     with pytest.raises(ValueError, match=r"skeleton.*faces"):
         learn_skinning(template, poses, people, worm_skeleton(worm(rings=20)))
-    with pytest.raises(ValueError, match="correctives: expected none, linear or quadratic, got 'cubic'"):
-        learn_skinning(template, poses, people, skeleton, SkinConfig(correctives="cubic"))
     double = Mesh(np.vstack([template.vertices, template.vertices + 5]),
                   np.vstack([template.faces, template.faces + len(template.vertices)]))
     with pytest.raises(ValueError, match="components"):

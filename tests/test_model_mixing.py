@@ -1,15 +1,17 @@
+from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
 import pytest
 from model_bodies import random_poses, worm_model, worm_skeleton
 
+from model import LearnConfig, learn_scape
 from model.fitting import fit_pose, fit_shape
-from model.learning import LearnConfig, learn_scape
-from model.learning.mixing import MixConfig, learn_scape_mix
+from model.learning.mixing import GAIN, MIX, learn_scape_mix
 from model.learning.within import Within
 
-FAST = MixConfig(features="quadratic", prunings=(0.01,), ridges=(3e-4, 0.01), rounds=2)
+FAST = replace(MIX, prunings=(0.01,), ridges=(3e-4, 0.01), refinements=2)
+FASTER = replace(MIX, prunings=(0.01,), ridges=(0.01,), refinements=1)
 
 
 def mix(truth, people, each, seed, size=0.4):
@@ -74,11 +76,10 @@ def test_one_body_a_person(truth, strangers):
 
 def test_labels_and_order_do_not_matter(truth):
     bodies, who, _ = mix(truth, 6, 2, 4)
-    config = MixConfig(prunings=(0.01,), ridges=(0.01,), rounds=1)
     names = [f"person {w}" for w in who]
-    a = learn_scape_mix(truth.template, bodies, names, truth.skeleton, config)
+    a = learn_scape_mix(truth.template, bodies, names, truth.skeleton, FASTER)
     turned = np.roll(np.arange(12), 4)
-    b = learn_scape_mix(truth.template, bodies[turned], [who[t] for t in turned], truth.skeleton, config)
+    b = learn_scape_mix(truth.template, bodies[turned], [who[t] for t in turned], truth.skeleton, FASTER)
     pose = random_poses(truth, 1, np.random.default_rng(6))[0]
     np.testing.assert_allclose(b.vertices(pose), a.vertices(pose), atol=1e-5)
     np.testing.assert_allclose(b.shape_space.variances, a.shape_space.variances, rtol=1e-3)
@@ -86,8 +87,8 @@ def test_labels_and_order_do_not_matter(truth):
 
 def test_it_stops_where_the_held_out_error_stops_falling(learned):
     errors = learned.info["held_out_errors"]
-    assert learned.info["rounds"] == 1 + int(np.argmin(errors)) <= FAST.rounds
-    assert all(b <= (1 - FAST.tolerance) * a for a, b in pairwise(errors[:-1]))
+    assert learned.info["rounds"] == 1 + int(np.argmin(errors)) <= FAST.refinements
+    assert all(b <= (1 - GAIN) * a for a, b in pairwise(errors[:-1]))
 
 
 def test_what_people_have_of_their_own_is_no_matter():
@@ -110,7 +111,7 @@ def test_what_people_have_of_their_own_is_no_matter():
 def test_progress_runs_to_its_end(truth):
     bodies, who, _ = mix(truth, 4, 2, 8)
     seen = []
-    learn_scape_mix(truth.template, bodies, who, truth.skeleton, MixConfig(prunings=(0.01,), ridges=(0.01,), rounds=2),
+    learn_scape_mix(truth.template, bodies, who, truth.skeleton, replace(FASTER, refinements=2),
                     lambda done, total: seen.append((done, total)))
     assert seen[-1][0] == seen[-1][1] and [d for d, _ in seen] == sorted(d for d, _ in seen)
 
@@ -128,6 +129,6 @@ def test_refuses_bad_input(truth):
     with pytest.raises(ValueError, match=r"skeleton.*joints\[0\]"):
         learn_scape_mix(truth.template, bodies, who, type(truth.skeleton)(
             truth.skeleton.part_of_face, truth.skeleton.parents, worm_skeleton(truth.template).joints + 0.1))
-    for bad in ({"regressor": "svr"}, {"rounds": 0}, {"held_out": 0.7}):
-        with pytest.raises(ValueError, match=next(iter(bad))):
-            MixConfig(**bad)
+    for bad in (replace(MIX, regressor="svr"), replace(MIX, refinements=0)):
+        with pytest.raises(ValueError, match="config"):
+            learn_scape_mix(truth.template, bodies, who, truth.skeleton, bad)

@@ -3,8 +3,10 @@ import pytest
 from model_bodies import random_poses, worm_model
 
 from model.features import PoseFeatures, QuadraticLift
-from model.learning.compress import condense
-from model.learning.regression import Design, RegressionConfig, choose_design
+from model.learning import regression
+from model.learning.config import LearnConfig
+from model.learning.pose import compress
+from model.learning.regression import Design, choose_design
 from model.pose_space import PoseSpace
 
 
@@ -19,7 +21,7 @@ def edge_error(model, Q):
 
 
 def learn(model, poses, Q, **settings) -> tuple[Design, PoseSpace]:
-    config = RegressionConfig(**{"prunings": (0.0,), "ridges": (1e-9,), "radii": (1.5,), **settings})
+    config = LearnConfig(**{"prunings": (0.0,), "ridges": (1e-9,), **settings})
     design = choose_design(model.template, model.skeleton, poses, Q, config, edge_error(model, Q))
     return design, design.fit(poses, Q)
 
@@ -51,13 +53,15 @@ def test_a_quadratic_truth_needs_products(model):
 
 
 @pytest.mark.parametrize("regressor", ["ridge", "svr"])
-def test_bells_follow_what_is_not_linear(model, regressor):
+def test_bells_follow_what_is_not_linear(model, regressor, monkeypatch):
+    monkeypatch.setattr(regression, "RADII", (1.5,))
+    monkeypatch.setattr(regression, "TUBE", 1e-5)
     rng = np.random.default_rng(6)
     poses, new = random_poses(model, 80, rng, 0.4), random_poses(model, 20, rng, 0.3)
     judge = edge_error(model, curved(model, new))
     line = judge(learn(model, poses, curved(model, poses), features="linear")[1].gradients(new))
-    bells = judge(learn(model, poses, curved(model, poses), features="radial", regressor=regressor, ridges=(1e-3,),
-                        tube=1e-5)[1].gradients(new))
+    _, radial = learn(model, poses, curved(model, poses), features="radial", regressor=regressor, ridges=(1e-3,))
+    bells = judge(radial.gradients(new))
     assert bells < 0.35 * line
 
 
@@ -68,18 +72,19 @@ def test_support_vectors_shrug_off_a_wrong_body(model):
     Q = model.pose_space.gradients(poses)
     Q[3, model.skeleton.part_of_face == 1] += 3.0
     judge = edge_error(model, model.pose_space.gradients(new))
-    errors = {r: judge(learn(model, poses, Q, features="linear", regressor=r, ridges=(1e-2,), tube=1e-4)[1]
+    errors = {r: judge(learn(model, poses, Q, features="linear", regressor=r, ridges=(1e-2,))[1]
                        .gradients(new)) for r in ("ridge", "svr")}
     assert errors["svr"] < 0.5 * errors["ridge"]
 
 
 @pytest.mark.parametrize("features", ["linear", "quadratic", "radial"])
-def test_left_out_predictions_are_those_of_leaving_out(model, features):
+def test_left_out_predictions_are_those_of_leaving_out(model, features, monkeypatch):
+    monkeypatch.setattr(regression, "RADII", (1.0,))
     rng = np.random.default_rng(8)
     poses = random_poses(model, 12, rng)
     Q = model.pose_space.gradients(poses) + rng.normal(0, 0.05, (12, len(model.template.faces), 3, 3))
     seen = []
-    config = RegressionConfig(features, "ridge", (0.0,), (0.05,), (1.0,))
+    config = LearnConfig(features, "ridge", (0.0,), (0.05,))
     design = choose_design(model.template, model.skeleton, poses, Q, config, lambda p: seen.append(p) or 0.0)
     for i in (0, 7):
         rest = np.delete(np.arange(12), i)
@@ -99,7 +104,7 @@ def test_what_predicts_best_is_chosen(model):
     assert chosen.ridge == min(tried, key=tried.get)
     assert chosen.left_out_error == pytest.approx(min(tried.values()), rel=1e-12)
     again = choose_design(model.template, model.skeleton, poses, Q,
-                          RegressionConfig("linear", "ridge", (0.0,), tuple(tried)), judge, chosen)
+                          LearnConfig("linear", "ridge", (0.0,), tuple(tried)), judge, chosen)
     assert again.ridge == chosen.ridge
 
 
@@ -112,23 +117,23 @@ def test_pruning_is_chosen_by_what_it_predicts(model):
     assert design.pruning == 1e-4
 
 
-def test_condensing_loses_no_more_than_told(model):
+def test_compressing_loses_no_more_than_told(model):
     rng = np.random.default_rng(11)
     poses = random_poses(model, 60, rng)
     _, space = learn(model, poses, curved(model, poses), features="quadratic")
-    fewer = condense(space, poses, model.template, 1e-4)
+    fewer = compress(space, poses, model.template, 1e-4)
     v_hat = np.swapaxes(model.template.corners[:, 1:] - model.template.corners[:, :1], -1, -2)
     off = ((fewer.gradients(poses) - space.gradients(poses)) @ v_hat) ** 2
     for p, faces in enumerate(space.faces_of_part):
         assert np.sqrt(off[:, faces].sum() / (2 * len(poses) * len(faces))) <= 1.01e-4, p
     assert fewer.features.count < 0.7 * space.features.count
-    exact = condense(space, poses, model.template, 0.0)
+    exact = compress(space, poses, model.template, 0.0)
     np.testing.assert_allclose(exact.gradients(poses), space.gradients(poses), atol=1e-5)
 
 
-def test_condensing_keeps_the_constants_of_parts_without_features(model):
+def test_compressing_keeps_the_constants_of_parts_without_features(model):
     space = PoseSpace.identity(model.skeleton)
-    same = condense(space, np.zeros((3, 4, 3)), model.template, 1e-4)
+    same = compress(space, np.zeros((3, 4, 3)), model.template, 1e-4)
     np.testing.assert_array_equal(same.gradients(np.ones((4, 3))), space.gradients(np.ones((4, 3))))
 
 

@@ -6,14 +6,13 @@ from model_bodies import random_poses, worm_model
 from posing_bodies import skinned, symmetric_worm
 
 from model import load_model
-from model.blendscape import BlendScapeModel
 from model.cli import group
 from model.features import linear_features
 from model.pose_space import PoseSpace
 from model.resolution.change import ResolutionConfig, change_resolution, resample, resolution_gap, subdivide
 from model.resolution.distil import Follower
 from model.resolution.pieces import Piece, carry_skeleton, gradients_of
-from model.scape import ScapeModel
+from model.scape import BlendScapeModel, ScapeModel
 from model.shape_space import ShapeSpace
 from scanprep import decimate, write_mesh
 from scanprep.geometry import rotations

@@ -4,9 +4,9 @@ import numpy as np
 import pytest
 from model_bodies import random_poses, worm_model
 
+from model import LearnConfig, learn_scape
 from model.files import load_model
 from model.fitting import fit_shape
-from model.learning import LearnConfig, learn_scape
 from model.learning.sex_plane import PLANE, guess_sex, learn_sex_plane
 from model.learning.sexes import learn_by_sex
 

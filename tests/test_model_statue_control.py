@@ -7,19 +7,20 @@ from fractions import Fraction
 import numpy as np
 import pytest
 from animal_bodies import Animal
+from humanoid_maker import NAMES, freedom, nearest_marks
 
 from model.export.glb import skinned_glb, write_skinned_glb
-from model.statue.control.chart import Chart, automatic_chart, chart_problem, densities, make_chart
+from model.statue.control.chart import Chart, automatic_chart, chart_problem, cut, densities, find_seams, make_chart
 from model.statue.control.files import read_control, write_control
 from model.statue.control.flatten import _derivatives, _energy, _rest, crossings, orientation
-from model.statue.control.humanoid import NAMES, STORED, humanoid, humanoid_markers
+from model.statue.control.humanoid import STORED, humanoid, humanoid_markers
 from model.statue.control.model import control_problem
-from model.statue.control.seams import cut, find_seams
 from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.storage import StorageError
 from scanprep.skeleton.tree import Skeleton
+from scanprep.synthetic.anatomy import Anatomy
 from scanprep.synthetic.people import LANDMARKS, MARKERS
-from scanprep.synthetic.topology import load
+from scanprep.synthetic.topology import CANONICAL, load
 
 MIRROR = np.array([-1, 1, 1])
 
@@ -160,6 +161,16 @@ def test_landmarks_and_markers_are_where_people_have_them():
             assert away < 0.015, name                            # not where people have ears and toes
 
 
+def test_what_is_stored_is_what_its_maker_makes():
+    control = humanoid()
+    assert control.skeleton.names == NAMES
+    axes, limits = freedom(Anatomy(CANONICAL))
+    np.testing.assert_allclose(np.concatenate(control.axes), np.concatenate(axes), atol=1e-12)
+    np.testing.assert_allclose(np.concatenate(control.limits), np.concatenate(limits), atol=1e-12)
+    assert nearest_marks(control.mesh, LANDMARKS) == control.landmarks
+    assert nearest_marks(control.mesh, MARKERS) == humanoid_markers()
+
+
 def test_the_chart_is_one_to_one_and_even():
     control = humanoid()
     assert chart_problem(control.mesh, control.chart) is None
@@ -216,7 +227,7 @@ def test_the_energy_of_the_chart_has_the_derivatives_it_says():
 
 def test_a_chart_that_is_not_one_to_one_is_told():
     mesh, chart = humanoid().mesh, humanoid().chart
-    assert "turned over" in chart_problem(mesh, replace(chart, uv=chart.uv[:, ::-1]))
+    assert "inverted" in chart_problem(mesh, replace(chart, uv=chart.uv[:, ::-1]))
     assert "leaves" in chart_problem(mesh, replace(chart, uv=chart.uv + 0.5))
     turn = np.linspace(0, 2.3 * np.pi, 60)                          # a ribbon that runs over its own beginning
     ribbon = 0.5 + 0.4 * np.concatenate([r * np.stack([np.cos(turn), np.sin(turn)], axis=1) for r in (0.7, 1.0)])

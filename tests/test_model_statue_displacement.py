@@ -11,18 +11,10 @@ from scipy.spatial.transform import Rotation
 from model.statue.control.chart import make_chart
 from model.statue.control.model import FOLDED, HOLE, MEASURED, OUTSIDE, ControlModel, DisplacementMap
 from model.statue.detail.displacement import DisplacementConfig, bake, coverage_shares, unfold_control
+from model.statue.detail.errors import in_folds, inverted_triangles, remaining_error, surface_error
 from model.statue.detail.maps import read_map, write_map
 from model.statue.detail.normal_volume import from_normal_volume, interpolate, solve_triangles, to_normal_volume
-from model.statue.detail.reconstruction import (
-    Reconstruction,
-    VertexRotations,
-    chart_places,
-    displaced_surface,
-    in_folds,
-    inverted_triangles,
-    remaining_error,
-    surface_error,
-)
+from model.statue.detail.reconstruction import Reconstruction, VertexRotations, chart_places, displaced_surface
 from model.statue.detail.subdivision import subdivide, subdivide_adaptive
 from model.statue.detail.texels import continue_chart, find_texels
 from model.statue.detail.textures import bake_texture, scan_look

@@ -6,7 +6,7 @@ from model.statue.control.humanoid import humanoid
 from model.statue.registration.articulated import Articulated, Points
 from model.statue.registration.automatic import find_features, likely_unit
 from model.statue.registration.clicks import MedialAxis
-from model.statue.registration.features import FeatureConfig, fit_features, head_share, misfit, warp
+from model.statue.registration.features import fit_features, head_share, misfit, warp
 from scanprep.geometry import rotations
 from scanprep.geometry.mesh import Mesh
 from scanprep.synthetic.people import BodyShape, Person, compose
@@ -136,8 +136,6 @@ def test_features_that_do_not_suffice_or_exist_are_refused(control, model):
         fit_features(control, {**joints, "l_tail": np.zeros(3)})
     with pytest.raises(ValueError, match="l_hip: expected three finite"):
         fit_features(control, {**joints, "l_hip": np.array([np.nan, 0, 0])})
-    with pytest.raises(ValueError, match="longest"):
-        FeatureConfig(longest=0.0)
 
 
 def test_the_warp_is_equation_5(control):

@@ -6,11 +6,11 @@ from model_bodies import random_poses, worm_model
 from posing_bodies import skinned, symmetric_worm
 
 from model import fit_pose
-from model.blendscape import BlendScapeModel
 from model.cli import group
 from model.features import linear_features
 from model.fitting import PoseFit, ShapeFit
 from model.posing.transfer import own_body, repose, subject_from_body
+from model.scape import BlendScapeModel
 from scanprep import read_mesh, write_mesh
 from scanprep.geometry import rotations
 

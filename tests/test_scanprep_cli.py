@@ -1,10 +1,10 @@
 """The commands of `scape prep`: each explains itself, and hands files from one to the next."""
 import json
 import re
+import shutil
 import subprocess
 import sys
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -19,6 +19,7 @@ from scanprep.cli import COMMANDS
 from scanprep.correspondence.correspondences import Correspondences
 from scanprep.correspondence.files import read_correspondences, write_correspondences
 from scanprep.geometry.files import PointCloud, write_points
+from scanprep.geometry.landmarks import LANDMARK_ENDINGS, read_landmarks
 from scanprep.geometry.storage import StorageError
 from scanprep.pipeline.prepare import prepare
 from scanprep.pipeline.scans import find_scans
@@ -51,7 +52,8 @@ def place(tmp_path_factory, template):
 @pytest.fixture
 def quick(tmp_path, monkeypatch):
     """A file of settings for a registration with few steps."""
-    monkeypatch.setattr(registration_cli, "register", partial(register, config=QUICK.scan.registration))
+    monkeypatch.setattr(registration_cli, "register", lambda *given, **named: register(
+        *given, **named | {"config": QUICK.scan.registration}))
     path = tmp_path / "quick.toml"
     config = replace(QUICK, min_poses=5, scan=replace(QUICK.scan, pictures=True))
     path.write_text(config_files.write({"config": config}))
@@ -229,10 +231,11 @@ def test_correspondences_in_a_file(place, tmp_path, capsys, quick):
     assert len(found) == report(tmp_path / "pairs.report.json")["correspondences"] > 5
     assert 0 <= found.template_vertices.min() and found.template_vertices.max() < 642
     assert ((found.confidence >= 0) & (found.confidence <= 1)).all()
-    assert run(*words, "--functional", "-o", tmp_path / "map.json") == 0
-    by_map = read_correspondences(tmp_path / "map.json")
-    assert by_map.method != found.method and len(by_map) > 5
-    assert run("correspond", scan, "--template", place / "template.ply", "-o", tmp_path / "none.json") == 1
+    beside = [*words[:4], "--points", 40]                    # the file of its name beside the scan
+    assert run(*beside, "-o", tmp_path / "beside.json") == 1
+    assert (tmp_path / "beside.json").read_bytes() == (tmp_path / "pairs.json").read_bytes()
+    capsys.readouterr()
+    assert run(*beside, "--ignore-landmarks", "-o", tmp_path / "none.json") == 1
     assert "at least three limbs" in capsys.readouterr().err
     few = read_mesh(scan).vertices[::90]
     write_correspondences(tmp_path / "few.json", Correspondences(np.arange(642)[::90], few, np.ones(len(few))))
@@ -258,3 +261,30 @@ def test_files_of_correspondences(tmp_path):
             read_correspondences(tmp_path / "c.json")
     with pytest.raises(StorageError, match="no such file"):
         read_correspondences(tmp_path / "none.json")
+
+
+@pytest.mark.parametrize("ending", LANDMARK_ENDINGS)
+def test_register_finds_the_landmarks_beside_the_scan(place, tmp_path, ending, quick):
+    scan = tmp_path / "scan.ply"
+    shutil.copy(place / "scans" / "body0.ply", scan)
+    points = read_landmarks(place / "scans" / "body0.landmarks.json")
+    (tmp_path / f"scan{ending}").write_text(landmark_file(ending, points))
+    assert run("register", scan, "--template", place / "template.ply", "-o", tmp_path / "out.ply") == 0
+    figures = report(tmp_path / "out.report.json")
+    assert figures["landmarks"] == len(MARKS) and figures["landmark file"] == f"scan{ending}"
+    assert figures["distance of landmarks, RMS"] < 30
+
+
+def landmark_file(ending, points):
+    if ending == ".mrk.json":
+        return json.dumps({"markups": [{"coordinateUnits": "m", "controlPoints": [
+            {"label": name, "position": list(p)} for name, p in points.items()]}]})
+    if ending.endswith(".json"):
+        return json.dumps({name: list(p) for name, p in points.items()})
+    if ending.endswith(".pp"):
+        rows = "".join(f'<point x="{x}" y="{y}" z="{z}" name="{name}"/>' for name, (x, y, z) in points.items())
+        return f"<PickedPoints>{rows}</PickedPoints>"
+    if ending == ".lnd":
+        return "".join(f"{i} 0 {i} 0 {1000 * x} {1000 * y} {1000 * z} {name}\n"
+                       for i, (name, (x, y, z)) in enumerate(points.items()))
+    return "".join(f"{x} {y} {z} {name}\n" for name, (x, y, z) in points.items())

@@ -11,6 +11,7 @@ from scanprep.geometry.files import (
     read_landmarks,
     write_landmarks,
 )
+from scanprep.geometry.landmarks import LANDMARK_ENDINGS, landmarks_beside, read_template_landmarks
 from scanprep.geometry.mesh import Mesh
 
 MESH = Mesh([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1.5]], [[0, 2, 1], [0, 1, 3], [1, 2, 3], [0, 3, 2]])
@@ -151,3 +152,25 @@ def test_too_few_matches_show_both_lists():
         match_landmarks({"nose": 1, "chin": 2}, {"Nose": 1, "chin": 2, "knee": 3})
     with pytest.raises(ValueError, match="template: none; scan: none"):
         match_landmarks({}, {})
+
+
+@pytest.mark.parametrize("ending", LANDMARK_ENDINGS)
+@pytest.mark.parametrize("scan", ["anna.ply", "anna.ply.gz", "anna.scan.xyz"])
+def test_the_landmark_file_beside_a_scan_is_found(tmp_path, ending, scan):
+    assert landmarks_beside(tmp_path / scan) is None
+    for name in ("landmarks.json", f"annabel{ending}"):                      # those of others
+        (tmp_path / name).touch()
+    assert landmarks_beside(tmp_path / scan) is None
+    (tmp_path / f"anna{ending}").touch()
+    assert landmarks_beside(tmp_path / scan) == tmp_path / f"anna{ending}"
+    assert landmarks_beside(tmp_path / "else" / scan, tmp_path) == tmp_path / f"anna{ending}"
+
+
+def test_the_template_of_a_registered_set_has_the_landmarks_of_the_set(tmp_path):
+    with pytest.raises(ValueError, match=r"template.landmarks.json beside it; name the file with --template-landmarks"):
+        read_template_landmarks(tmp_path / "template.ply", MESH)
+    write_landmarks(tmp_path / "landmarks.json", {"a": 3})
+    assert read_template_landmarks(tmp_path / "template.ply", MESH) == {"a": 3}
+    write_landmarks(tmp_path / "template.json", {"b": 2})
+    assert read_template_landmarks(tmp_path / "template.ply", MESH) == {"b": 2}
+    assert read_template_landmarks(tmp_path / "x.ply", MESH, tmp_path / "landmarks.json") == {"a": 3}

@@ -48,7 +48,7 @@ def test_a_surface_point_is_carried_with_its_triangle():
     mesh = ball()
     found = Surface(mesh).closest(RNG(1).normal(size=(50, 3)))
     A, t = RNG(2).normal(size=(3, 3)), np.array([1, 2, 3])
-    carried = found.carried(mesh.vertices @ A.T + t, mesh.faces)
+    carried = found.transferred(mesh.vertices @ A.T + t, mesh.faces)
     np.testing.assert_allclose(carried, found.points @ A.T + t, atol=1e-12)
 
 

@@ -1,4 +1,4 @@
-"""Embedded people: the surface, correspondence, posing, poses and marks."""
+"""Synthetic people: the surface, correspondence, posing, poses and marks."""
 from __future__ import annotations
 
 import igl
@@ -9,6 +9,7 @@ from scanprep.geometry import rotations, storage
 from scanprep.geometry.mesh import Mesh, template_problem
 from scanprep.synthetic import people
 from scanprep.synthetic import topology as people_template
+from scanprep.synthetic.body_parts import body_surface
 from scanprep.synthetic.muscles import COLUMNS, masks
 from scanprep.synthetic.people import NAMED_POSES, PARENTS, PARTS, BodyShape, Person
 
@@ -53,14 +54,14 @@ def test_canonical_mesh_has_no_slivers():
 def test_topology_is_shared_and_vertices_lie_on_the_surface_that_the_code_describes(bodies):
     for person in bodies:
         assert np.array_equal(person.mesh.faces, people_template.load().mesh.faces)
-        distance = np.abs(person.anatomy.field(person.mesh.vertices))
+        distance = np.abs(body_surface(person.anatomy)(person.mesh.vertices))
         assert np.median(distance) < 1e-5 and np.percentile(distance, 99) < 5e-4 and distance.max() < 5e-3
 
 
 def test_stored_template_is_what_the_code_would_build():
     _, arrays = storage.load(people_template.STORED, "people template", (people_template.VERSION,))
     stored = arrays["vertices"] / 1e5
-    assert np.abs(people_template.Anatomy(people_template.CANONICAL).field(stored)).max() < 5e-4
+    assert np.abs(body_surface(people_template.Anatomy(people_template.CANONICAL))(stored)).max() < 5e-4
     assert people_template.STORED.stat().st_size < 300_000
 
 
@@ -141,7 +142,7 @@ def test_every_shape_parameter_moves_the_surface(man):
                  "neck",
                  "head_size", "limbs", "extremities", "nose"):
         other = people_template.Anatomy(BodyShape(**{name: 1.5}))
-        assert np.abs(other.field(man.mesh.vertices)).max() > 0.0025, name
+        assert np.abs(body_surface(other)(man.mesh.vertices)).max() > 0.0025, name
 
 
 def test_pose_zero_is_rest(bodies):

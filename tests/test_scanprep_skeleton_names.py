@@ -12,7 +12,7 @@ from scanprep.synthetic.people import BodyShape, Person
 
 
 def expected(name):
-    """`l_upper_arm` of the embedded people as `upper_arm_left`."""
+    """`l_upper_arm` of the synthetic people as `upper_arm_left`."""
     return f"{name[2:]}_{'left' if name[0] == 'l' else 'right'}" if name[1] == "_" else name
 
 

@@ -12,7 +12,7 @@ from threadpoolctl import threadpool_info, threadpool_limits
 
 from completion import MarkerLayout, MarkerSequence, animate
 from model import fit_pose, learn_scape
-from model.learning.scape import LearnConfig
+from model.learning.config import LearnConfig
 from scanprep import threads
 from scanprep.console import Metric, Outcome, run
 from scanprep.threads import VARIABLES, begin_worker, one_thread, search_threads

@@ -26,11 +26,11 @@ from scanprep.pipeline.template import TemplateConfig, make_template
 from scanprep.skeleton.find import SkeletonConfig
 from scanprep.synthetic.data_set import (
     SUBJECT,
-    EmbeddedScan,
     GroundTruth,
+    SyntheticScan,
     click_landmarks,
-    embedded_plan,
     read_views,
+    scan_plan,
     stand,
     write_scan,
 )
@@ -42,10 +42,9 @@ from ..mocap.files.markers import MarkerSequence, read_markers
 from ..mocap.marker_sets.layout import MarkerLayout
 from ..mocap.pose.follow import animate
 from ..motion import Motion
-from ..partial.completion import Completion, complete
-from ..partial.results import load_completion, save_completion
+from ..partial.completion import Completion, complete, load_completion, save_completion
 from .recording import ScanPerson, record_walk
-from .settings import DemoConfig, write_settings
+from .settings import LANDMARKS, MARKER_NOISE, PARTS, TEMPLATE_VIEWS, DemoConfig, write_settings
 from .truth import TruthMap
 
 MODEL, HALF, MOTION = Path("model.npz"), Path("half_view/half_view.ply"), Path("animation/motion.npz")
@@ -54,19 +53,11 @@ Bar = Callable[[str], AbstractContextManager[Callable[[int, int], None]]]
 
 @dataclass(frozen=True)
 class Demo:
-    """One run of the demonstration in its folder.
-
-    Attributes
-    ----------
-    space : Workspace
-    config : DemoConfig
-    bar : callable
-        `bar(title)` is a context manager that yields a progress callback.
-    """
+    """One run of the demonstration in its folder."""
 
     space: Workspace
     config: DemoConfig
-    bar: Bar
+    bar: Bar  # `bar(title)` is a context manager that yields a progress callback
 
     @property
     def folder(self) -> Path:
@@ -79,11 +70,11 @@ class Demo:
         return ScannerConfig(resolution=self.config.resolution)
 
     @cached_property
-    def scans(self) -> list[EmbeddedScan]:
+    def scans(self) -> list[SyntheticScan]:
         """Scans of one subject in many poses and of many subjects."""
         tasks = [Task(f"{SCANS}{'pose' if which[1] else 'person'} {which[0]}", which)
-                 for which in embedded_plan(self.config.poses, self.config.subjects)]
-        with self.bar("scanning embedded people") as progress, one_thread():
+                 for which in scan_plan(self.config.poses, self.config.subjects)]
+        with self.bar("scanning synthetic people") as progress, one_thread():
             done = self.space.run(ScanPerson(self.config.seed, self.scanner), tasks, progress=progress)
         if done.failures:
             raise ValueError("; ".join(done.failures.values()))
@@ -98,7 +89,7 @@ class Demo:
     def template(self) -> Mesh:
         """A careful scan of the subject at rest from more sides, merged, its holes filled, decimated."""
         # from above and below too, and into places that a fixed scanner does not reach: hands have fingers
-        scanner = ScannerConfig(views=self.config.template_views, resolution=self.config.template_resolution,
+        scanner = ScannerConfig(views=TEMPLATE_VIEWS, resolution=self.config.template_resolution,
                                 height=1.2, blind_reach=0.01)
         settings = TemplateConfig()
         settings = replace(settings, merge=replace(settings.merge, voxel=self.config.template_resolution))
@@ -131,16 +122,10 @@ class Demo:
 
     @cached_property
     def prepared(self) -> Prepared:
-        """The registered set, with its skeleton.
-
-        Raises
-        ------
-        ValueError
-            A scan that could not be registered.
-        """
+        """The registered set, with its skeleton."""
         # registration slides some millimetres along the skin: less than that is not motion. The value was chosen
         # on these very scans, so the agreement with the true parts shows what can be reached, not what to expect.
-        config = PrepareConfig(skeleton=SkeletonConfig(parts=self.config.parts, tolerance=0.003))
+        config = PrepareConfig(skeleton=SkeletonConfig(parts=PARTS, tolerance=0.003))
         template, marks, _ = self.template, self.template_landmarks, self.scans
         tasks = find_scans(self.folder / "scans")
         with workspace(self.folder / "set", self.space.force) as space:
@@ -205,11 +190,11 @@ class Demo:
             rng = np.random.default_rng([self.config.seed, 8])
             seen = scan(truth.mesh, scanner, rng)
             marks = click_landmarks(truth, rng, seen=seen.merged.vertices)
-            few = np.unique(np.linspace(0, len(marks) - 1, self.config.landmarks).round().astype(int))
+            few = np.unique(np.linspace(0, len(marks) - 1, LANDMARKS).round().astype(int))
             write_scan(folder / HALF.parent, HALF.stem, seen, truth,
                        {name: marks[name] for name in np.array(list(marks))[few]}, views=False)
 
-        self.space.step("half view", (self.config.seed, scanner, self.config.landmarks), make)
+        self.space.step("half view", (self.config.seed, scanner, LANDMARKS), make)
         half = self.folder / HALF
         return read_mesh(half), read_landmarks(half.with_suffix(".landmarks.json")), truth
 
@@ -238,7 +223,7 @@ class Demo:
             with self.bar("recording a walk") as progress:
                 record_walk(folder / "markers", bodies, self.rest, template, config, progress)
 
-        self.space.step("markers", (config.seed, config.frames, config.rate, config.marker_noise, template), make)
+        self.space.step("markers", (config.seed, config.frames, config.rate, MARKER_NOISE, template), make)
         layout = MarkerLayout.load(self.folder / "markers" / "layout.json", len(template.vertices))
         return read_markers(self.folder / "markers" / "walk.c3d"), layout, bodies
 

@@ -63,7 +63,7 @@ def _animation(demo: Demo) -> list[Metric]:
     motion, (_, _, bodies) = demo.motion, demo.walk
     followed = motion.vertices(demo.subject)
     faces = demo.person.mesh.faces
-    apart = [distance(f, demo.truth_map.places.carried(b, faces)) for f, b in zip(followed, bodies, strict=True)]
+    apart = [distance(f, demo.truth_map.places.transferred(b, faces)) for f, b in zip(followed, bodies, strict=True)]
     return [Metric("animation: frames", len(followed)),
             Metric("animation: distance of markers, mean", MM * float(np.nanmean(motion.residuals)), "mm"),
             Metric("animation: distance of corresponding points, mean",

@@ -11,15 +11,16 @@ from model.report import picture_components, picture_parts
 from scanprep.console import Metric
 from scanprep.geometry import storage
 from scanprep.geometry.files import read_mesh
-from scanprep.pictures.animation import animated_glb
+from scanprep.pictures.camera import look_around, upright
+from scanprep.pictures.gltf import animated_glb
 from scanprep.pictures.page import Page
 from scanprep.pictures.shading import Shape, Solid, heat, part_colors, render, side_by_side
 from scanprep.pictures.sheets import save_png
-from scanprep.pictures.views import look_around, upright
 
-from ..mocap.animate.report import animated_picture, chart_residuals, picture_frames
+from ..motion_pictures import animated_picture, chart_residuals, picture_frames
 from ..partial.report import COMPLETED, HEIGHT, MEASURED, picture_completion, picture_distance
 from .chain import Demo
+from .settings import PARTS
 from .truth import surface_error
 
 FAR = 0.01                 # metres at the end of the heat maps
@@ -28,7 +29,7 @@ FAR = 0.01                 # metres at the end of the heat maps
 def write_page(demo: Demo, metrics: list[Metric], tell: Callable[[int, int], None], to: Path) -> None:
     """Write `report.html`, the animated GLB and pictures into a folder."""
     page = Page("From raw scans to a moving person",
-                "Every stage of the chain on embedded people, whose true shape, pose and correspondence are known.")
+                "Every stage of the chain on synthetic people, whose true shape, pose and correspondence are known.")
     page.table([(m.name, m.text(), m.unit) for m in metrics], ("against the ground truth", "value", "unit"))
     stages: tuple[Callable[[Demo, Page], None], ...] = (
         _scans, _template, _registration, _skeleton, _shapes, _poses, partial(_completion, to=to),
@@ -111,7 +112,7 @@ def _registration(demo: Demo, page: Page) -> None:
 
 
 def _skeleton(demo: Demo, page: Page) -> None:
-    page.section("Skeleton", f"The {demo.config.parts} parts that move most rigidly, found from the registered "
+    page.section("Skeleton", f"The {PARTS} parts that move most rigidly, found from the registered "
                  "poses of the subject, and the joints between them.")
     skeleton = demo.model.skeleton
     page.picture(picture_parts(demo.template, skeleton), "parts and joints")
@@ -159,7 +160,7 @@ def _animation(demo: Demo, page: Page, to: Path) -> None:
     glb = animated_glb(subject.template.faces, motion.vertices(subject), motion.rate, up=upright(subject.template)[0])
     with storage.writing(to / "animation" / "walk.glb") as beside:
         beside.write_bytes(glb)
-    page.picture(picture_frames(motion, subject, sequence), "some frames with the measured markers")
+    page.picture(picture_frames(motion, subject, sequence.positions), "some frames with the measured markers")
     page.picture(animated_picture(motion, subject), "the walk")
     page.chart(chart_residuals(motion), "distance of the markers to where the body puts them")
     page.download("walk.glb", glb, "the walk as an animated GLB")

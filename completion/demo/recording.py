@@ -1,4 +1,4 @@
-"""What is measured of the embedded people: range scans, and the markers of a walk."""
+"""What is measured of the synthetic people: range scans, and the markers of a walk."""
 from __future__ import annotations
 
 from collections.abc import Callable
@@ -10,24 +10,24 @@ from scipy.spatial import cKDTree
 
 from scanprep.batch.room import Room
 from scanprep.geometry.mesh import Mesh
-from scanprep.synthetic.data_set import EmbeddedScan, GroundTruth, embedded_scan
+from scanprep.synthetic.data_set import GroundTruth, SyntheticScan, synthetic_scan
 from scanprep.synthetic.people import MARKERS
 from scanprep.synthetic.scanner import ScannerConfig
 
 from ..mocap.files.markers import MarkerSequence, write_markers
 from ..mocap.marker_sets.layout import DISTANCE, MarkerLayout
-from .settings import DemoConfig
+from .settings import MARKER_NOISE, DemoConfig
 
 
 @dataclass(frozen=True)
 class ScanPerson:
-    """The work on each scan: an embedded person made and scanned."""
+    """The work on each scan: a synthetic person made and scanned."""
 
     seed: int
     scanner: ScannerConfig
 
-    def __call__(self, which: tuple[int, bool], room: Room) -> EmbeddedScan:
-        found = embedded_scan(room.folder / "scans", self.seed, *which, self.scanner)
+    def __call__(self, which: tuple[int, bool], room: Room) -> SyntheticScan:
+        found = synthetic_scan(room.folder / "scans", self.seed, *which, self.scanner)
         return replace(found, folder=Path("scans"))
 
 
@@ -40,7 +40,7 @@ def record_walk(folder: Path, bodies: np.ndarray, rest: GroundTruth, template: M
     for i, body in enumerate(bodies):
         out.append(body[places] + DISTANCE * Mesh(body, rest.faces).vertex_normals[places])
         tell(i + 1, len(bodies))
-    positions = np.stack(out) + rng.normal(0, config.marker_noise, (len(bodies), len(labels), 3))
+    positions = np.stack(out) + rng.normal(0, MARKER_NOISE, (len(bodies), len(labels), 3))
     positions[rng.random(positions.shape[:2]) < 0.03] = np.nan
     # as on a real subject: the layout is read off the scan at rest, on which the markers can be seen
     _, vertices = cKDTree(template.vertices).query(rest.vertices[places])

@@ -1,4 +1,4 @@
-"""How far the results of the chain are from the ground truth of the embedded people."""
+"""How far the results of the chain are from the ground truth of the synthetic people."""
 from __future__ import annotations
 
 from dataclasses import dataclass
@@ -13,23 +13,15 @@ from scanprep.synthetic.data_set import GroundTruth
 
 @dataclass(frozen=True, eq=False)
 class TruthMap:
-    """Where each vertex of the template truly lies on any embedded person.
+    """Where each vertex of the template truly lies on any synthetic person.
 
-    All embedded people share one triangulation, so a point of the surface is a triangle with barycentric
+    All synthetic people share one triangulation, so a point of the surface is a triangle with barycentric
     coordinates, and is carried from the scan that the template was made of to every other person and pose.
-
-    Attributes
-    ----------
-    template : Mesh
-    places : SurfacePoints
-        The true surface points nearest to the template's vertices.
-    part_of_face : (F,) int
-        True part under each triangle of the template.
     """
 
     template: Mesh
-    places: SurfacePoints
-    part_of_face: np.ndarray
+    places: SurfacePoints  # the true surface points nearest to the template's vertices
+    part_of_face: np.ndarray  # (F,) int: true part under each triangle of the template
 
     @staticmethod
     def of(template: Mesh, rest: GroundTruth) -> TruthMap:
@@ -40,7 +32,7 @@ class TruthMap:
 
     def vertices(self, truth: GroundTruth) -> np.ndarray:
         """True places (N, 3) of the template's vertices, metres."""
-        return self.places.carried(truth.vertices, truth.faces)
+        return self.places.transferred(truth.vertices, truth.faces)
 
 
 def surface_error(mesh: Mesh, truth: GroundTruth) -> np.ndarray:

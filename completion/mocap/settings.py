@@ -6,7 +6,7 @@ from typing import Literal
 
 from scanprep.ranges import Count, Positive, Seed, Settings, Share
 
-from .pose.settings import AnimateConfig
+from .pose.settings import AnimateConfig, FollowConfig
 
 Attachment = Literal["triangle", "neighbourhood"]
 
@@ -67,28 +67,6 @@ class PersonConfig(Settings):
     start_axes: int = 6
     iterations: Count = 8
     seed: Seed = 0
-
-
-@dataclass(frozen=True)
-class FollowConfig(Settings):
-    """Settings of the poses of every frame of a person whose shape and markers are known.
-
-    Attributes
-    ----------
-    data, pose, velocity : float
-        Weights of the terms, in the paper's units: markers, pose prior, and change of velocity from frame to frame,
-        120 frames a second.
-    outlier : float, metres
-        Residual at which a marker has lost three quarters of its weight.
-    prior_shrinkage : float in [0, 1]
-        See `gaussian_prior`.
-    """
-
-    data: float = 2.0
-    pose: float = 0.3
-    velocity: float = 57600.0
-    outlier: Positive = 0.06
-    prior_shrinkage: Share = 0.3
 
 
 @dataclass(frozen=True)

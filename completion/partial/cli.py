@@ -8,14 +8,13 @@ from typing import Annotated, Literal
 import tyro
 
 from model.body import BodyModel
-from model.cli import read_subject
 from model.linear import Subject
+from model.posing.cli import read_subject
 from scanprep.batch.pool import Workers
 from scanprep.batch.workspace import Task, Workspace
 from scanprep.cli import Output, Unit
 from scanprep.console import Outcome, bar, failures_of, problem_of, say
-from scanprep.geometry.landmarks import read_landmark_vertices
-from scanprep.pipeline.scans import LANDMARK_ENDINGS
+from scanprep.geometry.landmarks import landmarks_beside, read_landmark_vertices
 
 from ..cli import ModelOrNone, read_model
 from .colors import ColorConfig
@@ -41,7 +40,7 @@ def complete_scan(scans: ScansArg, output: Output, model: ModelOrNone = None, la
         scans: Mesh or point cloud, the views of one body, or a folder of scans.
         output: Folder to write completed.ply, predicted.ply, completion.npz and report.html to; completed.glb for a
             scan with a texture.
-        model: Model of `scape learn`; without it that of the embedded people, which is made on first use.
+        model: Model of `scape learn`; without it that of the synthetic people, which is made on first use.
         landmarks: 4 to 10 named points on the scan; else the file of the scan's name beside it. Without any the
             search starts from typical poses. For a folder of scans, the folder of such files.
         subject: Whose body it is: "template" for the one the model's poses were learned from, betas in JSON or .npz,
@@ -65,7 +64,7 @@ def complete_scan(scans: ScansArg, output: Output, model: ModelOrNone = None, la
     body: BodyModel | Subject = loaded
     if subject is not None or not loaded.n_betas:
         body = read_subject(loaded, None if subject in (None, "template") else Path(str(subject)), unit)
-    inputs = Inputs(scans, landmarks or _beside(scans), mask)
+    inputs = Inputs(scans, landmarks or landmarks_beside(scans[0]), mask)
     wanted = any(one.landmarks for one in found.values()) if folder else inputs.landmarks is not None
     marks = _template_landmarks(loaded, template_landmarks, name) if wanted else {}
     work = Work(body, name, marks, config, unit, ColorConfig(fill=fill_colors))
@@ -88,13 +87,6 @@ def _only(masks: tuple[Path, ...]) -> Path | None:
     if len(masks) > 1:
         raise ValueError(f"--mask: expected one folder of masks for a folder of scans, got {len(masks)}")
     return masks[0] if masks else None
-
-
-def _beside(scans: tuple[Path, ...]) -> Path | None:
-    """The landmark file of the first view's name."""
-    stem = scans[0].name.split(".")[0]
-    places = [scans[0].with_name(stem + ending) for ending in LANDMARK_ENDINGS]
-    return next((place for place in places if place.is_file()), None)
 
 
 def _template_landmarks(model: BodyModel, given: Path | None, name: str) -> dict[str, int]:

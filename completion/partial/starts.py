@@ -8,6 +8,7 @@ import numpy as np
 from model.priors import GaussianPrior, typical_poses
 from scanprep import find_correspondences
 from scanprep.geometry import rotations
+from scanprep.geometry.farthest_points import farthest_points
 from scanprep.geometry.least_squares import normal_equations
 
 from .. import energy
@@ -118,14 +119,7 @@ def starting_poses(fit: ScanFit) -> np.ndarray:
 
 def varied(poses: np.ndarray, count: int) -> np.ndarray:
     """Those `count` of the poses (M, J, 3), the first among them, that differ most from one another."""
-    if len(poses) <= count:
-        return poses
-    flat, kept = poses.reshape(len(poses), -1), [0]
-    apart = np.linalg.norm(flat - flat[0], axis=1)
-    while len(kept) < count:
-        kept.append(int(np.argmax(apart)))
-        apart = np.minimum(apart, np.linalg.norm(flat - flat[kept[-1]], axis=1))
-    return poses[kept]
+    return poses if len(poses) <= count else poses[farthest_points(poses.reshape(len(poses), -1), count, 0)]
 
 
 def all_rotations(count: int) -> np.ndarray:

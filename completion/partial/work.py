@@ -15,13 +15,13 @@ from model.linear import Subject
 from scanprep.batch.room import Room
 from scanprep.cli import MM, Unit
 from scanprep.console import Metric, Outcome, write_report
-from scanprep.geometry.files import PointCloud, read_mesh, read_points
+from scanprep.geometry.files import POINT_ENDINGS, PointCloud, read_mesh, read_points
 from scanprep.geometry.landmarks import match_landmarks, read_landmarks
 from scanprep.geometry.mesh import Mesh
 from scanprep.pictures.page import Page
 from scanprep.pictures.sheets import save_png
 from scanprep.pictures.textures import Texture, bake, read_texture, write_textured
-from scanprep.pipeline.scans import POINT_ENDINGS, find_scans
+from scanprep.pipeline.scans import find_scans
 
 from .colors import ColorConfig, blend, carry_colors, colored_views
 from .completion import Completion, complete, completion_problem, save_completion

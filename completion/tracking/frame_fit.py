@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from scanprep.geometry.farthest_points import farthest_points
 from scanprep.geometry.least_squares import Arrow, Dense, levenberg_marquardt, normal_equations
 from scanprep.geometry.surface import Surface
 
@@ -100,11 +101,8 @@ def shared_shape(body: ShapedBody, clouds: Sequence[ScanPoints], x: np.ndarray, 
 def spread_poses(vertices: np.ndarray, count: int) -> np.ndarray:
     """Indices of `count` of the bodies (n, N, 3) that are as unlike as possible, in order, the first among them."""
     shapes = vertices - vertices.mean(axis=1, keepdims=True)
-    chosen, apart = [0], np.linalg.norm(shapes - shapes[0], axis=2).mean(axis=1)
-    while len(chosen) < min(count, len(shapes)):
-        chosen.append(int(np.argmax(apart)))
-        apart = np.minimum(apart, np.linalg.norm(shapes - shapes[chosen[-1]], axis=2).mean(axis=1))
-    return np.sort(chosen)
+    return np.sort(farthest_points(
+        shapes, count, 0, lambda i, _: np.linalg.norm(shapes - shapes[i], axis=2).mean(axis=1)))
 
 
 def _reach(i: int) -> float:

@@ -7,7 +7,8 @@ import numpy as np
 
 from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.surface import OrientedPoints, Surface
-from scanprep.registration.matches import Target, tukey
+from scanprep.geometry.target import Target
+from scanprep.registration.matches import tukey
 
 
 @dataclass(frozen=True, eq=False)

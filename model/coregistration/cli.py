@@ -10,7 +10,6 @@ from typing import Annotated
 import numpy as np
 import tyro
 
-from scanprep.batch.pool import Workers
 from scanprep.batch.workspace import Workspace
 from scanprep.cli import Output, Unit
 from scanprep.console import Metric, Outcome, bar
@@ -20,7 +19,6 @@ from scanprep.geometry.landmarks import match_landmarks, read_landmarks, write_l
 from scanprep.geometry.mesh import Mesh
 from scanprep.pipeline.prepare import mesh_file
 from scanprep.pipeline.scans import ScanTask, find_scans
-from scanprep.ranges import Count, Share
 
 from ..body import BodyModel
 from ..cli import ModelArg
@@ -39,8 +37,8 @@ ScansArg = Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="SCANS")]
 
 def coregister_scans(model: ModelArg, scans: ScansArg, output: Output, landmarks: Path | None = None,
                      first: Path | None = None, subject: str = OWN, unit: Unit | None = None,
-                     rounds: Count = CoregistrationConfig.rounds, workers: Workers = Workers(),  # noqa: B008
-                     failed: Share = CoregistrationConfig.failed, *, space: Workspace) -> Outcome:
+                     config: CoregistrationConfig = CoregistrationConfig(), *, space: Workspace  # noqa: B008
+                     ) -> Outcome:
     """Register every scan of a folder with a model as prior, learn the model again, and so on until it settles.
 
     Writes a registered set with model.npz in it. Killed and started again it goes on where it was. Of a scan that has
@@ -56,14 +54,11 @@ def coregister_scans(model: ModelArg, scans: ScansArg, output: Output, landmarks
         first: Registered set of the same scans, where each search begins; bad ones do no harm.
         subject: Whose scans they are, where scans.csv does not say; else all of the template's person.
         unit: Unit of the scans and landmarks, where the files cannot tell.
-        rounds: Most times that all scans are registered and the model is learned.
-        workers: Who does the work.
-        failed: A scan of which a larger share of points stays unexplained does not teach the model.
+        config: Settings.
     """
-    from scanprep.pipeline.scans import read_scan
+    from scanprep.geometry.files import read_scan
 
     loaded, tasks = load_model(model), find_scans(scans, landmarks, subject)
-    config = CoregistrationConfig(rounds=rounds, workers=workers, failed=failed)
     read, marks, kept, failures = [], [], [], []
     for task in tasks:
         try:

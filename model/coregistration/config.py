@@ -2,13 +2,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import Annotated
 
 from scanprep.batch.pool import Workers
-from scanprep.ranges import Cell, Count, Positive, Settings, Share, Signed
+from scanprep.ranges import FLAG, Cell, Count, Positive, Settings, Share, Signed
 from scanprep.registration.schedule import GraphStage, RegistrationConfig
-from scanprep.skeleton.parts import SkeletonConfig
 
-from ..learning.scape import LearnConfig
+from ..learning.config import LearnConfig
 
 
 @dataclass(frozen=True)
@@ -92,6 +92,8 @@ class ModelFitConfig(Settings):
     enough: Share = 0.98
 
 
+EXPLAINED = 0.006                    # share of √area: scan points so near to the mesh, facing alike, are explained
+
 # the predicted mesh lies near already: fine stages only, whose stiffness is relative to the prediction's own shape
 NEAR = RegistrationConfig(graph=(
     GraphStage(300, 0.09, 0.009, 0.7, 0.01, 0.08),
@@ -110,30 +112,21 @@ class CoregistrationConfig(Settings):
     fit : ModelFitConfig
     registration : RegistrationConfig
         Of the template as the model predicts it, which resists by the predicted shape.
-    alignments : int
-        How often the template is aligned; before each further time, pose and betas are taken from the alignment.
     learn : LearnConfig
         How the model is learned again.
     rounds : int
         Most times that all scans are registered and the model is learned.
     tolerance : float
         Settled when a round moves the mean vertex by less than this share of √area.
-    explained : float
-        A scan point nearer to the mesh than this share of √area, and not facing away from it, is explained.
     failed : float
         A scan of which a larger share of points stays unexplained has failed, and does not teach the model.
-    skeleton : SkeletonConfig, optional
-        Find the skeleton again in every round; without it the model keeps the one it has.
     workers : Workers
     """
 
     fit: ModelFitConfig = field(default_factory=ModelFitConfig)
     registration: RegistrationConfig = NEAR
-    alignments: Count = 1
     learn: LearnConfig = field(default_factory=LearnConfig)
-    rounds: Count = 3
+    rounds: Annotated[Count, FLAG] = 3
     tolerance: float = 0.0007
-    explained: Positive = 0.006
-    failed: Share = 0.015
-    skeleton: SkeletonConfig | None = None
+    failed: Annotated[Share, FLAG] = 0.015
     workers: Workers = field(default_factory=Workers)

@@ -11,7 +11,7 @@ from scipy.spatial import cKDTree
 from scanprep.geometry import rotations
 from scanprep.geometry.least_squares import Dense, levenberg_marquardt
 from scanprep.geometry.mesh import Mesh
-from scanprep.registration.matches import Target, orient
+from scanprep.geometry.target import Target, orient
 
 from ..body import BodyModel
 from ..features import twists

@@ -14,12 +14,11 @@ from scanprep.batch.room import Room
 from scanprep.batch.workspace import Task, Workspace
 from scanprep.geometry.mesh import Mesh
 from scanprep.meaning import extent, unit_problem
-from scanprep.skeleton.find import find_skeleton
-from scanprep.skeleton.tree import Skeleton
 from scanprep.threads import one_thread
 
 from ..body import BodyModel
-from ..learning.scape import BlendConfig, learn_blendscape, learn_scape
+from ..learning.config import LearnConfig
+from ..learning.scape import learn_blendscape, learn_scape
 from ..linear import Subject
 from .config import CoregistrationConfig
 from .single import Landmarks, ModelRegistration, register_with_model
@@ -34,16 +33,8 @@ LOST = 0.5                           # mean share of the scans explained below w
 class Round:
     """What one round brought.
 
-    Attributes
-    ----------
-    failed : int
-        Scans that the template does not explain.
-    explained : float
-        Mean share of the points of a scan that it explains.
-    apart : float, metres
-        Median over the scans of the root mean square distance from mesh to model.
-    change : float, metres
-        How far the mean vertex of the scans that have not failed moved since the round before; NaN in the first.
+    How many scans failed, the mean share of a scan's points that is explained, the median distance from mesh to model
+    (root mean square, metres), and how far the mean vertex moved since the round before, metres; NaN in the first.
     """
 
     failed: int
@@ -80,14 +71,7 @@ class Coregistration:
 
 @dataclass(frozen=True, eq=False)
 class RegisterWithModel:
-    """The work on each scan of a round.
-
-    Attributes
-    ----------
-    model : BodyModel
-    config : CoregistrationConfig
-        What one registration depends on; all else is at its defaults.
-    """
+    """The work on each scan of a round, with what one registration depends on; all else is at its defaults."""
 
     model: BodyModel
     config: CoregistrationConfig
@@ -188,23 +172,11 @@ def kept_or_not(space: Workspace | None) -> Iterator[Workspace]:
         yield space or stack.enter_context(workspace(stack.enter_context(tempfile.TemporaryDirectory())))
 
 
-def _of_one(config: CoregistrationConfig) -> CoregistrationConfig:
-    return CoregistrationConfig(fit=config.fit, registration=config.registration, alignments=config.alignments,
-                                explained=config.explained)
-
-
-def learn_again(model: BodyModel, poses: np.ndarray, shapes: np.ndarray | None, config: CoregistrationConfig
-                ) -> BodyModel:
+def learn_again(model: BodyModel, poses: np.ndarray, shapes: np.ndarray | None, config: LearnConfig) -> BodyModel:
     """A model of the same kind from registered poses (M, N, 3) of the template's person and others (S, N, 3)."""
-    template = model.template
-    skeleton: Skeleton = model.skeleton if config.skeleton is None \
-        else find_skeleton(template, poses, config.skeleton)
-    bodies = np.concatenate([template.vertices[None], poses])
-    if model.kind == "blendscape":
-        blend = config.learn if isinstance(config.learn, BlendConfig) else BlendConfig(**vars(config.learn))
-        learned: BodyModel = learn_blendscape(template, bodies, shapes, skeleton, blend)
-    else:
-        learned = learn_scape(template, bodies, shapes, skeleton, config.learn)
+    bodies = np.concatenate([model.template.vertices[None], poses])
+    learn = learn_blendscape if model.kind == "blendscape" else learn_scape
+    learned: BodyModel = learn(model.template, bodies, shapes, model.skeleton, config)
     marks = {"landmarks": model.info["landmarks"]} if "landmarks" in model.info else {}
     return replace(learned, info={**learned.info, **marks})                                 # type: ignore[type-var]
 
@@ -217,7 +189,7 @@ def _own(subjects: Sequence[str] | None, n: int) -> np.ndarray:
     return np.array([subject == most for subject in subjects])
 
 
-def _registered(space: Workspace, model: BodyModel, given: Sequence[OneScan], names: Sequence[str],
+def _registered(space: Workspace, model: BodyModel, scans: Sequence[OneScan], names: Sequence[str],
                 config: CoregistrationConfig, turn: int, progress: Progress | None
                 ) -> tuple[list[ModelRegistration | None], dict[str, str]]:
     """One round of registrations, in the order of the scans, and by name why some could not be registered."""
@@ -225,9 +197,10 @@ def _registered(space: Workspace, model: BodyModel, given: Sequence[OneScan], na
         if progress is not None:
             progress(turn * total + done, config.rounds * total)
 
-    tasks = {name: Task(task_name(turn, name), one) for name, one in zip(names, given, strict=True)}
+    tasks = {name: Task(task_name(turn, name), given) for name, given in zip(names, scans, strict=True)}
     with one_thread():
-        found = space.run(RegisterWithModel(model, _of_one(config)), list(tasks.values()), config.workers, tell)
+        one = CoregistrationConfig(fit=config.fit, registration=config.registration)
+        found = space.run(RegisterWithModel(model, one), list(tasks.values()), config.workers, tell)
     return ([found.values.get(task.name) for task in tasks.values()],
             {name: found.failures[task.name] for name, task in tasks.items() if task.name in found.failures})
 
@@ -235,8 +208,8 @@ def _registered(space: Workspace, model: BodyModel, given: Sequence[OneScan], na
 def _taught(space: Workspace, model: BodyModel, lessons: Lessons, config: CoregistrationConfig, turn: int
             ) -> BodyModel:
     """The model of a round."""
-    return space.step(f"model of round {turn + 1}", (model, lessons, config.learn, config.skeleton),
-                      lambda _: learn_again(model, *lessons, config))
+    return space.step(f"model of round {turn + 1}", (model, lessons, config.learn),
+                      lambda _: learn_again(model, *lessons, config.learn))
 
 
 def _lessons(registrations: Sequence[ModelRegistration | None], good: np.ndarray, own: np.ndarray,

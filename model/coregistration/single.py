@@ -8,13 +8,13 @@ from dataclasses import dataclass
 import numpy as np
 
 from scanprep.geometry.mesh import Mesh
-from scanprep.registration.matches import target_of
+from scanprep.geometry.target import target_of
 from scanprep.registration.nonrigid import register
 from scanprep.threads import one_thread
 
 from ..body import BodyModel
 from ..linear import Subject
-from .config import CoregistrationConfig
+from .config import EXPLAINED, CoregistrationConfig
 from .modelfit import ModelFit
 
 Landmarks = tuple[np.ndarray, np.ndarray]
@@ -82,7 +82,7 @@ def register_with_model(body: BodyModel | Subject, scan: Mesh | np.ndarray, land
     1. Pose, place and betas are sought from several starts by matches alone.
     2. The template as the model predicts it is aligned with the scan, which it follows where there are data; along
        the surface and elsewhere it keeps the predicted shape.
-    3. Pose and betas are taken from where the alignment has data, and the template is aligned from there anew.
+    3. Pose and betas are taken from where the alignment has data.
 
     Parameters
     ----------
@@ -106,23 +106,20 @@ def register_with_model(body: BodyModel | Subject, scan: Mesh | np.ndarray, land
     """
     config = config or CoregistrationConfig()
     tell = progress or (lambda done, total: None)
-    total = 1 + config.alignments
-    fit = ModelFit(body, target_of(scan, config.registration.neighbours), landmarks, config.fit)
+    fit = ModelFit(body, target_of(scan), landmarks, config.fit)
     given = [] if start is None else [_given(fit, start)]
     best, tried = fit.best_of(itertools.chain(given, fit.starts()))
-    tell(1, total)
-    x, held = best.x, config.fit.refine[-1].prior
-    for i in range(config.alignments):
-        aligned = register(fit.predicted(x), scan, None, config.registration)
-        x = fit.taken_from(aligned.mesh.vertices, aligned.confidence, x, held)
-        tell(2 + i, total)
+    tell(1, 2)
+    aligned = register(fit.predicted(best.x), scan, None, config.registration)
+    x = fit.taken_from(aligned.mesh.vertices, aligned.confidence, best.x, config.fit.refine[-1].prior)
+    tell(2, 2)
     predicted, (pose, trans, betas) = fit.predicted(x), fit.split(x)
     mesh, seen = aligned.mesh, aligned.seen
     off_model = np.linalg.norm(mesh.vertices - predicted.vertices, axis=1)[seen]
     off_marks = np.linalg.norm(mesh.vertices[fit.marks] - fit.marked, axis=1)
     return ModelRegistration(mesh, predicted, pose, trans, betas, seen, aligned.distances, aligned.rms,
-                             fit.explained(mesh, 0.01, config.explained), _rms(off_model), _rms(off_marks),
-                             aligned.flipped, aligned.confidence, best.score, tried)
+                             fit.explained(mesh, 0.01, EXPLAINED), _rms(off_model), _rms(off_marks),
+                             aligned.inverted, aligned.confidence, best.score, tried)
 
 
 def _rms(distances: np.ndarray) -> float:

@@ -19,9 +19,10 @@ from scanprep.geometry.files import read_registered, write_mesh
 from scanprep.ranges import Count, Seed
 
 from ..body import BodyModel
-from ..cli import ModelArg, read_subject
+from ..cli import ModelArg
 from ..digests import digest, trained_on
 from ..files import load_model
+from ..posing.cli import read_subject
 from .errors import Errors, compactness, errors_problem, pose_errors, shape_errors
 from .page import MM, Findings, evaluation_page, generalisation_rows, picture_samples
 from .sampling import sample_bodies, specificity

@@ -20,16 +20,8 @@ Progress = Callable[[int, int], None]
 
 @dataclass(frozen=True, eq=False)
 class Errors:
-    """Distances of corresponding vertices between bodies and what was made of them.
-
-    Attributes
-    ----------
-    mean, p95, worst : (M,) float, metres
-        Of the vertices of each body.
-    by_vertex : (N,) float, metres
-        Mean over the bodies.
-    by_part : (M, J) float, metres
-        Mean over the vertices of each part.
+    """Distances of corresponding vertices, metres: of each body (M,) the mean, 95th percentile and worst, the mean at
+    each vertex (N,), and the mean of each part of each body (M, J).
     """
 
     mean: np.ndarray
@@ -229,20 +221,7 @@ def fit_with_held_pose(model: BodyModel, person: np.ndarray, counts: Sequence[in
 
 
 def vertex_components(train: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
-    """Plain principal components of centred bodies.
-
-    Parameters
-    ----------
-    train : (P, N, 3) float, metres
-    count : int
-        Fewer are returned where the bodies do not span as many.
-
-    Returns
-    -------
-    mean : (3N,) float, metres
-    components : (k, 3N) float
-        Orthonormal, largest variance first.
-    """
+    """Mean (3N,) and at most `count` plain principal components (k, 3N), orthonormal, of centred bodies (P, N, 3)."""
     flat = (train - train.mean(axis=1, keepdims=True)).reshape(len(train), -1)
     mean = flat.mean(axis=0)
     flat -= mean

@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 
 from scanprep.geometry.mesh import Mesh
+from scanprep.pictures.camera import look_around, upright
 from scanprep.pictures.page import Page
 from scanprep.pictures.shading import Solid, color_bar, heat, render, side_by_side
-from scanprep.pictures.views import look_around, upright
 
 from ..body import BodyModel
 from ..report import picture_components
@@ -24,19 +24,7 @@ Tell = Callable[[int, int], None]
 
 @dataclass(frozen=True, eq=False)
 class Findings:
-    """What was measured, and on which bodies.
-
-    Attributes
-    ----------
-    poses : PoseErrors, or None where it was not asked for
-    pose_names : M strings
-    pose_bodies : (M, N, 3) float, metres
-    shapes : ShapeErrors, or None
-    shape_names : S strings
-    shape_bodies : (S, N, 3) float, metres
-    specificity : Specificity, or None
-    samples : Samples, or None for a model without shape components
-    """
+    """What was measured, None where it was not asked for, and on which bodies."""
 
     poses: PoseErrors | None = None
     pose_names: tuple[str, ...] = ()
@@ -50,18 +38,7 @@ class Findings:
 
 def evaluation_page(name: str, model: BodyModel, found: Findings, rows: Sequence[tuple[str, Any, str]],
                     notes: Sequence[str] = (), tell: Tell | None = None) -> Page:
-    """The page, self-contained.
-
-    Parameters
-    ----------
-    name : str
-        Of the model.
-    rows : metric, value, unit
-        The closing table of the command.
-    notes : strings
-        What a reader must know, such as that the bodies trained the model.
-    tell : callable, optional
-        Called with the sections done and their number.
+    """The page, self-contained: the closing table (metric, value, unit), what a reader must know, pictures and curves.
     """
     page = Page(f"{name}, evaluated", f"A model of kind {model.kind} with {len(model.skeleton.parents)} parts and "
                 f"{model.n_betas} shape components, measured on bodies given to it.")
@@ -148,14 +125,9 @@ def picture_error_map(body: Mesh, distance: np.ndarray, title: str, height: int 
 
 def picture_extremes(model: BodyModel, errors: Errors, names: Sequence[str], bodies: np.ndarray,
                      make: Callable[[int], np.ndarray], poses: np.ndarray, height: int = HEIGHT) -> np.ndarray:
-    """The best and the worst body as given, then as fitted from both sides, coloured by error.
+    """The best and the worst body as given, then as fitted (`make(i)`) from both sides, coloured by error.
 
-    Parameters
-    ----------
-    make : i -> (N, 3) float, metres
-        The fitted body.
-    poses : (M, J, 3) float, radians
-        The cameras turn with the bodies about the vertical.
+    The cameras turn about the vertical with the bodies' poses (M, J, 3).
     """
     images, labels = [], []
     shown = [("best", int(errors.mean.argmin())), ("worst", int(errors.mean.argmax()))]

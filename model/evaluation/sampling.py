@@ -139,18 +139,10 @@ def specificity(model: BodyModel, people: np.ndarray, count: int = 100, rng: np.
 
 def unposed(model: BodyModel, people: np.ndarray, config: FitConfig | None = None, progress: Progress | None = None
             ) -> np.ndarray:
-    """People at rest: `fit_shape` with all components, then the fitted body at zero pose.
+    """People (S, N, 3) at rest: `fit_shape` with all components, then the fitted body at zero pose.
 
-    What the fit leaves at every vertex is turned back with the rotation of the vertex's part and added, so that it
-    is the person, not the model's idea of the person, that comes to rest.
-
-    Parameters
-    ----------
-    people : (S, N, 3) float, metres
-
-    Returns
-    -------
-    (S, N, 3) float, metres
+    What the fit leaves at every vertex is rotated back with the vertex's part and added, so that it is the person, not
+    the model's idea of the person, that comes to rest.
     """
     fitter, part = ShapeFitter(model, config), model.skeleton.part_of_vertex(model.template)
     rest = np.zeros((len(model.skeleton.parents), 3))

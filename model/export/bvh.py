@@ -79,12 +79,9 @@ def euler_degrees(poses: np.ndarray) -> np.ndarray:
 
 
 def part_ends(skeleton: Skeleton, body: Mesh | None = None) -> np.ndarray:
-    """(J, 3) the far end of every part, metres: of a leaf the tip of its surface, seen along the part.
+    """(J, 3) the far end of every part, metres: of a leaf the tip of its surface at rest, seen along the part.
 
-    Parameters
-    ----------
-    body : Mesh, optional
-        At rest; without it the bone before a part is continued by its own length.
+    Without a body the bone before a part is continued by its own length.
     """
     joints, parents = skeleton.joints, skeleton.parents
     ends = 2 * joints - joints[np.maximum(parents, 0)]

@@ -11,7 +11,7 @@ from scanprep.cli import Output, Unit
 from scanprep.console import Metric, Outcome, bar
 from scanprep.geometry.files import write_mesh
 from scanprep.geometry.storage import StorageError, load_arrays, numbers, taking_apart, text
-from scanprep.pictures.views import upright
+from scanprep.pictures.camera import upright
 from scanprep.ranges import BETAS, Beta
 
 from ..body import BodyModel
@@ -94,13 +94,7 @@ def export(model: ModelArg, output: Output, betas: tuple[Beta, ...] = (), own_bo
 
 
 def read_motion(path: Path, model: BodyModel) -> _Moves:
-    """A motion file (`poses`, `trans`, `betas`, `mocap_frame_rate`) of a model's parts.
-
-    Raises
-    ------
-    StorageError
-        Missing, not a motion, or of another body.
-    """
+    """A motion file (`poses`, `trans`, `betas`, `mocap_frame_rate`) of a model's parts, or StorageError."""
     stored = load_arrays(path, "a motion (.npz)")
     stored.setdefault("mocap_frame_rate", stored.pop("mocap_framerate", np.array(np.nan)))
     lacking = [name for name in ("poses", "trans") if name not in stored]

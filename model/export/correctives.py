@@ -14,13 +14,8 @@ STIFF = 0.1                          # share of a blended rotation below which i
 
 @dataclass(frozen=True, eq=False)
 class Correctives:
-    """The changes of the rest mesh that make a skinned motion exact, as a few shapes and their weights.
-
-    Attributes
-    ----------
-    shapes : (C, N, 3) float, metres
-        The largest first; their weights have a mean square of 1.
-    weights : (T, C) float
+    """The changes of the rest mesh that make a skinned motion exact: shapes (C, N, 3), metres, the largest first, and
+    their weights (T, C), of mean square 1.
     """
 
     shapes: np.ndarray
@@ -32,15 +27,7 @@ class Correctives:
 
 
 def rest_corrections(rig: Rig, poses: np.ndarray, exact: np.ndarray) -> np.ndarray:
-    """Changes of the rest mesh (T, N, 3) that skinning carries onto the exact bodies, metres.
-
-    Parameters
-    ----------
-    rig : Rig
-    poses : (T, J, 3) float, radians
-    exact : (T, N, 3) float, metres
-        With trans of zero.
-    """
+    """Changes of the rest mesh (T, N, 3), metres, that skinning carries onto the exact bodies (T, N, 3), trans zero."""
     out = np.empty_like(exact, dtype=np.float64)
     for t, pose in enumerate(poses):
         blended = np.einsum("nj,jab->nab", rig.weights, rig.skeleton.part_rotations(pose))

@@ -15,23 +15,7 @@ Progress = Callable[[int, int], None]
 
 def write_frames(folder: str | Path, subject: Subject, poses: np.ndarray, trans: np.ndarray | None = None,
                  ending: str = ".ply", progress: Progress | None = None) -> list[Path]:
-    """Write the exact mesh of every frame: `00000.ply`, `00001.ply`, ...
-
-    Parameters
-    ----------
-    folder : str or Path
-    subject : Subject
-    poses : (T, J, 3) float, radians
-    trans : (T, 3) float, metres, optional
-    ending : str
-        Any that `write_mesh` knows.
-    progress : callable, optional
-        Called with (done, total) frames.
-
-    Returns
-    -------
-    The files in the order of the frames.
-    """
+    """Write the exact mesh of every frame, 00000.ply, 00001.ply, ...; the files in the order of the frames."""
     paths = []
     for t, pose in enumerate(poses):
         paths.append(Path(folder) / f"{t:05d}{ending}")

@@ -28,27 +28,11 @@ def write_body_npz(path: str | Path, model: BodyModel, weights: np.ndarray | Non
 def body_arrays(model: BodyModel, weights: np.ndarray | None = None, draws: int = 300) -> dict[str, np.ndarray]:
     """A model as linear blend skinning with shape and pose directions.
 
-    At rest with betas of zero it is the mean person, or the template's own body where the model has no betas.
-
-    Posed by `Σ_j weights_j G_j (v_template + shapedirs @ betas + posedirs @ vec(R_1 - I, ..., R_{J-1} - I))`, where
-    G_j turns about `J_regressor @ (v_template + shapedirs @ betas)` and R_j is the turn of part j against its parent,
-    row by row.
-
-    Parameters
-    ----------
-    model : BodyModel
-    weights : (N, J) float, optional
-        As for `make_rig`.
-    draws : int
-        Poses drawn from the model's prior to which the pose directions are fitted. No kind of model here is linear
-        in R - I, so the file holds what comes nearest to the model, not the model itself. With 0 there are none.
-
-    Returns
-    -------
-    dict
-        `v_template` (N, 3) metres, `f` (F, 3), `weights` (N, J), `kintree_table` (2, J) with the parents (-1 for
-        the root) over the parts, `J_regressor` (J, N), `J` (J, 3) metres, `shapedirs` (N, 3, K) metres per
-        standard deviation, `posedirs` (N, 3, 9 (J - 1)) metres, `part_names` (J,), `betas_unit`, `length_unit`.
+    Posed by `Σ_j weights_j G_j (v_template + shapedirs @ betas + posedirs @ vec(R_1 - I, ..., R_{J-1} - I))`, where G_j
+    rotates about `J_regressor @ (v_template + shapedirs @ betas)` and R_j is the rotation of part j against its parent,
+    row by row. With betas of zero it is the mean person, or the template's own body where the model has no betas. No
+    kind of model here is linear in R - I, so the pose directions are fitted to so many draws from the prior; with 0
+    there are none.
     """
     mean = np.zeros(1) if model.n_betas else None
     rig = make_rig(model, mean, model.n_betas, weights)
@@ -72,14 +56,8 @@ def pose_features(poses: np.ndarray) -> np.ndarray:
 
 
 def pose_directions(rig: Rig, poses: np.ndarray, exact: np.ndarray) -> np.ndarray:
-    """(N, 3, 9 (J - 1)) changes of the rest mesh by `pose_features` that bring skinning nearest to the exact bodies.
-
-    Parameters
-    ----------
-    rig : Rig
-    poses : (T, J, 3) float, radians
-    exact : (T, N, 3) float, metres
-        With trans of zero.
+    """(N, 3, 9 (J - 1)) changes of the rest mesh by `pose_features` that bring skinning nearest to exact bodies (T, N,
+    3).
     """
     X = pose_features(poses)
     changes = rest_corrections(rig, poses, exact).reshape(len(X), -1)

@@ -144,13 +144,7 @@ def strongest(weights: np.ndarray, count: int = CARRIERS) -> np.ndarray:
 
 
 def joint_places(skeleton: Skeleton, poses: np.ndarray, trans: np.ndarray | None = None) -> np.ndarray:
-    """Where the joints (..., J, 3) of a skeleton with bones of fixed length stand, metres.
-
-    Parameters
-    ----------
-    poses : (..., J, 3) float, radians
-    trans : (..., 3) float, metres
-    """
+    """Where the joints (..., J, 3) of a skeleton with bones of fixed length stand, metres."""
     R = skeleton.part_rotations(poses)
     out = np.empty(R.shape[:-1])
     out[..., 0, :] = skeleton.joints[0] + (0.0 if trans is None else np.asarray(trans))

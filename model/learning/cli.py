@@ -20,50 +20,34 @@ from scanprep.geometry.files import list_meshes, read_registered
 from scanprep.geometry.landmarks import read_landmark_vertices
 from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.tables import read_table
-from scanprep.ranges import Count, Settings
+from scanprep.ranges import Count
 from scanprep.skeleton.find import find_skeleton
 from scanprep.skeleton.parts import SkeletonConfig
 from scanprep.skeleton.tree import Skeleton
 
 from ..body import BodyModel
-from .mixing import MixConfig, learn_scape_mix
+from ..cli import about
+from .config import LearnConfig
+from .mixing import MIX, learn_scape_mix
 from .parts import choose_skeleton
-from .scape import BlendConfig, LearnConfig, Progress, learn_blendscape, learn_scape, learning_problem, timed
+from .scape import learn_blendscape, learn_scape, learning_problem
 from .sexes import learn_by_sex
-from .skin import SkinConfig, learn_skinning
+from .skinning import SkinConfig, learn_skinning
+from .work import Progress, timed
 
-Kind = Literal["scape", "blendscape", "skinning"]
-Whole = dict[str, BodyModel]
-
-
-@dataclasses.dataclass(frozen=True)
-class Other(Settings):
-    """Settings of what only some ways of learning need.
-
-    Parameters
-    ----------
-    width : float
-        How far a rotation reaches over the border of its part in BlendSCAPE, as a share of the template's diagonal.
-    skin : SkinConfig
-        Of the kind `skinning`; its components are those of `--components`.
-    mix : MixConfig
-        Of `--mixed`; its components too.
-    """
-
-    width: float = BlendConfig.width
-    skin: SkinConfig = dataclasses.field(default_factory=SkinConfig)
-    mix: MixConfig = dataclasses.field(default_factory=MixConfig)
+SEXES = "sexes.csv"                  # in a plain folder of shapes
+Kind = Literal["scape", "blendscape", "skinning", "mixed"]
 
 
 def learn(poses: Path, output: Output, shapes: Path | None = None, template: Path | None = None,
           skeleton: Path | None = None, landmarks: Path | None = None, subject: str | None = None,
-          unit: Unit | None = None, parts: Count | None = None, kind: Kind = "scape", mixed: bool = False,
-          by_sex: bool = False, sexes: Path | None = None, pictures: bool = True,
-          config: LearnConfig = LearnConfig(),  # noqa: B008
-          other: Other = Other(), *, space: FileWorkspace) -> Outcome:
+          unit: Unit | None = None, parts: Count | None = None, kind: Kind = "scape", by_sex: bool = False,
+          scape: LearnConfig = LearnConfig(), skinning: SkinConfig = SkinConfig(), mixed: LearnConfig = MIX,  # noqa: B008
+          *, space: FileWorkspace) -> Outcome:
     """Learn a body model from one person in many poses and many people in about one pose, or from a mix.
 
-    Killed and started again it goes on where it was; what does not depend on a change is not learned again.
+    Killed and started again it goes on where it was; what does not depend on a change is not learned again. A picture
+    of the parts and one of the shape components lie beside the model.
 
     Example: scape learn --poses set --shapes set -o model.npz
 
@@ -78,69 +62,57 @@ def learn(poses: Path, output: Output, shapes: Path | None = None, template: Pat
         subject: Of a registered set, whose meshes are the poses; else of the one with the most.
         unit: Unit of the meshes.
         parts: Find a skeleton with so many parts, whatever skeleton there is.
-        kind: SCAPE, BlendSCAPE, or linear blend skinning with pose-corrective shapes.
-        mixed: The poses are those of many people: a registered set that says whose mesh each is.
-        by_sex: Also a model of the women and one of the men, beside the neutral one, where the set says the sex.
-        sexes: CSV with the columns name,sex for the meshes of a plain folder of shapes.
-        pictures: Write a picture of the parts and one of the shape components beside the model.
-        config: Settings.
-        other: More settings.
+        kind: SCAPE, BlendSCAPE, linear blend skinning with pose-corrective shapes, or SCAPE from a mix: the poses are
+            then those of many people, a registered set that says whose mesh each is.
+        by_sex: Also a model of the women and one of the men, beside the neutral one, where the set says the sex; of a
+            plain folder of shapes, sexes.csv in it with the columns name,sex.
+        scape: Settings of SCAPE and BlendSCAPE.
+        skinning: Settings of skinning.
+        mixed: Settings of a mix.
     """
-    if mixed and (shapes is not None or by_sex or kind != "scape"):
-        raise ValueError("--mixed: it learns one SCAPE model of --poses alone, without --shapes, --by-sex and --kind")
+    if kind == "mixed" and (shapes is not None or by_sex):
+        raise ValueError("--kind mixed: it learns one SCAPE model of --poses alone, without --shapes and --by-sex")
     if by_sex and (shapes is None or kind != "scape"):
         raise ValueError("--by-sex: it needs --shapes and the kind scape")
-    body, posed = read_poses(poses, template, subject, unit) if not mixed else _read_mix(poses)
+    body, posed = read_poses(poses, template, subject, unit) if kind != "mixed" else _read_mix(poses)
     people = None if shapes is None else _read_shapes(shapes, body, unit)
-    known = None if not by_sex or shapes is None else _read_sexes(shapes, sexes)
+    known = None if not by_sex or shapes is None else _read_sexes(shapes)
     tree = None if parts is not None else _read_skeleton(skeleton, poses, body)
     marks = _read_marks(landmarks, poses, body)
     step = KeptSteps(space)
     with _timed() as seconds:
         if tree is None:
-            if mixed:
+            if kind == "mixed":
                 raise ValueError(f"{poses}: a mix of people shows no skeleton; name one with --skeleton")
             with bar("finding the skeleton") as progress:
                 tree = step("skeleton", (body, posed, parts),
                             lambda: _find_skeleton(body, posed, parts, step, progress))
         with bar("learning the model") as progress:
-            if mixed:
-                mixing = dataclasses.replace(other.mix, components=config.components)
+            models: dict[str, BodyModel]
+            if kind == "mixed":
                 who = [entry.subject or entry.name for entry in RegisteredSet.load(poses).entries]
-                models: Whole = {"neutral": learn_scape_mix(body, posed, who, tree, mixing, progress, step)}
+                models = {"neutral": learn_scape_mix(body, posed, who, tree, mixed, progress, step)}
             elif known is not None:
                 assert people is not None
-                models = {**learn_by_sex(body, posed, people, known, tree, config, progress, step)}
+                models = {**learn_by_sex(body, posed, people, known, tree, scape, progress, step)}
             elif kind == "blendscape":
-                settings = BlendConfig(**vars(config), width=other.width)
-                models = {"neutral": learn_blendscape(body, posed, people, tree, settings, progress, step)}
+                models = {"neutral": learn_blendscape(body, posed, people, tree, scape, progress, step)}
             elif kind == "skinning":
-                skin = dataclasses.replace(other.skin, components=config.components)
-                models = {"neutral": learn_skinning(body, posed, people, tree, skin, progress, step)}
+                models = {"neutral": learn_skinning(body, posed, people, tree, skinning, progress, step)}
             else:
-                models = {"neutral": learn_scape(body, posed, people, tree, config, progress, step)}
+                models = {"neutral": learn_scape(body, posed, people, tree, scape, progress, step)}
     for name, model in models.items():
         path = output if name == "neutral" else output.with_suffix(f".{name}.npz")
         kept = dataclasses.replace(model, info={**model.info, "landmarks": marks})     # type: ignore[type-var]
         kept.save(path)
-        if pictures:
-            _draw(kept, path)
+        _draw(kept, path)
     return Outcome(output, [
         Metric("kind", models["neutral"].kind), Metric("poses", len(posed)),
         Metric("people", 0 if people is None else len(people)), Metric("triangles", len(body.faces)),
         Metric("parts", len(tree.parents)), *about(models["neutral"]),
         *[Metric(f"people of the {name} model", model.info["shapes"]) for name, model in models.items() if by_sex],
         *_times(seconds, step.found)],
-        {"learn": config, "other": other}, problem=learning_problem(models["neutral"], people))
-
-
-def about(model: BodyModel) -> list[Metric]:
-    """What a model is made of."""
-    rows = [Metric("pose features", model.terms.features.count), Metric("terms of the fast path", model.terms.count),
-            Metric("shape components", model.n_betas)]
-    if model.n_betas:
-        rows.append(Metric("variance of shape they explain", 100 * float(model.explained[-1]), "%"))
-    return rows
+        {"scape": scape, "skinning": skinning, "mixed": mixed}, problem=learning_problem(models["neutral"], people))
 
 
 def _find_skeleton(body: Mesh, posed: np.ndarray, parts: int | None, step: KeptSteps, progress: Progress) -> Skeleton:
@@ -202,18 +174,20 @@ def _read_shapes(folder: Path, body: Mesh, unit: Unit | None) -> np.ndarray:
     return vertices
 
 
-def _read_sexes(folder: Path, given: Path | None) -> list[str]:
+def _read_sexes(folder: Path) -> list[str]:
     """The sex of every person, in the order of `_read_shapes`; empty where not known."""
-    if given is None and (folder / "set.json").exists():
+    if (folder / "set.json").exists():
         whole = RegisteredSet.load(folder)
         first = {entry.subject: entry.sex for entry in reversed(whole.entries)}
         return [first[subject] for subject in whole.subjects]
-    if given is None:
-        raise ValueError(f"{folder}: a plain folder does not say the sex; name a CSV name,sex with --sexes")
-    table = {row["name"]: row["sex"] for _, row in read_table(given, ("name", "sex"))}
-    names = [path.name.split(".")[0] for path in list_meshes(folder)]
+    path = folder / SEXES
+    if not path.exists():
+        raise ValueError(f"{folder}: a plain folder does not say the sex; write {SEXES} in it, with the columns "
+                         "name,sex")
+    table = {row["name"]: row["sex"] for _, row in read_table(path, ("name", "sex"))}
+    names = [mesh.name.split(".")[0] for mesh in list_meshes(folder)]
     if not any(name in table for name in names):
-        raise ValueError(f"{given}: none of its names is a mesh of {folder}")
+        raise ValueError(f"{path}: none of its names is a mesh of {folder}")
     return [table.get(name, "") for name in names]
 
 

@@ -1,7 +1,6 @@
 """How many parts: as many as predict poses that were left out."""
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -10,40 +9,20 @@ from scipy.spatial import cKDTree
 from scanprep.batch.steps import Step, once
 from scanprep.decimation.decimate import decimate
 from scanprep.geometry.mesh import Mesh
-from scanprep.ranges import Count, Settings
 from scanprep.skeleton.find import find_skeleton
 from scanprep.skeleton.parts import SkeletonConfig
 from scanprep.skeleton.tree import Skeleton
 from scanprep.threads import one_thread
 
-from ..carriers import rigid_weights
-from .carriage import Carriage
-from .pose import PoseConfig, Ticks, learn_pose
+from ..blending import BlendedTemplate, rigid_weights
+from .config import LearnConfig
+from .pose import learn_pose
+from .work import Progress, Work
 
-Progress = Callable[[int, int], None]
-QUICK = PoseConfig(prunings=(0.01,), ridges=(1e-3, 1e-2), refinements=1, steps=2)
-
-
-@dataclass(frozen=True)
-class PartsConfig(Settings):
-    """Settings of `choose_skeleton`.
-
-    Parameters
-    ----------
-    step : int
-        So many parts more are tried each time.
-    steps : int
-        Largest number of times.
-    gain : float
-        Share of the left-out error that more parts must save to be kept.
-    vertices : int
-        The models that are compared are learned on so many vertices.
-    """
-
-    step: Count = 4
-    steps: int = 3
-    gain: float = 0.03
-    vertices: Count = 2500
+QUICK = LearnConfig(prunings=(0.01,), ridges=(1e-3, 1e-2), refinements=1)
+MORE, TRIES = 4, 3                   # parts more each time, and the largest number of times
+GAIN = 0.03                          # share of the left-out error that more parts must save to be kept
+VERTICES = 2500                      # of the coarse copies on which the models are learned that are compared
 
 
 @dataclass(frozen=True, eq=False)
@@ -62,8 +41,7 @@ class ChosenSkeleton:
 
 
 @one_thread()
-def choose_skeleton(template: Mesh, poses: np.ndarray, config: PartsConfig | None = None,
-                    learning: PoseConfig | None = None, progress: Progress | None = None, step: Step = once
+def choose_skeleton(template: Mesh, poses: np.ndarray, progress: Progress | None = None, step: Step = once
                     ) -> ChosenSkeleton:
     """A skeleton with as many parts as help to predict poses that were left out.
 
@@ -76,9 +54,6 @@ def choose_skeleton(template: Mesh, poses: np.ndarray, config: PartsConfig | Non
     template : Mesh
     poses : (M, N, 3) float, metres
         Of one person.
-    config : PartsConfig, optional
-    learning : PoseConfig, optional
-        Settings with which the models are learned that are compared; by default quick ones.
     progress : callable, optional
         Called with the skeletons done and their largest number.
     step : callable, optional
@@ -87,18 +62,17 @@ def choose_skeleton(template: Mesh, poses: np.ndarray, config: PartsConfig | Non
     Raises
     ------
     ValueError
-        As `find_skeleton`; a part that is too small for `config.vertices`.
+        As `find_skeleton`; a part that is too small for the coarse copies.
     """
-    config, learning = config or PartsConfig(), learning or QUICK
     tell = progress or (lambda done, total: None)
     poses = np.asarray(poses, dtype=np.float64)
-    vertices, coarse = coarse_copy(template, config.vertices)
+    vertices, coarse = coarse_copy(template, VERTICES)
 
     def tried(settings: SkeletonConfig) -> tuple[Skeleton, float] | None:
         """A skeleton and its error; None where there is no tree of so many parts, or parts are too small to compare."""
         try:
             found = find_skeleton(template, poses, settings, step=step)
-            left_out = _left_out_error(poses[:, vertices], coarse_skeleton(found, template, coarse), coarse, learning)
+            left_out = _left_out_error(poses[:, vertices], coarse_skeleton(found, template, coarse), coarse)
         except ValueError:
             if settings.parts is None:
                 raise
@@ -107,24 +81,24 @@ def choose_skeleton(template: Mesh, poses: np.ndarray, config: PartsConfig | Non
 
     def kept(settings: SkeletonConfig) -> tuple[Skeleton, float] | None:
         name = "best parts" if settings.parts is None else f"{settings.parts} parts"
-        return step(name, (template, poses, settings, learning, config.vertices), lambda: tried(settings))
+        return step(name, (template, poses, settings, QUICK, VERTICES), lambda: tried(settings))
 
     first = kept(SkeletonConfig())
     assert first is not None, "what goes wrong without a count of parts is raised"
     best, least = first
     errors = {len(best.parents): least}
-    tell(1, 1 + config.steps)
-    for done in range(config.steps):
-        wanted = len(best.parents) + config.step
+    tell(1, 1 + TRIES)
+    for done in range(TRIES):
+        wanted = len(best.parents) + MORE
         finer = kept(SkeletonConfig(parts=wanted, restarts=1))
         if finer is None:
             break
         errors[wanted] = finer[1]
-        tell(2 + done, 1 + config.steps)
-        if errors[wanted] > (1 - config.gain) * errors[len(best.parents)]:
+        tell(2 + done, 1 + TRIES)
+        if errors[wanted] > (1 - GAIN) * errors[len(best.parents)]:
             break
         best = finer[0]
-    tell(1 + config.steps, 1 + config.steps)
+    tell(1 + TRIES, 1 + TRIES)
     return ChosenSkeleton(best, errors)
 
 
@@ -152,7 +126,7 @@ def coarse_skeleton(skeleton: Skeleton, template: Mesh, coarse: Mesh) -> Skeleto
     return Skeleton(part, skeleton.parents, joints)
 
 
-def _left_out_error(poses: np.ndarray, skeleton: Skeleton, coarse: Mesh, learning: PoseConfig) -> float:
+def _left_out_error(poses: np.ndarray, skeleton: Skeleton, coarse: Mesh) -> float:
     """Mean distance in metres of the vertices of left-out poses (M, n, 3) of the coarse bodies."""
-    learned = learn_pose(Carriage(coarse, skeleton, rigid_weights(skeleton)), poses, learning, Ticks(None, 1))
-    return learned.design.left_out_error
+    parts = BlendedTemplate(coarse, skeleton, rigid_weights(skeleton))
+    return learn_pose(parts, poses, QUICK, Work(None, 1)).design.left_out_error

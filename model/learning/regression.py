@@ -2,127 +2,88 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
-from typing import Literal
+from dataclasses import dataclass, replace
 
 import numpy as np
 
 from scanprep.geometry.mesh import Mesh
-from scanprep.ranges import Positive, Settings
 from scanprep.skeleton.tree import Skeleton
 
-from ..features import Lift, LinearLift, PoseFeatures, QuadraticLift, RadialLift, twists
+from ..features import Lift, LinearLift, PoseFeatures, QuadraticLift, RadialLift, part_features, twists
 from ..pose_space import PoseSpace, faces_of_part, kept_directions, nearest_joints
+from .config import LearnConfig
 
 Judge = Callable[[np.ndarray], float]
-
-
-@dataclass(frozen=True)
-class RegressionConfig(Settings):
-    """Settings of the regression of Q.
-
-    Parameters
-    ----------
-    features : {"linear", "quadratic", "radial"}
-        What Q is linear in: the twists, also their products, or also Gaussian bells around the seen twists.
-    regressor : {"ridge", "svr"}
-        Least squares with a penalty, or support-vector regression.
-    prunings : floats, square radians
-        Twist directions of smaller variance are not regressed on; the best is chosen by leaving poses out.
-    ridges : floats, square radians
-        Strengths of the penalty; the best is chosen by leaving poses out.
-    radii : floats, radians
-        Standard deviations of the bells; the best is chosen by leaving poses out.
-    tube : float, metres
-        Errors of an edge below this cost nothing to support-vector regression.
-    """
-
-    features: Literal["linear", "quadratic", "radial"] = "linear"
-    regressor: Literal["ridge", "svr"] = "ridge"
-    prunings: tuple[float, ...] = (0.003, 0.01, 0.03)
-    ridges: tuple[Positive, ...] = (1e-4, 1e-3, 3e-3, 0.01, 0.03, 0.1)
-    radii: tuple[Positive, ...] = (0.5, 0.7, 1.0)
-    tube: float = 2e-4
+RADII = (0.5, 0.7, 1.0)              # radians: standard deviations of the bells, of which the best is chosen
+TUBE = 2e-4                          # metres: smaller errors of an edge cost nothing to support-vector regression
 
 
 @dataclass(frozen=True, eq=False)
 class Design:
     """What each triangle regresses on, chosen once; fitting it again to other poses and Q is cheap.
 
-    Parameters
-    ----------
-    template : Mesh
-    features : PoseFeatures
-        Before they are made few: every part has all the numbers of all its joints.
-    groups : list of (part, features (n,), faces (f,))
-        Triangles of one part that regress on the same two joints.
-    ridge : float, square radians
-    regressor : {"ridge", "svr"}
-    tube : float, metres
-    left_out_error : float, metres
-        What predictions of left-out poses are off.
-    pruning, radius : float
-        What was chosen.
+    The features are those before they are made few: every part has all the numbers of all its joints. A group is a
+    part, its features (n,), and the triangles (f,) that regress on the same two joints. Of the errors of left-out
+    poses, metres.
     """
 
     template: Mesh
     features: PoseFeatures
     groups: list[tuple[int, np.ndarray, np.ndarray]]
-    ridge: float
     regressor: str
-    tube: float
-    left_out_error: float
     pruning: float
     radius: float
+    ridge: float
+    left_out_error: float = float("nan")
 
     def fit(self, poses: np.ndarray, Q: np.ndarray) -> PoseSpace:
-        """Q as a function of the features.
-
-        Parameters
-        ----------
-        poses : (M, J, 3) float, radians
-        Q : (M, F, 3, 3) float
+        """Q (M, F, 3, 3), seen at poses (M, J, 3), as a function of the features.
 
         [SCAPE] Eq. 4
         """
-        features, delta = self.features, self.features.evaluate(poses)
-        each = faces_of_part(features.skeleton)
+        delta = self.features.evaluate(poses)
+        v_hat = self.template.corners[:, 1:] - self.template.corners[:, :1]
+
+        def solve(used: np.ndarray, faces: np.ndarray) -> np.ndarray:
+            X, flat = delta[:, used[1:]], Q[:, faces].reshape(len(delta), -1)
+            centre, mean = X.mean(axis=0), flat.mean(axis=0)
+            if self.regressor == "svr":
+                slope, mean = _support_vectors(X - centre, Q[:, faces], v_hat[faces], self.ridge)
+            else:
+                slope = _ridge(X - centre, self.ridge) @ flat
+            return np.concatenate([(mean - centre @ slope)[None], slope])
+
+        return self.space(solve)
+
+    def space(self, solve: Callable[[np.ndarray, np.ndarray], np.ndarray]) -> PoseSpace:
+        """The pose space with the coefficients (n, 9f) that `solve` finds for each group.
+
+        It gets the group's features (n,), the constant of the part first, and its faces (f,).
+        """
+        features, each = self.features, faces_of_part(self.features.skeleton)
         coefficients = tuple(np.zeros((features.of_part(p).stop - features.of_part(p).start, len(f), 3, 3),
                                       dtype=np.float32) for p, f in enumerate(each))
         place = np.empty(len(self.template.faces), dtype=np.int64)
         for faces in each:
             place[faces] = np.arange(len(faces))
-        v_hat = self.template.corners[:, 1:] - self.template.corners[:, :1]
         for part, used, faces in self.groups:
-            X, flat = delta[:, used], Q[:, faces].reshape(len(delta), -1)
-            centre, mean = X.mean(axis=0), flat.mean(axis=0)
-            if self.regressor == "svr":
-                slope, mean = _support_vectors(X - centre, Q[:, faces], v_hat[faces], self.ridge, self.tube)
-            else:
-                slope = _ridge(X - centre, self.ridge) @ flat
-            shape, rows = (len(faces), 3, 3), used - features.starts[part]
-            coefficients[part][rows[:, None], place[faces]] = slope.reshape(len(used), *shape)
-            coefficients[part][0, place[faces]] = (mean - centre @ slope).reshape(shape)
+            rows = np.r_[features.starts[part], used]
+            coefficients[part][(rows - features.starts[part])[:, None], place[faces]] = \
+                solve(rows, faces).reshape(len(rows), len(faces), 3, 3)
         return PoseSpace(features, coefficients)
 
 
-def choose_design(template: Mesh, skeleton: Skeleton, poses: np.ndarray, Q: np.ndarray, config: RegressionConfig,
+def choose_design(template: Mesh, skeleton: Skeleton, poses: np.ndarray, Q: np.ndarray, config: LearnConfig,
                   judge: Judge, start: Design | None = None) -> Design:
     """The features, pruning and penalty that predict left-out poses best, one sought after the other.
 
-    Parameters
-    ----------
-    poses : (M, J, 3) float, radians
-    Q : (M, F, 3, 3) float
-    judge : callable
-        The error in metres of predictions (M, F, 3, 3) of Q, each made without its own pose.
-    start : Design, optional
-        Whose choices to begin with; without it, the middle of what there is to choose from.
+    Of poses (M, J, 3) and Q (M, F, 3, 3); the judge gives the error in metres of predictions of Q, each made without
+    its own pose. The choices begin with those of `start`, or with the middle of what there is to choose from.
 
     [SCAPE] Eq. 4
     """
-    radii = config.radii if config.features == "radial" else (float("nan"),)
-    choices = {"pruning": config.prunings, "radius": radii, "ridge": config.ridges}
+    choices = {"pruning": config.prunings, "radius": RADII if config.features == "radial" else (float("nan"),),
+               "ridge": config.ridges}
     at = {name: values[len(values) // 2] for name, values in choices.items()}
     if start is not None:
         at = {name: getattr(start, name) for name in choices}
@@ -131,7 +92,8 @@ def choose_design(template: Mesh, skeleton: Skeleton, poses: np.ndarray, Q: np.n
         for value in sorted(values, key=lambda v: v != at[name]):              # what stands already comes first
             if best is not None and value == at[name]:
                 continue
-            tried = _design(template, skeleton, poses, Q, config, judge, **{**at, name: value})
+            tried = make_design(template, skeleton, poses, config, **{**at, name: value})
+            tried = replace(tried, left_out_error=judge(_left_out(tried, poses, Q)))
             if best is None or tried.left_out_error < best.left_out_error:
                 best = tried
         assert best is not None
@@ -140,29 +102,11 @@ def choose_design(template: Mesh, skeleton: Skeleton, poses: np.ndarray, Q: np.n
     return best
 
 
-def _design(template: Mesh, skeleton: Skeleton, poses: np.ndarray, Q: np.ndarray, config: RegressionConfig,
-            judge: Judge, pruning: float, radius: float, ridge: float) -> Design:
-    """One design and its error on left-out poses."""
-    features = _all_features(skeleton, poses, config.features, pruning, radius)
-    groups = _groups(template, features)
-    error = judge(_left_out(features.evaluate(poses), groups, Q, ridge))
-    return Design(template, features, groups, ridge, config.regressor, config.tube, error, pruning, radius)
-
-
-def _all_features(skeleton: Skeleton, poses: np.ndarray, kind: str, pruning: float, radius: float) -> PoseFeatures:
-    """For every part a constant and the lifted twists of its joints, whitened joint by joint."""
-    J = len(skeleton.parents)
-    t = twists(poses)
-    lift, axes = _make_lift(t, kind, pruning, radius)
-    part, columns = [], []
-    for p, joints in enumerate(skeleton.joints_of_part):
-        part += [p] * (1 + sum(axes[j].shape[1] for j in joints))
-        columns.append(np.zeros((J, lift.width, 1)))
-        for j in joints:
-            column = np.zeros((J, lift.width, axes[j].shape[1]))
-            column[j] = axes[j]
-            columns.append(column)
-    return PoseFeatures(skeleton, lift, np.array(part), np.concatenate(columns, axis=-1))
+def make_design(template: Mesh, skeleton: Skeleton, poses: np.ndarray, config: LearnConfig, pruning: float,
+                radius: float, ridge: float) -> Design:
+    """One design: for every part a constant and the lifted twists of its joints, whitened joint by joint."""
+    features = part_features(skeleton, *_make_lift(twists(poses), config.features, pruning, radius))
+    return Design(template, features, _groups(template, features), config.regressor, pruning, radius, ridge)
 
 
 def _make_lift(t: np.ndarray, kind: str, pruning: float, radius: float) -> tuple[Lift, list[np.ndarray]]:
@@ -223,20 +167,19 @@ def _ridge(centred: np.ndarray, ridge: float) -> np.ndarray:
     return centred.T @ np.linalg.inv(centred @ centred.T + (M * ridge + 1e-12) * np.eye(M))
 
 
-def _left_out(delta: np.ndarray, groups: list[tuple[int, np.ndarray, np.ndarray]], Q: np.ndarray, ridge: float
-              ) -> np.ndarray:
+def _left_out(design: Design, poses: np.ndarray, Q: np.ndarray) -> np.ndarray:
     """Q (M, F, 3, 3) of every pose as ridge regression on the other poses predicts it, in closed form."""
-    out = np.empty_like(Q)
-    for _, used, faces in groups:
+    delta, out = design.features.evaluate(poses), np.empty_like(Q)
+    for _, used, faces in design.groups:
         X = delta[:, used] - delta[:, used].mean(axis=0)
-        hat = X @ _ridge(X, ridge) + 1 / len(X)
+        hat = X @ _ridge(X, design.ridge) + 1 / len(X)
         target = Q[:, faces].reshape(len(X), -1)
         off = (target - hat @ target) / np.maximum(1 - np.diag(hat), 1e-6)[:, None]
         out[:, faces] = (target - off).reshape(len(X), len(faces), 3, 3)
     return out
 
 
-def _support_vectors(X: np.ndarray, Q: np.ndarray, v_hat: np.ndarray, ridge: float, tube: float
+def _support_vectors(X: np.ndarray, Q: np.ndarray, v_hat: np.ndarray, ridge: float
                      ) -> tuple[np.ndarray, np.ndarray]:
     """Slopes (n, 9f) and means (9f,) of support-vector regression of Q (M, f, 3, 3) on centred features (M, n).
 
@@ -257,11 +200,9 @@ def _support_vectors(X: np.ndarray, Q: np.ndarray, v_hat: np.ndarray, ridge: flo
     size = np.sqrt(modes.shape[1])
     slopes, offsets = np.zeros((X.shape[1], len(unit))), np.zeros(len(unit))
     for c in range(len(unit)):
-        machine = SVR(kernel="linear", C=1 / max(M * ridge, 1e-12), epsilon=min(tube * size / unit[c], 0.5))
+        machine = SVR(kernel="linear", C=1 / max(M * ridge, 1e-12), epsilon=min(TUBE * size / unit[c], 0.5))
         machine.fit(X, normal[:, c])
         slopes[:, c], offsets[c] = machine.coef_[0], machine.intercept_[0]
     back = (unit[:, None] * modes[good]).reshape(len(unit), *mean.shape) / weight
     flat = back.reshape(len(unit), -1)
     return slopes @ flat, mean.ravel() + offsets @ flat
-
-

@@ -1,64 +1,32 @@
 """Learning SCAPE and BlendSCAPE models from registered meshes."""
 from __future__ import annotations
 
-import contextlib
-import logging
-import time
-from collections.abc import Callable, Iterator
-from dataclasses import asdict, dataclass
+from dataclasses import asdict
 from functools import partial
-from typing import Any, TypeVar
+from typing import Any
 
 import numpy as np
 
-from scanprep.batch.steps import Step, inside, once
+from scanprep.batch.steps import Step, once
 from scanprep.geometry.mesh import Mesh, check_template
 from scanprep.meaning import HAND, extent, size, unit_problem
 from scanprep.skeleton.tree import Skeleton
 from scanprep.threads import one_thread
 
-from ..blendscape import BlendScapeModel
+from ..blending import BlendedTemplate, rigid_weights
 from ..body import BodyModel
 from ..borders import face_weights
-from ..carriers import rigid_weights
 from ..digests import body_digest, body_digests, digest
 from ..features import twists
 from ..gradients import GradientSystem, shape_gradients
 from ..pose_space import PoseSpace
-from ..scape import ScapeModel
+from ..scape import BlendScapeModel, ScapeModel
 from ..shape_space import ShapeSpace, learn_shape_space
-from .carriage import Carriage
-from .pose import LearnedPose, PoseConfig, Ticks, learn_pose
+from .config import LearnConfig
+from .pose import LearnedPose, learn_pose
+from .work import Progress, Work, timed
 
-Progress = Callable[[int, int], None]
-T = TypeVar("T")
-LOG = logging.getLogger(__name__)
-
-
-@dataclass(frozen=True)
-class LearnConfig(PoseConfig):
-    """Settings of `learn_scape`: those of the pose space, and of the space of shapes.
-
-    Parameters
-    ----------
-    components : int
-        Shape components to keep, fewer where there are fewer people.
-    """
-
-    components: int = 40
-
-
-@dataclass(frozen=True)
-class BlendConfig(LearnConfig):
-    """Settings of `learn_blendscape`: those of `learn_scape`, and how far rotations blend.
-
-    Parameters
-    ----------
-    width : float
-        How far a rotation reaches over the border of its part, as a share of the template's diagonal.
-    """
-
-    width: float = 0.01
+REACH = 0.01                         # of the template's diagonal: so far a rotation blends over the border of its part
 
 
 @one_thread()
@@ -90,15 +58,19 @@ def learn_scape(template: Mesh, poses: np.ndarray, shapes: np.ndarray | None, sk
     [SCAPE] Eq. 4, Eq. 5, Eq. 7, Eq. 8
     """
     config = config or LearnConfig()
-    check_template(template)
-    check_skeleton(template, skeleton)
-    carriage = Carriage(template, skeleton, rigid_weights(skeleton))
-    space, shape_space, mean, covariance, info, examples = _learn(carriage, poses, shapes, config, progress, step)
-    return ScapeModel(template, skeleton, space, shape_space, mean, covariance, info, pose_examples=examples)
+    poses, shapes = checked_training(template, skeleton, poses, shapes)
+    parts = BlendedTemplate(template, skeleton, rigid_weights(skeleton))                   # R of each part
+    work = Work(progress, amount(poses, shapes, config), step)
+    learned = learn_pose(parts, poses, config, work)                                       # [SCAPE] Eq. 3, Eq. 4, Eq. 5
+    people = learn_people(parts, learned.space, shapes, config, work)                      # [SCAPE] Eq. 7, Eq. 8
+    examples = pose_examples(template, skeleton, learned.poses, shapes)
+    return ScapeModel(template, skeleton, learned.space, people, *pose_prior(examples, len(poses)),
+                      how_learned(template, learned, poses, shapes, config), pose_examples=examples)
 
 
+@one_thread()
 def learn_blendscape(template: Mesh, poses: np.ndarray, shapes: np.ndarray | None, skeleton: Skeleton,
-                     config: BlendConfig | None = None, progress: Progress | None = None, step: Step = once
+                     config: LearnConfig | None = None, progress: Progress | None = None, step: Step = once
                      ) -> BlendScapeModel:
     """Learn a body model whose rotations blend across the borders of parts.
 
@@ -107,75 +79,74 @@ def learn_blendscape(template: Mesh, poses: np.ndarray, shapes: np.ndarray | Non
 
     Parameters
     ----------
-    template, poses, shapes, skeleton, progress, step
+    template, poses, shapes, skeleton, config, progress, step
         As for `learn_scape`.
-    config : BlendConfig, optional
 
     Raises
     ------
     ValueError
-        As `learn_scape`, and a width that is not positive.
+        As `learn_scape`.
 
     [BlendSCAPE]
     """
-    config = config or BlendConfig()
-    check_template(template)
-    check_skeleton(template, skeleton)
-    blend = face_weights(template, skeleton, config.width * float(np.linalg.norm(np.ptp(template.vertices, axis=0))))
-    carriage = Carriage(template, skeleton, blend)
-    space, shape_space, mean, covariance, info, examples = _learn(carriage, poses, shapes, config, progress, step)
-    return BlendScapeModel(template, skeleton, space, shape_space, mean, covariance, info, pose_examples=examples,
-                           blend=blend)
+    config = config or LearnConfig()
+    poses, shapes = checked_training(template, skeleton, poses, shapes)
+    blend = face_weights(template, skeleton, REACH * float(np.linalg.norm(np.ptp(template.vertices, axis=0))))
+    parts = BlendedTemplate(template, skeleton, blend)
+    work = Work(progress, amount(poses, shapes, config), step)
+    learned = learn_pose(parts, poses, config, work)
+    people = learn_people(parts, learned.space, shapes, config, work)
+    examples = pose_examples(template, skeleton, learned.poses, shapes)
+    return BlendScapeModel(template, skeleton, learned.space, people, *pose_prior(examples, len(poses)),
+                           how_learned(template, learned, poses, shapes, config), pose_examples=examples, blend=blend)
 
 
-def _learn(carriage: Carriage, poses: np.ndarray, shapes: np.ndarray | None, config: LearnConfig,
-           progress: Progress | None, step: Step
-           ) -> tuple[PoseSpace, ShapeSpace, np.ndarray, np.ndarray, dict[str, Any], np.ndarray]:
-    """Pose space, shape space, mean and covariance of the poses, how they came about, and the poses."""
-    template = carriage.template
-    poses = checked_bodies(template, poses, "poses")
-    shapes = None if shapes is None else checked_bodies(template, shapes, "shapes")
-    tick = Ticks(progress, (config.refinements + 1) * len(poses) + (0 if shapes is None else len(shapes)))
-    learned = pose_space(carriage, poses, config, tick, step)
-    shape_space = ShapeSpace.empty(len(template.faces))
-    if shapes is not None:
-        shape_space = from_shapes(carriage, learned.space, shapes, config, tick, step, None,
-                                  lambda S: learn_shape_space(S, config.components))
-    examples = pose_examples(template, carriage.skeleton, learned.poses, shapes)
-    return (learned.space, shape_space, *pose_prior(examples, len(poses)),
-            how_learned(template, learned, poses, shapes, config), examples)
+def amount(poses: np.ndarray, shapes: np.ndarray | None, config: LearnConfig) -> int:
+    """How much work it is, in bodies that are fitted or solved for."""
+    return (config.refinements + 1) * len(poses) + (0 if shapes is None else len(shapes))
 
 
-def pose_space(carriage: Carriage, poses: np.ndarray, config: LearnConfig, tick: Ticks, step: Step) -> LearnedPose:
-    """What is learned of the poses, in a step and its steps."""
-    def learn() -> LearnedPose:
-        with timed("pose space"):
-            return learn_pose(carriage, poses, config, tick, inside(step, "pose space"))
+def learn_people(parts: BlendedTemplate, space: PoseSpace, shapes: np.ndarray | None, config: LearnConfig, work: Work
+                 ) -> ShapeSpace:
+    """The space of body shapes of people (P, N, 3), without components where there are none.
 
-    return tick.over((config.refinements + 1) * len(poses),
-                     lambda: step("pose space", (carriage, poses, config.of_poses), learn))
-
-
-def from_shapes(carriage: Carriage, space: PoseSpace, shapes: np.ndarray, config: LearnConfig, tick: Ticks, step: Step,
-                inputs: Any, learn: Callable[[np.ndarray], T]) -> T:
-    """What is learned of the shape deformations S (P, F, 3, 3) of people (P, N, 3), in a step and one a person.
-
-    Parameters
-    ----------
-    inputs
-        What it depends on beside them and the settings.
-    learn : callable
-        Gets S.
+    [SCAPE] Eq. 7, Eq. 8
     """
-    def make() -> T:
-        with timed("shape of every person"):
-            each = inside(step, "shape components/shape of every person")
-            S = shape_deformations(carriage, space, shapes, config.smoothness, tick, each)
-        with timed("shape components"):
-            return learn(S)
+    if shapes is None:
+        return ShapeSpace.empty(len(parts.template.faces))
 
-    return tick.over(len(shapes), lambda: step(
-        "shape components", (carriage, space, shapes, config.smoothness, config.components, inputs), make))
+    def learn(inner: Work) -> ShapeSpace:
+        S = shape_deformations(parts, space, shapes, config, inner)
+        with timed("shape components"):
+            return learn_shape_space(S, config.components)
+
+    return work.step("shape components", (parts, space, shapes, config.smoothness, config.components), len(shapes),
+                     learn)
+
+
+def shape_deformations(parts: BlendedTemplate, space: PoseSpace, shapes: np.ndarray, config: LearnConfig, work: Work
+                       ) -> np.ndarray:
+    """S (P, F, 3, 3) of every person, in float32 to halve the memory.
+
+    Poses are those of Procrustes. Fitting each part to the template in the pose found, again and again, left the same
+    error on new people (6.50, 5.44 and 4.37 mm at 20, 40 and 80 components against 6.48, 5.47 and 4.38).
+
+    [SCAPE] Eq. 8
+    """
+    template, skeleton = parts.template, parts.skeleton
+    system = GradientSystem(template, config.smoothness)
+
+    def deformation(y: np.ndarray, _: Work) -> np.ndarray:
+        pose = skeleton.pose_of(skeleton.fit_rotations(template, y))
+        posed = parts.posed(space.gradients(pose))
+        return shape_gradients(system, posed, parts.local_edges(y, pose)).astype(np.float32)
+
+    S = np.empty((len(shapes), len(template.faces), 3, 3), dtype=np.float32)
+    with timed("shape of every person"):
+        for i, y in enumerate(shapes):
+            S[i] = work.step(f"person {body_digest(y)}", (parts, space, config.smoothness, y), 1,
+                             partial(deformation, y))
+    return S
 
 
 def how_learned(template: Mesh, learned: LearnedPose, poses: np.ndarray, shapes: np.ndarray | None, config: LearnConfig
@@ -189,18 +160,12 @@ def how_learned(template: Mesh, learned: LearnedPose, poses: np.ndarray, shapes:
 
 
 def pose_prior(examples: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
-    """Mean (J, 3) and covariance (3J, 3J) of poses, radians, zero for the root.
+    """Mean (J, 3) and covariance (3J, 3J) of `pose_examples` (M, J, 3), radians, zero for the root.
 
-    Two kinds of poses count alike, however many there are of each: those one person took for the sake of the pose, and
-    those in which people stood. A limb that nothing is known of would else be as likely behind the back as at the
-    side: on half views of five men that were not learned from, that left 20 mm where nothing was seen, and this 14.
-
-    Parameters
-    ----------
-    examples : (M, J, 3) float, radians
-        As `pose_examples` gives them.
-    count : int
-        The first so many are of the one kind, the rest of the other.
+    The first `count` and the rest count alike, however many there are of each: those one person took for the sake of
+    the pose, and those in which people stood. A limb that nothing is known of would else be as likely behind the back
+    as at the side: on half views of five men that were not learned from, that left 20 mm where nothing was seen, and
+    this 14.
     """
     flat = examples.reshape(len(examples), -1)
     kinds = [kind for kind in (flat[:count], flat[count:]) if len(kind)]
@@ -213,54 +178,32 @@ def pose_examples(template: Mesh, skeleton: Skeleton, poses: np.ndarray, shapes:
                   ) -> np.ndarray:
     """Poses (M, J, 3), radians, that bodies were seen in: the training poses, and how the people (P, N, 3) stand.
 
-    The root is not turned.
+    The root is at rest.
     """
-    out = _below_half_turn(poses)
+    out = _rootless(poses)
     if shapes is None:
         return out
-    return np.concatenate([out, _below_half_turn(skeleton.pose_of(skeleton.fit_rotations(template, shapes)))])
+    return np.concatenate([out, _rootless(skeleton.pose_of(skeleton.fit_rotations(template, shapes)))])
 
 
-def _below_half_turn(poses: np.ndarray) -> np.ndarray:
-    """Poses (M, J, 3), radians, below a half turn and without the root's."""
+def _rootless(poses: np.ndarray) -> np.ndarray:
+    """Poses (M, J, 3), radians, at most π and without the root's."""
     out = twists(poses).copy()
     out[:, 0] = 0
     return out
 
 
-@contextlib.contextmanager
-def timed(step: str) -> Iterator[None]:
-    """Tell the log how many seconds a step took."""
-    begun = time.perf_counter()
-    yield
-    LOG.info("%s: %.2f s", step, time.perf_counter() - begun)
-
-
-def shape_deformations(carriage: Carriage, space: PoseSpace, shapes: np.ndarray, smoothness: float, tick: Ticks,
-                       step: Step = once) -> np.ndarray:
-    """S (P, F, 3, 3) of every person, in float32 to halve the memory.
-
-    Poses are those of Procrustes. Fitting each part to the template in the pose found, again and again, left the same
-    error on new people (6.50, 5.44 and 4.37 mm at 20, 40 and 80 components against 6.48, 5.47 and 4.38).
-
-    [SCAPE] Eq. 8
-    """
-    template, skeleton = carriage.template, carriage.skeleton
-    system = GradientSystem(template, smoothness)
-
-    def deformation(y: np.ndarray) -> np.ndarray:
-        pose = skeleton.pose_of(skeleton.fit_rotations(template, y))
-        posed = carriage.v_hat @ np.swapaxes(space.gradients(pose), -1, -2)
-        return shape_gradients(system, posed, carriage.local_edges(y[None], pose[None])[0]).astype(np.float32)
-
-    S = np.empty((len(shapes), len(template.faces), 3, 3), dtype=np.float32)
-    for i, y in enumerate(shapes):
-        S[i] = step(f"person {body_digest(y)}", (carriage, space, smoothness, y), partial(deformation, y))
-        tick(1)
-    return S
+def checked_training(template: Mesh, skeleton: Skeleton, poses: np.ndarray, shapes: np.ndarray | None
+                     ) -> tuple[np.ndarray, np.ndarray | None]:
+    """Poses (M, N, 3) and people (P, N, 3) that a model can be learned from, or ValueError."""
+    check_template(template)
+    check_skeleton(template, skeleton)
+    return (checked_bodies(template, poses, "poses"),
+            None if shapes is None else checked_bodies(template, shapes, "shapes"))
 
 
 def check_skeleton(template: Mesh, skeleton: Skeleton) -> None:
+    """ValueError for a skeleton of another template."""
     if len(skeleton.part_of_face) != len(template.faces):
         raise ValueError(f"skeleton: it has {len(skeleton.part_of_face)} faces, "
                          f"the template {len(template.faces)}")
@@ -283,13 +226,7 @@ def checked_bodies(template: Mesh, bodies: np.ndarray, name: str) -> np.ndarray:
 
 
 def learning_problem(model: BodyModel, people: np.ndarray | None = None) -> str | None:
-    """Why a model that was learned means nothing, with the likely cause; None where it means something.
-
-    Parameters
-    ----------
-    people : (S, N, 3) float, metres, optional
-        That taught the shapes.
-    """
+    """Why a model learned with people (S, N, 3) means nothing, with the likely cause; None where it means something."""
     error, body = float(model.info.get("left_out_error", 0.0)), model.template
     spans = [extent(person) for person in people] if people is not None else [extent(body.vertices)]
     wrong = unit_problem(float(np.median(spans)), extent(body.vertices), "the people are")

@@ -19,18 +19,9 @@ SOFTNESS = (0.003, 0.01, 0.03, 0.1, 0.3, 1.0)        # C of the support vectors,
 class SexPlane:
     """A plane between the betas of women and men.
 
-    Attributes
-    ----------
-    weights : (K,) float
-        Normal of the plane, of length 1; it points to the men.
-    bias : float
-        `weights @ betas + bias` is the distance of betas from the plane, above zero on the men's side.
-    count : int
-        People it was learned from.
-    accuracy : float
-        Share of them that planes learned without them told right.
-    slope : float
-        `1 / (1 + exp(-slope distance))` is the probability of a man, by the same planes.
+    `weights` (K,) is its unit normal, towards the men; `weights @ betas + bias` the signed distance. `accuracy` is the
+    share of the `count` people that planes learned without them told right, and `1 / (1 + exp(-slope distance))` the
+    probability of a man, by the same planes.
     """
 
     weights: np.ndarray
@@ -68,22 +59,10 @@ class SexGuess:
 
 
 def learn_sex_plane(betas: np.ndarray, sexes: Sequence[str]) -> SexPlane:
-    """The plane of a linear support vector machine between women and men.
+    """The plane of a linear support vector machine between betas (P, K) of women and men, at least two of each.
 
     How soft it is, is chosen by planes that have not seen a fifth of the people; of those that tell equally well the
     softest is taken. The first betas count, a third as many as people.
-
-    Parameters
-    ----------
-    betas : (P, K) float
-        Of a model of both sexes, in standard deviations.
-    sexes : P strings
-        "female" or "male"; two people of each at least.
-
-    Raises
-    ------
-    ValueError
-        Betas that are not finite or of another count, other sexes, fewer people.
     """
     betas, men = _checked(betas, sexes)
     count, betas = betas.shape[1], betas[:, :max(1, len(betas) // PEOPLE)]
@@ -161,13 +140,7 @@ def guess_sex(model: BodyModel, betas: np.ndarray) -> SexGuess:
 
 
 def sex_plane(model: BodyModel) -> SexPlane:
-    """The plane that a model keeps.
-
-    Raises
-    ------
-    ValueError
-        A model that keeps none, or a damaged one.
-    """
+    """The plane that a model keeps, or ValueError where it keeps none or a damaged one."""
     kept = model.info.get(PLANE)
     if kept is None:
         raise ValueError("model: it keeps nothing that tells women from men; learn one of both sexes with "

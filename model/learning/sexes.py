@@ -2,32 +2,22 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import Any
 
 import numpy as np
 
 from scanprep.batch.steps import Step, once
-from scanprep.geometry.mesh import Mesh, check_template
+from scanprep.geometry.mesh import Mesh
 from scanprep.skeleton.tree import Skeleton
 from scanprep.threads import one_thread
 
-from ..carriers import rigid_weights
+from ..blending import BlendedTemplate, rigid_weights
 from ..scape import ScapeModel
 from ..shape_space import ShapeSpace, learn_shape_space
-from .carriage import Carriage
-from .pose import Ticks
-from .scape import (
-    LearnConfig,
-    Progress,
-    check_skeleton,
-    checked_bodies,
-    from_shapes,
-    how_learned,
-    pose_examples,
-    pose_prior,
-    pose_space,
-)
-from .sex_plane import PLANE, SexPlane, learn_sex_plane
+from .config import LearnConfig
+from .pose import learn_pose
+from .scape import amount, checked_training, how_learned, pose_examples, pose_prior, shape_deformations
+from .sex_plane import PLANE, learn_sex_plane
+from .work import Progress, Work, timed
 
 SEXES = ("female", "male")
 FEWEST = 2                           # people that span a space of shapes
@@ -61,34 +51,33 @@ def learn_by_sex(template: Mesh, poses: np.ndarray, shapes: np.ndarray, sexes: S
     [SCAPE] Eq. 4, Eq. 5, Eq. 7, Eq. 8
     """
     config = config or LearnConfig()
-    check_template(template)
-    check_skeleton(template, skeleton)
-    poses, shapes = checked_bodies(template, poses, "poses"), checked_bodies(template, shapes, "shapes")
-    groups = _groups(sexes, len(shapes))
-    carriage = Carriage(template, skeleton, rigid_weights(skeleton))
-    tick = Ticks(progress, (config.refinements + 1) * len(poses) + len(shapes))
-    learned = pose_space(carriage, poses, config, tick, step)
+    poses, people = checked_training(template, skeleton, poses, shapes)
+    assert people is not None
+    sex, groups = np.array(list(sexes), dtype=object), _groups(sexes, len(people))
+    parts = BlendedTemplate(template, skeleton, rigid_weights(skeleton))
+    work = Work(progress, amount(poses, people, config), step)
+    learned = learn_pose(parts, poses, config, work)
 
-    def learn(S: np.ndarray) -> tuple[dict[str, ShapeSpace], dict[str, Any] | None]:
-        spaces = {sex: learn_shape_space(S[chosen], config.components) for sex, chosen in groups.items()}
-        return spaces, _plane(spaces["neutral"], S, sexes).kept() if all(sex in groups for sex in SEXES) else None
+    def learn(inner: Work) -> tuple[dict[str, ShapeSpace], dict[str, object] | None]:
+        S = shape_deformations(parts, learned.space, people, config, inner)
+        with timed("shape components"):
+            spaces = {name: learn_shape_space(S[chosen], config.components) for name, chosen in groups.items()}
+            if not all(name in groups for name in SEXES):
+                return spaces, None
+            known = np.isin(sex, SEXES)
+            return spaces, learn_sex_plane(spaces["neutral"].betas_of(S[known]), sex[known].tolist()).kept()
 
-    spaces, plane = from_shapes(carriage, learned.space, shapes, config, tick, step, list(sexes), learn)
-    examples = pose_examples(template, skeleton, learned.poses, shapes)
+    spaces, plane = work.step("shape components", (parts, learned.space, people, config.smoothness, config.components,
+                                                   list(sexes)), len(people), learn)
+    examples = pose_examples(template, skeleton, learned.poses, people)
     prior = pose_prior(examples, len(poses))
     models = {}
-    for sex, chosen in groups.items():
-        info = {**how_learned(template, learned, poses, shapes[chosen], config), "sex": sex}
-        if sex == "neutral" and plane is not None:
+    for name, chosen in groups.items():
+        info = {**how_learned(template, learned, poses, people[chosen], config), "sex": name}
+        if name == "neutral" and plane is not None:
             info[PLANE] = plane
-        models[sex] = ScapeModel(template, skeleton, learned.space, spaces[sex], *prior, info, pose_examples=examples)
+        models[name] = ScapeModel(template, skeleton, learned.space, spaces[name], *prior, info, pose_examples=examples)
     return models
-
-
-def _plane(space: ShapeSpace, S: np.ndarray, sexes: Sequence[str]) -> SexPlane:
-    """What tells the sexes of people (P, F, 3, 3) apart."""
-    known = np.isin(np.array(list(sexes), dtype=object), SEXES)
-    return learn_sex_plane(space.betas_of(S[known]), [sex for sex in sexes if sex in SEXES])
 
 
 def _groups(sexes: Sequence[str], count: int) -> dict[str, np.ndarray]:

@@ -36,27 +36,14 @@ def kept_weights(weights: np.ndarray, count: int) -> np.ndarray:
 
 
 def fit_weights(carried: list[np.ndarray], bodies: np.ndarray, template: Mesh, start: np.ndarray,
-                allowed: np.ndarray, smoothness: float, steps: int = 100) -> np.ndarray:
+                allowed: np.ndarray, smoothness: float = 0.005, steps: int = 100) -> np.ndarray:
     """Weights with which the mean of what the parts say comes nearest to the bodies.
 
     Per vertex it is least squares over weights that are not negative and sum to 1, and neighbours are drawn to each
     other; accelerated projected gradients, every vertex with a step of its own.
 
-    Parameters
-    ----------
-    carried : M arrays (J, N, 3), metres
-        Where each part carries each vertex, body by body.
-    bodies : (M, N, 3) float, metres
-    template : Mesh
-    start : (N, J) float
-    allowed : (N, J) bool
-        The parts that each vertex may choose from.
-    smoothness : float, metres
-        So large an error is as bad as a weight that changes by 1 along an edge.
-
-    Returns
-    -------
-    (N, J) float
+    Of M arrays (J, N, 3) where each part carries each vertex of bodies (M, N, 3), and the parts (N, J) that each
+    vertex may choose from. An error of `smoothness`, metres, is as bad as a weight that changes by 1 along an edge.
     """
     parts = np.argsort(~allowed, axis=1, kind="stable")[:, :allowed.sum(axis=1).max()]       # (N, P)
     free = np.take_along_axis(allowed, parts, axis=1)

@@ -9,8 +9,9 @@ import numpy as np
 from scanprep.geometry.mesh import Mesh
 from scanprep.skeleton.tree import Skeleton
 
-from ..pose_space import PoseSpace, faces_of_part
-from .regression import Design, RegressionConfig, choose_design
+from ..pose_space import PoseSpace
+from .config import LearnConfig
+from .regression import RADII, Design, make_design
 
 OWN = 30.0                           # variance between people over that within, of what regression does not explain
 FEWEST_PEOPLE = 5                    # from here on whole people are held out, otherwise bodies of any
@@ -20,13 +21,9 @@ FEWEST_PEOPLE = 5                    # from here on whole people are held out, o
 class Within:
     """The transform that makes a regression with a random effect a person an ordinary one.
 
-    From every body a share of the mean over its person's bodies is taken, the larger the more there are. What people
-    have of their own weighs little then, and where each has one body only, all are weighed alike.
-
-    Parameters
-    ----------
-    who : (M,) int
-        Whose body each is, 0..P-1.
+    From every body a share of the mean over its person's bodies is taken, the larger the more there are; `who` (M,)
+    says whose each is, 0..P-1. What people have of their own weighs little then, and where each has one body only, all
+    are weighed alike.
     """
 
     who: np.ndarray
@@ -42,13 +39,7 @@ class Within:
     def without_the_person(self, X: np.ndarray, operator: np.ndarray, target: np.ndarray) -> np.ndarray:
         """Residuals (M, n) of transformed targets, every person predicted from the others, in closed form.
 
-        Parameters
-        ----------
-        X : (M, k) float
-            Transformed features.
-        operator : (k, M) float
-            From targets to coefficients.
-        target : (M, n) float
+        Of transformed features X (M, k) and the operator (k, M) from targets to coefficients.
         """
         hat = X @ operator
         left = target - hat @ target
@@ -59,26 +50,20 @@ class Within:
 
 
 def choose_within(template: Mesh, skeleton: Skeleton, poses: np.ndarray, Q: np.ndarray, who: np.ndarray,
-                  config: RegressionConfig) -> Design:
+                  config: LearnConfig) -> Design:
     """The pruning and penalty that predict the edges of left-out people best.
 
-    Parameters
-    ----------
-    poses : (M, J, 3) float, radians
-    Q : (M, F, 3, 3) float
-    who : (M,) int
-        Whose body each is.
+    Of poses (M, J, 3), Q (M, F, 3, 3), and whose body each is (M,).
 
     [SCAPE] Eq. 4
     """
     best: Design | None = None
     for pruning in config.prunings:
-        only = replace(config, prunings=(pruning,), ridges=config.ridges[:1], radii=config.radii[:1])
-        design = choose_design(template, skeleton, poses, Q, only, lambda predicted: 0.0)
         for ridge in config.ridges:
-            error = _left_out_error(replace(design, ridge=ridge), poses, Q, who)
-            if best is None or error < best.left_out_error:
-                best = replace(design, ridge=ridge, left_out_error=error)
+            tried = make_design(template, skeleton, poses, config, pruning, RADII[0], ridge)
+            tried = replace(tried, left_out_error=_left_out_error(tried, poses, Q, who))
+            if best is None or tried.left_out_error < best.left_out_error:
+                best = tried
     assert best is not None
     return best
 
@@ -86,29 +71,12 @@ def choose_within(template: Mesh, skeleton: Skeleton, poses: np.ndarray, Q: np.n
 def fit_within(design: Design, poses: np.ndarray, Q: np.ndarray, who: np.ndarray) -> PoseSpace:
     """Q as a function of the features, as `Design.fit`, were it not for what each person has of their own.
 
-    Parameters
-    ----------
-    poses : (M, J, 3) float, radians
-    Q : (M, F, 3, 3) float
-    who : (M,) int
-        Whose body each is.
-
     [SCAPE] Eq. 4
     """
-    features, within = design.features, Within(who)
-    delta = within(features.evaluate(poses))
-    each = faces_of_part(features.skeleton)
-    coefficients = tuple(np.zeros((features.of_part(p).stop - features.of_part(p).start, len(f), 3, 3),
-                                  dtype=np.float32) for p, f in enumerate(each))
-    place = np.empty(len(design.template.faces), dtype=np.int64)
-    for faces in each:
-        place[faces] = np.arange(len(faces))
-    for part, used, faces in design.groups:
-        rows = np.r_[features.starts[part], used]
-        found = _operator(delta[:, rows], design.ridge) @ within(Q[:, faces]).reshape(len(poses), -1)
-        coefficients[part][(rows - features.starts[part])[:, None], place[faces]] = \
-            found.reshape(len(rows), len(faces), 3, 3)
-    return PoseSpace(features, coefficients)
+    within = Within(who)
+    delta = within(design.features.evaluate(poses))
+    return design.space(lambda used, faces: _operator(delta[:, used], design.ridge) @ within(Q[:, faces]).reshape(
+        len(poses), -1))
 
 
 def _operator(X: np.ndarray, ridge: float) -> np.ndarray:

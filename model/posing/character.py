@@ -3,21 +3,23 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import singledispatch
-from typing import Literal
+from typing import Annotated, Literal
 
 import numpy as np
 
-from scanprep.ranges import Settings
+from scanprep.ranges import FLAG, Settings
 
 from ..body import BodyModel
-from ..gradients import GradientSystem, ShapeSolver, edges
+from ..gradients import GradientSystem, ShapeSolver
 from ..learning.sex_plane import PLANE
 from ..linear import check_pose
 from ..scape import ScapeModel
 from ..skinning import SkinningModel
-from .transfer import unpose
 
 OWN_CHARACTER = "character"          # its place in a model's info
+SMOOTHNESS = 0.0001                  # of Eq. 8: a character's triangles share less of their shape than people's
+NORMAL = 0.3                         # how much normals count beside edges: triangles thicken as they grow
+ROUNDS = 2                           # of adding what is left of the character to its shape
 
 
 @dataclass(frozen=True)
@@ -29,18 +31,9 @@ class CharacterConfig(Settings):
     pose : "found" or "rest"
         How the character stands: its parts are turned against the template's, which is found and undone, or it stands
         in the template's pose and parts that look turned are built so.
-    smoothness : float
-        Times the mean edge length it is w_s of Eq. 8: how far neighbouring triangles share a shape (SCAPE models).
-    normal : float
-        How much the normals of triangles count beside their edges: they thicken as the triangle grows (SCAPE models).
-    rounds : int
-        How often what is left of the character is added to its shape (SCAPE models).
     """
 
-    pose: Literal["found", "rest"] = "found"
-    smoothness: float = 0.0001
-    normal: float = 0.3
-    rounds: int = 2
+    pose: Annotated[Literal["found", "rest"], FLAG] = "found"
 
 
 def character_model(model: BodyModel, vertices: np.ndarray, config: CharacterConfig | None = None,
@@ -76,7 +69,7 @@ def character_model(model: BodyModel, vertices: np.ndarray, config: CharacterCon
     if pose is None:
         pose = character_pose(model, vertices, config)
     pose, _ = check_pose(model.skeleton, pose, None)
-    found = recentred(model, vertices, pose, config)
+    found = recentred(model, vertices, pose)
     kept = {name: value for name, value in model.info.items() if name != PLANE}   # these betas are nobody's
     return replace(found, info={**kept, OWN_CHARACTER: True})                      # type: ignore[type-var]
 
@@ -90,28 +83,24 @@ def character_pose(model: BodyModel, vertices: np.ndarray, config: CharacterConf
 
 
 @singledispatch
-def recentred(model: BodyModel, vertices: np.ndarray, pose: np.ndarray, config: CharacterConfig) -> BodyModel:
+def recentred(model: BodyModel, vertices: np.ndarray, pose: np.ndarray) -> BodyModel:
     """The model whose mean person is in the pose (J, 3) the character with vertices (N, 3), for one kind of model."""
     raise ValueError(f"model: the kind '{model.kind}' cannot take a character")
 
 
 @recentred.register
-def _of_triangles(model: ScapeModel, vertices: np.ndarray, pose: np.ndarray, config: CharacterConfig) -> ScapeModel:
+def _of_triangles(model: ScapeModel, vertices: np.ndarray, pose: np.ndarray) -> ScapeModel:
     """S by Eq. 8, and again for what the stitched character then lacks.
 
     Two edges leave open how a triangle thickens. People are smooth enough to share it with their neighbours; where a
     character is squeezed and stretched, poses that turn triangles out of their plane would then turn them over.
     """
-    faces = model.template.faces
-    R = np.tensordot(model.rotation_weights, model.skeleton.part_rotations(pose), axes=1)
-    v_hat = edges(model.template.vertices, faces)
-    posed, back = v_hat @ np.swapaxes(model.pose_space.gradients(pose), -1, -2), np.swapaxes(np.linalg.inv(R), -1, -2)
-    with_normals = np.concatenate([posed, config.normal * _normals(posed)], axis=1)
-    solver = ShapeSolver(GradientSystem(model.template, config.smoothness), with_normals)
-    wanted, S = edges(vertices, faces) @ back, np.zeros(R.shape)
-    for _ in range(1 + config.rounds):
-        S += solver(np.concatenate([wanted, config.normal * _normals(wanted)], axis=1) - with_normals
-                    @ np.swapaxes(S, -1, -2))
+    posed, wanted = model.posed_edges(pose), model.parts.local_edges(vertices, pose)
+    with_normals = np.concatenate([posed, NORMAL * _normals(posed)], axis=1)
+    solver = ShapeSolver(GradientSystem(model.template, SMOOTHNESS), with_normals)
+    target, S = np.concatenate([wanted, NORMAL * _normals(wanted)], axis=1), np.zeros((len(posed), 3, 3))
+    for _ in range(1 + ROUNDS):
+        S += solver(target - with_normals @ np.swapaxes(S, -1, -2))
     return replace(model, shape_space=replace(model.shape_space, mean=S.astype(np.float32)))
 
 
@@ -126,6 +115,5 @@ def _normals(pairs: np.ndarray) -> np.ndarray:
 
 
 @recentred.register
-def _of_vertices(model: SkinningModel, vertices: np.ndarray, pose: np.ndarray, config: CharacterConfig
-                 ) -> SkinningModel:
-    return replace(model, shape_mean=unpose(model, vertices, pose))
+def _of_vertices(model: SkinningModel, vertices: np.ndarray, pose: np.ndarray) -> SkinningModel:
+    return replace(model, shape_mean=model.unposed(vertices, pose))

@@ -9,7 +9,7 @@ import numpy as np
 from scanprep.geometry.landmarks import match_landmarks
 from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.surface import checked_points, checked_surface
-from scanprep.ranges import Count, Settings
+from scanprep.ranges import Settings
 from scanprep.registration.nonrigid import Registration, register
 from scanprep.registration.schedule import RegistrationConfig
 
@@ -18,6 +18,8 @@ from .character import CharacterConfig, character_model, character_pose
 
 Progress = Callable[[int, int], None]
 
+# a character is farther from people than people are from each other, and one registration does not stretch so far
+ROUNDS = 2
 LOST = 0.5                  # share of the character missed, or of joints outside it, that means nothing
 
 
@@ -27,43 +29,21 @@ class CharacterMeshConfig(Settings):
 
     Attributes
     ----------
-    rounds : int
-        Times that the template is registered, each time from where it came: a character is farther from people than
-        people are from each other, and one registration does not stretch so far.
     register : RegistrationConfig
         Of every round.
     character : CharacterConfig
         How the character becomes the mean of the model.
-
-    Raises
-    ------
-    ValueError
-        Less than one round.
     """
 
-    rounds: Count = 2
     register: RegistrationConfig = field(default_factory=RegistrationConfig)
     character: CharacterConfig = field(default_factory=CharacterConfig)
 
 
 @dataclass(frozen=True, eq=False)
 class Character:
-    """A character as a body model.
-
-    Attributes
-    ----------
-    model : BodyModel
-        With the character as its mean.
-    mesh : Mesh
-        The template on the character, as it stands.
-    pose : (J, 3) float, radians
-        How it stands.
-    joints : (J, 3) float, metres
-        Where it bends, on `mesh`.
-    inside : (J,) bool
-        Joints that lie inside the character.
-    registration : Registration or None
-        How the template lies on the character; None for a mesh that had the template's triangles.
+    """A character as the mean of a body model, the template on it as it stands, its pose (J, 3), its joints (J, 3),
+    metres, which of them lie inside, and how the template was registered to it, None for a mesh that had the template's
+    triangles.
     """
 
     model: BodyModel
@@ -79,24 +59,9 @@ def register_character(model: BodyModel, mesh: Mesh, landmarks: Mapping[str, np.
                        progress: Progress | None = None) -> Character:
     """Make a model of a character from its mesh: register the template to it, then `character_model`.
 
-    Parameters
-    ----------
-    model : BodyModel
-    mesh : Mesh
-        Of any size, in any place and direction, about in the template's pose; with the template's triangles it is
-        taken as it is, and nothing is registered.
-    landmarks : {name: (3,) float, metres}, optional
-        On the mesh. A dozen spread over the body are enough: tips of hands and feet, elbows, knees, head, trunk.
-    template_landmarks : {name: vertex}, optional
-        Of the template; else those that the model keeps.
-    config : CharacterMeshConfig, optional
-    progress : callable, optional
-        Called as progress(done, total).
-
-    Raises
-    ------
-    ValueError
-        Fewer than four landmarks with the same names, or none for a mesh of other triangles.
+    The mesh has any size, place and direction, and is about in the template's pose; a mesh with the template's
+    triangles is taken as it is. A dozen landmarks spread over the body are enough: tips of hands and feet, elbows,
+    knees, head, trunk. ValueError for fewer than four of the same names.
 
     [MoSh]
     """
@@ -121,9 +86,9 @@ def _registered(template: Mesh, mesh: Mesh, vertices: np.ndarray, points: np.nda
     tell = progress or (lambda done, total: None)
     size = _spread(template.vertices[vertices]) / _spread(points)
     start = template.with_vertices(template.vertices / size)
-    for k in range(config.rounds):
+    for k in range(ROUNDS):
         def told(done: int, total: int, before: int = k) -> None:
-            tell(before * total + done, config.rounds * total)
+            tell(before * total + done, ROUNDS * total)
 
         fit = register(start, mesh, (vertices, points), config.register, told)
         start = fit.mesh
@@ -145,7 +110,7 @@ def inside(mesh: Mesh, points: np.ndarray) -> np.ndarray:
 
 def character_problem(found: Character) -> str | None:
     """Why a character means nothing, with the likely cause; None where it means something."""
-    missed = 0.0 if found.registration is None else found.registration.missed
+    missed = 0.0 if found.registration is None else found.registration.uncovered
     if missed <= LOST and found.inside.mean() >= LOST:
         return None
     return (f"{100 * missed:.0f}% of the character lies off the template and {found.inside.sum()} of "

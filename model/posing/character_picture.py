@@ -3,8 +3,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from scanprep.pictures.camera import look_around
 from scanprep.pictures.shading import Bones, Dots, Shape, Solid, part_colors, render, side_by_side
-from scanprep.pictures.views import look_around
 
 from .character_mesh import Character
 

@@ -1,4 +1,4 @@
-"""`scape model repose` and `scape model character`: a registered body in other poses, a character as the mean."""
+"""`scape model mesh`, `repose` and `character`: bodies in poses, and a character as the mean of a model."""
 from __future__ import annotations
 
 from pathlib import Path
@@ -9,17 +9,20 @@ import tyro
 
 from scanprep.cli import Output, Unit
 from scanprep.console import Metric, Outcome, bar
-from scanprep.geometry.files import read_mesh
+from scanprep.geometry.files import read_mesh, write_mesh
 from scanprep.geometry.landmarks import read_landmark_vertices, read_landmarks
+from scanprep.geometry.storage import load_arrays, numbers, read_json, taking_apart
 from scanprep.meaning import HAND, size
+from scanprep.ranges import BETAS, TURNS, Beta
 
 from ..body import BodyModel
 from ..cli import ModelArg
 from ..export.cli import read_motion
 from ..export.meshes import write_frames
 from ..files import load_model
+from ..linear import Subject
 from .character_mesh import Character, CharacterMeshConfig, character_problem, register_character
-from .transfer import TransferConfig, own_body
+from .transfer import own_body, subject_from_body
 
 MM = 1000.0
 
@@ -27,8 +30,7 @@ CharacterArg = Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="MESH
 BodyArg = Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="BODY")]
 
 
-def repose(model: ModelArg, body: BodyArg, poses: Path, output: Output, unit: Unit | None = None,
-           config: TransferConfig = TransferConfig()) -> Outcome:  # noqa: B008
+def repose(model: ModelArg, body: BodyArg, poses: Path, output: Output, unit: Unit | None = None) -> Outcome:
     """Put one registered body, with all its detail, into the poses of a motion.
 
     Example: scape model repose model.npz man.ply --poses walk/motion.npz -o walking
@@ -39,20 +41,19 @@ def repose(model: ModelArg, body: BodyArg, poses: Path, output: Output, unit: Un
         poses: Motion file (.npz), as of scape animate; its betas are not used.
         output: Folder for the meshes.
         unit: Unit of the body.
-        config: Settings.
     """
     loaded, mesh = load_model(model), read_mesh(body, unit)
     if not np.array_equal(mesh.faces, loaded.template.faces):
         raise ValueError(f"{body}: expected the triangles of the model ({loaded.template}), found {mesh}; "
                          "register the template to it first (scape prep register)")
     moves = read_motion(poses, loaded)
-    found = own_body(loaded, mesh.vertices, config=config)
+    found = own_body(loaded, mesh.vertices)
     with bar("writing meshes") as progress:
         written = write_frames(output, found.subject, moves.poses, moves.trans, progress=progress)
     return Outcome(output, [
         Metric("meshes", len(written)),
         Metric("distance from the body in its own pose, mean", MM * found.mean, "mm"),
-        Metric("distance from the body in its own pose, largest", MM * found.largest, "mm")], {"repose": config},
+        Metric("distance from the body in its own pose, largest", MM * found.largest, "mm")],
         problem=None if found.mean <= HAND * size(loaded.template) else
         f"the body is {MM * found.mean:.0f} mm from the model's; registered otherwise, or the wrong unit (--unit)?")
 
@@ -101,11 +102,94 @@ def character(mesh: CharacterArg, model: Annotated[Path, tyro.conf.arg(aliases=[
 def _about(model: BodyModel, found: Character) -> list[Metric]:
     rows = [] if found.registration is None else [
         Metric("distance to the character, RMS", MM * found.registration.rms, "mm"),
-        Metric("character off the template", 100 * found.registration.missed, "%"),
+        Metric("character off the template", 100 * found.registration.uncovered, "%"),
         Metric("distance of landmarks, RMS", MM * found.registration.landmark_rms, "mm"),
-        Metric("flipped triangles", found.registration.flipped)]
+        Metric("inverted triangles", found.registration.inverted)]
     outside = [name for name, within in zip(model.skeleton.names, found.inside, strict=True) if not within]
     return [*rows, Metric("height, length or width", float(np.ptp(found.mesh.vertices, axis=0).max()), "m"),
             Metric("joints inside it", f"{found.inside.sum()} of {len(found.inside)}"
                    + (f", outside: {', '.join(outside)}" if outside else "")),
             Metric("most turned joint", float(np.degrees(np.linalg.norm(found.pose[1:], axis=1).max())), "°")]
+
+
+def mesh(model: ModelArg, output: Output, pose: Path | None = None, betas: tuple[Beta, ...] = (),
+         subject: Path | None = None, own_body: bool = False) -> Outcome:
+    """Write the mesh of one pose and shape.
+
+    Example: scape model mesh model.npz --betas 2 -1 -o body.ply
+
+    Args:
+        model: Model file.
+        output: Mesh to write.
+        pose: JSON {part name: [x, y, z]} of axis-angle turns against the parent in radians, others at rest.
+        betas: Shape in standard deviations, the first of them; the mean person without.
+        subject: Betas in JSON or .npz, or a mesh in the model's triangles, instead of --betas.
+        own_body: The template's own body instead of the mean person.
+    """
+    loaded = load_model(model)
+    turns = np.zeros((len(loaded.skeleton.parents), 3))
+    for name, turn in (_read_turns(pose) if pose else {}).items():
+        if name not in loaded.skeleton.names:
+            raise ValueError(f"{pose}: no part '{name}'; the model has {', '.join(loaded.skeleton.names)}")
+        try:
+            turns[loaded.skeleton.names.index(name)] = turn
+        except (TypeError, ValueError):
+            raise ValueError(f"{pose}: {name}: expected [x, y, z] in radians, got {turn}") from None
+    TURNS.check(turns, f"{pose}: turns")
+    if (subject is not None) + bool(betas) + own_body > 1:
+        raise ValueError("--betas, --subject and --own-body: expected one of them")
+    if subject is not None or own_body:
+        vertices = read_subject(loaded, subject).vertices(turns)
+    elif not loaded.n_betas:
+        raise ValueError(f"{model}: it has no shape components; ask for --own-body")
+    else:
+        vertices = loaded.vertices(turns, np.array(betas if betas else (0.0,)))
+    write_mesh(output, loaded.template.with_vertices(vertices))
+    return Outcome(output, [Metric("vertices", len(vertices)),
+                            Metric("largest extent", float(np.ptp(vertices, axis=0).max()), "m")])
+
+
+def _read_turns(path: Path) -> dict[str, np.ndarray]:
+    """Turns (3,), radians, by the names of parts."""
+    wanted = "turns {part: [x, y, z]}"
+    tree = read_json(path, wanted)
+    with taking_apart(path, f"{wanted} in JSON"):
+        turns = {name: np.array(turn, dtype=np.float64) for name, turn in tree.items()}
+        return {name: numbers(turns, name, 3) for name in turns}
+
+
+def read_subject(model: BodyModel, given: Path | None, unit: Unit | None = None) -> Subject:
+    """The subject named on the command line: betas in JSON or a motion file, or a mesh in the model's topology.
+
+    Without a name it is the template's own body; of a mesh it has all the detail, which betas have not.
+    """
+    if given is None:
+        return model.subject(None)
+    if given.suffix in (".json", ".npz"):
+        betas = _read_betas(given)
+        if len(betas) > model.n_betas:
+            raise ValueError(f"{given}: expected at most the {model.n_betas} betas of the model, found {len(betas)}")
+        return model.subject(betas if len(betas) else None)
+    person = read_mesh(given, unit)
+    if not np.array_equal(person.faces, model.template.faces):
+        raise ValueError(f"{given}: expected the triangles of the model ({model.template}), found {person}; "
+                         "register the template to it first (scape prep register)")
+    return subject_from_body(model, person.vertices)
+
+
+def _read_betas(path: Path) -> np.ndarray:
+    """Betas (k,) from JSON or from the array of that name in an `.npz`; none for the template's own body."""
+    wanted = 'betas [b1, b2, ...] or {"betas": [...]}'
+    if path.suffix == ".json":
+        found = read_json(path, wanted)
+        found = found.get("betas") if isinstance(found, dict) else found
+    else:
+        found = load_arrays(path).get("betas")
+    try:
+        betas = np.array(found, dtype=np.float64)
+    except (TypeError, ValueError, OverflowError):
+        betas = np.array(np.nan)
+    if betas.ndim != 1 or not np.isfinite(betas).all():
+        raise ValueError(f"{path}: expected {wanted}, found something else")
+    BETAS.check(betas, f"{path}: betas")
+    return betas

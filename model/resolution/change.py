@@ -3,7 +3,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import singledispatch
-from typing import Any
+from typing import Annotated, Any
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -11,19 +11,19 @@ from scipy.spatial import cKDTree
 from scanprep.decimation.decimate import DecimateConfig, decimate
 from scanprep.geometry.mesh import Mesh, check_template
 from scanprep.geometry.surface import Surface
-from scanprep.ranges import Count, Settings
+from scanprep.ranges import FLAG, Settings
 from scanprep.skeleton.tree import Skeleton
 
-from ..blendscape import BlendScapeModel
 from ..body import BodyModel
 from ..pose_space import PoseSpace, faces_of_part
 from ..priors import sample_poses
-from ..scape import ScapeModel
+from ..scape import BlendScapeModel, ScapeModel
 from ..shape_space import ShapeSpace
 from ..skinning import SkinningModel
 from .distil import Distillation, Follower, Progress, enough_poses
 from .pieces import Piece, carry_skeleton, gradients_of
 
+POSES, SHAPE_POSES = 40, 8           # of the prior, in which both models are compared and the new one corrected
 ASTRAY = 2.0                         # mean edges of the coarser surface that the two may lie apart
 
 
@@ -33,18 +33,11 @@ class ResolutionConfig(Settings):
 
     Parameters
     ----------
-    poses : int
-        Poses of the model's prior in which both are compared and the new one corrected, or more if the features ask
-        for more.
-    shape_poses : int
-        The same for the shape components.
     rounds : int
-        How often each is corrected; none for a fast and rougher answer.
+        How often pose space and shape space are corrected; none for a fast and rougher answer.
     """
 
-    poses: Count = 40
-    shape_poses: Count = 8
-    rounds: int = 2
+    rounds: Annotated[int, FLAG] = 2
 
 
 def change_resolution(model: BodyModel, template: Mesh, config: ResolutionConfig | None = None,
@@ -101,10 +94,10 @@ def _carry_scape(model: ScapeModel, template: Mesh, config: ResolutionConfig, pr
         shape_space=_carry_shape_space(model, pieces), info=carry_info(model, template), **_carry_blend(model, pieces))
     if not config.rounds:
         return carried
-    poses = sample_poses(model, enough_poses(model, config.poses), np.random.default_rng(0))
+    poses = sample_poses(model, enough_poses(model, POSES), np.random.default_rng(0))
     poses[0] = model.pose_mean
     teacher = Distillation(model, Follower(model.template, template), config.rounds, progress)
-    return teacher.shape_space(teacher.pose_space(carried, poses), poses[:config.shape_poses])
+    return teacher.shape_space(teacher.pose_space(carried, poses), poses[:SHAPE_POSES])
 
 
 def _carry_pose_space(space: PoseSpace, skeleton: Skeleton, pieces: list[Piece]) -> PoseSpace:
@@ -176,19 +169,9 @@ def carry_info(model: BodyModel, template: Mesh) -> dict[str, Any]:
 
 def resolution_gap(model: BodyModel, changed: BodyModel, poses: np.ndarray, betas: np.ndarray | None = None
                    ) -> np.ndarray:
-    """How far two resolutions of a model are apart, at the vertices of the second.
+    """(B,) mean distance, metres, of two resolutions of a model at the vertices of the second, in poses (B, J, 3).
 
-    Parameters
-    ----------
-    model, changed : BodyModel
-    poses : (B, J, 3) float, radians
-    betas : (B, k) float, optional
-        None is the template's own body.
-
-    Returns
-    -------
-    (B,) float, metres
-        Mean over the vertices.
+    With betas (B, k), or of the template's own body.
     """
     follow, gaps = Follower(model.template, changed.template), []
     for b, pose in enumerate(poses):

@@ -9,7 +9,6 @@ import numpy as np
 from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.surface import Surface
 
-from ..gradients import edges
 from ..pose_space import PoseSpace
 from ..scape import ScapeModel
 from ..shape_space import ShapeSpace
@@ -22,13 +21,7 @@ SHRINK = 1e-3                        # of the mean square: holds what the poses 
 
 
 class Follower:
-    """The vertices of one triangulation as points that ride on another one.
-
-    Parameters
-    ----------
-    ridden, rider : Mesh
-        At rest.
-    """
+    """The vertices of one triangulation as points that ride on another one, both at rest."""
 
     def __init__(self, ridden: Mesh, rider: Mesh) -> None:
         self._on = Surface(ridden).closest(rider.vertices)
@@ -64,21 +57,10 @@ def _frames(corners: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True, eq=False)
 class Distillation:
-    """Lowers what a carried model leaves of the model it was made of.
+    """Lowers what a carried model leaves of the model it was made of, in rounds.
 
-    The way is that of learning: what is left of every body, as edges in the frames of the parts, is regressed and
-    added to what the triangles have.
-
-    Parameters
-    ----------
-    model : ScapeModel
-        To be imitated.
-    follow : Follower
-        The imitation's vertices on the model's.
-    rounds : int
-        How often.
-    progress : callable, optional
-        Called with the work done and the whole.
+    The way is that of learning: what is left of every body, as edges in the frames of the parts, is regressed and added
+    to what the triangles have. `follow` puts the imitation's vertices on the model's.
     """
 
     model: ScapeModel
@@ -94,7 +76,7 @@ class Distillation:
         wanted = self.follow.positions(self.model.subject(None).vertices(poses))
         for _ in range(self.rounds):
             left = wanted - imitation.subject(None).vertices(poses)
-            local = np.stack([_unturned(imitation, d, pose) for d, pose in zip(left, poses, strict=True)])
+            local = imitation.parts.local_edges(left, poses)
             imitation = replace(imitation, pose_space=_corrected(imitation, poses, local))
         return imitation
 
@@ -115,8 +97,8 @@ class Distillation:
             square, product = np.zeros((3, 3)), np.zeros((3, 3))
             for pose, (y, dy) in zip(poses, wanted, strict=True):
                 mean, slope = _people(imitation, pose)
-                local = _unturned(imitation, np.concatenate([(y - mean)[None], dy - slope]), pose)
-                posed = _posed(imitation, pose)
+                local = imitation.parts.local_edges(np.concatenate([(y - mean)[None], dy - slope]), pose)
+                posed = imitation.posed_edges(pose)
                 square = square + np.swapaxes(posed, -1, -2) @ posed
                 product = product + np.swapaxes(local, -1, -2) @ posed
                 done = self._tell(done + 1, total)
@@ -135,7 +117,7 @@ class Distillation:
 
 def _corrected(model: ScapeModel, poses: np.ndarray, local: np.ndarray) -> PoseSpace:
     """The pose space with a regression of edges (M, F, 2, 3) that are left in poses (M, J, 3) added."""
-    space, v_hat = model.pose_space, edges(model.template.vertices, model.template.faces)
+    space, v_hat = model.pose_space, model.parts.v_hat
     delta = space.features.evaluate(poses)
     coefficients = []
     for p, faces in enumerate(space.faces_of_part):
@@ -155,15 +137,3 @@ def _people(model: ScapeModel, pose: np.ndarray) -> tuple[np.ndarray, np.ndarray
 def enough_poses(model: ScapeModel, least: int) -> int:
     """How many poses settle the features of every part."""
     return max(least, PER_FEATURE * int(np.bincount(model.pose_space.features.part).max()))
-
-
-def _unturned(model: ScapeModel, field: np.ndarray, pose: np.ndarray) -> np.ndarray:
-    """Edges (..., F, 2, 3) of a displacement (..., N, 3) as they were before rotations carried them."""
-    R = np.tensordot(model.rotation_weights, model.skeleton.part_rotations(pose), axes=1)
-    return edges(field, model.template.faces) @ np.swapaxes(np.linalg.inv(R), -1, -2)
-
-
-def _posed(model: ScapeModel, pose: np.ndarray) -> np.ndarray:
-    """`Q v̂` (F, 2, 3) at a pose."""
-    v_hat = edges(model.template.vertices, model.template.faces)
-    return v_hat @ np.swapaxes(model.pose_space.gradients(pose), -1, -2)

@@ -21,10 +21,7 @@ LEAST = 6                            # triangles that a part needs: fewer are no
 def carry_skeleton(skeleton: Skeleton, old: Mesh, new: Mesh) -> Skeleton:
     """The same tree and joints, the parts painted onto the new triangles by majority.
 
-    Raises
-    ------
-    ValueError
-        Too coarse: a part gets no triangles, or no longer touches its parent.
+    ValueError where it is too coarse: a part gets no triangles, or no longer touches its parent.
     """
     J, F = len(skeleton.parents), len(new.faces)
     bary = _inner_points(_cuts(old, new))
@@ -48,14 +45,7 @@ def carry_skeleton(skeleton: Skeleton, old: Mesh, new: Mesh) -> Skeleton:
 
 
 class Piece:
-    """One part on both triangulations: what is known on its old triangles is carried to its new ones.
-
-    Parameters
-    ----------
-    old, new : Mesh
-    old_faces, new_faces : (f,) and (g,) int
-        The triangles of the part.
-    """
+    """One part on both triangulations: what is known on its old triangles (f,) is carried to its new ones (g,)."""
 
     def __init__(self, old: Mesh, new: Mesh, old_faces: np.ndarray, new_faces: np.ndarray) -> None:
         self.old_faces, self.new_faces = old_faces, new_faces
@@ -87,20 +77,12 @@ class Piece:
         return (self._mean @ values.reshape(len(values), -1)).reshape(-1, *values.shape[1:])
 
     def edges(self, action: np.ndarray) -> np.ndarray:
-        """The edges that the new triangles have when the part alone is deformed.
+        """The edges (n, g, 2, 3), metres, of the new triangles when the old ones alone are deformed by `action` (n, f,
+        3, 3).
 
-        Stitching takes from the edges of a part only what is the gradient of some displacement of that part: all
-        the rest vanishes in the normal equations. So the part is stitched on its own, without loss, and
-        the new vertices are carried along with the triangles on which, or nearest to which, they lie.
-
-        Parameters
-        ----------
-        action : (n, f, 3, 3) float
-            What is done to each old triangle.
-
-        Returns
-        -------
-        (n, g, 2, 3) float, metres
+        Stitching takes from the edges of a part only what is the gradient of some displacement of that part: all the
+        rest vanishes in the normal equations. So the part is stitched on its own, without loss, and the new vertices
+        are carried along with the triangles on which, or nearest to which, they lie.
         """
         G, normal = self._stitch
         wanted = edges(self.before.vertices, self.before.faces) @ np.swapaxes(action, -1, -2)     # (n, f, 2, 3)
@@ -113,18 +95,9 @@ class Piece:
 
 
 def gradients_of(before: np.ndarray, after: np.ndarray, otherwise: np.ndarray | None = None) -> np.ndarray:
-    """The matrices that carry edges to other edges.
+    """The matrices (..., g, 3, 3) that carry edges (g, 2, 3) to other edges (..., g, 2, 3).
 
-    Parameters
-    ----------
-    before : (g, 2, 3) float, metres
-    after : (..., g, 2, 3) float, metres
-    otherwise : (..., g, 3, 3) float, optional
-        Matrices that act across the triangles, of which edges say nothing; zero without.
-
-    Returns
-    -------
-    (..., g, 3, 3) float
+    Across the triangles, of which edges say nothing, they act as `otherwise`, or not at all.
     """
     dual = np.linalg.solve(before @ np.swapaxes(before, -1, -2), before)      # (g, 2, 3)
     carried = np.swapaxes(after, -1, -2) @ dual

@@ -1,29 +1,32 @@
-"""A statue on disk: the control model, the images over its chart, and the files for other commands."""
+"""A statue on disk: control model, images over its chart, and files for other commands and programs (glTF, X3D)."""
 from __future__ import annotations
 
+import re
 from pathlib import Path
+from xml.etree import ElementTree as xml
 
 import numpy as np
 
 from scanprep.geometry import storage
-from scanprep.skeleton.tree import Skeleton
-from scanprep.synthetic import people
+from scanprep.geometry.mesh import Mesh
+from scanprep.pictures.sheets import save_png
 
+from ..export.glb import Material, write_skinned_glb
+from ..export.rig import Rig, strongest, turn_up
 from ..features import linear_features
 from ..skinning import SkinningModel
+from .control.chart import Chart
 from .control.files import read_control, write_control
 from .control.humanoid import humanoid, humanoid_markers
 from .control.model import ControlModel, Statue
 from .detail.maps import read_map, write_map
-from .detail.subdivision import Subdivision
-from .detail.textures import normal_image
+from .detail.subdivision import Subdivision, subdivide
+from .detail.textures import chart_tangents, normal_image, vertex_of_row
 from .motion.motions import people_motion
-from .skins import write_statue_glb, write_x3d
+from .motion.retarget import StatueMotion
 
 KIND, VERSION = "statue", 1
 CONTROL, ABOUT, TEXTURE = "control.npz", "statue.json", "texture.png"
-BODY, MARKERS = "body.npz", "markers.json"
-SKIN = 0.0095                        # metres from the skin to the middle of a marker [MoSh]
 
 
 def save_statue(folder: str | Path, statue: Statue) -> None:
@@ -75,27 +78,19 @@ def load_statue(folder: str | Path, edited: str | Path | None = None) -> Statue:
 
 
 def write_body(folder: Path, statue: Statue) -> None:
-    """Write body.npz, a model that markers and points drive, and for the humanoid markers.json, a layout of markers."""
+    """Write body.npz, a model that markers and points drive, and for the humanoid markers.json, a layout of markers.
+
+    What random poses of the synthetic people do with these joints makes the pose prior of the humanoid.
+    """
+    from scanprep.synthetic import people
+
     control, poses = statue.control, None
     if control.skeleton.names == humanoid().skeleton.names:
-        poses = people_motion(control, statue.pose, people_poses()).poses
-        storage.write_json(folder / MARKERS, {"markersets": [{
-            "type": "body", "distance_from_skin": SKIN, "indices": humanoid_markers()}]})
-    body_model(control, poses).save(folder / BODY)
-
-
-def write_for_programs(folder: Path, statue: Statue, vertices: np.ndarray, fine: Subdivision, up: int) -> None:
-    """Write statue.glb, the control mesh with skin and all images, and statue.x3d, the same as H-Anim; `vertices` are
-    those of the detailed surface, whose normals become the normal image.
-    """
-    normals = normal_image(statue.control, vertices, fine, len(statue.map.heights))
-    write_statue_glb(folder / "statue.glb", statue.control, texture=statue.texture, normals=normals,
-                     heights=statue.map.heights, up=up)
-    write_x3d(folder / "statue.x3d", statue.control, texture=statue.texture, up=up)
-
-
-POSES = 100                          # random poses of the synthetic people that make the pose prior
-WIDEST = 1.0                         # radians: standard deviation of the turns of a joint without such poses
+        rng = np.random.default_rng(0)
+        poses = people_motion(control, statue.pose, np.array([people.random_pose(rng) for _ in range(100)])).poses
+        storage.write_json(folder / "markers.json", {"markersets": [{
+            "type": "body", "distance_from_skin": 0.0095, "indices": humanoid_markers()}]})      # [MoSh]
+    body_model(control, poses).save(folder / "body.npz")
 
 
 def body_model(control: ControlModel, poses: np.ndarray | None = None) -> SkinningModel:
@@ -105,23 +100,125 @@ def body_model(control: ControlModel, poses: np.ndarray | None = None) -> Skinni
     skeleton, N = control.skeleton, len(control.mesh.vertices)
     J = len(skeleton.parents)
     if poses is None:
-        mean, covariance, poses = np.zeros((J, 3)), WIDEST**2 * np.eye(3 * J), np.zeros((0, J, 3))
+        mean, covariance, poses = np.zeros((J, 3)), np.eye(3 * J), np.zeros((0, J, 3))
         covariance[:3, :3] = 0
     else:
         poses = poses.copy()
         poses[:, 0] = 0
         mean, covariance = poses.mean(axis=0), np.cov(poses.reshape(len(poses), -1).T)
+    no_correctives = linear_features(skeleton, (np.zeros((3, 0)),) * J)
     return SkinningModel(
-        control.mesh, skeleton, control.mesh.vertices, control.weights, _no_correctives(skeleton),
+        control.mesh, skeleton, control.mesh.vertices, control.weights, no_correctives,
         np.zeros((0, N, 3)), control.mesh.vertices, np.zeros((0, N, 3)), np.zeros(0), 0.0, mean, covariance,
         {"made of": "a statue", "landmarks": dict(control.landmarks)}, pose_examples=poses)
 
 
-def people_poses(count: int = POSES, seed: int = 0) -> np.ndarray:
-    """Random poses (count, 16, 3), radians, of the synthetic people."""
-    rng = np.random.default_rng(seed)
-    return np.array([people.random_pose(rng) for _ in range(count)])
+def write_for_programs(folder: Path, statue: Statue, vertices: np.ndarray, fine: Subdivision, up: int) -> None:
+    """Write statue.glb and statue.x3d (H-Anim); the normals of the detailed `vertices` become an image."""
+    normals = normal_image(statue.control, vertices, fine, len(statue.map.heights))
+    write_statue_glb(folder / "statue.glb", statue.control, texture=statue.texture, normals=normals,
+                     heights=statue.map.heights, up=up)
+    write_x3d(folder / "statue.x3d", statue.control, texture=statue.texture, up=up)
 
 
-def _no_correctives(skeleton: Skeleton):  # type: ignore[no-untyped-def]
-    return linear_features(skeleton, tuple(np.zeros((3, 0)) for _ in skeleton.parents))
+def write_statue_glb(path: str | Path, control: ControlModel, vertices: np.ndarray | None = None,
+                     subdivision: Subdivision | None = None, texture: np.ndarray | None = None,
+                     normals: np.ndarray | None = None, heights: np.ndarray | None = None,
+                     motion: StatueMotion | None = None, up: int = 2) -> None:
+    """Write a statue for any glTF 2.0 viewer, animation program or game engine; the axis `up` points up.
+
+    glTF knows linear blend skinning only: joints carry the detailed vertices themselves, while `Reconstruction` moves
+    the control mesh and sets the detail upon it anew. The rest pose is that of the scan. Without `vertices` (n, 3) of a
+    subdivision it is the control mesh itself, which `normals` (`normal_image`) and `heights` detail; glTF has no place
+    for heights, so they are an image that the material's `extras` name.
+    """
+    if (vertices is None) != (subdivision is None):
+        raise ValueError("vertices, subdivision: expected both or none")
+    if subdivision is None or vertices is None:
+        subdivision, vertices = subdivide(control.mesh, control.chart, 0), control.mesh.vertices
+    if np.shape(vertices) != (len(subdivision.parent), 3):
+        raise ValueError(f"vertices: expected shape ({len(subdivision.parent)}, 3), got {np.shape(vertices)}")
+    mesh, chart = Mesh(vertices, subdivision.faces), subdivision.chart
+    weights = np.einsum("nc,ncj->nj", subdivision.bary, control.weights[control.mesh.faces[subdivision.parent]])
+    row = vertex_of_row(mesh, chart)                            # vertices are repeated along the seams of the chart
+    split = Mesh(mesh.vertices[row], chart.faces)
+    tangents = None if normals is None else chart_tangents(mesh, chart)
+    material = Material(chart.uv, mesh.vertex_normals[row], tangents, texture, normals, heights)
+    rig = Rig(split, control.skeleton, strongest(weights)[row], np.zeros((0, *split.vertices.shape)))
+    poses, trans, rate = (None, None, 1.0) if motion is None else (motion.poses, motion.trans, motion.rate)
+    write_skinned_glb(path, rig, poses, trans, rate, up=up, material=material)
+
+
+def write_x3d(path: str | Path, control: ControlModel, texture: np.ndarray | None = None, up: int = 2) -> None:
+    """Write a statue as an `HAnimHumanoid` of X3D 4.0, and its texture as a PNG of the same name beside it.
+
+    Joints have the names of H-Anim 2.0 where the control model's parts have those of 1.0, as the generic humanoid's,
+    and their centres in the pose of the scan, where no joint is turned. Skin and joints share their coordinates.
+    """
+    path = Path(path)
+    U = turn_up(up).T
+    root = xml.Element("X3D", profile="Full", version="4.0")
+    head = xml.SubElement(root, "head")
+    xml.SubElement(head, "meta", name="generator", content="scapekit")
+    scene = xml.SubElement(root, "Scene")
+    names = _names(control)
+    person = xml.SubElement(scene, "HAnimHumanoid", DEF="statue", name="statue", version="2.0")
+    _skeleton(person, control, names, U)
+    for name in names:
+        xml.SubElement(person, "HAnimJoint", USE=name, containerField="joints")
+    image = None if texture is None else path.with_suffix(".png").name
+    _skin(person, control.mesh.with_vertices(control.mesh.vertices @ U), control.chart, image)
+    if texture is not None:
+        save_png(path.with_suffix(".png"), texture)
+    xml.indent(root, " ")
+    with storage.writing(path) as beside:
+        doctype = ('<?xml version="1.0" encoding="UTF-8"?>\n<!DOCTYPE X3D PUBLIC "ISO//Web3D//DTD X3D 4.0//EN" '
+                   '"https://www.web3d.org/specifications/x3d-4.0.dtd">\n')
+        beside.write_text(doctype + xml.tostring(root, encoding="unicode") + "\n", encoding="utf-8")
+
+
+def _names(control: ControlModel) -> list[str]:
+    """Names of the parts as XML takes them for an identity."""
+    plain = [re.sub(r"[^A-Za-z0-9_]", "_", name) for name in control.skeleton.names]
+    plain = [name if name[:1].isalpha() else f"part_{name}" for name in plain]
+    return [name if plain.count(name) == 1 and name != "statue" else f"{name}_{j}" for j, name in enumerate(plain)]
+
+
+def _skeleton(person: xml.Element, control: ControlModel, names: list[str], U: np.ndarray) -> None:
+    nodes: list[xml.Element] = []
+    weights = strongest(control.weights)
+    renamed = {"wrist": "radiocarpal", "ankle": "talocrural"}       # joints that H-Anim 2.0 calls otherwise than 1.0
+    for j, parent in enumerate(control.skeleton.parents):
+        carried = np.flatnonzero(weights[:, j])
+        nodes.append(xml.SubElement(
+            nodes[parent] if j else person, "HAnimJoint", DEF=names[j],
+            name=re.sub("^([lr]_)(wrist|ankle)$", lambda found: found[1] + renamed[found[2]], names[j]),
+            containerField="children" if j else "skeleton", center=_row(control.skeleton.joints[j] @ U),
+            skinCoordIndex=" ".join(map(str, carried)), skinCoordWeight=_row(weights[carried, j])))
+
+
+def _skin(person: xml.Element, mesh: Mesh, chart: Chart, image: str | None) -> None:
+    xml.SubElement(person, "Coordinate", DEF="skin_points", containerField="skinCoord", point=_rows(mesh.vertices))
+    xml.SubElement(person, "Normal", DEF="skin_normals", containerField="skinNormal",
+                   vector=_rows(mesh.vertex_normals))
+    shape = xml.SubElement(person, "Shape", containerField="skin")
+    look = xml.SubElement(shape, "Appearance")
+    xml.SubElement(look, "Material", diffuseColor="0.8 0.77 0.74" if image is None else "1 1 1")
+    if image is not None:
+        xml.SubElement(look, "ImageTexture", url=f'"{image}"', repeatS="false", repeatT="false")
+    surface = xml.SubElement(shape, "IndexedFaceSet", coordIndex=_faces(mesh.faces), texCoordIndex=_faces(chart.faces))
+    xml.SubElement(surface, "Coordinate", USE="skin_points")
+    xml.SubElement(surface, "Normal", USE="skin_normals")
+    xml.SubElement(surface, "TextureCoordinate", point=_rows(chart.uv))
+
+
+def _row(values: np.ndarray) -> str:
+    return " ".join(f"{value:.7g}" for value in np.round(values, 8) + 0.0)
+
+
+def _rows(values: np.ndarray) -> str:
+    return ", ".join(map(_row, values))
+
+
+def _faces(faces: np.ndarray) -> str:
+    return " ".join(f"{a} {b} {c} -1" for a, b, c in faces)

@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
+from scanprep.batch.steps import Step, once
 from scanprep.geometry.mesh import Mesh
 from scanprep.ranges import Settings
 
@@ -13,7 +14,7 @@ from .control.humanoid import humanoid
 from .control.model import ControlModel, Statue
 from .detail.displacement import DisplacementConfig, bake, unfold_control
 from .registration.automatic import Features, find_features
-from .registration.features import FeatureConfig, FeatureFit, fit_features, head_share, warp
+from .registration.features import FeatureFit, fit_features, head_share, warp
 from .registration.surface_fit import SurfaceFit, SurfaceFitConfig, fit_surface
 
 Progress = Callable[[int, int], None]
@@ -26,14 +27,17 @@ class StatueConfig(Settings):
 
     Attributes
     ----------
-    features : FeatureConfig
     surface : SurfaceFitConfig
     displacement : DisplacementConfig
     """
 
-    features: FeatureConfig = field(default_factory=FeatureConfig)
     surface: SurfaceFitConfig = field(default_factory=SurfaceFitConfig)
     displacement: DisplacementConfig = field(default_factory=DisplacementConfig)
+
+    @classmethod
+    def published(cls) -> StatueConfig:
+        """The control mesh fitted by the steps of the paper alone."""
+        return cls(surface=SurfaceFitConfig.published())
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,15 +45,25 @@ class Posed:
     """A control model in the pose of a scan, before its surface is fitted."""
 
     features: FeatureFit
-    start: np.ndarray   # (N, 3) metres, its vertices after the warp of the head
-    hidden: np.ndarray  # (N,), vertices of parts that the scan does not show
-    face: int = 0       # points of the face that shaped the head: none where fewer than four are known or all lie in
-                        # one plane
+    start: np.ndarray              # (N, 3) metres, its vertices after the warp of the head
+    hidden: np.ndarray             # (N,), vertices of parts that the scan does not show
+    face: int = 0                  # points of the face that shaped the head: none where fewer than four are known
+    missing: tuple[str, ...] = ()  # joints and landmarks that the scan does not show
+    problem: str | None = None     # why features that were found should not be trusted
+
+
+@dataclass(frozen=True, eq=False)
+class FittedStatue(Statue):
+    """A statue as it was fitted, with how that went."""
+
+    posed: Posed | None = None
+    surface: SurfaceFit | None = None
 
 
 def fit_statue(scan: Mesh, joints: Mapping[str, np.ndarray] | None = None,
                points: Mapping[str, np.ndarray] | None = None, control: ControlModel | None = None,
-               config: StatueConfig | None = None, progress: Progress | None = None) -> Statue:
+               config: StatueConfig | None = None, progress: Progress | None = None, step: Step = once
+               ) -> FittedStatue:
     """One scan of one person as a character that moves, with all its detail.
 
     Parameters
@@ -65,6 +79,8 @@ def fit_statue(scan: Mesh, joints: Mapping[str, np.ndarray] | None = None,
     config : StatueConfig, optional
     progress : callable, optional
         Called as progress(done, total).
+    step : Step, optional
+        Keeps the results of the stages, so that work which was interrupted goes on.
 
     Raises
     ------
@@ -74,20 +90,24 @@ def fit_statue(scan: Mesh, joints: Mapping[str, np.ndarray] | None = None,
     [Statues]
     """
     control, config = control or humanoid(), config or StatueConfig()
+    given = (scan, joints, points, control)
     if joints is None and points is None:
-        found = find_features(control, scan)
-        posed = posed_automatically(control, found)
+        posed = posed_automatically(control, step("features", given, lambda: find_features(control, scan)))
     else:
-        posed = posed_by_features(control, joints or {}, points or {}, config.features)
-    surface = fit_surface(control.mesh, posed.start, scan, config.surface, progress, posed.hidden)
-    fitted = fitted_control(control, posed.features, surface, scan, config.displacement)
-    return Statue(fitted, posed.features.pose, bake(fitted, scan, config.displacement, progress))
+        posed = posed_by_features(control, joints or {}, points or {})                           # [Statues] Eq. 1-5
+    surface = step("surface", (given, config), lambda: fit_surface(
+        control.mesh, posed.start, scan, config.surface, progress, posed.hidden))                # [Statues] Eq. 6-18
+    fitted = step("control", (given, config), lambda: fitted_control(
+        control, posed.features, surface, scan, config.displacement))
+    map = step("map", (given, config), lambda: bake(
+        fitted, scan, config.displacement, progress))                                            # [Statues] Eq. 19-21
+    return FittedStatue(fitted, posed.features.pose, map, posed=posed, surface=surface)
 
 
-def posed_by_features(control: ControlModel, joints: Mapping[str, np.ndarray], points: Mapping[str, np.ndarray],
-                      config: FeatureConfig | None = None) -> Posed:
-    """The control model posed by features, and its head warped to those of the face. [Statues] Eq. 4, 5"""
-    fit = fit_features(control, joints, points, config)
+def posed_by_features(control: ControlModel, joints: Mapping[str, np.ndarray], points: Mapping[str, np.ndarray]
+                      ) -> Posed:
+    """The control model posed by features, and its head warped to those of the face."""
+    fit = fit_features(control, joints, points)                                                  # [Statues] Eq. 4
     shown = np.zeros(len(fit.vertices), dtype=bool)
     face = [name for name in FACE if name in points]
     if len(face) < 4 or "skullbase" not in control.skeleton.names:
@@ -95,7 +115,7 @@ def posed_by_features(control: ControlModel, joints: Mapping[str, np.ndarray], p
     own = fit.vertices[[control.landmarks[name] for name in face]]
     try:
         goal = np.array([points[name] for name in face])
-        return Posed(fit, warp(fit.vertices, own, goal, head_share(control)), shown, len(face))
+        return Posed(fit, warp(fit.vertices, own, goal, head_share(control)), shown, len(face))  # [Statues] Eq. 5
     except ValueError:                   # points in one plane say nothing of the shape of a head
         return Posed(fit, fit.vertices, shown)
 
@@ -110,7 +130,7 @@ def posed_automatically(control: ControlModel, found: Features) -> Posed:
     names = control.skeleton.names
     lacking = control.weights[:, [j for j, name in enumerate(names) if name in found.missing]].sum(axis=1)[:, None]
     start = found.registered.vertices + lacking * (found.fit.vertices - found.registered.vertices)
-    return Posed(found.fit, start, lacking[:, 0] > 0.5)
+    return Posed(found.fit, start, lacking[:, 0] > 0.5, missing=found.missing, problem=found.problem)
 
 
 def fitted_control(control: ControlModel, posed: FeatureFit, surface: SurfaceFit, scan: Mesh,

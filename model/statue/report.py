@@ -2,7 +2,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -14,37 +13,21 @@ from scanprep.pictures.page import Page
 from scanprep.pictures.shading import Bones, Dots, Shape, Solid, color_bar, heat, part_colors, render, side_by_side
 
 from .control.model import FOLDED, HOLE, MEASURED, OUTSIDE, DisplacementMap, Statue
+from .detail.errors import Level
 from .detail.reconstruction import Reconstruction, coverage_at
 from .detail.subdivision import subdivide
 
-HEIGHT, SMALL = 520, 360            # pixels of the pictures, and of animated ones
+HEIGHT = 520                         # pixels of the pictures
 SIDES = ("front", "left", "back", "right")
 WORST = 0.003                        # metres: the end of the colours of errors
-MOVING = 3                           # level of the pictures in motion
 KINDS = {MEASURED: (0.62, 0.70, 0.78), FOLDED: (0.86, 0.36, 0.22), HOLE: (0.93, 0.75, 0.42), OUTSIDE: (1.0, 1.0, 1.0)}
-
-
-@dataclass(frozen=True, eq=False)
-class Level:
-    """A reconstruction and how far it lies from the scan."""
-
-    name: str
-    mesh: Mesh
-    mean: float        # metres, from the reconstruction to the scan, where that has no hole [Statues] Eq. 22, 23
-    rms: float         # metres, from the reconstruction to the scan, where that has no hole [Statues] Eq. 22, 23
-    shown: np.ndarray  # (f,), triangles that are not in a hole of the scan
-
-
-def upright_axis(statue: Statue) -> int:
-    """0, 1 or 2: the axis of the scan nearest to the upward direction of the person's trunk."""
-    return int(np.abs(statue.control.skeleton.part_rotations(statue.pose)[0][:, 2]).argmax())
 
 
 def cameras(statue: Statue, subject: Any, turns: Sequence[float] = (0, 90, 180, 270)) -> list[Camera]:
     """Cameras around a subject (Mesh or points) from the front on; the front is where the control model looks."""
     R = statue.control.skeleton.part_rotations(statue.pose)[0]
     front = -R[:, 1]
-    axis = upright_axis(statue)
+    axis = statue.upright_axis
     first, second = np.eye(3)[[(axis + 1) % 3, (axis + 2) % 3]]
     azimuth = float(np.degrees(np.arctan2(front @ second, front @ first)))
     return [Camera.around(subject, azimuth + turn, up=axis) for turn in turns]
@@ -60,22 +43,19 @@ def statue_picture(scan: Mesh, statue: Statue, level: Level) -> np.ndarray:
 
 
 def statue_page(name: str, scan: Mesh, statue: Statue, levels: Sequence[Level], rows: list[tuple[str, Any, str]],
-                adaptive: Level | None = None, frames: Sequence[tuple[str, Mesh]] = (),
-                picture: np.ndarray | None = None) -> Page:
-    """The page of `scape statue fit`: levels are the coarsest first, rows (metric, value, unit) of the table, frames
-    the statue in other poses.
-    """
+                adaptive: Level, frames: Sequence[tuple[str, Mesh]], picture: np.ndarray) -> Page:
+    """The page of `scape statue fit`: levels, coarsest first, rows of the table, the statue in other poses."""
     finest = levels[-1]
     page = Page(f"{name}, a statue that moves", "A control mesh with a skeleton was fitted to the scan; the detail of "
                 "the scan is an image over it.")
-    page.picture(statue_picture(scan, statue, finest) if picture is None else picture)
+    page.picture(picture)
     page.table(rows, ("metric", "value", "unit"))
     _fit(page, scan, statue)
     _map(page, statue, scan)
     _errors(page, scan, statue, levels)
     page.section("Level of detail", "The same map on ever fewer triangles, and on triangles that are small only where "
                  "the displacement asks for it.")
-    shown = [*reversed(levels), *([adaptive] if adaptive else [])]
+    shown = [*reversed(levels), adaptive]
     camera = cameras(statue, scan, (20,))[0]
     page.picture(_row([(Solid(one.mesh, smooth=one is not finest), camera) for one in shown],
                       [f"{one.name}: {len(one.mesh.faces):,} triangles" for one in shown]))
@@ -175,7 +155,7 @@ def in_motion(statue: Statue) -> list[tuple[str, Mesh]]:
         return []
     poses = np.stack([walk(80)[0][20], named_pose("squat"), named_pose("arms_up")])
     moved = people_motion(statue.control, statue.pose, poses)
-    detailed = Reconstruction(statue.control, statue.map, subdivide(statue.control.mesh, statue.control.chart, MOVING))
+    detailed = Reconstruction(statue.control, statue.map, subdivide(statue.control.mesh, statue.control.chart, 3))
     bodies = statue.control.rig.vertices(moved.poses, moved.trans)
     return [(name, detailed.mesh(body)) for name, body in zip(("walking", "squatting", "arms overhead"), bodies,
                                                               strict=True)]
@@ -186,7 +166,7 @@ def motion_pictures(statue: Statue, detailed: Reconstruction, bodies: np.ndarray
     """A picture of each of some frames of control vertices (T, N, 3), all seen from one place in front."""
     camera, out = cameras(statue, bodies.reshape(-1, 3), (25,))[0], []
     for t, body in enumerate(bodies):
-        out.append(render(detailed.mesh(body), camera, int(SMALL * camera.width / camera.height) + 10, SMALL))
+        out.append(render(detailed.mesh(body), camera, int(360 * camera.width / camera.height) + 10, 360))
         if progress:
             progress(t + 1, len(bodies))
     return out

@@ -1,6 +1,7 @@
 """Filters of open3d, which needs the graphics libraries of the system even for geometry."""
 from __future__ import annotations
 
+import importlib
 from typing import Any
 
 import numpy as np
@@ -8,36 +9,23 @@ import numpy as np
 from ..geometry.mesh import Mesh
 from ..geometry.surface import Surface
 
-MISSING = ("{name} cannot be imported ({error}). Install it with `pip install {name}`; on Debian it also needs "
-           "`apt-get install libegl1 libgl1 libx11-6 libusb-1.0-0`")
-
 
 class MissingLibrary(ImportError):
     """A library that a setting asks for is not there, or not the system's libraries it stands on."""
 
 
 def quadric_decimation(mesh: Mesh, faces: int) -> Mesh:
-    """Fewer triangles by open3d's quadric error collapses.
-
-    Raises
-    ------
-    MissingLibrary
-        open3d cannot be imported.
-    """
-    o3d = _open3d()
-    smaller = _to_open3d(o3d, mesh).simplify_quadric_decimation(faces)
+    """Fewer triangles by open3d's quadric error collapses."""
+    o3d = library("open3d")
+    whole = o3d.geometry.TriangleMesh(o3d.utility.Vector3dVector(np.array(mesh.vertices)),      # it wants its own
+                                      o3d.utility.Vector3iVector(mesh.faces.astype(np.int32)))
+    smaller = whole.simplify_quadric_decimation(faces)
     return Mesh(np.asarray(smaller.vertices), np.asarray(smaller.triangles))
 
 
 def poisson(mesh: Mesh, depth: int = 8) -> Mesh:
-    """A closed surface near the mesh by screened Poisson reconstruction from its vertices and normals.
-
-    Raises
-    ------
-    MissingLibrary
-        open3d cannot be imported.
-    """
-    o3d = _open3d()
+    """A closed surface near the mesh by screened Poisson reconstruction from its vertices and normals."""
+    o3d = library("open3d")
     cloud = o3d.geometry.PointCloud(o3d.utility.Vector3dVector(np.array(mesh.vertices)))
     cloud.normals = o3d.utility.Vector3dVector(np.array(mesh.vertex_normals))
     closed, _ = o3d.geometry.TriangleMesh.create_from_point_cloud_poisson(cloud, depth=depth, n_threads=1)
@@ -49,17 +37,13 @@ def recolored(mesh: Mesh, source: Mesh) -> Mesh:
     if source.colors is None:
         return mesh
     at = Surface(source).closest(mesh.vertices)
-    return Mesh(mesh.vertices, mesh.faces, np.clip(at.carried(source.colors, source.faces), 0, 1))
+    return Mesh(mesh.vertices, mesh.faces, np.clip(at.transferred(source.colors, source.faces), 0, 1))
 
 
-def _open3d() -> Any:
+def library(name: str) -> Any:
+    """The module open3d or pymeshlab, or MissingLibrary."""
     try:
-        import open3d
+        return importlib.import_module(name)
     except (ImportError, OSError) as error:
-        raise MissingLibrary(MISSING.format(name="open3d", error=error)) from None
-    return open3d
-
-
-def _to_open3d(o3d: Any, mesh: Mesh) -> Any:
-    return o3d.geometry.TriangleMesh(o3d.utility.Vector3dVector(np.array(mesh.vertices)),      # it wants its own
-                                     o3d.utility.Vector3iVector(mesh.faces.astype(np.int32)))
+        raise MissingLibrary(f"{name} cannot be imported ({error}). Install it with `pip install {name}`; on Debian it "
+                             "also needs `apt-get install libegl1 libgl1 libx11-6 libusb-1.0-0`") from None

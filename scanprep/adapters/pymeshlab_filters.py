@@ -10,17 +10,11 @@ from typing import Any
 import numpy as np
 
 from ..geometry.mesh import Mesh
-from .open3d_filters import MISSING, MissingLibrary, recolored
+from .open3d_filters import library, recolored
 
 
 def quadric_decimation(mesh: Mesh, faces: int) -> Mesh:
-    """Fewer triangles by MeshLab's quadric edge collapses, keeping the topology.
-
-    Raises
-    ------
-    MissingLibrary
-        pymeshlab cannot be imported.
-    """
+    """Fewer triangles by MeshLab's quadric edge collapses, keeping the topology."""
     meshes = _meshes(mesh)
     meshes.meshing_decimation_quadric_edge_collapse(targetfacenum=faces, preservetopology=True,
                                                     preserveboundary=True)
@@ -28,23 +22,14 @@ def quadric_decimation(mesh: Mesh, faces: int) -> Mesh:
 
 
 def poisson(mesh: Mesh, depth: int = 8) -> Mesh:
-    """A closed surface near the mesh by screened Poisson reconstruction.
-
-    Raises
-    ------
-    MissingLibrary
-        pymeshlab cannot be imported.
-    """
+    """A closed surface near the mesh by screened Poisson reconstruction."""
     meshes = _meshes(mesh)
     meshes.generate_surface_reconstruction_screened_poisson(depth=depth)
     return recolored(_result(meshes), mesh)
 
 
 def _meshes(mesh: Mesh) -> Any:
-    try:
-        import pymeshlab
-    except (ImportError, OSError) as error:
-        raise MissingLibrary(MISSING.format(name="pymeshlab", error=error)) from None
+    pymeshlab = library("pymeshlab")
     meshes = pymeshlab.MeshSet()
     meshes.add_mesh(pymeshlab.Mesh(vertex_matrix=mesh.vertices, face_matrix=mesh.faces.astype(np.int32),
                                    v_normals_matrix=mesh.vertex_normals))

@@ -8,9 +8,9 @@ from scipy.spatial import cKDTree
 
 from ..geometry import rotations
 from ..geometry.mesh import Mesh
+from ..geometry.target import target_of
 from ..meaning import extent, unit_problem
 from ..ranges import Count, Positive, Settings, SomeShare
-from ..registration.matches import target_of
 from ..threads import search_threads
 
 LEAST = 6                   # matches that determine a motion
@@ -115,7 +115,7 @@ def align_rigid(source: Mesh | np.ndarray, target: Mesh | np.ndarray,
     config = config or RigidConfig()
     reach = np.inf if config.reach is None else config.reach
     moving = _points(source.vertices if isinstance(source, Mesh) else source, "source")
-    goal = target_of(target, config.neighbours, name="target")
+    goal = target_of(target, name="target")
     T = np.eye(4) if start is None else np.array(start, dtype=np.float64)
     if landmarks is not None:
         T = align_landmarks(*landmarks).T_target_source

@@ -4,9 +4,9 @@ from __future__ import annotations
 import numpy as np
 from scipy.spatial import cKDTree
 
-from ..decimation.remeshing import smooth
 from ..geometry import rotations
 from ..geometry.mesh import Mesh
+from ..geometry.remeshing import smooth
 from ..geometry.seen_space import SeenSpace
 from ..geometry.surface import OrientedPoints
 

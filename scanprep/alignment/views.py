@@ -7,10 +7,11 @@ from typing import Any
 
 import numpy as np
 
-from ..decimation.remeshing import smooth
-from ..fusion.tsdf import border_distance, mesh_and_camera
+from ..fusion.tsdf import border_distance
 from ..geometry import rotations
 from ..geometry.mesh import Mesh
+from ..geometry.remeshing import smooth
+from ..geometry.seen_space import mesh_and_camera
 from ..geometry.surface import OrientedPoints
 from ..ranges import Cosine, Count, Positive, Settings, Share
 from .view_features import place_by_features

@@ -1,7 +1,8 @@
 """The body out of a raw scan: floor, furniture and specks removed, and an account of every piece."""
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 from scipy.sparse import coo_array
@@ -9,11 +10,14 @@ from scipy.sparse.csgraph import connected_components
 from scipy.spatial import cKDTree
 
 from ..geometry.mesh import Mesh
-from ..ranges import Settings
-from .floor import FloorConfig, Plane, find_plane, floor_points
+from ..ranges import FLAG, Settings
+from .floor import Plane, find_plane, floor_points
 
 LARGEST, LANDMARKS, NEAR = "the largest piece", "the piece with the landmarks", "near the body"
 FAR, SPECKS, FLOOR = "apart from the body", "specks", "a plane with all on one side"
+
+
+LINK = 0.012               # metres: points closer than this belong together, whether triangles join them or not
 
 
 @dataclass(frozen=True)
@@ -22,52 +26,35 @@ class CleanScanConfig(Settings):
 
     Attributes
     ----------
-    link : float, metres
-        Points closer than this belong together, whether triangles join them or not.
-    spacings : float
-        So do those closer than this many times the median distance to the nearest neighbour.
     gap : float, metres
         Pieces closer than this to the body belong to it: hands and feet that the scanner saw apart.
     min_points : int
         Smaller pieces are specks, wherever they are.
     planes : int
         Most floors and walls that are taken off.
-    floor : FloorConfig
-        How floors are found.
+    floor_area : float, square metres
+        A plane on which less is measured is no floor; both soles together have about 0.04.
+    spacings : float
+        Points closer than this many times the median distance to the nearest neighbour belong together.
     """
 
-    link: float = 0.012
+    gap: Annotated[float, FLAG] = 0.03
+    min_points: Annotated[int, FLAG] = 30
+    planes: Annotated[int, FLAG] = 3
+    floor_area: float = 0.1
     spacings: float = 3.0
-    gap: float = 0.03
-    min_points: int = 30
-    planes: int = 3
-    floor: FloorConfig = field(default_factory=FloorConfig)
 
 
 @dataclass(frozen=True)
 class Component:
-    """One piece of a scan.
-
-    Attributes
-    ----------
-    points : int
-    area : float, square metres
-        Of its triangles; NaN in a point cloud.
-    size : (3,) float, metres
-        Extent along the axes.
-    gap : float, metres
-        To the body; 0 for the body itself.
-    kept : bool
-    reason : str
-        Why it was kept or dropped.
-    """
+    """One piece of a scan."""
 
     points: int
-    area: float
-    size: tuple[float, float, float]
-    gap: float
+    area: float                 # of its triangles, square metres; NaN in a point cloud
+    size: tuple[float, ...]     # extent along the axes, metres
+    gap: float                  # to the body, metres; 0 for the body itself
     kept: bool
-    reason: str
+    reason: str                 # why it was kept or dropped
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,7 +84,7 @@ class CleanedScan:
     @property
     def mesh(self) -> Mesh:
         """The body as a mesh; without triangles when a point cloud was given."""
-        return self.scan if isinstance(self.scan, Mesh) else Mesh(self.scan, np.zeros((0, 3), dtype=np.int64))
+        return _as_mesh(self.scan)
 
 
 def clean_scan(scan: Mesh | np.ndarray, config: CleanScanConfig | None = None, landmarks: np.ndarray | None = None,
@@ -128,12 +115,12 @@ def clean_scan(scan: Mesh | np.ndarray, config: CleanScanConfig | None = None, l
         A scan without points, or one of which nothing is left.
     """
     config, rng = config or CleanScanConfig(), rng or np.random.default_rng(0)
-    mesh = scan if isinstance(scan, Mesh) else Mesh(scan, np.zeros((0, 3), dtype=np.int64))
+    mesh = _as_mesh(scan)
     points = mesh.vertices
     if not len(points):
         raise ValueError("scan: expected points, got none")
     spacing = float(np.median(cKDTree(points).query(points[rng.permutation(len(points))[:2000]], 2)[0][:, 1]))
-    link = max(config.link, config.spacings * spacing)
+    link = max(LINK, config.spacings * spacing)
     label, planes = _without_planes(mesh, link, config, landmarks, rng)
     rest = np.flatnonzero(label < 0)
     if not len(rest):
@@ -147,19 +134,21 @@ def clean_scan(scan: Mesh | np.ndarray, config: CleanScanConfig | None = None, l
     row_of[large] = np.arange(len(large))
     label[rest] = len(planes) + row_of[piece]
     body = cKDTree(points[rest[piece == main]])
-    rows = [_component(mesh, label == i, _gap(body, points[label == i]), False, FLOOR)
-            for i in range(len(planes))]
-    for number, old in enumerate(large):
-        mine = label == len(planes) + number
+    rows = []
+    for number in range(int(label.max()) + 1):
+        mine = label == number
+        old = large[number - len(planes)] if len(planes) <= number < len(planes) + len(large) else None
         gap = 0.0 if old == main else _gap(body, points[mine])
-        reason = why if old == main else NEAR if gap <= max(config.gap, link) else FAR
+        reason = (FLOOR if number < len(planes) else SPECKS if old is None else why if old == main
+                  else NEAR if gap <= max(config.gap, link) else FAR)
         rows.append(_component(mesh, mine, gap, reason in (why, NEAR), reason))
-    specks = label == len(planes) + len(large)
-    if specks.any():
-        rows.append(_component(mesh, specks, _gap(body, points[specks]), False, SPECKS))
     kept = np.array([row.kept for row in rows])[label]
     floor = next((p for p in planes if p.height(body.data).min() <= config.gap), None)
     return CleanedScan(_only(scan, kept), kept, label, tuple(rows), floor)
+
+
+def _as_mesh(scan: Mesh | np.ndarray) -> Mesh:
+    return scan if isinstance(scan, Mesh) else Mesh(scan, np.zeros((0, 3), dtype=np.int64))
 
 
 def _without_planes(mesh: Mesh, link: float, config: CleanScanConfig, landmarks: np.ndarray | None,
@@ -169,14 +158,13 @@ def _without_planes(mesh: Mesh, link: float, config: CleanScanConfig, landmarks:
     label = np.full(len(points), -1)
     while len(planes) < config.planes and (label < 0).sum() > config.min_points:
         rest = np.flatnonzero(label < 0)
-        plane = find_plane(points[rest], config.floor, rng)
+        plane = find_plane(points[rest], config.floor_area, rng)
         if plane is None:
             break
-        high = plane.height(points[rest]) > config.floor.sigmas * plane.noise
-        standing = rest[high]
+        standing = rest[plane.height(points[rest]) > plane.thickness]
         piece = pieces(mesh, standing, link)
         body = standing[piece == _body_of(points[standing], piece, config, landmarks)[0]] if len(standing) else standing
-        label[rest[floor_points(points[rest], plane, points[body], config.floor)]] = len(planes)
+        label[rest[floor_points(points[rest], plane, points[body])]] = len(planes)
         planes.append(plane)
     return label, planes
 
@@ -225,8 +213,8 @@ def _gap(body: cKDTree, points: np.ndarray) -> float:
 def _component(mesh: Mesh, mine: np.ndarray, gap: float, kept: bool, reason: str) -> Component:
     points = mesh.vertices[mine]
     area = float(mesh.face_areas[mine[mesh.faces].all(axis=1)].sum()) if len(mesh.faces) else float("nan")
-    size = tuple(float(x) for x in np.ptp(points, axis=0)) if len(points) else (0.0, 0.0, 0.0)
-    return Component(len(points), area, (size[0], size[1], size[2]), gap, kept, reason)
+    size = tuple(np.ptp(points, axis=0).tolist()) if len(points) else (0.0, 0.0, 0.0)
+    return Component(len(points), area, size, gap, kept, reason)
 
 
 def _only(scan: Mesh | np.ndarray, kept: np.ndarray) -> Mesh | np.ndarray:

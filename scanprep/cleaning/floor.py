@@ -7,41 +7,12 @@ import numpy as np
 from scipy import ndimage
 from scipy.spatial import cKDTree
 
-from ..ranges import Count, Positive, Settings, Share
-
-
-@dataclass(frozen=True)
-class FloorConfig(Settings):
-    """Settings of `find_plane` and `floor_points`.
-
-    Attributes
-    ----------
-    min_area : float, square metres
-        A plane on which less is measured is no floor; both soles together have about 0.04.
-    max_below : float
-        Share of all points that may lie behind a floor.
-    tries : int
-        Planes that are tried.
-    widest : float, metres
-        Farthest distance of the points that a first guess is fitted to.
-    roughest : float
-        Points on a floor deviate by at most this many times what neighbouring points do.
-    sigmas : float
-        Points within this many standard deviations of a floor are on it.
-    footprint_height : float, metres
-        What of the body is lower than this shows where it stands.
-    bridge : float, metres
-        Gaps in the outline of a footprint that are closed.
-    """
-
-    min_area: float = 0.1
-    max_below: Share = 0.01
-    tries: Count = 150
-    widest: Positive = 0.03
-    roughest: Positive = 2.0
-    sigmas: Positive = 3.5
-    footprint_height: float = 0.03
-    bridge: Positive = 0.015
+WIDEST = 0.03              # metres: farthest distance of the points that a first guess is fitted to
+SIGMAS = 3.5               # standard deviations from a floor within which points are on it
+ROUGHEST = 2.0             # points on a floor deviate by at most this many times what neighbouring points do
+MOST_BELOW = 0.01          # share of all points that may lie behind a floor
+FOOTPRINT = 0.03           # metres: what of the body is lower than this shows where it stands
+BRIDGE = 0.015             # metres: gaps in the outline of a footprint that are closed
 
 
 @dataclass(frozen=True)
@@ -62,6 +33,11 @@ class Plane:
     offset: float
     noise: float
 
+    @property
+    def thickness(self) -> float:
+        """Points within this distance, metres, are on it."""
+        return SIGMAS * self.noise
+
     def height(self, points: np.ndarray) -> np.ndarray:
         """Distances (n,) of points (n, 3) in front of the plane, metres."""
         return np.asarray(points @ self.normal - self.offset)
@@ -72,47 +48,41 @@ class Plane:
         u /= np.linalg.norm(u)
         return points @ np.stack([u, np.cross(self.normal, u)], axis=1)
 
+    def flipped(self) -> Plane:
+        """The same plane from behind."""
+        return Plane(-self.normal, -self.offset, self.noise)
 
-def find_plane(points: np.ndarray, config: FloorConfig | None = None, rng: np.random.Generator | None = None
-               ) -> Plane | None:
-    """The largest plane that has nearly all points on it or on one side of it, or None.
+
+def find_plane(points: np.ndarray, min_area: float, rng: np.random.Generator) -> Plane | None:
+    """The largest plane that has nearly all points (n, 3) on it or on one side of it; None below `min_area` m².
 
     Guesses go through single points along the normal of their neighbourhood, and the best is fitted to closer and
     closer points.
-
-    Parameters
-    ----------
-    points : (n, 3) float, metres
-    config : FloorConfig, optional
-    rng : numpy.random.Generator, optional
-        Draws where planes are tried.
     """
-    config, rng = config or FloorConfig(), rng or np.random.default_rng(0)
     few = points[rng.permutation(len(points))[:10_000]]
     tree = cKDTree(few)
-    seeds = rng.choice(len(few), min(config.tries, len(few)), replace=False)
-    best, best_area = None, config.min_area
-    for seed in seeds:
-        near = few[tree.query_ball_point(few[seed], 2 * config.widest)]
+    best, best_area = None, min_area
+    for seed in rng.choice(len(few), min(150, len(few)), replace=False):
+        near = few[tree.query_ball_point(few[seed], 2 * WIDEST)]
         if len(near) < 6:
             continue
         plane = _fit(near)
         height = plane.height(few)
-        if np.mean(height < -config.widest) > np.mean(height > config.widest):
-            plane, height = Plane(-plane.normal, -plane.offset, plane.noise), -height
-        if np.mean(height < -config.widest) > config.max_below:
+        if np.mean(height < -WIDEST) > np.mean(height > WIDEST):
+            plane, height = plane.flipped(), -height
+        if np.mean(height < -WIDEST) > MOST_BELOW:
             continue
-        area = covered_area(plane.flat(few[np.abs(height) < config.widest / 2]), config.widest)
+        area = _covered_area(plane.flat(few[np.abs(height) < WIDEST / 2]), WIDEST)
         if area > best_area:
             best, best_area = plane, area
     if best is None:
         return None
-    plane = _refined(best, points, config)
+    plane = _refined(best, points)
     height = plane.height(points)
-    on_it = np.abs(height) <= config.sigmas * plane.noise
-    if (plane.noise > config.roughest * local_noise(points, rng)           # a back is nearly flat, but only nearly
-            or np.mean(height < -config.widest / 2) > config.max_below
-            or covered_area(plane.flat(points[on_it]), config.widest) < config.min_area):
+    on_it = np.abs(height) <= plane.thickness
+    if (plane.noise > ROUGHEST * local_noise(points, rng)           # a back is nearly flat, but only nearly
+            or np.mean(height < -WIDEST / 2) > MOST_BELOW
+            or _covered_area(plane.flat(points[on_it]), WIDEST) < min_area):
         return None
     return plane
 
@@ -126,39 +96,21 @@ def local_noise(points: np.ndarray, rng: np.random.Generator, count: int = 500, 
     return max(float(np.median(spread)) / max(near - 3, 1) ** 0.5, 1e-4)
 
 
-def floor_points(points: np.ndarray, plane: Plane, body: np.ndarray, config: FloorConfig | None = None
-                 ) -> np.ndarray:
-    """Which points are the floor: those on it outside the footprint of the body, and what lies under it.
-
-    Parameters
-    ----------
-    points : (n, 3) float, metres
-    plane : Plane
-    body : (m, 3) float, metres
-        Points of what stands on the floor; those near it make the footprint.
-    config : FloorConfig, optional
-
-    Returns
-    -------
-    (n,) bool
-    """
-    config = config or FloorConfig()
-    band = config.sigmas * plane.noise
+def floor_points(points: np.ndarray, plane: Plane, body: np.ndarray) -> np.ndarray:
+    """(n,) bool: points (n, 3) on a floor outside the footprint of the body (m, 3), and those under it."""
+    band = plane.thickness
     height = plane.height(points)
     on_it = np.abs(height) <= band
     above = plane.height(body)
-    low = plane.flat(body[(above > band) & (above < band + config.footprint_height)])
-    on_it[on_it] = ~inside_outline(plane.flat(points[on_it]), low, config.bridge)
+    low = plane.flat(body[(above > band) & (above < band + FOOTPRINT)])
+    on_it[on_it] = ~inside_outline(plane.flat(points[on_it]), low, BRIDGE)
     return np.asarray(on_it | (height < -band))
 
 
 def inside_outline(points: np.ndarray, outline: np.ndarray, bridge: float) -> np.ndarray:
-    """(n,) bool: points (n, 2) on or inside the closed curves that other points (m, 2) trace with gaps.
+    """(n,) bool: points (n, 2) on or inside the closed curves that other points (m, 2) trace.
 
-    Parameters
-    ----------
-    bridge : float, metres
-        Gaps that are closed.
+    Gaps up to `bridge` metres are closed.
     """
     if not len(outline) or not len(points):
         return np.zeros(len(points), dtype=bool)
@@ -177,7 +129,7 @@ def inside_outline(points: np.ndarray, outline: np.ndarray, bridge: float) -> np
     return inside
 
 
-def covered_area(flat: np.ndarray, cell: float) -> float:
+def _covered_area(flat: np.ndarray, cell: float) -> float:
     """Square metres of the cells, `cell` metres wide, that have one of the points (n, 2)."""
     place = np.floor(flat / cell).astype(np.int64)
     place -= place.min(axis=0, initial=0)
@@ -190,15 +142,15 @@ def _fit(points: np.ndarray) -> Plane:
     return Plane(axes[:, 0], float(axes[:, 0] @ centre), float(np.sqrt(max(spread[0], 0.0))))
 
 
-def _refined(plane: Plane, points: np.ndarray, config: FloorConfig) -> Plane:
+def _refined(plane: Plane, points: np.ndarray) -> Plane:
     """Fitted to points that are closer every time, the noise by the median so that feet do not count."""
-    band = config.widest
+    band = WIDEST
     for _ in range(8):
         height = plane.height(points)
         near = points[np.abs(height) < band]
         fitted = _fit(near)
         if fitted.normal @ plane.normal < 0:
-            fitted = Plane(-fitted.normal, -fitted.offset, fitted.noise)
+            fitted = fitted.flipped()
         noise = 1.4826 * float(np.median(np.abs(fitted.height(near))))
         plane = Plane(fitted.normal, fitted.offset, max(noise, 1e-5))
         band = min(band, max(3 * plane.noise, 1e-4))

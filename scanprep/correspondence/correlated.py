@@ -15,7 +15,7 @@ import numpy as np
 
 from ..geometry.geodesics import SurfaceGraph
 from ..geometry.mesh import Mesh, check_template
-from ..registration.matches import target_of
+from ..geometry.target import target_of
 from ..threads import one_thread
 from .correspondences import Correspondences, checked_pairs
 from .search import BeliefLevel, CorrelatedConfig, Search
@@ -63,7 +63,7 @@ def find_correspondences(template: Mesh, scan: Mesh | np.ndarray, seeds: tuple[n
         seeds = (found.template_vertices, found.scan_points)
     seeds = checked_pairs(template, *seeds, "seeds")
     total = 2 + 2 * len(config.levels)
-    sheet = Sheet(target_of(scan, config.neighbours), config.spacing * float(np.sqrt(template.face_areas.sum())))
+    sheet = Sheet(target_of(scan), config.spacing * float(np.sqrt(template.face_areas.sum())))
     search = Search(template, sheet, SurfaceGraph(template), seeds, config)
     tell(2, total)
     for number, level in enumerate(config.levels):

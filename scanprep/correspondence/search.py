@@ -8,10 +8,10 @@ import numpy as np
 from scipy.sparse import coo_array, csr_array
 from scipy.spatial import cKDTree
 
+from ..geometry.farthest_points import farthest_points
 from ..geometry.geodesics import SurfaceGraph
 from ..geometry.mesh import Mesh
 from ..ranges import Cell, Count, Positive, Settings, Share
-from ..registration.deformation_graph import farthest_points
 from .belief_propagation import Beliefs, PairField, propagate
 from .correspondences import Correspondences
 from .places import Places, turns_between

@@ -7,11 +7,11 @@ from itertools import permutations
 
 import numpy as np
 
+from ..geometry.farthest_points import farthest_points
 from ..geometry.geodesics import SurfaceGraph
 from ..geometry.mesh import Mesh, check_template
+from ..geometry.target import target_of
 from ..ranges import Cell, Count, Positive, Settings
-from ..registration.deformation_graph import farthest_points
-from ..registration.matches import target_of
 from ..threads import one_thread
 from .correspondences import Correspondences
 from .search import BeliefLevel, CorrelatedConfig, Search
@@ -83,7 +83,7 @@ def find_seeds(template: Mesh, scan: Mesh | np.ndarray, config: SeedConfig | Non
     ends, ways = _ends(template.vertices, surface.distances, config.ends, config.apart * size)
     if len(ends) < 3:
         raise ValueError(f"template: expected at least three limbs, found {len(ends)} ends")
-    sheet = Sheet(target_of(scan, config.check.neighbours), config.spacing * size)
+    sheet = Sheet(target_of(scan), config.spacing * size)
     seen, seen_ways = _ends(sheet.points, sheet.distances, config.candidates, config.apart * size)
     if len(seen) < 3:
         raise ValueError(f"scan: expected at least three ends of limbs, found {len(seen)}")

@@ -2,22 +2,20 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
-from typing import Literal
+from dataclasses import dataclass
+from typing import Annotated, Literal, NamedTuple, get_args
 
 import numpy as np
 from scipy.spatial import cKDTree
 
 from ..geometry.mesh import Mesh
+from ..geometry.remeshing import improve_triangles
 from ..geometry.surface import Surface
-from ..ranges import Settings
-from .edge_collapse import FIXED, RoundsConfig
-from .quadrics import sum_at
-from .remeshing import improve_triangles
-from .safe_collapses import fast_collapses
-from .start import begin
+from ..ranges import FLAG, Settings
+from .edge_collapse import FIXED, HOLD, Rounds, followed
+from .quadrics import lowest, sum_at, surface_quadrics
 
-METHODS = ("quadric", "even", "fast", "open3d", "pymeshlab")
+Method = Literal["quadric", "even", "fast", "open3d", "pymeshlab"]
 
 
 @dataclass(frozen=True)
@@ -32,38 +30,23 @@ class DecimateConfig(Settings):
         surface, quicker and rougher than "quadric". All three keep a closed manifold mesh closed and manifold.
         "open3d" and "pymeshlab" need these libraries.
     improve : bool
-        Turn edges and move vertices along the original surface for well-shaped triangles.
+        Flip edges and move vertices along the original surface for well-shaped triangles.
     crease : float, radians, optional
         Edges at which the surface bends by more stay edges; "quadric" only.
-    rounds : RoundsConfig
-        Further settings of "quadric".
     """
 
-    method: Literal["quadric", "even", "fast", "open3d", "pymeshlab"] = "quadric"
-    improve: bool = False
-    crease: float | None = None
-    rounds: RoundsConfig = field(default_factory=RoundsConfig)
+    method: Annotated[Method, FLAG] = "quadric"
+    improve: Annotated[bool, FLAG] = False
+    crease: Annotated[float | None, FLAG] = None
 
 
-@dataclass(frozen=True, eq=False)
-class Decimation:
-    """A mesh of fewer triangles, and what became of the original ones.
-
-    Attributes
-    ----------
-    mesh : Mesh
-    owner : (N,) int
-        The new vertex that stands for each original one.
-    vertex_map : (n,) int
-        An original vertex of every new one: the one that collapses left over.
-    face_map : (f,) int
-        The original triangle of every new one.
-    """
+class Decimation(NamedTuple):
+    """A mesh of fewer triangles, and what became of the original ones."""
 
     mesh: Mesh
-    owner: np.ndarray
-    vertex_map: np.ndarray
-    face_map: np.ndarray
+    owner: np.ndarray           # (N,) the new vertex that stands for each original one
+    vertex_map: np.ndarray      # (n,) an original vertex of every new one: the one that collapses left over
+    face_map: np.ndarray        # (f,) the original triangle of every new one
 
 
 def decimate(mesh: Mesh, faces: int, config: DecimateConfig | None = None, keep: np.ndarray | None = None,
@@ -98,29 +81,33 @@ def decimate(mesh: Mesh, faces: int, config: DecimateConfig | None = None, keep:
     [QEM] pair contraction
     """
     config = config or DecimateConfig()
-    if config.method not in METHODS:
-        raise ValueError(f"config.method: expected one of {', '.join(METHODS)}, got {config.method!r}")
+    if config.method not in get_args(Method):
+        raise ValueError(f"config.method: expected one of {', '.join(get_args(Method))}, got {config.method!r}")
     _check(mesh, faces)
     if faces >= len(mesh.faces):
         return mesh
     if config.method == "quadric":
-        return _improved(collapse(mesh, faces, config, keep, labels, progress).mesh, mesh, config.improve)
-    for name, value in (("keep", keep), ("labels", labels), ("config.crease", config.crease)):
-        if value is not None:
-            raise ValueError(f"{name}: the method {config.method!r} cannot keep them; expected 'quadric'")
-    return _improved(_OTHERS[config.method](mesh, faces), mesh, config.improve)
+        smaller = collapse(mesh, faces, config.crease, keep, labels, progress).mesh
+    else:
+        for name, value in (("keep", keep), ("labels", labels), ("config.crease", config.crease)):
+            if value is not None:
+                raise ValueError(f"{name}: the method {config.method!r} cannot keep them; expected 'quadric'")
+        smaller = _by_library(mesh, faces, config.method)
+    if smaller.colors is None and mesh.colors is not None:
+        nearest = cKDTree(mesh.vertices).query(smaller.vertices)[1]
+        smaller = Mesh(smaller.vertices, smaller.faces, mesh.colors[nearest])
+    return improve_triangles(smaller, Surface(mesh)) if config.improve else smaller
 
 
-def collapse(mesh: Mesh, faces: int, config: DecimateConfig | None = None, keep: np.ndarray | None = None,
+def collapse(mesh: Mesh, faces: int, crease: float | None = None, keep: np.ndarray | None = None,
              labels: np.ndarray | None = None, progress: Callable[[int, int], None] | None = None) -> Decimation:
     """Like `decimate` with the method "quadric", and says what became of every vertex and triangle.
 
     [QEM] pair contraction
     """
-    config = config or DecimateConfig()
     _check(mesh, faces)
     centre = mesh.vertices.mean(axis=0)                       # quadrics lose digits far from the origin
-    rounds = begin(mesh, (mesh.vertices - centre)[:, None], config.rounds, keep, labels, config.crease)
+    rounds = Rounds(mesh, (mesh.vertices - centre)[:, None], keep, labels, crease)
     rounds.run(faces, progress)
     kept, owner = rounds.numbered()
     vertices = rounds.points[kept, 0] + centre
@@ -146,11 +133,17 @@ def _mean_colors(mesh: Mesh, owner: np.ndarray, count: int) -> np.ndarray | None
     return np.clip(total[:, :3] / total[:, 3:], 0, 1)
 
 
-def _improved(smaller: Mesh, mesh: Mesh, improve: bool) -> Mesh:
-    if smaller.colors is None and mesh.colors is not None:
-        nearest = cKDTree(mesh.vertices).query(smaller.vertices)[1]
-        smaller = Mesh(smaller.vertices, smaller.faces, mesh.colors[nearest])
-    return improve_triangles(smaller, Surface(mesh)) if improve else smaller
+def _by_library(mesh: Mesh, faces: int, method: Method) -> Mesh:
+    if method == "even":
+        return _even(mesh, faces)
+    if method == "fast":
+        mended = fast_collapses(mesh, faces)
+        return mended if len(mended.faces) <= faces else collapse(mended, faces).mesh
+    if method == "open3d":
+        from ..adapters.open3d_filters import quadric_decimation
+    else:
+        from ..adapters.pymeshlab_filters import quadric_decimation
+    return quadric_decimation(mesh, faces)
 
 
 def _even(mesh: Mesh, faces: int) -> Mesh:
@@ -165,21 +158,55 @@ def _even(mesh: Mesh, faces: int) -> Mesh:
     return smaller.with_vertices(placed)
 
 
-def _fast(mesh: Mesh, faces: int) -> Mesh:
-    mended = fast_collapses(mesh, faces)
-    return mended if len(mended.faces) <= faces else collapse(mended, faces).mesh
+def fast_collapses(mesh: Mesh, faces: int) -> Mesh:
+    """Fewer triangles by the collapses that fast-simplification finds, in their order.
+
+    Its collapses are not tested for what they do to the topology. The ones that leave the surface non-manifold are
+    taken back, last ones first, so that some triangles more than wanted may be left.
+
+    [QEM] pair contraction
+    """
+    import fast_simplification
+
+    vertices, triangles = np.array(mesh.vertices), np.array(mesh.faces)         # it wants to write
+    collapses = fast_simplification.simplify(vertices, triangles, target_count=faces, return_collapses=True)[2]
+    centre = mesh.vertices.mean(axis=0)
+    quadrics, areas = (x[:, 0] for x in surface_quadrics((mesh.vertices - centre)[:, None], mesh.faces, HOLD))
+    undone = np.zeros(len(collapses), dtype=bool)
+    while True:
+        owner = np.arange(len(mesh.vertices))
+        owner[collapses[~undone, 1]] = collapses[~undone, 0]      # the second goes into the first
+        kept, number = np.unique(followed(owner), return_inverse=True)
+        corners = number[mesh.faces]
+        whole = (corners != np.roll(corners, 1, axis=1)).all(axis=1)
+        left = Mesh(lowest(sum_at(number[:, None], quadrics, len(kept))) + centre, corners[whole])
+        bad = _broken(left, sum_at(number[:, None], areas, len(kept)))
+        last = np.full(len(kept), -1)
+        rows = np.flatnonzero(~undone)
+        last[number[collapses[rows, 0]]] = rows                   # in order: the last one written stays
+        latest = last[bad]
+        if not (latest >= 0).any():
+            return left
+        undone[latest[latest >= 0]] = True
 
 
-def _open3d(mesh: Mesh, faces: int) -> Mesh:
-    from ..adapters.open3d_filters import quadric_decimation
+def _broken(left: Mesh, areas: np.ndarray) -> np.ndarray:
+    """(n,) bool: vertices where the surface is not manifold, is gone, or is inverted.
 
-    return quadric_decimation(mesh, faces)
-
-
-def _pymeshlab(mesh: Mesh, faces: int) -> Mesh:
-    from ..adapters.pymeshlab_filters import quadric_decimation
-
-    return quadric_decimation(mesh, faces)
-
-
-_OTHERS = {"even": _even, "fast": _fast, "open3d": _open3d, "pymeshlab": _pymeshlab}
+    `areas` (n, 3) are the area vectors of what the vertices stand for.
+    """
+    bad = np.ones(len(left.vertices), dtype=bool)
+    bad[left.faces] = False
+    half = np.sort(left.faces * len(bad) + np.roll(left.faces, -1, axis=1), axis=None)
+    twice = half[1:][half[1:] == half[:-1]]
+    bad[twice // len(bad)] = bad[twice % len(bad)] = True
+    bad[left.edges[left.edge_use > 2]] = True
+    corners = np.sort(left.faces, axis=1)
+    order = np.lexsort(corners.T)
+    bad[corners[order[1:]][(corners[order[1:]] == corners[order[:-1]]).all(axis=1)]] = True
+    fan = np.unique(np.stack([left.faces.ravel(), left.corner_fans.ravel()]), axis=1)[0]
+    bad[np.bincount(fan, minlength=len(bad)) > 1] = True
+    meant = areas / np.maximum(np.linalg.norm(areas, axis=1, keepdims=True), 1e-300)
+    inverted = np.einsum("fd,fd->f", left.face_normals, meant[left.faces].sum(axis=1)) < 0
+    bad[left.faces[inverted]] = True
+    return bad

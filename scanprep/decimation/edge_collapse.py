@@ -2,66 +2,28 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
 
 import numpy as np
 
-from ..ranges import Cosine, Settings, Share, SomeShare
-from .quadrics import lowest, value
+from ..geometry.mesh import Mesh
+from .quadrics import curve_quadrics, lowest, surface_quadrics, value
 
 FREE, CURVE, FIXED = 0, 1, 2
-PIECE = 20_000                       # edges priced at once: what stays in the processor's cache
+CHEAPEST = 0.3                       # share of the edges that may collapse in a round; small is nearer to exact order
+MIN_COSINE = 0.3                     # triangles that would turn by more in one collapse forbid it
+THINNEST = 0.1                       # triangles of less quality (1: equilateral) are not made of better ones
 STUCK = 1e-3, 5                      # where so many rounds take less of the triangles away, thin ones may be made
-
-
-@dataclass(frozen=True)
-class RoundsConfig(Settings):
-    """Settings of `Rounds`.
-
-    Attributes
-    ----------
-    share : float
-        Cheapest part of the edges that may collapse in a round; small is slow and close to the exact order.
-    min_cosine : float
-        Triangles that would turn by more in one collapse forbid it.
-    min_quality : float
-        Triangles thinner than this may not be made of better ones (1: equilateral), until nothing else is left.
-    hold : float
-        Weight of the distance to vertices beside that to planes: keeps triangles of an even size where it is flat.
-    wall : float
-        Weight of the distance to borders beside that to planes.
-    seam : float
-        The same for curves inside the surface; large keeps every zigzag of theirs.
-    onto_vertices : bool
-        Collapse onto one of the two vertices instead of to the point of least error.
-    """
-
-    share: SomeShare = 0.3
-    min_cosine: Cosine = 0.3
-    min_quality: Share = 0.1
-    hold: float = 3e-4
-    wall: float = 30.0
-    seam: float = 3.0
-    onto_vertices: bool = False
+HOLD = 3e-4                          # weight of the distance to vertices beside that to planes: even size where flat
+BORDER, SEAM = 30.0, 3.0             # the same for walls along borders, and along curves inside, which may lose zigzags
+PIECE = 20_000                       # edges priced at once: what stays in the processor's cache
 
 
 class Rounds:
-    """Triangles that get fewer by collapses.
+    """Triangles of M bodies (N, M, 3), metres, not far from the origin, that get fewer by collapses.
 
-    Parameters
-    ----------
-    points : (N, M, 3) float, metres
-        Vertices of M bodies with the same triangles; costs are summed over them.
-    faces : (F, 3) int
-        Manifold.
-    quadrics : (N, M, 10) float
-    areas : (N, 3) float
-        Area vectors around the vertices of the first body: what the surface of their neighbourhood faces.
-    kinds : (N,) int
-        FREE, on a CURVE that stays a curve, or FIXED where it is.
-    curves : (E, 2) int
-        Edges of curves and borders.
-    config : RoundsConfig, optional
+    Borders, edges between different `labels` (F,) of triangles and edges at which the mesh bends by more than `crease`
+    radians stay curves; the vertices `keep` (n,) stay where they are. Costs are summed over the bodies, triangles keep
+    their shape on the first. `onto_vertices` collapses onto one of two vertices instead of to the point of least error.
 
     Attributes
     ----------
@@ -71,22 +33,27 @@ class Rounds:
         Which original triangles they are.
     owner : (N,) int
         The vertex that each one collapsed into, itself where it is still there; see `numbered`.
+    kinds : (N,) int
+        FREE, on a CURVE that stays a curve, or FIXED where it is.
     """
 
-    def __init__(self, points: np.ndarray, faces: np.ndarray, quadrics: np.ndarray, areas: np.ndarray,
-                 kinds: np.ndarray, curves: np.ndarray, config: RoundsConfig | None = None) -> None:
-        self.config = config or RoundsConfig()
-        self.thinnest = self.config.min_quality
-        self.points, self.quadrics, self.areas, self.kinds = (np.array(x) for x in (points, quadrics, areas, kinds))
-        self.faces, self.face_rows = np.array(faces), np.arange(len(faces))
-        self.owner = np.arange(len(points))
+    def __init__(self, mesh: Mesh, points: np.ndarray, keep: np.ndarray | None = None,
+                 labels: np.ndarray | None = None, crease: float | None = None, onto_vertices: bool = False) -> None:
         N = len(points)
-        a, b = self.faces.ravel(), np.roll(self.faces, -1, axis=1).ravel()
-        keys = np.sort(np.minimum(a, b) * N + np.maximum(a, b))
-        keys = keys[np.r_[True, keys[1:] != keys[:-1]]]
-        self.ends = np.stack(np.divmod(keys, N), axis=1)
-        self.curve = np.zeros(len(keys), dtype=bool)
-        self.curve[np.searchsorted(keys, curves.min(axis=1) * N + curves.max(axis=1))] = True
+        curves = kept_curves(mesh, labels, crease)
+        kinds = np.minimum(np.bincount(curves.ravel(), minlength=N), 3)
+        self.kinds = np.array([FREE, FIXED, CURVE, FIXED])[kinds]    # the end of a curve, or where several meet, stays
+        if keep is not None:
+            self.kinds[checked_vertices(mesh, keep)] = FIXED
+        self.onto_vertices, self.thinnest = onto_vertices, THINNEST
+        self.points, (self.quadrics, areas) = np.array(points), surface_quadrics(points, mesh.faces, HOLD)
+        self.quadrics += wall_quadrics(mesh, points, areas, curves)
+        self.areas = np.array(areas[:, 0])                           # what the surface of a neighbourhood faces
+        self.faces, self.face_rows = np.array(mesh.faces), np.arange(len(mesh.faces))
+        self.owner = np.arange(N)
+        keys = mesh.edges @ [N, 1]
+        self.ends = np.array(mesh.edges)
+        self.curve = np.isin(keys, curves @ [N, 1])
         self.refused = np.zeros(len(keys), dtype=bool)
         self.cost = np.empty(len(keys))
         self._price(np.arange(len(keys)))
@@ -109,14 +76,7 @@ class Rounds:
 
     def numbered(self) -> tuple[np.ndarray, np.ndarray]:
         """The remaining vertices (n,), and for every original one (N,) which of them it ended in."""
-        owner = self.owner
-        while True:
-            further = owner[owner]
-            if np.array_equal(further, owner):
-                break
-            owner = further
-        kept = np.unique(owner)
-        return kept, np.searchsorted(kept, owner)
+        return np.unique(followed(self.owner), return_inverse=True)
 
     def _price(self, rows: np.ndarray) -> None:
         """Order the ends of edges (kept first), and set the cost of collapsing them."""
@@ -125,7 +85,7 @@ class Rounds:
             a, b = self.ends[part].T
             turn = self.kinds[b] > self.kinds[a]
             a, b = np.where(turn, b, a), np.where(turn, a, b)
-            if self.config.onto_vertices:
+            if self.onto_vertices:
                 Q = self.quadrics[a] + self.quadrics[b]
                 turn = self.kinds[a] == self.kinds[b]
                 turn &= value(Q, self.points[b]).sum(axis=1) < value(Q, self.points[a]).sum(axis=1)
@@ -137,7 +97,7 @@ class Rounds:
     def _goals(self, a: np.ndarray, b: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Quadrics (n, M, 10) of vertices b collapsed into a, and where these then lie (n, M, 3)."""
         Q = self.quadrics[a] + self.quadrics[b]
-        if self.config.onto_vertices:
+        if self.onto_vertices:
             return Q, self.points[a]
         anchored = (self.kinds[a] != self.kinds[b]) | (self.kinds[a] == FIXED)
         goal = lowest(Q)
@@ -150,7 +110,7 @@ class Rounds:
         open_edges = int(np.isfinite(cost).sum())
         if not open_edges:
             return np.zeros(0, dtype=np.int64)
-        place = min(open_edges - 1, max(int(self.config.share * len(cost)), 50))
+        place = min(open_edges - 1, max(int(CHEAPEST * len(cost)), 50))
         limit = np.partition(cost, place)[place]
         rows = np.flatnonzero(cost <= limit)
         rows = rows[np.argsort(cost[rows])]
@@ -228,7 +188,7 @@ class Rounds:
         meant = self.areas[faces]
         meant = (meant / np.maximum(np.linalg.norm(meant, axis=-1, keepdims=True), 1e-300)).sum(axis=1)
         was, now = _dot(n_old, meant), _dot(n_new, meant)
-        bad = _dot(n_old, n_new) < self.config.min_cosine
+        bad = _dot(n_old, n_new) < MIN_COSINE
         bad |= (now < 0.3) & (now < was)
         bad |= (q_new < self.thinnest) & (q_new < q_old)
         good = np.ones(len(rows), dtype=bool)
@@ -294,3 +254,43 @@ def _normals_and_quality(corners: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
 
 def _dot(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     return np.einsum("...d,...d->...", a, b)
+
+
+def followed(owner: np.ndarray) -> np.ndarray:
+    """Where every vertex ends when each goes to its owner (N,), that one to its own, and so on."""
+    while not np.array_equal(further := owner[owner], owner):
+        owner = further
+    return owner
+
+
+def wall_quadrics(mesh: Mesh, points: np.ndarray, areas: np.ndarray, curves: np.ndarray) -> np.ndarray | float:
+    """Quadrics (N, M, 10) of the walls along curves (E, 2), or 0 where there are none."""
+    if not len(curves):
+        return 0.0
+    border = mesh.edges[mesh.edge_use == 1] @ [len(mesh.vertices), 1]
+    weight = np.where(np.isin(curves @ [len(mesh.vertices), 1], border), BORDER, SEAM)
+    return curve_quadrics(points, curves, areas[curves].sum(axis=1), weight)
+
+
+def kept_curves(mesh: Mesh, labels: np.ndarray | None = None, crease: float | None = None) -> np.ndarray:
+    """(E, 2) vertices of border edges, edges between labels, and creases sharper than an angle in radians."""
+    stays = mesh.edge_use == 1
+    inner, (left, right) = np.flatnonzero(mesh.edge_use == 2), mesh.face_pairs.T
+    if labels is not None:
+        if np.shape(labels) != (len(mesh.faces),):
+            raise ValueError(f"labels: expected one for each of {len(mesh.faces)} triangles, got "
+                             f"shape {np.shape(labels)}")
+        stays[inner[np.asarray(labels)[left] != np.asarray(labels)[right]]] = True
+    if crease is not None:
+        cosine = np.einsum("nd,nd->n", mesh.face_normals[left], mesh.face_normals[right])
+        stays[inner[cosine < np.cos(crease)]] = True
+    return mesh.edges[stays]
+
+
+def checked_vertices(mesh: Mesh, keep: np.ndarray) -> np.ndarray:
+    """The vertices as integers, or ValueError when some are not of the mesh."""
+    keep = np.asarray(keep, dtype=np.int64).reshape(-1)
+    wrong = keep[(keep < 0) | (keep >= len(mesh.vertices))]
+    if len(wrong):
+        raise ValueError(f"keep: expected vertices 0..{len(mesh.vertices) - 1}, got {wrong[0]}")
+    return keep

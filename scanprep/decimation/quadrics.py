@@ -1,7 +1,7 @@
 """Quadrics: squared distances to many planes at once, as one polynomial of a point [QEM].
 
 A quadric is ten numbers, of `x A x + 2 b x + c`: A as xx, xy, xz, yy, yz, zz, then b, then c. Arrays of them
-have any shape in front; vertices of several bodies that share triangles are (N, M, 3), their quadrics (N, M, 10).
+have any shape in front; vertices of M bodies that share triangles are (N, M, 3), their quadrics (N, M, 10).
 """
 from __future__ import annotations
 
@@ -11,18 +11,7 @@ _ROW, _COLUMN = np.array([0, 0, 0, 1, 1, 2]), np.array([0, 1, 2, 1, 2, 2])
 
 
 def plane_quadrics(normals: np.ndarray, through: np.ndarray, weights: np.ndarray) -> np.ndarray:
-    """Weighted squared distance to planes.
-
-    Parameters
-    ----------
-    normals : (..., 3) float, unit
-    through : (..., 3) float, metres
-        A point of each plane.
-    weights : (...) float
-
-    Returns
-    -------
-    (..., 10) float
+    """Weighted squared distance (..., 10) to planes of unit normals (..., 3) through points (..., 3).
 
     [QEM] fundamental error quadric
     """
@@ -41,20 +30,9 @@ def point_quadrics(points: np.ndarray, weights: np.ndarray) -> np.ndarray:
 
 
 def surface_quadrics(points: np.ndarray, faces: np.ndarray, hold: float) -> tuple[np.ndarray, np.ndarray]:
-    """The quadrics of all vertices for the planes of the triangles around them, by their area.
+    """Quadrics (N, M, 10) of vertices for the planes of the triangles around them, by area; area vectors (N, M, 3).
 
-    Parameters
-    ----------
-    points : (N, M, 3) float, metres
-    faces : (F, 3) int
-    hold : float
-        Weight of the distance to the vertex itself beside that to the planes.
-
-    Returns
-    -------
-    quadrics : (N, M, 10) float
-    areas : (N, M, 3) float, square metres
-        Normals of the triangles around each vertex times their areas, summed.
+    `hold` weighs the distance to the vertex itself beside that to the planes.
     """
     corners = points[faces]
     cross = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]) / 2
@@ -66,21 +44,9 @@ def surface_quadrics(points: np.ndarray, faces: np.ndarray, hold: float) -> tupl
 
 
 def curve_quadrics(points: np.ndarray, ends: np.ndarray, normals: np.ndarray, weights: np.ndarray) -> np.ndarray:
-    """The quadrics of all vertices for walls along curves that are to stay where they are.
+    """Quadrics (N, M, 10) of vertices for walls along curves, edges (E, 2), that are to stay where they are.
 
-    Parameters
-    ----------
-    points : (N, M, 3) float, metres
-    ends : (E, 2) int
-        Edges of the curves.
-    normals : (E, M, 3) float
-        Of the surface there; the walls stand upright on it.
-    weights : (E,) float
-        Of walls as high as their edges are long, beside triangles of the same area.
-
-    Returns
-    -------
-    (N, M, 10) float
+    The walls stand upright on the surface, of normals (E, M, 3), as high as their edges are long.
 
     [QEM] boundary constraints
     """

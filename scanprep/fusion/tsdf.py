@@ -1,20 +1,23 @@
 """Range views fused into one surface [VRIP]."""
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Annotated, Any
 
 import numpy as np
 from scipy.sparse.csgraph import dijkstra
 
-from ..decimation.remeshing import smooth
 from ..geometry.mesh import Mesh
+from ..geometry.remeshing import smooth
+from ..geometry.seen_space import mesh_and_camera
 from ..geometry.surface import Rays, barycentric
-from ..ranges import Cell, Cosine, Range, Settings, Share
+from ..ranges import FLAG, Cell, Cosine, Range, Settings, Share
 from ..repair.manifold import drop_small_components, split_vertices
 
 BLOCK = 4                      # voxels along the side of a block; the smallest piece of the volume that is stored
+TAPER = 0.02                   # metres from its border at which a view has its full weight
+MIN_WEIGHT = 0.02              # below it a voxel counts as not seen
 CORNERS = np.array([(0, 0, 0), (1, 0, 0), (1, 1, 0), (0, 1, 0), (0, 0, 1), (1, 0, 1), (1, 1, 1), (0, 1, 1)])
 
 
@@ -30,22 +33,16 @@ class MergeConfig(Settings):
         How far from a view's surface it speaks about the volume, at most 4.
     min_cosine : float
         Surface seen at a flatter angle than this cosine has no weight.
-    taper : float, metres
-        The weight of a view rises from 0 at its border to its full value at this distance from it.
-    min_weight : float
-        Total weight below which a voxel counts as not seen.
     carving : float
         Weight with which a view declares empty the space in front of its surface; 0 for never.
     min_component : float
         Pieces with a smaller share of the vertices of the largest one are dropped.
     """
 
-    voxel: Cell = 0.004
+    voxel: Annotated[Cell, FLAG] = 0.004
     truncation: Annotated[float, Range(1, BLOCK)] = 3.0
     min_cosine: Cosine = 0.1
-    taper: float = 0.02
-    min_weight: float = 0.02
-    carving: float = 0.0
+    carving: Annotated[float, FLAG] = 0.0
     min_component: Share = 0.02
 
 
@@ -107,31 +104,22 @@ def merge_views(views: Sequence[Any], config: MergeConfig | None = None,
     ends = [end for view in prepared for end in (view.mesh.vertices.min(axis=0), view.mesh.vertices.max(axis=0))]
     grid = _Grid.around(np.min(ends, axis=0), np.max(ends, axis=0), config.voxel)
     near = [grid.near(view.mesh) for view in prepared]
-    keys = _distinct(np.concatenate(near))
+    keys = np.unique(np.concatenate(near))
     points = grid.points(keys)
     total, weight = np.zeros(len(keys)), np.zeros(len(keys))
     for number, view in enumerate(prepared):
         mine = np.arange(len(keys)) if config.carving else np.searchsorted(keys, near[number])
-        for part in _chunks(len(mine)):
-            _integrate(view, points, mine[part], total, weight, config)
+        for start in range(0, len(mine), 500_000):                    # what memory holds at once
+            _integrate(view, points, mine[start:start + 500_000], total, weight, config)
         if progress:
             progress(number + 1, len(prepared))
-    seen = weight > config.min_weight
+    seen = weight > MIN_WEIGHT
     distance = np.divide(total, weight, out=np.zeros_like(total), where=seen)
     mesh = _zero_surface(grid, keys[seen], points[seen], distance[seen])
     mesh = drop_small_components(split_vertices(mesh), config.min_component)
     if not len(mesh.faces):
         raise ValueError("views: no surface is left after merging; is every camera on the outer side of its view?")
     return _with_colors(mesh, prepared)
-
-
-def mesh_and_camera(view: Any) -> tuple[Mesh, np.ndarray]:
-    """The surface and the camera position of a RangeView or a pair."""
-    mesh, camera = view if isinstance(view, tuple) else (view.mesh, view.camera)
-    camera = np.asarray(camera, dtype=float)
-    if not isinstance(mesh, Mesh) or camera.shape != (3,) or not np.isfinite(camera).all():
-        raise ValueError("views: expected RangeViews or pairs of a Mesh and a camera position (3,)")
-    return mesh, camera
 
 
 def border_distance(mesh: Mesh, limit: float) -> np.ndarray:
@@ -151,7 +139,7 @@ def _prepare(mesh: Mesh, camera: np.ndarray, config: MergeConfig) -> _View:
     normals = smooth(mesh, 5).vertex_normals                  # noise tilts the single triangles
     cosine = np.einsum("nd,nd->n", normals, towards)
     angle = np.clip((cosine - config.min_cosine) / (1 - config.min_cosine), 0, 1)
-    border = border_distance(mesh, config.taper) / config.taper if config.taper > 0 else 1.0
+    border = border_distance(mesh, TAPER) / TAPER
     return _View(mesh, camera, Rays(mesh), np.clip(cosine, config.min_cosine, 1), angle * border)
 
 
@@ -162,7 +150,6 @@ class _Grid:
     origin: np.ndarray
     blocks: tuple[int, ...]
     voxel: float
-    block: int = BLOCK
 
     @classmethod
     def around(cls, low: np.ndarray, high: np.ndarray, voxel: float) -> _Grid:
@@ -173,7 +160,7 @@ class _Grid:
 
     @property
     def shape(self) -> tuple[int, ...]:
-        return tuple(self.block * count for count in self.blocks)
+        return tuple(BLOCK * count for count in self.blocks)
 
     def points(self, keys: np.ndarray) -> np.ndarray:
         return self.origin + self.voxel * np.stack(np.unravel_index(keys, self.shape), axis=1)
@@ -182,10 +169,10 @@ class _Grid:
         """Sorted numbers of the voxels in the blocks that hold a surface, and in those around them."""
         side = BLOCK * self.voxel
         blocks = np.floor((_dense_points(mesh, side / 2) - self.origin) / side).astype(np.int64)
-        flat = _distinct(np.ravel_multi_index(tuple(blocks.T), self.blocks))
+        flat = np.unique(np.ravel_multi_index(tuple(blocks.T), self.blocks))
         for axis in range(3):                       # one axis after the other is cheap
             step = int(np.prod(self.blocks[axis + 1:]))
-            flat = _distinct(np.concatenate([flat - step, flat, flat + step]))
+            flat = np.unique(np.concatenate([flat - step, flat, flat + step]))
         blocks = np.stack(np.unravel_index(flat, self.blocks), axis=1)
         inside = np.stack(np.meshgrid(*[np.arange(BLOCK)] * 3, indexing="ij"), axis=-1).reshape(-1, 3)
         voxels = (BLOCK * blocks[:, None] + inside).reshape(-1, 3)
@@ -236,19 +223,13 @@ def _zero_surface(grid: _Grid, keys: np.ndarray, points: np.ndarray, distance: n
     cells = cells[(inside > 0) & (inside < 8)]
     if not len(cells):
         return Mesh(np.empty((0, 3)), np.empty((0, 3), int))
-    used = _distinct(cells.ravel())
+    used = np.unique(cells.ravel())
     local = np.searchsorted(used, cells)
     values = distance[used]
     values[np.abs(values) < 1e-4 * voxel] = 1e-4 * voxel   # a surface through a corner would make flat triangles
     vertices, faces, _ = igl.marching_cubes(values, np.ascontiguousarray(points[used]),
                                             np.ascontiguousarray(local, dtype=np.int64), 0.0)
     return Mesh(vertices, faces)
-
-
-def zero_surface(points: np.ndarray, values: np.ndarray, shape: tuple[int, ...]) -> Mesh:
-    """Where values (N,) on a full grid (N, 3) of a shape change sign, by marching cubes."""
-    grid = _Grid(np.zeros(3), tuple(shape), 1.0, block=1)
-    return _zero_surface(grid, np.arange(len(values)), points, values / max(float(np.abs(values).max()), 1e-30))
 
 
 def _with_colors(mesh: Mesh, views: Sequence[_View]) -> Mesh:
@@ -264,13 +245,3 @@ def _with_colors(mesh: Mesh, views: Sequence[_View]) -> Mesh:
         total[use] += w[use, None] * colors
         weight[use] += w[use]
     return Mesh(mesh.vertices, mesh.faces, np.clip(total / weight[:, None], 0, 1))
-
-
-def _distinct(numbers: np.ndarray) -> np.ndarray:
-    """Sorted distinct integers; for millions of them faster than np.unique."""
-    numbers = np.sort(numbers)
-    return numbers[np.r_[True, numbers[1:] != numbers[:-1]][:len(numbers)]]
-
-
-def _chunks(count: int, size: int = 500_000) -> Iterable[slice]:
-    return (slice(start, start + size) for start in range(0, count, size))

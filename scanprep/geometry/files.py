@@ -20,12 +20,13 @@ from .landmarks import match_landmarks, read_landmark_vertices, read_landmarks, 
 from .mesh import Mesh
 
 __all__ = ["UNITS", "MeshFileError", "PointCloud", "Registered", "list_meshes", "match_landmarks",
-           "read_landmark_vertices", "read_landmarks", "read_mesh", "read_points", "read_registered",
+           "read_landmark_vertices", "read_landmarks", "read_mesh", "read_points", "read_registered", "read_scan",
            "write_landmarks", "write_mesh", "write_points"]
 
 Precision = Literal["double", "single"]
 
 _MESHES: dict[str, ModuleType] = {".ply": ply, ".obj": obj, ".stl": stl, ".off": off, ".glb": glb}
+POINT_ENDINGS = (".xyz", ".pcd", ".txt", ".pts")
 _POINTS: dict[str, ModuleType] = {".ply": ply, ".pcd": pcd, ".xyz": xyz, ".txt": xyz, ".pts": xyz}
 
 
@@ -131,6 +132,18 @@ def read_points(path: str | Path, unit: str | None = None) -> PointCloud:
     if normals is None and contents.faces is not None and len(contents.faces):
         normals = Mesh(points, contents.faces).vertex_normals
     return PointCloud(points, normals, contents.colors)
+
+
+def read_scan(path: str | Path, unit: str | None = None) -> Mesh | np.ndarray:
+    """A scan as a mesh, or as points (n, 3) where the file has no triangles."""
+    if Path(path).suffix.lower() in POINT_ENDINGS:
+        return read_points(path, unit).points
+    try:
+        return read_mesh(path, unit)
+    except ValueError as error:
+        if "no faces" in str(error):
+            return read_points(path, unit).points
+        raise
 
 
 def write_points(path: str | Path, cloud: PointCloud, precision: Precision = "double") -> None:

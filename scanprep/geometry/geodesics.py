@@ -5,6 +5,7 @@ import numpy as np
 from scipy.sparse import coo_array, csr_array
 from scipy.sparse.csgraph import dijkstra
 
+from .farthest_points import farthest_points
 from .mesh import Mesh
 
 
@@ -13,10 +14,6 @@ class SurfaceGraph:
 
     A path runs along the edges and straight across two neighbouring triangles, unfolded into a plane. It
     is never shorter than the true one, on even triangles at most 4 percent longer (along edges alone 15).
-
-    Parameters
-    ----------
-    mesh : Mesh
     """
 
     def __init__(self, mesh: Mesh) -> None:
@@ -24,31 +21,16 @@ class SurfaceGraph:
         self._graph = _with_diagonals(mesh)
 
     def distances(self, sources: np.ndarray | int, limit: float = np.inf) -> np.ndarray:
-        """Distances from each source to every vertex.
+        """Distances (S, N), metres, from each source vertex, or (N,) from one; infinite where no path leads.
 
-        Parameters
-        ----------
-        sources : (S,) int, or one int
-            Vertices.
-        limit : float, metres
-            Beyond it a distance is infinite; a small limit saves time.
-
-        Returns
-        -------
-        (S, N) float, or (N,) for one source, metres
-            Infinite where no path leads.
+        Beyond `limit` a distance is infinite too; a small one saves time.
         """
         return dijkstra(self._graph, directed=False, indices=_checked(self.mesh, sources), limit=limit)
 
     def nearest(self, sources: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """The source nearest to each vertex along the surface.
+        """Distance (N,) of every vertex to its nearest source along the surface, and the place (N,) in `sources`.
 
-        Returns
-        -------
-        (N,) float, metres
-            Distance, infinite where no path leads.
-        (N,) int
-            Place in `sources`, -1 where no path leads.
+        Infinite and -1 where no path leads.
         """
         sources = np.atleast_1d(_checked(self.mesh, sources))
         distance, _, origin = dijkstra(self._graph, directed=False, indices=sources, min_only=True,
@@ -59,89 +41,14 @@ class SurfaceGraph:
         return distance, np.where(reached, place[np.where(reached, origin, 0)], -1)
 
     def farthest_points(self, count: int, first: int = 0) -> np.ndarray:
-        """Vertices spread over the surface: each the one farthest from those before it.
+        """(count,) vertices spread over the surface: each farthest from those before it.
 
-        Parameters
-        ----------
-        count : int
-            At most the number of vertices.
-        first : int
-            The vertex to begin with.
-
-        Returns
-        -------
-        (count,) int
-            A piece of the surface that no path reaches yet is served first.
+        A piece of the surface that no path reaches yet is served first.
         """
         if not 1 <= count <= len(self.mesh.vertices):
             raise ValueError(f"count: expected 1..{len(self.mesh.vertices)}, got {count}")
-        chosen = [int(_checked(self.mesh, first))]
-        nearest = self.distances(chosen[0])
-        while len(chosen) < count:
-            nearest[chosen] = -1.0                       # never twice, even where all are at distance zero
-            chosen.append(int(nearest.argmax()))
-            reach = nearest[chosen[-1]]
-            nearest = np.minimum(nearest, self.distances(chosen[-1], limit=reach if reach > 0 else np.inf))
-        return np.array(chosen)
-
-
-class HeatGeodesics:
-    """Smooth distances by the heat method, factored once: fast for many sources on one mesh.
-
-    Without the preferred directions of paths over edges; within 1 to 2 percent on average on a body scan.
-
-    Parameters
-    ----------
-    mesh : Mesh
-        Edge-manifold, and every vertex belongs to a triangle.
-
-    Raises
-    ------
-    ValueError
-        Another mesh; `SurfaceGraph` takes any.
-    """
-
-    REACH = 300          # the heat must not fall below the smallest number, e^-700, at the far end
-
-    def __init__(self, mesh: Mesh) -> None:
-        import igl
-
-        unused = len(mesh.vertices) - len(np.unique(mesh.faces))
-        if unused:
-            raise ValueError(f"mesh: expected every vertex to belong to a triangle, {unused} do not")
-        if not len(mesh.faces) or (mesh.edge_use > 2).any():
-            raise ValueError(f"mesh: expected at most two triangles at every edge, and at least one, got {mesh}")
-        self.mesh = mesh
-        self._solve = igl.heat_geodesics_solve
-        self._data = igl.HeatGeodesicsData()
-        # On the triangles as they are the obtuse ones turn the heat negative and distances go wrong by half.
-        self._data.use_intrinsic_delaunay = True
-        across = 1.5 * float(np.linalg.norm(np.ptp(mesh.vertices, axis=0)))
-        time = max(mesh.mean_edge, across / self.REACH) ** 2
-        try:
-            igl.heat_geodesics_precompute(np.ascontiguousarray(mesh.vertices), np.ascontiguousarray(mesh.faces), time,
-                                          self._data)
-        except RuntimeError as error:
-            raise ValueError(f"mesh: no heat can spread over {mesh} ({error}); SurfaceGraph takes any") from None
-
-    def distances(self, sources: np.ndarray | int) -> np.ndarray:
-        """Distance (N,), metres, of every vertex to the nearest of the sources (S,).
-
-        Infinite in pieces of the surface that hold no source.
-        """
-        sources = np.atleast_1d(_checked(self.mesh, sources))
-        piece = self.mesh.vertex_component
-        out = np.full(len(piece), np.inf)
-        found = np.asarray(self._solve(self._data, sources)).reshape(-1)
-        for p in np.unique(piece[sources]):
-            inside = piece == p
-            if not np.isfinite(found[inside]).all():
-                raise ValueError(f"mesh: no heat can spread over {self.mesh}, as where triangles have no area; "
-                                 "SurfaceGraph takes any")
-            mine = sources[piece[sources] == p]
-            out[inside] = np.maximum(found[inside] - found[mine].min(), 0)
-        out[sources] = 0.0
-        return out
+        return farthest_points(self.mesh.vertices, count, int(_checked(self.mesh, first)),
+                               lambda i, limit: self.distances(i, limit=limit or np.inf), least=-0.5)
 
 
 def _checked(mesh: Mesh, sources: np.ndarray | int) -> np.ndarray:

@@ -15,6 +15,7 @@ from . import storage
 from .formats.common import FARTHEST, UNITS, Lines, MeshFileError, load_bytes, metres_per_unit, quote
 from .mesh import Mesh
 
+LANDMARK_ENDINGS = (".landmarks.json", ".json", ".mrk.json", ".pp", "_picked_points.pp", ".lnd", ".landmarks.txt")
 FAR, NEAR = 0.5, 0.01                # of the size of a surface: farther from it, or closer together, is no landmark
 
 
@@ -78,6 +79,26 @@ def read_landmark_vertices(path: str | Path, mesh: Mesh, unit: str | None = None
         else:
             out[name] = int(tree.query(points[name])[1])
     return out
+
+
+def landmarks_beside(path: str | Path, folder: Path | None = None) -> Path | None:
+    """The landmark file of a scan or template: that of its name, up to the first dot, beside it or in a folder.
+
+    A template called `template` has `landmarks.json` too, as in a registered set.
+    """
+    folder, stem = folder or Path(path).parent, Path(path).name.split(".")[0]
+    names = [stem + ending for ending in LANDMARK_ENDINGS] + ["landmarks.json"] * (stem == "template")
+    return next((folder / name for name in names if (folder / name).is_file()), None)
+
+
+def read_template_landmarks(template: Path, mesh: Mesh, given: Path | None = None, flag: str = "--template-landmarks"
+                            ) -> dict[str, int]:
+    """Named vertices of a template from the file given, or from the one beside it."""
+    path = given or landmarks_beside(template)
+    if path is None:
+        raise ValueError(f"{template}: expected its landmarks in {template.name.split('.')[0]}.landmarks.json beside "
+                         f"it; name the file with {flag}")
+    return read_landmark_vertices(path, mesh)
 
 
 def check_on_surface(path: str | Path, landmarks: Mapping[str, np.ndarray], surface: np.ndarray) -> None:

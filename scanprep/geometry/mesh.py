@@ -149,24 +149,28 @@ class Mesh:
         return bool((self.edge_use <= 2).all()) and bool((in_order[1:] != in_order[:-1]).all())
 
     @cached_property
+    def corner_fans(self) -> np.ndarray:
+        """(F, 3) number of the fan each corner belongs to; corners at a vertex share it when edges join them."""
+        corner = np.arange(self.faces.size).reshape(-1, 3)
+        rows = []
+        for side in range(3):        # corners of the two triangles at an inner edge that share a vertex
+            following = (side + 1) % 3
+            swap = self.faces[:, side] > self.faces[:, following]
+            low = np.where(swap, corner[:, following], corner[:, side])
+            high = np.where(swap, corner[:, side], corner[:, following])
+            rows.append(np.stack([self.face_edges[:, side], low, high], axis=1))
+        row = np.concatenate(rows)
+        row = row[np.argsort(row[:, 0], kind="stable")]
+        same = row[1:, 0] == row[:-1, 0]
+        a, b = np.r_[row[:-1, 1][same], row[:-1, 2][same]], np.r_[row[1:, 1][same], row[1:, 2][same]]
+        n = self.faces.size
+        fan = connected_components(coo_array((np.ones(len(a)), (a, b)), shape=(n, n)), directed=False)[1]
+        return fan.reshape(-1, 3)
+
+    @cached_property
     def is_vertex_manifold(self) -> bool:
         """The triangles around every vertex form one fan."""
-        corner = np.arange(self.faces.size).reshape(-1, 3)
-        joined = []
-        for side in range(3):        # corners of the two triangles at an inner edge that share a vertex
-            v = np.stack([self.faces[:, side], self.faces[:, (side + 1) % 3]], axis=1)
-            c = np.stack([corner[:, side], corner[:, (side + 1) % 3]], axis=1)
-            joined.append(np.concatenate([self.face_edges[:, [side]], v, c], axis=1))
-        rows = np.concatenate(joined)
-        swap = rows[:, 1] > rows[:, 2]
-        rows[swap] = rows[swap][:, [0, 2, 1, 4, 3]]
-        rows = rows[np.argsort(rows[:, 0], kind="stable")]
-        same = rows[1:, 0] == rows[:-1, 0]
-        a = np.r_[rows[:-1, 3][same], rows[:-1, 4][same]]
-        b = np.r_[rows[1:, 3][same], rows[1:, 4][same]]
-        n = self.faces.size
-        fans, _ = connected_components(coo_array((np.ones(len(a)), (a, b)), shape=(n, n)), directed=False)
-        return fans == len(np.unique(self.faces))
+        return int(self.corner_fans.max(initial=-1)) + 1 == len(np.unique(self.faces))
 
     @cached_property
     def boundary_vertices(self) -> np.ndarray:
@@ -210,33 +214,14 @@ class Mesh:
         return float(self.edge_lengths.mean())
 
     def submesh(self, keep: np.ndarray) -> tuple[Mesh, np.ndarray]:
-        """The triangles in `keep` and the vertices they use.
-
-        Parameters
-        ----------
-        keep : (F,) bool or (n,) int
-            Triangles to keep.
-
-        Returns
-        -------
-        Mesh
-        (n,) int
-            The old index of every new vertex.
-        """
+        """The triangles `keep`, (F,) bool or (n,) int, and the vertices they use, with the old index (n,) of each."""
         faces = self.faces[keep]
         used, new = np.unique(faces, return_inverse=True)
         colors = None if self.colors is None else self.colors[used]
         return Mesh(self.vertices[used], new.reshape(-1, 3), colors), used
 
     def sample(self, count: int, rng: np.random.Generator) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Points spread evenly over the surface.
-
-        Returns
-        -------
-        (count, 3) float, metres
-        (count,) int, the triangle of each
-        (count, 3) float, barycentric coordinates
-        """
+        """Points (count, 3) spread evenly over the surface, their triangles (count,) and barycentric coordinates."""
         face = rng.choice(len(self.faces), count, p=self.face_areas / self.face_areas.sum())
         r = np.sqrt(rng.random(count))
         s = rng.random(count)

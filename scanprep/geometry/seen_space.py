@@ -6,17 +6,21 @@ from typing import Any
 
 import numpy as np
 
-from ..fusion.tsdf import mesh_and_camera
+from .mesh import Mesh
 from .surface import Rays
 
 
-class SeenSpace:
-    """Space that views look through.
+def mesh_and_camera(view: Any) -> tuple[Mesh, np.ndarray]:
+    """The surface and the camera position of a RangeView or a pair."""
+    mesh, camera = view if isinstance(view, tuple) else (view.mesh, view.camera)
+    camera = np.asarray(camera, dtype=float)
+    if not isinstance(mesh, Mesh) or camera.shape != (3,) or not np.isfinite(camera).all():
+        raise ValueError("views: expected RangeViews or pairs of a Mesh and a camera position (3,)")
+    return mesh, camera
 
-    Parameters
-    ----------
-    views : sequence of RangeView, or of (Mesh, camera position (3,)) pairs
-        In the frame of the points that are asked about.
+
+class SeenSpace:
+    """Space that views look through: RangeViews, or pairs of a Mesh and a camera position (3,).
 
     [VRIP] space carving
     """
@@ -25,13 +29,10 @@ class SeenSpace:
         self._views = [(Rays(mesh), camera) for mesh, camera in map(mesh_and_camera, views)]
 
     def ahead(self, points: np.ndarray) -> np.ndarray:
-        """How far points (n, 3) lie in front of what was seen behind them, along the line of sight.
+        """How far points (n, 3) lie in front of what was seen behind them, along the line of sight, metres.
 
-        Returns
-        -------
-        (n,) float, metres
-            The largest over all views; negative behind the surface of every view, -inf where no line of sight
-            through the point ends on a surface.
+        The largest over all views; negative behind the surface of every view, -inf where no line of sight through
+        the point ends on a surface.
         """
         best = np.full(len(points), -np.inf)
         for rays, camera in self._views:

@@ -1,32 +1,20 @@
 """Symmetric positive definite systems, factored once and solved many times."""
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 
 import numpy as np
+from scipy.linalg import solveh_banded
 from scipy.sparse import coo_array, csc_array, csr_array, diags_array
 from scipy.sparse.csgraph import connected_components
 from scipy.sparse.linalg import splu
 
 
 def factor(matrix: csc_array) -> Callable[[np.ndarray], np.ndarray]:
-    """Factor a sparse symmetric positive definite matrix with SuperLU.
+    """The solver, (n,) or (n, k) -> the same shape, of a sparse symmetric positive definite matrix, with SuperLU.
 
     Symmetric mode and no pivoting: with its default pivoting SuperLU fills in beyond use on the larger
-    systems of this package.
-
-    Parameters
-    ----------
-    matrix : (n, n) sparse, symmetric positive definite
-
-    Returns
-    -------
-    solve : (n,) or (n, k) -> the same shape
-
-    Raises
-    ------
-    ValueError
-        The matrix is singular or not finite.
+    systems of this package. ValueError for a singular matrix or one that is not finite.
     """
     try:
         lu = splu(csc_array(matrix), permc_spec="MMD_AT_PLUS_A", diag_pivot_thresh=0.0,
@@ -40,12 +28,7 @@ class Factored:
     """A factored SPD system for many right-hand sides (CHOLMOD-class supernodal Cholesky from cholespy).
 
     Slower to factor than `factor`, several times faster to solve with three or more columns. Pickled, it is the matrix,
-    and factored again where it is read.
-
-    Raises
-    ------
-    ValueError
-        The matrix is empty, not finite or not positive definite.
+    and factored again where it is read. ValueError as for `factor`, and for an empty matrix.
     """
 
     LIMIT = 128                      # columns cholespy takes in one call
@@ -82,12 +65,8 @@ class Factored:
 def harmonic(near: csr_array, values: np.ndarray, known: np.ndarray) -> np.ndarray:
     """Values (N, k) that go over smoothly from the known ones (N,) bool: each other the mean of its neighbours'.
 
-    So none lies beyond the known ones. A piece without any known value keeps what it has.
-
-    Parameters
-    ----------
-    near : (N, N) sparse, symmetric
-        How much each counts for the other; zero where they are not neighbours.
+    So none lies beyond the known ones. A piece without any known value keeps what it has. `near` (N, N), symmetric,
+    says how much neighbours count for each other.
     """
     _, piece = connected_components(near, directed=False)
     free, fixed = np.flatnonzero(~known & np.isin(piece, np.unique(piece[known]))), np.flatnonzero(known)
@@ -96,3 +75,53 @@ def harmonic(near: csr_array, values: np.ndarray, known: np.ndarray) -> np.ndarr
         L = csr_array(diags_array(near.sum(axis=1)) - near)[free]
         out[free] = factor(csc_array(L[:, free]))(-L[:, fixed] @ out[fixed])
     return out
+
+
+def solve_smooth(blocks: np.ndarray, stiffness: np.ndarray | float, rhs: np.ndarray) -> np.ndarray:
+    """Frames x (T, P) that their second differences couple: `blocks[t] x[t] + stiffness (D₂ᵀ D₂ x)[t] = rhs[t]`.
+
+    `blocks` (T, P, P) are symmetric and positive semidefinite, `stiffness` is (P,) or one number, T at least 3: one
+    Cholesky factorisation of a band of width 2 P.
+    """
+    T, P = rhs.shape
+    lower = np.zeros((2 * P + 1, T * P))
+    for k in range(P):                               # entries k below the diagonal, inside the blocks
+        lower[k].reshape(T, P)[:, :P - k] = np.einsum("tii->ti", blocks[:, k:, :P - k])
+    D = np.array([1.0, -2.0, 1.0])
+    for i in range(3):
+        for j in range(i, 3):
+            lower[(j - i) * P].reshape(T, P)[i:T - 2 + i] += D[i] * D[j] * stiffness
+    lower[0] += 1e-9 * lower[0].max()
+    return np.asarray(solveh_banded(lower, rhs.ravel(), overwrite_ab=True, lower=True,
+                                    check_finite=False).reshape(T, P))
+
+
+def overlapping_windows(count: int, size: int, overlap: int) -> Iterator[tuple[slice, slice, slice]]:
+    """Windows over so many frames, at least 3, for `solve_smooth`: frames to solve, which of these to keep, and where.
+
+    Each lends `overlap` frames to its neighbours, more than a frame's influence reaches.
+    """
+    for start in range(0, count, size):
+        near = slice(max(0, min(start - overlap, count - 3)), min(count, start + size + overlap))
+        end = min(start + size, count)
+        yield near, slice(start - near.start, end - near.start), slice(start, end)
+
+
+def conjugate_gradients(apply: Callable[[np.ndarray], np.ndarray], force: np.ndarray,
+                        precondition: Callable[[np.ndarray], np.ndarray], iterations: int = 40,
+                        tolerance: float = 1e-4) -> np.ndarray:
+    """Solve `apply(d) = force` for arrays of any shape, with a symmetric positive definite `apply`."""
+    d, r = np.zeros_like(force), force.copy()
+    z = precondition(r)
+    p, rz = z, float(np.sum(r * z))
+    first = rz
+    for _ in range(iterations):
+        if rz <= tolerance**2 * first or not rz:
+            break
+        Ap = apply(p)
+        a = rz / float(np.sum(p * Ap))
+        d, r = d + a * p, r - a * Ap
+        z = precondition(r)
+        rz, last = float(np.sum(r * z)), rz
+        p = z + rz / last * p
+    return d

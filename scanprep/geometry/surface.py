@@ -13,13 +13,7 @@ FARTHEST = 1e30                      # metres; the square of what lies beyond, o
 
 
 def checked_points(points: np.ndarray, name: str = "points") -> np.ndarray:
-    """Query points (n, 3) as float64, in one block; beyond what is finite no library says which triangle is nearest.
-
-    Raises
-    ------
-    ValueError
-        Another shape, a coordinate that is NaN, infinite or above 1e30.
-    """
+    """Query points (n, 3) as float64, in one block; ValueError for one too far away for any library."""
     points = np.ascontiguousarray(points, dtype=np.float64)
     if points.ndim != 2 or points.shape[1] != 3:
         raise ValueError(f"{name}: expected shape (n, 3), got {points.shape}")
@@ -39,38 +33,20 @@ def checked_surface(mesh: Mesh) -> tuple[np.ndarray, np.ndarray]:
 
 @dataclass(frozen=True)
 class SurfacePoints:
-    """Points on the triangles of a mesh.
+    """Points on the triangles of a mesh."""
 
-    Attributes
-    ----------
-    points : (n, 3) float, metres
-    faces : (n,) int
-    bary : (n, 3) float, barycentric coordinates
-    distances : (n,) float, metres, from the query points
-    """
+    points: np.ndarray          # (n, 3), metres
+    faces: np.ndarray           # (n,)
+    bary: np.ndarray            # (n, 3) barycentric coordinates
+    distances: np.ndarray       # (n,) metres, from the query points
 
-    points: np.ndarray
-    faces: np.ndarray
-    bary: np.ndarray
-    distances: np.ndarray
-
-    def carried(self, vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
+    def transferred(self, vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
         """The same surface points (n, 3) on other vertices of the same triangulation."""
         return np.einsum("nc,ncd->nd", self.bary, vertices[faces[self.faces]])
 
 
 class Surface:
-    """Closest-point queries on one mesh, its search tree built once.
-
-    Parameters
-    ----------
-    mesh : Mesh
-
-    Raises
-    ------
-    ValueError
-        A mesh without triangles.
-    """
+    """Closest-point queries on one mesh, which has triangles; its search tree is built once."""
 
     def __init__(self, mesh: Mesh) -> None:
         import igl
@@ -109,17 +85,10 @@ def barycentric(points: np.ndarray, corners: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True)
 class Matches:
-    """For each query point a target point with a compatible normal, or none.
+    """For each query point a target point with a compatible normal, or none."""
 
-    Attributes
-    ----------
-    index : (n,) int
-        Which target, -1 where none was acceptable.
-    distances : (n,) float, metres; inf where there is none
-    """
-
-    index: np.ndarray
-    distances: np.ndarray
+    index: np.ndarray           # (n,) which target, -1 where none was acceptable
+    distances: np.ndarray       # (n,) metres; inf where there is none
 
     @property
     def valid(self) -> np.ndarray:
@@ -132,19 +101,8 @@ class OrientedPoints:
 
     Points and normals are searched together in six dimensions: the squared distance is
     |x - y|² + scale² |n - m|², so a point on the near side of a thin limb wins over a closer one on the far
-    side. Matches beyond the limits are rejected afterwards.
-
-    Parameters
-    ----------
-    points : (m, 3) float, metres
-    normals : (m, 3) float, unit
-    scale : float, metres
-        How much distance a difference of normals weighs.
-
-    Raises
-    ------
-    ValueError
-        No points at all, or one that is not finite.
+    side. Matches beyond the limits are rejected afterwards. `scale` is the distance, metres, that a difference of
+    normals weighs.
     """
 
     def __init__(self, points: np.ndarray, normals: np.ndarray, scale: float = 0.05) -> None:
@@ -165,12 +123,7 @@ class OrientedPoints:
 
 
 class Rays:
-    """Ray casting against one mesh with Embree.
-
-    Parameters
-    ----------
-    mesh : Mesh
-    """
+    """Ray casting against one mesh with Embree."""
 
     def __init__(self, mesh: Mesh) -> None:
         from embreex import rtcore_scene
@@ -183,25 +136,9 @@ class Rays:
 
     def cast(self, origins: np.ndarray, directions: np.ndarray, reach: float = 1e6
              ) -> tuple[np.ndarray, np.ndarray]:
-        """First hits of rays.
+        """First hits of rays (n, 3) with unit directions: triangle (n,), -1 for none, and distance (n,), NaN for none.
 
-        Parameters
-        ----------
-        origins, directions : (n, 3) float
-            Directions are unit vectors.
-        reach : float, metres
-
-        Returns
-        -------
-        (n,) int
-            Triangle, -1 for none.
-        (n,) float, metres
-            Distance, NaN for none.
-
-        Raises
-        ------
-        ValueError
-            An origin or a direction that is not finite: it would seem to hit nothing.
+        ValueError for a ray that is not finite: it would seem to hit nothing.
         """
         origins = checked_points(origins, "origins")
         along = checked_points(np.broadcast_to(directions, origins.shape), "directions").astype(np.float32)

@@ -1,14 +1,17 @@
-"""The writing half of glTF 2.0: one buffer, its accessors, and the container `.glb`."""
+"""The writing half of glTF 2.0: one buffer, its accessors, the container `.glb`, and moving bodies in it."""
 from __future__ import annotations
 
 import json
 import struct
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
 
 from ..geometry.mesh import Mesh
+from ..geometry.storage import writing
+from .colors import decode
 from .sheets import png_bytes
 
 # Turns that bring each axis to +y, the upward axis of glTF: quaternions x, y, z, w.
@@ -27,18 +30,7 @@ class Glb:
         self._accessors: list[dict[str, Any]] = []
 
     def add(self, array: np.ndarray, kind: str, target: int | None, bounds: bool = False) -> int:
-        """An accessor of float32 numbers; its index.
-
-        Parameters
-        ----------
-        array : (n, ...) float
-        kind : "SCALAR", "VEC2", "VEC3", "VEC4" or "MAT4"
-            What a row is; a matrix is stored column after column, as the caller has to lay it out.
-        target : VERTICES or None
-            `VERTICES` for what vertices have.
-        bounds : bool
-            Say the least and the greatest row, which glTF wants of positions and times.
-        """
+        """An accessor of float32 numbers; its index."""
         values = np.ascontiguousarray(array, dtype="<f4")
         extra: dict[str, Any] = {}
         if bounds:
@@ -96,3 +88,65 @@ def skin_material(color: Sequence[float] = (0.60, 0.57, 0.53)) -> dict[str, Any]
     """A material of one colour (linear light) that is dull all over."""
     return {"name": "skin", "pbrMetallicRoughness": {
         "baseColorFactor": [*color, 1], "metallicFactor": 0, "roughnessFactor": 0.75}}
+
+
+def write_animated_glb(path: str | Path, faces: np.ndarray, frames: np.ndarray, rate: float,
+                       colors: np.ndarray | None = None, up: int = 2, keys: int = 60) -> None:
+    """Write a moving mesh that any glTF 2.0 viewer plays.
+
+    Every key frame is a morph target with its own normals; the animation blends from one to the next. Nothing
+    but the core of glTF is used.
+    """
+    data = animated_glb(faces, frames, rate, colors, up, keys)
+    with writing(path) as beside:
+        beside.write_bytes(data)
+
+
+def animated_glb(faces: np.ndarray, frames: np.ndarray, rate: float, colors: np.ndarray | None = None, up: int = 2,
+                 keys: int = 60) -> bytes:
+    """The bytes of `write_animated_glb`."""
+    frames, faces = np.asarray(frames, dtype=float), np.asarray(faces)
+    _check(frames, rate, up, keys)
+    chosen = np.unique(np.linspace(0, len(frames) - 1, min(keys, len(frames))).round().astype(int))
+    meshes = [Mesh(frames[t], faces) for t in chosen]
+    glb = Glb()
+    base, normals = meshes[0].vertices, some_normal(meshes[0])
+    attributes = {"POSITION": glb.add(base, "VEC3", VERTICES, bounds=True),
+                  "NORMAL": glb.add(normals, "VEC3", VERTICES)}
+    if colors is not None:
+        rgba = np.concatenate([decode(np.asarray(colors)), np.ones((len(base), 1))], axis=1)
+        attributes["COLOR_0"] = glb.add(rgba, "VEC4", VERTICES)
+    primitive: dict[str, Any] = {"attributes": attributes, "indices": glb.add_indices(faces), "material": 0}
+    primitive["targets"] = [{"POSITION": glb.add(m.vertices - base, "VEC3", VERTICES, bounds=True),
+                             "NORMAL": glb.add(some_normal(m) - normals, "VEC3", VERTICES)} for m in meshes[1:]]
+    count = len(meshes) - 1
+    mesh: dict[str, Any] = {"name": "body", "primitives": [primitive]}
+    document: dict[str, Any] = {
+        "scene": 0, "scenes": [{"nodes": [0]}], "meshes": [mesh],
+        "nodes": [{"name": "body", "mesh": 0, "rotation": UPRIGHT[up]}],
+        "materials": [skin_material((1, 1, 1)) if colors is not None else skin_material()]}
+    if count:
+        mesh["weights"] = [0] * count
+        mesh["extras"] = {"targetNames": [f"frame {t}" for t in chosen[1:]]}
+        times = glb.add(chosen / rate, "SCALAR", None, bounds=True)
+        weights = glb.add(np.eye(count + 1)[:, 1:].ravel(), "SCALAR", None)
+        document["animations"] = [{
+            "name": "motion", "samplers": [{"input": times, "output": weights, "interpolation": "LINEAR"}],
+            "channels": [{"sampler": 0, "target": {"node": 0, "path": "weights"}}]}]
+    else:
+        del primitive["targets"]
+    return glb.pack(document)
+
+
+def _check(frames: np.ndarray, rate: float, up: int, keys: int) -> None:
+    if frames.ndim != 3 or frames.shape[2] != 3 or not len(frames):
+        raise ValueError(f"frames: expected shape (T, N, 3) with at least one frame, got {frames.shape}")
+    bad = np.flatnonzero(~np.isfinite(frames).all(axis=(1, 2)))
+    if len(bad):
+        raise ValueError(f"frames: {len(bad)} are not finite, the first is frame {bad[0]}")
+    if not rate > 0:
+        raise ValueError(f"rate: expected a positive number of frames a second, got {rate}")
+    if up not in UPRIGHT:
+        raise ValueError(f"up: expected 0, 1 or 2, got {up}")
+    if keys < 1:
+        raise ValueError(f"keys: expected at least 1, got {keys}")

@@ -1,7 +1,6 @@
 """Textures: read with a scan, baked onto a body, written as GLB."""
 from __future__ import annotations
 
-import io
 import warnings
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -10,10 +9,11 @@ from typing import Any
 
 import numpy as np
 
-from scanprep.geometry.formats.common import UNITS
-from scanprep.geometry.mesh import Mesh
-from scanprep.geometry.storage import writing
-from scanprep.geometry.surface import Rays, barycentric
+from ..geometry.formats.common import UNITS
+from ..geometry.mesh import Mesh
+from ..geometry.storage import writing
+from ..geometry.surface import Rays, barycentric
+from .gltf import VERTICES, Glb, skin_material
 
 SIZE = 1024                          # pixels of a baked texture, each way
 PADDING = 8                          # pixels that colours go on beyond the border of a chart
@@ -24,21 +24,12 @@ Look = Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]
 
 @dataclass(frozen=True, eq=False)
 class Texture:
-    """A picture laid on a mesh.
+    """A picture laid on a mesh."""
 
-    Attributes
-    ----------
-    mesh : Mesh
-        Its vertices are repeated where charts meet.
-    uv : (N, 2) float
-        Place of each vertex in the picture: (0, 0) is its lower left corner, (1, 1) its upper right one.
-    image : (H, W, 3) float in [0, 1]
-        Rows from the top.
-    """
-
-    mesh: Mesh
+    mesh: Mesh  # its vertices are repeated where charts meet
+    # (N, 2) float: place of each vertex in the picture: (0, 0) is its lower left corner, (1, 1) its upper right one
     uv: np.ndarray
-    image: np.ndarray
+    image: np.ndarray  # (H, W, 3) float in [0, 1]: rows from the top
 
     def scaled(self, factor: float) -> Texture:
         """All lengths of the mesh times a factor."""
@@ -113,16 +104,7 @@ def _picture(material: Any) -> np.ndarray | None:
 
 
 def bake(body: Mesh, look: Look, unseen: np.ndarray, size: int | None = None) -> Texture:
-    """A texture of a body: what `look` says of each of its pixels, elsewhere the colours of its vertices.
-
-    Parameters
-    ----------
-    body : Mesh
-    look : (places (n, 3), normals (n, 3)) -> colours (n, 3), weights (n,)
-    unseen : (N, 3) float in [0, 1]
-        Colours where the weight is zero.
-    size : int, pixels, optional
-    """
+    """A texture of a body: what `look` says of each of its pixels, elsewhere the colours of its vertices."""
     size = size or SIZE
     kept, faces, uv = unwrap(body)
     flat = Mesh(np.column_stack([uv, np.zeros(len(uv))]), faces)
@@ -143,25 +125,12 @@ def bake(body: Mesh, look: Look, unseen: np.ndarray, size: int | None = None) ->
 
 
 def unwrap(mesh: Mesh) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """A mesh cut into flat charts.
-
-    Returns
-    -------
-    (n,) int
-        The vertex that each vertex of the cut mesh was.
-    (F, 3) int
-        Its triangles, in the old order.
-    (n, 2) float in [0, 1]
-
-    Raises
-    ------
-    ModuleNotFoundError
-        xatlas is not installed.
-    """
+    """A mesh cut into flat charts."""
     try:
         import xatlas
     except ModuleNotFoundError:
-        raise ModuleNotFoundError("a texture needs the body unwrapped by xatlas: pip install xatlas") from None
+        raise ModuleNotFoundError("a texture needs the body unwrapped by xatlas: "
+                                  "pip install 'scapekit[textures]'") from None
     kept, faces, uv = xatlas.parametrize(mesh.vertices.astype(np.float32), mesh.faces.astype(np.uint32))
     return kept.astype(np.int64), faces.astype(np.int64), uv.astype(np.float64)
 
@@ -176,13 +145,16 @@ def padded(image: np.ndarray, covered: np.ndarray) -> np.ndarray:
 
 def write_textured(path: str | Path, texture: Texture) -> None:
     """Write a GLB with its picture inside, whole or not at all."""
-    import trimesh
-    from PIL import Image
-
-    picture = Image.fromarray((255 * np.clip(texture.image, 0, 1) + 0.5).astype(np.uint8))
-    material = trimesh.visual.material.PBRMaterial(baseColorTexture=picture, metallicFactor=0.0, roughnessFactor=0.8)
-    visual = trimesh.visual.TextureVisuals(uv=texture.uv, material=material)
-    mesh = trimesh.Trimesh(texture.mesh.vertices, texture.mesh.faces, visual=visual, process=False)
-    out = io.BytesIO(trimesh.exchange.gltf.export_glb(trimesh.Scene(mesh)))
+    glb = Glb()
+    attributes = {"POSITION": glb.add(texture.mesh.vertices, "VEC3", VERTICES, bounds=True),
+                  "TEXCOORD_0": glb.add(texture.uv * [1, -1] + [0, 1], "VEC2", VERTICES)}
+    material = skin_material((1, 1, 1))
+    material["pbrMetallicRoughness"]["baseColorTexture"] = {"index": 0}
+    image = glb.add_image((255 * np.clip(texture.image, 0, 1) + 0.5).astype(np.uint8), "texture")
+    data = glb.pack({
+        "scene": 0, "scenes": [{"nodes": [0]}], "nodes": [{"name": "body", "mesh": 0}], "materials": [material],
+        "meshes": [{"primitives": [{"attributes": attributes, "indices": glb.add_indices(texture.mesh.faces),
+                                    "material": 0}]}],
+        "images": [image], "textures": [{"source": 0}]})
     with writing(path) as beside:
-        beside.write_bytes(out.getvalue())
+        beside.write_bytes(data)

@@ -13,10 +13,10 @@ import tyro
 from ..batch.opening import workspace
 from ..batch.workspace import Workspace
 from ..cleaning.clean_scan import CleanScanConfig
-from ..cli import MM, Output, SetArg, landmarks_beside
+from ..cli import MM, Output, SetArg
 from ..console import Metric, Outcome, bar, say
 from ..geometry.files import read_mesh
-from ..geometry.landmarks import read_landmark_vertices
+from ..geometry.landmarks import read_template_landmarks
 from ..geometry.mesh import Mesh
 from .figures import ScanFigures
 from .page import PAGE, judge_set, write_set_page
@@ -86,7 +86,7 @@ def _template_marks(template: Path, given: Path | None, body: Mesh, tasks: Seque
     if without and init == "best":
         say(f"note: no landmarks for {len(without)} of {len(tasks)} scans ({', '.join(without[:LISTED])}); "
             "look at the page for those turned round or mirrored")
-    return read_landmark_vertices(given or landmarks_beside(template), body)
+    return read_template_landmarks(template, body, given)
 
 
 def _progress_made(done: Prepared, tasks: Sequence[ScanTask]) -> list[Metric]:

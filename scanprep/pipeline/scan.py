@@ -10,15 +10,17 @@ import numpy as np
 from ..cleaning.clean_scan import CleanScanConfig, clean_scan
 from ..correspondence.correlated import CorrelatedConfig, find_correspondences
 from ..correspondence.correspondences import Correspondences
+from ..geometry.files import read_scan
 from ..geometry.landmarks import check_on_surface, match_landmarks, read_landmarks
 from ..geometry.mesh import Mesh
 from ..meaning import extent
 from ..ranges import FLAG, Settings
 from ..registration.confidence import stretched_share
-from ..registration.nonrigid import Registration, RegistrationConfig, register, registration_problem
+from ..registration.nonrigid import Registration, register, registration_problem
+from ..registration.schedule import RegistrationConfig
 from ..threads import one_thread
 from .figures import ScanFigures
-from .scans import ScanTask, read_scan
+from .scans import ScanTask
 
 Init = Literal["best", "landmarks", "automatic", "pose"]
 
@@ -136,5 +138,5 @@ def _cleaned(scan: Mesh | np.ndarray, landmarks: Landmarks | None, config: Clean
 def _measure(task: ScanTask, template: Mesh, fit: Registration, init: str) -> ScanFigures:
     return ScanFigures(
         task.name, init, float(np.nanmean(fit.distances)) if fit.seen.any() else np.nan, fit.rms,
-        float(fit.seen.mean()), float(fit.confidence.mean()), fit.missed,
-        stretched_share(template, fit.mesh), fit.landmark_rms, fit.flipped, fit.converged)
+        float(fit.seen.mean()), float(fit.confidence.mean()), fit.uncovered,
+        stretched_share(template, fit.mesh), fit.landmark_rms, fit.inverted, fit.converged)

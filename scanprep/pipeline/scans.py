@@ -4,15 +4,11 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 from pathlib import Path
 
-import numpy as np
-
 from ..geometry import storage, tables
-from ..geometry.files import MeshFileError, read_mesh, read_points
-from ..geometry.mesh import Mesh
+from ..geometry.files import MeshFileError
+from ..geometry.landmarks import landmarks_beside
 
-LANDMARK_ENDINGS = (".json", ".mrk.json", ".landmarks.json", ".pp", "_picked_points.pp", ".lnd", ".landmarks.txt")
 SCAN_ENDINGS = (".ply", ".ply.gz", ".obj", ".stl", ".off", ".glb", ".xyz", ".pcd", ".pts")
-POINT_ENDINGS = (".xyz", ".pcd", ".txt", ".pts")
 TABLE = "scans.csv"
 ABOUT = {"digest": False}         # what is only told in tables: no registration depends on it
 
@@ -49,22 +45,10 @@ def find_scans(folder: str | Path, landmarks: str | Path | None = None, subject:
     tasks = []
     for name, path in sorted(paths.items()):
         row = about.get(name, {})
-        candidates = [place / (name + ending) for place in places for ending in LANDMARK_ENDINGS]
-        tasks.append(ScanTask(name, path, next((c for c in candidates if c.is_file()), None),
+        beside = (landmarks_beside(path, place) for place in places)
+        tasks.append(ScanTask(name, path, next(filter(None, beside), None),
                               row.get("subject") or subject or name, row.get("pose") or "", row.get("sex") or ""))
     return tasks
-
-
-def read_scan(path: str | Path, unit: str | None = None) -> Mesh | np.ndarray:
-    """A scan as a mesh, or as points (n, 3) where the file has no triangles."""
-    if Path(path).suffix.lower() in POINT_ENDINGS:
-        return read_points(path, unit).points
-    try:
-        return read_mesh(path, unit)
-    except ValueError as error:
-        if "no faces" in str(error):
-            return read_points(path, unit).points
-        raise
 
 
 def _list_scans(folder: Path) -> dict[str, Path]:

@@ -8,13 +8,13 @@ from typing import Any
 import numpy as np
 
 from ..decimation.decimate import DecimateConfig, decimate
-from ..decimation.remeshing import improve_triangles, smooth
 from ..fusion.tsdf import MergeConfig, merge_views
 from ..geometry.mesh import Mesh, check_template
+from ..geometry.remeshing import improve_triangles, smooth
 from ..geometry.surface import Surface
 from ..ranges import Settings
 from ..repair.hole_filling import FillConfig, close
-from ..repair.manifold import drop_thin, peel_border, repair
+from ..repair.manifold import drop_thin, repair
 
 
 @dataclass(frozen=True)
@@ -26,17 +26,15 @@ class TemplateConfig(Settings):
     merge : MergeConfig
     fill : FillConfig
     decimate : DecimateConfig
-    peel : int
-        Rings of triangles removed along the borders of holes before they are filled; takes hands and feet that
-        were seen in part with it.
     smoothing : int
         Rounds of smoothing, once before the holes are filled and once after.
+    thinnest : float, metres
+        What is thinner, as fingers are that were hardly seen, is taken off.
     """
 
     merge: MergeConfig = field(default_factory=lambda: MergeConfig(voxel=0.004, truncation=2.0, min_cosine=0.15))
     fill: FillConfig = field(default_factory=FillConfig)
     decimate: DecimateConfig = field(default_factory=lambda: DecimateConfig(method="quadric", improve=True))
-    peel: int = 0
     smoothing: int = 6
     thinnest: float = 0.007
 
@@ -52,7 +50,7 @@ def make_template(views: Sequence[Any], faces: int = 14000, config: TemplateConf
     tell = progress or (lambda done, total: None)
     mesh = merge_views(views, config.merge)
     tell(1, 4)
-    mesh = peel_border(smooth(repair(mesh), config.smoothing), config.peel)      # smooth rims make fair patches
+    mesh = smooth(repair(mesh), config.smoothing)      # smooth rims make fair patches
     tell(2, 4)
     mesh = close(mesh, config.fill)
     mesh = smooth(close(drop_thin(mesh, config.thinnest), config.fill), config.smoothing)

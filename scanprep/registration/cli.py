@@ -8,17 +8,16 @@ import numpy as np
 import tyro
 
 from ..alignment.icp import RigidConfig, align_landmarks, align_rigid, alignment_problem
-from ..cli import MM, MeshArg, Output, ScanArg, Unit, landmarks_beside
+from ..cli import MM, MeshArg, Output, ScanArg, Unit
 from ..console import Metric, Outcome, bar
 from ..correspondence.correlated import CorrelatedConfig, find_correspondences
 from ..correspondence.correspondences import correspondences_problem
 from ..correspondence.files import read_correspondences, write_correspondences
-from ..correspondence.functional import find_functional_correspondences
-from ..geometry.files import read_mesh, write_mesh
-from ..geometry.landmarks import match_landmarks, read_landmark_vertices, read_landmarks
+from ..geometry.files import read_mesh, read_scan, write_mesh
+from ..geometry.landmarks import landmarks_beside, match_landmarks, read_landmarks, read_template_landmarks
 from ..geometry.mesh import Mesh
-from ..pipeline.scans import read_scan
 from .nonrigid import register, registration_problem
+from .schedule import RegistrationConfig
 
 TargetArg = Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="TARGET")]
 
@@ -49,7 +48,7 @@ def align(source: MeshArg, target: TargetArg, output: Output, landmarks: Path | 
 
 
 def correspond(scan: ScanArg, template: Path, output: Output, landmarks: Path | None = None,
-               template_landmarks: Path | None = None, functional: bool = False, unit: Unit | None = None,
+               template_landmarks: Path | None = None, ignore_landmarks: bool = False, unit: Unit | None = None,
                config: CorrelatedConfig = CorrelatedConfig()) -> Outcome:  # noqa: B008
     """From a few landmarks, or none, to nearly two hundred pairs of places on template and scan.
 
@@ -59,30 +58,29 @@ def correspond(scan: ScanArg, template: Path, output: Output, landmarks: Path | 
         scan: Mesh or point cloud.
         template: Mesh to find on the scan.
         output: JSON file of vertices of the template, points of the scan in metres, and confidence.
-        landmarks: Landmarks of the scan: three at least, spread over the body; without them the ends of the limbs
-            are looked for.
+        landmarks: Landmarks of the scan: three at least, spread over the body; else the file of its name beside it,
+            and where there is none the ends of the limbs are looked for.
         template_landmarks: Landmarks of the template; else the file of its name beside it.
-        functional: By a functional map instead of beliefs; the settings below then do not apply.
+        ignore_landmarks: Leave out the landmark file beside the scan.
         unit: Unit of the scan and its landmarks.
-        config: Settings; lengths are multiples of the root of the template's area.
     """
     body, data = read_mesh(template), read_scan(scan, unit)
-    pairs = _pairs(body, data, template, landmarks, template_landmarks, unit) if landmarks else None
+    given = landmarks or (None if ignore_landmarks else landmarks_beside(scan))
+    pairs = _pairs(body, data, template, given, template_landmarks, unit)
     with bar("finding correspondences") as progress:
-        found = (find_functional_correspondences(body, data, pairs) if functional else
-                 find_correspondences(body, data, pairs, config, progress))
+        found = find_correspondences(body, data, pairs, config, progress)
     write_correspondences(output, found)
     return Outcome(output, [
-        Metric("method", found.method), Metric("landmarks", len(pairs[0]) if pairs else 0),
-        Metric("correspondences", len(found)),
+        Metric("method", found.method), *_led_by(given, pairs), Metric("correspondences", len(found)),
         Metric("confidence, median", float(np.median(found.confidence))),
-        Metric("converged", str(found.converged))], {} if functional else {"correspond": config},
-        problem=None if functional else correspondences_problem(found))
+        Metric("converged", str(found.converged))], {"correspond": config},
+        problem=correspondences_problem(found))
 
 
 def register_one(scan: ScanArg, template: Path, output: Output, landmarks: Path | None = None,
-                 template_landmarks: Path | None = None, correspondences: Path | None = None,
-                 unit: Unit | None = None) -> Outcome:
+                 template_landmarks: Path | None = None, ignore_landmarks: bool = False,
+                 correspondences: Path | None = None, unit: Unit | None = None,
+                 config: RegistrationConfig = RegistrationConfig()) -> Outcome:  # noqa: B008
     """Bend the template onto one scan.
 
     Example: scape prep register scan.ply --template template.ply --landmarks scan.json -o registered.ply
@@ -91,30 +89,44 @@ def register_one(scan: ScanArg, template: Path, output: Output, landmarks: Path 
         scan: Mesh or point cloud.
         template: Mesh to bring onto it.
         output: Mesh to write.
-        landmarks: Landmarks of the scan. With neither these nor correspondences it must be near the template's pose.
+        landmarks: Landmarks of the scan; else the file of its name beside it, where no correspondences are given.
+            With neither landmarks nor correspondences it must be near the template's pose.
         template_landmarks: Landmarks of the template; else the file of its name beside it.
+        ignore_landmarks: Leave out the landmark file beside the scan.
         correspondences: File of scape prep correspond; wrong pairs among them do little harm.
         unit: Unit of the scan and its landmarks.
     """
     body, data = read_mesh(template), read_scan(scan, unit)
-    pairs = _pairs(body, data, template, landmarks, template_landmarks, unit) if landmarks else None
+    given = landmarks or (None if ignore_landmarks or correspondences else landmarks_beside(scan))
+    pairs = _pairs(body, data, template, given, template_landmarks, unit)
     hints = read_correspondences(correspondences) if correspondences else None
     with bar("registering") as progress:
-        fit = register(body, data, pairs, progress=progress, correspondences=hints)
+        fit = register(body, data, pairs, config=config, progress=progress, correspondences=hints)
     write_mesh(output, fit.mesh)
     return Outcome(output, [
+        *_led_by(given, pairs),
         Metric("distance to the scan, RMS", MM * fit.rms, "mm"),
         Metric("vertices with data", 100 * float(fit.seen.mean()), "%"),
         Metric("confidence, mean", float(fit.confidence.mean())),
-        Metric("scan off the template", 100 * fit.missed, "%"),
+        Metric("scan off the template", 100 * fit.uncovered, "%"),
         Metric("distance of landmarks, RMS", MM * fit.landmark_rms, "mm"),
-        Metric("flipped triangles", fit.flipped), Metric("converged", str(fit.converged))],
+        Metric("inverted triangles", fit.inverted), Metric("converged", str(fit.converged))], {"register": config},
         problem=registration_problem(body, data, fit, pairs is not None))
 
 
-def _pairs(body: Mesh, data: Mesh | np.ndarray, template: Path, landmarks: Path, template_landmarks: Path | None,
-           unit: Unit | None) -> tuple[np.ndarray, np.ndarray]:
+Landmarks = tuple[np.ndarray, np.ndarray]
+
+
+def _pairs(body: Mesh, data: Mesh | np.ndarray, template: Path, landmarks: Path | None,
+           template_landmarks: Path | None, unit: Unit | None) -> Landmarks | None:
     """Vertices of the template and points of the scan that carry the same names."""
-    marks = read_landmark_vertices(template_landmarks or landmarks_beside(template), body)
+    if landmarks is None:
+        return None
     found = read_landmarks(landmarks, data if isinstance(data, Mesh) else None, unit)
-    return match_landmarks(marks, found)[1:]
+    return match_landmarks(read_template_landmarks(template, body, template_landmarks), found)[1:]
+
+
+def _led_by(landmarks: Path | None, pairs: Landmarks | None) -> list[Metric]:
+    """The rows that say what led the template to the scan."""
+    used = [] if landmarks is None else [Metric("landmark file", landmarks.name)]
+    return [Metric("landmarks", len(pairs[0]) if pairs else 0), *used]

@@ -8,7 +8,7 @@ from scipy.spatial import cKDTree
 
 from ..geometry.mesh import Mesh
 from ..geometry.surface import OrientedPoints, Surface
-from .matches import Target, orient
+from ..geometry.target import Target, orient
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,17 +29,9 @@ class Evidence:
 
 
 def evidence(deformed: Mesh, target: Target, reach: float, scale: float) -> Evidence:
-    """Weigh the data near every vertex.
+    """The data near every vertex of the template on the scan, weighed; farther away than `reach` (metres) are none.
 
-    Parameters
-    ----------
-    deformed : Mesh
-        The template on the scan.
-    target : Target
-    reach : float, metres
-        Data farther away say nothing.
-    scale : float, metres
-        How much distance a difference of normals of one is worth.
+    A difference of normals of one counts like a distance of `scale` metres.
     """
     target = orient(target, deformed, scale)
     x, normals = deformed.vertices, deformed.vertex_normals
@@ -83,7 +75,7 @@ def _ramp(value: np.ndarray, low: float, high: float) -> np.ndarray:
     return np.clip((value - low) / (high - low), 0, 1)
 
 
-def missed_share(scan: Mesh | np.ndarray, registered: Mesh, far: float, samples: int = 5000) -> float:
+def uncovered_share(scan: Mesh | np.ndarray, registered: Mesh, far: float, samples: int = 5000) -> float:
     """Share of the points of a scan that lie further than `far` (metres) from a mesh."""
     points = scan.vertices if isinstance(scan, Mesh) else scan
     points = points[:: max(1, len(points) // samples)]

@@ -1,4 +1,4 @@
-"""A graph of turning and scaling nodes that carries a surface: the coarse degrees of freedom of a registration."""
+"""A graph of rotating and scaling nodes that carries a surface: the coarse degrees of freedom of a registration."""
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
@@ -10,6 +10,7 @@ from scipy.sparse.csgraph import dijkstra
 from scipy.spatial import cKDTree
 
 from ..geometry import rotations
+from ..geometry.farthest_points import farthest_points
 from ..geometry.mesh import Mesh
 from ..geometry.surface import Rays
 
@@ -54,14 +55,7 @@ class DeformationGraph:
 
 @dataclass(frozen=True, eq=False)
 class NodeMotion:
-    """How every node has turned, grown and moved.
-
-    Attributes
-    ----------
-    R : (M, 3, 3) float
-    log_scale : (M,) float
-    positions : (M, 3) float, metres
-    """
+    """How every node has rotated, R (M, 3, 3), grown, log_scale (M,), and moved: positions (M, 3), metres."""
 
     R: np.ndarray
     log_scale: np.ndarray
@@ -69,7 +63,7 @@ class NodeMotion:
 
     @property
     def linear(self) -> np.ndarray:
-        """(M, 3, 3) turn and growth together."""
+        """(M, 3, 3) rotation and growth together."""
         return np.exp(self.log_scale)[:, None, None] * self.R
 
     def moved(self, step: np.ndarray) -> NodeMotion:
@@ -78,11 +72,11 @@ class NodeMotion:
                        positions=self.positions + step[:, 4:])
 
 
-def start(graph: DeformationGraph, T: np.ndarray, scale: float = 1.0) -> NodeMotion:
-    """The motion of all nodes by one rigid transform (4, 4), after scaling the template by `scale`."""
+def start_motion(graph: DeformationGraph, T: np.ndarray) -> NodeMotion:
+    """The motion of all nodes by one rigid transform (4, 4)."""
     M = len(graph.nodes)
-    return NodeMotion(np.broadcast_to(T[:3, :3], (M, 3, 3)).copy(), np.full(M, np.log(scale)),
-                      scale * graph.nodes @ T[:3, :3].T + T[:3, 3])
+    return NodeMotion(np.broadcast_to(T[:3, :3], (M, 3, 3)).copy(), np.zeros(M),
+                      graph.nodes @ T[:3, :3].T + T[:3, 3])
 
 
 def arms(graph: DeformationGraph, motion: NodeMotion, vertices: np.ndarray) -> np.ndarray:
@@ -101,13 +95,7 @@ def deform(graph: DeformationGraph, motion: NodeMotion) -> np.ndarray:
     return np.matmul(blended[..., :3], graph.rest[..., None])[..., 0] + blended[..., 3]
 
 
-def vertex_linear(graph: DeformationGraph, motion: NodeMotion) -> np.ndarray:
-    """(N, 3, 3) turn and growth around every vertex, blended from its nodes."""
-    blended = np.einsum("nk,nkc->nc", graph.weights, motion.linear.reshape(-1, 9)[graph.carriers])
-    return blended.reshape(-1, 3, 3)
-
-
-def carry_over(old: DeformationGraph, motion: NodeMotion, new: DeformationGraph) -> NodeMotion:
+def transferred(old: DeformationGraph, motion: NodeMotion, new: DeformationGraph) -> NodeMotion:
     """The motion of a finer graph of the same template that repeats the motion of a coarser one."""
     at = new.node_vertices
     w, carriers = old.weights[at], old.carriers[at]
@@ -117,24 +105,11 @@ def carry_over(old: DeformationGraph, motion: NodeMotion, new: DeformationGraph)
 
 @lru_cache(maxsize=4)                # a folder of scans shares one template
 def build_graph(template: Mesh, count: int, carriers: int = 4, reach: float = 0.18) -> DeformationGraph:
-    """Spread nodes over a template and link them along and through the body.
+    """So many nodes spread over a template, linked along and through the body.
 
-    Neighbours on the surface are linked, and so are nodes that face each other through the inside: these
-    keep the thickness of limbs where the scan shows nothing, and make a limb's cross-section turn as one.
-
-    Parameters
-    ----------
-    template : Mesh
-    count : int
-        Number of nodes.
-    carriers : int
-        Nodes that carry one vertex.
-    reach : float
-        Longest link through the inside, as a multiple of the square root of the template's area.
-
-    Returns
-    -------
-    DeformationGraph
+    Neighbours on the surface are linked, and so are nodes that face each other through the inside, up to `reach` times
+    the root of the template's area: these keep the thickness of limbs where the scan shows nothing, and make a limb's
+    cross-section rotate as one.
     """
     nodes = farthest_points(template.vertices, min(count, len(template.vertices)))
     carrying, weights = _carriers(template, nodes, min(carriers, len(nodes) - 1))
@@ -145,17 +120,6 @@ def build_graph(template: Mesh, count: int, carriers: int = 4, reach: float = 0.
     area = np.bincount(carrying.ravel(), (weights * template.vertex_areas[:, None]).ravel(), len(nodes))
     degree = np.bincount(edges[:, 0], minlength=len(nodes))
     return DeformationGraph(template.vertices, nodes, carrying, weights, edges, (area / degree)[edges[:, 0]])
-
-
-def farthest_points(points: np.ndarray, count: int) -> np.ndarray:
-    """Indices (count,) of points far from each other, beginning with the one farthest from the middle."""
-    chosen = np.empty(count, dtype=np.int64)
-    chosen[0] = np.argmax(np.linalg.norm(points - points.mean(axis=0), axis=1))
-    nearest = np.full(len(points), np.inf)
-    for k in range(1, count):
-        np.minimum(nearest, ((points - points[chosen[k - 1]]) ** 2).sum(axis=1), out=nearest)
-        chosen[k] = np.argmax(nearest)
-    return chosen
 
 
 def _carriers(template: Mesh, nodes: np.ndarray, K: int) -> tuple[np.ndarray, np.ndarray]:

@@ -7,6 +7,7 @@ graph or scan are divided.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Protocol
 
 import numpy as np
@@ -23,11 +24,7 @@ UNKNOWNS = 7
 class Pull:
     """A quadratic energy of each vertex, `Σ xᵀ A x - 2 b·x + c`: what matches and landmarks want.
 
-    Attributes
-    ----------
-    A : (N, 3, 3) float, square metres
-    b : (N, 3) float, cubic metres
-    c : float
+    A (N, 3, 3), square metres; b (N, 3), cubic metres.
     """
 
     A: np.ndarray
@@ -44,20 +41,10 @@ class Pull:
 
 def pull(count: int, vertices: np.ndarray, targets: np.ndarray, weights: np.ndarray,
          normals: np.ndarray | None = None, slide: float = 1.0) -> Pull:
-    """Vertices drawn to target points, with less force along the surface than across it.
+    """Some of `count` vertices, (n,), drawn to targets (n, 3) with weights (n,), square metres.
 
-    Parameters
-    ----------
-    count : int
-        Number of vertices of the template, N.
-    vertices : (n,) int
-        A vertex may have several targets.
-    targets : (n, 3) float, metres
-    weights : (n,) float, square metres
-    normals : (n, 3) float, optional
-        Of the targets.
-    slide : float
-        Force along the surface, as a share of that across it.
+    A vertex may have several targets. With their normals the force along the surface is only a share, `slide`, of that
+    across it.
     """
     A = np.broadcast_to(np.eye(3), (len(vertices), 3, 3))
     if normals is not None:
@@ -97,6 +84,12 @@ class NodePattern:
         return csc_array(bsr_array((blocks, self.columns, self._indptr), shape=(size, size)))
 
 
+@lru_cache(maxsize=4)
+def node_pattern(graph: DeformationGraph) -> NodePattern:
+    """The pattern of a graph, made once."""
+    return NodePattern(graph)
+
+
 class Term(Protocol):
     """One energy at one state: its value, and on demand what it adds to the normal equations."""
 
@@ -110,15 +103,9 @@ class Term(Protocol):
 
 @dataclass(frozen=True, eq=False)
 class EdgeTerm:
-    """`Σ w |r|²` over the edges of a graph.
+    """`Σ w |r|²` over the edges (E, 2) of a graph, for residuals r (E, d) with weights w (E,).
 
-    Attributes
-    ----------
-    edges : (E, 2) int
-    r : (E, d) float
-    Ji, Jj : (E, d, 7) float
-        Derivatives of the residual by the unknowns of the first and the second node.
-    w : (E,) float
+    Ji, Jj (E, d, 7) are their derivatives by the unknowns of the first and the second node.
     """
 
     edges: np.ndarray
@@ -141,20 +128,10 @@ class EdgeTerm:
 
 @dataclass(frozen=True, eq=False)
 class DataTerm:
-    """What matches and landmarks ask of the nodes that carry the vertices (only those that are asked).
+    """What matches and landmarks ask of the nodes that carry the vertices: A, b, c as in `Pull`.
 
-    Attributes
-    ----------
-    active : (n,) int
-        Vertices with a force on them.
-    carriers, w : (n, K)
-        The nodes that carry them, and their shares.
-    y : (n, K, 3) float, metres
-        From node to vertex.
-    x : (n, 3) float, metres
-        Where the vertices are.
-    A, b, c
-        As in `Pull`.
+    `active` (n,) are the vertices with a force on them, at x (n, 3), metres; `carriers` and `w` (n, K) the nodes that
+    carry them and their shares; `y` (n, K, 3), metres, is the way from node to vertex.
     """
 
     active: np.ndarray
@@ -196,12 +173,9 @@ def data_term(graph: DeformationGraph, motion: NodeMotion, wanted: Pull) -> Data
 
 
 def stretch_term(graph: DeformationGraph, motion: NodeMotion, stiffness: float) -> EdgeTerm:
-    """Every node wants to see its neighbours where its own turn and growth would put them.
+    """Every node wants to see its neighbours where its own rotation and growth would put them.
 
-    Parameters
-    ----------
-    stiffness : float, metres
-        A strain of one costs as much as this distance from the data.
+    A strain of one costs as much as `stiffness` metres from the data.
     """
     i, j = graph.edges.T
     rest = graph.edge_vectors
@@ -215,13 +189,7 @@ def stretch_term(graph: DeformationGraph, motion: NodeMotion, stiffness: float) 
 
 
 def bend_term(graph: DeformationGraph, motion: NodeMotion, stiffness: float) -> EdgeTerm:
-    """Neighbours want to turn alike.
-
-    Parameters
-    ----------
-    stiffness : float, metres
-        A turn of one radian between neighbours costs as much as this distance from the data.
-    """
+    """Neighbours want to rotate alike: one radian between them costs as much as `stiffness` metres from the data."""
     i, j = graph.edges.T
     r = rotations.log(motion.R[j] @ motion.R[i].transpose(0, 2, 1))
     inverse = rotations.inverse_right_jacobian(r)
@@ -231,13 +199,7 @@ def bend_term(graph: DeformationGraph, motion: NodeMotion, stiffness: float) -> 
 
 
 def growth_term(graph: DeformationGraph, motion: NodeMotion, stiffness: float) -> EdgeTerm:
-    """Neighbours want to grow alike.
-
-    Parameters
-    ----------
-    stiffness : float, metres
-        A factor of e between neighbours costs as much as this distance from the data.
-    """
+    """Neighbours want to grow alike: a factor of e between them costs as much as `stiffness` metres from the data."""
     i, j = graph.edges.T
     Ji, Jj = np.zeros((2, len(i), 1, UNKNOWNS))
     Ji[..., 3], Jj[..., 3] = -1, 1

@@ -1,37 +1,40 @@
-"""The last pass of a registration: the surface settles on the scan, evenly stretched and without folds.
+"""The last pass of a registration: the surface follows the scan below its noise, evenly stretched and without folds.
 
-Rounds of three steps: measure how every triangle has turned and stretched; smooth that field, so that folds and
+Rounds of three steps: measure how every triangle has rotated and stretched; smooth that field, so that folds and
 needles, which differ from their surroundings, vanish from it; lay the triangles out as the smooth field says while
 the data draw the surface across, but not along itself. Growth that varies smoothly costs nothing, so other people
-are as welcome as other poses, and where there are no data the template continues as its surroundings turned it.
+are as welcome as other poses, and where there are no data the template continues as its surroundings rotated it.
 """
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Annotated
 
 import numpy as np
 from scipy.sparse import csc_array, diags_array
+from scipy.spatial import cKDTree
 
-from ..geometry.mesh import Mesh, check_template
-from ..geometry.sparse import Factored
-from ..ranges import Count, Positive, Range, Settings
+from ..geometry.mesh import Mesh
+from ..geometry.sparse import Factored, conjugate_gradients
+from ..geometry.surface import OrientedPoints
+from ..geometry.target import Target, orient
+from ..ranges import Positive, Settings
+from ..threads import search_threads
 from .energies import Pull, pull
-from .final_fit_data import Skin, Touch, oriented, skin_of, touch
-from .final_fit_field import Field, Triangles
-from .matches import Target, target_of
-from .shell import conjugate_gradients
+from .gradient_field import Field, Triangles
+
+NORMALS = 0.04                # of the template's size: what a difference of normals of one is worth when matching
+NEEDLE = 4.0                  # stretch against the smooth field, or its inverse, beyond which a triangle is a needle
+STIFFER, REPAIRS = 4.0, 12    # folds, needles and their neighbours grow so much stiffer, at most so often
 
 
 @dataclass(frozen=True)
-class SettleRound(Settings):
-    """One round of `settle`. Lengths are multiples of the template's size, √area.
+class FinalFitRound(Settings):
+    """One round of `final_fit`. Lengths are multiples of the template's size, √area.
 
     Attributes
     ----------
     field : float
-        Length over which turns and stretches are smoothed.
+        Length over which rotations and stretches are smoothed.
     tension : float
         Distance to the data that a gradient of one off the smooth field is worth.
     reach : float
@@ -44,8 +47,8 @@ class SettleRound(Settings):
 
 
 @dataclass(frozen=True)
-class SettleConfig(Settings):
-    """Settings of `settle`. Lengths are multiples of the template's size, √area.
+class FinalFitConfig(Settings):
+    """Settings of `final_fit`. Lengths are multiples of the template's size, √area.
 
     Attributes
     ----------
@@ -58,40 +61,22 @@ class SettleConfig(Settings):
         Force towards the start where there are no data, as a share of what the data would have.
     landmarks : float
         The share of the surface that one landmark weighs as much as.
-    normal_weight : float
-        Distance that a difference of normals of one is worth when matching.
-    neighbours : int
-        Points of the scan over which its normals are averaged, where a scan and not a `Target` is given.
-    limit : float
-        Stretch against the smooth field, or its inverse, beyond which a triangle counts as a needle.
-    stiffer : float
-        Factor by which folded triangles, needles and their neighbours grow stiffer, as often as it takes.
-    repairs : int
-        Most times of that.
-    settled : float
-        Converged when the last round moves the mean vertex by less than this.
     """
 
-    rounds: tuple[SettleRound, ...] = (
-        SettleRound(0.02, 0.007, 0.02),
-        SettleRound(0.015, 0.004, 0.015),
-        SettleRound(0.015, 0.004, 0.015),
-        SettleRound(0.015, 0.004, 0.015),
+    rounds: tuple[FinalFitRound, ...] = (
+        FinalFitRound(0.02, 0.007, 0.02),
+        FinalFitRound(0.015, 0.004, 0.015),
+        FinalFitRound(0.015, 0.004, 0.015),
+        FinalFitRound(0.015, 0.004, 0.015),
     )
     noise_width: Positive = 0.007
     slide: float = 0.05
     stay: float = 0.003
     landmarks: float = 0.0002
-    normal_weight: float = 0.04
-    neighbours: Count = 16
-    limit: Annotated[float, Range(1)] = 4.0
-    stiffer: Annotated[float, Range(1)] = 4.0
-    repairs: int = 12
-    settled: float = 0.001
 
 
 @dataclass(frozen=True, eq=False)
-class Settled:
+class FinalFit:
     """Where the surface came to lie.
 
     Attributes
@@ -99,177 +84,167 @@ class Settled:
     vertices : (N, 3) float, metres
     seen : (N,) bool
         Whether there were data here.
-    distances : (N,) float, metres
-        From each vertex seen to the smoothed scan; NaN for the others.
     noise : float, metres
         Of the scan, standard deviation across its surface.
     strain : float
         Root mean square over the area of the logarithm of the stretches against the template.
     roughness : float
         The same against the smooth field of stretches.
-    flipped : int
-        Triangles that face against their surroundings.
-    needles : int
-        Triangles stretched beyond the limit against their surroundings.
+    inverted, needles : int
+        Triangles that face against their surroundings, and that are stretched too far against them.
     iterations : int
         Rounds and repairs.
-    converged : bool
+    moved : float, metres
+        How far the last round moved the mean vertex.
     """
 
     vertices: np.ndarray
     seen: np.ndarray
-    distances: np.ndarray
     noise: float
     strain: float
     roughness: float
-    flipped: int
+    inverted: int
     needles: int
     iterations: int
-    converged: bool
+    moved: float
 
 
-def settle(template: Mesh, start: np.ndarray, target: Target | Mesh | np.ndarray,
-           landmarks: tuple[np.ndarray, np.ndarray] | None = None, config: SettleConfig | None = None,
-           confidence: np.ndarray | None = None, extra: Pull | None = None,
-           progress: Callable[[int, int], None] | None = None) -> Settled:
-    """Let a template that lies near a scan settle on it.
+def final_fit(template: Mesh, start: np.ndarray, target: Target,
+              landmarks: tuple[np.ndarray, np.ndarray] | None = None, config: FinalFitConfig | None = None) -> FinalFit:
+    """A template whose vertices (N, 3) lie near a scan, on it; landmarks are vertices (L,) and places (L, 3)."""
+    given = _prepared(template, start, target, landmarks, config or FinalFitConfig())
+    x, before, stiff = start, start, np.ones(len(template.faces))
+    for stage in given.config.rounds:
+        x, before = _laid_out(given, x, stage, stiff), x
+    repairs = 0
+    while repairs < REPAIRS and (bad := np.logical_or(*_bad(given, x, stage))).any():
+        near = np.zeros(len(x))
+        near[template.faces[bad]] = 1
+        stiff = np.where(near[template.faces].any(axis=1), STIFFER * stiff, stiff)
+        x, before = _laid_out(given, x, stage, stiff), x
+        repairs += 1
+    inverted, needles = _bad(given, x, stage)
+    measured, smooth = _fields(given, x, stage)
+    return FinalFit(x, _data(given, x, stage.reach)[1], given.scan.noise, _strain(given, measured.gradient),
+                    _strain(given, measured.gradient @ np.linalg.inv(smooth.gradient)), int(inverted.sum()),
+                    int(needles.sum()), len(given.config.rounds) + repairs,
+                    float(np.linalg.norm(x - before, axis=1).mean()))
 
-    Parameters
-    ----------
-    template : Mesh
-    start : (N, 3) float, metres
-        Its vertices near the scan.
-    target : Target, Mesh or (n, 3) float, metres
-    landmarks : (L,) int and (L, 3) float, metres, optional
-    confidence : (N,) float, optional
-        How far the data near each vertex are trusted, from 0 to 1.
-    extra : Pull, optional
-        What else draws the vertices, such as correspondences.
-    progress : callable, optional
-        Called as progress(done, total).
 
-    Raises
-    ------
-    ValueError
-        A template that is not one manifold component, vertices of another shape or not finite.
+@dataclass(frozen=True, eq=False)
+class SmoothedScan:
+    """Points and normals (n, 3) of a scan, moved to the smooth surface that fits their neighbours.
+
+    `noise` is the standard deviation, metres, of the points around the fitted surfaces; `spacing` the distance between
+    neighbours; `border` (n,) says which lie on the edge of a hole.
     """
-    config = config or SettleConfig()
-    check_template(template)
-    start, trust = _checked(template, start, confidence)
-    goal = target if isinstance(target, Target) else target_of(target, config.neighbours)
-    rest = _Settling(template, start, goal, landmarks, config, trust, extra)
-    total = len(config.rounds)
-    for k, stage in enumerate(config.rounds):
-        rest.round(stage)
-        if progress:
-            progress(k + 1, total)
-    rest.repair(config.rounds[-1])
-    return rest.result(config.rounds[-1])
+
+    points: np.ndarray
+    normals: np.ndarray
+    border: np.ndarray
+    noise: float
+    spacing: float
 
 
-class _Settling:
-    """A surface on its way: where it lies, what holds it, how stiff each triangle is."""
-
-    def __init__(self, template: Mesh, start: np.ndarray, target: Target,
-                 landmarks: tuple[np.ndarray, np.ndarray] | None, config: SettleConfig, trust: np.ndarray,
-                 extra: Pull | None) -> None:
-        self.template, self.config, self.trust, self.x, self.start = template, config, trust, start, start
-        self.size = float(np.sqrt(template.face_areas.sum()))
-        self.triangles = Triangles(template)
-        self.areas = np.maximum(template.vertex_areas, 1e-3 * template.vertex_areas.mean())
-        normals = config.normal_weight * self.size
-        self.skin: Skin = skin_of(oriented(target, template.with_vertices(start), normals),
-                                  config.noise_width * self.size)
-        self.held = self._held(start, landmarks, extra)
-        self.stiff = np.ones(len(template.faces))
-        self.iterations, self.moved = 0, np.inf
-
-    def _held(self, start: np.ndarray, landmarks: tuple[np.ndarray, np.ndarray] | None, extra: Pull | None) -> Pull:
-        N, everywhere = len(start), np.arange(len(start))
-        held = pull(N, everywhere, start, 1e-9 * self.areas)
-        if landmarks is not None:
-            weights = np.full(len(landmarks[0]), self.config.landmarks * self.size**2)
-            held += pull(N, landmarks[0], landmarks[1], weights)
-        return held if extra is None else held + extra
-
-    def field(self, length: float) -> tuple[Field, Field, np.ndarray]:
-        """The field measured, the smooth one, and the weights of triangles that agree with it."""
-        measured = self.triangles.measured(self.x)
-        weights = np.ones(len(self.template.faces))
-        for _ in range(2):
-            smooth = self.triangles.smoothed(measured, length, weights)
-            off = np.linalg.norm(measured.gradient - smooth.gradient, axis=(1, 2))
-            weights = 1 / (1 + (off / 0.5) ** 2) ** 2
-        return measured, smooth, weights
-
-    def touch(self, reach: float) -> Touch:
-        """The data near the surface as it lies."""
-        return touch(self.template.with_vertices(self.x), self.areas, self.skin, reach * self.size,
-                     self.config.slide, self.config.normal_weight * self.size, self.trust)
-
-    def round(self, stage: SettleRound) -> None:
-        """Measure, smooth, and lay out anew under the pull of the data."""
-        _, smooth, _ = self.field(stage.field * self.size)
-        data = self.touch(stage.reach)
-        # Rounds of smoothing would straighten a limb that nothing holds: there the start is all that is known.
-        free = 1 - self.trust * data.seen
-        stay = pull(len(self.x), np.arange(len(self.x)), self.start, self.config.stay * free * self.areas)
-        x = self.laid(smooth, data.wanted + self.held + stay, stage.tension * self.size)
-        self.moved = float(np.linalg.norm(x - self.x, axis=1).mean())
-        self.x = x
-        self.iterations += 1
-
-    def laid(self, field: Field, wanted: Pull, tension: float) -> np.ndarray:
-        """Vertices that come nearest to a field of gradients and to what is wanted of them."""
-        weights = tension**2 * self.triangles.areas * self.stiff
-        K = self.triangles.stiffness(weights)
-        across = np.linalg.eigvalsh(wanted.A)[:, 2]
-        nearly = Factored(csc_array(K + diags_array(across)))
-        force = self.triangles.force(weights, field.gradient) + wanted.b
-        force -= K @ self.x + np.einsum("nij,nj->ni", wanted.A, self.x)
-        return self.x + conjugate_gradients(lambda d: K @ d + np.einsum("nij,nj->ni", wanted.A, d), force,
-                                            nearly.solve)
-
-    def bad(self, length: float) -> tuple[np.ndarray, np.ndarray]:
-        """(F,) bool twice: triangles that face against their surroundings, and needles."""
-        measured, smooth, _ = self.field(length)
-        n = self.template.face_normals[..., None]
-        flipped = np.einsum("fdk,fdk->f", measured.R @ n, smooth.R @ n) < 0
-        relative = np.linalg.svd(measured.gradient @ np.linalg.inv(smooth.gradient), compute_uv=False)
-        return flipped, (relative[:, 0] > self.config.limit) | (relative[:, 2] < 1 / self.config.limit)
-
-    def repair(self, stage: SettleRound) -> None:
-        """Stiffen triangles that are folded or needles, and their neighbours, until there are none."""
-        for _ in range(self.config.repairs):
-            bad = np.logical_or(*self.bad(stage.field * self.size))
-            if not bad.any():
-                return
-            near = np.zeros(len(self.x))
-            near[self.template.faces[bad]] = 1
-            self.stiff[near[self.template.faces].any(axis=1)] *= self.config.stiffer
-            self.round(stage)
-
-    def result(self, stage: SettleRound) -> Settled:
-        """What was reached."""
-        flipped, needles = self.bad(stage.field * self.size)
-        measured, smooth, _ = self.field(stage.field * self.size)
-        found = self.touch(stage.reach)
-        return Settled(self.x, found.seen, found.distances, self.skin.noise, self._strain(measured.gradient),
-                       self._strain(measured.gradient @ np.linalg.inv(smooth.gradient)), int(flipped.sum()),
-                       int(needles.sum()), self.iterations, self.moved <= self.config.settled * self.size)
-
-    def _strain(self, gradient: np.ndarray) -> float:
-        stretch = np.log(np.linalg.svd(gradient, compute_uv=False))
-        return float(np.sqrt(np.average((stretch**2).mean(axis=1), weights=self.triangles.areas)))
+def smoothed_scan(target: Target, width: float, neighbours: int = 40) -> SmoothedScan:
+    """A scan with a quadratic surface fitted around every point; others count by a Gaussian of `width` metres."""
+    P, n = target.points, target.normals
+    apart, near = cKDTree(P).query(P, min(neighbours, len(P)), workers=search_threads(len(P)))
+    agree = np.einsum("nkd,nd->nk", n[near], n)
+    w = np.exp(-0.5 * (apart / width) ** 2) * np.maximum(agree, 0)
+    side = np.cross(n, np.eye(3)[np.argmin(np.abs(n), axis=1)])
+    side /= np.linalg.norm(side, axis=1, keepdims=True)
+    axes = np.stack([side, np.cross(n, side), n], axis=1)
+    u, v, h = np.moveaxis(np.einsum("nad,nkd->nka", axes, P[near] - P[:, None]) / width, 2, 0)
+    basis = np.stack([np.ones_like(u), u, v, u * u, u * v, v * v], axis=2)
+    weighed = basis * w[..., None]
+    normal = np.matmul(weighed.transpose(0, 2, 1), basis)
+    # Few points say little about curvature: near borders the fit falls back to a plane.
+    normal += np.diag([1e-9, 1e-2, 1e-2, 0.3, 0.3, 0.3])
+    fit = np.linalg.solve(normal, np.einsum("nkb,nk->nb", weighed, h)[..., None])[..., 0]
+    rest = np.einsum("nkb,nb->nk", basis, fit) - h
+    noise = width * np.sqrt(np.median(np.sum(w * rest**2, axis=1) / np.maximum(w.sum(axis=1), 1e-12)))
+    normals = n - fit[:, 1:2] * axes[:, 0] - fit[:, 2:3] * axes[:, 1]
+    normals /= np.linalg.norm(normals, axis=1, keepdims=True)
+    spacing = np.median(apart[:, min(4, apart.shape[1] - 1)])
+    return SmoothedScan(P + width * np.clip(fit[:, :1], -1, 1) * n, normals, target.border, float(noise),
+                        float(spacing))
 
 
-def _checked(template: Mesh, start: np.ndarray, confidence: np.ndarray | None) -> tuple[np.ndarray, np.ndarray]:
-    start = np.asarray(start, dtype=np.float64)
-    if start.shape != template.vertices.shape:
-        raise ValueError(f"start: expected shape {template.vertices.shape}, got {start.shape}")
-    if not np.isfinite(start).all():
-        raise ValueError(f"start: {(~np.isfinite(start).all(axis=1)).sum()} vertices are not finite")
-    trust = np.ones(len(start)) if confidence is None else np.asarray(confidence, dtype=np.float64)
-    if trust.shape != (len(start),) or not ((trust >= 0) & (trust <= 1)).all():
-        raise ValueError(f"confidence: expected {len(start)} numbers from 0 to 1, got shape {trust.shape}")
-    return start, trust
+@dataclass(frozen=True, eq=False)
+class _Given:
+    """What does not change: the template, where it began, the scan, what holds it everywhere."""
+
+    template: Mesh
+    start: np.ndarray
+    config: FinalFitConfig
+    size: float
+    triangles: Triangles
+    areas: np.ndarray
+    scan: SmoothedScan
+    held: Pull
+
+
+def _prepared(template: Mesh, start: np.ndarray, target: Target, landmarks: tuple[np.ndarray, np.ndarray] | None,
+              config: FinalFitConfig) -> _Given:
+    size, N = float(np.sqrt(template.face_areas.sum())), len(start)
+    areas = np.maximum(template.vertex_areas, 1e-3 * template.vertex_areas.mean())
+    scan = smoothed_scan(orient(target, template.with_vertices(start), NORMALS * size), config.noise_width * size)
+    held = pull(N, np.arange(N), start, 1e-9 * areas)
+    if landmarks is not None:
+        held += pull(N, *landmarks, np.full(len(landmarks[0]), config.landmarks * size**2))
+    return _Given(template, start, config, size, Triangles(template), areas, scan, held)
+
+
+def _fields(given: _Given, x: np.ndarray, stage: FinalFitRound) -> tuple[Field, Field]:
+    """The field of rotations and stretches measured, and the smooth one, in which what disagrees counts little."""
+    measured = given.triangles.measured(x)
+    weights = np.ones(len(given.template.faces))
+    for _ in range(2):
+        smooth = given.triangles.smoothed(measured, stage.field * given.size, weights)
+        off = np.linalg.norm(measured.gradient - smooth.gradient, axis=(1, 2))
+        weights = 1 / (1 + (off / 0.5) ** 2) ** 2
+    return measured, smooth
+
+
+def _data(given: _Given, x: np.ndarray, reach: float) -> tuple[Pull, np.ndarray]:
+    """Vertices drawn to the tangent planes of the nearest smoothed points with like normals, and which (N,) are."""
+    reach, scan, body = reach * given.size, given.scan, given.template.with_vertices(x)
+    found = OrientedPoints(scan.points, scan.normals, NORMALS * given.size).match(x, body.vertex_normals, reach)
+    # At the edge of a hole a point speaks for its own neighbourhood, not for what lies beyond the edge.
+    beside = np.linalg.norm(np.cross(scan.normals[found.index], x - scan.points[found.index]), axis=1)
+    seen = found.valid & (~scan.border[found.index] | (beside <= scan.spacing))
+    v = np.flatnonzero(seen)
+    p = found.index[v]
+    weights = given.areas[v] * np.maximum(1 - (found.distances[v] / reach) ** 2, 0) ** 2
+    return pull(len(x), v, scan.points[p], weights, scan.normals[p], given.config.slide), seen
+
+
+def _laid_out(given: _Given, x: np.ndarray, stage: FinalFitRound, stiff: np.ndarray) -> np.ndarray:
+    """Vertices that come nearest to the smooth field of gradients and to what the data want of them."""
+    _, smooth = _fields(given, x, stage)
+    wanted, seen = _data(given, x, stage.reach)
+    # Rounds of smoothing would straighten a limb that nothing holds: there the start is all that is known.
+    wanted = wanted + given.held + pull(len(x), np.arange(len(x)), given.start,
+                                        given.config.stay * ~seen * given.areas)
+    weights = (stage.tension * given.size)**2 * given.triangles.areas * stiff
+    K = given.triangles.stiffness(weights)
+    across = np.linalg.eigvalsh(wanted.A)[:, 2]
+    nearly = Factored(csc_array(K + diags_array(across)))
+    force = given.triangles.force(weights, smooth.gradient) + wanted.b
+    force -= K @ x + np.einsum("nij,nj->ni", wanted.A, x)
+    return x + conjugate_gradients(lambda d: K @ d + np.einsum("nij,nj->ni", wanted.A, d), force, nearly.solve)
+
+
+def _bad(given: _Given, x: np.ndarray, stage: FinalFitRound) -> tuple[np.ndarray, np.ndarray]:
+    """(F,) bool twice: triangles that face against their surroundings, and needles."""
+    measured, smooth = _fields(given, x, stage)
+    n = given.template.face_normals[..., None]
+    inverted = np.einsum("fdk,fdk->f", measured.R @ n, smooth.R @ n) < 0
+    relative = np.linalg.svd(measured.gradient @ np.linalg.inv(smooth.gradient), compute_uv=False)
+    return inverted, (relative[:, 0] > NEEDLE) | (relative[:, 2] < 1 / NEEDLE)
+
+
+def _strain(given: _Given, gradient: np.ndarray) -> float:
+    stretch = np.log(np.linalg.svd(gradient, compute_uv=False))
+    return float(np.sqrt(np.average((stretch**2).mean(axis=1), weights=given.triangles.areas)))

@@ -1,37 +1,36 @@
 """Non-rigid registration of a template to a scan, from stiff to soft.
 
-1. The template is placed by its landmarks and bent towards them, with no data yet.
-2. A graph of nodes that turn and grow is drawn to the scan by matches in both directions, in stages of
-   falling stiffness and rising detail; turns are unknowns, so limbs keep their volume where there are no data.
-3. The surface follows the scan as a thin shell.
+1. The template is placed by the lengths of paths to its landmarks, whatever its pose.
+2. A graph of nodes that rotate and grow is drawn to the scan by matches in both directions, in stages of falling
+   stiffness and rising detail; rotations are unknowns, so limbs keep their volume where there are no data.
+3. The surface follows the scan below its noise, evenly stretched and without inverted triangles.
 
 [Hahnel], [Allen], [Amberg]
 """
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
-from ..correspondence.correspondences import Correspondences, checked_pairs
-from ..geometry.mesh import Mesh, check_template
+from ..correspondence.correspondences import Correspondences
+from ..geometry.mesh import Mesh
 from ..meaning import HAND, extent, size, unit_problem
 from ..threads import one_thread
-from .anchors import hints_of
-from .confidence import evidence, missed_share, stretched_share
-from .fit import Fit
-from .matches import target_of
-from .schedule import GraphStage, RegistrationConfig, ShellStage
-from .shell import flipped, unfold
-from .vertex_rotations import turns
+from .confidence import evidence, stretched_share, uncovered_share
+from .final_fit import final_fit
+from .graph_fit import NORMALS, GraphFit, graph_fit
+from .inputs import Inputs, placed, prepare
+from .inverted_triangles import inverted_triangles, without_inverted
+from .rigid_links import rigid_link_fit
+from .schedule import RegistrationConfig
 
-__all__ = ["GraphStage", "Registration", "RegistrationConfig", "ShellStage", "register"]
-
-WIDER = (2,), (2, 3), (3, 4)     # rings of the patches where folds are left
-FAR = 0.01                       # of the template's size: points of the scan farther off were missed
-LOST, UNSEEN = 0.5, 0.01         # shares, of the scan missed and of the template with data, that mean nothing
-ASTRAY = 0.05                    # so much missed and so much stretched: with left and right exchanged 0.13 and 0.10
+NEAR = 0.015                     # of the template's size: data farther from a vertex are not data of that vertex
+FAR = 0.01                       # of the size: points of the scan farther off are not covered by the template
+SETTLED = 0.001                  # of the size: the last stage moves the mean vertex by less
+LOST, UNSEEN = 0.5, 0.01         # shares, of the scan not covered and of the template with data, that mean nothing
+ASTRAY = 0.05                    # so much not covered and stretched: with left and right exchanged 0.13 and 0.10
 
 
 @dataclass(frozen=True, eq=False)
@@ -56,11 +55,11 @@ class Registration:
         Steps over all stages.
     energies : dict
         Value of each term at the end of the coarse registration, and of the data at the very end.
-    flipped : int
+    inverted : int
         Triangles that face against their surroundings.
     confidence : (N,) float
         From 0, made up from the surroundings, to 1: there were data here, from both directions.
-    missed : float
+    uncovered : float
         Share of the scan's points off the template, by more than a hundredth of its size (the root of its area). More
         than half a per cent is a limb in the wrong place, or clutter; `converged` does not tell.
     """
@@ -73,9 +72,9 @@ class Registration:
     converged: bool
     iterations: int
     energies: dict[str, float]
-    flipped: int
+    inverted: int
     confidence: np.ndarray
-    missed: float
+    uncovered: float
 
 
 @one_thread()
@@ -111,36 +110,42 @@ def register(template: Mesh, scan: Mesh | np.ndarray, landmarks: tuple[np.ndarra
         three landmarks or landmarks that do not exist.
     """
     config = config or RegistrationConfig()
-    check_template(template)
-    target = target_of(scan, config.neighbours)
-    if landmarks is not None:
-        landmarks = checked_pairs(template, *landmarks, "landmarks")
-    hints = None if correspondences is None else hints_of(template, correspondences)
-    fit = Fit(template, target, landmarks, hints, config, progress or (lambda done, total: None), start)
-    for stage in fit.stages:
-        fit.bend_graph(stage)
-        if stage.twists:
-            fit.try_twists(stage)
-    for links in config.links:
-        fit.bend_links(links)
-    for round_ in config.shell:
-        fit.follow(round_)
-    if config.settle is not None:
-        fit.settle(config.settle)
-    fit.x = _without_folds(template, fit.x)
-    return _result(fit, scan)
+    given = prepare(template, scan, landmarks, correspondences)
+    stages = tuple(s for s in config.graph if s.positions == 1 or given.descriptors is not None)
+    tell = _counted(progress, sum(stage.rounds for stage in config.rigid_links or stages) + 1)
+    T = placed(given) if start is None else start
+    if config.rigid_links:
+        fit = rigid_link_fit(given, T, config.rigid_links, tell)                                    # [Hahnel]
+    else:
+        fit = graph_fit(given, T, stages, config.ends, tell)
+    if config.final_fit is not None:
+        final = final_fit(template, fit.x, given.target, given.landmarks, config.final_fit)
+        fit = replace(fit, x=final.vertices, energies={**fit.energies, "strain": final.strain},
+                      iterations=fit.iterations + final.iterations, moved=final.moved)
+    tell(1)
+    return _result(given, replace(fit, x=without_inverted(template, fit.x)), scan)
+
+
+def _counted(progress: Callable[[int, int], None] | None, total: int) -> Callable[[int], None]:
+    """A callback that takes the steps done since the last call."""
+    done = 0
+
+    def tell(steps: int) -> None:
+        nonlocal done
+        done += steps
+        if progress:
+            progress(done, total)
+
+    return tell
 
 
 def registration_problem(template: Mesh, scan: Mesh | np.ndarray, fit: Registration, marked: bool) -> str | None:
     """Why a registration means nothing, with the likely cause; None where it means something.
 
-    Parameters
-    ----------
-    marked : bool
-        Whether landmarks led it.
+    `marked` is whether landmarks led it.
     """
     points = scan.vertices if isinstance(scan, Mesh) else scan
-    far, seen, stretch = fit.missed, float(fit.seen.mean()), stretched_share(template, fit.mesh)
+    far, seen, stretch = fit.uncovered, float(fit.seen.mean()), stretched_share(template, fit.mesh)
     off = fit.landmark_rms > HAND * size(template)
     if not (far > LOST or seen < UNSEEN or (far > ASTRAY and stretch > ASTRAY) or off):
         return None
@@ -153,33 +158,18 @@ def registration_problem(template: Mesh, scan: Mesh | np.ndarray, fit: Registrat
             f"{100 * stretch:.0f}% of it is stretched or shrunk to the double or half{marks}; {cause}")
 
 
-def _without_folds(template: Mesh, x: np.ndarray) -> np.ndarray:
-    """Vertices (N, 3) where patches around turned triangles were laid anew, wider ones while that leaves fewer."""
-    x = unfold(template, x, turns(template, x))
-    left = int(flipped(template, x, turns(template, x)).sum())
-    for rings in WIDER:
-        if not left:
-            break
-        trial = unfold(template, x, turns(template, x), rings)
-        turned = int(flipped(template, trial, turns(template, trial)).sum())
-        if turned < left:
-            x, left = trial, turned
-    return x
-
-
-def _result(fit: Fit, scan: Mesh | np.ndarray) -> Registration:
+def _result(given: Inputs, fit: GraphFit, scan: Mesh | np.ndarray) -> Registration:
     """What was found, measured against the whole scan."""
-    folded = flipped(fit.template, fit.x, turns(fit.template, fit.x))
-    body = fit.template.with_vertices(fit.x)
-    found = evidence(body, fit.target, fit.config.near * fit.size,
-                     fit.config.normal_weight * fit.size)
+    body = given.template.with_vertices(fit.x)
+    found = evidence(body, given.target, NEAR * given.size, NORMALS * given.size)
     seen = found.confidence >= 0.5
     distances = np.where(seen, found.distances, np.nan)
     landmark_rms = np.nan
-    if fit.landmarks is not None:
-        apart = np.linalg.norm(fit.x[fit.landmarks[0]] - fit.landmarks[1], axis=1)
+    if given.landmarks is not None:
+        apart = np.linalg.norm(fit.x[given.landmarks[0]] - given.landmarks[1], axis=1)
         landmark_rms = float(np.sqrt(np.mean(apart**2)))
     return Registration(body, distances, seen,
                         float(np.sqrt(np.mean(distances[seen] ** 2))) if seen.any() else np.nan, landmark_rms,
-                        bool(fit.converged and seen.any()), fit.iterations, fit.energies, int(folded.sum()),
-                        found.confidence, missed_share(scan, body, FAR * fit.size))
+                        bool(fit.moved <= SETTLED * given.size and seen.any()), fit.iterations, fit.energies,
+                        int(inverted_triangles(given.template, fit.x).sum()), found.confidence,
+                        uncovered_share(scan, body, FAR * given.size))

@@ -4,9 +4,7 @@ from __future__ import annotations
 from dataclasses import dataclass, field
 
 from ..ranges import Cell, Count, Positive, Settings
-from .affine import LinkStage, allen_stages, amberg_stages, hahnel_stages
-from .final_fit import SettleConfig
-from .limb_twists import TwistConfig
+from .final_fit import FinalFitConfig
 
 
 @dataclass(frozen=True)
@@ -18,26 +16,26 @@ class GraphStage(Settings):
     nodes : int
         Nodes of the graph.
     stretch, bend, growth : float
-        Resistance of the nodes, as the distance to the data that a strain, a turn by a radian between
+        Resistance of the nodes, as the distance to the data that a strain, a rotation by a radian between
         neighbours, or a growth by e between them is worth.
     landmarks : float
         The share of the surface that one landmark weighs as much as.
     reach : float
-        Farthest match that counts; 0 leaves the scan out.
+        Farthest match that counts.
     slide : float
         Force of a match along the surface, as a share of that across it.
     rounds : int
-        Times that matches are sought anew; without matches, most steps.
+        Times that matches are sought anew.
     detail : float
         Spacing to which scan and template are thinned for matching.
-    place : float
+    positions : float
         How much positions count when matches are sought; 0 seeks by paths alone.
     paths : float
         Distance that a difference by e between path lengths to the landmarks is worth when matching.
-    twists : bool
-        Afterwards, see whether ends of the body are turned about themselves.
     hints : float
         The share of the surface that all given correspondences together weigh as much as.
+    ends : bool
+        Afterwards, see whether ends of the body are rotated about themselves.
     """
 
     nodes: Count
@@ -45,35 +43,46 @@ class GraphStage(Settings):
     bend: Positive
     growth: Positive
     landmarks: float
-    reach: float
+    reach: Positive
     slide: float = 0.02
     rounds: Count = 2
     detail: Cell = 0.02
-    place: float = 1.0
+    positions: float = 1.0
     paths: float = 0.0
     hints: float = 0.0
-    twists: bool = False
+    ends: bool = False
 
 
 @dataclass(frozen=True)
-class ShellStage(Settings):
-    """One round of the last pass. Lengths are multiples of the template's size, √area.
+class RigidLinkStage(Settings):
+    """One stage of a registration by rigid links [Hahnel]. Lengths are multiples of the template's size, √area.
 
     Attributes
     ----------
-    smoothing : float
-        Details smaller than this are damped.
-    tension : float
-        Distance to the data that a gradient of one is worth.
-    landmarks, reach, slide : float
-        As in `GraphStage`.
+    nodes : int
+        Nodes that are linked.
+    length : float
+        Length over which the links resist: what is much smaller is not followed.
+    landmarks : float
+        The share of the surface that one landmark weighs as much as.
+    reach : float
+        Farthest match that counts; 0 leaves the scan out.
+    rounds : int
+        Times that matches are sought anew.
     """
 
-    smoothing: float
-    tension: Positive
+    nodes: Count
+    length: Positive
     landmarks: float
-    reach: Positive
-    slide: float = 0.02
+    reach: float
+    rounds: Count
+
+
+def hahnel_stages() -> tuple[RigidLinkStage, ...]:
+    """Drawn to the landmarks first, then to the scan with ever softer links [Hahnel]."""
+    first = tuple(RigidLinkStage(500, 0.7, held, 0.0, 8) for held in (0.001, 0.1, 10.0))
+    coarse = tuple(RigidLinkStage(500, length, 0.01, 2 * length, 3) for length in (0.2, 0.1, 0.06, 0.04))
+    return first + coarse + tuple(RigidLinkStage(2000, length, 0.005, 0.04, 3) for length in (0.04, 0.02))
 
 
 @dataclass(frozen=True)
@@ -82,66 +91,31 @@ class RegistrationConfig(Settings):
 
     Attributes
     ----------
-    graph : stages of the coarse registration
-    links : stages of a published regulariser, after or instead of those of the graph (see `published`)
-    shell : rounds in which the surface follows the scan as a thin shell
-    twists : TwistConfig
-        The search for ends of the body that are turned about themselves.
-    settle : SettleConfig or None
-        The last pass.
-    path_cell : float
-        Spacing of the points that paths to the landmarks run over, as a multiple of the template's size.
-    neighbours : int
-        Points of the scan over which its normals are averaged.
-    normal_weight : float
-        Distance, as a multiple of the template's size, that a difference of normals of one is worth when
-        matching.
-    near : float
-        Data farther from a vertex than this multiple of the size are not data of that vertex.
-    settled : float
-        Converged when the last round moves the mean vertex by less than this multiple of the size.
+    graph : stages of the coarse registration by a deformation graph
+    rigid_links : stages of the method of [Hahnel], which then takes the place of the graph
+    ends : int
+        How many ends of the body are tried in other rotations about themselves; 0 leaves that out.
+    final_fit : FinalFitConfig or None
+        The last pass: the surface follows the scan below its noise.
     """
 
     graph: tuple[GraphStage, ...] = (
-        GraphStage(300, 0.7, 0.07, 2.0, 0.1, 1.0, 1.0, rounds=4, place=0.0, paths=0.3, hints=1.0),
-        GraphStage(300, 0.5, 0.05, 2.0, 0.1, 0.3, 0.3, rounds=5, place=0.3, paths=0.3, hints=1.0),
+        GraphStage(300, 0.7, 0.07, 2.0, 0.1, 1.0, 1.0, rounds=4, positions=0.0, paths=0.3, hints=1.0),
+        GraphStage(300, 0.5, 0.05, 2.0, 0.1, 0.3, 0.3, rounds=5, positions=0.3, paths=0.3, hints=1.0),
         GraphStage(300, 0.3, 0.03, 0.7, 0.05, 0.2, 0.1, rounds=4, paths=0.2, hints=0.5),
         GraphStage(300, 0.2, 0.02, 0.7, 0.01, 0.15, 0.05, rounds=5, paths=0.1, hints=0.2),
         GraphStage(300, 0.13, 0.013, 0.7, 0.01, 0.11, 0.0, rounds=4, paths=0.05, hints=0.1),
         GraphStage(300, 0.09, 0.009, 0.7, 0.01, 0.08, 0.0, rounds=4),
         GraphStage(300, 0.06, 0.006, 0.7, 0.01, 0.06, 0.0, rounds=4),
-        GraphStage(300, 0.02, 0.002, 0.7, 0.01, 0.05, 0.0, rounds=5, twists=True),
+        GraphStage(300, 0.02, 0.002, 0.7, 0.01, 0.05, 0.0, rounds=5, ends=True),
         GraphStage(1000, 0.02, 0.002, 0.35, 0.01, 0.037, detail=0.008),
         GraphStage(1000, 0.015, 0.0015, 0.35, 0.005, 0.028, detail=0.008),
     )
-    links: tuple[LinkStage, ...] = ()
-    shell: tuple[ShellStage, ...] = ()
-    twists: TwistConfig = field(default_factory=TwistConfig)
-    settle: SettleConfig | None = field(default_factory=SettleConfig)
-    path_cell: Cell = 0.012
-    neighbours: Count = 16
-    normal_weight: float = 0.04
-    near: Positive = 0.015
-    settled: float = 0.001
+    rigid_links: tuple[RigidLinkStage, ...] = ()
+    ends: int = 5
+    final_fit: FinalFitConfig | None = field(default_factory=FinalFitConfig)
 
-
-PUBLISHED = {"hahnel": hahnel_stages, "allen": allen_stages, "amberg": amberg_stages}
-
-
-def published(method: str) -> RegistrationConfig:
-    """Settings with the regulariser of a published method in place of ours, and without our last pass.
-
-    Parameters
-    ----------
-    method : "hahnel", "allen" or "amberg"
-
-    Raises
-    ------
-    ValueError
-        Another name.
-
-    [Hahnel], [Allen], [Amberg]
-    """
-    if method not in PUBLISHED:
-        raise ValueError(f"method: expected one of {', '.join(PUBLISHED)}, got {method!r}")
-    return RegistrationConfig(graph=(), links=PUBLISHED[method](), settle=None)
+    @classmethod
+    def published(cls) -> RegistrationConfig:
+        """The registration that [SCAPE] used: rigid links between neighbours [Hahnel], and no pass after it."""
+        return cls(graph=(), rigid_links=hahnel_stages(), final_fit=None)

@@ -13,19 +13,7 @@ SMALLEST = 6           # edges; smaller borders are pinholes, each by itself
 
 
 def group_loops(mesh: Mesh, loops: list[np.ndarray]) -> list[list[np.ndarray]]:
-    """Borders that face each other put together, as the two ends where a limb was cut through.
-
-    Parameters
-    ----------
-    mesh : Mesh
-    loops : list of (n,) int
-        As from `Mesh.boundary_loops`.
-
-    Returns
-    -------
-    list of lists of (n,) int
-        In the order of the first loop of each.
-    """
+    """Borders that face each other put together, as the two ends where a limb was cut through; order as of `loops`."""
     large = [number for number, loop in enumerate(loops) if len(loop) >= SMALLEST]
     label = np.arange(len(loops))
     if len(large) > 1:
@@ -43,18 +31,9 @@ def group_loops(mesh: Mesh, loops: list[np.ndarray]) -> list[list[np.ndarray]]:
 
 
 def joined_polygon(vertices: np.ndarray, loops: list[np.ndarray]) -> np.ndarray:
-    """One polygon from several loops, cut open along the shortest lines between them.
+    """One polygon (m,) from several loops, cut open along the shortest lines between them.
 
-    Parameters
-    ----------
-    vertices : (N, 3) float, metres
-    loops : list of (n,) int
-        All in the direction of the sides of the triangles at the border.
-
-    Returns
-    -------
-    (m,) int
-        The vertices at the ends of a cut are named twice.
+    The vertices at the ends of a cut are named twice. All loops run as the sides of the triangles at the border do.
     """
     polygon = loops[0]
     rest = list(loops[1:])

@@ -7,28 +7,18 @@ import numpy as np
 from scipy.sparse import csc_array, csr_array, diags_array
 from scipy.spatial import cKDTree
 
-from ..decimation.remeshing import clamped_cotangents, flip_edges, mean_of_neighbours
 from ..geometry.mesh import Mesh
+from ..geometry.remeshing import clamped_cotangents, flip_edges, mean_of_neighbours
 from ..geometry.sparse import factor
 from ..geometry.surface import Rays
 from .intersections import intersecting_faces
 from .triangulate import triangulate_loop
 
 RIM_BEND, PATCH_BEND = 2.0, 4.0      # bends, in curvature times radius of the hole, that count less than squared
-REWEIGHTINGS = 3
-RETRIES = 5
 
 
 class Patch:
-    """New triangles and vertices, and the triangles `around` the holes, which stay.
-
-    Parameters
-    ----------
-    around : Mesh
-        All triangles that touch a rim.
-    rim : (n,) bool
-        Its vertices on the borders to close.
-    """
+    """New triangles and vertices, and the triangles `around` the holes, which stay: all that touch a rim (n,) bool."""
 
     def __init__(self, around: Mesh, rim: np.ndarray) -> None:
         self.mesh, self.rim = around, rim
@@ -38,20 +28,11 @@ class Patch:
     def _new(self) -> np.ndarray:
         return np.arange(len(self.mesh.faces)) >= self.old_faces
 
-    def triangulate(self, loops: list[np.ndarray], largest: int, rays: Rays,
-                    progress: Callable[[int, int], None] | None) -> None:
+    def triangulate(self, loops: list[np.ndarray], rays: Rays, progress: Callable[[int, int], None] | None) -> None:
         """Triangles between the existing vertices only, or a fan about a new one where that is impossible.
 
-        Parameters
-        ----------
-        loops : list of (n,) int
-            Vertices in the direction of the existing triangles' sides; a polygon may name a vertex twice where two
-            borders are joined by a cut.
-        largest : int
-            Longest loop that is triangulated as a whole.
-        rays : Rays
-            Of the existing surface, which the new triangles should not run through.
-        progress : callback(done, total), optional
+        Loops (n,) run as the existing triangles' sides do; a polygon may name a vertex twice where two borders are
+        joined by a cut. `rays` are those of the existing surface, which the new triangles should not run through.
         """
         around = self.mesh
         normal_of = _border_normals(around)
@@ -70,7 +51,7 @@ class Patch:
                 for a, b in np.concatenate(chords).tolist():
                     if a in place and b in place:
                         joined[place[a], place[b]] = joined[place[b], place[a]] = True
-            found = _clear_triangles(around, ring, rim_normals, joined, largest, rays)
+            found = _clear_triangles(around, ring, rim_normals, joined, rays)
             if found is None:
                 centre = sum(map(len, extra))
                 extra.append(around.vertices[ring].mean(axis=0, keepdims=True))
@@ -83,14 +64,13 @@ class Patch:
                 progress(done + 1, len(loops))
         self.mesh = Mesh(np.concatenate(extra), np.concatenate(triangles))
 
-    def flip(self, min_cosine: float) -> None:
-        """Turn edges between new triangles."""
-        self.mesh = flip_edges(self.mesh, self._new, rounds=10, min_cosine=min_cosine)
+    def _flip(self) -> None:
+        self.mesh = flip_edges(self.mesh, self._new, rounds=10, min_cosine=-1)
 
     def refine(self, density: float) -> None:
         """Cut triangles at their centroids until they are as small as those around the hole."""
         size = self._edge_size()
-        self.flip(min_cosine=-1)
+        self._flip()
         for _ in range(25):
             v, faces = self.mesh.vertices, self.mesh.faces[self.old_faces:]
             centre = v[faces].mean(axis=1)
@@ -107,7 +87,7 @@ class Patch:
             self.mesh = Mesh(np.concatenate([v, centre[cut]]),
                              np.concatenate([self.mesh.faces[:self.old_faces], faces, more]))
             size = np.concatenate([size, wanted[cut]])
-            self.flip(min_cosine=-1)
+            self._flip()
 
     def _edge_size(self) -> np.ndarray:
         """Mean length of the existing edges at every vertex; for a vertex without one, the mean of all."""
@@ -124,13 +104,7 @@ class Patch:
 
         The energy is the squared mean curvature, but large curvatures count less than by their square: a patch
         may meet its rim in an edge (soles) or keep a crease (armpits) where being round would take it far away.
-
-        Parameters
-        ----------
-        targets : (f, 3) float, metres, optional
-            Places that draw the new vertices.
-        strength : float
-            Of their pull, for a hole of radius 1.
+        Targets (f, 3) draw the new vertices; `strength` is that of their pull for a hole of radius 1.
         """
         free = np.arange(self.old_vertices, len(self.mesh.vertices))
         if not len(free):
@@ -145,7 +119,7 @@ class Patch:
         pull = np.zeros(len(free))
         if targets is not None:
             pull = strength * area[len(rim):] / self._radii()[free] ** 4
-        for _ in range(REWEIGHTINGS + 1):
+        for _ in range(4):                       # three times reweighted
             b = csr_array(laplacian.multiply(np.sqrt(weight / area)[:, None])).tocsc()
             known = b[:, :self.old_vertices] @ self.mesh.vertices[:self.old_vertices]
             inner = b[:, free]
@@ -167,14 +141,7 @@ class Patch:
         return np.sqrt(np.maximum(area, 1e-12) / np.pi)[patch]
 
     def untangle(self, start: np.ndarray, rounds: int = 10) -> None:
-        """Take new vertices back towards `start` (n, 3) around triangles that run through others.
-
-        Parameters
-        ----------
-        start : (n, 3) float, metres
-            The vertices before fairing.
-        rounds : int
-        """
+        """Take new vertices back towards `start` (n, 3), before fairing, around triangles that run through others."""
         goal, share = self.mesh.vertices, np.ones(len(self.mesh.vertices))
         near = mean_of_neighbours(self.mesh)
         patch = Mesh(goal, self.mesh.faces[self.old_faces:]).vertex_component
@@ -211,17 +178,18 @@ def _border_normals(mesh: Mesh) -> dict[tuple[int, int], np.ndarray]:
     return {(int(p), int(q)): normal for p, q, normal in zip(a, b, mesh.face_normals[face], strict=True)}
 
 
-def _clear_triangles(around: Mesh, ring: np.ndarray, rim_normals: np.ndarray, joined: np.ndarray, largest: int,
-                     rays: Rays) -> np.ndarray | None:
+def _clear_triangles(around: Mesh, ring: np.ndarray, rim_normals: np.ndarray, joined: np.ndarray, rays: Rays
+                     ) -> np.ndarray | None:
     """The triangles (n - 2, 3) across a ring, as far as possible without running through anything or each other."""
     points = around.vertices[ring]
-    dear = _price(points) * _pierced(points, joined, rays)
+    most = float(4 * np.linalg.norm(points - np.roll(points, 1, axis=0), axis=1).sum())    # than all bends together
+    price = most * _pierced(points, joined, rays)
     best, fewest = None, np.inf
     corners = around.corners                    # what overlaps the box of the ring; the new triangles lie inside it
     near = around.faces[((corners.max(axis=1) >= points.min(axis=0))
                          & (corners.min(axis=1) <= points.max(axis=0))).all(axis=1)]
-    for _ in range(RETRIES):
-        found = triangulate_loop(points, rim_normals, joined, largest, dear)
+    for _ in range(5):
+        found = triangulate_loop(points, rim_normals, joined, price)
         if found is None:
             return best
         mesh = Mesh(around.vertices, np.concatenate([near, ring[found]]))
@@ -232,14 +200,9 @@ def _clear_triangles(around: Mesh, ring: np.ndarray, rim_normals: np.ndarray, jo
             break
         bad = np.unique(pairs[pairs >= len(near)]) - len(near)
         sides = found[bad][:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
-        dear[sides[:, 0], sides[:, 1]] += _price(points)
-        dear = np.maximum(dear, dear.T)
+        price[sides[:, 0], sides[:, 1]] += most
+        price = np.maximum(price, price.T)
     return best
-
-
-def _price(points: np.ndarray) -> float:
-    """More than all bends of a loop together."""
-    return float(4 * np.linalg.norm(points - np.roll(points, 1, axis=0), axis=1).sum())
 
 
 def _pierced(points: np.ndarray, joined: np.ndarray, rays: Rays) -> np.ndarray:

@@ -7,24 +7,13 @@ from scipy.spatial import cKDTree
 from ..geometry.mesh import Mesh
 
 FOLD = -1 + 1e-6           # cosine between the normals of neighbours that lie flat on each other
-SIDES = ((0, 1), (1, 2), (2, 0))
 
 
 def intersecting_faces(mesh: Mesh, among: np.ndarray | None = None) -> np.ndarray:
-    """Pairs of triangles that cross or lie folded onto each other.
+    """Pairs (n, 2), lower number first, of triangles that cross or lie folded onto each other.
 
-    Triangles that only touch, in shared vertices and edges or elsewhere, do not count.
-
-    Parameters
-    ----------
-    mesh : Mesh
-    among : (n,) int or (F,) bool, optional
-        Triangles of which at least one is in every pair; all when not given.
-
-    Returns
-    -------
-    (n, 2) int
-        Triangles, the lower number first.
+    Triangles that only touch, in shared vertices and edges or elsewhere, do not count. At least one of each pair is
+    `among` some, (n,) int or (F,) bool.
     """
     rows = np.arange(len(mesh.faces)) if among is None else np.arange(len(mesh.faces))[among]
     pairs = _near(mesh, rows)
@@ -35,7 +24,7 @@ def intersecting_faces(mesh: Mesh, among: np.ndarray | None = None) -> np.ndarra
     shared = same.any(axis=2).sum(axis=1)
     crossing = np.zeros(len(pairs), dtype=bool)
     for one, other, known in ((f, g, same.any(axis=2)), (g, f, same.any(axis=1))):
-        for p, q in SIDES:
+        for p, q in ((0, 1), (1, 2), (2, 0)):
             free = ~known[:, p] & ~known[:, q] & (shared < 2)             # a side at a shared vertex only touches
             crossing[free] |= _pierces(mesh.vertices[one[free, p]], mesh.vertices[one[free, q]],
                                        mesh.vertices[other[free]])

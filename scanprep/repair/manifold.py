@@ -1,37 +1,17 @@
 """Meshes made manifold: no double or flat triangles, no sheets that touch, no loose pieces."""
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components
 
 from ..geometry.mesh import Mesh
 from ..geometry.surface import Rays
-from ..ranges import Settings, Share
+
+FLAT = 1e-12               # square metres: no area
 
 
-@dataclass(frozen=True)
-class RepairConfig(Settings):
-    """Settings of `repair`.
-
-    Attributes
-    ----------
-    weld : float, metres
-        Vertices closer than this become one; 0 for exactly equal ones.
-    min_area : float, square metres
-        Smaller triangles are removed.
-    min_component : float
-        Pieces with a smaller share of the vertices of the largest one are dropped; 1 keeps the largest alone.
-    """
-
-    weld: float = 1e-7
-    min_area: float = 1e-12
-    min_component: Share = 1.0
-
-
-def repair(mesh: Mesh, config: RepairConfig | None = None) -> Mesh:
+def repair(mesh: Mesh, min_component: float = 1.0) -> Mesh:
     """The nearest mesh that is manifold, with nothing double, flat, unused or loose in it.
 
     Triangles are turned over where neighbours disagree and else only ever removed, so holes may open; where sheets
@@ -40,7 +20,8 @@ def repair(mesh: Mesh, config: RepairConfig | None = None) -> Mesh:
     Parameters
     ----------
     mesh : Mesh
-    config : RepairConfig, optional
+    min_component : float
+        Pieces with a smaller share of the vertices of the largest one are dropped; 1 keeps the largest alone.
 
     Returns
     -------
@@ -51,21 +32,19 @@ def repair(mesh: Mesh, config: RepairConfig | None = None) -> Mesh:
     ValueError
         No triangle is left.
     """
-    config = config or RepairConfig()
-    mesh = weld(mesh, config.weld)
-    mesh = orient(drop_flat(mesh, config.min_area))
+    mesh = orient(_drop_flat(weld(mesh, 1e-7)))
     for _ in range(20):
         if mesh.is_edge_manifold:
             break
         mesh = _drop_at_bad_edges(mesh)
-    mesh = drop_small_components(split_vertices(mesh), config.min_component)
+    mesh = drop_small_components(split_vertices(mesh), min_component)
     if not len(mesh.faces):
         raise ValueError("mesh: no triangle is left after repair")
     return mesh
 
 
 def weld(mesh: Mesh, distance: float = 0.0) -> Mesh:
-    """Vertices that coincide made one; triangles that lose a corner by it, and repeated ones, removed."""
+    """Vertices closer than `distance` metres made one, without triangles that lose a corner by it or are repeated."""
     key = np.round(mesh.vertices / distance) if distance > 0 else mesh.vertices
     rows = np.lexsort(key.T)
     new = np.empty(len(key), dtype=np.int64)
@@ -84,10 +63,10 @@ def weld(mesh: Mesh, distance: float = 0.0) -> Mesh:
     return welded.submesh(np.arange(len(welded.faces)))[0]
 
 
-def drop_flat(mesh: Mesh, min_area: float = 1e-12) -> Mesh:
+def _drop_flat(mesh: Mesh) -> Mesh:
     """Triangles without area removed by collapsing their shortest side, where that harms no neighbour."""
     for _ in range(10):
-        flat = np.flatnonzero(mesh.face_areas < min_area)
+        flat = np.flatnonzero(mesh.face_areas < FLAT)
         if not len(flat):
             return mesh
         corners = mesh.corners[flat]
@@ -98,7 +77,7 @@ def drop_flat(mesh: Mesh, min_area: float = 1e-12) -> Mesh:
         moved = mesh.vertices[target[target]]
         faces = target[target][mesh.faces]
         mesh = weld(Mesh(moved, faces, mesh.colors))
-    return mesh.submesh(mesh.face_areas >= min_area)[0]
+    return mesh.submesh(mesh.face_areas >= FLAT)[0]
 
 
 def orient(mesh: Mesh) -> Mesh:
@@ -119,10 +98,10 @@ def orient(mesh: Mesh) -> Mesh:
     rows, columns = np.r_[a, a + count], np.r_[np.where(agree, b, b + count), np.where(agree, b + count, b)]
     _, patch = connected_components(coo_array((np.ones(len(rows)), (rows, columns)), shape=(2 * count, 2 * count)),
                                     directed=False)
-    as_is, turned = patch[:count], patch[count:]
+    as_is, inverted = patch[:count], patch[count:]
     area = np.bincount(as_is, mesh.face_areas, patch.max() + 1)     # of what a patch leaves as it is
-    turn = area[turned] > area[as_is]
-    turn |= (area[turned] == area[as_is]) & (turned < as_is)
+    turn = area[inverted] > area[as_is]
+    turn |= (area[inverted] == area[as_is]) & (inverted < as_is)
     return Mesh(mesh.vertices, np.where(turn[:, None], mesh.faces[:, ::-1], mesh.faces), mesh.colors)
 
 
@@ -144,15 +123,11 @@ def _drop_at_bad_edges(mesh: Mesh) -> Mesh:
 def split_vertices(mesh: Mesh, across_holes: bool = False) -> Mesh:
     """A copy of a vertex for every fan of triangles around it beyond the first.
 
-    Parameters
-    ----------
-    mesh : Mesh
-    across_holes : bool
-        Leave fans together that will be one when the holes between them are filled.
+    `across_holes` leaves fans together that will be one when the holes between them are filled.
     """
     if mesh.is_vertex_manifold:
         return mesh
-    fan = corner_fans(mesh)
+    fan = mesh.corner_fans
     number = (_joined_by_holes(mesh, fan)[fan] if across_holes else fan).ravel()
     _, first, new = np.unique(number, return_index=True, return_inverse=True)
     owner = mesh.faces.ravel()[first]
@@ -163,25 +138,6 @@ def split_vertices(mesh: Mesh, across_holes: bool = False) -> Mesh:
     source = np.concatenate([np.arange(len(mesh.vertices)), owner[order][duplicate]])
     colors = None if mesh.colors is None else mesh.colors[source]
     return Mesh(mesh.vertices[source], place[new.reshape(-1)].reshape(-1, 3), colors)
-
-
-def corner_fans(mesh: Mesh) -> np.ndarray:
-    """(F, 3) number of the fan each corner belongs to; corners at a vertex share it when edges join them."""
-    edge, corner = mesh.face_edges, np.arange(mesh.faces.size).reshape(-1, 3)
-    rows = []
-    for side in range(3):
-        following = (side + 1) % 3
-        swap = mesh.faces[:, side] > mesh.faces[:, following]
-        low = np.where(swap, corner[:, following], corner[:, side])
-        high = np.where(swap, corner[:, side], corner[:, following])
-        rows.append(np.stack([edge[:, side], low, high], axis=1))
-    row = np.concatenate(rows)
-    row = row[np.argsort(row[:, 0], kind="stable")]
-    same = row[1:, 0] == row[:-1, 0]
-    a, b = np.r_[row[:-1, 1][same], row[:-1, 2][same]], np.r_[row[1:, 1][same], row[1:, 2][same]]
-    n = mesh.faces.size
-    _, fan = connected_components(coo_array((np.ones(len(a)), (a, b)), shape=(n, n)), directed=False)
-    return fan.reshape(-1, 3)
 
 
 def _joined_by_holes(mesh: Mesh, fan: np.ndarray) -> np.ndarray:
@@ -222,24 +178,3 @@ def drop_thin(mesh: Mesh, thinnest: float) -> Mesh:
     _, depth = Rays(mesh).cast(middle + 1e-4 * inward, inward, 10 * thinnest)
     thick = ~(depth < thinnest)
     return drop_small_components(mesh.submesh(thick)[0], 1.0) if not thick.all() else mesh
-
-
-def peel_border(mesh: Mesh, rings: int, smallest: int = 40) -> Mesh:
-    """Without the outermost rings of triangles along borders, where scans are least certain.
-
-    Parameters
-    ----------
-    mesh : Mesh
-    rings : int
-    smallest : int
-        Borders of fewer edges are pinholes and keep their triangles.
-    """
-    for _ in range(rings):
-        loops = [loop for loop in mesh.boundary_loops if len(loop) >= smallest]
-        if not loops:
-            break
-        on_border = np.zeros(len(mesh.vertices), dtype=bool)
-        on_border[np.concatenate(loops)] = True
-        mesh = drop_small_components(mesh.submesh(~on_border[mesh.faces].any(axis=1))[0], 1.0)
-        mesh = split_vertices(mesh)
-    return mesh

@@ -5,45 +5,33 @@ import heapq
 
 import numpy as np
 
+LARGEST = 120            # vertices of a loop whose triangulation is found by dynamic programming as a whole
 AREA_SHARE = 0.01        # what the area, over the size of the loop, adds to the bends: it decides where all is flat
 
 
 def triangulate_loop(points: np.ndarray, rim_normals: np.ndarray, forbidden: np.ndarray,
-                     largest: int = 300, dear: np.ndarray | None = None) -> np.ndarray | None:
-    """The triangles across a loop that bend least along their edges and, where nothing bends, have the smallest area.
+                     price: np.ndarray | None = None) -> np.ndarray | None:
+    """The triangles (n - 2, 3) across a loop (n, 3) that bend least and, where nothing bends, have the smallest area.
 
     An edge of length l between triangles whose normals have the cosine c costs l (1 - c)²: a few sharp bends are
     dearer than many soft ones, but a crease along the bottom of an armpit is cheaper than a web across it, which
     bends sharply along both of its sides. Dynamic programming over all triangulations, O(n³); of longer loops,
     ears are cut off first.
 
-    Parameters
-    ----------
-    points : (n, 3) float, metres
-        In the direction in which the new triangles run along the loop.
-    rim_normals : (n, 3) float
-        Normal of the surface on the other side of each edge i, i + 1.
-    forbidden : (n, n) bool
-        Pairs that must not be joined because an edge joins them already.
-    largest : int
-        Longest loop that is solved as a whole.
-    dear : (n, n) float, metres, optional
-        What joining a pair costs beside its bend.
-
-    Returns
-    -------
-    (n - 2, 3) int, or None when every triangulation needs a forbidden edge
+    The loop runs as the new triangles do; `rim_normals` (n, 3) are those of the surface beyond each edge i, i + 1.
+    Pairs that are `forbidden` (n, n), because an edge joins them already, are not joined, and joining costs `price`
+    (n, n), metres, beside the bend. None when every triangulation needs a forbidden edge.
 
     [Liepa] hole triangulation
     """
-    kept, ears = _cut_ears(points, rim_normals, forbidden, largest)
+    kept, ears = _cut_ears(points, rim_normals, forbidden)
     normals = _chord_normals(points, rim_normals, kept, ears) if ears else rim_normals
-    price = np.zeros((len(kept), len(kept))) if dear is None else dear[np.ix_(kept, kept)]
-    inner = _least_weight(points[kept], normals, forbidden[np.ix_(kept, kept)], price)
+    price = np.zeros((len(points), len(points))) if price is None else price
+    inner = _least_weight(points[kept], normals, forbidden[np.ix_(kept, kept)], price[np.ix_(kept, kept)])
     return None if inner is None else np.concatenate([np.asarray(ears, dtype=int).reshape(-1, 3), kept[inner]])
 
 
-def _least_weight(p: np.ndarray, rim: np.ndarray, forbidden: np.ndarray, dear: np.ndarray) -> np.ndarray | None:
+def _least_weight(p: np.ndarray, rim: np.ndarray, forbidden: np.ndarray, price: np.ndarray) -> np.ndarray | None:
     n = len(p)
     cost = np.full((n, n), np.inf)
     normal, choice = np.zeros((n, n, 3)), np.zeros((n, n), dtype=np.int64)
@@ -71,7 +59,7 @@ def _least_weight(p: np.ndarray, rim: np.ndarray, forbidden: np.ndarray, dear: n
         row = np.arange(n - span)
         i, k = i[:, 0], k[:, 0]
         closed = forbidden[i, k] & (span < n - 1)
-        cost[i, k] = np.where(closed, np.inf, total[row, best] + dear[i, k])
+        cost[i, k] = np.where(closed, np.inf, total[row, best] + price[i, k])
         normal[i, k], choice[i, k] = across[row, best], best + i + 1
     if not np.isfinite(cost[0, n - 1]):
         return None
@@ -85,9 +73,9 @@ def _least_weight(p: np.ndarray, rim: np.ndarray, forbidden: np.ndarray, dear: n
     return np.array(triangles)
 
 
-def _cut_ears(points: np.ndarray, rim: np.ndarray, forbidden: np.ndarray, largest: int
+def _cut_ears(points: np.ndarray, rim: np.ndarray, forbidden: np.ndarray
               ) -> tuple[np.ndarray, list[tuple[int, int, int]]]:
-    """Cut corners that point away from the hole, shortest new edge first, until at most `largest` are left."""
+    """Cut corners that point away from the hole, shortest new edge first, until at most LARGEST are left."""
     n = len(points)
     after, before = (np.arange(n) + 1) % n, np.arange(n) - 1
     before[0] = n - 1
@@ -101,10 +89,10 @@ def _cut_ears(points: np.ndarray, rim: np.ndarray, forbidden: np.ndarray, larges
             return None
         return float(np.linalg.norm(points[a] - points[b])), i, a, b
 
-    heap = [e for e in map(entry, range(n)) if e] if n > largest else []
+    heap = [e for e in map(entry, range(n)) if e] if n > LARGEST else []
     heapq.heapify(heap)
     left = n
-    while heap and left > largest:
+    while heap and left > LARGEST:
         _, i, a, b = heapq.heappop(heap)
         if not alive[i] or before[i] != a or after[i] != b:
             continue

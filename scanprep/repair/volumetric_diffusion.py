@@ -1,89 +1,56 @@
 """The surface continued through holes in a volume [Davis]."""
 from __future__ import annotations
 
-from dataclasses import dataclass
-from typing import Annotated
-
 import numpy as np
 from scipy.sparse import coo_array, csc_array, csr_array, diags_array
 
-from ..fusion.tsdf import zero_surface
 from ..geometry.mesh import Mesh
 from ..geometry.seen_space import SeenSpace
 from ..geometry.sparse import factor
 from ..geometry.surface import Surface
-from ..ranges import Positive, Range, Settings
 
-EMPTY_ROUNDS = 6
-
-
-@dataclass(frozen=True)
-class DiffusionConfig(Settings):
-    """Settings of `diffused_surface`.
-
-    Attributes
-    ----------
-    voxels : int
-        Most voxels along the longest side of a hole; they are never finer than the mesh.
-    band : float, voxels
-        How far from the existing surface its distance is known.
-    margin : float, voxels
-        Volume beyond the hole on every side.
-    empty : float, metres
-        Space counts as seen to be empty this far in front of what was seen.
-    """
-
-    voxels: Annotated[int, Range(2, 1000)] = 12
-    band: Positive = 3.0
-    margin: float = 5.0
-    empty: float = 0.01
+EMPTY = 0.01                         # metres in front of what was seen from which on space counts as empty
+BAND, MARGIN = 3.0, 5.0              # voxels: where the distance is known, and the volume beyond the hole
 
 
-def diffused_surface(mesh: Mesh, rim: np.ndarray, config: DiffusionConfig | None = None,
-                     seen: SeenSpace | None = None) -> Mesh:
+def diffused_surface(mesh: Mesh, rim: np.ndarray, seen: SeenSpace | None = None, voxels: int = 12) -> Mesh:
     """The zero level of the signed distance, diffused from the existing surface into the space about holes.
 
     Near the surface the distance is known. Elsewhere it takes the steady state of diffusion; that of second order,
     in which the level sets run on in their direction instead of taking the shortest way. Space that was seen to
-    be empty keeps a positive distance.
-
-    Parameters
-    ----------
-    mesh : Mesh
-        With the holes.
-    rim : (n,) int
-        Vertices on their borders.
-    config : DiffusionConfig, optional
-    seen : SeenSpace, optional
-        Lines of sight.
-
-    Returns
-    -------
-    Mesh
-        Existing surface and patches together, as far as the volume reaches; of the size of the voxels.
+    be empty keeps a positive distance. Existing surface and patches come together, as far as the volume reaches: at
+    most `voxels` along the longest side of the holes, whose borders `rim` (n,) are, and never finer than the mesh.
 
     [Davis] volumetric diffusion, line-of-sight constraints
     """
-    config = config or DiffusionConfig()
     points = mesh.vertices[rim]
     extent = np.ptp(points, axis=0).max()
-    voxel = max(float(extent) / config.voxels, mesh.mean_edge)
-    low = points.min(axis=0) - config.margin * voxel
-    shape = np.ceil((np.ptp(points, axis=0) + 2 * config.margin * voxel) / voxel).astype(int) + 1
+    voxel = max(float(extent) / voxels, mesh.mean_edge)
+    low = points.min(axis=0) - MARGIN * voxel
+    shape = np.ceil((np.ptp(points, axis=0) + 2 * MARGIN * voxel) / voxel).astype(int) + 1
     grid = low + voxel * np.stack(np.unravel_index(np.arange(np.prod(shape)), shape), axis=1)
     distance, sure = signed_distance(mesh, grid)
-    known = sure & (np.abs(distance) <= config.band * voxel)
+    known = sure & (np.abs(distance) <= BAND * voxel)
     operator = _roughness(tuple(shape.tolist()))
     values = _spread(operator, known, distance)
     if seen is not None:
-        empty = ~known & (seen.ahead(grid) > max(config.empty, voxel))
-        for _ in range(EMPTY_ROUNDS):
+        empty = ~known & (seen.ahead(grid) > max(EMPTY, voxel))
+        for _ in range(6):
             wrong = empty & ~known & (values < voxel)
             if not wrong.any():
                 break
             known, distance = known | wrong, np.where(wrong, voxel, distance)
             values = _spread(operator, known, distance)
-    return zero_surface(grid, values, tuple(shape.tolist()))
+    return _zero_surface(grid, values / max(float(np.abs(values).max()), 1e-30), shape)
+
+
+def _zero_surface(grid: np.ndarray, values: np.ndarray, shape: np.ndarray) -> Mesh:
+    """Where values (N,) on a full grid (N, 3) of a shape change sign."""
+    import igl
+
+    values = np.where(np.abs(values) < 1e-4, 1e-4, values)      # a surface through a corner would make flat triangles
+    order = np.arange(len(values)).reshape(shape).ravel(order="F")             # igl: x runs fastest
+    return Mesh(*igl.marching_cubes(values[order], grid[order], *shape.tolist(), 0.0)[:2])
 
 
 def signed_distance(mesh: Mesh, points: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

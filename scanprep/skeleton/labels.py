@@ -9,16 +9,7 @@ RESOLUTION = 1e-4                # of the mean own cost: the unit of the integer
 
 
 def field_energy(costs: np.ndarray, pairs: np.ndarray, prices: np.ndarray, label: np.ndarray) -> float:
-    """What a labelling costs: the sum of own costs and of the prices of neighbours that differ.
-
-    Parameters
-    ----------
-    costs : (F, P) float
-    pairs : (n, 2) int
-        Triangles that are neighbours.
-    prices : (n,) float
-    label : (F,) int
-    """
+    """What a labelling (F,) costs: own costs (F, P), and the prices (n,) of neighbours (n, 2) that differ."""
     differ = label[pairs[:, 0]] != label[pairs[:, 1]]
     return float(costs[np.arange(len(label)), label].sum() + prices[differ].sum())
 

@@ -1,7 +1,6 @@
-"""The embedded data set: scans of one subject in many poses and of many subjects, truth kept beside them."""
+"""The synthetic data set: scans of one subject in many poses and of many subjects, truth kept beside them."""
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, fields
 from functools import lru_cache
 from pathlib import Path
@@ -21,28 +20,15 @@ TRUTH, VIEWS = "truth", "views"
 
 @dataclass(frozen=True, eq=False)
 class GroundTruth:
-    """What really stood in the scanner; for evaluation, used by no stage.
-
-    Attributes
-    ----------
-    shape : BodyShape
-    pose : (16, 3) float, radians
-    trans : (3,) float, metres
-    vertices : (N, 3) float, metres
-        On the topology shared by all people.
-    faces : (F, 3) int
-    part_of_face : (F,) int
-    joints : (16, 3) float, metres
-        In the pose.
-    """
+    """What really stood in the scanner; for evaluation, used by no stage."""
 
     shape: BodyShape
-    pose: np.ndarray
-    trans: np.ndarray
-    vertices: np.ndarray
-    faces: np.ndarray
-    part_of_face: np.ndarray
-    joints: np.ndarray
+    pose: np.ndarray  # (16, 3) float, radians
+    trans: np.ndarray  # (3,) float, metres
+    vertices: np.ndarray  # (N, 3) float, metres: on the topology shared by all people
+    faces: np.ndarray  # (F, 3) int
+    part_of_face: np.ndarray  # (F,) int
+    joints: np.ndarray  # (16, 3) float, metres: in the pose
 
     @property
     def mesh(self) -> Mesh:
@@ -57,13 +43,7 @@ class GroundTruth:
 
     @staticmethod
     def load(path: str | Path) -> GroundTruth:
-        """Read a file of `save`.
-
-        Raises
-        ------
-        StorageError
-            Missing, damaged, or of another kind or version.
-        """
+        """Read a file of `save`."""
         header, a = storage.load(path, "ground truth", (VERSION,))
         with storage.taking_apart(path, "a whole ground truth"):
             J = len(a["joints"])
@@ -87,15 +67,7 @@ def stand(person: Person, pose: np.ndarray) -> GroundTruth:
 
 def click_landmarks(truth: GroundTruth, rng: np.random.Generator, error: float = 0.003,
                     seen: np.ndarray | None = None, reach: float = 0.012) -> dict[str, np.ndarray]:
-    """Landmarks as a person would click them on the scan.
-
-    Parameters
-    ----------
-    error : float, metres
-        Standard deviation of every coordinate.
-    seen : (n, 3) float, metres, optional
-        Points of the scan; landmarks without one within `reach` are left out.
-    """
+    """Landmarks as a person would click them on the scan."""
     names = landmark_vertices()
     true = {name: truth.vertices[v] for name, v in names.items()}
     noise = {name: error * rng.normal(size=3) for name in names}
@@ -111,10 +83,6 @@ def write_scan(folder: str | Path, name: str, scanned: Scan, truth: GroundTruth 
 
     Landmarks go to `name.landmarks.json`, the views to `views/name.npz`, the truth to `truth/name.npz`. The
     PLY is written last, so where it is, the rest is too.
-
-    Returns
-    -------
-    Path of the PLY.
     """
     from ..geometry.files import write_mesh
 
@@ -142,13 +110,7 @@ def _write_views(path: Path, scanned: Scan) -> None:
 
 
 def read_views(path: str | Path) -> list[RangeView]:
-    """The views of one scan, from `views/name.npz`.
-
-    Raises
-    ------
-    StorageError
-        Missing, damaged, or of another kind or version.
-    """
+    """The views of one scan, from `views/name.npz`."""
     header, a = storage.load(path, "range views", (VERSION,))
     with storage.taking_apart(path, "whole range views"):
         return [_view(a, k) for k in range(header["views"])]
@@ -163,24 +125,14 @@ def _view(a: dict[str, np.ndarray], k: int) -> RangeView:
 
 
 @dataclass(frozen=True)
-class EmbeddedScan:
-    """One scan of the embedded data set.
+class SyntheticScan:
+    """One scan of the synthetic data set."""
 
-    Attributes
-    ----------
-    name : file name without ending
-    subject : "subject" for the one in many poses, else "person00", ...
-    pose : name of the pose
-    sex : "male" or "female"
-    folder : Path
-        Where its files are.
-    """
-
-    name: str
-    subject: str
-    pose: str
-    sex: str
-    folder: Path
+    name: str  # file name without ending
+    subject: str  # "subject" for the one in many poses, else "person00", ...
+    pose: str  # name of the pose
+    sex: str  # "male" or "female"
+    folder: Path  # where its files are
 
     @property
     def path(self) -> Path:
@@ -203,38 +155,7 @@ class EmbeddedScan:
 SUBJECT = BodyShape(sex=1.0, stature=1.78, weight=-0.3, muscle=0.9, shoulder_width=0.4)
 
 
-def embedded_dataset(folder: str | Path, seed: int = 0, subject_poses: int = 20, subjects: int = 12,
-                     config: ScannerConfig | None = None, click_error: float = 0.003,
-                     progress: Callable[[int, int], None] | None = None) -> list[EmbeddedScan]:
-    """Scan one subject in many poses and many subjects near the rest pose.
-
-    The first scan, `subject_00_rest`, is the one to make the template from. Scans that are there already are
-    kept, and every scan has its own random numbers, so an interrupted run goes on and ends with the same
-    files.
-
-    Parameters
-    ----------
-    folder : path
-    seed : int
-    subject_poses : int
-        Scans of the one subject, the rest pose included.
-    subjects : int
-        Other people, women and men in turn.
-    config : ScannerConfig, optional
-    click_error : float, metres
-        Standard deviation of every coordinate of a landmark.
-    progress : called with (done, total)
-    """
-    plan = embedded_plan(subject_poses, subjects)
-    out = []
-    for done, which in enumerate(plan):
-        out.append(embedded_scan(Path(folder), seed, *which, config or ScannerConfig(), click_error))
-        if progress is not None:
-            progress(done + 1, len(plan))
-    return out
-
-
-def embedded_plan(subject_poses: int, subjects: int) -> list[tuple[int, bool]]:
+def scan_plan(subject_poses: int, subjects: int) -> list[tuple[int, bool]]:
     """The scans of a data set: the number of each, and whether it is of the one subject."""
     return [(k, True) for k in range(subject_poses)] + [(k, False) for k in range(subjects)]
 
@@ -244,9 +165,9 @@ def _person(shape: BodyShape) -> Person:
     return Person(shape)
 
 
-def embedded_scan(folder: Path, seed: int, k: int, is_pose: bool, config: ScannerConfig, click_error: float = 0.003
-                  ) -> EmbeddedScan:
-    """One scan of `embedded_plan`, made unless its files are there."""
+def synthetic_scan(folder: Path, seed: int, k: int, is_pose: bool, config: ScannerConfig, click_error: float = 0.003
+                  ) -> SyntheticScan:
+    """One scan of `scan_plan`, made unless its files are there."""
     rng = np.random.default_rng([seed, int(is_pose), k])
     if is_pose:
         label, pose = subject_pose(k, rng)
@@ -255,7 +176,7 @@ def embedded_scan(folder: Path, seed: int, k: int, is_pose: bool, config: Scanne
         shape = BodyShape.random(rng, sex=-1.0 if k % 2 == 0 else 1.0)
         pose, label, subject = near_rest(rng), "rest", f"person{k:02d}"
         name = f"person_{k:02d}_{'female' if k % 2 == 0 else 'male'}"
-    entry = EmbeddedScan(name, subject, label, "male" if shape.sex > 0 else "female", folder)
+    entry = SyntheticScan(name, subject, label, "male" if shape.sex > 0 else "female", folder)
     if not entry.path.exists():
         truth = stand(_person(shape), pose)
         scanned = scan(truth.mesh, config, rng)

@@ -1,14 +1,16 @@
-"""Poses of the embedded people: everyday poses by name, and random ones between them."""
+"""Poses of the synthetic people: everyday poses by name, random ones between them, and a walk."""
 from __future__ import annotations
 
+import json
 from functools import lru_cache
+from pathlib import Path
+from typing import Any
 
 import numpy as np
+from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation
 
-from .anatomy import Anatomy, BodyShape
-
-_LEFT_ARM, _RIGHT_ARM, _LEFT_LEG, _RIGHT_LEG = 4, 7, 10, 13
+from .anatomy import MIRROR_PART, PARENTS, Anatomy, BodyShape
 
 
 @lru_cache(maxsize=1)
@@ -33,17 +35,7 @@ def _towards(axis: np.ndarray, direction: np.ndarray, twist: float) -> np.ndarra
 def arm(direction: tuple[float, float, float], elbow: float = 0, twist: float = 0, turn: float = 0,
         wrist: float = 0,
         side: int = 1) -> np.ndarray:
-    """Rotation vectors (3, 3) of upper arm, forearm and hand.
-
-    Parameters
-    ----------
-    direction : outwards, frontwards, upwards
-        Where the upper arm points, seen from the chest.
-    elbow, twist, turn, wrist : degrees
-        Flexion beyond rest; rotation of the upper arm about itself, positive inwards; pronation of the
-        hand; flexion of the wrist towards the palm.
-    side : 1 left, -1 right
-    """
+    """Rotation vectors (3, 3) of upper arm, forearm and hand."""
     a = average()
     out, front, up = direction
     upper, fore = a.upper_arm_frame, a.forearm_frame
@@ -57,15 +49,7 @@ def arm(direction: tuple[float, float, float], elbow: float = 0, twist: float = 
 
 def leg(direction: tuple[float, float, float], knee: float = 0, twist: float = 0, foot: float = 0, side: int = 1
         ) -> np.ndarray:
-    """Rotation vectors (3, 3) of thigh, shin and foot.
-
-    Parameters
-    ----------
-    direction : outwards, frontwards, upwards
-        Where the thigh points, seen from the pelvis.
-    knee, twist, foot : degrees
-        Flexion; rotation of the thigh about itself, positive outwards; raising of the toes.
-    """
+    """Rotation vectors (3, 3) of thigh, shin and foot."""
     a = average()
     out, front, up = direction
     axis = a.leg_frame[2]
@@ -104,95 +88,12 @@ def compose(left_arm: dict | None = None, right_arm: dict | None = None, left_le
     return pose
 
 
-def _both(**kwargs: object) -> dict:
-    return {"left_arm": dict(kwargs), "right_arm": dict(kwargs)}
-
-
-def _legs(**kwargs: object) -> dict:
-    return {"left_leg": dict(kwargs), "right_leg": dict(kwargs)}
-
-
-_NAMED: dict[str, dict] = {
-    "rest": {},
-    "attention": _both(direction=(0.30, 0.0, -1), elbow=-4),
-    "t_pose": _both(direction=(1, 0, 0), twist=0),
-    "arms_up": _both(direction=(0.45, 0.1, 1), elbow=0),
-    "arms_forward": _both(direction=(0.12, 1, 0.0), elbow=-5, turn=20),
-    "strong_arms": _both(direction=(1, 0.15, 0.1), elbow=95, twist=-90),
-    "hands_on_hips": _both(direction=(0.88, -0.25, -0.68), elbow=72, twist=55, turn=30),
-    "surrender": _both(direction=(1, 0.1, -0.05), elbow=75, twist=-80, turn=30),
-    "left_arm_up": {"left_arm": {"direction": (0.3, 0.15, 1)}, "back": {"lean": -12},
-                    "neck": {"turn": 25, "nod": -12}},
-    "point_right": {"right_arm": {"direction": (0.75, 0.65, 0.15)}, "neck": {"turn": -40}, "back": {"turn": -20},
-                    "left_arm": {"direction": (0.45, -0.1, -0.9), "elbow": 25}},
-    "sitting": {**_legs(direction=(0.16, 1, -0.05), knee=88), **_both(direction=(0.35, 0.55, -0.8), elbow=45,
-                                                                      turn=40),
-                "back": {"bend": 10}},
-    "squat": {**_legs(direction=(0.35, 1, -0.25), knee=92, twist=12, foot=14),
-              **_both(direction=(0.1, 1, -0.1), elbow=5),
-              "back": {"bend": 14}, "root": (22, 0, 0)},
-    "kick_left": {"left_leg": {"direction": (0.08, 1, -0.45), "knee": 12, "foot": -25},
-                  "back": {"bend": 8, "turn": -15},
-                  "left_arm": {"direction": (0.7, -0.6, -0.5), "elbow": 25},
-                  "right_arm": {"direction": (0.5, 0.8, -0.2), "elbow": 30}},
-    "kick_back_right": {"right_leg": {"direction": (0.1, -0.45, -1), "knee": 75, "foot": -30},
-                        "left_leg": {"direction": (0.05, 0.15, -1), "knee": 14, "foot": 6},
-                        "left_arm": {"direction": (0.4, 0.7, -0.5), "elbow": 50},
-                        "right_arm": {"direction": (0.6, -0.5, -0.7), "elbow": 35}, "back": {"bend": 12}},
-    "side_kick_right": {"right_leg": {"direction": (1, 0.15, -0.6), "knee": 5}, "back": {"lean": 20},
-                        **_both(direction=(0.6, 0.4, -0.6), elbow=80)},
-    "lunge_left": {"left_leg": {"direction": (0.1, 1, -0.55), "knee": 70}, "root": (4, 0, 0),
-                   "right_leg": {"direction": (0.08, -0.55, -1), "knee": 22, "foot": 10},
-                   "left_arm": {"direction": (0.5, -0.3, -0.9), "elbow": 30},
-                   "right_arm": {"direction": (0.4, 0.5, -0.8), "elbow": 40}},
-    "knee_up_right": {"right_leg": {"direction": (0.12, 1, 0.15), "knee": 105, "foot": -10},
-                      "left_arm": {"direction": (0.4, 0.6, -0.6), "elbow": 70},
-                      "right_arm": {"direction": (0.45, -0.5, -0.8), "elbow": 60}},
-    "twist_left": {"back": {"turn": 50}, "neck": {"turn": 30}, "left_arm": {"direction": (0.9, -0.35, -0.1),
-                                                                            "elbow": 20},
-                   "right_arm": {"direction": (0.25, 0.9, -0.15), "elbow": 35}},
-    "twist_right": {"back": {"turn": -50, "bend": 8}, "neck": {"turn": -20},
-                    **_both(direction=(1, 0.1, -0.15), elbow=25)},
-    "bow": {"back": {"bend": 42}, "neck": {"nod": 15}, "root": (28, 0, 0), **_legs(direction=(0.078, 0.53, -1.0)),
-            **_both(direction=(0.45, 0.45, -0.85), elbow=8)},
-    "lean_left": {"back": {"lean": 32}, "neck": {"lean": 10},
-                  "right_arm": {"direction": (0.3, 0.1, 1), "elbow": 25},
-                  "left_arm": {"direction": (0.55, 0.1, -0.8)}},
-    "lean_back": {"back": {"bend": -24}, "neck": {"nod": -20}, **_both(direction=(0.8, 0.35, 0.55), elbow=15)},
-    "boxer": {"left_arm": {"direction": (0.35, 0.6, -0.7), "elbow": 98, "twist": -10},
-              "right_arm": {"direction": (0.40, 0.35, -0.8), "elbow": 102, "twist": -10},
-              "back": {"bend": 10, "turn": -20}, "left_leg": {"direction": (0.14, 0.35, -1), "knee": 24,
-                                                              "foot": 4},
-              "right_leg": {"direction": (0.16, -0.15, -1), "knee": 22, "twist": 15, "foot": 10}},
-    "throw_right": {"right_arm": {"direction": (0.85, -0.35, 0.45), "elbow": 85, "twist": -70},
-                    "back": {"turn": -30, "bend": -8},
-                    "left_arm": {"direction": (0.35, 0.9, 0.1), "elbow": 15},
-                    "left_leg": {"direction": (0.1, 0.45, -1), "knee": 15},
-                    "right_leg": {"direction": (0.12, -0.25, -1), "knee": 12}},
-    "run": {"left_leg": {"direction": (0.06, 0.85, -0.75), "knee": 85}, "root": (10, 0, 0),
-            "right_leg": {"direction": (0.06, -0.4, -1), "knee": 35, "foot": -18},
-            "left_arm": {"direction": (0.35, -0.6, -0.75), "elbow": 80},
-            "right_arm": {"direction": (0.3, 0.55, -0.8), "elbow": 85}, "back": {"turn": 8, "bend": 6}},
-    "balance": {"root": (50, 0, 0), "right_leg": {"direction": (0.06, -0.75, -0.8), "knee": 5, "foot": -30},
-                "left_leg": {"direction": (0.03, 0.95, -0.75), "knee": 6}, **_both(direction=(1, 0.25, 0.1)),
-                "back": {"bend": -12}, "neck": {"nod": -25}},
-    "wave_right": {"right_arm": {"direction": (0.8, 0.25, 0.2), "elbow": 85, "twist": -85, "turn": -20},
-                   "neck": {"turn": -20, "lean": -8}, "left_arm": {"direction": (0.5, -0.1, -0.9), "elbow": 15},
-                   "left_leg": {"direction": (0.2, 0.05, -1), "twist": 12}},
-    "stretch_across": {"right_arm": {"direction": (-0.30, 0.95, -0.1), "elbow": 12}, "back": {"turn": 15},
-                       "left_arm": {"direction": (0.9, -0.3, -0.3), "elbow": 20}, "neck": {"turn": -25}},
-}
+_NAMED: dict[str, dict[str, Any]] = json.loads(Path(__file__).with_name("poses.json").read_text(encoding="utf-8"))
 NAMED_POSES = tuple(_NAMED)
 
 
 def named_pose(name: str) -> np.ndarray:
-    """A pose (16, 3), radians, by its name in `NAMED_POSES`.
-
-    Raises
-    ------
-    ValueError
-        A name that is not known.
-    """
+    """A pose (16, 3), radians, by its name in `NAMED_POSES`."""
     if name not in _NAMED:
         raise ValueError(f"name: no pose '{name}', expected one of {', '.join(NAMED_POSES)}")
     return compose(**_NAMED[name])
@@ -203,13 +104,7 @@ JITTER = np.radians(np.array([4, 4, 4, 7, 8, 6, 9, 8, 6, 9, 4, 4, 5, 4, 4, 5.0])
 
 
 def random_pose(rng: np.random.Generator, spread: float = 1.0) -> np.ndarray:
-    """A plausible pose (16, 3): arms, legs, back and neck each drawn from the named poses, loosened.
-
-    Parameters
-    ----------
-    spread : float
-        How far from rest: 0 gives rest, 1 poses as varied as the named ones.
-    """
+    """A plausible pose (16, 3): arms, legs, back and neck each drawn from the named poses, loosened."""
     pose = np.zeros((16, 3))
     for group in _GROUPS:
         name = NAMED_POSES[rng.integers(len(NAMED_POSES))]
@@ -224,6 +119,70 @@ def random_pose(rng: np.random.Generator, spread: float = 1.0) -> np.ndarray:
 
 def mirrored_pose(pose: np.ndarray) -> np.ndarray:
     """The pose (..., 16, 3) of the mirror image."""
-    from .anatomy import MIRROR_PART
-
     return pose[..., MIRROR_PART, :] * [1, -1, -1]
+
+
+# Joint angles over one gait cycle from heel strike, degrees (typical values of published gait analysis).
+_PHASE = np.linspace(0, 1, 11)
+_HIP = np.array([28, 24, 15, 5, -5, -11, -4, 14, 27, 31, 28.0])
+_KNEE = np.array([4, 16, 14, 8, 5, 10, 34, 60, 52, 18, 4.0])
+_ANKLE = np.array([0, -4, 3, 7, 10, 8, -14, -8, 0, 2, 0.0])
+
+
+def walk(frames: int, rate: float = 60.0, speed: float = 1.0) -> tuple[np.ndarray, np.ndarray]:
+    """A walk straight ahead."""
+    t = np.arange(frames) / rate * speed / 1.1
+    poses = np.stack([_stride(phase) for phase in t % 1.0])
+    fine = 120
+    heights, advance = _footing(np.stack([_stride(k / fine) for k in range(fine + 1)]))
+    cycle = np.concatenate([[0], np.cumsum(advance)])
+    at = (t % 1.0) * fine
+    ahead = np.interp(at, np.arange(fine + 1), cycle) + np.floor(t) * cycle[-1]
+    lift = np.interp(at, np.arange(fine + 1), heights)
+    return poses, np.stack([np.zeros(frames), -ahead, lift], axis=1)
+
+
+def _stride(phase: float) -> np.ndarray:
+    curves = CubicSpline(_PHASE, np.stack([_HIP, _KNEE, _ANKLE], axis=1), bc_type="periodic")
+    wave = 2 * np.pi * phase
+    limbs: dict[str, dict[str, Any]] = {}
+    for name, shift in (("left", 0.0), ("right", 0.5)):
+        hip, knee, ankle = curves((phase + shift) % 1.0)
+        swing = np.cos(wave + 2 * np.pi * shift)
+        limbs[f"{name}_leg"] = {"direction": (0.035, np.tan(np.radians(hip)), -1.0), "knee": float(knee),
+                                "foot": float(ankle)}
+        limbs[f"{name}_arm"] = {"direction": (0.28, 0.05 - 0.33 * swing, -1.0), "elbow": 10 - 9 * swing,
+                                "twist": 12}
+    pose = compose(limbs["left_arm"], limbs["right_arm"], limbs["left_leg"], limbs["right_leg"],
+                   {"turn": 9 * np.cos(wave), "bend": 2}, {"turn": -5 * np.cos(wave), "nod": 1})
+    pose[0] = Rotation.from_euler("zyx", [-4.5 * np.cos(wave), 2.5 * np.sin(wave), 2], degrees=True).as_rotvec()
+    return pose
+
+
+def _footing(poses: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Lift of the root (T,) that puts the lower foot on the floor, and how far it moves ahead (T - 1,)."""
+    a = average()
+    soles = []
+    for foot in (12, 15):
+        toe = a.ends[foot] * [1, 1, 0]
+        heel = a.joints[foot] * [1, 1, 0] + [0, 0.055, 0]
+        soles.append([_carried(a, pose, foot, np.stack([heel, toe])) for pose in poses])
+    points = np.swapaxes(np.array(soles), 0, 1).reshape(len(poses), 4, 3)
+    lowest = points[:, :, 2].min(axis=1)
+    weight = np.exp(-(points[:, :, 2] - lowest[:, None]) / 0.01)
+    weight = 0.5 * (weight[1:] + weight[:-1])
+    weight /= weight.sum(axis=1, keepdims=True)
+    advance = (weight * np.diff(points[:, :, 1], axis=0)).sum(axis=1)
+    kernel = np.hanning(15) / np.hanning(15).sum()
+    smooth = np.convolve(np.r_[lowest[-8:-1], lowest, lowest[1:8]], kernel, "valid")
+    advance = np.convolve(np.r_[advance[-7:], advance, advance[:7]], kernel, "valid")
+    return -smooth, advance
+
+
+def _carried(a: Anatomy, pose: np.ndarray, part: int, points: np.ndarray) -> np.ndarray:
+    chain = [part]
+    while PARENTS[chain[-1]] >= 0:
+        chain.append(int(PARENTS[chain[-1]]))
+    for p in chain:
+        points = a.joints[p] + Rotation.from_rotvec(pose[p]).apply(points - a.joints[p])
+    return points

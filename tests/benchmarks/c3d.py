@@ -18,6 +18,7 @@ from protocols import machine, write_report
 
 from completion.mocap.files.markers import MarkerSequence, read_markers
 from completion.mocap.marker_sets.layout import MarkerLayout
+from completion.mocap.marker_sets.named import named_layout
 from completion.mocap.pose.follow import AnimateConfig, animate
 from completion.mocap.subject.marker_shape import MarkerShapeConfig, MarkerSubject, subject_from_markers
 from completion.motion import Motion
@@ -51,13 +52,14 @@ def follow(model: BodyModel, markers: MarkerSequence, layout: MarkerLayout, shap
 def picture(model: BodyModel, found: MarkerSubject, motion: Motion, markers: MarkerSequence, every: int, path: Path
             ) -> None:
     """Every so many frames with the markers as dots, from two sides."""
-    from completion.mocap.animate.report import picture_frames
+    from completion.motion_pictures import picture_frames
     from scanprep.pictures.sheets import save_png
 
     few = Motion(motion.poses[::every], motion.trans[::every], motion.betas, motion.rate / every,
                  motion.residuals[::every], motion.labels)
     some = markers.frames(slice(None, None, every))
-    sides = [picture_frames(few, model.subject(found.betas), some, len(few.poses), 300, turn) for turn in (35.0, 215.0)]
+    sides = [picture_frames(few, model.subject(found.betas), some.positions, len(few.poses), 300, turn)
+             for turn in (35.0, 215.0)]
     save_png(path, np.concatenate(sides))
 
 
@@ -73,7 +75,7 @@ def main() -> None:
     args = parser.parse_args()
     model = load_model(args.model)
     people = model.info.get("people_vertices")
-    layout = MarkerLayout.named(args.layout, model.template, None if people is None else np.array(people))
+    layout = named_layout(args.layout, model.template, None if people is None else np.array(people))
     shape, config = MarkerShapeConfig(), AnimateConfig(key_interval=args.key_interval)
     rows = []
     for path in sorted(args.folder.glob("*.c3d")):

@@ -7,8 +7,10 @@ Peers are measured where they can be imported: open3d, pymeshlab, pymeshfix, tri
 from __future__ import annotations
 
 import argparse
+import sys
 import time
 from collections.abc import Callable, Iterator
+from pathlib import Path
 
 import numpy as np
 from holes import HoledBody, distances, embedded_body, real_body
@@ -18,12 +20,14 @@ from scans import HELD_MEN, HELD_POSES, TUNING_MEN, TUNING_POSES
 from scanprep.alignment.views import align_views
 from scanprep.fusion.tsdf import merge_views
 from scanprep.geometry import rotations
-from scanprep.geometry.distance import surface_distance
 from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.surface import Surface
 from scanprep.repair.hole_filling import FillConfig, fill_report
 from scanprep.repair.intersections import intersecting_faces
 from scanprep.synthetic.scanner import RangeView, scan
+
+sys.path.insert(0, str(Path(__file__).parents[1]))
+from surface_distances import surface_distance
 
 SEEN = 0.007           # metres: true surface with a scan point this close was seen
 

@@ -26,16 +26,17 @@ from scans import HELD_POSES, MARKS, TUNING_POSES, TestScan, test_scan
 from scipy.spatial import cKDTree
 
 from model import learn_scape
-from model.coregistration.config import CoregistrationConfig
-from model.coregistration.first import explained_share
+from model.coregistration.attraction import apart
+from model.coregistration.config import EXPLAINED, CoregistrationConfig
 from model.coregistration.rounds import coregister, task_name
 from model.coregistration.single import register_with_model
-from model.learning.scape import LearnConfig
+from model.learning.config import LearnConfig
 from scanprep.batch.opening import workspace
 from scanprep.batch.pool import Workers
 from scanprep.decimation.decimate import decimate
 from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.surface import Surface
+from scanprep.registration.matches import orient, target_of
 from scanprep.registration.nonrigid import register
 from scanprep.skeleton.find import find_skeleton
 
@@ -49,7 +50,7 @@ def coarse(data: RealData, faces: int) -> RealData:
         return data
     small = decimate(data.template, faces)
     on = Surface(data.template).closest(small.vertices)
-    poses = np.stack([on.carried(p, data.template.faces) for p in data.poses])
+    poses = np.stack([on.transferred(p, data.template.faces) for p in data.poses])
     near = cKDTree(poses[0]).query(data.template.vertices[list(data.landmarks.values())])[1]
     return RealData(Mesh(poses[0], small.faces), poses, poses[:0],
                     dict(zip(data.landmarks, near.tolist(), strict=True)))
@@ -89,6 +90,13 @@ class Story:
                        if k != "each_mm"), flush=True)
 
 
+def explained_share(mesh: Mesh, scan: Mesh | np.ndarray) -> float:
+    """Share of the points of a scan that lie near a registered mesh and do not face away from it."""
+    size = float(np.sqrt(mesh.face_areas.sum()))
+    target = orient(target_of(scan).thinned(0.01 * size), mesh, 0.05 * size)
+    return float((apart(mesh, target, EXPLAINED * size) < EXPLAINED * size).mean())
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--landmarks", choices=MARKS, default="7")
@@ -111,7 +119,7 @@ def main() -> None:
     plain = [register(data.template, s.scan, m) for s, m in zip(story.scans, story.marks(args.landmarks), strict=True)]
     first = np.stack([r.mesh.vertices for r in plain])
     story.tell("without a model", dict(enumerate(first)), sum(r.flipped for r in plain))
-    good = np.array([explained_share(r.mesh, s.scan, config) >= 1 - config.failed
+    good = np.array([explained_share(r.mesh, s.scan) >= 1 - config.failed
                      for r, s in zip(plain, story.scans, strict=True)])
     story.tell("those that explain their scan", {int(i): first[i] for i in np.flatnonzero(good)})
     bodies = np.concatenate([data.template.vertices[None], first[good]])

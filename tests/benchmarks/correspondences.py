@@ -1,6 +1,6 @@
 """Correspondences from a few seeds, or none, on the scans that registration is measured on.
 
-    SCAPEKIT_DATA=... python tests/benchmarks/correspondences.py --set tuning --seeds 7 --method cc
+    SCAPEKIT_DATA=... python tests/benchmarks/correspondences.py --set tuning --seeds 7
     SCAPEKIT_DATA=... python tests/benchmarks/correspondences.py --set held --seeds 0 --json results/cc.json
 
 `median` and `beyond` are of the distance along the true body between the true place of the template's vertex and
@@ -19,7 +19,6 @@ from scans import HELD_MEN, HELD_POSES, TUNING_MEN, TUNING_POSES, TestScan, test
 
 from scanprep.correspondence.correlated import find_correspondences
 from scanprep.correspondence.correspondences import Correspondences
-from scanprep.correspondence.functional import find_functional_correspondences
 from scanprep.geometry.geodesics import SurfaceGraph
 from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.surface import Surface
@@ -61,7 +60,6 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__.split("\n")[0])
     parser.add_argument("--set", choices=("tuning", "held"), default="tuning")
     parser.add_argument("--seeds", choices=("10", "7", "4", "0"), default="7")
-    parser.add_argument("--method", choices=("cc", "functional"), default="cc")
     parser.add_argument("--front", action="store_true", help="one view from the front in place of four")
     parser.add_argument("--first", type=int, default=None, help="only so many poses and men")
     parser.add_argument("--json", help="write the figures here")
@@ -69,14 +67,13 @@ def main() -> None:
     data = load_real()
     other = other_side(data)
     poses, men = (HELD_POSES, HELD_MEN) if options.set == "held" else (TUNING_POSES, TUNING_MEN)
-    find = find_correspondences if options.method == "cc" else find_functional_correspondences
     rows: dict[str, dict[str, float]] = {}
     print(f"{'scan':14s} count  median mm  p90 mm  >100 mm  flipped  seconds")
     for kind, index in [("pose", i) for i in poses[:options.first]] + [("man", i) for i in men[:options.first]]:
         item = test_scan(data, kind, index, options.front)
         start = time.process_time()
         try:
-            found = find(data.template, item.scan, item.landmarks(data, options.seeds))
+            found = find_correspondences(data.template, item.scan, item.landmarks(data, options.seeds))
         except ValueError as error:
             print(f"{item.name:14s} {error}")
             rows[item.name] = {"failed": 1}

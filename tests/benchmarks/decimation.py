@@ -10,8 +10,10 @@ from __future__ import annotations
 
 import argparse
 import importlib.util
+import sys
 import time
 from collections.abc import Callable
+from pathlib import Path
 
 import numpy as np
 from protocols import RealData, load_real, machine, write_report
@@ -19,10 +21,12 @@ from scipy.spatial import cKDTree
 
 from scanprep.decimation.decimate import DecimateConfig, decimate
 from scanprep.decimation.registered_set import DecimateSetConfig, decimate_set
-from scanprep.geometry.distance import surface_distance
 from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.surface import Surface
 from scanprep.repair.intersections import intersecting_faces
+
+sys.path.insert(0, str(Path(__file__).parents[1]))
+from surface_distances import surface_distance
 
 Method = Callable[[Mesh, int], Mesh]
 PEERS = {"fast-simplification": "fast_simplification", "pyfqmr": "pyfqmr", "igl.decimate": "igl", "igl.qslim": "igl",
@@ -121,7 +125,8 @@ def measure_set(data: RealData, faces: int, config: DecimateSetConfig) -> Row:
     small = decimate_set(data.template, data.poses[::2], faces, config, keep)
     row: Row = {"cpu_s": time.process_time() - start, "faces": len(small.template.faces)}
     for name, bodies in (("poses", data.poses[1::10]), ("men", data.shapes[3::40])):
-        row |= {f"{name}_{k}": v for k, v in unseen(data.template, small.template, bodies, small.carry(bodies)).items()}
+        found = unseen(data.template, small.template, bodies, small.transfer(bodies))
+        row |= {f"{name}_{k}": v for k, v in found.items()}
     return row
 
 
@@ -143,7 +148,7 @@ def replayed(data: RealData, faces: int) -> Row:
 def unseen(template: Mesh, small: Mesh, before: np.ndarray, after: np.ndarray | list[np.ndarray]) -> dict[str, float]:
     """Distances of the surfaces, and how far vertices lie, brought back to the template, from where they lie there."""
     there = Surface(template).closest(small.vertices).points
-    slid = [np.linalg.norm(Surface(template.with_vertices(b)).closest(a).carried(template.vertices, template.faces)
+    slid = [np.linalg.norm(Surface(template.with_vertices(b)).closest(a).transferred(template.vertices, template.faces)
                            - there, axis=1) for b, a in zip(before, after, strict=True)]
     apart = [surface_distance(template.with_vertices(b), small.with_vertices(a), 20_000)
              for b, a in zip(before, after, strict=True)]

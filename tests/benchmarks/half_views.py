@@ -22,8 +22,8 @@ from protocols import HalfView, RealData, half_view, load_real, machine, scape_f
 
 from completion.partial.completion import Completion, complete
 from completion.partial.settings import CompletionConfig
+from model import LearnConfig, learn_scape
 from model.files import load_model
-from model.learning import LearnConfig, learn_scape
 from model.scape import ScapeModel
 from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.surface import Surface

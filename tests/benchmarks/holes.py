@@ -15,7 +15,7 @@ from scanprep.geometry.surface import Surface
 RADII = {"crown": 0.06, "left armpit": 0.07, "right armpit": 0.07, "crotch": 0.07}
 REAL_MARKS = {"crown": "top of head", "left armpit": "shoulder (bottom) left side",
               "right armpit": "shoulder (bottom) right side", "crotch": "between two legs"}
-EMBEDDED_MARKS = {"crown": "top of head", "left armpit": "left armpit", "right armpit": "right armpit",
+SYNTHETIC_MARKS = {"crown": "top of head", "left armpit": "left armpit", "right armpit": "right armpit",
                   "crotch": "crotch"}
 
 
@@ -86,7 +86,7 @@ def embedded_body(seed: int, scale: float = 1.0) -> HoledBody:
     person = people.Person(BodyShape.random(rng))
     rest, body = stand(person, np.zeros((16, 3))).mesh, stand(person, near_rest(rng)).mesh
     toes = {"left sole": people.LANDMARKS["left toe"], "right sole": people.LANDMARKS["right toe"]}
-    marks = {hole: people.LANDMARKS[mark] for hole, mark in EMBEDDED_MARKS.items()}
+    marks = {hole: people.LANDMARKS[mark] for hole, mark in SYNTHETIC_MARKS.items()}
     return six_holes(f"embedded{seed}", body, marks, soles(rest, toes), scale)
 
 

@@ -19,7 +19,7 @@ from pathlib import Path
 import numpy as np
 from protocols import load_real, machine, spring_split, write_report
 
-from model import BlendConfig, BodyModel, LearnConfig, learn_blendscape, learn_scape, load_model
+from model import BodyModel, LearnConfig, learn_blendscape, learn_scape, load_model
 from model.evaluation.errors import shape_errors
 from model.learning.parts import choose_skeleton
 
@@ -93,7 +93,7 @@ def main() -> None:
     args = parser.parse_args()
     data = load_real()
     train, held = spring_split(len(data.shapes))
-    config = LearnConfig(components=80) if args.kind == "scape" else BlendConfig(components=80)
+    config = LearnConfig(components=80)
     report = {"protocol": "SPRING-182/45", "kind": args.kind, "config": dataclasses.asdict(config),
               "machine": machine()}
     steps, start, cpu = Steps(), time.perf_counter(), time.process_time()

@@ -1,4 +1,4 @@
-"""Learning from a random mix of people and poses against the separated design, on embedded people.
+"""Learning from a random mix of people and poses against the separated design, on synthetic people.
 
     python tests/benchmarks/mixed.py -o mixed.json
 
@@ -15,10 +15,10 @@ import time
 import numpy as np
 from protocols import machine, write_report
 
+from model import LearnConfig, learn_scape
 from model.body import BodyModel
 from model.fitting import FitConfig, PoseFitter, ShapeFitter
-from model.learning import LearnConfig, learn_scape
-from model.learning.mixing import MixConfig, learn_scape_mix
+from model.learning.mixing import MIX, learn_scape_mix
 from scanprep.geometry.mesh import Mesh
 from scanprep.skeleton.tree import Skeleton
 from scanprep.synthetic.people import BodyShape, Person, random_pose
@@ -28,7 +28,7 @@ FIT = FitConfig(sample=400, polish=0)
 
 
 class Stage:
-    """Template, skeleton and bodies of embedded people, on a coarser triangulation of some of their vertices."""
+    """Template, skeleton and bodies of synthetic people, on a coarser triangulation of some of their vertices."""
 
     def __init__(self, faces: int) -> None:
         import igl
@@ -78,7 +78,7 @@ def run(stage: Stage, seed: int, features: str, held: int) -> dict[str, object]:
     separated = {"linear": LearnConfig(), "quadratic": LearnConfig(features="quadratic", prunings=(0.01,))}
     designs = {
         "mixed 30 x 3": lambda: learn_scape_mix(stage.template, mixed, who.tolist(), stage.skeleton,
-                                                MixConfig(features=features))}
+                                                dataclasses.replace(MIX, features=features))}
     for kind, config in separated.items():
         for count in (45, 60):
             designs[f"separated {count} + {90 - count}, {kind}"] = lambda config=config, count=count: learn_scape(
@@ -104,13 +104,13 @@ def main() -> None:
     parser.add_argument("--faces", type=int, default=2000, help="triangles of the bodies; all of them at 18756")
     parser.add_argument("--held", type=int, default=20, help="new people in new poses")
     parser.add_argument("--seeds", type=int, nargs="+", default=[1, 2, 3])
-    parser.add_argument("--features", default=MixConfig.features, help="of the mix")
+    parser.add_argument("--features", default=MIX.features, help="of the mix")
     args = parser.parse_args()
     stage = Stage(args.faces)
     runs = [run(stage, seed, args.features, args.held) for seed in args.seeds]
     report: dict[str, object] = {
-        "protocol": "embedded people, 90 meshes, true skeleton", "faces": len(stage.template.faces), "held": args.held,
-        "features": args.features, "config": dataclasses.asdict(MixConfig()), "machine": machine(), "runs": runs}
+        "protocol": "synthetic people, 90 meshes, true skeleton", "faces": len(stage.template.faces), "held": args.held,
+        "features": args.features, "config": dataclasses.asdict(MIX), "machine": machine(), "runs": runs}
     for against in [name for name in runs[0] if name.startswith("separated")]:
         for what in ("new_people", "new_people_20_betas", "new_people_29_betas"):
             ratio = [r["mixed 30 x 3"][what]["mean_mm"] / r[against][what]["mean_mm"] for r in runs]

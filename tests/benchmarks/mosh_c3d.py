@@ -25,9 +25,10 @@ from c3d import HELD_OUT
 from protocols import machine, write_report
 
 from completion.mocap.files.markers import MarkerSequence, read_markers
-from completion.mocap.marker_sets.layout import MarkerLayout, most_used
+from completion.mocap.marker_sets.layout import MarkerLayout
+from completion.mocap.marker_sets.named import named_layout
+from completion.mocap.pose.follow import follow_poses
 from completion.mocap.pose.marked_body import MarkedBody
-from completion.mocap.pose.mosh_poses import follow_poses
 from completion.mocap.results import PersonFit
 from completion.mocap.settings import MoshConfig
 from completion.mocap.soft_tissue.soft_tissue import follow_soft_tissue
@@ -43,7 +44,7 @@ def held_out(model: BodyModel, motion: Motion, markers: MarkerSequence, layout: 
     places = layout.select(labels)
     body = MarkedBody(model.subject(motion.betas), places, 0.3, 0.3)
     off = markers.select(labels).positions - body.positions(body.body.join(motion.poses, motion.trans))
-    part = model.skeleton.part_of_vertex(model.template)[most_used(places)]
+    part = model.skeleton.part_of_vertex(model.template)[places.nearest]
     R = model.skeleton.part_rotations(motion.poses)[:, part]
     local = (np.swapaxes(R, -1, -2) @ off[..., None])[..., 0]
     steady = np.linalg.norm(local - np.nanmean(local, axis=0), axis=2)
@@ -79,7 +80,7 @@ def follow(model: BodyModel, markers: MarkerSequence, layout: MarkerLayout, conf
 def picture(model: BodyModel, motion: Motion, markers: MarkerSequence, every: int, path: Path, columns: int = 10
             ) -> None:
     """Every so many frames with the markers as dots."""
-    from completion.mocap.animate.report import picture_frames
+    from completion.motion_pictures import picture_frames
     from scanprep.pictures.sheets import save_png
 
     subject, rows, step = model.subject(motion.betas), [], every * columns
@@ -87,7 +88,7 @@ def picture(model: BodyModel, motion: Motion, markers: MarkerSequence, every: in
         some = slice(start, start + step, every)
         few = Motion(motion.poses[some], motion.trans[some], motion.betas, motion.rate / every,
                      motion.residuals[some], motion.labels)
-        rows.append(picture_frames(few, subject, markers.frames(some), columns, 300))
+        rows.append(picture_frames(few, subject, markers.positions[some], columns, 300))
     width = max(row.shape[1] for row in rows)
     white = 255 if rows[0].dtype == np.uint8 else 1
     save_png(path, np.concatenate([np.pad(row, ((0, 0), (0, width - row.shape[1]), (0, 0)), constant_values=white)
@@ -106,7 +107,7 @@ def main() -> None:
     args = parser.parse_args()
     model, config = load_model(args.model), MoshConfig(soft_tissue=args.soft)
     people = model.info.get("people_vertices")
-    layout = MarkerLayout.named(args.layout, model.template, None if people is None else np.array(people))
+    layout = named_layout(args.layout, model.template, None if people is None else np.array(people))
     rows: list[dict] = []
     for path in sorted(args.folder.glob("*.c3d")):
         markers = read_markers(path)

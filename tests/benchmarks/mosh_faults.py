@@ -26,9 +26,10 @@ from completion import energy
 from completion.mocap.artefacts.find import find_faults
 from completion.mocap.files.markers import MarkerSequence, read_markers
 from completion.mocap.marker_sets.layout import MarkerLayout
+from completion.mocap.marker_sets.named import named_layout
 from completion.mocap.mosh.mosh import mosh
+from completion.mocap.pose.follow import follow_poses
 from completion.mocap.pose.marked_body import supports
-from completion.mocap.pose.mosh_poses import follow_poses
 from completion.mocap.results import BadKind, BadSpan, Exchange
 from completion.mocap.settings import FaultConfig, MoshConfig
 from completion.mocap.subject.person import find_person
@@ -247,7 +248,7 @@ def run_exchanges(model: BodyModel, case: Case, faulty: Faulty, reference: np.nd
 
 def cases(model: BodyModel, args: argparse.Namespace) -> list[Case]:
     """The real files, and men moved as in them."""
-    layout = MarkerLayout.named("cmu41", model.template)
+    layout = named_layout("cmu41", model.template)
     out = [Case(path.stem, read_markers(path), layout, None) for path in sorted(args.folder.glob("*.c3d"))
            if not args.files or path.stem in args.files]
     if args.men:

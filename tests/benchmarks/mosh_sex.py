@@ -1,4 +1,4 @@
-"""Sex from markers: embedded women and men who were not learned from, walking with 41 markers.
+"""Sex from markers: synthetic women and men who were not learned from, walking with 41 markers.
 
     python tests/benchmarks/mosh_sex.py --models FOLDER -o mosh_sex.json
 
@@ -17,8 +17,9 @@ from protocols import machine, write_report
 
 from completion.mocap.files.markers import MarkerSequence
 from completion.mocap.marker_sets.layout import MarkerLayout
+from completion.mocap.marker_sets.named import named_layout
 from completion.mocap.subject.person import find_person
-from completion.synthetic_model import EmbeddedRecipe, _decimated
+from completion.synthetic_people import SyntheticRecipe, _decimated
 from model.body import BodyModel
 from model.files import load_model
 from model.learning.sex_plane import guess_sex, sex_plane
@@ -33,18 +34,18 @@ NAMES = ("neutral", "female", "male")
 
 
 def learned(folder: Path) -> dict[str, BodyModel]:
-    """The models of the embedded people by sex, from the folder or learned now, by the recipe of `embedded_model`."""
+    """The models of the synthetic people by sex, from the folder or learned now, by the recipe of `synthetic_model`."""
     paths = {name: folder / f"{name}.npz" for name in NAMES}
     if not all(path.exists() for path in paths.values()):
         folder.mkdir(parents=True, exist_ok=True)
-        recipe = EmbeddedRecipe()
+        recipe = SyntheticRecipe()
         rng = np.random.default_rng(recipe.seed)
         man, sexes = Person(SUBJECT), [("female", "male")[k % 2] for k in range(recipe.people)]
         poses = np.stack([man.posed(subject_pose(k, rng)[1]) for k in range(recipe.poses)])
         shapes = np.stack([Person(BodyShape.random(rng, sex=1.0 if sex == "male" else -1.0)).posed(near_rest(rng))
                            for sex in sexes])
         small = _decimated(man, poses, recipe.faces)
-        found = learn_by_sex(small.template, small.carry(poses), small.carry(shapes), sexes, small.skeleton,
+        found = learn_by_sex(small.template, small.transfer(poses), small.transfer(shapes), sexes, small.skeleton,
                              recipe.learn)
         for name, model in found.items():
             model.info["people_vertices"] = small.vertex_map.tolist()
@@ -70,10 +71,10 @@ def told(models: dict[str, BodyModel], sex: float, seed: int, args: argparse.Nam
     """One subject: truth, guess, and residuals with the models of both sexes."""
     rng = np.random.default_rng([seed, 61])
     person = Person(BodyShape.random(rng, sex=sex))
-    layout = MarkerLayout.named("cmu41", person.mesh)
+    layout = named_layout("cmu41", person.mesh)
     sequence = walking(person, layout, rng, args.error, args.frames)
     kept = np.array(models["neutral"].info["people_vertices"])
-    places = MarkerLayout.named("cmu41", models["neutral"].template, kept)
+    places = named_layout("cmu41", models["neutral"].template, kept)
     start = time.process_time()
     found = find_person(models["neutral"], sequence, places)
     seconds = time.process_time() - start

@@ -25,8 +25,9 @@ from scipy.linalg import eigh
 from completion.energy import lifted
 from completion.mocap.files.markers import MarkerSequence, read_markers
 from completion.mocap.marker_sets.layout import MarkerLayout
+from completion.mocap.marker_sets.named import named_layout
+from completion.mocap.pose.follow import follow_poses
 from completion.mocap.pose.marked_body import supports
-from completion.mocap.pose.mosh_poses import follow_poses
 from completion.mocap.settings import SoftTissueConfig
 from completion.mocap.soft_tissue.changing_bodies import changing_bodies
 from completion.mocap.soft_tissue.soft_tissue import SoftFollower, follow_soft_tissue
@@ -114,7 +115,7 @@ def main() -> None:
     parser.add_argument("--files", nargs="*", help="stems; all of the folder when not given")
     args = parser.parse_args()
     model = load_model(args.model)
-    layout, rows, simulation = MarkerLayout.named(args.layout, model.template), [], None
+    layout, rows, simulation = named_layout(args.layout, model.template), [], None
     for path in sorted(args.folder.glob("*.c3d")):
         if args.files and path.stem not in args.files:
             continue

@@ -21,7 +21,8 @@ from protocols import machine, write_report
 
 from completion.mocap.files.markers import MarkerSequence, read_markers
 from completion.mocap.marker_sets.layout import MarkerLayout
-from completion.mocap.pose.mosh_poses import follow_poses
+from completion.mocap.marker_sets.named import named_layout
+from completion.mocap.pose.follow import follow_poses
 from completion.mocap.settings import MoshConfig
 from completion.mocap.soft_tissue.soft_tissue import follow_soft_tissue
 from completion.mocap.subject.person import find_person
@@ -72,7 +73,7 @@ def main() -> None:
     args = parser.parse_args()
     model, config = load_model(args.model), MoshConfig()
     people = model.info.get("people_vertices")
-    layout = MarkerLayout.named(args.layout, model.template, None if people is None else np.array(people))
+    layout = named_layout(args.layout, model.template, None if people is None else np.array(people))
     rows = []
     for path in sorted(args.folder.glob("*.c3d")):
         rows.append({"file": path.name, **measure(model, read_markers(path), layout, config)})

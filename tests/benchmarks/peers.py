@@ -98,7 +98,7 @@ def classic_drift(data: RealData, item: TestScan, _: argparse.Namespace) -> np.n
     need("pycpd")
     from pycpd import DeformableRegistration
 
-    from scanprep.registration.deformation_graph import farthest_points
+    from scanprep.geometry.farthest_points import farthest_points
 
     start = placed(data, item)
     mine = farthest_points(start, 2000)

@@ -38,7 +38,7 @@ def measure(data: RealData, kind: str, index: int, marks: str, front: bool) -> d
     found = registered(data, item, marks)
     wall, cpu = time.perf_counter() - start[0], time.process_time() - start[1]
     sure = found.seen == item.seen
-    return {"scan": item.name, "kind": kind, **errors(found.mesh.vertices, item), "flipped": found.flipped,
+    return {"scan": item.name, "kind": kind, **errors(found.mesh.vertices, item), "flipped": found.inverted,
             "converged": found.converged, "seen_agrees": float(sure.mean()), "cpu_s": cpu, "wall_s": wall}
 
 

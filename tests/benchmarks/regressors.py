@@ -14,29 +14,30 @@ from pathlib import Path
 import numpy as np
 from protocols import load_real, machine, scape_fold, write_report
 
-from model.carriers import rigid_weights
+from model import LearnConfig
+from model.blending import BlendedTemplate, rigid_weights
 from model.fitting import PoseFitter
-from model.learning import Carriage, Ticks
 from model.learning.parts import coarse_copy, coarse_skeleton
-from model.learning.pose import PoseConfig, learn_pose
+from model.learning.pose import learn_pose
+from model.learning.work import Work
 from scanprep.skeleton.tree import Skeleton
 
 SETTINGS = {
-    "linear": PoseConfig(),
-    "quadratic": PoseConfig(features="quadratic"),
-    "radial (kernel ridge)": PoseConfig(features="radial"),
-    "radial, support vectors": PoseConfig(features="radial", regressor="svr"),
-    "linear, no refinement (as published)": PoseConfig(refinements=0),
-    "linear, one pruning of 0.1 (as published)": PoseConfig(prunings=(0.1,)),
+    "linear": LearnConfig(),
+    "quadratic": LearnConfig(features="quadratic"),
+    "radial (kernel ridge)": LearnConfig(features="radial"),
+    "radial, support vectors": LearnConfig(features="radial", regressor="svr"),
+    "linear, no refinement": LearnConfig(refinements=0),
+    "linear, as published": LearnConfig.published(),
 }
 
 
-def run(config: PoseConfig, carriage: Carriage, training: np.ndarray, held: np.ndarray) -> dict:
+def run(config: LearnConfig, parts: BlendedTemplate, training: np.ndarray, held: np.ndarray) -> dict:
     """Mean error in millimetres on held-out poses, and what it took."""
     start = time.process_time()
-    learned = learn_pose(carriage, training, config, Ticks(None, 1))
+    learned = learn_pose(parts, training, config, Work(None, 1))
     seconds = time.process_time() - start
-    fitter = PoseFitter(carriage.subject(learned.space))
+    fitter = PoseFitter(parts.subject(learned.space))
     errors = [1e3 * fitter.fit(body).mean for body in held]
     return {"error_mm": float(np.mean(errors)), "worst_mm": float(max(errors)),
             "features": learned.space.features.count, "left_out_mm": 1e3 * learned.design.left_out_error,
@@ -60,11 +61,11 @@ def main() -> None:
             continue
         train, held = scape_fold(int(fold), len(data.poses))
         skeleton = coarse_skeleton(Skeleton.load(path), data.template, coarse)
-        carriage = Carriage(coarse, skeleton, rigid_weights(skeleton))
+        parts = BlendedTemplate(coarse, skeleton, rigid_weights(skeleton))
         for name, config in SETTINGS.items():
             bodies = data.poses[:, vertices]
             row = {"fold": int(fold), "skeleton": finder, "parts": len(skeleton.parents), "setting": name,
-                   **run(config, carriage, bodies[train], bodies[held])}
+                   **run(config, parts, bodies[train], bodies[held])}
             rows.append(row)
             print(row, flush=True)
             write_report(args.output, {"protocol": f"SCAPE-5fold on {len(vertices)} vertices", "machine": machine(),

@@ -13,6 +13,7 @@ import json
 import time
 from collections.abc import Callable
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -41,7 +42,14 @@ def rigid(template: Mesh, poses: np.ndarray, skeleton: Skeleton) -> BodyModel:
     return replace(model, pose_space=PoseSpace.identity(skeleton))
 
 
-def skinning(correctives: str) -> Learn:
+def published(template: Mesh, poses: np.ndarray, skeleton: Skeleton, pruning: float | None = None) -> BodyModel:
+    """Learning as the paper has it; its 0.1 read as a standard deviation, or as a variance in square radians."""
+    config = LearnConfig.published()
+    config = config if pruning is None else replace(config, prunings=(pruning,))
+    return learn_scape(template, poses, None, skeleton, config)
+
+
+def skinning(correctives: bool) -> Learn:
     """Linear blend skinning, with or without pose-corrective shapes."""
     config = SkinConfig(correctives=correctives)
     return lambda template, poses, skeleton: learn_skinning(template, poses, None, skeleton, config)
@@ -49,9 +57,10 @@ def skinning(correctives: str) -> Learn:
 
 KINDS: dict[str, Learn] = {
     "rigid parts": rigid,
-    "LBS": skinning("none"),
-    "LBS + linear correctives": skinning("linear"),
-    "LBS + quadratic correctives": skinning("quadratic"),
+    "LBS": skinning(False),
+    "LBS + linear correctives": skinning(True),
+    "SCAPE, published": published,
+    "SCAPE, published, 0.1 square radians": partial(published, pruning=0.1),
     "SCAPE, linear": scape(features="linear"),
     "SCAPE, quadratic": scape(features="quadratic"),
     "SCAPE, radial": scape(features="radial"),

@@ -1,10 +1,10 @@
-"""Parts, tree and joints: on the real poses with every fifth held out, and on an embedded person.
+"""Parts, tree and joints: on the real poses with every fifth held out, and on a synthetic person.
 
     SCAPEKIT_DATA=... python tests/benchmarks/skeleton.py [OUT.json] [--only real folds embedded animals]
 
 Real poses have no truth: reported are the number of parts, the agreement over seeds and with the skeletons of
 four fifths of the poses (adjusted Rand index), how far poses are from moving rigidly, and how unlike left and right
-are in area. The embedded person is disturbed by smooth noise and by sliding along the skin, as registration does.
+are in area. The synthetic person is disturbed by smooth noise and by sliding along the skin, as registration does.
 Where py-dem-bones is installed it decomposes the same poses.
 """
 from __future__ import annotations
@@ -25,11 +25,10 @@ from scipy.sparse import csc_array, diags_array, eye_array
 from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.sparse import factor
 from scanprep.geometry.surface import Surface
-from scanprep.skeleton.find import find_skeleton
+from scanprep.skeleton.find import SkeletonSearch, find_skeleton, search_skeleton
 from scanprep.skeleton.motions import PosedSurface
 from scanprep.skeleton.names import part_partners
 from scanprep.skeleton.parts import SkeletonConfig
-from scanprep.skeleton.search import SkeletonSearch, search_skeleton
 from scanprep.skeleton.tree import Skeleton
 from scanprep.synthetic.data_set import subject_pose
 from scanprep.synthetic.people import Person

@@ -136,7 +136,7 @@ SECTIONS: dict[str, tuple[str, str, Callable[[dict], str], str]] = {
                  "nothing else running and the same skeleton given, `learn_scape` took 202 s: 81 for the pose space, "
                  "119 for the people, 1 for the components. The memory of the loaded model was measured afterwards on "
                  "the same file."),
-    "mixed": ("Learning from a random mix of embedded people", "python tests/benchmarks/mixed.py", mixed,
+    "mixed": ("Learning from a random mix of synthetic people", "python tests/benchmarks/mixed.py", mixed,
               "30 people in 3 poses each against one person in many poses and others in one, as many meshes, at 2,000 "
               "triangles with the true skeleton. Merged from one run of seed 1 and one of seeds 2 and 3; settings "
               "were tuned on other seeds. Where we lose: time, and the worst person of seed 1."),
@@ -182,7 +182,7 @@ SECTIONS: dict[str, tuple[str, str, Callable[[dict], str], str]] = {
                        "them again. `failed`: more than 25 mm off on average."),
     "skeleton": ("Skeletons", "python tests/benchmarks/skeleton.py", skeletons,
                  "Real poses have no truth: agreement is the adjusted Rand index of triangles. What a part must be "
-                 "worth was chosen on these poses, their five seeds and one embedded person. py-dem-bones is told the "
+                 "worth was chosen on these poses, their five seeds and one synthetic person. py-dem-bones is told the "
                  "number of parts and finds no joints. Where we lose: to it in time."),
     "decimation": ("Decimation of 400,000 triangles to 50,000", "python tests/benchmarks/decimation.py", decimation,
                    "A body subdivided twice, with relief. Where we lose: fast-simplification and pyfqmr are several "
@@ -195,7 +195,7 @@ SECTIONS: dict[str, tuple[str, str, Callable[[dict], str], str]] = {
                 "Virtual views with 2 mm noise of two held-out poses and two held-out men. `trusted`: share of bodies "
                 "whose alignment says of every view that it can be relied on; the others are not merged."),
     "holes": ("Six holes of a body", "python tests/benchmarks/cleaning.py --held --merge 0 --holes 2", holes,
-              "Crown, armpits, crotch and soles of real and embedded bodies; one of the seven, pose000, was tuned on. "
+              "Crown, armpits, crotch and soles of real and synthetic bodies; one of the seven, pose000, was tuned on. "
               "The second size was added after the first had been seen. `auto` is `fair` where no lines of sight "
               "are known. Where we lose: armpits (up to 22 mm from patch to truth); Poisson columns of the patch are "
               "missing as it remeshes everything."),

@@ -107,7 +107,7 @@ COMPLETION: dict[str, tuple[str, str, Callable[[dict], str], str]] = {
     "tracking": (
         "Frames of points without markers",
         "python tests/benchmarks/tracking.py tracking.json", tracking,
-        "A walk of 120 frames at 30 Hz of an embedded person who is not in the model of the embedded people, two "
+        "A walk of 120 frames at 30 Hz of a synthetic person who is not in the model of the synthetic people, two "
         "depth cameras with 5 mm noise, no landmarks. The run was stopped before its last two rows, frames that show "
         "nothing and frames that show half. `surface`: the model's vertices to the true surface of the whole body."),
 }

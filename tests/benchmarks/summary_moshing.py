@@ -138,13 +138,13 @@ MOSHING: dict[str, tuple[str, str, Callable[[dict], str], str]] = {
     "mosh_sex": (
         "Sex from markers",
         "python tests/benchmarks/mosh_sex.py --models DIR", sex,
-        "Embedded people not learned from, 41 markers 5 mm off, 24 frames of walking. Half and a quarter: "
+        "Synthetic people not learned from, 41 markers 5 mm off, 24 frames of walking. Half and a quarter: "
         "people half way "
         "and less to the middle between the sexes; there men are taken for women."),
     "mosh_characters": (
         "A motion on two cartoon figures",
         "python tests/benchmarks/mosh_characters.py", characters,
-        "The embedded walk, soft tissue twice. Triangles that turn over against the rotations of their parts, over all "
+        "The synthetic walk, soft tissue twice. Triangles that turn over against the rotations of their parts, all "
         "frames, before and after what pictures and GLB smooth. Where we lose: acrobatics on the template of the SCAPE "
         "scans turn over tens of triangles a frame, on the person too."),
     "mosh_design": (

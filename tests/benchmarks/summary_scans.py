@@ -60,7 +60,7 @@ def coregistration(report: dict) -> str:
 
 
 def skeletons(report: dict) -> str:
-    """Real poses from several seeds, exactly sixteen parts, embedded people and animals."""
+    """Real poses from several seeds, exactly sixteen parts, synthetic people and animals."""
     out = []
     if "real" in report:
         seeds, exact = report["real"], report["real"]["sixteen"]

@@ -3,7 +3,7 @@
     python tests/benchmarks/threads.py -o threads.json
     python tests/benchmarks/threads.py --tree ../older --busy 2 -o before.json
 
-Every command runs in a process of its own, on embedded people made beforehand: `prep register` of one scan, `learn` of
+Every command runs in a process of its own, on synthetic people made beforehand: `prep register` of one scan, `learn` of
 a small set, `complete` of a half view, `mosh` of 720 frames, `track` of 24. Once with no variable set, which is what
 scapekit decides by itself, and once for each number of OMP_NUM_THREADS. `--busy` runs beside so many processes that
 compute all the time; `--tree` measures another version of the sources. `same` says that what was written is byte for
@@ -27,8 +27,8 @@ import numpy as np
 from protocols import half_view, machine, write_report
 
 from completion.mocap.files.markers import MarkerSequence, write_markers
-from completion.mocap.marker_sets.layout import MarkerLayout
-from completion.synthetic_model import embedded_model, embedded_path
+from completion.mocap.marker_sets.named import named_layout
+from completion.synthetic_people import synthetic_model, synthetic_path
 from model.body import BodyModel
 from scanprep.geometry.files import PointCloud, write_mesh, write_points
 from scanprep.geometry.landmarks import write_landmarks
@@ -57,7 +57,7 @@ def make_cases(folder: Path, model: BodyModel, model_file: Path) -> dict[str, li
     write_landmarks(folder / "half.landmarks.json",
                     {names[int(v)]: p for v, p in zip(*seen.landmarks, strict=True)})
     subject = model.subject(0.5 * rng.normal(size=model.n_betas))
-    layout = MarkerLayout.named("cmu41", model.template, kept)
+    layout = named_layout("cmu41", model.template, kept)
     bodies = subject.vertices(*walk(720, 120.0))
     places = np.array([layout.place(model.template.with_vertices(v)) for v in bodies])
     places += rng.normal(0, 0.001, places.shape)
@@ -130,10 +130,10 @@ def main() -> None:
     parser.add_argument("--busy", type=int, default=0, help="processes that compute beside")
     parser.add_argument("--rounds", type=int, default=1)
     args = parser.parse_args()
-    model = embedded_model()
+    model = synthetic_model()
     with tempfile.TemporaryDirectory() as temporary, beside(args.busy):
         folder = Path(temporary)
-        cases = make_cases(folder, model, embedded_path())
+        cases = make_cases(folder, model, synthetic_path())
         rows = []
         for name in args.cases or cases:
             runs = [{t: run(cases[name], folder, args.tree.resolve(), t) for t in args.threads}

@@ -2,7 +2,7 @@
 
 Run:  python tests/benchmarks/tracking.py OUT.json [--quick] [--only NAME ...] [--real MODEL.npz FOLD]
 
-The walking person is not among those that the model of the embedded people was learned from. The scanner's cameras
+The walking person is not among those that the model of the synthetic people was learned from. The scanner's cameras
 go along with the person, 2.5 m away. Real motion leads through held-out poses: the model's poses in between, and what
 the model cannot follow of each mesh carried along, so that the surface that is tracked is not the model's own.
 """
@@ -18,7 +18,7 @@ from protocols import load_real, machine, scape_fold, write_report
 from scipy.spatial.transform import Rotation, Slerp
 
 from completion import TrackConfig, track
-from completion.synthetic_model import embedded_model
+from completion.synthetic_people import synthetic_model
 from model import Subject, fit_pose, load_model
 from model.body import BodyModel
 from model.posing.transfer import subject_from_body
@@ -102,7 +102,7 @@ def measure(body: BodyModel | Subject, model: BodyModel, frames: list, truth: np
 
 def procedural(only: list[str], count: int) -> dict[str, object]:
     """The walk, with everything that may go wrong."""
-    model = embedded_model()
+    model = synthetic_model()
     kept = np.array(model.info["people_vertices"])
     person = Person(BodyShape.random(np.random.default_rng(SEED)))
     poses, trans = walk(count, RATE)

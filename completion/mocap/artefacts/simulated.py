@@ -7,16 +7,17 @@ from model.linear import Subject
 
 from ..files.markers import MarkerSequence
 from ..marker_sets.layout import MarkerLayout
-from ..pose.follow import MarkerFollower
-from ..pose.marked_body import BATCH
+from ..pose.follow import between_keys, seen_span
+from ..pose.marked_body import BATCH, MarkedBody
+from ..pose.robust import marker_weights
 from ..pose.settings import AnimateConfig
-from ..pose.smooth import smooth_sequence
+from ..pose.smooth import inertia, smoothed
 
 LOOKS = 15.0                         # frames per second in which it is asked how a marker draws the body
 OWN = 0.6                            # most of a displacement that the body is taken to have followed
 
 
-class Simulation(MarkerFollower):
+class Simulation:
     """A body that follows markers whose labels are taken as they are.
 
     Parameters
@@ -28,30 +29,33 @@ class Simulation(MarkerFollower):
     """
 
     def __init__(self, subject: Subject, markers: MarkerSequence, layout: MarkerLayout, config: AnimateConfig) -> None:
-        super().__init__(subject, markers, layout, config)
-        self.labels = tuple(markers.labels[row] for row in self.rows)
+        self.labels = layout.matched(markers.labels)
+        self.config, self.rate = config, markers.rate
+        self.rows = np.array([markers.labels.index(label) for label in self.labels])
+        self.targets = markers.positions[:, self.rows]
         template, selected = subject.template, layout.select(self.labels)
-        base = selected.vertices.reshape(len(self.labels), -1)
-        share = np.ones(base.shape) if selected.weights is None else selected.weights
-        nearest = np.take_along_axis(base, share.argmax(axis=1)[:, None], axis=1)[:, 0]
-        self.part = subject.skeleton.part_of_vertex(template)[nearest]
+        self.body = MarkedBody(subject, selected, config.prior_weight, config.prior_shrinkage)
+        self.part = subject.skeleton.part_of_vertex(template)[selected.nearest]
         parents = np.asarray(subject.skeleton.parents)[self.part]
         hangs = self.part[:, None] == parents
         self.neighbours = (self.part[:, None] == self.part) | hangs | hangs.T
 
-    def find_exchanges(self, x: np.ndarray) -> None:
-        """Take the labels as they are."""
-        self.order[:] = np.arange(self.body.count)
+    def positions(self, x: np.ndarray) -> np.ndarray:
+        """Where the body puts the markers (..., L, 3), metres, for unknowns (..., P)."""
+        return self.body.positions(x)
+
+    def weights(self, frames: np.ndarray | slice, positions: np.ndarray) -> np.ndarray:
+        """Weights (n, L) of the markers of some frames, low for outliers."""
+        return marker_weights(positions, self.targets[frames], self.config.marker_sd, self.config.outlier)[0]
 
     def solve(self, targets: np.ndarray, near: np.ndarray | None = None) -> np.ndarray:
         """Unknowns (T, P) of the body that follows markers (T, L, 3), metres, from others that are near or anew."""
         self.targets = targets
-        x = self.between_keys(self.first_frame()) if near is None else near.copy()
-        self.find_exchanges(x)
-        some = np.flatnonzero(np.isfinite(targets[..., 0]).any(axis=1))
-        inside = np.arange(some[0], some[-1] + 1)
+        x = between_keys(self.body, targets, self.rate, self.config) if near is None else near.copy()
+        inside, stiffness = seen_span(targets), inertia(self.config, self.rate, self.body.n_unknowns)
         for _ in range(max(self.config.smoothing, 1)):
-            x[inside] = smooth_sequence(self, x[inside], inside)
+            weights = self.weights(inside, self.positions(x[inside]))
+            x[inside] = smoothed(self.body, stiffness, x[inside], targets[inside], weights)
         return x
 
     def alone(self, off: np.ndarray, x: np.ndarray) -> np.ndarray:
@@ -84,7 +88,7 @@ class Simulation(MarkerFollower):
         out = np.empty((*weights.shape, 3, 3))
         for start in range(0, len(x), BATCH):
             some = slice(start, start + BATCH)
-            _, _, hessian = self.body.system(x[some], self.taken(frames[some]), weights[some])
+            _, _, hessian = self.body.system(x[some], self.targets[frames[some]], weights[some])
             pose, trans, _ = self.body.body.split(x[some])
             _, by_turn = self.body.shapes.columns(pose, trans)                                    # (B, n, 3, L)
             columns = np.concatenate([by_turn, np.broadcast_to(np.eye(3)[None, :, :, None],

@@ -10,6 +10,7 @@ from scipy.spatial import cKDTree
 
 from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.surface import Surface
+from scanprep.skeleton.symmetry import MirrorPlane, find_symmetry
 
 from .layout import MarkerLayout
 
@@ -82,20 +83,10 @@ def label_pairs(labels: Sequence[str]) -> np.ndarray:
 
 
 def marker_pairs(layout: MarkerLayout, template: Mesh, mirror: SkinMirror | None = None) -> np.ndarray:
-    """The marker on the other side of every marker, by label, and by place where labels do not tell.
+    """(L,) the marker on the other side of every marker, by label, and by place where labels do not tell.
 
-    Parameters
-    ----------
-    layout : MarkerLayout
-    template : Mesh
-        A body that the layout is for.
-    mirror : SkinMirror, optional
-        Of `find_skin_mirror`; found when not given.
-
-    Returns
-    -------
-    (L,) int
-        Its own number for a marker in the middle, -1 where there is no partner; the partner's partner is the marker.
+    Its own number for a marker in the middle, -1 where there is no partner; the partner's partner is the marker.
+    `template` is a body that the layout is for, with its mirror, found when not given.
     """
     pairs = label_pairs(layout.labels)
     pairs[[other_side(label) is None for label in layout.labels]] = -1
@@ -103,7 +94,7 @@ def marker_pairs(layout: MarkerLayout, template: Mesh, mirror: SkinMirror | None
     if len(untold) == 0:
         return pairs
     mirror = mirror or find_skin_mirror(template)
-    skin = skin_points(layout, template)[untold]
+    skin = layout.skin_points(template.vertices)[untold]
     image = mirrored_points(layout, template, mirror)[untold]
     apart = np.linalg.norm(image[:, None] - skin[None], axis=-1)
     apart = apart + apart.T                                                    # there and back
@@ -114,27 +105,9 @@ def marker_pairs(layout: MarkerLayout, template: Mesh, mirror: SkinMirror | None
     return pairs
 
 
-def skin_points(layout: MarkerLayout, mesh: Mesh) -> np.ndarray:
-    """(L, 3) the points of the skin below the markers, metres."""
-    if layout.weights is None:
-        return mesh.vertices[layout.vertices]
-    return np.einsum("lc,lcd->ld", layout.weights, mesh.vertices[layout.vertices])
-
-
 def mirrored_points(layout: MarkerLayout, mesh: Mesh, mirror: SkinMirror) -> np.ndarray:
     """(L, 3) where the mirror images of the markers lie on the skin, metres."""
-    image = mirror.image(mesh)
-    return image[layout.vertices] if layout.weights is None else np.einsum(
-        "lc,lcd->ld", layout.weights, image[layout.vertices])
-
-
-def mirrored_layout(layout: MarkerLayout, template: Mesh, mirror: SkinMirror) -> MarkerLayout:
-    """The layout with left and right exchanged: every marker on the other side, with the label of that side."""
-    found = Surface(template).closest(mirrored_points(layout, template, mirror))
-    labels = tuple(other_side(label) or label for label in layout.labels)
-    aliases = {other_side(a) or a: other_side(label) or label for a, label in layout.aliases.items()}
-    return MarkerLayout(labels, template.faces[found.faces], layout.distances, found.bary, aliases,
-                        tuple(other_side(label) or label for label in layout.loose))
+    return layout.skin_points(mirror.image(mesh))
 
 
 def find_skin_mirror(template: Mesh, poses: np.ndarray | None = None, landmarks: Mapping[str, int] | None = None
@@ -170,8 +143,6 @@ def find_skin_mirror(template: Mesh, poses: np.ndarray | None = None, landmarks:
 
 def _by_symmetry(template: Mesh, poses: np.ndarray | None) -> tuple[Mesh, np.ndarray, np.ndarray]:
     """The body in the pose that serves, the images (N, 3) of its vertices, and the normal of the plane."""
-    from scanprep.skeleton.symmetry import find_symmetry
-
     found = find_symmetry(template, poses)
     if not found.holds:
         raise ValueError("template: expected one that stands symmetrically, its mirror image is "
@@ -192,10 +163,8 @@ def _by_landmarks(template: Mesh, landmarks: Mapping[str, int]) -> tuple[Mesh, n
     middle = [v for name, v in landmarks.items() if side_of(name) == 0]
     left, right = np.array(pairs).T
     x, y = template.vertices[np.r_[left, right, middle]], template.vertices[np.r_[right, left, middle]]
-    centre = x.mean(axis=0)
-    cross = (x - centre).T @ (y - y.mean(axis=0))
-    normal = np.linalg.eigh(cross + cross.T)[1][:, 0]
-    normal = normal * np.sign(((template.vertices[left] - template.vertices[right]) @ normal).sum())
-    start = template.vertices - 2 * ((template.vertices - centre) @ normal)[:, None] * normal
+    plane = MirrorPlane.between(x, y)
+    normal = plane.normal * np.sign(((template.vertices[left] - template.vertices[right]) @ plane.normal).sum())
+    start = plane.reflect(template.vertices)
     marks = np.r_[left, right, middle].astype(np.int64), y
     return template, register(Mesh(start, template.faces[:, ::-1]), template, marks).mesh.vertices, normal

@@ -6,7 +6,7 @@ from typing import Any
 
 import numpy as np
 
-from ..animate.report import chart_states
+from ...motion_pictures import chart_states
 from .takes import Take
 
 POINTS = 900                         # most points of a line, and columns of a map

@@ -16,7 +16,7 @@ from scanprep.console import Outcome, bar, say
 from scanprep.ranges import Count
 
 from ...cli import ModelOrNone, read_model
-from ..animate.work import choose_layout
+from ..marker_sets.named import choose_layout
 from ..settings import MoshConfig
 from .folder import keep_table, mosh_people, summary
 from .recordings import Actor, By, Grouping, find_actors
@@ -49,7 +49,7 @@ def mosh_markers(markers: MarkersArg, output: Output, model: ModelOrNone = None,
     Args:
         markers: C3D, TRC or CSV files, or folders of these.
         output: Folder to write to.
-        model: Model of `scape learn`; without it that of the embedded people, which is made on first use.
+        model: Model of `scape learn`; without it that of the synthetic people, which is made on first use.
         layout: Where the markers usually sit: one of `scape layout list`, or a JSON file {"markersets":
             [{"distance_from_skin": metres, "indices": {label: vertex}}]}. Without it the named one that fits best.
         subjects: Who is who: CSV with the columns file and subject, or JSON {file: subject}; other files are left out.

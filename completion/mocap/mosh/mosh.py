@@ -18,7 +18,7 @@ from ...motion import Motion
 from ..artefacts.find import by_tracks, find_faults
 from ..files.markers import MarkerSequence
 from ..marker_sets.layout import MarkerLayout
-from ..pose.mosh_poses import follow_poses
+from ..pose.follow import follow_poses
 from ..results import MarkerFaults, MoshResult, PersonFit, SoftTissue
 from ..settings import MoshConfig
 from ..soft_tissue.soft_tissue import follow_soft_tissue

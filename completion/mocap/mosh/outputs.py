@@ -10,9 +10,9 @@ from scanprep.console import plain
 from scanprep.geometry import storage
 from scanprep.geometry.storage import writing
 
-from ..animate.work import key_frames, write_glb
+from ...motion import spread_frames
 from ..artefacts.virtual import fault_table, write_virtual
-from ..files.motion_tables import write_joint_angles, write_joint_centres, write_motion_bvh, write_residuals
+from ..files.motion_files import write_glb, write_motion, write_residuals
 from ..results import MarkerFaults, MoshResult
 from .takes import Take
 
@@ -44,12 +44,8 @@ def write_take(folder: Path, take: Take, keys: int, factor: float = 1.0) -> None
         On the change of shape in exaggerated.glb, which is written where it is not 1.
     """
     motion, body, soft = take.motion, take.subject, take.soft
-    motion.save(folder / "motion.npz")
-    write_motion_bvh(folder / "motion.bvh", motion, body)
-    write_joint_angles(folder / "joint_angles.csv", motion, body.skeleton.names)
-    write_joint_centres(folder / "joint_centres.csv", motion, body)
-    write_residuals(folder / "residuals.csv", motion)
-    shown = key_frames(motion, keys)
+    write_motion(folder, motion, body)
+    shown = spread_frames(len(motion.poses), keys)
     write_glb(folder / "animation.glb", motion, body, keys, None if soft is None else take.bodies(shown))
     if soft is not None:
         soft.save(folder / "soft_tissue.npz")

@@ -15,7 +15,7 @@ from scanprep.pictures.page import Page
 from scanprep.pictures.shading import Dots, Shape, render, side_by_side
 
 from ...cli import rows
-from ..animate.report import MARKER, facing, worst_frames
+from ...motion_pictures import MARKER, facing, worst_frames
 from ..artefacts.chart import chart_faults
 from ..marker_sets.layout import MarkerLayout
 from ..results import MoshResult

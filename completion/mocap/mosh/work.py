@@ -13,14 +13,16 @@ from model.body import BodyModel
 from model.learning.sex_plane import SexGuess
 from scanprep.batch.room import Room
 from scanprep.console import Metric, Outcome, write_report
+from scanprep.pictures.camera import upright
 from scanprep.pictures.sheets import save_png
-from scanprep.pictures.views import upright
 
-from ..animate.report import morph_frames
-from ..animate.work import choose_layout, key_frames, write_glb
+from ...motion import spread_frames
+from ...motion_pictures import picture_bodies
 from ..artefacts.virtual import fault_table
 from ..files.markers import MarkerSequence, read_markers
+from ..files.motion_files import write_glb
 from ..marker_sets.layout import MarkerLayout
+from ..marker_sets.named import choose_layout
 from ..pose.robust import motion_problem
 from ..results import MoshResult
 from ..retargeting.pictures import picture_transfer, write_character
@@ -268,5 +270,5 @@ def _character(character: BodyModel, take: Take, folder: Path, keys: int, factor
     motion = retarget(take.motion, take.subject, body)
     motion.save(folder / "character.npz")
     write_glb(folder / "character.glb", motion, body, keys)
-    frames = key_frames(motion, 8)
-    return morph_frames(motion, body, motion.vertices(body, frames), frames), ""
+    frames = spread_frames(len(motion.poses), 8)
+    return picture_bodies(motion, body, motion.vertices(body, frames), frames), ""

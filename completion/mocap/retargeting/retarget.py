@@ -9,7 +9,7 @@ import numpy as np
 from model.body import BodyModel
 from model.linear import Subject
 from scanprep.geometry import rotations
-from scanprep.pictures.views import upright
+from scanprep.pictures.camera import upright
 
 from ...motion import Motion
 

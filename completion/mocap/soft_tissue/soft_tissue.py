@@ -13,12 +13,11 @@ from ...motion import Motion
 from ..files.markers import MarkerSequence
 from ..marker_sets.layout import MarkerLayout
 from ..pose.marked_body import BATCH
-from ..pose.mosh_poses import RATE, animate_config
-from ..pose.prediction import inertia
 from ..pose.robust import marker_weights
-from ..pose.smooth import FURTHEST, coupled_steps
+from ..pose.settings import RATE, FollowConfig, animate_config
+from ..pose.smooth import FURTHEST, coupled_steps, inertia
 from ..results import SoftTissue
-from ..settings import FollowConfig, SoftTissueConfig
+from ..settings import SoftTissueConfig
 from .equations import SwayingBody, skin_metric
 from .temporal_smoothness import steady_changes
 

@@ -3,8 +3,9 @@ from __future__ import annotations
 
 import numpy as np
 
+from scanprep.geometry.sparse import overlapping_windows, solve_smooth
+
 from ..pose.marked_body import BATCH
-from ..pose.smooth import solve_banded
 from .equations import SwayingBody
 
 WINDOW, OVERLAP = 400, 40            # frames solved at once, and those that each side lends to its neighbour
@@ -29,22 +30,13 @@ def steady_changes(body: SwayingBody, x: np.ndarray, targets: np.ndarray, weight
         Factor on the squared distance.
     steadiness : float
     """
-    T, K = len(x), body.n_betas
-    z = np.empty((T, K))
-    D = np.array([1.0, -2.0, 1.0])
-    for start in range(0, T, WINDOW):
-        near = slice(max(0, min(start - OVERLAP, T - 3)), min(T, start + WINDOW + OVERLAP))
-        n = near.stop - near.start
-        gradient, hessian = np.empty((n, K)), np.empty((n, K, K))
-        for first in range(0, n, BATCH):
+    z, eye = np.empty((len(x), body.n_betas)), np.eye(body.n_betas)
+    for near, kept, where in overlapping_windows(len(x), WINDOW, OVERLAP):
+        gradient = np.empty((near.stop - near.start, body.n_betas))
+        hessian = np.empty((*gradient.shape, body.n_betas))
+        for first in range(0, len(gradient), BATCH):
             some = slice(near.start + first, min(near.stop, near.start + first + BATCH))
             mine = slice(first, first + BATCH)
             gradient[mine], hessian[mine] = body.change_system(x[some], targets[some], weights[some])
-        band = np.zeros((3, n, K))                   # of a frame with itself, the next and the one after
-        band[0] = 1.0
-        for i in range(3):
-            for j in range(i, 3):
-                band[j - i, i:n - 2 + i] += steadiness * D[i] * D[j]
-        kept = slice(start - near.start, min(start + WINDOW, T) - near.start)
-        z[start:start + WINDOW] = -solve_banded(hessian, band, gradient)[kept]
+        z[where] = -solve_smooth(hessian + eye, steadiness, gradient)[kept]
     return z

@@ -15,7 +15,7 @@ from scanprep.geometry.least_squares import Residual, levenberg_marquardt, norma
 from ... import energy
 from ...bodies import FixedBody
 from ...starts import search
-from ..marker_sets.layout import MarkerLayout, most_used
+from ..marker_sets.layout import MarkerLayout
 from ..pose.marked_body import MarkedBody
 
 STARTS = 3                           # of those in a frame that are followed to their end
@@ -106,7 +106,7 @@ def find_loose(model: BodyModel, vertices: np.ndarray, layout: MarkerLayout, tar
     outlier : float, metres
         Distance beyond which it does not matter how far a marker is.
     """
-    template, distances, usual = model.template, np.asarray(layout.distances), most_used(layout)
+    template, distances, usual = model.template, np.asarray(layout.distances), layout.nearest
     meshes, found = [template.with_vertices(v) for v in vertices], {}
     tree, part = cKDTree(template.vertices), model.skeleton.part_of_vertex(template)
     for row in np.flatnonzero(np.isin(layout.labels, layout.loose)):

@@ -1,4 +1,4 @@
-"""One flat chart of a control mesh: where every triangle lies in an image."""
+"""One flat chart of a control mesh: the seams along which it is cut, and where every triangle lies in an image."""
 from __future__ import annotations
 
 from collections.abc import Sequence
@@ -6,13 +6,111 @@ from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
+from scipy.sparse import coo_array, csr_array
+from scipy.sparse.csgraph import connected_components, dijkstra
 
 from scanprep.geometry.mesh import Mesh
+from scanprep.geometry.surface import Rays
 from scanprep.skeleton.tree import Skeleton
 
-from .seams import cut, extended, find_seams
 
-MARGIN = 6 / 1024                    # of the image, left free around the chart
+def find_seams(mesh: Mesh, skeleton: Skeleton) -> list[np.ndarray]:
+    """A tree of seams, each the vertices (k,) that it passes, to the tips of all limbs, rather where the surface is
+    hidden. Each tip in turn, the nearest first, is joined to the seams there are by the shortest path over the edges.
+    """
+    graph = _costs(mesh)
+    tips = limb_tips(mesh, skeleton)
+    tree = np.array(tips[:1])
+    seams: list[np.ndarray] = []
+    left = set(tips[1:])
+    while left or not seams:
+        if left:
+            far = dijkstra(graph, directed=False, indices=tree, min_only=True)
+            goal = min(left, key=lambda v: (far[v], v))
+            left.discard(goal)
+        else:                                                          # one tip only: through the body to its far end
+            goal = int(dijkstra(graph, directed=False, indices=tree, min_only=True).argmax())
+        seam = join(graph, tree, goal)
+        if len(seam) > 1:
+            seams.append(seam)
+            tree = np.union1d(tree, seam)
+    return seams
+
+
+def extended(mesh: Mesh, seams: Sequence[np.ndarray], vertex: int) -> list[np.ndarray]:
+    """Seams with one more, the shortest path from them to a vertex; the same where they pass it already."""
+    seam = join(_costs(mesh), np.unique(np.concatenate(list(seams))), vertex)
+    return [*seams, seam] if len(seam) > 1 else list(seams)
+
+
+def join(graph: csr_array, tree: np.ndarray, goal: int) -> np.ndarray:
+    """The cheapest path (k,) over a graph from any vertex of `tree` to `goal`."""
+    before = dijkstra(graph, directed=False, indices=tree, min_only=True, return_predecessors=True)[1]
+    path = [goal]
+    while before[path[-1]] >= 0:
+        path.append(int(before[path[-1]]))
+    return np.array(path[::-1])
+
+
+def limb_tips(mesh: Mesh, skeleton: Skeleton) -> list[int]:
+    """One vertex for each part without children, and for the root when it has only one."""
+    x, y = mesh.edges.T
+    graph = coo_array((mesh.edge_lengths, (x, y)), shape=2 * (len(mesh.vertices),)).tocsr()
+    part, parents = skeleton.part_of_vertex(mesh), skeleton.parents
+    tips = []
+    for p in range(len(parents)):
+        children = np.flatnonzero(parents == p)
+        if len(children) > (1 if p == 0 else 0):
+            continue
+        mine = np.flatnonzero(part == p)
+        if not len(mine):
+            continue
+        joint = int(children[0]) if p == 0 and len(children) else p   # where it meets its neighbour
+        start = skeleton.ring(mesh, joint) if joint else mine[:0]
+        if not len(start):
+            start = mine[[np.linalg.norm(mesh.vertices[mine] - skeleton.joints[joint], axis=1).argmin()]]
+        far = dijkstra(graph, directed=False, indices=start, min_only=True)
+        tips.append(int(mine[far[mine].argmax()]))
+    return sorted(set(tips))
+
+
+def cut(mesh: Mesh, seams: Sequence[np.ndarray]) -> tuple[np.ndarray, np.ndarray]:
+    """Triangles (F, 3) of a closed mesh opened along seams, and the vertex (M,) that each of the new ones was."""
+    if not mesh.is_closed:
+        raise ValueError("mesh: expected a closed surface")
+    number = {edge: k for k, edge in enumerate(map(tuple, mesh.edges.tolist()))}
+    is_open = np.zeros(len(mesh.edges), dtype=bool)
+    for seam in seams:
+        for a, b in zip(seam[:-1].tolist(), seam[1:].tolist(), strict=True):
+            if (min(a, b), max(a, b)) not in number:
+                raise ValueError(f"seams: vertices {a} and {b} follow each other but no edge joins them")
+            is_open[number[min(a, b), max(a, b)]] = True
+    sides = np.argsort(mesh.face_edges.ravel(), kind="stable").reshape(-1, 2)[~is_open]    # the two at every edge
+    begin, end = sides, sides - sides % 3 + (sides + 1) % 3            # corners; the two sides run in opposite ways
+    n = mesh.faces.size
+    pairs = (np.r_[begin[:, 0], end[:, 0]], np.r_[end[:, 1], begin[:, 1]])
+    _, fan = connected_components(coo_array((np.ones(len(pairs[0])), pairs), shape=(n, n)), directed=False)
+    _, first = np.unique(fan, return_index=True)
+    return fan.reshape(-1, 3).astype(np.int64), mesh.faces.ravel()[first]
+
+
+def _costs(mesh: Mesh) -> csr_array:
+    """Lengths of the edges, those in sight counted longer."""
+    k = np.arange(48) + 0.5                                          # evenly over the sphere
+    z, turn = 1 - 2 * k / 48, np.pi * (1 + 5**0.5) * k
+    directions = np.stack([np.sqrt(1 - z * z) * np.cos(turn), np.sqrt(1 - z * z) * np.sin(turn), z], axis=1)
+    cosine = np.maximum(mesh.vertex_normals @ directions.T, 0)
+    vertex, ray = np.nonzero(cosine)
+    start = mesh.vertices[vertex] + 1e-3 * mesh.mean_edge * mesh.vertex_normals[vertex]
+    free = ~Rays(mesh).occluded(start, directions[ray])
+    weight = cosine[vertex, ray]
+    n = len(mesh.vertices)
+    seen = np.bincount(vertex, weight * free, n) / np.maximum(np.bincount(vertex, weight, n), 1e-12)
+    x, y = mesh.edges.T
+    return csr_array(coo_array((mesh.edge_lengths * (1 + (2.0 - 1) * (seen[x] + seen[y]) / 2), (x, y)),
+                               shape=(n, n)))
+
+
 FINE = 1 / 3                         # of the mean density, in length: coarser triangles ask for one more seam
 
 
@@ -20,8 +118,7 @@ FINE = 1 / 3                         # of the mean density, in length: coarser t
 class Chart:
     """Texture coordinates of a mesh in one connected piece. [Statues] Eq. 21"""
 
-    uv: np.ndarray     # (M, 2) in [0, 1], (0, 0) is the lower left corner of the image, (1, 1) its upper right one. A
-                       # vertex on a seam has several
+    uv: np.ndarray     # (M, 2) in [0, 1], from the lower left corner of the image; a vertex on a seam has several
     faces: np.ndarray  # (F, 3), the rows of `uv` at the corners of every triangle of the mesh, in its order
 
     @cached_property
@@ -30,9 +127,7 @@ class Chart:
         return Mesh(np.column_stack([self.uv, np.zeros(len(self.uv))]), self.faces)
 
     def texels(self, size: int) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
-        """The pixels of a square image of so many pixels a side whose centres lie in the chart: rows (n,), 0 the upper
-        one, columns (n,), and the faces (n,) and bary (n, 3) where they lie. [Statues] Eq. 21
-        """
+        """Rows (0 above), columns, faces (n,), bary (n, 3) of the pixels whose centres lie in it. [Statues] Eq. 21"""
         corners = self.uv[self.faces] * size - 0.5                     # pixel centres have whole numbers here
         low = np.maximum(np.ceil(corners.min(axis=1)).astype(np.int64), 0)
         count = np.maximum(np.minimum(np.floor(corners.max(axis=1)).astype(np.int64), size - 1) - low + 1, 0)
@@ -40,9 +135,7 @@ class Chart:
         face = np.repeat(np.arange(len(boxes)), boxes)
         within = np.arange(len(face)) - np.repeat(np.cumsum(boxes) - boxes, boxes)
         at = low[face] + np.stack(np.divmod(within, np.maximum(count[face, 1], 1)), axis=1)
-        a, b, c = (corners[face, k] for k in range(3))
-        bary = np.stack([_twice_area(at, b, c), _twice_area(at, c, a), _twice_area(at, a, b)], axis=1)
-        bary /= _twice_area(a, b, c)[:, None]
+        bary = barycentric(at, *corners[face].swapaxes(0, 1))
         inside = (bary >= -1e-12).all(axis=1)
         pixel = (size - 1 - at[inside, 1]) * size + at[inside, 0]
         pixel, first = np.unique(pixel, return_index=True)             # a centre on an edge lies in two triangles
@@ -51,9 +144,7 @@ class Chart:
 
 
 def make_chart(mesh: Mesh, seams: Sequence[np.ndarray]) -> Chart:
-    """A closed mesh cut along seams and laid flat in the unit square. Each seam is the vertices (k,) that it passes;
-    ValueError where the seams, together a tree, do not cut the mesh into one disk.
-    """
+    """A closed mesh cut along seams, a tree that must leave one disk, and laid flat in the unit square."""
     from .flatten import flatten
 
     faces, corner = cut(mesh, seams)
@@ -69,9 +160,7 @@ def make_chart(mesh: Mesh, seams: Sequence[np.ndarray]) -> Chart:
 
 
 def automatic_chart(mesh: Mesh, skeleton: Skeleton, rounds: int = 4) -> Chart:
-    """A chart along the seams of `find_seams`, which go on to where it is crowded, such as the tips of fingers;
-    `rounds` charts at most.
-    """
+    """A chart whose seams go on to where it is crowded, such as the tips of fingers; `rounds` charts at most."""
     seams = find_seams(mesh, skeleton)
     chart = make_chart(mesh, seams)
     for _ in range(rounds - 1):
@@ -108,13 +197,13 @@ def fill_square(uv: np.ndarray, mesh: Mesh) -> np.ndarray:
     extent = np.ptp(places, axis=1).max(axis=1)
     best = places[extent.argmin()]
     middle = (best.min(axis=0) + best.max(axis=0)) / 2
-    return 0.5 + (best - middle) * (1 - 2 * MARGIN) / extent.min()
+    return 0.5 + (best - middle) * (1 - 2 * 6 / 1024) / extent.min()    # left free around the chart
 
 
 def chart_problem(mesh: Mesh, chart: Chart) -> str | None:
     """Why a chart cannot carry the images of a mesh, or None when it can.
 
-    A chart is one disk inside the unit square, no triangle turned over, whose border does not meet itself: then it
+    A chart is one disk inside the unit square, no triangle inverted, whose border does not meet itself: then it
     is one-to-one.
     """
     from .flatten import crossings, orientation
@@ -130,9 +219,9 @@ def chart_problem(mesh: Mesh, chart: Chart) -> str | None:
     if not flat.is_edge_manifold or len(flat.boundary_loops) != 1:
         return f"expected one border, it has {len(flat.boundary_loops)}"
     corners = chart.uv[chart.faces]
-    turned = np.flatnonzero(orientation(*corners.swapaxes(0, 1)) <= 0)
-    if len(turned):
-        return f"{len(turned)} triangles are turned over, the first is face {turned[0]}"
+    inverted = np.flatnonzero(orientation(*corners.swapaxes(0, 1)) <= 0)
+    if len(inverted):
+        return f"{len(inverted)} triangles are inverted, the first is face {inverted[0]}"
     if crossings(chart.uv[flat.boundary_loops[0]]):
         return "its border crosses itself: places of the image belong to two places of the surface"
     return None
@@ -141,3 +230,9 @@ def chart_problem(mesh: Mesh, chart: Chart) -> str | None:
 def _twice_area(a: np.ndarray, b: np.ndarray, c: np.ndarray) -> np.ndarray:
     """Twice the signed area (n,) of triangles in the plane."""
     return (b[:, 0] - a[:, 0]) * (c[:, 1] - a[:, 1]) - (b[:, 1] - a[:, 1]) * (c[:, 0] - a[:, 0])
+
+
+def barycentric(points: np.ndarray, a: np.ndarray, b: np.ndarray, c: np.ndarray) -> np.ndarray:
+    """(n, 3) where points lie in triangles of the plane, negative outside."""
+    parts = np.stack([_twice_area(points, b, c), _twice_area(points, c, a), _twice_area(points, a, b)], axis=1)
+    return parts / _twice_area(a, b, c)[:, None]

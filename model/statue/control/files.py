@@ -32,8 +32,6 @@ def read_control(path: str | Path) -> ControlModel:
     if path.suffix.lower() == ".npz":
         return _load(path)
     if path.suffix.lower() == ".glb":
-        from .files import read_skinned
-
         return read_skinned(path)
     raise storage.StorageError(f"{path}: expected a control model in .npz or a skinned mesh in .glb")
 
@@ -78,8 +76,6 @@ def _load(path: str | Path) -> ControlModel:
 
 
 WHAT = "a GLB file with one mesh that hangs on joints"
-TRIANGLES = 4                        # of the modes of glTF
-WIDE = np.pi                         # radians either way: the limits of joints that nobody described
 
 
 @dataclass(frozen=True, eq=False)
@@ -132,7 +128,7 @@ def _corners(tree: dict[str, Any], binary: bytes, mesh: dict[str, Any], joints: 
 
 
 def _primitive(tree: dict[str, Any], binary: bytes, primitive: dict[str, Any], joints: int) -> _Corners:
-    if primitive.get("mode", TRIANGLES) != TRIANGLES:
+    if primitive.get("mode", 4) != 4:    # the mode of triangles
         raise ValueError(f"expected triangles, found a primitive of mode {primitive['mode']}")
     attributes = primitive["attributes"]
 
@@ -204,13 +200,14 @@ def _control(corners: _Corners, places: np.ndarray, parents: np.ndarray, names: 
     up = turn_up(2)                                                    # z up, as the people
     mesh, places = mesh.with_vertices(mesh.vertices @ up), places @ up
     kept, parents, weights, part_of_face = _with_triangles(mesh, weights, parents)
-    joints = places[kept]
-    skeleton = Skeleton(part_of_face, parents, joints, _distinct([names[j] for j in kept]))
+    joints, names = places[kept], [names[j] for j in kept]
+    distinct = tuple(name if names.count(name) == 1 else f"{name} {k}" for k, name in enumerate(names))
+    skeleton = Skeleton(part_of_face, parents, joints, distinct)
     joints[0] = mesh.vertices[skeleton.part_of_vertex(mesh) == 0].mean(axis=0)
     skeleton = Skeleton(part_of_face, parents, joints, skeleton.names)
     J = len(parents)
     control = ControlModel(mesh, skeleton, strongest(weights), chart or automatic_chart(mesh, skeleton), {},
-                           (np.eye(3),) * J, (np.array([[-WIDE, WIDE]] * 3),) * J, skeleton.names, np.arange(J))
+                           (np.eye(3),) * J, (np.array([[-np.pi, np.pi]] * 3),) * J, skeleton.names, np.arange(J))
     problem = control_problem(control)
     assert problem is None, problem
     return control
@@ -268,7 +265,3 @@ def _with_triangles(mesh: Mesh, weights: np.ndarray, parents: np.ndarray
     gathered = np.zeros((len(weights), len(kept)))
     np.add.at(gathered.T, index[heir], weights.T)
     return kept, tree, gathered, index[wanted.argmax(axis=1)]
-
-
-def _distinct(names: list[str]) -> tuple[str, ...]:
-    return tuple(name if names.count(name) == 1 else f"{name} {k}" for k, name in enumerate(names))

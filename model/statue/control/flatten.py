@@ -1,4 +1,4 @@
-"""A cut surface laid flat in one piece: no triangle turned over, no overlap, areas and angles nearly kept."""
+"""A cut surface laid flat in one piece: no triangle inverted, no overlap, areas and angles nearly kept."""
 from __future__ import annotations
 
 from fractions import Fraction
@@ -9,27 +9,22 @@ from scipy.sparse import coo_array, csc_array, diags_array
 from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.sparse import factor
 
-ROUNDS, ENOUGH = 300, 1e-5           # Newton steps at most; done when one lowers the energy by so little of it
-GAP = 0.012                          # of the chart's size: nearer than this, pieces of its border push each other off
-PUSH = 0.02                          # of the energy at rest, for how much that counts
-ROUNDING = 1e-15                     # of the two products of an area: below, its sign is worked out in fractions
-
 
 def flatten(mesh: Mesh) -> np.ndarray:
     """Places in the plane (N, 2) of a surface with one border, scaled to its area, one-to-one.
 
     Begins with an embedding of Tutte, the border on a circle, and lowers the symmetric Dirichlet energy
     |J|² + |J⁻¹|², J the derivative of the map, by Newton's method with definite Hessians of the triangles. No step
-    turns a triangle over or lets the border cross itself, so every stage is one-to-one.
+    inverts a triangle or lets the border cross itself, so every stage is one-to-one.
     """
     rest = _rest(mesh)
     areas = mesh.face_areas / mesh.face_areas.sum()
     border = mesh.boundary_loops[0]
     uv = tutte(mesh, border)
     uv *= np.sqrt(mesh.face_areas.sum() / abs(_signed_areas(uv, mesh.faces).sum()))
-    gap = GAP * np.sqrt(mesh.face_areas.sum())
+    gap = 0.012 * np.sqrt(mesh.face_areas.sum())    # nearer than this, pieces of the border push each other off
     energy = _energy(uv, mesh.faces, rest, areas, border, gap)
-    for _ in range(ROUNDS):
+    for _ in range(300):
         gradient, hessian = _derivatives(uv, mesh.faces, rest, areas, border, gap)
         ridge = diags_array(np.full(2 * len(uv), 1e-9 * hessian.diagonal().mean()))
         step = -factor((hessian + ridge).tocsc())(gradient).reshape(-1, 2)
@@ -44,7 +39,7 @@ def flatten(mesh: Mesh) -> np.ndarray:
             length /= 2
         else:
             return uv
-        if before - energy < ENOUGH * energy:
+        if before - energy < 1e-5 * energy:
             break
     return uv
 
@@ -88,7 +83,8 @@ def orientation(a: np.ndarray, b: np.ndarray, c: np.ndarray) -> np.ndarray:
     first = (b[:, 0] - a[:, 0]) * (c[:, 1] - a[:, 1])
     second = (b[:, 1] - a[:, 1]) * (c[:, 0] - a[:, 0])
     sign = np.sign(first - second).astype(int)
-    for k in np.flatnonzero(np.abs(first - second) <= ROUNDING * (np.abs(first) + np.abs(second))):
+    # else the sign is worked out in fractions
+    for k in np.flatnonzero(np.abs(first - second) <= 1e-15 * (np.abs(first) + np.abs(second))):
         (ax, ay), (bx, by), (cx, cy) = (map(Fraction, map(float, p[k])) for p in (a, b, c))
         area = (bx - ax) * (cy - ay) - (by - ay) * (cx - ax)
         sign[k] = (area > 0) - (area < 0)
@@ -149,19 +145,19 @@ def _derivatives(uv: np.ndarray, faces: np.ndarray, rest: np.ndarray, areas: np.
         for axis in range(2):
             B[:, 2 * axis + k, 2 + axis], B[:, 2 * axis + k, 4 + axis] = rest[:, 0, k], rest[:, 1, k]
             B[:, 2 * axis + k, axis] = -rest[:, 0, k] - rest[:, 1, k]
-    places = (2 * faces[:, :, None] + np.arange(2)).reshape(-1, 6)
-    size = 2 * len(uv)
-    gradient = np.bincount(places.ravel(), (areas[:, None] * np.einsum("fab,fa->fb", B, first)).ravel(), size)
-    blocks = areas[:, None, None] * (B.swapaxes(1, 2) @ second @ B)
-    rows, columns = np.repeat(places, 6, axis=1).ravel(), np.tile(places, (1, 6)).ravel()
-    _, pushed, (r, c, values) = _pushing(uv, border, gap)
-    hessian = coo_array((np.r_[blocks.ravel(), values], (np.r_[rows, r], np.r_[columns, c])), shape=(size, size))
-    return gradient + pushed, csc_array(hessian)
+    _, corners, pushed, stiffness = _pushing(uv, border, gap)
+    places = (2 * np.concatenate([faces, corners])[:, :, None] + np.arange(2)).reshape(-1, 6)
+    slopes = np.concatenate([areas[:, None] * np.einsum("fab,fa->fb", B, first), pushed])
+    blocks = np.concatenate([areas[:, None, None] * (B.swapaxes(1, 2) @ second @ B), stiffness])
+    size, rows, columns = 2 * len(uv), np.repeat(places, 6, axis=1).ravel(), np.tile(places, (1, 6)).ravel()
+    return (np.bincount(places.ravel(), slopes.ravel(), size),
+            csc_array(coo_array((blocks.ravel(), (rows, columns)), shape=(size, size))))
 
 
-def _pushing(uv: np.ndarray, border: np.ndarray, gap: float
-             ) -> tuple[float, np.ndarray, tuple[np.ndarray, np.ndarray, np.ndarray]]:
-    """Energy, gradient (2N,) and Hessian (rows, columns, values) of (gap/distance - 1)² of border points and sides."""
+def _pushing(uv: np.ndarray, border: np.ndarray, gap: float) -> tuple[float, np.ndarray, np.ndarray, np.ndarray]:
+    """(gap/distance - 1)² of border points and sides nearer than the gap: the sum, their corners (m, 3), slopes (m, 6)
+    and definite second derivatives (m, 6, 6) by the corners' places.
+    """
     p, n = uv[border], len(border)
     following = np.roll(np.arange(n), -1)
     a, side = p, p[following] - p
@@ -172,10 +168,6 @@ def _pushing(uv: np.ndarray, border: np.ndarray, gap: float
     index = np.arange(n)
     squared[index, index] = squared[following, index] = np.inf
     i, j = np.nonzero(squared < gap**2)
-    size = 2 * len(uv)
-    if not len(i):
-        none = np.zeros(0, dtype=np.int64)
-        return 0.0, np.zeros(size), (none, none, np.zeros(0))
     far, t = np.sqrt(squared[i, j]), t[i, j]
     unit = away[i, j] / far[:, None]
     share = np.stack([np.ones_like(t), t - 1, -t], axis=1)            # of the point and the side's two ends
@@ -183,12 +175,9 @@ def _pushing(uv: np.ndarray, border: np.ndarray, gap: float
     second = np.maximum(6 * gap**2 / far**4 - 4 * gap / far**3, 0)
     q = (share[:, :, None] * unit[:, None]).reshape(-1, 6)
     corners = np.stack([border[i], border[j], border[following[j]]], axis=1)
-    places = (2 * corners[:, :, None] + np.arange(2)).reshape(-1, 6)
-    scale = PUSH / n
-    gradient = np.bincount(places.ravel(), (scale * first[:, None] * q).ravel(), size)
-    blocks = scale * second[:, None, None] * q[:, :, None] * q[:, None]
-    return (scale * float(((gap / far - 1)**2).sum()), gradient,
-            (np.repeat(places, 6, axis=1).ravel(), np.tile(places, (1, 6)).ravel(), blocks.ravel()))
+    scale = 0.02 / n
+    return (scale * float(((gap / far - 1)**2).sum()), corners, scale * first[:, None] * q,
+            scale * second[:, None, None] * q[:, :, None] * q[:, None])
 
 
 def _until_flat(uv: np.ndarray, step: np.ndarray, faces: np.ndarray) -> float:

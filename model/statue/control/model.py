@@ -136,3 +136,8 @@ class Statue:
     pose: np.ndarray
     map: DisplacementMap
     texture: np.ndarray | None = None
+
+    @property
+    def upright_axis(self) -> int:
+        """0, 1 or 2: the axis of the scan nearest to the upward direction of the person's trunk."""
+        return int(np.abs(self.control.skeleton.part_rotations(self.pose)[0][:, 2]).argmax())

@@ -17,21 +17,15 @@ from scipy.sparse.csgraph import connected_components
 from scanprep.geometry import sparse
 from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.surface import Rays, Surface
-from scanprep.ranges import Cosine, Positive, Range, Settings
+from scanprep.ranges import FLAG, Positive, Range, Settings
 
 from ..control.model import FOLDED, HOLE, MEASURED, OUTSIDE, ControlModel, DisplacementMap
-from .crossings import Crossings, find_crossings, limits, outer_layers, unturned
-from .normal_volume import interpolate
+from .normal_volume import Crossings, find_crossings, interpolate, limits, not_inverted, outer_layers
 from .texels import Lattice, Texels, find_texels
 from .vectors import bend_over_folds
 
 Progress = Callable[[int, int], None]
-Pixels = Annotated[int, Range(16, 8192)]
-STEP = 0.003                         # metres: smaller steps are noise, or views that differ
 FILL_LEVEL = 3                       # of the subdivision on which holes are filled: edges of some 5 mm
-CLOSE = 0.01                         # metres: a surface so near to a place outside the scan is that place's
-UNFOLD_SIZE = 512                    # pixels each way while control vertices are moved out of folds
-VECTOR_LEVEL = 4                     # of that whose vertices are drawn onto the scan in folds
 
 
 @dataclass(frozen=True)
@@ -44,21 +38,12 @@ class DisplacementConfig(Settings):
         Pixels of the image, each way.
     reach : float, metres
         Largest height, up or down.
-    min_cosine : float
-        Least cosine between the normals of control mesh and scan.
-    slope : float
-        Heights of neighbouring pixels that differ by more than this times their distance are a fold.
-    island : float, square metres
-        Patches between folds that are smaller are left out and filled.
     vectors : bool
         Displacements of any direction where the surface is not one-to-one.
     """
 
-    size: Pixels = 1024
+    size: Annotated[int, Range(16, 8192), FLAG] = 1024
     reach: Positive = 0.1
-    min_cosine: Cosine = 0.1
-    slope: Positive = 3.0
-    island: Positive = 1e-4
     vectors: bool = False
 
 
@@ -66,17 +51,7 @@ def bake(control: ControlModel, scan: Mesh, config: DisplacementConfig | None = 
          progress: Progress | None = None) -> DisplacementMap:
     """The displacement map of a scan over a control model that has been fitted to it.
 
-    Parameters
-    ----------
-    control : ControlModel
-    scan : Mesh
-    config : DisplacementConfig, optional
-    progress : (done, total), optional
-
-    Raises
-    ------
-    ValueError
-        A scan without triangles, or a chart that covers no pixel.
+    ValueError for a scan without triangles, or a chart that covers no pixel.
 
     [Statues] Eq. 19, 20, 21
     """
@@ -109,8 +84,8 @@ def find_heights(control: ControlModel, scan: Mesh, config: DisplacementConfig) 
     texels = find_texels(control.mesh, control.chart, config.size)
     if not texels.inside.any():
         raise ValueError(f"size: {config.size} pixels are too few, no pixel's centre lies in the chart")
-    heights, several = _measure(control.mesh, scan, texels, config)
-    known, folded = _sort(control, texels, heights, several, config)
+    heights, several = _measure(control.mesh, scan, texels, config.reach)
+    known, folded = _sort(control, texels, heights, several)
     empty = ~known & ~folded
     if empty.any():
         folded[empty] = ~_without_data(control.mesh, scan, texels, empty, config.reach)
@@ -125,7 +100,7 @@ def unfold_control(control: ControlModel, scan: Mesh, config: DisplacementConfig
     surface. A round counts only if less of the control mesh than before is folded or a hole.
     """
     config = config or DisplacementConfig()
-    config = replace(config, size=min(config.size, UNFOLD_SIZE))
+    config = replace(config, size=min(config.size, 512))
     best, before = control, np.inf
     for number in range(rounds + 1):
         found = find_heights(control, scan, config)
@@ -142,15 +117,15 @@ def unfold_control(control: ControlModel, scan: Mesh, config: DisplacementConfig
     return best
 
 
-def _measure(mesh: Mesh, scan: Mesh, texels: Texels, config: DisplacementConfig) -> tuple[np.ndarray, np.ndarray]:
+def _measure(mesh: Mesh, scan: Mesh, texels: Texels, reach: float) -> tuple[np.ndarray, np.ndarray]:
     """Heights (n,) of pixels, NaN where there is none, and which (n,) had several to choose from."""
     points, normals = interpolate(mesh, texels.faces, texels.bary)
-    found = outer_layers(find_crossings(scan, Rays(scan), points, normals, config.reach))
-    low, high = limits(mesh, points, normals, config.reach)
+    found = outer_layers(find_crossings(scan, Rays(scan), points, normals, reach))
+    low, high = limits(mesh, points, normals, reach)
     of = found.normal
     far = found.heights * np.linalg.norm(normals[of], axis=1)
-    found = found.pick((found.cosines > config.min_cosine) & (far >= low[of]) & (far <= high[of])
-                       & unturned(mesh, texels.faces[of], texels.bary[of], found.heights))
+    found = found.pick((found.cosines > 0.1) & (far >= low[of]) & (far <= high[of])
+                       & not_inverted(mesh, texels.faces[of], texels.bary[of], found.heights))
     several = np.bincount(found.normal, minlength=len(points)) > 1
     return _choose(found, several, texels.neighbours()), several
 
@@ -180,15 +155,20 @@ def _choose(found: Crossings, several: np.ndarray, pairs: np.ndarray) -> np.ndar
     return heights
 
 
-def _sort(control: ControlModel, texels: Texels, heights: np.ndarray, several: np.ndarray, config: DisplacementConfig
+def _sort(control: ControlModel, texels: Texels, heights: np.ndarray, several: np.ndarray
           ) -> tuple[np.ndarray, np.ndarray]:
-    """Which pixels (n,) keep their height, and which lie in folds."""
+    """Which pixels (n,) keep their height, and which lie in folds.
+
+    Neighbours whose heights differ by more than three times their distance are torn apart; so many square metres
+    (1 cm²) between such folds are left out and filled.
+    """
     points, _ = interpolate(control.mesh, texels.faces, texels.bary)
     a, b = texels.neighbours().T
     both = ~np.isnan(heights[a]) & ~np.isnan(heights[b])
     a, b = a[both], b[both]
     apart = np.linalg.norm(points[a] - points[b], axis=1)
-    jump = np.abs(heights[a] - heights[b]) > np.maximum(config.slope * apart, STEP)
+    # steps of less than 3 mm are noise, or views that differ
+    jump = np.abs(heights[a] - heights[b]) > np.maximum(3.0 * apart, 0.003)
     count = len(heights)
     joined = coo_array((np.ones((~jump).sum()), (a[~jump], b[~jump])), shape=(count, count))
     _, patch = connected_components(joined, directed=False)
@@ -196,7 +176,7 @@ def _sort(control: ControlModel, texels: Texels, heights: np.ndarray, several: n
     beside[a[jump]] = beside[b[jump]] = True
     area = np.bincount(patch, texel_areas(control, texels))
     torn = np.bincount(patch, beside) > 0
-    dropped = (torn & (area < config.island))[patch] & ~np.isnan(heights)
+    dropped = (torn & (area < 1e-4))[patch] & ~np.isnan(heights)
     known = ~np.isnan(heights) & ~dropped
     return known, dropped | (known & (beside | several))
 
@@ -221,7 +201,7 @@ def _without_data(mesh: Mesh, scan: Mesh, texels: Texels, empty: np.ndarray, rea
     border[scan.boundary_vertices] = True
     inside = np.asarray(igl.fast_winding_number(scan.vertices, scan.faces, points)).ravel() > 0.5
     return ((nearest.distances > reach) | border[scan.faces[nearest.faces]].any(axis=1)
-            | (~inside & (nearest.distances > CLOSE)))
+            | (~inside & (nearest.distances > 0.01)))
 
 
 def _filled(control: ControlModel, texels: Texels, heights: np.ndarray, known: np.ndarray) -> np.ndarray:
@@ -242,7 +222,7 @@ def _over_folds(lattice: Lattice, scan: Mesh, found: Heights, reach: float) -> t
 
 def _vectors(control: ControlModel, scan: Mesh, found: Heights, reach: float) -> np.ndarray:
     """What is to be added (n, 3) to the heights of pixels in and around folds."""
-    lattice, texels = Lattice(control.mesh, control.chart, VECTOR_LEVEL), found.texels
+    lattice, texels = Lattice(control.mesh, control.chart, 4), found.texels
     drawn, u = _over_folds(lattice, scan, found, reach)
     out = np.zeros((len(found.heights), 3))
     vertex, _ = lattice.places(texels.faces, texels.bary)

@@ -25,23 +25,24 @@ from ..control.model import FOLDED, HOLE, MEASURED, OUTSIDE, DisplacementMap
 HEADER, HEIGHTS, IMAGE = "displacement.json", "displacement.tif", "displacement.png"
 COVERAGE, VECTORS = "coverage.png", "vectors.tif"
 ZERO, LARGEST = 32768, 65535
-FINEST = 1e-7                        # metres for a step of grey: a flat map has no extent to divide by
-LEVELS = {"measured": MEASURED, "folded": FOLDED, "hole": HOLE, "outside": OUTSIDE}
 
 
 def write_map(folder: str | Path, map: DisplacementMap) -> None:
     """Write a displacement map into a folder, which is made if it is not there; each file whole or not at all."""
     folder = Path(folder)
-    scale = _scale(map)
+    inside = np.abs(map.heights[map.coverage != OUTSIDE])
+    scale = max(float(inside.max(initial=0)) / (LARGEST - ZERO), 1e-7)         # a flat map has no extent to divide by
+    grey = np.clip(np.rint(map.heights.astype(float) / scale) + ZERO, 0, LARGEST).astype(np.uint16)
     _write_tiff(folder / HEIGHTS, map.heights)
-    _write_png(folder / IMAGE, _grey(map.heights, scale))
+    _write_png(folder / IMAGE, grey)
     _write_png(folder / COVERAGE, map.coverage)
     if map.vectors is None:
         (folder / VECTORS).unlink(missing_ok=True)
     else:
         _write_tiff(folder / VECTORS, map.vectors)
     write_json(folder / HEADER, {"kind": "displacement map", "version": 1, "size": list(map.heights.shape),
-                                 "zero": ZERO, "scale": scale, "coverage": LEVELS})
+                                 "zero": ZERO, "scale": scale, "coverage": {
+                                     "measured": MEASURED, "folded": FOLDED, "hole": HOLE, "outside": OUTSIDE}})
 
 
 def read_map(folder: str | Path, edited: str | Path | None = None) -> DisplacementMap:
@@ -64,20 +65,13 @@ def read_map(folder: str | Path, edited: str | Path | None = None) -> Displaceme
     found = DisplacementMap(heights, coverage, vectors)
     if edited is None:
         return found
-    stored = _checked(folder / IMAGE, _read_png(folder / IMAGE), size, np.uint16)
-    return edit(found, stored, read_edited(edited, size), scale)
-
-
-def edit(map: DisplacementMap, stored: np.ndarray, edited: np.ndarray, scale: float) -> DisplacementMap:
-    """A map whose heights change where two images (H, W) uint16 differ, by their difference."""
-    change = np.where(edited != stored, scale * (edited.astype(float) - stored), 0)
-    return replace(map, heights=(map.heights + change).astype(np.float32))
+    stored, changed = _checked(folder / IMAGE, _read_png(folder / IMAGE), size, np.uint16), read_edited(edited, size)
+    change = np.where(changed != stored, scale * (changed.astype(float) - stored), 0)
+    return replace(found, heights=(heights + change).astype(np.float32))
 
 
 def read_edited(path: str | Path, size: tuple[int, ...]) -> np.ndarray:
-    """(H, W) uint16 grey values of an image that an editor saved, 16 bits of grey or of three equal channels;
-    StorageError for another size or depth, or colours.
-    """
+    """(H, W) uint16 grey values of an image that an editor saved: 16 bits of grey, or three equal channels."""
     expected = f"an image of {size[1]} x {size[0]} pixels with 16 bits of grey"
     with taking_apart(path, expected):
         image, depth = _decoded(Path(path))
@@ -90,16 +84,6 @@ def read_edited(path: str | Path, size: tuple[int, ...]) -> np.ndarray:
     if depth != 16 or image.shape != tuple(size):
         raise StorageError(f"{path}: expected {expected}, got {came}")
     return image
-
-
-def _scale(map: DisplacementMap) -> float:
-    """Metres for a step of grey, so that all heights in the chart have a value."""
-    inside = np.abs(map.heights[map.coverage != OUTSIDE])
-    return max(float(inside.max(initial=0)) / (LARGEST - ZERO), FINEST)
-
-
-def _grey(heights: np.ndarray, scale: float) -> np.ndarray:
-    return np.clip(np.rint(heights.astype(float) / scale) + ZERO, 0, LARGEST).astype(np.uint16)
 
 
 def _write_png(path: Path, image: np.ndarray) -> None:

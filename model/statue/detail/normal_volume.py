@@ -17,11 +17,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from scanprep.geometry.mesh import Mesh
-from scanprep.geometry.surface import checked_points
-
-EDGE = 1e-9                          # barycentric coordinates this far below zero still lie in a triangle
-PAIRS = 250_000                      # points with triangles that are solved at once
-STEPS = 60                           # of a search between two signs: each at least halves it, most stop after 8
+from scanprep.geometry.surface import Rays, checked_points
 
 
 @dataclass(frozen=True, eq=False)
@@ -30,10 +26,8 @@ class NormalCoordinates:
 
     faces: np.ndarray      # (n,), triangle of the control mesh, -1 where a point lies in the volume of none
     bary: np.ndarray       # (n, 3), barycentric coordinates; zero where there is no triangle
-    heights: np.ndarray    # (n,) metres, along the interpolated normal, which is shorter than 1; NaN where there is no
-                           # triangle
-    solutions: np.ndarray  # (n,), how many places of the mesh reach the point: 0 outside the volume, 1 where it is one-
-                           # to-one
+    heights: np.ndarray    # (n,) metres, along the interpolated normal; NaN where there is no triangle
+    solutions: np.ndarray  # (n,), how many places of the mesh reach the point: 1 where it is one-to-one
 
     @property
     def inside(self) -> np.ndarray:
@@ -55,35 +49,28 @@ def from_normal_volume(mesh: Mesh, coordinates: NormalCoordinates) -> np.ndarray
 
 
 def to_normal_volume(mesh: Mesh, points: np.ndarray, reach: float) -> NormalCoordinates:
-    """Every point's (n, 3) triangle, place and least height, at most `reach` metres up or down, among all triangles of
-    a control mesh. [Statues] Eq. 19, 20
-    """
+    """Every point's (n, 3) triangle, place and least height, at most `reach` up or down. [Statues] Eq. 19, 20"""
     points = checked_points(points)
     if not 0 < reach < np.inf:
         raise ValueError(f"reach: expected a length above 0, got {reach}")
     count = len(points)
-    face, bary = np.full(count, -1), np.zeros((count, 3))
-    height, solutions = np.full(count, np.nan), np.zeros(count, dtype=np.int64)
-    best = np.full(count, np.inf)
-    places: list[tuple[np.ndarray, np.ndarray, np.ndarray]] = []
+    face, bary, height = np.full(count, -1), np.zeros((count, 3)), np.full(count, np.nan)
+    found: list[tuple[np.ndarray, ...]] = [(np.zeros(0, int), np.zeros(0), np.zeros((0, 3)), np.zeros(0, int))]
     for which, triangle in _near(mesh, points, reach):
         pair, d, b = solve_triangles(mesh, triangle, points[which], reach)
-        who = which[pair]
-        places.append((who, np.einsum("nc,ncd->nd", b, mesh.corners[triangle[pair]]), d))
-        order = np.argsort(-np.abs(d), kind="stable")           # of several the least is written last
-        who, d, b, of = who[order], d[order], b[order], triangle[pair][order]
-        better = np.abs(d) < best[who]
-        who, d, b, of = who[better], d[better], b[better], of[better]
-        best[who] = np.inf
-        face[who], bary[who], height[who], best[who] = of, b, d, np.abs(d)
-    if places:
-        solutions = _count_places(count, *(np.concatenate(part) for part in zip(*places, strict=True)))
+        found.append((which[pair], d, b, triangle[pair]))
+    who, d, b, of = (np.concatenate(part) for part in zip(*found, strict=True))
+    solutions = _count_places(count, who, np.einsum("nc,ncd->nd", b, mesh.corners[of]), d)
+    order = np.argsort(np.abs(d), kind="stable")
+    _, first = np.unique(who[order], return_index=True)
+    best = order[first]                                                 # of several the least height
+    face[who[best]], bary[who[best]], height[who[best]] = of[best], b[best], d[best]
     return NormalCoordinates(face, bary, height, solutions)
 
 
 def solve_triangles(mesh: Mesh, faces: np.ndarray, points: np.ndarray, reach: float
                     ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Heights at which points (n, 3) lie in given triangles (n,), displaced; only where these are not turned over.
+    """Heights at which points (n, 3) lie in given triangles (n,), displaced; only where these are not inverted.
     Which pair each solution is of (k,), its height (k,) in metres, its bary (k, 3).
     """
     v = mesh.corners[faces] - points[:, None]
@@ -94,7 +81,7 @@ def solve_triangles(mesh: Mesh, faces: np.ndarray, points: np.ndarray, reach: fl
     b = np.stack([np.einsum("nd,nd->n", np.cross(w[:, i - 2], w[:, i - 1]), N) for i in range(3)], axis=1)
     b /= np.maximum(b.sum(axis=1), 1e-300)[:, None]
     upright = np.einsum("nd,nd->n", N, np.einsum("nc,ncd->nd", b, n[pair])) > 0
-    good = upright & (b >= -EDGE).all(axis=1)
+    good = upright & (b >= -1e-9).all(axis=1)    # a little below zero is still in the triangle
     b = np.clip(b[good], 0, None)
     return pair[good], reach * d[good], b / b.sum(axis=1, keepdims=True)
 
@@ -125,7 +112,7 @@ def _roots(c: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     low, high, c = ends[cubic, piece], ends[cubic, piece + 1], c[cubic]
     rising = at[cubic, piece] < 0
     x = 0.5 * (low + high)
-    for _ in range(STEPS):
+    for _ in range(60):    # each at least halves the interval, most stop after 8
         value = _value(c, x)
         above = (value > 0) == rising
         low, high = np.where(above, low, x), np.where(above, x, high)
@@ -166,7 +153,7 @@ def _near(mesh: Mesh, points: np.ndarray, reach: float) -> Iterator[tuple[np.nda
             which = which[((at > low[face]) & (at < high[face])).all(axis=1)]
         held.append((which, np.full(len(which), face)))
         total += len(which)
-        if total and (total > PAIRS or face == len(center) - 1):
+        if total and (total > 250_000 or face == len(center) - 1):    # so many are solved at once
             yield np.concatenate([w for w, _ in held]), np.concatenate([f for _, f in held])
             held, total = [], 0
 
@@ -180,3 +167,106 @@ def _count_places(count: int, who: np.ndarray, at: np.ndarray, d: np.ndarray) ->
     who, at = who[order], at[order]
     same = (who[1:] == who[:-1]) & (np.linalg.norm(at[1:] - at[:-1], axis=1) < 1e-7)
     return found - np.bincount(who[1:][same], minlength=count)
+
+
+NEAREST = 0.003                      # metres: crossings up to this height are never those of another body part
+THICK = 0.75                         # share of the way to the other side of a limb, or across a gap, that heights go
+
+
+@dataclass(frozen=True, eq=False)
+class Crossings:
+    """Crossings of normals with a surface, ordered by normal and height."""
+
+    normal: np.ndarray   # (k,), which normal
+    heights: np.ndarray  # (k,) metres
+    cosines: np.ndarray  # (k,), between the normals of both; negative where the surface is met from inside
+    faces: np.ndarray    # (k,), triangle of the scan
+
+    def pick(self, keep: np.ndarray) -> Crossings:
+        """Only some of them."""
+        return Crossings(self.normal[keep], self.heights[keep], self.cosines[keep], self.faces[keep])
+
+
+def outer_layers(found: Crossings) -> Crossings:
+    """The crossings that meet the scan from outside, sheets of overlapping views as one at their mean height.
+
+    Two layers of a fold have one between them that is met from inside; two views of one surface have not.
+    """
+    outside = found.cosines > 0
+    layer = np.cumsum(~outside)[outside]
+    front = found.pick(outside)
+    begins = np.ones(len(front.normal), dtype=bool)
+    begins[1:] = ((front.normal[1:] != front.normal[:-1]) | (layer[1:] != layer[:-1])
+                  # metres: farther apart, two views have not met the same surface
+                  | (front.heights[1:] - front.heights[:-1] > 0.01))
+    group = np.cumsum(begins) - 1
+    count = np.maximum(np.bincount(group), 1)
+    return Crossings(front.normal[begins], np.bincount(group, front.heights) / count,
+                     np.bincount(group, front.cosines) / count, front.faces[begins])
+
+
+def find_crossings(scan: Mesh, rays: Rays, points: np.ndarray, normals: np.ndarray, reach: float) -> Crossings:
+    """Every crossing of normals (n, 3), of any length, at points (n, 3) with a scan, at most `reach` metres away.
+
+    Embree tells which triangle is met, in single precision; where, the triangle's plane says in double.
+    """
+    length = np.maximum(np.linalg.norm(normals, axis=1), 1e-12)
+    along = normals / length[:, None]
+    active, at = np.arange(len(points)), np.full(len(points), -reach)
+    found: list[tuple[np.ndarray, np.ndarray]] = []
+    for _ in range(30):
+        face, far = rays.cast(points[active] + at[active, None] * along[active], along[active], 2 * reach)
+        met = face >= 0
+        active, face, far = active[met], face[met], far[met]
+        at[active] += far + 2e-5    # metres behind what was met
+        inside = at[active] < reach
+        active, face = active[inside], face[inside]
+        if not len(active):
+            break
+        found.append((active, face))
+    normal = np.concatenate([a for a, _ in found]) if found else np.zeros(0, dtype=int)
+    face = np.concatenate([f for _, f in found]) if found else np.zeros(0, dtype=int)
+    N, m = scan.face_normals[face], along[normal]
+    cosine = np.einsum("nd,nd->n", N, m)
+    away = np.einsum("nd,nd->n", scan.corners[face, 0] - points[normal], N)
+    steep = np.abs(cosine) < 1e-3                           # seen from the edge: where, is not to be said
+    height = away / np.where(steep, 1, cosine)
+    order = np.lexsort((height, normal))
+    normal, height, cosine, face, steep = (v[order] for v in (normal, height, cosine, face, steep))
+    again = np.zeros(len(normal), dtype=bool)
+    # metres: met twice on a shared edge
+    again[1:] = (normal[1:] == normal[:-1]) & (height[1:] - height[:-1] < 1e-6) & (cosine[1:] * cosine[:-1] > 0)
+    keep = ~again & ~steep & (np.abs(height) <= reach)
+    return Crossings(normal[keep], (height / length[normal])[keep], cosine[keep], face[keep])
+
+
+def limits(control: Mesh, points: np.ndarray, normals: np.ndarray, reach: float) -> tuple[np.ndarray, np.ndarray]:
+    """Least and greatest distance (n,) along normals before which no other body part is met, metres."""
+    along = normals / np.maximum(np.linalg.norm(normals, axis=1), 1e-12)[:, None]
+    rays = Rays(control)
+    ends = []
+    for side in (-along, along):
+        far = rays.cast(points + 1e-4 * side, side, reach / THICK)[1]
+        ends.append(np.maximum(THICK * np.nan_to_num(far, nan=reach / THICK), NEAREST))
+    return -ends[0], ends[1]
+
+
+def not_inverted(control: Mesh, faces: np.ndarray, bary: np.ndarray, heights: np.ndarray) -> np.ndarray:
+    """(n,) bool: up to these heights the displaced triangles are nowhere inverted.
+
+    The area of the displaced triangle, as seen along the normal, is a quadratic in the height, and 1 at height 0.
+    """
+    corners, normals = control.corners[faces], control.vertex_normals[control.faces[faces]]
+    _, n = interpolate(control, faces, bary)
+    e, f = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0]
+    p, q = normals[:, 1] - normals[:, 0], normals[:, 2] - normals[:, 0]
+
+    def seen(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+        return np.einsum("nd,nd->n", np.cross(a, b), n)
+
+    c0, c1, c2 = seen(e, f), seen(e, q) + seen(p, f), seen(p, q)
+    good = c0 > 0
+    for part in (0.25, 0.5, 0.75, 1.0):
+        d = part * heights
+        good &= c0 + d * (c1 + d * c2) > 0.05 * c0
+    return good

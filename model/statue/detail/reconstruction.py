@@ -1,22 +1,17 @@
-"""The scan's surface on a control mesh, wherever that has moved, and how far it is from the scan [Statues]."""
+"""The scan's surface on a control mesh, wherever that has moved [Statues]."""
 from __future__ import annotations
-
-from dataclasses import dataclass
 
 import numpy as np
 from scipy.sparse import csr_array, diags_array, hstack
 
+from scanprep.geometry import rotations
 from scanprep.geometry.mesh import Mesh
-from scanprep.geometry.surface import Surface
 from scanprep.pictures.textures import bilinear
 
 from ..control.chart import Chart
-from ..control.model import FOLDED, HOLE, MEASURED, OUTSIDE, ControlModel, DisplacementMap
-from .normal_volume import from_normal_volume, interpolate, to_normal_volume
+from ..control.model import MEASURED, OUTSIDE, ControlModel, DisplacementMap
+from .normal_volume import interpolate
 from .subdivision import Displaced, Subdivision
-
-SEED = 14                            # of the places at which errors are measured
-BESIDE = 3                           # pixels each way that count as one place
 
 
 def chart_places(chart: Chart, faces: np.ndarray, bary: np.ndarray) -> np.ndarray:
@@ -74,7 +69,7 @@ class Reconstruction:
 def coverage_at(control: ControlModel, map: DisplacementMap, faces: np.ndarray, bary: np.ndarray) -> np.ndarray:
     """(n,) what the map says at places on triangles: MEASURED, FOLDED or HOLE; at a rim what the pixel beside says."""
     inwards = 0.9 * bary + 0.1 / 3                              # a pixel at a seam may lie outside the chart
-    found = map.coverage[_pixels(map, chart_places(control.chart, faces, inwards))]
+    found = map.coverage[pixels_at(map, chart_places(control.chart, faces, inwards))]
     return np.where(found == OUTSIDE, MEASURED, found)
 
 
@@ -126,80 +121,11 @@ class VertexRotations:
         edges = vertices[self._a] - vertices[self._b]
         S = (self._sum @ (edges[:, :, None] * self._edges[:, None]).reshape(-1, 9)).reshape(-1, 3, 3)
         S = S + normals[self._which][:, :, None] * self._normals[:, None]
-        U, _, Vt = np.linalg.svd(S)
-        U[:, :, 2] *= np.linalg.det(U @ Vt)[:, None]
-        return U @ Vt
+        return rotations.project(S)
 
 
-@dataclass(frozen=True)
-class SurfaceError:
-    """Distances from one surface to another, over the area of the first, metres."""
-
-    mean: float
-    rms: float
-    max: float
-
-
-def surface_error(reconstructed: Mesh, scan: Mesh, count: int = 200_000) -> SurfaceError:
-    """Distance from a reconstructed surface to the scan, one way, at so many places spread evenly. [Statues] Eq. 22, 23
-    """
-    points = reconstructed.sample(count, np.random.default_rng(SEED))[0]
-    return _error(Surface(scan).closest(points).distances)
-
-
-def remaining_error(control: ControlModel, map: DisplacementMap, scan: Mesh, count: int = 20_000,
-                    reach: float = 0.03) -> SurfaceError:
-    """Distance of places on the scan to what the map makes of them, where it is one-to-one: e of the paper's tables.
-
-    NaN where no place of the scan is mapped one-to-one.
-    """
-    points = scan.sample(count, np.random.default_rng(SEED))[0]
-    found = to_normal_volume(control.mesh, points, reach)
-    faces = np.maximum(found.faces, 0)
-    uv = chart_places(control.chart, faces, found.bary)
-    good = found.inside & (found.solutions == 1) & (coverage_at(control, map, faces, found.bary) == MEASURED)
-    if not good.any():
-        return SurfaceError(np.nan, np.nan, np.nan)
-    stored = from_normal_volume(control.mesh, type(found)(found.faces[good], found.bary[good],
-                                                          bilinear(map.heights, uv[good]), found.solutions[good]))
-    return _error(np.linalg.norm(stored - points[good], axis=1))
-
-
-def inverted_triangles(control: ControlModel, vertices: np.ndarray, subdivision: Subdivision, detailed: np.ndarray
-                       ) -> np.ndarray:
-    """Fine triangles, ascending, whose normal opposes that of the control surface below them, which has vertices (N,
-    3); `detailed` (n, 3) are those of the fine ones.
-
-    That is its interpolated normal: on it the heights stand, and a steep flank is not inverted because the control mesh
-    has an edge there.
-    """
-    _, n = interpolate(control.mesh.with_vertices(vertices), subdivision.parent, subdivision.bary)
-    below = n[subdivision.faces].sum(axis=1)
-    return np.flatnonzero(np.einsum("fd,fd->f", Mesh(detailed, subdivision.faces).face_normals, below) < 0)
-
-
-def in_folds(control: ControlModel, map: DisplacementMap, subdivision: Subdivision) -> np.ndarray:
-    """(f,) bool: fine triangles with a corner or their middle on, or beside, a pixel in a fold or hole.
-
-    With vectors also where these take part, some way around folds.
-    """
-    from scipy.ndimage import maximum_filter
-
-    bad = (map.coverage == FOLDED) | (map.coverage == HOLE)
-    if map.vectors is not None:
-        bad |= map.vectors.any(axis=2) & (map.coverage != OUTSIDE)
-    bad = maximum_filter(bad, BESIDE)
-    corners = subdivision.chart.uv[subdivision.chart.faces]
-    uv = np.concatenate([corners, corners.mean(axis=1, keepdims=True)], axis=1).reshape(-1, 2)
-    return bad[_pixels(map, uv)].reshape(-1, 4).any(axis=1)
-
-
-def _pixels(map: DisplacementMap, uv: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+def pixels_at(map: DisplacementMap, uv: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Rows and columns (n,) of the pixels at places (n, 2)."""
     height, width = map.coverage.shape
     return (np.clip(((1 - uv[:, 1]) * height).astype(int), 0, height - 1),
             np.clip((uv[:, 0] * width).astype(int), 0, width - 1))
-
-
-def _error(distances: np.ndarray) -> SurfaceError:
-    return SurfaceError(float(distances.mean()), float(np.sqrt(np.mean(distances**2))), float(distances.max()))

@@ -8,11 +8,8 @@ import numpy as np
 from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.surface import Surface
 
-from ..control.chart import Chart
+from ..control.chart import Chart, barycentric
 from .subdivision import subdivide
-
-PADDING = 4                          # pixels that the surface is continued beyond the border of a chart
-MARGIN = 16                          # pixels more that the last value is repeated
 
 
 @dataclass(frozen=True, eq=False)
@@ -23,8 +20,7 @@ class Texels:
     pixels: np.ndarray  # (n,), row times size plus column; row 0 is the upper one. Ascending
     faces: np.ndarray   # (n,), the control triangle of each
     bary: np.ndarray    # (n, 3)
-    inside: np.ndarray  # (n,), in the chart. The others lie beside it, and stand for the surface on the other side of
-                        # the seam
+    inside: np.ndarray  # (n,), in the chart; the others stand for the surface on the other side of the seam
 
     def image(self, values: np.ndarray, beyond: float | None = None) -> np.ndarray:
         """An image (size, size, ...) of values (n, ...) of the pixels.
@@ -35,12 +31,8 @@ class Texels:
         out[self.pixels] = values
         out = out.reshape(self.size, self.size, *values.shape[1:])
         if beyond is None:
-            from scipy.ndimage import distance_transform_edt
-
-            empty = np.ones(self.size**2, dtype=bool)
-            empty[self.pixels] = False
-            far, (row, column) = distance_transform_edt(empty.reshape(self.size, self.size), return_indices=True)
-            around = (far > 0) & (far <= MARGIN)
+            far, (row, column) = _away(self.pixels, self.size)
+            around = (far > 0) & (far <= 16)
             out[around] = out[row[around], column[around]]
         return out
 
@@ -54,10 +46,11 @@ class Texels:
 
 
 def find_texels(mesh: Mesh, chart: Chart, size: int) -> Texels:
-    """The pixels of a square image of `size` pixels each way over the chart of a mesh."""
+    """The pixels of a square image of `size` pixels each way over the chart of a mesh, and four beyond its border."""
     rows, columns, faces, bary = chart.texels(size)
     pixels = rows * size + columns
-    beside = _beside(pixels, size)
+    far = _away(pixels, size)[0].ravel()
+    beside = np.flatnonzero((far > 0) & (far <= 4))
     x, y = (beside % size + 0.5) / size, 1 - (beside // size + 0.5) / size
     face, place = continue_chart(mesh, chart, np.stack([x, y], axis=1))
     order = np.argsort(np.concatenate([pixels, beside]))
@@ -66,14 +59,13 @@ def find_texels(mesh: Mesh, chart: Chart, size: int) -> Texels:
                   np.concatenate([bary, place])[order], inside[order])
 
 
-def _beside(pixels: np.ndarray, size: int) -> np.ndarray:
-    """Pixels outside a set, at most PADDING from it."""
+def _away(pixels: np.ndarray, size: int) -> tuple[np.ndarray, np.ndarray]:
+    """How far (size, size) every place of an image is from some pixels, and the nearest of these (2, size, size)."""
     from scipy.ndimage import distance_transform_edt
 
     empty = np.ones(size**2, dtype=bool)
     empty[pixels] = False
-    far = distance_transform_edt(empty.reshape(size, size))
-    return np.flatnonzero((far > 0) & (far <= PADDING))
+    return distance_transform_edt(empty.reshape(size, size), return_indices=True)
 
 
 def continue_chart(mesh: Mesh, chart: Chart, uv: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -90,7 +82,7 @@ def continue_chart(mesh: Mesh, chart: Chart, uv: np.ndarray) -> tuple[np.ndarray
     bary = np.clip(found.bary, 0, None)
     seam = np.flatnonzero(beyond >= 0)
     f, s, g, t = face[seam], side[seam], beyond[seam], turned[face[seam], side[seam]]
-    at = np.einsum("nc,ncd->nd", _extended(uv[seam], chart.uv[chart.faces[f]]), mesh.corners[f])
+    at = np.einsum("nc,ncd->nd", barycentric(uv[seam], *chart.uv[chart.faces[f]].swapaxes(0, 1)), mesh.corners[f])
     a, b = mesh.vertices[mesh.faces[f, s]], mesh.vertices[mesh.faces[f, (s + 1) % 3]]
     length = np.maximum(np.linalg.norm(b - a, axis=1), 1e-30)
     along = np.einsum("nd,nd->n", at - a, b - a) / length**2
@@ -106,15 +98,6 @@ def continue_chart(mesh: Mesh, chart: Chart, uv: np.ndarray) -> tuple[np.ndarray
     place = np.clip(place, 0, None)
     face[seam], bary[seam] = g, place
     return face, bary / bary.sum(axis=1, keepdims=True)
-
-
-def _extended(uv: np.ndarray, corners: np.ndarray) -> np.ndarray:
-    """Barycentric coordinates (n, 3) of points (n, 2), negative outside triangles (n, 3, 2)."""
-    e, h, w = corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0], uv - corners[:, 0]
-    area = e[:, 0] * h[:, 1] - e[:, 1] * h[:, 0]
-    one = (w[:, 0] * h[:, 1] - w[:, 1] * h[:, 0]) / area
-    two = (e[:, 0] * w[:, 1] - e[:, 1] * w[:, 0]) / area
-    return np.stack([1 - one - two, one, two], axis=1)
 
 
 def _across(mesh: Mesh) -> tuple[np.ndarray, np.ndarray]:
@@ -137,14 +120,10 @@ class Lattice:
         self.subdivision = subdivide(mesh, chart, level)
         self.fine = self.subdivision.mesh(mesh)
         self.mesh, self._chart, self._steps = mesh, chart, 2**level
-        uv_corners = chart.uv[chart.faces]
-        fine_uv = self.subdivision.chart.uv[self.subdivision.chart.faces]
+        corners = np.repeat(chart.uv[chart.faces[self.subdivision.face_parent]], 3, axis=0).swapaxes(0, 1)
+        fine_uv = self.subdivision.chart.uv[self.subdivision.chart.faces].reshape(-1, 2)
+        _, i, j = np.rint(barycentric(fine_uv, *corners) * self._steps).astype(int).reshape(-1, 3, 3).transpose(2, 0, 1)
         parent = self.subdivision.face_parent[:, None]
-        e, f = (uv_corners[parent, k] - uv_corners[parent, 0] for k in (1, 2))
-        w = fine_uv - uv_corners[parent, 0]
-        area = e[..., 0] * f[..., 1] - e[..., 1] * f[..., 0]
-        i = np.rint((w[..., 0] * f[..., 1] - w[..., 1] * f[..., 0]) / area * self._steps).astype(int)
-        j = np.rint((e[..., 0] * w[..., 1] - e[..., 1] * w[..., 0]) / area * self._steps).astype(int)
         self._vertex = np.full((len(mesh.faces), self._steps + 2, self._steps + 2), -1)
         self._vertex[parent, i, j] = self.subdivision.faces
 

@@ -15,15 +15,9 @@ from .normal_volume import interpolate
 from .subdivision import Subdivision
 from .texels import Lattice, find_texels
 
-REACH = 0.01                         # metres: farther from a place the scan does not say its colour
-MIN_COSINE = 0.0                     # between the normals of both
-GREY = 0.6                           # where nothing at all is known
-
 
 def scan_look(scan: Mesh | Texture) -> Look:
-    """The colours of a scan, of its vertices or its picture, at the closest place of its surface, and a weight: 0 where
-    the scan does not say; ValueError for a scan without colours.
-    """
+    """The colours of a scan, of its vertices or its picture, at the closest place; weight 0 where it has none."""
     mesh = scan.mesh if isinstance(scan, Texture) else scan
     if not isinstance(scan, Texture) and mesh.colors is None:
         raise ValueError("scan: expected colours of its vertices or a texture, found neither")
@@ -37,7 +31,8 @@ def scan_look(scan: Mesh | Texture) -> Look:
             assert mesh.colors is not None, "a scan without colours was refused"
             colors = np.einsum("nc,ncd->nd", found.bary, mesh.colors[mesh.faces[found.faces]])
         facing = np.einsum("nd,nd->n", mesh.face_normals[found.faces], normals)
-        return colors, ((found.distances < REACH) & (facing > MIN_COSINE)).astype(float)
+        # metres: farther away the scan does not say
+        return colors, ((found.distances < 0.01) & (facing > 0)).astype(float)
     return look
 
 
@@ -56,12 +51,10 @@ def bake_texture(control: ControlModel, map: DisplacementMap, look: Look) -> np.
         lattice = Lattice(control.mesh, control.chart, FILL_LEVEL)
         found = [lattice.gather(texels, colors[:, k], known) for k in range(3)]
         values, sure = np.stack([value for value, _ in found], axis=1), found[0][1]
-        values = sparse.harmonic(lattice.fine.vertex_adjacency, np.where(sure[:, None], values, GREY), sure)
+        # where nothing at all is known
+        values = sparse.harmonic(lattice.fine.vertex_adjacency, np.where(sure[:, None], values, 0.6), sure)
         colors = np.where(known[:, None], colors, lattice.sample(values, texels.faces, texels.bary))
     return texels.image((255 * np.clip(colors, 0, 1) + 0.5).astype(np.uint8))
-
-
-SIZE = 2048                          # pixels of a side
 
 
 def vertex_of_row(mesh: Mesh, chart: Chart) -> np.ndarray:
@@ -94,7 +87,7 @@ def chart_tangents(mesh: Mesh, chart: Chart) -> np.ndarray:
     return np.column_stack([tangents, np.where(sign < 0, -1, 1)])
 
 
-def normal_image(control: ControlModel, vertices: np.ndarray, subdivision: Subdivision, size: int = SIZE) -> np.ndarray:
+def normal_image(control: ControlModel, vertices: np.ndarray, subdivision: Subdivision, size: int) -> np.ndarray:
     """(size, size, 3) uint8, the normals of the detailed surface, vertices (n, 3), in the frames of the control mesh: x
     to the right in the image, y upwards, z outwards; -1 to 1 are 0 to 255, as glTF has them.
     """

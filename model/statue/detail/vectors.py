@@ -19,12 +19,7 @@ from scanprep.threads import search_threads
 from .normal_volume import interpolate
 from .texels import Lattice
 
-RINGS = 5                            # vertices around a fold that are drawn with it
-STIFFNESS = (100.0, 30.0, 10.0, 3.0, 1.0, 0.3, 0.1, 0.03)   # of the thin plate against the data
-LOOSE = 0.001                        # weight of staying where nothing matches
-STEPS = 3                            # at each
 SPACING = 0.002                      # metres between the places of the scan that are matched
-SCALE = 0.01                         # metres that a turn of the normal by 60 degrees is worth in a match
 
 
 def bend_over_folds(lattice: Lattice, scan: Mesh, heights: np.ndarray, folded: np.ndarray, reach: float
@@ -37,7 +32,7 @@ def bend_over_folds(lattice: Lattice, scan: Mesh, heights: np.ndarray, folded: n
     start = p + heights[:, None] * n
     near = fine.vertex_adjacency
     drawn = folded
-    for _ in range(RINGS):
+    for _ in range(5):    # vertices around a fold that are drawn with it
         drawn = drawn | (near @ drawn.astype(float) > 0)
     free = np.flatnonzero(drawn)
     if not len(free):
@@ -51,14 +46,14 @@ def bend_over_folds(lattice: Lattice, scan: Mesh, heights: np.ndarray, folded: n
     places, facing = _places(scan, start[free], reach)
     if not len(places):
         return drawn, start - p
-    target = OrientedPoints(places, facing, SCALE)
+    target = OrientedPoints(places, facing, 0.01)    # metres that a change of the normal by 60 degrees is worth
     surface = start.copy()
-    for stiffness in STIFFNESS:
-        for _ in range(STEPS):
-            normals = _normals(surface, fine.faces[used])[free]
+    for stiffness in (100.0, 30.0, 10.0, 3.0, 1.0, 0.3, 0.1, 0.03):    # of the thin plate
+        for _ in range(3):
+            normals = Mesh(surface, fine.faces[used]).vertex_normals[free]
             match = target.match(surface[free], normals, reach, 0.3)
             onto = _onto(places[match.index], facing[match.index], surface[free])
-            w = np.where(match.valid, 1.0, LOOSE)[:, None]
+            w = np.where(match.valid, 1.0, 0.001)[:, None]    # lightly held where nothing matches
             wanted = np.where(match.valid[:, None], onto, surface[free])
             solver = sparse.Factored(csc_array(stiffness * bending + diags_array(w[:, 0])))
             surface[free] = solver.solve(w * wanted + stiffness * pull)
@@ -99,11 +94,3 @@ def _onto(q: np.ndarray, m: np.ndarray, points: np.ndarray) -> np.ndarray:
     off = points - q
     slip = off - np.einsum("nd,nd->n", off, m)[:, None] * m
     return q + slip * np.minimum(1, SPACING / np.maximum(np.linalg.norm(slip, axis=1), 1e-12))[:, None]
-
-
-def _normals(points: np.ndarray, faces: np.ndarray) -> np.ndarray:
-    """(n, 3) area-weighted unit normals of those vertices that the triangles (f, 3) use."""
-    a, b, c = (points[column] for column in faces.T)
-    cross = np.cross(b - a, c - a)
-    total = np.stack([np.bincount(faces.ravel(), np.repeat(cross[:, k], 3), len(points)) for k in range(3)], axis=1)
-    return total / np.maximum(np.linalg.norm(total, axis=1), 1e-300)[:, None]

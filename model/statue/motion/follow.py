@@ -2,7 +2,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from pathlib import Path
 
 import numpy as np
 from scipy.sparse import coo_array, csr_array, diags_array, eye_array
@@ -11,23 +10,17 @@ from scanprep.correspondence.correlated import find_correspondences
 from scanprep.geometry import rotations
 from scanprep.geometry.landmarks import match_landmarks
 from scanprep.geometry.mesh import Mesh
-from scanprep.geometry.storage import StorageError, load_arrays
 from scanprep.geometry.surface import OrientedPoints, Surface
 from scanprep.registration.nonrigid import Registration, register, registration_problem
 
 from ...body import BodyModel
-from ...export.bvh_read import read_bvh
 from ...fitting import fit_shape
 from ...linear import Subject
 from ..control.model import Statue
 from ..detail.reconstruction import Reconstruction
 from ..detail.subdivision import subdivide
-from .motions import bvh_motion, own_motion, people_motion
-from .retarget import StatueMotion
 
 _SAME_SIDE = 0.3                     # cosine of normals below which the nearest triangle is of another limb or side
-_RINGS = 4                           # of the model's vertices, over which its turns are averaged
-_AT_ONCE = 32                        # frames
 
 
 class Follower:
@@ -61,8 +54,8 @@ class Follower:
             return self._moved(self.subject.vertices(poses, trans))
         out = np.empty((len(poses), *self.mesh.vertices.shape))
         trans = np.broadcast_to(np.zeros(3) if trans is None else trans, (len(poses), 3))
-        for k in range(0, len(poses), _AT_ONCE):
-            for t, body in enumerate(self.subject.vertices(poses[k:k + _AT_ONCE], trans[k:k + _AT_ONCE]), start=k):
+        for k in range(0, len(poses), 32):
+            for t, body in enumerate(self.subject.vertices(poses[k:k + 32], trans[k:k + 32]), start=k):
                 out[t] = self._moved(body)
         return out
 
@@ -102,51 +95,25 @@ def _averaging(body: Mesh) -> csr_array:
                                shape=(N, len(edges))))
     ring = (body.vertex_adjacency != 0).astype(float) + eye_array(N)
     ring = csr_array(diags_array(1 / ring.sum(axis=1)) @ ring)
-    for _ in range(_RINGS - 1):
+    for _ in range(4 - 1):
         ends = ring @ ends
     return csr_array(ends)
 
 
-Progress = Callable[[int, int], None]
-REGISTERED_ON = 2                    # level of the reconstruction that a learned model is registered to
-
-
-def read_statue_motion(statue: Statue, path: Path) -> StatueMotion:
-    """A motion for the skeleton of a statue: BVH, or `.npz` of its own parts or of the synthetic people; StorageError
-    where it is damaged or of other parts.
-    """
-    if path.suffix.lower() == ".bvh":
-        return bvh_motion(statue.control, statue.pose, read_bvh(path, "cm"))     # travel is scaled by the legs
-    stored = load_arrays(path, "a motion (.npz) or BVH")
-    if "poses" not in stored:
-        raise StorageError(f"{path}: expected a motion, it lacks poses")
-    count = stored["poses"].size // max(3 * len(np.atleast_1d(stored["poses"])), 1)
-    own, people = len(statue.control.skeleton.parents), 16
-    if count == own:
-        return own_motion(statue.control, path)
-    if count != people:
-        raise StorageError(f"{path}: expected the {own} parts of the statue or the {people} of the synthetic people, "
-                           f"found {count}; for a motion of a learned model name it with --model")
-    rate = stored.get("mocap_frame_rate", stored.get("mocap_framerate", np.array(60.0)))
-    poses = stored["poses"].astype(np.float64).reshape(-1, people, 3)
-    return people_motion(statue.control, statue.pose, poses, stored.get("trans"), float(rate))
-
-
 def follower_of(statue: Statue, model: BodyModel, registered: np.ndarray | None = None,
-                progress: Progress | None = None) -> Follower:
-    """The control mesh bound to a learned model, whose template is registered to the statue first, by the landmarks
-    that both have or by correspondences; `registered` (N, 3) where that is known. ValueError where it fails.
-    """
+                progress: Callable[[int, int], None] | None = None) -> Follower:
+    """The control mesh bound to a learned model, whose template, if not `registered`, is registered first."""
     if registered is None:
         surface = Reconstruction(statue.control, statue.map,
-                                 subdivide(statue.control.mesh, statue.control.chart, REGISTERED_ON)).mesh()
+                                 subdivide(statue.control.mesh, statue.control.chart, 2)).mesh()
         registered = _registered(statue, model, surface, progress).mesh.vertices
     fit = fit_shape(model, registered)
     subject = model.subject(fit.betas if model.n_betas else None)
     return Follower(statue.control.mesh, subject, fit.pose, fit.trans, registered)
 
 
-def _registered(statue: Statue, model: BodyModel, surface: Mesh, progress: Progress | None) -> Registration:
+def _registered(statue: Statue, model: BodyModel, surface: Mesh, progress: Callable[[int, int], None] | None
+                ) -> Registration:
     control, pairs, hints = statue.control, None, None
     places = {name: control.mesh.vertices[vertex] for name, vertex in control.landmarks.items()}
     try:

@@ -1,7 +1,6 @@
 """Motions of other skeletons, carried over to a statue: of the synthetic people and of BVH files."""
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import replace
 from functools import lru_cache
 from pathlib import Path
@@ -9,13 +8,32 @@ from pathlib import Path
 import numpy as np
 
 from scanprep.geometry.mesh import Mesh
-from scanprep.geometry.storage import load_arrays, numbers, taking_apart, writing
+from scanprep.geometry.storage import StorageError, load_arrays, numbers, taking_apart, writing
 from scanprep.skeleton.tree import Skeleton
 
-from ...export.bvh_read import BvhMotion
+from ...export.bvh_read import BvhMotion, read_bvh
 from ...export.rig import check_motion, joint_places
-from ..control.model import ControlModel
-from .retarget import MotionConfig, Pairing, StatueMotion, retargeted
+from ..control.model import ControlModel, Statue
+from .retarget import Pairing, StatueMotion, retargeted
+
+
+def read_statue_motion(statue: Statue, path: Path) -> StatueMotion:
+    """A motion for the skeleton of a statue: BVH, or `.npz` of its own parts or of the synthetic people."""
+    if path.suffix.lower() == ".bvh":
+        return bvh_motion(statue.control, statue.pose, read_bvh(path, "cm"))     # travel is scaled by the legs
+    stored = load_arrays(path, "a motion (.npz) or BVH")
+    if "poses" not in stored:
+        raise StorageError(f"{path}: expected a motion, it lacks poses")
+    count = stored["poses"].size // max(3 * len(np.atleast_1d(stored["poses"])), 1)
+    own, people = len(statue.control.skeleton.parents), 16
+    if count == own:
+        return own_motion(statue.control, path)
+    if count != people:
+        raise StorageError(f"{path}: expected the {own} parts of the statue or the {people} of the synthetic people, "
+                           f"found {count}; for a motion of a learned model name it with --model")
+    rate = stored.get("mocap_frame_rate", stored.get("mocap_framerate", np.array(60.0)))
+    poses = stored["poses"].astype(np.float64).reshape(-1, people, 3)
+    return people_motion(statue.control, statue.pose, poses, stored.get("trans"), float(rate))
 
 
 def own_motion(control: ControlModel, path: str | Path) -> StatueMotion:
@@ -53,10 +71,8 @@ def middle_drift(control: ControlModel, poses: np.ndarray) -> np.ndarray:
 
 
 def people_motion(control: ControlModel, pose: np.ndarray, poses: np.ndarray, trans: np.ndarray | None = None,
-                  rate: float = 60.0, up: np.ndarray | None = None, config: MotionConfig | None = None
-                  ) -> StatueMotion:
-    """A motion of the synthetic people, poses (T, 16, 3) and trans (T, 3) of the average person; `pose` is that of the
-    statue.
+                  rate: float = 60.0, girdle: float = 0.2) -> StatueMotion:
+    """A motion of the synthetic people, poses (T, 16, 3) and trans (T, 3) of the average person, for a statue's `pose`.
 
     The generic control model rests as they do, so the rotations of the parts in the world carry over; abdomen and chest
     become the one rotation that brings neck and shoulders nearest to where those two bring them.
@@ -66,13 +82,11 @@ def people_motion(control: ControlModel, pose: np.ndarray, poses: np.ndarray, tr
     offsets = skeleton.joints - np.where(skeleton.parents[:, None] < 0, 0, skeleton.joints[skeleton.parents])
     moving = BvhMotion(skeleton.names, skeleton.parents, offsets, {}, skeleton.part_rotations(poses),
                        joint_places(skeleton, poses, trans), rate)
-    return retargeted(Pairing(control, pose, moving, None, up), True, config or MotionConfig())
+    return retargeted(Pairing(control, pose, moving), True, girdle)
 
 
-def bvh_motion(control: ControlModel, pose: np.ndarray, bvh: BvhMotion, reference: int | None = None,
-               names: Mapping[str, str] | None = None, up: np.ndarray | None = None,
-               config: MotionConfig | None = None) -> StatueMotion:
-    """The motion of a BVH file, by the names of its joints and the directions of its bones.
+def bvh_motion(control: ControlModel, pose: np.ndarray, bvh: BvhMotion) -> StatueMotion:
+    """The motion of a BVH file, by the names of its joints and the directions of its bones, for a statue's `pose`.
 
     A part follows the rotation of its joint against the rest of the file, in which somebody stands upright: bones of
     arms and legs then point where those of the file do, hands continue the forearms as at rest, and trunk, head and
@@ -83,36 +97,9 @@ def bvh_motion(control: ControlModel, pose: np.ndarray, bvh: BvhMotion, referenc
     Travel is scaled by the length of the legs, so the unit of the file does not matter. The statue starts where the
     scan stands, it faces as the scan does where a person of the file faces as at rest, and its lowest vertex is as low
     as in the scan in all but a twentieth of the frames. Upwards is the axis of the file that is nearest to the trunk
-    at rest: y, as BVH says, but some programs write z.
-
-    Parameters
-    ----------
-    control : ControlModel
-        Fitted.
-    pose : (J, 3) float, radians
-        `Statue.pose`.
-    bvh : BvhMotion
-    reference : int, optional
-        A frame in which the person stands upright with straight limbs, in the place of the rest of the file: for
-        files whose offsets all point the same way.
-    names : {H-Anim name: name in the file}, optional
-        Where the names say something else than `find_roles` finds.
-    up : (3,) float, optional
-        Upwards in the scan; else the axis nearest to the direction from feet to head.
-    config : MotionConfig, optional
-
-    Raises
-    ------
-    ValueError
-        Names that say too little; a frame that does not exist.
+    at rest: y, as BVH says, but some programs write z. ValueError for names that say too little.
     """
-    if reference is not None:
-        if not 0 <= reference < len(bvh.places):
-            raise ValueError(f"reference: expected a frame of 0 to {len(bvh.places) - 1}, got {reference}")
-        R, rest = bvh.rotations[reference], bvh.places[reference]
-        bvh = replace(bvh, offsets=rest - np.where(bvh.parents[:, None] < 0, 0, rest[bvh.parents]),
-                      rotations=bvh.rotations @ np.swapaxes(R, -1, -2))
-    return retargeted(Pairing(control, pose, bvh, names, up), False, config or MotionConfig())
+    return retargeted(Pairing(control, pose, bvh), False)
 
 
 @lru_cache(maxsize=1)

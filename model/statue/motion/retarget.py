@@ -1,38 +1,82 @@
-"""Retargeting: poses and travel of one skeleton for another, by the directions of bones."""
+"""Retargeting: poses and travel of one skeleton for another, by the names of joints and the directions of bones."""
 from __future__ import annotations
 
-from collections.abc import Mapping
+import re
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
 
 from scanprep.geometry import rotations
-from scanprep.ranges import Settings, Share
 
 from ...export.bvh_read import BvhMotion
 from ...export.rig import check_motion
 from ..control.model import ControlModel
-from .bone_names import above, find_roles, trunk
 
-_CHAINS = (("shoulder", "elbow", "wrist"), ("hip", "knee", "ankle"))
-_ON_THE_FLOOR = 5                    # percentile of the lowest vertex over the frames: some frames may err
-_AT_ONCE = 200                       # frames
-_APART = np.radians(10)              # from the vertical, of a shank at rest beyond which a foot is tilted with it
+# What the joints of our parts are called elsewhere, in H-Anim, motion databases and animation programs, in small
+# letters without separators; the first that a skeleton has is taken, and none twice. A knee may be a "leg" (below an
+# "up leg") and a clavicle a "shoulder" (above an "arm"): so the order of the rows matters.
+ROLES = {
+    "humanoid_root": ("sacroiliac", "pelvis", "hips", "humanoidroot", "hip", "root"),
+    "skullbase": ("skullbase", "head", "skull", "neck1", "neck"),
+    "vl5": ("vl5", "spine", "spine1", "spine01", "abdomen", "lowerback", "waist", "torso", "chest", "back")}
+SIDED_ROLES = {
+    "shoulder": ("upperarm", "uparm", "humerus", "arm", "shldr", "shoulder"),
+    "sternoclavicular": ("sternoclavicular", "clavicle", "collar", "collarbone", "shoulder"),
+    "elbow": ("elbow", "forearm", "lowerarm", "lowarm", "radius"),
+    "wrist": ("wrist", "radiocarpal", "hand"),
+    "knee": ("knee", "lowerleg", "lowleg", "shin", "shank", "calf", "tibia", "leg"),
+    "hip": ("upleg", "thigh", "upperleg", "femur", "hip", "leg", "hipjoint"),
+    "ankle": ("ankle", "talocrural", "foot")}
 
 
-@dataclass(frozen=True)
-class MotionConfig(Settings):
-    """Settings of `people_motion` and `bvh_motion`.
+def find_roles(names: Sequence[str]) -> dict[str, int]:
+    """The joints that play the parts of the humanoid: {H-Anim name: number of the joint}.
 
-    Parameters
-    ----------
-    girdle : float, 0 to 1
-        Share of the upper arm's angle above the horizontal that the clavicle is raised, where the motion has no
-        clavicle.
+    Case, separators and what stands before a colon do not matter.
     """
+    plain: dict[str, int] = {}
+    for j, name in enumerate(names):
+        letters = re.sub(r"[^a-z0-9]", "", name.rsplit(":", 1)[-1].lower())
+        letters = re.sub(r"^(mixamorig|bip|jbipc?|def|character)\d*", "", letters)
+        plain.setdefault(re.sub(r"(jnt|bone)$", "", letters), j)
+    forms = dict(ROLES)
+    for word, words in SIDED_ROLES.items():
+        for side, spelt in (("l", ("left", "l")), ("r", ("right", "r"))):
+            forms[f"{side}_{word}"] = tuple(form for each in words for s in spelt for form in (s + each, each + s))
+    out: dict[str, int] = {}
+    for role, words in forms.items():
+        free = [plain[form] for form in words if form in plain and plain[form] not in out.values()]
+        if free:
+            out[role] = free[0]
+    return out
 
-    girdle: Share = 0.2
+
+def above(parents: np.ndarray, j: int) -> list[int]:
+    """The joint, its parent, and so on up to the root."""
+    chain = [j]
+    while parents[chain[-1]] >= 0:
+        chain.append(int(parents[chain[-1]]))
+    return chain
+
+
+def trunk(parents: np.ndarray, roles: Mapping[str, int]) -> tuple[int, int]:
+    """The lowest joint of the trunk above the pelvis and the one that carries arms and head.
+
+    Both are the pelvis where the tree has no joint between them.
+    """
+    pelvis = roles["humanoid_root"]
+    chains = [above(parents, roles[role]) for role in ("l_shoulder", "r_shoulder") if role in roles]
+    if len(chains) < 2:
+        lowest = roles.get("vl5", pelvis)
+        return lowest, lowest
+    top = next(j for j in chains[0] if j in chains[1])
+    way = above(parents, top)
+    if pelvis not in way or top == pelvis:
+        lowest = roles.get("vl5", top)
+        return (lowest, top) if lowest in way else (top, top)
+    return way[way.index(pelvis) - 1], top
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,9 +87,7 @@ class StatueMotion:
     trans: np.ndarray                # (T, 3) metres, travel of the root's joint
     rate: float                      # frames a second
     matched: dict[str, str]          # {part of the statue: joint that it follows}
-    lacking: tuple[str, ...] = ()    # the statue's parts that go with the part above them, because the motion has no
-                                     # such joint
-    unmatched: tuple[str, ...] = ()  # joints of the motion that no part follows, not even by what hangs on them
+    lacking: tuple[str, ...] = ()    # parts that go with the one above them: the motion has no such joint
 
 
 class Pairing:
@@ -55,8 +97,7 @@ class Pairing:
     statue in the generic default pose, `ours` and `theirs` the parts and joints by their H-Anim names.
     """
 
-    def __init__(self, control: ControlModel, pose: np.ndarray, moving: BvhMotion, names: Mapping[str, str] | None,
-                 up: np.ndarray | None) -> None:
+    def __init__(self, control: ControlModel, pose: np.ndarray, moving: BvhMotion) -> None:
         self.control, self.moving = control, moving
         skeleton = control.skeleton
         self.P = skeleton.part_rotations(check_motion(skeleton, np.asarray(pose)[None], None, 1.0)[0][0])
@@ -64,7 +105,7 @@ class Pairing:
         for j, p in enumerate(skeleton.parents[1:], start=1):
             self.joints[j] = self.joints[p] + self.P[p].T @ (skeleton.joints[j] - skeleton.joints[p])
         self.ours = find_roles(skeleton.names)
-        self.theirs = find_roles(moving.names, names)
+        self.theirs = find_roles(moving.names)
         wanted = ("humanoid_root", "l_hip", "r_hip", "l_shoulder", "r_shoulder")
         for what, found, all_names in (("control model", self.ours, skeleton.names),
                                        ("motion", self.theirs, moving.names)):
@@ -75,26 +116,26 @@ class Pairing:
         self.axes = _axes(self.joints, self.ours)
         feet = [skeleton.joints[self.ours[r]] for r in ("l_ankle", "r_ankle", "l_hip", "r_hip") if r in self.ours]
         high = skeleton.joints[self.ours.get("skullbase", self.ours["l_shoulder"])] - np.mean(feet[:2], axis=0)
-        self.up = _nearest_axis(high) if up is None else np.asarray(up) / np.linalg.norm(up)
+        self.up = _nearest_axis(high)
 
     def alignment(self, aligned: bool) -> dict[int, np.ndarray]:
         """For each part the rotation from the axes of the generic model to those of the motion at rest.
 
-        The smallest turn that brings our bone to theirs, after that of the part above it. Feet stand flat, but where
+        The smallest rotation that brings our bone to theirs, after that of the part above. Feet stand flat, but where
         the legs are far apart at rest (as in the CMU files) they are taken to be square to the shanks from the front.
         """
         J = len(self.control.skeleton.parents)
         whole = self.whole(aligned)
         A = dict.fromkeys(range(J), whole)
         for side in "lr" if not aligned else "":
-            for chain in _CHAINS:
+            for chain in (("shoulder", "elbow", "wrist"), ("hip", "knee", "ankle")):
                 roles = [f"{side}_{name}" for name in chain]
                 turn = whole
                 for role, following in pairwise(roles):
                     if {role, following} <= self.ours.keys() & self.theirs.keys():
                         own = self.joints[self.ours[following]] - self.joints[self.ours[role]]
                         other = self.moving.rest[self.theirs[following]] - self.moving.rest[self.theirs[role]]
-                        turn = _smallest_turn(turn @ own, other) @ turn
+                        turn = _smallest_rotation(turn @ own, other) @ turn
                         A[self.ours[role]] = turn
                 if chain[2] == "wrist" and roles[2] in self.ours:
                     A[self.ours[roles[2]]] = turn                       # a hand continues the forearm
@@ -102,7 +143,7 @@ class Pairing:
                     knee, ankle = self.moving.rest[[self.theirs[role] for role in roles[1:]]]
                     left, down, _ = self.standing(False).T @ (ankle - knee) * [1, -1, 1]
                     aside = np.arctan2(left, down)
-                    if abs(aside) > _APART:
+                    if abs(aside) > np.radians(10):
                         A[self.ours[roles[2]]] = rotations.exp(aside * self.standing(False)[:, 2]) @ whole
         return A
 
@@ -134,8 +175,11 @@ class Pairing:
         return _upright(forwards, _nearest_axis(high))
 
 
-def retargeted(pair: Pairing, aligned: bool, config: MotionConfig) -> StatueMotion:
-    """The motion of the pair's skeleton on its statue; `aligned`: the generic model rests as that skeleton does."""
+def retargeted(pair: Pairing, aligned: bool, girdle: float = 0.2) -> StatueMotion:
+    """The motion of the pair's skeleton on its statue; `aligned`: the generic model rests as that skeleton does.
+
+    Where the motion has no clavicles, ours are raised by a share `girdle` of the upper arms' angle above the level.
+    """
     moving, skeleton = pair.moving, pair.control.skeleton
     A = pair.alignment(aligned)
     role_of = {part: role for role, part in pair.ours.items()}
@@ -153,13 +197,11 @@ def retargeted(pair: Pairing, aligned: bool, config: MotionConfig) -> StatueMoti
         else:
             lacking.append(name)
             M[:, j] = M[:, skeleton.parents[j]] if j else np.eye(3)
-    _raise_clavicles(pair, M, config.girdle)
+    _raise_clavicles(pair, M, girdle)
     V = pair.world(aligned)
     R = V @ M @ np.swapaxes(pair.P, -1, -2)
     poses = skeleton.pose_of(R)
-    used = {j for i in pair.theirs.values() for j in above(moving.parents, i)}
-    unmatched = tuple(name for j, name in enumerate(moving.names) if j not in used)
-    return StatueMotion(poses, _travel(pair, V, R, poses), moving.rate, matched, tuple(lacking), unmatched)
+    return StatueMotion(poses, _travel(pair, V, R, poses), moving.rate, matched, tuple(lacking))
 
 
 def _raise_clavicles(pair: Pairing, M: np.ndarray, share: float) -> None:
@@ -188,9 +230,10 @@ def _travel(pair: Pairing, V: np.ndarray, R: np.ndarray, poses: np.ndarray) -> n
     place = scale * pair.moving.places[:, theirs].mean(axis=1) @ V.T
     place = place - place[0] + middle
     trans = place + R[:, 0] @ (joints[0] - middle) - joints[0]
-    lowest = np.concatenate([(control.rig.vertices(poses[k:k + _AT_ONCE], trans[k:k + _AT_ONCE]) @ up).min(axis=1)
-                             for k in range(0, len(poses), _AT_ONCE)])
-    return trans + ((control.mesh.vertices @ up).min() - np.percentile(lowest, _ON_THE_FLOOR)) * up
+    lowest = np.concatenate([(control.rig.vertices(poses[k:k + 200], trans[k:k + 200]) @ up).min(axis=1)
+                             for k in range(0, len(poses), 200)])
+    # percentile: some frames may err
+    return trans + ((control.mesh.vertices @ up).min() - np.percentile(lowest, 5)) * up
 
 
 def _leg(joints: np.ndarray, roles: Mapping[str, int], others: Mapping[str, int]) -> float:
@@ -210,8 +253,7 @@ def _axes(joints: np.ndarray, roles: Mapping[str, int]) -> np.ndarray:
     forwards = np.cross(across, high)
     size = np.linalg.norm(forwards)
     if not size > 1e-6 * np.linalg.norm(across) * np.linalg.norm(high):
-        raise ValueError("joints: expected hips and shoulders that are not in one line at rest (a motion that has no "
-                         "such rest needs a reference frame)")
+        raise ValueError("joints: expected hips and shoulders that are not in one line at rest")
     return np.stack([np.cross(high, forwards) / np.linalg.norm(high) / size, high / np.linalg.norm(high),
                      forwards / size], axis=1)
 
@@ -231,7 +273,7 @@ def _upright(forwards: np.ndarray, up: np.ndarray) -> np.ndarray:
     return np.stack([np.cross(up, level), up, level], axis=1)
 
 
-def _smallest_turn(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+def _smallest_rotation(a: np.ndarray, b: np.ndarray) -> np.ndarray:
     """The rotation (3, 3) by the smallest angle that brings direction a (3,) to direction b."""
     axis = np.cross(a, b)
     size = np.linalg.norm(axis)

@@ -8,23 +8,17 @@ from scipy.spatial import cKDTree
 
 from scanprep.geometry.formats.common import UNITS
 from scanprep.geometry.mesh import Mesh
+from scanprep.geometry.target import Target, target_of
 from scanprep.geometry.thinning import thin
-from scanprep.registration.confidence import stretched_share
-from scanprep.registration.matches import Target, target_of
-from scanprep.registration.nonrigid import Registration, RegistrationConfig, register
+from scanprep.registration.nonrigid import Registration, register
+from scanprep.registration.schedule import RegistrationConfig
 from scanprep.threads import one_thread, search_threads
 
 from ..control.model import ControlModel
 from .articulated import Articulated
 from .features import FeatureFit, fit_features
-from .person_search import Stand, find_person
-from .pose_search import PoseSearch
+from .person_search import PoseSearch, Stand, find_person
 
-STATURE = 1.7                    # metres
-NOBODY, EITHER = 0.042, 1.05     # misfit, and margin, of what is no person
-DOUBTED = 0.025, 1.2, 0.05       # misfit, margin and share missed of a person with a limb in a wrong place
-MANY, SPACING = 40_000, 0.007    # points of a scan, and to how many metres apart more of them are thinned
-AROUND = 60                      # points, 3 cm apart: wider than a limb, and not as wide as the trunk
 SHOWN = 0.3                      # share of the vertices around a joint that have data
 
 
@@ -32,50 +26,31 @@ SHOWN = 0.3                      # share of the vertices around a joint that hav
 class Features:
     """What was found on a scan, in the scan's own axes and unit."""
 
-    joints: dict[str, np.ndarray]  # {name: (3,) }, joint centres and landmarks of the control model with data around
-                                   # them; empty where no person was found
-    points: dict[str, np.ndarray]  # {name: (3,) }, joint centres and landmarks of the control model with data around
-                                   # them; empty where no person was found
+    joints: dict[str, np.ndarray]  # {name: (3,)}, joint centres with data around them
+    points: dict[str, np.ndarray]  # {name: (3,)}, landmarks with data around them
     missing: tuple[str, ...]       # joints and landmarks that the scan does not show
-    registered: Mesh | None        # the control mesh on the scan
+    registered: Mesh | None        # the control mesh on the scan; None where no person was found
     fit: FeatureFit | None         # of the control model to these features
-    unit: str                      # of m, mm, cm and in the one in which the scan would be most nearly as long as a
-                                   # person is tall
-    up: np.ndarray                 # (3,) unit, upwards, and to where the person faces
-    front: np.ndarray              # (3,) unit, upwards, and to where the person faces
-    misfit: float                  # metres, between the scan and the control model in its pose: see `Stand`
-    margin: float                  # how many times larger it is for the best start that faces another way
-    missed: float                  # what `Registration.missed` and `stretched_share` say of the registered mesh
-    stretched: float               # what `Registration.missed` and `stretched_share` say of the registered mesh
+    unit: str                      # in which the scan would be most nearly as long as a person is tall
+    up: np.ndarray                 # (3,) unit, upwards
+    front: np.ndarray              # (3,) unit, to where the person faces
     problem: str | None            # why the features should not be trusted
 
 
 @one_thread()
 def find_features(control: ControlModel, scan: Mesh) -> Features:
-    """Joint centres and landmarks of a person who stands upright.
+    """Joint centres and landmarks of a person who stands upright, by a control model that is a humanoid.
 
-    Neither unit nor axes of the scan need to be known. The control model, z up and facing -y, is placed in many ways,
-    the best are bent onto the scan, and the best of them is registered; front and back, and with them left and right,
-    are told by what fits better.
-
-    Parameters
-    ----------
-    control : ControlModel
-        A humanoid.
-    scan : Mesh
-        May have holes, several components, or show a part of a person.
-
-    Raises
-    ------
-    ValueError
-        Fewer than 100 points.
+    Neither unit nor axes of the scan need to be known; it may have holes, several components, or show a part of a
+    person. The control model, z up and facing -y, is placed in many ways, the best are bent onto the scan, and the best
+    of them is registered; front and back, and with them left and right, are told by what fits better.
     """
     if len(scan.vertices) < 100:
         raise ValueError(f"scan: expected a person of at least 100 points, got {scan}")
     search = PoseSearch(Articulated(control))
     scan = outward(scan)
     unit = likely_unit(scan.vertices)
-    data = scan if len(scan.vertices) < MANY else scan.vertices[thin(scan.vertices, SPACING / UNITS[unit])]
+    data = scan if len(scan.vertices) < 40_000 else scan.vertices[thin(scan.vertices, 0.007 / UNITS[unit])]
     target = target_of(data)
     if data is not scan or not len(scan.faces):
         target = _facing_outward(target, scan, 0.03 / UNITS[unit])
@@ -85,8 +60,7 @@ def find_features(control: ControlModel, scan: Mesh) -> Features:
     up, front = (best.direction(search, np.array(axis)) for axis in ((0.0, 0, 1), (0.0, -1, 0)))
     problem = nobody_problem(best.off, margin, unit)
     if problem:
-        return Features({}, {}, (*control.skeleton.names, *control.landmarks), None, None, unit, up, front, best.off,
-                        margin, np.nan, np.nan, problem)
+        return Features({}, {}, (*control.skeleton.names, *control.landmarks), None, None, unit, up, front, problem)
     start = search.mesh(best.posed)
     placed = (data.vertices if isinstance(data, Mesh) else data) @ best.T[:3, :3].T + best.T[:3, 3]
     found = register(start, Mesh(placed, data.faces) if isinstance(data, Mesh) else placed,
@@ -94,25 +68,25 @@ def find_features(control: ControlModel, scan: Mesh) -> Features:
     joints, points, missing = _features(control, best, found)
     fit = fit_features(control, joints, points) if len(joints) + len(points) > 2 else None
     registered = control.mesh.with_vertices(best.to_scan(found.mesh.vertices))
-    return Features(joints, points, missing, registered, fit, unit, up, front, best.off, margin, found.missed,
-                    stretched_share(start, found.mesh), doubts(best.off, margin, found.missed))
+    problem = why_uncertain(best.off, margin, found.uncovered)
+    return Features(joints, points, missing, registered, fit, unit, up, front, problem)
 
 
 def nobody_problem(off: float, margin: float, unit: str) -> str | None:
     """Why there is no person in a scan, or none that stands upright; None where there is one."""
-    if off <= NOBODY and margin >= EITHER:
+    if off <= 0.042 and margin >= 1.05:
         return None
     return (f"no person who stands upright was found (the unit taken for {unit}): a body bent onto the scan stays "
             f"{1000 * off:.0f} mm off, and {margin:.2f} times as far when it faces another way; something else, or a "
             "pose that needs clicks?")
 
 
-def doubts(off: float, margin: float, missed: float) -> str | None:
-    """Why features should not be trusted; None where they may be."""
+def why_uncertain(off: float, margin: float, missed: float) -> str | None:
+    """Why features should not be trusted, as of a person with a limb in a wrong place; None where they may be."""
     reasons = [text for text, wrong in (
-        (f"the posed body stays {1000 * off:.0f} mm off the scan", off > DOUBTED[0]),
-        (f"facing another way it fits only {margin:.2f} times worse", margin < DOUBTED[1]),
-        (f"{100 * missed:.0f}% of the scan lies off the registered one", missed > DOUBTED[2])) if wrong]
+        (f"the posed body stays {1000 * off:.0f} mm off the scan", off > 0.025),
+        (f"facing another way it fits only {margin:.2f} times worse", margin < 1.2),
+        (f"{100 * missed:.0f}% of the scan lies off the registered one", missed > 0.05)) if wrong]
     return "; ".join(reasons) + ": look at it, or click" if reasons else None
 
 
@@ -120,7 +94,7 @@ def likely_unit(points: np.ndarray) -> str:
     """The unit in which points (n, 3) span most nearly as much as a person."""
     spread = points - points.mean(axis=0)
     longest = float(np.ptp(spread @ np.linalg.svd(spread[:: max(1, len(spread) // 5000)], full_matrices=False)[2][0]))
-    return min(UNITS, key=lambda unit: abs(np.log(max(longest, 1e-12) * UNITS[unit] / STATURE)))
+    return min(UNITS, key=lambda unit: abs(np.log(max(longest, 1e-12) * UNITS[unit] / 1.7)))    # metres
 
 
 def outward(scan: Mesh) -> Mesh:
@@ -137,7 +111,8 @@ def _facing_outward(target: Target, scan: Mesh, spacing: float) -> Target:
         outward = scan.vertex_normals[nearest]
     else:
         some = target.points[thin(target.points, spacing)]
-        around = cKDTree(some).query(target.points, min(AROUND, len(some)))[1]
+        # some 3 cm apart: wider than a limb, not as wide as the trunk
+        around = cKDTree(some).query(target.points, min(60, len(some)))[1]
         outward = target.points - some[around].mean(axis=1)
     inward = np.einsum("nd,nd->n", target.normals, outward) < 0
     return replace(target, normals=np.where(inward[:, None], -1, 1) * target.normals, oriented=True)

@@ -2,7 +2,6 @@
 from __future__ import annotations
 
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -25,8 +24,9 @@ def read_features(path: Path, control: ControlModel, scan: Mesh, unit: str | Non
     Any landmark file is read, in its `unit`. In JSON a joint may also be a click, `{"ray": [origin, direction],
     "depth": d}`: its centre is then on the ray, where that is nearest to the medial axis of the scan, and d farther.
     """
-    rays = _rays(path) if path.suffix == ".json" else {}
-    found = read_landmarks(path, scan, unit) if not rays else _places(path, rays, unit)
+    rays, found = _clicked(path, unit) if path.suffix == ".json" else ({}, {})
+    if not rays:
+        found = read_landmarks(path, scan, unit)
     known = {*control.skeleton.names, *control.landmarks}
     strange = [name for name in [*rays, *found] if name not in known]
     if strange:
@@ -34,40 +34,32 @@ def read_features(path: Path, control: ControlModel, scan: Mesh, unit: str | Non
                          f"{', '.join(control.skeleton.names)}; its landmarks {', '.join(control.landmarks)}")
     joints = {name: place for name, place in found.items() if name in control.skeleton.names}
     if rays:
-        medial, metre = MedialAxis(scan), UNITS[unit or "m"]
-        for name, (origin, direction, depth) in rays.items():
+        medial = MedialAxis(scan)
+        for name, click in rays.items():
             try:
-                joints[name] = medial.nearest_to_ray(metre * origin, direction, metre * depth)
+                joints[name] = medial.nearest_to_ray(*click)
             except ValueError as error:
                 raise ValueError(f"{path}: {name}: {error}") from None
     return joints, {name: place for name, place in found.items() if name in control.landmarks}
 
 
-def _rays(path: Path) -> dict[str, tuple[np.ndarray, np.ndarray, float]]:
+def _clicked(path: Path, unit: str | None) -> tuple[dict[str, tuple[np.ndarray, np.ndarray, float]],
+                                                    dict[str, np.ndarray]]:
+    """Origin, direction and depth of the clicks of a file, and its plain places; nothing where it has no click."""
     tree = read_json(path, WANTED)
     with taking_apart(path, WANTED):
-        clicks = {name: one for name, one in tree.items() if isinstance(one, dict) and "ray" in one} \
-            if isinstance(tree, dict) else {}
-        return {name: (*_ray(name, one), float(one.get("depth", 0.0))) for name, one in clicks.items()}
-
-
-def _ray(name: str, click: dict[str, Any]) -> tuple[np.ndarray, np.ndarray]:
-    origin, direction = numbers({name: np.array(click["ray"], dtype=np.float64)}, name, 2, 3)
-    return origin, direction
-
-
-def _places(path: Path, rays: dict[str, Any], unit: str | None) -> dict[str, np.ndarray]:
-    """The plain places of a file that has clicks as well."""
-    with taking_apart(path, WANTED):
-        places = {name: numbers({name: np.array(one, dtype=np.float64)}, name, 3)
-                  for name, one in read_json(path, WANTED).items() if name not in rays}
-    if unit is not None and unit not in UNITS:
-        raise StorageError(f"{path}: unknown unit {unit}")
-    return {name: UNITS[unit or "m"] * place for name, place in places.items()}
-
-
-INSIDE = 0.5                     # winding number; around a hole it falls smoothly from 1 to 0
-MOST = 60_000_000                # voxels that are still worked on
+        if not isinstance(tree, dict) or not any(isinstance(one, dict) and "ray" in one for one in tree.values()):
+            return {}, {}
+        if unit is not None and unit not in UNITS:
+            raise StorageError(f"{path}: unknown unit {unit}")
+        metre, rays, places = UNITS[unit or "m"], {}, {}
+        for name, one in tree.items():
+            if isinstance(one, dict) and "ray" in one:
+                origin, direction = numbers({name: np.array(one["ray"], dtype=np.float64)}, name, 2, 3)
+                rays[name] = (metre * origin, direction, metre * float(one.get("depth", 0.0)))
+            else:
+                places[name] = metre * numbers({name: np.array(one, dtype=np.float64)}, name, 3)
+        return rays, places
 
 
 class MedialAxis:
@@ -87,21 +79,20 @@ class MedialAxis:
         self.voxel = float(voxel)
         self._origin = vertices.min(axis=0) - 1.5 * voxel
         shape = np.ceil(np.ptp(vertices, axis=0) / voxel) + 4
-        if np.prod(shape) > MOST:
-            raise ValueError(f"voxel: {voxel} m gives {np.prod(shape):.3g} voxels, at most {MOST:.0e} are worked "
+        if np.prod(shape) > 60_000_000:
+            raise ValueError(f"voxel: {voxel} m gives {np.prod(shape):.3g} voxels, at most {60_000_000:.0e} are worked "
                              "on; is the mesh in metres?")
         cells = np.indices(shape.astype(int)).reshape(3, -1).T
         winding = igl.fast_winding_number(vertices, faces, self._origin + voxel * (cells + 0.5))
-        self.inside = (np.asarray(winding) > INSIDE).reshape(shape.astype(int))
+        # around a hole it falls smoothly from 1 to 0
+        self.inside = (np.asarray(winding) > 0.5).reshape(shape.astype(int))
         self.points = self._origin + voxel * (np.argwhere(skeletonize(self.inside, method="lee")) + 0.5)
         if not len(self.points):
             raise ValueError(f"mesh: no voxel of {voxel} m is inside; is it open, inside out, or in another unit?")
         self._tree = cKDTree(self.points)
 
     def nearest_to_ray(self, origin: np.ndarray, direction: np.ndarray, depth: float | None = None) -> np.ndarray:
-        """The point (3,) on a ray that is nearest to the medial axis, where the ray first passes through the body, and
-        `depth` metres farther; ValueError for a ray that misses it.
-        """
+        """The point (3,) of a ray, on its first way through the body, nearest to the medial axis; `depth` farther."""
         origin, along = np.asarray(origin, dtype=np.float64), np.asarray(direction, dtype=np.float64)
         if not (np.isfinite(origin).all() and np.isfinite(along).all() and np.linalg.norm(along) > 0):
             raise ValueError(f"origin, direction: expected finite numbers and a length, got {origin} and {along}")

@@ -8,41 +8,20 @@ import numpy as np
 
 from scanprep.alignment.icp import align_landmarks
 from scanprep.geometry import rotations
-from scanprep.ranges import Count, Positive, Settings
 
 from ..control.model import ControlModel
 from .articulated import Articulated, Points
 
-PLANE = 0.02                     # of the widest spread of points: flatter ones say nothing across their plane
-
-
-@dataclass(frozen=True)
-class FeatureConfig(Settings):
-    """Settings of `fit_features`.
-
-    Attributes
-    ----------
-    prior : float, metres
-        Misfit of a feature that an angle of one radian from the default pose, or a length twice the default one, is
-        worth. It decides only what the features leave open.
-    shortest, longest : float
-        Bounds of a segment length, as multiples of the default length of a body of that size.
-    iterations : int
-        Most steps of the solver.
-    """
-
-    prior: Positive = 0.001
-    shortest: Positive = 0.4
-    longest: Positive = 2.5
-    iterations: Count = 2000
+# metres: the misfit of a feature that an angle of one radian from the default pose, or a length twice the default one,
+# is worth; it decides only what the features leave open
+PRIOR = 0.001
 
 
 @dataclass(frozen=True, eq=False)
 class FeatureFit:
     """The control model in the pose, with the lengths and at the place of a scan."""
 
-    pose: np.ndarray      # (J, 3) radians, rotation vector of every part in its parent, as `Skeleton.part_rotations`
-                          # takes them
+    pose: np.ndarray      # (J, 3) radians, as `Skeleton.part_rotations` takes it
     lengths: np.ndarray   # (S,) metres, of the segments
     size: float           # of the body against the default one; its thickness grows by it
     trans: np.ndarray     # (3,) metres, from the default place of the root's joint to where it stands
@@ -55,39 +34,25 @@ class FeatureFit:
 
 
 def fit_features(control: ControlModel, joints: Mapping[str, np.ndarray],
-                 points: Mapping[str, np.ndarray] | None = None, config: FeatureConfig | None = None) -> FeatureFit:
-    """Pose, segment lengths and place of a control model that bring its features to those of a scan.
+                 points: Mapping[str, np.ndarray] | None = None) -> FeatureFit:
+    """Pose, segment lengths and place of a control model that bring its features, by name, to those of a scan.
 
-    Features that are not given are not in the sum. What the given ones leave open (the twist of an arm with a
-    straight elbow, the length of a hand) a weak prior keeps near the default pose and lengths. The result turns,
-    moves and scales with the features. How lengths stretch the surface: see `Articulated`.
-
-    Parameters
-    ----------
-    joints : {name of a part: (3,) float, metres}
-        Centres of joints.
-    points : {name of a landmark: (3,) float, metres}, optional
-        Points of the surface.
-
-    Raises
-    ------
-    ValueError
-        Names that the control model does not have, places that are not finite, fewer than three features that are
-        not on one line.
+    Features that are not given are not in the sum. What the given ones leave open (the twist of an arm with a straight
+    elbow, the length of a hand) a weak prior keeps near the default pose and lengths. The result turns, moves and
+    scales with the features. How lengths stretch the surface: see `Articulated`. ValueError for unknown names, places
+    that are not finite, fewer than three features that are not on one line.
 
     [Statues] Eq. 4
     """
     from scipy.optimize import minimize
 
-    config = config or FeatureConfig()
     model = Articulated(control)
     features, goal = _features(control, joints, points or {})
     T = _place(model, features, joints, goal)
     scale = float(np.cbrt(np.linalg.det(T[:3, :3])))
     R = T[:3, :3] / scale
     goal = (goal - T[:3, 3]) @ R / scale                        # in the axes and the size of the control model
-    bounds = np.concatenate([model.limits, [[config.shortest, config.longest]] * len(model.lengths),
-                             [[-np.inf, np.inf]] * 3])
+    bounds = np.concatenate([model.limits, [[0.4, 2.5]] * len(model.lengths), [[-np.inf, np.inf]] * 3])
     at = {name: goal[k] for k, name in enumerate(joints)}
     start = np.clip(analytic_start(model, at), *bounds.T)
     # Each unknown is measured by what it moves: a hand and the whole body alike, in millimetres.
@@ -99,12 +64,11 @@ def fit_features(control: ControlModel, joints: Mapping[str, np.ndarray],
         value, slope = misfit(model, x, features, goal)
         off = (x - model.rest)[:-3]
         off[:3] = 0                                             # the way the body stands is nobody's default
-        slope[:-3] += 2 * config.prior**2 * off
-        return 1e6 * (value + config.prior**2 * float(off @ off)), 1e6 * unit * slope
+        slope[:-3] += 2 * PRIOR**2 * off
+        return 1e6 * (value + PRIOR**2 * float(off @ off)), 1e6 * unit * slope
 
     found = minimize(energy, start / unit, jac=True, method="L-BFGS-B", bounds=bounds / unit[:, None],
-                     options={"maxiter": config.iterations, "maxfun": 2 * config.iterations, "ftol": 1e-9,
-                              "gtol": 1e-6, "maxcor": 50})
+                     options={"maxiter": 2000, "maxfun": 4000, "ftol": 1e-9, "gtol": 1e-6, "maxcor": 50})
     x = np.clip(unit * found.x, *bounds.T)
     frames = model.frames(x)
     pose = model.pose(x)
@@ -140,7 +104,7 @@ def warp(vertices: np.ndarray, from_points: np.ndarray, to_points: np.ndarray, s
     if not (np.isfinite(source).all() and np.isfinite(goal).all()):
         raise ValueError("from_points, to_points: expected finite numbers")
     spread = np.linalg.svd(source - source.mean(axis=0), compute_uv=False) if len(source) > 3 else np.zeros(3)
-    if spread[2] <= PLANE * spread[0]:
+    if spread[2] <= 0.02 * spread[0]:
         raise ValueError(f"from_points: expected at least 4 points that are not in one plane, got {len(source)}")
     if len(np.unique(source, axis=0)) < len(source):
         raise ValueError("from_points: expected different points, two are at one place")
@@ -233,9 +197,7 @@ def analytic_start(model: Articulated, at: Mapping[str, np.ndarray]) -> np.ndarr
 
 def limb_angles(model: Articulated, base: int, middle: int, end: int | None, goal: np.ndarray
                 ) -> tuple[np.ndarray, float]:
-    """Angles (3,) of the base joint and that of the middle one that point one or two bones along directions (1 or 2, 3)
-    in the axes of the part that the base joint is on.
-    """
+    """Angles (3,) of the base joint and of the middle one that point bones along goals, in the axes above."""
     o, of_base, hinge = model.control.skeleton.joints, model.joint_of == base, model.joint_of == middle
     rest = np.array([o[middle] - o[base], *([o[end] - o[middle]] if len(goal) == 2 else [])])
     return _limb(_unit(rest), _unit(goal), model.axes[of_base], model.axes[hinge][0], model.limits[of_base],

@@ -8,8 +8,8 @@ central triangle has barycentric coordinates and a height there. What the paper 
 - A triangle at a border has no frame. It is left out: its vertices are held by the triangles farther inside, and as
   corners of their frames. (A control mesh is closed.)
 - A frame whose corners nearly lie on one line says nothing safe about height or place: at a vertex of three triangles
-  two of its corners are even the same vertex. Frames flatter than FLATTEST, or where a barycentric coordinate is above
-  FARTHEST, are left out as well.
+  two of its corners are even the same vertex. Frames flatter than 0.05 of their longest side, or where a barycentric
+  coordinate is above 4, are left out as well.
 - N_i, the valence, is the number of frames that hold the vertex: on a closed mesh with sound frames they are the same.
 - Eq. 12 is not the gradient of Eq. 10: a vertex that moves also moves the frames of which it is a corner, and the
   factor 2 is missing. Both are here: `published_force`, and `gradient`, which is exact.
@@ -26,15 +26,10 @@ from scipy.sparse import csr_array
 
 from scanprep.geometry.mesh import Mesh
 
-FLATTEST = 0.05          # height of a frame over its longest side
-FARTHEST = 4.0           # barycentric coordinate
-FLOOR = 1e-6             # of its area at rest: a frame that has become smaller counts as this large
-
 
 @dataclass(frozen=True, eq=False)
 class LocalShape:
-    """The rest shape of a mesh in the frames of its triangles; R rows, one for a vertex in one frame. [Statues] Eq. 10
-    """
+    """The rest shape of a mesh in the frames of its triangles; R rows, one a vertex in a frame. [Statues] Eq. 10"""
 
     count: int            # vertices of the mesh, N
     held: np.ndarray      # (R,), the vertex
@@ -110,9 +105,7 @@ class LocalShape:
 
 
 def local_shape(rest: Mesh) -> LocalShape:
-    """The local shape of a mesh at rest; ValueError where that is not edge-manifold or has not one sound frame.
-    [Statues] section 4.1
-    """
+    """The local shape of an edge-manifold mesh at rest. [Statues] section 4.1"""
     if not rest.is_edge_manifold:
         raise ValueError(f"rest: expected every edge between two triangles that agree on the outside, got {rest}")
     x, whole = rest.vertices, np.flatnonzero((rest.edge_use[rest.face_edges] == 2).all(axis=1))
@@ -125,7 +118,7 @@ def local_shape(rest: Mesh) -> LocalShape:
     c = np.cross(p[:, 1] - p[:, 0], p[:, 2] - p[:, 0])
     size = np.linalg.norm(c, axis=1)
     longest = ((p - np.roll(p, 1, axis=1)) ** 2).sum(axis=2).max(axis=1)
-    safe = size > FLATTEST * longest
+    safe = size > 0.05 * longest
     corners, c, size, held = (np.repeat(a[safe], 3, axis=0) for a in (frames, c, size, face))
     held = face[safe].ravel()
     w = x[held] - x[corners[:, 0]]
@@ -133,8 +126,8 @@ def local_shape(rest: Mesh) -> LocalShape:
     alpha = np.einsum("rd,rd->r", np.cross(w, f), c) / size**2
     beta = np.einsum("rd,rd->r", np.cross(e, w), c) / size**2
     bary = np.stack([1 - alpha - beta, alpha, beta], axis=1)
-    near = np.repeat((np.abs(bary) <= FARTHEST).all(axis=1).reshape(-1, 3).all(axis=1), 3)
+    near = np.repeat((np.abs(bary) <= 4.0).all(axis=1).reshape(-1, 3).all(axis=1), 3)
     if not near.any():
         raise ValueError(f"rest: expected triangles with neighbours across all three sides, got {rest} without")
     heights = np.einsum("rd,rd->r", w, c) / size**1.5
-    return LocalShape(len(x), held[near], corners[near], bary[near], heights[near], FLOOR * size[near])
+    return LocalShape(len(x), held[near], corners[near], bary[near], heights[near], 1e-6 * size[near])

@@ -1,8 +1,9 @@
-"""Where a person stands in a scan of which neither up nor front is known: from rough starts to the best pose."""
+"""Where and how a person stands in a scan of which neither up nor front is known: rough starts, then the best pose."""
 from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -10,18 +11,143 @@ from scipy.spatial import cKDTree
 from scanprep.geometry import rotations
 from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.surface import Surface
+from scanprep.geometry.target import Target, orient
 from scanprep.geometry.thinning import thin
-from scanprep.registration.matches import Target
+from scanprep.registration.energies import Pull, pull
+from scanprep.registration.matches import Described, Likeness, tukey
 
+from .articulated import Articulated, Points
 from .features import limb_angles, limbs
-from .pose_search import COARSE, FINE, Posed, PoseSearch
+
+BOUNDS = 0.6, 1.6               # of a length, as multiples of the default one
+GIRTH = -0.03, 0.12             # metres off the default surface
+
+
+class PoseStage(NamedTuple):
+    """Rounds of matching at one reach; lengths, metres, are those of the control model."""
+
+    reach: float   # farthest match that counts
+    prior: float   # distance to the data that an angle of one radian is worth
+    growth: float  # distance to the data that a length twice the default one is worth
+    slide: float   # force of a match along the surface, as a share of that across it
+    detail: float  # spacing to which the scan is thinned
+    rounds: int
+
+
+COARSE = (PoseStage(0.5, 0.05, 0.2, 0.5, 0.05, 5), PoseStage(0.3, 0.03, 0.15, 0.3, 0.04, 5))
+FINE = (PoseStage(0.2, 0.015, 0.1, 0.15, 0.03, 6), PoseStage(0.12, 0.01, 0.08, 0.05, 0.025, 6),
+        PoseStage(0.08, 0.006, 0.05, 0.03, 0.02, 6))
+
+
+@dataclass(frozen=True, eq=False)
+class Posed:
+    """A control model on its way to a scan."""
+
+    x: np.ndarray      # (P,), parameters
+    girth: np.ndarray  # (S,) metres, how far the surface of every segment stands off the default one
+
+
+class PoseSearch:
+    """A control model, prepared to be posed onto scans.
+
+    Matches in both directions draw its surface; what they want of the parameters is solved for within the limits of
+    the joints, one Gauss-Newton step a round. Between the steps every segment grows thicker or thinner.
+    """
+
+    def __init__(self, model: Articulated, normals: float = 0.06) -> None:
+        self.model, self.normals = model, normals
+        mesh = model.control.mesh
+        self.area = float(mesh.face_areas.sum())
+        self.sample = thin(mesh.vertices, 0.03)
+        self.segments = model.control.weights @ model.is_of
+        self.bounds = np.concatenate([model.limits, np.tile(BOUNDS, (len(model.lengths), 1)), [[-np.inf, np.inf]] * 3])
+
+    @property
+    def start(self) -> Posed:
+        return Posed(self.model.rest, np.zeros(len(self.model.lengths)))
+
+    def points(self, girth: np.ndarray) -> Points:
+        """All vertices of a body so thick, in the default pose."""
+        mesh = self.model.control.mesh
+        thicker = (self.segments @ girth)[:, None] * mesh.vertex_normals
+        return Points(self.model.control.weights, mesh.vertices + thicker)
+
+    def mesh(self, posed: Posed) -> Mesh:
+        """The control mesh as it lies."""
+        vertices = self.model.positions(self.model.frames(posed.x), self.points(posed.girth))
+        return self.model.control.mesh.with_vertices(vertices)
+
+    def run(self, posed: Posed, target: Target, stages: tuple[PoseStage, ...]) -> Posed:
+        """Bring the control model onto a target that has its size and stands near it."""
+        for stage in stages:
+            goal = target.thinned(stage.detail)
+            for _ in range(stage.rounds):
+                posed = self.step(posed, goal, stage)
+        return posed
+
+    def step(self, posed: Posed, goal: Target, stage: PoseStage) -> Posed:
+        """One round of matching, one step of the parameters, then of the girth."""
+        model, x = self.model, posed.x
+        frames, points = model.frames(x), self.points(posed.girth)
+        mesh = model.control.mesh.with_vertices(model.positions(frames, points))
+        wanted = self.wanted(mesh, goal, stage)
+        D = model.derivatives(frames, points)
+        rows = D.reshape(-1, len(x))
+        H = rows.T @ (wanted.A @ D).reshape(-1, len(x))
+        g = rows.T @ (np.einsum("nij,nj->ni", wanted.A, mesh.vertices) - wanted.b).ravel()
+        A, S = len(model.axes), len(model.lengths)
+        hold, centre = np.zeros(len(x)), model.rest.copy()
+        hold[:A] = self.area * stage.prior**2 * (model.joint_of != 0)
+        hold[A:A + S] = self.area * stage.growth**2
+        centre[A:A + S] = model.size(x)
+        H += np.diag(hold) + 1e-9 * np.trace(H) / len(x) * np.eye(len(x))
+        moved = _bounded_step(x, H, g + hold * (x - centre), self.bounds)
+        off = wanted.b - np.einsum("nij,nj->ni", wanted.A, mesh.vertices + D @ (moved - x))
+        outward = mesh.vertex_normals
+        weight = np.einsum("ni,nij,nj->n", outward, wanted.A, outward)
+        more = (self.segments.T @ np.einsum("ni,ni->n", outward, off)) / (self.segments.T @ weight + 0.02 * self.area)
+        return Posed(moved, np.clip(posed.girth + more, *GIRTH))
+
+    def wanted(self, mesh: Mesh, goal: Target, stage: PoseStage) -> Pull:
+        """What matches in both directions want of the vertices.
+
+        A match of a vertex counts where its point of the scan, in turn, chooses a vertex nearby on the body: a forearm
+        that was not scanned is not drawn to the hip.
+        """
+        goal = orient(goal, mesh, self.normals)
+        like, N = Likeness(normals=self.normals), len(mesh.vertices)
+        mine = Described(mesh.vertices, mesh.vertex_normals)
+        theirs = Described(goal.points, goal.normals)
+        chosen, far = theirs.matched(mine, stage.reach, like)
+        p = np.flatnonzero(chosen >= 0)
+        wanted = pull(N, chosen[p], goal.points[p], self.area / len(goal.points) * tukey(far[p], stage.reach),
+                      goal.normals[p], stage.slide)
+        found, far = mine.of(self.sample).matched(theirs, stage.reach, like)
+        rest = self.model.control.mesh.vertices
+        apart = np.linalg.norm(rest[self.sample] - rest[chosen[found]], axis=1)
+        # metres: not taken for each other
+        good = (found >= 0) & (chosen[found] >= 0) & ~goal.border[found] & (apart < max(2 * stage.reach, 0.25))
+        weights = self.area / len(self.sample) * tukey(far[good], stage.reach)
+        return wanted + pull(N, self.sample[good], goal.points[found[good]], weights, goal.normals[found[good]],
+                             stage.slide)
+
+
+def _bounded_step(x: np.ndarray, H: np.ndarray, g: np.ndarray, bounds: np.ndarray) -> np.ndarray:
+    """The minimum of a quadratic within bounds, by fixing what a step would carry beyond them."""
+    free = np.ones(len(x), dtype=bool)
+    step = np.zeros(len(x))
+    for _ in range(4):
+        step[free] = -np.linalg.solve(H[np.ix_(free, free)], g[free] + H[np.ix_(free, ~free)] @ step[~free])
+        new = np.clip(x + step, *bounds.T)
+        out = free & (new != x + step)
+        if not out.any():
+            break
+        step[out] = (new - x)[out]
+        free &= ~out
+    return np.clip(x + step, *bounds.T)
+
 
 CAP, NORMALS = 0.08, 0.05        # metres: of a distance, and what a difference of normals of one is worth
-UNSEEN = 0.3                     # weight of the body's distances to the scan, which may show a part only
-HEADINGS = 8
-PART = 0.85                      # of the model's height: lower scans may be of a part of a person
-TRIED, ARMS_BENT = 8, 6          # starts of the body, and of an arm, that are bent a little
-RIVAL = 1.3                      # a stand that fits worse by this factor is no more than the other facing
 ASTRAY = 0.01, 0.25              # shares of a scan off the body, by more than a hand: arms are in a wrong place
 # Outwards, frontwards, upwards: where an upper arm may point, and a forearm, which else goes on straight.
 UPPER_ARMS = ((0.4, 0, -1), (0.7, 0.4, -0.7), (0.6, -0.6, -0.7), (1, 0, 0), (0.8, 0.6, 0.2), (0.2, 1, 0), (0.8, 0, 0.7),
@@ -54,16 +180,17 @@ class Stand:
 
 
 def find_person(search: PoseSearch, target: Target, metres: float) -> list[Stand]:
-    """The best stand in a scan and the best one that faces another way, best first. The scan is in its own unit, of so
-    many `metres`.
-    """
-    bent = sorted((bend(search, target, T, search.start, COARSE) for T in rough_stands(search, target, metres)[:TRIED]),
+    """The best stand in a scan whose unit is so many `metres`, and the best that faces another way."""
+    def facing(stand: Stand) -> np.ndarray:
+        return stand.direction(search, np.array([0.0, -1, 0]))
+
+    bent = sorted((bend(search, target, T, search.start, COARSE) for T in rough_stands(search, target, metres)[:8]),
                   key=lambda stand: stand.misfit)
-    best = bent[:1] + [s for s in bent[1:] if _facing(search, s) @ _facing(search, bent[0]) < 0.5][:1]
+    best = bent[:1] + [s for s in bent[1:] if facing(s) @ facing(bent[0]) < 0.5][:1]
     best = sorted((bend(search, target, s.T, s.posed, FINE) for s in best), key=lambda stand: stand.misfit)
     found = [with_arms(search, target, best[0])]
     for rival in best[1:]:
-        close = rival.misfit < RIVAL * found[0].misfit
+        close = rival.misfit < 1.3 * found[0].misfit    # what fits worse is no more than the other facing
         found.append(with_arms(search, target, rival) if close else rival)
     return sorted(found, key=lambda stand: stand.misfit)
 
@@ -90,7 +217,7 @@ def misfit(body: Mesh, goal: Target) -> tuple[float, float]:
     near = cKDTree(np.hstack([goal.points, NORMALS * goal.normals]))
     back = np.minimum(near.query(np.hstack([body.vertices, NORMALS * body.vertex_normals]))[0] ** 2, CAP**2)
     unseen = float(back @ body.vertex_areas) / float(body.vertex_areas.sum())
-    return float(np.sqrt(off.mean())), float(np.sqrt(off.mean() + UNSEEN * unseen))
+    return float(np.sqrt(off.mean())), float(np.sqrt(off.mean() + 0.3 * unseen))      # it may show a part only
 
 
 def rough_stands(search: PoseSearch, target: Target, metres: float) -> list[np.ndarray]:
@@ -122,10 +249,10 @@ def _placements(body: Mesh, points: np.ndarray, metres: float) -> Iterator[tuple
         tall = float(np.ptp(points @ up))
         whole = (highest - lowest) / tall
         ways = [(whole, False)] if 0.7 < metres / whole < 1.3 else []
-        if metres * tall < PART * (highest - lowest):
+        if metres * tall < 0.85 * (highest - lowest):    # lower scans may be of a part of a person
             ways += [(metres, False), (metres, True)]
-        for k in range(HEADINGS if ways else 0):
-            heading = rotations.exp(np.array([0, 0, 2 * np.pi * k / HEADINGS]))
+        for k in range(8 if ways else 0):
+            heading = rotations.exp(np.array([0, 0, 2 * np.pi * k / 8]))
             turn = heading @ np.array([right, np.cross(up, right), up])
             for scale, hangs in ways:
                 placed = scale * points @ turn.T
@@ -139,26 +266,21 @@ def with_arms(search: PoseSearch, target: Target, stand: Stand) -> Stand:
     """The same stand, with arms tried elsewhere while much of the scan lies off the body."""
     goal = moved(target, stand.T).thinned(0.02)
     coarse = goal.thinned(0.05)
+    o, z = search.model.control.skeleton.joints, search.model.control.mesh.vertices[:, 2]
     for base, middle, end in limbs(search.model):
         astray = (Surface(search.mesh(stand.posed)).closest(goal.points).distances > CAP).mean()
         if not ASTRAY[0] < astray < ASTRAY[1]:
             break
-        if end is None or not _is_arm(search, base):
+        if end is None or o[base, 2] <= 0.5 * (z.min() + z.max()):      # a leg
             continue
         starts = [_pointed(search, stand.posed, base, middle, end, np.array([upper, fore]))
                   for upper in UPPER_ARMS for fore in (upper, *FOREARMS)]
         starts.sort(key=lambda posed: misfit(search.mesh(posed), coarse)[1])
         # No coarser: from afar a hand beside the head is drawn to the head.
-        tried = min((bend(search, target, stand.T, posed, FINE[1:]) for posed in starts[:ARMS_BENT]),
+        tried = min((bend(search, target, stand.T, posed, FINE[1:]) for posed in starts[:6]),
                     key=lambda s: s.misfit)
         stand = min(stand, bend(search, target, stand.T, tried.posed, FINE), key=lambda s: s.misfit)
     return stand
-
-
-def _is_arm(search: PoseSearch, base: int) -> bool:
-    """A limb whose base lies in the upper half."""
-    o, z = search.model.control.skeleton.joints, search.model.control.mesh.vertices[:, 2]
-    return bool(o[base, 2] > 0.5 * (z.min() + z.max()))
 
 
 def _pointed(search: PoseSearch, posed: Posed, base: int, middle: int, end: int, arm: np.ndarray) -> Posed:
@@ -175,7 +297,3 @@ def _pointed(search: PoseSearch, posed: Posed, base: int, middle: int, end: int,
     A = len(angles)
     x[:A] = np.clip(x[:A], *model.limits.T)
     return Posed(x, posed.girth)
-
-
-def _facing(search: PoseSearch, stand: Stand) -> np.ndarray:
-    return stand.direction(search, np.array([0.0, -1, 0]))

@@ -92,8 +92,8 @@ class ScanPoints:
 def assign(near: np.ndarray, squared: np.ndarray, count: int, temperature: float, slack: Slack = "rest",
            tolerance: float = 0.01, most: int = 5) -> SoftAssignment:
     """Balanced soft assignment, at one temperature (m²), of vertices to the points (I, K) that each knows, -1 for none,
-    by their squared distances; done when no share of a point changes by more than `tolerance` of itself. [Statues] Eq.
-    14, 17
+    by their squared distances; done when no share of a point changes by more than `tolerance` of itself.
+    [Statues] Eq. 14, 17
     """
     known = near >= 0
     row, point = np.nonzero(known)[0], near[known]

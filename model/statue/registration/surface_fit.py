@@ -2,7 +2,7 @@
 
 Beyond the paper: points of the scan draw the mesh as well (`cover`), without which it leaves tips of limbs empty; at
 the end vertices are drawn to the surface between the points (`polish`); at the edge of a hole the data draw only across
-the surface, and beyond it not at all. `SurfaceFitConfig(step="explicit", polish=0)` has nothing of the first two.
+the surface, and beyond it not at all. `SurfaceFitConfig.published()` has nothing of the first two.
 
 [Statues] section 4
 """
@@ -10,27 +10,21 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Annotated, Literal
+from typing import Annotated, Literal, NamedTuple
 
 import numpy as np
 from scipy.sparse import csc_array, diags_array, eye_array
 
 from scanprep.geometry.mesh import Mesh, check_template
-from scanprep.geometry.sparse import Factored
+from scanprep.geometry.sparse import Factored, conjugate_gradients
 from scanprep.geometry.surface import Surface, checked_points
+from scanprep.geometry.target import Target, target_of
 from scanprep.ranges import Count, Positive, Range, Settings
-from scanprep.registration.matches import Target, target_of
-from scanprep.registration.shell import conjugate_gradients, flipped, unfold
-from scanprep.registration.vertex_rotations import turns
+from scanprep.registration.inverted_triangles import inverted_triangles, unfold
 from scanprep.threads import one_thread
 
-from .local_shape import LocalShape, local_shape
+from .local_shape import local_shape
 from .soft_assignment import ScanPoints, Slack, SoftAssignment, assign
-
-AGREE = 0.3              # least cosine between normals of the scan and the mesh, for points that draw the mesh
-BACK = 10                # times that vertices go back from the surface because a triangle turned over
-LAST = 10                # times as many steps at the last temperature
-SAMPLE = 10              # such points of the scan for each vertex
 
 
 @dataclass(frozen=True)
@@ -46,12 +40,9 @@ class SurfaceFitConfig(Settings):
     neighbours : int
         Points of the scan that a vertex is assigned to.
     slack : "rest" or "published"
+        What is left of a point of the scan costs nothing, or begins as its smallest match, as published.
     cooling : float
         Factor of the temperature from one stage to the next.
-    rate : float
-        Length of an Euler step.
-    tolerance : float, metres
-        Root of the final temperature.
     most : int
         Steps at one temperature at most; ten times as many at the last.
     cover : float
@@ -62,10 +53,6 @@ class SurfaceFitConfig(Settings):
         where it was posed. A multiple of the root of the mesh's area; the paper has none.
     polish : int
         Rounds at the end in which vertices are drawn to the surface between the points of the scan; 0 leaves them out.
-    tight : float
-        Weight of the data in these rounds, across the surface.
-    slide : float
-        Weight along it, as a share.
     """
 
     step: Literal["implicit", "explicit"] = "implicit"
@@ -73,14 +60,15 @@ class SurfaceFitConfig(Settings):
     neighbours: Count = 16
     slack: Slack = "rest"
     cooling: Annotated[float, Range(0.01, 0.99)] = 0.5
-    rate: Annotated[float, Range(1e-6, 1)] = 0.5
-    tolerance: Positive = 0.001
     most: Count = 5
     cover: float = 3.0
     reach: Positive = 0.06
     polish: int = 6
-    tight: Positive = 100.0
-    slide: float = 0.05
+
+    @classmethod
+    def published(cls) -> SurfaceFitConfig:
+        """As the paper has it; cooling and steps, which it does not tell, are such that the Euler steps converge."""
+        return cls(step="explicit", slack="published", cover=0.0, polish=0, cooling=0.7, most=100)
 
 
 @dataclass(frozen=True, eq=False)
@@ -90,17 +78,13 @@ class SurfaceFit:
     vertices: np.ndarray        # (N, 3) metres
     seen: np.ndarray            # (N,), whether there were data here; the others are carried by the shape
     rms: float                  # metres, distances of the vertices seen to the surface of the scan
-    largest: float              # metres, distances of the vertices seen to the surface of the scan
+    largest: float              # metres, the largest of them
     inverted: int               # triangles that face against their surroundings
-    distortion: float           # root mean square over the area of the logarithm of the stretches against the rest
-                                # shape
-    energies: dict[str, float]  # {"shape", "data", "entropy", "cover": }, terms of Eq. 16, and our own, after the last
-                                # step at the last temperature, square metres
+    energies: dict[str, float]  # square metres: "shape", "data", "entropy" of Eq. 16 and our "cover", at the end
     temperatures: np.ndarray    # (K,) square metres
     steps: np.ndarray           # (K,), steps at each of them
     converged: bool             # the longest gradient of a vertex fell below √T at the last temperature, and there were
-                                # data. At a higher one the fit goes on after `most` steps, for the next has another
-                                # minimum anyway
+                                # data; at a higher one the fit goes on, for the next has another minimum anyway
 
 
 @one_thread()
@@ -135,118 +119,125 @@ def fit_surface(rest: Mesh, start: np.ndarray, scan: Mesh, config: SurfaceFitCon
         raise ValueError(f"start: expected shape {rest.vertices.shape}, got {start.shape}")
     if not len(scan.faces):
         raise ValueError(f"scan: expected at least one triangle, got {scan}")
-    fit = _Fit(rest, start, scan_target(scan), float(scan.face_areas.sum()), config, hidden)
-    temperatures = fit.schedule()
+    fit, tell = _Fit(rest, start, scan, config, hidden), progress or (lambda done, total: None)
+    x, temperatures, steps = start, fit.schedule(start), []
     total = len(temperatures) + config.polish
     for k, T in enumerate(temperatures):
-        fit.anneal(T, config.most * (LAST if k == len(temperatures) - 1 else 1))
-        if progress:
-            progress(k + 1, total)
-    surface = Surface(scan)
+        last = k == len(temperatures) - 1
+        x, annealed = fit.anneal(x, T, 10 * config.most if last else config.most)             # [Statues] Eq. 16-18
+        steps.append(annealed.steps)
+        tell(k + 1, total)
     for k in range(config.polish):
-        fit.polish(surface)
-        if progress:
-            progress(len(temperatures) + k + 1, total)
+        x = fit.polish(x)
+        tell(len(temperatures) + k + 1, total)
     if config.polish:
-        fit.settle_down(surface)
-    return fit.result(surface, temperatures)
+        x = fit.onto_the_surface(x)
+    seen, _ = fit.seen(x)
+    apart = fit.surface.closest(x).distances[seen]
+    return SurfaceFit(x, seen, float(np.sqrt(np.mean(apart**2))) if seen.any() else np.nan,
+                      float(apart.max(initial=0.0)), int(fit.inverted(x).sum()), annealed.energies, temperatures,
+                      np.array(steps), bool(annealed.converged and seen.any()))
+
+
+class _Annealed(NamedTuple):
+    """How the steps at one temperature ended."""
+
+    steps: int
+    converged: bool
+    energies: dict[str, float]
 
 
 class _Fit:
-    """A control mesh on its way."""
+    """What a fit of vertices x (N, 3) goes by, and its steps."""
 
-    def __init__(self, rest: Mesh, start: np.ndarray, target: Target, area: float, config: SurfaceFitConfig,
-                 hidden: np.ndarray | None) -> None:
-        self.rest, self.x, self.target, self.config = rest, start, target, config
-        self.shape: LocalShape = local_shape(rest)
+    def __init__(self, rest: Mesh, start: np.ndarray, scan: Mesh, config: SurfaceFitConfig, hidden: np.ndarray | None
+                 ) -> None:
+        target = scan_target(scan)
+        self.rest, self.target, self.surface, self.config = rest, target, Surface(scan), config
+        self.shape = local_shape(rest)
         self.points = ScanPoints(target.points, target.normals, target.border)
         self.stiffness = csc_array(self.shape.plane.T @ diags_array(self.shape.weights) @ self.shape.plane)
-        self.sample = target.thinned(max(float(np.sqrt(area / (SAMPLE * len(start)))), 1e-4))
-        self.nothing = csc_array((0, len(start))), np.zeros((0, 3)), 0.0
+        # ten points of the scan for each vertex draw the mesh
+        self.sample = target.thinned(max(float(np.sqrt(float(scan.face_areas.sum()) / (10 * len(start)))), 1e-4))
         self.shown = np.ones(len(start), dtype=bool) if hidden is None else ~np.asarray(hidden)
         self.reach = config.reach * float(np.sqrt(rest.with_vertices(start).face_areas.sum()))
-        self.steps: list[int] = []
-        self.converged = False
-        self.energies: dict[str, float] = {}
 
-    @property
-    def mesh(self) -> Mesh:
-        """As it lies now."""
-        return self.rest.with_vertices(self.x)
+    def normals(self, x: np.ndarray) -> np.ndarray:
+        """(N, 3) of the vertices."""
+        return self.rest.with_vertices(x).vertex_normals
 
-    def schedule(self) -> np.ndarray:
-        """Temperatures from the largest squared distance of a vertex to its nearest point down to the tolerance."""
-        final = self.config.tolerance**2
-        near, squared = self.points.nearest(self.x, self.mesh.vertex_normals, 1)
-        first = max(float(squared[self.beside_data(near[:, 0]), 0].max(initial=0.0)), final)
+    def inverted(self, x: np.ndarray) -> np.ndarray:
+        """(F,) bool: triangles that face against their surroundings."""
+        return inverted_triangles(self.rest, x)
+
+    def schedule(self, x: np.ndarray) -> np.ndarray:
+        """Temperatures (K,), from the largest squared distance of a vertex to its nearest point down to (1 mm)²."""
+        final = 0.001**2
+        near, squared = self.points.nearest(x, self.normals(x), 1)
+        first = max(float(squared[self.beside_data(x, near[:, 0]), 0].max(initial=0.0)), final)
         stages = int(np.ceil(np.log(final / first) / np.log(self.config.cooling))) + 1
         return np.geomspace(first, final, stages)
 
-    def anneal(self, T: float, most: int) -> None:
-        """Steps at one temperature until the gradient lies within the region of matching."""
-        explicit = self.config.step == "explicit"
+    def anneal(self, x: np.ndarray, T: float, most: int) -> tuple[np.ndarray, _Annealed]:
+        """Vertices after steps at one temperature, until the gradient lies within the region of matching."""
+        explicit, lam = self.config.step == "explicit", self.config.shape
         for count in range(most + 1):
-            matches, A = self.assignment(T)
+            matches, A = self.assignment(x, T)                                                 # [Statues] Eq. 14, 17
             wanted = matches.matches @ self.points.points
-            if explicit:
-                data = SurfaceData(A, wanted, *self.nothing)
-                force = data.force(self.x) + self.config.shape * self.shape.published_force(self.x)
-            else:
-                data = self.drawn(A, wanted)
-                force = self.force(data)
-            self.converged = bool(np.linalg.norm(force, axis=1).max() <= np.sqrt(T))
-            if (self.converged and count) or count == most:
+            data = self.undrawn(A, wanted) if explicit else self.drawn(x, A, wanted)           # [Statues] Eq. 13
+            force = data.force(x) + lam * (self.shape.published_force(x) if explicit else -0.5 * self.shape.gradient(x))
+            converged = bool(np.linalg.norm(force, axis=1).max() <= np.sqrt(T))
+            if (converged and count) or count == most:
                 break
-            self.x = self.x + self.config.rate * force if explicit else self.stepped(data, force)     # Eq. 18
-        misfit, entropy = matches.energy(self.x, self.points.points, T)
-        self.energies = {"shape": self.config.shape * self.shape.energy(self.x), "data": misfit, "entropy": entropy,
-                         "cover": data.cover(self.x)}
-        self.steps.append(count)
+            x = x + 0.5 * force if explicit else self.stepped(x, data, force)                  # [Statues] Eq. 18
+        misfit, entropy = matches.energy(x, self.points.points, T)
+        return x, _Annealed(count, converged, {"shape": lam * self.shape.energy(x), "data": misfit, "entropy": entropy,
+                                               "cover": data.cover(x)})                        # [Statues] Eq. 16
 
-    def assignment(self, T: float) -> tuple[SoftAssignment, np.ndarray]:
+    def assignment(self, x: np.ndarray, T: float) -> tuple[SoftAssignment, np.ndarray]:
         """The balanced assignment, and (N, 3, 3) what it weighs: nothing without data, at borders only across them.
 
         At the edge of a hole all points lie to one side: their mean would draw the mesh off the hole.
         """
-        near, squared = self.points.nearest(self.x, self.mesh.vertex_normals, self.config.neighbours)
-        near[~self.beside_data(near[:, 0])] = -1
+        near, squared = self.points.nearest(x, self.normals(x), self.config.neighbours)
+        near[~self.beside_data(x, near[:, 0])] = -1
         found = assign(near, squared, len(self.points.points), T, self.config.slack)
         n = self.points.normals[near[:, 0]]
         edge = (self.points.border[near] & (near >= 0)).any(axis=1)
         A = np.where(edge[:, None, None], np.einsum("ni,nj->nij", n, n), np.eye(3))
         return found, found.seen[:, None, None] * A
 
-    def beside_data(self, nearest: np.ndarray) -> np.ndarray:
+    def beside_data(self, x: np.ndarray, nearest: np.ndarray) -> np.ndarray:
         """(N,) bool: shown, within reach of the nearest point, not past the edge of a hole where it says nothing."""
-        near = np.linalg.norm(self.points.points[nearest] - self.x, axis=1) <= self.reach
-        return self.shown & near & self.points.beside(self.x, nearest)
+        near = np.linalg.norm(self.points.points[nearest] - x, axis=1) <= self.reach
+        return self.shown & near & self.points.beside(x, nearest)
 
-    def seen(self) -> tuple[np.ndarray, np.ndarray]:
-        """Vertices with data, and the nearest point of the whole scan."""
-        nearest = self.points.nearest(self.x, self.mesh.vertex_normals, 1)[0][:, 0]
-        return self.beside_data(nearest), nearest
+    def seen(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Vertices with data (N,), and the nearest point (N,) of the whole scan."""
+        nearest = self.points.nearest(x, self.normals(x), 1)[0][:, 0]
+        return self.beside_data(x, nearest), nearest
 
-    def drawn(self, A: np.ndarray, wanted: np.ndarray) -> SurfaceData:
-        """The data term that draws vertices to `wanted` (N, 3) by A (N, 3, 3), and the mesh to points of the scan."""
-        mesh = self.mesh
+    def undrawn(self, A: np.ndarray, wanted: np.ndarray) -> SurfaceData:
+        """The data term that draws vertices to `wanted` (N, 3) by A (N, 3, 3) alone."""
+        return SurfaceData(A, wanted, csc_array((0, len(wanted))), np.zeros((0, 3)), 0.0)
+
+    def drawn(self, x: np.ndarray, A: np.ndarray, wanted: np.ndarray) -> SurfaceData:
+        """The same, and points of the scan draw the mesh where both face the same way."""
         if not self.config.cover:
-            return SurfaceData(A, wanted, *self.nothing)
+            return self.undrawn(A, wanted)
+        mesh = self.rest.with_vertices(x)
         found = Surface(mesh).closest(self.sample.points)
         corners = mesh.faces[found.faces]
-        normals = found.carried(mesh.vertex_normals, mesh.faces)
-        facing = np.einsum("pd,pd->p", normals, self.sample.normals) > AGREE
+        normals = found.transferred(mesh.vertex_normals, mesh.faces)
+        facing = np.einsum("pd,pd->p", normals, self.sample.normals) > 0.3
         good = np.flatnonzero(facing & self.shown[corners].all(axis=1))
         rows = np.repeat(np.arange(len(good)), 3)
-        C = csc_array((found.bary[good].ravel(), (rows, corners[good].ravel())), shape=(len(good), len(self.x)))
-        return SurfaceData(A, wanted, C, self.sample.points[good], self.config.cover * len(self.x) / len(found.faces))
+        C = csc_array((found.bary[good].ravel(), (rows, corners[good].ravel())), shape=(len(good), len(x)))
+        return SurfaceData(A, wanted, C, self.sample.points[good], self.config.cover * len(x) / len(found.faces))
 
-    def force(self, data: SurfaceData) -> np.ndarray:
-        """(N, 3) minus half the exact gradient."""
-        return data.force(self.x) - 0.5 * self.config.shape * self.shape.gradient(self.x)
-
-    def stepped(self, data: SurfaceData, force: np.ndarray) -> np.ndarray:
-        """Vertices after a Gauss-Newton step on local shape and data."""
-        shape, w, lam, x = self.shape, self.shape.weights[:, None], self.config.shape, self.x
+    def stepped(self, x: np.ndarray, data: SurfaceData, force: np.ndarray) -> np.ndarray:
+        """Vertices after a Gauss-Newton step on local shape and data; `force` is minus half the gradient."""
+        shape, w, lam = self.shape, self.shape.weights[:, None], self.config.shape
         nearly = Factored(csc_array(lam * self.stiffness + data.bound + 1e-6 * lam * eye_array(len(x))))
         d = conjugate_gradients(lambda d: lam * shape.transposed(x, w * shape.derivative(x, d)) + data.applied(d),
                                 force, nearly.solve, 30, 1e-2)
@@ -259,51 +250,40 @@ class _Fit:
             length /= 2
         return x + length * d
 
-    def polish(self, surface: Surface) -> None:
-        """One round in which the vertices are drawn to the tangent planes of the surface itself."""
-        normals = self.mesh.vertex_normals
-        seen, near = self.seen()
-        found = surface.closest(self.x)
-        n = self.target.normals[near]
-        wrong = np.einsum("nd,nd->n", surface.mesh.face_normals[found.faces], normals) <= 0
+    def polish(self, x: np.ndarray) -> np.ndarray:
+        """Vertices after a round in which they are drawn to the tangent planes of the surface itself."""
+        seen, near = self.seen(x)
+        found, n = self.surface.closest(x), self.target.normals[near]
+        wrong = np.einsum("nd,nd->n", self.surface.mesh.face_normals[found.faces], self.normals(x)) <= 0
         y = np.where(wrong[:, None], self.target.points[near], found.points)
-        A = np.einsum("ni,nj->nij", n, n) + self.config.slide * np.eye(3)
-        data = self.drawn(self.config.tight * seen[:, None, None] * A, y)
-        self.x = self.stepped(data, self.force(data))
+        A = np.einsum("ni,nj->nij", n, n) + 0.05 * np.eye(3)                # little force along the surface
+        data = self.drawn(x, 100.0 * seen[:, None, None] * A, y)
+        return self.stepped(x, data, data.force(x) - 0.5 * self.config.shape * self.shape.gradient(x))
 
-    def settle_down(self, surface: Surface) -> None:
-        """Vertices with data onto the surface, where that turns no triangle over."""
-        self.x = unfold(self.rest, self.x, turns(self.rest, self.x))
-        normals, (free, _) = self.mesh.vertex_normals, self.seen()
-        found = surface.closest(self.x)
-        free &= np.einsum("nd,nd->n", surface.mesh.face_normals[found.faces], normals) > 0
-        already = flipped(self.rest, self.x, turns(self.rest, self.x))
-        for _ in range(BACK):
-            y = np.where(free[:, None], found.points, self.x)
-            turned = flipped(self.rest, y, turns(self.rest, y)) & ~already
-            if not turned.any():
+    def onto_the_surface(self, x: np.ndarray) -> np.ndarray:
+        """Vertices with data moved onto the surface, where that inverts no triangle."""
+        x = unfold(self.rest, x)
+        free, _ = self.seen(x)
+        found = self.surface.closest(x)
+        free &= np.einsum("nd,nd->n", self.surface.mesh.face_normals[found.faces], self.normals(x)) > 0
+        already = self.inverted(x)
+        for _ in range(10):
+            y = np.where(free[:, None], found.points, x)
+            inverted = self.inverted(y) & ~already
+            if not inverted.any():
                 break
-            free[self.rest.faces[turned]] = False
-        self.x = y
-
-    def result(self, surface: Surface, temperatures: np.ndarray) -> SurfaceFit:
-        """What was reached."""
-        seen, _ = self.seen()
-        apart = surface.closest(self.x).distances[seen]
-        inverted = flipped(self.rest, self.x, turns(self.rest, self.x))
-        return SurfaceFit(self.x, seen, float(np.sqrt(np.mean(apart**2))) if seen.any() else np.nan,
-                          float(apart.max(initial=0.0)), int(inverted.sum()), distortion(self.rest, self.x),
-                          self.energies, temperatures, np.array(self.steps), bool(self.converged and seen.any()))
+            free[self.rest.faces[inverted]] = False
+        return y
 
 
 @dataclass(frozen=True, eq=False)
 class SurfaceData:
     """A data term Σ (x - y)ᵀ A (x - y) + share · |C x - z|²: vertices are drawn, and points of the scan draw the mesh.
+
     [Statues] Eq. 13
     """
 
-    A: np.ndarray  # (N, 3, 3), weight of each vertex: nothing without data, only across the surface at the edge of a
-                   # hole
+    A: np.ndarray  # (N, 3, 3), weight of each vertex: nothing without data, at the edge of a hole across the surface
     y: np.ndarray  # (N, 3) metres, where it is drawn
     C: csc_array   # (P, N), points of the mesh, as barycentric coordinates
     z: np.ndarray  # (P, 3) metres, the points of the scan that draw them
@@ -311,8 +291,7 @@ class SurfaceData:
 
     def energy(self, x: np.ndarray) -> float:
         """At vertices x (N, 3), square metres."""
-        return (float(np.einsum("ni,nij,nj->", x - self.y, self.A, x - self.y))
-                + self.cover(x))
+        return float(np.einsum("ni,nij,nj->", x - self.y, self.A, x - self.y)) + self.cover(x)
 
     def cover(self, x: np.ndarray) -> float:
         """The part of the points that draw the mesh."""
@@ -338,17 +317,3 @@ def scan_target(scan: Mesh) -> Target:
     border[scan.boundary_vertices] = True
     border |= scan.vertex_adjacency @ border.astype(float) > 0       # the nearest point may lie one step farther in
     return replace(target_of(scan, name="scan"), border=border[np.unique(scan.faces)])
-
-
-def distortion(rest: Mesh, x: np.ndarray) -> float:
-    """Root mean square over the area at rest of the logarithm of the stretches of the triangles."""
-    def flat(c: np.ndarray) -> np.ndarray:
-        e, f = c[:, 1] - c[:, 0], c[:, 2] - c[:, 0]
-        length = np.maximum(np.linalg.norm(e, axis=1), 1e-12)
-        along = np.einsum("fd,fd->f", e, f) / length
-        height = np.linalg.norm(np.cross(e, f), axis=1) / length
-        return np.stack([np.stack([length, along], axis=1), np.stack([np.zeros_like(length), height], axis=1)], axis=1)
-
-    s = np.linalg.svd(flat(x[rest.faces]) @ np.linalg.inv(flat(rest.corners)), compute_uv=False)
-    stretch = (np.log(np.maximum(s, 1e-6)) ** 2).mean(axis=1)
-    return float(np.sqrt(np.average(stretch, weights=rest.face_areas)))

@@ -1,0 +1,152 @@
+"""Triangles that follow the rotations of parts by blend weights, and the basis of the fast path that follows from it.
+
+In SCAPE a triangle rotates with its part. In BlendSCAPE the triangles near a border follow a mixture of rotations,
+`Σ_p w_kp R_p` [BlendSCAPE]. Both are weights (F, J), and nothing below tells them apart.
+"""
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+
+from scanprep.geometry.mesh import Mesh
+from scanprep.skeleton.tree import Skeleton
+
+from .bilinear import ShapedPoints
+from .features import PoseFeatures, Terms
+from .gradients import edges
+from .linear import Subject, check_points
+from .pose_space import PoseSpace
+from .shape_space import ShapeSpace
+from .stitching import StitchingSystem
+
+
+@dataclass(frozen=True, eq=False)
+class Block:
+    """Triangles of one part, `chosen` (f,) among them, that follow the rotation of one part by `weights` (f,)."""
+
+    part: int
+    rotation: int
+    chosen: np.ndarray
+    weights: np.ndarray
+
+
+def rigid_weights(skeleton: Skeleton) -> np.ndarray:
+    """(F, J) weights that leave every triangle to the rotation of its own part."""
+    return np.eye(len(skeleton.parents))[skeleton.part_of_face]
+
+
+@dataclass(frozen=True, eq=False)
+class BlendedTemplate:
+    """A template and how much (F, J) each rotation counts for each triangle, rows summing to 1."""
+
+    template: Mesh
+    skeleton: Skeleton
+    weights: np.ndarray
+
+    @cached_property
+    def blocks(self) -> list[Block]:
+        """Which triangles follow which rotation."""
+        found = []
+        for p in range(len(self.skeleton.parents)):
+            mine = self.weights[self.skeleton.part_of_face == p]
+            for q in np.flatnonzero((mine != 0).any(axis=0)):
+                chosen = np.flatnonzero(mine[:, q])
+                found.append(Block(p, int(q), chosen, mine[chosen, q]))
+        return found
+
+    @cached_property
+    def stitching(self) -> StitchingSystem:
+        """The stitching system of the template, factored once."""
+        return StitchingSystem(self.template, self.skeleton)
+
+    @cached_property
+    def v_hat(self) -> np.ndarray:
+        """(F, 2, 3) edges of the template, metres."""
+        return edges(self.template.vertices, self.template.faces)
+
+    def rotations(self, pose: np.ndarray) -> np.ndarray:
+        """(F, 3, 3) rotation, or mixture of rotations, of every triangle at one pose (J, 3)."""
+        return np.tensordot(self.weights, self.skeleton.part_rotations(pose), axes=1)
+
+    def posed(self, Q: np.ndarray) -> np.ndarray:
+        """`Q v̂` (..., F, 2, 3) for Q (..., F, 3, 3)."""
+        return self.v_hat @ np.swapaxes(Q, -1, -2)
+
+    def local_edges(self, vertices: np.ndarray, pose: np.ndarray) -> np.ndarray:
+        """Edges `R⁻¹ v` (..., F, 2, 3) of a body (..., N, 3), or of a difference, seen from the parts at a pose (J, 3).
+
+        Or (M, F, 2, 3) of bodies (M, N, 3) at as many poses.
+
+        [SCAPE] Eq. 1
+        """
+        if pose.ndim == 3:
+            return np.stack([self.local_edges(y, p) for y, p in zip(vertices, pose, strict=True)])
+        return edges(vertices, self.template.faces) @ np.swapaxes(np.linalg.inv(self.rotations(pose)), -1, -2)
+
+    def stitched(self, Q: np.ndarray, pose: np.ndarray) -> np.ndarray:
+        """Vertices (N, 3) for Q, or S Q, (F, 3, 3) at one pose, the root's joint in the origin.
+
+        [SCAPE] Eq. 2
+        """
+        return self.stitching.stitch(self.posed(self.rotations(pose) @ Q))
+
+    def terms(self, features: PoseFeatures) -> Terms:
+        """The products of features and rotations in which a body is linear, block by block."""
+        each = [np.arange(features.count)[features.of_part(block.part)] for block in self.blocks]
+        return Terms(features, np.repeat([block.rotation for block in self.blocks], [len(e) for e in each]),
+                     np.concatenate(each))
+
+    def basis(self, space: PoseSpace, S: np.ndarray) -> np.ndarray:
+        """T (M, N, 3), metres, of every term for one body with shape deformation S (F, 3, 3).
+
+        [SCAPE] Eq. 9
+        """
+        G, n = self.stitching.edge_operator, len(self.template.vertices)
+        columns = []
+        for block in self.blocks:
+            faces, a = _coefficients(space, block)
+            wanted = (self.v_hat[faces] * block.weights[:, None, None]) @ np.swapaxes(S[faces] @ a, -1, -2)
+            rows = (2 * faces[:, None] + np.arange(2)).ravel()                     # wanted: (n, f, 2, 3)
+            column = wanted.reshape(len(a), -1, 3).transpose(1, 0, 2).reshape(len(rows), -1)
+            columns.append((G[rows].T @ column).reshape(n, len(a), 3))
+        rhs = np.concatenate(columns, axis=1)
+        return self.stitching.solve(rhs.reshape(n, -1)).reshape(rhs.shape).transpose(1, 0, 2)
+
+    def subject(self, space: PoseSpace, S: np.ndarray | None = None) -> Subject:
+        """A body with a pose space in the making, the template's own unless S (F, 3, 3) is given."""
+        S = np.broadcast_to(np.eye(3), (len(self.template.faces), 3, 3)) if S is None else S
+        return Subject(self.template, self.skeleton, None, self.terms(space.features), self.basis(space, S),
+                       self.skeleton.joints[0])
+
+    def points(self, space: PoseSpace, shapes: ShapeSpace, vertex_ids: np.ndarray, weights: np.ndarray | None
+               ) -> ShapedPoints:
+        """Some points as a function of pose and betas: stitched backwards from them, edge by edge."""
+        ids, weights = check_points(len(self.template.vertices), vertex_ids, weights)
+        if weights is None:
+            ids, weights = ids[:, None], np.ones((len(ids), 1))
+        pick = np.zeros((len(self.template.vertices), len(ids)))
+        np.add.at(pick, (ids, np.arange(len(ids))[:, None]), weights)
+        reach = self.stitching.edge_operator @ self.stitching.solve_adjoint(pick)                # (2F, L)
+        each = [np.broadcast_to(np.eye(3), (len(self.v_hat), 3, 3)), shapes.mean, *shapes.components]
+        blocks = []
+        for block in self.blocks:
+            faces, a = _coefficients(space, block)
+            posed = (self.v_hat[faces] * block.weights[:, None, None]) @ np.swapaxes(a, -1, -2)   # (n, f, 2, 3)
+            posed = posed.transpose(1, 2, 0, 3).reshape(len(faces), -1, 3)                        # (f, 2n, 3)
+            mine = np.ascontiguousarray(reach[(2 * faces[:, None] + np.arange(2)).ravel()].T)
+            found = np.empty((len(each), len(a), len(ids), 3))
+            for k, S in enumerate(each):
+                # one wide product a shape: a stack of products with three columns each takes four times as long
+                wanted = (posed @ np.swapaxes(S[faces], -1, -2)).reshape(2 * len(faces), -1)
+                found[k] = (mine @ wanted).reshape(len(ids), len(a), 3).transpose(1, 0, 2)
+            blocks.append(found)
+        basis = np.concatenate(blocks, axis=1)
+        return ShapedPoints(self.terms(space.features), basis[0], basis[1], basis[2:], self.skeleton.joints[0])
+
+
+def _coefficients(space: PoseSpace, block: Block) -> tuple[np.ndarray, np.ndarray]:
+    """The triangles (f,) of a block and their coefficients (n, f, 3, 3)."""
+    faces = space.faces_of_part[block.part][block.chosen]
+    return faces, space.coefficients[block.part][:, block.chosen].astype(np.float64)

@@ -1,0 +1,277 @@
+"""Learning a skinning model from registered meshes."""
+from __future__ import annotations
+
+from dataclasses import asdict, dataclass, replace
+from functools import partial
+
+import numpy as np
+
+from scanprep.batch.steps import Step, once
+from scanprep.geometry.mesh import Mesh
+from scanprep.ranges import Count, Positive, Settings
+from scanprep.skeleton.tree import Skeleton
+from scanprep.threads import one_thread
+
+from ..digests import body_digest, digest
+from ..features import LinearLift, PoseFeatures, part_features
+from ..fitting import FitConfig, PoseFitter, ShapeFitter
+from ..pose_space import kept_directions
+from ..shape_space import learn_shape_space
+from ..skinning import SkinningModel, unblended
+from .pose import fit_poses
+from .scape import checked_training, pose_examples, pose_prior
+from .skin_weights import diffused, diffused_weights, fit_weights, kept_weights
+from .work import Progress, Work, timed
+
+PRUNING = 0.01                       # square radians: twist directions of smaller variance correct nothing
+RIDGES = (1e-4, 1e-3, 3e-3, 0.01, 0.03, 0.1, 0.3)      # penalties; the one that predicts left-out poses best is taken
+NEAREST = 2                          # joints that correct a vertex: those of its heaviest part that are nearest to it
+FADING = 0.05                        # metres of surface over which the correctives of a joint give way to another's
+LEVELS = 8                           # of how freely a joint corrects a vertex: vertices of one level share a solve
+ENOUGH = 0.005                       # relative gain of a round below which the next is not worth it
+PEOPLE_ROUNDS = 3                    # of fitting the poses of the other people and undoing them
+QUICK = FitConfig(sample=400, iterations=20, polish=0, tolerance=1e-4)     # of poses that will be fitted again
+
+
+@dataclass(frozen=True)
+class SkinConfig(Settings):
+    """Settings of `learn_skinning`.
+
+    Attributes
+    ----------
+    correctives : bool
+        Linear functions of the joint twists displace the rest vertices; without them it is plain linear blend skinning.
+    parts : int
+        Largest number of parts that a vertex follows.
+    width : float, metres
+        Over so much surface the weights pass from part to part before they are fitted.
+    rounds : int
+        Largest number of times that poses, weights and joints are fitted in turn, first without correctives and
+        then with them.
+    components : int
+        Shape components to keep, fewer where there are fewer people.
+    """
+
+    correctives: bool = True
+    parts: Count = 4
+    width: Positive = 0.05
+    rounds: Count = 8
+    components: int = 40
+
+
+@one_thread()
+def learn_skinning(template: Mesh, poses: np.ndarray, shapes: np.ndarray | None, skeleton: Skeleton,
+                   config: SkinConfig | None = None, progress: Progress | None = None, step: Step = once
+                   ) -> SkinningModel:
+    """Learn a skinning model from one person in many poses and many people in about one pose.
+
+    Parameters
+    ----------
+    template : Mesh
+        One of the poses.
+    poses : (M, N, 3) float, metres
+        The template's person in M poses.
+    shapes : (S, N, 3) float, metres, or None
+        Other people; None for a model of the template's own body alone.
+    skeleton : Skeleton
+        The parts and where the joints are sought.
+    config : SkinConfig, optional
+    progress : callable, optional
+        Called with the work done and the whole.
+    step : callable, optional
+        Keeps every round, as `scanprep.batch.steps.Step`.
+
+    Raises
+    ------
+    ValueError
+        Fewer than two poses, vertices of another count or not finite, a skeleton of another template.
+    """
+    config = config or SkinConfig()
+    poses, shapes = checked_training(template, skeleton, poses, shapes)
+    kinds = (False, True) if config.correctives else (False,)
+    first, later = len(kinds) * config.rounds * len(poses), 0 if shapes is None else PEOPLE_ROUNDS * len(shapes)
+    work = Work(progress, first + later, step)
+
+    def learn(inner: Work) -> tuple[SkinningModel, np.ndarray]:
+        at = skeleton.pose_of(skeleton.fit_rotations(template, poses))
+        model = _start(template, skeleton, config)
+        with timed("pose space"):
+            for correctives in kinds:
+                model, at = _learn_pose(model, at, poses, replace(config, correctives=correctives), inner)
+        return model, at
+
+    model, at = work.step("pose space", (template, skeleton, poses, replace(config, components=0)), first, learn)
+    if shapes is not None:
+        model = work.step("shape components", (model, shapes, config.components), later,
+                          partial(_learn_people, model, shapes, config.components))
+    examples = pose_examples(template, skeleton, at, shapes)
+    mean, covariance = pose_prior(examples, len(at))
+    info = {"settings": asdict(config), "poses": len(poses), "shapes": 0 if shapes is None else len(shapes),
+            **model.info, "terms": model.terms.count, "digest": digest(template, poses, shapes)}
+    return replace(model, pose_mean=mean, pose_covariance=covariance, pose_examples=examples, info=info)
+
+
+def _start(template: Mesh, skeleton: Skeleton, config: SkinConfig) -> SkinningModel:
+    """The template itself, with weights that pass smoothly from part to part, and no correctives."""
+    J, N = len(skeleton.parents), len(template.vertices)
+    constants = PoseFeatures(skeleton, LinearLift(), np.arange(J), np.zeros((J, 3, J)))
+    weights = kept_weights(diffused_weights(template, skeleton, config.width), config.parts)
+    return SkinningModel(template, skeleton, template.vertices, weights, constants, np.zeros((0, N, 3), np.float32),
+                         template.vertices, np.zeros((0, N, 3), np.float32), np.zeros(0), 0.0,
+                         np.zeros((J, 3)), np.zeros((3 * J, 3 * J)))
+
+
+def _learn_pose(model: SkinningModel, poses: np.ndarray, bodies: np.ndarray, config: SkinConfig, work: Work
+                ) -> tuple[SkinningModel, np.ndarray]:
+    """Poses, weights, joints, rest vertices and correctives in turn, while left-out poses are met better."""
+    allowed = diffused_weights(model.template, model.skeleton, 2 * config.width) > 0
+    model = replace(model, info={"left_out_error": np.inf})
+    for k in range(config.rounds):
+        tried, fitted = work.step(f"correctives {config.correctives}, round {k}", (model, poses, bodies, config),
+                                  len(bodies), partial(_next_round, model, poses, bodies, allowed, config))
+        gain = 1 - tried.info["left_out_error"] / model.info["left_out_error"]
+        if gain > 0:
+            model, poses = tried, fitted
+        if gain < ENOUGH:
+            break
+    return model, poses
+
+
+def _next_round(model: SkinningModel, poses: np.ndarray, bodies: np.ndarray, allowed: np.ndarray, config: SkinConfig,
+                work: Work) -> tuple[SkinningModel, np.ndarray]:
+    """Poses, weights, joints, rest vertices and correctives, each fitted to the others once."""
+    fitted = fit_poses(model.subject(), bodies, poses, work, QUICK)
+    tried = _with_weights(model, fitted, bodies, allowed, config)
+    tried = _with_joints(tried, fitted, bodies)
+    return _with_correctives(tried, fitted, bodies, config), fitted
+
+
+def _carried(model: SkinningModel, pose: np.ndarray, body: np.ndarray) -> np.ndarray:
+    """(J, N, 3) where each part alone would carry each vertex, the whole standing where the body stands."""
+    R, turns = model.skeleton.part_rotations(pose), model.joint_turns(pose)
+    offset = np.einsum("pj,jde,je->pd", model.skeleton.descends.astype(float), turns,
+                       model.joint_regressor @ model.rest)
+    each = (model.rest + model.corrections(pose)) @ np.swapaxes(R, -1, -2) + offset[:, None]
+    return np.asarray(each + (body - np.einsum("np,pnd->nd", model.weights, each)).mean(axis=0))
+
+
+def _with_weights(model: SkinningModel, poses: np.ndarray, bodies: np.ndarray, allowed: np.ndarray,
+                  config: SkinConfig) -> SkinningModel:
+    """The model with weights fitted to the bodies at their poses."""
+    carried = [_carried(model, p, y) for p, y in zip(poses, bodies, strict=True)]
+    weights = fit_weights(carried, bodies, model.template, model.weights, allowed)
+    return replace(model, weights=kept_weights(weights, config.parts))
+
+
+def _with_joints(model: SkinningModel, poses: np.ndarray, bodies: np.ndarray) -> SkinningModel:
+    """The model with joints where they fit best, which is linear least squares once the poses are known."""
+    J = len(model.skeleton.parents)
+    if J == 1:
+        return model
+    below = model.below[:, 1:] - model.below[:, 1:].mean(axis=0)              # the place of a body is free
+    overlap, normal, slope = below.T @ below, np.zeros((J - 1, 3, J - 1, 3)), np.zeros((J - 1, 3))
+    joints = model.joint_regressor @ model.rest
+    for pose, body in zip(poses, bodies, strict=True):
+        D = model.joint_turns(pose)[1:]
+        left = below.T @ (body - model.vertices(pose))
+        normal += np.einsum("ab,aki,bkj->aibj", overlap, D, D)
+        slope += np.einsum("aki,ak->ai", D, left)
+    flat = normal.reshape(3 * J - 3, -1)
+    flat += 1e-3 * np.trace(flat) / len(flat) * np.eye(len(flat))             # what nothing decides stays
+    moved = joints.copy()
+    moved[1:] += np.linalg.solve(flat, slope.ravel()).reshape(J - 1, 3)
+    return _with_joints_at(model, moved)
+
+
+def _with_joints_at(model: SkinningModel, wanted: np.ndarray) -> SkinningModel:
+    """The model whose joints, as combinations of its rest vertices, lie where wanted."""
+    for _ in range(3):                          # where the rest vertices are not the template's, by a few millimetres
+        shift = wanted - model.joint_regressor @ model.rest
+        shift[0] = 0
+        old = model.skeleton
+        skeleton = Skeleton(old.part_of_face, old.parents, old.joints + shift, old.names)
+        model = replace(model, skeleton=skeleton, features=replace(model.features, skeleton=skeleton))
+    return model
+
+
+def _with_correctives(model: SkinningModel, poses: np.ndarray, bodies: np.ndarray, config: SkinConfig
+                      ) -> SkinningModel:
+    """The model with rest vertices and correctives regressed on the unposed bodies."""
+    unposed = np.stack([_unposed(model, p, y) for p, y in zip(poses, bodies, strict=True)])
+    features = corrective_features(model.skeleton, poses, config.correctives)
+    joints = _acting_joints(model)
+    errors = [_regress(features, poses, unposed, joints, ridge)[2] for ridge in RIDGES] \
+        if features.count > len(features.starts) else [0.0]
+    ridge = RIDGES[int(np.argmin(errors))]
+    rest, correctives, error = _regress(features, poses, unposed, joints, ridge)
+    moved = _with_joints_at(replace(model, rest=rest), model.joint_regressor @ model.rest)
+    return replace(moved, features=replace(features, skeleton=moved.skeleton), correctives=correctives,
+                   info={"ridge": ridge, "left_out_error": error})
+
+
+def _unposed(model: SkinningModel, pose: np.ndarray, body: np.ndarray) -> np.ndarray:
+    """(N, 3) rest vertices, correctives included, that the model with its joints carries onto a body."""
+    y = model.vertices(pose)
+    left = body - y
+    moved = np.einsum("nij,nj->ni", unblended(model.blended(pose)), left - left.mean(axis=0))
+    return model.rest + model.corrections(pose) + moved
+
+
+def corrective_features(skeleton: Skeleton, poses: np.ndarray, correctives: bool) -> PoseFeatures:
+    """For every joint a constant, and its kept twist directions where there are correctives."""
+    J = len(skeleton.parents)
+    directions = kept_directions(poses, PRUNING) if correctives else [np.zeros((3, 0))] * J
+    return part_features(skeleton, LinearLift(), directions, [[j] for j in range(J)])
+
+
+def _acting_joints(model: SkinningModel) -> np.ndarray:
+    """(N, J) how freely each joint corrects each vertex: the nearest ones of its heaviest part, fading."""
+    x, joints = model.template.vertices, model.skeleton.joints
+    acting = np.zeros(model.weights.shape)
+    for p, of_part in enumerate(model.skeleton.joints_of_part):
+        mine, near = np.flatnonzero(model.weights.argmax(axis=1) == p), np.array(of_part, dtype=np.int64)
+        far = np.linalg.norm(x[mine, None] - joints[near], axis=2)
+        acting[mine[:, None], near[np.argsort(far, axis=1, kind="stable")[:, :NEAREST]]] = 1
+    return np.round(LEVELS * diffused(model.template, acting, FADING)) / LEVELS
+
+
+def _regress(features: PoseFeatures, poses: np.ndarray, unposed: np.ndarray, acting: np.ndarray, ridge: float
+             ) -> tuple[np.ndarray, np.ndarray, float]:
+    """Rest vertices (N, 3), correctives (C, N, 3) and the error of left-out poses, root mean square in metres."""
+    free = np.flatnonzero(features.constant == 0)
+    delta, M = features.evaluate(poses)[:, free], len(poses)
+    rest, correctives = np.empty(unposed.shape[1:]), np.zeros((len(free), *unposed.shape[1:]), dtype=np.float32)
+    kinds, which = np.unique(acting, axis=0, return_inverse=True)
+    total = 0.0
+    joint = features.part[free]
+    for g, freedom in enumerate(kinds):
+        used, mine = np.flatnonzero(freedom[joint] > 0), which.ravel() == g
+        target, scale = unposed[:, mine].reshape(M, -1), freedom[joint[used]]
+        centre, middle = delta[:, used].mean(axis=0) * scale, target.mean(axis=0)
+        X = delta[:, used] * scale - centre
+        solver = np.linalg.solve(X.T @ X + (M * ridge + 1e-12) * np.eye(len(used)), X.T)
+        slope, hat = solver @ target, X @ solver + 1 / M
+        left = (target - middle - X @ slope) / np.maximum(1 - np.diag(hat), 1e-6)[:, None]
+        total += float((left**2).sum())
+        rest[mine] = (middle - centre @ slope).reshape(-1, 3)
+        correctives[np.ix_(used, mine)] = (scale[:, None] * slope).reshape(len(used), mine.sum(), 3)
+    return rest, correctives, float(np.sqrt(total / (M * len(rest))))
+
+
+def _learn_people(model: SkinningModel, shapes: np.ndarray, components: int, work: Work) -> SkinningModel:
+    """The model with the shape components of people (P, N, 3) whose poses are fitted and undone in turn."""
+    with timed("shape components"):
+        for k in range(PEOPLE_ROUNDS):
+            quick = FitConfig(polish=0, n_betas=min(20, model.n_betas) or None)
+            fitter = ShapeFitter(model, quick) if k else PoseFitter(model.subject(), quick)
+            people = np.stack([work.step(f"round {k}, person {body_digest(body)}", (model, quick, k, body), 1,
+                                         partial(_unposed_person, model, fitter, body)) for body in shapes])
+            space = learn_shape_space(people, components)
+            model = replace(model, shape_mean=space.mean.astype(np.float64), shape_components=space.components,
+                            shape_variances=space.variances, shape_total=space.total_variance)
+    return model
+
+
+def _unposed_person(model: SkinningModel, fitter: ShapeFitter | PoseFitter, body: np.ndarray, _: Work) -> np.ndarray:
+    """(N, 3) rest vertices of a person whose pose is fitted."""
+    return model.unposed(body, fitter.fit(body).pose)

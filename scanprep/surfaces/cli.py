@@ -1,0 +1,225 @@
+"""From range views to a clean mesh: `scape prep views`, `merge`, `fill`, `decimate`, `template`, and `decimate-set`."""
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated
+
+import numpy as np
+import tyro
+
+from ..alignment.views import AlignViewsConfig, align_views, views_problem
+from ..cleaning.clean_scan import CleanScanConfig, clean_scan
+from ..cli import MM, MeshArg, Output, ScanArg, SetArg, Unit, about_mesh
+from ..console import Metric, Outcome, bar
+from ..dataset import RegisteredSet
+from ..decimation.decimate import DecimateConfig, decimate
+from ..decimation.registered_set import DecimateSetConfig, write_decimated_set
+from ..fusion.tsdf import MergeConfig, merge_views
+from ..geometry import storage
+from ..geometry.files import UNITS, PointCloud, list_meshes, read_mesh, read_scan, write_mesh, write_points
+from ..geometry.landmarks import landmarks_beside, read_landmark_vertices, read_landmarks
+from ..geometry.mesh import Mesh
+from ..pipeline.template import make_template
+from ..ranges import Faces
+from ..repair.hole_filling import FillConfig, FilledHole, fill_holes, fill_report
+
+ViewsArg = Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="VIEWS")]
+
+
+def template_of_views(views: ViewsArg, output: Output, cameras: Path | None = None, faces: Faces = 14000,
+                      unit: Unit | None = None) -> Outcome:
+    """Merge range views, close the holes, and decimate to a template.
+
+    Example: scape prep template views --faces 12000 -o template.ply
+
+    Args:
+        views: Folder of range meshes in one frame.
+        output: Mesh to write.
+        cameras: JSON {file name without ending: [x, y, z]}; else cameras.json in the folder.
+        faces: Triangles of the template.
+        unit: Unit of the views and cameras.
+    """
+    seen = _read_views(views, cameras, unit)
+    with bar("making the template") as progress:
+        made = make_template(seen, faces, progress=progress)
+    write_mesh(output, made)
+    return Outcome(output, [Metric("views", len(seen)), *about_mesh(made)])
+
+
+def clean(scan: ScanArg, output: Output, landmarks: Path | None = None, unit: Unit | None = None,
+          config: CleanScanConfig = CleanScanConfig()) -> Outcome:  # noqa: B008
+    """Keep the body of a raw scan; floor, furniture and specks go.
+
+    Example: scape prep clean raw.ply -o body.ply
+
+    Args:
+        scan: Mesh or point cloud.
+        output: File to write, a mesh or a point cloud as the scan is.
+        landmarks: Landmarks of the scan, where the body is not its largest piece.
+        unit: Unit of the scan and its landmarks.
+        config: Settings.
+    """
+    raw = read_scan(scan, unit)
+    mesh = raw if isinstance(raw, Mesh) else None
+    marks = np.array(list(read_landmarks(landmarks, mesh, unit).values())) if landmarks else None
+    found = clean_scan(raw, config, marks)
+    if isinstance(found.scan, Mesh):
+        write_mesh(output, found.scan)
+    else:
+        write_points(output, PointCloud(found.scan, None, None))
+    return Outcome(output, [
+        Metric("points before", len(found.kept)), Metric("points", int(found.kept.sum())),
+        *(Metric(f"{'kept' if piece.kept else 'dropped'}: {piece.reason}", piece.points, "points")
+          for piece in found.components)], {"clean": config})
+
+
+def align_cameras(views: ViewsArg, output: Output, cameras: Path | None = None, landmarks: Path | None = None,
+                  features: bool = False, unit: Unit | None = None,
+                  config: AlignViewsConfig = AlignViewsConfig()  # noqa: B008
+                  ) -> Outcome:
+    """Bring range views into one frame, all of them together.
+
+    Example: scape prep views views -o aligned
+
+    Args:
+        views: Folder of range meshes: roughly in one frame, unless landmarks or features place them.
+        output: Folder for the moved meshes and their cameras.json.
+        cameras: JSON {file name without ending: [x, y, z]}, each in the frame of its view; else cameras.json in the
+            folder.
+        landmarks: Folder of landmark files with the names of the views, which place them first.
+        features: Place the views by their shapes alone first.
+        unit: Unit of the views, cameras and landmarks.
+        config: Settings.
+    """
+    seen, names = _read_views(views, cameras, unit), [path.stem for path in list_meshes(views)]
+    marks = [_view_landmarks(landmarks, name, mesh, unit) for name, (mesh, _) in zip(names, seen, strict=True)] \
+        if landmarks else None
+    found = align_views(seen, config, landmarks=marks, features=features)
+    for name, (mesh, _) in zip(names, found.views, strict=True):
+        write_mesh(output / f"{name}.ply", mesh)
+    storage.write_json(output / "cameras.json",
+                       {name: camera.tolist() for name, (_, camera) in zip(names, found.views, strict=True)})
+    shifts = [float(np.linalg.norm(new - old)) for (_, new), (_, old) in zip(found.views, seen, strict=True)]
+    doubtful = [name for name, trusted in zip(names, found.trusted, strict=True) if not trusted]
+    return Outcome(output, [
+        Metric("views", len(seen)), Metric("distance between views, RMS", MM * found.rms, "mm"),
+        Metric("rounds", found.iterations), Metric("converged", str(found.converged)),
+        Metric("largest shift of a camera", MM * max(shifts), "mm"),
+        Metric("seen by others too, least of a view", 100 * float(found.overlap.min()), "%"),
+        Metric("looked through by others, most of a view", 100 * float(found.conflict.max()), "%")],
+        {"views": config}, [f"{name}: its place is not to be trusted" for name in doubtful], views_problem(found))
+
+
+def _view_landmarks(folder: Path, name: str, view: Mesh, unit: Unit | None) -> dict[str, np.ndarray]:
+    """The landmarks of one view; none where it has no file."""
+    path = landmarks_beside(name, folder)
+    return read_landmarks(path, view, unit) if path else {}
+
+
+def merge(views: ViewsArg, output: Output, cameras: Path | None = None, unit: Unit | None = None,
+          config: MergeConfig = MergeConfig()) -> Outcome:  # noqa: B008
+    """Merge range views into one surface, open where nothing was seen.
+
+    Example: scape prep merge views -o body.ply
+
+    Args:
+        views: Folder of range meshes in one frame.
+        output: Mesh to write.
+        cameras: JSON {file name without ending: [x, y, z]}; else cameras.json in the folder.
+        unit: Unit of the views and cameras.
+        config: Settings.
+    """
+    seen = _read_views(views, cameras, unit)
+    with bar("merging views") as progress:
+        merged = merge_views(seen, config, progress)
+    write_mesh(output, merged)
+    return Outcome(output, [Metric("views", len(seen)), *about_mesh(merged)], {"merge": config})
+
+
+def fill(mesh: MeshArg, output: Output, views: Path | None = None, cameras: Path | None = None,
+         unit: Unit | None = None,
+         config: FillConfig = FillConfig()) -> Outcome:  # noqa: B008
+    """Close the holes of a mesh; what was there stays as it was.
+
+    Example: scape prep fill body.ply -o closed.ply
+
+    Args:
+        mesh: Mesh with holes.
+        output: Mesh to write.
+        views: Folder of the range meshes it was merged from: space that they look through is left empty.
+        cameras: JSON {file name without ending: [x, y, z]}; else cameras.json in that folder.
+        unit: Unit of the mesh, the views and the cameras.
+        config: Settings.
+    """
+    before = read_mesh(mesh, unit)
+    seen = _read_views(views, cameras, unit) if views else ()
+    holes: tuple[FilledHole, ...] = ()
+    with bar("filling holes") as progress:
+        if config.method.startswith("poisson"):
+            after = fill_holes(before, config, progress)
+        else:
+            report = fill_report(before, config, progress, seen)
+            after, holes = report.mesh, report.holes
+    write_mesh(output, after)
+    return Outcome(output, [
+        Metric("holes before", len(before.boundary_loops)),
+        *(Metric(f"{way} patches", sum(hole.method == way for hole in holes)) for way in ("fair", "diffusion")),
+        Metric("triangles that run through others", sum(hole.intersections for hole in holes)),
+        *about_mesh(after)], {"fill": config})
+
+
+def reduce(mesh: MeshArg, output: Output, faces: Faces, landmarks: Path | None = None, unit: Unit | None = None,
+           config: DecimateConfig = DecimateConfig()) -> Outcome:  # noqa: B008
+    """Fewer triangles for the same surface.
+
+    Example: scape prep decimate closed.ply --faces 14000 -o template.ply
+
+    Args:
+        mesh: Mesh.
+        output: Mesh to write.
+        faces: How many triangles are wanted.
+        landmarks: Landmarks of the mesh, whose vertices stay where they are.
+        unit: Unit of the mesh and its landmarks.
+        config: Settings.
+    """
+    before = read_mesh(mesh, unit)
+    keep = np.array(list(read_landmark_vertices(landmarks, before, unit).values())) if landmarks else None
+    with bar("decimating") as progress:
+        after = decimate(before, faces, config, keep, progress=progress)
+    write_mesh(output, after)
+    return Outcome(output, [Metric("triangles before", len(before.faces)), *about_mesh(after)], {"decimate": config})
+
+
+def reduce_set(registered: SetArg, output: Output, faces: Faces,
+               config: DecimateSetConfig = DecimateSetConfig()  # noqa: B008
+               ) -> Outcome:
+    """A registered set in fewer triangles: template, meshes, skeleton and landmarks stay in step.
+
+    Example: scape prep decimate-set set --faces 5000 -o small_set
+
+    Args:
+        registered: Folder of a registered set.
+        output: Folder of the smaller one, which also holds the map between the two in decimation.npz.
+        faces: How many triangles are wanted.
+        config: Settings.
+    """
+    before = RegisteredSet.load(registered)
+    with bar("decimating") as progress:
+        after = write_decimated_set(before, output, faces, config, progress)
+    return Outcome(output, [
+        Metric("meshes", len(after.entries)), Metric("triangles before", len(before.template.faces)),
+        *about_mesh(after.template)], {"decimate-set": config})
+
+
+def _read_views(folder: Path, cameras: Path | None, unit: Unit | None) -> list[tuple[Mesh, np.ndarray]]:
+    """The range meshes of a folder with the positions of their cameras."""
+    given = cameras or folder / "cameras.json"
+    where = storage.read_json(given, "camera positions {name: [x, y, z]}")
+    paths = list_meshes(folder)
+    with storage.taking_apart(given, "camera positions {name: [x, y, z]} in JSON"):
+        missing = [path.stem for path in paths if path.stem not in where]
+        if missing:
+            raise ValueError(f"none for {', '.join(missing)}")
+        where = {name: np.array(place, dtype=np.float64) for name, place in where.items()}
+        places = [UNITS[unit or "m"] * storage.numbers(where, path.stem, 3) for path in paths]
+    return [(read_mesh(path, unit), place) for path, place in zip(paths, places, strict=True)]

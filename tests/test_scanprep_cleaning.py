@@ -1,0 +1,204 @@
+import numpy as np
+import pytest
+from scanned_shapes import ball
+
+from scanprep.cleaning import floor as floor_finding
+from scanprep.cleaning.clean_scan import (
+    FAR,
+    FLOOR,
+    LANDMARKS,
+    LARGEST,
+    NEAR,
+    SPECKS,
+    CleanScanConfig,
+    clean_scan,
+    pieces,
+)
+from scanprep.cleaning.floor import find_plane, floor_points, inside_outline, local_noise
+from scanprep.geometry import rotations
+from scanprep.geometry.mesh import Mesh
+from scanprep.synthetic.people import Person
+
+NOISE = 0.002
+
+
+def grid(width, depth, spacing=0.01):
+    """A flat sheet through the origin, facing up."""
+    x, y = (np.arange(-s / 2, s / 2, spacing) for s in (width, depth))
+    X, Y = np.meshgrid(x, y, indexing="ij")
+    number = np.arange(X.size).reshape(X.shape)
+    a, b, c, d = number[:-1, :-1], number[1:, :-1], number[1:, 1:], number[:-1, 1:]
+    faces = np.concatenate([np.stack(t, axis=-1).reshape(-1, 3) for t in ((a, b, c), (a, c, d))])
+    return Mesh(np.stack([X.ravel(), Y.ravel(), np.zeros(X.size)], axis=1), faces)
+
+
+def moved(mesh, by, R=None):
+    return mesh.with_vertices(mesh.vertices @ (np.eye(3) if R is None else R).T + np.asarray(by))
+
+
+def joined(*meshes):
+    starts = np.cumsum([0] + [len(m.vertices) for m in meshes[:-1]])
+    return Mesh(np.concatenate([m.vertices for m in meshes]),
+                np.concatenate([m.faces + s for m, s in zip(meshes, starts, strict=True)]))
+
+
+UPRIGHT = rotations.exp(np.array([0, np.pi / 2, 0]))
+
+
+@pytest.fixture(scope="module")
+def person():
+    mesh = Person().mesh
+    return moved(mesh, [0, 0, -mesh.vertices[:, 2].min()])
+
+
+@pytest.fixture(scope="module")
+def scene(person):
+    """A noisy person on a floor, a chair leg and a table top beside; which vertices are whose."""
+    rng = np.random.default_rng(0)
+    floor = grid(1.6, 1.6)
+    low = person.vertices[person.vertices[:, 2] < 0.02][:, :2]
+    hidden = inside_outline(floor.vertices[:, :2], low, 0.015)       # nobody sees the floor under the feet
+    floor = floor.submesh(~hidden[floor.faces].any(axis=1))[0]
+    leg = moved(grid(0.45, 0.04), [0.5, -0.4, 0.225], UPRIGHT)
+    table = moved(grid(0.6, 0.3), [-0.5, 0.75, 0.7])
+    parts = [person, floor, leg, table]
+    whole = joined(*parts)
+    whole = whole.with_vertices(whole.vertices + NOISE * rng.normal(size=whole.vertices.shape))
+    return whole, np.repeat(np.arange(4), [len(p.vertices) for p in parts])
+
+
+@pytest.mark.parametrize("kind", ["mesh", "points"])
+def test_the_person_is_left_with_the_soles(scene, person, kind):
+    mesh, whose = scene
+    clean = clean_scan(mesh if kind == "mesh" else mesh.vertices)
+    assert clean.kept[whose == 0].mean() > 0.999
+    soles = (whose == 0) & (np.r_[person.vertices[:, 2], np.full((whose > 0).sum(), 9)] < 3 * NOISE)
+    assert soles.sum() > 50 and clean.kept[soles].mean() > 0.98
+    assert not clean.kept[whose > 1].any()
+    wrong = mesh.vertices[clean.kept & (whose == 1)]
+    assert len(wrong) < 0.01 * (whose == 1).sum()
+    feet = person.vertices[person.vertices[:, 2] < 0.05]
+    assert all(np.linalg.norm(feet[:, :2] - p[:2], axis=1).min() < 0.03 for p in wrong)
+    assert clean.floor.normal[2] > 0.9999 and abs(clean.floor.offset) < 5e-4
+    assert clean.floor.noise == pytest.approx(NOISE, rel=0.1)
+    assert isinstance(clean.scan, Mesh) == (kind == "mesh")
+    assert len(clean.mesh.vertices) == pytest.approx(clean.kept.sum(), rel=5e-3)      # loose points have no triangle
+
+
+def test_every_piece_is_accounted_for(scene):
+    mesh, whose = scene
+    clean = clean_scan(mesh)
+    rows = clean.components
+    assert [row.reason for row in rows[:4]] == [FLOOR, LARGEST, FAR, FAR]
+    assert [row.reason for row in rows[4:]] in ([], [SPECKS])
+    assert sum(row.points for row in rows) == len(whose)
+    assert np.array_equal(np.bincount(clean.label), [row.points for row in rows])
+    table, leg = rows[2], rows[3]
+    assert table.points == (whose == 3).sum() and table.area == pytest.approx(0.18, rel=0.2)
+    assert table.size[2] < 0.03 and leg.size[2] == pytest.approx(0.45, abs=0.03)
+    truth = mesh.vertices[whose == 0]
+    gap = min(np.linalg.norm(truth - p, axis=1).min() for p in mesh.vertices[whose == 3])
+    assert table.gap == pytest.approx(gap, abs=1e-9)
+    assert [row.kept for row in rows[:4]] == [False, True, False, False]
+
+
+def test_the_frame_does_not_matter(scene):
+    mesh, _ = scene
+    R = rotations.exp(np.array([0.9, -0.4, 1.7]))
+    turned = moved(mesh, [3, -2, 5], R)
+    a, b = clean_scan(mesh), clean_scan(turned)
+    assert (a.kept != b.kept).mean() < 2e-3                 # the cells of the footprint lie otherwise
+    assert b.floor.normal @ R[:, 2] > 0.9999
+
+
+def test_a_body_without_a_floor_keeps_everything(person):
+    rng = np.random.default_rng(1)
+    clean = clean_scan(person.with_vertices(person.vertices + NOISE * rng.normal(size=person.vertices.shape)))
+    assert clean.floor is None and clean.kept.all()
+    assert [row.reason for row in clean.components] == [LARGEST]
+
+
+def test_floor_and_wall_go_and_the_floor_is_the_one_stood_on(scene):
+    mesh, whose = scene
+    rng = np.random.default_rng(2)
+    wall = moved(grid(2.2, 1.6), [0.9, 0, 1.1], UPRIGHT)
+    wall = wall.with_vertices(wall.vertices + NOISE * rng.normal(size=wall.vertices.shape))
+    clean = clean_scan(joined(mesh, wall))
+    assert [row.reason for row in clean.components[:3]] == [FLOOR, FLOOR, LARGEST]
+    assert clean.floor.normal[2] > 0.999
+    assert not clean.kept[len(whose):].any() and clean.kept[:len(whose)][whose == 0].mean() > 0.999
+
+
+def test_landmarks_say_which_piece_is_the_body(person):
+    large = moved(ball(5, 1.5), [4, 0, 0])
+    both = joined(person, large)
+    assert not clean_scan(both).kept[:len(person.vertices)].any()
+    clean = clean_scan(both, landmarks=person.vertices[[10, 500, 3000]])
+    assert clean.kept[:len(person.vertices)].all() and not clean.kept[len(person.vertices):].any()
+    assert sorted(row.reason for row in clean.components) == sorted([LANDMARKS, FAR])
+
+
+def test_near_pieces_stay_and_specks_go(person):
+    top = person.vertices[person.vertices[:, 2].argmax()]
+    hat, balloon, dust = (moved(ball(d, r), top + [0, 0, up]) for d, r, up in
+                          ((3, 0.05, 0.077), (3, 0.05, 0.3), (0, 0.002, 0.16)))
+    clean = clean_scan(joined(person, hat, balloon, dust), CleanScanConfig(spacings=1))
+    reasons = [row.reason for row in clean.components]
+    assert sorted(reasons) == sorted([LARGEST, NEAR, FAR, SPECKS])
+    assert clean.components[reasons.index(NEAR)].gap == pytest.approx(0.027, abs=0.003)
+    assert clean.kept.sum() == len(person.vertices) + len(hat.vertices)
+
+
+def test_views_side_by_side_are_one_piece():
+    one = ball(4)
+    left, right = (one.submesh(s * one.corners[:, :, 0].mean(axis=1) > -0.01)[0] for s in (1, -1))
+    both = joined(left, right)
+    assert pieces(both, np.arange(len(both.vertices)), 0.012).max() == 0
+    assert len(clean_scan(both).mesh.vertices) == len(both.vertices)
+
+
+def test_a_fitted_plane_is_the_true_one():
+    rng = np.random.default_rng(3)
+    R = rotations.exp(rng.normal(size=3))
+    flat = np.c_[rng.uniform(-1, 1, (5000, 2)), 0.003 * rng.normal(size=5000)]
+    above = np.c_[rng.uniform(-0.2, 0.2, (3000, 2)), rng.uniform(0.02, 1, 3000)]
+    plane = find_plane(np.concatenate([flat, above]) @ R.T + 7, 0.1, rng)
+    assert plane.normal @ R[:, 2] > 1 - 1e-5                       # towards what stands on it
+    assert plane.offset == pytest.approx(R[:, 2] @ [7, 7, 7], abs=5e-4)
+    assert plane.noise == pytest.approx(0.003, rel=0.1)
+    # With as much behind as in front it is no floor.
+    assert find_plane(np.concatenate([flat, above, above * [1, 1, -1]]) @ R.T, 0.1, rng) is None
+
+
+def test_noise_is_measured_on_a_curved_surface():
+    rng = np.random.default_rng(4)
+    points = rng.normal(size=(20_000, 3))
+    points *= (0.3 + 0.002 * rng.normal(size=(len(points), 1))) / np.linalg.norm(points, axis=1, keepdims=True)
+    assert local_noise(points, rng) == pytest.approx(0.002, rel=0.25)
+
+
+def test_outlines_with_gaps_are_filled():
+    angle = np.linspace(0, 2 * np.pi, 60, endpoint=False)
+    ring = 0.05 * np.stack([np.cos(angle), np.sin(angle)], axis=1)[angle > 0.2]
+    inside = inside_outline(np.array([[0, 0], [0.03, 0.02], [0.08, 0], [-0.3, 9]]), ring, 0.02)
+    assert list(inside) == [True, True, False, False]
+    assert not inside_outline(np.zeros((2, 2)), np.zeros((0, 2)), 0.02).any()
+
+
+def test_what_lies_under_the_floor_goes_with_it():
+    rng = np.random.default_rng(5)
+    plane = find_plane(np.concatenate([np.c_[rng.uniform(-1, 1, (5000, 2)), 0.001 * rng.normal(size=5000)],
+                                       [[0, 0, 1.0]]]), 0.1, rng)
+    points = np.array([[0, 0, -0.2], [0, 0, 0], [0.3, 0, 0], [0, 0, 0.5]])
+    body = np.array([[x, y, 0.015] for x in np.linspace(-0.05, 0.05, 11) for y in np.linspace(-0.05, 0.05, 11)])
+    assert list(floor_points(points, plane, body)) == [True, False, True, False]
+
+
+def test_nothing_is_an_error(monkeypatch):
+    with pytest.raises(ValueError, match="scan: expected points"):
+        clean_scan(np.zeros((0, 3)))
+    rng = np.random.default_rng(6)
+    bare = np.c_[rng.uniform(-1, 1, (5000, 2)), 0.001 * rng.normal(size=5000)]
+    monkeypatch.setattr(floor_finding, "SIGMAS", 10)
+    with pytest.raises(ValueError, match="nothing is left"):
+        clean_scan(bare, CleanScanConfig())

@@ -1,0 +1,199 @@
+"""Correlated correspondence and automatic seeds: known poses come back, from sheets, clouds and with clutter."""
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from scanprep.correspondence import potentials as ce
+from scanprep.correspondence.correlated import find_correspondences
+from scanprep.correspondence.places import Places, gradients
+from scanprep.correspondence.search import BeliefLevel, CorrelatedConfig
+from scanprep.correspondence.seeds import SeedConfig, find_seeds, matched_ends
+from scanprep.correspondence.sheet import Sheet
+from scanprep.geometry import rotations
+from scanprep.geometry.mesh import Mesh
+from scanprep.geometry.surface import Surface
+from scanprep.geometry.target import Target, target_of
+from scanprep.synthetic.people import Person, named_pose
+
+SMALL = CorrelatedConfig(points=100, keep=80, levels=(BeliefLevel(1200, 60), BeliefLevel(10**6, 40)))
+
+
+def sheets(body: Mesh, rng: np.random.Generator, noise: float = 0.001) -> Mesh:
+    """Two overlapping sheets, seen from the front and from the back, each with its own triangles."""
+    pieces, faces, start = [], [], 0
+    for direction in ([0, -1, 0.2], [0, 1, 0.2]):
+        keep = body.face_normals @ np.array(direction) > -0.35
+        piece, _ = body.submesh(keep)
+        pieces.append(piece.vertices + noise * rng.normal(size=piece.vertices.shape))
+        faces.append(piece.faces + start)
+        start += len(piece.vertices)
+    return Mesh(np.vstack(pieces), np.vstack(faces))
+
+
+@pytest.fixture(scope="module")
+def person() -> Person:
+    return Person()
+
+
+@pytest.fixture(scope="module")
+def kicking(person) -> Mesh:
+    return person.mesh.with_vertices(person.posed(named_pose("kick_left")))
+
+
+@pytest.fixture(scope="module")
+def ends(person) -> np.ndarray:
+    """Vertices of the finger tips, the toes and the crown: where the template reaches farthest."""
+    x = person.mesh.vertices
+    left = x[:, 0] > 0
+    foot = x[:, 2] < np.quantile(x[:, 2], 0.03)
+    far = [np.argmax(x[:, 0]), np.argmin(x[:, 0]), np.argmax(x[:, 2])]
+    front = 1.0 if (x[foot, 1].mean() > x[:, 1].mean()) else -1.0
+    far += [np.flatnonzero(foot & side)[np.argmax(front * x[foot & side, 1])] for side in (left, ~left)]
+    return np.array(far)
+
+
+@pytest.fixture(scope="module")
+def found(person, kicking, ends):
+    scan = sheets(kicking, np.random.default_rng(0))
+    return find_correspondences(person.mesh, scan, (ends, kicking.vertices[ends]), SMALL)
+
+
+def apart(found, truth: Mesh) -> np.ndarray:
+    return np.linalg.norm(truth.vertices[found.template_vertices] - found.scan_points, axis=1)
+
+
+def test_five_seeds_on_overlapping_sheets_become_many_pairs(found, kicking):
+    assert len(found) == 80
+    error = apart(found, kicking)
+    assert np.median(error) < 0.02 and (error > 0.1).mean() <= 0.03
+    assert found.confidence.min() >= 0 and found.confidence.max() <= 1
+    assert (np.diff(found.confidence) <= 0).all()
+
+
+def test_doubtful_pairs_are_worse(found, kicking):
+    error = apart(found, kicking)
+    assert error[:40].mean() < error[40:].mean()
+
+
+def test_the_scan_may_stand_anywhere(person, kicking, ends, found):
+    R, t = rotations.exp(np.array([0.3, -2.0, 1.1])), np.array([3.0, -1.0, 0.5])
+    scan = sheets(kicking, np.random.default_rng(0))
+    moved = kicking.with_vertices(kicking.vertices @ R.T + t)
+    again = find_correspondences(person.mesh, scan.with_vertices(scan.vertices @ R.T + t),
+                                 (ends, moved.vertices[ends]), SMALL)
+    error = apart(again, moved)           # cells of the thinning fall elsewhere, so other points are chosen
+    assert np.median(error) < 0.02 and (error > 0.1).mean() <= 0.03
+
+
+def test_the_scan_may_be_larger(person, kicking, ends, found):
+    large = kicking.with_vertices(1.25 * kicking.vertices)
+    again = find_correspondences(person.mesh, large, (ends, large.vertices[ends]), SMALL)
+    assert 1.15 < again.energies["scale"] < 1.32
+    assert np.median(apart(again, large)) < 0.025
+
+
+def test_wrong_seeds_are_refused(person, kicking):
+    mesh = person.mesh
+    with pytest.raises(ValueError, match="at least 3"):
+        find_correspondences(mesh, kicking, (np.array([0, 1]), np.zeros((2, 3))))
+    with pytest.raises(ValueError, match="outside"):
+        find_correspondences(mesh, kicking, (np.array([0, 1, 10**6]), np.zeros((3, 3))))
+    with pytest.raises(ValueError, match="shape"):
+        find_correspondences(mesh, kicking, (np.array([0, 1, 2]), np.zeros((3, 2))))
+    with pytest.raises(ValueError, match="finite"):
+        find_correspondences(mesh, kicking, (np.array([0, 1, 2]), np.full((3, 3), np.nan)))
+
+
+def test_seeds_are_found_without_a_click_and_not_swapped(person, kicking, ends):
+    config = SeedConfig(hypotheses=6)
+    seeds = find_seeds(person.mesh, sheets(kicking, np.random.default_rng(1)), config)
+    assert len(seeds) == 5 and seeds.converged
+    # The same five places as the farthest points of the template, give or take a hand's breadth.
+    nearest = np.linalg.norm(person.mesh.vertices[seeds.template_vertices][:, None] - person.mesh.vertices[ends],
+                             axis=2)
+    assert sorted(nearest.argmin(axis=1)) == [0, 1, 2, 3, 4] and nearest.min(axis=1).max() < 0.12
+    assert apart(seeds, kicking).max() < 0.08
+
+
+def test_ends_are_matched_by_the_ways_between_them():
+    rng = np.random.default_rng(3)
+    x = rng.normal(size=(5, 3))
+    ways = np.linalg.norm(x[:, None] - x, axis=2)
+    order = rng.permutation(5)
+    best = matched_ends(ways, 1.1 * ways[np.ix_(order, order)], SeedConfig())[0]
+    assert (order[best] == np.arange(5)).all()
+    lost = order[:4]                                         # one end of the scan is hidden
+    best = matched_ends(ways, ways[np.ix_(lost, lost)], SeedConfig())[0]
+    assert (best == -1).sum() == 1 and (lost[best[best >= 0]] == np.flatnonzero(best >= 0)).all()
+
+
+def two_plates(gap: float) -> Target:
+    """Two parallel plates that face each other across a gap."""
+    g = np.stack(np.meshgrid(np.arange(0, 0.3, 0.01), np.arange(0, 0.3, 0.01), indexing="ij"), -1).reshape(-1, 2)
+    lower = np.column_stack([g, np.zeros(len(g))])
+    upper = np.column_stack([g, np.full(len(g), gap)])
+    up = np.broadcast_to([0.0, 0.0, 1.0], lower.shape)
+    return Target(np.vstack([lower, upper]), np.vstack([up, -up]), np.zeros(2 * len(g), dtype=bool), True)
+
+
+def test_paths_do_not_jump_between_surfaces_that_face_each_other():
+    sheet = Sheet(two_plates(0.012), 0.01)
+    side = sheet.normals[:, 2] > 0
+    i, j = sheet.surface.nonzero()
+    assert (side[i] == side[j]).all()
+
+
+def test_paths_cross_overlapping_sheets():
+    one = two_plates(0.012)
+    half = one.normals[:, 2] > 0
+    points = one.points[half] + 0.002 * (np.arange(half.sum()) % 2)[:, None] * one.normals[half]
+    left, right = points[points[:, 0] < 0.17], points[points[:, 0] > 0.13]
+    both = np.vstack([left, right + [0, 0.004, 0.001]])
+    target = Target(both, np.broadcast_to([0.0, 0.0, 1.0], both.shape), np.zeros(len(both), dtype=bool), True)
+    sheet = Sheet(target, 0.01)
+    a, b = sheet.at(np.array([[0.0, 0.15, 0.0], [0.29, 0.15, 0.0]]))
+    straight = np.linalg.norm(sheet.points[a] - sheet.points[b])
+    assert straight <= sheet.distances(np.array([a]))[0, b] < 1.06 * straight
+
+
+def test_gradients_of_a_linear_function_are_its_direction():
+    target = two_plates(0.5)
+    points, normals = target.points[:900], target.normals[:900]
+    slope = np.array([0.6, 0.8, 0.0])
+    inside = np.flatnonzero((np.abs(points[:, :2] - 0.15) < 0.08).all(axis=1))
+    found = gradients(points, normals, (points @ slope)[None], inside, 0.04)
+    assert np.allclose(found[0], slope, atol=1e-3)
+
+
+def test_energies_of_true_images_are_zero_and_mirrors_cost():
+    rng = np.random.default_rng(0)
+    n = 12
+    normals = rotations.exp(rng.normal(size=(n, 3)))[:, 2]
+    places = Places(rng.normal(size=(n, 3)), normals, rng.uniform(0.2, 1, (n, 4)), rng.uniform(-1, 1, (n, 6)),
+                    np.ones((n, 4)))
+    config = ce.PotentialConfig()
+    mirrored = replace(places, turns=-places.turns)
+    edges = np.array([[0, 1], [4, 7], [3, 11]])
+    own = np.arange(n)[:, None]
+    assert np.allclose(np.diagonal(ce.place_energy(places, places, config, 1.0)), 0)
+    assert (np.diagonal(ce.place_energy(places, mirrored, config, 1.0)) > 0.1).all()
+    assert np.allclose(ce.edge_energy(places, places, edges, own, config, 1.0), 0, atol=1e-6)
+    domains = np.tile(np.arange(n), (n, 1))
+    table = ce.edge_energy(places, places, edges, domains, config, 1.0)
+    assert table.max() <= ce.most_edge_energy(config) + 1e-5
+    assert ce.place_energy(places, mirrored, config, 1.0).max() <= ce.most_place_energy(config, 4)
+    # The table of (i, j) is that of (j, i) turned over.
+    assert np.allclose(table, ce.edge_energy(places, places, edges[:, ::-1], domains, config, 1.0).transpose(0, 2, 1),
+                       atol=1e-5)
+
+
+def test_a_cloud_without_normals_gets_them_outward(kicking):
+    rng = np.random.default_rng(0)
+    points, _, _ = kicking.sample(9000, rng)
+    sheet = Sheet(target_of(points), 0.02)
+    near = Surface(kicking).closest(sheet.points)
+    agree = np.einsum("nd,nd->n", sheet.normals, kicking.face_normals[near.faces])
+    assert (agree > 0).mean() > 0.97

@@ -1,0 +1,81 @@
+"""Rigid links between neighbours [Hahnel]: nodes rotate and move, and keep their size."""
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+from jointed_bodies import bent, crab
+
+from scanprep.geometry import rotations
+from scanprep.geometry.mesh import Mesh
+from scanprep.registration.energies import pull
+from scanprep.registration.graph_fit import GraphFit, start_fit
+from scanprep.registration.inputs import prepare
+from scanprep.registration.nonrigid import register
+from scanprep.registration.rigid_links import linked
+from scanprep.registration.schedule import RegistrationConfig, hahnel_stages
+
+LEFT, RIGHT = np.array([0, 0, 0.6]), np.array([0, 0.6, 0])
+GIVEN = prepare(crab(), crab())
+SIZE = GIVEN.size
+
+
+def all_wanted(x):
+    return pull(len(x), np.arange(len(x)), x, GIVEN.template.vertex_areas)
+
+
+def begun(T=None, nodes=80) -> GraphFit:
+    return start_fit(GIVEN, np.eye(4) if T is None else T, nodes)
+
+
+def off(fit: GraphFit, wanted: np.ndarray) -> float:
+    return float(np.linalg.norm(fit.x - wanted, axis=1).mean())
+
+
+def test_moves_with_the_input():
+    wanted = bent(crab(), LEFT, RIGHT)
+    R, t = rotations.exp(np.array([0.4, -0.7, 1.1])), np.array([3.0, -1.0, 0.5])
+    T = np.eye(4)
+    T[:3, :3], T[:3, 3] = R, t
+    first = linked(begun(), all_wanted(wanted), 0.1 * SIZE)
+    moved = linked(begun(T), all_wanted(wanted @ R.T + t), 0.1 * SIZE)
+    np.testing.assert_allclose((moved.x - t) @ R, first.x, atol=2e-5)
+
+
+def test_nodes_rotate_but_do_not_grow():
+    wanted, fit, larger = bent(crab(), LEFT, RIGHT), begun(), begun()
+    for _ in range(6):
+        fit = linked(fit, all_wanted(wanted), 0.03 * SIZE)
+    assert off(fit, wanted) < 0.004
+    assert (fit.motion.log_scale == 0).all()
+    for _ in range(4):
+        larger = linked(larger, all_wanted(1.3 * crab().vertices), 5.0 * SIZE)
+    assert np.ptp(larger.x[:, 0]) < 1.02 * np.ptp(crab().vertices[:, 0])
+
+
+def test_softer_links_follow_more():
+    wanted = bent(crab(), LEFT, RIGHT)
+    apart = [off(linked(begun(), all_wanted(wanted), length * SIZE), wanted) for length in (2.0, 0.3, 0.03)]
+    assert apart[0] > 1.5 * apart[1] > 3 * apart[2]
+
+
+def test_a_finer_graph_goes_on_from_the_coarser_one():
+    wanted, fit = bent(crab(), LEFT, RIGHT), begun()
+    for _ in range(5):
+        fit = linked(fit, all_wanted(wanted), 0.1 * SIZE)
+    after = linked(fit.refined(GIVEN, 200), all_wanted(wanted), 0.1 * SIZE)
+    assert np.linalg.norm(after.x - fit.x, axis=1).mean() < 0.01
+    assert off(after, wanted) < off(fit, wanted) + 0.002
+
+
+def test_the_published_registration_bends_the_body_too():
+    stages = hahnel_stages()
+    assert [stage.length for stage in stages] == sorted((stage.length for stage in stages), reverse=True)
+    x = bent(crab(), LEFT / 2, RIGHT / 2)
+    marks = np.array([820, 821, 9 * 20, 9 * 20 + 10, 31 * 20 + 5, 31 * 20 + 15])
+    config = RegistrationConfig.published()
+    config = replace(config, rigid_links=tuple(replace(s, nodes=150, rounds=min(s.rounds, 3)) for s in stages))
+    found = register(crab(), Mesh(x, crab().faces), (marks, x[marks]), config)
+    apart, before = (np.linalg.norm(y - x, axis=1).mean() for y in (found.mesh.vertices, crab().vertices))
+    assert apart < 0.02 and apart < 0.8 * before        # point to point, matches slide along the skin
+    assert found.rms < 0.001 and found.seen.mean() > 0.8

@@ -1,0 +1,235 @@
+"""Where a registration begins and what it says of itself: paths to landmarks, hints, ends that turn, confidence."""
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from jointed_bodies import bent, crab
+
+from scanprep.correspondence.correspondences import Correspondences
+from scanprep.geometry import rotations
+from scanprep.geometry.geodesics import SurfaceGraph
+from scanprep.geometry.mesh import Mesh
+from scanprep.geometry.target import target_of
+from scanprep.registration.confidence import evidence
+from scanprep.registration.inputs import Hints, path_anchors, place_by_descriptors
+from scanprep.registration.inverted_triangles import vertex_rotations
+from scanprep.registration.limb_ends import RigidFit, find_ends, rotated_end
+from scanprep.registration.matches import Likeness, match_both_ways
+from scanprep.registration.nonrigid import register
+from scanprep.registration.path_descriptors import describe_both, descriptors, path_lengths
+from scanprep.registration.schedule import RegistrationConfig
+
+BEND = np.array([0.0, 0.0, 1.2]), np.array([0.0, 1.4, 0.0])
+
+
+def body() -> Mesh:
+    return crab(81, 40)
+
+
+def size_of(mesh: Mesh) -> float:
+    return float(np.sqrt(mesh.face_areas.sum()))
+
+
+def moved(points: np.ndarray) -> np.ndarray:
+    """Far away and upside down."""
+    return points @ rotations.exp(np.array([2.5, 0.4, 1.0])).T + [3.0, -1.0, 2.0]
+
+
+def small() -> RegistrationConfig:
+    config = RegistrationConfig()
+    return replace(config, graph=tuple(replace(s, nodes=min(s.nodes, 100), rounds=min(s.rounds, 5))
+                                       for s in config.graph))
+
+
+# ---- paths --------------------------------------------------------------------------------------------------
+
+def test_path_lengths_are_those_along_the_surface():
+    mesh = body()
+    sources = np.array([3, 1500])
+    mine = path_lengths(mesh.vertices, mesh.vertex_normals, mesh.vertices[sources], 0.005)
+    exact = SurfaceGraph(mesh).distances(sources).T
+    far = exact > 0.1
+    assert np.median(np.abs(mine[far] / exact[far] - 1)) < 0.05
+    assert np.quantile(np.abs(mine[far] / exact[far] - 1), 0.99) < 0.2       # tips hang on single links
+
+
+def test_path_lengths_do_not_change_with_the_pose():
+    mesh = body()
+    other = mesh.with_vertices(moved(bent(mesh, *BEND)))
+    a, b = (path_lengths(m.vertices, m.vertex_normals, m.vertices[[3240, 3241]], 0.01) for m in (mesh, other))
+    assert np.median(np.abs(a - b)) < 0.04 and np.abs(a - b).max() < 0.12    # of 1.1 m; the skin itself stretches
+
+
+def test_paths_cross_gaps_but_leave_crumbs_out():
+    line = np.stack([np.linspace(0, 1, 201), np.zeros(201), np.zeros(201)], axis=1)
+    line = line[(line[:, 0] < 0.4) | (line[:, 0] > 0.6)]
+    crumb = np.array([[5.0, 5, 5]])
+    points = np.vstack([np.repeat(line, 3, axis=0) + np.tile([[0, 0, 0], [0, 0.005, 0], [0, 0.01, 0]], (len(line), 1)),
+                        crumb])
+    lengths = path_lengths(points, np.tile([0.0, 0, 1], (len(points), 1)), np.array([[0.0, 0, 0]]), 0.004)[:, 0]
+    at_end = lengths[np.argmin(np.linalg.norm(points - [1.0, 0, 0], axis=1))]
+    assert 0.98 < at_end < 1.06
+    assert lengths[-1] > np.linalg.norm(crumb) - 1 and np.isfinite(descriptors(lengths[:, None], 1.0)).all()
+
+
+def test_a_body_upside_down_and_bent_is_placed_by_its_descriptors():
+    mesh = body()
+    x = moved(bent(mesh, *BEND))
+    target = target_of(Mesh(x, mesh.faces))
+    mine, theirs = describe_both(mesh, target, (spread(mesh), x[spread(mesh)]), 0.01, size_of(mesh))
+    T = place_by_descriptors(mesh, mine, replace(target, descriptors=theirs), np.arange(0, len(x), 3))
+    R, _ = rotations.procrustes(mesh.vertices, x)
+    assert np.linalg.norm(rotations.log(T[:3, :3] @ R.T)) < 0.2
+    np.testing.assert_allclose(T[:3, :3] @ T[:3, :3].T, np.eye(3), atol=1e-12)
+    assert np.linalg.det(T[:3, :3]) > 0
+
+
+def spread(mesh: Mesh) -> np.ndarray:
+    """Six vertices: both tips, one on either arm, two of the chest."""
+    N = len(mesh.vertices)
+    return np.array([N - 2, N - 1, 20 * 40, 60 * 40 + 10, 43 * 40, 43 * 40 + 20])
+
+
+# ---- anchors and hints --------------------------------------------------------------------------------------
+
+def test_landmarks_where_nothing_was_scanned_begin_no_path():
+    mesh = body()
+    target = target_of(mesh)
+    vertices = spread(mesh)
+    points = mesh.vertices[vertices].copy()
+    points[1] += 1.0
+    vertices, points = vertices[:4], points[:4]
+    used = path_anchors((vertices, points), None, target, 0.05)
+    assert used is not None
+    np.testing.assert_array_equal(used[0], vertices[[0, 2, 3]])
+    points[2] += 1.0
+    assert path_anchors((vertices, points), None, target, 0.05) is None
+
+
+def test_the_surest_hints_take_the_place_of_landmarks():
+    mesh = body()
+    vertices = np.arange(0, 3000, 100)
+    confidence = np.where(np.arange(len(vertices)) % 3 == 0, 0.1, 0.9)
+    found = path_anchors(None, Hints(vertices, mesh.vertices[vertices], confidence), target_of(mesh), 0.05)
+    assert found is not None and len(found[0]) == 8
+    assert np.isin(found[0], vertices[confidence > 0.5]).all()
+
+
+def test_a_hint_far_from_its_place_draws_less():
+    x = np.zeros((3, 3))
+    hints = Hints(np.array([0, 1]), np.array([[0.01, 0, 0], [1.0, 0, 0]]), np.ones(2))
+    wanted = hints.wanted(x, 0.1, 2.0)
+    assert wanted.A[0, 0, 0] > 0.95 and wanted.A[1, 0, 0] < 1e-3 and not wanted.A[2].any()
+
+
+def test_wrong_hints_among_right_ones_do_no_harm():
+    mesh = crab()
+    x = moved(bent(mesh, 0.5 * BEND[0], 0.5 * BEND[1]))
+    rng = np.random.default_rng(4)
+    vertices = rng.choice(len(x), 60, replace=False)
+    points = x[vertices] + 0.005 * rng.normal(size=(60, 3))
+    points[:6] = x[rng.choice(len(x), 6)]
+    confidence = np.r_[np.full(6, 0.3), np.ones(54)]
+    found = register(mesh, Mesh(x, mesh.faces), config=small(),
+                     correspondences=Correspondences(vertices, points, confidence))
+    assert np.linalg.norm(found.mesh.vertices - x, axis=1).mean() < 0.01
+    assert np.isnan(found.landmark_rms) and found.inverted == 0
+
+
+@pytest.mark.parametrize(("pairs", "word"), [
+    (Correspondences(np.array([9999]), np.zeros((1, 3)), np.ones(1)), "9999"),
+    (Correspondences(np.array([1]), np.full((1, 3), np.nan), np.ones(1)), "not finite"),
+    (Correspondences(np.array([1]), np.zeros((1, 3)), np.ones(2)), "confidences")])
+def test_bad_correspondences_are_named(pairs, word):
+    with pytest.raises(ValueError, match=f"correspondences.*{word}"):
+        register(crab(), crab(), correspondences=pairs)
+
+
+# ---- matching by descriptors --------------------------------------------------------------------------------------
+
+def test_descriptors_alone_find_every_vertex_wherever_it_lies():
+    mesh = body()
+    x = moved(mesh.vertices)
+    mine = np.random.default_rng(0).normal(size=(len(x), 3))
+    target = replace(target_of(Mesh(x, mesh.faces)), descriptors=mine)
+    area = float(mesh.face_areas.sum())
+    wanted = match_both_ways(mesh, np.arange(len(x)), area, target, 1e3, 1.0, Likeness(positions=0.0, descriptors=1.0),
+                             mine)
+    inner = ~target.border
+    A, b = wanted.A[inner], wanted.b[inner]
+    np.testing.assert_allclose(np.linalg.solve(A, b[..., None])[..., 0], x[inner], atol=1e-9)
+
+
+# ---- ends ---------------------------------------------------------------------------------------------------
+
+def test_an_end_that_is_rotated_about_itself_is_found():
+    mesh = body()
+    ends = find_ends(mesh, 2, 0.25)
+    assert {int(np.sign(e.axis[0])) for e in ends} == {-1, 1} and all(abs(e.axis[0]) > 0.95 for e in ends)
+    end = ends[0]
+    share = np.clip((end.axis[0] * mesh.vertices[:, 0] - 0.1) / 0.05, 0, 1)
+    truth = np.einsum("nij,nj->ni", rotations.exp(1.0 * share[:, None] * end.axis), mesh.vertices)
+    target = target_of(Mesh(truth, mesh.faces))
+    size = size_of(mesh)
+    rotated = rotated_end(mesh, end, mesh.vertices, RigidFit(target, 0.04 * size, 0.035 * size), size, moved=0.0)
+    assert rotated is not None
+    before = np.linalg.norm(mesh.vertices - truth, axis=1)[end.vertices].mean()
+    assert np.linalg.norm(rotated - truth[end.vertices], axis=1).mean() < 0.35 * before
+
+
+def test_an_end_that_fits_is_left_alone():
+    mesh = body()
+    end = find_ends(mesh, 2, 0.25)[0]
+    size = size_of(mesh)
+    assert rotated_end(mesh, end, mesh.vertices, RigidFit(target_of(mesh), 0.04 * size, 0.035 * size), size) is None
+
+
+# ---- confidence ---------------------------------------------------------------------------------------------
+
+def test_confidence_is_high_on_data_and_zero_off_them():
+    mesh = body()
+    points = mesh.sample(15000, np.random.default_rng(0))[0]
+    keep = points[:, 0] < 0.1
+    target = target_of(points[keep] + 0.001 * np.random.default_rng(1).normal(size=(keep.sum(), 3)))
+    found = evidence(mesh, target, 0.02, 0.05)
+    x = mesh.vertices[:, 0]
+    assert (found.confidence[(x < 0.07) & (x > -0.49)] > 0.5).mean() > 0.95
+    assert found.confidence[x > 0.12].max() < 0.05
+    assert ((found.confidence >= 0) & (found.confidence <= 1)).all()
+    assert np.isnan(found.distances[x > 0.13]).all()
+
+
+def test_a_surface_that_faces_away_is_no_data():
+    mesh = body()
+    inside_out = Mesh(mesh.vertices, mesh.faces[:, ::-1])
+    assert evidence(mesh, target_of(mesh), 0.02, 0.05).confidence.mean() > 0.95
+    assert evidence(mesh, target_of(inside_out), 0.02, 0.05).confidence.max() == 0
+
+
+def test_clutter_beside_the_body_changes_little_and_noise_is_told():
+    mesh = crab()
+    x = bent(mesh, 0.3 * BEND[0], 0.3 * BEND[1])
+    truth = Mesh(x, mesh.faces)
+    rng = np.random.default_rng(2)
+    points = truth.sample(5000, rng)[0]
+    board = np.stack([rng.uniform(-0.4, 0.4, 1500), rng.uniform(-0.3, 0.3, 1500), np.full(1500, -0.2)], axis=1)
+    marks = np.array([820, 821, 9 * 20, 9 * 20 + 10, 31 * 20 + 5, 31 * 20 + 15])
+    clean, cluttered, noisy = (register(mesh, scan, (marks, x[marks]), small()) for scan in (
+        points, np.vstack([points, board]), points + 0.005 * rng.normal(size=points.shape)))
+    apart = [np.linalg.norm(found.mesh.vertices - x, axis=1).mean() for found in (clean, cluttered, noisy)]
+    assert apart[0] < 0.008 and apart[1] < 0.012 and apart[2] < 0.014
+    assert noisy.rms > 2 * clean.rms
+    assert clean.uncovered < 0.005 and cluttered.uncovered == pytest.approx(1500 / 6500, abs=0.01)
+
+
+# ---- rotations around vertices ------------------------------------------------------------------------------
+
+def test_rotations_are_those_of_a_rigid_motion_and_a_fold_does_not_sway_them():
+    mesh = crab()
+    R = rotations.exp(np.array([1.0, -0.3, 2.0]))
+    x = mesh.vertices @ R.T + 1.0
+    np.testing.assert_allclose(vertex_rotations(mesh, x), np.broadcast_to(R, (len(x), 3, 3)), atol=1e-9)
+    x[[405, 406]] = x[[406, 405]]
+    assert np.linalg.norm(rotations.log(vertex_rotations(mesh, x) @ R.T), axis=1).max() < 0.3

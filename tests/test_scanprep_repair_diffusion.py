@@ -1,0 +1,96 @@
+import numpy as np
+import pytest
+from scanned_shapes import ball, bumpy, view
+
+from scanprep.geometry import rotations
+from scanprep.geometry.mesh import Mesh, template_problem
+from scanprep.geometry.seen_space import SeenSpace
+from scanprep.geometry.surface import Surface
+from scanprep.repair.hole_filling import FillConfig, fill_holes, fill_report
+from scanprep.repair.volumetric_diffusion import diffused_surface, signed_distance
+
+
+def pierced(mesh, centre, radius):
+    return mesh.submesh(np.linalg.norm(mesh.corners.mean(axis=1) - centre, axis=1) > radius)[0]
+
+
+def dented():
+    """A ball of radius 10 cm whose top is pressed in, with a hole there that hides the dent."""
+    whole = ball(5)
+    x, y, z = whole.vertices.T
+    dent = whole.with_vertices(np.stack([x, y, z - 0.035 * np.exp(-(x**2 + y**2) / (2 * 0.03**2)) * (z > 0)], axis=1))
+    return dent, pierced(dent, [0, 0, 0.08], 0.062)
+
+
+def test_signed_distances_of_a_ball_and_where_they_end():
+    holed = pierced(ball(5), [0, 0, 0.1], 0.05)
+    points = np.random.default_rng(0).uniform(-0.13, 0.13, size=(500, 3))
+    distance, sure = signed_distance(holed, points)
+    assert np.abs(distance - (np.linalg.norm(points, axis=1) - 0.1))[sure].max() < 0.001
+    above = points[:, 2] > 0.98 * np.linalg.norm(points, axis=1)
+    assert not sure[above & (np.linalg.norm(points, axis=1) > 0.05)].any()
+    assert sure[points[:, 2] < 0].all()
+
+
+def test_the_zero_level_continues_a_ball():
+    holed = pierced(ball(5), [0, 0, 0.1], 0.04)
+    zero = diffused_surface(holed, holed.boundary_vertices)
+    cap = zero.vertices[(zero.vertices[:, 2] > 0.09)]
+    assert len(cap) > 30
+    assert np.abs(np.linalg.norm(cap, axis=1) - 0.1).max() < 0.002
+
+
+def test_patches_follow_the_volume_and_keep_the_mesh():
+    holed = pierced(bumpy(5), [0.1, 0, 0], 0.04)
+    report = fill_report(holed, FillConfig(method="diffusion"))
+    filled = report.mesh
+    assert [hole.method for hole in report.holes] == ["diffusion"]
+    assert filled.is_closed and template_problem(filled) is None and report.holes[0].intersections == 0
+    assert np.array_equal(filled.vertices[:len(holed.vertices)], holed.vertices)
+    assert Surface(bumpy(5)).closest(filled.vertices[len(holed.vertices):]).distances.max() < 0.004
+
+
+def test_diffusion_moves_along_with_the_mesh():
+    holed = pierced(bumpy(4), [0.1, 0, 0], 0.05)
+    R, t = rotations.exp(np.array([0.4, -1.1, 0.3])), np.array([0.2, -3.0, 1.0])
+    config = FillConfig(method="diffusion")
+    moved = fill_holes(holed.with_vertices(holed.vertices @ R.T + t), config)
+    assert Surface(fill_holes(holed, config)).closest((moved.vertices - t) @ R).distances.max() < 0.002
+
+
+def test_lines_of_sight_measure_how_far_space_is_empty():
+    shape = ball(4)
+    seen = SeenSpace([view(shape, [1, 0, 0])])
+    ahead = seen.ahead(np.array([[0.15, 0, 0], [0.1, 0, 0], [0.05, 0, 0], [0, 0.2, 0]]))
+    assert np.abs(ahead[:3] - [0.05, 0, -0.05]).max() < 0.001
+    assert ahead[3] == -np.inf                                  # nothing was seen behind it
+
+
+def test_seen_space_stays_empty():
+    dent, holed = dented()
+    # A wall behind, seen by a camera that looks into the dent from the side and above: a line of sight is evidence.
+    views = [view(dent, d) for d in ([0.8, 0, 1], [-0.8, 0, 1], [0, 0.8, 1], [0, -0.8, 1])]
+    truth = Surface(dent)
+    blind, told = (fill_report(holed, views=v) for v in ((), views))
+    new = slice(len(holed.vertices), None)
+    before, after = (truth.closest(r.mesh.vertices[new]).distances.mean() for r in (blind, told))
+    assert told.mesh.is_closed and template_problem(told.mesh) is None
+    assert (SeenSpace(views).ahead(blind.mesh.vertices[new]) > 0.01).mean() > 0.3
+    assert told.holes[0].in_empty < 0.1
+    assert told.holes[0].method == "diffusion"
+    assert after < 0.6 * before
+
+
+def test_finer_voxels_find_the_same_surface():
+    holed = pierced(ball(5), [0, 0, 0.1], 0.05)
+    coarse, fine = (diffused_surface(holed, holed.boundary_vertices, voxels=n) for n in (10, 14))
+    inner = fine.vertices[np.linalg.norm(fine.vertices - [0, 0, 0.1], axis=1) < 0.05]
+    assert Surface(coarse).closest(inner).distances.max() < 0.004
+    assert len(fine.faces) > 1.5 * len(coarse.faces)
+
+
+@pytest.mark.parametrize("method", ["fair", "diffusion"])
+def test_colours_are_continued(method):
+    whole = ball(4)
+    red = Mesh(whole.vertices, whole.faces, np.tile([0.8, 0.1, 0.2], (len(whole.vertices), 1)))
+    assert np.allclose(fill_holes(pierced(red, [0.1, 0, 0], 0.05), FillConfig(method=method)).colors, [0.8, 0.1, 0.2])

@@ -1,0 +1,81 @@
+"""Surface distances whose true value is known."""
+import numpy as np
+import pytest
+import trimesh
+from surface_distances import surface_distance
+
+from scanprep.geometry.mesh import Mesh
+
+
+def ball(radius, subdivisions=4):
+    sphere = trimesh.creation.icosphere(subdivisions, radius)
+    return Mesh(sphere.vertices, sphere.faces)
+
+
+def square(height, side=1.0):
+    x = side / 2 * np.array([[-1, -1], [1, -1], [1, 1], [-1, 1]])
+    return Mesh(np.c_[x, np.full(4, height)], [[0, 1, 2], [0, 2, 3]])
+
+
+def test_balls_in_one_another():
+    found = surface_distance(ball(0.5), ball(0.6), samples=5000)
+    for way in (found, found.a_to_b, found.b_to_a):
+        for value in (way.mean, way.rms, way.p95, way.hausdorff):
+            assert value == pytest.approx(0.1, abs=2e-3)
+
+
+def test_a_surface_is_at_distance_zero_from_itself_and_from_a_finer_copy():
+    mesh = ball(0.5, 2)
+    corner = np.arange(3 * len(mesh.faces)).reshape(-1, 3)
+    middle = len(corner) * 3 + np.arange(len(corner))[:, None]
+    fine = Mesh(np.r_[mesh.corners.reshape(-1, 3), mesh.corners.mean(axis=1)],
+                np.concatenate([np.hstack([corner[:, [i, (i + 1) % 3]], middle]) for i in range(3)]))
+    assert surface_distance(mesh, mesh, samples=500).hausdorff < 1e-9
+    assert surface_distance(mesh, fine, samples=500).hausdorff < 1e-7
+
+
+def test_both_ways_differ_where_one_surface_is_larger():
+    small, large = square(0), square(0, side=3)
+    found = surface_distance(small, large, samples=200_000)
+    assert found.a_to_b.hausdorff < 1e-9
+    assert found.b_to_a.hausdorff == pytest.approx(np.sqrt(2))               # a corner to a corner: exact
+    assert found.hausdorff == found.b_to_a.hausdorff
+    # Of the area 9 the ring around: four strips of mean 1/2, four corners of mean (√2 + asinh 1) / 3.
+    mean = (4 * 0.5 + 4 * (np.sqrt(2) + np.arcsinh(1)) / 3) / 9
+    assert found.b_to_a.mean == pytest.approx(mean, rel=0.01)
+    assert found.b_to_a.rms == pytest.approx(np.sqrt((4 / 3 + 4 * 2 / 3) / 9), rel=0.01)
+    assert found.mean == pytest.approx((found.a_to_b.mean + found.b_to_a.mean) / 2)
+    assert found.rms == pytest.approx(found.b_to_a.rms / np.sqrt(2))
+    back = surface_distance(large, small, samples=200_000)
+    assert back.mean == pytest.approx(found.mean, rel=0.01) and back.hausdorff == found.hausdorff
+
+
+def test_area_counts_and_not_vertices():
+    """One far corner with a thousand small triangles weighs as much as its area."""
+    flat = square(0)
+    rng = np.random.default_rng(0)
+    tiny = np.array([0, 0, 0.5]) + 1e-4 * rng.normal(size=(3000, 3))
+    crowded = Mesh(np.r_[flat.vertices, tiny], np.r_[flat.faces, 4 + np.arange(3000).reshape(-1, 3)])
+    found = surface_distance(crowded, flat, samples=20_000)
+    assert found.a_to_b.mean < 1e-3 and found.a_to_b.hausdorff == pytest.approx(0.5, abs=1e-3)
+
+
+def test_the_same_places_every_time_and_a_rigid_motion_changes_nothing():
+    a, b = ball(0.5, 2), ball(0.55, 2)
+    first = surface_distance(a, b, samples=1000)
+    assert first == surface_distance(a, b, samples=1000)
+    assert first != surface_distance(a, b, samples=1000, rng=np.random.default_rng(9))
+    R = np.linalg.qr(np.random.default_rng(1).normal(size=(3, 3)))[0]
+    R *= np.linalg.det(R)
+    moved = surface_distance(*(m.with_vertices(m.vertices @ R.T + 1) for m in (a, b)), samples=1000)
+    assert moved.rms == pytest.approx(first.rms, abs=1e-9) and moved.p95 == pytest.approx(first.p95, abs=1e-9)
+
+
+def test_what_has_no_surface_is_refused():
+    empty, flat = Mesh(np.eye(3), np.zeros((0, 3))), Mesh(np.zeros((3, 3)), [[0, 1, 2]])
+    with pytest.raises(ValueError, match="a: expected a surface"):
+        surface_distance(empty, square(0))
+    with pytest.raises(ValueError, match="b: expected a surface"):
+        surface_distance(square(0), flat)
+    with pytest.raises(ValueError, match="samples"):
+        surface_distance(square(0), square(1), samples=0)
