@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 from completion_bodies import MEAN, worm_with_prior
+from config_files import config_file
 
 from completion import MarkerLayout, MarkerSequence, motion_pictures, write_markers
 from completion.__main__ import main
@@ -21,11 +22,11 @@ from scanprep.batch.workspace import HOME
 FRAMES = 40
 BETAS = {"ann": np.array([0.9, -0.6, 0.4]), "bob": np.array([-0.8, 0.5, -0.3])}
 TAKES = (("ann", "walk", 0.0), ("ann", "run", 1.0), ("bob", "jump", 0.5))
-QUICK = ("--keys", "5", "--person.frames", "4", "--person.start-axes", "1", "--person.annealing", "4", "1",
-         "--person.iterations", "4")
-STAGES = {"start": "completion.mocap.subject.person.FrameStarts.find",
+QUICK = {"frames": 4, "annealing": [4.0, 1.0]}
+STAGES = {"start": "completion.mocap.subject.person.start_frames",
           "solve": "completion.mocap.subject.person.LatentFit.solve",
-          "poses": "completion.mocap.mosh.mosh.follow_poses", "faults": "completion.mocap.mosh.mosh.find_faults",
+          "poses": "completion.mocap.mosh.mosh.animate",
+          "artefacts": "completion.mocap.mosh.mosh.find_artefacts",
           "soft": "completion.mocap.mosh.mosh.follow_soft_tissue",
           "files": "completion.mocap.mosh.work.write_take", "page": "completion.mocap.mosh.work.take_page",
           "person page": "completion.mocap.mosh.work.person_page"}
@@ -57,9 +58,11 @@ def write_people(place):
     return place
 
 
-def run(place, *words, quick=QUICK):
-    return main(["mosh", *quick, "-m", str(place / "model.npz"), "--layout", str(place / "layout.json"),
-                 "--workers", "1", *map(str, words)])
+def run(place, *words, **settings):
+    """`scape mosh` with few frames and stages, and other settings."""
+    settings["person"] = QUICK | settings.get("person", {})
+    return main(["mosh", "--config", str(config_file(place, **settings)), "-m", str(place / "model.npz"),
+                 "--layout", str(place / "layout.json"), "--workers", "1", *map(str, words)])
 
 
 @contextmanager

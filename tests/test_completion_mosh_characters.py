@@ -8,11 +8,11 @@ from completion_bodies import MEAN, worm_with_prior
 from glb_reader import Glb
 
 from completion import Motion, deformation, motion_pictures, retarget_soft_tissue
-from completion.mocap.results import SoftTissue
 from completion.mocap.retargeting.creases import Creases, at_rest
 from completion.mocap.retargeting.pictures import picture_transfer, write_character
 from completion.mocap.retargeting.retarget import world_up
 from completion.mocap.retargeting.soft_tissue import moving_character
+from completion.mocap.soft_tissue.soft_tissue import SoftTissue
 from model.posing.character import CharacterConfig, character_model, inside
 from scanprep.geometry import rotations
 from scanprep.geometry.surface import Surface

@@ -18,7 +18,7 @@ from completion.mocap.animate.work import GlbConfig, animate_file
 from completion.mocap.animate.work import Work as Follow
 from completion.mocap.pose.robust import motion_problem
 from completion.mocap.pose.settings import AnimateConfig
-from completion.mocap.subject.marker_shape import MarkerShapeConfig
+from completion.mocap.subject.person import PersonConfig
 from completion.motion import Motion
 from completion.partial.settings import CompletionConfig
 from completion.partial.work import Inputs, Work, complete_files
@@ -157,7 +157,7 @@ def test_motions(tmp_path, case, words):
         markers = dataclasses.replace(markers, labels=tuple(labels))
     write_markers(tmp_path / "walk.csv", markers)
     work = Follow(model, "model.npz", str(tmp_path / "layout.json"), model.subject(None), None, None, "m", None,
-                  AnimateConfig(), MarkerShapeConfig(), GlbConfig(6))
+                  AnimateConfig(), PersonConfig(), GlbConfig(6))
     check(animate_file(work, tmp_path / "walk.csv", Room(tmp_path / "out")), words)
     assert (tmp_path / "out" / "motion.npz").exists()
 

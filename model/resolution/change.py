@@ -3,7 +3,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import singledispatch
-from typing import Annotated, Any
+from typing import Any
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -11,7 +11,7 @@ from scipy.spatial import cKDTree
 from scanprep.decimation.decimate import DecimateConfig, decimate
 from scanprep.geometry.mesh import Mesh, check_template
 from scanprep.geometry.surface import Surface
-from scanprep.ranges import FLAG, Settings
+from scanprep.ranges import Settings
 from scanprep.skeleton.tree import Skeleton
 
 from ..body import BodyModel
@@ -36,7 +36,7 @@ class ResolutionConfig(Settings):
         How often pose space and shape space are corrected; none for a fast and rougher answer.
     """
 
-    rounds: Annotated[int, FLAG] = 2
+    rounds: int = 2
 
 
 def change_resolution(model: BodyModel, template: Mesh, config: ResolutionConfig | None = None,

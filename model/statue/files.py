@@ -10,6 +10,7 @@ import numpy as np
 from scanprep.geometry import storage
 from scanprep.geometry.mesh import Mesh
 from scanprep.pictures.sheets import save_png
+from scanprep.synthetic import people
 
 from ..blend_weights import strongest
 from ..export.glb import Material, write_skinned_glb
@@ -83,8 +84,6 @@ def write_body(folder: Path, statue: Statue) -> None:
 
     What random poses of the synthetic people do with these joints makes the pose prior of the humanoid.
     """
-    from scanprep.synthetic import people
-
     control, poses = statue.control, None
     if control.skeleton.names == humanoid().skeleton.names:
         rng = np.random.default_rng(0)

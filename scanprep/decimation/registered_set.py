@@ -6,7 +6,7 @@ import hashlib
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Any, Literal
 
 import numpy as np
 
@@ -15,7 +15,7 @@ from ..geometry import rotations, storage
 from ..geometry.farthest_points import farthest_points
 from ..geometry.landmarks import read_landmark_vertices, write_landmarks
 from ..geometry.mesh import Mesh, check_template
-from ..ranges import FLAG, Count, Settings
+from ..ranges import Count, Settings
 from ..skeleton.tree import Skeleton
 from .edge_collapse import FIXED, Rounds, checked_vertices, kept_curves, wall_quadrics
 from .quadrics import lowest, sum_at, surface_quadrics
@@ -43,8 +43,8 @@ class DecimateSetConfig(Settings):
         it slide less.
     """
 
-    meshes: Annotated[Count, FLAG] = 8
-    placement: Annotated[Literal["vertices", "solved"], FLAG] = "vertices"
+    meshes: Count = 8
+    placement: Literal["vertices", "solved"] = "vertices"
     anchor: float = 0.03
 
 
@@ -167,7 +167,7 @@ def _different_meshes(template: Mesh, poses: np.ndarray | None, count: int) -> n
         return centred[None]
     if np.ndim(poses) != 3 or np.shape(poses)[1:] != template.vertices.shape:
         raise ValueError(f"poses: expected shape (M, {len(template.vertices)}, 3), got {np.shape(poses)}")
-    R, t = rotations.procrustes(poses, np.broadcast_to(centred, poses.shape))[:2]
+    R, t = rotations.procrustes(poses, np.broadcast_to(centred, poses.shape))
     placed = np.concatenate([centred[None], np.einsum("mij,mnj->mni", R, poses) + t[:, None]])
     return placed[farthest_points(
         placed, count, 0, lambda i, _: np.sqrt(((placed - placed[i]) ** 2).sum(axis=2).mean(axis=1)), least=1e-9)]

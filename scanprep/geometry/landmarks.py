@@ -12,7 +12,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from . import storage
-from .formats.common import FARTHEST, UNITS, Lines, MeshFileError, load_bytes, metres_per_unit, quote
+from .format_common import FARTHEST, UNITS, Lines, MeshFileError, load_bytes, metres_per_unit, quote
 from .mesh import Mesh
 
 LANDMARK_ENDINGS = (".landmarks.json", ".json", ".mrk.json", ".pp", "_picked_points.pp", ".lnd", ".landmarks.txt")
@@ -102,13 +102,10 @@ def read_template_landmarks(template: Path, mesh: Mesh, given: Path | None = Non
 
 
 def check_on_surface(path: str | Path, landmarks: Mapping[str, np.ndarray], surface: np.ndarray) -> None:
-    """Refuse points that cannot have been picked on a surface (n, 3), whatever its shape.
+    """Refuse points that cannot have been picked on a surface (n, 3): in another unit, or of something else.
 
-    Raises
-    ------
-    MeshFileError
-        A landmark half the size of the surface away from it, or several so near to each other that they are all on
-        one spot of it: landmarks and surface are in different units, or do not belong together.
+    A landmark half the size of the surface away from it, or several so near to each other that they are all on
+    one spot of it.
     """
     points, size = np.array(list(landmarks.values())).reshape(-1, 3), np.linalg.norm(np.ptp(surface, axis=0))
     far = cKDTree(surface).query(points)[0]

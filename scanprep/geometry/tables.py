@@ -13,24 +13,10 @@ from .storage import LARGEST_TEXT, UTF_16, StorageError, read_bytes, taking_apar
 
 def read_table(path: str | Path, columns: Sequence[str], needed: Sequence[str] | None = None
                ) -> list[tuple[int, dict[str, str]]]:
-    """A CSV table with a heading, as spreadsheets save it: see `table_rows`.
+    """Lines and cells, by column, of a CSV table with a heading, as spreadsheets save it: see `table_rows`.
 
-    Parameters
-    ----------
-    columns : names
-        Those that are wanted.
-    needed : names, optional
-        Those of them that must be there; all, when not given.
-
-    Returns
-    -------
-    list of (line, {column: text})
-        Every one of `columns`, empty where the table does not have it; other columns too.
-
-    Raises
-    ------
-    StorageError
-        Missing, not a table, a column that is not there or comes twice, a line of another length.
+    Every one of `columns` is there, empty where the table does not have it, and other columns too. StorageError unless
+    the table has the `needed` ones of them, or all, each once, and lines that are equally long.
     """
     _, rows = table_rows(path, read_bytes(path, f"a table with the columns {','.join(columns)}"))
     head = rows[0][1] if rows else []

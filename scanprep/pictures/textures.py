@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 
-from ..geometry.formats.common import UNITS
+from ..geometry.format_common import UNITS
 from ..geometry.mesh import Mesh
 from ..geometry.storage import writing
 from ..geometry.surface import Rays, barycentric

@@ -47,7 +47,7 @@ class SkeletonConfig(Settings):
     tolerance: Positive = 0.001
     patches: Count = 300
     start: Count = 30
-    symmetric: Annotated[bool | None, FLAG] = None
+    symmetric: bool | None = None
     restarts: Count = 3
     seed: Seed = 0
 

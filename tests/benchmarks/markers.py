@@ -24,7 +24,7 @@ from completion.mocap.marker_sets.layout import MarkerLayout
 from completion.mocap.marker_sets.named import named_layout
 from completion.mocap.pose.follow import AnimateConfig, animate
 from completion.mocap.pose.stream import MarkerStream
-from completion.mocap.subject.marker_shape import subject_from_markers
+from completion.mocap.subject.person import find_person
 from completion.motion import Motion
 from model import learn_scape
 from model.body import BodyModel
@@ -100,7 +100,7 @@ def person(model: BodyModel, markers: MarkerSequence, layout: MarkerLayout, beta
     if betas:
         return model.subject(np.load(betas)["betas"]), layout
     if model.n_betas:
-        found = subject_from_markers(model, markers, layout)
+        found = find_person(model, markers, layout)
         return model.subject(found.betas), found.layout
     return model.subject(None), layout
 

@@ -21,9 +21,7 @@ from protocols import load_real, machine, spring_split, write_report
 from completion.mocap.files.markers import MarkerSequence
 from completion.mocap.marker_sets.layout import MarkerLayout
 from completion.mocap.marker_sets.named import layout_names, named_layout
-from completion.mocap.results import PersonFit
-from completion.mocap.settings import PersonConfig
-from completion.mocap.subject.person import find_person
+from completion.mocap.subject.person import PersonConfig, PersonFit, find_person
 from model.body import BodyModel
 from model.files import load_model
 from model.fitting import fit_pose

@@ -22,7 +22,7 @@ from scanprep.ranges import BETAS
 from ...cli import ModelOrNone, read_model
 from ..marker_sets.named import layout_or_file
 from ..pose.follow import AnimateConfig
-from ..subject.marker_shape import MarkerShapeConfig
+from ..subject.person import PersonConfig
 from .work import ENDINGS, MEAN_ERROR, BetasTo, GlbConfig, Work
 
 MarkersArg = Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="MARKERS")]
@@ -32,7 +32,7 @@ def animate_markers(markers: MarkersArg, output: Output, model: ModelOrNone = No
                     subject: str | None = None, unit: Unit | None = None, who: str | None = None,
                     retarget_to: Path | None = None, betas_to: Path | None = None,
                     config: AnimateConfig = AnimateConfig(),   # noqa: B008
-                    shape: MarkerShapeConfig = MarkerShapeConfig(),                               # noqa: B008
+                    person: PersonConfig = PersonConfig(),                                        # noqa: B008
                     glb: GlbConfig = GlbConfig(),                                                 # noqa: B008
                     workers: Workers = Workers(), *, space: Workspace) -> Outcome:              # noqa: B008
     """The motion of a person from markers, and the person.
@@ -61,7 +61,7 @@ def animate_markers(markers: MarkersArg, output: Output, model: ModelOrNone = No
         betas_to: Betas into which the body changes, in JSON: those at the end [b1, b2, ...], or keys in seconds
             {"0": [...], "2.5": [...]}: morph.glb.
         config: Settings.
-        shape: Settings of the subject from markers.
+        person: Settings of the person from markers.
         glb: Settings of animated files.
         workers: Who works through the files of a folder.
     """
@@ -69,8 +69,8 @@ def animate_markers(markers: MarkersArg, output: Output, model: ModelOrNone = No
     loaded, name = read_model(model)
     work = Work(loaded, name, None if layout is None else layout_or_file(layout), _subject(loaded, subject, unit),
                 None if retarget_to is None else read_subject(loaded, retarget_to, unit),
-                None if betas_to is None else read_betas_to(betas_to, loaded.n_betas), unit, who, config, shape, glb)
-    settings = {"animate": config, "shape": shape, "model": name}
+                None if betas_to is None else read_betas_to(betas_to, loaded.n_betas), unit, who, config, person, glb)
+    settings = {"animate": config, "person": person, "model": name}
     if markers.is_file():
         with bar("following the markers") as following:
             done = space.run(work, [Task("motion", markers)], inside=following).only

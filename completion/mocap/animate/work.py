@@ -24,7 +24,7 @@ from ..marker_sets.named import choose_layout
 from ..pose.follow import AnimateConfig, animate
 from ..pose.robust import motion_problem
 from ..retargeting.retarget import morphed_vertices, retarget
-from ..subject.marker_shape import MarkerShapeConfig, subject_from_markers
+from ..subject.person import PersonConfig, find_person
 from .report import motion_page
 
 BetasTo = dict[float, np.ndarray] | np.ndarray      # keys over seconds, or betas at the end
@@ -58,7 +58,7 @@ class Work:
     unit: str | None                     # as `read_markers` takes it, and whose markers
     who: str | None
     animate: AnimateConfig
-    shape: MarkerShapeConfig
+    person: PersonConfig
     glb: GlbConfig
 
     def __call__(self, path: Path, room: Room) -> list[Metric]:
@@ -76,8 +76,8 @@ def animate_file(work: Work, path: Path, room: Room) -> list[Metric]:
     metrics = [Metric("model", work.name), Metric("layout", name)]
     body, found = work.subject, None
     if body is None:
-        found = room.step("subject", (work.model, sequence, layout, work.shape),
-                          lambda: subject_from_markers(work.model, sequence, layout, work.shape, room.tell))
+        found = room.step("subject", (work.model, sequence, layout, work.person),
+                          lambda: find_person(work.model, sequence, layout, work.person, room.tell))
         body, layout = work.model.subject(found.betas), found.layout
         metrics.append(Metric("subject", f"{len(found.betas)} betas from {len(found.frames)} frames"))
     # a person found from a model: what it was found from tells as much as its body, and sooner
@@ -86,7 +86,8 @@ def animate_file(work: Work, path: Path, room: Room) -> list[Metric]:
                        lambda: animate(body, sequence, layout, work.animate, room.tell))
     output = room.folder
     if found is not None:
-        storage.write_json(output / "subject.json", {"betas": found.betas.tolist(), "frames": found.frames.tolist()})
+        storage.write_json(output / "subject.json", {"betas": found.betas.tolist(),
+                                                     "frames": found.frames[:, 1].tolist()})
         layout.save(output / "layout.json")
     problem = motion_problem(motion, body.template, layout, sequence)
     metrics = [*([Metric("problem", problem)] if problem else []), *metrics, *figures(motion, sequence)]

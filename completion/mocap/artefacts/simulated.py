@@ -5,6 +5,7 @@ import numpy as np
 
 from model.linear import Subject
 
+from ...motion import Motion
 from ..files.markers import MarkerSequence
 from ..marker_sets.layout import MarkerLayout
 from ..pose.follow import between_keys, seen_span
@@ -13,20 +14,11 @@ from ..pose.robust import marker_weights
 from ..pose.settings import AnimateConfig
 from ..pose.smooth import inertia, smoothed
 
-LOOKS = 15.0                         # frames per second in which it is asked how a marker draws the body
 OWN = 0.6                            # most of a displacement that the body is taken to have followed
 
 
 class Simulation:
-    """A body that follows markers whose labels are taken as they are.
-
-    Parameters
-    ----------
-    subject : Subject
-    markers : MarkerSequence
-    layout : MarkerLayout
-    config : AnimateConfig
-    """
+    """A body that follows markers whose labels are taken as they are."""
 
     def __init__(self, subject: Subject, markers: MarkerSequence, layout: MarkerLayout, config: AnimateConfig) -> None:
         self.labels = layout.matched(markers.labels)
@@ -58,17 +50,18 @@ class Simulation:
             x[inside] = smoothed(self.body, stiffness, x[inside], targets[inside], weights)
         return x
 
+    def taken_from(self, motion: Motion, repaired: np.ndarray) -> np.ndarray:
+        """Unknowns (T, P) of the body in a motion, which followed the repaired markers (T, all labels, 3)."""
+        self.targets = repaired[:, self.rows]
+        return self.body.body.join(motion.poses, motion.trans)
+
     def alone(self, off: np.ndarray, x: np.ndarray) -> np.ndarray:
         """What markers would be off (T, L, 3), metres, if the body x (T, P) followed the others alone.
 
         The body has gone after a displaced marker a little. Its own part in the normal equations is taken back.
-
-        Parameters
-        ----------
-        off : (T, L, 3) float, metres
-            From the simulated markers to the measured ones.
+        `off` (T, L, 3) is from the simulated markers to the measured ones.
         """
-        T, every = len(x), max(1, round(self.rate / LOOKS))
+        T, every = len(x), max(1, round(self.rate / 15))                # 15 looks a second at how markers draw the body
         frames = np.arange(min(every // 2, T - 1), T, every)
         freed = _between(self._freed(x[frames], frames), frames, T)
         return (freed @ off[..., None])[..., 0]
@@ -119,14 +112,9 @@ def usual_places(local: np.ndarray) -> np.ndarray:
 
 
 def bridged(local: np.ndarray, reach: float) -> np.ndarray:
-    """What markers are off (T, L, 3) with gaps bridged: straight from end to end, in long ones by way of the usual.
+    """What markers are off (T, L, 3), NaN in gaps, with these bridged: straight, in long ones by way of the usual.
 
-    Parameters
-    ----------
-    local : (T, L, 3) float, metres
-        NaN in gaps.
-    reach : float
-        Frames from an end of a long gap to where a marker is usually.
+    A marker is where it usually is `reach` frames from either end of a long gap.
     """
     out = np.repeat(usual_places(local)[None], len(local), axis=0)
     for i in range(local.shape[1]):

@@ -5,7 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from scanprep.geometry.formats.common import UNITS
+from scanprep.geometry.format_common import UNITS
 from scanprep.geometry.storage import StorageError
 
 MARKER_UNITS = UNITS

@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 
 from scanprep.geometry import storage
-from scanprep.geometry.formats.common import FARTHEST
+from scanprep.geometry.format_common import FARTHEST
 
 from .c3d import read_c3d, write_c3d
 from .common import MARKER_UNITS, MarkerFileError, RawMarkers

@@ -54,7 +54,7 @@ class DesignConfig(Settings):
     marker_sd: Positive = 0.005
     surface: Count = 1000
     exchanges: int = 1
-    checks: Annotated[tuple[Count, ...], FLAG] = ()
+    checks: tuple[Count, ...] = ()
 
 
 class BodyPoints:

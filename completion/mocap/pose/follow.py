@@ -15,11 +15,11 @@ from .foot_contact import Floor, FootContact
 from .initialise import reinitialise_limbs, search
 from .marked_body import MarkedBody
 from .robust import judge, label_order, marker_weights
-from .settings import AnimateConfig, FollowConfig, animate_config
+from .settings import AnimateConfig
 from .smooth import inertia, low_pass, smoothed
 from .stream import STEPS, Tracker
 
-__all__ = ["AnimateConfig", "animate", "follow_poses"]
+__all__ = ["AnimateConfig", "animate"]
 
 Progress = Callable[[int, int], None]
 KEY_INTERVAL = 0.1                   # seconds between the frames that are solved one after the other
@@ -72,15 +72,6 @@ def animate(subject: Subject, markers: MarkerSequence, layout: MarkerLayout, con
                                                         config.outlier)
     return Motion(pose.copy(), trans.copy(), subject.betas, markers.rate, residuals, markers.labels,
                   converged=settled, trusted=believed)
-
-
-def follow_poses(subject: Subject, markers: MarkerSequence, layout: MarkerLayout, config: FollowConfig | None = None,
-                 progress: Progress | None = None) -> Motion:
-    """The motion of a person whose shape and markers are known; `animate` with the weights of the paper.
-
-    [MoSh] Eq. 23
-    """
-    return animate(subject, markers, layout, animate_config(config or FollowConfig()), progress)
 
 
 def follow_frames(body: MarkedBody, targets: np.ndarray, frames: np.ndarray, rate: float, config: AnimateConfig,

@@ -4,11 +4,8 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Annotated, Literal
 
-import numpy as np
-
 from scanprep.ranges import FLAG, Positive, Settings, Share, Signed
 
-CENTIMETRE = 0.01                    # metres
 RATE = 120.0                         # frames per second for which the weight of the velocity is meant
 
 
@@ -52,38 +49,3 @@ class AnimateConfig(Settings):
     low_pass: float = 0.0
     ground: Annotated[bool, FLAG] = False
     floor: tuple[Signed, Signed, Signed, Signed] | None = None
-
-
-@dataclass(frozen=True)
-class FollowConfig(Settings):
-    """Settings of the poses of every frame of a person whose shape and markers are known.
-
-    Attributes
-    ----------
-    data, pose, velocity : float
-        Weights of the terms, in the paper's units: markers, pose prior, and change of velocity from frame to frame,
-        120 frames a second.
-    outlier : float, metres
-        Residual at which a marker has lost three quarters of its weight.
-    prior_shrinkage : float in [0, 1]
-        See `gaussian_prior`.
-    """
-
-    data: float = 2.0
-    pose: float = 0.3
-    velocity: float = 57600.0
-    outlier: Positive = 0.06
-    prior_shrinkage: Share = 0.3
-
-
-def animate_config(config: FollowConfig) -> AnimateConfig:
-    """The settings of `animate` for weights of the terms: each is the inverse of a squared deviation.
-
-    That of the velocity's change from frame to frame is meant for 120 frames per second; at another rate the
-    acceleration that it allows is the same.
-
-    [MoSh] Eq. 17, Eq. 21, Eq. 22
-    """
-    return AnimateConfig(marker_sd=CENTIMETRE / np.sqrt(config.data), prior_weight=config.pose,
-                         angle_acceleration=RATE**2 / np.sqrt(config.velocity), outlier=config.outlier,
-                         prior_shrinkage=config.prior_shrinkage)

@@ -12,7 +12,7 @@ from scanprep.pictures.shading import side_by_side
 from ...motion import spread_frames
 from ...motion_pictures import bodies_in_a_row, seconds
 from ..files.motion_files import write_glb
-from ..results import SoftTissue
+from ..soft_tissue.soft_tissue import SoftTissue
 from .creases import Creases, at_rest
 from .soft_tissue import deformation, moving_character
 

@@ -9,7 +9,7 @@ from scipy.sparse import csr_array
 from model.body import BodyModel
 from model.linear import Subject, posed_product
 
-from ..results import SoftTissue
+from ..soft_tissue.soft_tissue import SoftTissue
 from .retarget import AT_ONCE, retarget, world_up
 
 SOLES = 60                           # points that may touch the ground

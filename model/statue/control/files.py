@@ -7,9 +7,9 @@ from typing import Any
 
 import numpy as np
 
+from scanprep.geometry import format_glb as glb
 from scanprep.geometry import storage
-from scanprep.geometry.formats import glb
-from scanprep.geometry.formats.common import MeshFileError
+from scanprep.geometry.format_common import MeshFileError
 from scanprep.geometry.mesh import Mesh
 from scanprep.skeleton.tree import Skeleton
 

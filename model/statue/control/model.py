@@ -127,7 +127,7 @@ class Statue:
     control : ControlModel
         Fitted: its default pose is that of the scan.
     pose : (J, 3) float, radians
-        How the generic model's parts were turned from its default pose to that of the scan.
+        How the generic model's parts were rotated from its default pose to that of the scan.
     map : DisplacementMap
     texture : (H, W, 3) uint8, optional
         Colours over the same chart.

@@ -9,8 +9,8 @@ from typing import Any
 
 import numpy as np
 
-from .. import storage
-from .common import Contents, MeshFileError, as_colors, quote
+from . import storage
+from .format_common import Contents, MeshFileError, as_colors, quote
 
 _COMPONENTS = {5120: "i1", 5121: "u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
 _WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT4": 16}
@@ -184,7 +184,7 @@ def _colors(tree: dict[str, Any], binary: bytes, primitive: dict[str, Any], coun
 
 def encode(contents: Contents, double: bool) -> bytes:
     """A GLB file of one mesh with normals, in single precision whatever `double` says."""
-    from ..mesh import Mesh
+    from .mesh import Mesh
 
     assert contents.faces is not None, "a GLB file is written for meshes"
     points = contents.vertices.astype("<f4")
