@@ -15,8 +15,7 @@ from .colors import decode
 from .sheets import png_bytes
 
 # Turns that bring each axis to +y, the upward axis of glTF: quaternions x, y, z, w.
-_HALF = 0.5 ** 0.5
-UPRIGHT = {0: [0.0, 0.0, _HALF, _HALF], 1: [0.0, 0.0, 0.0, 1.0], 2: [-_HALF, 0.0, 0.0, _HALF]}
+UPRIGHT = {0: [0.0, 0.0, 0.5**0.5, 0.5**0.5], 1: [0.0, 0.0, 0.0, 1.0], 2: [-(0.5**0.5), 0.0, 0.0, 0.5**0.5]}
 VERTICES, _INDICES = 34962, 34963                                  # what a graphics card will use the numbers for
 _COMPONENTS = {"<f4": 5126, "<u4": 5125, "<u2": 5123, "|u1": 5121}
 
@@ -30,7 +29,11 @@ class Glb:
         self._accessors: list[dict[str, Any]] = []
 
     def add(self, array: np.ndarray, kind: str, target: int | None, bounds: bool = False) -> int:
-        """An accessor of float32 numbers; its index."""
+        """An accessor of float32 numbers, one of `kind` a row (a MAT4 column after column); its index.
+
+        `target` is `VERTICES` for what vertices have; `bounds` says the least and the greatest row, which glTF wants
+        of positions and times.
+        """
         values = np.ascontiguousarray(array, dtype="<f4")
         extra: dict[str, Any] = {}
         if bounds:
@@ -92,10 +95,10 @@ def skin_material(color: Sequence[float] = (0.60, 0.57, 0.53)) -> dict[str, Any]
 
 def write_animated_glb(path: str | Path, faces: np.ndarray, frames: np.ndarray, rate: float,
                        colors: np.ndarray | None = None, up: int = 2, keys: int = 60) -> None:
-    """Write a moving mesh that any glTF 2.0 viewer plays.
+    """Write a moving mesh, frames (T, N, 3) at `rate` a second, that any glTF 2.0 viewer plays.
 
-    Every key frame is a morph target with its own normals; the animation blends from one to the next. Nothing
-    but the core of glTF is used.
+    Every key frame is a morph target with its own normals; the animation blends from one to the next. Nothing but the
+    core of glTF is used. Of a longer motion `keys` evenly spaced frames are kept; the axis `up` points up.
     """
     data = animated_glb(faces, frames, rate, colors, up, keys)
     with writing(path) as beside:

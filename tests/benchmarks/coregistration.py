@@ -36,7 +36,7 @@ from scanprep.batch.pool import Workers
 from scanprep.decimation.decimate import decimate
 from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.surface import Surface
-from scanprep.registration.matches import orient, target_of
+from scanprep.geometry.target import orient, target_of
 from scanprep.registration.nonrigid import register
 from scanprep.skeleton.find import find_skeleton
 
