@@ -3,19 +3,18 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from cartoons import CARTOONS, CartoonShape, cartoon
 from completion_bodies import MEAN, worm_with_prior
 from glb_reader import Glb
 
-from completion import CartoonShape, Motion, cartoon, deformation, retarget_soft_tissue
-from completion.mocap.results import SoftTissue
-from completion.mocap.retargeting import pictures
-from completion.mocap.retargeting.cartoons import CARTOONS
-from completion.mocap.retargeting.creases import Creases, at_rest
+from completion import Motion, deformation, motion_pictures, retarget_soft_tissue
+from completion.bodies import at_rest
+from completion.mocap.retargeting.creases import Creases
 from completion.mocap.retargeting.pictures import picture_transfer, write_character
 from completion.mocap.retargeting.retarget import world_up
 from completion.mocap.retargeting.soft_tissue import moving_character
-from model.posing.character import CharacterConfig, character_model
-from model.posing.character_mesh import inside
+from completion.mocap.soft_tissue.soft_tissue import SoftTissue
+from model.posing.character import CharacterConfig, character_model, inside
 from scanprep.geometry import rotations
 from scanprep.geometry.surface import Surface
 
@@ -114,15 +113,15 @@ def test_creases_are_smoothed_and_nothing_else(model):
     body = model.vertices(pose, np.zeros(1))
     for blend in (0, 6):
         creases = Creases(rest, model.skeleton, blend)
-        assert not creases.turned_over(body, pose).any()
+        assert not creases.inverted(body, pose).any()
         np.testing.assert_array_equal(creases.smoothed(body[None], pose[None])[0], body)
     folded = body.copy()
     middle = int(np.argmin(np.abs(rest.vertices - rest.vertices.mean(axis=0)).sum(axis=1)))
     folded[middle] += 0.14 * np.array([1.0, 0.3, 0]) @ model.skeleton.part_rotations(pose)[0].T
-    turned = creases.turned_over(folded, pose)
+    turned = creases.inverted(folded, pose)
     assert turned.any() and (rest.faces[turned] == middle).any(axis=1).all()
     smooth = creases.smoothed(np.stack([body, folded]), np.stack([pose, pose]))
-    assert not creases.turned_over(smooth[1], pose).any()
+    assert not creases.inverted(smooth[1], pose).any()
     moved = np.flatnonzero(np.linalg.norm(smooth[1] - folded, axis=1))
     assert middle in moved and len(moved) < 30
     np.testing.assert_array_equal(smooth[0], body)
@@ -168,7 +167,7 @@ def test_files_and_pictures(model, soft, character, tmp_path, monkeypatch):
         seen.append(shape)
         return np.full((height, width, 3), 255, dtype=np.uint8)
 
-    monkeypatch.setattr(pictures, "render", draw)
+    monkeypatch.setattr(motion_pictures, "render", draw)
     sheet = picture_transfer(model, soft, character, moved, 3, 40)
     assert len(seen) == 9 and sheet.dtype == np.uint8
     assert [shape.color is None for shape in seen] == [True] * 6 + [False] * 3

@@ -11,7 +11,7 @@ from pathlib import Path
 import numpy as np
 
 from ..geometry import storage
-from ..geometry.formats.common import FARTHEST
+from ..geometry.format_common import FARTHEST
 from ..geometry.mesh import Mesh
 
 KIND, VERSION = "correspondences", 1

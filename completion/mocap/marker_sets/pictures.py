@@ -20,22 +20,12 @@ from .symmetry import label_pairs
 HEIGHT = 1000
 SIDES = ("front", "its left", "back", "its right")
 FIXED, LOOSE = (0.86, 0.24, 0.20), (0.93, 0.62, 0.12)
-INK = (24, 40, 92)
 
 
 def picture_layout(body: Mesh, layout: MarkerLayout, height: int | None = None) -> np.ndarray:
     """A body from four sides with its markers, each named where it is in sight; loose ones in another colour.
 
-    Parameters
-    ----------
-    body : Mesh
-        Standing.
-    layout : MarkerLayout
-    height : int, pixels, optional
-
-    Returns
-    -------
-    (H, W, 3) uint8
+    Returns (H, W, 3) uint8.
     """
     cameras, height = look_around(body), height or HEIGHT
     width = int(height * max(c.width / c.height for c in cameras)) + 100
@@ -72,7 +62,7 @@ def _write(draw: Any, label: str, place: np.ndarray, taken: list[tuple[float, fl
     boxes = [(a, b, a + wide, b + high) for a, b in spots]
     free = [box for box in boxes if not any(_meet(box, other) for other in taken)]
     box = (free or boxes)[0]
-    draw.text(box[:2], label, fill=INK, font=size)
+    draw.text(box[:2], label, fill=(24, 40, 92), font=size)
     return box
 
 
@@ -87,8 +77,7 @@ def marker_rows(body: Mesh, layout: MarkerLayout, skeleton: Skeleton | None = No
     others: dict[str, list[str]] = {}
     for alias, label in layout.aliases.items():
         others.setdefault(label, []).append(alias)
-    vertices = layout.vertices if layout.weights is None else \
-        layout.vertices[np.arange(len(layout.labels)), layout.weights.argmax(axis=1)]
+    vertices = layout.nearest
     rows: list[tuple[str, ...]] = []
     for i, label in enumerate(layout.labels):
         partner = "-" if pairs[i] < 0 else "middle" if pairs[i] == i else layout.labels[pairs[i]]
@@ -98,7 +87,6 @@ def marker_rows(body: Mesh, layout: MarkerLayout, skeleton: Skeleton | None = No
     return rows
 
 
-MARKER_HEADER = ("label", "also", "part", "partner", "from the skin", "place")
 
 
 def layout_page(name: str, body: Mesh, layout: MarkerLayout, picture: np.ndarray, figures: Mapping[str, str],
@@ -107,5 +95,6 @@ def layout_page(name: str, body: Mesh, layout: MarkerLayout, picture: np.ndarray
     page = Page(f"Markers: {name}", "Red markers sit on a point of the anatomy, yellow ones anywhere on their limb.")
     page.picture(picture, alt="the body from four sides with its markers")
     page.table(list(figures.items()), ("", ""))
-    page.section("Markers").table(marker_rows(body, layout, skeleton), MARKER_HEADER)
+    page.section("Markers").table(
+        marker_rows(body, layout, skeleton), ("label", "also", "part", "partner", "from the skin", "place"))
     return page

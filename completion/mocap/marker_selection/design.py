@@ -1,0 +1,237 @@
+"""Which markers to put on: the set from which bodies are estimated best."""
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from model.body import BodyModel
+
+from ..marker_sets.layout import MarkerLayout
+from .fits import DesignConfig, Progress, vertex_errors
+from .greedy import ADD, REMOVE, Groups, MarkerSets, Path, exchange, symmetric_groups, walk
+from .linear import LinearBodies, WholeFits, fit_bodies, shared_shape
+
+
+@dataclass(frozen=True, eq=False)
+class Curve:
+    """Sets of markers of many sizes, each the one before and a marker, or a pair, more or less."""
+
+    name: str                        # "removed" from all, "added" to those kept, or "kept, removed": these made fewer
+    start: tuple[str, ...]           # of the first set
+    steps: tuple[tuple[str, ...], ...]    # labels that came or went in every step
+    counts: np.ndarray               # (S,) int, markers of each set, the first included
+    rmse: np.ndarray                 # (S,), metres: over all vertices and bodies, linearised
+
+    def labels(self, count: int) -> tuple[str, ...]:
+        """The set with that many markers, or the most below it."""
+        below = np.flatnonzero(self.counts <= count)
+        if not len(below):
+            raise ValueError(f"count: expected at least {self.counts.min()}, got {count}")
+        moved = [label for step in self.steps[:int(below[np.argmax(self.counts[below])])] for label in step]
+        if self.name == "added":
+            return (*self.start, *moved)
+        return tuple(label for label in self.start if label not in moved)
+
+
+@dataclass(frozen=True, eq=False)
+class Check:
+    """A set of markers, its bodies estimated again without linearising."""
+
+    count: int
+    linearised: float                # metres, root mean squared distance over all vertices and bodies
+    full: float                      # metres, the same by a full refit
+
+
+@dataclass(frozen=True, eq=False)
+class MarkerDesign:
+    """A set of markers and how it was found.
+
+    Attributes
+    ----------
+    layout : MarkerLayout
+        The set, in the order of the candidates.
+    rmse : float, metres
+        Over all vertices and bodies, estimated from these markers, linearised.
+    full : float, optional, metres
+        The same by full refits; none where bodies of a person share betas.
+    floor : float, metres
+        What the model leaves of the bodies when it sees all of their surface.
+    other_half : float, metres
+        With sets chosen on one half of the bodies, measured on the other half; a set that only suits the bodies it
+        was chosen on has much more than `rmse`.
+    curves : tuple of Curve
+    checks : tuple of Check
+    exchanged : int
+        Groups exchanged after the last step.
+    """
+
+    layout: MarkerLayout
+    rmse: float
+    full: float | None
+    floor: float
+    other_half: float
+    curves: tuple[Curve, ...]
+    checks: tuple[Check, ...]
+    exchanged: int
+
+
+FEWEST = 3                           # markers below which a body has no place
+
+
+@dataclass(frozen=True, eq=False)
+class Choice:
+    """What the search for one set found."""
+
+    paths: dict[str, Path]
+    groups: np.ndarray               # (n,) int, of the set
+    rmse: float                      # metres
+    exchanged: int
+
+
+def design_markers(model: BodyModel, bodies: np.ndarray, candidates: MarkerLayout, config: DesignConfig | None = None,
+                   progress: Progress | None = None, *, keep: Sequence[str] = (),
+                   partners: np.ndarray | None = None, people: np.ndarray | None = None) -> MarkerDesign:
+    """The set of markers from which the model estimates the whole surface of some bodies best.
+
+    Every body is estimated from each set by itself, with the priors of shape and pose and with markers where the
+    body has them on its skin. Estimates are linearised around the fit to the whole body; sets are made by taking away
+    and adding the marker, or pair, that serves best, and at last by exchanges.
+
+    Parameters
+    ----------
+    model : BodyModel
+        With betas.
+    bodies : (Z, N, 3) float, metres
+        In the topology of the model's template, in any poses.
+    candidates : MarkerLayout
+    config : DesignConfig, optional
+    progress : callable, optional
+        Called with (done, total).
+    keep : labels, optional
+        Candidates that stay in the set, with their partners.
+    partners : (C,) int, optional
+        The candidate on the other side, which comes and goes with it, as `marker_pairs` finds it by place; without it
+        labels tell.
+    people : (Z,) int, optional
+        Whose body each is; else the first half of the bodies are other people than the second.
+
+    Raises
+    ------
+    ValueError
+        A model without betas, bodies of another shape, a count that cannot be had, unknown labels.
+
+    [MoSh] Eq. 25
+    [MoSh] Eq. 26
+    [MoSh] Eq. 27
+    """
+    config = config or DesignConfig()
+    groups = symmetric_groups(candidates.labels, partners)
+    kept = _kept(candidates, groups, keep, config)
+    if config.joint and people is None:
+        raise ValueError("people: expected whose body each is, for betas that are common to a person's bodies")
+    total = 2 * len(bodies) + 2 * len(candidates.labels)
+    tell = progress or (lambda done, total: None)
+    fits = fit_bodies(model, bodies, candidates, config, lambda done, _: tell(done, total))
+    linear, halves = fits.linear, np.arange(len(bodies)) < (len(bodies) + 1) // 2
+    if people is not None:
+        names = np.unique(people)
+        halves = np.isin(people, names[:(len(names) + 1) // 2])
+    if config.joint:
+        assert people is not None, "checked above"
+        linear = shared_shape(fits.linear, fits.x, np.asarray(people), fits.markers.n_betas)
+        halves = np.arange(len(linear.rest)) < (len(linear.rest) + 1) // 2
+    choice = choose(linear, groups, kept, config, lambda done: tell(min(2 * len(bodies) + done, total), total))
+    other = _other_half(linear, halves, groups, kept, config)
+    tell(total, total)
+    chosen = _members(groups, choice.groups)
+    full, checks = None, tuple[Check, ...]()
+    if not config.joint:
+        full = _refitted(model, bodies, fits, chosen, config)
+        checks = tuple(_check(model, bodies, fits, groups, choice, count, config) for count in config.checks)
+    curves = tuple(_curve(name, path, groups, candidates.labels) for name, path in choice.paths.items())
+    gone = [label for i, label in enumerate(candidates.labels) if i not in chosen]
+    return MarkerDesign(candidates.without(gone), choice.rmse, full,
+                        float(np.sqrt(fits.linear.rest.mean())), other, curves, checks, choice.exchanged)
+
+
+def choose(linear: LinearBodies, groups: Groups, kept: np.ndarray, config: DesignConfig,
+           tell: Callable[[int], None] | None = None) -> Choice:
+    """The set of `config.count` markers, and the curves it comes from.
+
+    `kept` (n,): groups that stay.
+    """
+    every, free, step = np.arange(len(groups)), ~kept, [0]
+    stops = {config.count, *config.through}
+
+    def told(_: int) -> None:
+        step[0] += 1
+        if tell is not None:
+            tell(step[0])
+
+    paths = {"removed": walk(MarkerSets(linear, groups, every), REMOVE, free, FEWEST, stops, told),
+             "added": walk(MarkerSets(linear, groups, np.flatnonzero(kept)), ADD, free, sum(map(len, groups)), stops,
+                           told)}
+    best = best_path(paths, config.count)
+    sets = MarkerSets(linear, groups, best.set(best.at(config.count)))
+    exchanged = exchange(sets, free, config.exchanges)
+    alone = MarkerSets(linear, groups, np.flatnonzero(kept))
+    if alone.count > FEWEST:
+        paths["kept, removed"] = walk(alone, REMOVE, kept, FEWEST, stops, told)
+    chosen = np.flatnonzero(sets.inside)
+    return Choice(paths, chosen, linear.rmse(_members(groups, chosen)), exchanged)
+
+
+def best_path(paths: dict[str, Path], count: int) -> Path:
+    """Of those that have a set with that many markers, or nearly, the one with the least error there."""
+    found = [path for path in paths.values() if path.at(count) >= 0]
+    return min(found, key=lambda path: (-path.counts[path.at(count)], path.rmse[path.at(count)]))
+
+
+def _kept(candidates: MarkerLayout, groups: Groups, keep: Sequence[str], config: DesignConfig) -> np.ndarray:
+    """(n,) bool: groups that stay."""
+    unknown = [label for label in keep if label not in candidates.labels]
+    if unknown:
+        raise ValueError(f"keep: {', '.join(unknown)} not among the candidates")
+    kept = np.array([any(candidates.labels[i] in keep for i in group) for group in groups])
+    least, most = sum(len(g) for g, k in zip(groups, kept, strict=True) if k), len(candidates.labels)
+    if not max(FEWEST, least) <= config.count <= most:
+        raise ValueError(f"count: expected {max(FEWEST, least)}..{most} markers, those that stay and the candidates, "
+                         f"got {config.count}")
+    return kept
+
+
+def _members(groups: Groups, chosen: np.ndarray) -> list[int]:
+    return sorted(i for g in chosen for i in groups[g])
+
+
+def _other_half(linear: LinearBodies, first: np.ndarray, groups: Groups, kept: np.ndarray, config: DesignConfig
+                ) -> float:
+    """RMSE, metres, with sets chosen on one half of the bodies and measured on the other."""
+    squared = []
+    for mine in (first, ~first):
+        if not mine.any() or mine.all():
+            return float("nan")
+        found = choose(linear.of(mine), groups, kept, config)
+        other = linear.of(~mine)
+        squared.append(other.left(other.steps(_members(groups, found.groups))))
+    return float(np.sqrt(np.concatenate(squared).mean()))
+
+
+def _refitted(model: BodyModel, bodies: np.ndarray, fits: WholeFits, chosen: list[int], config: DesignConfig) -> float:
+    x = fits.refitted(chosen, config)
+    return float(np.sqrt(vertex_errors(model, x, bodies).mean()))
+
+
+def _check(model: BodyModel, bodies: np.ndarray, fits: WholeFits, groups: Groups, choice: Choice, count: int,
+           config: DesignConfig) -> Check:
+    path = best_path(choice.paths, count)
+    i = path.at(count)
+    return Check(int(path.counts[i]), float(path.rmse[i]),
+                 _refitted(model, bodies, fits, _members(groups, path.set(i)), config))
+
+
+def _curve(name: str, path: Path, groups: Groups, labels: Sequence[str]) -> Curve:
+    return Curve(name, tuple(labels[i] for i in _members(groups, path.start)),
+                 tuple(tuple(labels[i] for i in groups[g]) for g in path.steps), path.counts, path.rmse)

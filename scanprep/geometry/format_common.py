@@ -1,0 +1,174 @@
+"""What the readers of all formats share: the error, the contents of a file, polygons and tables of numbers."""
+from __future__ import annotations
+
+import contextlib
+import gzip
+import io
+import warnings
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+
+from . import storage
+
+FARTHEST = 1e9                       # of a coordinate, in whatever unit
+UNITS = {"m": 1.0, "mm": 1e-3, "cm": 1e-2, "in": 0.0254}
+
+
+class MeshFileError(storage.StorageError):
+    """A file of a mesh, points or landmarks that cannot be read: which one, what was expected, what came."""
+
+
+@dataclass(frozen=True, eq=False)
+class Contents:
+    """What a file of any format holds, in the file's own unit and order."""
+
+    vertices: np.ndarray                    # (N, 3)
+    faces: np.ndarray | None = None         # (F, 3)
+    normals: np.ndarray | None = None       # (N, 3)
+    colors: np.ndarray | None = None        # (N, 3) in [0, 1]
+
+
+def load_bytes(path: Path) -> bytes:
+    """The whole file, unpacked when its name ends in `.gz`; MeshFileError for one that is missing, damaged or empty."""
+    try:
+        data = path.read_bytes()
+    except OSError as error:
+        what = {FileNotFoundError: "no such file", IsADirectoryError: "expected a file, found a folder"}
+        raise MeshFileError(f"{path}: {what.get(type(error), f'cannot be read ({error.strerror or error})')}") from None
+    if path.suffix.lower() == ".gz":
+        data = _unpacked(path, data)
+    if not data:
+        raise MeshFileError(f"{path}: the file is empty")
+    return data
+
+
+def _unpacked(path: Path, data: bytes) -> bytes:
+    """What a gzip file holds, up to far more than any mesh can be packed."""
+    most = 2**20 + 50 * len(data)
+    try:
+        with gzip.GzipFile(fileobj=io.BytesIO(data)) as packed:
+            out = packed.read(most + 1)
+    except Exception as error:                   # gzip lets errors of zlib and of struct through
+        raise MeshFileError(f"{path}: truncated or damaged gzip file ({error})") from None
+    if len(out) > most:
+        raise MeshFileError(f"{path}: expected a packed mesh, found {len(data)} bytes that unpack to more than {most}")
+    return out
+
+
+def check_extent(path: Path, what: str, points: np.ndarray) -> None:
+    """MeshFileError for coordinates that no scan has, and that have no squares, lengths and areas."""
+    far = np.flatnonzero((np.abs(points) > FARTHEST).any(axis=1) & np.isfinite(points).all(axis=1))
+    if len(far):
+        raise MeshFileError(f"{path}: {what} {far[0]} lies at {points[far[0]].tolist()}, "
+                            f"expected coordinates below {FARTHEST:g}")
+
+
+def metres_per_unit(path: Path, points: np.ndarray, unit: str | None, smallest: float = 0.1) -> float:
+    """What to multiply the coordinates of a file with to have metres.
+
+    Warns where metres are assumed and would make the points span more than 10 m or less than `smallest`.
+    """
+    if unit is not None:
+        if unit not in UNITS:
+            raise ValueError(f"unit: expected one of {', '.join(UNITS)}, got {unit!r}")
+        return UNITS[unit]
+    extent = float(np.ptp(points, axis=0).max()) if len(points) else 0.0
+    if extent > 10:
+        likely = min(("mm", "cm", "in"), key=lambda u: abs(np.log(extent * UNITS[u] / 1.7)))
+        warnings.warn(f"{path}: {extent:.4g} m from end to end when read as metres; "
+                      f"it looks like unit='{likely}' ({extent * UNITS[likely]:.3g} m)", stacklevel=3)
+    elif 0 < extent < smallest:
+        warnings.warn(f"{path}: {extent:.2g} m from end to end when read as metres; it looks as if millimetres "
+                      f"had been divided by 1000 twice ({extent * 1000:.3g} m)", stacklevel=3)
+    return 1.0
+
+
+def quote(text: bytes | str, length: int = 40) -> str:
+    """The beginning of a piece of a file, fit for one line of an error."""
+    shown = text if isinstance(text, str) else text.decode("latin-1")
+    return repr(shown if len(shown) <= length else shown[:length] + "...")
+
+
+class Lines:
+    """The lines of a text file that hold something, with their numbers from `first` on; without comments."""
+
+    def __init__(self, path: Path, data: bytes, first: int = 1, comment: bytes | None = None) -> None:
+        self.path = path
+        lines = data.splitlines()
+        if comment is not None and comment in data:
+            lines = [line.split(comment, 1)[0] for line in lines]
+        self.text = list(filter(bytes.strip, lines))
+        self.numbers: Sequence[int] = range(first, first + len(lines))
+        if len(self.text) < len(lines):
+            self.numbers = [number for number, line in enumerate(lines, first) if line.strip()]
+
+    def __len__(self) -> int:
+        return len(self.text)
+
+    def fail(self, row: int, expected: str) -> MeshFileError:
+        """The error for a row that is not as expected; past the last row: the file is truncated."""
+        if row >= len(self.text):
+            return MeshFileError(f"{self.path}: truncated: expected {expected}, found the end of the file")
+        return MeshFileError(f"{self.path}: line {self.numbers[row]}: expected {expected}, "
+                             f"found {quote(self.text[row].strip())}")
+
+    def table(self, rows: range, expected: str, columns: int, dtype: type = np.float64) -> np.ndarray:
+        """Numbers (rows, at least `columns`) of rows that all have equally many, or the error of the first bad one."""
+        if not rows:
+            return np.zeros((0, columns), dtype=dtype)
+        if rows.stop <= len(self.text):
+            with contextlib.suppress(ValueError):
+                values: np.ndarray = np.loadtxt(self.text[rows.start:rows.stop], dtype=dtype, ndmin=2, comments=None)
+                if values.shape[1] >= columns:
+                    return values
+        width = None
+        for row in rows:
+            words = self.text[row].split() if row < len(self.text) else []
+            try:
+                if len(words) < columns or len(words) != (width or len(words)):
+                    raise ValueError
+                width = len([dtype(word) for word in words])
+            except (ValueError, OverflowError):
+                raise self.fail(row, expected) from None
+        raise self.fail(rows.start, expected)
+
+
+def polygons(path: Path, sizes: np.ndarray, corners: np.ndarray, count: int,
+             numbers: Sequence[int] | None = None) -> np.ndarray:
+    """Triangles (F, 3) of polygons of `sizes` (P,) corners, each cut into a fan around its first corner.
+
+    `corners` are their vertices, of `count`, one polygon after the other; `numbers` the lines of the polygons.
+    MeshFileError for fewer than three corners, or a vertex out of range.
+    """
+    sizes, corners = np.asarray(sizes, dtype=np.int64), np.asarray(corners, dtype=np.int64)
+    start = np.cumsum(sizes) - sizes
+
+    def where(p: int) -> str:
+        return f"{path}: " + (f"line {numbers[p]}: " if numbers is not None else "") + f"face {p}"
+
+    few = np.flatnonzero(sizes < 3)
+    if len(few):
+        raise MeshFileError(f"{where(few[0])} has {sizes[few[0]]} corners, expected at least 3")
+    outside = np.flatnonzero((corners < 0) | (corners >= count))
+    if len(outside):
+        p = int(np.searchsorted(start, outside[0], side="right")) - 1
+        raise MeshFileError(f"{where(p)} refers to vertex {corners[outside[0]]}, expected 0..{count - 1}")
+    if (sizes == 3).all():
+        return corners.reshape(-1, 3)
+    of = np.repeat(np.arange(len(sizes)), sizes - 2)
+    within = np.arange(len(of)) - np.repeat(np.cumsum(sizes - 2) - (sizes - 2), sizes - 2)
+    return np.stack([corners[start[of]], corners[start[of] + within + 1], corners[start[of] + within + 2]], axis=1)
+
+
+def as_colors(values: np.ndarray, kind: np.dtype) -> np.ndarray:
+    """Colours in [0, 1] of values stored as integers of full scale or as floats in [0, 1]."""
+    scale = np.iinfo(kind).max if kind.kind in "iu" else 1.0
+    return np.clip(np.asarray(values, dtype=np.float64) / scale, 0, 1)
+
+
+def as_bytes(colors: np.ndarray) -> np.ndarray:
+    """Colours in [0, 1] as integers 0..255."""
+    return np.clip(np.rint(255 * colors), 0, 255).astype(np.uint8)

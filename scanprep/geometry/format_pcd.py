@@ -1,0 +1,120 @@
+"""PCD, the point cloud file of PCL: ascii and binary."""
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from . import storage
+from .format_common import Contents, Lines, MeshFileError, as_bytes, quote
+
+_KEYS = (b"VERSION", b"FIELDS", b"SIZE", b"TYPE", b"COUNT", b"WIDTH", b"HEIGHT", b"VIEWPOINT", b"POINTS", b"DATA")
+
+
+def read(path: Path, data: bytes) -> Contents:
+    """The points, normals and colours of a PCD file; points that are not finite (no return) are left out."""
+    header, start, line = _header(path, data)
+    names = header[b"FIELDS"]
+    try:
+        row = _row(header)
+        count = int(header[b"POINTS"][0])
+        if count < 0 or any(row[name].shape for name in ("x", "y", "z") if name in (row.names or ())):
+            raise ValueError("one x, y, z for each of POINTS")
+    except (KeyError, IndexError, ValueError, TypeError, OverflowError, MemoryError) as error:
+        raise MeshFileError(f"{path}: expected FIELDS, SIZE, TYPE, COUNT and POINTS that agree in the PCD header "
+                            f"({error})") from None
+    if not {b"x", b"y", b"z"} <= set(names):
+        raise MeshFileError(f"{path}: expected fields x, y, z in the PCD header, found {quote(b' '.join(names))}")
+    how = header[b"DATA"][0]
+    if how == b"ascii":
+        columns = _ascii(Lines(path, data[start:], line), row, count)
+    elif how == b"binary":
+        if len(data) - start < row.itemsize * count:
+            raise MeshFileError(f"{path}: truncated: expected {count} points, "
+                                f"found {(len(data) - start) // row.itemsize}")
+        table = np.frombuffer(data, row, count, start)
+        columns = {name: table[name] for name in row.names or ()}
+    else:
+        raise MeshFileError(f"{path}: expected DATA ascii or binary in the PCD header, found {quote(how)}; "
+                            f"save the file as binary")
+    with storage.taking_apart(path, "three normals and one colour of each point", MeshFileError):
+        return _contents(columns)
+
+
+def _header(path: Path, data: bytes) -> tuple[dict[bytes, list[bytes]], int, int]:
+    header: dict[bytes, list[bytes]] = {}
+    start, number = 0, 0
+    while b"DATA" not in header:
+        end = data.find(b"\n", start)
+        if end < 0:
+            raise MeshFileError(f"{path}: truncated or not a PCD file: the header has no line DATA")
+        words, number = data[start:end].split(b"#")[0].split(), number + 1
+        if words and words[0] not in _KEYS:
+            raise MeshFileError(f"{path}: line {number}: expected a line of a PCD header, "
+                                f"found {quote(data[start:end])}")
+        if words:
+            header[words[0]] = words[1:]
+        start = end + 1
+    if not header.get(b"FIELDS") or not header[b"DATA"]:
+        raise MeshFileError(f"{path}: expected FIELDS and DATA in the PCD header, found {list(header)}")
+    return header, start, number + 1
+
+
+def _row(header: dict[bytes, list[bytes]]) -> np.dtype:
+    fields: list[tuple] = []
+    letters = {b"F": "f", b"U": "u", b"I": "i"}
+    counts = header.get(b"COUNT", [b"1"] * len(header[b"FIELDS"]))
+    for i, name in enumerate(header[b"FIELDS"]):
+        kind = f"<{letters[header[b'TYPE'][i]]}{int(header[b'SIZE'][i])}"
+        text = f"padding{i}" if name == b"_" else name.decode()
+        fields.append((text, kind) if int(counts[i]) == 1 else (text, kind, (int(counts[i]),)))
+    return np.dtype(fields)
+
+
+def _ascii(lines: Lines, row: np.dtype, count: int) -> dict[str, np.ndarray]:
+    widths = [int(np.prod(row[name].shape)) for name in row.names or ()]
+    if len(lines) > count:
+        raise lines.fail(count, f"the end of the file after {count} points")
+    table = lines.table(range(count), f"{sum(widths)} numbers of a point, of {count} points", sum(widths))
+    start = np.cumsum([0, *widths])
+    columns = {}
+    for i, name in enumerate(row.names or ()):
+        values = table[:, start[i]]
+        columns[name] = values.astype(row[name]) if widths[i] == 1 else table[:, start[i]:start[i + 1]]
+    return columns
+
+
+def _contents(columns: dict[str, np.ndarray]) -> Contents:
+    points = np.stack([columns[name] for name in "xyz"], axis=1).astype(np.float64)
+    kept = np.isfinite(points).all(axis=1)
+    normals = colors = None
+    if {"normal_x", "normal_y", "normal_z"} <= set(columns):
+        normals = np.stack([columns[f"normal_{a}"] for a in "xyz"], axis=1).astype(np.float64)[kept]
+    packed = next((columns[name] for name in ("rgb", "rgba") if name in columns), None)
+    if packed is not None and packed.dtype.itemsize == 4 and packed.ndim == 1:       # 0xrrggbb, maybe in a float
+        bits = np.ascontiguousarray(packed).view(np.uint32)[kept]
+        colors = np.stack([(bits >> shift) & 255 for shift in (16, 8, 0)], axis=1) / 255
+    return Contents(points[kept], None, normals, colors)
+
+
+def encode(contents: Contents, double: bool) -> bytes:
+    """A binary PCD file."""
+    size = 8 if double else 4
+    fields = [("x", f"<f{size}"), ("y", f"<f{size}"), ("z", f"<f{size}")]
+    if contents.normals is not None:
+        fields += [("normal_x", "<f4"), ("normal_y", "<f4"), ("normal_z", "<f4")]
+    if contents.colors is not None:
+        fields.append(("rgb", "<u4"))
+    rows = np.zeros(len(contents.vertices), dtype=fields)
+    for i, axis in enumerate("xyz"):
+        rows[axis] = contents.vertices[:, i]
+        if contents.normals is not None:
+            rows[f"normal_{axis}"] = contents.normals[:, i]
+    if contents.colors is not None:
+        r, g, b = as_bytes(contents.colors).astype(np.uint32).T
+        rows["rgb"] = (r << 16) | (g << 8) | b
+    lines = ["VERSION 0.7", "FIELDS " + " ".join(n for n, _ in fields),
+             "SIZE " + " ".join(k[2] for _, k in fields), "TYPE " + " ".join(k[1].upper() for _, k in fields),
+             "COUNT " + " ".join("1" for _ in fields), f"WIDTH {len(rows)}", "HEIGHT 1",
+             "VIEWPOINT 0 0 0 1 0 0 0", f"POINTS {len(rows)}", "DATA binary"]
+    return ("\n".join(lines) + "\n").encode() + rows.tobytes()

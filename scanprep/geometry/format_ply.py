@@ -1,0 +1,250 @@
+"""PLY: ascii and binary of either byte order, with colours and normals; everything else is skipped."""
+from __future__ import annotations
+
+import contextlib
+from dataclasses import dataclass
+from itertools import islice
+from pathlib import Path
+from struct import Struct
+
+import numpy as np
+
+from . import storage
+from .format_common import Contents, Lines, MeshFileError, as_bytes, as_colors, polygons, quote
+
+_TYPES = {"char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4", "float": "f4",
+          "double": "f8", "int8": "i1", "uint8": "u1", "int16": "i2", "uint16": "u2", "int32": "i4",
+          "uint32": "u4", "int64": "i8", "uint64": "u8", "float32": "f4", "float64": "f8"}
+_LETTERS = {"i1": "b", "u1": "B", "i2": "h", "u2": "H", "i4": "i", "u4": "I", "i8": "q", "u8": "Q"}
+_ORDERS = {b"ascii": "=", b"binary_little_endian": "<", b"binary_big_endian": ">"}
+_COLORS = (("red", "green", "blue"), ("r", "g", "b"), ("diffuse_red", "diffuse_green", "diffuse_blue"))
+
+
+@dataclass(frozen=True)
+class Property:
+    name: str
+    kind: str                        # numpy type code of the value or of the list's items
+    length_kind: str | None = None   # that of the list's length, None for a single value
+
+
+@dataclass(frozen=True)
+class Element:
+    name: str
+    count: int
+    properties: tuple[Property, ...]
+
+
+_Column = np.ndarray | tuple[np.ndarray, np.ndarray]     # values, or the lengths and the items of lists
+
+
+def read(path: Path, data: bytes) -> Contents:
+    """The vertices, triangles, normals and colours of a PLY file."""
+    order, elements, start, first_line = _header(path, data)
+    names = [e.name for e in elements]
+    if "vertex" not in names or len(set(names)) < len(names):
+        raise MeshFileError(f"{path}: expected an element vertex, and each element once, the header has {names}")
+    lines = Lines(path, data[start:], first_line) if order == "=" else None
+    found: dict[str, dict[str, _Column]] = {}
+    place = 0 if lines else start
+    for element in elements:
+        found[element.name], place = (ascii_element(lines, element, place) if lines
+                                      else _binary_element(path, data, element, place, order))
+    rest = len(lines) - place if lines else len(data[place:].rstrip(b"\0\r\n\t "))
+    if rest > 0:
+        counts = ", ".join(f"{e.count} {e.name}" for e in elements)
+        raise MeshFileError(f"{path}: expected the end of the file after {counts}, found {rest} more "
+                            f"{'lines' if lines else 'bytes'}")
+    return _contents(path, elements[names.index("vertex")], found)
+
+
+def _header(path: Path, data: bytes) -> tuple[str, list[Element], int, int]:
+    """Byte order, elements, and the place and line number where the body begins."""
+    if not data.startswith(b"ply") or data[3:4] not in (b"\n", b"\r"):
+        raise MeshFileError(f"{path}: expected a PLY file that begins with 'ply', found {quote(data[:20])}")
+    end = data.find(b"end_header")
+    if end < 0:
+        raise MeshFileError(f"{path}: truncated: the PLY header has no end_header")
+    after = end + len(b"end_header")
+    after += len(b"\r\n") if data[3:5] == b"\r\n" else 1
+    order, elements, lines = None, [], data[:end].splitlines()
+    for number, line in enumerate(lines[1:], 2):
+        words = line.split()
+        try:
+            if not words or words[0] in (b"comment", b"obj_info"):
+                continue
+            if words[0] == b"format":
+                order = _ORDERS[words[1]]
+            elif words[0] == b"element":
+                elements.append(Element(words[1].decode(), int(words[2]), ()))
+                if elements[-1].count < 0:
+                    raise ValueError
+            elif words[0] == b"property":
+                last = elements[-1]
+                elements[-1] = Element(last.name, last.count, (*last.properties, _property(words)))
+            else:
+                raise KeyError
+        except (KeyError, IndexError, ValueError):
+            raise MeshFileError(f"{path}: line {number}: expected a line of a PLY header, "
+                                f"found {quote(line)}") from None
+    if order is None:
+        raise MeshFileError(f"{path}: expected a format line in the PLY header, found none")
+    return order, elements, after, len(lines) + 2
+
+
+def _property(words: list[bytes]) -> Property:
+    text = [w.decode() for w in words]
+    if text[1] == "list":
+        if _TYPES[text[2]][0] == "f":
+            raise ValueError
+        return Property(text[4], _TYPES[text[3]], _TYPES[text[2]])
+    return Property(text[2], _TYPES[text[1]])
+
+
+def _binary_element(path: Path, data: bytes, element: Element, start: int, order: str
+                    ) -> tuple[dict[str, _Column], int]:
+    """All rows at once when every list has the length it has in the first row, else row by row."""
+    fields, at = list[tuple](), start
+    for i, p in enumerate(element.properties):
+        n = 1
+        if p.length_kind:
+            width = int(p.length_kind[1])
+            n = int.from_bytes(data[at:at + width], "big" if order == ">" else "little") if element.count else 0
+            fields.append((f"length{i}", order + p.length_kind))
+            at += width
+        fields.append((f"value{i}", order + p.kind, (n,) if p.length_kind else ()))
+        at += n * int(p.kind[1])
+        if at > len(data) and element.count:
+            raise _truncated(path, element, 0)
+    row = np.dtype(fields)
+    if start + row.itemsize * element.count > len(data):
+        return _binary_rows(path, data, element, start, order)
+    table = np.frombuffer(data, row, element.count, start) if fields and element.count else np.zeros(0, row)
+    columns: dict[str, _Column] = {}
+    for i, p in enumerate(element.properties):
+        values = table[f"value{i}"]
+        if not p.length_kind:
+            columns[p.name] = values
+        elif (table[f"length{i}"] == values.shape[1]).all():
+            columns[p.name] = np.full(element.count, values.shape[1]), values.reshape(-1)
+        else:
+            return _binary_rows(path, data, element, start, order)
+    return columns, start + row.itemsize * element.count
+
+
+def _binary_rows(path: Path, data: bytes, element: Element, start: int, order: str
+                 ) -> tuple[dict[str, _Column], int]:
+    ways = [(int(p.kind[1]), Struct(order + _LETTERS[p.length_kind]) if p.length_kind else None)
+            for p in element.properties]
+    sizes, items = [list[int]() for _ in ways], [bytearray() for _ in ways]
+    for row in range(element.count):
+        for (width, length), size, item in zip(ways, sizes, items, strict=True):
+            n = 1
+            if length is not None:
+                if start + length.size > len(data):
+                    raise _truncated(path, element, row)
+                n = length.unpack_from(data, start)[0]
+                start += length.size
+            if n < 0 or start + n * width > len(data):
+                raise _truncated(path, element, row)
+            size.append(n)
+            item += data[start:start + n * width]
+            start += n * width
+    columns: dict[str, _Column] = {}
+    for p, size, item in zip(element.properties, sizes, items, strict=True):
+        values = np.frombuffer(item, order + p.kind)
+        columns[p.name] = (np.array(size, dtype=np.int64), values) if p.length_kind else values
+    return columns, start
+
+
+def _truncated(path: Path, element: Element, found: int) -> MeshFileError:
+    return MeshFileError(f"{path}: truncated: expected {element.count} rows of element {element.name}, "
+                         f"found {found}")
+
+
+def ascii_element(lines: Lines, element: Element, start: int) -> tuple[dict[str, _Column], int]:
+    """All rows at once where there are no lists, or one of whole numbers that has always the same length."""
+    stop = start + element.count
+    if stop > len(lines):
+        raise _truncated(lines.path, element, max(len(lines) - start, 0))
+    properties, width = element.properties, len(element.properties)
+    kind = np.int64 if all(p.kind[0] in "iu" for p in properties) else np.float64
+    if not any(p.length_kind for p in properties):
+        table = lines.table(range(start, stop), f"{width} values of element {element.name}", width, kind)
+        return {p.name: table[:, i] for i, p in enumerate(properties)}, stop
+    if width == 1 and kind is np.int64 and element.count:
+        with contextlib.suppress(ValueError):
+            table = np.loadtxt(lines.text[start:stop], dtype=kind, ndmin=2, comments=None)
+            if (table[:, 0] == table.shape[1] - 1).all():
+                return {properties[0].name: (table[:, 0], table[:, 1:].reshape(-1))}, stop
+    return _ascii_rows(lines, element, range(start, stop)), stop
+
+
+def _ascii_rows(lines: Lines, element: Element, rows: range) -> dict[str, _Column]:
+    sizes, items = [list[int]() for _ in element.properties], [list[float]() for _ in element.properties]
+    for row in rows:
+        words = iter(lines.text[row].split())
+        try:
+            for p, size, item in zip(element.properties, sizes, items, strict=True):
+                size.append(int(next(words)) if p.length_kind else 1)
+                values = list(islice(words, size[-1]))
+                if len(values) != size[-1]:
+                    raise ValueError
+                item += map(int if p.kind[0] in "iu" else float, values)
+        except (ValueError, StopIteration):
+            raise lines.fail(row, f"a row of element {element.name} as its header says") from None
+    columns: dict[str, _Column] = {}
+    with storage.taking_apart(lines.path, f"numbers of element {element.name} as its header says", MeshFileError):
+        for p, size, item in zip(element.properties, sizes, items, strict=True):
+            found = np.array(item, dtype=np.int64 if p.kind[0] in "iu" else np.float64)
+            columns[p.name] = (np.array(size, dtype=np.int64), found) if p.length_kind else found
+    return columns
+
+
+def _contents(path: Path, vertex: Element, found: dict[str, dict[str, _Column]]) -> Contents:
+    columns = found["vertex"]
+
+    def triple(names: tuple[str, ...]) -> np.ndarray | None:
+        values = [columns.get(name) for name in names]
+        if any(v is None or isinstance(v, tuple) for v in values):
+            return None
+        return np.stack([np.asarray(v, dtype=np.float64) for v in values], axis=1)
+
+    vertices = triple(("x", "y", "z"))
+    if vertices is None:
+        raise MeshFileError(f"{path}: expected properties x, y, z of element vertex, "
+                            f"found {[p.name for p in vertex.properties]}")
+    kinds = {p.name: np.dtype(p.kind) for p in vertex.properties}
+    colors = next((as_colors(c, kinds[names[0]]) for names in _COLORS if (c := triple(names)) is not None), None)
+    faces = None
+    if "face" in found:
+        lists = found["face"].get("vertex_indices", found["face"].get("vertex_index"))
+        if not isinstance(lists, tuple):
+            raise MeshFileError(f"{path}: expected a property list vertex_indices of element face, "
+                                f"found {list(found['face'])}")
+        faces = polygons(path, lists[0], lists[1], len(vertices))
+    return Contents(vertices, faces, triple(("nx", "ny", "nz")), colors)
+
+
+def encode(contents: Contents, double: bool) -> bytes:
+    """A binary little-endian PLY file; coordinates as `double` or, smaller, as `float`."""
+    number = "f8" if double else "f4"
+    names = ["x", "y", "z"] + (["nx", "ny", "nz"] if contents.normals is not None else [])
+    fields = [(name, "<" + number) for name in names]
+    if contents.colors is not None:
+        fields += [(name, "u1") for name in _COLORS[0]]
+    rows = np.zeros(len(contents.vertices), dtype=fields)
+    for values, group in ((contents.vertices, names[:3]), (contents.normals, names[3:]),
+                          (None if contents.colors is None else as_bytes(contents.colors), _COLORS[0])):
+        if values is not None:
+            for i, name in enumerate(group):
+                rows[name] = values[:, i]
+    words = {"<f8": "double", "<f4": "float", "u1": "uchar"}
+    header = ["ply", "format binary_little_endian 1.0", f"element vertex {len(rows)}"]
+    header += [f"property {words[kind]} {name}" for name, kind in fields]
+    body = rows.tobytes()
+    if contents.faces is not None:
+        header += [f"element face {len(contents.faces)}", "property list uchar int vertex_indices"]
+        faces = np.zeros(len(contents.faces), dtype=[("length", "u1"), ("corners", "<i4", (3,))])
+        faces["length"], faces["corners"] = 3, contents.faces
+        body += faces.tobytes()
+    return ("\n".join([*header, "end_header"]) + "\n").encode() + body

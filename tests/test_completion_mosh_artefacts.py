@@ -1,0 +1,338 @@
+"""Faults that were put into markers come back, exactly, and nothing else does."""
+import itertools
+from dataclasses import replace
+
+import numpy as np
+import pytest
+from completion_bodies import MEAN, worm_with_prior
+
+from completion.mocap.artefacts.find import ambiguous_swap, find_artefacts
+from completion.mocap.artefacts.results import ArtefactConfig, BadSpan
+from completion.mocap.artefacts.simulated import Simulation, bridged
+from completion.mocap.artefacts.slips import find_bad, without_lost_limbs
+from completion.mocap.artefacts.swaps import TORN, Tracks, _two_states, find_order, list_swaps
+from completion.mocap.files.markers import MarkerSequence
+from completion.mocap.marker_sets.layout import MarkerLayout
+from completion.mocap.mosh.charts import chart_artefacts
+from completion.mocap.pose.follow import AnimateConfig, animate
+from scanprep.geometry import rotations
+
+FRAMES, RATE = 160, 100.0
+CONFIG = ArtefactConfig()
+LABELS = tuple(f"M{i}" for i in range(30))
+
+
+@pytest.fixture(scope="module")
+def subject():
+    return worm_with_prior().subject(None)
+
+
+@pytest.fixture(scope="module")
+def layout():
+    vertices = np.random.default_rng(4).choice(396, 30, replace=False)
+    return MarkerLayout(LABELS, vertices, 0.012)
+
+
+@pytest.fixture(scope="module")
+def moved(subject, layout):
+    """Poses and places of a motion, its markers, and the part that each sits on."""
+    t = np.arange(FRAMES) / RATE
+    poses = MEAN + np.sin(2 * np.pi * t[:, None, None] + np.arange(4)[:, None]) * np.array([0.05, 0.3, 0.2])
+    trans = np.stack([1.2 * t, 0 * t, 0 * t], axis=1)
+    meshes = subject.vertices(poses, trans)
+    positions = np.stack([layout.place(subject.template.with_vertices(v)) for v in meshes])
+    positions += np.random.default_rng(0).normal(0, 0.0003, positions.shape)
+    part = subject.skeleton.part_of_vertex(subject.template)[layout.vertices]
+    return poses, trans, positions, subject.skeleton.part_rotations(poses)[:, part]
+
+
+def changed(positions):
+    return MarkerSequence(positions, LABELS, RATE)
+
+
+def exchanged(positions, a, b, begin, end):
+    positions[begin:end + 1, [a, b]] = positions[begin:end + 1, [b, a]]
+
+
+def neighbours(positions):
+    """The two markers that are closest to each other, and a far one."""
+    apart = np.linalg.norm(positions[0, :, None] - positions[0], axis=2) + 9 * np.eye(30)
+    a, b = (int(i) for i in np.unravel_index(apart.argmin(), apart.shape))
+    apart[apart > 5] = 0
+    return a, b, int(apart[a].argmax())
+
+
+def wavy(labels=6, frames=120):
+    """Tracks that swing about places 5 cm apart."""
+    t = np.arange(frames) / RATE
+    sway = 0.3 * np.sin(4 * t[:, None] + 0.1 * np.arange(labels))
+    out = np.stack([sway, 0.2 * np.cos(3 * t)[:, None] + 0 * sway, 0.05 * np.arange(labels) + 0 * sway], axis=2)
+    return out + np.random.default_rng(0).normal(0, 0.0003, out.shape)
+
+
+def tracked(positions):
+    return find_order(positions, RATE)
+
+
+# ---- tracks
+
+def test_a_track_of_constant_acceleration_does_not_jump():
+    t = np.arange(60)[:, None, None] / RATE
+    positions = np.broadcast_to(8 * t**2 + [1.0, 2.0, 3.0] * t, (60, 1, 3)).copy()
+    tracks = Tracks(positions, RATE)
+    assert np.nanmax(tracks.off[4:-4]) < 1e-12 and not tracks.jumped.any()
+    positions[30:] += [0.0, 0.02, 0.0]
+    tracks = Tracks(positions, RATE)
+    assert np.flatnonzero(tracks.jumped[:, 0]).tolist() == [30] and abs(tracks.off[30, 0] - 0.02) < 1e-12
+    positions[30:34] = np.nan
+    tracks = Tracks(positions, RATE)
+    assert not tracks.jumped.any() and np.flatnonzero(tracks.open[:, 0]).tolist() == [0, 30, 31, 32, 33, 34]
+
+
+def test_links_tell_which_label_goes_on():
+    positions = wavy()
+    exchanged(positions, 1, 4, 50, 119)
+    tracks = Tracks(positions, RATE)
+    some = np.arange(6)
+    cost = tracks.links(np.full((1, 1), 50), some[:, None], some)
+    assert cost.argmin(axis=1).tolist() == [0, 4, 2, 3, 1, 5] and (np.sort(cost, axis=1)[:, 1:] == TORN).all()
+    positions[45:50, 1] = np.nan                                     # over a gap: not as sure, but still the best
+    cost = Tracks(positions, RATE).links(np.array([50]), np.array([1]), np.array([4]))[0]
+    assert 0 < cost < TORN - 2
+
+
+# ---- exchanges from tracks alone
+
+def test_pairs_are_put_right_and_their_spans_are_exact():
+    positions = wavy()
+    faulty = positions.copy()
+    exchanged(faulty, 0, 1, 20, 44)
+    exchanged(faulty, 2, 5, 0, 9)
+    exchanged(faulty, 1, 3, 70, 119)
+    order = tracked(faulty)
+    np.testing.assert_array_equal(np.take_along_axis(faulty, order[..., None], axis=1), positions)
+    spans = [(e.first, e.second, e.begin, e.end) for e in list_swaps(order, np.ones((120, 6), bool), tuple("ABCDEF"))]
+    assert spans == [("C", "F", 0, 9), ("A", "B", 20, 44), ("B", "D", 70, 119)]
+
+
+def test_a_cycle_of_labels_comes_apart_into_pairs():
+    positions = wavy()
+    faulty = positions.copy()
+    faulty[30:60, [0, 2, 3, 5]] = positions[30:60, [2, 3, 5, 0]]
+    order = tracked(faulty)
+    np.testing.assert_array_equal(np.take_along_axis(faulty, order[..., None], axis=1), positions)
+    found = list_swaps(order, np.ones((120, 6), bool), tuple("ABCDEF"))
+    assert len(found) == 3 and {(e.begin, e.end) for e in found} == {(30, 59)}
+
+
+def test_exchanges_do_not_depend_on_the_order_of_labels_or_the_frame_of_space():
+    faulty = wavy()
+    exchanged(faulty, 0, 1, 20, 44)
+    faulty[60:70, 3] = np.nan
+    shuffle = np.array([3, 0, 5, 1, 4, 2])
+    R = rotations.exp(np.array([0.4, -1.0, 2.0]))
+    other = tracked((faulty @ R.T + [1.0, -2.0, 0.5])[:, shuffle])
+    np.testing.assert_array_equal(shuffle[other], tracked(faulty)[:, shuffle])
+
+
+def test_an_exchange_is_found_though_a_label_is_out_of_sight_when_it_begins():
+    positions = wavy()
+    faulty = positions.copy()
+    exchanged(faulty, 1, 4, 50, 89)
+    faulty[48:53, 1] = np.nan
+    order = tracked(faulty)
+    seen = np.isfinite(faulty[..., 0])
+    mended = np.take_along_axis(faulty, order[..., None], axis=1)
+    right = np.isclose(mended, positions, atol=1e-12).all(axis=2) | np.isnan(mended[..., 0])
+    assert right.all()
+    assert [(e.begin, e.end) for e in list_swaps(order, seen, tuple("ABCDEF"))] == [(50, 89)]
+
+
+def test_what_flickers_or_is_gone_is_not_exchanged():
+    positions = wavy()
+    positions[40, 2] += 0.05                                         # to where the next one is, which stays
+    positions[80:90, 3] += 0.3
+    positions[20:60, 5] = np.nan
+    assert (tracked(positions) == np.arange(6)).all()
+
+
+def test_two_states_are_the_best_of_all_ways():
+    rng = np.random.default_rng(1)
+    for _ in range(30):
+        gains, stay, switch = rng.normal(0, 5, 6), rng.uniform(0, 10, 5), rng.uniform(0, 10, 5)
+
+        def worth(way, gains=gains, stay=stay, switch=switch):
+            change = np.diff(way) != 0
+            return gains[np.array(way, bool)].sum() - np.where(change, switch + 4.0, stay).sum() + stay.sum()
+
+        best = max(itertools.product((0, 1), repeat=6), key=worth)
+        total, swapped = _two_states(gains, stay, switch)
+        assert total == pytest.approx(worth(best)) and swapped.astype(int).tolist() == list(best)
+
+
+# ---- bad spans
+
+def bad(local, jumps=None, **settings):
+    jumps = np.zeros(local.shape[:2]) if jumps is None else jumps
+    return find_bad(local, local, jumps, LABELS[:local.shape[1]], replace(CONFIG, **settings), RATE)
+
+
+def quiet(seed=0):
+    return np.random.default_rng(seed).normal(0, 0.001, (FRAMES, 5, 3)) + np.array([0.01, -0.01, 0.0])
+
+
+def test_a_slip_is_found_at_its_frame_and_a_slow_change_is_none():
+    local = quiet()
+    local[70:, 2] += [0.015, 0.015, -0.01]
+    local[:, 4] += 0.05 * np.linspace(0, 1, FRAMES)[:, None]          # drifts
+    assert [(s.label, s.kind, s.begin, s.end) for s in bad(local)] == []          # 2 cm without a jump may be the body
+    jumps = np.zeros(local.shape[:2])
+    jumps[70, 2] = 0.0235
+    (found,) = bad(local, jumps)
+    assert (found.label, found.kind, found.begin, found.end) == ("M2", "slipped", 70, FRAMES - 1)
+    assert abs(found.distance - np.sqrt(0.00055)) < 0.001
+    assert bad(local, jumps, slip=0.04) == ()
+
+
+def test_noise_and_strays_are_found_with_their_ends():
+    local, jumps = quiet(), np.zeros((FRAMES, 5))
+    local[50:90, 1] += np.random.default_rng(3).normal(0, 0.01, (40, 3))
+    local[100:110, 3] += [0.0, 0.15, 0.0]
+    jumps[[100, 110], 3] = 0.15
+    noisy, stray = bad(local, jumps)
+    assert (noisy.label, noisy.kind, stray.label, stray.kind) == ("M1", "noisy", "M3", "stray")
+    assert abs(noisy.begin - 50) <= 2 and abs(noisy.end - 89) <= 2
+    assert (stray.begin, stray.end) == (100, 109) and abs(stray.distance - 0.15) < 0.002
+
+
+def test_a_limb_that_is_lost_is_no_fault_of_its_markers():
+    spans = tuple(BadSpan(label, "stray", 10, 20, 0.1) for label in ("M0", "M1", "M2"))
+    alone = BadSpan("M4", "stray", 10, 40, 0.2)
+    slip = BadSpan("M0", "slipped", 50, 99, 0.03)
+    near = np.zeros((5, 5), bool)
+    near[:4, :4] = near[4, 4] = True
+    assert without_lost_limbs((*spans, alone, slip), near, LABELS[:5]) == (alone, slip)
+    assert without_lost_limbs(spans[:2], near, LABELS[:5]) == spans[:2]
+
+
+# ---- with the body
+
+def test_a_clean_sequence_has_no_faults(subject, layout, moved):
+    _, _, positions, _ = moved
+    ticks = []
+    found = find_artefacts(subject, changed(positions), layout, CONFIG, progress=lambda *at: ticks.append(at))
+    assert found.swaps == () and found.bad == () and len(ticks) == 1
+    np.testing.assert_array_equal(found.repaired.positions, positions)
+    assert np.linalg.norm(found.simulated - positions, axis=2).max() < 0.008 and found.weights.min() > 0.9
+
+
+def test_faults_of_all_kinds_together(subject, layout, moved):
+    _, _, positions, turned = moved
+    a, b, far = neighbours(positions)
+    rest = [i for i in range(30) if i not in (a, b, far)]
+    slipped, noisy, stray, gone = rest[:4]
+    faulty = positions.copy()
+    exchanged(faulty, a, b, 20, 79)
+    exchanged(faulty, a, far, 100, 140)
+    faulty[60:, slipped] += turned[60:, slipped] @ np.array([0.0, 0.03, 0.02])
+    faulty[40:100, noisy] += np.random.default_rng(2).normal(0, 0.01, (60, 3))
+    faulty[90:120, stray] += [0.2, -0.1, 0.1]
+    faulty[30:60, gone] = np.nan
+    found = find_artefacts(subject, changed(faulty), layout, CONFIG)
+    assert {(frozenset((e.first, e.second)), e.begin, e.end) for e in found.swaps} == {
+        (frozenset((LABELS[a], LABELS[b])), 20, 79), (frozenset((LABELS[a], LABELS[far])), 100, 140)}
+    spans = {s.label: s for s in found.bad}
+    assert {label: s.kind for label, s in spans.items()} == {
+        LABELS[slipped]: "slipped", LABELS[noisy]: "noisy", LABELS[stray]: "stray"}
+    assert (spans[LABELS[slipped]].begin, spans[LABELS[slipped]].end) == (60, FRAMES - 1)
+    assert (spans[LABELS[stray]].begin, spans[LABELS[stray]].end) == (90, 119)
+    assert abs(spans[LABELS[noisy]].begin - 40) <= 2 and abs(spans[LABELS[noisy]].end - 99) <= 2
+    assert abs(spans[LABELS[slipped]].distance - np.sqrt(0.0013)) < 0.008
+    np.testing.assert_array_equal(found.repaired.positions[:, [a, b, far]], positions[:, [a, b, far]])
+    assert not found.repaired.seen[60:, slipped].any() and not found.repaired.seen[90:120, stray].any()
+    filled = found.virtual()
+    assert filled.seen.all() and np.linalg.norm(filled.positions - positions, axis=2).max() < 0.012
+    assert found.weights[60:, slipped].max() == 0 and found.weights[:60, slipped].min() > 0.5
+    titles = [axis.get_ylabel() for axis in chart_artefacts(found, changed(faulty)).axes]
+    assert sorted(titles) == sorted({*spans, LABELS[a], LABELS[b], LABELS[far]})
+
+
+def test_the_motion_of_repaired_markers_is_the_clean_one(subject, layout, moved):
+    poses, trans, positions, _ = moved
+    rng = np.random.default_rng(5)
+    faulty, pairs = positions.copy(), rng.permutation(30)[:12].reshape(-1, 2)
+    for a, b in pairs:
+        begin = int(rng.integers(0, 100))
+        exchanged(faulty, a, b, begin, begin + int(rng.integers(20, 50)))
+    meshes = subject.vertices(poses, trans)
+    found = find_artefacts(subject, changed(faulty), layout, CONFIG)
+    assert len(found.swaps) == 6
+
+    def error(sequence):
+        motion = animate(subject, sequence, layout, AnimateConfig())
+        return np.linalg.norm(motion.vertices(subject) - meshes, axis=2).mean()
+
+    assert error(found.repaired) < 1.05 * error(changed(positions))
+    given = find_artefacts(subject, changed(positions), layout, CONFIG, animate(subject, changed(positions), layout,
+                                                                             AnimateConfig()))
+    assert given.swaps == () and given.bad == ()
+
+
+def test_an_exchange_with_a_label_that_no_layout_knows(subject, layout, moved):
+    _, _, positions, _ = moved
+    few = layout.select(LABELS[:25])
+    faulty = positions.copy()
+    exchanged(faulty, 3, 28, 50, 99)
+    found = find_artefacts(subject, changed(faulty), few, CONFIG)
+    assert [(e.first, e.second, e.begin, e.end) for e in found.swaps] == [("M3", "M28", 50, 99)]
+    np.testing.assert_array_equal(found.repaired.positions, positions)
+    assert found.labels == LABELS[:25] and found.bad == ()
+
+
+def test_close_labels_are_tried_both_ways(subject, layout, moved):
+    """Between two gaps the tracks say nothing, and the body may have followed either."""
+    _, _, positions, _ = moved
+    a, b, _ = neighbours(positions)
+    faulty = positions.copy()
+    exchanged(faulty, a, b, 40, 109)
+    for end in (40, 110):
+        faulty[end - 15:end + 15, [a, b]] = np.nan
+    body = Simulation(subject, changed(faulty), layout, AnimateConfig())
+    x = body.solve(faulty)
+    swapped = ambiguous_swap(body, x, Tracks(faulty, RATE), a, b)
+    there = np.isfinite(faulty[:, a, 0])
+    np.testing.assert_array_equal(swapped[there[swapped]], np.arange(55, 95))
+
+
+def test_what_a_marker_is_off_by_the_account_of_the_others(subject, layout, moved):
+    """The body that has gone after a displaced marker, corrected, is the one that never saw it."""
+    _, _, positions, _ = moved
+    faulty = positions[:40].copy()
+    faulty[:, 7] += [0.004, 0.01, -0.006]
+    body = Simulation(subject, MarkerSequence(faulty, LABELS, RATE), layout, AnimateConfig())
+    x = body.solve(faulty)
+    off = faulty - body.positions(x)
+    alone = body.alone(off, x)[:, 7]
+    without = faulty.copy()
+    without[:, 7] = np.nan
+    true = faulty[:, 7] - body.positions(body.solve(without))[:, 7]
+    assert np.linalg.norm(off[:, 7] - true, axis=1).mean() > 0.001
+    assert np.linalg.norm(alone - true, axis=1).mean() < 0.4 * np.linalg.norm(off[:, 7] - true, axis=1).mean()
+
+
+def test_bridges_join_both_ends_and_long_ones_pass_the_usual_place():
+    local = np.zeros((100, 1, 3))
+    local[:20], local[20:], local[90:] = 0.01, 0.03, 0.05
+    local[10:20] = local[40:90] = np.nan
+    out = bridged(local, 15.0)[:, 0, 0]
+    np.testing.assert_allclose(out[9:21], np.interp(np.arange(9, 21), [9, 20], [0.01, 0.03]), atol=1e-12)
+    usual = np.nanmedian(local[:, 0, 0])
+    np.testing.assert_allclose(out[54:75], usual, atol=1e-12)
+    assert np.abs(np.diff(out[38:92])).max() < 0.02 / 15 + 1e-9 and abs(out[89] - out[90]) > 1e-3
+
+
+def test_a_motion_of_other_length_is_refused(subject, layout, moved):
+    _, _, positions, _ = moved
+    motion = animate(subject, changed(positions).frames(slice(0, 20)), layout, AnimateConfig())
+    with pytest.raises(ValueError, match="motion: expected 160 frames as the markers have, got 20"):
+        find_artefacts(subject, changed(positions), layout, CONFIG, motion)
