@@ -1,5 +1,5 @@
 # The public names; loaded when they are first used, so that the command line answers at once.
-from .mocap.artefacts.find import find_faults as find_faults
+from .mocap.artefacts.find import find_artefacts as find_artefacts
 from .mocap.artefacts.virtual import write_virtual as write_virtual
 from .mocap.files.markers import (
     MarkerSequence as MarkerSequence,
@@ -10,60 +10,36 @@ from .mocap.files.markers import (
 from .mocap.files.markers import (
     write_markers as write_markers,
 )
-from .mocap.files.motion_tables import joint_angles as joint_angles
-from .mocap.files.motion_tables import joint_centres as joint_centres
-from .mocap.marker_selection.candidates import CandidateConfig as CandidateConfig
+from .mocap.files.motion_files import joint_angles as joint_angles
+from .mocap.files.motion_files import joint_centres as joint_centres
 from .mocap.marker_selection.candidates import candidate_layout as candidate_layout
-from .mocap.marker_selection.frames import FrameConfig as FrameConfig
-from .mocap.marker_selection.frames import informative_frames as informative_frames
-from .mocap.marker_selection.results import MarkerDesign as MarkerDesign
-from .mocap.marker_selection.sets import design_markers as design_markers
-from .mocap.marker_selection.settings import DesignConfig as DesignConfig
+from .mocap.marker_selection.design import MarkerDesign as MarkerDesign
+from .mocap.marker_selection.design import design_markers as design_markers
+from .mocap.marker_selection.fits import DesignConfig as DesignConfig
 from .mocap.marker_sets.layout import MarkerLayout as MarkerLayout
 from .mocap.marker_sets.named import layout_names as layout_names
+from .mocap.marker_sets.named import named_layout as named_layout
 from .mocap.marker_sets.symmetry import SkinMirror as SkinMirror
 from .mocap.marker_sets.symmetry import find_skin_mirror as find_skin_mirror
-from .mocap.marker_sets.transfer import (
-    CarriedLayout as CarriedLayout,
-)
-from .mocap.marker_sets.transfer import (
-    CarryConfig as CarryConfig,
-)
-from .mocap.marker_sets.transfer import (
-    carry_layout as carry_layout,
-)
-from .mocap.marker_sets.transfer import (
-    register_layout as register_layout,
-)
+from .mocap.marker_sets.transfer import TransferredLayout as TransferredLayout
+from .mocap.marker_sets.transfer import transfer_layout as transfer_layout
+from .mocap.mosh.by_sex import SexedMosh as SexedMosh
+from .mocap.mosh.by_sex import mosh_by_sex as mosh_by_sex
+from .mocap.mosh.mosh import MoshConfig as MoshConfig
+from .mocap.mosh.mosh import MoshResult as MoshResult
 from .mocap.mosh.mosh import mosh as mosh
-from .mocap.pose.follow import AnimateConfig as AnimateConfig
 from .mocap.pose.follow import animate as animate
+from .mocap.pose.settings import AnimateConfig as AnimateConfig
 from .mocap.pose.stream import Frame as Frame
 from .mocap.pose.stream import MarkerStream as MarkerStream
-from .mocap.results import MoshResult as MoshResult
-from .mocap.results import PersonFit as PersonFit
-from .mocap.retargeting.cartoons import Cartoon as Cartoon
-from .mocap.retargeting.cartoons import CartoonShape as CartoonShape
-from .mocap.retargeting.cartoons import cartoon as cartoon
 from .mocap.retargeting.retarget import morphed_vertices as morphed_vertices
 from .mocap.retargeting.retarget import retarget as retarget
 from .mocap.retargeting.soft_tissue import deformation as deformation
 from .mocap.retargeting.soft_tissue import retarget_soft_tissue as retarget_soft_tissue
-from .mocap.settings import MoshConfig as MoshConfig
-from .mocap.settings import PersonConfig as PersonConfig
 from .mocap.soft_tissue.soft_tissue import follow_soft_tissue as follow_soft_tissue
-from .mocap.subject.marker_shape import (
-    MarkerShapeConfig as MarkerShapeConfig,
-)
-from .mocap.subject.marker_shape import (
-    MarkerSubject as MarkerSubject,
-)
-from .mocap.subject.marker_shape import (
-    subject_from_markers as subject_from_markers,
-)
+from .mocap.subject.person import PersonConfig as PersonConfig
+from .mocap.subject.person import PersonFit as PersonFit
 from .mocap.subject.person import find_person as find_person
-from .mocap.subject.sex import SexedMosh as SexedMosh
-from .mocap.subject.sex import mosh_by_sex as mosh_by_sex
 from .motion import Motion as Motion
 from .partial.colors import ColorConfig as ColorConfig
 from .partial.colors import carry_colors as carry_colors

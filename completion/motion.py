@@ -94,6 +94,11 @@ class Motion:
             return _restored(path, stored)
 
 
+def spread_frames(length: int, count: int) -> np.ndarray:
+    """At most so many frames, spread evenly from the first to the last."""
+    return np.unique(np.linspace(0, length - 1, min(count, length)).round().astype(int))
+
+
 def _restored(path: str | Path, a: dict[str, np.ndarray]) -> Motion:
     """The motion of a file's arrays."""
     kind = storage.text(a, "surface_model_type", "")

@@ -2,12 +2,8 @@
 from .alignment.icp import align_rigid as align_rigid
 from .cleaning.clean_scan import CleanScanConfig as CleanScanConfig
 from .cleaning.clean_scan import clean_scan as clean_scan
-from .correspondence.correlated import (
-    CorrelatedConfig as CorrelatedConfig,
-)
-from .correspondence.correlated import (
-    find_correspondences as find_correspondences,
-)
+from .correspondence.correlated import find_correspondences as find_correspondences
+from .correspondence.search import CorrelatedConfig as CorrelatedConfig
 from .correspondence.seeds import SeedConfig as SeedConfig
 from .correspondence.seeds import find_seeds as find_seeds
 from .dataset import RegisteredSet as RegisteredSet

@@ -15,7 +15,7 @@ from scipy.sparse import coo_array, csr_array, diags_array
 from scipy.sparse.csgraph import dijkstra
 from scipy.spatial import cKDTree
 
-from model.export.rig import strongest
+from model.blend_weights import strongest
 from model.statue.control.chart import make_chart
 from model.statue.control.files import write_control
 from model.statue.control.humanoid import STORED

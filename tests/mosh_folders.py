@@ -11,10 +11,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 from completion_bodies import MEAN, worm_with_prior
+from config_files import config_file
 
-from completion import MarkerLayout, MarkerSequence, write_markers
+from completion import MarkerLayout, MarkerSequence, motion_pictures, write_markers
 from completion.__main__ import main
-from completion.mocap.animate import report as animation_report
 from completion.mocap.mosh import cli, pictures, report
 from completion.mocap.mosh.work import Work
 from scanprep.batch.workspace import HOME
@@ -22,11 +22,11 @@ from scanprep.batch.workspace import HOME
 FRAMES = 40
 BETAS = {"ann": np.array([0.9, -0.6, 0.4]), "bob": np.array([-0.8, 0.5, -0.3])}
 TAKES = (("ann", "walk", 0.0), ("ann", "run", 1.0), ("bob", "jump", 0.5))
-QUICK = ("--keys", "5", "--person.frames", "4", "--person.start-axes", "1", "--person.annealing", "4", "1",
-         "--person.iterations", "4")
-STAGES = {"start": "completion.mocap.subject.person.FrameStarts.find",
+QUICK = {"frames": 4, "annealing": [4.0, 1.0]}
+STAGES = {"start": "completion.mocap.subject.person.start_frames",
           "solve": "completion.mocap.subject.person.LatentFit.solve",
-          "poses": "completion.mocap.mosh.mosh.follow_poses", "faults": "completion.mocap.mosh.mosh.find_faults",
+          "poses": "completion.mocap.mosh.mosh.animate",
+          "artefacts": "completion.mocap.mosh.mosh.find_artefacts",
           "soft": "completion.mocap.mosh.mosh.follow_soft_tissue",
           "files": "completion.mocap.mosh.work.write_take", "page": "completion.mocap.mosh.work.take_page",
           "person page": "completion.mocap.mosh.work.person_page"}
@@ -58,16 +58,18 @@ def write_people(place):
     return place
 
 
-def run(place, *words, quick=QUICK):
-    return main(["mosh", *quick, "-m", str(place / "model.npz"), "--layout", str(place / "layout.json"),
-                 "--workers", "1", *map(str, words)])
+def run(place, *words, **settings):
+    """`scape mosh` with few frames and stages, and other settings."""
+    settings["person"] = QUICK | settings.get("person", {})
+    return main(["mosh", "--config", str(config_file(place, **settings)), "-m", str(place / "model.npz"),
+                 "--layout", str(place / "layout.json"), "--workers", "1", *map(str, words)])
 
 
 @contextmanager
 def small_pictures():
     """Nobody looks at them here."""
     with pytest.MonkeyPatch.context() as patch:
-        for module in (report, pictures, animation_report):
+        for module in (report, pictures, motion_pictures):
             patch.setattr(module, "render", lambda *_rest, **_named: np.full((30, 20, 3), 255, dtype=np.uint8))
         yield
 

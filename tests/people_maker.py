@@ -13,9 +13,9 @@ import numpy as np
 from scanprep.geometry import storage
 from scanprep.geometry.mesh import Mesh
 from scanprep.synthetic.anatomy import Anatomy
-from scanprep.synthetic.body_parts import body_surface
+from scanprep.synthetic.body_parts import arm, body_surface, hand, trunk
 from scanprep.synthetic.implicit_surface import Field, polygonise, project
-from scanprep.synthetic.topology import CANONICAL, STORED, VERSION, Template, label_faces
+from scanprep.synthetic.topology import CANONICAL, STORED, VERSION, Template
 
 Sizing = Callable[[np.ndarray], np.ndarray]
 
@@ -60,8 +60,44 @@ def store(template: Template, path: Path = STORED) -> None:
     """Keep a built template beside the code."""
     storage.save(path, "people template", VERSION, {
         "vertices": np.round(template.mesh.vertices * 1e5).astype(np.int32),
-        "mirror": template.mirror.astype(np.uint16),
+        "mirror": template.mirror.astype(np.uint16), "part_of_face": template.part_of_face.astype(np.uint8),
         "faces": template.mesh.faces.astype(np.uint16)})
+
+
+def label_faces(mesh: Mesh, anatomy: Anatomy) -> np.ndarray:
+    """Part of every triangle (F,): cut by a plane through each joint, across the surface only."""
+    c = mesh.corners.mean(axis=1)
+    j = anatomy.joints
+    part = np.zeros(len(c), dtype=np.int64)
+
+    def beyond(joint: int, normal: np.ndarray) -> np.ndarray:
+        return (c - j[joint]) @ normal > 0
+
+    folded = np.abs(c * [1, 0, 0]) + c * [0, 1, 1]
+    of_arm = np.minimum(arm(anatomy)(folded), hand(anatomy)(folded)) < 0.02
+    of_arm &= trunk(anatomy)[0][0][0](c) > 0.012 * anatomy.scale
+    part[c[:, 2] > j[1, 2]] = 1
+    part[c[:, 2] > j[2, 2]] = 2
+    neck = np.array([0, -0.35, 1.0])
+    part[beyond(3, neck / np.linalg.norm(neck)) & (np.abs(c[:, 0]) < 0.12)] = 3
+    for side, upper, leg in ((1, 4, 10), (-1, 7, 13)):
+        flip = np.array([side, 1, 1])
+        up = flip * anatomy.upper_arm_frame[2]
+        out = up * 0.75 + 0.66 * np.array([side, 0, 0.25])
+        armpit = j[upper] + 0.012 * anatomy.scale * flip * [-1, 0, 0]
+        mine = ((c - armpit) @ out > 0) & (c[:, 0] * side > 0.10 * anatomy.scale) & of_arm
+        fore = up + flip * anatomy.forearm_frame[2]
+        part[mine] = upper
+        part[mine & beyond(upper + 1, fore)] = upper + 1
+        part[mine & beyond(upper + 2, flip * anatomy.forearm_frame[2])] = upper + 2
+        cut = np.array([0.72 * side, -0.0, -1.0])
+        top = j[leg] + np.array([0.0, 0, -0.012 * anatomy.scale])
+        mine = ((c - top) @ cut > 0) & (c[:, 0] * side > 0) & (c[:, 2] < j[0, 2] + 0.02) & (part < 3)
+        part[mine] = leg
+        part[mine & (c[:, 2] < j[leg + 1, 2])] = leg + 1
+        heel = np.array([0, -0.5, -1.0])
+        part[mine & beyond(leg + 2, heel)] = leg + 2
+    return part
 
 
 def remesh(mesh: Mesh, field: Field, sizing: Sizing, rounds: int = 12) -> Mesh:

@@ -4,10 +4,11 @@ import json
 import numpy as np
 import pytest
 from completion_bodies import MEAN, worm_with_prior
+from config_files import config_file
 from glb_reader import Glb
 
+from completion import motion_pictures
 from completion.__main__ import main
-from completion.mocap.animate import report
 from completion.mocap.files.markers import MarkerSequence, write_markers
 from completion.mocap.marker_sets.layout import MarkerLayout
 from completion.motion import Motion
@@ -16,14 +17,13 @@ FRAMES = 30
 BETAS = np.array([0.9, -0.6, 0.4])
 WRITTEN = {"motion.npz", "animation.glb", "motion.bvh", "joint_angles.csv", "joint_centres.csv", "residuals.csv",
            "report.html"}
-QUICK = ("--start-axes", "1", "--keys", "6", "--shape.frames", "4", "--shape.start-axes", "1")
 
 
 @pytest.fixture(scope="module", autouse=True)
 def small_pictures():
     """Nobody looks at them here."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(report, "render", lambda *_rest, **_named: np.full((30, 20, 3), 255, dtype=np.uint8))
+        patch.setattr(motion_pictures, "render", lambda *_rest, **_named: np.full((30, 20, 3), 255, dtype=np.uint8))
         yield
 
 
@@ -33,6 +33,7 @@ def place(tmp_path_factory):
     place = tmp_path_factory.mktemp("animate")
     model = worm_with_prior()
     model.save(place / "model.npz")
+    config_file(place, glb={"keys": 6}, shape={"frames": 4, "start_axes": 1})
     vertices = np.random.default_rng(4).choice(396, 30, replace=False)
     layout = MarkerLayout(tuple(f"M{i}" for i in range(30)), vertices, 0.012)
     layout.save(place / "layout.json")
@@ -51,7 +52,7 @@ def place(tmp_path_factory):
 
 def run(place, *words):
     return main(["animate", *map(str, words), "-m", str(place / "model.npz"), "--layout", str(place / "layout.json"),
-                 *QUICK])
+                 "--config", str(place / "config.toml")])
 
 
 def told(folder):
@@ -62,7 +63,7 @@ def test_a_person_and_the_motion_from_markers(place, tmp_path):
     (tmp_path / "to.json").write_text(json.dumps({"0": [0, 0, 0], "0.4": [2.0, 0, 0]}))
     (tmp_path / "onto.json").write_text("[-1, 1, 0.5]")
     out = tmp_path / "out"
-    assert run(place, place / "walk.csv", "-o", out, "--onto", tmp_path / "onto.json", "--betas-to",
+    assert run(place, place / "walk.csv", "-o", out, "--retarget-to", tmp_path / "onto.json", "--betas-to",
                tmp_path / "to.json") == 0
     assert {p.name for p in out.iterdir()} >= WRITTEN | {"subject.json", "layout.json", "onto.npz", "onto.glb",
                                                          "morph.glb", "report.json"}
@@ -112,7 +113,7 @@ def test_a_folder_goes_on_where_it_was(place, tmp_path, capsys):
 
 @pytest.mark.parametrize("words, message", [
     (("--betas-to", "bad.json"), "expected betas at the end"),
-    (("--layout", "cmu40"), "--layout: expected a file or one of biomech57, cmu41"),
+    (("--layout", "cmu40"), "layout: expected a file or one of biomech57, cmu41"),
     (("--layout", "cmu41"), "template: expected a body on which 'cmu41' is known"),
 ])
 def test_wrong_words_are_one_line(place, tmp_path, capsys, words, message):

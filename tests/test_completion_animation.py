@@ -6,15 +6,16 @@ from scipy.linalg import block_diag
 from completion import energy
 from completion.mocap.files.markers import MarkerSequence
 from completion.mocap.marker_sets.layout import MarkerLayout
-from completion.mocap.pose.follow import AnimateConfig, MarkerFollower, animate
-from completion.mocap.pose.marked_body import supports
-from completion.mocap.pose.smooth import smooth_sequence
+from completion.mocap.pose.follow import AnimateConfig, animate
+from completion.mocap.pose.marked_body import MarkedBody, supports
+from completion.mocap.pose.robust import marker_weights
+from completion.mocap.pose.smooth import inertia, smoothed
 from completion.motion import Motion
 from scanprep.geometry import rotations
 from scanprep.geometry.storage import StorageError
 
 FRAMES = 60
-PLAIN = AnimateConfig(start_axes=2, smoothing=0)
+PLAIN = AnimateConfig(smoothing=0)
 
 
 @pytest.fixture(scope="module")
@@ -94,7 +95,7 @@ def test_smoothing_takes_noise_away(subject, layout, walk):
     meshes, sequence = walk
     noisy = changed(sequence, sequence.positions + np.random.default_rng(1).normal(0, 0.01, (FRAMES, 30, 3)))
     rough = animate(subject, noisy, layout, PLAIN)
-    smooth = animate(subject, noisy, layout, AnimateConfig(start_axes=2, smoothing=2))
+    smooth = animate(subject, noisy, layout, AnimateConfig(smoothing=2))
     assert surface_error(subject, smooth, meshes).mean() < 0.9 * surface_error(subject, rough, meshes).mean()
 
     def jerk(motion):
@@ -103,50 +104,56 @@ def test_smoothing_takes_noise_away(subject, layout, walk):
     assert jerk(smooth) < 0.3 * jerk(rough)
 
 
-def test_one_smoothing_step_is_the_dense_gauss_newton_step(subject, layout, walk):
-    _, sequence = walk
-    few = MarkerSequence(sequence.positions[:5], sequence.labels, 100.0)
-    follower = MarkerFollower(subject, few, layout, PLAIN)
-    x = np.random.default_rng(0).normal(0, 0.05, (5, 15))            # small angles: turns add
-    assert np.abs(smooth_sequence(follower, smooth_sequence(follower, x)) - x).max() > 0
+@pytest.fixture(scope="module")
+def body(subject, layout):
+    return MarkedBody(subject, layout, PLAIN.prior_weight, PLAIN.prior_shrinkage)
+
+
+def smooth_step(body, x, targets):
+    weights, _ = marker_weights(body.positions(x), targets, PLAIN.marker_sd, PLAIN.outlier)
+    return smoothed(body, inertia(PLAIN, 100.0, 15), x, targets, weights)
+
+
+def test_one_smoothing_step_is_the_dense_gauss_newton_step(body, walk):
+    targets, stiffness = walk[1].positions[:5], inertia(PLAIN, 100.0, 15)
+    x = np.random.default_rng(0).normal(0, 0.05, (5, 15))            # small angles: rotations add
+    weights, _ = marker_weights(body.positions(x), targets, PLAIN.marker_sd, PLAIN.outlier)
     rows, values = [], []
     for t in range(5):
-        at = x[t][None]
-        terms = [energy.point_to_point(follower.follow(at), follower.targets[t],
-                                       follower.weights(t, follower.positions(x[t]))),
-                 energy.pose_prior(at, follower.prior, PLAIN.prior_weight)]
-        for term in terms:
-            block = np.zeros((term.values.size, 75))
-            block[:, 15 * t:15 * t + 15] = term.jacobian[0] @ by_small_turns(x[t])
+        prior = energy.pose_prior(x[t][None], body.prior, PLAIN.prior_weight)
+        columns = body.shapes.columns(x[t, :-3].reshape(1, 4, 3), x[t, -3:][None])[1][0]              # (12, 3, 30)
+        markers = np.concatenate([columns, np.broadcast_to(np.eye(3)[:, :, None], (3, 3, 30))])
+        root = np.sqrt(weights[t])
+        residual = root * (body.positions(x[t]) - targets[t]).T
+        for jacobian, value in (((root * markers).reshape(15, -1).T, residual.ravel()),
+                                (prior.jacobian[0] @ by_small_turns(x[t]), prior.values[0])):
+            block = np.zeros((value.size, 75))
+            block[:, 15 * t:15 * t + 15] = jacobian
             rows.append(block)
-            values.append(term.values[0])
-    D = np.kron(np.array([[1, -2, 1, 0, 0], [0, 1, -2, 1, 0], [0, 0, 1, -2, 1.0]]), np.diag(np.sqrt(follower.inertia)))
+            values.append(value)
+    D = np.kron(np.array([[1, -2, 1, 0, 0], [0, 1, -2, 1, 0], [0, 0, 1, -2, 1.0]]), np.diag(np.sqrt(stiffness)))
     rows.append(D)
-    velocity = follower.body.step_to(x[:-1], x[1:])
-    values.append((np.sqrt(follower.inertia) * np.diff(velocity, axis=0)).ravel())
+    values.append((np.sqrt(stiffness) * np.diff(body.step_to(x[:-1], x[1:]), axis=0)).ravel())
     step = -np.linalg.lstsq(np.vstack(rows), np.concatenate(values), rcond=None)[0].reshape(5, 15)
-    got = smooth_sequence(follower, x)
+    got = smoothed(body, stiffness, x, targets, weights)
+    assert np.abs(step).max() > 0.01
     np.testing.assert_allclose(got[:, -3:] - x[:, -3:], step[:, -3:], atol=1e-5)
 
 
-def test_windows_agree_with_the_whole(subject, layout, walk, monkeypatch):
-    follower = MarkerFollower(subject, walk[1], layout, PLAIN)
+def test_windows_agree_with_the_whole(body, walk, monkeypatch):
     x = np.random.default_rng(0).normal(0, 0.02, (FRAMES, 15))
-    whole = smooth_sequence(follower, x)
+    whole = smooth_step(body, x, walk[1].positions)
     monkeypatch.setattr("completion.mocap.pose.smooth.WINDOW", 20)
     monkeypatch.setattr("completion.mocap.pose.smooth.OVERLAP", 15)
-    assert np.abs(smooth_sequence(follower, x) - whole).max() < 0.02 * np.abs(whole - x).max()
+    assert np.abs(smooth_step(body, x, walk[1].positions) - whole).max() < 0.02 * np.abs(whole - x).max()
 
 
-def test_markers_sit_where_the_layout_places_them(subject, layout, walk):
-    _, sequence = walk
-    follower = MarkerFollower(subject, sequence, layout, PLAIN)
+def test_markers_sit_where_the_layout_places_them(subject, layout, body):
     rest = np.zeros(15)
-    wanted = layout.place(subject.template.with_vertices(subject.vertices(np.zeros((4, 3)), np.zeros(3))))
-    assert np.linalg.norm(follower.positions(rest) - wanted, axis=1).max() < 0.004   # two ways to a normal
+    template = subject.template.with_vertices(subject.vertices(np.zeros((4, 3)), np.zeros(3)))
+    assert np.linalg.norm(body.positions(rest) - layout.place(template), axis=1).max() < 0.004   # two ways to a normal
     flat = MarkerLayout(layout.labels, layout.vertices, 0.0)
-    np.testing.assert_allclose(MarkerFollower(subject, sequence, flat, PLAIN).positions(rest), flat.place(
-        subject.template.with_vertices(subject.vertices(np.zeros((4, 3))))), atol=1e-12)
+    np.testing.assert_allclose(MarkedBody(subject, flat, 0.3, 0.3).positions(rest), flat.place(template), atol=1e-12)
     ids, weights = supports(subject.template, layout)
     np.testing.assert_allclose(weights.sum(axis=1), 1)
     assert len(ids) == 3 * len(layout.labels)

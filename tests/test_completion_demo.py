@@ -190,7 +190,6 @@ def test_what_is_not_ours_stays(tmp_path, capsys):
 KILLED = """
 import os, sys
 from completion.demo import chain, settings
-from completion.demo.recording import ScanPerson
 from scanprep.batch import pool
 from scanprep.batch.opening import workspace
 from scanprep.console import bar

@@ -6,14 +6,10 @@ import numpy as np
 import pytest
 from completion_bodies import worm_with_prior
 
-from completion.mocap.marker_selection.fits import prior_around, rough_poses, vertex_errors
-from completion.mocap.marker_selection.greedy import ADD, REMOVE, MarkerSets, exchange, walk
-from completion.mocap.marker_selection.joint import shared_shape
-from completion.mocap.marker_selection.linear import LinearBodies, fit_bodies
-from completion.mocap.marker_selection.pairs import symmetric_groups
-from completion.mocap.marker_selection.points import BodyPoints
-from completion.mocap.marker_selection.sets import design_markers
-from completion.mocap.marker_selection.settings import DesignConfig
+from completion.mocap.marker_selection.design import design_markers
+from completion.mocap.marker_selection.fits import BodyPoints, DesignConfig, prior_around, rough_poses, vertex_errors
+from completion.mocap.marker_selection.greedy import ADD, REMOVE, MarkerSets, exchange, symmetric_groups, walk
+from completion.mocap.marker_selection.linear import LinearBodies, fit_bodies, shared_shape
 from completion.mocap.marker_sets.layout import MarkerLayout
 from model.fitting import spread_vertices
 from scanprep.geometry import rotations
@@ -25,7 +21,7 @@ CANDIDATES = MarkerLayout(LABELS, spread_vertices(MODEL.template.vertices, len(L
 POSES = MODEL.pose_mean + RNG.normal(0, 0.3, (5, 4, 3))
 BODIES = MODEL.vertices(POSES, RNG.normal(0, 1, (5, 3)), RNG.normal(0, 1, (5, 3))) \
     + RNG.normal(0, 0.002, (5, *MODEL.template.vertices.shape))
-CONFIG = DesignConfig(count=7, surface=10_000, fit_surface=10_000, exchanges=0)
+CONFIG = DesignConfig(count=7, surface=10_000, exchanges=0)
 FITS = fit_bodies(MODEL, BODIES, CANDIDATES, CONFIG)
 GROUPS = symmetric_groups(LABELS)
 SINGLES = tuple((i,) for i in range(len(LABELS)))
@@ -136,7 +132,7 @@ def test_full_refits_end_where_their_energy_is_least():
 
 
 def test_moved_turned_and_reordered_bodies_have_the_same_markers():
-    config = replace(CONFIG, direction="remove")
+    config = CONFIG
     design = design_markers(MODEL, BODIES, CANDIDATES, config)
     R = rotations.exp(np.array([0.2, -0.4, 0.3]))
     moved = design_markers(MODEL, (BODIES @ R.T + [3.0, -1.0, 2.0])[::-1], CANDIDATES, config)
@@ -157,8 +153,8 @@ def test_betas_common_to_one_body_are_its_own():
 def test_two_equal_bodies_with_common_betas_are_one_with_half_the_shape_prior():
     twice = np.repeat(np.arange(5), 2)
     joint = shared_shape(FITS.linear.of(twice), FITS.x[twice], twice, 3)
-    half, prior = replace(CONFIG, shape_weight=0.5), FITS.prior
-    weaker = prior_around(MODEL, FITS.x, half)
+    prior = FITS.prior
+    weaker = prior_around(MODEL, FITS.x, 0.5)
     one = replace(FITS.linear, precision=weaker.precision, lean=(weaker.mean - FITS.x) @ weaker.precision)
     assert np.allclose(weaker.precision[:15, :15], prior.precision[:15, :15])
     for chosen in ([0, 3, 8], [1, 2, 5, 9, 10]):

@@ -9,7 +9,7 @@ from completion.__main__ import main
 from completion.mocap.marker_sets import pictures
 from completion.mocap.marker_sets import transfer as carry
 from completion.mocap.marker_sets.layout import MarkerLayout
-from completion.mocap.marker_sets.named import layout_names
+from completion.mocap.marker_sets.named import layout_names, named_layout
 from completion.mocap.marker_sets.pictures import marker_rows, picture_layout
 from scanprep import read_mesh, write_landmarks, write_mesh
 from scanprep.registration.nonrigid import Registration
@@ -40,7 +40,7 @@ def test_a_layout_is_shown_on_a_mesh_and_can_be_used_again(tmp_path, person):
     assert all(label in page for label in layout.labels) and (tmp_path / "out" / "layout.png").stat().st_size > 5_000
     figures = {m["metric"]: m["value"] for m in json.loads((tmp_path / "out" / "report.json").read_text())["metrics"]}
     assert (figures["markers"], figures["pairs of left and right"], figures["without a side"]) == (47, 21, 5)
-    named = MarkerLayout.named("vicon47", person.mesh)
+    named = named_layout("vicon47", person.mesh)
     assert set(zip(layout.labels, layout.vertices.tolist(), strict=True)) == \
         set(zip(named.labels, named.vertices.tolist(), strict=True))
 
@@ -53,7 +53,7 @@ def test_a_layout_is_shown_on_a_model(tmp_path):
 
 
 def test_the_picture_shows_every_marker(person):
-    layout = MarkerLayout.named("helenhayes29", person.mesh)
+    layout = named_layout("helenhayes29", person.mesh)
     bare = MarkerLayout(layout.labels[:1], layout.vertices[:1])
     full, one = (picture_layout(person.mesh, x, 220).astype(int) for x in (layout, bare))
     assert full.shape == one.shape and full.shape[0] > 220
@@ -61,7 +61,7 @@ def test_the_picture_shows_every_marker(person):
 
 
 def test_the_table_has_partners_and_parts(person):
-    layout = MarkerLayout.named("cmu41", person.mesh)
+    layout = named_layout("cmu41", person.mesh)
     rows = {row[0]: row for row in marker_rows(person.mesh, layout, person.skeleton)}
     assert rows["LELB"][3] == "RELB" and rows["C7"][3] == "middle" and rows["RBAC"][3] == "-"
     assert rows["LTHI"][2] == "l_thigh" and rows["LTHI"][5] == "loose" and rows["LWRA"][4] == "45.0 mm"
@@ -90,7 +90,7 @@ def test_carrying_writes_layout_picture_and_registration(tmp_path, person, monke
     assert seen["landmarks"][0].tolist() == [5, 9, 700]
     target = read_mesh(tmp_path / "b.ply")
     np.testing.assert_allclose(MarkerLayout.load(out, 9380).select(["C7", "LELB"]).place(target),
-                               MarkerLayout.named("vicon47", body).select(["C7", "LELB"]).place(body), atol=2e-3)
+                               named_layout("vicon47", body).select(["C7", "LELB"]).place(body), atol=2e-3)
     assert out.with_suffix(".png").exists() and len(read_mesh(out.with_suffix(".registered.ply")).vertices) == 9380
     figures = {m["metric"]: m["value"] for m in json.loads((tmp_path / "b.layout.report.json").read_text())["metrics"]}
     assert figures["target not covered"] == pytest.approx(6) and figures["landmarks"] == 3

@@ -3,19 +3,17 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
+from cartoons import CARTOONS, CartoonShape, cartoon
 from completion_bodies import MEAN, worm_with_prior
 from glb_reader import Glb
 
-from completion import CartoonShape, Motion, cartoon, deformation, retarget_soft_tissue
-from completion.mocap.results import SoftTissue
-from completion.mocap.retargeting import pictures
-from completion.mocap.retargeting.cartoons import CARTOONS
+from completion import Motion, deformation, motion_pictures, retarget_soft_tissue
 from completion.mocap.retargeting.creases import Creases, at_rest
 from completion.mocap.retargeting.pictures import picture_transfer, write_character
 from completion.mocap.retargeting.retarget import world_up
 from completion.mocap.retargeting.soft_tissue import moving_character
-from model.posing.character import CharacterConfig, character_model
-from model.posing.character_mesh import inside
+from completion.mocap.soft_tissue.soft_tissue import SoftTissue
+from model.posing.character import CharacterConfig, character_model, inside
 from scanprep.geometry import rotations
 from scanprep.geometry.surface import Surface
 
@@ -168,7 +166,7 @@ def test_files_and_pictures(model, soft, character, tmp_path, monkeypatch):
         seen.append(shape)
         return np.full((height, width, 3), 255, dtype=np.uint8)
 
-    monkeypatch.setattr(pictures, "render", draw)
+    monkeypatch.setattr(motion_pictures, "render", draw)
     sheet = picture_transfer(model, soft, character, moved, 3, 40)
     assert len(seen) == 9 and sheet.dtype == np.uint8
     assert [shape.color is None for shape in seen] == [True] * 6 + [False] * 3

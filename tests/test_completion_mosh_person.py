@@ -8,9 +8,8 @@ from completion_bodies import worm_with_prior
 from completion import MoshConfig, PersonConfig, find_person, mosh
 from completion.mocap.files.markers import MarkerSequence
 from completion.mocap.marker_sets.layout import MarkerLayout
-from completion.mocap.pose.follow import animate
-from completion.mocap.pose.mosh_poses import animate_config, follow_poses
-from completion.mocap.settings import FollowConfig
+from completion.mocap.mosh.mosh import PoseConfig
+from completion.mocap.pose.settings import AnimateConfig
 from completion.mocap.subject.attachment import latent_markers
 from completion.mocap.subject.person import choose_frames, common_markers
 from scanprep.geometry import rotations
@@ -21,8 +20,8 @@ BETAS = np.array([1.4, -1.1, 0.8])
 LABELS = tuple(f"M{i:02d}" for i in range(26))
 INSIDE = np.random.default_rng(9).dirichlet([6, 6, 6], 26)          # markers well inside of triangles
 LAYOUT = MarkerLayout(LABELS, MODEL.template.faces[np.round(np.linspace(8, 788, 26)).astype(int)], 0.0095, INSIDE)
-EXACT = PersonConfig(shape=1e-4, pose=1e-4, data=100.0, start_axes=2, n_betas=3, frames=8, annealing=(100.0, 10.0, 1.0))
-USUAL = PersonConfig(start_axes=2, frames=8, annealing=(10.0, 4.0, 1.0))
+EXACT = PersonConfig(shape=1e-4, pose=1e-4, data=100.0, n_betas=3, frames=8, annealing=(100.0, 10.0, 1.0))
+USUAL = PersonConfig(frames=8, annealing=(10.0, 4.0, 1.0))
 SUBJECT = MODEL.subject(BETAS)
 REST = np.zeros((4, 3))
 
@@ -187,12 +186,11 @@ def test_what_cannot_be_used_is_named():
 
 def test_weights_of_the_paper_are_those_of_the_engine():
     """[MoSh] Eq. 17, 21, 22: a residual of 1/√λ costs one."""
-    found = animate_config(FollowConfig(data=0.25, pose=0.7, velocity=4.0))
+    found = PoseConfig.weighted(data=0.25, pose=0.7, velocity=4.0)
     assert found.marker_sd == pytest.approx(0.02) and found.prior_weight == 0.7
     assert found.angle_acceleration == pytest.approx(0.5 * 120**2)
-    person, data = MODEL.subject(beside().betas), sequence(displaced())
-    one = follow_poses(person, data, beside().layout, FollowConfig(data=0.25, pose=0.7, velocity=4.0))
-    np.testing.assert_array_equal(one.poses, animate(person, data, beside().layout, found).poses)
+    ours = MoshConfig().poses                    # those of `animate`, but for markers that are held closer
+    assert (ours.prior_weight, ours.angle_acceleration) == (AnimateConfig().prior_weight, 60.0)
 
 
 def test_everything_together():
@@ -200,9 +198,9 @@ def test_everything_together():
     data = sequence(displaced())
     more = MarkerSequence(np.concatenate([data.positions, data.positions[:, :1] + 1], axis=1), (*LABELS, "prop"), 60.0)
     found = mosh(MODEL, more, LAYOUT, MoshConfig(person=USUAL, soft_tissue=False))
-    assert len(found.motions) == len(found.faults) == 1 and found.soft_tissue == ()
+    assert len(found.motions) == len(found.artefacts) == 1 and found.soft_tissue == ()
     assert found.motions[0].labels == more.labels and np.isnan(found.motions[0].residuals[:, -1]).all()
-    assert np.nanmean(found.motions[0].residuals) < 5e-3 and not found.faults[0].exchanges
+    assert np.nanmean(found.motions[0].residuals) < 5e-3 and not found.artefacts[0].swaps
     poses, trans = motion()
     body = found.motions[0].vertices(MODEL.subject(found.betas))
     assert np.linalg.norm(body - SUBJECT.vertices(poses, trans), axis=2).mean() < 0.01
@@ -217,7 +215,32 @@ def test_labels_that_were_exchanged_do_not_spoil_the_person():
     swapped[np.ix_(some, [0, 7])] = swapped[np.ix_(some, [7, 0])]
     found = mosh(MODEL, MarkerSequence(swapped, data.labels, data.rate), LAYOUT,
                  MoshConfig(person=USUAL, soft_tissue=False))
-    swap, = found.faults[0].exchanges
+    swap, = found.artefacts[0].swaps
     assert {swap.first, swap.second} == {LABELS[0], LABELS[7]} and (swap.begin, swap.end) == (some[0], some[-1])
     np.testing.assert_array_equal(found.betas, beside().betas)
     assert np.nanmean(found.motions[0].residuals) < 5e-3
+
+
+def test_the_published_preset_is_the_patent():
+    """Stage one, poses and soft tissue of [MoSh]; every marker believed alike and nothing repaired."""
+    found = MoshConfig.published()
+    person, poses, soft = found.person, found.poses, found.soft
+    assert (person.data, person.surface, person.initial, person.shape, person.pose) == (0.75, 100, 0.25, 1, 0.25)
+    assert (person.frames, person.choice, person.annealing) == (12, "random", (40, 20, 10, 4, 2, 1))
+    assert (0.01 / poses.marker_sd)**2 == pytest.approx(0.75) and poses.prior_weight == 1
+    assert (120**2 / poses.angle_acceleration)**2 == pytest.approx(6.25)
+    assert (soft.data, soft.pose, soft.velocity, soft.change) == (0.75, 1, 6.25, 0.25)
+    assert (soft.skin, soft.temporal_smoothness, found.repair) == (0, 0, False)
+    data = sequence(displaced())
+    result = mosh(MODEL, data, LAYOUT, replace(found, person=replace(person, frames=8, annealing=(10.0, 4.0, 1.0))))
+    assert not result.artefacts[0].swaps and not result.artefacts[0].bad
+    np.testing.assert_array_equal(result.artefacts[0].repaired.positions, data.positions)
+    body = result.soft_tissue[0].vertices(MODEL)
+    assert np.linalg.norm(body - SUBJECT.vertices(*motion()), axis=2).mean() < 0.02
+
+
+def test_places_that_are_known_are_held():
+    """With a strong weight on the usual places betas alone are left, and come back exactly as from a known layout."""
+    found = find_person(MODEL, sequence(), LAYOUT, replace(USUAL, initial=1e4, shape=1e-3, pose=1e-3))
+    assert found.moved.max() < 1e-3
+    np.testing.assert_allclose(found.betas, BETAS, atol=0.05)

@@ -3,6 +3,7 @@ import shutil
 import subprocess
 import sys
 from pathlib import Path
+from types import MappingProxyType
 
 import pytest
 from mosh_folders import QuietWork, contents, counted, run, write_people
@@ -15,9 +16,9 @@ from scanprep.batch.room import Room
 from scanprep.batch.workspace import HOME
 
 HERE = Path()
-BOB = ("people/bob", "--name", "bob")
+BOB = ("people/bob", "--subjects", "all")
 PERSON = {"start", "solve"}
-ALL = PERSON | {"poses", "faults", "soft", "files", "page", "person page"}
+ALL = PERSON | {"poses", "artefacts", "soft", "files", "page", "person page"}
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -50,7 +51,7 @@ def copied(place, whole, tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize("stage, call, kept", [
-    ("solve", 2, {"start"}), ("soft", 1, PERSON | {"poses", "faults"}), ("page", 1, ALL - {"page", "person page"}),
+    ("solve", 2, {"start"}), ("soft", 1, PERSON | {"poses", "artefacts"}), ("page", 1, ALL - {"page", "person page"}),
     ("person page", 1, ALL - {"person page"})])
 def test_killed_in_the_middle_of_a_recording_it_goes_on(copied, stage, call, kept):
     out, program = copied / "killed", Path(__file__).with_name("mosh_folders.py")
@@ -66,13 +67,13 @@ def test_killed_in_the_middle_of_a_recording_it_goes_on(copied, stage, call, kep
     assert not (out / HOME / "making").exists() and not list((out / HOME).rglob(".*"))
 
 
-@pytest.mark.parametrize("words, anew", [
-    ((), set()), (("--keys", "6"), {"files", "person page"}), (("--factor", "1.5"), {"files", "person page"}),
-    (("--soft.change", "0.5"), {"soft", "files", "page", "person page"}),
-    (("--follow.pose", "0.2"), ALL - PERSON), (("--person.shape", "0.4"), ALL), (("--hold-out", "M7"), ALL),
-    (("--force",), ALL)])
-def test_what_depends_on_a_changed_setting_is_done_anew(copied, words, anew):
-    check(copied, anew, words)
+@pytest.mark.parametrize("words, settings, anew", [
+    ((), {}, set()), ((), {"exaggeration": 1.5}, {"files", "page", "person page"}),
+    ((), {"soft": {"change": 0.5}}, {"soft", "files", "page", "person page"}),
+    ((), {"poses": {"prior_weight": 0.2}}, ALL - PERSON), ((), {"person": {"shape": 0.4}}, ALL),
+    (("--hold-out", "M7"), {}, ALL), (("--force",), {}, ALL)])
+def test_what_depends_on_a_changed_setting_is_done_anew(copied, words, settings, anew):
+    check(copied, anew, words, settings)
 
 
 @pytest.mark.parametrize("what", ["model", "layout", "recording"])
@@ -94,19 +95,19 @@ def test_what_depends_on_a_changed_file_is_done_anew(copied, what):
     check(copied, ALL - PERSON if what == "recording" else ALL)
 
 
-def check(copied, anew, words=()):
+def check(copied, anew, words=(), settings=MappingProxyType({})):
     """What is done anew is what was expected, and comes to what a first call comes to."""
     with counted() as calls:
-        assert run(HERE, *BOB, "-o", "whole", *words) == 0
+        assert run(HERE, *BOB, "-o", "whole", *words, **settings) == 0
     assert {name for name, count in calls.items() if count} == anew
     if anew:
-        assert run(HERE, *BOB, "-o", "fresh", *words) == 0
+        assert run(HERE, *BOB, "-o", "fresh", *words, **settings) == 0
         assert contents(copied / "whole") == contents(copied / "fresh")
 
 
 def test_two_workers_write_what_one_does(place, tmp_path):
     for count in ("1", "2"):
-        assert run(place, place / "people", "-o", tmp_path / count, "--workers", count, "--no-soft-tissue") == 0
+        assert run(place, place / "people", "-o", tmp_path / count, "--workers", count, soft_tissue=False) == 0
     one = contents(tmp_path / "1")
     assert {"ann/walk/motion.npz", "bob/jump/report.html"} <= set(one) and contents(tmp_path / "2") == one
 
@@ -121,10 +122,10 @@ def test_workers_of_a_cluster_keep_no_steps_and_write_the_same(copied, monkeypat
 def test_a_recording_less_takes_its_folder_away(place, tmp_path):
     people, out = tmp_path / "people", tmp_path / "out"
     shutil.copytree(place / "people", people)
-    assert run(place, people / "ann", "--by", "all", "--name", "ann", "-o", out, "--no-soft-tissue") == 0
+    assert run(place, people / "ann", "--subjects", "all", "-o", out, soft_tissue=False) == 0
     (out / "ann" / "walk" / "notes.txt").write_text("mine")
     (people / "ann" / "run.csv").unlink()
-    assert run(place, people / "ann", "--by", "all", "--name", "ann", "-o", out, "--no-soft-tissue") == 0
+    assert run(place, people / "ann", "--subjects", "all", "-o", out, soft_tissue=False) == 0
     assert not (out / "ann" / "run").exists() and (out / "ann" / "walk" / "notes.txt").read_text() == "mine"
 
 
@@ -133,7 +134,7 @@ def test_what_is_not_of_scapekit_stays(copied, capsys):
     (out / "bob" / "jump" / "animation.glb").write_bytes(b"mine")
     before = contents(out)
     with counted() as calls:
-        assert run(HERE, *BOB, "-o", "whole", "--keys", "6") == 1
+        assert run(HERE, *BOB, "-o", "whole", exaggeration=1.5) == 1
     assert "animation.glb: in the way of the output" in capsys.readouterr().err and not calls["start"]
     after = contents(out)
     assert {name for name in after if after[name] != before[name]} <= {"report.html", "report.json"}
@@ -151,7 +152,7 @@ def test_a_mended_table_is_never_overwritten(copied, capsys):
     assert run(HERE, *BOB, "-o", "whole") == 1
     assert "whole/subjects.csv: was mended; go by it with --subjects whole/subjects.csv" in capsys.readouterr().err
     assert contents(out) == before
-    assert run(HERE, "people/bob", "-o", "whole", "--subjects", table, "--no-soft-tissue") == 0
+    assert run(HERE, "people/bob", "-o", "whole", "--subjects", table, soft_tissue=False) == 0
     assert table.read_text() == mended and (out / "rob" / "jump" / "motion.npz").exists()
 
 
@@ -162,7 +163,7 @@ def test_a_second_run_leaves(copied, capsys):
             "    print('in', flush=True)\n    sys.stdin.read()\n")
     other = subprocess.Popen([sys.executable, "-c", code, out], stdin=subprocess.PIPE, stdout=subprocess.PIPE)
     assert other.stdout.readline() == b"in\n"
-    assert run(HERE, *BOB, "-o", "whole", "--keys", "6") == 1
+    assert run(HERE, *BOB, "-o", "whole", exaggeration=1.5) == 1
     assert "another run is at work on this output" in capsys.readouterr().err
     other.communicate()
     assert contents(out) == before
@@ -175,7 +176,7 @@ def test_figures_that_mean_nothing_are_a_failure(place, tmp_path, monkeypatch, c
     done = work.mosh_person
     monkeypatch.setattr(work, "mosh_person", lambda *given: (
         [Metric("problem", "half the body was missed: unit?"), *(found := done(*given))[0]], found[1]))
-    assert run(place, place / "people" / "bob", "--name", "bob", "-o", tmp_path / "out", "--no-soft-tissue") == 1
+    assert run(place, place / "people" / "bob", "--subjects", "all", "-o", tmp_path / "out", soft_tissue=False) == 1
     assert "failed: bob: half the body was missed: unit?" in capsys.readouterr().err
     assert (tmp_path / "out" / "bob" / "jump" / "motion.npz").exists()
     assert "half the body was missed" in (tmp_path / "out" / "report.html").read_text()

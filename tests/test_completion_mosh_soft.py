@@ -11,19 +11,21 @@ from conformance_bodies import KINDS
 from completion import MarkerLayout, MarkerSequence, Motion, follow_soft_tissue
 from completion.energy import lifted
 from completion.mocap.pose.marked_body import supports
-from completion.mocap.results import SoftTissue
-from completion.mocap.settings import SoftTissueConfig
-from completion.mocap.soft_tissue.changing_bodies import changing_bodies, skin_movement
-from completion.mocap.soft_tissue.equations import SwayingBody, skin_metric
-from completion.mocap.soft_tissue.soft_tissue import SoftFollower, cheap_directions
-from completion.mocap.soft_tissue.temporal_smoothness import steady_changes
+from completion.mocap.soft_tissue.changing_body import ChangingBody, changing_bodies, skin_metric, skin_movement
+from completion.mocap.soft_tissue.soft_tissue import (
+    SoftFollower,
+    SoftTissue,
+    SoftTissueConfig,
+    cheap_directions,
+    smooth_changes,
+)
 from model.body import BodyModel
 from scanprep.geometry import rotations
 from scanprep.geometry.storage import StorageError
 
 T, RATE = 24, 60.0
 OWN = np.array([0.6, -0.4, 0.3])
-BELIEVING = SoftTissueConfig(change=1e-4, skin=0, pose=1e-4, velocity=1e-3, steadiness=0, iterations=8)
+BELIEVING = SoftTissueConfig(change=1e-4, skin=0, pose=1e-4, velocity=1e-3, temporal_smoothness=0)
 
 
 @cache
@@ -62,9 +64,9 @@ def fixed(poses: np.ndarray, trans: np.ndarray, where: MarkerLayout) -> Motion:
     return Motion(poses, trans, OWN, RATE, np.zeros((len(poses), len(where.labels))), where.labels)
 
 
-def swaying(model: BodyModel, where: MarkerLayout) -> SwayingBody:
+def swaying(model: BodyModel, where: MarkerLayout) -> ChangingBody:
     """The worm that sways along its betas."""
-    return SwayingBody(model, OWN, where, np.eye(3), model.shape_jacobian(model.pose_mean), 0.3, 0.3)
+    return ChangingBody(model, OWN, where, np.eye(3), model.shape_jacobian(model.pose_mean), 0.3, 0.3)
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -141,10 +143,10 @@ def test_noise_is_not_taken_for_soft_tissue() -> None:
 def test_skin_and_steadiness_hold_the_change() -> None:
     model, where = body(), layout(body())
     markers, motion = seen(model, where, moving(model)[2], 0.005)
-    free = SoftTissueConfig(skin=0, steadiness=0)
+    free = SoftTissueConfig(skin=0, temporal_smoothness=0)
     size, bend = {}, {}
     for name, config in (("free", free), ("skin", replace(free, skin=1000.0)),
-                         ("steady", replace(free, steadiness=2e4)), ("still", replace(free, change=1e8))):
+                         ("steady", replace(free, temporal_smoothness=2e4)), ("still", replace(free, change=1e8))):
         changes = follow_soft_tissue(model, motion, markers, where, config).changes
         size[name], bend[name] = np.abs(changes).mean(), np.abs(np.diff(changes, n=2, axis=0)).mean()
     assert size["skin"] < 0.5 * size["free"] and size["still"] < 1e-4
@@ -158,7 +160,7 @@ def test_steady_changes_without_steadiness_are_frame_by_frame() -> None:
     x, weights = sway.marked.body.join(motion.poses, motion.trans), np.full((T, 40), 1e4)
     gradient, hessian = sway.change_system(x, markers.positions, weights)
     alone = -np.linalg.solve(hessian + np.eye(3), gradient[..., None])[..., 0]
-    np.testing.assert_allclose(steady_changes(sway, x, markers.positions, weights, 0.0), alone, rtol=1e-6, atol=1e-8)
+    np.testing.assert_allclose(smooth_changes(sway, x, markers.positions, weights, 0.0), alone, rtol=1e-6, atol=1e-8)
 
 
 def test_the_world_may_be_turned() -> None:
@@ -247,7 +249,7 @@ def test_what_does_not_belong_together_is_refused() -> None:
             follow_soft_tissue(model, wrong, markers, where)
     with pytest.raises(ValueError, match="24 frames, 40 labels"):
         follow_soft_tissue(model, motion, markers.frames(slice(0, 5)), where)
-    for name, value in (("change", 0.0), ("skin", -1.0), ("steadiness", -1.0)):
+    for name, value in (("change", 0.0), ("skin", -1.0), ("temporal_smoothness", -1.0)):
         with pytest.raises(ValueError, match=f"{name}: expected|config"):
             SoftFollower(model, motion, markers, where, SoftTissueConfig(**{name: value}))
     with pytest.raises(ValueError, match="k at most 3"):

@@ -7,13 +7,12 @@ from completion.bodies import FixedBody
 from completion.energy import MovingPoints
 from completion.mocap.marker_sets.layout import MarkerLayout
 from completion.mocap.pose.marked_body import supports
-from completion.mocap.subject import terms
-from completion.mocap.subject.attachment import above_triangles, latent_markers, signed_distance, simulated
-from completion.mocap.subject.terms import LatentPoints
+from completion.mocap.subject import latent_fit as terms
+from completion.mocap.subject.attachment import above_triangles, latent_markers, simulated
+from completion.mocap.subject.latent_fit import LatentPoints
 from completion.priors import gaussian_prior
 from scanprep.geometry import rotations
 from scanprep.geometry.least_squares import Residual
-from scanprep.geometry.mesh import Mesh
 
 MODEL = worm_with_prior()
 K, L, REST = MODEL.n_betas, 6, np.zeros((4, 3))
@@ -26,6 +25,13 @@ KINDS = ["triangle", "neighbourhood"]
 
 def mean_mesh(betas=None):
     return MODEL.template.with_vertices(LATENT.at(np.zeros(K) if betas is None else betas))
+
+
+def signed_distance(points, mesh):
+    """Distances (n,) from a surface by libigl, negative inside, with the nearest triangles and points."""
+    import igl
+
+    return igl.signed_distance(points, mesh.vertices, mesh.faces, sign_type=igl.SIGNED_DISTANCE_TYPE_PSEUDONORMAL)[:3]
 
 
 def beside(mesh, seed=0, off=0.02):
@@ -71,24 +77,18 @@ def of_frames(kind):
         moving = energy.moving_points(y, d_pose, points.shape_jacobian(pose))
         found, frame = simulated(kind, moving, x[15 + K:].reshape(-1, 3))
         J = np.concatenate([found.jacobian, terms.each_own(frame)], axis=-1)
-        residual = terms.data(MovingPoints(found.positions, J), targets, np.arange(1.0, L + 1))
+        residual = terms.data_term(MovingPoints(found.positions, J), targets, np.arange(1.0, L + 1))
         return Residual(residual.values[0], residual.jacobian[0])
 
     return term, x
 
 
-def of_motion(kind):
-    x = np.random.default_rng(3).normal(0, 0.4, (5, 15))
-    return (lambda flat: terms.velocity(flat.reshape(5, 15), 12, 6.25)), x.ravel()
-
-
 TERMS = {
     "data": of_frames,
-    "surface": of_latent(lambda m, corners, usual: terms.surface(m, corners, np.full(L, 0.01), np.arange(1.0, L + 1))),
-    "usual_place": of_latent(lambda m, corners, usual: terms.usual_place(m, usual, np.arange(1.0, L + 1))),
-    "shape": lambda kind: ((lambda z: terms.shape(z, K, 2.0)), np.random.default_rng(4).normal(size=K + 3 * L)),
-    "pose": lambda kind: ((lambda x: terms.pose(x, PRIOR, 0.25)), np.random.default_rng(5).normal(size=15)),
-    "velocity": of_motion,
+    "surface": of_latent(lambda m, corners, usual: terms.surface_term(m, corners, np.full(L, 0.01), 3.0)),
+    "usual_place": of_latent(lambda m, corners, usual: terms.place_term(m, usual, np.arange(1.0, L + 1))),
+    "shape": lambda kind: ((lambda z: terms.shape_term(z, K, 2.0)), np.random.default_rng(4).normal(size=K + 3 * L)),
+    "pose": lambda kind: ((lambda x: energy.pose_prior(x, PRIOR, 0.25)), np.random.default_rng(5).normal(size=15)),
 }
 
 
@@ -109,18 +109,9 @@ def test_weights_are_per_square_centimetre():
     still = np.zeros((1, 3, 1))
     at, there = MovingPoints(np.array([[0.0, 0.0, 0.03]]), still), MovingPoints(np.array([[0.0, 0.0, 0.01]]), still)
     corners = MovingPoints(np.array([[-1.0, -1, 0], [1, -1, 0], [0, 2, 0]]), np.zeros((3, 3, 1)))
-    assert terms.data(at, there.positions, np.array([0.75])).energy == pytest.approx(3.0)
-    assert terms.usual_place(at, there, np.array([0.25])).energy == pytest.approx(1.0)
-    assert terms.surface(at, corners, np.array([0.01]), np.array([100.0])).energy == pytest.approx(400.0)
-
-
-def test_constant_velocity_costs_nothing_and_a_turn_back_its_square():
-    x = np.zeros((4, 15))
-    x[:, :12] = np.arange(4)[:, None] * np.arange(12)
-    x[:, 12:] = np.random.default_rng(0).normal(size=(4, 3))                      # the place is free
-    assert terms.velocity(x, 12, 6.25).energy == pytest.approx(0.0, abs=1e-20)
-    x[3, 4] += 0.2
-    assert terms.velocity(x, 12, 6.25).energy == pytest.approx(6.25 * 0.04)
+    assert terms.data_term(at, there.positions, np.array([0.75])).energy == pytest.approx(3.0)
+    assert terms.place_term(at, there, np.array([0.25])).energy == pytest.approx(1.0)
+    assert terms.surface_term(at, corners, np.array([0.01]), 100.0).energy == pytest.approx(400.0)
 
 
 @pytest.mark.parametrize("kind", KINDS)
@@ -149,8 +140,7 @@ def test_hanging_a_marker_anew_keeps_its_place(kind):
     assert (anew.corners != markers.corners).any()
     np.testing.assert_allclose(anew.places(mesh.vertices, anew.coefficients(mesh.vertices, places)), places,
                                atol=1e-12)
-    nearest = signed_distance(places, mesh)
-    np.testing.assert_array_equal(anew.corners, mesh.faces[nearest.faces])
+    np.testing.assert_array_equal(anew.corners, mesh.faces[signed_distance(places, mesh)[1]])
 
 
 def test_the_neighbourhood_spreads_over_all_edges_of_the_nearest_vertex():
@@ -179,50 +169,16 @@ def test_the_neighbourhood_spreads_over_all_edges_of_the_nearest_vertex():
         latent_markers(mesh, points, "glue")
 
 
-def test_signed_distance_of_a_ball_of_triangles():
-    """Near a fine ball it is the distance from the centre less the radius, inside it is negative."""
-    import trimesh
-
-    ball = trimesh.creation.icosphere(4, 0.5)
-    mesh = Mesh(np.array(ball.vertices), np.array(ball.faces))
-    points = np.random.default_rng(0).normal(size=(200, 3))
-    points *= (np.random.default_rng(1).uniform(0.3, 0.9, 200) / np.linalg.norm(points, axis=1))[:, None]
-    found = signed_distance(points, mesh)
-    np.testing.assert_allclose(found.values, np.linalg.norm(points, axis=1) - 0.5, atol=2e-3)
-    radial = points / np.linalg.norm(points, axis=1, keepdims=True)
-    assert np.einsum("nd,nd->n", found.by_points, radial).min() > 0.99
-
-
-def test_derivatives_of_the_signed_distance_are_finite_differences():
-    mesh, h = mean_mesh(), 1e-7
-    points = beside(mesh, 3, 0.03)
-    points[0] = mesh.corners[40].mean(axis=0)                                     # on the surface itself
-    points[1] = mesh.vertices[100] + 0.05 * mesh.vertex_normals[100]              # nearest to a vertex
-    found = signed_distance(points, mesh)
-    assert found.values.min() < 0 < found.values.max() and abs(found.values[0]) < 1e-12
-    for i in range(L):
-        for d in range(3):
-            step = h * (np.arange(3) == d)
-            up, down = (signed_distance(points[i:i + 1] + s * step, mesh).values[0] for s in (1, -1))
-            assert found.by_points[i, d] == pytest.approx((up - down) / (2 * h), abs=1e-5)
-            for c, v in enumerate(mesh.faces[found.faces[i]]):
-                values = []
-                for s in (1, -1):
-                    vertices = mesh.vertices.copy()
-                    vertices[v] += s * step
-                    values.append(signed_distance(points[i:i + 1], mesh.with_vertices(vertices)).values[0])
-                assert found.by_corners[i, c, d] == pytest.approx((values[0] - values[1]) / (2 * h), abs=1e-5)
-
-
 def test_distance_from_the_nearest_triangle_is_that_from_the_surface():
     mesh = mean_mesh()
     rng = np.random.default_rng(8)
     points = np.concatenate([beside(mesh, seed, 0.05) for seed in range(20)]) + rng.normal(0, 0.01, (20 * L, 3))
-    whole = signed_distance(points, mesh)
-    values, by_points, by_corners = above_triangles(points, mesh.corners[whole.faces])
-    outside = whole.values > 1e-6                # beyond a sharp edge the side of one triangle is not that of both
-    np.testing.assert_allclose(np.abs(values), np.abs(whole.values), atol=1e-12)
+    whole, faces, nearest = signed_distance(points, mesh)
+    values, by_points, by_corners = above_triangles(points, mesh.corners[faces])
+    outside = whole > 1e-6                       # beyond a sharp edge the side of one triangle is not that of both
+    np.testing.assert_allclose(np.abs(values), np.abs(whole), atol=1e-12)
     same = outside & (values > 0)
     assert same.sum() > 0.95 * outside.sum() > 20
-    np.testing.assert_allclose(by_points[same], whole.by_points[same], atol=1e-9)
-    np.testing.assert_allclose(by_corners[same], whole.by_corners[same], atol=1e-9)
+    away = (points - nearest)[same] / whole[same, None]
+    np.testing.assert_allclose(by_points[same], away, atol=1e-9)
+    np.testing.assert_allclose(by_corners[same].sum(axis=1), -away, atol=1e-9)

@@ -4,11 +4,11 @@ import struct
 import numpy as np
 import pytest
 
-from completion.mocap.artefacts.virtual import fault_table, write_virtual
+from completion.mocap.artefacts.results import BadSpan, MarkerArtefacts, Swap
+from completion.mocap.artefacts.virtual import artefact_table, write_virtual
 from completion.mocap.files.c3d import _Numbers, point_table
 from completion.mocap.files.c3d_points import replace_points
 from completion.mocap.files.markers import MarkerFileError, MarkerSequence, read_markers
-from completion.mocap.results import BadSpan, Exchange, MarkerFaults
 
 ezc3d = pytest.importorskip("ezc3d")
 LABELS = ("LFHD", "RFHD", "C7", "Free")
@@ -49,7 +49,7 @@ def found(path):
     repaired = np.take_along_axis(sequence.positions, order[..., None], axis=1)
     repaired[8:10, 0] = np.nan
     simulated = np.random.default_rng(1).normal(0, 0.5, (T, 3, 3))
-    return MarkerFaults((Exchange("LFHD", "RFHD", 2, 5),), (BadSpan("LFHD", "stray", 8, 9, 0.2),), simulated,
+    return MarkerArtefacts((Swap("LFHD", "RFHD", 2, 5),), (BadSpan("LFHD", "stray", 8, 9, 0.2),), simulated,
                         LABELS[:3], MarkerSequence(repaired, LABELS, 100.0), np.ones((T, 3)), simulated + 0.01, order)
 
 
@@ -99,7 +99,7 @@ def test_a_new_file_tells_filled_points_too(tmp_path, original):
     np.testing.assert_array_equal(residual, np.where(filled, 0, np.where(faults.virtual().seen, 1, -1)))
     write_virtual(tmp_path / "v.csv", faults)
     np.testing.assert_allclose(read_markers(tmp_path / "v.csv").positions, faults.virtual().positions, atol=1e-8)
-    assert fault_table(faults)["filled"] == {"LFHD": 2, "C7": 3}
+    assert artefact_table(faults)["filled"] == {"LFHD": 2, "C7": 3}
 
 
 def test_whole_numbers_are_rounded_or_do_not_reach(tmp_path, original):

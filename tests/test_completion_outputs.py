@@ -5,18 +5,10 @@ import numpy as np
 import pytest
 from completion_bodies import MEAN, worm_with_prior
 
-from completion.mocap.files.motion_tables import (
-    joint_angles,
-    joint_centres,
-    rest_skeleton,
-    write_joint_angles,
-    write_joint_centres,
-    write_motion_bvh,
-    write_residuals,
-)
+from completion.mocap.files.motion_files import joint_angles, joint_centres, write_motion
 from completion.mocap.retargeting.retarget import betas_over_time, lowest, morphed_vertices, retarget, world_up
 from completion.motion import Motion
-from scanprep.geometry.rotations import exp
+from scanprep.geometry.rotations import exp, log
 from scanprep.pictures.camera import upright
 
 FRAMES = 40
@@ -50,16 +42,14 @@ def table(path):
     return head, np.array([[float(cell) if cell else np.nan for cell in row] for row in body])
 
 
-def test_joint_angles_are_the_turns_without_jumps(motion, model, tmp_path):
+def test_joint_angles_are_the_rotations_without_jumps(motion, model, subject, tmp_path):
     cut = Motion(motion.poses.copy(), motion.trans, None, 20.0, np.zeros((FRAMES, 0)))
-    from scanprep.geometry.rotations import log
-
     cut.poses[:] = log(exp(motion.poses))                          # jumps where the chart ends
     degrees = joint_angles(cut)
     assert np.abs(np.diff(cut.poses, axis=0)).max() > 3 and np.abs(np.diff(degrees, axis=0)).max() < 40
     np.testing.assert_allclose(exp(np.radians(degrees)), exp(motion.poses), atol=1e-9)
-    write_joint_angles(tmp_path / "a.csv", cut, model.skeleton.names)
-    head, rows = table(tmp_path / "a.csv")
+    write_motion(tmp_path, cut, subject)
+    head, rows = table(tmp_path / "joint_angles.csv")
     first, last = model.skeleton.names[0], model.skeleton.names[-1]
     assert head[:4] == ["time", f"{first}_rx", f"{first}_ry", f"{first}_rz"] and head[-1] == f"{last}_rz"
     np.testing.assert_allclose(rows[:, 1:], degrees.reshape(FRAMES, -1), rtol=1e-5, atol=1e-6)
@@ -71,15 +61,15 @@ def test_joint_centres_are_those_of_the_surface(motion, subject, tmp_path):
     wanted = np.stack([regressor @ v for v in motion.vertices(subject)])
     np.testing.assert_allclose(joint_centres(motion, subject), wanted, atol=1e-10)
     np.testing.assert_allclose(wanted[:, 0], subject.origin + motion.trans, atol=1e-9)      # the rule of Place
-    write_joint_centres(tmp_path / "c.csv", motion, subject)
-    head, rows = table(tmp_path / "c.csv")
+    write_motion(tmp_path, motion, subject)
+    head, rows = table(tmp_path / "joint_centres.csv")
     assert len(head) == 13
     np.testing.assert_allclose(rows[:, 1:].reshape(FRAMES, 4, 3), wanted, rtol=1e-5, atol=1e-6)
 
 
-def test_residuals_have_empty_cells_where_nothing_was_seen(motion, tmp_path):
-    write_residuals(tmp_path / "r.csv", motion)
-    head, rows = table(tmp_path / "r.csv")
+def test_residuals_have_empty_cells_where_nothing_was_seen(motion, subject, tmp_path):
+    write_motion(tmp_path, motion, subject)
+    head, rows = table(tmp_path / "residuals.csv")
     assert head == ["time", "mean", "A", "B"]
     np.testing.assert_allclose(rows[:, 2:], motion.residuals, rtol=1e-5)
     np.testing.assert_allclose(rows[0, 1], motion.residuals[0].mean(), rtol=1e-5)
@@ -87,11 +77,12 @@ def test_residuals_have_empty_cells_where_nothing_was_seen(motion, tmp_path):
 
 
 def test_bvh_has_the_bones_of_the_subject(motion, subject, model, tmp_path):
-    write_motion_bvh(tmp_path / "m.bvh", motion, subject)
-    text = (tmp_path / "m.bvh").read_text()
+    write_motion(tmp_path, motion, subject)
+    text = (tmp_path / "motion.bvh").read_text()
     assert f"Frames: {FRAMES}" in text and "Frame Time: 0.05" in text
     offsets = [np.array(line.split()[1:], float) for line in text.splitlines() if line.strip().startswith("OFFSET")]
-    joints, parents = rest_skeleton(subject).joints, subject.skeleton.parents
+    parents = subject.skeleton.parents
+    joints = subject.skeleton.joint_regressor(subject.template) @ subject.vertices(np.zeros((len(parents), 3)))
     bones = sorted(100 * np.linalg.norm(joints[1:] - joints[parents[1:]], axis=1))
     lengths = np.linalg.norm(offsets, axis=1)
     assert all(np.abs(lengths - bone).min() < 1e-4 for bone in bones)

@@ -7,14 +7,12 @@ from completion_bodies import MEAN, worm_with_prior
 from completion import energy
 from completion.mocap.files.markers import MarkerSequence
 from completion.mocap.marker_sets.layout import MarkerLayout
-from completion.mocap.pose.fast_rotations import compose, exp
 from completion.mocap.pose.follow import AnimateConfig, animate
-from completion.mocap.pose.foot_contact import Floor, Standing
-from completion.mocap.pose.lowpass import low_pass
-from completion.mocap.pose.marked_body import MarkedBody, supports
-from completion.mocap.pose.marker_points import PartShapes
-from completion.mocap.pose.prediction import KalmanPrediction, inertia
+from completion.mocap.pose.foot_contact import Floor, FootContact
+from completion.mocap.pose.marked_body import MarkedBody, PartShapes, supports
+from completion.mocap.pose.prediction import KalmanPrediction
 from completion.mocap.pose.robust import LabelWatch, marker_weights
+from completion.mocap.pose.smooth import inertia, low_pass
 from completion.mocap.pose.stream import MarkerStream
 from completion.motion import Motion
 from model.features import linear_features
@@ -25,7 +23,7 @@ from scanprep.geometry import rotations
 from scanprep.synthetic.people import Person, walk
 
 FRAMES = 50
-CONFIG = AnimateConfig(start_axes=1)
+CONFIG = AnimateConfig()
 
 
 @pytest.fixture(scope="module")
@@ -54,14 +52,6 @@ def pushed(stream, positions):
 def errors(subject, frames, meshes):
     found = subject.vertices(np.array([f.pose for f in frames]), np.array([f.trans for f in frames]))
     return np.linalg.norm(found - meshes, axis=2).mean(axis=1)
-
-
-def test_turns_agree_with_scipy():
-    a, b = np.random.default_rng(0).normal(0, 1.5, (2, 50, 3))
-    a[0], b[0], a[1], b[1] = 0, 0, [np.pi, 0, 0], 0
-    np.testing.assert_allclose(exp(a), rotations.exp(a), atol=1e-14)
-    np.testing.assert_allclose(rotations.exp(compose(a, b)), rotations.exp(a) @ rotations.exp(b), atol=1e-12)
-    assert np.linalg.norm(compose(a, b), axis=1).max() <= np.pi + 1e-12
 
 
 def test_part_shapes_are_the_point_operator(subject, layout):
@@ -180,11 +170,11 @@ def test_the_watch_changes_its_mind_only_with_reason():
 def test_the_kalman_filter_is_the_smoother_of_its_past(subject, layout):
     """On numbers that add, a filter's last state is the least-squares solution over all frames so far."""
     body = MarkedBody(subject, layout, 0.3, 0.3)
-    config = replace(CONFIG, momentum=1.0)
     rng, P, T = np.random.default_rng(5), body.n_unknowns, 8
-    filter = KalmanPrediction(body, config, 100.0)
+    filter = KalmanPrediction(body, CONFIG, 100.0)
+    filter.momentum = 1.0
     filter.begin(np.zeros(P))
-    noise, start = 1 / inertia(config, 100.0, P)[-1], filter.place[-1, -1]
+    noise, start = 1 / inertia(CONFIG, 100.0, P)[-1], filter.place[-1, -1]
     seen, information = rng.normal(0, 1e-4, T), rng.random(T) / noise
     for z, weight in zip(seen, information, strict=True):
         expected, prior = filter.expect()
@@ -260,7 +250,7 @@ def animated(walker, name, **settings):
     truth = subject.vertices(*motions[name])
     noise = np.random.default_rng(1).normal(0, 0.005, (60, 90, 3))
     motion = animate(subject, MarkerSequence(truth[:, layout.vertices] + noise, layout.labels, 60.0), layout,
-                     AnimateConfig(start_axes=1, **settings))
+                     AnimateConfig(**settings))
     return truth, motion.vertices(subject)
 
 
@@ -300,12 +290,13 @@ def test_what_stands_is_held_on_the_floor_and_the_rest_is_free(walker):
     subject, layout, motions = walker
     body = MarkedBody(subject, layout, 0.3, 0.3)
     x = body.body.join(*motions["stand"])
-    standing = Standing(body, x, 60.0)
-    held = ~np.isnan(standing.targets[..., 0])
-    assert held.all(axis=0).sum() >= 4 and (standing.floor.above(standing.targets[held]) > -1e-9).all()
+    feet = FootContact(body, x, 60.0)
+    places = feet.held(x).places
+    held = ~np.isnan(places[..., 0])
+    assert held.all(axis=0).sum() >= 4 and (feet.floor.above(places[held]) > -1e-9).all()
     raised = x.copy()
     raised[:, -1] += 1
-    assert np.isnan(Standing(body, raised, 60.0, standing.floor).targets).all()
+    assert np.isnan(FootContact(body, raised, 60.0, feet.floor).held(raised).places).all()
 
 
 def test_a_motion_keeps_which_markers_were_trusted(tmp_path):

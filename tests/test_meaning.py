@@ -12,14 +12,13 @@ import pytest
 from completion_bodies import half_view, worm_with_prior
 from scanned_shapes import ball as sphere
 
-from completion import MarkerLayout, MarkerSequence, write_markers
+from completion import MarkerLayout, MarkerSequence, motion_pictures, write_markers
 from completion.__main__ import main
-from completion.mocap.animate import report
+from completion.mocap.animate.work import GlbConfig, animate_file
 from completion.mocap.animate.work import Work as Follow
-from completion.mocap.animate.work import animate_file
 from completion.mocap.pose.robust import motion_problem
 from completion.mocap.pose.settings import AnimateConfig
-from completion.mocap.subject.marker_shape import MarkerShapeConfig
+from completion.mocap.subject.person import PersonConfig
 from completion.motion import Motion
 from completion.partial.settings import CompletionConfig
 from completion.partial.work import Inputs, Work, complete_files
@@ -46,7 +45,7 @@ QUICK = CompletionConfig(draws=4, rounds=3, scan_points=600, model_points=300, c
 def small_pictures():
     """Nobody looks at them here."""
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(report, "render", lambda *_rest, **_named: np.full((30, 20, 3), 255, dtype=np.uint8))
+        patch.setattr(motion_pictures, "render", lambda *_rest, **_named: np.full((30, 20, 3), 255, dtype=np.uint8))
         yield
 
 
@@ -157,8 +156,8 @@ def test_motions(tmp_path, case, words):
         labels[order] = np.array(LABELS, dtype=object)[back]
         markers = dataclasses.replace(markers, labels=tuple(labels))
     write_markers(tmp_path / "walk.csv", markers)
-    work = Follow(model, "model.npz", str(tmp_path / "layout.json"), model.subject(None), None, None, "m", None, 6,
-                  AnimateConfig(start_axes=1), MarkerShapeConfig())
+    work = Follow(model, "model.npz", str(tmp_path / "layout.json"), model.subject(None), None, None, "m", None,
+                  AnimateConfig(), PersonConfig(), GlbConfig(6))
     check(animate_file(work, tmp_path / "walk.csv", Room(tmp_path / "out")), words)
     assert (tmp_path / "out" / "motion.npz").exists()
 

@@ -252,7 +252,7 @@ def test_markers_are_animated(model):
                           0.012)
     positions = np.stack([layout.place(subject.template.with_vertices(v)) for v in meshes])
     motion = animate(subject, MarkerSequence(positions, layout.labels, 100.0), layout,
-                     AnimateConfig(start_axes=2, smoothing=0))
+                     AnimateConfig(smoothing=0))
     assert np.linalg.norm(motion.vertices(subject) - meshes, axis=2).mean(axis=1).max() < 0.01
 
 

@@ -143,3 +143,11 @@ def test_arrays_that_are_read_only_will_do():
     twist = np.broadcast_to([0.1, 0.2, 0.3], (4, 3))
     R = np.broadcast_to(rotations.exp(twist)[0], (2, 3, 3))
     np.testing.assert_allclose(rotations.log(R), twist[:2], atol=1e-12)
+
+
+def test_composed_rotation_vectors_are_those_of_the_product():
+    a, b = np.random.default_rng(0).normal(0, 1.5, (2, 50, 3))
+    a[0], b[0], a[1], b[1] = 0, 0, [np.pi, 0, 0], 0
+    found = rotations.compose(a, b)
+    np.testing.assert_allclose(rotations.exp(found), rotations.exp(a) @ rotations.exp(b), atol=1e-12)
+    assert np.linalg.norm(found, axis=1).max() <= np.pi + 1e-12

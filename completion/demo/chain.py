@@ -11,9 +11,11 @@ from functools import cached_property, partial
 from pathlib import Path
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from model import BodyModel, Subject, fit_pose, learn_scape, load_model
 from scanprep.batch.opening import workspace
+from scanprep.batch.room import Room
 from scanprep.batch.steps import KeptSteps, inside
 from scanprep.batch.workspace import Task, Workspace
 from scanprep.dataset import RegisteredSet
@@ -32,24 +34,36 @@ from scanprep.synthetic.data_set import (
     read_views,
     scan_plan,
     stand,
+    synthetic_scan,
     write_scan,
 )
-from scanprep.synthetic.people import Person, random_pose, walk
+from scanprep.synthetic.people import MARKERS, Person, random_pose, walk
 from scanprep.synthetic.scanner import ScannerConfig, scan
 from scanprep.threads import one_thread
 
-from ..mocap.files.markers import MarkerSequence, read_markers
-from ..mocap.marker_sets.layout import MarkerLayout
+from ..mocap.files.markers import MarkerSequence, read_markers, write_markers
+from ..mocap.marker_sets.layout import DISTANCE, MarkerLayout
 from ..mocap.pose.follow import animate
 from ..motion import Motion
 from ..partial.completion import Completion, complete
 from ..partial.results import load_completion, save_completion
-from .recording import ScanPerson, record_walk
 from .settings import LANDMARKS, MARKER_NOISE, PARTS, TEMPLATE_VIEWS, DemoConfig, write_settings
 from .truth import TruthMap
 
 MODEL, HALF, MOTION = Path("model.npz"), Path("half_view/half_view.ply"), Path("animation/motion.npz")
 Bar = Callable[[str], AbstractContextManager[Callable[[int, int], None]]]
+
+
+@dataclass(frozen=True)
+class ScanPerson:
+    """The work on each scan: a synthetic person made and scanned."""
+
+    seed: int
+    scanner: ScannerConfig
+
+    def __call__(self, which: tuple[int, bool], room: Room) -> SyntheticScan:
+        found = synthetic_scan(room.folder / "scans", self.seed, *which, self.scanner)
+        return replace(found, folder=Path("scans"))
 
 
 @dataclass(frozen=True)
@@ -244,3 +258,22 @@ class Demo:
     def truth_map(self) -> TruthMap:
         """Where the template's vertices truly lie."""
         return TruthMap.of(self.template, self.rest)
+
+
+def record_walk(folder: Path, bodies: np.ndarray, rest: GroundTruth, template: Mesh, config: DemoConfig,
+                tell: Callable[[int, int], None]) -> None:
+    """Write the markers of a walking person (T, N, 3), and where they sit on the template."""
+    rng = np.random.default_rng([config.seed, 9])
+    labels, places = tuple(MARKERS), np.array(list(MARKERS.values()))
+    out = []
+    for i, body in enumerate(bodies):
+        out.append(body[places] + DISTANCE * Mesh(body, rest.faces).vertex_normals[places])
+        tell(i + 1, len(bodies))
+    positions = np.stack(out) + rng.normal(0, MARKER_NOISE, (len(bodies), len(labels), 3))
+    positions[rng.random(positions.shape[:2]) < 0.03] = np.nan
+    # as on a real subject: the layout is read off the scan at rest, on which the markers can be seen
+    _, vertices = cKDTree(template.vertices).query(rest.vertices[places])
+    MarkerLayout(labels, vertices, DISTANCE).save(folder / "layout.json")
+    sequence = MarkerSequence(positions, labels, config.rate)
+    write_markers(folder / "walk.csv", sequence)
+    write_markers(folder / "walk.c3d", sequence)

@@ -17,7 +17,7 @@ from scanprep.pictures.page import Page
 from scanprep.pictures.shading import Shape, Solid, heat, part_colors, render, side_by_side
 from scanprep.pictures.sheets import save_png
 
-from ..mocap.animate.report import animated_picture, chart_residuals, picture_frames
+from ..motion_pictures import animated_picture, chart_residuals, picture_frames
 from ..partial.report import COMPLETED, HEIGHT, MEASURED, picture_completion, picture_distance
 from .chain import Demo
 from .settings import PARTS
@@ -160,7 +160,7 @@ def _animation(demo: Demo, page: Page, to: Path) -> None:
     glb = animated_glb(subject.template.faces, motion.vertices(subject), motion.rate, up=upright(subject.template)[0])
     with storage.writing(to / "animation" / "walk.glb") as beside:
         beside.write_bytes(glb)
-    page.picture(picture_frames(motion, subject, sequence), "some frames with the measured markers")
+    page.picture(picture_frames(motion, subject, sequence.positions), "some frames with the measured markers")
     page.picture(animated_picture(motion, subject), "the walk")
     page.chart(chart_residuals(motion), "distance of the markers to where the body puts them")
     page.download("walk.glb", glb, "the walk as an animated GLB")

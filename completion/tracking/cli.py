@@ -57,7 +57,7 @@ def track_frames(frames: FramesArg, output: Output, model: ModelOrNone = None, r
         keys: Largest number of key frames in the GLB.
         config: Settings.
     """
-    from ..mocap.animate.work import write_glb
+    from ..mocap.files.motion_files import write_glb, write_motion
 
     found = FrameFolder(frames, cameras, unit)
     loaded, name = read_model(model)
@@ -76,7 +76,7 @@ def track_frames(frames: FramesArg, output: Output, model: ModelOrNone = None, r
     metrics = [Metric("model", name), Metric("cameras", len(found.cameras)), *_figures(motion)]
 
     def write(folder: Path) -> None:
-        _write(folder, motion, person)
+        write_motion(folder, motion, person)
         _page(folder, motion, person, found, frames.name, metrics)
 
     of_motion = done.key, config.smoothing
@@ -93,16 +93,6 @@ def _figures(motion: Motion) -> list[Metric]:
             Metric("frames lost", int((~motion.converged).sum())),
             Metric("distance of the points to the body, mean", MM * float(shown.mean()), "mm"),
             Metric("the same, worst frame", MM * float(shown.max()), "mm")]
-
-
-def _write(output: Path, motion: Motion, person: Subject) -> None:
-    from ..mocap.files.motion_tables import write_joint_angles, write_joint_centres, write_motion_bvh, write_residuals
-
-    motion.save(output / "motion.npz")
-    write_motion_bvh(output / "motion.bvh", motion, person)
-    write_joint_angles(output / "joint_angles.csv", motion, person.skeleton.names)
-    write_joint_centres(output / "joint_centres.csv", motion, person)
-    write_residuals(output / "residuals.csv", motion)
 
 
 def _page(output: Path, motion: Motion, person: Subject, frames: FrameFolder, name: str, metrics: list[Metric]

@@ -4,9 +4,9 @@ from __future__ import annotations
 from collections.abc import Sequence
 
 import numpy as np
-from scipy.linalg import solveh_banded
 
 from scanprep.geometry import rotations
+from scanprep.geometry.sparse import overlapping_windows, solve_smooth
 
 WINDOW, OVERLAP = 600, 60            # frames smoothed at once, and those that each side lends to its neighbour
 
@@ -47,11 +47,8 @@ def smoothed(x: np.ndarray, gradient: np.ndarray, precision: np.ndarray, weights
     if T < 3:
         return x
     out = np.empty_like(x)
-    for start in range(0, T, WINDOW):
-        first, last = max(0, min(start - OVERLAP, T - 3)), min(T, start + WINDOW + OVERLAP)
-        kept = slice(start - first, min(start + WINDOW, T) - first)
-        mine = slice(first, last)
-        out[start:start + WINDOW] = _window(x[mine], gradient[mine], precision[mine], weights, rounds)[kept]
+    for near, kept, where in overlapping_windows(T, WINDOW, OVERLAP):
+        out[where] = _window(x[near], gradient[near], precision[near], weights, rounds)[kept]
     return out
 
 
@@ -66,7 +63,7 @@ def _window(x: np.ndarray, gradient: np.ndarray, precision: np.ndarray, weights:
         bend = np.diff(difference(at[:-1], at[1:]), axis=0)
         for i in range(3):
             rhs[i:len(x) - 2 + i] += D[i] * weights * bend
-        at = moved(at, -_solve_banded(H, weights, rhs))
+        at = moved(at, -solve_smooth(H, weights, rhs))
     return at
 
 
@@ -95,17 +92,3 @@ def _local(x: np.ndarray) -> np.ndarray:
         out[:, 3 * j:3 * j + 3, 3 * j:3 * j + 3] = inverse[:, j]
     out[:, -3:, -3:] = np.eye(3)
     return out
-
-
-def _solve_banded(blocks: np.ndarray, weights: np.ndarray, rhs: np.ndarray) -> np.ndarray:
-    """Solve for (T, P): blocks (T, P, P) on the diagonal, and the weighted squares of second differences."""
-    T, P = rhs.shape
-    lower = np.zeros((2 * P + 1, T * P))
-    for k in range(P):                               # entries k below the diagonal, inside the blocks
-        lower[k].reshape(T, P)[:, :P - k] = np.einsum("tii->ti", blocks[:, k:, :P - k])
-    D = np.array([1.0, -2.0, 1.0])
-    for i in range(3):
-        for j in range(i, 3):
-            lower[(j - i) * P].reshape(T, P)[i:T - 2 + i] += D[i] * D[j] * weights
-    lower[0] += 1e-9 * lower[0].max()
-    return solveh_banded(lower, rhs.ravel(), lower=True).reshape(T, P)

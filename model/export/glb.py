@@ -14,8 +14,9 @@ from scanprep.geometry.storage import writing
 from scanprep.pictures.gltf import skin_material
 from scanprep.pictures.sheets import png_bytes
 
+from ..blend_weights import CARRIERS
 from .correctives import Correctives
-from .rig import CARRIERS, Rig, check_motion, turn_up
+from .rig import Rig, check_motion, turn_up
 
 
 @dataclass(frozen=True, eq=False)

@@ -36,8 +36,8 @@ class CleanScanConfig(Settings):
     """
 
     gap: Annotated[float, FLAG] = 0.03
-    min_points: Annotated[int, FLAG] = 30
-    planes: Annotated[int, FLAG] = 3
+    min_points: int = 30
+    planes: int = 3
     floor_area: float = 0.1
     spacings: float = 3.0
 

@@ -6,7 +6,7 @@ import hashlib
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Any, Literal
 
 import numpy as np
 
@@ -15,7 +15,7 @@ from ..geometry import rotations, storage
 from ..geometry.farthest_points import farthest_points
 from ..geometry.landmarks import read_landmark_vertices, write_landmarks
 from ..geometry.mesh import Mesh, check_template
-from ..ranges import FLAG, Count, Settings
+from ..ranges import Count, Settings
 from ..skeleton.tree import Skeleton
 from .edge_collapse import FIXED, Rounds, checked_vertices, kept_curves, wall_quadrics
 from .quadrics import lowest, sum_at, surface_quadrics
@@ -42,8 +42,8 @@ class DecimateSetConfig(Settings):
         it slide less.
     """
 
-    meshes: Annotated[Count, FLAG] = 8
-    placement: Annotated[Literal["vertices", "solved"], FLAG] = "vertices"
+    meshes: Count = 8
+    placement: Literal["vertices", "solved"] = "vertices"
     anchor: float = 0.03
 
 

@@ -31,6 +31,30 @@ def log(R: np.ndarray) -> np.ndarray:
     return Rotation.from_matrix(R.reshape(-1, 3, 3)).as_rotvec().reshape(R.shape[:-1])
 
 
+def compose(first: np.ndarray, second: np.ndarray) -> np.ndarray:
+    """The rotation vectors (..., 3), at most π long, of `exp(first) @ exp(second)`; both of one shape.
+
+    By quaternions and a third of what `log(exp(first) @ exp(second))` takes, which solvers do in every step.
+    """
+    p, a = _quaternion(first)
+    q, b = _quaternion(second)
+    w = a * b - np.einsum("...i,...i->...", p, q)[..., None]
+    v = a * q + b * p
+    v[..., 0] += p[..., 1] * q[..., 2] - p[..., 2] * q[..., 1]
+    v[..., 1] += p[..., 2] * q[..., 0] - p[..., 0] * q[..., 2]
+    v[..., 2] += p[..., 0] * q[..., 1] - p[..., 1] * q[..., 0]
+    sine = np.sqrt(np.einsum("...i,...i->...", v, v))[..., None]
+    w, v = np.abs(w), np.where(w < 0, -v, v)
+    half = np.arctan2(sine, w)
+    return 2 * v * np.divide(half, sine, out=np.ones_like(sine), where=sine > 1e-12)
+
+
+def _quaternion(twist: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Vector part (..., 3) and scalar part (..., 1) of unit quaternions."""
+    half = 0.5 * np.sqrt(np.einsum("...i,...i->...", twist, twist))[..., None]
+    return 0.5 * np.sinc(half / np.pi) * twist, np.cos(half)
+
+
 def project(M: np.ndarray) -> np.ndarray:
     """The proper rotation nearest to each matrix (..., 3, 3) in the Frobenius norm, never a reflection."""
     U, _, Vt = np.linalg.svd(M)

@@ -1,9 +1,10 @@
 """Symmetric positive definite systems, factored once and solved many times."""
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 
 import numpy as np
+from scipy.linalg import solveh_banded
 from scipy.sparse import coo_array, csc_array, csr_array, diags_array
 from scipy.sparse.csgraph import connected_components
 from scipy.sparse.linalg import splu
@@ -74,6 +75,36 @@ def harmonic(near: csr_array, values: np.ndarray, known: np.ndarray) -> np.ndarr
         L = csr_array(diags_array(near.sum(axis=1)) - near)[free]
         out[free] = factor(csc_array(L[:, free]))(-L[:, fixed] @ out[fixed])
     return out
+
+
+def solve_smooth(blocks: np.ndarray, stiffness: np.ndarray | float, rhs: np.ndarray) -> np.ndarray:
+    """Frames x (T, P) that their second differences couple: `blocks[t] x[t] + stiffness (D₂ᵀ D₂ x)[t] = rhs[t]`.
+
+    `blocks` (T, P, P) are symmetric and positive semidefinite, `stiffness` is (P,) or one number, T at least 3: one
+    Cholesky factorisation of a band of width 2 P.
+    """
+    T, P = rhs.shape
+    lower = np.zeros((2 * P + 1, T * P))
+    for k in range(P):                               # entries k below the diagonal, inside the blocks
+        lower[k].reshape(T, P)[:, :P - k] = np.einsum("tii->ti", blocks[:, k:, :P - k])
+    D = np.array([1.0, -2.0, 1.0])
+    for i in range(3):
+        for j in range(i, 3):
+            lower[(j - i) * P].reshape(T, P)[i:T - 2 + i] += D[i] * D[j] * stiffness
+    lower[0] += 1e-9 * lower[0].max()
+    return np.asarray(solveh_banded(lower, rhs.ravel(), overwrite_ab=True, lower=True,
+                                    check_finite=False).reshape(T, P))
+
+
+def overlapping_windows(count: int, size: int, overlap: int) -> Iterator[tuple[slice, slice, slice]]:
+    """Windows over so many frames, at least 3, for `solve_smooth`: frames to solve, which of these to keep, and where.
+
+    Each lends `overlap` frames to its neighbours, more than a frame's influence reaches.
+    """
+    for start in range(0, count, size):
+        near = slice(max(0, min(start - overlap, count - 3)), min(count, start + size + overlap))
+        end = min(start + size, count)
+        yield near, slice(start - near.start, end - near.start), slice(start, end)
 
 
 def conjugate_gradients(apply: Callable[[np.ndarray], np.ndarray], force: np.ndarray,

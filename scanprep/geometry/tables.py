@@ -4,10 +4,11 @@ from __future__ import annotations
 import contextlib
 import csv
 import io
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
+from typing import Any
 
-from .storage import LARGEST_TEXT, UTF_16, StorageError, read_bytes, taking_apart
+from .storage import LARGEST_TEXT, UTF_16, StorageError, read_bytes, taking_apart, writing
 
 
 def read_table(path: str | Path, columns: Sequence[str], needed: Sequence[str] | None = None
@@ -26,6 +27,16 @@ def read_table(path: str | Path, columns: Sequence[str], needed: Sequence[str] |
         if len(cells) != len(head):
             raise StorageError(f"{path}: line {line}: expected {len(head)} values, found {len(cells)}")
     return [(line, {**dict.fromkeys(columns, ""), **dict(zip(head, cells, strict=True))}) for line, cells in rows[1:]]
+
+
+def write_table(path: str | Path, header: Sequence[str], rows: Iterable[Sequence[Any]]) -> None:
+    """Write a CSV table, whole or not at all."""
+    text = io.StringIO()
+    table = csv.writer(text, lineterminator="\n")
+    table.writerow(header)
+    table.writerows(rows)
+    with writing(path) as beside:
+        beside.write_text(text.getvalue(), encoding="utf-8")
 
 
 def table_rows(path: str | Path, data: bytes, error: type[StorageError] = StorageError

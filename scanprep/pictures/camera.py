@@ -23,7 +23,13 @@ class Camera:
     @classmethod
     def around(cls, subject: Any, azimuth: float = 0.0, elevation: float = 8.0,
                up: int = 2, lens: float = 6.0, margin: float = 1.06) -> Camera:
-        """A camera that holds the whole subject."""
+        """A camera that holds the whole subject: meshes, solids, or points (n, 3), two of them corners of a box.
+
+        `azimuth`, degrees, runs counter-clockwise about the axis `up` (0, 1 or 2); at 0 the camera stands on the +x
+        side when z is up, on the +z side when y is up. `elevation`, degrees above the horizon; `lens`, distance of
+        the camera in sizes of the subject, inf for parallel rays; `margin`, extent of the picture over that of the
+        subject.
+        """
         points = _points(subject)
         middle = (points.min(axis=0) + points.max(axis=0)) / 2
         a, e = np.radians(azimuth), np.radians(elevation)
@@ -116,7 +122,10 @@ def upright(mesh: Mesh) -> tuple[int, float]:
 
 def look_around(body: Mesh, poses: np.ndarray | None = None, turns: tuple[float, ...] = (0, 90, 180, 270),
                 elevation: float = 8.0) -> list[Camera]:
-    """Cameras around a body: by default from its front, its left, its back and its right."""
+    """Cameras around a standing body: by default from its front, its left, its back and its right.
+
+    `turns` are degrees from the front; `poses` (..., 3), metres, is what has to fit into the picture if not the body.
+    """
     up, front = upright(body)
     subject = body.vertices if poses is None else np.asarray(poses, dtype=float).reshape(-1, 3)
     return [Camera.around(subject, azimuth=front + turn, elevation=elevation, up=up) for turn in turns]

@@ -9,7 +9,10 @@ NO_VALUE = (0.72, 0.74, 0.76)
 
 
 def heat(values: np.ndarray, low: float = 0.0, high: float | None = None, colormap: str = HEAT) -> np.ndarray:
-    """Colours of a perceptually uniform map."""
+    """Colours (..., 3) in [0, 1] of a perceptually uniform map of matplotlib; NaN becomes a neutral grey.
+
+    `high` is the largest value when not given.
+    """
     from matplotlib import colormaps
 
     values = np.asarray(values, dtype=float)
@@ -23,7 +26,7 @@ def heat(values: np.ndarray, low: float = 0.0, high: float | None = None, colorm
 
 def color_bar(low: float, high: float, title: str = "", colormap: str = HEAT, width: int = 320,
               scale: float = 1000.0, unit: str = "mm") -> np.ndarray:
-    """A legend for `heat`, of lengths in millimetres or of what else the unit says."""
+    """A legend (H, W, 3) uint8 for `heat`; the numbers written are `scale` times `low` to `high`, in `unit`."""
     from PIL import Image, ImageDraw
 
     from .sheets import INK, font

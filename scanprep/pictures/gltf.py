@@ -13,8 +13,7 @@ from ..geometry.storage import writing
 from .colors import decode
 
 # Turns that bring each axis to +y, the upward axis of glTF: quaternions x, y, z, w.
-_HALF = 0.5 ** 0.5
-UPRIGHT = {0: [0.0, 0.0, _HALF, _HALF], 1: [0.0, 0.0, 0.0, 1.0], 2: [-_HALF, 0.0, 0.0, _HALF]}
+UPRIGHT = {0: [0.0, 0.0, 0.5**0.5, 0.5**0.5], 1: [0.0, 0.0, 0.0, 1.0], 2: [-(0.5**0.5), 0.0, 0.0, 0.5**0.5]}
 
 
 def skin_material(color: Sequence[float] = (0.60, 0.57, 0.53)) -> dict[str, Any]:
@@ -25,10 +24,10 @@ def skin_material(color: Sequence[float] = (0.60, 0.57, 0.53)) -> dict[str, Any]
 
 def write_animated_glb(path: str | Path, faces: np.ndarray, frames: np.ndarray, rate: float,
                        colors: np.ndarray | None = None, up: int = 2, keys: int = 60) -> None:
-    """Write a moving mesh that any glTF 2.0 viewer plays.
+    """Write a moving mesh, frames (T, N, 3) at `rate` a second, that any glTF 2.0 viewer plays.
 
-    Every key frame is a morph target with its own normals; the animation blends from one to the next. Nothing
-    but the core of glTF is used.
+    Every key frame is a morph target with its own normals; the animation blends from one to the next. Nothing but the
+    core of glTF is used. Of a longer motion `keys` evenly spaced frames are kept; the axis `up` points up.
     """
     data = animated_glb(faces, frames, rate, colors, up, keys)
     with writing(path) as beside:

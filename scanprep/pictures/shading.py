@@ -172,7 +172,10 @@ def sphere(divisions: int) -> tuple[np.ndarray, np.ndarray]:
 
 def balls(points: np.ndarray, radius: float, divisions: int | None = None
           ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """One ball for each point (n, 3); how round, as for `sphere`, goes by their number when it is not given."""
+    """One ball for each point (n, 3): corners and normals (f, 3, 3) of the triangles, and the point (f,) of each.
+
+    How round, as for `sphere`, goes by their number when it is not given.
+    """
     vertices, faces = sphere(divisions if divisions is not None else 2 if len(points) <= 400 else 1)
     normals = vertices[faces]
     corners = points[:, None, None, None, :].swapaxes(1, 2) + radius * normals

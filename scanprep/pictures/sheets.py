@@ -22,7 +22,10 @@ def font(size: int):
 
 def side_by_side(images: Sequence[np.ndarray], labels: Sequence[str] | None = None, gap: int = 8,
                  columns: int | None = None) -> np.ndarray:
-    """A contact sheet of pictures with a line of text below each."""
+    """A contact sheet (H, W, 3) uint8 of pictures of any sizes with a line of text below each.
+
+    All stand in one row unless `columns` says otherwise; each is centred in its cell.
+    """
     from PIL import Image, ImageDraw
 
     if not len(images):

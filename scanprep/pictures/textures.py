@@ -18,7 +18,6 @@ from .gltf import skin_material
 from .sheets import png_bytes
 
 SIZE = 1024                          # pixels of a baked texture, each way
-PADDING = 8                          # pixels that colours go on beyond the border of a chart
 
 # colours and weights of places with normals
 Look = Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]
@@ -106,7 +105,7 @@ def _picture(material: Any) -> np.ndarray | None:
 
 
 def bake(body: Mesh, look: Look, unseen: np.ndarray, size: int | None = None) -> Texture:
-    """A texture of a body: what `look` says of each of its pixels, elsewhere the colours of its vertices."""
+    """A texture of a body: what `look` says of its pixels, where its weight is zero `unseen` (N, 3) of the vertices."""
     size = size or SIZE
     kept, faces, uv = unwrap(body)
     flat = Mesh(np.column_stack([uv, np.zeros(len(uv))]), faces)
@@ -127,7 +126,7 @@ def bake(body: Mesh, look: Look, unseen: np.ndarray, size: int | None = None) ->
 
 
 def unwrap(mesh: Mesh) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """A mesh cut into flat charts."""
+    """A mesh in flat charts: the old vertex of each new one (n,), the triangles in the old order, uv (n, 2)."""
     try:
         import xatlas
     except ModuleNotFoundError:
@@ -138,11 +137,11 @@ def unwrap(mesh: Mesh) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
 
 def padded(image: np.ndarray, covered: np.ndarray) -> np.ndarray:
-    """The picture with the colours of charts going on a little beyond them, so that seams do not show."""
+    """The picture with the colours of charts going on eight pixels beyond them, so that seams do not show."""
     from scipy.ndimage import distance_transform_edt
 
     far, nearest = distance_transform_edt(~covered, return_indices=True)
-    return np.where((far <= PADDING)[:, :, None], image[nearest[0], nearest[1]], image)
+    return np.where((far <= 8)[:, :, None], image[nearest[0], nearest[1]], image)
 
 
 def write_textured(path: str | Path, texture: Texture) -> None:

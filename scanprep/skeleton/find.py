@@ -32,9 +32,7 @@ from .tree import Skeleton, reorder
 __all__ = ["SkeletonConfig", "find_skeleton", "search_skeleton"]
 
 Tree = tuple[np.ndarray, np.ndarray, list[Loop]]
-LEAST_GAIN = 0.005               # of the score: less is no improvement
 WORTH = 0.1                      # by how much a part must lower the logarithm of the energy to count
-LOOSE = 0.85                     # of the energy: where sides let go find so much less, the body is not symmetric
 
 
 @dataclass(frozen=True)
@@ -230,7 +228,7 @@ def _improved(search: PartSearch, label: np.ndarray, links: np.ndarray) -> tuple
             moved = search.alternate(trial[0], rounds=4)
             tree = without_weak(search, moved)
             better = _score(search, moved)
-            if (len(tree) == moved.max() and better < score - LEAST_GAIN
+            if (len(tree) == moved.max() and better < score - 0.005
                     and (moved.max() < many or passages(search, moved)[0].max() < FADING)):
                 label, links, score = moved, tree, better
                 break
@@ -249,7 +247,7 @@ def _settled(search: PartSearch, label: np.ndarray, links: np.ndarray) -> tuple[
 def _held_back(run: _Restart) -> bool:
     """Whether parts that need not be symmetric would fit far better, beginning with those found."""
     free = PartSearch(run.search.surface, replace(run.search.config, patches=2))
-    return free.energy(free.alternate(run.label, rounds=10)) < LOOSE * run.search.energy(run.label)
+    return free.energy(free.alternate(run.label, rounds=10)) < 0.85 * run.search.energy(run.label)
 
 
 def _of_count(best: _Restart, surface: PosedSurface, config: SkeletonConfig) -> tuple[np.ndarray, np.ndarray, bool]:

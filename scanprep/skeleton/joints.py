@@ -17,18 +17,15 @@ from .sides import mirror_pairs, reductions
 
 WEAK_CONTACT = 0.2               # of the longer borders of both parts: thighs that touch are not linked
 LOOP_SEPARATION = 1.5            # times the separation of parts: on a loop, closer ones are merged
-LEAST_PULL = 1e-4                # squared radians: rotations below 0.01 say nothing about where a joint is
-PRIOR_WIDTH = 0.6                # of the border's radius: how far from its centroid a joint is expected
 
 
 def border_lengths(search: PartSearch, label: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Pairs of parts that touch (n, 2) and the length of their common border (n,), metres."""
     s = search.surface
-    pairs = search.contacts(label)
     both = np.sort(label[s.pairs], axis=1)
-    number = {(int(a), int(b)): i for i, (a, b) in enumerate(pairs)}
-    of_pair = np.array([number.get((int(a), int(b)), len(pairs)) for a, b in both], dtype=np.int64)
-    return pairs, np.bincount(of_pair, s.pair_lengths, len(pairs) + 1)[:len(pairs)]
+    differ = both[:, 0] != both[:, 1]
+    pairs, number = np.unique(both[differ], axis=0, return_inverse=True)
+    return pairs, np.bincount(number.ravel(), s.pair_lengths[differ], len(pairs))
 
 
 def linked(links: np.ndarray, count: int) -> bool:
@@ -251,10 +248,11 @@ def _meeting_point(dR: np.ndarray, gap: np.ndarray, radius: float) -> np.ndarray
     """
     A = np.einsum("mki,mkj->ij", dR, dR) / len(dR)
     b = np.einsum("mki,mk->i", dR, gap) / len(dR)
-    pull = LEAST_PULL
+    pull = least = 1e-4                          # squared radians: rotations below 0.01 say nothing about a joint
+    expected = 0.6 * radius                      # from the border's centroid
     for _ in range(2):
         c = -np.linalg.solve(A + pull * np.eye(3), b)
-        pull = max(LEAST_PULL, float(((dR @ c + gap)**2).sum(axis=1).mean()) / (PRIOR_WIDTH * radius)**2)
+        pull = max(least, float(((dR @ c + gap)**2).sum(axis=1).mean()) / expected**2)
     return c
 
 

@@ -14,8 +14,6 @@ from scipy.sparse import coo_array, csr_array
 
 from ..geometry.mesh import Mesh
 
-RIGID = 1e-5                     # of the square root of the area: residuals below count as none
-
 
 @dataclass(frozen=True, eq=False)
 class Moments:
@@ -169,7 +167,8 @@ class PosedSurface:
         motions = fit_motions(self.moments(label, core))
         for _ in range(3):
             off = self.face_costs(motions)[np.arange(len(label)), label] / self.face_weights
-            typical = np.array([np.median(off[mine]) for mine in sets]) + RIGID**2 * self.area
+            # residuals below 1e-5 of the square root of the area count as none
+            typical = np.array([np.median(off[mine]) for mine in sets]) + 1e-5**2 * self.area
             motions = fit_motions(self.moments(label, core / (1 + off / typical[label])**2))
         return motions
 

@@ -12,10 +12,8 @@ from .patches import agglomerate, cover, halve
 from .sides import Sides, mirror_pairs
 from .symmetry import Symmetry
 
-BORDER_WIDTH = 0.01              # of the body's size: how much surface at mean cost a border is worth
 SMALLEST = 0.005                 # of the surface: a smaller part is joined to a neighbour
 FADING = 0.8                     # a part dissolves when its neighbours' motions, blended, explain so much of its own
-STEADY = 5e-4                    # of the surface: fewer changes of label count as none
 
 
 @dataclass(frozen=True)
@@ -47,7 +45,7 @@ class SkeletonConfig(Settings):
     tolerance: Positive = 0.001
     patches: Count = 300
     start: Count = 30
-    symmetric: Annotated[bool | None, FLAG] = None
+    symmetric: bool | None = None
     restarts: Count = 3
     seed: Seed = 0
 
@@ -63,7 +61,7 @@ class PartSearch:
         self.surface, self.config = surface, config
         self.sides = Sides(surface, symmetry)
         self.floor = config.tolerance**2 * surface.area
-        self.width = BORDER_WIDTH / np.sqrt(surface.area)
+        self.width = 0.01 / np.sqrt(surface.area)       # how much surface at mean cost a metre of border is worth
         self.patch = cover(surface, min(config.patches, len(surface.face_weights)), self.sides, rng)
         self.forget()
 
@@ -89,7 +87,7 @@ class PartSearch:
             moved = self.sides.relabel(costs, self.price(motions, 1.0), label, self.sides.partners(label))
             changed = s.face_weights[moved != label].sum()
             label = moved
-            if changed < STEADY:
+            if changed < 5e-4:                                       # of the surface
                 break
         return np.unique(label, return_inverse=True)[1]
 

@@ -12,14 +12,8 @@ from ..geometry.sparse import factor
 from ..geometry.surface import OrientedPoints
 from .labels import keep_connected
 
-SAMPLES = 800                        # points of the surface that planes are tried with
-ROUNDS = 60                          # of pairs and plane, at most
-POSES = 24                           # that are tried where the body is not symmetric at rest
-DIRECTIONS = 60                      # of planes, over half the sphere
 NORMAL_WEIGHT = 0.05                 # of the body's size: how much distance a difference of normals weighs
-STIFFNESS = (300.0, 100.0, 30.0, 10.0, 3.0)       # of the warp that takes the mirror image onto the body, falling
 SYMMETRIC = 0.03                     # of the body's size: the mirror image lies so near the body, RMS
-NEAR = 0.02                          # of the body's size: near by
 RETURNS = 0.8                        # of the surface that comes back to where it was when mirrored twice
 
 
@@ -78,11 +72,11 @@ def find_symmetry(template: Mesh, poses: np.ndarray | None = None) -> Symmetry:
     onto the body, so that a stance that is not quite symmetric does no harm. Nothing is taken from the numbers of
     vertices. `holds` says whether the body is symmetric at all.
     """
-    few = _spread(template, SAMPLES)
+    few = _spread(template, 800)
     at_rest = _matched(template, _best_plane(template, few)[1], -1)
     if at_rest.holds or poses is None:
         return at_rest
-    chosen = np.unique(np.linspace(0, len(poses) - 1, min(len(poses), POSES)).astype(int))
+    chosen = np.unique(np.linspace(0, len(poses) - 1, min(len(poses), 24)).astype(int))
     planes = [_best_plane(template.with_vertices(poses[m]), few) for m in chosen]
     best = int(np.argmin([distance for distance, _ in planes]))
     posed = _matched(template.with_vertices(poses[chosen[best]]), planes[best][1], int(chosen[best]))
@@ -116,13 +110,13 @@ def _best_plane(body: Mesh, few: np.ndarray) -> tuple[float, MirrorPlane]:
         off = target.scale**2 * ((target.normals[match.index] - image)**2).sum(axis=1)
         return float(np.sqrt((match.distances**2 + off).mean())) / size, plane
 
-    k = np.arange(DIRECTIONS)                                    # directions spread evenly over half the sphere
-    z, angle = (k + 0.5) / DIRECTIONS, k * np.pi * (3 - np.sqrt(5))
+    k = np.arange(60)                                            # directions spread evenly over half the sphere
+    z, angle = (k + 0.5) / len(k), k * np.pi * (3 - np.sqrt(5))
     r = np.sqrt(1 - z**2)
     around = np.stack([r * np.cos(angle), r * np.sin(angle), z], axis=1)
     rough = [fitted(MirrorPlane(normal, centre), 0) for normal in np.vstack([axes, around @ axes])]
     rough.sort(key=lambda found: found[0])
-    return min((fitted(plane, ROUNDS) for _, plane in rough[:5]), key=lambda found: found[0])
+    return min((fitted(plane, 60) for _, plane in rough[:5]), key=lambda found: found[0])
 
 
 def _size(body: Mesh) -> float:
@@ -142,7 +136,7 @@ def _matched(body: Mesh, plane: MirrorPlane, pose: int) -> Symmetry:
     graph = body.vertex_adjacency
     laplacian = diags_array(np.asarray(graph.sum(axis=1)).ravel()) - graph
     image, inside_out = start, body.faces[:, ::-1]
-    for stiffness in STIFFNESS:
+    for stiffness in (300.0, 100.0, 30.0, 10.0, 3.0):
         normals = Mesh(image, inside_out).vertex_normals
         match = target.match(image, normals)
         weight = match.valid / (1 + (match.distances / (0.03 * size))**2)
@@ -173,7 +167,7 @@ def _paired(body: Mesh, start: np.ndarray, image: np.ndarray, plane: MirrorPlane
     for here, there in (sides, sides[::-1]):                     # a partner lies on the other side
         if len(here) and len(there):
             partner[here] = nearest(there, here)[0]
-    back = np.linalg.norm(centres[partner[partner]] - centres, axis=1) < NEAR * size
+    back = np.linalg.norm(centres[partner[partner]] - centres, axis=1) < 0.02 * size
     moved = np.average(((start - image)**2).sum(axis=1), weights=body.vertex_areas)
     distance = np.sqrt(moved + np.average(apart**2, weights=areas)) / size
     return Symmetry(normal, plane.point, partner, left, float(distance), float(areas[back].sum() / areas.sum()), image,

@@ -15,7 +15,6 @@ from .people import NAMED_POSES, BodyShape, Person, mirrored_pose, named_pose, r
 from .scanner import RangeView, Scan, ScannerConfig, scan
 
 VERSION = 1
-TRUTH, VIEWS = "truth", "views"
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,7 +66,10 @@ def stand(person: Person, pose: np.ndarray) -> GroundTruth:
 
 def click_landmarks(truth: GroundTruth, rng: np.random.Generator, error: float = 0.003,
                     seen: np.ndarray | None = None, reach: float = 0.012) -> dict[str, np.ndarray]:
-    """Landmarks as a person would click them on the scan."""
+    """Landmarks as a person would click them on the scan, each coordinate off by `error`, metres.
+
+    Those without a point of the scan, `seen` (n, 3), within `reach` are left out.
+    """
     names = landmark_vertices()
     true = {name: truth.vertices[v] for name, v in names.items()}
     noise = {name: error * rng.normal(size=3) for name in names}
@@ -88,9 +90,9 @@ def write_scan(folder: str | Path, name: str, scanned: Scan, truth: GroundTruth 
 
     folder = Path(folder)
     if truth is not None:
-        truth.save(folder / TRUTH / f"{name}.npz")
+        truth.save(folder / "truth" / f"{name}.npz")
     if views:
-        _write_views(folder / VIEWS / f"{name}.npz", scanned)
+        _write_views(folder / "views" / f"{name}.npz", scanned)
     if landmarks is not None:
         storage.write_json(folder / f"{name}.landmarks.json",
                            {key: np.round(point, 6).tolist() for key, point in landmarks.items()})
@@ -145,11 +147,11 @@ class SyntheticScan:
 
     @property
     def views(self) -> Path:
-        return self.folder / VIEWS / f"{self.name}.npz"
+        return self.folder / "views" / f"{self.name}.npz"
 
     @property
     def truth(self) -> Path:
-        return self.folder / TRUTH / f"{self.name}.npz"
+        return self.folder / "truth" / f"{self.name}.npz"
 
 
 SUBJECT = BodyShape(sex=1.0, stature=1.78, weight=-0.3, muscle=0.9, shoulder_width=0.4)

@@ -21,7 +21,11 @@ class Field(Protocol):
 
 
 class Loft:
-    """Superelliptic cross-sections along an axis, closed by rounded caps."""
+    """Superelliptic cross-sections along an axis, closed by rounded caps that reach `caps` beyond the ends, metres.
+
+    Rows of `frame` are the sideways direction, the front direction and the axis. `keys` (k, 8): position on the axis,
+    centre sideways and frontwards, extents to +side, -side, front and back, metres, and the superellipse's exponent.
+    """
 
     _TABLE = 400
 
@@ -110,7 +114,10 @@ def smooth_union(a: np.ndarray, b: np.ndarray, k: float) -> np.ndarray:
 
 
 class Group:
-    """Fields joined one after the other, evaluated only near themselves."""
+    """Fields joined one after the other, each seam rounded over its k metres, evaluated only near themselves.
+
+    Points outside the capsule `bounds` (two ends and a radius) get their distance to it.
+    """
 
     MARGIN = 0.06
 

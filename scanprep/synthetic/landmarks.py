@@ -2,6 +2,7 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Callable
 from functools import lru_cache
 from pathlib import Path
 from typing import Any
@@ -38,7 +39,7 @@ def _points() -> dict[str, np.ndarray]:
         place = j[12] + a.width["foot"] * (side * ft[0] + ahead * ft[2])
         return np.array([place[0], place[1], up * a.width["foot"]])
 
-    place = {"body": body, "face": face, "limb": limb, "foot": foot}
+    place: dict[str, Callable[..., np.ndarray]] = {"body": body, "face": face, "limb": limb, "foot": foot}
     return {name: place[kind](*numbers)
             for name, (kind, *numbers) in (_stored()["landmarks"] | _stored()["marker_places"]).items()}
 

@@ -67,7 +67,10 @@ class Person:
         return Poser(self.anatomy, self.mesh.vertices, self.joints[0])
 
     def posed(self, pose: np.ndarray, trans: np.ndarray | None = None) -> np.ndarray:
-        """The vertices in a pose."""
+        """The vertices (N, 3), metres, in a pose (16, 3): rotation vectors of the parts against their parents.
+
+        `pose[0]` turns the body about `joints[0]`.
+        """
         pose = _checked(pose)
         return self._poser(pose) + (0 if trans is None else np.asarray(trans, dtype=np.float64))
 

@@ -35,7 +35,12 @@ def _towards(axis: np.ndarray, direction: np.ndarray, twist: float) -> np.ndarra
 def arm(direction: tuple[float, float, float], elbow: float = 0, twist: float = 0, turn: float = 0,
         wrist: float = 0,
         side: int = 1) -> np.ndarray:
-    """Rotation vectors (3, 3) of upper arm, forearm and hand."""
+    """Rotation vectors (3, 3) of upper arm, forearm and hand, left (side 1) or right (-1).
+
+    `direction` (outwards, frontwards, upwards) is where the upper arm points, seen from the chest. Degrees: flexion
+    of the elbow beyond rest; twist of the upper arm, positive inwards; pronation of the hand (`turn`); flexion of the
+    wrist towards the palm.
+    """
     a = average()
     out, front, up = direction
     upper, fore = a.upper_arm_frame, a.forearm_frame
@@ -49,7 +54,11 @@ def arm(direction: tuple[float, float, float], elbow: float = 0, twist: float = 
 
 def leg(direction: tuple[float, float, float], knee: float = 0, twist: float = 0, foot: float = 0, side: int = 1
         ) -> np.ndarray:
-    """Rotation vectors (3, 3) of thigh, shin and foot."""
+    """Rotation vectors (3, 3) of thigh, shin and foot, left (side 1) or right (-1).
+
+    `direction` as for `arm`, seen from the pelvis. Degrees: flexion of the knee; twist of the thigh, positive
+    outwards; raising of the toes.
+    """
     a = average()
     out, front, up = direction
     axis = a.leg_frame[2]
@@ -69,50 +78,48 @@ def head(nod: float = 0, lean: float = 0, turn: float = 0) -> np.ndarray:
     return Rotation.from_euler("zyx", [turn, lean, nod], degrees=True).as_rotvec()
 
 
-DOWN_ARM = (0.59, 0.0, -0.81)
-DOWN_LEG = (0.078, 0.0, -1.0)
-
-
 def compose(left_arm: dict | None = None, right_arm: dict | None = None, left_leg: dict | None = None,
             right_leg: dict | None = None, back: dict | None = None, neck: dict | None = None,
             root: tuple[float, float, float] = (0, 0, 0)) -> np.ndarray:
     """A pose (16, 3) from anatomical angles; what is not given stays at rest."""
+    down_arm, down_leg = (0.59, 0.0, -0.81), (0.078, 0.0, -1.0)
     pose = np.zeros((16, 3))
     pose[0] = _rotvec(root)
     pose[1:3] = spine(**(back or {}))
     pose[3] = head(**(neck or {}))
-    pose[4:7] = arm(**{"direction": DOWN_ARM, **(left_arm or {})})
-    pose[7:10] = arm(**{"direction": DOWN_ARM, **(right_arm or {})}, side=-1)
-    pose[10:13] = leg(**{"direction": DOWN_LEG, **(left_leg or {})})
-    pose[13:16] = leg(**{"direction": DOWN_LEG, **(right_leg or {})}, side=-1)
+    pose[4:7] = arm(**{"direction": down_arm, **(left_arm or {})})
+    pose[7:10] = arm(**{"direction": down_arm, **(right_arm or {})}, side=-1)
+    pose[10:13] = leg(**{"direction": down_leg, **(left_leg or {})})
+    pose[13:16] = leg(**{"direction": down_leg, **(right_leg or {})}, side=-1)
     return pose
 
 
-_NAMED: dict[str, dict[str, Any]] = json.loads(Path(__file__).with_name("poses.json").read_text(encoding="utf-8"))
-NAMED_POSES = tuple(_NAMED)
+_STORED: dict[str, Any] = json.loads(Path(__file__).with_name("poses.json").read_text(encoding="utf-8"))
+NAMED_POSES = tuple(_STORED["named"])
 
 
 def named_pose(name: str) -> np.ndarray:
     """A pose (16, 3), radians, by its name in `NAMED_POSES`."""
-    if name not in _NAMED:
+    if name not in NAMED_POSES:
         raise ValueError(f"name: no pose '{name}', expected one of {', '.join(NAMED_POSES)}")
-    return compose(**_NAMED[name])
-
-
-_GROUPS = ([4, 5, 6], [7, 8, 9], [0, 10, 11, 12, 13, 14, 15], [1, 2], [3])
-JITTER = np.radians(np.array([4, 4, 4, 7, 8, 6, 9, 8, 6, 9, 4, 4, 5, 4, 4, 5.0]))
+    return compose(**_STORED["named"][name])
 
 
 def random_pose(rng: np.random.Generator, spread: float = 1.0) -> np.ndarray:
-    """A plausible pose (16, 3): arms, legs, back and neck each drawn from the named poses, loosened."""
+    """A plausible pose (16, 3): arms, legs, back and neck each drawn from the named poses, loosened.
+
+    `spread` 0 gives rest, 1 poses as varied as the named ones.
+    """
+    limbs = [4, 5, 6], [7, 8, 9], [0, 10, 11, 12, 13, 14, 15], [1, 2], [3]
+    looseness = np.radians(np.array([4, 4, 4, 7, 8, 6, 9, 8, 6, 9, 4, 4, 5, 4, 4, 5.0]))
     pose = np.zeros((16, 3))
-    for group in _GROUPS:
+    for group in limbs:
         name = NAMED_POSES[rng.integers(len(NAMED_POSES))]
         source = named_pose(name)
         if rng.random() < 0.5:
             source = mirrored_pose(source)
         pose[group] = rng.uniform(0.55, 1.0) * source[group]
-    noise = rng.normal(size=(16, 3)) * JITTER[:, None] * 0.7
+    noise = rng.normal(size=(16, 3)) * looseness[:, None] * 0.7
     noise[[5, 8, 11, 14]] = 0.0
     return spread * (pose + noise)
 
@@ -122,15 +129,11 @@ def mirrored_pose(pose: np.ndarray) -> np.ndarray:
     return pose[..., MIRROR_PART, :] * [1, -1, -1]
 
 
-# Joint angles over one gait cycle from heel strike, degrees (typical values of published gait analysis).
-_PHASE = np.linspace(0, 1, 11)
-_HIP = np.array([28, 24, 15, 5, -5, -11, -4, 14, 27, 31, 28.0])
-_KNEE = np.array([4, 16, 14, 8, 5, 10, 34, 60, 52, 18, 4.0])
-_ANKLE = np.array([0, -4, 3, 7, 10, 8, -14, -8, 0, 2, 0.0])
-
-
 def walk(frames: int, rate: float = 60.0, speed: float = 1.0) -> tuple[np.ndarray, np.ndarray]:
-    """A walk straight ahead."""
+    """A walk straight ahead: poses (frames, 16, 3), radians, places (frames, 3) of the root against rest, metres.
+
+    The lower foot stays on the floor; at speed 1 a gait cycle takes 1.1 seconds.
+    """
     t = np.arange(frames) / rate * speed / 1.1
     poses = np.stack([_stride(phase) for phase in t % 1.0])
     fine = 120
@@ -143,7 +146,7 @@ def walk(frames: int, rate: float = 60.0, speed: float = 1.0) -> tuple[np.ndarra
 
 
 def _stride(phase: float) -> np.ndarray:
-    curves = CubicSpline(_PHASE, np.stack([_HIP, _KNEE, _ANKLE], axis=1), bc_type="periodic")
+    curves = CubicSpline(np.linspace(0, 1, 11), np.array(_STORED["gait"]).T, bc_type="periodic")
     wave = 2 * np.pi * phase
     limbs: dict[str, dict[str, Any]] = {}
     for name, shift in (("left", 0.0), ("right", 0.5)):

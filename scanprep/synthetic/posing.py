@@ -15,7 +15,7 @@ from .topology import blending, load, neighbour_mean
 
 
 class Poser:
-    """Everything about one person that posing needs."""
+    """Everything that posing needs of one person at rest on the shared topology; part 0 turns about `root` (3,)."""
 
     def __init__(self, anatomy: Anatomy, vertices: np.ndarray, root: np.ndarray) -> None:
         template = load()

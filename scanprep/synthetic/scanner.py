@@ -9,11 +9,8 @@ from ..geometry.mesh import Mesh
 from ..geometry.surface import Rays
 from ..ranges import Cell, Count, Settings, Signed
 
-DISTANCE = 2.5                       # of the cameras from the middle of the body, metres
 GRAZING = 12.0                       # degrees between ray and surface below which nothing is measured
 DROPOUT = 0.005                      # chance that a ray is lost at a right angle to the surface; grows towards GRAZING
-DEPTH_JUMP = 5.0                     # ray spacings: neighbours farther apart in depth are not joined
-ISLAND = 30                          # triangles: smaller connected pieces are removed
 
 
 @dataclass(frozen=True)
@@ -117,23 +114,24 @@ def _view(mesh: Mesh, rays: Rays, config: ScannerConfig, number: int, rng: np.ra
     middle = 0.5 * (low + high)
     azimuth = np.radians(config.azimuth + 360.0 * number / config.views)
     lift = config.height * (1 if number % 2 == 0 else -1)
-    camera = middle + [DISTANCE * np.sin(azimuth), -DISTANCE * np.cos(azimuth), lift]
+    distance = 2.5                                               # of the cameras from the middle of the body, metres
+    camera = middle + [distance * np.sin(azimuth), -distance * np.cos(azimuth), lift]
     camera[2] = max(camera[2], low[2] + 0.1)
     T = camera_pose(middle, camera)
-    focal = DISTANCE / config.resolution
+    focal = distance / config.resolution
     local = (mesh.vertices - camera) @ T[:3, :3]
     extent = np.abs(local[:, :2] / local[:, 2:]).max(axis=0) * focal + 3
     width, height = (2 * np.ceil(extent) + 1).astype(int)
     K = np.array([[focal, 0, (width - 1) / 2], [0, focal, (height - 1) / 2], [0, 0, 1.0]])
     directions = pixel_rays((height, width), K, T[:3, :3]).reshape(-1, 3)
-    face, distance = rays.cast(np.broadcast_to(camera, directions.shape), directions)
-    distance = _measured(mesh, rays, config, camera, directions, face, distance, rng)
-    seen = np.isfinite(distance)
-    triangles = _triangulate(distance.reshape(height, width), config)
-    points = camera + np.where(seen, distance, 0)[:, None] * directions
+    face, measured = rays.cast(np.broadcast_to(camera, directions.shape), directions)
+    measured = _measured(mesh, rays, config, camera, directions, face, measured, rng)
+    seen = np.isfinite(measured)
+    triangles = _triangulate(measured.reshape(height, width), config)
+    points = camera + np.where(seen, measured, 0)[:, None] * directions
     used, index = np.unique(triangles, return_inverse=True)
     surface = Mesh(points[used], index.reshape(-1, 3))
-    depth = (distance * (directions @ T[:3, 2])).reshape(height, width)
+    depth = (measured * (directions @ T[:3, 2])).reshape(height, width)
     kept = np.full(height * width, np.nan)
     kept[used] = depth.reshape(-1)[used]
     return RangeView(surface, surface.vertex_normals, camera, T, kept.reshape(height, width), K)
@@ -163,7 +161,7 @@ def _measured(mesh: Mesh, rays: Rays, config: ScannerConfig, camera: np.ndarray,
 
 
 def _triangulate(distance: np.ndarray, config: ScannerConfig) -> np.ndarray:
-    """Triangles (F, 3) of pixel numbers between neighbours at similar distance, outward as the camera sees."""
+    """Triangles (F, 3) of pixel numbers between neighbours within five ray spacings in depth, outward."""
     height, width = distance.shape
     number = np.arange(height * width).reshape(height, width)
     a, b, c, d = number[:-1, :-1], number[:-1, 1:], number[1:, :-1], number[1:, 1:]
@@ -177,11 +175,11 @@ def _triangulate(distance: np.ndarray, config: ScannerConfig) -> np.ndarray:
     triangles = np.concatenate([one.reshape(-1, 3), two.reshape(-1, 3)])
     corner = flat[triangles]
     with np.errstate(invalid="ignore"):
-        good = corner.max(axis=1) - corner.min(axis=1) < DEPTH_JUMP * config.resolution
+        good = corner.max(axis=1) - corner.min(axis=1) < 5 * config.resolution
     triangles = triangles[good]
     if not len(triangles):
         return triangles
     used, index = np.unique(triangles, return_inverse=True)
     surface = Mesh(np.zeros((len(used), 3)), index.reshape(-1, 3))
     island = surface.vertex_component[surface.faces[:, 0]]
-    return triangles[np.bincount(island)[island] >= ISLAND]
+    return triangles[np.bincount(island)[island] >= 30]          # smaller pieces are removed

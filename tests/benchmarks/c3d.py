@@ -4,7 +4,7 @@
 
 The model is of the SCAPE topology, or any on which the layout is known. For each file: seconds of one processor for
 the subject and for the motion, and the distance of every seen marker from where the body puts it: the mean, the
-95th percentile, the mean of the worst frame. `as_laid` is the same with loose markers where the layout has them.
+95th percentile, the mean of the worst frame.
 """
 from __future__ import annotations
 
@@ -18,8 +18,9 @@ from protocols import machine, write_report
 
 from completion.mocap.files.markers import MarkerSequence, read_markers
 from completion.mocap.marker_sets.layout import MarkerLayout
+from completion.mocap.marker_sets.named import named_layout
 from completion.mocap.pose.follow import AnimateConfig, animate
-from completion.mocap.subject.marker_shape import MarkerShapeConfig, MarkerSubject, subject_from_markers
+from completion.mocap.subject.person import PersonConfig, PersonFit, find_person
 from completion.motion import Motion
 from model.body import BodyModel
 from model.files import load_model
@@ -27,11 +28,11 @@ from model.files import load_model
 HELD_OUT = ("RBHD", "T10", "LUPA", "RFRM", "RTHI", "LSHN")      # of a later protocol; their places were not tuned
 
 
-def follow(model: BodyModel, markers: MarkerSequence, layout: MarkerLayout, shape: MarkerShapeConfig,
-           config: AnimateConfig) -> tuple[MarkerSubject, Motion, dict[str, float]]:
+def follow(model: BodyModel, markers: MarkerSequence, layout: MarkerLayout, shape: PersonConfig,
+           config: AnimateConfig) -> tuple[PersonFit, Motion, dict[str, float]]:
     """Subject, motion and figures of one file."""
     start = time.process_time()
-    found = subject_from_markers(model, markers, layout, shape)
+    found = find_person(model, markers, layout, shape)
     person = time.process_time()
     motion = animate(model.subject(found.betas), markers, found.layout, config)
     end = time.process_time()
@@ -48,16 +49,17 @@ def follow(model: BodyModel, markers: MarkerSequence, layout: MarkerLayout, shap
         "beta_rms": float(np.sqrt((found.betas**2).mean())), "beta_largest": float(np.abs(found.betas).max())}
 
 
-def picture(model: BodyModel, found: MarkerSubject, motion: Motion, markers: MarkerSequence, every: int, path: Path
+def picture(model: BodyModel, found: PersonFit, motion: Motion, markers: MarkerSequence, every: int, path: Path
             ) -> None:
     """Every so many frames with the markers as dots, from two sides."""
-    from completion.mocap.animate.report import picture_frames
+    from completion.motion_pictures import picture_frames
     from scanprep.pictures.sheets import save_png
 
     few = Motion(motion.poses[::every], motion.trans[::every], motion.betas, motion.rate / every,
                  motion.residuals[::every], motion.labels)
     some = markers.frames(slice(None, None, every))
-    sides = [picture_frames(few, model.subject(found.betas), some, len(few.poses), 300, turn) for turn in (35.0, 215.0)]
+    sides = [picture_frames(few, model.subject(found.betas), some.positions, len(few.poses), 300, turn)
+             for turn in (35.0, 215.0)]
     save_png(path, np.concatenate(sides))
 
 
@@ -73,16 +75,14 @@ def main() -> None:
     args = parser.parse_args()
     model = load_model(args.model)
     people = model.info.get("people_vertices")
-    layout = MarkerLayout.named(args.layout, model.template, None if people is None else np.array(people))
-    shape, config = MarkerShapeConfig(), AnimateConfig(key_interval=args.key_interval)
+    layout = named_layout(args.layout, model.template, None if people is None else np.array(people))
+    shape, config = PersonConfig(), AnimateConfig()
     rows = []
     for path in sorted(args.folder.glob("*.c3d")):
         markers = read_markers(path)
         found, motion, row = follow(model, markers, layout, shape, config)
-        as_laid = follow(model, markers, layout, dataclasses.replace(shape, loose_reach=0.0), config)[2]
-        rows.append({"file": path.name, "frames": len(markers.positions), **row, "as_laid": as_laid})
+        rows.append({"file": path.name, "frames": len(markers.positions), **row})
         print(f"{path.name:16s} " + "  ".join(f"{name} {value:.3g}" for name, value in row.items()), flush=True)
-        print(f"{'':16s} as laid: mean {as_laid['mean_mm']:.3g} mm, p95 {as_laid['p95_mm']:.3g} mm", flush=True)
         if args.pictures:
             args.pictures.mkdir(parents=True, exist_ok=True)
             picture(model, found, motion, markers, 100, args.pictures / f"{path.stem}.png")

@@ -21,9 +21,10 @@ from protocols import RealData, load_real, machine, scape_fold, write_report
 
 from completion.mocap.files.markers import MarkerSequence, read_markers
 from completion.mocap.marker_sets.layout import MarkerLayout
+from completion.mocap.marker_sets.named import named_layout
 from completion.mocap.pose.follow import AnimateConfig, animate
 from completion.mocap.pose.stream import MarkerStream
-from completion.mocap.subject.marker_shape import subject_from_markers
+from completion.mocap.subject.person import find_person
 from completion.motion import Motion
 from model import learn_scape
 from model.body import BodyModel
@@ -99,7 +100,7 @@ def person(model: BodyModel, markers: MarkerSequence, layout: MarkerLayout, beta
     if betas:
         return model.subject(np.load(betas)["betas"]), layout
     if model.n_betas:
-        found = subject_from_markers(model, markers, layout)
+        found = find_person(model, markers, layout)
         return model.subject(found.betas), found.layout
     return model.subject(None), layout
 
@@ -152,7 +153,7 @@ def main() -> None:
     if args.c3d:
         people = load_model(args.people) if args.people else model
         layout = MarkerLayout.load(args.layout) if Path(args.layout).is_file() else \
-            MarkerLayout.named(args.layout, people.template)
+            named_layout(args.layout, people.template)
         report["real"] = real_sequences(people, args.c3d, layout, args.betas, args.limit)
     for name, value in report["mean"].items():
         print(f"{name:24s} {value:8.2f}")

@@ -25,13 +25,13 @@ from c3d import HELD_OUT
 from protocols import machine, write_report
 
 from completion.mocap.files.markers import MarkerSequence, read_markers
-from completion.mocap.marker_sets.layout import MarkerLayout, most_used
+from completion.mocap.marker_sets.layout import MarkerLayout
+from completion.mocap.marker_sets.named import named_layout
+from completion.mocap.mosh.mosh import MoshConfig
+from completion.mocap.pose.follow import animate
 from completion.mocap.pose.marked_body import MarkedBody
-from completion.mocap.pose.mosh_poses import follow_poses
-from completion.mocap.results import PersonFit
-from completion.mocap.settings import MoshConfig
 from completion.mocap.soft_tissue.soft_tissue import follow_soft_tissue
-from completion.mocap.subject.person import find_person
+from completion.mocap.subject.person import PersonFit, find_person
 from completion.motion import Motion
 from model.body import BodyModel
 from model.files import load_model
@@ -43,7 +43,7 @@ def held_out(model: BodyModel, motion: Motion, markers: MarkerSequence, layout: 
     places = layout.select(labels)
     body = MarkedBody(model.subject(motion.betas), places, 0.3, 0.3)
     off = markers.select(labels).positions - body.positions(body.body.join(motion.poses, motion.trans))
-    part = model.skeleton.part_of_vertex(model.template)[most_used(places)]
+    part = model.skeleton.part_of_vertex(model.template)[places.nearest]
     R = model.skeleton.part_rotations(motion.poses)[:, part]
     local = (np.swapaxes(R, -1, -2) @ off[..., None])[..., 0]
     steady = np.linalg.norm(local - np.nanmean(local, axis=0), axis=2)
@@ -58,7 +58,7 @@ def follow(model: BodyModel, markers: MarkerSequence, layout: MarkerLayout, conf
     start = time.process_time()
     person = find_person(model, markers, layout.without(HELD_OUT), config.person)
     found = time.process_time()
-    motion = follow_poses(model.subject(person.betas), markers, person.layout, config.follow)
+    motion = animate(model.subject(person.betas), markers, person.layout, config.poses)
     followed = time.process_time()
     off = 1e3 * motion.residuals
     frames = np.nanmean(off, axis=1)
@@ -79,7 +79,7 @@ def follow(model: BodyModel, markers: MarkerSequence, layout: MarkerLayout, conf
 def picture(model: BodyModel, motion: Motion, markers: MarkerSequence, every: int, path: Path, columns: int = 10
             ) -> None:
     """Every so many frames with the markers as dots."""
-    from completion.mocap.animate.report import picture_frames
+    from completion.motion_pictures import picture_frames
     from scanprep.pictures.sheets import save_png
 
     subject, rows, step = model.subject(motion.betas), [], every * columns
@@ -87,7 +87,7 @@ def picture(model: BodyModel, motion: Motion, markers: MarkerSequence, every: in
         some = slice(start, start + step, every)
         few = Motion(motion.poses[some], motion.trans[some], motion.betas, motion.rate / every,
                      motion.residuals[some], motion.labels)
-        rows.append(picture_frames(few, subject, markers.frames(some), columns, 300))
+        rows.append(picture_frames(few, subject, markers.positions[some], columns, 300))
     width = max(row.shape[1] for row in rows)
     white = 255 if rows[0].dtype == np.uint8 else 1
     save_png(path, np.concatenate([np.pad(row, ((0, 0), (0, width - row.shape[1]), (0, 0)), constant_values=white)
@@ -101,12 +101,14 @@ def main() -> None:
     parser.add_argument("-m", "--model", required=True)
     parser.add_argument("-o", "--output", default="mosh_c3d.json")
     parser.add_argument("--layout", default="cmu41")
+    parser.add_argument("--preset", choices=("default", "published"), default="default")
     parser.add_argument("--soft", action="store_true", help="also with a changing shape")
     parser.add_argument("--pictures", type=Path, help="folder for sheets of every fiftieth frame")
     args = parser.parse_args()
-    model, config = load_model(args.model), MoshConfig(soft_tissue=args.soft)
+    model, presets = load_model(args.model), {"default": MoshConfig(), "published": MoshConfig.published()}
+    config = dataclasses.replace(presets[args.preset], soft_tissue=args.soft)
     people = model.info.get("people_vertices")
-    layout = MarkerLayout.named(args.layout, model.template, None if people is None else np.array(people))
+    layout = named_layout(args.layout, model.template, None if people is None else np.array(people))
     rows: list[dict] = []
     for path in sorted(args.folder.glob("*.c3d")):
         markers = read_markers(path)
@@ -124,8 +126,8 @@ def main() -> None:
                    "of_frames": float(share @ [row[name] for row in rows])} for name in names}
     for name, both in mean.items():
         print(f"{name:24s} {both['of_files']:8.2f} {both['of_frames']:8.2f}")
-    write_report(args.output, {"protocol": f"{args.layout} without {', '.join(HELD_OUT)}", "machine": machine(),
-                               "files": rows, "mean": mean, "config": dataclasses.asdict(config)})
+    write_report(args.output, {"protocol": f"{args.layout} without {', '.join(HELD_OUT)}, preset {args.preset}",
+                               "machine": machine(), "files": rows, "mean": mean, "config": dataclasses.asdict(config)})
 
 
 if __name__ == "__main__":

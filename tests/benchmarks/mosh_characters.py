@@ -3,7 +3,7 @@
     python tests/benchmarks/mosh_characters.py --walk -o OUT
     SCAPEKIT_DATA=... python tests/benchmarks/mosh_characters.py -m PEOPLE.npz --c3d FILE.c3d -o OUT
 
-The template is registered to each figure once and kept in OUT. Whose motion it is comes from `mosh`: a synthetic man
+The template is registered to each figure once and kept in OUT. Whose motion it is comes from `mosh`: an embedded man
 who walks, or a file. Counted are triangles that have turned over against the rotations of the parts around them
 (`Creases`) on the character and on the person, and how far the joints lie from those that the figure was made with.
 Pictures and animated GLB are written beside the figures.
@@ -11,6 +11,7 @@ Pictures and animated GLB are written beside the figures.
 from __future__ import annotations
 
 import argparse
+import sys
 import time
 from pathlib import Path
 
@@ -19,19 +20,22 @@ from protocols import load_real, machine, write_report
 
 from completion.mocap.files.markers import MarkerSequence, read_markers
 from completion.mocap.marker_sets.layout import MarkerLayout
+from completion.mocap.marker_sets.named import named_layout
 from completion.mocap.mosh.mosh import mosh
-from completion.mocap.results import SoftTissue
-from completion.mocap.retargeting.cartoons import CARTOONS, Cartoon, cartoon
 from completion.mocap.retargeting.creases import Creases, at_rest
 from completion.mocap.retargeting.pictures import picture_transfer, write_character
 from completion.mocap.retargeting.soft_tissue import deformation, moving_character, retarget_soft_tissue
+from completion.mocap.soft_tissue.soft_tissue import SoftTissue
 from completion.synthetic_people import synthetic_model
 from model.body import BodyModel
-from model.posing.character_mesh import Character, register_character
+from model.posing.character import Character, register_character
 from scanprep.geometry.mesh import Mesh
 from scanprep.pictures.shading import save_png
 from scanprep.synthetic.data_set import SUBJECT
 from scanprep.synthetic.people import Person, walk
+
+sys.path.append(str(Path(__file__).parents[1]))
+from cartoons import CARTOONS, Cartoon, cartoon
 
 MM = 1000.0
 OF_SCAPE = {                         # names of the landmarks of the SCAPE template
@@ -77,13 +81,13 @@ def joints_off(model: BodyModel, figure: Cartoon, found: Character) -> list[floa
 
 
 def walking_man(model: BodyModel, frames: int, rate: float) -> tuple[MarkerSequence, MarkerLayout]:
-    """Markers of a synthetic man who walks, and their layout on the model's template."""
+    """Markers of an embedded man who walks, and their layout on the model's template."""
     person = Person(SUBJECT)
-    layout = MarkerLayout.named("cmu41", person.mesh)
+    layout = named_layout("cmu41", person.mesh)
     poses, trans = walk(frames, rate)
     bodies = [person.mesh.with_vertices(person.posed(p, t)) for p, t in zip(poses, trans, strict=True)]
     markers = MarkerSequence(np.stack([layout.place(body) for body in bodies]), layout.labels, rate)
-    return markers, MarkerLayout.named("cmu41", model.template, np.array(model.info["people_vertices"]))
+    return markers, named_layout("cmu41", model.template, np.array(model.info["people_vertices"]))
 
 
 def measure(model: BodyModel, found: Character, soft: SoftTissue, factor: float, frames: np.ndarray) -> dict:
@@ -113,8 +117,8 @@ def main() -> None:
     """Run and print a row for each figure and factor."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("-o", "--output", type=Path, required=True)
-    parser.add_argument("-m", "--model", type=Path, help="of the file's person; else the synthetic one")
-    parser.add_argument("--c3d", type=Path, help="whose motion it is; else a synthetic man walks")
+    parser.add_argument("-m", "--model", type=Path, help="of the file's person; else the embedded one")
+    parser.add_argument("--c3d", type=Path, help="whose motion it is; else an embedded man walks")
     parser.add_argument("--frames", type=int, default=60, help="that are measured and shown")
     parser.add_argument("--factors", type=float, nargs="*", default=[0.0, 1.0, 2.0])
     args = parser.parse_args()
@@ -123,7 +127,7 @@ def main() -> None:
     args.output.mkdir(parents=True, exist_ok=True)
     model = load_model(args.model) if args.model else synthetic_model()
     markers, layout = walking_man(model, 120, 60.0) if args.c3d is None else \
-        (read_markers(args.c3d), MarkerLayout.named("cmu41", model.template))
+        (read_markers(args.c3d), named_layout("cmu41", model.template))
     soft = mosh(model, markers, layout).soft_tissue[0]
     frames = np.unique(np.linspace(0, len(soft.motion.poses) - 1, args.frames).round().astype(int))
     rows = []
@@ -139,7 +143,7 @@ def main() -> None:
         moved = retarget_soft_tissue(soft, model, found.model, max(args.factors))
         save_png(args.output / f"{name}.png", picture_transfer(model, soft, found.model, moved, 8))
         write_character(args.output / f"{name}.glb", found.model, moved)
-    write_report(args.output / "report.json", {"motion": str(args.c3d or "synthetic walk"), "machine": machine(),
+    write_report(args.output / "report.json", {"motion": str(args.c3d or "embedded walk"), "machine": machine(),
                                                "rows": rows})
 
 

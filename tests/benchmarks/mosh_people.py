@@ -19,11 +19,9 @@ import numpy as np
 from protocols import load_real, machine, spring_split, write_report
 
 from completion.mocap.files.markers import MarkerSequence
-from completion.mocap.marker_sets.layout import MarkerLayout, most_used
-from completion.mocap.marker_sets.named import layout_names
-from completion.mocap.results import PersonFit
-from completion.mocap.settings import PersonConfig
-from completion.mocap.subject.person import find_person
+from completion.mocap.marker_sets.layout import MarkerLayout
+from completion.mocap.marker_sets.named import layout_names, named_layout
+from completion.mocap.subject.person import PersonConfig, PersonFit, find_person
 from model.body import BodyModel
 from model.files import load_model
 from model.fitting import fit_pose
@@ -40,9 +38,9 @@ WHOLE = 47                           # markers of the set that is compared with 
 def marker_set(model: BodyModel, count: int) -> MarkerLayout:
     """The Vicon set, the spread-out part of it, or the larger set; every marker a ball on the skin."""
     name = "vicon47" if count <= WHOLE or "mosh67" not in layout_names() else "mosh67"
-    layout = MarkerLayout.named(name, model.template)
+    layout = named_layout(name, model.template)
     plain = MarkerLayout(layout.labels, layout.vertices, RADIUS, layout.weights)
-    places = model.template.vertices[most_used(plain)]
+    places = model.template.vertices[plain.nearest]
     if count >= len(plain.labels):
         return plain if count == len(plain.labels) else enlarged(model, plain, count)
     chosen = [int(np.argmin(np.linalg.norm(places - places.mean(axis=0), axis=1)))]
@@ -55,7 +53,7 @@ def marker_set(model: BodyModel, count: int) -> MarkerLayout:
 
 def enlarged(model: BodyModel, layout: MarkerLayout, count: int) -> MarkerLayout:
     """With more markers where there is most room between them."""
-    vertices, chosen = model.template.vertices, most_used(layout).tolist()
+    vertices, chosen = model.template.vertices, layout.nearest.tolist()
     far = np.linalg.norm(vertices[:, None] - vertices[chosen], axis=2).min(axis=1)
     while len(chosen) < count:
         chosen.append(int(far.argmax()))
@@ -67,7 +65,7 @@ def enlarged(model: BodyModel, layout: MarkerLayout, count: int) -> MarkerLayout
 def put_on(subject: Subject, layout: MarkerLayout, rng: np.random.Generator) -> SurfacePoints:
     """Where on the skin somebody put the markers."""
     vertices = subject.vertices(np.zeros((len(subject.skeleton.parents), 3)))
-    mesh, ids = Mesh(vertices, subject.template.faces), most_used(layout)
+    mesh, ids = Mesh(vertices, subject.template.faces), layout.nearest
     off = rng.normal(0, PLACING, (len(ids), 3))
     normals = mesh.vertex_normals[ids]
     off -= np.einsum("ld,ld->l", off, normals)[:, None] * normals

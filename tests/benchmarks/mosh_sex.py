@@ -17,6 +17,7 @@ from protocols import machine, write_report
 
 from completion.mocap.files.markers import MarkerSequence
 from completion.mocap.marker_sets.layout import MarkerLayout
+from completion.mocap.marker_sets.named import named_layout
 from completion.mocap.subject.person import find_person
 from completion.synthetic_people import SyntheticRecipe, _decimated
 from model.body import BodyModel
@@ -70,10 +71,10 @@ def told(models: dict[str, BodyModel], sex: float, seed: int, args: argparse.Nam
     """One subject: truth, guess, and residuals with the models of both sexes."""
     rng = np.random.default_rng([seed, 61])
     person = Person(BodyShape.random(rng, sex=sex))
-    layout = MarkerLayout.named("cmu41", person.mesh)
+    layout = named_layout("cmu41", person.mesh)
     sequence = walking(person, layout, rng, args.error, args.frames)
     kept = np.array(models["neutral"].info["people_vertices"])
-    places = MarkerLayout.named("cmu41", models["neutral"].template, kept)
+    places = named_layout("cmu41", models["neutral"].template, kept)
     start = time.process_time()
     found = find_person(models["neutral"], sequence, places)
     seconds = time.process_time() - start

@@ -25,20 +25,21 @@ from scipy.linalg import eigh
 from completion.energy import lifted
 from completion.mocap.files.markers import MarkerSequence, read_markers
 from completion.mocap.marker_sets.layout import MarkerLayout
+from completion.mocap.marker_sets.named import named_layout
+from completion.mocap.mosh.mosh import MoshConfig
+from completion.mocap.pose.follow import animate
 from completion.mocap.pose.marked_body import supports
-from completion.mocap.pose.mosh_poses import follow_poses
-from completion.mocap.settings import SoftTissueConfig
-from completion.mocap.soft_tissue.changing_bodies import changing_bodies
-from completion.mocap.soft_tissue.soft_tissue import SoftFollower, follow_soft_tissue
+from completion.mocap.soft_tissue.changing_body import changing_bodies
+from completion.mocap.soft_tissue.soft_tissue import SoftFollower, SoftTissueConfig, follow_soft_tissue
 from completion.mocap.subject.person import find_person
 from completion.motion import Motion
 from model.body import BodyModel
 from model.files import load_model
 
-OURS = SoftTissueConfig()
-PAPER = replace(OURS, pose=1.0, velocity=6.25, skin=0.0, steadiness=0.0)
+OURS, POSES = SoftTissueConfig(), MoshConfig().poses
+PAPER = SoftTissueConfig.published()
 CHOICES = {"paper, fixed": replace(PAPER, change=1e8), "paper": PAPER, "fixed": replace(OURS, change=1e8), "ours": OURS,
-           "not steady": replace(OURS, steadiness=0.0), "no skin": replace(OURS, skin=0.0)}
+           "not smooth": replace(OURS, temporal_smoothness=0.0), "no skin": replace(OURS, skin=0.0)}
 GROUPS = 6
 NOISE = 0.001                        # metres
 
@@ -86,7 +87,7 @@ def simulated(model: BodyModel, motion: Motion, layout: MarkerLayout, rng: np.ra
         truth = changing_bodies(model, motion.poses, own + change, motion.trans)
         markers = lifted(np.einsum("lk,tlkd->tld", weights, truth[:, ids]), np.asarray(layout.distances))
         seen = MarkerSequence(markers + rng.normal(0, NOISE, markers.shape), layout.labels, motion.rate)
-        start = follow_poses(model.subject(own), seen, layout)
+        start = animate(model.subject(own), seen, layout, POSES)
         for choice, config in CHOICES.items():
             soft = follow_soft_tissue(model, start, seen, layout, config)
             found = np.pad(soft.changes, ((0, 0), (0, model.n_betas - soft.changes.shape[1])))
@@ -114,7 +115,7 @@ def main() -> None:
     parser.add_argument("--files", nargs="*", help="stems; all of the folder when not given")
     args = parser.parse_args()
     model = load_model(args.model)
-    layout, rows, simulation = MarkerLayout.named(args.layout, model.template), [], None
+    layout, rows, simulation = named_layout(args.layout, model.template), [], None
     for path in sorted(args.folder.glob("*.c3d")):
         if args.files and path.stem not in args.files:
             continue
@@ -122,7 +123,7 @@ def main() -> None:
         first = max(0, (len(whole.positions) - args.frames) // 2)
         markers = whole.frames(slice(first, first + args.frames))
         person = find_person(model, whole, layout)
-        motion = follow_poses(model.subject(person.betas), markers, person.layout)
+        motion = animate(model.subject(person.betas), markers, person.layout, POSES)
         if simulation is None:
             simulation = simulated(model, motion, layout, np.random.default_rng(0))
         for choice, config in CHOICES.items():

@@ -21,8 +21,9 @@ from protocols import machine, write_report
 
 from completion.mocap.files.markers import MarkerSequence, read_markers
 from completion.mocap.marker_sets.layout import MarkerLayout
-from completion.mocap.pose.mosh_poses import follow_poses
-from completion.mocap.settings import MoshConfig
+from completion.mocap.marker_sets.named import named_layout
+from completion.mocap.mosh.mosh import MoshConfig
+from completion.mocap.pose.follow import animate
 from completion.mocap.soft_tissue.soft_tissue import follow_soft_tissue
 from completion.mocap.subject.person import find_person
 from model.body import BodyModel
@@ -47,8 +48,8 @@ def measure(model: BodyModel, markers: MarkerSequence, layout: MarkerLayout, con
     T = len(markers.positions)
     row: dict[str, float | str] = {"frames": T, "markers": len(layout.matched(markers.labels))}
     person = timed(row, "person", lambda: find_person(model, markers, layout, config.person))
-    motion = timed(row, "poses", lambda: follow_poses(model.subject(person.betas), markers, person.layout,
-                                                      config.follow))
+    motion = timed(row, "poses", lambda: animate(model.subject(person.betas), markers, person.layout,
+                                                      config.poses))
     soft = timed(row, "soft", lambda: follow_soft_tissue(model, motion, markers, person.layout, config.soft))
     some = np.linspace(0, T - 1, min(T, MESHES)).round().astype(int)
     soft.vertices(model, some[:1])                                      # what is factored once
@@ -72,7 +73,7 @@ def main() -> None:
     args = parser.parse_args()
     model, config = load_model(args.model), MoshConfig()
     people = model.info.get("people_vertices")
-    layout = MarkerLayout.named(args.layout, model.template, None if people is None else np.array(people))
+    layout = named_layout(args.layout, model.template, None if people is None else np.array(people))
     rows = []
     for path in sorted(args.folder.glob("*.c3d")):
         rows.append({"file": path.name, **measure(model, read_markers(path), layout, config)})

@@ -129,7 +129,8 @@ MOSHING: dict[str, tuple[str, str, Callable[[dict], str], str]] = {
         "two cores, so the times of the clock are upper bounds."),
     "mosh_faults": (
         "Faults put into markers",
-        "python tests/benchmarks/mosh_faults.py FOLDER -m MODEL --men 3 --held-out --no-real --files basketball 85_02",
+        "python tests/benchmarks/mosh_artefacts.py FOLDER -m MODEL --men 3 --held-out --no-real "
+        "--files basketball 85_02",
         faults,
         "Held-out men moved as in two recordings; a tenth of the markers exchanged at any time, each for 0.2 to 2 s, a "
         "twentieth out of sight; everything, person included, from the faulty markers. Close pairs are nearer "

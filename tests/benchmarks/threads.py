@@ -27,7 +27,7 @@ import numpy as np
 from protocols import half_view, machine, write_report
 
 from completion.mocap.files.markers import MarkerSequence, write_markers
-from completion.mocap.marker_sets.layout import MarkerLayout
+from completion.mocap.marker_sets.named import named_layout
 from completion.synthetic_people import synthetic_model, synthetic_path
 from model.body import BodyModel
 from scanprep.geometry.files import PointCloud, write_mesh, write_points
@@ -57,7 +57,7 @@ def make_cases(folder: Path, model: BodyModel, model_file: Path) -> dict[str, li
     write_landmarks(folder / "half.landmarks.json",
                     {names[int(v)]: p for v, p in zip(*seen.landmarks, strict=True)})
     subject = model.subject(0.5 * rng.normal(size=model.n_betas))
-    layout = MarkerLayout.named("cmu41", model.template, kept)
+    layout = named_layout("cmu41", model.template, kept)
     bodies = subject.vertices(*walk(720, 120.0))
     places = np.array([layout.place(model.template.with_vertices(v)) for v in bodies])
     places += rng.normal(0, 0.001, places.shape)

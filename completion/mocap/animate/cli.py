@@ -17,21 +17,23 @@ from scanprep.cli import Output, Unit
 from scanprep.console import Metric, Outcome, bar, failures_of, problem_of
 from scanprep.geometry.storage import read_json
 from scanprep.pictures.page import Page
-from scanprep.ranges import BETAS, Count
+from scanprep.ranges import BETAS
 
 from ...cli import ModelOrNone, read_model
+from ..marker_sets.named import layout_or_file
 from ..pose.follow import AnimateConfig
-from ..subject.marker_shape import MarkerShapeConfig
-from .work import ENDINGS, MEAN_ERROR, BetasTo, Work, layout_or_file
+from ..subject.person import PersonConfig
+from .work import ENDINGS, MEAN_ERROR, BetasTo, GlbConfig, Work
 
 MarkersArg = Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="MARKERS")]
 
 
 def animate_markers(markers: MarkersArg, output: Output, model: ModelOrNone = None, layout: str | None = None,
                     subject: str | None = None, unit: Unit | None = None, who: str | None = None,
-                    onto: Path | None = None, betas_to: Path | None = None, keys: Count = 120,
+                    retarget_to: Path | None = None, betas_to: Path | None = None,
                     config: AnimateConfig = AnimateConfig(),   # noqa: B008
-                    shape: MarkerShapeConfig = MarkerShapeConfig(),                               # noqa: B008
+                    person: PersonConfig = PersonConfig(),                                        # noqa: B008
+                    glb: GlbConfig = GlbConfig(),                                                 # noqa: B008
                     workers: Workers = Workers(), *, space: Workspace) -> Outcome:              # noqa: B008
     """The motion of a person from markers, and the person.
 
@@ -55,20 +57,20 @@ def animate_markers(markers: MarkersArg, output: Output, model: ModelOrNone = No
             betas.
         unit: Unit of the markers, where the file cannot tell.
         who: Whose markers, in a C3D file with several people.
-        onto: Another person who makes the motion too, as betas or a mesh: onto.npz, onto.glb.
+        retarget_to: Another person who makes the motion too, as betas or a mesh: onto.npz, onto.glb.
         betas_to: Betas into which the body changes, in JSON: those at the end [b1, b2, ...], or keys in seconds
             {"0": [...], "2.5": [...]}: morph.glb.
-        keys: Largest number of key frames in a GLB.
         config: Settings.
-        shape: Settings of the subject from markers.
+        person: Settings of the person from markers.
+        glb: Settings of animated files.
         workers: Who works through the files of a folder.
     """
     found = _marker_files(markers)
     loaded, name = read_model(model)
     work = Work(loaded, name, None if layout is None else layout_or_file(layout), _subject(loaded, subject, unit),
-                None if onto is None else read_subject(loaded, onto, unit),
-                None if betas_to is None else read_betas_to(betas_to, loaded.n_betas), unit, who, keys, config, shape)
-    settings = {"animate": config, "shape": shape, "model": name}
+                None if retarget_to is None else read_subject(loaded, retarget_to, unit),
+                None if betas_to is None else read_betas_to(betas_to, loaded.n_betas), unit, who, config, person, glb)
+    settings = {"animate": config, "person": person, "model": name}
     if markers.is_file():
         with bar("following the markers") as following:
             done = space.run(work, [Task("motion", markers)], inside=following).only
@@ -130,13 +132,7 @@ def _subject(model: BodyModel, given: str | None, unit: Unit | None) -> Subject 
 
 
 def read_betas_to(path: Path, n_betas: int) -> BetasTo:
-    """Betas at the end, [b1, b2, ...] or {"betas": [...]}, or keys {"seconds": [b1, b2, ...]}, from JSON.
-
-    Raises
-    ------
-    ValueError
-        Another form, more betas than the model has.
-    """
+    """Betas at the end, [b1, b2, ...] or {"betas": [...]}, or keys {"seconds": [b1, b2, ...]}, from JSON."""
     wanted = 'betas at the end, [b1, b2, ...], or keys {"0": [b1, ...], "2.5": [...]} in seconds'
     tree = read_json(path, wanted)
     keyed = isinstance(tree, dict) and "betas" not in tree

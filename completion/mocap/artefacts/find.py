@@ -2,37 +2,86 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 
 from model.linear import Subject
+from scanprep.geometry.least_squares import Minimum, levenberg_marquardt
 
 from ...motion import Motion
 from ..files.markers import MarkerSequence
 from ..marker_sets.layout import MarkerLayout
 from ..pose.robust import marker_weights
-from ..results import BadSpan, MarkerFaults
-from ..settings import FaultConfig
-from .ambiguous_swaps import doubtful_pairs, exchanged_after_all
+from ..pose.settings import AnimateConfig
+from .results import ArtefactConfig, BadSpan, MarkerArtefacts
 from .simulated import Simulation, bridged, usual_places
 from .slips import find_bad, without_lost_limbs
-from .swaps import Evidence, find_order, listed, marker_levels, pairs_that_jump
-from .tracks import Tracks
+from .swaps import (
+    AWAY,
+    MEMORY,
+    WORTH,
+    Tracks,
+    best_stretches,
+    find_order,
+    list_swaps,
+    marker_levels,
+    pairs_that_jump,
+    relabelled,
+)
 
 Progress = Callable[[int, int], None]
-BRIDGE = 0.5                         # seconds that a marker out of sight takes to its usual place, and from there
-USUAL_PLACE = 0.04                   # metres, most that a marker's usual place is taken to be from its simulation
-UNSURE = 0.25                        # share of the frames in which a label was exchanged, the more likely of two ways
-ENOUGH = 0.6                         # share of the markers that must be left without those
+FOLLOW = AnimateConfig()             # how the body follows the markers here
+ROUNDS = 6                           # most times that markers are repaired and the body follows them anew
 SETTLED = 0.002                      # share of the markers that may still change when the search ends
+USUAL_PLACE = 0.04                   # metres, most that a marker's usual place is taken to be from its simulation
+BRIDGE = 0.5                         # seconds that a marker out of sight takes to its usual place, and from there
+CLOSE = 0.25                         # metres between markers whose swap a body can follow
 
 
-def find_faults(subject: Subject, markers: MarkerSequence, layout: MarkerLayout, config: FaultConfig | None = None,
-                motion: Motion | None = None, progress: Progress | None = None) -> MarkerFaults:
-    """Labels that were exchanged, and markers that slip, jitter or stray.
+@dataclass(frozen=True, eq=False)
+class _State:
+    """Where the search stands.
+
+    Attributes
+    ----------
+    order : (T, L) int
+        From which label each marker is taken.
+    unsure : (L,) bool
+        Labels that tracks alone have swapped for so long that it may be the other way round.
+    bad : tuple of BadSpan
+    x : (T, P) float, optional
+        The body as it follows the markers so repaired.
+    both_ways_tried : bool
+        Swaps that the body may have followed were looked for.
+    """
+
+    order: np.ndarray
+    unsure: np.ndarray
+    bad: tuple[BadSpan, ...] = ()
+    x: np.ndarray | None = None
+    both_ways_tried: bool = False
+
+    def out(self, labels: tuple[str, ...]) -> np.ndarray:
+        """Bad markers (T, L) bool."""
+        found = np.zeros(self.order.shape, dtype=bool)
+        for span in self.bad:
+            found[span.begin:span.end + 1, labels.index(span.label)] = True
+        return found
+
+    def repaired(self, markers: MarkerSequence) -> np.ndarray:
+        """The markers (T, L, 3), metres, under their right labels, without bad spans."""
+        return np.where(self.out(markers.labels)[..., None], np.nan, relabelled(markers.positions, self.order))
+
+
+def find_artefacts(subject: Subject, markers: MarkerSequence, layout: MarkerLayout,
+                   config: ArtefactConfig | None = None, motion: Motion | None = None,
+                   progress: Progress | None = None) -> MarkerArtefacts:
+    """Labels that were swapped, and markers that slip, jitter or stray.
 
     First the tracks alone tell where two labels change places. The body follows the markers so repaired, and where
-    it has them tells with the tracks which labels are exchanged, and which markers are elsewhere. It follows what is
+    it has them tells with the tracks which labels are swapped, and which markers are elsewhere. It follows what is
     left, until nothing changes.
 
     Parameters
@@ -41,7 +90,8 @@ def find_faults(subject: Subject, markers: MarkerSequence, layout: MarkerLayout,
         The person, of known shape.
     markers : MarkerSequence
     layout : MarkerLayout
-        Where on the person the markers sit. Exchanges are also found among labels that it does not know.
+        Where on the person the markers sit. Swaps are also found among labels that it does not know.
+    config : ArtefactConfig, optional
     motion : Motion, optional
         Of the person in this sequence, where it is known already; it is followed anew where markers are repaired.
     progress : callable, optional
@@ -52,155 +102,161 @@ def find_faults(subject: Subject, markers: MarkerSequence, layout: MarkerLayout,
     ValueError
         Fewer than 3 markers in common, no frame with 3 of them, a layout of another body, a motion of other length.
     """
-    config = config or FaultConfig()
+    config = config or ArtefactConfig()
     if motion is not None and len(motion.poses) != len(markers.positions):
         raise ValueError(f"motion: expected {len(markers.positions)} frames as the markers have, "
                          f"got {len(motion.poses)}")
-    search = _Search(subject, markers, layout, config)
-    for done in range(config.rounds):
-        if motion is not None and not done and search.untouched:
-            search.take(motion)
+    body, state = Simulation(subject, markers, layout, FOLLOW), _by_tracks(markers)
+    for done in range(ROUNDS):
+        if motion is not None and not done and (state.order == np.arange(state.order.shape[1])).all():
+            x = body.taken_from(motion, state.repaired(markers))
         else:
-            search.follow()
-        settled = search.look()
+            x = _followed(body, markers, state)
+        before, state = state, _judged(body, markers, replace(state, x=x), config)
         if progress:
-            progress(done + 1, config.rounds)
-        if settled:
+            progress(done + 1, ROUNDS)
+        if _same(body, markers, before, state):
             break
-    return search.result()
+    return _result(body, markers, replace(state, x=x))
 
 
-def by_tracks(markers: MarkerSequence, config: FaultConfig | None = None) -> MarkerSequence:
+def relabelled_by_tracks(markers: MarkerSequence) -> MarkerSequence:
     """The sequence with labels put right as far as the tracks of the markers alone tell, without a body."""
-    return MarkerSequence(_ordered(markers, _order_by_tracks(markers, config or FaultConfig())), markers.labels,
-                          markers.rate)
+    order = find_order(markers.positions, markers.rate)
+    return MarkerSequence(relabelled(markers.positions, order), markers.labels, markers.rate)
 
 
-def _order_by_tracks(markers: MarkerSequence, config: FaultConfig) -> np.ndarray:
-    """Which column (T, L) each marker is to be taken from."""
-    T, L = markers.positions.shape[:2]
-    return find_order(Evidence(markers.positions, np.zeros((T, L, L)), markers.rate), config)
+def _by_tracks(markers: MarkerSequence) -> _State:
+    """What tracks alone tell; labels swapped in more than a quarter of the frames are the more likely of two ways."""
+    order = find_order(markers.positions, markers.rate)
+    return _State(order, (order != np.arange(order.shape[1])).mean(axis=0) > 0.25)
 
 
-def _ordered(markers: MarkerSequence, order: np.ndarray) -> np.ndarray:
-    """The markers (T, L, 3), metres, under the labels that an order (T, L) gives them."""
-    return np.take_along_axis(markers.positions, order[..., None], axis=1)
+def _followed(body: Simulation, markers: MarkerSequence, state: _State) -> np.ndarray:
+    """The body (T, P) that follows the repaired markers, without those of unsure labels where enough are left."""
+    enough = 0.6                                                        # share of the markers that the layout knows
+    repaired = state.repaired(markers)
+    targets = np.where(state.unsure[:, None], np.nan, repaired)[:, body.rows]
+    if np.isfinite(targets[..., 0]).sum(axis=1).max() < enough * len(body.rows):
+        targets = repaired[:, body.rows]
+    return body.solve(targets, None if state.unsure.any() else state.x)
 
 
-class _Search:
-    """The state of the search: labels, bad spans and the body that follows the rest.
+def _judged(body: Simulation, markers: MarkerSequence, state: _State, config: ArtefactConfig) -> _State:
+    """The state with the swaps and then the bad spans that the body at its x tells; x is None if it is to be anew."""
+    assert state.x is not None, "the body has followed"
+    places, simulated = np.full(markers.positions.shape, np.nan), body.positions(state.x)
+    places[:, body.rows] = _expected(body, state, state.repaired(markers)[:, body.rows], simulated)
+    order = find_order(markers.positions, markers.rate, marker_levels(places, markers.positions, markers.rate))
+    sure, tried = not state.unsure.any(), state.both_ways_tried
+    if sure and not tried and (order == state.order).all():
+        order, tried = _both_ways(body, markers, state.x, order, places), True
+    after = replace(state, order=order, unsure=np.zeros_like(state.unsure), both_ways_tried=tried)
+    if not sure or (order != state.order).any():                        # where labels are wrong, so is the body
+        return replace(after, bad=(), x=state.x if (order == state.order).all() else None)
+    tracks = Tracks(relabelled(markers.positions, order)[:, body.rows], markers.rate)
+    off = tracks.positions - simulated
+    mine, alone = (body.local(v, state.x) for v in (off, body.alone(off, state.x)))
+    found = find_bad(mine, alone, np.where(tracks.jumped, tracks.off, 0), body.labels, config, markers.rate)
+    bad = without_lost_limbs(found, body.neighbours, body.labels)
+    return replace(after, bad=bad, x=state.x if len(bad) == len(found) else None)       # a lost limb is sought anew
 
-    Parameters
-    ----------
-    subject : Subject
-    markers : MarkerSequence
-    layout : MarkerLayout
-    config : FaultConfig
+
+def _same(body: Simulation, markers: MarkerSequence, before: _State, after: _State) -> bool:
+    """Whether a round has changed next to nothing."""
+    changed = before.out(markers.labels) != after.out(markers.labels)
+    return bool((before.order == after.order).all() and not before.unsure.any()
+                and changed[:, body.rows].mean() <= SETTLED)
+
+
+def _expected(body: Simulation, state: _State, repaired: np.ndarray, simulated: np.ndarray) -> np.ndarray:
+    """Where markers (T, L, 3) are expected: off the simulated ones as they mostly are in their part's frame."""
+    assert state.x is not None, "the body has followed"
+    usual = usual_places(body.local(repaired - simulated, state.x))
+    usual[state.unsure[body.rows]] = 0
+    length = np.linalg.norm(usual, axis=1, keepdims=True)
+    usual *= np.minimum(1, USUAL_PLACE / np.maximum(length, 1e-12))
+    return simulated + np.einsum("tldc,lc->tld", body.part_rotations(state.x), usual)
+
+
+def _both_ways(body: Simulation, markers: MarkerSequence, x: np.ndarray, order: np.ndarray, places: np.ndarray
+               ) -> np.ndarray:
+    """The order (T, L) with close markers swapped where the body at x (T, P) has followed the wrong ones."""
+    raw, tracks = (Tracks(p, markers.rate) for p in (markers.positions, relabelled(markers.positions, order)))
+    swapped = {(min(a, b), max(a, b)) for row in np.unique(order, axis=0) for a, b in enumerate(row.tolist()) if a != b}
+    pairs, order = pairs_that_jump(raw, set(range(len(markers.labels)))) | swapped, order.copy()
+    for a, b in sorted(pairs):
+        if not np.median(np.linalg.norm(places[:, a] - places[:, b], axis=1)) < CLOSE:      # nor where one is unknown
+            continue
+        frames = ambiguous_swap(body, x, tracks, a, b)
+        if len(frames):
+            columns = np.array((a, b))
+            order[np.ix_(frames, columns)] = order[np.ix_(frames, columns[::-1])]
+            tracks.change(columns, relabelled(markers.positions, order[:, columns]))
+    return order
+
+
+def ambiguous_swap(body: Simulation, x: np.ndarray, tracks: Tracks, a: int, b: int) -> np.ndarray:
+    """Frames (n,) in which the labels a, b of close markers are better swapped, though the body followed them as is.
+
+    Both ways are tried in three frames of each stretch, from a body at x (T, P) that then follows neither; `tracks` are
+    those of the markers under the labels that they have now.
     """
+    samples = 3
+    begins = tracks.loose_ends(a, b)
+    lengths = np.diff(np.r_[begins, len(x)])
+    seen = np.isfinite(tracks.positions[:, [a, b], 0]).all(axis=1)
+    frames, stretch = [], []
+    for i, (begin, length) in enumerate(zip(begins, lengths, strict=True)):
+        there = begin + np.flatnonzero(seen[begin:begin + length])
+        if len(there):
+            some = np.unique(there[np.linspace(0, len(there) - 1, samples + 2).round().astype(int)[1:-1]])
+            frames.append(some)
+            stretch.append(np.full(len(some), i))
+    if not frames:
+        return np.zeros(0, dtype=int)
+    at, of = np.concatenate(frames), np.concatenate(stretch)
+    value = np.clip(_gains(body, x[at], tracks.positions[at], a, b), -2 * AWAY, 2 * AWAY)
+    mean = np.bincount(of, value, len(begins)) / np.maximum(np.bincount(of, minlength=len(begins)), 1)
+    known = np.add.reduceat(seen.astype(float), begins)
+    total, swapped = best_stretches(tracks, a, b, begins, mean * known * min(1.0, 1 / (MEMORY * body.rate)))
+    return swapped if total > WORTH else swapped[:0]
 
-    def __init__(self, subject: Subject, markers: MarkerSequence, layout: MarkerLayout, config: FaultConfig) -> None:
-        self.config, self.markers = config, markers
-        self.body = Simulation(subject, markers, layout, config.follow)
-        T, L = markers.positions.shape[:2]
-        self.order = _order_by_tracks(markers, config)
-        self.bad: tuple[BadSpan, ...] = ()
-        self.unsure = (self.order != np.arange(L)).mean(axis=0) > UNSURE
-        self.solved: np.ndarray | None = None
-        self.tried = False
-        self.out = np.zeros((T, L), dtype=bool)
 
-    @property
-    def untouched(self) -> bool:
-        """No label has been exchanged."""
-        return bool((self.order == np.arange(self.order.shape[1])).all())
+def _gains(body: Simulation, x: np.ndarray, positions: np.ndarray, a: int, b: int) -> np.ndarray:
+    """What it gains (n,), in half squared deviations, to swap a pair in frames with unknowns (n, P)."""
+    targets = positions[:, body.rows]
+    own = [int(np.flatnonzero(body.rows == label)[0]) for label in (a, b)]
+    weights, _ = marker_weights(body.positions(x), targets, FOLLOW.marker_sd, FOLLOW.outlier)
+    without, full = weights.copy(), weights
+    without[:, own], full[:, own] = 0, FOLLOW.marker_sd**-2
+    start = _solved(body, x, targets, without).x
+    other = targets.copy()
+    other[:, own] = targets[:, own[::-1]]
+    costs = [_solved(body, start, way, full).energy for way in (targets, other)]
+    return 0.5 * (costs[0] - costs[1])
 
-    @property
-    def ordered(self) -> np.ndarray:
-        """The markers (T, L, 3), metres, under their right labels."""
-        return _ordered(self.markers, self.order)
 
-    @property
-    def repaired(self) -> np.ndarray:
-        """The same without bad spans."""
-        return np.where(self.out[..., None], np.nan, self.ordered)
+def _solved(body: Simulation, x: np.ndarray, targets: np.ndarray, weights: np.ndarray) -> Minimum[np.ndarray]:
+    """Frames (n, P) after a few steps towards targets (n, L, 3)."""
+    return levenberg_marquardt(partial(body.body.system, targets=targets, weights=weights), x, iterations=8,
+                               tolerance=1e-3, retract=body.body.retract)
 
-    def take(self, motion: Motion) -> None:
-        """Have the body as in a motion."""
-        self.body.targets = self.repaired[:, self.body.rows]
-        self.x, self.solved = self.body.body.body.join(motion.poses, motion.trans), self.order
 
-    def follow(self) -> None:
-        """Have the body follow the repaired markers, at first without those whose label is in doubt."""
-        targets = np.where(self.unsure[:, None], np.nan, self.repaired)[:, self.body.rows]
-        if np.isfinite(targets[..., 0]).sum(axis=1).max() < ENOUGH * len(self.body.rows):
-            targets = self.repaired[:, self.body.rows]
-        same = self.solved is not None and (self.solved == self.order).all()
-        self.x = self.body.solve(targets, self.x if same and not self.unsure.any() else None)
-        self.solved = self.order
+def _result(body: Simulation, markers: MarkerSequence, state: _State) -> MarkerArtefacts:
+    """What has been found."""
+    assert state.x is not None, "the body has followed"
+    repaired, simulated = state.repaired(markers), body.positions(state.x)
+    targets = repaired[:, body.rows]
+    weights, _ = marker_weights(simulated, targets, 1.0, FOLLOW.outlier)
+    off = bridged(body.local(targets - simulated, state.x), BRIDGE * markers.rate)
+    expected = simulated + np.einsum("tldc,tlc->tld", body.part_rotations(state.x), off)
+    return MarkerArtefacts(list_swaps(state.order, markers.seen, markers.labels), state.bad, simulated, body.labels,
+                           MarkerSequence(repaired, markers.labels, markers.rate), weights, expected, state.order)
 
-    def look(self) -> bool:
-        """Find exchanges, and then bad spans, by where the body has the markers; whether nothing has changed."""
-        before, out, unsure = self.order, self.out, self.unsure.any()
-        places = np.full(self.markers.positions.shape, np.nan)
-        simulated = self.body.positions(self.x)
-        places[:, self.body.rows] = self._usual(simulated)
-        levels = marker_levels(places, self.markers.positions, self.config, self.markers.rate)
-        self.order = find_order(Evidence(self.markers.positions, levels, self.markers.rate), self.config)
-        self.unsure = np.zeros(len(self.unsure), dtype=bool)
-        if not unsure and not self.tried and (before == self.order).all():
-            self.tried = True
-            self._try_both_ways(places)
-        if (before != self.order).any() or unsure:                     # where labels are wrong, so is the body
-            self.bad, self.out = (), np.zeros_like(out)
-            return False
-        self._find_bad(simulated)
-        return bool((self.out != out)[:, self.body.rows].mean() <= SETTLED)
 
-    def _try_both_ways(self, places: np.ndarray) -> None:
-        """Exchange close markers where the body has followed the wrong ones."""
-        config, rate, L = self.config, self.markers.rate, len(self.markers.labels)
-        raw = Tracks(self.markers.positions, rate, config.floor, config.jump)
-        exchanged = {(min(a, b), max(a, b)) for row in np.unique(self.order, axis=0)
-                     for a, b in enumerate(row.tolist()) if a != b}
-        order, tracks = self.order.copy(), Tracks(self.ordered, rate, config.floor, config.jump)
-        for a, b in doubtful_pairs(pairs_that_jump(raw, set(range(L))) | exchanged, places):
-            swapped = exchanged_after_all(self.body, self.x, tracks, a, b, config)
-            if len(swapped):
-                columns = np.array((a, b))
-                order[np.ix_(swapped, columns)] = order[np.ix_(swapped, columns[::-1])]
-                tracks.changed(columns, np.take_along_axis(self.markers.positions, order[:, columns, None], axis=1))
-        self.order = order
-
-    def _find_bad(self, simulated: np.ndarray) -> None:
-        """Find the bad spans."""
-        config, rate = self.config, self.markers.rate
-        tracks = Tracks(self.ordered[:, self.body.rows], rate, config.floor, config.jump)
-        off = tracks.positions - simulated
-        mine, alone = (self.body.local(v, self.x) for v in (off, self.body.alone(off, self.x)))
-        jumps = np.where(tracks.jumped, tracks.off, 0)
-        found = find_bad(mine, alone, jumps, self.body.labels, config, rate)
-        self.bad = without_lost_limbs(found, self.body.neighbours, self.body.labels)
-        if len(self.bad) < len(found):
-            self.solved = None                                          # a limb is lost: it is looked for anew
-        self.out = np.zeros_like(self.out)
-        for span in self.bad:
-            self.out[span.begin:span.end + 1, self.markers.labels.index(span.label)] = True
-
-    def _usual(self, simulated: np.ndarray) -> np.ndarray:
-        """Where markers (T, L, 3) are expected: off the simulated ones as they mostly are in their part's frame."""
-        usual = usual_places(self.body.local(self.repaired[:, self.body.rows] - simulated, self.x))
-        usual[self.unsure[self.body.rows]] = 0
-        length = np.linalg.norm(usual, axis=1, keepdims=True)
-        usual *= np.minimum(1, USUAL_PLACE / np.maximum(length, 1e-12))
-        return simulated + np.einsum("tldc,lc->tld", self.body.part_rotations(self.x), usual)
-
-    def result(self) -> MarkerFaults:
-        """What has been found."""
-        repaired, labels = self.repaired, self.markers.labels
-        simulated = self.body.positions(self.x)
-        targets, sd = repaired[:, self.body.rows], self.config.follow.marker_sd
-        weights, _ = marker_weights(simulated, targets, sd, self.config.follow.outlier)
-        off = bridged(self.body.local(targets - simulated, self.x), BRIDGE * self.markers.rate)
-        expected = simulated + np.einsum("tldc,tlc->tld", self.body.part_rotations(self.x), off)
-        return MarkerFaults(listed(self.order, self.markers.seen, labels), self.bad, simulated, self.body.labels,
-                            MarkerSequence(repaired, labels, self.markers.rate), weights * sd**2, expected, self.order)
+def no_artefacts(subject: Subject, markers: MarkerSequence, layout: MarkerLayout, motion: Motion) -> MarkerArtefacts:
+    """What `find_artefacts` returns where nothing is wrong: markers as they came, and the body of a motion."""
+    body, (T, L) = Simulation(subject, markers, layout, FOLLOW), markers.positions.shape[:2]
+    x = body.taken_from(motion, markers.positions)
+    return _result(body, markers, _State(np.tile(np.arange(L), (T, 1)), np.zeros(L, dtype=bool), x=x))

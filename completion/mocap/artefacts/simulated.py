@@ -5,66 +5,63 @@ import numpy as np
 
 from model.linear import Subject
 
+from ...motion import Motion
 from ..files.markers import MarkerSequence
 from ..marker_sets.layout import MarkerLayout
-from ..pose.follow import MarkerFollower
-from ..pose.marked_body import BATCH
+from ..pose.follow import between_keys, seen_span
+from ..pose.marked_body import BATCH, MarkedBody
+from ..pose.robust import marker_weights
 from ..pose.settings import AnimateConfig
-from ..pose.smooth import smooth_sequence
+from ..pose.smooth import inertia, smoothed
 
-LOOKS = 15.0                         # frames per second in which it is asked how a marker draws the body
 OWN = 0.6                            # most of a displacement that the body is taken to have followed
 
 
-class Simulation(MarkerFollower):
-    """A body that follows markers whose labels are taken as they are.
-
-    Parameters
-    ----------
-    subject : Subject
-    markers : MarkerSequence
-    layout : MarkerLayout
-    config : AnimateConfig
-    """
+class Simulation:
+    """A body that follows markers whose labels are taken as they are."""
 
     def __init__(self, subject: Subject, markers: MarkerSequence, layout: MarkerLayout, config: AnimateConfig) -> None:
-        super().__init__(subject, markers, layout, config)
-        self.labels = tuple(markers.labels[row] for row in self.rows)
+        self.labels = layout.matched(markers.labels)
+        self.config, self.rate = config, markers.rate
+        self.rows = np.array([markers.labels.index(label) for label in self.labels])
+        self.targets = markers.positions[:, self.rows]
         template, selected = subject.template, layout.select(self.labels)
-        base = selected.vertices.reshape(len(self.labels), -1)
-        share = np.ones(base.shape) if selected.weights is None else selected.weights
-        nearest = np.take_along_axis(base, share.argmax(axis=1)[:, None], axis=1)[:, 0]
-        self.part = subject.skeleton.part_of_vertex(template)[nearest]
+        self.body = MarkedBody(subject, selected, config.prior_weight, config.prior_shrinkage)
+        self.part = subject.skeleton.part_of_vertex(template)[selected.nearest]
         parents = np.asarray(subject.skeleton.parents)[self.part]
         hangs = self.part[:, None] == parents
         self.neighbours = (self.part[:, None] == self.part) | hangs | hangs.T
 
-    def find_exchanges(self, x: np.ndarray) -> None:
-        """Take the labels as they are."""
-        self.order[:] = np.arange(self.body.count)
+    def positions(self, x: np.ndarray) -> np.ndarray:
+        """Where the body puts the markers (..., L, 3), metres, for unknowns (..., P)."""
+        return self.body.positions(x)
+
+    def weights(self, frames: np.ndarray | slice, positions: np.ndarray) -> np.ndarray:
+        """Weights (n, L) of the markers of some frames, low for outliers."""
+        return marker_weights(positions, self.targets[frames], self.config.marker_sd, self.config.outlier)[0]
 
     def solve(self, targets: np.ndarray, near: np.ndarray | None = None) -> np.ndarray:
         """Unknowns (T, P) of the body that follows markers (T, L, 3), metres, from others that are near or anew."""
         self.targets = targets
-        x = self.between_keys(self.first_frame()) if near is None else near.copy()
-        self.find_exchanges(x)
-        some = np.flatnonzero(np.isfinite(targets[..., 0]).any(axis=1))
-        inside = np.arange(some[0], some[-1] + 1)
+        x = between_keys(self.body, targets, self.rate, self.config) if near is None else near.copy()
+        inside, stiffness = seen_span(targets), inertia(self.config, self.rate, self.body.n_unknowns)
         for _ in range(max(self.config.smoothing, 1)):
-            x[inside] = smooth_sequence(self, x[inside], inside)
+            weights = self.weights(inside, self.positions(x[inside]))
+            x[inside] = smoothed(self.body, stiffness, x[inside], targets[inside], weights)
         return x
+
+    def taken_from(self, motion: Motion, repaired: np.ndarray) -> np.ndarray:
+        """Unknowns (T, P) of the body in a motion, which followed the repaired markers (T, all labels, 3)."""
+        self.targets = repaired[:, self.rows]
+        return self.body.body.join(motion.poses, motion.trans)
 
     def alone(self, off: np.ndarray, x: np.ndarray) -> np.ndarray:
         """What markers would be off (T, L, 3), metres, if the body x (T, P) followed the others alone.
 
         The body has gone after a displaced marker a little. Its own part in the normal equations is taken back.
-
-        Parameters
-        ----------
-        off : (T, L, 3) float, metres
-            From the simulated markers to the measured ones.
+        `off` (T, L, 3) is from the simulated markers to the measured ones.
         """
-        T, every = len(x), max(1, round(self.rate / LOOKS))
+        T, every = len(x), max(1, round(self.rate / 15))                # 15 looks a second at how markers draw the body
         frames = np.arange(min(every // 2, T - 1), T, every)
         freed = _between(self._freed(x[frames], frames), frames, T)
         return (freed @ off[..., None])[..., 0]
@@ -84,7 +81,7 @@ class Simulation(MarkerFollower):
         out = np.empty((*weights.shape, 3, 3))
         for start in range(0, len(x), BATCH):
             some = slice(start, start + BATCH)
-            _, _, hessian = self.body.system(x[some], self.taken(frames[some]), weights[some])
+            _, _, hessian = self.body.system(x[some], self.targets[frames[some]], weights[some])
             pose, trans, _ = self.body.body.split(x[some])
             _, by_turn = self.body.shapes.columns(pose, trans)                                    # (B, n, 3, L)
             columns = np.concatenate([by_turn, np.broadcast_to(np.eye(3)[None, :, :, None],
@@ -115,14 +112,9 @@ def usual_places(local: np.ndarray) -> np.ndarray:
 
 
 def bridged(local: np.ndarray, reach: float) -> np.ndarray:
-    """What markers are off (T, L, 3) with gaps bridged: straight from end to end, in long ones by way of the usual.
+    """What markers are off (T, L, 3), NaN in gaps, with these bridged: straight, in long ones by way of the usual.
 
-    Parameters
-    ----------
-    local : (T, L, 3) float, metres
-        NaN in gaps.
-    reach : float
-        Frames from an end of a long gap to where a marker is usually.
+    A marker is where it usually is `reach` frames from either end of a long gap.
     """
     out = np.repeat(usual_places(local)[None], len(local), axis=0)
     for i in range(local.shape[1]):

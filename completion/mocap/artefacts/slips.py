@@ -6,44 +6,24 @@ from itertools import pairwise
 import numpy as np
 from scipy.ndimage import binary_dilation, median_filter
 
-from ..results import BadKind, BadSpan
-from ..settings import FaultConfig
+from .results import ArtefactConfig, BadKind, BadSpan
 
-SLIP_WINDOW = 0.1                    # seconds in which a slip is over
-SLIP_SUDDEN = 0.6                    # share of the lasting displacement that comes within that time
-SLIP_USUAL = 3.0                     # times the usual change within that time
-SLIP_STAYS = 0.25                    # seconds that a marker is seen before and after
-SLIP_LEAP = 0.5                      # share of it that the jump of a track must be, at least, and it of the jump
-SLIP_LASTS = 0.65, 0.85              # share of the frames on either side that keep to it, with a jump or without
-SLIP_SMOOTH = 2.0                    # times the least displacement that it takes where no track jumps
-NOISE_WINDOW = 0.15                  # seconds, over which jitter is a median
-NOISE_USUAL = 5.0                    # times the usual jitter
-STRAY_USUAL = 4.0                    # times the usual distance of the markers of a frame
-STRAY_JUMPED = 0.5                   # share of the limit that does where a track jumps away and back
-STRAY_SMOOTH = 3.0                   # times the limit that it takes where no track jumps
-STRAY_LEAP = 0.5                     # share of the displacement that the jump of a track must be
-LOST_LIMB = 0.5                      # share of the markers of a limb that are not all bad at once
-JOINED = 0.1                         # seconds between two spans of a kind that are one
+SLIP_SUDDEN = 0.6                    # share of the lasting displacement that comes within a tenth of a second
+STRAY_SMOOTH = 3.0                   # times the limit that a stray takes where no track jumps
 
 
-def find_bad(off: np.ndarray, alone: np.ndarray, jumps: np.ndarray, labels: tuple[str, ...], config: FaultConfig,
+def find_bad(off: np.ndarray, alone: np.ndarray, jumps: np.ndarray, labels: tuple[str, ...], config: ArtefactConfig,
              rate: float) -> tuple[BadSpan, ...]:
-    """The bad spans of markers.
+    """The bad spans of markers that are off (T, L, 3), metres, from their simulation, in the frames of their parts.
 
-    Parameters
-    ----------
-    off, alone : (T, L, 3) float, metres
-        From the simulated marker to the measured one, in the frame of its part, as the body follows all markers, and
-        as it would follow the others alone; NaN where it was not seen.
-    jumps : (T, L) float, metres
-        How far the track jumps, zero where it goes on.
-    labels : L strings
-    rate : float, frames per second
+    `off` is as the body follows all markers, `alone` as it would follow the others alone; NaN where one was not seen.
+    `jumps` (T, L) is how far the track jumps, metres, zero where it goes on.
     """
+    noise_usual, stray_usual, joined = 5.0, 4.0, 0.1        # times what is usual; seconds between spans that are one
     usual = np.nan_to_num(_median(np.linalg.norm(off - _median(off), axis=2), axis=1))
     jitter = [_jitter(off[:, i][np.isfinite(off[:, i, 0])]) for i in range(len(labels))]
     known = [np.median(q) for q in jitter if len(q)]
-    limit = max(config.noise, NOISE_USUAL * float(np.median(known))) if known else config.noise
+    limit = max(config.noise, noise_usual * float(np.median(known))) if known else config.noise
     out: list[BadSpan] = []
     for i, label in enumerate(labels):
         seen = np.flatnonzero(np.isfinite(off[:, i, 0]))
@@ -55,22 +35,18 @@ def find_bad(off: np.ndarray, alone: np.ndarray, jumps: np.ndarray, labels: tupl
         before = ~noisy & (np.arange(len(seen)) < slip)
         middle = np.median(mine[before] if before.any() else mine, axis=0)
         away = np.linalg.norm(mine - middle, axis=1)
-        stray = _stray(away, np.maximum(config.stray, STRAY_USUAL * usual[seen]), leap, gap) & before
+        stray = _stray(away, np.maximum(config.stray, stray_usual * usual[seen]), leap, gap) & before
         slipped = np.arange(len(seen)) >= slip
         kinds: tuple[tuple[BadKind, np.ndarray], ...] = (("noisy", noisy), ("slipped", slipped), ("stray", stray))
         for kind, bad in kinds:
-            out += _spans(label, kind, seen, bad, away, JOINED * rate)
+            out += _spans(label, kind, seen, bad, away, joined * rate)
     return tuple(sorted(out, key=lambda s: (s.begin, s.label)))
 
 
 def without_lost_limbs(spans: tuple[BadSpan, ...], near: np.ndarray, labels: tuple[str, ...]) -> tuple[BadSpan, ...]:
-    """Spans but those in which most markers of a limb are bad together: there the body is at fault.
+    """Spans but those in which half the markers of a limb are bad together: there the body is at fault.
 
-    Parameters
-    ----------
-    near : (L, L) bool
-        Markers on the same part or the next ones, each among its own.
-    labels : L strings
+    `near` (L, L) bool are markers on the same part or the next ones, each among its own.
     """
     count = len(labels)
     begin, end = (np.array([getattr(span, name) for span in spans], dtype=int) for name in ("begin", "end"))
@@ -81,7 +57,7 @@ def without_lost_limbs(spans: tuple[BadSpan, ...], near: np.ndarray, labels: tup
         with_it = 2 * common > span.end - span.begin + 1
         together = np.bincount(of[with_it], minlength=count) > 0
         limb = near[of[i]]
-        if span.kind == "slipped" or (together & limb).sum() < max(3, LOST_LIMB * limb.sum()):
+        if span.kind == "slipped" or (together & limb).sum() < max(3, 0.5 * limb.sum()):
             kept.append(span)
     return tuple(kept)
 
@@ -95,7 +71,7 @@ def _jitter(off: np.ndarray) -> np.ndarray:
 
 def _noisy(jitter: np.ndarray, limit: float, rate: float) -> np.ndarray:
     """Frames (n,) bool of a track that jitters, to the first and last frame that it does."""
-    width = 2 * round(0.5 * NOISE_WINDOW * rate) + 1
+    width = 2 * round(0.5 * 0.15 * rate) + 1                    # 0.15 seconds, over which jitter is a median
     wide = median_filter(jitter, size=width, mode="nearest") > limit
     rough = jitter > limit
     reach = binary_dilation(wide, iterations=width // 2) if wide.any() else wide
@@ -109,7 +85,9 @@ def _noisy(jitter: np.ndarray, limit: float, rate: float) -> np.ndarray:
 
 def _slip(off: np.ndarray, clean: np.ndarray, jumps: np.ndarray, least: float, rate: float) -> int:
     """From which frame on a track (n, 3) stays displaced; n when it does not."""
-    n, lag, stays = len(off), max(1, round(0.5 * SLIP_WINDOW * rate)), max(3, round(SLIP_STAYS * rate))
+    n, lag = len(off), max(1, round(0.5 * 0.1 * rate))          # in a tenth of a second a slip is over
+    stays = max(3, round(0.25 * rate))                          # frames that a marker is seen before and after
+    usual = 3.0                                                 # times the usual change within that time
     some = np.flatnonzero(clean)
     if len(some) < 2 * stays:
         return n
@@ -118,7 +96,7 @@ def _slip(off: np.ndarray, clean: np.ndarray, jumps: np.ndarray, least: float, r
     step = np.zeros_like(track)
     step[stays:len(track) - stays] = (smooth[2 * lag:] - smooth[:-2 * lag])[stays - lag:len(track) - stays - lag]
     size = np.linalg.norm(step, axis=1)
-    size[size < max(SLIP_SUDDEN * least, SLIP_USUAL * float(np.median(size)))] = 0
+    size[size < max(SLIP_SUDDEN * least, usual * float(np.median(size)))] = 0
     best, found = 0.0, n
     while size[k := int(size.argmax())] > 0:
         worth, at = _lasting(track, jumps[some], k, step[k], least, lag)
@@ -134,15 +112,17 @@ def _lasting(track: np.ndarray, jumps: np.ndarray, k: int, step: np.ndarray, lea
 
     Where the track itself jumps, less is needed: a body that fits worse from some time on makes no track jump.
     """
+    leap, smooth = 0.5, 2.0         # share of it that a jump of the track is at least; times `least` without a jump
+    with_jump, without = 0.65, 0.85                             # shares of the frames on either side that keep to it
     before, after = np.median(track[:k], axis=0), np.median(track[k:], axis=0)
     way = after - before
     far = float(np.linalg.norm(way))
     near = np.arange(max(1, k - 2 * lag), min(len(track), k + 2 * lag))
-    jumped = SLIP_LEAP * far < jumps[near].max() < far / SLIP_LEAP
-    if far < (least if jumped else SLIP_SMOOTH * least) or step @ way < SLIP_SUDDEN * far**2:
+    jumped = leap * far < jumps[near].max() < far / leap
+    if far < (least if jumped else smooth * least) or step @ way < SLIP_SUDDEN * far**2:
         return 0.0, k
     share = (track - before) @ way / far**2
-    lasts = SLIP_LASTS[0 if jumped else 1]
+    lasts = with_jump if jumped else without
     if (share[:k] < 0.5).mean() < lasts or (share[k:] > 0.5).mean() < lasts:
         return 0.0, k
     share = np.clip(share, 0, 1)
@@ -154,15 +134,10 @@ def _lasting(track: np.ndarray, jumps: np.ndarray, k: int, step: np.ndarray, lea
 def _stray(away: np.ndarray, limit: np.ndarray, jumps: np.ndarray, gap: np.ndarray) -> np.ndarray:
     """Frames (n,) bool of a marker that is somewhere else, from one tear of its track to the next.
 
-    Parameters
-    ----------
-    away, limit : (n,) float, metres
-        From its usual place, and how far that may be.
-    jumps : (n,) float, metres
-        How far the track jumps from the frame before to this one.
-    gap : (n,) bool
-        It was out of sight between them.
+    `away` (n,) is how far it is from its usual place and `limit` (n,) how far that may be, metres; before a frame its
+    track `jumps` so far, or there was a `gap`.
     """
+    leap, jumped = 0.5, 0.5         # share of the displacement that a jump is; of the limit that does between two jumps
     out = away > STRAY_SMOOTH * limit
     ends = np.r_[0, np.flatnonzero((jumps > 0) | gap), len(away)]
     leaps, gaps = np.r_[jumps, 0.0], np.r_[gap, False]
@@ -170,10 +145,10 @@ def _stray(away: np.ndarray, limit: np.ndarray, jumps: np.ndarray, gap: np.ndarr
         if begin == end:
             continue
         far = float(np.median(away[begin:end]))
-        torn = [leaps[at] > STRAY_LEAP * far for at in (begin, end)]
+        torn = [leaps[at] > leap * far for at in (begin, end)]
         open_ended = [gaps[at] or at in (0, len(away)) for at in (begin, end)]
         both = all(a or b for a, b in zip(torn, open_ended, strict=True))
-        share = STRAY_JUMPED if all(torn) else 1.0 if any(torn) and both else STRAY_SMOOTH
+        share = jumped if all(torn) else 1.0 if any(torn) and both else STRAY_SMOOTH
         out[begin:end] |= far > share * np.median(limit[begin:end])
     return out
 

@@ -1,67 +1,136 @@
-"""Which labels have been exchanged when: pairs decided over the whole sequence, from tracks and from the body."""
+"""Which labels were swapped when: pairs decided over the whole sequence, from tracks and from where the body is.
+
+A track tells from one frame to the next which label goes on where another was; no body is needed for that. Where the
+body has the markers tells which label belongs to a stretch of track.
+"""
 from __future__ import annotations
 
-from dataclasses import dataclass
-
 import numpy as np
+from scipy.ndimage import median_filter
 
-from ..results import Exchange
-from ..settings import FaultConfig
-from .tracks import Tracks
+from .results import Swap
 
+TORN = 10.0                          # most that a torn track counts, in half squared standard deviations
 AWAY = 8.0                           # most that a marker away from its place counts, in half squared deviations
-MINORITY = 2.0                       # times the doubt of a change that a whole sequence of exchanged labels counts
-WORTH = 2.0                          # least gain for which labels are exchanged
-PASSES = 12                          # in which longer cycles come apart into pairs
+CHANGE = 4.0                         # what each change of a label must be worth, likewise
+WORTH = 2.0                          # least gain for which labels are swapped
+DEVIATION = 0.008                    # metres from its usual place on the body that a marker lies, in each direction
+MEMORY = 0.1                         # seconds that this distance stays much the same
 
 
-@dataclass(frozen=True, eq=False)
-class Evidence:
-    """What the markers of a sequence tell about their labels.
+class Tracks:
+    """Tracks (T, L, 3) of labels, metres, NaN where one was not seen.
+
+    From one frame to the next a track moves at the mean of its velocities before and after, which misses no more
+    than a change of acceleration. A label that takes over another's track goes on from that one's place.
 
     Attributes
     ----------
-    positions : (T, L, 3) float, metres
-        As they came.
-    levels : (T, L, L) float
-        What it counts that the label of a column is the marker of a row, in one frame, zero where nothing is known.
-    rate : float, frames per second
+    off : (T, L) float, metres
+        From the prediction; NaN where the label is not seen both in this frame and the one before.
+    sd : (T, L) float, metres
+        The usual size of `off` around that time.
+    jumped, open : (T, L) bool
+        The track does not go on here; it is not known whether it does.
     """
 
-    positions: np.ndarray
-    levels: np.ndarray
-    rate: float
+    def __init__(self, positions: np.ndarray, rate: float) -> None:
+        least_jump, jump_sds = 0.006, 5.0                               # metres, and standard deviations
+        self.positions, self.rate = positions, rate
+        steps = np.diff(positions, axis=0)
+        missing = np.full((1, *positions.shape[1:]), np.nan)
+        self._after = np.concatenate([_median_of_next(steps), missing])
+        self._before = np.concatenate([missing, _median_of_next(steps[::-1])[::-1]])
+        seen = np.isfinite(positions[..., 0])
+        self._last = np.maximum.accumulate(np.where(seen, np.arange(len(positions))[:, None], -1), axis=0)
+        self.off = np.full(positions.shape[:2], np.nan)
+        self.off[1:] = np.linalg.norm(steps - _mean_of_known(self._before[:-1], self._after[1:]), axis=-1)
+        self.sd = self._usual()
+        self.open = np.isnan(self.off)
+        self.jumped = np.nan_to_num(self.off) > np.maximum(least_jump, jump_sds * self.sd)
+
+    def change(self, columns: np.ndarray, positions: np.ndarray) -> None:
+        """Have other positions (T, n, 3) in some columns (n,)."""
+        other = Tracks(positions, self.rate)
+        self.positions = self.positions.copy()
+        for name in ("positions", "_after", "_before", "_last", "off", "sd", "open", "jumped"):
+            getattr(self, name)[:, columns] = getattr(other, name)
+
+    def _usual(self) -> np.ndarray:
+        """The usual size (T, L) of what is off: within 12 frames of that time, and no less than over all of it."""
+        floor, sds_to_median = 0.002, 1.5                               # metres; of a distance, nearly
+        near = median_filter(np.nan_to_num(self.off), size=(25, 1), mode="nearest")
+        whole = [np.median(x[np.isfinite(x)]) if np.isfinite(x).any() else 0.0 for x in self.off.T]
+        return np.maximum(floor, sds_to_median * np.maximum(near, whole))
+
+    def links(self, times: np.ndarray, before: np.ndarray, after: np.ndarray) -> np.ndarray:
+        """What it counts that labels `after` go on, in frames `times`, where labels `before` were until then.
+
+        Half squared standard deviations, no more than `TORN`; as much for one that appears, nothing where no label
+        `after` is seen. Over a gap a track may have taken another way, the farther the longer it was. The three are
+        arrays of one shape, after broadcasting.
+        """
+        acceleration, longest = 10.0, 0.25          # m/s² out of sight; seconds of a gap beyond which nothing is told
+        last = self._last[times - 1, before]
+        gap = times - last
+        way = gap[..., None] * _mean_of_known(self._before[last, before], self._after[times, after])
+        off = np.linalg.norm(self.positions[times, after] - self.positions[last, before] - way, axis=-1)
+        usual = np.maximum(self.sd[last, before], self.sd[times, after])
+        sd = 0.5 * (gap + 1) * usual + 0.5 * acceleration * ((gap - 1) / self.rate)**2
+        cost = np.nan_to_num(off**2 / (2 * sd**2), nan=TORN) + 3 * np.log(sd / usual)
+        cost = np.where((last < 0) | (gap > longest * self.rate + 1), TORN, np.minimum(cost, TORN))
+        return np.where(np.isnan(self.positions[times, after, 0]), 0.0, cost)
+
+    def loose_ends(self, a: int, b: int) -> np.ndarray:
+        """Frames (n,), the first among them, from which on a pair may be swapped: neither track goes on there."""
+        free = self.jumped[:, [a, b]] | self.open[:, [a, b]]
+        loose = free.all(axis=1)
+        loose &= ~(self.open[:, a] & self.open[:, b] & np.append(loose[1:], False))        # of a gap its end alone
+        loose[0] = True
+        return np.flatnonzero(loose)
 
 
-def marker_levels(places: np.ndarray, positions: np.ndarray, config: FaultConfig, rate: float) -> np.ndarray:
-    """The levels (T, L, L) of `Evidence` from where the body has the markers.
+def _median_of_next(steps: np.ndarray) -> np.ndarray:
+    """The median (T - 1, L, 3) of this and the next two steps, or one of those that are known; NaN without any."""
+    padded = np.concatenate([steps, np.full((2, *steps.shape[1:]), np.nan)])
+    a, b, c = (padded[i:len(steps) + i] for i in range(3))
+    return np.fmax(np.fmin(a, b), np.fmin(np.fmax(a, b), c))
 
-    What a marker is off changes slowly, so that the frames of `config.memory` count as one.
 
-    Parameters
-    ----------
-    places, positions : (T, L, 3) float, metres
-        NaN for markers that the body does not know, which are taken to be nowhere near, or that were not seen.
+def _mean_of_known(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """The mean of two velocities, or the one that is known, or zero."""
+    known = np.isfinite(a[..., :1]).astype(int) + np.isfinite(b[..., :1])
+    return (np.nan_to_num(a) + np.nan_to_num(b)) / np.maximum(known, 1)
+
+
+def relabelled(positions: np.ndarray, order: np.ndarray) -> np.ndarray:
+    """Markers (T, L, 3) under the labels that an order (T, L) gives them."""
+    return np.take_along_axis(positions, order[..., None], axis=1)
+
+
+def marker_levels(places: np.ndarray, positions: np.ndarray, rate: float) -> np.ndarray:
+    """What it counts (T, L, L) that the label of a column is the marker of a row, by where the body has the markers.
+
+    Zero where nothing is known. What a marker is off changes slowly: the frames of `MEMORY` count as one. Places are
+    NaN for markers that the body does not know, which are taken to be nowhere near.
     """
     squared = sum((places[:, :, None, d] - positions[:, None, :, d])**2 for d in range(3))
     assert isinstance(squared, np.ndarray)
-    share = min(1.0, 1 / (config.memory * rate))
-    cost = share * np.minimum(np.nan_to_num(squared / (2 * config.deviation**2), nan=AWAY), AWAY)
-    return cost * np.isfinite(positions[:, None, :, 0])
+    cost = np.minimum(np.nan_to_num(squared / (2 * DEVIATION**2), nan=AWAY), AWAY)
+    return min(1.0, 1 / (MEMORY * rate)) * cost * np.isfinite(positions[:, None, :, 0])
 
 
-def find_order(evidence: Evidence, config: FaultConfig) -> np.ndarray:
-    """Which column (T, L) each marker is to be taken from.
+def find_order(positions: np.ndarray, rate: float, levels: np.ndarray | None = None) -> np.ndarray:
+    """Which column (T, L) each marker is to be taken from, by its track and by `marker_levels`, if there are any.
 
-    The best pair and span is exchanged, then the best of what is left, until nothing gains: of a longer cycle
-    each exchange puts one marker right.
+    The best pair and span is swapped, then the best of what is left, until nothing gains: of a longer cycle each swap
+    puts one marker right.
     """
-    T, L = evidence.positions.shape[:2]
-    order = np.tile(np.arange(L), (T, 1))
-    tracks = Tracks(evidence.positions, evidence.rate, config.floor, config.jump)
-    levels, touched = evidence.levels.copy(), set(range(L))
-    for _ in range(PASSES):
-        found = _best_spans(tracks, levels, touched, config)
+    T, L = positions.shape[:2]
+    order, tracks = np.tile(np.arange(L), (T, 1)), Tracks(positions, rate)
+    levels, touched = np.zeros((T, L, L)) if levels is None else levels.copy(), set(range(L))
+    for _ in range(12):                                                 # longer cycles come apart into pairs
+        found = _best_spans(tracks, levels, touched)
         touched = set()
         for _, a, b, swapped in sorted(found, key=lambda f: -f[0]):
             if not touched & {a, b}:
@@ -72,49 +141,35 @@ def find_order(evidence: Evidence, config: FaultConfig) -> np.ndarray:
         if not touched:
             break
         columns = np.array(sorted(touched))
-        tracks.changed(columns, np.take_along_axis(evidence.positions, order[:, columns, None], axis=1))
+        tracks.change(columns, relabelled(positions, order[:, columns]))
     return order
 
 
-def _best_spans(tracks: Tracks, levels: np.ndarray, touched: set[int], config: FaultConfig
+def _best_spans(tracks: Tracks, levels: np.ndarray, touched: set[int]
                 ) -> list[tuple[float, int, int, np.ndarray]]:
-    """Gain, pair and frames (n,) of all pairs with a label of `touched` that gain by being exchanged."""
+    """Gain, pair and frames (n,) of all pairs with a label of `touched` that gain by being swapped."""
     own = np.einsum("tll->tl", levels)
     out = []
-    for a, b in sorted(pairs_that_jump(tracks, touched) | _pairs_that_fit(own, levels, touched, config)):
-        begins = loose_ends(tracks, a, b)
+    for a, b in sorted(pairs_that_jump(tracks, touched) | _pairs_that_fit(own, levels, touched)):
+        begins = tracks.loose_ends(a, b)
         gain = own[:, a] + own[:, b] - levels[:, a, b] - levels[:, b, a]
-        total, swapped = best_stretches(tracks, a, b, begins, np.add.reduceat(gain, begins), config)
+        total, swapped = best_stretches(tracks, a, b, begins, np.add.reduceat(gain, begins))
         if total > WORTH:
             out.append((total, a, b, swapped))
     return out
 
 
-def loose_ends(tracks: Tracks, a: int, b: int) -> np.ndarray:
-    """Frames (n,), the first among them, from which on a pair may be exchanged: neither track goes on there."""
-    free = tracks.jumped[:, [a, b]] | tracks.open[:, [a, b]]
-    loose = free.all(axis=1)
-    loose &= ~(tracks.open[:, a] & tracks.open[:, b] & np.append(loose[1:], False))        # of a gap its end alone
-    loose[0] = True
-    return np.flatnonzero(loose)
+def best_stretches(tracks: Tracks, a: int, b: int, begins: np.ndarray, gains: np.ndarray) -> tuple[float, np.ndarray]:
+    """What it gains to swap a pair, and in which frames (n,).
 
-
-def best_stretches(tracks: Tracks, a: int, b: int, begins: np.ndarray, gains: np.ndarray, config: FaultConfig
-                   ) -> tuple[float, np.ndarray]:
-    """What it gains to exchange a pair, and in which frames (n,).
-
-    Parameters
-    ----------
-    begins : (m,) int
-        Of stretches in which the pair is exchanged or not.
-    gains : (m,) float
-        Of each when it is exchanged, as the places of the markers tell.
+    Stretches that begin at frames (m,) are swapped or not; the places of the markers tell what each gains (m,).
     """
     lengths = np.diff(np.r_[begins, len(tracks.positions)])
-    gains = gains - MINORITY * config.doubt * lengths / lengths.sum()
+    minority = 2.0                                  # changes that swapping the labels of the whole sequence counts
+    gains = gains - minority * CHANGE * lengths / lengths.sum()
     stay, switch = (tracks.links(begins[1:], np.array([[a], [b]]), np.array(after)).sum(axis=0)
                     for after in ([[a], [b]], [[b], [a]]))
-    total, swapped = _two_states(gains, stay, switch, config.doubt)
+    total, swapped = _two_states(gains, stay, switch)
     return total, np.flatnonzero(np.repeat(swapped, lengths))
 
 
@@ -132,8 +187,7 @@ def pairs_that_jump(tracks: Tracks, touched: set[int]) -> set[tuple[int, int]]:
     return {pair for pair in pairs if touched & set(pair)}
 
 
-def _pairs_that_fit(own: np.ndarray, levels: np.ndarray, touched: set[int], config: FaultConfig
-                    ) -> set[tuple[int, int]]:
+def _pairs_that_fit(own: np.ndarray, levels: np.ndarray, touched: set[int]) -> set[tuple[int, int]]:
     """Pairs of labels that over some stretch lie where the body has the other one."""
     pairs: set[tuple[int, int]] = set()
     if not levels.any():
@@ -142,25 +196,19 @@ def _pairs_that_fit(own: np.ndarray, levels: np.ndarray, touched: set[int], conf
         total = np.zeros((len(own) + 1, own.shape[1]))
         np.cumsum(own[:, [a]] + own - levels[:, a] - levels[:, :, a], axis=0, out=total[1:])
         best = (total - np.minimum.accumulate(total, axis=0)).max(axis=0)
-        pairs |= {(min(a, int(b)), max(a, int(b))) for b in np.flatnonzero(best > config.doubt + WORTH) if b != a}
+        pairs |= {(min(a, int(b)), max(a, int(b))) for b in np.flatnonzero(best > CHANGE + WORTH) if b != a}
     return pairs
 
 
-def _two_states(gains: np.ndarray, stay: np.ndarray, switch: np.ndarray, doubt: float) -> tuple[float, np.ndarray]:
-    """The best way through stretches (n + 1) of a pair as labelled or exchanged: what it gains, and where (n + 1).
+def _two_states(gains: np.ndarray, stay: np.ndarray, switch: np.ndarray) -> tuple[float, np.ndarray]:
+    """The best way through stretches (n + 1) of a pair as labelled or swapped: what it gains, and where (n + 1).
 
-    Parameters
-    ----------
-    gains : (n + 1,) float
-        Of being exchanged in a stretch.
-    stay, switch : (n,) float
-        Costs of remaining as it is, or of changing, between two stretches.
-    doubt : float
-        Further cost of each change.
+    `gains` (n + 1,) are of being swapped in a stretch; `stay` and `switch` (n,) what it costs to remain as it is or to
+    change between two stretches, to which `CHANGE` comes.
     """
     value, came = np.array([0.0, gains[0]]), np.zeros((len(stay), 2), dtype=int)
     for i, (remain, change) in enumerate(zip(stay, switch, strict=True)):
-        onward = np.stack([value - remain, value[::-1] - change - doubt])
+        onward = np.stack([value - remain, value[::-1] - change - CHANGE])
         came[i] = onward.argmax(axis=0)
         value = onward.max(axis=0) + [0.0, gains[i + 1]]
     state = int(value.argmax())
@@ -172,13 +220,10 @@ def _two_states(gains: np.ndarray, stay: np.ndarray, switch: np.ndarray, doubt: 
     return gained, np.array(states[::-1], dtype=bool)
 
 
-def listed(order: np.ndarray, seen: np.ndarray, labels: tuple[str, ...]) -> tuple[Exchange, ...]:
-    """The exchanges that an order (T, L) is made of; a longer cycle is a chain of pairs.
+def list_swaps(order: np.ndarray, seen: np.ndarray, labels: tuple[str, ...]) -> tuple[Swap, ...]:
+    """The swaps that an order (T, L) is made of; a longer cycle is a chain of pairs.
 
-    Parameters
-    ----------
-    seen : (T, L) bool
-        As the labels came; an exchange begins and ends where one of the two is seen.
+    A swap begins and ends where one of the two labels is seen (T, L), as they came.
     """
     frames: dict[tuple[int, int], list[int]] = {}
     for t in np.flatnonzero((order != np.arange(order.shape[1])).any(axis=1)):
@@ -193,5 +238,5 @@ def listed(order: np.ndarray, seen: np.ndarray, labels: tuple[str, ...]) -> tupl
         for run in np.split(np.array(times), np.flatnonzero(np.diff(times) > 1) + 1):
             there = run[seen[run, a] | seen[run, b]]
             if len(there):
-                out.append(Exchange(labels[a], labels[b], int(there[0]), int(there[-1])))
-    return tuple(sorted(out, key=lambda e: (e.begin, e.first, e.second)))
+                out.append(Swap(labels[a], labels[b], int(there[0]), int(there[-1])))
+    return tuple(sorted(out, key=lambda s: (s.begin, s.first, s.second)))

@@ -1,4 +1,4 @@
-"""Virtual marker files: exchanged labels put right, bad spans and gaps filled by the simulated markers."""
+"""Virtual marker files: swapped labels put right, bad spans and gaps filled by the simulated markers."""
 from __future__ import annotations
 
 from pathlib import Path
@@ -12,10 +12,10 @@ from ..files.c3d import point_table, write_c3d
 from ..files.c3d_points import replace_points
 from ..files.common import MarkerFileError
 from ..files.markers import write_markers
-from ..results import MarkerFaults
+from .results import MarkerArtefacts
 
 
-def write_virtual(path: str | Path, faults: MarkerFaults, original: str | Path | None = None,
+def write_virtual(path: str | Path, artefacts: MarkerArtefacts, original: str | Path | None = None,
                   subject: str | None = None, unit: str | None = None) -> None:
     """Write the markers of a sequence with all gaps filled, whole or not at all.
 
@@ -27,7 +27,7 @@ def write_virtual(path: str | Path, faults: MarkerFaults, original: str | Path |
     ----------
     path : str or Path
         A name that ends in `.c3d` or `.csv`.
-    faults : MarkerFaults
+    artefacts : MarkerArtefacts
     original : str or Path, optional
         The C3D file that the sequence was read from.
     subject, unit : str, optional
@@ -38,8 +38,8 @@ def write_virtual(path: str | Path, faults: MarkerFaults, original: str | Path |
     MarkerFileError
         A name that ends in neither, an original that is no C3D file or has other frames or labels.
     """
-    path, sequence = Path(path), faults.virtual()
-    filled = ~faults.repaired.seen
+    path, sequence = Path(path), artefacts.virtual()
+    filled = ~artefacts.repaired.seen
     if path.suffix.lower() != ".c3d":
         write_markers(path, sequence)
     elif original is None:
@@ -48,7 +48,7 @@ def write_virtual(path: str | Path, faults: MarkerFaults, original: str | Path |
     else:
         data = Path(original).read_bytes()
         columns = _columns(Path(original), data, sequence.labels, subject)
-        source = np.where(filled, -1, faults.order)
+        source = np.where(filled, -1, artefacts.order)
         with storage.writing(path) as beside:
             beside.write_bytes(replace_points(Path(original), data, columns, sequence.positions, source, unit))
 
@@ -65,15 +65,15 @@ def _columns(path: Path, data: bytes, labels: tuple[str, ...], subject: str | No
     return np.array([bare.index(label) for label in labels])
 
 
-def fault_table(faults: MarkerFaults) -> dict[str, Any]:
+def artefact_table(artefacts: MarkerArtefacts) -> dict[str, Any]:
     """What was found, as numbers and text for a JSON file: exchanges, bad spans, and how much was filled.
 
     Frames count from 0; both ends belong to a span. Distances are in metres.
     """
-    gone = ~faults.repaired.seen
-    known = [faults.repaired.labels.index(label) for label in faults.labels]
-    return {"rate": faults.repaired.rate, "frames": len(gone),
-            "exchanges": [{"labels": [e.first, e.second], "begin": e.begin, "end": e.end} for e in faults.exchanges],
+    gone = ~artefacts.repaired.seen
+    known = [artefacts.repaired.labels.index(label) for label in artefacts.labels]
+    return {"rate": artefacts.repaired.rate, "frames": len(gone),
+            "exchanges": [{"labels": [s.first, s.second], "begin": s.begin, "end": s.end} for s in artefacts.swaps],
             "bad": [{"label": b.label, "kind": b.kind, "begin": b.begin, "end": b.end, "distance": b.distance}
-                    for b in faults.bad],
-            "filled": {faults.repaired.labels[i]: int(gone[:, i].sum()) for i in known if gone[:, i].any()}}
+                    for b in artefacts.bad],
+            "filled": {artefacts.repaired.labels[i]: int(gone[:, i].sum()) for i in known if gone[:, i].any()}}

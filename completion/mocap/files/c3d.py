@@ -55,32 +55,16 @@ class _Numbers:
 
 @dataclass(frozen=True, eq=False)
 class PointTable:
-    """Where in a C3D file its points stand.
+    """Where in a C3D file its points stand."""
 
-    Attributes
-    ----------
-    numbers : _Numbers
-    labels : strings
-        Of all points, those that hold no positions among them.
-    kept : (L,) int
-        The columns that hold positions.
-    start, width : int, bytes
-        Of the first frame, and of each.
-    frames : int
-    scale : float
-        Of whole numbers; negative where the file holds floating-point numbers.
-    rate : float or None
-    unit : str
-    """
-
-    numbers: _Numbers
-    labels: tuple[str, ...]
-    kept: tuple[int, ...]
-    start: int
-    width: int
+    numbers: _Numbers                # _Numbers
+    labels: tuple[str, ...]          # Of all points, those that hold no positions among them
+    kept: tuple[int, ...]            # (L,) int: The columns that hold positions
+    start: int                       # bytes: Of the first frame, and of each
+    width: int                       # bytes: Of the first frame, and of each
     frames: int
-    scale: float
-    rate: float | None
+    scale: float                     # Of whole numbers; negative where the file holds floating-point numbers
+    rate: float | None               # or None
     unit: str
 
     @property
@@ -96,13 +80,7 @@ class PointTable:
 
 
 def point_table(path: Path, data: bytes) -> PointTable:
-    """Where the points of a C3D file stand.
-
-    Raises
-    ------
-    MarkerFileError
-        Not a C3D file, damaged, truncated, or without points.
-    """
+    """Where the points of a C3D file stand."""
     start = (data[0] - 1) * _BLOCK if data else 0
     if len(data) < _BLOCK or data[1] != _MAGIC:
         raise MarkerFileError(f"{path}: expected a C3D file, with byte 2 = 80 and a header of {_BLOCK} bytes; "
@@ -124,13 +102,7 @@ def point_table(path: Path, data: bytes) -> PointTable:
 
 
 def read_c3d(path: Path, data: bytes) -> RawMarkers:
-    """The points of a C3D file; missing are those with a negative residual.
-
-    Raises
-    ------
-    MarkerFileError
-        Not a C3D file, damaged, truncated, or without points.
-    """
+    """The points of a C3D file; missing are those with a negative residual."""
     table = point_table(path, data)
     words = table.words(data)[:, list(table.kept)]
     positions = words[..., :3] * (1.0 if table.kind == "f4" else table.scale)
@@ -228,11 +200,7 @@ def write_c3d(path: Path, positions: np.ndarray, labels: tuple[str, ...], rate: 
               filled: np.ndarray | None = None) -> None:
     """Write positions (T, L, 3), metres, as a C3D file in millimetres; missing points have residual -1.
 
-    Parameters
-    ----------
-    filled : (T, L) bool, optional
-        Points that were not measured. They get residual 0, as the format has it for computed points, and the others
-        `MEASURED`; without this all get residual 0.
+    `filled` (T, L): points that were not measured.
     """
     try:
         import ezc3d

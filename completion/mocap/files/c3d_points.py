@@ -18,25 +18,8 @@ def replace_points(path: Path, data: bytes, columns: np.ndarray, positions: np.n
     A point that was measured keeps its cameras and its residual, which is made no less than the least that the file
     can hold; one that was computed has neither, as the format has it; a missing one has residual -1.
 
-    Parameters
-    ----------
-    path : Path
-        For messages.
-    data : bytes
-        The whole file.
-    columns : (L,) int
-        Of the file's points that have positions, which to replace.
-    positions : (T, L, 3) float, metres
-        NaN where a point is missing.
-    source : (T, L) int
-        Which of `columns` a point was measured as, -1 where it was computed.
-    unit : str, optional
-        Unit of the file, where it does not say or says it wrongly.
-
-    Raises
-    ------
-    MarkerFileError
-        Not a C3D file, or damaged; another number of frames; a place that its whole numbers do not reach.
+    `columns` (L,): of the file's points that have positions, which to replace; `positions` (T, L, 3), metres: naN where
+    a point is missing; `source` (T, L): which of `columns` a point was measured as, -1 where it was computed.
     """
     table = point_table(path, data)
     if len(positions) != table.frames:

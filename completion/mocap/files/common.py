@@ -17,17 +17,9 @@ class MarkerFileError(StorageError):
 
 @dataclass(frozen=True, eq=False)
 class RawMarkers:
-    """What a marker file holds, in its own unit.
+    """What a marker file holds, in its own unit."""
 
-    Attributes
-    ----------
-    positions : (T, L, 3) float, NaN where missing
-    labels : L strings, as they stand in the file
-    rate : float, frames per second, or None where the file does not say
-    unit : str, as it stands in the file
-    """
-
-    positions: np.ndarray
-    labels: tuple[str, ...]
-    rate: float | None
-    unit: str
+    positions: np.ndarray            # (T, L, 3) float, NaN where missing
+    labels: tuple[str, ...]          # L strings, as they stand in the file
+    rate: float | None               # frames per second, or None where the file does not say
+    unit: str                        # as it stands in the file

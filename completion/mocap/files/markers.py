@@ -159,13 +159,7 @@ def read_markers(path: str | Path, unit: str | None = None, subject: str | None 
 
 
 def marker_subjects(path: str | Path) -> tuple[str, ...]:
-    """Whose markers are in a file: what stands before the colon of its labels; none where there is no colon.
-
-    Raises
-    ------
-    MarkerFileError
-        As `read_markers`.
-    """
+    """Whose markers are in a file: what stands before the colon of its labels; none where there is no colon."""
     split = (label.rpartition(":") for label in _read_raw(Path(path)).labels)
     return tuple(dict.fromkeys(who for who, colon, _ in split if colon))
 

@@ -1,7 +1,6 @@
 """Symmetric places for markers, spread over the skin, of which a marker set may be chosen."""
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import TYPE_CHECKING
 
 import numpy as np
@@ -10,10 +9,10 @@ from scipy.sparse import coo_array, csr_array, diags_array
 from scanprep.geometry.geodesics import SurfaceGraph
 from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.surface import Rays
-from scanprep.ranges import Cosine, Positive, Settings
 from scanprep.skeleton.tree import Skeleton
 
 from ..marker_sets.layout import DISTANCE, MarkerLayout
+from ..marker_sets.pictures import mean_body
 from ..marker_sets.symmetry import SkinMirror, find_skin_mirror, other_side, side_of
 
 if TYPE_CHECKING:
@@ -23,41 +22,8 @@ RAYS = 48                            # directions that are tried from every plac
 CONE = 0.5                           # cosine of the directions inwards along which thickness is measured
 
 
-@dataclass(frozen=True)
-class CandidateConfig(Settings):
-    """Where markers can sit; lengths are shares of the body's length.
-
-    Attributes
-    ----------
-    reach : float
-        Skin that is nearer hides a marker from cameras.
-    open : float
-        Share of the directions outwards that must be free, averaged within `thick`: armpits, crotch and the skin
-        between fingers have less.
-    margin : float
-        Distance along the skin from places that are less open.
-    thick : float
-        Least thickness of the body below a marker: fingers, toes and ears have less.
-    ends : float
-        The outermost places at both ends, as far as they face outwards there, are left out: the soles, the crown.
-    flat : float
-        Least mean cosine between the normal and those around it, within `thick`.
-    middle : float
-        Places nearer to the middle than this are taken in the middle, alone.
-    """
-
-    reach: Positive = 0.06
-    open: float = 0.75
-    margin: float = 0.035
-    thick: float = 0.022
-    ends: float = 0.025
-    flat: Cosine = 0.75
-    middle: float = 0.012
-
-
 def candidate_layout(body: BodyModel | Mesh, base: MarkerLayout, count: int = 114,
-                     config: CandidateConfig | None = None, mirror: SkinMirror | None = None,
-                     skeleton: Skeleton | None = None) -> MarkerLayout:
+                     mirror: SkinMirror | None = None, skeleton: Skeleton | None = None) -> MarkerLayout:
     """A marker set and more markers, each as far along the skin from all others as can be, the same left and right.
 
     A marker that the base has on one side only gets its partner first. New markers are called after the part that
@@ -71,7 +37,6 @@ def candidate_layout(body: BodyModel | Mesh, base: MarkerLayout, count: int = 11
         Its labels tell left from right.
     count : int
         Markers altogether, those of the base included.
-    config : CandidateConfig, optional
     mirror : SkinMirror, optional
         Of `find_skin_mirror`; found when not given.
     skeleton : Skeleton, optional
@@ -89,52 +54,42 @@ def candidate_layout(body: BodyModel | Mesh, base: MarkerLayout, count: int = 11
 
     [MoSh] Eq. 25
     """
-    config = config or CandidateConfig()
     if not isinstance(body, Mesh):
-        skeleton = skeleton or body.skeleton
-        pose = np.zeros((len(skeleton.parents), 3))
-        body = body.template.with_vertices(body.vertices(pose, np.zeros(body.n_betas)) if body.n_betas
-                                           else body.vertices(pose, None))
+        skeleton, body = skeleton or body.skeleton, mean_body(body)
     mirror = mirror or find_skin_mirror(body)
-    room = _Room(body, base, config, mirror)
+    room = _Room(body, base, mirror)
     whole = _with_partners(base, mirror)
     if count < len(whole.labels):
         raise ValueError(f"count: expected at least the {len(whole.labels)} markers of the base with their partners, "
                          f"got {count}")
-    places = room.spread(count - len(whole.labels), _vertices(whole))
+    places = room.spread(count - len(whole.labels), whole.nearest)
     return _joined(whole, places, _names(body, skeleton, places))
 
 
-def sitting_room(body: Mesh, mirror: SkinMirror, config: CandidateConfig | None = None) -> np.ndarray:
+def sitting_room(body: Mesh, mirror: SkinMirror, thick: float = 0.022) -> np.ndarray:
     """(N,) bool where a marker can sit: open to cameras, flat, on a thick enough limb, not on the soles.
 
-    Parameters
-    ----------
-    body : Mesh
-        In a pose with limbs apart.
-    mirror : SkinMirror
-        Says which direction is across; the body's length is the largest extent along the others.
+    The body stands with limbs apart; lengths are shares of its length, the largest extent along the plane of symmetry.
+    The body is at least `thick` below a marker: fingers, toes and ears are less.
     """
-    config = config or CandidateConfig()
     axis, length = _long_axis(body, mirror)
     along = body.vertices @ axis
-    outward = body.vertex_normals @ axis
-    near_end = np.minimum(along - along.min(), along.max() - along) < config.ends * length
-    at_end = near_end & (np.abs(outward) > 0.5)
-    reach = config.reach * length
-    around = _around(body, config.thick * length)
+    near_end = np.minimum(along - along.min(), along.max() - along) < 0.025 * length
+    at_end = near_end & (np.abs(body.vertex_normals @ axis) > 0.5)    # the soles and the crown face outwards there
+    reach = 0.06 * length                                             # skin that is nearer hides a marker from cameras
+    around = _around(body, thick * length)
     flatness = np.einsum("nd,nd->n", body.vertex_normals, around @ body.vertex_normals)
-    closed = np.flatnonzero(around @ _openness(body, reach) < config.open)
+    # in armpits, the crotch and between fingers less than three quarters of the directions outwards are free
+    closed = np.flatnonzero(around @ _openness(body, reach) < 0.75)
     away = SurfaceGraph(body).nearest(closed)[0] if len(closed) else np.inf
-    return (away > config.margin * length) & (_thickness(body, reach) >= config.thick * length) \
-        & (flatness >= config.flat) & ~at_end
+    return (away > 0.035 * length) & (_thickness(body, reach) >= thick * length) & (flatness >= 0.75) & ~at_end
 
 
 class _Room:
     """Where on a body markers can be added."""
 
-    def __init__(self, body: Mesh, base: MarkerLayout, config: CandidateConfig, mirror: SkinMirror) -> None:
-        vertices = _vertices(base)
+    def __init__(self, body: Mesh, base: MarkerLayout, mirror: SkinMirror) -> None:
+        vertices = base.nearest
         sides = np.array([side_of(label) for label in base.labels])
         turn = float(np.sign((sides * mirror.across[vertices]).sum()))
         if turn == 0:
@@ -143,13 +98,13 @@ class _Room:
         across = turn * mirror.across
         length = _long_axis(body, mirror)[1]
         self.graph, self.partner = SurfaceGraph(body), mirror.partner
-        free = sitting_room(body, mirror, config)
+        free = sitting_room(body, mirror)
         free &= free[self.partner]
         edge = float(np.linalg.norm(np.diff(body.vertices[body.edges], axis=1), axis=-1).mean())
         on_line = np.abs(across) < edge
         from_line = self.graph.nearest(np.flatnonzero(on_line))[0]
         self.apart = 2 * from_line                                   # of a place from its partner, along the skin
-        self.left = free & (across > 0) & (from_line > config.middle * length)
+        self.left = free & (across > 0) & (from_line > 0.012 * length)   # nearer ones are alone
         self.line = free & on_line
 
     def spread(self, count: int, taken: np.ndarray) -> list[tuple[int, ...]]:
@@ -172,7 +127,7 @@ def _with_partners(base: MarkerLayout, mirror: SkinMirror) -> MarkerLayout:
     """The base, and the partners that are missing in it."""
     lonely = [i for i, label in enumerate(base.labels) if (o := other_side(label)) and o not in base.labels]
     others = [other_side(base.labels[i]) or "" for i in lonely]
-    places: list[tuple[int, ...]] = [(int(mirror.partner[_vertices(base)[i]]),) for i in lonely]
+    places: list[tuple[int, ...]] = [(int(mirror.partner[base.nearest[i]]),) for i in lonely]
     free = {base.labels[i] for i in lonely} & set(base.loose)
     joined = _joined(base, places, others)
     aliases = {a: label for a, label in joined.aliases.items() if a not in others}
@@ -191,13 +146,6 @@ def _joined(base: MarkerLayout, places: list[tuple[int, ...]], labels: list[str]
     weights = np.vstack([base.weights, np.tile([1.0, 0.0, 0.0], (len(v), 1))])
     return MarkerLayout(all_labels, np.vstack([base.vertices, np.repeat(v[:, None], 3, axis=1)]), distances, weights,
                         aliases, base.loose)
-
-
-def _vertices(layout: MarkerLayout) -> np.ndarray:
-    """(L,) the vertex of every marker, or that of the largest weight."""
-    if layout.weights is None:
-        return layout.vertices
-    return layout.vertices[np.arange(len(layout.labels)), layout.weights.argmax(axis=1)]
 
 
 def _names(body: Mesh, skeleton: Skeleton | None, places: list[tuple[int, ...]]) -> list[str]:

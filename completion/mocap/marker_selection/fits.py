@@ -1,37 +1,121 @@
-"""The model fitted to whole bodies, or to some of their points: many bodies at once."""
+"""The model fitted to many bodies at once: to whole ones, or to some of their points."""
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
+from typing import Annotated
 
 import numpy as np
 
+from model.bilinear import ShapedPoints
 from model.body import BodyModel
+from model.linear import PointOperator
 from scanprep.geometry import rotations
 from scanprep.geometry.least_squares import Dense, levenberg_marquardt
+from scanprep.ranges import FLAG, Count, Positive, Settings
 
+from ...energy import MovingPoints, moving_points
 from ...priors import gaussian_prior
-from .points import BodyPoints
-from .settings import DesignConfig
+
+AT_ONCE = 2**25                      # numbers of a batch of derivatives
+
+
+@dataclass(frozen=True)
+class DesignConfig(Settings):
+    """Settings of `design_markers`.
+
+    Eq. 26 has no prior; without one fewer markers than a third of the unknowns have no answer. So betas are held to
+    the mean person and poses to the usual ones, as far as `marker_sd` lets them.
+
+    Attributes
+    ----------
+    count : int
+        Markers of the set that is wanted.
+    through : ints
+        Further counts at which the curve must have a set of just that size; pairs go two at a time.
+    n_betas : int, optional
+        Betas that are estimated, the first ones; all when not given.
+    joint : bool
+        Betas are common to the bodies of a person; else each body is estimated by itself, as in the paper.
+    marker_sd : float, metres
+        How far a marker may lie from where the body would put it.
+    surface : int
+        Vertices, well spread, that stand for all of them while sets are compared, each for those nearest to it.
+    exchanges : int
+        Rounds in which each marker of the set, or pair, is tried against those left out.
+    checks : ints
+        Counts at which the set of the curve is estimated again without linearising.
+    """
+
+    count: Annotated[Count, FLAG] = 47
+    through: tuple[Count, ...] = ()
+    n_betas: int | None = None
+    joint: Annotated[bool, FLAG] = False
+    marker_sd: Positive = 0.005
+    surface: Count = 1000
+    exchanges: int = 1
+    checks: tuple[Count, ...] = ()
+
+
+class BodyPoints:
+    """Surface points as a function of unknowns x = (pose (3J), trans (3), betas (K)) of a batch of bodies."""
+
+    def __init__(self, shaped: ShapedPoints) -> None:
+        self.shaped = shaped
+        self.n_betas, _, self.count, _ = shaped.shape_basis.shape
+        self.n_angles = 3 * len(shaped.terms.skeleton.parents)
+        self.n_unknowns = self.n_angles + 3 + self.n_betas
+        self._changes = shaped.shape_basis.reshape(self.n_betas, -1)
+
+    def some(self, chosen: np.ndarray) -> BodyPoints:
+        """Some of the points."""
+        shaped = self.shaped
+        return BodyPoints(replace(shaped, template_basis=shaped.template_basis[:, chosen],
+                                  mean_basis=shaped.mean_basis[:, chosen],
+                                  shape_basis=shaped.shape_basis[:, :, chosen]))
+
+    @property
+    def batch(self) -> int:
+        """Bodies whose derivatives are held at once."""
+        return max(1, AT_ONCE // max(1, 3 * self.count * (self.n_unknowns + self.shaped.terms.count)))
+
+    def _operators(self, betas: np.ndarray) -> list[PointOperator]:
+        change = (betas @ self._changes).reshape(len(betas), *self.shaped.mean_basis.shape)
+        return [PointOperator(self.shaped.terms, self.shaped.mean_basis + own, self.shaped.origin) for own in change]
+
+    def _split(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        n = self.n_angles
+        return x[:, :n].reshape(len(x), -1, 3), x[:, n:n + 3], x[:, n + 3:]
+
+    def positions(self, x: np.ndarray) -> np.ndarray:
+        """(B, L, 3) metres, for unknowns (B, P)."""
+        out = np.empty((len(x), self.count, 3))
+        for start in range(0, len(x), self.batch):
+            pose, trans, betas = self._split(x[start:start + self.batch])
+            for i, operator in enumerate(self._operators(betas)):
+                out[start + i] = operator.evaluate(pose[i], trans[i])
+        return out
+
+    def follow(self, x: np.ndarray) -> MovingPoints:
+        """The points with their derivatives by the unknowns (B, P); keep B small."""
+        pose, trans, betas = self._split(x)
+        found = [operator.columns(p, t) for operator, p, t in zip(self._operators(betas), pose, trans, strict=True)]
+        by_pose = np.moveaxis(np.stack([columns for _, columns in found]), 1, -1)
+        return moving_points(np.stack([y for y, _ in found]), by_pose, self.shaped.shape_jacobian(pose))
+
 
 Tell = Callable[[int], None]
+Progress = Callable[[int, int], None]
 TOGETHER = 24                        # bodies that are minimised at once
-LOOSE = 1.0                          # metre and radian: how far the place of a body is known beforehand
 
 
 @dataclass(frozen=True, eq=False)
 class Prior:
-    """What is known of the unknowns x of a body before it is measured: a Gaussian.
+    """What is known of the unknowns x of a body before it is measured: a Gaussian."""
 
-    Attributes
-    ----------
-    precision : (P, P) float
-    mean : (Z, P) float
-        One for each body: its root and its place are known to a radian and a metre, loosely enough to say nothing
-        once there are three markers.
-    """
-
-    precision: np.ndarray
+    precision: np.ndarray            # (P, P) float
+    # (Z, P) float: One for each body: its root and its place are known to a radian and a metre, loosely enough to say
+    # nothing once there are three markers
     mean: np.ndarray
 
     def system(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -44,19 +128,19 @@ class Prior:
         return Prior(self.precision, self.mean[some])
 
 
-def prior_around(model: BodyModel, x: np.ndarray, config: DesignConfig) -> Prior:
+def prior_around(model: BodyModel, x: np.ndarray, shape_weight: float = 1.0) -> Prior:
     """The prior of bodies that stand and face about as at x (Z, P).
 
     [MoSh] Eq. 20
     [MoSh] Eq. 21
     """
-    poses = gaussian_prior(model.pose_mean, model.pose_covariance, config.prior_shrinkage)
+    poses = gaussian_prior(model.pose_mean, model.pose_covariance)
     n, P = len(poses.mean), x.shape[1]
     precision = np.zeros((P, P))
-    precision[:n, :n] = config.prior_weight * poses.whitening.T @ poses.whitening
+    precision[:n, :n] = poses.whitening.T @ poses.whitening
     place = np.r_[:3, n:n + 3]
-    precision[place, place] += LOOSE**-2
-    precision[np.arange(n + 3, P), np.arange(n + 3, P)] = config.shape_weight
+    precision[place, place] += 1.0                       # known to a metre and a radian beforehand
+    precision[np.arange(n + 3, P), np.arange(n + 3, P)] = shape_weight
     mean = np.zeros_like(x)
     mean[:, :n] = poses.mean
     mean[:, place] = x[:, place]
@@ -67,12 +151,7 @@ def fit_points(points: BodyPoints, targets: np.ndarray, weights: np.ndarray, pri
                iterations: int, tell: Tell | None = None) -> np.ndarray:
     """Unknowns (Z, P) with which the points come nearest to their targets, by Levenberg-Marquardt.
 
-    Parameters
-    ----------
-    targets : (Z, L, 3) float, metres
-    weights : (L,) float
-        Factor on the squared distance.
-    start : (Z, P) float
+    `targets` (Z, L, 3), metres; `weights` (L,): factor on the squared distance; `start` (Z, P).
 
     [MoSh] Eq. 26
     """

@@ -6,7 +6,27 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ..marker_sets.symmetry import label_pairs
 from .linear import LinearBodies
+
+
+def symmetric_groups(labels: Sequence[str], partners: np.ndarray | None = None) -> tuple[tuple[int, ...], ...]:
+    """Numbers of the markers of each pair, and of each marker alone.
+
+    `partners` (L,).
+    """
+    partners = label_pairs(labels) if partners is None else np.asarray(partners, dtype=np.int64)
+    each = np.arange(len(labels))
+    if partners.shape != each.shape or partners.max(initial=-1) >= len(each):
+        raise ValueError(f"partners: expected a marker, or -1, for each of {len(each)}, got shape {partners.shape} "
+                         f"up to {partners.max(initial=-1)}")
+    other = np.where(partners < 0, each, partners)
+    wrong = np.flatnonzero(other[other] != each)
+    if len(wrong):
+        raise ValueError(f"partners: expected that the partner of {labels[other[wrong[0]]]} is {labels[wrong[0]]}, got "
+                         f"{labels[other[other[wrong[0]]]]}")
+    return tuple((int(i),) if i == j else (int(i), int(j)) for i, j in enumerate(other) if i <= j)
+
 
 Groups = Sequence[tuple[int, ...]]
 State = tuple[np.ndarray, ...]
@@ -16,26 +36,13 @@ LEAST_GAIN = 1e-6                    # share of the mean squared distance below 
 
 @dataclass(frozen=True, eq=False)
 class Path:
-    """Sets of markers, each the one before and a group more or less.
+    """Sets of markers, each the one before and a group more or less."""
 
-    Attributes
-    ----------
-    start : (m,) int
-        Groups of the first set, in rising order.
-    steps : tuple of int
-        The group that came or went in each step.
-    added : bool
-        They came.
-    counts : (S,) int
-        Markers of each set, the first included.
-    rmse : (S,) float, metres
-    """
-
-    start: np.ndarray
-    steps: tuple[int, ...]
-    added: bool
-    counts: np.ndarray
-    rmse: np.ndarray
+    start: np.ndarray                # (m,) int: Groups of the first set, in rising order
+    steps: tuple[int, ...]           # The group that came or went in each step
+    added: bool                      # They came
+    counts: np.ndarray               # (S,) int: Markers of each set, the first included
+    rmse: np.ndarray                 # (S,) float, metres
 
     def set(self, i: int) -> np.ndarray:
         """Groups of the i-th set, in rising order."""
@@ -55,12 +62,6 @@ class MarkerSets:
     `k = (I + s B C Bᵀ)⁻¹ (g - B d)`, the step becomes `d + s C Bᵀ k` and the cost changes by
     `2 s k·q + kᵀ F k`, where `q = B C (G d - p)` and `F = B C G C Bᵀ`. What changes with C is kept for the rows of
     each group alone, so trying all groups costs small solves only, and taking one costs one pass over the rows.
-
-    Parameters
-    ----------
-    linear : LinearBodies
-    groups : candidates that come and go together
-    chosen : groups of the first set
 
     [MoSh] Eq. 26
     [MoSh] Eq. 27
@@ -147,19 +148,7 @@ def walk(sets: MarkerSets, sign: int, movable: np.ndarray, until: int, through: 
          tell: Callable[[int], None] | None = None) -> Path:
     """Let the group come or go that serves best for each of its markers, again and again.
 
-    Parameters
-    ----------
-    sets : MarkerSets
-        Is changed.
-    sign : +1 adds, -1 removes
-    movable : (n,) bool
-        Groups that may come or go.
-    until : int
-        Count at which to stop.
-    through : ints
-        Counts that are not stepped over where a single marker can be had.
-    tell : callable, optional
-        Called with the count after each step.
+    `movable` (n,): groups that may come or go.
     """
     start, steps = np.flatnonzero(sets.inside), list[int]()
     counts, rmse = [sets.count], [sets.rmse]
@@ -185,19 +174,9 @@ def exchange(sets: MarkerSets, movable: np.ndarray, rounds: int) -> int:
 
     A pair may make room for two single markers, and two of these for a pair.
 
-    Parameters
-    ----------
-    sets : MarkerSets
-        Is changed; its count is not.
-    movable : (n,) bool
-        Groups that may come or go.
-    rounds : int
-        Most times that every group is tried.
+    Returns int (How many exchanges were made).
 
-    Returns
-    -------
-    int
-        How many exchanges were made.
+    `movable` (n,): groups that may come or go.
     """
     done = 0
     for _ in range(rounds):

@@ -7,14 +7,17 @@ from dataclasses import dataclass
 import numpy as np
 
 from model.body import BodyModel
-from model.fitting import share_of_vertices, spread_vertices
+from model.fitting import FitConfig, ShapeFitter, share_of_vertices, spread_vertices
+from model.linear import check_pose
+from model.posing.transfer import own_body
+from scanprep.geometry import rotations
+from scanprep.geometry.farthest_points import farthest_points
 
 from ..marker_sets.layout import MarkerLayout
-from .fits import Prior, fit_points, prior_around, rough_poses
-from .points import BodyPoints
-from .settings import DesignConfig
+from .fits import BodyPoints, DesignConfig, Prior, Progress, fit_points, prior_around, rough_poses
 
-Progress = Callable[[int, int], None]
+FIT_SURFACE = 400                    # vertices that stand for all of them in the first fit to each whole body
+FIT_ITERATIONS = 20                  # most steps of that fit, and of a full refit
 
 
 @dataclass(frozen=True, eq=False)
@@ -23,32 +26,16 @@ class LinearBodies:
 
     From markers T the step is `(Λ + Σ_T BᵀB)⁻¹ (l + Σ_T Bᵀ g)`, and leaves the surface a mean squared distance of
     `dᵀ G d - 2 dᵀ p + c`.
-
-    Attributes
-    ----------
-    rows : (Z, C, r, P) float
-        B: derivatives of every candidate, over the standard deviation of a marker.
-    gaps : (Z, C, r) float
-        g: how far it is from where the body has it, over the same.
-    gram : (Z, P, P) float, square metres
-        G
-    pull : (Z, P) float, square metres
-        p
-    rest : (Z,) float, square metres
-        c: what the model cannot reach.
-    precision : (P, P) float
-        Λ of the priors.
-    lean : (Z, P) float
-        l: where the priors pull.
     """
 
+    # (Z, C, r, P) float: B: derivatives of every candidate, over the standard deviation of a marker
     rows: np.ndarray
-    gaps: np.ndarray
-    gram: np.ndarray
-    pull: np.ndarray
-    rest: np.ndarray
-    precision: np.ndarray
-    lean: np.ndarray
+    gaps: np.ndarray                 # (Z, C, r) float: g: how far it is from where the body has it, over the same
+    gram: np.ndarray                 # (Z, P, P) float, square metres: G
+    pull: np.ndarray                 # (Z, P) float, square metres: p
+    rest: np.ndarray                 # (Z,) float, square metres: c: what the model cannot reach
+    precision: np.ndarray            # (P, P) float: Λ of the priors
+    lean: np.ndarray                 # (Z, P) float: l: where the priors pull
 
     def steps(self, chosen: Sequence[int] | np.ndarray) -> np.ndarray:
         """(Z, P) from these candidates, each solved for by itself.
@@ -80,25 +67,13 @@ class LinearBodies:
 
 @dataclass(frozen=True, eq=False)
 class WholeFits:
-    """Bodies, their candidates, and the model fitted to their whole surfaces.
+    """Bodies, their candidates, and the model fitted to their whole surfaces."""
 
-    Attributes
-    ----------
-    x : (Z, P) float
-        Unknowns (pose, trans, betas).
-    markers : BodyPoints
-        The candidates, on the skin.
-    places : (Z, C, 3) float, metres
-        Where they are on the bodies.
-    prior : Prior
-    linear : LinearBodies
-    """
-
-    x: np.ndarray
-    markers: BodyPoints
-    places: np.ndarray
+    x: np.ndarray                    # (Z, P) float: Unknowns (pose, trans, betas)
+    markers: BodyPoints              # The candidates, on the skin
+    places: np.ndarray               # (Z, C, 3) float, metres: Where they are on the bodies
     prior: Prior
-    linear: LinearBodies
+    linear: LinearBodies             # LinearBodies
 
     def refitted(self, chosen: Sequence[int] | np.ndarray, config: DesignConfig,
                  tell: Callable[[int], None] | None = None) -> np.ndarray:
@@ -109,37 +84,25 @@ class WholeFits:
         chosen = np.asarray(chosen)
         weights = np.full(len(chosen), config.marker_sd**-2)
         return fit_points(self.markers.some(chosen), self.places[:, chosen], weights, self.prior, self.x,
-                          config.fit_iterations, tell)
+                          FIT_ITERATIONS, tell)
 
 
 def fit_bodies(model: BodyModel, bodies: np.ndarray, candidates: MarkerLayout, config: DesignConfig,
                progress: Progress | None = None) -> WholeFits:
     """Fit the model to every whole body, and linearise there.
 
-    Parameters
-    ----------
-    model : BodyModel
-        With betas.
-    bodies : (Z, N, 3) float, metres
-        In the topology of the model's template, in any poses.
-    candidates : MarkerLayout
-        Their distance from the skin is not used.
-
-    Raises
-    ------
-    ValueError
-        A model without betas, bodies of another shape or not finite, a layout of another body.
+    `bodies` (Z, N, 3), metres: in the topology of the model's template, in any poses.
     """
     bodies, n_betas = check_bodies(model, bodies), _check(model, candidates, config)
     tell = progress or (lambda done, total: None)
     template, total = model.template.vertices, 2 * len(bodies)
-    few = spread_vertices(template, config.fit_surface)
+    few = spread_vertices(template, FIT_SURFACE)
     weights = share_of_vertices(template, few) * len(few) / (len(template) * config.marker_sd**2)
     start = rough_poses(model, bodies, n_betas)
     x = fit_points(BodyPoints(model.points(few, None, n_betas)), bodies[:, few], weights,
-                   prior_around(model, start, config), start, config.fit_iterations, lambda done: tell(done, total))
-    ids, shares = support(candidates)
-    markers, prior = BodyPoints(model.points(ids, shares, n_betas)), prior_around(model, x, config)
+                   prior_around(model, start), start, FIT_ITERATIONS, lambda done: tell(done, total))
+    ids, shares = candidates.skin
+    markers, prior = BodyPoints(model.points(ids, shares, n_betas)), prior_around(model, x)
     places = np.einsum("lk,zlkd->zld", shares, bodies[:, ids])
     some = spread_vertices(template, config.surface)
     surface = BodyPoints(model.points(some, None, n_betas))
@@ -171,12 +134,6 @@ def _check(model: BodyModel, candidates: MarkerLayout, config: DesignConfig) -> 
     return n_betas
 
 
-def support(layout: MarkerLayout) -> tuple[np.ndarray, np.ndarray]:
-    """Vertices and weights (C, k) of the points of the skin under the markers."""
-    ids = layout.vertices.reshape(len(layout.labels), -1)
-    return ids, np.ones(ids.shape) if layout.weights is None else layout.weights
-
-
 def _linearised(x: np.ndarray, markers: BodyPoints, places: np.ndarray, surface: BodyPoints, targets: np.ndarray,
                 share: np.ndarray, prior: Prior, sd: float, tell: Callable[[int], None]) -> LinearBodies:
     """`LinearBodies` at x (Z, P); the surface's points (L) stand for shares (L,) of it."""
@@ -196,3 +153,79 @@ def _linearised(x: np.ndarray, markers: BodyPoints, places: np.ndarray, surface:
         tell(min(begin + size, Z))
     lean = (prior.mean - x) @ prior.precision
     return LinearBodies(rows, gaps, gram, pull, rest, prior.precision, lean)
+
+
+def shared_shape(linear: LinearBodies, x: np.ndarray, people: np.ndarray, n_betas: int) -> LinearBodies:
+    """The same bodies with betas common to those of a person: one problem a person.
+
+    Unknowns of a person are pose and place of the bodies one after the other, and the betas, a step from the mean
+    of those that the bodies have by themselves. Rows of a candidate are those in all the bodies.
+
+    `x` (Z, P): unknowns around which it was linearised; betas come last; `people` (Z,): whose body each is.
+    """
+    names, each = np.unique(people, return_counts=True)
+    if len(people) != len(x) or len(set(each.tolist())) > 1:
+        raise ValueError(f"people: expected one of each of {len(x)} bodies, and as many bodies of every person, got "
+                         f"{len(people)} with {each.tolist()}")
+    bodies, F, K = np.argsort(people, kind="stable"), int(each[0]), n_betas
+    Z, P = x.shape
+    n, own = P - K, slice(P - K, P)
+    shift = np.zeros((len(names), F, P))
+    betas = x[bodies][:, own].reshape(len(names), F, K)
+    shift[..., own] = betas.mean(axis=1, keepdims=True) - betas
+    at = _moved(linear.of(bodies), shift.reshape(Z, P))
+    C, r = at.gaps.shape[1:]
+    rows, gaps = np.zeros((len(names), C, F * r, F * n + K)), at.gaps.reshape(len(names), F, C, r)
+    gram, pull = np.zeros((len(names), F * n + K, F * n + K)), np.zeros((len(names), F * n + K))
+    precision, lean = np.zeros(gram.shape[1:]), np.zeros_like(pull)
+    alone = (at.rows.reshape(len(names), F, C, r, P), at.gram.reshape(len(names), F, P, P),
+             at.pull.reshape(len(names), F, P), at.lean.reshape(len(names), F, P))
+    for f in range(F):
+        B, G, p, lean_f = (a[:, f] for a in alone)
+        mine = np.r_[f * n:(f + 1) * n, F * n:F * n + K]
+        rows[:, :, f * r:(f + 1) * r, mine] = B
+        gram[:, mine[:, None], mine] += G / F
+        pull[:, mine] += p / F
+        lean[:, mine[:n]] = lean_f[:, :n]
+        precision[mine[:n, None], mine[:n]] = linear.precision[:n, :n]
+    precision[F * n:, F * n:] = linear.precision[own, own]
+    lean[:, F * n:] = alone[3][:, 0, own]                            # all bodies are at the same betas now
+    return LinearBodies(rows, gaps.transpose(0, 2, 1, 3).reshape(len(names), C, F * r), gram, pull,
+                        at.rest.reshape(len(names), F).mean(axis=1), precision, lean)
+
+
+def _moved(linear: LinearBodies, shift: np.ndarray) -> LinearBodies:
+    """The same affine bodies, with steps counted from where `shift` (Z, P) leads."""
+    gaps = linear.gaps - (linear.rows @ shift[:, None, :, None])[..., 0]
+    pull = linear.pull - (linear.gram @ shift[..., None])[..., 0]
+    return LinearBodies(linear.rows, gaps, linear.gram, pull, linear.left(shift), linear.precision,
+                        linear.lean - shift @ linear.precision)
+
+
+def example_poses(model: BodyModel, count: int) -> np.ndarray:
+    """Poses (count, J, 3) that the model was learned from, as different as can be; the first is the most usual one."""
+    examples = model.pose_examples
+    if not 1 <= count <= len(examples):
+        raise ValueError(f"count: expected 1..{len(examples)} poses, those that the model keeps, got {count}")
+    turned = rotations.exp(examples).reshape(len(examples), -1)
+    usual = ((turned - turned.mean(axis=0))**2).sum(axis=1).argmin()
+    return examples[farthest_points(turned, count, usual, least=-0.5)]
+
+
+def in_poses(model: BodyModel, bodies: np.ndarray, poses: np.ndarray,
+             progress: Callable[[int, int], None] | None = None) -> np.ndarray:
+    """Each registered body, with its own full shape, in some poses.
+
+    Returns (Z, F, N, 3) float32, metres.
+
+    `bodies` (Z, N, 3), metres; `poses` (F, J, 3), radians.
+    """
+    bodies = check_bodies(model, bodies)
+    poses, _ = check_pose(model.skeleton, poses, None)
+    fitter = ShapeFitter(model, FitConfig(polish=0))
+    out = np.empty((len(bodies), len(poses), *bodies.shape[1:]), dtype=np.float32)
+    for i, body in enumerate(np.asarray(bodies, dtype=np.float64)):
+        out[i] = own_body(model, body, fitter.fit(body)).subject.vertices(poses)
+        if progress is not None:
+            progress(i + 1, len(bodies))
+    return out

@@ -7,7 +7,6 @@ from typing import Annotated
 import numpy as np
 import tyro
 
-from model.body import BodyModel
 from scanprep.cli import MM, Output, Unit
 from scanprep.console import Metric, Outcome, bar, dispatch, say
 from scanprep.geometry.files import read_mesh, write_mesh
@@ -17,7 +16,8 @@ from scanprep.skeleton.tree import Skeleton
 
 from ...cli import ModelOrNone, read_model
 from .layout import MarkerLayout
-from .named import layout_names, layout_summaries
+from .named import layout_summaries, read_layout
+from .pictures import mean_body
 from .symmetry import label_pairs
 
 LayoutArg = Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="LAYOUT")]
@@ -26,7 +26,8 @@ COMMANDS = {
     "list": ("The marker sets that come along.", "completion.mocap.marker_sets.cli:list_layouts"),
     "show": ("A layout on a body: pictures from four sides and a table.",
              "completion.mocap.marker_sets.cli:show_layout"),
-    "carry": ("A layout on another triangulation, by registration.", "completion.mocap.marker_sets.cli:carry_to"),
+    "transfer": ("A layout on another triangulation, by registration.",
+                 "completion.mocap.marker_sets.cli:transfer_to"),
     "design": ("Which markers to put on: the set from which bodies are estimated best.",
                "completion.mocap.marker_selection.cli:design"),
 }
@@ -80,13 +81,13 @@ def show_layout(layout: LayoutArg, output: Output, model: ModelOrNone = None, bo
     return Outcome(output, [Metric("body", name), *figures], {"layout": layout})
 
 
-def carry_to(layout: LayoutArg, source: Path, target: Path, output: Output, landmarks: Path | None = None,
+def transfer_to(layout: LayoutArg, source: Path, target: Path, output: Output, landmarks: Path | None = None,
              source_landmarks: Path | None = None, unit: Unit | None = None) -> Outcome:
     """A layout on another triangulation: the source body is registered to the target and takes its markers along.
 
-    Example: scape layout carry vicon47 --source template.ply --target mine.ply -o mine.layout.json
+    Example: scape layout transfer vicon47 --source template.ply --target mine.ply -o mine.layout.json
 
-    Without landmarks, places that look alike are sought; they cannot tell how far a smooth limb is turned about
+    Without landmarks, places that look alike are sought; they cannot tell how far a smooth limb is rotated about
     itself, so look at the picture beside the output, and name landmarks where it is wrong: ends of the limbs, inner
     and outer sides of knees, elbows, wrists.
 
@@ -102,7 +103,7 @@ def carry_to(layout: LayoutArg, source: Path, target: Path, output: Output, land
     from scanprep.pictures.shading import save_png
 
     from .pictures import picture_layout
-    from .transfer import DOUBTFUL, register_layout
+    from .transfer import DOUBTFUL, transfer_layout
 
     ours, theirs = read_mesh(source), read_mesh(target, unit)
     found = read_layout(layout, ours, None)
@@ -114,41 +115,20 @@ def carry_to(layout: LayoutArg, source: Path, target: Path, output: Output, land
         except ValueError as error:
             raise ValueError(f"{landmarks}: {error}") from None
     with bar("registering") as progress:
-        result = register_layout(found, ours, theirs, pairs, progress=progress)
+        result = transfer_layout(found, ours, theirs, pairs, progress=progress)
     result.layout.save(output)
     save_png(output.with_suffix(".png"), picture_layout(theirs, result.layout))
     write_mesh(output.with_suffix(".registered.ply"), result.registered)
-    if result.missed > DOUBTFUL:
-        say(f"note: {result.missed:.0%} of {target} is not covered by the source; look at "
+    if result.uncovered > DOUBTFUL:
+        say(f"note: {result.uncovered:.0%} of {target} is not covered by the source; look at "
             f"{output.with_suffix('.png')}, and name landmarks if limbs are wrong")
     return Outcome(output, [
         *_figures(result.layout, theirs), Metric("landmarks", 0 if pairs is None else len(pairs[0])),
         Metric("distance of the registered source, RMS", MM * result.rms, "mm"),
         *([] if pairs is None else [Metric("distance of landmarks, RMS", MM * result.landmark_rms, "mm")]),
-        Metric("target not covered", 100 * result.missed, "%"),
+        Metric("target not covered", 100 * result.uncovered, "%"),
         Metric("largest distance at a marker", MM * float(result.distances.max()), "mm"),
         Metric("markers without data below them", int((result.confidence < 0.5).sum()))], {"layout": layout})
-
-
-def read_layout(given: str, body: Mesh, kept: np.ndarray | None) -> MarkerLayout:
-    """The layout that is named, or in a file, for a body.
-
-    Raises
-    ------
-    ValueError
-        Neither a name nor a file, another body.
-    """
-    if given in layout_names():
-        return MarkerLayout.named(given, body, kept)
-    if not Path(given).exists():
-        raise ValueError(f"layout: expected a file or one of {', '.join(layout_names())}, got '{given}'")
-    return MarkerLayout.load(given, len(body.vertices))
-
-
-def mean_body(model: BodyModel) -> Mesh:
-    """The mean person in the pose of the template, or the template's own body of a model without betas."""
-    pose = np.zeros((len(model.skeleton.parents), 3))
-    return model.template.with_vertices(model.vertices(pose, np.zeros(model.n_betas) if model.n_betas else None))
 
 
 def _body(model: Path | None, body: Path | None, unit: Unit | None

@@ -115,28 +115,22 @@ class MarkerLayout:
             layout._check(n_vertices, str(path))
         return layout
 
-    @staticmethod
-    def named(name: str, template: Mesh, kept: np.ndarray | None = None) -> MarkerLayout:
-        """A usual marker set on a body that is known here: the triangles of SCAPE and SPRING, or the synthetic people.
+    @property
+    def skin(self) -> tuple[np.ndarray, np.ndarray]:
+        """Vertices and weights (L, k) of the points of the skin below the markers, k 1 or 3."""
+        ids = self.vertices.reshape(len(self.labels), -1)
+        return ids, np.ones(ids.shape) if self.weights is None else self.weights
 
-        Parameters
-        ----------
-        name : str
-            One of `layout_names()`, such as "cmu41".
-        template : Mesh
-            Known by its triangles, whatever its shape and pose.
-        kept : (N,) int, optional
-            The vertices of the synthetic people that a template with fewer triangles kept,
-            `info["people_vertices"]` of their model.
+    @property
+    def nearest(self) -> np.ndarray:
+        """(L,) the vertex that has the largest share in each marker's place."""
+        ids, weights = self.skin
+        return np.take_along_axis(ids, weights.argmax(axis=1)[:, None], axis=1)[:, 0]
 
-        Raises
-        ------
-        ValueError
-            A set that does not come along, or a body on which it is not known.
-        """
-        from .named import named_layout
-
-        return named_layout(name, template, kept)
+    def skin_points(self, vertices: np.ndarray) -> np.ndarray:
+        """(L, 3) the points below the markers, metres, of skin with vertices (N, 3)."""
+        ids, weights = self.skin
+        return np.einsum("lk,lkd->ld", weights, vertices[ids])
 
     def save(self, path: str | Path) -> None:
         """Write as JSON, one marker set for each distance from the skin, whole or not at all."""
@@ -152,12 +146,9 @@ class MarkerLayout:
         storage.write_json(path, tree | ({"aliases": dict(self.aliases)} if self.aliases else {}))
 
     def matched(self, labels: Sequence[str], minimum: int = 3) -> tuple[str, ...]:
-        """Those of the labels that the layout knows, in their own order; an alias only where its marker is not there.
+        """Those of the labels that the layout knows, in their own order, or ValueError where they are fewer.
 
-        Raises
-        ------
-        ValueError
-            Fewer than `minimum`; both lists are in the message.
+        An alias counts only where its marker is not there.
         """
         names = [label if label in self.labels else self.aliases.get(label) for label in labels]
         found = tuple(label for i, label in enumerate(labels)
@@ -178,13 +169,7 @@ class MarkerLayout:
                             None if self.weights is None else self.weights[rows], loose=loose)
 
     def without(self, labels: Sequence[str]) -> MarkerLayout:
-        """All markers but these; an alias takes its marker out, and aliases of markers that go, go too.
-
-        Raises
-        ------
-        ValueError
-            An unknown label.
-        """
+        """All markers but these; an alias takes its marker out, and aliases of markers that go, go too."""
         known = {**{label: label for label in self.labels}, **self.aliases}
         unknown = [label for label in labels if label not in known]
         if unknown:
@@ -192,21 +177,6 @@ class MarkerLayout:
         gone = {known[label] for label in labels}
         kept = self.select([label for label in self.labels if label not in gone])
         return replace(kept, aliases={a: label for a, label in self.aliases.items() if label not in gone})
-
-    def pairs(self, template: Mesh | None = None) -> np.ndarray:
-        """(L,) which marker is on the other side of each: its own number in the middle, -1 without a partner.
-
-        Labels tell (LELB and RELB, l_elbow and r_elbow, left elbow and right elbow), and places on a symmetric body
-        where they do not.
-
-        Parameters
-        ----------
-        template : Mesh, optional
-            The body; without it a marker whose label names no side is taken to be in the middle.
-        """
-        from .symmetry import label_pairs, marker_pairs
-
-        return label_pairs(self.labels) if template is None else marker_pairs(self, template)
 
     def moved(self, places: Mapping[str, int]) -> MarkerLayout:
         """The same with some markers on other vertices, {label: vertex}; an alias moves its marker."""
@@ -222,17 +192,12 @@ class MarkerLayout:
         """Where the markers are on a body (L, 3), metres: the point of the skin, and out along the normal there.
 
         The normal is that of the vertex or of the triangle on which a marker sits.
-
-        Raises
-        ------
-        ValueError
-            A layout of another body.
         """
         self._check(len(mesh.vertices), "vertices")
         vertices, normals = mesh.vertices[self.vertices], mesh.vertex_normals[self.vertices]
         if self.weights is not None:
             corners, smooth = vertices, normals
-            vertices = np.einsum("lc,lcd->ld", self.weights, corners)
+            vertices = self.skin_points(mesh.vertices)
             normals = np.cross(corners[:, 1] - corners[:, 0], corners[:, 2] - corners[:, 0])
             normals *= np.where(np.einsum("ld,lcd->l", normals, smooth) < 0, -1.0, 1.0)[:, None]
             length = np.linalg.norm(normals, axis=1, keepdims=True)
@@ -245,13 +210,6 @@ class MarkerLayout:
             place = self.vertices[self.labels.index(outside[0])].tolist()
             error = ValueError if what == "vertices" else MarkerFileError
             raise error(f"{what}: marker '{outside[0]}' sits on vertex {place}, the body has 0..{n_vertices - 1}")
-
-
-def most_used(layout: MarkerLayout) -> np.ndarray:
-    """(L,) the vertex that has the largest share in each marker's place."""
-    base = layout.vertices.reshape(len(layout.labels), -1)
-    share = np.ones(base.shape) if layout.weights is None else layout.weights
-    return np.take_along_axis(base, share.argmax(axis=1)[:, None], axis=1)[:, 0]
 
 
 def _restored(path: Path, tree: Any) -> MarkerLayout:

@@ -5,16 +5,16 @@ import hashlib
 from collections.abc import Sequence
 from functools import cache
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any
 
 import numpy as np
 
+from model.body import BodyModel
 from scanprep.geometry import storage
 from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.surface import Surface
 
-if TYPE_CHECKING:
-    from .layout import MarkerLayout
+from .layout import MarkerLayout
 
 FOLDER = Path(__file__).parent / "layouts"
 SYNTHETIC = "synthetic people"
@@ -43,9 +43,23 @@ def layout_summaries() -> list[tuple[str, int, str, str]]:
 
 
 def named_layout(name: str, template: Mesh, kept: np.ndarray | None = None) -> MarkerLayout:
-    """See `MarkerLayout.named`."""
-    from .layout import MarkerLayout
+    """A usual marker set on a body that is known here: the triangles of SCAPE and SPRING, or the synthetic people.
 
+    Parameters
+    ----------
+    name : str
+        One of `layout_names()`, such as "cmu41".
+    template : Mesh
+        Known by its triangles, whatever its shape and pose.
+    kept : (N,) int, optional
+        The vertices of the synthetic people that a template with fewer triangles kept,
+        `info["people_vertices"]` of their model.
+
+    Raises
+    ------
+    ValueError
+        A set that does not come along, or a body on which it is not known.
+    """
     if name not in layout_names():
         raise ValueError(f"name: expected a marker layout of {', '.join(layout_names())}, got {name!r}; for another, "
                          + OWN)
@@ -67,8 +81,6 @@ def _on_kept(layout: MarkerLayout, template: Mesh, kept: np.ndarray) -> MarkerLa
     """The layout of the synthetic people on a template that kept only some of their vertices."""
     from scanprep.synthetic.topology import load
 
-    from .layout import MarkerLayout
-
     whole = load().mesh.vertices
     found = Surface(Mesh(whole[kept], template.faces)).closest(whole[layout.vertices])
     return MarkerLayout(layout.labels, template.faces[found.faces], layout.distances, found.bary, layout.aliases,
@@ -82,14 +94,33 @@ def _files() -> tuple[tuple[Path, dict[str, Any]], ...]:
 
 def fitting_layout(labels: Sequence[str], template: Mesh, kept: np.ndarray | None = None
                    ) -> tuple[MarkerLayout, str]:
-    """The named layout that knows most of some labels, and its name.
-
-    Raises
-    ------
-    ValueError
-        A body on which none is known, or labels of which none knows three.
-    """
+    """The named layout that knows most of some labels, and its name; ValueError where none knows three of them."""
     found = {name: named_layout(name, template, kept) for name in layout_names()}
     best = max(found, key=lambda name: (len(found[name].matched(labels, 0)), -len(found[name].labels)))
     found[best].matched(labels)
     return found[best], best
+
+
+def choose_layout(model: BodyModel, given: str | Path | None, labels: Sequence[str]) -> tuple[MarkerLayout, str]:
+    """The layout that is named, or in a file, or the named one that fits some labels best; and its name."""
+    kept = model.info.get("people_vertices")
+    of_people = None if kept is None else np.array(kept)
+    if given is None:
+        return fitting_layout(labels, model.template, of_people)
+    return read_layout(given, model.template, of_people), str(given)
+
+
+def read_layout(given: str | Path, template: Mesh, kept: np.ndarray | None = None) -> MarkerLayout:
+    """The layout for a body that is named, or in a file."""
+    named = layout_or_file(given)
+    return named_layout(named, template, kept) if isinstance(named, str) else \
+        MarkerLayout.load(named, len(template.vertices))
+
+
+def layout_or_file(given: str | Path) -> str | Path:
+    """What a command line names: a layout of ours as text, or a file as Path, on whose contents results depend."""
+    if str(given) in layout_names():
+        return str(given)
+    if not Path(given).exists():
+        raise ValueError(f"layout: expected a file or one of {', '.join(layout_names())}, got '{given}'")
+    return Path(given)

@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from model.body import BodyModel
 from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.surface import Rays
 from scanprep.pictures.camera import Camera, look_around
@@ -23,19 +24,16 @@ FIXED, LOOSE = (0.86, 0.24, 0.20), (0.93, 0.62, 0.12)
 INK = (24, 40, 92)
 
 
+def mean_body(model: BodyModel) -> Mesh:
+    """The mean person in the pose of the template, or the template's own body of a model without betas."""
+    pose = np.zeros((len(model.skeleton.parents), 3))
+    return model.template.with_vertices(model.vertices(pose, np.zeros(model.n_betas) if model.n_betas else None))
+
+
 def picture_layout(body: Mesh, layout: MarkerLayout, height: int | None = None) -> np.ndarray:
     """A body from four sides with its markers, each named where it is in sight; loose ones in another colour.
 
-    Parameters
-    ----------
-    body : Mesh
-        Standing.
-    layout : MarkerLayout
-    height : int, pixels, optional
-
-    Returns
-    -------
-    (H, W, 3) uint8
+    Returns (H, W, 3) uint8.
     """
     cameras, height = look_around(body), height or HEIGHT
     width = int(height * max(c.width / c.height for c in cameras)) + 100
@@ -87,8 +85,7 @@ def marker_rows(body: Mesh, layout: MarkerLayout, skeleton: Skeleton | None = No
     others: dict[str, list[str]] = {}
     for alias, label in layout.aliases.items():
         others.setdefault(label, []).append(alias)
-    vertices = layout.vertices if layout.weights is None else \
-        layout.vertices[np.arange(len(layout.labels)), layout.weights.argmax(axis=1)]
+    vertices = layout.nearest
     rows: list[tuple[str, ...]] = []
     for i, label in enumerate(layout.labels):
         partner = "-" if pairs[i] < 0 else "middle" if pairs[i] == i else layout.labels[pairs[i]]

@@ -83,20 +83,10 @@ def label_pairs(labels: Sequence[str]) -> np.ndarray:
 
 
 def marker_pairs(layout: MarkerLayout, template: Mesh, mirror: SkinMirror | None = None) -> np.ndarray:
-    """The marker on the other side of every marker, by label, and by place where labels do not tell.
+    """(L,) the marker on the other side of every marker, by label, and by place where labels do not tell.
 
-    Parameters
-    ----------
-    layout : MarkerLayout
-    template : Mesh
-        A body that the layout is for.
-    mirror : SkinMirror, optional
-        Of `find_skin_mirror`; found when not given.
-
-    Returns
-    -------
-    (L,) int
-        Its own number for a marker in the middle, -1 where there is no partner; the partner's partner is the marker.
+    Its own number for a marker in the middle, -1 where there is no partner; the partner's partner is the marker.
+    `template` is a body that the layout is for, with its mirror, found when not given.
     """
     pairs = label_pairs(layout.labels)
     pairs[[other_side(label) is None for label in layout.labels]] = -1
@@ -104,7 +94,7 @@ def marker_pairs(layout: MarkerLayout, template: Mesh, mirror: SkinMirror | None
     if len(untold) == 0:
         return pairs
     mirror = mirror or find_skin_mirror(template)
-    skin = skin_points(layout, template)[untold]
+    skin = layout.skin_points(template.vertices)[untold]
     image = mirrored_points(layout, template, mirror)[untold]
     apart = np.linalg.norm(image[:, None] - skin[None], axis=-1)
     apart = apart + apart.T                                                    # there and back
@@ -115,27 +105,9 @@ def marker_pairs(layout: MarkerLayout, template: Mesh, mirror: SkinMirror | None
     return pairs
 
 
-def skin_points(layout: MarkerLayout, mesh: Mesh) -> np.ndarray:
-    """(L, 3) the points of the skin below the markers, metres."""
-    if layout.weights is None:
-        return mesh.vertices[layout.vertices]
-    return np.einsum("lc,lcd->ld", layout.weights, mesh.vertices[layout.vertices])
-
-
 def mirrored_points(layout: MarkerLayout, mesh: Mesh, mirror: SkinMirror) -> np.ndarray:
     """(L, 3) where the mirror images of the markers lie on the skin, metres."""
-    image = mirror.image(mesh)
-    return image[layout.vertices] if layout.weights is None else np.einsum(
-        "lc,lcd->ld", layout.weights, image[layout.vertices])
-
-
-def mirrored_layout(layout: MarkerLayout, template: Mesh, mirror: SkinMirror) -> MarkerLayout:
-    """The layout with left and right exchanged: every marker on the other side, with the label of that side."""
-    found = Surface(template).closest(mirrored_points(layout, template, mirror))
-    labels = tuple(other_side(label) or label for label in layout.labels)
-    aliases = {other_side(a) or a: other_side(label) or label for a, label in layout.aliases.items()}
-    return MarkerLayout(labels, template.faces[found.faces], layout.distances, found.bary, aliases,
-                        tuple(other_side(label) or label for label in layout.loose))
+    return layout.skin_points(mirror.image(mesh))
 
 
 def find_skin_mirror(template: Mesh, poses: np.ndarray | None = None, landmarks: Mapping[str, int] | None = None

@@ -2,105 +2,104 @@
 from __future__ import annotations
 
 import sys
+import warnings
+from collections.abc import Mapping, Sequence
+from html import escape
 from pathlib import Path
 from typing import Annotated
 
+import numpy as np
 import tyro
 
 from model.body import BodyModel
 from model.files import load_model
 from scanprep.batch.pool import Workers
-from scanprep.batch.workspace import Workspace
+from scanprep.batch.workspace import Task, Workspace
 from scanprep.cli import Output, Unit
-from scanprep.console import Outcome, bar, say
-from scanprep.ranges import Count
+from scanprep.console import PROBLEM, Metric, Outcome, bar, say
+from scanprep.pictures.page import Page
 
-from ...cli import ModelOrNone, read_model
-from ..animate.work import choose_layout
-from ..settings import MoshConfig
-from .folder import keep_table, mosh_people, summary
-from .recordings import Actor, By, Grouping, find_actors
-from .work import Work
+from ...cli import read_model
+from ..marker_sets.named import choose_layout
+from .mosh import MoshConfig
+from .recordings import TABLE, Actor, Grouping, find_actors, write_table
+from .report import PICTURE
+from .work import ERRORS, Work
 
 MarkersArg = Annotated[tyro.conf.Positional[tuple[Path, ...]], tyro.conf.arg(metavar="MARKERS [MARKERS ...]")]
-TOLD = 20                            # people that are listed before the work begins
+Models = Annotated[tyro.conf.UseAppendAction[tuple[Path, ...]], tyro.conf.arg(aliases=["-m"])]
+_STYLE = """.person { display: grid; grid-template-columns: minmax(17rem, 1fr) 2fr; gap: 1rem; margin: 1.6rem 0; }
+.person img { width: 100%; } .person p { margin: .2rem 0; }"""
 
 
-def mosh_markers(markers: MarkersArg, output: Output, model: ModelOrNone = None, layout: str | None = None,
-                 subjects: Path | None = None, by: By = "auto", name: str | None = None, who: str | None = None,
-                 hold_out: tuple[str, ...] = (), female: Path | None = None, male: Path | None = None,
-                 character: Path | None = None, factor: float = 1.0, unit: Unit | None = None, keys: Count = 120,
+def mosh_markers(markers: MarkersArg, output: Output, model: Models = (), layout: str | None = None,
+                 subjects: str = "auto", subject_prefix: str | None = None, hold_out: tuple[str, ...] = (),
+                 retarget_to: Path | None = None, unit: Unit | None = None,
                  config: MoshConfig = MoshConfig(),               # noqa: B008
                  workers: Workers = Workers(), *, space: Workspace) -> Outcome:                   # noqa: B008
     """Body shape, marker places, motion and soft tissue of people from markers alone.
+
+    Nothing is needed but a file: scape mosh walk.c3d -o out
+    With a model of your own: scape mosh 85_02.c3d 85_03.c3d -m model.npz --layout cmu41 -o out
+
+    Begin with report.html in the output. Each person has a folder with subject.json (betas), layout.json (where the
+    markers sat), report.html, and in it a folder for each sequence: motion.npz and soft_tissue.npz, animation.glb,
+    motion.bvh, joint_angles.csv, joint_centres.csv, residuals.csv and residuals_soft.csv (metres), virtual.c3d (labels
+    put right, gaps filled by the body), artefacts.json and artefacts.csv, report.html.
 
     Files that are named are of one person. In a folder every sub-folder is a person; of files that lie side by side
     those are, whose names begin with the same number, as 85_02.c3d and 85_03.c3d, or else whose labels begin with the
     same `Subject:`. What was found is printed, and kept in subjects.csv, which --subjects takes when it is mended.
     Called again, the command leaves alone what is done and has not changed; killed, it goes on where it was.
 
-    Example: scape mosh 85_02.c3d 85_03.c3d -m model.npz --layout cmu41 -o out
-
-    Each person has a folder with subject.json (betas), layout.json (where the markers sat), report.html, and in it a
-    folder for each sequence: motion.npz and soft_tissue.npz, animation.glb, motion.bvh, joint_angles.csv,
-    joint_centres.csv, residuals.csv and residuals_soft.csv (metres), virtual.c3d (labels put right, gaps filled by
-    the body), faults.json and faults.csv, report.html. Begin with report.html in the output.
-
     Args:
         markers: C3D, TRC or CSV files, or folders of these.
         output: Folder to write to.
-        model: Model of `scape learn`; without it that of the synthetic people, which is made on first use.
+        model: Model of `scape learn`; without it that of the synthetic people, which is made on first use. Given three
+            times, a model of both sexes, one of women and one of men: the markers tell the sex, by the first.
         layout: Where the markers usually sit: one of `scape layout list`, or a JSON file {"markersets":
             [{"distance_from_skin": metres, "indices": {label: vertex}}]}. Without it the named one that fits best.
-        subjects: Who is who: CSV with the columns file and subject, or JSON {file: subject}; other files are left out.
-        by: How files are given to people: "name", by what stands before the first _, - or blank of the file name;
-            "label", by what stands before the colon of the labels; "each", every file is of another person; "all".
-        name: Name of the only person.
-        who: Whose markers, in C3D files with several people.
+        subjects: Who is who: a CSV file with the columns file and subject, or JSON {file: subject}, where files that
+            are left out are not used; or a rule: "name", by what stands before the first _, - or blank of the file
+            name; "label", by what stands before the colon of the labels; "each", every file is of another person;
+            "all", they are of one; "auto".
+        subject_prefix: Whose markers, in C3D files with several people: what stands before the colon of the labels.
         hold_out: Labels of markers that no stage sees, which then tell how well the body predicts.
-        female: Model of women, with --male; the markers tell the sex, by MODEL, which is of both.
-        male: Model of men.
-        character: Model whose mean is a character, which makes the motion too: character.glb.
-        factor: Exaggerates soft tissue, in exaggerated.glb and on the character; 0 leaves it out there.
+        retarget_to: Model whose mean is a character, which makes the motion too: character.glb.
         unit: Unit of the markers, where the file cannot tell.
-        keys: Largest number of key frames in a GLB.
         config: Settings.
         workers: Who does the work, a person at a time.
     """
     if not markers:
         raise ValueError("MARKERS: expected at least one file or folder")
-    grouping = Grouping(by, subjects, name, who)
-    actors = find_actors(markers, grouping, output)
+    actors = find_actors(markers, Grouping.of(subjects, subject_prefix), output)
     held = tuple(label for words in hold_out for label in words.split(",") if label)
-    loaded, model_name = read_model(model)
-    work = Work(loaded, model_name, _sexes(female, male, character),
-                None if character is None else _character(character, loaded),
-                None if layout is None else choose_layout(loaded, layout, ()), held, unit, keys, factor, config,
+    loaded, model_name = read_model(model[0] if model else None)
+    work = Work(loaded, model_name, _sexes(model, retarget_to),
+                None if retarget_to is None else _character(retarget_to, loaded),
+                None if layout is None else choose_layout(loaded, layout, ()), held, unit, config,
                 f"scape mosh {' '.join(sys.argv[2:])}")
-    keep_table(space, actors, subjects is not None)
+    _keep_table(space, actors, subjects)
     _tell(actors)
     with bar("people") as people, bar("one of them") as inside:
-        done = mosh_people(work, actors, space, workers, people, inside)
+        done = space.run(work, [Task(actor.name, actor, actor.name) for actor in actors], workers, people, inside)
+    failures = [line if line.startswith(f"{name}: ") else f"{name}: {line}" for name, line in done.failures.items()]
+    for name, (rows, failed) in done.values.items():
+        failures += [f"{name}: {line}" for line in [*(str(m.value) for m in rows if m.name == PROBLEM), *failed]]
+    metrics = {name: [m for m in rows if m.name != PROBLEM] for name, (rows, _) in done.values.items()}
+    with space.staging("page") as staged:
+        _page(actors, metrics, failures).write(staged.folder / "report.html")
     settings = {"mosh": config, "model": model_name, "layout": layout, "held out": held}
-    return Outcome(output, summary(done, len(actors)), settings, done.failures)
+    return Outcome(output, _summary(metrics, len(actors), len(metrics) - len(done.fresh)), settings, failures)
 
 
-def _tell(actors: list[Actor]) -> None:
-    """Who is taken to be who."""
-    for actor in actors[:TOLD]:
-        files = ", ".join(r.path.name for r in actor.recordings[:4])
-        more = len(actor.recordings) - 4
-        say(f"{actor.name}: {files}{f' and {more} more' if more > 0 else ''} ({actor.rule})")
-    if len(actors) > TOLD:
-        say(f"and {len(actors) - TOLD} more people")
-
-
-def _sexes(female: Path | None, male: Path | None, character: Path | None) -> dict[str, BodyModel]:
-    if (female is None) != (male is None):
-        raise ValueError("--female and --male: expected both or none")
-    if character is not None and female is not None:
-        raise ValueError("--character: it is made of one model; expected it without --female and --male")
-    return {} if female is None or male is None else {"female": load_model(female), "male": load_model(male)}
+def _sexes(models: Sequence[Path], character: Path | None) -> dict[str, BodyModel]:
+    """The models of women and men, where they are given."""
+    if len(models) not in (0, 1, 3):
+        raise ValueError(f"--model: expected one, or three of both sexes, of women and of men, got {len(models)}")
+    if character is not None and len(models) == 3:
+        raise ValueError("--retarget-to: a character is made of one model; expected one --model, got 3")
+    return dict(zip(("female", "male"), map(load_model, models[1:]), strict=True)) if len(models) == 3 else {}
 
 
 def _character(path: Path, model: BodyModel) -> BodyModel:
@@ -109,3 +108,62 @@ def _character(path: Path, model: BodyModel) -> BodyModel:
         raise ValueError(f"{path}: expected a character made of the model, with its {len(model.template.faces)} "
                          f"triangles, found {character.kind} with {len(character.template.faces)}")
     return character
+
+
+def _keep_table(space: Workspace, actors: Sequence[Actor], subjects: str) -> None:
+    """Who is who into subjects.csv; one that was mended stays as it is, and has to be named."""
+    table = space.folder / TABLE
+    if not table.exists() or space.is_ours(TABLE):
+        with space.staging("people") as staged:
+            write_table(staged.folder / TABLE, actors)
+    elif Grouping.of(subjects).table is not None:
+        warnings.warn(f"{table}: left as it was mended", stacklevel=2)
+    else:
+        raise ValueError(f"{table}: was mended; go by it with --subjects {table}, or move it away")
+
+
+def _tell(actors: list[Actor], most: int = 20) -> None:
+    """Who is taken to be who."""
+    for actor in actors[:most]:
+        files = ", ".join(r.path.name for r in actor.recordings[:4])
+        more = len(actor.recordings) - 4
+        say(f"{actor.name}: {files}{f' and {more} more' if more > 0 else ''} ({actor.rule})")
+    if len(actors) > most:
+        say(f"and {len(actors) - most} more people")
+
+
+def _summary(metrics: Mapping[str, Sequence[Metric]], count: int, before: int) -> list[Metric]:
+    """The rows of the closing table: those of one person, or means over several."""
+    if count == 1 and metrics:
+        only = next(iter(metrics.values()))
+        return [Metric("person", next(iter(metrics))), *only, Metric("done before", before)]
+    values = [{m.name: m for m in rows} for rows in metrics.values()]
+    rows = [Metric("people", count), Metric("done before", before), Metric("failed", count - len(metrics))]
+    for name in ("sequences", "frames", "swaps", "bad spans"):
+        rows.append(Metric(name, sum(int(v[name].value) for v in values)))
+    for name in ERRORS:
+        found = {person: v[name] for person, v in zip(metrics, values, strict=True) if name in v}
+        if found:
+            worst = max(found, key=lambda person: float(found[person].value))
+            rows += [Metric(f"{name}, mean of the people", float(np.mean([float(m.value) for m in found.values()])),
+                            "mm"),
+                     Metric(f"the same, worst ({worst})", float(found[worst].value), "mm")]
+    return rows
+
+
+def _page(actors: Sequence[Actor], metrics: Mapping[str, Sequence[Metric]], failures: Sequence[str]) -> Page:
+    """All people, those with the largest error first."""
+    page = Page(f"{len(metrics)} {'person' if len(metrics) == 1 else 'people'} from markers, worst first",
+                "Each picture leads to the page of the person, and that to the sequences.")
+    if failures:
+        page.section("Failed").table([(line,) for line in failures])
+    error = {name: float(next(m.value for m in rows if m.name == ERRORS[0])) for name, rows in metrics.items()}
+    rules = {actor.name: actor.rule for actor in actors}
+    for name in sorted(metrics, key=lambda name: (-error[name], name)):
+        told = [f"{m.name}: {m.text()} {m.unit}" for m in metrics[name]
+                if m.name in (*ERRORS, "sequences", "frames", "sex")]
+        lines = "".join(f"<p>{escape(line)}</p>" for line in (*told, f"recordings put together: {rules[name]}"))
+        link = escape(name)
+        page.markup(f'<div class="person"><div><a href="{link}/report.html"><b>{link}</b></a>{lines}</div>'
+                    f'<a href="{link}/report.html"><img src="{link}/{PICTURE}" alt="{link}"></a></div>', _STYLE)
+    return page

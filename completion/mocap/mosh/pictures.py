@@ -11,7 +11,7 @@ from scanprep.geometry.mesh import Mesh
 from scanprep.pictures.camera import Camera, look_around, upright
 from scanprep.pictures.shading import Bones, Dots, Shape, Solid, color_bar, heat, render, side_by_side
 
-from ..animate.report import MARKER, facing, moving_picture
+from ...motion_pictures import MARKER, facing, moving_picture
 from ..marker_sets.layout import MarkerLayout
 from .takes import Take
 

@@ -6,7 +6,7 @@ import re
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Literal, get_args
+from typing import Literal, cast, get_args
 
 from scanprep.batch.workspace import HOME
 from scanprep.geometry import storage, tables
@@ -21,16 +21,7 @@ TABLE = "subjects.csv"
 
 @dataclass(frozen=True)
 class Recording:
-    """One sequence of one person.
-
-    Attributes
-    ----------
-    path : Path
-    name : str
-        Of the folder that its output goes to.
-    who : str, optional
-        Whose markers, in a C3D file.
-    """
+    """One sequence of one person: its file, the name of its output folder, and whose markers in a C3D file."""
 
     path: Path
     name: str
@@ -39,16 +30,7 @@ class Recording:
 
 @dataclass(frozen=True)
 class Actor:
-    """A person and the recordings of it.
-
-    Attributes
-    ----------
-    name : str
-        Fit for a folder.
-    recordings : tuple of Recording
-    rule : str
-        Why these are thought to be of one person.
-    """
+    """A person, by a name fit for a folder, the recordings of it, and the rule by which these are thought to be so."""
 
     name: str
     recordings: tuple[Recording, ...]
@@ -68,35 +50,30 @@ class Grouping:
         as in 85_02, else "label", else "each".
     table : Path, optional
         CSV with the columns file and subject, or JSON {file: subject}, which goes before any rule.
-    name : str, optional
-        Of the only person.
     who : str, optional
         Whose markers, in C3D files with several people.
     """
 
     by: By = "auto"
     table: Path | None = None
-    name: str | None = None
     who: str | None = None
 
-    def __post_init__(self) -> None:
-        if self.by not in get_args(By):
-            raise ValueError(f"by: expected one of {', '.join(get_args(By))}, got '{self.by}'")
+    @staticmethod
+    def of(subjects: str, who: str | None = None) -> Grouping:
+        """By a rule that is named, or by a table."""
+        if subjects in get_args(By):
+            return Grouping(cast(By, subjects), None, who)
+        if Path(subjects).suffix.lower() not in (".csv", ".json"):
+            raise ValueError(f"--subjects: expected a file .csv or .json, or one of {', '.join(get_args(By))}, "
+                             f"got '{subjects}'")
+        return Grouping("auto", Path(subjects), who)
 
 
 def find_actors(markers: Iterable[Path], grouping: Grouping, output: Path | None = None) -> list[Actor]:
-    """The people of some files and folders.
+    """The people of some files and folders; what lies in `output`, where results go, is no recording.
 
-    Parameters
-    ----------
-    output : Path, optional
-        Where results go: what lies there is no recording.
-
-    Raises
-    ------
-    ValueError
-        No marker files, no such file, an output around the recordings, a table that names a file that is not there,
-        one name for several people.
+    ValueError: no marker files, no such file, an output around the recordings, a table that names a file that is not
+    there.
     """
     given = list(markers)
     for place in given:
@@ -111,17 +88,15 @@ def find_actors(markers: Iterable[Path], grouping: Grouping, output: Path | None
         rows = [(folder_name(said[f.path]), f, grouping.who, f"as {grouping.table} says")
                 for f in found if f.path in said]
     elif whole:
-        name = next(_people(found[0], grouping))[0] if grouping.name is None else grouping.name
+        name = next(_people(found[0], grouping))[0]
+        if len(given) == 1 and given[0].is_dir():
+            name = given[0].resolve().name
         rows = [(folder_name(name), f, grouping.who, "files that were named together") for f in found]
     else:
         rows = [(folder_name(name), f, who, rule) for f in found for name, who, rule in _people(f, grouping)]
-    people = sorted({name for name, *_ in rows})
-    if grouping.name is not None:
-        if len(people) > 1:
-            raise ValueError(f"--name: expected one person for one name, found {', '.join(people)}")
-        people, rows = [grouping.name], [(grouping.name, f, who, rule) for _, f, who, rule in rows]
-    return [Actor(folder_name(person), _named(person, [(f, who) for name, f, who, _ in rows if name == person]),
-                  next(rule for name, *_, rule in rows if name == person)) for person in people]
+    return [Actor(person, _named(person, [(f, who) for name, f, who, _ in rows if name == person]),
+                  next(rule for name, *_, rule in rows if name == person))
+            for person in sorted({name for name, *_ in rows})]
 
 
 def write_table(path: Path, actors: Iterable[Actor]) -> None:

@@ -15,12 +15,11 @@ from scanprep.pictures.page import Page
 from scanprep.pictures.shading import Dots, Shape, render, side_by_side
 
 from ...cli import rows
-from ..animate.report import MARKER, facing, worst_frames
-from ..artefacts.chart import chart_faults
+from ...motion_pictures import MARKER, facing, worst_frames
 from ..marker_sets.layout import MarkerLayout
-from ..results import MoshResult
 from . import pictures
-from .charts import MM, chart_frames, chart_map, chart_timeline, mean_over
+from .charts import MM, chart_artefacts, chart_frames, chart_map, chart_timeline, mean_over
+from .mosh import MoshResult
 from .takes import Take
 
 PICTURE = "picture.png"
@@ -68,11 +67,11 @@ def person_page(name: str, model: BodyModel, result: MoshResult, usual: MarkerLa
 
 
 def take_page(take: Take, metrics: Sequence[Metric]) -> Page:
-    """One sequence: the whole of it at a glance, how far the markers are, soft tissue, faults; see `closing`."""
+    """One sequence: the whole of it at a glance, how far the markers are, soft tissue, artefacts; see `closing`."""
     step = pictures.every(len(take.motion.poses))
     frames = np.arange(0, len(take.motion.poses), step)
     page = Page(f"{take.name}, with {'soft tissue' if take.soft else 'fixed shape'}", COLORS)
-    page.table(rows([m for m in metrics if m.unit == "mm" or m.name in ("frames", "exchanges", "bad spans")]))
+    page.table(rows([m for m in metrics if m.unit == "mm" or m.name in ("frames", "swaps", "bad spans")]))
     page.section("The whole sequence", f"Every {_th(step)} frame; below each its number and time.")
     page.picture(pictures.contact_sheet(take, frames))
     page.picture(pictures.moving(take), "the first seconds")
@@ -86,7 +85,7 @@ def take_page(take: Take, metrics: Sequence[Metric]) -> Page:
     _unused(page, take)
     if take.soft is not None:
         _soft_section(page, take, frames)
-    _fault_section(page, take)
+    _artefact_section(page, take)
     return page
 
 
@@ -105,23 +104,22 @@ def _soft_section(page: Page, take: Take, frames: np.ndarray) -> None:
                  "frames that change most; above with the person's own shape, below with soft tissue")
 
 
-def _fault_section(page: Page, take: Take) -> None:
-    faults, rate = take.faults, take.motion.rate
-    page.section("Faults of the markers", "The body says where each marker should be: one that is elsewhere was "
-                 "exchanged with another, has slipped, jitters or strays.")
-    found = [("exchanged", f"{e.first} and {e.second}", e.begin, e.end, (e.end - e.begin + 1) / rate, np.nan)
-             for e in faults.exchanges]
-    found += [(b.kind, b.label, b.begin, b.end, (b.end - b.begin + 1) / rate, MM * b.distance) for b in faults.bad]
+def _artefact_section(page: Page, take: Take) -> None:
+    artefacts, rate = take.artefacts, take.motion.rate
+    page.section("Marker artefacts", "The body says where each marker should be: one that is elsewhere was "
+                 "swapped with another, has slipped, jitters or strays.")
+    found = [("swapped", f"{e.first} and {e.second}", e.begin, e.end, (e.end - e.begin + 1) / rate, np.nan)
+             for e in artefacts.swaps]
+    found += [(b.kind, b.label, b.begin, b.end, (b.end - b.begin + 1) / rate, MM * b.distance) for b in artefacts.bad]
     if found:
         page.table(sorted(found, key=lambda row: row[2]),
-                   ("fault", "marker", "first frame", "last frame", "lasts (s)", "distance (mm)"))
+                   ("artefact", "marker", "first frame", "last frame", "lasts (s)", "distance (mm)"))
     else:
         page.text("None was found.")
     page.chart(chart_timeline(take), "every marker over time")
-    if not {b.label for b in faults.bad}.union(*({e.first, e.second} for e in faults.exchanges)).isdisjoint(
-            faults.labels):
-        page.picture(_drawn(chart_faults(faults, take.markers)), "faulty markers: how far they were from where the "
-                     "body has them, and what is left of it")
+    if not artefacts.labels_touched.isdisjoint(artefacts.labels):
+        page.picture(_drawn(chart_artefacts(artefacts, take.markers)), "these markers: how far they were from where "
+                     "the body has them, and what is left of it")
 
 
 def _drawn(figure: Any) -> bytes:
@@ -134,7 +132,7 @@ def _drawn(figure: Any) -> bytes:
 def _entry(page: Page, take: Take, metrics: Sequence[Metric]) -> None:
     """A sequence on the page of its person, leading to its own."""
     told = "".join(f"<p>{escape(m.name)}: {escape(m.text())} {escape(m.unit)}</p>" for m in metrics
-                   if m.unit == "mm" or m.name in ("frames", "exchanges", "bad spans"))
+                   if m.unit == "mm" or m.name in ("frames", "swaps", "bad spans"))
     link = f"{escape(take.name)}/report.html"
     page.markup(f'<div class="take"><div><a href="{link}"><b>{escape(take.name)}</b></a>{told}</div>'
                 f'<a href="{link}"><img src="{escape(take.name)}/{PICTURE}" alt="{escape(take.name)}"></a></div>',

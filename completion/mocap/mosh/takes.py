@@ -14,10 +14,11 @@ from scanprep.geometry.mesh import Mesh
 
 from ...energy import lifted
 from ...motion import Motion
+from ..artefacts.results import MarkerArtefacts
 from ..files.markers import MarkerSequence
 from ..marker_sets.layout import MarkerLayout
 from ..pose.marked_body import supports
-from ..results import MarkerFaults, SoftTissue
+from ..soft_tissue.soft_tissue import SoftTissue
 
 LIGHT = 7000                         # triangles of a body in small pictures
 AT_ONCE = 128                        # frames whose changes are held at a time
@@ -58,29 +59,15 @@ class HeldOut:
     fixed: np.ndarray
     soft: np.ndarray | None
 
+    @property
+    def shown(self) -> np.ndarray:
+        """(T, H) with soft tissue where there is one."""
+        return self.fixed if self.soft is None else self.soft
+
 
 @dataclass(frozen=True, eq=False)
 class Take:
-    """One sequence of a person.
-
-    Attributes
-    ----------
-    name : str
-        Of its folder.
-    path : Path
-        The file, and `who` and `unit` as it was read.
-    model : BodyModel
-    subject : Subject
-        The person.
-    markers : MarkerSequence
-    motion : Motion
-        With the shape fixed.
-    soft : SoftTissue, optional
-    faults : MarkerFaults
-    held : HeldOut, optional
-    light : LightMesh
-        Of the body, for small pictures.
-    """
+    """One sequence of a person: where it was read from, what was found of it, and a body for small pictures."""
 
     name: str
     path: Path
@@ -91,7 +78,7 @@ class Take:
     markers: MarkerSequence
     motion: Motion
     soft: SoftTissue | None
-    faults: MarkerFaults
+    artefacts: MarkerArtefacts
     held: HeldOut | None
     light: LightMesh
     _kept: dict[int, np.ndarray] = field(default_factory=dict)
@@ -117,15 +104,7 @@ class Take:
 
 def held_out(model: BodyModel, layout: MarkerLayout, labels: Sequence[str], markers: MarkerSequence, motion: Motion,
              soft: SoftTissue | None) -> HeldOut | None:
-    """How far a motion is from markers that it was not made from; None where the sequence has none of them.
-
-    Parameters
-    ----------
-    layout : MarkerLayout
-        Where these markers usually sit.
-    labels : strings
-        Of the layout, or aliases of it.
-    """
+    """How far a motion is from markers of the layout that it was not made from; None where there are none of them."""
     wanted = {layout.aliases.get(label, label) for label in labels}
     known = layout.matched(markers.labels, 0)
     names = tuple(label for label in known if layout.aliases.get(label, label) in wanted)
@@ -135,13 +114,12 @@ def held_out(model: BodyModel, layout: MarkerLayout, labels: Sequence[str], mark
     ids, weights = supports(model.template, places)
     lift, seen = np.asarray(places.distances), markers.select(names).positions
     assert motion.betas is not None, "a person of a shape space"
-    if soft is None:
-        points = model.points(ids, weights, len(motion.betas)).operator(motion.betas)
-        fixed = lifted(points.evaluate(motion.poses, motion.trans), lift)
-        return HeldOut(names, np.linalg.norm(fixed - seen, axis=2), None)
-    shaped = model.points(ids, weights, max(len(motion.betas), soft.changes.shape[1]))
+    K = len(motion.betas) if soft is None else max(len(motion.betas), soft.changes.shape[1])
+    shaped = model.points(ids, weights, K)
     points = shaped.operator(motion.betas)
     fixed = lifted(points.evaluate(motion.poses, motion.trans), lift)
+    if soft is None:
+        return HeldOut(names, np.linalg.norm(fixed - seen, axis=2), None)
     moving = points.evaluate(soft.motion.poses, soft.motion.trans)
     K, M, L, _ = shaped.shape_basis.shape
     flat = np.ascontiguousarray(shaped.shape_basis.transpose(1, 3, 0, 2)).reshape(3 * M, K * L)

@@ -1,6 +1,7 @@
 """One person: read the recordings, find the person and the motions, and write everything."""
 from __future__ import annotations
 
+import csv
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -12,25 +13,26 @@ import numpy as np
 from model.body import BodyModel
 from model.learning.sex_plane import SexGuess
 from scanprep.batch.room import Room
-from scanprep.console import Metric, Outcome, write_report
+from scanprep.console import Metric, Outcome, plain, write_report
+from scanprep.geometry import storage
 from scanprep.pictures.camera import upright
 from scanprep.pictures.sheets import save_png
 
-from ..animate.report import morph_frames
-from ..animate.work import choose_layout, key_frames, write_glb
-from ..artefacts.virtual import fault_table
+from ...motion import spread_frames
+from ...motion_pictures import picture_bodies
+from ..artefacts.results import MarkerArtefacts
+from ..artefacts.virtual import artefact_table, write_virtual
 from ..files.markers import MarkerSequence, read_markers
+from ..files.motion_files import write_glb, write_motion, write_residuals
 from ..marker_sets.layout import MarkerLayout
+from ..marker_sets.named import choose_layout
 from ..pose.robust import motion_problem
-from ..results import MoshResult
 from ..retargeting.pictures import picture_transfer, write_character
 from ..retargeting.retarget import retarget
 from ..retargeting.soft_tissue import retarget_soft_tissue
-from ..settings import MoshConfig
-from ..subject.sex import mosh_by_sex
+from .by_sex import mosh_by_sex
 from .charts import MM
-from .mosh import mosh
-from .outputs import write_person, write_take
+from .mosh import MoshConfig, MoshResult, mosh
 from .pictures import standing
 from .recordings import Actor, Recording
 from .report import PICTURE, closing, person_page, person_picture, take_page, take_picture
@@ -39,6 +41,7 @@ from .takes import LightMesh, Take, held_out
 ERRORS = ("marker error, fixed shape", "marker error, soft tissue", "held-out error, fixed shape",
           "held-out error, soft tissue")
 HALF = 100                           # of progress: finding shape and motion, then files and pictures
+KEYS = 120                           # most key frames in a GLB, each of which holds a whole body
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,10 +63,7 @@ class Work:
         Markers that no stage sees.
     unit : str, optional
         As `read_markers` takes it.
-    keys : int
-        Largest number of key frames in a GLB.
-    factor : float
-        On soft tissue, in exaggerated.glb and on the character.
+    config : MoshConfig
     command : str
         For report.json.
     """
@@ -75,8 +75,6 @@ class Work:
     layout: tuple[MarkerLayout, str] | None
     hold_out: tuple[str, ...]
     unit: str | None
-    keys: int
-    factor: float
     config: MoshConfig
     command: str = field(metadata={"digest": False})
 
@@ -95,35 +93,32 @@ class _Found:
     usual: MarkerLayout
     layout_name: str
 
+    def problem(self, take: Take) -> str | None:
+        """Why the motion of a sequence means nothing."""
+        return motion_problem(take.motion, take.subject.template, self.result.layout, take.markers)
+
 
 def mosh_person(work: Work, actor: Actor, room: Room) -> tuple[list[Metric], list[str]]:
     """Everything of one person into the folder of a room: the figures, and what failed.
 
-    A recording that cannot be read is left out and told. The first figure is called "problem" where a motion means
-    nothing, and says why.
-
-    Raises
-    ------
-    ValueError
-        No recording that can be read, or as `mosh`.
+    A recording that cannot be read is left out and told; ValueError where none can. The first figure is called
+    "problem" where a motion means nothing, and says why.
     """
     start, folder = time.perf_counter(), room.folder
     found, failures = _solve(work, actor, room)
     settings = {"mosh": work.config, "model": work.name, "layout": found.layout_name, "held out": work.hold_out}
-    about = {"model": work.name, "layout": found.layout_name, "held_out": work.hold_out, "sex": found.guess,
-             "recordings": [r.path.name for r in actor.recordings]}
-    write_person(folder, found.result, about)
+    _write_person(folder, found.result, {
+        "model": work.name, "layout": found.layout_name, "held_out": work.hold_out, "sex": found.guess,
+        "recordings": [r.path.name for r in actor.recordings]})
     figures: dict[str, list[Metric]] = {}
     total = len(found.takes) + 1
     for i, take in enumerate(found.takes):
         room.tell(HALF + HALF * i // total, 2 * HALF)
         figures[take.name] = _write(work, found, take, room, settings)
     room.tell(HALF + HALF * (total - 1) // total, 2 * HALF)
-    problems = [(take.name, _problem(found, take)) for take in found.takes]
-    metrics = [Metric("model", work.name), *_person_metrics(found), *_figures(found.takes)]
-    if any(problem for _, problem in problems):
-        told = "; ".join(f"{name}: {problem}" for name, problem in problems if problem)
-        metrics.insert(0, Metric("problem", told))
+    problems = "; ".join(f"{take.name}: {why}" for take in found.takes if (why := found.problem(take)))
+    metrics = [Metric("problem", problems)] if problems else []
+    metrics += [Metric("model", work.name), *_person_metrics(found), *_figures(found.takes)]
     person_page(actor.name, found.model, found.result, found.usual, found.takes, metrics, figures,
                 settings).write(folder / "report.html")
     save_png(folder / PICTURE, person_picture(found.model, found.result))
@@ -157,7 +152,7 @@ def _solve(work: Work, actor: Actor, room: Room) -> tuple[_Found, list[str]]:
         soft = result.soft_tissue[i] if result.soft_tissue else None
         held = held_out(model, usual, work.hold_out, markers, result.motions[i], soft)
         takes.append(Take(source.name, source.path, source.who, work.unit, model, subject, markers, result.motions[i],
-                          soft, result.faults[i], held, light))
+                          soft, result.artefacts[i], held, light))
     return _Found(model, guess, result, takes, usual, layout_name), failures
 
 
@@ -175,41 +170,91 @@ def _read(work: Work, recordings: Sequence[Recording]) -> tuple[list[Recording],
 
 
 def _write(work: Work, found: _Found, take: Take, room: Room, settings: Mapping[str, Any]) -> list[Metric]:
-    """A sequence into its folder; the figures."""
-    metrics = [Metric("layout", found.layout_name), *_figures([take])]
-    solved = found.model, take.markers, take.motion, take.soft, take.faults, take.held
+    """A sequence into its folder, in steps that are kept; the figures."""
+    metrics, factor = [Metric("layout", found.layout_name), *_figures([take])], work.config.exaggeration
+    solved = found.model, take.markers, take.motion, take.soft, take.artefacts, take.held
 
-    def files(folder: Path) -> None:
+    def place(folder: Path) -> Path:
         (folder / take.name).mkdir(exist_ok=True)
-        write_take(folder / take.name, take, work.keys, work.factor)
+        return folder / take.name
 
-    def character(folder: Path) -> tuple[Any, str]:
-        (folder / take.name).mkdir(exist_ok=True)
+    def character(folder: Path) -> tuple[np.ndarray, str]:
         assert work.character is not None, "asked for"
-        return _character(work.character, take, folder / take.name, work.keys, work.factor)
+        return _character(work.character, take, place(folder), factor)
 
     def page(folder: Path) -> None:
-        start, place = time.perf_counter(), folder / take.name
-        place.mkdir(exist_ok=True)
+        start = time.perf_counter()
         page = take_page(take, metrics)
         if shown is not None:
-            page.section("On a character", "The same turns of the joints, and feet on the ground when those of the "
-                         f"person are; soft tissue taken {work.factor:g} times.").picture(*shown)
-        closing(page, metrics, settings).write(place / "report.html")
-        save_png(place / PICTURE, take_picture(take))
-        outcome = Outcome(place, metrics, settings, problem=_problem(found, take))
+            page.section("On a character", "The same rotations of the joints, and feet on the ground when those of the "
+                         f"person are; soft tissue taken {factor:g} times.").picture(*shown)
+        closing(page, metrics, settings).write(place(folder) / "report.html")
+        save_png(place(folder) / PICTURE, take_picture(take))
+        outcome = Outcome(place(folder), metrics, settings, problem=found.problem(take))
         write_report(outcome, work.command, time.perf_counter() - start)
 
-    room.files(f"{take.name} files", (solved, take.path, take.who, take.unit, work.keys, work.factor), files)
-    shown = None if work.character is None else room.files(
-        f"{take.name} character", (solved, work.character, work.keys, work.factor), character)
-    room.files(f"{take.name} page", (solved, metrics, settings, shown and (shown, work.factor)), page)
+    room.files(f"{take.name} files", (solved, take.path, take.who, take.unit, factor),
+               lambda folder: write_take(place(folder), take, factor))
+    shown: tuple[np.ndarray, str] | None = None if work.character is None else room.files(
+        f"{take.name} character", (solved, work.character, factor), character)
+    room.files(f"{take.name} page", (solved, metrics, settings, shown and (shown, factor)), page)
     return metrics
 
 
-def _problem(found: _Found, take: Take) -> str | None:
-    """Why the motion of a sequence means nothing."""
-    return motion_problem(take.motion, take.subject.template, found.result.layout, take.markers)
+def _write_person(folder: Path, result: MoshResult, about: Mapping[str, Any]) -> None:
+    """subject.json with the betas and how they were found, layout.json with where the markers sat."""
+    person = result.person
+    moved = dict(zip(result.layout.labels, person.moved.tolist(), strict=True))
+    storage.write_json(folder / "subject.json", {
+        "betas": result.betas.tolist(), **plain(about), "frames": person.frames.tolist(), "moved": moved,
+        "residual": person.residual, "energies": plain(person.energies), "converged": bool(person.converged)})
+    result.layout.save(folder / "layout.json")
+
+
+def write_take(folder: Path, take: Take, factor: float = 1.0) -> None:
+    """All files of a sequence but its page; exaggerated.glb where the factor on the change of shape is not 1."""
+    motion, body, soft = take.motion, take.subject, take.soft
+    write_motion(folder, motion, body)
+    shown = spread_frames(len(motion.poses), KEYS)
+    write_glb(folder / "animation.glb", motion, body, KEYS, None if soft is None else take.bodies(shown))
+    if soft is not None:
+        soft.save(folder / "soft_tissue.npz")
+        write_residuals(folder / "residuals_soft.csv", soft.motion)
+        if factor != 1:
+            write_glb(folder / "exaggerated.glb", soft.motion, body, KEYS, soft.vertices(take.model, shown, factor))
+    c3d = take.path.suffix.lower() == ".c3d"
+    write_virtual(folder / "virtual.c3d", take.artefacts, take.path if c3d else None, take.who, take.unit)
+    _write_artefacts(folder, take.artefacts)
+
+
+def _write_artefacts(folder: Path, found: MarkerArtefacts) -> None:
+    """artefacts.json with swapped labels, bad spans and how much was filled in, and the spans as artefacts.csv."""
+    storage.write_json(folder / "artefacts.json", artefact_table(found))
+    rows: list[tuple[str, str, int, int, str]] = [
+        *(("swapped", f"{s.first} {s.second}", s.begin, s.end, "") for s in found.swaps),
+        *((b.kind, b.label, b.begin, b.end, f"{b.distance:.4g}") for b in found.bad)]
+    path = folder / "artefacts.csv"
+    with storage.writing(path) as beside, open(beside, "w", newline="", encoding="utf-8") as out:
+        table = csv.writer(out)
+        table.writerow(["artefact", "markers", "begin", "end", "distance"])
+        rows.sort(key=lambda row: (row[2], row[1]))
+        table.writerows(rows)
+
+
+def _character(character: BodyModel, take: Take, folder: Path, factor: float) -> tuple[np.ndarray, str]:
+    """The motion on a character: character.npz, character.glb; a picture, and what it shows."""
+    if take.soft is not None:
+        moving = retarget_soft_tissue(take.soft, take.model, character, factor)
+        moving.save(folder / "character.npz")
+        write_character(folder / "character.glb", character, moving, KEYS)
+        return (picture_transfer(take.model, take.soft, character, moving),
+                "the person, the character, and how far the character's skin is stretched or squeezed")
+    body = character.subject(np.zeros(character.n_betas))
+    motion = retarget(take.motion, take.subject, body)
+    motion.save(folder / "character.npz")
+    write_glb(folder / "character.glb", motion, body, KEYS)
+    frames = spread_frames(len(motion.poses), 8)
+    return picture_bodies(motion, body, motion.vertices(body, frames), frames), ""
 
 
 def _person_metrics(found: _Found) -> list[Metric]:
@@ -235,8 +280,7 @@ def _speeds(found: _Found) -> list[Metric]:
 
 def _figures(takes: Sequence[Take]) -> list[Metric]:
     """What motions are judged by, of all frames together."""
-    T = sum(len(take.motion.poses) for take in takes)
-    out = [Metric("frames", T)]
+    out = [Metric("frames", sum(len(take.motion.poses) for take in takes))]
     if len(takes) == 1:
         out.append(Metric("rate", takes[0].motion.rate, "1/s"))
     fixed, soft = ([t.motion.residuals for t in takes], [t.soft.motion.residuals for t in takes if t.soft is not None])
@@ -245,28 +289,11 @@ def _figures(takes: Sequence[Take]) -> list[Metric]:
     for name, values in zip(ERRORS, (fixed, soft, [h.fixed for h in held], held_soft), strict=True):
         if values:
             out.append(Metric(name, MM * float(np.nanmean(np.concatenate([v.ravel() for v in values]))), "mm"))
-    missing = sum(int((~t.markers.select(t.faults.labels).seen).sum()) for t in takes)
-    filled = sum(sum(fault_table(t.faults)["filled"].values()) for t in takes)
-    share = 100 / max(sum(t.faults.simulated[..., 0].size for t in takes), 1)
-    return [*out, Metric("exchanges", sum(len(t.faults.exchanges) for t in takes)),
-            Metric("bad spans", sum(len(t.faults.bad) for t in takes)),
+    missing = sum(int((~t.markers.select(t.artefacts.labels).seen).sum()) for t in takes)
+    filled = sum(sum(artefact_table(t.artefacts)["filled"].values()) for t in takes)
+    share = 100 / max(sum(t.artefacts.simulated[..., 0].size for t in takes), 1)
+    return [*out, Metric("swaps", sum(len(t.artefacts.swaps) for t in takes)),
+            Metric("bad spans", sum(len(t.artefacts.bad) for t in takes)),
             Metric("markers missing", share * missing, "%"),
             Metric("taken out as bad", share * max(filled - missing, 0), "%"),
             Metric("gaps filled in", filled, "positions")]
-
-
-def _character(character: BodyModel, take: Take, folder: Path, keys: int, factor: float
-               ) -> tuple[np.ndarray, str]:
-    """The motion on a character: character.npz, character.glb; a picture, and what it shows."""
-    if take.soft is not None:
-        moving = retarget_soft_tissue(take.soft, take.model, character, factor)
-        moving.save(folder / "character.npz")
-        write_character(folder / "character.glb", character, moving, keys)
-        return (picture_transfer(take.model, take.soft, character, moving),
-                "the person, the character, and how far the character's skin is stretched or squeezed")
-    body = character.subject(np.zeros(character.n_betas))
-    motion = retarget(take.motion, take.subject, body)
-    motion.save(folder / "character.npz")
-    write_glb(folder / "character.glb", motion, body, keys)
-    frames = key_frames(motion, 8)
-    return morph_frames(motion, body, motion.vertices(body, frames), frames), ""

@@ -1,36 +1,40 @@
-"""A body that carries markers: where they are, and the normal equations of a batch of frames."""
+"""A body that carries markers, in the fewest products: the inner loop of animation.
+
+A feature of a part's shape depends on the joints of that part alone, so the sum over all products of a
+feature and a rotation falls apart into one local shape a part, rotated once:
+
+    Y = Σ_p (K_p + Σ_j Σ_c f_c(t_j) B_{p,j,c}) R_pᵀ + origin + trans
+
+Everything is done for a batch of poses. Derivatives are by small rotations of every joint from the right,
+`R_parent exp(pose) exp(d)`, so that no chart ends at a half turn.
+"""
 from __future__ import annotations
 
 import numpy as np
 
 from model.features import twists
-from model.linear import Subject
+from model.linear import PointOperator, Subject
 from scanprep.geometry import rotations
 from scanprep.geometry.least_squares import Dense
 from scanprep.geometry.mesh import Mesh
+from scanprep.skeleton.tree import Skeleton
 
+from ... import energy
 from ...bodies import FixedBody
 from ...energy import MovingPoints, moving_points
 from ...priors import gaussian_prior
 from ..marker_sets.layout import MarkerLayout
-from . import fast_rotations as turns
-from .marker_points import PartShapes, marker_shapes
 
 System = tuple[np.ndarray, np.ndarray, np.ndarray]                      # energy, half its gradient, Gauss-Newton matrix
 BATCH = 64                           # frames whose parts are held at once
+SAMPLES = 120                        # poses from which the turning of the normals is learned
+RIDGE = 1e-2                         # that holds a normal to its part where the poses say little
 
 
 class MarkedBody:
-    """A body of known shape with markers; unknowns are x = (pose (3J), trans (3)), steps are small turns.
+    """A body of known shape with markers; unknowns are x = (pose (3J), trans (3)), steps are small rotations.
 
-    A step (P,) turns every joint from the right, `exp(pose) exp(d)`, so that nothing happens at a half turn.
-
-    Parameters
-    ----------
-    subject : Subject
-    layout : MarkerLayout
-    prior_weight, prior_shrinkage : float
-        See `AnimateConfig`.
+    A step (P,) rotates every joint from the right, `exp(pose) exp(d)`, so that nothing happens at a half turn.
     """
 
     def __init__(self, subject: Subject, layout: MarkerLayout, prior_weight: float, prior_shrinkage: float) -> None:
@@ -55,25 +59,18 @@ class MarkedBody:
     def follow(self, x: np.ndarray) -> MovingPoints:
         """The markers for unknowns (B, P), with their derivatives by the unknowns themselves."""
         pose, trans, _ = self.body.split(x)
-        y, by_turn = self.shapes.columns(pose, trans)
+        y, by_rotation = self.shapes.columns(pose, trans)
         B, J = pose.shape[:2]
-        by_turn = np.moveaxis(by_turn.reshape(B, J, 3, 3, self.count), 2, -1)                    # (B, J, 3, L, 3)
-        by_pose = by_turn @ rotations.right_jacobian(pose)[:, :, None]
+        by_rotation = np.moveaxis(by_rotation.reshape(B, J, 3, 3, self.count), 2, -1)            # (B, J, 3, L, 3)
+        by_pose = by_rotation @ rotations.right_jacobian(pose)[:, :, None]
         return moving_points(np.swapaxes(y, -1, -2),
                              by_pose.transpose(0, 3, 2, 1, 4).reshape(B, self.count, 3, 3 * J))
 
     def system(self, x: np.ndarray, targets: np.ndarray, weights: np.ndarray, stiff: float = 1.0) -> Dense:
         """Markers and pose prior: energy (B,), half its gradient (B, P) and Gauss-Newton matrix (B, P, P).
 
-        Parameters
-        ----------
-        x : (B, P) float
-        targets : (B, L, 3) float, metres
-            NaN where a marker was not seen.
-        weights : (B, L) float
-            Factor on the squared distance.
-        stiff : float
-            Further factor on the pose prior.
+        For unknowns (B, P), markers (B, L, 3), metres, NaN where not seen, and factors on their squared distances
+        (B, L); `stiff` is a further factor on the pose prior.
 
         [SCAPE] §8
         """
@@ -101,16 +98,17 @@ class MarkedBody:
 
     def retract(self, x: np.ndarray, step: np.ndarray) -> np.ndarray:
         """The unknowns (..., P) after a step (..., P); poses come out at most a half turn long."""
-        n = self.body.n_angles
-        out = x + step
-        out[..., :n] = turns.compose(*(a[..., :n].reshape(-1, 3) for a in (x, step))).reshape(*x.shape[:-1], n)
-        return out
+        return self._composed(x, x, step)
 
     def step_to(self, x: np.ndarray, goal: np.ndarray) -> np.ndarray:
         """The step (..., P) that leads from unknowns (..., P) to others."""
+        return self._composed(x, -x, goal)
+
+    def _composed(self, x: np.ndarray, first: np.ndarray, second: np.ndarray) -> np.ndarray:
         n = self.body.n_angles
-        out = goal - x
-        out[..., :n] = turns.compose(*(a[..., :n].reshape(-1, 3) for a in (-x, goal))).reshape(*x.shape[:-1], n)
+        out = first + second
+        out[..., :n] = rotations.compose(first[..., :n].reshape(-1, 3), second[..., :n].reshape(-1, 3)
+                                         ).reshape(*x.shape[:-1], n)
         return out
 
 
@@ -118,42 +116,170 @@ def point_system(shapes: PartShapes, pose: np.ndarray, trans: np.ndarray, target
                  ) -> System:
     """Points that are to be at their targets (B, L, 3): energy (B,), half its gradient, Gauss-Newton matrix.
 
-    Parameters
-    ----------
-    pose, trans : (B, J, 3), (B, 3) float
-    targets : (B, L, 3) float, metres
-        NaN where there is none.
-    weights : (B, L) float
-        Factor on the squared distance.
+    Targets are NaN where there is none; `weights` (B, L) are factors on the squared distance.
     """
-    y, by_turn = shapes.columns(pose, trans)
-    (B, n), L = by_turn.shape[:2], shapes.count
+    y, by_rotation = shapes.columns(pose, trans)
+    (B, n), L = by_rotation.shape[:2], shapes.count
     missing = np.isnan(targets[..., 0])
     root = np.sqrt(np.where(missing, 0.0, weights))[:, None]
     residual = (root * np.where(missing[:, None], 0.0, y - np.swapaxes(targets, -1, -2))).reshape(B, -1)
     columns = np.empty((B, n + 3, 3, L))
-    np.multiply(by_turn, root[:, None], out=columns[:, :n])
+    np.multiply(by_rotation, root[:, None], out=columns[:, :n])
     columns[:, n:] = np.eye(3)[:, :, None] * root[:, None]
     A = columns.reshape(B, n + 3, -1)
     return (residual**2).sum(axis=1), (A @ residual[..., None])[..., 0], A @ np.swapaxes(A, -1, -2)
 
 
-def supports(template: Mesh, layout: MarkerLayout) -> tuple[np.ndarray, np.ndarray]:
-    """Three points of the skin for each marker: below it, and two around it that span its tangent plane.
+class PartShapes:
+    """Points (L) of a body as local shapes of its parts; coordinates come before points, (3, L), everywhere."""
 
-    A marker on a triangle has the triangle's own plane. For one on a vertex the two are weighted sums of the ring of
-    neighbours, with cosines and sines of the angle about the normal as weights, so that their cross product is a
-    smooth normal that moves with the body.
+    def __init__(self, operator: PointOperator) -> None:
+        terms, features = operator.terms, operator.terms.features
+        self.skeleton, self.lift, self.origin = terms.skeleton, features.lift, operator.origin
+        J, L, m = len(terms.skeleton.parents), operator.count, features.lift.width
+        self.joints, self.count = J, L
+        flat = operator.basis.transpose(0, 2, 1).reshape(terms.count, -1)
+        of_part = terms.part == np.arange(J)[:, None]
+        self.constant = ((of_part * features.constant[terms.feature]) @ flat).reshape(J, 3, L)
+        uses = np.array([features.uses[terms.feature[mine]].any(axis=0) for mine in of_part])    # (J parts, J joints)
+        mix = features.mix[:, :, terms.feature]                                                  # (J, m, M)
+        self.bends = {(int(p), int(j)): ((mix[j] * of_part[p]) @ flat).reshape(m, 3, L)
+                      for p, j in np.argwhere(uses)}
+        self._below = terms.skeleton.descends.T.astype(float)
+        self._levels = _levels(terms.skeleton)
+        self._arrange()
 
-    Returns
-    -------
-    (3 L, k) int
-        Vertices, padded by repeats.
-    (3 L, k) float
-        Weights; each row sums to 1.
+    def _arrange(self) -> None:
+        """Lay the bends out part by part and joint by joint, padded with zeros to one length."""
+        J, L, m = self.joints, self.count, self.lift.width
+        self._joint_of, by_part = _padded([[j for q, j in self.bends if q == p] for p in range(J)])
+        self._part_of, by_joint = _padded([[p for p, q in self.bends if q == j] for j in range(J)])
+        self._by_part = np.zeros((*by_part.shape, m, 3, L))
+        self._by_joint = np.zeros((*by_joint.shape, m, 3, L))
+        for p, i in np.argwhere(by_part):
+            self._by_part[p, i] = self.bends[p, self._joint_of[p, i]]
+        for j, i in np.argwhere(by_joint):
+            self._by_joint[j, i] = self.bends[self._part_of[j, i], j]
+
+    def rotations(self, pose: np.ndarray) -> np.ndarray:
+        """World rotations (J, B, 3, 3) of the parts at poses (J, B, 3)."""
+        relative = rotations.exp(pose)
+        R = relative.copy()
+        for children, parents in self._levels:
+            R[children] = R[parents] @ relative[children]
+        return R
+
+    def shapes(self, t: np.ndarray) -> np.ndarray:
+        """Local shapes (J, B, 3, L) of the parts at twists (J, B, 3)."""
+        raised = self.lift.evaluate(t.swapaxes(0, 1)).swapaxes(0, 1)                             # (J, B, m)
+        known = raised[self._joint_of].swapaxes(1, 2)                                            # (J, B, n, m)
+        J, B = t.shape[:2]
+        bent = known.reshape(J, B, -1) @ self._by_part.reshape(J, -1, 3 * self.count)
+        return self.constant[:, None] + bent.reshape(J, B, 3, -1)
+
+    def evaluate(self, pose: np.ndarray, trans: np.ndarray) -> np.ndarray:
+        """Places (B, 3, L), metres, at poses (B, J, 3) and trans (B, 3)."""
+        t = twists(pose).swapaxes(0, 1)
+        carried = self.rotations(t) @ self.shapes(t)
+        return carried.sum(axis=0) + (self.origin + trans)[:, :, None]
+
+    def columns(self, pose: np.ndarray, trans: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Places (B, 3, L), metres, at poses (B, J, 3), and their derivatives (B, 3J, 3, L).
+
+        These are by small rotations of the joints from the right; by trans it is the identity.
+        """
+        t = twists(pose).swapaxes(0, 1)
+        (J, B), L = t.shape[:2], self.count
+        R = self.rotations(t)
+        below = (self._below @ (R @ self.shapes(t)).reshape(J, -1)).reshape(J, B, 3, L)
+        # a rotation about the column ω of R moves x by ω × x = hat(ω) @ x
+        columns = rotations.hat(np.swapaxes(R, -1, -2)).reshape(J, B, 9, 3) @ below
+        slope = self.lift.derivative(t.swapaxes(0, 1)).swapaxes(0, 1) @ rotations.inverse_right_jacobian(t)
+        rotated = R[self._part_of].swapaxes(1, 2)                                                # (J, B, n, 3, 3)
+        along = slope.swapaxes(-1, -2)[:, :, :, None, None, :, None] \
+            * rotated[:, :, None].swapaxes(-2, -3)[..., None, :]
+        columns += (along.reshape(J, 9 * B, -1) @ self._by_joint.reshape(J, -1, L)).reshape(J, B, 9, L)
+        return below[0] + (self.origin + trans)[:, :, None], \
+            columns.reshape(J, B, 3, 3, L).swapaxes(0, 1).reshape(B, 3 * J, 3, L)
+
+    def lift_off(self, part: np.ndarray, offsets: np.ndarray, bends: list[dict[int, np.ndarray]]) -> None:
+        """Add to every point a vector (L, 3), metres, that turns with a part (L,) and bends with its joints.
+
+        `bends` holds for each point (m, 3), metres, of some joints.
+        """
+        for i, p in enumerate(part):
+            self.constant[p, :, i] += offsets[i]
+            for j, bend in bends[i].items():
+                self.bends[p, j][:, :, i] += bend
+        self._arrange()
+
+
+def marker_shapes(subject: Subject, vertex_ids: np.ndarray, weights: np.ndarray, distances: np.ndarray
+                  ) -> PartShapes:
+    """Markers at distances (L,), metres, above the skin as local shapes, the normal fitted once to the exact one.
+
+    Three points of the skin (3L, k) for each marker are those of `supports`. The exact normal, of `energy.above_skin`,
+    is no linear function of the body's features. Over poses drawn from the prior, each marker's normal is regressed on
+    the rotation of the part that it follows best and the lifted twists of that part's joints.
     """
-    base = layout.vertices.reshape(len(layout.labels), -1)
-    weights = np.ones(base.shape) if layout.weights is None else layout.weights
+    shapes = PartShapes(subject.points(vertex_ids[::3], weights[::3]))
+    if not distances.any():
+        return shapes
+    poses = _sample_poses(subject)
+    supports = subject.points(vertex_ids, weights).evaluate(poses)
+    normals = energy.lifted(supports, np.ones(len(distances))) - supports[:, ::3]         # (S, L, 3)
+    back = np.swapaxes(shapes.skeleton.part_rotations(poses), -1, -2)
+    local = (back[:, :, None] @ normals[:, None, ..., None])[..., 0]                      # (S, J, L, 3)
+    part = np.argmin(local.var(axis=0).sum(axis=-1), axis=0)
+    raised = shapes.lift.evaluate(twists(poses))
+    offsets, bends = np.empty((len(part), 3)), []
+    for i, p in enumerate(part):
+        joints = [j for q, j in shapes.bends if q == p]
+        known = raised[:, joints].reshape(len(poses), -1)
+        wanted, middle = local[:, p, i], known.mean(axis=0)
+        A = known - middle
+        slope = np.linalg.solve(A.T @ A + RIDGE * len(poses) * np.eye(A.shape[1]), A.T @ (wanted - wanted.mean(axis=0)))
+        offsets[i] = distances[i] * (wanted.mean(axis=0) - middle @ slope)
+        bends.append(dict(zip(joints, distances[i] * slope.reshape(len(joints), shapes.lift.width, 3), strict=True)))
+    shapes.lift_off(part, offsets, bends)
+    return shapes
+
+
+def _sample_poses(subject: Subject) -> np.ndarray:
+    """Poses (S, J, 3) of the prior, the root at rest."""
+    assert subject.pose_mean is not None and subject.pose_covariance is not None, "a subject with a pose prior"
+    prior = gaussian_prior(subject.pose_mean, subject.pose_covariance)
+    draws = np.random.default_rng(0).standard_normal((SAMPLES, prior.free))
+    poses = np.zeros((SAMPLES, len(prior.mean)))
+    poses[:, 3:] = prior.mean[3:] + np.linalg.solve(prior.whitening[:, 3:], draws.T).T
+    return poses.reshape(SAMPLES, -1, 3)
+
+
+def _levels(skeleton: Skeleton) -> list[tuple[np.ndarray, np.ndarray]]:
+    """Parts of equal depth in the tree and their parents, from the root's children on."""
+    depth = np.zeros(len(skeleton.parents), dtype=int)
+    for j, parent in enumerate(skeleton.parents):
+        depth[j] = depth[parent] + 1 if j else 0
+    levels = [np.flatnonzero(depth == d) for d in range(1, depth.max() + 1)]
+    return [(children, skeleton.parents[children]) for children in levels]
+
+
+def _padded(lists: list[list[int]]) -> tuple[np.ndarray, np.ndarray]:
+    """Lists of different lengths as rows (n, width), and which entries are real."""
+    width = max(1, max(len(row) for row in lists))
+    return (np.array([row + [0] * (width - len(row)) for row in lists]),
+            np.array([[i < len(row) for i in range(width)] for row in lists]))
+
+
+def supports(template: Mesh, layout: MarkerLayout) -> tuple[np.ndarray, np.ndarray]:
+    """Three points of the skin for each marker, below it and two around it that span its tangent plane.
+
+    They are vertices (3L, k), padded by repeats, and weights (3L, k) of which each row sums to 1. A marker on a
+    triangle has the triangle's own plane. For one on a vertex the two are weighted sums of the ring of neighbours, with
+    cosines and sines of the angle about the normal as weights, so that their cross product is a smooth normal that
+    moves with the body.
+    """
+    base, weights = layout.skin
     if base.max(initial=0) >= len(template.vertices):
         raise ValueError(f"layout: expected vertices of 0..{len(template.vertices) - 1}, got {base.max()}")
     adjacency = template.vertex_adjacency

@@ -1,4 +1,4 @@
-"""Which markers are believed: weights that outliers lose, and labels that two markers have exchanged."""
+"""Which markers are believed: weights that outliers lose, and labels that two markers have swapped."""
 from __future__ import annotations
 
 import numpy as np
@@ -10,32 +10,18 @@ from ...motion import Motion
 from ..files.markers import MarkerSequence
 from ..marker_sets.layout import MarkerLayout
 
-ASTRAY = 0.025                       # of the size, 34 mm on a man; good motions 4 to 25, sides exchanged 36 to 60
+ASTRAY = 0.025                       # of the size, 34 mm on a man; good motions 4 to 25, sides swapped 36 to 60
 WIDEST = 5.0                         # metres; a marker farther off is an outlier on however bad a fit
-ENTER, LEAVE = 0.5, 1.0              # share of the distance that remains when labels are exchanged, and put back
+ENTER, LEAVE = 0.5, 1.0              # share of the distance that remains when labels are swapped, and put back
 
 
 def marker_weights(positions: np.ndarray, targets: np.ndarray, sd: float, outlier: float
                    ) -> tuple[np.ndarray, np.ndarray]:
-    """Weights of the markers of frames, low for outliers, and whether each is believed.
+    """Factors (..., L) on the squared distances of markers, low for outliers, 0 where nothing was seen; which count.
 
-    What is common to all markers does not make an outlier: the body may be a step behind.
-
-    Parameters
-    ----------
-    positions : (..., L, 3) float, metres
-        Where the body puts them.
-    targets : (..., L, 3) float, metres
-        NaN where a marker was not seen.
-    sd, outlier : float, metres
-        See `AnimateConfig`.
-
-    Returns
-    -------
-    (..., L) float
-        Factors on the squared distance, zero where nothing was seen.
-    (..., L) bool
-        Seen, and of more than a quarter of the full weight.
+    Places and targets are (..., L, 3), metres, NaN where a marker was not seen; `sd` and `outlier` as in
+    `AnimateConfig`. What is common to all markers does not make an outlier: the body may be a step behind. Those count
+    that have more than a quarter of the full weight.
     """
     squared, scale = distances_apart(positions, targets, outlier)
     share = np.where(np.isnan(squared), 0.0, (scale**2 / (scale**2 + squared))**2)
@@ -65,8 +51,29 @@ def misfit(apart: np.ndarray, outlier: float) -> np.ndarray:
     return np.nanmean(squared / (outlier**2 + squared), axis=-1)
 
 
-def exchangeable(positions: np.ndarray, targets: np.ndarray, outlier: float) -> np.ndarray:
-    """Frames (T,) bool in which a `LabelWatch` would exchange some labels, for places and targets (T, L, 3)."""
+def judge(positions: np.ndarray, targets: np.ndarray, order: np.ndarray, outlier: float
+          ) -> tuple[np.ndarray, np.ndarray]:
+    """Residuals (..., L), metres, of the markers as they came, and which were believed under their own label.
+
+    `order` (..., L) is which column each marker was taken from.
+    """
+    residuals = np.linalg.norm(positions - targets, axis=-1)
+    squared, scale = distances_apart(positions, targets, outlier)
+    return residuals, (squared < scale**2) & (order == np.arange(order.shape[-1]))
+
+
+def label_order(positions: np.ndarray, targets: np.ndarray, outlier: float) -> np.ndarray:
+    """Which column (T, L) each marker is taken from, the body having them at places (T, L, 3)."""
+    watch, order = LabelWatch(positions.shape[1], outlier), np.empty(positions.shape[:2], dtype=np.int64)
+    for t, uncertain in enumerate(_may_be_swapped(positions, targets, outlier)):
+        if uncertain or not watch.idle:
+            watch.update(positions[t], targets[t])
+        order[t] = watch.order
+    return order
+
+
+def _may_be_swapped(positions: np.ndarray, targets: np.ndarray, outlier: float) -> np.ndarray:
+    """Frames (T,) bool in which a `LabelWatch` would swap some labels, for places and targets (T, L, 3)."""
     squared, scale = distances_apart(positions, targets, outlier)
     suspect = squared > (0.5 * scale)**2
     out = np.zeros(len(targets), dtype=bool)
@@ -78,24 +85,17 @@ def exchangeable(positions: np.ndarray, targets: np.ndarray, outlier: float) -> 
 
 
 def _gains(places: np.ndarray, targets: np.ndarray, scale: float) -> np.ndarray:
-    """Pairs (n, n) bool that would fit well if they exchanged their targets, and do not as they are."""
+    """Pairs (n, n) bool that would fit well if they swapped their targets, and do not as they are."""
     apart = np.linalg.norm(places[:, None] - targets, axis=2)
     own = np.diag(apart)
     return (apart + apart.T < ENTER * (own[:, None] + own)) & (np.maximum(apart, apart.T) < 0.5 * scale)
 
 
 class LabelWatch:
-    """Finds pairs of markers that have exchanged their labels, and remembers them from frame to frame.
+    """Finds pairs of markers, of so many, that have swapped their labels, and remembers them from frame to frame.
 
-    A pair is exchanged when that removes most of the distance of both from where the body would put them,
+    A pair is swapped when that removes most of the distance of both from where the body would put them,
     and put back when the labels as they came fit better again: in between nothing changes.
-
-    Parameters
-    ----------
-    count : int
-        L, the number of markers.
-    outlier : float, metres
-        See `AnimateConfig`.
     """
 
     def __init__(self, count: int, outlier: float) -> None:
@@ -108,19 +108,11 @@ class LabelWatch:
 
     @property
     def idle(self) -> bool:
-        """No labels are exchanged at present."""
+        """No labels are swapped at present."""
         return bool((self.order == np.arange(len(self.order))).all())
 
     def update(self, positions: np.ndarray, targets: np.ndarray) -> np.ndarray:
-        """Which column (L,) each marker is taken from.
-
-        Parameters
-        ----------
-        positions : (L, 3) float, metres
-            Where the body puts the markers.
-        targets : (L, 3) float, metres
-            As they came.
-        """
+        """Which column (L,) each marker is taken from, for places on the body and markers as they came (L, 3)."""
         taken = targets[self.order]
         squared, scale = distances_apart(positions, taken, self.outlier)
         suspect = squared > (0.5 * scale)**2                            # never of NaN
@@ -142,14 +134,9 @@ class LabelWatch:
 
 
 def motion_problem(motion: Motion, body: Mesh, layout: MarkerLayout, markers: MarkerSequence) -> str | None:
-    """Why a motion from markers means nothing, with the likely cause; None where it means something.
+    """Why a motion from markers of a layout means nothing, with the likely cause; None where it means something.
 
-    Parameters
-    ----------
-    body : Mesh
-        Template of the person's model.
-    layout : MarkerLayout
-        That the markers were followed with.
+    `body` is the template of the person's model.
     """
     seen = np.isfinite(motion.residuals)
     if not seen.any():
@@ -164,4 +151,4 @@ def motion_problem(motion: Motion, body: Mesh, layout: MarkerLayout, markers: Ma
     believed = 100 * float(motion.trusted[seen].mean())
     return (f"the markers are {1000 * off:.0f} mm from where the body has them, {100 * motion.converged.mean():.0f}% "
             f"of the frames settled and {believed:.0f}% of the markers are believed; "
-            + (wrong or "labels of left and right exchanged, another layout, or another model?"))
+            + (wrong or "labels of left and right swapped, another layout, or another model?"))

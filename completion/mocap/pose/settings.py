@@ -2,9 +2,11 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Annotated, Literal
 
-from scanprep.ranges import Count, Positive, Settings, Share, Signed
+from scanprep.ranges import FLAG, Positive, Settings, Share, Signed
+
+RATE = 120.0                         # frames per second for which the weight of the velocity is meant
 
 
 @dataclass(frozen=True)
@@ -22,23 +24,11 @@ class AnimateConfig(Settings):
         Factor on the pose prior: small, it speaks for joints that no marker sees.
     prior_shrinkage : float in [0, 1]
         See `gaussian_prior`.
-    start_axes : int
-        Directions of the training poses along which the first frame is searched.
     prediction : "velocity" or "kalman"
         What a frame is expected to be: the one before, moved on at its velocity and held by how strongly
         joints accelerate; or a Kalman filter, whose uncertainty remembers what the markers have told.
     angle_acceleration : float, radians per second squared
         How strongly joints accelerate, as a standard deviation.
-    place_acceleration : float, metres per second squared
-        The same for the place.
-    momentum : float in [0, 1]
-        Share of the velocity that the prediction keeps.
-    iterations : int
-        Most steps for a frame.
-    lost : float, metres
-        Median residual of a frame above which it is searched anew, as one is that a fifth of its markers belie.
-    key_interval : float, seconds
-        Between the frames of a whole sequence that are solved one after the other; the others begin between them.
     smoothing : int
         Rounds over the whole sequence; 0 leaves the frame-by-frame solution.
     low_pass : float, hertz
@@ -53,15 +43,9 @@ class AnimateConfig(Settings):
     outlier: Positive = 0.06
     prior_weight: float = 0.3
     prior_shrinkage: Share = 0.3
-    start_axes: int = 6
     prediction: Literal["velocity", "kalman"] = "kalman"
     angle_acceleration: Positive = 60.0
-    place_acceleration: Positive = 15.0
-    momentum: Share = 0.95
-    iterations: Count = 3
-    lost: Positive = 0.08
-    key_interval: Positive = 0.1
     smoothing: int = 2
     low_pass: float = 0.0
-    ground: bool = False
+    ground: Annotated[bool, FLAG] = False
     floor: tuple[Signed, Signed, Signed, Signed] | None = None

@@ -10,13 +10,15 @@ from model.linear import Subject
 from scanprep.geometry.least_squares import Dense, Minimum, levenberg_marquardt
 
 from ..marker_sets.layout import MarkerLayout
-from .first_frame import search
+from .initialise import search
 from .marked_body import MarkedBody
-from .prediction import make_prediction
-from .robust import LabelWatch, distances_apart, marker_weights, misfit
+from .prediction import prediction_of
+from .robust import LabelWatch, judge, marker_weights, misfit
 from .settings import AnimateConfig
 
+STEPS = 3                            # most for a frame
 ENOUGH = 0.5                         # share of the markers that a search wants
+LOST = 0.08                          # metres, median residual of a frame above which it is searched anew
 BELIED = 0.2                         # share of the markers seen that are outliers on a body gone astray
 PATIENCE = 0.25                      # seconds from a search that found nothing to the next; then twice as many
 DOUBT = 0.25                         # seconds for which frames that no body explains are taken for wrong
@@ -99,35 +101,29 @@ class MarkerStream:
         tracker, targets = self.tracker, positions[self.rows]
         x, settled = tracker.push(targets)
         residuals, trusted = np.full(self.n_labels, np.nan), np.zeros(self.n_labels, dtype=bool)
-        residuals[self.rows], trusted[self.rows] = judge(tracker.places, targets, tracker.watch.order, tracker.config)
+        residuals[self.rows], trusted[self.rows] = judge(tracker.places, targets, tracker.watch.order,
+                                                        tracker.config.outlier)
         pose, trans, _ = tracker.body.body.split(x)
         return Frame(pose, trans, residuals, trusted & tracker.believed, settled)
 
 
 class Tracker:
-    """The state of a stream of markers (L, 3) that all belong to the body.
+    """The state of a stream of markers (L, 3) that all belong to the body, `rate` frames a second."""
 
-    Parameters
-    ----------
-    body : MarkedBody
-    config : AnimateConfig
-    rate : float, frames per second
-    """
-
-    def __init__(self, body: MarkedBody, config: AnimateConfig, rate: float) -> None:
-        self.body, self.config, self.rate = body, config, rate
+    def __init__(self, body: MarkedBody, config: AnimateConfig, rate: float, steps: int = STEPS) -> None:
+        self.body, self.config, self.rate, self.steps = body, config, rate, steps
         self.watch = LabelWatch(body.count, config.outlier)
-        self.prediction = make_prediction(body, config, rate)
+        self.prediction = prediction_of(body, config, rate)
         self.wait, self.patience, self.started = 0, PATIENCE * rate, False
         self.places = np.full((body.count, 3), np.nan)                  # of the markers on the body of the last frame
-        self.believed, self.since, self.doubts = False, 0, 0            # frames since one was believed, and doubted
+        self.believed, self.since, self.passed = False, 0, 0            # frames since one was believed, passed over
         self.leapt = self.places                                        # where the last frame would have had the body
 
     def begin(self, x: np.ndarray) -> None:
         """Continue from these unknowns (P,), at rest."""
         self.prediction.begin(x)
         self.watch.forget()
-        self.started, self.since, self.doubts = True, 0, 0
+        self.started, self.since, self.passed = True, 0, 0
 
     def push(self, targets: np.ndarray) -> tuple[np.ndarray, bool]:
         """Unknowns (P,) of the next frame, NaN before the first that could be solved, and whether it settled."""
@@ -138,9 +134,9 @@ class Tracker:
         if fresh:
             if not enough:
                 return np.full(self.body.n_unknowns, np.nan), False
-            doubts = self.doubts
+            passed = self.passed
             self.begin(search(self.body, targets, self.config))
-            self.doubts = doubts
+            self.passed = passed
         expected, information = self.prediction.expect()
         self.places = before = self.body.positions(expected)
         if not there:
@@ -148,7 +144,7 @@ class Tracker:
             return expected, False
         order = self.watch.order.copy()
         taken = targets[self.watch.update(before, targets)]
-        end = self.solve(taken, expected, information)
+        end = self._solve(taken, expected, information)
         x, settled, found = end.x[0], bool(end.converged[0]), None
         self.places = self.body.positions(x)
         if not self.wait and enough and not fresh and self._astray(taken):
@@ -156,7 +152,7 @@ class Tracker:
             if found is not None:
                 x, settled = found, True
                 self.places = self.body.positions(x)
-        if self._doubtful(taken, before):
+        if self._to_pass_over(taken, before):
             self.watch.order, self.places = order, before
             if fresh:
                 self.started = False
@@ -169,6 +165,19 @@ class Tracker:
             self.prediction.update(x, end.equations.hessian[0] - information)
         return x, settled
 
+    def _solve(self, targets: np.ndarray, expected: np.ndarray, information: np.ndarray) -> Minimum[np.ndarray]:
+        """The best unknowns of a frame near the expected ones, which put the markers where `places` says."""
+        body, config = self.body, self.config
+        weights, _ = marker_weights(self.places, targets, config.marker_sd, config.outlier)
+
+        def system(x: np.ndarray) -> Dense:
+            cost, gradient, hessian = body.system(x, targets[None], weights[None])
+            step = body.step_to(expected, x[0])
+            pull = information @ step
+            return Dense(cost + step @ pull, gradient + pull, hessian + information)
+
+        return levenberg_marquardt(system, expected[None], self.steps, 1e-2, 1e-4, retract=body.retract)
+
     def _found(self, targets: np.ndarray) -> np.ndarray | None:
         """Unknowns (P,) that a search finds and that fit much better than the body at `places`, or None."""
         found = search(self.body, targets, self.config)
@@ -180,59 +189,30 @@ class Tracker:
         self.wait, self.patience = round(self.patience), 2 * self.patience
         return None
 
-    def _doubtful(self, targets: np.ndarray, before: np.ndarray) -> bool:
+    def _to_pass_over(self, targets: np.ndarray, before: np.ndarray) -> bool:
         """Whether the markers (L, 3) are to be passed over, the body at `places` having been expected at `before`.
 
         No body explains them, or it would have leapt there: that is believed when the next frame says the same, and
         anything when it goes on for long.
         """
-        near = self.config.lost + FASTEST * self.since / self.rate
-        lost = bool(np.nanmedian(np.linalg.norm(self.places - targets, axis=1)) > self.config.lost)
+        near = LOST + FASTEST * self.since / self.rate
+        lost = bool(np.nanmedian(np.linalg.norm(self.places - targets, axis=1)) > LOST)
         leapt, self.leapt = self.leapt, np.full_like(before, np.nan) if lost else self.places
         self.believed = not lost and min(_apart(self.places, before), _apart(self.places, leapt)) <= near
         if self.believed:
-            self.since = self.doubts = 0
+            self.since = self.passed = 0
             return False
-        self.doubts += 1
-        return self.doubts <= DOUBT * self.rate
+        self.passed += 1
+        return self.passed <= DOUBT * self.rate
 
     def _astray(self, targets: np.ndarray) -> bool:
         """The body has lost its markers (L, 3), or many of them."""
         apart = np.linalg.norm(self.places - targets, axis=1)
         apart = apart[~np.isnan(apart)]
-        return bool(np.median(apart) > self.config.lost or (apart > self.config.outlier).mean() > BELIED)
-
-    def solve(self, targets: np.ndarray, expected: np.ndarray, information: np.ndarray) -> Minimum[np.ndarray]:
-        """The best unknowns of a frame near the expected ones, which put the markers where `places` says."""
-        config, body = self.config, self.body
-        weights, _ = marker_weights(self.places, targets, config.marker_sd, config.outlier)
-
-        def system(x: np.ndarray) -> Dense:
-            cost, gradient, hessian = body.system(x, targets[None], weights[None])
-            step = body.step_to(expected, x[0])
-            pull = information @ step
-            return Dense(cost + step @ pull, gradient + pull, hessian + information)
-
-        return levenberg_marquardt(system, expected[None], config.iterations, 1e-2, 1e-4,
-                                   retract=body.retract)
+        return bool(np.median(apart) > LOST or (apart > self.config.outlier).mean() > BELIED)
 
 
 def _apart(a: np.ndarray, b: np.ndarray) -> float:
     """The median distance of points (L, 3), metres; infinite where some are not known."""
     apart = float(np.median(np.linalg.norm(a - b, axis=1)))
     return np.inf if np.isnan(apart) else apart
-
-
-def judge(positions: np.ndarray, targets: np.ndarray, order: np.ndarray, config: AnimateConfig
-          ) -> tuple[np.ndarray, np.ndarray]:
-    """Residuals (..., L), metres, of the markers as they came, and which were believed under their own label.
-
-    Parameters
-    ----------
-    positions, targets : (..., L, 3) float, metres
-    order : (..., L) int
-        Which column each marker was taken from.
-    """
-    residuals = np.linalg.norm(positions - targets, axis=-1)
-    squared, scale = distances_apart(positions, targets, config.outlier)
-    return residuals, (squared < scale**2) & (order == np.arange(order.shape[-1]))

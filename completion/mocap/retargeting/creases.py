@@ -19,14 +19,6 @@ class Creases:
 
     A triangle is turned over when it faces away from where the rotations of the parts around it turn it, those of
     neighbouring parts mixed over some rings: at a raised shoulder the skin rightly faces away from its own part.
-
-    Parameters
-    ----------
-    rest : Mesh
-        The body at rest.
-    skeleton : Skeleton
-    blend : int
-        Rings over which rotations are mixed; with 0 it is the own part's alone.
     """
 
     def __init__(self, rest: Mesh, skeleton: Skeleton, blend: int = BLEND) -> None:
@@ -98,10 +90,7 @@ def at_rest(model: BodyModel, betas: np.ndarray | None = None) -> Mesh:
 def _membrane(adjacency: csr_array, mine: np.ndarray, fixed: np.ndarray) -> np.ndarray:
     """Places (n, 3) of vertices `mine` in the middle of their neighbours, the rows of `adjacency` (n, N).
 
-    Parameters
-    ----------
-    fixed : (N, 3) float, metres
-        Zero where vertices are free.
+    `fixed` (N, 3), metres: zero where vertices are free.
     """
     inside = csc_array(diags_array(np.asarray(adjacency.sum(axis=1)).ravel()) - adjacency[:, mine])
     return np.asarray(factor(inside)(adjacency @ fixed))

@@ -9,7 +9,7 @@ from scipy.sparse import csr_array
 from model.body import BodyModel
 from model.linear import Subject, posed_product
 
-from ..results import SoftTissue
+from ..soft_tissue.soft_tissue import SoftTissue
 from .retarget import AT_ONCE, retarget, world_up
 
 SOLES = 60                           # points that may touch the ground
@@ -115,12 +115,7 @@ def _products(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.n
 def moving_character(character: BodyModel, soft: SoftTissue, frames: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """The meshes (n, N, 3), metres, of some frames without and with soft tissue.
 
-    Parameters
-    ----------
-    character : BodyModel
-        The model that the soft tissue is of: a character's, or the person's own.
-    soft : SoftTissue
-    frames : (n,) int
+    `frames` (n,).
     """
     poses, trans = soft.motion.poses[frames], soft.motion.trans[frames]
     fixed = soft.motion.vertices(character.subject(soft.motion.betas), frames)

@@ -1,30 +1,123 @@
-"""Soft tissue: a person whose shape changes a little in every frame."""
+"""Soft tissue: a person whose shape changes a little in every frame. [MoSh] Eq. 24"""
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import replace
+from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
 
 from model.body import BodyModel
+from scanprep.geometry import storage
+from scanprep.geometry.sparse import overlapping_windows, solve_smooth
+from scanprep.ranges import Positive, Settings
 from scanprep.threads import one_thread
 
 from ...motion import Motion
 from ..files.markers import MarkerSequence
 from ..marker_sets.layout import MarkerLayout
 from ..pose.marked_body import BATCH
-from ..pose.mosh_poses import RATE, animate_config
-from ..pose.prediction import inertia
 from ..pose.robust import marker_weights
-from ..pose.smooth import FURTHEST, coupled_steps
-from ..results import SoftTissue
-from ..settings import FollowConfig, SoftTissueConfig
-from .equations import SwayingBody, skin_metric
-from .temporal_smoothness import steady_changes
+from ..pose.settings import RATE, AnimateConfig
+from ..pose.smooth import FURTHEST, coupled_steps, inertia
+from .changing_body import ChangingBody, changing_bodies, skin_metric, skin_movement
 
 Progress = Callable[[int, int], None]
 PER_SQUARE_METRE = 1e4               # of a weight on square centimetres
+ROUNDS = 3                           # Gauss-Newton steps over the whole sequence, which begins near its end
 STILL = 0.002                        # metres that the last round moves any marker of a frame that has settled
+WINDOW, OVERLAP = 400, 40            # frames smoothed at once, and those that each side lends to its neighbour
+
+
+@dataclass(frozen=True)
+class SoftTissueConfig(Settings):
+    """Settings of `follow_soft_tissue`.
+
+    Weights stand on squared centimetres, as in the paper, whose own are `published()`. Here the pose prior is a narrow
+    one, which at the paper's 1 keeps poses from their markers, and the shape would bend to make up for it; and
+    velocities are held because the shape would else follow the noise.
+
+    Attributes
+    ----------
+    n_betas : int
+        Components in which the shape may change: at least those of the person, all that the model has at most.
+    data : float
+        Weight of the markers against their simulation.
+    pose : float
+        Weight of the pose prior; the paper's is 1.
+    velocity : float
+        Weight of the squared change of velocity from frame to frame, 120 frames a second; the paper's is 6.25.
+    change : float
+        Weight of the squared change of betas from the person's own.
+    skin : float
+        Weight of the squared distance, in centimetres, that the change moves the skin: the mean over the surface.
+    temporal_smoothness : float
+        Weight of the squared second difference of the change from frame to frame, 120 frames a second, against that
+        of the change itself.
+    outlier : float, metres
+        Residual at which a marker has lost three quarters of its weight.
+    """
+
+    n_betas: int = 200
+    data: float = 0.75
+    pose: float = 0.1
+    velocity: float = 40000.0
+    change: float = 0.25
+    skin: float = 10.0
+    temporal_smoothness: float = 20.0
+    outlier: Positive = 0.06
+
+    @classmethod
+    def published(cls) -> SoftTissueConfig:
+        """The weights of [MoSh] Eq. 24, and nothing that holds the change but its λΔ of 0.25."""
+        return cls(pose=1.0, velocity=6.25, skin=0.0, temporal_smoothness=0.0, outlier=1000.0)
+
+
+@dataclass(frozen=True, eq=False)
+class SoftTissue:
+    """A motion of a body whose shape changes while it moves.
+
+    Attributes
+    ----------
+    motion : Motion
+        Poses and places, and the residuals with the changing shape; `motion.betas` is the person's own shape.
+    changes : (T, K) float
+        What is added to the person's betas in every frame; K may be more than the person's betas, which are zero beyond
+        their end.
+    """
+
+    motion: Motion
+    changes: np.ndarray
+
+    def betas(self, factor: float = 1.0) -> np.ndarray:
+        """(T, K) betas of every frame, the change taken `factor` times: more than 1 exaggerates it."""
+        assert self.motion.betas is not None, "a person of a shape space"
+        own = np.zeros(self.changes.shape[1])
+        own[:len(self.motion.betas)] = self.motion.betas
+        return own + factor * self.changes
+
+    def vertices(self, model: BodyModel, frames: np.ndarray | slice = slice(None), factor: float = 1.0) -> np.ndarray:
+        """The meshes (n, N, 3) of some frames, metres, the change taken `factor` times."""
+        return changing_bodies(model, self.motion.poses[frames], self.betas(factor)[frames], self.motion.trans[frames])
+
+    def movement(self, model: BodyModel) -> np.ndarray:
+        """How far the change moves every vertex (N,) of the skin, metres: the root of the mean square over time."""
+        return skin_movement(model, self.changes)
+
+    def save(self, path: str | Path) -> None:
+        """Write a motion file (see `Motion.save`) that also holds the changes, as `shape_changes`."""
+        self.motion.save(path, shape_changes=self.changes)
+
+    @staticmethod
+    def load(path: str | Path) -> SoftTissue:
+        """Read a file of `save`; StorageError for one that is missing, not a motion, or of a fixed shape."""
+        motion, stored = Motion.load(path), storage.load_arrays(path, "a motion")
+        with storage.taking_apart(path, f"shape_changes, a row for each of {len(motion.poses)} frames"):
+            changes = storage.numbers(stored, "shape_changes", len(motion.poses), None)
+        if motion.betas is None or len(motion.betas) > changes.shape[1]:
+            raise storage.StorageError(f"{path}: expected a person of at most {changes.shape[1]} betas, "
+                                       f"found {0 if motion.betas is None else len(motion.betas)}")
+        return SoftTissue(motion, changes.astype(np.float64))
 
 
 @one_thread()
@@ -67,15 +160,10 @@ def follow_soft_tissue(model: BodyModel, motion: Motion, markers: MarkerSequence
 
 
 class SoftFollower:
-    """The markers of a sequence, and the changing body that is to carry them.
+    """The markers of a sequence, and the changing body that is to carry them; arguments as of `follow_soft_tissue`.
 
     Unknowns are x (T, P) as in `MarkedBody` and changes z (T, K) along directions of which each costs the same: their
     energy is |z|².
-
-    Parameters
-    ----------
-    model, motion, markers, layout, config
-        As for `follow_soft_tissue`.
     """
 
     def __init__(self, model: BodyModel, motion: Motion, markers: MarkerSequence, layout: MarkerLayout,
@@ -88,29 +176,29 @@ class SoftFollower:
         self.targets = markers.positions[:, self.rows]
         K = min(max(config.n_betas, len(motion.betas)), model.n_betas)
         slopes = model.shape_jacobian(model.pose_mean)[..., :K]
-        self.body = SwayingBody(model, motion.betas, layout.select(labels), cheap_directions(model, slopes, config),
-                                slopes, config.pose, config.prior_shrinkage)
-        follow = FollowConfig(config.data, config.pose, config.velocity, config.outlier, config.prior_shrinkage)
-        self.inertia = inertia(animate_config(follow), markers.rate, self.body.marked.n_unknowns)
-        self.steadiness = config.steadiness * (markers.rate / RATE)**4
+        poses = AnimateConfig(prior_weight=config.pose, angle_acceleration=RATE**2 / np.sqrt(config.velocity))
+        self.body = ChangingBody(model, motion.betas, layout.select(labels), cheap_directions(model, slopes, config),
+                                 slopes, config.pose, poses.prior_shrinkage)
+        self.inertia = inertia(poses, markers.rate, self.body.marked.n_unknowns)
+        self.smoothness = config.temporal_smoothness * (markers.rate / RATE)**4
 
     def solve(self, progress: Progress | None = None) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Unknowns (T, P), changes z (T, K), and which frames settled (T,)."""
-        marked, T, rounds = self.body.marked, len(self.targets), self.config.iterations
+        marked, T = self.body.marked, len(self.targets)
         x = marked.body.join(self.motion.poses, self.motion.trans)
         z, moved = np.zeros((T, self.body.n_betas)), np.zeros(T)
         some, weights = self.weights(marked.positions(x))
         targets, weights = self.targets[some], weights[some]
-        for i in range(rounds if len(some) else 0):
+        for i in range(ROUNDS if len(some) else 0):
             earlier = x[some], z[some]
             x[some], z[some] = self.round(*earlier, targets, weights)
-            if i == rounds - 1:
+            if i == ROUNDS - 1:
                 moved[some] = np.linalg.norm(self.body.positions(x[some], z[some]) - self.body.positions(*earlier),
                                              axis=2).max(axis=1)
             if progress:
-                progress(round(T * (i + 1) / (rounds + 1)), T)
-        if self.steadiness and len(some) > 2:
-            z[some] = steady_changes(self.body, x[some], targets, weights, self.steadiness)
+                progress(round(T * (i + 1) / (ROUNDS + 1)), T)
+        if self.smoothness and len(some) > 2:
+            z[some] = smooth_changes(self.body, x[some], targets, weights, self.smoothness)
         if progress:
             progress(T, T)
         return x, z, moved < STILL
@@ -131,7 +219,7 @@ class SoftFollower:
         for start in range(0, T, BATCH):
             some = slice(start, start + BATCH)
             _, g, H = self.body.system(x[some], z[some], targets[some], weights[some])
-            g[:, P:] += z[some]
+            g[:, P:] += z[some]                                         # [MoSh] Eq. 24
             across = H[:, :P, P:]
             right = np.concatenate([np.swapaxes(across, 1, 2), g[:, P:, None]], axis=2)
             back[some] = solved = np.linalg.solve(H[:, P:, P:] + np.eye(self.body.n_betas), right)
@@ -147,17 +235,32 @@ class SoftFollower:
 def cheap_directions(model: BodyModel, slopes: np.ndarray, config: SoftTissueConfig) -> np.ndarray:
     """(K, K) directions of betas, by rows, that each cost one: `Δ = z @ directions` has the energy |z|².
 
-    Parameters
-    ----------
-    model : BodyModel
-    slopes : (N, 3, K) float, metres
-        Derivative of the vertices by betas, in the mean pose.
-    config : SoftTissueConfig
+    `slopes` (N, 3, K) are the derivatives of the vertices by betas in the mean pose, metres.
 
     [MoSh] Eq. 24
     """
     cost = config.change * np.eye(slopes.shape[-1]) + config.skin * PER_SQUARE_METRE * skin_metric(model, slopes)
     return np.asarray(np.linalg.inv(np.linalg.cholesky(cost)))
+
+
+def smooth_changes(body: ChangingBody, x: np.ndarray, targets: np.ndarray, weights: np.ndarray, smoothness: float
+                   ) -> np.ndarray:
+    """The changes z (T, K) of at least 3 frames that follow each other, poses x held, constant velocity of z as prior.
+
+    Minimised is what the markers say, |z|² and `smoothness` times the squared second difference of z over time. Where
+    markers say little it is a low-pass filter; the poses were found with changes free of each other, and filtering
+    these hardly moves a marker.
+    """
+    z, eye = np.empty((len(x), body.n_betas)), np.eye(body.n_betas)
+    for near, kept, where in overlapping_windows(len(x), WINDOW, OVERLAP):
+        gradient = np.empty((near.stop - near.start, body.n_betas))
+        hessian = np.empty((*gradient.shape, body.n_betas))
+        for first in range(0, len(gradient), BATCH):
+            some = slice(near.start + first, min(near.stop, near.start + first + BATCH))
+            mine = slice(first, first + BATCH)
+            gradient[mine], hessian[mine] = body.change_system(x[some], targets[some], weights[some])
+        z[where] = -solve_smooth(hessian + eye, smoothness, gradient)[kept]
+    return z
 
 
 def _check(model: BodyModel, motion: Motion, markers: MarkerSequence, config: SoftTissueConfig) -> None:
@@ -170,6 +273,5 @@ def _check(model: BodyModel, motion: Motion, markers: MarkerSequence, config: So
     if motion.labels != markers.labels or len(motion.poses) != len(markers.positions):
         raise ValueError(f"motion: expected the one of these markers ({len(markers.positions)} frames, "
                          f"{len(markers.labels)} labels), got {len(motion.poses)} frames, {len(motion.labels)} labels")
-    if not config.change > 0 or config.skin < 0 or config.steadiness < 0:
-        raise ValueError(f"config: expected change > 0, skin and steadiness >= 0, got {config.change}, {config.skin} "
-                         f"and {config.steadiness}")
+    if not config.change > 0:
+        raise ValueError(f"config: expected change > 0, got {config.change}")

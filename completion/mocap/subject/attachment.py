@@ -6,15 +6,17 @@ supports, so coefficients are what is solved for: the place in the latent coordi
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Literal
 
 import numpy as np
 
 from scanprep.geometry import rotations
 from scanprep.geometry.mesh import Mesh
-from scanprep.geometry.surface import Surface, barycentric, checked_points, checked_surface
+from scanprep.geometry.surface import Surface, barycentric
 
 from ...energy import MovingPoints
-from ..settings import Attachment
+
+Attachment = Literal["triangle", "neighbourhood"]
 
 
 @dataclass(frozen=True, eq=False)
@@ -35,48 +37,26 @@ class LatentMarkers:
     weights: np.ndarray
     corners: np.ndarray
 
-    @property
-    def count(self) -> int:
-        """L."""
-        return len(self.corners)
-
     def supports(self, vertices: np.ndarray) -> np.ndarray:
         """The supports (..., 3L, 3) on a surface with vertices (..., N, 3)."""
         return np.einsum("lk,...lkd->...ld", self.weights, vertices[..., self.ids, :])
 
     def coefficients(self, vertices: np.ndarray, points: np.ndarray) -> np.ndarray:
-        """Coefficients (L, 3) that put markers at points (L, 3) of the latent coordinate system.
-
-        [MoSh] Eq. 16
-        """
+        """Coefficients (L, 3) that put markers at points (L, 3) of the latent coordinate system. [MoSh] Eq. 16"""
         origin, frame = _frames(self.kind, self.supports(vertices))
         return np.linalg.solve(frame, (points - origin)[..., None])[..., 0]
 
     def places(self, vertices: np.ndarray, coefficients: np.ndarray) -> np.ndarray:
-        """Where the markers are (..., L, 3) on a surface with vertices (..., N, 3).
-
-        [MoSh] Eq. 16
-        """
+        """Where the markers are (..., L, 3) on a surface with vertices (..., N, 3). [MoSh] Eq. 16"""
         origin, frame = _frames(self.kind, self.supports(vertices))
         return origin + (frame @ coefficients[..., None])[..., 0]
 
 
 def latent_markers(mesh: Mesh, points: np.ndarray, kind: Attachment = "triangle") -> LatentMarkers:
-    """Hang points on the surface to which they are nearest.
+    """Hang points (L, 3) on the surface to which they are nearest; the mesh is the body in the latent pose.
 
-    Parameters
-    ----------
-    mesh : Mesh
-        The body in the latent pose.
-    points : (L, 3) float, metres
-    kind : "triangle" or "neighbourhood"
-        In the frame of the nearest triangle: its normal, a normalised edge and the cross product of the two; or as a
-        sum of the edges that leave the nearest vertex, of least norm, and the normal there.
-
-    Raises
-    ------
-    ValueError
-        No such kind.
+    In the frame of the nearest triangle: its normal, a normalised edge and the cross product of the two; or as a sum
+    of the edges that leave the nearest vertex, of least norm, and the normal there.
 
     [MoSh] Eq. 1, Eq. 15
     """
@@ -124,20 +104,10 @@ def _frames(kind: Attachment, supports: np.ndarray) -> tuple[np.ndarray, np.ndar
 
 
 def simulated(kind: Attachment, supports: MovingPoints, coefficients: np.ndarray) -> tuple[MovingPoints, np.ndarray]:
-    """The simulated markers, and their derivative by the coefficients of each.
+    """The simulated markers on 3 L supports, and their derivative (..., L, 3, 3) by the coefficients (L, 3) of each.
 
-    Parameters
-    ----------
-    kind : "triangle" or "neighbourhood"
-    supports : 3 L points
-    coefficients : (L, 3) float, metres
-
-    Returns
-    -------
-    L points
-        Derivatives by what moves the supports.
-    (..., L, 3, 3) float
-        Derivatives by the coefficients: the axes of the frame, in columns.
+    The derivative by the coefficients is the frame itself, its axes in columns; that of the points is by what moves
+    the supports.
 
     [MoSh] Eq. 4, Eq. 16
     """
@@ -168,61 +138,11 @@ def _by_supports(kind: Attachment, supports: np.ndarray, frame: np.ndarray, c: n
     return np.concatenate([eye - by_a - by_b, by_a, by_b], axis=-1)
 
 
-@dataclass(frozen=True, eq=False)
-class SignedDistances:
-    """Distances of points from a surface, positive outside, and their derivatives.
-
-    Attributes
-    ----------
-    values : (n,) float, metres
-    faces : (n,) int
-        The nearest triangles.
-    by_points : (n, 3) float
-    by_corners : (n, 3, 3) float
-        By the corners of the nearest triangle; all other vertices do not matter.
-    """
-
-    values: np.ndarray
-    faces: np.ndarray
-    by_points: np.ndarray
-    by_corners: np.ndarray
-
-
-def signed_distance(points: np.ndarray, mesh: Mesh) -> SignedDistances:
-    """The signed distance r(x, S) of points (n, 3) from a surface, with its derivatives.
-
-    The nearest point stays where it is on the surface to first order, so the derivative by a corner is that by the
-    point, backwards, times the corner's share in the nearest point.
-
-    Raises
-    ------
-    ValueError
-        A point that is not finite, a mesh without triangles.
-
-    [MoSh] Eq. 18
-    """
-    import igl
-
-    points = checked_points(points)
-    values, face, nearest, normals = igl.signed_distance(
-        points, *checked_surface(mesh), sign_type=igl.SIGNED_DISTANCE_TYPE_PSEUDONORMAL)
-    off = points - nearest
-    far = np.abs(values) > 1e-9
-    direction = np.where(far[:, None], off / np.where(far, values, 1.0)[:, None], normals)
-    share = barycentric(nearest, mesh.corners[face])
-    return SignedDistances(values, face, direction, -share[..., None] * direction[:, None])
-
-
 def above_triangles(points: np.ndarray, corners: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """Signed distances (n,) of points (n, 3) from one triangle each, and their derivatives by point and corners.
+    """Signed distances (n,) of points (n, 3) from triangles (n, 3, 3), one each, and their derivatives by both.
 
-    What `signed_distance` is as long as the triangle is the nearest.
-
-    Parameters
-    ----------
-    points : (n, 3) float, metres
-    corners : (n, 3, 3) float, metres
-        Of the triangles, counter-clockwise seen from outside.
+    The distance r(x, S) of [MoSh] Eq. 18 as long as the triangle is the nearest. The nearest point stays where it is
+    on the triangle to first order: the derivative by a corner is that by the point, backwards, times its share.
     """
     share = barycentric(points, corners)
     nearest = np.einsum("nc,ncd->nd", share, corners)

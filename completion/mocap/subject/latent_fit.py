@@ -1,30 +1,180 @@
-"""Betas, latent markers and the poses of some frames, all together."""
+"""Betas, latent markers and the poses of some frames, all together: the terms of Eq. 23 and their minimum.
+
+Unknowns that frames share are a row `z = (betas (K), coefficients of the latent markers (3 L))`, those of one frame
+`x = (pose (3J), trans (3))`. Distances are in centimetres inside the terms, so that weights compare with the paper's.
+"""
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, field, replace
+from typing import Literal
 
 import numpy as np
 
 from model.bilinear import ShapedPoints
 from model.body import BodyModel
-from scanprep.geometry.least_squares import Arrow, Minimum, Residual, levenberg_marquardt, normal_equations
+from scanprep.geometry.least_squares import Arrow, Residual, levenberg_marquardt, normal_equations
+from scanprep.ranges import Count, Positive, Seed, Settings
 
 from ... import energy
-from ...bodies import FixedBody
 from ...energy import MovingPoints
 from ...priors import gaussian_prior
 from ..marker_sets.layout import MarkerLayout
 from ..pose.marked_body import supports
-from ..settings import PersonConfig
-from . import terms
-from .attachment import LatentMarkers, latent_markers, simulated
+from .attachment import Attachment, LatentMarkers, above_triangles, latent_markers, simulated
 from .frame_starts import find_loose
-from .terms import LatentPoints
 
+CENTIMETRES = 100.0                  # in a metre
+LOOSE = 0.0025                       # weight of the usual place of a marker that the layout calls loose: 20 cm
 UNSURE = 5.0                         # how much farther off a loose marker may be before it was looked for
-TOLERANCE = 1e-3                     # fraction of the energy, in all stages but the last
-FINAL = 1e-4                         # the same in the last
-LONGER = 3                           # times as many steps in the last
+STEPS, TOLERANCE = 8, 1e-3           # most steps of a stage, and the fraction of the energy at which it ends
+LAST_STEPS, LAST_TOLERANCE = 24, 1e-4           # the same of the last stage
+
+
+@dataclass(frozen=True)
+class PersonConfig(Settings):
+    """Settings of `find_person`: the shape of a person and where the markers really sit, from some frames.
+
+    Weights stand on squared distances in centimetres, on squared standard deviations of betas and on the squared
+    Mahalanobis distance of poses, as in the paper. Its own values are `published()`; ours hold the markers closer to
+    their usual places and the betas less, which brings people out nearer to their true shape: the pose prior and shape
+    space of a few dozen scans are narrower than those of thousands.
+
+    Attributes
+    ----------
+    frames : int
+        Frames that are used, over all sequences.
+    choice : "spread" or "random"
+        Frames that differ most, or drawn at random.
+    n_betas : int
+        Betas that are looked for, at most; the others stay zero.
+    attachment : "triangle" or "neighbourhood"
+        A latent marker in the coordinate frame of its nearest triangle, or as a sum of the neighbours of its
+        nearest vertex and the normal there.
+    data : float
+        Weight of the markers against their simulation.
+    surface : float
+        Weight of the prescribed distance from the skin; the paper's is 100.
+    initial : float
+        Weight of the usual place of a marker; the paper's is 0.25, and 10000 takes the layout's places as known.
+    shape : float
+        Weight of the shape prior; the paper's is 1.
+    pose : float
+        Weight of the pose prior.
+    annealing : floats
+        Factors on the last three weights, one stage each.
+    outlier : float, metres
+        Residual at which a marker has lost three quarters of its weight; the paper weighs all alike.
+    seed : int
+        Of the frames drawn at random.
+    """
+
+    frames: Count = 12
+    choice: Literal["spread", "random"] = "spread"
+    n_betas: int = 80
+    attachment: Attachment = "triangle"
+    data: float = 0.75
+    surface: float = 25.0
+    initial: float = 1.0
+    shape: float = 0.3
+    pose: float = 0.25
+    annealing: tuple[Positive, ...] = (40.0, 20.0, 10.0, 4.0, 2.0, 1.0)
+    outlier: Positive = 0.06
+    seed: Seed = 0
+
+    @classmethod
+    def published(cls) -> PersonConfig:
+        """Weights, twelve random frames and six stages of [MoSh]."""
+        return cls(choice="random", surface=100.0, initial=0.25, shape=1.0, outlier=1000.0)
+
+
+@dataclass(frozen=True, eq=False)
+class LatentPoints:
+    """Points of the skin in the latent pose, affine in betas: `mean` (..., 3) and `by_betas` (..., 3, K), metres."""
+
+    mean: np.ndarray
+    by_betas: np.ndarray
+
+    def at(self, betas: np.ndarray) -> np.ndarray:
+        """Their places (..., 3) for betas (K,)."""
+        return self.mean + self.by_betas @ betas
+
+    def moving(self, z: np.ndarray) -> MovingPoints:
+        """The same for unknowns z (P,), with derivatives by all of them."""
+        K = self.by_betas.shape[-1]
+        rest = np.zeros((*self.mean.shape, len(z) - K))
+        return MovingPoints(self.at(z[:K]), np.concatenate([self.by_betas, rest], axis=-1))
+
+    def combined(self, ids: np.ndarray, weights: np.ndarray) -> LatentPoints:
+        """Combinations of some of them, ids and weights (n, k)."""
+        return LatentPoints(np.einsum("lk,lkd->ld", weights, self.mean[ids]),
+                            np.einsum("lk,lkdb->ldb", weights, self.by_betas[ids]))
+
+
+def latent_places(kind: Attachment, points: LatentPoints, z: np.ndarray) -> MovingPoints:
+    """The latent markers (L) in the latent coordinate system, from their 3 L supports. [MoSh] Eq. 16"""
+    K = points.by_betas.shape[-1]
+    found, frame = simulated(kind, points.moving(z), z[K:].reshape(-1, 3))
+    found.jacobian[..., K:] += each_own(frame)
+    return found
+
+
+def each_own(frame: np.ndarray) -> np.ndarray:
+    """Derivatives (..., L, 3, 3) of every marker by its own coefficients as those by all of them, (..., L, 3, 3L)."""
+    L = frame.shape[-3]
+    out = np.zeros((*frame.shape[:-1], L, 3))
+    i = np.arange(L)
+    np.moveaxis(out, (-4, -2), (0, 1))[i, i] = np.moveaxis(frame, -3, 0)
+    return out.reshape(*frame.shape[:-1], 3 * L)
+
+
+def data_term(points: MovingPoints, targets: np.ndarray, weights: np.ndarray) -> Residual:
+    """Simulated markers against observed ones (..., L, 3); what was not seen (NaN) counts nothing. [MoSh] Eq. 17"""
+    return energy.point_to_point(points, targets, CENTIMETRES**2 * weights)
+
+
+def surface_term(markers: MovingPoints, corners: MovingPoints, distances: np.ndarray, weight: float) -> Residual:
+    """Latent markers at their distance (L,) from the nearest triangles, of 3 L corners. [MoSh] Eq. 18"""
+    L, P = len(distances), markers.jacobian.shape[-1]
+    r, by_point, by_corners = above_triangles(markers.positions, corners.positions.reshape(L, 3, 3))
+    J = (by_point[:, None] @ markers.jacobian)[:, 0] + \
+        (by_corners.reshape(L, 1, 9) @ corners.jacobian.reshape(L, 9, P))[:, 0]
+    root = CENTIMETRES * np.sqrt(weight)
+    return Residual(root * (r - distances), root * J)
+
+
+def place_term(markers: MovingPoints, usual: MovingPoints, weights: np.ndarray) -> Residual:
+    """Latent markers near their usual place on this body, weights (L,). [MoSh] Eq. 19"""
+    root = CENTIMETRES * np.sqrt(weights)[:, None]
+    r = root * (markers.positions - usual.positions)
+    J = root[..., None] * (markers.jacobian - usual.jacobian)
+    return Residual(r.ravel(), J.reshape(-1, J.shape[-1]))
+
+
+def shape_term(z: np.ndarray, n_betas: int, weight: float) -> Residual:
+    """Squared Mahalanobis distance of the betas, standard deviations, from the mean person. [MoSh] Eq. 20"""
+    found = energy.shape_prior(z[..., :n_betas], 0, weight)
+    J = np.zeros((*found.values.shape, z.shape[-1]))
+    J[..., :n_betas] = found.jacobian
+    return Residual(found.values, J)
+
+
+@dataclass(frozen=True, eq=False)
+class Hung:
+    """Latent markers with what follows from the triangles that they hang on.
+
+    Attributes
+    ----------
+    markers : LatentMarkers
+    points : ShapedPoints
+        Their supports on the body, posed and of any shape.
+    supports, corners : LatentPoints
+        Their supports, and the corners of the nearest triangles, in the latent pose.
+    """
+
+    markers: LatentMarkers
+    points: ShapedPoints
+    supports: LatentPoints
+    corners: LatentPoints
 
 
 @dataclass(frozen=True, eq=False)
@@ -38,174 +188,148 @@ class State:
     betas : (K,) float
     coefficients : (L, 3) float
         Of the latent markers.
+    hung : Hung
+        What they are coefficients of.
+    layout : MarkerLayout
+        Where the markers usually are, loose ones where they were found.
+    looked : bool
+        Loose markers were looked for.
     """
 
     x: np.ndarray
     betas: np.ndarray
     coefficients: np.ndarray
+    hung: Hung
+    layout: MarkerLayout
+    looked: bool = False
 
     @property
     def z(self) -> np.ndarray:
         """(K + 3L,) what the frames share."""
         return np.concatenate([self.betas, self.coefficients.ravel()])
 
+    @property
+    def places(self) -> np.ndarray:
+        """The latent markers (L, 3) in the latent coordinate system, metres."""
+        return latent_places(self.hung.markers.kind, self.hung.supports, self.z).positions
+
+    @property
+    def rows(self) -> np.ndarray:
+        """(B, 3J + 3 + K + 3L) all unknowns, those that frames share in every row."""
+        return np.concatenate([self.x, np.tile(self.z, (len(self.x), 1))], axis=1)
+
+    def moved(self, rows: np.ndarray) -> State:
+        """The state with other unknowns."""
+        n, K = self.x.shape[1], len(self.betas)
+        return replace(self, x=rows[:, :n], betas=rows[0, n:n + K], coefficients=rows[0, n + K:].reshape(-1, 3))
+
 
 class LatentFit:
-    """Markers of some frames on a body of unknown shape, which sit about where a layout has them.
+    """Markers (B, L, 3) of some frames, metres, on a body of unknown shape, about where a layout has them."""
 
-    Parameters
-    ----------
-    model : BodyModel
-    body : FixedBody
-        Of the model, of any shape: it splits the unknowns.
-    layout : MarkerLayout
-        Of these markers.
-    targets : (B, L, 3) float, metres
-        NaN where a marker was not seen.
-    config : PersonConfig
-    """
-
-    def __init__(self, model: BodyModel, body: FixedBody, layout: MarkerLayout, targets: np.ndarray,
-                 config: PersonConfig) -> None:
-        self.model, self.body, self.targets, self.config = model, body, targets, config
+    def __init__(self, model: BodyModel, layout: MarkerLayout, targets: np.ndarray, config: PersonConfig) -> None:
+        self.model, self.layout, self.targets, self.config = model, layout, targets, config
         self.n_betas = min(config.n_betas, model.n_betas)
+        self.n_angles = 3 * len(model.skeleton.parents)
         rest = np.zeros((len(model.skeleton.parents), 3))
         self.latent = LatentPoints(model.vertices(rest, np.zeros(self.n_betas)),
                                    model.shape_jacobian(rest)[..., :self.n_betas])
-        self.prior = gaussian_prior(model.pose_mean, model.pose_covariance, config.prior_shrinkage)
-        self.layout = self.usual_layout = layout
-        self.unsure = np.isin(layout.labels, layout.loose) & (config.loose_reach > 0)
-        self.place_weight = np.where(np.isin(layout.labels, layout.loose), config.loose, config.initial)
-        self._pool = PointPool(model, self.n_betas)
-        self._set_usual(layout)
+        self.prior = gaussian_prior(model.pose_mean, model.pose_covariance)
+        self.distances, self.loose = np.asarray(layout.distances), np.isin(layout.labels, layout.loose)
+        self.place_weight = np.where(self.loose, min(LOOSE, config.initial), config.initial)
+        self.pool = PointPool(model, self.n_betas)
+
+    def split(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Poses (B, J, 3) and places (B, 3) of unknowns (B, 3J + 3)."""
+        return x[:, :self.n_angles].reshape(len(x), -1, 3), x[:, self.n_angles:]
 
     def start(self, x: np.ndarray) -> State:
-        """The mean person with the markers in their usual places, at poses that were found for it."""
-        return self.attached(x, np.zeros(self.n_betas), self.usual(np.zeros(self.n_betas)).positions)
+        """The mean person with the markers in their usual places, at poses (B, 3J + 3) that were found for it."""
+        betas = np.zeros(self.n_betas)
+        return self._hung(x, betas, self.usual_places(self.layout, betas), self.layout, False)
 
-    def attached(self, x: np.ndarray, betas: np.ndarray, points: np.ndarray) -> State:
+    def hung_anew(self, state: State, look: bool) -> State:
+        """The same places on the triangles that are nearest now; to `look` finds loose markers along their limbs."""
+        if not look or not self.layout.loose:
+            return self._hung(state.x, state.betas, state.places, state.layout, state.looked)
+        vertices = self.model.subject(state.betas).vertices(*self.split(state.x))
+        layout = self.layout.moved(find_loose(self.model, vertices, self.layout, self.targets))
+        places = np.where(self.loose[:, None], self.usual_places(layout, state.betas), state.places)
+        return self._hung(state.x, state.betas, places, layout, True)
+
+    def _hung(self, x: np.ndarray, betas: np.ndarray, points: np.ndarray, layout: MarkerLayout, looked: bool) -> State:
         """The state with markers at points (L, 3) of the latent coordinate system, each on its nearest triangle."""
         vertices = self.latent.at(betas)
-        self.markers = latent_markers(self.model.template.with_vertices(vertices), points, self.config.attachment)
-        self.points = self._pool.points(self.markers)
-        self._supports = self.latent.combined(self.markers.ids, self.markers.weights)
-        self._corners = self.latent.combined(self.markers.corners.reshape(-1, 1), np.ones((3 * len(points), 1)))
-        return State(x, betas, self.markers.coefficients(vertices, points))
+        markers = latent_markers(self.model.template.with_vertices(vertices), points, self.config.attachment)
+        corners = self.latent.combined(markers.corners.reshape(-1, 1), np.ones((3 * len(points), 1)))
+        hung = Hung(markers, self.pool.points(markers), self.latent.combined(markers.ids, markers.weights), corners)
+        return State(x, betas, markers.coefficients(vertices, points), hung, layout, looked)
 
-    def reattached(self, state: State) -> State:
-        """The same places on the triangles that are nearest now.
+    def usual_places(self, layout: MarkerLayout, betas: np.ndarray) -> np.ndarray:
+        """Where a layout has the markers (L, 3) on a body of these betas in the latent pose, metres. [MoSh] Eq. 15"""
+        return energy.lifted(self._usual(layout).at(betas), self.distances)
 
-        [MoSh] Eq. 16
-        """
-        return self.attached(state.x, state.betas, self.places(state))
+    def _usual(self, layout: MarkerLayout) -> LatentPoints:
+        return self.latent.combined(*supports(self.model.template, layout))
 
-    def places(self, state: State) -> np.ndarray:
-        """The latent markers (L, 3) in the latent coordinate system, metres."""
-        return terms.latent_places(self.markers.kind, self._supports, state.z).positions
-
-    def usual(self, betas: np.ndarray) -> MovingPoints:
-        """The usual places of the markers in the latent coordinate system, derivatives by betas.
-
-        [MoSh] Eq. 15
-        """
-        return energy.above_skin(self._usual_supports.moving(betas), np.asarray(self.layout.distances))
-
-    def usual_places(self, betas: np.ndarray) -> np.ndarray:
-        """Where the given layout has the markers (L, 3) on this body, metres: loose ones not where they were found."""
-        points = self.latent.combined(*supports(self.model.template, self.usual_layout))
-        return energy.lifted(points.at(betas), np.asarray(self.usual_layout.distances))
-
-    def _set_usual(self, layout: MarkerLayout) -> None:
-        self.layout = layout
-        self._usual_supports = self.latent.combined(*supports(self.model.template, layout))
-
-    def with_loose_found(self, state: State) -> State:
-        """Each loose marker where on its limb it is nearest to what was measured; the others stay."""
-        if not self.usual_layout.loose or not self.config.loose_reach:
-            return self.reattached(state)
-        pose, trans, _ = self.body.split(state.x)
-        vertices = self.model.subject(state.betas).vertices(pose, trans)
-        found = find_loose(self.model, vertices, self.usual_layout, self.targets, self.config.loose_reach,
-                           self.config.outlier)
-        self._set_usual(self.usual_layout.moved(found))
-        self.unsure[:] = False
-        loose = np.isin(self.layout.labels, self.layout.loose)[:, None]
-        return self.attached(state.x, state.betas,
-                             np.where(loose, self.usual(state.betas).positions, self.places(state)))
-
-    def simulated(self, x: np.ndarray, z: np.ndarray) -> MovingPoints:
-        """The markers in every frame for x (B, n) and z (K + 3L,), derivatives by both.
-
-        [MoSh] Eq. 16
-        """
-        K = self.n_betas
-        pose, trans, _ = self.body.split(x)
-        positions, d_pose = self.points.operator(z[:K]).jacobian(pose, trans)
-        moving = energy.moving_points(positions, d_pose, self.points.shape_jacobian(pose))
-        found, frame = simulated(self.markers.kind, moving, z[K:].reshape(-1, 3))
-        return MovingPoints(found.positions, np.concatenate([found.jacobian, terms.each_own(frame)], axis=-1))
+    def simulated(self, hung: Hung, x: np.ndarray, z: np.ndarray) -> MovingPoints:
+        """The markers in every frame for x (B, n) and z (K + 3L,), derivatives by both. [MoSh] Eq. 16"""
+        K, (pose, trans) = self.n_betas, self.split(x)
+        positions, d_pose = hung.points.operator(z[:K]).jacobian(pose, trans)
+        moving = energy.moving_points(positions, d_pose, hung.points.shape_jacobian(pose))
+        found, frame = simulated(hung.markers.kind, moving, z[K:].reshape(-1, 3))
+        return MovingPoints(found.positions, np.concatenate([found.jacobian, each_own(frame)], axis=-1))
 
     def residuals(self, state: State) -> np.ndarray:
         """(B, L) distances of simulated from observed markers, metres; NaN where one was not seen."""
-        return np.linalg.norm(self.simulated(state.x, state.z).positions - self.targets, axis=2)
+        return np.linalg.norm(self.simulated(state.hung, state.x, state.z).positions - self.targets, axis=2)
 
     def weights(self, state: State) -> np.ndarray:
         """(B, L) weights of the data, per square centimetre; outliers have less, as loose markers not yet found."""
         off = self.residuals(state)
         usual = np.nanmedian(off, axis=1, keepdims=True)
         share = energy.geman_mcclure(np.nan_to_num(off), np.maximum(self.config.outlier, 3 * usual))
-        return self.config.data * share / np.where(self.unsure, UNSURE, 1.0)**2
+        return self.config.data * share / np.where(self.loose & (not state.looked), UNSURE, 1.0)**2
 
-    def common(self, z: np.ndarray, factor: float) -> dict[str, Residual]:
-        """The terms of what frames share; the last two are `factor` times their weight.
-
-        [MoSh] Eq. 18, Eq. 19, Eq. 20
-        """
-        c, L = self.config, len(self.layout.labels)
-        markers = terms.latent_places(self.markers.kind, self._supports, z)
-        usual = self.usual(z)
-        distances = np.asarray(self.layout.distances)
-        return {"surface": terms.surface(markers, self._corners.moving(z), distances, np.full(L, c.surface)),
-                "initial": terms.usual_place(markers, usual, factor * self.place_weight),
-                "shape": terms.shape(z, self.n_betas, factor * c.shape)}
-
-    def frames(self, x: np.ndarray, z: np.ndarray, weights: np.ndarray, factor: float) -> dict[str, Residual]:
-        """The terms of the frames, derivatives by (x, z).
-
-        [MoSh] Eq. 17, Eq. 21
-        """
-        whole = np.concatenate([x, np.tile(z, (len(x), 1))], axis=1)
-        return {"data": terms.data(self.simulated(x, z), self.targets, weights),
-                "pose": terms.pose(whole, self.prior, factor * self.config.pose)}
-
-    def solve(self, state: State, factor: float, last: bool) -> tuple[State, Minimum[np.ndarray]]:
-        """One stage: everything together by Levenberg-Marquardt.
-
-        [MoSh] Eq. 23
-        """
-        weights, K = self.weights(state), self.n_betas
-        n, shared = state.x.shape[1], len(state.z)
+    def solve(self, state: State, factor: float, last: bool) -> tuple[np.ndarray, bool, int]:
+        """One stage of [MoSh] Eq. 23, everything together: unknowns as `State.rows`, whether it settled, and steps."""
+        weights, usual, n = self.weights(state), self._usual(state.layout), state.x.shape[1]
 
         def equations(rows: np.ndarray) -> Arrow:
             x, z = rows[:, :n], rows[0, n:]
-            common = [Residual(r.values[None], r.jacobian[None]) for r in self.common(z, factor).values()]
-            return Arrow(normal_equations(list(self.frames(x, z, weights, factor).values())), shared,
+            common = [Residual(r.values[None], r.jacobian[None]) for r in self.shared(state, usual, z, factor).values()]
+            return Arrow(normal_equations(list(self.of_frames(state, x, z, weights, factor).values())), len(z),
                          normal_equations(common))
 
-        steps, tolerance = (LONGER * self.config.iterations, FINAL) if last else (self.config.iterations, TOLERANCE)
-        rows = np.concatenate([state.x, np.tile(state.z, (len(state.x), 1))], axis=1)
-        end = levenberg_marquardt(equations, rows, steps, tolerance)
-        return State(end.x[:, :n], end.x[0, n:n + K], end.x[0, n + K:].reshape(-1, 3)), end
+        steps, tolerance = (LAST_STEPS, LAST_TOLERANCE) if last else (STEPS, TOLERANCE)
+        end = levenberg_marquardt(equations, state.rows, steps, tolerance)
+        return end.x, bool(end.converged[0]), end.iterations
+
+    def of_frames(self, state: State, x: np.ndarray, z: np.ndarray, weights: np.ndarray, factor: float
+                  ) -> dict[str, Residual]:
+        """The terms of the frames, derivatives by (x, z)."""
+        whole = np.concatenate([x, np.tile(z, (len(x), 1))], axis=1)
+        return {"data": data_term(self.simulated(state.hung, x, z), self.targets, weights),
+                "pose": energy.pose_prior(whole, self.prior, factor * self.config.pose)}            # [MoSh] Eq. 21
+
+    def shared(self, state: State, usual: LatentPoints, z: np.ndarray, factor: float) -> dict[str, Residual]:
+        """The terms of what frames share."""
+        c, hung = self.config, state.hung
+        markers = latent_places(hung.markers.kind, hung.supports, z)
+        return {"surface": surface_term(markers, hung.corners.moving(z), self.distances, c.surface),
+                "initial": place_term(markers, energy.above_skin(usual.moving(z), self.distances),
+                                      factor * self.place_weight),
+                "shape": shape_term(z, self.n_betas, factor * c.shape)}
 
     def energies(self, state: State) -> dict[str, float]:
         """What each term is, weights included."""
-        both = self.frames(state.x, state.z, self.weights(state), 1.0) | self.common(state.z, 1.0)
+        both = self.of_frames(state, state.x, state.z, self.weights(state), 1.0) | self.shared(
+            state, self._usual(state.layout), state.z, 1.0)
         return {name: float(np.sum(term.energy)) for name, term in both.items()}
 
     def placed_layout(self, state: State) -> MarkerLayout:
         """The layout with every marker on the triangle it hangs on at its own distance, exact in the latent pose."""
-        vertices, points = self.latent.at(state.betas), self.places(state)
-        hung = self.markers
+        vertices, points, hung = self.latent.at(state.betas), state.places, state.hung.markers
         if hung.kind != "triangle":
             hung = latent_markers(self.model.template.with_vertices(vertices), points)
         p = vertices[hung.corners]
@@ -220,33 +344,28 @@ class LatentFit:
                             np.stack([1 - second - third, second, third], axis=1), self.layout.aliases)
 
 
+@dataclass
 class PointPool:
-    """Points of the skin with free shape, each made once.
+    """Points of the skin with free shape, each made once: stitching them is what hanging markers anew costs."""
 
-    Parameters
-    ----------
-    model : BodyModel
-    n_betas : int
-    """
-
-    def __init__(self, model: BodyModel, n_betas: int) -> None:
-        self.model, self.n_betas = model, n_betas
-        self._column: dict[bytes, int] = {}
-        self._made: ShapedPoints | None = None
+    model: BodyModel
+    n_betas: int
+    column: dict[bytes, int] = field(default_factory=dict)
+    made: ShapedPoints | None = None
 
     def points(self, markers: LatentMarkers) -> ShapedPoints:
         """The supports of some markers."""
         keys = [ids.tobytes() + weights.tobytes() for ids, weights in zip(markers.ids, markers.weights, strict=True)]
-        new = {key: row for row, key in enumerate(keys) if key not in self._column}
+        new = {key: row for row, key in enumerate(keys) if key not in self.column}
         if new:
             rows = np.array(list(new.values()))
             made = self.model.points(markers.ids[rows], markers.weights[rows], self.n_betas)
-            self._column |= {key: len(self._column) + i for i, key in enumerate(new)}
-            self._made = made if self._made is None else ShapedPoints(
-                made.terms, np.concatenate([self._made.template_basis, made.template_basis], axis=1),
-                np.concatenate([self._made.mean_basis, made.mean_basis], axis=1),
-                np.concatenate([self._made.shape_basis, made.shape_basis], axis=2), made.origin)
-        assert self._made is not None, "at least one marker"
-        some, all_ = [self._column[key] for key in keys], self._made
-        return ShapedPoints(all_.terms, all_.template_basis[:, some], all_.mean_basis[:, some],
-                            all_.shape_basis[:, :, some], all_.origin)
+            self.column |= {key: len(self.column) + i for i, key in enumerate(new)}
+            self.made = made if self.made is None else ShapedPoints(
+                made.terms, np.concatenate([self.made.template_basis, made.template_basis], axis=1),
+                np.concatenate([self.made.mean_basis, made.mean_basis], axis=1),
+                np.concatenate([self.made.shape_basis, made.shape_basis], axis=2), made.origin)
+        assert self.made is not None, "at least one marker"
+        some, every = [self.column[key] for key in keys], self.made
+        return ShapedPoints(every.terms, every.template_basis[:, some], every.mean_basis[:, some],
+                            every.shape_basis[:, :, some], every.origin)

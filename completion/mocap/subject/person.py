@@ -1,7 +1,8 @@
-"""The first stage: the shape of a person and where the markers really sit, from some frames."""
+"""The first stage of [MoSh]: the shape of a person and where the markers really sit, from some frames."""
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
@@ -13,17 +14,56 @@ from scanprep.threads import one_thread
 
 from ..files.markers import MarkerSequence
 from ..marker_sets.layout import MarkerLayout
-from ..results import PersonFit
-from ..settings import PersonConfig
-from .frame_starts import FrameStarts
-from .latent_fit import LatentFit, State
-from .marker_shape import spread_frames
+from .frame_starts import mean_person, start_frames
+from .latent_fit import LatentFit, PersonConfig, State
+
+__all__ = ["PersonConfig", "PersonFit", "find_person"]
 
 Progress = Callable[[int, int], None]
-START_SD, START_PRIOR = 0.03, 0.3    # metres and factor: the mean person carries the markers only roughly
 LOOK = (1, 3)                        # before these stages loose markers are looked for
 EVERY = 2                            # stages before one of which, and before the last, markers are hung anew
 FEW_SEEN = 0.9                       # of the most markers that any frame has; frames with fewer are not used
+CANDIDATES = 400                     # frames among which those that differ most are chosen
+
+
+@dataclass(frozen=True, eq=False)
+class PersonFit:
+    """The shape of a person and where the markers really sit.
+
+    Attributes
+    ----------
+    betas : (k,) float
+    layout : MarkerLayout
+        Of the markers that were fitted: three vertices of a triangle with weights, and the distance from the skin.
+    frames : (B, 2) int
+        Number of the sequence and of the frame that were used.
+    poses : (B, J, 3) float, radians
+    trans : (B, 3) float, metres
+    residuals : (B, L) float, metres
+        Of the markers of `layout`; NaN where one was not seen.
+    moved : (L,) float, metres
+        How far each marker sits from its usual place on this person.
+    energies : {str: float}
+        What each term is at the end.
+    converged : bool
+    iterations : int
+    """
+
+    betas: np.ndarray
+    layout: MarkerLayout
+    frames: np.ndarray
+    poses: np.ndarray
+    trans: np.ndarray
+    residuals: np.ndarray
+    moved: np.ndarray
+    energies: dict[str, float]
+    converged: bool
+    iterations: int
+
+    @property
+    def residual(self) -> float:
+        """The mean distance, metres."""
+        return float(np.nanmean(self.residuals))
 
 
 @one_thread()
@@ -46,70 +86,55 @@ def find_person(model: BodyModel, sequences: MarkerSequence | Sequence[MarkerSeq
     progress : callable, optional
         Called with (done, total).
     step : callable, optional
-        Keeps the person, and what leads there, as `Room.step` does.
+        Keeps what leads to the person, as `Room.step` does.
 
     Raises
     ------
     ValueError
         A model without betas, no sequence, fewer than 3 markers in common, no frame with 3 of them, a layout of
-        another body, settings that make no sense.
+        another body, no stage of annealing.
 
     [MoSh] Eq. 23
     """
     config, sequences = config or PersonConfig(), one_or_more(sequences)
-    _check(model, config)
+    if not model.n_betas:
+        raise ValueError("model: expected one with betas, this one knows its template's body only")
+    if not config.annealing:
+        raise ValueError("annealing: expected at least one factor, got none")
     known, positions = common_markers(sequences, layout)
-    return step("person", (model, known, positions, config),
-                lambda: _find(model, known, positions, config, progress or (lambda done, total: None), step))
+    return _find(model, known, positions, config, progress or (lambda done, total: None), step)
 
 
 def _find(model: BodyModel, known: MarkerLayout, positions: Sequence[np.ndarray], config: PersonConfig, tell: Progress,
           step: Step) -> PersonFit:
     chosen = choose_frames(positions, config)
     targets = np.concatenate(positions)[chosen]
-    total = len(chosen) + len(config.annealing)
+    total, stages = len(chosen) + len(config.annealing), len(config.annealing)
     given = model, known, targets, config
-    starts = FrameStarts(model.subject(np.zeros(min(config.n_betas, model.n_betas))), known, START_SD, START_PRIOR,
-                         config.prior_shrinkage, config.start_axes)
-    x = step("person, start", given, lambda: starts.find(targets, lambda done: tell(done, total)))
-    fit = LatentFit(model, starts.body, known, targets, config)
+    mean = mean_person(model.subject(np.zeros(min(config.n_betas, model.n_betas))), known)
+    x = step("person, start", given, lambda: start_frames(mean, targets, lambda done: tell(done, total)))
+    fit = LatentFit(model, known, targets, config)                                          # [MoSh] Eq. 15
     state, steps, converged = fit.start(x), 0, False
     for i, factor in enumerate(config.annealing):
-        last = i == len(config.annealing) - 1
-        if i in LOOK:
-            state = fit.with_loose_found(state)
-        elif i and (i % EVERY or last):
-            state = fit.reattached(state)
-        state, end = step(f"person, stage {i}", given, partial(fit.solve, state, factor, last))
-        steps, converged = steps + end.iterations, bool(end.converged[0])
+        last = i == stages - 1
+        if i and (i in LOOK or i % EVERY or last):
+            state = fit.hung_anew(state, i in LOOK)                                         # [MoSh] Eq. 16
+        rows, converged, taken = step(f"person, stage {i}", given,
+                                      partial(fit.solve, state, factor, last))              # [MoSh] Eq. 23
+        state, steps = state.moved(rows), steps + taken
         tell(len(chosen) + i + 1, total)
     return _result(fit, state, _whose(positions, chosen), converged, steps)
 
 
 def _result(fit: LatentFit, state: State, frames: np.ndarray, converged: bool, steps: int) -> PersonFit:
-    pose, trans, _ = fit.body.split(state.x)
-    moved = np.linalg.norm(fit.places(state) - fit.usual_places(state.betas), axis=1)
+    pose, trans = fit.split(state.x)
+    moved = np.linalg.norm(state.places - fit.usual_places(fit.layout, state.betas), axis=1)
     return PersonFit(state.betas.copy(), fit.placed_layout(state), frames, rotations.log(rotations.exp(pose)),
                      trans.copy(), fit.residuals(state), moved, fit.energies(state), converged, steps)
 
 
-def _check(model: BodyModel, config: PersonConfig) -> None:
-    if not model.n_betas:
-        raise ValueError("model: expected one with betas, this one knows its template's body only")
-    if config.frames < 1:
-        raise ValueError(f"frames: expected at least 1, got {config.frames}")
-    if not config.annealing:
-        raise ValueError("annealing: expected at least one factor, got none")
-
-
 def one_or_more(sequences: MarkerSequence | Sequence[MarkerSequence]) -> list[MarkerSequence]:
-    """The sequences as a list.
-
-    Raises
-    ------
-    ValueError
-        There is none.
-    """
+    """The sequences as a list; ValueError where there is none."""
     found = [sequences] if isinstance(sequences, MarkerSequence) else list(sequences)
     if not found:
         raise ValueError("sequences: expected at least one, got none")
@@ -121,11 +146,6 @@ def common_markers(sequences: Sequence[MarkerSequence], layout: MarkerLayout
     """The part of a layout that is in any of the sequences, and its markers (T, L, 3) in each, metres.
 
     Sequences may name a marker differently, each by another alias; where one lacks a marker it is NaN.
-
-    Raises
-    ------
-    ValueError
-        A sequence with fewer than 3 markers of the layout.
     """
     columns = []
     for sequence in sequences:
@@ -147,25 +167,40 @@ def common_markers(sequences: Sequence[MarkerSequence], layout: MarkerLayout
 
 
 def choose_frames(positions: Sequence[np.ndarray], config: PersonConfig) -> np.ndarray:
-    """Frames (B,) to use, counted through all sequences (T, L, 3).
-
-    Raises
-    ------
-    ValueError
-        No frame with at least 3 markers, no such choice.
-    """
-    together = np.concatenate(positions)
-    if config.choice == "spread":
-        return spread_frames(together, config.frames)
-    if config.choice != "random":
+    """Frames (B,) to use, counted through all sequences (T, L, 3): well seen ones that differ most, or random ones."""
+    if config.choice not in ("spread", "random"):
         raise ValueError(f"choice: expected spread or random, got {config.choice!r}")
+    together = np.concatenate(positions)
     seen = (~np.isnan(together[..., 0])).sum(axis=1)
     if seen.max(initial=0) < 3:
         raise ValueError(f"sequences: expected a frame with at least 3 known markers, the best has "
                          f"{seen.max(initial=0)}")
     good = np.flatnonzero(seen >= max(3, FEW_SEEN * seen.max()))
-    rng = np.random.default_rng(config.seed)
-    return np.sort(rng.choice(good, min(config.frames, len(good)), replace=False))
+    if config.choice == "random":
+        rng = np.random.default_rng(config.seed)
+        return np.sort(rng.choice(good, min(config.frames, len(good)), replace=False))
+    return good[spread_frames(together[good], config.frames)]
+
+
+def spread_frames(positions: np.ndarray, count: int) -> np.ndarray:
+    """Frames (B,) in which markers (T, L, 3) stand to each other in many ways, by the distances between them.
+
+    The first is the most usual one; each further one is farthest from those before.
+    """
+    some = np.unique(np.linspace(0, len(positions) - 1, CANDIDATES).round().astype(int))
+    first, second = np.triu_indices(positions.shape[1], 1)
+    apart = np.linalg.norm(positions[some][:, first] - positions[some][:, second], axis=2)
+    there = ~np.isnan(apart)
+    middle = np.where(there, apart, 0).sum(axis=0) / np.maximum(there.sum(axis=0), 1)
+    apart = np.where(there, apart - middle, 0)
+    chosen = [int(np.argmin((apart**2).sum(axis=1)))]
+    far = np.full(len(some), np.inf)
+    while len(chosen) < min(count, len(some)):
+        far = np.minimum(far, ((apart - apart[chosen[-1]])**2).sum(axis=1))
+        if far.max() <= 0:
+            break
+        chosen.append(int(far.argmax()))
+    return some[np.sort(chosen)]
 
 
 def _whose(positions: Sequence[np.ndarray], chosen: np.ndarray) -> np.ndarray:

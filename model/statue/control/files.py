@@ -13,7 +13,8 @@ from scanprep.geometry.format_common import MeshFileError
 from scanprep.geometry.mesh import Mesh
 from scanprep.skeleton.tree import Skeleton
 
-from ...export.rig import strongest, turn_up
+from ...blend_weights import strongest
+from ...export.rig import turn_up
 from .chart import Chart, automatic_chart, chart_problem
 from .model import ControlModel, control_problem, surface_problem
 

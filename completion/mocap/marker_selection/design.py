@@ -9,33 +9,85 @@ import numpy as np
 from model.body import BodyModel
 
 from ..marker_sets.layout import MarkerLayout
-from .fits import vertex_errors
-from .greedy import ADD, REMOVE, Groups, MarkerSets, Path, exchange, walk
-from .joint import shared_shape
-from .linear import LinearBodies, Progress, WholeFits, fit_bodies
-from .pairs import symmetric_groups
-from .results import Check, Curve, MarkerDesign
-from .settings import DesignConfig
+from .fits import DesignConfig, Progress, vertex_errors
+from .greedy import ADD, REMOVE, Groups, MarkerSets, Path, exchange, symmetric_groups, walk
+from .linear import LinearBodies, WholeFits, fit_bodies, shared_shape
+
+
+@dataclass(frozen=True, eq=False)
+class Curve:
+    """Sets of markers of many sizes, each the one before and a marker, or a pair, more or less."""
+
+    # "removed" from all candidates, "added" to those kept or to none, or "kept, removed": those kept, made fewer
+    name: str
+    start: tuple[str, ...]           # Labels of the first set
+    steps: tuple[tuple[str, ...], ...] # each: Labels that came or went in every step
+    counts: np.ndarray               # (S,) int: Markers of each set, the first included
+    rmse: np.ndarray                 # (S,) float, metres: Over all vertices and bodies, linearised
+
+    def labels(self, count: int) -> tuple[str, ...]:
+        """The set with that many markers, or the most below it."""
+        below = np.flatnonzero(self.counts <= count)
+        if not len(below):
+            raise ValueError(f"count: expected at least {self.counts.min()}, got {count}")
+        moved = [label for step in self.steps[:int(below[np.argmax(self.counts[below])])] for label in step]
+        if self.name == "added":
+            return (*self.start, *moved)
+        return tuple(label for label in self.start if label not in moved)
+
+
+@dataclass(frozen=True, eq=False)
+class Check:
+    """A set of markers, its bodies estimated again without linearising."""
+
+    count: int
+    linearised: float                # metres: Root mean squared distance over all vertices and bodies
+    full: float                      # metres: Root mean squared distance over all vertices and bodies
+
+
+@dataclass(frozen=True, eq=False)
+class MarkerDesign:
+    """A set of markers and how it was found.
+
+    Attributes
+    ----------
+    layout : MarkerLayout
+        The set, in the order of the candidates.
+    rmse : float, metres
+        Over all vertices and bodies, estimated from these markers, linearised.
+    full : float, optional, metres
+        The same by full refits; none where bodies of a person share betas.
+    floor : float, metres
+        What the model leaves of the bodies when it sees all of their surface.
+    other_half : float, metres
+        With sets chosen on one half of the bodies, measured on the other half; a set that only suits the bodies it
+        was chosen on has much more than `rmse`.
+    curves : tuple of Curve
+    checks : tuple of Check
+    exchanged : int
+        Groups exchanged after the last step.
+    """
+
+    layout: MarkerLayout
+    rmse: float
+    full: float | None
+    floor: float
+    other_half: float
+    curves: tuple[Curve, ...]
+    checks: tuple[Check, ...]
+    exchanged: int
+
 
 FEWEST = 3                           # markers below which a body has no place
 
 
 @dataclass(frozen=True, eq=False)
 class Choice:
-    """What the search for one set found.
+    """What the search for one set found."""
 
-    Attributes
-    ----------
-    paths : {str: Path}
-    groups : (n,) int
-        Of the set.
-    rmse : float, metres
-    exchanged : int
-    """
-
-    paths: dict[str, Path]
-    groups: np.ndarray
-    rmse: float
+    paths: dict[str, Path]           # {str: Path}
+    groups: np.ndarray               # (n,) int: Of the set
+    rmse: float                      # metres
     exchanged: int
 
 
@@ -109,12 +161,7 @@ def choose(linear: LinearBodies, groups: Groups, kept: np.ndarray, config: Desig
            tell: Callable[[int], None] | None = None) -> Choice:
     """The set of `config.count` markers, and the curves it comes from.
 
-    Parameters
-    ----------
-    kept : (n,) bool
-        Groups that stay.
-    tell : callable, optional
-        Called with the steps done.
+    `kept` (n,): groups that stay.
     """
     every, free, step = np.arange(len(groups)), ~kept, [0]
     stops = {config.count, *config.through}
@@ -124,12 +171,9 @@ def choose(linear: LinearBodies, groups: Groups, kept: np.ndarray, config: Desig
         if tell is not None:
             tell(step[0])
 
-    paths = {}
-    if config.direction != "add":
-        paths["removed"] = walk(MarkerSets(linear, groups, every), REMOVE, free, FEWEST, stops, told)
-    if config.direction != "remove":
-        paths["added"] = walk(MarkerSets(linear, groups, np.flatnonzero(kept)), ADD, free,
-                              sum(map(len, groups)), stops, told)
+    paths = {"removed": walk(MarkerSets(linear, groups, every), REMOVE, free, FEWEST, stops, told),
+             "added": walk(MarkerSets(linear, groups, np.flatnonzero(kept)), ADD, free, sum(map(len, groups)), stops,
+                           told)}
     best = best_path(paths, config.count)
     sets = MarkerSets(linear, groups, best.set(best.at(config.count)))
     exchanged = exchange(sets, free, config.exchanges)

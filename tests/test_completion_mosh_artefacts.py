@@ -6,22 +6,19 @@ import numpy as np
 import pytest
 from completion_bodies import MEAN, worm_with_prior
 
-from completion.mocap.artefacts.ambiguous_swaps import exchanged_after_all
-from completion.mocap.artefacts.chart import chart_faults
-from completion.mocap.artefacts.find import find_faults
+from completion.mocap.artefacts.find import ambiguous_swap, find_artefacts
+from completion.mocap.artefacts.results import ArtefactConfig, BadSpan
 from completion.mocap.artefacts.simulated import Simulation, bridged
 from completion.mocap.artefacts.slips import find_bad, without_lost_limbs
-from completion.mocap.artefacts.swaps import Evidence, _two_states, find_order, listed
-from completion.mocap.artefacts.tracks import TORN, Tracks
+from completion.mocap.artefacts.swaps import TORN, Tracks, _two_states, find_order, list_swaps
 from completion.mocap.files.markers import MarkerSequence
 from completion.mocap.marker_sets.layout import MarkerLayout
+from completion.mocap.mosh.charts import chart_artefacts
 from completion.mocap.pose.follow import AnimateConfig, animate
-from completion.mocap.results import BadSpan
-from completion.mocap.settings import FaultConfig
 from scanprep.geometry import rotations
 
 FRAMES, RATE = 160, 100.0
-CONFIG = FaultConfig(follow=AnimateConfig(start_axes=1))
+CONFIG = ArtefactConfig()
 LABELS = tuple(f"M{i}" for i in range(30))
 
 
@@ -74,7 +71,7 @@ def wavy(labels=6, frames=120):
 
 
 def tracked(positions):
-    return find_order(Evidence(positions, np.zeros((*positions.shape[:2], positions.shape[1])), RATE), CONFIG)
+    return find_order(positions, RATE)
 
 
 # ---- tracks
@@ -82,25 +79,25 @@ def tracked(positions):
 def test_a_track_of_constant_acceleration_does_not_jump():
     t = np.arange(60)[:, None, None] / RATE
     positions = np.broadcast_to(8 * t**2 + [1.0, 2.0, 3.0] * t, (60, 1, 3)).copy()
-    tracks = Tracks(positions, RATE, 0.002, 0.006)
+    tracks = Tracks(positions, RATE)
     assert np.nanmax(tracks.off[4:-4]) < 1e-12 and not tracks.jumped.any()
     positions[30:] += [0.0, 0.02, 0.0]
-    tracks = Tracks(positions, RATE, 0.002, 0.006)
+    tracks = Tracks(positions, RATE)
     assert np.flatnonzero(tracks.jumped[:, 0]).tolist() == [30] and abs(tracks.off[30, 0] - 0.02) < 1e-12
     positions[30:34] = np.nan
-    tracks = Tracks(positions, RATE, 0.002, 0.006)
+    tracks = Tracks(positions, RATE)
     assert not tracks.jumped.any() and np.flatnonzero(tracks.open[:, 0]).tolist() == [0, 30, 31, 32, 33, 34]
 
 
 def test_links_tell_which_label_goes_on():
     positions = wavy()
     exchanged(positions, 1, 4, 50, 119)
-    tracks = Tracks(positions, RATE, 0.002, 0.006)
+    tracks = Tracks(positions, RATE)
     some = np.arange(6)
     cost = tracks.links(np.full((1, 1), 50), some[:, None], some)
     assert cost.argmin(axis=1).tolist() == [0, 4, 2, 3, 1, 5] and (np.sort(cost, axis=1)[:, 1:] == TORN).all()
     positions[45:50, 1] = np.nan                                     # over a gap: not as sure, but still the best
-    cost = Tracks(positions, RATE, 0.002, 0.006).links(np.array([50]), np.array([1]), np.array([4]))[0]
+    cost = Tracks(positions, RATE).links(np.array([50]), np.array([1]), np.array([4]))[0]
     assert 0 < cost < TORN - 2
 
 
@@ -114,7 +111,7 @@ def test_pairs_are_put_right_and_their_spans_are_exact():
     exchanged(faulty, 1, 3, 70, 119)
     order = tracked(faulty)
     np.testing.assert_array_equal(np.take_along_axis(faulty, order[..., None], axis=1), positions)
-    spans = [(e.first, e.second, e.begin, e.end) for e in listed(order, np.ones((120, 6), bool), tuple("ABCDEF"))]
+    spans = [(e.first, e.second, e.begin, e.end) for e in list_swaps(order, np.ones((120, 6), bool), tuple("ABCDEF"))]
     assert spans == [("C", "F", 0, 9), ("A", "B", 20, 44), ("B", "D", 70, 119)]
 
 
@@ -124,7 +121,7 @@ def test_a_cycle_of_labels_comes_apart_into_pairs():
     faulty[30:60, [0, 2, 3, 5]] = positions[30:60, [2, 3, 5, 0]]
     order = tracked(faulty)
     np.testing.assert_array_equal(np.take_along_axis(faulty, order[..., None], axis=1), positions)
-    found = listed(order, np.ones((120, 6), bool), tuple("ABCDEF"))
+    found = list_swaps(order, np.ones((120, 6), bool), tuple("ABCDEF"))
     assert len(found) == 3 and {(e.begin, e.end) for e in found} == {(30, 59)}
 
 
@@ -148,7 +145,7 @@ def test_an_exchange_is_found_though_a_label_is_out_of_sight_when_it_begins():
     mended = np.take_along_axis(faulty, order[..., None], axis=1)
     right = np.isclose(mended, positions, atol=1e-12).all(axis=2) | np.isnan(mended[..., 0])
     assert right.all()
-    assert [(e.begin, e.end) for e in listed(order, seen, tuple("ABCDEF"))] == [(50, 89)]
+    assert [(e.begin, e.end) for e in list_swaps(order, seen, tuple("ABCDEF"))] == [(50, 89)]
 
 
 def test_what_flickers_or_is_gone_is_not_exchanged():
@@ -169,7 +166,7 @@ def test_two_states_are_the_best_of_all_ways():
             return gains[np.array(way, bool)].sum() - np.where(change, switch + 4.0, stay).sum() + stay.sum()
 
         best = max(itertools.product((0, 1), repeat=6), key=worth)
-        total, swapped = _two_states(gains, stay, switch, 4.0)
+        total, swapped = _two_states(gains, stay, switch)
         assert total == pytest.approx(worth(best)) and swapped.astype(int).tolist() == list(best)
 
 
@@ -223,8 +220,8 @@ def test_a_limb_that_is_lost_is_no_fault_of_its_markers():
 def test_a_clean_sequence_has_no_faults(subject, layout, moved):
     _, _, positions, _ = moved
     ticks = []
-    found = find_faults(subject, changed(positions), layout, CONFIG, progress=lambda *at: ticks.append(at))
-    assert found.exchanges == () and found.bad == () and len(ticks) == 1
+    found = find_artefacts(subject, changed(positions), layout, CONFIG, progress=lambda *at: ticks.append(at))
+    assert found.swaps == () and found.bad == () and len(ticks) == 1
     np.testing.assert_array_equal(found.repaired.positions, positions)
     assert np.linalg.norm(found.simulated - positions, axis=2).max() < 0.008 and found.weights.min() > 0.9
 
@@ -241,8 +238,8 @@ def test_faults_of_all_kinds_together(subject, layout, moved):
     faulty[40:100, noisy] += np.random.default_rng(2).normal(0, 0.01, (60, 3))
     faulty[90:120, stray] += [0.2, -0.1, 0.1]
     faulty[30:60, gone] = np.nan
-    found = find_faults(subject, changed(faulty), layout, CONFIG)
-    assert {(frozenset((e.first, e.second)), e.begin, e.end) for e in found.exchanges} == {
+    found = find_artefacts(subject, changed(faulty), layout, CONFIG)
+    assert {(frozenset((e.first, e.second)), e.begin, e.end) for e in found.swaps} == {
         (frozenset((LABELS[a], LABELS[b])), 20, 79), (frozenset((LABELS[a], LABELS[far])), 100, 140)}
     spans = {s.label: s for s in found.bad}
     assert {label: s.kind for label, s in spans.items()} == {
@@ -256,7 +253,7 @@ def test_faults_of_all_kinds_together(subject, layout, moved):
     filled = found.virtual()
     assert filled.seen.all() and np.linalg.norm(filled.positions - positions, axis=2).max() < 0.012
     assert found.weights[60:, slipped].max() == 0 and found.weights[:60, slipped].min() > 0.5
-    titles = [axis.get_ylabel() for axis in chart_faults(found, changed(faulty)).axes]
+    titles = [axis.get_ylabel() for axis in chart_artefacts(found, changed(faulty)).axes]
     assert sorted(titles) == sorted({*spans, LABELS[a], LABELS[b], LABELS[far]})
 
 
@@ -268,17 +265,17 @@ def test_the_motion_of_repaired_markers_is_the_clean_one(subject, layout, moved)
         begin = int(rng.integers(0, 100))
         exchanged(faulty, a, b, begin, begin + int(rng.integers(20, 50)))
     meshes = subject.vertices(poses, trans)
-    found = find_faults(subject, changed(faulty), layout, CONFIG)
-    assert len(found.exchanges) == 6
+    found = find_artefacts(subject, changed(faulty), layout, CONFIG)
+    assert len(found.swaps) == 6
 
     def error(sequence):
-        motion = animate(subject, sequence, layout, CONFIG.follow)
+        motion = animate(subject, sequence, layout, AnimateConfig())
         return np.linalg.norm(motion.vertices(subject) - meshes, axis=2).mean()
 
     assert error(found.repaired) < 1.05 * error(changed(positions))
-    given = find_faults(subject, changed(positions), layout, CONFIG, animate(subject, changed(positions), layout,
-                                                                             CONFIG.follow))
-    assert given.exchanges == () and given.bad == ()
+    given = find_artefacts(subject, changed(positions), layout, CONFIG, animate(subject, changed(positions), layout,
+                                                                             AnimateConfig()))
+    assert given.swaps == () and given.bad == ()
 
 
 def test_an_exchange_with_a_label_that_no_layout_knows(subject, layout, moved):
@@ -286,8 +283,8 @@ def test_an_exchange_with_a_label_that_no_layout_knows(subject, layout, moved):
     few = layout.select(LABELS[:25])
     faulty = positions.copy()
     exchanged(faulty, 3, 28, 50, 99)
-    found = find_faults(subject, changed(faulty), few, CONFIG)
-    assert [(e.first, e.second, e.begin, e.end) for e in found.exchanges] == [("M3", "M28", 50, 99)]
+    found = find_artefacts(subject, changed(faulty), few, CONFIG)
+    assert [(e.first, e.second, e.begin, e.end) for e in found.swaps] == [("M3", "M28", 50, 99)]
     np.testing.assert_array_equal(found.repaired.positions, positions)
     assert found.labels == LABELS[:25] and found.bad == ()
 
@@ -300,9 +297,9 @@ def test_close_labels_are_tried_both_ways(subject, layout, moved):
     exchanged(faulty, a, b, 40, 109)
     for end in (40, 110):
         faulty[end - 15:end + 15, [a, b]] = np.nan
-    body = Simulation(subject, changed(faulty), layout, CONFIG.follow)
+    body = Simulation(subject, changed(faulty), layout, AnimateConfig())
     x = body.solve(faulty)
-    swapped = exchanged_after_all(body, x, Tracks(faulty, RATE, CONFIG.floor, CONFIG.jump), a, b, CONFIG)
+    swapped = ambiguous_swap(body, x, Tracks(faulty, RATE), a, b)
     there = np.isfinite(faulty[:, a, 0])
     np.testing.assert_array_equal(swapped[there[swapped]], np.arange(55, 95))
 
@@ -312,7 +309,7 @@ def test_what_a_marker_is_off_by_the_account_of_the_others(subject, layout, move
     _, _, positions, _ = moved
     faulty = positions[:40].copy()
     faulty[:, 7] += [0.004, 0.01, -0.006]
-    body = Simulation(subject, MarkerSequence(faulty, LABELS, RATE), layout, CONFIG.follow)
+    body = Simulation(subject, MarkerSequence(faulty, LABELS, RATE), layout, AnimateConfig())
     x = body.solve(faulty)
     off = faulty - body.positions(x)
     alone = body.alone(off, x)[:, 7]
@@ -336,6 +333,6 @@ def test_bridges_join_both_ends_and_long_ones_pass_the_usual_place():
 
 def test_a_motion_of_other_length_is_refused(subject, layout, moved):
     _, _, positions, _ = moved
-    motion = animate(subject, changed(positions).frames(slice(0, 20)), layout, CONFIG.follow)
+    motion = animate(subject, changed(positions).frames(slice(0, 20)), layout, AnimateConfig())
     with pytest.raises(ValueError, match="motion: expected 160 frames as the markers have, got 20"):
-        find_faults(subject, changed(positions), layout, CONFIG, motion)
+        find_artefacts(subject, changed(positions), layout, CONFIG, motion)

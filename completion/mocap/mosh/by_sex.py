@@ -1,7 +1,7 @@
 """A person with the model of their sex, which the markers tell."""
 from __future__ import annotations
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 from model.body import BodyModel
@@ -11,10 +11,9 @@ from scanprep.threads import one_thread
 
 from ..files.markers import MarkerSequence
 from ..marker_sets.layout import MarkerLayout
-from ..results import MoshResult, PersonFit
-from ..settings import MoshConfig
+from ..subject.person import PersonFit, find_person
+from .mosh import MoshConfig, MoshResult, Progress, mosh
 
-Progress = Callable[[int, int], None]
 SEXES = ("female", "male")
 
 
@@ -62,9 +61,6 @@ def mosh_by_sex(models: Mapping[str, BodyModel], sequences: MarkerSequence | Seq
 
     [MoSh]
     """
-    from ..mosh.mosh import mosh
-    from .person import find_person
-
     checked_models(models)
     config = config or MoshConfig()
     neutral = find_person(models["neutral"], sequences, layout, config.person, None, inside(step, "neutral"))
@@ -76,18 +72,12 @@ def mosh_by_sex(models: Mapping[str, BodyModel], sequences: MarkerSequence | Seq
 
 
 def checked_models(models: Mapping[str, BodyModel]) -> None:
-    """Refuse models with which a sex cannot be told or used.
-
-    Raises
-    ------
-    ValueError
-        One that is missing or of another topology, a neutral one that cannot tell.
-    """
+    """ValueError for models with which a sex cannot be told or used."""
     missing = [name for name in ("neutral", *SEXES) if name not in models]
     if missing:
         raise ValueError(f"models: expected 'neutral', 'female' and 'male', {' and '.join(missing)} missing")
     sex_plane(models["neutral"])
+    faces = models["neutral"].template.faces
     for name in SEXES:
-        if models[name].template.faces.shape != models["neutral"].template.faces.shape \
-                or (models[name].template.faces != models["neutral"].template.faces).any():
+        if models[name].template.faces.shape != faces.shape or (models[name].template.faces != faces).any():
             raise ValueError(f"models: expected the triangles of the neutral model in that of '{name}', found others")

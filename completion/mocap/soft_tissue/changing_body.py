@@ -1,19 +1,52 @@
-"""Markers on a body whose shape changes: the places, and the normal equations of poses and changes."""
+"""Bodies whose betas change in every frame: their vertices, and the places of their markers with derivatives."""
 from __future__ import annotations
 
 import numpy as np
 
 from model.body import BodyModel
-from model.linear import posed_product
+from model.linear import check_pose, posed_product
 from scanprep.geometry import rotations
 
 from ..marker_sets.layout import MarkerLayout
-from ..pose.marked_body import BATCH, MarkedBody, supports
+from ..pose.marked_body import BATCH, MarkedBody, System, supports
 
-System = tuple[np.ndarray, np.ndarray, np.ndarray]
+AT_ONCE = 32                         # bodies that are made together
 
 
-class SwayingBody:
+def changing_bodies(model: BodyModel, poses: np.ndarray, betas: np.ndarray, trans: np.ndarray) -> np.ndarray:
+    """Vertices (T, N, 3), metres, each frame with betas of its own (T, k), exact."""
+    poses, trans = check_pose(model.skeleton, poses, trans)
+    if betas.ndim != 2 or len(betas) != len(poses) or betas.shape[1] > model.n_betas:
+        raise ValueError(f"betas: expected ({len(poses)}, k) with k at most {model.n_betas}, got {betas.shape}")
+    out = np.empty((len(poses), len(model.template.vertices), 3))
+    for start in range(0, len(poses), AT_ONCE):
+        some = slice(start, start + AT_ONCE)
+        out[some] = model.bodies_of(poses[some], betas[some])
+    out += (model.skeleton.joints[0] + trans)[:, None]
+    return out
+
+
+def skin_movement(model: BodyModel, changes: np.ndarray) -> np.ndarray:
+    """How far changes of betas (T, k) move every vertex (N,), metres: the root of the mean square over time.
+
+    In the mean pose; other poses turn the movement, and hardly lengthen it.
+    """
+    D = model.shape_jacobian(model.pose_mean)[..., :changes.shape[1]]
+    moment = changes.T @ changes / max(len(changes), 1)
+    return np.sqrt(np.maximum(np.einsum("ndk,ndk->n", D @ moment, D), 0.0))
+
+
+def skin_metric(model: BodyModel, slopes: np.ndarray) -> np.ndarray:
+    """(K, K): `Δ @ metric @ Δ` is how far a change Δ of betas moves the skin, squared, square metres.
+
+    The mean over the surface, areas as on the template; `slopes` (N, 3, K) are the vertices' derivatives by betas.
+    """
+    areas = model.template.vertex_areas
+    D = (np.sqrt(areas / areas.sum())[:, None, None] * slopes).reshape(-1, slopes.shape[-1])
+    return np.asarray(D.T @ D)
+
+
+class ChangingBody:
     """A person with markers whose betas change by Δ = z @ directions around their own.
 
     Markers are affine in z, `y(θ) + D(θ) z`, and D (3L, K) is a linear function of products of features and rotations:
@@ -78,16 +111,9 @@ class SwayingBody:
         return y
 
     def system(self, x: np.ndarray, z: np.ndarray, targets: np.ndarray, weights: np.ndarray) -> System:
-        """Markers and pose prior: energy (B,), half its gradient (B, P + K) and Gauss-Newton matrix.
+        """Markers and pose prior at x (B, P), z (B, K): energy (B,), half its gradient (B, P + K), its matrix.
 
-        Parameters
-        ----------
-        x : (B, P) float
-        z : (B, K) float
-        targets : (B, L, 3) float, metres
-            NaN where a marker was not seen.
-        weights : (B, L) float
-            Factor on the squared distance.
+        Markers are to be at targets (B, L, 3), metres, NaN where not seen; weights (B, L) are on squared metres.
         """
         pose, trans, _ = self.marked.body.split(x)
         y, by_turn = self.marked.shapes.columns(pose, trans)
@@ -122,14 +148,7 @@ def _weighed(y: np.ndarray, targets: np.ndarray, weights: np.ndarray) -> tuple[n
 
 
 def normal_slopes(corners: np.ndarray, slopes: np.ndarray) -> np.ndarray:
-    """Derivative (L, 3, K) of the unit normals of the skin by betas.
-
-    Parameters
-    ----------
-    corners : (3L, 3) float, metres
-        Three points of the skin for each marker, as `energy.above_skin` takes them.
-    slopes : (3L, 3, K) float
-        Their derivative by betas.
+    """Derivative (L, 3, K) of unit normals by betas, from three points of the skin each (3L, 3), and theirs (3L, 3, K).
     """
     p = corners.reshape(-1, 3, 3)
     J = slopes.reshape(*p.shape, -1)
@@ -139,19 +158,3 @@ def normal_slopes(corners: np.ndarray, slopes: np.ndarray) -> np.ndarray:
     n = c / length
     tangent = (np.eye(3) - n[:, :, None] * n[:, None, :]) / length[..., None]
     return np.asarray(tangent @ (rotations.hat(u) @ (J[:, 2] - J[:, 0]) - rotations.hat(v) @ (J[:, 1] - J[:, 0])))
-
-
-def skin_metric(model: BodyModel, slopes: np.ndarray) -> np.ndarray:
-    """(K, K): `Δ @ metric @ Δ` is how far the skin moves when betas change by Δ, squared, square metres.
-
-    The mean over the surface, areas as on the template.
-
-    Parameters
-    ----------
-    model : BodyModel
-    slopes : (N, 3, K) float, metres
-        Derivative of the vertices by betas.
-    """
-    areas = model.template.vertex_areas
-    D = (np.sqrt(areas / areas.sum())[:, None, None] * slopes).reshape(-1, slopes.shape[-1])
-    return np.asarray(D.T @ D)

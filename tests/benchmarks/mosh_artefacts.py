@@ -1,6 +1,6 @@
-"""Faults put into marker sequences: what `find_faults` finds of them, and what they do to the motion.
+"""Faults put into marker sequences: what `find_artefacts` finds of them, and what they do to the motion.
 
-    python tests/benchmarks/mosh_faults.py FOLDER -m MODEL.npz -o mosh_faults.json [--men 3] [--files 01_01 85_02]
+    python tests/benchmarks/mosh_artefacts.py FOLDER -m MODEL.npz -o mosh_artefacts.json [--men 3] [--files 01_01 85_02]
 
 FOLDER has real marker files. Three kinds of sequences: the real files with faults put in, the reference being the
 motion without them; men of SPRING that the model has not seen, moved by the motions found in the files, their own
@@ -23,14 +23,14 @@ from marker_motion import dropped
 from protocols import load_real, machine, spring_split, write_report
 
 from completion import energy
-from completion.mocap.artefacts.find import find_faults
+from completion.mocap.artefacts.find import find_artefacts
+from completion.mocap.artefacts.results import ArtefactConfig, BadKind, BadSpan, Swap
 from completion.mocap.files.markers import MarkerSequence, read_markers
 from completion.mocap.marker_sets.layout import MarkerLayout
-from completion.mocap.mosh.mosh import mosh
+from completion.mocap.marker_sets.named import named_layout
+from completion.mocap.mosh.mosh import MoshConfig, mosh
+from completion.mocap.pose.follow import animate
 from completion.mocap.pose.marked_body import supports
-from completion.mocap.pose.mosh_poses import follow_poses
-from completion.mocap.results import BadKind, BadSpan, Exchange
-from completion.mocap.settings import FaultConfig, MoshConfig
 from completion.mocap.subject.person import find_person
 from completion.motion import Motion
 from model.body import BodyModel
@@ -38,6 +38,7 @@ from model.files import load_model
 from model.linear import Subject
 from model.posing.transfer import subject_from_body
 
+POSES = MoshConfig().poses
 SPANS = (0.2, 2.0)                   # seconds that an exchange lasts
 APART = 60                           # frames between two exchanges of a marker
 NEAR = 0.2                           # metres, between the markers of a close pair
@@ -49,7 +50,7 @@ class Faulty:
     """A sequence with faults in it, and which."""
 
     markers: MarkerSequence
-    exchanges: tuple[Exchange, ...]
+    exchanges: tuple[Swap, ...]
     bad: tuple[BadSpan, ...]
 
 
@@ -73,7 +74,7 @@ def exchanged(sequence: MarkerSequence, share: float, close: bool, rng: np.rando
             continue
         busy[begin:end, two] = True
         positions[begin:end, two] = positions[begin:end, two[::-1]]
-        out.append(Exchange(sequence.labels[two[0]], sequence.labels[two[1]], begin, end - 1))
+        out.append(Swap(sequence.labels[two[0]], sequence.labels[two[1]], begin, end - 1))
     return Faulty(MarkerSequence(positions, sequence.labels, sequence.rate), tuple(out), ())
 
 
@@ -106,32 +107,32 @@ def spoilt(sequence: MarkerSequence, kind: BadKind, count: int, part_rotations: 
     return Faulty(MarkerSequence(positions, sequence.labels, sequence.rate), (), tuple(out))
 
 
-def overlap(a: Exchange | BadSpan, b: Exchange | BadSpan) -> float:
+def overlap(a: Swap | BadSpan, b: Swap | BadSpan) -> float:
     """Common frames of two spans over those of their union."""
     common = min(a.end, b.end) - max(a.begin, b.begin) + 1
     return max(0, common) / (a.end - a.begin + b.end - b.begin + 2 - max(0, common))
 
 
-def hits(found: Sequence[Exchange | BadSpan], true: Sequence[Exchange | BadSpan]) -> tuple[int, int]:
+def hits(found: Sequence[Swap | BadSpan], true: Sequence[Swap | BadSpan]) -> tuple[int, int]:
     """How many of the found are true, and how many of the true are found."""
-    def name(span: Exchange | BadSpan) -> frozenset[str]:
-        return frozenset((span.first, span.second) if isinstance(span, Exchange) else (span.label, span.kind))
+    def name(span: Swap | BadSpan) -> frozenset[str]:
+        return frozenset((span.first, span.second) if isinstance(span, Swap) else (span.label, span.kind))
 
     same = np.array([[name(f) == name(t) and overlap(f, t) >= 0.5 for t in true] for f in found], dtype=bool)
     same = same.reshape(len(found), len(true))
     return int(same.any(axis=1).sum()), int(same.any(axis=0).sum())
 
 
-def marked(spans: Sequence[Exchange | BadSpan], sequence: MarkerSequence) -> np.ndarray:
+def marked(spans: Sequence[Swap | BadSpan], sequence: MarkerSequence) -> np.ndarray:
     """Marker-frames (T, L) that spans cover."""
     out = np.zeros(sequence.positions.shape[:2], dtype=bool)
     for span in spans:
-        for label in (span.first, span.second) if isinstance(span, Exchange) else (span.label,):
+        for label in (span.first, span.second) if isinstance(span, Swap) else (span.label,):
             out[span.begin:span.end + 1, sequence.labels.index(label)] = True
     return out & sequence.seen
 
 
-def scores(found: Sequence[Exchange | BadSpan], true: Sequence[Exchange | BadSpan], sequence: MarkerSequence
+def scores(found: Sequence[Swap | BadSpan], true: Sequence[Swap | BadSpan], sequence: MarkerSequence
            ) -> dict[str, float]:
     """Counts of spans, and of marker-frames."""
     right, reached = hits(found, true)
@@ -169,7 +170,7 @@ def followed(model: BodyModel, case: Case, markers: MarkerSequence) -> tuple[Sub
     """The person and the motion of markers as they are."""
     found = find_person(model, markers, case.layout)
     subject = model.subject(found.betas)
-    return subject, found.layout, follow_poses(subject, markers, found.layout)
+    return subject, found.layout, animate(subject, markers, found.layout, POSES)
 
 
 def surface(subject: Subject, motion: Motion, every: int = 10) -> np.ndarray:
@@ -197,7 +198,7 @@ def turned(subject: Subject, layout: MarkerLayout, motion: Motion) -> np.ndarray
     return subject.skeleton.part_rotations(motion.poses)[:, part]
 
 
-def run_case(model: BodyModel, case: Case, config: FaultConfig, seed: int) -> dict[str, object]:
+def run_case(model: BodyModel, case: Case, config: ArtefactConfig, seed: int) -> dict[str, object]:
     """All faults on one sequence."""
     rng = np.random.default_rng(seed)
     subject, layout, motion = followed(model, case, case.markers)
@@ -207,10 +208,10 @@ def run_case(model: BodyModel, case: Case, config: FaultConfig, seed: int) -> di
         reference = surface(*case.truth)
         clean = float(np.linalg.norm(surface(subject, motion) - reference, axis=2).mean())
     start = time.process_time()
-    plain = find_faults(subject, case.markers, layout, config)
+    plain = find_artefacts(subject, case.markers, layout, config)
     seconds = time.process_time() - start
     row: dict[str, object] = {"case": case.name, "clean_mm": 1e3 * clean, "alarms": [
-        str(span) for span in (*plain.exchanges, *plain.bad)], "frames_per_cpu_s": len(reference) * 10 / seconds}
+        str(span) for span in (*plain.swaps, *plain.bad)], "frames_per_cpu_s": len(reference) * 10 / seconds}
     for close in (False, True):
         faulty = exchanged(case.markers, 0.1, close, rng)
         gone = dataclasses.replace(faulty, markers=dropped(faulty.markers, 0.05, 0.25, rng))
@@ -219,27 +220,27 @@ def run_case(model: BodyModel, case: Case, config: FaultConfig, seed: int) -> di
     known = case.markers.select(layout.matched(case.markers.labels))
     for kind in KINDS:
         faulty = spoilt(known, kind, 6, turns, rng)
-        found = find_faults(subject, faulty.markers, layout, config)
+        found = find_artefacts(subject, faulty.markers, layout, config)
         fresh = [b for b in found.bad if b.kind == kind]
         row[kind] = scores(fresh, faulty.bad, faulty.markers) | {
-            "exchanges": len(found.exchanges), "other": len(found.bad) - len(fresh)}
+            "exchanges": len(found.swaps), "other": len(found.bad) - len(fresh)}
     return row
 
 
 def run_exchanges(model: BodyModel, case: Case, faulty: Faulty, reference: np.ndarray, clean: float,
-                  config: FaultConfig) -> dict[str, float]:
+                  config: ArtefactConfig) -> dict[str, float]:
     """Find exchanges, and what is left of them in the motion: all from the faulty markers alone, seconds too."""
     person = find_person(model, faulty.markers, case.layout)
     subject = model.subject(person.betas)
-    raw = follow_poses(subject, faulty.markers, person.layout)
+    raw = animate(subject, faulty.markers, person.layout, POSES)
     start = time.process_time()
-    result = mosh(model, faulty.markers, case.layout, MoshConfig(faults=config, soft_tissue=False))
-    seconds, found = time.process_time() - start, result.faults[0]
+    result = mosh(model, faulty.markers, case.layout, MoshConfig(artefacts=config, soft_tissue=False))
+    seconds, found = time.process_time() - start, result.artefacts[0]
     mended = model.subject(result.betas), result.layout, result.motions[0]
     away = [float(np.linalg.norm(surface(s, m) - reference, axis=2).mean())
             for s, m in ((subject, raw), (mended[0], mended[2]))]
-    on_it = follow_poses(mended[0], case.markers, mended[1])     # what the true markers are off there
-    return scores(found.exchanges, faulty.exchanges, faulty.markers) | {
+    on_it = animate(mended[0], case.markers, mended[1], POSES)     # what the true markers are off there
+    return scores(found.swaps, faulty.exchanges, faulty.markers) | {
         "bad": len(found.bad), "raw_mm": 1e3 * away[0], "mended_mm": 1e3 * away[1],
         "true_markers_mm": 1e3 * float(np.nanmean(on_it.residuals)),
         "frames_per_cpu_s": len(faulty.markers.positions) / seconds}
@@ -247,7 +248,7 @@ def run_exchanges(model: BodyModel, case: Case, faulty: Faulty, reference: np.nd
 
 def cases(model: BodyModel, args: argparse.Namespace) -> list[Case]:
     """The real files, and men moved as in them."""
-    layout = MarkerLayout.named("cmu41", model.template)
+    layout = named_layout("cmu41", model.template)
     out = [Case(path.stem, read_markers(path), layout, None) for path in sorted(args.folder.glob("*.c3d"))
            if not args.files or path.stem in args.files]
     if args.men:
@@ -267,14 +268,14 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("folder", type=Path)
     parser.add_argument("-m", "--model", required=True)
-    parser.add_argument("-o", "--output", default="mosh_faults.json")
+    parser.add_argument("-o", "--output", default="mosh_artefacts.json")
     parser.add_argument("--files", nargs="*")
     parser.add_argument("--men", type=int, default=4)
     parser.add_argument("--real", action=argparse.BooleanOptionalAction, default=True, help="the files themselves too")
     parser.add_argument("--held-out", action="store_true", help="the 45 men kept for the end")
     parser.add_argument("--seed", type=int, default=0)
     args = parser.parse_args()
-    model, config, rows = load_model(args.model), FaultConfig(), []
+    model, config, rows = load_model(args.model), ArtefactConfig(), []
     for case in cases(model, args):
         row = run_case(model, case, config, args.seed)
         rows.append(row)

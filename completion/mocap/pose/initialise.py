@@ -1,0 +1,103 @@
+"""Where a body begins: from one frame of markers alone, and anew where it has lost a limb."""
+from __future__ import annotations
+
+from functools import partial
+
+import numpy as np
+
+from scanprep.geometry import rotations
+from scanprep.geometry.least_squares import Minimum, levenberg_marquardt
+
+from ... import energy
+from ...priors import typical_poses
+from ...starts import ANNEALING
+from .marked_body import MarkedBody
+from .robust import marker_weights, misfit
+from .settings import AnimateConfig
+
+AXES = 6                             # directions of the training poses along which a first frame is searched
+SCALES = (1.0, 0.3, 0.1)             # metres, at which a marker of a lost limb has lost three quarters of its weight
+
+
+def search(body: MarkedBody, targets: np.ndarray, config: AnimateConfig) -> np.ndarray:
+    """Unknowns (P,) of a frame from nothing but its markers (L, 3), metres, at least three of them seen.
+
+    As `starts.search`, on the fewer products of the markers; then outliers lose their weight.
+    """
+    x = _laid_on(body, typical_poses(body.body.pose_mean, body.body.pose_covariance, AXES), targets)
+    weights = np.full(body.count, config.marker_sd**-2)
+    for stiff in ANNEALING:
+        end = _solved(body, x, targets, weights, stiff / config.prior_weight if config.prior_weight else 0.0,
+                      iterations=8, tolerance=1e-3)
+        x = end.x
+    x = x[np.argsort(end.energy)[:2]]
+    for _ in range(5):                                                  # with all markers, then with the likely ones
+        end = _solved(body, x, targets, weights)
+        x = end.x[np.argmin(end.energy)][None]
+        weights, _ = marker_weights(body.positions(x[0]), targets, config.marker_sd, config.outlier)
+    return x[0]
+
+
+def _solved(body: MarkedBody, x: np.ndarray, targets: np.ndarray, weights: np.ndarray, stiff: float = 1.0,
+            iterations: int = 30, tolerance: float = 1e-5) -> Minimum[np.ndarray]:
+    """All starts (n, P) on the same markers; `stiff` is a factor on the pose prior."""
+    system = partial(body.system, targets=np.broadcast_to(targets, (len(x), *targets.shape)),
+                     weights=np.broadcast_to(weights, (len(x), len(weights))), stiff=stiff)
+    return levenberg_marquardt(system, x, iterations, tolerance, retract=body.retract)
+
+
+def _laid_on(body: MarkedBody, poses: np.ndarray, targets: np.ndarray) -> np.ndarray:
+    """Unknowns (4 n, P) of poses (n, J, 3) laid on the markers, and rotated by quarters about their long axis."""
+    there = ~np.isnan(targets[:, 0])
+    goal = targets[there]
+    centre = goal.mean(axis=0)
+    axis = np.linalg.svd(goal - centre)[2][0]
+    rest = body.positions(body.body.join(poses, np.zeros((len(poses), 3))))[:, there]
+    R, _ = rotations.procrustes(rest, np.broadcast_to(goal, rest.shape))
+    quarters = rotations.exp(np.arange(4)[:, None] * np.pi / 2 * axis)
+    placed = np.repeat(poses, 4, axis=0)
+    placed[:, 0] = rotations.log(quarters @ (R @ rotations.exp(poses[:, 0]))[:, None]).reshape(-1, 3)
+    x = body.body.join(placed, np.zeros((len(placed), 3)))
+    x[:, -3:] = centre - body.positions(x)[:, there].mean(axis=1)
+    return x
+
+
+def reinitialise_limbs(body: MarkedBody, x: np.ndarray, targets: np.ndarray, config: AnimateConfig) -> np.ndarray:
+    """Unknowns (T, P) in which frames that had lost a limb have it again; markers are (T, L, 3), metres.
+
+    A body that follows a fast limb too late takes all its markers for outliers, and never sees them again. So frames
+    with three markers far away, twice an outlier's residual, are solved anew, from what they are and from the joints of
+    the nearest frames without, with outliers that keep their weight at first; they are taken where that explains the
+    markers better, by a fifth.
+    """
+    apart = _apart(body, x, targets)
+    lost = (apart > 2.0 * config.outlier).sum(axis=1) >= 3
+    frames, good = np.flatnonzero(lost), np.flatnonzero(~lost)
+    if not len(frames) or not len(good):
+        return x
+    after = np.searchsorted(good, frames)
+    root = np.r_[0:3, body.body.n_angles:body.n_unknowns]
+    starts = [x[frames], x[good[np.maximum(after - 1, 0)]], x[good[np.minimum(after, len(good) - 1)]]]
+    for start in starts[1:]:
+        start[:, root] = x[np.ix_(frames, root)]
+    found = np.stack([_from_far(body, start, targets[frames], config) for start in starts])
+    left = np.stack([misfit(_apart(body, end, targets[frames]), config.outlier) for end in found])
+    best = left.argmin(axis=0)
+    better = left.min(axis=0) < 0.8 * misfit(apart[frames], config.outlier)
+    out = x.copy()
+    out[frames[better]] = found[best, np.arange(len(frames))][better]
+    return out
+
+
+def _from_far(body: MarkedBody, x: np.ndarray, targets: np.ndarray, config: AnimateConfig) -> np.ndarray:
+    """The unknowns (n, P) to which frames come from x, each by itself, while outliers lose their weight."""
+    for scale in SCALES:
+        weights = energy.geman_mcclure(np.nan_to_num(_apart(body, x, targets)), scale) / config.marker_sd**2
+        x = levenberg_marquardt(partial(body.system, targets=targets, weights=weights), x, 8, 1e-3, 1e-3,
+                                retract=body.retract).x
+    return x
+
+
+def _apart(body: MarkedBody, x: np.ndarray, targets: np.ndarray) -> np.ndarray:
+    """(T, L) metres from the markers to where the body puts them."""
+    return np.linalg.norm(body.positions(x) - targets, axis=2)
