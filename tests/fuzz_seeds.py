@@ -13,7 +13,7 @@ from model_bodies import random_poses, worm, worm_skeleton
 
 from completion import MarkerLayout, MarkerSequence, read_markers, write_markers
 from completion.mocap.animate.cli import read_betas_to
-from completion.mocap.files.c3d_points import replace_points
+from completion.mocap.files.c3d import replace_points
 from completion.mocap.mosh.recordings import _table_rows
 from completion.mocap.soft_tissue.soft_tissue import SoftTissue
 from completion.motion import Motion

@@ -14,6 +14,8 @@ from scanprep.pictures.camera import upright
 
 from ...motion import Motion, spread_frames
 
+KEYS = 120                           # most key frames in a GLB
+
 
 def joint_angles(motion: Motion) -> np.ndarray:
     """(T, J, 3) rotation vectors in degrees: how every part is turned against its parent, the root in the world.
@@ -70,8 +72,8 @@ def write_motion_bvh(path: Path, motion: Motion, subject: Subject) -> None:
               body=subject.template.with_vertices(rest))
 
 
-def write_glb(path: Path, motion: Motion, subject: Subject, keys: int, vertices: np.ndarray | None = None,
-              colors: np.ndarray | None = None) -> None:
+def write_glb(path: Path, motion: Motion, subject: Subject, vertices: np.ndarray | None = None,
+              colors: np.ndarray | None = None, keys: int = KEYS) -> None:
     """An animated GLB that lasts as long as the motion, of at most so many key frames.
 
     `vertices` (n, N, 3), metres, are of the key frames, where the body changes; else it is the subject's.

@@ -14,7 +14,6 @@ from scanprep.skeleton.symmetry import MirrorPlane, find_symmetry
 
 from .layout import MarkerLayout
 
-FAR = 0.06                           # metres: a marker of no telling label has no partner beyond it
 _WORDS = re.compile(r"(?<![A-Za-z])(left|right)(?![A-Za-z])", re.IGNORECASE)
 _LETTER = re.compile(r"^[LR](?=[A-Z0-9._ ])|^[lr](?=[._ ])|(?<=[._ ])[LRlr]$|(?<=[a-z0-9])[LR]$")
 _OTHER = {"L": "R", "R": "L", "l": "r", "r": "l", "left": "right", "right": "left"}
@@ -100,7 +99,7 @@ def marker_pairs(layout: MarkerLayout, template: Mesh, mirror: SkinMirror | None
     apart = apart + apart.T                                                    # there and back
     for i, row in enumerate(untold):
         j = int(apart[i].argmin())
-        if int(apart[j].argmin()) == i and apart[i, j] < 2 * FAR:
+        if int(apart[j].argmin()) == i and apart[i, j] < 0.12:         # metres, there and back
             pairs[row] = untold[j]
     return pairs
 
