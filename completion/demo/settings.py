@@ -38,11 +38,11 @@ class DemoConfig(Settings):
         How the model is learned.
     """
 
-    poses: Count = 10
+    poses: Count = 9
     subjects: Count = 4
-    faces: Faces = 9000
-    resolution: Cell = 0.009
-    template_resolution: Cell = 0.005
+    faces: Faces = 8000
+    resolution: Cell = 0.01
+    template_resolution: Cell = 0.0055
     held_out: int = 3
     frames: Count = 66
     rate: Positive = 60.0
