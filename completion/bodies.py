@@ -161,3 +161,10 @@ def as_body(body: BodyModel | Subject) -> FixedBody:
     if isinstance(body, BodyModel):
         return ShapedBody(body) if body.n_betas else FixedBody(body.subject(None))
     raise ValueError(f"body: expected a BodyModel or a Subject, got {type(body).__name__}")
+
+
+def at_rest(model: BodyModel, betas: np.ndarray | None = None) -> Mesh:
+    """The body with betas (k,), else the mean person or character, in the pose of the template."""
+    pose = np.zeros((len(model.skeleton.parents), 3))
+    mean = np.zeros(model.n_betas) if model.n_betas else None
+    return model.template.with_vertices(model.vertices(pose, mean if betas is None else betas))

@@ -9,10 +9,9 @@ import numpy as np
 from model.linear import Subject
 from scanprep.geometry import rotations
 from scanprep.geometry.mesh import Mesh
-from scanprep.pictures.animation import gif_bytes
-from scanprep.pictures.camera import Camera
+from scanprep.pictures.camera import Camera, look_around, upright
 from scanprep.pictures.shading import Dots, Shape, Solid, render, side_by_side
-from scanprep.pictures.views import look_around, upright
+from scanprep.pictures.sheets import gif_bytes
 
 from .motion import Motion, spread_frames
 

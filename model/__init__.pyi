@@ -1,18 +1,14 @@
 # The public names; loaded when they are first used, so that the command line answers at once.
+from .blend_weights import skin_weights as skin_weights
 from .body import BodyModel as BodyModel
-from .body import Derivatives as Derivatives
 from .coregistration.config import CoregistrationConfig as CoregistrationConfig
 from .coregistration.rounds import Coregistration as Coregistration
 from .coregistration.rounds import coregister as coregister
 from .coregistration.single import ModelRegistration as ModelRegistration
 from .coregistration.single import register_with_model as register_with_model
-from .evaluation.errors import PoseErrors as PoseErrors
-from .evaluation.errors import ShapeErrors as ShapeErrors
 from .evaluation.errors import compactness as compactness
 from .evaluation.errors import pose_errors as pose_errors
 from .evaluation.errors import shape_errors as shape_errors
-from .evaluation.sampling import Samples as Samples
-from .evaluation.sampling import Specificity as Specificity
 from .evaluation.sampling import sample_bodies as sample_bodies
 from .evaluation.sampling import specificity as specificity
 from .export.bvh import write_bvh as write_bvh
@@ -22,7 +18,6 @@ from .export.glb import write_skinned_glb as write_skinned_glb
 from .export.npz import write_body_npz as write_body_npz
 from .export.rig import Rig as Rig
 from .export.rig import make_rig as make_rig
-from .export.rig import skin_weights as skin_weights
 from .files import load_model as load_model
 from .fitting import FitConfig as FitConfig
 from .fitting import PoseFit as PoseFit
@@ -31,7 +26,6 @@ from .fitting import fit_pose as fit_pose
 from .fitting import fit_shape as fit_shape
 from .learning.config import LearnConfig as LearnConfig
 from .learning.mixing import learn_scape_mix as learn_scape_mix
-from .learning.parts import ChosenSkeleton as ChosenSkeleton
 from .learning.parts import choose_skeleton as choose_skeleton
 from .learning.scape import learn_blendscape as learn_blendscape
 from .learning.scape import learn_scape as learn_scape
@@ -40,7 +34,6 @@ from .learning.sex_plane import guess_sex as guess_sex
 from .learning.sexes import learn_by_sex as learn_by_sex
 from .learning.skinning import SkinConfig as SkinConfig
 from .learning.skinning import learn_skinning as learn_skinning
-from .linear import PointOperator as PointOperator
 from .linear import Subject as Subject
 from .posing.angles import pose_from_angles as pose_from_angles
 from .posing.angles import rotate_joint as rotate_joint
@@ -51,7 +44,6 @@ from .posing.mirroring import find_mirror as find_mirror
 from .posing.mirroring import mirror_pose as mirror_pose
 from .posing.transfer import repose as repose
 from .posing.transfer import subject_from_body as subject_from_body
-from .priors import JointLimits as JointLimits
 from .priors import sample_poses as sample_poses
 from .resolution.change import ResolutionConfig as ResolutionConfig
 from .resolution.change import change_resolution as change_resolution

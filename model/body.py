@@ -18,21 +18,12 @@ from .bilinear import ShapedPoints
 from .features import PoseFeatures, Terms
 from .linear import Subject, check_pose
 
-HERE_OR_EVERYWHERE = 0.25            # share of the vertices beyond which derivatives are made for all of them
-
 
 @dataclass(frozen=True, eq=False)
 class Derivatives:
-    """Vertices and how they change.
+    """Vertices (L, 3), metres, and how they change: by pose (L, 3, 3J), metres per radian, and by betas (L, 3, k).
 
-    Attributes
-    ----------
-    vertices : (L, 3) float, metres
-    pose : (L, 3, 3J) float, metres per radian
-    betas : (L, 3, k) float, metres per standard deviation
-        k = 0 where the body is the template's own, which has no betas.
-
-    The derivative with respect to trans is the identity for every vertex.
+    k = 0 where the body is the template's own, which has no betas. By trans it is the identity for every vertex.
     """
 
     vertices: np.ndarray
@@ -130,6 +121,15 @@ class BodyModel(ABC):
         (L, 3, K) float, metres per standard deviation
         """
 
+    def pull_back(self, force: np.ndarray, pose: np.ndarray, betas: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Gradient (3J,), (k,) by pose (J, 3) and betas (k,) of a function with gradient `force` (N, 3) by the
+        vertices.
+
+        It costs about as much as the vertices themselves where a kind of model goes backwards through itself.
+        """
+        found = self.jacobian(pose, betas)
+        return np.einsum("nd,ndp->p", force, found.pose), np.einsum("nd,ndk->k", force, found.betas)
+
     @abstractmethod
     def save(self, path: str | Path) -> None:
         """Write the model into one `.npz` file with a JSON header."""
@@ -217,7 +217,8 @@ class BodyModel(ABC):
             Of these vertices only.
         """
         N, K = len(self.template.vertices), 0 if betas is None else len(betas)
-        few = vertex_ids is not None and len(vertex_ids) < HERE_OR_EVERYWHERE * N
+        # share of the vertices beyond which derivatives are made for all of them
+        few = vertex_ids is not None and len(vertex_ids) < 0.25 * N
         ids = np.arange(N) if vertex_ids is None else np.asarray(vertex_ids)
         if few:
             shaped = self.points(ids, n_betas=K)

@@ -1,12 +1,17 @@
-"""`scape learn` and `scape model`: learn a body from registered meshes, look into it, pose it."""
+"""`scape model`: look into a body model and pose it; what commands on models share."""
 from __future__ import annotations
 
 from pathlib import Path
 from typing import Annotated
 
+import numpy as np
 import tyro
 
+from scanprep.cli import Unit
 from scanprep.console import Metric, Outcome, dispatch
+from scanprep.dataset import RegisteredSet
+from scanprep.geometry.files import read_registered
+from scanprep.geometry.mesh import Mesh
 
 from .body import BodyModel
 from .files import load_model
@@ -53,3 +58,30 @@ def about(model: BodyModel) -> list[Metric]:
     if model.n_betas:
         rows.append(Metric("variance of shape they explain", 100 * float(model.explained[-1]), "%"))
     return rows
+
+
+def read_bodies(folder: Path, template: Mesh, unit: Unit | None = None, one_person: bool = False
+                ) -> tuple[np.ndarray, tuple[str, ...]]:
+    """Vertices (n, N, 3) and names of a folder or a set: one body of every person, or all of the one with the most.
+
+    Raises
+    ------
+    ValueError
+        Triangles that are not those of the template.
+    """
+    if (folder / "set.json").exists():
+        whole = RegisteredSet.load(folder)
+        faces, subjects = whole.template.faces, [entry.subject for entry in whole.entries]
+        if not subjects:
+            raise ValueError(f"{folder}: the set holds no meshes")
+        most = max(whole.subjects, key=subjects.count)
+        names = tuple(entry.name for i, entry in enumerate(whole.entries) if
+                      (entry.subject == most if one_person else entry.subject not in subjects[:i]))
+        vertices = whole.vertices(names)
+    else:
+        faces, vertices, names = read_registered(folder, unit)
+    if not np.array_equal(faces, template.faces):
+        order = ", in another order" if len(faces) == len(template.faces) else ""
+        raise ValueError(f"{folder}: expected the triangles of {template}; these have {len(faces)} faces and "
+                         f"{vertices.shape[1]} vertices{order}")
+    return vertices, names

@@ -9,12 +9,11 @@ from scanprep.geometry.mesh import Mesh
 
 from .body import BodyModel
 
-LENGTH = 16                          # hexadecimal digits, 64 bits: chance meetings are rare below a billion bodies
-
 
 def body_digest(vertices: np.ndarray) -> str:
     """A short digest of one registered body (N, 3), the same for float64 and float32."""
-    return hashlib.sha256(np.ascontiguousarray(vertices, dtype=np.float32).tobytes()).hexdigest()[:LENGTH]
+    # hexadecimal digits, 64 bits: chance meetings are rare below a billion bodies
+    return hashlib.sha256(np.ascontiguousarray(vertices, dtype=np.float32).tobytes()).hexdigest()[:16]
 
 
 def digest(template: Mesh, poses: np.ndarray, shapes: np.ndarray | None) -> str:

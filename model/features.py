@@ -119,26 +119,20 @@ class RadialLift:
         return {"centres": self.centres, "radius": self.radius}
 
 
-def make_lift(kind: str, arrays: dict[str, np.ndarray]) -> Lift:
-    """The map of a file, from its name and its arrays."""
-    if kind == LinearLift.kind:
-        return LinearLift()
-    if kind == QuadraticLift.kind:
-        return QuadraticLift()
-    if kind == RadialLift.kind:
-        return RadialLift(arrays["centres"], arrays["radius"])
-    raise ValueError(f"features: '{kind}' is not known here (known: linear, quadratic, radial)")
-
-
 def restored_features(skeleton: Skeleton, header: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> PoseFeatures:
-    """The features of a model file."""
-    J, lift_arrays = len(skeleton.parents), {}
-    if header["lift"] == RadialLift.kind:
-        lift_arrays = {"centres": storage.numbers(arrays, "lift_centres", J, None, 3),
-                       "radius": storage.numbers(arrays, "lift_radius", J)}
-        if not (lift_arrays["radius"] > 0).all():
+    """The features of a model file, or ValueError."""
+    J, kind = len(skeleton.parents), header["lift"]
+    lift: Lift = LinearLift()
+    if kind == QuadraticLift.kind:
+        lift = QuadraticLift()
+    elif kind == RadialLift.kind:
+        radius = storage.numbers(arrays, "lift_radius", J)
+        if not (radius > 0).all():
             raise ValueError("lift_radius: expected positive numbers")
-    lift, part = make_lift(header["lift"], lift_arrays), storage.numbers(arrays, "feature_part", None)
+        lift = RadialLift(storage.numbers(arrays, "lift_centres", J, None, 3), radius)
+    elif kind != LinearLift.kind:
+        raise ValueError(f"features: '{kind}' is not known here (known: linear, quadratic, radial)")
+    part = storage.numbers(arrays, "feature_part", None)
     return PoseFeatures(skeleton, lift, part.astype(np.int64),
                         storage.numbers(arrays, "feature_mix", J, lift.width, len(part)))
 

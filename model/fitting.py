@@ -19,7 +19,6 @@ from .bilinear import ShapedPoints
 from .body import BodyModel
 from .features import twists
 from .linear import PointOperator, Subject
-from .pullback import pull_back
 
 EXACT = 1e-15                        # square metres, over all points: a step that gains less is none
 
@@ -267,7 +266,7 @@ def _polished(model: BodyModel, target: np.ndarray, x: np.ndarray, matrix: np.nd
 
     def energy(x: np.ndarray) -> tuple[float, np.ndarray]:
         force = model.vertices(x[:J3].reshape(-1, 3), x[J3 + 3:], x[J3:J3 + 3]) - target
-        by_pose, by_betas = pull_back(model, force, x[:J3].reshape(-1, 3), x[J3 + 3:])
+        by_pose, by_betas = model.pull_back(force, x[:J3].reshape(-1, 3), x[J3 + 3:])
         return 0.5 * float((force**2).sum()), np.concatenate([by_pose, force.sum(axis=0), by_betas])
 
     def settled(intermediate_result: OptimizeResult) -> None:

@@ -10,7 +10,7 @@ from scipy.sparse import coo_array, csc_array
 from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.sparse import Factored
 
-SETTLE = 1e-4                        # pull towards I, as a share of w_s: decides what nothing else decides
+PULL = 1e-4                          # pull towards I, as a share of w_s: decides what nothing else decides
 
 
 def edges(vertices: np.ndarray, faces: np.ndarray) -> np.ndarray:
@@ -49,7 +49,7 @@ class GradientSystem:
             pairs = pairs[self.parts[pairs[:, 0]] == self.parts[pairs[:, 1]]]
         F = len(self.template.faces)
         a, b = pairs.T
-        degree = np.bincount(pairs.ravel(), minlength=F) + SETTLE
+        degree = np.bincount(pairs.ravel(), minlength=F) + PULL
         off = coo_array((-np.ones(2 * len(a)), (np.r_[a, b], np.r_[b, a])), shape=(F, F))
         diagonal = coo_array((degree, (np.arange(F), np.arange(F))), shape=(F, F))
         return csc_array(off + diagonal) * self.w_s
@@ -69,7 +69,7 @@ class GradientSystem:
 
     def right_side(self, before: np.ndarray, after: np.ndarray) -> np.ndarray:
         """(..., F, 3, 3) of `Σ_j e_j v_jᵀ`, for edges (..., F, 2, 3) before and after, and the pull towards I."""
-        return np.swapaxes(before, -1, -2) @ after + SETTLE * self.w_s * np.eye(3)
+        return np.swapaxes(before, -1, -2) @ after + PULL * self.w_s * np.eye(3)
 
 
 def pose_gradients(system: GradientSystem, local: np.ndarray) -> np.ndarray:

@@ -20,8 +20,6 @@ from scanprep.skeleton.tree import Skeleton
 
 from .features import Terms
 
-AT_ONCE = 2**24                      # numbers that a batch of derivatives holds at a time
-
 
 def check_pose(skeleton: Skeleton, pose: Any, trans: Any) -> tuple[np.ndarray, np.ndarray]:
     """Pose (..., J, 3) and trans (..., 3), finite and with the same leading shape."""
@@ -46,16 +44,10 @@ def posed_product(terms: Terms, flat: np.ndarray, pose: np.ndarray) -> np.ndarra
 
 @dataclass(frozen=True, eq=False)
 class PointOperator:
-    """Some surface points of a fixed body as a function of pose and place, with derivatives.
+    """Some surface points of a fixed body, T (M, L, 3), metres, as a function of pose and place, with derivatives.
 
-    Built by `Subject.points`; it never touches the mesh.
-
-    Parameters
-    ----------
-    terms : Terms
-    basis : (M, L, 3) float, metres
-    origin : (3,) float, metres
-        Where the root part's centroid stands when trans is zero.
+    Built by `Subject.points`; it never touches the mesh. The root part's centroid stands in `origin` when trans is
+    zero.
     """
 
     terms: Terms
@@ -72,37 +64,17 @@ class PointOperator:
         return np.ascontiguousarray(self.basis.transpose(0, 2, 1)).reshape(-1, self.count)
 
     def evaluate(self, pose: np.ndarray, trans: np.ndarray | None = None) -> np.ndarray:
-        """Positions of the points.
-
-        Parameters
-        ----------
-        pose : (J, 3) or (B, J, 3) float, radians
-        trans : (3,) or (B, 3) float, metres
-
-        Returns
-        -------
-        (L, 3) or (B, L, 3) float, metres
-        """
+        """Positions (..., L, 3) of the points at poses (..., J, 3) and trans (..., 3)."""
         pose, trans = check_pose(self.terms.skeleton, pose, trans)
         y = posed_product(self.terms, self._flat, pose)
         y += (self.origin + trans)[..., None].astype(y.dtype)
         return np.swapaxes(y, -1, -2)
 
     def jacobian(self, pose: np.ndarray, trans: np.ndarray | None = None) -> tuple[np.ndarray, np.ndarray]:
-        """Positions and their derivatives with respect to the pose parameters.
+        """Positions (..., L, 3) and their derivatives (..., L, 3, 3J) by the pose, metres per radian.
 
-        A pose parameter turns its part and all that hangs below it, and changes the features of its joint.
+        A pose parameter rotates its part and all that hangs below it, and changes the features of its joint.
         The derivative with respect to trans is the identity.
-
-        Parameters
-        ----------
-        pose : (J, 3) or (B, J, 3) float, radians
-        trans : (3,) or (B, 3) float, metres
-
-        Returns
-        -------
-        positions : (L, 3) or (B, L, 3) float, metres
-        d_pose : (L, 3, 3J) or (B, L, 3, 3J) float, metres per radian
         """
         pose, trans = check_pose(self.terms.skeleton, pose, trans)
         if pose.ndim == 2:
@@ -110,7 +82,8 @@ class PointOperator:
             return y, np.moveaxis(columns, 0, -1)
         B, J, L = len(pose), len(self.terms.skeleton.parents), self.count
         y, d_pose = np.empty((B, L, 3)), np.empty((B, L, 3, 3 * J))
-        step = max(1, AT_ONCE // max(1, 3 * L * (self.terms.count + 4 * J)))
+        # numbers that a batch of derivatives holds at a time
+        step = max(1, 2**24 // max(1, 3 * L * (self.terms.count + 4 * J)))
         for start in range(0, B, step):
             mine = slice(start, start + step)
             y[mine], columns = self.columns(pose[mine], trans[mine])

@@ -39,19 +39,8 @@ def typical_poses(mean: np.ndarray, covariance: np.ndarray, axes: int, deviation
 
 def sample_poses(model: BodyModel, count: int, rng: np.random.Generator, limits: JointLimits | None = None
                  ) -> np.ndarray:
-    """Poses drawn from the model's Gaussian prior, and brought within the limits of the joints.
-
-    Parameters
-    ----------
-    model : BodyModel
-    count : int
-    rng : np.random.Generator
-    limits : JointLimits, optional
-
-    Returns
-    -------
-    (count, J, 3) float, radians
-        The root at rest.
+    """Poses (count, J, 3), radians, drawn from the model's Gaussian prior, the root at rest, brought within joint
+    limits.
     """
     if count < 0:
         raise ValueError(f"count: expected 0 or more, got {count}")
@@ -65,16 +54,9 @@ def sample_poses(model: BodyModel, count: int, rng: np.random.Generator, limits:
 class JointLimits:
     """Bounds of the rotation of every joint along its own main directions.
 
-    A rotation is looked at from the joint's mean, `log(mean⁻¹ exp(pose))`, which has no seam near the poses that were
-    seen, and its principal directions are bounded one by one. The root is free.
-
-    Parameters
-    ----------
-    mean : (J, 3) float, radians
-    axes : (J, 3, 3) float
-        Principal directions of the rotations from there, in columns, the widest first.
-    low, high : (J, 3) float, radians
-        Bounds along them; infinite where a joint is free.
+    A rotation is looked at from the joint's mean (J, 3), `log(mean⁻¹ exp(pose))`, which has no seam near the poses that
+    were seen. Its principal directions, the columns of `axes` (J, 3, 3), the widest first, are bounded one by one by
+    `low` and `high` (J, 3), radians. The root is free.
     """
 
     mean: np.ndarray
@@ -84,20 +66,9 @@ class JointLimits:
 
     @staticmethod
     def from_poses(poses: np.ndarray, coverage: float = 0.98, slack: float = 0.1) -> JointLimits:
-        """Bounds that hold most of some poses.
+        """Bounds that hold a share of poses (M, J, 3), M ≥ 5, in each direction, moved outwards by `slack`, radians.
 
-        Parameters
-        ----------
-        poses : (M, J, 3) float, radians
-        coverage : float in (0, 1]
-            Share of the poses within the bounds of each direction; what is left out is left out on both sides alike.
-        slack : float, radians
-            By how much the bounds are then moved outwards: few poses do not show all that a joint can do.
-
-        Raises
-        ------
-        ValueError
-            Fewer than five poses, settings out of range.
+        What is left out is left out on both sides alike; few poses do not show all that a joint can do.
         """
         poses = np.asarray(poses, dtype=np.float64)
         if poses.ndim != 3 or poses.shape[2] != 3 or len(poses) < LEAST_POSES or not np.isfinite(poses).all():

@@ -8,7 +8,7 @@ from typing import Any, ClassVar
 
 import numpy as np
 
-from scanprep.geometry import storage
+from scanprep.geometry import rotations, storage
 from scanprep.geometry.mesh import Mesh
 from scanprep.skeleton.tree import Skeleton
 
@@ -35,14 +35,8 @@ class ScapeModel(BodyModel):
     pose_space : PoseSpace
     shape_space : ShapeSpace
         Without components for a model of the template's own body alone.
-    pose_mean : (J, 3) float, radians
-    pose_covariance : (3J, 3J) float, square radians
-        Of the training poses, zero in the root's rows: a Gaussian prior of the pose.
-    pose_examples : (M, J, 3) float, radians
-        The training poses themselves, and those in which the people of the training set stand, the root not turned;
-        M = 0 in files of earlier versions.
-    info : dict
-        How the model was made: settings, sizes and a digest of the training set.
+    pose_mean, pose_covariance, pose_examples, info
+        As for `BodyModel`.
 
     [SCAPE] Eq. 6
     """
@@ -146,6 +140,27 @@ class ScapeModel(BodyModel):
         rhs = self.stitching.edge_operator.T @ e.transpose(0, 3, 1, 2).reshape(2 * F, 3 * K)
         y = self.stitching.solve(rhs).reshape(-1, 3, K)
         return y if vertex_ids is None else y[vertex_ids]
+
+    def pull_back(self, force: np.ndarray, pose: np.ndarray, betas: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        skeleton, space, weights = self.skeleton, self.pose_space, self.blend_weights
+        R, v_hat, Q = skeleton.part_rotations(pose), self.parts.v_hat, space.gradients(pose)
+        pulled = (self.stitching.edge_operator @ self.stitching.solve_adjoint(force)).reshape(-1, 2, 3)
+        S, posed = self.shape_space.gradients(betas), v_hat @ np.swapaxes(Q, -1, -2)                 # rows (Q v̂)ᵀ
+        local = pulled @ np.tensordot(weights, R, axes=1)                                            # rows (Rᵀ z)ᵀ
+        by_S = np.swapaxes(local, -1, -2) @ posed                                                    # Σ_j Rᵀ z (Q v̂)ᵀ
+        by_Q = np.swapaxes(S, -1, -2) @ (np.swapaxes(local, -1, -2) @ v_hat)
+        by_R = np.tensordot(weights, np.swapaxes(pulled, -1, -2) @ (posed @ np.swapaxes(S, -1, -2)), axes=(0, 0))
+        components = self.shape_space.components[:len(betas)]
+        by_betas = components.reshape(len(components), -1) @ by_S.ravel().astype(components.dtype)
+        delta = np.concatenate([a.reshape(len(a), -1) @ by_Q[faces].ravel() for faces, a in
+                                zip(space.faces_of_part, space.coefficients, strict=True)])
+        # a turn ω of part p changes R_p by hat(ω) R_p, and turns all that hangs below it
+        M = by_R @ np.swapaxes(R, -1, -2)
+        turn = np.stack([M[:, 2, 1] - M[:, 1, 2], M[:, 0, 2] - M[:, 2, 0], M[:, 1, 0] - M[:, 0, 1]], axis=-1)
+        below = skeleton.descends.T.astype(float) @ turn
+        by_pose = np.einsum("pd,pdc->pc", below, R @ rotations.right_jacobian(pose))
+        by_pose += np.tensordot(delta, space.features.derivative(pose), axes=1)
+        return by_pose.ravel(), by_betas.astype(np.float64)
 
     def _arrays(self) -> dict[str, np.ndarray]:
         return {

@@ -51,14 +51,8 @@ class SkinningModel(BodyModel):
         Variance over the training people along each component, summed over vertices, largest first.
     shape_total : float, square metres
         The same in all directions.
-    pose_mean : (J, 3) float, radians
-    pose_covariance : (3J, 3J) float, square radians
-        Of the training poses, zero in the root's rows: a Gaussian prior of the pose.
-    pose_examples : (M, J, 3) float, radians
-        The training poses themselves, and those in which the people of the training set stand, the root not turned;
-        M = 0 in files of earlier versions.
-    info : dict
-        How the model was made: settings, sizes and a digest of the training set.
+    pose_mean, pose_covariance, pose_examples, info
+        As for `BodyModel`.
     """
 
     template: Mesh

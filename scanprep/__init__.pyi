@@ -2,12 +2,8 @@
 from .alignment.icp import align_rigid as align_rigid
 from .cleaning.clean_scan import CleanScanConfig as CleanScanConfig
 from .cleaning.clean_scan import clean_scan as clean_scan
-from .correspondence.correlated import (
-    CorrelatedConfig as CorrelatedConfig,
-)
-from .correspondence.correlated import (
-    find_correspondences as find_correspondences,
-)
+from .correspondence.correlated import find_correspondences as find_correspondences
+from .correspondence.search import CorrelatedConfig as CorrelatedConfig
 from .correspondence.seeds import SeedConfig as SeedConfig
 from .correspondence.seeds import find_seeds as find_seeds
 from .dataset import RegisteredSet as RegisteredSet
@@ -63,8 +59,8 @@ from .skeleton.edit import (
     split_part as split_part,
 )
 from .skeleton.find import SkeletonConfig as SkeletonConfig
+from .skeleton.find import SkeletonSearch as SkeletonSearch
 from .skeleton.find import find_skeleton as find_skeleton
+from .skeleton.find import search_skeleton as search_skeleton
 from .skeleton.names import name_parts as name_parts
-from .skeleton.search import SkeletonSearch as SkeletonSearch
-from .skeleton.search import search_skeleton as search_skeleton
 from .skeleton.tree import Skeleton as Skeleton

@@ -8,9 +8,9 @@ import numpy as np
 from completion_bodies import MEAN, SD
 from model_bodies import worm, worm_model, worm_skeleton
 
+from model.blend_weights import diffused_weights
 from model.body import BodyModel
 from model.features import Lift, PoseFeatures, QuadraticLift, RadialLift
-from model.learning.skin_weights import diffused_weights
 from model.learning.skinning import corrective_features
 from model.pose_space import PoseSpace
 from model.scape import BlendScapeModel, ScapeModel

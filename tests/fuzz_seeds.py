@@ -13,7 +13,7 @@ from model_bodies import random_poses, worm, worm_skeleton
 
 from completion import MarkerLayout, MarkerSequence, read_markers, write_markers
 from completion.mocap.animate.cli import read_betas_to
-from completion.mocap.files.c3d_points import replace_points
+from completion.mocap.files.c3d import replace_points
 from completion.mocap.mosh.recordings import _table_rows
 from completion.mocap.soft_tissue.soft_tissue import SoftTissue
 from completion.motion import Motion
@@ -27,8 +27,7 @@ from model.files import load_model
 from model.learning.cli import _read_sexes
 from model.posing.cli import _read_betas, _read_turns
 from scanprep import Mesh, RegisteredSet, read_landmarks, read_mesh, write_landmarks, write_mesh
-from scanprep.correspondence.correspondences import Correspondences
-from scanprep.correspondence.files import read_correspondences, write_correspondences
+from scanprep.correspondence.correspondences import Correspondences, read_correspondences, write_correspondences
 from scanprep.decimation.registered_set import DecimateSetConfig, _load_map, write_decimated_set
 from scanprep.geometry import storage
 from scanprep.geometry.files import PointCloud, read_points, write_points

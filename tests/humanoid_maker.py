@@ -9,12 +9,13 @@ from collections.abc import Callable
 from dataclasses import replace
 
 import numpy as np
+from people_maker import mirror, remesh
 from scipy.optimize import linear_sum_assignment
 from scipy.sparse import coo_array, csr_array, diags_array
 from scipy.sparse.csgraph import dijkstra
 from scipy.spatial import cKDTree
 
-from model.export.rig import strongest
+from model.blend_weights import strongest
 from model.statue.control.chart import make_chart
 from model.statue.control.files import write_control
 from model.statue.control.humanoid import STORED
@@ -23,13 +24,11 @@ from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.surface import Surface
 from scanprep.skeleton.tree import Skeleton
 from scanprep.synthetic import body_parts as people_parts
-from scanprep.synthetic import head as people_head
-from scanprep.synthetic.anatomy import Anatomy
+from scanprep.synthetic.anatomy import Anatomy, tables
 from scanprep.synthetic.body_parts import cross_sections
-from scanprep.synthetic.implicit_surface import Field, Group, Loft, Mirrored, RoundCone, project
+from scanprep.synthetic.implicit_surface import Field, Group, Loft, Mirrored, RoundCone, polygonise, project
 from scanprep.synthetic.landmarks import landmarks, markers
 from scanprep.synthetic.topology import CANONICAL, blending, load
-from scanprep.synthetic.triangulation import mirror, polygonise, remesh
 
 NAMES = ("humanoid_root", "vl5", "skullbase", "l_sternoclavicular", "l_shoulder", "l_elbow", "l_wrist",
          "r_sternoclavicular", "r_shoulder", "r_elbow", "r_wrist", "l_hip", "l_knee", "l_ankle", "r_hip", "r_knee",
@@ -68,7 +67,7 @@ def coarse_body(a: Anatomy) -> Field:
     """The surface of the people without toes, fingers and ears, which few triangles cannot follow."""
     g = a.scale
     torso, shoulders = people_parts.trunk(a)
-    leg, head = people_parts.leg(a), people_head.head(a)
+    leg, head = people_parts.leg(a), people_parts.head(a)
     assert isinstance(leg, Group) and isinstance(head, Group)
     leg = Group([leg.members[0], (shoe(a), leg.members[1][1])], leg.bumps, leg.bounds)
     nose = RoundCone(a.eye + a.front(0, 0.084, 0.012), a.eye + a.front(0, 0.101, -0.036), 0.008, 0.0125)
@@ -96,11 +95,10 @@ def mitten(a: Anatomy) -> Field:
 
 def shoe(a: Anatomy) -> Field:
     """The foot with its toes in one."""
-    from scanprep.synthetic.profiles import FOOT as TABLE
 
     length, frame, ankle = a.width["foot"], a.foot_frame, a.joints[12]
     toes = np.array([[0.66, -0.020, 0.150, -0.045, 0.138], [0.72, -0.045, 0.110, -0.055, 0.136]])
-    t, shift, half, top, bottom = (np.vstack([TABLE, toes]) * length).T
+    t, shift, half, top, bottom = (np.vstack([tables.foot, toes]) * length).T
     origin = np.array([ankle[0], ankle[1], 0.140 * length])
     keys = cross_sections(t, half, half, (top + bottom) / 2, (top + bottom) / 2, 2.8, shift, (top - bottom) / 2)
     return Group([(Loft(origin, frame, keys, (0.018 * length, 0.03 * length)), 0)],

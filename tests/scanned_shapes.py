@@ -3,7 +3,7 @@ import numpy as np
 
 from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.surface import Rays
-from scanprep.pictures.glyphs import sphere
+from scanprep.pictures.shading import sphere
 
 
 def ball(divisions: int = 4, radius: float = 0.1) -> Mesh:

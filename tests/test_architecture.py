@@ -1,5 +1,6 @@
 """The structure of the project holds: imports point down, tags name known papers, libraries do not print."""
 import ast
+import functools
 import importlib
 import re
 import subprocess
@@ -20,6 +21,11 @@ ONE_FILE_EACH = {"pymeshlab", "open3d", "ezc3d"}
 SPEAKS = {"cli.py", "console.py", "__main__.py"}
 
 
+@functools.cache
+def parsed(path):
+    return ast.parse(path.read_text(encoding="utf-8"))
+
+
 def name(path):
     return str(path.relative_to(ROOT))
 
@@ -37,7 +43,7 @@ def imports(tree, only_top=False):
 def test_imports_point_down(path):
     package = path.relative_to(ROOT).parts[0]
     above = PACKAGES[PACKAGES.index(package) + 1:]
-    wrong = [f"{name(path)}:{line} imports {module}" for module, line in imports(ast.parse(path.read_text()))
+    wrong = [f"{name(path)}:{line} imports {module}" for module, line in imports(parsed(path))
              if module in above or module == "tests"]
     assert not wrong
 
@@ -45,19 +51,19 @@ def test_imports_point_down(path):
 @pytest.mark.parametrize("path", MODULES, ids=name)
 def test_heavy_libraries_load_late(path):
     wrong = [f"{name(path)}:{line} imports {module} at the top"
-             for module, line in imports(ast.parse(path.read_text()), only_top=True) if module in HEAVY]
+             for module, line in imports(parsed(path), only_top=True) if module in HEAVY]
     assert not wrong or path.name in SPEAKS
 
 
 @pytest.mark.parametrize("library", sorted(ONE_FILE_EACH))
 def test_one_file_a_foreign_library(library):
-    users = [name(p) for p in MODULES if library in {m for m, _ in imports(ast.parse(p.read_text()))}]
+    users = [name(p) for p in MODULES if library in {m for m, _ in imports(parsed(p))}]
     assert len(users) <= 1, users
 
 
 @pytest.mark.parametrize("path", [p for p in MODULES if p.name not in SPEAKS], ids=name)
 def test_libraries_do_not_print_or_exit(path):
-    calls = [node for node in ast.walk(ast.parse(path.read_text())) if isinstance(node, ast.Call)]
+    calls = [node for node in ast.walk(parsed(path)) if isinstance(node, ast.Call)]
     wrong = [f"{name(path)}:{node.lineno}" for node in calls
              if ast.unparse(node.func) in ("print", "exit", "quit", "sys.exit", "os._exit")]
     assert not wrong

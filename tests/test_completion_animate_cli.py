@@ -33,7 +33,7 @@ def place(tmp_path_factory):
     place = tmp_path_factory.mktemp("animate")
     model = worm_with_prior()
     model.save(place / "model.npz")
-    config_file(place, glb={"keys": 6}, shape={"frames": 4, "start_axes": 1})
+    config_file(place, person={"frames": 4})
     vertices = np.random.default_rng(4).choice(396, 30, replace=False)
     layout = MarkerLayout(tuple(f"M{i}" for i in range(30)), vertices, 0.012)
     layout.save(place / "layout.json")

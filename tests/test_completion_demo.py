@@ -117,12 +117,12 @@ def counted(monkeypatch):
 
 
 def test_another_setting_does_anew_what_depends_on_it(demo_folder, tmp_path, counted):
-    """Other noise of the markers: another recording and another motion, and nothing else."""
+    """Another rate of the markers: another recording and another motion, and nothing else."""
     folder = tmp_path / "again"
     shutil.copytree(demo_folder, folder)
     before = files(folder)
     with workspace(folder) as space:
-        measuring.figures(Demo(space, replace(QUICK, marker_noise=0.002), console.bar))
+        measuring.figures(Demo(space, replace(QUICK, rate=33.0), console.bar))
     changed = {name for name, data in files(folder).items() if before[name] != data}
     done = {name: calls for name, calls in counted.items() if calls}
     assert done == {"prepare": 1, "record_walk": 1, "animate": 1}        # `prepare` looks for itself what is to be done
@@ -190,7 +190,6 @@ def test_what_is_not_ours_stays(tmp_path, capsys):
 KILLED = """
 import os, sys
 from completion.demo import chain, settings
-from completion.demo.recording import ScanPerson
 from scanprep.batch import pool
 from scanprep.batch.opening import workspace
 from scanprep.console import bar

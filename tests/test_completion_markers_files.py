@@ -280,25 +280,6 @@ def test_select_and_frames():
         seq.select(["NOSE"])
 
 
-@pytest.mark.parametrize("rate", [120.0, 60.0, 240.0, 47.0, 100.0])
-def test_resampling_a_straight_motion_is_exact(rate):
-    t = np.arange(31) / 120
-
-    def motion(t):
-        return np.stack([2 * t, 1 - t, 0.5 + 0 * t], axis=-1)[:, None]
-
-    found = MarkerSequence(motion(t), ("A",), 120).resampled(rate)
-    assert found.rate == rate and len(found.positions) == int(30 / 120 * rate + 1e-9) + 1
-    np.testing.assert_allclose(found.positions, motion(found.times), atol=1e-12)
-
-
-def test_resampling_keeps_gaps_missing_and_nothing_else():
-    positions = np.ones((5, 1, 3))
-    positions[2] = np.nan
-    found = MarkerSequence(positions, ("A",), 10).resampled(20)
-    assert found.seen[:, 0].tolist() == [True, True, True, False, False, False, True, True, True]
-
-
 @pytest.mark.parametrize(("positions", "labels", "rate", "says"), [
     (np.ones((2, 3, 3)), ("A", "B"), 100, "positions: expected shape"),
     (np.ones((2, 2, 3)), ("A", "A"), 100, "labels: .* A comes"),

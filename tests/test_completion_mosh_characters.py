@@ -8,13 +8,13 @@ from completion_bodies import MEAN, worm_with_prior
 from glb_reader import Glb
 
 from completion import Motion, deformation, motion_pictures, retarget_soft_tissue
-from completion.mocap.retargeting.creases import Creases, at_rest
+from completion.bodies import at_rest
+from completion.mocap.retargeting.creases import Creases
 from completion.mocap.retargeting.pictures import picture_transfer, write_character
 from completion.mocap.retargeting.retarget import world_up
 from completion.mocap.retargeting.soft_tissue import moving_character
 from completion.mocap.soft_tissue.soft_tissue import SoftTissue
-from model.posing.character import CharacterConfig, character_model
-from model.posing.character_mesh import inside
+from model.posing.character import CharacterConfig, character_model, inside
 from scanprep.geometry import rotations
 from scanprep.geometry.surface import Surface
 
@@ -113,15 +113,15 @@ def test_creases_are_smoothed_and_nothing_else(model):
     body = model.vertices(pose, np.zeros(1))
     for blend in (0, 6):
         creases = Creases(rest, model.skeleton, blend)
-        assert not creases.turned_over(body, pose).any()
+        assert not creases.inverted(body, pose).any()
         np.testing.assert_array_equal(creases.smoothed(body[None], pose[None])[0], body)
     folded = body.copy()
     middle = int(np.argmin(np.abs(rest.vertices - rest.vertices.mean(axis=0)).sum(axis=1)))
     folded[middle] += 0.14 * np.array([1.0, 0.3, 0]) @ model.skeleton.part_rotations(pose)[0].T
-    turned = creases.turned_over(folded, pose)
+    turned = creases.inverted(folded, pose)
     assert turned.any() and (rest.faces[turned] == middle).any(axis=1).all()
     smooth = creases.smoothed(np.stack([body, folded]), np.stack([pose, pose]))
-    assert not creases.turned_over(smooth[1], pose).any()
+    assert not creases.inverted(smooth[1], pose).any()
     moved = np.flatnonzero(np.linalg.norm(smooth[1] - folded, axis=1))
     assert middle in moved and len(moved) < 30
     np.testing.assert_array_equal(smooth[0], body)

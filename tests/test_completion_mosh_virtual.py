@@ -6,8 +6,7 @@ import pytest
 
 from completion.mocap.artefacts.results import BadSpan, MarkerArtefacts, Swap
 from completion.mocap.artefacts.virtual import artefact_table, write_virtual
-from completion.mocap.files.c3d import _Numbers, point_table
-from completion.mocap.files.c3d_points import replace_points
+from completion.mocap.files.c3d import _Numbers, point_table, replace_points
 from completion.mocap.files.markers import MarkerFileError, MarkerSequence, read_markers
 
 ezc3d = pytest.importorskip("ezc3d")

@@ -9,7 +9,7 @@ from completion.mocap.files.motion_files import joint_angles, joint_centres, wri
 from completion.mocap.retargeting.retarget import betas_over_time, lowest, morphed_vertices, retarget, world_up
 from completion.motion import Motion
 from scanprep.geometry.rotations import exp, log
-from scanprep.pictures.views import upright
+from scanprep.pictures.camera import upright
 
 FRAMES = 40
 BETAS = np.array([0.5, -0.5, 0.2])

@@ -14,8 +14,8 @@ from scanned_shapes import ball as sphere
 
 from completion import MarkerLayout, MarkerSequence, motion_pictures, write_markers
 from completion.__main__ import main
-from completion.mocap.animate.work import GlbConfig, animate_file
 from completion.mocap.animate.work import Work as Follow
+from completion.mocap.animate.work import animate_file
 from completion.mocap.pose.robust import motion_problem
 from completion.mocap.pose.settings import AnimateConfig
 from completion.mocap.subject.person import PersonConfig
@@ -33,7 +33,7 @@ from scanprep.console import Metric
 from scanprep.correspondence.correspondences import Correspondences, correspondences_problem
 from scanprep.geometry.files import PointCloud, write_points
 from scanprep.registration.nonrigid import Registration, registration_problem
-from scanprep.skeleton.search import skeleton_problem
+from scanprep.skeleton.find import skeleton_problem
 
 MARKS = {"head": 10, "tail": 380, "left": 100, "right": 200, "middle": 250}
 LABELS = tuple(f"M{i}" for i in range(30))
@@ -157,7 +157,7 @@ def test_motions(tmp_path, case, words):
         markers = dataclasses.replace(markers, labels=tuple(labels))
     write_markers(tmp_path / "walk.csv", markers)
     work = Follow(model, "model.npz", str(tmp_path / "layout.json"), model.subject(None), None, None, "m", None,
-                  AnimateConfig(), PersonConfig(), GlbConfig(6))
+                  AnimateConfig(), PersonConfig())
     check(animate_file(work, tmp_path / "walk.csv", Room(tmp_path / "out")), words)
     assert (tmp_path / "out" / "motion.npz").exists()
 

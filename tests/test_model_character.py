@@ -9,8 +9,14 @@ from posing_bodies import skinned, symmetric_worm
 from model import load_model
 from model.cli import group
 from model.learning.sex_plane import PLANE
-from model.posing.character import CharacterConfig, character_model, character_pose
-from model.posing.character_mesh import CharacterMeshConfig, inside, register_character
+from model.posing.character import (
+    CharacterConfig,
+    CharacterMeshConfig,
+    character_model,
+    character_pose,
+    inside,
+    register_character,
+)
 from model.scape import BlendScapeModel
 from scanprep import Mesh, write_landmarks, write_mesh
 from scanprep.geometry import rotations

@@ -6,7 +6,8 @@ import pytest
 from model_bodies import worm_model
 
 from model import fit_pose, fit_shape
-from model.cli import info, mesh, read_subject
+from model.cli import info
+from model.posing.cli import mesh, read_subject
 from scanprep import read_mesh, write_mesh
 
 

@@ -80,7 +80,7 @@ def test_a_scan_that_plain_registration_gets_wrong_is_right_with_the_model(body,
     found = register_with_model(crab_model.subject(), scan, start=plain.mesh.vertices, config=QUICK)
     assert mean_mm(plain.mesh.vertices, truth) > 30 and mean_mm(found.mesh.vertices, truth) < 4
     assert 1 - QUICK.failed < found.explained
-    assert found.seen.mean() > 0.8 and found.rms < 1e-3 and found.flipped == 0
+    assert found.seen.mean() > 0.8 and found.rms < 1e-3 and found.inverted == 0
 
 
 def test_without_any_start_or_landmark_the_pose_is_found(body, crab_model):
@@ -269,7 +269,7 @@ def test_what_was_kept_is_not_made_again(story, tmp_path, monkeypatch):
     for a, b in zip(again.registrations, done.registrations, strict=True):
         np.testing.assert_array_equal(a.mesh.vertices, b.mesh.vertices)
         np.testing.assert_array_equal(a.distances, b.distances)
-        assert (a.explained, a.flipped, a.betas) == (b.explained, b.flipped, None)
+        assert (a.explained, a.inverted, a.betas) == (b.explained, b.inverted, None)
     pose = done.registrations[4].pose
     np.testing.assert_array_equal(again.model.vertices(pose), done.model.vertices(pose))
     assert digests_of(again.model) == digests_of(done.model)

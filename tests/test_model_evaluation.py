@@ -7,7 +7,6 @@ from conformance_bodies import KINDS
 from model_bodies import random_poses, worm_model
 
 from model import LearnConfig, learn_scape
-from model.cli import mesh as mesh_command
 from model.digests import body_digest, digest, trained_on
 from model.evaluation.cli import evaluate, sample
 from model.evaluation.errors import (
@@ -20,6 +19,7 @@ from model.evaluation.errors import (
 from model.evaluation.page import picture_error_map
 from model.evaluation.sampling import sample_bodies, specificity, unposed
 from model.fitting import FitConfig, ShapeFitter
+from model.posing.cli import mesh as mesh_command
 from model.scape import ScapeModel
 from model.shape_space import ShapeSpace
 from scanprep.dataset import RegisteredSet

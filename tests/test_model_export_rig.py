@@ -3,8 +3,9 @@ import numpy as np
 import pytest
 from model_bodies import random_poses, worm, worm_model, worm_skeleton
 
+from model.blend_weights import skin_weights, strongest
 from model.export.correctives import motion_correctives, rest_corrections
-from model.export.rig import Rig, joint_places, make_rig, skin_weights, strongest, turn_up
+from model.export.rig import Rig, joint_places, make_rig, turn_up
 from model.features import linear_features
 from model.skinning import SkinningModel
 from scanprep.geometry import rotations

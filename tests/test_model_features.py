@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 from model_bodies import random_poses, worm_model, worm_skeleton
 
-from model.features import LinearLift, PoseFeatures, QuadraticLift, RadialLift, make_lift, twists
+from model.features import LinearLift, PoseFeatures, QuadraticLift, RadialLift, restored_features, twists
 
 
 def lifts():
@@ -48,7 +48,10 @@ def test_batch_is_the_loop_and_the_first_feature_of_a_part_is_one(lift):
 @pytest.mark.parametrize("lift", lifts(), ids=lambda lift: lift.kind)
 def test_lift_comes_back_from_its_arrays(lift):
     t = np.random.default_rng(4).normal(size=(2, 4, 3))
-    again = make_lift(lift.kind, lift.arrays())
+    features = features_of(lift)
+    arrays = {"feature_part": features.part, "feature_mix": features.mix,
+              **{f"lift_{name}": array for name, array in lift.arrays().items()}}
+    again = restored_features(features.skeleton, {"lift": lift.kind}, arrays).lift
     np.testing.assert_array_equal(again.evaluate(t), lift.evaluate(t))
 
 
@@ -77,4 +80,4 @@ def test_refuses_shapes_that_do_not_agree():
     with pytest.raises(ValueError, match="part"):
         PoseFeatures(features.skeleton, LinearLift(), features.part[::-1], features.mix)
     with pytest.raises(ValueError, match="not known"):
-        make_lift("cubic", {})
+        restored_features(features.skeleton, {"lift": "cubic"}, {})

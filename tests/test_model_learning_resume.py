@@ -15,7 +15,7 @@ from model.learning.cli import learn
 from scanprep import read_mesh, write_mesh
 from scanprep.batch.opening import beside
 from scanprep.console import run
-from scanprep.skeleton import search
+from scanprep.skeleton import find
 
 STAGES = {"skeleton": (cli, "find_skeleton"), "poses": (scape, "learn_pose"), "people": (scape, "shape_gradients"),
           "components": (scape, "learn_shape_space"), "pictures": (cli, "_draw")}
@@ -154,7 +154,7 @@ def test_the_search_for_a_skeleton_goes_on(tmp_path, monkeypatch):
                 "--config", str(config_file(tmp_path, scape=QUICK))]
 
     assert run(learn, "scape learn", given("a.npz")) == 0
-    killed(search, "_searched", 1, given("b.npz"))                                # after the first restart
+    killed(find, "_searched", 1, given("b.npz"))                                # after the first restart
     killed(parts, "_left_out_error", 0, given("b.npz"))                           # after the last
     killed(parts, "find_skeleton", 1, given("b.npz"))                             # before more parts are tried
     tried, real = [], parts.find_skeleton

@@ -11,7 +11,7 @@ from model.features import linear_features
 from model.pose_space import PoseSpace
 from model.resolution.change import ResolutionConfig, change_resolution, resample, resolution_gap, subdivide
 from model.resolution.distil import Follower
-from model.resolution.pieces import Piece, carry_skeleton, gradients_of
+from model.resolution.pieces import Piece, gradients_of, transfer_skeleton
 from model.scape import BlendScapeModel, ScapeModel
 from model.shape_space import ShapeSpace
 from scanprep import decimate, write_mesh
@@ -145,7 +145,7 @@ def test_blended_rotations_are_carried_too(model):
 
 def test_parts_are_connected_and_nearly_where_they_were(model):
     coarse = decimate(model.template, 300)
-    skeleton = carry_skeleton(model.skeleton, model.template, coarse)
+    skeleton = transfer_skeleton(model.skeleton, model.template, coarse)
     x = coarse.corners.mean(axis=1)[:, 0] - 0.3
     inside = np.abs(x[:, None] - [-0.35, 0.35, 0.7]).min(axis=1) > 0.1
     np.testing.assert_array_equal(skeleton.part_of_face[inside],

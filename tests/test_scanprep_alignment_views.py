@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 from scanned_shapes import SIX, bumpy, view
 
-from scanprep.alignment.view_landmarks import fit_of_views, place_by_landmarks
+from scanprep.alignment.view_poses import fit_of_views, place_by_landmarks
 from scanprep.alignment.views import AlignViewsConfig, align_views
 from scanprep.geometry import rotations
 

@@ -16,8 +16,7 @@ from scipy.spatial.transform import Rotation
 from completion.__main__ import main
 from scanprep import Mesh, RegisteredSet, Skeleton, config_files, read_mesh, read_points, write_landmarks, write_mesh
 from scanprep.cli import COMMANDS
-from scanprep.correspondence.correspondences import Correspondences
-from scanprep.correspondence.files import read_correspondences, write_correspondences
+from scanprep.correspondence.correspondences import Correspondences, read_correspondences, write_correspondences
 from scanprep.geometry.files import PointCloud, write_points
 from scanprep.geometry.landmarks import LANDMARK_ENDINGS, read_landmarks
 from scanprep.geometry.storage import StorageError

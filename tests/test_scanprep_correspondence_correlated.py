@@ -8,7 +8,7 @@ import pytest
 
 from scanprep.correspondence import potentials as ce
 from scanprep.correspondence.correlated import find_correspondences
-from scanprep.correspondence.places import Places, gradients
+from scanprep.correspondence.potentials import Places, gradients
 from scanprep.correspondence.search import BeliefLevel, CorrelatedConfig
 from scanprep.correspondence.seeds import SeedConfig, find_seeds, matched_ends
 from scanprep.correspondence.sheet import Sheet
@@ -174,19 +174,18 @@ def test_energies_of_true_images_are_zero_and_mirrors_cost():
     normals = rotations.exp(rng.normal(size=(n, 3)))[:, 2]
     places = Places(rng.normal(size=(n, 3)), normals, rng.uniform(0.2, 1, (n, 4)), rng.uniform(-1, 1, (n, 6)),
                     np.ones((n, 4)))
-    config = ce.PotentialConfig()
-    mirrored = replace(places, turns=-places.turns)
+    mirrored = replace(places, angles=-places.angles)
     edges = np.array([[0, 1], [4, 7], [3, 11]])
     own = np.arange(n)[:, None]
-    assert np.allclose(np.diagonal(ce.place_energy(places, places, config, 1.0)), 0)
-    assert (np.diagonal(ce.place_energy(places, mirrored, config, 1.0)) > 0.1).all()
-    assert np.allclose(ce.edge_energy(places, places, edges, own, config, 1.0), 0, atol=1e-6)
+    assert np.allclose(np.diagonal(ce.place_energy(places, places, 1.0)), 0)
+    assert (np.diagonal(ce.place_energy(places, mirrored, 1.0)) > 0.1).all()
+    assert np.allclose(ce.edge_energy(places, places, edges, own, 1.0), 0, atol=1e-6)
     domains = np.tile(np.arange(n), (n, 1))
-    table = ce.edge_energy(places, places, edges, domains, config, 1.0)
-    assert table.max() <= ce.most_edge_energy(config) + 1e-5
-    assert ce.place_energy(places, mirrored, config, 1.0).max() <= ce.most_place_energy(config, 4)
+    table = ce.edge_energy(places, places, edges, domains, 1.0)
+    assert table.max() <= ce.MOST_EDGE + 1e-5
+    assert ce.place_energy(places, mirrored, 1.0).max() <= ce.most_place_energy(4)
     # The table of (i, j) is that of (j, i) turned over.
-    assert np.allclose(table, ce.edge_energy(places, places, edges[:, ::-1], domains, config, 1.0).transpose(0, 2, 1),
+    assert np.allclose(table, ce.edge_energy(places, places, edges[:, ::-1], domains, 1.0).transpose(0, 2, 1),
                        atol=1e-5)
 
 

@@ -4,14 +4,16 @@ import json
 import numpy as np
 import pytest
 
-from scanprep.geometry.files import (
-    MeshFileError,
+from scanprep.geometry.files import MeshFileError
+from scanprep.geometry.landmarks import (
+    LANDMARK_ENDINGS,
+    landmarks_beside,
     match_landmarks,
     read_landmark_vertices,
     read_landmarks,
+    read_template_landmarks,
     write_landmarks,
 )
-from scanprep.geometry.landmarks import LANDMARK_ENDINGS, landmarks_beside, read_template_landmarks
 from scanprep.geometry.mesh import Mesh
 
 MESH = Mesh([[0, 0, 0], [1, 0, 0], [0, 1, 0], [0, 0, 1.5]], [[0, 2, 1], [0, 1, 3], [1, 2, 3], [0, 3, 2]])

@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 import trimesh
 
-from model.posing.character_mesh import inside
+from model.posing.character import inside
 from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.surface import OrientedPoints, Rays, Surface, barycentric
 

@@ -22,7 +22,7 @@ from scanprep.pipeline.page import write_set_page
 from scanprep.pipeline.prepare import prepare
 from scanprep.pipeline.review import Limits, review
 from scanprep.pipeline.scans import find_scans
-from scanprep.registration.confidence import missed_share, principal_stretches, stretched_share
+from scanprep.registration.confidence import principal_stretches, stretched_share, uncovered_share
 
 GOOD = ScanFigures("good", "10 landmarks", 0.001, 0.0015, 0.85, 0.85, 0.0, 0.004, 0.002, 0, True, 0.0, 3.25)
 
@@ -146,7 +146,7 @@ def test_stretches_of_a_known_map(template):
 
 def test_missed_points(template):
     points = np.vstack([template.vertices * 1.001, template.vertices[:214] + [3, 0, 0]])
-    assert missed_share(points, template, 0.01, samples=len(points)) == pytest.approx(214 / 856)
+    assert uncovered_share(points, template, 0.01, samples=len(points)) == pytest.approx(214 / 856)
 
 
 def test_tables_keep_their_numbers(tmp_path):

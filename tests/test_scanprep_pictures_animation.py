@@ -6,8 +6,9 @@ from glb_reader import Glb
 
 from scanprep.geometry import rotations
 from scanprep.geometry.mesh import Mesh
-from scanprep.pictures.animation import animated_glb, gif_bytes, write_animated_glb, write_gif
-from scanprep.pictures.glyphs import sphere
+from scanprep.pictures.gltf import animated_glb, write_animated_glb
+from scanprep.pictures.shading import sphere
+from scanprep.pictures.sheets import gif_bytes, write_gif
 
 
 @pytest.fixture(scope="module")

@@ -4,12 +4,13 @@ import pytest
 from scanprep.geometry import rotations
 from scanprep.geometry.mesh import Mesh
 from scanprep.pictures.colors import decode, encode, part_palette
-from scanprep.pictures.glyphs import balls, capsules, sphere
 from scanprep.pictures.shading import (
     Bones,
     Camera,
     Dots,
     Solid,
+    balls,
+    capsules,
     color_bar,
     heat,
     part_colors,
@@ -17,6 +18,7 @@ from scanprep.pictures.shading import (
     render,
     save_png,
     side_by_side,
+    sphere,
 )
 
 RED, GREEN = (0.9, 0.1, 0.1), (0.1, 0.8, 0.1)

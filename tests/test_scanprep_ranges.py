@@ -141,12 +141,12 @@ def test_wrong_numbers_end_a_command_before_it_begins(prog, capsys, tmp_path, mo
 
 
 def flags(function):
-    """How many flags a command has, those that every command has too."""
-    shown = inspect.signature(function).parameters.values()
+    """How many flags a command has, those that every command has too; what is given by its place is none."""
+    shown, hints = inspect.signature(function).parameters.values(), typing.get_type_hints(function, include_extras=True)
     settings = {p.name: p.default for p in shown if isinstance(p.default, Settings)}
     own = [p for p in shown if p.name not in settings and p.name != console.SPACE]
-    return (len(own) + len(config_files.flags(settings)) + (2 if settings else 0)
-            + any(hasattr(value, "published") for value in settings.values())
+    return (sum("Positional" not in str(hints[p.name]) for p in own) + len(config_files.flags(settings))
+            + (2 if settings else 0) + any(hasattr(value, "published") for value in settings.values())
             + any(p.name in console.OUTPUTS for p in own))
 
 

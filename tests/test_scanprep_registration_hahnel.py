@@ -8,12 +8,11 @@ from jointed_bodies import bent, crab
 
 from scanprep.geometry import rotations
 from scanprep.geometry.mesh import Mesh
-from scanprep.registration.energies import pull
+from scanprep.registration.energies import Stiffness, pull
 from scanprep.registration.graph_fit import GraphFit, start_fit
 from scanprep.registration.inputs import prepare
 from scanprep.registration.nonrigid import register
-from scanprep.registration.rigid_links import linked
-from scanprep.registration.schedule import RegistrationConfig, hahnel_stages
+from scanprep.registration.schedule import RegistrationConfig
 
 LEFT, RIGHT = np.array([0, 0, 0.6]), np.array([0, 0.6, 0])
 GIVEN = prepare(crab(), crab())
@@ -26,6 +25,10 @@ def all_wanted(x):
 
 def begun(T=None, nodes=80) -> GraphFit:
     return start_fit(GIVEN, np.eye(4) if T is None else T, nodes)
+
+
+def linked(fit: GraphFit, wanted, length: float) -> GraphFit:
+    return fit.minimised(wanted, Stiffness(length, 0.1 * length, 0.0), 3)
 
 
 def off(fit: GraphFit, wanted: np.ndarray) -> float:
@@ -69,12 +72,11 @@ def test_a_finer_graph_goes_on_from_the_coarser_one():
 
 
 def test_the_published_registration_bends_the_body_too():
-    stages = hahnel_stages()
-    assert [stage.length for stage in stages] == sorted((stage.length for stage in stages), reverse=True)
+    stages = RegistrationConfig.published().graph
+    assert [stage.stretch for stage in stages] == sorted((stage.stretch for stage in stages), reverse=True)
     x = bent(crab(), LEFT / 2, RIGHT / 2)
     marks = np.array([820, 821, 9 * 20, 9 * 20 + 10, 31 * 20 + 5, 31 * 20 + 15])
-    config = RegistrationConfig.published()
-    config = replace(config, rigid_links=tuple(replace(s, nodes=150, rounds=min(s.rounds, 3)) for s in stages))
+    config = replace(RegistrationConfig.published(), graph=tuple(replace(s, nodes=150) for s in stages))
     found = register(crab(), Mesh(x, crab().faces), (marks, x[marks]), config)
     apart, before = (np.linalg.norm(y - x, axis=1).mean() for y in (found.mesh.vertices, crab().vertices))
     assert apart < 0.02 and apart < 0.8 * before        # point to point, matches slide along the skin

@@ -3,8 +3,8 @@ import numpy as np
 import pytest
 from animal_bodies import Animal, Build, random_pose
 
-from scanprep.skeleton.bands import dissolve_bands, passages
-from scanprep.skeleton.joints import to_tree
+from scanprep.skeleton import joints
+from scanprep.skeleton.joints import dissolve_bands, passages, to_tree
 from scanprep.skeleton.motions import PosedSurface, rigid_costs
 from scanprep.skeleton.parts import PartSearch, SkeletonConfig
 from scanprep.skeleton.patches import agglomerate, halve
@@ -15,7 +15,7 @@ def search():
     rng, animal = np.random.default_rng(3), Animal(Build(aside=0.0))
     poses = np.stack([animal.posed(random_pose(rng)) for _ in range(5)])
     poses += rng.normal(0, 0.01, poses.shape)
-    return PartSearch(PosedSurface(animal.mesh, poses), SkeletonConfig(patches=120, separation=1e6, fading=1e-6))
+    return PartSearch(PosedSurface(animal.mesh, poses), SkeletonConfig(patches=120, separation=1e6))
 
 
 @pytest.fixture
@@ -50,7 +50,8 @@ def test_a_group_in_pieces_keeps_them(search):
 @pytest.mark.timeout(60)
 def test_moves_that_the_alternation_takes_back_come_to_an_end(search, label, monkeypatch, move):
     """A band was dissolved and found again without end."""
-    assert passages(search, label)[0].max() > search.config.fading
+    monkeypatch.setattr(joints, "FADING", 1e-6)
+    assert passages(search, label)[0].max() > joints.FADING
     monkeypatch.setattr(PartSearch, "alternate", lambda *_, **__: label)
     np.testing.assert_array_equal(move(search, label), label)
 

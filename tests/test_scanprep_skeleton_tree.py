@@ -161,7 +161,7 @@ def test_what_is_no_skeleton(part, parents, joints, says):
 def test_reordering_puts_the_root_first_and_parents_before_children(root):
     parents = [-1, 0, 1, 1, 3]
     part = np.repeat(np.arange(5), [5, 1, 4, 2, 3])
-    order = reorder(part, parents, root)
+    order = reorder(part, np.array([(c, p) for c, p in enumerate(parents) if p >= 0]), root)
     assert order[0] == root and sorted(order) == list(range(5))
     links = {frozenset((c, p)) for c, p in enumerate(parents) if p >= 0}
     for i in range(1, 5):            # each new part hangs on exactly one that came before

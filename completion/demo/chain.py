@@ -11,9 +11,11 @@ from functools import cached_property, partial
 from pathlib import Path
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from model import BodyModel, Subject, fit_pose, learn_scape, load_model
 from scanprep.batch.opening import workspace
+from scanprep.batch.room import Room
 from scanprep.batch.steps import KeptSteps, inside
 from scanprep.batch.workspace import Task, Workspace
 from scanprep.dataset import RegisteredSet
@@ -32,20 +34,20 @@ from scanprep.synthetic.data_set import (
     read_views,
     scan_plan,
     stand,
+    synthetic_scan,
     write_scan,
 )
-from scanprep.synthetic.people import Person, random_pose, walk
+from scanprep.synthetic.people import MARKERS, Person, random_pose, walk
 from scanprep.synthetic.scanner import ScannerConfig, scan
 from scanprep.threads import one_thread
 
-from ..mocap.files.markers import MarkerSequence, read_markers
-from ..mocap.marker_sets.layout import MarkerLayout
+from ..mocap.files.markers import MarkerSequence, read_markers, write_markers
+from ..mocap.marker_sets.layout import DISTANCE, MarkerLayout
 from ..mocap.pose.follow import animate
 from ..motion import Motion
 from ..partial.completion import Completion, complete
 from ..partial.results import load_completion, save_completion
-from .recording import ScanPerson, record_walk
-from .settings import DemoConfig, write_settings
+from .settings import LANDMARKS, MARKER_NOISE, PARTS, TEMPLATE_VIEWS, DemoConfig, write_settings
 from .truth import TruthMap
 
 MODEL, HALF, MOTION = Path("model.npz"), Path("half_view/half_view.ply"), Path("animation/motion.npz")
@@ -53,20 +55,24 @@ Bar = Callable[[str], AbstractContextManager[Callable[[int, int], None]]]
 
 
 @dataclass(frozen=True)
-class Demo:
-    """One run of the demonstration in its folder.
+class ScanPerson:
+    """The work on each scan: a synthetic person made and scanned."""
 
-    Attributes
-    ----------
-    space : Workspace
-    config : DemoConfig
-    bar : callable
-        `bar(title)` is a context manager that yields a progress callback.
-    """
+    seed: int
+    scanner: ScannerConfig
+
+    def __call__(self, which: tuple[int, bool], room: Room) -> SyntheticScan:
+        found = synthetic_scan(room.folder / "scans", self.seed, *which, self.scanner)
+        return replace(found, folder=Path("scans"))
+
+
+@dataclass(frozen=True)
+class Demo:
+    """One run of the demonstration in its folder."""
 
     space: Workspace
     config: DemoConfig
-    bar: Bar
+    bar: Bar  # `bar(title)` is a context manager that yields a progress callback
 
     @property
     def folder(self) -> Path:
@@ -98,7 +104,7 @@ class Demo:
     def template(self) -> Mesh:
         """A careful scan of the subject at rest from more sides, merged, its holes filled, decimated."""
         # from above and below too, and into places that a fixed scanner does not reach: hands have fingers
-        scanner = ScannerConfig(views=self.config.template_views, resolution=self.config.template_resolution,
+        scanner = ScannerConfig(views=TEMPLATE_VIEWS, resolution=self.config.template_resolution,
                                 height=1.2, blind_reach=0.01)
         settings = TemplateConfig()
         settings = replace(settings, merge=replace(settings.merge, voxel=self.config.template_resolution))
@@ -131,16 +137,10 @@ class Demo:
 
     @cached_property
     def prepared(self) -> Prepared:
-        """The registered set, with its skeleton.
-
-        Raises
-        ------
-        ValueError
-            A scan that could not be registered.
-        """
+        """The registered set, with its skeleton."""
         # registration slides some millimetres along the skin: less than that is not motion. The value was chosen
         # on these very scans, so the agreement with the true parts shows what can be reached, not what to expect.
-        config = PrepareConfig(skeleton=SkeletonConfig(parts=self.config.parts, tolerance=0.003))
+        config = PrepareConfig(skeleton=SkeletonConfig(parts=PARTS, tolerance=0.003))
         template, marks, _ = self.template, self.template_landmarks, self.scans
         tasks = find_scans(self.folder / "scans")
         with workspace(self.folder / "set", self.space.force) as space:
@@ -205,11 +205,11 @@ class Demo:
             rng = np.random.default_rng([self.config.seed, 8])
             seen = scan(truth.mesh, scanner, rng)
             marks = click_landmarks(truth, rng, seen=seen.merged.vertices)
-            few = np.unique(np.linspace(0, len(marks) - 1, self.config.landmarks).round().astype(int))
+            few = np.unique(np.linspace(0, len(marks) - 1, LANDMARKS).round().astype(int))
             write_scan(folder / HALF.parent, HALF.stem, seen, truth,
                        {name: marks[name] for name in np.array(list(marks))[few]}, views=False)
 
-        self.space.step("half view", (self.config.seed, scanner, self.config.landmarks), make)
+        self.space.step("half view", (self.config.seed, scanner, LANDMARKS), make)
         half = self.folder / HALF
         return read_mesh(half), read_landmarks(half.with_suffix(".landmarks.json")), truth
 
@@ -238,7 +238,7 @@ class Demo:
             with self.bar("recording a walk") as progress:
                 record_walk(folder / "markers", bodies, self.rest, template, config, progress)
 
-        self.space.step("markers", (config.seed, config.frames, config.rate, config.marker_noise, template), make)
+        self.space.step("markers", (config.seed, config.frames, config.rate, MARKER_NOISE, template), make)
         layout = MarkerLayout.load(self.folder / "markers" / "layout.json", len(template.vertices))
         return read_markers(self.folder / "markers" / "walk.c3d"), layout, bodies
 
@@ -258,3 +258,22 @@ class Demo:
     def truth_map(self) -> TruthMap:
         """Where the template's vertices truly lie."""
         return TruthMap.of(self.template, self.rest)
+
+
+def record_walk(folder: Path, bodies: np.ndarray, rest: GroundTruth, template: Mesh, config: DemoConfig,
+                tell: Callable[[int, int], None]) -> None:
+    """Write the markers of a walking person (T, N, 3), and where they sit on the template."""
+    rng = np.random.default_rng([config.seed, 9])
+    labels, places = tuple(MARKERS), np.array(list(MARKERS.values()))
+    out = []
+    for i, body in enumerate(bodies):
+        out.append(body[places] + DISTANCE * Mesh(body, rest.faces).vertex_normals[places])
+        tell(i + 1, len(bodies))
+    positions = np.stack(out) + rng.normal(0, MARKER_NOISE, (len(bodies), len(labels), 3))
+    positions[rng.random(positions.shape[:2]) < 0.03] = np.nan
+    # as on a real subject: the layout is read off the scan at rest, on which the markers can be seen
+    _, vertices = cKDTree(template.vertices).query(rest.vertices[places])
+    MarkerLayout(labels, vertices, DISTANCE).save(folder / "layout.json")
+    sequence = MarkerSequence(positions, labels, config.rate)
+    write_markers(folder / "walk.csv", sequence)
+    write_markers(folder / "walk.c3d", sequence)

@@ -11,15 +11,16 @@ from model.report import picture_components, picture_parts
 from scanprep.console import Metric
 from scanprep.geometry import storage
 from scanprep.geometry.files import read_mesh
-from scanprep.pictures.animation import animated_glb
+from scanprep.pictures.camera import look_around, upright
+from scanprep.pictures.gltf import animated_glb
 from scanprep.pictures.page import Page
 from scanprep.pictures.shading import Shape, Solid, heat, part_colors, render, side_by_side
 from scanprep.pictures.sheets import save_png
-from scanprep.pictures.views import look_around, upright
 
 from ..motion_pictures import animated_picture, chart_residuals, picture_frames
 from ..partial.report import COMPLETED, HEIGHT, MEASURED, picture_completion, picture_distance
 from .chain import Demo
+from .settings import PARTS
 from .truth import surface_error
 
 FAR = 0.01                 # metres at the end of the heat maps
@@ -111,7 +112,7 @@ def _registration(demo: Demo, page: Page) -> None:
 
 
 def _skeleton(demo: Demo, page: Page) -> None:
-    page.section("Skeleton", f"The {demo.config.parts} parts that move most rigidly, found from the registered "
+    page.section("Skeleton", f"The {PARTS} parts that move most rigidly, found from the registered "
                  "poses of the subject, and the joints between them.")
     skeleton = demo.model.skeleton
     page.picture(picture_parts(demo.template, skeleton), "parts and joints")

@@ -11,6 +11,11 @@ from scanprep.geometry import storage
 from scanprep.pipeline.scans import TABLE
 from scanprep.ranges import Cell, Count, Faces, Positive, Seed, Settings
 
+PARTS = 16                               # left to itself, the search finds rings at the shoulders, moved by the skin
+TEMPLATE_VIEWS = 12                      # sides from which the careful scan is taken that the template is made of
+LANDMARKS = 7                            # that are marked on the half view
+MARKER_NOISE = 0.001                     # metres
+
 
 @dataclass(frozen=True)
 class DemoConfig(Settings):
@@ -22,40 +27,32 @@ class DemoConfig(Settings):
         Scans of one subject in many poses, and of other people.
     faces : int
         Triangles of the template.
-    parts : int
-        Of the skeleton. Left to itself, the search finds rings at the shoulders too, which move with the skin.
     resolution, template_resolution : float, metres
         Spacing of the scanner's rays, for the scans and for the careful one that the template is made of.
-    template_views : int
-        Sides from which the careful scan is taken.
     held_out : int
         Poses of the subject that the model never saw.
-    landmarks : int
-        That are marked on the half view.
     frames, rate : int, frames per second
         Of the walk.
-    marker_noise : float, metres
     seed : int
+    learn : LearnConfig
+        How the model is learned.
     """
 
-    poses: Count = 20
-    subjects: Count = 12
-    faces: Faces = 14000
-    parts: Count = 16
-    resolution: Cell = 0.0068
-    template_resolution: Cell = 0.004
-    template_views: Count = 12
-    held_out: int = 5
-    landmarks: Count = 7
-    frames: Count = 132
+    poses: Count = 10
+    subjects: Count = 4
+    faces: Faces = 9000
+    resolution: Cell = 0.009
+    template_resolution: Cell = 0.005
+    held_out: int = 3
+    frames: Count = 66
     rate: Positive = 60.0
-    marker_noise: float = 0.001
     seed: Seed = 0
     learn: LearnConfig = field(default_factory=LearnConfig)
 
 
-QUICK = DemoConfig(poses=8, subjects=3, faces=7000, resolution=0.011, template_resolution=0.006, held_out=2, frames=66,
-                   rate=30.0)
+FULL = DemoConfig(poses=20, subjects=12, faces=14000, resolution=0.0068, template_resolution=0.004, held_out=5,
+                  frames=132)
+QUICK = DemoConfig(poses=8, subjects=3, faces=7000, resolution=0.011, template_resolution=0.006, held_out=2, rate=30.0)
 
 
 def write_settings(config: DemoConfig, rows: list[tuple[str, str, str, str]], folder: Path) -> None:

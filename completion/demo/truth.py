@@ -17,19 +17,11 @@ class TruthMap:
 
     All synthetic people share one triangulation, so a point of the surface is a triangle with barycentric
     coordinates, and is carried from the scan that the template was made of to every other person and pose.
-
-    Attributes
-    ----------
-    template : Mesh
-    places : SurfacePoints
-        The true surface points nearest to the template's vertices.
-    part_of_face : (F,) int
-        True part under each triangle of the template.
     """
 
     template: Mesh
-    places: SurfacePoints
-    part_of_face: np.ndarray
+    places: SurfacePoints  # the true surface points nearest to the template's vertices
+    part_of_face: np.ndarray  # (F,) int: true part under each triangle of the template
 
     @staticmethod
     def of(template: Mesh, rest: GroundTruth) -> TruthMap:

@@ -11,10 +11,9 @@ from scanprep.geometry import rotations
 from scanprep.geometry.files import PointCloud
 from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.surface import Surface
-from scanprep.pictures.camera import Camera
+from scanprep.pictures.camera import Camera, upright
 from scanprep.pictures.page import Page
 from scanprep.pictures.shading import Dots, Shape, Solid, color_bar, heat, render, side_by_side
-from scanprep.pictures.views import upright
 
 from .completion import Completion
 from .scan import View, all_points, as_views, in_metres

@@ -81,7 +81,8 @@ def track_frames(frames: FramesArg, output: Output, model: ModelOrNone = None, r
 
     of_motion = done.key, config.smoothing
     space.step("motion", (of_motion, rows(metrics), frames.name), write)
-    space.step("animation", (of_motion, keys), lambda folder: write_glb(folder / "animation.glb", motion, person, keys))
+    space.step("animation", (of_motion, keys),
+               lambda folder: write_glb(folder / "animation.glb", motion, person, keys=keys))
     return Outcome(output, metrics, {"track": config, "rate": rate, "model": name}, found.problems,
                    tracking_problem(motion))
 

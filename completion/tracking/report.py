@@ -7,10 +7,10 @@ from typing import Any
 import numpy as np
 
 from model.linear import Subject
-from scanprep.pictures.animation import gif_bytes
+from scanprep.pictures.camera import look_around, upright
 from scanprep.pictures.page import Page
 from scanprep.pictures.shading import Dots, Shape, Solid, render, side_by_side
-from scanprep.pictures.views import look_around, upright
+from scanprep.pictures.sheets import gif_bytes
 
 from ..motion import Motion
 

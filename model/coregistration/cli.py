@@ -1,8 +1,6 @@
 """`scape model coregister`: a folder of scans registered with a model, and the model learned again."""
 from __future__ import annotations
 
-import csv
-import io
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated
@@ -17,6 +15,7 @@ from scanprep.dataset import RegisteredSet, SetEntry, write_set
 from scanprep.geometry.files import write_mesh
 from scanprep.geometry.landmarks import match_landmarks, read_landmarks, write_landmarks
 from scanprep.geometry.mesh import Mesh
+from scanprep.geometry.tables import write_table
 from scanprep.pipeline.prepare import mesh_file
 from scanprep.pipeline.scans import ScanTask, find_scans
 
@@ -27,16 +26,13 @@ from .config import CoregistrationConfig
 from .rounds import Coregistration, coregister, coregistration_problem
 from .single import Landmarks
 
-MM = 1000.0
-TABLE = "coregistration.csv"
-FIGURES = ("rms", "explained", "apart", "landmark_rms", "flipped", "score", "starts")
-OWN = "template"                     # whose scans they are where nothing says it
+FIGURES = ("rms", "explained", "apart", "landmark_rms", "inverted", "score", "starts")
 
 ScansArg = Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="SCANS")]
 
 
 def coregister_scans(model: ModelArg, scans: ScansArg, output: Output, landmarks: Path | None = None,
-                     first: Path | None = None, subject: str = OWN, unit: Unit | None = None,
+                     first: Path | None = None, subject: str = "template", unit: Unit | None = None,
                      config: CoregistrationConfig = CoregistrationConfig(), *, space: Workspace  # noqa: B008
                      ) -> Outcome:
     """Register every scan of a folder with a model as prior, learn the model again, and so on until it settles.
@@ -91,19 +87,10 @@ def write_coregistered(folder: Path, first: BodyModel, tasks: Sequence[ScanTask]
         write_mesh(folder / mesh_file(task.name), r.mesh)
     done.model.skeleton.save(folder / "skeleton.json")
     write_landmarks(folder / "landmarks.json", first.info.get("landmarks", {}))
-    write_table(folder / TABLE, tasks, done)
+    write_table(folder / "coregistration.csv", ["name", "good", *FIGURES], [
+        [task.name, bool(fine), *(getattr(r, figure) for figure in FIGURES)]
+        for task, fine, r in zip(tasks, done.good, done.registrations, strict=True) if r is not None])
     done.model.save(folder / "model.npz")
-
-
-def write_table(path: Path, tasks: Sequence[ScanTask], done: Coregistration) -> None:
-    """A row of figures for every scan that could be registered, in metres."""
-    text = io.StringIO()
-    table = csv.writer(text, lineterminator="\n")
-    table.writerow(["name", "good", *FIGURES])
-    for task, fine, r in zip(tasks, done.good, done.registrations, strict=True):
-        if r is not None:
-            table.writerow([task.name, bool(fine), *(getattr(r, figure) for figure in FIGURES)])
-    path.write_text(text.getvalue(), encoding="utf-8")
 
 
 def _figures(done: Coregistration, names: Sequence[str]) -> list[Metric]:
@@ -113,12 +100,12 @@ def _figures(done: Coregistration, names: Sequence[str]) -> list[Metric]:
             Metric("failed", ", ".join(bad) or "none"),
             Metric("rounds", done.rounds), Metric("converged", done.converged),
             *(Metric(f"round {i}: failed", turn.failed) for i, turn in enumerate(done.history, 1)),
-            *(Metric(f"round {i}: mean vertex moved", MM * turn.change, "mm")
+            *(Metric(f"round {i}: mean vertex moved", 1e3 * turn.change, "mm")
               for i, turn in enumerate(done.history, 1) if i > 1),
-            Metric("distance to the scan, median RMS", MM * float(np.median([r.rms for r in found])), "mm"),
+            Metric("distance to the scan, median RMS", 1e3 * float(np.median([r.rms for r in found])), "mm"),
             Metric("scan explained, mean", 100 * float(np.mean([r.explained for r in found])), "%"),
-            Metric("distance from the model, median RMS", MM * float(np.median([r.apart for r in found])), "mm"),
-            Metric("flipped triangles", sum(r.flipped for r in found))]
+            Metric("distance from the model, median RMS", 1e3 * float(np.median([r.apart for r in found])), "mm"),
+            Metric("inverted triangles", sum(r.inverted for r in found))]
 
 
 def _landmarks(model: BodyModel, path: Path | None, scan: Mesh | np.ndarray, unit: Unit | None) -> Landmarks | None:

@@ -26,7 +26,6 @@ from .single import Landmarks, ModelRegistration, register_with_model
 Progress = Callable[[int, int], None]
 Scan = Mesh | np.ndarray
 Lessons = tuple[np.ndarray, np.ndarray | None]       # poses (M, N, 3) of the template's person, shapes (S, N, 3)
-LOST = 0.5                           # mean share of the scans explained below which they mean nothing
 
 
 @dataclass(frozen=True)
@@ -244,7 +243,8 @@ def _settled(history: Sequence[Round], model: BodyModel, config: CoregistrationC
 def coregistration_problem(done: Coregistration, scans: Sequence[Scan]) -> str | None:
     """Why co-registered scans mean nothing, with the likely cause; None where they mean something."""
     explained = float(np.mean([0.0 if r is None else r.explained for r in done.registrations]))
-    if done.good.any() and explained >= LOST:
+    # mean share of the scans explained below which they mean nothing
+    if done.good.any() and explained >= 0.5:
         return None
     spans = [extent(scan.vertices if isinstance(scan, Mesh) else scan) for scan in scans]
     cause = unit_problem(float(np.median(spans)), extent(done.model.template.vertices), "the scans are", 0.05)

@@ -30,30 +30,24 @@ class ModelRegistration:
         Follows the scan where there are data, the model along the surface and where there are none.
     predicted : Mesh
         The model's own mesh.
-    pose : (J, 3) float, radians
-    trans : (3,) float, metres
-    betas : (K,) float, or None for a body of known shape
+    pose, trans, betas : (J, 3), (3,) and (K,) float
+        No betas for a body of known shape.
     seen : (N,) bool
         Whether there were data here.
     distances : (N,) float, metres
         From each vertex that was seen to the surface of the scan; NaN for the others.
-    rms : float, metres
-        Of these distances.
+    rms, landmark_rms : float, metres
+        Of these distances, and of those of the landmarks.
     explained : float
         Share of the scan's points that the mesh explains.
     apart : float, metres
-        Root mean square distance of the mesh from the prediction where there were data; much of it tells of a wrong
-        pose.
-    landmark_rms : float, metres
-        NaN without landmarks.
-    flipped : int
+        Root mean square distance of mesh and prediction where there were data; much of it tells of a wrong pose.
+    inverted : int
         Triangles that face against their surroundings.
     confidence : (N,) float
         From 0, made up by the model, to 1: there were data here.
-    score : float, metres
-        How far scan and model were apart, of the best start.
-    starts : int
-        How many starts were tried.
+    score, starts : float, metres, and int
+        How far scan and model were apart, of the best start, and how many were tried.
     """
 
     mesh: Mesh
@@ -67,7 +61,7 @@ class ModelRegistration:
     explained: float
     apart: float
     landmark_rms: float
-    flipped: int
+    inverted: int
     confidence: np.ndarray
     score: float
     starts: int

@@ -1,9 +1,7 @@
 """`scape model evaluate` and `scape model sample`: how good a model is, and random bodies of it."""
 from __future__ import annotations
 
-import csv
-import io
-from collections.abc import Iterable, Sequence
+from collections.abc import Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any
@@ -13,22 +11,19 @@ import tyro
 
 from scanprep.cli import Output, Unit
 from scanprep.console import Metric, Outcome, bar
-from scanprep.dataset import RegisteredSet
 from scanprep.geometry import storage
-from scanprep.geometry.files import read_registered, write_mesh
+from scanprep.geometry.files import write_mesh
+from scanprep.geometry.tables import write_table
 from scanprep.ranges import Count, Seed
 
 from ..body import BodyModel
-from ..cli import ModelArg
+from ..cli import ModelArg, read_bodies
 from ..digests import digest, trained_on
 from ..files import load_model
 from ..posing.cli import read_subject
 from .errors import Errors, compactness, errors_problem, pose_errors, shape_errors
 from .page import MM, Findings, evaluation_page, generalisation_rows, picture_samples
 from .sampling import sample_bodies, specificity
-
-RANDOM = 100                         # random bodies that specificity is measured on
-SHOWN = 8                            # random bodies on the page
 
 
 def evaluate(model: ModelArg, output: Output, poses: Path | None = None, shapes: Path | None = None,
@@ -56,9 +51,10 @@ def evaluate(model: ModelArg, output: Output, poses: Path | None = None, shapes:
         raise ValueError("--train-shapes serves to judge people: give --shapes too")
     if shapes is not None and not loaded.n_betas:
         raise ValueError(f"{model}: it has no shape components, so it cannot be measured on people")
-    posed, pose_names = _read_bodies(loaded, poses, unit, one_person=True)
-    people, people_names = _read_bodies(loaded, shapes, unit)
-    train, _ = _read_bodies(loaded, train_shapes, unit)
+    nothing: tuple[None, tuple[str, ...]] = (None, ())
+    posed, pose_names = read_bodies(poses, loaded.template, unit, one_person=True) if poses else nothing
+    people, people_names = read_bodies(shapes, loaded.template, unit) if shapes else nothing
+    train, _ = read_bodies(train_shapes, loaded.template, unit) if train_shapes else nothing
     found = Findings(pose_names=pose_names, pose_bodies=posed, shape_names=people_names, shape_bodies=people)
     if posed is not None:
         with bar("fitting poses") as progress:
@@ -70,9 +66,11 @@ def evaluate(model: ModelArg, output: Output, poses: Path | None = None, shapes:
     if train is not None:
         with bar("bringing training people to rest") as progress:
             found = replace(found, specificity=specificity(
-                loaded, train, RANDOM, np.random.default_rng(seed), counts, progress=progress))
+                # random bodies that specificity is measured on
+                loaded, train, 100, np.random.default_rng(seed), counts, progress=progress))
     if loaded.n_betas:
-        found = replace(found, samples=sample_bodies(loaded, SHOWN, np.random.default_rng(seed)))
+        # random bodies on the page
+        found = replace(found, samples=sample_bodies(loaded, 8, np.random.default_rng(seed)))
     notes, metrics = _notes(loaded, posed, people), _metrics(loaded, found)
     metrics += [Metric("note", note) for note in notes]
     _write_tables(output, loaded, found)
@@ -128,29 +126,6 @@ def sample(model: ModelArg, output: Output,
         Metric("largest extent, largest body", float(extent.max()), "m")], {"seed": seed, "pose_too": pose_too})
 
 
-def _read_bodies(model: BodyModel, folder: Path | None, unit: Unit | None, one_person: bool = False
-                 ) -> tuple[np.ndarray | None, tuple[str, ...]]:
-    """Vertices (n, N, 3) and names of a folder or a set: all of one person, or one of every person."""
-    if folder is None:
-        return None, ()
-    if (folder / "set.json").exists():
-        whole = RegisteredSet.load(folder)
-        faces, subjects = whole.template.faces, [entry.subject for entry in whole.entries]
-        if not subjects:
-            raise ValueError(f"{folder}: the set holds no meshes")
-        most = max(whole.subjects, key=subjects.count)
-        names = tuple(entry.name for i, entry in enumerate(whole.entries) if
-                      (entry.subject == most if one_person else entry.subject not in subjects[:i]))
-        vertices = whole.vertices(names)
-    else:
-        faces, vertices, names = read_registered(folder, unit)
-    if not np.array_equal(faces, model.template.faces):
-        order = ", in another order" if len(faces) == len(model.template.faces) else ""
-        raise ValueError(f"{folder}: expected the triangles of the model ({model.template}); these have {len(faces)} "
-                         f"faces and {vertices.shape[1]} vertices{order}")
-    return vertices, names
-
-
 def _notes(model: BodyModel, posed: np.ndarray | None, people: np.ndarray | None) -> list[str]:
     """Whether the bodies trained the model, as far as its file tells."""
     if posed is not None and model.info.get("digest") == digest(model.template, posed, people):
@@ -200,12 +175,12 @@ def _write_tables(output: Path, model: BodyModel, found: Findings) -> None:
     parts = [f"{name}_mm" for name in model.skeleton.names]
     if found.poses is not None:
         rows = _rows(found.pose_names, found.poses.errors, found.poses.converged)
-        _write_csv(output / "poses.csv", ["name", "mean_mm", "p95_mm", "worst_mm", *parts, "converged"], rows)
+        write_table(output / "poses.csv", ["name", "mean_mm", "p95_mm", "worst_mm", *parts, "converged"], rows)
     if found.shapes is not None:
         rows = [[count, *row] for count, errors, converged in
                 zip(found.shapes.counts, found.shapes.errors, found.shapes.converged, strict=True)
                 for row in _rows(found.shape_names, errors, converged)]
-        _write_csv(output / "people.csv", ["components", "name", "mean_mm", "p95_mm", "worst_mm", *parts, "converged"],
+        write_table(output / "people.csv", ["components", "name", "mean_mm", "p95_mm", "worst_mm", *parts, "converged"],
                    rows)
 
 
@@ -213,12 +188,3 @@ def _rows(names: Sequence[str], errors: Errors, converged: np.ndarray) -> list[l
     table = np.column_stack([errors.mean, errors.p95, errors.worst, errors.by_part])
     return [[name, *(f"{MM * value:.4f}" for value in row), "yes" if done else "no"]
             for name, row, done in zip(names, table, converged, strict=True)]
-
-
-def _write_csv(path: Path, header: Sequence[str], rows: Iterable[Sequence[Any]]) -> None:
-    text = io.StringIO()
-    table = csv.writer(text, lineterminator="\n")
-    table.writerow(header)
-    table.writerows(rows)
-    with storage.writing(path) as beside:
-        beside.write_text(text.getvalue(), encoding="utf-8")

@@ -38,16 +38,10 @@ class Errors:
 
 @dataclass(frozen=True, eq=False)
 class PoseErrors:
-    """What is left of bodies after fitting pose and place.
+    """What is left of bodies after fitting pose and place: errors, poses (M, J, 3), trans (M, 3), which fits converged
+    (M,).
 
-    Attributes
-    ----------
-    errors : Errors
-    poses : (M, J, 3) float, radians
-    trans : (M, 3) float, metres
-    betas : (k,) float or None
-        Of the body that was posed; None is the template's own.
-    converged : (M,) bool
+    `betas` are those of the body that was posed; None is the template's own.
     """
 
     errors: Errors
@@ -63,23 +57,12 @@ class PoseErrors:
 
 @dataclass(frozen=True, eq=False)
 class ShapeErrors:
-    """What is left of people after fitting shape, pose and place with several numbers of components.
+    """What is left of people after fitting shape, pose and place with several rising numbers of components, `counts`
+    (C,).
 
-    Attributes
-    ----------
-    counts : (C,) int
-        Numbers of components, rising.
-    errors : C Errors
-        After `fit_shape`.
-    pose_held : C Errors
-        After fitting betas and place alone, the pose that of the parts' own best rotations.
-    vertex_pca : C Errors, or None
-        Of principal components of the vertices of the training people, every body centred; None where no
-        training people were given.
-    betas : (C, S, K) float
-    poses : (C, S, J, 3) float, radians
-    trans : (C, S, 3) float, metres
-    converged : (C, S) bool
+    For each count the errors after `fit_shape`, those with the pose held at that of the parts' own best rotations, and
+    those of plain principal components of the vertices of the training people, centred, None where none were given;
+    then betas (C, S, K), poses (C, S, J, 3), trans (C, S, 3) and which fits converged (C, S).
     """
 
     counts: np.ndarray

@@ -8,9 +8,9 @@ from typing import Any
 import numpy as np
 
 from scanprep.geometry.mesh import Mesh
+from scanprep.pictures.camera import look_around, upright
 from scanprep.pictures.page import Page
 from scanprep.pictures.shading import Solid, color_bar, heat, render, side_by_side
-from scanprep.pictures.views import look_around, upright
 
 from ..body import BodyModel
 from ..report import picture_components
@@ -169,12 +169,18 @@ def _round_up(length: float) -> float:
     return float(power * min(step for step in steps if step * power >= length * (1 - 1e-9)))
 
 
-def chart_bodies(errors: Errors, names: Sequence[str]) -> Any:
-    """A matplotlib figure: mean and 95th percentile of every body, worst first."""
+def _figure(width: float, height: float) -> tuple[Any, Any]:
+    """A matplotlib figure, inches, and its axes."""
     from matplotlib.figure import Figure
 
-    figure = Figure(figsize=(8.0, 2.8))
-    axes, order = figure.add_subplot(), np.argsort(-errors.mean)
+    figure = Figure(figsize=(width, height))
+    return figure, figure.add_subplot()
+
+
+def chart_bodies(errors: Errors, names: Sequence[str]) -> Any:
+    """A matplotlib figure: mean and 95th percentile of every body, worst first."""
+    figure, axes = _figure(8.0, 2.8)
+    order = np.argsort(-errors.mean)
     place = np.arange(len(order))
     axes.bar(place, MM * errors.mean[order], width=0.7, label="mean")
     axes.plot(place, MM * errors.p95[order], "_", color="0.35", markersize=7, label="95th percentile")
@@ -186,10 +192,7 @@ def chart_bodies(errors: Errors, names: Sequence[str]) -> Any:
 
 def chart_generalisation(shapes: ShapeErrors) -> Any:
     """A matplotlib figure: error over the number of components, with what it is compared to."""
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(7.0, 3.0))
-    axes = figure.add_subplot()
+    figure, axes = _figure(7.0, 3.0)
     axes.plot(shapes.counts, [MM * e.overall for e in shapes.errors], "o-", label="shape, pose and place fitted")
     axes.plot(shapes.counts, [MM * e.overall for e in shapes.pose_held], "s--", color="0.45",
               label="pose held at the parts' own rotations")
@@ -203,10 +206,8 @@ def chart_generalisation(shapes: ShapeErrors) -> Any:
 
 def chart_compactness(model: BodyModel) -> Any:
     """A matplotlib figure: variance explained over the number of components."""
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(7.0, 2.6))
-    axes, explained = figure.add_subplot(), compactness(model)
+    figure, axes = _figure(7.0, 2.6)
+    explained = compactness(model)
     axes.plot(np.arange(len(explained) + 1), 100 * np.concatenate([[0], explained]), "-")
     axes.set(xlabel="shape components", ylabel="variance explained (%)", ylim=(0, 100), xlim=(0, len(explained)))
     return figure
@@ -214,10 +215,8 @@ def chart_compactness(model: BodyModel) -> Any:
 
 def chart_specificity(found: Specificity) -> Any:
     """A matplotlib figure: distance of random bodies to the nearest person, over the number of components."""
-    from matplotlib.figure import Figure
-
-    figure = Figure(figsize=(7.0, 2.6))
-    axes, far = figure.add_subplot(), MM * found.distances
+    figure, axes = _figure(7.0, 2.6)
+    far = MM * found.distances
     axes.fill_between(found.counts, *np.percentile(far, [10, 90], axis=1), alpha=0.25, linewidth=0,
                       label="10th to 90th percentile")
     axes.plot(found.counts, far.mean(axis=1), "o-", label="mean")

@@ -16,15 +16,7 @@ Progress = Callable[[int, int], None]
 
 @dataclass(frozen=True, eq=False)
 class Samples:
-    """Random bodies.
-
-    Attributes
-    ----------
-    betas : (n, k) float, standard deviations
-        k = 0 for a model without shape components, whose own body it is then.
-    poses : (n, J, 3) float, radians
-    vertices : (n, N, 3) float, metres
-    """
+    """Random bodies: betas (n, k), k = 0 for a model without shape components, poses (n, J, 3), vertices (n, N, 3)."""
 
     betas: np.ndarray
     poses: np.ndarray
@@ -67,18 +59,12 @@ def sample_bodies(model: BodyModel, count: int, rng: np.random.Generator, pose_t
 
 @dataclass(frozen=True, eq=False)
 class Specificity:
-    """How far random bodies of the model are from the nearest real person.
+    """How far random bodies of the model are from the nearest real person, for each number of components, `counts`
+    (C,).
 
-    Attributes
-    ----------
-    counts : (C,) int
-        Numbers of components.
-    distances : (C, n) float, metres
-        Mean vertex distance of every random body to the training person that is nearest to it.
-    nearest : (C, n) int
-        Which person that is.
-    between_people : float, metres
-        Mean over the training people of the distance to their nearest other, as a measure to compare with.
+    The mean vertex distance (C, n), metres, of every random body to the training person nearest to it, which one that
+    is (C, n), and the mean over the training people of the distance to their nearest other, as a measure to compare
+    with.
     """
 
     counts: np.ndarray

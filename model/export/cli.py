@@ -8,25 +8,23 @@ from typing import Literal
 import numpy as np
 
 from scanprep.cli import Output, Unit
-from scanprep.console import Metric, Outcome, bar
+from scanprep.console import Metric, Outcome, Progress, bar
 from scanprep.geometry.files import write_mesh
 from scanprep.geometry.storage import StorageError, load_arrays, numbers, taking_apart, text
-from scanprep.pictures.views import upright
+from scanprep.pictures.camera import upright
 from scanprep.ranges import BETAS, Beta
 
 from ..body import BodyModel
 from ..cli import ModelArg
 from ..files import load_model
+from ..linear import Subject
 from ..priors import sample_poses
 from .bvh import write_bvh
 from .correctives import motion_correctives, spaced
 from .glb import write_skinned_glb
-from .meshes import write_frames
 from .npz import pose_features, write_body_npz
 from .rig import Rig, check_motion, joint_places, make_rig
 
-MM = 1000.0
-SHAPES = 10                          # morph targets where nobody says how many
 MOTIONS_OF = "scape"                 # what motion files say they are made for
 MEASURED = 40                        # poses in which the files are compared with the exact model
 _MESHES = (".obj", ".ply", ".stl", ".off", ".ply.gz")
@@ -85,7 +83,8 @@ def export(model: ModelArg, output: Output, betas: tuple[Beta, ...] = (), own_bo
     if kind == "folder":
         return Outcome(output, _folder(output, loaded, person, moves))
     if shapes is None:
-        shapes = 0 if person is None or kind == "bvh" else min(SHAPES, loaded.n_betas)
+        # morph targets where nobody says how many
+        shapes = 0 if person is None or kind == "bvh" else min(10, loaded.n_betas)
     rig = make_rig(loaded, person, shapes)
     axis = upright(rig.mesh)[0] if up is None else up
     if kind == "bvh":
@@ -116,6 +115,19 @@ def read_motion(path: Path, model: BodyModel) -> _Moves:
         poses, rate = stored["poses"].astype(np.float64).reshape(T, J, 3), float(stored["mocap_frame_rate"])
         poses, trans = check_motion(model.skeleton, poses, stored["trans"], rate)
         return _Moves(poses, trans, betas if betas.size else None, rate)
+
+
+def write_frames(folder: str | Path, subject: Subject, poses: np.ndarray, trans: np.ndarray | None = None,
+                 ending: str = ".ply", progress: Progress | None = None) -> list[Path]:
+    """Write the exact mesh of every frame, 00000.ply, 00001.ply, ...; the files in the order of the frames."""
+    paths = []
+    for t, pose in enumerate(poses):
+        paths.append(Path(folder) / f"{t:05d}{ending}")
+        vertices = subject.vertices(pose, None if trans is None else trans[t])
+        write_mesh(paths[-1], subject.template.with_vertices(vertices), "single")
+        if progress:
+            progress(t + 1, len(poses))
+    return paths
 
 
 def _kind(output: Path) -> str:
@@ -215,7 +227,7 @@ def _measured(model: BodyModel, moves: _Moves | None) -> tuple[np.ndarray, str]:
 
 
 def _distances(what: str, off: np.ndarray) -> list[Metric]:
-    distance = MM * np.linalg.norm(off, axis=-1)
+    distance = 1000.0 * np.linalg.norm(off, axis=-1)
     return [Metric(f"distance from {what}, mean", float(distance.mean()), "mm"),
             Metric("the same, 95th percentile", float(np.percentile(distance, 95)), "mm"),
             Metric("the same, largest", float(distance.max()), "mm")]

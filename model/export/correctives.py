@@ -9,7 +9,6 @@ from ..linear import Subject
 from .rig import Rig
 
 AT_ONCE = 32                         # frames that are held at a time
-STIFF = 0.1                          # share of a blended rotation below which it is not undone
 
 
 @dataclass(frozen=True, eq=False)
@@ -32,7 +31,8 @@ def rest_corrections(rig: Rig, poses: np.ndarray, exact: np.ndarray) -> np.ndarr
     for t, pose in enumerate(poses):
         blended = np.einsum("nj,jab->nab", rig.weights, rig.skeleton.part_rotations(pose))
         # opposite rotations can cancel; the damped inverse leaves alone what they blot out
-        square = np.swapaxes(blended, 1, 2) @ blended + STIFF**2 * _lost(blended)[:, None, None] * np.eye(3)
+        # share of a blended rotation below which it is not undone
+        square = np.swapaxes(blended, 1, 2) @ blended + 0.1**2 * _lost(blended)[:, None, None] * np.eye(3)
         off = exact[t] - rig.vertices(pose)
         out[t] = np.linalg.solve(square, np.swapaxes(blended, 1, 2) @ off[..., None])[..., 0]
     return out

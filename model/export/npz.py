@@ -13,26 +13,31 @@ from ..priors import sample_poses
 from .correctives import rest_corrections
 from .rig import Rig, make_rig
 
-RIDGE = 1e-3                         # mean square of a pose feature that counts as nothing
-
 
 def write_body_npz(path: str | Path, model: BodyModel, weights: np.ndarray | None = None, draws: int = 300
                    ) -> dict[str, np.ndarray]:
-    """Write the arrays of `body_arrays` as an `.npz` without objects; returns them."""
-    arrays = body_arrays(model, weights, draws)
-    with writing(path) as beside, open(beside, "wb") as out:
-        np.savez_compressed(out, allow_pickle=False, **arrays)  # type: ignore[arg-type]
-    return arrays
-
-
-def body_arrays(model: BodyModel, weights: np.ndarray | None = None, draws: int = 300) -> dict[str, np.ndarray]:
-    """A model as linear blend skinning with shape and pose directions.
+    """Write a model as linear blend skinning with shape and pose directions, an `.npz` without objects.
 
     Posed by `Σ_j weights_j G_j (v_template + shapedirs @ betas + posedirs @ vec(R_1 - I, ..., R_{J-1} - I))`, where G_j
     rotates about `J_regressor @ (v_template + shapedirs @ betas)` and R_j is the rotation of part j against its parent,
     row by row. With betas of zero it is the mean person, or the template's own body where the model has no betas. No
     kind of model here is linear in R - I, so the pose directions are fitted to so many draws from the prior; with 0
     there are none.
+
+    Parameters
+    ----------
+    path : str or Path
+    model : BodyModel
+    weights : (N, J) float
+        As for `make_rig`.
+    draws : int
+
+    Returns
+    -------
+    dict
+        `v_template` (N, 3) metres, `f` (F, 3), `weights` (N, J), `kintree_table` (2, J) with the parents (-1 for
+        the root) over the parts, `J_regressor` (J, N), `J` (J, 3) metres, `shapedirs` (N, 3, K) metres per
+        standard deviation, `posedirs` (N, 3, 9 (J - 1)) metres, `part_names` (J,), `betas_unit`, `length_unit`.
     """
     mean = np.zeros(1) if model.n_betas else None
     rig = make_rig(model, mean, model.n_betas, weights)
@@ -47,6 +52,8 @@ def body_arrays(model: BodyModel, weights: np.ndarray | None = None, draws: int 
     if draws and J > 1:
         poses = sample_poses(model, draws, np.random.default_rng(0))
         arrays["posedirs"] = pose_directions(rig, poses, model.subject(mean).vertices(poses)).astype(np.float32)
+    with writing(path) as beside, open(beside, "wb") as out:
+        np.savez_compressed(out, allow_pickle=False, **arrays)  # type: ignore[arg-type]
     return arrays
 
 
@@ -61,5 +68,6 @@ def pose_directions(rig: Rig, poses: np.ndarray, exact: np.ndarray) -> np.ndarra
     """
     X = pose_features(poses)
     changes = rest_corrections(rig, poses, exact).reshape(len(X), -1)
-    B = np.linalg.solve(X.T @ X + RIDGE * len(X) * np.eye(X.shape[1]), X.T @ changes)
+    # mean square of a pose feature that counts as nothing
+    B = np.linalg.solve(X.T @ X + 1e-3 * len(X) * np.eye(X.shape[1]), X.T @ changes)
     return np.moveaxis(B.reshape(-1, *rig.mesh.vertices.shape), 0, -1)

@@ -11,12 +11,9 @@ from scanprep.pictures.gltf import UPRIGHT
 from scanprep.ranges import TURNS
 from scanprep.skeleton.tree import Skeleton
 
+from ..blend_weights import CARRIERS, skin_weights, strongest
 from ..body import BodyModel
-from ..borders import vertex_weights
 from ..skinning import SkinningModel
-
-CARRIERS = 4                         # joints that carry one vertex: more is not what other programs read
-WIDTH = 0.05                         # of 0.005 to 0.08 the nearest to a SCAPE model of real scans, within a percent
 
 
 @dataclass(frozen=True, eq=False)
@@ -116,31 +113,6 @@ def make_rig(model: BodyModel, betas: np.ndarray | None = None, shapes: int = 0,
     if shapes:
         changes = np.moveaxis(model.shape_jacobian(rest)[..., :shapes], -1, 0)
     return Rig(mesh, replace(model.skeleton, joints=joints), strongest(weights), changes)
-
-
-def skin_weights(template: Mesh, skeleton: Skeleton, width: float = WIDTH) -> np.ndarray:
-    """(N, J) how much each part carries each vertex, smooth across the borders of parts, rows sum to 1.
-
-    Parameters
-    ----------
-    width : float, metres
-        How far a part reaches along the surface.
-
-    Raises
-    ------
-    ValueError
-        A width that is not positive.
-    """
-    return vertex_weights(template, skeleton, width)
-
-
-def strongest(weights: np.ndarray, count: int = CARRIERS) -> np.ndarray:
-    """Weights (N, J) with no more than the largest `count` of each vertex, which sum to 1."""
-    kept = np.array(weights, dtype=np.float64)
-    if count < kept.shape[1]:
-        np.put_along_axis(kept, np.argsort(-kept, axis=1, kind="stable")[:, count:], 0, axis=1)
-    kept[kept < 1e-6] = 0
-    return kept / kept.sum(axis=1, keepdims=True)
 
 
 def joint_places(skeleton: Skeleton, poses: np.ndarray, trans: np.ndarray | None = None) -> np.ndarray:

@@ -16,7 +16,7 @@ from scanprep.batch.steps import KeptSteps, inside
 from scanprep.cli import Output, Unit, read_poses
 from scanprep.console import Metric, Outcome, bar
 from scanprep.dataset import RegisteredSet
-from scanprep.geometry.files import list_meshes, read_registered
+from scanprep.geometry.files import list_meshes
 from scanprep.geometry.landmarks import read_landmark_vertices
 from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.tables import read_table
@@ -26,7 +26,7 @@ from scanprep.skeleton.parts import SkeletonConfig
 from scanprep.skeleton.tree import Skeleton
 
 from ..body import BodyModel
-from ..cli import about
+from ..cli import about, read_bodies
 from .config import LearnConfig
 from .mixing import MIX, learn_scape_mix
 from .parts import choose_skeleton
@@ -75,7 +75,7 @@ def learn(poses: Path, output: Output, shapes: Path | None = None, template: Pat
     if by_sex and (shapes is None or kind != "scape"):
         raise ValueError("--by-sex: it needs --shapes and the kind scape")
     body, posed = read_poses(poses, template, subject, unit) if kind != "mixed" else _read_mix(poses)
-    people = None if shapes is None else _read_shapes(shapes, body, unit)
+    people = None if shapes is None else read_bodies(shapes, body, unit)[0]
     known = None if not by_sex or shapes is None else _read_sexes(shapes)
     tree = None if parts is not None else _read_skeleton(skeleton, poses, body)
     marks = _read_marks(landmarks, poses, body)
@@ -161,21 +161,8 @@ def _read_mix(folder: Path) -> tuple[Mesh, np.ndarray]:
     return whole.template, whole.vertices()
 
 
-def _read_shapes(folder: Path, body: Mesh, unit: Unit | None) -> np.ndarray:
-    if (folder / "set.json").exists():
-        whole = RegisteredSet.load(folder)
-        faces, vertices = whole.template.faces, whole.shapes()
-    else:
-        faces, vertices, _ = read_registered(folder, unit)
-    if not np.array_equal(faces, body.faces):
-        order = ", in another order" if len(faces) == len(body.faces) else ""
-        raise ValueError(f"{folder}: expected the triangles of the poses ({body}); these have {len(faces)} faces "
-                         f"and {vertices.shape[1]} vertices{order}")
-    return vertices
-
-
 def _read_sexes(folder: Path) -> list[str]:
-    """The sex of every person, in the order of `_read_shapes`; empty where not known."""
+    """The sex of every person, in the order of `read_bodies`; empty where not known."""
     if (folder / "set.json").exists():
         whole = RegisteredSet.load(folder)
         first = {entry.subject: entry.sex for entry in reversed(whole.entries)}

@@ -51,4 +51,4 @@ class LearnConfig(Settings):
 
         [SCAPE] Eq. 3, Eq. 4, Eq. 5, Eq. 7, Eq. 8
         """
-        return cls(prunings=(0.1**2,), ridges=(1e-9,), smoothness=0.001, refinements=0, detail=0.0)
+        return cls(prunings=(0.01,), ridges=(1e-9,), smoothness=0.001, refinements=0, detail=0.0)

@@ -31,9 +31,7 @@ from .work import Progress, Work, timed
 
 # what `learn_scape_mix` takes by default; `refinements` is the largest number of rounds
 MIX = LearnConfig(features="quadratic", ridges=(1e-4, 3e-4, 1e-3, 3e-3, 0.01, 0.03, 0.1), detail=0.005, refinements=6)
-STIFF = 20                           # shape components that tell people apart in the first round; twice as many in each
 CORRECTIONS = 2                      # of Q and of S in a round, by what the stitched model leaves
-HELD_OUT = 0.2                       # share of the bodies that is held out to find after how many rounds to stop
 GAIN = 0.01                          # a round counts as progress when it lowers the held-out error by this share of it
 DAMPING = 0.1                        # of the inverse of S, against triangles that somebody has nearly flat
 
@@ -93,10 +91,8 @@ def learn_scape_mix(template: Mesh, bodies: np.ndarray, subjects: Sequence[Hasha
         On the template.
     config : LearnConfig, optional
         By default `MIX`.
-    progress : callable, optional
-        Called with the work done and the whole.
-    step : callable, optional
-        Keeps every round, as `scanprep.batch.steps.Step`.
+    progress, step
+        As for `learn_scape`.
 
     Raises
     ------
@@ -139,7 +135,8 @@ def _in_turns(mix: Mix, rounds: int, work: Work) -> tuple[State, ShapeSpace]:
 
 def held_out_errors(mix: Mix, work: Work) -> list[float]:
     """Mean error, metres, of bodies that are held out, after each round until it stops falling."""
-    held = held_out_bodies(mix.who, HELD_OUT)
+    # share of the bodies that is held out to find after how many rounds to stop
+    held = held_out_bodies(mix.who, 0.2)
     train = mix.some(np.setdiff1d(np.arange(len(mix.bodies)), held))
     state, errors = _start(train), list[float]()
 
@@ -182,7 +179,8 @@ def _kept_round(mix: Mix, state: State, number: int, work: Work) -> State:
 
 def _next_round(mix: Mix, state: State, number: int, work: Work) -> State:
     """Part rotations with the model held, then the pose model with the shapes held, then the shapes."""
-    S, poses = _simplified(state.S, STIFF * 2**number), state.poses.copy()
+    # shape components that tell people apart: in each round twice as many as in the one before
+    S, poses = _simplified(state.S, 20 * 2**number), state.poses.copy()
     for person in range(mix.people if number else 0):
         mine = mix.who == person
         poses[mine] = fit_poses(mix.parts.subject(state.space, S[person]), mix.bodies[mine], poses[mine], work)

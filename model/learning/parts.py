@@ -21,20 +21,12 @@ from .work import Progress, Work
 
 QUICK = LearnConfig(prunings=(0.01,), ridges=(1e-3, 1e-2), refinements=1)
 MORE, TRIES = 4, 3                   # parts more each time, and the largest number of times
-GAIN = 0.03                          # share of the left-out error that more parts must save to be kept
 VERTICES = 2500                      # of the coarse copies on which the models are learned that are compared
 
 
 @dataclass(frozen=True, eq=False)
 class ChosenSkeleton:
-    """A skeleton and why it was chosen.
-
-    Attributes
-    ----------
-    skeleton : Skeleton
-    errors : {int: float}, metres
-        Error of poses that were left out, by the number of parts.
-    """
+    """A skeleton, and the errors of poses that were left out, metres, by the number of parts."""
 
     skeleton: Skeleton
     errors: dict[int, float]
@@ -95,7 +87,8 @@ def choose_skeleton(template: Mesh, poses: np.ndarray, progress: Progress | None
             break
         errors[wanted] = finer[1]
         tell(2 + done, 1 + TRIES)
-        if errors[wanted] > (1 - GAIN) * errors[len(best.parents)]:
+        # share of the left-out error that more parts must save to be kept
+        if errors[wanted] > (1 - 0.03) * errors[len(best.parents)]:
             break
         best = finer[0]
     tell(1 + TRIES, 1 + TRIES)

@@ -19,7 +19,6 @@ from .config import LearnConfig
 from .regression import Design, choose_design
 from .work import Work, timed
 
-CORRECTIONS = 3                      # of the regression after each fit of the part rotations
 NOTHING = 1e-9                       # relative size below which a direction of the features is none
 
 
@@ -74,7 +73,8 @@ def _refined(parts: BlendedTemplate, bodies: np.ndarray, config: LearnConfig, le
     """
     space, design, system = learned.space, learned.design, _system(parts, config)
     poses = fit_poses(parts.subject(space), bodies, learned.poses, work)
-    for number in range(CORRECTIONS):
+    # corrections of the regression after each fit of the part rotations
+    for number in range(3):
         left = bodies - parts.subject(space).vertices(poses)
         Q = space.gradients(poses)
         Q += pose_gradients(system, parts.v_hat + parts.local_edges(left, poses)) - np.eye(3)   # [SCAPE] Eq. 5

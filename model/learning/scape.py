@@ -13,9 +13,9 @@ from scanprep.meaning import HAND, extent, size, unit_problem
 from scanprep.skeleton.tree import Skeleton
 from scanprep.threads import one_thread
 
+from ..blend_weights import face_weights
 from ..blending import BlendedTemplate, rigid_weights
 from ..body import BodyModel
-from ..borders import face_weights
 from ..digests import body_digest, body_digests, digest
 from ..features import twists
 from ..gradients import GradientSystem, shape_gradients
@@ -25,8 +25,6 @@ from ..shape_space import ShapeSpace, learn_shape_space
 from .config import LearnConfig
 from .pose import LearnedPose, learn_pose
 from .work import Progress, Work, timed
-
-REACH = 0.01                         # of the template's diagonal: so far a rotation blends over the border of its part
 
 
 @one_thread()
@@ -91,7 +89,8 @@ def learn_blendscape(template: Mesh, poses: np.ndarray, shapes: np.ndarray | Non
     """
     config = config or LearnConfig()
     poses, shapes = checked_training(template, skeleton, poses, shapes)
-    blend = face_weights(template, skeleton, REACH * float(np.linalg.norm(np.ptp(template.vertices, axis=0))))
+    # a share of the template's diagonal: so far a rotation blends over the border of its part
+    blend = face_weights(template, skeleton, 0.01 * float(np.linalg.norm(np.ptp(template.vertices, axis=0))))
     parts = BlendedTemplate(template, skeleton, blend)
     work = Work(progress, amount(poses, shapes, config), step)
     learned = learn_pose(parts, poses, config, work)

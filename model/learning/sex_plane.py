@@ -10,8 +10,6 @@ import numpy as np
 from ..body import BodyModel
 
 PLANE = "sex_plane"                  # its place in a model's info
-FOLDS = 5
-PEOPLE = 3                           # for each beta that counts: with a beta a person everybody is like nobody else
 SOFTNESS = (0.003, 0.01, 0.03, 0.1, 0.3, 1.0)        # C of the support vectors, the softest first
 
 
@@ -42,15 +40,9 @@ class SexPlane:
 
 @dataclass(frozen=True)
 class SexGuess:
-    """Whether betas are a woman's or a man's.
-
-    Attributes
-    ----------
-    sex : "female" or "male"
-    margin : float
-        Distance from the plane between them in standard deviations of betas, positive for a man.
-    probability : float
-        Of `sex`, as often as the model's own people were told right at such a margin.
+    """Whether betas are a woman's or a man's: the sex, the signed distance from the plane between them in standard
+    deviations, positive for a man, and the probability of that sex, as often as the model's own people were told right
+    at such a margin.
     """
 
     sex: str
@@ -65,7 +57,8 @@ def learn_sex_plane(betas: np.ndarray, sexes: Sequence[str]) -> SexPlane:
     softest is taken. The first betas count, a third as many as people.
     """
     betas, men = _checked(betas, sexes)
-    count, betas = betas.shape[1], betas[:, :max(1, len(betas) // PEOPLE)]
+    # three people for each beta that counts: with a beta a person everybody is like nobody else
+    count, betas = betas.shape[1], betas[:, :max(1, len(betas) // 3)]
     tried = [(_unseen(betas, men, C), C) for C in SOFTNESS]
     right = [float(np.mean((margins > 0) == men)) for margins, _ in tried]
     margins, C = tried[int(np.argmax(right))]
@@ -87,7 +80,7 @@ def _unseen(betas: np.ndarray, men: np.ndarray, C: float) -> np.ndarray:
     """(P,) distances of people from planes that were learned without them."""
     from sklearn.model_selection import StratifiedKFold
 
-    folds = StratifiedKFold(min(FOLDS, int(men.sum()), int((~men).sum())), shuffle=True, random_state=0)
+    folds = StratifiedKFold(min(5, int(men.sum()), int((~men).sum())), shuffle=True, random_state=0)
     margins = np.empty(len(men))
     for known, new in folds.split(betas, men):
         weights, bias = _plane(betas[known], men[known], C)

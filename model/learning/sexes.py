@@ -20,7 +20,6 @@ from .sex_plane import PLANE, learn_sex_plane
 from .work import Progress, Work, timed
 
 SEXES = ("female", "male")
-FEWEST = 2                           # people that span a space of shapes
 
 
 @one_thread()
@@ -90,6 +89,7 @@ def _groups(sexes: Sequence[str], count: int) -> dict[str, np.ndarray]:
     groups = {"neutral": np.arange(count)}
     for sex in SEXES:
         chosen = np.flatnonzero(np.array(list(sexes), dtype=object) == sex)
-        if len(chosen) >= FEWEST:
+        # people that span a space of shapes
+        if len(chosen) >= 2:
             groups[sex] = chosen
     return groups

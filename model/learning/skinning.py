@@ -12,6 +12,7 @@ from scanprep.ranges import Count, Positive, Settings
 from scanprep.skeleton.tree import Skeleton
 from scanprep.threads import one_thread
 
+from ..blend_weights import diffused, diffused_weights, fit_weights, strongest
 from ..digests import body_digest, digest
 from ..features import LinearLift, PoseFeatures, part_features
 from ..fitting import FitConfig, PoseFitter, ShapeFitter
@@ -20,15 +21,10 @@ from ..shape_space import learn_shape_space
 from ..skinning import SkinningModel, unblended
 from .pose import fit_poses
 from .scape import checked_training, pose_examples, pose_prior
-from .skin_weights import diffused, diffused_weights, fit_weights, kept_weights
 from .work import Progress, Work, timed
 
-PRUNING = 0.01                       # square radians: twist directions of smaller variance correct nothing
 RIDGES = (1e-4, 1e-3, 3e-3, 0.01, 0.03, 0.1, 0.3)      # penalties; the one that predicts left-out poses best is taken
-NEAREST = 2                          # joints that correct a vertex: those of its heaviest part that are nearest to it
-FADING = 0.05                        # metres of surface over which the correctives of a joint give way to another's
 LEVELS = 8                           # of how freely a joint corrects a vertex: vertices of one level share a solve
-ENOUGH = 0.005                       # relative gain of a round below which the next is not worth it
 PEOPLE_ROUNDS = 3                    # of fitting the poses of the other people and undoing them
 QUICK = FitConfig(sample=400, iterations=20, polish=0, tolerance=1e-4)     # of poses that will be fitted again
 
@@ -67,24 +63,14 @@ def learn_skinning(template: Mesh, poses: np.ndarray, shapes: np.ndarray | None,
 
     Parameters
     ----------
-    template : Mesh
-        One of the poses.
-    poses : (M, N, 3) float, metres
-        The template's person in M poses.
-    shapes : (S, N, 3) float, metres, or None
-        Other people; None for a model of the template's own body alone.
-    skeleton : Skeleton
-        The parts and where the joints are sought.
+    template, poses, shapes, skeleton, progress, step
+        As for `learn_scape`; joints are sought near those of the skeleton.
     config : SkinConfig, optional
-    progress : callable, optional
-        Called with the work done and the whole.
-    step : callable, optional
-        Keeps every round, as `scanprep.batch.steps.Step`.
 
     Raises
     ------
     ValueError
-        Fewer than two poses, vertices of another count or not finite, a skeleton of another template.
+        As `learn_scape`.
     """
     config = config or SkinConfig()
     poses, shapes = checked_training(template, skeleton, poses, shapes)
@@ -115,7 +101,7 @@ def _start(template: Mesh, skeleton: Skeleton, config: SkinConfig) -> SkinningMo
     """The template itself, with weights that pass smoothly from part to part, and no correctives."""
     J, N = len(skeleton.parents), len(template.vertices)
     constants = PoseFeatures(skeleton, LinearLift(), np.arange(J), np.zeros((J, 3, J)))
-    weights = kept_weights(diffused_weights(template, skeleton, config.width), config.parts)
+    weights = strongest(diffused_weights(template, skeleton, config.width), config.parts, 1e-3)
     return SkinningModel(template, skeleton, template.vertices, weights, constants, np.zeros((0, N, 3), np.float32),
                          template.vertices, np.zeros((0, N, 3), np.float32), np.zeros(0), 0.0,
                          np.zeros((J, 3)), np.zeros((3 * J, 3 * J)))
@@ -132,7 +118,8 @@ def _learn_pose(model: SkinningModel, poses: np.ndarray, bodies: np.ndarray, con
         gain = 1 - tried.info["left_out_error"] / model.info["left_out_error"]
         if gain > 0:
             model, poses = tried, fitted
-        if gain < ENOUGH:
+        # relative gain of a round below which the next is not worth it
+        if gain < 0.005:
             break
     return model, poses
 
@@ -160,7 +147,7 @@ def _with_weights(model: SkinningModel, poses: np.ndarray, bodies: np.ndarray, a
     """The model with weights fitted to the bodies at their poses."""
     carried = [_carried(model, p, y) for p, y in zip(poses, bodies, strict=True)]
     weights = fit_weights(carried, bodies, model.template, model.weights, allowed)
-    return replace(model, weights=kept_weights(weights, config.parts))
+    return replace(model, weights=strongest(weights, config.parts, 1e-3))
 
 
 def _with_joints(model: SkinningModel, poses: np.ndarray, bodies: np.ndarray) -> SkinningModel:
@@ -220,7 +207,8 @@ def _unposed(model: SkinningModel, pose: np.ndarray, body: np.ndarray) -> np.nda
 def corrective_features(skeleton: Skeleton, poses: np.ndarray, correctives: bool) -> PoseFeatures:
     """For every joint a constant, and its kept twist directions where there are correctives."""
     J = len(skeleton.parents)
-    directions = kept_directions(poses, PRUNING) if correctives else [np.zeros((3, 0))] * J
+    # rad²: twist directions of smaller variance correct nothing
+    directions = kept_directions(poses, 0.01) if correctives else [np.zeros((3, 0))] * J
     return part_features(skeleton, LinearLift(), directions, [[j] for j in range(J)])
 
 
@@ -231,8 +219,10 @@ def _acting_joints(model: SkinningModel) -> np.ndarray:
     for p, of_part in enumerate(model.skeleton.joints_of_part):
         mine, near = np.flatnonzero(model.weights.argmax(axis=1) == p), np.array(of_part, dtype=np.int64)
         far = np.linalg.norm(x[mine, None] - joints[near], axis=2)
-        acting[mine[:, None], near[np.argsort(far, axis=1, kind="stable")[:, :NEAREST]]] = 1
-    return np.round(LEVELS * diffused(model.template, acting, FADING)) / LEVELS
+        # two joints correct a vertex: those of its heaviest part that are nearest to it
+        acting[mine[:, None], near[np.argsort(far, axis=1, kind="stable")[:, :2]]] = 1
+    # metres of surface over which the correctives of a joint give way to another's
+    return np.round(LEVELS * diffused(model.template, acting, 0.05)) / LEVELS
 
 
 def _regress(features: PoseFeatures, poses: np.ndarray, unposed: np.ndarray, acting: np.ndarray, ridge: float

@@ -13,9 +13,6 @@ from ..pose_space import PoseSpace
 from .config import LearnConfig
 from .regression import RADII, Design, make_design
 
-OWN = 30.0                           # variance between people over that within, of what regression does not explain
-FEWEST_PEOPLE = 5                    # from here on whole people are held out, otherwise bodies of any
-
 
 @dataclass(frozen=True, eq=False)
 class Within:
@@ -33,7 +30,8 @@ class Within:
         out = np.array(values, dtype=np.float64)
         for person in range(int(self.who.max()) + 1):
             mine = self.who == person
-            out[mine] -= (1 - 1 / np.sqrt(1 + OWN * mine.sum())) * out[mine].mean(axis=0)
+            # 30: variance between people over that within, of what regression does not explain
+            out[mine] -= (1 - 1 / np.sqrt(1 + 30.0 * mine.sum())) * out[mine].mean(axis=0)
         return out
 
     def without_the_person(self, X: np.ndarray, operator: np.ndarray, target: np.ndarray) -> np.ndarray:
@@ -100,7 +98,8 @@ def _left_out_error(design: Design, poses: np.ndarray, Q: np.ndarray, who: np.nd
 
 def held_out_bodies(who: np.ndarray, share: float) -> np.ndarray:
     """Bodies to hold out, evenly from the whole: all of some people, or where there are few people any bodies."""
-    groups = who if who.max() + 1 >= FEWEST_PEOPLE else np.arange(len(who))
+    # from here on whole people are held out, otherwise bodies of any
+    groups = who if who.max() + 1 >= 5 else np.arange(len(who))
     count = int(groups.max()) + 1
     chosen = np.linspace(0, count - 1, max(1, round(share * count)) + 2).round().astype(int)[1:-1]
     return np.flatnonzero(np.isin(groups, chosen))

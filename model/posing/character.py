@@ -1,13 +1,19 @@
 """A character as the mean of a body model: betas are then offsets from it, and poses bend it as they bend people."""
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Mapping
+from dataclasses import dataclass, field, replace
 from functools import singledispatch
 from typing import Annotated, Literal
 
 import numpy as np
 
+from scanprep.geometry.landmarks import match_landmarks
+from scanprep.geometry.mesh import Mesh
+from scanprep.geometry.surface import checked_points, checked_surface
 from scanprep.ranges import FLAG, Settings
+from scanprep.registration.nonrigid import Registration, register
+from scanprep.registration.schedule import RegistrationConfig
 
 from ..body import BodyModel
 from ..gradients import GradientSystem, ShapeSolver
@@ -16,10 +22,12 @@ from ..linear import check_pose
 from ..scape import ScapeModel
 from ..skinning import SkinningModel
 
-OWN_CHARACTER = "character"          # its place in a model's info
-SMOOTHNESS = 0.0001                  # of Eq. 8: a character's triangles share less of their shape than people's
+Progress = Callable[[int, int], None]
+
 NORMAL = 0.3                         # how much normals count beside edges: triangles thicken as they grow
-ROUNDS = 2                           # of adding what is left of the character to its shape
+# registrations of the template, each from where the last one left it: one alone does not stretch so far
+REGISTRATIONS = 2
+LOST = 0.5                           # share of the character missed, or of joints outside it, that means nothing
 
 
 @dataclass(frozen=True)
@@ -71,7 +79,8 @@ def character_model(model: BodyModel, vertices: np.ndarray, config: CharacterCon
     pose, _ = check_pose(model.skeleton, pose, None)
     found = recentred(model, vertices, pose)
     kept = {name: value for name, value in model.info.items() if name != PLANE}   # these betas are nobody's
-    return replace(found, info={**kept, OWN_CHARACTER: True})                      # type: ignore[type-var]
+    # its place in a model's info
+    return replace(found, info={**kept, "character": True})                      # type: ignore[type-var]
 
 
 def character_pose(model: BodyModel, vertices: np.ndarray, config: CharacterConfig) -> np.ndarray:
@@ -97,9 +106,11 @@ def _of_triangles(model: ScapeModel, vertices: np.ndarray, pose: np.ndarray) -> 
     """
     posed, wanted = model.posed_edges(pose), model.parts.local_edges(vertices, pose)
     with_normals = np.concatenate([posed, NORMAL * _normals(posed)], axis=1)
-    solver = ShapeSolver(GradientSystem(model.template, SMOOTHNESS), with_normals)
+    # a tenth of the paper's smoothness: a character's triangles share less of their shape than people's
+    solver = ShapeSolver(GradientSystem(model.template, 0.0001), with_normals)
     target, S = np.concatenate([wanted, NORMAL * _normals(wanted)], axis=1), np.zeros((len(posed), 3, 3))
-    for _ in range(1 + ROUNDS):
+    # twice what is left of the character is added to its shape
+    for _ in range(3):
         S += solver(target - with_normals @ np.swapaxes(S, -1, -2))
     return replace(model, shape_space=replace(model.shape_space, mean=S.astype(np.float32)))
 
@@ -117,3 +128,98 @@ def _normals(pairs: np.ndarray) -> np.ndarray:
 @recentred.register
 def _of_vertices(model: SkinningModel, vertices: np.ndarray, pose: np.ndarray) -> SkinningModel:
     return replace(model, shape_mean=model.unposed(vertices, pose))
+
+
+@dataclass(frozen=True)
+class CharacterMeshConfig(Settings):
+    """Settings of `register_character`.
+
+    Attributes
+    ----------
+    register : RegistrationConfig
+        Of every round.
+    character : CharacterConfig
+        How the character becomes the mean of the model.
+    """
+
+    register: RegistrationConfig = field(default_factory=RegistrationConfig)
+    character: CharacterConfig = field(default_factory=CharacterConfig)
+
+
+@dataclass(frozen=True, eq=False)
+class Character:
+    """A character as the mean of a body model, the template on it as it stands, its pose (J, 3), its joints (J, 3),
+    metres, which of them lie inside, and how the template was registered to it, None for a mesh that had the template's
+    triangles.
+    """
+
+    model: BodyModel
+    mesh: Mesh
+    pose: np.ndarray
+    joints: np.ndarray
+    inside: np.ndarray
+    registration: Registration | None
+
+
+def register_character(model: BodyModel, mesh: Mesh, landmarks: Mapping[str, np.ndarray] | None = None,
+                       template_landmarks: Mapping[str, int] | None = None, config: CharacterMeshConfig | None = None,
+                       progress: Progress | None = None) -> Character:
+    """Make a model of a character from its mesh: register the template to it, then `character_model`.
+
+    The mesh has any size, place and direction, and is about in the template's pose; a mesh with the template's
+    triangles is taken as it is. A dozen landmarks spread over the body are enough: tips of hands and feet, elbows,
+    knees, head, trunk. ValueError for fewer than four of the same names.
+
+    [MoSh]
+    """
+    config = config or CharacterMeshConfig()
+    fit = None
+    if np.array_equal(mesh.faces, model.template.faces):
+        body = mesh
+    else:
+        known = model.info.get("landmarks", {}) if template_landmarks is None else template_landmarks
+        _, vertices, points = match_landmarks(known, landmarks or {}, minimum=4)
+        fit = _registered(model.template, mesh, vertices.astype(np.int64), points, config, progress)
+        body = fit.mesh
+    pose = character_pose(model, body.vertices, config.character)
+    found = character_model(model, body.vertices, config.character, pose)
+    joints = model.skeleton.joint_regressor(model.template) @ body.vertices
+    return Character(found, body, pose, joints, inside(body, joints), fit)
+
+
+def _registered(template: Mesh, mesh: Mesh, vertices: np.ndarray, points: np.ndarray, config: CharacterMeshConfig,
+                progress: Progress | None) -> Registration:
+    """The template on the mesh; first at the template's size, then from where that left it."""
+    tell = progress or (lambda done, total: None)
+    size = _spread(template.vertices[vertices]) / _spread(points)
+    start = template.with_vertices(template.vertices / size)
+    for k in range(REGISTRATIONS):
+        def told(done: int, total: int, before: int = k) -> None:
+            tell(before * total + done, REGISTRATIONS * total)
+
+        fit = register(start, mesh, (vertices, points), config.register, told)
+        start = fit.mesh
+    return fit
+
+
+def _spread(points: np.ndarray) -> float:
+    """The root mean square distance of points (n, 3) from their middle."""
+    return float(np.sqrt(((points - points.mean(axis=0))**2).sum(axis=1).mean()))
+
+
+def inside(mesh: Mesh, points: np.ndarray) -> np.ndarray:
+    """Which points (n, 3) lie inside a closed mesh; ValueError for one that is not finite."""
+    import igl
+
+    turns = igl.fast_winding_number(*checked_surface(mesh), checked_points(points))
+    return np.asarray(np.abs(turns) > 0.5)
+
+
+def character_problem(found: Character) -> str | None:
+    """Why a character means nothing, with the likely cause; None where it means something."""
+    missed = 0.0 if found.registration is None else found.registration.uncovered
+    if missed <= LOST and found.inside.mean() >= LOST:
+        return None
+    return (f"{100 * missed:.0f}% of the character lies off the template and {found.inside.sum()} of "
+            f"{len(found.inside)} joints inside it; landmarks of other places, left and right exchanged, or a mesh "
+            "that is no body?")

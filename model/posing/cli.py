@@ -17,14 +17,11 @@ from scanprep.ranges import BETAS, TURNS, Beta
 
 from ..body import BodyModel
 from ..cli import ModelArg
-from ..export.cli import read_motion
-from ..export.meshes import write_frames
+from ..export.cli import read_motion, write_frames
 from ..files import load_model
 from ..linear import Subject
-from .character_mesh import Character, CharacterMeshConfig, character_problem, register_character
+from .character import Character, CharacterMeshConfig, character_problem, register_character
 from .transfer import own_body, subject_from_body
-
-MM = 1000.0
 
 CharacterArg = Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="MESH")]
 BodyArg = Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="BODY")]
@@ -52,10 +49,10 @@ def repose(model: ModelArg, body: BodyArg, poses: Path, output: Output, unit: Un
         written = write_frames(output, found.subject, moves.poses, moves.trans, progress=progress)
     return Outcome(output, [
         Metric("meshes", len(written)),
-        Metric("distance from the body in its own pose, mean", MM * found.mean, "mm"),
-        Metric("distance from the body in its own pose, largest", MM * found.largest, "mm")],
+        Metric("distance from the body in its own pose, mean", 1e3 * found.mean, "mm"),
+        Metric("distance from the body in its own pose, largest", 1e3 * found.largest, "mm")],
         problem=None if found.mean <= HAND * size(loaded.template) else
-        f"the body is {MM * found.mean:.0f} mm from the model's; registered otherwise, or the wrong unit (--unit)?")
+        f"the body is {1e3 * found.mean:.0f} mm from the model's; registered otherwise, or the wrong unit (--unit)?")
 
 
 def character(mesh: CharacterArg, model: Annotated[Path, tyro.conf.arg(aliases=["-m"])], output: Output,
@@ -93,17 +90,17 @@ def character(mesh: CharacterArg, model: Annotated[Path, tyro.conf.arg(aliases=[
     if pictures:
         from scanprep.pictures.shading import save_png
 
-        from .character_picture import picture_character
+        from ..report import picture_character
 
-        save_png(output.with_suffix(".png"), picture_character(found))
+        save_png(output.with_suffix(".png"), picture_character(found.model))
     return Outcome(output, _about(loaded, found), {"character": config}, problem=character_problem(found))
 
 
 def _about(model: BodyModel, found: Character) -> list[Metric]:
     rows = [] if found.registration is None else [
-        Metric("distance to the character, RMS", MM * found.registration.rms, "mm"),
+        Metric("distance to the character, RMS", 1e3 * found.registration.rms, "mm"),
         Metric("character off the template", 100 * found.registration.uncovered, "%"),
-        Metric("distance of landmarks, RMS", MM * found.registration.landmark_rms, "mm"),
+        Metric("distance of landmarks, RMS", 1e3 * found.registration.landmark_rms, "mm"),
         Metric("inverted triangles", found.registration.inverted)]
     outside = [name for name, within in zip(model.skeleton.names, found.inside, strict=True) if not within]
     return [*rows, Metric("height, length or width", float(np.ptp(found.mesh.vertices, axis=0).max()), "m"),

@@ -7,6 +7,7 @@ import numpy as np
 from scipy.optimize import linear_sum_assignment
 
 from scanprep.geometry.mesh import Mesh
+from scanprep.skeleton.symmetry import MirrorPlane
 from scanprep.skeleton.tree import Skeleton
 
 NEAR = 0.08                          # of the body's size: how far mirrored parts may lie from their partners
@@ -15,38 +16,25 @@ ROUNDS = 10
 
 
 @dataclass(frozen=True, eq=False)
-class Mirror:
+class Mirror(MirrorPlane):
     """The plane of a body's symmetry and which parts it exchanges.
 
     Attributes
     ----------
-    normal : (3,) float
-        Unit normal of the plane.
-    point : (3,) float, metres
-        A point on it.
+    normal, point : (3,) float, metres
+        Of the plane.
     partners : (J,) int
         The part on the other side; a part in the middle is its own.
     distance : float, metres
         Root mean square distance of mirrored joints and centroids of parts from those of their partners.
     """
 
-    normal: np.ndarray
-    point: np.ndarray
     partners: np.ndarray
     distance: float
 
-    @property
-    def matrix(self) -> np.ndarray:
-        """(3, 3) the reflection M."""
-        return np.eye(3) - 2 * np.outer(self.normal, self.normal)
-
-    def points(self, points: np.ndarray) -> np.ndarray:
-        """Mirrored points (..., 3), metres."""
-        return (points - self.point) @ self.matrix + self.point
-
     def trans(self, skeleton: Skeleton, trans: np.ndarray) -> np.ndarray:
         """The places (..., 3) of mirrored bodies, metres."""
-        return self.points(skeleton.joints[0] + trans) - skeleton.joints[0]
+        return self.reflect(skeleton.joints[0] + trans) - skeleton.joints[0]
 
 
 def mirror_pose(mirror: Mirror, pose: np.ndarray) -> np.ndarray:
@@ -84,14 +72,15 @@ def find_mirror(template: Mesh, skeleton: Skeleton) -> Mirror:
     """
     marks = _marks(template, skeleton)
     size = float(np.linalg.norm(np.ptp(template.vertices, axis=0)))
-    found = [m for n, c in _candidates(template, skeleton, marks) if (m := _fitted(skeleton, marks, n, c)) is not None]
+    tried = [_fitted(skeleton, marks, plane) for plane in _candidates(template, skeleton, marks)]
+    found = [mirror for mirror in tried if mirror is not None]
     if not found:
         raise ValueError("skeleton: it is not symmetric, no mirror image of its tree is the tree itself")
     each = np.arange(len(skeleton.parents))
     exchanging = [m for m in found if (m.partners != each).any()]
     best = min(exchanging or found, key=lambda m: m.distance)
     if best.distance > (NEAR if exchanging else NEAR_ALONE) * size:
-        image = np.linalg.norm(best.points(marks) - marks[:, best.partners], axis=-1).max(axis=0)
+        image = np.linalg.norm(best.reflect(marks) - marks[:, best.partners], axis=-1).max(axis=0)
         worst = int(image.argmax())
         how = "in the best mirror" if exchanging else "no two parts can be exchanged, and in the best mirror"
         raise ValueError(f"skeleton: it is not symmetric; {how}, part '{skeleton.names[worst]}' comes to lie "
@@ -108,18 +97,18 @@ def _marks(template: Mesh, skeleton: Skeleton) -> np.ndarray:
     return np.stack([skeleton.joints, centroids])
 
 
-def _candidates(template: Mesh, skeleton: Skeleton, marks: np.ndarray) -> list[tuple[np.ndarray, np.ndarray]]:
-    """Planes (normal, point) to start from: halfway between two parts alike, and through the body's main axes."""
+def _candidates(template: Mesh, skeleton: Skeleton, marks: np.ndarray) -> list[MirrorPlane]:
+    """Planes to start from: halfway between two parts alike, and through the body's main axes."""
     kind, middle = _kinds(skeleton), marks[1]
     planes = []
     for a in range(len(kind)):
         for b in range(a + 1, len(kind)):
             apart = middle[a] - middle[b]
             if kind[a] == kind[b] and np.linalg.norm(apart) > 0:
-                planes.append((apart / np.linalg.norm(apart), (middle[a] + middle[b]) / 2))
+                planes.append(MirrorPlane(apart / np.linalg.norm(apart), (middle[a] + middle[b]) / 2))
     centre = template.vertices.mean(axis=0)
     axes = np.linalg.eigh(np.cov(template.vertices.T))[1]
-    return planes + [(axis, centre) for axis in axes.T]
+    return planes + [MirrorPlane(axis, centre) for axis in axes.T]
 
 
 def _kinds(skeleton: Skeleton) -> list[tuple[int, str]]:
@@ -137,24 +126,20 @@ def _kinds(skeleton: Skeleton) -> list[tuple[int, str]]:
     return list(zip(depth, shape, strict=True))
 
 
-def _fitted(skeleton: Skeleton, marks: np.ndarray, normal: np.ndarray, point: np.ndarray) -> Mirror | None:
+def _fitted(skeleton: Skeleton, marks: np.ndarray, plane: MirrorPlane) -> Mirror | None:
     """The mirror near a plane, parts paired and plane fitted in turn; None where parts cannot be paired."""
     partners = np.full(len(skeleton.parents), -1)
     for _ in range(ROUNDS):
         before = partners
-        paired = _paired(skeleton, Mirror(normal, point, before, np.inf).points(marks), marks)
+        paired = _paired(skeleton, plane.reflect(marks), marks)
         if paired is None:
             return None
         partners = paired
         if (partners == before).all():
             break
-        p, q = marks.reshape(-1, 3), marks[:, partners].reshape(-1, 3)
-        point = (p + q).mean(axis=0) / 2
-        cross = (p - p.mean(axis=0)).T @ (q - q.mean(axis=0))
-        normal = np.linalg.eigh(cross + cross.T)[1][:, 0]
-    mirror = Mirror(normal, point, partners, np.inf)
-    off = mirror.points(marks) - marks[:, partners]
-    return Mirror(normal, point, partners, float(np.sqrt((off**2).sum(axis=-1).mean())))
+        plane = MirrorPlane.between(marks.reshape(-1, 3), marks[:, partners].reshape(-1, 3))
+    off = plane.reflect(marks) - marks[:, partners]
+    return Mirror(plane.normal, plane.point, partners, float(np.sqrt((off**2).sum(axis=-1).mean())))
 
 
 def _paired(skeleton: Skeleton, image: np.ndarray, marks: np.ndarray) -> np.ndarray | None:

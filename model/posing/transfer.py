@@ -14,7 +14,6 @@ from ..scape import ScapeModel
 from ..skinning import SkinningModel
 
 QUICK = FitConfig(polish=0)          # of pose and betas: the body's own shape takes up what a rough fit leaves
-ROUNDS = 2                           # of adding what is left of the body to its shape (SCAPE models)
 
 
 @dataclass(frozen=True, eq=False)
@@ -116,7 +115,8 @@ def _of_triangles(model: ScapeModel, vertices: np.ndarray, fit: PoseFit) -> Subj
     parts, Q, posed = model.parts, model.pose_space.gradients(fit.pose), model.posed_edges(fit.pose)
     system = GradientSystem(model.template)
     S = model.shape_space.gradients(fit.betas if isinstance(fit, ShapeFit) else None)
-    for _ in range(ROUNDS):
+    # twice what is left of the body is added to its shape
+    for _ in range(2):
         left = vertices - parts.stitched(S @ Q, fit.pose)
         S += shape_gradients(system, posed, posed + parts.local_edges(left, fit.pose)) - np.eye(3)
     return replace(parts.subject(model.pose_space, S), pose_mean=model.pose_mean,

@@ -3,7 +3,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import singledispatch
-from typing import Annotated, Any
+from typing import Any
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -11,7 +11,7 @@ from scipy.spatial import cKDTree
 from scanprep.decimation.decimate import DecimateConfig, decimate
 from scanprep.geometry.mesh import Mesh, check_template
 from scanprep.geometry.surface import Surface
-from scanprep.ranges import FLAG, Settings
+from scanprep.ranges import Settings
 from scanprep.skeleton.tree import Skeleton
 
 from ..body import BodyModel
@@ -21,10 +21,9 @@ from ..scape import BlendScapeModel, ScapeModel
 from ..shape_space import ShapeSpace
 from ..skinning import SkinningModel
 from .distil import Distillation, Follower, Progress, enough_poses
-from .pieces import Piece, carry_skeleton, gradients_of
+from .pieces import Piece, gradients_of, transfer_skeleton
 
 POSES, SHAPE_POSES = 40, 8           # of the prior, in which both models are compared and the new one corrected
-ASTRAY = 2.0                         # mean edges of the coarser surface that the two may lie apart
 
 
 @dataclass(frozen=True)
@@ -37,12 +36,12 @@ class ResolutionConfig(Settings):
         How often pose space and shape space are corrected; none for a fast and rougher answer.
     """
 
-    rounds: Annotated[int, FLAG] = 2
+    rounds: int = 2
 
 
 def change_resolution(model: BodyModel, template: Mesh, config: ResolutionConfig | None = None,
                       progress: Progress | None = None) -> BodyModel:
-    """Carry a model to a coarser or finer triangulation, so that pose, betas and trans keep their meaning.
+    """Transfer a model to a coarser or finer triangulation, so that pose, betas and trans keep their meaning.
 
     Parameters
     ----------
@@ -74,33 +73,34 @@ def change_resolution(model: BodyModel, template: Mesh, config: ResolutionConfig
     """
     check_template(template)
     _check_same_surface(model.template, template)
-    return carry_model(model, template, config or ResolutionConfig(), progress)
+    return transfer_model(model, template, config or ResolutionConfig(), progress)
 
 
 @singledispatch
-def carry_model(model: BodyModel, template: Mesh, config: ResolutionConfig, progress: Progress | None) -> BodyModel:
+def transfer_model(model: BodyModel, template: Mesh, config: ResolutionConfig, progress: Progress | None) -> BodyModel:
     """What `change_resolution` does for one kind of model."""
     raise ValueError(f"model: the resolution of the kind '{model.kind}' cannot be changed")
 
 
-@carry_model.register
-def _carry_scape(model: ScapeModel, template: Mesh, config: ResolutionConfig, progress: Progress | None
+@transfer_model.register
+def _transfer_scape(model: ScapeModel, template: Mesh, config: ResolutionConfig, progress: Progress | None
                  ) -> ScapeModel:
-    skeleton = carry_skeleton(model.skeleton, model.template, template)
+    skeleton = transfer_skeleton(model.skeleton, model.template, template)
     pieces = [Piece(model.template, template, old, new) for old, new in
               zip(faces_of_part(model.skeleton), faces_of_part(skeleton), strict=True)]
-    carried = replace(
-        model, template=template, skeleton=skeleton, pose_space=_carry_pose_space(model.pose_space, skeleton, pieces),
-        shape_space=_carry_shape_space(model, pieces), info=carry_info(model, template), **_carry_blend(model, pieces))
+    moved = replace(
+        model, template=template, skeleton=skeleton, info=transfer_info(model, template),
+        pose_space=_transfer_pose_space(model.pose_space, skeleton, pieces),
+        shape_space=_transfer_shape_space(model, pieces), **_transfer_blend(model, pieces))
     if not config.rounds:
-        return carried
+        return moved
     poses = sample_poses(model, enough_poses(model, POSES), np.random.default_rng(0))
     poses[0] = model.pose_mean
     teacher = Distillation(model, Follower(model.template, template), config.rounds, progress)
-    return teacher.shape_space(teacher.pose_space(carried, poses), poses[:SHAPE_POSES])
+    return teacher.shape_space(teacher.pose_space(moved, poses), poses[:SHAPE_POSES])
 
 
-def _carry_pose_space(space: PoseSpace, skeleton: Skeleton, pieces: list[Piece]) -> PoseSpace:
+def _transfer_pose_space(space: PoseSpace, skeleton: Skeleton, pieces: list[Piece]) -> PoseSpace:
     coefficients = []
     for piece, a in zip(pieces, space.coefficients, strict=True):
         action = a.astype(np.float64)
@@ -109,7 +109,7 @@ def _carry_pose_space(space: PoseSpace, skeleton: Skeleton, pieces: list[Piece])
     return PoseSpace(replace(space.features, skeleton=skeleton), tuple(coefficients))
 
 
-def _carry_shape_space(model: ScapeModel, pieces: list[Piece]) -> ShapeSpace:
+def _transfer_shape_space(model: ScapeModel, pieces: list[Piece]) -> ShapeSpace:
     """S with which the parts, in the mean pose, have the shapes they had."""
     old, F = model.shape_space, sum(len(piece.new_faces) for piece in pieces)
     Q = model.pose_space.gradients(model.pose_mean)
@@ -125,7 +125,7 @@ def _carry_shape_space(model: ScapeModel, pieces: list[Piece]) -> ShapeSpace:
     return ShapeSpace(mean, components, old.variances, old.total_variance)
 
 
-def _carry_blend(model: ScapeModel, pieces: list[Piece]) -> dict[str, np.ndarray]:
+def _transfer_blend(model: ScapeModel, pieces: list[Piece]) -> dict[str, np.ndarray]:
     """The weights of blended rotations, where the model has them."""
     if not isinstance(model, BlendScapeModel):
         return {}
@@ -135,10 +135,10 @@ def _carry_blend(model: ScapeModel, pieces: list[Piece]) -> dict[str, np.ndarray
     return {"blend": blend}
 
 
-@carry_model.register
-def _carry_skinning(model: SkinningModel, template: Mesh, config: ResolutionConfig, progress: Progress | None
+@transfer_model.register
+def _transfer_skinning(model: SkinningModel, template: Mesh, config: ResolutionConfig, progress: Progress | None
                     ) -> SkinningModel:
-    skeleton = carry_skeleton(model.skeleton, model.template, template)
+    skeleton = transfer_skeleton(model.skeleton, model.template, template)
     follow = Follower(model.template, template)
 
     def displaced(field: np.ndarray) -> np.ndarray:
@@ -153,10 +153,10 @@ def _carry_skinning(model: SkinningModel, template: Mesh, config: ResolutionConf
         features=replace(model.features, skeleton=skeleton), correctives=displaced(model.correctives),
         shape_mean=shape_mean, shape_components=displaced(model.shape_components),
         shape_variances=model.shape_variances * per_vertex, shape_total=model.shape_total * per_vertex,
-        info=carry_info(model, template))
+        info=transfer_info(model, template))
 
 
-def carry_info(model: BodyModel, template: Mesh) -> dict[str, Any]:
+def transfer_info(model: BodyModel, template: Mesh) -> dict[str, Any]:
     """The model's info with its landmarks on the nearest new vertices and a note of the resolution it was made at."""
     old, marks = model.template, model.info.get("landmarks", {})
     points = old.vertices[np.array(list(marks.values()), dtype=np.int64)]
@@ -198,7 +198,8 @@ def resample(mesh: Mesh, vertices: int) -> Mesh:
 
 
 def _check_same_surface(old: Mesh, new: Mesh) -> None:
-    limit = ASTRAY * max(old.mean_edge, new.mean_edge)
+    # mean edges of the coarser surface that the two may lie apart
+    limit = 2.0 * max(old.mean_edge, new.mean_edge)
     for a, b, which in ((new, old, "it lies"), (old, new, "the model's own lies")):
         far = float(Surface(b).closest(a.vertices).distances.max())
         if far > limit:

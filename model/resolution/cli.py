@@ -15,14 +15,13 @@ from ..files import load_model
 from ..priors import sample_poses
 from .change import ResolutionConfig, change_resolution, resample, resolution_gap
 
-MM = 1000.0
 MEASURED = 20                        # poses in which the two models are compared
 
 
 def resample_model(model: ModelArg, output: Output, template: Path | None = None, vertices: Faces | None = None,
                    unit: Unit | None = None, config: ResolutionConfig
                    = ResolutionConfig()) -> Outcome:  # noqa: B008
-    """Carry a model to fewer or more triangles; poses, betas and places keep their meaning.
+    """Transfer a model to fewer or more triangles; poses, betas and places keep their meaning.
 
     Example: scape model resample model.npz --vertices 5389 -o coarse.npz
 
@@ -38,7 +37,7 @@ def resample_model(model: ModelArg, output: Output, template: Path | None = None
         raise ValueError("--template and --vertices: expected one of them")
     loaded = load_model(model)
     mesh = resample(loaded.template, vertices) if vertices is not None else read_mesh(Path(str(template)), unit)
-    with bar("carrying the model") as progress:
+    with bar("transferring the model") as progress:
         changed = change_resolution(loaded, mesh, config, progress)
     changed.save(output)
     rng = np.random.default_rng(1)
@@ -49,6 +48,6 @@ def resample_model(model: ModelArg, output: Output, template: Path | None = None
     return Outcome(output, [
         Metric("vertices before", len(loaded.template.vertices)), Metric("vertices", len(mesh.vertices)),
         Metric("triangles", len(mesh.faces)),
-        *(Metric(f"distance in {MEASURED} random poses, {who}, {what}", MM * float(value), "mm")
+        *(Metric(f"distance in {MEASURED} random poses, {who}, {what}", 1000.0 * float(value), "mm")
           for who, gap in gaps for what, value in (("mean", gap.mean()), ("worst pose", gap.max())))],
         {"resample": config})

@@ -1,4 +1,4 @@
-"""What a model carried to another resolution still lacks, found by comparing the two in many poses."""
+"""What a model transferred to another resolution still lacks, found by comparing the two in many poses."""
 from __future__ import annotations
 
 from collections.abc import Callable
@@ -16,7 +16,6 @@ from .pieces import gradients_of
 
 Progress = Callable[[int, int], None]
 
-PER_FEATURE = 3                      # poses for each feature of the part that has most, if that is more
 SHRINK = 1e-3                        # of the mean square: holds what the poses do not show
 
 
@@ -57,7 +56,7 @@ def _frames(corners: np.ndarray) -> np.ndarray:
 
 @dataclass(frozen=True, eq=False)
 class Distillation:
-    """Lowers what a carried model leaves of the model it was made of, in rounds.
+    """Lowers what a transferred model leaves of the model it was made of, in rounds.
 
     The way is that of learning: what is left of every body, as edges in the frames of the parts, is regressed and added
     to what the triangles have. `follow` puts the imitation's vertices on the model's.
@@ -136,4 +135,5 @@ def _people(model: ScapeModel, pose: np.ndarray) -> tuple[np.ndarray, np.ndarray
 
 def enough_poses(model: ScapeModel, least: int) -> int:
     """How many poses settle the features of every part."""
-    return max(least, PER_FEATURE * int(np.bincount(model.pose_space.features.part).max()))
+    # three poses for each feature of the part that has most
+    return max(least, 3 * int(np.bincount(model.pose_space.features.part).max()))

@@ -1,4 +1,4 @@
-"""Parts of a template on another triangulation of its surface, and what is known on them carried over."""
+"""Parts of a template on another triangulation of its surface, and what is known on them transferred."""
 from __future__ import annotations
 
 from functools import cached_property
@@ -18,7 +18,7 @@ from ..stitching import edge_operator
 LEAST = 6                            # triangles that a part needs: fewer are no piece of surface
 
 
-def carry_skeleton(skeleton: Skeleton, old: Mesh, new: Mesh) -> Skeleton:
+def transfer_skeleton(skeleton: Skeleton, old: Mesh, new: Mesh) -> Skeleton:
     """The same tree and joints, the parts painted onto the new triangles by majority.
 
     ValueError where it is too coarse: a part gets no triangles, or no longer touches its parent.
@@ -45,7 +45,7 @@ def carry_skeleton(skeleton: Skeleton, old: Mesh, new: Mesh) -> Skeleton:
 
 
 class Piece:
-    """One part on both triangulations: what is known on its old triangles (f,) is carried to its new ones (g,)."""
+    """One part on both triangulations: what is known on its old triangles (f,) is transferred to its new ones (g,)."""
 
     def __init__(self, old: Mesh, new: Mesh, old_faces: np.ndarray, new_faces: np.ndarray) -> None:
         self.old_faces, self.new_faces = old_faces, new_faces

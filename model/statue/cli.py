@@ -1,7 +1,16 @@
 """`scape statue`: its commands, which are imported when they are called, so that help answers at once."""
 from __future__ import annotations
 
+from pathlib import Path
+from typing import Annotated, Literal
+
+import tyro
+
 from scanprep.console import dispatch
+
+StatueArg = Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="STATUE")]
+MotionArg = Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="MOTION")]
+LevelArg = Literal[0, 1, 2, 3, 4]
 
 COMMANDS = {
     "fit": ("A scan -> control model, displacement map and texture.", "model.statue.commands:fit"),

@@ -3,22 +3,22 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
-from typing import Annotated, Literal
 
 import numpy as np
-import tyro
 
 from scanprep.batch.pool import Workers
 from scanprep.batch.workspace import Task, Workspace
 from scanprep.cli import MM, Output, ScanArg, Unit
 from scanprep.console import Metric, Outcome, bar, failures_of, problem_of
 from scanprep.geometry.files import read_mesh, write_mesh
-from scanprep.pictures.animation import write_animated_glb, write_gif
-from scanprep.pipeline.scans import SCAN_ENDINGS
+from scanprep.pictures.gltf import write_animated_glb
+from scanprep.pictures.sheets import write_gif
+from scanprep.pipeline.scans import find_scans
 from scanprep.ranges import Positive
 
 from ..export.cli import read_motion
 from ..files import load_model
+from .cli import LevelArg, MotionArg, StatueArg
 from .control.files import read_control
 from .control.humanoid import humanoid
 from .control.model import Statue
@@ -33,9 +33,6 @@ from .motion.motions import read_statue_motion, write_motion
 from .report import motion_pictures
 from .work import Inputs, Work
 
-StatueArg = Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="STATUE")]
-MotionArg = Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="MOTION")]
-LevelArg = Literal[0, 1, 2, 3, 4]
 FINE = StatueConfig(displacement=DisplacementConfig(size=2048))
 
 
@@ -67,11 +64,10 @@ def fit(scan: ScanArg, output: Output, features: Path | None = None, control: Pa
         with bar("fitting the statue") as progress:
             done = space.run(work, [Task("statue", Inputs(scan, features))], inside=progress).only
         return Outcome(output, done, {"statue": config}, problem=problem_of(done))
+    if features is not None and not features.is_dir():
+        raise ValueError(f"--features: expected a folder for a folder of scans, got {features}")
     work = replace(work, command=f"scape statue fit {scan}")
-    found = {path.name.split(".")[0]: Inputs(path, _features_of(path, features)) for path in sorted(scan.iterdir())
-             if path.name.lower().endswith(SCAN_ENDINGS)}
-    if not found:
-        raise ValueError(f"{scan}: expected scans ({', '.join(SCAN_ENDINGS)}), found none")
+    found = {one.name: Inputs(one.scan, one.landmarks if features else None) for one in find_scans(scan, features)}
     with bar("fitting statues") as progress:
         results = space.run(work, [Task(name, one, name) for name, one in found.items()], workers, progress)
     return Outcome(output, [Metric("scans", len(found)), Metric("statues", len(results.values))], {"statue": config},
@@ -177,14 +173,3 @@ def _following(statue: Statue, motion: Path, model: Path, registered: Path | Non
     with bar("registering the model") as progress:
         follower = follower_of(statue, learned, there, progress)
     return follower.vertices(moves.poses, moves.trans), moves.rate
-
-
-def _features_of(scan: Path, features: Path | None) -> Path | None:
-    """The file of a scan's name in a folder of features."""
-    if features is None:
-        return None
-    if not features.is_dir():
-        raise ValueError(f"--features: expected a folder for a folder of scans, got {features}")
-    stem = scan.name.split(".")[0]
-    named = [features / (stem + ending) for ending in (".features.json", ".json", ".pp", ".mrk.json")]
-    return next((path for path in named if path.is_file()), None)

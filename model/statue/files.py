@@ -10,9 +10,11 @@ import numpy as np
 from scanprep.geometry import storage
 from scanprep.geometry.mesh import Mesh
 from scanprep.pictures.sheets import save_png
+from scanprep.synthetic import people
 
+from ..blend_weights import strongest
 from ..export.glb import Material, write_skinned_glb
-from ..export.rig import Rig, strongest, turn_up
+from ..export.rig import Rig, turn_up
 from ..features import linear_features
 from ..skinning import SkinningModel
 from .control.chart import Chart
@@ -82,8 +84,6 @@ def write_body(folder: Path, statue: Statue) -> None:
 
     What random poses of the synthetic people do with these joints makes the pose prior of the humanoid.
     """
-    from scanprep.synthetic import people
-
     control, poses = statue.control, None
     if control.skeleton.names == humanoid().skeleton.names:
         rng = np.random.default_rng(0)

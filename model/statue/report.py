@@ -11,11 +11,14 @@ from scanprep.geometry.surface import Surface
 from scanprep.pictures.camera import Camera
 from scanprep.pictures.page import Page
 from scanprep.pictures.shading import Bones, Dots, Shape, Solid, color_bar, heat, part_colors, render, side_by_side
+from scanprep.synthetic.people import named_pose, walk
 
+from .control.humanoid import humanoid
 from .control.model import FOLDED, HOLE, MEASURED, OUTSIDE, DisplacementMap, Statue
 from .detail.errors import Level
 from .detail.reconstruction import Reconstruction, coverage_at
 from .detail.subdivision import subdivide
+from .motion.motions import people_motion
 
 HEIGHT = 520                         # pixels of the pictures
 SIDES = ("front", "left", "back", "right")
@@ -114,12 +117,10 @@ def height_picture(map_: DisplacementMap, size: int = 640) -> np.ndarray:
 
 def coverage_picture(map_: DisplacementMap, size: int = 640) -> np.ndarray:
     """The coverage in colours."""
-    step = max(1, len(map_.coverage) // size)
-    small = map_.coverage[::step, ::step]
-    out = np.full((*small.shape, 3), 255, dtype=np.uint8)
+    step, colors = max(1, len(map_.coverage) // size), np.full((256, 3), 255, dtype=np.uint8)
     for kind, color in KINDS.items():
-        out[small == kind] = (255 * np.array(color)).astype(np.uint8)
-    return out
+        colors[kind] = (255 * np.array(color)).astype(np.uint8)
+    return colors[map_.coverage[::step, ::step]]
 
 
 def coverage_of_vertices(statue: Statue) -> np.ndarray:
@@ -146,11 +147,6 @@ def parts_without_data(statue: Statue) -> list[str]:
 
 def in_motion(statue: Statue) -> list[tuple[str, Mesh]]:
     """The statue in a walk, a squat and with its arms overhead; none for a control model with other joints."""
-    from scanprep.synthetic.people import named_pose, walk
-
-    from .control.humanoid import humanoid
-    from .motion.motions import people_motion
-
     if statue.control.skeleton.names != humanoid().skeleton.names:
         return []
     poses = np.stack([walk(80)[0][20], named_pose("squat"), named_pose("arms_up")])

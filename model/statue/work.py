@@ -11,7 +11,7 @@ from scanprep.cleaning.clean_scan import clean_scan
 from scanprep.cli import MM, Unit
 from scanprep.console import Metric, Outcome, write_report
 from scanprep.geometry.files import read_mesh, write_mesh
-from scanprep.geometry.formats.common import UNITS
+from scanprep.geometry.format_common import UNITS
 from scanprep.geometry.mesh import Mesh
 from scanprep.pictures.sheets import save_png
 from scanprep.pictures.textures import Texture, read_texture

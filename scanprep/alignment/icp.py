@@ -1,7 +1,8 @@
-"""Rigid alignment of one set of points to another."""
+"""Rigid alignment: by landmarks, and by iterative closest points (trimmed, point to plane)."""
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -10,11 +11,13 @@ from ..geometry import rotations
 from ..geometry.mesh import Mesh
 from ..geometry.target import target_of
 from ..meaning import extent, unit_problem
-from ..ranges import Count, Positive, Settings, SomeShare
+from ..ranges import FLAG, Positive, Settings, SomeShare
 from ..threads import search_threads
 
 LEAST = 6                   # matches that determine a motion
+ROUNDS, SETTLED = 60, 1e-6  # most rounds of matching; a round that moves less, as a share of the points' spread
 ASTRAY = 0.025              # of the smaller extent: surfaces so far apart do not lie on each other
+
 
 @dataclass(frozen=True)
 class RigidConfig(Settings):
@@ -22,23 +25,14 @@ class RigidConfig(Settings):
 
     Attributes
     ----------
-    iterations : int
-        Most rounds of matching.
     keep : float
         Share of the matches, the nearest ones, that count.
     reach : float, metres, optional
         Farthest match that counts.
-    neighbours : int
-        Points whose spread gives the normals of a cloud.
-    tolerance : float
-        Settled when a round moves the points by less than this share of their spread.
     """
 
-    iterations: Count = 60
-    keep: SomeShare = 0.8
-    reach: Positive | None = None
-    neighbours: Count = 16
-    tolerance: float = 1e-6
+    keep: Annotated[SomeShare, FLAG] = 0.8
+    reach: Annotated[Positive | None, FLAG] = None
 
 
 @dataclass(frozen=True, eq=False)
@@ -63,19 +57,7 @@ class RigidAlignment:
 
 
 def align_landmarks(source: np.ndarray, target: np.ndarray, scale: bool = False) -> RigidAlignment:
-    """The rotation and translation, optionally with scale, that bring landmarks nearest to their targets.
-
-    Parameters
-    ----------
-    source, target : (L, 3) float, metres
-        At least three, not on one line.
-    scale : bool
-        Let the transform scale as well.
-
-    Raises
-    ------
-    ValueError
-        Fewer than three landmarks, shapes that differ, values that are not finite.
+    """The rotation and translation, optionally with scale, that bring landmarks (L, 3) nearest to their targets (L, 3).
     """
     source, target = _points(source, "source"), _points(target, "target")
     if source.shape != target.shape:
@@ -85,7 +67,7 @@ def align_landmarks(source: np.ndarray, target: np.ndarray, scale: bool = False)
     R, _ = rotations.procrustes(source, target)
     a, b = source - source.mean(axis=0), target - target.mean(axis=0)
     s = float(np.sum(b * (a @ R.T)) / np.sum(a * a)) if scale else 1.0
-    T = _transform(s * R, target.mean(axis=0) - s * R @ source.mean(axis=0))
+    T = transform(s * R, target.mean(axis=0) - s * R @ source.mean(axis=0))
     residual = np.linalg.norm(apply(T, source) - target, axis=1)
     return RigidAlignment(T, float(np.sqrt(np.mean(residual**2))), len(source), True, 1)
 
@@ -122,7 +104,7 @@ def align_rigid(source: Mesh | np.ndarray, target: Mesh | np.ndarray,
     tree = cKDTree(goal.points)
     spread = np.linalg.norm(moving - moving.mean(axis=0), axis=1).mean()
     settled, rounds, rms, inliers = False, 0, np.nan, 0
-    while rounds < config.iterations and not settled:
+    while rounds < ROUNDS and not settled:
         moved = apply(T, moving)
         distance, near = tree.query(moved, workers=search_threads(len(moved)))
         good = (distance <= reach) & (distance <= np.quantile(distance, config.keep)) & ~goal.border[near]
@@ -132,7 +114,7 @@ def align_rigid(source: Mesh | np.ndarray, target: Mesh | np.ndarray,
         step, residual = _plane_step(moved[good], goal.points[near[good]], goal.normals[near[good]])
         T = step @ T
         rms = float(np.sqrt(np.mean(residual**2)))
-        settled = bool(np.abs(apply(T, moving) - moved).mean() <= config.tolerance * spread)
+        settled = bool(np.abs(apply(T, moving) - moved).mean() <= SETTLED * spread)
         rounds += 1
     return RigidAlignment(T, rms, inliers, settled, rounds)
 
@@ -152,10 +134,16 @@ def _plane_step(x: np.ndarray, y: np.ndarray, n: np.ndarray) -> tuple[np.ndarray
     H = J.T @ (w[:, None] * J)
     step = -np.linalg.solve(H + 1e-9 * np.diag(np.maximum(H.diagonal(), 1e-12)), J.T @ (w * r))
     R = rotations.exp(step[:3])
-    return _transform(R, middle - R @ middle + step[3:]), r
+    return transform(R, middle - R @ middle + step[3:]), r
 
 
-def _transform(linear: np.ndarray, translation: np.ndarray) -> np.ndarray:
+def landmark_motion(source: np.ndarray, target: np.ndarray) -> np.ndarray:
+    """The rigid transform (4, 4) that brings points (n, 3) nearest to others."""
+    return transform(*rotations.procrustes(source, target))
+
+
+def transform(linear: np.ndarray, translation: np.ndarray) -> np.ndarray:
+    """(4, 4)"""
     T = np.eye(4)
     T[:3, :3], T[:3, 3] = linear, translation
     return T

@@ -13,9 +13,11 @@ from ..geometry.mesh import Mesh
 from ..geometry.remeshing import smooth
 from ..geometry.seen_space import mesh_and_camera
 from ..geometry.surface import OrientedPoints
-from ..ranges import Cosine, Count, Positive, Settings, Share
-from .view_features import place_by_features
-from .view_landmarks import fit_of_views, place_by_landmarks
+from ..ranges import Count, Positive, Settings, Share
+from .view_poses import fit_of_views, place_by_features, place_by_landmarks
+
+POINTS = 4000                 # of each view that look for matches
+SETTLED = 5e-5                # metres: no view's points move further in a round
 
 
 @dataclass(frozen=True)
@@ -26,18 +28,10 @@ class AlignViewsConfig(Settings):
     ----------
     iterations : int
         Most rounds of matching.
-    points : int
-        Points of each view that look for matches.
     reach : float, metres
         Farthest match of the first round; later ones keep three times the median distance.
-    min_cosine : float
-        Matches whose normals differ more do not count.
     border : float, metres
         Points nearer to the border of their view do not count.
-    smoothing : int
-        Rounds of smoothing before normals are taken.
-    tolerance : float, metres
-        Settled when no view's points move further in a round.
     min_overlap : float
         Share of a view that others must have seen as well for its place to be trusted.
     max_conflict : float
@@ -45,12 +39,8 @@ class AlignViewsConfig(Settings):
     """
 
     iterations: Count = 60
-    points: Count = 4000
     reach: Positive = 0.08
-    min_cosine: Cosine = 0.8
     border: float = 0.02
-    smoothing: int = 10
-    tolerance: float = 5e-5
     min_overlap: Share = 0.15
     max_conflict: Share = 0.03
 
@@ -130,14 +120,14 @@ def align_views(views: Sequence[Any], config: AlignViewsConfig | None = None,
     while rounds < config.iterations and not settled:
         placed = [(p @ T[:3, :3].T + T[:3, 3], n @ T[:3, :3].T)
                   for T, (p, n, _) in zip(poses, samples, strict=True)]
-        matches = _match(placed, [inner for _, _, inner in samples], reach, config)
+        matches = _match(placed, [inner for _, _, inner in samples], reach)
         if not matches:
             break
         steps, residual = _solve(placed, matches)
         moved = max(float(np.linalg.norm(p @ S[:3, :3].T + S[:3, 3] - p, axis=1).mean())
                     for S, (p, _) in zip(steps, placed, strict=True))
         poses = steps @ poses
-        rms, settled, rounds = float(np.sqrt(np.mean(residual**2))), moved < config.tolerance, rounds + 1
+        rms, settled, rounds = float(np.sqrt(np.mean(residual**2))), moved < SETTLED, rounds + 1
         distances = np.concatenate([d for *_, d in matches])
         reach = min(reach, max(3 * float(np.median(distances)), 0.005))
     out = [_moved(pair, T) for pair, T in zip(pairs, poses, strict=True)]
@@ -154,14 +144,14 @@ def _moved(view: tuple[Mesh, np.ndarray], T: np.ndarray) -> tuple[Mesh, np.ndarr
 def _oriented(mesh: Mesh, config: AlignViewsConfig, rng: np.random.Generator
               ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Points of a view, their normals, and which of them lie well inside."""
-    even = smooth(mesh, config.smoothing)
+    even = smooth(mesh, 10)
     inner = border_distance(mesh, config.border) >= config.border
-    chosen = rng.permutation(len(mesh.vertices))[:4 * config.points]
+    chosen = rng.permutation(len(mesh.vertices))[:4 * POINTS]
     return even.vertices[chosen], even.vertex_normals[chosen], inner[chosen]
 
 
 def _match(placed: list[tuple[np.ndarray, np.ndarray]], inner: list[np.ndarray], reach: float,
-           config: AlignViewsConfig) -> list[tuple[int, int, np.ndarray, np.ndarray, np.ndarray]]:
+           ) -> list[tuple[int, int, np.ndarray, np.ndarray, np.ndarray]]:
     """For every pair of views (i, j): points of i, their matches in j, distances."""
     found = []
     for j, (points, normals) in enumerate(placed):
@@ -169,8 +159,8 @@ def _match(placed: list[tuple[np.ndarray, np.ndarray]], inner: list[np.ndarray],
         for i, (mine, my_normals) in enumerate(placed):
             if i == j:
                 continue
-            rows = np.flatnonzero(inner[i][:config.points])
-            match = target.match(mine[rows], my_normals[rows], reach, config.min_cosine)
+            rows = np.flatnonzero(inner[i][:POINTS])
+            match = target.match(mine[rows], my_normals[rows], reach, 0.8)
             good = match.valid & inner[j][np.maximum(match.index, 0)]
             if good.sum() >= 30:
                 found.append((i, j, rows[good], match.index[good], match.distances[good]))

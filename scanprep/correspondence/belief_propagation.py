@@ -1,4 +1,4 @@
-"""Loopy belief propagation on a pairwise field: sums by matrix products, or the best single assignment."""
+"""Loopy belief propagation on a pairwise field: sums by matrix products over all edges at once."""
 from __future__ import annotations
 
 from dataclasses import dataclass
@@ -35,72 +35,37 @@ class PairField:
 
 @dataclass(frozen=True, eq=False)
 class Beliefs:
-    """What a field says of its variables.
-
-    Attributes
-    ----------
-    probabilities : (n, K) float
-        Of every state; with `best` those of the best assignment that holds the state (max-marginals, scaled).
-    states : (n,) int
-        The likeliest state of each variable.
-    iterations : int
-    converged : bool
-    change : float
-        Mean change of a message in the last round.
-    """
+    """Probabilities (n, K) of the states of a field's variables, and the likeliest states (n,)."""
 
     probabilities: np.ndarray
     states: np.ndarray
     iterations: int
     converged: bool
-    change: float
 
 
-def propagate(field: PairField, iterations: int = 40, damping: float = 0.3, tolerance: float = 1e-3,
-              best: bool = False) -> Beliefs:
-    """Pass messages over all edges at once until they settle.
+def propagate(field: PairField, iterations: int = 40, damping: float = 0.3, tolerance: float = 1e-3) -> Beliefs:
+    """Beliefs after messages were passed over all edges at once until they settle; exact on a tree.
 
-    Parameters
-    ----------
-    field : PairField
-    iterations : int
-        Most rounds.
-    damping : float
-        Share of the old message that is kept.
-    tolerance : float
-        Settled when the mean message changes by less.
-    best : bool
-        Max-product in place of sum-product.
-
-    Returns
-    -------
-    Beliefs
-        Exact on a tree.
+    A share of the old message is kept, `damping`; settled when the mean message changes by less than the tolerance.
 
     [CC] loopy belief propagation
     """
     i, j = field.edges.T
     forth, back = np.zeros((2, len(i), field.unary.shape[1]))
-    combine = _best if best else _total
-    weights = _prepared(field.pairwise, best)
+    # tables with the receiver's states as rows
+    onward = np.exp(-np.ascontiguousarray(field.pairwise.transpose(0, 2, 1), dtype=np.float32))
+    return_ = np.exp(-np.ascontiguousarray(field.pairwise, dtype=np.float32))
     done, change = 0, np.inf
     while done < iterations and change > tolerance:
         belief = _gathered(field, forth, back)
-        new_forth = combine(weights[0], _scaled(belief[i] - back))
-        new_back = combine(weights[1], _scaled(belief[j] - forth))
+        new_forth = _passed(onward, _scaled(belief[i] - back))
+        new_back = _passed(return_, _scaled(belief[j] - forth))
         change = max(float(np.abs(new_forth - forth).mean()), float(np.abs(new_back - back).mean())) if len(i) else 0.0
         forth = damping * forth + (1 - damping) * new_forth
         back = damping * back + (1 - damping) * new_back
         done += 1
     p = np.exp(_scaled(_gathered(field, forth, back)))
-    return Beliefs(p / p.sum(axis=1, keepdims=True), p.argmax(axis=1), done, change <= tolerance, change)
-
-
-def _prepared(pairwise: np.ndarray, best: bool) -> tuple[np.ndarray, np.ndarray]:
-    """For messages forth and back: tables with the receiver's states as rows."""
-    forth = np.ascontiguousarray(pairwise.transpose(0, 2, 1), dtype=np.float32)
-    back = np.ascontiguousarray(pairwise, dtype=np.float32)
-    return (-forth, -back) if best else (np.exp(-forth), np.exp(-back))
+    return Beliefs(p / p.sum(axis=1, keepdims=True), p.argmax(axis=1), done, change <= tolerance)
 
 
 def _gathered(field: PairField, forth: np.ndarray, back: np.ndarray) -> np.ndarray:
@@ -110,13 +75,9 @@ def _gathered(field: PairField, forth: np.ndarray, back: np.ndarray) -> np.ndarr
     return belief
 
 
-def _total(weights: np.ndarray, log_belief: np.ndarray) -> np.ndarray:
+def _passed(weights: np.ndarray, log_belief: np.ndarray) -> np.ndarray:
     sums = np.matmul(weights, np.exp(log_belief).astype(np.float32)[..., None])[..., 0]
     return _scaled(np.log(np.maximum(sums.astype(np.float64), 1e-37)))
-
-
-def _best(weights: np.ndarray, log_belief: np.ndarray) -> np.ndarray:
-    return _scaled(np.max(weights + log_belief.astype(np.float32)[:, None, :], axis=2).astype(np.float64))
 
 
 def _scaled(messages: np.ndarray) -> np.ndarray:

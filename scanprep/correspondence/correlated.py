@@ -18,11 +18,9 @@ from ..geometry.mesh import Mesh, check_template
 from ..geometry.target import target_of
 from ..threads import one_thread
 from .correspondences import Correspondences, checked_pairs
-from .search import BeliefLevel, CorrelatedConfig, Search
+from .search import CorrelatedConfig, result, search, surfaces_of
 from .seeds import find_seeds
 from .sheet import Sheet
-
-__all__ = ["BeliefLevel", "CorrelatedConfig", "find_correspondences"]
 
 
 @one_thread()
@@ -64,9 +62,10 @@ def find_correspondences(template: Mesh, scan: Mesh | np.ndarray, seeds: tuple[n
     seeds = checked_pairs(template, *seeds, "seeds")
     total = 2 + 2 * len(config.levels)
     sheet = Sheet(target_of(scan), config.spacing * float(np.sqrt(template.face_areas.sum())))
-    search = Search(template, sheet, SurfaceGraph(template), seeds, config)
+    surfaces, images = surfaces_of(template, sheet, SurfaceGraph(template), seeds, config), None
     tell(2, total)
     for number, level in enumerate(config.levels):
-        search.descend(level)
+        surfaces, images = search(surfaces, images, level, config)
         tell(4 + 2 * number, total)
-    return search.result()
+    assert images is not None, "levels: expected at least one"
+    return result(surfaces, images, config)

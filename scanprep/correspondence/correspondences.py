@@ -1,13 +1,21 @@
-"""Pairs of places on a template and a scan, however they were found."""
+"""Pairs of places on a template and a scan, however they were found, and their JSON file.
+
+    {"kind": "correspondences", "version": 1, "method": "...", "converged": true, "energies": {...},
+     "pairs": [{"vertex": 8120, "point": [x, y, z], "confidence": 0.93}, ...]}
+"""
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from pathlib import Path
 
 import numpy as np
 
+from ..geometry import storage
+from ..geometry.format_common import FARTHEST
 from ..geometry.mesh import Mesh
 
 SURE = 0.4                  # median confidence: 0.87 between poses of a person, 0.25 to 0.37 on a ball
+KIND, VERSION = "correspondences", 1
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,18 +48,7 @@ class Correspondences:
 
 def checked_pairs(template: Mesh, vertices: np.ndarray, points: np.ndarray, name: str, least: int = 3
                   ) -> tuple[np.ndarray, np.ndarray]:
-    """Vertices of a template and their places as arrays, or ValueError with what is wrong with them.
-
-    Parameters
-    ----------
-    template : Mesh
-    vertices : (L,) int
-    points : (L, 3) float, metres
-    name : str
-        What the argument is called where it was given.
-    least : int
-        So many are needed.
-    """
+    """Vertices (L,) of a template and their places (L, 3), or ValueError that names the argument they came by."""
     vertices, points = np.asarray(vertices), np.asarray(points, dtype=np.float64)
     if vertices.ndim != 1 or not np.issubdtype(vertices.dtype, np.integer):
         raise ValueError(f"{name}: expected vertex numbers of shape (L,), got {vertices.dtype} "
@@ -75,3 +72,36 @@ def correspondences_problem(found: Correspondences) -> str | None:
         return None
     return (f"{len(found)} pairs were found with a median confidence of {sure:.2f}; a scan of something else, too "
             "little of the body, or landmarks of other places?")
+
+
+def write_correspondences(path: str | Path, found: Correspondences) -> None:
+    """Write correspondences, whole or not at all; points are in metres."""
+    rows = zip(found.template_vertices.tolist(), np.asarray(found.scan_points).tolist(), found.confidence.tolist(),
+               strict=True)
+    storage.write_json(path, {
+        "kind": KIND, "version": VERSION, "method": found.method, "converged": bool(found.converged),
+        "energies": {name: float(value) for name, value in found.energies.items()},
+        "pairs": [{"vertex": v, "point": p, "confidence": c} for v, p, c in rows]})
+
+
+def read_correspondences(path: str | Path) -> Correspondences:
+    """Read correspondences; StorageError where they are missing, damaged, or something else."""
+    expected = "expected correspondences in JSON"
+    stored = storage.read_json(path, "correspondences")
+    if not isinstance(stored, dict) or stored.get("kind") != KIND:
+        raise storage.StorageError(f"{path}: {expected}, found something else")
+    if stored.get("version") != VERSION:
+        raise storage.StorageError(f"{path}: version {stored.get('version')} of correspondences is not known here "
+                                   f"(known: {VERSION})")
+    with storage.taking_apart(path, "correspondences in JSON with vertex, point and confidence"):
+        pairs = stored["pairs"]
+        found = Correspondences(np.array([pair["vertex"] for pair in pairs], dtype=np.int64),
+                                np.array([pair["point"] for pair in pairs], dtype=np.float64).reshape(len(pairs), 3),
+                                np.array([pair.get("confidence", 1.0) for pair in pairs], dtype=np.float64),
+                                str(stored.get("method", "")),
+                                {name: np.nan if value is None else float(value)
+                                 for name, value in stored.get("energies", {}).items()},
+                                bool(stored.get("converged", True)))
+        if (found.template_vertices < 0).any() or not (np.abs(found.scan_points) <= FARTHEST).all():
+            raise ValueError("a vertex below 0, or a point without end")
+        return found

@@ -1,52 +1,80 @@
-"""Potentials of correlated correspondence: what speaks for one image, and for two images together."""
+"""Potentials of correlated correspondence: what speaks for one image, and for two images together.
+
+The width of a residual is the error that costs one.
+"""
 from __future__ import annotations
 
 from dataclasses import dataclass
 
 import numpy as np
+from scipy.spatial import cKDTree
 
-from ..ranges import Positive, Settings
-from .places import Places
+ANGLES = 3.0                   # weight of all sines between directions to seeds together
+MOST_EDGE = 9.0 * 2.5 + 4.0    # no edge can cost more: length, two leans and a bend at 3² each, directions at 2²
 
 
-@dataclass(frozen=True)
-class PotentialConfig(Settings):
-    """Widths and weights of the potentials; a width is the error that costs one.
+@dataclass(frozen=True, eq=False)
+class Places:
+    """Points of a surface seen from the seeds; the same on template and scan, in metres of the scan.
 
     Attributes
     ----------
-    seed_share : float
-        Width of a distance to a seed as a share of the distance: bending lengthens and shortens paths.
-    seed_floor : float, multiples of the template's size
-        Width of a distance to a seed beside that seed.
-    turn : float
-        Width of the sine between the directions away from two seeds.
-    turn_weight : float
-        Of all those sines together.
-    length_share, length_floor : float, share and multiples of the template's size
-        Width of the length of an edge.
-    lean : float
-        Width of the cosine between an edge and a normal at its ends.
-    direction : float
-        Width of the difference of an edge's ends in distance to a seed, as a share of its length.
-    direction_weight : float
-    place_weight : float
-        Of all that speaks for a single image.
-    nothing : float
-        Cost of a point that has no image, and of each of its edges, as shares of the highest possible cost.
+    points, normals : (n, 3) float
+    to_seeds : (n, S) float, metres
+        Along the surface; NaN where no way leads.
+    angles : (n, S(S-1)/2) float
+        For every pair of seeds the sine of the angle from the direction away from the first to that away from
+        the second, about the normal: reflections change its sign, bending does not.
+    sure : (n, S) float
+        How much the way to each seed is to be trusted, 1 for a way that needs no bridge between pieces.
     """
 
-    seed_share: float = 0.10
-    seed_floor: Positive = 0.014
-    turn: Positive = 0.4
-    turn_weight: float = 3.0
-    length_share: float = 0.08
-    length_floor: Positive = 0.006
-    lean: Positive = 0.25
-    direction: Positive = 0.3
-    direction_weight: float = 1.0
-    place_weight: float = 0.5
-    nothing: float = 0.5
+    points: np.ndarray
+    normals: np.ndarray
+    to_seeds: np.ndarray
+    angles: np.ndarray
+    sure: np.ndarray
+
+    def __getitem__(self, index: np.ndarray) -> Places:
+        return Places(self.points[index], self.normals[index], self.to_seeds[index], self.angles[index],
+                      self.sure[index])
+
+    def __len__(self) -> int:
+        return len(self.points)
+
+
+def seen_from(points: np.ndarray, normals: np.ndarray, distances: np.ndarray, at: np.ndarray, radius: float,
+              sure: np.ndarray) -> Places:
+    """Some points `at` (n,) of a surface (m, 3) as seen from the seeds, from which `distances` (S, m) are.
+
+    Directions are averaged over neighbourhoods of `radius` metres.
+    """
+    to_seeds = np.where(np.isfinite(distances[:, at]), distances[:, at], np.nan).T
+    gradient = gradients(points, normals, distances, at, radius)
+    a, b = np.triu_indices(len(distances), 1)
+    angles = np.einsum("pnd,nd->np", np.cross(gradient[a], gradient[b]), normals[at])
+    return Places(points[at], normals[at], to_seeds, angles, sure)
+
+
+def gradients(points: np.ndarray, normals: np.ndarray, values: np.ndarray, at: np.ndarray, radius: float,
+              neighbours: int = 48) -> np.ndarray:
+    """Directions (S, n, 3) in which values (S, m) grow along the surface, of length one at most."""
+    near_distance, near = cKDTree(points).query(points[at], min(neighbours, len(points)),
+                                                distance_upper_bound=radius)
+    found = np.isfinite(near_distance)
+    near = np.where(found, near, at[:, None])
+    n = normals[at]
+    found &= np.einsum("nkd,nd->nk", normals[near], n) > 0.3
+    arm = points[near] - points[at][:, None]
+    arm -= np.einsum("nkd,nd->nk", arm, n)[..., None] * n[:, None]
+    arm *= found[..., None]
+    with np.errstate(invalid="ignore"):
+        rise = values[:, near] - values[:, at][..., None]
+    rise = np.where(np.isfinite(rise) & (np.abs(rise) < 1.5 * radius), rise, 0.0)      # no jump counts
+    H = np.einsum("nki,nkj->nij", arm, arm) + radius**2 * n[:, :, None] * n[:, None, :]
+    H += 1e-6 * radius**2 * np.eye(3)
+    slope = np.linalg.solve(H[None], np.einsum("nkd,snk->snd", arm, rise)[..., None])[..., 0]
+    return slope / np.maximum(np.linalg.norm(slope, axis=2, keepdims=True), 0.5)
 
 
 def robust(r: np.ndarray, limit: float) -> np.ndarray:
@@ -55,7 +83,7 @@ def robust(r: np.ndarray, limit: float) -> np.ndarray:
     return squared / (1 + squared / limit**2)
 
 
-def place_energy(scan: Places, template: Places, config: PotentialConfig, size: float) -> np.ndarray:
+def place_energy(scan: Places, template: Places, size: float) -> np.ndarray:
     """Energy (n, m) of every place of the template as the image of every place of the scan.
 
     [CC] geodesic potentials, as evidence for single places
@@ -63,32 +91,30 @@ def place_energy(scan: Places, template: Places, config: PotentialConfig, size: 
     energy = np.zeros((len(scan), len(template)))
     known = np.zeros_like(energy)
     for x, y, w in zip(scan.to_seeds.T, template.to_seeds.T, scan.sure.T, strict=True):
-        width = config.seed_floor * size + config.seed_share * np.minimum(x[:, None], y[None])
+        # bending lengthens and shortens paths by a share; beside a seed a click is off by so much
+        width = 0.014 * size + 0.10 * np.minimum(x[:, None], y[None])
         r = robust((x[:, None] - y[None]) / width * w[:, None], 2.0)
         energy += np.nan_to_num(r)
         known += np.isfinite(r)
     energy *= scan.to_seeds.shape[1] / np.maximum(known, 1)
     a, b = np.triu_indices(scan.to_seeds.shape[1], 1)
     both = (scan.sure[:, a] * scan.sure[:, b]).T
-    for x, y, w in zip(scan.turns.T, template.turns.T, both, strict=True):
-        energy += config.turn_weight / len(a) * w[:, None] * robust((x[:, None] - y[None]) / config.turn, 2.0)
+    for x, y, w in zip(scan.angles.T, template.angles.T, both, strict=True):
+        energy += ANGLES / len(a) * w[:, None] * robust((x[:, None] - y[None]) / 0.4, 2.0)
     return energy
 
 
-def edge_energy(scan: Places, template: Places, edges: np.ndarray, domains: np.ndarray, config: PotentialConfig,
-                size: float) -> np.ndarray:
-    """Energy (E, K, K) of the images of the two ends of every edge.
+def most_place_energy(seeds: int) -> float:
+    """No place can cost more."""
+    return 4.0 * (seeds + ANGLES)
+
+
+def edge_energy(scan: Places, template: Places, edges: np.ndarray, domains: np.ndarray, size: float) -> np.ndarray:
+    """Energy (E, K, K) of the images of the two ends of every edge (E, 2) of the scan, within domains (n, K).
 
     The edge between two points of the scan against the edge between their images: its length, its angles to the
     normals at both ends and the angle between these, and its direction, told by how much nearer to every seed it
-    leads. The last is a local frame that needs no estimate of the turn.
-
-    Parameters
-    ----------
-    edges : (E, 2) int
-        Pairs of places of the scan.
-    domains : (n, K) int
-        Places of the template that may be the image of each place of the scan.
+    leads. The last is a local frame that needs no estimate of the rotation.
 
     [CC] deformation potential
     """
@@ -103,26 +129,15 @@ def edge_energy(scan: Places, template: Places, edges: np.ndarray, domains: np.n
         k, l = domains[i], domains[j]
         apart = x[l][None] - x[k][:, None]
         far = np.sqrt(np.einsum("kld,kld->kl", apart, apart)) + 1e-9
-        width = config.length_floor * size + config.length_share * length[e]
-        energy = robust((far - length[e]) / width, 3.0)
+        energy = robust((far - length[e]) / (0.006 * size + 0.08 * length[e]), 3.0)
         lean_k = np.einsum("kld,kd->kl", apart, n[k]) / far
         lean_l = np.einsum("kld,ld->kl", apart, n[l]) / far
-        energy += 0.5 * robust((lean_k - at_i[e]) / config.lean, 3.0)
-        energy += 0.5 * robust((lean_l - at_j[e]) / config.lean, 3.0)
-        energy += 0.5 * robust((n[k] @ n[l].T - bend[e]) / (1.5 * config.lean), 3.0)
+        energy += 0.5 * robust((lean_k - at_i[e]) / 0.25, 3.0)
+        energy += 0.5 * robust((lean_l - at_j[e]) / 0.25, 3.0)
+        energy += 0.5 * robust((n[k] @ n[l].T - bend[e]) / 0.375, 3.0)
         w = np.where(np.isfinite(nearer[e]), np.minimum(scan.sure[i], scan.sure[j]), 0.0)
         for s in np.flatnonzero(w):
-            r = (d[l, s][None] - d[k, s][:, None] - nearer[e, s]) / (config.direction * length[e])
-            energy += config.direction_weight * w[s] / w.sum() * robust(r, 2.0)
+            r = (d[l, s][None] - d[k, s][:, None] - nearer[e, s]) / (0.3 * length[e])
+            energy += w[s] / w.sum() * robust(r, 2.0)
         out[e] = energy
     return out
-
-
-def most_edge_energy(config: PotentialConfig) -> float:
-    """No edge can cost more."""
-    return 9.0 * 2.5 + 4.0 * config.direction_weight
-
-
-def most_place_energy(config: PotentialConfig, seeds: int) -> float:
-    """No place can cost more."""
-    return 4.0 * (seeds + config.turn_weight)

@@ -1,8 +1,9 @@
-"""A search for correspondences under way: two surfaces seen from the seeds, and what is believed so far."""
+"""Correlated correspondence from given seeds: two surfaces seen from the seeds, and what is believed of them."""
 from __future__ import annotations
 
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import lru_cache
+from typing import Annotated
 
 import numpy as np
 from scipy.sparse import coo_array, csr_array
@@ -11,12 +12,17 @@ from scipy.spatial import cKDTree
 from ..geometry.farthest_points import farthest_points
 from ..geometry.geodesics import SurfaceGraph
 from ..geometry.mesh import Mesh
-from ..ranges import Cell, Count, Positive, Settings, Share
+from ..ranges import FLAG, Cell, Count, Settings
 from .belief_propagation import Beliefs, PairField, propagate
 from .correspondences import Correspondences
-from .places import Places, turns_between
-from .potentials import PotentialConfig, edge_energy, most_edge_energy, most_place_energy, place_energy
+from .potentials import MOST_EDGE, Places, edge_energy, most_place_energy, place_energy, seen_from
 from .sheet import Sheet
+
+FRAME = 0.042        # of the template's size: radius over which directions on the surface are averaged
+LINKS = 6            # edges that each point has to its nearest neighbours along the surface
+PLACE = 0.5          # weight of all that speaks for a single image
+NOTHING = 0.5        # cost of a point without image, and of each of its edges, as shares of the highest possible cost
+SPREAD = 2000        # vertices beyond these come in no special order: all of them are wanted then
 
 
 @dataclass(frozen=True)
@@ -37,7 +43,7 @@ class BeliefLevel(Settings):
 
 @dataclass(frozen=True)
 class CorrelatedConfig(Settings):
-    """Settings of `find_correspondences`. Lengths are multiples of the template's size, √area.
+    """Settings of `find_correspondences`.
 
     Attributes
     ----------
@@ -46,168 +52,109 @@ class CorrelatedConfig(Settings):
     keep : int
         Most correspondences in the result: the most certain ones.
     spacing : float
-        Distance that the scan is thinned to.
-    links : int
-        Edges that each point has to its nearest neighbours along the surface.
-    frame : float
-        Radius over which directions on the surface are averaged.
-    bridged : float
-        How much a way to a seed is trusted that bridges a gap of the scan or ends in one.
+        Distance that the scan is thinned to, as a multiple of the template's size, √area.
     levels : from coarse to fine
-    potentials : PotentialConfig
     iterations : int
         Most rounds of messages at each level.
-    damping : float
-        Share of the old message that is kept.
-    spread : float
-        Beliefs of one level spread so far over the places of the next.
-    certain : float
-        Confidence is the belief that the image is within this distance of the one chosen.
-    strained : float
-        Mean energy of the edges around a point at which its confidence falls by e.
-    neighbours : int
-        Points of the scan over which its normals are averaged.
     """
 
-    points: Count = 240
+    points: Annotated[Count, FLAG] = 240
     keep: Count = 170
     spacing: Cell = 0.009
-    links: Count = 6
-    frame: Positive = 0.042
-    bridged: Share = 0.3
     levels: tuple[BeliefLevel, ...] = (BeliefLevel(2000, 80), BeliefLevel(2000, 60), BeliefLevel(1_000_000, 60))
-    potentials: PotentialConfig = field(default_factory=PotentialConfig)
     iterations: Count = 40
-    damping: Share = 0.3
-    spread: Positive = 0.012
-    certain: Positive = 0.03
-    strained: Positive = 4.0
-    neighbours: Count = 16
 
 
-class Search:
-    """Belief propagation from given seeds, level by level.
+@dataclass(frozen=True, eq=False)
+class Surfaces:
+    """Points of the scan that look for an image, and places of the template among which they choose.
 
-    Parameters
-    ----------
-    template : Mesh
-    sheet : Sheet
-        The scan.
-    surface : SurfaceGraph
-        Of the template.
-    seeds : (S,) int and (S, 3) float, metres
-    config : CorrelatedConfig
+    `edges` (E, 2) join neighbours among the former; `vertices` (m,) are where the latter lie, `scale` how much larger
+    the scan is than the template, whose places are scaled to it.
     """
 
-    def __init__(self, template: Mesh, sheet: Sheet, surface: SurfaceGraph,
-                 seeds: tuple[np.ndarray, np.ndarray], config: CorrelatedConfig) -> None:
-        self.template, self.config = template, config
-        self.size = float(np.sqrt(template.face_areas.sum()))
-        clicked = sheet.at(seeds[1])
-        on_scan = sheet.distances(clicked)
-        on_template = surface.distances(seeds[0])
-        self.scale = scale_between(on_template[:, seeds[0]], on_scan[:, clicked])
-        self.chosen = farthest_points(sheet.points, min(config.points, len(sheet.points)))
-        self.edges = neighbour_edges(sheet, self.chosen, config.links, 0.3 * self.size)
-        off = np.linalg.norm(sheet.points[clicked] - seeds[1], axis=1)         # a click where there are no data
-        same = (sheet.piece[self.chosen][:, None] == sheet.piece[clicked]) & (off < 3 * sheet.spacing)
-        self.scan = seen_from(sheet.points, sheet.normals, on_scan, self.chosen, config.frame * self.size,
-                              np.where(same, 1.0, config.bridged))
-        most = min(max(level.places for level in config.levels), len(template.vertices))
-        self.vertices = spread_vertices(template, most)
-        self.places = seen_from(self.scale * template.vertices, template.vertex_normals, self.scale * on_template,
-                                self.vertices, config.frame * self.size,
-                                np.ones((most, len(seeds[0]))))
-        self.beliefs: Beliefs | None = None
-        self.domains = np.zeros((len(self.chosen), 0), dtype=np.int64)
-        self.energy = np.nan
-
-    def descend(self, level: BeliefLevel) -> None:
-        """Belief propagation over the places of one level, in domains pruned by what is known."""
-        spread = np.arange(min(level.places, len(self.places)))
-        known = self.config.potentials
-        unary = place_energy(self.scan, self.places[spread], known, self.size)
-        wanted = unary if self.beliefs is None else -self.carried(spread)
-        domains = np.argsort(wanted, axis=1)[:, :level.domain]
-        self.domains = spread[domains]
-        problem = self.problem(np.take_along_axis(unary, domains, axis=1))
-        self.beliefs = propagate(problem, self.config.iterations, self.config.damping)
-        self.energy = problem.energy(self.beliefs.states)
-        self.resize()
-
-    def resize(self) -> None:
-        """Scale the template by the edges whose images are known: bending changes paths, but not short edges."""
-        assert self.beliefs is not None
-        found = self.beliefs.states < self.domains.shape[1]
-        i, j = self.edges[found[self.edges].all(axis=1)].T
-        image = np.take_along_axis(self.domains, np.minimum(self.beliefs.states, self.domains.shape[1] - 1)[:, None], 1)
-        x, y = self.scan.points, self.places.points[image[:, 0]]
-        far = np.linalg.norm(y[i] - y[j], axis=1)
-        ratio = np.linalg.norm(x[i] - x[j], axis=1)[far > 0] / far[far > 0]
-        grown = float(np.median(ratio)) if len(ratio) else 1.0
-        self.places = replace(self.places, points=grown * self.places.points)
-        self.scale *= grown
-
-    def carried(self, places: np.ndarray) -> np.ndarray:
-        """Beliefs so far, spread over other places: (n, m), not normalised."""
-        assert self.beliefs is not None
-        n, K = self.domains.shape
-        reach = self.config.spread * self.size
-        old, column = np.unique(self.domains, return_inverse=True)
-        p = np.zeros((n, len(old)))
-        np.add.at(p, (np.repeat(np.arange(n), K), column.ravel()), self.beliefs.probabilities[:, :K].ravel())
-        i, j, distance = _pairs_within(self.places.points[old], self.places.points[places], 3 * reach)
-        share = csr_array(coo_array((np.exp(-0.5 * (distance / reach) ** 2), (i, j)), shape=(len(old), len(places))))
-        return p @ share
-
-    def problem(self, unary: np.ndarray) -> PairField:
-        """The field over the domains, with one more state that says: no image."""
-        known, (n, K) = self.config.potentials, self.domains.shape
-        energies = np.full((n, K + 1), known.nothing * known.place_weight * most_place_energy(
-            known, self.scan.to_seeds.shape[1]))
-        energies[:, :K] = known.place_weight * unary
-        pairwise = np.full((len(self.edges), K + 1, K + 1), known.nothing * most_edge_energy(known), dtype=np.float32)
-        pairwise[:, :K, :K] = edge_energy(self.scan, self.places, self.edges, self.domains, known, self.size)
-        return PairField(energies, self.edges, pairwise)
-
-    def result(self) -> Correspondences:
-        """The images found, most certain first."""
-        assert self.beliefs is not None
-        n, K = self.domains.shape
-        found = np.flatnonzero(self.beliefs.states < K)
-        image = self.domains[found, self.beliefs.states[found]]
-        apart = np.linalg.norm(self.places.points[self.domains[found]] - self.places.points[image][:, None], axis=2)
-        sure = (self.beliefs.probabilities[found, :K] * (apart < self.config.certain * self.size)).sum(axis=1)
-        confidence = sure * np.exp(-self.strain()[found] / self.config.strained)
-        order = np.argsort(-confidence, kind="stable")[:self.config.keep]
-        energies = {"field": self.energy, "scale": self.scale, "without_image": float(n - len(found))}
-        return Correspondences(self.vertices[image[order]], self.scan.points[found[order]], confidence[order],
-                               "correlated", energies, self.beliefs.converged)
-
-    def strain(self) -> np.ndarray:
-        """Mean energy (n,) of the edges around every point, each with the images chosen."""
-        assert self.beliefs is not None
-        n, K = self.domains.shape
-        found = self.beliefs.states < K
-        image = self.domains[np.arange(n), np.where(found, self.beliefs.states, 0)]
-        edges = self.edges[found[self.edges].all(axis=1)]
-        cost = edge_energy(self.scan, self.places, edges, image[:, None], self.config.potentials, self.size)[:, 0, 0]
-        total, count = (np.bincount(edges.ravel(), np.repeat(w, 2), n) for w in (cost, np.ones(len(edges))))
-        return total / np.maximum(count, 1)
+    size: float
+    scan: Places
+    edges: np.ndarray
+    places: Places
+    vertices: np.ndarray
+    scale: float
 
 
-SPREAD = 2000        # vertices beyond these come in no special order: all of them are wanted then
+@dataclass(frozen=True, eq=False)
+class Images:
+    """What is believed: states of every point (n,) within its domain (n, K) of places; K means no image."""
+
+    domains: np.ndarray
+    beliefs: Beliefs
+    energy: float
+
+    @property
+    def found(self) -> np.ndarray:
+        """(n,) bool: an image was found."""
+        return self.beliefs.states < self.domains.shape[1]
+
+    @property
+    def chosen(self) -> np.ndarray:
+        """(n,) the place of each, any where none was found."""
+        state = np.minimum(self.beliefs.states, self.domains.shape[1] - 1)
+        return self.domains[np.arange(len(state)), state]
+
+
+def search(surfaces: Surfaces, before: Images | None, level: BeliefLevel, config: CorrelatedConfig
+           ) -> tuple[Surfaces, Images]:
+    """Belief propagation over the places of one level, in domains pruned by what is known; the template rescaled."""
+    spread = np.arange(min(level.places, len(surfaces.places)))
+    unary = place_energy(surfaces.scan, surfaces.places[spread], surfaces.size)
+    wanted = unary if before is None else -_passed_on(surfaces, before, spread)
+    domains = np.argsort(wanted, axis=1)[:, :level.domain]
+    field = _field(surfaces, spread[domains], np.take_along_axis(unary, domains, axis=1))
+    beliefs = propagate(field, config.iterations)
+    images = Images(spread[domains], beliefs, field.energy(beliefs.states))
+    return _rescaled(surfaces, images), images
+
+
+def result(surfaces: Surfaces, images: Images, config: CorrelatedConfig) -> Correspondences:
+    """The images found, most certain first: by the belief near the one chosen, and the strain of the edges around."""
+    found, K = np.flatnonzero(images.found), images.domains.shape[1]
+    image, domains = images.chosen[found], images.domains[found]
+    apart = np.linalg.norm(surfaces.places.points[domains] - surfaces.places.points[image][:, None], axis=2)
+    sure = (images.beliefs.probabilities[found, :K] * (apart < 0.03 * surfaces.size)).sum(axis=1)
+    confidence = sure * np.exp(-_strain(surfaces, images)[found] / 4.0)
+    order = np.argsort(-confidence, kind="stable")[:config.keep]
+    energies = {"field": images.energy, "scale": surfaces.scale,
+                "without_image": float(len(images.domains) - len(found))}
+    return Correspondences(surfaces.vertices[image[order]], surfaces.scan.points[found[order]], confidence[order],
+                           "correlated", energies, images.beliefs.converged)
+
+
+def surfaces_of(template: Mesh, sheet: Sheet, surface: SurfaceGraph, seeds: tuple[np.ndarray, np.ndarray],
+                config: CorrelatedConfig) -> Surfaces:
+    """Template and scan seen from seeds: vertices (S,) and where they are on the scan (S, 3)."""
+    size = float(np.sqrt(template.face_areas.sum()))
+    clicked = sheet.at(seeds[1])
+    on_scan, on_template = sheet.distances(clicked), surface.distances(seeds[0])
+    scale = _scale_between(on_template[:, seeds[0]], on_scan[:, clicked])
+    chosen = farthest_points(sheet.points, config.points)
+    off = np.linalg.norm(sheet.points[clicked] - seeds[1], axis=1)         # a click where there are no data
+    same = (sheet.piece[chosen][:, None] == sheet.piece[clicked]) & (off < 3 * sheet.spacing)
+    # a way that bridges a gap of the scan, or ends in one, is trusted less
+    scan = seen_from(sheet.points, sheet.normals, on_scan, chosen, FRAME * size, np.where(same, 1.0, 0.3))
+    vertices = _spread_vertices(template, min(max(level.places for level in config.levels), len(template.vertices)))
+    places = seen_from(scale * template.vertices, template.vertex_normals, scale * on_template, vertices, FRAME * size,
+                       np.ones((len(vertices), len(seeds[0]))))
+    return Surfaces(size, scan, _neighbours(sheet, chosen, 0.3 * size), places, vertices, scale)
 
 
 @lru_cache(maxsize=4)                # a folder of scans shares one template
-def spread_vertices(template: Mesh, count: int) -> np.ndarray:
+def _spread_vertices(template: Mesh, count: int) -> np.ndarray:
     """So many vertices (count,), the first of which, however few are taken, are spread over the template."""
     first = farthest_points(template.vertices, min(count, SPREAD))
     rest = np.setdiff1d(np.arange(len(template.vertices)), first)
     return np.concatenate([first, rest])[:count]
 
 
-def scale_between(template: np.ndarray, scan: np.ndarray) -> float:
+def _scale_between(template: np.ndarray, scan: np.ndarray) -> float:
     """How much larger the scan is, by the distances (S, S) between seeds: bending changes some of them."""
     a, b = np.triu_indices(len(template), 1)
     far, near = template[a, b], scan[a, b]
@@ -215,23 +162,54 @@ def scale_between(template: np.ndarray, scan: np.ndarray) -> float:
     return float(np.median(near[good] / far[good])) if good.any() else 1.0
 
 
-def seen_from(points: np.ndarray, normals: np.ndarray, distances: np.ndarray, at: np.ndarray, frame: float,
-              sure: np.ndarray) -> Places:
-    """Some points of a surface as seen from the seeds, from which `distances` (S, m) are."""
-    to_seeds = np.where(np.isfinite(distances[:, at]), distances[:, at], np.nan).T
-    turns = turns_between(points, normals, distances, at, frame)
-    return Places(points[at], normals[at], to_seeds, turns, sure)
-
-
-def neighbour_edges(sheet: Sheet, chosen: np.ndarray, links: int, limit: float) -> np.ndarray:
+def _neighbours(sheet: Sheet, chosen: np.ndarray, limit: float) -> np.ndarray:
     """Pairs (E, 2) of chosen points near to each other along the surface."""
     between = sheet.distances(chosen, limit=limit)[:, chosen]
-    near = np.argsort(between, axis=1)[:, 1:links + 1]
+    near = np.argsort(between, axis=1)[:, 1:LINKS + 1]
     i, j = np.repeat(np.arange(len(chosen)), near.shape[1]), near.ravel()
     linked = np.isfinite(between[i, j])
     return np.unique(np.sort(np.stack([i[linked], j[linked]], axis=1), axis=1), axis=0)
 
 
-def _pairs_within(a: np.ndarray, b: np.ndarray, reach: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    pairs = cKDTree(a).sparse_distance_matrix(cKDTree(b), reach, output_type="coo_matrix")
-    return pairs.row, pairs.col, pairs.data
+def _field(surfaces: Surfaces, domains: np.ndarray, unary: np.ndarray) -> PairField:
+    """The field over the domains (n, K), with one more state that says: no image."""
+    n, K = domains.shape
+    energies = np.full((n, K + 1), NOTHING * PLACE * most_place_energy(surfaces.scan.to_seeds.shape[1]))
+    energies[:, :K] = PLACE * unary
+    pairwise = np.full((len(surfaces.edges), K + 1, K + 1), NOTHING * MOST_EDGE, dtype=np.float32)
+    pairwise[:, :K, :K] = edge_energy(surfaces.scan, surfaces.places, surfaces.edges, domains, surfaces.size)
+    return PairField(energies, surfaces.edges, pairwise)
+
+
+def _rescaled(surfaces: Surfaces, images: Images) -> Surfaces:
+    """The template scaled by the edges whose images are known: bending changes paths, but not short edges."""
+    i, j = surfaces.edges[images.found[surfaces.edges].all(axis=1)].T
+    x, y = surfaces.scan.points, surfaces.places.points[images.chosen]
+    far = np.linalg.norm(y[i] - y[j], axis=1)
+    ratio = np.linalg.norm(x[i] - x[j], axis=1)[far > 0] / far[far > 0]
+    grown = float(np.median(ratio)) if len(ratio) else 1.0
+    return replace(surfaces, places=replace(surfaces.places, points=grown * surfaces.places.points),
+                   scale=grown * surfaces.scale)
+
+
+def _passed_on(surfaces: Surfaces, images: Images, places: np.ndarray) -> np.ndarray:
+    """Beliefs so far, spread over other places near by: (n, m), not normalised."""
+    n, K = images.domains.shape
+    reach = 0.012 * surfaces.size
+    old, column = np.unique(images.domains, return_inverse=True)
+    p = np.zeros((n, len(old)))
+    np.add.at(p, (np.repeat(np.arange(n), K), column.ravel()), images.beliefs.probabilities[:, :K].ravel())
+    points = surfaces.places.points
+    near = cKDTree(points[old]).sparse_distance_matrix(cKDTree(points[places]), 3 * reach, output_type="coo_matrix")
+    share = csr_array(coo_array((np.exp(-0.5 * (near.data / reach) ** 2), (near.row, near.col)),
+                                shape=(len(old), len(places))))
+    return p @ share
+
+
+def _strain(surfaces: Surfaces, images: Images) -> np.ndarray:
+    """Mean energy (n,) of the edges around every point, each with the images chosen."""
+    n = len(images.domains)
+    edges = surfaces.edges[images.found[surfaces.edges].all(axis=1)]
+    cost = edge_energy(surfaces.scan, surfaces.places, edges, images.chosen[:, None], surfaces.size)[:, 0, 0]
+    total, count = (np.bincount(edges.ravel(), np.repeat(w, 2), n) for w in (cost, np.ones(len(edges))))
+    return total / np.maximum(count, 1)

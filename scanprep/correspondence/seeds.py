@@ -2,7 +2,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from itertools import permutations
 
 import numpy as np
@@ -11,44 +11,32 @@ from ..geometry.farthest_points import farthest_points
 from ..geometry.geodesics import SurfaceGraph
 from ..geometry.mesh import Mesh, check_template
 from ..geometry.target import target_of
-from ..ranges import Cell, Count, Positive, Settings
+from ..ranges import Count, Settings
 from ..threads import one_thread
 from .correspondences import Correspondences
-from .search import BeliefLevel, CorrelatedConfig, Search
+from .search import BeliefLevel, CorrelatedConfig, search, surfaces_of
 from .sheet import Sheet
 
-QUICK = CorrelatedConfig(points=90, keep=90, links=6, levels=(BeliefLevel(900, 60),), iterations=25)
+# Of the trial of a hypothesis: fewer points, and one coarse level
+TRIAL = CorrelatedConfig(points=90, levels=(BeliefLevel(900, 60),), iterations=25)
+APART = 0.28                  # of the template's size: an end is the farthest place within it along the surface
+HIDDEN = 0.12                 # cost of an end that the scan does not show, as the share by which a way may be wrong
 
 
 @dataclass(frozen=True)
 class SeedConfig(Settings):
-    """Settings of `find_seeds`. Lengths are multiples of the template's size, √area.
+    """Settings of `find_seeds`.
 
     Attributes
     ----------
     ends : int
-        Most ends that are looked for on the template.
-    candidates : int
-        Most ends of the scan that may be among them.
-    apart : float
-        An end is the farthest place within this distance along the surface.
-    spacing : float
-        Distance that the scan is thinned to.
+        Most ends that are looked for on the template; on the scan two more may be among them.
     hypotheses : int
         Ways to match the ends that are tried by correlated correspondence.
-    missing : float
-        Cost of an end of the template that the scan does not show, as the share by which a way may be wrong.
-    check : CorrelatedConfig
-        Of the trial of every hypothesis.
     """
 
     ends: Count = 5
-    candidates: Count = 7
-    apart: Positive = 0.28
-    spacing: Cell = 0.009
     hypotheses: Count = 8
-    missing: float = 0.12
-    check: CorrelatedConfig = field(default_factory=lambda: QUICK)
 
 
 @one_thread()
@@ -80,21 +68,20 @@ def find_seeds(template: Mesh, scan: Mesh | np.ndarray, config: SeedConfig | Non
     check_template(template)
     size = float(np.sqrt(template.face_areas.sum()))
     surface = SurfaceGraph(template)
-    ends, ways = _ends(template.vertices, surface.distances, config.ends, config.apart * size)
+    ends, ways = _ends(template.vertices, surface.distances, config.ends, APART * size)
     if len(ends) < 3:
         raise ValueError(f"template: expected at least three limbs, found {len(ends)} ends")
-    sheet = Sheet(target_of(scan), config.spacing * size)
-    seen, seen_ways = _ends(sheet.points, sheet.distances, config.candidates, config.apart * size)
+    sheet = Sheet(target_of(scan), TRIAL.spacing * size)
+    seen, seen_ways = _ends(sheet.points, sheet.distances, config.ends + 2, APART * size)
     if len(seen) < 3:
         raise ValueError(f"scan: expected at least three ends of limbs, found {len(seen)}")
     hypotheses = matched_ends(ways, seen_ways, config)
     trials = []
     for image in hypotheses:
         there = image >= 0
-        search = Search(template, sheet, surface, (ends[there], sheet.points[seen[image[there]]]), config.check)
-        for level in config.check.levels:
-            search.descend(level)
-        trials.append(search.energy / len(search.chosen) + 2.0 * float((~there).sum()))
+        pairs = ends[there], sheet.points[seen[image[there]]]
+        surfaces, images = search(surfaces_of(template, sheet, surface, pairs, TRIAL), None, TRIAL.levels[0], TRIAL)
+        trials.append(images.energy / len(surfaces.scan) + 2.0 * float((~there).sum()))
     order = np.argsort(trials)
     best = hypotheses[order[0]]
     there = best >= 0
@@ -107,7 +94,7 @@ def find_seeds(template: Mesh, scan: Mesh | np.ndarray, config: SeedConfig | Non
 def _ends(points: np.ndarray, distances: Callable[[np.ndarray], np.ndarray], count: int, apart: float
           ) -> tuple[np.ndarray, np.ndarray]:
     """Places farther from the rest than all around them, most pronounced first, and the ways between them."""
-    sample = farthest_points(points, min(64, len(points)))
+    sample = farthest_points(points, 64)
     ways = distances(sample)
     there = np.isfinite(ways)
     mean = np.full(ways.shape[1], np.nan)                     # of pieces that no sample reaches
@@ -126,17 +113,9 @@ def _ends(points: np.ndarray, distances: Callable[[np.ndarray], np.ndarray], cou
 
 
 def matched_ends(template: np.ndarray, scan: np.ndarray, config: SeedConfig) -> list[np.ndarray]:
-    """The matches of the ends that keep the ways between them best, best first.
+    """The matches of the ends that keep the ways between them, (E, E) and (F, F) metres, best, best first.
 
-    Parameters
-    ----------
-    template, scan : (E, E) and (F, F) float, metres
-        Ways between the ends.
-
-    Returns
-    -------
-    list of (E,) int
-        The scan's end for every end of the template, -1 for none.
+    Each is the scan's end for every end of the template (E,), -1 for none.
     """
     E, F = len(template), len(scan)
     hidden = max(0, min(E - 3, 2))
@@ -148,5 +127,5 @@ def matched_ends(template: np.ndarray, scan: np.ndarray, config: SeedConfig) -> 
     log_ratio = np.where(both & np.isfinite(ratio) & (ratio > 0), np.log(np.where(ratio > 0, ratio, 1.0)), np.nan)
     scale = np.clip(np.nanmedian(log_ratio, axis=1), -0.35, 0.35)
     wrong = np.where(both, np.minimum(np.nan_to_num(np.abs(log_ratio - scale[:, None]), nan=0.5), 0.5), 0.0)
-    cost = wrong.sum(axis=1) / np.maximum(both.sum(axis=1), 1) + config.missing * (images < 0).sum(axis=1)
+    cost = wrong.sum(axis=1) / np.maximum(both.sum(axis=1), 1) + HIDDEN * (images < 0).sum(axis=1)
     return list(images[np.argsort(cost, kind="stable")[:config.hypotheses]])

@@ -11,25 +11,11 @@ from ..geometry.thinning import thin
 
 
 class Sheet:
-    """Evenly spread points of a surface and the graph of short ways between them.
+    """Points of a scan, thinned to a spacing (metres), and the graph of short ways between them.
 
     Points of overlapping sheets are neighbours of each other; two points that face each other across a gap, or
-    lie on the two sides of a thin part, are not.
-
-    Parameters
-    ----------
-    target : Target
-        Points with smooth normals.
-    spacing : float, metres
-        Distance that the points are thinned to.
-
-    Attributes
-    ----------
-    points, normals : (n, 3) float
-    piece : (n,) int
-        Which connected piece each point belongs to.
-    surface, graph : (n, n) sparse, metres
-        Lengths of the short ways, without and with the bridges that join the larger pieces.
+    lie on the two sides of a thin part, are not. `piece` (n,) is the connected piece of each point; `surface` and
+    `graph` (n, n) hold the lengths of the ways, metres, without and with the bridges that join the larger pieces.
     """
 
     REACH = 2.6          # radius of the neighbourhood, in spacings: about twenty neighbours
@@ -63,7 +49,7 @@ class Sheet:
         return _symmetric(i[good], j[good], length[good], len(self.points))
 
     def distances(self, sources: np.ndarray, limit: float = np.inf) -> np.ndarray:
-        """Distances (S, n), metres, from points of the sheet (S,) to all; infinite where no way leads."""
+        """(S, n) metres from points of the sheet (S,) to all; infinite where no way leads."""
         return dijkstra(self.graph, directed=False, indices=sources, limit=limit)
 
     def at(self, points: np.ndarray) -> np.ndarray:

@@ -37,7 +37,7 @@ class DecimateConfig(Settings):
 
     method: Annotated[Method, FLAG] = "quadric"
     improve: Annotated[bool, FLAG] = False
-    crease: Annotated[float | None, FLAG] = None
+    crease: float | None = None
 
 
 class Decimation(NamedTuple):

@@ -6,7 +6,7 @@ import hashlib
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass, replace
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Any, Literal
 
 import numpy as np
 
@@ -15,14 +15,13 @@ from ..geometry import rotations, storage
 from ..geometry.farthest_points import farthest_points
 from ..geometry.landmarks import read_landmark_vertices, write_landmarks
 from ..geometry.mesh import Mesh, check_template
-from ..ranges import FLAG, Count, Settings
+from ..ranges import Count, Settings
 from ..skeleton.tree import Skeleton
 from .edge_collapse import FIXED, Rounds, checked_vertices, kept_curves, wall_quadrics
 from .quadrics import lowest, sum_at, surface_quadrics
 
 Progress = Callable[[int, int], None]
 KIND, VERSION = "decimation", 1
-MOST_READ = 200                      # meshes among which the different ones are looked for
 _MAPS = ("vertex_map", "owner", "face_map", "fixed")
 
 
@@ -43,42 +42,23 @@ class DecimateSetConfig(Settings):
         it slide less.
     """
 
-    meshes: Annotated[Count, FLAG] = 8
-    placement: Annotated[Literal["vertices", "solved"], FLAG] = "vertices"
+    meshes: Count = 8
+    placement: Literal["vertices", "solved"] = "vertices"
     anchor: float = 0.03
 
 
 @dataclass(frozen=True, eq=False)
 class DecimatedSet:
-    """How meshes of one topology get fewer triangles.
-
-    Attributes
-    ----------
-    template : Mesh
-    vertex_map : (n,) int
-        The original vertex of every one that was kept.
-    owner : (N,) int
-        The new vertex that stands for each original one.
-    face_map : (f,) int
-        The original triangle of every one that was kept.
-    skeleton : Skeleton or None
-    source : Mesh
-        The template before.
-    labels : (F,) int or None
-        Parts of the triangles before.
-    fixed : (n,) bool
-        New vertices that stay on the original one in any case.
-    config : DecimateSetConfig
-    """
+    """How meshes of one topology get fewer triangles."""
 
     template: Mesh
-    vertex_map: np.ndarray
-    owner: np.ndarray
-    face_map: np.ndarray
+    vertex_map: np.ndarray          # (n,) the original vertex of every one that was kept
+    owner: np.ndarray               # (N,) the new vertex that stands for each original one
+    face_map: np.ndarray            # (f,) the original triangle of every one that was kept
     skeleton: Skeleton | None
-    source: Mesh
-    labels: np.ndarray | None
-    fixed: np.ndarray
+    source: Mesh                    # the template before
+    labels: np.ndarray | None       # (F,) parts of the triangles before
+    fixed: np.ndarray               # (n,) bool, new vertices that stay on the original one in any case
     config: DecimateSetConfig
 
     def transfer(self, vertices: np.ndarray) -> np.ndarray:
@@ -167,7 +147,7 @@ def _different_meshes(template: Mesh, poses: np.ndarray | None, count: int) -> n
         return centred[None]
     if np.ndim(poses) != 3 or np.shape(poses)[1:] != template.vertices.shape:
         raise ValueError(f"poses: expected shape (M, {len(template.vertices)}, 3), got {np.shape(poses)}")
-    R, t = rotations.procrustes(poses, np.broadcast_to(centred, poses.shape))[:2]
+    R, t = rotations.procrustes(poses, np.broadcast_to(centred, poses.shape))
     placed = np.concatenate([centred[None], np.einsum("mij,mnj->mni", R, poses) + t[:, None]])
     return placed[farthest_points(
         placed, count, 0, lambda i, _: np.sqrt(((placed - placed[i]) ** 2).sum(axis=2).mean(axis=1)), least=1e-9)]
@@ -239,7 +219,7 @@ def write_decimated_set(source: Path | str | RegisteredSet, folder: Path | str, 
     elif (folder / "set.json").exists():
         raise ValueError(f"folder: {folder} holds a registered set that is no decimation")
     else:
-        step = max(-(-len(source.names) // MOST_READ), 1)
+        step = max(-(-len(source.names) // 200), 1)        # among so many meshes the different ones are looked for
         some = source.names[::step] if config.meshes > 1 else ()
         done = decimate_set(source.template, source.vertices(some) if some else None, faces, config,
                             np.array(list(landmarks.values()), dtype=np.int64), source.skeleton)

@@ -1,4 +1,4 @@
-"""Files of meshes, points and landmarks, with errors that say what is wrong.
+"""Files of meshes and points, with errors that say what is wrong.
 
 Vertices keep the order of the file. Coordinates become metres: most files do not say their unit, so either
 the caller does or metres are assumed, with a warning where that would make a giant or a dwarf.
@@ -13,21 +13,20 @@ from typing import Literal, NamedTuple
 
 import numpy as np
 
-from . import storage
-from .formats import glb, obj, off, pcd, ply, stl, xyz
-from .formats.common import UNITS, Contents, MeshFileError, check_extent, load_bytes, metres_per_unit
-from .landmarks import match_landmarks, read_landmark_vertices, read_landmarks, write_landmarks
+from . import format_glb, format_obj, format_off, format_pcd, format_ply, format_stl, format_xyz, storage
+from .format_common import UNITS, Contents, MeshFileError, check_extent, load_bytes, metres_per_unit
 from .mesh import Mesh
 
-__all__ = ["UNITS", "MeshFileError", "PointCloud", "Registered", "list_meshes", "match_landmarks",
-           "read_landmark_vertices", "read_landmarks", "read_mesh", "read_points", "read_registered", "read_scan",
-           "write_landmarks", "write_mesh", "write_points"]
+__all__ = ["UNITS", "MeshFileError", "PointCloud", "Registered", "list_meshes", "read_mesh", "read_points",
+           "read_registered", "read_scan", "write_mesh", "write_points"]
 
 Precision = Literal["double", "single"]
 
-_MESHES: dict[str, ModuleType] = {".ply": ply, ".obj": obj, ".stl": stl, ".off": off, ".glb": glb}
 POINT_ENDINGS = (".xyz", ".pcd", ".txt", ".pts")
-_POINTS: dict[str, ModuleType] = {".ply": ply, ".pcd": pcd, ".xyz": xyz, ".txt": xyz, ".pts": xyz}
+_MESHES: dict[str, ModuleType] = {".ply": format_ply, ".obj": format_obj, ".stl": format_stl, ".off": format_off,
+                                  ".glb": format_glb}
+_POINTS: dict[str, ModuleType] = {".ply": format_ply, ".pcd": format_pcd, ".xyz": format_xyz, ".txt": format_xyz,
+                                  ".pts": format_xyz}
 
 
 def read_mesh(path: str | Path, unit: str | None = None) -> Mesh:
@@ -86,18 +85,11 @@ def write_mesh(path: str | Path, mesh: Mesh, precision: Precision = "double") ->
 
 @dataclass(frozen=True, eq=False)
 class PointCloud:
-    """Points of a surface.
+    """Points of a surface."""
 
-    Attributes
-    ----------
-    points : (n, 3) float, metres
-    normals : (n, 3) float, unit, optional
-    colors : (n, 3) float in [0, 1], optional
-    """
-
-    points: np.ndarray
-    normals: np.ndarray | None = None
-    colors: np.ndarray | None = None
+    points: np.ndarray                      # (n, 3), metres
+    normals: np.ndarray | None = None       # (n, 3), unit
+    colors: np.ndarray | None = None        # (n, 3) in [0, 1]
 
 
 def read_points(path: str | Path, unit: str | None = None) -> PointCloud:
@@ -152,13 +144,7 @@ def write_points(path: str | Path, cloud: PointCloud, precision: Precision = "do
 
 
 def list_meshes(folder: str | Path) -> list[Path]:
-    """The mesh files of a folder, sorted by name; of a RegisteredSet those in its `meshes`.
-
-    Raises
-    ------
-    MeshFileError
-        No such folder, or none in it.
-    """
+    """The mesh files of a folder, sorted by name, at least one; of a RegisteredSet those in its `meshes`."""
     folder = Path(folder)
     if not folder.is_dir():
         problem = "expected a folder, found a file" if folder.exists() else "no such folder"
@@ -171,29 +157,15 @@ def list_meshes(folder: str | Path) -> list[Path]:
 
 
 class Registered(NamedTuple):
-    """Meshes that share their triangles.
+    """Meshes that share their triangles."""
 
-    Attributes
-    ----------
-    faces : (F, 3) int
-    vertices : (M, N, 3) float, metres
-    names : M strings
-        File names without their endings.
-    """
-
-    faces: np.ndarray
-    vertices: np.ndarray
-    names: tuple[str, ...]
+    faces: np.ndarray           # (F, 3)
+    vertices: np.ndarray        # (M, N, 3), metres
+    names: tuple[str, ...]      # of the files, without their endings
 
 
 def read_registered(folder: str | Path, unit: str | None = None) -> Registered:
-    """Read every mesh of a folder, or of a RegisteredSet, sorted by name.
-
-    Raises
-    ------
-    MeshFileError
-        A mesh that cannot be read, or that has other vertices or triangles than the first one.
-    """
+    """Every mesh of a folder, or of a RegisteredSet, sorted by name; MeshFileError where one has other triangles."""
     paths = list_meshes(folder)
     meshes = []
     for path in paths:
@@ -227,10 +199,10 @@ def _format(path: Path, formats: dict[str, ModuleType]) -> ModuleType:
 
 
 def _read(path: Path, formats: dict[str, ModuleType]) -> Contents:
-    reader = _format(path, formats) if path.exists() else None
+    if path.is_file():
+        _format(path, formats)           # a wrong name is told even of a file that holds nothing
     data = load_bytes(path)
-    assert reader is not None, "a file that could be read exists"
-    contents: Contents = reader.read(path, data)
+    contents: Contents = _format(path, formats).read(path, data)
     if not len(contents.vertices):
         raise MeshFileError(f"{path}: the file holds no vertices")
     check_extent(path, "vertex", contents.vertices)

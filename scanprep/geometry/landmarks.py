@@ -12,11 +12,10 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from . import storage
-from .formats.common import FARTHEST, UNITS, Lines, MeshFileError, load_bytes, metres_per_unit, quote
+from .format_common import FARTHEST, UNITS, Lines, MeshFileError, load_bytes, metres_per_unit, quote
 from .mesh import Mesh
 
 LANDMARK_ENDINGS = (".landmarks.json", ".json", ".mrk.json", ".pp", "_picked_points.pp", ".lnd", ".landmarks.txt")
-FAR, NEAR = 0.5, 0.01                # of the size of a surface: farther from it, or closer together, is no landmark
 
 
 def read_landmarks(path: str | Path, mesh: Mesh | None = None, unit: str | None = None) -> dict[str, np.ndarray]:
@@ -102,18 +101,15 @@ def read_template_landmarks(template: Path, mesh: Mesh, given: Path | None = Non
 
 
 def check_on_surface(path: str | Path, landmarks: Mapping[str, np.ndarray], surface: np.ndarray) -> None:
-    """Refuse points that cannot have been picked on a surface (n, 3), whatever its shape.
+    """Refuse points that cannot have been picked on a surface (n, 3): in another unit, or of something else.
 
-    Raises
-    ------
-    MeshFileError
-        A landmark half the size of the surface away from it, or several so near to each other that they are all on
-        one spot of it: landmarks and surface are in different units, or do not belong together.
+    A landmark half the size of the surface away from it, or several so near to each other that they are all on
+    one spot of it.
     """
     points, size = np.array(list(landmarks.values())).reshape(-1, 3), np.linalg.norm(np.ptp(surface, axis=0))
     far = cKDTree(surface).query(points)[0]
     span = np.linalg.norm(np.ptp(points, axis=0)) if len(points) > 2 else size
-    if not (far <= FAR * size).all() or span < NEAR * size:
+    if not (far <= 0.5 * size).all() or span < 0.01 * size:
         raise MeshFileError(f"{path}: expected landmarks on the surface, which is {size:.3g} m from corner to corner; "
                             f"they span {span:.3g} m, and '{list(landmarks)[far.argmax()]}' is {far.max():.3g} m from "
                             "it; are both in the same unit?")

@@ -17,7 +17,6 @@ from typing import IO, Any
 import numpy as np
 
 HEADER = "header"
-UNPACKED, RATIO = 2**27, 100         # an archive may hold this many bytes, and so many more for each of its own
 LARGEST = 1e30                       # number that still has a square: what is larger counts as infinite
 LARGEST_TEXT = 2**28                 # bytes of a JSON file or a table
 
@@ -111,18 +110,7 @@ def _finite(value: Any) -> Any:
 
 
 def read_json(path: str | Path, what: str, error: type[StorageError] = StorageError) -> Any:
-    """A JSON file of finite numbers.
-
-    Parameters
-    ----------
-    what : str
-        What was expected, for the error.
-
-    Raises
-    ------
-    StorageError, or the one given
-        Missing, not JSON, not in UTF-8, nested too deeply, too large, a number that is not finite.
-    """
+    """A JSON file of finite numbers; `what` was expected, for the error."""
     return parse_json(path, read_bytes(path, what, error), what, error)
 
 
@@ -151,16 +139,7 @@ def _number(text: str) -> float:
 
 def save(path: str | Path, kind: str, version: int, arrays: dict[str, np.ndarray],
          header: dict[str, Any] | None = None) -> None:
-    """Write arrays and a JSON header into one `.npz` file.
-
-    Parameters
-    ----------
-    kind, version
-        What the file holds and the number of its layout; `load` checks both.
-    arrays : name -> array
-        No object arrays.
-    header : JSON-serialisable, optional
-    """
+    """Write arrays and a JSON header into one `.npz` file: what it holds and the number of its layout, for `load`."""
     text = json.dumps({"kind": kind, "version": version, **(header or {})})
     with writing(path) as beside, open(beside, "wb") as out:
         np.savez_compressed(out, allow_pickle=False, **{HEADER: np.array(text)}, **arrays)
@@ -188,7 +167,7 @@ def _arrays(path: str | Path, what: str, only: str | None) -> dict[str, np.ndarr
     with taking_apart(path, what), zipfile.ZipFile(path) as archive:
         members = {info.filename[:-4]: info for info in archive.infolist() if info.filename.endswith(".npy")}
         unpacked, packed = sum(info.file_size for info in members.values()), os.path.getsize(path)
-        if unpacked > UNPACKED + RATIO * packed or len(members) > packed // 64:
+        if unpacked > 2**27 + 100 * packed or len(members) > packed // 64:
             raise ValueError(f"{packed} bytes that would unpack to {len(members)} arrays of {unpacked} bytes")
         found = {}
         for name, info in members.items():
@@ -224,10 +203,7 @@ def numbers(arrays: Mapping[str, np.ndarray], name: str, *shape: int | None, fin
             ) -> np.ndarray:
     """The array of this name, of this shape (None: any length), of one of these kinds of numpy, and finite.
 
-    Raises
-    ------
-    KeyError, ValueError
-        Not there, of another shape, not numbers, not finite.
+    KeyError or ValueError when it is not; see `taking_apart`.
     """
     values = arrays[name]
     if values.dtype.kind not in kinds:
@@ -252,17 +228,7 @@ def _header(path: str | Path, kind: str, stored: np.ndarray | None) -> dict[str,
 
 
 def load(path: str | Path, kind: str, versions: tuple[int, ...]) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
-    """Read a file of `save`.
-
-    Returns
-    -------
-    header, arrays
-
-    Raises
-    ------
-    StorageError
-        Missing, not such a file, damaged, another kind, or a version that is not in `versions`.
-    """
+    """Header and arrays of a file of `save` of this kind, in one of these versions; StorageError for any other."""
     path = Path(path)
     arrays = load_arrays(path, f"a {kind} file")
     header = _header(path, kind, arrays.pop(HEADER, None))

@@ -4,32 +4,19 @@ from __future__ import annotations
 import contextlib
 import csv
 import io
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
+from typing import Any
 
-from .storage import LARGEST_TEXT, UTF_16, StorageError, read_bytes, taking_apart
+from .storage import LARGEST_TEXT, UTF_16, StorageError, read_bytes, taking_apart, writing
 
 
 def read_table(path: str | Path, columns: Sequence[str], needed: Sequence[str] | None = None
                ) -> list[tuple[int, dict[str, str]]]:
-    """A CSV table with a heading, as spreadsheets save it: see `table_rows`.
+    """Lines and cells, by column, of a CSV table with a heading, as spreadsheets save it: see `table_rows`.
 
-    Parameters
-    ----------
-    columns : names
-        Those that are wanted.
-    needed : names, optional
-        Those of them that must be there; all, when not given.
-
-    Returns
-    -------
-    list of (line, {column: text})
-        Every one of `columns`, empty where the table does not have it; other columns too.
-
-    Raises
-    ------
-    StorageError
-        Missing, not a table, a column that is not there or comes twice, a line of another length.
+    Every one of `columns` is there, empty where the table does not have it, and other columns too. StorageError unless
+    the table has the `needed` ones of them, or all, each once, and lines that are equally long.
     """
     _, rows = table_rows(path, read_bytes(path, f"a table with the columns {','.join(columns)}"))
     head = rows[0][1] if rows else []
@@ -40,6 +27,16 @@ def read_table(path: str | Path, columns: Sequence[str], needed: Sequence[str] |
         if len(cells) != len(head):
             raise StorageError(f"{path}: line {line}: expected {len(head)} values, found {len(cells)}")
     return [(line, {**dict.fromkeys(columns, ""), **dict(zip(head, cells, strict=True))}) for line, cells in rows[1:]]
+
+
+def write_table(path: str | Path, header: Sequence[str], rows: Iterable[Sequence[Any]]) -> None:
+    """Write a CSV table, whole or not at all."""
+    text = io.StringIO()
+    table = csv.writer(text, lineterminator="\n")
+    table.writerow(header)
+    table.writerows(rows)
+    with writing(path) as beside:
+        beside.write_text(text.getvalue(), encoding="utf-8")
 
 
 def table_rows(path: str | Path, data: bytes, error: type[StorageError] = StorageError

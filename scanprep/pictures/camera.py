@@ -1,4 +1,4 @@
-"""Where a picture is taken from."""
+"""Where a picture is taken from, also of a body whose axes nobody has named."""
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
@@ -11,48 +11,24 @@ from ..geometry.mesh import Mesh
 
 @dataclass(frozen=True, eq=False)
 class Camera:
-    """A view of the scene; the picture is scaled so that `width` × `height` metres fit into it.
+    """A view of the scene; the picture is scaled so that `width` × `height` metres fit into it."""
 
-    Attributes
-    ----------
-    target : (3,) float, metres
-        What stands in the middle of the picture.
-    axes : (3, 3) float
-        Rows: right, up and back (towards the camera), unit and perpendicular.
-    vertical : (3,) float
-        Unit vector that points away from the ground.
-    width, height : float, metres
-        Extent to be visible at the target.
-    distance : float, metres
-        From the camera to the target; inf for parallel rays.
-    """
-
-    target: np.ndarray
-    axes: np.ndarray
-    vertical: np.ndarray
-    width: float
-    height: float
-    distance: float = np.inf
+    target: np.ndarray  # (3,) float, metres: what stands in the middle of the picture
+    axes: np.ndarray  # (3, 3) float: rows: right, up and back (towards the camera), unit and perpendicular
+    vertical: np.ndarray  # (3,) float: unit vector that points away from the ground
+    width: float  # metres: extent to be visible at the target
+    height: float  # metres: extent to be visible at the target
+    distance: float = np.inf  # metres: from the camera to the target; inf for parallel rays
 
     @classmethod
     def around(cls, subject: Any, azimuth: float = 0.0, elevation: float = 8.0,
                up: int = 2, lens: float = 6.0, margin: float = 1.06) -> Camera:
-        """A camera that holds the whole subject.
+        """A camera that holds the whole subject: meshes, solids, or points (n, 3), two of them corners of a box.
 
-        Parameters
-        ----------
-        subject : Mesh, Solid, a sequence of them, or points (n, 3); two points are the corners of a box
-        azimuth : float, degrees
-            Counter-clockwise about the upward axis. At 0 the camera stands on the +x side when z is up, on the
-            +z side when y is up.
-        elevation : float, degrees
-            Height of the camera above the horizon.
-        up : int
-            0, 1 or 2: the axis that points up.
-        lens : float
-            Distance of the camera in sizes of the subject; inf for parallel rays.
-        margin : float
-            Extent of the picture over that of the subject.
+        `azimuth`, degrees, runs counter-clockwise about the axis `up` (0, 1 or 2); at 0 the camera stands on the +x
+        side when z is up, on the +z side when y is up. `elevation`, degrees above the horizon; `lens`, distance of
+        the camera in sizes of the subject, inf for parallel rays; `margin`, extent of the picture over that of the
+        subject.
         """
         points = _points(subject)
         middle = (points.min(axis=0) + points.max(axis=0)) / 2
@@ -122,3 +98,34 @@ def _points(subject: Any) -> np.ndarray:
     if not len(points):
         raise ValueError("subject: expected a mesh or points to look at, found none")
     return points
+
+
+def upright(mesh: Mesh) -> tuple[int, float]:
+    """The axis that is probably up and the azimuth in degrees of a camera that probably sees the front.
+
+    For pictures only: up is the axis of the largest extent, the front is where the toes point, that is, where the
+    lowest twentieth of the body lies from the fifth above it. The widest horizontal direction is taken to be left
+    to right.
+    """
+    extent = np.ptp(mesh.vertices, axis=0)
+    up = int(extent.argmax())
+    across = [(up + 1) % 3, (up + 2) % 3]
+    height = (mesh.vertices[:, up] - mesh.vertices[:, up].min()) / extent[up]
+    flat = mesh.vertices[:, across]
+    _, directions = np.linalg.eigh(np.cov(flat.T, aweights=mesh.vertex_areas))
+    forward = directions[:, 0]
+    toes = flat[height < 0.05].mean(axis=0) - flat[(height >= 0.05) & (height < 0.25)].mean(axis=0)
+    if forward @ toes < 0:
+        forward = -forward
+    return up, float(np.degrees(np.arctan2(forward[1], forward[0])))
+
+
+def look_around(body: Mesh, poses: np.ndarray | None = None, turns: tuple[float, ...] = (0, 90, 180, 270),
+                elevation: float = 8.0) -> list[Camera]:
+    """Cameras around a standing body: by default from its front, its left, its back and its right.
+
+    `turns` are degrees from the front; `poses` (..., 3), metres, is what has to fit into the picture if not the body.
+    """
+    up, front = upright(body)
+    subject = body.vertices if poses is None else np.asarray(poses, dtype=float).reshape(-1, 3)
+    return [Camera.around(subject, azimuth=front + turn, elevation=elevation, up=up) for turn in turns]

@@ -9,20 +9,9 @@ NO_VALUE = (0.72, 0.74, 0.76)
 
 
 def heat(values: np.ndarray, low: float = 0.0, high: float | None = None, colormap: str = HEAT) -> np.ndarray:
-    """Colours of a perceptually uniform map.
+    """Colours (..., 3) in [0, 1] of a perceptually uniform map of matplotlib; NaN becomes a neutral grey.
 
-    Parameters
-    ----------
-    values : (...,) float
-        NaN becomes a neutral grey.
-    low, high : float
-        Values at the two ends; None for the largest value.
-    colormap : str
-        A matplotlib name.
-
-    Returns
-    -------
-    (..., 3) float in [0, 1]
+    `high` is the largest value when not given.
     """
     from matplotlib import colormaps
 
@@ -37,21 +26,7 @@ def heat(values: np.ndarray, low: float = 0.0, high: float | None = None, colorm
 
 def color_bar(low: float, high: float, title: str = "", colormap: str = HEAT, width: int = 320,
               scale: float = 1000.0, unit: str = "mm") -> np.ndarray:
-    """A legend for `heat`, of lengths in millimetres or of what else the unit says.
-
-    Parameters
-    ----------
-    low, high : float, metres
-    title : str
-    width : int, pixels
-    scale : float
-        Of the numbers that are written: 100 for per cent of a share.
-    unit : str
-
-    Returns
-    -------
-    (H, W, 3) uint8
-    """
+    """A legend (H, W, 3) uint8 for `heat`; the numbers written are `scale` times `low` to `high`, in `unit`."""
     from PIL import Image, ImageDraw
 
     from .sheets import INK, font

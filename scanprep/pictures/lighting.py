@@ -13,7 +13,6 @@ from .colors import encode
 KEY, FILL, RIM = ((-0.58, 0.62, 0.52), 1.00), ((0.85, 0.05, 0.50), 0.13), ((0.62, 0.40, -0.68), 0.50)
 SKY, BOUNCE = np.array([0.32, 0.34, 0.38]), np.array([0.20, 0.175, 0.16])
 BACK_FACE = np.array([0.30, 0.33, 0.40])      # tint of the inner side of an open surface
-SHADOW = 0.46                                 # darkest alpha on the floor
 
 
 @dataclass(frozen=True, eq=False)
@@ -135,7 +134,7 @@ class Scene:
         s, t = np.meshgrid(*(np.linspace(low[i], high[i], cells) for i in range(2)), indexing="ij")
         dark = self._floor_darkness(np.stack([s.ravel(), t.ravel()], axis=1) @ across.T).reshape(cells, cells)
         fade = np.clip(np.minimum(np.arange(cells), np.arange(cells)[::-1]) / (0.2 * cells), 0, 1)
-        dark = (SHADOW * gaussian_filter(dark, 0.02 * cells) * fade[:, None] * fade).astype(np.float32)
+        dark = (0.46 * gaussian_filter(dark, 0.02 * cells) * fade[:, None] * fade).astype(np.float32)
         up = self.vertical.astype(np.float32)
         fall = np.minimum(directions @ up, -1e-6)
         far = (np.float32(self.floor) - origins @ up) / fall

@@ -14,52 +14,9 @@ import numpy as np
 from ..geometry.storage import writing
 from .sheets import png_bytes
 
-_STYLE = """
-:root { color-scheme: light dark; --paper: #ffffff; --ink: #24282d; --soft: #667078; --line: #e2e5e8;
-  --tint: #f5f6f7; --link: #1d5f9e; }
-@media (prefers-color-scheme: dark) { :root { --paper: #16191c; --ink: #e4e7ea; --soft: #98a2ab; --line: #31373d;
-  --tint: #1e2226; --link: #7db8ee; } }
-* { box-sizing: border-box; }
-body { margin: 0; background: var(--paper); color: var(--ink); line-height: 1.55;
-  font: 17px/1.55 system-ui, -apple-system, "Segoe UI", Roboto, "Helvetica Neue", sans-serif; }
-main { max-width: 62rem; margin: 0 auto; padding: 3.5rem 1.25rem 5rem; }
-h1 { font-size: clamp(1.9rem, 5vw, 2.7rem); line-height: 1.12; letter-spacing: -0.02em; margin: 0 0 .6rem; }
-h2 { font-size: 1.4rem; letter-spacing: -0.01em; margin: 3.2rem 0 .4rem; padding-top: 1.1rem;
-  border-top: 1px solid var(--line); }
-p { max-width: 42rem; margin: .4rem 0 1rem; }
-.lead { font-size: 1.15rem; color: var(--soft); }
-figure { margin: 1.2rem 0; }
-.row { display: grid; gap: 1rem; grid-template-columns: repeat(auto-fit, minmax(min(100%, 13rem), 1fr)); }
-.row figure { margin: 0; }
-img, svg { display: block; max-width: 100%; height: auto; margin: 0 auto; }
-figure > img, figure > svg { background: #fff; border: 1px solid var(--line); border-radius: 10px; }
-figcaption { color: var(--soft); font-size: .92rem; margin: .45rem auto 0; max-width: 42rem; text-align: center; }
-.scroll { overflow-x: auto; margin: 1.2rem 0; }
-table { border-collapse: collapse; font-variant-numeric: tabular-nums; font-size: .96rem; }
-th { text-align: left; font-weight: 600; color: var(--soft); border-bottom: 2px solid var(--line); }
-th, td { padding: .42rem 1.1rem .42rem 0; vertical-align: baseline; }
-td { border-bottom: 1px solid var(--line); }
-.number { text-align: right; }
-nav { display: flex; flex-wrap: wrap; gap: .3rem 1.2rem; margin: 1.6rem 0 0; font-size: .95rem; }
-a { color: var(--link); text-decoration: none; } a:hover { text-decoration: underline; }
-.file { display: inline-block; margin: .2rem .8rem .8rem 0; padding: .5rem .9rem; border: 1px solid var(--line);
-  border-radius: 8px; background: var(--tint); }
-.file small { color: var(--soft); margin-left: .5rem; }
-pre { background: var(--tint); border: 1px solid var(--line); border-radius: 8px; padding: .8rem 1rem;
-  overflow-x: auto; font-size: .88rem; }
-@media print { main { padding: 0; } figure, table { break-inside: avoid; } }
-"""
-
 
 class Page:
-    """A page built from top to bottom; every method returns the page, so that calls can be chained.
-
-    Parameters
-    ----------
-    title : str
-    lead : str
-        What the page shows, in a sentence or two.
-    """
+    """A page built from top to bottom; every method returns the page, so that calls can be chained."""
 
     def __init__(self, title: str, lead: str = "") -> None:
         self.title, self.lead = title, lead
@@ -91,26 +48,12 @@ class Page:
         return self
 
     def picture(self, image: np.ndarray | bytes, caption: str = "", alt: str = "") -> Page:
-        """A picture.
-
-        Parameters
-        ----------
-        image : (H, W, 3 or 4) uint8, or the bytes of a PNG, GIF, WebP, JPEG or SVG file
-        caption : str
-        alt : str
-            What the picture shows, for readers who do not see it; the caption when not given.
-        """
+        """A picture."""
         self._parts.append(_figure(image, caption, alt))
         return self
 
     def pictures(self, images: Sequence[np.ndarray | bytes], captions: Sequence[str] = ()) -> Page:
-        """Pictures in a row that wraps on narrow screens.
-
-        Raises
-        ------
-        ValueError
-            Captions that are not one for each image.
-        """
+        """Pictures in a row that wraps on narrow screens."""
         if captions and len(captions) != len(images):
             raise ValueError(f"captions: expected {len(images)}, one for each image, got {len(captions)}")
         figures = [_figure(image, caption, "") for image, caption in
@@ -145,12 +88,13 @@ class Page:
 
     def html(self) -> str:
         """The whole page."""
+        style = Path(__file__).with_name("page.css").read_text(encoding="utf-8") + "".join(self._styles)
         lead = f'<p class="lead">{escape(self.lead)}</p>' if self.lead else ""
         links = "".join(f'<a href="#s{i + 1}">{escape(s)}</a>' for i, s in enumerate(self._sections))
         nav = f'<nav aria-label="Contents">{links}</nav>' if len(self._sections) > 2 else ""
         return (f'<!doctype html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
                 f'<meta name="viewport" content="width=device-width, initial-scale=1">\n'
-                f"<title>{escape(self.title)}</title>\n<style>{_STYLE}{''.join(self._styles)}</style>\n</head>\n<body>\n<main>\n"
+                f"<title>{escape(self.title)}</title>\n<style>{style}</style>\n</head>\n<body>\n<main>\n"
                 f"<header><h1>{escape(self.title)}</h1>{lead}{nav}</header>\n"
                 + "\n".join(self._parts) + "\n</main>\n</body>\n</html>\n")
 

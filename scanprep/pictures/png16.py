@@ -12,26 +12,14 @@ MOST = 2**28                         # pixels
 
 
 def depth(data: bytes) -> tuple[int, int]:
-    """Bits and channels of a PNG file; channels 0 where it has a palette.
-
-    Raises
-    ------
-    ValueError
-        No PNG file.
-    """
+    """Bits and channels of a PNG file; channels 0 where it has a palette."""
     if data[:8] != SIGNATURE or data[12:16] != b"IHDR" or len(data) < 33:
         raise ValueError("it is not a PNG file")
     return data[24], CHANNELS.get(data[25], 0)
 
 
 def decode(data: bytes) -> np.ndarray:
-    """(H, W, C) uint16 of a PNG file with 16 bits a channel.
-
-    Raises
-    ------
-    ValueError
-        Another depth, interlaced, cut short, or damaged.
-    """
+    """(H, W, C) uint16 of a PNG file with 16 bits a channel."""
     bits, channels = depth(data)
     width, height = struct.unpack(">II", data[16:24])
     if bits != 16 or not channels or data[28]:

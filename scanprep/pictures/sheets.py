@@ -1,4 +1,4 @@
-"""Pictures put together, written to files."""
+"""Pictures put together, written to files, and moving ones as GIF."""
 from __future__ import annotations
 
 import io
@@ -22,25 +22,9 @@ def font(size: int):
 
 def side_by_side(images: Sequence[np.ndarray], labels: Sequence[str] | None = None, gap: int = 8,
                  columns: int | None = None) -> np.ndarray:
-    """A contact sheet of pictures with a line of text below each.
+    """A contact sheet (H, W, 3) uint8 of pictures of any sizes with a line of text below each.
 
-    Parameters
-    ----------
-    images : sequence of (H, W, 3) uint8
-        Of any sizes; each is centred in its cell, and every row is as high as its highest picture.
-    labels : sequence of str, optional
-    gap : int, pixels
-    columns : int, optional
-        All in one row when not given.
-
-    Returns
-    -------
-    (H, W, 3) uint8
-
-    Raises
-    ------
-    ValueError
-        No images, or another number of labels.
+    All stand in one row unless `columns` says otherwise; each is centred in its cell.
     """
     from PIL import Image, ImageDraw
 
@@ -79,5 +63,34 @@ def png_bytes(image: np.ndarray) -> bytes:
 def save_png(path: str | Path, image: np.ndarray) -> None:
     """Write a picture (H, W, 3 or 4) uint8, whole or not at all."""
     data = png_bytes(image)
+    with writing(path) as beside:
+        beside.write_bytes(data)
+
+
+def gif_bytes(images: Sequence[np.ndarray], rate: float) -> bytes:
+    """Pictures (H, W, 3) uint8 as an endless animated GIF of `rate` pictures a second.
+
+    All share one palette, so that nothing flickers.
+    """
+    from PIL import Image
+
+    if not len(images):
+        raise ValueError("images: expected at least one, got none")
+    step = max(1, len(images) // 6)
+    palette = Image.fromarray(np.concatenate([i[::2, ::2] for i in images[::step]])).quantize(
+        255, method=Image.Quantize.MEDIANCUT)
+    colors = np.array(palette.getpalette()).reshape(-1, 3)
+    colors[colors.sum(axis=1).argmax()] = 255                 # the background of most pictures
+    palette.putpalette(colors.ravel().tolist())
+    drawn = [Image.fromarray(i).quantize(palette=palette, dither=Image.Dither.FLOYDSTEINBERG) for i in images]
+    out = io.BytesIO()
+    drawn[0].save(out, format="GIF", save_all=True, append_images=drawn[1:], loop=0,
+                  duration=max(20, round(1000 / rate / 10) * 10), optimize=False)
+    return out.getvalue()
+
+
+def write_gif(path: str | Path, images: Sequence[np.ndarray], rate: float) -> None:
+    """Write `gif_bytes`, whole or not at all."""
+    data = gif_bytes(images, rate)
     with writing(path) as beside:
         beside.write_bytes(data)

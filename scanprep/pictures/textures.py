@@ -1,7 +1,6 @@
 """Textures: read with a scan, baked onto a body, written as GLB."""
 from __future__ import annotations
 
-import io
 import warnings
 from collections.abc import Callable
 from dataclasses import dataclass, replace
@@ -10,13 +9,15 @@ from typing import Any
 
 import numpy as np
 
-from scanprep.geometry.formats.common import UNITS
-from scanprep.geometry.mesh import Mesh
-from scanprep.geometry.storage import writing
-from scanprep.geometry.surface import Rays, barycentric
+from ..geometry.format_common import UNITS
+from ..geometry.format_glb import VERTICES, Glb
+from ..geometry.mesh import Mesh
+from ..geometry.storage import writing
+from ..geometry.surface import Rays, barycentric
+from .gltf import skin_material
+from .sheets import png_bytes
 
 SIZE = 1024                          # pixels of a baked texture, each way
-PADDING = 8                          # pixels that colours go on beyond the border of a chart
 
 # colours and weights of places with normals
 Look = Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]
@@ -24,21 +25,12 @@ Look = Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]
 
 @dataclass(frozen=True, eq=False)
 class Texture:
-    """A picture laid on a mesh.
+    """A picture laid on a mesh."""
 
-    Attributes
-    ----------
-    mesh : Mesh
-        Its vertices are repeated where charts meet.
-    uv : (N, 2) float
-        Place of each vertex in the picture: (0, 0) is its lower left corner, (1, 1) its upper right one.
-    image : (H, W, 3) float in [0, 1]
-        Rows from the top.
-    """
-
-    mesh: Mesh
+    mesh: Mesh  # its vertices are repeated where charts meet
+    # (N, 2) float: place of each vertex in the picture: (0, 0) is its lower left corner, (1, 1) its upper right one
     uv: np.ndarray
-    image: np.ndarray
+    image: np.ndarray  # (H, W, 3) float in [0, 1]: rows from the top
 
     def scaled(self, factor: float) -> Texture:
         """All lengths of the mesh times a factor."""
@@ -113,16 +105,7 @@ def _picture(material: Any) -> np.ndarray | None:
 
 
 def bake(body: Mesh, look: Look, unseen: np.ndarray, size: int | None = None) -> Texture:
-    """A texture of a body: what `look` says of each of its pixels, elsewhere the colours of its vertices.
-
-    Parameters
-    ----------
-    body : Mesh
-    look : (places (n, 3), normals (n, 3)) -> colours (n, 3), weights (n,)
-    unseen : (N, 3) float in [0, 1]
-        Colours where the weight is zero.
-    size : int, pixels, optional
-    """
+    """A texture of a body: what `look` says of its pixels, where its weight is zero `unseen` (N, 3) of the vertices."""
     size = size or SIZE
     kept, faces, uv = unwrap(body)
     flat = Mesh(np.column_stack([uv, np.zeros(len(uv))]), faces)
@@ -143,46 +126,36 @@ def bake(body: Mesh, look: Look, unseen: np.ndarray, size: int | None = None) ->
 
 
 def unwrap(mesh: Mesh) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """A mesh cut into flat charts.
-
-    Returns
-    -------
-    (n,) int
-        The vertex that each vertex of the cut mesh was.
-    (F, 3) int
-        Its triangles, in the old order.
-    (n, 2) float in [0, 1]
-
-    Raises
-    ------
-    ModuleNotFoundError
-        xatlas is not installed.
-    """
+    """A mesh in flat charts: the old vertex of each new one (n,), the triangles in the old order, uv (n, 2)."""
     try:
         import xatlas
     except ModuleNotFoundError:
-        raise ModuleNotFoundError("a texture needs the body unwrapped by xatlas: pip install xatlas") from None
+        raise ModuleNotFoundError("a texture needs the body unwrapped by xatlas: "
+                                  "pip install 'scapekit[textures]'") from None
     kept, faces, uv = xatlas.parametrize(mesh.vertices.astype(np.float32), mesh.faces.astype(np.uint32))
     return kept.astype(np.int64), faces.astype(np.int64), uv.astype(np.float64)
 
 
 def padded(image: np.ndarray, covered: np.ndarray) -> np.ndarray:
-    """The picture with the colours of charts going on a little beyond them, so that seams do not show."""
+    """The picture with the colours of charts going on eight pixels beyond them, so that seams do not show."""
     from scipy.ndimage import distance_transform_edt
 
     far, nearest = distance_transform_edt(~covered, return_indices=True)
-    return np.where((far <= PADDING)[:, :, None], image[nearest[0], nearest[1]], image)
+    return np.where((far <= 8)[:, :, None], image[nearest[0], nearest[1]], image)
 
 
 def write_textured(path: str | Path, texture: Texture) -> None:
     """Write a GLB with its picture inside, whole or not at all."""
-    import trimesh
-    from PIL import Image
-
-    picture = Image.fromarray((255 * np.clip(texture.image, 0, 1) + 0.5).astype(np.uint8))
-    material = trimesh.visual.material.PBRMaterial(baseColorTexture=picture, metallicFactor=0.0, roughnessFactor=0.8)
-    visual = trimesh.visual.TextureVisuals(uv=texture.uv, material=material)
-    mesh = trimesh.Trimesh(texture.mesh.vertices, texture.mesh.faces, visual=visual, process=False)
-    out = io.BytesIO(trimesh.exchange.gltf.export_glb(trimesh.Scene(mesh)))
+    glb = Glb()
+    attributes = {"POSITION": glb.add(texture.mesh.vertices, "VEC3", VERTICES, bounds=True),
+                  "TEXCOORD_0": glb.add(texture.uv * [1, -1] + [0, 1], "VEC2", VERTICES)}
+    material = skin_material((1, 1, 1))
+    material["pbrMetallicRoughness"]["baseColorTexture"] = {"index": 0}
+    image = glb.add_png(png_bytes((255 * np.clip(texture.image, 0, 1) + 0.5).astype(np.uint8)), "texture")
+    data = glb.pack({
+        "scene": 0, "scenes": [{"nodes": [0]}], "nodes": [{"name": "body", "mesh": 0}], "materials": [material],
+        "meshes": [{"primitives": [{"attributes": attributes, "indices": glb.add_indices(texture.mesh.faces),
+                                    "material": 0}]}],
+        "images": [image], "textures": [{"source": 0}]})
     with writing(path) as beside:
-        beside.write_bytes(out.getvalue())
+        beside.write_bytes(data)

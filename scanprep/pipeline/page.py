@@ -168,8 +168,8 @@ def _legend(size: float) -> np.ndarray:
 
 
 def _parts_picture(template: Mesh, part_of_face: np.ndarray) -> np.ndarray:
+    from ..pictures.camera import look_around
     from ..pictures.shading import Solid, part_colors, render, side_by_side
-    from ..pictures.views import look_around
 
     body = Solid(template, part_colors(part_of_face))
     return side_by_side([render(body, camera, 240, 340) for camera in look_around(template, turns=(20, 200))])

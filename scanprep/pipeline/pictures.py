@@ -9,10 +9,9 @@ from scipy.sparse import eye_array
 from ..geometry import rotations
 from ..geometry.mesh import Mesh
 from ..geometry.thinning import thin
-from ..pictures.camera import Camera
+from ..pictures.camera import Camera, upright
 from ..pictures.colors import heat
 from ..pictures.shading import CLAY, Dots, Shape, Solid, render
-from ..pictures.views import upright
 from ..registration.nonrigid import Registration
 
 WIDTH, HEIGHT = 150, 216

@@ -8,8 +8,9 @@ from typing import Annotated, Literal
 import numpy as np
 
 from ..cleaning.clean_scan import CleanScanConfig, clean_scan
-from ..correspondence.correlated import CorrelatedConfig, find_correspondences
+from ..correspondence.correlated import find_correspondences
 from ..correspondence.correspondences import Correspondences
+from ..correspondence.search import CorrelatedConfig
 from ..geometry.files import read_scan
 from ..geometry.landmarks import check_on_surface, match_landmarks, read_landmarks
 from ..geometry.mesh import Mesh

@@ -10,9 +10,13 @@ import tyro
 from ..alignment.icp import RigidConfig, align_landmarks, align_rigid, alignment_problem
 from ..cli import MM, MeshArg, Output, ScanArg, Unit
 from ..console import Metric, Outcome, bar
-from ..correspondence.correlated import CorrelatedConfig, find_correspondences
-from ..correspondence.correspondences import correspondences_problem
-from ..correspondence.files import read_correspondences, write_correspondences
+from ..correspondence.correlated import find_correspondences
+from ..correspondence.correspondences import (
+    correspondences_problem,
+    read_correspondences,
+    write_correspondences,
+)
+from ..correspondence.search import CorrelatedConfig
 from ..geometry.files import read_mesh, read_scan, write_mesh
 from ..geometry.landmarks import landmarks_beside, match_landmarks, read_landmarks, read_template_landmarks
 from ..geometry.mesh import Mesh

@@ -17,7 +17,7 @@ from ..geometry import rotations
 from ..geometry.least_squares import Minimum, Sparse, levenberg_marquardt
 from .deformation_graph import DeformationGraph, NodeMotion, arms
 
-UNKNOWNS = 7
+UNKNOWNS, SCALE = 7, 3           # of a node, and the place of its log-scale among them
 
 
 @dataclass(frozen=True, eq=False)
@@ -209,7 +209,7 @@ def growth_term(graph: DeformationGraph, motion: NodeMotion, stiffness: float) -
 
 @dataclass(frozen=True)
 class Stiffness:
-    """How much the nodes resist, each in metres of distance to the data."""
+    """How much the nodes resist, each in metres of distance to the data; with a growth of 0 they keep their size."""
 
     stretch: float
     bend: float
@@ -224,15 +224,19 @@ def terms(graph: DeformationGraph, motion: NodeMotion, wanted: Pull, stiffness: 
             "growth": growth_term(graph, motion, stiffness.growth)}
 
 
-def follow_pull(graph: DeformationGraph, pattern: NodePattern, motion: NodeMotion, wanted: Pull, stiffness: Stiffness,
-           steps: int) -> Minimum[NodeMotion]:
+def follow_pull(graph: DeformationGraph, motion: NodeMotion, wanted: Pull, stiffness: Stiffness, steps: int
+                ) -> Minimum[NodeMotion]:
     """The motion of all nodes of least energy near a motion."""
+    pattern = node_pattern(graph)
+
     def equations(at: NodeMotion) -> Sparse:
         now = terms(graph, at, wanted, stiffness).values()
 
         def assemble() -> tuple[np.ndarray, csc_array]:
-            blocks, half = zip(*(term.normal(pattern) for term in now), strict=True)
-            return np.sum(half, axis=0).reshape(-1), pattern.matrix(np.sum(blocks, axis=0))
+            blocks, half = (np.sum(parts, axis=0) for parts in zip(*(t.normal(pattern) for t in now), strict=True))
+            if not stiffness.growth:
+                blocks[:, SCALE], blocks[:, :, SCALE], half[:, SCALE] = 0, 0, 0
+            return half.reshape(-1), pattern.matrix(blocks)
 
         return Sparse(sum(term.value for term in now), assemble)
 

@@ -9,7 +9,7 @@ import numpy as np
 from ..geometry.target import Target, orient
 from ..geometry.thinning import thin
 from .deformation_graph import DeformationGraph, NodeMotion, build_graph, deform, start_motion, transferred
-from .energies import Pull, Stiffness, follow_pull, node_pattern, pull, terms
+from .energies import Pull, Stiffness, follow_pull, pull, terms
 from .inputs import Inputs
 from .limb_ends import RADIUS, End, RigidFit, find_ends, rotated_end
 from .matches import Likeness, match_both_ways
@@ -38,7 +38,7 @@ class GraphFit:
         """The fit nearer to what matches and landmarks want, against the resistance of the nodes."""
         if not wanted.A.any():
             return self
-        found = follow_pull(self.graph, node_pattern(self.graph), self.motion, wanted, stiffness, steps)
+        found = follow_pull(self.graph, self.motion, wanted, stiffness, steps)
         now = {name: term.value for name, term in terms(self.graph, found.x, wanted, stiffness).items()}
         return replace(self, x=deform(self.graph, found.x), motion=found.x, energies=now,
                        iterations=self.iterations + found.iterations)
@@ -83,8 +83,10 @@ def bent(given: Inputs, fit: GraphFit, stage: GraphStage) -> GraphFit:
     target, sample = given.target.thinned(stage.detail * size), thin(template.vertices, stage.detail * size)
     like = Likeness(stage.positions, NORMALS * size, stage.paths * size)
     for _ in range(stage.rounds):
-        wanted = held + match_both_ways(template.with_vertices(fit.x), sample, size**2, target, stage.reach * size,
-                                        stage.slide, like, given.descriptors)
+        wanted = held
+        if stage.reach:
+            wanted = held + match_both_ways(template.with_vertices(fit.x), sample, size**2, target, stage.reach * size,
+                                            stage.slide, like, given.descriptors)
         if given.hints is not None and stage.hints:
             wanted += given.hints.wanted(fit.x, stage.reach * size, stage.hints * size**2)
         fit = fit.minimised(wanted, _stiffness(stage, size), 1)

@@ -6,9 +6,8 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.spatial import cKDTree
 
-from ..alignment.icp import align_landmarks, align_rigid
+from ..alignment.icp import align_landmarks, align_rigid, landmark_motion
 from ..correspondence.correspondences import Correspondences, checked_pairs
-from ..geometry import rotations
 from ..geometry.farthest_points import farthest_points
 from ..geometry.mesh import Mesh, check_template
 from ..geometry.target import Target, target_of
@@ -123,8 +122,4 @@ def place_by_descriptors(template: Mesh, descriptors: np.ndarray, target: Target
     mine = Described(template.vertices, template.vertex_normals, descriptors).of(sample)
     theirs = Described(target.points, target.normals, target.descriptors)
     index, _ = mine.matched(theirs, np.inf, Likeness(positions=0.0, descriptors=1.0, limit=np.inf))
-    a, b = template.vertices[sample[index >= 0]], target.points[index[index >= 0]]
-    R, t = rotations.procrustes(a, b)
-    T = np.eye(4)
-    T[:3, :3], T[:3, 3] = R, t
-    return T
+    return landmark_motion(template.vertices[sample[index >= 0]], target.points[index[index >= 0]])

@@ -23,7 +23,6 @@ from .final_fit import final_fit
 from .graph_fit import NORMALS, GraphFit, graph_fit
 from .inputs import Inputs, placed, prepare
 from .inverted_triangles import inverted_triangles, without_inverted
-from .rigid_links import rigid_link_fit
 from .schedule import RegistrationConfig
 
 NEAR = 0.015                     # of the template's size: data farther from a vertex are not data of that vertex
@@ -112,12 +111,9 @@ def register(template: Mesh, scan: Mesh | np.ndarray, landmarks: tuple[np.ndarra
     config = config or RegistrationConfig()
     given = prepare(template, scan, landmarks, correspondences)
     stages = tuple(s for s in config.graph if s.positions == 1 or given.descriptors is not None)
-    tell = _counted(progress, sum(stage.rounds for stage in config.rigid_links or stages) + 1)
+    tell = _counted(progress, sum(stage.rounds for stage in stages) + 1)
     T = placed(given) if start is None else start
-    if config.rigid_links:
-        fit = rigid_link_fit(given, T, config.rigid_links, tell)                                    # [Hahnel]
-    else:
-        fit = graph_fit(given, T, stages, config.ends, tell)
+    fit = graph_fit(given, T, stages, config.ends, tell)
     if config.final_fit is not None:
         final = final_fit(template, fit.x, given.target, given.landmarks, config.final_fit)
         fit = replace(fit, x=final.vertices, energies={**fit.energies, "strain": final.strain},

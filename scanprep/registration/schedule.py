@@ -6,6 +6,8 @@ from dataclasses import dataclass, field
 from ..ranges import Cell, Count, Positive, Settings
 from .final_fit import FinalFitConfig
 
+WHOLE = 1e-4                     # spacing that leaves all points of a scan
+
 
 @dataclass(frozen=True)
 class GraphStage(Settings):
@@ -17,11 +19,11 @@ class GraphStage(Settings):
         Nodes of the graph.
     stretch, bend, growth : float
         Resistance of the nodes, as the distance to the data that a strain, a rotation by a radian between
-        neighbours, or a growth by e between them is worth.
+        neighbours, or a growth by e between them is worth; with a growth of 0 nodes keep their size.
     landmarks : float
         The share of the surface that one landmark weighs as much as.
     reach : float
-        Farthest match that counts.
+        Farthest match that counts; 0 leaves the scan out.
     slide : float
         Force of a match along the surface, as a share of that across it.
     rounds : int
@@ -41,9 +43,9 @@ class GraphStage(Settings):
     nodes: Count
     stretch: Positive
     bend: Positive
-    growth: Positive
+    growth: float
     landmarks: float
-    reach: Positive
+    reach: float
     slide: float = 0.02
     rounds: Count = 2
     detail: Cell = 0.02
@@ -54,45 +56,12 @@ class GraphStage(Settings):
 
 
 @dataclass(frozen=True)
-class RigidLinkStage(Settings):
-    """One stage of a registration by rigid links [Hahnel]. Lengths are multiples of the template's size, √area.
-
-    Attributes
-    ----------
-    nodes : int
-        Nodes that are linked.
-    length : float
-        Length over which the links resist: what is much smaller is not followed.
-    landmarks : float
-        The share of the surface that one landmark weighs as much as.
-    reach : float
-        Farthest match that counts; 0 leaves the scan out.
-    rounds : int
-        Times that matches are sought anew.
-    """
-
-    nodes: Count
-    length: Positive
-    landmarks: float
-    reach: float
-    rounds: Count
-
-
-def hahnel_stages() -> tuple[RigidLinkStage, ...]:
-    """Drawn to the landmarks first, then to the scan with ever softer links [Hahnel]."""
-    first = tuple(RigidLinkStage(500, 0.7, held, 0.0, 8) for held in (0.001, 0.1, 10.0))
-    coarse = tuple(RigidLinkStage(500, length, 0.01, 2 * length, 3) for length in (0.2, 0.1, 0.06, 0.04))
-    return first + coarse + tuple(RigidLinkStage(2000, length, 0.005, 0.04, 3) for length in (0.04, 0.02))
-
-
-@dataclass(frozen=True)
 class RegistrationConfig(Settings):
     """Settings of `register`.
 
     Attributes
     ----------
     graph : stages of the coarse registration by a deformation graph
-    rigid_links : stages of the method of [Hahnel], which then takes the place of the graph
     ends : int
         How many ends of the body are tried in other rotations about themselves; 0 leaves that out.
     final_fit : FinalFitConfig or None
@@ -111,11 +80,19 @@ class RegistrationConfig(Settings):
         GraphStage(1000, 0.02, 0.002, 0.35, 0.01, 0.037, detail=0.008),
         GraphStage(1000, 0.015, 0.0015, 0.35, 0.005, 0.028, detail=0.008),
     )
-    rigid_links: tuple[RigidLinkStage, ...] = ()
     ends: int = 5
     final_fit: FinalFitConfig | None = field(default_factory=FinalFitConfig)
 
     @classmethod
     def published(cls) -> RegistrationConfig:
-        """The registration that [SCAPE] used: rigid links between neighbours [Hahnel], and no pass after it."""
-        return cls(graph=(), rigid_links=hahnel_stages(), final_fit=None)
+        """The registration that [SCAPE] used: rigid links between neighbours, matches point to point [Hahnel].
+
+        Nodes keep their size; the template is drawn to the landmarks first, then to the scan with ever softer links.
+        """
+        def stage(nodes: int, length: float, landmarks: float, reach: float, rounds: int) -> GraphStage:
+            return GraphStage(nodes, length, 0.1 * length, 0.0, landmarks, reach, 1.0, rounds, WHOLE)
+
+        first = (stage(500, 0.7, landmarks, 0.0, 24) for landmarks in (0.001, 0.1, 10.0))
+        coarse = (stage(500, length, 0.01, 2 * length, 6) for length in (0.2, 0.1, 0.06, 0.04))
+        fine = (stage(2000, length, 0.005, 0.04, 6) for length in (0.04, 0.02))
+        return cls((*first, *coarse, *fine), 0, None)

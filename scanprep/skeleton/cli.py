@@ -14,8 +14,8 @@ from ..geometry.files import read_mesh
 from ..geometry.mesh import Mesh
 from ..ranges import Signed
 from .edit import apply_edits, read_edits
+from .find import SkeletonSearch, search_skeleton, skeleton_problem
 from .parts import SkeletonConfig
-from .search import SkeletonSearch, search_skeleton, skeleton_problem
 from .tree import Skeleton
 
 PosesArg = Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="POSES")]
@@ -23,8 +23,7 @@ SkeletonArg = Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="SKELE
 
 
 def skeleton(poses: PosesArg, output: Output, template: Path | None = None, subject: str | None = None,
-             unit: Unit | None = None,
-             config: SkeletonConfig = SkeletonConfig()) -> Outcome:  # noqa: B008
+             unit: Unit | None = None, config: SkeletonConfig = SkeletonConfig()) -> Outcome:  # noqa: B008
     """Rigid parts, joints and a tree from meshes of one person that share their triangles.
 
     Example: scape prep skeleton set -o skeleton.json

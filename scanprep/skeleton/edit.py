@@ -14,7 +14,7 @@ template; a ring is a list of its vertices, in whose middle the joint is put. `n
 from __future__ import annotations
 
 import json
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -22,19 +22,15 @@ import numpy as np
 
 from ..geometry import storage
 from ..geometry.mesh import Mesh
-from .joints import ring_centre
-from .partition import Links, assemble, border_between, cut_across, cut_where_it_bends
+from .joints import place_joints, ring_centre
+from .labels import keep_connected, pieces
+from .motions import PosedSurface
+from .parts import PartSearch, SkeletonConfig
 from .tree import Skeleton
 
 
 def part_number(skeleton: Skeleton, part: int | str) -> int:
-    """The number of a part that is given by name or number.
-
-    Raises
-    ------
-    ValueError
-        No such part.
-    """
+    """The number of a part that is given by name or number."""
     names = skeleton.names
     if isinstance(part, str) and part in names:
         return names.index(part)
@@ -79,8 +75,9 @@ def merge_parts(skeleton: Skeleton, template: Mesh, a: int | str, b: int | str) 
     keep = np.arange(len(parents)) != high
     above = np.where(parents < 0, -1, new[parents])
     names = [skeleton.names[first] if p == low else name for p, name in enumerate(skeleton.names)]
-    return assemble(template, new[skeleton.part_of_face], above[keep], joints[keep],
-                    tuple(name for p, name in enumerate(names) if keep[p]))
+    merged = Skeleton(new[skeleton.part_of_face], above[keep], joints[keep],
+                      tuple(name for p, name in enumerate(names) if keep[p]))
+    return merged.with_root_centred(template)
 
 
 def split_part(skeleton: Skeleton, template: Mesh, part: int | str, poses: np.ndarray | None = None,
@@ -133,8 +130,8 @@ def split_part(skeleton: Skeleton, template: Mesh, part: int | str, poses: np.nd
     if len(chosen) != 2:
         raise ValueError(f"names: expected two, got {list(chosen)}")
     listed = [*skeleton.names[:p], *chosen, *skeleton.names[p + 1:]]
-    joints[p + 1] = Links(template, place[halved], poses).joint(p, p + 1)
-    return assemble(template, place[halved], parents, joints, tuple(listed))
+    joints[p + 1] = _joint_between(template, place[halved], p, p + 1, poses)
+    return Skeleton(place[halved], parents, joints, tuple(listed)).with_root_centred(template)
 
 
 def rename_part(skeleton: Skeleton, part: int | str, name: str) -> Skeleton:
@@ -235,50 +232,83 @@ def read_edits(path: str | Path) -> list[dict[str, Any]]:
     return stored
 
 
-Action = Callable[[Skeleton, Mesh, dict[str, Any], np.ndarray | None], Skeleton]
-
-
-def _merge(skeleton: Skeleton, template: Mesh, edit: dict[str, Any], poses: np.ndarray | None) -> Skeleton:
-    pair = edit["merge"]
-    if not isinstance(pair, list) or len(pair) != 2:
-        raise ValueError(f"merge: expected a list of two parts, got {pair!r}")
-    return merge_parts(skeleton, template, *pair)
-
-
-def _split(skeleton: Skeleton, template: Mesh, edit: dict[str, Any], poses: np.ndarray | None) -> Skeleton:
-    return split_part(skeleton, template, edit["split"], poses, edit.get("names"))
-
-
-def _rename(skeleton: Skeleton, template: Mesh, edit: dict[str, Any], poses: np.ndarray | None) -> Skeleton:
-    if not isinstance(edit["rename"], dict):
-        raise ValueError(f"rename: expected {{old: new}}, got {edit['rename']!r}")
-    for old, new in edit["rename"].items():
+def _applied(skeleton: Skeleton, template: Mesh, edit: dict[str, Any], poses: np.ndarray | None) -> Skeleton:
+    """The skeleton after one entry of a list of edits."""
+    known = {"merge": set(), "split": {"names"}, "rename": set(), "move_joint": {"position", "ring"}}
+    if not isinstance(edit, dict):
+        raise ValueError(f"expected an object with one of {', '.join(known)}")
+    asked = [action for action in known if action in edit]
+    if len(asked) != 1:
+        raise ValueError(f"expected one of {', '.join(known)}, found {asked or list(edit)}")
+    (action,) = asked
+    what = edit[action]
+    unknown = set(edit) - known[action] - {action}
+    if unknown:
+        raise ValueError(f"{action} does not know {', '.join(sorted(unknown))}")
+    if action == "merge":
+        if not isinstance(what, list) or len(what) != 2:
+            raise ValueError(f"merge: expected a list of two parts, got {what!r}")
+        return merge_parts(skeleton, template, *what)
+    if action == "split":
+        return split_part(skeleton, template, what, poses, edit.get("names"))
+    if action == "move_joint":
+        return move_joint(skeleton, template, what, edit.get("position"), edit.get("ring"))
+    if not isinstance(what, dict):
+        raise ValueError(f"rename: expected {{old: new}}, got {what!r}")
+    for old, new in what.items():
         skeleton = rename_part(skeleton, old, new)
     return skeleton
-
-
-def _move(skeleton: Skeleton, template: Mesh, edit: dict[str, Any], poses: np.ndarray | None) -> Skeleton:
-    return move_joint(skeleton, template, edit["move_joint"], edit.get("position"), edit.get("ring"))
-
-
-ACTIONS: dict[str, tuple[Action, frozenset[str]]] = {
-    "merge": (_merge, frozenset()), "split": (_split, frozenset({"names"})), "rename": (_rename, frozenset()),
-    "move_joint": (_move, frozenset({"position", "ring"}))}
-
-
-def _applied(skeleton: Skeleton, template: Mesh, edit: dict[str, Any], poses: np.ndarray | None) -> Skeleton:
-    if not isinstance(edit, dict):
-        raise ValueError(f"expected an object with one of {', '.join(ACTIONS)}")
-    asked = [action for action in ACTIONS if action in edit]
-    if len(asked) != 1:
-        raise ValueError(f"expected one of {', '.join(ACTIONS)}, found {asked or list(edit)}")
-    action, extras = ACTIONS[asked[0]]
-    unknown = set(edit) - extras - {asked[0]}
-    if unknown:
-        raise ValueError(f"{asked[0]} does not know {', '.join(sorted(unknown))}")
-    return action(skeleton, template, edit, poses)
 
 
 def _free(skeleton: Skeleton, name: str) -> str:
     """`name` with the lowest number from 2 that makes it new."""
     return next(new for k in range(2, len(skeleton.names) + 3) if (new := f"{name}_{k}") not in skeleton.names)
+
+
+def border_between(template: Mesh, label: np.ndarray, a: int, b: int) -> tuple[np.ndarray, np.ndarray]:
+    """The edges (n, 2) that part a shares with part b, as vertices, and their lengths (n,), metres."""
+    shared = template.edge_use == 2
+    both = np.sort(label[template.face_pairs], axis=1)
+    border = (both == [min(a, b), max(a, b)]).all(axis=1)
+    return template.edges[shared][border], template.edge_lengths[shared][border]
+
+
+def cut_across(template: Mesh, mine: np.ndarray, joints: np.ndarray) -> np.ndarray | None:
+    """Which triangles (F,) bool of a part `mine` (F,) bool to cut off: the farther half along its length.
+
+    Its length runs along its joints (n, 3), of one joint from there to the middle, of none along its main axis. None
+    where no cut leaves two connected halves.
+    """
+    inside = np.flatnonzero(mine)
+    pairs = np.searchsorted(inside, template.face_pairs[mine[template.face_pairs].all(axis=1)])
+    areas, centres = template.face_areas[inside], template.corners.mean(axis=1)[inside]
+    middle = areas @ centres / areas.sum()
+    axes = np.linalg.eigh(np.cov(centres.T, aweights=areas))[1].T[::-1]
+    if len(joints):
+        axes = np.vstack([np.linalg.svd(joints - joints.mean(axis=0))[2][0] if len(joints) > 1
+                          else middle - joints[0], axes])
+    for axis in axes:
+        far = ((centres - middle) @ axis > 0).astype(np.int64)
+        if not 0 < far.sum() < len(far):
+            continue
+        far = keep_connected(np.zeros((len(far), 2)), pairs, areas, far)      # what lies apart there goes back
+        if pieces(pairs, far).max() == 1:
+            cut = np.zeros_like(mine)
+            cut[inside[far == 1]] = True
+            return cut
+    return None
+
+
+def cut_where_it_bends(template: Mesh, poses: np.ndarray, mine: np.ndarray) -> np.ndarray | None:
+    """Which triangles (F,) bool of a part (F,) bool to cut off so that the halves move most rigidly; None if none."""
+    search = PartSearch(PosedSurface(template, poses), SkeletonConfig())
+    halved, apart = search.split(np.where(mine, 0, 1), 0)
+    return halved == halved.max() if apart > 0 else None
+
+
+def _joint_between(template: Mesh, label: np.ndarray, a: int, b: int, poses: np.ndarray | None) -> np.ndarray:
+    """The joint (3,) of two parts: by the poses where there are some, else the middle of the border."""
+    if poses is None:
+        return ring_centre(template, np.unique(border_between(template, label, a, b)[0]))
+    surface = PosedSurface(template, poses)
+    return place_joints(surface, label, surface.core_motions(label), np.array([[a, b]]))[0]

@@ -1,4 +1,7 @@
-"""From rigid parts to a tree with a joint on every link."""
+"""From rigid parts to a tree with a joint on every link.
+
+Parts that are mere passages between two others dissolve, loops are opened, and every link gets its joint.
+"""
 from __future__ import annotations
 
 from dataclasses import dataclass
@@ -8,24 +11,21 @@ from scipy.sparse import coo_array
 from scipy.sparse.csgraph import connected_components, dijkstra
 
 from ..geometry.mesh import Mesh
-from .motions import Motions
-from .parts import PartSearch
+from .motions import Motions, PosedSurface
+from .parts import FADING, PartSearch
 from .sides import mirror_pairs, reductions
 
 WEAK_CONTACT = 0.2               # of the longer borders of both parts: thighs that touch are not linked
 LOOP_SEPARATION = 1.5            # times the separation of parts: on a loop, closer ones are merged
-LEAST_PULL = 1e-4                # squared radians: turns below 0.01 say nothing about where a joint is
-PRIOR_WIDTH = 0.6                # of the border's radius: how far from its centroid a joint is expected
 
 
 def border_lengths(search: PartSearch, label: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Pairs of parts that touch (n, 2) and the length of their common border (n,), metres."""
     s = search.surface
-    pairs = search.contacts(label)
     both = np.sort(label[s.pairs], axis=1)
-    number = {(int(a), int(b)): i for i, (a, b) in enumerate(pairs)}
-    of_pair = np.array([number.get((int(a), int(b)), len(pairs)) for a, b in both], dtype=np.int64)
-    return pairs, np.bincount(of_pair, s.pair_lengths, len(pairs) + 1)[:len(pairs)]
+    differ = both[:, 0] != both[:, 1]
+    pairs, number = np.unique(both[differ], axis=0, return_inverse=True)
+    return pairs, np.bincount(number.ravel(), s.pair_lengths[differ], len(pairs))
 
 
 def linked(links: np.ndarray, count: int) -> bool:
@@ -56,26 +56,90 @@ def without_weak(search: PartSearch, label: np.ndarray) -> np.ndarray:
     return pairs[keep]
 
 
+def dissolve_bands(search: PartSearch, label: np.ndarray) -> np.ndarray:
+    """Labels (F,) without the parts that are only the passage between two neighbours.
+
+    The skin of a shoulder or a knee moves in between; cut out, such a band looks like a part. It is none if a blend of
+    its neighbours' motions, vertex by vertex, explains nearly all that its own motion explains. A band stays if the
+    labels that follow are no fewer.
+    """
+    while True:
+        explained, between = passages(search, label)
+        for band in np.argsort(-explained, kind="stable"):
+            if explained[band] < FADING:
+                return label
+            without = search.alternate(_shared_out(search, label, int(band), between[band]), rounds=4)
+            if without.max() < label.max():
+                label = without
+                break
+        else:
+            return label
+
+
+def passages(search: PartSearch, label: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """How far each part is a passage between neighbours (P,), 1 when entirely, and between which two (P, 2).
+
+    The share of what is lost when the part's vertices follow the neighbour they fit best that a blend of two
+    neighbours wins back.
+    """
+    s, motions = search.surface, search.motions(label)
+    partner = search.sides.partners(label)
+    P, contacts = int(label.max()) + 1, search.contacts(label)
+    lost, won, between = np.ones(P), np.full(P, -np.inf), np.zeros((P, 2), dtype=np.int64)
+    for p in range(P):
+        mine = label == p
+        vertices, place = np.unique(s.mesh.faces[mine], return_inverse=True)
+        weights = np.bincount(place.ravel(), np.repeat(s.face_weights[mine] / 3, 3))
+        near = np.setdiff1d(contacts[(contacts == p).any(axis=1)], p)
+        own = weights @ _squares(_gaps(search, motions, p, vertices))
+        gaps = [_gaps(search, motions, int(q), vertices) for q in near]
+        if not len(near):
+            continue
+        between[p] = near[0]
+        lost[p] = weights @ np.min([_squares(gap) for gap in gaps], axis=0) - own
+        for i in range(len(near)):
+            for k in range(i):
+                left = lost[p] + own - weights @ _blended(gaps[i], gaps[k])
+                if left > won[p]:
+                    won[p], between[p] = left, near[[k, i]]
+    lost, won = lost + lost[partner], won + won[partner]
+    return np.where(lost > 0, won / np.where(lost > 0, lost, 1), 1.0), between
+
+
+def _gaps(search: PartSearch, motions: Motions, part: int, vertices: np.ndarray) -> np.ndarray:
+    """(n, M, 3) from the vertices in the poses to where the motion of a part would carry them, metres."""
+    s = search.surface
+    return np.einsum("mij,nj->nmi", motions.R[part], s.x[vertices]) + motions.t[part] - s.y[vertices]
+
+
+def _squares(gap: np.ndarray) -> np.ndarray:
+    """(n,) squared lengths, mean over the poses."""
+    return (gap**2).sum(axis=(1, 2)) / gap.shape[1]
+
+
+def _blended(a: np.ndarray, b: np.ndarray) -> np.ndarray:
+    """(n,) the least squares that a blend of two motions leaves of their gaps, its share free for every vertex."""
+    apart = a - b
+    share = np.clip(-(apart * b).sum(axis=(1, 2)) / np.maximum((apart**2).sum(axis=(1, 2)), 1e-300), 0, 1)
+    return _squares(b + share[:, None, None] * apart)
+
+
+def _shared_out(search: PartSearch, label: np.ndarray, band: int, between: np.ndarray) -> np.ndarray:
+    """Labels where every triangle of a band, and of its mirror image, goes to the neighbour that it follows better."""
+    partner = search.sides.partners(label)
+    costs = search.surface.face_costs(search.motions(label))
+    for part, pair in ((band, between), (partner[band], partner[between])):
+        label = np.where(label == part, pair[costs[:, pair].argmin(axis=1)], label)
+    return search.sides.spread(label[search.sides.half], partner)
+
+
 @dataclass(frozen=True, eq=False)
 class Loop:
-    """A loop of parts that was opened.
+    """A loop of parts that was opened."""
 
-    Attributes
-    ----------
-    sides : two (F,) bool
-        The triangles of the two parts where it was opened, before.
-    joined : bool
-        Whether the two became one; else only the link between them was dropped.
-    length : int
-        Number of links that lay on loops.
-    separation : float
-        How far apart the two were.
-    """
-
-    sides: tuple[np.ndarray, np.ndarray]
-    joined: bool
-    length: int
-    separation: float
+    sides: tuple[np.ndarray, np.ndarray]  # two (F,) bool: the triangles of the two parts where it was opened, before
+    joined: bool  # whether the two became one; else only the link between them was dropped
+    length: int  # number of links that lay on loops
 
 
 def to_tree(search: PartSearch, label: np.ndarray) -> tuple[np.ndarray, np.ndarray, list[Loop]]:
@@ -84,21 +148,7 @@ def to_tree(search: PartSearch, label: np.ndarray) -> tuple[np.ndarray, np.ndarr
     On a loop, the two parts whose union costs least become one unless they are well apart: this joined the
     halves of crotch and chest in the paper, by hand. Where all parts of a loop move freely, the link whose
     parts move most against each other is dropped: thighs that touch under the crotch. On a symmetric body both
-    happen on both sides, so that the tree is symmetric too.
-
-    Parameters
-    ----------
-    search : PartSearch
-    label : (F,) int
-
-    Returns
-    -------
-    (F,) int
-        Labels.
-    (P - 1, 2) int
-        Links.
-    list of Loop
-        The loops that were opened.
+    happen on both sides, so that the tree is symmetric too. Returns labels (F,), links (P - 1, 2) and loops opened.
 
     [SCAPE] §3
     """
@@ -120,7 +170,7 @@ def to_tree(search: PartSearch, label: np.ndarray) -> tuple[np.ndarray, np.ndarr
             joined = not sound or close
             at = cheapest if joined else number[sound[0]]
             both = label == pairs[at, 0], label == pairs[at, 1]
-            loops.append(Loop(both, bool(joined), len(loop), float(separation[at])))
+            loops.append(Loop(both, bool(joined), len(loop)))
             if joined:
                 break
             links = np.delete(links, np.unique([loop[sound[0]], image[loop[sound[0]]]]), axis=0)
@@ -133,13 +183,7 @@ def to_tree(search: PartSearch, label: np.ndarray) -> tuple[np.ndarray, np.ndarr
 
 
 def tree_of(search: PartSearch, label: np.ndarray, links: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
-    """From a tree of parts one of exactly `count`: linked parts joined, or the parts cut that bend most.
-
-    Raises
-    ------
-    ValueError
-        No part can be cut so that a tree remains, or on a symmetric body none of those in the middle.
-    """
+    """From a tree of parts one of exactly `count`: linked parts joined, or the parts cut that bend most."""
     while len(links) + 1 != count:
         found = (fewer_parts if len(links) + 1 > count else more_parts)(search, label, count)
         if found is None:
@@ -177,24 +221,13 @@ def fewer_parts(search: PartSearch, label: np.ndarray, count: int, limit: float 
     return None
 
 
-def place_joints(search: PartSearch, label: np.ndarray, motions: Motions, links: np.ndarray) -> np.ndarray:
-    """Points on the template that both parts of a link carry to the same place in every pose.
+def place_joints(surface: PosedSurface, label: np.ndarray, motions: Motions, links: np.ndarray) -> np.ndarray:
+    """Points (n, 3), metres on the template, that both parts of a link (n, 2) carry to one place in every pose.
 
-    Least squares over the poses. Along the axis of a hinge, and where the parts hardly turn, any point will
+    Least squares over the poses. Along the axis of a hinge, and where the parts hardly rotate, any point will
     do: there the joint is drawn to the centroid of the border.
-
-    Parameters
-    ----------
-    search : PartSearch
-    label : (F,) int
-    motions : Motions of the parts
-    links : (n, 2) int
-
-    Returns
-    -------
-    (n, 3) float, metres
     """
-    s = search.surface
+    s = surface
     edge = s.mesh.edges[s.mesh.edge_use == 2]
     middle = s.x[edge].mean(axis=1)
     both = np.sort(label[s.pairs], axis=1)
@@ -215,10 +248,11 @@ def _meeting_point(dR: np.ndarray, gap: np.ndarray, radius: float) -> np.ndarray
     """
     A = np.einsum("mki,mkj->ij", dR, dR) / len(dR)
     b = np.einsum("mki,mk->i", dR, gap) / len(dR)
-    pull = LEAST_PULL
+    pull = least = 1e-4                          # squared radians: rotations below 0.01 say nothing about a joint
+    expected = 0.6 * radius                      # from the border's centroid
     for _ in range(2):
         c = -np.linalg.solve(A + pull * np.eye(3), b)
-        pull = max(LEAST_PULL, float(((dR @ c + gap)**2).sum(axis=1).mean()) / (PRIOR_WIDTH * radius)**2)
+        pull = max(least, float(((dR @ c + gap)**2).sum(axis=1).mean()) / expected**2)
     return c
 
 
@@ -232,15 +266,7 @@ def ring_centre(template: Mesh, ring: np.ndarray) -> np.ndarray:
 
 
 def middle_part(areas: np.ndarray, centres: np.ndarray, links: np.ndarray, joints: np.ndarray) -> int:
-    """The part nearest to the rest of the body, by paths through the joints, weighted by area.
-
-    Parameters
-    ----------
-    areas : (P,) float
-    centres : (P, 3) float, metres
-    links : (P - 1, 2) int
-    joints : (P - 1, 3) float, metres
-    """
+    """The part nearest to the rest of the body, by paths through the joints, weighted by areas (P,)."""
     P = len(areas)
     if P == 1:
         return 0

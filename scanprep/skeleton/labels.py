@@ -5,20 +5,9 @@ import numpy as np
 from scipy.sparse import coo_array, csr_array
 from scipy.sparse.csgraph import breadth_first_order, connected_components, maximum_flow
 
-RESOLUTION = 1e-4                # of the mean own cost: the unit of the integer capacities
-
 
 def field_energy(costs: np.ndarray, pairs: np.ndarray, prices: np.ndarray, label: np.ndarray) -> float:
-    """What a labelling costs: the sum of own costs and of the prices of neighbours that differ.
-
-    Parameters
-    ----------
-    costs : (F, P) float
-    pairs : (n, 2) int
-        Triangles that are neighbours.
-    prices : (n,) float
-    label : (F,) int
-    """
+    """What a labelling (F,) costs: own costs (F, P), and the prices (n,) of neighbours (n, 2) that differ."""
     differ = label[pairs[:, 0]] != label[pairs[:, 1]]
     return float(costs[np.arange(len(label)), label].sum() + prices[differ].sum())
 
@@ -32,7 +21,7 @@ def relabel(costs: np.ndarray, pairs: np.ndarray, prices: np.ndarray, label: np.
     [Articulated] E-step
     """
     around = np.bincount(pairs.ravel(), np.repeat(prices, 2), len(label))
-    unit = max(costs.mean() * RESOLUTION, np.finfo(float).tiny)
+    unit = max(costs.mean() * 1e-4, np.finfo(float).tiny)       # of the integer capacities
     energy = field_energy(costs, pairs, prices, label)
     vain = np.zeros(costs.shape[1], dtype=bool)              # moves that changed nothing, and nothing has changed since
     for _ in range(rounds):

@@ -14,35 +14,17 @@ from scipy.sparse import coo_array, csr_array
 
 from ..geometry.mesh import Mesh
 
-CORE_ROUNDS = 3                  # of weights and motions
-RIGID = 1e-5                     # of the square root of the area: residuals below count as none
-NEWTON = 60                      # steps at most; few are needed unless the points of a set lie on a line
-
 
 @dataclass(frozen=True, eq=False)
 class Moments:
-    """Weighted sums over P sets of vertices, in M poses.
+    """Weighted sums over P sets of vertices, in M poses."""
 
-    Attributes
-    ----------
-    w : (P,) float
-        Σ w.
-    x : (P, 3) float
-        Σ w x, x on the template.
-    y : (P, M, 3) float
-        Σ w y, y in the pose.
-    yx : (P, M, 3, 3) float
-        Σ w y xᵀ.
-    xx, yy : (P,) float
-        Σ w |x|² and Σ w |y|² over all poses.
-    """
-
-    w: np.ndarray
-    x: np.ndarray
-    y: np.ndarray
-    yx: np.ndarray
-    xx: np.ndarray
-    yy: np.ndarray
+    w: np.ndarray  # (P,) float: σ w
+    x: np.ndarray  # (P, 3) float: σ w x, x on the template
+    y: np.ndarray  # (P, M, 3) float: σ w y, y in the pose
+    yx: np.ndarray  # (P, M, 3, 3) float: σ w y xᵀ
+    xx: np.ndarray  # (P,) float: σ w |x|² and Σ w |y|² over all poses
+    yy: np.ndarray  # (P,) float: σ w |x|² and Σ w |y|² over all poses
 
     def each(self) -> tuple[np.ndarray, ...]:
         """All sums, arrays of P rows."""
@@ -69,20 +51,11 @@ class Moments:
 
 @dataclass(frozen=True, eq=False)
 class Motions:
-    """Best rigid motions of P sets in M poses.
+    """Best rigid motions of P sets in M poses."""
 
-    Attributes
-    ----------
-    R : (P, M, 3, 3) float
-    t : (P, M, 3) float, metres
-        `y ≈ R x + t`, in the centred coordinates of `PosedSurface`.
-    cost : (P,) float, square metres
-        Σ w |R x + t - y|², mean over the poses.
-    """
-
-    R: np.ndarray
-    t: np.ndarray
-    cost: np.ndarray
+    R: np.ndarray  # (P, M, 3, 3) float
+    t: np.ndarray  # (P, M, 3) float, metres: `y ≈ R x + t`, in the centred coordinates of `PosedSurface`
+    cost: np.ndarray  # (P,) float, square metres: σ w |R x + t - y|², mean over the poses
 
 
 def fit_motions(moments: Moments) -> Motions:
@@ -125,7 +98,7 @@ def _best_trace(H: np.ndarray) -> np.ndarray:
     a = n0 + n1 + n2
     b = np.maximum(n0 * n1 - d01**2, 0) + np.maximum(n1 * n2 - d12**2, 0) + np.maximum(n0 * n2 - d02**2, 0)
     e = np.sqrt(3 * a)
-    for _ in range(NEWTON):
+    for _ in range(60):                              # few are needed unless the points of a set lie on a line
         over = e * e - a
         slope = over * e - 2 * d
         step = (over * over / 4 - b - 2 * d * e) / np.where(slope > 0, slope, np.inf)
@@ -141,14 +114,9 @@ def union_costs(moments: Moments, pairs: np.ndarray) -> np.ndarray:
 
 
 class PosedSurface:
-    """A template and its poses, centred and laid out for sums over vertices.
+    """A template and its poses (M, N, 3), centred and laid out for sums over vertices.
 
     Vertices weigh as much as the area around them, the whole surface 1.
-
-    Parameters
-    ----------
-    template : Mesh
-    poses : (M, N, 3) float, metres
     """
 
     def __init__(self, template: Mesh, poses: np.ndarray) -> None:
@@ -165,14 +133,7 @@ class PosedSurface:
         self.pair_lengths = template.edge_lengths[template.edge_use == 2]
 
     def moments(self, label: np.ndarray, face_weights: np.ndarray | None = None) -> Moments:
-        """Sums over the triangles of every label; a third of a triangle's weight goes to each corner.
-
-        Parameters
-        ----------
-        label : (F,) int, 0..P-1
-        face_weights : (F,) float, optional
-            Instead of the areas.
-        """
+        """Sums over the triangles of every label; a third of a triangle's weight goes to each corner."""
         weights = self.face_weights if face_weights is None else face_weights
         rows, columns = np.repeat(label, 3), self.mesh.faces.ravel()
         W = csr_array(coo_array((np.repeat(weights / 3, 3), (rows, columns)),
@@ -204,9 +165,10 @@ class PosedSurface:
         core = np.where((share > 0.3)[label], core, self.face_weights)
         sets = [np.flatnonzero((label == p) & (core > 0)) for p in range(label.max() + 1)]
         motions = fit_motions(self.moments(label, core))
-        for _ in range(CORE_ROUNDS):
+        for _ in range(3):
             off = self.face_costs(motions)[np.arange(len(label)), label] / self.face_weights
-            typical = np.array([np.median(off[mine]) for mine in sets]) + RIGID**2 * self.area
+            # residuals below 1e-5 of the square root of the area count as none
+            typical = np.array([np.median(off[mine]) for mine in sets]) + 1e-5**2 * self.area
             motions = fit_motions(self.moments(label, core / (1 + off / typical[label])**2))
         return motions
 

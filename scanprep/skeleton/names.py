@@ -11,10 +11,6 @@ from .tree import Skeleton
 
 ARM = {1: ("arm",), 2: ("upper_arm", "forearm"), 3: ("upper_arm", "forearm", "hand")}
 LEG = {1: ("leg",), 2: ("thigh", "shin"), 3: ("thigh", "shin", "foot")}
-SHORT = 0.45                     # of the next segment: a first segment so short is a shoulder or hip, no upper arm
-UPRIGHT = 0.7                    # cosine: so far the legs go on where the trunk ends
-POINTING = 0.04                  # of the leg's length: so far forward of the ankle the middle of the sole lies
-SOLE, ANKLE = 0.05, (0.12, 0.22)                 # of the leg's length from its end
 
 
 def name_parts(template: Mesh, skeleton: Skeleton, up: np.ndarray | None = None) -> tuple[str, ...]:
@@ -105,7 +101,7 @@ def _person(template: Mesh, skeleton: Skeleton, symmetry: Symmetry) -> _Person |
     hips = roots[order[:2]].mean(axis=0)
     up = (neck - hips) / np.linalg.norm(neck - hips)
     down = np.mean([_end(template, skeleton, leg) for leg in legs], axis=0) - hips
-    if down @ up > -UPRIGHT * np.linalg.norm(down):
+    if down @ up > -0.7 * np.linalg.norm(down):                           # the legs do not go on where the trunk ends
         return None
     return _Person(spine, arms, legs, limbs[order[2]][0], up, hips)
 
@@ -161,15 +157,15 @@ def _left(template: Mesh, skeleton: Skeleton, person: _Person) -> np.ndarray | N
         points, areas = _points(template, skeleton, leg)
         height = points @ person.up
         bottom, size = height.min(), np.ptp(height)
-        sole = height < bottom + SOLE * size
-        ankle = (height > bottom + ANKLE[0] * size) & (height < bottom + ANKLE[1] * size)
+        sole = height < bottom + 0.05 * size
+        ankle = (height > bottom + 0.12 * size) & (height < bottom + 0.22 * size)
         if not sole.any() or not ankle.any():
             return None
         front += (np.average(points[sole], axis=0, weights=areas[sole])
                   - np.average(points[ankle], axis=0, weights=areas[ankle])) / 2
         length += size / 2
     front -= person.up * (front @ person.up)
-    return np.cross(person.up, front) if np.linalg.norm(front) > POINTING * length else None
+    return np.cross(person.up, front) if np.linalg.norm(front) > 0.04 * length else None
 
 
 def _spine_names(person: _Person) -> list[str]:
@@ -188,7 +184,7 @@ def _limb_names(skeleton: Skeleton, limb: list[int], kinds: dict[int, tuple[str,
     places = [_joint(skeleton, a, b) for a, b in zip(limb[1:], limb, strict=False)]
     if n in (3, 4) and len(places) > 1 and skeleton.parents[limb[0]] not in limb:
         lengths = np.linalg.norm(np.diff([skeleton.joints[limb[0]], *places], axis=0), axis=1)
-        if lengths[0] < SHORT * lengths[1]:
+        if lengths[0] < 0.45 * lengths[1]:                  # so short it is a shoulder or hip, no upper arm or thigh
             return first, *kinds[n - 1]
     if n in kinds:
         return kinds[n]

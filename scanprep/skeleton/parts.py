@@ -2,17 +2,18 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Annotated
 
 import numpy as np
 
-from ..ranges import Count, Positive, Seed, Settings
+from ..ranges import FLAG, Count, Positive, Seed, Settings
 from .motions import Moments, Motions, PosedSurface, fit_motions, rigid_costs, union_costs
 from .patches import agglomerate, cover, halve
 from .sides import Sides, mirror_pairs
 from .symmetry import Symmetry
 
-BORDER_WIDTH = 0.01              # of the body's size: how much surface at mean cost a border is worth
-STEADY = 5e-4                    # of the surface: fewer changes of label count as none
+SMALLEST = 0.005                 # of the surface: a smaller part is joined to a neighbour
+FADING = 0.8                     # a part dissolves when its neighbours' motions, blended, explain so much of its own
 
 
 @dataclass(frozen=True)
@@ -27,10 +28,6 @@ class SkeletonConfig(Settings):
         Two neighbours that are less apart become one part, see `PartSearch.separations`.
     tolerance : float
         Residual, as a fraction of the square root of the surface area, that counts as rigid.
-    smallest : float
-        Smallest part, as a fraction of the surface area.
-    smoothness : float
-        Price of the borders between parts.
     patches : int
         Number of patches of the first cover.
     start : int
@@ -41,37 +38,22 @@ class SkeletonConfig(Settings):
         So often the search begins anew, with other patches; the best result is kept.
     seed : int
         Of the random numbers that place the patches.
-    worth : float
-        By how much a part must lower the logarithm of the energy to count in the comparison of restarts.
-    fading : float
-        A part dissolves when its neighbours' motions, blended from place to place, explain so much of its own.
     """
 
-    parts: Count | None = None
+    parts: Annotated[Count | None, FLAG] = None
     separation: Positive = 5.0
     tolerance: Positive = 0.001
-    smallest: Positive = 0.005
-    smoothness: Positive = 1.0
     patches: Count = 300
     start: Count = 30
     symmetric: bool | None = None
     restarts: Count = 3
     seed: Seed = 0
-    worth: Positive = 0.1
-    fading: Positive = 0.8
 
 
 class PartSearch:
-    """The moves of the search: alternate, join, split. On a symmetric body every move is made on both sides.
+    """The moves of the search: alternate, join, split. With a symmetry every move is made on both sides.
 
-    Parameters
-    ----------
-    surface : PosedSurface
-    config : SkeletonConfig
-    symmetry : Symmetry, optional
-        Parts found are symmetric in it.
-    rng : numpy Generator, optional
-        Where the first patches lie.
+    The generator says where the first patches lie.
     """
 
     def __init__(self, surface: PosedSurface, config: SkeletonConfig, symmetry: Symmetry | None = None,
@@ -79,7 +61,7 @@ class PartSearch:
         self.surface, self.config = surface, config
         self.sides = Sides(surface, symmetry)
         self.floor = config.tolerance**2 * surface.area
-        self.width = config.smoothness * BORDER_WIDTH / np.sqrt(surface.area)
+        self.width = 0.01 / np.sqrt(surface.area)       # how much surface at mean cost a metre of border is worth
         self.patch = cover(surface, min(config.patches, len(surface.face_weights)), self.sides, rng)
         self.forget()
 
@@ -105,7 +87,7 @@ class PartSearch:
             moved = self.sides.relabel(costs, self.price(motions, 1.0), label, self.sides.partners(label))
             changed = s.face_weights[moved != label].sum()
             label = moved
-            if changed < STEADY:
+            if changed < 5e-4:                                       # of the surface
                 break
         return np.unique(label, return_inverse=True)[1]
 
@@ -182,7 +164,7 @@ class PartSearch:
         while True:
             pairs, separation, extra = self.separations(label)
             share = np.bincount(label, self.surface.face_weights)
-            open_ = (share[pairs] < self.config.smallest).any(axis=1) | (separation < self.config.separation)
+            open_ = (share[pairs] < SMALLEST).any(axis=1) | (separation < self.config.separation)
             for i in np.flatnonzero(open_)[np.argsort(extra[open_], kind="stable")]:
                 joined = self.alternate(self.join(label, *pairs[i]), rounds=2)
                 if joined.max() < label.max():
@@ -192,14 +174,9 @@ class PartSearch:
                 return label
 
     def split(self, label: np.ndarray, part: int) -> tuple[np.ndarray, float]:
-        """Cut one part where it bends most: in two or, in the middle of a symmetric body, in three.
+        """Labels (F,) with one part cut where it bends most, and how far apart the pieces are, 0 where there is no cut.
 
-        Returns
-        -------
-        (F,) int
-            Labels, more than before; unchanged if no acceptable cut was found.
-        float
-            How far apart the pieces are, 0 where there is no cut.
+        In two or, in the middle of a symmetric body, in three.
         """
         partner = self.sides.partners(label)
         mine = (label == part) | (label == partner[part])
@@ -229,7 +206,7 @@ class PartSearch:
         weights = s.face_weights[mine]
         for _ in range(4):
             shares = np.bincount(local[mine] - 1, weights)
-            if len(shares) < (4 if two else 2) or shares.min() < self.config.smallest:
+            if len(shares) < (4 if two else 2) or shares.min() < SMALLEST:
                 return local, 0.0
             motions = fit_motions(s.moments(local)[1:])
             partner = sides.partners(local)[1:] - 1 if sides.tied else np.arange(len(shares))
@@ -252,18 +229,10 @@ class PartSearch:
 
 
 def find_parts(search: PartSearch) -> np.ndarray:
-    """Labels of triangles such that every label moves rigidly through the poses, as nearly as can be.
+    """Labels (F,) of triangles, each connected, that move through the poses as rigidly as can be.
 
     Many patches are joined greedily, labels and motions alternate while the least separate parts go on
-    being joined; then parts are cut where that shows a motion that was missed.
-
-    Parameters
-    ----------
-    search : PartSearch
-
-    Returns
-    -------
-    (F,) int, 0..P-1, every label connected
+    being joined; then parts are cut where that shows a motion not yet found.
 
     [Articulated]
     """

@@ -5,6 +5,7 @@ import numpy as np
 from scipy.sparse import coo_array, csr_array
 from scipy.sparse.csgraph import dijkstra
 
+from ..geometry.farthest_points import farthest_points
 from .motions import Moments, PosedSurface, rigid_costs, union_costs
 from .sides import Sides, closure
 
@@ -20,32 +21,20 @@ def cover(surface: PosedSurface, count: int, sides: Sides, rng: np.random.Genera
     a, b = sides.pairs.T
     step = np.linalg.norm(centre[a] - centre[b], axis=1)
     graph = csr_array(coo_array((np.r_[step, step], (np.r_[a, b], np.r_[b, a])), shape=(n, n)))
-    distance, patch = np.full(n, np.inf), np.zeros(n, dtype=np.int64)
     seed = int(np.linalg.norm(centre, axis=1).argmax()) if rng is None else int(rng.integers(n))
-    for k in range(min(-(-count // 2) if sides.tied else count, n)):
-        ahead = dijkstra(graph, indices=seed, limit=distance.max())
-        nearer = ahead < distance
-        patch[nearer], distance[nearer] = k, ahead[nearer]
-        seed = int(distance.argmax())
+    seeds = farthest_points(centre, -(-count // 2) if sides.tied else count, seed,
+                            lambda i, limit: dijkstra(graph, indices=i, limit=limit))
+    nearest = dijkstra(graph, indices=seeds, min_only=True, return_predecessors=True)[2]
+    order = np.argsort(seeds)
+    patch = order[np.searchsorted(seeds, nearest, sorter=order)]
     K = int(patch.max()) + 1
     return np.unique(sides.spread(patch, np.r_[np.arange(K) + K, np.arange(K)]), return_inverse=True)[1]
 
 
 def agglomerate(moments: Moments, contacts: np.ndarray, count: int, partner: np.ndarray | None = None) -> np.ndarray:
-    """Join sets that touch, each time the pair whose union costs least more, until `count` are left.
+    """The new number (P,) of every set after those that touch were joined, the cheapest union first, down to `count`.
 
-    Parameters
-    ----------
-    moments : Moments of P sets
-    contacts : (n, 2) int
-    count : int
-        A set and its partner count as one.
-    partner : (P,) int, optional
-        The mirror image of every set: mirror images are joined together.
-
-    Returns
-    -------
-    (P,) int, the new number of every set, from 0
+    A set and its `partner` (P,), the mirror image with which it is joined too, count as one.
     """
     moments = moments[np.arange(len(moments.w))]
     cost = rigid_costs(moments)
@@ -87,19 +76,10 @@ def agglomerate(moments: Moments, contacts: np.ndarray, count: int, partner: np.
 
 
 def halve(moments: Moments, contacts: np.ndarray, group: np.ndarray) -> np.ndarray:
-    """What `agglomerate` down to two sets does, for many groups of sets side by side.
+    """What `agglomerate` down to two sets does, for many groups (P,) of sets side by side.
 
-    Parameters
-    ----------
-    moments : Moments of P sets
-    contacts : (n, 2) int
-        Pairs of sets of one group.
-    group : (P,) int, 0..G-1
-
-    Returns
-    -------
-    (P,) int
-        A set of those that became one; of every group two are left, or as many pieces as it is in.
+    Contacts (n, 2) are of sets of one group. Returns (P,) a set of those that became one; of every group two are left,
+    or as many pieces as it is in.
     """
     moments = moments[np.arange(len(moments.w))]
     cost, owner, pairs = rigid_costs(moments), np.arange(len(group)), contacts

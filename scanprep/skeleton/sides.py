@@ -13,28 +13,15 @@ from .symmetry import Symmetry
 
 
 class Sides:
-    """The side that is labelled and what follows from it on the other.
+    """The side that is labelled and what follows from it on the other; without a symmetry nothing is tied.
 
-    Parameters
-    ----------
-    surface : PosedSurface
-    symmetry : Symmetry, optional
-        Without it nothing is tied.
-
-    Attributes
-    ----------
-    tied : bool
-    half : (H,) int
-        The triangles that are labelled.
-    home : (F,) int
-        For every triangle the place in `half` of itself or of its mirror image.
-    mirrored : (F,) bool
-        Triangles that take the partner of the label of their home.
+    `half` (H,) are the triangles that are labelled, `home` (F,) the place in it of every triangle or of its mirror
+    image, `mirrored` (F,) bool those that take the partner of the label of their home.
     """
 
     def __init__(self, surface: PosedSurface, symmetry: Symmetry | None = None) -> None:
         F = len(surface.face_weights)
-        self.tied = symmetry is not None and bool(symmetry.left.any()) and not bool(symmetry.left.all())
+        self.tied = symmetry is not None and symmetry.two_sided
         self.mirrored = ~symmetry.left if symmetry is not None and self.tied else np.zeros(F, dtype=bool)
         self.half = np.flatnonzero(~self.mirrored)
         self.home = np.arange(F)
@@ -68,16 +55,9 @@ class Sides:
 
     def relabel(self, costs: np.ndarray, price: float, label: np.ndarray, partner: np.ndarray,
                 inside: np.ndarray | None = None) -> np.ndarray:
-        """Better labels for costs (F, P) and a price for every metre of border, every label connected.
+        """Better labels (F,) for costs (F, P) and a price for every metre of border, every label connected.
 
-        Parameters
-        ----------
-        costs : (F, P) float
-        price : float
-        label : (F,) int
-        partner : (P,) int
-        inside : (F,) bool, optional
-            Only these change; the labels of the others do not matter to them.
+        Only triangles `inside` (F,) bool change; the labels of the others do not matter to them.
         """
         here = np.arange(len(self.half)) if inside is None else np.flatnonzero(inside[self.half])
         P = costs.shape[1]

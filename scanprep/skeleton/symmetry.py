@@ -12,64 +12,56 @@ from ..geometry.sparse import factor
 from ..geometry.surface import OrientedPoints
 from .labels import keep_connected
 
-SAMPLES = 800                        # points of the surface that planes are tried with
-ROUNDS = 60                          # of pairs and plane, at most
-POSES = 24                           # that are tried where the body is not symmetric at rest
-DIRECTIONS = 60                      # of planes, over half the sphere
 NORMAL_WEIGHT = 0.05                 # of the body's size: how much distance a difference of normals weighs
-STIFFNESS = (300.0, 100.0, 30.0, 10.0, 3.0)       # of the warp that takes the mirror image onto the body, falling
 SYMMETRIC = 0.03                     # of the body's size: the mirror image lies so near the body, RMS
-NEAR = 0.02                          # of the body's size: near by
 RETURNS = 0.8                        # of the surface that comes back to where it was when mirrored twice
 
 
 @dataclass(frozen=True, eq=False)
-class Symmetry:
-    """The plane of symmetry and the mirror image of every triangle.
+class MirrorPlane:
+    """A plane that mirrors points."""
 
-    Attributes
-    ----------
-    normal : (3,) float
-        Unit normal of the plane, in the coordinates of the body it was found in.
-    point : (3,) float, metres
-        On the plane.
-    partner : (F,) int
-        The triangle where the mirror image of each triangle lies; for many, but not all, of an odd triangulation the
-        partner's partner is the triangle itself.
-    left : (F,) bool
-        On the side the normal points to.
-    distance : float
-        Of the mirror image from the body, RMS, as a share of the body's size.
-    returns : float
-        Share of the surface whose partner's partner is near by.
-    image : (N, 3) float, metres
-        Where the mirror image of every vertex comes to lie, bent onto the body in the pose it was found in.
-    pose : int
-        The pose it was found in, -1 for the template.
-    """
+    normal: np.ndarray  # (3,) float, unit
+    point: np.ndarray  # (3,) float, metres: on the plane
 
-    normal: np.ndarray
-    point: np.ndarray
+    @staticmethod
+    def between(x: np.ndarray, y: np.ndarray) -> MirrorPlane:
+        """The plane that mirrors points (n, 3) as nearly as can be onto y (n, 3), by least squares."""
+        cross = (x - x.mean(axis=0)).T @ (y - y.mean(axis=0))
+        return MirrorPlane(np.linalg.eigh(cross + cross.T)[1][:, 0], (x.mean(axis=0) + y.mean(axis=0)) / 2)
+
+    @property
+    def matrix(self) -> np.ndarray:
+        """(3, 3) the reflection M of directions."""
+        return np.eye(3) - 2 * np.outer(self.normal, self.normal)
+
+    def reflect(self, points: np.ndarray) -> np.ndarray:
+        """Mirrored points (..., 3), metres."""
+        return points - 2 * ((points - self.point) @ self.normal)[..., None] * self.normal
+
+
+@dataclass(frozen=True, eq=False)
+class Symmetry(MirrorPlane):
+    """The plane of symmetry, in the coordinates of the body it was found in, and the mirror image of every triangle."""
+
+    # (F,) int: the triangle where the mirror image of each triangle lies; for many, but not all, of an odd
+    # triangulation the partner's partner is the triangle itself
     partner: np.ndarray
-    left: np.ndarray
-    distance: float
-    returns: float
-    image: np.ndarray
-    pose: int = -1
+    left: np.ndarray  # (F,) bool: on the side the normal points to
+    distance: float  # of the mirror image from the body, RMS, as a share of the body's size
+    returns: float  # share of the surface whose partner's partner is near by
+    image: np.ndarray  # (N, 3) float, metres: the mirror image of every vertex, bent onto the body in that pose
+    pose: int = -1  # the pose it was found in, -1 for the template
 
     @property
     def holds(self) -> bool:
         """Whether the body is symmetric, within the tolerances above."""
         return self.distance <= SYMMETRIC and self.returns >= RETURNS
 
-    def reflect(self, points: np.ndarray) -> np.ndarray:
-        """Mirrored points (..., 3), metres."""
-        return reflect(points, self.normal, self.point)
-
-
-def reflect(points: np.ndarray, normal: np.ndarray, point: np.ndarray) -> np.ndarray:
-    """Points (..., 3) mirrored in a plane."""
-    return points - 2 * ((points - point) @ normal)[..., None] * normal
+    @property
+    def two_sided(self) -> bool:
+        """Whether there are triangles on either side."""
+        return bool(self.left.any()) and not bool(self.left.all())
 
 
 def find_symmetry(template: Mesh, poses: np.ndarray | None = None) -> Symmetry:
@@ -78,26 +70,16 @@ def find_symmetry(template: Mesh, poses: np.ndarray | None = None) -> Symmetry:
     It is sought at rest and, where the body does not stand symmetrically there, in its most symmetric pose: planes in
     all directions through the middle, the best ones fitted to nearest points, and a smooth warp from the mirror image
     onto the body, so that a stance that is not quite symmetric does no harm. Nothing is taken from the numbers of
-    vertices.
-
-    Parameters
-    ----------
-    template : Mesh
-    poses : (M, N, 3) float, metres, optional
-
-    Returns
-    -------
-    Symmetry
-        `holds` says whether the body is symmetric at all.
+    vertices. `holds` says whether the body is symmetric at all.
     """
-    few = _spread(template, SAMPLES)
-    at_rest = _matched(template, *_best_plane(template, few)[1:], -1)
+    few = _spread(template, 800)
+    at_rest = _matched(template, _best_plane(template, few)[1], -1)
     if at_rest.holds or poses is None:
         return at_rest
-    chosen = np.unique(np.linspace(0, len(poses) - 1, min(len(poses), POSES)).astype(int))
+    chosen = np.unique(np.linspace(0, len(poses) - 1, min(len(poses), 24)).astype(int))
     planes = [_best_plane(template.with_vertices(poses[m]), few) for m in chosen]
-    best = int(np.argmin([distance for distance, _, _ in planes]))
-    posed = _matched(template.with_vertices(poses[chosen[best]]), *planes[best][1:], int(chosen[best]))
+    best = int(np.argmin([distance for distance, _ in planes]))
+    posed = _matched(template.with_vertices(poses[chosen[best]]), planes[best][1], int(chosen[best]))
     return posed if posed.holds or posed.distance < at_rest.distance else at_rest
 
 
@@ -107,8 +89,8 @@ def _spread(template: Mesh, count: int) -> np.ndarray:
     return np.unique(cKDTree(template.vertices).query(points)[1])
 
 
-def _best_plane(body: Mesh, few: np.ndarray) -> tuple[float, np.ndarray, np.ndarray]:
-    """Distance of the mirror image (a share of the size), normal and point of the best plane."""
+def _best_plane(body: Mesh, few: np.ndarray) -> tuple[float, MirrorPlane]:
+    """Distance of the mirror image (a share of the size) and the plane that is best."""
     size = _size(body)
     x, normals = body.vertices[few], body.vertex_normals[few]
     target = OrientedPoints(x, normals, NORMAL_WEIGHT * size)
@@ -116,24 +98,25 @@ def _best_plane(body: Mesh, few: np.ndarray) -> tuple[float, np.ndarray, np.ndar
     axes = np.linalg.eigh(np.cov(x.T))[1].T
     axes[(((x - centre) @ axes.T)**3).sum(axis=0) < 0] *= -1                # the same whichever way the body is turned
 
-    def fitted(normal: np.ndarray, point: np.ndarray, rounds: int) -> tuple[float, np.ndarray, np.ndarray]:
+    def fitted(plane: MirrorPlane, rounds: int) -> tuple[float, MirrorPlane]:
         before = np.zeros(0)
         for _ in range(rounds):
-            nearest = target.match(reflect(x, normal, point), _turned(normals, normal), min_cosine=-1.0).index
+            nearest = target.match(plane.reflect(x), _mirrored(normals, plane), min_cosine=-1.0).index
             if np.array_equal(nearest, before):
                 break
-            before, y = nearest, x[nearest]
-            point = (x.mean(axis=0) + y.mean(axis=0)) / 2
-            cross = (x - x.mean(axis=0)).T @ (y - y.mean(axis=0))
-            normal = np.linalg.eigh(cross + cross.T)[1][:, 0]
-        match = target.match(reflect(x, normal, point), _turned(normals, normal), min_cosine=-1.0)
-        apart = np.sqrt(match.distances**2 + target.scale**2 * ((target.normals[match.index]
-                                                                - _turned(normals, normal))**2).sum(axis=1))
-        return float(np.sqrt((apart**2).mean())) / size, normal, point
+            before, plane = nearest, MirrorPlane.between(x, x[nearest])
+        image = _mirrored(normals, plane)
+        match = target.match(plane.reflect(x), image, min_cosine=-1.0)
+        off = target.scale**2 * ((target.normals[match.index] - image)**2).sum(axis=1)
+        return float(np.sqrt((match.distances**2 + off).mean())) / size, plane
 
-    rough = [fitted(normal, centre, 0) for normal in np.vstack([axes, _half_sphere(DIRECTIONS) @ axes])]
-    rough.sort(key=lambda plane: plane[0])
-    return min((fitted(normal, point, ROUNDS) for _, normal, point in rough[:5]), key=lambda plane: plane[0])
+    k = np.arange(60)                                            # directions spread evenly over half the sphere
+    z, angle = (k + 0.5) / len(k), k * np.pi * (3 - np.sqrt(5))
+    r = np.sqrt(1 - z**2)
+    around = np.stack([r * np.cos(angle), r * np.sin(angle), z], axis=1)
+    rough = [fitted(MirrorPlane(normal, centre), 0) for normal in np.vstack([axes, around @ axes])]
+    rough.sort(key=lambda found: found[0])
+    return min((fitted(plane, 60) for _, plane in rough[:5]), key=lambda found: found[0])
 
 
 def _size(body: Mesh) -> float:
@@ -141,40 +124,31 @@ def _size(body: Mesh) -> float:
     return 2 * float(np.linalg.norm(body.vertices - body.vertices.mean(axis=0), axis=1).max())
 
 
-def _half_sphere(count: int) -> np.ndarray:
-    """(count, 3) directions spread evenly over half the sphere."""
-    k = np.arange(count)
-    z, turn = (k + 0.5) / count, k * np.pi * (3 - np.sqrt(5))
-    r = np.sqrt(1 - z**2)
-    return np.stack([r * np.cos(turn), r * np.sin(turn), z], axis=1)
+def _mirrored(normals: np.ndarray, plane: MirrorPlane) -> np.ndarray:
+    return MirrorPlane(plane.normal, np.zeros(3)).reflect(normals)
 
 
-def _turned(normals: np.ndarray, normal: np.ndarray) -> np.ndarray:
-    return reflect(normals, normal, np.zeros(3))
-
-
-def _matched(body: Mesh, normal: np.ndarray, point: np.ndarray, pose: int) -> Symmetry:
+def _matched(body: Mesh, plane: MirrorPlane, pose: int) -> Symmetry:
     """Warp the mirror image of a body onto it and pair the triangles."""
     size = _size(body)
     target = OrientedPoints(body.vertices, body.vertex_normals, NORMAL_WEIGHT * size)
-    start = reflect(body.vertices, normal, point)
+    start = plane.reflect(body.vertices)
     graph = body.vertex_adjacency
     laplacian = diags_array(np.asarray(graph.sum(axis=1)).ravel()) - graph
-    image, flipped = start, body.faces[:, ::-1]
-    for stiffness in STIFFNESS:
-        normals = Mesh(image, flipped).vertex_normals
+    image, inside_out = start, body.faces[:, ::-1]
+    for stiffness in (300.0, 100.0, 30.0, 10.0, 3.0):
+        normals = Mesh(image, inside_out).vertex_normals
         match = target.match(image, normals)
         weight = match.valid / (1 + (match.distances / (0.03 * size))**2)
         weight[~match.valid] = 0
         solve = factor(csc_array(diags_array(weight + 1e-6) + stiffness * laplacian))
         image = start + solve(weight[:, None] * (body.vertices[match.index] - start))
-    return _paired(body, start, image, normal, point, pose)
+    return _paired(body, start, image, plane, pose)
 
 
-def _paired(body: Mesh, start: np.ndarray, image: np.ndarray, normal: np.ndarray, point: np.ndarray, pose: int
-            ) -> Symmetry:
+def _paired(body: Mesh, start: np.ndarray, image: np.ndarray, plane: MirrorPlane, pose: int) -> Symmetry:
     """Pair triangles by the warped mirror image (N, 3) of the body, which began at `start` (N, 3)."""
-    size = _size(body)
+    size, normal = _size(body), plane.normal
     centres, areas, normals = body.corners.mean(axis=1), body.face_areas, body.face_normals
     seen, seen_normals = image[body.faces].mean(axis=1), Mesh(image, body.faces[:, ::-1]).face_normals
 
@@ -193,8 +167,8 @@ def _paired(body: Mesh, start: np.ndarray, image: np.ndarray, normal: np.ndarray
     for here, there in (sides, sides[::-1]):                     # a partner lies on the other side
         if len(here) and len(there):
             partner[here] = nearest(there, here)[0]
-    back = np.linalg.norm(centres[partner[partner]] - centres, axis=1) < NEAR * size
+    back = np.linalg.norm(centres[partner[partner]] - centres, axis=1) < 0.02 * size
     moved = np.average(((start - image)**2).sum(axis=1), weights=body.vertex_areas)
     distance = np.sqrt(moved + np.average(apart**2, weights=areas)) / size
-    return Symmetry(normal, point, partner, left, float(distance), float(areas[back].sum() / areas.sum()), image,
+    return Symmetry(normal, plane.point, partner, left, float(distance), float(areas[back].sum() / areas.sum()), image,
                     pose)

@@ -1,7 +1,6 @@
 """The articulated skeleton: parts of the surface, a tree over them, and a joint for every link."""
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
@@ -108,11 +107,6 @@ class Skeleton:
         A joint is a fixed affine combination of the vertices around the ring where the parts meet (for
         the root: the mean of its vertices), so on any posed or reshaped body `regressor @ vertices` are
         its joints.
-
-        Raises
-        ------
-        ValueError
-            A part that does not touch its parent.
         """
         rings, values = zip(*(self.joint_weights(template, j) for j in range(len(self.parents))), strict=True)
         rows = np.repeat(np.arange(len(rings)), [len(r) for r in rings])
@@ -158,6 +152,12 @@ class Skeleton:
                 vertices[..., mine, :])[0]
         return R
 
+    def with_root_centred(self, template: Mesh) -> Skeleton:
+        """The same with `joints[0]` at the centroid of the vertices of part 0."""
+        joints = self.joints.copy()
+        joints[0] = template.vertices[self.part_of_vertex(template) == 0].mean(axis=0)
+        return Skeleton(self.part_of_face, self.parents, joints, self.names)
+
     def save(self, path: str | Path) -> None:
         """Write as JSON."""
         storage.write_json(path, {
@@ -166,13 +166,7 @@ class Skeleton:
 
     @staticmethod
     def load(path: str | Path) -> Skeleton:
-        """Read a file of `save`.
-
-        Raises
-        ------
-        StorageError
-            Missing, not a skeleton, or a version that is not known.
-        """
+        """Read a file of `save`."""
         stored = storage.read_json(path, "a skeleton")
         if not isinstance(stored, dict) or stored.get("kind") != "skeleton":
             raise storage.StorageError(f"{path}: expected a skeleton in JSON, found something else")
@@ -193,23 +187,12 @@ def _affine_weights(points: np.ndarray, target: np.ndarray) -> np.ndarray:
     return start + np.linalg.lstsq(A, b - A @ start, rcond=None)[0]
 
 
-def reorder(part_of_face: np.ndarray, parents: Sequence[int], root: int) -> np.ndarray:
-    """Order of the parts (old numbers) that puts `root` first and every parent before its children.
-
-    Parameters
-    ----------
-    parents : J ints
-        An undirected tree given by any rooting, -1 at its root.
-    """
-    links: dict[int, list[int]] = {p: [] for p in range(len(parents))}
-    for child, parent in enumerate(parents):
-        if parent >= 0:
-            links[child].append(int(parent))
-            links[int(parent)].append(child)
-    size = np.bincount(part_of_face, minlength=len(parents))
+def reorder(part_of_face: np.ndarray, links: np.ndarray, root: int) -> np.ndarray:
+    """Order of the parts (old numbers), linked (J - 1, 2), that puts `root` first and parents before their children."""
+    size = np.bincount(part_of_face)
     order, seen = [root], {root}
     for part in order:
-        ahead = sorted((q for q in links[part] if q not in seen), key=lambda q: (-size[q], q))
-        order += ahead
-        seen.update(ahead)
+        near = {int(a + b - part) for a, b in links if part in (a, b)}
+        order += sorted(near - seen, key=lambda q: (-size[q], q))
+        seen |= near
     return np.array(order)

@@ -5,12 +5,15 @@ as (sideways, frontwards, up) and mirrored.
 """
 from __future__ import annotations
 
+import json
 from dataclasses import dataclass, fields
+from pathlib import Path
+from types import SimpleNamespace
+from typing import Annotated, Any
 
 import numpy as np
 
-from . import profiles as tables
-from .implicit_surface import Field, Group, Mirrored
+from ..ranges import Range, Settings, ranges
 
 PARTS = ("pelvis", "abdomen", "chest", "head",
          "l_upper_arm", "l_forearm", "l_hand", "r_upper_arm", "r_forearm", "r_hand",
@@ -20,8 +23,23 @@ MIRROR_PART = np.array([0, 1, 2, 3, 7, 8, 9, 4, 5, 6, 13, 14, 15, 10, 11, 12])
 ARM_ANGLE, ELBOW_ANGLE, LEG_ANGLE, TOE_OUT = np.radians([36.0, 14.0, 4.5, 9.0])
 
 
+def _tables() -> SimpleNamespace:
+    """The tables of `anatomy.json`, where it says what their columns are: arrays, or as they stand."""
+    stored = json.loads(Path(__file__).with_name("anatomy.json").read_text(encoding="utf-8"))
+    rows: dict[str, Any] = {name: table["rows"] for name, table in stored.items() if name != "about"}
+    for name, value in rows.items():
+        if isinstance(value, list) and not name.endswith("muscles"):
+            rows[name] = np.array(value)
+    rows["leg_woman"] = rows["leg_man"] + rows["leg_woman_difference"]
+    rows["trunk_fat_woman"] = rows["trunk_fat"] * rows["trunk_fat_woman"]
+    return SimpleNamespace(**rows)
+
+
+tables = _tables()
+
+
 @dataclass(frozen=True)
-class BodyShape:
+class BodyShape(Settings):
     """What makes one person's build differ from another's.
 
     Except for sex and stature, 0 is the average of the sex and 1 a standard deviation above it.
@@ -48,29 +66,26 @@ class BodyShape:
         A value outside its range.
     """
 
-    sex: float = 1.0
-    stature: float = 1.75
-    weight: float = 0.0
-    muscle: float = 0.0
-    leg_length: float = 0.0
-    arm_length: float = 0.0
-    shoulder_width: float = 0.0
-    hip_width: float = 0.0
-    belly: float = 0.0
-    chest: float = 0.0
-    neck: float = 0.0
-    head_size: float = 0.0
-    limbs: float = 0.0
-    extremities: float = 0.0
-    nose: float = 0.0
+    sex: Annotated[float, Range(-1, 1)] = 1.0
+    stature: Annotated[float, Range(1.45, 2.05)] = 1.75
+    weight: Annotated[float, Range(-1.8, 3)] = 0.0
+    muscle: Annotated[float, Range(-2, 3)] = 0.0
+    leg_length: Annotated[float, Range(-2.5, 2.5)] = 0.0
+    arm_length: Annotated[float, Range(-2.5, 2.5)] = 0.0
+    shoulder_width: Annotated[float, Range(-2.5, 2.5)] = 0.0
+    hip_width: Annotated[float, Range(-2.5, 2.5)] = 0.0
+    belly: Annotated[float, Range(-1.5, 3)] = 0.0
+    chest: Annotated[float, Range(-2, 3)] = 0.0
+    neck: Annotated[float, Range(-2.5, 2.5)] = 0.0
+    head_size: Annotated[float, Range(-2.5, 2.5)] = 0.0
+    limbs: Annotated[float, Range(-2, 2)] = 0.0
+    extremities: Annotated[float, Range(-2.5, 2.5)] = 0.0
+    nose: Annotated[float, Range(-2, 2.5)] = 0.0
 
     def __post_init__(self) -> None:
         for field in fields(self):
-            low, high = RANGES[field.name]
-            value = float(getattr(self, field.name))
-            if not low <= value <= high:
-                raise ValueError(f"{field.name}: expected {low} to {high}, got {value}")
-            object.__setattr__(self, field.name, value)
+            object.__setattr__(self, field.name, float(getattr(self, field.name)))
+        super().__post_init__()
 
     def array(self) -> np.ndarray:
         """(15,) the values in the order of the fields."""
@@ -83,15 +98,7 @@ class BodyShape:
 
     @staticmethod
     def random(rng: np.random.Generator, sex: float | None = None, spread: float = 1.0) -> BodyShape:
-        """A plausible person: stature from the population, the rest normal within its range.
-
-        Parameters
-        ----------
-        sex : -1 to 1, optional
-            A man or a woman at equal chance when not given.
-        spread : float
-            Factor on the standard deviations.
-        """
+        """A plausible person: stature from the population, the rest normal within its range."""
         if sex is None:
             sex = 1.0 if rng.random() < 0.5 else -1.0
         man = (sex + 1) / 2
@@ -100,35 +107,24 @@ class BodyShape:
         scale = {"weight": 0.9, "muscle": 0.8, "belly": 0.7, "chest": 0.8, "limbs": 0.7}
         for field in fields(BodyShape)[2:]:
             values[field.name] = spread * scale.get(field.name, 0.9) * rng.normal()
-        return BodyShape(**{name: float(np.clip(v, *RANGES[name])) for name, v in values.items()})
-
-
-RANGES = {"sex": (-1.0, 1.0), "stature": (1.45, 2.05), "weight": (-1.8, 3.0), "muscle": (-2.0, 3.0),
-          "leg_length": (-2.5, 2.5), "arm_length": (-2.5, 2.5), "shoulder_width": (-2.5, 2.5),
-          "hip_width": (-2.5, 2.5), "belly": (-1.5, 3.0), "chest": (-2.0, 3.0), "neck": (-2.5, 2.5),
-          "head_size": (-2.5, 2.5), "limbs": (-2.0, 2.0), "extremities": (-2.5, 2.5), "nose": (-2.0, 2.5)}
+        allowed = {name: (found.low, found.high) for name, (found, _) in ranges(BodyShape).items()}
+        return BodyShape(**{name: float(np.clip(v, *allowed[name])) for name, v in values.items()})
 
 
 class Anatomy:
-    """Joints, frames and the implicit surface of one person at rest.
+    """Joints and frames of one person at rest.
 
-    Attributes
-    ----------
-    joints : (16, 3) float, metres
-        Centre of rotation of every part; of part 0 the middle between the hips.
-    ends : (16, 3) float, metres
-        The far end of every part's bone.
-    field : the implicit surface
+    `joints` (16, 3), metres, are the centres of rotation of the parts, of part 0 the middle between the hips, `ends`
+    (16, 3) the far ends of their bones.
     """
 
     def __init__(self, shape: BodyShape) -> None:
         self.shape = s = shape
         self.man = w = (s.sex + 1) / 2
         self.fat = s.weight + 0.45 * w + 0.70 * (1 - w)       # the tables are of lean people
-        self.scale = s.stature / (w * tables.MAN + (1 - w) * tables.WOMAN)
+        self.scale = s.stature / (w * tables.stature["man"] + (1 - w) * tables.stature["woman"])
         self._levels()
         self._place_joints()
-        self._build_field()
 
     def mix(self, man: np.ndarray | float, woman: np.ndarray | float) -> np.ndarray:
         """Between the man's and the woman's value, scaled with stature."""
@@ -136,10 +132,10 @@ class Anatomy:
 
     def _levels(self) -> None:
         s = self.shape
-        level = {name: float(self.mix(tables.LEVELS["man"][name], tables.LEVELS["woman"][name]))
-                 for name in tables.LEVELS["man"]}
-        width = {name: float(self.mix(tables.WIDTHS["man"][name], tables.WIDTHS["woman"][name]))
-                 for name in tables.WIDTHS["man"]}
+        level = {name: float(self.mix(tables.levels["man"][name], tables.levels["woman"][name]))
+                 for name in tables.levels["man"]}
+        width = {name: float(self.mix(tables.widths["man"][name], tables.widths["woman"][name]))
+                 for name in tables.widths["man"]}
         self.head_scale = float(self.man + (1 - self.man) * 0.945) * self.scale**0.5 * (1 + 0.022 * s.head_size)
         leg = 1 + 0.03 * s.leg_length
         for name in ("ankle", "knee", "hip"):
@@ -196,16 +192,6 @@ class Anatomy:
         for left, right in ((4, 7), (5, 8), (6, 9), (10, 13), (11, 14), (12, 15)):
             joints[right], ends[right] = joints[left] * [-1, 1, 1], ends[left] * [-1, 1, 1]
         self.joints, self.ends = joints, ends
-
-    def _build_field(self) -> None:
-        from .body_parts import arm, hand, leg, trunk, trunk_bumps
-        from .head import head
-
-        torso, shoulders = trunk(self)
-        body: list[tuple[Field, float]] = [*torso, (leg(self), 0.035 * self.scale)]
-        left = Group([(Group(body), 0), *shoulders, (arm(self), 0.048 * self.scale)], trunk_bumps(self))
-        members: list[tuple[Field, float]] = [(left, 0), (head(self), 0.012), (hand(self), 0.012)]
-        self.field: Field = Mirrored(Group(members))
 
     def front(self, side: float, front: float, up: float) -> np.ndarray:
         """World point of (sideways, frontwards, up)."""

@@ -3,11 +3,18 @@ from __future__ import annotations
 
 import numpy as np
 
-from . import profiles as tables
-from .anatomy import Anatomy
-from .implicit_surface import Bump, Ellipsoid, Field, Group, Loft, RoundCone
+from .anatomy import Anatomy, tables
+from .implicit_surface import Bump, Ellipsoid, Field, Group, Loft, Mirrored, RoundCone
 
 UPRIGHT = np.array([[1.0, 0, 0], [0, -1.0, 0], [0, 0, 1.0]])       # rows: sideways, frontwards, up
+
+
+def body_surface(a: Anatomy) -> Field:
+    """The implicit surface of the whole body at rest."""
+    torso, shoulders = trunk(a)
+    body: list[tuple[Field, float]] = [*torso, (leg(a), 0.035 * a.scale)]
+    left = Group([(Group(body), 0), *shoulders, (arm(a), 0.048 * a.scale)], trunk_bumps(a))
+    return Mirrored(Group([(left, 0), (head(a), 0.012), (hand(a), 0.012)]))
 
 
 def cross_sections(at: np.ndarray, out: np.ndarray, inner: np.ndarray, front: np.ndarray, back: np.ndarray,
@@ -20,9 +27,9 @@ def cross_sections(at: np.ndarray, out: np.ndarray, inner: np.ndarray, front: np
 def trunk(a: Anatomy) -> tuple[list[tuple[Field, float]], list[tuple[Field, float]]]:
     """Trunk with buttocks and breasts; neck and shoulder line."""
     s, g, man = a.shape, a.scale, a.man
-    table = man * tables.TRUNK_MAN + (1 - man) * tables.TRUNK_WOMAN
-    fat = man * tables.TRUNK_FAT + (1 - man) * tables.TRUNK_FAT_WOMAN
-    body = table[:, 1:4] + a.fat * fat + s.muscle * tables.TRUNK_MUSCLE
+    table = man * tables.trunk_man + (1 - man) * tables.trunk_woman
+    fat = man * tables.trunk_fat + (1 - man) * tables.trunk_fat_woman
+    body = table[:, 1:4] + a.fat * fat + s.muscle * tables.trunk_muscle
     up = table[:, 0]
     belly = np.exp(-((up - 0.28) / 0.20)**2)
     body[:, 1] += s.belly * 0.017 * belly
@@ -99,10 +106,10 @@ def _limb(a: Anatomy, origin: np.ndarray, frame: np.ndarray, at: np.ndarray, ext
 def leg(a: Anatomy) -> Field:
     """Leg and foot."""
     s, g = a.shape, a.scale
-    own = a.man + (1 - a.man) * tables.WOMAN / tables.MAN           # the tables are for a man's size
-    table = a.man * tables.LEG_MAN + (1 - a.man) * tables.LEG_WOMAN
+    own = a.man + (1 - a.man) * tables.stature["woman"] / tables.stature["man"]    # the tables are for a man's size
+    table = a.man * tables.leg_man + (1 - a.man) * tables.leg_woman
     fat = a.fat * (1.0 + 0.25 * (1 - a.man)) + 0.7 * s.limbs
-    grown = fat * tables.LEG_FAT[:, None] * [1.2, 0.45, 1.0, 1.0] + s.muscle * tables.LEG_MUSCLE
+    grown = fat * tables.leg_fat[:, None] * [1.2, 0.45, 1.0, 1.0] + s.muscle * tables.leg_muscle
     extents = table[:, 1:] * (1 - 0.035 * (1 - a.man)) + grown * own
     extents = extents * g
     thigh = np.linalg.norm(a.joints[11] - a.joints[10])
@@ -136,7 +143,7 @@ def foot(a: Anatomy) -> Field:
     ankle = a.joints[12]
     sole = 0.140 * length
     origin = np.array([ankle[0], ankle[1], sole])
-    t, shift, half, top, bottom = (tables.FOOT * length).T
+    t, shift, half, top, bottom = (tables.foot * length).T
     centre, extent = (top - bottom) / 2, (top + bottom) / 2
     wide = 1 + 0.02 * a.fat
     main = Loft(origin, frame, cross_sections(t, half * wide, half * wide, extent, extent, 2.8, shift, centre),
@@ -154,13 +161,13 @@ def foot(a: Anatomy) -> Field:
 def arm(a: Anatomy) -> Field:
     """Upper arm and forearm."""
     s, g = a.shape, a.scale
-    thin = (a.man + (1 - a.man) * tables.ARM_WOMAN) * g
+    thin = (a.man + (1 - a.man) * tables.arm_woman) * g
     fat = a.fat * (1.0 + 0.2 * (1 - a.man)) + 0.6 * s.limbs
-    upper, fore = tables.UPPER_ARM_MAN, tables.FOREARM_MAN
-    extents = upper[:, 1:] + fat * tables.UPPER_ARM_FAT[:, None] + s.muscle * tables.UPPER_ARM_MUSCLE
+    upper, fore = tables.upper_arm_man, tables.forearm_man
+    extents = upper[:, 1:] + fat * tables.upper_arm_fat[:, None] + s.muscle * tables.upper_arm_muscle
     first = _limb(a, a.joints[4], a.upper_arm_frame, upper[:, 0] * a.width["upper_arm"], extents * thin,
                   (0.03 * g, 0.02 * g))
-    extents = fore[:, 1:] + fat * tables.FOREARM_FAT[:, None] + s.muscle * tables.FOREARM_MUSCLE[:, None]
+    extents = fore[:, 1:] + fat * tables.forearm_fat[:, None] + s.muscle * tables.forearm_muscle[:, None]
     second = _limb(a, a.joints[5], a.forearm_frame, fore[:, 0] * a.width["forearm"], extents * thin,
                    (0.02 * g, 0.006 * g))
     elbow, wrist, f = a.joints[5], a.joints[6], a.forearm_frame
@@ -243,3 +250,68 @@ def trunk_bumps(a: Anatomy) -> list[Bump]:
             bump(0.110, 0.09, 0.15, 0.004 * lean, (0.022, 0.03, 0.020)),
             bump(0.070, 0.09, -0.03, -0.004, (0.030, 0.04, 0.016)),
             bump(0.0, 0.075, -0.165, 0.017 * man, (0.026, 0.04, 0.030))]
+
+
+def head(a: Anatomy) -> Field:
+    """Skull, face and ears."""
+    s, h, man = a.shape, a.head_scale, a.man
+
+    def at(side: float, front: float, up: float) -> np.ndarray:
+        return a.eye + np.array([side, -front, up]) * h
+
+    cranium = Ellipsoid(at(0, -0.008, 0.0195), np.array([0.0755, 0.0965, 0.0895]) * h)
+    hair = Ellipsoid(at(0, -0.020, 0.0255 - 0.004 * (1 - man)),
+                     np.array([0.0785 + 0.004 * (1 - man), 0.0940 + 0.004 * (1 - man),
+                               0.087 + 0.004 * (1 - man)]) * h)
+    up = np.array([0.052, 0.022, 0.0, -0.030, -0.058, -0.082, -0.100])
+    half = np.array([0.064, 0.0675, 0.068, 0.0665, 0.059 - 0.002 * (1 - man), 0.048 - 0.004 * (1 - man),
+                     0.034 - 0.003 * (1 - man)]) + a.fat * np.array([0, 0, 0.0005, 0.002, 0.003, 0.0035, 0.003])
+    fore = np.array([0.082, 0.089, 0.0875, 0.088, 0.0885, 0.0855, 0.0785])
+    back = np.array([0.07, 0.07, 0.07, 0.06, 0.045, 0.03, 0.02])
+    face = Loft(a.eye, UPRIGHT, cross_sections(up[::-1], half[::-1], half[::-1], fore[::-1], back[::-1], 2.25) *
+                np.array([h] * 7 + [1.0]), (0.010 * h, 0.03 * h))
+    big = 1 + 0.20 * s.nose + 0.06 * (man - 0.5)
+    nose = RoundCone(at(0, 0.086, 0.010), at(0, 0.0945 + 0.012 * big, -0.036), 0.0065 * h, 0.0095 * h)
+    wing = Ellipsoid(at(0.0115, 0.0965, -0.0395), np.array([0.0075, 0.0095, 0.0065]) * h)
+    eyeball = Ellipsoid(at(0.0315, 0.0715, -0.001), np.array([0.0160, 0.0125, 0.0115]) * h)
+    bun = Ellipsoid(at(0, -0.119 + 0.052 * man, 0.034), np.array([0.031, 0.029, 0.030]) * h)
+    lean = np.radians(14)
+    flare = np.radians(30)
+    ear_frame = np.array([[np.cos(flare), -np.sin(flare), 0], [np.sin(flare), np.cos(flare), 0], [0, 0, 1.0]])
+    tip = np.array([[1.0, 0, 0], [0, np.cos(lean), np.sin(lean)], [0, -np.sin(lean), np.cos(lean)]])
+    ear = Ellipsoid(at(0.0800, -0.010, -0.010), np.array([0.0075, 0.0185, 0.0320]) * h, ear_frame @ tip)
+    parts: list[tuple[Field, float]] = [(cranium, 0), (face, 0.03 * h), (hair, 0.004 * h)]
+    return Group([(Group(parts, _face_bumps(a)), 0), (eyeball, 0.004 * h), (nose, 0.012 * h), (wing, 0.007 * h),
+                  (ear, 0.006 * h), (bun, 0.007 * h)], _feature_bumps(a), bounds=(a.eye, a.eye + 1e-3, 0.19 * h))
+
+
+Triple = tuple[float, float, float]
+
+
+def _on_head(a: Anatomy, rises: list[tuple[Triple, float, Triple]]) -> list[Bump]:
+    """Bumps from places against the eyes, heights and widths of a head of average size."""
+    h = a.head_scale
+    return [Bump(a.eye + np.array([side, -front, up]) * h, height * h, np.array(widths) * h)
+            for (side, front, up), height, widths in rises]
+
+
+def _face_bumps(a: Anatomy) -> list[Bump]:
+    man = a.man
+    return _on_head(a, [((0.031, 0.085, 0.003), -0.0088, (0.0150, 0.03, 0.0105)),
+                        ((0.014, 0.088, 0.001), -0.0035, (0.007, 0.02, 0.010)),
+                        ((0.030, 0.088, 0.019), 0.0025 + 0.0025 * man, (0.018, 0.03, 0.0065)),
+                        ((0, 0.09, 0.020), 0.001 + 0.0012 * man, (0.012, 0.03, 0.008)),
+                        ((0.047, 0.066, -0.022), 0.0055, (0.015, 0.02, 0.011)),
+                        ((0.046, 0.060, -0.056), -0.004 + 0.003 * a.fat, (0.014, 0.025, 0.016)),
+                        ((0.050, 0.015, -0.066), 0.005 * man, (0.014, 0.018, 0.014)),
+                        ((0.070, 0.045, 0.020), -0.003, (0.02, 0.018, 0.018)),
+                        ((0, 0.088, -0.0955), 0.0065 + 0.001 * man, (0.015, 0.03, 0.0105)),
+                        ((0, 0.088, -0.0790), -0.004, (0.016, 0.03, 0.0055))])
+
+
+def _feature_bumps(a: Anatomy) -> list[Bump]:
+    return _on_head(a, [((0, 0.092, -0.0565), 0.0044, (0.017, 0.03, 0.0046)),
+                        ((0, 0.092, -0.0685), 0.0058, (0.0145, 0.03, 0.0046)),
+                        ((0, 0.092, -0.0622), -0.0030, (0.021, 0.03, 0.0020)),
+                        ((0.090, -0.004, -0.010), -0.005, (0.010, 0.008, 0.014)),
+                        ((0.0115, 0.100, -0.0475), -0.003, (0.004, 0.008, 0.003))])

@@ -1,7 +1,6 @@
 """The synthetic data set: scans of one subject in many poses and of many subjects, truth kept beside them."""
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, fields
 from functools import lru_cache
 from pathlib import Path
@@ -16,33 +15,19 @@ from .people import NAMED_POSES, BodyShape, Person, mirrored_pose, named_pose, r
 from .scanner import RangeView, Scan, ScannerConfig, scan
 
 VERSION = 1
-TRUTH, VIEWS = "truth", "views"
 
 
 @dataclass(frozen=True, eq=False)
 class GroundTruth:
-    """What really stood in the scanner; for evaluation, used by no stage.
-
-    Attributes
-    ----------
-    shape : BodyShape
-    pose : (16, 3) float, radians
-    trans : (3,) float, metres
-    vertices : (N, 3) float, metres
-        On the topology shared by all people.
-    faces : (F, 3) int
-    part_of_face : (F,) int
-    joints : (16, 3) float, metres
-        In the pose.
-    """
+    """What really stood in the scanner; for evaluation, used by no stage."""
 
     shape: BodyShape
-    pose: np.ndarray
-    trans: np.ndarray
-    vertices: np.ndarray
-    faces: np.ndarray
-    part_of_face: np.ndarray
-    joints: np.ndarray
+    pose: np.ndarray  # (16, 3) float, radians
+    trans: np.ndarray  # (3,) float, metres
+    vertices: np.ndarray  # (N, 3) float, metres: on the topology shared by all people
+    faces: np.ndarray  # (F, 3) int
+    part_of_face: np.ndarray  # (F,) int
+    joints: np.ndarray  # (16, 3) float, metres: in the pose
 
     @property
     def mesh(self) -> Mesh:
@@ -57,13 +42,7 @@ class GroundTruth:
 
     @staticmethod
     def load(path: str | Path) -> GroundTruth:
-        """Read a file of `save`.
-
-        Raises
-        ------
-        StorageError
-            Missing, damaged, or of another kind or version.
-        """
+        """Read a file of `save`."""
         header, a = storage.load(path, "ground truth", (VERSION,))
         with storage.taking_apart(path, "a whole ground truth"):
             J = len(a["joints"])
@@ -87,14 +66,9 @@ def stand(person: Person, pose: np.ndarray) -> GroundTruth:
 
 def click_landmarks(truth: GroundTruth, rng: np.random.Generator, error: float = 0.003,
                     seen: np.ndarray | None = None, reach: float = 0.012) -> dict[str, np.ndarray]:
-    """Landmarks as a person would click them on the scan.
+    """Landmarks as a person would click them on the scan, each coordinate off by `error`, metres.
 
-    Parameters
-    ----------
-    error : float, metres
-        Standard deviation of every coordinate.
-    seen : (n, 3) float, metres, optional
-        Points of the scan; landmarks without one within `reach` are left out.
+    Those without a point of the scan, `seen` (n, 3), within `reach` are left out.
     """
     names = landmark_vertices()
     true = {name: truth.vertices[v] for name, v in names.items()}
@@ -111,18 +85,14 @@ def write_scan(folder: str | Path, name: str, scanned: Scan, truth: GroundTruth 
 
     Landmarks go to `name.landmarks.json`, the views to `views/name.npz`, the truth to `truth/name.npz`. The
     PLY is written last, so where it is, the rest is too.
-
-    Returns
-    -------
-    Path of the PLY.
     """
     from ..geometry.files import write_mesh
 
     folder = Path(folder)
     if truth is not None:
-        truth.save(folder / TRUTH / f"{name}.npz")
+        truth.save(folder / "truth" / f"{name}.npz")
     if views:
-        _write_views(folder / VIEWS / f"{name}.npz", scanned)
+        _write_views(folder / "views" / f"{name}.npz", scanned)
     if landmarks is not None:
         storage.write_json(folder / f"{name}.landmarks.json",
                            {key: np.round(point, 6).tolist() for key, point in landmarks.items()})
@@ -142,13 +112,7 @@ def _write_views(path: Path, scanned: Scan) -> None:
 
 
 def read_views(path: str | Path) -> list[RangeView]:
-    """The views of one scan, from `views/name.npz`.
-
-    Raises
-    ------
-    StorageError
-        Missing, damaged, or of another kind or version.
-    """
+    """The views of one scan, from `views/name.npz`."""
     header, a = storage.load(path, "range views", (VERSION,))
     with storage.taking_apart(path, "whole range views"):
         return [_view(a, k) for k in range(header["views"])]
@@ -164,23 +128,13 @@ def _view(a: dict[str, np.ndarray], k: int) -> RangeView:
 
 @dataclass(frozen=True)
 class SyntheticScan:
-    """One scan of the synthetic data set.
+    """One scan of the synthetic data set."""
 
-    Attributes
-    ----------
-    name : file name without ending
-    subject : "subject" for the one in many poses, else "person00", ...
-    pose : name of the pose
-    sex : "male" or "female"
-    folder : Path
-        Where its files are.
-    """
-
-    name: str
-    subject: str
-    pose: str
-    sex: str
-    folder: Path
+    name: str  # file name without ending
+    subject: str  # "subject" for the one in many poses, else "person00", ...
+    pose: str  # name of the pose
+    sex: str  # "male" or "female"
+    folder: Path  # where its files are
 
     @property
     def path(self) -> Path:
@@ -193,45 +147,14 @@ class SyntheticScan:
 
     @property
     def views(self) -> Path:
-        return self.folder / VIEWS / f"{self.name}.npz"
+        return self.folder / "views" / f"{self.name}.npz"
 
     @property
     def truth(self) -> Path:
-        return self.folder / TRUTH / f"{self.name}.npz"
+        return self.folder / "truth" / f"{self.name}.npz"
 
 
 SUBJECT = BodyShape(sex=1.0, stature=1.78, weight=-0.3, muscle=0.9, shoulder_width=0.4)
-
-
-def synthetic_dataset(folder: str | Path, seed: int = 0, subject_poses: int = 20, subjects: int = 12,
-                     config: ScannerConfig | None = None, click_error: float = 0.003,
-                     progress: Callable[[int, int], None] | None = None) -> list[SyntheticScan]:
-    """Scan one subject in many poses and many subjects near the rest pose.
-
-    The first scan, `subject_00_rest`, is the one to make the template from. Scans that are there already are
-    kept, and every scan has its own random numbers, so an interrupted run goes on and ends with the same
-    files.
-
-    Parameters
-    ----------
-    folder : path
-    seed : int
-    subject_poses : int
-        Scans of the one subject, the rest pose included.
-    subjects : int
-        Other people, women and men in turn.
-    config : ScannerConfig, optional
-    click_error : float, metres
-        Standard deviation of every coordinate of a landmark.
-    progress : called with (done, total)
-    """
-    plan = scan_plan(subject_poses, subjects)
-    out = []
-    for done, which in enumerate(plan):
-        out.append(synthetic_scan(Path(folder), seed, *which, config or ScannerConfig(), click_error))
-        if progress is not None:
-            progress(done + 1, len(plan))
-    return out
 
 
 def scan_plan(subject_poses: int, subjects: int) -> list[tuple[int, bool]]:

@@ -11,6 +11,8 @@ from typing import Protocol
 import numpy as np
 from scipy.interpolate import CubicSpline, PchipInterpolator
 
+from ..geometry.mesh import Mesh
+
 
 class Field(Protocol):
     """Anything that gives an approximate signed distance."""
@@ -19,18 +21,10 @@ class Field(Protocol):
 
 
 class Loft:
-    """Superelliptic cross-sections along an axis, closed by rounded caps.
+    """Superelliptic cross-sections along an axis, closed by rounded caps that reach `caps` beyond the ends, metres.
 
-    Parameters
-    ----------
-    origin : (3,) float, metres
-    frame : (3, 3) float
-        Rows: the sideways direction, the front direction, the axis.
-    keys : (k, 8) float
-        Position on the axis, centre sideways, centre frontwards, extents to +side, -side, front and back,
-        all in metres, and the exponent of the superellipse.
-    caps : (2,) float, metres
-        How far the rounded ends reach beyond the first and the last key.
+    Rows of `frame` are the sideways direction, the front direction and the axis. `keys` (k, 8): position on the axis,
+    centre sideways and frontwards, extents to +side, -side, front and back, metres, and the superellipse's exponent.
     """
 
     _TABLE = 400
@@ -66,13 +60,7 @@ class Loft:
 
 
 class RoundCone:
-    """The hull of two spheres.
-
-    Parameters
-    ----------
-    a, b : (3,) float, metres
-    radius_a, radius_b : float, metres
-    """
+    """The hull of two spheres."""
 
     def __init__(self, a: np.ndarray, b: np.ndarray, radius_a: float, radius_b: float) -> None:
         self.a, self.b, self.ra, self.rb = np.asarray(a), np.asarray(b), radius_a, radius_b
@@ -86,13 +74,7 @@ class RoundCone:
 
 
 class Ellipsoid:
-    """An ellipsoid, its radii along the rows of a frame.
-
-    Parameters
-    ----------
-    centre, radii : (3,) float, metres
-    frame : (3, 3) float, optional
-    """
+    """An ellipsoid, its radii along the rows of a frame."""
 
     def __init__(self, centre: np.ndarray, radii: np.ndarray, frame: np.ndarray | None = None) -> None:
         self.centre, self.radii = np.asarray(centre), np.asarray(radii, dtype=np.float64)
@@ -107,21 +89,12 @@ class Ellipsoid:
 
 @dataclass(frozen=True)
 class Bump:
-    """A soft rise (height > 0) or hollow (height < 0) of the surface around a point.
+    """A soft rise (height > 0) or hollow (height < 0) of the surface around a point."""
 
-    Parameters
-    ----------
-    centre : (3,) float, metres
-    height : float, metres
-    widths : (3,) float, metres
-        Standard deviations along the rows of `frame`.
-    frame : (3, 3) float, optional
-    """
-
-    centre: np.ndarray
-    height: float
-    widths: Sequence[float] | np.ndarray
-    frame: np.ndarray | None = None
+    centre: np.ndarray  # (3,) float, metres
+    height: float  # metres
+    widths: Sequence[float] | np.ndarray  # (3,) float, metres: standard deviations along the rows of `frame`
+    frame: np.ndarray | None = None  # (3, 3) float, optional
 
     def __call__(self, points: np.ndarray) -> np.ndarray:
         out = np.zeros(len(points))
@@ -141,15 +114,9 @@ def smooth_union(a: np.ndarray, b: np.ndarray, k: float) -> np.ndarray:
 
 
 class Group:
-    """Fields joined one after the other, evaluated only near themselves.
+    """Fields joined one after the other, each seam rounded over its k metres, evaluated only near themselves.
 
-    Parameters
-    ----------
-    members : (field, k) pairs
-        `k` rounds the seam with the members before, metres.
-    bumps : Bump
-    bounds : (3,) and (3,) ends, and radius, metres, optional
-        Points outside this capsule get their distance to it.
+    Points outside the capsule `bounds` (two ends and a radius) get their distance to it.
     """
 
     MARGIN = 0.06
@@ -209,3 +176,33 @@ def project(field: Field, points: np.ndarray, steps: int = 4, reach: float = 0.0
         length = np.linalg.norm(step, axis=1, keepdims=True)
         points += step * np.minimum(1, reach / np.maximum(length, 1e-12))
     return points
+
+
+def polygonise(field: Field, low: np.ndarray, high: np.ndarray, step: float) -> Mesh:
+    """The zero surface in a box by marching cubes; open where the box cuts it.
+
+    Only cells near the surface are evaluated finely.
+    """
+    import igl
+
+    coarse = 6
+    cells = np.ceil((high - low) / (coarse * step)).astype(int)
+    axes = [low[d] + coarse * step * np.arange(cells[d] + 1) for d in range(3)]
+    grid = np.stack(np.meshgrid(*axes[::-1], indexing="ij")[::-1], axis=-1)
+    shape = grid.shape[:3]
+    rough = field(grid.reshape(-1, 3)).reshape(shape)
+    near = np.abs(rough) < 3.2 * coarse * step
+    n = cells * coarse + 1
+    fine_axes = [low[d] + step * np.arange(n[d]) for d in range(3)]
+    index = [np.minimum((np.arange(n[d]) + coarse // 2) // coarse, cells[d]) for d in range(3)]
+    pick = np.ix_(index[2], index[1], index[0])
+    values, todo = rough[pick].copy(), near[pick]
+    points = np.stack(np.meshgrid(*fine_axes[::-1], indexing="ij")[::-1], axis=-1)
+    wanted = points[todo]
+    values[todo] = np.concatenate([field(part) for part in np.array_split(wanted, max(1, len(wanted) // 200_000))])
+    vertices, faces = igl.marching_cubes(values.reshape(-1), points.reshape(-1, 3), int(n[0]), int(n[1]),
+                                         int(n[2]),
+                                         0.0)[:2]
+    mesh = Mesh(vertices, np.asarray(faces, dtype=np.int64))
+    outside = field(mesh.corners.mean(axis=1) + 1e-3 * mesh.face_normals)
+    return mesh if np.median(outside) > 0 else Mesh(vertices, mesh.faces[:, ::-1])

@@ -8,41 +8,14 @@ import numpy as np
 from scipy.spatial.transform import Rotation
 
 from ..geometry import rotations
-from .anatomy import Anatomy
+from .anatomy import Anatomy, tables
 from .topology import blending, load
 
 Put = Callable[[str, str, float], None]
 
-# name, part, place along the bone (0 joint, 1 end), direction in the bone's (out, front) plane in degrees
-# from the front towards outside, widths along the bone (m) and around it (degrees), height (m)
-LIMB_MUSCLES = (
-    ("biceps", 4, 0.60, 0, 0.055, 55, 0.015), ("triceps", 4, 0.50, 180, 0.065, 55, 0.008),
-    ("elbow_fold", 4, 0.95, 10, 0.022, 45, -0.008), ("olecranon", 4, 1.02, 180, 0.022, 40, 0.008),
-    ("flexors", 5, 0.17, 0, 0.045, 65, 0.009), ("brachioradialis", 5, 0.18, 70, 0.045, 45, 0.005),
-    ("deltoid", 4, 0.20, 90, 0.055, 70, 0.012), ("shoulder_cap", 4, 0.02, 95, 0.032, 60, 0.009),
-    ("quadriceps", 10, 0.55, 0, 0.10, 60, 0.010), ("hamstrings", 10, 0.70, 180, 0.075, 55, 0.016),
-    ("groin", 10, 0.06, 0, 0.035, 70, 0.012), ("knee_cap", 10, 0.985, 0, 0.030, 40, 0.010),
-    ("adductors", 10, 0.22, -90, 0.07, 50, 0.008), ("buttock_fold", 10, 0.14, 180, 0.045, 70, 0.014),
-    ("calf", 11, 0.28, 180, 0.070, 60, 0.012), ("soleus", 11, 0.50, 150, 0.060, 60, 0.005),
-    ("knee_hollow", 11, 0.04, 180, 0.028, 45, 0.008), ("shin", 11, 0.3, 30, 0.07, 40, 0.004),
-    ("instep", 12, 0.10, 0, 0.030, 80, 0.004),
-)
-# name, side (0 middle), front (1) or back (-1), sideways, level of the trunk, widths, height
-TRUNK_MUSCLES = (
-    ("belly", 0, 1, 0.0, 0.30, 0.10, 0.075, 0.022), ("belly_fold", 0, 1, 0.0, 0.36, 0.14, 0.016, -0.012),
-    ("loin", 0, -1, 0.0, 0.28, 0.07, 0.07, 0.010), ("upper_back", 0, -1, 0.0, 0.72, 0.07, 0.10, 0.010),
-    ("pectoral", 1, 1, 0.075, 0.78, 0.050, 0.050, 0.013), ("scapula_in", 1, -1, 0.075, 0.84, 0.030, 0.045, 0.010),
-    ("scapula_out", 1, -1, 0.135, 0.80, 0.028, 0.045, 0.014), ("lat", 1, -1, 0.15, 0.62, 0.045, 0.075, 0.012),
-    ("trapezius", 1, -1, 0.07, 1.07, 0.035, 0.030, 0.012), ("flank", 1, 0, 0.15, 0.30, 0.08, 0.050, 0.016),
-    ("gluteus", 1, -1, 0.080, -0.06, 0.060, 0.060, 0.020), ("gluteus_medius", 1, 0, 0.16, 0.10, 0.06, 0.050,
-                                                            0.010),
-    ("sternomastoid", 1, 1, 0.040, 1.16, 0.014, 0.045, 0.006), ("throat", 0, 1, 0.0, 1.26, 0.03, 0.020, 0.008),
-)
-
-
 def _columns() -> list[tuple[str, str]]:
-    limbs = [(name, side) for name, *_ in LIMB_MUSCLES for side in "lr"]
-    trunk = [(name, side) for name, paired, *_ in TRUNK_MUSCLES for side in ("lr" if paired else "m")]
+    limbs = [(name, side) for name, *_ in tables.limb_muscles for side in "lr"]
+    trunk = [(name, side) for name, paired, *_ in tables.trunk_muscles for side in ("lr" if paired else "m")]
     return limbs + trunk
 
 
@@ -56,11 +29,11 @@ def masks() -> np.ndarray:
     v, a = template.mesh.vertices, template.anatomy
     weights = blending()[0]
     columns = []
-    for _, part, along, direction, wide, spread, height in LIMB_MUSCLES:
+    for _, part, along, direction, wide, spread, height in tables.limb_muscles:
         left = _limb_mask(v, a, weights, part, along, direction, wide, spread) * height
         columns += [left, left[template.mirror]]
     normals = template.mesh.vertex_normals
-    for _, paired, facing, sideways, level, wx, wz, height in TRUNK_MUSCLES:
+    for _, paired, facing, sideways, level, wx, wz, height in tables.trunk_muscles:
         d = (v[:, 0] - sideways) / wx, (v[:, 2] - a.at(level)) / wz
         mask = np.exp(-0.5 * (d[0]**2 + d[1]**2)) * (1 - weights[:, [5, 6, 8, 9, 11, 14]].sum(axis=1))
         mask *= np.clip(0.5 - 0.9 * facing * normals[:, 1], 0, 1) if facing else 1

@@ -2,7 +2,7 @@
 
 z is up, a person faces -y, stands on z = 0 and has the left side at +x; at rest the arms hang about 36
 degrees away from the body. All people share one closed triangulation, and vertex i is the same anatomical
-place on everybody. Posing is no linear blend skinning: see `people_posing`.
+place on everybody. Posing is no linear blend skinning: see `posing`.
 """
 from __future__ import annotations
 
@@ -14,10 +14,9 @@ from ..geometry.mesh import Mesh
 from ..skeleton.tree import Skeleton
 from .anatomy import PARENTS, PARTS, BodyShape
 from .landmarks import landmarks, markers
-from .poses import NAMED_POSES, compose, mirrored_pose, named_pose, random_pose
+from .poses import NAMED_POSES, compose, mirrored_pose, named_pose, random_pose, walk
 from .posing import Poser, part_of_vertex
 from .topology import carry, load
-from .walk import walk
 
 __all__ = ["NAMED_POSES", "PARENTS", "PARTS", "BodyShape", "Person", "compose", "mirrored_pose", "named_pose",
            "random_pose", "walk"]
@@ -68,17 +67,9 @@ class Person:
         return Poser(self.anatomy, self.mesh.vertices, self.joints[0])
 
     def posed(self, pose: np.ndarray, trans: np.ndarray | None = None) -> np.ndarray:
-        """The vertices in a pose.
+        """The vertices (N, 3), metres, in a pose (16, 3): rotation vectors of the parts against their parents.
 
-        Parameters
-        ----------
-        pose : (16, 3) float, radians
-            Rotation vector of every part against its parent; `pose[0]` turns the body about `joints[0]`.
-        trans : (3,) float, metres, optional
-
-        Returns
-        -------
-        (N, 3) float, metres
+        `pose[0]` turns the body about `joints[0]`.
         """
         pose = _checked(pose)
         return self._poser(pose) + (0 if trans is None else np.asarray(trans, dtype=np.float64))

@@ -1,14 +1,16 @@
-"""Poses of the synthetic people: everyday poses by name, and random ones between them."""
+"""Poses of the synthetic people: everyday poses by name, random ones between them, and a walk."""
 from __future__ import annotations
 
+import json
 from functools import lru_cache
+from pathlib import Path
+from typing import Any
 
 import numpy as np
+from scipy.interpolate import CubicSpline
 from scipy.spatial.transform import Rotation
 
-from .anatomy import Anatomy, BodyShape
-
-_LEFT_ARM, _RIGHT_ARM, _LEFT_LEG, _RIGHT_LEG = 4, 7, 10, 13
+from .anatomy import MIRROR_PART, PARENTS, Anatomy, BodyShape
 
 
 @lru_cache(maxsize=1)
@@ -33,16 +35,11 @@ def _towards(axis: np.ndarray, direction: np.ndarray, twist: float) -> np.ndarra
 def arm(direction: tuple[float, float, float], elbow: float = 0, twist: float = 0, turn: float = 0,
         wrist: float = 0,
         side: int = 1) -> np.ndarray:
-    """Rotation vectors (3, 3) of upper arm, forearm and hand.
+    """Rotation vectors (3, 3) of upper arm, forearm and hand, left (side 1) or right (-1).
 
-    Parameters
-    ----------
-    direction : outwards, frontwards, upwards
-        Where the upper arm points, seen from the chest.
-    elbow, twist, turn, wrist : degrees
-        Flexion beyond rest; rotation of the upper arm about itself, positive inwards; pronation of the
-        hand; flexion of the wrist towards the palm.
-    side : 1 left, -1 right
+    `direction` (outwards, frontwards, upwards) is where the upper arm points, seen from the chest. Degrees: flexion
+    of the elbow beyond rest; twist of the upper arm, positive inwards; pronation of the hand (`turn`); flexion of the
+    wrist towards the palm.
     """
     a = average()
     out, front, up = direction
@@ -57,14 +54,10 @@ def arm(direction: tuple[float, float, float], elbow: float = 0, twist: float = 
 
 def leg(direction: tuple[float, float, float], knee: float = 0, twist: float = 0, foot: float = 0, side: int = 1
         ) -> np.ndarray:
-    """Rotation vectors (3, 3) of thigh, shin and foot.
+    """Rotation vectors (3, 3) of thigh, shin and foot, left (side 1) or right (-1).
 
-    Parameters
-    ----------
-    direction : outwards, frontwards, upwards
-        Where the thigh points, seen from the pelvis.
-    knee, twist, foot : degrees
-        Flexion; rotation of the thigh about itself, positive outwards; raising of the toes.
+    `direction` as for `arm`, seen from the pelvis. Degrees: flexion of the knee; twist of the thigh, positive
+    outwards; raising of the toes.
     """
     a = average()
     out, front, up = direction
@@ -85,145 +78,114 @@ def head(nod: float = 0, lean: float = 0, turn: float = 0) -> np.ndarray:
     return Rotation.from_euler("zyx", [turn, lean, nod], degrees=True).as_rotvec()
 
 
-DOWN_ARM = (0.59, 0.0, -0.81)
-DOWN_LEG = (0.078, 0.0, -1.0)
-
-
 def compose(left_arm: dict | None = None, right_arm: dict | None = None, left_leg: dict | None = None,
             right_leg: dict | None = None, back: dict | None = None, neck: dict | None = None,
             root: tuple[float, float, float] = (0, 0, 0)) -> np.ndarray:
     """A pose (16, 3) from anatomical angles; what is not given stays at rest."""
+    down_arm, down_leg = (0.59, 0.0, -0.81), (0.078, 0.0, -1.0)
     pose = np.zeros((16, 3))
     pose[0] = _rotvec(root)
     pose[1:3] = spine(**(back or {}))
     pose[3] = head(**(neck or {}))
-    pose[4:7] = arm(**{"direction": DOWN_ARM, **(left_arm or {})})
-    pose[7:10] = arm(**{"direction": DOWN_ARM, **(right_arm or {})}, side=-1)
-    pose[10:13] = leg(**{"direction": DOWN_LEG, **(left_leg or {})})
-    pose[13:16] = leg(**{"direction": DOWN_LEG, **(right_leg or {})}, side=-1)
+    pose[4:7] = arm(**{"direction": down_arm, **(left_arm or {})})
+    pose[7:10] = arm(**{"direction": down_arm, **(right_arm or {})}, side=-1)
+    pose[10:13] = leg(**{"direction": down_leg, **(left_leg or {})})
+    pose[13:16] = leg(**{"direction": down_leg, **(right_leg or {})}, side=-1)
     return pose
 
 
-def _both(**kwargs: object) -> dict:
-    return {"left_arm": dict(kwargs), "right_arm": dict(kwargs)}
-
-
-def _legs(**kwargs: object) -> dict:
-    return {"left_leg": dict(kwargs), "right_leg": dict(kwargs)}
-
-
-_NAMED: dict[str, dict] = {
-    "rest": {},
-    "attention": _both(direction=(0.30, 0.0, -1), elbow=-4),
-    "t_pose": _both(direction=(1, 0, 0), twist=0),
-    "arms_up": _both(direction=(0.45, 0.1, 1), elbow=0),
-    "arms_forward": _both(direction=(0.12, 1, 0.0), elbow=-5, turn=20),
-    "strong_arms": _both(direction=(1, 0.15, 0.1), elbow=95, twist=-90),
-    "hands_on_hips": _both(direction=(0.88, -0.25, -0.68), elbow=72, twist=55, turn=30),
-    "surrender": _both(direction=(1, 0.1, -0.05), elbow=75, twist=-80, turn=30),
-    "left_arm_up": {"left_arm": {"direction": (0.3, 0.15, 1)}, "back": {"lean": -12},
-                    "neck": {"turn": 25, "nod": -12}},
-    "point_right": {"right_arm": {"direction": (0.75, 0.65, 0.15)}, "neck": {"turn": -40}, "back": {"turn": -20},
-                    "left_arm": {"direction": (0.45, -0.1, -0.9), "elbow": 25}},
-    "sitting": {**_legs(direction=(0.16, 1, -0.05), knee=88), **_both(direction=(0.35, 0.55, -0.8), elbow=45,
-                                                                      turn=40),
-                "back": {"bend": 10}},
-    "squat": {**_legs(direction=(0.35, 1, -0.25), knee=92, twist=12, foot=14),
-              **_both(direction=(0.1, 1, -0.1), elbow=5),
-              "back": {"bend": 14}, "root": (22, 0, 0)},
-    "kick_left": {"left_leg": {"direction": (0.08, 1, -0.45), "knee": 12, "foot": -25},
-                  "back": {"bend": 8, "turn": -15},
-                  "left_arm": {"direction": (0.7, -0.6, -0.5), "elbow": 25},
-                  "right_arm": {"direction": (0.5, 0.8, -0.2), "elbow": 30}},
-    "kick_back_right": {"right_leg": {"direction": (0.1, -0.45, -1), "knee": 75, "foot": -30},
-                        "left_leg": {"direction": (0.05, 0.15, -1), "knee": 14, "foot": 6},
-                        "left_arm": {"direction": (0.4, 0.7, -0.5), "elbow": 50},
-                        "right_arm": {"direction": (0.6, -0.5, -0.7), "elbow": 35}, "back": {"bend": 12}},
-    "side_kick_right": {"right_leg": {"direction": (1, 0.15, -0.6), "knee": 5}, "back": {"lean": 20},
-                        **_both(direction=(0.6, 0.4, -0.6), elbow=80)},
-    "lunge_left": {"left_leg": {"direction": (0.1, 1, -0.55), "knee": 70}, "root": (4, 0, 0),
-                   "right_leg": {"direction": (0.08, -0.55, -1), "knee": 22, "foot": 10},
-                   "left_arm": {"direction": (0.5, -0.3, -0.9), "elbow": 30},
-                   "right_arm": {"direction": (0.4, 0.5, -0.8), "elbow": 40}},
-    "knee_up_right": {"right_leg": {"direction": (0.12, 1, 0.15), "knee": 105, "foot": -10},
-                      "left_arm": {"direction": (0.4, 0.6, -0.6), "elbow": 70},
-                      "right_arm": {"direction": (0.45, -0.5, -0.8), "elbow": 60}},
-    "twist_left": {"back": {"turn": 50}, "neck": {"turn": 30}, "left_arm": {"direction": (0.9, -0.35, -0.1),
-                                                                            "elbow": 20},
-                   "right_arm": {"direction": (0.25, 0.9, -0.15), "elbow": 35}},
-    "twist_right": {"back": {"turn": -50, "bend": 8}, "neck": {"turn": -20},
-                    **_both(direction=(1, 0.1, -0.15), elbow=25)},
-    "bow": {"back": {"bend": 42}, "neck": {"nod": 15}, "root": (28, 0, 0), **_legs(direction=(0.078, 0.53, -1.0)),
-            **_both(direction=(0.45, 0.45, -0.85), elbow=8)},
-    "lean_left": {"back": {"lean": 32}, "neck": {"lean": 10},
-                  "right_arm": {"direction": (0.3, 0.1, 1), "elbow": 25},
-                  "left_arm": {"direction": (0.55, 0.1, -0.8)}},
-    "lean_back": {"back": {"bend": -24}, "neck": {"nod": -20}, **_both(direction=(0.8, 0.35, 0.55), elbow=15)},
-    "boxer": {"left_arm": {"direction": (0.35, 0.6, -0.7), "elbow": 98, "twist": -10},
-              "right_arm": {"direction": (0.40, 0.35, -0.8), "elbow": 102, "twist": -10},
-              "back": {"bend": 10, "turn": -20}, "left_leg": {"direction": (0.14, 0.35, -1), "knee": 24,
-                                                              "foot": 4},
-              "right_leg": {"direction": (0.16, -0.15, -1), "knee": 22, "twist": 15, "foot": 10}},
-    "throw_right": {"right_arm": {"direction": (0.85, -0.35, 0.45), "elbow": 85, "twist": -70},
-                    "back": {"turn": -30, "bend": -8},
-                    "left_arm": {"direction": (0.35, 0.9, 0.1), "elbow": 15},
-                    "left_leg": {"direction": (0.1, 0.45, -1), "knee": 15},
-                    "right_leg": {"direction": (0.12, -0.25, -1), "knee": 12}},
-    "run": {"left_leg": {"direction": (0.06, 0.85, -0.75), "knee": 85}, "root": (10, 0, 0),
-            "right_leg": {"direction": (0.06, -0.4, -1), "knee": 35, "foot": -18},
-            "left_arm": {"direction": (0.35, -0.6, -0.75), "elbow": 80},
-            "right_arm": {"direction": (0.3, 0.55, -0.8), "elbow": 85}, "back": {"turn": 8, "bend": 6}},
-    "balance": {"root": (50, 0, 0), "right_leg": {"direction": (0.06, -0.75, -0.8), "knee": 5, "foot": -30},
-                "left_leg": {"direction": (0.03, 0.95, -0.75), "knee": 6}, **_both(direction=(1, 0.25, 0.1)),
-                "back": {"bend": -12}, "neck": {"nod": -25}},
-    "wave_right": {"right_arm": {"direction": (0.8, 0.25, 0.2), "elbow": 85, "twist": -85, "turn": -20},
-                   "neck": {"turn": -20, "lean": -8}, "left_arm": {"direction": (0.5, -0.1, -0.9), "elbow": 15},
-                   "left_leg": {"direction": (0.2, 0.05, -1), "twist": 12}},
-    "stretch_across": {"right_arm": {"direction": (-0.30, 0.95, -0.1), "elbow": 12}, "back": {"turn": 15},
-                       "left_arm": {"direction": (0.9, -0.3, -0.3), "elbow": 20}, "neck": {"turn": -25}},
-}
-NAMED_POSES = tuple(_NAMED)
+_STORED: dict[str, Any] = json.loads(Path(__file__).with_name("poses.json").read_text(encoding="utf-8"))
+NAMED_POSES = tuple(_STORED["named"])
 
 
 def named_pose(name: str) -> np.ndarray:
-    """A pose (16, 3), radians, by its name in `NAMED_POSES`.
-
-    Raises
-    ------
-    ValueError
-        A name that is not known.
-    """
-    if name not in _NAMED:
+    """A pose (16, 3), radians, by its name in `NAMED_POSES`."""
+    if name not in NAMED_POSES:
         raise ValueError(f"name: no pose '{name}', expected one of {', '.join(NAMED_POSES)}")
-    return compose(**_NAMED[name])
-
-
-_GROUPS = ([4, 5, 6], [7, 8, 9], [0, 10, 11, 12, 13, 14, 15], [1, 2], [3])
-JITTER = np.radians(np.array([4, 4, 4, 7, 8, 6, 9, 8, 6, 9, 4, 4, 5, 4, 4, 5.0]))
+    return compose(**_STORED["named"][name])
 
 
 def random_pose(rng: np.random.Generator, spread: float = 1.0) -> np.ndarray:
     """A plausible pose (16, 3): arms, legs, back and neck each drawn from the named poses, loosened.
 
-    Parameters
-    ----------
-    spread : float
-        How far from rest: 0 gives rest, 1 poses as varied as the named ones.
+    `spread` 0 gives rest, 1 poses as varied as the named ones.
     """
+    limbs = [4, 5, 6], [7, 8, 9], [0, 10, 11, 12, 13, 14, 15], [1, 2], [3]
+    looseness = np.radians(np.array([4, 4, 4, 7, 8, 6, 9, 8, 6, 9, 4, 4, 5, 4, 4, 5.0]))
     pose = np.zeros((16, 3))
-    for group in _GROUPS:
+    for group in limbs:
         name = NAMED_POSES[rng.integers(len(NAMED_POSES))]
         source = named_pose(name)
         if rng.random() < 0.5:
             source = mirrored_pose(source)
         pose[group] = rng.uniform(0.55, 1.0) * source[group]
-    noise = rng.normal(size=(16, 3)) * JITTER[:, None] * 0.7
+    noise = rng.normal(size=(16, 3)) * looseness[:, None] * 0.7
     noise[[5, 8, 11, 14]] = 0.0
     return spread * (pose + noise)
 
 
 def mirrored_pose(pose: np.ndarray) -> np.ndarray:
     """The pose (..., 16, 3) of the mirror image."""
-    from .anatomy import MIRROR_PART
-
     return pose[..., MIRROR_PART, :] * [1, -1, -1]
+
+
+def walk(frames: int, rate: float = 60.0, speed: float = 1.0) -> tuple[np.ndarray, np.ndarray]:
+    """A walk straight ahead: poses (frames, 16, 3), radians, places (frames, 3) of the root against rest, metres.
+
+    The lower foot stays on the floor; at speed 1 a gait cycle takes 1.1 seconds.
+    """
+    t = np.arange(frames) / rate * speed / 1.1
+    poses = np.stack([_stride(phase) for phase in t % 1.0])
+    fine = 120
+    heights, advance = _footing(np.stack([_stride(k / fine) for k in range(fine + 1)]))
+    cycle = np.concatenate([[0], np.cumsum(advance)])
+    at = (t % 1.0) * fine
+    ahead = np.interp(at, np.arange(fine + 1), cycle) + np.floor(t) * cycle[-1]
+    lift = np.interp(at, np.arange(fine + 1), heights)
+    return poses, np.stack([np.zeros(frames), -ahead, lift], axis=1)
+
+
+def _stride(phase: float) -> np.ndarray:
+    curves = CubicSpline(np.linspace(0, 1, 11), np.array(_STORED["gait"]).T, bc_type="periodic")
+    wave = 2 * np.pi * phase
+    limbs: dict[str, dict[str, Any]] = {}
+    for name, shift in (("left", 0.0), ("right", 0.5)):
+        hip, knee, ankle = curves((phase + shift) % 1.0)
+        swing = np.cos(wave + 2 * np.pi * shift)
+        limbs[f"{name}_leg"] = {"direction": (0.035, np.tan(np.radians(hip)), -1.0), "knee": float(knee),
+                                "foot": float(ankle)}
+        limbs[f"{name}_arm"] = {"direction": (0.28, 0.05 - 0.33 * swing, -1.0), "elbow": 10 - 9 * swing,
+                                "twist": 12}
+    pose = compose(limbs["left_arm"], limbs["right_arm"], limbs["left_leg"], limbs["right_leg"],
+                   {"turn": 9 * np.cos(wave), "bend": 2}, {"turn": -5 * np.cos(wave), "nod": 1})
+    pose[0] = Rotation.from_euler("zyx", [-4.5 * np.cos(wave), 2.5 * np.sin(wave), 2], degrees=True).as_rotvec()
+    return pose
+
+
+def _footing(poses: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Lift of the root (T,) that puts the lower foot on the floor, and how far it moves ahead (T - 1,)."""
+    a = average()
+    soles = []
+    for foot in (12, 15):
+        toe = a.ends[foot] * [1, 1, 0]
+        heel = a.joints[foot] * [1, 1, 0] + [0, 0.055, 0]
+        soles.append([_carried(a, pose, foot, np.stack([heel, toe])) for pose in poses])
+    points = np.swapaxes(np.array(soles), 0, 1).reshape(len(poses), 4, 3)
+    lowest = points[:, :, 2].min(axis=1)
+    weight = np.exp(-(points[:, :, 2] - lowest[:, None]) / 0.01)
+    weight = 0.5 * (weight[1:] + weight[:-1])
+    weight /= weight.sum(axis=1, keepdims=True)
+    advance = (weight * np.diff(points[:, :, 1], axis=0)).sum(axis=1)
+    kernel = np.hanning(15) / np.hanning(15).sum()
+    smooth = np.convolve(np.r_[lowest[-8:-1], lowest, lowest[1:8]], kernel, "valid")
+    advance = np.convolve(np.r_[advance[-7:], advance, advance[:7]], kernel, "valid")
+    return -smooth, advance
+
+
+def _carried(a: Anatomy, pose: np.ndarray, part: int, points: np.ndarray) -> np.ndarray:
+    chain = [part]
+    while PARENTS[chain[-1]] >= 0:
+        chain.append(int(PARENTS[chain[-1]]))
+    for p in chain:
+        points = a.joints[p] + Rotation.from_rotvec(pose[p]).apply(points - a.joints[p])
+    return points

@@ -15,16 +15,7 @@ from .topology import blending, load, neighbour_mean
 
 
 class Poser:
-    """Everything about one person that posing needs.
-
-    Parameters
-    ----------
-    anatomy : Anatomy
-    vertices : (N, 3) float, metres
-        The person at rest on the shared topology.
-    root : (3,) float, metres
-        What part 0 turns about, the centroid of its vertices.
-    """
+    """Everything that posing needs of one person at rest on the shared topology; part 0 turns about `root` (3,)."""
 
     def __init__(self, anatomy: Anatomy, vertices: np.ndarray, root: np.ndarray) -> None:
         template = load()

@@ -2,78 +2,55 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Annotated
 
 import numpy as np
 
 from ..geometry.mesh import Mesh
 from ..geometry.surface import Rays
-from ..ranges import Cell, Count, Positive, Range, Settings, Signed
+from ..ranges import Cell, Count, Settings, Signed
+
+GRAZING = 12.0                       # degrees between ray and surface below which nothing is measured
+DROPOUT = 0.005                      # chance that a ray is lost at a right angle to the surface; grows towards GRAZING
 
 
 @dataclass(frozen=True)
 class ScannerConfig(Settings):
     """Settings of the scanner.
 
-    Parameters
+    Attributes
     ----------
-    views : number of cameras, evenly spaced around the vertical
-    distance : of the cameras from the middle of the body, metres
-    height : of the cameras above the middle of the body, metres; every other one as far below it,
-        but above the feet
-    azimuth : direction of the first camera from the front (-y) towards the left (+x), degrees
-    resolution : spacing of the rays at the middle of the body, metres
-    noise : standard deviation along the ray, metres
-    grazing : angle between ray and surface below which nothing is measured, degrees
-    dropout : chance that a ray is lost at a right angle to the surface; grows towards `grazing`
-    depth_jump : neighbours farther apart in depth than this many ray spacings are not joined
-    blind_reach : how near two surfaces that face each other must be to hide each other, metres; this blinds
-        the scanner in armpits and between the legs
-    min_island : connected pieces with fewer triangles are removed
-
-    Raises
-    ------
-    ValueError
-        A value out of its range.
+    views : int
+        Cameras, evenly spaced around the vertical.
+    height : float, metres
+        Of the cameras above the middle of the body; every other one as far below it, but above the feet.
+    azimuth : float, degrees
+        Of the first camera, from the front (-y) towards the left (+x).
+    resolution : float, metres
+        Spacing of the rays at the middle of the body.
+    noise : float, metres
+        Standard deviation along the ray.
+    blind_reach : float, metres
+        How near two surfaces that face each other must be to hide each other: armpits, and between the legs.
     """
 
     views: Count = 4
-    distance: Positive = 2.5
     height: Signed = 1.2
     azimuth: Signed = 45.0
     resolution: Cell = 0.0059
     noise: float = 0.002
-    grazing: Annotated[float, Range(0, 89.9)] = 12.0
-    dropout: Annotated[float, Range(0, 0.99)] = 0.005
-    depth_jump: Positive = 5.0
     blind_reach: float = 0.05
-    min_island: int = 30
 
 
 @dataclass(frozen=True, eq=False)
 class RangeView:
-    """What one camera saw.
+    """What one camera saw."""
 
-    Attributes
-    ----------
-    mesh : Mesh
-        The triangulated range image; its vertices are `points`.
-    normals : (n, 3) float
-        Of the triangulated points, unit, outwards.
-    camera : (3,) float, metres
-    T_world_camera : (4, 4) float
-        Camera axes are right, down, ahead.
-    depth : (H, W) float, metres
-        Distance along the optical axis, NaN where nothing was measured.
-    intrinsics : (3, 3) float, pixels
-    """
-
-    mesh: Mesh
-    normals: np.ndarray
-    camera: np.ndarray
-    T_world_camera: np.ndarray
-    depth: np.ndarray
-    intrinsics: np.ndarray
+    mesh: Mesh  # the triangulated range image; its vertices are `points`
+    normals: np.ndarray  # (n, 3) float: of the triangulated points, unit, outwards
+    camera: np.ndarray  # (3,) float, metres
+    T_world_camera: np.ndarray  # (4, 4) float: camera axes are right, down, ahead
+    depth: np.ndarray  # (H, W) float, metres: distance along the optical axis, NaN where nothing was measured
+    intrinsics: np.ndarray  # (3, 3) float, pixels
 
     @property
     def points(self) -> np.ndarray:
@@ -93,17 +70,10 @@ class RangeView:
 
 @dataclass(frozen=True, eq=False)
 class Scan:
-    """All views of one body.
+    """All views of one body."""
 
-    Attributes
-    ----------
-    views : RangeView of every camera
-    merged : Mesh
-        The triangles of all views side by side.
-    """
-
-    views: tuple[RangeView, ...]
-    merged: Mesh
+    views: tuple[RangeView, ...]  # of every camera
+    merged: Mesh  # the triangles of all views side by side
 
 
 def pixel_rays(shape: tuple[int, ...], intrinsics: np.ndarray, R_world_camera: np.ndarray) -> np.ndarray:
@@ -116,21 +86,7 @@ def pixel_rays(shape: tuple[int, ...], intrinsics: np.ndarray, R_world_camera: n
 
 
 def scan(mesh: Mesh, config: ScannerConfig | None = None, rng: np.random.Generator | None = None) -> Scan:
-    """Scan a body that stands upright along z.
-
-    Parameters
-    ----------
-    mesh : Mesh
-        The true surface.
-    config : ScannerConfig, optional
-    rng : Generator, optional
-        Source of noise and dropout; seed 0 when not given.
-
-    Raises
-    ------
-    ValueError
-        A mesh without triangles.
-    """
+    """All views of a body that stands upright along z, with noise and dropout from `rng` (seed 0 if not given)."""
     config = config or ScannerConfig()
     rng = rng or np.random.default_rng(0)
     if not len(mesh.faces):
@@ -158,23 +114,24 @@ def _view(mesh: Mesh, rays: Rays, config: ScannerConfig, number: int, rng: np.ra
     middle = 0.5 * (low + high)
     azimuth = np.radians(config.azimuth + 360.0 * number / config.views)
     lift = config.height * (1 if number % 2 == 0 else -1)
-    camera = middle + [config.distance * np.sin(azimuth), -config.distance * np.cos(azimuth), lift]
+    distance = 2.5                                               # of the cameras from the middle of the body, metres
+    camera = middle + [distance * np.sin(azimuth), -distance * np.cos(azimuth), lift]
     camera[2] = max(camera[2], low[2] + 0.1)
     T = camera_pose(middle, camera)
-    focal = config.distance / config.resolution
+    focal = distance / config.resolution
     local = (mesh.vertices - camera) @ T[:3, :3]
     extent = np.abs(local[:, :2] / local[:, 2:]).max(axis=0) * focal + 3
     width, height = (2 * np.ceil(extent) + 1).astype(int)
     K = np.array([[focal, 0, (width - 1) / 2], [0, focal, (height - 1) / 2], [0, 0, 1.0]])
     directions = pixel_rays((height, width), K, T[:3, :3]).reshape(-1, 3)
-    face, distance = rays.cast(np.broadcast_to(camera, directions.shape), directions)
-    distance = _measured(mesh, rays, config, camera, directions, face, distance, rng)
-    seen = np.isfinite(distance)
-    triangles = _triangulate(distance.reshape(height, width), config)
-    points = camera + np.where(seen, distance, 0)[:, None] * directions
+    face, measured = rays.cast(np.broadcast_to(camera, directions.shape), directions)
+    measured = _measured(mesh, rays, config, camera, directions, face, measured, rng)
+    seen = np.isfinite(measured)
+    triangles = _triangulate(measured.reshape(height, width), config)
+    points = camera + np.where(seen, measured, 0)[:, None] * directions
     used, index = np.unique(triangles, return_inverse=True)
     surface = Mesh(points[used], index.reshape(-1, 3))
-    depth = (distance * (directions @ T[:3, 2])).reshape(height, width)
+    depth = (measured * (directions @ T[:3, 2])).reshape(height, width)
     kept = np.full(height * width, np.nan)
     kept[used] = depth.reshape(-1)[used]
     return RangeView(surface, surface.vertex_normals, camera, T, kept.reshape(height, width), K)
@@ -186,9 +143,9 @@ def _measured(mesh: Mesh, rays: Rays, config: ScannerConfig, camera: np.ndarray,
     hit = np.flatnonzero(face >= 0)
     normal = mesh.face_normals[face[hit]]
     cosine = np.abs(np.einsum("nd,nd->n", normal, directions[hit]))
-    limit = np.sin(np.radians(config.grazing))
+    limit = np.sin(np.radians(GRAZING))
     margin = np.clip((cosine - limit) / max(1 - limit, 1e-9), 0, 1)
-    lost = (cosine <= limit) | (rng.random(len(hit)) < config.dropout + (1 - config.dropout) * np.exp(-margin / 0.05))
+    lost = (cosine <= limit) | (rng.random(len(hit)) < DROPOUT + (1 - DROPOUT) * np.exp(-margin / 0.05))
     points = camera + distance[hit, None] * directions[hit]
     blind = np.zeros(len(hit), dtype=bool)
     if config.blind_reach > 0:
@@ -204,7 +161,7 @@ def _measured(mesh: Mesh, rays: Rays, config: ScannerConfig, camera: np.ndarray,
 
 
 def _triangulate(distance: np.ndarray, config: ScannerConfig) -> np.ndarray:
-    """Triangles (F, 3) of pixel numbers between neighbours at similar distance, outward as the camera sees."""
+    """Triangles (F, 3) of pixel numbers between neighbours within five ray spacings in depth, outward."""
     height, width = distance.shape
     number = np.arange(height * width).reshape(height, width)
     a, b, c, d = number[:-1, :-1], number[:-1, 1:], number[1:, :-1], number[1:, 1:]
@@ -218,11 +175,11 @@ def _triangulate(distance: np.ndarray, config: ScannerConfig) -> np.ndarray:
     triangles = np.concatenate([one.reshape(-1, 3), two.reshape(-1, 3)])
     corner = flat[triangles]
     with np.errstate(invalid="ignore"):
-        good = corner.max(axis=1) - corner.min(axis=1) < config.depth_jump * config.resolution
+        good = corner.max(axis=1) - corner.min(axis=1) < 5 * config.resolution
     triangles = triangles[good]
     if not len(triangles):
         return triangles
     used, index = np.unique(triangles, return_inverse=True)
     surface = Mesh(np.zeros((len(used), 3)), index.reshape(-1, 3))
     island = surface.vertex_component[surface.faces[:, 0]]
-    return triangles[np.bincount(island)[island] >= config.min_island]
+    return triangles[np.bincount(island)[island] >= 30]          # smaller pieces are removed

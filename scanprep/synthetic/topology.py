@@ -1,7 +1,6 @@
 """The topology that all people share, and how it is carried onto another body."""
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
@@ -13,75 +12,22 @@ from ..geometry import storage
 from ..geometry.mesh import Mesh
 from ..geometry.sparse import factor
 from .anatomy import PARENTS, Anatomy, BodyShape
+from .body_parts import body_surface
 from .implicit_surface import Field, project, value_and_gradient
 
-STORED = Path(__file__).with_name("topology.npz")
+STORED = Path(__file__).with_name("topology.npz")         # made by tests/people_maker.py
 CANONICAL = BodyShape(sex=0.0, stature=1.69)
 VERSION = 1
 
 
 @dataclass(frozen=True, eq=False)
 class Template:
-    """The shared triangulation on the canonical body.
-
-    Attributes
-    ----------
-    mesh : Mesh
-    mirror : (N,) int
-        The vertex at the mirrored place.
-    part_of_face : (F,) int
-    anatomy : Anatomy of the canonical body
-    """
+    """The shared triangulation on the canonical body."""
 
     mesh: Mesh
-    mirror: np.ndarray
-    part_of_face: np.ndarray
-    anatomy: Anatomy
-
-
-def sizing(anatomy: Anatomy) -> Callable[[np.ndarray], np.ndarray]:
-    """Wanted edge length in metres at points (n, 3): fine on face, ears, hands and toes."""
-    hand = anatomy.joints[6] + 0.6 * (anatomy.ends[6] - anatomy.joints[6])
-    foot = anatomy.joints[12] + 0.75 * anatomy.width["foot"] * anatomy.foot_frame[2] * [1, 1, 0]
-    foot[2] = 0.01
-    face = anatomy.eye + np.array([0, -0.095, -0.035])
-    ear = anatomy.eye + np.array([0.08, 0.008, -0.01])
-    spots = [(hand, 0.0068, 0.09), (foot, 0.0085, 0.05), (face, 0.0062, 0.05), (anatomy.eye, 0.0110, 0.12),
-             (ear, 0.0055, 0.036)]
-
-    def size(points: np.ndarray) -> np.ndarray:
-        wanted = np.full(len(points), 0.0235)
-        for centre, fine, radius in spots:
-            folded = np.abs(points[:, :1]) if centre[0] > 0 else points[:, :1]
-            d = np.linalg.norm(np.hstack([folded, points[:, 1:]]) - centre, axis=1)
-            wanted = np.minimum(wanted, fine + 0.16 * np.maximum(d - radius, 0))
-        return wanted
-
-    return size
-
-
-def build(step: float = 0.0035) -> Template:
-    """Polygonise and remesh the canonical body from scratch (about two minutes)."""
-    from .triangulation import mirror, polygonise, remesh
-
-    anatomy = Anatomy(CANONICAL)
-    high = np.array([anatomy.ends[6, 0] + 0.08, 0.22, CANONICAL.stature + 0.03])
-    half = polygonise(anatomy.field, np.array([0.0, -0.30, -0.02]), high, step)
-    keep = half.vertex_component[half.faces[:, 0]] == 0
-    half = remesh(half.submesh(keep)[0], anatomy.field, sizing(anatomy))
-    mesh, twin = mirror(half)
-    order = np.lexsort((np.round(mesh.vertices[:, 0], 4), np.round(mesh.vertices[:, 2], 3)))
-    place = np.argsort(order)
-    mesh = Mesh(mesh.vertices[order], place[mesh.faces])
-    return Template(mesh, place[twin[order]], label_faces(mesh, anatomy), anatomy)
-
-
-def store(template: Template, path: Path = STORED) -> None:
-    """Keep a built template beside the code."""
-    storage.save(path, "people template", VERSION, {
-        "vertices": np.round(template.mesh.vertices * 1e5).astype(np.int32),
-        "mirror": template.mirror.astype(np.uint16),
-        "faces": template.mesh.faces.astype(np.uint16)})
+    mirror: np.ndarray  # (N,) int: the vertex at the mirrored place
+    part_of_face: np.ndarray  # (F,) int
+    anatomy: Anatomy  # anatomy of the canonical body
 
 
 @lru_cache(maxsize=1)
@@ -91,48 +37,10 @@ def load() -> Template:
     anatomy = Anatomy(CANONICAL)
     vertices = arrays["vertices"] / 1e5
     mirror = arrays["mirror"].astype(np.int64)
-    vertices = project(anatomy.field, vertices, 2)
+    vertices = project(body_surface(anatomy), vertices, 2)
     vertices = 0.5 * (vertices + vertices[mirror] * [-1, 1, 1])
     mesh = Mesh(vertices, arrays["faces"].astype(np.int64))
-    return Template(mesh, mirror, label_faces(mesh, anatomy), anatomy)
-
-
-def label_faces(mesh: Mesh, anatomy: Anatomy) -> np.ndarray:
-    """Part of every triangle (F,): cut by a plane through each joint, across the surface only."""
-    from .body_parts import arm, hand, trunk
-
-    c = mesh.corners.mean(axis=1)
-    j = anatomy.joints
-    part = np.zeros(len(c), dtype=np.int64)
-
-    def beyond(joint: int, normal: np.ndarray) -> np.ndarray:
-        return (c - j[joint]) @ normal > 0
-
-    folded = np.abs(c * [1, 0, 0]) + c * [0, 1, 1]
-    of_arm = np.minimum(arm(anatomy)(folded), hand(anatomy)(folded)) < 0.02
-    of_arm &= trunk(anatomy)[0][0][0](c) > 0.012 * anatomy.scale
-    part[c[:, 2] > j[1, 2]] = 1
-    part[c[:, 2] > j[2, 2]] = 2
-    neck = np.array([0, -0.35, 1.0])
-    part[beyond(3, neck / np.linalg.norm(neck)) & (np.abs(c[:, 0]) < 0.12)] = 3
-    for side, upper, leg in ((1, 4, 10), (-1, 7, 13)):
-        flip = np.array([side, 1, 1])
-        up = flip * anatomy.upper_arm_frame[2]
-        out = up * 0.75 + 0.66 * np.array([side, 0, 0.25])
-        armpit = j[upper] + 0.012 * anatomy.scale * flip * [-1, 0, 0]
-        mine = ((c - armpit) @ out > 0) & (c[:, 0] * side > 0.10 * anatomy.scale) & of_arm
-        fore = up + flip * anatomy.forearm_frame[2]
-        part[mine] = upper
-        part[mine & beyond(upper + 1, fore)] = upper + 1
-        part[mine & beyond(upper + 2, flip * anatomy.forearm_frame[2])] = upper + 2
-        cut = np.array([0.72 * side, -0.0, -1.0])
-        top = j[leg] + np.array([0.0, 0, -0.012 * anatomy.scale])
-        mine = ((c - top) @ cut > 0) & (c[:, 0] * side > 0) & (c[:, 2] < j[0, 2] + 0.02) & (part < 3)
-        part[mine] = leg
-        part[mine & (c[:, 2] < j[leg + 1, 2])] = leg + 1
-        heel = np.array([0, -0.5, -1.0])
-        part[mine & beyond(leg + 2, heel)] = leg + 2
-    return part
+    return Template(mesh, mirror, arrays["part_of_face"].astype(np.int64), anatomy)
 
 
 @lru_cache(maxsize=1)
@@ -208,6 +116,7 @@ def carry(shape: BodyShape, stages: int = 3) -> tuple[np.ndarray, Anatomy]:
     offset = x0 - mean @ x0
     for stage in range(1, stages + 1):
         now = Anatomy(BodyShape.from_array(at + (goal - at) * stage / stages))
+        field = body_surface(now)
         change = frames(now) @ np.linalg.inv(frames(before))
         shift = now.joints - np.einsum("pij,pj->pi", change, before.joints)
         blend = np.einsum("np,pij->nij", weights, change)
@@ -216,9 +125,9 @@ def carry(shape: BodyShape, stages: int = 3) -> tuple[np.ndarray, Anatomy]:
         wanted = np.einsum("np,pij,nj->ni", weights, total, offset)
         gradient = None
         for _ in range(2):
-            vertices, gradient = _settle(now.field, vertices, wanted, gradient)
+            vertices, gradient = _relaxed(field, vertices, wanted, gradient)
         before = now
-    value, gradient = _symmetric(now.field, vertices)
+    value, gradient = _symmetric(field, vertices)
     step = np.clip(value / np.maximum((gradient**2).sum(axis=1), 0.1), -0.005, 0.005)
     vertices = vertices - step[:, None] * gradient
     return 0.5 * (vertices + vertices[template.mirror] * [-1, 1, 1]), now
@@ -240,7 +149,7 @@ def _symmetric(field: Field, vertices: np.ndarray, gradient: np.ndarray | None =
     return value, gradient
 
 
-def _settle(field: Field, vertices: np.ndarray, wanted: np.ndarray, gradient: np.ndarray | None
+def _relaxed(field: Field, vertices: np.ndarray, wanted: np.ndarray, gradient: np.ndarray | None
             ) -> tuple[np.ndarray, np.ndarray]:
     """One Newton step onto the surface, then tangential steps towards the canonical neighbourhoods."""
     value, gradient = _symmetric(field, vertices, gradient)

@@ -70,7 +70,6 @@ def main() -> None:
     parser.add_argument("-m", "--model", required=True)
     parser.add_argument("-o", "--output", default="c3d.json")
     parser.add_argument("--layout", default="cmu41")
-    parser.add_argument("--key-interval", type=float, default=AnimateConfig().key_interval)
     parser.add_argument("--pictures", type=Path, help="folder for sheets of every hundredth frame")
     args = parser.parse_args()
     model = load_model(args.model)

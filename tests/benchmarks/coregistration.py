@@ -36,7 +36,7 @@ from scanprep.batch.pool import Workers
 from scanprep.decimation.decimate import decimate
 from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.surface import Surface
-from scanprep.registration.matches import orient, target_of
+from scanprep.geometry.target import orient, target_of
 from scanprep.registration.nonrigid import register
 from scanprep.skeleton.find import find_skeleton
 
@@ -71,7 +71,7 @@ class Story:
         vertices = np.array([self.data.landmarks[name] for name in MARKS[which]], dtype=np.int64)
         return [(vertices, body[vertices]) if len(vertices) else None for body in self.truth]
 
-    def tell(self, what: str, found: dict[int, np.ndarray], flipped: int = -1) -> None:
+    def tell(self, what: str, found: dict[int, np.ndarray], inverted: int = -1) -> None:
         """Measure vertices (N, 3) of some scans, by number, and print a row."""
         which = np.array(list(found))
         apart = [1e3 * np.linalg.norm(found[i] - self.truth[i], axis=1) for i in which]
@@ -82,7 +82,7 @@ class Story:
                "median_mm": float(np.median(mean)), "worst_mm": float(mean.max()),
                "shown_mm": float(mean[shown].mean()), "shown_failed": int((mean[shown] > TOO_FAR).sum()),
                "surface_seen_mm": float(np.mean([o.mean() for o in off])),
-               "beyond_50mm": float(np.mean([(a > 50).mean() for a in apart])), "flipped": flipped,
+               "beyond_50mm": float(np.mean([(a > 50).mean() for a in apart])), "inverted": inverted,
                "cpu_s": time.process_time() - self.begun,
                "each_mm": {self.poses[i]: float(m) for i, m in zip(which, mean, strict=True)}}
         self.rows.append(row)
@@ -118,7 +118,7 @@ def main() -> None:
 
     plain = [register(data.template, s.scan, m) for s, m in zip(story.scans, story.marks(args.landmarks), strict=True)]
     first = np.stack([r.mesh.vertices for r in plain])
-    story.tell("without a model", dict(enumerate(first)), sum(r.flipped for r in plain))
+    story.tell("without a model", dict(enumerate(first)), sum(r.inverted for r in plain))
     good = np.array([explained_share(r.mesh, s.scan) >= 1 - config.failed
                      for r, s in zip(plain, story.scans, strict=True)])
     story.tell("those that explain their scan", {int(i): first[i] for i in np.flatnonzero(good)})
@@ -132,7 +132,7 @@ def main() -> None:
         for turn in range(done.rounds):
             now = {i: space.value(task_name(turn, name)) for i, name in enumerate(names) if name not in done.failures}
             story.tell(f"round {turn + 1}", {i: r.mesh.vertices for i, r in now.items()},
-                       sum(r.flipped for r in now.values()))
+                       sum(r.inverted for r in now.values()))
             story.tell(f"round {turn + 1}, predicted", {i: r.predicted.vertices for i, r in now.items()})
     if args.clickless:
         free = replace(config, fit=replace(config.fit, up=(0.0, 0.0, 1.0)))

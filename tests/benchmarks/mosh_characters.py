@@ -18,17 +18,18 @@ from pathlib import Path
 import numpy as np
 from protocols import load_real, machine, write_report
 
+from completion.bodies import at_rest
 from completion.mocap.files.markers import MarkerSequence, read_markers
 from completion.mocap.marker_sets.layout import MarkerLayout
 from completion.mocap.marker_sets.named import named_layout
 from completion.mocap.mosh.mosh import mosh
-from completion.mocap.retargeting.creases import Creases, at_rest
+from completion.mocap.retargeting.creases import Creases
 from completion.mocap.retargeting.pictures import picture_transfer, write_character
 from completion.mocap.retargeting.soft_tissue import deformation, moving_character, retarget_soft_tissue
 from completion.mocap.soft_tissue.soft_tissue import SoftTissue
 from completion.synthetic_people import synthetic_model
 from model.body import BodyModel
-from model.posing.character_mesh import Character, register_character
+from model.posing.character import Character, register_character
 from scanprep.geometry.mesh import Mesh
 from scanprep.pictures.shading import save_png
 from scanprep.synthetic.data_set import SUBJECT
@@ -102,12 +103,12 @@ def measure(model: BodyModel, found: Character, soft: SoftTissue, factor: float,
     smooth = creases[""].smoothed(changed, poses)
     row["smoothing_ms"] = MM * (time.process_time() - start) / len(frames)
     row["smoothing_moved_mm"] = MM * float(np.linalg.norm(smooth - changed, axis=2).max())
-    theirs = Creases(at_rest(model, soft.motion.betas), model.skeleton).turned_over(person, poses)
+    theirs = Creases(at_rest(model, soft.motion.betas), model.skeleton).inverted(person, poses)
     row["turned_on_person"] = int(theirs.sum())
     for kind, each in creases.items():
-        before, after = each.turned_over(changed, poses), each.turned_over(smooth, poses)
+        before, after = each.inverted(changed, poses), each.inverted(smooth, poses)
         row |= {f"turned{kind}": int(before.sum()), f"turned{kind}, smoothed": int(after.sum())}
-    row["worst_frame"] = int(creases[""].turned_over(changed, poses).sum(axis=1).max())
+    row["worst_frame"] = int(creases[""].inverted(changed, poses).sum(axis=1).max())
     share = deformation(model.template.faces, fixed, changed)
     return row | {"deformed_mean": float(share.mean()), "deformed_most": float(np.percentile(share, 99.9)),
                   "moved_by_soft_tissue_mm": float(MM * np.linalg.norm(changed - fixed, axis=2).mean())}

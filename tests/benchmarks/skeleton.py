@@ -25,11 +25,10 @@ from scipy.sparse import csc_array, diags_array, eye_array
 from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.sparse import factor
 from scanprep.geometry.surface import Surface
-from scanprep.skeleton.find import find_skeleton
+from scanprep.skeleton.find import SkeletonSearch, find_skeleton, search_skeleton
 from scanprep.skeleton.motions import PosedSurface
 from scanprep.skeleton.names import part_partners
 from scanprep.skeleton.parts import SkeletonConfig
-from scanprep.skeleton.search import SkeletonSearch, search_skeleton
 from scanprep.skeleton.tree import Skeleton
 from scanprep.synthetic.data_set import subject_pose
 from scanprep.synthetic.people import Person

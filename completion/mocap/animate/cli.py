@@ -23,17 +23,16 @@ from ...cli import ModelOrNone, read_model
 from ..marker_sets.named import layout_or_file
 from ..pose.follow import AnimateConfig
 from ..subject.person import PersonConfig
-from .work import ENDINGS, MEAN_ERROR, BetasTo, GlbConfig, Work
+from .work import ENDINGS, MEAN_ERROR, BetasTo, Work
 
 MarkersArg = Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="MARKERS")]
 
 
 def animate_markers(markers: MarkersArg, output: Output, model: ModelOrNone = None, layout: str | None = None,
-                    subject: str | None = None, unit: Unit | None = None, who: str | None = None,
+                    subject: str | None = None, unit: Unit | None = None, subject_prefix: str | None = None,
                     retarget_to: Path | None = None, betas_to: Path | None = None,
                     config: AnimateConfig = AnimateConfig(),   # noqa: B008
-                    person: PersonConfig = PersonConfig(),                                        # noqa: B008
-                    glb: GlbConfig = GlbConfig(),                                                 # noqa: B008
+                    person: PersonConfig = PersonConfig(),                                         # noqa: B008
                     workers: Workers = Workers(), *, space: Workspace) -> Outcome:              # noqa: B008
     """The motion of a person from markers, and the person.
 
@@ -56,20 +55,20 @@ def animate_markers(markers: MarkersArg, output: Output, model: ModelOrNone = No
             from, betas in JSON or .npz, or a mesh in the model's triangles. Without it "markers" where the model has
             betas.
         unit: Unit of the markers, where the file cannot tell.
-        who: Whose markers, in a C3D file with several people.
+        subject_prefix: Whose markers, in a C3D file with several people: what stands before the colon of their labels.
         retarget_to: Another person who makes the motion too, as betas or a mesh: onto.npz, onto.glb.
         betas_to: Betas into which the body changes, in JSON: those at the end [b1, b2, ...], or keys in seconds
             {"0": [...], "2.5": [...]}: morph.glb.
         config: Settings.
         person: Settings of the person from markers.
-        glb: Settings of animated files.
         workers: Who works through the files of a folder.
     """
     found = _marker_files(markers)
     loaded, name = read_model(model)
     work = Work(loaded, name, None if layout is None else layout_or_file(layout), _subject(loaded, subject, unit),
                 None if retarget_to is None else read_subject(loaded, retarget_to, unit),
-                None if betas_to is None else read_betas_to(betas_to, loaded.n_betas), unit, who, config, person, glb)
+                None if betas_to is None else read_betas_to(betas_to, loaded.n_betas), unit, subject_prefix, config,
+                person)
     settings = {"animate": config, "person": person, "model": name}
     if markers.is_file():
         with bar("following the markers") as following:

@@ -13,13 +13,12 @@ from scanprep.cli import MM
 from scanprep.console import Metric
 from scanprep.geometry import storage
 from scanprep.pictures.page import Page
-from scanprep.ranges import Count, Settings
 
 from ...cli import rows
 from ...motion import Motion, spread_frames
 from ...motion_pictures import moving_picture, picture_bodies, picture_frames
 from ..files.markers import MarkerSequence, read_markers
-from ..files.motion_files import write_glb, write_motion
+from ..files.motion_files import KEYS, write_glb, write_motion
 from ..marker_sets.named import choose_layout
 from ..pose.follow import AnimateConfig, animate
 from ..pose.robust import motion_problem
@@ -30,19 +29,6 @@ from .report import motion_page
 BetasTo = dict[float, np.ndarray] | np.ndarray      # keys over seconds, or betas at the end
 ENDINGS = (".c3d", ".trc", ".csv")
 MEAN_ERROR = "distance of markers, mean"
-
-
-@dataclass(frozen=True)
-class GlbConfig(Settings):
-    """Settings of animated GLB files.
-
-    Attributes
-    ----------
-    keys : int
-        Largest number of key frames.
-    """
-
-    keys: Count = 120
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,7 +45,6 @@ class Work:
     who: str | None
     animate: AnimateConfig
     person: PersonConfig
-    glb: GlbConfig
 
     def __call__(self, path: Path, room: Room) -> list[Metric]:
         """Follow the markers of a file; the figures."""
@@ -92,7 +77,7 @@ def animate_file(work: Work, path: Path, room: Room) -> list[Metric]:
     problem = motion_problem(motion, body.template, layout, sequence)
     metrics = [*([Metric("problem", problem)] if problem else []), *metrics, *figures(motion, sequence)]
     write_motion(output, motion, body)
-    write_glb(output / "animation.glb", motion, body, work.glb.keys)
+    write_glb(output / "animation.glb", motion, body)
     page = motion_page(motion, body, sequence, path.name, rows(metrics))
     if work.retarget_to is not None:
         _other_person(work, work.retarget_to, output, motion, body, page)
@@ -114,22 +99,22 @@ def figures(motion: Motion, markers: MarkerSequence) -> list[Metric]:
         Metric("distance of markers, 95th percentile", float(np.percentile(off, 95)), "mm"),
         Metric("distance of markers, mean of the worst frame", float(frame.max()), "mm"),
         Metric("markers missing", 100 * float(1 - seen[:, seen.any(axis=0)].mean()) if seen.any() else 100.0, "%"),
-        Metric("frames that settled", 100 * float(motion.converged.mean()), "%")]
+        Metric("frames that converged", 100 * float(motion.converged.mean()), "%")]
 
 
 def _other_person(work: Work, person: Subject, output: Path, motion: Motion, body: Subject, page: Page) -> None:
     other = retarget(motion, body, person)
     other.save(output / "onto.npz")
-    write_glb(output / "onto.glb", other, person, work.glb.keys)
+    write_glb(output / "onto.glb", other, person)
     page.section("On another person", "The same rotations of the joints; the way over the ground is as much longer as "
                  "the legs are, and the feet are on the ground when those of the first are.")
     page.picture(picture_frames(other, person, None))
 
 
 def _changing_body(work: Work, goal: BetasTo, output: Path, motion: Motion, body: Subject, page: Page) -> None:
-    shown = spread_frames(len(motion.poses), work.glb.keys)
+    shown = spread_frames(len(motion.poses), KEYS)
     bodies = morphed_vertices(work.model, motion, morph_keys(goal, motion), shown)
-    write_glb(output / "morph.glb", motion, body, work.glb.keys, bodies)
+    write_glb(output / "morph.glb", motion, body, bodies)
     some = spread_frames(len(bodies), 24)
     page.section("With a body that changes", "Betas change from key to key, straight over time.")
     page.picture(picture_bodies(motion, body, bodies, shown)).picture(moving_picture(bodies[some], body, 8.0))

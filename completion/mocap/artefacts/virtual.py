@@ -8,8 +8,7 @@ import numpy as np
 
 from scanprep.geometry import storage
 
-from ..files.c3d import point_table, write_c3d
-from ..files.c3d_points import replace_points
+from ..files.c3d import point_table, replace_points, write_c3d
 from ..files.common import MarkerFileError
 from ..files.markers import write_markers
 from .results import MarkerArtefacts

@@ -13,12 +13,14 @@ from typing import Any
 
 import numpy as np
 
+from scanprep.geometry.format_common import UNITS
+
 from .common import MarkerFileError, RawMarkers
 
-_MAGIC = 0x50
 _BLOCK = 512
 _INTEL, _DEC, _MIPS = 84, 85, 86
 _COMPUTED = ("ANGLES", "FORCES", "MOMENTS", "POWERS", "SCALARS")     # stored among the points, but no positions
+RESIDUAL = 256                       # one step of the residual in the fourth number of a point; below it are cameras
 MEASURED = 1.0                       # residual, millimetres, of points that were measured, where others were not
 _Parameters = dict[tuple[str, str], list[Any]]                       # group and name -> values
 
@@ -57,14 +59,14 @@ class _Numbers:
 class PointTable:
     """Where in a C3D file its points stand."""
 
-    numbers: _Numbers                # _Numbers
-    labels: tuple[str, ...]          # Of all points, those that hold no positions among them
-    kept: tuple[int, ...]            # (L,) int: The columns that hold positions
-    start: int                       # bytes: Of the first frame, and of each
-    width: int                       # bytes: Of the first frame, and of each
+    numbers: _Numbers
+    labels: tuple[str, ...]          # of all points, those that hold no positions among them
+    kept: tuple[int, ...]            # the columns that hold positions
+    start: int                       # byte of the first frame
+    width: int                       # bytes of each
     frames: int
-    scale: float                     # Of whole numbers; negative where the file holds floating-point numbers
-    rate: float | None               # or None
+    scale: float                     # of whole numbers; negative where the file holds floating-point numbers
+    rate: float | None
     unit: str
 
     @property
@@ -82,7 +84,7 @@ class PointTable:
 def point_table(path: Path, data: bytes) -> PointTable:
     """Where the points of a C3D file stand."""
     start = (data[0] - 1) * _BLOCK if data else 0
-    if len(data) < _BLOCK or data[1] != _MAGIC:
+    if len(data) < _BLOCK or data[1] != 0x50:
         raise MarkerFileError(f"{path}: expected a C3D file, with byte 2 = 80 and a header of {_BLOCK} bytes; "
                               f"found {len(data)} bytes that begin {data[:8]!r}")
     if not 0 < start < len(data) - 4:
@@ -194,6 +196,46 @@ def _labels(parameters: _Parameters, count: int) -> list[str]:
         part += 1
     labels = (labels + [""] * count)[:count]
     return [label or f"point{i}" for i, label in enumerate(labels)]
+
+
+def replace_points(path: Path, data: bytes, columns: np.ndarray, positions: np.ndarray, source: np.ndarray,
+                   unit: str | None = None) -> bytes:
+    """The file with other positions of some points; analog channels, events and all parameters are kept.
+
+    A point that was measured keeps its cameras and its residual, which is made no less than the least that the file
+    can hold; one that was computed has neither, as the format has it; a missing one has residual -1.
+
+    `columns` (L,) says which of the file's points that have positions, `positions` (T, L, 3), metres, are NaN where a
+    point is missing, `source` (T, L) is which of `columns` a point was measured as, -1 where it was computed. `unit` is
+    that of a file that does not say, or says it wrongly.
+    """
+    table = point_table(path, data)
+    if len(positions) != table.frames:
+        raise MarkerFileError(f"{path}: expected a file of {len(positions)} frames, found {table.frames}")
+    if len(columns) and np.max(columns) >= len(table.kept):
+        raise MarkerFileError(f"{path}: expected a file of more than {np.max(columns)} points, found {len(table.kept)}")
+    if (unit or table.unit) not in UNITS:
+        raise MarkerFileError(f"{path}: expected a unit of {', '.join(UNITS)}, found '{table.unit}'")
+    words, mine = table.words(data), np.array(table.kept)[columns]
+    scale = UNITS[unit or table.unit] * (1.0 if table.kind == "f4" else table.scale)
+    fresh = np.empty((*positions.shape[:2], 4))
+    fresh[..., :3] = positions / scale
+    old = np.take_along_axis(words[:, mine, 3], np.maximum(source, 0), axis=1)
+    fresh[..., 3] = np.where(source < 0, 0.0, np.where(old < RESIDUAL, old + RESIDUAL, old))
+    same = (source == np.arange(len(mine))) & (words[:, mine, 3] >= 0)
+    fresh[same, :3] = words[:, mine][same, :3]                         # not a bit of them changes
+    fresh[np.isnan(positions[..., 0])] = [0, 0, 0, -1]
+    if table.kind == "i2":
+        fresh = np.rint(fresh)
+        if np.abs(fresh).max(initial=0) > 32767:
+            raise MarkerFileError(f"{path}: expected places within {32767 * abs(table.scale):g} {table.unit}, which "
+                                  f"its whole numbers reach, got {np.nanmax(np.abs(positions)):g} m")
+    words[:, mine] = fresh
+    out = np.frombuffer(data, np.uint8).copy()
+    rows = out[table.start:table.start + table.frames * table.width].reshape(table.frames, -1)
+    encoded = np.frombuffer(table.numbers.encoded(words, table.kind), np.uint8)
+    rows[:, :encoded.size // table.frames] = encoded.reshape(table.frames, -1)
+    return out.tobytes()
 
 
 def write_c3d(path: Path, positions: np.ndarray, labels: tuple[str, ...], rate: float,

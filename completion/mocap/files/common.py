@@ -5,10 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from scanprep.geometry.formats.common import UNITS
 from scanprep.geometry.storage import StorageError
-
-MARKER_UNITS = UNITS
 
 
 class MarkerFileError(StorageError):

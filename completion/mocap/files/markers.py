@@ -9,10 +9,10 @@ from pathlib import Path
 import numpy as np
 
 from scanprep.geometry import storage
-from scanprep.geometry.formats.common import FARTHEST
+from scanprep.geometry.format_common import FARTHEST, UNITS
 
 from .c3d import read_c3d, write_c3d
-from .common import MARKER_UNITS, MarkerFileError, RawMarkers
+from .common import MarkerFileError, RawMarkers
 from .text import encode_csv, read_csv, read_trc
 
 __all__ = ["MarkerFileError", "MarkerSequence", "read_markers", "write_markers"]
@@ -93,22 +93,6 @@ class MarkerSequence:
             raise ValueError(f"which: expected a slice that goes forward, got {which}")
         return MarkerSequence(self.positions[which], self.labels, self.rate / step)
 
-    def resampled(self, rate: float) -> MarkerSequence:
-        """The sequence at another rate, straight between frames; missing wherever a neighbour is missing."""
-        if not (np.isfinite(rate) and rate > 0):
-            raise ValueError(f"rate: expected a positive number of frames per second, got {rate}")
-        last = len(self.positions) - 1
-        if last < 1:
-            return MarkerSequence(self.positions, self.labels, rate)
-        place = np.arange(int(np.floor(last * rate / self.rate + 1e-9)) + 1) * (self.rate / rate)
-        nearest = np.rint(place)
-        place = np.clip(np.where(np.abs(place - nearest) < 1e-9, nearest, place), 0, last)
-        before = np.minimum(np.floor(place).astype(np.int64), last)
-        after = np.minimum(before + 1, last)
-        part = (place - before)[:, None, None]
-        between = (1 - part) * self.positions[before] + part * self.positions[after]
-        return MarkerSequence(np.where(part == 0, self.positions[before], between), self.labels, rate)
-
 
 def read_markers(path: str | Path, unit: str | None = None, subject: str | None = None,
                  rate: float | None = None) -> MarkerSequence:
@@ -137,17 +121,17 @@ def read_markers(path: str | Path, unit: str | None = None, subject: str | None 
         Missing, truncated or of another format, several subjects and none named, a label that comes twice.
     """
     path = Path(path)
-    if unit is not None and unit not in MARKER_UNITS:
-        raise ValueError(f"unit: expected one of {', '.join(MARKER_UNITS)}, got {unit!r}")
+    if unit is not None and unit not in UNITS:
+        raise ValueError(f"unit: expected one of {', '.join(UNITS)}, got {unit!r}")
     raw = _read_raw(path)
     own_unit = unit or raw.unit
-    if own_unit not in MARKER_UNITS:
-        raise MarkerFileError(f"{path}: expected a unit of {', '.join(MARKER_UNITS)}, found '{raw.unit}'; "
+    if own_unit not in UNITS:
+        raise MarkerFileError(f"{path}: expected a unit of {', '.join(UNITS)}, found '{raw.unit}'; "
                               f"say unit=")
     if rate is None and raw.rate is None:
         raise MarkerFileError(f"{path}: expected a column time, found frame numbers only; say rate=")
     columns, labels = _of_subject(path, raw.labels, subject)
-    positions = MARKER_UNITS[own_unit] * raw.positions[:, columns]
+    positions = UNITS[own_unit] * raw.positions[:, columns]
     positions[(positions == 0).all(axis=2)] = np.nan
     if (np.abs(positions) > FARTHEST).any():
         raise MarkerFileError(f"{path}: expected positions that are finite and below {FARTHEST:g} m, found "

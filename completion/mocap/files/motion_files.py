@@ -10,9 +10,11 @@ import numpy as np
 from model.export.bvh import write_bvh
 from model.linear import PointOperator, Subject
 from scanprep.geometry.storage import writing
-from scanprep.pictures.views import upright
+from scanprep.pictures.camera import upright
 
 from ...motion import Motion, spread_frames
+
+KEYS = 120                           # most key frames in a GLB
 
 
 def joint_angles(motion: Motion) -> np.ndarray:
@@ -70,13 +72,13 @@ def write_motion_bvh(path: Path, motion: Motion, subject: Subject) -> None:
               body=subject.template.with_vertices(rest))
 
 
-def write_glb(path: Path, motion: Motion, subject: Subject, keys: int, vertices: np.ndarray | None = None,
-              colors: np.ndarray | None = None) -> None:
+def write_glb(path: Path, motion: Motion, subject: Subject, vertices: np.ndarray | None = None,
+              colors: np.ndarray | None = None, keys: int = KEYS) -> None:
     """An animated GLB that lasts as long as the motion, of at most so many key frames.
 
     `vertices` (n, N, 3), metres, are of the key frames, where the body changes; else it is the subject's.
     """
-    from scanprep.pictures.animation import write_animated_glb
+    from scanprep.pictures.gltf import write_animated_glb
 
     chosen, mesh = spread_frames(len(motion.poses), keys), subject.template
     rate = motion.rate * max(len(chosen) - 1, 1) / max(len(motion.poses) - 1, 1)

@@ -12,8 +12,6 @@ from scanprep.geometry import tables
 
 from .common import MarkerFileError, RawMarkers
 
-_AXES = ("x", "y", "z")
-
 
 def read_trc(path: Path, data: bytes) -> RawMarkers:
     """A TRC file of Motion Analysis or OpenSim: empty cells and NaN are missing."""
@@ -60,7 +58,7 @@ def read_csv(path: Path, data: bytes) -> RawMarkers:
     columns = {word.lower(): i for i, word in enumerate(head)}
     names = [word for word in head if word not in clock]
     labels = tuple(word[:-2] for word in names[::3])
-    wanted = [f"{label}_{axis}" for label in labels for axis in _AXES]
+    wanted = [f"{label}_{axis}" for label in labels for axis in "xyz"]
     if not clock or not labels or [n.lower() for n in names] != [w.lower() for w in wanted]:
         raise MarkerFileError(f"{path}: line 1: expected the columns time,LABEL_x,LABEL_y,LABEL_z,..., "
                               f"found {','.join(head)[:80]!r}")
@@ -102,7 +100,7 @@ def encode_csv(positions: np.ndarray, labels: Sequence[str], rate: float) -> byt
     """Positions (T, L, 3), metres, as the CSV that `read_csv` reads."""
     text = io.StringIO()
     table = csv.writer(text, lineterminator="\n")
-    table.writerow(["time", *(f"{label}_{axis}" for label in labels for axis in _AXES)])
+    table.writerow(["time", *(f"{label}_{axis}" for label in labels for axis in "xyz")])
     for t, frame in enumerate(positions):
         table.writerow([f"{t / rate:.9g}", *("" if np.isnan(v) else f"{v:.9g}" for v in frame.ravel())])
     return text.getvalue().encode()

@@ -11,15 +11,14 @@ from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.surface import Rays
 from scanprep.skeleton.tree import Skeleton
 
-from ..marker_sets.layout import DISTANCE, MarkerLayout
-from ..marker_sets.pictures import mean_body
+from ...bodies import at_rest
+from ..marker_sets.layout import MarkerLayout
 from ..marker_sets.symmetry import SkinMirror, find_skin_mirror, other_side, side_of
 
 if TYPE_CHECKING:
     from model.body import BodyModel
 
 RAYS = 48                            # directions that are tried from every place
-CONE = 0.5                           # cosine of the directions inwards along which thickness is measured
 
 
 def candidate_layout(body: BodyModel | Mesh, base: MarkerLayout, count: int = 114,
@@ -55,7 +54,7 @@ def candidate_layout(body: BodyModel | Mesh, base: MarkerLayout, count: int = 11
     [MoSh] Eq. 25
     """
     if not isinstance(body, Mesh):
-        skeleton, body = skeleton or body.skeleton, mean_body(body)
+        skeleton, body = skeleton or body.skeleton, at_rest(body)
     mirror = mirror or find_skin_mirror(body)
     room = _Room(body, base, mirror)
     whole = _with_partners(base, mirror)
@@ -63,7 +62,8 @@ def candidate_layout(body: BodyModel | Mesh, base: MarkerLayout, count: int = 11
         raise ValueError(f"count: expected at least the {len(whole.labels)} markers of the base with their partners, "
                          f"got {count}")
     places = room.spread(count - len(whole.labels), whole.nearest)
-    return _joined(whole, places, _names(body, skeleton, places))
+    vertices = np.array([v for place in places for v in place], dtype=np.int64)
+    return whole.joined(MarkerLayout(tuple(_names(body, skeleton, places)), vertices))
 
 
 def sitting_room(body: Mesh, mirror: SkinMirror, thick: float = 0.022) -> np.ndarray:
@@ -125,27 +125,10 @@ class _Room:
 
 def _with_partners(base: MarkerLayout, mirror: SkinMirror) -> MarkerLayout:
     """The base, and the partners that are missing in it."""
-    lonely = [i for i, label in enumerate(base.labels) if (o := other_side(label)) and o not in base.labels]
-    others = [other_side(base.labels[i]) or "" for i in lonely]
-    places: list[tuple[int, ...]] = [(int(mirror.partner[base.nearest[i]]),) for i in lonely]
-    free = {base.labels[i] for i in lonely} & set(base.loose)
-    joined = _joined(base, places, others)
-    aliases = {a: label for a, label in joined.aliases.items() if a not in others}
-    return MarkerLayout(joined.labels, joined.vertices, joined.distances, joined.weights, aliases,
-                        (*base.loose, *(o for i, o in zip(lonely, others, strict=True) if base.labels[i] in free)))
-
-
-def _joined(base: MarkerLayout, places: list[tuple[int, ...]], labels: list[str]) -> MarkerLayout:
-    """The base, and markers on single vertices."""
-    v = np.array([v for place in places for v in place], dtype=np.int64)
-    distances = np.r_[np.asarray(base.distances), np.full(len(v), DISTANCE)]
-    all_labels = (*base.labels, *labels)
-    aliases = {a: label for a, label in base.aliases.items() if a not in labels}
-    if base.weights is None:
-        return MarkerLayout(all_labels, np.r_[base.vertices, v], distances, None, aliases, base.loose)
-    weights = np.vstack([base.weights, np.tile([1.0, 0.0, 0.0], (len(v), 1))])
-    return MarkerLayout(all_labels, np.vstack([base.vertices, np.repeat(v[:, None], 3, axis=1)]), distances, weights,
-                        aliases, base.loose)
+    lonely = {label: o for label in base.labels if (o := other_side(label)) and o not in base.labels}
+    rows = [base.labels.index(label) for label in lonely]
+    loose = tuple(o for label, o in lonely.items() if label in base.loose)
+    return base.joined(MarkerLayout(tuple(lonely.values()), mirror.partner[base.nearest[rows]], loose=loose))
 
 
 def _names(body: Mesh, skeleton: Skeleton | None, places: list[tuple[int, ...]]) -> list[str]:
@@ -185,7 +168,7 @@ def _openness(body: Mesh, reach: float) -> np.ndarray:
 def _thickness(body: Mesh, reach: float) -> np.ndarray:
     """(N,) how far the skin on the other side is, metres: the median of directions inwards, at most `reach`."""
     k = np.arange(RAYS // 3)
-    z = 1 - (1 - CONE) * (k + 0.5) / len(k)
+    z = 1 - (1 - 0.5) * (k + 0.5) / len(k)  # cosine of the directions inwards along which thickness is measured
     origins, directions = _fans(body, z)
     inward = np.repeat(body.vertex_normals, len(k), axis=0)
     hit = Rays(body).cast(origins - 1e-4 * reach * inward, -directions, reach)[1]

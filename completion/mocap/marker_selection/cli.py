@@ -13,21 +13,20 @@ from scanprep.dataset import RegisteredSet
 from scanprep.geometry import storage
 from scanprep.geometry.files import read_registered
 from scanprep.geometry.mesh import Mesh
+from scanprep.pictures.camera import look_around
 from scanprep.pictures.page import Page
 from scanprep.pictures.shading import Dots, render, side_by_side
-from scanprep.pictures.views import look_around
 
+from ...bodies import at_rest
 from ...cli import ModelOrNone, read_model, rows
 from ..marker_sets.layout import MarkerLayout
 from ..marker_sets.named import choose_layout
-from ..marker_sets.pictures import SIDES, mean_body
+from ..marker_sets.pictures import SIDES
 from ..marker_sets.symmetry import label_pairs, marker_pairs
 from .candidates import candidate_layout
 from .design import MarkerDesign, design_markers
 from .fits import DesignConfig
 from .linear import check_bodies, example_poses, in_poses
-
-USUAL = "vicon47"                    # around which candidates are made where none are named
 
 
 def design(bodies: Path, output: Output, model: ModelOrNone = None, candidates: str | None = None,
@@ -80,20 +79,12 @@ def design(bodies: Path, output: Output, model: ModelOrNone = None, candidates: 
 def _candidates(model: BodyModel, given: str | None, kept: MarkerLayout | None) -> MarkerLayout:
     """The candidates, those that are kept among them."""
     if given is None:
-        return candidate_layout(model, choose_layout(model, USUAL, ())[0] if kept is None else kept)
+        return candidate_layout(model, choose_layout(model, "vicon47", ())[0] if kept is None else kept)
     among = choose_layout(model, given, ())[0]
     if kept is None or set(kept.labels) <= set(among.labels):
         return among
     own = kept.without([label for label in kept.labels if label in among.labels])
-    (ids, weights), (others, shares) = (_on_triangles(*each.skin) for each in (among, own))
-    return MarkerLayout((*among.labels, *own.labels), np.vstack([ids, others]),
-                        np.r_[np.asarray(among.distances), np.asarray(own.distances)], np.vstack([weights, shares]),
-                        {**own.aliases, **among.aliases}, (*among.loose, *own.loose))
-
-
-def _on_triangles(ids: np.ndarray, weights: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Vertices and weights (L, 3) of skin points of one or three vertices."""
-    return np.broadcast_to(ids, (len(ids), 3)), weights if weights.shape[1] == 3 else np.eye(3)[[0] * len(ids)]
+    return among.joined(own)
 
 
 def _read_bodies(model: BodyModel, folder: Path, unit: Unit | None) -> tuple[np.ndarray, np.ndarray]:
@@ -178,7 +169,7 @@ def design_page(design: MarkerDesign, model: BodyModel, candidates: MarkerLayout
     """The page of `scape layout design`."""
     page = Page(f"{len(design.layout.labels)} markers", "Chosen so that bodies estimated from them are near the true "
                 "ones over their whole surface. Red: chosen; blue: kept; grey: left out.")
-    page.picture(picture_design(design, mean_body(model), candidates, keep))
+    page.picture(picture_design(design, at_rest(model), candidates, keep))
     chosen = [label for label in design.layout.labels if label not in keep]
     page.text(f"Chosen: {', '.join(chosen) or 'none'}." + (f" Kept: {', '.join(keep)}." if keep else ""))
     page.section("Error and number of markers").chart(chart_curve(design), "root mean squared distance of all vertices "

@@ -18,12 +18,11 @@ from .linear import LinearBodies, WholeFits, fit_bodies, shared_shape
 class Curve:
     """Sets of markers of many sizes, each the one before and a marker, or a pair, more or less."""
 
-    # "removed" from all candidates, "added" to those kept or to none, or "kept, removed": those kept, made fewer
-    name: str
-    start: tuple[str, ...]           # Labels of the first set
-    steps: tuple[tuple[str, ...], ...] # each: Labels that came or went in every step
-    counts: np.ndarray               # (S,) int: Markers of each set, the first included
-    rmse: np.ndarray                 # (S,) float, metres: Over all vertices and bodies, linearised
+    name: str                        # "removed" from all, "added" to those kept, or "kept, removed": these made fewer
+    start: tuple[str, ...]           # of the first set
+    steps: tuple[tuple[str, ...], ...]    # labels that came or went in every step
+    counts: np.ndarray               # (S,) int, markers of each set, the first included
+    rmse: np.ndarray                 # (S,), metres: over all vertices and bodies, linearised
 
     def labels(self, count: int) -> tuple[str, ...]:
         """The set with that many markers, or the most below it."""
@@ -41,8 +40,8 @@ class Check:
     """A set of markers, its bodies estimated again without linearising."""
 
     count: int
-    linearised: float                # metres: Root mean squared distance over all vertices and bodies
-    full: float                      # metres: Root mean squared distance over all vertices and bodies
+    linearised: float                # metres, root mean squared distance over all vertices and bodies
+    full: float                      # metres, the same by a full refit
 
 
 @dataclass(frozen=True, eq=False)
@@ -85,8 +84,8 @@ FEWEST = 3                           # markers below which a body has no place
 class Choice:
     """What the search for one set found."""
 
-    paths: dict[str, Path]           # {str: Path}
-    groups: np.ndarray               # (n,) int: Of the set
+    paths: dict[str, Path]
+    groups: np.ndarray               # (n,) int, of the set
     rmse: float                      # metres
     exchanged: int
 

@@ -17,8 +17,6 @@ from scanprep.ranges import FLAG, Count, Positive, Settings
 from ...energy import MovingPoints, moving_points
 from ...priors import gaussian_prior
 
-AT_ONCE = 2**25                      # numbers of a batch of derivatives
-
 
 @dataclass(frozen=True)
 class DesignConfig(Settings):
@@ -54,7 +52,7 @@ class DesignConfig(Settings):
     marker_sd: Positive = 0.005
     surface: Count = 1000
     exchanges: int = 1
-    checks: Annotated[tuple[Count, ...], FLAG] = ()
+    checks: tuple[Count, ...] = ()
 
 
 class BodyPoints:
@@ -77,7 +75,8 @@ class BodyPoints:
     @property
     def batch(self) -> int:
         """Bodies whose derivatives are held at once."""
-        return max(1, AT_ONCE // max(1, 3 * self.count * (self.n_unknowns + self.shaped.terms.count)))
+        # numbers of a batch of derivatives
+        return max(1, 2**25 // max(1, 3 * self.count * (self.n_unknowns + self.shaped.terms.count)))
 
     def _operators(self, betas: np.ndarray) -> list[PointOperator]:
         change = (betas @ self._changes).reshape(len(betas), *self.shaped.mean_basis.shape)
@@ -106,7 +105,6 @@ class BodyPoints:
 
 Tell = Callable[[int], None]
 Progress = Callable[[int, int], None]
-TOGETHER = 24                        # bodies that are minimised at once
 
 
 @dataclass(frozen=True, eq=False)
@@ -156,7 +154,7 @@ def fit_points(points: BodyPoints, targets: np.ndarray, weights: np.ndarray, pri
     [MoSh] Eq. 26
     """
     root, found = np.sqrt(weights)[:, None], np.empty_like(start)
-    size = min(TOGETHER, points.batch)
+    size = min(24, points.batch)  # bodies that are minimised at once
     for begin in range(0, len(start), size):
         some = slice(begin, begin + size)
         goal, known = targets[some], prior.of(some)

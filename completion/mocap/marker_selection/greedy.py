@@ -38,10 +38,10 @@ LEAST_GAIN = 1e-6                    # share of the mean squared distance below 
 class Path:
     """Sets of markers, each the one before and a group more or less."""
 
-    start: np.ndarray                # (m,) int: Groups of the first set, in rising order
-    steps: tuple[int, ...]           # The group that came or went in each step
-    added: bool                      # They came
-    counts: np.ndarray               # (S,) int: Markers of each set, the first included
+    start: np.ndarray                # (m,) int, groups of the first set, in rising order
+    steps: tuple[int, ...]           # the group that came or went in each step
+    added: bool                      # they came
+    counts: np.ndarray               # (S,) int, markers of each set, the first included
     rmse: np.ndarray                 # (S,) float, metres
 
     def set(self, i: int) -> np.ndarray:
@@ -148,7 +148,8 @@ def walk(sets: MarkerSets, sign: int, movable: np.ndarray, until: int, through: 
          tell: Callable[[int], None] | None = None) -> Path:
     """Let the group come or go that serves best for each of its markers, again and again.
 
-    `movable` (n,): groups that may come or go.
+    `movable` (n,) are groups that may come or go; the count goes no further than `until`, and stops at those of
+    `through` where a single marker can be had.
     """
     start, steps = np.flatnonzero(sets.inside), list[int]()
     counts, rmse = [sets.count], [sets.rmse]
@@ -163,6 +164,8 @@ def walk(sets: MarkerSets, sign: int, movable: np.ndarray, until: int, through: 
         gain = (sets.tried(open_, sign) - sets.costs.mean()) / sets.sizes[open_]
         steps.append(int(open_[np.argmin(gain)]))
         sets.take(steps[-1], sign)
+        if sign == ADD and sets.count < 8:           # the first markers know the place a thousand times better
+            sets.renew()                             # than what was before, and updates lose as many digits
         counts.append(sets.count)
         rmse.append(sets.rmse)
         if tell is not None:
@@ -174,9 +177,8 @@ def exchange(sets: MarkerSets, movable: np.ndarray, rounds: int) -> int:
 
     A pair may make room for two single markers, and two of these for a pair.
 
-    Returns int (How many exchanges were made).
-
-    `movable` (n,): groups that may come or go.
+    `movable` (n,) are groups that may come or go. The set changes, its count does not; found is how many exchanges were
+    made in at most so many rounds.
     """
     done = 0
     for _ in range(rounds):

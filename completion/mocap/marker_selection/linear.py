@@ -16,7 +16,6 @@ from scanprep.geometry.farthest_points import farthest_points
 from ..marker_sets.layout import MarkerLayout
 from .fits import BodyPoints, DesignConfig, Prior, Progress, fit_points, prior_around, rough_poses
 
-FIT_SURFACE = 400                    # vertices that stand for all of them in the first fit to each whole body
 FIT_ITERATIONS = 20                  # most steps of that fit, and of a full refit
 
 
@@ -28,14 +27,13 @@ class LinearBodies:
     `dᵀ G d - 2 dᵀ p + c`.
     """
 
-    # (Z, C, r, P) float: B: derivatives of every candidate, over the standard deviation of a marker
-    rows: np.ndarray
-    gaps: np.ndarray                 # (Z, C, r) float: g: how far it is from where the body has it, over the same
-    gram: np.ndarray                 # (Z, P, P) float, square metres: G
-    pull: np.ndarray                 # (Z, P) float, square metres: p
-    rest: np.ndarray                 # (Z,) float, square metres: c: what the model cannot reach
-    precision: np.ndarray            # (P, P) float: Λ of the priors
-    lean: np.ndarray                 # (Z, P) float: l: where the priors pull
+    rows: np.ndarray                 # (Z, C, r, P), B: derivatives of every candidate, over a marker's deviation
+    gaps: np.ndarray                 # (Z, C, r), g: how far it is from where the body has it, over the same
+    gram: np.ndarray                 # (Z, P, P), square metres, G
+    pull: np.ndarray                 # (Z, P), square metres, p
+    rest: np.ndarray                 # (Z,), square metres, c: what the model cannot reach
+    precision: np.ndarray            # (P, P), Λ of the priors
+    lean: np.ndarray                 # (Z, P), l: where the priors pull
 
     def steps(self, chosen: Sequence[int] | np.ndarray) -> np.ndarray:
         """(Z, P) from these candidates, each solved for by itself.
@@ -69,11 +67,11 @@ class LinearBodies:
 class WholeFits:
     """Bodies, their candidates, and the model fitted to their whole surfaces."""
 
-    x: np.ndarray                    # (Z, P) float: Unknowns (pose, trans, betas)
-    markers: BodyPoints              # The candidates, on the skin
-    places: np.ndarray               # (Z, C, 3) float, metres: Where they are on the bodies
+    x: np.ndarray                    # (Z, P) unknowns: pose, trans, betas
+    markers: BodyPoints              # the candidates, on the skin
+    places: np.ndarray               # (Z, C, 3), metres: where they are on the bodies
     prior: Prior
-    linear: LinearBodies             # LinearBodies
+    linear: LinearBodies
 
     def refitted(self, chosen: Sequence[int] | np.ndarray, config: DesignConfig,
                  tell: Callable[[int], None] | None = None) -> np.ndarray:
@@ -91,12 +89,12 @@ def fit_bodies(model: BodyModel, bodies: np.ndarray, candidates: MarkerLayout, c
                progress: Progress | None = None) -> WholeFits:
     """Fit the model to every whole body, and linearise there.
 
-    `bodies` (Z, N, 3), metres: in the topology of the model's template, in any poses.
+    Bodies (Z, N, 3), metres, are in the topology of the model's template, in any poses.
     """
     bodies, n_betas = check_bodies(model, bodies), _check(model, candidates, config)
     tell = progress or (lambda done, total: None)
     template, total = model.template.vertices, 2 * len(bodies)
-    few = spread_vertices(template, FIT_SURFACE)
+    few = spread_vertices(template, 400)  # vertices that stand for all of them in the first fit to each whole body
     weights = share_of_vertices(template, few) * len(few) / (len(template) * config.marker_sd**2)
     start = rough_poses(model, bodies, n_betas)
     x = fit_points(BodyPoints(model.points(few, None, n_betas)), bodies[:, few], weights,
@@ -161,7 +159,7 @@ def shared_shape(linear: LinearBodies, x: np.ndarray, people: np.ndarray, n_beta
     Unknowns of a person are pose and place of the bodies one after the other, and the betas, a step from the mean
     of those that the bodies have by themselves. Rows of a candidate are those in all the bodies.
 
-    `x` (Z, P): unknowns around which it was linearised; betas come last; `people` (Z,): whose body each is.
+    It was linearised around unknowns x (Z, P), betas last; `people` (Z,) is whose body each is.
     """
     names, each = np.unique(people, return_counts=True)
     if len(people) != len(x) or len(set(each.tolist())) > 1:
@@ -216,9 +214,7 @@ def in_poses(model: BodyModel, bodies: np.ndarray, poses: np.ndarray,
              progress: Callable[[int, int], None] | None = None) -> np.ndarray:
     """Each registered body, with its own full shape, in some poses.
 
-    Returns (Z, F, N, 3) float32, metres.
-
-    `bodies` (Z, N, 3), metres; `poses` (F, J, 3), radians.
+    Bodies (Z, N, 3), metres, in poses (F, J, 3), radians, come out as (Z, F, N, 3) float32.
     """
     bodies = check_bodies(model, bodies)
     poses, _ = check_pose(model.skeleton, poses, None)

@@ -14,10 +14,10 @@ from scanprep.geometry.landmarks import match_landmarks, read_landmarks, read_te
 from scanprep.geometry.mesh import Mesh
 from scanprep.skeleton.tree import Skeleton
 
+from ...bodies import at_rest
 from ...cli import ModelOrNone, read_model
 from .layout import MarkerLayout
 from .named import layout_summaries, read_layout
-from .pictures import mean_body
 from .symmetry import label_pairs
 
 LayoutArg = Annotated[tyro.conf.Positional[str], tyro.conf.arg(metavar="LAYOUT")]
@@ -103,7 +103,7 @@ def transfer_to(layout: LayoutArg, source: Path, target: Path, output: Output, l
     from scanprep.pictures.shading import save_png
 
     from .pictures import picture_layout
-    from .transfer import DOUBTFUL, transfer_layout
+    from .transfer import UNCERTAIN, transfer_layout
 
     ours, theirs = read_mesh(source), read_mesh(target, unit)
     found = read_layout(layout, ours, None)
@@ -119,7 +119,7 @@ def transfer_to(layout: LayoutArg, source: Path, target: Path, output: Output, l
     result.layout.save(output)
     save_png(output.with_suffix(".png"), picture_layout(theirs, result.layout))
     write_mesh(output.with_suffix(".registered.ply"), result.registered)
-    if result.uncovered > DOUBTFUL:
+    if result.uncovered > UNCERTAIN:
         say(f"note: {result.uncovered:.0%} of {target} is not covered by the source; look at "
             f"{output.with_suffix('.png')}, and name landmarks if limbs are wrong")
     return Outcome(output, [
@@ -138,7 +138,7 @@ def _body(model: Path | None, body: Path | None, unit: Unit | None
         return read_mesh(body, unit), None, None, str(body)
     loaded, name = read_model(model)
     kept = loaded.info.get("people_vertices")
-    return mean_body(loaded), loaded.skeleton, None if kept is None else np.array(kept), name
+    return at_rest(loaded), loaded.skeleton, None if kept is None else np.array(kept), name
 
 
 def _figures(layout: MarkerLayout, body: Mesh) -> list[Metric]:

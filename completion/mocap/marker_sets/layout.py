@@ -118,7 +118,7 @@ class MarkerLayout:
     @property
     def skin(self) -> tuple[np.ndarray, np.ndarray]:
         """Vertices and weights (L, k) of the points of the skin below the markers, k 1 or 3."""
-        ids = self.vertices.reshape(len(self.labels), -1)
+        ids = self.vertices if self.vertices.ndim == 2 else self.vertices[:, None]
         return ids, np.ones(ids.shape) if self.weights is None else self.weights
 
     @property
@@ -177,6 +177,20 @@ class MarkerLayout:
         gone = {known[label] for label in labels}
         kept = self.select([label for label in self.labels if label not in gone])
         return replace(kept, aliases={a: label for a, label in self.aliases.items() if label not in gone})
+
+    def joined(self, other: MarkerLayout) -> MarkerLayout:
+        """The markers of both, of which no label is the same; aliases that are labels now go."""
+        labels, both = (*self.labels, *other.labels), (self, other)
+        aliases = {a: label for each in (other, self) for a, label in each.aliases.items() if a not in labels}
+        weights = None
+        if self.weights is None and other.weights is None:
+            places = np.concatenate([self.vertices, other.vertices])
+        else:
+            places = np.concatenate([np.broadcast_to(each.skin[0], (len(each.labels), 3)) for each in both])
+            weights = np.concatenate([np.eye(3)[[0] * len(each.labels)] if each.weights is None else each.weights
+                                      for each in both])
+        return MarkerLayout(labels, places, np.r_[np.asarray(self.distances), np.asarray(other.distances)], weights,
+                            aliases, (*self.loose, *other.loose))
 
     def moved(self, places: Mapping[str, int]) -> MarkerLayout:
         """The same with some markers on other vertices, {label: vertex}; an alias moves its marker."""

@@ -17,7 +17,6 @@ from scanprep.geometry.surface import Surface
 from .layout import MarkerLayout
 
 FOLDER = Path(__file__).parent / "layouts"
-SYNTHETIC = "synthetic people"
 OWN = ('write a file {"markersets": [{"distance_from_skin": 0.0095, "indices": {LABEL: VERTEX, ...}}]} '
        "and load it with MarkerLayout.load (--layout FILE)")
 
@@ -70,7 +69,7 @@ def named_layout(name: str, template: Mesh, kept: np.ndarray | None = None) -> M
             return MarkerLayout.load(path)
     if kept is not None and len(kept) == len(template.vertices):
         for path, body in bodies:
-            if body["name"] == SYNTHETIC:
+            if body["name"] == "synthetic people":
                 return _on_kept(MarkerLayout.load(path), template, np.asarray(kept))
     known = ", ".join(f"{body['name']} ({body['vertices']} vertices)" for _, body in bodies)
     raise ValueError(f"template: expected a body on which '{name}' is known: {known}; got another triangulation with "

@@ -6,14 +6,12 @@ from typing import Any
 
 import numpy as np
 
-from model.body import BodyModel
 from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.surface import Rays
-from scanprep.pictures.camera import Camera
+from scanprep.pictures.camera import Camera, look_around
 from scanprep.pictures.page import Page
 from scanprep.pictures.shading import Dots, Solid, render, side_by_side
 from scanprep.pictures.sheets import font
-from scanprep.pictures.views import look_around
 from scanprep.skeleton.tree import Skeleton
 
 from .layout import MarkerLayout
@@ -22,13 +20,6 @@ from .symmetry import label_pairs
 HEIGHT = 1000
 SIDES = ("front", "its left", "back", "its right")
 FIXED, LOOSE = (0.86, 0.24, 0.20), (0.93, 0.62, 0.12)
-INK = (24, 40, 92)
-
-
-def mean_body(model: BodyModel) -> Mesh:
-    """The mean person in the pose of the template, or the template's own body of a model without betas."""
-    pose = np.zeros((len(model.skeleton.parents), 3))
-    return model.template.with_vertices(model.vertices(pose, np.zeros(model.n_betas) if model.n_betas else None))
 
 
 def picture_layout(body: Mesh, layout: MarkerLayout, height: int | None = None) -> np.ndarray:
@@ -71,7 +62,7 @@ def _write(draw: Any, label: str, place: np.ndarray, taken: list[tuple[float, fl
     boxes = [(a, b, a + wide, b + high) for a, b in spots]
     free = [box for box in boxes if not any(_meet(box, other) for other in taken)]
     box = (free or boxes)[0]
-    draw.text(box[:2], label, fill=INK, font=size)
+    draw.text(box[:2], label, fill=(24, 40, 92), font=size)
     return box
 
 
@@ -96,7 +87,6 @@ def marker_rows(body: Mesh, layout: MarkerLayout, skeleton: Skeleton | None = No
     return rows
 
 
-MARKER_HEADER = ("label", "also", "part", "partner", "from the skin", "place")
 
 
 def layout_page(name: str, body: Mesh, layout: MarkerLayout, picture: np.ndarray, figures: Mapping[str, str],
@@ -105,5 +95,6 @@ def layout_page(name: str, body: Mesh, layout: MarkerLayout, picture: np.ndarray
     page = Page(f"Markers: {name}", "Red markers sit on a point of the anatomy, yellow ones anywhere on their limb.")
     page.picture(picture, alt="the body from four sides with its markers")
     page.table(list(figures.items()), ("", ""))
-    page.section("Markers").table(marker_rows(body, layout, skeleton), MARKER_HEADER)
+    page.section("Markers").table(
+        marker_rows(body, layout, skeleton), ("label", "also", "part", "partner", "from the skin", "place"))
     return page

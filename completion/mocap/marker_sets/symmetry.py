@@ -10,10 +10,10 @@ from scipy.spatial import cKDTree
 
 from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.surface import Surface
+from scanprep.skeleton.symmetry import MirrorPlane, find_symmetry
 
 from .layout import MarkerLayout
 
-FAR = 0.06                           # metres: a marker of no telling label has no partner beyond it
 _WORDS = re.compile(r"(?<![A-Za-z])(left|right)(?![A-Za-z])", re.IGNORECASE)
 _LETTER = re.compile(r"^[LR](?=[A-Z0-9._ ])|^[lr](?=[._ ])|(?<=[._ ])[LRlr]$|(?<=[a-z0-9])[LR]$")
 _OTHER = {"L": "R", "R": "L", "l": "r", "r": "l", "left": "right", "right": "left"}
@@ -99,7 +99,7 @@ def marker_pairs(layout: MarkerLayout, template: Mesh, mirror: SkinMirror | None
     apart = apart + apart.T                                                    # there and back
     for i, row in enumerate(untold):
         j = int(apart[i].argmin())
-        if int(apart[j].argmin()) == i and apart[i, j] < 2 * FAR:
+        if int(apart[j].argmin()) == i and apart[i, j] < 0.12:         # metres, there and back
             pairs[row] = untold[j]
     return pairs
 
@@ -142,8 +142,6 @@ def find_skin_mirror(template: Mesh, poses: np.ndarray | None = None, landmarks:
 
 def _by_symmetry(template: Mesh, poses: np.ndarray | None) -> tuple[Mesh, np.ndarray, np.ndarray]:
     """The body in the pose that serves, the images (N, 3) of its vertices, and the normal of the plane."""
-    from scanprep.skeleton.symmetry import find_symmetry
-
     found = find_symmetry(template, poses)
     if not found.holds:
         raise ValueError("template: expected one that stands symmetrically, its mirror image is "
@@ -164,10 +162,8 @@ def _by_landmarks(template: Mesh, landmarks: Mapping[str, int]) -> tuple[Mesh, n
     middle = [v for name, v in landmarks.items() if side_of(name) == 0]
     left, right = np.array(pairs).T
     x, y = template.vertices[np.r_[left, right, middle]], template.vertices[np.r_[right, left, middle]]
-    centre = x.mean(axis=0)
-    cross = (x - centre).T @ (y - y.mean(axis=0))
-    normal = np.linalg.eigh(cross + cross.T)[1][:, 0]
-    normal = normal * np.sign(((template.vertices[left] - template.vertices[right]) @ normal).sum())
-    start = template.vertices - 2 * ((template.vertices - centre) @ normal)[:, None] * normal
+    plane = MirrorPlane.between(x, y)
+    normal = plane.normal * np.sign(((template.vertices[left] - template.vertices[right]) @ plane.normal).sum())
+    start = plane.reflect(template.vertices)
     marks = np.r_[left, right, middle].astype(np.int64), y
     return template, register(Mesh(start, template.faces[:, ::-1]), template, marks).mesh.vertices, normal

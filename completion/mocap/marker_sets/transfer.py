@@ -15,7 +15,7 @@ from scanprep.registration.schedule import RegistrationConfig
 from .layout import MarkerLayout
 
 LOST = 0.3                           # of the target that the source does not cover: it is somewhere else
-DOUBTFUL = 0.05                      # a limb may be wrong
+UNCERTAIN = 0.05                      # a limb may be wrong
 Landmarks = tuple[np.ndarray, np.ndarray]
 
 
@@ -103,6 +103,6 @@ def _registered(source: Mesh, target: Mesh, landmarks: Landmarks | None, config:
     if landmarks is not None or not search:
         return register(source, target, landmarks, config, tell)
     alike = register(source, target, None, config, tell, find_correspondences(source, target))
-    if alike.uncovered <= DOUBTFUL:
+    if alike.uncovered <= UNCERTAIN:
         return alike
     return min(alike, register(source, target, None, config, tell), key=lambda fit: fit.uncovered)

@@ -3,7 +3,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from typing import Any, TypeVar
 
 import numpy as np
@@ -85,7 +85,7 @@ class MoshConfig(Settings):
     @classmethod
     def published(cls) -> MoshConfig:
         """The weights of [MoSh], every marker believed alike, nothing repaired and nothing smoothed beyond them."""
-        poses = PoseConfig.weighted(0.75, 1.0, 6.25, outlier=1000.0)
+        poses = replace(PoseConfig.weighted(0.75, 1.0, 6.25, outlier=1000.0), place_acceleration=1e6)
         return cls(PersonConfig.published(), poses, SoftTissueConfig.published(), repair=False)
 
 

@@ -8,9 +8,8 @@ import numpy as np
 
 from model.body import BodyModel
 from scanprep.geometry.mesh import Mesh
-from scanprep.pictures.camera import Camera
+from scanprep.pictures.camera import Camera, look_around, upright
 from scanprep.pictures.shading import Bones, Dots, Shape, Solid, color_bar, heat, render, side_by_side
-from scanprep.pictures.views import look_around, upright
 
 from ...motion_pictures import MARKER, facing, moving_picture
 from ..marker_sets.layout import MarkerLayout

@@ -15,15 +15,15 @@ from model.learning.sex_plane import SexGuess
 from scanprep.batch.room import Room
 from scanprep.console import Metric, Outcome, plain, write_report
 from scanprep.geometry import storage
+from scanprep.pictures.camera import upright
 from scanprep.pictures.sheets import save_png
-from scanprep.pictures.views import upright
 
 from ...motion import spread_frames
 from ...motion_pictures import picture_bodies
 from ..artefacts.results import MarkerArtefacts
 from ..artefacts.virtual import artefact_table, write_virtual
 from ..files.markers import MarkerSequence, read_markers
-from ..files.motion_files import write_glb, write_motion, write_residuals
+from ..files.motion_files import KEYS, write_glb, write_motion, write_residuals
 from ..marker_sets.layout import MarkerLayout
 from ..marker_sets.named import choose_layout
 from ..pose.robust import motion_problem
@@ -41,7 +41,6 @@ from .takes import LightMesh, Take, held_out
 ERRORS = ("marker error, fixed shape", "marker error, soft tissue", "held-out error, fixed shape",
           "held-out error, soft tissue")
 HALF = 100                           # of progress: finding shape and motion, then files and pictures
-KEYS = 120                           # most key frames in a GLB, each of which holds a whole body
 
 
 @dataclass(frozen=True, eq=False)
@@ -200,12 +199,12 @@ def write_take(folder: Path, take: Take, factor: float = 1.0) -> None:
     motion, body, soft = take.motion, take.subject, take.soft
     write_motion(folder, motion, body)
     shown = spread_frames(len(motion.poses), KEYS)
-    write_glb(folder / "animation.glb", motion, body, KEYS, None if soft is None else take.bodies(shown))
+    write_glb(folder / "animation.glb", motion, body, None if soft is None else take.bodies(shown))
     if soft is not None:
         soft.save(folder / "soft_tissue.npz")
         write_residuals(folder / "residuals_soft.csv", soft.motion)
         if factor != 1:
-            write_glb(folder / "exaggerated.glb", soft.motion, body, KEYS, soft.vertices(take.model, shown, factor))
+            write_glb(folder / "exaggerated.glb", soft.motion, body, soft.vertices(take.model, shown, factor))
     c3d = take.path.suffix.lower() == ".c3d"
     write_virtual(folder / "virtual.c3d", take.artefacts, take.path if c3d else None, take.who, take.unit)
     _write_artefacts(folder, take.artefacts)
@@ -236,7 +235,7 @@ def _character(character: BodyModel, take: Take, folder: Path, factor: float) ->
     body = character.subject(np.zeros(character.n_betas))
     motion = retarget(take.motion, take.subject, body)
     motion.save(folder / "character.npz")
-    write_glb(folder / "character.glb", motion, body, KEYS)
+    write_glb(folder / "character.glb", motion, body)
     frames = spread_frames(len(motion.poses), 8)
     return picture_bodies(motion, body, motion.vertices(body, frames), frames), ""
 

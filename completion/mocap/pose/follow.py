@@ -23,9 +23,7 @@ __all__ = ["AnimateConfig", "animate"]
 
 Progress = Callable[[int, int], None]
 KEY_INTERVAL = 0.1                   # seconds between the frames that are solved one after the other
-KEY_STEPS = 8                        # most steps for each of these
-GROUND_ROUNDS = 2                    # over the whole sequence, the feet held
-STILL = 0.005                        # metres that the last round moves any marker of a frame that has settled
+STILL = 0.005                        # metres that the last round moves any marker of a frame that has converged
 
 
 @one_thread()
@@ -60,9 +58,9 @@ def animate(subject: Subject, markers: MarkerSequence, layout: MarkerLayout, con
     targets, tell = markers.positions[:, columns], progress or (lambda done, total: None)
     body = MarkedBody(subject, layout.select(labels), config.prior_weight, config.prior_shrinkage)
     if config.smoothing or config.ground:
-        x, order, settled = follow_whole(body, targets, markers.rate, config, tell)
+        x, order, converged = follow_whole(body, targets, markers.rate, config, tell)
     else:
-        x, order, settled = follow_frames(body, targets, np.arange(len(targets)), markers.rate, config, tell)
+        x, order, converged = follow_frames(body, targets, np.arange(len(targets)), markers.rate, config, tell)
     pose, trans, _ = body.body.split(x)
     if config.low_pass:
         pose, trans = low_pass(pose, trans, markers.rate, config.low_pass)
@@ -71,17 +69,18 @@ def animate(subject: Subject, markers: MarkerSequence, layout: MarkerLayout, con
     residuals[:, columns], believed[:, columns] = judge(body.positions(body.body.join(pose, trans)), targets, order,
                                                         config.outlier)
     return Motion(pose.copy(), trans.copy(), subject.betas, markers.rate, residuals, markers.labels,
-                  converged=settled, trusted=believed)
+                  converged=converged, trusted=believed)
 
 
 def follow_frames(body: MarkedBody, targets: np.ndarray, frames: np.ndarray, rate: float, config: AnimateConfig,
                   tell: Progress, steps: int = STEPS) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Some frames, `rate` of them a second, each from those before: begins at a whole one and goes both ways.
 
-    Found are unknowns (n, P), which of the markers (T, L, 3) each was taken from (n, L), and which frames settled (n,).
+    Found are unknowns (n, P), from which column of targets (T, L, 3) each marker was taken (n, L), and which frames
+    converged (n,).
     """
     first = _first_frame(targets)
-    x, settled = np.empty((len(frames), body.n_unknowns)), np.zeros(len(frames), dtype=bool)
+    x, converged = np.empty((len(frames), body.n_unknowns)), np.zeros(len(frames), dtype=bool)
     order = np.tile(np.arange(body.count), (len(frames), 1))
     at, start, done = int(np.searchsorted(frames, first)), search(body, targets[first], config), 0
     ways: tuple[Sequence[int], Sequence[int]] = range(at, len(frames)), range(at - 1, -1, -1)
@@ -89,22 +88,22 @@ def follow_frames(body: MarkedBody, targets: np.ndarray, frames: np.ndarray, rat
         tracker = Tracker(body, config, rate, steps)
         tracker.begin(x[at] if done else start)
         for i in way:
-            x[i], settled[i] = tracker.push(targets[frames[i]])
+            x[i], converged[i] = tracker.push(targets[frames[i]])
             order[i] = tracker.watch.order
             done += 1
             tell(done, len(frames))
-    return x, order, settled
+    return x, order, converged
 
 
 def follow_whole(body: MarkedBody, targets: np.ndarray, rate: float, config: AnimateConfig, tell: Progress
                  ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-    """All frames together: unknowns (T, P), the order of the labels (T, L), and which frames settled (T,)."""
+    """All frames together: unknowns (T, P), the order of the labels (T, L), and which frames converged (T,)."""
     T, stiffness = len(targets), inertia(config, rate, body.n_unknowns)
     x, moved, feet = between_keys(body, targets, rate, config), np.zeros(T), None
     seen = ~np.isnan(targets[..., 0])
     inside = seen_span(targets)
     free = max(config.smoothing, 1)
-    rounds = free + GROUND_ROUNDS * (config.ground and T > 2)
+    rounds = free + 2 * (config.ground and T > 2)                       # the last ones with the feet held
     for i in range(rounds):
         if i == free:
             feet = FootContact(body, x, rate, None if config.floor is None else Floor.given(config.floor))
@@ -123,7 +122,7 @@ def between_keys(body: MarkedBody, targets: np.ndarray, rate: float, config: Ani
     """Unknowns (T, P) on the way from one key frame to the next, which are followed one after the other."""
     T, every = len(targets), max(1, round(KEY_INTERVAL * rate))
     frames = np.unique(np.r_[0, np.arange(_first_frame(targets) % every, T, every), T - 1])
-    keys, _, _ = follow_frames(body, targets, frames, rate / every, config, lambda done, total: None, KEY_STEPS)
+    keys, _, _ = follow_frames(body, targets, frames, rate / every, config, lambda done, total: None, steps=8)
     if len(frames) == 1:
         return keys
     i = np.clip(np.searchsorted(frames, np.arange(T), side="right") - 1, 0, max(0, len(frames) - 2))

@@ -10,11 +10,8 @@ from scanprep.geometry.farthest_points import farthest_points
 
 from .marked_body import MarkedBody, PartShapes, System, point_system
 
-SOLES = 24                           # points that may stand
 TOUCH = 0.025                        # metres above the floor below which a point may stand
 STILL = 0.2                          # metres per second below which it does
-CALM = 0.15                          # seconds over which a place is averaged, to tell its speed
-SHORTEST = 0.08                      # seconds that standing lasts at least
 CONTACT_SD = 0.002                   # metres that a standing point may be from its place
 
 
@@ -104,22 +101,23 @@ class FootContact:
     def _standing_places(self, points: np.ndarray, rate: float) -> np.ndarray:
         """Places (T, K, 3) where points stand, NaN where they move freely."""
         held = np.full(points.shape, np.nan)
-        calm = uniform_filter1d(points, max(1, round(CALM * rate)), axis=0, mode="nearest")
+        # places are averaged over 0.15 s to tell their speed; who stands does so for 0.08 s at least
+        calm = uniform_filter1d(points, max(1, round(0.15 * rate)), axis=0, mode="nearest")
         speed = np.linalg.norm(np.gradient(calm, axis=0), axis=2) * rate
         stands = (self.floor.above(calm) < TOUCH) & (speed < STILL)
         for k in range(points.shape[1]):
             runs, count = label(stands[:, k])
             for run in range(1, count + 1):
                 mine = np.flatnonzero(runs == run)
-                if len(mine) >= SHORTEST * rate:
+                if len(mine) >= 0.08 * rate:
                     place = np.median(points[mine, k], axis=0)
                     held[mine, k] = place - min(0.0, float(self.floor.above(place))) * self.floor.normal
         return held
 
 
 def _soles(rest: np.ndarray, height: np.ndarray) -> np.ndarray:
-    """Vertices (K,) spread over what comes near the floor, from heights (n, N) over it."""
+    """At most 24 vertices (K,) spread over what comes near the floor, from heights (n, N) over it."""
     near = np.flatnonzero((height < TOUCH).mean(axis=0) > 0.05)
     if not len(near):
         near = np.array([int(height.min(axis=0).argmin())])
-    return near[farthest_points(rest[near], SOLES, height[:, near].mean(axis=0).argmin())]
+    return near[farthest_points(rest[near], 24, height[:, near].mean(axis=0).argmin())]

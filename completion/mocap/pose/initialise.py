@@ -15,7 +15,6 @@ from .marked_body import MarkedBody
 from .robust import marker_weights, misfit
 from .settings import AnimateConfig
 
-AXES = 6                             # directions of the training poses along which a first frame is searched
 SCALES = (1.0, 0.3, 0.1)             # metres, at which a marker of a lost limb has lost three quarters of its weight
 
 
@@ -24,7 +23,7 @@ def search(body: MarkedBody, targets: np.ndarray, config: AnimateConfig) -> np.n
 
     As `starts.search`, on the fewer products of the markers; then outliers lose their weight.
     """
-    x = _laid_on(body, typical_poses(body.body.pose_mean, body.body.pose_covariance, AXES), targets)
+    x = _laid_on(body, typical_poses(body.body.pose_mean, body.body.pose_covariance, axes=6), targets)
     weights = np.full(body.count, config.marker_sd**-2)
     for stiff in ANNEALING:
         end = _solved(body, x, targets, weights, stiff / config.prior_weight if config.prior_weight else 0.0,

@@ -21,14 +21,12 @@ from scanprep.skeleton.tree import Skeleton
 
 from ... import energy
 from ...bodies import FixedBody
-from ...energy import MovingPoints, moving_points
 from ...priors import gaussian_prior
 from ..marker_sets.layout import MarkerLayout
 
 System = tuple[np.ndarray, np.ndarray, np.ndarray]                      # energy, half its gradient, Gauss-Newton matrix
 BATCH = 64                           # frames whose parts are held at once
 SAMPLES = 120                        # poses from which the turning of the normals is learned
-RIDGE = 1e-2                         # that holds a normal to its part where the poses say little
 
 
 class MarkedBody:
@@ -55,16 +53,6 @@ class MarkedBody:
             some = slice(start, start + BATCH)
             y[some] = self.shapes.evaluate(pose[some], trans[some])
         return np.swapaxes(y, -1, -2).reshape(*x.shape[:-1], self.count, 3)
-
-    def follow(self, x: np.ndarray) -> MovingPoints:
-        """The markers for unknowns (B, P), with their derivatives by the unknowns themselves."""
-        pose, trans, _ = self.body.split(x)
-        y, by_rotation = self.shapes.columns(pose, trans)
-        B, J = pose.shape[:2]
-        by_rotation = np.moveaxis(by_rotation.reshape(B, J, 3, 3, self.count), 2, -1)            # (B, J, 3, L, 3)
-        by_pose = by_rotation @ rotations.right_jacobian(pose)[:, :, None]
-        return moving_points(np.swapaxes(y, -1, -2),
-                             by_pose.transpose(0, 3, 2, 1, 4).reshape(B, self.count, 3, 3 * J))
 
     def system(self, x: np.ndarray, targets: np.ndarray, weights: np.ndarray, stiff: float = 1.0) -> Dense:
         """Markers and pose prior: energy (B,), half its gradient (B, P) and Gauss-Newton matrix (B, P, P).
@@ -238,7 +226,8 @@ def marker_shapes(subject: Subject, vertex_ids: np.ndarray, weights: np.ndarray,
         known = raised[:, joints].reshape(len(poses), -1)
         wanted, middle = local[:, p, i], known.mean(axis=0)
         A = known - middle
-        slope = np.linalg.solve(A.T @ A + RIDGE * len(poses) * np.eye(A.shape[1]), A.T @ (wanted - wanted.mean(axis=0)))
+        # the ridge holds a normal to its part where the poses say little
+        slope = np.linalg.solve(A.T @ A + 1e-2 * len(poses) * np.eye(A.shape[1]), A.T @ (wanted - wanted.mean(axis=0)))
         offsets[i] = distances[i] * (wanted.mean(axis=0) - middle @ slope)
         bends.append(dict(zip(joints, distances[i] * slope.reshape(len(joints), shapes.lift.width, 3), strict=True)))
     shapes.lift_off(part, offsets, bends)

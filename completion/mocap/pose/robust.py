@@ -11,7 +11,6 @@ from ..files.markers import MarkerSequence
 from ..marker_sets.layout import MarkerLayout
 
 ASTRAY = 0.025                       # of the size, 34 mm on a man; good motions 4 to 25, sides swapped 36 to 60
-WIDEST = 5.0                         # metres; a marker farther off is an outlier on however bad a fit
 ENTER, LEAVE = 0.5, 1.0              # share of the distance that remains when labels are swapped, and put back
 
 
@@ -33,7 +32,8 @@ def distances_apart(positions: np.ndarray, targets: np.ndarray, outlier: float) 
     off = positions - targets
     off = off - _median(np.swapaxes(off, -1, -2))[..., None, :]
     squared = np.einsum("...d,...d->...", off, off)
-    return squared, np.maximum(outlier, np.minimum(3 * np.sqrt(_median(squared)), WIDEST))[..., None]
+    # metres; a marker farther off is an outlier on however bad a fit
+    return squared, np.maximum(outlier, np.minimum(3 * np.sqrt(_median(squared)), 5.0))[..., None]
 
 
 def _median(values: np.ndarray) -> np.ndarray:
@@ -150,5 +150,5 @@ def motion_problem(motion: Motion, body: Mesh, layout: MarkerLayout, markers: Ma
         return None
     believed = 100 * float(motion.trusted[seen].mean())
     return (f"the markers are {1000 * off:.0f} mm from where the body has them, {100 * motion.converged.mean():.0f}% "
-            f"of the frames settled and {believed:.0f}% of the markers are believed; "
+            f"of the frames converged and {believed:.0f}% of the markers are believed; "
             + (wrong or "labels of left and right swapped, another layout, or another model?"))

@@ -29,6 +29,8 @@ class AnimateConfig(Settings):
         joints accelerate; or a Kalman filter, whose uncertainty remembers what the markers have told.
     angle_acceleration : float, radians per second squared
         How strongly joints accelerate, as a standard deviation.
+    place_acceleration : float, metres per second squared
+        The same for the place.
     smoothing : int
         Rounds over the whole sequence; 0 leaves the frame-by-frame solution.
     low_pass : float, hertz
@@ -45,6 +47,7 @@ class AnimateConfig(Settings):
     prior_shrinkage: Share = 0.3
     prediction: Literal["velocity", "kalman"] = "kalman"
     angle_acceleration: Positive = 60.0
+    place_acceleration: Positive = 15.0
     smoothing: int = 2
     low_pass: float = 0.0
     ground: Annotated[bool, FLAG] = False

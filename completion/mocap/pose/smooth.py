@@ -10,7 +10,6 @@ from .foot_contact import HeldPoints
 from .marked_body import BATCH, MarkedBody
 from .settings import AnimateConfig
 
-PLACE_ACCELERATION = 15.0            # metres per second squared, a standard deviation
 WINDOW, OVERLAP = 1000, 60           # frames solved at once, and those that each side lends to its neighbour
 FURTHEST = 0.5                       # radians or metres that a step may go
 
@@ -18,7 +17,7 @@ FURTHEST = 0.5                       # radians or metres that a step may go
 def inertia(config: AnimateConfig, rate: float, n_unknowns: int) -> np.ndarray:
     """Information (P,) of the change of velocity from frame to frame."""
     out = np.full(n_unknowns, (config.angle_acceleration / rate**2)**-2)
-    out[-3:] = (PLACE_ACCELERATION / rate**2)**-2
+    out[-3:] = (config.place_acceleration / rate**2)**-2
     return out
 
 

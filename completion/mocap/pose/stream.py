@@ -17,13 +17,8 @@ from .robust import LabelWatch, judge, marker_weights, misfit
 from .settings import AnimateConfig
 
 STEPS = 3                            # most for a frame
-ENOUGH = 0.5                         # share of the markers that a search wants
 LOST = 0.08                          # metres, median residual of a frame above which it is searched anew
-BELIED = 0.2                         # share of the markers seen that are outliers on a body gone astray
 PATIENCE = 0.25                      # seconds from a search that found nothing to the next; then twice as many
-DOUBT = 0.25                         # seconds for which frames that no body explains are taken for wrong
-FASTEST = 10.0                       # metres per second that the markers of a body together stray from the expected
-FARTHEST = 1e6                       # metres; a coordinate beyond it is no place
 
 
 @dataclass(frozen=True, eq=False)
@@ -97,14 +92,14 @@ class MarkerStream:
         positions = np.asarray(positions, dtype=np.float64)
         if positions.shape != (self.n_labels, 3):
             raise ValueError(f"positions: expected shape ({self.n_labels}, 3), got {positions.shape}")
-        positions = np.where((np.abs(positions) < FARTHEST).all(axis=1, keepdims=True), positions, np.nan)
+        positions = np.where((np.abs(positions) < 1e6).all(axis=1, keepdims=True), positions, np.nan)
         tracker, targets = self.tracker, positions[self.rows]
-        x, settled = tracker.push(targets)
+        x, converged = tracker.push(targets)
         residuals, trusted = np.full(self.n_labels, np.nan), np.zeros(self.n_labels, dtype=bool)
         residuals[self.rows], trusted[self.rows] = judge(tracker.places, targets, tracker.watch.order,
                                                         tracker.config.outlier)
         pose, trans, _ = tracker.body.body.split(x)
-        return Frame(pose, trans, residuals, trusted & tracker.believed, settled)
+        return Frame(pose, trans, residuals, trusted & tracker.believed, converged)
 
 
 class Tracker:
@@ -126,9 +121,9 @@ class Tracker:
         self.started, self.since, self.passed = True, 0, 0
 
     def push(self, targets: np.ndarray) -> tuple[np.ndarray, bool]:
-        """Unknowns (P,) of the next frame, NaN before the first that could be solved, and whether it settled."""
+        """Unknowns (P,) of the next frame, NaN before the first that could be solved, and whether it converged."""
         there = int((~np.isnan(targets[:, 0])).sum())
-        enough = there >= max(3, ENOUGH * self.body.count)
+        enough = there >= max(3, 0.5 * self.body.count)                 # for a search
         self.wait, self.since, self.believed = max(0, self.wait - 1), self.since + 1, False
         fresh = not self.started
         if fresh:
@@ -145,12 +140,12 @@ class Tracker:
         order = self.watch.order.copy()
         taken = targets[self.watch.update(before, targets)]
         end = self._solve(taken, expected, information)
-        x, settled, found = end.x[0], bool(end.converged[0]), None
+        x, converged, found = end.x[0], bool(end.converged[0]), None
         self.places = self.body.positions(x)
         if not self.wait and enough and not fresh and self._astray(taken):
             found = self._found(taken)
             if found is not None:
-                x, settled = found, True
+                x, converged = found, True
                 self.places = self.body.positions(x)
         if self._to_pass_over(taken, before):
             self.watch.order, self.places = order, before
@@ -163,7 +158,7 @@ class Tracker:
             self.begin(x)
         else:
             self.prediction.update(x, end.equations.hessian[0] - information)
-        return x, settled
+        return x, converged
 
     def _solve(self, targets: np.ndarray, expected: np.ndarray, information: np.ndarray) -> Minimum[np.ndarray]:
         """The best unknowns of a frame near the expected ones, which put the markers where `places` says."""
@@ -195,7 +190,8 @@ class Tracker:
         No body explains them, or it would have leapt there: that is believed when the next frame says the same, and
         anything when it goes on for long.
         """
-        near = LOST + FASTEST * self.since / self.rate
+        # the markers of a body stray at most 10 m/s together from where they are expected
+        near = LOST + 10.0 * self.since / self.rate
         lost = bool(np.nanmedian(np.linalg.norm(self.places - targets, axis=1)) > LOST)
         leapt, self.leapt = self.leapt, np.full_like(before, np.nan) if lost else self.places
         self.believed = not lost and min(_apart(self.places, before), _apart(self.places, leapt)) <= near
@@ -203,13 +199,13 @@ class Tracker:
             self.since = self.passed = 0
             return False
         self.passed += 1
-        return self.passed <= DOUBT * self.rate
+        return self.passed <= 0.25 * self.rate                          # for so many seconds they are taken for wrong
 
     def _astray(self, targets: np.ndarray) -> bool:
-        """The body has lost its markers (L, 3), or many of them."""
+        """The body has lost its markers (L, 3), or a fifth of those seen."""
         apart = np.linalg.norm(self.places - targets, axis=1)
         apart = apart[~np.isnan(apart)]
-        return bool(np.median(apart) > LOST or (apart > self.config.outlier).mean() > BELIED)
+        return bool(np.median(apart) > LOST or (apart > self.config.outlier).mean() > 0.2)
 
 
 def _apart(a: np.ndarray, b: np.ndarray) -> float:

@@ -1,27 +1,25 @@
-"""Creases of posed bodies laid smooth where triangles have turned over."""
+"""Creases of posed bodies laid smooth where triangles are inverted."""
 from __future__ import annotations
 
 import numpy as np
-from scipy.sparse import csc_array, csr_array, diags_array
+from scipy.sparse import csr_array, diags_array
 from scipy.sparse.csgraph import connected_components
 
-from model.body import BodyModel
 from scanprep.geometry.mesh import Mesh
-from scanprep.geometry.sparse import factor
+from scanprep.geometry.sparse import harmonic
 from scanprep.skeleton.tree import Skeleton
 
-REACH = (1, 2, 2, 3, 3, 4)           # rings around turned triangles that are laid anew, one round each
-BLEND = 6                            # rings over which the rotation of one part passes into that of the next
+REACH = (1, 2, 2, 3, 3, 4)           # rings around inverted triangles that are laid anew, one round each
 
 
 class Creases:
-    """Where triangles of a posed body have turned over, and the body without.
+    """Where triangles of a posed body are inverted, and the body without.
 
-    A triangle is turned over when it faces away from where the rotations of the parts around it turn it, those of
-    neighbouring parts mixed over some rings: at a raised shoulder the skin rightly faces away from its own part.
+    A triangle is inverted when it faces away from where the rotations of the parts around it take it, those of
+    neighbouring parts mixed over `blend` rings: at a raised shoulder the skin rightly faces away from its own part.
     """
 
-    def __init__(self, rest: Mesh, skeleton: Skeleton, blend: int = BLEND) -> None:
+    def __init__(self, rest: Mesh, skeleton: Skeleton, blend: int = 6) -> None:
         self.rest, self.skeleton = rest, skeleton
         self._near = csr_array(rest.vertex_adjacency, dtype=np.float64)
         self._shares = np.eye(len(skeleton.parents))[skeleton.part_of_face]
@@ -32,7 +30,7 @@ class Creases:
                 own = spread @ (own + self._near @ own)
             self._shares = own[rest.faces].mean(axis=1)
 
-    def turned_over(self, bodies: np.ndarray, poses: np.ndarray) -> np.ndarray:
+    def inverted(self, bodies: np.ndarray, poses: np.ndarray) -> np.ndarray:
         """(..., F) bool: triangles of bodies (..., N, 3) in poses (..., J, 3) that face the wrong way."""
         corners = bodies[..., self.rest.faces, :]
         now = np.cross(corners[..., 1, :] - corners[..., 0, :], corners[..., 2, :] - corners[..., 0, :])
@@ -41,24 +39,24 @@ class Creases:
         return np.asarray((now * (R @ self.rest.face_normals[..., None])[..., 0]).sum(axis=-1) < 0)
 
     def smoothed(self, bodies: np.ndarray, poses: np.ndarray) -> np.ndarray:
-        """Bodies (n, N, 3) in poses (n, J, 3) whose turned triangles are laid as smoothly as their surroundings allow.
+        """Bodies (n, N, 3) in poses (n, J, 3) whose inverted triangles are laid as smoothly as what is around allows.
 
         Where thick limbs bend sharply, as those of a character do, the skin of the hollow has no room and folds over.
-        Small patches are laid there instead, wider ones while triangles are turned; nothing else moves, and patches
-        that leave more triangles turned than there were are not taken.
+        Small patches are laid there instead, wider ones while triangles are inverted; nothing else moves, and patches
+        that leave more triangles inverted than there were are not taken.
         """
         out = np.array(bodies)
         for t in range(len(out)):
-            bad = self.turned_over(out[t], poses[t])
+            bad = self.inverted(out[t], poses[t])
             for rings in REACH:
                 if not bad.any():
                     break
                 out[t] = self._laid(out[t], poses[t], bad, rings)
-                bad = self.turned_over(out[t], poses[t])
+                bad = self.inverted(out[t], poses[t])
         return out
 
     def _laid(self, x: np.ndarray, pose: np.ndarray, bad: np.ndarray, rings: int) -> np.ndarray:
-        """Vertices (N, 3) with patches of so many rings around turned triangles (F,) laid where that helps."""
+        """Vertices (N, 3) with patches of so many rings around inverted triangles (F,) laid where that helps."""
         free = np.zeros(len(x))
         free[self.rest.faces[bad]] = 1
         for _ in range(rings - 1):
@@ -67,9 +65,8 @@ class Creases:
         if len(mine) == len(x):
             return x
         count, patch = connected_components(self._near[mine][:, mine])
-        trial = x.copy()
-        trial[mine] = _membrane(self._near[mine], mine, np.where(free[:, None] > 0, 0.0, x))
-        left = self.turned_over(trial, pose)
+        trial = harmonic(self._near, x, free == 0)
+        left = self.inverted(trial, pose)
         of_vertex = np.full(len(x), -1)
         of_vertex[mine] = patch
         of_face = of_vertex[self.rest.faces].max(axis=1)                      # no triangle touches two patches
@@ -78,19 +75,3 @@ class Creases:
         kept = mine[~better[patch]]
         trial[kept] = x[kept]
         return trial
-
-
-def at_rest(model: BodyModel, betas: np.ndarray | None = None) -> Mesh:
-    """The body with betas (k,), else the mean person or character, in zero pose."""
-    pose = np.zeros((len(model.skeleton.parents), 3))
-    return model.template.with_vertices(model.vertices(pose, np.zeros(min(1, model.n_betas)) if betas is None
-                                                       else betas))
-
-
-def _membrane(adjacency: csr_array, mine: np.ndarray, fixed: np.ndarray) -> np.ndarray:
-    """Places (n, 3) of vertices `mine` in the middle of their neighbours, the rows of `adjacency` (n, N).
-
-    `fixed` (N, 3), metres: zero where vertices are free.
-    """
-    inside = csc_array(diags_array(np.asarray(adjacency.sum(axis=1)).ravel()) - adjacency[:, mine])
-    return np.asarray(factor(inside)(adjacency @ fixed))

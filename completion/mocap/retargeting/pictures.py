@@ -9,11 +9,12 @@ from model.body import BodyModel
 from scanprep.pictures.colors import color_bar, heat
 from scanprep.pictures.shading import side_by_side
 
+from ...bodies import at_rest
 from ...motion import spread_frames
 from ...motion_pictures import bodies_in_a_row, seconds
 from ..files.motion_files import write_glb
 from ..soft_tissue.soft_tissue import SoftTissue
-from .creases import Creases, at_rest
+from .creases import Creases
 from .soft_tissue import deformation, moving_character
 
 FULL = 0.2                           # deformation at the end of the heat map
@@ -51,5 +52,5 @@ def write_character(path: Path, character: BodyModel, soft: SoftTissue, keys: in
     fixed, changed = moving_character(character, soft, frames)
     most = np.asarray(deformation(character.template.faces, fixed, changed).max(axis=0))
     changed = Creases(at_rest(character), character.skeleton).smoothed(changed, soft.motion.poses[frames])
-    write_glb(path, soft.motion, character.subject(soft.motion.betas), keys, changed, heat(most, 0.0, FULL))
+    write_glb(path, soft.motion, character.subject(soft.motion.betas), changed, heat(most, 0.0, FULL), keys)
     return most

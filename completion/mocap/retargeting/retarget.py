@@ -9,14 +9,11 @@ import numpy as np
 from model.body import BodyModel
 from model.linear import Subject
 from scanprep.geometry import rotations
-from scanprep.pictures.views import upright
+from scanprep.pictures.camera import upright
 
 from ...motion import Motion
 
-FLAT = 1e-6                          # share of the largest change of betas below which a direction counts nothing
 AT_ONCE = 256                        # frames whose meshes are held at a time
-A_BODY = 20                          # frames whose meshes cost as much, one by one, as making the body of a person
-STANDING = 2.0                       # percentile of the lowest points over time that is taken for the floor
 
 
 def retarget(motion: Motion, source: Subject, target: Subject) -> Motion:
@@ -46,7 +43,7 @@ def retarget(motion: Motion, source: Subject, target: Subject) -> Motion:
     trans = motion.trans[0] + ratio * (motion.trans - motion.trans[0])
     trans[:, up] = motion.trans[:, up]
     low = lowest(source, motion.poses, motion.trans, up, sign)
-    floor = np.percentile(low, STANDING)
+    floor = np.percentile(low, 2.0)                                  # where the lowest points are when they are low
     trans[:, up] += sign * (floor + ratio * (low - floor) - lowest(target, motion.poses, trans, up, sign))
     none = np.zeros((len(motion.poses), 0))
     return replace(motion, trans=trans, betas=target.betas, residuals=none, labels=(), trusted=none.astype(bool))
@@ -82,9 +79,9 @@ def morphed_vertices(model: BodyModel, motion: Motion, betas: np.ndarray | Mappi
     poses, trans, betas = motion.poses[frames], motion.trans[frames], betas[frames]
     middle = betas.mean(axis=0)
     U, size, directions = np.linalg.svd(betas - middle, full_matrices=False)
-    some = size > FLAT * max(size.max(initial=0), 1.0)
+    some = size > 1e-6 * max(size.max(initial=0), 1.0)
     shares, steps = U[:, some] * size[some], directions[some]
-    if len(poses) < A_BODY * len(steps):
+    if len(poses) < 20 * len(steps):                  # making a body costs as much as the meshes of 20 frames
         out = model.vertices(poses, betas, trans)
     else:
         out = _along_lines(model, middle, shares, steps, poses, trans)

@@ -7,13 +7,14 @@ from typing import Any
 
 import numpy as np
 
+from scanprep.geometry import format_glb as glb
 from scanprep.geometry import storage
-from scanprep.geometry.formats import glb
-from scanprep.geometry.formats.common import MeshFileError
+from scanprep.geometry.format_common import MeshFileError
 from scanprep.geometry.mesh import Mesh
 from scanprep.skeleton.tree import Skeleton
 
-from ...export.rig import strongest, turn_up
+from ...blend_weights import strongest
+from ...export.rig import turn_up
 from .chart import Chart, automatic_chart, chart_problem
 from .model import ControlModel, control_problem, surface_problem
 

@@ -28,8 +28,7 @@ def flatten(mesh: Mesh) -> np.ndarray:
         gradient, hessian = _derivatives(uv, mesh.faces, rest, areas, border, gap)
         ridge = diags_array(np.full(2 * len(uv), 1e-9 * hessian.diagonal().mean()))
         step = -factor((hessian + ridge).tocsc())(gradient).reshape(-1, 2)
-        slope, length = float(gradient @ step.ravel()), min(1.0, 0.9 * _until_flat(uv, step, mesh.faces))
-        before = energy
+        slope, length, before = float(gradient @ step.ravel()), 1.0, energy
         while length > 1e-12:
             trial = uv + length * step
             energy = _energy(trial, mesh.faces, rest, areas, border, gap)
@@ -178,20 +177,3 @@ def _pushing(uv: np.ndarray, border: np.ndarray, gap: float) -> tuple[float, np.
     scale = 0.02 / n
     return (scale * float(((gap / far - 1)**2).sum()), corners, scale * first[:, None] * q,
             scale * second[:, None, None] * q[:, :, None] * q[:, None])
-
-
-def _until_flat(uv: np.ndarray, step: np.ndarray, faces: np.ndarray) -> float:
-    """How many steps until the first triangle has no area."""
-    u, v = uv[faces[:, 1]] - uv[faces[:, 0]], uv[faces[:, 2]] - uv[faces[:, 0]]
-    s, r = step[faces[:, 1]] - step[faces[:, 0]], step[faces[:, 2]] - step[faces[:, 0]]
-
-    def cross(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-        return a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]
-
-    a, b, c = cross(s, r), cross(u, r) + cross(s, v), cross(u, v)
-    with np.errstate(all="ignore"):
-        root = np.sqrt(b * b - 4 * a * c)
-        low = -0.5 * (b + np.where(b < 0, -root, root))
-        times = np.stack([low / a, c / low])
-    times = times[np.isfinite(times) & (times > 0)]
-    return float(times.min()) if len(times) else np.inf

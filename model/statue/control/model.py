@@ -9,7 +9,8 @@ import numpy as np
 from scanprep.geometry.mesh import Mesh, template_problem
 from scanprep.skeleton.tree import Skeleton
 
-from ...export.rig import CARRIERS, Rig
+from ...blend_weights import CARRIERS
+from ...export.rig import Rig
 from .chart import Chart, chart_problem
 
 
@@ -126,7 +127,7 @@ class Statue:
     control : ControlModel
         Fitted: its default pose is that of the scan.
     pose : (J, 3) float, radians
-        How the generic model's parts were turned from its default pose to that of the scan.
+        How the generic model's parts were rotated from its default pose to that of the scan.
     map : DisplacementMap
     texture : (H, W, 3) uint8, optional
         Colours over the same chart.

@@ -10,7 +10,6 @@ displaced by d, det[v_r + d n_r - p, v_s + d n_s - p, v_t + d n_t - p] = 0: a cu
 """
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -55,11 +54,9 @@ def to_normal_volume(mesh: Mesh, points: np.ndarray, reach: float) -> NormalCoor
         raise ValueError(f"reach: expected a length above 0, got {reach}")
     count = len(points)
     face, bary, height = np.full(count, -1), np.zeros((count, 3)), np.full(count, np.nan)
-    found: list[tuple[np.ndarray, ...]] = [(np.zeros(0, int), np.zeros(0), np.zeros((0, 3)), np.zeros(0, int))]
-    for which, triangle in _near(mesh, points, reach):
-        pair, d, b = solve_triangles(mesh, triangle, points[which], reach)
-        found.append((which[pair], d, b, triangle[pair]))
-    who, d, b, of = (np.concatenate(part) for part in zip(*found, strict=True))
+    which, triangle = _near(mesh, points, reach)
+    pair, d, b = solve_triangles(mesh, triangle, points[which], reach)
+    who, of = which[pair], triangle[pair]
     solutions = _count_places(count, who, np.einsum("nc,ncd->nd", b, mesh.corners[of]), d)
     order = np.argsort(np.abs(d), kind="stable")
     _, first = np.unique(who[order], return_index=True)
@@ -131,31 +128,23 @@ def _value(c: np.ndarray, x: np.ndarray) -> np.ndarray:
     return c[..., 0] + x * (c[..., 1] + x * (c[..., 2] + x * c[..., 3]))
 
 
-def _near(mesh: Mesh, points: np.ndarray, reach: float) -> Iterator[tuple[np.ndarray, np.ndarray]]:
-    """Pairs (points, triangles) in batches: all where a point may lie in a triangle's volume, and some more.
+def _near(mesh: Mesh, points: np.ndarray, reach: float) -> tuple[np.ndarray, np.ndarray]:
+    """Pairs (points, triangles): all where a point may lie in a triangle's volume, and some more.
 
     The volume lies in the convex hull of the corners displaced up and down, so in its box and the ball around it.
     """
+    none = np.zeros(0, dtype=np.int64)
     if not len(points) or not len(mesh.faces):
-        return
+        return none, none
     shift = reach * mesh.vertex_normals[mesh.faces]
     hull = np.concatenate([mesh.corners + shift, mesh.corners - shift], axis=1)
-    low, high = hull.min(axis=1) - 1e-9, hull.max(axis=1) + 1e-9
-    center = hull.mean(axis=1)
+    low, high, center = hull.min(axis=1) - 1e-9, hull.max(axis=1) + 1e-9, hull.mean(axis=1)
     radius = np.linalg.norm(hull - center[:, None], axis=2).max(axis=1) + 1e-9
-    tree = cKDTree(points)
-    held: list[tuple[np.ndarray, np.ndarray]] = []
-    total = 0
-    for face in range(len(center)):
-        which = np.array(tree.query_ball_point(center[face], radius[face]), dtype=np.int64)
-        if len(which):
-            at = points[which]
-            which = which[((at > low[face]) & (at < high[face])).all(axis=1)]
-        held.append((which, np.full(len(which), face)))
-        total += len(which)
-        if total and (total > 250_000 or face == len(center) - 1):    # so many are solved at once
-            yield np.concatenate([w for w, _ in held]), np.concatenate([f for _, f in held])
-            held, total = [], 0
+    near = cKDTree(points).query_ball_point(center, radius)
+    which = np.concatenate([none, *(np.array(found, dtype=np.int64) for found in near)])
+    face = np.repeat(np.arange(len(near)), [len(found) for found in near])
+    inside = ((points[which] > low[face]) & (points[which] < high[face])).all(axis=1)
+    return which[inside], face[inside]
 
 
 def _count_places(count: int, who: np.ndarray, at: np.ndarray, d: np.ndarray) -> np.ndarray:

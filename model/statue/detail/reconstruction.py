@@ -38,11 +38,11 @@ class Reconstruction:
         share.eliminate_zeros()
         self._spread = csr_array(hstack([share, diags_array(heights) @ share]))
         self._around = _around(mesh)
-        self._turning = np.flatnonzero(rest.any(axis=1))
-        self._carriers = np.unique(corners[self._turning])
+        self._rotated = np.flatnonzero(rest.any(axis=1))
+        self._carriers = np.unique(corners[self._rotated])
         self._rotations = VertexRotations(mesh, self._carriers)
-        self._rest = rest[self._turning]
-        self._share = csr_array(share[self._turning][:, self._carriers])
+        self._rest = rest[self._rotated]
+        self._share = csr_array(share[self._rotated][:, self._carriers])
 
     def __call__(self, control_vertices: np.ndarray) -> np.ndarray:
         """(n, 3) metres, the detailed surface on control vertices (N, 3)."""
@@ -51,9 +51,9 @@ class Reconstruction:
             raise ValueError(f"control_vertices: expected shape {self.control.mesh.vertices.shape}, got {v.shape}")
         n = self._normals(v)
         out = self._spread @ np.concatenate([v, n])
-        if len(self._turning):
+        if len(self._rotated):
             R = self._rotations(v, n).reshape(-1, 9)
-            out[self._turning] += np.einsum("nij,nj->ni", (self._share @ R).reshape(-1, 3, 3), self._rest)
+            out[self._rotated] += np.einsum("nij,nj->ni", (self._share @ R).reshape(-1, 3, 3), self._rest)
         return out
 
     def mesh(self, control_vertices: np.ndarray | None = None) -> Mesh:

@@ -77,11 +77,11 @@ def continue_chart(mesh: Mesh, chart: Chart, uv: np.ndarray) -> tuple[np.ndarray
     flat = chart.flat
     found = Surface(flat).closest(np.column_stack([uv, np.zeros(len(uv))]))
     face, side = found.faces, (np.argmin(found.bary, axis=1) + 1) % 3
-    other, turned = _across(mesh)
+    other, back = _across(mesh)
     beyond = np.where(flat.edge_use[flat.face_edges[face, side]] == 1, other[face, side], -1)
     bary = np.clip(found.bary, 0, None)
     seam = np.flatnonzero(beyond >= 0)
-    f, s, g, t = face[seam], side[seam], beyond[seam], turned[face[seam], side[seam]]
+    f, s, g, t = face[seam], side[seam], beyond[seam], back[face[seam], side[seam]]
     at = np.einsum("nc,ncd->nd", barycentric(uv[seam], *chart.uv[chart.faces[f]].swapaxes(0, 1)), mesh.corners[f])
     a, b = mesh.vertices[mesh.faces[f, s]], mesh.vertices[mesh.faces[f, (s + 1) % 3]]
     length = np.maximum(np.linalg.norm(b - a, axis=1), 1e-30)
@@ -102,13 +102,13 @@ def continue_chart(mesh: Mesh, chart: Chart, uv: np.ndarray) -> tuple[np.ndarray
 
 def _across(mesh: Mesh) -> tuple[np.ndarray, np.ndarray]:
     """The triangle beyond each side (F, 3) and which of its sides that is; -1 at a border."""
-    other, turned = np.full(mesh.faces.shape, -1), np.full(mesh.faces.shape, -1)
+    other, back = np.full(mesh.faces.shape, -1), np.full(mesh.faces.shape, -1)
     order = np.argsort(mesh.face_edges.ravel(), kind="stable")
     start = np.concatenate([[0], np.cumsum(mesh.edge_use)[:-1]])[mesh.edge_use == 2]
     one, two = order[start], order[start + 1]
     for a, b in ((one, two), (two, one)):
-        other.ravel()[a], turned.ravel()[a] = np.divmod(b, 3)
-    return other, turned
+        other.ravel()[a], back.ravel()[a] = np.divmod(b, 3)
+    return other, back
 
 
 class Lattice:

@@ -93,7 +93,7 @@ class StatueMotion:
 class Pairing:
     """A statue and a skeleton that moves, both at rest.
 
-    `P` (J, 3, 3) is how the generic model's parts were turned to the pose of the scan, `joints` (J, 3) those of the
+    `P` (J, 3, 3) is how the generic model's parts were rotated to the pose of the scan, `joints` (J, 3) those of the
     statue in the generic default pose, `ours` and `theirs` the parts and joints by their H-Anim names.
     """
 
@@ -130,15 +130,15 @@ class Pairing:
         for side in "lr" if not aligned else "":
             for chain in (("shoulder", "elbow", "wrist"), ("hip", "knee", "ankle")):
                 roles = [f"{side}_{name}" for name in chain]
-                turn = whole
+                R = whole
                 for role, following in pairwise(roles):
                     if {role, following} <= self.ours.keys() & self.theirs.keys():
                         own = self.joints[self.ours[following]] - self.joints[self.ours[role]]
                         other = self.moving.rest[self.theirs[following]] - self.moving.rest[self.theirs[role]]
-                        turn = _smallest_rotation(turn @ own, other) @ turn
-                        A[self.ours[role]] = turn
+                        R = _smallest_rotation(R @ own, other) @ R
+                        A[self.ours[role]] = R
                 if chain[2] == "wrist" and roles[2] in self.ours:
-                    A[self.ours[roles[2]]] = turn                       # a hand continues the forearm
+                    A[self.ours[roles[2]]] = R                          # a hand continues the forearm
                 elif {*roles[1:]} <= self.ours.keys() & self.theirs.keys():
                     knee, ankle = self.moving.rest[[self.theirs[role] for role in roles[1:]]]
                     left, down, _ = self.standing(False).T @ (ankle - knee) * [1, -1, 1]

@@ -26,7 +26,7 @@ class Frames:
     R: np.ndarray       # (J, 3, 3), world rotation of every part
     joints: np.ndarray  # (J, 3) metres
     shapes: np.ndarray  # (J, 3, 3), the stretch of every part in the axes of the default pose
-    turns: np.ndarray   # (A, 3), world axis about which each angle turns its part and all that hangs on it
+    axes: np.ndarray    # (A, 3), in the world: about which each angle rotates its part and all that hangs on it
     shifts: np.ndarray  # (J, S, 3) metres, derivative of the joints by the length factors
 
 
@@ -121,7 +121,7 @@ class Articulated:
         return x[:A], x[A:A + S], x[A + S:]
 
     def pose(self, x: np.ndarray) -> np.ndarray:
-        """(J, 3) float, radians: `exp(angles @ axes)` turns every part in its parent."""
+        """(J, 3) float, radians: `exp(angles @ axes)` rotates every part in its parent."""
         pose = np.zeros_like(self.control.skeleton.joints)
         np.add.at(pose, self.joint_of, self.split(x)[0][:, None] * self.axes)
         return pose
@@ -146,9 +146,9 @@ class Articulated:
             shifts[c, segment[p]] += offset
         above = np.concatenate([np.eye(3)[None], R[skeleton.parents[1:]]])
         left = above @ rotations.right_jacobian(-pose)           # exp(t + d) ≈ exp(J_l(t) d) exp(t), J_l(t) = J_r(-t)
-        turns = np.einsum("aij,aj->ai", left[self.joint_of], self.axes)
+        axes = np.einsum("aij,aj->ai", left[self.joint_of], self.axes)
         shapes = factors[segment, None, None] * self.along + self.size(x) * (np.eye(3) - self.along)
-        return Frames(R, joints, shapes, turns, shifts)
+        return Frames(R, joints, shapes, axes, shifts)
 
     def positions(self, frames: Frames, points: Points) -> np.ndarray:
         """Where points are (n, 3), metres. [Statues] Eq. 2"""
@@ -161,7 +161,7 @@ class Articulated:
         below = skeleton.descends.astype(float)
         carried = (w[..., None] * self._by_part(frames, points)).transpose(0, 2, 1) @ below          # (n, 3, J)
         arm = carried - (w @ below)[:, None] * frames.joints.T
-        by_angle = np.cross(frames.turns, arm.transpose(0, 2, 1)[:, self.joint_of]).transpose(0, 2, 1)
+        by_angle = np.cross(frames.axes, arm.transpose(0, 2, 1)[:, self.joint_of]).transpose(0, 2, 1)
         d = w[..., None] * (points.rest[:, None] - skeleton.joints)
         along = _each(frames.R @ self.along, d)
         across = (_each(frames.R, d) - along).sum(axis=1)

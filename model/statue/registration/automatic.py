@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.spatial import cKDTree
 
-from scanprep.geometry.formats.common import UNITS
+from scanprep.geometry.format_common import UNITS
 from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.target import Target, target_of
 from scanprep.geometry.thinning import thin

@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 from scipy.spatial import cKDTree
 
-from scanprep.geometry.formats.common import UNITS
+from scanprep.geometry.format_common import UNITS
 from scanprep.geometry.landmarks import read_landmarks
 from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.storage import StorageError, numbers, read_json, taking_apart

@@ -38,7 +38,7 @@ def fit_features(control: ControlModel, joints: Mapping[str, np.ndarray],
     """Pose, segment lengths and place of a control model that bring its features, by name, to those of a scan.
 
     Features that are not given are not in the sum. What the given ones leave open (the twist of an arm with a straight
-    elbow, the length of a hand) a weak prior keeps near the default pose and lengths. The result turns, moves and
+    elbow, the length of a hand) a weak prior keeps near the default pose and lengths. The result rotates, moves and
     scales with the features. How lengths stretch the surface: see `Articulated`. ValueError for unknown names, places
     that are not finite, fewer than three features that are not on one line.
 
@@ -197,28 +197,21 @@ def analytic_start(model: Articulated, at: Mapping[str, np.ndarray]) -> np.ndarr
 
 def limb_angles(model: Articulated, base: int, middle: int, end: int | None, goal: np.ndarray
                 ) -> tuple[np.ndarray, float]:
-    """Angles (3,) of the base joint and of the middle one that point bones along goals, in the axes above."""
-    o, of_base, hinge = model.control.skeleton.joints, model.joint_of == base, model.joint_of == middle
-    rest = np.array([o[middle] - o[base], *([o[end] - o[middle]] if len(goal) == 2 else [])])
-    return _limb(_unit(rest), _unit(goal), model.axes[of_base], model.axes[hinge][0], model.limits[of_base],
-                 model.limits[hinge][0])
+    """Angles (3,) of the base joint and of the middle one that point bones along goals, in the axes above.
 
-
-def _limb(rest: np.ndarray, goal: np.ndarray, axes: np.ndarray, hinge: np.ndarray, limits: np.ndarray,
-          hinge_limits: np.ndarray) -> tuple[np.ndarray, float]:
-    """Angles (3,) of the base and that of the hinge that turn one or two bones (1 or 2, 3), unit, to their goals.
-
-    A hinge has two angles at which the bones enclose the right one: of these the one that is farther inside the
-    limits of both joints, or else nearer to the default pose.
+    A hinge has two angles at which two bones enclose the right one: of these the one that is farther inside the limits
+    of both joints, or else nearer to the default pose.
     """
-    bends = _bends(hinge, rest[0], rest[1], float(goal[0] @ goal[1])) if len(goal) == 2 else np.zeros(1)
+    o, of_base, of_hinge = model.control.skeleton.joints, model.joint_of == base, model.joint_of == middle
+    bones = _unit(np.array([o[middle] - o[base], *([o[end] - o[middle]] if len(goal) == 2 else [])]))
+    goal, hinge, limits = _unit(goal), model.axes[of_hinge][0], model.limits[of_base]
     tried = []
-    for bend in bends:
-        allowed = float(np.clip(bend, *hinge_limits))
-        turned = np.concatenate([rest[:1], rest[1:] @ rotations.exp(allowed * hinge).T])
-        # The identity decides how a straight limb is turned about itself.
-        H = goal.T @ turned + 1e-3 * np.eye(3)
-        angles = np.linalg.solve(axes.T, rotations.log(rotations.project(H[None])[0]))
+    for bend in _bends(hinge, bones[0], bones[1], float(goal[0] @ goal[1])) if len(goal) == 2 else np.zeros(1):
+        allowed = float(np.clip(bend, *model.limits[of_hinge][0]))
+        bent = np.concatenate([bones[:1], bones[1:] @ rotations.exp(allowed * hinge).T])
+        # The identity decides how a straight limb is rotated about itself.
+        H = goal.T @ bent + 1e-3 * np.eye(3)
+        angles = np.linalg.solve(model.axes[of_base].T, rotations.log(rotations.project(H[None])[0]))
         beyond = np.abs(angles - np.clip(angles, *limits.T)).sum() + abs(bend - allowed)
         tried.append((round(float(beyond), 3), abs(allowed), allowed, angles))
     _, _, bend, angles = min(tried, key=lambda t: t[:2])

@@ -204,8 +204,8 @@ def bend(search: PoseSearch, target: Target, T: np.ndarray, posed: Posed, stages
 
 def moved(target: Target, T: np.ndarray) -> Target:
     """A target after a similarity (4, 4)."""
-    turn = T[:3, :3] / np.cbrt(np.linalg.det(T[:3, :3]))
-    return replace(target, points=target.points @ T[:3, :3].T + T[:3, 3], normals=target.normals @ turn.T)
+    R = T[:3, :3] / np.cbrt(np.linalg.det(T[:3, :3]))
+    return replace(target, points=target.points @ T[:3, :3].T + T[:3, 3], normals=target.normals @ R.T)
 
 
 def misfit(body: Mesh, goal: Target) -> tuple[float, float]:
@@ -229,8 +229,8 @@ def rough_stands(search: PoseSearch, target: Target, metres: float) -> list[np.n
     tree = cKDTree(here)
     keep = thin(target.points, 0.022 * float(np.linalg.norm(np.ptp(target.points, axis=0))))
     found = []
-    for T, turn in _placements(mesh, target.points[keep], metres):
-        there = np.hstack([target.points[keep] @ T[:3, :3].T + T[:3, 3], scale * target.normals[keep] @ turn.T])
+    for T, R in _placements(mesh, target.points[keep], metres):
+        there = np.hstack([target.points[keep] @ T[:3, :3].T + T[:3, 3], scale * target.normals[keep] @ R.T])
         apart = np.minimum(tree.query(there)[0], 4 * CAP), np.minimum(cKDTree(there).query(here)[0], 4 * CAP)
         found.append((float(np.mean(apart[0] ** 2) + 0.5 * np.mean(apart[1] ** 2)), T))
     return [T for _, T in sorted(found, key=lambda pair: pair[0])]
@@ -253,13 +253,13 @@ def _placements(body: Mesh, points: np.ndarray, metres: float) -> Iterator[tuple
             ways += [(metres, False), (metres, True)]
         for k in range(8 if ways else 0):
             heading = rotations.exp(np.array([0, 0, 2 * np.pi * k / 8]))
-            turn = heading @ np.array([right, np.cross(up, right), up])
+            R = heading @ np.array([right, np.cross(up, right), up])
             for scale, hangs in ways:
-                placed = scale * points @ turn.T
+                placed = scale * points @ R.T
                 level = highest - placed[:, 2].max() if hangs else lowest - placed[:, 2].min()
                 T = np.eye(4)
-                T[:3, :3], T[:3, 3] = scale * turn, [*(middle - placed[:, :2].mean(axis=0)), level]
-                yield T, turn
+                T[:3, :3], T[:3, 3] = scale * R, [*(middle - placed[:, :2].mean(axis=0)), level]
+                yield T, R
 
 
 def with_arms(search: PoseSearch, target: Target, stand: Stand) -> Stand:

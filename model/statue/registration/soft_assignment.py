@@ -118,9 +118,9 @@ def assign(near: np.ndarray, squared: np.ndarray, count: int, temperature: float
     return SoftAssignment(matches, np.maximum(left, 0), float(max(0, -left.min())))
 
 
-def _balanced(M: csr_array, most: np.ndarray | None, log_s: np.ndarray, tolerance: float, turns: int = 20
+def _balanced(M: csr_array, most: np.ndarray | None, log_s: np.ndarray, tolerance: float, rounds: int = 20
               ) -> tuple[np.ndarray, np.ndarray, float]:
-    """Factors of rows (I,) and columns (J,), rows last, and the largest relative change in the last turn.
+    """Factors of rows (I,) and columns (J,), rows last, and the largest relative change in the last round.
 
     Columns come to 1 together with a slack of exp(log_s); or at most to 1, by factors of at most `most`.
     """
@@ -128,7 +128,7 @@ def _balanced(M: csr_array, most: np.ndarray | None, log_s: np.ndarray, toleranc
     empty = np.diff(M.indptr) == 0
     b, changed = np.ones(M.shape[1]), np.inf
     a = 1 / np.where(empty, 1.0, M @ b)
-    for _ in range(turns):
+    for _ in range(rounds):
         total, before = np.maximum(T @ a, 1e-250), b
         b = np.minimum(most, 1 / total) if most is not None else 1 / (np.exp(np.minimum(log_s, 300.0)) + total)
         a = 1 / np.where(empty, 1.0, M @ b)

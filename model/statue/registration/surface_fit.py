@@ -133,10 +133,10 @@ def fit_surface(rest: Mesh, start: np.ndarray, scan: Mesh, config: SurfaceFitCon
     if config.polish:
         x = fit.onto_the_surface(x)
     seen, _ = fit.seen(x)
-    apart = fit.surface.closest(x).distances[seen]
+    apart, inverted = fit.surface.closest(x).distances[seen], int(inverted_triangles(rest, x).sum())
     return SurfaceFit(x, seen, float(np.sqrt(np.mean(apart**2))) if seen.any() else np.nan,
-                      float(apart.max(initial=0.0)), int(fit.inverted(x).sum()), annealed.energies, temperatures,
-                      np.array(steps), bool(annealed.converged and seen.any()))
+                      float(apart.max(initial=0.0)), inverted, annealed.energies, temperatures, np.array(steps),
+                      bool(annealed.converged and seen.any()))
 
 
 class _Annealed(NamedTuple):
@@ -165,10 +165,6 @@ class _Fit:
     def normals(self, x: np.ndarray) -> np.ndarray:
         """(N, 3) of the vertices."""
         return self.rest.with_vertices(x).vertex_normals
-
-    def inverted(self, x: np.ndarray) -> np.ndarray:
-        """(F,) bool: triangles that face against their surroundings."""
-        return inverted_triangles(self.rest, x)
 
     def schedule(self, x: np.ndarray) -> np.ndarray:
         """Temperatures (K,), from the largest squared distance of a vertex to its nearest point down to (1 mm)²."""
@@ -266,10 +262,10 @@ class _Fit:
         free, _ = self.seen(x)
         found = self.surface.closest(x)
         free &= np.einsum("nd,nd->n", self.surface.mesh.face_normals[found.faces], self.normals(x)) > 0
-        already = self.inverted(x)
+        already = inverted_triangles(self.rest, x)
         for _ in range(10):
             y = np.where(free[:, None], found.points, x)
-            inverted = self.inverted(y) & ~already
+            inverted = inverted_triangles(self.rest, y) & ~already
             if not inverted.any():
                 break
             free[self.rest.faces[inverted]] = False

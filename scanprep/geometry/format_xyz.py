@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from .common import Contents, Lines, MeshFileError
+from .format_common import Contents, Lines, MeshFileError
 
 
 def read(path: Path, data: bytes) -> Contents:

@@ -1,37 +1,37 @@
 """PLY: ascii and binary of either byte order, with colours and normals; everything else is skipped."""
 from __future__ import annotations
 
-from array import array
+import contextlib
 from dataclasses import dataclass
+from itertools import islice
 from pathlib import Path
 from struct import Struct
 
 import numpy as np
 
-from .. import storage
-from .common import Contents, Lines, MeshFileError, as_bytes, as_colors, polygons, quote
+from . import storage
+from .format_common import Contents, Lines, MeshFileError, as_bytes, as_colors, polygons, quote
 
 _TYPES = {"char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4", "float": "f4",
           "double": "f8", "int8": "i1", "uint8": "u1", "int16": "i2", "uint16": "u2", "int32": "i4",
           "uint32": "u4", "int64": "i8", "uint64": "u8", "float32": "f4", "float64": "f8"}
 _LETTERS = {"i1": "b", "u1": "B", "i2": "h", "u2": "H", "i4": "i", "u4": "I", "i8": "q", "u8": "Q"}
 _ORDERS = {b"ascii": "=", b"binary_little_endian": "<", b"binary_big_endian": ">"}
-_CORNERS = ("vertex_indices", "vertex_index")
 _COLORS = (("red", "green", "blue"), ("r", "g", "b"), ("diffuse_red", "diffuse_green", "diffuse_blue"))
 
 
 @dataclass(frozen=True)
-class _Property:
+class Property:
     name: str
     kind: str                        # numpy type code of the value or of the list's items
     length_kind: str | None = None   # that of the list's length, None for a single value
 
 
 @dataclass(frozen=True)
-class _Element:
+class Element:
     name: str
     count: int
-    properties: tuple[_Property, ...]
+    properties: tuple[Property, ...]
 
 
 _Column = np.ndarray | tuple[np.ndarray, np.ndarray]     # values, or the lengths and the items of lists
@@ -41,29 +41,23 @@ def read(path: Path, data: bytes) -> Contents:
     """The vertices, triangles, normals and colours of a PLY file."""
     order, elements, start, first_line = _header(path, data)
     names = [e.name for e in elements]
-    if len(set(names)) < len(names):
-        raise MeshFileError(f"{path}: expected each element once in the PLY header, found {', '.join(names)}")
-    if "vertex" not in names:
-        raise MeshFileError(f"{path}: expected an element vertex, the header has {names}")
+    if "vertex" not in names or len(set(names)) < len(names):
+        raise MeshFileError(f"{path}: expected an element vertex, and each element once, the header has {names}")
     lines = Lines(path, data[start:], first_line) if order == "=" else None
     found: dict[str, dict[str, _Column]] = {}
     place = 0 if lines else start
     for element in elements:
-        if lines:
-            columns, place = _ascii_element(lines, element, place)
-        else:
-            columns, place = _binary_element(path, data, element, place, order)
-        found[element.name] = columns
+        found[element.name], place = (ascii_element(lines, element, place) if lines
+                                      else _binary_element(path, data, element, place, order))
     rest = len(lines) - place if lines else len(data[place:].rstrip(b"\0\r\n\t "))
     if rest > 0:
         counts = ", ".join(f"{e.count} {e.name}" for e in elements)
         raise MeshFileError(f"{path}: expected the end of the file after {counts}, found {rest} more "
                             f"{'lines' if lines else 'bytes'}")
-    vertex = next(e for e in elements if e.name == "vertex")
-    return _contents(path, vertex, found)
+    return _contents(path, elements[names.index("vertex")], found)
 
 
-def _header(path: Path, data: bytes) -> tuple[str, list[_Element], int, int]:
+def _header(path: Path, data: bytes) -> tuple[str, list[Element], int, int]:
     """Byte order, elements, and the place and line number where the body begins."""
     if not data.startswith(b"ply") or data[3:4] not in (b"\n", b"\r"):
         raise MeshFileError(f"{path}: expected a PLY file that begins with 'ply', found {quote(data[:20])}")
@@ -81,10 +75,12 @@ def _header(path: Path, data: bytes) -> tuple[str, list[_Element], int, int]:
             if words[0] == b"format":
                 order = _ORDERS[words[1]]
             elif words[0] == b"element":
-                elements.append(_Element(words[1].decode(), _count(words[2]), ()))
+                elements.append(Element(words[1].decode(), int(words[2]), ()))
+                if elements[-1].count < 0:
+                    raise ValueError
             elif words[0] == b"property":
                 last = elements[-1]
-                elements[-1] = _Element(last.name, last.count, (*last.properties, _property(words)))
+                elements[-1] = Element(last.name, last.count, (*last.properties, _property(words)))
             else:
                 raise KeyError
         except (KeyError, IndexError, ValueError):
@@ -95,73 +91,53 @@ def _header(path: Path, data: bytes) -> tuple[str, list[_Element], int, int]:
     return order, elements, after, len(lines) + 2
 
 
-def _count(word: bytes) -> int:
-    if int(word) < 0:
-        raise ValueError
-    return int(word)
-
-
-def _property(words: list[bytes]) -> _Property:
+def _property(words: list[bytes]) -> Property:
     text = [w.decode() for w in words]
     if text[1] == "list":
         if _TYPES[text[2]][0] == "f":
             raise ValueError
-        return _Property(text[4], _TYPES[text[3]], _TYPES[text[2]])
-    return _Property(text[2], _TYPES[text[1]])
+        return Property(text[4], _TYPES[text[3]], _TYPES[text[2]])
+    return Property(text[2], _TYPES[text[1]])
 
 
-def _binary_element(path: Path, data: bytes, element: _Element, start: int, order: str
+def _binary_element(path: Path, data: bytes, element: Element, start: int, order: str
                     ) -> tuple[dict[str, _Column], int]:
     """All rows at once when every list has the length it has in the first row, else row by row."""
-    if not element.properties:
-        return {}, start
-    lengths = _first_lengths(data, element, start, order) if element.count else {}
-    if lengths is not None:
-        fields: list[tuple] = []
-        for i, p in enumerate(element.properties):
-            if p.length_kind:
-                fields.append((f"length{i}", order + p.length_kind))
-            fields.append((f"value{i}", order + p.kind, (lengths.get(i, 0),) if p.length_kind else ()))
-        row = np.dtype(fields)
-        whole = start + row.itemsize * element.count <= len(data)
-        if whole or not lengths:
-            if not whole:
-                raise _truncated(path, element, (len(data) - start) // row.itemsize)
-            table = np.frombuffer(data, row, element.count, start)
-            if all((table[f"length{i}"] == n).all() for i, n in lengths.items()):
-                columns: dict[str, _Column] = {}
-                for i, p in enumerate(element.properties):
-                    value = table[f"value{i}"]
-                    columns[p.name] = ((np.full(element.count, lengths.get(i, 0)), value.reshape(-1))
-                                       if p.length_kind else value)
-                return columns, start + row.itemsize * element.count
-    return _binary_rows(path, data, element, start, order)
-
-
-def _first_lengths(data: bytes, element: _Element, start: int, order: str) -> dict[int, int] | None:
-    """The length of each list in the first row, None where the data end before it does."""
-    lengths = {}
+    fields, at = list[tuple](), start
     for i, p in enumerate(element.properties):
         n = 1
         if p.length_kind:
-            kind = np.dtype(order + p.length_kind)
-            if start + kind.itemsize > len(data):
-                return None
-            n = lengths[i] = int(np.frombuffer(data, kind, 1, start)[0])
-            start += kind.itemsize
-        start += n * np.dtype(p.kind).itemsize
-        if n < 0 or start > len(data):
-            return None
-    return lengths
+            width = int(p.length_kind[1])
+            n = int.from_bytes(data[at:at + width], "big" if order == ">" else "little") if element.count else 0
+            fields.append((f"length{i}", order + p.length_kind))
+            at += width
+        fields.append((f"value{i}", order + p.kind, (n,) if p.length_kind else ()))
+        at += n * int(p.kind[1])
+        if at > len(data) and element.count:
+            raise _truncated(path, element, 0)
+    row = np.dtype(fields)
+    if start + row.itemsize * element.count > len(data):
+        return _binary_rows(path, data, element, start, order)
+    table = np.frombuffer(data, row, element.count, start) if fields and element.count else np.zeros(0, row)
+    columns: dict[str, _Column] = {}
+    for i, p in enumerate(element.properties):
+        values = table[f"value{i}"]
+        if not p.length_kind:
+            columns[p.name] = values
+        elif (table[f"length{i}"] == values.shape[1]).all():
+            columns[p.name] = np.full(element.count, values.shape[1]), values.reshape(-1)
+        else:
+            return _binary_rows(path, data, element, start, order)
+    return columns, start + row.itemsize * element.count
 
 
-def _binary_rows(path: Path, data: bytes, element: _Element, start: int, order: str
+def _binary_rows(path: Path, data: bytes, element: Element, start: int, order: str
                  ) -> tuple[dict[str, _Column], int]:
-    ways = [(np.dtype(order + p.kind).itemsize, Struct(order + _LETTERS[p.length_kind]) if p.length_kind else None)
+    ways = [(int(p.kind[1]), Struct(order + _LETTERS[p.length_kind]) if p.length_kind else None)
             for p in element.properties]
-    sizes, places = [array("q") for _ in ways], [array("q") for _ in ways]
+    sizes, items = [list[int]() for _ in ways], [bytearray() for _ in ways]
     for row in range(element.count):
-        for (width, length), size, place in zip(ways, sizes, places, strict=True):
+        for (width, length), size, item in zip(ways, sizes, items, strict=True):
             n = 1
             if length is not None:
                 if start + length.size > len(data):
@@ -171,74 +147,60 @@ def _binary_rows(path: Path, data: bytes, element: _Element, start: int, order: 
             if n < 0 or start + n * width > len(data):
                 raise _truncated(path, element, row)
             size.append(n)
-            place.append(start)
+            item += data[start:start + n * width]
             start += n * width
     columns: dict[str, _Column] = {}
-    whole = np.frombuffer(data, np.uint8)
-    for p, (width, _), size, place in zip(element.properties, ways, sizes, places, strict=True):
-        counts, first = np.array(size, dtype=np.int64), np.array(place, dtype=np.int64)
-        before = np.cumsum(counts) - counts
-        each = np.repeat(first - width * before, counts) + width * np.arange(counts.sum())   # where every item begins
-        flat = whole[each[:, None] + np.arange(width)].view(order + p.kind)[:, 0]
-        columns[p.name] = (counts, flat) if p.length_kind else flat
+    for p, size, item in zip(element.properties, sizes, items, strict=True):
+        values = np.frombuffer(item, order + p.kind)
+        columns[p.name] = (np.array(size, dtype=np.int64), values) if p.length_kind else values
     return columns, start
 
 
-def _truncated(path: Path, element: _Element, found: int) -> MeshFileError:
+def _truncated(path: Path, element: Element, found: int) -> MeshFileError:
     return MeshFileError(f"{path}: truncated: expected {element.count} rows of element {element.name}, "
                          f"found {found}")
 
 
-def _ascii_element(lines: Lines, element: _Element, start: int) -> tuple[dict[str, _Column], int]:
+def ascii_element(lines: Lines, element: Element, start: int) -> tuple[dict[str, _Column], int]:
+    """All rows at once where there are no lists, or one of whole numbers that has always the same length."""
     stop = start + element.count
     if stop > len(lines):
         raise _truncated(lines.path, element, max(len(lines) - start, 0))
-    width = len(element.properties)
-    expected = f"{width} values of element {element.name}"
-    whole = all(p.kind[0] in "iu" for p in element.properties)
-    if not any(p.length_kind for p in element.properties):
-        table = lines.table(range(start, stop), expected, width, np.int64 if whole else np.float64)
-        return {p.name: table[:, i] for i, p in enumerate(element.properties)}, stop
-    if width == 1 and whole and element.count:
-        n = len(lines.text[start].split()) - 1           # all lists as long as the first, or one by one below
-        try:
-            table = np.loadtxt(lines.text[start:stop], dtype=np.int64, ndmin=2, comments=None)
-        except ValueError:
-            pass
-        else:
-            if (table[:, 0] == n).all():
-                return {element.properties[0].name: (table[:, 0], table[:, 1:].reshape(-1))}, stop
-    return _ascii_rows(lines, element, start), stop
+    properties, width = element.properties, len(element.properties)
+    kind = np.int64 if all(p.kind[0] in "iu" for p in properties) else np.float64
+    if not any(p.length_kind for p in properties):
+        table = lines.table(range(start, stop), f"{width} values of element {element.name}", width, kind)
+        return {p.name: table[:, i] for i, p in enumerate(properties)}, stop
+    if width == 1 and kind is np.int64 and element.count:
+        with contextlib.suppress(ValueError):
+            table = np.loadtxt(lines.text[start:stop], dtype=kind, ndmin=2, comments=None)
+            if (table[:, 0] == table.shape[1] - 1).all():
+                return {properties[0].name: (table[:, 0], table[:, 1:].reshape(-1))}, stop
+    return _ascii_rows(lines, element, range(start, stop)), stop
 
 
-def _ascii_rows(lines: Lines, element: _Element, start: int) -> dict[str, _Column]:
-    sizes: list[list[int]] = [[] for _ in element.properties]
-    items: list[list[float]] = [[] for _ in element.properties]
-    for row in range(start, start + element.count):
-        words = lines.text[row].split()
-        place = 0
+def _ascii_rows(lines: Lines, element: Element, rows: range) -> dict[str, _Column]:
+    sizes, items = [list[int]() for _ in element.properties], [list[float]() for _ in element.properties]
+    for row in rows:
+        words = iter(lines.text[row].split())
         try:
-            for i, p in enumerate(element.properties):
-                n = 1
-                if p.length_kind:
-                    n = int(words[place])
-                    place += 1
-                values = words[place:place + n]
-                if n < 0 or len(values) != n:
+            for p, size, item in zip(element.properties, sizes, items, strict=True):
+                size.append(int(next(words)) if p.length_kind else 1)
+                values = list(islice(words, size[-1]))
+                if len(values) != size[-1]:
                     raise ValueError
-                sizes[i].append(n)
-                items[i] += map(int if p.kind[0] in "iu" else float, values)
-                place += n
-        except (ValueError, IndexError):
+                item += map(int if p.kind[0] in "iu" else float, values)
+        except (ValueError, StopIteration):
             raise lines.fail(row, f"a row of element {element.name} as its header says") from None
+    columns: dict[str, _Column] = {}
     with storage.taking_apart(lines.path, f"numbers of element {element.name} as its header says", MeshFileError):
-        found = [np.array(each, dtype=np.int64 if p.kind[0] in "iu" else np.float64)
-                  for p, each in zip(element.properties, items, strict=True)]
-    return {p.name: (np.array(sizes[i], dtype=np.int64), found[i]) if p.length_kind else found[i]
-            for i, p in enumerate(element.properties)}
+        for p, size, item in zip(element.properties, sizes, items, strict=True):
+            found = np.array(item, dtype=np.int64 if p.kind[0] in "iu" else np.float64)
+            columns[p.name] = (np.array(size, dtype=np.int64), found) if p.length_kind else found
+    return columns
 
 
-def _contents(path: Path, vertex: _Element, found: dict[str, dict[str, _Column]]) -> Contents:
+def _contents(path: Path, vertex: Element, found: dict[str, dict[str, _Column]]) -> Contents:
     columns = found["vertex"]
 
     def triple(names: tuple[str, ...]) -> np.ndarray | None:
@@ -255,7 +217,7 @@ def _contents(path: Path, vertex: _Element, found: dict[str, dict[str, _Column]]
     colors = next((as_colors(c, kinds[names[0]]) for names in _COLORS if (c := triple(names)) is not None), None)
     faces = None
     if "face" in found:
-        lists = next((found["face"][name] for name in _CORNERS if name in found["face"]), None)
+        lists = found["face"].get("vertex_indices", found["face"].get("vertex_index"))
         if not isinstance(lists, tuple):
             raise MeshFileError(f"{path}: expected a property list vertex_indices of element face, "
                                 f"found {list(found['face'])}")

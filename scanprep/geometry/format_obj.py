@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from .common import Contents, Lines, MeshFileError, polygons
+from .format_common import Contents, Lines, MeshFileError, polygons
 
 
 def read(path: Path, data: bytes) -> Contents:

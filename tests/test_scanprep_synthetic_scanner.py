@@ -9,7 +9,7 @@ import pytest
 from scanprep.geometry.files import read_mesh
 from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.surface import Surface
-from scanprep.synthetic import data_set, people
+from scanprep.synthetic import data_set, people, scanner
 from scanprep.synthetic.people import BodyShape, Person
 from scanprep.synthetic.scanner import ScannerConfig, scan
 
@@ -102,13 +102,14 @@ def test_the_scan_has_its_own_triangulation_and_the_seed_decides(body):
     assert not np.array_equal(one.merged.vertices, three.merged.vertices)
 
 
-def test_more_grazing_and_dropout_means_fewer_points(body):
-    def count(**settings: float) -> int:
-        return len(scan(body, ScannerConfig(resolution=0.014, **settings),
-                        np.random.default_rng(0)).merged.vertices)
+def test_more_grazing_and_dropout_means_fewer_points(body, monkeypatch):
+    def count(name: str, value: float) -> int:
+        with monkeypatch.context() as patch:
+            patch.setattr(scanner, name, value)
+            return len(scan(body, COARSE, np.random.default_rng(0)).merged.vertices)
 
-    assert count(grazing=40.0) < count(grazing=10.0)
-    assert count(dropout=0.3) < 0.85 * count(dropout=0.0)
+    assert count("GRAZING", 40.0) < count("GRAZING", 10.0)
+    assert count("DROPOUT", 0.3) < 0.85 * count("DROPOUT", 0.0)
 
 
 def test_settings_are_checked(body):
@@ -120,11 +121,12 @@ def test_settings_are_checked(body):
         scan(Mesh(np.zeros((3, 3)), np.zeros((0, 3))))
 
 
-def test_synthetic_dataset_is_complete_repeatable_and_resumable(tmp_path):
-    calls = []
-    first = data_set.synthetic_dataset(tmp_path / "a", seed=3, subject_poses=2, subjects=2, config=COARSE,
-                                      progress=lambda done, total: calls.append((done, total)))
-    assert calls == [(1, 4), (2, 4), (3, 4), (4, 4)]
+def scans(folder, seed, poses, people):
+    return [data_set.synthetic_scan(folder, seed, *which, COARSE) for which in data_set.scan_plan(poses, people)]
+
+
+def test_synthetic_scans_are_complete_repeatable_and_resumable(tmp_path):
+    first = scans(tmp_path / "a", 3, 2, 2)
     assert [e.sex for e in first[2:]] == ["female", "male"] and len({e.name for e in first}) == 4
     for entry in first:
         mesh = read_mesh(entry.path)
@@ -142,12 +144,12 @@ def test_synthetic_dataset_is_complete_repeatable_and_resumable(tmp_path):
     stamps = [entry.path.stat().st_mtime_ns for entry in first]
     bytes_before = first[1].path.read_bytes()
     first[1].path.unlink()
-    again = data_set.synthetic_dataset(tmp_path / "a", seed=3, subject_poses=2, subjects=2, config=COARSE)
+    again = scans(tmp_path / "a", 3, 2, 2)
     assert again == first
     assert first[1].path.read_bytes() == bytes_before
     assert again[0].path.stat().st_mtime_ns == stamps[0]
 
 
 def test_first_scan_is_the_rest_pose(tmp_path):
-    entry = data_set.synthetic_dataset(tmp_path, subject_poses=1, subjects=0, config=COARSE)[0]
+    (entry,) = scans(tmp_path, 0, 1, 0)
     assert entry.pose == "rest" and np.abs(data_set.GroundTruth.load(entry.truth).pose).max() == 0

@@ -5,7 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
-from .common import Contents, Lines, MeshFileError, quote
+from .format_common import Contents, Lines, MeshFileError, quote
 
 _HEADER = 80
 _FACET = np.dtype([("normal", "<f4", (3,)), ("corners", "<f4", (3, 3)), ("attribute", "<u2")])
@@ -60,21 +60,14 @@ def _ascii(path: Path, data: bytes) -> np.ndarray:
     facets = starts.count(b"facet")
     if len(rows) != 3 * facets:
         raise MeshFileError(f"{path}: expected 3 vertex lines for each of {facets} facets, found {len(rows)}")
-    try:
-        values = np.array([lines.text[row].split()[1:] for row in rows], dtype=np.float64)
-        if values.size and values.shape[1] != 3:
-            raise ValueError
-    except ValueError:
-        bad = next((row for row in rows if not _is_vertex(lines.text[row])), rows[0])
-        raise lines.fail(bad, "'vertex x y z'") from None
-    return values.reshape(-1, 3, 3)
-
-
-def _is_vertex(line: bytes) -> bool:
-    try:
-        return len([float(word) for word in line.split()[1:]]) == 3
-    except ValueError:
-        return False
+    corners = []
+    for row in rows:
+        try:
+            x, y, z = map(float, lines.text[row].split()[1:])
+        except ValueError:
+            raise lines.fail(row, "'vertex x y z'") from None
+        corners.append((x, y, z))
+    return np.array(corners).reshape(-1, 3, 3)
 
 
 def encode(contents: Contents, double: bool) -> bytes:

@@ -6,7 +6,8 @@ from pathlib import Path
 
 import numpy as np
 
-from .common import Contents, Lines, MeshFileError, as_bytes, polygons, quote
+from .format_common import Contents, Lines, MeshFileError, as_bytes, polygons, quote
+from .format_ply import Element, Property, ascii_element
 
 
 def read(path: Path, data: bytes) -> Contents:
@@ -22,8 +23,7 @@ def read(path: Path, data: bytes) -> Contents:
     if len(counts) < 2 or not all(word.isdigit() and len(word) < 10 for word in counts[:2]):
         raise lines.fail(place - 1, "the numbers of vertices, faces and edges")
     n, f = int(counts[0]), int(counts[1])
-    normals_at = 3 if kind[3] else None
-    width = 3 + (3 if kind[3] else 0)
+    width = 6 if kind[3] else 3
     table = lines.table(range(place, place + n), f"{width} or more numbers of vertex 0..{n - 1}", width)
     colors = None
     if kind[2] and table.shape[1] >= width + 3:
@@ -34,33 +34,10 @@ def read(path: Path, data: bytes) -> Contents:
         found = len(lines) - place
         raise MeshFileError(f"{path}: {'truncated: ' if found < f else ''}expected {f} faces after {n} vertices, "
                             f"found {found} lines")
-    sizes, corners = _faces(lines, place, f)
+    face = Element("face", f, (Property("corners", "i4", "u1"),))                 # as in PLY; what follows is skipped
+    sizes, corners = ascii_element(lines, face, place)[0]["corners"]
     faces = polygons(path, sizes, corners, n, lines.numbers[place:place + f])
-    return Contents(table[:, :3], faces, table[:, 3:6] if normals_at else None, colors)
-
-
-def _faces(lines: Lines, start: int, count: int) -> tuple[np.ndarray, np.ndarray]:
-    """How many corners each face has, and their vertices; colours behind them are skipped."""
-    text = lines.text[start:start + count]
-    try:                             # all with as many corners, nothing behind them
-        table: np.ndarray = np.loadtxt(text, dtype=np.int64, ndmin=2, comments=None) if text else np.zeros((0, 4))
-        if (table[:, 0] == table.shape[1] - 1).all() and len(table) == count:
-            return table[:, 0], table[:, 1:].ravel()
-    except (ValueError, OverflowError):
-        pass
-    rows = [line.split() for line in text]
-    try:
-        sizes = np.array([row[0] for row in rows], dtype=np.int64)
-        corners = [row[1:size + 1] for row, size in zip(rows, sizes.tolist(), strict=True)]
-        if any(len(c) != size for c, size in zip(corners, sizes.tolist(), strict=True)):
-            raise ValueError
-        return sizes, np.array([word for c in corners for word in c], dtype=np.int64)
-    except (ValueError, OverflowError):
-        for i, row in enumerate(rows):
-            size = int(row[0]) if row[0].isdigit() and len(row[0]) < 10 else -1
-            if size < 0 or len(row) <= size or not all(re.fullmatch(rb"-?\d{1,18}", w) for w in row[1:size + 1]):
-                raise lines.fail(start + i, "a face 'n v1 ... vn'") from None
-        raise
+    return Contents(table[:, :3], faces, table[:, 3:6] if kind[3] else None, colors)
 
 
 def encode(contents: Contents, double: bool) -> bytes:

@@ -1,6 +1,7 @@
 """What the readers of all formats share: the error, the contents of a file, polygons and tables of numbers."""
 from __future__ import annotations
 
+import contextlib
 import gzip
 import io
 import warnings
@@ -10,9 +11,8 @@ from pathlib import Path
 
 import numpy as np
 
-from .. import storage
+from . import storage
 
-UNPACKED, RATIO = 2**20, 50          # a gzip file may unpack to this many bytes, and so many for each of its own
 FARTHEST = 1e9                       # of a coordinate, in whatever unit
 UNITS = {"m": 1.0, "mm": 1e-3, "cm": 1e-2, "in": 0.0254}
 
@@ -23,38 +23,21 @@ class MeshFileError(storage.StorageError):
 
 @dataclass(frozen=True, eq=False)
 class Contents:
-    """What a file of any format holds, in the file's own unit and order.
+    """What a file of any format holds, in the file's own unit and order."""
 
-    Attributes
-    ----------
-    vertices : (N, 3) float
-    faces : (F, 3) int, or None where the format or the file has none
-    normals : (N, 3) float, optional
-    colors : (N, 3) float in [0, 1], optional
-    """
-
-    vertices: np.ndarray
-    faces: np.ndarray | None = None
-    normals: np.ndarray | None = None
-    colors: np.ndarray | None = None
+    vertices: np.ndarray                    # (N, 3)
+    faces: np.ndarray | None = None         # (F, 3)
+    normals: np.ndarray | None = None       # (N, 3)
+    colors: np.ndarray | None = None        # (N, 3) in [0, 1]
 
 
 def load_bytes(path: Path) -> bytes:
-    """The whole file, unpacked when its name ends in `.gz`.
-
-    Raises
-    ------
-    MeshFileError
-        Missing, a folder, unreadable, empty, or a damaged gzip file.
-    """
+    """The whole file, unpacked when its name ends in `.gz`; MeshFileError for one that is missing, damaged or empty."""
     try:
         data = path.read_bytes()
-    except FileNotFoundError:
-        raise MeshFileError(f"{path}: no such file") from None
-    except IsADirectoryError:
-        raise MeshFileError(f"{path}: expected a file, found a folder") from None
     except OSError as error:
-        raise MeshFileError(f"{path}: cannot be read ({error.strerror or error})") from None
+        what = {FileNotFoundError: "no such file", IsADirectoryError: "expected a file, found a folder"}
+        raise MeshFileError(f"{path}: {what.get(type(error), f'cannot be read ({error.strerror or error})')}") from None
     if path.suffix.lower() == ".gz":
         data = _unpacked(path, data)
     if not data:
@@ -64,7 +47,7 @@ def load_bytes(path: Path) -> bytes:
 
 def _unpacked(path: Path, data: bytes) -> bytes:
     """What a gzip file holds, up to far more than any mesh can be packed."""
-    most = UNPACKED + RATIO * len(data)
+    most = 2**20 + 50 * len(data)
     try:
         with gzip.GzipFile(fileobj=io.BytesIO(data)) as packed:
             out = packed.read(most + 1)
@@ -110,18 +93,7 @@ def quote(text: bytes | str, length: int = 40) -> str:
 
 
 class Lines:
-    """The lines of a text file that hold something, with their numbers.
-
-    Parameters
-    ----------
-    path : Path
-        For the errors.
-    data : bytes
-    first : int
-        The number of the first line of `data`.
-    comment : bytes, optional
-        What follows it on a line is left out.
-    """
+    """The lines of a text file that hold something, with their numbers from `first` on; without comments."""
 
     def __init__(self, path: Path, data: bytes, first: int = 1, comment: bytes | None = None) -> None:
         self.path = path
@@ -143,64 +115,33 @@ class Lines:
         return MeshFileError(f"{self.path}: line {self.numbers[row]}: expected {expected}, "
                              f"found {quote(self.text[row].strip())}")
 
-    def table(self, rows: Sequence[int], expected: str, columns: int, dtype: type = np.float64) -> np.ndarray:
-        """The numbers (len(rows), at least `columns`) of rows that all have equally many.
-
-        Raises
-        ------
-        MeshFileError
-            A row that is missing, too short, of another length than the first, or not numbers.
-        """
-        inside = slice(rows[0], rows[-1] + 1) if isinstance(rows, range) and rows else None
-        chunk = self.text[inside] if inside else [self.text[row] for row in rows if row < len(self.text)]
+    def table(self, rows: range, expected: str, columns: int, dtype: type = np.float64) -> np.ndarray:
+        """Numbers (rows, at least `columns`) of rows that all have equally many, or the error of the first bad one."""
         if not rows:
             return np.zeros((0, columns), dtype=dtype)
-        if not (inside and rows[-1] >= len(self.text)) and len(chunk) == len(rows):
-            try:
-                values: np.ndarray = np.loadtxt(chunk, dtype=dtype, ndmin=2, comments=None)
-            except ValueError:
-                pass
-            else:
+        if rows.stop <= len(self.text):
+            with contextlib.suppress(ValueError):
+                values: np.ndarray = np.loadtxt(self.text[rows.start:rows.stop], dtype=dtype, ndmin=2, comments=None)
                 if values.shape[1] >= columns:
                     return values
-        raise self._first_bad(rows, expected, columns, dtype)
-
-    def _first_bad(self, rows: Sequence[int], expected: str, columns: int, dtype: type) -> MeshFileError:
         width = None
         for row in rows:
             words = self.text[row].split() if row < len(self.text) else []
-            if len(words) < columns or (width is not None and len(words) != width):
-                return self.fail(row, expected)
-            width = len(words)
             try:
-                for word in words:
-                    dtype(word)
+                if len(words) < columns or len(words) != (width or len(words)):
+                    raise ValueError
+                width = len([dtype(word) for word in words])
             except (ValueError, OverflowError):
-                return self.fail(row, expected)
-        return self.fail(rows[0], expected)
+                raise self.fail(row, expected) from None
+        raise self.fail(rows.start, expected)
 
 
 def polygons(path: Path, sizes: np.ndarray, corners: np.ndarray, count: int,
              numbers: Sequence[int] | None = None) -> np.ndarray:
-    """Triangles (F, 3) of polygons, each cut into a fan around its first corner.
+    """Triangles (F, 3) of polygons of `sizes` (P,) corners, each cut into a fan around its first corner.
 
-    Parameters
-    ----------
-    path : Path
-        For the errors.
-    sizes : (P,) int
-        Corners of each polygon.
-    corners : (sum of sizes,) int
-        Their vertices, one polygon after the other.
-    count : int
-        How many vertices there are.
-    numbers : P ints, optional
-        The line of each polygon, for the errors.
-
-    Raises
-    ------
-    MeshFileError
-        Fewer than three corners, or a vertex out of range.
+    `corners` are their vertices, of `count`, one polygon after the other; `numbers` the lines of the polygons.
+    MeshFileError for fewer than three corners, or a vertex out of range.
     """
     sizes, corners = np.asarray(sizes, dtype=np.int64), np.asarray(corners, dtype=np.int64)
     start = np.cumsum(sizes) - sizes

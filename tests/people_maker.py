@@ -1,52 +1,103 @@
-"""The shared triangulation: one half of the canonical body polygonised, remeshed evenly, and mirrored.
+"""How the triangulation that all synthetic people share is made: done once, its result is stored in the package.
 
-Run once by `people_template.build`; its result is stored beside the code.
+One half of the canonical body is polygonised, remeshed evenly, and mirrored. `python tests/people_maker.py` makes the
+file anew, in two minutes.
 """
 from __future__ import annotations
 
 from collections.abc import Callable
+from pathlib import Path
 
 import numpy as np
 
-from ..geometry.mesh import Mesh
-from .implicit_surface import Field, project
+from scanprep.geometry import storage
+from scanprep.geometry.mesh import Mesh
+from scanprep.synthetic.anatomy import Anatomy
+from scanprep.synthetic.body_parts import arm, body_surface, hand, trunk
+from scanprep.synthetic.implicit_surface import Field, polygonise, project
+from scanprep.synthetic.topology import CANONICAL, STORED, VERSION, Template
 
 Sizing = Callable[[np.ndarray], np.ndarray]
 
 
-def polygonise(field: Field, low: np.ndarray, high: np.ndarray, step: float) -> Mesh:
-    """The zero surface in a box by marching cubes; open where the box cuts it.
+def sizing(anatomy: Anatomy) -> Sizing:
+    """Wanted edge length in metres at points (n, 3): fine on face, ears, hands and toes."""
+    hand = anatomy.joints[6] + 0.6 * (anatomy.ends[6] - anatomy.joints[6])
+    foot = anatomy.joints[12] + 0.75 * anatomy.width["foot"] * anatomy.foot_frame[2] * [1, 1, 0]
+    foot[2] = 0.01
+    face = anatomy.eye + np.array([0, -0.095, -0.035])
+    ear = anatomy.eye + np.array([0.08, 0.008, -0.01])
+    spots = [(hand, 0.0068, 0.09), (foot, 0.0085, 0.05), (face, 0.0062, 0.05), (anatomy.eye, 0.0110, 0.12),
+             (ear, 0.0055, 0.036)]
 
-    Only cells near the surface are evaluated finely.
+    def size(points: np.ndarray) -> np.ndarray:
+        wanted = np.full(len(points), 0.0235)
+        for centre, fine, radius in spots:
+            folded = np.abs(points[:, :1]) if centre[0] > 0 else points[:, :1]
+            d = np.linalg.norm(np.hstack([folded, points[:, 1:]]) - centre, axis=1)
+            wanted = np.minimum(wanted, fine + 0.16 * np.maximum(d - radius, 0))
+        return wanted
 
-    Parameters
-    ----------
-    low, high : (3,) float, metres
-    step : float, metres
-    """
-    import igl
+    return size
 
-    coarse = 6
-    cells = np.ceil((high - low) / (coarse * step)).astype(int)
-    axes = [low[d] + coarse * step * np.arange(cells[d] + 1) for d in range(3)]
-    grid = np.stack(np.meshgrid(*axes[::-1], indexing="ij")[::-1], axis=-1)
-    shape = grid.shape[:3]
-    rough = field(grid.reshape(-1, 3)).reshape(shape)
-    near = np.abs(rough) < 3.2 * coarse * step
-    n = cells * coarse + 1
-    fine_axes = [low[d] + step * np.arange(n[d]) for d in range(3)]
-    index = [np.minimum((np.arange(n[d]) + coarse // 2) // coarse, cells[d]) for d in range(3)]
-    pick = np.ix_(index[2], index[1], index[0])
-    values, todo = rough[pick].copy(), near[pick]
-    points = np.stack(np.meshgrid(*fine_axes[::-1], indexing="ij")[::-1], axis=-1)
-    wanted = points[todo]
-    values[todo] = np.concatenate([field(part) for part in np.array_split(wanted, max(1, len(wanted) // 200_000))])
-    vertices, faces = igl.marching_cubes(values.reshape(-1), points.reshape(-1, 3), int(n[0]), int(n[1]),
-                                         int(n[2]),
-                                         0.0)[:2]
-    mesh = Mesh(vertices, np.asarray(faces, dtype=np.int64))
-    outside = field(mesh.corners.mean(axis=1) + 1e-3 * mesh.face_normals)
-    return mesh if np.median(outside) > 0 else Mesh(vertices, mesh.faces[:, ::-1])
+
+def build(step: float = 0.0035) -> Template:
+    """Polygonise and remesh the canonical body from scratch (about two minutes)."""
+    anatomy = Anatomy(CANONICAL)
+    field = body_surface(anatomy)
+    high = np.array([anatomy.ends[6, 0] + 0.08, 0.22, CANONICAL.stature + 0.03])
+    half = polygonise(field, np.array([0.0, -0.30, -0.02]), high, step)
+    keep = half.vertex_component[half.faces[:, 0]] == 0
+    half = remesh(half.submesh(keep)[0], field, sizing(anatomy))
+    mesh, twin = mirror(half)
+    order = np.lexsort((np.round(mesh.vertices[:, 0], 4), np.round(mesh.vertices[:, 2], 3)))
+    place = np.argsort(order)
+    mesh = Mesh(mesh.vertices[order], place[mesh.faces])
+    return Template(mesh, place[twin[order]], label_faces(mesh, anatomy), anatomy)
+
+
+def store(template: Template, path: Path = STORED) -> None:
+    """Keep a built template beside the code."""
+    storage.save(path, "people template", VERSION, {
+        "vertices": np.round(template.mesh.vertices * 1e5).astype(np.int32),
+        "mirror": template.mirror.astype(np.uint16), "part_of_face": template.part_of_face.astype(np.uint8),
+        "faces": template.mesh.faces.astype(np.uint16)})
+
+
+def label_faces(mesh: Mesh, anatomy: Anatomy) -> np.ndarray:
+    """Part of every triangle (F,): cut by a plane through each joint, across the surface only."""
+    c = mesh.corners.mean(axis=1)
+    j = anatomy.joints
+    part = np.zeros(len(c), dtype=np.int64)
+
+    def beyond(joint: int, normal: np.ndarray) -> np.ndarray:
+        return (c - j[joint]) @ normal > 0
+
+    folded = np.abs(c * [1, 0, 0]) + c * [0, 1, 1]
+    of_arm = np.minimum(arm(anatomy)(folded), hand(anatomy)(folded)) < 0.02
+    of_arm &= trunk(anatomy)[0][0][0](c) > 0.012 * anatomy.scale
+    part[c[:, 2] > j[1, 2]] = 1
+    part[c[:, 2] > j[2, 2]] = 2
+    neck = np.array([0, -0.35, 1.0])
+    part[beyond(3, neck / np.linalg.norm(neck)) & (np.abs(c[:, 0]) < 0.12)] = 3
+    for side, upper, leg in ((1, 4, 10), (-1, 7, 13)):
+        flip = np.array([side, 1, 1])
+        up = flip * anatomy.upper_arm_frame[2]
+        out = up * 0.75 + 0.66 * np.array([side, 0, 0.25])
+        armpit = j[upper] + 0.012 * anatomy.scale * flip * [-1, 0, 0]
+        mine = ((c - armpit) @ out > 0) & (c[:, 0] * side > 0.10 * anatomy.scale) & of_arm
+        fore = up + flip * anatomy.forearm_frame[2]
+        part[mine] = upper
+        part[mine & beyond(upper + 1, fore)] = upper + 1
+        part[mine & beyond(upper + 2, flip * anatomy.forearm_frame[2])] = upper + 2
+        cut = np.array([0.72 * side, -0.0, -1.0])
+        top = j[leg] + np.array([0.0, 0, -0.012 * anatomy.scale])
+        mine = ((c - top) @ cut > 0) & (c[:, 0] * side > 0) & (c[:, 2] < j[0, 2] + 0.02) & (part < 3)
+        part[mine] = leg
+        part[mine & (c[:, 2] < j[leg + 1, 2])] = leg + 1
+        heel = np.array([0, -0.5, -1.0])
+        part[mine & beyond(leg + 2, heel)] = leg + 2
+    return part
 
 
 def remesh(mesh: Mesh, field: Field, sizing: Sizing, rounds: int = 12) -> Mesh:
@@ -68,14 +119,7 @@ def remesh(mesh: Mesh, field: Field, sizing: Sizing, rounds: int = 12) -> Mesh:
 
 
 def mirror(half: Mesh) -> tuple[Mesh, np.ndarray]:
-    """A half body (x >= 0, its border at x = 0) and its mirror image as one mesh.
-
-    Returns
-    -------
-    Mesh
-    (N,) int
-        The mirror image of every vertex; itself in the middle.
-    """
+    """A half body (x >= 0, its border at x = 0) and its mirror image as one mesh."""
     n = len(half.vertices)
     middle = np.zeros(n, dtype=bool)
     middle[half.boundary_vertices] = True
@@ -207,3 +251,7 @@ def _relax(vertices: np.ndarray, faces: np.ndarray, field: Field, sizing: Sizing
     moved = project(field, moved, 2, 0.004)
     moved[border, 0] = 0
     return moved
+
+
+if __name__ == "__main__":
+    store(build())

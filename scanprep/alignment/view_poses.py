@@ -1,5 +1,7 @@
-"""Rough camera poses from the shapes of the views alone."""
+"""Rough camera poses, from landmarks seen in several views or from the shapes alone; and how well views agree."""
 from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -9,28 +11,86 @@ from ..geometry.mesh import Mesh
 from ..geometry.remeshing import smooth
 from ..geometry.seen_space import SeenSpace
 from ..geometry.surface import OrientedPoints
+from .icp import landmark_motion, transform
 
+ROUNDS = 50                                        # of moving each view onto the mean places of its landmarks
 SPACING, REACH, BINS = 1 / 120, 1 / 18, 11      # shares of a view's extent: between described points; described
 INLIER, NEAR, THROUGH = 1 / 60, 1 / 120, 1 / 60
 DRAWS, PROPOSALS, JUDGES, TRIED, ICP_ROUNDS = 30_000, 4000, 1500, 12, 12
 
 
+def place_by_landmarks(landmarks: Sequence[Mapping[str, np.ndarray]], count: int) -> np.ndarray:
+    """Motions (V, 4, 4) that bring landmarks of the same name together, over all views at once; the first view stays.
+
+    Views are added one after the other, each on three or more landmarks it shares with those before it, not on one
+    line; then all are moved in turns onto the mean places of their landmarks.
+    """
+    if len(landmarks) != count:
+        raise ValueError(f"landmarks: expected one mapping for each of {count} views, got {len(landmarks)}")
+    names = sorted(set().union(*landmarks)) if count else []
+    points = np.full((count, len(names), 3), np.nan)
+    for view, marks in enumerate(landmarks):
+        for name, point in marks.items():
+            points[view, names.index(name)] = point
+    seen = np.isfinite(points).all(axis=2)
+    T = np.tile(np.eye(4), (count, 1, 1))
+    placed = [0]
+    while len(placed) < count:
+        rest = [view for view in range(count) if view not in placed]
+        known = seen[placed].any(axis=0)
+        view = max(rest, key=lambda v: int((seen[v] & known).sum()))
+        shared = seen[view] & known
+        there = points[view][shared]
+        if len(there) < 3 or np.linalg.matrix_rank(there - there.mean(axis=0), tol=1e-3) < 2:
+            raise ValueError(f"landmarks: view {view} shares {shared.sum()} with the views placed before it; "
+                             "expected at least three that are not on one line")
+        T[view] = landmark_motion(points[view][shared], _means(T[placed], points[placed])[shared])
+        placed.append(view)
+    for _ in range(ROUNDS):
+        means = _means(T, points)
+        for view in range(1, count):
+            good = seen[view] & (seen.sum(axis=0) > 1)
+            T[view] = landmark_motion(points[view][good], means[good])
+    return T
+
+
+def fit_of_views(views: Sequence[tuple[Mesh, np.ndarray]], near: float = 0.01, apart: float = 0.02,
+                 points: int = 2000, rng: np.random.Generator | None = None) -> tuple[np.ndarray, np.ndarray]:
+    """Shares (V,) of the points of each view that another saw as well, and (V,) that another looks through.
+
+    Two views agree about a point when their surfaces, facing the same way, are `near` (metres); they contradict each
+    other when one looks through what the other saw, so far `apart` in front of its own surface.
+    """
+    rng = rng or np.random.default_rng(0)
+    chosen = [rng.permutation(len(mesh.vertices))[:points] for mesh, _ in views]
+    targets = [OrientedPoints(mesh.vertices, mesh.vertex_normals) for mesh, _ in views]
+    overlap, conflict = np.zeros(len(views)), np.zeros(len(views))
+    for number, (mesh, _) in enumerate(views):
+        rows = chosen[number]
+        others = [k for k in range(len(views)) if k != number]
+        if not others or not len(rows):
+            continue
+        p, n = mesh.vertices[rows], mesh.vertex_normals[rows]
+        overlap[number] = np.mean(np.any([targets[k].match(p, n, near, 0.5).valid for k in others], axis=0))
+        conflict[number] = np.mean(SeenSpace([views[k] for k in others]).ahead(p) > apart)
+    return overlap, conflict
+
+
+def _means(T: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """(L, 3) mean of the moved landmarks over the views that saw each; NaN where none did."""
+    moved = np.einsum("vij,vlj->vli", T[:, :3, :3], points) + T[:, None, :3, 3]
+    seen = np.isfinite(moved).all(axis=2, keepdims=True)
+    total = np.where(seen, moved, 0).sum(axis=0)
+    return np.asarray(np.where(seen.any(axis=0), total / np.maximum(seen.sum(axis=0), 1), np.nan))
+
+
 def place_by_features(views: list[tuple[Mesh, np.ndarray]], rng: np.random.Generator) -> np.ndarray:
-    """Motions of views that bring alike shapes together where no view then looks through another.
+    """Motions (V, 4, 4) of views that bring alike shapes together where no view then looks through another.
 
     Histograms of the angles between normals around points are compared between all pairs of views, three matches
     at a time propose a motion, and motions are judged by how much surface agrees and how much one view looks
-    through the other. The best pairs are chained.
-
-    Parameters
-    ----------
-    views : list of (Mesh, camera position (3,)) pairs
-    rng : numpy.random.Generator
-
-    Returns
-    -------
-    (V, 4, 4) float
-        The first view stays. The proposal may be wrong where views overlap little: see `AlignedViews.trusted`.
+    through the other. The best pairs are chained from the first view, which stays. The proposal may be wrong where
+    views overlap little: see `AlignedViews.trusted`.
     """
     extent = float(max(np.ptp(mesh.vertices, axis=0).max() for mesh, _ in views))
     described = [_described(mesh, extent) for mesh, _ in views]
@@ -106,9 +166,7 @@ def _place(mine: tuple[np.ndarray, np.ndarray, np.ndarray], other: tuple[np.ndar
                       float((back.ahead((q - s) @ r) > THROUGH * extent).mean()))
         score = float(found) - 2 * through
         if score > best[0]:
-            T = np.eye(4)
-            T[:3, :3], T[:3, 3] = r, s
-            best = score, T
+            best = score, transform(r, s)
     return best
 
 

@@ -7,8 +7,8 @@ import pytest
 
 from scanprep.geometry import rotations, storage
 from scanprep.geometry.mesh import Mesh, template_problem
-from scanprep.synthetic import people
-from scanprep.synthetic import topology as people_template
+from scanprep.synthetic import people, topology
+from scanprep.synthetic.body_parts import body_surface
 from scanprep.synthetic.muscles import COLUMNS, masks
 from scanprep.synthetic.people import NAMED_POSES, PARENTS, PARTS, BodyShape, Person
 
@@ -47,21 +47,21 @@ def test_everybody_is_one_closed_outward_surface(bodies):
 
 
 def test_canonical_mesh_has_no_slivers():
-    assert quality(people_template.load().mesh).min() > 0.4
+    assert quality(topology.load().mesh).min() > 0.4
 
 
 def test_topology_is_shared_and_vertices_lie_on_the_surface_that_the_code_describes(bodies):
     for person in bodies:
-        assert np.array_equal(person.mesh.faces, people_template.load().mesh.faces)
-        distance = np.abs(person.anatomy.field(person.mesh.vertices))
+        assert np.array_equal(person.mesh.faces, topology.load().mesh.faces)
+        distance = np.abs(body_surface(person.anatomy)(person.mesh.vertices))
         assert np.median(distance) < 1e-5 and np.percentile(distance, 99) < 5e-4 and distance.max() < 5e-3
 
 
 def test_stored_template_is_what_the_code_would_build():
-    _, arrays = storage.load(people_template.STORED, "people template", (people_template.VERSION,))
+    _, arrays = storage.load(topology.STORED, "people template", (topology.VERSION,))
     stored = arrays["vertices"] / 1e5
-    assert np.abs(people_template.Anatomy(people_template.CANONICAL).field(stored)).max() < 5e-4
-    assert people_template.STORED.stat().st_size < 300_000
+    assert np.abs(body_surface(topology.Anatomy(topology.CANONICAL))(stored)).max() < 5e-4
+    assert topology.STORED.stat().st_size < 300_000
 
 
 def test_stature_and_floor(bodies):
@@ -80,16 +80,16 @@ def test_mass_is_plausible(bodies):
 
 
 def test_left_and_right_are_mirror_images(bodies):
-    twin = people_template.load().mirror
+    twin = topology.load().mirror
     assert np.array_equal(twin[twin], np.arange(len(twin)))
     for person in bodies:
         v = person.mesh.vertices
         assert np.abs(v[twin] * [-1, 1, 1] - v).max() < 1e-12
-        assert np.abs(person.joints[people_template.PARENTS == 0][:, 0].sum()) < 1e-12
+        assert np.abs(person.joints[topology.PARENTS == 0][:, 0].sum()) < 1e-12
 
 
 def test_mirrored_pose_gives_the_mirrored_body(man):
-    twin = people_template.load().mirror
+    twin = topology.load().mirror
     pose = people.named_pose("throw_right")
     assert np.abs(man.posed(people.mirrored_pose(pose))[twin] * [-1, 1, 1] - man.posed(pose)).max() < 1e-9
 
@@ -140,8 +140,8 @@ def test_every_shape_parameter_moves_the_surface(man):
     for name in ("weight", "muscle", "leg_length", "arm_length", "shoulder_width", "hip_width", "belly", "chest",
                  "neck",
                  "head_size", "limbs", "extremities", "nose"):
-        other = people_template.Anatomy(BodyShape(**{name: 1.5}))
-        assert np.abs(other.field(man.mesh.vertices)).max() > 0.0025, name
+        other = topology.Anatomy(BodyShape(**{name: 1.5}))
+        assert np.abs(body_surface(other)(man.mesh.vertices)).max() > 0.0025, name
 
 
 def test_pose_zero_is_rest(bodies):
@@ -254,7 +254,7 @@ def test_walk_goes_ahead_with_a_foot_on_the_floor(man):
 
 
 def test_landmarks_and_markers(bodies):
-    twin = people_template.load().mirror
+    twin = topology.load().mirror
     assert 36 <= len(people.LANDMARKS) <= 48 and len(people.MARKERS) == 41
     for table in (people.LANDMARKS, people.MARKERS):
         assert len(set(table.values())) == len(table)

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 from model_bodies import worm_model
 
-from model.borders import face_weights, to_neighbours, vertex_weights
+from model.blend_weights import face_weights, skin_weights, to_neighbours
 from model.scape import BlendScapeModel
 
 
@@ -11,10 +11,10 @@ def model():
     return worm_model()
 
 
-@pytest.mark.parametrize("weights", [vertex_weights, face_weights])
+@pytest.mark.parametrize("weights", [skin_weights, face_weights])
 def test_weights_are_shares_that_fade_with_distance(model, weights):
     given = weights(model.template, model.skeleton, 0.1)
-    x = (model.template.vertices if weights is vertex_weights else model.template.corners.mean(axis=1))[:, 0] - 0.3
+    x = (model.template.vertices if weights is skin_weights else model.template.corners.mean(axis=1))[:, 0] - 0.3
     assert given.min() >= 0
     np.testing.assert_allclose(given.sum(axis=1), 1, atol=1e-12)
     for a, b, border in ((0, 1, -0.35), (0, 2, 0.35), (2, 3, 0.7)):
@@ -41,7 +41,7 @@ def test_only_linked_parts_share(model):
 
 def test_refuses_a_width_that_is_not_positive(model):
     with pytest.raises(ValueError, match="width"):
-        vertex_weights(model.template, model.skeleton, 0.0)
+        skin_weights(model.template, model.skeleton, 0.0)
 
 
 def test_blending_with_own_rotations_alone_is_scape(model):

@@ -5,8 +5,8 @@ from pathlib import Path
 
 import numpy as np
 
-from .. import storage
-from .common import Contents, Lines, MeshFileError, as_bytes, quote
+from . import storage
+from .format_common import Contents, Lines, MeshFileError, as_bytes, quote
 
 _KEYS = (b"VERSION", b"FIELDS", b"SIZE", b"TYPE", b"COUNT", b"WIDTH", b"HEIGHT", b"VIEWPOINT", b"POINTS", b"DATA")
 
