@@ -17,12 +17,8 @@ from .takes import Take
 
 USUAL, DOUBTED, UNUSED = (0.30, 0.50, 0.72), (0.93, 0.62, 0.16), (0.20, 0.62, 0.32)
 SIDES = ("front", "left", "back", "right")
-STEPS = (1, 2, 5)                    # times powers of ten: every so many frames
-MOST = 85                            # percent of the frames of a contact sheet that are at one scale
 SHEET = 56                           # pictures on a contact sheet
-NAMED, FAR = 6, 0.01                 # markers with their label on one side of the body, and metres from which
 LITTLE = 0.005                       # metres: the end of a colour scale that must not make much of nothing
-BEND = "coolwarm"
 
 
 def standing(model: BodyModel, betas: np.ndarray) -> Mesh:
@@ -32,14 +28,9 @@ def standing(model: BodyModel, betas: np.ndarray) -> Mesh:
 
 def picture_sides(body: Mesh, found: np.ndarray, usual: np.ndarray | None = None, labels: Sequence[str] = (),
                   height: int = 560) -> np.ndarray:
-    """A body from four sides with its markers, and where they usually sit with a rod from there.
+    """A body from four sides with its markers (L, 3), and where they usually sit (L, 3) with a rod from there.
 
-    Parameters
-    ----------
-    found, usual : (L, 3) float, metres
-        Markers on this person; where the layout has them.
-    labels : L strings
-        Those that moved most on each side are named.
+    Those that moved most on each side are named by their labels.
     """
     cameras, images = look_around(body), []
     for camera in cameras:
@@ -55,7 +46,7 @@ def picture_sides(body: Mesh, found: np.ndarray, usual: np.ndarray | None = None
 
 def _named(image: np.ndarray, camera: Camera, body: Mesh, found: np.ndarray, moved: np.ndarray,
            labels: Sequence[str]) -> np.ndarray:
-    """The picture with the labels of the markers in sight that have moved most, none over another."""
+    """The picture with the labels of at most 6 markers in sight that have moved most, none over another."""
     from PIL import Image, ImageDraw
     from scipy.spatial import cKDTree
 
@@ -71,7 +62,7 @@ def _named(image: np.ndarray, camera: Camera, body: Mesh, found: np.ndarray, mov
         for where, anchor in (((x + 9, y), "lm"), ((x - 9, y), "rm")):
             box = np.array(draw.textbbox(where, labels[i], font=font(13), anchor=anchor))
             free = not len(taken) or ((box[2:] < taken[:, :2]) | (box[:2] > taken[:, 2:])).any(axis=1).all()
-            if in_sight[i] and moved[i] > FAR and free and box[0] > 0 and box[2] < width and len(taken) < NAMED:
+            if in_sight[i] and moved[i] > 0.01 and free and box[0] > 0 and box[2] < width and len(taken) < 6:
                 draw.text(where, labels[i], fill=INK, anchor=anchor, font=font(13), stroke_width=2, stroke_fill="white")
                 taken = np.vstack([taken, box])
                 break
@@ -82,17 +73,17 @@ def every(count: int, most: int = SHEET) -> int:
     """1, 2, 5, 10, 20, 50 ...: of so many frames, every so many make at most so many pictures."""
     power = 1
     while True:
-        for step in STEPS:
+        for step in (1, 2, 5):
             if -(-count // (step * power)) <= most:
                 return step * power
         power *= 10
 
 
 def contact_sheet(take: Take, frames: np.ndarray, columns: int = 8, width: int = 122) -> np.ndarray:
-    """Frames of a sequence, most of them at one scale, the camera going along, the measured markers as dots."""
+    """Frames of a sequence, 85% of them at one scale, the camera going along, the measured markers as dots."""
     motion, bodies = take.shown, take.bodies(frames)
     cameras = [facing(take.subject, motion.poses[t], body, 35.0) for t, body in zip(frames, bodies, strict=True)]
-    tall, wide = (float(np.percentile([getattr(c, side) for c in cameras], MOST)) for side in ("height", "width"))
+    tall, wide = (float(np.percentile([getattr(c, side) for c in cameras], 85)) for side in ("height", "width"))
     wide = min(max(wide, 0.5 * tall), 0.75 * tall)         # what is larger is shown smaller, not everything
     images = []
     for t, body, camera in zip(frames, bodies, cameras, strict=True):
@@ -156,11 +147,11 @@ def picture_fixed_and_soft(take: Take, frames: np.ndarray, height: int = 400) ->
         width = round(0.62 * height)
         rows[0].append(render([Solid(template.with_vertices(rigid)), marker_dots(take, int(t), 0.010)], camera, width,
                               height))
-        rows[1].append(render([Solid(template.with_vertices(soft), heat(out, -end, end, BEND)),
+        rows[1].append(render([Solid(template.with_vertices(soft), heat(out, -end, end, "coolwarm")),
                                marker_dots(take, int(t), 0.010)], camera, width, height))
     seconds = [f"{t} · {t / take.shown.rate:.2f} s" for t in frames]
     return side_by_side([side_by_side(rows[0]), side_by_side(rows[1], seconds),
-                         color_bar(-end, end, "skin moved inwards (-) and outwards", BEND)], columns=1)
+                         color_bar(-end, end, "skin moved inwards (-) and outwards", "coolwarm")], columns=1)
 
 
 def most_changed(take: Take, frames: np.ndarray, count: int) -> np.ndarray:

@@ -25,7 +25,6 @@ from .takes import Take
 PICTURE = "picture.png"
 COLORS = ("Dots are the measured markers: red where they are believed, orange where they are seen but not believed, "
           "green for held-out markers, which no stage has seen.")
-WORST, CHANGED = 7, 5                # frames in the pictures of the worst and of those that change most
 _STYLE = """.take { display: grid; grid-template-columns: minmax(17rem, 1fr) 2fr; gap: 1rem; margin: 1.4rem 0; }
 .take img { width: 100%; } .take p { margin: .2rem 0; }"""
 
@@ -33,15 +32,7 @@ _STYLE = """.take { display: grid; grid-template-columns: minmax(17rem, 1fr) 2fr
 def person_page(name: str, model: BodyModel, result: MoshResult, usual: MarkerLayout, takes: Sequence[Take],
                 metrics: Sequence[Metric], figures: Mapping[str, Sequence[Metric]], settings: Mapping[str, Any]
                 ) -> Page:
-    """Shape and markers of a person, and the way to its sequences.
-
-    Parameters
-    ----------
-    usual : MarkerLayout
-        The one that was given.
-    metrics : of the person
-    figures : name of the sequence -> its figures
-    """
+    """Shape and markers of a person, before in the `usual` layout, and the way to its sequences and their figures."""
     body = pictures.standing(model, result.betas)
     labels = result.layout.labels
     before = usual.select(labels)
@@ -79,7 +70,7 @@ def take_page(take: Take, metrics: Sequence[Metric]) -> Page:
     page.chart(chart_frames(take), "mean of the markers, over time")
     page.chart(chart_map(take), "every marker over time, the worst first; white where it was not seen, or taken out "
                                 "as bad")
-    page.picture(pictures.picture_large(take, worst_frames(take.shown, WORST)), "the frames in which they are farthest")
+    page.picture(pictures.picture_large(take, worst_frames(take.shown, 7)), "the frames in which they are farthest")
     page.table(_marker_rows(take), ("marker", "fixed shape (mm)", "soft tissue (mm)", "95th percentile (mm)",
                                     "seen (%)", "believed (%)"))
     _unused(page, take)
@@ -100,7 +91,7 @@ def _soft_section(page: Page, take: Take, frames: np.ndarray) -> None:
     page.section("Soft tissue", "The shape may change in every frame, as flesh does and as a pose model with one fixed "
                  "shape cannot. What it takes up may also be markers that slide with the skin.")
     page.picture(pictures.picture_soft_map(take, frames), "where the body changes most")
-    page.picture(pictures.picture_fixed_and_soft(take, pictures.most_changed(take, frames, CHANGED)),
+    page.picture(pictures.picture_fixed_and_soft(take, pictures.most_changed(take, frames, 5)),
                  "frames that change most; above with the person's own shape, below with soft tissue")
 
 

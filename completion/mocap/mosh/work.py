@@ -45,26 +45,10 @@ HALF = 100                           # of progress: finding shape and motion, th
 
 @dataclass(frozen=True, eq=False)
 class Work:
-    """The work on each person of a call.
+    """The work on each person of a call, with the model and its name for the output.
 
-    Attributes
-    ----------
-    model : BodyModel
-    name : str
-        Of the model, for the output.
-    sexes : {"female", "male": BodyModel}
-        Models for the sex that `model` tells; empty to do without.
-    character : BodyModel, optional
-        Whose body makes the motions too.
-    layout : MarkerLayout and its name, optional
-        Else the named one that fits the labels best.
-    hold_out : strings
-        Markers that no stage sees.
-    unit : str, optional
-        As `read_markers` takes it.
-    config : MoshConfig
-    command : str
-        For report.json.
+    `sexes` are models of "female" and "male" people for the sex that `model` tells, empty to do without; the layout
+    comes with its name, else the named one that fits the labels best is used; no stage sees markers held out.
     """
 
     model: BodyModel

@@ -52,18 +52,8 @@ class ChangingBody:
     Markers are affine in z, `y(θ) + D(θ) z`, and D (3L, K) is a linear function of products of features and rotations:
     for a batch of poses it is one matrix product. The derivative by the pose is that of the person's own shape.
 
-    Parameters
-    ----------
-    model : BodyModel
-    betas : (k,) float
-        The person's own.
-    layout : MarkerLayout
-    directions : (K, K) float
-        In which the betas change.
-    slopes : (N, 3, K) float, metres
-        Derivative of all vertices by betas in the mean pose, from which the turning of the skin is known.
-    prior_weight, prior_shrinkage : float
-        See `MarkedBody`.
+    The directions (K, K) are rows of betas; `slopes` (N, 3, K) are derivatives of all vertices by betas in the mean
+    pose, from which the turning of the skin is known.
     """
 
     def __init__(self, model: BodyModel, betas: np.ndarray, layout: MarkerLayout, directions: np.ndarray,

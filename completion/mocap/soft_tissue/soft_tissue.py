@@ -26,6 +26,7 @@ Progress = Callable[[int, int], None]
 PER_SQUARE_METRE = 1e4               # of a weight on square centimetres
 ROUNDS = 3                           # Gauss-Newton steps over the whole sequence, which begins near its end
 STILL = 0.002                        # metres that the last round moves any marker of a frame that has settled
+N_BETAS = 200                        # components in which the shape may change, of those that the model has
 WINDOW, OVERLAP = 400, 40            # frames smoothed at once, and those that each side lends to its neighbour
 
 
@@ -39,8 +40,6 @@ class SoftTissueConfig(Settings):
 
     Attributes
     ----------
-    n_betas : int
-        Components in which the shape may change: at least those of the person, all that the model has at most.
     data : float
         Weight of the markers against their simulation.
     pose : float
@@ -58,7 +57,6 @@ class SoftTissueConfig(Settings):
         Residual at which a marker has lost three quarters of its weight.
     """
 
-    n_betas: int = 200
     data: float = 0.75
     pose: float = 0.1
     velocity: float = 40000.0
@@ -174,7 +172,7 @@ class SoftFollower:
         self.config, self.motion = config, motion
         self.rows = np.array([markers.labels.index(label) for label in labels])
         self.targets = markers.positions[:, self.rows]
-        K = min(max(config.n_betas, len(motion.betas)), model.n_betas)
+        K = min(max(N_BETAS, len(motion.betas)), model.n_betas)
         slopes = model.shape_jacobian(model.pose_mean)[..., :K]
         poses = AnimateConfig(prior_weight=config.pose, angle_acceleration=RATE**2 / np.sqrt(config.velocity))
         self.body = ChangingBody(model, motion.betas, layout.select(labels), cheap_directions(model, slopes, config),

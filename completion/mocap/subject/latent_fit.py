@@ -26,8 +26,6 @@ from .frame_starts import find_loose
 CENTIMETRES = 100.0                  # in a metre
 LOOSE = 0.0025                       # weight of the usual place of a marker that the layout calls loose: 20 cm
 UNSURE = 5.0                         # how much farther off a loose marker may be before it was looked for
-STEPS, TOLERANCE = 8, 1e-3           # most steps of a stage, and the fraction of the energy at which it ends
-LAST_STEPS, LAST_TOLERANCE = 24, 1e-4           # the same of the last stage
 
 
 @dataclass(frozen=True)
@@ -160,15 +158,9 @@ def shape_term(z: np.ndarray, n_betas: int, weight: float) -> Residual:
 
 @dataclass(frozen=True, eq=False)
 class Hung:
-    """Latent markers with what follows from the triangles that they hang on.
+    """Latent markers with their supports on the body, posed and of any shape, and in the latent pose.
 
-    Attributes
-    ----------
-    markers : LatentMarkers
-    points : ShapedPoints
-        Their supports on the body, posed and of any shape.
-    supports, corners : LatentPoints
-        Their supports, and the corners of the nearest triangles, in the latent pose.
+    `corners` are those of the nearest triangles in the latent pose.
     """
 
     markers: LatentMarkers
@@ -301,8 +293,7 @@ class LatentFit:
             return Arrow(normal_equations(list(self.of_frames(state, x, z, weights, factor).values())), len(z),
                          normal_equations(common))
 
-        steps, tolerance = (LAST_STEPS, LAST_TOLERANCE) if last else (STEPS, TOLERANCE)
-        end = levenberg_marquardt(equations, state.rows, steps, tolerance)
+        end = levenberg_marquardt(equations, state.rows, *((24, 1e-4) if last else (8, 1e-3)))      # steps, tolerance
         return end.x, bool(end.converged[0]), end.iterations
 
     def of_frames(self, state: State, x: np.ndarray, z: np.ndarray, weights: np.ndarray, factor: float

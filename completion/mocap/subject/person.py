@@ -21,9 +21,7 @@ __all__ = ["PersonConfig", "PersonFit", "find_person"]
 
 Progress = Callable[[int, int], None]
 LOOK = (1, 3)                        # before these stages loose markers are looked for
-EVERY = 2                            # stages before one of which, and before the last, markers are hung anew
 FEW_SEEN = 0.9                       # of the most markers that any frame has; frames with fewer are not used
-CANDIDATES = 400                     # frames among which those that differ most are chosen
 
 
 @dataclass(frozen=True, eq=False)
@@ -117,7 +115,7 @@ def _find(model: BodyModel, known: MarkerLayout, positions: Sequence[np.ndarray]
     state, steps, converged = fit.start(x), 0, False
     for i, factor in enumerate(config.annealing):
         last = i == stages - 1
-        if i and (i in LOOK or i % EVERY or last):
+        if i % 2 or (last and i):
             state = fit.hung_anew(state, i in LOOK)                                         # [MoSh] Eq. 16
         rows, converged, taken = step(f"person, stage {i}", given,
                                       partial(fit.solve, state, factor, last))              # [MoSh] Eq. 23
@@ -187,7 +185,7 @@ def spread_frames(positions: np.ndarray, count: int) -> np.ndarray:
 
     The first is the most usual one; each further one is farthest from those before.
     """
-    some = np.unique(np.linspace(0, len(positions) - 1, CANDIDATES).round().astype(int))
+    some = np.unique(np.linspace(0, len(positions) - 1, 400).round().astype(int))
     first, second = np.triu_indices(positions.shape[1], 1)
     apart = np.linalg.norm(positions[some][:, first] - positions[some][:, second], axis=2)
     there = ~np.isnan(apart)
