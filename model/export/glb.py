@@ -8,9 +8,11 @@ from typing import Any
 import numpy as np
 from scipy.spatial.transform import Rotation
 
+from scanprep.geometry.format_glb import VERTICES, Glb, some_normal
 from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.storage import writing
-from scanprep.pictures.gltf import VERTICES, Glb, skin_material, some_normal
+from scanprep.pictures.gltf import skin_material
+from scanprep.pictures.sheets import png_bytes
 
 from ..blend_weights import CARRIERS
 from .correctives import Correctives
@@ -157,7 +159,7 @@ def _materials(glb: Glb, material: Material | None) -> dict[str, Any]:
     images: list[dict[str, Any]] = []
 
     def texture(image: np.ndarray, name: str) -> dict[str, int]:
-        images.append(glb.add_image(image, name))
+        images.append(glb.add_png(png_bytes(image), name))
         return {"index": len(images) - 1}
 
     if material is not None and material.color is not None:

@@ -17,9 +17,6 @@ LARGEST, LANDMARKS, NEAR = "the largest piece", "the piece with the landmarks", 
 FAR, SPECKS, FLOOR = "apart from the body", "specks", "a plane with all on one side"
 
 
-LINK = 0.012               # metres: points closer than this belong together, whether triangles join them or not
-
-
 @dataclass(frozen=True)
 class CleanScanConfig(Settings):
     """Settings of `clean_scan`.
@@ -59,27 +56,13 @@ class Component:
 
 @dataclass(frozen=True, eq=False)
 class CleanedScan:
-    """A scan after `clean_scan`.
+    """A scan after `clean_scan`."""
 
-    Attributes
-    ----------
-    scan : Mesh or (n, 3) float, metres
-        The body alone, of the same kind as what was given.
-    kept : (N,) bool
-        Which points of the raw scan are in it.
-    label : (N,) int
-        The row in `components` of every point of the raw scan.
-    components : tuple of Component
-        Planes first, then pieces, largest first, then all specks as one.
-    floor : Plane or None
-        The plane on which the body stands.
-    """
-
-    scan: Mesh | np.ndarray
-    kept: np.ndarray
-    label: np.ndarray
-    components: tuple[Component, ...]
-    floor: Plane | None
+    scan: Mesh | np.ndarray                 # the body alone, of the same kind as what was given
+    kept: np.ndarray                        # (N,) bool, which points of the raw scan are in it
+    label: np.ndarray                       # (N,) the row in `components` of every point of the raw scan
+    components: tuple[Component, ...]       # planes first, then pieces, largest first, then all specks as one
+    floor: Plane | None                     # on which the body stands
 
     @property
     def mesh(self) -> Mesh:
@@ -120,7 +103,7 @@ def clean_scan(scan: Mesh | np.ndarray, config: CleanScanConfig | None = None, l
     if not len(points):
         raise ValueError("scan: expected points, got none")
     spacing = float(np.median(cKDTree(points).query(points[rng.permutation(len(points))[:2000]], 2)[0][:, 1]))
-    link = max(LINK, config.spacings * spacing)
+    link = max(0.012, config.spacings * spacing)    # whether triangles join them or not
     label, planes = _without_planes(mesh, link, config, landmarks, rng)
     rest = np.flatnonzero(label < 0)
     if not len(rest):

@@ -9,29 +9,16 @@ from scipy.spatial import cKDTree
 
 WIDEST = 0.03              # metres: farthest distance of the points that a first guess is fitted to
 SIGMAS = 3.5               # standard deviations from a floor within which points are on it
-ROUGHEST = 2.0             # points on a floor deviate by at most this many times what neighbouring points do
 MOST_BELOW = 0.01          # share of all points that may lie behind a floor
-FOOTPRINT = 0.03           # metres: what of the body is lower than this shows where it stands
-BRIDGE = 0.015             # metres: gaps in the outline of a footprint that are closed
 
 
 @dataclass(frozen=True)
 class Plane:
-    """A plane with what was measured on it in front.
+    """A plane with what was measured on it in front."""
 
-    Attributes
-    ----------
-    normal : (3,) float, unit
-        Towards the body.
-    offset : float, metres
-        Of points x on the plane, `normal @ x`.
-    noise : float, metres
-        Standard deviation of the points that were measured on it.
-    """
-
-    normal: np.ndarray
-    offset: float
-    noise: float
+    normal: np.ndarray          # (3,) unit, towards the body
+    offset: float               # of points x on the plane, `normal @ x`, metres
+    noise: float                # standard deviation of the points that were measured on it, metres
 
     @property
     def thickness(self) -> float:
@@ -80,7 +67,7 @@ def find_plane(points: np.ndarray, min_area: float, rng: np.random.Generator) ->
     plane = _refined(best, points)
     height = plane.height(points)
     on_it = np.abs(height) <= plane.thickness
-    if (plane.noise > ROUGHEST * local_noise(points, rng)           # a back is nearly flat, but only nearly
+    if (plane.noise > 2 * local_noise(points, rng)           # a back is nearly flat, but only nearly
             or np.mean(height < -WIDEST / 2) > MOST_BELOW
             or _covered_area(plane.flat(points[on_it]), WIDEST) < min_area):
         return None
@@ -102,8 +89,8 @@ def floor_points(points: np.ndarray, plane: Plane, body: np.ndarray) -> np.ndarr
     height = plane.height(points)
     on_it = np.abs(height) <= band
     above = plane.height(body)
-    low = plane.flat(body[(above > band) & (above < band + FOOTPRINT)])
-    on_it[on_it] = ~inside_outline(plane.flat(points[on_it]), low, BRIDGE)
+    low = plane.flat(body[(above > band) & (above < band + 0.03)])         # what shows where it stands
+    on_it[on_it] = ~inside_outline(plane.flat(points[on_it]), low, bridge=0.015)
     return np.asarray(on_it | (height < -band))
 
 

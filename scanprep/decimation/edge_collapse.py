@@ -9,10 +9,7 @@ from ..geometry.mesh import Mesh
 from .quadrics import curve_quadrics, lowest, surface_quadrics, value
 
 FREE, CURVE, FIXED = 0, 1, 2
-CHEAPEST = 0.3                       # share of the edges that may collapse in a round; small is nearer to exact order
-MIN_COSINE = 0.3                     # triangles that would turn by more in one collapse forbid it
 THINNEST = 0.1                       # triangles of less quality (1: equilateral) are not made of better ones
-STUCK = 1e-3, 5                      # where so many rounds take less of the triangles away, thin ones may be made
 HOLD = 3e-4                          # weight of the distance to vertices beside that to planes: even size where flat
 BORDER, SEAM = 30.0, 3.0             # the same for walls along borders, and along curves inside, which may lose zigzags
 PIECE = 20_000                       # edges priced at once: what stays in the processor's cache
@@ -25,16 +22,9 @@ class Rounds:
     radians stay curves; the vertices `keep` (n,) stay where they are. Costs are summed over the bodies, triangles keep
     their shape on the first. `onto_vertices` collapses onto one of two vertices instead of to the point of least error.
 
-    Attributes
-    ----------
-    faces : (f, 3) int
-        Of the remaining triangles, by original vertex numbers.
-    face_rows : (f,) int
-        Which original triangles they are.
-    owner : (N,) int
-        The vertex that each one collapsed into, itself where it is still there; see `numbered`.
-    kinds : (N,) int
-        FREE, on a CURVE that stays a curve, or FIXED where it is.
+    Remaining are `faces` (f, 3), by original vertex numbers, of the original rows `face_rows`. `owner` (N,) is the
+    vertex that each one collapsed into, itself where it is still there; of `kinds` (N,) it is FREE, on a CURVE that
+    stays a curve, or FIXED where it is.
     """
 
     def __init__(self, mesh: Mesh, points: np.ndarray, keep: np.ndarray | None = None,
@@ -67,8 +57,8 @@ class Rounds:
                 self._collapse(chosen, len(self.faces) - count)
             elif self.thinnest == 0:
                 break
-            idle = idle + 1 if before - len(self.faces) < STUCK[0] * before else 0
-            if self.thinnest > 0 and (idle == STUCK[1] or not len(chosen)):
+            idle = idle + 1 if before - len(self.faces) < 1e-3 * before else 0
+            if self.thinnest > 0 and (idle == 5 or not len(chosen)):
                 self.thinnest = 0.0
                 self.refused[:] = False
             if progress is not None:
@@ -110,7 +100,7 @@ class Rounds:
         open_edges = int(np.isfinite(cost).sum())
         if not open_edges:
             return np.zeros(0, dtype=np.int64)
-        place = min(open_edges - 1, max(int(CHEAPEST * len(cost)), 50))
+        place = min(open_edges - 1, max(int(0.3 * len(cost)), 50))    # fewer is nearer to the exact order
         limit = np.partition(cost, place)[place]
         rows = np.flatnonzero(cost <= limit)
         rows = rows[np.argsort(cost[rows])]
@@ -188,7 +178,7 @@ class Rounds:
         meant = self.areas[faces]
         meant = (meant / np.maximum(np.linalg.norm(meant, axis=-1, keepdims=True), 1e-300)).sum(axis=1)
         was, now = _dot(n_old, meant), _dot(n_new, meant)
-        bad = _dot(n_old, n_new) < MIN_COSINE
+        bad = _dot(n_old, n_new) < 0.3
         bad |= (now < 0.3) & (now < was)
         bad |= (q_new < self.thinnest) & (q_new < q_old)
         good = np.ones(len(rows), dtype=bool)

@@ -22,7 +22,6 @@ from .quadrics import lowest, sum_at, surface_quadrics
 
 Progress = Callable[[int, int], None]
 KIND, VERSION = "decimation", 1
-MOST_READ = 200                      # meshes among which the different ones are looked for
 _MAPS = ("vertex_map", "owner", "face_map", "fixed")
 
 
@@ -50,35 +49,16 @@ class DecimateSetConfig(Settings):
 
 @dataclass(frozen=True, eq=False)
 class DecimatedSet:
-    """How meshes of one topology get fewer triangles.
-
-    Attributes
-    ----------
-    template : Mesh
-    vertex_map : (n,) int
-        The original vertex of every one that was kept.
-    owner : (N,) int
-        The new vertex that stands for each original one.
-    face_map : (f,) int
-        The original triangle of every one that was kept.
-    skeleton : Skeleton or None
-    source : Mesh
-        The template before.
-    labels : (F,) int or None
-        Parts of the triangles before.
-    fixed : (n,) bool
-        New vertices that stay on the original one in any case.
-    config : DecimateSetConfig
-    """
+    """How meshes of one topology get fewer triangles."""
 
     template: Mesh
-    vertex_map: np.ndarray
-    owner: np.ndarray
-    face_map: np.ndarray
+    vertex_map: np.ndarray          # (n,) the original vertex of every one that was kept
+    owner: np.ndarray               # (N,) the new vertex that stands for each original one
+    face_map: np.ndarray            # (f,) the original triangle of every one that was kept
     skeleton: Skeleton | None
-    source: Mesh
-    labels: np.ndarray | None
-    fixed: np.ndarray
+    source: Mesh                    # the template before
+    labels: np.ndarray | None       # (F,) parts of the triangles before
+    fixed: np.ndarray               # (n,) bool, new vertices that stay on the original one in any case
     config: DecimateSetConfig
 
     def transfer(self, vertices: np.ndarray) -> np.ndarray:
@@ -239,7 +219,7 @@ def write_decimated_set(source: Path | str | RegisteredSet, folder: Path | str, 
     elif (folder / "set.json").exists():
         raise ValueError(f"folder: {folder} holds a registered set that is no decimation")
     else:
-        step = max(-(-len(source.names) // MOST_READ), 1)
+        step = max(-(-len(source.names) // 200), 1)        # among so many meshes the different ones are looked for
         some = source.names[::step] if config.meshes > 1 else ()
         done = decimate_set(source.template, source.vertices(some) if some else None, faces, config,
                             np.array(list(landmarks.values()), dtype=np.int64), source.skeleton)

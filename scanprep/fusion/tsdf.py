@@ -17,7 +17,6 @@ from ..repair.manifold import drop_small_components, split_vertices
 
 BLOCK = 4                      # voxels along the side of a block; the smallest piece of the volume that is stored
 TAPER = 0.02                   # metres from its border at which a view has its full weight
-MIN_WEIGHT = 0.02              # below it a voxel counts as not seen
 CORNERS = np.array([(0, 0, 0), (1, 0, 0), (1, 1, 0), (0, 1, 0), (0, 0, 1), (1, 0, 1), (1, 1, 1), (0, 1, 1)])
 
 
@@ -113,7 +112,7 @@ def merge_views(views: Sequence[Any], config: MergeConfig | None = None,
             _integrate(view, points, mine[start:start + 500_000], total, weight, config)
         if progress:
             progress(number + 1, len(prepared))
-    seen = weight > MIN_WEIGHT
+    seen = weight > 0.02
     distance = np.divide(total, weight, out=np.zeros_like(total), where=seen)
     mesh = _zero_surface(grid, keys[seen], points[seen], distance[seen])
     mesh = drop_small_components(split_vertices(mesh), config.min_component)

@@ -13,7 +13,6 @@ import numpy as np
 
 from . import storage
 
-UNPACKED, RATIO = 2**20, 50          # a gzip file may unpack to this many bytes, and so many for each of its own
 FARTHEST = 1e9                       # of a coordinate, in whatever unit
 UNITS = {"m": 1.0, "mm": 1e-3, "cm": 1e-2, "in": 0.0254}
 
@@ -48,7 +47,7 @@ def load_bytes(path: Path) -> bytes:
 
 def _unpacked(path: Path, data: bytes) -> bytes:
     """What a gzip file holds, up to far more than any mesh can be packed."""
-    most = UNPACKED + RATIO * len(data)
+    most = 2**20 + 50 * len(data)
     try:
         with gzip.GzipFile(fileobj=io.BytesIO(data)) as packed:
             out = packed.read(most + 1)

@@ -11,11 +11,12 @@ import numpy as np
 
 from . import storage
 from .format_common import Contents, MeshFileError, as_colors, quote
+from .mesh import Mesh
 
 _COMPONENTS = {5120: "i1", 5121: "u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
+VERTICES, _INDICES = 34962, 34963     # what a graphics card will use the numbers for
+_NUMBERS = {np.dtype(kind).str: number for number, kind in _COMPONENTS.items()}
 _WIDTHS = {"SCALAR": 1, "VEC2": 2, "VEC3": 3, "VEC4": 4, "MAT4": 16}
-_TRIANGLES, _STRIP, _FAN = 4, 5, 6
-_VALUES, _REPEATS = 10**6, 4         # vertices and corners of a scene, and so many more for each byte
 
 
 def read(path: Path, data: bytes) -> Contents:
@@ -35,14 +36,14 @@ def _scene(path: Path, tree: dict[str, Any], binary: bytes) -> Contents:
     vertices: list[np.ndarray] = []
     faces: list[np.ndarray] = []
     colors: list[np.ndarray | None] = []
-    start, most = 0, _VALUES + _REPEATS * len(binary)    # many nodes may show one mesh, but not without end
+    start, most = 0, 10**6 + 4 * len(binary)    # many nodes may show one mesh, but not without end
     for _, node, matrix in nodes_of(tree):
         if "mesh" not in node:
             continue
         matrix = np.eye(4) if "skin" in node else matrix
         placed: dict[int, int] = {}                      # primitives may share their vertices
         for primitive in item(tree["meshes"], node["mesh"])["primitives"]:
-            if primitive.get("mode", _TRIANGLES) not in (_TRIANGLES, _STRIP, _FAN):
+            if primitive.get("mode", 4) not in (4, 5, 6):         # triangles, a strip, a fan
                 continue
             points = primitive["attributes"]["POSITION"]
             if points not in placed:
@@ -153,10 +154,10 @@ def triangles_of(tree: dict[str, Any], binary: bytes, primitive: dict[str, Any],
     """(F, 3) the corners of the triangles, strips or fans of a primitive of `count` vertices."""
     line = (accessor(tree, binary, primitive["indices"], "SCALAR")[:, 0].astype(np.int64) if "indices" in primitive
             else np.arange(count))
-    mode = primitive.get("mode", _TRIANGLES)
-    if mode == _TRIANGLES:
+    mode = primitive.get("mode", 4)
+    if mode == 4:
         return line[:len(line) // 3 * 3].reshape(-1, 3)
-    if mode == _FAN:
+    if mode == 6:
         return np.stack([np.full(max(len(line) - 2, 0), line[0]), line[1:-1], line[2:]], axis=1)
     strip = np.stack([line[:-2], line[1:-1], line[2:]], axis=1)
     strip[1::2] = strip[1::2, [1, 0, 2]]
@@ -184,32 +185,78 @@ def _colors(tree: dict[str, Any], binary: bytes, primitive: dict[str, Any], coun
 
 def encode(contents: Contents, double: bool) -> bytes:
     """A GLB file of one mesh with normals, in single precision whatever `double` says."""
-    from .mesh import Mesh
-
     assert contents.faces is not None, "a GLB file is written for meshes"
-    points = contents.vertices.astype("<f4")
-    normals = Mesh(contents.vertices, contents.faces).vertex_normals.copy()
-    normals[~normals.any(axis=1)] = (0, 0, 1)
-    blocks = [(contents.faces.reshape(-1, 1).astype("<u4"), "SCALAR", 5125, 34963), (points, "VEC3", 5126, 34962),
-              (normals.astype("<f4"), "VEC3", 5126, 34962)]
-    attributes = {"POSITION": 1, "NORMAL": 2}
+    glb, normals = Glb(), some_normal(Mesh(contents.vertices, contents.faces))
+    indices = glb.add_indices(contents.faces)
+    attributes = {"POSITION": glb.add(contents.vertices, "VEC3", VERTICES, bounds=True),
+                  "NORMAL": glb.add(normals, "VEC3", VERTICES)}
     if contents.colors is not None:
         c = contents.colors
         linear = np.where(c <= 0.04045, c / 12.92, ((c + 0.055) / 1.055) ** 2.4)
-        blocks.append((linear.astype("<f4"), "VEC3", 5126, 34962))
-        attributes["COLOR_0"] = 3
-    binary, views, accessors = b"", [], []
-    for i, (values, shape, kind, target) in enumerate(blocks):
-        views.append({"buffer": 0, "byteOffset": len(binary), "byteLength": values.nbytes, "target": target})
-        accessors.append({"bufferView": i, "componentType": kind, "count": len(values), "type": shape})
-        binary += values.tobytes()
-    accessors[1].update(min=points.min(axis=0).tolist(), max=points.max(axis=0).tolist())
-    tree = {"asset": {"version": "2.0", "generator": "scapekit"}, "scene": 0, "scenes": [{"nodes": [0]}],
-            "nodes": [{"mesh": 0}],
-            "meshes": [{"primitives": [{"attributes": attributes, "indices": 0, "material": 0}]}],
-            "materials": [{"pbrMetallicRoughness": {"metallicFactor": 0.0, "roughnessFactor": 0.8}}],
-            "buffers": [{"byteLength": len(binary)}], "bufferViews": views, "accessors": accessors}
-    text = json.dumps(tree, separators=(",", ":")).encode()
-    text += b" " * (-len(text) % 4)
-    body = struct.pack("<I4s", len(text), b"JSON") + text + struct.pack("<I4s", len(binary), b"BIN\0") + binary
-    return struct.pack("<4sII", b"glTF", 2, 12 + len(body)) + body
+        attributes["COLOR_0"] = glb.add(linear, "VEC3", VERTICES)
+    return glb.pack({
+        "scene": 0, "scenes": [{"nodes": [0]}], "nodes": [{"mesh": 0}],
+        "meshes": [{"primitives": [{"attributes": attributes, "indices": indices, "material": 0}]}],
+        "materials": [{"pbrMetallicRoughness": {"metallicFactor": 0.0, "roughnessFactor": 0.8}}]})
+
+
+class Glb:
+    """Arrays gathered into the one buffer of a binary glTF file."""
+
+    def __init__(self) -> None:
+        self._data = bytearray()
+        self._views: list[dict[str, Any]] = []
+        self._accessors: list[dict[str, Any]] = []
+
+    def add(self, array: np.ndarray, kind: str, target: int | None, bounds: bool = False) -> int:
+        """An accessor of float32 numbers; its index."""
+        values = np.ascontiguousarray(array, dtype="<f4")
+        extra: dict[str, Any] = {}
+        if bounds:
+            rows = values.reshape(len(values), -1).astype(float)
+            extra = {"min": rows.min(axis=0).tolist(), "max": rows.max(axis=0).tolist()}
+        return self._append(values, len(values), kind, target, extra)
+
+    def add_indices(self, faces: np.ndarray) -> int:
+        """An accessor of the corners of triangles; its index."""
+        return self._append(np.ascontiguousarray(faces, dtype="<u4"), faces.size, "SCALAR", _INDICES, {})
+
+    def add_joints(self, joints: np.ndarray) -> int:
+        """An accessor of the four joints (n, 4) of every vertex, in one or two bytes; its index."""
+        kind = "|u1" if joints.max(initial=0) < 256 else "<u2"
+        return self._append(np.ascontiguousarray(joints, dtype=kind), len(joints), "VEC4", VERTICES, {})
+
+    def add_png(self, data: bytes, name: str) -> dict[str, Any]:
+        """An entry of `images`."""
+        self._views.append({"buffer": 0, "byteOffset": len(self._data), "byteLength": len(data)})
+        self._data += data + b"\0" * (-len(data) % 4)
+        return {"name": name, "mimeType": "image/png", "bufferView": len(self._views) - 1}
+
+    def _append(self, values: np.ndarray, count: int, kind: str, target: int | None, extra: dict[str, Any]) -> int:
+        view: dict[str, Any] = {"buffer": 0, "byteOffset": len(self._data), "byteLength": values.nbytes}
+        if target is not None:
+            view["target"] = target
+        self._data += values.tobytes()
+        self._views.append(view)
+        self._accessors.append({"bufferView": len(self._views) - 1, "count": count, "type": kind,
+                                "componentType": _NUMBERS[values.dtype.str], **extra})
+        return len(self._accessors) - 1
+
+    def pack(self, document: dict[str, Any]) -> bytes:
+        """The file: header, JSON, buffer."""
+        document = {"asset": {"version": "2.0", "generator": "scapekit"}, **document,
+                    "buffers": [{"byteLength": len(self._data)}], "bufferViews": self._views,
+                    "accessors": self._accessors}
+        text = json.dumps(document, separators=(",", ":")).encode()
+        text += b" " * (-len(text) % 4)
+        data = bytes(self._data) + b"\0" * (-len(self._data) % 4)
+        size = 12 + 8 + len(text) + 8 + len(data)
+        return (struct.pack("<4sII", b"glTF", 2, size) + struct.pack("<I4s", len(text), b"JSON") + text
+                + struct.pack("<I4s", len(data), b"BIN\0") + data)
+
+
+def some_normal(mesh: Mesh) -> np.ndarray:
+    """Unit normals at all vertices: glTF allows no zero normal, not even where there are no triangles."""
+    normals = np.array(mesh.vertex_normals)
+    normals[~normals.any(axis=1)] = (0, 0, 1)
+    return normals

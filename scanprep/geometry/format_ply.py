@@ -17,7 +17,6 @@ _TYPES = {"char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4
           "uint32": "u4", "int64": "i8", "uint64": "u8", "float32": "f4", "float64": "f8"}
 _LETTERS = {"i1": "b", "u1": "B", "i2": "h", "u2": "H", "i4": "i", "u4": "I", "i8": "q", "u8": "Q"}
 _ORDERS = {b"ascii": "=", b"binary_little_endian": "<", b"binary_big_endian": ">"}
-_CORNERS = ("vertex_indices", "vertex_index")
 _COLORS = (("red", "green", "blue"), ("r", "g", "b"), ("diffuse_red", "diffuse_green", "diffuse_blue"))
 
 
@@ -218,7 +217,7 @@ def _contents(path: Path, vertex: Element, found: dict[str, dict[str, _Column]])
     colors = next((as_colors(c, kinds[names[0]]) for names in _COLORS if (c := triple(names)) is not None), None)
     faces = None
     if "face" in found:
-        lists = next((found["face"][name] for name in _CORNERS if name in found["face"]), None)
+        lists = found["face"].get("vertex_indices", found["face"].get("vertex_index"))
         if not isinstance(lists, tuple):
             raise MeshFileError(f"{path}: expected a property list vertex_indices of element face, "
                                 f"found {list(found['face'])}")

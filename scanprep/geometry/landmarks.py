@@ -16,7 +16,6 @@ from .format_common import FARTHEST, UNITS, Lines, MeshFileError, load_bytes, me
 from .mesh import Mesh
 
 LANDMARK_ENDINGS = (".landmarks.json", ".json", ".mrk.json", ".pp", "_picked_points.pp", ".lnd", ".landmarks.txt")
-FAR, NEAR = 0.5, 0.01                # of the size of a surface: farther from it, or closer together, is no landmark
 
 
 def read_landmarks(path: str | Path, mesh: Mesh | None = None, unit: str | None = None) -> dict[str, np.ndarray]:
@@ -110,7 +109,7 @@ def check_on_surface(path: str | Path, landmarks: Mapping[str, np.ndarray], surf
     points, size = np.array(list(landmarks.values())).reshape(-1, 3), np.linalg.norm(np.ptp(surface, axis=0))
     far = cKDTree(surface).query(points)[0]
     span = np.linalg.norm(np.ptp(points, axis=0)) if len(points) > 2 else size
-    if not (far <= FAR * size).all() or span < NEAR * size:
+    if not (far <= 0.5 * size).all() or span < 0.01 * size:
         raise MeshFileError(f"{path}: expected landmarks on the surface, which is {size:.3g} m from corner to corner; "
                             f"they span {span:.3g} m, and '{list(landmarks)[far.argmax()]}' is {far.max():.3g} m from "
                             "it; are both in the same unit?")

@@ -17,7 +17,6 @@ from typing import IO, Any
 import numpy as np
 
 HEADER = "header"
-UNPACKED, RATIO = 2**27, 100         # an archive may hold this many bytes, and so many more for each of its own
 LARGEST = 1e30                       # number that still has a square: what is larger counts as infinite
 LARGEST_TEXT = 2**28                 # bytes of a JSON file or a table
 
@@ -168,7 +167,7 @@ def _arrays(path: str | Path, what: str, only: str | None) -> dict[str, np.ndarr
     with taking_apart(path, what), zipfile.ZipFile(path) as archive:
         members = {info.filename[:-4]: info for info in archive.infolist() if info.filename.endswith(".npy")}
         unpacked, packed = sum(info.file_size for info in members.values()), os.path.getsize(path)
-        if unpacked > UNPACKED + RATIO * packed or len(members) > packed // 64:
+        if unpacked > 2**27 + 100 * packed or len(members) > packed // 64:
             raise ValueError(f"{packed} bytes that would unpack to {len(members)} arrays of {unpacked} bytes")
         found = {}
         for name, info in members.items():

@@ -10,10 +10,12 @@ from typing import Any
 import numpy as np
 
 from ..geometry.format_common import UNITS
+from ..geometry.format_glb import VERTICES, Glb
 from ..geometry.mesh import Mesh
 from ..geometry.storage import writing
 from ..geometry.surface import Rays, barycentric
-from .gltf import VERTICES, Glb, skin_material
+from .gltf import skin_material
+from .sheets import png_bytes
 
 SIZE = 1024                          # pixels of a baked texture, each way
 
@@ -149,7 +151,7 @@ def write_textured(path: str | Path, texture: Texture) -> None:
                   "TEXCOORD_0": glb.add(texture.uv * [1, -1] + [0, 1], "VEC2", VERTICES)}
     material = skin_material((1, 1, 1))
     material["pbrMetallicRoughness"]["baseColorTexture"] = {"index": 0}
-    image = glb.add_image((255 * np.clip(texture.image, 0, 1) + 0.5).astype(np.uint8), "texture")
+    image = glb.add_png(png_bytes((255 * np.clip(texture.image, 0, 1) + 0.5).astype(np.uint8)), "texture")
     data = glb.pack({
         "scene": 0, "scenes": [{"nodes": [0]}], "nodes": [{"name": "body", "mesh": 0}], "materials": [material],
         "meshes": [{"primitives": [{"attributes": attributes, "indices": glb.add_indices(texture.mesh.faces),

@@ -7,14 +7,10 @@ from scipy.sparse.csgraph import connected_components
 
 from ..geometry.mesh import Mesh
 
-FACING = 0.7           # cosine: what lies straight ahead of a border
-SHARE = 0.6            # of a border's vertices must have the other border ahead
-SMALLEST = 6           # edges; smaller borders are pinholes, each by itself
-
 
 def group_loops(mesh: Mesh, loops: list[np.ndarray]) -> list[list[np.ndarray]]:
     """Borders that face each other put together, as the two ends where a limb was cut through; order as of `loops`."""
-    large = [number for number, loop in enumerate(loops) if len(loop) >= SMALLEST]
+    large = [number for number, loop in enumerate(loops) if len(loop) >= 6]    # others are pinholes
     label = np.arange(len(loops))
     if len(large) > 1:
         points = np.concatenate([mesh.vertices[loops[number]] for number in large])
@@ -22,7 +18,7 @@ def group_loops(mesh: Mesh, loops: list[np.ndarray]) -> list[list[np.ndarray]]:
         ahead = np.concatenate([_outward(mesh, loops[number]) for number in large])
         facing = np.array([_met(points, owner, ahead, number, len(loops)) for number in large])
         both = np.zeros((len(loops), len(loops)), dtype=bool)
-        both[large] = facing > SHARE
+        both[large] = facing > 0.6
         pairs = np.argwhere(both & both.T)
         graph = coo_array((np.ones(len(pairs)), (pairs[:, 0], pairs[:, 1])), shape=both.shape)
         label = connected_components(graph, directed=False)[1]
@@ -65,7 +61,7 @@ def _met(points: np.ndarray, owner: np.ndarray, ahead: np.ndarray, number: int, 
     apart = points[None] - points[mine][:, None]
     far = np.linalg.norm(apart, axis=2)
     width = np.linalg.norm(np.ptp(points[mine], axis=0))
-    straight = np.einsum("abd,ad->ab", apart, ahead[mine]) > FACING * far
+    straight = np.einsum("abd,ad->ab", apart, ahead[mine]) > 0.7 * far
     far = np.where(straight & (far > 0) & (far < width), far, np.inf)
     next_one = far.argmin(axis=1)
     met = owner[next_one][np.isfinite(far.min(axis=1))]

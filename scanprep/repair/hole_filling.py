@@ -18,7 +18,6 @@ from .manifold import repair, split_vertices
 from .volumetric_diffusion import EMPTY, diffused_surface
 
 Method = Literal["auto", "fair", "diffusion", "poisson-open3d", "poisson-pymeshlab"]
-PULL = 3e3                           # of the diffused surface on a patch, for a hole of radius 1
 MOST_EMPTY = 0.02                    # share of a good patch that may lie in space that was seen to be empty
 
 
@@ -52,44 +51,22 @@ class FillConfig(Settings):
 
 @dataclass(frozen=True, eq=False)
 class FilledHole:
-    """What was done about one hole.
+    """What was done about one hole."""
 
-    Attributes
-    ----------
-    centre : (3,) float, metres
-    borders : int
-        Closed borders that one patch joins.
-    edges : int
-        Their length in edges.
-    method : "fair" or "diffusion"
-    intersections : int
-        Pairs of triangles, one of them new, that run through each other in the end.
-    in_empty : float
-        Share of the new vertices in space that the views saw to be empty; 0 without views.
-    """
-
-    centre: np.ndarray
-    borders: int
-    edges: int
-    method: str
-    intersections: int
-    in_empty: float
+    centre: np.ndarray          # (3,) metres
+    borders: int                # closed borders that one patch joins
+    edges: int                  # their length in edges
+    method: str                 # "fair" or "diffusion"
+    intersections: int          # pairs of triangles, one of them new, that run through each other in the end
+    in_empty: float             # share of the new vertices in space that the views saw to be empty; 0 without views
 
 
 @dataclass(frozen=True, eq=False)
 class FillReport:
-    """A filled mesh and how each hole was filled.
-
-    Attributes
-    ----------
-    mesh : Mesh
-        The vertices and triangles of the mesh with holes come first, untouched.
-    holes : tuple of FilledHole
-        Longest border first.
-    """
+    """A filled mesh, whose old vertices and triangles come first, untouched, and how each hole was filled."""
 
     mesh: Mesh
-    holes: tuple[FilledHole, ...]
+    holes: tuple[FilledHole, ...]           # longest border first
 
 
 def fill_holes(mesh: Mesh, config: FillConfig | None = None,
@@ -236,7 +213,7 @@ class _Filling:
             surface, start = Surface(guide), patch.mesh.vertices
             for _ in range(4):
                 new = patch.mesh.vertices[patch.old_vertices:]
-                patch.fair(surface.closest(new).points if len(new) else new, PULL)
+                patch.fair(surface.closest(new).points if len(new) else new, 3e3)
             patch.untangle(start)
         return patch.onto(mesh, used)
 

@@ -14,8 +14,6 @@ from ..geometry.surface import Rays
 from .intersections import intersecting_faces
 from .triangulate import triangulate_loop
 
-RIM_BEND, PATCH_BEND = 2.0, 4.0      # bends, in curvature times radius of the hole, that count less than squared
-
 
 class Patch:
     """New triangles and vertices, and the triangles `around` the holes, which stay: all that touch a rim (n,) bool."""
@@ -114,7 +112,8 @@ class Patch:
         area = self.mesh.vertex_areas[rows]
         area = np.maximum(area, 0.1 * np.median(area))                 # slivers on a rim must not rule
         laplacian = csr_array(clamped_cotangents(self.mesh)[rows])
-        large = np.repeat([RIM_BEND, PATCH_BEND], [len(rim), len(free)]) / self._radii()[rows]
+        # bends of rim and patch, in curvature times radius of the hole, that count less than squared
+        large = np.repeat([2.0, 4.0], [len(rim), len(free)]) / self._radii()[rows]
         weight = np.ones(len(rows))
         pull = np.zeros(len(free))
         if targets is not None:

@@ -6,8 +6,6 @@ from scipy.spatial import cKDTree
 
 from ..geometry.mesh import Mesh
 
-FOLD = -1 + 1e-6           # cosine between the normals of neighbours that lie flat on each other
-
 
 def intersecting_faces(mesh: Mesh, among: np.ndarray | None = None) -> np.ndarray:
     """Pairs (n, 2), lower number first, of triangles that cross or lie folded onto each other.
@@ -29,7 +27,7 @@ def intersecting_faces(mesh: Mesh, among: np.ndarray | None = None) -> np.ndarra
             crossing[free] |= _pierces(mesh.vertices[one[free, p]], mesh.vertices[one[free, q]],
                                        mesh.vertices[other[free]])
     normals = mesh.face_normals
-    fold = np.einsum("nd,nd->n", normals[pairs[:, 0]], normals[pairs[:, 1]]) < FOLD
+    fold = np.einsum("nd,nd->n", normals[pairs[:, 0]], normals[pairs[:, 1]]) < -1 + 1e-6
     return pairs[crossing | (fold & (shared == 2)) | (shared == 3)]
 
 

@@ -6,7 +6,6 @@ import heapq
 import numpy as np
 
 LARGEST = 120            # vertices of a loop whose triangulation is found by dynamic programming as a whole
-AREA_SHARE = 0.01        # what the area, over the size of the loop, adds to the bends: it decides where all is flat
 
 
 def triangulate_loop(points: np.ndarray, rim_normals: np.ndarray, forbidden: np.ndarray,
@@ -36,7 +35,8 @@ def _least_weight(p: np.ndarray, rim: np.ndarray, forbidden: np.ndarray, price: 
     cost = np.full((n, n), np.inf)
     normal, choice = np.zeros((n, n, 3)), np.zeros((n, n), dtype=np.int64)
     apart = np.linalg.norm(p[:, None] - p, axis=2)
-    per_area = AREA_SHARE / max(float(np.linalg.norm(p - p.mean(axis=0), axis=1).mean()), 1e-30)
+    # what the area, over the size of the loop, adds to the bends: it decides where all is flat
+    per_area = 0.01 / max(float(np.linalg.norm(p - p.mean(axis=0), axis=1).mean()), 1e-30)
     first = np.arange(n - 1)
     cost[first, first + 1] = 0
     normal[first, first + 1] = rim[:-1]

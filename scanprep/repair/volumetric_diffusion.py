@@ -10,7 +10,6 @@ from ..geometry.sparse import factor
 from ..geometry.surface import Surface
 
 EMPTY = 0.01                         # metres in front of what was seen from which on space counts as empty
-BAND, MARGIN = 3.0, 5.0              # voxels: where the distance is known, and the volume beyond the hole
 
 
 def diffused_surface(mesh: Mesh, rim: np.ndarray, seen: SeenSpace | None = None, voxels: int = 12) -> Mesh:
@@ -26,11 +25,12 @@ def diffused_surface(mesh: Mesh, rim: np.ndarray, seen: SeenSpace | None = None,
     points = mesh.vertices[rim]
     extent = np.ptp(points, axis=0).max()
     voxel = max(float(extent) / voxels, mesh.mean_edge)
-    low = points.min(axis=0) - MARGIN * voxel
-    shape = np.ceil((np.ptp(points, axis=0) + 2 * MARGIN * voxel) / voxel).astype(int) + 1
+    margin = 5 * voxel
+    low = points.min(axis=0) - margin
+    shape = np.ceil((np.ptp(points, axis=0) + 2 * margin) / voxel).astype(int) + 1
     grid = low + voxel * np.stack(np.unravel_index(np.arange(np.prod(shape)), shape), axis=1)
     distance, sure = signed_distance(mesh, grid)
-    known = sure & (np.abs(distance) <= BAND * voxel)
+    known = sure & (np.abs(distance) <= 3 * voxel)
     operator = _roughness(tuple(shape.tolist()))
     values = _spread(operator, known, distance)
     if seen is not None:
