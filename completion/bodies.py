@@ -46,6 +46,10 @@ class FixedBody:
         """The body with the shape it has at x (P,), as one of known shape."""
         return self
 
+    def in_metres(self, x: np.ndarray) -> tuple[np.ndarray, float]:
+        """Unknowns (P,) of the body at its own size, and what the scan has to be multiplied with for it."""
+        return x, 1.0
+
     def vertices(self, x: np.ndarray) -> np.ndarray:
         """The predicted mesh (N, 3) of unknowns (P,)."""
         pose, trans, _ = self.split(x)

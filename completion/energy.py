@@ -10,10 +10,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from model.priors import GaussianPrior, JointLimits
 from scanprep.geometry import rotations
 from scanprep.geometry.least_squares import Residual
 
-from .priors import GaussianPrior, JointLimits
+GIVE = 0.1                           # radians beyond a joint's limit that cost as much as one standard deviation
 
 
 @dataclass(frozen=True, eq=False)
@@ -98,12 +99,14 @@ def pose_prior(x: np.ndarray, prior: GaussianPrior, weight: float | np.ndarray =
 
 
 def joint_limits(x: np.ndarray, limits: JointLimits, weight: float = 1.0) -> Residual:
-    """How far joint angles are beyond their limits; nothing within."""
-    count = len(limits.low)
-    angles, root = x[..., :count], np.sqrt(weight) / limits.give
-    beyond = np.maximum(angles - limits.high, 0) - np.maximum(limits.low - angles, 0)
+    """How far joints are beyond their limits, with a unit cost at `GIVE`; nothing within.
+
+    [SCAPE-patent] §0090
+    """
+    count, root = limits.low.size, np.sqrt(weight) / GIVE
+    beyond, slope = limits.residual(x[..., :count].reshape(*x.shape[:-1], -1, 3))
     J = np.zeros((*beyond.shape, x.shape[-1]))
-    J[..., np.arange(count), np.arange(count)] = root * (beyond != 0)
+    J[..., :count] = root * slope
     return Residual(root * beyond, J)
 
 

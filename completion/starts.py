@@ -5,12 +5,12 @@ from functools import partial
 
 import numpy as np
 
+from model.priors import GaussianPrior, typical_poses
 from scanprep.geometry import rotations
 from scanprep.geometry.least_squares import Dense, levenberg_marquardt, normal_equations
 
 from . import energy
 from .bodies import FixedBody, Follow
-from .priors import GaussianPrior, typical_poses
 
 ANNEALING = (10.0, 3.0, 1.0)         # weight of the pose prior: first near the usual poses, then free
 

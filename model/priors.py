@@ -26,6 +26,30 @@ def whitening(covariance: np.ndarray, shrinkage: float = 0.3, floor: float = 0.1
     return W
 
 
+@dataclass(frozen=True, eq=False)
+class GaussianPrior:
+    """A Gaussian over the joint angles of a pose; the root rotates freely."""
+
+    mean: np.ndarray                 # (3J,), radians
+    whitening: np.ndarray            # (3J-3, 3J), 1 / radians: `whitening @ (pose - mean)` has unit covariance
+
+    def energy(self, pose: np.ndarray) -> float:
+        """Squared Mahalanobis distance of a pose (J, 3)."""
+        return float(((self.whitening @ (pose.ravel() - self.mean))**2).sum())
+
+
+def gaussian_prior(mean: np.ndarray, covariance: np.ndarray, shrinkage: float = 0.3, floor: float = 0.05
+                   ) -> GaussianPrior:
+    """The prior from mean (J, 3) and covariance (3J, 3J) of a few training poses, safe to invert: see `whitening`."""
+    mean = np.asarray(mean, dtype=np.float64).reshape(-1)
+    covariance = np.asarray(covariance, dtype=np.float64)
+    if covariance.shape != (len(mean), len(mean)):
+        raise ValueError(f"covariance: expected shape {(len(mean), len(mean))}, got {covariance.shape}")
+    if not (np.isfinite(mean).all() and np.isfinite(covariance).all()):
+        raise ValueError("mean, covariance: expected finite values")
+    return GaussianPrior(mean, whitening(covariance, shrinkage, floor))
+
+
 def typical_poses(mean: np.ndarray, covariance: np.ndarray, axes: int, deviation: float = 1.5) -> np.ndarray:
     """(≤ 1 + 2 axes, J, 3), the root not turned: the mean, and a step of some deviations each way along main axes."""
     mean = np.array(mean, dtype=np.float64)

@@ -14,7 +14,7 @@ from scanprep.geometry.surface import Rays
 POSE = np.array([[0.3, -0.5, 0.8], [0.2, 0.5, -0.4], [-0.1, -0.6, 0.3], [0.3, 0.1, 0.5]])
 TRANS = np.array([0.4, -0.3, 1.1])
 MARKS = np.array([6, 75, 130, 200, 255, 330, 396])
-QUICK = CompletionConfig(draws=6, rounds=5, scan_points=800, model_points=300, candidates=2, start_axes=2)
+QUICK = CompletionConfig(random_starts=6, rounds=5, scan_points=800, model_points=300)
 
 MEAN = np.array([[0, 0, 0], [0, 0.2, -0.1], [0, -0.2, 0.1], [0.1, 0, 0.2]])
 SD = 0.35

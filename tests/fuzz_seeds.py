@@ -17,9 +17,8 @@ from completion.mocap.files.c3d import replace_points
 from completion.mocap.mosh.recordings import _table_rows
 from completion.mocap.soft_tissue.soft_tissue import SoftTissue
 from completion.motion import Motion
-from completion.partial.completion import Completion
+from completion.partial.completion import Completion, load_completion, save_completion
 from completion.partial.masks import read_mask
-from completion.partial.results import load_completion, save_completion
 from model.export.bvh import write_bvh
 from model.export.bvh_read import read_bvh
 from model.export.cli import read_motion

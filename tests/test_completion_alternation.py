@@ -15,7 +15,7 @@ POSE = np.array([[0.3, -0.5, 0.8], [0.2, 0.5, -0.4], [-0.1, -0.6, 0.3], [0.3, 0.
 TRANS = np.array([0.4, -0.3, 1.1])
 BETAS = np.array([1.2, -0.8, 0.5])
 MARKS = np.array([6, 75, 130, 200, 255, 330, 396])
-TURNS = CompletionConfig(draws=12, rounds=6, scan_points=800, model_points=300, candidates=2, start_axes=2,
+TURNS = CompletionConfig(random_starts=12, rounds=6, scan_points=800, model_points=300,
                          method="alternation")
 MODEL = worm_with_prior()
 
@@ -38,7 +38,7 @@ def test_each_step_lowers_the_energy_over_its_own_block():
         shaped = steps.shaped(stretched)
         assert steps.energy(shaped, markers) < steps.energy(stretched, markers) < before
         assert stretched.R is now.R and stretched.betas is now.betas and shaped.R is now.R and shaped.Y is stretched.Y
-        now = steps.turned(shaped, 0.0)
+        now = steps.rotated(shaped, 0.0)
 
 
 def test_the_surface_and_the_betas_are_where_the_gradient_vanishes():
@@ -59,7 +59,7 @@ def test_turns_reach_the_truth_when_every_point_is_known():
     steps = Alternation(MODEL)
     markers = replace(markers, weights=100 * markers.weights)        # the more they weigh, the fewer turns it takes
     for _ in range(30):
-        now = steps.shaped(steps.stretched(steps.turned(now, 0.01), markers))
+        now = steps.shaped(steps.stretched(steps.rotated(now, 0.01), markers))
     assert np.linalg.norm(now.Y - truth, axis=1).mean() < 1e-3
     true = Blocks(MODEL.skeleton.part_rotations(POSE), truth, BETAS)
     assert steps.energy(now, markers) <= steps.energy(true, markers)     # not zero: the edges do not quite fit together

@@ -7,11 +7,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from completion_bodies import half_view, worm_with_prior
+from config_files import config_file
 
 from completion.__main__ import main
 from completion.partial import report
-from completion.partial.results import load_completion
-from completion.partial.views import read_view
+from completion.partial.completion import load_completion
+from completion.partial.work import read_view
 from scanprep.geometry.files import PointCloud, read_mesh, write_mesh, write_points
 from scanprep.geometry.landmarks import write_landmarks
 from scanprep.geometry.mesh import Mesh
@@ -21,8 +22,7 @@ from scanprep.pictures.textures import read_texture
 POSE = np.array([[0.3, -0.5, 0.8], [0.2, 0.5, -0.4], [-0.1, -0.6, 0.3], [0.3, 0.1, 0.5]])
 TRANS = np.array([0.4, -0.3, 1.1])
 MARKS = {f"m{v}": v for v in (6, 75, 130, 200, 255, 330, 396)}
-QUICK = ("--draws", "3", "--rounds", "3", "--scan-points", "300", "--model-points", "150", "--candidates", "1",
-         "--start-axes", "1")
+QUICK = {"random_starts": 3, "rounds": 3, "scan_points": 300, "model_points": 150}
 
 
 @pytest.fixture(scope="module", autouse=True)
@@ -57,6 +57,11 @@ def run(*words):
     return main(["complete", *map(str, words)])
 
 
+def quick(place, **more):
+    """A short schedule, as a user would write it."""
+    return "--config", config_file(place, **{**QUICK, **more})
+
+
 def told(folder):
     written = json.loads((folder / "report.json").read_text())
     return {row["metric"]: row["value"] for row in written["metrics"]}, written
@@ -65,11 +70,11 @@ def told(folder):
 def test_two_coloured_views_make_one_body_and_a_page(place, tmp_path, capsys):
     out = tmp_path / "out"
     assert run(place / "one.ply", place / "two.ply", "-m", place / "model.npz", "--subject", "template", "-o", out,
-               "--mask", place / "mask.npy", *QUICK) == 0
+               "--mask", place / "mask.npy", *quick(place)) == 0
     metrics, written = told(out)
     assert metrics["views"] == 2 and metrics["landmarks used"] == 7 and metrics["vertices with data"] > 70
     assert metrics["scan points masked"] > 0 and str(place / "model.npz") in metrics["model"]
-    assert written["settings"]["complete"]["draws"] == 3
+    assert written["settings"]["complete"]["random_starts"] == 3
     done = load_completion(out)
     assert done.betas is None and done.rms * 1000 == pytest.approx(
         metrics["distance of the scan to the completed mesh, RMS"])
@@ -85,7 +90,7 @@ def test_two_coloured_views_make_one_body_and_a_page(place, tmp_path, capsys):
 
 def test_without_landmarks_it_says_so_and_goes_on(place, tmp_path, capsys):
     assert run(place / "two.xyz", "-m", place / "model.npz", "--subject", "template", "-o", tmp_path / "out",
-               *QUICK) == 0
+               *quick(place)) == 0
     assert told(tmp_path / "out")[0]["landmarks used"] == "none"
     assert "no landmarks" in capsys.readouterr().err
 
@@ -96,7 +101,7 @@ def test_the_unit_of_the_scan_may_be_unknown(place, tmp_path, capsys):
     marks = json.loads((place / "one.landmarks.json").read_text())
     write_landmarks(tmp_path / "large.landmarks.json", {n: np.array(p) / 0.0254 for n, p in marks.items()})
     assert run(tmp_path / "large.ply", "-m", place / "model.npz", "--subject", "template", "-o", tmp_path / "out",
-               "--free-scale", *QUICK) == 0
+               "--unit", "unknown", *quick(place)) == 0
     assert told(tmp_path / "out")[0]["unit of the scan"] == pytest.approx(0.0254, rel=0.05)
     assert "looks like unit" not in capsys.readouterr().err
     assert load_completion(tmp_path / "out").scale == pytest.approx(0.0254, rel=0.05)
@@ -117,7 +122,7 @@ def test_a_textured_scan_gives_a_textured_body(place, tmp_path):
     (tmp_path / "one.obj").write_text("\n".join(["mtllib a.mtl", *lines, "usemtl skin", *faces]) + "\n")
     shutil.copy(place / "one.landmarks.json", tmp_path)
     assert run(tmp_path / "one.obj", "-m", place / "model.npz", "--subject", "template", "-o", tmp_path / "out",
-               *QUICK) == 0
+               *quick(place)) == 0
     done = load_completion(tmp_path / "out")
     wanted = np.clip((done.completed.vertices[:, 2] - low[2]) / extent[2], 0, 1)
     colored = done.seen & (np.abs(done.completed.colors - 0.6) > 0.02).any(axis=1)
@@ -139,12 +144,12 @@ def folder(place, tmp_path_factory):
         shutil.copy(place / "one.ply", scans / f"{name}.ply")
         shutil.copy(place / "one.landmarks.json", scans / f"{name}.landmarks.json")
     (scans / "c.ply").write_text("ply\nformat ascii 1.0\nelement vertex 3\n")
-    code = run(scans, "-m", place / "model.npz", "--subject", "template", "-o", out, *QUICK)
+    code = run(scans, "-m", place / "model.npz", "--subject", "template", "-o", out, *quick(place))
     return scans, out, code
 
 
-def words(place, folder, *more):
-    return (folder[0], "-m", place / "model.npz", "--subject", "template", "-o", folder[1], *QUICK, *more)
+def words(place, folder, **more):
+    return (folder[0], "-m", place / "model.npz", "--subject", "template", "-o", folder[1], *quick(place, **more))
 
 
 def test_a_folder_is_completed_scan_by_scan(folder):
@@ -165,8 +170,8 @@ def test_what_is_finished_is_skipped_and_what_changed_is_done_anew(place, folder
     (out / ".scapekit" / "making" / "left").mkdir(parents=True)     # by a run that was killed
     before = {name: (out / name / "completed.ply").stat().st_mtime_ns for name in ("a", "b")}
 
-    def fresh(*more):
-        run(*words(place, folder, *more))
+    def fresh(**more):
+        run(*words(place, folder, **more))
         return told(out)[0]["of them in this run"]
 
     assert fresh() == 0
@@ -175,7 +180,7 @@ def test_what_is_finished_is_skipped_and_what_changed_is_done_anew(place, folder
     marks = json.loads((scans / "b.landmarks.json").read_text())
     write_landmarks(scans / "b.landmarks.json", {n: np.array(p) + 0.001 for n, p in marks.items()})
     assert fresh() == 1 and fresh() == 0                             # a changed input
-    assert fresh("--surface-weight", "2") == 2                       # a changed setting
+    assert fresh(surface_weight=2.0) == 2                       # a changed setting
 
 
 @pytest.mark.parametrize("words, message", [
@@ -183,15 +188,16 @@ def test_what_is_finished_is_skipped_and_what_changed_is_done_anew(place, folder
     (("one.ply", "--landmarks", "none.json"), "none.json: no such file"),
     (("one.ply", "--mask", "none.npy"), "none.npy: no such file"),
     (("one.ply", "--mask", "long.json"), "long.json: element 0: expected a point of 0.."),
-    (("one.ply", "--ignored-parts", "wing"), "ignored_parts: expected names of"),
-    (("one.ply", "--unit", "mm", "--free-scale"), "--unit, --free-scale: expected one of them"),
+    (("one.ply", "--config", "wing.toml"), "ignored_parts: expected names of"),
     (("one.ply", "two.ply", "--mask", *["mask.npy"] * 3), "expected one file, or one for each of the 2 views, got 3"),
     (("one.ply", "--subject", "none.json"), "none.json: no such file"),
 ])
 def test_what_cannot_be_used_is_named(place, tmp_path, capsys, monkeypatch, words, message):
     monkeypatch.chdir(place)
     (place / "long.json").write_text("[99999]")
-    assert run(*words, "-m", "model.npz", "-o", tmp_path / "out", *QUICK) == 1
+    config_file(place, "wing.toml", ignored_parts=["wing"])
+    settings = () if "--config" in words else quick(place)
+    assert run(*words, "-m", "model.npz", "-o", tmp_path / "out", *settings) == 1
     assert message in " ".join(capsys.readouterr().err.split())
 
 

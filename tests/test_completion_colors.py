@@ -73,9 +73,9 @@ def test_the_view_that_looked_squarely_counts_most():
 
 def test_what_was_not_seen_is_grey_or_filled(person, views):
     meshes, cameras, seen = views
-    grey = carry_colors(person, seen, meshes[:1], ColorConfig(grey=0.3), cameras[0])
+    grey = carry_colors(person, seen, meshes[:1], ColorConfig(), cameras[0])
     filled = carry_colors(person, seen, meshes[:1], ColorConfig(fill=True), cameras[0])
-    unseen = (grey == 0.3).all(axis=1)
+    unseen = (grey == 0.6).all(axis=1)
     assert unseen.mean() > 0.3 and (np.ptp(filled[unseen], axis=0) > 0.1).all()
     np.testing.assert_array_equal(filled[~unseen], grey[~unseen])
 

@@ -4,14 +4,14 @@ from completion_bodies import worm_with_prior
 
 from completion import energy
 from completion.bodies import Anchor, FixedBody, ShapedBody, as_body
-from completion.priors import gaussian_prior, joint_limits
+from model.priors import JointLimits, gaussian_prior
 from scanprep.geometry import rotations
 
 RNG = np.random.default_rng(3)
 MODEL = worm_with_prior()
 FIXED, SHAPED = FixedBody(MODEL.subject(None)), ShapedBody(MODEL)
 PRIOR = gaussian_prior(MODEL.pose_mean, MODEL.pose_covariance)
-LIMITS = joint_limits(np.random.default_rng(5).normal(0, 0.2, (9, 4, 3)), margin=0.05)
+LIMITS = JointLimits.from_poses(np.random.default_rng(5).normal(0, 0.2, (9, 4, 3)), 1.0, 0.05)
 IDS = RNG.choice(398, 5, replace=False)
 TRIPLES = RNG.choice(398, (6, 3), replace=False)
 TARGETS = RNG.normal(size=(5, 3))

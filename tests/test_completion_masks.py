@@ -7,7 +7,8 @@ import pytest
 from completion_bodies import MARKS, POSE, QUICK, TRANS, half_view, worm_with_prior
 
 from completion.partial.completion import complete
-from completion.partial.masks import Cover, part_vertices, read_mask
+from completion.partial.free_space import Clothing
+from completion.partial.masks import part_vertices, read_mask
 from completion.partial.scan import prepare_scan
 from scanprep.geometry.files import PointCloud, write_mesh, write_points
 from scanprep.geometry.mesh import Mesh
@@ -58,14 +59,14 @@ def test_masked_points_are_set_apart_and_still_seen(dressed):
 def test_what_sticks_out_of_clothing_is_pushed_in():
     x, y = (g.ravel() for g in np.meshgrid(np.linspace(0, 0.2, 21), np.linspace(0, 0.2, 21)))
     cloth = prepare_scan(np.column_stack([x, y, 0 * x, 0 * x, 0 * x, 1 + 0 * x]))
-    cover = Cover(cloth, tolerance=0.003)
+    clothing = Clothing(cloth)
     places = np.array([[0.1, 0.1, 0.023], [0.1, 0.1, -0.04], [0.1, 0.1, 0.4], [0.5, 0.1, 0.01], [0.05, 0.1, 0.03]])
     up = np.array([[0, 0, 1.0]] * 4 + [[0, 0, -1.0]])
-    depth, normal, target = cover.trespass(places, up)
+    depth, normal, target = clothing.violation(places, up)
     np.testing.assert_allclose(depth, [0.02, 0, 0, 0, 0], atol=1e-12)
     np.testing.assert_allclose(target[0], [0.1, 0.1, 0.003], atol=1e-12)
     np.testing.assert_allclose(normal[0], [0, 0, 1])
-    under, point, out = cover.below(places, up)
+    under, point, out = clothing.below(places, up)
     np.testing.assert_array_equal(under, [False, True, False, False, False])
     np.testing.assert_allclose([point[1], out[1]], [[0.1, 0.1, 0], [0, 0, 1]], atol=1e-12)
 

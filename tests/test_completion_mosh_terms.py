@@ -10,7 +10,7 @@ from completion.mocap.pose.marked_body import supports
 from completion.mocap.subject import latent_fit as terms
 from completion.mocap.subject.attachment import above_triangles, latent_markers, simulated
 from completion.mocap.subject.latent_fit import LatentPoints
-from completion.priors import gaussian_prior
+from model.priors import gaussian_prior
 from scanprep.geometry import rotations
 from scanprep.geometry.least_squares import Residual
 

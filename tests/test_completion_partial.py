@@ -5,10 +5,10 @@ from completion_bodies import half_view, worm_with_prior
 from completion import energy
 from completion.bodies import FixedBody
 from completion.partial.completion import complete
-from completion.partial.draws import limbs, redrawn
-from completion.partial.self_intersection import Contact
+from completion.partial.free_space import Contact
+from completion.partial.limbs import limbs, redrawn
 from completion.partial.settings import CompletionConfig
-from completion.priors import gaussian_prior
+from model.priors import gaussian_prior
 from scanprep.geometry import rotations
 from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.surface import Surface
@@ -17,7 +17,7 @@ POSE = np.array([[0.3, -0.5, 0.8], [0.2, 0.5, -0.4], [-0.1, -0.6, 0.3], [0.3, 0.
 TRANS = np.array([0.4, -0.3, 1.1])
 BETAS = np.array([1.2, -0.8, 0.5])
 MARKS = np.array([6, 75, 130, 200, 255, 330, 396])
-QUICK = CompletionConfig(draws=12, rounds=6, scan_points=800, model_points=300, candidates=2, start_axes=2)
+QUICK = CompletionConfig(random_starts=12, rounds=6, scan_points=800, model_points=300)
 
 
 @pytest.fixture(scope="module")
@@ -151,11 +151,11 @@ def test_a_part_inside_another_is_pushed_out(model):
     subject, part = model.subject(None), model.skeleton.part_of_vertex(model.template)
     contact = Contact(model.skeleton, part)
     rest = model.template.with_vertices(subject.vertices(np.zeros((4, 3))))
-    assert contact.intrusions(rest.vertices, rest.vertex_normals)[0].max() == 0
+    assert contact.violation(rest.vertices, rest.vertex_normals)[0].max() == 0
     moved = rest.vertices.copy()
     moved[part == 3] += rest.vertices[part == 0].mean(axis=0) - rest.vertices[part == 3].mean(axis=0)
     mesh = rest.with_vertices(moved)
-    depth, normal, target = contact.intrusions(mesh.vertices, mesh.vertex_normals)
+    depth, normal, target = contact.violation(mesh.vertices, mesh.vertex_normals)
     inside = (part == 3) & (depth > 0)
     assert inside.sum() > 0.5 * (part == 3).sum() and not depth[(part == 1) | (part == 2)].any()
     np.testing.assert_allclose(target, mesh.vertices + depth[:, None] * normal)

@@ -4,8 +4,7 @@ import numpy as np
 import pytest
 from completion_bodies import worm_with_prior
 
-from completion.partial.completion import Completion
-from completion.partial.results import load_completion, save_completion
+from completion.partial.completion import Completion, load_completion, save_completion
 from scanprep.geometry import storage
 
 MODEL = worm_with_prior()

@@ -2,7 +2,7 @@ import numpy as np
 import pytest
 from completion_bodies import half_view, worm_with_prior
 
-from completion.partial.free_space import find_sight
+from completion.partial.free_space import find_camera
 from completion.partial.scan import prepare_scan, spread
 from completion.starts import distinct
 from scanprep.geometry import rotations
@@ -81,29 +81,29 @@ def test_spread_points_cover_the_whole_evenly(body):
 
 
 def test_the_viewpoint_of_a_single_view_is_found(body, view):
-    sight = find_sight(prepare_scan(view[0]))
-    away = sight.viewpoint - view[0].mean(axis=0)
+    camera = find_camera(prepare_scan(view[0]))
+    away = camera.viewpoint - view[0].mean(axis=0)
     assert away @ TOWARD / np.linalg.norm(away) / np.linalg.norm(TOWARD) > np.cos(np.radians(8))
 
 
 def test_a_scan_from_all_sides_has_no_viewpoint(body):
-    assert find_sight(prepare_scan(body.sample(4000, np.random.default_rng(0))[0])) is None
+    assert find_camera(prepare_scan(body.sample(4000, np.random.default_rng(0))[0])) is None
 
 
 def test_nothing_stands_beside_or_in_front_of_what_was_seen(body, view):
     camera = body.vertices.mean(axis=0) + 3 * TOWARD / np.linalg.norm(TOWARD)
-    sight = find_sight(prepare_scan(view[0], camera), camera)
-    assert sight.trespass(body.vertices, 0.03)[0].max() < 1e-3       # the true body is nowhere denied
+    seen_from = find_camera(prepare_scan(view[0], camera), camera)
+    assert seen_from.violation(body.vertices).excess.max() < 1e-3       # the true body is nowhere denied
     middle = view[0].mean(axis=0)
     seen = view[0][np.argmin(np.linalg.norm(view[0] - middle, axis=1))]
     ahead = (camera - seen) / np.linalg.norm(camera - seen)
     up = np.cross(ahead, [1.0, 0, 0])
     points = seen + np.array([0.1 * ahead, -0.1 * ahead, 0.5 * up / np.linalg.norm(up)])
-    excess, normal, target = sight.trespass(points, 0.03)
+    excess, normal, target = seen_from.violation(points)
     np.testing.assert_allclose(excess[:2], [0.07, 0], atol=0.01)
     assert excess[2] > 0.2
     np.testing.assert_allclose(points - excess[:, None] * normal, target, atol=1e-12)
-    assert (sight.trespass(target, 0.03)[0] <= 0.3 * excess + 1e-9).all()
+    assert (seen_from.violation(target).excess <= 0.3 * excess + 1e-9).all()
 
 
 def test_distinct_bodies_are_kept_in_order():

@@ -7,11 +7,9 @@ from test_completion_partial import MARKS, QUICK
 
 from completion import Motion, TrackConfig, track
 from completion.bodies import FixedBody, ShapedBody
-from completion.partial.scan import prepare_scan
-from completion.tracking import person
 from completion.tracking.dynamics import difference, inertia, moved, predicted, smoothed
+from completion.tracking.frame_fit import shared_shape, spread_poses
 from completion.tracking.frames import prepare_frame
-from completion.tracking.person import shared_shape, spread_poses
 from completion.tracking.tracker import Tracker
 from scanprep.batch.values import load_value, save_value
 from scanprep.geometry import rotations
@@ -123,7 +121,7 @@ def test_frames_are_taken_one_by_one(model, known):
 def test_a_tracker_that_goes_on_from_what_another_knew_ends_the_same(model, tmp_path):
     """Before the shape is known, right after, and between frames that are searched from scratch."""
     bodies = bodies_of(model, BETAS)
-    settings = replace(SETTINGS, shape_frames=3, search_every=2, start=replace(QUICK, draws=3))
+    settings = replace(SETTINGS, shape_frames=3, search_every=2, start=replace(QUICK, random_starts=3))
     frames = [None, *record(bodies[:8])]
     frames[4:8] = [[view * [1, 1, 0.3] for view in views] for views in frames[4:8]]     # nothing the body could be
     marks = MARKS, bodies[0].vertices[MARKS]
@@ -135,7 +133,7 @@ def test_a_tracker_that_goes_on_from_what_another_knew_ends_the_same(model, tmp_
     done += first.finish()
     assert [f.found for f in done] == [False, *[True] * 3, *[False] * 4, True]
     assert states[2].kept and not states[2].shape_known and states[3].shape_known
-    assert states[4].draws != states[6].draws != states[8].draws
+    assert states[4].random_state != states[6].random_state != states[8].random_state
     for cut, end in ((1, 4), (2, 4), (6, 9)):
         save_value(tmp_path / "state.npz", states[cut], {})
         other = Tracker(model, settings, RATE, marks)
@@ -144,8 +142,8 @@ def test_a_tracker_that_goes_on_from_what_another_knew_ends_the_same(model, tmp_
         assert rest[-1].number == end - 1
         for found in rest:
             same(found, done[found.number])
-        np.testing.assert_array_equal(other.betas, first.betas)
-        assert other.state.draws == states[end].draws
+        np.testing.assert_array_equal(other.state.betas, first.state.betas)
+        assert other.state.random_state == states[end].random_state
 
 
 def same(ours, theirs):
@@ -216,30 +214,6 @@ def test_smoothing_is_the_least_squares_solution():
     np.testing.assert_array_equal(smoothed(x[:2], gradient[:2], precision[:2], weights, 1), x[:2])
 
 
-def test_poses_are_eliminated_without_changing_the_step(model, monkeypatch):
-    """One round for three frames against the dense system of all their unknowns."""
-    rng = np.random.default_rng(2)
-    P, K, n = 15, 3, 3
-    systems = []
-    for _ in range(n):
-        root = rng.normal(size=(40, P + K))
-        systems.append((root.T @ rng.normal(size=40), root.T @ root))
-    waiting = iter(systems)
-    monkeypatch.setattr(person, "_system", lambda *_: next(waiting))
-    cloud = prepare_scan(model.template)
-    x, betas = rng.normal(0, 0.1, (n, P)), rng.normal(size=K)
-    got = shared_shape(ShapedBody(model), [cloud] * n, x, betas, replace(SETTINGS, shape_rounds=1))
-    H, g = np.zeros((n * P + K, n * P + K)), np.r_[np.zeros(n * P), betas]
-    H[n * P:, n * P:] = np.eye(K)
-    for k, (gk, Hk) in enumerate(systems):
-        mine = np.r_[k * P:(k + 1) * P, n * P:n * P + K]
-        H[np.ix_(mine, mine)] += Hk
-        g[mine] += gk
-    step = np.linalg.solve(H, g)
-    np.testing.assert_allclose(got.betas, betas - step[n * P:], atol=1e-9)
-    np.testing.assert_allclose(got.x, x - step[:n * P].reshape(n, P), atol=1e-9)
-
-
 def test_several_frames_tell_the_shape(model):
     bodies = bodies_of(model, BETAS)
     chosen = spread_poses(np.stack([b.vertices for b in bodies]), 4)
@@ -248,10 +222,10 @@ def test_several_frames_tell_the_shape(model):
     poses, trans = motion()
     body = ShapedBody(model)
     x = FixedBody(model.subject(np.zeros(3))).join(poses, trans)[chosen]
-    found = shared_shape(body, clouds, x, np.zeros(3), SETTINGS)
-    assert np.linalg.norm(found.betas - BETAS) < 0.35
-    for i, at in zip(chosen, found.x, strict=True):
-        assert np.linalg.norm(body.vertices(np.r_[at, found.betas]) - bodies[i].vertices, axis=1).mean() < 0.008
+    betas, found = shared_shape(body, clouds, x, np.zeros(3), SETTINGS)
+    assert np.linalg.norm(betas - BETAS) < 0.35
+    for i, at in zip(chosen, found, strict=True):
+        assert np.linalg.norm(body.vertices(np.r_[at, betas]) - bodies[i].vertices, axis=1).mean() < 0.008
 
 
 @pytest.mark.parametrize("known_by", ["triangles", "normals", "viewpoint", "expected", "form"])

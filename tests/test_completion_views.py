@@ -7,7 +7,7 @@ from completion_bodies import MARKS, POSE, QUICK, TRANS, half_view, worm_with_pr
 
 from completion.bodies import as_body
 from completion.partial.completion import complete
-from completion.partial.free_space import Sights, find_sights
+from completion.partial.free_space import find_cameras, free_space_violation
 from completion.partial.scale import LOOSE, ScaledBody, landmark_scale, rough_scale
 from completion.partial.scan import as_views, prepare_scan
 from scanprep.geometry.files import PointCloud
@@ -73,27 +73,27 @@ def test_two_views_complete_what_one_leaves_open(model, body, views):
     assert apart[0].mean() < 0.004 and apart[0][second].mean() < 0.9 * apart[1][second].mean()
 
 
-def test_every_view_has_its_own_sight(body, views):
+def test_every_view_has_its_own_camera(body, views):
     points = [points for points, _ in views]
-    sights = find_sights(prepare_scan(points, cameras(body)))
-    assert isinstance(sights, Sights)
-    for camera, at, mine in zip(sights.cameras, cameras(body), points, strict=True):
+    known = find_cameras(prepare_scan(points, cameras(body)))
+    assert len(known) == 2
+    for camera, at, mine in zip(known, cameras(body), points, strict=True):
         np.testing.assert_array_equal(camera.viewpoint, at)
         np.testing.assert_array_equal(camera.points, mine)
-    found = find_sights(prepare_scan(points))
-    for camera, toward in zip(found.cameras, FROM, strict=True):
+    found = find_cameras(prepare_scan(points))
+    for camera, toward in zip(found, FROM, strict=True):
         away = camera.viewpoint - body.vertices.mean(axis=0)
         assert away @ toward / np.linalg.norm(away) / np.linalg.norm(toward) > np.cos(np.radians(15))
 
 
 def test_what_one_camera_denies_is_denied(body, views):
-    sights = find_sights(prepare_scan([points for points, _ in views], cameras(body)))
+    both = find_cameras(prepare_scan([points for points, _ in views], cameras(body)))
     places = body.vertices + np.random.default_rng(0).normal(0, 0.15, body.vertices.shape)
-    excess, normal, target = sights.trespass(places, 0.03)
-    single = [camera.trespass(places, 0.03) for camera in sights.cameras]
+    excess, normal, target = free_space_violation(both, places)
+    single = [camera.violation(places) for camera in both]
     np.testing.assert_array_equal(excess, np.maximum(single[0][0], single[1][0]))
     np.testing.assert_allclose(target, places - excess[:, None] * normal, atol=1e-12)
-    assert sights.trespass(body.vertices, 0.03)[0].max() < 2e-3
+    assert free_space_violation(both, body.vertices).excess.max() < 2e-3
     assert (excess > 0).sum() > max((one[0] > 0).sum() for one in single)
 
 

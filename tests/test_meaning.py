@@ -38,7 +38,7 @@ from scanprep.skeleton.find import skeleton_problem
 MARKS = {"head": 10, "tail": 380, "left": 100, "right": 200, "middle": 250}
 LABELS = tuple(f"M{i}" for i in range(30))
 ROWS = np.random.default_rng(4).choice(396, 30, replace=False)
-QUICK = CompletionConfig(draws=4, rounds=3, scan_points=600, model_points=300, candidates=1, start_axes=1)
+QUICK = CompletionConfig(random_starts=4, rounds=3, scan_points=600, model_points=300)
 
 
 @pytest.fixture(scope="module", autouse=True)

@@ -234,7 +234,7 @@ POSE = np.array([[0.3, -0.5, 0.8], [0.2, 0.5, -0.4], [-0.1, -0.6, 0.3], [0.3, 0.
 
 @pytest.mark.parametrize("known", [True, False], ids=["known", "unknown"])
 def test_half_a_scan_is_completed(model, known):
-    quick = CompletionConfig(draws=8, rounds=5, scan_points=500, model_points=200, candidates=2, start_axes=2)
+    quick = CompletionConfig(random_starts=8, rounds=5, scan_points=500, model_points=200)
     body = model.template.with_vertices(model.vertices(POSE, BETAS, np.array([0.4, -0.3, 1.1])))
     points, seen = half_view(body, np.array([0.3, -1, 0.5]), count=2000, noise=0.001)
     result = complete(model.subject(BETAS) if known else model, points, (MARKS, body.vertices[MARKS]), quick)

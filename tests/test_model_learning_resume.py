@@ -17,7 +17,7 @@ from scanprep.batch.opening import beside
 from scanprep.console import run
 from scanprep.skeleton import find
 
-STAGES = {"skeleton": (cli, "find_skeleton"), "poses": (scape, "learn_pose"), "people": (scape, "shape_gradients"),
+STAGES = {"skeleton": (cli, "find_skeleton"), "poses": (pose, "_learned"), "people": (scape, "shape_gradients"),
           "components": (scape, "learn_shape_space"), "pictures": (cli, "_draw")}
 QUICK = {"refinements": 1, "components": 4, "prunings": [0.01], "ridges": [1e-3]}
 SKIN = {"rounds": 2, "components": 4}

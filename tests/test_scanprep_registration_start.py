@@ -173,7 +173,7 @@ def test_an_end_that_is_rotated_about_itself_is_found():
     truth = np.einsum("nij,nj->ni", rotations.exp(1.0 * share[:, None] * end.axis), mesh.vertices)
     target = target_of(Mesh(truth, mesh.faces))
     size = size_of(mesh)
-    rotated = rotated_end(mesh, end, mesh.vertices, RigidFit(target, 0.04 * size, 0.035 * size), size, moved=0.0)
+    rotated = rotated_end(mesh, end, mesh.vertices, RigidFit(target, size), moved=0.0)
     assert rotated is not None
     before = np.linalg.norm(mesh.vertices - truth, axis=1)[end.vertices].mean()
     assert np.linalg.norm(rotated - truth[end.vertices], axis=1).mean() < 0.35 * before
@@ -183,7 +183,7 @@ def test_an_end_that_fits_is_left_alone():
     mesh = body()
     end = find_ends(mesh, 2, 0.25)[0]
     size = size_of(mesh)
-    assert rotated_end(mesh, end, mesh.vertices, RigidFit(target_of(mesh), 0.04 * size, 0.035 * size), size) is None
+    assert rotated_end(mesh, end, mesh.vertices, RigidFit(target_of(mesh), size)) is None
 
 
 # ---- confidence ---------------------------------------------------------------------------------------------

@@ -45,8 +45,7 @@ from ..mocap.files.markers import MarkerSequence, read_markers, write_markers
 from ..mocap.marker_sets.layout import DISTANCE, MarkerLayout
 from ..mocap.pose.follow import animate
 from ..motion import Motion
-from ..partial.completion import Completion, complete
-from ..partial.results import load_completion, save_completion
+from ..partial.completion import Completion, complete, load_completion, save_completion
 from .settings import LANDMARKS, MARKER_NOISE, PARTS, TEMPLATE_VIEWS, DemoConfig, write_settings
 from .truth import TruthMap
 

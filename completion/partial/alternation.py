@@ -10,7 +10,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from functools import cached_property
+from functools import cached_property, partial
 
 import numpy as np
 from scipy.sparse import csr_array
@@ -23,23 +23,21 @@ from scanprep.geometry import rotations
 from scanprep.geometry.mesh import Mesh
 from scanprep.skeleton.tree import Skeleton
 
-from .fit import SETTLED, ScanFit
+from .fit import EVIDENCE, FINAL_REACH, REACH, SETTLED, ScanFit, Solved
 from .free_surface import FreeSurface
 from .settings import CompletionConfig
 
 MORE = 3                             # times as many rounds as the joint method: each block gives way only a little
 
 
-def model_for_turns(body: BodyModel | Subject, config: CompletionConfig) -> ScapeModel | None:
-    """The model that the alternation works on; None when the settings ask for the joint method."""
-    if config.method == "joint":
-        return None
+def turns_of(body: BodyModel | Subject, config: CompletionConfig) -> Callable[..., Solved]:
+    """The solver in turns; refused for a body that is not made of R, S and Q triangle by triangle, or without scale."""
     if config.method != "alternation":
         raise ValueError(f"method: expected 'joint' or 'alternation', got {config.method!r}")
     if config.free_scale:
         raise ValueError("free_scale: expected False with method='alternation'; a scan of unknown scale needs 'joint'")
     if isinstance(body, ScapeModel) and body.kind == ScapeModel.kind:
-        return body
+        return partial(solve_in_turns, body)
     what = f"a model of kind {body.kind!r}" if isinstance(body, BodyModel) else f"a {type(body).__name__}"
     raise ValueError(f"body: expected a SCAPE model with method='alternation', which turns and deforms its triangles, "
                      f"got {what}; a model learned without shapes stands for its template's own body")
@@ -90,7 +88,7 @@ class Alternation:
         turned = R[self.part] @ self.shape(betas)
         return self.model.stitching.stitch(self.posed(R) @ np.swapaxes(turned, -1, -2))
 
-    def turned(self, now: Blocks, w_T: float) -> Blocks:
+    def rotated(self, now: Blocks, w_T: float) -> Blocks:
         """R for fixed Y and betas, Q held, neighbouring twists damped.
 
         [SCAPE] Eq. 11
@@ -159,31 +157,28 @@ def damped_twists(skeleton: Skeleton, part: np.ndarray, e: np.ndarray, v: np.nda
     return np.linalg.solve(normal.reshape(3 * J, 3 * J), side.ravel()).reshape(J, 3)
 
 
-def follow_alternating(fit: ScanFit, model: ScapeModel, x: np.ndarray, tell: Callable[[int], None]
-                       ) -> tuple[np.ndarray, bool, int, dict[str, float]]:
-    """As `ScanFit.follow_scan`: unknowns after rounds of matching, whether they settled, rounds, energies.
-
-    One round: the points closest to the current Y[Z] become the markers, then R, Y and betas are found in turns, each
-    once.
+def solve_in_turns(model: ScapeModel, fit: ScanFit, x: np.ndarray, tell: Callable[[int], None]) -> Solved:
+    """As `solve_jointly`: in a round the points closest to Y[Z] become markers, then R, Y and betas are found in turns.
 
     [SCAPE] §7
     """
     config, steps = fit.config, Alternation(model)
-    pose, trans, betas = fit.body.split(x)
+    pose, _, betas = fit.body.split(x)
     now = Blocks(model.skeleton.part_rotations(pose), fit.body.vertices(x), betas)
     rounds, shift = MORE * config.rounds, np.inf
-    reaches = np.geomspace(config.reach, config.final_reach, rounds)
-    for i, reach in enumerate([*reaches, *[config.final_reach] * rounds]):
-        markers = nearest_markers(fit, model.template.with_vertices(now.Y), reach)
-        before = now.Y
-        now = steps.shaped(steps.stretched(steps.turned(now, config.twist_damping), markers))
+    reaches = np.geomspace(REACH, FINAL_REACH, rounds)
+    for i, reach in enumerate([*reaches, *[FINAL_REACH] * rounds]):
+        markers, before = nearest_markers(fit, model.template.with_vertices(now.Y), reach), now.Y
+        now = steps.rotated(now, config.twist_weight)               # [SCAPE] Eq. 11
+        now = steps.stretched(now, markers)                         # [SCAPE] Eq. 10
+        now = steps.shaped(now)                                     # [SCAPE] §6
         shift = float(np.sqrt(((now.Y - before)**2).sum(axis=1).mean()))
         tell(min(1 + i // MORE, config.rounds))
         if i >= rounds and shift < SETTLED / MORE:
             break
     trans = model.stitching.root_weights @ now.Y - model.skeleton.joints[0]
     x = np.concatenate([model.skeleton.pose_of(now.R).ravel(), trans, now.betas])
-    return x, bool(shift < SETTLED), i + 1, {"eq_10": steps.energy(now, markers)}
+    return Solved(x, bool(shift < SETTLED), i + 1, {"eq_10": steps.energy(now, markers)})
 
 
 def nearest_markers(fit: ScanFit, mesh: Mesh, reach: float) -> Markers:
@@ -195,7 +190,7 @@ def nearest_markers(fit: ScanFit, mesh: Mesh, reach: float) -> Markers:
     """
     config = fit.config
     ids, points, _, weights = fit.matches(mesh, fit.thin, reach)
-    one = config.evidence / config.scan_sd**2 / len(fit.thin.points)
+    one = EVIDENCE / config.scan_sd**2 / len(fit.thin.points)
     w_Z = config.surface_weight * len(fit.cloud.points) / len(fit.thin.points)
     marked = np.full(len(fit.vertices), config.landmark_sd**-2)
     return Markers(np.concatenate([fit.vertices, ids]), np.concatenate([fit.points, points]),

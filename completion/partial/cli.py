@@ -3,7 +3,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Literal
 
 import tyro
 
@@ -18,16 +18,15 @@ from scanprep.geometry.landmarks import landmarks_beside, read_landmark_vertices
 
 from ..cli import ModelOrNone, read_model
 from .colors import ColorConfig
-from .folder import folder_inputs, folder_page, summary
 from .settings import CompletionConfig
-from .work import Inputs, Work
+from .work import Inputs, Work, folder_inputs, folder_page, summary
 
 ScansArg = Annotated[tyro.conf.Positional[tuple[Path, ...]], tyro.conf.arg(metavar="SCAN [SCAN ...]")]
 
 
 def complete_scan(scans: ScansArg, output: Output, model: ModelOrNone = None, landmarks: Path | None = None,
                   subject: str | None = None, template_landmarks: Path | None = None, mask: tuple[Path, ...] = (),
-                  unit: Unit | None = None, fill_colors: bool = False,
+                  unit: Unit | Literal["unknown"] | None = None, fill_colors: bool = False,
                   config: CompletionConfig = CompletionConfig(),  # noqa: B008
                   workers: Workers = Workers(), *, space: Workspace) -> Outcome:                 # noqa: B008
     """The whole body from a scan of some of it.
@@ -50,15 +49,15 @@ def complete_scan(scans: ScansArg, output: Output, model: ModelOrNone = None, la
         mask: Which points are clothing or hair: .npy, .json or .txt of booleans or of the numbers of points, or a
             mesh or cloud in which they are painted in a colour. One file, or one for each view; for a folder of
             scans, the folder of such files.
-        unit: Unit of the scan and landmarks; --free-scale when nobody knows it.
+        unit: Unit of the scan and landmarks; "unknown": it is found together with the body.
         fill_colors: Spread the scan's colours over what was not seen, which else is grey.
         config: Settings.
         workers: Who completes the scans of a folder.
     """
     if not scans:
         raise ValueError("SCAN: expected at least one scan, or a folder of scans")
-    if unit is not None and config.free_scale:
-        raise ValueError("--unit, --free-scale: expected one of them, got both")
+    if unit == "unknown":
+        config, unit = replace(config, free_scale=True), None
     folder = scans[0] if len(scans) == 1 and scans[0].is_dir() else None
     found = folder_inputs(folder, landmarks, _only(mask)) if folder else {}
     loaded, name = read_model(model)

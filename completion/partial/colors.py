@@ -12,14 +12,16 @@ from scanprep.geometry.files import PointCloud
 from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.surface import Surface
 from scanprep.pictures.textures import Texture
-from scanprep.ranges import Cosine, Positive, Settings, Share
+from scanprep.ranges import Positive, Settings
 
-from .free_space import find_sight
+from .free_space import find_camera
 from .scan import View, as_views, check_viewpoints, in_metres, prepare_scan
 
 NEIGHBOURS = 3                       # points of a cloud that make the colour of a place
 RIM = 0.015                          # metres: towards its border a view counts less and less
 SQUARE = 2                           # power of the cosine at which a view looked
+MIN_COSINE = 0.5                     # between the normals of scan and body
+GREY = 0.6                           # what was not seen
 
 
 @dataclass(frozen=True)
@@ -30,17 +32,12 @@ class ColorConfig(Settings):
     ----------
     reach : float, metres
         How far the scan may be from a place to give it its colour.
-    min_cosine : float
-        Least cosine between the normals of both.
     fill : bool
         Spread colours smoothly over what was not seen, instead of grey.
-    grey : float in [0, 1]
     """
 
     reach: Positive = 0.02
-    min_cosine: Cosine = 0.5
     fill: bool = False
-    grey: Share = 0.6
 
 
 class ColoredView:
@@ -79,7 +76,7 @@ class ColoredView:
             share = 1 / np.maximum(apart, 1e-6)
             colors = np.einsum("nk,nkd->nd", share / share.sum(axis=1, keepdims=True), self.colors[near])
         cosine = np.einsum("nd,nd->n", facing, normals)
-        weight = ((far < config.reach) & (cosine > config.min_cosine)).astype(float)
+        weight = ((far < config.reach) & (cosine > MIN_COSINE)).astype(float)
         return colors, weight * self._squarely(places, normals) * self._inside(places)
 
     def _squarely(self, places: np.ndarray, normals: np.ndarray) -> np.ndarray:
@@ -124,7 +121,7 @@ def carry_colors(body: Mesh, seen: np.ndarray, scan: View | Sequence[View], conf
     near = body.vertex_adjacency
     closed = seen | (near @ seen.astype(float) > 0.5 * near.sum(axis=1))     # single gaps amid what was seen
     known = closed & (weight > 0)
-    out = np.where(known[:, None], colors, config.grey)
+    out = np.where(known[:, None], colors, GREY)
     return np.clip(sparse.harmonic(near, out, known), 0, 1) if config.fill and known.any() else out
 
 
@@ -138,8 +135,8 @@ def colored_views(scan: View | Sequence[View], viewpoint: object = None, metres:
         texture = textures[i] if textures else None
         if isinstance(view, np.ndarray) or (view.colors is None and texture is None):
             continue
-        sight = None if cameras is not None else find_sight(prepare_scan(view))
-        camera = cameras[i] if cameras is not None else None if sight is None else sight.viewpoint
+        found_camera = None if cameras is not None else find_camera(prepare_scan(view))
+        camera = cameras[i] if cameras is not None else None if found_camera is None else found_camera.viewpoint
         found.append(ColoredView(view, camera, None if texture is None else texture.scaled(metres)))
     if not found:
         raise ValueError("scan: expected colours at its points, found none")

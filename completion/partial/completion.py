@@ -1,30 +1,38 @@
-"""Completion of a partial scan: a start from landmarks, the pose and shape, then the free surface."""
+"""Completion of a partial scan: a start from landmarks, the pose and shape, then the free surface; and its folder."""
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
-from functools import partial
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 
 from model.body import BodyModel
 from model.linear import Subject
+from scanprep.geometry import storage
+from scanprep.geometry.files import check_same_topology, read_mesh, write_mesh
 from scanprep.geometry.mesh import Mesh
 from scanprep.meaning import HAND, extent, size, unit_problem
 from scanprep.threads import one_thread
 
 from ..bodies import as_body
-from .alternation import follow_alternating, model_for_turns
+from .alternation import turns_of
 from .confidence import distance_to_seen, expected_error, posterior_error, probability_within
-from .fit import ScanFit
+from .fit import ScanFit, solve_jointly
 from .free_surface import free_surface
 from .inputs import in_metres
-from .reinitialise import best_start, first_starts, redraw_limbs
+from .limbs import reinitialise_limbs
 from .scale import ScaledBody
 from .scan import View
 from .settings import CompletionConfig
+from .starts import best_start, first_starts
 
 Progress = Callable[[int, int], None]
+
+KIND, VERSION = "completion", 2       # 1 had no scale, expected error and confidence
+_ARRAYS = ("pose", "betas", "trans", "seen", "expected_error", "confidence")
+_FACTS = ("rms", "explained", "landmark_rms", "converged", "iterations")
 
 LOST = 0.5                           # share of a scan explained below which a completion means nothing
 ASTRAY, ENOUGH = 0.016, 0.9          # so far landmarks, of the size, and so little explained: left and right exchanged
@@ -97,7 +105,7 @@ def complete(body: BodyModel | Subject, scan: View | Sequence[View],
         `config.free_scale` says so.
     landmarks : ((L,) int, (L, 3) float), optional
         Vertices of the template and where they are on the scan; 4 to 10, at least 3. Without them the search
-        starts from typical poses, turned every way.
+        starts from typical poses, rotated every way.
     progress : callable, optional
         Called with (done, total).
     masked : (n,) bool, optional
@@ -110,35 +118,30 @@ def complete(body: BodyModel | Subject, scan: View | Sequence[View],
 
     [SCAPE] Eq. 10
     """
-    config = config or CompletionConfig()
-    posed = as_body(body)
-    by_turns = model_for_turns(body, config)
-    given = in_metres(posed, scan, landmarks, masked, config)
-    sized = ScaledBody(posed) if config.free_scale else None
-    task = ScanFit(sized or posed, given.cloud, given.vertices, given.points, config)
-    total = config.rounds + 3
-    tell = progress or (lambda done, total: None)
-    starts = first_starts(task)
+    config, tell = config or CompletionConfig(), progress or (lambda done, total: None)
+    total, person = config.rounds + 3, as_body(body)
+    solve = solve_jointly if config.method == "joint" else turns_of(body, config)
+    given = in_metres(person, scan, landmarks, masked, config)
+    sized = ScaledBody(person) if config.free_scale else person
+    fit = ScanFit(sized, given.cloud, given.vertices, given.points, config)
+    starts = first_starts(fit)                                # [SCAPE] §7
     tell(1, total)
-    x = redraw_limbs(task, best_start(task, starts))
+    x = reinitialise_limbs(fit, best_start(fit, starts))
     tell(2, total)
-    follow = partial(follow_alternating, task, by_turns) if by_turns else task.follow_scan
-    x, converged, rounds, energies = follow(x, lambda done: tell(2 + done, total))
-    open_error = posterior_error(task.body, x, task.precision(x))
-    if sized:
-        x, factor = sized.in_metres(x)
-        given, open_error = given.scaled(factor), factor * open_error
-    predicted = posed.template.with_vertices(posed.vertices(x))
-    cloud = task.without_ignored(given.cloud, predicted)
-    completed, seen, used, rms = free_surface(predicted, cloud, config)
+    solved = solve(fit, x, lambda done: tell(2 + done, total))            # [SCAPE] Eq. 10, Eq. 11
+    x, factor = fit.body.in_metres(solved.x)
+    given, open_error = given.scaled(factor), factor * posterior_error(fit.body, solved.x, fit.precision(solved.x))
+    predicted = person.template.with_vertices(person.vertices(x))
+    cloud = fit.without_ignored(given.cloud, predicted)
+    completed, seen, used, rms = free_surface(predicted, cloud, config)   # [SCAPE] Eq. 10, over Y
     error = expected_error(open_error, distance_to_seen(predicted, seen), rms)
     tell(total, total)
-    pose, trans, betas = posed.split(x)
-    shape = body.betas if isinstance(body, Subject) else betas if posed.n_betas else None
+    pose, trans, betas = person.split(x)
+    shape = body.betas if isinstance(body, Subject) else betas if person.n_betas else None
     off = np.linalg.norm(predicted.vertices[given.vertices] - given.points, axis=1)
     landmark_rms = float(np.sqrt((off**2).mean())) if len(off) else np.nan
-    return Completion(completed, predicted, pose, shape, trans, seen, rms, float(used.mean()),
-                      landmark_rms, converged, rounds, energies, given.metres, error,
+    return Completion(completed, predicted, pose, shape, trans, seen, rms, float(used.mean()), landmark_rms,
+                      solved.converged, solved.rounds, solved.energies, given.metres, error,
                       probability_within(error, config.tolerance))
 
 
@@ -155,3 +158,38 @@ def completion_problem(done: Completion, points: np.ndarray, free_scale: bool = 
     return (f"the body explains {100 * done.explained:.0f}% of the scan, {100 * done.seen.mean():.2g}% of it has "
             f"data{marks}; " + (wrong or ("landmarks of other places, left and right exchanged, or " if marks else "")
                                 + "a scan of something else, another model?"))
+
+
+def save_completion(folder: str | Path, completion: Completion) -> Path:
+    """Write `completed.ply`, `predicted.ply` and `completion.npz` (the arrays and figures).
+
+    Returns The folder. `completion.npz` is written last, so where it is, the meshes are too.
+    """
+    folder = Path(folder)
+    write_mesh(folder / "completed.ply", completion.completed)
+    write_mesh(folder / "predicted.ply", completion.predicted)
+    arrays = {name: getattr(completion, name) for name in _ARRAYS if getattr(completion, name) is not None}
+    facts = {name: getattr(completion, name) for name in (*_FACTS, "energies", "scale")}
+    storage.save(folder / "completion.npz", KIND, VERSION, arrays, facts)
+    return folder
+
+
+def load_completion(folder: str | Path) -> Completion:
+    """Read a folder of `save_completion`."""
+    folder = Path(folder)
+    path = folder / "completion.npz"
+    header, arrays = storage.load(path, KIND, (1, VERSION))
+    with storage.taking_apart(path, "a whole completion"):
+        completed, predicted = (read_mesh(folder / f"{name}.ply", unit="m") for name in ("completed", "predicted"))
+        check_same_topology(folder / "predicted.ply", predicted, folder / "completed.ply", completed)
+        N = len(completed.vertices)
+        shapes: dict[str, tuple[int | None, ...]] = {"pose": (None, 3), "betas": (None,), "trans": (3,), "seen": (N,),
+                                                     "expected_error": (N,), "confidence": (N,)}
+        found: dict[str, Any] = {name: storage.numbers(arrays, name, *shape, kinds="b" if name == "seen" else "f")
+                                 for name, shape in shapes.items()
+                                 if name in arrays or name in ("pose", "trans", "seen")}
+        facts: dict[str, Any] = {name: float(header[name]) for name in ("rms", "explained", "landmark_rms")}
+        return Completion(completed, predicted, **{"betas": None, **found}, **facts,
+                          converged=bool(header["converged"]), iterations=int(header["iterations"]),
+                          energies={name: float(value) for name, value in header["energies"].items()},
+                          scale=float(header["scale"]) if header["version"] > 1 else 1.0)

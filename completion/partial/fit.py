@@ -1,30 +1,35 @@
 """Pose, place and shape of a body from a scan: matches, robust weights, and a search that escapes wrong limbs."""
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from copy import copy
+from dataclasses import dataclass
 
 import numpy as np
 
+from model.priors import LEAST_POSES, GaussianPrior, JointLimits, gaussian_prior
 from scanprep.geometry.least_squares import Residual, levenberg_marquardt, normal_equations
 from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.surface import OrientedPoints
 
 from .. import energy
 from ..bodies import FixedBody
-from ..priors import GaussianPrior, choose_prior, gaussian_prior, joint_limits
-from .free_space import find_sights
-from .masks import Cover, part_vertices
+from .free_space import Clothing, Contact, Violation, find_cameras, free_space_violation
+from .masks import part_vertices
 from .scan import ScanPoints, spread
-from .self_intersection import Contact
 from .settings import CompletionConfig
 
-Energy = Callable[[np.ndarray], Sequence[Residual]]
-Denial = tuple[np.ndarray, np.ndarray, np.ndarray]
+Terms = dict[str, Residual]
 
-TERMS = ("landmarks", "pose_prior", "joint_limits", "shape_prior", "scan_planes", "scan_points", "trespass")
 LIKELY = 0.04                        # metres: matches closer than this are mostly right
 SETTLED = 5e-4                       # metres, root mean square over the vertices from round to round
+REACH, FINAL_REACH = 0.2, 0.03       # metres: limits on the distance of matches in the first round and the last
+QUICK = 3000                         # vertices that a quick look takes
+BEYOND = 0.2                         # radians that joints may rotate farther than in the training poses
+MIN_COSINE = 0.6                     # between the normals of a match
+# Independent measurements that a whole scan is worth: what the model cannot follow is alike at neighbouring points, so
+# this is far fewer than there are points.
+EVIDENCE = 400.0
 
 
 class ScanFit:
@@ -37,10 +42,9 @@ class ScanFit:
                  config: CompletionConfig) -> None:
         self.body, self.config = body, config
         self.vertices, self.points = vertices, points
-        self.prior: GaussianPrior = gaussian_prior(body.pose_mean, body.pose_covariance, config.prior_shrinkage)
-        self.habit = choose_prior(config.pose_prior, body.pose_mean, body.pose_covariance, body.pose_examples,
-                                  body.skeleton.parents, config.prior_shrinkage)
-        self.limits = joint_limits(body.pose_examples)
+        self.prior: GaussianPrior = gaussian_prior(body.pose_mean, body.pose_covariance)
+        known = config.joint_limits and len(body.pose_examples) >= LEAST_POSES
+        self.limits = JointLimits.from_poses(body.pose_examples, 1.0, BEYOND) if known else None
         self.spread = spread(body.template.vertices, config.model_points)
         self.ignored = part_vertices(body.template, body.skeleton, config.ignored_parts)
         self.matched = self.spread[~self.ignored[self.spread]]
@@ -56,14 +60,20 @@ class ScanFit:
         self.thin = cloud.thinned(config.scan_points)
         self.coarse = cloud.thinned(config.scan_points // 4)
         self.tree = OrientedPoints(cloud.points, cloud.normals)
-        self.sight = find_sights(cloud) if config.silhouette_weight > 0 else None
-        self.cover = None if cloud.masked is None else Cover(cloud.masked)
+        self.cameras = find_cameras(cloud) if config.free_space_weight > 0 else ()
+        self.clothing = None if cloud.masked is None else Clothing(cloud.masked)
 
     def on(self, cloud: ScanPoints) -> ScanFit:
         """The same body with another scan, without landmarks; all that belongs to the body is shared."""
         out = copy(self)
         out.vertices, out.points = np.zeros(0, dtype=np.int64), np.zeros((0, 3))
         out._take(cloud)
+        return out
+
+    def held(self, x: np.ndarray) -> ScanFit:
+        """The same scan with the body that has the shape of unknowns (P,), as one of known shape."""
+        out = copy(self)
+        out.body = self.body.held(x)
         return out
 
     def mesh(self, x: np.ndarray) -> Mesh:
@@ -74,7 +84,7 @@ class ScanFit:
         """(n,) bool: points of the scan with nothing of the body near."""
         mesh = self.mesh(x)
         found = OrientedPoints(mesh.vertices, mesh.vertex_normals).match(scan.points, scan.normals, 0.05,
-                                                                         self.config.min_cosine)
+                                                                         MIN_COSINE)
         return ~found.valid
 
     def without_ignored(self, cloud: ScanPoints, predicted: Mesh) -> ScanPoints:
@@ -89,84 +99,101 @@ class ScanFit:
         config = self.config
         mesh = self.mesh(x)
         found = OrientedPoints(mesh.vertices, mesh.vertex_normals).match(self.thin.points, self.thin.normals, cap,
-                                                                         config.min_cosine)
+                                                                         MIN_COSINE)
         counted = np.minimum(found.distances, cap)**2 * ~(found.valid & self.ignored[found.index])
         apart = counted.mean()
-        for weight, ids, (excess, _, _) in self._denials(mesh):
-            apart += weight * (np.minimum(excess, cap)**2).sum() / len(ids)
+        for weight, ids, found_out in self._violations(mesh):
+            apart += weight * (np.minimum(found_out.excess, cap)**2).sum() / len(ids)
         off = ((mesh.vertices[self.vertices] - self.points)**2).sum() / config.landmark_sd**2
-        return float(config.evidence * apart / config.scan_sd**2 + off) + self.unlikely(x)
+        return float(EVIDENCE * apart / config.scan_sd**2 + off) + self.unlikely(x)
+
+    def quick_misfits(self, x: np.ndarray, moved: np.ndarray | None = None, cap: float = 0.1) -> np.ndarray:
+        """How badly bodies (n, P) explain the scan, on few vertices whose normals rotate with their parts.
+
+        Where the bodies differ in some parts only, these alone are tested for passing through others.
+        """
+        ids, few = spread(self.body.template.vertices, QUICK), slice(None, None, 3)
+        contact = Contact(self.body.skeleton, self.part[ids[few]])
+        pose, trans, _ = self.body.split(x)
+        places, normals = self.posed_points(ids, pose, trans)
+        out = np.empty(len(x))
+        for i, (y, n) in enumerate(zip(places, normals, strict=True)):
+            found = OrientedPoints(y, n).match(self.coarse.points, self.coarse.normals, cap, MIN_COSINE)
+            apart = (np.minimum(found.distances, cap)**2).mean()
+            depth = contact.violation(y[few], n[few], moved).excess
+            apart += self.config.contact_weight * (np.minimum(depth, cap)**2).mean()
+            if self.cameras:
+                excess = free_space_violation(self.cameras, y[few]).excess
+                apart += self.config.free_space_weight * (np.minimum(excess, cap)**2).mean()
+            out[i] = EVIDENCE * apart / self.config.scan_sd**2 + self.unlikely(x[i])
+        return out
+
+    def posed_points(self, ids: np.ndarray, poses: np.ndarray, trans: np.ndarray | None = None
+                     ) -> tuple[np.ndarray, np.ndarray]:
+        """Some vertices (B, L, 3) in poses (B, J, 3), and normals that rotate with their parts."""
+        R = self.body.skeleton.part_rotations(poses)[:, self.part[ids]]
+        normals = (R @ self.body.template.vertex_normals[ids][:, :, None])[..., 0]
+        return self.body.subject.points(ids).evaluate(poses, trans), normals
 
     def unlikely(self, x: np.ndarray) -> float:
         """Energy of the pose of unknowns (P,) before anything is measured."""
-        over = energy.joint_limits(x, self.limits).energy if self.config.joint_limits else 0.0
-        return float(self.config.prior_weight * (self.habit.energy(self.body.split(x)[0]) + over))
+        return float(sum(term.energy[0] for term in self.prior_terms(x[None]).values()))
 
-    def follow_scan(self, x: np.ndarray, tell: Callable[[int], None]
-                    ) -> tuple[np.ndarray, bool, int, dict[str, float]]:
-        """Unknowns after rounds of matching with shrinking reach, whether they settled, rounds, energies."""
-        config = self.config
-        shift, place = np.inf, self.mesh(x).vertices
-        energies: dict[str, float] = {}
-        reaches = np.geomspace(config.reach, config.final_reach, config.rounds)
-        for i, reach in enumerate([*reaches, *[config.final_reach] * 6]):
-            x, energies = self.step(x, self.thin, reach)
-            before, place = place, self.mesh(x).vertices
-            shift = float(np.sqrt(((place - before)**2).sum(axis=1).mean()))
-            tell(min(i + 1, config.rounds))
-            if i >= config.rounds and shift < SETTLED:
-                break
-        return x, bool(shift < 2 * SETTLED), i + 1, energies
+    def prior_terms(self, x: np.ndarray) -> Terms:
+        """What is known of poses (B, P) beforehand: the Gaussian, and joint limits where asked for.
+
+        [SCAPE-patent] §0090
+        """
+        weight = self.config.prior_weight
+        limits = {} if self.limits is None else {"joint_limits": energy.joint_limits(x, self.limits, weight)}
+        return {"pose_prior": energy.pose_prior(x, self.prior, weight), **limits}
 
     def step(self, x: np.ndarray, scan: ScanPoints, reach: float) -> tuple[np.ndarray, dict[str, float]]:
         """One matching and the best unknowns (P,) for it, and the energies there."""
         held = np.full(len(x), self.config.twist_weight)
         held[:3] = held[self.body.n_angles:] = 0
-        terms = self.terms(x, scan, reach)
+        data, betas = self.terms(x, scan, reach), self.body.n_angles + 3
+        stiff = max(1.0, reach / LIKELY)             # far matches are often wrong, and shape gives way before pose does
 
-        def energies(at: np.ndarray) -> list[Residual]:
-            return [*terms(at), energy.stay_near(at, x, held)]
+        def terms(at: np.ndarray) -> Terms:
+            return {**data(at), "shape_prior": energy.shape_prior(at, betas, stiff),
+                    "twists": energy.stay_near(at, x, held)}                                      # [SCAPE] Eq. 11
 
-        best = levenberg_marquardt(lambda at: normal_equations(energies(at)), x[None], 2, 1e-3).x
-        return best[0], {n: float(r.energy[0]) for n, r in zip((*TERMS, "twists"), energies(best), strict=True)}
+        best = levenberg_marquardt(lambda at: normal_equations([*terms(at).values()]), x[None], 2, 1e-3).x
+        return best[0], {name: float(term.energy[0]) for name, term in terms(best).items()}
 
     def precision(self, x: np.ndarray) -> np.ndarray:
         """(P, P) how sharply scan, landmarks and priors together determine unknowns (P,): the Gauss-Newton matrix."""
-        terms = self.terms(x, self.thin, self.config.final_reach)
-        return normal_equations(terms(x[None])).hessian[0]
+        terms = self.terms(x, self.thin, FINAL_REACH)(x[None])
+        return normal_equations([*terms.values(), energy.shape_prior(x[None], self.body.n_angles + 3)]).hessian[0]
 
-    def terms(self, x: np.ndarray, scan: ScanPoints, reach: float) -> Energy:
-        """The energies `TERMS` of unknowns (B, P) near x (P,), for the matches at x."""
-        body, config = self.body, self.config
+    def terms(self, x: np.ndarray, scan: ScanPoints, reach: float) -> Callable[[np.ndarray], Terms]:
+        """The energies of unknowns (B, P) near x (P,) for the matches at x, without what is known of shapes."""
         mesh = self.mesh(x)
         ids, target, normal, weights = self.matches(mesh, scan, reach)
-        out_ids, out_target, out_normal, out_weights = self.trespasses(mesh)
-        follow = body.follow(np.concatenate([self.vertices, ids, out_ids]), x)
+        out_ids, out_target, out_normal, out_weights = self.violations(mesh)
+        follow = self.body.follow(np.concatenate([self.vertices, ids, out_ids]), x)
         count, end = len(self.vertices), len(self.vertices) + len(ids)
-        landmark_weights = np.full(count, config.landmark_sd**-2)
-        prior, limit = self.habit.near(body.split(x)[0]), config.prior_weight * config.joint_limits
-        stiff = max(1.0, reach / LIKELY)             # far matches are often wrong, and shape gives way before pose does
+        landmark_weights = np.full(count, self.config.landmark_sd**-2)
 
-        def energies(at: np.ndarray) -> list[Residual]:
+        def terms(at: np.ndarray) -> Terms:
             points = follow(at)
-            marked, free, denied = points[:count], points[count:end], points[end:]
-            return [energy.point_to_point(marked, self.points, landmark_weights),
-                    energy.pose_prior(at, prior, config.prior_weight),
-                    energy.joint_limits(at, self.limits, limit),
-                    energy.shape_prior(at, body.n_angles + 3, stiff),
-                    energy.point_to_plane(free, target, normal, weights),
-                    energy.point_to_point(free, target, 0.1 * weights),
-                    energy.point_to_plane(denied, out_target, out_normal, out_weights)]
+            marked, free, out = points[:count], points[count:end], points[end:]
+            return {"landmarks": energy.point_to_point(marked, self.points, landmark_weights),
+                    **self.prior_terms(at),
+                    "scan_planes": energy.point_to_plane(free, target, normal, weights),
+                    "scan_points": energy.point_to_point(free, target, 0.1 * weights),
+                    "violations": energy.point_to_plane(out, out_target, out_normal, out_weights)}
 
-        return energies
+        return terms
 
     def matches(self, mesh: Mesh, scan: ScanPoints, reach: float) -> tuple[np.ndarray, ...]:
         """Vertices, scan points, their normals and weights, by closest points both ways."""
         config = self.config
         there = OrientedPoints(mesh.vertices, mesh.vertex_normals).match(scan.points, scan.normals, reach,
-                                                                         config.min_cosine)
+                                                                         MIN_COSINE)
         mine = self.matched
-        back = self.tree.match(mesh.vertices[mine], mesh.vertex_normals[mine], reach, config.min_cosine)
+        back = self.tree.match(mesh.vertices[mine], mesh.vertex_normals[mine], reach, MIN_COSINE)
         hit = back.index
         off = mesh.vertices[mine] - self.cloud.points[hit]
         along = np.einsum("nd,nd->n", off, self.cloud.normals[hit])
@@ -178,38 +205,65 @@ class ScanFit:
         normal = np.concatenate([scan.normals[a], self.cloud.normals[hit[b]]])
         distance = np.concatenate([there.distances[a], back.distances[b]])
         share = np.concatenate([np.full(a.sum(), 1 / len(scan.points)), np.full(b.sum(), 0.5 / len(mine))])
-        weights = config.evidence / config.scan_sd**2 * share * energy.geman_mcclure(distance, max(reach / 2, 0.015))
-        if self.cover is None:
+        weights = EVIDENCE / config.scan_sd**2 * share * energy.geman_mcclure(distance, max(reach / 2, 0.015))
+        if self.clothing is None:
             return ids, target, normal, weights
-        under, over, away = self.cover.below(mesh.vertices[mine], mesh.vertex_normals[mine])
-        loose = np.full(under.sum(), config.evidence / config.cover_sd**2 / len(mine))
+        under, over, away = self.clothing.below(mesh.vertices[mine], mesh.vertex_normals[mine])
+        loose = np.full(under.sum(), EVIDENCE / config.clothing_sd**2 / len(mine))
         return (np.concatenate([ids, mine[under]]), np.concatenate([target, over[under]]),
                 np.concatenate([normal, away[under]]), np.concatenate([weights, loose]))
 
-    def trespasses(self, mesh: Mesh) -> tuple[np.ndarray, ...]:
+    def violations(self, mesh: Mesh) -> tuple[np.ndarray, ...]:
         """Vertices that are where nothing can be, points and normals of the planes they should reach, weights.
 
-        The camera would have seen them, they stick out of clothing, or another part of the body is there.
+        A camera would have seen them, they stick out of clothing, or another part of the body is there.
         """
-        share = self.config.evidence / self.config.scan_sd**2
+        share = EVIDENCE / self.config.scan_sd**2
         ids, targets, normals, weights = [], [], [], []
-        for weight, mine, (excess, normal, target) in self._denials(mesh):
-            out = excess > 0
+        for weight, mine, found in self._violations(mesh):
+            out = found.excess > 0
             ids.append(mine[out])
-            targets.append(target[out])
-            normals.append(normal[out])
-            weights.append(weight * share / len(mine) * energy.geman_mcclure(excess[out], 0.1))
+            targets.append(found.target[out])
+            normals.append(found.normal[out])
+            weights.append(weight * share / len(mine) * energy.geman_mcclure(found.excess[out], 0.1))
         return tuple(np.concatenate(part) for part in (ids, targets, normals, weights))
 
-    def _denials(self, mesh: Mesh) -> list[tuple[float, np.ndarray, Denial]]:
-        """What says that vertices cannot be where they are: its weight, the vertices, and what `trespass` gives."""
+    def _violations(self, mesh: Mesh) -> list[tuple[float, np.ndarray, Violation]]:
+        """What says that vertices cannot be where they are: its weight, and the vertices."""
         config, places, normals = self.config, mesh.vertices, mesh.vertex_normals
-        found = [(config.contact_weight, self.spread, self.contact.intrusions(places[self.spread],
-                                                                              normals[self.spread]))]
-        if self.sight is not None:
-            found.append((config.silhouette_weight, self.matched,
-                          self.sight.trespass(places[self.matched], config.silhouette_tolerance)))
-        if self.cover is not None:
-            found.append((config.cover_weight, self.matched,
-                          self.cover.trespass(places[self.matched], normals[self.matched])))
+        mine = self.matched
+        found = [(config.contact_weight, self.spread, self.contact.violation(places[self.spread],
+                                                                             normals[self.spread]))]
+        if self.cameras:
+            found.append((config.free_space_weight, mine, free_space_violation(self.cameras, places[mine])))
+        if self.clothing is not None:
+            found.append((1.0, mine, self.clothing.violation(places[mine], normals[mine])))
         return found
+
+
+@dataclass(frozen=True, eq=False)
+class Solved:
+    """Unknowns (P,) at the end of the rounds, whether they settled, the rounds, and each term of the energy."""
+
+    x: np.ndarray
+    converged: bool
+    rounds: int
+    energies: dict[str, float]
+
+
+def solve_jointly(fit: ScanFit, x: np.ndarray, tell: Callable[[int], None]) -> Solved:
+    """All unknowns at once from x (P,) on, in rounds of matching with shrinking reach.
+
+    [SCAPE] Eq. 10
+    """
+    config, shift, place = fit.config, np.inf, fit.mesh(x).vertices
+    energies: dict[str, float] = {}
+    reaches = np.geomspace(REACH, FINAL_REACH, config.rounds)
+    for i, reach in enumerate([*reaches, *[FINAL_REACH] * 6]):
+        x, energies = fit.step(x, fit.thin, reach)
+        before, place = place, fit.mesh(x).vertices
+        shift = float(np.sqrt(((place - before)**2).sum(axis=1).mean()))
+        tell(min(i + 1, config.rounds))
+        if i >= config.rounds and shift < SETTLED:
+            break
+    return Solved(x, bool(shift < 2 * SETTLED), i + 1, energies)

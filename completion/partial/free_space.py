@@ -1,26 +1,45 @@
-"""What cameras must have seen is evidence too: nothing stands beside or in front of what one of them saw."""
+"""Where the body cannot be: in space that a camera saw through, outside its clothing, inside another part of itself.
+
+Each kind gives, for vertices (n, 3), a `Violation`: how deep they stand there, and the plane that they should reach.
+"""
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import cached_property
+from typing import NamedTuple
 
 import numpy as np
 from scipy.optimize import minimize
 from scipy.spatial import cKDTree
 
+from scanprep.geometry.surface import OrientedPoints
+from scanprep.skeleton.tree import Skeleton
+
 from .scan import ScanPoints, spread
 
 GRAZING = 0.3                        # cosine below which a scanner sees little
 FEW = 2000                           # points that are enough to find the viewpoint
+FACING = 0.97                        # share of the points of a scan that must face its one viewpoint
+TOLERANCE = 0.03                     # metres: the rim that scanners lose, and an inexact viewpoint
+INSIDE, PRESSED = 0.12, 0.015        # metres: half of the thickest part of a body; how deep skin may press into skin
+CLOTHING, NOISE = 0.10, 0.003        # metres that hair or a skirt may stand off the skin; that skin may stick out
+
+
+class Violation(NamedTuple):
+    """Of n vertices: metres (n,) beyond what is allowed, zero where all is well; a plane to reach: normals, points."""
+
+    excess: np.ndarray
+    normal: np.ndarray
+    target: np.ndarray
 
 
 @dataclass(frozen=True, eq=False)
-class Sight:
-    """A scan as one camera saw it."""
+class CameraView:
+    """A scan as one camera saw it: nothing stands beside or in front of what it saw."""
 
-    viewpoint: np.ndarray   # (3,), metres
-    points: np.ndarray      # (n, 3), metres
+    viewpoint: np.ndarray            # (3,), metres
+    points: np.ndarray               # (n, 3), metres
 
     @cached_property
     def _rays(self) -> tuple[np.ndarray, np.ndarray, cKDTree]:
@@ -28,13 +47,8 @@ class Sight:
         direction = (self.points - self.viewpoint) / depth[:, None]
         return depth, direction, cKDTree(direction)
 
-    def trespass(self, vertices: np.ndarray, tolerance: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """How far vertices stand where the camera saw nothing, or in front of what it saw.
-
-        `vertices` (n, 3), metres; `tolerance` metres.
-        Returns (n,), metres, beyond the tolerance; zero where there is nothing to object to; (n, 3), the way out,
-        from the vertex's side: the normal of the plane it should reach; (n, 3), metres, a point of that plane.
-        """
+    def violation(self, vertices: np.ndarray) -> Violation:
+        """How far vertices (n, 3) stand where the camera saw nothing, or in front of what it saw."""
         depth, direction, tree = self._rays
         away = vertices - self.viewpoint
         far = np.linalg.norm(away, axis=1)
@@ -42,57 +56,43 @@ class Sight:
         along = np.einsum("nd,nd->n", away, direction[near[:, 0]])
         beside = away - along[:, None] * direction[near[:, 0]]
         wide = np.linalg.norm(beside, axis=1)
-        front = np.where(chord * far[:, None] < tolerance, depth[near], np.inf).min(axis=1)
+        front = np.where(chord * far[:, None] < TOLERANCE, depth[near], np.inf).min(axis=1)
         ahead = np.where(np.isfinite(front), front - far, 0.0)
-        outside = wide > np.maximum(tolerance, ahead)
+        outside = wide > np.maximum(TOLERANCE, ahead)
         normal = np.where(outside[:, None], beside / np.maximum(wide, 1e-12)[:, None], -away / far[:, None])
-        excess = np.maximum(np.where(outside, wide, ahead) - tolerance, 0)
-        return excess, normal, vertices - excess[:, None] * normal
+        excess = np.maximum(np.where(outside, wide, ahead) - TOLERANCE, 0)
+        return Violation(excess, normal, vertices - excess[:, None] * normal)
 
 
-@dataclass(frozen=True, eq=False)
-class Sights:
-    """A scan as several cameras saw it."""
-
-    cameras: tuple[Sight, ...]  # Sight of each view whose viewpoint is known
-
-    @property
-    def points(self) -> np.ndarray:
-        """(n, 3) what all of them saw, metres."""
-        return np.concatenate([camera.points for camera in self.cameras])
-
-    def trespass(self, vertices: np.ndarray, tolerance: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """As `Sight.trespass`: what one camera denies is denied, by the one that objects most."""
-        found = [camera.trespass(vertices, tolerance) for camera in self.cameras]
-        worst = np.argmax([excess for excess, _, _ in found], axis=0)
-        each = np.arange(len(vertices))
-        excess, normal, target = (np.stack(part)[worst, each] for part in zip(*found, strict=True))
-        return excess, normal, target
+def free_space_violation(cameras: Sequence[CameraView], vertices: np.ndarray) -> Violation:
+    """That of the camera, at least one, that objects most to each of the vertices (n, 3)."""
+    found = [camera.violation(vertices) for camera in cameras]
+    if len(found) == 1:
+        return found[0]
+    worst, each = np.argmax([one.excess for one in found], axis=0), np.arange(len(vertices))
+    return Violation(*(np.stack(part)[worst, each] for part in zip(*found, strict=True)))
 
 
-def find_sights(cloud: ScanPoints) -> Sight | Sights | None:
-    """What the camera saw, or those of all views, or None when no view has a viewpoint.
-
-    What is masked was seen too.
-    """
+def find_cameras(cloud: ScanPoints) -> tuple[CameraView, ...]:
+    """The cameras of those views that have a viewpoint, given or found; what is masked was seen too."""
     seen = cloud.everything
     views = [seen.some(seen.view == number) for number in range(cloud.views)]
     given: Sequence[np.ndarray | None] = len(views) * (None,) if cloud.viewpoints is None else list(cloud.viewpoints)
-    found = [find_sight(view, place) for view, place in zip(views, given, strict=True) if len(view.points)]
-    cameras = tuple(sight for sight in found if sight is not None)
-    return None if not cameras else cameras[0] if len(cameras) == 1 else Sights(cameras)
+    found = [find_camera(view, place) for view, place in zip(views, given, strict=True) if len(view.points)]
+    return tuple(camera for camera in found if camera is not None)
 
 
-def find_sight(cloud: ScanPoints, viewpoint: np.ndarray | None = None, share: float = 0.97) -> Sight | None:
+def find_camera(cloud: ScanPoints, viewpoint: np.ndarray | None = None) -> CameraView | None:
     """The camera of a scan, or None when no single viewpoint faces nearly all of it.
 
-    `viewpoint` (3,), metres.
+    Where it is not known, it is the one that the fewest normals turn away from; its direction is good to a few
+    degrees, its distance is not.
     """
     if viewpoint is None:
         viewpoint = _facing_point(cloud)
     to = viewpoint - cloud.points
     facing = np.einsum("nd,nd->n", to, cloud.normals) > 0.05 * np.linalg.norm(to, axis=1)
-    return Sight(np.asarray(viewpoint, dtype=np.float64), cloud.points) if facing.mean() >= share else None
+    return CameraView(np.asarray(viewpoint, dtype=np.float64), cloud.points) if facing.mean() >= FACING else None
 
 
 def _facing_point(cloud: ScanPoints) -> np.ndarray:
@@ -111,3 +111,57 @@ def _facing_point(cloud: ScanPoints) -> np.ndarray:
                      options={"maxiter": 400, "xatol": 1e-3, "fatol": 1e-9}).x
     nearness = np.clip(found[3], 0.05, 0.7)
     return centre + size / nearness * found[:3] / np.linalg.norm(found[:3])
+
+
+class Contact:
+    """Some vertices of a body by the part (n,) of each: no part may enter another that is not next to it."""
+
+    def __init__(self, skeleton: Skeleton, part: np.ndarray) -> None:
+        J = len(skeleton.parents)
+        near = np.eye(J, dtype=bool)
+        child = np.arange(1, J)
+        near[child, skeleton.parents[child]] = near[skeleton.parents[child], child] = True
+        self._mine = [np.flatnonzero(part == p) for p in range(J)]
+        self._others = [np.flatnonzero(~near[p][part]) for p in range(J)]
+
+    def violation(self, places: np.ndarray, normals: np.ndarray, parts: np.ndarray | None = None) -> Violation:
+        """How deep vertices (n, 3) with normals (n, 3) stand inside another part, those of some parts or of all."""
+        depth, way = np.zeros(len(places)), np.zeros_like(places)
+        for p in range(len(self._mine)) if parts is None else parts:
+            mine, others = self._mine[p], self._others[p]
+            if not len(mine) or not len(others):
+                continue
+            far, hit = cKDTree(places[others]).query(places[mine], distance_upper_bound=INSIDE)
+            found = np.isfinite(far)
+            mine, hit = mine[found], others[hit[found]]
+            inside = np.einsum("nd,nd->n", normals[hit], places[hit] - places[mine]) - PRESSED
+            depth[mine], way[mine] = np.maximum(inside, 0), normals[hit]
+        return Violation(depth, way, places + depth[:, None] * way)
+
+
+class Clothing:
+    """Points of clothing and hair: the body is inside them."""
+
+    def __init__(self, scan: ScanPoints) -> None:
+        self.scan = scan
+        self._near = OrientedPoints(scan.points, scan.normals)
+
+    def violation(self, places: np.ndarray, normals: np.ndarray) -> Violation:
+        """How far vertices (n, 3) with normals (n, 3) stick out; zero inside, and where no clothing is."""
+        over, out, near = self._over(places, normals)
+        depth = np.where(over, np.maximum(out - NOISE, 0), 0.0)
+        normal = self.scan.normals[near]
+        return Violation(depth, normal, places - depth[:, None] * normal)
+
+    def below(self, places: np.ndarray, normals: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Which vertices (n,) are under it, and the point (n, 3) and normal (n, 3) of what lies over each."""
+        over, out, near = self._over(places, normals)
+        return over & (out < 0), self.scan.points[near], self.scan.normals[near]
+
+    def _over(self, places: np.ndarray, normals: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Whether something lies over a vertex or under it, how far the vertex is outside, and which point it is."""
+        found = self._near.match(places, normals, CLOTHING, 0.3)
+        off = places - self.scan.points[found.index]
+        out = np.einsum("nd,nd->n", off, self.scan.normals[found.index])
+        beside = np.sqrt(np.maximum((off**2).sum(axis=1) - out**2, 0))
+        return found.valid & (beside < 2 * self.scan.spacing + 0.3 * np.abs(out)), out, found.index

@@ -8,8 +8,11 @@ from scanprep.geometry import sparse
 from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.surface import Surface
 
+from .fit import MIN_COSINE
 from .scan import ScanPoints
 from .settings import CompletionConfig
+
+NEAR, ROUNDS = 0.03, 4              # metres: limit on the distance of scan points to the free surface; its matchings
 
 
 class FreeSurface:
@@ -60,10 +63,10 @@ def free_surface(predicted: Mesh, cloud: ScanPoints, config: CompletionConfig
     """
     solver = FreeSurface(predicted)
     mesh = predicted
-    for _ in range(config.surface_rounds):
+    for _ in range(ROUNDS):
         found = Surface(mesh).closest(cloud.points)
-        agree = np.einsum("nd,nd->n", mesh.face_normals[found.faces], cloud.normals) > config.min_cosine
-        used = agree & (found.distances < config.surface_reach)
+        agree = np.einsum("nd,nd->n", mesh.face_normals[found.faces], cloud.normals) > MIN_COSINE
+        used = agree & (found.distances < NEAR)
         weights = _rows(predicted, found.faces[used], found.bary[used])
         mesh = predicted.with_vertices(solver.solve(predicted.vertices, weights, cloud.points[used],
                                                     np.full(used.sum(), config.surface_weight)))

@@ -12,50 +12,10 @@ from scipy.spatial import cKDTree
 from scanprep.geometry import storage
 from scanprep.geometry.files import read_points
 from scanprep.geometry.mesh import Mesh
-from scanprep.geometry.surface import OrientedPoints
 from scanprep.skeleton.tree import Skeleton
 
-from .scan import ScanPoints
-
-REACH = 0.10                         # metres that hair or a skirt may stand off the skin
 GREY = 0.1                           # least difference of two channels of a colour that marks
 NEAR = 6e-4                          # of the scan's extent: from a point of a marked file to the point it means
-
-
-class Cover:
-    """What lies over the skin: the body is inside it.
-
-    `tolerance`, metres, how far skin may stick out, for noise.
-    """
-
-    def __init__(self, scan: ScanPoints, tolerance: float = 0.003) -> None:
-        self.scan, self.tolerance = scan, tolerance
-        self._near = OrientedPoints(scan.points, scan.normals)
-
-    def trespass(self, places: np.ndarray, normals: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """How far vertices stick out of it.
-
-        `places, normals` (n, 3).
-        Returns (n,), metres, beyond the tolerance; zero inside, and where no clothing is; (n, 3), normal of the plane
-        to reach; (n, 3), metres, a point of that plane.
-        """
-        over, out, near = self._over(places, normals)
-        depth = np.where(over, np.maximum(out - self.tolerance, 0), 0.0)
-        normal = self.scan.normals[near]
-        return depth, normal, places - depth[:, None] * normal
-
-    def below(self, places: np.ndarray, normals: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Which vertices (n,) are under it, and the point (n, 3) and normal (n, 3) of what lies over each."""
-        over, out, near = self._over(places, normals)
-        return over & (out < 0), self.scan.points[near], self.scan.normals[near]
-
-    def _over(self, places: np.ndarray, normals: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Whether something lies over a vertex or under it, how far the vertex is outside, and which point it is."""
-        found = self._near.match(places, normals, REACH, 0.3)
-        off = places - self.scan.points[found.index]
-        out = np.einsum("nd,nd->n", off, self.scan.normals[found.index])
-        beside = np.sqrt(np.maximum((off**2).sum(axis=1) - out**2, 0))
-        return found.valid & (beside < 2 * self.scan.spacing + 0.3 * np.abs(out)), out, found.index
 
 
 def part_vertices(template: Mesh, skeleton: Skeleton, names: Sequence[str]) -> np.ndarray:

@@ -74,12 +74,11 @@ def scan_shapes(scan: View | Sequence[View], masked: np.ndarray | None = None, m
 
 
 def picture_distance(mesh: Mesh, distance: np.ndarray, views: Sequence[Camera], high: float = 0.01,
-                     height: int | None = None, title: str = "distance", labels: Sequence[str] | None = None
+                     title: str = "distance", labels: Sequence[str] | None = None, height: int | None = None
                      ) -> np.ndarray:
     """A mesh coloured by a distance (N,) in metres from several sides, with its colour bar; grey where it is NaN."""
     width, height = _size(views, height or HEIGHT)
-    colored = Solid(mesh, heat(distance, 0.0, high))
-    images = [render(colored, view, width, height) for view in views]
+    images = [render([Solid(mesh, heat(distance, 0.0, high))], view, width, height) for view in views]
     return side_by_side([side_by_side(images, labels), color_bar(0.0, high, title)], columns=1)
 
 
@@ -91,59 +90,45 @@ def scan_distances(points: np.ndarray, mesh: Mesh, body: Mesh, seen: np.ndarray)
 
 
 def completion_page(scan: View | Sequence[View], completion: Completion, template: Mesh, name: str,
-                    rows: list[tuple[str, Any, str]], masked: np.ndarray | None = None,
-                    landmarks: tuple[np.ndarray, np.ndarray] | None = None, picture: np.ndarray | None = None
-                    ) -> Page:
-    """The page of `scape complete`.
+                    rows: list[tuple[str, Any, str]], picture: np.ndarray, masked: np.ndarray | None = None,
+                    landmarks: tuple[np.ndarray, np.ndarray] | None = None) -> Page:
+    """The page of `scape complete`: name of the scan, rows (metric, value, unit), its `picture_completion`.
 
-    `rows` (metric, value, unit) of the table; `masked` (n,) bool, as for `complete`; `landmarks` ((L,) int, (L,
-    3)), as for `complete`, in the unit of the scan; `picture` (H, W, 3) uint8, that of `picture_completion`, where
-    it is there already.
+    `masked` and `landmarks` are those of `complete`, in the unit of the scan.
     """
-    cameras = sides(completion, template)
-    body = completion.completed
-    plain = Mesh(body.vertices, body.faces)
+    cameras, body = sides(completion, template), completion.completed
+    plain, (width, height) = Mesh(body.vertices, body.faces), _size(cameras, HEIGHT)
+
+    def all_sides(*shapes: Shape) -> np.ndarray:
+        return side_by_side([render(list(shapes), view, width, height) for view in cameras], SIDES)
+
     page = Page(f"{name}, completed", "Blue was measured, yellow was filled in by the body model."
                 + (" Violet is clothing or hair: the body is somewhere inside." if masked is not None else ""))
-    page.picture(picture_completion(scan, completion, template, masked=masked) if picture is None else picture)
+    page.picture(picture)
     page.table(rows, ("metric", "value", "unit"))
-    width, height = _size(cameras, HEIGHT)
     marks = [] if landmarks is None else [Dots(completion.scale * np.asarray(landmarks[1]), MARK, 0.012, True)]
     page.section("From all sides", "The completed body." + (" Red: where the landmarks are on the scan."
                                                             if marks else ""))
-    page.picture(side_by_side([render([Solid(plain, _two_colors(completion)), *marks], view, width, height)
-                               for view in cameras], SIDES))
+    page.picture(all_sides(Solid(plain, _two_colors(completion)), *marks))
     if body.colors is not None:
         page.section("Colours", "Carried over from the scan where it was seen; elsewhere grey, or spread smoothly when "
                      "--fill-colors asks for it.")
-        page.picture(side_by_side([render(Solid(body), view, width, height) for view in cameras], SIDES))
-    _distances(page, scan, completion, cameras, masked)
-    _confidence(page, completion, cameras)
-    return page
-
-
-def _distances(page: Page, scan: View | Sequence[View], completion: Completion, cameras: list[Camera],
-               masked: np.ndarray | None) -> None:
-    points = completion.scale * all_points(scan)
-    points = points if masked is None else points[~masked]
-    body = Mesh(completion.completed.vertices, completion.completed.faces)
+        page.picture(all_sides(Solid(body)))
     page.section("Distance of the scan", "Grey: no data. The completed mesh follows the scan, up to its noise; the "
                  "predicted mesh is the model's own, and where it is far off the model cannot follow.")
-    for mesh, high, title in ((completion.completed, 0.005, "distance of the scan to the completed mesh"),
-                              (completion.predicted, 0.015, "distance of the scan to the predicted mesh")):
-        distance = scan_distances(points, mesh, body, completion.seen)
-        page.picture(picture_distance(body, distance, cameras, high, HEIGHT, title, SIDES))
-
-
-def _confidence(page: Page, completion: Completion, cameras: list[Camera]) -> None:
-    expected = completion.expected_error
-    if expected is None:
-        return
-    body = Mesh(completion.completed.vertices, completion.completed.faces)
-    high = float(np.ceil(200 * np.nanquantile(expected, 0.98)) / 200)
-    page.section("How far to trust it", "The error to expect of each vertex: small where it was measured, larger the "
-                 "further it is from what was, and the less the model and the usual poses say of it.")
-    page.picture(picture_distance(body, expected, cameras, max(high, 0.005), HEIGHT, "expected error", SIDES))
+    points = completion.scale * all_points(scan)
+    points = points if masked is None else points[~masked]
+    for mesh, high, which in ((body, 0.005, "completed"), (completion.predicted, 0.015, "predicted")):
+        far = scan_distances(points, mesh, plain, completion.seen)
+        page.picture(picture_distance(plain, far, cameras, high, f"distance of the scan to the {which} mesh",
+                                      SIDES))
+    if completion.expected_error is not None:
+        page.section("Expected error", "Of each vertex: small where it was measured, larger the further it is from "
+                     "what was, and the less the model and the usual poses say of it.")
+        high = float(np.ceil(200 * np.nanquantile(completion.expected_error, 0.98)) / 200)
+        page.picture(picture_distance(plain, completion.expected_error, cameras, max(high, 0.005), "expected error",
+                                      SIDES))
+    return page
 
 
 def _two_colors(completion: Completion) -> np.ndarray:

@@ -7,16 +7,16 @@ from functools import partial
 import numpy as np
 from scipy.spatial import cKDTree
 
+from model.priors import gaussian_prior, typical_poses
 from scanprep.geometry import rotations
 from scanprep.geometry.least_squares import Dense, levenberg_marquardt, normal_equations
 
 from .. import energy
 from ..bodies import FixedBody, Follow
 from ..energy import MovingPoints
-from ..priors import gaussian_prior, typical_poses
 from .scan import spread
-from .search import all_turns
 from .settings import CompletionConfig
+from .starts import all_rotations
 
 LOOSE = 0.3                          # standard deviation of the logarithm of what the first guess is off by
 POINTS = 1500                        # that show how far a scan extends
@@ -87,7 +87,7 @@ def rough_scale(body: FixedBody, points: np.ndarray) -> float:
     part = body.skeleton.part_of_vertex(body.template)[ids]
     R = body.skeleton.part_rotations(poses)[:, part]
     normals = (R @ body.template.vertex_normals[ids][:, :, None])[..., 0]
-    toward = all_turns(DIRECTIONS)[:, :, 0]
+    toward = all_rotations(DIRECTIONS)[:, :, 0]
     sizes, forms = [], []
     for y, n in zip(places, normals, strict=True):
         seen = (toward @ n.T > 0.15).astype(float)
@@ -117,7 +117,7 @@ def _extent(points: np.ndarray, weights: np.ndarray | None = None) -> tuple[np.n
 def landmark_scale(body: FixedBody, vertices: np.ndarray, points: np.ndarray, config: CompletionConfig) -> float:
     """What to multiply landmarks (L, 3) with, which are roughly in metres, to be in metres more closely."""
     scaled = ScaledBody(body)
-    prior = gaussian_prior(body.pose_mean, body.pose_covariance, config.prior_shrinkage)
+    prior = gaussian_prior(body.pose_mean, body.pose_covariance)
     poses = _usual_poses(body)
     here = body.subject.points(vertices).evaluate(poses, np.zeros((len(poses), 3)))
     start, misfit = [], []

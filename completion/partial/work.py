@@ -1,9 +1,11 @@
-"""One scan of `scape complete`: read, completed, coloured, written with its page."""
+"""The scans of `scape complete`: files read, completed, coloured, written with their pages."""
 from __future__ import annotations
 
 import time
 import warnings
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from html import escape
 from pathlib import Path
 
 import numpy as np
@@ -13,32 +15,37 @@ from model.linear import Subject
 from scanprep.batch.room import Room
 from scanprep.cli import MM, Unit
 from scanprep.console import Metric, Outcome, write_report
+from scanprep.geometry.files import POINT_ENDINGS, PointCloud, read_mesh, read_points
 from scanprep.geometry.landmarks import match_landmarks, read_landmarks
 from scanprep.geometry.mesh import Mesh
+from scanprep.pictures.page import Page
 from scanprep.pictures.sheets import save_png
-from scanprep.pictures.textures import bake, write_textured
+from scanprep.pictures.textures import Texture, bake, read_texture, write_textured
+from scanprep.pipeline.scans import find_scans
 
 from .colors import ColorConfig, blend, carry_colors, colored_views
-from .completion import Completion, complete, completion_problem
+from .completion import Completion, complete, completion_problem, save_completion
 from .masks import read_mask
 from .report import completion_page, picture_completion
-from .results import save_completion
 from .scan import all_points, point_count
 from .settings import CompletionConfig
-from .views import ScanFiles, read_views
+
+_STYLE = """.scan { display: grid; grid-template-columns: minmax(9rem, 1fr) 3fr; gap: 1rem; margin: 1.4rem 0; }
+.scan img { width: 100%; } .scan p { margin: .2rem 0; }"""
+MEANS = ("distance of the scan to the completed mesh, RMS", "scan points explained", "vertices with data")
 
 
 @dataclass(frozen=True, eq=False)
 class Work:
     """What the scans of one call have in common."""
 
-    body: BodyModel | Subject  # BodyModel or Subject
-    model: str              # name of the model, for the report
-    marks: dict[str, int]   # name -> vertex of the template
-    config: CompletionConfig  # CompletionConfig
-    unit: Unit | None = None  # of the scans and landmarks, where the files cannot tell
-    colors: ColorConfig = field(default_factory=ColorConfig)  # ColorConfig
-    command: str = field(default="", metadata={"digest": False})
+    body: BodyModel | Subject
+    model: str                       # its name, for the report
+    marks: dict[str, int]            # name -> vertex of the template
+    config: CompletionConfig
+    unit: Unit | None = None         # of the scans and landmarks, where the files cannot tell
+    colors: ColorConfig = field(default_factory=ColorConfig)
+    command: str = field(default="", metadata={"digest": False})     # for the report of each scan of a folder
 
     def __call__(self, inputs: Inputs, room: Room) -> list[Metric]:
         """Complete the scan of some files; the figures."""
@@ -58,10 +65,24 @@ class Inputs:
     landmarks: Path | None = None
     masks: tuple[Path, ...] = ()
 
+
+@dataclass(frozen=True, eq=False)
+class ScanFiles:
+    """The views of one scan, and the texture of each that has one."""
+
+    views: tuple[Mesh | PointCloud, ...]
+    textures: tuple[Texture | None, ...]
+
     @property
-    def name(self) -> str:
-        """For the title of the page."""
-        return ", ".join(path.name for path in self.scans)
+    def colored(self) -> bool:
+        """Whether any view has colours or a texture."""
+        return any(t is not None or v.colors is not None for v, t in zip(self.views, self.textures, strict=True))
+
+    @property
+    def mesh(self) -> Mesh | None:
+        """What vertices and faces of a landmark file can refer to: the mesh, where there is one view."""
+        only = self.views[0]
+        return only if len(self.views) == 1 and isinstance(only, Mesh) else None
 
 
 def complete_files(work: Work, inputs: Inputs, room: Room) -> list[Metric]:
@@ -75,10 +96,9 @@ def complete_files(work: Work, inputs: Inputs, room: Room) -> list[Metric]:
         files = read_views(inputs.scans, work.unit)
         landmarks = _landmarks(work, inputs, files)
         masked = read_masks(inputs.masks, files, work.unit)
-    views = list(files.views)
+    views, output = list(files.views), room.folder
     done = room.step("completion", (work.body, work.marks, work.config, work.unit, inputs),
                      lambda: complete(work.body, views, landmarks, work.config, room.tell, masked))
-    output = room.folder
     if files.colored:
         done = _with_colors(work, files, done, output)
     save_completion(output, done)
@@ -87,8 +107,9 @@ def complete_files(work: Work, inputs: Inputs, room: Room) -> list[Metric]:
     picture = picture_completion(views, done, work.body.template, masked=masked)
     save_png(output / "picture.png", picture)
     rows = [(m.name, m.value, m.unit) for m in metrics]
-    page = completion_page(views, done, work.body.template, inputs.name, rows, masked, landmarks, picture)
-    page.write(output / "report.html")
+    name = ", ".join(path.name for path in inputs.scans)
+    completion_page(views, done, work.body.template, name, rows, picture, masked, landmarks).write(
+        output / "report.html")
     return metrics
 
 
@@ -148,3 +169,60 @@ def _with_colors(work: Work, files: ScanFiles, done: Completion, output: Path) -
         write_textured(output / "completed.glb",
                        bake(mesh, lambda places, normals: blend(known, places, normals, work.colors), colors))
     return replace(done, completed=Mesh(mesh.vertices, mesh.faces, colors))
+
+
+def read_views(paths: Sequence[Path], unit: str | None = None) -> ScanFiles:
+    """Read the views of a scan."""
+    views = tuple(read_view(path, unit) for path in paths)
+    return ScanFiles(views, tuple(read_texture(path, unit) if isinstance(view, Mesh) else None
+                                  for path, view in zip(paths, views, strict=True)))
+
+
+def read_view(path: Path, unit: str | None = None) -> Mesh | PointCloud:
+    """A mesh, or the points of a file without triangles with the normals and colours that it has."""
+    if path.suffix.lower() in POINT_ENDINGS:
+        return read_points(path, unit)
+    try:
+        return read_mesh(path, unit)
+    except ValueError as error:
+        if "no faces" in str(error):
+            return read_points(path, unit)
+        raise
+
+
+def folder_inputs(folder: Path, landmarks: Path | None, masks: Path | None) -> dict[str, Inputs]:
+    """The scans of a folder by name, with their landmarks, in their folder or its own, and masks of their names."""
+    if masks is not None and not masks.is_dir():
+        raise ValueError(f"--mask: expected a folder of masks for a folder of scans, there is none at {masks}")
+    found = {}
+    for task in find_scans(folder, landmarks):
+        mine = sorted(p for p in masks.iterdir() if p.name.split(".")[0] == task.name) if masks else []
+        found[task.name] = Inputs((task.scan,), task.landmarks, tuple(mine[:1]))
+    return found
+
+
+def summary(metrics: Mapping[str, Sequence[Metric]], fresh: int, count: int) -> list[Metric]:
+    """The rows of the closing table."""
+    rows = [Metric("scans completed", f"{len(metrics)} of {count}"), Metric("of them in this run", fresh)]
+    for name in MEANS:
+        found = [m for of_one in metrics.values() for m in of_one if m.name == name]
+        if found:
+            rows.append(Metric(f"{name}, mean", float(np.mean([float(m.value) for m in found])), found[0].unit))
+    return rows
+
+
+def folder_page(metrics: Mapping[str, Sequence[Metric]], failures: Sequence[str]) -> Page:
+    """The page of all scans, those worst explained first."""
+    page = Page(f"{len(metrics)} scans completed", "Worst first; each picture leads to the page of its scan.")
+    if failures:
+        page.section("Failed").table([(line,) for line in failures])
+
+    def explained(name: str) -> float:
+        return next((float(m.value) for m in metrics[name] if m.name == MEANS[1]), 0.0)
+
+    for name in sorted(metrics, key=explained):
+        told = "".join(f"<p>{escape(f'{m.name}: {m.text()} {m.unit}')}</p>" for m in metrics[name][:3])
+        page.markup(f'<div class="scan"><div><a href="{escape(name)}/report.html"><b>{escape(name)}</b></a>{told}</div>'
+                    f'<a href="{escape(name)}/report.html"><img src="{escape(name)}/picture.png" '
+                    f'alt="{escape(name)}, completed"></a></div>', _STYLE)
+    return page

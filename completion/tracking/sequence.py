@@ -2,6 +2,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Iterable, Sized
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -77,13 +78,12 @@ def track(body: BodyModel | Subject, frames: Iterable[Frame], config: TrackConfi
         done.append(without_points(frame))
         if progress is not None:
             progress(len(done), max(total, len(done)))
-    return as_motion(done, tracker.betas, rate, config)
+    return as_motion(done, tracker.state.betas, rate, config)
 
 
 def without_points(frame: TrackedFrame) -> TrackedFrame:
     """The frame without what it was found from, which is large."""
-    return TrackedFrame(frame.number, frame.x, frame.found, frame.residual, frame.explained, frame.gradient,
-                        frame.precision)
+    return replace(frame, cloud=None)
 
 
 def as_motion(frames: list[TrackedFrame], betas: np.ndarray | None, rate: float, config: TrackConfig) -> Motion:

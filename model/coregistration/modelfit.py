@@ -8,6 +8,7 @@ from functools import lru_cache
 import numpy as np
 from scipy.spatial import cKDTree
 
+from model.priors import typical_poses, whitening
 from scanprep.geometry import rotations
 from scanprep.geometry.least_squares import Dense, levenberg_marquardt
 from scanprep.geometry.mesh import Mesh
@@ -17,7 +18,6 @@ from ..body import BodyModel
 from ..features import twists
 from ..fitting import share_of_vertices, spread_vertices
 from ..linear import Subject
-from ..priors import typical_poses, whitening
 from .attraction import Attraction, apart, attraction, towards
 from .config import ModelFitConfig, PoseStage
 from .posed import PosedPoints, posed_points

@@ -6,9 +6,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from model.priors import sample_poses
+
 from ..body import BodyModel
 from ..fitting import FitConfig, ShapeFitter
-from ..priors import sample_poses
 from .errors import checked_bodies, checked_counts
 
 Progress = Callable[[int, int], None]

@@ -7,6 +7,7 @@ from typing import Literal
 
 import numpy as np
 
+from model.priors import sample_poses
 from scanprep.cli import Output, Unit
 from scanprep.console import Metric, Outcome, Progress, bar
 from scanprep.geometry.files import write_mesh
@@ -18,7 +19,6 @@ from ..body import BodyModel
 from ..cli import ModelArg
 from ..files import load_model
 from ..linear import Subject
-from ..priors import sample_poses
 from .bvh import write_bvh
 from .correctives import motion_correctives, spaced
 from .glb import write_skinned_glb

@@ -5,11 +5,11 @@ from pathlib import Path
 
 import numpy as np
 
+from model.priors import sample_poses
 from scanprep.geometry import rotations
 from scanprep.geometry.storage import writing
 
 from ..body import BodyModel
-from ..priors import sample_poses
 from .correctives import rest_corrections
 from .rig import Rig, make_rig
 

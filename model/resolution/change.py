@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 from scipy.spatial import cKDTree
 
+from model.priors import sample_poses
 from scanprep.decimation.decimate import DecimateConfig, decimate
 from scanprep.geometry.mesh import Mesh, check_template
 from scanprep.geometry.surface import Surface
@@ -16,7 +17,6 @@ from scanprep.skeleton.tree import Skeleton
 
 from ..body import BodyModel
 from ..pose_space import PoseSpace, faces_of_part
-from ..priors import sample_poses
 from ..scape import BlendScapeModel, ScapeModel
 from ..shape_space import ShapeSpace
 from ..skinning import SkinningModel

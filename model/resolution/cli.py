@@ -5,6 +5,7 @@ from pathlib import Path
 
 import numpy as np
 
+from model.priors import sample_poses
 from scanprep.cli import Output, Unit
 from scanprep.console import Metric, Outcome, bar
 from scanprep.geometry.files import read_mesh
@@ -12,7 +13,6 @@ from scanprep.ranges import Faces
 
 from ..cli import ModelArg
 from ..files import load_model
-from ..priors import sample_poses
 from .change import ResolutionConfig, change_resolution, resample, resolution_gap
 
 MEASURED = 20                        # poses in which the two models are compared

@@ -15,8 +15,6 @@ from ..ranges import FLAG, Positive, Settings, SomeShare
 from ..threads import search_threads
 
 LEAST = 6                   # matches that determine a motion
-ROUNDS, SETTLED = 60, 1e-6  # most rounds of matching; a round that moves less, as a share of the points' spread
-ASTRAY = 0.025              # of the smaller extent: surfaces so far apart do not lie on each other
 
 
 @dataclass(frozen=True)
@@ -57,8 +55,7 @@ class RigidAlignment:
 
 
 def align_landmarks(source: np.ndarray, target: np.ndarray, scale: bool = False) -> RigidAlignment:
-    """The rotation and translation, optionally with scale, that bring landmarks (L, 3) nearest to their targets (L, 3).
-    """
+    """The rotation and translation, optionally with scale, that bring landmarks (L, 3) nearest to their targets."""
     source, target = _points(source, "source"), _points(target, "target")
     if source.shape != target.shape:
         raise ValueError(f"target: expected {len(source)} landmarks as in source, got {len(target)}")
@@ -104,7 +101,7 @@ def align_rigid(source: Mesh | np.ndarray, target: Mesh | np.ndarray,
     tree = cKDTree(goal.points)
     spread = np.linalg.norm(moving - moving.mean(axis=0), axis=1).mean()
     settled, rounds, rms, inliers = False, 0, np.nan, 0
-    while rounds < ROUNDS and not settled:
+    while rounds < 60 and not settled:
         moved = apply(T, moving)
         distance, near = tree.query(moved, workers=search_threads(len(moved)))
         good = (distance <= reach) & (distance <= np.quantile(distance, config.keep)) & ~goal.border[near]
@@ -114,7 +111,7 @@ def align_rigid(source: Mesh | np.ndarray, target: Mesh | np.ndarray,
         step, residual = _plane_step(moved[good], goal.points[near[good]], goal.normals[near[good]])
         T = step @ T
         rms = float(np.sqrt(np.mean(residual**2)))
-        settled = bool(np.abs(apply(T, moving) - moved).mean() <= SETTLED * spread)
+        settled = bool(np.abs(apply(T, moving) - moved).mean() <= 1e-6 * spread)
         rounds += 1
     return RigidAlignment(T, rms, inliers, settled, rounds)
 
@@ -161,7 +158,8 @@ def _points(points: np.ndarray, name: str) -> np.ndarray:
 def alignment_problem(source: np.ndarray, target: np.ndarray, found: RigidAlignment) -> str | None:
     """Why a rigid alignment of points (n, 3) to others means nothing; None where it means something."""
     ours, theirs = extent(source), extent(target)
-    if found.inliers >= LEAST and found.rms <= ASTRAY * min(ours, theirs):
+    # surfaces farther apart than a fortieth of the smaller one do not lie on each other
+    if found.inliers >= LEAST and found.rms <= 0.025 * min(ours, theirs):
         return None
     off = f"the surfaces are {1000 * found.rms:.0f} mm apart" if found.inliers >= LEAST else "the surfaces do not meet"
     return f"{off}; " + (unit_problem(ours, theirs, "the source is", 0.05) or

@@ -13,10 +13,7 @@ from ..geometry.seen_space import SeenSpace
 from ..geometry.surface import OrientedPoints
 from .icp import landmark_motion, transform
 
-ROUNDS = 50                                        # of moving each view onto the mean places of its landmarks
-SPACING, REACH, BINS = 1 / 120, 1 / 18, 11      # shares of a view's extent: between described points; described
-INLIER, NEAR, THROUGH = 1 / 60, 1 / 120, 1 / 60
-DRAWS, PROPOSALS, JUDGES, TRIED, ICP_ROUNDS = 30_000, 4000, 1500, 12, 12
+REACH = 1 / 18                # of a view's extent: radius of the neighbourhoods that are described
 
 
 def place_by_landmarks(landmarks: Sequence[Mapping[str, np.ndarray]], count: int) -> np.ndarray:
@@ -46,7 +43,7 @@ def place_by_landmarks(landmarks: Sequence[Mapping[str, np.ndarray]], count: int
                              "expected at least three that are not on one line")
         T[view] = landmark_motion(points[view][shared], _means(T[placed], points[placed])[shared])
         placed.append(view)
-    for _ in range(ROUNDS):
+    for _ in range(50):
         means = _means(T, points)
         for view in range(1, count):
             good = seen[view] & (seen.sum(axis=0) > 1)
@@ -112,7 +109,7 @@ def place_by_features(views: list[tuple[Mesh, np.ndarray]], rng: np.random.Gener
 def _described(mesh: Mesh, extent: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Points (n, 3) spread over a view, their normals, and a histogram (n, 33) for each."""
     even = smooth(mesh, 10)
-    rows = np.unique(np.floor(even.vertices / (SPACING * extent)).astype(np.int64), axis=0, return_index=True)[1]
+    rows = np.unique(np.floor(even.vertices / (extent / 120)).astype(np.int64), axis=0, return_index=True)[1]
     p, n = even.vertices[rows], even.vertex_normals[rows]
     a, b = cKDTree(p).query_pairs(REACH * extent, output_type="ndarray").T
     a, b = np.r_[a, b], np.r_[b, a]
@@ -125,9 +122,10 @@ def _described(mesh: Mesh, extent: float) -> tuple[np.ndarray, np.ndarray, np.nd
     alpha = np.einsum("nd,nd->n", v, n[b])
     phi = np.einsum("nd,nd->n", n[a], across)
     theta = np.arctan2(np.einsum("nd,nd->n", w, n[b]), np.einsum("nd,nd->n", n[a], n[b])) / np.pi
-    single = np.zeros((len(p), 3 * BINS))
+    bins = 11
+    single = np.zeros((len(p), 3 * bins))
     for k, value in enumerate((alpha, phi, theta)):
-        place = np.clip(((value + 1) / 2 * BINS).astype(int), 0, BINS - 1) + k * BINS
+        place = np.clip(((value + 1) / 2 * bins).astype(int), 0, bins - 1) + k * bins
         np.add.at(single, (a, place), 1)
     single /= np.maximum(single.sum(axis=1, keepdims=True), 1)
     total = single.copy()
@@ -143,7 +141,7 @@ def _place(mine: tuple[np.ndarray, np.ndarray, np.ndarray], other: tuple[np.ndar
     q, m, g = other
     match = cKDTree(g).query(f, k=3)[1]
     source, goal = np.repeat(np.arange(len(p)), 3), match.ravel()
-    draws = rng.integers(len(source), size=(DRAWS, 3))
+    draws = rng.integers(len(source), size=(30_000, 3))
     x, y = p[source[draws]], q[goal[draws]]
     side_x, side_y = (np.linalg.norm(z - np.roll(z, 1, axis=1), axis=2) for z in (x, y))
     rigid = (np.minimum(side_x, side_y) > 0.9 * np.maximum(side_x, side_y)).all(axis=1)
@@ -152,18 +150,18 @@ def _place(mine: tuple[np.ndarray, np.ndarray, np.ndarray], other: tuple[np.ndar
     best: tuple[float, np.ndarray] = (-np.inf, np.eye(4))
     if not len(x):
         return best
-    R, t = rotations.procrustes(x[:PROPOSALS], y[:PROPOSALS])
-    some = rng.permutation(len(source))[:JUDGES]
+    R, t = rotations.procrustes(x[:4000], y[:4000])
+    some = rng.permutation(len(source))[:1500]
     a, b, na, nb = p[source[some]], q[goal[some]], n[source[some]], m[goal[some]]
-    hits = np.array([((np.linalg.norm(a @ r.T + s - b, axis=1) < INLIER * extent)
+    hits = np.array([((np.linalg.norm(a @ r.T + s - b, axis=1) < extent / 60)
                       & (np.einsum("nd,nd->n", na @ r.T, nb) > 0.7)).sum() for r, s in zip(R, t, strict=True)])
     tree, back = OrientedPoints(q, m), SeenSpace([view])
     front = SeenSpace([target])
-    for k in np.argsort(-hits)[:TRIED]:
+    for k in np.argsort(-hits)[:12]:
         r, s = _refined(p, n, tree, R[k], t[k], extent)
-        found = tree.match(p @ r.T + s, n @ r.T, NEAR * extent, 0.7).valid.mean()
-        through = max(float((front.ahead(p @ r.T + s) > THROUGH * extent).mean()),
-                      float((back.ahead((q - s) @ r) > THROUGH * extent).mean()))
+        found = tree.match(p @ r.T + s, n @ r.T, extent / 120, 0.7).valid.mean()
+        through = max(float((front.ahead(p @ r.T + s) > extent / 60).mean()),
+                      float((back.ahead((q - s) @ r) > extent / 60).mean()))
         score = float(found) - 2 * through
         if score > best[0]:
             best = score, transform(r, s)
@@ -173,7 +171,7 @@ def _place(mine: tuple[np.ndarray, np.ndarray, np.ndarray], other: tuple[np.ndar
 def _refined(p: np.ndarray, n: np.ndarray, tree: OrientedPoints, R: np.ndarray, t: np.ndarray,
              extent: float) -> tuple[np.ndarray, np.ndarray]:
     """A motion after a few rounds of point-to-point matching."""
-    for reach in extent * np.linspace(1 / 30, 1 / 90, ICP_ROUNDS):
+    for reach in extent * np.linspace(1 / 30, 1 / 90, 12):
         match = tree.match(p @ R.T + t, n @ R.T, reach, 0.6)
         good = match.valid
         if good.sum() < 20:

@@ -16,9 +16,6 @@ from ..geometry.surface import OrientedPoints
 from ..ranges import Count, Positive, Settings, Share
 from .view_poses import fit_of_views, place_by_features, place_by_landmarks
 
-POINTS = 4000                 # of each view that look for matches
-SETTLED = 5e-5                # metres: no view's points move further in a round
-
 
 @dataclass(frozen=True)
 class AlignViewsConfig(Settings):
@@ -47,35 +44,16 @@ class AlignViewsConfig(Settings):
 
 @dataclass(frozen=True, eq=False)
 class AlignedViews:
-    """Views after `align_views`.
+    """Views after `align_views`."""
 
-    Attributes
-    ----------
-    views : list of (Mesh, (3,)) pairs
-        Moved surfaces and camera positions, ready for `merge_views`.
-    T_world_view : (V, 4, 4) float
-        The motion of each view; the first one stays.
-    rms : float, metres
-        Of the distances between matched points and planes, in the end.
-    converged : bool
-    iterations : int
-    overlap : (V,) float
-        Share of each view that others saw as well.
-    conflict : (V,) float
-        Share of each view that others look through, which cannot be where views are in place.
-    trusted : (V,) bool
-        Views that came to rest, overlap with others and do not contradict them; where one is False the result
-        should not be merged.
-    """
-
-    views: list[tuple[Mesh, np.ndarray]]
-    T_world_view: np.ndarray
-    rms: float
+    views: list[tuple[Mesh, np.ndarray]]     # moved surfaces and camera positions, ready for `merge_views`
+    T_world_view: np.ndarray                 # (V, 4, 4) the motion of each view; the first one stays
+    rms: float                               # metres, of the distances between matched points and planes, in the end
     converged: bool
     iterations: int
-    overlap: np.ndarray
-    conflict: np.ndarray
-    trusted: np.ndarray
+    overlap: np.ndarray                      # (V,) share of each view that others saw as well
+    conflict: np.ndarray                     # (V,) share that others look through, which no view in place has
+    trusted: np.ndarray                      # (V,) came to rest, overlaps and contradicts no other; else do not merge
 
 
 def align_views(views: Sequence[Any], config: AlignViewsConfig | None = None,
@@ -127,7 +105,7 @@ def align_views(views: Sequence[Any], config: AlignViewsConfig | None = None,
         moved = max(float(np.linalg.norm(p @ S[:3, :3].T + S[:3, 3] - p, axis=1).mean())
                     for S, (p, _) in zip(steps, placed, strict=True))
         poses = steps @ poses
-        rms, settled, rounds = float(np.sqrt(np.mean(residual**2))), moved < SETTLED, rounds + 1
+        rms, settled, rounds = float(np.sqrt(np.mean(residual**2))), moved < 5e-5, rounds + 1
         distances = np.concatenate([d for *_, d in matches])
         reach = min(reach, max(3 * float(np.median(distances)), 0.005))
     out = [_moved(pair, T) for pair, T in zip(pairs, poses, strict=True)]
@@ -146,7 +124,7 @@ def _oriented(mesh: Mesh, config: AlignViewsConfig, rng: np.random.Generator
     """Points of a view, their normals, and which of them lie well inside."""
     even = smooth(mesh, 10)
     inner = border_distance(mesh, config.border) >= config.border
-    chosen = rng.permutation(len(mesh.vertices))[:4 * POINTS]
+    chosen = rng.permutation(len(mesh.vertices))[:16_000]
     return even.vertices[chosen], even.vertex_normals[chosen], inner[chosen]
 
 
@@ -159,7 +137,7 @@ def _match(placed: list[tuple[np.ndarray, np.ndarray]], inner: list[np.ndarray],
         for i, (mine, my_normals) in enumerate(placed):
             if i == j:
                 continue
-            rows = np.flatnonzero(inner[i][:POINTS])
+            rows = np.flatnonzero(inner[i][:4000])         # of many points few look for matches
             match = target.match(mine[rows], my_normals[rows], reach, 0.8)
             good = match.valid & inner[j][np.maximum(match.index, 0)]
             if good.sum() >= 30:

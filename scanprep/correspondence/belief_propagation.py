@@ -5,26 +5,14 @@ from dataclasses import dataclass
 
 import numpy as np
 
-FLOOR = -60.0        # messages below e^-60 of the best state say no more than that
-
 
 @dataclass(frozen=True, eq=False)
 class PairField:
-    """Variables with the same number of states, each with its own meaning.
+    """Variables with the same number of states, each with its own meaning."""
 
-    Attributes
-    ----------
-    unary : (n, K) float
-        Energy of every state of every variable; infinite for a state that is not there.
-    edges : (E, 2) int
-        Pairs of variables, each once.
-    pairwise : (E, K, K) float
-        Energy of a state of the first variable (rows) with one of the second (columns).
-    """
-
-    unary: np.ndarray
-    edges: np.ndarray
-    pairwise: np.ndarray
+    unary: np.ndarray            # (n, K) energy of every state of every variable; infinite for one that is not there
+    edges: np.ndarray            # (E, 2) pairs of variables, each once
+    pairwise: np.ndarray         # (E, K, K) energy of a state of the first (rows) with one of the second (columns)
 
     def energy(self, states: np.ndarray) -> float:
         """The energy of one assignment (n,)."""
@@ -81,7 +69,7 @@ def _passed(weights: np.ndarray, log_belief: np.ndarray) -> np.ndarray:
 
 
 def _scaled(messages: np.ndarray) -> np.ndarray:
-    """Log-messages with their largest entry at zero."""
+    """Log-messages with their largest entry at zero; those below e^-60 say no more than that."""
     if not messages.size:
         return messages
-    return np.maximum(messages - messages.max(axis=1, keepdims=True), FLOOR)
+    return np.maximum(messages - messages.max(axis=1, keepdims=True), -60.0)

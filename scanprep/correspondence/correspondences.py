@@ -14,7 +14,6 @@ from ..geometry import storage
 from ..geometry.format_common import FARTHEST
 from ..geometry.mesh import Mesh
 
-SURE = 0.4                  # median confidence: 0.87 between poses of a person, 0.25 to 0.37 on a ball
 KIND, VERSION = "correspondences", 1
 
 
@@ -68,7 +67,7 @@ def checked_pairs(template: Mesh, vertices: np.ndarray, points: np.ndarray, name
 def correspondences_problem(found: Correspondences) -> str | None:
     """Why correspondences mean nothing, with the likely cause; None where they mean something."""
     sure = float(np.median(found.confidence)) if len(found) else 0.0
-    if sure >= SURE:
+    if sure >= 0.4:             # 0.87 between poses of a person, 0.25 to 0.37 on a ball
         return None
     return (f"{len(found)} pairs were found with a median confidence of {sure:.2f}; a scan of something else, too "
             "little of the body, or landmarks of other places?")

@@ -15,25 +15,17 @@ MOST_EDGE = 9.0 * 2.5 + 4.0    # no edge can cost more: length, two leans and a 
 
 @dataclass(frozen=True, eq=False)
 class Places:
-    """Points of a surface seen from the seeds; the same on template and scan, in metres of the scan.
+    """Points and normals (n, 3) of a surface seen from the seeds, in metres of the scan for the template too.
 
-    Attributes
-    ----------
-    points, normals : (n, 3) float
-    to_seeds : (n, S) float, metres
-        Along the surface; NaN where no way leads.
-    angles : (n, S(S-1)/2) float
-        For every pair of seeds the sine of the angle from the direction away from the first to that away from
-        the second, about the normal: reflections change its sign, bending does not.
-    sure : (n, S) float
-        How much the way to each seed is to be trusted, 1 for a way that needs no bridge between pieces.
+    `angles` are, for every pair of seeds, the sine of the angle from the direction away from the first to that away
+    from the second, about the normal: reflections change its sign, bending does not.
     """
 
     points: np.ndarray
     normals: np.ndarray
-    to_seeds: np.ndarray
-    angles: np.ndarray
-    sure: np.ndarray
+    to_seeds: np.ndarray         # (n, S) metres along the surface; NaN where no way leads
+    angles: np.ndarray           # (n, S(S-1)/2)
+    sure: np.ndarray             # (n, S) how sure the way to each seed is, 1 where it needs no bridge between pieces
 
     def __getitem__(self, index: np.ndarray) -> Places:
         return Places(self.points[index], self.normals[index], self.to_seeds[index], self.angles[index],

@@ -18,12 +18,6 @@ from .correspondences import Correspondences
 from .potentials import MOST_EDGE, Places, edge_energy, most_place_energy, place_energy, seen_from
 from .sheet import Sheet
 
-FRAME = 0.042        # of the template's size: radius over which directions on the surface are averaged
-LINKS = 6            # edges that each point has to its nearest neighbours along the surface
-PLACE = 0.5          # weight of all that speaks for a single image
-NOTHING = 0.5        # cost of a point without image, and of each of its edges, as shares of the highest possible cost
-SPREAD = 2000        # vertices beyond these come in no special order: all of them are wanted then
-
 
 @dataclass(frozen=True)
 class BeliefLevel(Settings):
@@ -139,17 +133,18 @@ def surfaces_of(template: Mesh, sheet: Sheet, surface: SurfaceGraph, seeds: tupl
     off = np.linalg.norm(sheet.points[clicked] - seeds[1], axis=1)         # a click where there are no data
     same = (sheet.piece[chosen][:, None] == sheet.piece[clicked]) & (off < 3 * sheet.spacing)
     # a way that bridges a gap of the scan, or ends in one, is trusted less
-    scan = seen_from(sheet.points, sheet.normals, on_scan, chosen, FRAME * size, np.where(same, 1.0, 0.3))
+    radius = 0.042 * size                                                  # over which directions are averaged
+    scan = seen_from(sheet.points, sheet.normals, on_scan, chosen, radius, np.where(same, 1.0, 0.3))
     vertices = _spread_vertices(template, min(max(level.places for level in config.levels), len(template.vertices)))
-    places = seen_from(scale * template.vertices, template.vertex_normals, scale * on_template, vertices, FRAME * size,
+    places = seen_from(scale * template.vertices, template.vertex_normals, scale * on_template, vertices, radius,
                        np.ones((len(vertices), len(seeds[0]))))
     return Surfaces(size, scan, _neighbours(sheet, chosen, 0.3 * size), places, vertices, scale)
 
 
 @lru_cache(maxsize=4)                # a folder of scans shares one template
 def _spread_vertices(template: Mesh, count: int) -> np.ndarray:
-    """So many vertices (count,), the first of which, however few are taken, are spread over the template."""
-    first = farthest_points(template.vertices, min(count, SPREAD))
+    """So many vertices (count,), of which the first 2000, however few are taken, are spread over the template."""
+    first = farthest_points(template.vertices, min(count, 2000))
     rest = np.setdiff1d(np.arange(len(template.vertices)), first)
     return np.concatenate([first, rest])[:count]
 
@@ -163,9 +158,9 @@ def _scale_between(template: np.ndarray, scan: np.ndarray) -> float:
 
 
 def _neighbours(sheet: Sheet, chosen: np.ndarray, limit: float) -> np.ndarray:
-    """Pairs (E, 2) of chosen points near to each other along the surface."""
+    """Pairs (E, 2) of chosen points, each with the six nearest to it along the surface."""
     between = sheet.distances(chosen, limit=limit)[:, chosen]
-    near = np.argsort(between, axis=1)[:, 1:LINKS + 1]
+    near = np.argsort(between, axis=1)[:, 1:7]
     i, j = np.repeat(np.arange(len(chosen)), near.shape[1]), near.ravel()
     linked = np.isfinite(between[i, j])
     return np.unique(np.sort(np.stack([i[linked], j[linked]], axis=1), axis=1), axis=0)
@@ -173,10 +168,11 @@ def _neighbours(sheet: Sheet, chosen: np.ndarray, limit: float) -> np.ndarray:
 
 def _field(surfaces: Surfaces, domains: np.ndarray, unary: np.ndarray) -> PairField:
     """The field over the domains (n, K), with one more state that says: no image."""
-    n, K = domains.shape
-    energies = np.full((n, K + 1), NOTHING * PLACE * most_place_energy(surfaces.scan.to_seeds.shape[1]))
-    energies[:, :K] = PLACE * unary
-    pairwise = np.full((len(surfaces.edges), K + 1, K + 1), NOTHING * MOST_EDGE, dtype=np.float32)
+    (n, K), single = domains.shape, 0.5                            # weight of all that speaks for a single image
+    # no image costs half of what the worst one may cost, and so does each edge to it
+    energies = np.full((n, K + 1), 0.5 * single * most_place_energy(surfaces.scan.to_seeds.shape[1]))
+    energies[:, :K] = single * unary
+    pairwise = np.full((len(surfaces.edges), K + 1, K + 1), 0.5 * MOST_EDGE, dtype=np.float32)
     pairwise[:, :K, :K] = edge_energy(surfaces.scan, surfaces.places, surfaces.edges, domains, surfaces.size)
     return PairField(energies, surfaces.edges, pairwise)
 

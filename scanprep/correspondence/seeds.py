@@ -20,7 +20,6 @@ from .sheet import Sheet
 # Of the trial of a hypothesis: fewer points, and one coarse level
 TRIAL = CorrelatedConfig(points=90, levels=(BeliefLevel(900, 60),), iterations=25)
 APART = 0.28                  # of the template's size: an end is the farthest place within it along the surface
-HIDDEN = 0.12                 # cost of an end that the scan does not show, as the share by which a way may be wrong
 
 
 @dataclass(frozen=True)
@@ -127,5 +126,5 @@ def matched_ends(template: np.ndarray, scan: np.ndarray, config: SeedConfig) -> 
     log_ratio = np.where(both & np.isfinite(ratio) & (ratio > 0), np.log(np.where(ratio > 0, ratio, 1.0)), np.nan)
     scale = np.clip(np.nanmedian(log_ratio, axis=1), -0.35, 0.35)
     wrong = np.where(both, np.minimum(np.nan_to_num(np.abs(log_ratio - scale[:, None]), nan=0.5), 0.5), 0.0)
-    cost = wrong.sum(axis=1) / np.maximum(both.sum(axis=1), 1) + HIDDEN * (images < 0).sum(axis=1)
+    cost = wrong.sum(axis=1) / np.maximum(both.sum(axis=1), 1) + 0.12 * (images < 0).sum(axis=1)
     return list(images[np.argsort(cost, kind="stable")[:config.hypotheses]])

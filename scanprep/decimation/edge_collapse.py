@@ -73,13 +73,13 @@ class Rounds:
         for start in range(0, len(rows), PIECE):
             part = rows[start:start + PIECE]
             a, b = self.ends[part].T
-            turn = self.kinds[b] > self.kinds[a]
-            a, b = np.where(turn, b, a), np.where(turn, a, b)
+            swap = self.kinds[b] > self.kinds[a]
+            a, b = np.where(swap, b, a), np.where(swap, a, b)
             if self.onto_vertices:
                 Q = self.quadrics[a] + self.quadrics[b]
-                turn = self.kinds[a] == self.kinds[b]
-                turn &= value(Q, self.points[b]).sum(axis=1) < value(Q, self.points[a]).sum(axis=1)
-                a, b = np.where(turn, b, a), np.where(turn, a, b)
+                swap = self.kinds[a] == self.kinds[b]
+                swap &= value(Q, self.points[b]).sum(axis=1) < value(Q, self.points[a]).sum(axis=1)
+                a, b = np.where(swap, b, a), np.where(swap, a, b)
             cost = value(*self._goals(a, b)).sum(axis=1)
             cost[(self.kinds[b] == FIXED) | ((self.kinds[b] == CURVE) & ~self.curve[part])] = np.inf
             self.ends[part], self.cost[part] = np.stack([a, b], axis=1), cost

@@ -209,7 +209,11 @@ class Glb:
         self._accessors: list[dict[str, Any]] = []
 
     def add(self, array: np.ndarray, kind: str, target: int | None, bounds: bool = False) -> int:
-        """An accessor of float32 numbers; its index."""
+        """An accessor of float32 numbers, one of `kind` a row (a MAT4 column after column); its index.
+
+        `target` is `VERTICES` for what vertices have; `bounds` says the least and the greatest row, which glTF wants
+        of positions and times.
+        """
         values = np.ascontiguousarray(array, dtype="<f4")
         extra: dict[str, Any] = {}
         if bounds:

@@ -241,14 +241,14 @@ def _slicer(path: Path, markups: list[Any], mesh: Mesh | None, unit: str | None
         for markup in markups:
             units = markup.get("coordinateUnits", "mm")
             own_unit = units[0] if isinstance(units, list) else units
-            turn = {"LPS": (1, 1, 1), "RAS": (-1, -1, 1)}[markup.get("coordinateSystem", "LPS")]
+            signs = {"LPS": (1, 1, 1), "RAS": (-1, -1, 1)}[markup.get("coordinateSystem", "LPS")]
             for i, point in enumerate(markup["controlPoints"]):
                 if point.get("positionStatus", "defined") == "defined":
                     position = np.array(point["position"], dtype=np.float64)
                     name = point.get("label", i)
                     if not isinstance(name, str | int):
                         raise ValueError(f"point {i} has a label that is no text")
-                    pairs.append((str(name), position.reshape(3) * turn))
+                    pairs.append((str(name), position.reshape(3) * signs))
     if str(own_unit) not in UNITS and unit is None:
         raise MeshFileError(f"{path}: expected coordinateUnits of {', '.join(UNITS)}, found {own_unit!r}")
     if mesh is not None and pairs and all((np.abs(np.asarray(p)) <= FARTHEST).all() for _, p in pairs):

@@ -23,7 +23,7 @@ def flip_edges(mesh: Mesh, allowed: np.ndarray | None = None, rounds: int = 20, 
 
 
 def _flip_once(v: np.ndarray, faces: np.ndarray, allowed: np.ndarray, min_cosine: float) -> int:
-    """One round of turns that do not touch each other; changes `faces` and returns their number."""
+    """One round of flips that do not touch each other; changes `faces` and returns their number."""
     count = len(v)
     start, end = faces.ravel(), np.roll(faces, -1, axis=1).ravel()
     across = np.roll(faces, 1, axis=1).ravel()

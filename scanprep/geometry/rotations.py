@@ -3,8 +3,8 @@
 - A rotation is an active 3×3 matrix that acts on column vectors: `x_world = R_world_part @ x_part`.
 - The target frame comes first in a name: `T_scan_template` takes template points to the scan.
 - A rotation vector (twist) is axis times angle in radians; `exp` and `log` go between the two.
-- A small turn is applied from the left: `R ← exp(ω) R`, with ω in world axes.
-- Points are stored as rows, so `points @ R.T` turns them.
+- A small rotation is applied from the left: `R ← exp(ω) R`, with ω in world axes.
+- Points are stored as rows, so `points @ R.T` rotates them.
 
 All functions take any number of leading dimensions.
 """

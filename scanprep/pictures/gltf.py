@@ -13,8 +13,7 @@ from ..geometry.storage import writing
 from .colors import decode
 
 # Turns that bring each axis to +y, the upward axis of glTF: quaternions x, y, z, w.
-_HALF = 0.5 ** 0.5
-UPRIGHT = {0: [0.0, 0.0, _HALF, _HALF], 1: [0.0, 0.0, 0.0, 1.0], 2: [-_HALF, 0.0, 0.0, _HALF]}
+UPRIGHT = {0: [0.0, 0.0, 0.5**0.5, 0.5**0.5], 1: [0.0, 0.0, 0.0, 1.0], 2: [-(0.5**0.5), 0.0, 0.0, 0.5**0.5]}
 
 
 def skin_material(color: Sequence[float] = (0.60, 0.57, 0.53)) -> dict[str, Any]:

@@ -15,13 +15,9 @@ from ..geometry.target import Target, orient
 class Evidence:
     """What the scan says of every vertex of a template that lies on it.
 
-    Attributes
-    ----------
-    confidence : (N,) float
-        From 0, no data here, to 1: a scanned surface lies here, faces the same way, does not end here, and its
-        points find this part of the template too.
-    distances : (N,) float, metres
-        To the plane of the scan at the nearest point that faces the same way; NaN beyond `reach`.
+    The confidence (N,) goes from 0, no data here, to 1: a scanned surface lies here, faces the same way, does not end
+    here, and its points find this part of the template too. Distances (N,), metres, are to the plane of the scan at the
+    nearest point that faces the same way; NaN where that is too far.
     """
 
     confidence: np.ndarray

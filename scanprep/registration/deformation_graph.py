@@ -17,30 +17,14 @@ from ..geometry.surface import Rays
 
 @dataclass(frozen=True, eq=False)
 class DeformationGraph:
-    """Nodes on a template, how they carry its vertices, and which nodes hold each other.
+    """Nodes on a template, how they carry its vertices, and which nodes hold each other."""
 
-    Attributes
-    ----------
-    rest : (N, 3) float, metres
-        The template's vertices.
-    node_vertices : (M,) int
-        The vertex where each node sits.
-    carriers : (N, K) int
-        The nodes that carry each vertex.
-    weights : (N, K) float
-        Their shares, each row summing to 1.
-    edges : (E, 2) int
-        Directed pairs of nodes, each pair in both directions.
-    edge_area : (E,) float, square metres
-        The part of the surface that each edge stands for.
-    """
-
-    rest: np.ndarray
-    node_vertices: np.ndarray
-    carriers: np.ndarray
-    weights: np.ndarray
-    edges: np.ndarray
-    edge_area: np.ndarray
+    rest: np.ndarray             # (N, 3) metres, the template's vertices
+    node_vertices: np.ndarray    # (M,) the vertex where each node sits
+    carriers: np.ndarray         # (N, K) the nodes that carry each vertex
+    weights: np.ndarray          # (N, K) their shares, each row summing to 1
+    edges: np.ndarray            # (E, 2) directed pairs of nodes, each pair in both directions
+    edge_area: np.ndarray        # (E,) square metres, the part of the surface that each edge stands for
 
     @property
     def nodes(self) -> np.ndarray:

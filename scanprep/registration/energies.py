@@ -17,7 +17,7 @@ from ..geometry import rotations
 from ..geometry.least_squares import Minimum, Sparse, levenberg_marquardt
 from .deformation_graph import DeformationGraph, NodeMotion, arms
 
-UNKNOWNS, SCALE = 7, 3           # of a node, and the place of its log-scale among them
+UNKNOWNS = 7
 
 
 @dataclass(frozen=True, eq=False)
@@ -235,7 +235,7 @@ def follow_pull(graph: DeformationGraph, motion: NodeMotion, wanted: Pull, stiff
         def assemble() -> tuple[np.ndarray, csc_array]:
             blocks, half = (np.sum(parts, axis=0) for parts in zip(*(t.normal(pattern) for t in now), strict=True))
             if not stiffness.growth:
-                blocks[:, SCALE], blocks[:, :, SCALE], half[:, SCALE] = 0, 0, 0
+                blocks[:, 3], blocks[:, :, 3], half[:, 3] = 0, 0, 0               # the log-scale
             return half.reshape(-1), pattern.matrix(blocks)
 
         return Sparse(sum(term.value for term in now), assemble)

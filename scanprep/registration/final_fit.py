@@ -21,10 +21,7 @@ from ..ranges import Positive, Settings
 from ..threads import search_threads
 from .energies import Pull, pull
 from .gradient_field import Field, Triangles
-
-NORMALS = 0.04                # of the template's size: what a difference of normals of one is worth when matching
-NEEDLE = 4.0                  # stretch against the smooth field, or its inverse, beyond which a triangle is a needle
-STIFFER, REPAIRS = 4.0, 12    # folds, needles and their neighbours grow so much stiffer, at most so often
+from .matches import NORMALS
 
 
 @dataclass(frozen=True)
@@ -77,36 +74,17 @@ class FinalFitConfig(Settings):
 
 @dataclass(frozen=True, eq=False)
 class FinalFit:
-    """Where the surface came to lie.
-
-    Attributes
-    ----------
-    vertices : (N, 3) float, metres
-    seen : (N,) bool
-        Whether there were data here.
-    noise : float, metres
-        Of the scan, standard deviation across its surface.
-    strain : float
-        Root mean square over the area of the logarithm of the stretches against the template.
-    roughness : float
-        The same against the smooth field of stretches.
-    inverted, needles : int
-        Triangles that face against their surroundings, and that are stretched too far against them.
-    iterations : int
-        Rounds and repairs.
-    moved : float, metres
-        How far the last round moved the mean vertex.
-    """
+    """Where the surface came to lie: vertices (N, 3), metres, and which of them, seen (N,), had data."""
 
     vertices: np.ndarray
     seen: np.ndarray
-    noise: float
-    strain: float
-    roughness: float
-    inverted: int
-    needles: int
-    iterations: int
-    moved: float
+    noise: float                 # metres, standard deviation of the scan across its surface
+    strain: float                # root mean square over the area of the logarithm of the stretches
+    roughness: float             # the same against the smooth field of stretches
+    inverted: int                # triangles that face against their surroundings
+    needles: int                 # triangles that are stretched too far against their surroundings
+    iterations: int              # rounds and repairs
+    moved: float                 # metres, of the mean vertex in the last round
 
 
 def final_fit(template: Mesh, start: np.ndarray, target: Target,
@@ -117,10 +95,10 @@ def final_fit(template: Mesh, start: np.ndarray, target: Target,
     for stage in given.config.rounds:
         x, before = _laid_out(given, x, stage, stiff), x
     repairs = 0
-    while repairs < REPAIRS and (bad := np.logical_or(*_bad(given, x, stage))).any():
+    while repairs < 12 and (bad := np.logical_or(*_bad(given, x, stage))).any():
         near = np.zeros(len(x))
         near[template.faces[bad]] = 1
-        stiff = np.where(near[template.faces].any(axis=1), STIFFER * stiff, stiff)
+        stiff = np.where(near[template.faces].any(axis=1), 4 * stiff, stiff)
         x, before = _laid_out(given, x, stage, stiff), x
         repairs += 1
     inverted, needles = _bad(given, x, stage)
@@ -242,7 +220,7 @@ def _bad(given: _Given, x: np.ndarray, stage: FinalFitRound) -> tuple[np.ndarray
     n = given.template.face_normals[..., None]
     inverted = np.einsum("fdk,fdk->f", measured.R @ n, smooth.R @ n) < 0
     relative = np.linalg.svd(measured.gradient @ np.linalg.inv(smooth.gradient), compute_uv=False)
-    return inverted, (relative[:, 0] > NEEDLE) | (relative[:, 2] < 1 / NEEDLE)
+    return inverted, (relative[:, 0] > 4) | (relative[:, 2] < 1 / 4)
 
 
 def _strain(given: _Given, gradient: np.ndarray) -> float:

@@ -11,13 +11,9 @@ from ..geometry.thinning import thin
 from .deformation_graph import DeformationGraph, NodeMotion, build_graph, deform, start_motion, transferred
 from .energies import Pull, Stiffness, follow_pull, pull, terms
 from .inputs import Inputs
-from .limb_ends import RADIUS, End, RigidFit, find_ends, rotated_end
-from .matches import Likeness, match_both_ways
+from .limb_ends import End, RigidFit, find_ends, rotated_end
+from .matches import NORMALS, Likeness, match_both_ways
 from .schedule import GraphStage
-
-NORMALS = 0.04                # of the template's size: what a difference of normals of one is worth when matching
-FEW = 300                     # nodes of a graph that no stage asks for
-CAP = 0.035                   # of the size: errors against the scan do not grow beyond it when rotations are compared
 
 
 @dataclass(frozen=True, eq=False)
@@ -60,13 +56,13 @@ def start_fit(given: Inputs, T: np.ndarray, nodes: int) -> GraphFit:
 def graph_fit(given: Inputs, T: np.ndarray, stages: tuple[GraphStage, ...], ends: int,
               tell: Callable[[int], None]) -> GraphFit:
     """The template bent onto the scan by all stages, from where a rigid transform (4, 4) places it."""
-    fit = start_fit(given, T, stages[0].nodes if stages else FEW)
+    fit = start_fit(given, T, stages[0].nodes if stages else 300)
     for stage in stages:
         before, fit = fit, bent(given, fit, stage)
         fit = replace(fit, moved=mean_move(before.x, fit.x))
         tell(stage.rounds)
         if stage.ends:
-            for end in find_ends(given.template, ends, RADIUS * given.size) if ends else ():
+            for end in find_ends(given.template, ends, 0.14 * given.size) if ends else ():
                 fit = with_end_rotated(given, fit, stage, end)
     return fit
 
@@ -97,7 +93,7 @@ def with_end_rotated(given: Inputs, fit: GraphFit, stage: GraphStage, end: End) 
     """The fit with an end of the body rotated about itself, where that lies nearer to the scan, stretch counted in."""
     size, template = given.size, given.template
     target = orient(given.target.thinned(0.5 * stage.detail * size), template.with_vertices(fit.x), NORMALS * size)
-    places = rotated_end(template, end, fit.x, RigidFit(target, NORMALS * size, CAP * size), size)
+    places = rotated_end(template, end, fit.x, RigidFit(target, size))
     if places is None:
         return fit
     drawn = pull(len(fit.x), end.vertices, places, template.vertex_areas[end.vertices])
@@ -109,7 +105,7 @@ def with_end_rotated(given: Inputs, fit: GraphFit, stage: GraphStage, end: End) 
 def _misfit(given: Inputs, fit: GraphFit, target: Target, stage: GraphStage) -> float:
     """Error against the scan and strain, as they are now."""
     size, body = given.size, given.template.with_vertices(fit.x)
-    error = RigidFit(target, NORMALS * size, CAP * size).error(body.vertices, body.vertex_normals)
+    error = RigidFit(target, size).error(body.vertices, body.vertex_normals)
     now = terms(fit.graph, fit.motion, given.landmark_pull(stage.landmarks), _stiffness(stage, size))
     return float(error @ given.template.vertex_areas) + sum(term.value for term in now.values())
 

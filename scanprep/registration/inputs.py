@@ -16,7 +16,6 @@ from .energies import Pull, pull
 from .matches import Described, Likeness
 from .path_descriptors import describe_both
 
-CELL = 0.012                # of the template's size: spacing of the points that paths to the landmarks run over
 Landmarks = tuple[np.ndarray, np.ndarray]
 
 
@@ -66,10 +65,11 @@ def prepare(template: Mesh, scan: Mesh | np.ndarray, landmarks: Landmarks | None
     if landmarks is not None:
         landmarks = checked_pairs(template, *landmarks, "landmarks")
     hints = None if correspondences is None else hints_of(template, correspondences)
-    anchors = path_anchors(landmarks, hints, target, 3 * CELL * size)
+    cell = 0.012 * size                                     # spacing of the points that paths run over
+    anchors = path_anchors(landmarks, hints, target, 3 * cell)
     if anchors is None:
         return Inputs(template, target, size, landmarks, hints)
-    mine, theirs = describe_both(template, target, anchors, CELL * size, size)
+    mine, theirs = describe_both(template, target, anchors, cell, size)
     return Inputs(template, replace(target, descriptors=theirs), size, landmarks, hints, mine)
 
 

@@ -8,15 +8,12 @@ from ..geometry import rotations
 from ..geometry.mesh import Mesh
 from ..geometry.sparse import factor
 
-SMALL = 1, 1, 2                         # rings of the patches that are laid anew, round by round
-WIDER = (2,), (2, 3), (3, 4)            # the same where inverted triangles are left
-
 
 def without_inverted(template: Mesh, x: np.ndarray) -> np.ndarray:
     """Vertices (N, 3) where patches around inverted triangles were laid anew, wider ones while that leaves fewer."""
     x = unfold(template, x)
     left = int(inverted_triangles(template, x).sum())
-    for rings in WIDER:
+    for rings in ((2,), (2, 3), (3, 4)):
         if not left:
             break
         trial = unfold(template, x, rings=rings)
@@ -53,7 +50,7 @@ def inverted_triangles(template: Mesh, x: np.ndarray, linear: np.ndarray | None 
     return np.einsum("fd,fd->f", template.with_vertices(x).face_normals, wanted) < 0
 
 
-def unfold(template: Mesh, x: np.ndarray, linear: np.ndarray | None = None, rings: tuple[int, ...] = SMALL
+def unfold(template: Mesh, x: np.ndarray, linear: np.ndarray | None = None, rings: tuple[int, ...] = (1, 1, 2)
            ) -> np.ndarray:
     """Vertices (N, 3) with small patches around inverted triangles laid anew, each edge as its surroundings rotated it.
 

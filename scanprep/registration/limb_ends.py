@@ -11,11 +11,7 @@ from ..geometry import rotations
 from ..geometry.geodesics import SurfaceGraph
 from ..geometry.mesh import Mesh
 from ..geometry.target import Target
-
-RADIUS = 0.14                 # of the template's size: of an end along the surface
-ANGLES = 0.5, 1.0             # radians, tried both ways: nearest points find what is less than half a step away
-POINTS, ROUNDS = 120, 8       # vertices of an end that are compared with the scan; rounds of nearest points
-MOVED = 0.01                  # of the size: an end that fits best so near to where it is stays there
+from .matches import NORMALS
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,33 +37,32 @@ def find_ends(template: Mesh, count: int, radius: float) -> tuple[End, ...]:
     return tuple(ends)
 
 
-def rotated_end(template: Mesh, end: End, x: np.ndarray, scan: RigidFit, size: float, moved: float = MOVED
+def rotated_end(template: Mesh, end: End, x: np.ndarray, scan: RigidFit, moved: float = 0.01
                 ) -> np.ndarray | None:
-    """Places (n, 3) of the vertices of an end after the rotation that fits best as a rigid piece, if that is elsewhere.
+    """Places (n, 3) of the vertices of an end after the rotation that fits best as a rigid piece.
+
+    None where that is no farther than `moved`, a share of the template's size, from where they are.
     """
     rest, middle = template.vertices[end.vertices], x[end.vertices].mean(axis=0)
     R, _ = rotations.procrustes(rest, x[end.vertices])
-    sample = np.linspace(0, len(rest) - 1, min(POINTS, len(rest))).astype(int)
+    sample = np.linspace(0, len(rest) - 1, min(120, len(rest))).astype(int)
     local, normals = rest - rest.mean(axis=0), template.vertex_normals[end.vertices]
     found = []
-    for angle in (0.0, *ANGLES, *(-a for a in ANGLES)):
+    for angle in (0.0, 0.5, 1.0, -0.5, -1.0):        # radians: nearest points find what is half a step away
         start = rotations.exp(angle * (R @ end.axis)) @ R
         rotation, place, error = scan.fitted(local[sample], normals[sample], start, middle)
         found.append((error, local @ rotation.T + place))
     best = int(np.argmin([error for error, _ in found]))
     apart = np.linalg.norm(found[best][1] - x[end.vertices], axis=1).mean()
-    return found[best][1] if apart > moved * size else None
+    return found[best][1] if apart > moved * scan.size else None
 
 
 class RigidFit:
-    """A scan that rigid pieces are laid on; a difference of normals of one counts like `scale` metres.
+    """A scan that rigid pieces of a template of some size are laid on; errors do not grow beyond `cap`, metres."""
 
-    An error does not grow beyond `cap` metres.
-    """
-
-    def __init__(self, target: Target, scale: float, cap: float) -> None:
-        self.target, self.scale, self.cap = target, scale, cap
-        self.tree = cKDTree(np.hstack([target.points, scale * target.normals]))
+    def __init__(self, target: Target, size: float) -> None:
+        self.target, self.size, self.scale, self.cap = target, size, NORMALS * size, 0.035 * size
+        self.tree = cKDTree(np.hstack([target.points, self.scale * target.normals]))
 
     def nearest(self, x: np.ndarray, n: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Points and normals (n, 3) of the scan nearest to others, and which of them are near and on no border."""
@@ -85,7 +80,7 @@ class RigidFit:
     def fitted(self, local: np.ndarray, normals: np.ndarray, R: np.ndarray, place: np.ndarray
                ) -> tuple[np.ndarray, np.ndarray, float]:
         """A rigid piece after some rounds of nearest points: its rotation, its place, its mean error."""
-        for _ in range(ROUNDS):
+        for _ in range(8):
             x, n = local @ R.T + place, normals @ R.T
             y, m, good = self.nearest(x, n)
             if good.sum() < 6:

@@ -11,25 +11,17 @@ from ..geometry.target import Target, orient
 from ..threads import search_threads
 from .energies import Pull, pull
 
+NORMALS = 0.04                # of the template's size: what a difference of normals of one is worth when matching
+
 
 @dataclass(frozen=True)
 class Likeness:
-    """What a match is sought by, each as the distance in metres that a difference of one is worth.
+    """What a match is sought by, each as the distance in metres that a difference of one is worth."""
 
-    Attributes
-    ----------
-    positions : float
-        1, or less where the template does not lie near yet; 0 seeks by descriptors alone.
-    normals : float, metres
-    descriptors : float, metres
-    limit : float
-        Descriptors that differ by more than this do not match.
-    """
-
-    positions: float = 1.0
+    positions: float = 1.0       # less where the template does not lie near yet; 0 seeks by descriptors alone
     normals: float = 0.05
     descriptors: float = 0.0
-    limit: float = 0.3
+    limit: float = 0.3           # descriptors that differ by more do not match
 
 
 @dataclass(frozen=True, eq=False)
@@ -67,22 +59,11 @@ class Described:
 
 def match_both_ways(deformed: Mesh, sample: np.ndarray, area: float, target: Target, reach: float, slide: float,
                     like: Likeness, descriptors: np.ndarray | None = None) -> Pull:
-    """What matches want of the vertices: template to scan and scan to template, weighed by their distance.
+    """What matches want of the vertices of a deformed template: some of them to the scan, and the scan to all of them.
 
-    Parameters
-    ----------
-    deformed : Mesh
-        The template as it lies now.
-    sample : (n,) int
-        Vertices that look for a match; points of the scan may choose any vertex.
-    area : float, square metres
-        Of the template; either direction weighs as much as this.
-    reach : float, metres
-        Matches farther apart than this do not count; the weight falls to zero towards it.
-    slide : float
-        Force along the surface as a share of the force across it.
-    descriptors : (N, q) float, optional
-        Of the template's vertices, to be compared with the target's.
+    `sample` (n,) are the vertices that look for a match. Either direction weighs as much as an area, square metres.
+    The weight of a match falls to zero at a distance of `reach`, metres; its force along the surface is a share,
+    `slide`, of that across it. `descriptors` (N, q) are those of the vertices.
     """
     target = orient(target, deformed, max(like.normals, 1e-6))
     x, N = deformed.vertices, len(deformed.vertices)

@@ -20,16 +20,11 @@ from ..meaning import HAND, extent, size, unit_problem
 from ..threads import one_thread
 from .confidence import evidence, stretched_share, uncovered_share
 from .final_fit import final_fit
-from .graph_fit import NORMALS, GraphFit, graph_fit
+from .graph_fit import GraphFit, graph_fit
 from .inputs import Inputs, placed, prepare
 from .inverted_triangles import inverted_triangles, without_inverted
+from .matches import NORMALS
 from .schedule import RegistrationConfig
-
-NEAR = 0.015                     # of the template's size: data farther from a vertex are not data of that vertex
-FAR = 0.01                       # of the size: points of the scan farther off are not covered by the template
-SETTLED = 0.001                  # of the size: the last stage moves the mean vertex by less
-LOST, UNSEEN = 0.5, 0.01         # shares, of the scan not covered and of the template with data, that mean nothing
-ASTRAY = 0.05                    # so much not covered and stretched: with left and right exchanged 0.13 and 0.10
 
 
 @dataclass(frozen=True, eq=False)
@@ -143,10 +138,11 @@ def registration_problem(template: Mesh, scan: Mesh | np.ndarray, fit: Registrat
     points = scan.vertices if isinstance(scan, Mesh) else scan
     far, seen, stretch = fit.uncovered, float(fit.seen.mean()), stretched_share(template, fit.mesh)
     off = fit.landmark_rms > HAND * size(template)
-    if not (far > LOST or seen < UNSEEN or (far > ASTRAY and stretch > ASTRAY) or off):
+    # with left and right exchanged 0.13 are not covered and 0.10 stretched
+    if not (far > 0.5 or seen < 0.01 or min(far, stretch) > 0.05 or off):
         return None
     cause = unit_problem(extent(points), extent(template.vertices), "the scan is", 0.05) or (
-        "landmarks of left and right exchanged, or of other places?" if marked and seen >= UNSEEN else
+        "landmarks of left and right exchanged, or of other places?" if marked and seen >= 0.01 else
         "a scan of something else, or too few points?" if marked else
         "a scan of something else, or a pose far from the template's, which needs landmarks?")
     marks = f", its landmarks are {1000 * fit.landmark_rms:.0f} mm off" if marked else ""
@@ -157,7 +153,7 @@ def registration_problem(template: Mesh, scan: Mesh | np.ndarray, fit: Registrat
 def _result(given: Inputs, fit: GraphFit, scan: Mesh | np.ndarray) -> Registration:
     """What was found, measured against the whole scan."""
     body = given.template.with_vertices(fit.x)
-    found = evidence(body, given.target, NEAR * given.size, NORMALS * given.size)
+    found = evidence(body, given.target, 0.015 * given.size, NORMALS * given.size)
     seen = found.confidence >= 0.5
     distances = np.where(seen, found.distances, np.nan)
     landmark_rms = np.nan
@@ -166,6 +162,6 @@ def _result(given: Inputs, fit: GraphFit, scan: Mesh | np.ndarray) -> Registrati
         landmark_rms = float(np.sqrt(np.mean(apart**2)))
     return Registration(body, distances, seen,
                         float(np.sqrt(np.mean(distances[seen] ** 2))) if seen.any() else np.nan, landmark_rms,
-                        bool(fit.moved <= SETTLED * given.size and seen.any()), fit.iterations, fit.energies,
+                        bool(fit.moved <= 0.001 * given.size and seen.any()), fit.iterations, fit.energies,
                         int(inverted_triangles(given.template, fit.x).sum()), found.confidence,
-                        uncovered_share(scan, body, FAR * given.size))
+                        uncovered_share(scan, body, 0.01 * given.size))

@@ -6,8 +6,6 @@ from dataclasses import dataclass, field
 from ..ranges import Cell, Count, Positive, Settings
 from .final_fit import FinalFitConfig
 
-WHOLE = 1e-4                     # spacing that leaves all points of a scan
-
 
 @dataclass(frozen=True)
 class GraphStage(Settings):
@@ -90,7 +88,7 @@ class RegistrationConfig(Settings):
         Nodes keep their size; the template is drawn to the landmarks first, then to the scan with ever softer links.
         """
         def stage(nodes: int, length: float, landmarks: float, reach: float, rounds: int) -> GraphStage:
-            return GraphStage(nodes, length, 0.1 * length, 0.0, landmarks, reach, 1.0, rounds, WHOLE)
+            return GraphStage(nodes, length, round(0.1 * length, 6), 0.0, landmarks, reach, 1.0, rounds, detail=1e-4)
 
         first = (stage(500, 0.7, landmarks, 0.0, 24) for landmarks in (0.001, 0.1, 10.0))
         coarse = (stage(500, length, 0.01, 2 * length, 6) for length in (0.2, 0.1, 0.06, 0.04))

@@ -135,7 +135,7 @@ def fill_report(mesh: Mesh, config: FillConfig | None = None, progress: Callable
         filled, made = mesh, list[_Made | None]([None] * len(groups))
     else:
         filled = work.patched(mesh, groups, progress=progress)
-        made = [*work.faults(filled, mesh, groups, "fair")]
+        made = [*work.rated(filled, mesh, groups, "fair")]
     seen_in = config.method == "auto" and len(views) > 0
     tried = [g for g, fair in enumerate(made) if fair is None or (seen_in and fair.is_bad)]
     good = [group for g, group in enumerate(groups) if g not in tried]
@@ -223,12 +223,12 @@ class _Filling:
         [Davis] volumetric diffusion
         """
         filled = self.patched(mesh, [group], diffused_surface(*_around(mesh, np.concatenate(group)), self.seen))
-        made = self.faults(filled, mesh, [group], "diffusion")[0]
+        made = self.rated(filled, mesh, [group], "diffusion")[0]
         if fair is None or (made.empty > MOST_EMPTY, *made[1:]) < (fair.empty > MOST_EMPTY, *fair[1:]):
             return filled, made
         return self.patched(mesh, [group]), fair
 
-    def faults(self, filled: Mesh, before: Mesh, groups: list[list[np.ndarray]], method: str) -> list[_Made]:
+    def rated(self, filled: Mesh, before: Mesh, groups: list[list[np.ndarray]], method: str) -> list[_Made]:
         """For every hole what is wrong with its patch."""
         old = len(before.faces)
         label = Mesh(filled.vertices, filled.faces[old:]).vertex_component

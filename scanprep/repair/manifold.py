@@ -14,7 +14,7 @@ FLAT = 1e-12               # square metres: no area
 def repair(mesh: Mesh, min_component: float = 1.0) -> Mesh:
     """The nearest mesh that is manifold, with nothing double, flat, unused or loose in it.
 
-    Triangles are turned over where neighbours disagree and else only ever removed, so holes may open; where sheets
+    Triangles are inverted where neighbours disagree and else only ever removed, so holes may open; where sheets
     touch in a vertex it is split in two.
 
     Parameters
@@ -81,7 +81,7 @@ def _drop_flat(mesh: Mesh) -> Mesh:
 
 
 def orient(mesh: Mesh) -> Mesh:
-    """Triangles turned so that neighbours face the same way, in every patch the way most of its area does.
+    """Triangles inverted so that neighbours face the same way, in every patch the way most of its area does.
 
     Patches end at edges with more than two triangles. One that has a single side only, as a Möbius strip has, is
     left as it is.
@@ -93,16 +93,16 @@ def orient(mesh: Mesh) -> Mesh:
     start = np.concatenate([[0], np.cumsum(mesh.edge_use)[:-1]])[mesh.edge_use == 2]
     first, second = order[start], order[start + 1]
     a, b, agree = first // 3, second // 3, forward[first] != forward[second]
-    # Every triangle is there twice, as it is and turned over; what faces the same way hangs together.
+    # Every triangle is there twice, as it is and inverted; what faces the same way hangs together.
     count = len(mesh.faces)
     rows, columns = np.r_[a, a + count], np.r_[np.where(agree, b, b + count), np.where(agree, b + count, b)]
     _, patch = connected_components(coo_array((np.ones(len(rows)), (rows, columns)), shape=(2 * count, 2 * count)),
                                     directed=False)
     as_is, inverted = patch[:count], patch[count:]
     area = np.bincount(as_is, mesh.face_areas, patch.max() + 1)     # of what a patch leaves as it is
-    turn = area[inverted] > area[as_is]
-    turn |= (area[inverted] == area[as_is]) & (inverted < as_is)
-    return Mesh(mesh.vertices, np.where(turn[:, None], mesh.faces[:, ::-1], mesh.faces), mesh.colors)
+    invert = area[inverted] > area[as_is]
+    invert |= (area[inverted] == area[as_is]) & (inverted < as_is)
+    return Mesh(mesh.vertices, np.where(invert[:, None], mesh.faces[:, ::-1], mesh.faces), mesh.colors)
 
 
 def _drop_at_bad_edges(mesh: Mesh) -> Mesh:

@@ -100,14 +100,14 @@ def align_cameras(views: ViewsArg, output: Output, cameras: Path | None = None, 
     storage.write_json(output / "cameras.json",
                        {name: camera.tolist() for name, (_, camera) in zip(names, found.views, strict=True)})
     shifts = [float(np.linalg.norm(new - old)) for (_, new), (_, old) in zip(found.views, seen, strict=True)]
-    doubtful = [name for name, trusted in zip(names, found.trusted, strict=True) if not trusted]
+    uncertain = [name for name, trusted in zip(names, found.trusted, strict=True) if not trusted]
     return Outcome(output, [
         Metric("views", len(seen)), Metric("distance between views, RMS", MM * found.rms, "mm"),
         Metric("rounds", found.iterations), Metric("converged", str(found.converged)),
         Metric("largest shift of a camera", MM * max(shifts), "mm"),
         Metric("seen by others too, least of a view", 100 * float(found.overlap.min()), "%"),
         Metric("looked through by others, most of a view", 100 * float(found.conflict.max()), "%")],
-        {"views": config}, [f"{name}: its place is not to be trusted" for name in doubtful], views_problem(found))
+        {"views": config}, [f"{name}: its place is uncertain" for name in uncertain], views_problem(found))
 
 
 def _view_landmarks(folder: Path, name: str, view: Mesh, unit: Unit | None) -> dict[str, np.ndarray]:

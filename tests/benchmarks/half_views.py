@@ -3,6 +3,7 @@
     SCAPEKIT_DATA=... python tests/benchmarks/half_views.py -o half_views.json --pictures DIR
     SCAPEKIT_DATA=... python tests/benchmarks/half_views.py -m MODEL.npz --marks 0 -o half_views_blind.json
     SCAPEKIT_DATA=... python tests/benchmarks/half_views.py --people -m MODEL.npz -o half_people.json
+    SCAPEKIT_DATA=... python tests/benchmarks/half_views.py -m MODEL.npz --only 0 1 2 3 4 --published -o published.json
 
 Without a model it is learned first, from the training part alone. `seen` is the distance of the seen vertices to
 the true surface, `unseen` that of corresponding vertices; both for the completed mesh and for the predicted one.
@@ -88,19 +89,21 @@ def main() -> None:
     parser.add_argument("--fold", type=int, default=0)
     parser.add_argument("--only", type=int, nargs="*", help="indices in the list of held-out bodies")
     parser.add_argument("--marks", type=int, choices=(0, 7), default=7, help="landmarks on each view")
+    parser.add_argument("--published", action="store_true", help="the paper's way, beside the default")
     parser.add_argument("--known-viewpoint", action="store_true", help="tell where the camera stood")
     parser.add_argument("--pictures", type=Path, help="folder for a picture of each")
     args = parser.parse_args()
     data = load_real()
     model = load_model(args.model) if args.model else learned(data, args.people, args.fold)
     bodies = data.shapes[spring_split(len(data.shapes))[1]] if args.people else data.poses[scape_fold(args.fold)[1]]
-    subject = model if args.people else model.subject(None)
+    subject = model if args.people or args.published else model.subject(None)      # the paper's way takes models only
     part = model.skeleton.part_of_vertex(data.template)
     rows = []
     for k in args.only if args.only is not None else range(len(bodies)):
         body = data.template.with_vertices(bodies[k])
         view = half_view(body, k, data.landmarks, np.random.default_rng(k))
-        config = CompletionConfig(viewpoint=tuple(view.camera) if args.known_viewpoint else None)
+        config = CompletionConfig.published() if args.published else CompletionConfig()
+        config = dataclasses.replace(config, viewpoint=tuple(view.camera) if args.known_viewpoint else None)
         start, cpu = time.perf_counter(), time.process_time()
         result = complete(subject, view.points, view.landmarks if args.marks else None, config)
         row = {"k": k, **errors(body, view, result, part), "seconds": round(time.perf_counter() - start, 2),

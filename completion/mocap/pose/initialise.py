@@ -5,11 +5,11 @@ from functools import partial
 
 import numpy as np
 
+from model.priors import typical_poses
 from scanprep.geometry import rotations
 from scanprep.geometry.least_squares import Minimum, levenberg_marquardt
 
 from ... import energy
-from ...priors import typical_poses
 from ...starts import ANNEALING
 from .marked_body import MarkedBody
 from .robust import marker_weights, misfit

@@ -14,6 +14,7 @@ import numpy as np
 
 from model.features import twists
 from model.linear import PointOperator, Subject
+from model.priors import gaussian_prior
 from scanprep.geometry import rotations
 from scanprep.geometry.least_squares import Dense
 from scanprep.geometry.mesh import Mesh
@@ -21,7 +22,6 @@ from scanprep.skeleton.tree import Skeleton
 
 from ... import energy
 from ...bodies import FixedBody
-from ...priors import gaussian_prior
 from ..marker_sets.layout import MarkerLayout
 
 System = tuple[np.ndarray, np.ndarray, np.ndarray]                      # energy, half its gradient, Gauss-Newton matrix
@@ -238,7 +238,7 @@ def _sample_poses(subject: Subject) -> np.ndarray:
     """Poses (S, J, 3) of the prior, the root at rest."""
     assert subject.pose_mean is not None and subject.pose_covariance is not None, "a subject with a pose prior"
     prior = gaussian_prior(subject.pose_mean, subject.pose_covariance)
-    draws = np.random.default_rng(0).standard_normal((SAMPLES, prior.free))
+    draws = np.random.default_rng(0).standard_normal((SAMPLES, len(prior.whitening)))
     poses = np.zeros((SAMPLES, len(prior.mean)))
     poses[:, 3:] = prior.mean[3:] + np.linalg.solve(prior.whitening[:, 3:], draws.T).T
     return poses.reshape(SAMPLES, -1, 3)

@@ -12,12 +12,12 @@ import numpy as np
 
 from model.bilinear import ShapedPoints
 from model.body import BodyModel
+from model.priors import gaussian_prior
 from scanprep.geometry.least_squares import Arrow, Residual, levenberg_marquardt, normal_equations
 from scanprep.ranges import Count, Positive, Seed, Settings
 
 from ... import energy
 from ...energy import MovingPoints
-from ...priors import gaussian_prior
 from ..marker_sets.layout import MarkerLayout
 from ..pose.marked_body import supports
 from .attachment import Attachment, LatentMarkers, above_triangles, latent_markers, simulated

@@ -1,22 +1,29 @@
-"""Where the fit of a scan begins when no landmark is known: typical poses, turned every way."""
+"""Where the fit of a scan begins: bodies that meet the landmarks, or without any typical poses, rotated every way."""
 from __future__ import annotations
 
-from typing import TYPE_CHECKING
+from collections.abc import Sequence
 
 import numpy as np
 
+from model.priors import GaussianPrior, typical_poses
+from scanprep import find_correspondences
 from scanprep.geometry import rotations
 from scanprep.geometry.farthest_points import farthest_points
+from scanprep.geometry.least_squares import normal_equations
 
-from ..priors import typical_poses
-from ..starts import distinct
-from .free_space import Sight, Sights
+from .. import energy
+from ..bodies import FixedBody, Follow
+from ..starts import distinct, search
+from .fit import ScanFit
+from .free_space import CameraView, free_space_violation
 from .scan import ScanPoints, spread
 
-if TYPE_CHECKING:
-    from .fit import ScanFit
-
-TURNS = 600                          # about 25 degrees between neighbours
+AXES = 4                             # directions of the training poses along which a search from landmarks starts
+CANDIDATES = 3                       # starts that are carried on from the landmarks to the scan
+COARSE = (0.25, 0.2, 0.15, 0.12, 0.1)    # metres: reaches of the first rounds, on few points
+PAIRS_SD = 0.05                      # metres: correspondences are that far off, and not independently of each other
+FINALISTS = 4                        # starts that are carried through all these rounds
+ROTATIONS = 600                         # about 25 degrees between neighbours
 POSES = 100                          # tried at most
 VERTICES, POINTS = 500, 120          # of body and scan, in the first look at all turns
 CAP = 0.15                           # metres: further off is as bad
@@ -27,6 +34,66 @@ PROMISING = 0.4                      # share of all placements, those least deni
 AT_ONCE = 1000                       # points that are compared at a time
 POOL = 200                           # best placements that are kept
 BLIND, APART = 24, 0.08              # of them, starts that differ by so many metres on average
+
+
+def first_starts(fit: ScanFit) -> np.ndarray:
+    """Bodies (n, P) to start from: those that meet the landmarks, or, without any, typical poses on the scan."""
+    if not len(fit.vertices):
+        return from_nothing(fit)
+    marked = from_landmarks(fit, fit.vertices, fit.points, fit.config.landmark_sd)
+    if not fit.config.correspondences:
+        return marked
+    pairs = find_correspondences(fit.body.template, fit.cloud.points, (fit.vertices, fit.points))
+    more = from_landmarks(fit, pairs.template_vertices, pairs.scan_points, PAIRS_SD)
+    return np.concatenate([more, marked])
+
+
+def from_landmarks(fit: ScanFit, vertices: np.ndarray, points: np.ndarray, sd: float) -> np.ndarray:
+    """The likeliest bodies (n, P) that meet landmarks (L,), (L, 3) to within sd metres, distinct and best first."""
+    body = fit.body
+    follow = body.follow(vertices, np.zeros(body.n_angles + 3 + body.n_betas))
+    x, _ = search(body, follow, points, sd, fit.prior, AXES)
+    places = body.subject.points(fit.spread).evaluate(*body.split(x)[:2])
+    x = x[distinct(places, CANDIDATES)]
+    drawn = np.concatenate([x, *(around(body, follow, start, points, sd, fit.prior, fit.config.random_starts, fit.rng)
+                                for start in x)])
+    drawn = drawn[np.argsort(fit.quick_misfits(drawn))]
+    places = body.subject.points(fit.spread).evaluate(*body.split(drawn)[:2])
+    return drawn[distinct(places, CANDIDATES)]
+
+
+def around(body: FixedBody, follow: Follow, x: np.ndarray, targets: np.ndarray, sd: float, prior: GaussianPrior,
+           count: int, rng: np.random.Generator) -> np.ndarray:
+    """Draws (count, P) of what the landmarks and the pose prior leave open around their optimum x (P,).
+
+    The normal distribution whose precision is the Gauss-Newton matrix (Laplace's approximation).
+    """
+    weights = np.full(len(targets), sd**-2)
+    terms = [energy.point_to_point(follow(x[None]), targets, weights), energy.pose_prior(x[None], prior)]
+    free = body.n_angles + 3
+    precision = normal_equations(terms).hessian[0, :free, :free] + 1e-6 * np.eye(free)
+    drawn = np.repeat(x[None], count, axis=0)
+    drawn[:, :free] += np.linalg.solve(np.linalg.cholesky(precision).T, rng.normal(size=(free, count))).T
+    return drawn
+
+
+def best_start(fit: ScanFit, starts: np.ndarray) -> np.ndarray:
+    """The start (P,) that explains the scan best after a few rounds on few points; the worst drop out early."""
+    ends = np.array(starts)
+    if len(ends) > FINALISTS:
+        ends = np.array([approach(fit, x, COARSE[:2]) for x in ends])
+        ends = ends[np.argsort([fit.misfit(x) for x in ends], kind="stable")[:FINALISTS]]
+        ends = np.array([approach(fit, x, COARSE[2:]) for x in ends])
+    else:
+        ends = np.array([approach(fit, x) for x in ends])
+    return ends[int(np.argmin([fit.misfit(x) for x in ends]))]
+
+
+def approach(fit: ScanFit, x: np.ndarray, reaches: tuple[float, ...] = COARSE) -> np.ndarray:
+    """Unknowns (P,) after a few rounds on few points."""
+    for reach in reaches:
+        x = fit.step(x, fit.coarse, reach)[0]
+    return x
 
 
 def from_nothing(fit: ScanFit) -> np.ndarray:
@@ -44,7 +111,7 @@ def starting_poses(fit: ScanFit) -> np.ndarray:
     """Poses (M, J, 3) to try: those the model was trained on, or steps along the Gaussian's main directions."""
     body = fit.body
     if not len(body.pose_examples):
-        return typical_poses(body.pose_mean, body.pose_covariance, fit.config.start_axes)
+        return typical_poses(body.pose_mean, body.pose_covariance, AXES)
     mean = body.pose_mean.copy()
     mean[0] = 0
     return varied(np.concatenate([mean[None], body.pose_examples]), POSES)
@@ -55,7 +122,7 @@ def varied(poses: np.ndarray, count: int) -> np.ndarray:
     return poses if len(poses) <= count else poses[farthest_points(poses.reshape(len(poses), -1), count, 0)]
 
 
-def all_turns(count: int) -> np.ndarray:
+def all_rotations(count: int) -> np.ndarray:
     """Rotations (count, 3, 3) spread evenly, with no axis preferred: the quaternions of two golden spirals."""
     i = np.arange(count) + 0.5
     r, R = np.sqrt(i / count), np.sqrt(1 - i / count)
@@ -67,16 +134,15 @@ def all_turns(count: int) -> np.ndarray:
 
 
 class Outside:
-    """A table of how far places stand where a camera would have seen them.
+    """A table of how far places stand where cameras, at least one, would have seen them."""
 
-    `tolerance`, metres, see `Sight.trespass`.
-    """
-
-    def __init__(self, sight: Sight | Sights, tolerance: float) -> None:
-        self.low = sight.points.min(axis=0) - MARGIN
-        self.count = np.ceil((sight.points.max(axis=0) + MARGIN - self.low) / CELL).astype(np.int64)
+    def __init__(self, cameras: Sequence[CameraView]) -> None:
+        points = np.concatenate([camera.points for camera in cameras])
+        self.low = points.min(axis=0) - MARGIN
+        self.count = np.ceil((points.max(axis=0) + MARGIN - self.low) / CELL).astype(np.int64)
         grid = np.stack(np.meshgrid(*[np.arange(n) for n in self.count], indexing="ij"), axis=-1).reshape(-1, 3)
-        self.excess = np.minimum(sight.trespass(self.low + CELL * (grid + 0.5), tolerance)[0], CAP).astype(np.float32)
+        excess = free_space_violation(cameras, self.low + CELL * (grid + 0.5)).excess
+        self.excess = np.minimum(excess, CAP).astype(np.float32)
 
     def at(self, places: np.ndarray) -> np.ndarray:
         """(...) metres, for places (..., 3); beyond the table as at its end."""
@@ -87,36 +153,29 @@ class Outside:
 def placements(fit: ScanFit) -> tuple[np.ndarray, np.ndarray]:
     """The best of all poses in all turns, laid on the scan: unknowns (POOL, P) and costs, best first."""
     body, config = fit.body, fit.config
-    poses, turns = starting_poses(fit), all_turns(TURNS)
+    poses, turns = starting_poses(fit), all_rotations(ROTATIONS)
     scan, ids = fit.cloud.thinned(POINTS), spread(body.template.vertices, VERTICES)
-    places, normals = posed_points(fit, ids, poses)
-    cameras = fit.sight.cameras if isinstance(fit.sight, Sights) else [fit.sight] if fit.sight else []
-    toward = np.array([_unit(camera.viewpoint - scan.points.mean(axis=0)) for camera in cameras]).reshape(-1, 3)
-    table = None if fit.sight is None else Outside(fit.sight, config.silhouette_tolerance)
-    cost, shift = np.zeros((len(poses), TURNS)), np.empty((len(poses), TURNS, 3))
+    places, normals = fit.posed_points(ids, poses)
+    toward = np.array([camera.viewpoint - scan.points.mean(axis=0) for camera in fit.cameras]).reshape(-1, 3)
+    toward /= np.linalg.norm(toward, axis=1, keepdims=True)
+    table = Outside(fit.cameras) if fit.cameras else None
+    cost, shift = np.zeros((len(poses), ROTATIONS)), np.empty((len(poses), ROTATIONS, 3))
     for a, (y, n) in enumerate(zip(places, normals, strict=True)):
         shift[a] = scan.points.mean(axis=0) - (turns @ _shown(y, n, turns, toward)[:, :, None])[..., 0]
         if table is not None:
             out = table.at((y @ np.swapaxes(turns, 1, 2) + shift[a][:, None]).astype(np.float32))
-            cost[a] = config.silhouette_weight * (out**2).mean(axis=1)
-    doubtful = cost > (np.quantile(cost, PROMISING) if table is not None else np.inf)
+            cost[a] = config.free_space_weight * (out**2).mean(axis=1)
+    unlikely = cost > (np.quantile(cost, PROMISING) if table is not None else np.inf)
     for a, (y, n) in enumerate(zip(places, normals, strict=True)):
-        likely = ~doubtful[a]
+        likely = ~unlikely[a]
         cost[a, likely] += _distances(y, n, turns[likely], shift[a, likely], scan)
-    cost[doubtful] = np.inf
+    cost[unlikely] = np.inf
     order = np.argsort(cost, axis=None, kind="stable")[:POOL]
     which, turn = np.unravel_index(order, cost.shape)
-    x = np.array([body.join(_turned(poses[a], turns[b]), np.zeros(3)) for a, b in zip(which, turn, strict=True)])
+    x = np.array([body.join(_rotated(poses[a], turns[b]), np.zeros(3)) for a, b in zip(which, turn, strict=True)])
     stand = body.subject.origin
     x[:, body.n_angles:body.n_angles + 3] = (turns[turn] @ stand) + shift[which, turn] - stand
     return x, cost.ravel()[order]
-
-
-def posed_points(fit: ScanFit, ids: np.ndarray, poses: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Some vertices (B, L, 3) in poses (B, J, 3), and normals that turn with their parts."""
-    R = fit.body.skeleton.part_rotations(poses)[:, fit.part[ids]]
-    normals = (R @ fit.body.template.vertex_normals[ids][:, :, None])[..., 0]
-    return fit.body.subject.points(ids).evaluate(poses), normals
 
 
 def _shown(y: np.ndarray, n: np.ndarray, turns: np.ndarray, toward: np.ndarray) -> np.ndarray:
@@ -139,11 +198,7 @@ def _distances(y: np.ndarray, n: np.ndarray, turns: np.ndarray, shift: np.ndarra
     return np.minimum(nearest, CAP**2).reshape(len(turns), -1).mean(axis=1)
 
 
-def _turned(pose: np.ndarray, R: np.ndarray) -> np.ndarray:
+def _rotated(pose: np.ndarray, R: np.ndarray) -> np.ndarray:
     out = pose.copy()
     out[0] = rotations.log(R @ rotations.exp(pose[0]))
     return out
-
-
-def _unit(v: np.ndarray) -> np.ndarray:
-    return v / np.linalg.norm(v)
