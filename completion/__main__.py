@@ -14,7 +14,7 @@ COMMANDS = {
     "animate": ("Markers -> the person and a moving body.", "completion.mocap.animate.cli:animate_markers"),
     "mosh": ("Markers -> shape, motion and soft tissue; a file, or a folder of people.",
              "completion.mocap.mosh.cli:mosh_markers"),
-    "layout": ("Marker sets: look at them, carry them to other bodies, design them.",
+    "layout": ("Marker sets: look at them, transfer them to other bodies, design them.",
                "completion.mocap.marker_sets.cli:group"),
     "statue": ("One scan -> a layered character that moves, with all its detail.", "model.statue.cli:group"),
     "track": ("Frames of points -> a moving body, without markers.", "completion.tracking.cli:track_frames"),

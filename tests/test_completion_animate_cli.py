@@ -10,6 +10,7 @@ from glb_reader import Glb
 from completion import motion_pictures
 from completion.__main__ import main
 from completion.mocap.files.markers import MarkerSequence, write_markers
+from completion.mocap.files.motion_files import write_glb
 from completion.mocap.marker_sets.layout import MarkerLayout
 from completion.motion import Motion
 
@@ -83,10 +84,13 @@ def test_a_person_and_the_motion_from_markers(place, tmp_path):
 
 def test_the_glb_lasts_as_long_as_the_motion(place, tmp_path):
     assert run(place, place / "walk.csv", "-o", tmp_path / "out", "--subject", "template") == 0
-    glb = Glb((tmp_path / "out" / "animation.glb").read_bytes())
-    times = glb.array(glb.json["animations"][0]["samplers"][0]["input"])[:, 0]
-    assert len(times) == 6 and times[0] == 0 and times[-1] == pytest.approx((FRAMES - 1) / 60, rel=1e-5)
-    assert Motion.load(tmp_path / "out" / "motion.npz").betas is None
+    motion = Motion.load(tmp_path / "out" / "motion.npz")
+    write_glb(tmp_path / "few.glb", motion, worm_with_prior().subject(None), keys=6)
+    for path, keys in ((tmp_path / "out" / "animation.glb", FRAMES), (tmp_path / "few.glb", 6)):
+        glb = Glb(path.read_bytes())
+        times = glb.array(glb.json["animations"][0]["samplers"][0]["input"])[:, 0]
+        assert len(times) == keys and times[0] == 0 and times[-1] == pytest.approx((FRAMES - 1) / 60, rel=1e-5)
+    assert motion.betas is None
     assert not (tmp_path / "out" / "subject.json").exists()
 
 

@@ -6,8 +6,7 @@ import pytest
 from people_bodies import small_people
 
 from completion.__main__ import main
-from completion.mocap.marker_sets import pictures
-from completion.mocap.marker_sets import transfer as carry
+from completion.mocap.marker_sets import pictures, transfer
 from completion.mocap.marker_sets.layout import MarkerLayout
 from completion.mocap.marker_sets.named import layout_names, named_layout
 from completion.mocap.marker_sets.pictures import marker_rows, picture_layout
@@ -68,7 +67,7 @@ def test_the_table_has_partners_and_parts(person):
     assert "RBAK" in rows["RBAC"][1]
 
 
-def test_carrying_writes_layout_picture_and_registration(tmp_path, person, monkeypatch):
+def test_a_transfer_writes_layout_picture_and_registration(tmp_path, person, monkeypatch):
     """With a registration that is known: the command passes landmarks on by name and says how it went."""
     seen = {}
 
@@ -77,7 +76,7 @@ def test_carrying_writes_layout_picture_and_registration(tmp_path, person, monke
         nothing = np.zeros(len(source.vertices))
         return Registration(source, nothing, nothing == 0, 0.001, 0.002, True, 1, {}, 0, nothing + 1, 0.06)
 
-    monkeypatch.setattr(carry, "register", perfect)
+    monkeypatch.setattr(transfer, "register", perfect)
     body = person.mesh
     write_mesh(tmp_path / "a.ply", body)
     write_mesh(tmp_path / "b.ply", type(body)(body.vertices[::-1], len(body.vertices) - 1 - body.faces))
@@ -85,8 +84,8 @@ def test_carrying_writes_layout_picture_and_registration(tmp_path, person, monke
     marks = {"toe": 700, "heel": 9, "nose": 5}
     write_landmarks(tmp_path / "b.json", {name: body.vertices[v] for name, v in marks.items()})
     out = tmp_path / "b.layout.json"
-    assert main(["layout", "carry", "vicon47", "--source", str(tmp_path / "a.ply"), "--target", str(tmp_path / "b.ply"),
-                 "--landmarks", str(tmp_path / "b.json"), "-o", str(out)]) == 0
+    assert main(["layout", "transfer", "vicon47", "--source", str(tmp_path / "a.ply"),
+                 "--target", str(tmp_path / "b.ply"), "--landmarks", str(tmp_path / "b.json"), "-o", str(out)]) == 0
     assert seen["landmarks"][0].tolist() == [5, 9, 700]
     target = read_mesh(tmp_path / "b.ply")
     np.testing.assert_allclose(MarkerLayout.load(out, 9380).select(["C7", "LELB"]).place(target),
@@ -102,11 +101,12 @@ BAD = {
     "a layout of another body": ("show big.json --body ball.ply -o out", ["big.json", "vertex 77"]),
     "a mesh that is not there": ("show vicon47 --body none.ply -o out", ["none.ply", "no such file"]),
     "a body and a model": ("show vicon47 --body body.ply -m model.npz -o out", ["--model", "--body"]),
-    "a source of another body": ("carry vicon47 --source ball.ply --target body.ply -o o.json",
+    "a source of another body": ("transfer vicon47 --source ball.ply --target body.ply -o o.json",
                                  ["vicon47", "4 vertices"]),
-    "landmarks that do not match": ("carry vicon47 --source body.ply --target ball.ply --landmarks far.json -o o.json",
+    "landmarks that do not match": ("transfer vicon47 --source body.ply --target ball.ply --landmarks far.json "
+                                    "-o o.json",
                                     ["far.json", "nose", "chin"]),
-    "no landmarks of the source": ("carry vicon47 --source lonely/body.ply --target ball.ply --landmarks far.json "
+    "no landmarks of the source": ("transfer vicon47 --source lonely/body.ply --target ball.ply --landmarks far.json "
                                    "-o o.json", ["body.landmarks.json"]),
     "a damaged layout": ("show broken.json --body body.ply -o out", ["broken.json", "JSON"]),
 }
