@@ -236,7 +236,7 @@ class _Settings:
         early = argparse.ArgumentParser(add_help=False, allow_abbrev=False, exit_on_error=False)
         early.add_argument("--config", type=Path)
         early.add_argument("--preset", default="default")
-        self.presets = any(hasattr(value, "published") for value in values.values())
+        self.presets = hasattr(values.get("config"), "published")     # of the command's own method
         self.values = values
         if not values or {"-h", "--help"} & {*argv}:
             return

@@ -13,14 +13,14 @@ QUICK = CoregistrationConfig(
     fit=ModelFitConfig(axes=2, turns=2),
     registration=RegistrationConfig(graph=(GraphStage(80, 0.09, 0.009, 0.7, 0.01, 0.08),
                                            GraphStage(80, 0.06, 0.006, 0.7, 0.01, 0.05))),
-    learn=LearnConfig(refinements=1), rounds=2, workers=Workers(1))
+    learn=LearnConfig(refinements=1), rounds=2, failed=0.05, workers=Workers(1))
 
 
 def run(argv):
     """Exit code of the command."""
     quick = (*cli.coregister_scans.__defaults__[:-1], QUICK)
     with mock.patch.object(cli.coregister_scans, "__defaults__", quick):
-        return console.run(cli.coregister_scans, "scape model coregister", ["--rounds", "1", "--failed", "0.05", *argv])
+        return console.run(cli.coregister_scans, "scape model coregister", ["--rounds", "1", *argv])
 
 
 if __name__ == "__main__":

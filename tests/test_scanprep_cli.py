@@ -223,14 +223,14 @@ def test_views_come_together(tmp_path):
 def test_correspondences_in_a_file(place, tmp_path, capsys, quick):
     scan = place / "scans" / "body0.ply"
     words = ["correspond", scan, "--template", place / "template.ply", "--landmarks",
-             place / "scans" / "body0.landmarks.json", "--points", 40]
+             place / "scans" / "body0.landmarks.json", "--config", config_file(tmp_path, points=40)]
     assert run(*words, "-o", tmp_path / "pairs.json") == 1   # on an egg all pairs are wrong by a third of it
     assert "MEANS NOTHING: 40 pairs were found with a median confidence of 0.03" in capsys.readouterr().err
     found = read_correspondences(tmp_path / "pairs.json")
     assert len(found) == report(tmp_path / "pairs.report.json")["correspondences"] > 5
     assert 0 <= found.template_vertices.min() and found.template_vertices.max() < 642
     assert ((found.confidence >= 0) & (found.confidence <= 1)).all()
-    beside = [*words[:4], "--points", 40]                    # the file of its name beside the scan
+    beside = [*words[:4], "--config", config_file(tmp_path, points=40)]     # the landmarks of its name beside the scan
     assert run(*beside, "-o", tmp_path / "beside.json") == 1
     assert (tmp_path / "beside.json").read_bytes() == (tmp_path / "pairs.json").read_bytes()
     capsys.readouterr()

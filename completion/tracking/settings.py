@@ -2,9 +2,8 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field, replace
-from typing import Annotated
 
-from scanprep.ranges import FLAG, Count, Positive, Settings
+from scanprep.ranges import Count, Positive, Settings
 
 from ..partial.settings import CompletionConfig
 
@@ -51,7 +50,7 @@ class TrackConfig(Settings):
     search_every: Count = 10
     shape_frames: Count = 24
     shape_views: Count = 8
-    smoothing: Annotated[int, FLAG] = 2
+    smoothing: int = 2
     start: CompletionConfig = field(default_factory=CompletionConfig)
 
     @property

@@ -128,5 +128,5 @@ class CoregistrationConfig(Settings):
     learn: LearnConfig = field(default_factory=LearnConfig)
     rounds: Annotated[Count, FLAG] = 3
     tolerance: float = 0.0007
-    failed: Annotated[Share, FLAG] = 0.015
+    failed: Share = 0.015
     workers: Workers = field(default_factory=Workers)

@@ -2,7 +2,6 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Annotated
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -11,7 +10,7 @@ from ..geometry import rotations
 from ..geometry.mesh import Mesh
 from ..geometry.target import target_of
 from ..meaning import extent, unit_problem
-from ..ranges import FLAG, Positive, Settings, SomeShare
+from ..ranges import Positive, Settings, SomeShare
 from ..threads import search_threads
 
 LEAST = 6                   # matches that determine a motion
@@ -29,8 +28,8 @@ class RigidConfig(Settings):
         Farthest match that counts.
     """
 
-    keep: Annotated[SomeShare, FLAG] = 0.8
-    reach: Annotated[Positive | None, FLAG] = None
+    keep: SomeShare = 0.8
+    reach: Positive | None = None
 
 
 @dataclass(frozen=True, eq=False)

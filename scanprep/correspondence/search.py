@@ -3,7 +3,6 @@ from __future__ import annotations
 
 from dataclasses import dataclass, replace
 from functools import lru_cache
-from typing import Annotated
 
 import numpy as np
 from scipy.sparse import coo_array, csr_array
@@ -12,7 +11,7 @@ from scipy.spatial import cKDTree
 from ..geometry.farthest_points import farthest_points
 from ..geometry.geodesics import SurfaceGraph
 from ..geometry.mesh import Mesh
-from ..ranges import FLAG, Cell, Count, Settings
+from ..ranges import Cell, Count, Settings
 from .belief_propagation import Beliefs, PairField, propagate
 from .correspondences import Correspondences
 from .potentials import MOST_EDGE, Places, edge_energy, most_place_energy, place_energy, seen_from
@@ -52,7 +51,7 @@ class CorrelatedConfig(Settings):
         Most rounds of messages at each level.
     """
 
-    points: Annotated[Count, FLAG] = 240
+    points: Count = 240
     keep: Count = 170
     spacing: Cell = 0.009
     levels: tuple[BeliefLevel, ...] = (BeliefLevel(2000, 80), BeliefLevel(2000, 60), BeliefLevel(1_000_000, 60))

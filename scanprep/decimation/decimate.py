@@ -36,7 +36,7 @@ class DecimateConfig(Settings):
     """
 
     method: Annotated[Method, FLAG] = "quadric"
-    improve: Annotated[bool, FLAG] = False
+    improve: bool = False
     crease: float | None = None
 
 

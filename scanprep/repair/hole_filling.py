@@ -43,7 +43,7 @@ class FillConfig(Settings):
     """
 
     method: Annotated[Method, FLAG] = "auto"
-    max_edges: Annotated[Count | None, FLAG] = None
+    max_edges: Count | None = None
     density: Positive = 2 ** 0.5
     join: bool = True
     poisson_depth: Annotated[int, Range(1, 16)] = 8

@@ -48,7 +48,7 @@ class DesignConfig(Settings):
     count: Annotated[Count, FLAG] = 47
     through: tuple[Count, ...] = ()
     n_betas: int | None = None
-    joint: Annotated[bool, FLAG] = False
+    joint: bool = False
     marker_sd: Positive = 0.005
     surface: Count = 1000
     exchanges: int = 1
