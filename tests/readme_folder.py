@@ -5,8 +5,11 @@ import shlex
 import shutil
 from pathlib import Path
 
+import numpy as np
+
 from completion import Motion
 from completion.__main__ import main
+from completion.mocap.files.motion_files import write_motion_bvh
 from model import load_model
 from scanprep import write_mesh
 from scanprep.synthetic.data_set import read_views
@@ -74,8 +77,9 @@ def with_results(folder):
     demo = folder / "scape_demo"
     shutil.copy(demo / "model.npz", folder / "model.npz")
     model = load_model(demo / "model.npz")
-    write_mesh(folder / "heavier.ply", model.template.with_vertices(model.vertices(None, [1.5])))
+    standing = np.zeros((len(model.skeleton.parents), 3))
+    write_mesh(folder / "heavier.ply", model.template.with_vertices(model.vertices(standing, np.array([1.5]))))
     (folder / "walk").mkdir()
     shutil.copy(demo / "animation" / "motion.npz", folder / "walk")
-    shutil.copy(demo / "animation" / "motion.bvh", folder / "walk.bvh")
+    write_motion_bvh(folder / "walk.bvh", Motion.load(folder / "walk" / "motion.npz"), model.subject(None))
     return folder

@@ -124,7 +124,7 @@ CASES = {
         worm().vertices, worm().faces[::-1])), ["pose1.ply", "face"]),
     "one pose": (LEARN, lambda place: [(place / "poses" / f"pose{k}.ply").unlink() for k in (1, 2)], ["poses"]),
     "shapes of other topology": (LEARN + " --shapes shapes", lambda place: write_mesh("shapes/a.ply", worm(20)),
-                                 ["shapes", "triangles of the poses"]),
+                                 ["shapes", "expected the triangles"]),
     "skeleton that is none": (LEARN + " --skeleton layout.json", lambda place: None, ["layout.json", "skeleton"]),
     "landmark names that do not match": (COMPLETE, text("half.landmarks.json", '{"a": [0, 0, 0], "b": [1, 0, 0]}'),
                                          ["half.landmarks.json", "head"]),
@@ -153,8 +153,8 @@ CASES = {
     "a table of nobody": (MOSH + " --subjects layout.json", lambda place: None, ["layout.json", "subject"]),
     "a table of other files": (MOSH + " --subjects who.csv", text("who.csv", "file,subject\nrun.c3d,ann\n"),
                                ["who.csv", "run.c3d"]),
-    "a character that is none": (MOSH + " --character layout.json", lambda place: None, ["layout.json"]),
-    "a sex alone": (MOSH + " --female model.npz", lambda place: None, ["--female", "--male"]),
+    "a character that is none": (MOSH + " --retarget-to layout.json", lambda place: None, ["layout.json"]),
+    "a sex alone": (MOSH + " -m model.npz", lambda place: None, ["--model", "three"]),
 }
 
 

@@ -146,7 +146,7 @@ DAMAGE = {
 }
 
 
-@pytest.mark.parametrize("kind", ["scape-radial", "blendscape", "skinning-quadratic"])
+@pytest.mark.parametrize("kind", ["scape-radial", "blendscape", "skinning-linear"])
 def test_damaged_models_are_refused_when_they_are_loaded(tmp_path, kind):
     path = tmp_path / "model.npz"
     KINDS[kind]().save(path)
