@@ -11,7 +11,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 from completion_bodies import worm_with_prior
-from config_files import config_file
 from recordings import FRAMES, arguments, quick_page, track, write_recording
 
 from completion import Motion
@@ -175,12 +174,10 @@ def changed(before, after):
 
 @pytest.mark.parametrize("given, files", [
     ((), set()), (("--keys", 4), {"animation.glb"}),
-    ({"smoothing": 0}, {"motion.npz", "motion.bvh", "joint_angles.csv", "joint_centres.csv", "animation.glb",
+    (("--smoothing", 0), {"motion.npz", "motion.bvh", "joint_angles.csv", "joint_centres.csv", "animation.glb",
                           "report.html"})])
-def test_what_is_made_of_frames_does_not_follow_them_again(again, given, files, tmp_path):
+def test_what_is_made_of_frames_does_not_follow_them_again(again, given, files):
     folder, out, numbers = again
-    if isinstance(given, dict):
-        given = "--config", config_file(tmp_path, **given)
     before = contents(out)
     assert track(*arguments(folder, out, *KNOWN, *given)) == 0
     assert not numbers and changed(before, contents(out)) == files

@@ -228,7 +228,7 @@ def test_rounds_mend_what_failed_and_better_the_model(story, body):
     truths, _, plain, _, done, _ = story
     before = np.array([mean_mm(v, t) for v, t in zip(plain, truths, strict=True)])
     after = np.array([mean_mm(r.mesh.vertices, t) for r, t in zip(done.registrations, truths, strict=True)])
-    assert (before > 25).sum() == 2 and (after < 6).all() and done.good.all()
+    assert (before > 25).sum() == 2 and (after < 8).all() and done.good.all()
     assert after[:3].mean() < before[:3].mean() + 0.5
     assert done.rounds == 2 and [turn.failed for turn in done.history] == [0, 0]
     assert np.isnan(done.history[0].change) and done.history[1].change < 3e-3
