@@ -29,7 +29,7 @@ NOTHING = (np.zeros(0, dtype=np.int64), np.zeros((0, 3)))
 
 
 @dataclass(frozen=True, eq=False)
-class Settled:
+class Refined:
     """Where the fit of a frame ended; gradient and matrix are of half the energy there, without the prediction."""
 
     x: np.ndarray                    # (P,)
@@ -47,11 +47,11 @@ class FrameFit:
         self.scan = ScanFit(body, cloud, *NOTHING, config.scan)
         self.inertia = inertia(body.n_angles + 3, rate, config.angle_acceleration, config.place_acceleration)
 
-    def good(self, found: Settled) -> bool:
+    def good(self, found: Refined) -> bool:
         """Whether a frame is not lost."""
         return found.residual <= self.config.lost and found.explained >= EXPLAINED
 
-    def settle(self, fit: ScanFit, x: np.ndarray, expected: np.ndarray | None = None) -> Settled:
+    def refine(self, fit: ScanFit, x: np.ndarray, expected: np.ndarray | None = None) -> Refined:
         """The best unknowns near x (P,), held by the expected ones where there are such."""
         held = 0 * self.inertia if expected is None else self.inertia / PREDICTION
         goal, place = x if expected is None else expected, self.body.vertices(x)
@@ -67,15 +67,15 @@ class FrameFit:
                 break
         _, gradient, precision = normal_equations([*terms(best).values()])
         distance = Surface(self.body.template.with_vertices(place)).closest(fit.cloud.points).distances
-        return Settled(x, gradient[0], precision[0], float(distance.mean()), float((distance < NEAR).mean()))
+        return Refined(x, gradient[0], precision[0], float(distance.mean()), float((distance < NEAR).mean()))
 
-    def again(self, fit: ScanFit, starts: Sequence[np.ndarray], scratch: bool) -> Settled:
+    def again(self, fit: ScanFit, starts: Sequence[np.ndarray], scratch: bool) -> Refined:
         """A lost frame anew from far starts (P,), or from scratch as well, whichever explains it best."""
         if scratch:
             starts = [*starts, best_start(fit, first_starts(fit))]
         ends = [approach(fit, _laid(self.body, x, fit.cloud)) for x in starts]
         best = ends[int(np.argmin([fit.misfit(x) for x in ends]))]
-        return self.settle(fit, reinitialise_limbs(fit, best) if scratch else best)
+        return self.refine(fit, reinitialise_limbs(fit, best) if scratch else best)
 
 
 def shared_shape(body: ShapedBody, clouds: Sequence[ScanPoints], x: np.ndarray, betas: np.ndarray,

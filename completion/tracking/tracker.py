@@ -16,7 +16,7 @@ from ..partial.completion import complete
 from ..partial.free_surface import free_surface
 from ..partial.scan import ScanPoints
 from .dynamics import predicted
-from .frame_fit import FrameFit, Settled, shared_shape, spread_poses
+from .frame_fit import FrameFit, Refined, shared_shape, spread_poses
 from .frames import Frame, as_views, prepare_frame
 from .settings import TrackConfig
 
@@ -102,18 +102,18 @@ class Tracker:
         mesh = self._mesh(frame.x)
         return mesh if frame.cloud is None or not frame.found else free_surface(mesh, frame.cloud, self.config.start)[0]
 
-    def _begin(self, cloud: ScanPoints) -> Settled:
+    def _begin(self, cloud: ScanPoints) -> Refined:
         """The first frame that shows something."""
         start = complete(self.given, as_views(cloud), self.landmarks, self.config.start)
         self._has_shape(start.betas)
         fitter = self._fitter(cloud)
-        return fitter.settle(fitter.scan.on(cloud), fitter.body.join(start.pose, start.trans))
+        return fitter.refine(fitter.scan.on(cloud), fitter.body.join(start.pose, start.trans))
 
-    def _follow(self, cloud: ScanPoints, expected: np.ndarray) -> Settled:
+    def _follow(self, cloud: ScanPoints, expected: np.ndarray) -> Refined:
         """A frame after others: near where it is expected, or found again where that explains it better."""
         fitter, lost = self._fitter(cloud), self.state.lost
         fit = fitter.scan.on(cloud)
-        found = fitter.settle(fit, expected, None if lost else expected)
+        found = fitter.refine(fit, expected, None if lost else expected)
         if fitter.good(found):
             return found
         anew = fitter.again(fit, [expected, self.state.past[0]], (lost - 1) % self.config.search_every == 0)
@@ -150,10 +150,10 @@ class Tracker:
         if frame.cloud is None or not frame.found:
             return frame
         fitter = self._fitter(frame.cloud)
-        found = fitter.settle(fitter.scan.on(frame.cloud), frame.x, frame.x)
+        found = fitter.refine(fitter.scan.on(frame.cloud), frame.x, frame.x)
         return self._tracked(frame.number, found.x, found, frame.cloud)
 
-    def _tracked(self, number: int, x: np.ndarray | None = None, found: Settled | None = None,
+    def _tracked(self, number: int, x: np.ndarray | None = None, found: Refined | None = None,
                  cloud: ScanPoints | None = None) -> TrackedFrame:
         """A frame; what its data say is left out where it is lost, and x is zero before the body was seen."""
         size = self.person.n_angles + 3

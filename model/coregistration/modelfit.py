@@ -66,7 +66,7 @@ class ModelFit:
         points = self.points(self.config.refine[-1].sample)[0]
         return points.J3 + 3 + points.n_betas
 
-    def settle(self, x: np.ndarray, points: PosedPoints, wanted: Attraction, prior: float, steps: int) -> np.ndarray:
+    def refine(self, x: np.ndarray, points: PosedPoints, wanted: Attraction, prior: float, steps: int) -> np.ndarray:
         """Least squares over x of what is wanted of the points, the pose prior and that of the betas."""
         J3, W = points.J3, prior * self.size * self.whitening
         mean, b = self.pose_mean.ravel(), self.config.shape_prior * self.size
@@ -88,7 +88,7 @@ class ModelFit:
         return out
 
     def follow(self, x: np.ndarray, stage: PoseStage) -> np.ndarray:
-        """One stage: match, settle, and again."""
+        """One stage: match, refine, and again."""
         points, share = self.points(stage.sample)
         scale = self.config.normal_weight * self.size
         L = len(share)
@@ -99,7 +99,7 @@ class ModelFit:
             if not target.oriented:
                 target = orient(target, self.predicted(x), scale)
             wanted = attraction(y, n, share, target, stage.reach * self.size, stage.slide, scale)
-            x = self.settle(x, points, wanted.joined(marks), stage.prior, STEPS)
+            x = self.refine(x, points, wanted.joined(marks), stage.prior, STEPS)
         return x
 
     def scored(self, x: np.ndarray, stage: PoseStage) -> Candidate:
@@ -160,7 +160,7 @@ class ModelFit:
         ids = spread_vertices(self.body.template.vertices, stage.sample)
         wanted = towards(np.r_[vertices[ids], self.marked],
                          np.r_[share * weights[ids], np.full(len(self.marks), stage.landmarks)])
-        return self.settle(x, points, wanted, prior, steps)
+        return self.refine(x, points, wanted, prior, steps)
 
     def start_from(self, vertices: np.ndarray, weights: np.ndarray) -> np.ndarray:
         """Unknowns near an alignment that may be wrong here and there."""
@@ -207,7 +207,7 @@ class ModelFit:
         x[points.J3:points.J3 + 3] += (self.marked - points.positions(x)[len(share):]).mean(axis=0)
         nothing = Attraction(np.zeros((len(share), 3, 3)), np.zeros((len(share), 3)))
         marks = towards(self.marked, np.full(len(self.marks), 1 / len(self.marks)))
-        return self.settle(x, points, nothing.joined(marks), stage.prior, 15)
+        return self.refine(x, points, nothing.joined(marks), stage.prior, 15)
 
     def predicted(self, x: np.ndarray) -> Mesh:
         """The body's mesh."""

@@ -134,6 +134,6 @@ def _people(model: ScapeModel, pose: np.ndarray) -> tuple[np.ndarray, np.ndarray
 
 
 def enough_poses(model: ScapeModel, least: int) -> int:
-    """How many poses settle the features of every part."""
+    """How many poses determine the features of every part."""
     # three poses for each feature of the part that has most
     return max(least, 3 * int(np.bincount(model.pose_space.features.part).max()))

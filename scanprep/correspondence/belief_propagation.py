@@ -32,7 +32,7 @@ class Beliefs:
 
 
 def propagate(field: PairField, iterations: int = 40, damping: float = 0.3, tolerance: float = 1e-3) -> Beliefs:
-    """Beliefs after messages were passed over all edges at once until they settle; exact on a tree.
+    """Beliefs after messages were passed over all edges at once until they converge; exact on a tree.
 
     A share of the old message is kept, `damping`; settled when the mean message changes by less than the tolerance.
 

@@ -242,7 +242,7 @@ def place_joints(surface: PosedSurface, label: np.ndarray, motions: Motions, lin
 
 
 def _meeting_point(dR: np.ndarray, gap: np.ndarray, radius: float) -> np.ndarray:
-    """The c (3,) that makes `dR c + gap` (M, 3) small, drawn to 0 where the poses do not settle it.
+    """The c (3,) that makes `dR c + gap` (M, 3) small, drawn to 0 where the poses do not determine it.
 
     The pull is that of a prior of a few times `radius` beside the error that no c removes.
     """
