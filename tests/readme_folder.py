@@ -9,7 +9,6 @@ import numpy as np
 
 from completion import Motion
 from completion.__main__ import main
-from completion.mocap.files.motion_files import write_motion_bvh
 from model import load_model
 from scanprep import write_mesh
 from scanprep.synthetic.data_set import read_views
@@ -81,5 +80,4 @@ def with_results(folder):
     write_mesh(folder / "heavier.ply", model.template.with_vertices(model.vertices(standing, np.array([1.5]))))
     (folder / "walk").mkdir()
     shutil.copy(demo / "animation" / "motion.npz", folder / "walk")
-    write_motion_bvh(folder / "walk.bvh", Motion.load(folder / "walk" / "motion.npz"), model.subject(None))
     return folder
