@@ -83,9 +83,9 @@ class BodyShape(Settings):
     nose: Annotated[float, Range(-2, 2.5)] = 0.0
 
     def __post_init__(self) -> None:
+        super().__post_init__()
         for field in fields(self):
             object.__setattr__(self, field.name, float(getattr(self, field.name)))
-        super().__post_init__()
 
     def array(self) -> np.ndarray:
         """(15,) the values in the order of the fields."""
