@@ -91,7 +91,7 @@ def test_loose_markers_are_found_where_they_are(model, layout):
     stays = find_person(model, sequence, replace(layout, loose=()), CONFIG)
     places = found.layout.place(model.template)
     for label, vertex in true.items():
-        assert np.linalg.norm(places[layout.labels.index(label)] - rest_at[vertex]) < 0.04, label
+        assert np.linalg.norm(places[layout.labels.index(label)] - rest_at[vertex]) < 0.03, label
     assert found.residual < 0.6 * stays.residual
     firm = [i for i, label in enumerate(layout.labels) if label not in layout.loose]
     assert found.moved[firm].max() < 0.03 < found.moved[rows].min()

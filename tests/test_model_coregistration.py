@@ -35,6 +35,7 @@ from scanprep.registration.nonrigid import register
 from scanprep.registration.schedule import GraphStage
 from scanprep.skeleton.tree import Skeleton
 
+COARSE = replace(QUICK, registration=replace(QUICK.registration, final_fit=None))     # bodies of 398 vertices
 PLAIN = replace(QUICK.registration, graph=(GraphStage(80, 0.2, 0.02, 0.7, 0.01, 0.21),
                                            GraphStage(80, 0.13, 0.013, 0.7, 0.01, 0.15), *QUICK.registration.graph))
 FAR = np.array([0, -1.3, 0.1]), np.array([0.1, 1.3, 0.2])          # both arms far from the template's
@@ -126,12 +127,12 @@ def test_betas_are_found_with_the_pose():
     rng = np.random.default_rng(1)
     pose, betas = 0.3 * random_poses(worm, 1, rng)[0], np.array([1.5, -1.0, 0.5])
     truth = worm.vertices(pose, betas, [0.02, 0, 0.01])
-    config = replace(QUICK, fit=replace(QUICK.fit, shape_prior=1e-5, search=(), refine=(
+    config = replace(COARSE, fit=replace(QUICK.fit, shape_prior=1e-5, search=(), refine=(
         *QUICK.fit.refine, replace(QUICK.fit.refine[-1], reach=0.02, prior=1e-5, rounds=20, slide=0.01))))
     marks = np.arange(0, 398, 40)
     found = register_with_model(worm, scan_of(worm.template, truth), (marks, truth[marks]), pose, config)
     assert found.betas is not None and found.betas == pytest.approx(betas, abs=0.3)
-    assert mean_mm(found.mesh.vertices, truth) < 9      # on 398 vertices: the final surface fit slides along the skin
+    assert mean_mm(found.mesh.vertices, truth) < 5
 
 
 def test_residual_is_the_energy_of_all_matches(body):
@@ -205,7 +206,7 @@ def test_the_person_with_most_scans_teaches_poses_and_others_shapes(monkeypatch)
         return made_of(worm.template, scan, 0.5 if scan is bodies[6] else 1.0)
 
     monkeypatch.setattr(rounds_module, "register_with_model", ready)
-    done = coregister(worm, bodies, None, replace(QUICK, rounds=1), subjects=who)
+    done = coregister(worm, bodies, None, replace(COARSE, rounds=1), subjects=who)
     assert done.model.info["poses"] == 1 + 3 and done.model.info["shapes"] == 3      # the template; not the one failed
     assert done.good.tolist() == [True] * 6 + [False, True] and done.history[0].failed == 1
     assert done.model.n_betas == 2
@@ -220,7 +221,7 @@ def story(body, skeleton, tmp_path_factory):
     plain = np.stack([register(body, scan, config=PLAIN).mesh.vertices for scan in scans])
     first = learn_scape(body, np.stack([body.vertices, *plain[:3]]), None, skeleton, QUICK.learn)
     with workspace(tmp_path_factory.mktemp("story") / "kept") as space:
-        done = coregister(first, scans, None, QUICK, list(plain), space=space)
+        done = coregister(first, scans, None, COARSE, list(plain), space=space)
     return truths, scans, plain, first, done, space.folder
 
 
@@ -228,7 +229,7 @@ def test_rounds_mend_what_failed_and_better_the_model(story, body):
     truths, _, plain, _, done, _ = story
     before = np.array([mean_mm(v, t) for v, t in zip(plain, truths, strict=True)])
     after = np.array([mean_mm(r.mesh.vertices, t) for r, t in zip(done.registrations, truths, strict=True)])
-    assert (before > 25).sum() == 2 and (after < 8).all() and done.good.all()
+    assert (before > 25).sum() == 2 and (after < 6).all() and done.good.all()
     assert after[:3].mean() < before[:3].mean() + 0.5
     assert done.rounds == 2 and [turn.failed for turn in done.history] == [0, 0]
     assert np.isnan(done.history[0].change) and done.history[1].change < 3e-3
@@ -237,7 +238,7 @@ def test_rounds_mend_what_failed_and_better_the_model(story, body):
 
 def test_a_settled_folder_stops_early_and_reports_it(story):
     _, scans, _, _, done, _ = story
-    again = coregister(done.model, scans[:2], None, replace(QUICK, tolerance=0.02, rounds=4),
+    again = coregister(done.model, scans[:2], None, replace(COARSE, tolerance=0.02, rounds=4),
                        [r.mesh.vertices for r in done.registrations[:2]])
     assert again.converged and again.rounds == 2
 
@@ -265,7 +266,7 @@ def test_what_was_kept_is_not_made_again(story, tmp_path, monkeypatch):
     monkeypatch.setattr(rounds_module, "register_with_model", forbidden)
     monkeypatch.setattr(rounds_module, "learn_again", forbidden)
     with workspace(tmp_path / "kept") as space:
-        again = coregister(first, scans, None, QUICK, list(plain), space=space)
+        again = coregister(first, scans, None, COARSE, list(plain), space=space)
     for a, b in zip(again.registrations, done.registrations, strict=True):
         np.testing.assert_array_equal(a.mesh.vertices, b.mesh.vertices)
         np.testing.assert_array_equal(a.distances, b.distances)
