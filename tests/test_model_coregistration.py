@@ -402,7 +402,7 @@ def contents(folder):
 @pytest.mark.parametrize("given, words", [
     ({"start": np.zeros((4, 3))}, "start: expected"),
     ({"landmarks": (np.array([5000]), np.zeros((1, 3)))}, "0..821"),
-    ({"landmarks": (np.array([1, 2]), np.zeros((1, 3)))}, "landmarks: expected vertices"),
+    ({"landmarks": (np.array([1, 2]), np.zeros((1, 3)))}, "landmarks: expected points of shape .2, 3."),
     ({"landmarks": (np.array([1]), np.full((1, 3), np.nan))}, "finite")])
 def test_one_scan_refuses_what_it_cannot_use(body, crab_model, given, words):
     with pytest.raises(ValueError, match=words):

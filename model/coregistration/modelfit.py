@@ -9,6 +9,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from model.priors import typical_poses, whitening
+from scanprep.correspondence.correspondences import checked_pairs
 from scanprep.geometry import rotations
 from scanprep.geometry.least_squares import Dense, levenberg_marquardt
 from scanprep.geometry.mesh import Mesh
@@ -45,7 +46,8 @@ class ModelFit:
         template = body.template
         self.body, self.target, self.config = body, target, config
         self.size = float(np.sqrt(template.face_areas.sum()))
-        self.marks, self.marked = _checked(template, landmarks)
+        self.marks, self.marked = (np.zeros(0, dtype=np.int64), np.zeros((0, 3))) if landmarks is None \
+            else checked_pairs(template, *landmarks, "landmarks", 0)
         if body.pose_mean is None or body.pose_covariance is None:
             raise ValueError("body: expected one with a mean and covariance of the pose, got a subject without")
         self.pose_mean, self.covariance = body.pose_mean, body.pose_covariance
@@ -220,19 +222,3 @@ class ModelFit:
         """Pose (J, 3), trans (3,), and betas (K,) or None where the shape is known."""
         J3 = self.pose_mean.size
         return x[:J3].reshape(-1, 3), x[J3:J3 + 3], x[J3 + 3:] if len(x) > J3 + 3 else None
-
-
-def _checked(template: Mesh, landmarks: tuple[np.ndarray, np.ndarray] | None) -> tuple[np.ndarray, np.ndarray]:
-    """Landmarks as arrays, none or more, or ValueError."""
-    if landmarks is None:
-        return np.zeros(0, dtype=np.int64), np.zeros((0, 3))
-    marks, marked = np.asarray(landmarks[0]), np.asarray(landmarks[1], dtype=np.float64)
-    if marks.ndim != 1 or not np.issubdtype(marks.dtype, np.integer) or marked.shape != (len(marks), 3):
-        raise ValueError(f"landmarks: expected vertices (L,) and points (L, 3), got {marks.dtype} {marks.shape} and "
-                         f"{marked.shape}")
-    if len(marks) and not 0 <= marks.min() <= marks.max() < len(template.vertices):
-        raise ValueError(f"landmarks: expected vertices of 0..{len(template.vertices) - 1}, got "
-                         f"{marks.min()}..{marks.max()}")
-    if not np.isfinite(marked).all():
-        raise ValueError("landmarks: expected finite points")
-    return marks, marked
