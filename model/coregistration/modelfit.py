@@ -46,8 +46,8 @@ class ModelFit:
         template = body.template
         self.body, self.target, self.config = body, target, config
         self.size = float(np.sqrt(template.face_areas.sum()))
-        self.marks, self.marked = (np.zeros(0, dtype=np.int64), np.zeros((0, 3))) if landmarks is None \
-            else checked_pairs(template, *landmarks, "landmarks", 0)
+        given = landmarks or (np.zeros(0, dtype=np.int64), np.zeros((0, 3)))
+        self.marks, self.marked = checked_pairs(template, *given, "landmarks", 0)
         if body.pose_mean is None or body.pose_covariance is None:
             raise ValueError("body: expected one with a mean and covariance of the pose, got a subject without")
         self.pose_mean, self.covariance = body.pose_mean, body.pose_covariance
