@@ -46,7 +46,7 @@ class ModelFit:
         template = body.template
         self.body, self.target, self.config = body, target, config
         self.size = float(np.sqrt(template.face_areas.sum()))
-        given = landmarks or (np.zeros(0, dtype=np.int64), np.zeros((0, 3)))
+        given: tuple[np.ndarray, np.ndarray] = landmarks or (np.zeros(0, dtype=np.int64), np.zeros((0, 3)))
         self.marks, self.marked = checked_pairs(template, *given, "landmarks", 0)
         if body.pose_mean is None or body.pose_covariance is None:
             raise ValueError("body: expected one with a mean and covariance of the pose, got a subject without")
