@@ -15,9 +15,8 @@ from scipy.spatial import cKDTree
 
 from model import BodyModel, Subject, fit_pose, learn_scape, load_model
 from scanprep.batch.opening import workspace
-from scanprep.batch.room import Room
-from scanprep.batch.steps import KeptSteps, inside
-from scanprep.batch.workspace import Task, Workspace
+from scanprep.batch.room import Room, inside
+from scanprep.batch.workspace import KeptSteps, Task, Workspace
 from scanprep.dataset import RegisteredSet
 from scanprep.geometry.files import read_mesh, write_mesh
 from scanprep.geometry.landmarks import match_landmarks, read_landmark_vertices, read_landmarks, write_landmarks
