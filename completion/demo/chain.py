@@ -23,8 +23,8 @@ from scanprep.geometry.landmarks import match_landmarks, read_landmark_vertices,
 from scanprep.geometry.mesh import Mesh
 from scanprep.pipeline.prepare import SCANS, PrepareConfig, Prepared, prepare
 from scanprep.pipeline.scans import find_scans
-from scanprep.pipeline.template import TemplateConfig, make_template
 from scanprep.skeleton.find import SkeletonConfig
+from scanprep.surfaces.template import TemplateConfig, make_template
 from scanprep.synthetic.data_set import (
     SUBJECT,
     GroundTruth,

@@ -1,7 +1,6 @@
-"""The one place of stored files: arrays with a JSON header, and JSON; tables stand beside it.
+"""Stored files: JSON, and `.npz` files of named arrays and a JSON header with kind and version; never pickle.
 
-Arrays: one `.npz` file = named arrays and a JSON header with kind and version; never pickle. Whatever is wrong with
-a file is a StorageError that names it, and a small file never asks for much memory.
+Whatever is wrong with a file is a StorageError that names it, and a small file never asks for much memory.
 """
 from __future__ import annotations
 
@@ -28,10 +27,7 @@ class StorageError(ValueError):
 
 @contextlib.contextmanager
 def taking_apart(path: str | Path, what: str, error: type[StorageError] = StorageError) -> Iterator[None]:
-    """Whatever goes wrong inside while a file is taken apart is an `error` that names it.
-
-    Damaged files fail in more ways than a list of exceptions foresees (numpy alone raises eight kinds).
-    """
+    """Whatever goes wrong inside is an `error` that names the file: damaged ones fail in too many ways to list."""
     try:
         yield
     except StorageError:                 # says already which file
@@ -60,12 +56,15 @@ def read_bytes(path: str | Path, what: str = "a file", error: type[StorageError]
         return Path(path).read_bytes()
 
 
+def write(path: str | Path, data: bytes | str) -> None:
+    """Write a file, whole or not at all; text as UTF-8."""
+    with writing(path) as beside:
+        beside.write_bytes(data.encode("utf-8") if isinstance(data, str) else data)
+
+
 @contextlib.contextmanager
 def writing(path: str | Path) -> Iterator[Path]:
-    """A temporary path beside `path` that takes its place when the block ends without an error.
-
-    The file is never seen half written, and what stood there before stays until the new one is whole.
-    """
+    """A temporary path beside `path` that takes its place when the block ends well; until then the old file stays."""
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
     beside = path.with_name(f".{path.stem}.{os.getpid()}.part{path.suffix}")
@@ -91,8 +90,7 @@ def as_json(value: Any) -> Any:
 
 def write_json(path: str | Path, value: Any) -> None:
     """Write JSON, whole or not at all: dataclasses as tables, arrays as lists, null for what is not finite."""
-    with writing(path) as beside:
-        beside.write_text(_json(value, 1) + "\n", encoding="utf-8")
+    write(path, _json(value, 1) + "\n")
 
 
 def _json(value: Any, indent: int | None = None) -> str:

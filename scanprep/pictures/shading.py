@@ -153,21 +153,13 @@ def _corner_colors(color: np.ndarray, mesh: Mesh) -> np.ndarray:
 
 def sphere(divisions: int) -> tuple[np.ndarray, np.ndarray]:
     """A unit sphere as an icosahedron whose triangles are cut in four `divisions` times."""
-    g = (1 + 5 ** 0.5) / 2
-    vertices = np.array([(-1, g, 0), (1, g, 0), (-1, -g, 0), (1, -g, 0), (0, -1, g), (0, 1, g), (0, -1, -g),
-                         (0, 1, -g), (g, 0, -1), (g, 0, 1), (-g, 0, -1), (-g, 0, 1)], dtype=float)
-    faces = np.array([(0, 11, 5), (0, 5, 1), (0, 1, 7), (0, 7, 10), (0, 10, 11),
-                      (1, 5, 9), (5, 11, 4), (11, 10, 2), (10, 7, 6), (7, 1, 8),
-                      (3, 9, 4), (3, 4, 2), (3, 2, 6), (3, 6, 8), (3, 8, 9), (4, 9, 5),
-                      (2, 4, 11), (6, 2, 10), (8, 6, 7), (9, 8, 1)])
+    import igl
+
+    vertices, faces = igl.icosahedron()
     for _ in range(divisions):
-        corners = vertices[faces]
-        a, b, c = (corners[:, i] + corners[:, (i + 1) % 3] for i in range(3))
-        p, q, r = corners.transpose(1, 0, 2)
-        quarters = np.concatenate([np.stack(t, axis=1) for t in ((p, a, c), (a, q, b), (c, b, r), (a, b, c))])
-        vertices, faces = quarters.reshape(-1, 3), np.arange(12 * len(faces)).reshape(-1, 3)
-        vertices = vertices / np.linalg.norm(vertices, axis=1, keepdims=True)
-    return vertices / np.linalg.norm(vertices, axis=1, keepdims=True), faces
+        vertices, faces = igl.upsample(vertices, faces)
+        vertices /= np.linalg.norm(vertices, axis=1, keepdims=True)
+    return vertices, faces
 
 
 def balls(points: np.ndarray, radius: float, divisions: int | None = None
