@@ -29,8 +29,7 @@ class Solid:
     """A mesh and how it looks."""
 
     mesh: Mesh
-    # (3,), (N, 3) per vertex or (F, 3) per triangle, in [0, 1], optional; The mesh's own colours, else clay, when not
-    # given
+    # (3,), (N, 3) per vertex or (F, 3) per triangle, in [0, 1]; by default the mesh's own colours, else clay
     color: np.ndarray | Sequence[float] | None = None
     opacity: float = 1.0  # below 1 what lies behind shines through
     smooth: bool = True  # interpolate normals: false shows the single triangles
@@ -63,23 +62,10 @@ Shape = Mesh | Solid | Dots | Bones
 
 def render(shapes: Shape | Sequence[Shape], camera: Camera | None = None, width: int = 480, height: int = 640,
            ground: bool = False, background: Sequence[float] | None = WHITE, samples: int = 2) -> np.ndarray:
-    """A shaded picture.
+    """A shaded picture (height, width, 3) uint8, or (height, width, 4) when the background is None.
 
-    Parameters
-    ----------
-    shapes : Mesh, Solid, Dots, Bones, or a sequence of them
-    camera : Camera, optional
-        From the front, holding all meshes, when not given.
-    width, height : int, pixels
-    ground : bool
-        A soft shadow on the floor below the lowest point.
-    background : (3,) in [0, 1], or None for a transparent picture
-    samples : int
-        Each pixel is the mean of samples × samples rays.
-
-    Returns
-    -------
-    (height, width, 3) uint8, or (height, width, 4) when the background is transparent
+    The camera sees all meshes from their front when it is not given. `ground` is a soft shadow on the floor below the
+    lowest point; each pixel is the mean of samples × samples rays.
     """
     everything = [shapes] if isinstance(shapes, Shape) else list(shapes)
     if camera is None:
