@@ -32,43 +32,20 @@ from .schedule import RegistrationConfig
 class Registration:
     """The template on the scan.
 
-    Attributes
-    ----------
-    mesh : Mesh
-        The template's triangles on their new vertices.
-    distances : (N,) float, metres
-        From each vertex that was seen to the surface of the scan; NaN for the others.
-    seen : (N,) bool
-        Whether there were data here: the confidence is at least one half.
-    rms : float, metres
-        Of the distances of the vertices seen.
-    landmark_rms : float, metres
-        NaN without landmarks.
-    converged : bool
-        Never without data.
-    iterations : int
-        Steps over all stages.
-    energies : dict
-        Value of each term at the end of the coarse registration, and of the data at the very end.
-    inverted : int
-        Triangles that face against their surroundings.
-    confidence : (N,) float
-        From 0, made up from the surroundings, to 1: there were data here, from both directions.
-    uncovered : float
-        Share of the scan's points off the template, by more than a hundredth of its size (the root of its area). More
-        than half a per cent is a limb in the wrong place, or clutter; `converged` does not tell.
+    `uncovered` is the share of the scan's points off the template, by more than a hundredth of its size (the root of
+    its area). More than half a per cent is a limb in the wrong place, or clutter; `converged` does not tell.
     """
 
-    mesh: Mesh
-    distances: np.ndarray
-    seen: np.ndarray
-    rms: float
-    landmark_rms: float
-    converged: bool
-    iterations: int
-    energies: dict[str, float]
-    inverted: int
-    confidence: np.ndarray
+    mesh: Mesh                   # the template's triangles on their new vertices
+    distances: np.ndarray        # (N,) metres, from each vertex that was seen to the surface of the scan, else NaN
+    seen: np.ndarray             # (N,) bool: there were data here, the confidence is at least one half
+    rms: float                   # metres, of the distances of the vertices seen
+    landmark_rms: float          # metres; NaN without landmarks
+    converged: bool              # never without data
+    iterations: int              # steps over all stages
+    energies: dict[str, float]   # each term at the end of the coarse registration, and of the data at the very end
+    inverted: int                # triangles that face against their surroundings
+    confidence: np.ndarray       # (N,) from 0, made up from the surroundings, to 1: data here, from both directions
     uncovered: float
 
 
