@@ -10,9 +10,9 @@ import numpy as np
 from ..geometry.mesh import Mesh, template_problem
 from ..geometry.surface import Rays, SeenSpace, Surface
 from ..ranges import FLAG, Count, Positive, Range, Settings
-from .boundary_loops import group_loops, joined_polygon
 from .hole_patch import Patch
 from .intersections import intersecting_faces
+from .loops import group_loops, joined_polygon
 from .manifold import repair, split_vertices
 from .volumetric_diffusion import EMPTY, diffused_surface
 

@@ -11,7 +11,7 @@ from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.storage import StorageError, load_arrays, numbers, taking_apart, writing
 from scanprep.skeleton.tree import Skeleton
 
-from ...export.bvh_read import BvhMotion, read_bvh
+from ...export.bvh import BvhMotion, read_bvh
 from ...export.rig import check_motion, joint_places
 from ..control.model import ControlModel, Statue
 from .retarget import Pairing, StatueMotion, retargeted

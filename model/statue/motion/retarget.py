@@ -10,7 +10,7 @@ import numpy as np
 
 from scanprep.geometry import rotations
 
-from ...export.bvh_read import BvhMotion
+from ...export.bvh import BvhMotion
 from ...export.rig import check_motion
 from ..control.model import ControlModel
 

@@ -13,8 +13,7 @@ from scanprep.geometry.farthest_points import thin
 from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.surface import Surface
 from scanprep.geometry.target import Target, orient
-from scanprep.registration.energies import Pull, pull
-from scanprep.registration.matches import Described, Likeness, tukey
+from scanprep.registration.matches import Described, Likeness, Pull, pull, tukey
 
 from .articulated import Articulated, Points
 from .features import limb_angles, limbs
