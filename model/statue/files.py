@@ -23,7 +23,7 @@ from .control.humanoid import humanoid, humanoid_markers
 from .control.model import ControlModel, Statue
 from .detail.maps import read_map, write_map
 from .detail.subdivision import Subdivision, subdivide
-from .detail.textures import chart_tangents, normal_image, vertex_of_row
+from .detail.texels import chart_tangents, normal_image, vertex_of_row
 from .motion.motions import people_motion
 from .motion.retarget import StatueMotion
 

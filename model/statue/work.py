@@ -20,7 +20,7 @@ from .control.model import ControlModel, Statue
 from .detail.displacement import coverage_shares
 from .detail.errors import Level, adaptive_level, in_folds, inverted_triangles, measured_levels, remaining_error
 from .detail.subdivision import Subdivision
-from .detail.textures import bake_texture, scan_look
+from .detail.texels import bake_texture, scan_look
 from .files import save_statue, write_body, write_for_programs
 from .fit import FittedStatue, StatueConfig, fit_statue
 from .registration.automatic import likely_unit

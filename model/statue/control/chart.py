@@ -192,8 +192,8 @@ def densities(mesh: Mesh, chart: Chart) -> np.ndarray:
 def flatten(mesh: Mesh) -> np.ndarray:
     """Places in the plane (N, 2) of a surface with one border, scaled to its area, one-to-one.
 
-    From an embedding of Tutte on, libigl's SLIM lowers the symmetric Dirichlet energy. Its steps invert no triangle; each
-    goes only so far that the border does not cross itself.
+    From an embedding of Tutte on, libigl's SLIM lowers the symmetric Dirichlet energy. Its steps invert no triangle;
+    each goes only so far that the border does not cross itself.
     """
     import igl
 

@@ -11,8 +11,8 @@ from scanprep.pictures.textures import bilinear
 
 from ..control.model import FOLDED, HOLE, MEASURED, OUTSIDE, ControlModel, DisplacementMap, Statue
 from .normal_volume import from_normal_volume, interpolate, to_normal_volume
-from .reconstruction import Reconstruction, chart_places, coverage_at, displaced_surface, pixels_at
-from .subdivision import Subdivision, subdivide, subdivide_adaptive
+from .reconstruction import Reconstruction, coverage_at, displaced_surface, pixels_at
+from .subdivision import Subdivision, chart_places, subdivide, subdivide_adaptive
 
 
 @dataclass(frozen=True, eq=False)
@@ -81,8 +81,7 @@ def remaining_error(control: ControlModel, map: DisplacementMap, scan: Mesh, cou
     good = found.inside & (found.solutions == 1) & (coverage_at(control, map, faces, found.bary) == MEASURED)
     if not good.any():
         return SurfaceError(np.nan, np.nan, np.nan)
-    stored = from_normal_volume(control.mesh, type(found)(found.faces[good], found.bary[good],
-                                                          bilinear(map.heights, uv[good]), found.solutions[good]))
+    stored = from_normal_volume(control.mesh, faces[good], found.bary[good], bilinear(map.heights, uv[good]))
     return _error(np.linalg.norm(stored - points[good], axis=1))
 
 

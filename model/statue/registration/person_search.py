@@ -24,7 +24,7 @@ GIRTH = -0.03, 0.12             # metres off the default surface
 
 
 class PoseStage(NamedTuple):
-    """Rounds of matching at one reach; lengths, metres, are those of the control model."""
+    """Rounds of matching at one reach; lengths are metres of the control model."""
 
     reach: float   # farthest match that counts
     prior: float   # distance to the data that an angle of one radian is worth
@@ -41,10 +41,12 @@ FINE = (PoseStage(0.2, 0.015, 0.1, 0.15, 0.03, 6), PoseStage(0.12, 0.01, 0.08, 0
 
 @dataclass(frozen=True, eq=False)
 class Posed:
-    """A control model on its way to a scan."""
+    """A control model on its way to a scan: parameters (P,), and how far every segment's surface stands off the default
+    one, (S,) metres.
+    """
 
-    x: np.ndarray      # (P,), parameters
-    girth: np.ndarray  # (S,) metres, how far the surface of every segment stands off the default one
+    x: np.ndarray
+    girth: np.ndarray
 
 
 class PoseSearch:
@@ -68,9 +70,8 @@ class PoseSearch:
 
     def points(self, girth: np.ndarray) -> Points:
         """All vertices of a body so thick, in the default pose."""
-        mesh = self.model.control.mesh
-        thicker = (self.segments @ girth)[:, None] * mesh.vertex_normals
-        return Points(self.model.control.weights, mesh.vertices + thicker)
+        mesh, off = self.model.control.mesh, (self.segments @ girth)[:, None]
+        return Points(self.model.control.weights, mesh.vertices + off * mesh.vertex_normals)
 
     def mesh(self, posed: Posed) -> Mesh:
         """The control mesh as it lies."""
