@@ -151,7 +151,7 @@ def test_every_kind_goes_on(bodies, kind, module, name, after):
 
 
 def test_the_search_for_a_skeleton_goes_on(tmp_path, monkeypatch):
-    truth = worm_model()
+    truth = worm_model(rings=17)
     bodies = truth.subject().vertices(random_poses(truth, 5, np.random.default_rng(0), 0.4))
     for i, body in enumerate(bodies):
         write_mesh(tmp_path / "poses" / f"pose{i}.ply", truth.template.with_vertices(body))

@@ -126,15 +126,6 @@ def test_tangents_go_along_the_rows_of_the_image():
         assert upwards[:2] @ grows > 0.4, "the way in which v grows"
 
 
-def test_vertices_of_another_level_are_refused(detailed, tmp_path):
-    control, (fine, vertices) = humanoid(), detailed
-    with pytest.raises(ValueError, match="vertices, subdivision: expected both or none"):
-        write_statue_glb(tmp_path / "a.glb", control, vertices)
-    with pytest.raises(ValueError, match=rf"vertices: expected shape \({len(vertices)}, 3\), got \(5, 3\)"):
-        write_statue_glb(tmp_path / "a.glb", control, vertices[:5], fine)
-    assert not list(tmp_path.iterdir())
-
-
 def numbers(node, name, width):
     return np.array(node.get(name).replace(",", " ").split(), dtype=float).reshape(-1, width)
 

@@ -17,7 +17,7 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from scanprep.geometry.mesh import Mesh
-from scanprep.geometry.surface import Rays, checked_points
+from scanprep.geometry.surface import Rays
 
 
 @dataclass(frozen=True, eq=False)
@@ -50,9 +50,6 @@ def from_normal_volume(mesh: Mesh, faces: np.ndarray, bary: np.ndarray, heights:
 
 def to_normal_volume(mesh: Mesh, points: np.ndarray, reach: float) -> NormalCoordinates:
     """Every point's (n, 3) triangle, place and least height, at most `reach` up or down. [Statues] Eq. 19, 20"""
-    points = checked_points(points)
-    if not 0 < reach < np.inf:
-        raise ValueError(f"reach: expected a length above 0, got {reach}")
     count = len(points)
     face, bary, height = np.full(count, -1), np.zeros((count, 3)), np.full(count, np.nan)
     which, triangle = _near(mesh, points, reach)

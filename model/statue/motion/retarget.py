@@ -156,8 +156,8 @@ class Pairing:
         return rotations.project(np.einsum("tka,kb->tab", there, points - rest[low]))
 
     def world(self, aligned: bool) -> np.ndarray:
-        """The rotation (3, 3) from the axes of the motion to those of the scan: upwards to upwards, and forwards at rest
-        to where the scan faces.
+        """The rotation (3, 3) from the axes of the motion to those of the scan: upwards to upwards, and forwards at
+        rest to where the scan faces.
         """
         return _upright(self.P[0] @ self.axes[:, 2], self.up) @ self.standing(aligned).T
 
