@@ -187,10 +187,10 @@ def test_a_click_on_a_cylinder_finds_its_axis_though_it_has_holes():
         for way in ([1.0, 0, 0], [0.6, 0.8, 0], [2.0, 1, 0.5]):
             along = np.array(way) / np.linalg.norm(way)
             origin = np.array([0.004, 0, 0.25]) - 3 * along
-            found = medial.nearest_to_ray(origin, way)
+            found = medial.nearest_to_ray(origin, np.array(way))
             assert np.linalg.norm(found[:2]) < 0.015
             np.testing.assert_allclose(np.cross(found - origin, along), 0, atol=1e-9)
-            np.testing.assert_allclose(medial.nearest_to_ray(origin, way, 0.03), found + 0.03 * along)
+            np.testing.assert_allclose(medial.nearest_to_ray(origin, np.array(way), 0.03), found + 0.03 * along)
     with pytest.raises(ValueError, match="does not meet"):
         medial.nearest_to_ray(np.array([1.0, 1, 5]), np.array([1.0, 0, 0]))
     with pytest.raises(ValueError, match="metres"):

@@ -21,17 +21,13 @@ def find_seams(mesh: Mesh, skeleton: Skeleton) -> list[np.ndarray]:
     hidden. Each tip in turn, the nearest first, is joined to the seams there are by the shortest path over the edges.
     """
     graph = _costs(mesh)
-    tips = limb_tips(mesh, skeleton)
-    tree = np.array(tips[:1])
-    seams: list[np.ndarray] = []
-    left = set(tips[1:])
+    first, *rest = limb_tips(mesh, skeleton)
+    tree, left, seams = np.array([first]), set(rest), list[np.ndarray]()
     while left or not seams:
-        if left:
-            far = dijkstra(graph, directed=False, indices=tree, min_only=True)
-            goal = min(left, key=lambda v: (far[v], v))
-            left.discard(goal)
-        else:                                                          # one tip only: through the body to its far end
-            goal = int(dijkstra(graph, directed=False, indices=tree, min_only=True).argmax())
+        far = dijkstra(graph, directed=False, indices=tree, min_only=True)
+        # one tip only: through the body to its far end
+        goal = min(left, key=lambda v: (far[v], v)) if left else int(far.argmax())
+        left.discard(goal)
         seam = join(graph, tree, goal)
         if len(seam) > 1:
             seams.append(seam)
@@ -109,11 +105,7 @@ def _costs(mesh: Mesh) -> csr_array:
     n = len(mesh.vertices)
     seen = np.bincount(vertex, weight * free, n) / np.maximum(np.bincount(vertex, weight, n), 1e-12)
     x, y = mesh.edges.T
-    return csr_array(coo_array((mesh.edge_lengths * (1 + (2.0 - 1) * (seen[x] + seen[y]) / 2), (x, y)),
-                               shape=(n, n)))
-
-
-FINE = 1 / 3                         # of the mean density, in length: coarser triangles ask for one more seam
+    return csr_array(coo_array((mesh.edge_lengths * (1 + (seen[x] + seen[y]) / 2), (x, y)), shape=(n, n)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -175,12 +167,12 @@ def automatic_chart(mesh: Mesh, skeleton: Skeleton, rounds: int = 4) -> Chart:
 
 
 def crowded_places(mesh: Mesh, density: np.ndarray) -> list[int]:
-    """A vertex of the smallest triangle of every region that is drawn smaller than `FINE`."""
-    crowded = np.flatnonzero(density < FINE)
-    part, old = mesh.submesh(crowded)
-    region = part.vertex_component[part.faces[:, 0]]
-    return [int(old[part.faces[np.flatnonzero(region == k)[density[crowded][region == k].argmin()], 0]])
-            for k in np.unique(region)]
+    """A vertex of the smallest triangle of every region that is drawn smaller than a third of the mean, in length."""
+    crowded = np.flatnonzero(density < 1 / 3)
+    region = mesh.submesh(crowded)[0]
+    region_of = region.vertex_component[region.faces[:, 0]]
+    return [int(mesh.faces[mine[density[mine].argmin()], 0])
+            for mine in (crowded[region_of == k] for k in np.unique(region_of))]
 
 
 def densities(mesh: Mesh, chart: Chart) -> np.ndarray:
@@ -230,7 +222,7 @@ def fill_square(uv: np.ndarray, mesh: Mesh) -> np.ndarray:
     extent = np.ptp(places, axis=1).max(axis=1)
     best = places[extent.argmin()]
     middle = (best.min(axis=0) + best.max(axis=0)) / 2
-    return 0.5 + (best - middle) * (1 - 2 * 6 / 1024) / extent.min()    # left free around the chart
+    return 0.5 + (best - middle) * (1 - 2 * 6 / 1024) / extent.min()    # six pixels of 1,024 are left free around it
 
 
 def chart_problem(mesh: Mesh, chart: Chart) -> str | None:

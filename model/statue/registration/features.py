@@ -1,6 +1,7 @@
 """Registration of the control model by features: pose, segment lengths and place, then the shape of the head."""
 from __future__ import annotations
 
+from collections import defaultdict
 from collections.abc import Mapping
 from dataclasses import dataclass
 
@@ -127,9 +128,8 @@ def _features(control: ControlModel, joints: Mapping[str, np.ndarray], points: M
 
 def _place(model: Articulated, features: Points, joints: Mapping[str, np.ndarray], goal: np.ndarray) -> np.ndarray:
     """The similarity (4, 4) of the trunk, from the bases of the limbs where they suffice, else from all features."""
-    names = list(joints)
     bases = [model.control.skeleton.names[base] for base, _, _ in limbs(model)]
-    trunk = [names.index(name) for name in bases if name in names]
+    trunk = [k for k, name in enumerate(joints) if name in bases]
     for rows in (trunk, list(range(len(goal)))):
         if len(rows) > 2 and not _on_a_line(goal[rows]) and not _on_a_line(features.rest[rows]):
             return align_landmarks(features.rest[rows], goal[rows], scale=True).T_target_source
@@ -160,16 +160,14 @@ def limbs(model: Articulated) -> list[tuple[int, int, int | None]]:
 
 def analytic_start(model: Articulated, at: Mapping[str, np.ndarray]) -> np.ndarray:
     """Lengths from joints that are neighbours, and each limb from its base, middle and end joints in closed form."""
-    skeleton = model.control.skeleton
+    skeleton, x = model.control.skeleton, model.rest.copy()
     o, names = skeleton.joints, skeleton.names
-    x = model.rest.copy()
     angles, factors, _ = model.split(x)
-    ratios: dict[int, list[float]] = {}
-    for c in range(1, len(o)):
-        p = skeleton.parents[c]
+    ratios = defaultdict(list)
+    for c, p in enumerate(skeleton.parents[1:], 1):
         if names[c] in at and names[p] in at:
-            ratios.setdefault(int(model.control.segment_of_part[p]), []).append(float(
-                np.linalg.norm(at[names[c]] - at[names[p]]) / max(np.linalg.norm(o[c] - o[p]), 1e-9)))
+            ratios[model.control.segment_of_part[p]].append(
+                np.linalg.norm(at[names[c]] - at[names[p]]) / max(np.linalg.norm(o[c] - o[p]), 1e-9))
     for s, values in ratios.items():
         factors[s] = np.mean(values)
     for base, middle, end in limbs(model):
