@@ -23,8 +23,8 @@ from .learning.mixing import learn_scape_mix as learn_scape_mix
 from .learning.parts import choose_skeleton as choose_skeleton
 from .learning.scape import learn_blendscape as learn_blendscape
 from .learning.scape import learn_scape as learn_scape
-from .learning.sex_plane import SexGuess as SexGuess
-from .learning.sex_plane import guess_sex as guess_sex
+from .learning.sexes import SexGuess as SexGuess
+from .learning.sexes import guess_sex as guess_sex
 from .learning.sexes import learn_by_sex as learn_by_sex
 from .learning.skinning import SkinConfig as SkinConfig
 from .learning.skinning import learn_skinning as learn_skinning

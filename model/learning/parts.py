@@ -16,7 +16,7 @@ from scanprep.threads import one_thread
 
 from ..blending import BlendedTemplate, rigid_weights
 from .config import LearnConfig
-from .pose import learn_pose
+from .scape import learn_pose
 from .work import Progress, Work
 
 QUICK = LearnConfig(prunings=(0.01,), ridges=(1e-3, 1e-2), refinements=1)
@@ -122,4 +122,4 @@ def coarse_skeleton(skeleton: Skeleton, template: Mesh, coarse: Mesh) -> Skeleto
 def _left_out_error(poses: np.ndarray, skeleton: Skeleton, coarse: Mesh) -> float:
     """Mean distance in metres of the vertices of left-out poses (M, n, 3) of the coarse bodies."""
     parts = BlendedTemplate(coarse, skeleton, rigid_weights(skeleton))
-    return learn_pose(parts, poses, QUICK, Work(None, 1)).design.left_out_error
+    return learn_pose(parts, poses, QUICK, Work(None)).design.left_out_error

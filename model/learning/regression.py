@@ -206,3 +206,41 @@ def _support_vectors(X: np.ndarray, Q: np.ndarray, v_hat: np.ndarray, ridge: flo
     back = (unit[:, None] * modes[good]).reshape(len(unit), *mean.shape) / weight
     flat = back.reshape(len(unit), -1)
     return slopes @ flat, mean.ravel() + offsets @ flat
+
+
+def compress(space: PoseSpace, poses: np.ndarray, template: Mesh, tolerance: float) -> PoseSpace:
+    """The pose space with those mixtures of its features alone that matter for the edges in the poses (M, J, 3) seen.
+
+    The fast path pays for features one by one. In each part an edge may change by the tolerance, metres root mean
+    square.
+    """
+    features, delta = space.features, space.features.evaluate(poses)
+    v_hat = np.swapaxes(template.corners[:, 1:] - template.corners[:, :1], -1, -2)
+    part, mixes, coefficients = [], [], []
+    for p, faces in enumerate(space.faces_of_part):
+        mine = features.of_part(p)
+        a = space.coefficients[p].astype(np.float64)
+        X = delta[:, mine][:, 1:]
+        centre = X.mean(axis=0)
+        scale, axes = _principal(X - centre)                        # X - centre = U diag(scale) axesᵀ
+        moved = (a[1:] @ v_hat[faces]).reshape(len(a) - 1, 6 * len(faces))
+        U, s, _ = np.linalg.svd((scale[:, None] * (axes.T @ moved)), full_matrices=False)
+        left = np.sqrt(np.maximum(np.cumsum((s**2)[::-1])[::-1], 0) / (len(poses) * 2 * len(faces)))
+        r = int((left > tolerance).sum())
+        W = axes @ (U[:, :r] / scale[:, None])                      # features -> r numbers of unit scatter
+        back = (U[:, :r] * scale[:, None]).T @ axes.T               # r numbers -> features
+        kept = np.tensordot(back, a[1:], axes=1)
+        constant = a[0] + np.tensordot(centre, a[1:], axes=1) - np.tensordot(centre @ W, kept, axes=1)
+        part += [p] * (1 + r)
+        mixes.append(np.concatenate([np.zeros((*features.mix.shape[:2], 1)), features.mix[..., mine][..., 1:] @ W],
+                                    axis=-1))
+        coefficients.append(np.concatenate([constant[None], kept]).astype(np.float32))
+    fewer = PoseFeatures(features.skeleton, features.lift, np.array(part), np.concatenate(mixes, axis=-1))
+    return PoseSpace(fewer, tuple(coefficients))
+
+
+def _principal(X: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Scales (k,) and axes (n, k) of centred features (M, n), without those in which nothing varies."""
+    _, s, Vt = np.linalg.svd(X, full_matrices=False)
+    good = s > 1e-9 * max(s.max(initial=0.0), 1e-9)
+    return s[good], Vt[good].T

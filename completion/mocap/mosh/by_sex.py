@@ -5,7 +5,7 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 
 from model.body import BodyModel
-from model.learning.sex_plane import SexGuess, guess_sex, sex_plane
+from model.learning.sexes import SexGuess, guess_sex, sex_plane
 from scanprep.batch.room import Step, inside, once
 from scanprep.threads import one_thread
 

@@ -11,8 +11,8 @@ from scanprep.pictures.textures import bilinear
 
 from ..control.model import FOLDED, HOLE, MEASURED, OUTSIDE, ControlModel, DisplacementMap, Statue
 from .normal_volume import from_normal_volume, interpolate, to_normal_volume
-from .reconstruction import Reconstruction, chart_places, coverage_at, displaced_surface, pixels_at
-from .subdivision import Subdivision, subdivide, subdivide_adaptive
+from .reconstruction import Reconstruction, coverage_at, displaced_surface, pixels_at
+from .subdivision import Subdivision, chart_places, subdivide, subdivide_adaptive
 
 
 @dataclass(frozen=True, eq=False)
@@ -48,7 +48,7 @@ def adaptive_level(statue: Statue, scan: Mesh, tolerance: float = 0.0005, level:
 def _level(name: str, statue: Statue, fine: Subdivision, scan: Mesh) -> Level:
     mesh = Reconstruction(statue.control, statue.map, fine).mesh()
     shown = (coverage_at(statue.control, statue.map, fine.parent, fine.bary)[fine.faces] != HOLE).all(axis=1)
-    error = surface_error(mesh.submesh(shown)[0], scan) if shown.any() else SurfaceError(np.nan, np.nan, np.nan)
+    error = surface_error(mesh.submesh(shown)[0], scan) if shown.any() else SurfaceError(np.nan, np.nan)
     return Level(name, mesh, error.mean, error.rms, shown)
 
 
@@ -58,7 +58,6 @@ class SurfaceError:
 
     mean: float
     rms: float
-    max: float
 
 
 def surface_error(reconstructed: Mesh, scan: Mesh, count: int = 200_000) -> SurfaceError:
@@ -80,9 +79,8 @@ def remaining_error(control: ControlModel, map: DisplacementMap, scan: Mesh, cou
     uv = chart_places(control.chart, faces, found.bary)
     good = found.inside & (found.solutions == 1) & (coverage_at(control, map, faces, found.bary) == MEASURED)
     if not good.any():
-        return SurfaceError(np.nan, np.nan, np.nan)
-    stored = from_normal_volume(control.mesh, type(found)(found.faces[good], found.bary[good],
-                                                          bilinear(map.heights, uv[good]), found.solutions[good]))
+        return SurfaceError(np.nan, np.nan)
+    stored = from_normal_volume(control.mesh, faces[good], found.bary[good], bilinear(map.heights, uv[good]))
     return _error(np.linalg.norm(stored - points[good], axis=1))
 
 
@@ -116,4 +114,4 @@ def in_folds(control: ControlModel, map: DisplacementMap, subdivision: Subdivisi
 
 
 def _error(distances: np.ndarray) -> SurfaceError:
-    return SurfaceError(float(distances.mean()), float(np.sqrt(np.mean(distances**2))), float(distances.max()))
+    return SurfaceError(float(distances.mean()), float(np.sqrt(np.mean(distances**2))))

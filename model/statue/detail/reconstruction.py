@@ -8,15 +8,9 @@ from scanprep.geometry import rotations
 from scanprep.geometry.mesh import Mesh
 from scanprep.pictures.textures import bilinear
 
-from ..control.chart import Chart
 from ..control.model import MEASURED, OUTSIDE, ControlModel, DisplacementMap
 from .normal_volume import interpolate
-from .subdivision import Displaced, Subdivision
-
-
-def chart_places(chart: Chart, faces: np.ndarray, bary: np.ndarray) -> np.ndarray:
-    """Texture coordinates (n, 2) of places on triangles. [Statues] Eq. 21"""
-    return np.einsum("nc,ncd->nd", bary, chart.uv[chart.faces[faces]])
+from .subdivision import Displaced, Subdivision, chart_places
 
 
 class Reconstruction:

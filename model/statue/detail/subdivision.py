@@ -61,6 +61,11 @@ class _Corners:
     uv: np.ndarray
 
 
+def chart_places(chart: Chart, faces: np.ndarray, bary: np.ndarray) -> np.ndarray:
+    """Texture coordinates (n, 2) of places on triangles. [Statues] Eq. 21"""
+    return np.einsum("nc,ncd->nd", bary, chart.uv[chart.faces[faces]])
+
+
 def subdivide(mesh: Mesh, chart: Chart, level: int) -> Subdivision:
     """Every triangle in four, `level` times over; ValueError for a level below 0 or a chart of another mesh."""
     now = _begin(mesh, chart, level)

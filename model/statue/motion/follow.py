@@ -26,17 +26,17 @@ _SAME_SIDE = 0.3                     # cosine of normals below which the nearest
 class Follower:
     """A control mesh bound to the surface of a learned model's person, in the pose and place of the scan.
 
-    Each control vertex keeps its offset from the point of the model's surface that it is bound to, in axes that turn
-    with the surface there: the rotations that best carry the edges around that point. In the scan's own pose it is
-    where it was. `registered` (N, 3) is the model's template on the scan: nearer to it than the model, to find the
-    point for each vertex.
+    Each control vertex keeps its offset from the point of the surface that it is bound to, in axes that turn with the
+    edges around that point. `registered` (N, 3), the model's template on the scan, is nearer to it to find that point.
     """
 
     def __init__(self, mesh: Mesh, subject: Subject, pose: np.ndarray, trans: np.ndarray | None = None,
                  registered: np.ndarray | None = None) -> None:
         self.mesh, self.subject = mesh, subject
         body = subject.template.with_vertices(subject.vertices(pose, trans))
-        near = body if registered is None else body.with_vertices(_checked(registered, body))
+        if registered is not None and registered.shape != body.vertices.shape:
+            raise ValueError(f"registered: expected shape {body.vertices.shape}, got {registered.shape}")
+        near = body if registered is None else body.with_vertices(registered)
         self._bind = _bound(mesh, near)
         self._around = csr_array(self._bind @ _averaging(body))
         used = np.unique(self._around.indices)
@@ -49,27 +49,17 @@ class Follower:
 
     def vertices(self, poses: np.ndarray, trans: np.ndarray | None = None) -> np.ndarray:
         """The control mesh (..., n, 3), metres, in poses (..., J, 3) of the model."""
-        poses = np.asarray(poses, dtype=np.float64)
         if poses.ndim == 2:
             return self._moved(self.subject.vertices(poses, trans))
-        out = np.empty((len(poses), *self.mesh.vertices.shape))
         trans = np.broadcast_to(np.zeros(3) if trans is None else trans, (len(poses), 3))
-        for k in range(0, len(poses), 32):
-            for t, body in enumerate(self.subject.vertices(poses[k:k + 32], trans[k:k + 32]), start=k):
-                out[t] = self._moved(body)
-        return out
+        return np.concatenate([[self._moved(body) for body in self.subject.vertices(poses[k:k + 32], trans[k:k + 32])]
+                               for k in range(0, len(poses), 32)])
 
     def _moved(self, body: np.ndarray) -> np.ndarray:
         body = np.asarray(body, dtype=np.float64)
         outer = np.einsum("ea,eb->eab", self._edge(body), self._before).reshape(-1, 9)
         R = rotations.project((self._around @ outer).reshape(-1, 3, 3))
         return np.asarray(self._bind @ body + np.einsum("nab,nb->na", R, self._offset))
-
-
-def _checked(vertices: np.ndarray, body: Mesh) -> np.ndarray:
-    if np.shape(vertices) != body.vertices.shape:
-        raise ValueError(f"registered: expected shape {body.vertices.shape}, got {np.shape(vertices)}")
-    return vertices
 
 
 def _bound(mesh: Mesh, body: Mesh) -> csr_array:

@@ -74,8 +74,7 @@ def people_motion(control: ControlModel, pose: np.ndarray, poses: np.ndarray, tr
                   rate: float = 60.0, girdle: float = 0.2) -> StatueMotion:
     """A motion of the synthetic people, poses (T, 16, 3) and trans (T, 3) of the average person, for a statue's `pose`.
 
-    The generic control model rests as they do, so the rotations of the parts in the world carry over; abdomen and chest
-    become the one rotation that brings neck and shoulders nearest to where those two bring them.
+    The generic control model rests as they do, so the rotations of the parts in the world carry over.
     """
     skeleton = _average_person()
     poses, trans = check_motion(skeleton, poses, trans, rate)
@@ -88,16 +87,11 @@ def people_motion(control: ControlModel, pose: np.ndarray, poses: np.ndarray, tr
 def bvh_motion(control: ControlModel, pose: np.ndarray, bvh: BvhMotion) -> StatueMotion:
     """The motion of a BVH file, by the names of its joints and the directions of its bones, for a statue's `pose`.
 
-    A part follows the rotation of its joint against the rest of the file, in which somebody stands upright: bones of
-    arms and legs then point where those of the file do, hands continue the forearms as at rest, and trunk, head and
-    feet are level where those of the file are turned as at rest. The trunk of the file, of any number of joints,
-    becomes one rotation that brings neck and shoulders nearest to where it brings them. Joints between two that are
-    matched count with the rotations below them.
-
-    Travel is scaled by the length of the legs, so the unit of the file does not matter. The statue starts where the
-    scan stands, it faces as the scan does where a person of the file faces as at rest, and its lowest vertex is as low
-    as in the scan in all but a twentieth of the frames. Upwards is the axis of the file that is nearest to the trunk
-    at rest: y, as BVH says, but some programs write z. ValueError for names that say too little.
+    A part follows the rotation of its joint against the rest of the file, in which somebody stands upright. A trunk of
+    any number of joints becomes one rotation that brings neck and shoulders nearest to where it brings them. Travel is
+    scaled by the length of the legs, so the unit of the file does not matter; the statue starts where the scan stands.
+    Upwards is the axis of the file that is nearest to the trunk at rest: y, as BVH says, but some programs write z.
+    ValueError for names that say too little.
     """
     return retargeted(Pairing(control, pose, bvh), False)
 

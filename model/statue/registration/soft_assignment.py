@@ -43,13 +43,6 @@ class SoftAssignment:
         """(I,) bool: vertices that know a point."""
         return np.diff(self.matches.indptr) > 0
 
-    def energy(self, x: np.ndarray, points: np.ndarray, temperature: float) -> tuple[float, float]:
-        """The data term Σ m |y - x|² and the entropy term T Σ m (log m - 1), square metres. [Statues] Eq. 15"""
-        i, j = np.repeat(np.arange(len(x)), np.diff(self.matches.indptr)), self.matches.indices
-        m = self.matches.data
-        apart = ((points[j] - x[i]) ** 2).sum(axis=1)
-        return float(m @ apart), float(temperature * (m @ (np.log(np.maximum(m, 1e-300)) - 1)))
-
 
 class ScanPoints:
     """Points of a scan with normals, searched for the nearest ones that face the same way."""
