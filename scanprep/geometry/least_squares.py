@@ -150,6 +150,23 @@ def retract_pose(angles: int) -> Callable[[np.ndarray, np.ndarray], np.ndarray]:
     return retract
 
 
+def by_rotations(equations: Any, x: np.ndarray, angles: int) -> Any:
+    """`Dense` or `Arrow` equations at rows x (B, P) that begin with rotation vectors, by small rotations `R exp(d)`."""
+    if isinstance(equations, Arrow):
+        return equations._replace(rows=by_rotations(equations.rows, x, angles))
+    local = np.swapaxes(rotations.inverse_right_jacobian(x[:, :angles].reshape(len(x), -1, 3)), -1, -2)
+
+    def along(matrix: np.ndarray) -> np.ndarray:
+        """The rows (B, P, k) of the vectors by the rotations."""
+        out = matrix.copy()
+        own = out[:, :angles]
+        own[:] = (local @ own.reshape(*local.shape[:3], -1)).reshape(own.shape)
+        return out
+
+    return Dense(equations.energy, along(equations.gradient[..., None])[..., 0],
+                 along(np.swapaxes(along(equations.hessian), 1, 2)))
+
+
 @dataclass(frozen=True, eq=False)
 class Minimum(Generic[State]):
     """Where the search ended: the state, its equations, which of the B problems converged, and the steps tried."""
@@ -167,7 +184,7 @@ class Minimum(Generic[State]):
 
 def levenberg_marquardt(equations: Callable[[State], NormalEquations], start: State, iterations: int = 30,
                         tolerance: float = 1e-5, damping: float = 1e-3, exact: float = 0.0,
-                        retract: Callable[[Any, np.ndarray], Any] = np.add) -> Minimum[State]:
+                        retract: Callable[[Any, np.ndarray], Any] = np.add, angles: int = 0) -> Minimum[State]:
     """The state of least energy near a start; a step is taken only where it lowers the energy.
 
     Parameters
@@ -185,7 +202,16 @@ def levenberg_marquardt(equations: Callable[[State], NormalEquations], start: St
         Also stop when it lowers the energy by less than this.
     retract : state, step -> state
         What a step does to the state.
+    angles : int
+        So many first unknowns of a row are rotation vectors. Derivatives are by them, steps are small rotations; so
+        are the equations that are returned.
     """
+    if angles:
+        retract, by_vectors = retract_pose(angles), equations
+
+        def equations(x: State) -> NormalEquations:
+            return by_rotations(by_vectors(x), x, angles)
+
     x, now = start, equations(start)
     factor = np.full(len(now.energy), damping)
     converged = np.zeros(len(factor), dtype=bool)

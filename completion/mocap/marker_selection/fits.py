@@ -168,7 +168,7 @@ def fit_points(points: BodyPoints, targets: np.ndarray, weights: np.ndarray, pri
             return Dense((residual**2).sum(axis=(1, 2)) + energy, (transposed @ residual)[..., 0] + slope,
                          transposed @ J + known.precision)
 
-        found[some] = levenberg_marquardt(system, start[some], iterations, 1e-4).x
+        found[some] = levenberg_marquardt(system, start[some], iterations, 1e-4, angles=points.n_angles).x
         if tell is not None:
             tell(min(begin + size, len(start)))
     return found
