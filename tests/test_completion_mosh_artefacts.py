@@ -7,14 +7,14 @@ import pytest
 from completion_bodies import MEAN, worm_with_prior
 
 from completion.mocap.artefacts.find import ambiguous_swap, find_artefacts
-from completion.mocap.artefacts.results import ArtefactConfig, BadSpan
+from completion.mocap.artefacts.results import ArtefactConfig, BadSpan, list_swaps
 from completion.mocap.artefacts.simulated import Simulation, bridged
 from completion.mocap.artefacts.slips import find_bad, without_lost_limbs
-from completion.mocap.artefacts.swaps import TORN, Tracks, _two_states, find_order, list_swaps
 from completion.mocap.files.markers import MarkerSequence
 from completion.mocap.marker_sets.layout import MarkerLayout
 from completion.mocap.mosh.charts import chart_artefacts
 from completion.mocap.pose.follow import AnimateConfig, animate
+from completion.mocap.pose.swaps import TORN, Tracks, _two_states, find_order
 from scanprep.geometry import rotations
 
 FRAMES, RATE = 160, 100.0

@@ -143,14 +143,19 @@ def retract_pose(angles: int) -> Callable[[np.ndarray, np.ndarray], np.ndarray]:
     """
     def retract(x: np.ndarray, step: np.ndarray) -> np.ndarray:
         out = x + step
-        R, d = (rotations.exp(part[..., :angles].reshape(-1, 3)) for part in (x, step))
-        out[..., :angles] = rotations.log(R @ d).reshape(out[..., :angles].shape)
+        first, second = (part[..., :angles].reshape(-1, 3) for part in (x, step))
+        out[..., :angles] = rotations.compose(first, second).reshape(out[..., :angles].shape)
         return out
 
     return retract
 
 
-def by_rotations(equations: Any, x: np.ndarray, angles: int) -> Any:
+def step_between(x: np.ndarray, goal: np.ndarray, angles: int) -> np.ndarray:
+    """The step (..., P) by which the retract of `retract_pose(angles)` leads from rows x to others."""
+    return retract_pose(angles)(-x, goal)
+
+
+def by_rotations(equations: Any, x: Any, angles: int) -> Any:
     """`Dense` or `Arrow` equations at rows x (B, P) that begin with rotation vectors, by small rotations `R exp(d)`."""
     if isinstance(equations, Arrow):
         return equations._replace(rows=by_rotations(equations.rows, x, angles))

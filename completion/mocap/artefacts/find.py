@@ -15,21 +15,20 @@ from ..files.markers import MarkerSequence
 from ..marker_sets.layout import MarkerLayout
 from ..pose.robust import marker_weights
 from ..pose.settings import AnimateConfig
-from .results import ArtefactConfig, BadSpan, MarkerArtefacts
-from .simulated import Simulation, bridged, usual_places
-from .slips import find_bad, without_lost_limbs
-from .swaps import (
+from ..pose.swaps import (
     AWAY,
     MEMORY,
     WORTH,
     Tracks,
     best_stretches,
     find_order,
-    list_swaps,
     marker_levels,
     pairs_that_jump,
     relabelled,
 )
+from .results import ArtefactConfig, BadSpan, MarkerArtefacts, list_swaps
+from .simulated import Simulation, bridged, usual_places
+from .slips import find_bad, without_lost_limbs
 
 Progress = Callable[[int, int], None]
 FOLLOW = AnimateConfig()             # how the body follows the markers here
@@ -147,7 +146,7 @@ def _judged(body: Simulation, markers: MarkerSequence, state: _State, config: Ar
     assert state.x is not None, "the body has followed"
     places, simulated = np.full(markers.positions.shape, np.nan), body.positions(state.x)
     places[:, body.rows] = _expected(body, state, state.repaired(markers)[:, body.rows], simulated)
-    order = find_order(markers.positions, markers.rate, marker_levels(places, markers.positions, markers.rate))
+    order = find_order(markers.positions, markers.rate, marker_levels(places, markers.positions))
     sure, tried = not state.unsure.any(), state.both_ways_tried
     if sure and not tried and (order == state.order).all():
         order, tried = _both_ways(body, markers, state.x, order, places), True

@@ -107,3 +107,25 @@ class MarkerArtefacts:
     def labels_touched(self) -> set[str]:
         """Labels that were swapped or bad at some time."""
         return {label for s in self.swaps for label in (s.first, s.second)} | {b.label for b in self.bad}
+
+
+def list_swaps(order: np.ndarray, seen: np.ndarray, labels: tuple[str, ...]) -> tuple[Swap, ...]:
+    """The swaps that an order (T, L) is made of; a longer cycle is a chain of pairs.
+
+    A swap begins and ends where one of the two labels is seen (T, L), as they came.
+    """
+    frames: dict[tuple[int, int], list[int]] = {}
+    for t in np.flatnonzero((order != np.arange(order.shape[1])).any(axis=1)):
+        left = order[t].copy()
+        for a in range(len(left)):
+            while left[a] != a:                                        # puts one label right at a time
+                b = int(left[a])
+                left[a], left[b] = left[b], b
+                frames.setdefault((min(a, b), max(a, b)), []).append(int(t))
+    out = []
+    for (a, b), times in frames.items():
+        for run in np.split(np.array(times), np.flatnonzero(np.diff(times) > 1) + 1):
+            there = run[seen[run, a] | seen[run, b]]
+            if len(there):
+                out.append(Swap(labels[a], labels[b], int(there[0]), int(there[-1])))
+    return tuple(sorted(out, key=lambda s: (s.begin, s.first, s.second)))

@@ -108,7 +108,7 @@ def follow_whole(body: MarkedBody, targets: np.ndarray, rate: float, config: Ani
         if i == free:
             feet = FootContact(body, x, rate, None if config.floor is None else Floor.given(config.floor))
         held = None if feet is None else feet.held(x)
-        order = label_order(body.positions(x), targets, config.outlier)
+        order = label_order(body.positions(x), targets, rate, config.outlier)
         taken = np.take_along_axis(targets, order[..., None], axis=1)[inside]
         near = reinitialise_limbs(body, x[inside], taken, config)
         weights, _ = marker_weights(body.positions(near), taken, config.marker_sd, config.outlier)

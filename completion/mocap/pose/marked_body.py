@@ -16,7 +16,7 @@ from model.features import twists
 from model.linear import PointOperator, Subject
 from model.priors import gaussian_prior
 from scanprep.geometry import rotations
-from scanprep.geometry.least_squares import Dense
+from scanprep.geometry.least_squares import Dense, retract_pose, step_between
 from scanprep.geometry.mesh import Mesh
 from scanprep.skeleton.tree import Skeleton
 
@@ -86,18 +86,11 @@ class MarkedBody:
 
     def retract(self, x: np.ndarray, step: np.ndarray) -> np.ndarray:
         """The unknowns (..., P) after a step (..., P); poses come out at most a half turn long."""
-        return self._composed(x, x, step)
+        return retract_pose(self.body.n_angles)(x, step)
 
     def step_to(self, x: np.ndarray, goal: np.ndarray) -> np.ndarray:
         """The step (..., P) that leads from unknowns (..., P) to others."""
-        return self._composed(x, -x, goal)
-
-    def _composed(self, x: np.ndarray, first: np.ndarray, second: np.ndarray) -> np.ndarray:
-        n = self.body.n_angles
-        out = first + second
-        out[..., :n] = rotations.compose(first[..., :n].reshape(-1, 3), second[..., :n].reshape(-1, 3)
-                                         ).reshape(*x.shape[:-1], n)
-        return out
+        return step_between(x, goal, self.body.n_angles)
 
 
 def point_system(shapes: PartShapes, pose: np.ndarray, trans: np.ndarray, targets: np.ndarray, weights: np.ndarray

@@ -8,8 +8,6 @@ from __future__ import annotations
 import numpy as np
 from scipy.ndimage import median_filter
 
-from .results import Swap
-
 TORN = 10.0                          # most that a torn track counts, in half squared standard deviations
 AWAY = 8.0                           # most that a marker away from its place counts, in half squared deviations
 CHANGE = 4.0                         # what each change of a label must be worth, likewise
@@ -108,27 +106,27 @@ def relabelled(positions: np.ndarray, order: np.ndarray) -> np.ndarray:
     return np.take_along_axis(positions, order[..., None], axis=1)
 
 
-def marker_levels(places: np.ndarray, positions: np.ndarray, rate: float) -> np.ndarray:
-    """What it counts (T, L, L) that the label of a column is the marker of a row, by where the body has the markers.
+def marker_levels(places: np.ndarray, positions: np.ndarray, deviation: float | np.ndarray = DEVIATION) -> np.ndarray:
+    """What it counts (..., L, L) that the label of a column is the marker of a row, by where the body has the markers.
 
-    Zero where nothing is known. What a marker is off changes slowly: the frames of `MEMORY` count as one. Places are
-    NaN for markers that the body does not know, which are taken to be nowhere near.
+    Half squared deviations, no more than `AWAY`; zero where nothing is known. Places (..., L, 3) are NaN for markers
+    that the body does not know, which are taken to be nowhere near; the deviation, metres, is one for each frame.
     """
-    squared = sum((places[:, :, None, d] - positions[:, None, :, d])**2 for d in range(3))
-    assert isinstance(squared, np.ndarray)
-    cost = np.minimum(np.nan_to_num(squared / (2 * DEVIATION**2), nan=AWAY), AWAY)
-    return min(1.0, 1 / (MEMORY * rate)) * cost * np.isfinite(positions[:, None, :, 0])
+    squared = sum((places[..., :, None, d] - positions[..., None, :, d])**2 for d in range(3))
+    cost = np.minimum(np.nan_to_num(squared / (2 * np.asarray(deviation)[..., None, None]**2), nan=AWAY), AWAY)
+    return np.asarray(cost * np.isfinite(positions[..., None, :, 0]))
 
 
 def find_order(positions: np.ndarray, rate: float, levels: np.ndarray | None = None) -> np.ndarray:
     """Which column (T, L) each marker is to be taken from, by its track and by `marker_levels`, if there are any.
 
-    The best pair and span is swapped, then the best of what is left, until nothing gains: of a longer cycle each swap
-    puts one marker right.
+    What a marker is off changes slowly: the frames of `MEMORY` count as one. The best pair and span is swapped, then
+    the best of what is left, until nothing gains: of a longer cycle each swap puts one marker right.
     """
     T, L = positions.shape[:2]
     order, tracks = np.tile(np.arange(L), (T, 1)), Tracks(positions, rate)
-    levels, touched = np.zeros((T, L, L)) if levels is None else levels.copy(), set(range(L))
+    levels = np.zeros((T, L, L)) if levels is None else min(1.0, 1 / (MEMORY * rate)) * levels
+    touched = set(range(L))
     for _ in range(12):                                                 # longer cycles come apart into pairs
         found = _best_spans(tracks, levels, touched)
         touched = set()
@@ -218,25 +216,3 @@ def _two_states(gains: np.ndarray, stay: np.ndarray, switch: np.ndarray) -> tupl
         state = 1 - state if from_other[state] else state
         states.append(state)
     return gained, np.array(states[::-1], dtype=bool)
-
-
-def list_swaps(order: np.ndarray, seen: np.ndarray, labels: tuple[str, ...]) -> tuple[Swap, ...]:
-    """The swaps that an order (T, L) is made of; a longer cycle is a chain of pairs.
-
-    A swap begins and ends where one of the two labels is seen (T, L), as they came.
-    """
-    frames: dict[tuple[int, int], list[int]] = {}
-    for t in np.flatnonzero((order != np.arange(order.shape[1])).any(axis=1)):
-        left = order[t].copy()
-        for a in range(len(left)):
-            while left[a] != a:                                        # puts one label right at a time
-                b = int(left[a])
-                left[a], left[b] = left[b], b
-                frames.setdefault((min(a, b), max(a, b)), []).append(int(t))
-    out = []
-    for (a, b), times in frames.items():
-        for run in np.split(np.array(times), np.flatnonzero(np.diff(times) > 1) + 1):
-            there = run[seen[run, a] | seen[run, b]]
-            if len(there):
-                out.append(Swap(labels[a], labels[b], int(there[0]), int(there[-1])))
-    return tuple(sorted(out, key=lambda s: (s.begin, s.first, s.second)))
