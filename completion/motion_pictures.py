@@ -103,8 +103,8 @@ def moving_picture(bodies: np.ndarray, subject: Subject, rate: float, width: int
     return gif_bytes([render(Mesh(v, faces), camera, width, height, ground=True) for v in centred], rate)
 
 
-def chart_residuals(motion: Motion) -> Any:
-    """A matplotlib figure: the distance of the markers to where the body puts them, over time."""
+def chart_residuals(motion: Motion, what: str = "markers", lost: bool = False) -> Any:
+    """A matplotlib figure: the distance of the markers from the body over time; `lost` frames shaded where wanted."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(7.5, 2.6))
@@ -114,7 +114,10 @@ def chart_residuals(motion: Motion) -> Any:
     axes.fill_between(motion.times[shown], *np.nanpercentile(millimetres, [10, 90], axis=1), alpha=0.25,
                       label="10th to 90th percentile", linewidth=0)
     axes.plot(motion.times[shown], np.nanmean(millimetres, axis=1), linewidth=1.2, label="mean")
-    axes.set(xlabel="time (s)", ylabel="distance of the markers (mm)", ylim=(0, None))
+    edges = np.flatnonzero(np.diff(np.r_[True, motion.converged, True])) if lost else np.zeros(0, dtype=int)
+    for i, span in enumerate((edges.reshape(-1, 2) - 0.5) / motion.rate):
+        axes.axvspan(*span, color="0.85", label="lost" if i == 0 else None)
+    axes.set(xlabel="time (s)", ylabel=f"distance of the {what} (mm)", ylim=(0, None))
     axes.legend(frameon=False)
     return figure
 

@@ -9,7 +9,7 @@ from completion.mocap.marker_sets.layout import MarkerLayout
 from completion.mocap.pose.follow import AnimateConfig, animate
 from completion.mocap.pose.marked_body import MarkedBody, supports
 from completion.mocap.pose.robust import marker_weights
-from completion.mocap.pose.smooth import inertia, smoothed
+from completion.mocap.pose.smooth import smoothed
 from completion.motion import Motion
 from scanprep.geometry import rotations
 from scanprep.geometry.storage import StorageError
@@ -111,11 +111,11 @@ def body(subject, layout):
 
 def smooth_step(body, x, targets):
     weights, _ = marker_weights(body.positions(x), targets, PLAIN.marker_sd, PLAIN.outlier)
-    return smoothed(body, inertia(PLAIN, 100.0, 15), x, targets, weights)
+    return smoothed(body, PLAIN.inertia(100.0, 15), x, targets, weights)
 
 
 def test_one_smoothing_step_is_the_dense_gauss_newton_step(body, walk):
-    targets, stiffness = walk[1].positions[:5], inertia(PLAIN, 100.0, 15)
+    targets, stiffness = walk[1].positions[:5], PLAIN.inertia(100.0, 15)
     x = np.random.default_rng(0).normal(0, 0.05, (5, 15))            # small angles: rotations add
     weights, _ = marker_weights(body.positions(x), targets, PLAIN.marker_sd, PLAIN.outlier)
     rows, values = [], []
@@ -143,7 +143,7 @@ def test_one_smoothing_step_is_the_dense_gauss_newton_step(body, walk):
 def test_windows_agree_with_the_whole(body, walk, monkeypatch):
     x = np.random.default_rng(0).normal(0, 0.02, (FRAMES, 15))
     whole = smooth_step(body, x, walk[1].positions)
-    monkeypatch.setattr("completion.mocap.pose.smooth.WINDOW", 20)
+    monkeypatch.setattr("completion.smoothing.WINDOW", 20)
     monkeypatch.setattr("completion.mocap.pose.smooth.OVERLAP", 15)
     assert np.abs(smooth_step(body, x, walk[1].positions) - whole).max() < 0.02 * np.abs(whole - x).max()
 

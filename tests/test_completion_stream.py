@@ -10,10 +10,9 @@ from completion.mocap.marker_sets.layout import MarkerLayout
 from completion.mocap.pose.follow import AnimateConfig, animate
 from completion.mocap.pose.foot_contact import Floor, FootContact
 from completion.mocap.pose.marked_body import MarkedBody, PartShapes, supports
-from completion.mocap.pose.prediction import KalmanPrediction
 from completion.mocap.pose.robust import LabelWatch, marker_weights
-from completion.mocap.pose.smooth import inertia, low_pass
-from completion.mocap.pose.stream import MarkerStream
+from completion.mocap.pose.smooth import low_pass
+from completion.mocap.pose.stream import KalmanPrediction, MarkerStream
 from completion.motion import Motion
 from model.features import linear_features
 from model.pose_space import PoseSpace
@@ -174,7 +173,7 @@ def test_the_kalman_filter_is_the_smoother_of_its_past(subject, layout):
     filter = KalmanPrediction(body, CONFIG, 100.0)
     filter.momentum = 1.0
     filter.begin(np.zeros(P))
-    noise, start = 1 / inertia(CONFIG, 100.0, P)[-1], filter.place[-1, -1]
+    noise, start = 1 / CONFIG.inertia(100.0, P)[-1], filter.place[-1, -1]
     seen, information = rng.normal(0, 1e-4, T), rng.random(T) / noise
     for z, weight in zip(seen, information, strict=True):
         expected, prior = filter.expect()

@@ -13,7 +13,7 @@ from scanprep.geometry.mesh import Mesh
 from scanprep.threads import one_thread
 
 from ..motion import Motion
-from .dynamics import inertia, smoothed
+from ..smoothing import inertia, smooth
 from .frames import Frame
 from .settings import TrackConfig
 from .tracker import TrackedFrame, Tracker, follow_frames
@@ -91,8 +91,8 @@ def as_motion(frames: list[TrackedFrame], betas: np.ndarray | None, rate: float,
     x = np.stack([frame.x for frame in frames])
     if config.smoothing:
         weights = inertia(x.shape[1], rate, config.angle_acceleration, config.place_acceleration)
-        x = smoothed(x, np.stack([frame.gradient for frame in frames]), np.stack([f.precision for f in frames]),
-                     weights, config.smoothing)
+        x = smooth(x, np.stack([frame.gradient for frame in frames]), np.stack([f.precision for f in frames]),
+                   weights, config.smoothing)
     residuals = np.array([[frame.residual] for frame in frames])
     return Motion(x[:, :-3].reshape(len(x), -1, 3), x[:, -3:].copy(), betas, rate, residuals, ("surface",),
                   converged=np.array([frame.found for frame in frames]))

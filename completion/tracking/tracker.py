@@ -15,7 +15,7 @@ from ..bodies import FixedBody, ShapedBody, as_body
 from ..partial.completion import complete
 from ..partial.free_surface import free_surface
 from ..partial.scan import ScanPoints
-from .dynamics import predicted
+from ..smoothing import predicted
 from .frame_fit import FrameFit, Refined, shared_shape, spread_poses
 from .frames import Frame, as_views, prepare_frame
 from .settings import TrackConfig
@@ -74,7 +74,7 @@ class Tracker:
     def push(self, frame: Frame) -> list[TrackedFrame]:
         """Take the next frame; returns those that are done, which may be none or several."""
         config, state = self.config, self.state
-        expected = predicted(state.past, LOST if state.lost else MOMENTUM) if state.past else None
+        expected = predicted(state.past[0], state.past[-1], LOST if state.lost else MOMENTUM) if state.past else None
         cloud = prepare_frame(frame, config.frame_points, config.normal_points, self.viewpoints,
                               None if expected is None else self._mesh(expected))
         if expected is None and cloud is None:

@@ -12,7 +12,7 @@ from ..pose.follow import between_keys, seen_span
 from ..pose.marked_body import BATCH, MarkedBody
 from ..pose.robust import marker_weights
 from ..pose.settings import AnimateConfig
-from ..pose.smooth import inertia, smoothed
+from ..pose.smooth import smoothed
 
 OWN = 0.6                            # most of a displacement that the body is taken to have followed
 
@@ -44,7 +44,7 @@ class Simulation:
         """Unknowns (T, P) of the body that follows markers (T, L, 3), metres, from others that are near or anew."""
         self.targets = targets
         x = between_keys(self.body, targets, self.rate, self.config) if near is None else near.copy()
-        inside, stiffness = seen_span(targets), inertia(self.config, self.rate, self.body.n_unknowns)
+        inside, stiffness = seen_span(targets), self.config.inertia(self.rate, self.body.n_unknowns)
         for _ in range(max(self.config.smoothing, 1)):
             weights = self.weights(inside, self.positions(x[inside]))
             x[inside] = smoothed(self.body, stiffness, x[inside], targets[inside], weights)

@@ -30,9 +30,8 @@ from ..pose.robust import motion_problem
 from ..retargeting.pictures import picture_transfer, write_character
 from ..retargeting.retarget import retarget
 from ..retargeting.soft_tissue import retarget_soft_tissue
-from .by_sex import mosh_by_sex
 from .charts import MM
-from .mosh import MoshConfig, MoshResult, mosh
+from .mosh import MoshConfig, MoshResult, mosh, mosh_by_sex
 from .pictures import standing
 from .recordings import Actor, Recording
 from .report import PICTURE, closing, person_page, person_picture, take_page, take_picture

@@ -16,7 +16,7 @@ from .initialise import reinitialise_limbs, search
 from .marked_body import MarkedBody
 from .robust import judge, label_order, marker_weights
 from .settings import AnimateConfig
-from .smooth import inertia, low_pass, smoothed
+from .smooth import low_pass, smoothed
 from .stream import STEPS, Tracker
 
 __all__ = ["AnimateConfig", "animate"]
@@ -98,7 +98,7 @@ def follow_frames(body: MarkedBody, targets: np.ndarray, frames: np.ndarray, rat
 def follow_whole(body: MarkedBody, targets: np.ndarray, rate: float, config: AnimateConfig, tell: Progress
                  ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """All frames together: unknowns (T, P), the order of the labels (T, L), and which frames converged (T,)."""
-    T, stiffness = len(targets), inertia(config, rate, body.n_unknowns)
+    T, stiffness = len(targets), config.inertia(rate, body.n_unknowns)
     x, moved, feet = between_keys(body, targets, rate, config), np.zeros(T), None
     seen = ~np.isnan(targets[..., 0])
     inside = seen_span(targets)

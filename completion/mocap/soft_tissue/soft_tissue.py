@@ -14,12 +14,13 @@ from scanprep.ranges import Positive, Settings
 from scanprep.threads import one_thread
 
 from ...motion import Motion
+from ...smoothing import coupled_steps
 from ..files.markers import MarkerSequence
 from ..marker_sets.layout import MarkerLayout
 from ..pose.marked_body import BATCH
 from ..pose.robust import marker_weights
 from ..pose.settings import RATE, AnimateConfig
-from ..pose.smooth import FURTHEST, coupled_steps, inertia
+from ..pose.smooth import FURTHEST
 from .changing_body import ChangingBody, changing_bodies, skin_metric, skin_movement
 
 Progress = Callable[[int, int], None]
@@ -177,7 +178,7 @@ class SoftFollower:
         poses = AnimateConfig(prior_weight=config.pose, angle_acceleration=RATE**2 / np.sqrt(config.velocity))
         self.body = ChangingBody(model, motion.betas, layout.select(labels), cheap_directions(model, slopes, config),
                                  slopes, config.pose, poses.prior_shrinkage)
-        self.inertia = inertia(poses, markers.rate, self.body.marked.n_unknowns)
+        self.inertia = poses.inertia(markers.rate, self.body.marked.n_unknowns)
         self.smoothness = config.temporal_smoothness * (markers.rate / RATE)**4
 
     def solve(self, progress: Progress | None = None) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -223,7 +224,7 @@ class SoftFollower:
             back[some] = solved = np.linalg.solve(H[:, P:, P:] + np.eye(self.body.n_betas), right)
             hessian[some] = H[:, :P, :P] - across @ solved[:, :, :P]
             gradient[some] = g[:, :P] - (across @ solved[:, :, P:])[..., 0]
-        step = coupled_steps(self.body.marked, self.inertia, x, gradient, hessian) if T > 2 \
+        step = coupled_steps(x, gradient, hessian, self.inertia) if T > 2 \
             else -np.linalg.solve(hessian, gradient[..., None])[..., 0]
         share = np.minimum(1, FURTHEST / np.maximum(np.abs(step).max(axis=1, keepdims=True), 1e-12))
         shift = -(back[:, :, P] + (back[:, :, :P] @ step[..., None].astype(np.float32))[..., 0])
