@@ -1,6 +1,6 @@
 # The public names; loaded when they are first used, so that the command line answers at once.
 from .mocap.artefacts.find import find_artefacts as find_artefacts
-from .mocap.artefacts.virtual import write_virtual as write_virtual
+from .mocap.artefacts.results import write_virtual as write_virtual
 from .mocap.files.markers import (
     MarkerSequence as MarkerSequence,
 )

@@ -12,7 +12,7 @@ from completion.mocap.artefacts.simulated import Simulation, bridged
 from completion.mocap.artefacts.slips import find_bad, without_lost_limbs
 from completion.mocap.files.markers import MarkerSequence
 from completion.mocap.marker_sets.layout import MarkerLayout
-from completion.mocap.mosh.charts import chart_artefacts
+from completion.mocap.mosh.pictures import chart_artefacts
 from completion.mocap.pose.follow import AnimateConfig, animate
 from completion.mocap.pose.swaps import TORN, Tracks, _two_states, find_order
 from scanprep.geometry import rotations

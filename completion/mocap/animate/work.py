@@ -1,8 +1,9 @@
-"""One marker file: whose body, its motion, and all that is written of it."""
+"""One marker file: whose body, its motion, and all that is written of it, with the page."""
 from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -16,7 +17,15 @@ from scanprep.pictures.page import Page
 
 from ...cli import rows
 from ...motion import Motion, spread_frames
-from ...motion_pictures import moving_picture, picture_bodies, picture_frames
+from ...motion_pictures import (
+    animated_picture,
+    chart_residuals,
+    chart_states,
+    moving_picture,
+    picture_bodies,
+    picture_frames,
+    worst_frames,
+)
 from ..files.markers import MarkerSequence, read_markers
 from ..files.motion_files import KEYS, write_glb, write_motion
 from ..marker_sets.named import choose_layout
@@ -24,7 +33,6 @@ from ..pose.follow import AnimateConfig, animate
 from ..pose.robust import motion_problem
 from ..retargeting.retarget import morphed_vertices, retarget
 from ..subject.person import PersonConfig, find_person
-from .report import motion_page
 
 BetasTo = dict[float, np.ndarray] | np.ndarray      # keys over seconds, or betas at the end
 ENDINGS = (".c3d", ".trc", ".csv")
@@ -127,3 +135,38 @@ def morph_keys(given: BetasTo, motion: Motion) -> dict[float, np.ndarray]:
     if motion.betas is None:
         raise ValueError("--betas-to: the subject has no betas to begin with; give keys {seconds: betas}")
     return {0.0: motion.betas, float(motion.times[-1]): given}
+
+
+def motion_page(motion: Motion, subject: Subject, markers: MarkerSequence, name: str,
+                rows: list[tuple[str, Any, str]]) -> Page:
+    """The page of `scape animate`."""
+    page = Page(f"{name}, animated", "The body in some frames, with the markers that were measured as dots.")
+    page.picture(picture_frames(motion, subject, markers.positions), "from the front and the person's left")
+    page.picture(picture_frames(motion, subject, markers.positions, turn=215.0), "the same frames from behind")
+    page.picture(animated_picture(motion, subject, 10.0, 4.0), "first seconds")
+    page.section("Markers").chart(chart_residuals(motion), "distance of the markers to where the body puts them")
+    page.picture(picture_frames(motion, subject, markers.positions, worst_frames(motion, 8)),
+                 "where the markers are farthest off")
+    used = np.isfinite(motion.residuals).any(axis=0)
+    labels = [label for label, is_used in zip(motion.labels, used, strict=True) if is_used]
+    missing = ~np.isfinite(motion.residuals[:, used])
+    state = np.where(missing, 2, np.where(motion.trusted[:, used], 0, 1))
+    page.chart(chart_states(state, labels, motion.rate, ("#dfe7ee", "#e39b3b", "#8c2f39")),
+               "light: seen; orange: seen, but not believed; red: missing")
+    page.table(_marker_rows(motion, used), ("marker", "mean distance (mm)", "95th percentile (mm)", "seen (%)",
+                                            "believed (%)"))
+    unused = [label for label in motion.labels if label not in labels]
+    if unused:
+        page.text(f"Not used, because the layout does not know them or they were never seen: {', '.join(unused)}.")
+    return page.section("Figures").table(rows, ("metric", "value", "unit"))
+
+
+def _marker_rows(motion: Motion, used: np.ndarray) -> list[tuple[str, float, float, float, float]]:
+    """The markers, that with the largest mean distance first."""
+    found = []
+    for i in np.flatnonzero(used):
+        seen = np.isfinite(motion.residuals[:, i])
+        off = 1000 * motion.residuals[seen, i]
+        found.append((motion.labels[i], float(off.mean()), float(np.percentile(off, 95)), 100 * float(seen.mean()),
+                      100 * float(motion.trusted[seen, i].mean())))
+    return sorted(found, key=lambda row: -row[1])

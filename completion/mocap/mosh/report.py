@@ -18,8 +18,8 @@ from ...cli import rows
 from ...motion_pictures import MARKER, facing, worst_frames
 from ..marker_sets.layout import MarkerLayout
 from . import pictures
-from .charts import MM, chart_artefacts, chart_frames, chart_map, chart_timeline, mean_over
 from .mosh import MoshResult
+from .pictures import MM, chart_artefacts, chart_frames, chart_map, chart_timeline, mean_over
 from .takes import Take
 
 PICTURE = "picture.png"

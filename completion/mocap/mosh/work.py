@@ -20,19 +20,16 @@ from scanprep.pictures.sheets import save_png
 
 from ...motion import spread_frames
 from ...motion_pictures import picture_bodies
-from ..artefacts.results import MarkerArtefacts
-from ..artefacts.virtual import artefact_table, write_virtual
+from ..artefacts.results import MarkerArtefacts, artefact_table, write_virtual
 from ..files.markers import MarkerSequence, read_markers
 from ..files.motion_files import KEYS, write_glb, write_motion, write_residuals
 from ..marker_sets.layout import MarkerLayout
 from ..marker_sets.named import choose_layout
 from ..pose.robust import motion_problem
-from ..retargeting.pictures import picture_transfer, write_character
 from ..retargeting.retarget import retarget
-from ..retargeting.soft_tissue import retarget_soft_tissue
-from .charts import MM
+from ..retargeting.soft_tissue import picture_transfer, retarget_soft_tissue, write_character
 from .mosh import MoshConfig, MoshResult, mosh, mosh_by_sex
-from .pictures import standing
+from .pictures import MM, standing
 from .recordings import Actor, Recording
 from .report import PICTURE, closing, person_page, person_picture, take_page, take_picture
 from .takes import LightMesh, Take, held_out
