@@ -1,6 +1,7 @@
 """Pictures and charts of a body in motion."""
 from __future__ import annotations
 
+import warnings
 from collections.abc import Sequence
 from typing import Any
 
@@ -101,6 +102,32 @@ def moving_picture(bodies: np.ndarray, subject: Subject, rate: float, width: int
         facing(subject, pose, centred.reshape(-1, 3))
     faces = subject.template.faces if faces is None else faces
     return gif_bytes([render(Mesh(v, faces), camera, width, height, ground=True) for v in centred], rate)
+
+
+def mean_over(values: np.ndarray, axis: int) -> np.ndarray:
+    """The mean of what is not NaN, NaN where there is nothing."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", RuntimeWarning)
+        return np.nanmean(values, axis=axis)
+
+
+def marker_rows(labels: Sequence[str], residuals: np.ndarray, soft: np.ndarray | None, trusted: np.ndarray | None
+                ) -> list[tuple[Any, ...]]:
+    """A table of markers, the worst first: label, mean distances (mm), 95th percentile, seen and believed (%).
+
+    Distances (T, L) are of the fixed shape and, if there is one, of the changing one, which then is that of the
+    percentile. Markers that were never seen are left out, unless nothing is told of trust in them.
+    """
+    out = []
+    for i, label in enumerate(labels):
+        seen = np.isfinite(residuals[:, i])
+        if seen.any() or trusted is None:
+            shown = 1000 * (residuals if soft is None else soft)[seen, i]
+            out.append((label, 1000 * float(mean_over(residuals[:, i], 0)),
+                        np.nan if soft is None else 1000 * float(mean_over(soft[:, i], 0)),
+                        float(np.nanpercentile(shown, 95)) if len(shown) else np.nan, 100 * float(seen.mean()),
+                        np.nan if trusted is None else 100 * float(trusted[seen, i].mean())))
+    return sorted(out, key=lambda row: -row[1])
 
 
 def chart_residuals(motion: Motion, what: str = "markers", lost: bool = False) -> Any:

@@ -121,8 +121,7 @@ def test_one_smoothing_step_is_the_dense_gauss_newton_step(body, walk):
     rows, values = [], []
     for t in range(5):
         prior = energy.pose_prior(x[t][None], body.prior, PLAIN.prior_weight)
-        columns = body.shapes.columns(x[t, :-3].reshape(1, 4, 3), x[t, -3:][None])[1][0]              # (12, 3, 30)
-        markers = np.concatenate([columns, np.broadcast_to(np.eye(3)[:, :, None], (3, 3, 30))])
+        markers = body.shapes.columns(x[t, :-3].reshape(1, 4, 3), x[t, -3:][None])[1][0]              # (15, 3, 30)
         root = np.sqrt(weights[t])
         residual = root * (body.positions(x[t]) - targets[t]).T
         for jacobian, value in (((root * markers).reshape(15, -1).T, residual.ravel()),
@@ -144,7 +143,7 @@ def test_windows_agree_with_the_whole(body, walk, monkeypatch):
     x = np.random.default_rng(0).normal(0, 0.02, (FRAMES, 15))
     whole = smooth_step(body, x, walk[1].positions)
     monkeypatch.setattr("completion.smoothing.WINDOW", 20)
-    monkeypatch.setattr("completion.mocap.pose.smooth.OVERLAP", 15)
+    monkeypatch.setattr("completion.smoothing.OVERLAP", 15)
     assert np.abs(smooth_step(body, x, walk[1].positions) - whole).max() < 0.02 * np.abs(whole - x).max()
 
 

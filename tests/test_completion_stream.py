@@ -59,10 +59,11 @@ def test_part_shapes_are_the_point_operator(subject, layout):
     pose, trans = rng.normal(0, 1, (6, 4, 3)), rng.normal(size=(6, 3))
     pose[0] *= 4                                                     # beyond a half turn
     positions, by_pose = operator.jacobian(pose, trans)
-    y, by_turn = PartShapes(operator).columns(pose, trans)
+    y, columns = PartShapes(operator).columns(pose, trans)
     np.testing.assert_allclose(y.swapaxes(1, 2), positions, atol=1e-12)
     np.testing.assert_allclose(PartShapes(operator).evaluate(pose, trans).swapaxes(1, 2), positions, atol=1e-12)
-    turns = by_turn.reshape(6, 4, 3, 3, 30).transpose(0, 4, 3, 1, 2)               # (B, L, 3, J, 3)
+    np.testing.assert_array_equal(columns[:, 12:], np.broadcast_to(np.eye(3)[:, :, None], (6, 3, 3, 30)))
+    turns = columns[:, :12].reshape(6, 4, 3, 3, 30).transpose(0, 4, 3, 1, 2)               # (B, L, 3, J, 3)
     got = np.einsum("blijc,bjcd->blijd", turns, rotations.right_jacobian(pose))
     np.testing.assert_allclose(got.reshape(by_pose.shape), by_pose, atol=1e-9)
 

@@ -4,8 +4,6 @@
 """
 from __future__ import annotations
 
-import csv
-import io
 from collections.abc import Callable
 from contextlib import AbstractContextManager
 from dataclasses import asdict, dataclass, field, replace
@@ -21,7 +19,7 @@ from scanprep.batch.room import Room
 from scanprep.batch.steps import KeptSteps, inside
 from scanprep.batch.workspace import Task, Workspace
 from scanprep.dataset import RegisteredSet
-from scanprep.geometry import storage
+from scanprep.geometry import storage, tables
 from scanprep.geometry.files import read_mesh, write_mesh
 from scanprep.geometry.landmarks import match_landmarks, read_landmark_vertices, read_landmarks, write_landmarks
 from scanprep.geometry.mesh import Mesh
@@ -99,12 +97,8 @@ QUICK = DemoConfig(poses=8, subjects=3, faces=7000, resolution=0.011, template_r
 def write_settings(config: DemoConfig, rows: list[tuple[str, str, str, str]], folder: Path) -> None:
     """What the folder holds, and who is in the scans."""
     storage.write_json(folder / "demo.json", storage.as_json(asdict(config)))
-    text = io.StringIO()
-    table = csv.writer(text, lineterminator="\n")
-    table.writerow(["name", "subject", "pose", "sex"])
-    table.writerows(rows)
     (folder / "scans").mkdir()
-    (folder / "scans" / TABLE).write_text(text.getvalue(), encoding="utf-8")
+    tables.write_table(folder / "scans" / TABLE, ("name", "subject", "pose", "sex"), rows)
 
 
 MODEL, HALF, MOTION = Path("model.npz"), Path("half_view/half_view.ply"), Path("animation/motion.npz")

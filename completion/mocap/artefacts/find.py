@@ -3,12 +3,10 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import partial
 
 import numpy as np
 
 from model.linear import Subject
-from scanprep.geometry.least_squares import Minimum, levenberg_marquardt
 
 from ...motion import Motion
 from ..files.markers import MarkerSequence
@@ -144,7 +142,7 @@ def _followed(body: Simulation, markers: MarkerSequence, state: _State) -> np.nd
 def _judged(body: Simulation, markers: MarkerSequence, state: _State, config: ArtefactConfig) -> _State:
     """The state with the swaps and then the bad spans that the body at its x tells; x is None if it is to be anew."""
     assert state.x is not None, "the body has followed"
-    places, simulated = np.full(markers.positions.shape, np.nan), body.positions(state.x)
+    places, simulated = np.full(markers.positions.shape, np.nan), body.body.positions(state.x)
     places[:, body.rows] = _expected(body, state, state.repaired(markers)[:, body.rows], simulated)
     order = find_order(markers.positions, markers.rate, marker_levels(places, markers.positions))
     sure, tried = not state.unsure.any(), state.both_ways_tried
@@ -226,26 +224,20 @@ def _gains(body: Simulation, x: np.ndarray, positions: np.ndarray, a: int, b: in
     """What it gains (n,), in half squared deviations, to swap a pair in frames with unknowns (n, P)."""
     targets = positions[:, body.rows]
     own = [int(np.flatnonzero(body.rows == label)[0]) for label in (a, b)]
-    weights, _ = marker_weights(body.positions(x), targets, FOLLOW.marker_sd, FOLLOW.outlier)
+    weights, _ = marker_weights(body.body.positions(x), targets, FOLLOW.marker_sd, FOLLOW.outlier)
     without, full = weights.copy(), weights
     without[:, own], full[:, own] = 0, FOLLOW.marker_sd**-2
-    start = _solved(body, x, targets, without).x
+    start = body.body.solve(x, targets, without, 8, 1e-3).x
     other = targets.copy()
     other[:, own] = targets[:, own[::-1]]
-    costs = [_solved(body, start, way, full).energy for way in (targets, other)]
+    costs = [body.body.solve(start, way, full, 8, 1e-3).energy for way in (targets, other)]
     return 0.5 * (costs[0] - costs[1])
-
-
-def _solved(body: Simulation, x: np.ndarray, targets: np.ndarray, weights: np.ndarray) -> Minimum[np.ndarray]:
-    """Frames (n, P) after a few steps towards targets (n, L, 3)."""
-    return levenberg_marquardt(partial(body.body.system, targets=targets, weights=weights), x, iterations=8,
-                               tolerance=1e-3, retract=body.body.retract)
 
 
 def _result(body: Simulation, markers: MarkerSequence, state: _State) -> MarkerArtefacts:
     """What has been found."""
     assert state.x is not None, "the body has followed"
-    repaired, simulated = state.repaired(markers), body.positions(state.x)
+    repaired, simulated = state.repaired(markers), body.body.positions(state.x)
     targets = repaired[:, body.rows]
     weights, _ = marker_weights(simulated, targets, 1.0, FOLLOW.outlier)
     off = bridged(body.local(targets - simulated, state.x), BRIDGE * markers.rate)

@@ -9,7 +9,7 @@ from ...motion import Motion
 from ..files.markers import MarkerSequence
 from ..marker_sets.layout import MarkerLayout
 from ..pose.follow import between_keys, seen_span
-from ..pose.marked_body import BATCH, MarkedBody
+from ..pose.marked_body import MarkedBody, batches
 from ..pose.robust import marker_weights
 from ..pose.settings import AnimateConfig
 from ..pose.smooth import smoothed
@@ -32,13 +32,10 @@ class Simulation:
         hangs = self.part[:, None] == parents
         self.neighbours = (self.part[:, None] == self.part) | hangs | hangs.T
 
-    def positions(self, x: np.ndarray) -> np.ndarray:
-        """Where the body puts the markers (..., L, 3), metres, for unknowns (..., P)."""
-        return self.body.positions(x)
-
-    def weights(self, frames: np.ndarray | slice, positions: np.ndarray) -> np.ndarray:
-        """Weights (n, L) of the markers of some frames, low for outliers."""
-        return marker_weights(positions, self.targets[frames], self.config.marker_sd, self.config.outlier)[0]
+    def weights(self, frames: np.ndarray | slice, x: np.ndarray) -> np.ndarray:
+        """Weights (n, L) of the markers of some frames, low for outliers, the body being at unknowns (n, P)."""
+        return marker_weights(self.body.positions(x), self.targets[frames], self.config.marker_sd,
+                              self.config.outlier)[0]
 
     def solve(self, targets: np.ndarray, near: np.ndarray | None = None) -> np.ndarray:
         """Unknowns (T, P) of the body that follows markers (T, L, 3), metres, from others that are near or anew."""
@@ -46,7 +43,7 @@ class Simulation:
         x = between_keys(self.body, targets, self.rate, self.config) if near is None else near.copy()
         inside, stiffness = seen_span(targets), self.config.inertia(self.rate, self.body.n_unknowns)
         for _ in range(max(self.config.smoothing, 1)):
-            weights = self.weights(inside, self.positions(x[inside]))
+            weights = self.weights(inside, x[inside])
             x[inside] = smoothed(self.body, stiffness, x[inside], targets[inside], weights)
         return x
 
@@ -77,15 +74,11 @@ class Simulation:
 
     def _freed(self, x: np.ndarray, frames: np.ndarray) -> np.ndarray:
         """Matrices (n, L, 3, 3) from what is left of a displacement to the whole of it, at unknowns (n, P)."""
-        weights = self.weights(frames, self.positions(x))
+        weights = self.weights(frames, x)
         out = np.empty((*weights.shape, 3, 3))
-        for start in range(0, len(x), BATCH):
-            some = slice(start, start + BATCH)
+        for some in batches(len(x)):
             _, _, hessian = self.body.system(x[some], self.targets[frames[some]], weights[some])
-            pose, trans, _ = self.body.body.split(x[some])
-            _, by_turn = self.body.shapes.columns(pose, trans)                                    # (B, n, 3, L)
-            columns = np.concatenate([by_turn, np.broadcast_to(np.eye(3)[None, :, :, None],
-                                                               (len(pose), 3, 3, self.body.count))], axis=1)
+            _, columns = self.body.shapes.columns(*self.body.body.split(x[some])[:2])                # (B, P, 3, L)
             B, P = columns.shape[:2]
             hessian += 1e-9 * np.trace(hessian, axis1=1, axis2=2)[:, None, None] * np.eye(P)
             answer = np.linalg.solve(hessian, columns.reshape(B, P, -1)).reshape(columns.shape)

@@ -1,7 +1,6 @@
 """Pictures of a person with markers and of what soft tissue does; charts of how far the markers are from the body."""
 from __future__ import annotations
 
-import warnings
 from collections.abc import Sequence
 from dataclasses import replace
 from typing import Any
@@ -9,11 +8,12 @@ from typing import Any
 import numpy as np
 
 from model.body import BodyModel
+from scanprep.cli import MM
 from scanprep.geometry.mesh import Mesh
 from scanprep.pictures.camera import Camera, look_around, upright
 from scanprep.pictures.shading import Bones, Dots, Shape, Solid, color_bar, heat, render, side_by_side
 
-from ...motion_pictures import MARKER, chart_states, facing, moving_picture
+from ...motion_pictures import MARKER, chart_states, facing, mean_over, moving_picture
 from ..artefacts.results import MarkerArtefacts
 from ..files.markers import MarkerSequence
 from ..marker_sets.layout import MarkerLayout
@@ -195,16 +195,8 @@ def _width(camera: Camera, height: int) -> int:
     return max(120, round(height * camera.width / camera.height) + 8)
 
 
-MM = 1000.0
 STATES = {"believed": "#e3eaf0", "not believed": "#f0c46c", "missing": "#9aa3ab", "swapped": "#2f6db3",
           "slipped": "#8557a8", "noisy": "#b3592f", "stray": "#c02a3c"}
-
-
-def mean_over(values: np.ndarray, axis: int) -> np.ndarray:
-    """The mean of what is not NaN, NaN where there is nothing."""
-    with warnings.catch_warnings():
-        warnings.simplefilter("ignore", RuntimeWarning)
-        return np.nanmean(values, axis=axis)
 
 
 def _thinned(values: np.ndarray, most: int = 900) -> np.ndarray:

@@ -1,7 +1,6 @@
 """Which marker files belong to whom."""
 from __future__ import annotations
 
-import csv
 import re
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
@@ -101,10 +100,8 @@ def find_actors(markers: Iterable[Path], grouping: Grouping, output: Path | None
 
 def write_table(path: Path, actors: Iterable[Actor]) -> None:
     """Who is who as CSV, in the form that `Grouping.table` takes."""
-    with storage.writing(path) as beside, open(beside, "w", newline="", encoding="utf-8") as out:
-        table = csv.writer(out)
-        table.writerow(["file", "subject", "rule"])
-        table.writerows([r.path, actor.name, actor.rule] for actor in actors for r in actor.recordings)
+    tables.write_table(path, ("file", "subject", "rule"),
+                       ((r.path, actor.name, actor.rule) for actor in actors for r in actor.recordings))
 
 
 def folder_name(text: str) -> str:

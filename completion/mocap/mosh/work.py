@@ -1,7 +1,6 @@
 """One person: read the recordings, find the person and the motions, and write everything."""
 from __future__ import annotations
 
-import csv
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -13,8 +12,9 @@ import numpy as np
 from model.body import BodyModel
 from model.learning.sex_plane import SexGuess
 from scanprep.batch.room import Room
+from scanprep.cli import MM
 from scanprep.console import Metric, Outcome, plain, write_report
-from scanprep.geometry import storage
+from scanprep.geometry import storage, tables
 from scanprep.pictures.camera import upright
 from scanprep.pictures.sheets import save_png
 
@@ -29,7 +29,7 @@ from ..pose.robust import motion_problem
 from ..retargeting.retarget import retarget
 from ..retargeting.soft_tissue import picture_transfer, retarget_soft_tissue, write_character
 from .mosh import MoshConfig, MoshResult, mosh, mosh_by_sex
-from .pictures import MM, standing
+from .pictures import standing
 from .recordings import Actor, Recording
 from .report import PICTURE, closing, person_page, person_picture, take_page, take_picture
 from .takes import LightMesh, Take, held_out
@@ -58,7 +58,33 @@ class Work:
     command: str = field(metadata={"digest": False})
 
     def __call__(self, actor: Actor, room: Room) -> tuple[list[Metric], list[str]]:
-        return mosh_person(self, actor, room)
+        """Everything of one person into the folder of a room: the figures, and what failed.
+
+        A recording that cannot be read is left out and told; ValueError where none can. The first figure is called
+        "problem" where a motion means nothing, and says why.
+        """
+        start, folder = time.perf_counter(), room.folder
+        found, failures = _solve(self, actor, room)
+        settings = {"mosh": self.config, "model": self.name, "layout": found.layout_name, "held out": self.hold_out}
+        _write_person(folder, found.result, {
+            "model": self.name, "layout": found.layout_name, "held_out": self.hold_out, "sex": found.guess,
+            "recordings": [r.path.name for r in actor.recordings]})
+        figures: dict[str, list[Metric]] = {}
+        total = len(found.takes) + 1
+        for i, take in enumerate(found.takes):
+            room.tell(HALF + HALF * i // total, 2 * HALF)
+            figures[take.name] = _write(self, found, take, room, settings)
+        room.tell(HALF + HALF * (total - 1) // total, 2 * HALF)
+        problems = "; ".join(f"{take.name}: {why}" for take in found.takes if (why := found.problem(take)))
+        metrics = [Metric("problem", problems)] if problems else []
+        metrics += [Metric("model", self.name), *_person_metrics(found), *_figures(found.takes)]
+        person_page(actor.name, found.model, found.result, found.usual, found.takes, metrics, figures,
+                    settings).write(folder / "report.html")
+        save_png(folder / PICTURE, person_picture(found.model, found.result))
+        metrics += _speeds(found)                    # not on the page: it is the same however often it is made
+        write_report(Outcome(folder, metrics, settings, failures), self.command, time.perf_counter() - start)
+        room.tell(2 * HALF, 2 * HALF)
+        return metrics, failures
 
 
 @dataclass(frozen=True, eq=False)
@@ -75,36 +101,6 @@ class _Found:
     def problem(self, take: Take) -> str | None:
         """Why the motion of a sequence means nothing."""
         return motion_problem(take.motion, take.subject.template, self.result.layout, take.markers)
-
-
-def mosh_person(work: Work, actor: Actor, room: Room) -> tuple[list[Metric], list[str]]:
-    """Everything of one person into the folder of a room: the figures, and what failed.
-
-    A recording that cannot be read is left out and told; ValueError where none can. The first figure is called
-    "problem" where a motion means nothing, and says why.
-    """
-    start, folder = time.perf_counter(), room.folder
-    found, failures = _solve(work, actor, room)
-    settings = {"mosh": work.config, "model": work.name, "layout": found.layout_name, "held out": work.hold_out}
-    _write_person(folder, found.result, {
-        "model": work.name, "layout": found.layout_name, "held_out": work.hold_out, "sex": found.guess,
-        "recordings": [r.path.name for r in actor.recordings]})
-    figures: dict[str, list[Metric]] = {}
-    total = len(found.takes) + 1
-    for i, take in enumerate(found.takes):
-        room.tell(HALF + HALF * i // total, 2 * HALF)
-        figures[take.name] = _write(work, found, take, room, settings)
-    room.tell(HALF + HALF * (total - 1) // total, 2 * HALF)
-    problems = "; ".join(f"{take.name}: {why}" for take in found.takes if (why := found.problem(take)))
-    metrics = [Metric("problem", problems)] if problems else []
-    metrics += [Metric("model", work.name), *_person_metrics(found), *_figures(found.takes)]
-    person_page(actor.name, found.model, found.result, found.usual, found.takes, metrics, figures,
-                settings).write(folder / "report.html")
-    save_png(folder / PICTURE, person_picture(found.model, found.result))
-    metrics += _speeds(found)                    # not on the page: it is the same however often it is made
-    write_report(Outcome(folder, metrics, settings, failures), work.command, time.perf_counter() - start)
-    room.tell(2 * HALF, 2 * HALF)
-    return metrics, failures
 
 
 def _solve(work: Work, actor: Actor, room: Room) -> tuple[_Found, list[str]]:
@@ -212,12 +208,8 @@ def _write_artefacts(folder: Path, found: MarkerArtefacts) -> None:
     rows: list[tuple[str, str, int, int, str]] = [
         *(("swapped", f"{s.first} {s.second}", s.begin, s.end, "") for s in found.swaps),
         *((b.kind, b.label, b.begin, b.end, f"{b.distance:.4g}") for b in found.bad)]
-    path = folder / "artefacts.csv"
-    with storage.writing(path) as beside, open(beside, "w", newline="", encoding="utf-8") as out:
-        table = csv.writer(out)
-        table.writerow(["artefact", "markers", "begin", "end", "distance"])
-        rows.sort(key=lambda row: (row[2], row[1]))
-        table.writerows(rows)
+    tables.write_table(folder / "artefacts.csv", ("artefact", "markers", "begin", "end", "distance"),
+                       sorted(rows, key=lambda row: (row[2], row[1])))
 
 
 def _character(character: BodyModel, take: Take, folder: Path, factor: float) -> tuple[np.ndarray, str]:

@@ -7,8 +7,9 @@ import numpy as np
 from scipy.ndimage import label, uniform_filter1d
 
 from scanprep.geometry.farthest_points import farthest_points
+from scanprep.geometry.least_squares import Dense
 
-from .marked_body import MarkedBody, PartShapes, System, point_system
+from .marked_body import MarkedBody, PartShapes, point_system
 
 TOUCH = 0.025                        # metres above the floor below which a point may stand
 STILL = 0.2                          # metres per second below which it does
@@ -69,10 +70,10 @@ class HeldPoints:
         """Those of some frames."""
         return HeldPoints(self.shapes, self.places[frames])
 
-    def system(self, pose: np.ndarray, trans: np.ndarray, frames: slice) -> System:
-        """Energy, half its gradient and Gauss-Newton matrix of some frames."""
+    def system(self, pose: np.ndarray, trans: np.ndarray, frames: slice) -> Dense:
+        """The equations of some frames."""
         places = self.places[frames]
-        return point_system(self.shapes, pose, trans, places, np.full(places.shape[:2], CONTACT_SD**-2))
+        return point_system(*self.shapes.columns(pose, trans), places, np.full(places.shape[:2], CONTACT_SD**-2))
 
 
 class FootContact:

@@ -10,13 +10,15 @@ Everything is done for a batch of poses. Derivatives are by small rotations of e
 """
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import numpy as np
 
 from model.features import twists
 from model.linear import PointOperator, Subject
 from model.priors import gaussian_prior
 from scanprep.geometry import rotations
-from scanprep.geometry.least_squares import Dense, retract_pose, step_between
+from scanprep.geometry.least_squares import Dense, Minimum, levenberg_marquardt, retract_pose, step_between
 from scanprep.geometry.mesh import Mesh
 from scanprep.skeleton.tree import Skeleton
 
@@ -24,7 +26,6 @@ from ... import energy
 from ...bodies import FixedBody
 from ..marker_sets.layout import MarkerLayout
 
-System = tuple[np.ndarray, np.ndarray, np.ndarray]                      # energy, half its gradient, Gauss-Newton matrix
 BATCH = 64                           # frames whose parts are held at once
 SAMPLES = 120                        # poses from which the turning of the normals is learned
 
@@ -46,43 +47,37 @@ class MarkedBody:
 
     def positions(self, x: np.ndarray) -> np.ndarray:
         """Where the body puts the markers (..., L, 3), metres, for unknowns (..., P)."""
-        pose, trans, _ = self.body.split(x)
-        pose, trans = pose.reshape(-1, *pose.shape[-2:]), trans.reshape(-1, 3)
-        y = np.empty((len(pose), 3, self.count))
-        for start in range(0, len(pose), BATCH):
-            some = slice(start, start + BATCH)
-            y[some] = self.shapes.evaluate(pose[some], trans[some])
-        return np.swapaxes(y, -1, -2).reshape(*x.shape[:-1], self.count, 3)
+        pose, trans, _ = self.body.split(x.reshape(-1, x.shape[-1]))
+        y = np.empty((len(pose), self.count, 3))
+        for some in batches(len(pose)):
+            y[some] = np.swapaxes(self.shapes.evaluate(pose[some], trans[some]), 1, 2)
+        return y.reshape(*x.shape[:-1], self.count, 3)
 
     def system(self, x: np.ndarray, targets: np.ndarray, weights: np.ndarray, stiff: float = 1.0) -> Dense:
-        """Markers and pose prior: energy (B,), half its gradient (B, P) and Gauss-Newton matrix (B, P, P).
-
-        For unknowns (B, P), markers (B, L, 3), metres, NaN where not seen, and factors on their squared distances
-        (B, L); `stiff` is a further factor on the pose prior.
-
-        [SCAPE] §8
-        """
+        """Markers (B, L, 3), weighted (B, L), and the pose prior, with a factor, at unknowns (B, P). [SCAPE] §8"""
         pose, trans, _ = self.body.split(x)
-        n = self.body.n_angles
-        energy, gradient, hessian = point_system(self.shapes, pose, trans, targets, weights)
-        prior = self.prior_system(pose, stiff)
-        gradient[:, :n] += prior[1]
-        hessian[:, :n, :n] += prior[2]
-        return Dense(energy + prior[0], gradient, hessian)
+        return self.with_prior(point_system(*self.shapes.columns(pose, trans), targets, weights), pose, stiff)
 
-    def prior_system(self, pose: np.ndarray, stiff: float = 1.0) -> System:
-        """The pose prior at poses (B, J, 3): energy (B,), half its gradient (B, 3J), its matrix (B, 3J, 3J)."""
-        pose = twists(pose)
+    def solve(self, x: np.ndarray, targets: np.ndarray, weights: np.ndarray, iterations: int, tolerance: float,
+              stiff: float = 1.0) -> Minimum[np.ndarray]:
+        """The best unknowns near x (B, P), each row by itself; arguments as of `system`, without B if all are alike."""
+        targets, weights = (np.broadcast_to(of, (len(x), *of.shape[-k:])) for of, k in ((targets, 2), (weights, 1)))
+        return levenberg_marquardt(lambda at: self.system(at, targets, weights, stiff), x, iterations, tolerance,
+                                   retract=self.retract)
+
+    def with_prior(self, data: Dense, pose: np.ndarray, stiff: float = 1.0) -> Dense:
+        """Equations whose first unknowns are those of poses (B, J, 3), and the pose prior."""
+        pose, (energy, gradient, hessian) = twists(pose), data
         B, n = len(pose), self.body.n_angles
         local = rotations.inverse_right_jacobian(pose)                                           # dpose = local d
         off = pose.reshape(B, n) - self.prior.mean
         precision = stiff * self._precision
         pull = off @ precision
-        gradient = (pull.reshape(B, -1, 1, 3) @ local).reshape(B, n)
+        gradient[:, :n] += (pull.reshape(B, -1, 1, 3) @ local).reshape(B, n)
         half = precision.reshape(n, -1, 3).swapaxes(0, 1) @ local                          # (B, J, n, 3)
         half = half.reshape(B, -1, n // 3, 3, 3).swapaxes(-1, -2)                                # transposed rows
-        hessian = (half @ local[:, None]).transpose(0, 1, 3, 2, 4).reshape(B, n, n)
-        return (pull * off).sum(axis=1), gradient, hessian
+        hessian[:, :n, :n] += (half @ local[:, None]).transpose(0, 1, 3, 2, 4).reshape(B, n, n)
+        return Dense(energy + (pull * off).sum(axis=1), gradient, hessian)
 
     def retract(self, x: np.ndarray, step: np.ndarray) -> np.ndarray:
         """The unknowns (..., P) after a step (..., P); poses come out at most a half turn long."""
@@ -93,22 +88,23 @@ class MarkedBody:
         return step_between(x, goal, self.body.n_angles)
 
 
-def point_system(shapes: PartShapes, pose: np.ndarray, trans: np.ndarray, targets: np.ndarray, weights: np.ndarray
-                 ) -> System:
-    """Points that are to be at their targets (B, L, 3): energy (B,), half its gradient, Gauss-Newton matrix.
+def batches(count: int) -> Iterator[slice]:
+    """So many frames, some at a time."""
+    return (slice(start, start + BATCH) for start in range(0, count, BATCH))
 
-    Targets are NaN where there is none; `weights` (B, L) are factors on the squared distance.
+
+def point_system(y: np.ndarray, columns: np.ndarray, targets: np.ndarray, weights: np.ndarray) -> Dense:
+    """The equations of points at y (B, 3, L), with derivatives (B, P, 3, L), that are to be at targets (B, L, 3).
+
+    Targets are NaN where there is none; `weights` (B, L) are factors on the squared distance. Both of the first are
+    used up.
     """
-    y, by_rotation = shapes.columns(pose, trans)
-    (B, n), L = by_rotation.shape[:2], shapes.count
-    missing = np.isnan(targets[..., 0])
+    (B, P), missing = columns.shape[:2], np.isnan(targets[..., 0])
     root = np.sqrt(np.where(missing, 0.0, weights))[:, None]
     residual = (root * np.where(missing[:, None], 0.0, y - np.swapaxes(targets, -1, -2))).reshape(B, -1)
-    columns = np.empty((B, n + 3, 3, L))
-    np.multiply(by_rotation, root[:, None], out=columns[:, :n])
-    columns[:, n:] = np.eye(3)[:, :, None] * root[:, None]
-    A = columns.reshape(B, n + 3, -1)
-    return (residual**2).sum(axis=1), (A @ residual[..., None])[..., 0], A @ np.swapaxes(A, -1, -2)
+    columns *= root[:, None]
+    A = columns.reshape(B, P, -1)
+    return Dense((residual**2).sum(axis=1), (A @ residual[..., None])[..., 0], A @ np.swapaxes(A, -1, -2))
 
 
 class PartShapes:
@@ -165,9 +161,9 @@ class PartShapes:
         return carried.sum(axis=0) + (self.origin + trans)[:, :, None]
 
     def columns(self, pose: np.ndarray, trans: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Places (B, 3, L), metres, at poses (B, J, 3), and their derivatives (B, 3J, 3, L).
+        """Places (B, 3, L), metres, at poses (B, J, 3), and their derivatives (B, 3J + 3, 3, L).
 
-        These are by small rotations of the joints from the right; by trans it is the identity.
+        These are by small rotations of the joints from the right, and by trans.
         """
         t = twists(pose).swapaxes(0, 1)
         (J, B), L = t.shape[:2], self.count
@@ -180,8 +176,10 @@ class PartShapes:
         along = slope.swapaxes(-1, -2)[:, :, :, None, None, :, None] \
             * rotated[:, :, None].swapaxes(-2, -3)[..., None, :]
         columns += (along.reshape(J, 9 * B, -1) @ self._by_joint.reshape(J, -1, L)).reshape(J, B, 9, L)
-        return below[0] + (self.origin + trans)[:, :, None], \
-            columns.reshape(J, B, 3, 3, L).swapaxes(0, 1).reshape(B, 3 * J, 3, L)
+        out = np.empty((B, 3 * J + 3, 3, L))
+        out[:, :-3].reshape(B, J, 9, L)[:] = columns.swapaxes(0, 1)
+        out[:, -3:] = np.eye(3)[:, :, None]
+        return below[0] + (self.origin + trans)[:, :, None], out
 
     def lift_off(self, part: np.ndarray, offsets: np.ndarray, bends: list[dict[int, np.ndarray]]) -> None:
         """Add to every point a vector (L, 3), metres, that turns with a part (L,) and bends with its joints.

@@ -6,7 +6,7 @@ from scipy.spatial.transform import Rotation
 
 from ...smoothing import coupled_steps
 from .foot_contact import HeldPoints
-from .marked_body import BATCH, MarkedBody
+from .marked_body import MarkedBody, batches
 
 FURTHEST = 0.5                       # radians or metres that a step may go
 
@@ -21,8 +21,7 @@ def smoothed(body: MarkedBody, stiffness: np.ndarray, x: np.ndarray, targets: np
     if T < 3:
         return x
     gradient, hessian = np.empty((T, P)), np.empty((T, P, P))
-    for start in range(0, T, BATCH):
-        some = slice(start, start + BATCH)
+    for some in batches(T):
         _, gradient[some], hessian[some] = body.system(x[some], targets[some], weights[some])
         if held is not None:
             _, pull, stiff = held.system(*body.body.split(x[some])[:2], some)

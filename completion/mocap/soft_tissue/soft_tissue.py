@@ -17,7 +17,7 @@ from ...motion import Motion
 from ...smoothing import coupled_steps
 from ..files.markers import MarkerSequence
 from ..marker_sets.layout import MarkerLayout
-from ..pose.marked_body import BATCH
+from ..pose.marked_body import batches
 from ..pose.robust import marker_weights
 from ..pose.settings import RATE, AnimateConfig
 from ..pose.smooth import FURTHEST
@@ -215,8 +215,7 @@ class SoftFollower:
         T, P = x.shape
         gradient, hessian = np.empty((T, P)), np.empty((T, P, P))
         back = np.empty((T, self.body.n_betas, P + 1), dtype=np.float32)
-        for start in range(0, T, BATCH):
-            some = slice(start, start + BATCH)
+        for some in batches(T):
             _, g, H = self.body.system(x[some], z[some], targets[some], weights[some])
             g[:, P:] += z[some]                                         # [MoSh] Eq. 24
             across = H[:, :P, P:]
@@ -252,12 +251,10 @@ def smooth_changes(body: ChangingBody, x: np.ndarray, targets: np.ndarray, weigh
     """
     z, eye = np.empty((len(x), body.n_betas)), np.eye(body.n_betas)
     for near, kept, where in overlapping_windows(len(x), WINDOW, OVERLAP):
-        gradient = np.empty((near.stop - near.start, body.n_betas))
-        hessian = np.empty((*gradient.shape, body.n_betas))
-        for first in range(0, len(gradient), BATCH):
-            some = slice(near.start + first, min(near.stop, near.start + first + BATCH))
-            mine = slice(first, first + BATCH)
-            gradient[mine], hessian[mine] = body.change_system(x[some], targets[some], weights[some])
+        at, goal, share = x[near], targets[near], weights[near]
+        gradient, hessian = np.empty((len(at), body.n_betas)), np.empty((len(at), body.n_betas, body.n_betas))
+        for some in batches(len(at)):
+            _, gradient[some], hessian[some] = body.change_system(at[some], goal[some], share[some])
         z[where] = -solve_smooth(hessian + eye, smoothness, gradient)[kept]
     return z
 

@@ -2,7 +2,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from functools import partial
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -10,7 +9,6 @@ from scipy.spatial import cKDTree
 from model.body import BodyModel
 from model.linear import Subject
 from scanprep.geometry import rotations
-from scanprep.geometry.least_squares import levenberg_marquardt
 
 from ..marker_sets.layout import MarkerLayout
 from ..pose.initialise import search
@@ -50,9 +48,7 @@ def _from_found(body: MarkedBody, found: Sequence[np.ndarray], targets: np.ndarr
     x[:, -3:] += (targets - body.positions(x))[:, there].mean(axis=1)
     off = np.nanmean(np.linalg.norm(body.positions(x) - targets, axis=2), axis=1)
     x = x[np.argsort(off)[:most]]
-    weights = np.full((len(x), len(targets)), MEAN_PERSON.marker_sd**-2)
-    system = partial(body.system, targets=np.broadcast_to(targets, (len(x), *targets.shape)), weights=weights)
-    end = levenberg_marquardt(system, x, iterations=20, tolerance=1e-3, retract=body.retract)
+    end = body.solve(x, targets, np.full(len(targets), MEAN_PERSON.marker_sd**-2), 20, 1e-3)
     return end.x[np.argmin(end.energy)]
 
 
