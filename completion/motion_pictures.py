@@ -92,8 +92,7 @@ def moving_picture(bodies: np.ndarray, subject: Subject, rate: float, width: int
                    faces: np.ndarray | None = None, pose: np.ndarray | None = None) -> bytes:
     """Meshes (n, N, 3) as an endless GIF of `rate` pictures a second, the camera following them over the ground.
 
-    `faces` are theirs, where they are not the subject's; a body in `pose` (J, 3) is seen from its front, else as at
-    rest.
+    `faces` are theirs, if not the subject's; a body in `pose` (J, 3) is seen from its front, else as at rest.
     """
     centred = bodies - bodies.mean(axis=1, keepdims=True)
     up, _ = upright(subject.template)

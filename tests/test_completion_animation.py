@@ -6,10 +6,9 @@ from scipy.linalg import block_diag
 from completion import energy
 from completion.mocap.files.markers import MarkerSequence
 from completion.mocap.marker_sets.layout import MarkerLayout
-from completion.mocap.pose.follow import AnimateConfig, animate
+from completion.mocap.pose.follow import AnimateConfig, animate, smoothed
 from completion.mocap.pose.marked_body import MarkedBody, supports
 from completion.mocap.pose.robust import marker_weights
-from completion.mocap.pose.smooth import smoothed
 from completion.motion import Motion
 from scanprep.geometry import rotations
 from scanprep.geometry.storage import StorageError

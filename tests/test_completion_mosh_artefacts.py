@@ -311,11 +311,11 @@ def test_what_a_marker_is_off_by_the_account_of_the_others(subject, layout, move
     faulty[:, 7] += [0.004, 0.01, -0.006]
     body = Simulation(subject, MarkerSequence(faulty, LABELS, RATE), layout, AnimateConfig())
     x = body.solve(faulty)
-    off = faulty - body.positions(x)
+    off = faulty - body.body.positions(x)
     alone = body.alone(off, x)[:, 7]
     without = faulty.copy()
     without[:, 7] = np.nan
-    true = faulty[:, 7] - body.positions(body.solve(without))[:, 7]
+    true = faulty[:, 7] - body.body.positions(body.solve(without))[:, 7]
     assert np.linalg.norm(off[:, 7] - true, axis=1).mean() > 0.001
     assert np.linalg.norm(alone - true, axis=1).mean() < 0.4 * np.linalg.norm(off[:, 7] - true, axis=1).mean()
 

@@ -10,7 +10,7 @@ from completion.bodies import FixedBody, ShapedBody
 from completion.smoothing import inertia, predicted, smooth
 from completion.tracking.frame_fit import shared_shape, spread_poses
 from completion.tracking.frames import prepare_frame
-from completion.tracking.tracker import Tracker
+from completion.tracking.sequence import Tracker
 from scanprep.batch.values import load_value, save_value
 from scanprep.geometry import rotations
 from scanprep.geometry.files import PointCloud

@@ -11,8 +11,7 @@ import numpy as np
 from scanprep.batch.workspace import Workspace
 from scanprep.geometry.files import MeshFileError, PointCloud, read_points, write_mesh
 
-from .sequence import without_points
-from .tracker import TrackedFrame, Tracker, TrackerState
+from .sequence import TrackedFrame, Tracker, TrackerState, without_points
 
 ENDINGS = (".ply", ".ply.gz", ".obj", ".stl", ".off", ".glb", ".pcd", ".xyz", ".txt", ".pts")
 NOTHING = ("holds no vertices", "the file is empty")
@@ -20,10 +19,9 @@ SPARSE = 2                           # numbers may leave out as many frames as t
 
 
 class FrameFolder:
-    """Frames in the order of the numbers in their names.
+    """Frames in the order of the numbers in their names: in a folder, in one for each camera, or named by a pattern.
 
-    A folder holds a file for each frame, or a subfolder of such files for each camera, or, with a pattern, the files
-    of all cameras. A number that is left out is a frame in which nothing was seen.
+    A number that is left out is a frame in which nothing was seen.
     """
 
     def __init__(self, folder: Path, pattern: str | None = None, unit: str | None = None) -> None:
@@ -150,9 +148,8 @@ def follow_folder(tracker: Tracker, frames: FrameFolder, space: Workspace, key: 
                   progress: Progress | None = None) -> Followed:
     """Follow a body through a folder of frames; those that were followed before are not followed again.
 
-    Frames are followed one from the other, and the shape is found from several, so what is kept of a chunk depends
-    on every file up to its last frame, and nothing after it. The state of the tracker is kept with it: when a chunk
-    is missing or damaged, or a frame in it has changed, the tracker goes on from the end of the one before.
+    What is kept of a chunk, with the tracker's state, depends on every file up to its last frame and nothing after it:
+    when one is missing, damaged or changed, the tracker goes on from the end of the one before.
     """
     done: list[TrackedFrame] = []
     state, fresh, names = tracker.state, 0, []

@@ -97,10 +97,7 @@ class FrameFit:
 
 def shared_shape(body: ShapedBody, clouds: Sequence[ScanPoints], x: np.ndarray, betas: np.ndarray,
                  config: TrackConfig) -> tuple[np.ndarray, np.ndarray]:
-    """Betas (K,) that explain frames together, and pose and trans (n, P) of each, from such near the truth.
-
-    Every round matches all frames anew and takes one Gauss-Newton step on all unknowns.
-    """
+    """Betas (K,) that explain frames together, and pose and trans (n, P) of each, from such near the truth."""
     fit = ScanFit(body, clouds[0], *NOTHING, config.scan)
     fits = [fit.on(cloud) for cloud in clouds]
     for one in fits:

@@ -150,8 +150,8 @@ def motion_page(motion: Motion, subject: Subject, markers: MarkerSequence, name:
     page.chart(chart_states(state, labels, motion.rate, ("#dfe7ee", "#e39b3b", "#8c2f39")),
                "light: seen; orange: seen, but not believed; red: missing")
     told = marker_rows(motion.labels, motion.residuals, None, motion.trusted)
-    page.table([(*row[:2], *row[3:]) for row in told], ("marker", "mean distance (mm)", "95th percentile (mm)", "seen (%)",
-                                            "believed (%)"))
+    page.table([(*row[:2], *row[3:]) for row in told],
+               ("marker", "mean distance (mm)", "95th percentile (mm)", "seen (%)", "believed (%)"))
     unused = [label for label in motion.labels if label not in labels]
     if unused:
         page.text(f"Not used, because the layout does not know them or they were never seen: {', '.join(unused)}.")

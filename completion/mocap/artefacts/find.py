@@ -196,8 +196,7 @@ def _both_ways(body: Simulation, markers: MarkerSequence, x: np.ndarray, order: 
 def ambiguous_swap(body: Simulation, x: np.ndarray, tracks: Tracks, a: int, b: int) -> np.ndarray:
     """Frames (n,) in which the labels a, b of close markers are better swapped, though the body followed them as is.
 
-    Both ways are tried in three frames of each stretch, from a body at x (T, P) that then follows neither; `tracks` are
-    those of the markers under the labels that they have now.
+    Both ways are tried in three frames of each stretch of `tracks`, from a body at x (T, P) that follows neither.
     """
     samples = 3
     begins = tracks.loose_ends(a, b)

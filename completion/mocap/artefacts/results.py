@@ -11,8 +11,8 @@ from scanprep.geometry import storage
 from scanprep.ranges import Settings
 
 from ..files.c3d import point_table, replace_points, write_c3d
-from ..files.common import MarkerFileError
 from ..files.markers import MarkerSequence, write_markers
+from ..files.text import MarkerFileError
 
 
 @dataclass(frozen=True)
@@ -51,14 +51,8 @@ BadKind = Literal["slipped", "noisy", "stray"]
 class BadSpan:
     """A marker that was not where the body says, from one frame to another, both included.
 
-    Attributes
-    ----------
-    label : str
-    kind : "slipped", "noisy" or "stray"
-        It stays displaced, it jitters, or it is somewhere else for a while.
-    begin, end : int
-    distance : float, metres
-        From the simulated marker, the median of the span.
+    "slipped" stays displaced, "noisy" jitters, "stray" is somewhere else for a while; the distance from the simulated
+    marker, metres, is the median of the span.
     """
 
     label: str
@@ -114,10 +108,7 @@ class MarkerArtefacts:
 
 
 def list_swaps(order: np.ndarray, seen: np.ndarray, labels: tuple[str, ...]) -> tuple[Swap, ...]:
-    """The swaps that an order (T, L) is made of; a longer cycle is a chain of pairs.
-
-    A swap begins and ends where one of the two labels is seen (T, L), as they came.
-    """
+    """The swaps that an order (T, L) is made of, a longer cycle as pairs; one of the two is seen at both ends."""
     frames: dict[tuple[int, int], list[int]] = {}
     for t in np.flatnonzero((order != np.arange(order.shape[1])).any(axis=1)):
         left = order[t].copy()

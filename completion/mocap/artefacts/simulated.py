@@ -8,11 +8,10 @@ from model.linear import Subject
 from ...motion import Motion
 from ..files.markers import MarkerSequence
 from ..marker_sets.layout import MarkerLayout
-from ..pose.follow import between_keys, seen_span
+from ..pose.follow import between_keys, seen_span, smoothed
 from ..pose.marked_body import MarkedBody, batches
 from ..pose.robust import marker_weights
 from ..pose.settings import AnimateConfig
-from ..pose.smooth import smoothed
 
 OWN = 0.6                            # most of a displacement that the body is taken to have followed
 
@@ -53,10 +52,9 @@ class Simulation:
         return self.body.body.join(motion.poses, motion.trans)
 
     def alone(self, off: np.ndarray, x: np.ndarray) -> np.ndarray:
-        """What markers would be off (T, L, 3), metres, if the body x (T, P) followed the others alone.
+        """What markers, off by (T, L, 3) metres, would be off if the body x (T, P) followed the others alone.
 
-        The body has gone after a displaced marker a little. Its own part in the normal equations is taken back.
-        `off` (T, L, 3) is from the simulated markers to the measured ones.
+        The body has gone after a displaced marker a little: its own part in the normal equations is taken back.
         """
         T, every = len(x), max(1, round(self.rate / 15))                # 15 looks a second at how markers draw the body
         frames = np.arange(min(every // 2, T - 1), T, every)
@@ -105,10 +103,7 @@ def usual_places(local: np.ndarray) -> np.ndarray:
 
 
 def bridged(local: np.ndarray, reach: float) -> np.ndarray:
-    """What markers are off (T, L, 3), NaN in gaps, with these bridged: straight, in long ones by way of the usual.
-
-    A marker is where it usually is `reach` frames from either end of a long gap.
-    """
+    """What markers are off (T, L, 3), NaN in gaps, with these bridged: straight, long ones by the usual place."""
     out = np.repeat(usual_places(local)[None], len(local), axis=0)
     for i in range(local.shape[1]):
         seen = np.flatnonzero(np.isfinite(local[:, i, 0]))

@@ -41,11 +41,7 @@ def joint_centres(motion: Motion, subject: Subject) -> np.ndarray:
 
 
 def write_motion(folder: Path, motion: Motion, subject: Subject) -> None:
-    """motion.npz, motion.bvh, joint_angles.csv, joint_centres.csv and residuals.csv.
-
-    Times are in seconds. Columns are `PART_rx, PART_ry, PART_rz`, the rotation vectors of `joint_angles`; `PART_x,
-    PART_y, PART_z`, metres, the joint of each part with its parent, for the root part the centroid of its surface.
-    """
+    """motion.npz, motion.bvh, joint_angles.csv, joint_centres.csv and residuals.csv; times are in seconds."""
     names, T = subject.skeleton.names, len(motion.poses)
     motion.save(folder / "motion.npz")
     write_motion_bvh(folder / "motion.bvh", motion, subject)

@@ -12,7 +12,7 @@ import numpy as np
 from scanprep.geometry import storage
 from scanprep.geometry.mesh import Mesh
 
-from ..files.common import MarkerFileError
+from ..files.text import MarkerFileError
 
 DISTANCE = 0.0095        # metres from the skin to the centre of a common marker
 

@@ -10,8 +10,8 @@ from typing import Literal, cast, get_args
 from scanprep.batch.workspace import HOME
 from scanprep.geometry import storage, tables
 
-from ..files.common import MarkerFileError
 from ..files.markers import marker_subjects
+from ..files.text import MarkerFileError
 
 By = Literal["auto", "name", "label", "each", "all"]
 ENDINGS = (".c3d", ".trc", ".csv")
@@ -69,11 +69,7 @@ class Grouping:
 
 
 def find_actors(markers: Iterable[Path], grouping: Grouping, output: Path | None = None) -> list[Actor]:
-    """The people of some files and folders; what lies in `output`, where results go, is no recording.
-
-    ValueError: no marker files, no such file, an output around the recordings, a table that names a file that is not
-    there.
-    """
+    """The people of some files and folders; what lies in `output` is no recording. ValueError for what cannot be."""
     given = list(markers)
     for place in given:
         if output is not None and place.is_dir() and output.resolve() in (place.resolve(), *place.resolve().parents):

@@ -46,14 +46,7 @@ class LightMesh:
 
 @dataclass(frozen=True, eq=False)
 class HeldOut:
-    """Markers that no stage has seen, and how far the body is from them where the layout has them.
-
-    Attributes
-    ----------
-    labels : H strings
-    fixed, soft : (T, H) float, metres
-        With the shape fixed, and changing in time; NaN where one was not seen. `soft` is None without soft tissue.
-    """
+    """How far the body is (T, H), metres, from markers that no stage saw; `soft` with soft tissue, if any."""
 
     labels: tuple[str, ...]
     fixed: np.ndarray

@@ -41,18 +41,14 @@ HALF = 100                           # of progress: finding shape and motion, th
 
 @dataclass(frozen=True, eq=False)
 class Work:
-    """The work on each person of a call, with the model and its name for the output.
-
-    `sexes` are models of "female" and "male" people for the sex that `model` tells, empty to do without; the layout
-    comes with its name, else the named one that fits the labels best is used; no stage sees markers held out.
-    """
+    """The work on each person of a call."""
 
     model: BodyModel
-    name: str
-    sexes: Mapping[str, BodyModel]
+    name: str                            # of the model, for the output
+    sexes: Mapping[str, BodyModel]       # of "female" and "male" people, for the sex that the model tells; or none
     character: BodyModel | None
-    layout: tuple[MarkerLayout, str] | None
-    hold_out: tuple[str, ...]
+    layout: tuple[MarkerLayout, str] | None          # with its name; else the named one that fits the labels best
+    hold_out: tuple[str, ...]            # labels that no stage sees
     unit: str | None
     config: MoshConfig
     command: str = field(metadata={"digest": False})

@@ -35,8 +35,7 @@ class Floor:
     def below(vertices: np.ndarray) -> Floor:
         """The floor under a moving body (n, N, 3), metres; for who lies or sits it should be given.
 
-        Vertical is the world axis along which the body is longest on average, down is the end that is broad and
-        stays level, to half a centimetre, and the floor is where that end mostly is.
+        Up is the world axis along which the body is longest; down is the end that is broad and stays level, to 5 mm.
         """
         low, high = vertices.min(axis=1), vertices.max(axis=1)
         axis = int((high - low).mean(axis=0).argmax())

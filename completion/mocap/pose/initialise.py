@@ -16,10 +16,7 @@ SCALES = (1.0, 0.3, 0.1)             # metres, at which a marker of a lost limb 
 
 
 def search(body: MarkedBody, targets: np.ndarray, config: AnimateConfig) -> np.ndarray:
-    """Unknowns (P,) of a frame from nothing but its markers (L, 3), metres, at least three of them seen.
-
-    As `starts.search`, on the fewer products of the markers; then outliers lose their weight.
-    """
+    """Unknowns (P,) of a frame from nothing but its markers (L, 3), metres, at least three of them seen."""
     x = _laid_on(body, typical_poses(body.body.pose_mean, body.body.pose_covariance, axes=6), targets)
     weights = np.full(body.count, config.marker_sd**-2)
     for stiff in ANNEALING:
@@ -52,10 +49,8 @@ def _laid_on(body: MarkedBody, poses: np.ndarray, targets: np.ndarray) -> np.nda
 def reinitialise_limbs(body: MarkedBody, x: np.ndarray, targets: np.ndarray, config: AnimateConfig) -> np.ndarray:
     """Unknowns (T, P) in which frames that had lost a limb have it again; markers are (T, L, 3), metres.
 
-    A body that follows a fast limb too late takes all its markers for outliers, and never sees them again. So frames
-    with three markers far away, twice an outlier's residual, are solved anew, from what they are and from the joints of
-    the nearest frames without, with outliers that keep their weight at first; they are taken where that explains the
-    markers better, by a fifth.
+    A body that follows a fast limb too late takes all its markers for outliers. Frames with three markers far away are
+    solved anew, from what they are and from the nearest frames without, and taken where that explains them better.
     """
     apart = _apart(body, x, targets)
     lost = (apart > 2.0 * config.outlier).sum(axis=1) >= 3

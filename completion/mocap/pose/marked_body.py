@@ -31,7 +31,7 @@ SAMPLES = 120                        # poses from which the turning of the norma
 
 
 class MarkedBody:
-    """A body of known shape with markers; unknowns are x = (pose (3J), trans (3)), steps are small rotations.
+    """A body of known shape with markers; unknowns are x = (pose (3J), trans (3)).
 
     A step (P,) rotates every joint from the right, `exp(pose) exp(d)`, so that nothing happens at a half turn.
     """
@@ -94,10 +94,9 @@ def batches(count: int) -> Iterator[slice]:
 
 
 def point_system(y: np.ndarray, columns: np.ndarray, targets: np.ndarray, weights: np.ndarray) -> Dense:
-    """The equations of points at y (B, 3, L), with derivatives (B, P, 3, L), that are to be at targets (B, L, 3).
+    """The equations of points at y (B, 3, L), derivatives (B, P, 3, L), that are to be at targets (B, L, 3) or NaN.
 
-    Targets are NaN where there is none; `weights` (B, L) are factors on the squared distance. Both of the first are
-    used up.
+    `weights` (B, L) are factors on the squared distance. The derivatives are used up.
     """
     (B, P), missing = columns.shape[:2], np.isnan(targets[..., 0])
     root = np.sqrt(np.where(missing, 0.0, weights))[:, None]
@@ -161,10 +160,7 @@ class PartShapes:
         return carried.sum(axis=0) + (self.origin + trans)[:, :, None]
 
     def columns(self, pose: np.ndarray, trans: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Places (B, 3, L), metres, at poses (B, J, 3), and their derivatives (B, 3J + 3, 3, L).
-
-        These are by small rotations of the joints from the right, and by trans.
-        """
+        """Places (B, 3, L), metres, at poses (B, J, 3); derivatives (B, 3J + 3, 3, L) by rotations from the right, trans."""
         t = twists(pose).swapaxes(0, 1)
         (J, B), L = t.shape[:2], self.count
         R = self.rotations(t)
@@ -182,10 +178,7 @@ class PartShapes:
         return below[0] + (self.origin + trans)[:, :, None], out
 
     def lift_off(self, part: np.ndarray, offsets: np.ndarray, bends: list[dict[int, np.ndarray]]) -> None:
-        """Add to every point a vector (L, 3), metres, that turns with a part (L,) and bends with its joints.
-
-        `bends` holds for each point (m, 3), metres, of some joints.
-        """
+        """Add to every point a vector (L, 3), metres, that turns with a part (L,), and (m, 3) by its joints."""
         for i, p in enumerate(part):
             self.constant[p, :, i] += offsets[i]
             for j, bend in bends[i].items():
@@ -195,11 +188,10 @@ class PartShapes:
 
 def marker_shapes(subject: Subject, vertex_ids: np.ndarray, weights: np.ndarray, distances: np.ndarray
                   ) -> PartShapes:
-    """Markers at distances (L,), metres, above the skin as local shapes, the normal fitted once to the exact one.
+    """Markers at distances (L,), metres, above the skin as local shapes; points (3L, k) are those of `supports`.
 
-    Three points of the skin (3L, k) for each marker are those of `supports`. The exact normal, of `energy.above_skin`,
-    is no linear function of the body's features. Over poses drawn from the prior, each marker's normal is regressed on
-    the rotation of the part that it follows best and the lifted twists of that part's joints.
+    The exact normal, of `energy.above_skin`, is no linear function of the body's features: over poses drawn from the
+    prior it is regressed on the rotation of the part that it follows best and the lifted twists of that part's joints.
     """
     shapes = PartShapes(subject.points(vertex_ids[::3], weights[::3]))
     if not distances.any():
@@ -254,10 +246,8 @@ def _padded(lists: list[list[int]]) -> tuple[np.ndarray, np.ndarray]:
 def supports(template: Mesh, layout: MarkerLayout) -> tuple[np.ndarray, np.ndarray]:
     """Three points of the skin for each marker, below it and two around it that span its tangent plane.
 
-    They are vertices (3L, k), padded by repeats, and weights (3L, k) of which each row sums to 1. A marker on a
-    triangle has the triangle's own plane. For one on a vertex the two are weighted sums of the ring of neighbours, with
-    cosines and sines of the angle about the normal as weights, so that their cross product is a smooth normal that
-    moves with the body.
+    Vertices (3L, k), padded by repeats, and weights (3L, k), rows of which sum to 1. A marker on a triangle has its
+    plane; for one on a vertex the two are sums of the ring, by cosine and sine of the angle about the normal.
     """
     base, weights = layout.skin
     if base.max(initial=0) >= len(template.vertices):

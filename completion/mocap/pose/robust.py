@@ -18,11 +18,10 @@ ENTER, LEAVE = 0.5, 1.0              # share of the distance that remains when l
 
 def marker_weights(positions: np.ndarray, targets: np.ndarray, sd: float, outlier: float
                    ) -> tuple[np.ndarray, np.ndarray]:
-    """Factors (..., L) on the squared distances of markers, low for outliers, 0 where nothing was seen; which count.
+    """Factors (..., L) on the squared distances of markers, 0 where nothing was seen, and which count: above a quarter.
 
     Places and targets are (..., L, 3), metres, NaN where a marker was not seen; `sd` and `outlier` as in
-    `AnimateConfig`. What is common to all markers does not make an outlier: the body may be a step behind. Those count
-    that have more than a quarter of the full weight.
+    `AnimateConfig`. What is common to all markers does not make an outlier: the body may be a step behind.
     """
     squared, scale = distances_apart(positions, targets, outlier)
     share = np.where(np.isnan(squared), 0.0, (scale**2 / (scale**2 + squared))**2)
@@ -55,10 +54,7 @@ def misfit(apart: np.ndarray, outlier: float) -> np.ndarray:
 
 def judge(positions: np.ndarray, targets: np.ndarray, order: np.ndarray, outlier: float
           ) -> tuple[np.ndarray, np.ndarray]:
-    """Residuals (..., L), metres, of the markers as they came, and which were believed under their own label.
-
-    `order` (..., L) is which column each marker was taken from.
-    """
+    """Residuals (..., L), metres, of the markers as they came, and which were believed under their own label."""
     residuals = np.linalg.norm(positions - targets, axis=-1)
     squared, scale = distances_apart(positions, targets, outlier)
     return residuals, (squared < scale**2) & (order == np.arange(order.shape[-1]))
@@ -111,10 +107,7 @@ class LabelWatch:
 
 
 def motion_problem(motion: Motion, body: Mesh, layout: MarkerLayout, markers: MarkerSequence) -> str | None:
-    """Why a motion from markers of a layout means nothing, with the likely cause; None where it means something.
-
-    `body` is the template of the person's model.
-    """
+    """Why a motion from markers of a layout means nothing, and the likely cause; `body` is the model's template."""
     seen = np.isfinite(motion.residuals)
     if not seen.any():
         return "no marker of the layout was ever seen: markers of another layout?"

@@ -64,9 +64,8 @@ class Tracks:
     def links(self, times: np.ndarray, before: np.ndarray, after: np.ndarray) -> np.ndarray:
         """What it counts that labels `after` go on, in frames `times`, where labels `before` were until then.
 
-        Half squared standard deviations, no more than `TORN`; as much for one that appears, nothing where no label
-        `after` is seen. Over a gap a track may have taken another way, the farther the longer it was. The three are
-        arrays of one shape, after broadcasting.
+        Half squared standard deviations, at most `TORN`, as for a label that appears; nothing where no label `after` is
+        seen. Over a gap a track may have taken another way. The three are arrays of one shape, after broadcasting.
         """
         acceleration, longest = 10.0, 0.25          # m/s² out of sight; seconds of a gap beyond which nothing is told
         last = self._last[times - 1, before]
@@ -107,10 +106,9 @@ def relabelled(positions: np.ndarray, order: np.ndarray) -> np.ndarray:
 
 
 def marker_levels(places: np.ndarray, positions: np.ndarray, deviation: float | np.ndarray = DEVIATION) -> np.ndarray:
-    """What it counts (..., L, L) that the label of a column is the marker of a row, by where the body has the markers.
+    """What it counts (..., L, L) that the label of a column is the marker of a row: half squared deviations, at most `AWAY`.
 
-    Half squared deviations, no more than `AWAY`; zero where nothing is known. Places (..., L, 3) are NaN for markers
-    that the body does not know, which are taken to be nowhere near; the deviation, metres, is one for each frame.
+    Places (..., L, 3) on the body are NaN where unknown, then nowhere near; the deviation, metres, is one for each frame.
     """
     squared = sum((places[..., :, None, d] - positions[..., None, :, d])**2 for d in range(3))
     cost = np.minimum(np.nan_to_num(squared / (2 * np.asarray(deviation)[..., None, None]**2), nan=AWAY), AWAY)
@@ -120,8 +118,8 @@ def marker_levels(places: np.ndarray, positions: np.ndarray, deviation: float | 
 def find_order(positions: np.ndarray, rate: float, levels: np.ndarray | None = None) -> np.ndarray:
     """Which column (T, L) each marker is to be taken from, by its track and by `marker_levels`, if there are any.
 
-    What a marker is off changes slowly: the frames of `MEMORY` count as one. The best pair and span is swapped, then
-    the best of what is left, until nothing gains: of a longer cycle each swap puts one marker right.
+    The frames of `MEMORY` count as one. The best pair and span is swapped, then the best of what is left, until nothing
+    gains: of a longer cycle each swap puts one marker right.
     """
     T, L = positions.shape[:2]
     order, tracks = np.tile(np.arange(L), (T, 1)), Tracks(positions, rate)
@@ -158,10 +156,7 @@ def _best_spans(tracks: Tracks, levels: np.ndarray, touched: set[int]
 
 
 def best_stretches(tracks: Tracks, a: int, b: int, begins: np.ndarray, gains: np.ndarray) -> tuple[float, np.ndarray]:
-    """What it gains to swap a pair, and in which frames (n,).
-
-    Stretches that begin at frames (m,) are swapped or not; the places of the markers tell what each gains (m,).
-    """
+    """What it gains to swap a pair in some of the stretches that begin at frames (m,), and in which frames (n,)."""
     lengths = np.diff(np.r_[begins, len(tracks.positions)])
     minority = 2.0                                  # changes that swapping the labels of the whole sequence counts
     gains = gains - minority * CHANGE * lengths / lengths.sum()
@@ -201,8 +196,7 @@ def _pairs_that_fit(own: np.ndarray, levels: np.ndarray, touched: set[int]) -> s
 def _two_states(gains: np.ndarray, stay: np.ndarray, switch: np.ndarray) -> tuple[float, np.ndarray]:
     """The best way through stretches (n + 1) of a pair as labelled or swapped: what it gains, and where (n + 1).
 
-    `gains` (n + 1,) are of being swapped in a stretch; `stay` and `switch` (n,) what it costs to remain as it is or to
-    change between two stretches, to which `CHANGE` comes.
+    `gains` (n + 1,) are of being swapped in a stretch; `stay`, `switch` (n,) what remaining and changing cost.
     """
     value, came = np.array([0.0, gains[0]]), np.zeros((len(stay), 2), dtype=int)
     for i, (remain, change) in enumerate(zip(stay, switch, strict=True)):

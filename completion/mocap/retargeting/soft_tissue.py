@@ -124,10 +124,7 @@ def _products(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.n
 
 
 def moving_character(character: BodyModel, soft: SoftTissue, frames: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The meshes (n, N, 3), metres, of some frames without and with soft tissue.
-
-    `frames` (n,).
-    """
+    """The meshes (n, N, 3), metres, of some frames (n,) without and with soft tissue."""
     poses, trans = soft.motion.poses[frames], soft.motion.trans[frames]
     fixed = soft.motion.vertices(character.subject(soft.motion.betas), frames)
     return fixed, character.vertices(poses, soft.betas()[frames], trans)
@@ -138,12 +135,7 @@ FULL = 0.2                           # deformation at the end of the heat map
 
 def picture_transfer(model: BodyModel, soft: SoftTissue, character: BodyModel, moved: SoftTissue, count: int = 8,
                      height: int = 320) -> np.ndarray:
-    """Some frames in three rows: the person, the character, and the character by how far its skin is deformed.
-
-    `moved` is what `retarget_soft_tissue` made of the person's for the character.
-
-    [MoSh]
-    """
+    """Frames in three rows: the person, the character that moves as `moved`, and how far its skin is deformed. [MoSh]"""
     frames = spread_frames(len(soft.motion.poses), count)
     person = moving_character(model, soft, frames)[1]
     fixed, changed = moving_character(character, moved, frames)
@@ -160,10 +152,7 @@ def picture_transfer(model: BodyModel, soft: SoftTissue, character: BodyModel, m
 
 
 def write_character(path: Path, character: BodyModel, soft: SoftTissue, keys: int = 60) -> np.ndarray:
-    """Write an animated GLB of soft tissue on its character, coloured by the most that the skin is deformed.
-
-    Returns that (N,).
-    """
+    """Write an animated GLB of soft tissue on its character, coloured by the most that the skin is deformed (N,): returned."""
     frames = spread_frames(len(soft.motion.poses), keys)
     fixed, changed = moving_character(character, soft, frames)
     most = np.asarray(deformation(character.template.faces, fixed, changed).max(axis=0))
@@ -178,8 +167,8 @@ REACH = (1, 2, 2, 3, 3, 4)           # rings around inverted triangles that are 
 class Creases:
     """Where triangles of a posed body are inverted, and the body without.
 
-    A triangle is inverted when it faces away from where the rotations of the parts around it take it, those of
-    neighbouring parts mixed over `blend` rings: at a raised shoulder the skin rightly faces away from its own part.
+    Inverted is one that faces away from where its parts' rotations, mixed over `blend` rings, take it: at a raised
+    shoulder the skin rightly faces away from its own part.
     """
 
     def __init__(self, rest: Mesh, skeleton: Skeleton, blend: int = 6) -> None:
@@ -202,11 +191,9 @@ class Creases:
         return np.asarray((now * (R @ self.rest.face_normals[..., None])[..., 0]).sum(axis=-1) < 0)
 
     def smoothed(self, bodies: np.ndarray, poses: np.ndarray) -> np.ndarray:
-        """Bodies (n, N, 3) in poses (n, J, 3) whose inverted triangles are laid as smoothly as what is around allows.
+        """Bodies (n, N, 3) in poses (n, J, 3) whose folded hollows are laid as smoothly as what is around allows.
 
-        Where thick limbs bend sharply, as those of a character do, the skin of the hollow has no room and folds over.
-        Small patches are laid there instead, wider ones while triangles are inverted; nothing else moves, and patches
-        that leave more triangles inverted than there were are not taken.
+        Patches around inverted triangles grow while some are left; one that leaves more of them is not taken.
         """
         out = np.array(bodies)
         for t in range(len(out)):

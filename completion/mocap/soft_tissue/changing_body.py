@@ -38,23 +38,17 @@ def skin_movement(model: BodyModel, changes: np.ndarray) -> np.ndarray:
 
 
 def skin_metric(model: BodyModel, slopes: np.ndarray) -> np.ndarray:
-    """(K, K): `Δ @ metric @ Δ` is how far a change Δ of betas moves the skin, squared, square metres.
-
-    The mean over the surface, areas as on the template; `slopes` (N, 3, K) are the vertices' derivatives by betas.
-    """
+    """(K, K): `Δ @ metric @ Δ` is how far a change Δ of betas moves the skin, squared, square metres, the mean by area."""
     areas = model.template.vertex_areas
     D = (np.sqrt(areas / areas.sum())[:, None, None] * slopes).reshape(-1, slopes.shape[-1])
     return np.asarray(D.T @ D)
 
 
 class ChangingBody:
-    """A person with markers whose betas change by Δ = z @ directions around their own.
+    """A person with markers whose betas change by Δ = z @ directions (K, K) around their own.
 
-    Markers are affine in z, `y(θ) + D(θ) z`, and D (3L, K) is a linear function of products of features and rotations:
-    for a batch of poses it is one matrix product. The derivative by the pose is that of the person's own shape.
-
-    The directions (K, K) are rows of betas; `slopes` (N, 3, K) are derivatives of all vertices by betas in the mean
-    pose, from which the turning of the skin is known.
+    Markers are affine in z, `y(θ) + D(θ) z`, D (3L, K) linear in products of features and rotations: one matrix product
+    for a batch of poses. `slopes` (N, 3, K) of all vertices by betas in the mean pose tell how the skin turns.
     """
 
     def __init__(self, model: BodyModel, betas: np.ndarray, layout: MarkerLayout, directions: np.ndarray,

@@ -17,10 +17,10 @@ from ...motion import Motion
 from ...smoothing import coupled_steps
 from ..files.markers import MarkerSequence
 from ..marker_sets.layout import MarkerLayout
+from ..pose.follow import FURTHEST
 from ..pose.marked_body import batches
 from ..pose.robust import marker_weights
 from ..pose.settings import RATE, AnimateConfig
-from ..pose.smooth import FURTHEST
 from .changing_body import ChangingBody, changing_bodies, skin_metric, skin_movement
 
 Progress = Callable[[int, int], None]
@@ -161,8 +161,7 @@ def follow_soft_tissue(model: BodyModel, motion: Motion, markers: MarkerSequence
 class SoftFollower:
     """The markers of a sequence, and the changing body that is to carry them; arguments as of `follow_soft_tissue`.
 
-    Unknowns are x (T, P) as in `MarkedBody` and changes z (T, K) along directions of which each costs the same: their
-    energy is |z|².
+    Unknowns are x (T, P) as in `MarkedBody` and changes z (T, K), whose energy is |z|².
     """
 
     def __init__(self, model: BodyModel, motion: Motion, markers: MarkerSequence, layout: MarkerLayout,
@@ -231,23 +230,16 @@ class SoftFollower:
 
 
 def cheap_directions(model: BodyModel, slopes: np.ndarray, config: SoftTissueConfig) -> np.ndarray:
-    """(K, K) directions of betas, by rows, that each cost one: `Δ = z @ directions` has the energy |z|².
-
-    `slopes` (N, 3, K) are the derivatives of the vertices by betas in the mean pose, metres.
-
-    [MoSh] Eq. 24
-    """
+    """(K, K) directions of betas, by rows, of which each costs one, from the vertices' slopes (N, 3, K). [MoSh] Eq. 24"""
     cost = config.change * np.eye(slopes.shape[-1]) + config.skin * PER_SQUARE_METRE * skin_metric(model, slopes)
     return np.asarray(np.linalg.inv(np.linalg.cholesky(cost)))
 
 
 def smooth_changes(body: ChangingBody, x: np.ndarray, targets: np.ndarray, weights: np.ndarray, smoothness: float
                    ) -> np.ndarray:
-    """The changes z (T, K) of at least 3 frames that follow each other, poses x held, constant velocity of z as prior.
+    """The changes z (T, K) of at least 3 frames, poses x held, with `smoothness` on their second difference over time.
 
-    Minimised is what the markers say, |z|² and `smoothness` times the squared second difference of z over time. Where
-    markers say little it is a low-pass filter; the poses were found with changes free of each other, and filtering
-    these hardly moves a marker.
+    Poses were found with changes free of each other; filtering these hardly moves a marker.
     """
     z, eye = np.empty((len(x), body.n_betas)), np.eye(body.n_betas)
     for near, kept, where in overlapping_windows(len(x), WINDOW, OVERLAP):

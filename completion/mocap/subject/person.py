@@ -141,10 +141,7 @@ def one_or_more(sequences: MarkerSequence | Sequence[MarkerSequence]) -> list[Ma
 
 def common_markers(sequences: Sequence[MarkerSequence], layout: MarkerLayout
                    ) -> tuple[MarkerLayout, list[np.ndarray]]:
-    """The part of a layout that is in any of the sequences, and its markers (T, L, 3) in each, metres.
-
-    Sequences may name a marker differently, each by another alias; where one lacks a marker it is NaN.
-    """
+    """The part of a layout that is in any of the sequences, and its markers (T, L, 3) in each, metres, NaN where it lacks one."""
     columns = []
     for sequence in sequences:
         labels = layout.matched(sequence.labels)
@@ -181,10 +178,7 @@ def choose_frames(positions: Sequence[np.ndarray], config: PersonConfig) -> np.n
 
 
 def spread_frames(positions: np.ndarray, count: int) -> np.ndarray:
-    """Frames (B,) in which markers (T, L, 3) stand to each other in many ways, by the distances between them.
-
-    The first is the most usual one; each further one is farthest from those before.
-    """
+    """Frames (B,) in which markers (T, L, 3) stand to each other in many ways, by the distances between them."""
     some = np.unique(np.linspace(0, len(positions) - 1, 400).round().astype(int))
     first, second = np.triu_indices(positions.shape[1], 1)
     apart = np.linalg.norm(positions[some][:, first] - positions[some][:, second], axis=2)
