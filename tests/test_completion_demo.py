@@ -19,7 +19,7 @@ from completion.demo.cli import demo
 from model import load_model
 from scanprep import RegisteredSet, console
 from scanprep.batch.opening import workspace
-from scanprep.console import run
+from scanprep.command_line import run
 from scanprep.geometry.mesh import template_problem
 
 pytestmark = pytest.mark.timeout(600)

@@ -6,7 +6,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from contextlib import AbstractContextManager
-from dataclasses import asdict, dataclass, field, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 from pathlib import Path
 
@@ -15,9 +15,8 @@ from scipy.spatial import cKDTree
 
 from model import BodyModel, LearnConfig, Subject, fit_pose, learn_scape, load_model
 from scanprep.batch.opening import workspace
-from scanprep.batch.room import Room
-from scanprep.batch.steps import KeptSteps, inside
-from scanprep.batch.workspace import Task, Workspace
+from scanprep.batch.room import Room, inside
+from scanprep.batch.workspace import KeptSteps, Task, Workspace
 from scanprep.dataset import RegisteredSet
 from scanprep.geometry import storage, tables
 from scanprep.geometry.files import read_mesh, write_mesh
@@ -25,9 +24,9 @@ from scanprep.geometry.landmarks import match_landmarks, read_landmark_vertices,
 from scanprep.geometry.mesh import Mesh
 from scanprep.pipeline.prepare import SCANS, PrepareConfig, Prepared, prepare
 from scanprep.pipeline.scans import TABLE, find_scans
-from scanprep.pipeline.template import TemplateConfig, make_template
 from scanprep.ranges import Cell, Count, Faces, Positive, Seed, Settings
 from scanprep.skeleton.find import SkeletonConfig
+from scanprep.surfaces.template import TemplateConfig, make_template
 from scanprep.synthetic.data_set import (
     SUBJECT,
     GroundTruth,
@@ -96,7 +95,7 @@ QUICK = DemoConfig(poses=8, subjects=3, faces=7000, resolution=0.011, template_r
 
 def write_settings(config: DemoConfig, rows: list[tuple[str, str, str, str]], folder: Path) -> None:
     """What the folder holds, and who is in the scans."""
-    storage.write_json(folder / "demo.json", storage.as_json(asdict(config)))
+    storage.write_json(folder / "demo.json", storage.as_json(config))
     (folder / "scans").mkdir()
     tables.write_table(folder / "scans" / TABLE, ("name", "subject", "pose", "sex"), rows)
 

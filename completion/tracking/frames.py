@@ -33,9 +33,9 @@ def prepare_frame(frame: Frame, count: int, neighbours: int, viewpoints: Any = N
                   ) -> ScanPoints | None:
     """Points with normals of a frame, or None when it shows nothing.
 
-    Normals are those of planes through many neighbours, so that some millimetres of noise do not turn them. Their sign is
-    that of given normals or triangles, else towards the viewpoint, one or one for each camera, else that of the expected
-    body, else outward by the form of the cloud.
+    Normals are those of planes through many neighbours, so that some millimetres of noise do not turn them. Their sign
+    is that of given normals or triangles, else towards the viewpoint, one or one for each camera, else that of the
+    expected body, else outward by the form of the cloud.
     """
     views = [] if frame is None else [frame] if isinstance(frame, Mesh | PointCloud | np.ndarray) else list(frame)
     given = None if viewpoints is None else np.broadcast_to(np.asarray(viewpoints, float), (len(views), 3))

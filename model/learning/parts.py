@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial import cKDTree
 
-from scanprep.batch.steps import Step, once
+from scanprep.batch.room import Step, once
 from scanprep.decimation.decimate import decimate
 from scanprep.geometry.mesh import Mesh
 from scanprep.skeleton.find import find_skeleton
@@ -49,7 +49,7 @@ def choose_skeleton(template: Mesh, poses: np.ndarray, progress: Progress | None
     progress : callable, optional
         Called with the skeletons done and their largest number.
     step : callable, optional
-        Keeps every skeleton and its error, as `scanprep.batch.steps.Step`.
+        Keeps every skeleton and its error, as `scanprep.batch.room.Step`.
 
     Raises
     ------

@@ -5,7 +5,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
-from scanprep.batch.steps import Step, once
+from scanprep.batch.room import Step, once
 from scanprep.geometry.mesh import Mesh
 from scanprep.skeleton.tree import Skeleton
 from scanprep.threads import one_thread

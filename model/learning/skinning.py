@@ -6,7 +6,7 @@ from functools import partial
 
 import numpy as np
 
-from scanprep.batch.steps import Step, once
+from scanprep.batch.room import Step, once
 from scanprep.geometry.mesh import Mesh
 from scanprep.ranges import Count, Positive, Settings
 from scanprep.skeleton.tree import Skeleton

@@ -8,7 +8,7 @@ from collections.abc import Callable, Iterator
 from copy import copy
 from typing import Any, TypeVar
 
-from scanprep.batch.steps import Step, inside, once
+from scanprep.batch.room import Step, inside, once
 
 Progress = Callable[[int, int], None]
 T = TypeVar("T")

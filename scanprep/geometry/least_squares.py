@@ -6,7 +6,7 @@ The caller gives the normal equations at a state; their structure solves for the
 - `Arrow`: many frames with unknowns of their own, coupled by those they share alone;
 - `Sparse`: one large problem with a sparse matrix.
 
-A step is added to the state, unless a `retract` says otherwise: `retract_pose` turns each rotation by its step.
+A step is added to the state, unless a `retract` says otherwise, as for rotations.
 """
 from __future__ import annotations
 
@@ -192,24 +192,11 @@ def levenberg_marquardt(equations: Callable[[State], NormalEquations], start: St
                         retract: Callable[[Any, np.ndarray], Any] = np.add, angles: int = 0) -> Minimum[State]:
     """The state of least energy near a start; a step is taken only where it lowers the energy.
 
-    Parameters
-    ----------
-    equations : state -> NormalEquations
-    start : state
-        (B, P) float for `Dense` and `Arrow`; whatever `retract` takes for `Sparse`.
-    iterations : int
-        Most steps tried.
-    tolerance : float
-        Stop when a step lowers the energy by less than this fraction.
-    damping : float
-        First factor on the diagonal of the matrix.
-    exact : float
-        Also stop when it lowers the energy by less than this.
-    retract : state, step -> state
-        What a step does to the state.
-    angles : int
-        So many first unknowns of a row are rotation vectors. Derivatives are by them, steps are small rotations; so
-        are the equations that are returned.
+    A state is (B, P) float for `Dense` and `Arrow`, for `Sparse` whatever `retract`, which does a step to it, takes.
+    The search stops after so many `iterations`, steps tried, or when a step lowers the energy by less than the fraction
+    `tolerance`, or by less than `exact`. `damping` is the first factor on the diagonal of the matrix. With `angles` so
+    many first unknowns of a row are rotation vectors: derivatives are by them, steps are small rotations, and so are
+    the equations that are returned.
     """
     if angles:
         retract, by_vectors = retract_pose(angles), equations

@@ -6,8 +6,8 @@ from dataclasses import dataclass, field, replace
 
 import numpy as np
 
+from ..geometry.farthest_points import thin
 from ..geometry.target import Target, orient
-from ..geometry.thinning import thin
 from .deformation_graph import DeformationGraph, NodeMotion, build_graph, deform, start_motion, transferred
 from .energies import Pull, Stiffness, follow_pull, pull, terms
 from .inputs import Inputs

@@ -8,10 +8,9 @@ from scipy.spatial import cKDTree
 
 from ..alignment.icp import align_landmarks, align_rigid, landmark_motion
 from ..correspondence.correspondences import Correspondences, checked_pairs
-from ..geometry.farthest_points import farthest_points
+from ..geometry.farthest_points import farthest_points, thin
 from ..geometry.mesh import Mesh, check_template
 from ..geometry.target import Target, target_of
-from ..geometry.thinning import thin
 from .energies import Pull, pull
 from .matches import Described, Likeness
 from .path_descriptors import describe_both

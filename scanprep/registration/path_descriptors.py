@@ -6,9 +6,9 @@ from scipy.sparse import coo_array, csr_array
 from scipy.sparse.csgraph import connected_components, dijkstra
 from scipy.spatial import cKDTree
 
+from ..geometry.farthest_points import thin
 from ..geometry.mesh import Mesh
 from ..geometry.target import Target
-from ..geometry.thinning import thin
 
 
 def describe_both(template: Mesh, target: Target, anchors: tuple[np.ndarray, np.ndarray], cell: float, size: float

@@ -12,7 +12,7 @@ import numpy as np
 from model.body import BodyModel
 from model.learning.sex_plane import SexGuess, guess_sex, sex_plane
 from model.linear import Subject
-from scanprep.batch.steps import Step, inside, once
+from scanprep.batch.room import Step, inside, once
 from scanprep.ranges import Settings
 from scanprep.threads import one_thread
 

@@ -160,7 +160,7 @@ class PartShapes:
         return carried.sum(axis=0) + (self.origin + trans)[:, :, None]
 
     def columns(self, pose: np.ndarray, trans: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Places (B, 3, L), metres, at poses (B, J, 3); derivatives (B, 3J + 3, 3, L) by rotations from the right, trans."""
+        """Places (B, 3, L), metres, at poses (B, J, 3), and their derivatives (B, 3J + 3, 3, L) as of `MarkedBody`."""
         t = twists(pose).swapaxes(0, 1)
         (J, B), L = t.shape[:2], self.count
         R = self.rotations(t)

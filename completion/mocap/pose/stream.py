@@ -260,7 +260,8 @@ class Tracker:
     def _to_pass_over(self, targets: np.ndarray, before: np.ndarray) -> bool:
         """Whether the markers (L, 3) are to be passed over, the body at `places` having been expected at `before`.
 
-        No body explains them, or it leapt there: that is believed when the next frame says the same, or it goes on for long.
+        No body explains them, or it leapt there: that is believed when the next frame says the same, or it goes on for
+        long.
         """
         # the markers of a body stray at most 10 m/s together from where they are expected
         near = LOST + 10.0 * self.since / self.rate

@@ -106,7 +106,7 @@ def relabelled(positions: np.ndarray, order: np.ndarray) -> np.ndarray:
 
 
 def marker_levels(places: np.ndarray, positions: np.ndarray, deviation: float | np.ndarray = DEVIATION) -> np.ndarray:
-    """What it counts (..., L, L) that the label of a column is the marker of a row: half squared deviations, at most `AWAY`.
+    """What it counts (..., L, L) that a column's label is the marker of a row: half squared deviations, at most `AWAY`.
 
     Places (..., L, 3) on the body are NaN where unknown, then nowhere near; the deviation, metres, is one for each frame.
     """

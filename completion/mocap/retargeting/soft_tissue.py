@@ -135,7 +135,7 @@ FULL = 0.2                           # deformation at the end of the heat map
 
 def picture_transfer(model: BodyModel, soft: SoftTissue, character: BodyModel, moved: SoftTissue, count: int = 8,
                      height: int = 320) -> np.ndarray:
-    """Frames in three rows: the person, the character that moves as `moved`, and how far its skin is deformed. [MoSh]"""
+    """Frames in three rows: the person, the character moving as `moved`, how far its skin is deformed. [MoSh]"""
     frames = spread_frames(len(soft.motion.poses), count)
     person = moving_character(model, soft, frames)[1]
     fixed, changed = moving_character(character, moved, frames)
@@ -152,7 +152,7 @@ def picture_transfer(model: BodyModel, soft: SoftTissue, character: BodyModel, m
 
 
 def write_character(path: Path, character: BodyModel, soft: SoftTissue, keys: int = 60) -> np.ndarray:
-    """Write an animated GLB of soft tissue on its character, coloured by the most that the skin is deformed (N,): returned."""
+    """Write an animated GLB of soft tissue on its character, coloured by the most that its skin is deformed (N,)."""
     frames = spread_frames(len(soft.motion.poses), keys)
     fixed, changed = moving_character(character, soft, frames)
     most = np.asarray(deformation(character.template.faces, fixed, changed).max(axis=0))

@@ -38,7 +38,7 @@ def skin_movement(model: BodyModel, changes: np.ndarray) -> np.ndarray:
 
 
 def skin_metric(model: BodyModel, slopes: np.ndarray) -> np.ndarray:
-    """(K, K): `Δ @ metric @ Δ` is how far a change Δ of betas moves the skin, squared, square metres, the mean by area."""
+    """(K, K): `Δ @ metric @ Δ` is how far a change Δ of betas moves the skin, square metres, the mean by area."""
     areas = model.template.vertex_areas
     D = (np.sqrt(areas / areas.sum())[:, None, None] * slopes).reshape(-1, slopes.shape[-1])
     return np.asarray(D.T @ D)

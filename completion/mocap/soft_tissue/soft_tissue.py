@@ -230,7 +230,7 @@ class SoftFollower:
 
 
 def cheap_directions(model: BodyModel, slopes: np.ndarray, config: SoftTissueConfig) -> np.ndarray:
-    """(K, K) directions of betas, by rows, of which each costs one, from the vertices' slopes (N, 3, K). [MoSh] Eq. 24"""
+    """(K, K) directions of betas, by rows, each of cost one, from the vertices' slopes (N, 3, K). [MoSh] Eq. 24"""
     cost = config.change * np.eye(slopes.shape[-1]) + config.skin * PER_SQUARE_METRE * skin_metric(model, slopes)
     return np.asarray(np.linalg.inv(np.linalg.cholesky(cost)))
 

@@ -21,7 +21,7 @@ Attachment = Literal["triangle", "neighbourhood"]
 
 @dataclass(frozen=True, eq=False)
 class LatentMarkers:
-    """Markers that hang on a surface by three supports, combinations of vertices (3 L, k), each near a triangle (L, 3)."""
+    """Markers on a surface: three supports each, combinations of vertices (3 L, k), and the nearest triangle (L, 3)."""
 
     kind: Attachment
     ids: np.ndarray
@@ -46,7 +46,8 @@ class LatentMarkers:
 def latent_markers(mesh: Mesh, points: np.ndarray, kind: Attachment = "triangle") -> LatentMarkers:
     """Hang points (L, 3) on the surface to which they are nearest; the mesh is the body in the latent pose.
 
-    In the frame of the nearest triangle: normal, edge and their product; or as a sum of the edges of the nearest vertex.
+    In the frame of the nearest triangle: normal, edge and their product; or as a sum of the edges of the nearest
+    vertex.
 
     [MoSh] Eq. 1, Eq. 15
     """

@@ -53,7 +53,7 @@ def _from_found(body: MarkedBody, found: Sequence[np.ndarray], targets: np.ndarr
 
 
 def find_loose(model: BodyModel, vertices: np.ndarray, layout: MarkerLayout, targets: np.ndarray) -> dict[str, int]:
-    """The vertex of its part on which each loose marker is nearest to its targets (B, L, 3), on bodies (B, N, 3), metres."""
+    """The vertex of its part on which each loose marker is nearest to its targets (B, L, 3), on bodies (B, N, 3)."""
     template, distances, usual = model.template, np.asarray(layout.distances), layout.nearest
     meshes, found = [template.with_vertices(v) for v in vertices], {}
     tree, part = cKDTree(template.vertices), model.skeleton.part_of_vertex(template)

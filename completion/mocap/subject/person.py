@@ -8,7 +8,7 @@ from functools import partial
 import numpy as np
 
 from model.body import BodyModel
-from scanprep.batch.steps import Step, once
+from scanprep.batch.room import Step, once
 from scanprep.geometry import rotations
 from scanprep.threads import one_thread
 
@@ -141,7 +141,7 @@ def one_or_more(sequences: MarkerSequence | Sequence[MarkerSequence]) -> list[Ma
 
 def common_markers(sequences: Sequence[MarkerSequence], layout: MarkerLayout
                    ) -> tuple[MarkerLayout, list[np.ndarray]]:
-    """The part of a layout that is in any of the sequences, and its markers (T, L, 3) in each, metres, NaN where it lacks one."""
+    """The part of a layout that is in any of the sequences, and its markers (T, L, 3) in each, NaN where it lacks one."""
     columns = []
     for sequence in sequences:
         labels = layout.matched(sequence.labels)
