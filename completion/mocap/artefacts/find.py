@@ -11,19 +11,9 @@ from model.linear import Subject
 from ...motion import Motion
 from ..files.markers import MarkerSequence
 from ..marker_sets.layout import MarkerLayout
+from ..pose import swaps
 from ..pose.robust import marker_weights
 from ..pose.settings import AnimateConfig
-from ..pose.swaps import (
-    AWAY,
-    MEMORY,
-    WORTH,
-    Tracks,
-    best_stretches,
-    find_order,
-    marker_levels,
-    pairs_that_jump,
-    relabelled,
-)
 from .results import ArtefactConfig, BadSpan, MarkerArtefacts, list_swaps
 from .simulated import Simulation, bridged, usual_places
 from .slips import find_bad, without_lost_limbs
@@ -39,26 +29,13 @@ CLOSE = 0.25                         # metres between markers whose swap a body 
 
 @dataclass(frozen=True, eq=False)
 class _State:
-    """Where the search stands.
+    """Where the search stands."""
 
-    Attributes
-    ----------
-    order : (T, L) int
-        From which label each marker is taken.
-    unsure : (L,) bool
-        Labels that tracks alone have swapped for so long that it may be the other way round.
-    bad : tuple of BadSpan
-    x : (T, P) float, optional
-        The body as it follows the markers so repaired.
-    both_ways_tried : bool
-        Swaps that the body may have followed were looked for.
-    """
-
-    order: np.ndarray
-    unsure: np.ndarray
+    order: np.ndarray                    # (T, L) int, from which label each marker is taken
+    unsure: np.ndarray                   # (L,) bool, swapped by tracks for so long that it may be the other way round
     bad: tuple[BadSpan, ...] = ()
-    x: np.ndarray | None = None
-    both_ways_tried: bool = False
+    x: np.ndarray | None = None          # (T, P) the body as it follows the markers so repaired
+    both_ways_tried: bool = False        # swaps that the body may have followed were looked for
 
     def out(self, labels: tuple[str, ...]) -> np.ndarray:
         """Bad markers (T, L) bool."""
@@ -69,7 +46,7 @@ class _State:
 
     def repaired(self, markers: MarkerSequence) -> np.ndarray:
         """The markers (T, L, 3), metres, under their right labels, without bad spans."""
-        return np.where(self.out(markers.labels)[..., None], np.nan, relabelled(markers.positions, self.order))
+        return np.where(self.out(markers.labels)[..., None], np.nan, swaps.relabelled(markers.positions, self.order))
 
 
 def find_artefacts(subject: Subject, markers: MarkerSequence, layout: MarkerLayout,
@@ -119,13 +96,13 @@ def find_artefacts(subject: Subject, markers: MarkerSequence, layout: MarkerLayo
 
 def relabelled_by_tracks(markers: MarkerSequence) -> MarkerSequence:
     """The sequence with labels put right as far as the tracks of the markers alone tell, without a body."""
-    order = find_order(markers.positions, markers.rate)
-    return MarkerSequence(relabelled(markers.positions, order), markers.labels, markers.rate)
+    order = swaps.find_order(markers.positions, markers.rate)
+    return MarkerSequence(swaps.relabelled(markers.positions, order), markers.labels, markers.rate)
 
 
 def _by_tracks(markers: MarkerSequence) -> _State:
     """What tracks alone tell; labels swapped in more than a quarter of the frames are the more likely of two ways."""
-    order = find_order(markers.positions, markers.rate)
+    order = swaps.find_order(markers.positions, markers.rate)
     return _State(order, (order != np.arange(order.shape[1])).mean(axis=0) > 0.25)
 
 
@@ -144,14 +121,14 @@ def _judged(body: Simulation, markers: MarkerSequence, state: _State, config: Ar
     assert state.x is not None, "the body has followed"
     places, simulated = np.full(markers.positions.shape, np.nan), body.body.positions(state.x)
     places[:, body.rows] = _expected(body, state, state.repaired(markers)[:, body.rows], simulated)
-    order = find_order(markers.positions, markers.rate, marker_levels(places, markers.positions))
+    order = swaps.find_order(markers.positions, markers.rate, swaps.marker_levels(places, markers.positions))
     sure, tried = not state.unsure.any(), state.both_ways_tried
     if sure and not tried and (order == state.order).all():
         order, tried = _both_ways(body, markers, state.x, order, places), True
     after = replace(state, order=order, unsure=np.zeros_like(state.unsure), both_ways_tried=tried)
     if not sure or (order != state.order).any():                        # where labels are wrong, so is the body
         return replace(after, bad=(), x=state.x if (order == state.order).all() else None)
-    tracks = Tracks(relabelled(markers.positions, order)[:, body.rows], markers.rate)
+    tracks = swaps.Tracks(swaps.relabelled(markers.positions, order)[:, body.rows], markers.rate)
     off = tracks.positions - simulated
     mine, alone = (body.local(v, state.x) for v in (off, body.alone(off, state.x)))
     found = find_bad(mine, alone, np.where(tracks.jumped, tracks.off, 0), body.labels, config, markers.rate)
@@ -179,9 +156,9 @@ def _expected(body: Simulation, state: _State, repaired: np.ndarray, simulated: 
 def _both_ways(body: Simulation, markers: MarkerSequence, x: np.ndarray, order: np.ndarray, places: np.ndarray
                ) -> np.ndarray:
     """The order (T, L) with close markers swapped where the body at x (T, P) has followed the wrong ones."""
-    raw, tracks = (Tracks(p, markers.rate) for p in (markers.positions, relabelled(markers.positions, order)))
+    raw, tracks = (swaps.Tracks(p, markers.rate) for p in (markers.positions, swaps.relabelled(markers.positions, order)))
     swapped = {(min(a, b), max(a, b)) for row in np.unique(order, axis=0) for a, b in enumerate(row.tolist()) if a != b}
-    pairs, order = pairs_that_jump(raw, set(range(len(markers.labels)))) | swapped, order.copy()
+    pairs, order = swaps.pairs_that_jump(raw, set(range(len(markers.labels)))) | swapped, order.copy()
     for a, b in sorted(pairs):
         if not np.median(np.linalg.norm(places[:, a] - places[:, b], axis=1)) < CLOSE:      # nor where one is unknown
             continue
@@ -189,11 +166,11 @@ def _both_ways(body: Simulation, markers: MarkerSequence, x: np.ndarray, order: 
         if len(frames):
             columns = np.array((a, b))
             order[np.ix_(frames, columns)] = order[np.ix_(frames, columns[::-1])]
-            tracks.change(columns, relabelled(markers.positions, order[:, columns]))
+            tracks.change(columns, swaps.relabelled(markers.positions, order[:, columns]))
     return order
 
 
-def ambiguous_swap(body: Simulation, x: np.ndarray, tracks: Tracks, a: int, b: int) -> np.ndarray:
+def ambiguous_swap(body: Simulation, x: np.ndarray, tracks: swaps.Tracks, a: int, b: int) -> np.ndarray:
     """Frames (n,) in which the labels a, b of close markers are better swapped, though the body followed them as is.
 
     Both ways are tried in three frames of each stretch of `tracks`, from a body at x (T, P) that follows neither.
@@ -212,11 +189,11 @@ def ambiguous_swap(body: Simulation, x: np.ndarray, tracks: Tracks, a: int, b: i
     if not frames:
         return np.zeros(0, dtype=int)
     at, of = np.concatenate(frames), np.concatenate(stretch)
-    value = np.clip(_gains(body, x[at], tracks.positions[at], a, b), -2 * AWAY, 2 * AWAY)
+    value = np.clip(_gains(body, x[at], tracks.positions[at], a, b), -2 * swaps.AWAY, 2 * swaps.AWAY)
     mean = np.bincount(of, value, len(begins)) / np.maximum(np.bincount(of, minlength=len(begins)), 1)
     known = np.add.reduceat(seen.astype(float), begins)
-    total, swapped = best_stretches(tracks, a, b, begins, mean * known * min(1.0, 1 / (MEMORY * body.rate)))
-    return swapped if total > WORTH else swapped[:0]
+    total, swapped = swaps.best_stretches(tracks, a, b, begins, mean * known * min(1.0, 1 / (swaps.MEMORY * body.rate)))
+    return swapped if total > swaps.WORTH else swapped[:0]
 
 
 def _gains(body: Simulation, x: np.ndarray, positions: np.ndarray, a: int, b: int) -> np.ndarray:

@@ -2,7 +2,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -91,8 +91,7 @@ def transfer_layout(layout: MarkerLayout, source: Mesh, target: Mesh, landmarks:
                          "give landmarks, three at least, spread over the body")
     found = Surface(target).closest(layout.skin_points(fit.mesh.vertices))
     inside = np.clip(found.bary, 0.0, 1.0)                            # without the last digits outside of the triangle
-    there = MarkerLayout(layout.labels, target.faces[found.faces], layout.distances,
-                         inside / inside.sum(axis=1, keepdims=True), layout.aliases, layout.loose)
+    there = replace(layout, vertices=target.faces[found.faces], weights=inside / inside.sum(axis=1, keepdims=True))
     return TransferredLayout(there, found.distances, fit.confidence[layout.nearest], fit.rms, fit.landmark_rms,
                              fit.uncovered, fit.mesh)
 

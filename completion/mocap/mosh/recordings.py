@@ -38,24 +38,15 @@ class Actor:
 
 @dataclass(frozen=True)
 class Grouping:
-    """How recordings are given to people.
+    """How recordings are given to people: by a rule, see --subjects of `scape mosh`, or by a table.
 
-    Attributes
-    ----------
-    by : str
-        "name": what stands before the first _, - or blank of the file name; "label": the `Subject:` before the
-        labels; "each": every file is of another person; "all": all are of one. "auto": of files that were named
-        "all"; of a folder its sub-folders, and of files that lie side by side "name" where the name is two numbers,
-        as in 85_02, else "label", else "each".
-    table : Path, optional
-        CSV with the columns file and subject, or JSON {file: subject}, which goes before any rule.
-    who : str, optional
-        Whose markers, in C3D files with several people.
+    "auto" is, of files that were named, "all"; of a folder its sub-folders, and of files that lie side by side "name"
+    where the name is two numbers, as in 85_02, else "label", else "each".
     """
 
     by: By = "auto"
-    table: Path | None = None
-    who: str | None = None
+    table: Path | None = None            # CSV with the columns file and subject, or JSON {file: subject}
+    who: str | None = None               # whose markers, in C3D files with several people
 
     @staticmethod
     def of(subjects: str, who: str | None = None) -> Grouping:

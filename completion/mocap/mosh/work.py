@@ -122,8 +122,8 @@ def _solve(work: Work, actor: Actor, room: Room) -> tuple[_Found, list[str]]:
     for i, (source, markers) in enumerate(zip(recordings, sequences, strict=True)):
         soft = result.soft_tissue[i] if result.soft_tissue else None
         held = held_out(model, usual, work.hold_out, markers, result.motions[i], soft)
-        takes.append(Take(source.name, source.path, source.who, work.unit, model, subject, markers, result.motions[i],
-                          soft, result.artefacts[i], held, light))
+        takes.append(Take(source, work.unit, model, subject, markers, result.motions[i], soft, result.artefacts[i], held,
+                          light))
     return _Found(model, guess, result, takes, usual, layout_name), failures
 
 
@@ -164,7 +164,7 @@ def _write(work: Work, found: _Found, take: Take, room: Room, settings: Mapping[
         outcome = Outcome(place(folder), metrics, settings, problem=found.problem(take))
         write_report(outcome, work.command, time.perf_counter() - start)
 
-    room.files(f"{take.name} files", (solved, take.path, take.who, take.unit, factor),
+    room.files(f"{take.name} files", (solved, take.source.path, take.source.who, take.unit, factor),
                lambda folder: write_take(place(folder), take, factor))
     shown: tuple[np.ndarray, str] | None = None if work.character is None else room.files(
         f"{take.name} character", (solved, work.character, factor), character)
@@ -193,8 +193,9 @@ def write_take(folder: Path, take: Take, factor: float = 1.0) -> None:
         write_residuals(folder / "residuals_soft.csv", soft.motion)
         if factor != 1:
             write_glb(folder / "exaggerated.glb", soft.motion, body, soft.vertices(take.model, shown, factor))
-    c3d = take.path.suffix.lower() == ".c3d"
-    write_virtual(folder / "virtual.c3d", take.artefacts, take.path if c3d else None, take.who, take.unit)
+    path = take.source.path
+    write_virtual(folder / "virtual.c3d", take.artefacts, path if path.suffix.lower() == ".c3d" else None,
+                  take.source.who, take.unit)
     _write_artefacts(folder, take.artefacts)
 
 

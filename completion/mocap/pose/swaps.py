@@ -20,16 +20,8 @@ class Tracks:
     """Tracks (T, L, 3) of labels, metres, NaN where one was not seen.
 
     From one frame to the next a track moves at the mean of its velocities before and after, which misses no more
-    than a change of acceleration. A label that takes over another's track goes on from that one's place.
-
-    Attributes
-    ----------
-    off : (T, L) float, metres
-        From the prediction; NaN where the label is not seen both in this frame and the one before.
-    sd : (T, L) float, metres
-        The usual size of `off` around that time.
-    jumped, open : (T, L) bool
-        The track does not go on here; it is not known whether it does.
+    than a change of acceleration: it is `off` (T, L) metres, usually `sd`, NaN where it is not seen in both. It
+    `jumped` (T, L), or is `open`: not known to go on. A label that takes over another's track goes on from its place.
     """
 
     def __init__(self, positions: np.ndarray, rate: float) -> None:
@@ -108,7 +100,7 @@ def relabelled(positions: np.ndarray, order: np.ndarray) -> np.ndarray:
 def marker_levels(places: np.ndarray, positions: np.ndarray, deviation: float | np.ndarray = DEVIATION) -> np.ndarray:
     """What it counts (..., L, L) that a column's label is the marker of a row: half squared deviations, at most `AWAY`.
 
-    Places (..., L, 3) on the body are NaN where unknown, then nowhere near; the deviation, metres, is one for each frame.
+    Places (..., L, 3) on the body are NaN where unknown, then nowhere near; `deviation`, metres, one for each frame.
     """
     squared = sum((places[..., :, None, d] - positions[..., None, :, d])**2 for d in range(3))
     cost = np.minimum(np.nan_to_num(squared / (2 * np.asarray(deviation)[..., None, None]**2), nan=AWAY), AWAY)

@@ -158,42 +158,24 @@ def shape_term(z: np.ndarray, n_betas: int, weight: float) -> Residual:
 
 @dataclass(frozen=True, eq=False)
 class Hung:
-    """Latent markers with their supports on the body, posed and of any shape, and in the latent pose.
-
-    `corners` are those of the nearest triangles in the latent pose.
-    """
+    """Latent markers with their supports on the body, posed and of any shape, and in the latent pose."""
 
     markers: LatentMarkers
     points: ShapedPoints
     supports: LatentPoints
-    corners: LatentPoints
+    corners: LatentPoints                # of the nearest triangles in the latent pose
 
 
 @dataclass(frozen=True, eq=False)
 class State:
-    """Where the solution stands.
+    """Where the solution stands."""
 
-    Attributes
-    ----------
-    x : (B, 3J + 3) float
-        Pose and place in every frame.
-    betas : (K,) float
-    coefficients : (L, 3) float
-        Of the latent markers.
-    hung : Hung
-        What they are coefficients of.
-    layout : MarkerLayout
-        Where the markers usually are, loose ones where they were found.
-    looked : bool
-        Loose markers were looked for.
-    """
-
-    x: np.ndarray
-    betas: np.ndarray
-    coefficients: np.ndarray
-    hung: Hung
-    layout: MarkerLayout
-    looked: bool = False
+    x: np.ndarray                        # (B, 3J + 3) pose and place in every frame
+    betas: np.ndarray                    # (K,)
+    coefficients: np.ndarray             # (L, 3) of the latent markers
+    hung: Hung                           # what they are coefficients of
+    layout: MarkerLayout                 # where the markers usually are, loose ones where they were found
+    looked: bool = False                 # loose markers were looked for
 
     @property
     def z(self) -> np.ndarray:

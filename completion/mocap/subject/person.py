@@ -141,23 +141,17 @@ def one_or_more(sequences: MarkerSequence | Sequence[MarkerSequence]) -> list[Ma
 
 def common_markers(sequences: Sequence[MarkerSequence], layout: MarkerLayout
                    ) -> tuple[MarkerLayout, list[np.ndarray]]:
-    """The part of a layout that is in any of the sequences, and its markers (T, L, 3) in each, NaN where it lacks one."""
+    """The part of a layout that is in any of the sequences, and its markers (T, L, 3) in each, NaN if it lacks one."""
     columns = []
     for sequence in sequences:
         labels = layout.matched(sequence.labels)
         columns.append({layout.aliases.get(label, label): sequence.labels.index(label) for label in labels})
-    rows = [i for i, label in enumerate(layout.labels) if any(label in mine for mine in columns)]
-    kept = tuple(layout.labels[i] for i in rows)
-    known = MarkerLayout(kept, layout.vertices[rows], np.asarray(layout.distances)[rows],
-                         None if layout.weights is None else layout.weights[rows],
-                         {alias: label for alias, label in layout.aliases.items() if label in kept},
-                         tuple(label for label in layout.loose if label in kept))
+    known = layout.without([label for label in layout.labels if not any(label in mine for mine in columns)])
     positions = []
     for sequence, mine in zip(sequences, columns, strict=True):
-        there = np.full((len(sequence.positions), len(kept), 3), np.nan)
-        some = [i for i, label in enumerate(kept) if label in mine]
-        there[:, some] = sequence.positions[:, [mine[kept[i]] for i in some]]
-        positions.append(there)
+        missing = np.full((len(sequence.positions), 3), np.nan)
+        positions.append(np.stack([sequence.positions[:, mine[label]] if label in mine else missing
+                                   for label in known.labels], axis=1))
     return known, positions
 
 
