@@ -76,7 +76,7 @@ def track(body: BodyModel | Subject, frames: Iterable[Frame], config: TrackConfi
     tracker = Tracker(body, config, rate, landmarks, viewpoints)
     total = len(frames) if isinstance(frames, Sized) else 0
     done: list[TrackedFrame] = []
-    for frame in follow_frames(tracker, iter(frames)):
+    for frame in tracker.follow(frames):
         if surfaces is not None:
             surfaces(frame.number, tracker.surface(frame))
         done.append(without_points(frame))
@@ -181,6 +181,12 @@ class Tracker:
                              random_state=self._random_state())
         return self._done()
 
+    def follow(self, frames: Iterable[Frame]) -> Iterator[TrackedFrame]:
+        """The frames of a stream, each as soon as it is done."""
+        for frame in frames:
+            yield from self.push(frame)
+        yield from self.finish()
+
     def finish(self) -> list[TrackedFrame]:
         """The frames that were still kept."""
         if not self.state.past:
@@ -250,14 +256,13 @@ class Tracker:
                  cloud: ScanPoints | None = None) -> TrackedFrame:
         """A frame; what its data say is left out where it is lost, and x is zero before the body was seen."""
         size = self.person.n_angles + 3
-        nothing = TrackedFrame(number, np.zeros(size) if x is None else x, False, np.nan, 0.0, np.zeros(size),
-                               np.zeros((size, size)), cloud)
+        out = TrackedFrame(number, np.zeros(size) if x is None else x, False, np.nan, 0.0, np.zeros(size),
+                           np.zeros((size, size)), cloud)
         if found is None:
-            return nothing
-        if not self._fitter(cloud).good(found):
-            return replace(nothing, residual=found.residual, explained=found.explained)
-        return TrackedFrame(number, nothing.x, True, found.residual, found.explained, found.gradient, found.precision,
-                            cloud)
+            return out
+        out = replace(out, residual=found.residual, explained=found.explained)
+        good = self._fitter(cloud).good(found)
+        return replace(out, found=True, gradient=found.gradient, precision=found.precision) if good else out
 
     def _has_shape(self, betas: np.ndarray | None) -> None:
         """Go on with a person of unknown shape as one of these betas (K,); random numbers begin anew."""
@@ -283,10 +288,3 @@ class Tracker:
 
     def _mesh(self, x: np.ndarray) -> Mesh:
         return self.person.template.with_vertices(self._known().vertices(x))
-
-
-def follow_frames(tracker: Tracker, frames: Iterator[Frame]) -> Iterator[TrackedFrame]:
-    """The frames of a stream, each as soon as it is done."""
-    for frame in frames:
-        yield from tracker.push(frame)
-    yield from tracker.finish()

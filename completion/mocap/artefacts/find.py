@@ -156,7 +156,8 @@ def _expected(body: Simulation, state: _State, repaired: np.ndarray, simulated: 
 def _both_ways(body: Simulation, markers: MarkerSequence, x: np.ndarray, order: np.ndarray, places: np.ndarray
                ) -> np.ndarray:
     """The order (T, L) with close markers swapped where the body at x (T, P) has followed the wrong ones."""
-    raw, tracks = (swaps.Tracks(p, markers.rate) for p in (markers.positions, swaps.relabelled(markers.positions, order)))
+    raw = swaps.Tracks(markers.positions, markers.rate)
+    tracks = swaps.Tracks(swaps.relabelled(markers.positions, order), markers.rate)
     swapped = {(min(a, b), max(a, b)) for row in np.unique(order, axis=0) for a, b in enumerate(row.tolist()) if a != b}
     pairs, order = swaps.pairs_that_jump(raw, set(range(len(markers.labels)))) | swapped, order.copy()
     for a, b in sorted(pairs):

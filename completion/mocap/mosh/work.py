@@ -122,8 +122,8 @@ def _solve(work: Work, actor: Actor, room: Room) -> tuple[_Found, list[str]]:
     for i, (source, markers) in enumerate(zip(recordings, sequences, strict=True)):
         soft = result.soft_tissue[i] if result.soft_tissue else None
         held = held_out(model, usual, work.hold_out, markers, result.motions[i], soft)
-        takes.append(Take(source, work.unit, model, subject, markers, result.motions[i], soft, result.artefacts[i], held,
-                          light))
+        takes.append(Take(source, work.unit, model, subject, markers, result.motions[i], soft, result.artefacts[i],
+                          held, light))
     return _Found(model, guess, result, takes, usual, layout_name), failures
 
 
