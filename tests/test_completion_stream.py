@@ -1,3 +1,4 @@
+import copy
 from dataclasses import replace
 
 import numpy as np
@@ -323,17 +324,23 @@ WRONG = {"times 1000": lambda p: 1000 * p, "half of it": lambda p: p * np.where(
          "mixed up": lambda p: p[np.random.default_rng(0).permutation(90)]}
 
 
-@pytest.mark.parametrize("kind", ["velocity", "kalman"])
-@pytest.mark.parametrize("wrong", WRONG.values(), ids=WRONG)
-def test_one_frame_that_no_body_makes_is_passed_over(passing, wrong, kind):
+@pytest.fixture(scope="module", params=["velocity", "kalman"])
+def unbroken(passing, request):
+    """A stream of 20 frames, what the next 20 come to, and how far they are from the truth at most."""
     subject, layout, truth, positions = passing
-    broken, config = positions.copy(), replace(CONFIG, prediction=kind)
-    broken[30] = wrong(positions[30])
-    frames = pushed(MarkerStream(subject, layout, layout.labels, 60.0, config), broken)
-    clean = pushed(MarkerStream(subject, layout, layout.labels, 60.0, config), positions)
-    assert not frames[30].trusted.any() and not frames[30].converged
-    assert errors(subject, frames, truth)[30:].max() < errors(subject, clean, truth).max() + 0.015
-    for there, other in zip(frames[31:], clean[31:], strict=True):
+    stream = MarkerStream(subject, layout, layout.labels, 60.0, replace(CONFIG, prediction=request.param))
+    first = pushed(stream, positions[:20])
+    frames = pushed(copy.deepcopy(stream), positions[20:40])
+    return stream, frames, errors(subject, [*first, *frames], truth[:40]).max()
+
+
+@pytest.mark.parametrize("wrong", WRONG.values(), ids=WRONG)
+def test_one_frame_that_no_body_makes_is_passed_over(passing, unbroken, wrong):
+    (subject, _, truth, positions), (stream, clean, apart) = passing, unbroken
+    frames = pushed(copy.deepcopy(stream), [wrong(positions[20]), *positions[21:40]])
+    assert not frames[0].trusted.any() and not frames[0].converged
+    assert errors(subject, frames, truth[20:40]).max() < apart + 0.015
+    for there, other in zip(frames[1:], clean[1:], strict=True):
         assert other.converged and there.converged
         np.testing.assert_array_equal(there.trusted, other.trusted)
 
