@@ -54,8 +54,6 @@ def agree(found, expected, tolerance=1e-9):
     np.testing.assert_allclose(found.positions, expected.positions, atol=tolerance)
 
 
-# ---- what is written comes back
-
 @pytest.mark.parametrize(("suffix", "tolerance"), [(".csv", 1e-8), (".c3d", 1e-6)])
 @pytest.mark.parametrize("rate", [120.0, 59.94, 1000 / 3, 30.0])
 def test_round_trip(tmp_path, suffix, tolerance, rate):
@@ -91,8 +89,6 @@ def test_trc_in_its_own_unit(tmp_path, missing, unit, factor):
     seq = sequence(np.random.default_rng(2))
     agree(read_markers(trc_file(tmp_path / "a.trc", seq, unit, factor, missing)), seq)
 
-
-# ---- what C3D files hold
 
 @pytest.mark.parametrize(("units", "factor"), [(("mm",), 1e-3), (("M ",), 1), (("cm",), 1e-2), (None, 1e-3),
                                                (("",), 1e-3)])
@@ -154,8 +150,6 @@ def test_c3d_labels_of_all_kinds(tmp_path, labels, groups, kept):
         assert read_markers(path).labels == kept
 
 
-# ---- CSV from elsewhere
-
 def test_csv_with_frames_asks_for_a_rate(tmp_path):
     (tmp_path / "a.csv").write_text("Frame,C7_X,C7_Y,C7_Z\n0,1,2,3\n1,,,\n2,1.5,2,3\n")
     with pytest.raises(MarkerFileError, match=r"a\.csv: expected a column time.*say rate="):
@@ -176,8 +170,6 @@ def test_csv_is_plain_enough_for_a_spreadsheet(tmp_path):
     rows = list(csv.reader((tmp_path / "a.csv").open()))
     assert rows == [["time", "C7_x", "C7_y", "C7_z", "T10_x", "T10_y", "T10_z"], ["0", "1", "2", "3", "", "", ""]]
 
-
-# ---- bad files
 
 def refused(path, *words):
     with pytest.raises(MarkerFileError) as caught:
@@ -257,8 +249,6 @@ def test_a_bad_trc_says_where(tmp_path, line, new, words):
     path.write_text("\n".join(lines))
     refused(path, *words)
 
-
-# ---- the sequence itself
 
 def test_select_and_frames():
     seq = sequence(np.random.default_rng(7), 10)

@@ -15,7 +15,6 @@ from .sequence import TrackedFrame, Tracker, TrackerState, without_points
 
 ENDINGS = (".ply", ".ply.gz", ".obj", ".stl", ".off", ".glb", ".pcd", ".xyz", ".txt", ".pts")
 NOTHING = ("holds no vertices", "the file is empty")
-SPARSE = 2                           # numbers may leave out as many frames as there are; else they only give the order
 
 
 class FrameFolder:
@@ -116,7 +115,8 @@ def _numbers(found: set[int]) -> list[int]:
     steps = np.diff(order)
     step = int(np.gcd.reduce(steps)) if len(steps) else 1
     filled = (order[-1] - order[0]) // step + 1
-    return list(range(order[0], order[-1] + 1, step)) if filled <= SPARSE * len(order) else order
+    # numbers may leave out as many frames as there are; else they only give the order
+    return list(range(order[0], order[-1] + 1, step)) if filled <= 2 * len(order) else order
 
 
 Progress = Callable[[int, int], None]

@@ -31,8 +31,6 @@ from .settings import TrackConfig
 REACH, FINAL_REACH = 0.1, 0.03       # metres: limits on the distance of matches in the first round and the third
 SETTLED = 1e-3                       # metres, root mean square: a round that moves the body less is the last
 NEAR, EXPLAINED = 0.05, 0.7          # metres: points that have the body within this are explained; share that must be
-PREDICTION = 10.0                    # variance of a prediction from two uncertain frames, against the acceleration's
-SHAPE_ROUNDS = 4                     # matchings of the frames that tell the shape
 NOTHING = (np.zeros(0, dtype=np.int64), np.zeros((0, 3)))
 
 
@@ -64,7 +62,8 @@ class FrameFit:
 
     def refine(self, fit: ScanFit, x: np.ndarray, expected: np.ndarray | None = None) -> Refined:
         """The best unknowns near x (P,), held by the expected ones where there are such."""
-        held = 0 * self.inertia if expected is None else self.inertia / PREDICTION
+        # variance of a prediction from two uncertain frames, against the acceleration's
+        held = 0 * self.inertia if expected is None else self.inertia / 10.0
         goal, place, n = x if expected is None else expected, self.body.vertices(x), self.body.n_angles
 
         def data(terms: Callable[[np.ndarray], Terms], at: np.ndarray) -> Dense:
@@ -103,7 +102,7 @@ def shared_shape(body: ShapedBody, clouds: Sequence[ScanPoints], x: np.ndarray, 
     for one in fits:
         one.body = copy(body)            # keeps what it has worked out for the pose of its own frame
     rows = np.concatenate([x, np.tile(betas, (len(x), 1))], axis=1)
-    for i in range(SHAPE_ROUNDS):
+    for i in range(4):  # matchings of the frames that tell the shape
         frames = [one.terms(row, one.thin, _reach(i))(row[None]) for one, row in zip(fits, rows, strict=True)]
         each = [normal_equations([*terms.values()]) for terms in frames]
         together = Dense(*(np.concatenate(part) for part in zip(*each, strict=True)))

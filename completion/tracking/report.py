@@ -16,7 +16,6 @@ from ..motion_pictures import animated_picture, chart_residuals, seconds
 
 POINTS, BODY, LOST = (0.16, 0.42, 0.72), (0.90, 0.78, 0.55), (0.78, 0.78, 0.78)
 SIDES = (35.0, 215.0)                # degrees from the front
-SHOWN = 2500                         # points of a frame in a picture
 
 Cloud = Callable[[int], np.ndarray]
 
@@ -32,7 +31,8 @@ def picture_tracked(motion: Motion, subject: Subject, cloud: Cloud, count: int =
         vertices = motion.vertices(subject, np.array([t]))[0].astype(float)
         body = Solid(subject.template.with_vertices(vertices), BODY if motion.converged[t] else LOST)
         cameras, points = look_around(subject.template, vertices, SIDES), cloud(int(t))
-        dots: list[Shape] = [Dots(points[::max(1, len(points) // SHOWN)], POINTS, radius=0.006)] if len(points) else []
+        # points of a frame in a picture
+        dots: list[Shape] = [Dots(points[::max(1, len(points) // 2500)], POINTS, radius=0.006)] if len(points) else []
         measured.append(render(dots, cameras[0], int(0.6 * height), height))
         bodies.append([render(body, camera, int(0.6 * height), height) for camera in cameras])
     front, behind = (list(images) for images in zip(*bodies, strict=True))

@@ -22,7 +22,6 @@ from .frame_fit import FrameFit, Refined, shared_shape, spread_poses
 from .frames import Frame, as_views, prepare_frame
 from .settings import TrackConfig
 
-FOUND = 0.1                          # share of the frames in which the body must be found
 Progress = Callable[[int, int], None]
 Surfaces = Callable[[int, Mesh], None]
 
@@ -105,7 +104,7 @@ def as_motion(frames: list[TrackedFrame], betas: np.ndarray | None, rate: float,
 def tracking_problem(motion: Motion) -> str | None:
     """Why the motion of tracked frames means nothing, with the likely cause; None where it means something."""
     found = float(motion.converged.mean())
-    if found >= FOUND:
+    if found >= 0.1:  # share of the frames in which the body must be found
         return None
     seen = motion.residuals[np.isfinite(motion.residuals)]
     off = f"the points are {1000 * float(seen.mean()):.0f} mm from the body" if len(seen) else "no frame shows anything"

@@ -21,9 +21,6 @@ from .slips import find_bad, without_lost_limbs
 Progress = Callable[[int, int], None]
 FOLLOW = AnimateConfig()             # how the body follows the markers here
 ROUNDS = 6                           # most times that markers are repaired and the body follows them anew
-SETTLED = 0.002                      # share of the markers that may still change when the search ends
-USUAL_PLACE = 0.04                   # metres, most that a marker's usual place is taken to be from its simulation
-BRIDGE = 0.5                         # seconds that a marker out of sight takes to its usual place, and from there
 CLOSE = 0.25                         # metres between markers whose swap a body can follow
 
 
@@ -139,8 +136,9 @@ def _judged(body: Simulation, markers: MarkerSequence, state: _State, config: Ar
 def _same(body: Simulation, markers: MarkerSequence, before: _State, after: _State) -> bool:
     """Whether a round has changed next to nothing."""
     changed = before.out(markers.labels) != after.out(markers.labels)
+    # share of the markers that may still change when the search ends
     return bool((before.order == after.order).all() and not before.unsure.any()
-                and changed[:, body.rows].mean() <= SETTLED)
+                and changed[:, body.rows].mean() <= 0.002)
 
 
 def _expected(body: Simulation, state: _State, repaired: np.ndarray, simulated: np.ndarray) -> np.ndarray:
@@ -149,7 +147,8 @@ def _expected(body: Simulation, state: _State, repaired: np.ndarray, simulated: 
     usual = usual_places(body.local(repaired - simulated, state.x))
     usual[state.unsure[body.rows]] = 0
     length = np.linalg.norm(usual, axis=1, keepdims=True)
-    usual *= np.minimum(1, USUAL_PLACE / np.maximum(length, 1e-12))
+    # metres, most that a marker's usual place is taken to be from its simulation
+    usual *= np.minimum(1, 0.04 / np.maximum(length, 1e-12))
     return simulated + np.einsum("tldc,lc->tld", body.part_rotations(state.x), usual)
 
 
@@ -217,7 +216,8 @@ def _result(body: Simulation, markers: MarkerSequence, state: _State) -> MarkerA
     repaired, simulated = state.repaired(markers), body.body.positions(state.x)
     targets = repaired[:, body.rows]
     weights, _ = marker_weights(simulated, targets, 1.0, FOLLOW.outlier)
-    off = bridged(body.local(targets - simulated, state.x), BRIDGE * markers.rate)
+    # seconds that a marker out of sight takes to its usual place, and from there
+    off = bridged(body.local(targets - simulated, state.x), 0.5 * markers.rate)
     expected = simulated + np.einsum("tldc,tlc->tld", body.part_rotations(state.x), off)
     return MarkerArtefacts(list_swaps(state.order, markers.seen, markers.labels), state.bad, simulated, body.labels,
                            MarkerSequence(repaired, markers.labels, markers.rate), weights, expected, state.order)

@@ -13,8 +13,6 @@ from ..pose.marked_body import MarkedBody, batches
 from ..pose.robust import marker_weights
 from ..pose.settings import AnimateConfig
 
-OWN = 0.6                            # most of a displacement that the body is taken to have followed
-
 
 class Simulation:
     """A body that follows markers whose labels are taken as they are."""
@@ -82,7 +80,8 @@ class Simulation:
             answer = np.linalg.solve(hessian, columns.reshape(B, P, -1)).reshape(columns.shape)
             followed = np.einsum("bpcl,bpdl->blcd", columns, answer) * weights[some][..., None, None]
             share, axes = np.linalg.eigh(followed)
-            out[some] = (axes / (1 - np.clip(share, 0, OWN))[..., None, :]) @ np.swapaxes(axes, -1, -2)
+            # most of a displacement that the body is taken to have followed
+            out[some] = (axes / (1 - np.clip(share, 0, 0.6))[..., None, :]) @ np.swapaxes(axes, -1, -2)
         return out
 
 

@@ -21,7 +21,6 @@ _BLOCK = 512
 _INTEL, _DEC, _MIPS = 84, 85, 86
 _COMPUTED = ("ANGLES", "FORCES", "MOMENTS", "POWERS", "SCALARS")     # stored among the points, but no positions
 RESIDUAL = 256                       # one step of the residual in the fourth number of a point; below it are cameras
-MEASURED = 1.0                       # residual, millimetres, of points that were measured, where others were not
 _Parameters = dict[tuple[str, str], list[Any]]                       # group and name -> values
 
 
@@ -251,7 +250,8 @@ def write_c3d(path: Path, positions: np.ndarray, labels: tuple[str, ...], rate: 
     points = np.ones((4, L, T))
     points[:3] = 1000 * positions.transpose(2, 1, 0)
     tree["data"]["points"] = points
-    residual = np.zeros((T, L)) if filled is None else np.where(filled, 0.0, MEASURED)
+    # residual, millimetres, of points that were measured, where others were not
+    residual = np.zeros((T, L)) if filled is None else np.where(filled, 0.0, 1.0)
     tree["data"]["meta_points"] = {"residuals": np.where(np.isnan(positions[..., 0]), -1.0, residual).T[None],
                                    "camera_masks": np.zeros((7, L, T), dtype=bool)}
     if T > 65535:

@@ -28,7 +28,6 @@ from ..subject.person import PersonConfig, PersonFit, find_person, one_or_more
 
 Progress = Callable[[int, int], None]
 T = TypeVar("T")
-ROUNDS = 3                           # most times that a person is followed and the markers are judged
 STEPS = 100                          # of progress, of each stage
 
 
@@ -153,7 +152,7 @@ def mosh(model: BodyModel, sequences: MarkerSequence | Sequence[MarkerSequence],
     stages = _Stages(step, progress, STEPS * (1 + len(sequences) * (2 + config.soft_tissue)))
     used = [_relabelled(stages, i, each, config) for i, each in enumerate(sequences)]
     person = _person(stages, model, used, layout, config)                       # [MoSh] Eq. 23, shape and markers
-    for n in range(ROUNDS):
+    for n in range(3):  # most times that a person is followed and the markers are judged
         motions = [_motion(stages, f"poses {n} {i}", person, each, config, n == 0)  # [MoSh] Eq. 23, poses
                    for i, each in enumerate(used)]
         artefacts = [_artefacts(stages, f"artefacts {n} {i}", person, each, motion, config, n == 0)

@@ -21,7 +21,6 @@ from .takes import Take
 
 USUAL, DOUBTED, UNUSED = (0.30, 0.50, 0.72), (0.93, 0.62, 0.16), (0.20, 0.62, 0.32)
 SIDES = ("front", "left", "back", "right")
-SHEET = 56                           # pictures on a contact sheet
 LITTLE = 0.005                       # metres: the end of a colour scale that must not make much of nothing
 
 
@@ -73,7 +72,7 @@ def _named(image: np.ndarray, camera: Camera, body: Mesh, found: np.ndarray, mov
     return np.asarray(picture)
 
 
-def every(count: int, most: int = SHEET) -> int:
+def every(count: int, most: int = 56) -> int:  # pictures on a contact sheet
     """1, 2, 5, 10, 20, 50 ...: of so many frames, every so many make at most so many pictures."""
     power = 1
     while True:

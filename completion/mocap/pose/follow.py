@@ -23,7 +23,6 @@ from .stream import STEPS, Tracker
 __all__ = ["AnimateConfig", "animate"]
 
 Progress = Callable[[int, int], None]
-KEY_INTERVAL = 0.1                   # seconds between the frames that are solved one after the other
 STILL = 0.005                        # metres that the last round moves any marker of a frame that has converged
 
 
@@ -120,7 +119,7 @@ def follow_whole(body: MarkedBody, targets: np.ndarray, rate: float, config: Ani
 
 def between_keys(body: MarkedBody, targets: np.ndarray, rate: float, config: AnimateConfig) -> np.ndarray:
     """Unknowns (T, P) on the way from one key frame to the next, which are followed one after the other."""
-    T, every = len(targets), max(1, round(KEY_INTERVAL * rate))
+    T, every = len(targets), max(1, round(0.1 * rate))  # seconds between the frames that are solved one after the other
     frames = np.unique(np.r_[0, np.arange(_first_frame(targets) % every, T, every), T - 1])
     keys, _, _ = follow_frames(body, targets, frames, rate / every, config, lambda done, total: None, steps=8)
     if len(frames) == 1:

@@ -13,7 +13,6 @@ from .marked_body import MarkedBody, PartShapes, point_system
 
 TOUCH = 0.025                        # metres above the floor below which a point may stand
 STILL = 0.2                          # metres per second below which it does
-CONTACT_SD = 0.002                   # metres that a standing point may be from its place
 
 
 @dataclass(frozen=True, eq=False)
@@ -72,7 +71,8 @@ class HeldPoints:
     def system(self, pose: np.ndarray, trans: np.ndarray, frames: slice) -> Dense:
         """The equations of some frames."""
         places = self.places[frames]
-        return point_system(*self.shapes.columns(pose, trans), places, np.full(places.shape[:2], CONTACT_SD**-2))
+        # metres that a standing point may be from its place
+        return point_system(*self.shapes.columns(pose, trans), places, np.full(places.shape[:2], 0.002**-2))
 
 
 class FootContact:

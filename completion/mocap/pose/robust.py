@@ -12,7 +12,6 @@ from ..marker_sets.layout import MarkerLayout
 from .settings import AnimateConfig
 from .swaps import DEVIATION, find_order, marker_levels
 
-ASTRAY = 0.025                       # of the size, 34 mm on a man; good motions 4 to 25, sides swapped 36 to 60
 ENTER, LEAVE = 0.5, 1.0              # share of the distance that remains when labels are swapped, and put back
 
 
@@ -115,7 +114,8 @@ def motion_problem(motion: Motion, body: Mesh, layout: MarkerLayout, markers: Ma
     columns = [markers.labels.index(label) for label in known]
     spans = [extent(frame) for frame in markers.positions[:: max(1, len(seen) // 50), columns]]
     wrong = unit_problem(float(np.nanmax(spans)), extent(layout.select(known).place(body)), "the markers span a box")
-    off, far = float(motion.residuals[seen].mean()), ASTRAY * size(body)
+    # of the size, 34 mm on a man; good motions 4 to 25, sides swapped 36 to 60
+    off, far = float(motion.residuals[seen].mean()), 0.025 * size(body)
     if wrong is None and off <= far:
         return None
     believed = 100 * float(motion.trusted[seen].mean())

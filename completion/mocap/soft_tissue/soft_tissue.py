@@ -26,8 +26,6 @@ from .changing_body import ChangingBody, changing_bodies, skin_metric, skin_move
 Progress = Callable[[int, int], None]
 PER_SQUARE_METRE = 1e4               # of a weight on square centimetres
 ROUNDS = 3                           # Gauss-Newton steps over the whole sequence, which begins near its end
-STILL = 0.002                        # metres that the last round moves any marker of a frame that has settled
-N_BETAS = 200                        # components in which the shape may change, of those that the model has
 WINDOW, OVERLAP = 400, 40            # frames smoothed at once, and those that each side lends to its neighbour
 
 
@@ -172,7 +170,8 @@ class SoftFollower:
         self.config, self.motion = config, motion
         self.rows = np.array([markers.labels.index(label) for label in labels])
         self.targets = markers.positions[:, self.rows]
-        K = min(max(N_BETAS, len(motion.betas)), model.n_betas)
+        # components in which the shape may change, of those that the model has
+        K = min(max(200, len(motion.betas)), model.n_betas)
         slopes = model.shape_jacobian(model.pose_mean)[..., :K]
         poses = AnimateConfig(prior_weight=config.pose, angle_acceleration=RATE**2 / np.sqrt(config.velocity))
         self.body = ChangingBody(model, motion.betas, layout.select(labels), cheap_directions(model, slopes, config),
@@ -199,7 +198,7 @@ class SoftFollower:
             z[some] = smooth_changes(self.body, x[some], targets, weights, self.smoothness)
         if progress:
             progress(T, T)
-        return x, z, moved < STILL
+        return x, z, moved < 0.002  # metres that the last round moves any marker of a frame that has settled
 
     def weights(self, positions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Frames from the first to the last with a marker that counts (n,), and weights of all markers (T, L)."""

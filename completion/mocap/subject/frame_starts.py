@@ -17,8 +17,6 @@ from ..pose.settings import AnimateConfig
 
 MEAN_PERSON = AnimateConfig(marker_sd=0.03)     # metres: the mean person carries the markers only roughly
 LOST = 0.1                           # metres, median distance of a frame's markers above which it is searched anew
-LOOSE_REACH = 0.2                    # metres from its usual place that a loose marker is looked for: half a thigh
-FAR = 0.06                           # metres beyond which it does not matter how far a loose marker is
 
 
 def mean_person(mean: Subject, layout: MarkerLayout) -> MarkedBody:
@@ -58,11 +56,13 @@ def find_loose(model: BodyModel, vertices: np.ndarray, layout: MarkerLayout, tar
     meshes, found = [template.with_vertices(v) for v in vertices], {}
     tree, part = cKDTree(template.vertices), model.skeleton.part_of_vertex(template)
     for row in np.flatnonzero(np.isin(layout.labels, layout.loose)):
-        near = np.array(tree.query_ball_point(template.vertices[usual[row]], LOOSE_REACH))
+        # metres from its usual place that a loose marker is looked for: half a thigh
+        near = np.array(tree.query_ball_point(template.vertices[usual[row]], 0.2))
         near = near[part[near] == part[usual[row]]]
         off = np.stack([mesh.vertices[near] + distances[row] * mesh.vertex_normals[near] - target
                         for mesh, target in zip(meshes, targets[:, row], strict=True)
                         if np.isfinite(target[0])] or [np.zeros((len(near), 3))])
-        squared = np.minimum((off**2).sum(axis=2), FAR**2)
+        # metres beyond which it does not matter how far a loose marker is
+        squared = np.minimum((off**2).sum(axis=2), 0.06**2)
         found[layout.labels[row]] = int(near[squared.mean(axis=0).argmin()])
     return found

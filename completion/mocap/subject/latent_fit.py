@@ -24,8 +24,6 @@ from .attachment import Attachment, LatentMarkers, above_triangles, latent_marke
 from .frame_starts import find_loose
 
 CENTIMETRES = 100.0                  # in a metre
-LOOSE = 0.0025                       # weight of the usual place of a marker that the layout calls loose: 20 cm
-UNSURE = 5.0                         # how much farther off a loose marker may be before it was looked for
 
 
 @dataclass(frozen=True)
@@ -210,7 +208,8 @@ class LatentFit:
                                    model.shape_jacobian(rest)[..., :self.n_betas])
         self.prior = gaussian_prior(model.pose_mean, model.pose_covariance)
         self.distances, self.loose = np.asarray(layout.distances), np.isin(layout.labels, layout.loose)
-        self.place_weight = np.where(self.loose, min(LOOSE, config.initial), config.initial)
+        # weight of the usual place of a marker that the layout calls loose: 20 cm
+        self.place_weight = np.where(self.loose, min(0.0025, config.initial), config.initial)
         self.pool = PointPool(model, self.n_betas)
 
     def split(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -263,7 +262,8 @@ class LatentFit:
         off = self.residuals(state)
         usual = np.nanmedian(off, axis=1, keepdims=True)
         share = energy.geman_mcclure(np.nan_to_num(off), np.maximum(self.config.outlier, 3 * usual))
-        return self.config.data * share / np.where(self.loose & (not state.looked), UNSURE, 1.0)**2
+        # how much farther off a loose marker may be before it was looked for
+        return self.config.data * share / np.where(self.loose & (not state.looked), 5.0, 1.0)**2
 
     def solve(self, state: State, factor: float, last: bool) -> tuple[np.ndarray, bool, int]:
         """One stage of [MoSh] Eq. 23, everything together: unknowns as `State.rows`, whether it settled, and steps."""

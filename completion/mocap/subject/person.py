@@ -21,7 +21,6 @@ __all__ = ["PersonConfig", "PersonFit", "find_person"]
 
 Progress = Callable[[int, int], None]
 LOOK = (1, 3)                        # before these stages loose markers are looked for
-FEW_SEEN = 0.9                       # of the most markers that any frame has; frames with fewer are not used
 
 
 @dataclass(frozen=True, eq=False)
@@ -164,7 +163,8 @@ def choose_frames(positions: Sequence[np.ndarray], config: PersonConfig) -> np.n
     if seen.max(initial=0) < 3:
         raise ValueError(f"sequences: expected a frame with at least 3 known markers, the best has "
                          f"{seen.max(initial=0)}")
-    good = np.flatnonzero(seen >= max(3, FEW_SEEN * seen.max()))
+    # of the most markers that any frame has; frames with fewer are not used
+    good = np.flatnonzero(seen >= max(3, 0.9 * seen.max()))
     if config.choice == "random":
         rng = np.random.default_rng(config.seed)
         return np.sort(rng.choice(good, min(config.frames, len(good)), replace=False))
