@@ -14,10 +14,17 @@ from scipy.spatial.transform import Rotation
 from model.statue.control.chart import make_chart
 from model.statue.control.model import FOLDED, HOLE, MEASURED, OUTSIDE, ControlModel, DisplacementMap
 from model.statue.detail.displacement import DisplacementConfig, bake, coverage_shares, unfold_control
-from model.statue.detail.errors import in_folds, inverted_triangles, remaining_error, surface_error
 from model.statue.detail.maps import read_map, write_map
 from model.statue.detail.normal_volume import from_normal_volume, interpolate, to_normal_volume
-from model.statue.detail.reconstruction import Reconstruction, VertexRotations, displaced_surface
+from model.statue.detail.reconstruction import (
+    Reconstruction,
+    VertexRotations,
+    displaced_surface,
+    in_folds,
+    inverted_triangles,
+    remaining_error,
+    surface_error,
+)
 from model.statue.detail.subdivision import chart_places, subdivide, subdivide_adaptive
 from model.statue.detail.texels import bake_texture, continue_chart, find_texels, scan_look, vertex_of_row
 from scanprep.geometry.mesh import Mesh

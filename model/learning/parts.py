@@ -16,8 +16,7 @@ from scanprep.threads import one_thread
 
 from ..blending import BlendedTemplate, rigid_weights
 from .config import LearnConfig
-from .scape import learn_pose
-from .work import Progress, Work
+from .scape import Progress, Work, learn_pose
 
 QUICK = LearnConfig(prunings=(0.01,), ridges=(1e-3, 1e-2), refinements=1)
 MORE, TRIES = 4, 3                   # parts more each time, and the largest number of times

@@ -18,8 +18,7 @@ from ..digests import body_digests, digest
 from ..scape import ScapeModel
 from ..shape_space import ShapeSpace, learn_shape_space
 from .config import LearnConfig
-from .scape import POSES, checked_training, learn_pose, seen_in_training, shape_deformations
-from .work import Progress, Work
+from .scape import POSES, Progress, Work, checked_training, learn_pose, seen_in_training, shape_deformations
 
 SEXES = ("female", "male")
 PLANE = "sex_plane"                  # its place in a model's info

@@ -19,8 +19,7 @@ from ..fitting import FitConfig, PoseFitter, ShapeFitter
 from ..pose_space import kept_directions
 from ..shape_space import learn_shape_space
 from ..skinning import SkinningModel, unblended
-from .scape import POSES, checked_training, fit_poses, pose_examples, pose_prior
-from .work import Progress, Work
+from .scape import POSES, Progress, Work, checked_training, fit_poses, pose_examples, pose_prior
 
 RIDGES = (1e-4, 1e-3, 3e-3, 0.01, 0.03, 0.1, 0.3)      # penalties; the one that predicts left-out poses best is taken
 LEVELS = 8                           # of how freely a joint corrects a vertex: vertices of one level share a solve

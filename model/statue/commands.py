@@ -26,18 +26,24 @@ from scanprep.ranges import Positive
 from ..export.cli import read_motion
 from ..files import load_model
 from .cli import LevelArg, MotionArg, StatueArg
-from .control.files import read_control
-from .control.humanoid import humanoid
+from .control.files import humanoid, read_control
 from .control.model import ControlModel, Statue
 from .detail.displacement import DisplacementConfig, coverage_shares
-from .detail.errors import Level, adaptive_level, in_folds, inverted_triangles, measured_levels, remaining_error
-from .detail.reconstruction import Reconstruction, displaced_surface
+from .detail.reconstruction import (
+    Level,
+    Reconstruction,
+    adaptive_level,
+    displaced_surface,
+    in_folds,
+    inverted_triangles,
+    measured_levels,
+    remaining_error,
+)
 from .detail.subdivision import Subdivision, subdivide, subdivide_adaptive
 from .detail.texels import bake_texture, scan_look
 from .files import load_statue, save_statue, write_body, write_for_programs, write_statue_glb
 from .fit import FittedStatue, StatueConfig, fit_statue
-from .motion.follow import follower_of
-from .motion.motions import read_statue_motion, write_motion
+from .motion.motions import follower_of, read_statue_motion, write_motion
 from .registration.automatic import likely_unit
 from .registration.clicks import read_features
 from .report import in_motion, motion_pictures, parts_without_data, statue_page, statue_picture

@@ -18,8 +18,7 @@ from ..export.rig import Rig, turn_up
 from ..features import linear_features
 from ..skinning import SkinningModel
 from .control.chart import Chart
-from .control.files import read_control, write_control
-from .control.humanoid import humanoid, humanoid_markers
+from .control.files import humanoid, humanoid_markers, read_control, write_control
 from .control.model import ControlModel, Statue
 from .detail.maps import read_map, write_map
 from .detail.subdivision import Subdivision, subdivide
