@@ -1,8 +1,6 @@
 """The registered set: a folder of meshes in one topology, handed over from `scanprep` to `model`."""
 from __future__ import annotations
 
-import csv
-import io
 import re
 from collections.abc import Sequence
 from dataclasses import astuple, dataclass, field, fields
@@ -22,23 +20,13 @@ KIND = "registered set"
 
 @dataclass(frozen=True)
 class SetEntry:
-    """One registered mesh: a row of `set.csv`.
+    """One registered mesh: a row of `set.csv`; empty what is not known."""
 
-    Attributes
-    ----------
-    name : str
-        Its own in the set, and the name of its file.
-    subject, pose, sex : str
-        Whose body, in which pose; empty where not known.
-    file : str
-        Path inside the folder.
-    """
-
-    name: str
+    name: str               # its own in the set, and the name of its file
     subject: str = ""
     pose: str = ""
     sex: str = ""
-    file: str = ""
+    file: str = ""          # path inside the folder
 
 
 _COLUMNS = [f.name for f in fields(SetEntry)]
@@ -255,9 +243,4 @@ def _read_rows(folder: Path) -> tuple[SetEntry, ...]:
 
 
 def _write_rows(folder: Path, rows: Sequence[SetEntry]) -> None:
-    text = io.StringIO()
-    table = csv.writer(text, lineterminator="\n")
-    table.writerow(_COLUMNS)
-    table.writerows(astuple(row) for row in rows)
-    with storage.writing(folder / "set.csv") as beside:
-        beside.write_text(text.getvalue(), encoding="utf-8")
+    tables.write_table(folder / "set.csv", _COLUMNS, map(astuple, rows))

@@ -10,6 +10,7 @@ from dataclasses import replace
 
 import numpy as np
 from people_maker import mirror, remesh
+from polygonise import polygonise
 from scipy.optimize import linear_sum_assignment
 from scipy.sparse import coo_array, csr_array, diags_array
 from scipy.sparse.csgraph import dijkstra
@@ -25,7 +26,7 @@ from scanprep.skeleton.tree import Skeleton
 from scanprep.synthetic import body_parts as people_parts
 from scanprep.synthetic.anatomy import Anatomy, tables
 from scanprep.synthetic.body_parts import cross_sections
-from scanprep.synthetic.implicit_surface import Field, Group, Loft, Mirrored, RoundCone, polygonise, project
+from scanprep.synthetic.implicit_surface import Field, Group, Loft, Mirrored, RoundCone, project
 from scanprep.synthetic.landmarks import landmarks, markers
 from scanprep.synthetic.topology import CANONICAL, blending, load
 

@@ -20,7 +20,7 @@ from completion.demo.settings import QUICK, DemoConfig
 from model import load_model
 from scanprep import RegisteredSet, console
 from scanprep.batch.opening import workspace
-from scanprep.console import run
+from scanprep.command_line import run
 from scanprep.geometry.mesh import template_problem
 
 pytestmark = pytest.mark.timeout(600)

@@ -20,7 +20,7 @@ from completion.tracking.report import _ranges
 from completion.tracking.tracker import Tracker
 from model import load_model
 from scanprep.batch.workspace import HOME
-from scanprep.console import run
+from scanprep.command_line import run
 from scanprep.geometry.files import PointCloud, read_mesh, read_points, write_points
 
 KNOWN = "--subject", "template", "--surfaces"

@@ -14,7 +14,7 @@ from model.learning import cli, mixing, parts, scape, skinning
 from model.learning.cli import learn
 from scanprep import read_mesh, write_mesh
 from scanprep.batch.opening import beside
-from scanprep.console import run
+from scanprep.command_line import run
 from scanprep.skeleton import find
 
 STAGES = {"skeleton": (cli, "find_skeleton"), "poses": (scape, "_learned"), "people": (scape, "shape_gradients"),

@@ -10,7 +10,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from scanprep import Mesh, console
+from scanprep import Mesh, command_line
 from scanprep.batch import digests as digests_module
 from scanprep.batch import workspace as room
 from scanprep.batch.digests import Digests
@@ -299,7 +299,7 @@ def learned(output: Output, text: str = "text", *, space: FileWorkspace) -> Outc
 
 
 def command(function, output, *words):
-    return console.run(function, "scape x", ["--output", str(output), *words])
+    return command_line.run(function, "scape x", ["--output", str(output), *words])
 
 
 def test_an_output_file_that_is_not_ours_stays(tmp_path, capsys):

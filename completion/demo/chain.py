@@ -15,17 +15,16 @@ from scipy.spatial import cKDTree
 
 from model import BodyModel, Subject, fit_pose, learn_scape, load_model
 from scanprep.batch.opening import workspace
-from scanprep.batch.room import Room
-from scanprep.batch.steps import KeptSteps, inside
-from scanprep.batch.workspace import Task, Workspace
+from scanprep.batch.room import Room, inside
+from scanprep.batch.workspace import KeptSteps, Task, Workspace
 from scanprep.dataset import RegisteredSet
 from scanprep.geometry.files import read_mesh, write_mesh
 from scanprep.geometry.landmarks import match_landmarks, read_landmark_vertices, read_landmarks, write_landmarks
 from scanprep.geometry.mesh import Mesh
 from scanprep.pipeline.prepare import SCANS, PrepareConfig, Prepared, prepare
 from scanprep.pipeline.scans import find_scans
-from scanprep.pipeline.template import TemplateConfig, make_template
 from scanprep.skeleton.find import SkeletonConfig
+from scanprep.surfaces.template import TemplateConfig, make_template
 from scanprep.synthetic.data_set import (
     SUBJECT,
     GroundTruth,

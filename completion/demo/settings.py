@@ -3,7 +3,7 @@ from __future__ import annotations
 
 import csv
 import io
-from dataclasses import asdict, dataclass, field
+from dataclasses import dataclass, field
 from pathlib import Path
 
 from model import LearnConfig
@@ -57,7 +57,7 @@ QUICK = DemoConfig(poses=8, subjects=3, faces=7000, resolution=0.011, template_r
 
 def write_settings(config: DemoConfig, rows: list[tuple[str, str, str, str]], folder: Path) -> None:
     """What the folder holds, and who is in the scans."""
-    storage.write_json(folder / "demo.json", storage.as_json(asdict(config)))
+    storage.write_json(folder / "demo.json", storage.as_json(config))
     text = io.StringIO()
     table = csv.writer(text, lineterminator="\n")
     table.writerow(["name", "subject", "pose", "sex"])

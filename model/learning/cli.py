@@ -10,7 +10,8 @@ from typing import Any, Literal
 import numpy as np
 
 from scanprep.batch.opening import FileWorkspace
-from scanprep.batch.steps import KeptSteps, Step, T, inside
+from scanprep.batch.room import Step, T, inside
+from scanprep.batch.workspace import KeptSteps
 from scanprep.cli import Output, Unit, read_poses
 from scanprep.console import Metric, Outcome, bar
 from scanprep.dataset import RegisteredSet

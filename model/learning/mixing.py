@@ -10,7 +10,7 @@ from dataclasses import asdict, dataclass, replace
 
 import numpy as np
 
-from scanprep.batch.steps import Step, once
+from scanprep.batch.room import Step, once
 from scanprep.geometry.mesh import Mesh, check_template
 from scanprep.skeleton.tree import Skeleton
 from scanprep.threads import one_thread

@@ -9,7 +9,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from scanprep.batch.steps import Step, inside, once
+from scanprep.batch.room import Step, inside, once
 from scanprep.geometry.mesh import Mesh, check_template
 from scanprep.meaning import HAND, extent, size, unit_problem
 from scanprep.skeleton.tree import Skeleton
@@ -77,7 +77,7 @@ def learn_scape(template: Mesh, poses: np.ndarray, shapes: np.ndarray | None, sk
     progress : callable, optional
         Called with the work done and the whole.
     step : callable, optional
-        Keeps what was worked out on the way, as `scanprep.batch.steps.Step`.
+        Keeps what was worked out on the way, as `scanprep.batch.room.Step`.
 
     Raises
     ------

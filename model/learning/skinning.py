@@ -6,7 +6,7 @@ from functools import partial
 
 import numpy as np
 
-from scanprep.batch.steps import Step, once
+from scanprep.batch.room import Step, once
 from scanprep.geometry.mesh import Mesh
 from scanprep.ranges import Count, Positive, Settings
 from scanprep.skeleton.tree import Skeleton
@@ -19,6 +19,7 @@ from ..fitting import FitConfig, PoseFitter, ShapeFitter
 from ..pose_space import kept_directions
 from ..shape_space import learn_shape_space
 from ..skinning import SkinningModel, unblended
+from .regression import ridge_operator
 from .scape import POSES, Progress, Work, checked_training, fit_poses, pose_examples, pose_prior
 
 RIDGES = (1e-4, 1e-3, 3e-3, 0.01, 0.03, 0.1, 0.3)      # penalties; the one that predicts left-out poses best is taken
@@ -236,7 +237,7 @@ def _regress(features: PoseFeatures, poses: np.ndarray, unposed: np.ndarray, act
         target, scale = unposed[:, mine].reshape(M, -1), freedom[joint[used]]
         centre, middle = delta[:, used].mean(axis=0) * scale, target.mean(axis=0)
         X = delta[:, used] * scale - centre
-        solver = np.linalg.solve(X.T @ X + (M * ridge + 1e-12) * np.eye(len(used)), X.T)
+        solver = ridge_operator(X, ridge)
         slope, hat = solver @ target, X @ solver + 1 / M
         left = (target - middle - X @ slope) / np.maximum(1 - np.diag(hat), 1e-6)[:, None]
         total += float((left**2).sum())

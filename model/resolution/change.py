@@ -20,8 +20,7 @@ from ..pose_space import PoseSpace, faces_of_part
 from ..scape import BlendScapeModel, ScapeModel
 from ..shape_space import ShapeSpace
 from ..skinning import SkinningModel
-from .distil import Distillation, Follower, Progress, enough_poses
-from .pieces import Piece, gradients_of, transfer_skeleton
+from .transfer import Distillation, Follower, Piece, Progress, enough_poses, gradients_of, transfer_skeleton
 
 POSES, SHAPE_POSES = 40, 8           # of the prior, in which both models are compared and the new one corrected
 

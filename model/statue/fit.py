@@ -6,7 +6,7 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from scanprep.batch.steps import Step, once
+from scanprep.batch.room import Step, once
 from scanprep.geometry.mesh import Mesh
 from scanprep.ranges import Settings
 

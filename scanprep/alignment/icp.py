@@ -34,20 +34,10 @@ class RigidConfig(Settings):
 
 @dataclass(frozen=True, eq=False)
 class RigidAlignment:
-    """A rigid (or similarity) transform that brings a source to its target.
+    """A rigid (or similarity) transform that brings a source to its target."""
 
-    Attributes
-    ----------
-    T_target_source : (4, 4) float
-    rms : float, metres
-        Of the distances of the inliers: to the planes of the target, or between landmarks.
-    inliers : int
-    converged : bool
-    iterations : int
-    """
-
-    T_target_source: np.ndarray
-    rms: float
+    T_target_source: np.ndarray     # (4, 4)
+    rms: float                      # metres, distances of inliers to the planes of the target, or between landmarks
     inliers: int
     converged: bool
     iterations: int

@@ -19,26 +19,13 @@ KIND, VERSION = "correspondences", 1
 
 @dataclass(frozen=True, eq=False)
 class Correspondences:
-    """Which vertex of the template lies where on the scan.
+    """Which vertex of the template lies where on the scan."""
 
-    Attributes
-    ----------
-    template_vertices : (C,) int
-    scan_points : (C, 3) float, metres
-    confidence : (C,) float
-        From 0, a guess, to 1, certain.
-    method : str
-        How they were found.
-    energies : dict
-        Terms of what was minimised, and other figures of the search.
-    converged : bool
-    """
-
-    template_vertices: np.ndarray
-    scan_points: np.ndarray
-    confidence: np.ndarray
-    method: str = ""
-    energies: dict[str, float] = field(default_factory=dict)
+    template_vertices: np.ndarray    # (C,) int
+    scan_points: np.ndarray          # (C, 3) metres
+    confidence: np.ndarray           # (C,) from 0, a guess, to 1, certain
+    method: str = ""                 # how they were found
+    energies: dict[str, float] = field(default_factory=dict)     # what was minimised, and other figures of the search
     converged: bool = True
 
     def __len__(self) -> int:
@@ -54,14 +41,14 @@ def checked_pairs(template: Mesh, vertices: np.ndarray, points: np.ndarray, name
                          f"of shape {vertices.shape}")
     if points.shape != (len(vertices), 3):
         raise ValueError(f"{name}: expected points of shape ({len(vertices)}, 3), got {points.shape}")
-    if len(vertices) < least:
-        raise ValueError(f"{name}: expected at least {least}, got {len(vertices)}")
+    if len(np.unique(vertices)) < least:
+        raise ValueError(f"{name}: expected at least {least} different ones, got {len(np.unique(vertices))}")
     outside = (vertices < 0) | (vertices >= len(template.vertices))
     if outside.any():
-        raise ValueError(f"{name}: vertex {vertices[outside][0]} is outside 0..{len(template.vertices) - 1}")
+        raise ValueError(f"{name}: expected vertices of 0..{len(template.vertices) - 1}, got {vertices[outside][0]}")
     if not np.isfinite(points).all():
-        raise ValueError(f"{name}: {(~np.isfinite(points).all(axis=1)).sum()} points are not finite")
-    return vertices, points
+        raise ValueError(f"{name}: expected finite points, {(~np.isfinite(points).all(axis=1)).sum()} are not finite")
+    return vertices.astype(np.int64), points
 
 
 def correspondences_problem(found: Correspondences) -> str | None:

@@ -217,5 +217,4 @@ def _write(path: Path, contents: Contents, precision: Precision, formats: dict[s
     data = _format(path, formats).encode(contents, precision == "double")
     if path.suffix.lower() == ".gz":
         data = gzip.compress(data, compresslevel=6, mtime=0)
-    with storage.writing(path) as beside:
-        beside.write_bytes(data)
+    storage.write(path, data)

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from .format_common import Contents, Lines, MeshFileError, polygons
+from .format_common import Contents, Lines, MeshFileError, polygons, text_rows, three_numbers
 
 
 def read(path: Path, data: bytes) -> Contents:
@@ -76,11 +76,8 @@ def _corners(lines: Lines, v_rows: list[int], f_rows: list[int]) -> tuple[np.nda
 
 def encode(contents: Contents, double: bool) -> bytes:
     """An OBJ file; colours, when there are any, behind the coordinates."""
-    digits = "%.12g" if double else "%.8g"
-    rows, form = contents.vertices, " ".join([digits] * 3)
+    form, columns = f"v {three_numbers(double)}", [contents.vertices]
     if contents.colors is not None:
-        rows, form = np.hstack([contents.vertices, contents.colors]), form + " %.4g %.4g %.4g"
-    text = (f"v {form}\n" * len(rows)) % tuple(rows.ravel().tolist())
-    if contents.faces is not None:
-        text += ("f %d %d %d\n" * len(contents.faces)) % tuple((contents.faces + 1).ravel().tolist())
-    return text.encode()
+        form, columns = form + " %.4g %.4g %.4g", [contents.vertices, contents.colors]
+    text = text_rows(form, *columns)
+    return (text if contents.faces is None else text + text_rows("f %d %d %d", contents.faces + 1)).encode()

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from .format_common import Contents, Lines, MeshFileError, as_bytes, polygons, quote
+from .format_common import Contents, Lines, MeshFileError, as_bytes, polygons, quote, text_rows, three_numbers
 from .format_ply import Element, Property, ascii_element
 
 
@@ -43,11 +43,9 @@ def read(path: Path, data: bytes) -> Contents:
 def encode(contents: Contents, double: bool) -> bytes:
     """An OFF file, or COFF where there are colours."""
     assert contents.faces is not None, "an OFF file is written for meshes"
-    n, f = len(contents.vertices), len(contents.faces)
-    form = " ".join(["%.12g" if double else "%.8g"] * 3)
-    rows = contents.vertices
+    kind, form, columns = "OFF", three_numbers(double), [contents.vertices]
     if contents.colors is not None:
-        rows, form = np.hstack([rows, as_bytes(contents.colors)]), form + " %d %d %d 255"
-    text = f"{'OFF' if contents.colors is None else 'COFF'}\n{n} {f} 0\n"
-    text += (form + "\n") * n % tuple(rows.ravel().tolist())
-    return (text + ("3 %d %d %d\n" * f) % tuple(contents.faces.ravel().tolist())).encode()
+        kind, form = "COFF", form + " %d %d %d 255"
+        columns.append(as_bytes(contents.colors))
+    return (f"{kind}\n{len(contents.vertices)} {len(contents.faces)} 0\n" + text_rows(form, *columns)
+            + text_rows("3 %d %d %d", contents.faces)).encode()

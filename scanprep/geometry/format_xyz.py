@@ -6,7 +6,7 @@ from pathlib import Path
 
 import numpy as np
 
-from .format_common import Contents, Lines, MeshFileError
+from .format_common import Contents, Lines, MeshFileError, text_rows, three_numbers
 
 
 def read(path: Path, data: bytes) -> Contents:
@@ -46,12 +46,9 @@ def _is_heading(line: bytes) -> bool:
 
 def encode(contents: Contents, double: bool) -> bytes:
     """Lines of coordinates, then normals, then colours 0..255."""
-    form = " ".join(["%.12g" if double else "%.8g"] * 3)
-    columns = [contents.vertices]
+    form, columns = three_numbers(double), [contents.vertices]
     if contents.normals is not None:
-        columns.append(contents.normals)
-        form += " %.7g %.7g %.7g"
+        form, columns = form + " %.7g %.7g %.7g", [*columns, contents.normals]
     if contents.colors is not None:
-        columns.append(255 * contents.colors)
-        form += " %.6g %.6g %.6g"
-    return (((form + "\n") * len(contents.vertices)) % tuple(np.hstack(columns).ravel().tolist())).encode()
+        form, columns = form + " %.6g %.6g %.6g", [*columns, 255 * contents.colors]
+    return text_rows(form, *columns).encode()

@@ -6,7 +6,7 @@ The caller gives the normal equations at a state; their structure solves for the
 - `Arrow`: many frames with unknowns of their own, coupled by those they share alone;
 - `Sparse`: one large problem with a sparse matrix.
 
-A step is added to the state, unless a `retract` says otherwise: `retract_pose` turns each rotation by its step.
+A step is added to the state, unless a `retract` says otherwise, as for rotations.
 """
 from __future__ import annotations
 
@@ -18,7 +18,7 @@ from typing import Any, Generic, NamedTuple, Protocol, TypeVar
 import numpy as np
 from scipy.sparse import csc_array, diags_array
 
-from . import rotations, sparse
+from . import sparse
 
 State = TypeVar("State")
 FLOOR = 1e-9                         # of the largest diagonal entry, added to all: some unknowns may have no data
@@ -136,20 +136,6 @@ def normal_equations(residuals: Sequence[Residual]) -> Dense:
     return Dense(cost, gradient, hessian)
 
 
-def retract_pose(angles: int) -> Callable[[np.ndarray, np.ndarray], np.ndarray]:
-    """A retract of rows (..., P) whose first unknowns are rotation vectors: `R exp(d)`, the rest by addition.
-
-    For equations whose derivatives are by `d` at zero. Rotation vectors come out at most π long.
-    """
-    def retract(x: np.ndarray, step: np.ndarray) -> np.ndarray:
-        out = x + step
-        R, d = (rotations.exp(part[..., :angles].reshape(-1, 3)) for part in (x, step))
-        out[..., :angles] = rotations.log(R @ d).reshape(out[..., :angles].shape)
-        return out
-
-    return retract
-
-
 @dataclass(frozen=True, eq=False)
 class Minimum(Generic[State]):
     """Where the search ended: the state, its equations, which of the B problems converged, and the steps tried."""
@@ -170,21 +156,9 @@ def levenberg_marquardt(equations: Callable[[State], NormalEquations], start: St
                         retract: Callable[[Any, np.ndarray], Any] = np.add) -> Minimum[State]:
     """The state of least energy near a start; a step is taken only where it lowers the energy.
 
-    Parameters
-    ----------
-    equations : state -> NormalEquations
-    start : state
-        (B, P) float for `Dense` and `Arrow`; whatever `retract` takes for `Sparse`.
-    iterations : int
-        Most steps tried.
-    tolerance : float
-        Stop when a step lowers the energy by less than this fraction.
-    damping : float
-        First factor on the diagonal of the matrix.
-    exact : float
-        Also stop when it lowers the energy by less than this.
-    retract : state, step -> state
-        What a step does to the state.
+    A state is (B, P) float for `Dense` and `Arrow`, for `Sparse` whatever `retract`, which does a step to it, takes.
+    The search stops after so many `iterations`, steps tried, or when a step lowers the energy by less than the fraction
+    `tolerance`, or by less than `exact`. `damping` is the first factor on the diagonal of the matrix.
     """
     x, now = start, equations(start)
     factor = np.full(len(now.energy), damping)

@@ -9,7 +9,7 @@ import numpy as np
 
 from ..geometry.format_glb import VERTICES, Glb, some_normal
 from ..geometry.mesh import Mesh
-from ..geometry.storage import writing
+from ..geometry.storage import write
 from .colors import decode
 
 # Turns that bring each axis to +y, the upward axis of glTF: quaternions x, y, z, w.
@@ -29,9 +29,7 @@ def write_animated_glb(path: str | Path, faces: np.ndarray, frames: np.ndarray, 
     Every key frame is a morph target with its own normals; the animation blends from one to the next. Nothing but the
     core of glTF is used. Of a longer motion `keys` evenly spaced frames are kept; the axis `up` points up.
     """
-    data = animated_glb(faces, frames, rate, colors, up, keys)
-    with writing(path) as beside:
-        beside.write_bytes(data)
+    write(path, animated_glb(faces, frames, rate, colors, up, keys))
 
 
 def animated_glb(faces: np.ndarray, frames: np.ndarray, rate: float, colors: np.ndarray | None = None, up: int = 2,

@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from ..geometry.storage import writing
+from ..geometry.storage import write
 from .sheets import png_bytes
 
 
@@ -100,8 +100,7 @@ class Page:
 
     def write(self, path: str | Path) -> None:
         """Write the page, whole or not at all."""
-        with writing(path) as beside:
-            beside.write_text(self.html(), encoding="utf-8")
+        write(path, self.html())
 
 
 def _figure(image: np.ndarray | bytes, caption: str, alt: str) -> str:

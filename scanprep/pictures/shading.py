@@ -29,8 +29,7 @@ class Solid:
     """A mesh and how it looks."""
 
     mesh: Mesh
-    # (3,), (N, 3) per vertex or (F, 3) per triangle, in [0, 1], optional; The mesh's own colours, else clay, when not
-    # given
+    # (3,), (N, 3) per vertex or (F, 3) per triangle, in [0, 1]; by default the mesh's own colours, else clay
     color: np.ndarray | Sequence[float] | None = None
     opacity: float = 1.0  # below 1 what lies behind shines through
     smooth: bool = True  # interpolate normals: false shows the single triangles
@@ -63,23 +62,10 @@ Shape = Mesh | Solid | Dots | Bones
 
 def render(shapes: Shape | Sequence[Shape], camera: Camera | None = None, width: int = 480, height: int = 640,
            ground: bool = False, background: Sequence[float] | None = WHITE, samples: int = 2) -> np.ndarray:
-    """A shaded picture.
+    """A shaded picture (height, width, 3) uint8, or (height, width, 4) when the background is None.
 
-    Parameters
-    ----------
-    shapes : Mesh, Solid, Dots, Bones, or a sequence of them
-    camera : Camera, optional
-        From the front, holding all meshes, when not given.
-    width, height : int, pixels
-    ground : bool
-        A soft shadow on the floor below the lowest point.
-    background : (3,) in [0, 1], or None for a transparent picture
-    samples : int
-        Each pixel is the mean of samples × samples rays.
-
-    Returns
-    -------
-    (height, width, 3) uint8, or (height, width, 4) when the background is transparent
+    The camera sees all meshes from their front when it is not given. `ground` is a soft shadow on the floor below the
+    lowest point; each pixel is the mean of samples × samples rays.
     """
     everything = [shapes] if isinstance(shapes, Shape) else list(shapes)
     if camera is None:
@@ -153,21 +139,13 @@ def _corner_colors(color: np.ndarray, mesh: Mesh) -> np.ndarray:
 
 def sphere(divisions: int) -> tuple[np.ndarray, np.ndarray]:
     """A unit sphere as an icosahedron whose triangles are cut in four `divisions` times."""
-    g = (1 + 5 ** 0.5) / 2
-    vertices = np.array([(-1, g, 0), (1, g, 0), (-1, -g, 0), (1, -g, 0), (0, -1, g), (0, 1, g), (0, -1, -g),
-                         (0, 1, -g), (g, 0, -1), (g, 0, 1), (-g, 0, -1), (-g, 0, 1)], dtype=float)
-    faces = np.array([(0, 11, 5), (0, 5, 1), (0, 1, 7), (0, 7, 10), (0, 10, 11),
-                      (1, 5, 9), (5, 11, 4), (11, 10, 2), (10, 7, 6), (7, 1, 8),
-                      (3, 9, 4), (3, 4, 2), (3, 2, 6), (3, 6, 8), (3, 8, 9), (4, 9, 5),
-                      (2, 4, 11), (6, 2, 10), (8, 6, 7), (9, 8, 1)])
+    import igl
+
+    vertices, faces = igl.icosahedron()
     for _ in range(divisions):
-        corners = vertices[faces]
-        a, b, c = (corners[:, i] + corners[:, (i + 1) % 3] for i in range(3))
-        p, q, r = corners.transpose(1, 0, 2)
-        quarters = np.concatenate([np.stack(t, axis=1) for t in ((p, a, c), (a, q, b), (c, b, r), (a, b, c))])
-        vertices, faces = quarters.reshape(-1, 3), np.arange(12 * len(faces)).reshape(-1, 3)
-        vertices = vertices / np.linalg.norm(vertices, axis=1, keepdims=True)
-    return vertices / np.linalg.norm(vertices, axis=1, keepdims=True), faces
+        vertices, faces = igl.upsample(vertices, faces)
+        vertices /= np.linalg.norm(vertices, axis=1, keepdims=True)
+    return vertices, faces
 
 
 def balls(points: np.ndarray, radius: float, divisions: int | None = None

@@ -10,8 +10,7 @@ import numpy as np
 from ..dataset import RegisteredSet, SetEntry
 from ..geometry.mesh import Mesh
 from ..pictures.page import Page, data_uri
-from .figures import ScanFigures, read_failures, read_figures
-from .review import Limits, Verdict, review
+from .figures import Limits, ScanFigures, Verdict, read_failures, read_figures, review
 
 PICTURES, PAGE = "pictures", "report.html"
 

@@ -7,8 +7,8 @@ import numpy as np
 from scipy.sparse import eye_array
 
 from ..geometry import rotations
+from ..geometry.farthest_points import thin
 from ..geometry.mesh import Mesh
-from ..geometry.thinning import thin
 from ..pictures.camera import Camera, upright
 from ..pictures.colors import heat
 from ..pictures.shading import CLAY, Dots, Shape, Solid, render

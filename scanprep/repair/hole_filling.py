@@ -8,12 +8,11 @@ from typing import Annotated, Any, Literal, NamedTuple, get_args
 import numpy as np
 
 from ..geometry.mesh import Mesh, template_problem
-from ..geometry.seen_space import SeenSpace
-from ..geometry.surface import Rays, Surface
+from ..geometry.surface import Rays, SeenSpace, Surface
 from ..ranges import FLAG, Count, Positive, Range, Settings
-from .boundary_loops import group_loops, joined_polygon
 from .hole_patch import Patch
 from .intersections import intersecting_faces
+from .loops import group_loops, joined_polygon
 from .manifold import repair, split_vertices
 from .volumetric_diffusion import EMPTY, diffused_surface
 

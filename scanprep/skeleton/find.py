@@ -7,7 +7,7 @@ from functools import partial
 
 import numpy as np
 
-from ..batch.steps import Step, once
+from ..batch.room import Step, once
 from ..geometry.mesh import Mesh, check_template
 from ..threads import one_thread
 from .joints import (
@@ -46,28 +46,14 @@ class OpenedLoop:
 
 @dataclass(frozen=True, eq=False)
 class SkeletonSearch:
-    """A skeleton and how it was found.
-
-    Attributes
-    ----------
-    skeleton : Skeleton
-    loops : tuple of OpenedLoop
-    symmetry : Symmetry
-        The best mirror symmetry of the body, whether it holds or not.
-    symmetric : bool
-        Whether left and right have the same parts by construction; only borders may differ, as far as the poses show.
-    energies : tuple of float
-        Of every restart, as a share of the squared size of the body.
-    parts : tuple of int
-        Number of parts that every restart ended with.
-    """
+    """A skeleton and how it was found."""
 
     skeleton: Skeleton
     loops: tuple[OpenedLoop, ...]
-    symmetry: Symmetry
-    symmetric: bool
-    energies: tuple[float, ...]
-    parts: tuple[int, ...]
+    symmetry: Symmetry               # the best mirror symmetry of the body, whether it holds or not
+    symmetric: bool                  # left and right have the same parts by construction, only borders may differ
+    energies: tuple[float, ...]      # of every restart, as a share of the squared size of the body
+    parts: tuple[int, ...]           # number of parts that every restart ended with
 
 
 def find_skeleton(template: Mesh, poses: np.ndarray, config: SkeletonConfig | None = None,
@@ -85,7 +71,7 @@ def find_skeleton(template: Mesh, poses: np.ndarray, config: SkeletonConfig | No
     config : SkeletonConfig, optional
     progress : callable(done, total), optional
     step : callable, optional
-        Keeps what was found on the way, as `scanprep.batch.steps.Step`.
+        Keeps what was found on the way, as `scanprep.batch.room.Step`.
 
     Returns
     -------

@@ -19,18 +19,8 @@ def name_parts(template: Mesh, skeleton: Skeleton, up: np.ndarray | None = None)
     A body counts as a person if it is symmetric with a tree that is, the parts in the middle form one chain that
     ends in a head, one pair of limbs hangs at its other end and one further up, every limb is a chain, and the legs go
     on where the trunk ends, as on somebody who stands. Left and right follow from the feet, whose soles are taken to
-    reach forward from the ankles. Any other body keeps the names it has.
-
-    Parameters
-    ----------
-    template : Mesh
-    skeleton : Skeleton
-    up : (3,) float, optional
-        Direction of the sky; then a person must also stand on the feet in it.
-
-    Returns
-    -------
-    tuple of J strings
+    reach forward from the ankles. Any other body keeps the names it has; with `up` (3,), the direction of the sky, also
+    a person who does not stand on the feet in it.
     """
     return names_by_symmetry(template, skeleton, find_symmetry(template), up)
 

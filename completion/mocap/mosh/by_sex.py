@@ -6,7 +6,7 @@ from dataclasses import dataclass, replace
 
 from model.body import BodyModel
 from model.learning.sexes import SexGuess, guess_sex, sex_plane
-from scanprep.batch.steps import Step, inside, once
+from scanprep.batch.room import Step, inside, once
 from scanprep.threads import one_thread
 
 from ..files.markers import MarkerSequence

@@ -10,7 +10,7 @@ import numpy as np
 
 from model.body import BodyModel
 from model.linear import Subject
-from scanprep.batch.steps import Step, inside, once
+from scanprep.batch.room import Step, inside, once
 from scanprep.ranges import Settings
 from scanprep.threads import one_thread
 

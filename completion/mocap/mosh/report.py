@@ -10,7 +10,8 @@ from typing import Any
 import numpy as np
 
 from model.body import BodyModel
-from scanprep.console import Metric, plain
+from scanprep.console import Metric
+from scanprep.geometry import storage
 from scanprep.pictures.page import Page
 from scanprep.pictures.shading import Dots, Shape, render, side_by_side
 
@@ -83,7 +84,7 @@ def take_page(take: Take, metrics: Sequence[Metric]) -> Page:
 def closing(page: Page, metrics: Sequence[Metric], settings: Mapping[str, Any]) -> Page:
     """The end of a page: all figures and the settings."""
     page.section("Figures").table(rows(list(metrics)), ("metric", "value", "unit"))
-    text = escape(json.dumps(plain(settings), indent=1))
+    text = escape(json.dumps(storage.as_json(settings), indent=1))
     return page.markup(f"<details><summary>All settings</summary><pre><code>{text}</code></pre></details>")
 
 

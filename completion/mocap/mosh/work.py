@@ -13,7 +13,7 @@ import numpy as np
 from model.body import BodyModel
 from model.learning.sexes import SexGuess
 from scanprep.batch.room import Room
-from scanprep.console import Metric, Outcome, plain, write_report
+from scanprep.console import Metric, Outcome, write_report
 from scanprep.geometry import storage
 from scanprep.pictures.camera import upright
 from scanprep.pictures.sheets import save_png
@@ -189,8 +189,8 @@ def _write_person(folder: Path, result: MoshResult, about: Mapping[str, Any]) ->
     person = result.person
     moved = dict(zip(result.layout.labels, person.moved.tolist(), strict=True))
     storage.write_json(folder / "subject.json", {
-        "betas": result.betas.tolist(), **plain(about), "frames": person.frames.tolist(), "moved": moved,
-        "residual": person.residual, "energies": plain(person.energies), "converged": bool(person.converged)})
+        "betas": result.betas.tolist(), **about, "frames": person.frames.tolist(), "moved": moved,
+        "residual": person.residual, "energies": person.energies, "converged": bool(person.converged)})
     result.layout.save(folder / "layout.json")
 
 

@@ -8,7 +8,7 @@ from functools import partial
 import numpy as np
 
 from model.body import BodyModel
-from scanprep.batch.steps import Step, once
+from scanprep.batch.room import Step, once
 from scanprep.geometry import rotations
 from scanprep.threads import one_thread
 

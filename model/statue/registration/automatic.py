@@ -6,10 +6,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.spatial import cKDTree
 
+from scanprep.geometry.farthest_points import thin
 from scanprep.geometry.format_common import UNITS
 from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.target import Target, target_of
-from scanprep.geometry.thinning import thin
 from scanprep.registration.nonrigid import Registration, register
 from scanprep.registration.schedule import RegistrationConfig
 from scanprep.threads import one_thread, search_threads

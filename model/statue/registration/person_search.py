@@ -10,12 +10,11 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from scanprep.geometry import rotations
+from scanprep.geometry.farthest_points import thin
 from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.surface import Surface
 from scanprep.geometry.target import Target, orient
-from scanprep.geometry.thinning import thin
-from scanprep.registration.energies import Pull, pull
-from scanprep.registration.matches import Described, Likeness, tukey
+from scanprep.registration.matches import Described, Likeness, Pull, pull, tukey
 
 from .articulated import Articulated, Points
 from .features import limb_angles, limbs
