@@ -44,8 +44,6 @@ class Reconstruction:
     def __call__(self, control_vertices: np.ndarray) -> np.ndarray:
         """(n, 3) metres, the detailed surface on control vertices (N, 3)."""
         v = np.asarray(control_vertices, dtype=np.float64)
-        if v.shape != self.control.mesh.vertices.shape:
-            raise ValueError(f"control_vertices: expected shape {self.control.mesh.vertices.shape}, got {v.shape}")
         n = self._normals(v)
         out = self._spread @ np.concatenate([v, n])
         if len(self._rotated):
