@@ -44,7 +44,7 @@ from .resolution.change import change_resolution as change_resolution
 from .scape import BlendScapeModel as BlendScapeModel
 from .scape import ScapeModel as ScapeModel
 from .skinning import SkinningModel as SkinningModel
-from .statue.control.humanoid import humanoid as humanoid
+from .statue.control.files import humanoid as humanoid
 from .statue.control.model import ControlModel as ControlModel
 from .statue.control.model import DisplacementMap as DisplacementMap
 from .statue.control.model import Statue as Statue

@@ -98,3 +98,12 @@ def mushroom(R):
     below = s > 0.25
     r, z = np.where(below, R * np.sin(polar), r), np.where(below, R * np.cos(polar), z)
     return Mesh(np.stack([r * np.cos(a), r * np.sin(a), z], axis=1), mesh.faces)
+
+
+BUMPY = 0.2                            # metres, mean radius
+
+
+def bumpy_radius(directions):
+    """Radius of a bumpy sphere in a direction (..., 3), unit."""
+    x, y, z = np.moveaxis(directions, -1, 0)
+    return BUMPY + 0.006 * np.sin(9 * x) * np.cos(7 * y) + 0.004 * np.sin(8 * z + 1)

@@ -21,8 +21,7 @@ from model.statue.control.chart import (
     make_chart,
     orientation,
 )
-from model.statue.control.files import read_control, write_control
-from model.statue.control.humanoid import STORED, humanoid, humanoid_markers
+from model.statue.control.files import STORED, humanoid, humanoid_markers, read_control, write_control
 from model.statue.control.model import control_problem
 from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.storage import StorageError

@@ -2,7 +2,7 @@
 import numpy as np
 import pytest
 
-from model.statue.control.humanoid import humanoid
+from model.statue.control.files import humanoid
 from model.statue.registration.articulated import Articulated, Points
 from model.statue.registration.automatic import find_features, likely_unit
 from model.statue.registration.clicks import MedialAxis

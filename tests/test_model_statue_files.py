@@ -10,7 +10,7 @@ from PIL import Image
 
 from model.export.rig import turn_up
 from model.statue.control.chart import Chart
-from model.statue.control.humanoid import humanoid
+from model.statue.control.files import humanoid
 from model.statue.detail.subdivision import subdivide
 from model.statue.detail.texels import chart_tangents, normal_image, vertex_of_row
 from model.statue.files import write_statue_glb, write_x3d

@@ -29,10 +29,9 @@ from ..cli import about, read_bodies
 from .config import LearnConfig
 from .mixing import MIX, learn_scape_mix
 from .parts import choose_skeleton
-from .scape import learn_blendscape, learn_scape, learning_problem
+from .scape import Progress, learn_blendscape, learn_scape, learning_problem
 from .sexes import learn_by_sex
 from .skinning import SkinConfig, learn_skinning
-from .work import Progress
 
 SEXES = "sexes.csv"                  # in a plain folder of shapes
 Kind = Literal["scape", "blendscape", "skinning", "mixed"]

@@ -24,9 +24,8 @@ from ..scape import ScapeModel
 from ..shape_space import ShapeSpace, learn_shape_space
 from .config import LearnConfig
 from .regression import Design, compress
-from .scape import check_skeleton, checked_bodies, fit_poses, pose_examples, pose_prior
+from .scape import Progress, Work, check_skeleton, checked_bodies, fit_poses, pose_examples, pose_prior
 from .within import choose_within, fit_within, held_out_bodies, number_people
-from .work import Progress, Work
 
 # what `learn_scape_mix` takes by default; `refinements` is the largest number of rounds
 MIX = LearnConfig(features="quadratic", ridges=(1e-4, 3e-4, 1e-3, 3e-3, 0.01, 0.03, 0.1), detail=0.005, refinements=6)

@@ -3,6 +3,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from operator import attrgetter
 
 import numpy as np
 
@@ -50,7 +51,7 @@ class Design:
             if self.regressor == "svr":
                 slope, mean = _support_vectors(X - centre, Q[:, faces], v_hat[faces], self.ridge)
             else:
-                slope = _ridge(X - centre, self.ridge) @ flat
+                slope = ridge_operator(X - centre, self.ridge) @ flat
             return np.concatenate([(mean - centre @ slope)[None], slope])
 
         return self.space(solve)
@@ -87,18 +88,15 @@ def choose_design(template: Mesh, skeleton: Skeleton, poses: np.ndarray, Q: np.n
     at = {name: values[len(values) // 2] for name, values in choices.items()}
     if start is not None:
         at = {name: getattr(start, name) for name in choices}
-    best: Design | None = None
+    def tried(**chosen: float) -> Design:
+        design = make_design(template, skeleton, poses, config, **{**at, **chosen})
+        return replace(design, left_out_error=judge(_left_out(design, poses, Q)))
+
+    best = tried()
     for name, values in choices.items():
-        for value in sorted(values, key=lambda v: v != at[name]):              # what stands already comes first
-            if best is not None and value == at[name]:
-                continue
-            tried = make_design(template, skeleton, poses, config, **{**at, name: value})
-            tried = replace(tried, left_out_error=judge(_left_out(tried, poses, Q)))
-            if best is None or tried.left_out_error < best.left_out_error:
-                best = tried
-        assert best is not None
+        others = [tried(**{name: value}) for value in values if value != at[name]]
+        best = min([best, *others], key=attrgetter("left_out_error"))          # of equals the one that stands already
         at[name] = getattr(best, name)
-    assert best is not None
     return best
 
 
@@ -159,7 +157,7 @@ def _groups(template: Mesh, features: PoseFeatures) -> list[tuple[int, np.ndarra
     return groups
 
 
-def _ridge(centred: np.ndarray, ridge: float) -> np.ndarray:
+def ridge_operator(centred: np.ndarray, ridge: float) -> np.ndarray:
     """(n, M) matrix that gives the slopes of a ridge regression on centred features (M, n)."""
     M, n = centred.shape
     if n <= M:
@@ -172,7 +170,7 @@ def _left_out(design: Design, poses: np.ndarray, Q: np.ndarray) -> np.ndarray:
     delta, out = design.features.evaluate(poses), np.empty_like(Q)
     for _, used, faces in design.groups:
         X = delta[:, used] - delta[:, used].mean(axis=0)
-        hat = X @ _ridge(X, design.ridge) + 1 / len(X)
+        hat = X @ ridge_operator(X, design.ridge) + 1 / len(X)
         target = Q[:, faces].reshape(len(X), -1)
         off = (target - hat @ target) / np.maximum(1 - np.diag(hat), 1e-6)[:, None]
         out[:, faces] = (target - off).reshape(len(X), len(faces), 3, 3)

@@ -2,13 +2,14 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from copy import copy
 from dataclasses import asdict, dataclass, replace
 from functools import partial
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
-from scanprep.batch.room import Step, once
+from scanprep.batch.room import Step, inside, once
 from scanprep.geometry.mesh import Mesh, check_template
 from scanprep.meaning import HAND, extent, size, unit_problem
 from scanprep.skeleton.tree import Skeleton
@@ -27,9 +28,34 @@ from ..scape import BlendScapeModel, ScapeModel
 from ..shape_space import ShapeSpace, learn_shape_space
 from .config import LearnConfig
 from .regression import Design, choose_design, compress
-from .work import Progress, Work
 
+Progress = Callable[[int, int], None]
+T = TypeVar("T")
 POSES = 2 / 3                        # of the time of learning, where there are people as well
+
+
+class Work:
+    """Steps of some work, each a share of the whole, of which progress is told in thousandths."""
+
+    def __init__(self, progress: Progress | None, step: Step = once) -> None:
+        self._progress, self._step, self._part, self._done = progress, step, 1.0, [0.0]
+
+    def tick(self, share: float) -> None:
+        """So much of this work is done."""
+        self._done[0] += share * self._part
+        if self._progress:
+            self._progress(round(1000 * self._done[0]), 1000)
+
+    def step(self, name: str, inputs: Any, share: float, make: Callable[[Work], T]) -> T:
+        """What `make` returns, or returned before for the same inputs; it is a share of this work either way.
+
+        `make` gets the work of its own steps, which are forgotten once it is done.
+        """
+        inner, end = copy(self), self._done[0] + share * self._part
+        inner._step, inner._part = inside(self._step, name), share * self._part
+        value = self._step(name, inputs, lambda: make(inner))
+        self.tick((end - self._done[0]) / self._part)
+        return value
 
 
 @one_thread()

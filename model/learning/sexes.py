@@ -1,7 +1,7 @@
 """Models of women, of men and of everybody, from one training set; and the plane that parts their betas."""
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -18,8 +18,7 @@ from ..digests import body_digests, digest
 from ..scape import ScapeModel
 from ..shape_space import ShapeSpace, learn_shape_space
 from .config import LearnConfig
-from .scape import POSES, checked_training, learn_pose, seen_in_training, shape_deformations
-from .work import Progress, Work
+from .scape import POSES, Progress, Work, checked_training, learn_pose, seen_in_training, shape_deformations
 
 SEXES = ("female", "male")
 PLANE = "sex_plane"                  # its place in a model's info
@@ -113,11 +112,6 @@ class SexPlane:
     accuracy: float
     slope: float
 
-    def margins(self, betas: np.ndarray) -> np.ndarray:
-        """(...,) signed distances of betas (..., k), k ≤ K, from the plane, in standard deviations of betas."""
-        betas = np.asarray(betas, dtype=np.float64)
-        return np.asarray(betas @ self.weights[:betas.shape[-1]] + self.bias)
-
     def kept(self) -> dict[str, Any]:
         """What a model keeps of it."""
         return {**vars(self), "weights": self.weights.tolist()}
@@ -136,12 +130,12 @@ class SexGuess:
 
 
 def learn_sex_plane(betas: np.ndarray, sexes: Sequence[str]) -> SexPlane:
-    """The plane of a linear support vector machine between betas (P, K) of women and men, at least two of each.
+    """The plane of a linear support vector machine between betas (P, K) of "female" and "male", at least two of each.
 
     How soft it is, is chosen by planes that have not seen a fifth of the people; of those that tell equally well the
     softest is taken. The first betas count, a third as many as people.
     """
-    betas, men = _checked(betas, sexes)
+    betas, men = np.asarray(betas, dtype=np.float64), np.array([sex == "male" for sex in sexes], dtype=bool)
     # three people for each beta that counts: with a beta a person everybody is like nobody else
     count, betas = betas.shape[1], betas[:, :max(1, len(betas) // 3)]
     tried = [(_unseen(betas, men, C), C) for C in SOFTNESS]
@@ -173,19 +167,6 @@ def _unseen(betas: np.ndarray, men: np.ndarray, C: float) -> np.ndarray:
     return margins
 
 
-def _checked(betas: np.ndarray, sexes: Sequence[str]) -> tuple[np.ndarray, np.ndarray]:
-    """Betas (P, K), and who is a man (P,)."""
-    betas, men = np.asarray(betas, dtype=np.float64), np.array([sex == "male" for sex in sexes], dtype=bool)
-    if betas.ndim != 2 or len(betas) != len(men) or not np.isfinite(betas).all():
-        raise ValueError(f"betas: expected finite numbers ({len(men)}, K), one row a person, got shape {betas.shape}")
-    other = sorted({sex for sex in sexes if sex not in ("female", "male")})
-    if other:
-        raise ValueError(f"sexes: expected 'female' or 'male', got {', '.join(map(repr, other))}")
-    if men.sum() < 2 or (~men).sum() < 2:
-        raise ValueError(f"sexes: expected two women and two men at least, got {(~men).sum()} and {men.sum()}")
-    return betas, men
-
-
 def _certainty(margins: np.ndarray, men: np.ndarray) -> float:
     """How fast the odds of a man grow with margins (P,)."""
     from sklearn.linear_model import LogisticRegression
@@ -212,7 +193,7 @@ def guess_sex(model: BodyModel, betas: np.ndarray) -> SexGuess:
     betas = np.asarray(betas, dtype=np.float64)
     if betas.ndim != 1 or len(betas) > len(plane.weights) or not np.isfinite(betas).all():
         raise ValueError(f"betas: expected at most {len(plane.weights)} finite numbers, got shape {betas.shape}")
-    margin = float(plane.margins(betas))
+    margin = float(betas @ plane.weights[:len(betas)] + plane.bias)
     sure = 1 / (1 + np.exp(-plane.slope * abs(margin)))
     return SexGuess("male" if margin > 0 else "female", margin, float(sure))
 
@@ -224,15 +205,10 @@ def sex_plane(model: BodyModel) -> SexPlane:
         raise ValueError("model: it keeps nothing that tells women from men; learn one of both sexes with "
                          "learn_by_sex (scape learn --by-sex)")
     try:
-        return plane_of(kept, model.n_betas)
+        weights = np.array(kept["weights"], dtype=np.float64)
+        numbers = {name: float(kept[name]) for name in ("bias", "accuracy", "slope")}
+        if weights.shape != (model.n_betas,) or not np.isfinite([*weights, *numbers.values()]).all():
+            raise ValueError(f"expected {model.n_betas} finite weights, found shape {weights.shape}")
+        return SexPlane(weights, count=int(kept["count"]), **numbers)
     except (KeyError, TypeError, ValueError) as error:
         raise ValueError(f"model: what tells women from men is damaged ({error})") from None
-
-
-def plane_of(kept: Mapping[str, Any], n_betas: int) -> SexPlane:
-    """The plane that `SexPlane.kept` wrote, or the error of what it lacks."""
-    weights = np.array(kept["weights"], dtype=np.float64)
-    numbers = {name: float(kept[name]) for name in ("bias", "accuracy", "slope")}
-    if weights.shape != (n_betas,) or not np.isfinite([*weights, *numbers.values()]).all():
-        raise ValueError(f"expected {n_betas} finite weights, found shape {weights.shape}")
-    return SexPlane(weights, count=int(kept["count"]), **numbers)

@@ -3,6 +3,7 @@ from __future__ import annotations
 
 from dataclasses import asdict, dataclass, replace
 from functools import partial
+from operator import itemgetter
 
 import numpy as np
 
@@ -19,8 +20,8 @@ from ..fitting import FitConfig, PoseFitter, ShapeFitter
 from ..pose_space import kept_directions
 from ..shape_space import learn_shape_space
 from ..skinning import SkinningModel, unblended
-from .scape import POSES, checked_training, fit_poses, pose_examples, pose_prior
-from .work import Progress, Work
+from .regression import ridge_operator
+from .scape import POSES, Progress, Work, checked_training, fit_poses, pose_examples, pose_prior
 
 RIDGES = (1e-4, 1e-3, 3e-3, 0.01, 0.03, 0.1, 0.3)      # penalties; the one that predicts left-out poses best is taken
 LEVELS = 8                           # of how freely a joint corrects a vertex: vertices of one level share a solve
@@ -98,7 +99,7 @@ def learn_skinning(template: Mesh, poses: np.ndarray, shapes: np.ndarray | None,
 def _start(template: Mesh, skeleton: Skeleton, config: SkinConfig) -> SkinningModel:
     """The template itself, with weights that pass smoothly from part to part, and no correctives."""
     J, N = len(skeleton.parents), len(template.vertices)
-    constants = PoseFeatures(skeleton, LinearLift(), np.arange(J), np.zeros((J, 3, J)))
+    constants = corrective_features(skeleton, np.zeros((1, J, 3)), False)
     weights = strongest(diffused_weights(template, skeleton, config.width), config.parts, 1e-3)
     return SkinningModel(template, skeleton, template.vertices, weights, constants, np.zeros((0, N, 3), np.float32),
                          template.vertices, np.zeros((0, N, 3), np.float32), np.zeros(0), 0.0,
@@ -185,10 +186,9 @@ def _with_correctives(model: SkinningModel, poses: np.ndarray, bodies: np.ndarra
     unposed = np.stack([_unposed(model, p, y) for p, y in zip(poses, bodies, strict=True)])
     features = corrective_features(model.skeleton, poses, config.correctives)
     joints = _acting_joints(model)
-    errors = [_regress(features, poses, unposed, joints, ridge)[2] for ridge in RIDGES] \
-        if features.count > len(features.starts) else [0.0]
-    ridge = RIDGES[int(np.argmin(errors))]
-    rest, correctives, error = _regress(features, poses, unposed, joints, ridge)
+    ridges = RIDGES if features.count > len(features.starts) else RIDGES[:1]
+    tried = [(ridge, *_regress(features, poses, unposed, joints, ridge)) for ridge in ridges]
+    ridge, rest, correctives, error = min(tried, key=itemgetter(-1))
     moved = _with_joints_at(replace(model, rest=rest), model.joint_regressor @ model.rest)
     return replace(moved, features=replace(features, skeleton=moved.skeleton), correctives=correctives,
                    info={"ridge": ridge, "left_out_error": error})
@@ -237,7 +237,7 @@ def _regress(features: PoseFeatures, poses: np.ndarray, unposed: np.ndarray, act
         target, scale = unposed[:, mine].reshape(M, -1), freedom[joint[used]]
         centre, middle = delta[:, used].mean(axis=0) * scale, target.mean(axis=0)
         X = delta[:, used] * scale - centre
-        solver = np.linalg.solve(X.T @ X + (M * ridge + 1e-12) * np.eye(len(used)), X.T)
+        solver = ridge_operator(X, ridge)
         slope, hat = solver @ target, X @ solver + 1 / M
         left = (target - middle - X @ slope) / np.maximum(1 - np.diag(hat), 1e-6)[:, None]
         total += float((left**2).sum())

@@ -26,18 +26,24 @@ from scanprep.ranges import Positive
 from ..export.cli import read_motion
 from ..files import load_model
 from .cli import LevelArg, MotionArg, StatueArg
-from .control.files import read_control
-from .control.humanoid import humanoid
+from .control.files import humanoid, read_control
 from .control.model import ControlModel, Statue
 from .detail.displacement import DisplacementConfig, coverage_shares
-from .detail.errors import Level, adaptive_level, in_folds, inverted_triangles, measured_levels, remaining_error
-from .detail.reconstruction import Reconstruction, displaced_surface
+from .detail.reconstruction import (
+    Level,
+    Reconstruction,
+    adaptive_level,
+    displaced_surface,
+    in_folds,
+    inverted_triangles,
+    measured_levels,
+    remaining_error,
+)
 from .detail.subdivision import Subdivision, subdivide, subdivide_adaptive
 from .detail.texels import bake_texture, scan_look
 from .files import load_statue, save_statue, write_body, write_for_programs, write_statue_glb
 from .fit import FittedStatue, StatueConfig, fit_statue
-from .motion.follow import follower_of
-from .motion.motions import read_statue_motion, write_motion
+from .motion.motions import follower_of, read_statue_motion, write_motion
 from .registration.automatic import likely_unit
 from .registration.clicks import read_features
 from .report import in_motion, motion_pictures, parts_without_data, statue_page, statue_picture
@@ -120,14 +126,16 @@ def write_statue(folder: Path, name: str, scan: Mesh, statue: FittedStatue, rows
     write_mesh(folder / "reconstruction.ply", levels[-1].mesh)
     write_body(folder, statue)
     write_for_programs(folder, statue, levels[-1].mesh.vertices, fine, statue.upright_axis)
+    stored = sum((folder / file).stat().st_size for file in ("control.npz", "displacement.png", "coverage.png"))
     problem = statue_problem(statue)
     rows = [*([Metric("problem", problem)] if problem else []), *rows, *_of_the_fit(statue),
-            *_of_the_map(statue, scan, levels, adaptive, fine), *_sizes(folder, scan)]
+            *_of_the_map(statue, scan, levels, adaptive, fine),
+            Metric("control model and map on disk", stored / 1e6, "MB"),
+            Metric("scan on disk as binary PLY", (12 * len(scan.vertices) + 13 * len(scan.faces)) / 1e6, "MB")]
     picture = statue_picture(scan, statue, levels[-1])
     save_png(folder / "picture.png", picture)
-    page = statue_page(name, scan, statue, levels, [(m.name, m.value, m.unit) for m in rows], adaptive,
-                       in_motion(statue), picture)
-    page.write(folder / "report.html")
+    statue_page(name, scan, statue, levels, [(m.name, m.value, m.unit) for m in rows], adaptive, in_motion(statue),
+                picture).write(folder / "report.html")
     return rows
 
 
@@ -195,12 +203,6 @@ def _of_the_map(statue: Statue, scan: Mesh, levels: list[Level], adaptive: Level
             Metric("triangles of the adaptive subdivision", len(adaptive.mesh.faces)),
             Metric(f"inverted triangles at {levels[-1].name}", len(inverted)),
             Metric("of these outside folds and holes", int(outside.sum()))]
-
-
-def _sizes(folder: Path, scan: Mesh) -> list[Metric]:
-    stored = sum((folder / name).stat().st_size for name in ("control.npz", "displacement.png", "coverage.png"))
-    return [Metric("control model and map on disk", stored / 1e6, "MB"),
-            Metric("scan on disk as binary PLY", (12 * len(scan.vertices) + 13 * len(scan.faces)) / 1e6, "MB")]
 
 
 def reconstruct(statue: StatueArg, output: Output, level: LevelArg = 3, tolerance: Positive | None = None,

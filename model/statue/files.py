@@ -18,8 +18,7 @@ from ..export.rig import Rig, turn_up
 from ..features import linear_features
 from ..skinning import SkinningModel
 from .control.chart import Chart
-from .control.files import read_control, write_control
-from .control.humanoid import humanoid, humanoid_markers
+from .control.files import humanoid, humanoid_markers, read_control, write_control
 from .control.model import ControlModel, Statue
 from .detail.maps import read_map, write_map
 from .detail.subdivision import Subdivision, subdivide
@@ -61,16 +60,12 @@ def load_statue(folder: str | Path, edited: str | Path | None = None) -> Statue:
     """
     from PIL import Image
 
-    folder = Path(folder)
+    folder, texture = Path(folder), None
     about = storage.read_json(folder / ABOUT, "a folder of scape statue fit")
-    if not isinstance(about, dict) or about.get("kind") != KIND:
-        raise storage.StorageError(f"{folder / ABOUT}: expected a statue in JSON, found something else")
-    if about.get("version") != VERSION:
-        raise storage.StorageError(f"{folder / ABOUT}: statue version {about.get('version')} is not known here "
-                                   f"(known: {VERSION})")
     control = read_control(folder / CONTROL)
-    texture = None
     with storage.taking_apart(folder / ABOUT, "a whole statue"):
+        if not isinstance(about, dict) or (about.get("kind"), about.get("version")) != (KIND, VERSION):
+            raise ValueError(f"no statue of the version that is known here, {VERSION}")
         pose = storage.numbers({"pose": np.array(about["pose"], dtype=np.float64)}, "pose",
                                len(control.skeleton.parents), 3)
     if about.get("texture"):

@@ -13,10 +13,9 @@ from scanprep.pictures.page import Page
 from scanprep.pictures.shading import Bones, Dots, Shape, Solid, color_bar, heat, part_colors, render, side_by_side
 from scanprep.synthetic.people import named_pose, walk
 
-from .control.humanoid import humanoid
+from .control.files import humanoid
 from .control.model import FOLDED, HOLE, MEASURED, OUTSIDE, DisplacementMap, Statue
-from .detail.errors import Level
-from .detail.reconstruction import Reconstruction, coverage_at
+from .detail.reconstruction import Level, Reconstruction, coverage_at
 from .detail.subdivision import subdivide
 from .motion.motions import people_motion
 

@@ -18,8 +18,7 @@ from model import LearnConfig
 from model.blending import BlendedTemplate, rigid_weights
 from model.fitting import PoseFitter
 from model.learning.parts import coarse_copy, coarse_skeleton
-from model.learning.scape import learn_pose
-from model.learning.work import Work
+from model.learning.scape import Work, learn_pose
 from scanprep.skeleton.tree import Skeleton
 
 SETTINGS = {

@@ -1,7 +1,9 @@
-"""Files of control models: our own, and skinned meshes of other programs."""
+"""Files of control models: our own, the generic humanoid among them, and skinned meshes of other programs."""
 from __future__ import annotations
 
+import json
 from dataclasses import dataclass, replace
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -257,3 +259,24 @@ def _with_triangles(mesh: Mesh, weights: np.ndarray, parents: np.ndarray
     gathered = np.zeros((len(weights), len(kept)))
     np.add.at(gathered.T, index[heir], weights.T)
     return np.array(kept), np.array([-1 if j == root else index[above[j]] for j in kept]), gathered, index[carrier]
+
+
+STORED = Path(__file__).with_name("humanoid.npz")           # made by tests/humanoid_maker.py
+
+
+@lru_cache(maxsize=1)
+def humanoid() -> ControlModel:
+    """The generic humanoid, the average of a man and a woman of 1.69 m, arms and legs a little apart.
+
+    z is up, it faces -y and stands on z = 0, its left side is at +x. Its joints turn and its segments stretch as in the
+    paper: with the place of the root 38 parameters of pose, and 9 lengths.
+
+    [Statues] Section 3.1
+    """
+    return read_control(STORED)
+
+
+@lru_cache(maxsize=1)
+def humanoid_markers() -> dict[str, int]:
+    """Label -> vertex of 41 motion-capture markers, labelled as in the CMU recordings."""
+    return dict(json.loads(STORED.with_name("humanoid_markers.json").read_text(encoding="utf-8")))

@@ -1,8 +1,7 @@
 """The displacement map of a scan over a control model, and where the scan is not one-to-one with it [Statues].
 
-Every pixel is a place of the control mesh; its height is where the interpolated normal there crosses the scan: Eq. 19
-solved at the pixel itself. The paper solves it at the scan's vertices and interpolates between them, which is the
-same where the scan's triangles are small against the control mesh's, and depends on their shape where they are not.
+Every pixel's height is where the interpolated normal there crosses the scan: Eq. 19 at the pixel itself. The paper
+solves it at the scan's vertices and interpolates, which is the same where the scan's triangles are small.
 """
 from __future__ import annotations
 

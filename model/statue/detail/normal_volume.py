@@ -1,12 +1,8 @@
 """Space around a control mesh: a triangle, a place on it and a height along its interpolated normal [Statues].
 
-The normals of a triangle's corners are interpolated linearly and not made unit length again, as in Eq. 20: only so is a
-point of the volume a linear function of its place for a given height, and heights are what the corners' normals say.
-
-The paper finds the height from the plane that is parallel to the triangle and passes through the point and a
-displaced corner. That is exact only where the three corners' normals rise equally fast above the triangle.
-Eliminating the place from Eq. 19 instead says that the point lies in the plane of the three corners
-displaced by d, det[v_r + d n_r - p, v_s + d n_s - p, v_t + d n_t - p] = 0: a cubic in d, solved here.
+Normals are interpolated linearly and not made unit length again, as in Eq. 20. Eq. 19 without its place says that a
+point lies in the plane of three corners displaced by d, det[v_r + d n_r - p, v_s + d n_s - p, v_t + d n_t - p] = 0: a
+cubic in d, solved here; the paper's plane parallel to the triangle is exact only where three normals rise alike.
 """
 from __future__ import annotations
 

@@ -1,8 +1,7 @@
 """Fit of a control mesh to a scan: a shape-constrained deformable surface under annealed soft assignment.
 
-Beyond the paper: points of the scan draw the mesh as well (`cover`), without which it leaves tips of limbs empty; at
-the end vertices are drawn to the surface between the points (`polish`); at the edge of a hole the data draw only across
-the surface, and beyond it not at all. `SurfaceFitConfig.published()` has nothing of the first two.
+Beyond the paper, points of the scan draw the mesh as well (`cover`), at the end vertices are drawn to the surface
+between the points (`polish`), and at the edge of a hole the data draw only across the surface.
 
 [Statues] section 4
 """
