@@ -20,12 +20,6 @@ from .console import PROBLEM, Metric, Outcome, say, show, write_report
 from .threads import one_thread
 
 OUTPUTS, SPACE, FORCE = ("output", "out"), "space", "force"     # parameters of commands that are dealt with here
-FORCE_HELP = "\n    force: Do all anew, whatever is done already."
-CONFIG_HELP = """
-    config: TOML file with settings that have no flag.
-    write_config: Print such a file, with the values in force and what each setting means, and do nothing else."""
-PRESET_HELP = "\n    preset: Where settings begin: ours, or the values of the paper."
-WRITE_CONFIG = "--write-config"
 TRACEBACK = "SCAPEKIT_TRACEBACK"       # environment variable that shows where an error came from
 
 
@@ -72,7 +66,7 @@ def settings_file(function: Callable[..., Outcome], argv: list[str]) -> str | No
     """The file of settings that `--write-config` asks for, or None where it does not."""
     found = {p.name: p.default for p in inspect.signature(function).parameters.values()
              if isinstance(p.default, ranges.Settings)}
-    return config_files.write(_Settings(found, argv).values) if found and WRITE_CONFIG in argv else None
+    return config_files.write(_Settings(found, argv).values) if found and "--write-config" in argv else None
 
 
 class _Settings:
@@ -110,8 +104,13 @@ class _Settings:
         """What the docstring of the command says of them."""
         if not self.values:
             return ""
-        told = "".join(f"\n    {name}: {flag.sentence}" for name, flag in config_files.flags(self.values).items())
-        return told + (PRESET_HELP if self.presets else "") + CONFIG_HELP
+        told = {name: flag.sentence for name, flag in config_files.flags(self.values).items()}
+        if self.presets:
+            told["preset"] = "Where settings begin: ours, or the values of the paper."
+        told["config"] = "TOML file with settings that have no flag."
+        told["write_config"] = ("Print such a file, with the values in force and what each setting means, and do "
+                                "nothing else.")
+        return "".join(f"\n    {name}: {sentence}" for name, sentence in told.items())
 
     def taken_from(self, given: dict[str, Any]) -> dict[str, Any]:
         """The arguments of the command's function: settings in place of flags."""
@@ -151,8 +150,8 @@ class _Call:
             given.apply_defaults()
             return given.arguments
 
-        collect.__doc__ = (inspect.getdoc(function) or "") + self.settings.help() + (
-            FORCE_HELP if self.output_name else "")
+        force = "\n    force: Do all anew, whatever is done already." if self.output_name else ""
+        collect.__doc__ = (inspect.getdoc(function) or "") + self.settings.help() + force
         collect.__annotations__ = {p.name: p.annotation for p in shown}
         collect.__signature__ = signature                            # type: ignore[attr-defined]
         self.given = self.settings.taken_from(

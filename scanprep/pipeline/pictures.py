@@ -20,7 +20,6 @@ TURN = 20.0                 # degrees from the front
 BALL = 0.013                # of the template's size: radius of the balls that stand for points
 
 PANELS = ("the scan", "the template on it", "distance, front", "distance, back", "dark: not sure")
-UNSURE = "Blues"            # another map than that of the distances
 
 
 def strip(template: Mesh, scan: Mesh | np.ndarray, fit: Registration) -> bytes:
@@ -36,7 +35,7 @@ def strip(template: Mesh, scan: Mesh | np.ndarray, fit: Registration) -> bytes:
     size = float(np.sqrt(template.face_areas.sum()))
     far = Solid(body, heat(evened(body, fit.distances), 0, FAR * size))
     shown = [(_scan(scan, R, middle, size), near), (Solid(body, CLAY), near), (far, near), (far, back),
-             (Solid(body, heat(1 - fit.confidence, -0.35, 1, UNSURE)), near)]
+             (Solid(body, heat(1 - fit.confidence, -0.35, 1, "Blues")), near)]      # unlike the distances
     return webp_bytes(np.concatenate([render(shape, camera, WIDTH, HEIGHT) for shape, camera in shown], axis=1))
 
 
