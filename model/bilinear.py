@@ -45,3 +45,36 @@ class ShapedPoints:
     def _flat(self) -> np.ndarray:
         K, M, L, _ = self.shape_basis.shape
         return np.ascontiguousarray(self.shape_basis.transpose(1, 3, 0, 2)).reshape(3 * M, K * L)
+
+
+@dataclass(frozen=True, eq=False)
+class PosedPoints:
+    """Points as a function of unknowns x = (pose (3J), trans (3), betas (K)); no betas for a known shape."""
+
+    source: PointOperator | ShapedPoints
+
+    @property
+    def J3(self) -> int:
+        """Three times the number of parts."""
+        return 3 * len(self.source.terms.skeleton.parents)
+
+    @property
+    def n_unknowns(self) -> int:
+        """P."""
+        return self.J3 + 3 + (len(self.source.shape_basis) if isinstance(self.source, ShapedPoints) else 0)
+
+    def positions(self, x: np.ndarray) -> np.ndarray:
+        """(L, 3) metres."""
+        return self._operator(x).evaluate(x[:self.J3].reshape(-1, 3), x[self.J3:self.J3 + 3])
+
+    def columns(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """Positions (L, 3) and their derivatives (P, L, 3)."""
+        pose = x[:self.J3].reshape(-1, 3)
+        y, by_pose = self._operator(x).columns(pose, x[self.J3:self.J3 + 3])
+        blocks = [by_pose, np.broadcast_to(np.eye(3)[:, None], (3, *y.shape))]
+        if isinstance(self.source, ShapedPoints):
+            blocks.append(np.moveaxis(self.source.shape_jacobian(pose), -1, 0))
+        return y, np.concatenate(blocks)
+
+    def _operator(self, x: np.ndarray) -> PointOperator:
+        return self.source if isinstance(self.source, PointOperator) else self.source.operator(x[self.J3 + 3:])

@@ -15,7 +15,7 @@ from scanprep.geometry.least_squares import Dense, Minimum, levenberg_marquardt
 from scanprep.ranges import Count, Settings
 from scanprep.threads import one_thread
 
-from .bilinear import ShapedPoints
+from .bilinear import PosedPoints, ShapedPoints
 from .body import BodyModel
 from .features import twists
 from .linear import PointOperator, Subject
@@ -105,7 +105,7 @@ class PoseFitter:
         J = len(subject.skeleton.parents)
         best: Minimum[np.ndarray] | None = None
         for x in _starts(subject, vertices) if start is None else [_placed(subject, vertices, start)]:
-            found = _solved(_pose_equations(self._sample, vertices[chosen]), x[None], J, config.iterations,
+            found = _solved(_equations(self._sample, vertices[chosen]), x[None], J, config.iterations,
                             config.tolerance)
             if best is None or found.energy[0] < best.energy[0]:
                 best = found
@@ -114,7 +114,7 @@ class PoseFitter:
         assert best is not None
         steps = best.iterations
         if len(chosen) < subject.n_vertices and config.polish:
-            best = _solved(_pose_equations(self._everything, vertices), best.x, J, config.polish, config.tolerance)
+            best = _solved(_equations(self._everything, vertices), best.x, J, config.polish, config.tolerance)
             steps += best.iterations
         pose, trans = best.x[0, :3 * J].reshape(J, 3), best.x[0, 3 * J:]
         fitted = np.asarray(subject.vertices(pose, trans), dtype=np.float64)
@@ -174,7 +174,7 @@ class ShapeFitter:
         start = start or self._mean_person.fit(vertices)
         betas = start.betas[:K] if isinstance(start, ShapeFit) else np.zeros(K)
         x = np.concatenate([start.pose.ravel(), start.trans, betas])
-        best = _solved(_shape_equations(self._points, vertices[self._chosen], np.sqrt(self._share)), x[None], J,
+        best = _solved(_equations(self._points, vertices[self._chosen], self._share), x[None], J,
                        config.iterations, config.tolerance)
         x, converged, steps = best.x[0], bool(best.converged[0]), best.iterations
         if len(self._chosen) < len(vertices) and config.polish:
@@ -226,34 +226,18 @@ def _solved(equations: Callable[[np.ndarray], Dense], x: np.ndarray, J: int, ite
     return levenberg_marquardt(equations, x, iterations, tolerance, exact=EXACT, retract=retract)
 
 
-def _pose_columns(operator: PointOperator, target: np.ndarray, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Residual (3L,) of the points at x (3J + 3,) against their targets (L, 3), and its derivatives (3J + 3, 3L)."""
-    J3 = 3 * len(operator.terms.skeleton.parents)
-    place = np.broadcast_to(np.eye(3)[:, None], (3, operator.count, 3)).reshape(3, -1)
-    y, columns = operator.columns(x[:J3].reshape(-1, 3), x[J3:])
-    return (y - target).ravel(), np.concatenate([columns.reshape(J3, -1), place])
-
-
-def _pose_equations(operator: PointOperator, target: np.ndarray) -> Callable[[np.ndarray], Dense]:
-    """The normal equations of pose and place, for points that are to be at their targets (L, 3)."""
-    return lambda x: _dense(*_pose_columns(operator, target, x[0]))
-
-
-def _shape_equations(points: ShapedPoints, target: np.ndarray, weights: np.ndarray) -> Callable[[np.ndarray], Dense]:
-    """As `_pose_equations`, with betas behind pose and place; residuals are times the weights (L,) of their points."""
-    J3, each = 3 * len(points.terms.skeleton.parents), np.repeat(weights, 3)
+def _equations(points: PointOperator | ShapedPoints, target: np.ndarray, weights: np.ndarray | None = None
+               ) -> Callable[[np.ndarray], Dense]:
+    """The normal equations of points that are to be at their targets (L, 3), times the roots (L,) of their weights."""
+    posed = PosedPoints(points)
+    root = np.ones((len(target), 1)) if weights is None else np.sqrt(weights)[:, None]
 
     def equations(x: np.ndarray) -> Dense:
-        residual, columns = _pose_columns(points.operator(x[0, J3 + 3:]), target, x[0, :J3 + 3])
-        by_shape = np.moveaxis(points.shape_jacobian(x[0, :J3].reshape(-1, 3)), -1, 0)
-        return _dense(each * residual, each * np.concatenate([columns, by_shape.reshape(len(by_shape), -1)]))
+        y, columns = posed.columns(x[0])
+        residual, columns = (root * (y - target)).ravel(), (root * columns).reshape(posed.n_unknowns, -1)
+        return Dense(np.array([residual @ residual]), (columns @ residual)[None], (columns @ columns.T)[None])
 
     return equations
-
-
-def _dense(residual: np.ndarray, columns: np.ndarray) -> Dense:
-    """One problem from residuals (m,) and their derivatives (P, m)."""
-    return Dense(np.array([residual @ residual]), (columns @ residual)[None], (columns @ columns.T)[None])
 
 
 def _polished(model: BodyModel, target: np.ndarray, x: np.ndarray, matrix: np.ndarray, config: FitConfig

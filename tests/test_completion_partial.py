@@ -112,7 +112,7 @@ def test_a_scan_turned_and_moved_gives_the_body_turned_and_moved(model, known):
 @pytest.mark.parametrize("change, message", [
     (lambda v, p: (v[:2], p[:2]), "at least 3 different ones, got 2"),
     (lambda v, p: (np.r_[v[:6], 9999], p), "expected vertices of 0..397"),
-    (lambda v, p: (v, p[:5]), "expected .L,. vertices and .L, 3. points"),
+    (lambda v, p: (v, p[:5]), "expected points of shape .7, 3."),
     (lambda v, p: (v.astype(float), p), "expected vertex numbers"),
     (lambda v, p: (v, 1000 * p), "expected the scan in metres"),
     (lambda v, p: (v, np.where(np.arange(7)[:, None] == 3, np.nan, p)), "expected finite points"),

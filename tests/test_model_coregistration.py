@@ -19,9 +19,9 @@ from model_bodies import random_poses, worm_model
 
 import model.coregistration.rounds as rounds_module
 from model import ModelRegistration, coregister, learn_scape, load_model, register_with_model
+from model.bilinear import PosedPoints
 from model.coregistration.attraction import apart, attraction, towards
 from model.coregistration.modelfit import ModelFit
-from model.coregistration.posed import posed_points
 from model.priors import typical_poses, whitening
 from scanprep import RegisteredSet, write_mesh
 from scanprep.batch.digests import Digests
@@ -158,8 +158,9 @@ def test_what_faces_away_does_not_explain(body):
 @pytest.mark.parametrize("known", [True, False], ids=["subject", "betas"])
 def test_derivatives_agree_with_finite_differences(known):
     worm = worm_model()
-    points = posed_points(worm.subject([1.0, 0, 0]) if known else worm, np.array([3, 50, 200, 390]), 3)
-    x = np.random.default_rng(2).normal(0, 0.4, points.J3 + 3 + points.n_betas)
+    body = worm.subject([1.0, 0, 0]) if known else worm
+    points = PosedPoints(body.points(np.array([3, 50, 200, 390])))
+    x = np.random.default_rng(2).normal(0, 0.4, points.n_unknowns)
     y, columns = points.columns(x)
     np.testing.assert_allclose(y, points.positions(x), atol=1e-12)
     for k in range(len(x)):
@@ -402,7 +403,7 @@ def contents(folder):
 @pytest.mark.parametrize("given, words", [
     ({"start": np.zeros((4, 3))}, "start: expected"),
     ({"landmarks": (np.array([5000]), np.zeros((1, 3)))}, "0..821"),
-    ({"landmarks": (np.array([1, 2]), np.zeros((1, 3)))}, "landmarks: expected vertices"),
+    ({"landmarks": (np.array([1, 2]), np.zeros((1, 3)))}, "landmarks: expected points of shape .2, 3."),
     ({"landmarks": (np.array([1]), np.full((1, 3), np.nan))}, "finite")])
 def test_one_scan_refuses_what_it_cannot_use(body, crab_model, given, words):
     with pytest.raises(ValueError, match=words):

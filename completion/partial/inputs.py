@@ -6,6 +6,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from scanprep.correspondence.correspondences import checked_pairs
 from scanprep.geometry.mesh import Mesh
 
 from ..bodies import FixedBody
@@ -48,22 +49,9 @@ def in_metres(body: FixedBody, scan: View | Sequence[View], landmarks: tuple[np.
 
 def check_landmarks(landmarks: tuple[np.ndarray, np.ndarray], template: Mesh) -> tuple[np.ndarray, np.ndarray]:
     """Landmark vertices (L,) and points (L, 3) as arrays."""
-    count = len(template.vertices)
-    vertices, points = (np.asarray(part) for part in landmarks)
-    if vertices.ndim != 1 or points.shape != (len(vertices), 3):
-        raise ValueError(f"landmarks: expected (L,) vertices and (L, 3) points, got {vertices.shape} "
-                         f"and {points.shape}")
-    if len(np.unique(vertices)) < 3:
-        raise ValueError(f"landmarks: expected at least 3 different ones, got {len(np.unique(vertices))}")
-    if not np.issubdtype(vertices.dtype, np.integer):
-        raise ValueError("landmarks: expected vertex numbers")
-    if vertices.min() < 0 or vertices.max() >= count:
-        raise ValueError(f"landmarks: expected vertices of 0..{count - 1}, "
-                         f"got {vertices.min()}..{vertices.max()}")
-    if not np.isfinite(points).all():
-        raise ValueError("landmarks: expected finite points")
+    vertices, points = checked_pairs(template, *landmarks, "landmarks")
     extent, whole = (float(np.ptp(p, axis=0).max()) for p in (points, template.vertices))
     if not whole / 100 < extent < 5 * whole:
         raise ValueError(f"landmarks: they extend over {extent:.3g} m, the template over {whole:.3g} m; "
                          "expected the scan in metres")
-    return vertices.astype(np.int64), points.astype(np.float64)
+    return vertices, points

@@ -6,21 +6,23 @@ from dataclasses import dataclass
 from functools import lru_cache
 
 import numpy as np
+from scipy.linalg import block_diag
 from scipy.spatial import cKDTree
 
 from model.priors import typical_poses, whitening
+from scanprep.correspondence.correspondences import checked_pairs
 from scanprep.geometry import rotations
 from scanprep.geometry.least_squares import Dense, levenberg_marquardt
 from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.target import Target, orient
 
+from ..bilinear import PosedPoints, ShapedPoints
 from ..body import BodyModel
 from ..features import twists
 from ..fitting import share_of_vertices, spread_vertices
-from ..linear import Subject
+from ..linear import PointOperator, Subject
 from .attraction import Attraction, apart, attraction, towards
 from .config import ModelFitConfig, PoseStage
-from .posed import PosedPoints, posed_points
 
 STEPS = 2                            # of Levenberg-Marquardt between matchings
 ALIKE = 0.005                        # share of √area: searches that end nearer to each other have found the same
@@ -45,34 +47,36 @@ class ModelFit:
         template = body.template
         self.body, self.target, self.config = body, target, config
         self.size = float(np.sqrt(template.face_areas.sum()))
-        self.marks, self.marked = _checked(template, landmarks)
+        given: tuple[np.ndarray, np.ndarray] = landmarks or (np.zeros(0, dtype=np.int64), np.zeros((0, 3)))
+        self.marks, self.marked = checked_pairs(template, *given, "landmarks", 0)
         if body.pose_mean is None or body.pose_covariance is None:
             raise ValueError("body: expected one with a mean and covariance of the pose, got a subject without")
         self.pose_mean, self.covariance = body.pose_mean, body.pose_covariance
         self.whitening = whitening(self.covariance)
+        self.part = body.skeleton.part_of_vertex(template)
         self.points = lru_cache(maxsize=4)(self._points)
         self.thinned = lru_cache(maxsize=4)(lambda detail: target.thinned(detail * self.size))
         self._tree = cKDTree(target.thinned(0.01 * self.size).points)
 
-    def _points(self, sample: int) -> tuple[PosedPoints, np.ndarray]:
-        """Spread vertices with the landmarks behind them, and the share of the surface of each of the former."""
+    def _points(self, sample: int) -> tuple[PosedPoints, np.ndarray, np.ndarray]:
+        """Spread vertices with the landmarks behind them; the former's numbers (L,) and shares (L,) of all."""
         ids = spread_vertices(self.body.template.vertices, sample)
         share = share_of_vertices(self.body.template.vertices, ids) / len(self.body.template.vertices)
-        return posed_points(self.body, np.r_[ids, self.marks], self.config.n_betas), share
+        return PosedPoints(self._vertices(np.r_[ids, self.marks])), ids, share
 
-    @property
-    def unknowns(self) -> int:
-        """How many numbers x has."""
-        points = self.points(self.config.refine[-1].sample)[0]
-        return points.J3 + 3 + points.n_betas
+    def _vertices(self, ids: np.ndarray) -> PointOperator | ShapedPoints:
+        """Vertices (L,) of a model, whose first betas are unknown, or of a subject, whose shape is known."""
+        if isinstance(self.body, Subject):
+            return self.body.points(ids)
+        K = min(self.config.n_betas, self.body.n_betas)
+        shaped = self.body.points(ids, n_betas=K)
+        return shaped if K else shaped.operator(None)
 
     def refine(self, x: np.ndarray, points: PosedPoints, wanted: Attraction, prior: float, steps: int) -> np.ndarray:
         """Least squares over x of what is wanted of the points, the pose prior and that of the betas."""
         J3, W = points.J3, prior * self.size * self.whitening
         mean, b = self.pose_mean.ravel(), self.config.shape_prior * self.size
-        by_prior = np.zeros((len(x), len(W) + points.n_betas))
-        by_prior[:J3, :len(W)] = W.T
-        by_prior[J3 + 3:, len(W):] = b * np.eye(points.n_betas)
+        by_prior = block_diag(W.T, np.zeros((3, 0)), b * np.eye(len(x) - J3 - 3))
 
         def priors(x: np.ndarray) -> np.ndarray:
             return np.r_[W @ (x[:J3] - mean), b * x[J3 + 3:]]
@@ -89,12 +93,12 @@ class ModelFit:
 
     def follow(self, x: np.ndarray, stage: PoseStage) -> np.ndarray:
         """One stage: match, refine, and again."""
-        points, share = self.points(stage.sample)
+        points, ids, share = self.points(stage.sample)
         scale = self.config.normal_weight * self.size
         L = len(share)
         marks = towards(self.marked, np.full(len(self.marks), stage.landmarks))
         for _ in range(stage.rounds):
-            y, n = points.positions(x)[:L], points.normals(x)[:L]
+            y, n = points.positions(x)[:L], self.normals(x, ids)
             target = self.thinned(stage.detail)
             if not target.oriented:
                 target = orient(target, self.predicted(x), scale)
@@ -102,9 +106,14 @@ class ModelFit:
             x = self.refine(x, points, wanted.joined(marks), stage.prior, STEPS)
         return x
 
+    def normals(self, x: np.ndarray, ids: np.ndarray) -> np.ndarray:
+        """Normals (L, 3) of some vertices, which rotate with their parts."""
+        R = self.body.skeleton.part_rotations(self.split(x)[0])[self.part[ids]]
+        return np.einsum("lij,lj->li", R, self.body.template.vertex_normals[ids])
+
     def scored(self, x: np.ndarray, stage: PoseStage) -> Candidate:
         """How far scan and body are apart, both ways and at most the stage's reach, as a root mean square."""
-        points, share = self.points(stage.sample)
+        points, _, share = self.points(stage.sample)
         mesh, limit = self.predicted(x), stage.reach * self.size
         back = apart(mesh, self.oriented(mesh, stage.detail), limit)
         y = points.positions(x)
@@ -125,7 +134,7 @@ class ModelFit:
         best: Candidate | None = None
         ends: list[np.ndarray] = []
         met: list[int] = []
-        points, _ = self.points(config.refine[-1].sample)
+        points, _, _ = self.points(config.refine[-1].sample)
         for x in starts:
             tried += 1
             for stage in config.search:
@@ -156,8 +165,7 @@ class ModelFit:
                    ) -> np.ndarray:
         """Pose, place and betas from an alignment's vertices (N, 3), metres, weighted (N,), from x on."""
         stage = self.config.refine[-1]
-        points, share = self.points(stage.sample)
-        ids = spread_vertices(self.body.template.vertices, stage.sample)
+        points, ids, share = self.points(stage.sample)
         wanted = towards(np.r_[vertices[ids], self.marked],
                          np.r_[share * weights[ids], np.full(len(self.marks), stage.landmarks)])
         return self.refine(x, points, wanted, prior, steps)
@@ -171,9 +179,9 @@ class ModelFit:
 
     def placed(self, pose: np.ndarray, onto: np.ndarray) -> np.ndarray:
         """Unknowns of a pose (J, 3), mean betas, with the body's middle in that of points (n, 3), metres."""
-        x = np.zeros(self.unknowns)
+        x = np.zeros(self.points(self.config.refine[-1].sample)[0].n_unknowns)
         x[:pose.size] = twists(pose).ravel()
-        points, _ = self.points(self.config.refine[-1].sample)
+        points, _, _ = self.points(self.config.refine[-1].sample)
         x[pose.size:pose.size + 3] = onto.mean(axis=0) - points.positions(x).mean(axis=0)
         return x
 
@@ -197,7 +205,7 @@ class ModelFit:
     def _on_landmarks(self, pose: np.ndarray) -> np.ndarray:
         """A pose turned as a whole, then bent, towards the landmarks."""
         stage = (self.config.search + self.config.refine)[0]
-        points, share = self.points(stage.sample)
+        points, _, share = self.points(stage.sample)
         x = self.placed(pose, self.marked)
         here = points.positions(x)[len(share):]
         R, _ = rotations.procrustes(here, self.marked)
@@ -220,19 +228,3 @@ class ModelFit:
         """Pose (J, 3), trans (3,), and betas (K,) or None where the shape is known."""
         J3 = self.pose_mean.size
         return x[:J3].reshape(-1, 3), x[J3:J3 + 3], x[J3 + 3:] if len(x) > J3 + 3 else None
-
-
-def _checked(template: Mesh, landmarks: tuple[np.ndarray, np.ndarray] | None) -> tuple[np.ndarray, np.ndarray]:
-    """Landmarks as arrays, none or more, or ValueError."""
-    if landmarks is None:
-        return np.zeros(0, dtype=np.int64), np.zeros((0, 3))
-    marks, marked = np.asarray(landmarks[0]), np.asarray(landmarks[1], dtype=np.float64)
-    if marks.ndim != 1 or not np.issubdtype(marks.dtype, np.integer) or marked.shape != (len(marks), 3):
-        raise ValueError(f"landmarks: expected vertices (L,) and points (L, 3), got {marks.dtype} {marks.shape} and "
-                         f"{marked.shape}")
-    if len(marks) and not 0 <= marks.min() <= marks.max() < len(template.vertices):
-        raise ValueError(f"landmarks: expected vertices of 0..{len(template.vertices) - 1}, got "
-                         f"{marks.min()}..{marks.max()}")
-    if not np.isfinite(marked).all():
-        raise ValueError("landmarks: expected finite points")
-    return marks, marked

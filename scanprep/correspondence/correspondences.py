@@ -54,14 +54,14 @@ def checked_pairs(template: Mesh, vertices: np.ndarray, points: np.ndarray, name
                          f"of shape {vertices.shape}")
     if points.shape != (len(vertices), 3):
         raise ValueError(f"{name}: expected points of shape ({len(vertices)}, 3), got {points.shape}")
-    if len(vertices) < least:
-        raise ValueError(f"{name}: expected at least {least}, got {len(vertices)}")
+    if len(np.unique(vertices)) < least:
+        raise ValueError(f"{name}: expected at least {least} different ones, got {len(np.unique(vertices))}")
     outside = (vertices < 0) | (vertices >= len(template.vertices))
     if outside.any():
-        raise ValueError(f"{name}: vertex {vertices[outside][0]} is outside 0..{len(template.vertices) - 1}")
+        raise ValueError(f"{name}: expected vertices of 0..{len(template.vertices) - 1}, got {vertices[outside][0]}")
     if not np.isfinite(points).all():
-        raise ValueError(f"{name}: {(~np.isfinite(points).all(axis=1)).sum()} points are not finite")
-    return vertices, points
+        raise ValueError(f"{name}: expected finite points, {(~np.isfinite(points).all(axis=1)).sum()} are not finite")
+    return vertices.astype(np.int64), points
 
 
 def correspondences_problem(found: Correspondences) -> str | None:
