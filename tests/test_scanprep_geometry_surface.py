@@ -158,5 +158,5 @@ def test_without_triangles_nothing_is_nearest_and_nothing_is_hit(vertices):
 def test_no_points_have_no_answers_and_one_point_is_no_row_of_points():
     none = np.zeros((0, 3))
     assert len(Surface(ball()).closest(none).faces) == len(Rays(ball()).cast(none, none)[0]) == 0
-    with pytest.raises(ValueError, match=r"points: expected shape \(n, 3\), got \(3,\)"):
+    with pytest.raises(ValueError, match=r"points: expected points of shape \(n, 3\), got shape \(3,\)"):
         Surface(ball()).closest(np.zeros(3))
