@@ -40,10 +40,9 @@ def motion(model):
 
 @pytest.mark.parametrize("up", [0, 1, 2])
 def test_a_viewer_sees_the_skinned_motion(rig, motion, up):
-    poses, trans = motion
-    glb = Glb(skinned_glb(rig, poses, trans, 4.0, up=up))
+    glb = Glb(skinned_glb(rig, *motion, 4.0, up=up))
     assert np.array_equal(glb.faces, rig.mesh.faces)
-    for t, expected in enumerate(rig.vertices(poses, trans)):
+    for t, expected in enumerate(rig.vertices(*motion)):
         assert np.abs(glb.skinned(t) - expected @ turn_up(up).T).max() < 1e-5
     times = [glb.array(s["input"]) for s in glb.json["animations"][0]["samplers"]]
     assert all(np.allclose(t[:, 0], [0, 0.25, 0.5, 0.75, 1.0]) for t in times)
@@ -132,8 +131,7 @@ def test_bad_motion_is_refused(rig, motion, change, words):
 @pytest.mark.parametrize(("up", "unit", "metre"), [(0, "cm", 100), (1, "m", 1), (2, "in", 39.37007874015748)])
 def test_bvh_holds_the_motion_of_the_joints_and_is_read_back(rig, motion, tmp_path, up, unit, metre):
     poses, trans = motion[0].copy(), motion[1]
-    poses[0, 2] = [np.pi / 2, 0, 0]                                # two Euler axes fall together
-    poses[1, 1] = [0, 0, 3.5]
+    poses[0, 2], poses[1, 1] = [np.pi / 2, 0, 0], [0, 0, 3.5]      # of the first two Euler axes fall together
     write_bvh(tmp_path / "a.bvh", rig.skeleton, poses, trans, 120.0, unit, up, body=rig.mesh)
     theirs, ours, U = Bvh((tmp_path / "a.bvh").read_text()), read_bvh(tmp_path / "a.bvh", unit), turn_up(up)
     assert abs(float(theirs.time) - 1 / 120) < 1e-9 and len(theirs.frames) == 5
@@ -210,16 +208,11 @@ def test_bvh_of_other_programs(tmp_path, end):
     ((MIXED, "\x00\xff"), "expected HIERARCHY")])
 def test_damaged_bvh_is_refused(tmp_path, change, words):
     assert change[0] in MIXED
+    with pytest.raises(StorageError, match=r"a\.bvh: no such file; expected a BVH file"):
+        read_bvh(tmp_path / "a.bvh", "cm")
     (tmp_path / "a.bvh").write_text(MIXED.replace(*change))
     with pytest.raises(StorageError, match=words):
         read_bvh(tmp_path / "a.bvh", "cm")
-
-
-def test_bvh_without_a_file_or_a_unit_is_refused(tmp_path):
-    with pytest.raises(StorageError, match=r"no\.bvh: no such file; expected a BVH file"):
-        read_bvh(tmp_path / "no.bvh", "cm")
-    with pytest.raises(ValueError, match="unit: expected one of m, cm, mm, in, got 'ft'"):
-        read_bvh(tmp_path / "no.bvh", "ft")
 
 
 def test_bvh_turns_do_not_jump(rig, tmp_path):
@@ -237,8 +230,7 @@ def test_bvh_without_motion_is_one_frame_at_rest(rig, tmp_path):
     assert (tmp_path / "a.bvh").read_text() == (tmp_path / "b.bvh").read_text()
     assert len(bvh.frames) == 1 and not bvh.frames[0, 3:].any()
     places = bvh.positions(0)
-    for name, joint in zip(rig.skeleton.names, rig.skeleton.joints, strict=True):
-        assert np.abs(places[name] / 100 - joint).max() < 1e-6
+    assert np.abs(np.stack([places[name] for name in rig.skeleton.names]) / 100 - rig.skeleton.joints).max() < 1e-6
     assert set(bvh.ends) == {"part1", "part3"}, "the leaves"
     # the worm's parts end where the worm ends, along its axis
     for name, end in (("part1", rig.mesh.vertices[:, 0].min()), ("part3", rig.mesh.vertices[:, 0].max())):
@@ -253,6 +245,8 @@ def test_bvh_without_motion_is_one_frame_at_rest(rig, tmp_path):
 def test_bad_bvh_is_refused(rig, tmp_path, names, how, words):
     with pytest.raises(ValueError, match=words):
         write_bvh(tmp_path / "a.bvh", replace(rig.skeleton, names=names or rig.skeleton.names), **how)
+    with pytest.raises(ValueError, match="unit: expected one of m, cm, mm, in, got 'ft'"):
+        read_bvh(tmp_path / "no.bvh", "ft")
     assert not list(tmp_path.iterdir())
 
 
@@ -310,8 +304,7 @@ def test_known_pose_directions_are_found(model, rig):
 
 
 def test_a_motion_becomes_a_folder_of_meshes(model, motion, tmp_path):
-    subject = model.subject(BETAS)
-    calls = []
+    subject, calls = model.subject(BETAS), []
     paths = write_frames(tmp_path / "frames", subject, *motion, progress=lambda *now: calls.append(now))
     assert [p.name for p in paths] == [f"{t:05d}.ply" for t in range(5)] and calls[-1] == (5, 5)
     for t, path in enumerate(paths):

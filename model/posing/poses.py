@@ -126,9 +126,6 @@ def _finite(given: Any, name: str) -> np.ndarray:
     return vector
 
 
-NEAR = 0.08                          # of the body's size: how far mirrored parts may lie from their partners
-NEAR_ALONE = 0.015                   # where none are exchanged: a man is nearly flat, but not his own front to back
-ROUNDS = 10
 
 
 @dataclass(frozen=True, eq=False)
@@ -195,7 +192,8 @@ def find_mirror(template: Mesh, skeleton: Skeleton) -> Mirror:
     each = np.arange(len(skeleton.parents))
     exchanging = [m for m in found if (m.partners != each).any()]
     best = min(exchanging or found, key=lambda m: m.distance)
-    if best.distance > (NEAR if exchanging else NEAR_ALONE) * size:
+    # where no parts are exchanged they may lie less far apart: a man is nearly flat, but not his own front to back
+    if best.distance > (0.08 if exchanging else 0.015) * size:
         image = np.linalg.norm(best.reflect(marks) - marks[:, best.partners], axis=-1).max(axis=0)
         worst = int(image.argmax())
         how = "in the best mirror" if exchanging else "no two parts can be exchanged, and in the best mirror"
@@ -225,7 +223,7 @@ def _candidates(template: Mesh, marks: np.ndarray) -> list[MirrorPlane]:
 def _fitted(skeleton: Skeleton, marks: np.ndarray, plane: MirrorPlane) -> Mirror | None:
     """The mirror near a plane, parts paired and plane fitted in turn; None where parts cannot be paired."""
     partners = np.full(len(skeleton.parents), -1)
-    for _ in range(ROUNDS):
+    for _ in range(10):
         before = partners
         paired = _paired(skeleton, plane.reflect(marks), marks)
         if paired is None:

@@ -22,8 +22,6 @@ from ..shape_space import ShapeSpace
 from ..skinning import SkinningModel
 from .transfer import Distillation, Follower, Piece, Progress, enough_poses, gradients_of, transfer_skeleton
 
-POSES, SHAPE_POSES = 40, 8           # of the prior, in which both models are compared and the new one corrected
-
 
 @dataclass(frozen=True)
 class ResolutionConfig(Settings):
@@ -93,10 +91,10 @@ def _transfer_scape(model: ScapeModel, template: Mesh, config: ResolutionConfig,
         shape_space=_transfer_shape_space(model, pieces), **_transfer_blend(model, pieces))
     if not config.rounds:
         return moved
-    poses = sample_poses(model, enough_poses(model, POSES), np.random.default_rng(0))
+    poses = sample_poses(model, enough_poses(model, 40), np.random.default_rng(0))
     poses[0] = model.pose_mean
     teacher = Distillation(model, Follower(model.template, template), config.rounds, progress)
-    return teacher.shape_space(teacher.pose_space(moved, poses), poses[:SHAPE_POSES])
+    return teacher.shape_space(teacher.pose_space(moved, poses), poses[:8])
 
 
 def _transfer_pose_space(space: PoseSpace, skeleton: Skeleton, pieces: list[Piece]) -> PoseSpace:

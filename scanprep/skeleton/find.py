@@ -32,7 +32,6 @@ from .tree import Skeleton, reorder
 __all__ = ["SkeletonConfig", "find_skeleton", "search_skeleton"]
 
 Tree = tuple[np.ndarray, np.ndarray, list[Loop]]
-WORTH = 0.1                      # by how much a part must lower the logarithm of the energy to count
 
 
 @dataclass(frozen=True)
@@ -195,7 +194,8 @@ def _searched(search: PartSearch) -> Tree:
 def _score(search: PartSearch, label: np.ndarray) -> float:
     """What is compared: the logarithm of the energy, and what every part must be worth."""
     energy = search.energy(label) / search.surface.area
-    return float(np.log(energy + search.config.tolerance**2) + WORTH * (label.max() + 1))
+    # a part counts that lowers the logarithm of the energy by a tenth
+    return float(np.log(energy + search.config.tolerance**2) + 0.1 * (label.max() + 1))
 
 
 def _improved(search: PartSearch, label: np.ndarray, links: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
