@@ -45,7 +45,7 @@ def pose_from_angles(skeleton: Skeleton, angles: Mapping[str | int, Any]) -> np.
         if j in seen:
             raise ValueError(f"angles: part '{skeleton.names[j]}' is given twice")
         seen.add(j)
-        pose[j] = turn_vector(angle, f"angles['{part}']")
+        pose[j] = rotation_vector(angle, f"angles['{part}']")
     return pose
 
 
@@ -77,7 +77,7 @@ def rotate_joint(skeleton: Skeleton, pose: np.ndarray, part: str | int, rotation
     j = part_number(skeleton, part)
     if pose.shape[-2:] != (len(skeleton.parents), 3):
         raise ValueError(f"pose: expected shape (..., {len(skeleton.parents)}, 3), got {pose.shape}")
-    more, now = rotations.exp(turn_vector(rotation, "rotation")), rotations.exp(pose[..., j, :])
+    more, now = rotations.exp(rotation_vector(rotation, "rotation")), rotations.exp(pose[..., j, :])
     if frame == "own":
         turned = now @ more
     elif frame == "parent" or (frame == "world" and j == 0):
@@ -102,7 +102,7 @@ def part_number(skeleton: Skeleton, part: str | int) -> int:
     return int(part)
 
 
-def turn_vector(given: Any, name: str) -> np.ndarray:
+def rotation_vector(given: Any, name: str) -> np.ndarray:
     """The axis-angle vector (3,), radians, of a vector or of an axis with degrees."""
     if isinstance(given, tuple | list) and len(given) == 2:
         axis, degrees = given
@@ -130,20 +130,10 @@ def _finite(given: Any, name: str) -> np.ndarray:
 
 @dataclass(frozen=True, eq=False)
 class Mirror(MirrorPlane):
-    """The plane of a body's symmetry and which parts it exchanges.
+    """The plane of a body's symmetry and which parts it exchanges."""
 
-    Attributes
-    ----------
-    normal, point : (3,) float, metres
-        Of the plane.
-    partners : (J,) int
-        The part on the other side; a part in the middle is its own.
-    distance : float, metres
-        Root mean square distance of mirrored joints and centroids of parts from those of their partners.
-    """
-
-    partners: np.ndarray
-    distance: float
+    partners: np.ndarray             # (J,) the part on the other side; a part in the middle is its own
+    distance: float                  # metres, RMS of mirrored joints and centroids from those of the partners
 
     def trans(self, skeleton: Skeleton, trans: np.ndarray) -> np.ndarray:
         """The places (..., 3) of mirrored bodies, metres."""

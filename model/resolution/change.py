@@ -40,26 +40,23 @@ def change_resolution(model: BodyModel, template: Mesh, config: ResolutionConfig
                       progress: Progress | None = None) -> BodyModel:
     """Transfer a model to a coarser or finer triangulation, so that pose, betas and trans keep their meaning.
 
+    A skinning model turns parts about joints, and on a body of other betas these are averages of the vertices within
+    two edges of the borders of parts, with other triangles a band of another width: such bodies move some millimetres
+    apart when they bend. SCAPE models do not use joints in this way.
+
     Parameters
     ----------
     model : BodyModel
     template : Mesh
         Other triangles on the surface of the model's template, in the same place.
     config : ResolutionConfig, optional
-    progress : callable, optional
-        Called with the work done and the whole.
+    progress : callable(done, total), optional
 
     Returns
     -------
     BodyModel
         Of the same kind, with the same tree, joints, features, betas and priors; landmarks are on the nearest new
         vertices.
-
-    Notes
-    -----
-    A skinning model turns parts about joints, and on a body of other betas these are averages of the vertices within
-    two edges of the borders of parts. With other triangles that is a band of another width, so that
-    such bodies move some millimetres apart when they bend; SCAPE models do not use joints in this way.
 
     Raises
     ------
