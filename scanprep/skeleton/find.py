@@ -24,7 +24,7 @@ from .joints import (
     without_weak,
 )
 from .motions import PosedSurface
-from .names import names_by_symmetry
+from .names import name_parts
 from .parts import FADING, PartSearch, SkeletonConfig, find_parts
 from .symmetry import Symmetry, find_symmetry
 from .tree import Skeleton, reorder
@@ -116,7 +116,7 @@ def search_skeleton(template: Mesh, poses: np.ndarray, config: SkeletonConfig | 
     joints = place_joints(surface, label, surface.core_motions(label), links)       # [Articulated] joints
     skeleton = _assembled(template, label, links, joints)
     if tied:
-        skeleton = replace(skeleton, names=names_by_symmetry(template, skeleton, symmetry))
+        skeleton = replace(skeleton, names=name_parts(template, skeleton, symmetry))
     tell(True)
     return SkeletonSearch(skeleton, tuple(_opened(loop, skeleton) for loop in runs[0].loops), symmetry, tied,
                           tuple(run.energy for run in runs), tuple(len(run.links) + 1 for run in runs))
