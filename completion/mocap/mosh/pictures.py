@@ -13,7 +13,7 @@ from scanprep.geometry.mesh import Mesh
 from scanprep.pictures.camera import Camera, look_around, upright
 from scanprep.pictures.shading import Bones, Dots, Shape, Solid, color_bar, heat, render, side_by_side
 
-from ...motion_pictures import MARKER, chart_states, facing, mean_over, moving_picture
+from ...motion_pictures import MARKER, chart_states, facing, frames_apart, mean_over, moving_picture
 from ..artefacts.results import MarkerArtefacts
 from ..files.markers import MarkerSequence
 from ..marker_sets.layout import MarkerLayout
@@ -160,12 +160,7 @@ def picture_fixed_and_soft(take: Take, frames: np.ndarray, height: int = 400) ->
 def most_changed(take: Take, frames: np.ndarray, count: int) -> np.ndarray:
     """Of some frames those, in order, in which soft tissue moves the body most, no two close in time."""
     size = np.sqrt((soft_change(take, frames)**2).mean(axis=1))
-    apart = len(take.motion.poses) / (3 * count)
-    chosen: list[int] = []
-    for t in frames[np.argsort(-size)].tolist():
-        if len(chosen) < count and all(abs(t - other) >= apart for other in chosen):
-            chosen.append(t)
-    return np.sort(chosen)
+    return frames_apart(frames[np.argsort(-size)], count, len(take.motion.poses) / (3 * count))
 
 
 def moving(take: Take, seconds: float = 4.0, rate: float = 6.0) -> bytes:
