@@ -22,7 +22,6 @@ from . import rotations, sparse
 
 State = TypeVar("State")
 FLOOR = 1e-9                         # of the largest diagonal entry, added to all: some unknowns may have no data
-STIFF = 1e8                          # damping beyond which no step lowers the energy any more
 
 
 @dataclass(frozen=True, eq=False)
@@ -217,7 +216,7 @@ def levenberg_marquardt(equations: Callable[[State], NormalEquations], start: St
         least = np.maximum(tolerance * now.energy, max(exact, 1e-300))
         # a step that failed settles nothing unless there was nothing to gain: it may have been too long
         settled = (better & (now.energy - tried.energy <= least)) | (gain <= least)
-        converged |= settled | (factor > STIFF)
+        converged |= settled | (factor > 1e8)        # so much damping: no step lowers the energy any more
         x, now = _taken(better, x, ahead), _taken(better, now, tried)
         factor = np.where(better, np.maximum(factor / 5, 1e-9), factor * 8)
     return Minimum(x, now, converged, done)

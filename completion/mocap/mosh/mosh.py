@@ -10,7 +10,7 @@ from typing import Any, TypeVar
 import numpy as np
 
 from model.body import BodyModel
-from model.learning.sex_plane import SexGuess, guess_sex, sex_plane
+from model.learning.sexes import SexGuess, guess_sex, sex_plane
 from model.linear import Subject
 from scanprep.batch.room import Step, inside, once
 from scanprep.ranges import Settings

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from model.body import BodyModel
-from model.learning.sex_plane import SexGuess
+from model.learning.sexes import SexGuess
 from scanprep.batch.room import Room
 from scanprep.cli import MM
 from scanprep.console import Metric, Outcome, write_report
