@@ -19,7 +19,7 @@ from ..files.markers import MarkerSequence
 from ..marker_sets.layout import MarkerLayout
 from .takes import Take
 
-USUAL, DOUBTED, UNUSED = (0.30, 0.50, 0.72), (0.93, 0.62, 0.16), (0.20, 0.62, 0.32)
+USUAL, UNCERTAIN, UNUSED = (0.30, 0.50, 0.72), (0.93, 0.62, 0.16), (0.20, 0.62, 0.32)
 SIDES = ("front", "left", "back", "right")
 LITTLE = 0.005                       # metres: the end of a colour scale that must not make much of nothing
 
@@ -98,7 +98,7 @@ def contact_sheet(take: Take, frames: np.ndarray, columns: int = 8, width: int =
 
 def marker_dots(take: Take, t: int, radius: float = 0.014, coarse: bool = False) -> Dots:
     """The measured markers of a frame: believed, not believed, and those that no stage has seen."""
-    colors = np.where(take.motion.trusted[t][:, None], MARKER, DOUBTED)
+    colors = np.where(take.motion.trusted[t][:, None], MARKER, UNCERTAIN)
     unused = ~np.isfinite(take.motion.residuals).any(axis=0)
     held = () if take.held is None else take.held.labels
     points = take.markers.positions[t].copy()
@@ -242,8 +242,8 @@ def chart_timeline(take: Take) -> Any:
     markers, found, names = take.markers, take.artefacts, list(STATES)
     labels = [label for label in markers.labels if label in found.labels_touched or label in found.labels]
     columns = [markers.labels.index(label) for label in labels]
-    doubted = np.isfinite(take.motion.residuals[:, columns]) & ~take.motion.trusted[:, columns]
-    state = np.where(markers.seen[:, columns], doubted.astype(int), names.index("missing"))
+    uncertain = np.isfinite(take.motion.residuals[:, columns]) & ~take.motion.trusted[:, columns]
+    state = np.where(markers.seen[:, columns], uncertain.astype(int), names.index("missing"))
     for label, spans in _spans(found).items():
         for kind, begin, end, _ in spans:
             state[begin:end + 1, labels.index(label)] = names.index(kind)
