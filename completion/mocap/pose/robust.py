@@ -67,8 +67,10 @@ def judge(positions: np.ndarray, targets: np.ndarray, order: np.ndarray, outlier
 
 def label_order(positions: np.ndarray, targets: np.ndarray, rate: float, outlier: float) -> np.ndarray:
     """Which column (T, L) each marker is taken from, the body having them at places (T, L, 3), by `find_order`."""
+    squared, scale = distances_apart(positions, targets, outlier)
+    if ((squared > (0.5 * scale)**2).sum(axis=1) < 2).all():            # nothing is far off, or everything is believed
+        return np.tile(np.arange(targets.shape[1]), (len(targets), 1))
     shift = known_median(positions - targets, -2)[..., None, :]
-    _, scale = distances_apart(positions, targets, outlier)
     # on a body that fits badly a marker is as much farther from its place as one must be to be an outlier
     deviation = DEVIATION * scale[..., 0] / AnimateConfig.outlier
     return find_order(targets, rate, marker_levels(positions - shift, targets, deviation))
