@@ -31,7 +31,6 @@ from .within import choose_within, fit_within, held_out_bodies, number_people
 MIX = LearnConfig(features="quadratic", ridges=(1e-4, 3e-4, 1e-3, 3e-3, 0.01, 0.03, 0.1), detail=0.005, refinements=6)
 CORRECTIONS = 2                      # of Q and of S in a round, by what the stitched model leaves
 GAIN = 0.01                          # a round counts as progress when it lowers the held-out error by this share of it
-DAMPING = 0.1                        # of the inverse of S, against triangles that somebody has nearly flat
 
 
 @dataclass(frozen=True, eq=False)
@@ -211,10 +210,10 @@ def _learn_pose(mix: Mix, state: State) -> tuple[PoseSpace, Design]:
 
 
 def _safe_inverse(S: np.ndarray) -> np.ndarray:
-    """`S⁻¹`, less of it where S is nearly flat; the identity stays the identity."""
+    """`S⁻¹`, a tenth damped against triangles that somebody has nearly flat; the identity stays the identity."""
     S = S.astype(np.float64)
     St = np.swapaxes(S, -1, -2)
-    return (1 + DAMPING) * St @ np.linalg.inv(S @ St + DAMPING * np.eye(3))
+    return 1.1 * St @ np.linalg.inv(S @ St + 0.1 * np.eye(3))
 
 
 def _at_rest(space: PoseSpace) -> PoseSpace:

@@ -21,6 +21,8 @@ from .chart import Chart, automatic_chart, chart_problem
 from .model import ControlModel, control_problem, surface_problem
 
 KIND, VERSION = "control model", 1
+WHAT = "a GLB file with one mesh that hangs on joints"
+STORED = Path(__file__).with_name("humanoid.npz")           # made by tests/humanoid_maker.py
 
 
 def read_control(path: str | Path) -> ControlModel:
@@ -74,9 +76,6 @@ def _load(path: Path) -> ControlModel:
         if problem:
             raise ValueError(problem)
     return control
-
-
-WHAT = "a GLB file with one mesh that hangs on joints"
 
 
 @dataclass(frozen=True, eq=False)
@@ -259,9 +258,6 @@ def _with_triangles(mesh: Mesh, weights: np.ndarray, parents: np.ndarray
     gathered = np.zeros((len(weights), len(kept)))
     np.add.at(gathered.T, index[heir], weights.T)
     return np.array(kept), np.array([-1 if j == root else index[above[j]] for j in kept]), gathered, index[carrier]
-
-
-STORED = Path(__file__).with_name("humanoid.npz")           # made by tests/humanoid_maker.py
 
 
 @lru_cache(maxsize=1)
