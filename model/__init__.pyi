@@ -10,7 +10,6 @@ from .export.bvh import read_bvh as read_bvh
 from .export.bvh import write_bvh as write_bvh
 from .export.correctives import write_body_npz as write_body_npz
 from .export.glb import write_skinned_glb as write_skinned_glb
-from .export.rig import Rig as Rig
 from .export.rig import make_rig as make_rig
 from .files import load_model as load_model
 from .fitting import FitConfig as FitConfig
@@ -29,17 +28,12 @@ from .learning.sexes import learn_by_sex as learn_by_sex
 from .learning.skinning import SkinConfig as SkinConfig
 from .learning.skinning import learn_skinning as learn_skinning
 from .linear import Subject as Subject
-from .posing.character import CharacterConfig as CharacterConfig
-from .posing.character import character_model as character_model
-from .posing.poses import Mirror as Mirror
 from .posing.poses import find_mirror as find_mirror
 from .posing.poses import mirror_pose as mirror_pose
 from .posing.poses import pose_from_angles as pose_from_angles
 from .posing.poses import rotate_joint as rotate_joint
-from .posing.transfer import repose as repose
 from .posing.transfer import subject_from_body as subject_from_body
 from .priors import sample_poses as sample_poses
-from .resolution.change import ResolutionConfig as ResolutionConfig
 from .resolution.change import change_resolution as change_resolution
 from .scape import BlendScapeModel as BlendScapeModel
 from .scape import ScapeModel as ScapeModel

@@ -16,16 +16,11 @@ from pathlib import Path
 from typing import Any
 
 from . import config_files, ranges
+from .config_files import Flag
 from .console import PROBLEM, Metric, Outcome, say, show, write_report
 from .threads import one_thread
 
 OUTPUTS, SPACE, FORCE = ("output", "out"), "space", "force"     # parameters of commands that are dealt with here
-FORCE_HELP = "\n    force: Do all anew, whatever is done already."
-CONFIG_HELP = """
-    config: TOML file with settings that have no flag.
-    write_config: Print such a file, with the values in force and what each setting means, and do nothing else."""
-PRESET_HELP = "\n    preset: Where settings begin: ours, or the values of the paper."
-WRITE_CONFIG = "--write-config"
 TRACEBACK = "SCAPEKIT_TRACEBACK"       # environment variable that shows where an error came from
 
 
@@ -72,7 +67,7 @@ def settings_file(function: Callable[..., Outcome], argv: list[str]) -> str | No
     """The file of settings that `--write-config` asks for, or None where it does not."""
     found = {p.name: p.default for p in inspect.signature(function).parameters.values()
              if isinstance(p.default, ranges.Settings)}
-    return config_files.write(_Settings(found, argv).values) if found and WRITE_CONFIG in argv else None
+    return config_files.write(_Settings(found, argv).values) if found and "--write-config" in argv else None
 
 
 class _Settings:
@@ -94,34 +89,28 @@ class _Settings:
             if given.config is not None:
                 self.values = config_files.read(given.config, self.values)
 
-    def parameters(self) -> list[inspect.Parameter]:
-        """The flags of the command line."""
-        def keyword(name: str, default: Any, annotation: Any) -> inspect.Parameter:
-            return inspect.Parameter(name, inspect.Parameter.KEYWORD_ONLY, default=default, annotation=annotation)
-
+    @property
+    def flags(self) -> dict[str, Flag]:
+        """The flags of the command line by their names; those without a path are of no setting."""
         if not self.values:
-            return []
-        shown = [keyword(name, flag.value, flag.annotation) for name, flag in config_files.flags(self.values).items()]
+            return {}
+        found = config_files.flags(self.values)
         if self.presets:
-            shown.append(keyword("preset", "default", typing.Literal["default", "published"]))
-        return [*shown, keyword("config", None, Path | None), keyword("write_config", False, bool)]
-
-    def help(self) -> str:
-        """What the docstring of the command says of them."""
-        if not self.values:
-            return ""
-        told = "".join(f"\n    {name}: {flag.sentence}" for name, flag in config_files.flags(self.values).items())
-        return told + (PRESET_HELP if self.presets else "") + CONFIG_HELP
+            found["preset"] = Flag((), typing.Literal["default", "published"], "default",
+                                   "Where settings begin: ours, or the values of the paper.")
+        found["config"] = Flag((), Path | None, None, "TOML file with settings that have no flag.")
+        found["write_config"] = Flag((), bool, False, "Print such a file, with the values in force and what each "
+                                     "setting means, and do nothing else.")
+        return found
 
     def taken_from(self, given: dict[str, Any]) -> dict[str, Any]:
         """The arguments of the command's function: settings in place of flags."""
         values = dict(self.values)
-        for name, flag in (config_files.flags(values) if values else {}).items():
-            first, *rest = flag.path
-            values[first] = config_files.replaced(values[first], tuple(rest), given.pop(name))
-        for name in ("preset", "config", "write_config"):
-            if values:
-                given.pop(name, None)
+        for name, flag in self.flags.items():
+            value = given.pop(name)
+            if flag.path:
+                first, *rest = flag.path
+                values[first] = config_files.replaced(values[first], tuple(rest), value)
         return {**given, **values}
 
 
@@ -141,9 +130,12 @@ class _Call:
                  if p.name != SPACE and p.name not in self.settings.values]
         self.output_name = next((p.name for p in shown if p.name in OUTPUTS), None)
         self.beside = self.wants_space and typing.get_origin(hints[SPACE]) is not None      # Annotated: FileWorkspace
-        shown = [*shown, *self.settings.parameters()]
+        flags = self.settings.flags
         if self.output_name is not None:
-            shown.append(inspect.Parameter(FORCE, inspect.Parameter.KEYWORD_ONLY, default=False, annotation=bool))
+            flags[FORCE] = Flag((), bool, False, "Do all anew, whatever is done already.")
+        keyword = inspect.Parameter.KEYWORD_ONLY
+        shown += [inspect.Parameter(name, keyword, default=flag.value, annotation=flag.annotation)
+                  for name, flag in flags.items()]
         signature = inspect.Signature(shown)
 
         def collect(*args: Any, **named: Any) -> dict[str, Any]:
@@ -151,8 +143,8 @@ class _Call:
             given.apply_defaults()
             return given.arguments
 
-        collect.__doc__ = (inspect.getdoc(function) or "") + self.settings.help() + (
-            FORCE_HELP if self.output_name else "")
+        told = "".join(f"\n    {name}: {flag.sentence}" for name, flag in flags.items())
+        collect.__doc__ = (inspect.getdoc(function) or "") + told
         collect.__annotations__ = {p.name: p.annotation for p in shown}
         collect.__signature__ = signature                            # type: ignore[attr-defined]
         self.given = self.settings.taken_from(

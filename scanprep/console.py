@@ -17,7 +17,6 @@ if TYPE_CHECKING:               # imported where it is used: help answers at onc
 
 Progress = Callable[[int, int], None]
 
-LIBRARIES = ("scapekit", "numpy", "scipy", "libigl", "cholespy", "embreex")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -123,7 +122,7 @@ def show(metrics: list[Metric]) -> None:
 def versions() -> dict[str, str]:
     """Versions of Python, the platform and the libraries the figures depend on."""
     found = {"python": platform.python_version(), "machine": f"{platform.machine()}, {os.cpu_count()} cores"}
-    for name in LIBRARIES:
+    for name in ("scapekit", "numpy", "scipy", "libigl", "cholespy", "embreex"):
         with contextlib.suppress(importlib.metadata.PackageNotFoundError):
             found[name] = importlib.metadata.version(name)
     return found

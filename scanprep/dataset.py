@@ -61,17 +61,9 @@ class RegisteredSet:
 
     @staticmethod
     def create(folder: str | Path, template: Mesh, info: dict[str, Any] | None = None) -> RegisteredSet:
-        """Begin a set, or go on with the one in the folder.
+        """Begin a set, or go on with the one in the folder; `info`, values of JSON, is kept in `set.json`.
 
-        Parameters
-        ----------
-        info : dict of JSON values, optional
-            Kept in `set.json`.
-
-        Raises
-        ------
-        ValueError
-            The folder holds a set of another template.
+        ValueError where the folder holds a set of another template.
         """
         folder = Path(folder)
         if (folder / "set.json").exists():
@@ -88,10 +80,7 @@ class RegisteredSet:
     def load(folder: str | Path) -> RegisteredSet:
         """Read a set; its meshes stay on disk until they are asked for.
 
-        Raises
-        ------
-        MeshFileError, StorageError
-            No such set, or one that is damaged or of an unknown version: which file, and what is wrong.
+        MeshFileError or StorageError, which names the file, for one that is missing, damaged or of an unknown version.
         """
         folder = Path(folder)
         info = _read_header(folder)
@@ -145,13 +134,7 @@ class RegisteredSet:
         return RegisteredSet(self.folder, self.template, rows, self.skeleton, self.info)
 
     def with_skeleton(self, skeleton: Skeleton) -> RegisteredSet:
-        """Write a skeleton into the set.
-
-        Raises
-        ------
-        ValueError
-            A skeleton of another triangulation.
-        """
+        """Write a skeleton into the set; ValueError for one of another triangulation."""
         if len(skeleton.part_of_face) != len(self.template.faces):
             raise ValueError(f"skeleton: expected {len(self.template.faces)} faces as the template has, "
                              f"got {len(skeleton.part_of_face)}")
@@ -171,12 +154,7 @@ class RegisteredSet:
     def vertices(self, names: Sequence[str] | None = None) -> np.ndarray:
         """Vertices (M, N, 3), metres, of the meshes of these names, or of all.
 
-        Raises
-        ------
-        MeshFileError
-            A mesh that is missing, damaged or of another topology.
-        ValueError
-            A name that is not in the set.
+        MeshFileError for a mesh that is missing, damaged or of another topology, ValueError for an unknown name.
         """
         by_name = {entry.name: entry for entry in self.entries}
         unknown = [name for name in names or () if name not in by_name]

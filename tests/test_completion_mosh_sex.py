@@ -6,8 +6,7 @@ import pytest
 from completion_bodies import MEAN, worm_with_prior
 
 from completion import MarkerLayout, MarkerSequence, mosh_by_sex
-from completion.mocap.mosh.by_sex import checked_models
-from completion.mocap.mosh.mosh import MoshConfig
+from completion.mocap.mosh.mosh import MoshConfig, checked_models
 from completion.mocap.subject.person import PersonConfig
 from model.learning.sexes import PLANE, learn_sex_plane
 

@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 
 from scanprep import RegisteredSet, write_landmarks, write_mesh
 from scanprep.geometry.files import PointCloud, write_points
-from scanprep.pipeline import pictures
+from scanprep.pipeline import page as pictures
 from scanprep.pipeline.figures import (
     Limits,
     ScanFigures,

@@ -22,8 +22,6 @@ _DIGITS = 8                          # after the point: in any unit finer than a
 _ORDER = "ZXY"                       # R = R_z R_x R_y, about axes that turn with the part
 _TURNS = " ".join(f"{axis}rotation" for axis in _ORDER)
 _DEEPEST = 500                       # joints below each other: more is no skeleton
-_VALUES, _REPEATS = 10**6, 4         # joints of all frames, and so many more for each byte
-_CHANNEL = re.compile("([xyz])(position|rotation)")
 
 
 def write_bvh(path: str | Path, skeleton: Skeleton, poses: np.ndarray | None = None, trans: np.ndarray | None = None,
@@ -295,7 +293,7 @@ def _read_joint(words: _Words, parent: int, names: set[str]) -> _Joint:
     words.keyword("CHANNELS")
     for _ in range(words.whole("the number of channels, 0 to 6", 0, 6)):
         word = words.take("a channel")
-        found = _CHANNEL.fullmatch(word.lower())
+        found = re.fullmatch("([xyz])(position|rotation)", word.lower())
         if not found:
             raise words.wrong("a channel as Xposition or Zrotation", word)
         channels.append((found[2] == "rotation", "xyz".index(found[1])))
@@ -351,7 +349,7 @@ def _read_motion(words: _Words, joints: list[_Joint]) -> tuple[np.ndarray, float
         raise words.wrong("the seconds of a frame", f"{time:g}")
     wanted = sum(len(joint.channels) for joint in joints)
     size = sum(map(len, words.lines))
-    if not wanted or count * len(joints) > _VALUES + _REPEATS * size:
+    if not wanted or count * len(joints) > 10**6 + 4 * size:          # joints of all frames
         raise StorageError(f"{words.path}: expected frames of joints with channels, found {count} frames of "
                            f"{len(joints)} joints with {wanted} channels in {size} bytes")
     first = words.line                                           # numbers begin on a line of their own

@@ -82,28 +82,17 @@ def spaced(total: int, count: int) -> np.ndarray:
 
 def write_body_npz(path: str | Path, model: BodyModel, weights: np.ndarray | None = None, draws: int = 300
                    ) -> dict[str, np.ndarray]:
-    """Write a model as linear blend skinning with shape and pose directions, an `.npz` without objects.
+    """Write a model as linear blend skinning with shape and pose directions, an `.npz` without objects; its arrays.
 
     Posed by `Σ_j weights_j G_j (v_template + shapedirs @ betas + posedirs @ vec(R_1 - I, ..., R_{J-1} - I))`, where G_j
     rotates about `J_regressor @ (v_template + shapedirs @ betas)` and R_j is the rotation of part j against its parent,
     row by row. With betas of zero it is the mean person, or the template's own body where the model has no betas. No
     kind of model here is linear in R - I, so the pose directions are fitted to so many draws from the prior; with 0
-    there are none.
+    there are none. Weights (N, J) are as for `make_rig`.
 
-    Parameters
-    ----------
-    path : str or Path
-    model : BodyModel
-    weights : (N, J) float
-        As for `make_rig`.
-    draws : int
-
-    Returns
-    -------
-    dict
-        `v_template` (N, 3) metres, `f` (F, 3), `weights` (N, J), `kintree_table` (2, J) with the parents (-1 for
-        the root) over the parts, `J_regressor` (J, N), `J` (J, 3) metres, `shapedirs` (N, 3, K) metres per
-        standard deviation, `posedirs` (N, 3, 9 (J - 1)) metres, `part_names` (J,), `betas_unit`, `length_unit`.
+    `v_template` (N, 3) metres, `f` (F, 3), `weights` (N, J), `kintree_table` (2, J) with the parents (-1 for the root)
+    over the parts, `J_regressor` (J, N), `J` (J, 3) metres, `shapedirs` (N, 3, K) metres per standard deviation,
+    `posedirs` (N, 3, 9 (J - 1)) metres, `part_names` (J,), `betas_unit`, `length_unit`.
     """
     mean = np.zeros(1) if model.n_betas else None
     rig = make_rig(model, mean, model.n_betas, weights)

@@ -45,7 +45,7 @@ def pose_from_angles(skeleton: Skeleton, angles: Mapping[str | int, Any]) -> np.
         if j in seen:
             raise ValueError(f"angles: part '{skeleton.names[j]}' is given twice")
         seen.add(j)
-        pose[j] = turn_vector(angle, f"angles['{part}']")
+        pose[j] = rotation_vector(angle, f"angles['{part}']")
     return pose
 
 
@@ -77,7 +77,7 @@ def rotate_joint(skeleton: Skeleton, pose: np.ndarray, part: str | int, rotation
     j = part_number(skeleton, part)
     if pose.shape[-2:] != (len(skeleton.parents), 3):
         raise ValueError(f"pose: expected shape (..., {len(skeleton.parents)}, 3), got {pose.shape}")
-    more, now = rotations.exp(turn_vector(rotation, "rotation")), rotations.exp(pose[..., j, :])
+    more, now = rotations.exp(rotation_vector(rotation, "rotation")), rotations.exp(pose[..., j, :])
     if frame == "own":
         turned = now @ more
     elif frame == "parent" or (frame == "world" and j == 0):
@@ -102,7 +102,7 @@ def part_number(skeleton: Skeleton, part: str | int) -> int:
     return int(part)
 
 
-def turn_vector(given: Any, name: str) -> np.ndarray:
+def rotation_vector(given: Any, name: str) -> np.ndarray:
     """The axis-angle vector (3,), radians, of a vector or of an axis with degrees."""
     if isinstance(given, tuple | list) and len(given) == 2:
         axis, degrees = given
@@ -126,27 +126,14 @@ def _finite(given: Any, name: str) -> np.ndarray:
     return vector
 
 
-NEAR = 0.08                          # of the body's size: how far mirrored parts may lie from their partners
-NEAR_ALONE = 0.015                   # where none are exchanged: a man is nearly flat, but not his own front to back
-ROUNDS = 10
 
 
 @dataclass(frozen=True, eq=False)
 class Mirror(MirrorPlane):
-    """The plane of a body's symmetry and which parts it exchanges.
+    """The plane of a body's symmetry and which parts it exchanges."""
 
-    Attributes
-    ----------
-    normal, point : (3,) float, metres
-        Of the plane.
-    partners : (J,) int
-        The part on the other side; a part in the middle is its own.
-    distance : float, metres
-        Root mean square distance of mirrored joints and centroids of parts from those of their partners.
-    """
-
-    partners: np.ndarray
-    distance: float
+    partners: np.ndarray             # (J,) the part on the other side; a part in the middle is its own
+    distance: float                  # metres, RMS of mirrored joints and centroids from those of the partners
 
     def trans(self, skeleton: Skeleton, trans: np.ndarray) -> np.ndarray:
         """The places (..., 3) of mirrored bodies, metres."""
@@ -195,7 +182,8 @@ def find_mirror(template: Mesh, skeleton: Skeleton) -> Mirror:
     each = np.arange(len(skeleton.parents))
     exchanging = [m for m in found if (m.partners != each).any()]
     best = min(exchanging or found, key=lambda m: m.distance)
-    if best.distance > (NEAR if exchanging else NEAR_ALONE) * size:
+    # where no parts are exchanged they may lie less far apart: a man is nearly flat, but not his own front to back
+    if best.distance > (0.08 if exchanging else 0.015) * size:
         image = np.linalg.norm(best.reflect(marks) - marks[:, best.partners], axis=-1).max(axis=0)
         worst = int(image.argmax())
         how = "in the best mirror" if exchanging else "no two parts can be exchanged, and in the best mirror"
@@ -225,7 +213,7 @@ def _candidates(template: Mesh, marks: np.ndarray) -> list[MirrorPlane]:
 def _fitted(skeleton: Skeleton, marks: np.ndarray, plane: MirrorPlane) -> Mirror | None:
     """The mirror near a plane, parts paired and plane fitted in turn; None where parts cannot be paired."""
     partners = np.full(len(skeleton.parents), -1)
-    for _ in range(ROUNDS):
+    for _ in range(10):
         before = partners
         paired = _paired(skeleton, plane.reflect(marks), marks)
         if paired is None:

@@ -17,7 +17,6 @@ from ..geometry import storage
 
 DIGITS = 32
 SETTLED = 2_000_000_000        # nanoseconds after which a file's time of change tells of every later change
-_STAT = ("st_size", "st_mtime_ns", "st_ctime_ns", "st_ino")
 
 
 class Digests:
@@ -58,7 +57,7 @@ class Digests:
             return self.of([(name, path / name) for name in names if not f"/{name}".count("/.")])
         try:
             stat = path.stat()
-            now = [getattr(stat, name) for name in _STAT]
+            now = [stat.st_size, stat.st_mtime_ns, stat.st_ctime_ns, stat.st_ino]
             key = str(path.absolute())
             known = self._known.get(key)
             if isinstance(known, list) and known[:-1] == now:

@@ -169,6 +169,18 @@ def as_colors(values: np.ndarray, kind: np.dtype) -> np.ndarray:
     return np.clip(np.asarray(values, dtype=np.float64) / scale, 0, 1)
 
 
+def as_seen(linear: np.ndarray) -> np.ndarray:
+    """sRGB values in [0, 1], as screens show them, of linear light, which is clipped to [0, 1]."""
+    linear = np.clip(linear, 0, 1)
+    return np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)
+
+
+def as_light(color: np.ndarray) -> np.ndarray:
+    """Linear light of sRGB values in [0, 1]."""
+    color = np.asarray(color, dtype=float)
+    return np.where(color <= 0.04045, color / 12.92, ((color + 0.055) / 1.055) ** 2.4)
+
+
 def as_bytes(colors: np.ndarray) -> np.ndarray:
     """Colours in [0, 1] as integers 0..255."""
     return np.clip(np.rint(255 * colors), 0, 255).astype(np.uint8)

@@ -69,10 +69,7 @@ def _diagonals(mesh: Mesh) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
     Only where that line crosses the edge, so that it runs inside the two triangles.
     """
-    order = np.argsort(mesh.face_edges.ravel(), kind="stable")
-    start = np.concatenate([[0], np.cumsum(mesh.edge_use)[:-1]])
-    inner = np.flatnonzero(mesh.edge_use == 2)
-    sides = np.stack([order[start[inner]], order[start[inner] + 1]])
+    inner, sides = np.flatnonzero(mesh.edge_use == 2), mesh.side_pairs.T
     c, d = mesh.faces[sides // 3, (sides % 3 + 2) % 3]    # the corner that faces side 01, 12 or 20
     x = mesh.vertices
     a, b = mesh.edges[inner].T

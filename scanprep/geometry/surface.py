@@ -18,11 +18,11 @@ def checked_points(points: np.ndarray, name: str = "points") -> np.ndarray:
     """Query points (n, 3) as float64, in one block; ValueError for one too far away for any library."""
     points = np.ascontiguousarray(points, dtype=np.float64)
     if points.ndim != 2 or points.shape[1] != 3:
-        raise ValueError(f"{name}: expected shape (n, 3), got {points.shape}")
+        raise ValueError(f"{name}: expected points of shape (n, 3), got shape {points.shape}")
     bad = np.flatnonzero(~(np.abs(points) < FARTHEST).all(axis=1))
     if len(bad):
-        raise ValueError(f"{name}: expected finite coordinates below {FARTHEST:g} m, got {len(bad)} of {len(points)} "
-                         f"without, the first is number {bad[0]}: {points[bad[0]].tolist()}")
+        raise ValueError(f"{name}: {len(bad)} points are not finite, or beyond {FARTHEST:g} m; the first is number "
+                         f"{bad[0]}: {points[bad[0]].tolist()}")
     return points
 
 

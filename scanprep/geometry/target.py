@@ -9,7 +9,7 @@ from scipy.spatial import cKDTree
 from ..threads import search_threads
 from .farthest_points import thin
 from .mesh import Mesh
-from .surface import OrientedPoints
+from .surface import OrientedPoints, checked_points
 
 NEIGHBOURS = 16                  # points of a scan over which its normals are averaged
 
@@ -33,13 +33,9 @@ class Target:
 
 def target_of(scan: Mesh | np.ndarray, name: str = "scan") -> Target:
     """Prepare a scan: normals averaged over neighbours, borders found; ValueError for fewer than four points."""
-    points = scan.vertices if isinstance(scan, Mesh) else np.asarray(scan, dtype=np.float64)
-    if points.ndim != 2 or points.shape[1] != 3:
-        raise ValueError(f"{name}: expected a Mesh or points of shape (n, 3), got shape {points.shape}")
+    points = checked_points(scan.vertices if isinstance(scan, Mesh) else scan, name)
     if len(points) < 4:
         raise ValueError(f"{name}: expected at least 4 points, got {len(points)}")
-    if not np.isfinite(points).all():
-        raise ValueError(f"{name}: {(~np.isfinite(points).all(axis=1)).sum()} points are not finite")
     normals = None
     if isinstance(scan, Mesh) and len(scan.faces):
         used = np.unique(scan.faces)

@@ -7,10 +7,10 @@ from typing import Any
 
 import numpy as np
 
+from ..geometry.format_common import as_light
 from ..geometry.format_glb import VERTICES, Glb, some_normal
 from ..geometry.mesh import Mesh
 from ..geometry.storage import write
-from .colors import decode
 
 # Turns that bring each axis to +y, the upward axis of glTF: quaternions x, y, z, w.
 UPRIGHT = {0: [0.0, 0.0, 0.5**0.5, 0.5**0.5], 1: [0.0, 0.0, 0.0, 1.0], 2: [-(0.5**0.5), 0.0, 0.0, 0.5**0.5]}
@@ -44,7 +44,7 @@ def animated_glb(faces: np.ndarray, frames: np.ndarray, rate: float, colors: np.
     attributes = {"POSITION": glb.add(base, "VEC3", VERTICES, bounds=True),
                   "NORMAL": glb.add(normals, "VEC3", VERTICES)}
     if colors is not None:
-        rgba = np.concatenate([decode(np.asarray(colors)), np.ones((len(base), 1))], axis=1)
+        rgba = np.concatenate([as_light(np.asarray(colors)), np.ones((len(base), 1))], axis=1)
         attributes["COLOR_0"] = glb.add(rgba, "VEC4", VERTICES)
     primitive: dict[str, Any] = {"attributes": attributes, "indices": glb.add_indices(faces), "material": 0}
     primitive["targets"] = [{"POSITION": glb.add(m.vertices - base, "VEC3", VERTICES, bounds=True),

@@ -35,11 +35,6 @@ class Page:
         self._parts += [f"<p>{escape(block.strip())}</p>" for block in text.split("\n\n") if block.strip()]
         return self
 
-    def code(self, text: str) -> Page:
-        """Text in a typewriter face, as it stands: commands, settings."""
-        self._parts.append(f"<pre><code>{escape(text.strip())}</code></pre>")
-        return self
-
     def markup(self, html: str, style: str = "") -> Page:
         """HTML as it stands, for what the other methods cannot show, and the CSS rules it needs, once each."""
         self._parts.append(html)

@@ -10,9 +10,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ..geometry.format_common import as_light
 from ..geometry.mesh import Mesh
 from .camera import Camera
-from .colors import color_bar, decode, heat, part_colors, part_palette
+from .colors import color_bar, heat, part_colors, part_palette
 from .lighting import Canvas, Scene, Triangles
 from .sheets import png_bytes, save_png, side_by_side
 
@@ -20,8 +21,6 @@ __all__ = ["Bones", "Camera", "Dots", "Solid", "color_bar", "heat", "part_colors
            "render", "save_png", "side_by_side"]
 
 CLAY = (0.79, 0.76, 0.725)
-ACCENT = (0.86, 0.24, 0.20)
-WHITE = (1.0, 1.0, 1.0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -40,7 +39,7 @@ class Dots:
     """Small balls: markers, joints, landmarks."""
 
     points: np.ndarray  # (n, 3) float, metres: points that are not finite are left out
-    color: np.ndarray | Sequence[float] = ACCENT  # (3,) or (n, 3) in [0, 1]
+    color: np.ndarray | Sequence[float] = (0.86, 0.24, 0.20)  # (3,) or (n, 3) in [0, 1]
     radius: float = 0.012  # metres
     on_top: bool = False  # seen through the meshes in front of them
     coarse: bool = False  # balls of few triangles, for pictures in which they are a few pixels wide
@@ -61,7 +60,7 @@ Shape = Mesh | Solid | Dots | Bones
 
 
 def render(shapes: Shape | Sequence[Shape], camera: Camera | None = None, width: int = 480, height: int = 640,
-           ground: bool = False, background: Sequence[float] | None = WHITE, samples: int = 2) -> np.ndarray:
+           ground: bool = False, background: Sequence[float] | None = (1.0, 1.0, 1.0), samples: int = 2) -> np.ndarray:
     """A shaded picture (height, width, 3) uint8, or (height, width, 4) when the background is None.
 
     The camera sees all meshes from their front when it is not given. `ground` is a soft shadow on the floor below the
@@ -120,13 +119,13 @@ def _triangles(shape: Shape, origin: np.ndarray) -> Triangles:
         use = np.isfinite(starts).all(axis=1) & np.isfinite(ends).all(axis=1)
         corners, normals, owner = capsules(starts[use] - origin, ends[use] - origin, shape.radius)
         count = len(starts)
-    color = decode(np.broadcast_to(np.asarray(shape.color, dtype=float), (count, 3)))[use][owner]
+    color = as_light(np.broadcast_to(np.asarray(shape.color, dtype=float), (count, 3)))[use][owner]
     return Triangles(corners, normals, np.repeat(color[:, None], 3, axis=1))
 
 
 def _corner_colors(color: np.ndarray, mesh: Mesh) -> np.ndarray:
     """(F, 3, 3) linear light at the corners of every triangle."""
-    linear = decode(color)
+    linear = as_light(color)
     if color.shape == (3,):
         return np.broadcast_to(linear, (len(mesh.faces), 3, 3))
     if color.shape == mesh.vertices.shape:

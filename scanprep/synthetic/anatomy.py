@@ -76,16 +76,16 @@ class BodyShape(Settings):
         return BodyShape(*map(float, values))
 
     @staticmethod
-    def random(rng: np.random.Generator, sex: float | None = None, spread: float = 1.0) -> BodyShape:
+    def random(rng: np.random.Generator, sex: float | None = None) -> BodyShape:
         """A plausible person: stature from the population, the rest normal within its range."""
         if sex is None:
             sex = 1.0 if rng.random() < 0.5 else -1.0
         man = (sex + 1) / 2
-        stature = man * 1.765 + (1 - man) * 1.64 + spread * rng.normal() * 0.068
+        stature = man * 1.765 + (1 - man) * 1.64 + rng.normal() * 0.068
         values = {"sex": sex, "stature": stature}
         scale = {"weight": 0.9, "muscle": 0.8, "belly": 0.7, "chest": 0.8, "limbs": 0.7}
         for field in fields(BodyShape)[2:]:
-            values[field.name] = spread * scale.get(field.name, 0.9) * rng.normal()
+            values[field.name] = scale.get(field.name, 0.9) * rng.normal()
         allowed = {name: (found.low, found.high) for name, (found, _) in ranges(BodyShape).items()}
         return BodyShape(**{name: float(np.clip(v, *allowed[name])) for name, v in values.items()})
 
