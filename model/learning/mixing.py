@@ -184,11 +184,8 @@ def _next_round(mix: Mix, state: State, number: int, work: Work) -> State:
 
 
 def _learn_pose(mix: Mix, state: State) -> tuple[PoseSpace, Design]:
-    """The pose space with the shapes held, first as in the paper, then corrected on the stitched surface.
-
-    As in `learn_pose`, where all bodies are one person's.
-
-    [SCAPE] Eq. 4, Eq. 5
+    """The pose space with the shapes held, first as in the paper, then corrected on the stitched surface, as in
+    `learn_pose`. [SCAPE] Eq. 4, Eq. 5
     """
     parts, config, poses, S = mix.parts, mix.config, state.poses, state.S
     gradients = GradientSystem(parts.template, config.smoothness, parts.skeleton.part_of_face)
@@ -225,11 +222,8 @@ def _at_rest(space: PoseSpace) -> PoseSpace:
 
 
 def _learn_people(mix: Mix, poses: np.ndarray, space: PoseSpace) -> np.ndarray:
-    """S (P, F, 3, 3) of every person from all of his bodies together, in float32 to halve the memory.
-
-    As with Q, Eq. 8 does not know of the stitching: what the stitched bodies leave is added and solved for again.
-
-    [SCAPE] Eq. 8
+    """S (P, F, 3, 3) of every person from all of their bodies together, in float32 to halve the memory. As with Q, what
+    the stitched bodies leave is added and solved for again. [SCAPE] Eq. 8
     """
     parts = mix.parts
     system = GradientSystem(parts.template, mix.config.smoothness)

@@ -98,11 +98,9 @@ def _groups(sexes: Sequence[str], count: int) -> dict[str, np.ndarray]:
 
 @dataclass(frozen=True, eq=False)
 class SexPlane:
-    """A plane between the betas of women and men.
-
-    `weights` (K,) is its unit normal, towards the men; `weights @ betas + bias` the signed distance. `accuracy` is the
-    share of the `count` people that planes learned without them told right, and `1 / (1 + exp(-slope distance))` the
-    probability of a man, by the same planes.
+    """A plane between the betas of women and men: its unit normal `weights` (K,), towards the men, and the signed
+    distance `weights @ betas + bias`. Planes learned without them told the share `accuracy` of the `count` people
+    right, and give the probability of a man, `1 / (1 + exp(-slope distance))`.
     """
 
     weights: np.ndarray

@@ -28,10 +28,9 @@ STORED = Path(__file__).with_name("humanoid.npz")           # made by tests/huma
 def read_control(path: str | Path) -> ControlModel:
     """A control model: a file of `write_control`, or a skinned mesh in a GLB file as Blender exports it.
 
-    Of a skinned mesh the pose of the file is the default pose, turned so that z is up; vertices that stand at one place
-    are one; joints turn about three axes with wide limits, every part is a segment of its own, and there are no
-    landmarks. Joints that carry no triangle are left out. Without texture coordinates a chart is made. StorageError
-    says what is wrong with a file.
+    Of a skinned mesh the pose of the file is the default pose, turned so that z is up; joints turn about three axes
+    with wide limits, every part is a segment of its own, and there are no landmarks. Joints that carry no triangle are
+    left out; without texture coordinates a chart is made. StorageError says what is wrong with a file.
     """
     readers = {".npz": _load, ".glb": _read_skinned}
     if Path(path).suffix.lower() not in readers:
