@@ -74,10 +74,10 @@ def find_plane(points: np.ndarray, min_area: float, rng: np.random.Generator) ->
     return plane
 
 
-def local_noise(points: np.ndarray, rng: np.random.Generator, count: int = 500, near: int = 16) -> float:
+def local_noise(points: np.ndarray, rng: np.random.Generator) -> float:
     """Standard deviation, metres, of points (n, 3) from planes through their nearest neighbours: the median."""
-    near = min(near, len(points))
-    index = cKDTree(points).query(points[rng.choice(len(points), min(count, len(points)), replace=False)], near)[1]
+    near = min(16, len(points))
+    index = cKDTree(points).query(points[rng.choice(len(points), min(500, len(points)), replace=False)], near)[1]
     patch = points[index.reshape(-1, near)]
     spread = np.linalg.svd(patch - patch.mean(axis=1, keepdims=True), compute_uv=False)[:, 2]
     return max(float(np.median(spread)) / max(near - 3, 1) ** 0.5, 1e-4)

@@ -183,11 +183,11 @@ def _scan(scan: Mesh | np.ndarray, R: np.ndarray, middle: np.ndarray, size: floa
     return Dots((points[thin(points, 1.25 * BALL * size)] - middle) @ R.T, CLAY, BALL * size)
 
 
-def evened(mesh: Mesh, values: np.ndarray, rounds: int = 2) -> np.ndarray:
+def evened(mesh: Mesh, values: np.ndarray) -> np.ndarray:
     """Values (N,) averaged with those of neighbours, so that noise fades and misfit stays; NaN stays NaN."""
     known = np.isfinite(values)
     weights = mesh.vertex_adjacency.astype(float) + eye_array(len(values))
-    for _ in range(rounds):
+    for _ in range(2):
         total = weights @ np.where(known, values, 0.0)
         values = np.where(known, total / np.maximum(weights @ known.astype(float), 1.0), np.nan)
     return values
@@ -205,10 +205,10 @@ def coarsened(mesh: Mesh, cell: float) -> Mesh:
     return Mesh(means, faces[apart], colors)
 
 
-def webp_bytes(image: np.ndarray, quality: int = 82) -> bytes:
+def webp_bytes(image: np.ndarray) -> bytes:
     """A picture (H, W, 3) uint8 as a WebP file, a tenth of the size of a PNG."""
     from PIL import Image
 
     out = io.BytesIO()
-    Image.fromarray(image).save(out, format="WEBP", quality=quality, method=4)
+    Image.fromarray(image).save(out, format="WEBP", quality=82, method=4)
     return out.getvalue()
