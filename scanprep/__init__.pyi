@@ -4,13 +4,8 @@ from .cleaning.clean_scan import CleanScanConfig as CleanScanConfig
 from .cleaning.clean_scan import clean_scan as clean_scan
 from .correspondence.correlated import find_correspondences as find_correspondences
 from .correspondence.search import CorrelatedConfig as CorrelatedConfig
-from .correspondence.seeds import SeedConfig as SeedConfig
-from .correspondence.seeds import find_seeds as find_seeds
 from .dataset import RegisteredSet as RegisteredSet
 from .decimation.decimate import decimate as decimate
-from .decimation.registered_set import DecimateSetConfig as DecimateSetConfig
-from .decimation.registered_set import decimate_set as decimate_set
-from .decimation.registered_set import write_decimated_set as write_decimated_set
 from .fusion.tsdf import merge_views as merge_views
 from .geometry.files import (
     MeshFileError as MeshFileError,
@@ -43,24 +38,6 @@ from .repair.hole_filling import fill_holes as fill_holes
 from .skeleton.edit import (
     apply_edits as apply_edits,
 )
-from .skeleton.edit import (
-    merge_parts as merge_parts,
-)
-from .skeleton.edit import (
-    move_joint as move_joint,
-)
-from .skeleton.edit import (
-    read_edits as read_edits,
-)
-from .skeleton.edit import (
-    rename_part as rename_part,
-)
-from .skeleton.edit import (
-    split_part as split_part,
-)
 from .skeleton.find import SkeletonConfig as SkeletonConfig
-from .skeleton.find import SkeletonSearch as SkeletonSearch
 from .skeleton.find import find_skeleton as find_skeleton
-from .skeleton.find import search_skeleton as search_skeleton
-from .skeleton.names import name_parts as name_parts
 from .skeleton.tree import Skeleton as Skeleton

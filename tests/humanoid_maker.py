@@ -10,6 +10,7 @@ from dataclasses import replace
 
 import numpy as np
 from people_maker import mirror, remesh
+from polygonise import polygonise
 from scipy.optimize import linear_sum_assignment
 from scipy.sparse import coo_array, csr_array, diags_array
 from scipy.sparse.csgraph import dijkstra
@@ -17,8 +18,7 @@ from scipy.spatial import cKDTree
 
 from model.blend_weights import strongest
 from model.statue.control.chart import make_chart
-from model.statue.control.files import write_control
-from model.statue.control.humanoid import STORED
+from model.statue.control.files import STORED, write_control
 from model.statue.control.model import ControlModel
 from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.surface import Surface
@@ -26,7 +26,7 @@ from scanprep.skeleton.tree import Skeleton
 from scanprep.synthetic import body_parts as people_parts
 from scanprep.synthetic.anatomy import Anatomy, tables
 from scanprep.synthetic.body_parts import cross_sections
-from scanprep.synthetic.implicit_surface import Field, Group, Loft, Mirrored, RoundCone, polygonise, project
+from scanprep.synthetic.implicit_surface import Field, Group, Loft, Mirrored, RoundCone, project
 from scanprep.synthetic.landmarks import landmarks, markers
 from scanprep.synthetic.topology import CANONICAL, blending, load
 

@@ -9,12 +9,13 @@ from collections.abc import Callable
 from pathlib import Path
 
 import numpy as np
+from polygonise import polygonise
 
 from scanprep.geometry import storage
 from scanprep.geometry.mesh import Mesh
 from scanprep.synthetic.anatomy import Anatomy
 from scanprep.synthetic.body_parts import arm, body_surface, hand, trunk
-from scanprep.synthetic.implicit_surface import Field, polygonise, project
+from scanprep.synthetic.implicit_surface import Field, project
 from scanprep.synthetic.topology import CANONICAL, STORED, VERSION, Template
 
 Sizing = Callable[[np.ndarray], np.ndarray]

@@ -17,7 +17,7 @@ from completion import Motion
 from completion.tracking import cli
 from completion.tracking.folder import FrameFolder
 from completion.tracking.report import _ranges
-from completion.tracking.tracker import Tracker
+from completion.tracking.sequence import Tracker
 from model import load_model
 from scanprep.batch.workspace import HOME
 from scanprep.command_line import run

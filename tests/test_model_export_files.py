@@ -1,17 +1,17 @@
 """Exported files, read back by readers of their own."""
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
+from bvh_reader import Bvh
 from glb_reader import Glb
 from model_bodies import random_poses, worm_model
 
-from model.export.bvh import part_ends, write_bvh
-from model.export.bvh_read import read_bvh
+from model.export.bvh import part_ends, read_bvh, write_bvh
 from model.export.cli import export, read_motion, write_frames
-from model.export.correctives import motion_correctives
+from model.export.correctives import motion_correctives, pose_directions, pose_features, write_body_npz
 from model.export.glb import continuous_quaternions, skinned_glb, write_skinned_glb
-from model.export.npz import pose_directions, pose_features, write_body_npz
 from model.export.rig import joint_places, make_rig, turn_up
 from scanprep.command_line import run
 from scanprep.geometry import rotations
@@ -40,16 +40,15 @@ def motion(model):
 
 @pytest.mark.parametrize("up", [0, 1, 2])
 def test_a_viewer_sees_the_skinned_motion(rig, motion, up):
-    poses, trans = motion
-    glb = Glb(skinned_glb(rig, poses, trans, 4.0, up=up))
+    glb = Glb(skinned_glb(rig, *motion, 4.0, up=up))
     assert np.array_equal(glb.faces, rig.mesh.faces)
-    for t, expected in enumerate(rig.vertices(poses, trans)):
+    for t, expected in enumerate(rig.vertices(*motion)):
         assert np.abs(glb.skinned(t) - expected @ turn_up(up).T).max() < 1e-5
     times = [glb.array(s["input"]) for s in glb.json["animations"][0]["samplers"]]
     assert all(np.allclose(t[:, 0], [0, 0.25, 0.5, 0.75, 1.0]) for t in times)
 
 
-def test_at_rest_nothing_is_moved(rig):
+def test_at_rest_nothing_is_moved_and_weights_are_as_gltf_wants_them(rig):
     glb = Glb(skinned_glb(rig, up=1))
     assert np.abs(glb.skinned() - rig.mesh.vertices).max() < 1e-6
     assert np.abs(glb.morphed([0, 0, 0]) - rig.mesh.vertices).max() < 1e-6
@@ -61,10 +60,6 @@ def test_at_rest_nothing_is_moved(rig):
         assert np.abs(world[node][:3, 3] - rig.skeleton.joints[j]).max() < 1e-6
         assert glb.json["nodes"][node]["name"] == rig.skeleton.names[j]
     assert "animations" not in glb.json
-
-
-def test_weights_are_as_gltf_wants_them(rig):
-    glb = Glb(skinned_glb(rig))
     joints = glb.array(glb.primitive["attributes"]["JOINTS_0"])
     weights = glb.array(glb.primitive["attributes"]["WEIGHTS_0"])
     assert joints.max() < 4 and np.abs(weights.sum(axis=1, dtype=float) - 1).max() < 1e-6
@@ -133,100 +128,25 @@ def test_bad_motion_is_refused(rig, motion, change, words):
         skinned_glb(rig, *change(*motion))
 
 
-class Bvh:
-    """A BVH file, read word by word."""
-
-    def __init__(self, text):
-        self.words = text.split()
-        self.names, self.parents, self.offsets, self.channels, self.ends = [], [], [], [], {}
-        assert self.take() == "HIERARCHY" and self.take() == "ROOT"
-        self.joint(-1)
-        assert [self.take() for _ in range(2)] == ["MOTION", "Frames:"]
-        count = int(self.take())
-        assert [self.take() for _ in range(2)] == ["Frame", "Time:"]
-        self.time = float(self.take())
-        self.frames = np.array(self.words, dtype=float).reshape(count, -1)
-        assert self.frames.shape[1] == sum(map(len, self.channels))
-
-    def take(self):
-        return self.words.pop(0)
-
-    def vector(self):
-        assert self.take() == "OFFSET"
-        return np.array([float(self.take()) for _ in range(3)])
-
-    def joint(self, parent):
-        me = len(self.names)
-        self.names.append(self.take())
-        self.parents.append(parent)
-        assert self.take() == "{"
-        self.offsets.append(self.vector())
-        assert self.take() == "CHANNELS"
-        self.channels.append([self.take() for _ in range(int(self.take()))])
-        while (word := self.take()) != "}":
-            if word == "JOINT":
-                self.joint(me)
-            else:
-                assert (word, self.take(), self.take()) == ("End", "Site", "{")
-                self.ends[self.names[me]] = self.vector()
-                assert self.take() == "}"
-
-    def positions(self, frame):
-        """name -> place of the joint, each channel a matrix that is multiplied on from the right."""
-        values = iter(self.frames[frame])
-        world = []
-        for j, parent in enumerate(self.parents):
-            M = np.eye(4) if parent < 0 else world[parent].copy()
-            for axis, step in enumerate(self.offsets[j]):
-                M = M @ moved(axis, step)
-            for channel in self.channels[j]:
-                axis, value = "XYZ".index(channel[0]), next(values)
-                M = M @ (moved(axis, value) if channel.endswith("position") else spun(axis, np.radians(value)))
-            world.append(M)
-        return {name: M[:3, 3] for name, M in zip(self.names, world, strict=True)}
-
-
-def moved(axis, step):
-    M = np.eye(4)
-    M[axis, 3] = step
-    return M
-
-
-def spun(axis, angle):
-    M = np.eye(4)
-    b, c = (axis + 1) % 3, (axis + 2) % 3
-    M[b, b] = M[c, c] = np.cos(angle)
-    M[c, b], M[b, c] = np.sin(angle), -np.sin(angle)
-    return M
-
-
 @pytest.mark.parametrize(("up", "unit", "metre"), [(0, "cm", 100), (1, "m", 1), (2, "in", 39.37007874015748)])
-def test_bvh_holds_the_motion_of_the_joints(rig, motion, tmp_path, up, unit, metre):
+def test_bvh_holds_the_motion_of_the_joints_and_is_read_back(rig, motion, tmp_path, up, unit, metre):
     poses, trans = motion[0].copy(), motion[1]
-    poses[0, 2] = [np.pi / 2, 0, 0]                                # two Euler axes fall together
-    poses[1, 1] = [0, 0, 3.5]
-    write_bvh(tmp_path / "a.bvh", rig.skeleton, poses, trans, 120.0, unit, up)
-    bvh = Bvh((tmp_path / "a.bvh").read_text())
-    assert abs(bvh.time - 1 / 120) < 1e-9 and len(bvh.frames) == 5
-    assert [len(c) for c in bvh.channels] == [6, 3, 3, 3] and not bvh.offsets[0].any()
-    for t, places in enumerate(joint_places(rig.skeleton, poses, trans) @ turn_up(up).T):
-        found = bvh.positions(t)
-        for name, place in zip(rig.skeleton.names, places, strict=True):
-            assert np.abs(found[name] / metre - place).max() < 1e-6
-
-
-@pytest.mark.parametrize("unit", ["m", "in"])
-def test_bvh_that_was_written_is_read_back(rig, motion, tmp_path, unit):
-    poses, trans = motion
-    write_bvh(tmp_path / "a.bvh", rig.skeleton, poses, trans, 4.0, unit, up=2, body=rig.mesh)
-    bvh, U = read_bvh(tmp_path / "a.bvh", unit), turn_up(2)
-    order = [bvh.names.index(name) for name in rig.skeleton.names]
-    assert bvh.rate == pytest.approx(4.0, abs=1e-6) and not bvh.offsets[0].any()
-    assert np.abs(bvh.places[:, order] - joint_places(rig.skeleton, poses, trans) @ U.T).max() < 1e-6
-    assert np.abs(bvh.rotations[:, order] - U @ rig.skeleton.part_rotations(poses) @ U.T).max() < 1e-6
-    rest = bvh.rest[order] @ U
+    poses[0, 2], poses[1, 1] = [np.pi / 2, 0, 0], [0, 0, 3.5]      # of the first two Euler axes fall together
+    write_bvh(tmp_path / "a.bvh", rig.skeleton, poses, trans, 120.0, unit, up, body=rig.mesh)
+    theirs, ours, U = Bvh((tmp_path / "a.bvh").read_text()), read_bvh(tmp_path / "a.bvh", unit), turn_up(up)
+    assert abs(float(theirs.time) - 1 / 120) < 1e-9 and len(theirs.frames) == 5
+    assert [len(c) for c in theirs.channels] == [6, 3, 3, 3]
+    assert ours.rate == pytest.approx(120, abs=1e-4) and not theirs.offsets[0].any() and not ours.offsets[0].any()
+    order = [ours.names.index(name) for name in rig.skeleton.names]
+    places = joint_places(rig.skeleton, poses, trans) @ U.T
+    for t in range(5):
+        found = theirs.positions(t)
+        assert np.abs(np.stack([found[name] for name in rig.skeleton.names]) / metre - places[t]).max() < 1e-6
+    assert np.abs(ours.places[:, order] - places).max() < 1e-6
+    assert np.abs(ours.rotations[:, order] - U @ rig.skeleton.part_rotations(poses) @ U.T).max() < 1e-6
+    rest = ours.rest[order] @ U
     assert np.abs(rest - rest[0] - rig.skeleton.joints + rig.skeleton.joints[0]).max() < 1e-6
-    ends = {bvh.names[j]: end for j, end in bvh.ends.items()}
+    ends = {ours.names[j]: end for j, end in ours.ends.items()}
     assert set(ends) == {"part1", "part3"}
     assert np.abs(ends["part3"] @ U - part_ends(rig.skeleton, rig.mesh)[3] + rig.skeleton.joints[3]).max() < 1e-6
 
@@ -239,22 +159,10 @@ ROOT Left Hip {
 \t{
 \t\tOFFSET 0 10 0
 \t\tCHANNELS 1 Xrotation
-\t\tEnd Site
-\t\t{
-\t\t\tOFFSET 0 1 0
-\t\t}
-\t}
-\tJOINT b
-\t{
-\t\tOFFSET 4 0 0
-\t\tCHANNELS 5 Xposition Yposition Zposition Zrotation Yrotation
-\t}
-\tJOINT c
-\t{
-\t\tOFFSET 4 0 0
-\t\tCHANNELS 3 xposition yposition zposition
-\t}
-}
+\t\tEnd Site { OFFSET 0 1 0 } }
+\tJOINT b { OFFSET 4 0 0 CHANNELS 5 Xposition Yposition Zposition Zrotation Yrotation }
+\tJOINT c { OFFSET 4 0 0
+\t\tCHANNELS 3 xposition yposition zposition } }
 MOTION
 Frames : 3
 Frame Time:\t0.05
@@ -287,34 +195,28 @@ def test_bvh_of_other_programs(tmp_path, end):
 
 @pytest.mark.parametrize(("change", "words"), [
     (("Frames : 3", "Frames : 4"), "a.bvh: expected 4 frames of 15 numbers, found 3 lines with 45 numbers"),
-    (("0.5 0 0\n30\t", "0.5 0\n30 "), "a.bvh, line 29: expected the 15 numbers of a frame, found 14"),
-    (("-70", "nan"), "a.bvh, line 30: expected finite numbers, found 'nan'"),
-    (("-70", "x7"), "a.bvh, line 30: expected finite numbers, found 'x7'"),
+    (("0.5 0 0\n30\t", "0.5 0\n30 "), "a.bvh, line 17: expected the 15 numbers of a frame, found 14"),
+    (("-70", "nan"), "a.bvh, line 18: expected finite numbers, found 'nan'"),
+    (("-70", "x7"), "a.bvh, line 18: expected finite numbers, found 'x7'"),
     (("OFFSET 0 10 0", "OFFSET 0 10"), "a.bvh, line 8: expected a number of the OFFSET, found 'CHANNELS'"),
     (("CHANNELS 1 X", "CHANNELS 2 X"), "a.bvh, line 9: expected a channel as Xposition or Zrotation, found 'End'"),
-    (("JOINT c", "JOINT b"), "a.bvh, line 19: expected joints with names that differ, found 'b'"),
-    (("0.05", "0"), "a.bvh, line 27: expected the seconds of a frame, found '0'"),
+    (("JOINT c", "JOINT b"), "a.bvh, line 11: expected joints with names that differ, found 'b'"),
+    (("0.05", "0"), "a.bvh, line 15: expected the seconds of a frame, found '0'"),
     (("Frames : 3", "Frames : 900000000"), "expected frames of joints with channels, found 900000000"),
     (("MOTION", ""), "expected MOTION, found 'Frames'"),
     ((MIXED, "HIERARCHY"), "expected ROOT, the file ends at line 1"),
     ((MIXED, "\x00\xff"), "expected HIERARCHY")])
 def test_damaged_bvh_is_refused(tmp_path, change, words):
     assert change[0] in MIXED
+    with pytest.raises(StorageError, match=r"a\.bvh: no such file; expected a BVH file"):
+        read_bvh(tmp_path / "a.bvh", "cm")
     (tmp_path / "a.bvh").write_text(MIXED.replace(*change))
     with pytest.raises(StorageError, match=words):
         read_bvh(tmp_path / "a.bvh", "cm")
 
 
-def test_bvh_without_a_file_or_a_unit_is_refused(tmp_path):
-    with pytest.raises(StorageError, match=r"no\.bvh: no such file; expected a BVH file"):
-        read_bvh(tmp_path / "no.bvh", "cm")
-    with pytest.raises(ValueError, match="unit: expected one of m, cm, mm, in, got 'ft'"):
-        read_bvh(tmp_path / "no.bvh", "ft")
-
-
 def test_bvh_turns_do_not_jump(rig, tmp_path):
-    poses = np.zeros((50, 4, 3))
-    poses[:, 2, 2] = np.linspace(0, 4 * np.pi, 50)
+    poses = np.linspace(0, 4 * np.pi, 50)[:, None, None] * np.array([[0, 0, j == 2] for j in range(4)])
     write_bvh(tmp_path / "a.bvh", rig.skeleton, poses, up=1)
     frames = Bvh((tmp_path / "a.bvh").read_text()).frames
     assert np.abs(np.diff(frames, axis=0)).max() < 15
@@ -328,28 +230,23 @@ def test_bvh_without_motion_is_one_frame_at_rest(rig, tmp_path):
     assert (tmp_path / "a.bvh").read_text() == (tmp_path / "b.bvh").read_text()
     assert len(bvh.frames) == 1 and not bvh.frames[0, 3:].any()
     places = bvh.positions(0)
-    for name, joint in zip(rig.skeleton.names, rig.skeleton.joints, strict=True):
-        assert np.abs(places[name] / 100 - joint).max() < 1e-6
+    assert np.abs(np.stack([places[name] for name in rig.skeleton.names]) / 100 - rig.skeleton.joints).max() < 1e-6
     assert set(bvh.ends) == {"part1", "part3"}, "the leaves"
     # the worm's parts end where the worm ends, along its axis
     for name, end in (("part1", rig.mesh.vertices[:, 0].min()), ("part3", rig.mesh.vertices[:, 0].max())):
         assert (places[name] + bvh.ends[name])[0] / 100 == pytest.approx(end, abs=0.02)
-
-
-def test_without_a_body_a_leaf_is_as_long_as_the_bone_before_it(rig):
     joints = rig.skeleton.joints
-    assert np.allclose(part_ends(rig.skeleton)[3], 2 * joints[3] - joints[2])
+    assert np.allclose(part_ends(rig.skeleton)[3], 2 * joints[3] - joints[2]), "without a body: as the bone before it"
 
 
-def test_bad_bvh_is_refused(rig, model, tmp_path):
-    from dataclasses import replace
-
+@pytest.mark.parametrize(("names", "how", "words"), [
+    (None, {"unit": "ft"}, "unit: expected one of m, cm, mm, in, got 'ft'"),
+    (("a", "b", "c", "left arm"), {}, "without white space"), (None, {"rate": -1.0}, "rate")])
+def test_bad_bvh_is_refused(rig, tmp_path, names, how, words):
+    with pytest.raises(ValueError, match=words):
+        write_bvh(tmp_path / "a.bvh", replace(rig.skeleton, names=names or rig.skeleton.names), **how)
     with pytest.raises(ValueError, match="unit: expected one of m, cm, mm, in, got 'ft'"):
-        write_bvh(tmp_path / "a.bvh", rig.skeleton, unit="ft")
-    with pytest.raises(ValueError, match="without white space"):
-        write_bvh(tmp_path / "a.bvh", replace(rig.skeleton, names=("a", "b", "c", "left arm")))
-    with pytest.raises(ValueError, match="rate"):
-        write_bvh(tmp_path / "a.bvh", rig.skeleton, rate=-1.0)
+        read_bvh(tmp_path / "no.bvh", "ft")
     assert not list(tmp_path.iterdir())
 
 
@@ -360,15 +257,12 @@ def body(arrays, pose, betas, trans):
     joints = arrays["J_regressor"] @ shaped
     R = rotations.exp(pose)
     bent = shaped + arrays["posedirs"] @ (R[1:] - np.eye(3)).ravel()
-    world = []
-    for j, parent in enumerate(parents):
-        local = np.eye(4)
-        local[:3, :3], local[:3, 3] = R[j], joints[j] - (joints[parent] if j else 0)
-        world.append(world[parent] @ local if j else local)
-    carry = np.array(world)
-    carry[:, :3, 3] -= np.einsum("jab,jb->ja", carry[:, :3, :3], joints)
-    return (np.einsum("nj,jab,nb->na", arrays["weights"], carry[:, :3, :3], bent)
-            + arrays["weights"] @ carry[:, :3, 3] + trans)
+    world, places = [R[0]], [joints[0]]
+    for j, parent in enumerate(parents[1:], 1):
+        world.append(world[parent] @ R[j])
+        places.append(places[parent] + world[parent] @ (joints[j] - joints[parent]))
+    offset = np.array(places) - np.einsum("jab,jb->ja", world, joints)
+    return np.einsum("nj,jab,nb->na", arrays["weights"], world, bent) + arrays["weights"] @ offset + trans
 
 
 def test_npz_has_the_arrays_that_users_expect(model, tmp_path):
@@ -382,12 +276,10 @@ def test_npz_has_the_arrays_that_users_expect(model, tmp_path):
     assert str(arrays["betas_unit"]) == "standard deviation" and str(arrays["length_unit"]) == "metre"
     assert np.array_equal(arrays["kintree_table"], [[-1, 0, 0, 2], [0, 1, 2, 3]])
     assert np.allclose(arrays["J_regressor"] @ arrays["v_template"], arrays["J"], atol=1e-12)
-    rest, trans = np.zeros((4, 3)), np.array([1.0, -2.0, 0.5])
-    betas = np.array([1.0, -2.0, 0.5])
-    assert np.abs(body(arrays, rest, betas, trans) - model.vertices(rest, betas, trans)).max() < 1e-6
-    turned = rest.copy()
-    turned[0] = [1.0, 0.5, 2.0]
-    assert np.abs(body(arrays, turned, betas, trans) - model.vertices(turned, betas, trans)).max() < 1e-6
+    betas, trans = np.array([1.0, -2.0, 0.5]), np.array([1.0, -2.0, 0.5])
+    for root in (np.zeros(3), [1.0, 0.5, 2.0]):
+        pose = np.vstack([root, np.zeros((3, 3))])
+        assert np.abs(body(arrays, pose, betas, trans) - model.vertices(pose, betas, trans)).max() < 1e-6
 
 
 def test_pose_directions_bring_skinning_to_the_model(tmp_path):
@@ -412,8 +304,7 @@ def test_known_pose_directions_are_found(model, rig):
 
 
 def test_a_motion_becomes_a_folder_of_meshes(model, motion, tmp_path):
-    subject = model.subject(BETAS)
-    calls = []
+    subject, calls = model.subject(BETAS), []
     paths = write_frames(tmp_path / "frames", subject, *motion, progress=lambda *now: calls.append(now))
     assert [p.name for p in paths] == [f"{t:05d}.ply" for t in range(5)] and calls[-1] == (5, 5)
     for t, path in enumerate(paths):
@@ -473,16 +364,16 @@ def test_the_command_refuses_in_one_line(files, arguments, words, capsys, monkey
     assert not list(files.glob("b.*")) and not (files / "nothing").exists()
 
 
-def test_motions_of_other_bodies_are_refused(model, tmp_path):
-    good = {"poses": np.zeros((2, 12)), "trans": np.zeros((2, 3)), "mocap_frame_rate": np.array(30.0)}
-    for change, words in (({"poses": np.zeros((2, 15))}, "4 parts"), ({"betas": np.zeros(7)}, "at most the 3 betas"),
-                          ({"poses": np.zeros((0, 12))}, "4 parts"),
-                          ({"surface_model_type": np.array("other")}, "surface_model_type 'scape'"),
-                          ({"trans": np.zeros((3, 3))}, r"trans: expected shape \(2, 3\)"),
-                          ({"mocap_frame_rate": np.array(0.0)}, "rate")):
-        np.savez(tmp_path / "m.npz", **{**good, **change})
-        with pytest.raises(StorageError, match=words):
-            read_motion(tmp_path / "m.npz", model)
-    good["mocap_framerate"] = good.pop("mocap_frame_rate")
-    np.savez(tmp_path / "m.npz", **good)
-    assert read_motion(tmp_path / "m.npz", model).rate == 30.0
+@pytest.mark.parametrize(("change", "words"), [
+    ({"poses": np.zeros((2, 15))}, "4 parts"), ({"betas": np.zeros(7)}, "at most the 3 betas"),
+    ({"poses": np.zeros((0, 12))}, "4 parts"), ({"trans": np.zeros((3, 3))}, r"trans: expected shape \(2, 3\)"),
+    ({"surface_model_type": np.array("other")}, "surface_model_type 'scape'"),
+    ({"mocap_frame_rate": np.array(0.0)}, "rate"), ({}, None)])
+def test_motions_of_other_bodies_are_refused(model, tmp_path, change, words):
+    rate = {"mocap_frame_rate" if words else "mocap_framerate": np.array(30.0)}
+    np.savez(tmp_path / "m.npz", **{"poses": np.zeros((2, 12)), "trans": np.zeros((2, 3)), **rate, **change})
+    if words is None:
+        assert read_motion(tmp_path / "m.npz", model).rate == 30.0
+        return
+    with pytest.raises(StorageError, match=words):
+        read_motion(tmp_path / "m.npz", model)

@@ -5,8 +5,7 @@ import pytest
 from model_bodies import random_poses, worm, worm_model, worm_skeleton
 from posing_bodies import skinned, symmetric_worm
 
-from model.posing.angles import pose_from_angles, rotate_joint
-from model.posing.mirroring import find_mirror, mirror_pose
+from model.posing.poses import find_mirror, mirror_pose, pose_from_angles, rotate_joint
 from model.priors import JointLimits, sample_poses
 from scanprep.geometry import rotations
 from scanprep.skeleton.tree import Skeleton

@@ -10,8 +10,7 @@ from model.cli import group
 from model.features import linear_features
 from model.pose_space import PoseSpace
 from model.resolution.change import ResolutionConfig, change_resolution, resample, resolution_gap, subdivide
-from model.resolution.distil import Follower
-from model.resolution.pieces import Piece, gradients_of, transfer_skeleton
+from model.resolution.transfer import Follower, Piece, gradients_of, transfer_skeleton
 from model.scape import BlendScapeModel, ScapeModel
 from model.shape_space import ShapeSpace
 from scanprep import decimate, write_mesh

@@ -9,7 +9,7 @@ from model import fit_pose
 from model.cli import group
 from model.features import linear_features
 from model.fitting import PoseFit, ShapeFit
-from model.posing.transfer import own_body, repose, subject_from_body
+from model.posing.transfer import own_body, subject_from_body
 from model.scape import BlendScapeModel
 from scanprep import read_mesh, write_mesh
 from scanprep.geometry import rotations
@@ -18,6 +18,11 @@ from scanprep.geometry import rotations
 @pytest.fixture(scope="module")
 def model():
     return replace(worm_model(), pose_covariance=0.1 * np.eye(12))
+
+
+def repose(model, body, poses, trans=None, fit=None):
+    return own_body(model, body, fit).subject.vertices(poses, trans)
+
 
 
 def fit_of(pose, betas=None):

@@ -7,10 +7,9 @@ import numpy as np
 import pytest
 
 from scanprep.correspondence import potentials as ce
-from scanprep.correspondence.correlated import find_correspondences
+from scanprep.correspondence.correlated import find_correspondences, find_seeds, matched_ends
 from scanprep.correspondence.potentials import Places, gradients
 from scanprep.correspondence.search import BeliefLevel, CorrelatedConfig
-from scanprep.correspondence.seeds import SeedConfig, find_seeds, matched_ends
 from scanprep.correspondence.sheet import Sheet
 from scanprep.geometry import rotations
 from scanprep.geometry.mesh import Mesh
@@ -108,8 +107,7 @@ def test_wrong_seeds_are_refused(person, kicking):
 
 
 def test_seeds_are_found_without_a_click_and_not_swapped(person, kicking, ends):
-    config = SeedConfig(hypotheses=6)
-    seeds = find_seeds(person.mesh, sheets(kicking, np.random.default_rng(1)), config)
+    seeds = find_seeds(person.mesh, sheets(kicking, np.random.default_rng(1)), hypotheses=6)
     assert len(seeds) == 5 and seeds.converged
     # The same five places as the farthest points of the template, give or take a hand's breadth.
     nearest = np.linalg.norm(person.mesh.vertices[seeds.template_vertices][:, None] - person.mesh.vertices[ends],
@@ -123,10 +121,10 @@ def test_ends_are_matched_by_the_ways_between_them():
     x = rng.normal(size=(5, 3))
     ways = np.linalg.norm(x[:, None] - x, axis=2)
     order = rng.permutation(5)
-    best = matched_ends(ways, 1.1 * ways[np.ix_(order, order)], SeedConfig())[0]
+    best = matched_ends(ways, 1.1 * ways[np.ix_(order, order)], 8)[0]
     assert (order[best] == np.arange(5)).all()
     lost = order[:4]                                         # one end of the scan is hidden
-    best = matched_ends(ways, ways[np.ix_(lost, lost)], SeedConfig())[0]
+    best = matched_ends(ways, ways[np.ix_(lost, lost)], 8)[0]
     assert (best == -1).sum() == 1 and (lost[best[best >= 0]] == np.flatnonzero(best >= 0)).all()
 
 

@@ -22,7 +22,7 @@ from scanprep.pipeline.figures import (
 from scanprep.pipeline.page import write_set_page
 from scanprep.pipeline.prepare import prepare
 from scanprep.pipeline.scans import find_scans
-from scanprep.registration.confidence import principal_stretches, stretched_share, uncovered_share
+from scanprep.registration.nonrigid import principal_stretches, stretched_share, uncovered_share
 
 GOOD = ScanFigures("good", "10 landmarks", 0.001, 0.0015, 0.85, 0.85, 0.0, 0.004, 0.002, 0, True, 0.0, 3.25)
 

@@ -11,8 +11,8 @@ from scanprep.geometry import rotations
 from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.surface import Surface
 from scanprep.geometry.target import target_of
-from scanprep.registration.final_fit import FinalFit, FinalFitConfig, FinalFitRound, final_fit, smoothed_scan
-from scanprep.registration.gradient_field import Triangles
+from scanprep.registration.final_fit import FinalFit, Triangles, final_fit, smoothed_scan
+from scanprep.registration.schedule import FinalFitConfig, FinalFitRound
 
 LEFT, RIGHT = np.array([0.0, 0.0, 0.7]), np.array([0.0, 0.7, 0.0])
 NOISE = 0.002
@@ -31,7 +31,7 @@ def truth() -> Mesh:
     return crab().with_vertices(bent(crab(), LEFT, RIGHT))
 
 
-def cloud(body: Mesh, count: int = 20000, noise: float = NOISE, seed: int = 0) -> np.ndarray:
+def cloud(body: Mesh, count: int = 10000, noise: float = NOISE, seed: int = 0) -> np.ndarray:
     """Noisy points of a body."""
     rng = np.random.default_rng(seed)
     points, face, _ = body.sample(count, rng)

@@ -8,9 +8,8 @@ from jointed_bodies import bent, crab
 
 from scanprep.geometry import rotations
 from scanprep.geometry.mesh import Mesh
-from scanprep.registration.energies import Stiffness, pull
-from scanprep.registration.graph_fit import GraphFit, start_fit
-from scanprep.registration.inputs import prepare
+from scanprep.registration.deformation_graph import GraphFit, Stiffness, pull, start_fit
+from scanprep.registration.matches import prepare
 from scanprep.registration.nonrigid import register
 from scanprep.registration.schedule import RegistrationConfig
 
@@ -24,7 +23,7 @@ def all_wanted(x):
 
 
 def begun(T=None, nodes=80) -> GraphFit:
-    return start_fit(GIVEN, np.eye(4) if T is None else T, nodes)
+    return start_fit(GIVEN.template, np.eye(4) if T is None else T, nodes)
 
 
 def linked(fit: GraphFit, wanted, length: float) -> GraphFit:
@@ -66,7 +65,7 @@ def test_a_finer_graph_goes_on_from_the_coarser_one():
     wanted, fit = bent(crab(), LEFT, RIGHT), begun()
     for _ in range(5):
         fit = linked(fit, all_wanted(wanted), 0.1 * SIZE)
-    after = linked(fit.refined(GIVEN, 200), all_wanted(wanted), 0.1 * SIZE)
+    after = linked(fit.refined(GIVEN.template, 200), all_wanted(wanted), 0.1 * SIZE)
     assert np.linalg.norm(after.x - fit.x, axis=1).mean() < 0.01
     assert off(after, wanted) < off(fit, wanted) + 0.002
 

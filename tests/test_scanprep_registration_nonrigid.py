@@ -14,8 +14,7 @@ from scanprep.geometry import rotations
 from scanprep.geometry.mesh import Mesh, template_problem
 from scanprep.geometry.surface import Surface
 from scanprep.registration import deformation_graph as graph
-from scanprep.registration import energies
-from scanprep.registration import inverted_triangles as inverted
+from scanprep.registration import final_fit as inverted
 from scanprep.registration.nonrigid import register
 from scanprep.registration.schedule import RegistrationConfig
 
@@ -151,7 +150,7 @@ def test_a_similarity_is_free_and_exact():
     motion = replace(graph.start_motion(g, T), log_scale=np.full(len(g.nodes), np.log(1.3)),
                      positions=1.3 * g.nodes @ T[:3, :3].T + T[:3, 3])
     np.testing.assert_allclose(graph.deform(g, motion), 1.3 * crab().vertices @ T[:3, :3].T + T[:3, 3], atol=1e-12)
-    for term in (energies.stretch_term, energies.bend_term, energies.growth_term):
+    for term in (graph.stretch_term, graph.bend_term, graph.growth_term):
         assert term(g, motion, 1.0).value < 1e-20
 
 
@@ -176,7 +175,7 @@ def wanted_pull(rng):
     at = rng.integers(0, len(body.vertices), 300)
     normals = rng.normal(size=(300, 3))
     normals /= np.linalg.norm(normals, axis=1, keepdims=True)
-    return energies.pull(len(body.vertices), at, rng.normal(size=(300, 3)), rng.random(300), normals, 0.1)
+    return graph.pull(len(body.vertices), at, rng.normal(size=(300, 3)), rng.random(300), normals, 0.1)
 
 
 @pytest.mark.parametrize("name", ["data", "stretch", "bend", "growth"])
@@ -184,16 +183,16 @@ def test_gradient_matches_finite_differences(name):
     rng = np.random.default_rng(7)
     g = small_graph()
     motion, wanted = random_motion(g, rng), wanted_pull(rng)
-    stiffness = energies.Stiffness(0.7, 0.5, 0.3)
-    term = energies.terms(g, motion, wanted, stiffness)[name]
-    blocks, half = term.normal(energies.NodePattern(g))
+    stiffness = graph.Stiffness(0.7, 0.5, 0.3)
+    term = graph.terms(g, motion, wanted, stiffness)[name]
+    blocks, half = term.normal(graph.NodePattern(g))
     for _ in range(4):
         direction = rng.normal(size=half.shape)
-        ahead, behind = (energies.terms(g, motion.moved(h * direction), wanted, stiffness)[name].value
+        ahead, behind = (graph.terms(g, motion.moved(h * direction), wanted, stiffness)[name].value
                          for h in (1e-5, -1e-5))
         expected = (ahead - behind) / 2e-5
         np.testing.assert_allclose(2 * np.sum(half * direction), expected, rtol=1e-6, atol=1e-7 * abs(term.value))
-    H = energies.NodePattern(g).matrix(blocks)
+    H = graph.NodePattern(g).matrix(blocks)
     assert abs(H - H.T).max() <= 1e-12 * abs(H).max()
     assert np.linalg.eigvalsh(H.toarray()).min() > -1e-9 * abs(H).max()
 
@@ -201,7 +200,7 @@ def test_gradient_matches_finite_differences(name):
 def test_pull_is_its_own_sum_of_squares():
     rng = np.random.default_rng(8)
     x, at, targets, w = rng.normal(size=(10, 3)), rng.integers(0, 10, 30), rng.normal(size=(30, 3)), rng.random(30)
-    wanted = energies.pull(10, at, targets, w)
+    wanted = graph.pull(10, at, targets, w)
     np.testing.assert_allclose(wanted.energy(x), np.sum(w * ((x[at] - targets) ** 2).sum(axis=1)))
 
 

@@ -7,18 +7,25 @@ import numpy as np
 import pytest
 from jointed_bodies import bent, crab
 
+from scanprep.alignment.icp import landmark_motion
 from scanprep.correspondence.correspondences import Correspondences
 from scanprep.geometry import rotations
 from scanprep.geometry.geodesics import SurfaceGraph
 from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.target import target_of
-from scanprep.registration.confidence import evidence
-from scanprep.registration.inputs import Hints, path_anchors, place_by_descriptors
-from scanprep.registration.inverted_triangles import vertex_rotations
-from scanprep.registration.limb_ends import RigidFit, find_ends, rotated_end
-from scanprep.registration.matches import Likeness, match_both_ways
-from scanprep.registration.nonrigid import register
-from scanprep.registration.path_descriptors import describe_both, descriptors, path_lengths
+from scanprep.registration.final_fit import vertex_rotations
+from scanprep.registration.graph_fit import RigidFit, find_ends, rotated_end
+from scanprep.registration.matches import (
+    Likeness,
+    describe_both,
+    described_alike,
+    descriptors,
+    hint_pull,
+    match_both_ways,
+    path_anchors,
+    path_lengths,
+)
+from scanprep.registration.nonrigid import evidence, register
 from scanprep.registration.schedule import RegistrationConfig
 
 BEND = np.array([0.0, 0.0, 1.2]), np.array([0.0, 1.4, 0.0])
@@ -79,7 +86,8 @@ def test_a_body_upside_down_and_bent_is_placed_by_its_descriptors():
     x = moved(bent(mesh, *BEND))
     target = target_of(Mesh(x, mesh.faces))
     mine, theirs = describe_both(mesh, target, (spread(mesh), x[spread(mesh)]), 0.01, size_of(mesh))
-    T = place_by_descriptors(mesh, mine, replace(target, descriptors=theirs), np.arange(0, len(x), 3))
+    vertices, points = described_alike(mesh, mine, replace(target, descriptors=theirs), np.arange(0, len(x), 3))
+    T = landmark_motion(mesh.vertices[vertices], points)
     R, _ = rotations.procrustes(mesh.vertices, x)
     assert np.linalg.norm(rotations.log(T[:3, :3] @ R.T)) < 0.2
     np.testing.assert_allclose(T[:3, :3] @ T[:3, :3].T, np.eye(3), atol=1e-12)
@@ -112,15 +120,15 @@ def test_the_surest_hints_take_the_place_of_landmarks():
     mesh = body()
     vertices = np.arange(0, 3000, 100)
     confidence = np.where(np.arange(len(vertices)) % 3 == 0, 0.1, 0.9)
-    found = path_anchors(None, Hints(vertices, mesh.vertices[vertices], confidence), target_of(mesh), 0.05)
+    found = path_anchors(None, Correspondences(vertices, mesh.vertices[vertices], confidence), target_of(mesh), 0.05)
     assert found is not None and len(found[0]) == 8
     assert np.isin(found[0], vertices[confidence > 0.5]).all()
 
 
 def test_a_hint_far_from_its_place_draws_less():
     x = np.zeros((3, 3))
-    hints = Hints(np.array([0, 1]), np.array([[0.01, 0, 0], [1.0, 0, 0]]), np.ones(2))
-    wanted = hints.wanted(x, 0.1, 2.0)
+    hints = Correspondences(np.array([0, 1]), np.array([[0.01, 0, 0], [1.0, 0, 0]]), np.ones(2))
+    wanted = hint_pull(hints, x, 0.1, 2.0)
     assert wanted.A[0, 0, 0] > 0.95 and wanted.A[1, 0, 0] < 1e-3 and not wanted.A[2].any()
 
 

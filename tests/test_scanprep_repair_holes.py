@@ -7,11 +7,10 @@ from scanned_shapes import ball, bumpy
 from scanprep.geometry import rotations
 from scanprep.geometry.mesh import Mesh, template_problem
 from scanprep.geometry.surface import Surface
-from scanprep.repair.boundary_loops import group_loops, joined_polygon
 from scanprep.repair.hole_filling import FillConfig, fill_holes, fill_report
 from scanprep.repair.intersections import intersecting_faces
+from scanprep.repair.loops import group_loops, joined_polygon, triangulate_loop
 from scanprep.repair.manifold import repair
-from scanprep.repair.triangulate import triangulate_loop
 
 
 def pierced(mesh, centres, radius):

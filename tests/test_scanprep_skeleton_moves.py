@@ -5,9 +5,8 @@ from animal_bodies import Animal, Build, random_pose
 
 from scanprep.skeleton import joints
 from scanprep.skeleton.joints import dissolve_bands, passages, to_tree
-from scanprep.skeleton.motions import PosedSurface, rigid_costs
+from scanprep.skeleton.motions import PosedSurface, agglomerate, halve, rigid_costs
 from scanprep.skeleton.parts import PartSearch, SkeletonConfig
-from scanprep.skeleton.patches import agglomerate, halve
 
 
 @pytest.fixture(scope="module")

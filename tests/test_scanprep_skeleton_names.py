@@ -7,6 +7,7 @@ from scanprep.geometry import rotations
 from scanprep.geometry.mesh import Mesh
 from scanprep.skeleton.edit import merge_parts, split_part
 from scanprep.skeleton.names import name_parts
+from scanprep.skeleton.symmetry import find_symmetry
 from scanprep.skeleton.tree import Skeleton
 from scanprep.synthetic.people import BodyShape, Person
 
@@ -18,6 +19,10 @@ def expected(name):
 
 def unnamed(skeleton):
     return Skeleton(skeleton.part_of_face, skeleton.parents, skeleton.joints)
+
+
+def named(mesh, skeleton):
+    return name_parts(mesh, skeleton, find_symmetry(mesh))
 
 
 @pytest.fixture(scope="module")
@@ -32,15 +37,13 @@ def test_people_of_any_build_and_direction_are_named(seed):
     R, t = rotations.exp(rng.normal(0, 2, 3)), rng.normal(0, 3, 3)
     mesh = Mesh(body.mesh.vertices @ R.T + t, body.mesh.faces)
     skeleton = Skeleton(body.part_of_face, body.parents, body.joints @ R.T + t)
-    assert name_parts(mesh, skeleton) == tuple(map(expected, body.names))
-    assert name_parts(mesh, skeleton, up=R[:, 2]) == tuple(map(expected, body.names))
-    assert name_parts(mesh, skeleton, up=-R[:, 2]) == skeleton.names
+    assert named(mesh, skeleton) == tuple(map(expected, body.names))
 
 
 def test_in_the_mirror_left_is_right(person):
     flip = np.array([1, -1, 1])
     mesh = Mesh(person.mesh.vertices * flip, person.mesh.faces[:, ::-1])
-    found = name_parts(mesh, Skeleton(person.part_of_face, person.parents, person.joints * flip))
+    found = named(mesh, Skeleton(person.part_of_face, person.parents, person.joints * flip))
     swapped = {"left": "right", "right": "left"}
     for name, true in zip(found, map(expected, person.names), strict=True):
         stem, _, side = true.rpartition("_")
@@ -51,7 +54,7 @@ def test_the_order_of_vertices_and_parts_does_not_matter(person):
     rng = np.random.default_rng(0)
     old, faces = rng.permutation(len(person.mesh.vertices)), rng.permutation(len(person.mesh.faces))
     mesh = Mesh(person.mesh.vertices[old], np.argsort(old)[person.mesh.faces[faces]])
-    found = name_parts(mesh, Skeleton(person.part_of_face[faces], person.parents, person.joints))
+    found = named(mesh, Skeleton(person.part_of_face[faces], person.parents, person.joints))
     assert found == tuple(map(expected, person.names))
 
 
@@ -59,7 +62,7 @@ def test_coarser_and_finer_trees_are_named(person):
     mesh = person.mesh
 
     def names(skeleton):
-        return set(name_parts(mesh, unnamed(skeleton)))
+        return set(named(mesh, unnamed(skeleton)))
 
     whole = set(map(expected, person.names))
     two = merge_parts(person.skeleton, mesh, "pelvis", "abdomen")
@@ -75,11 +78,11 @@ def test_coarser_and_finer_trees_are_named(person):
 def test_what_is_no_person_keeps_its_names(person):
     mesh = person.mesh
     lame = unnamed(merge_parts(person.skeleton, mesh, "l_hand", "l_forearm"))
-    assert name_parts(mesh, lame) == lame.names
+    assert named(mesh, lame) == lame.names
     headless = unnamed(merge_parts(person.skeleton, mesh, "chest", "head"))
-    assert name_parts(mesh, headless) == headless.names
+    assert named(mesh, headless) == headless.names
     for animal in (Animal(), Animal(Build(aside=0.0))):
-        assert name_parts(animal.mesh, animal.skeleton) == animal.skeleton.names
+        assert named(animal.mesh, animal.skeleton) == animal.skeleton.names
     tailless = Animal(Build(aside=0.0))
     skeleton = unnamed(merge_parts(tailless.skeleton, tailless.mesh, "barrel", "tail"))
-    assert name_parts(tailless.mesh, skeleton) == skeleton.names
+    assert named(tailless.mesh, skeleton) == skeleton.names

@@ -9,11 +9,10 @@ from scanprep.geometry import rotations
 from scanprep.geometry.mesh import Mesh
 from scanprep.skeleton.find import search_skeleton
 from scanprep.skeleton.joints import dissolve_bands, passages, to_tree, without_weak
-from scanprep.skeleton.motions import PosedSurface, fit_motions, rigid_costs
+from scanprep.skeleton.motions import PosedSurface, closure, fit_motions, rigid_costs
 from scanprep.skeleton.names import part_partners
 from scanprep.skeleton.parts import PartSearch, SkeletonConfig
-from scanprep.skeleton.patches import cover
-from scanprep.skeleton.sides import Sides, closure, mirror_pairs
+from scanprep.skeleton.sides import Sides, cover, mirror_pairs
 from scanprep.skeleton.symmetry import find_symmetry
 from scanprep.synthetic.anatomy import MIRROR_PART
 from scanprep.synthetic.people import Person

@@ -2,7 +2,6 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -55,22 +54,18 @@ def evaluate(model: ModelArg, output: Output, poses: Path | None = None, shapes:
     posed, pose_names = read_bodies(poses, loaded.template, unit, one_person=True) if poses else nothing
     people, people_names = read_bodies(shapes, loaded.template, unit) if shapes else nothing
     train, _ = read_bodies(train_shapes, loaded.template, unit) if train_shapes else nothing
-    found = Findings(pose_names=pose_names, pose_bodies=posed, shape_names=people_names, shape_bodies=people)
+    poses_found = shapes_found = specific = None
     if posed is not None:
         with bar("fitting poses") as progress:
-            found = replace(found, poses=pose_errors(loaded, posed, read_subject(loaded, subject, unit),
-                                                     progress=progress))
+            poses_found = pose_errors(loaded, posed, read_subject(loaded, subject, unit), progress=progress)
     if people is not None:
         with bar("fitting people") as progress:
-            found = replace(found, shapes=shape_errors(loaded, people, counts, train, progress=progress))
+            shapes_found = shape_errors(loaded, people, counts, train, progress=progress)
     if train is not None:
         with bar("bringing training people to rest") as progress:
-            found = replace(found, specificity=specificity(
-                # random bodies that specificity is measured on
-                loaded, train, 100, np.random.default_rng(seed), counts, progress=progress))
-    if loaded.n_betas:
-        # random bodies on the page
-        found = replace(found, samples=sample_bodies(loaded, 8, np.random.default_rng(seed)))
+            specific = specificity(loaded, train, 100, np.random.default_rng(seed), counts, progress=progress)
+    samples = sample_bodies(loaded, 8, np.random.default_rng(seed)) if loaded.n_betas else None      # on the page
+    found = Findings(poses_found, pose_names, posed, shapes_found, people_names, people, specific, samples)
     notes, metrics = _notes(loaded, posed, people), _metrics(loaded, found)
     metrics += [Metric("note", note) for note in notes]
     _write_tables(output, loaded, found)

@@ -4,7 +4,7 @@ Every figure is made through the contract of `BodyModel` alone, so that kinds of
 """
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -12,7 +12,7 @@ import numpy as np
 from scanprep.meaning import HAND, extent, size, unit_problem
 
 from ..body import BodyModel
-from ..fitting import FitConfig, PoseFitter, ShapeFit, ShapeFitter
+from ..fitting import FitConfig, PoseFit, PoseFitter, ShapeFit, ShapeFitter
 from ..linear import Subject
 
 Progress = Callable[[int, int], None]
@@ -79,107 +79,60 @@ class ShapeErrors:
         return model.vertices(self.poses[c, i], self.betas[c, i], self.trans[c, i])
 
 
-class _Tally:
-    """Gathers the distances of one body after the other."""
-
-    def __init__(self, model: BodyModel) -> None:
-        part = model.skeleton.part_of_vertex(model.template)
-        self._of_part = (part == np.arange(len(model.skeleton.parents))[:, None]).astype(float)
-        self._of_part /= np.maximum(self._of_part.sum(axis=1, keepdims=True), 1)
-        self._rows: list[tuple[float, float, float]] = []
-        self._parts: list[np.ndarray] = []
-        self._sum = np.zeros(len(model.template.vertices))
-
-    def add(self, made: np.ndarray, truth: np.ndarray) -> None:
-        far = np.linalg.norm(made - truth, axis=1)
-        self._rows.append((far.mean(), np.percentile(far, 95), far.max()))
-        self._parts.append(self._of_part @ far)
-        self._sum += far
-
-    def errors(self) -> Errors:
-        mean, p95, worst = np.array(self._rows).T
-        return Errors(mean, p95, worst, self._sum / len(mean), np.stack(self._parts))
+def errors_between(model: BodyModel, made: Sequence[np.ndarray], truth: np.ndarray) -> Errors:
+    """The errors of bodies (N, 3) against what they should be (M, N, 3), metres."""
+    far = np.array([np.linalg.norm(y - x, axis=1) for y, x in zip(made, truth, strict=True)])
+    of_part = np.eye(len(model.skeleton.parents))[model.skeleton.part_of_vertex(model.template)]       # (N, J)
+    return Errors(far.mean(axis=1), np.percentile(far, 95, axis=1), far.max(axis=1), far.mean(axis=0),
+                  far @ of_part / np.maximum(of_part.sum(axis=0), 1))
 
 
 def pose_errors(model: BodyModel, bodies: np.ndarray, subject: Subject | None = None,
                 config: FitConfig | None = None, progress: Progress | None = None) -> PoseErrors:
-    """Error of one person's bodies after fitting pose and place.
+    """What is left of one person's registered bodies (M, N, 3), metres, after fitting pose and place.
 
-    Parameters
-    ----------
-    model : BodyModel
-    bodies : (M, N, 3) float, metres
-        Registered, of the subject, best those that the model was not trained on.
-    subject : Subject, optional
-        Whose bodies they are; the template's own body when not given.
-    config : FitConfig, optional
-    progress : callable, optional
-        Called with the bodies done and their number.
-
-    Raises
-    ------
-    ValueError
-        Bodies of another count of vertices or not finite.
+    Best of bodies that the model was not trained on; the subject is the template's own body when not given.
     """
     bodies = checked_bodies(model, bodies, "bodies")
     subject = subject or model.subject()
-    fitter, tally, fits = PoseFitter(subject, config), _Tally(model), []
+    fitter, fits = PoseFitter(subject, config), list[PoseFit]()
     for body in bodies:
         fits.append(fitter.fit(body))
-        tally.add(fits[-1].vertices, body)
         if progress:
             progress(len(fits), len(bodies))
-    return PoseErrors(tally.errors(), np.stack([f.pose for f in fits]), np.stack([f.trans for f in fits]),
-                      subject.betas, np.array([f.converged for f in fits]))
+    return PoseErrors(errors_between(model, [f.vertices for f in fits], bodies), np.stack([f.pose for f in fits]),
+                      np.stack([f.trans for f in fits]), subject.betas, np.array([f.converged for f in fits]))
 
 
 def shape_errors(model: BodyModel, people: np.ndarray, counts: Sequence[int] = (10, 20, 40),
                  train: np.ndarray | None = None, config: FitConfig | None = None,
                  progress: Progress | None = None) -> ShapeErrors:
-    """Error of people after fitting shape, pose and place: the curve of generalisation.
+    """What is left of registered people (S, N, 3), metres, after fitting shape, pose and place: the curve of
+    generalisation over numbers of components, of which more than the model has mean all of them.
 
-    Parameters
-    ----------
-    model : BodyModel
-        With shape components.
-    people : (S, N, 3) float, metres
-        Registered, best people that the model was not trained on.
-    counts : ints
-        Numbers of components; more than the model has means all of them.
-    train : (P, N, 3) float, metres, optional
-        The training people, for plain principal components of vertices as a yardstick.
-    config : FitConfig, optional
-    progress : callable, optional
-        Called with the fits done and their number.
-
-    Raises
-    ------
-    ValueError
-        People of another count of vertices or not finite, a count below 1, a model without shape components.
+    `train` (P, N, 3) are the training people, for plain principal components of vertices as a yardstick.
     """
     people, wanted = checked_bodies(model, people, "people"), checked_counts(model, counts)
     largest = ShapeFitter(model, replace(config or FitConfig(), n_betas=wanted[-1]))
     fitters = [largest.first(count) for count in wanted]
-    free, held = [_Tally(model) for _ in wanted], [_Tally(model) for _ in wanted]
-    fits, done = [], 0
-    for person in people:
-        for tally, made in zip(held, fit_with_held_pose(model, person, wanted), strict=True):
-            tally.add(made, person)
-        mine: list[ShapeFit] = []
-        for fitter, tally in zip(fitters, free, strict=True):
-            mine.append(fitter.fit(person, mine[-1] if mine else None))
-            tally.add(mine[-1].vertices, person)
-            done += 1
+    held, fits = [], list[list[ShapeFit]]()
+    for done, person in enumerate(people):
+        held.append(fit_with_held_pose(model, person, wanted))
+        fits.append([])
+        for fitter in fitters:
+            fits[-1].append(fitter.fit(person, fits[-1][-1] if fits[-1] else None))
             if progress:
-                progress(done, len(people) * len(wanted))
-        fits.append(mine)
+                progress(done * len(wanted) + len(fits[-1]), len(people) * len(wanted))
     by_count = list(zip(*fits, strict=True))
+
+    def errors(made: Iterable[Sequence[np.ndarray]]) -> tuple[Errors, ...]:
+        return tuple(errors_between(model, bodies, people) for bodies in made)
+
     return ShapeErrors(
-        np.array(wanted), tuple(t.errors() for t in free), tuple(t.errors() for t in held),
-        None if train is None else _pca_errors(model, checked_bodies(model, train, "train"), people, wanted),
-        np.array([[f.betas for f in row] for row in by_count]), np.array([[f.pose for f in row] for row in by_count]),
-        np.array([[f.trans for f in row] for row in by_count]),
-        np.array([[f.converged for f in row] for row in by_count]))
+        np.array(wanted), errors([f.vertices for f in row] for row in by_count), errors(zip(*held, strict=True)),
+        None if train is None else errors(_by_components(checked_bodies(model, train, "train"), people, wanted)),
+        *(np.array([[getattr(f, name) for f in row] for row in by_count])
+          for name in ("betas", "pose", "trans", "converged")))
 
 
 def fit_with_held_pose(model: BodyModel, person: np.ndarray, counts: Sequence[int]) -> list[np.ndarray]:
@@ -214,16 +167,13 @@ def vertex_components(train: np.ndarray, count: int) -> tuple[np.ndarray, np.nda
     return mean, directions / np.linalg.norm(directions, axis=1, keepdims=True)
 
 
-def _pca_errors(model: BodyModel, train: np.ndarray, people: np.ndarray, counts: Sequence[int]
-                ) -> tuple[Errors, ...]:
+def _by_components(train: np.ndarray, people: np.ndarray, counts: Sequence[int]) -> list[list[np.ndarray]]:
+    """For each count the people (S, N, 3) as plain principal components of the training people have them, centred."""
     mean, components = vertex_components(train, max(counts))
-    tallies = [_Tally(model) for _ in counts]
-    for person in people:
-        middle = person.mean(axis=0)
-        weights = components @ ((person - middle).ravel() - mean)
-        for count, tally in zip(counts, tallies, strict=True):
-            tally.add((mean + weights[:count] @ components[:count]).reshape(-1, 3) + middle, person)
-    return tuple(t.errors() for t in tallies)
+    middles = people.mean(axis=1, keepdims=True)
+    weights = ((people - middles).reshape(len(people), -1) - mean) @ components.T
+    return [[(mean + w[:count] @ components[:count]).reshape(-1, 3) + middle
+             for w, middle in zip(weights, middles, strict=True)] for count in counts]
 
 
 def compactness(model: BodyModel) -> np.ndarray:

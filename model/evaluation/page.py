@@ -18,7 +18,6 @@ from .errors import Errors, PoseErrors, ShapeErrors, compactness
 from .sampling import Samples, Specificity
 
 MM = 1000.0
-HEIGHT = 400
 Tell = Callable[[int, int], None]
 
 
@@ -113,7 +112,7 @@ def generalisation_rows(shapes: ShapeErrors) -> list[tuple[int, float, float, fl
             for k, e, held, plain in zip(shapes.counts, shapes.errors, shapes.pose_held, pca, strict=True)]
 
 
-def picture_error_map(body: Mesh, distance: np.ndarray, title: str, height: int = HEIGHT) -> np.ndarray:
+def picture_error_map(body: Mesh, distance: np.ndarray, title: str, height: int = 400) -> np.ndarray:
     """A body coloured by a distance (N,) in metres, from the front and the back, with its colour bar."""
     front, left, back, _ = look_around(body)
     high = _round_up(float(np.percentile(distance, 99.5)))
@@ -124,7 +123,7 @@ def picture_error_map(body: Mesh, distance: np.ndarray, title: str, height: int 
 
 
 def picture_extremes(model: BodyModel, errors: Errors, names: Sequence[str], bodies: np.ndarray,
-                     make: Callable[[int], np.ndarray], poses: np.ndarray, height: int = HEIGHT) -> np.ndarray:
+                     make: Callable[[int], np.ndarray], poses: np.ndarray, height: int = 400) -> np.ndarray:
     """The best and the worst body as given, then as fitted (`make(i)`) from both sides, coloured by error.
 
     The cameras turn about the vertical with the bodies' poses (M, J, 3).

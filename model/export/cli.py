@@ -20,9 +20,8 @@ from ..cli import ModelArg
 from ..files import load_model
 from ..linear import Subject
 from .bvh import write_bvh
-from .correctives import motion_correctives, spaced
+from .correctives import motion_correctives, pose_features, spaced, write_body_npz
 from .glb import write_skinned_glb
-from .npz import pose_features, write_body_npz
 from .rig import Rig, check_motion, joint_places, make_rig
 
 MOTIONS_OF = "scape"                 # what motion files say they are made for

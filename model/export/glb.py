@@ -23,29 +23,18 @@ from .rig import Rig, check_motion, turn_up
 class Material:
     """What the surface of a rig looks like, whose vertices are repeated where the chart of the images has a seam.
 
-    Parameters
-    ----------
-    uv : (N, 2) float
-        (0, 0) is the lower left corner of the images, (1, 1) their upper right one.
-    normals : (N, 3) float, unit
-        The same at all vertices of one place.
-    tangents : (N, 4) float, optional
-        Unit vectors along the image's rows, and 1 where the image's upwards is their left as seen from outside, -1
-        where it is their right; needed for `relief`.
-    color : (H, W, 3) uint8, optional
-    relief : (H, W, 3) uint8, optional
-        Normals in the frames of `tangents` and `normals`: the normal texture of glTF.
-    heights : (H, W) float, metres, optional
-        A displacement along the normal. glTF has no place for it: it becomes a grey image of two bytes, which the
-        material names in its `extras` with the heights of black and of white.
+    glTF has no place for heights, a displacement along the normal: they become a grey image of two bytes, which the
+    material names in its `extras` with the heights of black and of white.
     """
 
-    uv: np.ndarray
-    normals: np.ndarray
+    uv: np.ndarray                           # (N, 2): (0, 0) is the lower left corner of the images, (1, 1) opposite
+    normals: np.ndarray                      # (N, 3) unit, the same at all vertices of one place
+    # (N, 4): unit vectors along the image's rows, and 1 where the image's upwards is their left as seen from outside,
+    # -1 where it is their right; needed for `relief`
     tangents: np.ndarray | None = None
-    color: np.ndarray | None = None
-    relief: np.ndarray | None = None
-    heights: np.ndarray | None = None
+    color: np.ndarray | None = None          # (H, W, 3) uint8
+    relief: np.ndarray | None = None         # (H, W, 3) uint8, normals in the frames of `tangents` and `normals`
+    heights: np.ndarray | None = None        # (H, W) metres
 
 
 def write_skinned_glb(path: str | Path, rig: Rig, poses: np.ndarray | None = None, trans: np.ndarray | None = None,

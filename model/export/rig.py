@@ -22,23 +22,12 @@ class Rig:
 
     At rest all parts have the axes of the world. A pose turns every part about its joint, and the root's joint
     stands at `joints[0] + trans`, as in the models.
-
-    Parameters
-    ----------
-    mesh : Mesh
-        At rest: pose and trans are zero.
-    skeleton : Skeleton
-        With the joints of this body.
-    weights : (N, J) float
-        Rows sum to 1, with at most `CARRIERS` entries that are not zero.
-    shapes : (K, N, 3) float, metres
-        Change of the rest mesh for one standard deviation of each beta.
     """
 
-    mesh: Mesh
-    skeleton: Skeleton
-    weights: np.ndarray
-    shapes: np.ndarray
+    mesh: Mesh                       # at rest: pose and trans are zero
+    skeleton: Skeleton               # with the joints of this body
+    weights: np.ndarray              # (N, J), rows sum to 1, with at most `CARRIERS` entries that are not zero
+    shapes: np.ndarray               # (K, N, 3) metres, change of the rest mesh for one standard deviation of each beta
 
     def __post_init__(self) -> None:
         N, J = len(self.mesh.vertices), len(self.skeleton.parents)
@@ -56,18 +45,9 @@ class Rig:
 
     def vertices(self, poses: np.ndarray, trans: np.ndarray | None = None, changes: np.ndarray | None = None
                  ) -> np.ndarray:
-        """The skinned mesh.
+        """The skinned mesh (N, 3) or (T, N, 3), metres, in one pose (J, 3) or several (T, J, 3), radians.
 
-        Parameters
-        ----------
-        poses : (J, 3) or (T, J, 3) float, radians
-        trans : (3,) or (T, 3) float, metres
-        changes : (N, 3) or (T, N, 3) float, metres, optional
-            Added to the rest mesh before it is skinned.
-
-        Returns
-        -------
-        (N, 3) or (T, N, 3) float, metres
+        `changes` (N, 3) or (T, N, 3), metres, are added to the rest mesh before it is skinned.
         """
         R = self.skeleton.part_rotations(poses)
         offset = joint_places(self.skeleton, poses, trans) - np.einsum("...jab,jb->...ja", R, self.skeleton.joints)

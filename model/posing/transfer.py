@@ -33,8 +33,8 @@ class OwnBody:
 def subject_from_body(model: BodyModel, vertices: np.ndarray) -> Subject:
     """The subject whose shape is that of one registered body, detail that betas do not reach included.
 
-    In the body's own pose it is that body, to the millimetre or two that smoothing takes. Its `betas` are the
-    fitted ones and describe it only roughly.
+    In the body's own pose it is that body, to the millimetre or two that smoothing takes; in others the pose-dependent
+    deformation of the model is added. Its `betas` are the fitted ones and describe it only roughly.
 
     Parameters
     ----------
@@ -47,7 +47,7 @@ def subject_from_body(model: BodyModel, vertices: np.ndarray) -> Subject:
     ValueError
         Vertices of another count or not finite.
 
-    [SCAPE] Eq. 8
+    [SCAPE] Eq. 8, 9
     """
     return own_body(model, vertices).subject
 
@@ -68,35 +68,6 @@ def own_body(model: BodyModel, vertices: np.ndarray, fit: PoseFit | None = None)
     found = subject.vertices(pose, trans)
     far = np.linalg.norm(found - vertices, axis=1)
     return OwnBody(subject, pose, trans, found, float(far.mean()), float(far.max()))
-
-
-def repose(model: BodyModel, vertices: np.ndarray, poses: np.ndarray, trans: np.ndarray | None = None,
-           fit: PoseFit | None = None) -> np.ndarray:
-    """Put one registered body into other poses: its own shape, the pose-dependent deformation of the model.
-
-    Parameters
-    ----------
-    model : BodyModel
-    vertices : (N, 3) float, metres
-        The body, in the topology of the model's template.
-    poses : (J, 3) or (B, J, 3) float, radians
-    trans : (3,) or (B, 3) float, metres, optional
-    fit : PoseFit or ShapeFit, optional
-        Of this body; found when not given.
-
-    Returns
-    -------
-    (N, 3) or (B, N, 3) float, metres
-
-    Raises
-    ------
-    ValueError
-        Vertices of another count or not finite, poses or trans of the wrong shape.
-
-    [SCAPE] Eq. 9
-    """
-    check_pose(model.skeleton, poses, trans)
-    return own_body(model, vertices, fit).subject.vertices(poses, trans)
 
 
 @singledispatch

@@ -20,10 +20,7 @@ from ..pose_space import PoseSpace, faces_of_part
 from ..scape import BlendScapeModel, ScapeModel
 from ..shape_space import ShapeSpace
 from ..skinning import SkinningModel
-from .distil import Distillation, Follower, Progress, enough_poses
-from .pieces import Piece, gradients_of, transfer_skeleton
-
-POSES, SHAPE_POSES = 40, 8           # of the prior, in which both models are compared and the new one corrected
+from .transfer import Distillation, Follower, Piece, Progress, enough_poses, gradients_of, transfer_skeleton
 
 
 @dataclass(frozen=True)
@@ -43,26 +40,23 @@ def change_resolution(model: BodyModel, template: Mesh, config: ResolutionConfig
                       progress: Progress | None = None) -> BodyModel:
     """Transfer a model to a coarser or finer triangulation, so that pose, betas and trans keep their meaning.
 
+    A skinning model turns parts about joints, and on a body of other betas these are averages of the vertices within
+    two edges of the borders of parts, with other triangles a band of another width: such bodies move some millimetres
+    apart when they bend. SCAPE models do not use joints in this way.
+
     Parameters
     ----------
     model : BodyModel
     template : Mesh
         Other triangles on the surface of the model's template, in the same place.
     config : ResolutionConfig, optional
-    progress : callable, optional
-        Called with the work done and the whole.
+    progress : callable(done, total), optional
 
     Returns
     -------
     BodyModel
         Of the same kind, with the same tree, joints, features, betas and priors; landmarks are on the nearest new
         vertices.
-
-    Notes
-    -----
-    A skinning model turns parts about joints, and on a body of other betas these are averages of the vertices within
-    two edges of the borders of parts. With other triangles that is a band of another width, so that
-    such bodies move some millimetres apart when they bend; SCAPE models do not use joints in this way.
 
     Raises
     ------
@@ -94,10 +88,10 @@ def _transfer_scape(model: ScapeModel, template: Mesh, config: ResolutionConfig,
         shape_space=_transfer_shape_space(model, pieces), **_transfer_blend(model, pieces))
     if not config.rounds:
         return moved
-    poses = sample_poses(model, enough_poses(model, POSES), np.random.default_rng(0))
+    poses = sample_poses(model, enough_poses(model, 40), np.random.default_rng(0))
     poses[0] = model.pose_mean
     teacher = Distillation(model, Follower(model.template, template), config.rounds, progress)
-    return teacher.shape_space(teacher.pose_space(moved, poses), poses[:SHAPE_POSES])
+    return teacher.shape_space(teacher.pose_space(moved, poses), poses[:8])
 
 
 def _transfer_pose_space(space: PoseSpace, skeleton: Skeleton, pieces: list[Piece]) -> PoseSpace:

@@ -10,7 +10,7 @@ from scanprep.batch.room import Step, once
 from scanprep.geometry.mesh import Mesh
 from scanprep.ranges import Settings
 
-from .control.humanoid import humanoid
+from .control.files import humanoid
 from .control.model import ControlModel, Statue
 from .detail.displacement import DisplacementConfig, bake, unfold_control
 from .registration.automatic import Features, find_features

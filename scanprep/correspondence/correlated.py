@@ -5,22 +5,29 @@
    like from the seeds speaks for single values, edges that keep length and direction for pairs of them.
 3. Loopy belief propagation, first over places spread wide, then over all vertices around the likely ones.
 
+Seeds that nobody gave are the ends of the limbs, matched by the ways between them.
+
 [CC]
 """
 from __future__ import annotations
 
 from collections.abc import Callable
+from itertools import permutations
 
 import numpy as np
 
+from ..geometry.farthest_points import farthest_points
 from ..geometry.geodesics import SurfaceGraph
 from ..geometry.mesh import Mesh, check_template
 from ..geometry.target import target_of
 from ..threads import one_thread
 from .correspondences import Correspondences, checked_pairs
-from .search import CorrelatedConfig, result, search, surfaces_of
-from .seeds import find_seeds
+from .search import BeliefLevel, CorrelatedConfig, result, search, surfaces_of
 from .sheet import Sheet
+
+# Of the trial of a hypothesis: fewer points, and one coarse level
+TRIAL = CorrelatedConfig(points=90, levels=(BeliefLevel(900, 60),), iterations=25)
+APART = 0.28                  # of the template's size: an end is the farthest place within it along the surface
 
 
 @one_thread()
@@ -31,15 +38,12 @@ def find_correspondences(template: Mesh, scan: Mesh | np.ndarray, seeds: tuple[n
 
     Parameters
     ----------
-    template : Mesh
-        One connected manifold component.
-    scan : Mesh or (n, 3) float, metres
-        May have holes, borders, several overlapping sheets, noise.
+    template, scan
+        As in `register`.
     seeds : (S,) int and (S, 3) float, metres, optional
         Vertices of the template and where they are on the scan; three at least, spread over the body. Without them the
         ends of the limbs are looked for.
-    progress : callable, optional
-        Called as progress(done, total).
+    progress : callable(done, total), optional
 
     Returns
     -------
@@ -49,8 +53,7 @@ def find_correspondences(template: Mesh, scan: Mesh | np.ndarray, seeds: tuple[n
     Raises
     ------
     ValueError
-        A template that is not one manifold component, an empty scan, values that are not finite, fewer than
-        three seeds or seeds that do not exist.
+        What `register` refuses; seeds that are too few, do not exist, or were not found.
 
     [CC]
     """
@@ -69,3 +72,79 @@ def find_correspondences(template: Mesh, scan: Mesh | np.ndarray, seeds: tuple[n
         tell(4 + 2 * number, total)
     assert images is not None, "levels: expected at least one"
     return result(surfaces, images, config)
+
+
+@one_thread()
+def find_seeds(template: Mesh, scan: Mesh | np.ndarray, ends: int = 5, hypotheses: int = 8) -> Correspondences:
+    """The ends of the limbs on template and scan, with no click.
+
+    Ends are places farther from the rest of the surface than all around them: head, hands and feet of a person
+    whose limbs do not hide in each other; at most so many on the template, and two more on the scan. They are matched
+    by the lengths of the ways between them; left and right, front and back are told by trying the best `hypotheses`:
+    the right one keeps the surface the same way round, and its short edges. Nothing is assumed about which way is up.
+    The confidence is how much worse the next hypothesis is. ValueError where either has fewer than three ends.
+    """
+    check_template(template)
+    size = float(np.sqrt(template.face_areas.sum()))
+    surface = SurfaceGraph(template)
+    own, ways = _ends(template.vertices, surface.distances, ends, APART * size)
+    if len(own) < 3:
+        raise ValueError(f"template: expected at least three limbs, found {len(own)} ends")
+    sheet = Sheet(target_of(scan), TRIAL.spacing * size)
+    seen, seen_ways = _ends(sheet.points, sheet.distances, ends + 2, APART * size)
+    if len(seen) < 3:
+        raise ValueError(f"scan: expected at least three ends of limbs, found {len(seen)}")
+    matches = matched_ends(ways, seen_ways, hypotheses)
+    trials = []
+    for image in matches:
+        there = image >= 0
+        pairs = own[there], sheet.points[seen[image[there]]]
+        surfaces, images = search(surfaces_of(template, sheet, surface, pairs, TRIAL), None, TRIAL.levels[0], TRIAL)
+        trials.append(images.energy / len(surfaces.scan) + 2.0 * float((~there).sum()))
+    order = np.argsort(trials)
+    best = matches[order[0]]
+    there = best >= 0
+    margin = 1.0 if len(trials) < 2 else 1 - np.exp(trials[order[0]] - trials[order[1]])
+    energies = {f"hypothesis {k}": float(trials[h]) for k, h in enumerate(order)}
+    return Correspondences(own[there], sheet.points[seen[best[there]]], np.full(int(there.sum()), float(margin)),
+                           "ends of limbs", energies, bool(margin > 0.2))
+
+
+def _ends(points: np.ndarray, distances: Callable[[np.ndarray], np.ndarray], count: int, apart: float
+          ) -> tuple[np.ndarray, np.ndarray]:
+    """Places farther from the rest than all around them, most pronounced first, and the ways between them."""
+    sample = farthest_points(points, 64)
+    ways = distances(sample)
+    there = np.isfinite(ways)
+    mean = np.full(ways.shape[1], np.nan)                     # of pieces that no sample reaches
+    np.divide(np.where(there, ways, 0).sum(axis=0), there.sum(axis=0), out=mean, where=there.any(axis=0))
+    chosen: list[int] = []
+    todo = mean - np.nanmin(mean)
+    while len(chosen) < count and np.nanmax(todo) > 0:
+        top = int(np.nanargmax(todo))
+        ring = distances(np.array([top]))[0]
+        near = ring < apart
+        if mean[top] >= np.nanmax(mean[near]) and mean[top] - np.nanmin(mean[near]) > 0.5 * apart:
+            chosen.append(top)
+        todo = np.where(near, -1.0, todo)
+    ends = np.array(chosen, dtype=np.int64)
+    return ends, distances(ends)[:, ends] if len(ends) else np.zeros((0, 0))
+
+
+def matched_ends(template: np.ndarray, scan: np.ndarray, count: int) -> list[np.ndarray]:
+    """So many matches of the ends that keep the ways between them, (E, E) and (F, F) metres, best, best first.
+
+    Each is the scan's end for every end of the template (E,), -1 for none.
+    """
+    E, F = len(template), len(scan)
+    hidden = max(0, min(E - 3, 2))
+    images = np.array(sorted(set(permutations([*range(F), *([-1] * hidden)], E))))
+    images = images[(images >= 0).sum(axis=1) >= 3]
+    a, b = np.triu_indices(E, 1)
+    both = (images[:, a] >= 0) & (images[:, b] >= 0)
+    ratio = scan[images[:, a], images[:, b]] / template[a, b]
+    log_ratio = np.where(both & np.isfinite(ratio) & (ratio > 0), np.log(np.where(ratio > 0, ratio, 1.0)), np.nan)
+    scale = np.clip(np.nanmedian(log_ratio, axis=1), -0.35, 0.35)
+    wrong = np.where(both, np.minimum(np.nan_to_num(np.abs(log_ratio - scale[:, None]), nan=0.5), 0.5), 0.0)
+    cost = wrong.sum(axis=1) / np.maximum(both.sum(axis=1), 1) + 0.12 * (images < 0).sum(axis=1)
+    return list(images[np.argsort(cost, kind="stable")[:count]])

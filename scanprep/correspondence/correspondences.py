@@ -19,26 +19,13 @@ KIND, VERSION = "correspondences", 1
 
 @dataclass(frozen=True, eq=False)
 class Correspondences:
-    """Which vertex of the template lies where on the scan.
+    """Which vertex of the template lies where on the scan."""
 
-    Attributes
-    ----------
-    template_vertices : (C,) int
-    scan_points : (C, 3) float, metres
-    confidence : (C,) float
-        From 0, a guess, to 1, certain.
-    method : str
-        How they were found.
-    energies : dict
-        Terms of what was minimised, and other figures of the search.
-    converged : bool
-    """
-
-    template_vertices: np.ndarray
-    scan_points: np.ndarray
-    confidence: np.ndarray
-    method: str = ""
-    energies: dict[str, float] = field(default_factory=dict)
+    template_vertices: np.ndarray    # (C,) int
+    scan_points: np.ndarray          # (C, 3) metres
+    confidence: np.ndarray           # (C,) from 0, a guess, to 1, certain
+    method: str = ""                 # how they were found
+    energies: dict[str, float] = field(default_factory=dict)     # what was minimised, and other figures of the search
     converged: bool = True
 
     def __len__(self) -> int:

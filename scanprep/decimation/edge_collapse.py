@@ -11,7 +11,6 @@ from .quadrics import curve_quadrics, lowest, surface_quadrics, value
 FREE, CURVE, FIXED = 0, 1, 2
 THINNEST = 0.1                       # triangles of less quality (1: equilateral) are not made of better ones
 HOLD = 3e-4                          # weight of the distance to vertices beside that to planes: even size where flat
-BORDER, SEAM = 30.0, 3.0             # the same for walls along borders, and along curves inside, which may lose zigzags
 PIECE = 20_000                       # edges priced at once: what stays in the processor's cache
 
 
@@ -258,7 +257,8 @@ def wall_quadrics(mesh: Mesh, points: np.ndarray, areas: np.ndarray, curves: np.
     if not len(curves):
         return 0.0
     border = mesh.edges[mesh.edge_use == 1] @ [len(mesh.vertices), 1]
-    weight = np.where(np.isin(curves @ [len(mesh.vertices), 1], border), BORDER, SEAM)
+    # walls weigh so much beside planes; curves inside may lose zigzags
+    weight = np.where(np.isin(curves @ [len(mesh.vertices), 1], border), 30.0, 3.0)
     return curve_quadrics(points, curves, areas[curves].sum(axis=1), weight)
 
 

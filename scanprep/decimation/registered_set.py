@@ -92,33 +92,11 @@ class DecimatedSet:
 def decimate_set(template: Mesh, poses: np.ndarray | None, faces: int, config: DecimateSetConfig | None = None,
                  keep: np.ndarray | None = None, skeleton: Skeleton | None = None,
                  progress: Progress | None = None) -> DecimatedSet:
-    """Collapse edges of a template so that all meshes registered with it keep their shape.
+    """Collapse edges of a template so that all meshes registered with it keep their shape, down to so many triangles.
 
-    What bends in any of them counts as curved. Borders, and borders of the skeleton's parts, stay curves.
-
-    Parameters
-    ----------
-    template : Mesh
-    poses : (M, N, 3) float, metres, or None
-        Other meshes in its topology; None for the template alone.
-    faces : int
-        How many triangles are wanted.
-    config : DecimateSetConfig, optional
-    keep : (k,) int, optional
-        Vertices that stay, such as landmarks.
-    skeleton : Skeleton, optional
-    progress : callback(done, total), optional
-
-    Returns
-    -------
-    DecimatedSet
-        With a template that has a triangle or two less than wanted, or more when no further edge can go without
-        harm.
-
-    Raises
-    ------
-    ValueError
-        Not a template, meshes of other topology, vertices or a skeleton that are not of it.
+    What bends in any of the poses (M, N, 3), metres, counts as curved; None is the template alone. Borders, and borders
+    of the skeleton's parts, stay curves, the vertices `keep` (k,) where they are. There may be a triangle or two less
+    than wanted, or more when no further edge can go without harm.
 
     [QEM] pair contraction
     """
@@ -183,27 +161,8 @@ def write_decimated_set(source: Path | str | RegisteredSet, folder: Path | str, 
     """Write a registered set with fewer triangles: template, meshes, skeleton, landmarks and the map.
 
     Every file is written whole or not at all and the map first, so that a run that was interrupted goes on where
-    it was; meshes that are there are not written again.
-
-    Parameters
-    ----------
-    source : path or RegisteredSet
-        Landmarks in `landmarks.json` of its folder stay on their vertices.
-    folder : path
-        New, or that of an earlier run with the same source and settings.
-    faces : int
-    config : DecimateSetConfig, optional
-    progress : callback(done, total), optional
-        Called after every mesh.
-
-    Returns
-    -------
-    RegisteredSet
-
-    Raises
-    ------
-    ValueError
-        The folder is that of the source, or holds something else.
+    it was; meshes that are there are not written again. Landmarks in `landmarks.json` of the source stay on their
+    vertices. ValueError for a folder that is that of the source, or holds something else.
     """
     config = config or DecimateSetConfig()
     source = source if isinstance(source, RegisteredSet) else RegisteredSet.load(source)

@@ -18,7 +18,7 @@ from typing import Any, Generic, NamedTuple, Protocol, TypeVar
 import numpy as np
 from scipy.sparse import csc_array, diags_array
 
-from . import sparse
+from . import rotations, sparse
 
 State = TypeVar("State")
 FLOOR = 1e-9                         # of the largest diagonal entry, added to all: some unknowns may have no data
@@ -135,6 +135,42 @@ def normal_equations(residuals: Sequence[Residual]) -> Dense:
     return Dense(cost, gradient, hessian)
 
 
+def retract_pose(angles: int) -> Callable[[np.ndarray, np.ndarray], np.ndarray]:
+    """A retract of rows (..., P) whose first unknowns are rotation vectors: `R exp(d)`, the rest by addition.
+
+    For equations whose derivatives are by `d` at zero. Rotation vectors come out at most π long.
+    """
+    def retract(x: np.ndarray, step: np.ndarray) -> np.ndarray:
+        out = x + step
+        first, second = (part[..., :angles].reshape(-1, 3) for part in (x, step))
+        out[..., :angles] = rotations.compose(first, second).reshape(out[..., :angles].shape)
+        return out
+
+    return retract
+
+
+def step_between(x: np.ndarray, goal: np.ndarray, angles: int) -> np.ndarray:
+    """The step (..., P) by which the retract of `retract_pose(angles)` leads from rows x to others."""
+    return retract_pose(angles)(-x, goal)
+
+
+def by_rotations(equations: Any, x: Any, angles: int) -> Any:
+    """`Dense` or `Arrow` equations at rows x (B, P) that begin with rotation vectors, by small rotations `R exp(d)`."""
+    if isinstance(equations, Arrow):
+        return equations._replace(rows=by_rotations(equations.rows, x, angles))
+    local = np.swapaxes(rotations.inverse_right_jacobian(x[:, :angles].reshape(len(x), -1, 3)), -1, -2)
+
+    def along(matrix: np.ndarray) -> np.ndarray:
+        """The rows (B, P, k) of the vectors by the rotations."""
+        out = matrix.copy()
+        own = out[:, :angles]
+        own[:] = (local @ own.reshape(*local.shape[:3], -1)).reshape(own.shape)
+        return out
+
+    return Dense(equations.energy, along(equations.gradient[..., None])[..., 0],
+                 along(np.swapaxes(along(equations.hessian), 1, 2)))
+
+
 @dataclass(frozen=True, eq=False)
 class Minimum(Generic[State]):
     """Where the search ended: the state, its equations, which of the B problems converged, and the steps tried."""
@@ -152,13 +188,21 @@ class Minimum(Generic[State]):
 
 def levenberg_marquardt(equations: Callable[[State], NormalEquations], start: State, iterations: int = 30,
                         tolerance: float = 1e-5, damping: float = 1e-3, exact: float = 0.0,
-                        retract: Callable[[Any, np.ndarray], Any] = np.add) -> Minimum[State]:
+                        retract: Callable[[Any, np.ndarray], Any] = np.add, angles: int = 0) -> Minimum[State]:
     """The state of least energy near a start; a step is taken only where it lowers the energy.
 
     A state is (B, P) float for `Dense` and `Arrow`, for `Sparse` whatever `retract`, which does a step to it, takes.
     The search stops after so many `iterations`, steps tried, or when a step lowers the energy by less than the fraction
-    `tolerance`, or by less than `exact`. `damping` is the first factor on the diagonal of the matrix.
+    `tolerance`, or by less than `exact`. `damping` is the first factor on the diagonal of the matrix. With `angles` so
+    many first unknowns of a row are rotation vectors: derivatives are by them, steps are small rotations, and so are
+    the equations that are returned.
     """
+    if angles:
+        retract, by_vectors = retract_pose(angles), equations
+
+        def equations(x: State) -> NormalEquations:
+            return by_rotations(by_vectors(x), x, angles)
+
     x, now = start, equations(start)
     factor = np.full(len(now.energy), damping)
     converged = np.zeros(len(factor), dtype=bool)

@@ -16,8 +16,7 @@ from ..geometry.landmarks import check_on_surface, match_landmarks, read_landmar
 from ..geometry.mesh import Mesh
 from ..meaning import extent
 from ..ranges import FLAG, Settings
-from ..registration.confidence import stretched_share
-from ..registration.nonrigid import Registration, register, registration_problem
+from ..registration.nonrigid import Registration, register, registration_problem, stretched_share
 from ..registration.schedule import RegistrationConfig
 from ..threads import one_thread
 from .figures import ScanFigures

@@ -8,68 +8,21 @@ are as welcome as other poses, and where there are no data the template continue
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import NamedTuple
 
 import numpy as np
-from scipy.sparse import csc_array, diags_array
+from scipy.sparse import coo_array, csc_array, diags_array
 from scipy.spatial import cKDTree
 
+from ..geometry import rotations
 from ..geometry.mesh import Mesh
-from ..geometry.sparse import Factored, conjugate_gradients
+from ..geometry.sparse import Factored, conjugate_gradients, factor
 from ..geometry.surface import OrientedPoints
 from ..geometry.target import Target, orient
-from ..ranges import Positive, Settings
 from ..threads import search_threads
-from .energies import Pull, pull
-from .gradient_field import Field, Triangles
+from .deformation_graph import Pull, pull
 from .matches import NORMALS
-
-
-@dataclass(frozen=True)
-class FinalFitRound(Settings):
-    """One round of `final_fit`. Lengths are multiples of the template's size, √area.
-
-    Attributes
-    ----------
-    field : float
-        Length over which rotations and stretches are smoothed.
-    tension : float
-        Distance to the data that a gradient of one off the smooth field is worth.
-    reach : float
-        Farthest match that counts.
-    """
-
-    field: Positive
-    tension: Positive
-    reach: Positive
-
-
-@dataclass(frozen=True)
-class FinalFitConfig(Settings):
-    """Settings of `final_fit`. Lengths are multiples of the template's size, √area.
-
-    Attributes
-    ----------
-    rounds : of measuring, smoothing and laying out
-    noise_width : float
-        Neighbourhood over which the scan's noise is averaged.
-    slide : float
-        Force of the data along the surface, as a share of that across it.
-    stay : float
-        Force towards the start where there are no data, as a share of what the data would have.
-    landmarks : float
-        The share of the surface that one landmark weighs as much as.
-    """
-
-    rounds: tuple[FinalFitRound, ...] = (
-        FinalFitRound(0.02, 0.007, 0.02),
-        FinalFitRound(0.015, 0.004, 0.015),
-        FinalFitRound(0.015, 0.004, 0.015),
-        FinalFitRound(0.015, 0.004, 0.015),
-    )
-    noise_width: Positive = 0.007
-    slide: float = 0.05
-    stay: float = 0.003
-    landmarks: float = 0.0002
+from .schedule import FinalFitConfig, FinalFitRound
 
 
 @dataclass(frozen=True, eq=False)
@@ -94,18 +47,15 @@ def final_fit(template: Mesh, start: np.ndarray, target: Target,
     x, before, stiff = start, start, np.ones(len(template.faces))
     for stage in given.config.rounds:
         x, before = _laid_out(given, x, stage, stiff), x
-    repairs = 0
-    while repairs < 12 and (bad := np.logical_or(*_bad(given, x, stage))).any():
+    repairs, quality = 0, _quality(given, x, stage)
+    while repairs < 12 and (bad := quality.inverted | quality.needles).any():
         near = np.zeros(len(x))
         near[template.faces[bad]] = 1
         stiff = np.where(near[template.faces].any(axis=1), 4 * stiff, stiff)
         x, before = _laid_out(given, x, stage, stiff), x
-        repairs += 1
-    inverted, needles = _bad(given, x, stage)
-    measured, smooth = _fields(given, x, stage)
-    return FinalFit(x, _data(given, x, stage.reach)[1], given.scan.noise, _strain(given, measured.gradient),
-                    _strain(given, measured.gradient @ np.linalg.inv(smooth.gradient)), int(inverted.sum()),
-                    int(needles.sum()), len(given.config.rounds) + repairs,
+        repairs, quality = repairs + 1, _quality(given, x, stage)
+    return FinalFit(x, _data(given, x, stage.reach)[1], given.scan.noise, quality.strain, quality.roughness,
+                    int(quality.inverted.sum()), int(quality.needles.sum()), len(given.config.rounds) + repairs,
                     float(np.linalg.norm(x - before, axis=1).mean()))
 
 
@@ -167,7 +117,8 @@ def _prepared(template: Mesh, start: np.ndarray, target: Target, landmarks: tupl
               config: FinalFitConfig) -> _Given:
     size, N = float(np.sqrt(template.face_areas.sum())), len(start)
     areas = np.maximum(template.vertex_areas, 1e-3 * template.vertex_areas.mean())
-    scan = smoothed_scan(orient(target, template.with_vertices(start), NORMALS * size), config.noise_width * size)
+    target = orient(target, template.with_vertices(start), NORMALS * size)
+    scan = smoothed_scan(target, config.noise_width * size)
     held = pull(N, np.arange(N), start, 1e-9 * areas)
     if landmarks is not None:
         held += pull(N, *landmarks, np.full(len(landmarks[0]), config.landmarks * size**2))
@@ -214,15 +165,185 @@ def _laid_out(given: _Given, x: np.ndarray, stage: FinalFitRound, stiff: np.ndar
     return x + conjugate_gradients(lambda d: K @ d + np.einsum("nij,nj->ni", wanted.A, d), force, nearly.solve)
 
 
-def _bad(given: _Given, x: np.ndarray, stage: FinalFitRound) -> tuple[np.ndarray, np.ndarray]:
-    """(F,) bool twice: triangles that face against their surroundings, and needles."""
+class _Quality(NamedTuple):
+    """Triangles (F,) bool that face against their surroundings and needles, and the strains of `FinalFit`."""
+
+    inverted: np.ndarray
+    needles: np.ndarray
+    strain: float
+    roughness: float
+
+
+def _quality(given: _Given, x: np.ndarray, stage: FinalFitRound) -> _Quality:
     measured, smooth = _fields(given, x, stage)
     n = given.template.face_normals[..., None]
     inverted = np.einsum("fdk,fdk->f", measured.R @ n, smooth.R @ n) < 0
+    own = np.linalg.svd(measured.gradient, compute_uv=False)
     relative = np.linalg.svd(measured.gradient @ np.linalg.inv(smooth.gradient), compute_uv=False)
-    return inverted, (relative[:, 0] > 4) | (relative[:, 2] < 1 / 4)
+    strain, roughness = (float(np.sqrt(np.average((np.log(stretch)**2).mean(axis=1), weights=given.triangles.areas)))
+                         for stretch in (own, relative))
+    return _Quality(inverted, (relative[:, 0] > 4) | (relative[:, 2] < 1 / 4), strain, roughness)
 
 
-def _strain(given: _Given, gradient: np.ndarray) -> float:
-    stretch = np.log(np.linalg.svd(gradient, compute_uv=False))
-    return float(np.sqrt(np.average((stretch**2).mean(axis=1), weights=given.triangles.areas)))
+@dataclass(frozen=True, eq=False)
+class Field:
+    """The rotation R and the stretch S (F, 3, 3) of every triangle; its gradient is `R S`.
+
+    S is symmetric, in the template's axes; along the normal it is the mean stretch within the triangle.
+    """
+
+    R: np.ndarray
+    S: np.ndarray
+
+    @property
+    def gradient(self) -> np.ndarray:
+        """(F, 3, 3)"""
+        return self.R @ self.S
+
+
+class Triangles:
+    """The triangles of a template at rest, ready to measure gradients and to lay wanted ones out."""
+
+    def __init__(self, template: Mesh) -> None:
+        c = template.corners
+        self.mesh = template
+        self.areas = np.maximum(template.face_areas, 1e-3 * template.face_areas.mean())
+        n = template.face_normals
+        e = np.stack([c[:, 2] - c[:, 1], c[:, 0] - c[:, 2], c[:, 1] - c[:, 0]], axis=1)
+        self.hats = np.cross(n[:, None], e) / (2 * self.areas)[:, None, None]
+        u = e[:, 2] / np.maximum(np.linalg.norm(e[:, 2], axis=1, keepdims=True), 1e-300)
+        self.frames = np.stack([u, np.cross(n, u), n], axis=1)
+        self._stiffness = self.stiffness(self.areas)
+
+    def measured(self, x: np.ndarray) -> Field:
+        """The rotations and stretches of vertices (N, 3)."""
+        flat = np.einsum("fad,fae,fke->fdk", x[self.mesh.faces], self.hats, self.frames[:, :2], optimize=True)
+        C = np.matmul(flat.transpose(0, 2, 1), flat)
+        area = np.sqrt(np.maximum(C[:, 0, 0] * C[:, 1, 1] - C[:, 0, 1] ** 2, 1e-12))
+        trace = np.sqrt(C[:, 0, 0] + C[:, 1, 1] + 2 * area)
+        U = (C + area[:, None, None] * np.eye(2)) / trace[:, None, None]
+        inverse = (np.eye(2) * np.einsum("fii->f", U)[:, None, None] - U) / area[:, None, None]
+        rotated = np.empty((len(U), 3, 3))
+        rotated[:, :, :2] = flat @ inverse
+        rotated[:, :, 2] = self.mesh.with_vertices(x).face_normals
+        full = np.zeros((len(U), 3, 3))
+        full[:, :2, :2], full[:, 2, 2] = U, np.sqrt(area)
+        B = self.frames
+        return Field(rotated @ B, B.transpose(0, 2, 1) @ full @ B)
+
+    def smoothed(self, field: Field, length: float, weights: np.ndarray) -> Field:
+        """The field that varies little over `length` (metres), where triangles count by weights (F,)."""
+        w = np.maximum(weights, 1e-6) * self.areas
+        entries = np.concatenate([field.R.reshape(-1, 9), _log_symmetric(field.S).reshape(-1, 9)], axis=1)
+        faces, N = self.mesh.faces, len(self.mesh.vertices)
+        mass = np.bincount(faces.ravel(), np.repeat(w / 3, 3), N)
+        collect = csc_array(coo_array((np.repeat(w / 3, 3), (faces.ravel(), np.repeat(np.arange(len(faces)), 3))),
+                                      shape=(N, len(faces))))
+        even = Factored(csc_array(diags_array(mass) + length**2 * self._stiffness)).solve(collect @ entries)
+        of_faces = even[faces].mean(axis=1)
+        return Field(rotations.project(of_faces[:, :9].reshape(-1, 3, 3)),
+                     _exp_symmetric(of_faces[:, 9:].reshape(-1, 3, 3)))
+
+    def stiffness(self, weights: np.ndarray) -> csc_array:
+        """(N, N) with `x·Kx = Σ w |∇x|²` for weights (F,), square metres."""
+        faces, N = self.mesh.faces, len(self.mesh.vertices)
+        local = weights[:, None, None] * np.matmul(self.hats, self.hats.transpose(0, 2, 1))
+        rows, columns = np.repeat(faces, 3, axis=1).ravel(), np.tile(faces, (1, 3)).ravel()
+        return csc_array(coo_array((local.ravel(), (rows, columns)), shape=(N, N)))
+
+    def force(self, weights: np.ndarray, gradient: np.ndarray) -> np.ndarray:
+        """(N, 3) right-hand side that asks for gradients (F, 3, 3) with weights (F,)."""
+        local = weights[:, None, None] * np.matmul(self.hats, gradient.transpose(0, 2, 1))
+        out = np.empty((len(self.mesh.vertices), 3))
+        for d in range(3):
+            out[:, d] = np.bincount(self.mesh.faces.ravel(), local[:, :, d].ravel(), len(out))
+        return out
+
+
+def _log_symmetric(S: np.ndarray) -> np.ndarray:
+    values, vectors = np.linalg.eigh(S)
+    return (vectors * np.log(np.maximum(values, 1e-3))[:, None]) @ vectors.transpose(0, 2, 1)
+
+
+def _exp_symmetric(E: np.ndarray) -> np.ndarray:
+    values, vectors = np.linalg.eigh(0.5 * (E + E.transpose(0, 2, 1)))
+    return (vectors * np.exp(values)[:, None]) @ vectors.transpose(0, 2, 1)
+
+
+def without_inverted(template: Mesh, x: np.ndarray) -> np.ndarray:
+    """Vertices (N, 3) where patches around inverted triangles were laid anew, wider ones while that leaves fewer."""
+    x = unfold(template, x)
+    left = int(inverted_triangles(template, x).sum())
+    for rings in ((2,), (2, 3), (3, 4)):
+        if not left:
+            break
+        trial = unfold(template, x, rings=rings)
+        count = int(inverted_triangles(template, trial).sum())
+        if count < left:
+            x, left = trial, count
+    return x
+
+
+def vertex_rotations(template: Mesh, x: np.ndarray, rings: int = 4) -> np.ndarray:
+    """Rotations (N, 3, 3) of the surroundings of each vertex from the template to vertices (N, 3).
+
+    The surroundings reach so many rings far: a folded triangle must not sway them.
+    """
+    a, b = template.edges.T
+    outer = np.einsum("ei,ej->eij", x[b] - x[a], template.vertices[b] - template.vertices[a]).reshape(-1, 9)
+    M = np.zeros((len(x), 9))
+    for end in (a, b):
+        np.add.at(M, end, outer)
+    A = template.vertex_adjacency
+    spread = diags_array(1 / (1 + np.asarray(A.sum(axis=1)).ravel())) @ (A + diags_array(np.ones(len(x))))
+    for _ in range(rings):
+        M = spread @ M
+    return rotations.project(M.reshape(-1, 3, 3))
+
+
+def inverted_triangles(template: Mesh, x: np.ndarray, linear: np.ndarray | None = None) -> np.ndarray:
+    """(F,) bool: triangles of vertices (N, 3) that face away from where their surroundings were rotated to.
+
+    `linear` (N, 3, 3) is the rotation around every vertex, by default that of its surroundings.
+    """
+    linear = vertex_rotations(template, x) if linear is None else linear
+    wanted = np.matmul(linear[template.faces].sum(axis=1), template.face_normals[..., None])[..., 0]
+    return np.einsum("fd,fd->f", template.with_vertices(x).face_normals, wanted) < 0
+
+
+def unfold(template: Mesh, x: np.ndarray, linear: np.ndarray | None = None, rings: tuple[int, ...] = (1, 1, 2)
+           ) -> np.ndarray:
+    """Vertices (N, 3) with small patches around inverted triangles laid anew, each edge as its surroundings rotated it.
+
+    The patches stay small: where skin truly folds triangles stay inverted, and laying wide patches there would leave
+    the data.
+    """
+    linear = vertex_rotations(template, x) if linear is None else linear
+    a, b = template.edges.T
+    rest = template.vertices[b] - template.vertices[a]
+    wanted = np.matmul(0.5 * (linear[a] + linear[b]), rest[..., None])[..., 0]
+    for reach in rings:
+        bad = inverted_triangles(template, x, linear)
+        if not bad.any():
+            break
+        patch = np.zeros(len(x))
+        patch[template.faces[bad]] = 1
+        for _ in range(reach):
+            patch = (patch + template.vertex_adjacency @ patch > 0).astype(float)
+        x = _laid(x, patch > 0, template.edges, wanted)
+    return x
+
+
+def _laid(x: np.ndarray, free: np.ndarray, edges: np.ndarray, wanted: np.ndarray) -> np.ndarray:
+    """Vertices (N, 3) where those that are free have moved so that their edges are nearest to the wanted ones."""
+    if free.all():
+        return x
+    near = free[edges].any(axis=1)
+    e = np.arange(int(near.sum()))
+    a, b = edges[near].T
+    D = csc_array(coo_array((np.r_[np.full(len(e), -1.0), np.ones(len(e))], (np.r_[e, e], np.r_[a, b])),
+                            shape=(len(e), len(x))))
+    inside, outside = D[:, np.flatnonzero(free)], D[:, np.flatnonzero(~free)]
+    x = x.copy()
+    x[free] = factor(csc_array(inside.T @ inside))(inside.T @ (wanted[near] - outside @ x[~free]))
+    return x

@@ -1,65 +1,34 @@
-"""The coarse registration: a deformation graph is drawn to the scan by matches in both directions, stage by stage."""
+"""The coarse registration: a deformation graph is drawn to the scan by matches in both directions, stage by stage.
+
+Ends of the body are tried in other rotations about themselves: a head that looks elsewhere is out of reach of nearest
+points.
+"""
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
+from functools import lru_cache
 
 import numpy as np
+from scipy.spatial import cKDTree
 
+from ..geometry import rotations
 from ..geometry.farthest_points import thin
+from ..geometry.geodesics import SurfaceGraph
+from ..geometry.mesh import Mesh
 from ..geometry.target import Target, orient
-from .deformation_graph import DeformationGraph, NodeMotion, build_graph, deform, start_motion, transferred
-from .energies import Pull, Stiffness, follow_pull, pull, terms
-from .inputs import Inputs
-from .limb_ends import End, RigidFit, find_ends, rotated_end
-from .matches import NORMALS, Likeness, match_both_ways
+from .deformation_graph import GraphFit, Stiffness, pull, start_fit, terms
+from .matches import NORMALS, Inputs, landmark_pull, wanted_by
 from .schedule import GraphStage
-
-
-@dataclass(frozen=True, eq=False)
-class GraphFit:
-    """Where the template lies: its vertices x (N, 3), metres, and the motion of the nodes that carry them.
-
-    `moved` is how far the last stage moved the mean vertex, metres.
-    """
-
-    x: np.ndarray
-    graph: DeformationGraph
-    motion: NodeMotion
-    energies: dict[str, float] = field(default_factory=dict)
-    iterations: int = 0
-    moved: float = np.inf
-
-    def minimised(self, wanted: Pull, stiffness: Stiffness, steps: int) -> GraphFit:
-        """The fit nearer to what matches and landmarks want, against the resistance of the nodes."""
-        if not wanted.A.any():
-            return self
-        found = follow_pull(self.graph, self.motion, wanted, stiffness, steps)
-        now = {name: term.value for name, term in terms(self.graph, found.x, wanted, stiffness).items()}
-        return replace(self, x=deform(self.graph, found.x), motion=found.x, energies=now,
-                       iterations=self.iterations + found.iterations)
-
-    def refined(self, given: Inputs, nodes: int) -> GraphFit:
-        """The same motion on a graph of so many nodes."""
-        if min(nodes, len(self.x)) == len(self.graph.node_vertices):
-            return self
-        finer = build_graph(given.template, nodes)
-        return replace(self, graph=finer, motion=transferred(self.graph, self.motion, finer))
-
-
-def start_fit(given: Inputs, T: np.ndarray, nodes: int) -> GraphFit:
-    """The template where a rigid transform (4, 4) places it, on a graph of so many nodes."""
-    graph = build_graph(given.template, nodes)
-    return GraphFit(given.template.vertices @ T[:3, :3].T + T[:3, 3], graph, start_motion(graph, T))
 
 
 def graph_fit(given: Inputs, T: np.ndarray, stages: tuple[GraphStage, ...], ends: int,
               tell: Callable[[int], None]) -> GraphFit:
     """The template bent onto the scan by all stages, from where a rigid transform (4, 4) places it."""
-    fit = start_fit(given, T, stages[0].nodes if stages else 300)
+    fit = start_fit(given.template, T, stages[0].nodes if stages else 300)
     for stage in stages:
         before, fit = fit, bent(given, fit, stage)
-        fit = replace(fit, moved=mean_move(before.x, fit.x))
+        fit = replace(fit, moved=float(np.linalg.norm(fit.x - before.x, axis=1).mean()))
         tell(stage.rounds)
         if stage.ends:
             for end in find_ends(given.template, ends, 0.14 * given.size) if ends else ():
@@ -67,48 +36,117 @@ def graph_fit(given: Inputs, T: np.ndarray, stages: tuple[GraphStage, ...], ends
     return fit
 
 
-def mean_move(before: np.ndarray, after: np.ndarray) -> float:
-    """Metres."""
-    return float(np.linalg.norm(after - before, axis=1).mean())
-
-
 def bent(given: Inputs, fit: GraphFit, stage: GraphStage) -> GraphFit:
     """The fit after matches were sought and followed, as often as the stage says."""
     size, template = given.size, given.template
-    fit, held = fit.refined(given, stage.nodes), given.landmark_pull(stage.landmarks)
     target, sample = given.target.thinned(stage.detail * size), thin(template.vertices, stage.detail * size)
-    like = Likeness(stage.positions, NORMALS * size, stage.paths * size)
+    fit = fit.refined(template, stage.nodes)
     for _ in range(stage.rounds):
-        wanted = held
-        if stage.reach:
-            wanted = held + match_both_ways(template.with_vertices(fit.x), sample, size**2, target, stage.reach * size,
-                                            stage.slide, like, given.descriptors)
-        if given.hints is not None and stage.hints:
-            wanted += given.hints.wanted(fit.x, stage.reach * size, stage.hints * size**2)
-        fit = fit.minimised(wanted, _stiffness(stage, size), 1)
+        fit = fit.minimised(wanted_by(given, stage, fit.x, target, sample), _stiffness(stage, size), 1)
     return fit
 
 
 def with_end_rotated(given: Inputs, fit: GraphFit, stage: GraphStage, end: End) -> GraphFit:
     """The fit with an end of the body rotated about itself, where that lies nearer to the scan, stretch counted in."""
     size, template = given.size, given.template
-    target = orient(given.target.thinned(0.5 * stage.detail * size), template.with_vertices(fit.x), NORMALS * size)
-    places = rotated_end(template, end, fit.x, RigidFit(target, size))
+    scan = RigidFit(orient(given.target.thinned(0.5 * stage.detail * size), template.with_vertices(fit.x),
+                           NORMALS * size), size)
+    places = rotated_end(template, end, fit.x, scan)
     if places is None:
         return fit
-    drawn = pull(len(fit.x), end.vertices, places, template.vertex_areas[end.vertices])
-    trial = fit.minimised(drawn + given.landmark_pull(stage.landmarks), _stiffness(stage, size), 8)
-    trial = bent(given, trial, replace(stage, hints=0.0, paths=0.0))
-    return trial if _misfit(given, trial, target, stage) < _misfit(given, fit, target, stage) else fit
+    held = landmark_pull(len(fit.x), given.landmarks, stage.landmarks * size**2)
+    stiffness = _stiffness(stage, size)
+    drawn = held + pull(len(fit.x), end.vertices, places, template.vertex_areas[end.vertices])
+    trial = bent(given, fit.minimised(drawn, stiffness, 8), replace(stage, hints=0.0, paths=0.0))
 
+    def misfit(of: GraphFit) -> float:
+        """Error against the scan and strain, as they are now."""
+        body = template.with_vertices(of.x)
+        strain = sum(term.value for term in terms(of.graph, of.motion, held, stiffness).values())
+        return float(scan.error(body.vertices, body.vertex_normals) @ template.vertex_areas) + strain
 
-def _misfit(given: Inputs, fit: GraphFit, target: Target, stage: GraphStage) -> float:
-    """Error against the scan and strain, as they are now."""
-    size, body = given.size, given.template.with_vertices(fit.x)
-    error = RigidFit(target, size).error(body.vertices, body.vertex_normals)
-    now = terms(fit.graph, fit.motion, given.landmark_pull(stage.landmarks), _stiffness(stage, size))
-    return float(error @ given.template.vertex_areas) + sum(term.value for term in now.values())
+    return trial if misfit(trial) < misfit(fit) else fit
 
 
 def _stiffness(stage: GraphStage, size: float) -> Stiffness:
     return Stiffness(stage.stretch * size, stage.bend * size, stage.growth * size)
+
+
+@dataclass(frozen=True, eq=False)
+class End:
+    """An end of a body: its vertices, and the direction in which it points away from the rest."""
+
+    vertices: np.ndarray
+    axis: np.ndarray
+
+
+@lru_cache(maxsize=4)
+def find_ends(template: Mesh, count: int, radius: float) -> tuple[End, ...]:
+    """The `count` places farthest from all others along the surface, with all within `radius` (metres)."""
+    surface = SurfaceGraph(template)
+    tips = surface.farthest_points(count, first=int(surface.farthest_points(2)[1]))
+    ends = []
+    for distance in surface.distances(tips):
+        inside = np.flatnonzero(distance <= radius)
+        rim = inside[distance[inside] > 0.8 * radius]
+        axis = template.vertices[inside].mean(axis=0) - template.vertices[rim].mean(axis=0) if len(rim) else np.zeros(3)
+        if np.linalg.norm(axis) > 1e-3 * radius:
+            ends.append(End(inside, axis / np.linalg.norm(axis)))
+    return tuple(ends)
+
+
+def rotated_end(template: Mesh, end: End, x: np.ndarray, scan: RigidFit, moved: float = 0.01
+                ) -> np.ndarray | None:
+    """Places (n, 3) of the vertices of an end after the rotation that fits best as a rigid piece.
+
+    None where that is no farther than `moved`, a share of the template's size, from where they are.
+    """
+    rest, middle = template.vertices[end.vertices], x[end.vertices].mean(axis=0)
+    R, _ = rotations.procrustes(rest, x[end.vertices])
+    sample = np.linspace(0, len(rest) - 1, min(120, len(rest))).astype(int)
+    local, normals = rest - rest.mean(axis=0), template.vertex_normals[end.vertices]
+    found = []
+    for angle in (0.0, 0.5, 1.0, -0.5, -1.0):        # radians: nearest points find what is half a step away
+        start = rotations.exp(angle * (R @ end.axis)) @ R
+        rotation, place, error = scan.fitted(local[sample], normals[sample], start, middle)
+        found.append((error, local @ rotation.T + place))
+    best = int(np.argmin([error for error, _ in found]))
+    apart = np.linalg.norm(found[best][1] - x[end.vertices], axis=1).mean()
+    return found[best][1] if apart > moved * scan.size else None
+
+
+class RigidFit:
+    """A scan that rigid pieces of a template of some size are laid on; errors do not grow beyond `cap`, metres."""
+
+    def __init__(self, target: Target, size: float) -> None:
+        self.target, self.size, self.scale, self.cap = target, size, NORMALS * size, 0.035 * size
+        self.tree = cKDTree(np.hstack([target.points, self.scale * target.normals]))
+
+    def nearest(self, x: np.ndarray, n: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Points and normals (n, 3) of the scan nearest to others, and which of them are near and on no border."""
+        index = self.tree.query(np.hstack([x, self.scale * n]))[1]
+        y, m = self.target.points[index], self.target.normals[index]
+        near = np.linalg.norm(y - x, axis=1) <= 2 * self.cap
+        return y, m, near & ~self.target.border[index]
+
+    def error(self, x: np.ndarray, n: np.ndarray) -> np.ndarray:
+        """Squared error (n,) of points with normals: across the surface and of the normals, at most `cap`²."""
+        y, m, good = self.nearest(x, n)
+        off = np.einsum("nd,nd->n", m, x - y) ** 2 + self.scale**2 * ((n - m) ** 2).sum(axis=1)
+        return np.where(good, np.minimum(off, self.cap**2), self.cap**2)
+
+    def fitted(self, local: np.ndarray, normals: np.ndarray, R: np.ndarray, place: np.ndarray
+               ) -> tuple[np.ndarray, np.ndarray, float]:
+        """A rigid piece after some rounds of nearest points: its rotation, its place, its mean error."""
+        for _ in range(8):
+            x, n = local @ R.T + place, normals @ R.T
+            y, m, good = self.nearest(x, n)
+            if good.sum() < 6:
+                break
+            arm = x - place
+            J = np.hstack([np.cross(arm, m), m])[good]
+            H = J.T @ J
+            step = -np.linalg.solve(H + 1e-6 * np.trace(H) * np.eye(6),
+                                    J.T @ np.einsum("nd,nd->n", m, x - y)[good])
+            R, place = rotations.exp(step[:3]) @ R, place + step[3:]
+        return R, place, float(self.error(local @ R.T + place, normals @ R.T).mean())

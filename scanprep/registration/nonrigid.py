@@ -13,17 +13,18 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
+from scipy.spatial import cKDTree
 
 from ..correspondence.correspondences import Correspondences
 from ..geometry.mesh import Mesh
+from ..geometry.surface import OrientedPoints, Surface
+from ..geometry.target import Target, orient
 from ..meaning import HAND, extent, size, unit_problem
 from ..threads import one_thread
-from .confidence import evidence, stretched_share, uncovered_share
-from .final_fit import final_fit
-from .graph_fit import GraphFit, graph_fit
-from .inputs import Inputs, placed, prepare
-from .inverted_triangles import inverted_triangles, without_inverted
-from .matches import NORMALS
+from .deformation_graph import GraphFit
+from .final_fit import final_fit, inverted_triangles, without_inverted
+from .graph_fit import graph_fit
+from .matches import NORMALS, Inputs, placed, prepare
 from .schedule import RegistrationConfig
 
 
@@ -31,43 +32,20 @@ from .schedule import RegistrationConfig
 class Registration:
     """The template on the scan.
 
-    Attributes
-    ----------
-    mesh : Mesh
-        The template's triangles on their new vertices.
-    distances : (N,) float, metres
-        From each vertex that was seen to the surface of the scan; NaN for the others.
-    seen : (N,) bool
-        Whether there were data here: the confidence is at least one half.
-    rms : float, metres
-        Of the distances of the vertices seen.
-    landmark_rms : float, metres
-        NaN without landmarks.
-    converged : bool
-        Never without data.
-    iterations : int
-        Steps over all stages.
-    energies : dict
-        Value of each term at the end of the coarse registration, and of the data at the very end.
-    inverted : int
-        Triangles that face against their surroundings.
-    confidence : (N,) float
-        From 0, made up from the surroundings, to 1: there were data here, from both directions.
-    uncovered : float
-        Share of the scan's points off the template, by more than a hundredth of its size (the root of its area). More
-        than half a per cent is a limb in the wrong place, or clutter; `converged` does not tell.
+    `uncovered` is the share of the scan's points off the template, by more than a hundredth of its size (the root of
+    its area). More than half a per cent is a limb in the wrong place, or clutter; `converged` does not tell.
     """
 
-    mesh: Mesh
-    distances: np.ndarray
-    seen: np.ndarray
-    rms: float
-    landmark_rms: float
-    converged: bool
-    iterations: int
-    energies: dict[str, float]
-    inverted: int
-    confidence: np.ndarray
+    mesh: Mesh                   # the template's triangles on their new vertices
+    distances: np.ndarray        # (N,) metres, from each vertex that was seen to the surface of the scan, else NaN
+    seen: np.ndarray             # (N,) bool: there were data here, the confidence is at least one half
+    rms: float                   # metres, of the distances of the vertices seen
+    landmark_rms: float          # metres; NaN without landmarks
+    converged: bool              # never without data
+    iterations: int              # steps over all stages
+    energies: dict[str, float]   # each term at the end of the coarse registration, and of the data at the very end
+    inverted: int                # triangles that face against their surroundings
+    confidence: np.ndarray       # (N,) from 0, made up from the surroundings, to 1: data here, from both directions
     uncovered: float
 
 
@@ -113,8 +91,10 @@ def register(template: Mesh, scan: Mesh | np.ndarray, landmarks: tuple[np.ndarra
         final = final_fit(template, fit.x, given.target, given.landmarks, config.final_fit)
         fit = replace(fit, x=final.vertices, energies={**fit.energies, "strain": final.strain},
                       iterations=fit.iterations + final.iterations, moved=final.moved)
+    x = without_inverted(template, fit.x)
+    inverted = int(inverted_triangles(template, x).sum())
     tell(1)
-    return _result(given, replace(fit, x=without_inverted(template, fit.x)), scan)
+    return _result(given, replace(fit, x=x), inverted, scan)
 
 
 def _counted(progress: Callable[[int, int], None] | None, total: int) -> Callable[[int], None]:
@@ -150,7 +130,7 @@ def registration_problem(template: Mesh, scan: Mesh | np.ndarray, fit: Registrat
             f"{100 * stretch:.0f}% of it is stretched or shrunk to the double or half{marks}; {cause}")
 
 
-def _result(given: Inputs, fit: GraphFit, scan: Mesh | np.ndarray) -> Registration:
+def _result(given: Inputs, fit: GraphFit, inverted: int, scan: Mesh | np.ndarray) -> Registration:
     """What was found, measured against the whole scan."""
     body = given.template.with_vertices(fit.x)
     found = evidence(body, given.target, 0.015 * given.size, NORMALS * given.size)
@@ -163,5 +143,88 @@ def _result(given: Inputs, fit: GraphFit, scan: Mesh | np.ndarray) -> Registrati
     return Registration(body, distances, seen,
                         float(np.sqrt(np.mean(distances[seen] ** 2))) if seen.any() else np.nan, landmark_rms,
                         bool(fit.moved <= 0.001 * given.size and seen.any()), fit.iterations, fit.energies,
-                        int(inverted_triangles(given.template, fit.x).sum()), found.confidence,
-                        uncovered_share(scan, body, 0.01 * given.size))
+                        inverted, found.confidence, uncovered_share(scan, body, 0.01 * given.size))
+
+
+@dataclass(frozen=True, eq=False)
+class Evidence:
+    """What the scan says of every vertex of a template that lies on it.
+
+    The confidence (N,) goes from 0, no data here, to 1: a scanned surface lies here, faces the same way, does not end
+    here, and its points find this part of the template too. Distances (N,), metres, are to the plane of the scan at the
+    nearest point that faces the same way; NaN where that is too far.
+    """
+
+    confidence: np.ndarray
+    distances: np.ndarray
+
+
+def evidence(deformed: Mesh, target: Target, reach: float, scale: float) -> Evidence:
+    """The data near every vertex of the template on the scan, weighed; farther away than `reach` (metres) are none.
+
+    A difference of normals of one counts like a distance of `scale` metres.
+    """
+    target = orient(target, deformed, scale)
+    x, normals = deformed.vertices, deformed.vertex_normals
+    found = OrientedPoints(target.points, target.normals, scale).match(x, normals, reach)
+    back = OrientedPoints(x, normals, scale).match(target.points, target.normals, reach)
+    v = np.flatnonzero(found.valid)
+    p = found.index[v]
+    off = np.abs(np.einsum("nd,nd->n", target.normals[p], x[v] - target.points[p]))
+    noise = 1.4826 * float(np.median(off)) if len(v) else 0.0
+    near = np.exp(-0.5 * (np.maximum(off - 2 * noise, 0) / max(2 * noise, 0.05 * reach)) ** 2)
+    facing = _ramp(np.einsum("nd,nd->n", target.normals[p], normals[v]), 0.5, 0.8)
+    confidence = np.zeros(len(x))
+    confidence[v] = near * facing * (_within(target, x, normals)
+                                     * _chosen(deformed, back.index[back.valid]))[v]
+    distances = np.full(len(x), np.nan)
+    distances[v] = off
+    return Evidence(confidence, distances)
+
+
+def _within(target: Target, x: np.ndarray, normals: np.ndarray, neighbours: int = 8) -> np.ndarray:
+    """(N,) from 0 to 1: points that face the same way lie close by, and not at the edge of a hole."""
+    tree = cKDTree(target.points)
+    apart, near = tree.query(x, min(neighbours, len(target.points)))
+    spacing = float(np.median(tree.query(target.points, 2)[0][:, 1]))
+    alike = np.einsum("nkd,nd->nk", target.normals[near], normals) > 0.3
+    nearest = np.where(alike, apart, np.inf).min(axis=1)
+    edge = (alike * target.border[near]).sum(axis=1) / np.maximum(alike.sum(axis=1), 1)
+    return np.exp(-0.5 * (np.maximum(nearest - 2 * spacing, 0) / (2 * spacing)) ** 2) * (1 - _ramp(edge, 0.3, 0.9))
+
+
+def _chosen(deformed: Mesh, chosen: np.ndarray) -> np.ndarray:
+    """(N,) from 0 to 1: the scan's points chose this vertex, or its neighbours, as theirs."""
+    hits = (np.bincount(chosen, minlength=len(deformed.vertices)) > 0).astype(float)
+    A = deformed.vertex_adjacency
+    degree = np.maximum(np.asarray(A.sum(axis=1)).ravel(), 1)
+    around = np.maximum(hits, (A @ hits) / degree)
+    return _ramp(around, 0.1, 0.4)
+
+
+def _ramp(value: np.ndarray, low: float, high: float) -> np.ndarray:
+    return np.clip((value - low) / (high - low), 0, 1)
+
+
+def uncovered_share(scan: Mesh | np.ndarray, registered: Mesh, far: float, samples: int = 5000) -> float:
+    """Share of the points of a scan that lie further than `far` (metres) from a mesh."""
+    points = scan.vertices if isinstance(scan, Mesh) else scan
+    points = points[:: max(1, len(points) // samples)]
+    return float((Surface(registered).closest(points).distances > far).mean())
+
+
+def stretched_share(template: Mesh, registered: Mesh, factor: float = 2.0) -> float:
+    """Share of the template's area that is longer by `factor`, or shorter, in some direction than the template."""
+    long, short = principal_stretches(template, registered)
+    return float(template.face_areas @ ((long > factor) | (short < 1 / factor)) / template.face_areas.sum())
+
+
+def principal_stretches(template: Mesh, registered: Mesh) -> tuple[np.ndarray, np.ndarray]:
+    """The largest and the smallest stretch (F,) of every triangle."""
+    rest, now = (m.corners[:, 1:] - m.corners[:, :1] for m in (template, registered))
+    # edges of the template in an orthonormal basis of its triangle, as a lower triangular matrix
+    gram = np.einsum("fid,fjd->fij", rest, rest)
+    basis = np.linalg.inv(np.linalg.cholesky(gram + 1e-18 * np.eye(2)))
+    metric = np.einsum("fij,fjd,fkd,flk->fil", basis, now, now, basis)
+    squared = np.linalg.eigvalsh(metric)
+    return np.sqrt(np.maximum(squared[:, 1], 0)), np.sqrt(np.maximum(squared[:, 0], 0))

@@ -1,10 +1,57 @@
-"""The schedule of a non-rigid registration, as data."""
+"""The schedule of a non-rigid registration, as data. Lengths are multiples of the template's size, √area."""
 from __future__ import annotations
 
 from dataclasses import dataclass, field
 
 from ..ranges import Cell, Count, Positive, Settings
-from .final_fit import FinalFitConfig
+
+
+@dataclass(frozen=True)
+class FinalFitRound(Settings):
+    """One round of `final_fit`. Lengths are multiples of the template's size, √area.
+
+    Attributes
+    ----------
+    field : float
+        Length over which rotations and stretches are smoothed.
+    tension : float
+        Distance to the data that a gradient of one off the smooth field is worth.
+    reach : float
+        Farthest match that counts.
+    """
+
+    field: Positive
+    tension: Positive
+    reach: Positive
+
+
+@dataclass(frozen=True)
+class FinalFitConfig(Settings):
+    """Settings of `final_fit`. Lengths are multiples of the template's size, √area.
+
+    Attributes
+    ----------
+    rounds : of measuring, smoothing and laying out
+    noise_width : float
+        Neighbourhood over which the scan's noise is averaged.
+    slide : float
+        Force of the data along the surface, as a share of that across it.
+    stay : float
+        Force towards the start where there are no data, as a share of what the data would have.
+    landmarks : float
+        The share of the surface that one landmark weighs as much as.
+    """
+
+    rounds: tuple[FinalFitRound, ...] = (
+        FinalFitRound(0.02, 0.007, 0.02),
+        FinalFitRound(0.015, 0.004, 0.015),
+        FinalFitRound(0.015, 0.004, 0.015),
+        FinalFitRound(0.015, 0.004, 0.015),
+    )
+    noise_width: Positive = 0.007
+    slide: float = 0.05
+    stay: float = 0.003
+    landmarks: float = 0.0002
 
 
 @dataclass(frozen=True)

@@ -10,9 +10,9 @@ import numpy as np
 from ..geometry.mesh import Mesh, template_problem
 from ..geometry.surface import Rays, SeenSpace, Surface
 from ..ranges import FLAG, Count, Positive, Range, Settings
-from .boundary_loops import group_loops, joined_polygon
 from .hole_patch import Patch
 from .intersections import intersecting_faces
+from .loops import group_loops, joined_polygon
 from .manifold import repair, split_vertices
 from .volumetric_diffusion import EMPTY, diffused_surface
 
@@ -48,8 +48,7 @@ class FillConfig(Settings):
     poisson_depth: Annotated[int, Range(1, 16)] = 8
 
 
-@dataclass(frozen=True, eq=False)
-class FilledHole:
+class FilledHole(NamedTuple):
     """What was done about one hole."""
 
     centre: np.ndarray          # (3,) metres
@@ -58,6 +57,15 @@ class FilledHole:
     method: str                 # "fair" or "diffusion"
     intersections: int          # pairs of triangles, one of them new, that run through each other in the end
     in_empty: float             # share of the new vertices in space that the views saw to be empty; 0 without views
+
+    @property
+    def faults(self) -> tuple[bool, int, float]:
+        """What a patch is judged by, the lower the better: too much of it where nothing can be, and the rest."""
+        return self.in_empty > MOST_EMPTY, self.intersections, self.in_empty
+
+    @property
+    def is_bad(self) -> bool:
+        return bool(self.intersections) or self.in_empty > MOST_EMPTY
 
 
 @dataclass(frozen=True, eq=False)
@@ -69,7 +77,7 @@ class FillReport:
 
 
 def fill_holes(mesh: Mesh, config: FillConfig | None = None,
-               progress: Callable[[int, int], None] | None = None, views: Sequence[Any] = ()) -> Mesh:
+               progress: Callable[[int, int], None] | None = None) -> Mesh:
     """Close the holes of a mesh.
 
     Each hole gets the triangulation that bends least, is refined to the size of the triangles around it, and
@@ -81,8 +89,6 @@ def fill_holes(mesh: Mesh, config: FillConfig | None = None,
         Edge-manifold; borders may touch in a vertex (see `repair`).
     config : FillConfig, optional
     progress : callback(done, total), optional
-    views : sequence of RangeView, or of (Mesh, camera position (3,)) pairs, optional
-        What the mesh was merged from; space they look through is left empty.
 
     Returns
     -------
@@ -106,14 +112,15 @@ def fill_holes(mesh: Mesh, config: FillConfig | None = None,
         else:
             from ..adapters.pymeshlab_filters import poisson
         return close(poisson(mesh, config.poisson_depth))
-    return fill_report(mesh, config, progress, views).mesh
+    return fill_report(mesh, config, progress).mesh
 
 
 def fill_report(mesh: Mesh, config: FillConfig | None = None, progress: Callable[[int, int], None] | None = None,
                 views: Sequence[Any] = ()) -> FillReport:
     """Close the holes of a mesh and tell how; as `fill_holes`, for the methods that keep the mesh.
 
-    Fair patches for all holes together; then those that are not good enough one by one in a volume.
+    Fair patches for all holes together; then those that are not good enough one by one in a volume. The mesh was merged
+    from the views, RangeView or pairs (Mesh, camera position (3,)): space they look through is left empty.
 
     [Liepa] triangulation, refinement, fairing
     [Davis] volumetric diffusion
@@ -131,7 +138,7 @@ def fill_report(mesh: Mesh, config: FillConfig | None = None, progress: Callable
     groups = group_loops(mesh, loops) if config.join else [[loop] for loop in loops]
     work = _Filling(mesh, config, SeenSpace(views) if len(views) else None, Rays(mesh))
     if config.method == "diffusion":
-        filled, made = mesh, list[_Made | None]([None] * len(groups))
+        filled, made = mesh, list[FilledHole | None]([None] * len(groups))
     else:
         filled = work.patched(mesh, groups, progress=progress)
         made = [*work.rated(filled, mesh, groups, "fair")]
@@ -144,9 +151,7 @@ def fill_report(mesh: Mesh, config: FillConfig | None = None, progress: Callable
         filled, made[g] = work.in_volume(filled, groups[g], made[g])
         if progress:
             progress(done, len(groups))
-    holes = [FilledHole(mesh.vertices[np.concatenate(group)].mean(axis=0), len(group), sum(map(len, group)), *one)
-             for group, one in zip(groups, made, strict=True) if one is not None]
-    return FillReport(split_vertices(filled), tuple(holes))
+    return FillReport(split_vertices(filled), tuple(hole for hole in made if hole is not None))
 
 
 def close(mesh: Mesh, config: FillConfig | None = None) -> Mesh:
@@ -167,18 +172,6 @@ def _check(mesh: Mesh, config: FillConfig) -> None:
         raise ValueError("mesh: expected a surface with holes, got one without triangles")
     if config.method not in get_args(Method):
         raise ValueError(f"config.method: expected one of {', '.join(get_args(Method))}, got {config.method!r}")
-
-
-class _Made(NamedTuple):
-    """How a hole was filled: method, pairs of triangles that cross, share of new vertices where nothing can be."""
-
-    method: str
-    crossing: int
-    empty: float
-
-    @property
-    def is_bad(self) -> bool:
-        return bool(self.crossing) or self.empty > MOST_EMPTY
 
 
 @dataclass(frozen=True, eq=False)
@@ -216,19 +209,21 @@ class _Filling:
             patch.untangle(start)
         return patch.onto(mesh, used)
 
-    def in_volume(self, mesh: Mesh, group: list[np.ndarray], fair: _Made | None) -> tuple[Mesh, _Made]:
+    def in_volume(self, mesh: Mesh, group: list[np.ndarray], fair: FilledHole | None
+                  ) -> tuple[Mesh, FilledHole]:
         """The mesh with one hole filled by diffusion, unless the fair patch was better.
 
         [Davis] volumetric diffusion
         """
         filled = self.patched(mesh, [group], diffused_surface(*_around(mesh, np.concatenate(group)), self.seen))
         made = self.rated(filled, mesh, [group], "diffusion")[0]
-        if fair is None or (made.empty > MOST_EMPTY, *made[1:]) < (fair.empty > MOST_EMPTY, *fair[1:]):
+        if fair is None or made.faults < fair.faults:
             return filled, made
         return self.patched(mesh, [group]), fair
 
-    def rated(self, filled: Mesh, before: Mesh, groups: list[list[np.ndarray]], method: str) -> list[_Made]:
-        """For every hole what is wrong with its patch."""
+    def rated(self, filled: Mesh, before: Mesh, groups: list[list[np.ndarray]], method: str
+              ) -> list[FilledHole]:
+        """What was done about every hole, and what is wrong with its patch."""
         old = len(before.faces)
         label = Mesh(filled.vertices, filled.faces[old:]).vertex_component
         pairs = intersecting_faces(filled, np.arange(old, len(filled.faces)))
@@ -239,8 +234,9 @@ class _Filling:
             inside = self.seen.ahead(filled.vertices[fresh]) > EMPTY
             count = np.bincount(label[fresh], minlength=len(empty))
             empty = np.bincount(label[fresh], inside, len(empty)) / np.maximum(count, 1)
-        piece = [label[group[0][0]] for group in groups]
-        return [_Made(method, int(crossing[p]), float(empty[p])) for p in piece]
+        pieces = [(np.concatenate(group), len(group), label[group[0][0]]) for group in groups]
+        return [FilledHole(before.vertices[rim].mean(axis=0), borders, len(rim), method, int(crossing[p]),
+                           float(empty[p])) for rim, borders, p in pieces]
 
 
 def _around(mesh: Mesh, rim: np.ndarray) -> tuple[Mesh, np.ndarray]:

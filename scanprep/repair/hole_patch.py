@@ -12,7 +12,7 @@ from ..geometry.remeshing import clamped_cotangents, flip_edges, mean_of_neighbo
 from ..geometry.sparse import factor
 from ..geometry.surface import Rays
 from .intersections import intersecting_faces
-from .triangulate import triangulate_loop
+from .loops import triangulate_loop
 
 
 class Patch:

@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import json
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -43,18 +44,8 @@ def part_number(skeleton: Skeleton, part: int | str) -> int:
 def merge_parts(skeleton: Skeleton, template: Mesh, a: int | str, b: int | str) -> Skeleton:
     """Two parts as one, called like the first.
 
-    They are linked, or touch and hang on the same part: then the joint comes to lie between their two.
-
-    Parameters
-    ----------
-    skeleton : Skeleton
-    template : Mesh
-    a, b : names or numbers of parts
-
-    Raises
-    ------
-    ValueError
-        A part that is not there, twice the same, or parts whose union would close a loop or lie in two pieces.
+    They are linked, or touch and hang on the same part: then the joint comes to lie between their two. ValueError for
+    others, whose union would close a loop or lie in two pieces.
     """
     first, second = part_number(skeleton, a), part_number(skeleton, b)
     if first == second:
@@ -74,32 +65,16 @@ def merge_parts(skeleton: Skeleton, template: Mesh, a: int | str, b: int | str) 
     new[high] = new[low]
     keep = np.arange(len(parents)) != high
     above = np.where(parents < 0, -1, new[parents])
-    names = [skeleton.names[first] if p == low else name for p, name in enumerate(skeleton.names)]
-    merged = Skeleton(new[skeleton.part_of_face], above[keep], joints[keep],
-                      tuple(name for p, name in enumerate(names) if keep[p]))
-    return merged.with_root_centred(template)
+    names = tuple(skeleton.names[first if p == low else p] for p in np.flatnonzero(keep))
+    return Skeleton(new[skeleton.part_of_face], above[keep], joints[keep], names).with_root_centred(template)
 
 
 def split_part(skeleton: Skeleton, template: Mesh, part: int | str, poses: np.ndarray | None = None,
                names: Sequence[str] | None = None) -> Skeleton:
-    """One part as two: where it bends most in the poses or, without poses, across its length in the middle.
+    """One part as two: where it bends most in the poses (M, N, 3) or, without, across its length in the middle.
 
     The half that lies on the old parent (in the root: the larger) keeps number and name; the new one follows it.
-    Children go with the half they share the longer border with.
-
-    Parameters
-    ----------
-    skeleton : Skeleton
-    template : Mesh
-    part : name or number
-    poses : (M, N, 3) float, metres, optional
-    names : two strings, optional
-        Of the half that stays and of the new one.
-
-    Raises
-    ------
-    ValueError
-        A part that is not there, one that the poses do not bend, or names that are taken.
+    Children go with the half they share the longer border with. ValueError for a part that the poses do not bend.
     """
     p = part_number(skeleton, part)
     label = skeleton.part_of_face
@@ -126,48 +101,31 @@ def split_part(skeleton: Skeleton, template: Mesh, part: int | str, poses: np.nd
     parents[p + 1] = p
     joints = np.empty((P + 1, 3))
     joints[place] = np.r_[skeleton.joints, np.zeros((1, 3))]
-    chosen = tuple(names) if names is not None else (skeleton.names[p], _free(skeleton, skeleton.names[p]))
+    name = skeleton.names[p]
+    free = next(new for k in range(2, P + 3) if (new := f"{name}_{k}") not in skeleton.names)
+    chosen = (name, free) if names is None else tuple(names)
     if len(chosen) != 2:
         raise ValueError(f"names: expected two, got {list(chosen)}")
-    listed = [*skeleton.names[:p], *chosen, *skeleton.names[p + 1:]]
     joints[p + 1] = _joint_between(template, place[halved], p, p + 1, poses)
-    return Skeleton(place[halved], parents, joints, tuple(listed)).with_root_centred(template)
+    listed = (*skeleton.names[:p], *chosen, *skeleton.names[p + 1:])
+    return Skeleton(place[halved], parents, joints, listed).with_root_centred(template)
 
 
 def rename_part(skeleton: Skeleton, part: int | str, name: str) -> Skeleton:
-    """The skeleton with another name for one part.
-
-    Raises
-    ------
-    ValueError
-        A part that is not there, or a name that is empty, a number, or taken.
-    """
+    """The skeleton with another name for one part; ValueError for one that is empty, a number, or taken."""
     p = part_number(skeleton, part)
     if not isinstance(name, str) or not name.strip() or name.isdecimal():
         raise ValueError(f"name: expected a name that is not a number, got {name!r}")
     if name in skeleton.names and skeleton.names[p] != name:
         raise ValueError(f"name: '{name}' is part {skeleton.names.index(name)} already")
-    names = tuple(name if j == p else old for j, old in enumerate(skeleton.names))
-    return Skeleton(skeleton.part_of_face, skeleton.parents, skeleton.joints, names)
+    return replace(skeleton, names=tuple(name if j == p else old for j, old in enumerate(skeleton.names)))
 
 
 def move_joint(skeleton: Skeleton, template: Mesh, part: int | str, position: Sequence[float] | None = None,
                ring: Sequence[int] | None = None) -> Skeleton:
-    """The skeleton with the joint between a part and its parent elsewhere.
+    """The skeleton with the joint between a part and its parent elsewhere, on the template.
 
-    Parameters
-    ----------
-    skeleton : Skeleton
-    template : Mesh
-    part : name or number
-    position : (3,) float, metres, on the template
-    ring : (n,) int
-        Instead of a position: vertices of the template, in whose middle the joint is put.
-
-    Raises
-    ------
-    ValueError
-        The root, which has no joint; not one of `position` and `ring`; numbers that are no position or no vertices.
+    At a position (3,), metres, or in the middle of a ring of vertices (n,).
     """
     p = part_number(skeleton, part)
     if p == 0:
@@ -187,7 +145,7 @@ def move_joint(skeleton: Skeleton, template: Mesh, part: int | str, position: Se
         if point.shape != (3,) or not np.isfinite(point).all():
             raise ValueError(f"position: expected three finite numbers, got {position}")
         joints[p] = point
-    return Skeleton(skeleton.part_of_face, skeleton.parents, joints, skeleton.names)
+    return replace(skeleton, joints=joints)
 
 
 def apply_edits(skeleton: Skeleton, template: Mesh, edits: Sequence[dict[str, Any]],
@@ -219,13 +177,7 @@ def apply_edits(skeleton: Skeleton, template: Mesh, edits: Sequence[dict[str, An
 
 
 def read_edits(path: str | Path) -> list[dict[str, Any]]:
-    """The edits of a JSON file.
-
-    Raises
-    ------
-    StorageError
-        Missing, or not a list of edits in JSON.
-    """
+    """The edits of a JSON file; StorageError where it is missing or holds no list."""
     stored = storage.read_json(path, "a list of edits")
     if not isinstance(stored, list):
         raise storage.StorageError(f"{path}: expected a list of edits in JSON, found something else")
@@ -258,11 +210,6 @@ def _applied(skeleton: Skeleton, template: Mesh, edit: dict[str, Any], poses: np
     for old, new in what.items():
         skeleton = rename_part(skeleton, old, new)
     return skeleton
-
-
-def _free(skeleton: Skeleton, name: str) -> str:
-    """`name` with the lowest number from 2 that makes it new."""
-    return next(new for k in range(2, len(skeleton.names) + 3) if (new := f"{name}_{k}") not in skeleton.names)
 
 
 def border_between(template: Mesh, label: np.ndarray, a: int, b: int) -> tuple[np.ndarray, np.ndarray]:

@@ -24,7 +24,7 @@ from .joints import (
     without_weak,
 )
 from .motions import PosedSurface
-from .names import names_by_symmetry
+from .names import name_parts
 from .parts import FADING, PartSearch, SkeletonConfig, find_parts
 from .symmetry import Symmetry, find_symmetry
 from .tree import Skeleton, reorder
@@ -32,7 +32,6 @@ from .tree import Skeleton, reorder
 __all__ = ["SkeletonConfig", "find_skeleton", "search_skeleton"]
 
 Tree = tuple[np.ndarray, np.ndarray, list[Loop]]
-WORTH = 0.1                      # by how much a part must lower the logarithm of the energy to count
 
 
 @dataclass(frozen=True)
@@ -46,28 +45,14 @@ class OpenedLoop:
 
 @dataclass(frozen=True, eq=False)
 class SkeletonSearch:
-    """A skeleton and how it was found.
-
-    Attributes
-    ----------
-    skeleton : Skeleton
-    loops : tuple of OpenedLoop
-    symmetry : Symmetry
-        The best mirror symmetry of the body, whether it holds or not.
-    symmetric : bool
-        Whether left and right have the same parts by construction; only borders may differ, as far as the poses show.
-    energies : tuple of float
-        Of every restart, as a share of the squared size of the body.
-    parts : tuple of int
-        Number of parts that every restart ended with.
-    """
+    """A skeleton and how it was found."""
 
     skeleton: Skeleton
     loops: tuple[OpenedLoop, ...]
-    symmetry: Symmetry
-    symmetric: bool
-    energies: tuple[float, ...]
-    parts: tuple[int, ...]
+    symmetry: Symmetry               # the best mirror symmetry of the body, whether it holds or not
+    symmetric: bool                  # left and right have the same parts by construction, only borders may differ
+    energies: tuple[float, ...]      # of every restart, as a share of the squared size of the body
+    parts: tuple[int, ...]           # number of parts that every restart ended with
 
 
 def find_skeleton(template: Mesh, poses: np.ndarray, config: SkeletonConfig | None = None,
@@ -131,7 +116,7 @@ def search_skeleton(template: Mesh, poses: np.ndarray, config: SkeletonConfig | 
     joints = place_joints(surface, label, surface.core_motions(label), links)       # [Articulated] joints
     skeleton = _assembled(template, label, links, joints)
     if tied:
-        skeleton = replace(skeleton, names=names_by_symmetry(template, skeleton, symmetry))
+        skeleton = replace(skeleton, names=name_parts(template, skeleton, symmetry))
     tell(True)
     return SkeletonSearch(skeleton, tuple(_opened(loop, skeleton) for loop in runs[0].loops), symmetry, tied,
                           tuple(run.energy for run in runs), tuple(len(run.links) + 1 for run in runs))
@@ -209,7 +194,8 @@ def _searched(search: PartSearch) -> Tree:
 def _score(search: PartSearch, label: np.ndarray) -> float:
     """What is compared: the logarithm of the energy, and what every part must be worth."""
     energy = search.energy(label) / search.surface.area
-    return float(np.log(energy + search.config.tolerance**2) + WORTH * (label.max() + 1))
+    # a part counts that lowers the logarithm of the energy by a tenth
+    return float(np.log(energy + search.config.tolerance**2) + 0.1 * (label.max() + 1))
 
 
 def _improved(search: PartSearch, label: np.ndarray, links: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

@@ -15,7 +15,6 @@ from .motions import Motions, PosedSurface
 from .parts import FADING, PartSearch
 from .sides import mirror_pairs, reductions
 
-WEAK_CONTACT = 0.2               # of the longer borders of both parts: thighs that touch are not linked
 LOOP_SEPARATION = 1.5            # times the separation of parts: on a loop, closer ones are merged
 
 
@@ -46,7 +45,7 @@ def without_weak(search: PartSearch, label: np.ndarray) -> np.ndarray:
     longest = np.zeros(count)
     for side in range(2):
         np.maximum.at(longest, pairs[:, side], lengths)
-    weak = lengths < WEAK_CONTACT * longest[pairs].min(axis=1)
+    weak = lengths < 0.2 * longest[pairs].min(axis=1)                # thighs that touch are not linked
     keep = np.ones(len(pairs), dtype=bool)
     for i in np.argsort(lengths, kind="stable"):
         if weak[i] and keep[i]:

@@ -6,40 +6,23 @@ from dataclasses import dataclass
 import numpy as np
 
 from ..geometry.mesh import Mesh
-from .symmetry import Symmetry, find_symmetry
+from .symmetry import Symmetry
 from .tree import Skeleton
 
 ARM = {1: ("arm",), 2: ("upper_arm", "forearm"), 3: ("upper_arm", "forearm", "hand")}
 LEG = {1: ("leg",), 2: ("thigh", "shin"), 3: ("thigh", "shin", "foot")}
 
 
-def name_parts(template: Mesh, skeleton: Skeleton, up: np.ndarray | None = None) -> tuple[str, ...]:
+def name_parts(template: Mesh, skeleton: Skeleton, symmetry: Symmetry) -> tuple[str, ...]:
     """Names of the parts of a person: pelvis, abdomen, chest, head, upper_arm_left, ..., foot_right.
 
     A body counts as a person if it is symmetric with a tree that is, the parts in the middle form one chain that
     ends in a head, one pair of limbs hangs at its other end and one further up, every limb is a chain, and the legs go
     on where the trunk ends, as on somebody who stands. Left and right follow from the feet, whose soles are taken to
     reach forward from the ankles. Any other body keeps the names it has.
-
-    Parameters
-    ----------
-    template : Mesh
-    skeleton : Skeleton
-    up : (3,) float, optional
-        Direction of the sky; then a person must also stand on the feet in it.
-
-    Returns
-    -------
-    tuple of J strings
     """
-    return names_by_symmetry(template, skeleton, find_symmetry(template), up)
-
-
-def names_by_symmetry(template: Mesh, skeleton: Skeleton, symmetry: Symmetry, up: np.ndarray | None = None
-                      ) -> tuple[str, ...]:
-    """`name_parts` where the symmetry is known."""
     person = _person(template, skeleton, symmetry) if symmetry.holds else None
-    if person is None or (up is not None and np.asarray(up, dtype=np.float64) @ person.up <= 0):
+    if person is None:
         return skeleton.names
     left = _left(template, skeleton, person)
     if left is None:

@@ -7,9 +7,8 @@ from typing import Annotated
 import numpy as np
 
 from ..ranges import FLAG, Count, Positive, Seed, Settings
-from .motions import Moments, Motions, PosedSurface, fit_motions, rigid_costs, union_costs
-from .patches import agglomerate, cover, halve
-from .sides import Sides, mirror_pairs
+from .motions import Moments, Motions, PosedSurface, agglomerate, fit_motions, halve, rigid_costs, union_costs
+from .sides import Sides, cover, mirror_pairs
 from .symmetry import Symmetry
 
 SMALLEST = 0.005                 # of the surface: a smaller part is joined to a neighbour

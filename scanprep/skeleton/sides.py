@@ -6,9 +6,12 @@ symmetric is all one side: then nothing is tied, and every label counts as its o
 from __future__ import annotations
 
 import numpy as np
+from scipy.sparse import coo_array, csr_array
+from scipy.sparse.csgraph import dijkstra
 
+from ..geometry.farthest_points import farthest_points
 from .labels import keep_connected, relabel
-from .motions import PosedSurface
+from .motions import PosedSurface, closure
 from .symmetry import Symmetry
 
 
@@ -97,12 +100,6 @@ class Sides:
         return label
 
 
-def closure(a: int, b: int, partner: np.ndarray) -> list[list[int]]:
-    """The sets of labels that become one each when a and b do: one set, or two that are mirror images."""
-    one, other = {int(a), int(b)}, {int(partner[a]), int(partner[b])}
-    return [sorted(one | other)] if one & other else [sorted(one), sorted(other)]
-
-
 def reductions(pairs: np.ndarray, partner: np.ndarray) -> np.ndarray:
     """(n,) how many labels fewer there are when the pairs (n, 2) of labels become one each."""
     a, b = pairs.T
@@ -114,3 +111,24 @@ def mirror_pairs(pairs: np.ndarray, partner: np.ndarray) -> np.ndarray:
     number = {(int(a), int(b)): i for i, (a, b) in enumerate(pairs)}
     image = np.sort(partner[pairs], axis=1)
     return np.array([number.get((int(a), int(b)), i) for i, (a, b) in enumerate(image)], dtype=np.int64)
+
+
+def cover(surface: PosedSurface, count: int, sides: Sides, rng: np.random.Generator | None = None) -> np.ndarray:
+    """(F,) patch of every triangle: about `count` seeds, each the farthest from those before, along the surface.
+
+    The first is the farthest from the middle or, with `rng`, any. On a symmetric body the patches of one side are
+    the mirror images of those of the other.
+    """
+    half, n = sides.half, len(sides.half)
+    centre = surface.x[surface.mesh.faces[half]].mean(axis=1)
+    a, b = sides.pairs.T
+    step = np.linalg.norm(centre[a] - centre[b], axis=1)
+    graph = csr_array(coo_array((np.r_[step, step], (np.r_[a, b], np.r_[b, a])), shape=(n, n)))
+    seed = int(np.linalg.norm(centre, axis=1).argmax()) if rng is None else int(rng.integers(n))
+    seeds = farthest_points(centre, -(-count // 2) if sides.tied else count, seed,
+                            lambda i, limit: dijkstra(graph, indices=i, limit=limit))
+    nearest = dijkstra(graph, indices=seeds, min_only=True, return_predecessors=True)[2]
+    order = np.argsort(seeds)
+    patch = order[np.searchsorted(seeds, nearest, sorter=order)]
+    K = int(patch.max()) + 1
+    return np.unique(sides.spread(patch, np.r_[np.arange(K) + K, np.arange(K)]), return_inverse=True)[1]

@@ -13,8 +13,6 @@ from ..geometry.surface import OrientedPoints
 from .labels import keep_connected
 
 NORMAL_WEIGHT = 0.05                 # of the body's size: how much distance a difference of normals weighs
-SYMMETRIC = 0.03                     # of the body's size: the mirror image lies so near the body, RMS
-RETURNS = 0.8                        # of the surface that comes back to where it was when mirrored twice
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,8 +53,8 @@ class Symmetry(MirrorPlane):
 
     @property
     def holds(self) -> bool:
-        """Whether the body is symmetric, within the tolerances above."""
-        return self.distance <= SYMMETRIC and self.returns >= RETURNS
+        """Whether the body is symmetric: its mirror image lies near, and most of it comes back when mirrored twice."""
+        return self.distance <= 0.03 and self.returns >= 0.8
 
     @property
     def two_sided(self) -> bool:

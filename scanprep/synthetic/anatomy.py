@@ -43,44 +43,23 @@ class BodyShape(Settings):
     """What makes one person's build differ from another's.
 
     Except for sex and stature, 0 is the average of the sex and 1 a standard deviation above it.
-
-    Parameters
-    ----------
-    sex : -1 (woman) to 1 (man), continuous
-    stature : metres, 1.45 to 2.05
-    weight : fat all over the body, -1.8 to 3
-    muscle : breadth of the muscles, -2 to 3
-    leg_length, arm_length : against the stature, -2.5 to 2.5
-    shoulder_width, hip_width : of the skeleton, -2.5 to 2.5
-    belly : fat at the front of the waist beyond what weight gives, -1.5 to 3
-    chest : depth of the rib cage; of the breasts in women, -2 to 3
-    neck : length of the neck, -2.5 to 2.5
-    head_size : -2.5 to 2.5
-    limbs : thickness of arms and legs beyond what weight gives, -2 to 2
-    extremities : length of hands and feet, -2.5 to 2.5
-    nose : size of the nose, -2 to 2.5
-
-    Raises
-    ------
-    ValueError
-        A value outside its range.
     """
 
-    sex: Annotated[float, Range(-1, 1)] = 1.0
-    stature: Annotated[float, Range(1.45, 2.05)] = 1.75
-    weight: Annotated[float, Range(-1.8, 3)] = 0.0
-    muscle: Annotated[float, Range(-2, 3)] = 0.0
-    leg_length: Annotated[float, Range(-2.5, 2.5)] = 0.0
+    sex: Annotated[float, Range(-1, 1)] = 1.0                    # -1 (woman) to 1 (man), continuous
+    stature: Annotated[float, Range(1.45, 2.05)] = 1.75          # metres
+    weight: Annotated[float, Range(-1.8, 3)] = 0.0               # fat all over the body
+    muscle: Annotated[float, Range(-2, 3)] = 0.0                 # breadth of the muscles
+    leg_length: Annotated[float, Range(-2.5, 2.5)] = 0.0         # against the stature, as of the arms
     arm_length: Annotated[float, Range(-2.5, 2.5)] = 0.0
-    shoulder_width: Annotated[float, Range(-2.5, 2.5)] = 0.0
+    shoulder_width: Annotated[float, Range(-2.5, 2.5)] = 0.0     # of the skeleton, as of the hips
     hip_width: Annotated[float, Range(-2.5, 2.5)] = 0.0
-    belly: Annotated[float, Range(-1.5, 3)] = 0.0
-    chest: Annotated[float, Range(-2, 3)] = 0.0
-    neck: Annotated[float, Range(-2.5, 2.5)] = 0.0
+    belly: Annotated[float, Range(-1.5, 3)] = 0.0                # fat at the front of the waist beyond that of weight
+    chest: Annotated[float, Range(-2, 3)] = 0.0                  # depth of the rib cage; of the breasts in women
+    neck: Annotated[float, Range(-2.5, 2.5)] = 0.0               # length
     head_size: Annotated[float, Range(-2.5, 2.5)] = 0.0
-    limbs: Annotated[float, Range(-2, 2)] = 0.0
-    extremities: Annotated[float, Range(-2.5, 2.5)] = 0.0
-    nose: Annotated[float, Range(-2, 2.5)] = 0.0
+    limbs: Annotated[float, Range(-2, 2)] = 0.0                  # thickness of arms and legs beyond what weight gives
+    extremities: Annotated[float, Range(-2.5, 2.5)] = 0.0        # length of hands and feet
+    nose: Annotated[float, Range(-2, 2.5)] = 0.0                 # size
 
     def __post_init__(self) -> None:
         super().__post_init__()
@@ -97,16 +76,16 @@ class BodyShape(Settings):
         return BodyShape(*map(float, values))
 
     @staticmethod
-    def random(rng: np.random.Generator, sex: float | None = None, spread: float = 1.0) -> BodyShape:
+    def random(rng: np.random.Generator, sex: float | None = None) -> BodyShape:
         """A plausible person: stature from the population, the rest normal within its range."""
         if sex is None:
             sex = 1.0 if rng.random() < 0.5 else -1.0
         man = (sex + 1) / 2
-        stature = man * 1.765 + (1 - man) * 1.64 + spread * rng.normal() * 0.068
+        stature = man * 1.765 + (1 - man) * 1.64 + rng.normal() * 0.068
         values = {"sex": sex, "stature": stature}
         scale = {"weight": 0.9, "muscle": 0.8, "belly": 0.7, "chest": 0.8, "limbs": 0.7}
         for field in fields(BodyShape)[2:]:
-            values[field.name] = spread * scale.get(field.name, 0.9) * rng.normal()
+            values[field.name] = scale.get(field.name, 0.9) * rng.normal()
         allowed = {name: (found.low, found.high) for name, (found, _) in ranges(BodyShape).items()}
         return BodyShape(**{name: float(np.clip(v, *allowed[name])) for name, v in values.items()})
 

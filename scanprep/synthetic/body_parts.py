@@ -103,6 +103,16 @@ def _limb(a: Anatomy, origin: np.ndarray, frame: np.ndarray, at: np.ndarray, ext
     return Loft(origin, frame, cross_sections(at, out, inner, front, back, exponent), caps)
 
 
+Triple = tuple[float, float, float]
+
+
+def _bumps(origin: np.ndarray, frame: np.ndarray, scale: float, rises: list[tuple[Triple, float, Triple]]
+           ) -> list[Bump]:
+    """Bumps from places in a frame, heights and widths on a body of average size."""
+    return [Bump(origin + frame.T @ np.array(at) * scale, height * scale, np.array(widths) * scale, frame)
+            for at, height, widths in rises]
+
+
 def leg(a: Anatomy) -> Field:
     """Leg and foot."""
     s, g = a.shape, a.scale
@@ -117,21 +127,14 @@ def leg(a: Anatomy) -> Field:
     at = np.interp(table[:, 0], [-1, 0, 1, 2, 3], [-thigh, 0, thigh, thigh + shin, thigh + 2 * shin])
     shank = _limb(a, a.joints[10], a.leg_frame, at, extents, (0.02 * g, 0.012 * g))
     knee, ankle, f = a.joints[11], a.joints[12], a.leg_frame
-    bumps = [Bump(knee + f.T @ np.array([0.0, 0.052, -0.012]) * g, 0.007 * g, np.array([0.019, 0.03, 0.024]) * g,
-                  f),
-             Bump(knee + f.T @ np.array([0.0, 0.045, 0.055]) * g, 0.004 * g, np.array([0.014, 0.03, 0.016]) * g,
-                  f),
-             Bump(ankle + f.T @ np.array([0.036, -0.006, -0.002]) * g, 0.007 * g,
-                  np.array([0.012, 0.010, 0.012]) * g, f),
-             Bump(ankle + f.T @ np.array([-0.034, 0.004, -0.010]) * g, 0.007 * g,
-                  np.array([0.012, 0.011, 0.012]) * g, f),
-             Bump(knee + f.T @ np.array([0.030, -0.05, 0.0]) * g, 0.003 * g, np.array([0.008, 0.02, 0.04]) * g, f),
-             Bump(knee + f.T @ np.array([-0.030, -0.05, 0.0]) * g, 0.003 * g, np.array([0.008, 0.02, 0.04]) * g,
-                  f),
-             Bump(ankle + f.T @ np.array([0.022, -0.035, -0.035]) * g, -0.005 * g,
-                  np.array([0.012, 0.014, 0.05]) * g, f),
-             Bump(ankle + f.T @ np.array([-0.022, -0.035, -0.035]) * g, -0.005 * g,
-                  np.array([0.012, 0.014, 0.05]) * g, f)]
+    bumps = _bumps(knee, f, g, [((0.0, 0.052, -0.012), 0.007, (0.019, 0.03, 0.024)),
+                                ((0.0, 0.045, 0.055), 0.004, (0.014, 0.03, 0.016)),
+                                ((0.030, -0.05, 0.0), 0.003, (0.008, 0.02, 0.04)),
+                                ((-0.030, -0.05, 0.0), 0.003, (0.008, 0.02, 0.04))])
+    bumps += _bumps(ankle, f, g, [((0.036, -0.006, -0.002), 0.007, (0.012, 0.010, 0.012)),
+                                  ((-0.034, 0.004, -0.010), 0.007, (0.012, 0.011, 0.012)),
+                                  ((0.022, -0.035, -0.035), -0.005, (0.012, 0.014, 0.05)),
+                                  ((-0.022, -0.035, -0.035), -0.005, (0.012, 0.014, 0.05))])
     return Group([(shank, 0), (foot(a), 0.022 * g)], bumps,
                  (a.joints[10] + [0, 0, 0.05], np.array([ankle[0], ankle[1] - 0.05, 0.02]), 0.29 * g))
 
@@ -171,12 +174,9 @@ def arm(a: Anatomy) -> Field:
     second = _limb(a, a.joints[5], a.forearm_frame, fore[:, 0] * a.width["forearm"], extents * thin,
                    (0.02 * g, 0.006 * g))
     elbow, wrist, f = a.joints[5], a.joints[6], a.forearm_frame
-    bumps = [Bump(elbow + f.T @ np.array([0.0, -0.037, -0.004]) * g, 0.006 * g, np.array([0.012, 0.02, 0.016]) * g,
-                  f),
-             Bump(elbow + f.T @ np.array([-0.034, -0.006, -0.010]) * g, 0.004 * g,
-                  np.array([0.015, 0.011, 0.014]) * g, f),
-             Bump(wrist + f.T @ np.array([0.018, -0.018, -0.015]) * g, 0.004 * g,
-                  np.array([0.01, 0.009, 0.010]) * g, f)]
+    bumps = _bumps(elbow, f, g, [((0.0, -0.037, -0.004), 0.006, (0.012, 0.02, 0.016)),
+                                 ((-0.034, -0.006, -0.010), 0.004, (0.015, 0.011, 0.014))])
+    bumps += _bumps(wrist, f, g, [((0.018, -0.018, -0.015), 0.004, (0.01, 0.009, 0.010))])
     return Group([(first, 0), (second, 0.018 * g)], bumps, (a.joints[4], wrist, 0.20 * g))
 
 
@@ -285,33 +285,25 @@ def head(a: Anatomy) -> Field:
                   (ear, 0.006 * h), (bun, 0.007 * h)], _feature_bumps(a), bounds=(a.eye, a.eye + 1e-3, 0.19 * h))
 
 
-Triple = tuple[float, float, float]
-
-
-def _on_head(a: Anatomy, rises: list[tuple[Triple, float, Triple]]) -> list[Bump]:
-    """Bumps from places against the eyes, heights and widths of a head of average size."""
-    h = a.head_scale
-    return [Bump(a.eye + np.array([side, -front, up]) * h, height * h, np.array(widths) * h)
-            for (side, front, up), height, widths in rises]
-
-
 def _face_bumps(a: Anatomy) -> list[Bump]:
     man = a.man
-    return _on_head(a, [((0.031, 0.085, 0.003), -0.0088, (0.0150, 0.03, 0.0105)),
-                        ((0.014, 0.088, 0.001), -0.0035, (0.007, 0.02, 0.010)),
-                        ((0.030, 0.088, 0.019), 0.0025 + 0.0025 * man, (0.018, 0.03, 0.0065)),
-                        ((0, 0.09, 0.020), 0.001 + 0.0012 * man, (0.012, 0.03, 0.008)),
-                        ((0.047, 0.066, -0.022), 0.0055, (0.015, 0.02, 0.011)),
-                        ((0.046, 0.060, -0.056), -0.004 + 0.003 * a.fat, (0.014, 0.025, 0.016)),
-                        ((0.050, 0.015, -0.066), 0.005 * man, (0.014, 0.018, 0.014)),
-                        ((0.070, 0.045, 0.020), -0.003, (0.02, 0.018, 0.018)),
-                        ((0, 0.088, -0.0955), 0.0065 + 0.001 * man, (0.015, 0.03, 0.0105)),
-                        ((0, 0.088, -0.0790), -0.004, (0.016, 0.03, 0.0055))])
+    return _bumps(a.eye, UPRIGHT, a.head_scale, [
+        ((0.031, 0.085, 0.003), -0.0088, (0.0150, 0.03, 0.0105)),
+        ((0.014, 0.088, 0.001), -0.0035, (0.007, 0.02, 0.010)),
+        ((0.030, 0.088, 0.019), 0.0025 + 0.0025 * man, (0.018, 0.03, 0.0065)),
+        ((0, 0.09, 0.020), 0.001 + 0.0012 * man, (0.012, 0.03, 0.008)),
+        ((0.047, 0.066, -0.022), 0.0055, (0.015, 0.02, 0.011)),
+        ((0.046, 0.060, -0.056), -0.004 + 0.003 * a.fat, (0.014, 0.025, 0.016)),
+        ((0.050, 0.015, -0.066), 0.005 * man, (0.014, 0.018, 0.014)),
+        ((0.070, 0.045, 0.020), -0.003, (0.02, 0.018, 0.018)),
+        ((0, 0.088, -0.0955), 0.0065 + 0.001 * man, (0.015, 0.03, 0.0105)),
+        ((0, 0.088, -0.0790), -0.004, (0.016, 0.03, 0.0055))])
 
 
 def _feature_bumps(a: Anatomy) -> list[Bump]:
-    return _on_head(a, [((0, 0.092, -0.0565), 0.0044, (0.017, 0.03, 0.0046)),
-                        ((0, 0.092, -0.0685), 0.0058, (0.0145, 0.03, 0.0046)),
-                        ((0, 0.092, -0.0622), -0.0030, (0.021, 0.03, 0.0020)),
-                        ((0.090, -0.004, -0.010), -0.005, (0.010, 0.008, 0.014)),
-                        ((0.0115, 0.100, -0.0475), -0.003, (0.004, 0.008, 0.003))])
+    return _bumps(a.eye, UPRIGHT, a.head_scale, [
+        ((0, 0.092, -0.0565), 0.0044, (0.017, 0.03, 0.0046)),
+        ((0, 0.092, -0.0685), 0.0058, (0.0145, 0.03, 0.0046)),
+        ((0, 0.092, -0.0622), -0.0030, (0.021, 0.03, 0.0020)),
+        ((0.090, -0.004, -0.010), -0.005, (0.010, 0.008, 0.014)),
+        ((0.0115, 0.100, -0.0475), -0.003, (0.004, 0.008, 0.003))])

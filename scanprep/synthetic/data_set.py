@@ -59,8 +59,7 @@ def stand(person: Person, pose: np.ndarray) -> GroundTruth:
     """A person in a pose with the lowest point on the floor, z = 0."""
     vertices = person.posed(pose)
     trans = np.array([0.0, 0.0, -vertices[:, 2].min()])
-    return GroundTruth(person.shape, np.asarray(pose, dtype=np.float64), trans, vertices + trans,
-                       person.mesh.faces,
+    return GroundTruth(person.shape, np.asarray(pose, dtype=np.float64), trans, vertices + trans, person.mesh.faces,
                        person.part_of_face, person.posed_joints(pose, trans))
 
 

@@ -15,7 +15,7 @@ from ..skeleton.tree import Skeleton
 from .anatomy import PARENTS, PARTS, BodyShape
 from .landmarks import landmarks, markers
 from .poses import NAMED_POSES, compose, mirrored_pose, named_pose, random_pose, walk
-from .posing import Poser, part_of_vertex
+from .posing import Poser
 from .topology import carry, load
 
 __all__ = ["NAMED_POSES", "PARENTS", "PARTS", "BodyShape", "Person", "compose", "mirrored_pose", "named_pose",
@@ -25,20 +25,8 @@ __all__ = ["NAMED_POSES", "PARENTS", "PARTS", "BodyShape", "Person", "compose", 
 class Person:
     """One person: the surface at rest, the skeleton, and the surface in any pose.
 
-    Parameters
-    ----------
-    shape : BodyShape
-
-    Attributes
-    ----------
-    mesh : Mesh
-        At rest.
-    part_of_face : (F,) int
-    part_of_vertex : (N,) int
-    parents : (16,) int
-    joints : (16, 3) float, metres
-        Where every part turns in its parent, at rest; `joints[0]` is the centroid of the vertices of part 0.
-    names : the 16 names of the parts
+    `mesh` is at rest, with `part_of_face` (F,) and `part_of_vertex` (N,); every part turns in its parent at the
+    `joints` (16, 3), metres, of which the first is the centroid of the vertices of part 0.
     """
 
     parents = PARENTS
@@ -50,7 +38,7 @@ class Person:
         vertices, self.anatomy = carry(self.shape)
         self.mesh = Mesh(vertices, template.mesh.faces)
         self.part_of_face = template.part_of_face
-        self.part_of_vertex = part_of_vertex()
+        self.part_of_vertex = template.part_of_vertex
         self.joints = self.anatomy.joints.copy()
         self.joints[0] = self.mesh.vertices[self.part_of_vertex == 0].mean(axis=0)
 

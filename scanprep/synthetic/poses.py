@@ -19,10 +19,6 @@ def average() -> Anatomy:
     return Anatomy(BodyShape())
 
 
-def _rotvec(degrees_about: tuple[float, float, float]) -> np.ndarray:
-    return np.radians(np.array(degrees_about))
-
-
 def _towards(axis: np.ndarray, direction: np.ndarray, twist: float) -> np.ndarray:
     """The rotation vector that turns `axis` about itself by `twist` and then to `direction` the shortest way."""
     direction = direction / np.linalg.norm(direction)
@@ -32,8 +28,7 @@ def _towards(axis: np.ndarray, direction: np.ndarray, twist: float) -> np.ndarra
     return (Rotation.from_rotvec(swing) * Rotation.from_rotvec(twist * axis)).as_rotvec()
 
 
-def arm(direction: tuple[float, float, float], elbow: float = 0, twist: float = 0, turn: float = 0,
-        wrist: float = 0,
+def arm(direction: tuple[float, float, float], elbow: float = 0, twist: float = 0, turn: float = 0, wrist: float = 0,
         side: int = 1) -> np.ndarray:
     """Rotation vectors (3, 3) of upper arm, forearm and hand, left (side 1) or right (-1).
 
@@ -84,7 +79,7 @@ def compose(left_arm: dict | None = None, right_arm: dict | None = None, left_le
     """A pose (16, 3) from anatomical angles; what is not given stays at rest."""
     down_arm, down_leg = (0.59, 0.0, -0.81), (0.078, 0.0, -1.0)
     pose = np.zeros((16, 3))
-    pose[0] = _rotvec(root)
+    pose[0] = np.radians(root)
     pose[1:3] = spine(**(back or {}))
     pose[3] = head(**(neck or {}))
     pose[4:7] = arm(**{"direction": down_arm, **(left_arm or {})})

@@ -28,7 +28,7 @@ class Poser:
         self.axes = self.axes / np.linalg.norm(self.axes, axis=1, keepdims=True)
         smooth = _smoothed(vertices)
         self._coordinates = np.einsum("nij,ni->nj", _detail_frames(smooth, template.mesh.faces), vertices - smooth)
-        self._root_vertices = np.flatnonzero(part_of_vertex() == 0)
+        self._root_vertices = np.flatnonzero(template.part_of_vertex == 0)
 
     def part_motion(self, pose: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """World rotations (16, 3, 3) of the parts and the places (16, 3) of their joints."""
@@ -92,16 +92,6 @@ class Poser:
                 x = x.copy()
                 x[near] = base + turn.apply(x[near] - base)
         return x
-
-
-@lru_cache(maxsize=1)
-def part_of_vertex() -> np.ndarray:
-    """(N,) the part of most triangles around each vertex."""
-    template = load()
-    votes = np.zeros((len(template.mesh.vertices), 16), dtype=np.int64)
-    for corner in range(3):
-        np.add.at(votes, (template.mesh.faces[:, corner], template.part_of_face), 1)
-    return votes.argmax(axis=1)
 
 
 @lru_cache(maxsize=1)

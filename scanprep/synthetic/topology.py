@@ -2,7 +2,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from functools import lru_cache
+from functools import cached_property, lru_cache
 from pathlib import Path
 
 import numpy as np
@@ -11,6 +11,7 @@ from scipy.sparse import csr_array, diags_array
 from ..geometry import storage
 from ..geometry.mesh import Mesh
 from ..geometry.sparse import factor
+from ..skeleton.tree import Skeleton
 from .anatomy import PARENTS, Anatomy, BodyShape
 from .body_parts import body_surface
 from .implicit_surface import Field, project, value_and_gradient
@@ -28,6 +29,11 @@ class Template:
     mirror: np.ndarray  # (N,) int: the vertex at the mirrored place
     part_of_face: np.ndarray  # (F,) int
     anatomy: Anatomy  # anatomy of the canonical body
+
+    @cached_property
+    def part_of_vertex(self) -> np.ndarray:
+        """(N,) the part of most triangles around each vertex."""
+        return Skeleton(self.part_of_face, PARENTS, self.anatomy.joints).part_of_vertex(self.mesh)
 
 
 @lru_cache(maxsize=1)

@@ -25,7 +25,7 @@ from protocols import data_folder, load_real, machine, write_report
 from scanned_shapes import distortion
 from scipy.sparse import csc_array, diags_array, eye_array
 
-from model.statue.control.humanoid import humanoid
+from model.statue.control.files import humanoid
 from model.statue.registration.local_shape import LocalShape, local_shape
 from model.statue.registration.surface_fit import SurfaceFitConfig, fit_surface
 from scanprep.alignment.icp import align_landmarks, apply
@@ -33,8 +33,7 @@ from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.sparse import Factored, conjugate_gradients
 from scanprep.geometry.surface import Surface
 from scanprep.geometry.target import target_of
-from scanprep.registration.final_fit import final_fit
-from scanprep.registration.inverted_triangles import inverted_triangles, unfold
+from scanprep.registration.final_fit import final_fit, inverted_triangles, unfold
 from scanprep.registration.nonrigid import register
 from scanprep.registration.schedule import RegistrationConfig
 

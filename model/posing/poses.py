@@ -1,0 +1,234 @@
+"""Poses by hand: from joint angles, by rotating a joint, and mirrored, left for right."""
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from itertools import combinations
+from typing import Any, Literal
+
+import numpy as np
+from scipy.optimize import linear_sum_assignment
+
+from scanprep.geometry import rotations
+from scanprep.geometry.mesh import Mesh
+from scanprep.skeleton.symmetry import MirrorPlane
+from scanprep.skeleton.tree import Skeleton
+
+Frame = Literal["parent", "world", "own"]
+
+_AXES = {"x": (1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "z": (0.0, 0.0, 1.0)}
+
+
+def pose_from_angles(skeleton: Skeleton, angles: Mapping[str | int, Any]) -> np.ndarray:
+    """A pose in which some parts are turned against their parents and all others are at rest.
+
+    Parameters
+    ----------
+    skeleton : Skeleton
+    angles : {part: turn}
+        Parts by name or number. A turn is an axis-angle vector (3,) in radians, or an axis and degrees: `("x", 30)`,
+        `((0, 1, 1), -45)`. Axes are those of the template.
+
+    Returns
+    -------
+    (J, 3) float, radians
+
+    Raises
+    ------
+    ValueError
+        A part that is not known or given twice, a turn that is neither.
+    """
+    pose = np.zeros((len(skeleton.parents), 3))
+    seen: set[int] = set()
+    for part, angle in angles.items():
+        j = part_number(skeleton, part)
+        if j in seen:
+            raise ValueError(f"angles: part '{skeleton.names[j]}' is given twice")
+        seen.add(j)
+        pose[j] = rotation_vector(angle, f"angles['{part}']")
+    return pose
+
+
+def rotate_joint(skeleton: Skeleton, pose: np.ndarray, part: str | int, rotation: Any, frame: Frame = "parent"
+                 ) -> np.ndarray:
+    """Rotate one part, and what hangs below it, further from where it is.
+
+    Parameters
+    ----------
+    skeleton : Skeleton
+    pose : (..., J, 3) float, radians
+    part : str or int
+    rotation
+        As in `pose_from_angles`: axis-angle vector, or axis and degrees.
+    frame : str
+        Whose axes these are: of the part's "parent" (of the world for the root), of the "world", or of the part's
+        "own" present frame.
+
+    Returns
+    -------
+    (..., J, 3) float, radians
+
+    Raises
+    ------
+    ValueError
+        A part or frame that is not known, a rotation that is neither.
+    """
+    pose = np.array(pose, dtype=np.float64)
+    j = part_number(skeleton, part)
+    if pose.shape[-2:] != (len(skeleton.parents), 3):
+        raise ValueError(f"pose: expected shape (..., {len(skeleton.parents)}, 3), got {pose.shape}")
+    more, now = rotations.exp(rotation_vector(rotation, "rotation")), rotations.exp(pose[..., j, :])
+    if frame == "own":
+        turned = now @ more
+    elif frame == "parent" or (frame == "world" and j == 0):
+        turned = more @ now
+    elif frame == "world":
+        above = skeleton.part_rotations(pose)[..., skeleton.parents[j], :, :]
+        turned = np.swapaxes(above, -1, -2) @ more @ above @ now
+    else:
+        raise ValueError(f"frame: expected 'parent', 'world' or 'own', got {frame!r}")
+    pose[..., j, :] = rotations.log(turned)
+    return pose
+
+
+def part_number(skeleton: Skeleton, part: str | int) -> int:
+    """The number of a part given by name or number, or ValueError."""
+    if isinstance(part, str):
+        if part not in skeleton.names:
+            raise ValueError(f"part: no '{part}'; the skeleton has {', '.join(skeleton.names)}")
+        return skeleton.names.index(part)
+    if not 0 <= part < len(skeleton.parents):
+        raise ValueError(f"part: expected 0..{len(skeleton.parents) - 1}, got {part}")
+    return int(part)
+
+
+def rotation_vector(given: Any, name: str) -> np.ndarray:
+    """The axis-angle vector (3,), radians, of a vector or of an axis with degrees."""
+    if isinstance(given, tuple | list) and len(given) == 2:
+        axis, degrees = given
+        if isinstance(axis, str) and axis not in _AXES:
+            raise ValueError(f"{name}: expected an axis x, y or z, got '{axis}'")
+        along = _finite(_AXES[axis] if isinstance(axis, str) else axis, name)
+        length = float(np.linalg.norm(along))
+        if not length:
+            raise ValueError(f"{name}: the axis has no direction")
+        return np.radians(float(degrees)) * along / length
+    return _finite(given, name)
+
+
+def _finite(given: Any, name: str) -> np.ndarray:
+    try:
+        vector = np.array(given, dtype=np.float64)
+    except (TypeError, ValueError):
+        vector = np.zeros(0)
+    if vector.shape != (3,) or not np.isfinite(vector).all():
+        raise ValueError(f"{name}: expected an axis-angle vector of 3 numbers, or an axis and degrees, got {given!r}")
+    return vector
+
+
+
+
+@dataclass(frozen=True, eq=False)
+class Mirror(MirrorPlane):
+    """The plane of a body's symmetry and which parts it exchanges."""
+
+    partners: np.ndarray             # (J,) the part on the other side; a part in the middle is its own
+    distance: float                  # metres, RMS of mirrored joints and centroids from those of the partners
+
+    def trans(self, skeleton: Skeleton, trans: np.ndarray) -> np.ndarray:
+        """The places (..., 3) of mirrored bodies, metres."""
+        return self.reflect(skeleton.joints[0] + trans) - skeleton.joints[0]
+
+
+def mirror_pose(mirror: Mirror, pose: np.ndarray) -> np.ndarray:
+    """Mirrored poses: every part does what its partner did, seen in the mirror.
+
+    The rotation becomes `M R M`, its axis-angle vector `-M pose`; twice is the identity.
+
+    Parameters
+    ----------
+    mirror : Mirror
+        Of `find_mirror`.
+    pose : (..., J, 3) float, radians
+
+    Returns
+    -------
+    (..., J, 3) float, radians
+    """
+    pose = np.asarray(pose, dtype=np.float64)
+    if pose.shape[-2:] != (len(mirror.partners), 3):
+        raise ValueError(f"pose: expected shape (..., {len(mirror.partners)}, 3), got {pose.shape}")
+    return -pose[..., mirror.partners, :] @ mirror.matrix
+
+
+def find_mirror(template: Mesh, skeleton: Skeleton) -> Mirror:
+    """The plane in which a template and its skeleton are most nearly their own mirror image.
+
+    Planes halfway between two parts are tried, and those through the body's main axes; under each, parts are paired
+    where they come nearest, and the plane is fitted to the pairs. Only a body without any pair is mirrored with every
+    part staying its own partner.
+
+    Raises
+    ------
+    ValueError
+        The skeleton is not symmetric: no pairing, or none whose parts lie near each other.
+    """
+    marks = _marks(template, skeleton)
+    size = float(np.linalg.norm(np.ptp(template.vertices, axis=0)))
+    tried = (_fitted(skeleton, marks, plane) for plane in _candidates(template, marks))
+    found = [mirror for mirror in tried if mirror is not None]
+    if not found:
+        raise ValueError("skeleton: it is not symmetric, no mirror image of its tree is the tree itself")
+    each = np.arange(len(skeleton.parents))
+    exchanging = [m for m in found if (m.partners != each).any()]
+    best = min(exchanging or found, key=lambda m: m.distance)
+    # where no parts are exchanged they may lie less far apart: a man is nearly flat, but not his own front to back
+    if best.distance > (0.08 if exchanging else 0.015) * size:
+        image = np.linalg.norm(best.reflect(marks) - marks[:, best.partners], axis=-1).max(axis=0)
+        worst = int(image.argmax())
+        how = "in the best mirror" if exchanging else "no two parts can be exchanged, and in the best mirror"
+        raise ValueError(f"skeleton: it is not symmetric; {how}, part '{skeleton.names[worst]}' comes to lie "
+                         f"{image[worst]:.3g} m from part '{skeleton.names[best.partners[worst]]}'")
+    return best
+
+
+def _marks(template: Mesh, skeleton: Skeleton) -> np.ndarray:
+    """(2, J, 3) what is mirrored: joints and centroids of the parts, metres."""
+    J, part = len(skeleton.parents), skeleton.part_of_face
+    area = np.bincount(part, template.face_areas, J)
+    middle = template.corners.mean(axis=1) * template.face_areas[:, None]
+    centroids = np.stack([np.bincount(part, middle[:, i], J) for i in range(3)], axis=1) / area[:, None]
+    return np.stack([skeleton.joints, centroids])
+
+
+def _candidates(template: Mesh, marks: np.ndarray) -> list[MirrorPlane]:
+    """Planes to start from: halfway between two parts, and through the body's main axes."""
+    middle = marks[1]
+    planes = [MirrorPlane(apart / np.linalg.norm(apart), (one + other) / 2)
+              for one, other in combinations(middle, 2) if np.linalg.norm(apart := one - other) > 0]
+    centre, axes = template.vertices.mean(axis=0), np.linalg.eigh(np.cov(template.vertices.T))[1]
+    return planes + [MirrorPlane(axis, centre) for axis in axes.T]
+
+
+def _fitted(skeleton: Skeleton, marks: np.ndarray, plane: MirrorPlane) -> Mirror | None:
+    """The mirror near a plane, parts paired and plane fitted in turn; None where parts cannot be paired."""
+    partners = np.full(len(skeleton.parents), -1)
+    for _ in range(10):
+        before = partners
+        paired = _paired(skeleton, plane.reflect(marks), marks)
+        if paired is None:
+            return None
+        partners = paired
+        if (partners == before).all():
+            break
+        plane = MirrorPlane.between(marks.reshape(-1, 3), marks[:, partners].reshape(-1, 3))
+    off = plane.reflect(marks) - marks[:, partners]
+    return Mirror(plane.normal, plane.point, partners, float(np.sqrt((off**2).sum(axis=-1).mean())))
+
+
+def _paired(skeleton: Skeleton, image: np.ndarray, marks: np.ndarray) -> np.ndarray | None:
+    """The partner of every part, paired where they come nearest; None where that breaks the tree."""
+    cost = ((image[:, :, None] - marks[:, None]) ** 2).sum(axis=(0, -1))
+    partners, parents = linear_sum_assignment(cost)[1], skeleton.parents
+    whole = (partners[partners] == np.arange(len(partners))).all() and partners[0] == 0
+    return partners if whole and (parents[partners[1:]] == partners[parents[1:]]).all() else None
