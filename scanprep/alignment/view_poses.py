@@ -82,10 +82,9 @@ def _means(T: np.ndarray, points: np.ndarray) -> np.ndarray:
 def place_by_features(views: list[tuple[Mesh, np.ndarray]], rng: np.random.Generator) -> np.ndarray:
     """Motions (V, 4, 4) of views that bring alike shapes together where no view then looks through another.
 
-    Histograms of the angles between normals around points are compared between all pairs of views, three matches
-    at a time propose a motion, and motions are judged by how much surface agrees and how much one view looks
-    through the other. The best pairs are chained from the first view, which stays. The proposal may be wrong where
-    views overlap little: see `AlignedViews.trusted`.
+    Histograms of the angles between normals around points are compared between all pairs of views, three matches at a
+    time propose a motion, and motions are judged by how much surface agrees and how much one view looks through the
+    other. The best pairs are chained from the first view. It may be wrong where views overlap little: see `trusted`.
     """
     extent = float(max(np.ptp(mesh.vertices, axis=0).max() for mesh, _ in views))
     described = [_described(mesh, extent) for mesh, _ in views]

@@ -43,8 +43,7 @@ class Plane:
 def find_plane(points: np.ndarray, min_area: float, rng: np.random.Generator) -> Plane | None:
     """The largest plane that has nearly all points (n, 3) on it or on one side of it; None below `min_area` m².
 
-    Guesses go through single points along the normal of their neighbourhood, and the best is fitted to closer and
-    closer points.
+    Guesses go through single points along the normal of their neighbourhood; the best is fitted to ever closer points.
     """
     few = points[rng.permutation(len(points))[:10_000]]
     tree = cKDTree(few)
