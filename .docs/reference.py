@@ -23,7 +23,7 @@ os.environ["COLUMNS"] = "110"
 
 def commands(prog: str, listed: dict[str, tuple[str, str]]) -> Iterator[str]:
     """Every command below a group with its help."""
-    from scanprep import console
+    from scanprep import command_line
 
     for name, (_, target) in listed.items():
         module, function = target.split(":")
@@ -31,18 +31,18 @@ def commands(prog: str, listed: dict[str, tuple[str, str]]) -> Iterator[str]:
         if function == "group":
             yield from commands(f"{prog} {name}", found.COMMANDS)
             continue
-        told = said(console, getattr(found, function), f"{prog} {name}", "--help")
+        told = said(command_line, getattr(found, function), f"{prog} {name}", "--help")
         yield f"## {prog} {name}\n\n```text\n{told}\n```\n"
         if "--write-config" in told:
-            settings = said(console, getattr(found, function), f"{prog} {name}", "--write-config")
+            settings = said(command_line, getattr(found, function), f"{prog} {name}", "--write-config")
             yield f"Settings for `--config`:\n\n```toml\n{settings}\n```\n"
 
 
-def said(console: Any, function: Any, prog: str, flag: str) -> str:
+def said(command_line: Any, function: Any, prog: str, flag: str) -> str:
     """What a command prints when it is asked for help or settings."""
     shown = io.StringIO()
     with contextlib.redirect_stdout(shown), contextlib.suppress(SystemExit):
-        console.run(function, prog, [flag])
+        command_line.run(function, prog, [flag])
     return re.sub(r"\x1b\[[0-9;]*m", "", shown.getvalue()).strip()
 
 

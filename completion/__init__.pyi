@@ -1,6 +1,6 @@
 # The public names; loaded when they are first used, so that the command line answers at once.
 from .mocap.artefacts.find import find_artefacts as find_artefacts
-from .mocap.artefacts.virtual import write_virtual as write_virtual
+from .mocap.artefacts.results import write_virtual as write_virtual
 from .mocap.files.markers import (
     MarkerSequence as MarkerSequence,
 )
@@ -23,11 +23,11 @@ from .mocap.marker_sets.symmetry import SkinMirror as SkinMirror
 from .mocap.marker_sets.symmetry import find_skin_mirror as find_skin_mirror
 from .mocap.marker_sets.transfer import TransferredLayout as TransferredLayout
 from .mocap.marker_sets.transfer import transfer_layout as transfer_layout
-from .mocap.mosh.by_sex import SexedMosh as SexedMosh
-from .mocap.mosh.by_sex import mosh_by_sex as mosh_by_sex
 from .mocap.mosh.mosh import MoshConfig as MoshConfig
 from .mocap.mosh.mosh import MoshResult as MoshResult
+from .mocap.mosh.mosh import SexedMosh as SexedMosh
 from .mocap.mosh.mosh import mosh as mosh
+from .mocap.mosh.mosh import mosh_by_sex as mosh_by_sex
 from .mocap.pose.follow import animate as animate
 from .mocap.pose.settings import AnimateConfig as AnimateConfig
 from .mocap.pose.stream import Frame as Frame

@@ -3,7 +3,7 @@ from __future__ import annotations
 
 import sys
 
-from scanprep.console import dispatch
+from scanprep.command_line import dispatch
 
 COMMANDS = {
     "demo": ("The whole chain on synthetic scans; ends with a page to open.", "completion.demo.cli:demo"),

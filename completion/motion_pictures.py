@@ -1,6 +1,7 @@
 """Pictures and charts of a body in motion."""
 from __future__ import annotations
 
+import warnings
 from collections.abc import Sequence
 from typing import Any
 
@@ -91,8 +92,7 @@ def moving_picture(bodies: np.ndarray, subject: Subject, rate: float, width: int
                    faces: np.ndarray | None = None, pose: np.ndarray | None = None) -> bytes:
     """Meshes (n, N, 3) as an endless GIF of `rate` pictures a second, the camera following them over the ground.
 
-    `faces` are theirs, where they are not the subject's; a body in `pose` (J, 3) is seen from its front, else as at
-    rest.
+    `faces` are theirs, if not the subject's; a body in `pose` (J, 3) is seen from its front, else as at rest.
     """
     centred = bodies - bodies.mean(axis=1, keepdims=True)
     up, _ = upright(subject.template)
@@ -103,8 +103,34 @@ def moving_picture(bodies: np.ndarray, subject: Subject, rate: float, width: int
     return gif_bytes([render(Mesh(v, faces), camera, width, height, ground=True) for v in centred], rate)
 
 
-def chart_residuals(motion: Motion) -> Any:
-    """A matplotlib figure: the distance of the markers to where the body puts them, over time."""
+def mean_over(values: np.ndarray, axis: int) -> np.ndarray:
+    """The mean of what is not NaN, NaN where there is nothing."""
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore", RuntimeWarning)
+        return np.nanmean(values, axis=axis)
+
+
+def marker_rows(labels: Sequence[str], residuals: np.ndarray, soft: np.ndarray | None, trusted: np.ndarray | None
+                ) -> list[tuple[Any, ...]]:
+    """A table of markers, the worst first: label, mean distances (mm), 95th percentile, seen and believed (%).
+
+    Distances (T, L) are of the fixed shape and, if there is one, of the changing one, which then is that of the
+    percentile. Markers that were never seen are left out, unless nothing is told of trust in them.
+    """
+    out = []
+    for i, label in enumerate(labels):
+        seen = np.isfinite(residuals[:, i])
+        if seen.any() or trusted is None:
+            shown = 1000 * (residuals if soft is None else soft)[seen, i]
+            out.append((label, 1000 * float(mean_over(residuals[:, i], 0)),
+                        np.nan if soft is None else 1000 * float(mean_over(soft[:, i], 0)),
+                        float(np.nanpercentile(shown, 95)) if len(shown) else np.nan, 100 * float(seen.mean()),
+                        np.nan if trusted is None else 100 * float(trusted[seen, i].mean())))
+    return sorted(out, key=lambda row: -row[1])
+
+
+def chart_residuals(motion: Motion, what: str = "markers", lost: bool = False) -> Any:
+    """A matplotlib figure: the distance of the markers from the body over time; `lost` frames shaded where wanted."""
     from matplotlib.figure import Figure
 
     figure = Figure(figsize=(7.5, 2.6))
@@ -114,7 +140,10 @@ def chart_residuals(motion: Motion) -> Any:
     axes.fill_between(motion.times[shown], *np.nanpercentile(millimetres, [10, 90], axis=1), alpha=0.25,
                       label="10th to 90th percentile", linewidth=0)
     axes.plot(motion.times[shown], np.nanmean(millimetres, axis=1), linewidth=1.2, label="mean")
-    axes.set(xlabel="time (s)", ylabel="distance of the markers (mm)", ylim=(0, None))
+    edges = np.flatnonzero(np.diff(np.r_[True, motion.converged, True])) if lost else np.zeros(0, dtype=int)
+    for i, span in enumerate((edges.reshape(-1, 2) - 0.5) / motion.rate):
+        axes.axvspan(*span, color="0.85", label="lost" if i == 0 else None)
+    axes.set(xlabel="time (s)", ylabel=f"distance of the {what} (mm)", ylim=(0, None))
     axes.legend(frameon=False)
     return figure
 

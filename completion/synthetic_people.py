@@ -17,7 +17,7 @@ from model.learning.config import LearnConfig
 from model.learning.scape import learn_scape
 from model.scape import ScapeModel
 from scanprep.batch.digests import Digests
-from scanprep.batch.lock import locked
+from scanprep.batch.opening import locked
 from scanprep.decimation.registered_set import DecimatedSet, decimate_set
 from scanprep.synthetic.data_set import SUBJECT, near_rest, subject_pose
 from scanprep.synthetic.landmarks import landmarks, markers

@@ -8,7 +8,8 @@ import numpy as np
 import tyro
 
 from scanprep.cli import Unit
-from scanprep.console import Metric, Outcome, dispatch
+from scanprep.command_line import dispatch
+from scanprep.console import Metric, Outcome
 from scanprep.dataset import RegisteredSet
 from scanprep.geometry.files import read_registered
 from scanprep.geometry.mesh import Mesh

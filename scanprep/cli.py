@@ -10,7 +10,8 @@ from typing import TYPE_CHECKING, Annotated, Literal
 import numpy as np
 import tyro
 
-from .console import Metric, dispatch
+from .command_line import dispatch
+from .console import Metric
 
 if TYPE_CHECKING:               # imported where they are used: this module must answer --help at once
     from .geometry.mesh import Mesh

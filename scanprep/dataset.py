@@ -1,8 +1,6 @@
 """The registered set: a folder of meshes in one topology, handed over from `scanprep` to `model`."""
 from __future__ import annotations
 
-import csv
-import io
 import re
 from collections.abc import Sequence
 from dataclasses import astuple, dataclass, field, fields
@@ -22,23 +20,13 @@ KIND = "registered set"
 
 @dataclass(frozen=True)
 class SetEntry:
-    """One registered mesh: a row of `set.csv`.
+    """One registered mesh: a row of `set.csv`; empty what is not known."""
 
-    Attributes
-    ----------
-    name : str
-        Its own in the set, and the name of its file.
-    subject, pose, sex : str
-        Whose body, in which pose; empty where not known.
-    file : str
-        Path inside the folder.
-    """
-
-    name: str
+    name: str               # its own in the set, and the name of its file
     subject: str = ""
     pose: str = ""
     sex: str = ""
-    file: str = ""
+    file: str = ""          # path inside the folder
 
 
 _COLUMNS = [f.name for f in fields(SetEntry)]
@@ -73,17 +61,9 @@ class RegisteredSet:
 
     @staticmethod
     def create(folder: str | Path, template: Mesh, info: dict[str, Any] | None = None) -> RegisteredSet:
-        """Begin a set, or go on with the one in the folder.
+        """Begin a set, or go on with the one in the folder; `info`, values of JSON, is kept in `set.json`.
 
-        Parameters
-        ----------
-        info : dict of JSON values, optional
-            Kept in `set.json`.
-
-        Raises
-        ------
-        ValueError
-            The folder holds a set of another template.
+        ValueError where the folder holds a set of another template.
         """
         folder = Path(folder)
         if (folder / "set.json").exists():
@@ -100,10 +80,7 @@ class RegisteredSet:
     def load(folder: str | Path) -> RegisteredSet:
         """Read a set; its meshes stay on disk until they are asked for.
 
-        Raises
-        ------
-        MeshFileError, StorageError
-            No such set, or one that is damaged or of an unknown version: which file, and what is wrong.
+        MeshFileError or StorageError, which names the file, for one that is missing, damaged or of an unknown version.
         """
         folder = Path(folder)
         info = _read_header(folder)
@@ -157,13 +134,7 @@ class RegisteredSet:
         return RegisteredSet(self.folder, self.template, rows, self.skeleton, self.info)
 
     def with_skeleton(self, skeleton: Skeleton) -> RegisteredSet:
-        """Write a skeleton into the set.
-
-        Raises
-        ------
-        ValueError
-            A skeleton of another triangulation.
-        """
+        """Write a skeleton into the set; ValueError for one of another triangulation."""
         if len(skeleton.part_of_face) != len(self.template.faces):
             raise ValueError(f"skeleton: expected {len(self.template.faces)} faces as the template has, "
                              f"got {len(skeleton.part_of_face)}")
@@ -183,12 +154,7 @@ class RegisteredSet:
     def vertices(self, names: Sequence[str] | None = None) -> np.ndarray:
         """Vertices (M, N, 3), metres, of the meshes of these names, or of all.
 
-        Raises
-        ------
-        MeshFileError
-            A mesh that is missing, damaged or of another topology.
-        ValueError
-            A name that is not in the set.
+        MeshFileError for a mesh that is missing, damaged or of another topology, ValueError for an unknown name.
         """
         by_name = {entry.name: entry for entry in self.entries}
         unknown = [name for name in names or () if name not in by_name]
@@ -255,9 +221,4 @@ def _read_rows(folder: Path) -> tuple[SetEntry, ...]:
 
 
 def _write_rows(folder: Path, rows: Sequence[SetEntry]) -> None:
-    text = io.StringIO()
-    table = csv.writer(text, lineterminator="\n")
-    table.writerow(_COLUMNS)
-    table.writerows(astuple(row) for row in rows)
-    with storage.writing(folder / "set.csv") as beside:
-        beside.write_text(text.getvalue(), encoding="utf-8")
+    tables.write_table(folder / "set.csv", _COLUMNS, map(astuple, rows))

@@ -6,7 +6,6 @@ import numpy as np
 from .geometry.mesh import Mesh
 
 HAND = 0.06                 # of a body's size, the root of its area: a hand's width, 8 cm on a man
-SMALL, LARGE = 0.2, 2.5     # extents that a body may have, as multiples of the one that is expected
 
 
 def size(body: Mesh) -> float:
@@ -20,11 +19,11 @@ def extent(points: np.ndarray) -> float:
     return float(np.linalg.norm(np.ptp(found, axis=0))) if len(found) else np.nan
 
 
-def unit_problem(found: float, expected: float, what: str, least: float = SMALL) -> str | None:
-    """What the extents of data and body (metres) say about the unit: None where it may be right.
+def unit_problem(found: float, expected: float, what: str, least: float = 0.2) -> str | None:
+    """Why data `found` metres large, for a body of `expected`, may be in another unit; None where they are not.
 
     `what` is the data as they stand in the sentence; `least` is how small data of a part of a body may be.
     """
-    if not np.isfinite(found) or least <= found / expected <= LARGE:
+    if not np.isfinite(found) or least <= found / expected <= 2.5:
         return None
     return f"{what} {found / expected:.3g} times as large as the body: the wrong unit? (--unit)"

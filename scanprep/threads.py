@@ -25,7 +25,6 @@ from typing import Any
 
 VARIABLES = ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS", "MKL_NUM_THREADS")
 LIBIGL = "IGL_NUM_THREADS"
-MANY = 4000                          # points above which threads save more than they cost in a search
 
 _guard = threading.Lock()
 _before: list[tuple[Any, int]] = []  # libraries, and the threads they had
@@ -68,7 +67,7 @@ def one_thread() -> Iterator[None]:
 
 def search_threads(points: int) -> int:
     """Threads for a search of so many points in a k-d tree; the answer does not depend on them."""
-    if points <= MANY:
+    if points <= 4000:               # threads cost more than they save
         return 1
     return asked() or _cores()
 

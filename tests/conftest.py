@@ -11,7 +11,7 @@ import pytest
 if "PYTEST_XDIST_WORKER" in os.environ:                      # processes do not take each other's cores
     os.environ.setdefault("OMP_NUM_THREADS", "1")
 
-from scanprep.console import run
+from scanprep.command_line import run
 
 
 def pytest_collection_modifyitems(items):

@@ -5,7 +5,7 @@ from unittest import mock
 from model.coregistration import cli
 from model.coregistration.config import CoregistrationConfig, ModelFitConfig
 from model.learning.config import LearnConfig
-from scanprep import console
+from scanprep import command_line
 from scanprep.batch.pool import Workers
 from scanprep.registration.schedule import GraphStage, RegistrationConfig
 
@@ -20,7 +20,7 @@ def run(argv):
     """Exit code of the command."""
     quick = (*cli.coregister_scans.__defaults__[:-1], QUICK)
     with mock.patch.object(cli.coregister_scans, "__defaults__", quick):
-        return console.run(cli.coregister_scans, "scape model coregister", ["--rounds", "1", *argv])
+        return command_line.run(cli.coregister_scans, "scape model coregister", ["--rounds", "1", *argv])
 
 
 if __name__ == "__main__":

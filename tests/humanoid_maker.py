@@ -18,8 +18,7 @@ from scipy.spatial import cKDTree
 
 from model.blend_weights import strongest
 from model.statue.control.chart import make_chart
-from model.statue.control.files import write_control
-from model.statue.control.humanoid import STORED
+from model.statue.control.files import STORED, write_control
 from model.statue.control.model import ControlModel
 from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.surface import Surface

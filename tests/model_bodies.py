@@ -40,9 +40,9 @@ def worm_skeleton(template: Mesh) -> Skeleton:
     return Skeleton(part, [-1, 0, 0, 2], joints)
 
 
-def worm_model(seed: int = 0, components: int = 3, bulge: float = 0.15) -> ScapeModel:
+def worm_model(seed: int = 0, components: int = 3, bulge: float = 0.15, rings: int = 33) -> ScapeModel:
     """A model of the worm whose Q depends smoothly on place and linearly on the twists, with Q = I at rest."""
-    template = worm()
+    template = worm(rings)
     skeleton = worm_skeleton(template)
     rng = np.random.default_rng(seed)
     features = linear_features(skeleton, (np.zeros((3, 0)), np.eye(3), np.eye(3), np.eye(3)[:, :2]))

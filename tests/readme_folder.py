@@ -5,8 +5,6 @@ import shlex
 import shutil
 from pathlib import Path
 
-import numpy as np
-
 from completion import Motion
 from completion.__main__ import main
 from model import load_model
@@ -68,16 +66,4 @@ def user_folder(demo, folder):
         (folder / "registered" / part).mkdir(parents=True)
         for row in names:
             shutil.copy(demo / "set" / "meshes" / f"{row.split(',')[0]}.ply", folder / "registered" / part)
-    return folder
-
-
-def with_results(folder):
-    """What the commands of the README leave behind, for those of the packages."""
-    demo = folder / "scape_demo"
-    shutil.copy(demo / "model.npz", folder / "model.npz")
-    model = load_model(demo / "model.npz")
-    standing = np.zeros((len(model.skeleton.parents), 3))
-    write_mesh(folder / "heavier.ply", model.template.with_vertices(model.vertices(standing, np.array([1.5]))))
-    (folder / "walk").mkdir()
-    shutil.copy(demo / "animation" / "motion.npz", folder / "walk")
     return folder

@@ -9,7 +9,7 @@ from test_completion_partial import MARKS
 from test_completion_tracking import SETTINGS, motion
 
 from completion.tracking import cli
-from scanprep.console import run
+from scanprep.command_line import run
 from scanprep.geometry.files import PointCloud, write_points
 
 FRAMES = 9

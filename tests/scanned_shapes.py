@@ -68,3 +68,42 @@ def distortion(rest: Mesh, x: np.ndarray) -> float:
     s = np.linalg.svd(flat(x[rest.faces]) @ np.linalg.inv(flat(rest.corners)), compute_uv=False)
     stretch = (np.log(np.maximum(s, 1e-6)) ** 2).mean(axis=1)
     return float(np.sqrt(np.average(stretch, weights=rest.face_areas)))
+
+
+def globe(rings, sectors, radius):
+    """A sphere of rings and sectors, and its meridian from pole to pole."""
+    t, a = np.meshgrid(np.pi * np.arange(1, rings) / rings, 2 * np.pi * np.arange(sectors) / sectors, indexing="ij")
+    around = np.stack([np.sin(t) * np.cos(a), np.sin(t) * np.sin(a), np.cos(t)], axis=-1).reshape(-1, 3)
+    number = np.pad(1 + np.arange(len(around)).reshape(t.shape), ((1, 1), (0, 0)))
+    number[-1] = len(around) + 1
+    a, b = (v[:-1].ravel() for v in (number, np.roll(number, -1, axis=1)))
+    c, d = (v[1:].ravel() for v in (number, np.roll(number, -1, axis=1)))
+    faces = np.stack([[a, c, d], [a, d, b]]).transpose(0, 2, 1).reshape(-1, 3)
+    faces = faces[(faces != np.roll(faces, 1, axis=1)).all(axis=1)]            # at the poles every second has no area
+    return Mesh(radius * np.vstack([[0, 0, 1], around, [0, 0, -1]]), faces), number[:, 0]
+
+
+def mushroom(R):
+    """A sphere of radius R, metres, with a round mushroom on it: stem 24 mm, cap 36 mm wide, 20 mm high."""
+    mesh, _ = globe(400, 80, 1.0)
+    t = np.arccos(np.clip(mesh.vertices[:, 2], -1, 1))
+    a = np.arctan2(mesh.vertices[:, 1], mesh.vertices[:, 0])
+    s = t / np.pi                                            # along the profile from the top
+    profile = np.array([(0, .22), (.012, .2195), (.017, .216), (.018, .213), (.017, .210), (.013, .2085), (.012, .206),
+                        (.012, .202), (.014, np.sqrt(R**2 - .014**2))])
+    way = np.r_[0, np.cumsum(np.linalg.norm(np.diff(profile, axis=0), axis=1))]
+    way *= 0.25 / way[-1]
+    r, z = (np.interp(s, way, profile[:, k]) for k in range(2))
+    polar = np.arcsin(.014 / R) + (s - 0.25) / 0.75 * (np.pi - np.arcsin(.014 / R))
+    below = s > 0.25
+    r, z = np.where(below, R * np.sin(polar), r), np.where(below, R * np.cos(polar), z)
+    return Mesh(np.stack([r * np.cos(a), r * np.sin(a), z], axis=1), mesh.faces)
+
+
+BUMPY = 0.2                            # metres, mean radius
+
+
+def bumpy_radius(directions):
+    """Radius of a bumpy sphere in a direction (..., 3), unit."""
+    x, y, z = np.moveaxis(directions, -1, 0)
+    return BUMPY + 0.006 * np.sin(9 * x) * np.cos(7 * y) + 0.004 * np.sin(8 * z + 1)

@@ -53,7 +53,7 @@ def place(tmp_path_factory):
 
 def run(place, *words):
     return main(["animate", *map(str, words), "-m", str(place / "model.npz"), "--layout", str(place / "layout.json"),
-                 "--config", str(place / "config.toml")])
+                 "--config", str(place / "config.toml"), "--workers", "1"])
 
 
 def told(folder):

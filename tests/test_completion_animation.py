@@ -6,10 +6,9 @@ from scipy.linalg import block_diag
 from completion import energy
 from completion.mocap.files.markers import MarkerSequence
 from completion.mocap.marker_sets.layout import MarkerLayout
-from completion.mocap.pose.follow import AnimateConfig, animate
+from completion.mocap.pose.follow import AnimateConfig, animate, smoothed
 from completion.mocap.pose.marked_body import MarkedBody, supports
 from completion.mocap.pose.robust import marker_weights
-from completion.mocap.pose.smooth import inertia, smoothed
 from completion.motion import Motion
 from scanprep.geometry import rotations
 from scanprep.geometry.storage import StorageError
@@ -111,18 +110,17 @@ def body(subject, layout):
 
 def smooth_step(body, x, targets):
     weights, _ = marker_weights(body.positions(x), targets, PLAIN.marker_sd, PLAIN.outlier)
-    return smoothed(body, inertia(PLAIN, 100.0, 15), x, targets, weights)
+    return smoothed(body, PLAIN.inertia(100.0, 15), x, targets, weights)
 
 
 def test_one_smoothing_step_is_the_dense_gauss_newton_step(body, walk):
-    targets, stiffness = walk[1].positions[:5], inertia(PLAIN, 100.0, 15)
+    targets, stiffness = walk[1].positions[:5], PLAIN.inertia(100.0, 15)
     x = np.random.default_rng(0).normal(0, 0.05, (5, 15))            # small angles: rotations add
     weights, _ = marker_weights(body.positions(x), targets, PLAIN.marker_sd, PLAIN.outlier)
     rows, values = [], []
     for t in range(5):
         prior = energy.pose_prior(x[t][None], body.prior, PLAIN.prior_weight)
-        columns = body.shapes.columns(x[t, :-3].reshape(1, 4, 3), x[t, -3:][None])[1][0]              # (12, 3, 30)
-        markers = np.concatenate([columns, np.broadcast_to(np.eye(3)[:, :, None], (3, 3, 30))])
+        markers = body.shapes.columns(x[t, :-3].reshape(1, 4, 3), x[t, -3:][None])[1][0]              # (15, 3, 30)
         root = np.sqrt(weights[t])
         residual = root * (body.positions(x[t]) - targets[t]).T
         for jacobian, value in (((root * markers).reshape(15, -1).T, residual.ravel()),
@@ -143,8 +141,8 @@ def test_one_smoothing_step_is_the_dense_gauss_newton_step(body, walk):
 def test_windows_agree_with_the_whole(body, walk, monkeypatch):
     x = np.random.default_rng(0).normal(0, 0.02, (FRAMES, 15))
     whole = smooth_step(body, x, walk[1].positions)
-    monkeypatch.setattr("completion.mocap.pose.smooth.WINDOW", 20)
-    monkeypatch.setattr("completion.mocap.pose.smooth.OVERLAP", 15)
+    monkeypatch.setattr("completion.smoothing.WINDOW", 20)
+    monkeypatch.setattr("completion.smoothing.OVERLAP", 15)
     assert np.abs(smooth_step(body, x, walk[1].positions) - whole).max() < 0.02 * np.abs(whole - x).max()
 
 

@@ -14,13 +14,12 @@ import pytest
 from completion import Motion
 from completion.demo import chain
 from completion.demo import figures as measuring
-from completion.demo.chain import Demo
+from completion.demo.chain import QUICK, Demo, DemoConfig
 from completion.demo.cli import demo
-from completion.demo.settings import QUICK, DemoConfig
 from model import load_model
 from scanprep import RegisteredSet, console
 from scanprep.batch.opening import workspace
-from scanprep.console import run
+from scanprep.command_line import run
 from scanprep.geometry.mesh import template_problem
 
 pytestmark = pytest.mark.timeout(600)
@@ -189,7 +188,7 @@ def test_what_is_not_ours_stays(tmp_path, capsys):
 
 KILLED = """
 import os, sys
-from completion.demo import chain, settings
+from completion.demo import chain, chain
 from scanprep.batch import pool
 from scanprep.batch.opening import workspace
 from scanprep.console import bar

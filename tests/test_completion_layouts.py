@@ -19,8 +19,20 @@ FILES = sorted(FOLDER.glob("*.json"))
 
 
 @pytest.fixture(scope="module")
-def person():
-    return Person().mesh
+def someone():
+    return Person()
+
+
+@pytest.fixture(scope="module")
+def person(someone):
+    return someone.mesh
+
+
+@pytest.fixture(scope="module")
+def part_names(someone):
+    """The part of every vertex."""
+    skeleton = someone.skeleton
+    return np.array(skeleton.names)[skeleton.part_of_vertex(someone.mesh)]
 
 
 def test_every_set_is_there_for_both_bodies():
@@ -126,10 +138,9 @@ NEIGHBOURS = {"pelvis": ("abdomen", "thigh"), "chest": ("abdomen",)}         # p
 
 
 @pytest.mark.parametrize("name", COUNTS)
-def test_labels_lie_on_the_part_that_the_anatomy_says(name, person):
-    skeleton = Person().skeleton
+def test_labels_lie_on_the_part_that_the_anatomy_says(name, person, part_names):
     layout = named_layout(name, person)
-    parts = [skeleton.names[p] for p in skeleton.part_of_vertex(person)[layout.vertices]]
+    parts = part_names[layout.vertices].tolist()
     told = 0
     for label, part in zip(layout.labels, parts, strict=True):
         for stem, ends in ON.items():

@@ -54,8 +54,6 @@ def agree(found, expected, tolerance=1e-9):
     np.testing.assert_allclose(found.positions, expected.positions, atol=tolerance)
 
 
-# ---- what is written comes back
-
 @pytest.mark.parametrize(("suffix", "tolerance"), [(".csv", 1e-8), (".c3d", 1e-6)])
 @pytest.mark.parametrize("rate", [120.0, 59.94, 1000 / 3, 30.0])
 def test_round_trip(tmp_path, suffix, tolerance, rate):
@@ -77,16 +75,12 @@ def test_round_trip_of_any_csv(tmp_path_factory, frames, markers, seed):
     agree(read_markers(path, rate=50.0), seq, 1e-8)
 
 
-def test_more_than_255_labels_go_on_in_labels2(tmp_path):
-    seq = sequence(np.random.default_rng(1), 3, tuple(f"M{i}" for i in range(600)))
+@pytest.mark.parametrize(("frames", "markers"), [(3, 600), (70_000, 1)])
+def test_more_labels_or_frames_than_the_header_can_count(tmp_path, frames, markers):
+    positions = np.random.default_rng(1).normal(size=(frames, markers, 3))
+    seq = MarkerSequence(positions, tuple(f"M{i}" for i in range(markers)), 1000)
     write_markers(tmp_path / "a.c3d", seq)
     agree(read_markers(tmp_path / "a.c3d"), seq, 1e-6)
-
-
-def test_more_frames_than_the_header_can_count(tmp_path):
-    positions = np.random.default_rng(1).normal(size=(70_000, 1, 3))
-    write_markers(tmp_path / "a.c3d", MarkerSequence(positions, ("A",), 1000))
-    agree(read_markers(tmp_path / "a.c3d"), MarkerSequence(positions, ("A",), 1000), 1e-6)
 
 
 @pytest.mark.parametrize("missing", ["", "NaN", "0.0"])
@@ -95,8 +89,6 @@ def test_trc_in_its_own_unit(tmp_path, missing, unit, factor):
     seq = sequence(np.random.default_rng(2))
     agree(read_markers(trc_file(tmp_path / "a.trc", seq, unit, factor, missing)), seq)
 
-
-# ---- what C3D files hold
 
 @pytest.mark.parametrize(("units", "factor"), [(("mm",), 1e-3), (("M ",), 1), (("cm",), 1e-2), (None, 1e-3),
                                                (("",), 1e-3)])
@@ -145,24 +137,18 @@ def test_c3d_labels_lose_their_subject(tmp_path):
         read_markers(path, subject="Cid")
 
 
-def test_c3d_computed_quantities_are_no_markers(tmp_path):
-    path = c3d_file(tmp_path / "a.c3d", ["C7", "LKneeAngles", "T10", "LKneeMoment"], np.ones((3, 4, 2)),
-                    ANGLES=["LKneeAngles"], MOMENTS=["LKneeMoment"])
-    assert read_markers(path).labels == ("C7", "T10")
+@pytest.mark.parametrize(("labels", "groups", "kept"), [
+    (["C7", "LKneeAngles", "T10", "LKneeMoment"], {"ANGLES": ["LKneeAngles"], "MOMENTS": ["LKneeMoment"]},
+     ("C7", "T10")),                                                 # computed quantities are no markers
+    (["C7", "", "T10"], {}, ("C7", "point1", "T10")), (["C7", "T10", "C7"], {}, None)])
+def test_c3d_labels_of_all_kinds(tmp_path, labels, groups, kept):
+    path = c3d_file(tmp_path / "a.c3d", labels, np.ones((3, len(labels), 2)), **groups)
+    if kept is None:
+        with pytest.raises(MarkerFileError, match=r"a\.c3d: labels: .* C7 comes more often"):
+            read_markers(path)
+    else:
+        assert read_markers(path).labels == kept
 
-
-def test_c3d_a_label_that_comes_twice(tmp_path):
-    path = c3d_file(tmp_path / "a.c3d", ["C7", "T10", "C7"], np.ones((3, 3, 2)))
-    with pytest.raises(MarkerFileError, match=r"a\.c3d: labels: .* C7 comes more often"):
-        read_markers(path)
-
-
-def test_c3d_points_without_a_label_get_a_number(tmp_path):
-    path = c3d_file(tmp_path / "a.c3d", ["C7", "", "T10"], np.ones((3, 3, 2)))
-    assert read_markers(path).labels == ("C7", "point1", "T10")
-
-
-# ---- CSV from elsewhere
 
 def test_csv_with_frames_asks_for_a_rate(tmp_path):
     (tmp_path / "a.csv").write_text("Frame,C7_X,C7_Y,C7_Z\n0,1,2,3\n1,,,\n2,1.5,2,3\n")
@@ -185,8 +171,6 @@ def test_csv_is_plain_enough_for_a_spreadsheet(tmp_path):
     assert rows == [["time", "C7_x", "C7_y", "C7_z", "T10_x", "T10_y", "T10_z"], ["0", "1", "2", "3", "", "", ""]]
 
 
-# ---- bad files
-
 def refused(path, *words):
     with pytest.raises(MarkerFileError) as caught:
         read_markers(path)
@@ -195,17 +179,17 @@ def refused(path, *words):
     assert all(word in message for word in words), message
 
 
+@pytest.mark.parametrize(("data", "word"), [
+    (None, "no such file"), (b"", "empty"), (b"\x89PNG\r\n" + bytes(range(256)) * 8, "expected"),
+    (b"hello\nworld\n" * 100, "expected"), ("folder", "directory")])
 @pytest.mark.parametrize("suffix", [".c3d", ".trc", ".csv"])
-def test_missing_empty_folder_and_foreign_files(tmp_path, suffix):
-    refused(tmp_path / f"none{suffix}", "no such file")
-    (tmp_path / f"empty{suffix}").touch()
-    refused(tmp_path / f"empty{suffix}", "empty")
-    (tmp_path / f"folder{suffix}").mkdir()
-    refused(tmp_path / f"folder{suffix}", "directory")
-    (tmp_path / f"foreign{suffix}").write_bytes(b"\x89PNG\r\n" + bytes(range(256)) * 8)
-    refused(tmp_path / f"foreign{suffix}", "expected")
-    (tmp_path / f"text{suffix}").write_text("hello\nworld\n" * 100)
-    refused(tmp_path / f"text{suffix}", "expected")
+def test_missing_empty_folder_and_foreign_files(tmp_path, suffix, data, word):
+    path = tmp_path / f"a{suffix}"
+    if data == "folder":
+        path.mkdir()
+    elif data is not None:
+        path.write_bytes(data)
+    refused(path, word)
 
 
 def test_a_name_of_no_known_format(tmp_path):
@@ -265,8 +249,6 @@ def test_a_bad_trc_says_where(tmp_path, line, new, words):
     path.write_text("\n".join(lines))
     refused(path, *words)
 
-
-# ---- the sequence itself
 
 def test_select_and_frames():
     seq = sequence(np.random.default_rng(7), 10)

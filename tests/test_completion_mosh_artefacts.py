@@ -7,14 +7,14 @@ import pytest
 from completion_bodies import MEAN, worm_with_prior
 
 from completion.mocap.artefacts.find import ambiguous_swap, find_artefacts
-from completion.mocap.artefacts.results import ArtefactConfig, BadSpan
+from completion.mocap.artefacts.results import ArtefactConfig, BadSpan, list_swaps
 from completion.mocap.artefacts.simulated import Simulation, bridged
 from completion.mocap.artefacts.slips import find_bad, without_lost_limbs
-from completion.mocap.artefacts.swaps import TORN, Tracks, _two_states, find_order, list_swaps
 from completion.mocap.files.markers import MarkerSequence
 from completion.mocap.marker_sets.layout import MarkerLayout
-from completion.mocap.mosh.charts import chart_artefacts
+from completion.mocap.mosh.pictures import chart_artefacts
 from completion.mocap.pose.follow import AnimateConfig, animate
+from completion.mocap.pose.swaps import TORN, Tracks, _two_states, find_order
 from scanprep.geometry import rotations
 
 FRAMES, RATE = 160, 100.0
@@ -311,11 +311,11 @@ def test_what_a_marker_is_off_by_the_account_of_the_others(subject, layout, move
     faulty[:, 7] += [0.004, 0.01, -0.006]
     body = Simulation(subject, MarkerSequence(faulty, LABELS, RATE), layout, AnimateConfig())
     x = body.solve(faulty)
-    off = faulty - body.positions(x)
+    off = faulty - body.body.positions(x)
     alone = body.alone(off, x)[:, 7]
     without = faulty.copy()
     without[:, 7] = np.nan
-    true = faulty[:, 7] - body.positions(body.solve(without))[:, 7]
+    true = faulty[:, 7] - body.body.positions(body.solve(without))[:, 7]
     assert np.linalg.norm(off[:, 7] - true, axis=1).mean() > 0.001
     assert np.linalg.norm(alone - true, axis=1).mean() < 0.4 * np.linalg.norm(off[:, 7] - true, axis=1).mean()
 

@@ -9,10 +9,8 @@ from glb_reader import Glb
 
 from completion import Motion, deformation, motion_pictures, retarget_soft_tissue
 from completion.bodies import at_rest
-from completion.mocap.retargeting.creases import Creases
-from completion.mocap.retargeting.pictures import picture_transfer, write_character
 from completion.mocap.retargeting.retarget import world_up
-from completion.mocap.retargeting.soft_tissue import moving_character
+from completion.mocap.retargeting.soft_tissue import Creases, moving_character, picture_transfer, write_character
 from completion.mocap.soft_tissue.soft_tissue import SoftTissue
 from model.posing.character import CharacterConfig, character_model, inside
 from scanprep.geometry import rotations

@@ -14,7 +14,7 @@ from completion.mocap.mosh.pictures import every
 from completion.mocap.mosh.recordings import Grouping, find_actors
 from completion.mocap.mosh.takes import held_out
 from completion.mocap.soft_tissue.soft_tissue import SoftTissue
-from model.learning.sex_plane import SexPlane
+from model.learning.sexes import SexPlane
 
 PERSON = {"subject.json", "layout.json", "report.html", "report.json", "picture.png"}
 TAKE = {"motion.npz", "soft_tissue.npz", "animation.glb", "motion.bvh", "joint_angles.csv", "joint_centres.csv",

@@ -170,11 +170,10 @@ def test_a_second_run_leaves(copied, capsys):
 
 
 def test_figures_that_mean_nothing_are_a_failure(place, tmp_path, monkeypatch, capsys):
-    from completion.mocap.mosh import work
     from scanprep.console import Metric
 
-    done = work.mosh_person
-    monkeypatch.setattr(work, "mosh_person", lambda *given: (
+    done = QuietWork.__call__
+    monkeypatch.setattr(QuietWork, "__call__", lambda *given: (
         [Metric("problem", "half the body was missed: unit?"), *(found := done(*given))[0]], found[1]))
     assert run(place, place / "people" / "bob", "--subjects", "all", "-o", tmp_path / "out", soft_tissue=False) == 1
     assert "failed: bob: half the body was missed: unit?" in capsys.readouterr().err

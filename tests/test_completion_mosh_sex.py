@@ -6,10 +6,9 @@ import pytest
 from completion_bodies import MEAN, worm_with_prior
 
 from completion import MarkerLayout, MarkerSequence, mosh_by_sex
-from completion.mocap.mosh.by_sex import checked_models
-from completion.mocap.mosh.mosh import MoshConfig
+from completion.mocap.mosh.mosh import MoshConfig, checked_models
 from completion.mocap.subject.person import PersonConfig
-from model.learning.sex_plane import PLANE, learn_sex_plane
+from model.learning.sexes import PLANE, learn_sex_plane
 
 QUICK = MoshConfig(person=PersonConfig(frames=4, annealing=(4.0, 1.0)), soft_tissue=False)
 SIDE = 1.2                           # of the first beta: a woman's is below zero

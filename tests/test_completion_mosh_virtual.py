@@ -4,8 +4,7 @@ import struct
 import numpy as np
 import pytest
 
-from completion.mocap.artefacts.results import BadSpan, MarkerArtefacts, Swap
-from completion.mocap.artefacts.virtual import artefact_table, write_virtual
+from completion.mocap.artefacts.results import BadSpan, MarkerArtefacts, Swap, artefact_table, write_virtual
 from completion.mocap.files.c3d import _Numbers, point_table, replace_points
 from completion.mocap.files.markers import MarkerFileError, MarkerSequence, read_markers
 

@@ -1,3 +1,4 @@
+import copy
 from dataclasses import replace
 
 import numpy as np
@@ -7,13 +8,11 @@ from completion_bodies import MEAN, worm_with_prior
 from completion import energy
 from completion.mocap.files.markers import MarkerSequence
 from completion.mocap.marker_sets.layout import MarkerLayout
-from completion.mocap.pose.follow import AnimateConfig, animate
+from completion.mocap.pose.follow import AnimateConfig, animate, low_pass
 from completion.mocap.pose.foot_contact import Floor, FootContact
 from completion.mocap.pose.marked_body import MarkedBody, PartShapes, supports
-from completion.mocap.pose.prediction import KalmanPrediction
 from completion.mocap.pose.robust import LabelWatch, marker_weights
-from completion.mocap.pose.smooth import inertia, low_pass
-from completion.mocap.pose.stream import MarkerStream
+from completion.mocap.pose.stream import KalmanPrediction, MarkerStream
 from completion.motion import Motion
 from model.features import linear_features
 from model.pose_space import PoseSpace
@@ -60,10 +59,11 @@ def test_part_shapes_are_the_point_operator(subject, layout):
     pose, trans = rng.normal(0, 1, (6, 4, 3)), rng.normal(size=(6, 3))
     pose[0] *= 4                                                     # beyond a half turn
     positions, by_pose = operator.jacobian(pose, trans)
-    y, by_turn = PartShapes(operator).columns(pose, trans)
+    y, columns = PartShapes(operator).columns(pose, trans)
     np.testing.assert_allclose(y.swapaxes(1, 2), positions, atol=1e-12)
     np.testing.assert_allclose(PartShapes(operator).evaluate(pose, trans).swapaxes(1, 2), positions, atol=1e-12)
-    turns = by_turn.reshape(6, 4, 3, 3, 30).transpose(0, 4, 3, 1, 2)               # (B, L, 3, J, 3)
+    np.testing.assert_array_equal(columns[:, 12:], np.broadcast_to(np.eye(3)[:, :, None], (6, 3, 3, 30)))
+    turns = columns[:, :12].reshape(6, 4, 3, 3, 30).transpose(0, 4, 3, 1, 2)               # (B, L, 3, J, 3)
     got = np.einsum("blijc,bjcd->blijd", turns, rotations.right_jacobian(pose))
     np.testing.assert_allclose(got.reshape(by_pose.shape), by_pose, atol=1e-9)
 
@@ -174,7 +174,7 @@ def test_the_kalman_filter_is_the_smoother_of_its_past(subject, layout):
     filter = KalmanPrediction(body, CONFIG, 100.0)
     filter.momentum = 1.0
     filter.begin(np.zeros(P))
-    noise, start = 1 / inertia(CONFIG, 100.0, P)[-1], filter.place[-1, -1]
+    noise, start = 1 / CONFIG.inertia(100.0, P)[-1], filter.place[-1, -1]
     seen, information = rng.normal(0, 1e-4, T), rng.random(T) / noise
     for z, weight in zip(seen, information, strict=True):
         expected, prior = filter.expect()
@@ -324,17 +324,23 @@ WRONG = {"times 1000": lambda p: 1000 * p, "half of it": lambda p: p * np.where(
          "mixed up": lambda p: p[np.random.default_rng(0).permutation(90)]}
 
 
-@pytest.mark.parametrize("kind", ["velocity", "kalman"])
-@pytest.mark.parametrize("wrong", WRONG.values(), ids=WRONG)
-def test_one_frame_that_no_body_makes_is_passed_over(passing, wrong, kind):
+@pytest.fixture(scope="module", params=["velocity", "kalman"])
+def unbroken(passing, request):
+    """A stream of 20 frames, what the next 20 come to, and how far they are from the truth at most."""
     subject, layout, truth, positions = passing
-    broken, config = positions.copy(), replace(CONFIG, prediction=kind)
-    broken[30] = wrong(positions[30])
-    frames = pushed(MarkerStream(subject, layout, layout.labels, 60.0, config), broken)
-    clean = pushed(MarkerStream(subject, layout, layout.labels, 60.0, config), positions)
-    assert not frames[30].trusted.any() and not frames[30].converged
-    assert errors(subject, frames, truth)[30:].max() < errors(subject, clean, truth).max() + 0.015
-    for there, other in zip(frames[31:], clean[31:], strict=True):
+    stream = MarkerStream(subject, layout, layout.labels, 60.0, replace(CONFIG, prediction=request.param))
+    first = pushed(stream, positions[:20])
+    frames = pushed(copy.deepcopy(stream), positions[20:40])
+    return stream, frames, errors(subject, [*first, *frames], truth[:40]).max()
+
+
+@pytest.mark.parametrize("wrong", WRONG.values(), ids=WRONG)
+def test_one_frame_that_no_body_makes_is_passed_over(passing, unbroken, wrong):
+    (subject, _, truth, positions), (stream, clean, apart) = passing, unbroken
+    frames = pushed(copy.deepcopy(stream), [wrong(positions[20]), *positions[21:40]])
+    assert not frames[0].trusted.any() and not frames[0].converged
+    assert errors(subject, frames, truth[20:40]).max() < apart + 0.015
+    for there, other in zip(frames[1:], clean[1:], strict=True):
         assert other.converged and there.converged
         np.testing.assert_array_equal(there.trusted, other.trusted)
 

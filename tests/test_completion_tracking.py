@@ -5,12 +5,12 @@ import pytest
 from completion_bodies import half_view, worm_with_prior
 from test_completion_partial import MARKS, QUICK
 
-from completion import Motion, TrackConfig, track
+from completion import Motion, TrackConfig, smoothing, track
 from completion.bodies import FixedBody, ShapedBody
-from completion.tracking.dynamics import difference, inertia, moved, predicted, smoothed
+from completion.smoothing import inertia, predicted, smooth
 from completion.tracking.frame_fit import shared_shape, spread_poses
 from completion.tracking.frames import prepare_frame
-from completion.tracking.tracker import Tracker
+from completion.tracking.sequence import Tracker
 from scanprep.batch.values import load_value, save_value
 from scanprep.geometry import rotations
 from scanprep.geometry.files import PointCloud
@@ -164,18 +164,10 @@ def test_a_sequence_without_anything_is_refused(model):
 def test_prediction_is_exact_at_constant_velocity():
     x = np.stack([np.r_[0.5 * (t + 1) * np.array([1.0, 2, 2]) / 3, 0.2 * t, 0, -t] for t in range(8)])
     for t in range(2, 8):
-        ahead = predicted([x[t - 1], x[t - 2]], 1.0)
+        ahead = predicted(x[t - 1], x[t - 2], 1.0)
         np.testing.assert_allclose(rotations.exp(ahead[:3]), rotations.exp(x[t, :3]), atol=1e-12)
         np.testing.assert_allclose(ahead[3:], x[t, 3:], atol=1e-12)
-    np.testing.assert_array_equal(predicted([x[3]], 1.0)[3:], x[3, 3:])
-
-
-def test_moves_and_differences_are_inverse():
-    rng = np.random.default_rng(0)
-    x, y = rng.normal(0, 1.2, (2, 20, 12))
-    np.testing.assert_allclose(rotations.exp(moved(x, difference(x, y))[:, :9].reshape(20, 3, 3)),
-                               rotations.exp(y[:, :9].reshape(20, 3, 3)), atol=1e-10)
-    np.testing.assert_allclose(moved(x, difference(x, y))[:, 9:], y[:, 9:], atol=1e-12)
+    np.testing.assert_array_equal(predicted(x[3], x[3], 1.0)[3:], x[3, 3:])
 
 
 def test_smoothing_bridges_a_gap_at_constant_velocity():
@@ -185,14 +177,15 @@ def test_smoothing_bridges_a_gap_at_constant_velocity():
     wrong = x.copy()
     wrong[5:9] += 0.3
     precision[5:9] = 0
-    out = smoothed(wrong, np.zeros((T, 6)), precision, inertia(6, RATE, 60.0, 15.0), 10)
+    out = smooth(wrong, np.zeros((T, 6)), precision, inertia(6, RATE, 60.0, 15.0), 10)
     np.testing.assert_allclose(rotations.exp(out[:, :3]), rotations.exp(x[:, :3]), atol=1e-6)
     np.testing.assert_allclose(out[:, 3:], x[:, 3:], atol=1e-6)
 
 
-def test_smoothing_is_the_least_squares_solution():
+def test_smoothing_is_the_least_squares_solution(monkeypatch):
     """For the place alone the problem is linear: a dense solve must agree, also where windows meet."""
-    rng, T = np.random.default_rng(1), 700
+    monkeypatch.setattr(smoothing, "WINDOW", 100)
+    rng, T = np.random.default_rng(1), 240
     x = np.zeros((T, 6))
     x[:, 3:] = np.cumsum(rng.normal(0, 0.01, (T, 3)), axis=0)
     root = rng.normal(size=(T, 6, 6))
@@ -209,9 +202,9 @@ def test_smoothing_is_the_least_squares_solution():
     for t in range(T):
         A[3 * t:3 * t + 3, 3 * t:3 * t + 3] += precision[t, 3:, 3:]
     wanted = x[:, 3:] - np.linalg.solve(A, rhs).reshape(T, 3)
-    out = smoothed(x, gradient, precision, weights, 1)
+    out = smooth(x, gradient, precision, weights, 1)
     np.testing.assert_allclose(out[:, 3:], wanted, atol=1e-6)
-    np.testing.assert_array_equal(smoothed(x[:2], gradient[:2], precision[:2], weights, 1), x[:2])
+    np.testing.assert_array_equal(smooth(x[:2], gradient[:2], precision[:2], weights, 1), x[:2])
 
 
 def test_several_frames_tell_the_shape(model):

@@ -17,10 +17,10 @@ from completion import Motion
 from completion.tracking import cli
 from completion.tracking.folder import FrameFolder
 from completion.tracking.report import _ranges
-from completion.tracking.tracker import Tracker
+from completion.tracking.sequence import Tracker
 from model import load_model
 from scanprep.batch.workspace import HOME
-from scanprep.console import run
+from scanprep.command_line import run
 from scanprep.geometry.files import PointCloud, read_mesh, read_points, write_points
 
 KNOWN = "--subject", "template", "--surfaces"

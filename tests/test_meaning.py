@@ -15,7 +15,6 @@ from scanned_shapes import ball as sphere
 from completion import MarkerLayout, MarkerSequence, motion_pictures, write_markers
 from completion.__main__ import main
 from completion.mocap.animate.work import Work as Follow
-from completion.mocap.animate.work import animate_file
 from completion.mocap.pose.robust import motion_problem
 from completion.mocap.pose.settings import AnimateConfig
 from completion.mocap.subject.person import PersonConfig
@@ -158,7 +157,7 @@ def test_motions(tmp_path, case, words):
     write_markers(tmp_path / "walk.csv", markers)
     work = Follow(model, "model.npz", str(tmp_path / "layout.json"), model.subject(None), None, None, "m", None,
                   AnimateConfig(), PersonConfig())
-    check(animate_file(work, tmp_path / "walk.csv", Room(tmp_path / "out")), words)
+    check(work(tmp_path / "walk.csv", Room(tmp_path / "out")), words)
     assert (tmp_path / "out" / "motion.npz").exists()
 
 

@@ -8,7 +8,7 @@ from posing_bodies import skinned, symmetric_worm
 
 from model import load_model
 from model.cli import group
-from model.learning.sex_plane import PLANE
+from model.learning.sexes import PLANE
 from model.posing.character import (
     CharacterConfig,
     CharacterMeshConfig,

@@ -13,7 +13,7 @@ from model.export.cli import export, read_motion, write_frames
 from model.export.correctives import motion_correctives, pose_directions, pose_features, write_body_npz
 from model.export.glb import continuous_quaternions, skinned_glb, write_skinned_glb
 from model.export.rig import joint_places, make_rig, turn_up
-from scanprep.console import run
+from scanprep.command_line import run
 from scanprep.geometry import rotations
 from scanprep.geometry.files import read_mesh
 from scanprep.geometry.mesh import Mesh

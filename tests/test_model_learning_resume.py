@@ -9,15 +9,15 @@ import pytest
 from config_files import config_file
 from model_bodies import random_poses, worm_model
 
-from model import load_model
-from model.learning import cli, mixing, parts, pose, scape, skinning
+from model import load_model, report
+from model.learning import cli, mixing, parts, scape, skinning
 from model.learning.cli import learn
 from scanprep import read_mesh, write_mesh
 from scanprep.batch.opening import beside
-from scanprep.console import run
+from scanprep.command_line import run
 from scanprep.skeleton import find
 
-STAGES = {"skeleton": (cli, "find_skeleton"), "poses": (pose, "_learned"), "people": (scape, "shape_gradients"),
+STAGES = {"skeleton": (cli, "find_skeleton"), "poses": (scape, "_learned"), "people": (scape, "shape_gradients"),
           "components": (scape, "learn_shape_space"), "pictures": (cli, "_draw")}
 QUICK = {"refinements": 1, "components": 4, "prunings": [0.01], "ridges": [1e-3]}
 SKIN = {"rounds": 2, "components": 4}
@@ -40,6 +40,13 @@ def dying(*given, **named):
 module.{name} = dying
 run(learn, "scape learn", sys.argv[1:])
 """
+
+
+@pytest.fixture(autouse=True)
+def small_pictures(monkeypatch):
+    """They are drawn in test_model_learning_cli; here they would take most of the time."""
+    for name in ("picture_parts", "picture_components"):
+        monkeypatch.setattr(report, name, lambda *given: np.zeros((4, 4, 3), dtype=np.uint8))
 
 
 @pytest.fixture
@@ -124,11 +131,11 @@ def test_killed_and_started_again_it_goes_on_and_ends_with_the_same_bytes(bodies
 
 def test_killed_twice_in_the_poses(bodies, monkeypatch):
     undisturbed = learned(bodies, "a.npz", refinements=3)
-    killed(pose, "_refined", 1, words(bodies, "b.npz", refinements=3))       # after the first refinement
-    killed(pose, "_refined", 1, words(bodies, "b.npz", refinements=3))       # after the second
-    real, calls = pose._refined, []
-    monkeypatch.setattr(pose, "_refined", lambda *given, **named: calls.append(1) or real(*given, **named))
-    monkeypatch.setattr(pose, "_first", None)
+    killed(scape, "_refined", 1, words(bodies, "b.npz", refinements=3))       # after the first refinement
+    killed(scape, "_refined", 1, words(bodies, "b.npz", refinements=3))       # after the second
+    real, calls = scape._refined, []
+    monkeypatch.setattr(scape, "_refined", lambda *given, **named: calls.append(1) or real(*given, **named))
+    monkeypatch.setattr(scape, "_first", None)
     assert learned(bodies, "b.npz", refinements=3) == undisturbed
     assert len(calls) == 1
 
@@ -144,7 +151,7 @@ def test_every_kind_goes_on(bodies, kind, module, name, after):
 
 
 def test_the_search_for_a_skeleton_goes_on(tmp_path, monkeypatch):
-    truth = worm_model()
+    truth = worm_model(rings=17)
     bodies = truth.subject().vertices(random_poses(truth, 5, np.random.default_rng(0), 0.4))
     for i, body in enumerate(bodies):
         write_mesh(tmp_path / "poses" / f"pose{i}.ply", truth.template.with_vertices(body))

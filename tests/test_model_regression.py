@@ -5,8 +5,7 @@ from model_bodies import random_poses, worm_model
 from model.features import PoseFeatures, QuadraticLift
 from model.learning import regression
 from model.learning.config import LearnConfig
-from model.learning.pose import compress
-from model.learning.regression import Design, choose_design
+from model.learning.regression import Design, choose_design, compress
 from model.pose_space import PoseSpace
 
 

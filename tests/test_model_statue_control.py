@@ -10,10 +10,18 @@ from animal_bodies import Animal
 from humanoid_maker import NAMES, freedom, nearest_marks
 
 from model.export.glb import skinned_glb, write_skinned_glb
-from model.statue.control.chart import Chart, automatic_chart, chart_problem, cut, densities, find_seams, make_chart
-from model.statue.control.files import read_control, write_control
-from model.statue.control.flatten import _derivatives, _energy, _rest, crossings, orientation
-from model.statue.control.humanoid import STORED, humanoid, humanoid_markers
+from model.statue.control.chart import (
+    Chart,
+    automatic_chart,
+    chart_problem,
+    crossings,
+    cut,
+    densities,
+    find_seams,
+    make_chart,
+    orientation,
+)
+from model.statue.control.files import STORED, humanoid, humanoid_markers, read_control, write_control
 from model.statue.control.model import control_problem
 from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.storage import StorageError
@@ -207,22 +215,6 @@ def test_signs_of_areas_and_crossings_are_exact():
     square = np.array([[0, 0], [1, 0], [1, 1], [0, 1.0]])
     assert not crossings(square) and crossings(square[[0, 2, 1, 3]])
     assert crossings(np.array([[0, 0], [2, 0], [2, 1], [1, 0], [0, 1.0]]))      # touches a side with a corner
-
-
-def test_the_energy_of_the_chart_has_the_derivatives_it_says():
-    control = humanoid()
-    rng = np.random.default_rng(2)
-    chart = control.chart
-    flat, faces = chart.uv + 1e-4 * rng.normal(size=chart.uv.shape), chart.faces[:400]
-    used, faces = np.unique(faces, return_inverse=True)
-    uv, faces = flat[used], faces.reshape(-1, 3)
-    rest, areas = _rest(control.mesh.submesh(np.arange(400))[0]), rng.random(400)
-    border = np.arange(40)                                          # some pairs nearer than the gap of 0.02
-    gradient, _ = _derivatives(uv, faces, rest, areas, border, 0.02)
-    for _ in range(5):
-        way = rng.normal(size=uv.shape)
-        up, down = (_energy(uv + h * way, faces, rest, areas, border, 0.02) for h in (1e-8, -1e-8))
-        assert (up - down) / 2e-8 == pytest.approx(gradient @ way.ravel(), rel=1e-4)
 
 
 def test_a_chart_that_is_not_one_to_one_is_told():

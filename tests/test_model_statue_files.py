@@ -10,9 +10,9 @@ from PIL import Image
 
 from model.export.rig import turn_up
 from model.statue.control.chart import Chart
-from model.statue.control.humanoid import humanoid
+from model.statue.control.files import humanoid
 from model.statue.detail.subdivision import subdivide
-from model.statue.detail.textures import chart_tangents, normal_image, vertex_of_row
+from model.statue.detail.texels import chart_tangents, normal_image, vertex_of_row
 from model.statue.files import write_statue_glb, write_x3d
 from model.statue.motion.motions import people_motion
 from scanprep.geometry import rotations
@@ -124,15 +124,6 @@ def test_tangents_go_along_the_rows_of_the_image():
         upwards = turn.T @ np.cross(turn[:, 2], found[0, :3]) * sign
         grows = np.linalg.lstsq(mesh.vertices[:, :2], uv[:, 1] - uv[0, 1], rcond=None)[0]
         assert upwards[:2] @ grows > 0.4, "the way in which v grows"
-
-
-def test_vertices_of_another_level_are_refused(detailed, tmp_path):
-    control, (fine, vertices) = humanoid(), detailed
-    with pytest.raises(ValueError, match="vertices, subdivision: expected both or none"):
-        write_statue_glb(tmp_path / "a.glb", control, vertices)
-    with pytest.raises(ValueError, match=rf"vertices: expected shape \({len(vertices)}, 3\), got \(5, 3\)"):
-        write_statue_glb(tmp_path / "a.glb", control, vertices[:5], fine)
-    assert not list(tmp_path.iterdir())
 
 
 def numbers(node, name, width):

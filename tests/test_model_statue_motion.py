@@ -10,9 +10,8 @@ from model.export.cli import read_motion
 from model.export.rig import joint_places
 from model.features import linear_features
 from model.skinning import SkinningModel
-from model.statue.control.humanoid import humanoid
-from model.statue.motion.follow import Follower, _bound
-from model.statue.motion.motions import bvh_motion, own_motion, people_motion, write_motion
+from model.statue.control.files import humanoid
+from model.statue.motion.motions import Follower, _bound, bvh_motion, own_motion, people_motion, write_motion
 from model.statue.motion.retarget import find_roles, trunk
 from scanprep.geometry import rotations
 from scanprep.geometry.storage import StorageError

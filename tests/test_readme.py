@@ -1,16 +1,35 @@
-"""Every command and snippet of the README runs, on files under the names that it uses."""
+"""Every command and snippet of the README runs, on files under the names that it uses; then those of the packages.
+
+One file, so that one process does it all: the READMEs of the packages go on with what the commands of the README wrote.
+"""
 import re
 
 import pytest
 from readme_folder import ROOT, SET_UP, blocks, commands, run_commands, user_folder
 
 README = (ROOT / "README.md").read_text(encoding="utf-8")
+PACKAGES = [f"{package}/README.md" for package in ("scanprep", "model", "completion")]
 pytestmark = pytest.mark.timeout(1800)
 
 
 @pytest.fixture(scope="module")
 def place(demo_folder, tmp_path_factory):
-    return user_folder(demo_folder, tmp_path_factory.mktemp("readme"))
+    """The folder of a user in which the commands of the README were run."""
+    folder = user_folder(demo_folder, tmp_path_factory.mktemp("readme"))
+    with pytest.MonkeyPatch.context() as patch:
+        patch.chdir(folder)
+        patch.setenv("SCAPEKIT_CACHE", str(folder / "cache"))
+        run_commands("README.md")
+    return folder
+
+
+@pytest.fixture(autouse=True)
+def there(request, monkeypatch):
+    """Work in that folder."""
+    if "place" in request.fixturenames:
+        place = request.getfixturevalue("place")
+        monkeypatch.chdir(place)
+        monkeypatch.setenv("SCAPEKIT_CACHE", str(place / "cache"))
 
 
 def test_set_up_is_what_ci_does():
@@ -19,20 +38,26 @@ def test_set_up_is_what_ci_does():
     assert 'pip install --quiet ".[test]"' in ci and "\npytest\n" in ci
 
 
-def test_commands(place, monkeypatch):
-    monkeypatch.chdir(place)
-    monkeypatch.setenv("SCAPEKIT_CACHE", str(place / "cache"))
-    run_commands("README.md")
+def test_commands(place):
     for written in ("out/report.html", "completed/report.html", "walk/animation.glb", "person/report.html", "body.glb",
                     "walk_of_two/motion.npz", "tracked/motion.npz"):
         assert (place / written).exists(), written
 
 
 @pytest.mark.parametrize("code", blocks("README.md", "python"))
-def test_snippets(place, monkeypatch, code):
-    monkeypatch.chdir(place)
+def test_snippets(place, code):
     exec(compile(code, "README.md", "exec"), {})
     assert (place / "whole.ply").stat().st_size > 10_000
+
+
+@pytest.mark.parametrize("readme", PACKAGES)
+def test_commands_of_packages(place, readme):
+    run_commands(readme)
+
+
+@pytest.mark.parametrize("readme, code", [(readme, code) for readme in PACKAGES for code in blocks(readme, "python")])
+def test_snippets_of_packages(place, readme, code):
+    exec(compile(code, readme, "exec"), {})
 
 
 def test_first_screen_and_limits():

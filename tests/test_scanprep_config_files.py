@@ -7,7 +7,7 @@ import pytest
 from config_files import config_file
 from test_scanprep_ranges import CALLS
 
-from scanprep import config_files, console
+from scanprep import command_line, config_files
 from scanprep.console import Metric, Outcome
 from scanprep.ranges import FLAG, Count, Settings, Share
 
@@ -77,7 +77,7 @@ def run(argv, capsys):
         seen.append(config)
         return Outcome(None, [Metric("done", 1)])
 
-    code = console.run(spy, "scape work", [str(word) for word in argv])
+    code = command_line.run(spy, "scape work", [str(word) for word in argv])
     said = capsys.readouterr()
     return (seen[0] if seen else None), code, said
 

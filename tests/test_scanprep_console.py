@@ -7,8 +7,9 @@ from typing import Annotated
 import numpy as np
 import pytest
 
-from scanprep import console
+from scanprep import command_line
 from scanprep.console import Metric, Outcome
+from scanprep.geometry import storage
 from scanprep.ranges import FLAG, Settings
 
 
@@ -28,7 +29,7 @@ def work(out: Path, times: int = 2, settings: Choices = Choices()) -> Outcome:
 
 def test_done(tmp_path, capsys):
     out = tmp_path / "a.txt"
-    assert console.run(work, "scape work", ["--out", str(out), "--weight", "0.25"]) == 0
+    assert command_line.run(work, "scape work", ["--out", str(out), "--weight", "0.25"]) == 0
     assert "0.00123" in capsys.readouterr().out
     report = json.loads((tmp_path / "a.report.json").read_text())
     assert report["settings"]["settings"] == {"weight": 0.25}
@@ -37,31 +38,31 @@ def test_done(tmp_path, capsys):
 
 
 def test_failed_is_one_line(tmp_path, capsys):
-    assert console.run(work, "scape work", ["--out", str(tmp_path / "a"), "--times", "100"]) == 1
+    assert command_line.run(work, "scape work", ["--out", str(tmp_path / "a"), "--times", "100"]) == 1
     shown = capsys.readouterr()
     assert shown.err == "scape work: times: expected a count, got 100\n" and not shown.out
     assert not list(tmp_path.iterdir())
 
 
 def test_some_failed(tmp_path, capsys):
-    assert console.run(work, "scape work", ["--out", str(tmp_path / "a.txt"), "--times", "7"]) == 1
+    assert command_line.run(work, "scape work", ["--out", str(tmp_path / "a.txt"), "--times", "7"]) == 1
     assert "failed: scan7: empty" in capsys.readouterr().err
 
 
 def test_wrong_usage(tmp_path):
     with pytest.raises(SystemExit) as stop:
-        console.run(work, "scape work", ["--no-such"])
+        command_line.run(work, "scape work", ["--no-such"])
     assert stop.value.code == 2
-    assert console.dispatch({"work": ("Do it.", "nowhere:work")}, "scape", ["nothing"], "lead") == 2
-    assert console.dispatch({"work": ("Do it.", "nowhere:work")}, "scape", [], "lead") == 2
+    assert command_line.dispatch({"work": ("Do it.", "nowhere:work")}, "scape", ["nothing"], "lead") == 2
+    assert command_line.dispatch({"work": ("Do it.", "nowhere:work")}, "scape", [], "lead") == 2
 
 
 def test_help_imports_nothing(capsys):
-    assert console.dispatch({"work": ("Do it.", "nowhere:work")}, "scape", ["--help"], "lead") == 0
+    assert command_line.dispatch({"work": ("Do it.", "nowhere:work")}, "scape", ["--help"], "lead") == 0
     assert "Do it." in capsys.readouterr().out
 
 
 def test_plain_survives_json():
     value = {"a": np.float64(1.5), "b": np.arange(3), "c": Choices(), "d": (Path("x"), None)}
-    assert json.loads(json.dumps(console.plain(value))) == {
+    assert json.loads(json.dumps(storage.as_json(value))) == {
         "a": 1.5, "b": [0, 1, 2], "c": {"weight": 0.5}, "d": ["x", None]}

@@ -13,9 +13,9 @@ from scanprep.fusion.tsdf import MergeConfig
 from scanprep.geometry.files import read_mesh
 from scanprep.geometry.mesh import Mesh, template_problem
 from scanprep.geometry.surface import Surface
-from scanprep.pipeline.template import TemplateConfig, make_template
 from scanprep.repair.intersections import intersecting_faces
 from scanprep.repair.manifold import weld
+from scanprep.surfaces.template import TemplateConfig, make_template
 from scanprep.synthetic.scanner import ScannerConfig, scan
 
 

@@ -8,6 +8,7 @@ from scanprep.geometry.least_squares import (
     Dense,
     Residual,
     Sparse,
+    by_rotations,
     levenberg_marquardt,
     normal_equations,
     retract_pose,
@@ -112,23 +113,35 @@ def test_rotations_are_found_that_lie_far_away():
         values = points @ np.swapaxes(now, 1, 2) - goal
         return normal_equations([Residual(values.reshape(5, -1), J.reshape(5, -1, 3))])
 
-    end = levenberg_marquardt(equations, 0.1 * RNG.normal(size=(5, 3)), 60, 1e-12, retract=retract_pose(3))
+    end = levenberg_marquardt(equations, 0.1 * RNG.normal(size=(5, 3)), 60, 1e-12, retract=rotations.compose)
     H = np.swapaxes(goal, 1, 2) @ points
     np.testing.assert_allclose(rotations.exp(end.x), rotations.project(H), atol=1e-5)
     assert (np.linalg.norm(end.x, axis=1) <= np.pi + 1e-12).all()
-
-
-def test_a_retract_composes_rotations_and_adds_the_rest():
-    x, step = RNG.normal(size=(2, 4, 8))
-    out = retract_pose(6)(x, step)
-    np.testing.assert_allclose(rotations.exp(out[:, :6].reshape(-1, 3)),
-                               rotations.exp(x[:, :6].reshape(-1, 3)) @ rotations.exp(step[:, :6].reshape(-1, 3)),
-                               atol=1e-12)
-    np.testing.assert_array_equal(out[:, 6:], (x + step)[:, 6:])
-    np.testing.assert_allclose(retract_pose(6)(out, retract_pose(6)(0 * x, -step)), x, atol=1e-9)
 
 
 def test_a_dense_batch_of_one_is_a_tuple_of_three():
     energy, gradient, hessian = linear(np.eye(2), np.ones(2))(np.zeros((1, 2)))
     assert isinstance(linear(np.eye(2), np.ones(2))(np.zeros((1, 2))), Dense)
     np.testing.assert_allclose((energy[0], gradient[0, 0], hessian[0, 0, 0]), (2, -1, 1))
+
+
+def test_steps_are_rotations_where_derivatives_are_by_rotation_vectors():
+    """An arrow whose frames begin with two rotation vectors: its equations against finite differences."""
+    x, goal = RNG.normal(size=(2, 9)), RNG.normal(size=(2, 12))
+
+    def residual(x):
+        R = rotations.exp(x[:, :6].reshape(-1, 2, 3))
+        return np.concatenate([R[:, 0] @ [1, 2, 3] + x[:, 6:], (R[:, 0] @ R[:, 1]).reshape(-1, 9)], axis=1) - goal
+
+    def equations(x):
+        by_x = np.stack([(residual(x + d) - residual(x - d)) / 2e-6 for d in 1e-6 * np.eye(9)], axis=-1)
+        return Arrow(normal_equations([Residual(residual(x), by_x)]), 3)
+
+    found, retract = by_rotations(equations(x), x, 6).rows, retract_pose(6)
+    J = np.stack([(residual(retract(x, d)) - residual(retract(x, -d))) / 2e-6
+                  for d in 1e-6 * np.eye(9)[:, None] * np.ones((2, 1))], axis=-1)
+    expected = normal_equations([Residual(residual(x), J)])
+    np.testing.assert_allclose(found.gradient, expected.gradient, atol=1e-7)
+    np.testing.assert_allclose(found.hessian, expected.hessian, atol=1e-7)
+    end = levenberg_marquardt(equations, np.tile(x[:1], (2, 1)), 80, 1e-9, angles=6)
+    assert (np.linalg.norm(end.x[:, :6].reshape(-1, 3), axis=1) <= np.pi + 1e-12).all() and end.converged.all()

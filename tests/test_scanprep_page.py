@@ -9,18 +9,18 @@ from scipy.spatial.transform import Rotation
 
 from scanprep import RegisteredSet, write_landmarks, write_mesh
 from scanprep.geometry.files import PointCloud, write_points
-from scanprep.pipeline import pictures
+from scanprep.pipeline import page as pictures
 from scanprep.pipeline.figures import (
-    Failure,
+    Limits,
     ScanFigures,
     read_failures,
     read_figures,
+    review,
     write_failures,
     write_figures,
 )
 from scanprep.pipeline.page import write_set_page
 from scanprep.pipeline.prepare import prepare
-from scanprep.pipeline.review import Limits, review
 from scanprep.pipeline.scans import find_scans
 from scanprep.registration.nonrigid import principal_stretches, stretched_share, uncovered_share
 
@@ -95,7 +95,7 @@ def test_names_cannot_break_the_page(folder, tmp_path):
     whole = RegisteredSet.create(tmp_path / "set", ball(0))
     whole.add("a b&c", ball(0).vertices, "<script>", "'\"")
     write_figures(tmp_path / "set", [replace(GOOD, name="a b&c")])
-    write_failures(tmp_path / "set", [Failure("d", "<i>broken</i>")])
+    write_failures(tmp_path / "set", {"d": "<i>broken</i>"})
     page = write_set_page(tmp_path / "set").read_text()
     assert "<script" not in page and "<i>" not in page and "a b&amp;c" in page
 
@@ -111,7 +111,7 @@ def test_set_without_scans(tmp_path):
     ({"converged": False}, "converged"), ({"seen": 0.0, "distance": np.nan, "rms": np.nan}, "nowhere near")])
 def test_each_figure_alone_is_noticed(change, reason):
     figures = [replace(GOOD, name=f"good{k}") for k in range(4)] + [replace(GOOD, name="bad", **change)]
-    verdicts = review(figures, [], size=1.4, faces=25_000, limits=Limits(not_converged=1))
+    verdicts = review(figures, {}, size=1.4, faces=25_000, limits=Limits(not_converged=1))
     assert verdicts[0].name == "bad" and verdicts[0].suspect and any(reason in r for r in verdicts[0].reasons)
     assert not any(v.suspect or v.reasons for v in verdicts[1:])
 
@@ -119,7 +119,7 @@ def test_each_figure_alone_is_noticed(change, reason):
 def test_order_of_verdicts():
     figures = [replace(GOOD, name="a"), replace(GOOD, name="b", missed=0.02), replace(GOOD, name="c", missed=0.2),
                replace(GOOD, name="d", landmarks=np.nan)]
-    verdicts = review(figures, [Failure("a", "gone"), Failure("z", "broken")], 1.4, 25_000, Limits(missed=0.01))
+    verdicts = review(figures, {"a": "gone", "z": "broken"}, 1.4, 25_000, Limits(missed=0.01))
     assert [v.name for v in verdicts] == ["a", "z", "c", "b", "d"]
     assert [v.failed for v in verdicts] == [True, True, False, False, False]
     assert [v.badness for v in verdicts[2:4]] == [pytest.approx(20), pytest.approx(2)]
@@ -127,7 +127,7 @@ def test_order_of_verdicts():
 
 def test_scans_from_one_side_are_not_blamed_for_it():
     front = [replace(GOOD, name=f"front{k}", seen=0.4) for k in range(5)]
-    assert not any(v.suspect for v in review(front, [], 1.4, 25_000))
+    assert not any(v.suspect for v in review(front, {}, 1.4, 25_000))
 
 
 def test_stretches_of_a_known_map(template):
@@ -153,8 +153,8 @@ def test_tables_keep_their_numbers(tmp_path):
     rows = [replace(GOOD, name="b", landmarks=np.nan), replace(GOOD, name="a", distance=1 / 3, converged=False)]
     write_figures(tmp_path, rows)
     assert [repr(f) for f in read_figures(tmp_path)] == [repr(rows[1]), repr(rows[0])]
-    write_failures(tmp_path, [Failure("x", 'a, "b"\tc')])
-    assert read_failures(tmp_path) == [Failure("x", 'a, "b"\tc')]
+    write_failures(tmp_path, {"x": 'a, "b"\tc'})
+    assert read_failures(tmp_path) == {"x": 'a, "b"\tc'}
     (tmp_path / "registration.csv").write_text("name,distance\na,1\n")
     with pytest.raises(ValueError, match=r"registration\.csv: expected the columns name, init"):
         read_figures(tmp_path)

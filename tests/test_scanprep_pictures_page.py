@@ -48,7 +48,7 @@ def test_everything_is_in_the_one_file(image, tmp_path):
     page = (Page("A <title>", "Lead & all").section("One", "First.\n\nSecond.").picture(image, "A picture")
             .section("Two").pictures([image, image], ["left", "right"]).chart(figure, "A chart")
             .section("Three").table([("error", 9.51234, True), ("bodies", 1820, "–")], ("metric", "value", "ok"))
-            .code("scape demo").download("body.glb", b"glTF\x00\x01"))
+            .download("body.glb", b"glTF\x00\x01"))
     page.write(tmp_path / "report.html")
     text = (tmp_path / "report.html").read_text(encoding="utf-8")
     assert text == page.html()
@@ -75,7 +75,7 @@ def test_downloads_are_the_same_bytes():
 
 def test_text_is_escaped():
     nasty = '<script>alert("x")</script>'
-    page = Page(nasty, nasty).section(nasty, nasty).table([(nasty,)], (nasty,)).code(nasty).download(nasty, b"", nasty)
+    page = Page(nasty, nasty).section(nasty, nasty).table([(nasty,)], (nasty,)).download(nasty, b"", nasty)
     assert not Reader(page.html()).all("script")
 
 

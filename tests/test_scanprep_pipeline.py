@@ -56,9 +56,6 @@ def test_scans_and_what_is_known_of_them(scans):
     (scans / "scans.csv").unlink()
     assert [t.subject for t in find_scans(scans)] == ["body0", "body1", "body2"]
     assert {t.subject for t in find_scans(scans, subject="carl")} == {"carl"}
-
-
-def test_point_clouds_are_scans(scans):
     (scans / "cloud.xyz").write_text("0 0 0\n1 0 0\n")
     (scans / "notes.txt").write_text("Tuesday")
     assert [t.name for t in find_scans(scans)] == ["body0", "body1", "body2", "cloud"]
@@ -68,24 +65,21 @@ def test_folders_that_cannot_be_meant(scans, tmp_path):
     shutil.copy(scans / "body0.ply", scans / "body0.obj")
     with pytest.raises(ValueError, match=r"body0\.obj and body0\.ply, both of the name 'body0'"):
         find_scans(scans)
-    with pytest.raises(ValueError, match="in its folders scans: name one of them"):
-        find_scans(tmp_path)
-    with pytest.raises(ValueError, match="no such folder"):
-        find_scans(tmp_path / "nowhere")
+    for folder, says in ((tmp_path, "in its folders scans: name one"), (tmp_path / "nowhere", "no such folder")):
+        with pytest.raises(ValueError, match=says):
+            find_scans(folder)
     (scans / "body0.obj").unlink()
     with pytest.raises(ValueError, match="landmarks: expected a folder"):
         find_scans(scans, tmp_path / "nowhere")
 
 
-def test_table_that_names_no_scan(scans):
-    (scans / "scans.csv").write_text("name,subject\nnobody,anna\n")
-    with pytest.raises(ValueError, match=r"scans\.csv: no scan is called nobody"):
-        find_scans(scans)
-    (scans / "scans.csv").write_text("scan,subject\nbody0,anna\n")
-    with pytest.raises(ValueError, match="line 1: expected the columns name,subject"):
-        find_scans(scans)
-    (scans / "scans.csv").write_text("name,subject\nbody0,anna\nbody0,ben\n")
-    with pytest.raises(ValueError, match="body0 comes twice"):
+@pytest.mark.parametrize("text, says", [
+    ("name,subject\nnobody,anna\n", r"scans\.csv: no scan is called nobody"),
+    ("scan,subject\nbody0,anna\n", "line 1: expected the columns name,subject"),
+    ("name,subject\nbody0,anna\nbody0,ben\n", "body0 comes twice")])
+def test_tables_that_cannot_be_meant(scans, text, says):
+    (scans / "scans.csv").write_text(text)
+    with pytest.raises(ValueError, match=says):
         find_scans(scans)
 
 

@@ -17,8 +17,9 @@ import scanprep
 from completion.__main__ import COMMANDS
 from completion.mocap.mosh.mosh import MoshConfig
 from completion.mocap.subject.person import PersonConfig
-from scanprep import config_files, console
+from scanprep import command_line, config_files
 from scanprep.console import Metric, Outcome
+from scanprep.geometry import storage
 from scanprep.ranges import LARGE, OutOfRange, Range, Settings, ranges
 
 
@@ -79,7 +80,7 @@ def needed(function):
     words, seen = [], inspect.signature(function).parameters
     hints = typing.get_type_hints(function, include_extras=True)
     for name, parameter in seen.items():
-        if parameter.default is inspect.Parameter.empty and name != console.SPACE:
+        if parameter.default is inspect.Parameter.empty and name != command_line.SPACE:
             if "Positional" in str(hints[name]):
                 words.insert(0, "nowhere")
             else:
@@ -131,7 +132,7 @@ def test_wrong_numbers_end_a_command_before_it_begins(prog, capsys, tmp_path, mo
             at = words.index(flag)
             del words[at:at + 2]
         try:
-            code = console.run(spy, prog, [*words, *written(flag, value, hint)])
+            code = command_line.run(spy, prog, [*words, *written(flag, value, hint)])
         except SystemExit as stop:
             code = ("tyro", stop.code)
         said = capsys.readouterr().err
@@ -144,10 +145,10 @@ def flags(function):
     """How many flags a command has, those that every command has too; what is given by its place is none."""
     shown, hints = inspect.signature(function).parameters.values(), typing.get_type_hints(function, include_extras=True)
     settings = {p.name: p.default for p in shown if isinstance(p.default, Settings)}
-    own = [p for p in shown if p.name not in settings and p.name != console.SPACE]
+    own = [p for p in shown if p.name not in settings and p.name != command_line.SPACE]
     return (sum("Positional" not in str(hints[p.name]) for p in own) + len(config_files.flags(settings))
             + (2 if settings else 0) + hasattr(settings.get("config"), "published")
-            + any(p.name in console.OUTPUTS for p in own))
+            + any(p.name in command_line.OUTPUTS for p in own))
 
 
 def test_commands_have_few_flags():
@@ -165,7 +166,7 @@ def test_defaults_are_in_their_ranges(prog, monkeypatch, tmp_path):
         called.append(named)
         return Outcome(None, [Metric("done", 1)])
 
-    assert console.run(spy, prog, needed(function)) == 0 and len(called) == 1
+    assert command_line.run(spy, prog, needed(function)) == 0 and len(called) == 1
 
 
 @pytest.mark.parametrize("cls", SETTINGS, ids=lambda c: c.__qualname__)
@@ -203,4 +204,4 @@ def test_ranges_in_words():
 
 
 def test_settings_survive_json():
-    assert json.loads(json.dumps(console.plain(PersonConfig())))["frames"] == PersonConfig().frames
+    assert json.loads(json.dumps(storage.as_json(PersonConfig())))["frames"] == PersonConfig().frames

@@ -4,8 +4,7 @@ from scanned_shapes import ball, bumpy, view
 
 from scanprep.geometry import rotations
 from scanprep.geometry.mesh import Mesh, template_problem
-from scanprep.geometry.seen_space import SeenSpace
-from scanprep.geometry.surface import Surface
+from scanprep.geometry.surface import SeenSpace, Surface
 from scanprep.repair.hole_filling import FillConfig, fill_holes, fill_report
 from scanprep.repair.volumetric_diffusion import diffused_surface, signed_distance
 

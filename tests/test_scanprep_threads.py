@@ -14,7 +14,8 @@ from completion import MarkerLayout, MarkerSequence, animate
 from model import fit_pose, learn_scape
 from model.learning.config import LearnConfig
 from scanprep import threads
-from scanprep.console import Metric, Outcome, run
+from scanprep.command_line import run
+from scanprep.console import Metric, Outcome
 from scanprep.threads import VARIABLES, begin_worker, one_thread, search_threads
 
 
@@ -103,7 +104,7 @@ import os, numpy, scipy.linalg
 from threadpoolctl import threadpool_info, threadpool_limits
 threadpool_limits(2)
 before = dict(os.environ)
-import scanprep.console, model, completion
+import scanprep.command_line, model, completion
 from scanprep import register; from model import learn_scape, fit_pose; from completion import mosh, complete, track
 assert {p["num_threads"] for p in threadpool_info()} == {2} and dict(os.environ) == before
 """

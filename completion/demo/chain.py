@@ -6,26 +6,27 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from contextlib import AbstractContextManager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import cached_property, partial
 from pathlib import Path
 
 import numpy as np
 from scipy.spatial import cKDTree
 
-from model import BodyModel, Subject, fit_pose, learn_scape, load_model
+from model import BodyModel, LearnConfig, Subject, fit_pose, learn_scape, load_model
 from scanprep.batch.opening import workspace
-from scanprep.batch.room import Room
-from scanprep.batch.steps import KeptSteps, inside
-from scanprep.batch.workspace import Task, Workspace
+from scanprep.batch.room import Room, inside
+from scanprep.batch.workspace import KeptSteps, Task, Workspace
 from scanprep.dataset import RegisteredSet
+from scanprep.geometry import storage, tables
 from scanprep.geometry.files import read_mesh, write_mesh
 from scanprep.geometry.landmarks import match_landmarks, read_landmark_vertices, read_landmarks, write_landmarks
 from scanprep.geometry.mesh import Mesh
 from scanprep.pipeline.prepare import SCANS, PrepareConfig, Prepared, prepare
-from scanprep.pipeline.scans import find_scans
-from scanprep.pipeline.template import TemplateConfig, make_template
+from scanprep.pipeline.scans import TABLE, find_scans
+from scanprep.ranges import Cell, Count, Faces, Positive, Seed, Settings
 from scanprep.skeleton.find import SkeletonConfig
+from scanprep.surfaces.template import TemplateConfig, make_template
 from scanprep.synthetic.data_set import (
     SUBJECT,
     GroundTruth,
@@ -46,8 +47,58 @@ from ..mocap.marker_sets.layout import DISTANCE, MarkerLayout
 from ..mocap.pose.follow import animate
 from ..motion import Motion
 from ..partial.completion import Completion, complete, load_completion, save_completion
-from .settings import LANDMARKS, MARKER_NOISE, PARTS, TEMPLATE_VIEWS, DemoConfig, write_settings
 from .truth import TruthMap
+
+PARTS = 16                               # left to itself, the search finds rings at the shoulders, moved by the skin
+TEMPLATE_VIEWS = 12                      # sides from which the careful scan is taken that the template is made of
+LANDMARKS = 7                            # that are marked on the half view
+MARKER_NOISE = 0.001                     # metres
+
+
+@dataclass(frozen=True)
+class DemoConfig(Settings):
+    """How much of everything.
+
+    Attributes
+    ----------
+    poses, subjects : int
+        Scans of one subject in many poses, and of other people.
+    faces : int
+        Triangles of the template.
+    resolution, template_resolution : float, metres
+        Spacing of the scanner's rays, for the scans and for the careful one that the template is made of.
+    held_out : int
+        Poses of the subject that the model never saw.
+    frames, rate : int, frames per second
+        Of the walk.
+    seed : int
+    learn : LearnConfig
+        How the model is learned.
+    """
+
+    poses: Count = 9
+    subjects: Count = 4
+    faces: Faces = 8000
+    resolution: Cell = 0.01
+    template_resolution: Cell = 0.0055
+    held_out: int = 3
+    frames: Count = 66
+    rate: Positive = 60.0
+    seed: Seed = 0
+    learn: LearnConfig = field(default_factory=LearnConfig)
+
+
+FULL = DemoConfig(poses=20, subjects=12, faces=14000, resolution=0.0068, template_resolution=0.004, held_out=5,
+                  frames=132)
+QUICK = DemoConfig(poses=8, subjects=3, faces=7000, resolution=0.011, template_resolution=0.006, held_out=2, rate=30.0)
+
+
+def write_settings(config: DemoConfig, rows: list[tuple[str, str, str, str]], folder: Path) -> None:
+    """What the folder holds, and who is in the scans."""
+    storage.write_json(folder / "demo.json", storage.as_json(config))
+    (folder / "scans").mkdir()
+    tables.write_table(folder / "scans" / TABLE, ("name", "subject", "pose", "sex"), rows)
+
 
 MODEL, HALF, MOTION = Path("model.npz"), Path("half_view/half_view.ply"), Path("animation/motion.npz")
 Bar = Callable[[str], AbstractContextManager[Callable[[int, int], None]]]

@@ -9,8 +9,7 @@ from scanprep.console import Outcome, bar, say
 from scanprep.ranges import Seed
 
 from ..cli import Out
-from .chain import Demo
-from .settings import FULL, QUICK, DemoConfig
+from .chain import FULL, QUICK, Demo, DemoConfig
 
 
 def demo(out: Out = Path("scape_demo"), quick: bool = False, full: bool = False, seed: Seed = DemoConfig.seed,

@@ -19,8 +19,7 @@ from scanprep.pictures.sheets import save_png
 
 from ..motion_pictures import animated_picture, chart_residuals, picture_frames
 from ..partial.report import COMPLETED, HEIGHT, MEASURED, picture_completion, picture_distance
-from .chain import Demo
-from .settings import PARTS
+from .chain import PARTS, Demo
 from .truth import surface_error
 
 FAR = 0.01                 # metres at the end of the heat maps

@@ -13,11 +13,7 @@ from scanprep.synthetic.data_set import GroundTruth
 
 @dataclass(frozen=True, eq=False)
 class TruthMap:
-    """Where each vertex of the template truly lies on any synthetic person.
-
-    All synthetic people share one triangulation, so a point of the surface is a triangle with barycentric
-    coordinates, and is carried from the scan that the template was made of to every other person and pose.
-    """
+    """Where each vertex of the template truly lies on any synthetic person: all of them share one triangulation."""
 
     template: Mesh
     places: SurfacePoints  # the true surface points nearest to the template's vertices

@@ -18,11 +18,9 @@ from scanprep.ranges import Count, Positive
 
 from ..cli import ModelOrNone, read_landmark_pairs, read_model, rows
 from ..motion import Motion
-from .chunks import follow_folder
-from .folder import FrameFolder
-from .sequence import as_motion, tracking_problem
+from .folder import FrameFolder, follow_folder
+from .sequence import Tracker, as_motion, tracking_problem
 from .settings import TrackConfig
-from .tracker import Tracker
 
 FramesArg = Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="FRAMES")]
 

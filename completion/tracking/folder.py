@@ -1,24 +1,26 @@
-"""A folder of frames: which file is which frame and camera, and reading them one by one."""
+"""A folder of frames: which file is which frame and camera; frames followed a few at a time, each few kept."""
 from __future__ import annotations
 
 import re
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
-from scanprep.geometry.files import MeshFileError, PointCloud, read_points
+from scanprep.batch.workspace import Workspace
+from scanprep.geometry.files import MeshFileError, PointCloud, read_points, write_mesh
+
+from .sequence import TrackedFrame, Tracker, TrackerState, without_points
 
 ENDINGS = (".ply", ".ply.gz", ".obj", ".stl", ".off", ".glb", ".pcd", ".xyz", ".txt", ".pts")
 NOTHING = ("holds no vertices", "the file is empty")
-SPARSE = 2                           # numbers may leave out as many frames as there are; else they only give the order
 
 
 class FrameFolder:
-    """Frames in the order of the numbers in their names.
+    """Frames in the order of the numbers in their names: in a folder, in one for each camera, or named by a pattern.
 
-    A folder holds a file for each frame, or a subfolder of such files for each camera, or, with a pattern, the files
-    of all cameras. A number that is left out is a frame in which nothing was seen.
+    A number that is left out is a frame in which nothing was seen.
     """
 
     def __init__(self, folder: Path, pattern: str | None = None, unit: str | None = None) -> None:
@@ -113,4 +115,74 @@ def _numbers(found: set[int]) -> list[int]:
     steps = np.diff(order)
     step = int(np.gcd.reduce(steps)) if len(steps) else 1
     filled = (order[-1] - order[0]) // step + 1
-    return list(range(order[0], order[-1] + 1, step)) if filled <= SPARSE * len(order) else order
+    # numbers may leave out as many frames as there are; else they only give the order
+    return list(range(order[0], order[-1] + 1, step)) if filled <= 2 * len(order) else order
+
+
+Progress = Callable[[int, int], None]
+AT_ONCE = 5                          # frames that are kept together
+START = "frames/"                    # of the names of what is kept
+SURFACES = "surfaces"
+
+
+@dataclass(frozen=True, eq=False)
+class Chunk:
+    """What came of some frames."""
+
+    ready: tuple[TrackedFrame, ...]  # tuple of TrackedFrame
+    state: TrackerState     # TrackerState, after them
+    problems: tuple[str, ...]  # tuple of str, what was wrong with their files, the folder left out
+
+
+@dataclass(frozen=True, eq=False)
+class Followed:
+    """All frames of a folder."""
+
+    frames: list[TrackedFrame]  # list of TrackedFrame
+    state: TrackerState     # TrackerState, at the end
+    key: str                # changes with everything they depend on
+    fresh: int              # frames that were followed now; the others had been before
+
+
+def follow_folder(tracker: Tracker, frames: FrameFolder, space: Workspace, key: str, surfaces: bool = False,
+                  progress: Progress | None = None) -> Followed:
+    """Follow a body through a folder of frames; those that were followed before are not followed again.
+
+    What is kept of a chunk, with the tracker's state, depends on every file up to its last frame and nothing after it:
+    when one is missing, damaged or changed, the tracker goes on from the end of the one before.
+    """
+    done: list[TrackedFrame] = []
+    state, fresh, names = tracker.state, 0, []
+    for first in (*range(0, len(frames), AT_ONCE), len(frames)):
+        mine = range(first, min(first + AT_ONCE, len(frames)))
+        files = [[(path.relative_to(frames.folder).as_posix(), path) for path in frames.paths(i)] for i in mine]
+        key = space.digests.of(key, files)
+        names.append(f"{START}{first:08d}" if mine else f"{START}end")
+
+        def follow(folder: Path, mine: range = mine, before: TrackerState = state) -> Chunk:
+            nonlocal fresh
+            fresh += len(mine)
+            if tracker.state.number != before.number:
+                tracker.resume(before)
+            return _followed(tracker, frames, mine, folder / SURFACES if surfaces else None)
+
+        chunk = space.step(names[-1], key, follow)
+        state = chunk.state
+        done += chunk.ready
+        frames.problems += [f"{frames.folder}{text}" for text in chunk.problems]
+        if progress is not None:
+            progress(first + len(mine), len(frames))
+    space.drop_others(START, names)                          # the recording was longer
+    return Followed(done, state, key, fresh)
+
+
+def _followed(tracker: Tracker, frames: FrameFolder, mine: range, surfaces: Path | None) -> Chunk:
+    """Some frames, or none for those that were waiting at the end."""
+    told = len(frames.problems)
+    ready = [frame for i in mine for frame in tracker.push(frames[i])] if mine else tracker.finish()
+    if surfaces is not None:
+        for frame in ready:
+            write_mesh(surfaces / f"{frame.number:06d}.ply", tracker.surface(frame), "single")
+    problems = tuple(text.removeprefix(str(frames.folder)) for text in frames.problems[told:])
+    del frames.problems[told:]
+    return Chunk(tuple(without_points(frame) for frame in ready), tracker.state, problems)

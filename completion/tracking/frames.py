@@ -13,9 +13,7 @@ from scanprep.geometry.mesh import Mesh
 
 from ..partial.scan import NEIGHBOURS, ScanPoints, View, prepare_scan, spread
 
-FEWEST = 60                          # points below which a frame shows nothing
 DENSER = 4                           # times as many points as are matched make the normals
-RIM = 0.35                           # offset of the neighbours' mean, as a share of their reach, at a border
 
 Frame = Mesh | PointCloud | np.ndarray | Sequence[View] | None
 
@@ -33,18 +31,15 @@ def prepare_frame(frame: Frame, count: int, neighbours: int, viewpoints: Any = N
                   ) -> ScanPoints | None:
     """Points with normals of a frame, or None when it shows nothing.
 
-    Normals are those of planes through many neighbours, so that some millimetres of noise do not turn them. Their
-    sign is that of given normals or of the triangles, or else such that they face the viewpoint, or else that of the
-    expected body, or else outward by the form of the cloud alone.
-
-    `frame` Mesh, PointCloud, (n, 3) or (n, 6), metres, a sequence of these (cameras), or None; `viewpoints` (3,),
-    metres, or one for each camera.
+    Normals are those of planes through many neighbours, so that some millimetres of noise do not turn them. Their sign
+    is that of given normals or triangles, else towards the viewpoint, one or one for each camera, else that of the
+    expected body, else outward by the form of the cloud.
     """
     views = [] if frame is None else [frame] if isinstance(frame, Mesh | PointCloud | np.ndarray) else list(frame)
     given = None if viewpoints is None else np.broadcast_to(np.asarray(viewpoints, float), (len(views), 3))
     read = [_read(view, None if given is None else given[i], i) for i, view in enumerate(views)]
     read = [view for view in read if len(view.points) > max(NEIGHBOURS, neighbours)]
-    if sum(len(view.points) for view in read) < FEWEST:
+    if sum(len(view.points) for view in read) < 60:  # points below which a frame shows nothing
         return None
     parts = [_oriented(view, count // len(read), neighbours, expected) for view in read]
     points, normals = (np.concatenate([part[i] for part in parts]) for i in (0, 1))
@@ -104,6 +99,7 @@ def _borders(points: np.ndarray, normals: np.ndarray, dense: np.ndarray, neighbo
     distance, near = cKDTree(dense).query(points, neighbours)
     mean = dense[near].mean(axis=1) - points
     mean -= np.einsum("nd,nd->n", mean, normals)[:, None] * normals
-    border = np.linalg.norm(mean, axis=1) > RIM * distance[:, -1]
+    # offset of the neighbours' mean, as a share of their reach, at a border
+    border = np.linalg.norm(mean, axis=1) > 0.35 * distance[:, -1]
     apart = cKDTree(points).query(points, 5)[0][:, 1:].mean(axis=1)
     return border, float(np.median(apart))

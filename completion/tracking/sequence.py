@@ -1,8 +1,8 @@
 """The motion of a body from a sequence of frames."""
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sized
-from dataclasses import replace
+from collections.abc import Callable, Iterable, Iterator, Sized
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -12,13 +12,16 @@ from model.linear import Subject
 from scanprep.geometry.mesh import Mesh
 from scanprep.threads import one_thread
 
+from ..bodies import FixedBody, ShapedBody, as_body
 from ..motion import Motion
-from .dynamics import inertia, smoothed
-from .frames import Frame
+from ..partial.completion import complete
+from ..partial.free_surface import free_surface
+from ..partial.scan import ScanPoints
+from ..smoothing import inertia, predicted, smooth
+from .frame_fit import FrameFit, Refined, shared_shape, spread_poses
+from .frames import Frame, as_views, prepare_frame
 from .settings import TrackConfig
-from .tracker import TrackedFrame, Tracker, follow_frames
 
-FOUND = 0.1                          # share of the frames in which the body must be found
 Progress = Callable[[int, int], None]
 Surfaces = Callable[[int, Mesh], None]
 
@@ -72,7 +75,7 @@ def track(body: BodyModel | Subject, frames: Iterable[Frame], config: TrackConfi
     tracker = Tracker(body, config, rate, landmarks, viewpoints)
     total = len(frames) if isinstance(frames, Sized) else 0
     done: list[TrackedFrame] = []
-    for frame in follow_frames(tracker, iter(frames)):
+    for frame in tracker.follow(frames):
         if surfaces is not None:
             surfaces(frame.number, tracker.surface(frame))
         done.append(without_points(frame))
@@ -91,8 +94,8 @@ def as_motion(frames: list[TrackedFrame], betas: np.ndarray | None, rate: float,
     x = np.stack([frame.x for frame in frames])
     if config.smoothing:
         weights = inertia(x.shape[1], rate, config.angle_acceleration, config.place_acceleration)
-        x = smoothed(x, np.stack([frame.gradient for frame in frames]), np.stack([f.precision for f in frames]),
-                     weights, config.smoothing)
+        x = smooth(x, np.stack([frame.gradient for frame in frames]), np.stack([f.precision for f in frames]),
+                   weights, config.smoothing)
     residuals = np.array([[frame.residual] for frame in frames])
     return Motion(x[:, :-3].reshape(len(x), -1, 3), x[:, -3:].copy(), betas, rate, residuals, ("surface",),
                   converged=np.array([frame.found for frame in frames]))
@@ -101,9 +104,186 @@ def as_motion(frames: list[TrackedFrame], betas: np.ndarray | None, rate: float,
 def tracking_problem(motion: Motion) -> str | None:
     """Why the motion of tracked frames means nothing, with the likely cause; None where it means something."""
     found = float(motion.converged.mean())
-    if found >= FOUND:
+    if found >= 0.1:  # share of the frames in which the body must be found
         return None
     seen = motion.residuals[np.isfinite(motion.residuals)]
     off = f"the points are {1000 * float(seen.mean()):.0f} mm from the body" if len(seen) else "no frame shows anything"
     return (f"the body was found in {100 * found:.0f}% of the frames, {off}; the wrong unit (--unit), frames of "
             "something else, or another model?")
+
+
+MOMENTUM, LOST = 0.9, 0.5            # share of the velocity that the prediction keeps; after a lost frame
+
+
+@dataclass(frozen=True, eq=False)
+class TrackedFrame:
+    """One frame of a motion."""
+
+    number: int                      # from 0
+    x: np.ndarray                    # (P,), pose (3J) and trans (3)
+    found: bool                      # not lost
+    residual: float                  # metres, mean distance of the points to the surface; NaN without points
+    explained: float                 # share of the points that have the surface near
+    gradient: np.ndarray             # (P,) what the frame's data say near x, for smoothing; zero when it is lost
+    precision: np.ndarray            # (P, P)
+    cloud: ScanPoints | None = None  # its points
+
+
+@dataclass(frozen=True, eq=False)
+class TrackerState:
+    """All that a tracker knows after some frames: another one goes on from there to the very same end."""
+
+    number: int                      # frames taken
+    lost: int                        # how many of the last ones were lost, one after the other
+    betas: np.ndarray | None         # (K,) those found so far, None for the template's own body
+    shape_known: bool                # whether they stay
+    past: tuple[np.ndarray, ...] = ()        # up to two (P,): where the body was, the last frame first
+    kept: tuple[TrackedFrame, ...] = ()      # frames that may still change, with their points
+    random_state: dict[str, Any] | None = None       # of the random numbers of a search from scratch
+
+
+class Tracker:
+    """Follows one body through frames that are handed over one by one.
+
+    For a model the first frames are kept until the shape is found. `landmarks` are of the first frame, as for
+    `complete`; `viewpoints` (3,), metres, or one for each camera, tell where bare points were seen from.
+    """
+
+    def __init__(self, body: BodyModel | Subject, config: TrackConfig, rate: float,
+                 landmarks: tuple[np.ndarray, np.ndarray] | None = None, viewpoints: np.ndarray | None = None) -> None:
+        self.given, self.config, self.rate = body, config, rate
+        self.landmarks, self.viewpoints = landmarks, viewpoints
+        self.person = as_body(body)
+        self.resume(TrackerState(0, 0, body.betas if isinstance(body, Subject) else None,
+                                 not isinstance(self.person, ShapedBody)))
+
+    def resume(self, state: TrackerState) -> None:
+        """Go on where a tracker of the same body and settings was."""
+        self.state = state
+        self._body: FixedBody | None = None          # with the betas of the state
+        self._fit: FrameFit | None = None
+
+    def push(self, frame: Frame) -> list[TrackedFrame]:
+        """Take the next frame; returns those that are done, which may be none or several."""
+        config, state = self.config, self.state
+        expected = predicted(state.past[0], state.past[-1], LOST if state.lost else MOMENTUM) if state.past else None
+        cloud = prepare_frame(frame, config.frame_points, config.normal_points, self.viewpoints,
+                              None if expected is None else self._mesh(expected))
+        if expected is None and cloud is None:
+            self.state = replace(state, number=state.number + 1, kept=(*state.kept, self._tracked(state.number)))
+            return []
+        found = None if cloud is None else self._begin(cloud) if expected is None else self._follow(cloud, expected)
+        good = found is not None and (expected is None or self._fitter(cloud).good(found))
+        tracked = self._tracked(state.number, found.x if found is not None and good else expected, found, cloud)
+        self.state = replace(self.state, number=state.number + 1, lost=0 if tracked.found else state.lost + 1,
+                             past=(tracked.x, *state.past)[:2], kept=(*state.kept, tracked),
+                             random_state=self._random_state())
+        return self._done()
+
+    def follow(self, frames: Iterable[Frame]) -> Iterator[TrackedFrame]:
+        """The frames of a stream, each as soon as it is done."""
+        for frame in frames:
+            yield from self.push(frame)
+        yield from self.finish()
+
+    def finish(self) -> list[TrackedFrame]:
+        """The frames that were still kept."""
+        if not self.state.past:
+            raise ValueError("frames: expected at least one that shows something")
+        return self._done(last=True)
+
+    def surface(self, frame: TrackedFrame) -> Mesh:
+        """The completed surface of a frame: it follows the points where there are any, the model elsewhere.
+
+        [SCAPE] Eq. 10
+        """
+        mesh = self._mesh(frame.x)
+        return mesh if frame.cloud is None or not frame.found else free_surface(mesh, frame.cloud, self.config.start)[0]
+
+    def _begin(self, cloud: ScanPoints) -> Refined:
+        """The first frame that shows something."""
+        start = complete(self.given, as_views(cloud), self.landmarks, self.config.start)
+        self._has_shape(start.betas)
+        fitter = self._fitter(cloud)
+        return fitter.refine(fitter.scan.on(cloud), fitter.body.join(start.pose, start.trans))
+
+    def _follow(self, cloud: ScanPoints, expected: np.ndarray) -> Refined:
+        """A frame after others: near where it is expected, or found again where that explains it better."""
+        fitter, lost = self._fitter(cloud), self.state.lost
+        fit = fitter.scan.on(cloud)
+        found = fitter.refine(fit, expected, None if lost else expected)
+        if fitter.good(found):
+            return found
+        anew = fitter.again(fit, [expected, self.state.past[0]], (lost - 1) % self.config.search_every == 0)
+        return anew if fit.misfit(anew.x) < fit.misfit(found.x) else found
+
+    def _done(self, last: bool = False) -> list[TrackedFrame]:
+        """Frames that will not change any more; those before the first that showed something stand where it does."""
+        if not self.state.shape_known:
+            if not last and len(self.state.kept) < self.config.shape_frames:
+                return []
+            self._find_shape()
+        ready = self.state.kept
+        self.state = replace(self.state, kept=())
+        first = next((f.x for f in ready if f.cloud is not None), None)
+        return [f if f.x.any() or first is None else replace(f, x=first) for f in ready]
+
+    def _find_shape(self) -> None:
+        """The betas from some of the frames kept, and these once more with the person as it is."""
+        before = self.state.betas
+        assert isinstance(self.person, ShapedBody) and before is not None, "a model, completed once"
+        seen = [(f.x, f.cloud) for f in self.state.kept if f.found and f.cloud is not None]
+        self.state = replace(self.state, shape_known=True)
+        if not seen:
+            return
+        chosen = spread_poses(np.stack([self._known().vertices(x) for x, _ in seen]), self.config.shape_views)
+        betas, _ = shared_shape(self.person, [seen[i][1] for i in chosen], np.stack([seen[i][0] for i in chosen]),
+                                before, self.config)
+        self._has_shape(betas)
+        kept = tuple(self._refined(f) for f in self.state.kept)
+        self.state = replace(self.state, kept=kept, past=tuple(f.x for f in kept[:-3:-1]),
+                             random_state=self._random_state())
+
+    def _refined(self, frame: TrackedFrame) -> TrackedFrame:
+        if frame.cloud is None or not frame.found:
+            return frame
+        fitter = self._fitter(frame.cloud)
+        found = fitter.refine(fitter.scan.on(frame.cloud), frame.x, frame.x)
+        return self._tracked(frame.number, found.x, found, frame.cloud)
+
+    def _tracked(self, number: int, x: np.ndarray | None = None, found: Refined | None = None,
+                 cloud: ScanPoints | None = None) -> TrackedFrame:
+        """A frame; what its data say is left out where it is lost, and x is zero before the body was seen."""
+        size = self.person.n_angles + 3
+        out = TrackedFrame(number, np.zeros(size) if x is None else x, False, np.nan, 0.0, np.zeros(size),
+                           np.zeros((size, size)), cloud)
+        if found is None:
+            return out
+        out = replace(out, residual=found.residual, explained=found.explained)
+        good = self._fitter(cloud).good(found)
+        return replace(out, found=True, gradient=found.gradient, precision=found.precision) if good else out
+
+    def _has_shape(self, betas: np.ndarray | None) -> None:
+        """Go on with a person of unknown shape as one of these betas (K,); random numbers begin anew."""
+        if isinstance(self.person, ShapedBody):
+            self.resume(replace(self.state, betas=betas, random_state=None))
+
+    def _known(self) -> FixedBody:
+        if self._body is None:
+            self._body = FixedBody(self.person.model.subject(self.state.betas)) \
+                if isinstance(self.person, ShapedBody) else self.person
+        return self._body
+
+    def _fitter(self, cloud: ScanPoints | None) -> FrameFit:
+        if self._fit is None:
+            assert cloud is not None, "the first fit is of a frame that shows something"
+            self._fit = FrameFit(self._known(), cloud, self.config, self.rate)
+            if self.state.random_state is not None:
+                self._fit.scan.rng.bit_generator.state = self.state.random_state
+        return self._fit
+
+    def _random_state(self) -> dict[str, Any] | None:
+        return self.state.random_state if self._fit is None else dict(self._fit.scan.rng.bit_generator.state)
+
+    def _mesh(self, x: np.ndarray) -> Mesh:
+        return self.person.template.with_vertices(self._known().vertices(x))

@@ -1,18 +1,17 @@
 """`scape learn`: a body model from registered meshes."""
 from __future__ import annotations
 
-import contextlib
 import dataclasses
-import logging
-import re
-from collections.abc import Iterator
+import time
+from collections.abc import Callable
 from pathlib import Path
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 
 from scanprep.batch.opening import FileWorkspace
-from scanprep.batch.steps import KeptSteps, inside
+from scanprep.batch.room import Step, T, inside
+from scanprep.batch.workspace import KeptSteps
 from scanprep.cli import Output, Unit, read_poses
 from scanprep.console import Metric, Outcome, bar
 from scanprep.dataset import RegisteredSet
@@ -30,10 +29,9 @@ from ..cli import about, read_bodies
 from .config import LearnConfig
 from .mixing import MIX, learn_scape_mix
 from .parts import choose_skeleton
-from .scape import learn_blendscape, learn_scape, learning_problem
+from .scape import Progress, learn_blendscape, learn_scape, learning_problem
 from .sexes import learn_by_sex
 from .skinning import SkinConfig, learn_skinning
-from .work import Progress, timed
 
 SEXES = "sexes.csv"                  # in a plain folder of shapes
 Kind = Literal["scape", "blendscape", "skinning", "mixed"]
@@ -79,28 +77,27 @@ def learn(poses: Path, output: Output, shapes: Path | None = None, template: Pat
     known = None if not by_sex or shapes is None else _read_sexes(shapes)
     tree = None if parts is not None else _read_skeleton(skeleton, poses, body)
     marks = _read_marks(landmarks, poses, body)
-    step = KeptSteps(space)
-    with _timed() as seconds:
-        if tree is None:
-            if kind == "mixed":
-                raise ValueError(f"{poses}: a mix of people shows no skeleton; name one with --skeleton")
-            with bar("finding the skeleton") as progress:
-                tree = step("skeleton", (body, posed, parts),
-                            lambda: _find_skeleton(body, posed, parts, step, progress))
-        with bar("learning the model") as progress:
-            models: dict[str, BodyModel]
-            if kind == "mixed":
-                who = [entry.subject or entry.name for entry in RegisteredSet.load(poses).entries]
-                models = {"neutral": learn_scape_mix(body, posed, who, tree, mixed, progress, step)}
-            elif known is not None:
-                assert people is not None
-                models = {**learn_by_sex(body, posed, people, known, tree, scape, progress, step)}
-            elif kind == "blendscape":
-                models = {"neutral": learn_blendscape(body, posed, people, tree, scape, progress, step)}
-            elif kind == "skinning":
-                models = {"neutral": learn_skinning(body, posed, people, tree, skinning, progress, step)}
-            else:
-                models = {"neutral": learn_scape(body, posed, people, tree, scape, progress, step)}
+    kept_steps, seconds = KeptSteps(space), dict[str, float]()
+    step = _timed(kept_steps, seconds)
+    if tree is None:
+        if kind == "mixed":
+            raise ValueError(f"{poses}: a mix of people shows no skeleton; name one with --skeleton")
+        with bar("finding the skeleton") as progress:
+            tree = step("skeleton", (body, posed, parts), lambda: _find_skeleton(body, posed, parts, step, progress))
+    with bar("learning the model") as progress:
+        models: dict[str, BodyModel]
+        if kind == "mixed":
+            who = [entry.subject or entry.name for entry in RegisteredSet.load(poses).entries]
+            models = {"neutral": learn_scape_mix(body, posed, who, tree, mixed, progress, step)}
+        elif known is not None:
+            assert people is not None
+            models = {**learn_by_sex(body, posed, people, known, tree, scape, progress, step)}
+        elif kind == "blendscape":
+            models = {"neutral": learn_blendscape(body, posed, people, tree, scape, progress, step)}
+        elif kind == "skinning":
+            models = {"neutral": learn_skinning(body, posed, people, tree, skinning, progress, step)}
+        else:
+            models = {"neutral": learn_scape(body, posed, people, tree, scape, progress, step)}
     for name, model in models.items():
         path = output if name == "neutral" else output.with_suffix(f".{name}.npz")
         kept = dataclasses.replace(model, info={**model.info, "landmarks": marks})     # type: ignore[type-var]
@@ -111,46 +108,35 @@ def learn(poses: Path, output: Output, shapes: Path | None = None, template: Pat
         Metric("people", 0 if people is None else len(people)), Metric("triangles", len(body.faces)),
         Metric("parts", len(tree.parents)), *about(models["neutral"]),
         *[Metric(f"people of the {name} model", model.info["shapes"]) for name, model in models.items() if by_sex],
-        *_times(seconds, step.found)],
+        *_times(seconds, kept_steps.found)],
         {"scape": scape, "skinning": skinning, "mixed": mixed}, problem=learning_problem(models["neutral"], people))
 
 
-def _find_skeleton(body: Mesh, posed: np.ndarray, parts: int | None, step: KeptSteps, progress: Progress) -> Skeleton:
+def _find_skeleton(body: Mesh, posed: np.ndarray, parts: int | None, step: Step, progress: Progress) -> Skeleton:
     within = inside(step, "skeleton")
-    with timed("skeleton"):
-        if parts is None:
-            return choose_skeleton(body, posed, progress=progress, step=within).skeleton
-        return find_skeleton(body, posed, SkeletonConfig(parts=parts), progress, within)
+    if parts is None:
+        return choose_skeleton(body, posed, progress=progress, step=within).skeleton
+    return find_skeleton(body, posed, SkeletonConfig(parts=parts), progress, within)
+
+
+def _timed(step: KeptSteps, seconds: dict[str, float]) -> Step:
+    """The same steps; how long each that was done now took is written into `seconds`."""
+    def timed(name: str, inputs: Any, make: Callable[[], T]) -> T:
+        begun = time.perf_counter()
+        value = step(name, inputs, make)
+        if "/" not in name and name in step.made:
+            seconds[name] = time.perf_counter() - begun
+        return value
+
+    return timed
 
 
 def _times(seconds: dict[str, float], found: list[str]) -> list[Metric]:
     """Seconds of every step; of one that had been begun before, of what was left."""
-    begun = {name.split("/")[-2] for name in found if "/" in name}
+    begun = {name.split("/")[0] for name in found if "/" in name}
     return [*[Metric(f"time: {name}", "done before") for name in found if "/" not in name],
             *[Metric(f"time: {name}", value, "s, of what was left" if name in begun else "s")
               for name, value in seconds.items()]]
-
-
-@contextlib.contextmanager
-def _timed() -> Iterator[dict[str, float]]:
-    """Seconds of every step that the library logs meanwhile."""
-    seconds: dict[str, float] = {}
-    log, handler = logging.getLogger("model"), logging.Handler(logging.INFO)
-    before = log.level
-
-    def keep(record: logging.LogRecord) -> None:
-        found = re.fullmatch(r"(.+): ([0-9.]+) s", record.getMessage())
-        if found:
-            seconds[found[1]] = seconds.get(found[1], 0.0) + float(found[2])
-
-    handler.emit = keep                                                       # type: ignore[method-assign]
-    log.addHandler(handler)
-    log.setLevel(logging.INFO)
-    try:
-        yield seconds
-    finally:
-        log.removeHandler(handler)
-        log.setLevel(before)
 
 
 def _read_mix(folder: Path) -> tuple[Mesh, np.ndarray]:

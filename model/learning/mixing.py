@@ -10,7 +10,7 @@ from dataclasses import asdict, dataclass, replace
 
 import numpy as np
 
-from scanprep.batch.steps import Step, once
+from scanprep.batch.room import Step, once
 from scanprep.geometry.mesh import Mesh, check_template
 from scanprep.skeleton.tree import Skeleton
 from scanprep.threads import one_thread
@@ -23,11 +23,9 @@ from ..pose_space import PoseSpace
 from ..scape import ScapeModel
 from ..shape_space import ShapeSpace, learn_shape_space
 from .config import LearnConfig
-from .pose import compress, fit_poses
-from .regression import Design
-from .scape import check_skeleton, checked_bodies, pose_examples, pose_prior
+from .regression import Design, compress
+from .scape import Progress, Work, check_skeleton, checked_bodies, fit_poses, pose_examples, pose_prior
 from .within import choose_within, fit_within, held_out_bodies, number_people
-from .work import Progress, Work, timed
 
 # what `learn_scape_mix` takes by default; `refinements` is the largest number of rounds
 MIX = LearnConfig(features="quadratic", ridges=(1e-4, 3e-4, 1e-3, 3e-3, 0.01, 0.03, 0.1), detail=0.005, refinements=6)
@@ -111,11 +109,10 @@ def learn_scape_mix(template: Mesh, bodies: np.ndarray, subjects: Sequence[Hasha
     bodies = checked_bodies(template, bodies, "bodies")
     mix = Mix(BlendedTemplate(template, skeleton, rigid_weights(skeleton)), bodies,
               number_people(subjects, len(bodies)), config)
-    inputs, each = (mix.parts, bodies, mix.who, config), config.refinements * len(bodies)
-    work = Work(progress, 2 * each, step)
-    errors = work.step("how many rounds", inputs, each, lambda inner: held_out_errors(mix, inner))
+    work, inputs = Work(progress, step), (mix.parts, bodies, mix.who, config)
+    errors = work.step("how many rounds", inputs, 0.5, lambda inner: held_out_errors(mix, inner))
     rounds = 1 + int(np.argmin(errors))
-    state, shapes = work.step("poses and shapes in turns", inputs, each, lambda inner: _in_turns(mix, rounds, inner))
+    state, shapes = work.step("poses and shapes in turns", inputs, 0.5, lambda inner: _in_turns(mix, rounds, inner))
     assert state.design is not None
     return _model(mix, state, shapes, {
         "settings": asdict(config), "bodies": len(bodies), "people": mix.people, "rounds": rounds,
@@ -126,11 +123,10 @@ def learn_scape_mix(template: Mesh, bodies: np.ndarray, subjects: Sequence[Hasha
 
 def _in_turns(mix: Mix, rounds: int, work: Work) -> tuple[State, ShapeSpace]:
     """What so many rounds reach, and the space of the shapes, which are then no longer needed."""
-    with timed("poses and shapes in turns"):
-        state = _start(mix)
-        for number in range(rounds):
-            state = _kept_round(mix, state, number, work)
-        return replace(state, S=np.zeros((0, 3, 3))), learn_shape_space(state.S, mix.config.components)
+    state = _start(mix)
+    for number in range(rounds):
+        state = _kept_round(mix, state, number, 1 / rounds, work)
+    return replace(state, S=np.zeros((0, 3, 3))), learn_shape_space(state.S, mix.config.components)
 
 
 def held_out_errors(mix: Mix, work: Work) -> list[float]:
@@ -138,20 +134,19 @@ def held_out_errors(mix: Mix, work: Work) -> list[float]:
     # share of the bodies that is held out to find after how many rounds to stop
     held = held_out_bodies(mix.who, 0.2)
     train = mix.some(np.setdiff1d(np.arange(len(mix.bodies)), held))
-    state, errors = _start(train), list[float]()
+    state, errors, share = _start(train), list[float](), 0.5 / mix.config.refinements
 
     def error(_: Work) -> float:
         model = _model(train, state, learn_shape_space(state.S, mix.config.components), {})
         fitter = ShapeFitter(model, FitConfig(sample=400, polish=0))
         return float(np.mean([fitter.fit(y).mean for y in mix.bodies[held]]))
 
-    with timed("how many rounds"):
-        for number in range(mix.config.refinements):
-            state = _kept_round(train, state, number, work)
-            errors.append(work.step(f"error of round {number}", (mix.parts, mix.bodies, mix.who, mix.config, number),
-                                    len(held), error))
-            if number and errors[-1] > (1 - GAIN) * min(errors[:-1]):
-                break
+    for number in range(mix.config.refinements):
+        state = _kept_round(train, state, number, share, work)
+        errors.append(work.step(f"error of round {number}", (mix.parts, mix.bodies, mix.who, mix.config, number),
+                                share, error))
+        if number and errors[-1] > (1 - GAIN) * min(errors[:-1]):
+            break
     return errors
 
 
@@ -171,9 +166,9 @@ def _start(mix: Mix) -> State:
     return State(poses, PoseSpace.identity(skeleton), S, None)
 
 
-def _kept_round(mix: Mix, state: State, number: int, work: Work) -> State:
+def _kept_round(mix: Mix, state: State, number: int, share: float, work: Work) -> State:
     """The next round, in a step."""
-    return work.step(f"round {number}", (mix.parts, mix.bodies, mix.who, mix.config, number), len(mix.bodies),
+    return work.step(f"round {number}", (mix.parts, mix.bodies, mix.who, mix.config, number), share,
                      lambda inner: _next_round(mix, state, number, inner))
 
 
@@ -183,7 +178,8 @@ def _next_round(mix: Mix, state: State, number: int, work: Work) -> State:
     S, poses = _simplified(state.S, 20 * 2**number), state.poses.copy()
     for person in range(mix.people if number else 0):
         mine = mix.who == person
-        poses[mine] = fit_poses(mix.parts.subject(state.space, S[person]), mix.bodies[mine], poses[mine], work)
+        poses[mine] = fit_poses(mix.parts.subject(state.space, S[person]), mix.bodies[mine], poses[mine], Work(None))
+        work.tick(float(mine.mean()))
     space, design = _learn_pose(mix, State(poses, state.space, S, state.design))         # [SCAPE] Eq. 4, Eq. 5
     return State(poses, space, _learn_people(mix, poses, space), design)                # [SCAPE] Eq. 8
 

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.spatial import cKDTree
 
-from scanprep.batch.steps import Step, once
+from scanprep.batch.room import Step, once
 from scanprep.decimation.decimate import decimate
 from scanprep.geometry.mesh import Mesh
 from scanprep.skeleton.find import find_skeleton
@@ -16,8 +16,7 @@ from scanprep.threads import one_thread
 
 from ..blending import BlendedTemplate, rigid_weights
 from .config import LearnConfig
-from .pose import learn_pose
-from .work import Progress, Work
+from .scape import Progress, Work, learn_pose
 
 QUICK = LearnConfig(prunings=(0.01,), ridges=(1e-3, 1e-2), refinements=1)
 MORE, TRIES = 4, 3                   # parts more each time, and the largest number of times
@@ -49,7 +48,7 @@ def choose_skeleton(template: Mesh, poses: np.ndarray, progress: Progress | None
     progress : callable, optional
         Called with the skeletons done and their largest number.
     step : callable, optional
-        Keeps every skeleton and its error, as `scanprep.batch.steps.Step`.
+        Keeps every skeleton and its error, as `scanprep.batch.room.Step`.
 
     Raises
     ------
@@ -64,12 +63,11 @@ def choose_skeleton(template: Mesh, poses: np.ndarray, progress: Progress | None
         """A skeleton and its error; None where there is no tree of so many parts, or parts are too small to compare."""
         try:
             found = find_skeleton(template, poses, settings, step=step)
-            left_out = _left_out_error(poses[:, vertices], coarse_skeleton(found, template, coarse), coarse)
+            return found, _left_out_error(poses[:, vertices], coarse_skeleton(found, template, coarse), coarse)
         except ValueError:
             if settings.parts is None:
                 raise
             return None
-        return found, left_out
 
     def kept(settings: SkeletonConfig) -> tuple[Skeleton, float] | None:
         name = "best parts" if settings.parts is None else f"{settings.parts} parts"
@@ -122,4 +120,4 @@ def coarse_skeleton(skeleton: Skeleton, template: Mesh, coarse: Mesh) -> Skeleto
 def _left_out_error(poses: np.ndarray, skeleton: Skeleton, coarse: Mesh) -> float:
     """Mean distance in metres of the vertices of left-out poses (M, n, 3) of the coarse bodies."""
     parts = BlendedTemplate(coarse, skeleton, rigid_weights(skeleton))
-    return learn_pose(parts, poses, QUICK, Work(None, 1)).design.left_out_error
+    return learn_pose(parts, poses, QUICK, Work(None)).design.left_out_error

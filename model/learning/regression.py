@@ -3,6 +3,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from operator import attrgetter
 
 import numpy as np
 
@@ -50,7 +51,7 @@ class Design:
             if self.regressor == "svr":
                 slope, mean = _support_vectors(X - centre, Q[:, faces], v_hat[faces], self.ridge)
             else:
-                slope = _ridge(X - centre, self.ridge) @ flat
+                slope = ridge_operator(X - centre, self.ridge) @ flat
             return np.concatenate([(mean - centre @ slope)[None], slope])
 
         return self.space(solve)
@@ -87,18 +88,15 @@ def choose_design(template: Mesh, skeleton: Skeleton, poses: np.ndarray, Q: np.n
     at = {name: values[len(values) // 2] for name, values in choices.items()}
     if start is not None:
         at = {name: getattr(start, name) for name in choices}
-    best: Design | None = None
+    def tried(**chosen: float) -> Design:
+        design = make_design(template, skeleton, poses, config, **{**at, **chosen})
+        return replace(design, left_out_error=judge(_left_out(design, poses, Q)))
+
+    best = tried()
     for name, values in choices.items():
-        for value in sorted(values, key=lambda v: v != at[name]):              # what stands already comes first
-            if best is not None and value == at[name]:
-                continue
-            tried = make_design(template, skeleton, poses, config, **{**at, name: value})
-            tried = replace(tried, left_out_error=judge(_left_out(tried, poses, Q)))
-            if best is None or tried.left_out_error < best.left_out_error:
-                best = tried
-        assert best is not None
+        others = [tried(**{name: value}) for value in values if value != at[name]]
+        best = min([best, *others], key=attrgetter("left_out_error"))          # of equals the one that stands already
         at[name] = getattr(best, name)
-    assert best is not None
     return best
 
 
@@ -159,7 +157,7 @@ def _groups(template: Mesh, features: PoseFeatures) -> list[tuple[int, np.ndarra
     return groups
 
 
-def _ridge(centred: np.ndarray, ridge: float) -> np.ndarray:
+def ridge_operator(centred: np.ndarray, ridge: float) -> np.ndarray:
     """(n, M) matrix that gives the slopes of a ridge regression on centred features (M, n)."""
     M, n = centred.shape
     if n <= M:
@@ -172,7 +170,7 @@ def _left_out(design: Design, poses: np.ndarray, Q: np.ndarray) -> np.ndarray:
     delta, out = design.features.evaluate(poses), np.empty_like(Q)
     for _, used, faces in design.groups:
         X = delta[:, used] - delta[:, used].mean(axis=0)
-        hat = X @ _ridge(X, design.ridge) + 1 / len(X)
+        hat = X @ ridge_operator(X, design.ridge) + 1 / len(X)
         target = Q[:, faces].reshape(len(X), -1)
         off = (target - hat @ target) / np.maximum(1 - np.diag(hat), 1e-6)[:, None]
         out[:, faces] = (target - off).reshape(len(X), len(faces), 3, 3)
@@ -206,3 +204,41 @@ def _support_vectors(X: np.ndarray, Q: np.ndarray, v_hat: np.ndarray, ridge: flo
     back = (unit[:, None] * modes[good]).reshape(len(unit), *mean.shape) / weight
     flat = back.reshape(len(unit), -1)
     return slopes @ flat, mean.ravel() + offsets @ flat
+
+
+def compress(space: PoseSpace, poses: np.ndarray, template: Mesh, tolerance: float) -> PoseSpace:
+    """The pose space with those mixtures of its features alone that matter for the edges in the poses (M, J, 3) seen.
+
+    The fast path pays for features one by one. In each part an edge may change by the tolerance, metres root mean
+    square.
+    """
+    features, delta = space.features, space.features.evaluate(poses)
+    v_hat = np.swapaxes(template.corners[:, 1:] - template.corners[:, :1], -1, -2)
+    part, mixes, coefficients = [], [], []
+    for p, faces in enumerate(space.faces_of_part):
+        mine = features.of_part(p)
+        a = space.coefficients[p].astype(np.float64)
+        X = delta[:, mine][:, 1:]
+        centre = X.mean(axis=0)
+        scale, axes = _principal(X - centre)                        # X - centre = U diag(scale) axesᵀ
+        moved = (a[1:] @ v_hat[faces]).reshape(len(a) - 1, 6 * len(faces))
+        U, s, _ = np.linalg.svd((scale[:, None] * (axes.T @ moved)), full_matrices=False)
+        left = np.sqrt(np.maximum(np.cumsum((s**2)[::-1])[::-1], 0) / (len(poses) * 2 * len(faces)))
+        r = int((left > tolerance).sum())
+        W = axes @ (U[:, :r] / scale[:, None])                      # features -> r numbers of unit scatter
+        back = (U[:, :r] * scale[:, None]).T @ axes.T               # r numbers -> features
+        kept = np.tensordot(back, a[1:], axes=1)
+        constant = a[0] + np.tensordot(centre, a[1:], axes=1) - np.tensordot(centre @ W, kept, axes=1)
+        part += [p] * (1 + r)
+        mixes.append(np.concatenate([np.zeros((*features.mix.shape[:2], 1)), features.mix[..., mine][..., 1:] @ W],
+                                    axis=-1))
+        coefficients.append(np.concatenate([constant[None], kept]).astype(np.float32))
+    fewer = PoseFeatures(features.skeleton, features.lift, np.array(part), np.concatenate(mixes, axis=-1))
+    return PoseSpace(fewer, tuple(coefficients))
+
+
+def _principal(X: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Scales (k,) and axes (n, k) of centred features (M, n), without those in which nothing varies."""
+    _, s, Vt = np.linalg.svd(X, full_matrices=False)
+    good = s > 1e-9 * max(s.max(initial=0.0), 1e-9)
+    return s[good], Vt[good].T

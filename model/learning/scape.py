@@ -1,13 +1,15 @@
 """Learning SCAPE and BlendSCAPE models from registered meshes."""
 from __future__ import annotations
 
-from dataclasses import asdict
+from collections.abc import Callable
+from copy import copy
+from dataclasses import asdict, dataclass, replace
 from functools import partial
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
-from scanprep.batch.steps import Step, once
+from scanprep.batch.room import Step, inside, once
 from scanprep.geometry.mesh import Mesh, check_template
 from scanprep.meaning import HAND, extent, size, unit_problem
 from scanprep.skeleton.tree import Skeleton
@@ -18,13 +20,42 @@ from ..blending import BlendedTemplate, rigid_weights
 from ..body import BodyModel
 from ..digests import body_digest, body_digests, digest
 from ..features import twists
-from ..gradients import GradientSystem, shape_gradients
+from ..fitting import FitConfig, PoseFitter
+from ..gradients import GradientSystem, pose_gradients, shape_gradients
+from ..linear import Subject
 from ..pose_space import PoseSpace
 from ..scape import BlendScapeModel, ScapeModel
 from ..shape_space import ShapeSpace, learn_shape_space
 from .config import LearnConfig
-from .pose import LearnedPose, learn_pose
-from .work import Progress, Work, timed
+from .regression import Design, choose_design, compress
+
+Progress = Callable[[int, int], None]
+T = TypeVar("T")
+POSES = 2 / 3                        # of the time of learning, where there are people as well
+
+
+class Work:
+    """Steps of some work, each a share of the whole, of which progress is told in thousandths."""
+
+    def __init__(self, progress: Progress | None, step: Step = once) -> None:
+        self._progress, self._step, self._part, self._done = progress, step, 1.0, [0.0]
+
+    def tick(self, share: float) -> None:
+        """So much of this work is done."""
+        self._done[0] += share * self._part
+        if self._progress:
+            self._progress(round(1000 * self._done[0]), 1000)
+
+    def step(self, name: str, inputs: Any, share: float, make: Callable[[Work], T]) -> T:
+        """What `make` returns, or returned before for the same inputs; it is a share of this work either way.
+
+        `make` gets the work of its own steps, which are forgotten once it is done.
+        """
+        inner, end = copy(self), self._done[0] + share * self._part
+        inner._step, inner._part = inside(self._step, name), share * self._part
+        value = self._step(name, inputs, lambda: make(inner))
+        self.tick((end - self._done[0]) / self._part)
+        return value
 
 
 @one_thread()
@@ -46,7 +77,7 @@ def learn_scape(template: Mesh, poses: np.ndarray, shapes: np.ndarray | None, sk
     progress : callable, optional
         Called with the work done and the whole.
     step : callable, optional
-        Keeps what was worked out on the way, as `scanprep.batch.steps.Step`.
+        Keeps what was worked out on the way, as `scanprep.batch.room.Step`.
 
     Raises
     ------
@@ -58,12 +89,11 @@ def learn_scape(template: Mesh, poses: np.ndarray, shapes: np.ndarray | None, sk
     config = config or LearnConfig()
     poses, shapes = checked_training(template, skeleton, poses, shapes)
     parts = BlendedTemplate(template, skeleton, rigid_weights(skeleton))                   # R of each part
-    work = Work(progress, amount(poses, shapes, config), step)
+    work = Work(progress, step)
     learned = learn_pose(parts, poses, config, work)                                       # [SCAPE] Eq. 3, Eq. 4, Eq. 5
     people = learn_people(parts, learned.space, shapes, config, work)                      # [SCAPE] Eq. 7, Eq. 8
-    examples = pose_examples(template, skeleton, learned.poses, shapes)
-    return ScapeModel(template, skeleton, learned.space, people, *pose_prior(examples, len(poses)),
-                      how_learned(template, learned, poses, shapes, config), pose_examples=examples)
+    return ScapeModel(template, skeleton, learned.space, people,
+                      **seen_in_training(template, skeleton, learned, poses, shapes, config))
 
 
 @one_thread()
@@ -92,17 +122,111 @@ def learn_blendscape(template: Mesh, poses: np.ndarray, shapes: np.ndarray | Non
     # a share of the template's diagonal: so far a rotation blends over the border of its part
     blend = face_weights(template, skeleton, 0.01 * float(np.linalg.norm(np.ptp(template.vertices, axis=0))))
     parts = BlendedTemplate(template, skeleton, blend)
-    work = Work(progress, amount(poses, shapes, config), step)
+    work = Work(progress, step)
     learned = learn_pose(parts, poses, config, work)
     people = learn_people(parts, learned.space, shapes, config, work)
-    examples = pose_examples(template, skeleton, learned.poses, shapes)
-    return BlendScapeModel(template, skeleton, learned.space, people, *pose_prior(examples, len(poses)),
-                           how_learned(template, learned, poses, shapes, config), pose_examples=examples, blend=blend)
+    return BlendScapeModel(template, skeleton, learned.space, people, blend=blend,
+                           **seen_in_training(template, skeleton, learned, poses, shapes, config))
 
 
-def amount(poses: np.ndarray, shapes: np.ndarray | None, config: LearnConfig) -> int:
-    """How much work it is, in bodies that are fitted or solved for."""
-    return (config.refinements + 1) * len(poses) + (0 if shapes is None else len(shapes))
+@dataclass(frozen=True, eq=False)
+class LearnedPose:
+    """What was learned of the poses: the pose space, the poses (M, J, 3) of the training bodies, what was chosen."""
+
+    space: PoseSpace
+    poses: np.ndarray
+    design: Design
+
+
+def learn_pose(parts: BlendedTemplate, bodies: np.ndarray, config: LearnConfig, work: Work) -> LearnedPose:
+    """The pose space, first as in the paper, then refined on the stitched surface.
+
+    [SCAPE] Eq. 3, Eq. 4, Eq. 5
+    """
+    inputs = parts, bodies, replace(config, components=0)
+    return work.step("pose space", inputs, POSES, lambda inner: _learned(parts, bodies, config, inputs, inner))
+
+
+def _learned(parts: BlendedTemplate, bodies: np.ndarray, config: LearnConfig, inputs: object, work: Work
+             ) -> LearnedPose:
+    share = 1 / (1 + config.refinements)
+    learned = work.step("first fit", inputs, share, lambda _: _first(parts, bodies, config))
+    for k in range(config.refinements):
+        learned = work.step(f"refinement {k}", inputs, share,
+                            partial(_refined, parts, bodies, config, learned, k == 0))
+    tolerance = config.detail * parts.template.mean_edge
+    return learned if not tolerance else replace(
+        learned, space=compress(learned.space, learned.poses, parts.template, tolerance))
+
+
+def _first(parts: BlendedTemplate, bodies: np.ndarray, config: LearnConfig) -> LearnedPose:
+    """Q of every body from the rotations of Procrustes, regressed on the joint twists."""
+    skeleton = parts.skeleton
+    poses = skeleton.pose_of(skeleton.fit_rotations(parts.template, bodies))                     # R, then Δr
+    Q = pose_gradients(_system(parts, config), parts.local_edges(bodies, poses))                # [SCAPE] Eq. 5
+    design = choose_design(parts.template, skeleton, poses, Q, config, _by_edges(parts, Q))
+    return LearnedPose(design.fit(poses, Q), poses, design)                                     # [SCAPE] Eq. 4
+
+
+def _refined(parts: BlendedTemplate, bodies: np.ndarray, config: LearnConfig, learned: LearnedPose, choosing: bool,
+             work: Work) -> LearnedPose:
+    """The part rotations fitted anew, and Q regressed again on what the stitched model leaves.
+
+    Stitching sees only what neighbouring triangles agree on, and Eq. 4 does not know it. So what the stitched model
+    leaves of every body, as deformation of the triangles, is added to what the model says now, and regressed again:
+    majorise and minimise, which lowers the error of the stitched edges step by step. What Q depends on is chosen first
+    by the edges of left-out poses, and after the first fit of the rotations once more by their stitched vertices.
+    """
+    space, design, system = learned.space, learned.design, _system(parts, config)
+    poses = fit_poses(parts.subject(space), bodies, learned.poses, work)
+    # corrections of the regression after each fit of the part rotations
+    for number in range(3):
+        left = bodies - parts.subject(space).vertices(poses)
+        Q = space.gradients(poses)
+        Q += pose_gradients(system, parts.v_hat + parts.local_edges(left, poses)) - np.eye(3)   # [SCAPE] Eq. 5
+        if choosing and number == 0:
+            design = choose_design(parts.template, parts.skeleton, poses, Q, config, _by_vertices(parts, bodies, poses),
+                                   design)
+        space = design.fit(poses, Q)                                                            # [SCAPE] Eq. 4
+    return LearnedPose(space, poses, design)
+
+
+def _system(parts: BlendedTemplate, config: LearnConfig) -> GradientSystem:
+    return GradientSystem(parts.template, config.smoothness, parts.skeleton.part_of_face)
+
+
+def fit_poses(subject: Subject, bodies: np.ndarray, poses: np.ndarray, work: Work, config: FitConfig | None = None
+              ) -> np.ndarray:
+    """Poses (M, J, 3), radians, with which the subject comes nearest to the bodies, from poses nearby."""
+    fitter = PoseFitter(subject, config or FitConfig(polish=0))
+    fitted = []
+    for body, pose in zip(bodies, poses, strict=True):
+        fitted.append(fitter.fit(body, pose).pose)
+        work.tick(1 / len(bodies))
+    return np.stack(fitted)
+
+
+def _by_edges(parts: BlendedTemplate, Q: np.ndarray) -> Callable[[np.ndarray], float]:
+    """A judge of predictions of Q (M, F, 3, 3): the root mean square error of an edge."""
+    v_hat = np.swapaxes(parts.v_hat, -1, -2)
+
+    def error(predicted: np.ndarray) -> float:
+        return float(np.sqrt(np.mean([(((q - p) @ v_hat) ** 2).sum(axis=1).mean()
+                                      for q, p in zip(Q, predicted, strict=True)])))
+
+    return error
+
+
+def _by_vertices(parts: BlendedTemplate, bodies: np.ndarray, poses: np.ndarray) -> Callable[[np.ndarray], float]:
+    """A judge of predictions of Q (M, F, 3, 3): the mean distance of the stitched vertices, well placed."""
+    def error(predicted: np.ndarray) -> float:
+        far = []
+        for body, pose, Q in zip(bodies, poses, predicted, strict=True):
+            off = parts.stitched(Q, pose) - body
+            far.append(np.linalg.norm(off - off.mean(axis=0), axis=1).mean())
+        return float(np.mean(far))
+
+    return error
 
 
 def learn_people(parts: BlendedTemplate, space: PoseSpace, shapes: np.ndarray | None, config: LearnConfig, work: Work
@@ -112,15 +236,12 @@ def learn_people(parts: BlendedTemplate, space: PoseSpace, shapes: np.ndarray | 
     [SCAPE] Eq. 7, Eq. 8
     """
     if shapes is None:
+        work.tick(1 - POSES)
         return ShapeSpace.empty(len(parts.template.faces))
 
-    def learn(inner: Work) -> ShapeSpace:
-        S = shape_deformations(parts, space, shapes, config, inner)
-        with timed("shape components"):
-            return learn_shape_space(S, config.components)
-
-    return work.step("shape components", (parts, space, shapes, config.smoothness, config.components), len(shapes),
-                     learn)
+    return work.step(
+        "shape components", (parts, space, shapes, config.smoothness, config.components), 1 - POSES,
+        lambda inner: learn_shape_space(shape_deformations(parts, space, shapes, config, inner), config.components))
 
 
 def shape_deformations(parts: BlendedTemplate, space: PoseSpace, shapes: np.ndarray, config: LearnConfig, work: Work
@@ -141,21 +262,22 @@ def shape_deformations(parts: BlendedTemplate, space: PoseSpace, shapes: np.ndar
         return shape_gradients(system, posed, parts.local_edges(y, pose)).astype(np.float32)
 
     S = np.empty((len(shapes), len(template.faces), 3, 3), dtype=np.float32)
-    with timed("shape of every person"):
-        for i, y in enumerate(shapes):
-            S[i] = work.step(f"person {body_digest(y)}", (parts, space, config.smoothness, y), 1,
-                             partial(deformation, y))
+    for i, y in enumerate(shapes):
+        S[i] = work.step(f"person {body_digest(y)}", (parts, space, config.smoothness, y), 1 / len(shapes),
+                         partial(deformation, y))
     return S
 
 
-def how_learned(template: Mesh, learned: LearnedPose, poses: np.ndarray, shapes: np.ndarray | None, config: LearnConfig
-                ) -> dict[str, Any]:
-    """What a model keeps of its making: settings, what was chosen, sizes and digests of the training set."""
-    design = learned.design
-    return {"settings": asdict(config), "poses": len(poses), "shapes": 0 if shapes is None else len(shapes),
-            "pruning": design.pruning, "ridge": design.ridge, "features": learned.space.features.count,
-            "left_out_error": design.left_out_error, "digest": digest(template, poses, shapes),
-            "digests": body_digests(poses, shapes)}
+def seen_in_training(template: Mesh, skeleton: Skeleton, learned: LearnedPose, poses: np.ndarray,
+                     shapes: np.ndarray | None, config: LearnConfig) -> dict[str, Any]:
+    """What a model keeps of its making: the pose prior, its examples, and settings, choices, sizes and digests."""
+    design, examples = learned.design, pose_examples(template, skeleton, learned.poses, shapes)
+    mean, covariance = pose_prior(examples, len(poses))
+    return {"pose_mean": mean, "pose_covariance": covariance, "pose_examples": examples, "info": {
+        "settings": asdict(config), "poses": len(poses), "shapes": 0 if shapes is None else len(shapes),
+        "pruning": design.pruning, "ridge": design.ridge, "features": learned.space.features.count,
+        "left_out_error": design.left_out_error, "digest": digest(template, poses, shapes),
+        "digests": body_digests(poses, shapes)}}
 
 
 def pose_prior(examples: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
@@ -177,16 +299,10 @@ def pose_examples(template: Mesh, skeleton: Skeleton, poses: np.ndarray, shapes:
                   ) -> np.ndarray:
     """Poses (M, J, 3), radians, that bodies were seen in: the training poses, and how the people (P, N, 3) stand.
 
-    The root is at rest.
+    All are at most π, the root is at rest.
     """
-    out = _rootless(poses)
-    if shapes is None:
-        return out
-    return np.concatenate([out, _rootless(skeleton.pose_of(skeleton.fit_rotations(template, shapes)))])
-
-
-def _rootless(poses: np.ndarray) -> np.ndarray:
-    """Poses (M, J, 3), radians, at most π and without the root's."""
+    if shapes is not None:
+        poses = np.concatenate([poses, skeleton.pose_of(skeleton.fit_rotations(template, shapes))])
     out = twists(poses).copy()
     out[:, 0] = 0
     return out

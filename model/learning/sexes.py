@@ -1,25 +1,28 @@
-"""Models of women, of men and of everybody, from one training set."""
+"""Models of women, of men and of everybody, from one training set; and the plane that parts their betas."""
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
-from scanprep.batch.steps import Step, once
+from scanprep.batch.room import Step, once
 from scanprep.geometry.mesh import Mesh
 from scanprep.skeleton.tree import Skeleton
 from scanprep.threads import one_thread
 
 from ..blending import BlendedTemplate, rigid_weights
+from ..body import BodyModel
+from ..digests import body_digests, digest
 from ..scape import ScapeModel
 from ..shape_space import ShapeSpace, learn_shape_space
 from .config import LearnConfig
-from .pose import learn_pose
-from .scape import amount, checked_training, how_learned, pose_examples, pose_prior, shape_deformations
-from .sex_plane import PLANE, learn_sex_plane
-from .work import Progress, Work, timed
+from .scape import POSES, Progress, Work, checked_training, learn_pose, seen_in_training, shape_deformations
 
 SEXES = ("female", "male")
+PLANE = "sex_plane"                  # its place in a model's info
+SOFTNESS = (0.003, 0.01, 0.03, 0.1, 0.3, 1.0)        # C of the support vectors, the softest first
 
 
 @one_thread()
@@ -54,28 +57,27 @@ def learn_by_sex(template: Mesh, poses: np.ndarray, shapes: np.ndarray, sexes: S
     assert people is not None
     sex, groups = np.array(list(sexes), dtype=object), _groups(sexes, len(people))
     parts = BlendedTemplate(template, skeleton, rigid_weights(skeleton))
-    work = Work(progress, amount(poses, people, config), step)
+    work = Work(progress, step)
     learned = learn_pose(parts, poses, config, work)
 
     def learn(inner: Work) -> tuple[dict[str, ShapeSpace], dict[str, object] | None]:
         S = shape_deformations(parts, learned.space, people, config, inner)
-        with timed("shape components"):
-            spaces = {name: learn_shape_space(S[chosen], config.components) for name, chosen in groups.items()}
-            if not all(name in groups for name in SEXES):
-                return spaces, None
-            known = np.isin(sex, SEXES)
-            return spaces, learn_sex_plane(spaces["neutral"].betas_of(S[known]), sex[known].tolist()).kept()
+        spaces = {name: learn_shape_space(S[chosen], config.components) for name, chosen in groups.items()}
+        if not all(name in groups for name in SEXES):
+            return spaces, None
+        known = np.isin(sex, SEXES)
+        return spaces, learn_sex_plane(spaces["neutral"].betas_of(S[known]), sex[known].tolist()).kept()
 
     spaces, plane = work.step("shape components", (parts, learned.space, people, config.smoothness, config.components,
-                                                   list(sexes)), len(people), learn)
-    examples = pose_examples(template, skeleton, learned.poses, people)
-    prior = pose_prior(examples, len(poses))
+                                                   list(sexes)), 1 - POSES, learn)
+    kept = seen_in_training(template, skeleton, learned, poses, people, config)
     models = {}
     for name, chosen in groups.items():
-        info = {**how_learned(template, learned, poses, people[chosen], config), "sex": name}
+        info = {**kept["info"], "sex": name, "shapes": len(chosen), "digest": digest(template, poses, people[chosen]),
+                "digests": body_digests(poses, people[chosen])}
         if name == "neutral" and plane is not None:
             info[PLANE] = plane
-        models[name] = ScapeModel(template, skeleton, learned.space, spaces[name], *prior, info, pose_examples=examples)
+        models[name] = ScapeModel(template, skeleton, learned.space, spaces[name], **{**kept, "info": info})
     return models
 
 
@@ -93,3 +95,120 @@ def _groups(sexes: Sequence[str], count: int) -> dict[str, np.ndarray]:
         if len(chosen) >= 2:
             groups[sex] = chosen
     return groups
+
+
+@dataclass(frozen=True, eq=False)
+class SexPlane:
+    """A plane between the betas of women and men.
+
+    `weights` (K,) is its unit normal, towards the men; `weights @ betas + bias` the signed distance. `accuracy` is the
+    share of the `count` people that planes learned without them told right, and `1 / (1 + exp(-slope distance))` the
+    probability of a man, by the same planes.
+    """
+
+    weights: np.ndarray
+    bias: float
+    count: int
+    accuracy: float
+    slope: float
+
+    def kept(self) -> dict[str, Any]:
+        """What a model keeps of it."""
+        return {**vars(self), "weights": self.weights.tolist()}
+
+
+@dataclass(frozen=True)
+class SexGuess:
+    """Whether betas are a woman's or a man's: the sex, the signed distance from the plane between them in standard
+    deviations, positive for a man, and the probability of that sex, as often as the model's own people were told right
+    at such a margin.
+    """
+
+    sex: str
+    margin: float
+    probability: float
+
+
+def learn_sex_plane(betas: np.ndarray, sexes: Sequence[str]) -> SexPlane:
+    """The plane of a linear support vector machine between betas (P, K) of "female" and "male", at least two of each.
+
+    How soft it is, is chosen by planes that have not seen a fifth of the people; of those that tell equally well the
+    softest is taken. The first betas count, a third as many as people.
+    """
+    betas, men = np.asarray(betas, dtype=np.float64), np.array([sex == "male" for sex in sexes], dtype=bool)
+    # three people for each beta that counts: with a beta a person everybody is like nobody else
+    count, betas = betas.shape[1], betas[:, :max(1, len(betas) // 3)]
+    tried = [(_unseen(betas, men, C), C) for C in SOFTNESS]
+    right = [float(np.mean((margins > 0) == men)) for margins, _ in tried]
+    margins, C = tried[int(np.argmax(right))]
+    weights, bias = _plane(betas, men, C)
+    weights = np.pad(weights, (0, count - len(weights)))
+    return SexPlane(weights, bias, len(betas), max(right), _certainty(margins, men))
+
+
+def _plane(betas: np.ndarray, men: np.ndarray, C: float) -> tuple[np.ndarray, float]:
+    """Normal (K,), of length 1, and bias of the plane of a support vector machine."""
+    from sklearn.svm import SVC
+
+    machine = SVC(kernel="linear", C=C, class_weight="balanced").fit(betas, men)
+    size = np.linalg.norm(machine.coef_[0])
+    return machine.coef_[0] / size, float(machine.intercept_[0] / size)
+
+
+def _unseen(betas: np.ndarray, men: np.ndarray, C: float) -> np.ndarray:
+    """(P,) distances of people from planes that were learned without them."""
+    from sklearn.model_selection import StratifiedKFold
+
+    folds = StratifiedKFold(min(5, int(men.sum()), int((~men).sum())), shuffle=True, random_state=0)
+    margins = np.empty(len(men))
+    for known, new in folds.split(betas, men):
+        weights, bias = _plane(betas[known], men[known], C)
+        margins[new] = betas[new] @ weights + bias
+    return margins
+
+
+def _certainty(margins: np.ndarray, men: np.ndarray) -> float:
+    """How fast the odds of a man grow with margins (P,)."""
+    from sklearn.linear_model import LogisticRegression
+
+    found = LogisticRegression(class_weight="balanced", fit_intercept=False).fit(margins[:, None], men)
+    return max(float(found.coef_[0, 0]), 0.0)
+
+
+def guess_sex(model: BodyModel, betas: np.ndarray) -> SexGuess:
+    """Whether betas of the neutral model are a woman's or a man's, by the plane that the model keeps.
+
+    Parameters
+    ----------
+    model : BodyModel
+        The neutral model of `learn_by_sex`, learned from people of both sexes.
+    betas : (k,) float, k ≤ K
+
+    Raises
+    ------
+    ValueError
+        A model that keeps no plane, betas of the wrong shape or not finite.
+    """
+    plane = sex_plane(model)
+    betas = np.asarray(betas, dtype=np.float64)
+    if betas.ndim != 1 or len(betas) > len(plane.weights) or not np.isfinite(betas).all():
+        raise ValueError(f"betas: expected at most {len(plane.weights)} finite numbers, got shape {betas.shape}")
+    margin = float(betas @ plane.weights[:len(betas)] + plane.bias)
+    sure = 1 / (1 + np.exp(-plane.slope * abs(margin)))
+    return SexGuess("male" if margin > 0 else "female", margin, float(sure))
+
+
+def sex_plane(model: BodyModel) -> SexPlane:
+    """The plane that a model keeps, or ValueError where it keeps none or a damaged one."""
+    kept = model.info.get(PLANE)
+    if kept is None:
+        raise ValueError("model: it keeps nothing that tells women from men; learn one of both sexes with "
+                         "learn_by_sex (scape learn --by-sex)")
+    try:
+        weights = np.array(kept["weights"], dtype=np.float64)
+        numbers = {name: float(kept[name]) for name in ("bias", "accuracy", "slope")}
+        if weights.shape != (model.n_betas,) or not np.isfinite([*weights, *numbers.values()]).all():
+            raise ValueError(f"expected {model.n_betas} finite weights, found shape {weights.shape}")
+        return SexPlane(weights, count=int(kept["count"]), **numbers)
+    except (KeyError, TypeError, ValueError) as error:
+        raise ValueError(f"model: what tells women from men is damaged ({error})") from None

@@ -3,10 +3,11 @@ from __future__ import annotations
 
 from dataclasses import asdict, dataclass, replace
 from functools import partial
+from operator import itemgetter
 
 import numpy as np
 
-from scanprep.batch.steps import Step, once
+from scanprep.batch.room import Step, once
 from scanprep.geometry.mesh import Mesh
 from scanprep.ranges import Count, Positive, Settings
 from scanprep.skeleton.tree import Skeleton
@@ -19,9 +20,8 @@ from ..fitting import FitConfig, PoseFitter, ShapeFitter
 from ..pose_space import kept_directions
 from ..shape_space import learn_shape_space
 from ..skinning import SkinningModel, unblended
-from .pose import fit_poses
-from .scape import checked_training, pose_examples, pose_prior
-from .work import Progress, Work, timed
+from .regression import ridge_operator
+from .scape import POSES, Progress, Work, checked_training, fit_poses, pose_examples, pose_prior
 
 RIDGES = (1e-4, 1e-3, 3e-3, 0.01, 0.03, 0.1, 0.3)      # penalties; the one that predicts left-out poses best is taken
 LEVELS = 8                           # of how freely a joint corrects a vertex: vertices of one level share a solve
@@ -74,21 +74,20 @@ def learn_skinning(template: Mesh, poses: np.ndarray, shapes: np.ndarray | None,
     """
     config = config or SkinConfig()
     poses, shapes = checked_training(template, skeleton, poses, shapes)
-    kinds = (False, True) if config.correctives else (False,)
-    first, later = len(kinds) * config.rounds * len(poses), 0 if shapes is None else PEOPLE_ROUNDS * len(shapes)
-    work = Work(progress, first + later, step)
+    kinds, work = (False, True) if config.correctives else (False,), Work(progress, step)
 
     def learn(inner: Work) -> tuple[SkinningModel, np.ndarray]:
         at = skeleton.pose_of(skeleton.fit_rotations(template, poses))
         model = _start(template, skeleton, config)
-        with timed("pose space"):
-            for correctives in kinds:
-                model, at = _learn_pose(model, at, poses, replace(config, correctives=correctives), inner)
+        for correctives in kinds:
+            model, at = _learn_pose(model, at, poses, replace(config, correctives=correctives), 1 / len(kinds), inner)
         return model, at
 
-    model, at = work.step("pose space", (template, skeleton, poses, replace(config, components=0)), first, learn)
-    if shapes is not None:
-        model = work.step("shape components", (model, shapes, config.components), later,
+    model, at = work.step("pose space", (template, skeleton, poses, replace(config, components=0)), POSES, learn)
+    if shapes is None:
+        work.tick(1 - POSES)
+    else:
+        model = work.step("shape components", (model, shapes, config.components), 1 - POSES,
                           partial(_learn_people, model, shapes, config.components))
     examples = pose_examples(template, skeleton, at, shapes)
     mean, covariance = pose_prior(examples, len(at))
@@ -100,21 +99,21 @@ def learn_skinning(template: Mesh, poses: np.ndarray, shapes: np.ndarray | None,
 def _start(template: Mesh, skeleton: Skeleton, config: SkinConfig) -> SkinningModel:
     """The template itself, with weights that pass smoothly from part to part, and no correctives."""
     J, N = len(skeleton.parents), len(template.vertices)
-    constants = PoseFeatures(skeleton, LinearLift(), np.arange(J), np.zeros((J, 3, J)))
+    constants = corrective_features(skeleton, np.zeros((1, J, 3)), False)
     weights = strongest(diffused_weights(template, skeleton, config.width), config.parts, 1e-3)
     return SkinningModel(template, skeleton, template.vertices, weights, constants, np.zeros((0, N, 3), np.float32),
                          template.vertices, np.zeros((0, N, 3), np.float32), np.zeros(0), 0.0,
                          np.zeros((J, 3)), np.zeros((3 * J, 3 * J)))
 
 
-def _learn_pose(model: SkinningModel, poses: np.ndarray, bodies: np.ndarray, config: SkinConfig, work: Work
-                ) -> tuple[SkinningModel, np.ndarray]:
+def _learn_pose(model: SkinningModel, poses: np.ndarray, bodies: np.ndarray, config: SkinConfig, share: float,
+                work: Work) -> tuple[SkinningModel, np.ndarray]:
     """Poses, weights, joints, rest vertices and correctives in turn, while left-out poses are met better."""
     allowed = diffused_weights(model.template, model.skeleton, 2 * config.width) > 0
     model = replace(model, info={"left_out_error": np.inf})
     for k in range(config.rounds):
         tried, fitted = work.step(f"correctives {config.correctives}, round {k}", (model, poses, bodies, config),
-                                  len(bodies), partial(_next_round, model, poses, bodies, allowed, config))
+                                  share / config.rounds, partial(_next_round, model, poses, bodies, allowed, config))
         gain = 1 - tried.info["left_out_error"] / model.info["left_out_error"]
         if gain > 0:
             model, poses = tried, fitted
@@ -187,10 +186,9 @@ def _with_correctives(model: SkinningModel, poses: np.ndarray, bodies: np.ndarra
     unposed = np.stack([_unposed(model, p, y) for p, y in zip(poses, bodies, strict=True)])
     features = corrective_features(model.skeleton, poses, config.correctives)
     joints = _acting_joints(model)
-    errors = [_regress(features, poses, unposed, joints, ridge)[2] for ridge in RIDGES] \
-        if features.count > len(features.starts) else [0.0]
-    ridge = RIDGES[int(np.argmin(errors))]
-    rest, correctives, error = _regress(features, poses, unposed, joints, ridge)
+    ridges = RIDGES if features.count > len(features.starts) else RIDGES[:1]
+    tried = [(ridge, *_regress(features, poses, unposed, joints, ridge)) for ridge in ridges]
+    ridge, rest, correctives, error = min(tried, key=itemgetter(-1))
     moved = _with_joints_at(replace(model, rest=rest), model.joint_regressor @ model.rest)
     return replace(moved, features=replace(features, skeleton=moved.skeleton), correctives=correctives,
                    info={"ridge": ridge, "left_out_error": error})
@@ -239,7 +237,7 @@ def _regress(features: PoseFeatures, poses: np.ndarray, unposed: np.ndarray, act
         target, scale = unposed[:, mine].reshape(M, -1), freedom[joint[used]]
         centre, middle = delta[:, used].mean(axis=0) * scale, target.mean(axis=0)
         X = delta[:, used] * scale - centre
-        solver = np.linalg.solve(X.T @ X + (M * ridge + 1e-12) * np.eye(len(used)), X.T)
+        solver = ridge_operator(X, ridge)
         slope, hat = solver @ target, X @ solver + 1 / M
         left = (target - middle - X @ slope) / np.maximum(1 - np.diag(hat), 1e-6)[:, None]
         total += float((left**2).sum())
@@ -250,15 +248,15 @@ def _regress(features: PoseFeatures, poses: np.ndarray, unposed: np.ndarray, act
 
 def _learn_people(model: SkinningModel, shapes: np.ndarray, components: int, work: Work) -> SkinningModel:
     """The model with the shape components of people (P, N, 3) whose poses are fitted and undone in turn."""
-    with timed("shape components"):
-        for k in range(PEOPLE_ROUNDS):
-            quick = FitConfig(polish=0, n_betas=min(20, model.n_betas) or None)
-            fitter = ShapeFitter(model, quick) if k else PoseFitter(model.subject(), quick)
-            people = np.stack([work.step(f"round {k}, person {body_digest(body)}", (model, quick, k, body), 1,
-                                         partial(_unposed_person, model, fitter, body)) for body in shapes])
-            space = learn_shape_space(people, components)
-            model = replace(model, shape_mean=space.mean.astype(np.float64), shape_components=space.components,
-                            shape_variances=space.variances, shape_total=space.total_variance)
+    share = 1 / (PEOPLE_ROUNDS * len(shapes))
+    for k in range(PEOPLE_ROUNDS):
+        quick = FitConfig(polish=0, n_betas=min(20, model.n_betas) or None)
+        fitter = ShapeFitter(model, quick) if k else PoseFitter(model.subject(), quick)
+        people = np.stack([work.step(f"round {k}, person {body_digest(body)}", (model, quick, k, body), share,
+                                     partial(_unposed_person, model, fitter, body)) for body in shapes])
+        space = learn_shape_space(people, components)
+        model = replace(model, shape_mean=space.mean.astype(np.float64), shape_components=space.components,
+                        shape_variances=space.variances, shape_total=space.total_variance)
     return model
 
 

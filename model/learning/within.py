@@ -3,6 +3,8 @@ from __future__ import annotations
 
 from collections.abc import Hashable, Sequence
 from dataclasses import dataclass, replace
+from itertools import product
+from operator import attrgetter
 
 import numpy as np
 
@@ -55,15 +57,10 @@ def choose_within(template: Mesh, skeleton: Skeleton, poses: np.ndarray, Q: np.n
 
     [SCAPE] Eq. 4
     """
-    best: Design | None = None
-    for pruning in config.prunings:
-        for ridge in config.ridges:
-            tried = make_design(template, skeleton, poses, config, pruning, RADII[0], ridge)
-            tried = replace(tried, left_out_error=_left_out_error(tried, poses, Q, who))
-            if best is None or tried.left_out_error < best.left_out_error:
-                best = tried
-    assert best is not None
-    return best
+    designs = (make_design(template, skeleton, poses, config, pruning, RADII[0], ridge)
+               for pruning, ridge in product(config.prunings, config.ridges))
+    return min((replace(design, left_out_error=_left_out_error(design, poses, Q, who)) for design in designs),
+               key=attrgetter("left_out_error"))
 
 
 def fit_within(design: Design, poses: np.ndarray, Q: np.ndarray, who: np.ndarray) -> PoseSpace:

@@ -17,7 +17,7 @@ from scanprep.registration.schedule import RegistrationConfig
 
 from ..body import BodyModel
 from ..gradients import GradientSystem, ShapeSolver
-from ..learning.sex_plane import PLANE
+from ..learning.sexes import PLANE
 from ..linear import check_pose
 from ..scape import ScapeModel
 from ..skinning import SkinningModel

@@ -6,7 +6,7 @@ from typing import Annotated, Literal
 
 import tyro
 
-from scanprep.console import dispatch
+from scanprep.command_line import dispatch
 
 StatueArg = Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="STATUE")]
 MotionArg = Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="MOTION")]

@@ -18,12 +18,11 @@ from ..export.rig import Rig, turn_up
 from ..features import linear_features
 from ..skinning import SkinningModel
 from .control.chart import Chart
-from .control.files import read_control, write_control
-from .control.humanoid import humanoid, humanoid_markers
+from .control.files import humanoid, humanoid_markers, read_control, write_control
 from .control.model import ControlModel, Statue
 from .detail.maps import read_map, write_map
 from .detail.subdivision import Subdivision, subdivide
-from .detail.textures import chart_tangents, normal_image, vertex_of_row
+from .detail.texels import chart_tangents, normal_image, vertex_of_row
 from .motion.motions import people_motion
 from .motion.retarget import StatueMotion
 
@@ -61,16 +60,12 @@ def load_statue(folder: str | Path, edited: str | Path | None = None) -> Statue:
     """
     from PIL import Image
 
-    folder = Path(folder)
+    folder, texture = Path(folder), None
     about = storage.read_json(folder / ABOUT, "a folder of scape statue fit")
-    if not isinstance(about, dict) or about.get("kind") != KIND:
-        raise storage.StorageError(f"{folder / ABOUT}: expected a statue in JSON, found something else")
-    if about.get("version") != VERSION:
-        raise storage.StorageError(f"{folder / ABOUT}: statue version {about.get('version')} is not known here "
-                                   f"(known: {VERSION})")
     control = read_control(folder / CONTROL)
-    texture = None
     with storage.taking_apart(folder / ABOUT, "a whole statue"):
+        if not isinstance(about, dict) or (about.get("kind"), about.get("version")) != (KIND, VERSION):
+            raise ValueError(f"no statue of the version that is known here, {VERSION}")
         pose = storage.numbers({"pose": np.array(about["pose"], dtype=np.float64)}, "pose",
                                len(control.skeleton.parents), 3)
     if about.get("texture"):
@@ -132,12 +127,8 @@ def write_statue_glb(path: str | Path, control: ControlModel, vertices: np.ndarr
     subdivision it is the control mesh itself, which `normals` (`normal_image`) and `heights` detail; glTF has no place
     for heights, so they are an image that the material's `extras` name.
     """
-    if (vertices is None) != (subdivision is None):
-        raise ValueError("vertices, subdivision: expected both or none")
     if subdivision is None or vertices is None:
         subdivision, vertices = subdivide(control.mesh, control.chart, 0), control.mesh.vertices
-    if np.shape(vertices) != (len(subdivision.parent), 3):
-        raise ValueError(f"vertices: expected shape ({len(subdivision.parent)}, 3), got {np.shape(vertices)}")
     mesh, chart = Mesh(vertices, subdivision.faces), subdivision.chart
     weights = np.einsum("nc,ncj->nj", subdivision.bary, control.weights[control.mesh.faces[subdivision.parent]])
     row = vertex_of_row(mesh, chart)                            # vertices are repeated along the seams of the chart
@@ -198,27 +189,25 @@ def _skeleton(person: xml.Element, control: ControlModel, names: list[str], U: n
 
 
 def _skin(person: xml.Element, mesh: Mesh, chart: Chart, image: str | None) -> None:
-    xml.SubElement(person, "Coordinate", DEF="skin_points", containerField="skinCoord", point=_rows(mesh.vertices))
-    xml.SubElement(person, "Normal", DEF="skin_normals", containerField="skinNormal",
-                   vector=_rows(mesh.vertex_normals))
+    def rows(values: np.ndarray) -> str:
+        return ", ".join(map(_row, values))
+
+    def corners(faces: np.ndarray) -> str:
+        return " ".join(f"{a} {b} {c} -1" for a, b, c in faces)
+
+    xml.SubElement(person, "Coordinate", DEF="skin_points", containerField="skinCoord", point=rows(mesh.vertices))
+    xml.SubElement(person, "Normal", DEF="skin_normals", containerField="skinNormal", vector=rows(mesh.vertex_normals))
     shape = xml.SubElement(person, "Shape", containerField="skin")
     look = xml.SubElement(shape, "Appearance")
     xml.SubElement(look, "Material", diffuseColor="0.8 0.77 0.74" if image is None else "1 1 1")
     if image is not None:
         xml.SubElement(look, "ImageTexture", url=f'"{image}"', repeatS="false", repeatT="false")
-    surface = xml.SubElement(shape, "IndexedFaceSet", coordIndex=_faces(mesh.faces), texCoordIndex=_faces(chart.faces))
+    surface = xml.SubElement(shape, "IndexedFaceSet", coordIndex=corners(mesh.faces),
+                             texCoordIndex=corners(chart.faces))
     xml.SubElement(surface, "Coordinate", USE="skin_points")
     xml.SubElement(surface, "Normal", USE="skin_normals")
-    xml.SubElement(surface, "TextureCoordinate", point=_rows(chart.uv))
+    xml.SubElement(surface, "TextureCoordinate", point=rows(chart.uv))
 
 
 def _row(values: np.ndarray) -> str:
     return " ".join(f"{value:.7g}" for value in np.round(values, 8) + 0.0)
-
-
-def _rows(values: np.ndarray) -> str:
-    return ", ".join(map(_row, values))
-
-
-def _faces(faces: np.ndarray) -> str:
-    return " ".join(f"{a} {b} {c} -1" for a, b, c in faces)

@@ -6,11 +6,11 @@ from dataclasses import dataclass, field
 
 import numpy as np
 
-from scanprep.batch.steps import Step, once
+from scanprep.batch.room import Step, once
 from scanprep.geometry.mesh import Mesh
 from scanprep.ranges import Settings
 
-from .control.humanoid import humanoid
+from .control.files import humanoid
 from .control.model import ControlModel, Statue
 from .detail.displacement import DisplacementConfig, bake, unfold_control
 from .registration.automatic import Features, find_features

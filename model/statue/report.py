@@ -13,10 +13,9 @@ from scanprep.pictures.page import Page
 from scanprep.pictures.shading import Bones, Dots, Shape, Solid, color_bar, heat, part_colors, render, side_by_side
 from scanprep.synthetic.people import named_pose, walk
 
-from .control.humanoid import humanoid
+from .control.files import humanoid
 from .control.model import FOLDED, HOLE, MEASURED, OUTSIDE, DisplacementMap, Statue
-from .detail.errors import Level
-from .detail.reconstruction import Reconstruction, coverage_at
+from .detail.reconstruction import Level, Reconstruction, coverage_at
 from .detail.subdivision import subdivide
 from .motion.motions import people_motion
 
@@ -28,9 +27,7 @@ KINDS = {MEASURED: (0.62, 0.70, 0.78), FOLDED: (0.86, 0.36, 0.22), HOLE: (0.93, 
 
 def cameras(statue: Statue, subject: Any, turns: Sequence[float] = (0, 90, 180, 270)) -> list[Camera]:
     """Cameras around a subject (Mesh or points) from the front on; the front is where the control model looks."""
-    R = statue.control.skeleton.part_rotations(statue.pose)[0]
-    front = -R[:, 1]
-    axis = statue.upright_axis
+    front, axis = -statue.control.skeleton.part_rotations(statue.pose)[0][:, 1], statue.upright_axis
     first, second = np.eye(3)[[(axis + 1) % 3, (axis + 2) % 3]]
     azimuth = float(np.degrees(np.arctan2(front @ second, front @ first)))
     return [Camera.around(subject, azimuth + turn, up=axis) for turn in turns]
@@ -70,13 +67,11 @@ def statue_page(name: str, scan: Mesh, statue: Statue, levels: Sequence[Level], 
 
 
 def _fit(page: Page, scan: Mesh, statue: Statue) -> None:
-    control = statue.control
-    parents = control.skeleton.parents
-    joints = control.skeleton.joints
+    control, joints = statue.control, statue.control.skeleton.joints
     marks = control.mesh.vertices[list(control.landmarks.values())]
     inside: list[Shape] = [Solid(Mesh(scan.vertices, scan.faces), opacity=0.35),
-                           Bones(joints[parents[1:]], joints[1:], on_top=True), Dots(joints, on_top=True),
-                           Dots(marks, (0.15, 0.45, 0.75), 0.006, True)]
+                           Bones(joints[control.skeleton.parents[1:]], joints[1:], on_top=True),
+                           Dots(joints, on_top=True), Dots(marks, (0.15, 0.45, 0.75), 0.006, True)]
     page.section("Joints and control mesh", "Red: joint centres. Blue: feature points of the control model. Below, the "
                  "control mesh; its colours are the parts of the skeleton.")
     page.picture(_row([(inside, camera) for camera in cameras(statue, scan)], SIDES))
@@ -88,8 +83,7 @@ def _map(page: Page, statue: Statue, scan: Mesh) -> None:
     page.section("Displacement map", "White: the scan lies outside the control mesh, black: inside. Right: blue was "
                  "measured; red is folded, not one-to-one with the control mesh; yellow is a hole of the scan. Red and "
                  "yellow were filled smoothly.")
-    page.picture(side_by_side([height_picture(statue.map), coverage_picture(statue.map)],
-                              ("displacement", "coverage")))
+    page.picture(side_by_side(map_pictures(statue.map), ("displacement", "coverage")))
     colors = np.array([KINDS[kind] for kind in coverage_of_vertices(statue)])
     page.picture(_row([(Solid(statue.control.mesh, colors), camera) for camera in cameras(statue, scan)], SIDES))
 
@@ -106,21 +100,16 @@ def _errors(page: Page, scan: Mesh, statue: Statue, levels: Sequence[Level]) -> 
                                color_bar(0.0, WORST, "distance to the scan")], columns=1))
 
 
-def height_picture(map_: DisplacementMap, size: int = 640) -> np.ndarray:
-    """The heights as grey values: white out, black in, the middle grey zero; white outside the chart."""
+def map_pictures(map_: DisplacementMap, size: int = 640) -> tuple[np.ndarray, np.ndarray]:
+    """The heights as grey values (white out, black in, the middle grey zero), and the coverage in colours."""
     step = max(1, len(map_.heights) // size)
-    heights, covered = map_.heights[::step, ::step], map_.coverage[::step, ::step] != OUTSIDE
+    heights, coverage = map_.heights[::step, ::step], map_.coverage[::step, ::step]
+    covered = coverage != OUTSIDE
     most = float(np.quantile(np.abs(heights[covered]), 0.995)) if covered.any() else 1.0
     grey = np.where(covered, 127.5 + 127.5 * np.clip(heights / max(most, 1e-9), -1, 1), 255)
-    return np.repeat(grey.astype(np.uint8)[..., None], 3, axis=-1)
-
-
-def coverage_picture(map_: DisplacementMap, size: int = 640) -> np.ndarray:
-    """The coverage in colours."""
-    step, colors = max(1, len(map_.coverage) // size), np.full((256, 3), 255, dtype=np.uint8)
-    for kind, color in KINDS.items():
-        colors[kind] = (255 * np.array(color)).astype(np.uint8)
-    return colors[map_.coverage[::step, ::step]]
+    colors = np.zeros((256, 3))
+    colors[list(KINDS)] = list(KINDS.values())
+    return np.repeat(grey.astype(np.uint8)[..., None], 3, axis=-1), (255 * colors[coverage]).astype(np.uint8)
 
 
 def coverage_of_vertices(statue: Statue) -> np.ndarray:

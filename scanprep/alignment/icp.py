@@ -8,6 +8,7 @@ from scipy.spatial import cKDTree
 
 from ..geometry import rotations
 from ..geometry.mesh import Mesh
+from ..geometry.surface import checked_points
 from ..geometry.target import target_of
 from ..meaning import extent, unit_problem
 from ..ranges import Positive, Settings, SomeShare
@@ -34,20 +35,10 @@ class RigidConfig(Settings):
 
 @dataclass(frozen=True, eq=False)
 class RigidAlignment:
-    """A rigid (or similarity) transform that brings a source to its target.
+    """A rigid (or similarity) transform that brings a source to its target."""
 
-    Attributes
-    ----------
-    T_target_source : (4, 4) float
-    rms : float, metres
-        Of the distances of the inliers: to the planes of the target, or between landmarks.
-    inliers : int
-    converged : bool
-    iterations : int
-    """
-
-    T_target_source: np.ndarray
-    rms: float
+    T_target_source: np.ndarray     # (4, 4)
+    rms: float                      # metres, distances of inliers to the planes of the target, or between landmarks
     inliers: int
     converged: bool
     iterations: int
@@ -55,7 +46,7 @@ class RigidAlignment:
 
 def align_landmarks(source: np.ndarray, target: np.ndarray, scale: bool = False) -> RigidAlignment:
     """The rotation and translation, optionally with scale, that bring landmarks (L, 3) nearest to their targets."""
-    source, target = _points(source, "source"), _points(target, "target")
+    source, target = checked_points(source, "source"), checked_points(target, "target")
     if source.shape != target.shape:
         raise ValueError(f"target: expected {len(source)} landmarks as in source, got {len(target)}")
     if len(source) < 3:
@@ -92,7 +83,9 @@ def align_rigid(source: Mesh | np.ndarray, target: Mesh | np.ndarray,
     """
     config = config or RigidConfig()
     reach = np.inf if config.reach is None else config.reach
-    moving = _points(source.vertices if isinstance(source, Mesh) else source, "source")
+    moving = checked_points(source.vertices if isinstance(source, Mesh) else source, "source")
+    if not len(moving):
+        raise ValueError("source: expected points, got none")
     goal = target_of(target, name="target")
     T = np.eye(4) if start is None else np.array(start, dtype=np.float64)
     if landmarks is not None:
@@ -143,15 +136,6 @@ def transform(linear: np.ndarray, translation: np.ndarray) -> np.ndarray:
     T = np.eye(4)
     T[:3, :3], T[:3, 3] = linear, translation
     return T
-
-
-def _points(points: np.ndarray, name: str) -> np.ndarray:
-    points = np.asarray(points, dtype=np.float64)
-    if points.ndim != 2 or points.shape[1] != 3 or not len(points):
-        raise ValueError(f"{name}: expected points of shape (n, 3), got shape {points.shape}")
-    if not np.isfinite(points).all():
-        raise ValueError(f"{name}: {(~np.isfinite(points).all(axis=1)).sum()} points are not finite")
-    return points
 
 
 def alignment_problem(source: np.ndarray, target: np.ndarray, found: RigidAlignment) -> str | None:

@@ -9,8 +9,7 @@ from scipy.spatial import cKDTree
 from ..geometry import rotations
 from ..geometry.mesh import Mesh
 from ..geometry.remeshing import smooth
-from ..geometry.seen_space import SeenSpace
-from ..geometry.surface import OrientedPoints
+from ..geometry.surface import OrientedPoints, SeenSpace
 from .icp import landmark_motion, transform
 
 REACH = 1 / 18                # of a view's extent: radius of the neighbourhoods that are described

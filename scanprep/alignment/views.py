@@ -11,8 +11,7 @@ from ..fusion.tsdf import border_distance
 from ..geometry import rotations
 from ..geometry.mesh import Mesh
 from ..geometry.remeshing import smooth
-from ..geometry.seen_space import mesh_and_camera
-from ..geometry.surface import OrientedPoints
+from ..geometry.surface import OrientedPoints, mesh_and_camera
 from ..ranges import Count, Positive, Settings, Share
 from .view_poses import fit_of_views, place_by_features, place_by_landmarks
 
@@ -61,26 +60,10 @@ def align_views(views: Sequence[Any], config: AlignViewsConfig | None = None,
                 landmarks: Sequence[Mapping[str, np.ndarray]] | None = None, features: bool = False) -> AlignedViews:
     """Refine rough camera poses by point-to-plane matching between all pairs of views together.
 
-    Parameters
-    ----------
-    views : sequence of RangeView, or of (Mesh, camera position (3,)) pairs
-        A few centimetres and degrees from where they belong, unless landmarks or features place them first.
-    config : AlignViewsConfig, optional
-    rng : numpy.random.Generator, optional
-        Draws the points that look for matches.
-    landmarks : sequence of mappings name -> (3,) point, one for each view, optional
-        Clicked points or markers, each in two views or more; they bring the views to where matching can begin.
-    features : bool
-        Find the places of the views from their shapes alone, without any knowledge of the cameras.
-
-    Returns
-    -------
-    AlignedViews
-
-    Raises
-    ------
-    ValueError
-        No views.
+    `views` are RangeViews, or pairs of a Mesh and a camera position (3,), a few centimetres and degrees from where they
+    belong; further off only where `landmarks` (one mapping name -> (3,) point a view, each name in two views or more)
+    or `features`, their shapes alone, place them first. `rng` draws the points that look for matches. ValueError for
+    no views.
     """
     config, rng = config or AlignViewsConfig(), rng or np.random.default_rng(0)
     pairs = [mesh_and_camera(view) for view in views]

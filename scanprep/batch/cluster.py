@@ -3,7 +3,6 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
-import importlib.metadata
 import pickle
 import tempfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
@@ -13,10 +12,10 @@ from typing import Any
 
 import numpy as np
 
-from .digests import paths_of
+from .digests import paths_of, version
 from .room import Failure, Job, attempt
 
-ANSWER, WAIT = 10, 60          # seconds for the scheduler, and for the first worker of a cluster just started
+ANSWER = 10                    # seconds that a scheduler may take
 
 
 def run_on_cluster(address: str, work: Any, jobs: Sequence[Job], ship: bool = False) -> Iterator[tuple[Job, Any]]:
@@ -26,14 +25,18 @@ def run_on_cluster(address: str, work: Any, jobs: Sequence[Job], ship: bool = Fa
     place to write to. One thread a worker is best (`dask worker --nthreads 1 --nworkers auto`). With `ship` the files
     of each job travel along, for workers that do not see them under the same path.
     """
-    Client, as_completed, KilledWorker = _distributed()
+    from distributed import Client, as_completed
+
     try:
         client = Client(address, timeout=ANSWER, set_as_default=False)
     except (OSError, ValueError) as error:
         raise ValueError(f"scheduler: expected the address of a Dask scheduler, none answers at {address} "
                          f"({' '.join(str(error).split())})") from None
     with client:
-        _await_workers(client, address)
+        try:
+            client.wait_for_workers(1, timeout=60)          # of a cluster that was just started
+        except TimeoutError:
+            raise ValueError(f"scheduler: {address} has no workers; start some with: dask worker {address}") from None
         # a task that gives its argument back: unlike scattered data it is made anew where all copies are lost
         shared = client.submit(bytes, pickle.dumps((work, _versions())), pure=False)
         there = _entrance()
@@ -56,7 +59,7 @@ def run_on_cluster(address: str, work: Any, jobs: Sequence[Job], ship: bool = Fa
         for future in running:
             job = job_of.pop(future)
             submit()
-            yield job, _outcome(future, job, address, KilledWorker)
+            yield job, _outcome(future, job, address)
 
 
 def _entrance() -> Callable[[bytes, bytes], tuple[Any, dict[str, bytes]]]:
@@ -70,23 +73,10 @@ def _entrance() -> Callable[[bytes, bytes], tuple[Any, dict[str, bytes]]]:
     return there
 
 
-def _distributed() -> tuple[Any, Any, Any]:
-    try:
-        from distributed import Client, KilledWorker, as_completed
-    except ModuleNotFoundError:
-        raise ModuleNotFoundError("a scheduler needs Dask: pip install distributed") from None
-    return Client, as_completed, KilledWorker
-
-
-def _await_workers(client: Any, address: str) -> None:
-    try:
-        client.wait_for_workers(1, timeout=WAIT)
-    except TimeoutError:
-        raise ValueError(f"scheduler: {address} has no workers; start some with: dask worker {address}") from None
-
-
-def _outcome(future: Any, job: Job, address: str, KilledWorker: type) -> Any:
+def _outcome(future: Any, job: Job, address: str) -> Any:
     """What came of a job, its files written to its folder."""
+    from distributed import KilledWorker
+
     try:
         error = future.exception()
     except CancelledError:
@@ -161,11 +151,7 @@ def _unpacked(sent: dict[Path, bytes], folder: Path) -> dict[Path, Path]:
 
 
 def _versions() -> dict[str, str]:
-    try:
-        own = importlib.metadata.version("scapekit")
-    except importlib.metadata.PackageNotFoundError:
-        own = "not installed"
-    return {"scapekit": own, "numpy": np.__version__}
+    return {"scapekit": version(), "numpy": np.__version__}
 
 
 def _described(versions: dict[str, str]) -> str:

@@ -1,10 +1,10 @@
 """What a result depends on, as a short text that changes with it: whole files, models, arrays, tables, settings."""
 from __future__ import annotations
 
+import contextlib
 import dataclasses
 import hashlib
 import importlib.metadata
-import json
 import time
 import weakref
 from collections.abc import Iterator, Mapping
@@ -15,9 +15,8 @@ import numpy as np
 
 from ..geometry import storage
 
-LENGTH = 32                    # hexadecimal digits
+DIGITS = 32
 SETTLED = 2_000_000_000        # nanoseconds after which a file's time of change tells of every later change
-_STAT = ("st_size", "st_mtime_ns", "st_ctime_ns", "st_ino")
 
 
 class Digests:
@@ -34,11 +33,9 @@ class Digests:
         self._values: dict[int, tuple[weakref.ref[Any], bytes]] = {}
         self._known: dict[str, list[Any]] = {}
         if path is not None and path.exists():
-            try:
-                known = json.loads(path.read_text(encoding="utf-8"))
+            with contextlib.suppress(storage.StorageError):        # only a memory: files are read again
+                known = storage.read_json(path, "digests of files")
                 self._known = known if isinstance(known, dict) else {}
-            except (OSError, ValueError, RecursionError):
-                pass                                 # only a memory: files are read again
 
     def save(self) -> None:
         """Remember digests of files for the next run."""
@@ -48,10 +45,10 @@ class Digests:
 
     def of(self, *values: Any) -> str:
         """A digest of values: paths count as what the files hold, dataclasses as their fields."""
-        whole = hashlib.sha256(_version())
+        whole = hashlib.sha256(version().encode())
         for value in values:
             self._update(whole, value)
-        return whole.hexdigest()[:LENGTH]
+        return whole.hexdigest()[:DIGITS]
 
     def of_file(self, path: Path) -> str:
         """A digest of what a file holds; "missing" where there is none, and of a folder of all files in it."""
@@ -60,14 +57,16 @@ class Digests:
             return self.of([(name, path / name) for name in names if not f"/{name}".count("/.")])
         try:
             stat = path.stat()
-            now = [getattr(stat, name) for name in _STAT]
+            now = [stat.st_size, stat.st_mtime_ns, stat.st_ctime_ns, stat.st_ino]
             key = str(path.absolute())
             known = self._known.get(key)
             if isinstance(known, list) and known[:-1] == now:
                 return str(known[-1])
+            whole = hashlib.sha256()
             with open(path, "rb") as file:
-                found = hashlib.file_digest(file, "sha256").hexdigest()[:LENGTH] \
-                    if hasattr(hashlib, "file_digest") else _read_through(file)
+                while block := file.read(1 << 20):
+                    whole.update(block)
+            found = whole.hexdigest()[:DIGITS]
         except OSError:
             return "missing"
         if time.time_ns() - max(stat.st_mtime_ns, stat.st_ctime_ns) > SETTLED:
@@ -116,13 +115,6 @@ class Digests:
         return own.digest()
 
 
-def _read_through(file: Any) -> str:
-    whole = hashlib.sha256()
-    while block := file.read(1 << 20):
-        whole.update(block)
-    return whole.hexdigest()[:LENGTH]
-
-
 def paths_of(value: Any) -> Iterator[Path]:
     """All paths in a value of paths, tuples, lists, dicts and dataclasses."""
     if isinstance(value, Path):
@@ -136,9 +128,9 @@ def paths_of(value: Any) -> Iterator[Path]:
         yield from paths_of([getattr(value, field.name) for field in dataclasses.fields(value)])
 
 
-def _version() -> bytes:
-    """Results of another version of this project are done anew."""
+def version() -> str:
+    """Of this project: results of another one are done anew."""
     try:
-        return importlib.metadata.version("scapekit").encode()
+        return importlib.metadata.version("scapekit")
     except importlib.metadata.PackageNotFoundError:
-        return b"not installed"
+        return "not installed"

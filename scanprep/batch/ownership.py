@@ -1,14 +1,13 @@
 """What in an output is scapekit's own, and what is not and is left alone."""
 from __future__ import annotations
 
-import json
 from collections.abc import Mapping
 from pathlib import Path
 
+from ..geometry import storage
 from .digests import Digests
 
 HOME = ".scapekit"
-SHOWN = 3                                 # files that a message names
 
 
 class ForeignFileError(ValueError):
@@ -51,8 +50,9 @@ def report_path(output: Path) -> Path:
 def written_of(report: Path) -> dict[str, str]:
     """File -> digest of all that a command wrote, as its report tells; nothing where there is no such report."""
     try:
-        told = json.loads(report.read_text(encoding="utf-8"))["written"]
-    except (OSError, ValueError, KeyError, TypeError, RecursionError):
+        with storage.taking_apart(report, "a report"):
+            told = storage.read_json(report, "a report")["written"]
+    except storage.StorageError:
         return {}
     return {**told, report.name: Digests().of_file(report)} if isinstance(told, dict) else {}
 
@@ -65,6 +65,6 @@ def refuse_any(folder: Path) -> None:
 
 
 def refusal(*taken: Path) -> str:
-    more = f" and {len(taken) - SHOWN} more" if len(taken) > SHOWN else ""
-    return (f"{', '.join(str(path) for path in taken[:SHOWN])}{more}: in the way of the output, and not as scapekit "
+    more = f" and {len(taken) - 3} more" if len(taken) > 3 else ""
+    return (f"{', '.join(str(path) for path in taken[:3])}{more}: in the way of the output, and not as scapekit "
             "wrote it; nothing was touched: name another output, or move it away")

@@ -14,8 +14,6 @@ from ..ranges import FLAG, Processes, Settings
 from ..threads import begin_worker
 from .room import Failure, Job, Progress, attempt
 
-WATCH = 0.2                    # seconds between two looks whether the process that wants the work is still there
-
 
 @dataclass(frozen=True)
 class Workers(Settings):
@@ -103,7 +101,7 @@ def _begin(work: Any, parent: int) -> None:
 
 def _watch(parent: int) -> None:
     while os.getppid() == parent:
-        time.sleep(WATCH)
+        time.sleep(0.2)
     os.kill(os.getpid(), 9)
 
 

@@ -1,4 +1,4 @@
-"""Where one task is worked on: its files, its steps, and what became of it."""
+"""Where one task is worked on: its files, its steps, and what became of it; and steps that need not be kept."""
 from __future__ import annotations
 
 import contextlib
@@ -7,7 +7,7 @@ import shutil
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, TypeVar
+from typing import Any, Protocol, TypeVar
 from urllib.parse import quote
 
 from ..geometry import storage
@@ -112,3 +112,22 @@ def attempt(work: Any, job: Job, tell: Progress | None = None) -> Any:
             text = f"{type(error).__name__}: {text}"
         files = [str(path) for path in paths_of(job.given)] or [job.name]
         return Failure(text if any(file in text for file in files) else f"{files[0]}: {text}")
+
+
+class Step(Protocol):
+    """What `make` returns, or returned when it was last called for the same inputs: `Room.step`, or `KeptSteps`."""
+
+    def __call__(self, name: str, inputs: Any, make: Callable[[], T]) -> T: ...
+
+
+def once(name: str, inputs: Any, make: Callable[[], T]) -> T:
+    """A step that is not kept."""
+    return make()
+
+
+def inside(step: Step, outer: str) -> Step:
+    """Steps of which a larger one consists."""
+    def inner(name: str, inputs: Any, make: Callable[[], T]) -> T:
+        return step(f"{outer}/{name}", inputs, make)
+
+    return inner

@@ -3,7 +3,6 @@ from __future__ import annotations
 
 import dataclasses
 import importlib
-import json
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +12,6 @@ from ..geometry import storage
 
 KIND, VERSION = "result", 1
 PACKAGES = ("scanprep", "model", "completion")
-_ARRAY = "a{}"
 
 
 def save_value(path: Path, value: Any, header: dict[str, Any]) -> None:
@@ -22,30 +20,24 @@ def save_value(path: Path, value: Any, header: dict[str, Any]) -> None:
     Values are None, bool, number, text, Path, array, and tuples, lists, dicts with text keys and dataclasses of these.
     """
     arrays: list[np.ndarray] = []
-    told = json.dumps({"kind": KIND, "version": VERSION, **header, "value": _packed(value, arrays)})
-    with storage.writing(path) as beside, open(beside, "wb") as out:
-        named = {_ARRAY.format(i): array for i, array in enumerate(arrays)}
-        np.savez(out, allow_pickle=False, **{storage.HEADER: np.array(told)}, **named)
+    told = {**header, "value": _packed(value, arrays)}
+    storage.save(path, KIND, VERSION, {f"a{i}": array for i, array in enumerate(arrays)}, told, compress=False)
 
 
 def load_header(path: Path) -> dict[str, Any] | None:
     """The header of a file of `save_value`, or None where there is no such file that can be read."""
     try:
-        with np.load(path, allow_pickle=False) as data:
-            header = json.loads(str(data[storage.HEADER]))
-        return header if (header["kind"], header["version"]) == (KIND, VERSION) else None
-    except Exception:                    # whatever is wrong with the file, the result is made anew
+        header = storage.load_header(path, KIND)
+    except storage.StorageError:         # whatever is wrong with the file, the result is made anew
         return None
+    return header if (header.get("kind"), header.get("version")) == (KIND, VERSION) else None
 
 
 def load_value(path: Path) -> Any:
     """The value of a file of `save_value`; StorageError where it is missing, damaged or of another version."""
     header, arrays = storage.load(path, KIND, (VERSION,))
-    try:
-        return _unpacked(header["value"], [arrays[_ARRAY.format(i)] for i in range(len(arrays))])
-    except (KeyError, TypeError, ValueError, AttributeError, ImportError, IndexError) as error:
-        raise storage.StorageError(f"{path}: expected a result, cannot read it ({type(error).__name__}: {error})"
-                                   ) from None
+    with storage.taking_apart(path, "a result"):
+        return _unpacked(header["value"], [arrays[f"a{i}"] for i in range(len(arrays))])
 
 
 def _packed(value: Any, arrays: list[np.ndarray]) -> Any:

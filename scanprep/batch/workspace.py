@@ -16,7 +16,7 @@ import os
 import shutil
 import tempfile
 from collections.abc import Callable, Collection, Iterator, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from functools import cached_property
 from pathlib import Path
 from typing import Any, TypeVar
@@ -81,17 +81,10 @@ class Workspace:
             inside: Progress | None = None) -> Results:
         """Every task whose result is not there, or depends on something that has changed since.
 
-        A task that fails stops no other. Files and value of each take their place when they are whole.
-
-        Parameters
-        ----------
-        work : frozen dataclass with `__call__(given, room)`
-            What tasks have in common; it is sent to every worker once. It reads `given`, writes files into
-            `room.folder` and returns a value that can be kept.
-        progress : callable, optional
-            Called with (done, total) tasks.
-        inside : callable, optional
-            `room.tell` of tasks that are done in this process.
+        A task that fails stops no other. Files and value of each take their place when they are whole. `work`, a frozen
+        dataclass, is what tasks have in common and sent to every worker once: called with (given, room), it writes
+        files into `room.folder` and returns a value that can be kept. `progress` counts tasks, `inside` is `room.tell`
+        of those that are done in this process.
         """
         tell = progress or (lambda done, total: None)
         common = self.digests.of(work)
@@ -117,7 +110,6 @@ class Workspace:
                         values[job.name] = self.value(job.name)
                     except ForeignFileError as error:
                         failures[job.name] = str(error)
-                shutil.rmtree(job.folder, ignore_errors=True)
                 done += 1
                 tell(done, len(tasks))
         finally:
@@ -277,14 +269,39 @@ class Workspace:
             half.unlink()
 
 
+@dataclass
 class Staged:
     """Files and value of a result that is being made."""
 
-    def __init__(self, folder: Path) -> None:
-        self.folder = folder
-        self.value: Any = None
+    folder: Path
+    value: Any = None
 
 
 def _plain(name: str) -> str:
     """A name as that of a file."""
     return quote(name, safe=" ")
+
+
+@dataclass(frozen=True, eq=False)
+class KeptSteps:
+    """Steps that are kept in an output; when a step is done, those `inside` it are forgotten."""
+
+    space: Workspace
+    found: list[str] = field(default_factory=list)          # the steps that had been done before this run
+    made: set[str] = field(default_factory=set)             # those that were done now
+
+    def __call__(self, name: str, inputs: Any, make: Callable[[], T]) -> T:
+        fresh = False
+
+        def now(folder: Path) -> T:
+            nonlocal fresh
+            fresh = True
+            return make()
+
+        value = self.space.step(name, inputs, now)
+        if fresh:
+            self.made.add(name)
+        elif name not in self.made:
+            self.found.append(name)
+        self.space.drop_others(f"{name}/")
+        return value

@@ -6,8 +6,8 @@ from scipy.sparse import coo_array, csr_array
 from scipy.sparse.csgraph import breadth_first_order, connected_components, dijkstra, minimum_spanning_tree
 from scipy.spatial import cKDTree
 
+from ..geometry.farthest_points import thin
 from ..geometry.target import Target
-from ..geometry.thinning import thin
 
 
 class Sheet:

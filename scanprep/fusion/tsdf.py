@@ -10,8 +10,7 @@ from scipy.sparse.csgraph import dijkstra
 
 from ..geometry.mesh import Mesh
 from ..geometry.remeshing import smooth
-from ..geometry.seen_space import mesh_and_camera
-from ..geometry.surface import Rays, barycentric
+from ..geometry.surface import Rays, barycentric, mesh_and_camera
 from ..ranges import FLAG, Cell, Cosine, Range, Settings, Share
 from ..repair.manifold import drop_small_components, split_vertices
 

@@ -6,14 +6,14 @@ the caller does or metres are assumed, with a warning where that would make a gi
 from __future__ import annotations
 
 import gzip
+from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from types import ModuleType
 from typing import Literal, NamedTuple
 
 import numpy as np
 
-from . import format_glb, format_obj, format_off, format_pcd, format_ply, format_stl, format_xyz, storage
+from . import format_glb, format_pcd, format_ply, format_stl, format_text, storage
 from .format_common import UNITS, Contents, MeshFileError, check_extent, load_bytes, metres_per_unit
 from .mesh import Mesh
 
@@ -23,10 +23,20 @@ __all__ = ["UNITS", "MeshFileError", "PointCloud", "Registered", "list_meshes", 
 Precision = Literal["double", "single"]
 
 POINT_ENDINGS = (".xyz", ".pcd", ".txt", ".pts")
-_MESHES: dict[str, ModuleType] = {".ply": format_ply, ".obj": format_obj, ".stl": format_stl, ".off": format_off,
-                                  ".glb": format_glb}
-_POINTS: dict[str, ModuleType] = {".ply": format_ply, ".pcd": format_pcd, ".xyz": format_xyz, ".txt": format_xyz,
-                                  ".pts": format_xyz}
+
+
+class _Format(NamedTuple):
+    read: Callable[[Path, bytes], Contents]
+    encode: Callable[[Contents, bool], bytes]         # with coordinates in double precision, or not
+
+
+_PLY, _ROWS = _Format(format_ply.read, format_ply.encode), _Format(format_text.read_xyz, format_text.encode_xyz)
+_MESHES = {".ply": _PLY, ".obj": _Format(format_text.read_obj, format_text.encode_obj),
+           ".stl": _Format(format_stl.read, format_stl.encode),
+           ".off": _Format(format_text.read_off, format_text.encode_off),
+           ".glb": _Format(format_glb.read, format_glb.encode)}
+_POINTS = {".ply": _PLY, ".pcd": _Format(format_pcd.read, format_pcd.encode), ".xyz": _ROWS, ".txt": _ROWS,
+           ".pts": _ROWS}
 
 
 def read_mesh(path: str | Path, unit: str | None = None) -> Mesh:
@@ -192,17 +202,17 @@ def _suffix(path: Path) -> str:
     return suffixes[-2] if len(suffixes) > 1 and suffixes[-1] == ".gz" else "".join(suffixes[-1:])
 
 
-def _format(path: Path, formats: dict[str, ModuleType]) -> ModuleType:
+def _format(path: Path, formats: dict[str, _Format]) -> _Format:
     if _suffix(path) not in formats:
         raise MeshFileError(f"{path}: expected a name ending in {', '.join(formats)}, found '{_suffix(path)}'")
     return formats[_suffix(path)]
 
 
-def _read(path: Path, formats: dict[str, ModuleType]) -> Contents:
+def _read(path: Path, formats: dict[str, _Format]) -> Contents:
     if path.is_file():
         _format(path, formats)           # a wrong name is told even of a file that holds nothing
     data = load_bytes(path)
-    contents: Contents = _format(path, formats).read(path, data)
+    contents = _format(path, formats).read(path, data)
     if not len(contents.vertices):
         raise MeshFileError(f"{path}: the file holds no vertices")
     check_extent(path, "vertex", contents.vertices)
@@ -211,11 +221,10 @@ def _read(path: Path, formats: dict[str, ModuleType]) -> Contents:
     return contents
 
 
-def _write(path: Path, contents: Contents, precision: Precision, formats: dict[str, ModuleType]) -> None:
+def _write(path: Path, contents: Contents, precision: Precision, formats: dict[str, _Format]) -> None:
     if precision not in ("double", "single"):
         raise ValueError(f"precision: expected 'double' or 'single', got {precision!r}")
     data = _format(path, formats).encode(contents, precision == "double")
     if path.suffix.lower() == ".gz":
         data = gzip.compress(data, compresslevel=6, mtime=0)
-    with storage.writing(path) as beside:
-        beside.write_bytes(data)
+    storage.write(path, data)

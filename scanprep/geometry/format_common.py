@@ -5,7 +5,7 @@ import contextlib
 import gzip
 import io
 import warnings
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -169,6 +169,43 @@ def as_colors(values: np.ndarray, kind: np.dtype) -> np.ndarray:
     return np.clip(np.asarray(values, dtype=np.float64) / scale, 0, 1)
 
 
+def as_seen(linear: np.ndarray) -> np.ndarray:
+    """sRGB values in [0, 1], as screens show them, of linear light, which is clipped to [0, 1]."""
+    linear = np.clip(linear, 0, 1)
+    return np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)
+
+
+def as_light(color: np.ndarray) -> np.ndarray:
+    """Linear light of sRGB values in [0, 1]."""
+    color = np.asarray(color, dtype=float)
+    return np.where(color <= 0.04045, color / 12.92, ((color + 0.055) / 1.055) ** 2.4)
+
+
 def as_bytes(colors: np.ndarray) -> np.ndarray:
     """Colours in [0, 1] as integers 0..255."""
     return np.clip(np.rint(255 * colors), 0, 255).astype(np.uint8)
+
+
+def structured(columns: Iterable[tuple[Sequence[str], str, np.ndarray | None]]) -> np.ndarray:
+    """Rows with named fields, little-endian, of arrays (N, k) with the names of their columns and their kind."""
+    given = [(names, kind, values) for names, kind, values in columns if values is not None]
+    rows = np.zeros(len(given[0][2]), dtype=[(name, "<" + kind) for names, kind, _ in given for name in names])
+    for names, _, values in given:
+        for name, column in zip(names, values.T, strict=True):
+            rows[name] = column
+    return rows
+
+
+def fields_of(rows: np.ndarray) -> list[tuple[str, str]]:
+    """The name and the kind, such as `<f4`, of every field."""
+    return [(name, rows.dtype[name].str) for name in rows.dtype.names or ()]
+
+
+def text_rows(form: str, *columns: np.ndarray) -> str:
+    """One line for each row of arrays (N, k) side by side; `form` is that of a line."""
+    return (form + "\n") * len(columns[0]) % tuple(np.hstack(columns).ravel().tolist())
+
+
+def three_numbers(double: bool) -> str:
+    """The form of the coordinates of a point in a line of text."""
+    return "%.12g %.12g %.12g" if double else "%.8g %.8g %.8g"

@@ -10,7 +10,7 @@ from typing import Any
 import numpy as np
 
 from . import storage
-from .format_common import Contents, MeshFileError, as_colors, quote
+from .format_common import Contents, MeshFileError, as_colors, as_light, as_seen, polygons, quote
 from .mesh import Mesh
 
 _COMPONENTS = {5120: "i1", 5121: "u1", 5122: "<i2", 5123: "<u2", 5125: "<u4", 5126: "<f4"}
@@ -56,7 +56,7 @@ def _scene(path: Path, tree: dict[str, Any], binary: bytes) -> Contents:
             corners = triangles_of(tree, binary, primitive, count)
             if np.linalg.det(matrix[:3, :3]) < 0:
                 corners = corners[:, ::-1]
-            faces.append(_in_range(path, corners, count) + placed[points])
+            faces.append(polygons(path, np.full(len(corners), 3), corners.ravel(), count) + placed[points])
             most -= count + 3 * len(corners) + 1
             if most < 0:
                 raise ValueError("it shows its meshes too often")
@@ -96,10 +96,7 @@ def chunks_of(path: Path, data: bytes) -> tuple[dict[str, Any], bytes]:
 
 
 def nodes_of(tree: dict[str, Any]) -> Iterator[tuple[int, dict[str, Any], np.ndarray]]:
-    """Every node of the scene, its number and its matrix (4, 4) to the scene; all root nodes where there is no scene.
-
-    A node comes before those below it.
-    """
+    """Every node of the scene (or below all roots without one), its number and matrix (4, 4), parents first."""
     nodes = tree.get("nodes", [])
     if tree.get("scenes"):
         roots = item(tree["scenes"], tree.get("scene", 0)).get("nodes", [])
@@ -164,14 +161,6 @@ def triangles_of(tree: dict[str, Any], binary: bytes, primitive: dict[str, Any],
     return strip[(strip != np.roll(strip, 1, axis=1)).all(axis=1)]
 
 
-def _in_range(path: Path, corners: np.ndarray, count: int) -> np.ndarray:
-    outside = np.flatnonzero(((corners < 0) | (corners >= count)).any(axis=1))
-    if len(outside):
-        raise MeshFileError(f"{path}: face {outside[0]} refers to vertex {corners[outside[0]].max()}, "
-                            f"expected 0..{count - 1}")
-    return corners
-
-
 def _colors(tree: dict[str, Any], binary: bytes, primitive: dict[str, Any], count: int) -> np.ndarray | None:
     """The vertex colours as they are seen on a screen: glTF stores them linear in light."""
     if "COLOR_0" not in primitive["attributes"]:
@@ -179,8 +168,7 @@ def _colors(tree: dict[str, Any], binary: bytes, primitive: dict[str, Any], coun
     values = accessor(tree, binary, primitive["attributes"]["COLOR_0"], "VEC3", "VEC4")
     if len(values) != count:
         raise ValueError(f"{len(values)} colours of {count} vertices")
-    linear = as_colors(values[:, :3], values.dtype)
-    return np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * np.maximum(linear, 1e-9) ** (1 / 2.4) - 0.055)
+    return as_seen(as_colors(values[:, :3], values.dtype))
 
 
 def encode(contents: Contents, double: bool) -> bytes:
@@ -191,9 +179,7 @@ def encode(contents: Contents, double: bool) -> bytes:
     attributes = {"POSITION": glb.add(contents.vertices, "VEC3", VERTICES, bounds=True),
                   "NORMAL": glb.add(normals, "VEC3", VERTICES)}
     if contents.colors is not None:
-        c = contents.colors
-        linear = np.where(c <= 0.04045, c / 12.92, ((c + 0.055) / 1.055) ** 2.4)
-        attributes["COLOR_0"] = glb.add(linear, "VEC3", VERTICES)
+        attributes["COLOR_0"] = glb.add(as_light(contents.colors), "VEC3", VERTICES)
     return glb.pack({
         "scene": 0, "scenes": [{"nodes": [0]}], "nodes": [{"mesh": 0}],
         "meshes": [{"primitives": [{"attributes": attributes, "indices": indices, "material": 0}]}],
@@ -211,8 +197,7 @@ class Glb:
     def add(self, array: np.ndarray, kind: str, target: int | None, bounds: bool = False) -> int:
         """An accessor of float32 numbers, one of `kind` a row (a MAT4 column after column); its index.
 
-        `target` is `VERTICES` for what vertices have; `bounds` says the least and the greatest row, which glTF wants
-        of positions and times.
+        `target` is `VERTICES` for what vertices have; glTF wants `bounds` of positions and times.
         """
         values = np.ascontiguousarray(array, dtype="<f4")
         extra: dict[str, Any] = {}

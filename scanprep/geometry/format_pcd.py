@@ -6,7 +6,7 @@ from pathlib import Path
 import numpy as np
 
 from . import storage
-from .format_common import Contents, Lines, MeshFileError, as_bytes, quote
+from .format_common import Contents, Lines, MeshFileError, as_bytes, fields_of, quote, structured
 
 _KEYS = (b"VERSION", b"FIELDS", b"SIZE", b"TYPE", b"COUNT", b"WIDTH", b"HEIGHT", b"VIEWPOINT", b"POINTS", b"DATA")
 
@@ -99,20 +99,13 @@ def _contents(columns: dict[str, np.ndarray]) -> Contents:
 
 def encode(contents: Contents, double: bool) -> bytes:
     """A binary PCD file."""
-    size = 8 if double else 4
-    fields = [("x", f"<f{size}"), ("y", f"<f{size}"), ("z", f"<f{size}")]
-    if contents.normals is not None:
-        fields += [("normal_x", "<f4"), ("normal_y", "<f4"), ("normal_z", "<f4")]
+    packed = None
     if contents.colors is not None:
-        fields.append(("rgb", "<u4"))
-    rows = np.zeros(len(contents.vertices), dtype=fields)
-    for i, axis in enumerate("xyz"):
-        rows[axis] = contents.vertices[:, i]
-        if contents.normals is not None:
-            rows[f"normal_{axis}"] = contents.normals[:, i]
-    if contents.colors is not None:
-        r, g, b = as_bytes(contents.colors).astype(np.uint32).T
-        rows["rgb"] = (r << 16) | (g << 8) | b
+        packed = as_bytes(contents.colors).astype(np.uint32) @ np.array([1 << 16, 1 << 8, 1], dtype=np.uint32)
+    rows = structured([(("x", "y", "z"), "f8" if double else "f4", contents.vertices),
+                       (("normal_x", "normal_y", "normal_z"), "f4", contents.normals),
+                       (("rgb",), "u4", None if packed is None else packed[:, None])])
+    fields = fields_of(rows)
     lines = ["VERSION 0.7", "FIELDS " + " ".join(n for n, _ in fields),
              "SIZE " + " ".join(k[2] for _, k in fields), "TYPE " + " ".join(k[1].upper() for _, k in fields),
              "COUNT " + " ".join("1" for _ in fields), f"WIDTH {len(rows)}", "HEIGHT 1",

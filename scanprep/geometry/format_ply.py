@@ -5,17 +5,15 @@ import contextlib
 from dataclasses import dataclass
 from itertools import islice
 from pathlib import Path
-from struct import Struct
 
 import numpy as np
 
 from . import storage
-from .format_common import Contents, Lines, MeshFileError, as_bytes, as_colors, polygons, quote
+from .format_common import Contents, Lines, MeshFileError, as_bytes, as_colors, fields_of, polygons, quote, structured
 
 _TYPES = {"char": "i1", "uchar": "u1", "short": "i2", "ushort": "u2", "int": "i4", "uint": "u4", "float": "f4",
           "double": "f8", "int8": "i1", "uint8": "u1", "int16": "i2", "uint16": "u2", "int32": "i4",
           "uint32": "u4", "int64": "i8", "uint64": "u8", "float32": "f4", "float64": "f8"}
-_LETTERS = {"i1": "b", "u1": "B", "i2": "h", "u2": "H", "i4": "i", "u4": "I", "i8": "q", "u8": "Q"}
 _ORDERS = {b"ascii": "=", b"binary_little_endian": "<", b"binary_big_endian": ">"}
 _COLORS = (("red", "green", "blue"), ("r", "g", "b"), ("diffuse_red", "diffuse_green", "diffuse_blue"))
 
@@ -107,10 +105,9 @@ def _binary_element(path: Path, data: bytes, element: Element, start: int, order
     for i, p in enumerate(element.properties):
         n = 1
         if p.length_kind:
-            width = int(p.length_kind[1])
-            n = int.from_bytes(data[at:at + width], "big" if order == ">" else "little") if element.count else 0
+            n = _length(data, at, p.length_kind, order) if element.count else 0
             fields.append((f"length{i}", order + p.length_kind))
-            at += width
+            at += int(p.length_kind[1])
         fields.append((f"value{i}", order + p.kind, (n,) if p.length_kind else ()))
         at += n * int(p.kind[1])
         if at > len(data) and element.count:
@@ -133,27 +130,28 @@ def _binary_element(path: Path, data: bytes, element: Element, start: int, order
 
 def _binary_rows(path: Path, data: bytes, element: Element, start: int, order: str
                  ) -> tuple[dict[str, _Column], int]:
-    ways = [(int(p.kind[1]), Struct(order + _LETTERS[p.length_kind]) if p.length_kind else None)
-            for p in element.properties]
-    sizes, items = [list[int]() for _ in ways], [bytearray() for _ in ways]
+    sizes, items = [list[int]() for _ in element.properties], [bytearray() for _ in element.properties]
     for row in range(element.count):
-        for (width, length), size, item in zip(ways, sizes, items, strict=True):
+        for p, size, item in zip(element.properties, sizes, items, strict=True):
             n = 1
-            if length is not None:
-                if start + length.size > len(data):
-                    raise _truncated(path, element, row)
-                n = length.unpack_from(data, start)[0]
-                start += length.size
-            if n < 0 or start + n * width > len(data):
+            if p.length_kind:
+                n = _length(data, start, p.length_kind, order)
+                start += int(p.length_kind[1])
+            end = start + n * int(p.kind[1])
+            if n < 0 or end > len(data):
                 raise _truncated(path, element, row)
             size.append(n)
-            item += data[start:start + n * width]
-            start += n * width
+            item += data[start:end]
+            start = end
     columns: dict[str, _Column] = {}
     for p, size, item in zip(element.properties, sizes, items, strict=True):
         values = np.frombuffer(item, order + p.kind)
         columns[p.name] = (np.array(size, dtype=np.int64), values) if p.length_kind else values
     return columns, start
+
+
+def _length(data: bytes, at: int, kind: str, order: str) -> int:
+    return int.from_bytes(data[at:at + int(kind[1])], "big" if order == ">" else "little", signed=kind[0] == "i")
 
 
 def _truncated(path: Path, element: Element, found: int) -> MeshFileError:
@@ -228,19 +226,11 @@ def _contents(path: Path, vertex: Element, found: dict[str, dict[str, _Column]])
 def encode(contents: Contents, double: bool) -> bytes:
     """A binary little-endian PLY file; coordinates as `double` or, smaller, as `float`."""
     number = "f8" if double else "f4"
-    names = ["x", "y", "z"] + (["nx", "ny", "nz"] if contents.normals is not None else [])
-    fields = [(name, "<" + number) for name in names]
-    if contents.colors is not None:
-        fields += [(name, "u1") for name in _COLORS[0]]
-    rows = np.zeros(len(contents.vertices), dtype=fields)
-    for values, group in ((contents.vertices, names[:3]), (contents.normals, names[3:]),
-                          (None if contents.colors is None else as_bytes(contents.colors), _COLORS[0])):
-        if values is not None:
-            for i, name in enumerate(group):
-                rows[name] = values[:, i]
-    words = {"<f8": "double", "<f4": "float", "u1": "uchar"}
+    rows = structured([(("x", "y", "z"), number, contents.vertices), (("nx", "ny", "nz"), number, contents.normals),
+                       (_COLORS[0], "u1", None if contents.colors is None else as_bytes(contents.colors))])
+    words = {"<f8": "double", "<f4": "float", "|u1": "uchar"}
     header = ["ply", "format binary_little_endian 1.0", f"element vertex {len(rows)}"]
-    header += [f"property {words[kind]} {name}" for name, kind in fields]
+    header += [f"property {words[kind]} {name}" for name, kind in fields_of(rows)]
     body = rows.tobytes()
     if contents.faces is not None:
         header += [f"element face {len(contents.faces)}", "property list uchar int vertex_indices"]

@@ -21,16 +21,11 @@ class SurfaceGraph:
         self._graph = _with_diagonals(mesh)
 
     def distances(self, sources: np.ndarray | int, limit: float = np.inf) -> np.ndarray:
-        """Distances (S, N), metres, from each source vertex, or (N,) from one; infinite where no path leads.
-
-        Beyond `limit` a distance is infinite too; a small one saves time.
-        """
+        """Distances (S, N), metres, from each source vertex, or (N,) from one; infinite beyond `limit` or any path."""
         return dijkstra(self._graph, directed=False, indices=_checked(self.mesh, sources), limit=limit)
 
     def nearest(self, sources: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Distance (N,) of every vertex to its nearest source along the surface, and the place (N,) in `sources`.
-
-        Infinite and -1 where no path leads.
+        """Distance (N,) of each vertex to its nearest source, and its place (N,) in `sources`; infinite and -1 without.
         """
         sources = np.atleast_1d(_checked(self.mesh, sources))
         distance, _, origin = dijkstra(self._graph, directed=False, indices=sources, min_only=True,
@@ -41,10 +36,7 @@ class SurfaceGraph:
         return distance, np.where(reached, place[np.where(reached, origin, 0)], -1)
 
     def farthest_points(self, count: int, first: int = 0) -> np.ndarray:
-        """(count,) vertices spread over the surface: each farthest from those before it.
-
-        A piece of the surface that no path reaches yet is served first.
-        """
+        """(count,) vertices spread over the surface, pieces that no path reaches yet first: see `farthest_points`."""
         if not 1 <= count <= len(self.mesh.vertices):
             raise ValueError(f"count: expected 1..{len(self.mesh.vertices)}, got {count}")
         return farthest_points(self.mesh.vertices, count, int(_checked(self.mesh, first)),
@@ -77,10 +69,7 @@ def _diagonals(mesh: Mesh) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
 
     Only where that line crosses the edge, so that it runs inside the two triangles.
     """
-    order = np.argsort(mesh.face_edges.ravel(), kind="stable")
-    start = np.concatenate([[0], np.cumsum(mesh.edge_use)[:-1]])
-    inner = np.flatnonzero(mesh.edge_use == 2)
-    sides = np.stack([order[start[inner]], order[start[inner] + 1]])
+    inner, sides = np.flatnonzero(mesh.edge_use == 2), mesh.side_pairs.T
     c, d = mesh.faces[sides // 3, (sides % 3 + 2) % 3]    # the corner that faces side 01, 12 or 20
     x = mesh.vertices
     a, b = mesh.edges[inner].T

@@ -163,7 +163,10 @@ def _entries(path: Path, mesh: Mesh | None, unit: str | None) -> dict[str, _Entr
     pairs: list[tuple[str, _Entry]]
     with storage.taking_apart(path, "landmarks", MeshFileError):
         if suffix == ".json":
-            tree = _json(path, data)
+            tree = storage.parse_json(path, data, "landmarks", MeshFileError, nan=True)      # refused below, by name
+            if not isinstance(tree, dict):
+                raise MeshFileError(f"{path}: expected landmarks in JSON {{name: [x, y, z]}}, "
+                                    f"found a {type(tree).__name__}")
             if isinstance(tree.get("markups"), list):
                 own_unit, pairs = _slicer(path, tree["markups"], mesh, unit)
             else:
@@ -171,9 +174,11 @@ def _entries(path: Path, mesh: Mesh | None, unit: str | None) -> dict[str, _Entr
         elif suffix == ".pp":
             pairs = _picked_points(path, data)
         elif suffix == ".lnd":
-            own_unit, pairs = "mm", _caesar(path, data)
+            # number, two codes, distance from the axis, x, y, z and name, after a heading of `KEY = value`
+            expected = "a line of a CAESAR .lnd file, seven numbers and a name"
+            own_unit, pairs = "mm", _named_rows(Lines(path, data), 7, expected, "latin-1", b"=")
         else:
-            pairs = _text(path, data)
+            pairs = _named_rows(Lines(path, data, comment=b"#"), 3, "'x y z name'", "utf-8")
     if not pairs:
         raise MeshFileError(f"{path}: expected landmarks, found none")
     entries = dict(pairs)
@@ -201,14 +206,6 @@ def _place(path: Path, name: str, value: _Entry, mesh: Mesh | None) -> np.ndarra
     if not 0 <= index < count:
         raise MeshFileError(f"{path}: landmark '{name}' refers to {what} {index}, the mesh has 0..{count - 1}")
     return mesh.vertices[index].copy() if isinstance(value, int) else value["bary"] @ mesh.corners[index]
-
-
-def _json(path: Path, data: bytes) -> dict[str, Any]:
-    tree = storage.parse_json(path, data, "landmarks", MeshFileError, nan=True)      # refused below, by name
-    if not isinstance(tree, dict):
-        raise MeshFileError(f"{path}: expected landmarks in JSON {{name: [x, y, z]}}, "
-                            f"found a {type(tree).__name__}")
-    return tree
 
 
 def _json_entry(path: Path, name: str, value: Any) -> _Entry:
@@ -267,31 +264,17 @@ def _picked_points(path: Path, data: bytes) -> list[tuple[str, _Entry]]:
                 for point in root.iter("point") if point.attrib.get("active", "1") != "0"]
 
 
-def _caesar(path: Path, data: bytes) -> list[tuple[str, _Entry]]:
-    """Lines of number, two codes, distance from the axis, x, y, z and name, after a heading of `KEY = value`."""
-    lines = Lines(path, data)
+def _named_rows(lines: Lines, count: int, expected: str, encoding: str, heading: bytes | None = None
+                ) -> list[tuple[str, _Entry]]:
+    """Lines of so many numbers, the last three of them x, y, z, and a name; those with `heading` in them left out."""
     pairs: list[tuple[str, _Entry]] = []
     for row, line in enumerate(lines.text):
-        if b"=" in line:
+        if heading is not None and heading in line:
             continue
-        words = line.split()
+        words = line.split(None, count)
         try:
-            numbers = [float(word) for word in words[:7]]
-            if len(words) < 8:
-                raise ValueError
-        except ValueError:
-            raise lines.fail(row, "a line of a CAESAR .lnd file, seven numbers and a name") from None
-        pairs.append((b" ".join(words[7:]).decode("latin-1"), np.array(numbers[4:7])))
-    return pairs
-
-
-def _text(path: Path, data: bytes) -> list[tuple[str, _Entry]]:
-    lines = Lines(path, data, comment=b"#")
-    pairs: list[tuple[str, _Entry]] = []
-    for row, line in enumerate(lines.text):
-        words = line.split(None, 3)
-        try:
-            pairs.append((words[3].strip().decode(), np.array([float(word) for word in words[:3]])))
+            numbers = [float(word) for word in words[:count]]
+            pairs.append((b" ".join(words[count].split()).decode(encoding), np.array(numbers[-3:])))
         except (ValueError, IndexError):
-            raise lines.fail(row, "'x y z name'") from None
+            raise lines.fail(row, expected) from None
     return pairs

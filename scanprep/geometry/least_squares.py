@@ -6,7 +6,7 @@ The caller gives the normal equations at a state; their structure solves for the
 - `Arrow`: many frames with unknowns of their own, coupled by those they share alone;
 - `Sparse`: one large problem with a sparse matrix.
 
-A step is added to the state, unless a `retract` says otherwise: `retract_pose` turns each rotation by its step.
+A step is added to the state, unless a `retract` says otherwise, as for rotations.
 """
 from __future__ import annotations
 
@@ -22,7 +22,6 @@ from . import rotations, sparse
 
 State = TypeVar("State")
 FLOOR = 1e-9                         # of the largest diagonal entry, added to all: some unknowns may have no data
-STIFF = 1e8                          # damping beyond which no step lowers the energy any more
 
 
 @dataclass(frozen=True, eq=False)
@@ -143,11 +142,33 @@ def retract_pose(angles: int) -> Callable[[np.ndarray, np.ndarray], np.ndarray]:
     """
     def retract(x: np.ndarray, step: np.ndarray) -> np.ndarray:
         out = x + step
-        R, d = (rotations.exp(part[..., :angles].reshape(-1, 3)) for part in (x, step))
-        out[..., :angles] = rotations.log(R @ d).reshape(out[..., :angles].shape)
+        first, second = (part[..., :angles].reshape(-1, 3) for part in (x, step))
+        out[..., :angles] = rotations.compose(first, second).reshape(out[..., :angles].shape)
         return out
 
     return retract
+
+
+def step_between(x: np.ndarray, goal: np.ndarray, angles: int) -> np.ndarray:
+    """The step (..., P) by which the retract of `retract_pose(angles)` leads from rows x to others."""
+    return retract_pose(angles)(-x, goal)
+
+
+def by_rotations(equations: Any, x: Any, angles: int) -> Any:
+    """`Dense` or `Arrow` equations at rows x (B, P) that begin with rotation vectors, by small rotations `R exp(d)`."""
+    if isinstance(equations, Arrow):
+        return equations._replace(rows=by_rotations(equations.rows, x, angles))
+    local = np.swapaxes(rotations.inverse_right_jacobian(x[:, :angles].reshape(len(x), -1, 3)), -1, -2)
+
+    def along(matrix: np.ndarray) -> np.ndarray:
+        """The rows (B, P, k) of the vectors by the rotations."""
+        out = matrix.copy()
+        own = out[:, :angles]
+        own[:] = (local @ own.reshape(*local.shape[:3], -1)).reshape(own.shape)
+        return out
+
+    return Dense(equations.energy, along(equations.gradient[..., None])[..., 0],
+                 along(np.swapaxes(along(equations.hessian), 1, 2)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -167,25 +188,21 @@ class Minimum(Generic[State]):
 
 def levenberg_marquardt(equations: Callable[[State], NormalEquations], start: State, iterations: int = 30,
                         tolerance: float = 1e-5, damping: float = 1e-3, exact: float = 0.0,
-                        retract: Callable[[Any, np.ndarray], Any] = np.add) -> Minimum[State]:
+                        retract: Callable[[Any, np.ndarray], Any] = np.add, angles: int = 0) -> Minimum[State]:
     """The state of least energy near a start; a step is taken only where it lowers the energy.
 
-    Parameters
-    ----------
-    equations : state -> NormalEquations
-    start : state
-        (B, P) float for `Dense` and `Arrow`; whatever `retract` takes for `Sparse`.
-    iterations : int
-        Most steps tried.
-    tolerance : float
-        Stop when a step lowers the energy by less than this fraction.
-    damping : float
-        First factor on the diagonal of the matrix.
-    exact : float
-        Also stop when it lowers the energy by less than this.
-    retract : state, step -> state
-        What a step does to the state.
+    A state is (B, P) float for `Dense` and `Arrow`, for `Sparse` whatever `retract`, which does a step to it, takes.
+    The search stops after so many `iterations`, steps tried, or when a step lowers the energy by less than the fraction
+    `tolerance`, or by less than `exact`. `damping` is the first factor on the diagonal of the matrix. With `angles` so
+    many first unknowns of a row are rotation vectors: derivatives are by them, steps are small rotations, and so are
+    the equations that are returned.
     """
+    if angles:
+        retract, by_vectors = retract_pose(angles), equations
+
+        def equations(x: State) -> NormalEquations:
+            return by_rotations(by_vectors(x), x, angles)
+
     x, now = start, equations(start)
     factor = np.full(len(now.energy), damping)
     converged = np.zeros(len(factor), dtype=bool)
@@ -199,7 +216,7 @@ def levenberg_marquardt(equations: Callable[[State], NormalEquations], start: St
         least = np.maximum(tolerance * now.energy, max(exact, 1e-300))
         # a step that failed settles nothing unless there was nothing to gain: it may have been too long
         settled = (better & (now.energy - tried.energy <= least)) | (gain <= least)
-        converged |= settled | (factor > STIFF)
+        converged |= settled | (factor > 1e8)        # so much damping: no step lowers the energy any more
         x, now = _taken(better, x, ahead), _taken(better, now, tried)
         factor = np.where(better, np.maximum(factor / 5, 1e-9), factor * 8)
     return Minimum(x, now, converged, done)

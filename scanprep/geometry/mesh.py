@@ -126,12 +126,16 @@ class Mesh:
         return np.bincount(self.face_edges.ravel(), minlength=len(self.edges))
 
     @cached_property
+    def side_pairs(self) -> np.ndarray:
+        """(P, 2) places in `face_edges`, flattened, of the two sides that meet at each edge with two triangles."""
+        order = np.argsort(self.face_edges.ravel(), kind="stable")
+        inner = np.concatenate([[0], np.cumsum(self.edge_use)[:-1]])[self.edge_use == 2]
+        return np.stack([order[inner], order[inner + 1]], axis=1)
+
+    @property
     def face_pairs(self) -> np.ndarray:
         """(P, 2) triangles that share an edge, for edges with exactly two triangles."""
-        order = np.argsort(self.face_edges.ravel(), kind="stable") // 3
-        start = np.concatenate([[0], np.cumsum(self.edge_use)[:-1]])
-        inner = start[self.edge_use == 2]
-        return np.stack([order[inner], order[inner + 1]], axis=1)
+        return self.side_pairs // 3
 
     @cached_property
     def vertex_adjacency(self) -> csr_array:

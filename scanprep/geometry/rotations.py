@@ -82,11 +82,7 @@ def hat(v: np.ndarray) -> np.ndarray:
 
 def right_jacobian(twist: np.ndarray) -> np.ndarray:
     """J_r (..., 3, 3) with `exp(t + d) ≈ exp(t) exp(J_r(t) d)`."""
-    t = np.asarray(twist, dtype=np.float64)
-    angle = np.linalg.norm(t, axis=-1)[..., None, None]
-    small = angle < 1e-3
-    a = np.where(small, 1.0, angle)
-    K = hat(t)
+    angle, small, a, K = _terms(twist)
     first = np.where(small, 0.5 - angle**2 / 24, (1 - np.cos(a)) / a**2)
     second = np.where(small, 1 / 6 - angle**2 / 120, (a - np.sin(a)) / a**3)
     return np.eye(3) - first * K + second * K @ K
@@ -97,13 +93,16 @@ def inverse_right_jacobian(twist: np.ndarray) -> np.ndarray:
 
     `log(exp(t) exp(d)) ≈ t + J_r⁻¹(t) d`.
     """
-    t = np.asarray(twist, dtype=np.float64)
-    angle = np.linalg.norm(t, axis=-1)[..., None, None]
-    small = angle < 1e-3
-    a = np.where(small, 1.0, angle)
-    K = hat(t)
+    angle, small, a, K = _terms(twist)
     second = np.where(small, 1 / 12 + angle**2 / 720, 1 / a**2 - (1 + np.cos(a)) / (2 * a * np.sin(a)))
     return np.eye(3) + 0.5 * K + second * K @ K
+
+
+def _terms(twist: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
+    """Angles (..., 1, 1), where they are too small to divide by, the angles with 1 in these places, and `hat`."""
+    angle = np.linalg.norm(twist, axis=-1)[..., None, None]
+    small = angle < 1e-3
+    return angle, small, np.where(small, 1.0, angle), hat(twist)
 
 
 def procrustes(source: np.ndarray, target: np.ndarray, weights: np.ndarray | None = None

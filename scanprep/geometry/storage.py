@@ -1,11 +1,11 @@
-"""The one place of stored files: arrays with a JSON header, and JSON; tables stand beside it.
+"""Stored files: JSON, and `.npz` files of named arrays and a JSON header with kind and version; never pickle.
 
-Arrays: one `.npz` file = named arrays and a JSON header with kind and version; never pickle. Whatever is wrong with
-a file is a StorageError that names it, and a small file never asks for much memory.
+Whatever is wrong with a file is a StorageError that names it, and a small file never asks for much memory.
 """
 from __future__ import annotations
 
 import contextlib
+import dataclasses
 import json
 import math
 import os
@@ -27,10 +27,7 @@ class StorageError(ValueError):
 
 @contextlib.contextmanager
 def taking_apart(path: str | Path, what: str, error: type[StorageError] = StorageError) -> Iterator[None]:
-    """Whatever goes wrong inside while a file is taken apart is an `error` that names it.
-
-    Damaged files fail in more ways than a list of exceptions foresees (numpy alone raises eight kinds).
-    """
+    """Whatever goes wrong inside is an `error` that names the file: damaged ones fail in too many ways to list."""
     try:
         yield
     except StorageError:                 # says already which file
@@ -59,12 +56,15 @@ def read_bytes(path: str | Path, what: str = "a file", error: type[StorageError]
         return Path(path).read_bytes()
 
 
+def write(path: str | Path, data: bytes | str) -> None:
+    """Write a file, whole or not at all; text as UTF-8."""
+    with writing(path) as beside:
+        beside.write_bytes(data.encode("utf-8") if isinstance(data, str) else data)
+
+
 @contextlib.contextmanager
 def writing(path: str | Path) -> Iterator[Path]:
-    """A temporary path beside `path` that takes its place when the block ends without an error.
-
-    The file is never seen half written, and what stood there before stays until the new one is whole.
-    """
+    """A temporary path beside `path` that takes its place when the block ends well; until then the old file stays."""
     path = Path(path)
     path.parent.mkdir(parents=True, exist_ok=True)
     beside = path.with_name(f".{path.stem}.{os.getpid()}.part{path.suffix}")
@@ -84,29 +84,32 @@ def text(arrays: Mapping[str, np.ndarray], name: str, usual: str) -> str:
 
 
 def as_json(value: Any) -> Any:
-    """A value as it comes back from a JSON file: tuples as lists, keys as strings, None for what is not finite."""
+    """A value as it comes back from a JSON file of `write_json`: tuples as lists, keys as strings."""
     return json.loads(_json(value))
 
 
 def write_json(path: str | Path, value: Any) -> None:
-    """Write JSON, whole or not at all, null for what is not finite."""
-    with writing(path) as beside:
-        beside.write_text(_json(value, 1) + "\n", encoding="utf-8")
+    """Write JSON, whole or not at all: dataclasses as tables, arrays as lists, null for what is not finite."""
+    write(path, _json(value, 1) + "\n")
 
 
 def _json(value: Any, indent: int | None = None) -> str:
     try:
-        return json.dumps(value, indent=indent, allow_nan=False)
+        return json.dumps(value, indent=indent, allow_nan=False, default=_plain)
     except ValueError:
-        return json.dumps(_finite(value), indent=indent, allow_nan=False)
+        text = json.dumps(value, default=_plain)
+        return json.dumps(json.loads(text, parse_constant=lambda name: None), indent=indent)
 
 
-def _finite(value: Any) -> Any:
-    if isinstance(value, dict):
-        return {key: _finite(v) for key, v in value.items()}
-    if isinstance(value, list | tuple):
-        return [_finite(v) for v in value]
-    return None if isinstance(value, float) and not math.isfinite(value) else value
+def _plain(value: Any) -> Any:
+    """What JSON can hold of settings and figures."""
+    if dataclasses.is_dataclass(value) and not isinstance(value, type):
+        return {f.name: getattr(value, f.name) for f in dataclasses.fields(value)}
+    if isinstance(value, np.generic | np.ndarray):
+        return value.tolist()
+    if isinstance(value, Path):
+        return str(value)
+    raise TypeError(f"JSON holds no {type(value).__name__}")
 
 
 def read_json(path: str | Path, what: str, error: type[StorageError] = StorageError) -> Any:
@@ -138,11 +141,11 @@ def _number(text: str) -> float:
 
 
 def save(path: str | Path, kind: str, version: int, arrays: dict[str, np.ndarray],
-         header: dict[str, Any] | None = None) -> None:
+         header: dict[str, Any] | None = None, compress: bool = True) -> None:
     """Write arrays and a JSON header into one `.npz` file: what it holds and the number of its layout, for `load`."""
     text = json.dumps({"kind": kind, "version": version, **(header or {})})
     with writing(path) as beside, open(beside, "wb") as out:
-        np.savez_compressed(out, allow_pickle=False, **{HEADER: np.array(text)}, **arrays)
+        (np.savez_compressed if compress else np.savez)(out, allow_pickle=False, **{HEADER: np.array(text)}, **arrays)
 
 
 def load_arrays(path: str | Path, what: str = "an .npz file") -> dict[str, np.ndarray]:
@@ -158,8 +161,12 @@ def load_array(path: str | Path, what: str = "an array of NumPy") -> np.ndarray:
 
 def kind_of(path: str | Path) -> str:
     """The kind of a file of `save`, read from its header alone, or StorageError."""
-    header = _header(path, "scapekit", _arrays(path, "an .npz file with a header", HEADER).get(HEADER))
-    return str(header.get("kind"))
+    return str(load_header(path, "scapekit").get("kind"))
+
+
+def load_header(path: str | Path, kind: str) -> dict[str, Any]:
+    """The header alone of a file of `save`, whatever its kind and version; StorageError where there is none."""
+    return _header(path, kind, _arrays(path, "an .npz file with a header", HEADER).get(HEADER))
 
 
 def _arrays(path: str | Path, what: str, only: str | None) -> dict[str, np.ndarray]:

@@ -1,7 +1,9 @@
-"""Closest points on a surface, matches with compatible normals, and rays."""
+"""Closest points on a surface, matches with compatible normals, rays, and what lines of sight tell about space."""
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -16,11 +18,11 @@ def checked_points(points: np.ndarray, name: str = "points") -> np.ndarray:
     """Query points (n, 3) as float64, in one block; ValueError for one too far away for any library."""
     points = np.ascontiguousarray(points, dtype=np.float64)
     if points.ndim != 2 or points.shape[1] != 3:
-        raise ValueError(f"{name}: expected shape (n, 3), got {points.shape}")
+        raise ValueError(f"{name}: expected points of shape (n, 3), got shape {points.shape}")
     bad = np.flatnonzero(~(np.abs(points) < FARTHEST).all(axis=1))
     if len(bad):
-        raise ValueError(f"{name}: expected finite coordinates below {FARTHEST:g} m, got {len(bad)} of {len(points)} "
-                         f"without, the first is number {bad[0]}: {points[bad[0]].tolist()}")
+        raise ValueError(f"{name}: {len(bad)} points are not finite, or beyond {FARTHEST:g} m; the first is number "
+                         f"{bad[0]}: {points[bad[0]].tolist()}")
     return points
 
 
@@ -99,10 +101,8 @@ class Matches:
 class OrientedPoints:
     """Nearest neighbours among points whose normals agree with the query's.
 
-    Points and normals are searched together in six dimensions: the squared distance is
-    |x - y|² + scale² |n - m|², so a point on the near side of a thin limb wins over a closer one on the far
-    side. Matches beyond the limits are rejected afterwards. `scale` is the distance, metres, that a difference of
-    normals weighs.
+    Points and normals are searched together in six dimensions: the squared distance is |x - y|² + scale² |n - m|²
+    (scale in metres), so a point on the near side of a thin limb wins over a closer one on the far side.
     """
 
     def __init__(self, points: np.ndarray, normals: np.ndarray, scale: float = 0.05) -> None:
@@ -150,3 +150,36 @@ class Rays:
     def occluded(self, origins: np.ndarray, directions: np.ndarray, reach: float = 1e6) -> np.ndarray:
         """(n,) bool: something lies within `reach` along each ray."""
         return self.cast(origins, directions, reach)[0] >= 0
+
+
+def mesh_and_camera(view: Any) -> tuple[Mesh, np.ndarray]:
+    """The surface and the camera position of a RangeView or a pair."""
+    mesh, camera = view if isinstance(view, tuple) else (view.mesh, view.camera)
+    camera = np.asarray(camera, dtype=float)
+    if not isinstance(mesh, Mesh) or camera.shape != (3,) or not np.isfinite(camera).all():
+        raise ValueError("views: expected RangeViews or pairs of a Mesh and a camera position (3,)")
+    return mesh, camera
+
+
+class SeenSpace:
+    """Space that views look through, as it is empty as far as the surface that was seen.
+
+    [VRIP] space carving
+    """
+
+    def __init__(self, views: Sequence[Any]) -> None:
+        self._views = [(Rays(mesh), camera) for mesh, camera in map(mesh_and_camera, views)]
+
+    def ahead(self, points: np.ndarray) -> np.ndarray:
+        """How far points (n, 3) lie in front of what a view saw behind them, metres; the largest over all views.
+
+        Negative behind the surface of every view, -inf where no line of sight through the point ends on a surface.
+        """
+        best = np.full(len(points), -np.inf)
+        for rays, camera in self._views:
+            along = points - camera
+            depth = np.linalg.norm(along, axis=1)
+            along = along / np.maximum(depth, 1e-12)[:, None]
+            _, hit = rays.cast(np.broadcast_to(camera, points.shape), along)
+            best = np.maximum(best, np.nan_to_num(hit - depth, nan=-np.inf))
+        return best

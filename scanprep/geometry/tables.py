@@ -8,7 +8,7 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
-from .storage import LARGEST_TEXT, UTF_16, StorageError, read_bytes, taking_apart, writing
+from .storage import LARGEST_TEXT, UTF_16, StorageError, read_bytes, taking_apart, write
 
 
 def read_table(path: str | Path, columns: Sequence[str], needed: Sequence[str] | None = None
@@ -35,8 +35,7 @@ def write_table(path: str | Path, header: Sequence[str], rows: Iterable[Sequence
     table = csv.writer(text, lineterminator="\n")
     table.writerow(header)
     table.writerows(rows)
-    with writing(path) as beside:
-        beside.write_text(text.getvalue(), encoding="utf-8")
+    write(path, text.getvalue())
 
 
 def table_rows(path: str | Path, data: bytes, error: type[StorageError] = StorageError

@@ -7,33 +7,22 @@ import numpy as np
 from scipy.spatial import cKDTree
 
 from ..threads import search_threads
+from .farthest_points import thin
 from .mesh import Mesh
-from .surface import OrientedPoints
-from .thinning import thin
+from .surface import OrientedPoints, checked_points
 
 NEIGHBOURS = 16                  # points of a scan over which its normals are averaged
 
 
 @dataclass(frozen=True, eq=False)
 class Target:
-    """Points of a scan with smooth normals.
+    """Points of a scan with smooth normals."""
 
-    Attributes
-    ----------
-    points, normals : (n, 3) float
-    border : (n,) bool
-        On the edge of a hole: such a point says where data end, not where the surface is.
-    oriented : bool
-        Whether the normals are known to point outward.
-    descriptors : (n, q) float, optional
-        What else a point is matched by (see `path_descriptors`).
-    """
-
-    points: np.ndarray
-    normals: np.ndarray
-    border: np.ndarray
-    oriented: bool
-    descriptors: np.ndarray | None = None
+    points: np.ndarray                          # (n, 3), metres
+    normals: np.ndarray                         # (n, 3)
+    border: np.ndarray                          # (n,) bool: on the edge of a hole, where data end, not the surface
+    oriented: bool                              # the normals are known to point outward
+    descriptors: np.ndarray | None = None       # (n, q) what else a point is matched by (see `path_descriptors`)
 
     def thinned(self, cell: float) -> Target:
         """One point for each cubic cell (metres)."""
@@ -43,20 +32,10 @@ class Target:
 
 
 def target_of(scan: Mesh | np.ndarray, name: str = "scan") -> Target:
-    """Prepare a scan: normals averaged over neighbours, borders found.
-
-    Raises
-    ------
-    ValueError
-        Too few points, a wrong shape, or values that are not finite.
-    """
-    points = scan.vertices if isinstance(scan, Mesh) else np.asarray(scan, dtype=np.float64)
-    if points.ndim != 2 or points.shape[1] != 3:
-        raise ValueError(f"{name}: expected a Mesh or points of shape (n, 3), got shape {points.shape}")
+    """Prepare a scan: normals averaged over neighbours, borders found; ValueError for fewer than four points."""
+    points = checked_points(scan.vertices if isinstance(scan, Mesh) else scan, name)
     if len(points) < 4:
         raise ValueError(f"{name}: expected at least 4 points, got {len(points)}")
-    if not np.isfinite(points).all():
-        raise ValueError(f"{name}: {(~np.isfinite(points).all(axis=1)).sum()} points are not finite")
     normals = None
     if isinstance(scan, Mesh) and len(scan.faces):
         used = np.unique(scan.faces)
@@ -86,9 +65,7 @@ def _one_sided(points: np.ndarray, near: np.ndarray, limit: float = 0.3) -> np.n
 
 
 def orient(target: Target, deformed: Mesh, scale: float) -> Target:
-    """The same target with the sign of its normals taken from the nearest part of a mesh that lies on it.
-
-    A difference of normals of one counts like a distance of `scale` metres.
+    """The same target with the sign of its normals from the nearest part of a mesh on it; `scale` as `OrientedPoints`.
     """
     if target.oriented:
         return target

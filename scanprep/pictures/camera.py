@@ -25,10 +25,9 @@ class Camera:
                up: int = 2, lens: float = 6.0, margin: float = 1.06) -> Camera:
         """A camera that holds the whole subject: meshes, solids, or points (n, 3), two of them corners of a box.
 
-        `azimuth`, degrees, runs counter-clockwise about the axis `up` (0, 1 or 2); at 0 the camera stands on the +x
-        side when z is up, on the +z side when y is up. `elevation`, degrees above the horizon; `lens`, distance of
-        the camera in sizes of the subject, inf for parallel rays; `margin`, extent of the picture over that of the
-        subject.
+        `azimuth`, degrees, runs counter-clockwise about the axis `up` (0, 1 or 2) from the +x side when z is up, from
+        the +z side when y is up; `elevation`, degrees. `lens` is the distance of the camera in sizes of the subject
+        (inf for parallel rays), `margin` the extent of the picture over that of the subject.
         """
         points = _points(subject)
         middle = (points.min(axis=0) + points.max(axis=0)) / 2
@@ -101,11 +100,10 @@ def _points(subject: Any) -> np.ndarray:
 
 
 def upright(mesh: Mesh) -> tuple[int, float]:
-    """The axis that is probably up and the azimuth in degrees of a camera that probably sees the front.
+    """The axis that is probably up and the azimuth, degrees, of a camera that probably sees the front; for pictures.
 
-    For pictures only: up is the axis of the largest extent, the front is where the toes point, that is, where the
-    lowest twentieth of the body lies from the fifth above it. The widest horizontal direction is taken to be left
-    to right.
+    Up is the axis of the largest extent, left to right the widest horizontal direction, and the front is where the
+    toes point: where the lowest twentieth of the body lies from the fifth above it.
     """
     extent = np.ptp(mesh.vertices, axis=0)
     up = int(extent.argmax())

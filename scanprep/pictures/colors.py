@@ -3,6 +3,8 @@ from __future__ import annotations
 
 import numpy as np
 
+from ..geometry.format_common import as_seen
+
 HEAT = "magma_r"      # light where the value is low, so that a good result looks like a body
 HEAT_END = 0.86       # the darkest end of the map would swallow the shading
 NO_VALUE = (0.72, 0.74, 0.76)
@@ -69,16 +71,4 @@ def _from_oklab(lab: np.ndarray) -> np.ndarray:
                        [1, -0.0894841775, -1.2914855480]])
     to_rgb = np.array([[4.0767416621, -3.3077115913, 0.2309699292], [-1.2684380046, 2.6097574011, -0.3413193965],
                        [-0.0041960863, -0.7034186147, 1.7076147010]])
-    return encode((lab @ to_lms.T) ** 3 @ to_rgb.T)
-
-
-def encode(linear: np.ndarray) -> np.ndarray:
-    """sRGB values of linear light, clipped to [0, 1]."""
-    linear = np.clip(linear, 0, 1)
-    return np.where(linear <= 0.0031308, 12.92 * linear, 1.055 * linear ** (1 / 2.4) - 0.055)
-
-
-def decode(color: np.ndarray) -> np.ndarray:
-    """Linear light of sRGB values in [0, 1]."""
-    color = np.asarray(color, dtype=float)
-    return np.where(color <= 0.04045, color / 12.92, ((color + 0.055) / 1.055) ** 2.4)
+    return as_seen((lab @ to_lms.T) ** 3 @ to_rgb.T)

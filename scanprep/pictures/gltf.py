@@ -7,10 +7,10 @@ from typing import Any
 
 import numpy as np
 
+from ..geometry.format_common import as_light
 from ..geometry.format_glb import VERTICES, Glb, some_normal
 from ..geometry.mesh import Mesh
-from ..geometry.storage import writing
-from .colors import decode
+from ..geometry.storage import write
 
 # Turns that bring each axis to +y, the upward axis of glTF: quaternions x, y, z, w.
 UPRIGHT = {0: [0.0, 0.0, 0.5**0.5, 0.5**0.5], 1: [0.0, 0.0, 0.0, 1.0], 2: [-(0.5**0.5), 0.0, 0.0, 0.5**0.5]}
@@ -29,9 +29,7 @@ def write_animated_glb(path: str | Path, faces: np.ndarray, frames: np.ndarray, 
     Every key frame is a morph target with its own normals; the animation blends from one to the next. Nothing but the
     core of glTF is used. Of a longer motion `keys` evenly spaced frames are kept; the axis `up` points up.
     """
-    data = animated_glb(faces, frames, rate, colors, up, keys)
-    with writing(path) as beside:
-        beside.write_bytes(data)
+    write(path, animated_glb(faces, frames, rate, colors, up, keys))
 
 
 def animated_glb(faces: np.ndarray, frames: np.ndarray, rate: float, colors: np.ndarray | None = None, up: int = 2,
@@ -46,7 +44,7 @@ def animated_glb(faces: np.ndarray, frames: np.ndarray, rate: float, colors: np.
     attributes = {"POSITION": glb.add(base, "VEC3", VERTICES, bounds=True),
                   "NORMAL": glb.add(normals, "VEC3", VERTICES)}
     if colors is not None:
-        rgba = np.concatenate([decode(np.asarray(colors)), np.ones((len(base), 1))], axis=1)
+        rgba = np.concatenate([as_light(np.asarray(colors)), np.ones((len(base), 1))], axis=1)
         attributes["COLOR_0"] = glb.add(rgba, "VEC4", VERTICES)
     primitive: dict[str, Any] = {"attributes": attributes, "indices": glb.add_indices(faces), "material": 0}
     primitive["targets"] = [{"POSITION": glb.add(m.vertices - base, "VEC3", VERTICES, bounds=True),

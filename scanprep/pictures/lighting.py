@@ -7,7 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 from scipy.ndimage import gaussian_filter, map_coordinates
 
-from .colors import encode
+from ..geometry.format_common import as_seen
 
 # Directions of the lights in the camera's frame (right, up, back) and their linear strengths.
 KEY, FILL, RIM = ((-0.58, 0.62, 0.52), 1.00), ((0.85, 0.05, 0.50), 0.13), ((0.62, 0.40, -0.68), 0.50)
@@ -190,9 +190,9 @@ class Canvas:
             alpha = alpha + (1 - alpha) * self.floor.reshape(height, width, 1)
         if background is None:
             straight = np.divide(color, alpha, out=np.zeros_like(color), where=alpha > 0)
-            return _bytes(np.concatenate([encode(straight), alpha], axis=-1))
+            return _bytes(np.concatenate([as_seen(straight), alpha], axis=-1))
         # The background is blended as displayed, so that shadows on white fade evenly.
-        inked = encode(np.divide(color, alpha, out=np.zeros_like(color), where=alpha > 0))
+        inked = as_seen(np.divide(color, alpha, out=np.zeros_like(color), where=alpha > 0))
         return _bytes(inked * alpha + np.asarray(background, dtype=float) * (1 - alpha))
 
 

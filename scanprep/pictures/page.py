@@ -11,7 +11,7 @@ from typing import Any
 
 import numpy as np
 
-from ..geometry.storage import writing
+from ..geometry.storage import write
 from .sheets import png_bytes
 
 
@@ -33,11 +33,6 @@ class Page:
     def text(self, text: str) -> Page:
         """Paragraphs, separated by empty lines."""
         self._parts += [f"<p>{escape(block.strip())}</p>" for block in text.split("\n\n") if block.strip()]
-        return self
-
-    def code(self, text: str) -> Page:
-        """Text in a typewriter face, as it stands: commands, settings."""
-        self._parts.append(f"<pre><code>{escape(text.strip())}</code></pre>")
         return self
 
     def markup(self, html: str, style: str = "") -> Page:
@@ -100,8 +95,7 @@ class Page:
 
     def write(self, path: str | Path) -> None:
         """Write the page, whole or not at all."""
-        with writing(path) as beside:
-            beside.write_text(self.html(), encoding="utf-8")
+        write(path, self.html())
 
 
 def _figure(image: np.ndarray | bytes, caption: str, alt: str) -> str:

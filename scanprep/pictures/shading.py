@@ -10,9 +10,10 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from ..geometry.format_common import as_light
 from ..geometry.mesh import Mesh
 from .camera import Camera
-from .colors import color_bar, decode, heat, part_colors, part_palette
+from .colors import color_bar, heat, part_colors, part_palette
 from .lighting import Canvas, Scene, Triangles
 from .sheets import png_bytes, save_png, side_by_side
 
@@ -20,8 +21,6 @@ __all__ = ["Bones", "Camera", "Dots", "Solid", "color_bar", "heat", "part_colors
            "render", "save_png", "side_by_side"]
 
 CLAY = (0.79, 0.76, 0.725)
-ACCENT = (0.86, 0.24, 0.20)
-WHITE = (1.0, 1.0, 1.0)
 
 
 @dataclass(frozen=True, eq=False)
@@ -29,8 +28,7 @@ class Solid:
     """A mesh and how it looks."""
 
     mesh: Mesh
-    # (3,), (N, 3) per vertex or (F, 3) per triangle, in [0, 1], optional; The mesh's own colours, else clay, when not
-    # given
+    # (3,), (N, 3) per vertex or (F, 3) per triangle, in [0, 1]; by default the mesh's own colours, else clay
     color: np.ndarray | Sequence[float] | None = None
     opacity: float = 1.0  # below 1 what lies behind shines through
     smooth: bool = True  # interpolate normals: false shows the single triangles
@@ -41,7 +39,7 @@ class Dots:
     """Small balls: markers, joints, landmarks."""
 
     points: np.ndarray  # (n, 3) float, metres: points that are not finite are left out
-    color: np.ndarray | Sequence[float] = ACCENT  # (3,) or (n, 3) in [0, 1]
+    color: np.ndarray | Sequence[float] = (0.86, 0.24, 0.20)  # (3,) or (n, 3) in [0, 1]
     radius: float = 0.012  # metres
     on_top: bool = False  # seen through the meshes in front of them
     coarse: bool = False  # balls of few triangles, for pictures in which they are a few pixels wide
@@ -62,24 +60,11 @@ Shape = Mesh | Solid | Dots | Bones
 
 
 def render(shapes: Shape | Sequence[Shape], camera: Camera | None = None, width: int = 480, height: int = 640,
-           ground: bool = False, background: Sequence[float] | None = WHITE, samples: int = 2) -> np.ndarray:
-    """A shaded picture.
+           ground: bool = False, background: Sequence[float] | None = (1.0, 1.0, 1.0), samples: int = 2) -> np.ndarray:
+    """A shaded picture (height, width, 3) uint8, or (height, width, 4) when the background is None.
 
-    Parameters
-    ----------
-    shapes : Mesh, Solid, Dots, Bones, or a sequence of them
-    camera : Camera, optional
-        From the front, holding all meshes, when not given.
-    width, height : int, pixels
-    ground : bool
-        A soft shadow on the floor below the lowest point.
-    background : (3,) in [0, 1], or None for a transparent picture
-    samples : int
-        Each pixel is the mean of samples × samples rays.
-
-    Returns
-    -------
-    (height, width, 3) uint8, or (height, width, 4) when the background is transparent
+    The camera sees all meshes from their front when it is not given. `ground` is a soft shadow on the floor below the
+    lowest point; each pixel is the mean of samples × samples rays.
     """
     everything = [shapes] if isinstance(shapes, Shape) else list(shapes)
     if camera is None:
@@ -134,13 +119,13 @@ def _triangles(shape: Shape, origin: np.ndarray) -> Triangles:
         use = np.isfinite(starts).all(axis=1) & np.isfinite(ends).all(axis=1)
         corners, normals, owner = capsules(starts[use] - origin, ends[use] - origin, shape.radius)
         count = len(starts)
-    color = decode(np.broadcast_to(np.asarray(shape.color, dtype=float), (count, 3)))[use][owner]
+    color = as_light(np.broadcast_to(np.asarray(shape.color, dtype=float), (count, 3)))[use][owner]
     return Triangles(corners, normals, np.repeat(color[:, None], 3, axis=1))
 
 
 def _corner_colors(color: np.ndarray, mesh: Mesh) -> np.ndarray:
     """(F, 3, 3) linear light at the corners of every triangle."""
-    linear = decode(color)
+    linear = as_light(color)
     if color.shape == (3,):
         return np.broadcast_to(linear, (len(mesh.faces), 3, 3))
     if color.shape == mesh.vertices.shape:
@@ -153,21 +138,13 @@ def _corner_colors(color: np.ndarray, mesh: Mesh) -> np.ndarray:
 
 def sphere(divisions: int) -> tuple[np.ndarray, np.ndarray]:
     """A unit sphere as an icosahedron whose triangles are cut in four `divisions` times."""
-    g = (1 + 5 ** 0.5) / 2
-    vertices = np.array([(-1, g, 0), (1, g, 0), (-1, -g, 0), (1, -g, 0), (0, -1, g), (0, 1, g), (0, -1, -g),
-                         (0, 1, -g), (g, 0, -1), (g, 0, 1), (-g, 0, -1), (-g, 0, 1)], dtype=float)
-    faces = np.array([(0, 11, 5), (0, 5, 1), (0, 1, 7), (0, 7, 10), (0, 10, 11),
-                      (1, 5, 9), (5, 11, 4), (11, 10, 2), (10, 7, 6), (7, 1, 8),
-                      (3, 9, 4), (3, 4, 2), (3, 2, 6), (3, 6, 8), (3, 8, 9), (4, 9, 5),
-                      (2, 4, 11), (6, 2, 10), (8, 6, 7), (9, 8, 1)])
+    import igl
+
+    vertices, faces = igl.icosahedron()
     for _ in range(divisions):
-        corners = vertices[faces]
-        a, b, c = (corners[:, i] + corners[:, (i + 1) % 3] for i in range(3))
-        p, q, r = corners.transpose(1, 0, 2)
-        quarters = np.concatenate([np.stack(t, axis=1) for t in ((p, a, c), (a, q, b), (c, b, r), (a, b, c))])
-        vertices, faces = quarters.reshape(-1, 3), np.arange(12 * len(faces)).reshape(-1, 3)
-        vertices = vertices / np.linalg.norm(vertices, axis=1, keepdims=True)
-    return vertices / np.linalg.norm(vertices, axis=1, keepdims=True), faces
+        vertices, faces = igl.upsample(vertices, faces)
+        vertices /= np.linalg.norm(vertices, axis=1, keepdims=True)
+    return vertices, faces
 
 
 def balls(points: np.ndarray, radius: float, divisions: int | None = None

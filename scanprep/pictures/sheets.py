@@ -7,10 +7,9 @@ from pathlib import Path
 
 import numpy as np
 
-from ..geometry.storage import writing
+from ..geometry.storage import write
 
 INK = (58, 62, 68)
-LARGE = 4_000_000                    # numbers: above, a picture is not packed as tightly as it could be
 
 
 def font(size: int):
@@ -56,15 +55,13 @@ def png_bytes(image: np.ndarray) -> bytes:
     from PIL import Image
 
     out = io.BytesIO()
-    Image.fromarray(image).save(out, format="PNG", optimize=image.size < LARGE)
+    Image.fromarray(image).save(out, format="PNG", optimize=image.size < 4_000_000)      # larger ones would take long
     return out.getvalue()
 
 
 def save_png(path: str | Path, image: np.ndarray) -> None:
     """Write a picture (H, W, 3 or 4) uint8, whole or not at all."""
-    data = png_bytes(image)
-    with writing(path) as beside:
-        beside.write_bytes(data)
+    write(path, png_bytes(image))
 
 
 def gif_bytes(images: Sequence[np.ndarray], rate: float) -> bytes:
@@ -91,6 +88,4 @@ def gif_bytes(images: Sequence[np.ndarray], rate: float) -> bytes:
 
 def write_gif(path: str | Path, images: Sequence[np.ndarray], rate: float) -> None:
     """Write `gif_bytes`, whole or not at all."""
-    data = gif_bytes(images, rate)
-    with writing(path) as beside:
-        beside.write_bytes(data)
+    write(path, gif_bytes(images, rate))

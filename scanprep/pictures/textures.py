@@ -12,12 +12,10 @@ import numpy as np
 from ..geometry.format_common import UNITS
 from ..geometry.format_glb import VERTICES, Glb
 from ..geometry.mesh import Mesh
-from ..geometry.storage import writing
+from ..geometry.storage import write
 from ..geometry.surface import Rays, barycentric
 from .gltf import skin_material
 from .sheets import png_bytes
-
-SIZE = 1024                          # pixels of a baked texture, each way
 
 # colours and weights of places with normals
 Look = Callable[[np.ndarray, np.ndarray], tuple[np.ndarray, np.ndarray]]
@@ -46,17 +44,13 @@ def bilinear(image: np.ndarray, uv: np.ndarray) -> np.ndarray:
 
     (0, 0) is the lower left corner of the image, (1, 1) its upper right one; rows from the top.
     """
+    from scipy.ndimage import map_coordinates
+
     height, width = image.shape[:2]
-    x, y = uv[:, 0] * width - 0.5, (1 - uv[:, 1]) * height - 0.5
-    left, top = np.floor(x), np.floor(y)
-    out = np.zeros((len(uv), *image.shape[2:]))
-    for dx in (0, 1):
-        for dy in (0, 1):
-            share = np.abs(1 - dx - (x - left)) * np.abs(1 - dy - (y - top))
-            row = np.clip(top + dy, 0, height - 1).astype(int)
-            column = np.clip(left + dx, 0, width - 1).astype(int)
-            out += share.reshape(-1, *[1] * (image.ndim - 2)) * image[row, column]
-    return out
+    place = (1 - uv[:, 1]) * height - 0.5, uv[:, 0] * width - 0.5
+    channels = np.moveaxis(np.asarray(image, dtype=float).reshape(height, width, -1), 2, 0)
+    values = np.stack([map_coordinates(channel, place, order=1, mode="nearest") for channel in channels], axis=1)
+    return values.reshape(len(uv), *image.shape[2:])
 
 
 def read_texture(path: str | Path, unit: str | None = None) -> Texture | None:
@@ -94,19 +88,13 @@ def _names_a_picture(path: Path) -> bool:
 
 def _picture(material: Any) -> np.ndarray | None:
     """(H, W, 3) of a material of trimesh, or None."""
-    if material is None:
-        return None
-    image = getattr(material, "image", None)
-    if image is None:
-        image = getattr(material, "baseColorTexture", None)
-    if image is None:
-        return None
-    return np.asarray(image.convert("RGB"), dtype=np.float64) / 255
+    found = (getattr(material, name, None) for name in ("image", "baseColorTexture"))
+    image = next((image for image in found if image is not None), None)
+    return None if image is None else np.asarray(image.convert("RGB"), dtype=np.float64) / 255
 
 
-def bake(body: Mesh, look: Look, unseen: np.ndarray, size: int | None = None) -> Texture:
+def bake(body: Mesh, look: Look, unseen: np.ndarray, size: int = 1024) -> Texture:
     """A texture of a body: what `look` says of its pixels, where its weight is zero `unseen` (N, 3) of the vertices."""
-    size = size or SIZE
     kept, faces, uv = unwrap(body)
     flat = Mesh(np.column_stack([uv, np.zeros(len(uv))]), faces)
     at = (np.arange(size) + 0.5) / size
@@ -152,10 +140,8 @@ def write_textured(path: str | Path, texture: Texture) -> None:
     material = skin_material((1, 1, 1))
     material["pbrMetallicRoughness"]["baseColorTexture"] = {"index": 0}
     image = glb.add_png(png_bytes((255 * np.clip(texture.image, 0, 1) + 0.5).astype(np.uint8)), "texture")
-    data = glb.pack({
+    write(path, glb.pack({
         "scene": 0, "scenes": [{"nodes": [0]}], "nodes": [{"name": "body", "mesh": 0}], "materials": [material],
         "meshes": [{"primitives": [{"attributes": attributes, "indices": glb.add_indices(texture.mesh.faces),
                                     "material": 0}]}],
-        "images": [image], "textures": [{"source": 0}]})
-    with writing(path) as beside:
-        beside.write_bytes(data)
+        "images": [image], "textures": [{"source": 0}]}))

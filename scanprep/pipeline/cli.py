@@ -18,10 +18,9 @@ from ..console import Metric, Outcome, bar, say
 from ..geometry.files import read_mesh
 from ..geometry.landmarks import read_template_landmarks
 from ..geometry.mesh import Mesh
-from .figures import ScanFigures
+from .figures import Limits, ScanFigures
 from .page import PAGE, judge_set, write_set_page
 from .prepare import PrepareConfig, Prepared, prepare
-from .review import Limits, Verdict
 from .scan import Init
 from .scans import ScanTask, find_scans
 
@@ -92,9 +91,10 @@ def _template_marks(template: Path, given: Path | None, body: Mesh, tasks: Seque
 def _progress_made(done: Prepared, tasks: Sequence[ScanTask]) -> list[Metric]:
     tree = done.registered.skeleton
     seconds = [f.seconds for f in done.figures if np.isfinite(f.seconds)]
+    ways = Counter(f.init.lstrip("0123456789 ") for f in done.figures)        # without the number of landmarks
     return [Metric("scans registered", f"{len(tasks) - len(done.failures)} of {len(tasks)}"),
             Metric("of them in this run", done.fresh),
-            *(Metric(f"led by {way}", count) for way, count in sorted(Counter(map(_way, done.figures)).items())),
+            *(Metric(f"led by {way}", count) for way, count in sorted(ways.items())),
             Metric("time a scan, mean", float(np.mean(seconds)) if seconds else "", "s"),
             Metric("parts of the skeleton", len(tree.parents) if tree else "none sought")]
 
@@ -114,13 +114,4 @@ def _quality(folder: Path, figures: Sequence[ScanFigures], limits: Limits | None
             Metric("distance of landmarks, mean RMS", MM * mean("landmarks"), "mm"),
             Metric("inverted triangles", sum(f.inverted for f in figures)),
             Metric("scans that need a look", len(suspects)),
-            *(Metric(f"  {v.name}", _short(v)) for v in suspects[:LISTED])]
-
-
-def _short(verdict: Verdict) -> str:
-    return "failed" if verdict.failed else verdict.reasons[0]
-
-
-def _way(figures: ScanFigures) -> str:
-    """Landmarks, correspondences or pose, without their number."""
-    return figures.init.lstrip("0123456789 ")
+            *(Metric(f"  {v.name}", "failed" if v.failed else v.reasons[0]) for v in suspects[:LISTED])]

@@ -1,16 +1,15 @@
-"""How well the template lies on each scan: figures, and their tables in the folder of the set."""
+"""How well the template lies on each scan: figures, their tables in the folder of the set, which scans need a look."""
 from __future__ import annotations
 
-import csv
-import io
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass, fields
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from ..geometry import storage
+from ..geometry import tables
+from ..ranges import Settings
 
 NONE = "none"                  # what a table says where a figure has no value
 EARLIER = {"guide": "init", "flipped": "inverted"}      # names of columns in tables written before
@@ -36,14 +35,6 @@ class ScanFigures:
     seconds: float = np.nan         # in `times.csv`, as it is the one figure that differs from run to run
 
 
-@dataclass(frozen=True)
-class Failure:
-    """A scan that could not be registered, and one line that says why and names the file: a row of `failures.csv`."""
-
-    name: str
-    reason: str
-
-
 _TABLED = [f for f in fields(ScanFigures) if f.name != "seconds"]
 _READ: dict[str, Callable[[str], Any]] = {"str": str, "float": lambda text: np.nan if text == NONE else float(text),
                                           "int": int, "bool": "True".__eq__}
@@ -64,36 +55,111 @@ def read_figures(folder: Path) -> list[ScanFigures]:
 def write_figures(folder: Path, figures: Iterable[ScanFigures]) -> None:
     """Write the tables of figures and times, sorted by name."""
     rows = sorted(figures, key=lambda f: f.name)
-    _write(folder / TIMES, ["name", "seconds"], [[f.name, f"{f.seconds:.2f}"] for f in rows])
     names = [f.name for f in _TABLED]
-    _write(folder / FIGURES, names, [[_tabled(getattr(row, name)) for name in names] for row in rows])
+    tables.write_table(folder / TIMES, ["name", "seconds"], [(f.name, f"{f.seconds:.2f}") for f in rows])
+    tables.write_table(folder / FIGURES, names, [[_tabled(getattr(row, name)) for name in names] for row in rows])
 
 
 def _tabled(value: Any) -> Any:
     return NONE if isinstance(value, float) and np.isnan(value) else value
 
 
-def read_failures(folder: Path) -> list[Failure]:
-    """The scans that could not be registered when they were tried last."""
-    return [Failure(row["name"], row["reason"]) for row in _read(folder / FAILURES)]
+def read_failures(folder: Path) -> dict[str, str]:
+    """The scans that could not be registered when they were tried last, and why, in one line."""
+    return {row["name"]: row["reason"] for row in _read(folder / FAILURES)}
 
 
-def write_failures(folder: Path, failures: Iterable[Failure]) -> None:
+def write_failures(folder: Path, failures: Mapping[str, str]) -> None:
     """Write the table of failures, sorted by name; without any there is none."""
-    rows = sorted(failures, key=lambda f: f.name)
-    if rows:
-        _write(folder / FAILURES, ["name", "reason"], [[f.name, f.reason] for f in rows])
+    if failures:
+        tables.write_table(folder / FAILURES, ["name", "reason"], sorted(failures.items()))
     else:
         (folder / FAILURES).unlink(missing_ok=True)
 
 
 def _read(path: Path) -> list[dict[str, str]]:
-    return list(csv.DictReader(io.StringIO(path.read_text(encoding="utf-8")))) if path.exists() else []
+    return [row for _, row in tables.read_table(path, ())] if path.exists() else []
 
 
-def _write(path: Path, header: list[str], rows: list[list[Any]]) -> None:
-    text = io.StringIO()
-    table = csv.writer(text, lineterminator="\n")
-    table.writerows([header, *rows])
-    with storage.writing(path) as beside:
-        beside.write_text(text.getvalue(), encoding="utf-8")
+@dataclass(frozen=True)
+class Limits(Settings):
+    """Where a figure of a registration begins to be suspect.
+
+    Lengths are multiples of the template's size, the square root of its area (1.4 m for a man), so that they hold
+    for hands and horses too.
+
+    Attributes
+    ----------
+    missed : float
+        Share of the scan's points off the template.
+    distance : float
+        Mean distance of the vertices with data to the scan, over the size.
+    unseen : float
+        Share of vertices without data, above what is usual in the set (its median).
+    stretch : float
+        Share of the surface stretched or shrunk to the double or half.
+    inverted : float
+        Share of the triangles that face against their surroundings.
+    landmarks : float
+        RMS distance of the landmarks, over the size.
+    not_converged : float
+        What a registration that did not converge counts, as a multiple of a limit; below 1 it is not suspect for
+        that alone.
+    """
+
+    missed: float = 0.005
+    distance: float = 0.002
+    unseen: float = 0.15
+    stretch: float = 0.02
+    inverted: float = 0.001
+    landmarks: float = 0.015
+    not_converged: float = 0.5
+
+
+@dataclass(frozen=True)
+class Verdict:
+    """What is to be thought of one scan."""
+
+    name: str
+    badness: float                  # the largest multiple of a limit; from 1 on it needs a look; infinite: it failed
+    reasons: tuple[str, ...]        # what is over its limit, worst first; for a scan that failed, why
+    figures: ScanFigures | None = None
+
+    @property
+    def failed(self) -> bool:
+        """Whether the scan could not be registered as its files are now."""
+        return self.badness == np.inf
+
+    @property
+    def suspect(self) -> bool:
+        """Whether a person should look at it."""
+        return self.badness >= 1
+
+
+def review(figures: Sequence[ScanFigures], failures: Mapping[str, str], size: float, faces: int,
+           limits: Limits | None = None) -> list[Verdict]:
+    """Verdicts on all scans, worst first; `size` of the template in metres, the number of its `faces`."""
+    limits = limits or Limits()
+    usual = float(np.median([1 - f.seen for f in figures])) if figures else 0.0
+    known = {f.name: f for f in figures}
+    verdicts = [Verdict(name, np.inf, (reason,), known.get(name)) for name, reason in sorted(failures.items())]
+    judged = [_judge(f, size, faces, usual, limits) for f in figures if f.name not in failures]
+    return verdicts + sorted(judged, key=lambda verdict: (-verdict.badness, verdict.name))
+
+
+def _judge(f: ScanFigures, size: float, faces: int, usual: float, limits: Limits) -> Verdict:
+    over = {
+        f"{100 * f.missed:.1f}% of the scan lies off the template: an uncovered limb, or clutter":
+            f.missed / limits.missed,
+        f"{1000 * f.distance:.1f} mm from the scan on average": f.distance / (limits.distance * size),
+        f"{100 * (1 - f.seen):.0f}% without data, {100 * usual:.0f}% is usual here":
+            (1 - f.seen - usual) / limits.unseen,
+        f"{100 * f.stretch:.1f}% of the surface stretched or shrunk to the double or half":
+            f.stretch / limits.stretch,
+        f"{f.inverted} triangles inverted": f.inverted / faces / limits.inverted,
+        f"landmarks {1000 * f.landmarks:.0f} mm off": f.landmarks / (limits.landmarks * size),
+        "not converged": 0.0 if f.converged else limits.not_converged,
+        "nowhere near the scan": 0.0 if f.seen else 100.0}
+    over = {reason: value for reason, value in over.items() if np.isfinite(value)}
+    reasons = sorted((reason for reason, value in over.items() if value >= 1), key=lambda reason: -over[reason])
+    return Verdict(f.name, max(over.values()), tuple(reasons), f)

@@ -1,41 +1,31 @@
-"""The page of a registered set: every scan with its pictures and figures, worst first."""
+"""The page of a registered set: every scan with its pictures and figures, worst first; and these pictures."""
 from __future__ import annotations
 
+import io
 from collections.abc import Sequence
 from html import escape
 from pathlib import Path
 
 import numpy as np
+from scipy.sparse import eye_array
 
 from ..dataset import RegisteredSet, SetEntry
+from ..geometry import rotations
+from ..geometry.farthest_points import thin
 from ..geometry.mesh import Mesh
+from ..pictures.camera import Camera, look_around, upright
 from ..pictures.page import Page, data_uri
-from .figures import ScanFigures, read_failures, read_figures
-from .review import Limits, Verdict, review
+from ..pictures.shading import CLAY, Dots, Shape, Solid, color_bar, heat, part_colors, render, side_by_side
+from ..registration.nonrigid import Registration
+from .figures import Limits, ScanFigures, Verdict, read_failures, read_figures, review
 
 PICTURES, PAGE = "pictures", "report.html"
+WIDTH, HEIGHT = 150, 216
+FAR = 0.005                 # of the template's size: the dark end of the distances
+TURN = 20.0                 # degrees from the front
+BALL = 0.013                # of the template's size: radius of the balls that stand for points
 
-_STYLE = """
-main { max-width: 76rem; }
-.scan { display: grid; grid-template-columns: minmax(0, 1fr) 16rem; gap: .2rem 1.4rem; padding: 1rem 0 1.1rem;
-  border-top: 1px solid var(--line); content-visibility: auto; contain-intrinsic-size: auto 300px; }
-.scan h3 { grid-column: 1 / -1; margin: 0; font-size: 1.08rem; }
-.scan h3 small { font-weight: 400; color: var(--soft); margin-left: .6rem; }
-.scan ul { grid-column: 1 / -1; margin: .1rem 0 .5rem; padding: 0; list-style: none; font-size: .95rem; }
-.scan li { display: inline-block; margin-right: 1.1rem; overflow-wrap: anywhere; }
-.scan img { background: #fff; border-radius: 8px; width: 100%; }
-.scan .panels { display: grid; grid-auto-flow: column; grid-auto-columns: 1fr; color: var(--soft); font-size: .82rem;
-  text-align: center; }
-.scan table { font-size: .86rem; width: 100%; align-self: start; }
-.scan td { padding: .16rem 0; }
-.dot { display: inline-block; width: .62em; height: .62em; border-radius: 50%; margin-right: .4em;
-  background: #4f9d69; }
-.look .dot, .dot.look { background: #e09a2b; } .failed .dot, .dot.failed { background: #cf3f36; }
-.index { display: flex; flex-wrap: wrap; gap: .25rem 1.5rem; font-size: .93rem; }
-.index a { margin-right: .7em; white-space: nowrap; }
-.index b { margin-right: .6em; font-weight: 600; }
-@media (max-width: 760px) { .scan { grid-template-columns: minmax(0, 1fr); } }
-"""
+PANELS = ("the scan", "the template on it", "distance, front", "distance, back", "dark: not sure")
 
 
 def write_set_page(folder: str | Path, limits: Limits | None = None, to: Path | None = None) -> Path:
@@ -45,7 +35,7 @@ def write_set_page(folder: str | Path, limits: Limits | None = None, to: Path | 
     size = float(np.sqrt(whole.template.face_areas.sum()))
     entries = {entry.name: entry for entry in whole.entries}
     page = Page(f"Scans of {folder.absolute().name}", _lead(verdicts))
-    page.markup("", _STYLE)
+    page.markup("", Path(__file__).with_name("page.css").read_text(encoding="utf-8"))
     page.table(_summary(verdicts), ("", "median", "worst", "unit"))
     page.section("Subjects", "Every scan, by subject: green is fine, amber needs a look, red could not be registered.")
     page.markup(_index(verdicts, entries))
@@ -127,8 +117,6 @@ def _card(folder: Path, verdict: Verdict, entry: SetEntry | None) -> str:
     reasons = "".join(f"<li>{escape(reason)}</li>" for reason in verdict.reasons)
     shown = ""
     if path.exists():
-        from .pictures import HEIGHT, PANELS, WIDTH
-
         labels = "".join(f"<span>{escape(label)}</span>" for label in PANELS)
         shown = (f'<div><img src="{data_uri(path.read_bytes())}" alt="{escape(verdict.name)}: {", ".join(PANELS)}" '
                  f'width="{WIDTH * len(PANELS)}" height="{HEIGHT}" loading="lazy" decoding="async">'
@@ -161,15 +149,66 @@ def _anchor(verdict: Verdict) -> str:
 
 
 def _legend(size: float) -> np.ndarray:
-    from ..pictures.colors import color_bar
-    from .pictures import FAR
-
     return color_bar(0, FAR * size, "distance to the scan; grey: no data there")
 
 
 def _parts_picture(template: Mesh, part_of_face: np.ndarray) -> np.ndarray:
-    from ..pictures.camera import look_around
-    from ..pictures.shading import Solid, part_colors, render, side_by_side
-
     body = Solid(template, part_colors(part_of_face))
     return side_by_side([render(body, camera, 240, 340) for camera in look_around(template, turns=(20, 200))])
+
+
+def strip(template: Mesh, scan: Mesh | np.ndarray, fit: Registration) -> bytes:
+    """One row of pictures as a WebP file, in the order of `PANELS`.
+
+    All are seen as the template would be from its front, whichever way the person stood in the scanner.
+    """
+    R, _ = rotations.procrustes(fit.mesh.vertices, template.vertices)
+    middle = fit.mesh.vertices.mean(axis=0)
+    body = fit.mesh.with_vertices((fit.mesh.vertices - middle) @ R.T)
+    up, front = upright(template)
+    near, back = (Camera.around(body.vertices, front + turn, up=up, margin=1.12) for turn in (TURN, TURN + 180))
+    size = float(np.sqrt(template.face_areas.sum()))
+    far = Solid(body, heat(evened(body, fit.distances), 0, FAR * size))
+    shown = [(_scan(scan, R, middle, size), near), (Solid(body, CLAY), near), (far, near), (far, back),
+             (Solid(body, heat(1 - fit.confidence, -0.35, 1, "Blues")), near)]      # unlike the distances
+    return webp_bytes(np.concatenate([render(shape, camera, WIDTH, HEIGHT) for shape, camera in shown], axis=1))
+
+
+def _scan(scan: Mesh | np.ndarray, R: np.ndarray, middle: np.ndarray, size: float) -> Shape:
+    """The scan in the frame of the picture, with no more detail than a small picture can show."""
+    if isinstance(scan, Mesh) and len(scan.faces):
+        coarse = coarsened(scan, 0.007 * size)
+        return Solid(coarse.with_vertices((coarse.vertices - middle) @ R.T))
+    points = scan.vertices if isinstance(scan, Mesh) else scan
+    return Dots((points[thin(points, 1.25 * BALL * size)] - middle) @ R.T, CLAY, BALL * size)
+
+
+def evened(mesh: Mesh, values: np.ndarray, rounds: int = 2) -> np.ndarray:
+    """Values (N,) averaged with those of neighbours, so that noise fades and misfit stays; NaN stays NaN."""
+    known = np.isfinite(values)
+    weights = mesh.vertex_adjacency.astype(float) + eye_array(len(values))
+    for _ in range(rounds):
+        total = weights @ np.where(known, values, 0.0)
+        values = np.where(known, total / np.maximum(weights @ known.astype(float), 1.0), np.nan)
+    return values
+
+
+def coarsened(mesh: Mesh, cell: float) -> Mesh:
+    """The mesh with all vertices of a cubic cell (metres) in one; for pictures only, it may not be manifold."""
+    key = np.floor((mesh.vertices - mesh.vertices.min(axis=0)) / cell).astype(np.int64)
+    _, first, place = np.unique(key, axis=0, return_index=True, return_inverse=True)
+    faces = place.reshape(-1)[mesh.faces]
+    apart = (faces[:, 0] != faces[:, 1]) & (faces[:, 1] != faces[:, 2]) & (faces[:, 2] != faces[:, 0])
+    count = np.bincount(place.reshape(-1))
+    means = np.stack([np.bincount(place.reshape(-1), axis) / count for axis in mesh.vertices.T], axis=1)
+    colors = None if mesh.colors is None else mesh.colors[first]
+    return Mesh(means, faces[apart], colors)
+
+
+def webp_bytes(image: np.ndarray, quality: int = 82) -> bytes:
+    """A picture (H, W, 3) uint8 as a WebP file, a tenth of the size of a PNG."""
+    from PIL import Image
+
+    out = io.BytesIO()
+    Image.fromarray(image).save(out, format="WEBP", quality=quality, method=4)
+    return out.getvalue()

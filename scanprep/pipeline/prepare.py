@@ -23,7 +23,7 @@ from ..ranges import Count, Settings
 from ..skeleton.find import find_skeleton
 from ..skeleton.parts import SkeletonConfig
 from ..threads import one_thread
-from .figures import Failure, ScanFigures, write_failures, write_figures
+from .figures import ScanFigures, write_failures, write_figures
 from .page import PICTURES, write_set_page
 from .scan import ScanSettings, register_scan
 from .scans import ScanTask
@@ -146,7 +146,7 @@ class _Tables:
                       {"settings": asdict(self.work.settings)})
             write_landmarks(staged.folder / "landmarks.json", dict(self.work.landmarks))
             write_figures(staged.folder, figures.values())
-            write_failures(staged.folder, [Failure(name, line) for name, line in failures.items()])
+            write_failures(staged.folder, failures)
         return RegisteredSet.load(self.space.folder)
 
     def _before(self) -> Sequence[SetEntry]:

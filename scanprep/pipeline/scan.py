@@ -83,7 +83,7 @@ def register_scan(task: ScanTask, template: Mesh, template_landmarks: dict[str, 
             raise ValueError(f"{task.scan}: the template is not on it: {problem}")
         picture = b""
         if settings.pictures:
-            from .pictures import strip
+            from .page import strip
 
             picture = strip(template, scan, fit)
     init = (f"{len(landmarks[0])} landmarks" if landmarks is not None else

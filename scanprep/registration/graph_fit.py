@@ -15,10 +15,10 @@ import numpy as np
 from scipy.sparse import bsr_array, coo_array, csc_array, csr_array
 
 from ..geometry import rotations
+from ..geometry.farthest_points import thin
 from ..geometry.least_squares import Sparse, levenberg_marquardt
 from ..geometry.mesh import Mesh
 from ..geometry.target import orient
-from ..geometry.thinning import thin
 from .deformation_graph import DeformationGraph, build_graph
 from .limb_ends import End, RigidFit, find_ends, rotated_end
 from .matches import NORMALS, Inputs, Pull, landmark_pull, pull, wanted_by

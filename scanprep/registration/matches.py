@@ -13,10 +13,9 @@ from scipy.spatial import cKDTree
 
 from ..alignment.icp import align_rigid, landmark_motion
 from ..correspondence.correspondences import Correspondences, checked_pairs
-from ..geometry.farthest_points import farthest_points
+from ..geometry.farthest_points import farthest_points, thin
 from ..geometry.mesh import Mesh, check_template
 from ..geometry.target import Target, orient, target_of
-from ..geometry.thinning import thin
 from ..threads import search_threads
 from .schedule import GraphStage
 

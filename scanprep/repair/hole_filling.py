@@ -8,8 +8,7 @@ from typing import Annotated, Any, Literal, NamedTuple, get_args
 import numpy as np
 
 from ..geometry.mesh import Mesh, template_problem
-from ..geometry.seen_space import SeenSpace
-from ..geometry.surface import Rays, Surface
+from ..geometry.surface import Rays, SeenSpace, Surface
 from ..ranges import FLAG, Count, Positive, Range, Settings
 from .hole_patch import Patch
 from .intersections import intersecting_faces

@@ -5,9 +5,8 @@ import numpy as np
 from scipy.sparse import coo_array, csc_array, csr_array, diags_array
 
 from ..geometry.mesh import Mesh
-from ..geometry.seen_space import SeenSpace
 from ..geometry.sparse import factor
-from ..geometry.surface import Surface
+from ..geometry.surface import SeenSpace, Surface
 
 EMPTY = 0.01                         # metres in front of what was seen from which on space counts as empty
 

@@ -7,7 +7,7 @@ from functools import partial
 
 import numpy as np
 
-from ..batch.steps import Step, once
+from ..batch.room import Step, once
 from ..geometry.mesh import Mesh, check_template
 from ..threads import one_thread
 from .joints import (
@@ -70,7 +70,7 @@ def find_skeleton(template: Mesh, poses: np.ndarray, config: SkeletonConfig | No
     config : SkeletonConfig, optional
     progress : callable(done, total), optional
     step : callable, optional
-        Keeps what was found on the way, as `scanprep.batch.steps.Step`.
+        Keeps what was found on the way, as `scanprep.batch.room.Step`.
 
     Returns
     -------

@@ -19,9 +19,9 @@ from ..geometry import storage
 from ..geometry.files import UNITS, PointCloud, list_meshes, read_mesh, read_scan, write_mesh, write_points
 from ..geometry.landmarks import landmarks_beside, read_landmark_vertices, read_landmarks
 from ..geometry.mesh import Mesh
-from ..pipeline.template import make_template
 from ..ranges import Faces
 from ..repair.hole_filling import FillConfig, FilledHole, fill_holes, fill_report
+from .template import make_template
 
 ViewsArg = Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="VIEWS")]
 

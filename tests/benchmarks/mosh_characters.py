@@ -23,9 +23,14 @@ from completion.mocap.files.markers import MarkerSequence, read_markers
 from completion.mocap.marker_sets.layout import MarkerLayout
 from completion.mocap.marker_sets.named import named_layout
 from completion.mocap.mosh.mosh import mosh
-from completion.mocap.retargeting.creases import Creases
-from completion.mocap.retargeting.pictures import picture_transfer, write_character
-from completion.mocap.retargeting.soft_tissue import deformation, moving_character, retarget_soft_tissue
+from completion.mocap.retargeting.soft_tissue import (
+    Creases,
+    deformation,
+    moving_character,
+    picture_transfer,
+    retarget_soft_tissue,
+    write_character,
+)
 from completion.mocap.soft_tissue.soft_tissue import SoftTissue
 from completion.synthetic_people import synthetic_model
 from model.body import BodyModel

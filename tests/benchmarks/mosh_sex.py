@@ -22,8 +22,7 @@ from completion.mocap.subject.person import find_person
 from completion.synthetic_people import SyntheticRecipe, _decimated
 from model.body import BodyModel
 from model.files import load_model
-from model.learning.sex_plane import guess_sex, sex_plane
-from model.learning.sexes import learn_by_sex
+from model.learning.sexes import guess_sex, learn_by_sex, sex_plane
 from scanprep.geometry.surface import Surface
 from scanprep.synthetic.data_set import SUBJECT, near_rest, subject_pose
 from scanprep.synthetic.people import BodyShape, Person, walk

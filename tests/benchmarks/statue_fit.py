@@ -25,7 +25,7 @@ from protocols import data_folder, load_real, machine, write_report
 from scanned_shapes import distortion
 from scipy.sparse import csc_array, diags_array, eye_array
 
-from model.statue.control.humanoid import humanoid
+from model.statue.control.files import humanoid
 from model.statue.registration.local_shape import LocalShape, local_shape
 from model.statue.registration.surface_fit import SurfaceFitConfig, fit_surface
 from scanprep.alignment.icp import align_landmarks, apply

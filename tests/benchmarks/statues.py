@@ -17,8 +17,13 @@ import numpy as np
 from protocols import machine, write_report
 
 from model.statue.detail.displacement import DisplacementConfig, coverage_shares
-from model.statue.detail.errors import in_folds, inverted_triangles, measured_levels, remaining_error
-from model.statue.detail.reconstruction import Reconstruction
+from model.statue.detail.reconstruction import (
+    Reconstruction,
+    in_folds,
+    inverted_triangles,
+    measured_levels,
+    remaining_error,
+)
 from model.statue.fit import StatueConfig, fit_statue
 from scanprep import Mesh, read_mesh
 

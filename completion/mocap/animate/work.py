@@ -1,8 +1,9 @@
-"""One marker file: whose body, its motion, and all that is written of it."""
+"""One marker file: whose body, its motion, and all that is written of it, with the page."""
 from __future__ import annotations
 
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -16,7 +17,16 @@ from scanprep.pictures.page import Page
 
 from ...cli import rows
 from ...motion import Motion, spread_frames
-from ...motion_pictures import moving_picture, picture_bodies, picture_frames
+from ...motion_pictures import (
+    animated_picture,
+    chart_residuals,
+    chart_states,
+    marker_rows,
+    moving_picture,
+    picture_bodies,
+    picture_frames,
+    worst_frames,
+)
 from ..files.markers import MarkerSequence, read_markers
 from ..files.motion_files import KEYS, write_glb, write_motion
 from ..marker_sets.named import choose_layout
@@ -24,7 +34,6 @@ from ..pose.follow import AnimateConfig, animate
 from ..pose.robust import motion_problem
 from ..retargeting.retarget import morphed_vertices, retarget
 from ..subject.person import PersonConfig, find_person
-from .report import motion_page
 
 BetasTo = dict[float, np.ndarray] | np.ndarray      # keys over seconds, or betas at the end
 ENDINGS = (".c3d", ".trc", ".csv")
@@ -47,44 +56,39 @@ class Work:
     person: PersonConfig
 
     def __call__(self, path: Path, room: Room) -> list[Metric]:
-        """Follow the markers of a file; the figures."""
-        return animate_file(self, path, room)
+        """Follow the markers of a file, write everything into the folder of a room, and return the figures.
 
-
-def animate_file(work: Work, path: Path, room: Room) -> list[Metric]:
-    """Follow the markers of a file, write everything into the folder of a room, and return the figures.
-
-    The first is called "problem" where the motion means nothing, and says why.
-    """
-    sequence = read_markers(path, work.unit, work.who)
-    layout, name = choose_layout(work.model, work.layout, sequence.labels)
-    metrics = [Metric("model", work.name), Metric("layout", name)]
-    body, found = work.subject, None
-    if body is None:
-        found = room.step("subject", (work.model, sequence, layout, work.person),
-                          lambda: find_person(work.model, sequence, layout, work.person, room.tell))
-        body, layout = work.model.subject(found.betas), found.layout
-        metrics.append(Metric("subject", f"{len(found.betas)} betas from {len(found.frames)} frames"))
-    # a person found from a model: what it was found from tells as much as its body, and sooner
-    whose = work.subject if found is None else (work.model, found.betas)
-    motion = room.step("motion", (whose, sequence, layout, work.animate),
-                       lambda: animate(body, sequence, layout, work.animate, room.tell))
-    output = room.folder
-    if found is not None:
-        storage.write_json(output / "subject.json", {"betas": found.betas.tolist(),
-                                                     "frames": found.frames[:, 1].tolist()})
-        layout.save(output / "layout.json")
-    problem = motion_problem(motion, body.template, layout, sequence)
-    metrics = [*([Metric("problem", problem)] if problem else []), *metrics, *figures(motion, sequence)]
-    write_motion(output, motion, body)
-    write_glb(output / "animation.glb", motion, body)
-    page = motion_page(motion, body, sequence, path.name, rows(metrics))
-    if work.retarget_to is not None:
-        _other_person(work, work.retarget_to, output, motion, body, page)
-    if work.betas_to is not None:
-        _changing_body(work, work.betas_to, output, motion, body, page)
-    page.write(output / "report.html")
-    return metrics
+        The first is called "problem" where the motion means nothing, and says why.
+        """
+        sequence = read_markers(path, self.unit, self.who)
+        layout, name = choose_layout(self.model, self.layout, sequence.labels)
+        metrics = [Metric("model", self.name), Metric("layout", name)]
+        body, found = self.subject, None
+        if body is None:
+            found = room.step("subject", (self.model, sequence, layout, self.person),
+                              lambda: find_person(self.model, sequence, layout, self.person, room.tell))
+            body, layout = self.model.subject(found.betas), found.layout
+            metrics.append(Metric("subject", f"{len(found.betas)} betas from {len(found.frames)} frames"))
+        # a person found from a model: what it was found from tells as much as its body, and sooner
+        whose = self.subject if found is None else (self.model, found.betas)
+        motion = room.step("motion", (whose, sequence, layout, self.animate),
+                           lambda: animate(body, sequence, layout, self.animate, room.tell))
+        output = room.folder
+        if found is not None:
+            storage.write_json(output / "subject.json", {"betas": found.betas.tolist(),
+                                                         "frames": found.frames[:, 1].tolist()})
+            layout.save(output / "layout.json")
+        problem = motion_problem(motion, body.template, layout, sequence)
+        metrics = [*([Metric("problem", problem)] if problem else []), *metrics, *figures(motion, sequence)]
+        write_motion(output, motion, body)
+        write_glb(output / "animation.glb", motion, body)
+        page = motion_page(motion, body, sequence, path.name, rows(metrics))
+        if self.retarget_to is not None:
+            _other_person(self, self.retarget_to, output, motion, body, page)
+        if self.betas_to is not None:
+            _changing_body(self, self.betas_to, output, motion, body, page)
+        page.write(output / "report.html")
+        return metrics
 
 
 def figures(motion: Motion, markers: MarkerSequence) -> list[Metric]:
@@ -127,3 +131,28 @@ def morph_keys(given: BetasTo, motion: Motion) -> dict[float, np.ndarray]:
     if motion.betas is None:
         raise ValueError("--betas-to: the subject has no betas to begin with; give keys {seconds: betas}")
     return {0.0: motion.betas, float(motion.times[-1]): given}
+
+
+def motion_page(motion: Motion, subject: Subject, markers: MarkerSequence, name: str,
+                rows: list[tuple[str, Any, str]]) -> Page:
+    """The page of `scape animate`."""
+    page = Page(f"{name}, animated", "The body in some frames, with the markers that were measured as dots.")
+    page.picture(picture_frames(motion, subject, markers.positions), "from the front and the person's left")
+    page.picture(picture_frames(motion, subject, markers.positions, turn=215.0), "the same frames from behind")
+    page.picture(animated_picture(motion, subject, 10.0, 4.0), "first seconds")
+    page.section("Markers").chart(chart_residuals(motion), "distance of the markers to where the body puts them")
+    page.picture(picture_frames(motion, subject, markers.positions, worst_frames(motion, 8)),
+                 "where the markers are farthest off")
+    used = np.isfinite(motion.residuals).any(axis=0)
+    labels = [label for label, is_used in zip(motion.labels, used, strict=True) if is_used]
+    missing = ~np.isfinite(motion.residuals[:, used])
+    state = np.where(missing, 2, np.where(motion.trusted[:, used], 0, 1))
+    page.chart(chart_states(state, labels, motion.rate, ("#dfe7ee", "#e39b3b", "#8c2f39")),
+               "light: seen; orange: seen, but not believed; red: missing")
+    told = marker_rows(motion.labels, motion.residuals, None, motion.trusted)
+    page.table([(*row[:2], *row[3:]) for row in told],
+               ("marker", "mean distance (mm)", "95th percentile (mm)", "seen (%)", "believed (%)"))
+    unused = [label for label in motion.labels if label not in labels]
+    if unused:
+        page.text(f"Not used, because the layout does not know them or they were never seen: {', '.join(unused)}.")
+    return page.section("Figures").table(rows, ("metric", "value", "unit"))

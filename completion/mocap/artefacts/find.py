@@ -3,65 +3,36 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from functools import partial
 
 import numpy as np
 
 from model.linear import Subject
-from scanprep.geometry.least_squares import Minimum, levenberg_marquardt
 
 from ...motion import Motion
 from ..files.markers import MarkerSequence
 from ..marker_sets.layout import MarkerLayout
+from ..pose import swaps
 from ..pose.robust import marker_weights
 from ..pose.settings import AnimateConfig
-from .results import ArtefactConfig, BadSpan, MarkerArtefacts
+from .results import ArtefactConfig, BadSpan, MarkerArtefacts, list_swaps
 from .simulated import Simulation, bridged, usual_places
 from .slips import find_bad, without_lost_limbs
-from .swaps import (
-    AWAY,
-    MEMORY,
-    WORTH,
-    Tracks,
-    best_stretches,
-    find_order,
-    list_swaps,
-    marker_levels,
-    pairs_that_jump,
-    relabelled,
-)
 
 Progress = Callable[[int, int], None]
 FOLLOW = AnimateConfig()             # how the body follows the markers here
 ROUNDS = 6                           # most times that markers are repaired and the body follows them anew
-SETTLED = 0.002                      # share of the markers that may still change when the search ends
-USUAL_PLACE = 0.04                   # metres, most that a marker's usual place is taken to be from its simulation
-BRIDGE = 0.5                         # seconds that a marker out of sight takes to its usual place, and from there
 CLOSE = 0.25                         # metres between markers whose swap a body can follow
 
 
 @dataclass(frozen=True, eq=False)
 class _State:
-    """Where the search stands.
+    """Where the search stands."""
 
-    Attributes
-    ----------
-    order : (T, L) int
-        From which label each marker is taken.
-    unsure : (L,) bool
-        Labels that tracks alone have swapped for so long that it may be the other way round.
-    bad : tuple of BadSpan
-    x : (T, P) float, optional
-        The body as it follows the markers so repaired.
-    both_ways_tried : bool
-        Swaps that the body may have followed were looked for.
-    """
-
-    order: np.ndarray
-    unsure: np.ndarray
+    order: np.ndarray                    # (T, L) int, from which label each marker is taken
+    unsure: np.ndarray                   # (L,) bool, swapped by tracks for so long that it may be the other way round
     bad: tuple[BadSpan, ...] = ()
-    x: np.ndarray | None = None
-    both_ways_tried: bool = False
+    x: np.ndarray | None = None          # (T, P) the body as it follows the markers so repaired
+    both_ways_tried: bool = False        # swaps that the body may have followed were looked for
 
     def out(self, labels: tuple[str, ...]) -> np.ndarray:
         """Bad markers (T, L) bool."""
@@ -72,7 +43,7 @@ class _State:
 
     def repaired(self, markers: MarkerSequence) -> np.ndarray:
         """The markers (T, L, 3), metres, under their right labels, without bad spans."""
-        return np.where(self.out(markers.labels)[..., None], np.nan, relabelled(markers.positions, self.order))
+        return np.where(self.out(markers.labels)[..., None], np.nan, swaps.relabelled(markers.positions, self.order))
 
 
 def find_artefacts(subject: Subject, markers: MarkerSequence, layout: MarkerLayout,
@@ -122,13 +93,13 @@ def find_artefacts(subject: Subject, markers: MarkerSequence, layout: MarkerLayo
 
 def relabelled_by_tracks(markers: MarkerSequence) -> MarkerSequence:
     """The sequence with labels put right as far as the tracks of the markers alone tell, without a body."""
-    order = find_order(markers.positions, markers.rate)
-    return MarkerSequence(relabelled(markers.positions, order), markers.labels, markers.rate)
+    order = swaps.find_order(markers.positions, markers.rate)
+    return MarkerSequence(swaps.relabelled(markers.positions, order), markers.labels, markers.rate)
 
 
 def _by_tracks(markers: MarkerSequence) -> _State:
     """What tracks alone tell; labels swapped in more than a quarter of the frames are the more likely of two ways."""
-    order = find_order(markers.positions, markers.rate)
+    order = swaps.find_order(markers.positions, markers.rate)
     return _State(order, (order != np.arange(order.shape[1])).mean(axis=0) > 0.25)
 
 
@@ -145,16 +116,16 @@ def _followed(body: Simulation, markers: MarkerSequence, state: _State) -> np.nd
 def _judged(body: Simulation, markers: MarkerSequence, state: _State, config: ArtefactConfig) -> _State:
     """The state with the swaps and then the bad spans that the body at its x tells; x is None if it is to be anew."""
     assert state.x is not None, "the body has followed"
-    places, simulated = np.full(markers.positions.shape, np.nan), body.positions(state.x)
+    places, simulated = np.full(markers.positions.shape, np.nan), body.body.positions(state.x)
     places[:, body.rows] = _expected(body, state, state.repaired(markers)[:, body.rows], simulated)
-    order = find_order(markers.positions, markers.rate, marker_levels(places, markers.positions, markers.rate))
+    order = swaps.find_order(markers.positions, markers.rate, swaps.marker_levels(places, markers.positions))
     sure, tried = not state.unsure.any(), state.both_ways_tried
     if sure and not tried and (order == state.order).all():
         order, tried = _both_ways(body, markers, state.x, order, places), True
     after = replace(state, order=order, unsure=np.zeros_like(state.unsure), both_ways_tried=tried)
     if not sure or (order != state.order).any():                        # where labels are wrong, so is the body
         return replace(after, bad=(), x=state.x if (order == state.order).all() else None)
-    tracks = Tracks(relabelled(markers.positions, order)[:, body.rows], markers.rate)
+    tracks = swaps.Tracks(swaps.relabelled(markers.positions, order)[:, body.rows], markers.rate)
     off = tracks.positions - simulated
     mine, alone = (body.local(v, state.x) for v in (off, body.alone(off, state.x)))
     found = find_bad(mine, alone, np.where(tracks.jumped, tracks.off, 0), body.labels, config, markers.rate)
@@ -165,8 +136,9 @@ def _judged(body: Simulation, markers: MarkerSequence, state: _State, config: Ar
 def _same(body: Simulation, markers: MarkerSequence, before: _State, after: _State) -> bool:
     """Whether a round has changed next to nothing."""
     changed = before.out(markers.labels) != after.out(markers.labels)
+    # share of the markers that may still change when the search ends
     return bool((before.order == after.order).all() and not before.unsure.any()
-                and changed[:, body.rows].mean() <= SETTLED)
+                and changed[:, body.rows].mean() <= 0.002)
 
 
 def _expected(body: Simulation, state: _State, repaired: np.ndarray, simulated: np.ndarray) -> np.ndarray:
@@ -175,16 +147,18 @@ def _expected(body: Simulation, state: _State, repaired: np.ndarray, simulated: 
     usual = usual_places(body.local(repaired - simulated, state.x))
     usual[state.unsure[body.rows]] = 0
     length = np.linalg.norm(usual, axis=1, keepdims=True)
-    usual *= np.minimum(1, USUAL_PLACE / np.maximum(length, 1e-12))
+    # metres, most that a marker's usual place is taken to be from its simulation
+    usual *= np.minimum(1, 0.04 / np.maximum(length, 1e-12))
     return simulated + np.einsum("tldc,lc->tld", body.part_rotations(state.x), usual)
 
 
 def _both_ways(body: Simulation, markers: MarkerSequence, x: np.ndarray, order: np.ndarray, places: np.ndarray
                ) -> np.ndarray:
     """The order (T, L) with close markers swapped where the body at x (T, P) has followed the wrong ones."""
-    raw, tracks = (Tracks(p, markers.rate) for p in (markers.positions, relabelled(markers.positions, order)))
+    raw = swaps.Tracks(markers.positions, markers.rate)
+    tracks = swaps.Tracks(swaps.relabelled(markers.positions, order), markers.rate)
     swapped = {(min(a, b), max(a, b)) for row in np.unique(order, axis=0) for a, b in enumerate(row.tolist()) if a != b}
-    pairs, order = pairs_that_jump(raw, set(range(len(markers.labels)))) | swapped, order.copy()
+    pairs, order = swaps.pairs_that_jump(raw, set(range(len(markers.labels)))) | swapped, order.copy()
     for a, b in sorted(pairs):
         if not np.median(np.linalg.norm(places[:, a] - places[:, b], axis=1)) < CLOSE:      # nor where one is unknown
             continue
@@ -192,15 +166,14 @@ def _both_ways(body: Simulation, markers: MarkerSequence, x: np.ndarray, order: 
         if len(frames):
             columns = np.array((a, b))
             order[np.ix_(frames, columns)] = order[np.ix_(frames, columns[::-1])]
-            tracks.change(columns, relabelled(markers.positions, order[:, columns]))
+            tracks.change(columns, swaps.relabelled(markers.positions, order[:, columns]))
     return order
 
 
-def ambiguous_swap(body: Simulation, x: np.ndarray, tracks: Tracks, a: int, b: int) -> np.ndarray:
+def ambiguous_swap(body: Simulation, x: np.ndarray, tracks: swaps.Tracks, a: int, b: int) -> np.ndarray:
     """Frames (n,) in which the labels a, b of close markers are better swapped, though the body followed them as is.
 
-    Both ways are tried in three frames of each stretch, from a body at x (T, P) that then follows neither; `tracks` are
-    those of the markers under the labels that they have now.
+    Both ways are tried in three frames of each stretch of `tracks`, from a body at x (T, P) that follows neither.
     """
     samples = 3
     begins = tracks.loose_ends(a, b)
@@ -216,40 +189,35 @@ def ambiguous_swap(body: Simulation, x: np.ndarray, tracks: Tracks, a: int, b: i
     if not frames:
         return np.zeros(0, dtype=int)
     at, of = np.concatenate(frames), np.concatenate(stretch)
-    value = np.clip(_gains(body, x[at], tracks.positions[at], a, b), -2 * AWAY, 2 * AWAY)
+    value = np.clip(_gains(body, x[at], tracks.positions[at], a, b), -2 * swaps.AWAY, 2 * swaps.AWAY)
     mean = np.bincount(of, value, len(begins)) / np.maximum(np.bincount(of, minlength=len(begins)), 1)
     known = np.add.reduceat(seen.astype(float), begins)
-    total, swapped = best_stretches(tracks, a, b, begins, mean * known * min(1.0, 1 / (MEMORY * body.rate)))
-    return swapped if total > WORTH else swapped[:0]
+    total, swapped = swaps.best_stretches(tracks, a, b, begins, mean * known * min(1.0, 1 / (swaps.MEMORY * body.rate)))
+    return swapped if total > swaps.WORTH else swapped[:0]
 
 
 def _gains(body: Simulation, x: np.ndarray, positions: np.ndarray, a: int, b: int) -> np.ndarray:
     """What it gains (n,), in half squared deviations, to swap a pair in frames with unknowns (n, P)."""
     targets = positions[:, body.rows]
     own = [int(np.flatnonzero(body.rows == label)[0]) for label in (a, b)]
-    weights, _ = marker_weights(body.positions(x), targets, FOLLOW.marker_sd, FOLLOW.outlier)
+    weights, _ = marker_weights(body.body.positions(x), targets, FOLLOW.marker_sd, FOLLOW.outlier)
     without, full = weights.copy(), weights
     without[:, own], full[:, own] = 0, FOLLOW.marker_sd**-2
-    start = _solved(body, x, targets, without).x
+    start = body.body.solve(x, targets, without, 8, 1e-3).x
     other = targets.copy()
     other[:, own] = targets[:, own[::-1]]
-    costs = [_solved(body, start, way, full).energy for way in (targets, other)]
+    costs = [body.body.solve(start, way, full, 8, 1e-3).energy for way in (targets, other)]
     return 0.5 * (costs[0] - costs[1])
-
-
-def _solved(body: Simulation, x: np.ndarray, targets: np.ndarray, weights: np.ndarray) -> Minimum[np.ndarray]:
-    """Frames (n, P) after a few steps towards targets (n, L, 3)."""
-    return levenberg_marquardt(partial(body.body.system, targets=targets, weights=weights), x, iterations=8,
-                               tolerance=1e-3, retract=body.body.retract)
 
 
 def _result(body: Simulation, markers: MarkerSequence, state: _State) -> MarkerArtefacts:
     """What has been found."""
     assert state.x is not None, "the body has followed"
-    repaired, simulated = state.repaired(markers), body.positions(state.x)
+    repaired, simulated = state.repaired(markers), body.body.positions(state.x)
     targets = repaired[:, body.rows]
     weights, _ = marker_weights(simulated, targets, 1.0, FOLLOW.outlier)
-    off = bridged(body.local(targets - simulated, state.x), BRIDGE * markers.rate)
+    # seconds that a marker out of sight takes to its usual place, and from there
+    off = bridged(body.local(targets - simulated, state.x), 0.5 * markers.rate)
     expected = simulated + np.einsum("tldc,tlc->tld", body.part_rotations(state.x), off)
     return MarkerArtefacts(list_swaps(state.order, markers.seen, markers.labels), state.bad, simulated, body.labels,
                            MarkerSequence(repaired, markers.labels, markers.rate), weights, expected, state.order)

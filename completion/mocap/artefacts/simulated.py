@@ -8,13 +8,10 @@ from model.linear import Subject
 from ...motion import Motion
 from ..files.markers import MarkerSequence
 from ..marker_sets.layout import MarkerLayout
-from ..pose.follow import between_keys, seen_span
-from ..pose.marked_body import BATCH, MarkedBody
+from ..pose.follow import between_keys, seen_span, smoothed
+from ..pose.marked_body import MarkedBody, batches
 from ..pose.robust import marker_weights
 from ..pose.settings import AnimateConfig
-from ..pose.smooth import inertia, smoothed
-
-OWN = 0.6                            # most of a displacement that the body is taken to have followed
 
 
 class Simulation:
@@ -32,21 +29,18 @@ class Simulation:
         hangs = self.part[:, None] == parents
         self.neighbours = (self.part[:, None] == self.part) | hangs | hangs.T
 
-    def positions(self, x: np.ndarray) -> np.ndarray:
-        """Where the body puts the markers (..., L, 3), metres, for unknowns (..., P)."""
-        return self.body.positions(x)
-
-    def weights(self, frames: np.ndarray | slice, positions: np.ndarray) -> np.ndarray:
-        """Weights (n, L) of the markers of some frames, low for outliers."""
-        return marker_weights(positions, self.targets[frames], self.config.marker_sd, self.config.outlier)[0]
+    def weights(self, frames: np.ndarray | slice, x: np.ndarray) -> np.ndarray:
+        """Weights (n, L) of the markers of some frames, low for outliers, the body being at unknowns (n, P)."""
+        return marker_weights(self.body.positions(x), self.targets[frames], self.config.marker_sd,
+                              self.config.outlier)[0]
 
     def solve(self, targets: np.ndarray, near: np.ndarray | None = None) -> np.ndarray:
         """Unknowns (T, P) of the body that follows markers (T, L, 3), metres, from others that are near or anew."""
         self.targets = targets
         x = between_keys(self.body, targets, self.rate, self.config) if near is None else near.copy()
-        inside, stiffness = seen_span(targets), inertia(self.config, self.rate, self.body.n_unknowns)
+        inside, stiffness = seen_span(targets), self.config.inertia(self.rate, self.body.n_unknowns)
         for _ in range(max(self.config.smoothing, 1)):
-            weights = self.weights(inside, self.positions(x[inside]))
+            weights = self.weights(inside, x[inside])
             x[inside] = smoothed(self.body, stiffness, x[inside], targets[inside], weights)
         return x
 
@@ -56,10 +50,9 @@ class Simulation:
         return self.body.body.join(motion.poses, motion.trans)
 
     def alone(self, off: np.ndarray, x: np.ndarray) -> np.ndarray:
-        """What markers would be off (T, L, 3), metres, if the body x (T, P) followed the others alone.
+        """What markers, off by (T, L, 3) metres, would be off if the body x (T, P) followed the others alone.
 
-        The body has gone after a displaced marker a little. Its own part in the normal equations is taken back.
-        `off` (T, L, 3) is from the simulated markers to the measured ones.
+        The body has gone after a displaced marker a little: its own part in the normal equations is taken back.
         """
         T, every = len(x), max(1, round(self.rate / 15))                # 15 looks a second at how markers draw the body
         frames = np.arange(min(every // 2, T - 1), T, every)
@@ -77,21 +70,18 @@ class Simulation:
 
     def _freed(self, x: np.ndarray, frames: np.ndarray) -> np.ndarray:
         """Matrices (n, L, 3, 3) from what is left of a displacement to the whole of it, at unknowns (n, P)."""
-        weights = self.weights(frames, self.positions(x))
+        weights = self.weights(frames, x)
         out = np.empty((*weights.shape, 3, 3))
-        for start in range(0, len(x), BATCH):
-            some = slice(start, start + BATCH)
+        for some in batches(len(x)):
             _, _, hessian = self.body.system(x[some], self.targets[frames[some]], weights[some])
-            pose, trans, _ = self.body.body.split(x[some])
-            _, by_turn = self.body.shapes.columns(pose, trans)                                    # (B, n, 3, L)
-            columns = np.concatenate([by_turn, np.broadcast_to(np.eye(3)[None, :, :, None],
-                                                               (len(pose), 3, 3, self.body.count))], axis=1)
+            _, columns = self.body.shapes.columns(*self.body.body.split(x[some])[:2])                # (B, P, 3, L)
             B, P = columns.shape[:2]
             hessian += 1e-9 * np.trace(hessian, axis1=1, axis2=2)[:, None, None] * np.eye(P)
             answer = np.linalg.solve(hessian, columns.reshape(B, P, -1)).reshape(columns.shape)
             followed = np.einsum("bpcl,bpdl->blcd", columns, answer) * weights[some][..., None, None]
             share, axes = np.linalg.eigh(followed)
-            out[some] = (axes / (1 - np.clip(share, 0, OWN))[..., None, :]) @ np.swapaxes(axes, -1, -2)
+            # most of a displacement that the body is taken to have followed
+            out[some] = (axes / (1 - np.clip(share, 0, 0.6))[..., None, :]) @ np.swapaxes(axes, -1, -2)
         return out
 
 
@@ -112,10 +102,7 @@ def usual_places(local: np.ndarray) -> np.ndarray:
 
 
 def bridged(local: np.ndarray, reach: float) -> np.ndarray:
-    """What markers are off (T, L, 3), NaN in gaps, with these bridged: straight, in long ones by way of the usual.
-
-    A marker is where it usually is `reach` frames from either end of a long gap.
-    """
+    """What markers are off (T, L, 3), NaN in gaps, with these bridged: straight, long ones by the usual place."""
     out = np.repeat(usual_places(local)[None], len(local), axis=0)
     for i in range(local.shape[1]):
         seen = np.flatnonzero(np.isfinite(local[:, i, 0]))

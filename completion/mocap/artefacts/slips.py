@@ -14,10 +14,9 @@ STRAY_SMOOTH = 3.0                   # times the limit that a stray takes where 
 
 def find_bad(off: np.ndarray, alone: np.ndarray, jumps: np.ndarray, labels: tuple[str, ...], config: ArtefactConfig,
              rate: float) -> tuple[BadSpan, ...]:
-    """The bad spans of markers that are off (T, L, 3), metres, from their simulation, in the frames of their parts.
+    """The bad spans of markers that are off (T, L, 3), metres, in the frames of their parts, NaN where not seen.
 
-    `off` is as the body follows all markers, `alone` as it would follow the others alone; NaN where one was not seen.
-    `jumps` (T, L) is how far the track jumps, metres, zero where it goes on.
+    `off` is as the body follows all, `alone` as it would the others; `jumps` (T, L), metres, is how far tracks jump.
     """
     noise_usual, stray_usual, joined = 5.0, 4.0, 0.1        # times what is usual; seconds between spans that are one
     usual = np.nan_to_num(_median(np.linalg.norm(off - _median(off), axis=2), axis=1))
@@ -44,10 +43,7 @@ def find_bad(off: np.ndarray, alone: np.ndarray, jumps: np.ndarray, labels: tupl
 
 
 def without_lost_limbs(spans: tuple[BadSpan, ...], near: np.ndarray, labels: tuple[str, ...]) -> tuple[BadSpan, ...]:
-    """Spans but those in which half the markers of a limb are bad together: there the body is at fault.
-
-    `near` (L, L) bool are markers on the same part or the next ones, each among its own.
-    """
+    """Spans but those in which half the markers of a limb, `near` (L, L), are bad: there the body is at fault."""
     count = len(labels)
     begin, end = (np.array([getattr(span, name) for span in spans], dtype=int) for name in ("begin", "end"))
     of = np.array([labels.index(span.label) for span in spans], dtype=int)
@@ -134,8 +130,7 @@ def _lasting(track: np.ndarray, jumps: np.ndarray, k: int, step: np.ndarray, lea
 def _stray(away: np.ndarray, limit: np.ndarray, jumps: np.ndarray, gap: np.ndarray) -> np.ndarray:
     """Frames (n,) bool of a marker that is somewhere else, from one tear of its track to the next.
 
-    `away` (n,) is how far it is from its usual place and `limit` (n,) how far that may be, metres; before a frame its
-    track `jumps` so far, or there was a `gap`.
+    All (n,): metres from its usual place and how far that may be; how far its track jumps there; after a gap.
     """
     leap, jumped = 0.5, 0.5         # share of the displacement that a jump is; of the limit that does between two jumps
     out = away > STRAY_SMOOTH * limit

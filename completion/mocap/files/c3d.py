@@ -15,13 +15,12 @@ import numpy as np
 
 from scanprep.geometry.format_common import UNITS
 
-from .common import MarkerFileError, RawMarkers
+from .text import MarkerFileError, RawMarkers
 
 _BLOCK = 512
 _INTEL, _DEC, _MIPS = 84, 85, 86
 _COMPUTED = ("ANGLES", "FORCES", "MOMENTS", "POWERS", "SCALARS")     # stored among the points, but no positions
 RESIDUAL = 256                       # one step of the residual in the fourth number of a point; below it are cameras
-MEASURED = 1.0                       # residual, millimetres, of points that were measured, where others were not
 _Parameters = dict[tuple[str, str], list[Any]]                       # group and name -> values
 
 
@@ -202,12 +201,9 @@ def replace_points(path: Path, data: bytes, columns: np.ndarray, positions: np.n
                    unit: str | None = None) -> bytes:
     """The file with other positions of some points; analog channels, events and all parameters are kept.
 
-    A point that was measured keeps its cameras and its residual, which is made no less than the least that the file
-    can hold; one that was computed has neither, as the format has it; a missing one has residual -1.
-
-    `columns` (L,) says which of the file's points that have positions, `positions` (T, L, 3), metres, are NaN where a
-    point is missing, `source` (T, L) is which of `columns` a point was measured as, -1 where it was computed. `unit` is
-    that of a file that does not say, or says it wrongly.
+    A measured point keeps its cameras and its residual, made no less than the least that the file can hold; a computed
+    one has neither, a missing one residual -1. `columns` (L,) are of the points with positions, `positions` (T, L, 3),
+    metres, `source` (T, L) the column a point was measured as, -1 if computed; `unit` of a file that says it wrongly.
     """
     table = point_table(path, data)
     if len(positions) != table.frames:
@@ -240,10 +236,7 @@ def replace_points(path: Path, data: bytes, columns: np.ndarray, positions: np.n
 
 def write_c3d(path: Path, positions: np.ndarray, labels: tuple[str, ...], rate: float,
               filled: np.ndarray | None = None) -> None:
-    """Write positions (T, L, 3), metres, as a C3D file in millimetres; missing points have residual -1.
-
-    `filled` (T, L): points that were not measured.
-    """
+    """Write positions (T, L, 3), metres, of which some, `filled` (T, L), were not measured."""
     try:
         import ezc3d
     except ImportError:
@@ -257,7 +250,8 @@ def write_c3d(path: Path, positions: np.ndarray, labels: tuple[str, ...], rate: 
     points = np.ones((4, L, T))
     points[:3] = 1000 * positions.transpose(2, 1, 0)
     tree["data"]["points"] = points
-    residual = np.zeros((T, L)) if filled is None else np.where(filled, 0.0, MEASURED)
+    # residual, millimetres, of points that were measured, where others were not
+    residual = np.zeros((T, L)) if filled is None else np.where(filled, 0.0, 1.0)
     tree["data"]["meta_points"] = {"residuals": np.where(np.isnan(positions[..., 0]), -1.0, residual).T[None],
                                    "camera_masks": np.zeros((7, L, T), dtype=bool)}
     if T > 65535:

@@ -12,8 +12,7 @@ from scanprep.geometry import storage
 from scanprep.geometry.format_common import FARTHEST, UNITS
 
 from .c3d import read_c3d, write_c3d
-from .common import MarkerFileError, RawMarkers
-from .text import encode_csv, read_csv, read_trc
+from .text import MarkerFileError, RawMarkers, encode_csv, read_csv, read_trc
 
 __all__ = ["MarkerFileError", "MarkerSequence", "read_markers", "write_markers"]
 

@@ -1,7 +1,6 @@
 """Files of a motion: tables of joint angles, joint centres and residuals, BVH and GLB."""
 from __future__ import annotations
 
-import csv
 from dataclasses import replace
 from pathlib import Path
 
@@ -9,7 +8,7 @@ import numpy as np
 
 from model.export.bvh import write_bvh
 from model.linear import PointOperator, Subject
-from scanprep.geometry.storage import writing
+from scanprep.geometry import tables
 from scanprep.pictures.camera import upright
 
 from ...motion import Motion, spread_frames
@@ -42,11 +41,7 @@ def joint_centres(motion: Motion, subject: Subject) -> np.ndarray:
 
 
 def write_motion(folder: Path, motion: Motion, subject: Subject) -> None:
-    """motion.npz, motion.bvh, joint_angles.csv, joint_centres.csv and residuals.csv.
-
-    Times are in seconds. Columns are `PART_rx, PART_ry, PART_rz`, the rotation vectors of `joint_angles`; `PART_x,
-    PART_y, PART_z`, metres, the joint of each part with its parent, for the root part the centroid of its surface.
-    """
+    """motion.npz, motion.bvh, joint_angles.csv, joint_centres.csv and residuals.csv; times are in seconds."""
     names, T = subject.skeleton.names, len(motion.poses)
     motion.save(folder / "motion.npz")
     write_motion_bvh(folder / "motion.bvh", motion, subject)
@@ -88,7 +83,5 @@ def write_glb(path: Path, motion: Motion, subject: Subject, vertices: np.ndarray
 
 def write_table(path: Path, columns: list[str], rows: np.ndarray) -> None:
     """Numbers as CSV, whole or not at all; NaN becomes an empty cell."""
-    with writing(path) as beside, open(beside, "w", newline="", encoding="utf-8") as out:
-        table = csv.writer(out)
-        table.writerow(columns)
-        table.writerows(["" if np.isnan(value) else f"{value:.6g}" for value in row] for row in rows.tolist())
+    tables.write_table(path, columns, (["" if np.isnan(value) else f"{value:.6g}" for value in row]
+                                       for row in rows.tolist()))

@@ -69,8 +69,7 @@ def candidate_layout(body: BodyModel | Mesh, base: MarkerLayout, count: int = 11
 def sitting_room(body: Mesh, mirror: SkinMirror, thick: float = 0.022) -> np.ndarray:
     """(N,) bool where a marker can sit: open to cameras, flat, on a thick enough limb, not on the soles.
 
-    The body stands with limbs apart; lengths are shares of its length, the largest extent along the plane of symmetry.
-    The body is at least `thick` below a marker: fingers, toes and ears are less.
+    Lengths are shares of the body's; at least `thick` is below a marker: fingers, toes and ears are less.
     """
     axis, length = _long_axis(body, mirror)
     along = body.vertices @ axis

@@ -158,10 +158,7 @@ def design_markers(model: BodyModel, bodies: np.ndarray, candidates: MarkerLayou
 
 def choose(linear: LinearBodies, groups: Groups, kept: np.ndarray, config: DesignConfig,
            tell: Callable[[int], None] | None = None) -> Choice:
-    """The set of `config.count` markers, and the curves it comes from.
-
-    `kept` (n,): groups that stay.
-    """
+    """The set of `config.count` markers, with groups `kept` (n,) in it, and the curves it comes from."""
     every, free, step = np.arange(len(groups)), ~kept, [0]
     stops = {config.count, *config.through}
 

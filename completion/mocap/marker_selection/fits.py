@@ -127,11 +127,7 @@ class Prior:
 
 
 def prior_around(model: BodyModel, x: np.ndarray, shape_weight: float = 1.0) -> Prior:
-    """The prior of bodies that stand and face about as at x (Z, P).
-
-    [MoSh] Eq. 20
-    [MoSh] Eq. 21
-    """
+    """The prior of bodies that stand and face about as at x (Z, P). [MoSh] Eq. 20, Eq. 21"""
     poses = gaussian_prior(model.pose_mean, model.pose_covariance)
     n, P = len(poses.mean), x.shape[1]
     precision = np.zeros((P, P))
@@ -147,12 +143,7 @@ def prior_around(model: BodyModel, x: np.ndarray, shape_weight: float = 1.0) -> 
 
 def fit_points(points: BodyPoints, targets: np.ndarray, weights: np.ndarray, prior: Prior, start: np.ndarray,
                iterations: int, tell: Tell | None = None) -> np.ndarray:
-    """Unknowns (Z, P) with which the points come nearest to their targets, by Levenberg-Marquardt.
-
-    `targets` (Z, L, 3), metres; `weights` (L,): factor on the squared distance; `start` (Z, P).
-
-    [MoSh] Eq. 26
-    """
+    """Unknowns (Z, P) with which points come nearest to targets (Z, L, 3), metres, weighted (L,). [MoSh] Eq. 26"""
     root, found = np.sqrt(weights)[:, None], np.empty_like(start)
     size = min(24, points.batch)  # bodies that are minimised at once
     for begin in range(0, len(start), size):
@@ -168,7 +159,7 @@ def fit_points(points: BodyPoints, targets: np.ndarray, weights: np.ndarray, pri
             return Dense((residual**2).sum(axis=(1, 2)) + energy, (transposed @ residual)[..., 0] + slope,
                          transposed @ J + known.precision)
 
-        found[some] = levenberg_marquardt(system, start[some], iterations, 1e-4).x
+        found[some] = levenberg_marquardt(system, start[some], iterations, 1e-4, angles=points.n_angles).x
         if tell is not None:
             tell(min(begin + size, len(start)))
     return found

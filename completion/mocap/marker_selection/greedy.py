@@ -11,10 +11,7 @@ from .linear import LinearBodies
 
 
 def symmetric_groups(labels: Sequence[str], partners: np.ndarray | None = None) -> tuple[tuple[int, ...], ...]:
-    """Numbers of the markers of each pair, and of each marker alone.
-
-    `partners` (L,).
-    """
+    """Numbers of the markers of each pair, and of each marker alone; `partners` (L,), else by label."""
     partners = label_pairs(labels) if partners is None else np.asarray(partners, dtype=np.int64)
     each = np.arange(len(labels))
     if partners.shape != each.shape or partners.max(initial=-1) >= len(each):
@@ -148,8 +145,7 @@ def walk(sets: MarkerSets, sign: int, movable: np.ndarray, until: int, through: 
          tell: Callable[[int], None] | None = None) -> Path:
     """Let the group come or go that serves best for each of its markers, again and again.
 
-    `movable` (n,) are groups that may come or go; the count goes no further than `until`, and stops at those of
-    `through` where a single marker can be had.
+    Only those of `movable` (n,), no further than `until`; it stops at counts of `through` that single markers can make.
     """
     start, steps = np.flatnonzero(sets.inside), list[int]()
     counts, rmse = [sets.count], [sets.rmse]
@@ -173,12 +169,9 @@ def walk(sets: MarkerSets, sign: int, movable: np.ndarray, until: int, through: 
 
 
 def exchange(sets: MarkerSets, movable: np.ndarray, rounds: int) -> int:
-    """Put every group of the set, and single ones two at a time, against all that may take its place.
+    """Put every group of the set, and single ones two at a time, against all that may take its place, for some rounds.
 
-    A pair may make room for two single markers, and two of these for a pair.
-
-    `movable` (n,) are groups that may come or go. The set changes, its count does not; found is how many exchanges were
-    made in at most so many rounds.
+    A pair may make room for two single markers and the other way round; returned is how many exchanges were made.
     """
     done = 0
     for _ in range(rounds):

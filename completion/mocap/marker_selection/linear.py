@@ -36,10 +36,7 @@ class LinearBodies:
     lean: np.ndarray                 # (Z, P), l: where the priors pull
 
     def steps(self, chosen: Sequence[int] | np.ndarray) -> np.ndarray:
-        """(Z, P) from these candidates, each solved for by itself.
-
-        [MoSh] Eq. 26
-        """
+        """(Z, P) from these candidates, each solved for by itself. [MoSh] Eq. 26"""
         Z, _, _, P = self.rows.shape
         B = self.rows[:, chosen].reshape(Z, -1, P)
         transposed = np.swapaxes(B, -1, -2)
@@ -51,10 +48,7 @@ class LinearBodies:
         return np.asarray(((steps[:, None] @ self.gram)[:, 0] * steps - 2 * self.pull * steps).sum(axis=1) + self.rest)
 
     def rmse(self, chosen: Sequence[int] | np.ndarray) -> float:
-        """Root of the mean squared distance, metres, over all vertices and bodies.
-
-        [MoSh] Eq. 27
-        """
+        """Root of the mean squared distance, metres, over all vertices and bodies. [MoSh] Eq. 27"""
         return float(np.sqrt(self.left(self.steps(chosen)).mean()))
 
     def of(self, bodies: np.ndarray) -> LinearBodies:
@@ -75,10 +69,7 @@ class WholeFits:
 
     def refitted(self, chosen: Sequence[int] | np.ndarray, config: DesignConfig,
                  tell: Callable[[int], None] | None = None) -> np.ndarray:
-        """Unknowns (Z, P) from some candidates without linearising, from the fit to the whole body on.
-
-        [MoSh] Eq. 26
-        """
+        """Unknowns (Z, P) from some candidates without linearising, from the fit to the whole body on. [MoSh] Eq. 26"""
         chosen = np.asarray(chosen)
         weights = np.full(len(chosen), config.marker_sd**-2)
         return fit_points(self.markers.some(chosen), self.places[:, chosen], weights, self.prior, self.x,
@@ -87,10 +78,7 @@ class WholeFits:
 
 def fit_bodies(model: BodyModel, bodies: np.ndarray, candidates: MarkerLayout, config: DesignConfig,
                progress: Progress | None = None) -> WholeFits:
-    """Fit the model to every whole body, and linearise there.
-
-    Bodies (Z, N, 3), metres, are in the topology of the model's template, in any poses.
-    """
+    """Fit the model to every whole body (Z, N, 3), metres, in any poses, and linearise there."""
     bodies, n_betas = check_bodies(model, bodies), _check(model, candidates, config)
     tell = progress or (lambda done, total: None)
     template, total = model.template.vertices, 2 * len(bodies)
@@ -154,12 +142,10 @@ def _linearised(x: np.ndarray, markers: BodyPoints, places: np.ndarray, surface:
 
 
 def shared_shape(linear: LinearBodies, x: np.ndarray, people: np.ndarray, n_betas: int) -> LinearBodies:
-    """The same bodies with betas common to those of a person: one problem a person.
+    """The same bodies, linearised around x (Z, P), with betas common to those of a person (Z,): one problem a person.
 
     Unknowns of a person are pose and place of the bodies one after the other, and the betas, a step from the mean
     of those that the bodies have by themselves. Rows of a candidate are those in all the bodies.
-
-    It was linearised around unknowns x (Z, P), betas last; `people` (Z,) is whose body each is.
     """
     names, each = np.unique(people, return_counts=True)
     if len(people) != len(x) or len(set(each.tolist())) > 1:
@@ -212,10 +198,7 @@ def example_poses(model: BodyModel, count: int) -> np.ndarray:
 
 def in_poses(model: BodyModel, bodies: np.ndarray, poses: np.ndarray,
              progress: Callable[[int, int], None] | None = None) -> np.ndarray:
-    """Each registered body, with its own full shape, in some poses.
-
-    Bodies (Z, N, 3), metres, in poses (F, J, 3), radians, come out as (Z, F, N, 3) float32.
-    """
+    """Each registered body (Z, N, 3), metres, with its own full shape, in poses (F, J, 3): (Z, F, N, 3) float32."""
     bodies = check_bodies(model, bodies)
     poses, _ = check_pose(model.skeleton, poses, None)
     fitter = ShapeFitter(model, FitConfig(polish=0))

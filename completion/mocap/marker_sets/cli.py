@@ -8,7 +8,8 @@ import numpy as np
 import tyro
 
 from scanprep.cli import MM, Output, Unit
-from scanprep.console import Metric, Outcome, bar, dispatch, say
+from scanprep.command_line import dispatch
+from scanprep.console import Metric, Outcome, bar, say
 from scanprep.geometry.files import read_mesh, write_mesh
 from scanprep.geometry.landmarks import match_landmarks, read_landmarks, read_template_landmarks
 from scanprep.geometry.mesh import Mesh

@@ -12,7 +12,7 @@ import numpy as np
 from scanprep.geometry import storage
 from scanprep.geometry.mesh import Mesh
 
-from ..files.common import MarkerFileError
+from ..files.text import MarkerFileError
 
 DISTANCE = 0.0095        # metres from the skin to the centre of a common marker
 
@@ -200,7 +200,7 @@ class MarkerLayout:
             vertices[row] = vertex
             if weights is not None:
                 weights[row] = [1.0, 0.0, 0.0]
-        return MarkerLayout(self.labels, vertices, self.distances, weights, self.aliases, self.loose)
+        return replace(self, vertices=vertices, weights=weights)
 
     def place(self, mesh: Mesh) -> np.ndarray:
         """Where the markers are on a body (L, 3), metres: the point of the skin, and out along the normal there.

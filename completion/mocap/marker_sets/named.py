@@ -3,6 +3,7 @@ from __future__ import annotations
 
 import hashlib
 from collections.abc import Sequence
+from dataclasses import replace
 from functools import cache
 from pathlib import Path
 from typing import Any
@@ -82,8 +83,7 @@ def _on_kept(layout: MarkerLayout, template: Mesh, kept: np.ndarray) -> MarkerLa
 
     whole = load().mesh.vertices
     found = Surface(Mesh(whole[kept], template.faces)).closest(whole[layout.vertices])
-    return MarkerLayout(layout.labels, template.faces[found.faces], layout.distances, found.bary, layout.aliases,
-                        layout.loose)
+    return replace(layout, vertices=template.faces[found.faces], weights=found.bary)
 
 
 @cache

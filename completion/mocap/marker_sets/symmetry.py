@@ -82,10 +82,9 @@ def label_pairs(labels: Sequence[str]) -> np.ndarray:
 
 
 def marker_pairs(layout: MarkerLayout, template: Mesh, mirror: SkinMirror | None = None) -> np.ndarray:
-    """(L,) the marker on the other side of every marker, by label, and by place where labels do not tell.
+    """(L,) the marker on the other side of every marker, by label, or by place where labels do not tell.
 
     Its own number for a marker in the middle, -1 where there is no partner; the partner's partner is the marker.
-    `template` is a body that the layout is for, with its mirror, found when not given.
     """
     pairs = label_pairs(layout.labels)
     pairs[[other_side(label) is None for label in layout.labels]] = -1

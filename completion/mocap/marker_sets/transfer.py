@@ -2,7 +2,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -14,7 +14,6 @@ from scanprep.registration.schedule import RegistrationConfig
 
 from .layout import MarkerLayout
 
-LOST = 0.3                           # of the target that the source does not cover: it is somewhere else
 UNCERTAIN = 0.05                      # a limb may be wrong
 Landmarks = tuple[np.ndarray, np.ndarray]
 
@@ -86,13 +85,12 @@ def transfer_layout(layout: MarkerLayout, source: Mesh, target: Mesh, landmarks:
         return TransferredLayout(layout, np.zeros(L), np.ones(L), 0.0, np.nan, 0.0, target)
     fit = _registered(source, target, landmarks, config or RegistrationConfig(), search,
                       progress or (lambda done, total: None))
-    if fit.uncovered > LOST:
+    if fit.uncovered > 0.3:  # of the target that the source does not cover: it is somewhere else
         raise ValueError(f"target: the source could not be brought onto it, {fit.uncovered:.0%} of it stays uncovered; "
                          "give landmarks, three at least, spread over the body")
     found = Surface(target).closest(layout.skin_points(fit.mesh.vertices))
     inside = np.clip(found.bary, 0.0, 1.0)                            # without the last digits outside of the triangle
-    there = MarkerLayout(layout.labels, target.faces[found.faces], layout.distances,
-                         inside / inside.sum(axis=1, keepdims=True), layout.aliases, layout.loose)
+    there = replace(layout, vertices=target.faces[found.faces], weights=inside / inside.sum(axis=1, keepdims=True))
     return TransferredLayout(there, found.distances, fit.confidence[layout.nearest], fit.rms, fit.landmark_rms,
                              fit.uncovered, fit.mesh)
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 import sys
 import warnings
 from collections.abc import Mapping, Sequence
-from html import escape
 from pathlib import Path
 from typing import Annotated
 
@@ -23,13 +22,11 @@ from ...cli import read_model
 from ..marker_sets.named import choose_layout
 from .mosh import MoshConfig
 from .recordings import TABLE, Actor, Grouping, find_actors, write_table
-from .report import PICTURE
+from .report import add_entry
 from .work import ERRORS, Work
 
 MarkersArg = Annotated[tyro.conf.Positional[tuple[Path, ...]], tyro.conf.arg(metavar="MARKERS [MARKERS ...]")]
 Models = Annotated[tyro.conf.UseAppendAction[tuple[Path, ...]], tyro.conf.arg(aliases=["-m"])]
-_STYLE = """.person { display: grid; grid-template-columns: minmax(17rem, 1fr) 2fr; gap: 1rem; margin: 1.6rem 0; }
-.person img { width: 100%; } .person p { margin: .2rem 0; }"""
 
 
 def mosh_markers(markers: MarkersArg, output: Output, model: Models = (), layout: str | None = None,
@@ -162,8 +159,5 @@ def _page(actors: Sequence[Actor], metrics: Mapping[str, Sequence[Metric]], fail
     for name in sorted(metrics, key=lambda name: (-error[name], name)):
         told = [f"{m.name}: {m.text()} {m.unit}" for m in metrics[name]
                 if m.name in (*ERRORS, "sequences", "frames", "sex")]
-        lines = "".join(f"<p>{escape(line)}</p>" for line in (*told, f"recordings put together: {rules[name]}"))
-        link = escape(name)
-        page.markup(f'<div class="person"><div><a href="{link}/report.html"><b>{link}</b></a>{lines}</div>'
-                    f'<a href="{link}/report.html"><img src="{link}/{PICTURE}" alt="{link}"></a></div>', _STYLE)
+        add_entry(page, name, (*told, f"recordings put together: {rules[name]}"))
     return page

@@ -1,16 +1,18 @@
-"""From marker files of one subject to a moving body: all stages of [MoSh] one after the other."""
+"""From marker files of one subject to a moving body: all stages of [MoSh] one after the other; by sex, if wanted."""
 from __future__ import annotations
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from functools import cached_property
 from typing import Any, TypeVar
 
 import numpy as np
 
 from model.body import BodyModel
+from model.learning.sexes import SexGuess, guess_sex, sex_plane
 from model.linear import Subject
-from scanprep.batch.steps import Step, inside, once
+from scanprep.batch.room import Step, inside, once
 from scanprep.ranges import Settings
 from scanprep.threads import one_thread
 
@@ -26,7 +28,6 @@ from ..subject.person import PersonConfig, PersonFit, find_person, one_or_more
 
 Progress = Callable[[int, int], None]
 T = TypeVar("T")
-ROUNDS = 3                           # most times that a person is followed and the markers are judged
 STEPS = 100                          # of progress, of each stage
 
 
@@ -148,88 +149,56 @@ def mosh(model: BodyModel, sequences: MarkerSequence | Sequence[MarkerSequence],
     [MoSh] Eq. 23, Eq. 24
     """
     config, sequences = config or MoshConfig(), one_or_more(sequences)
-    stages = _Stages(model, config, step, progress, STEPS * (1 + len(sequences) * (2 + config.soft_tissue)))
-    used = [stages.relabelled(f"tracks {i}", each) for i, each in enumerate(sequences)]
-    person = stages.person(used, layout)                                        # [MoSh] Eq. 23, shape and markers
-    for n in range(ROUNDS):
-        motions = [stages.motion(f"poses {n} {i}", person, each, n == 0)        # [MoSh] Eq. 23, poses
+    stages = _Stages(step, progress, STEPS * (1 + len(sequences) * (2 + config.soft_tissue)))
+    used = [_relabelled(stages, i, each, config) for i, each in enumerate(sequences)]
+    person = _person(stages, model, used, layout, config)                       # [MoSh] Eq. 23, shape and markers
+    for n in range(3):  # most times that a person is followed and the markers are judged
+        motions = [_motion(stages, f"poses {n} {i}", person, each, config, n == 0)  # [MoSh] Eq. 23, poses
                    for i, each in enumerate(used)]
-        artefacts = [stages.artefacts(f"artefacts {n} {i}", person, each, motion, n == 0)
+        artefacts = [_artefacts(stages, f"artefacts {n} {i}", person, each, motion, config, n == 0)
                      for i, (each, motion) in enumerate(zip(sequences, motions, strict=True))]
         before, used = used, [each.repaired for each in artefacts]
-        settled = all(same(before[i], used[i], t) for i, t in person.frames)
+        settled = all(_same(before[i], used[i], t) for i, t in person.fit.frames)
         if settled:
             break
-        person = stages.person(used, layout, f"again {n}")
-    motions = [motion if settled and same(old, new) else stages.motion(f"poses last {i}", person, new)
+        person = _person(stages, model, used, layout, config, f"again {n}")
+    motions = [motion if settled and _same(old, new) else _motion(stages, f"poses last {i}", person, new, config, False)
                for i, (motion, old, new) in enumerate(zip(motions, before, used, strict=True))]
-    soft = [stages.soft_tissue(f"soft tissue {i}", person, each, motion)        # [MoSh] Eq. 24
+    soft = [_soft_tissue(stages, i, person, each, motion, config)               # [MoSh] Eq. 24
             for i, (each, motion) in enumerate(zip(used, motions, strict=True)) if config.soft_tissue]
-    return MoshResult(person.betas, person.layout, person, tuple(motions), tuple(soft), tuple(artefacts),
+    return MoshResult(person.fit.betas, person.fit.layout, person.fit, tuple(motions), tuple(soft), tuple(artefacts),
                       stages.seconds)
 
 
-def same(first: MarkerSequence, second: MarkerSequence, frames: int | slice = slice(None)) -> bool:
+def _same(first: MarkerSequence, second: MarkerSequence, frames: int | slice = slice(None)) -> bool:
     """Whether two sequences hold the same markers in the same places, in some frames."""
     return np.array_equal(first.positions[frames], second.positions[frames], equal_nan=True)
 
 
-@dataclass
-class _Stages:
-    """The stages of a call: what each finds is kept by what it depends on, and it is told how far it is."""
+@dataclass(frozen=True, eq=False)
+class _Person:
+    """A person, and the body, which is made when a stage needs it."""
 
     model: BodyModel
-    config: MoshConfig
+    fit: PersonFit
+
+    @cached_property
+    def subject(self) -> Subject:
+        return self.model.subject(self.fit.betas)
+
+
+@dataclass
+class _Stages:
+    """What runs the stages of a call: each is kept by what it depends on, its seconds count, the bar moves."""
+
     step: Step
     progress: Progress | None
     total: int
     done: int = 0
     seconds: dict[str, float] = field(default_factory=dict)
-    last: tuple[PersonFit, Subject] | None = None
 
-    def relabelled(self, name: str, markers: MarkerSequence) -> MarkerSequence:
-        """A sequence with labels put right as far as tracks tell."""
-        if not self.config.repair:
-            return markers
-        return self._run("artefacts", name, markers, lambda _: relabelled_by_tracks(markers))
-
-    def person(self, sequences: Sequence[MarkerSequence], layout: MarkerLayout, again: str = "") -> PersonFit:
-        """Shape and marker places; `again` names it where it was found before, of other markers."""
-        model, config = self.model, self.config.person
-        step = inside(self.step, again) if again else self.step
-        return self._run("person", f"{again} person".strip(), (model, sequences, layout, config),
-                         lambda tell: find_person(model, sequences, layout, config, tell, step), not again)
-
-    def motion(self, name: str, person: PersonFit, markers: MarkerSequence, told: bool = False) -> Motion:
-        """The motion of a person of fixed shape."""
-        layout, config = person.layout, self.config.poses
-        return self._run("poses", name, (self.model, person.betas, layout, markers, config),
-                         lambda tell: animate(self._subject(person), markers, layout, config, tell), told)
-
-    def artefacts(self, name: str, person: PersonFit, markers: MarkerSequence, motion: Motion, told: bool
-                  ) -> MarkerArtefacts:
-        """What is wrong with the markers, by the body that carries them."""
-        layout, config = person.layout, self.config.artefacts
-        if not self.config.repair:
-            return no_artefacts(self._subject(person), markers, layout, motion)
-        return self._run("artefacts", name, (self.model, person.betas, layout, markers, motion, config), lambda tell:
-                         find_artefacts(self._subject(person), markers, layout, config, motion, tell), told)
-
-    def soft_tissue(self, name: str, person: PersonFit, markers: MarkerSequence, motion: Motion) -> SoftTissue:
-        """The motion with a shape that changes."""
-        model, layout, config = self.model, person.layout, self.config.soft
-        return self._run("soft tissue", name, (model, layout, markers, motion, config),
-                         lambda tell: follow_soft_tissue(model, motion, markers, layout, config, tell), True)
-
-    def _subject(self, person: PersonFit) -> Subject:
-        """Made when a stage needs it, once."""
-        if self.last is None or self.last[0] is not person:
-            self.last = person, self.model.subject(person.betas)
-        return self.last[1]
-
-    def _run(self, stage: str, name: str, inputs: Any, make: Callable[[Progress | None], T], told: bool = False
-             ) -> T:
-        """What `make` finds or found in an earlier run; its seconds count, and it moves the bar if it is told."""
+    def run(self, stage: str, name: str, inputs: Any, make: Callable[[Progress | None], T], told: bool = False) -> T:
+        """What `make` finds, or found in an earlier run; it moves the bar if it is told."""
         before, self.done = self.done, self.done + STEPS * told
 
         def tell(done: int, total: int) -> None:
@@ -243,3 +212,111 @@ class _Stages:
         value, seconds = self.step(name, inputs, timed)
         self.seconds[stage] = self.seconds.get(stage, 0.0) + seconds
         return value
+
+
+def _relabelled(stages: _Stages, i: int, markers: MarkerSequence, config: MoshConfig) -> MarkerSequence:
+    """A sequence with labels put right as far as tracks tell."""
+    if not config.repair:
+        return markers
+    return stages.run("artefacts", f"tracks {i}", markers, lambda _: relabelled_by_tracks(markers))
+
+
+def _person(stages: _Stages, model: BodyModel, sequences: Sequence[MarkerSequence], layout: MarkerLayout,
+            config: MoshConfig, again: str = "") -> _Person:
+    """Shape and marker places; `again` names it where it was found before, of other markers."""
+    step = inside(stages.step, again) if again else stages.step
+    return _Person(model, stages.run(
+        "person", f"{again} person".strip(), (model, sequences, layout, config.person),
+        lambda tell: find_person(model, sequences, layout, config.person, tell, step), not again))
+
+
+def _motion(stages: _Stages, name: str, person: _Person, markers: MarkerSequence, config: MoshConfig, told: bool
+            ) -> Motion:
+    """The motion of a person of fixed shape."""
+    fit, poses = person.fit, config.poses
+    return stages.run("poses", name, (person.model, fit.betas, fit.layout, markers, poses),
+                      lambda tell: animate(person.subject, markers, fit.layout, poses, tell), told)
+
+
+def _artefacts(stages: _Stages, name: str, person: _Person, markers: MarkerSequence, motion: Motion,
+               config: MoshConfig, told: bool) -> MarkerArtefacts:
+    """What is wrong with the markers, by the body that carries them."""
+    fit, judge = person.fit, config.artefacts
+    if not config.repair:
+        return no_artefacts(person.subject, markers, fit.layout, motion)
+    return stages.run("artefacts", name, (person.model, fit.betas, fit.layout, markers, motion, judge), lambda tell:
+                      find_artefacts(person.subject, markers, fit.layout, judge, motion, tell), told)
+
+
+def _soft_tissue(stages: _Stages, i: int, person: _Person, markers: MarkerSequence, motion: Motion, config: MoshConfig
+                 ) -> SoftTissue:
+    """The motion with a shape that changes."""
+    model, layout, soft = person.model, person.fit.layout, config.soft
+    return stages.run("soft tissue", f"soft tissue {i}", (model, layout, markers, motion, soft),
+                      lambda tell: follow_soft_tissue(model, motion, markers, layout, soft, tell), True)
+
+
+@dataclass(frozen=True, eq=False)
+class SexedMosh:
+    """A person and their motions with the model of their sex.
+
+    Attributes
+    ----------
+    guess : SexGuess
+        What the markers told.
+    model : BodyModel
+        The model of that sex.
+    neutral : PersonFit
+        The person with the neutral model, by which it was told.
+    result : MoshResult
+        With the model of that sex; the motions say it as their gender.
+    """
+
+    guess: SexGuess
+    model: BodyModel
+    neutral: PersonFit
+    result: MoshResult
+
+
+@one_thread()
+def mosh_by_sex(models: Mapping[str, BodyModel], sequences: MarkerSequence | Sequence[MarkerSequence],
+                layout: MarkerLayout, config: MoshConfig | None = None, progress: Progress | None = None,
+                step: Step = once) -> SexedMosh:
+    """As `mosh`, with the model of the person's sex.
+
+    The neutral model finds a body, its betas tell the sex, and all is done with the model of that sex.
+
+    Parameters
+    ----------
+    models : {"neutral", "female", "male": BodyModel}
+        As `learn_by_sex` makes them, of one topology; the neutral one keeps what tells women from men.
+    sequences, layout, config, progress, step
+        As for `mosh`.
+
+    Raises
+    ------
+    ValueError
+        A model that is missing or of another topology, a neutral one that cannot tell, and as `mosh`.
+
+    [MoSh]
+    """
+    checked_models(models)
+    config = config or MoshConfig()
+    neutral = find_person(models["neutral"], sequences, layout, config.person, None, inside(step, "neutral"))
+    guess = guess_sex(models["neutral"], neutral.betas)
+    result = mosh(models[guess.sex], sequences, layout, config, progress, step)
+    motions = tuple(replace(motion, gender=guess.sex) for motion in result.motions)
+    soft = tuple(replace(one, motion=replace(one.motion, gender=guess.sex)) for one in result.soft_tissue)
+    return SexedMosh(guess, models[guess.sex], neutral, replace(result, motions=motions, soft_tissue=soft))
+
+
+def checked_models(models: Mapping[str, BodyModel]) -> None:
+    """ValueError for models with which a sex cannot be told or used."""
+    missing = [name for name in ("neutral", "female", "male") if name not in models]
+    if missing:
+        raise ValueError(f"models: expected 'neutral', 'female' and 'male', {' and '.join(missing)} missing")
+    sex_plane(models["neutral"])
+    faces = models["neutral"].template.faces
+    for name in ("female", "male"):
+        if models[name].template.faces.shape != faces.shape or (models[name].template.faces != faces).any():
+            raise ValueError(f"models: expected the triangles of the neutral model in that of '{name}', found others")

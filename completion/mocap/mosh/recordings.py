@@ -1,7 +1,6 @@
 """Which marker files belong to whom."""
 from __future__ import annotations
 
-import csv
 import re
 from collections.abc import Iterable, Iterator
 from dataclasses import dataclass, field
@@ -11,8 +10,8 @@ from typing import Literal, cast, get_args
 from scanprep.batch.workspace import HOME
 from scanprep.geometry import storage, tables
 
-from ..files.common import MarkerFileError
 from ..files.markers import marker_subjects
+from ..files.text import MarkerFileError
 
 By = Literal["auto", "name", "label", "each", "all"]
 ENDINGS = (".c3d", ".trc", ".csv")
@@ -39,24 +38,15 @@ class Actor:
 
 @dataclass(frozen=True)
 class Grouping:
-    """How recordings are given to people.
+    """How recordings are given to people: by a rule, see --subjects of `scape mosh`, or by a table.
 
-    Attributes
-    ----------
-    by : str
-        "name": what stands before the first _, - or blank of the file name; "label": the `Subject:` before the
-        labels; "each": every file is of another person; "all": all are of one. "auto": of files that were named
-        "all"; of a folder its sub-folders, and of files that lie side by side "name" where the name is two numbers,
-        as in 85_02, else "label", else "each".
-    table : Path, optional
-        CSV with the columns file and subject, or JSON {file: subject}, which goes before any rule.
-    who : str, optional
-        Whose markers, in C3D files with several people.
+    "auto" is, of files that were named, "all"; of a folder its sub-folders, and of files that lie side by side "name"
+    where the name is two numbers, as in 85_02, else "label", else "each".
     """
 
     by: By = "auto"
-    table: Path | None = None
-    who: str | None = None
+    table: Path | None = None            # CSV with the columns file and subject, or JSON {file: subject}
+    who: str | None = None               # whose markers, in C3D files with several people
 
     @staticmethod
     def of(subjects: str, who: str | None = None) -> Grouping:
@@ -70,11 +60,7 @@ class Grouping:
 
 
 def find_actors(markers: Iterable[Path], grouping: Grouping, output: Path | None = None) -> list[Actor]:
-    """The people of some files and folders; what lies in `output`, where results go, is no recording.
-
-    ValueError: no marker files, no such file, an output around the recordings, a table that names a file that is not
-    there.
-    """
+    """The people of some files and folders; what lies in `output` is no recording. ValueError for what cannot be."""
     given = list(markers)
     for place in given:
         if output is not None and place.is_dir() and output.resolve() in (place.resolve(), *place.resolve().parents):
@@ -101,10 +87,8 @@ def find_actors(markers: Iterable[Path], grouping: Grouping, output: Path | None
 
 def write_table(path: Path, actors: Iterable[Actor]) -> None:
     """Who is who as CSV, in the form that `Grouping.table` takes."""
-    with storage.writing(path) as beside, open(beside, "w", newline="", encoding="utf-8") as out:
-        table = csv.writer(out)
-        table.writerow(["file", "subject", "rule"])
-        table.writerows([r.path, actor.name, actor.rule] for actor in actors for r in actor.recordings)
+    tables.write_table(path, ("file", "subject", "rule"),
+                       ((r.path, actor.name, actor.rule) for actor in actors for r in actor.recordings))
 
 
 def folder_name(text: str) -> str:

@@ -3,30 +3,32 @@ from __future__ import annotations
 
 import io
 import json
-from collections.abc import Mapping, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from html import escape
 from typing import Any
 
 import numpy as np
 
 from model.body import BodyModel
-from scanprep.console import Metric, plain
+from scanprep.cli import MM
+from scanprep.console import Metric
+from scanprep.geometry import storage
 from scanprep.pictures.page import Page
 from scanprep.pictures.shading import Dots, Shape, render, side_by_side
 
 from ...cli import rows
-from ...motion_pictures import MARKER, facing, worst_frames
+from ...motion_pictures import MARKER, facing, marker_rows, mean_over, worst_frames
 from ..marker_sets.layout import MarkerLayout
 from . import pictures
-from .charts import MM, chart_artefacts, chart_frames, chart_map, chart_timeline, mean_over
 from .mosh import MoshResult
+from .pictures import chart_artefacts, chart_frames, chart_map, chart_timeline
 from .takes import Take
 
 PICTURE = "picture.png"
 COLORS = ("Dots are the measured markers: red where they are believed, orange where they are seen but not believed, "
           "green for held-out markers, which no stage has seen.")
-_STYLE = """.take { display: grid; grid-template-columns: minmax(17rem, 1fr) 2fr; gap: 1rem; margin: 1.4rem 0; }
-.take img { width: 100%; } .take p { margin: .2rem 0; }"""
+_STYLE = """.entry { display: grid; grid-template-columns: minmax(17rem, 1fr) 2fr; gap: 1rem; margin: 1.4rem 0; }
+.entry img { width: 100%; } .entry p { margin: .2rem 0; }"""
 
 
 def person_page(name: str, model: BodyModel, result: MoshResult, usual: MarkerLayout, takes: Sequence[Take],
@@ -43,7 +45,7 @@ def person_page(name: str, model: BodyModel, result: MoshResult, usual: MarkerLa
                  "the body from four sides, in the mean pose of the model's people; red: where the markers sat")
     page.section("Sequences")
     for take in takes:
-        _entry(page, take, figures[take.name])
+        add_entry(page, take.name, (f"{m.name}: {m.text()} {m.unit}" for m in _main(figures[take.name])))
     page.section("Markers before and after", "Blue: where the layout has each marker on this body. Red: where it was "
                  "found, with a rod from the one to the other. Those that moved most are named, from a centimetre on.")
     page.picture(pictures.picture_sides(body, found, before.place(body), labels))
@@ -62,7 +64,7 @@ def take_page(take: Take, metrics: Sequence[Metric]) -> Page:
     step = pictures.every(len(take.motion.poses))
     frames = np.arange(0, len(take.motion.poses), step)
     page = Page(f"{take.name}, with {'soft tissue' if take.soft else 'fixed shape'}", COLORS)
-    page.table(rows([m for m in metrics if m.unit == "mm" or m.name in ("frames", "swaps", "bad spans")]))
+    page.table(rows(_main(metrics)))
     page.section("The whole sequence", f"Every {_th(step)} frame; below each its number and time.")
     page.picture(pictures.contact_sheet(take, frames))
     page.picture(pictures.moving(take), "the first seconds")
@@ -83,7 +85,7 @@ def take_page(take: Take, metrics: Sequence[Metric]) -> Page:
 def closing(page: Page, metrics: Sequence[Metric], settings: Mapping[str, Any]) -> Page:
     """The end of a page: all figures and the settings."""
     page.section("Figures").table(rows(list(metrics)), ("metric", "value", "unit"))
-    text = escape(json.dumps(plain(settings), indent=1))
+    text = escape(json.dumps(storage.as_json(settings), indent=1))
     return page.markup(f"<details><summary>All settings</summary><pre><code>{text}</code></pre></details>")
 
 
@@ -120,14 +122,11 @@ def _drawn(figure: Any) -> bytes:
     return out.getvalue()
 
 
-def _entry(page: Page, take: Take, metrics: Sequence[Metric]) -> None:
-    """A sequence on the page of its person, leading to its own."""
-    told = "".join(f"<p>{escape(m.name)}: {escape(m.text())} {escape(m.unit)}</p>" for m in metrics
-                   if m.unit == "mm" or m.name in ("frames", "swaps", "bad spans"))
-    link = f"{escape(take.name)}/report.html"
-    page.markup(f'<div class="take"><div><a href="{link}"><b>{escape(take.name)}</b></a>{told}</div>'
-                f'<a href="{link}"><img src="{escape(take.name)}/{PICTURE}" alt="{escape(take.name)}"></a></div>',
-                _STYLE)
+def add_entry(page: Page, name: str, lines: Iterable[str]) -> None:
+    """A person, or a sequence, leading to its own page."""
+    link, told = escape(name), "".join(f"<p>{escape(line)}</p>" for line in lines)
+    page.markup(f'<div class="entry"><div><a href="{link}/report.html"><b>{link}</b></a>{told}</div>'
+                f'<a href="{link}/report.html"><img src="{link}/{PICTURE}" alt="{link}"></a></div>', _STYLE)
 
 
 def person_picture(model: BodyModel, result: MoshResult) -> np.ndarray:
@@ -175,28 +174,19 @@ def _moved_rows(result: MoshResult, before: MarkerLayout, moved: np.ndarray, tak
     return sorted(out, key=lambda row: -row[1])
 
 
+def _main(metrics: Sequence[Metric]) -> list[Metric]:
+    """Those that tell how good a motion is."""
+    return [m for m in metrics if m.unit == "mm" or m.name in ("frames", "swaps", "bad spans")]
+
+
 def _marker_rows(take: Take) -> list[tuple[Any, ...]]:
     """The markers, the worst first, held-out ones above all."""
-    out = []
-    fixed = take.motion.residuals
-    soft = np.full(fixed.shape, np.nan) if take.soft is None else take.soft.motion.residuals
-    for i in np.flatnonzero(np.isfinite(fixed).any(axis=0)).tolist():
-        seen = np.isfinite(fixed[:, i])
-        shown = (fixed if take.soft is None else soft)[seen, i]
-        out.append((take.motion.labels[i], MM * float(fixed[seen, i].mean()), MM * float(mean_over(soft[:, i], 0)),
-                    MM * float(np.nanpercentile(shown, 95)), 100 * float(seen.mean()),
-                    100 * float(take.motion.trusted[seen, i].mean())))
-    out.sort(key=lambda row: -row[1])
-    if take.held is None:
-        return out
-    held = []
-    for i, label in enumerate(take.held.labels):
-        seen = np.isfinite(take.held.fixed[:, i])
-        soft_off = np.nan if take.held.soft is None else float(mean_over(take.held.soft[:, i], 0))
-        shown = (take.held.fixed if take.held.soft is None else take.held.soft)[seen, i]
-        held.append((f"{label} (held out)", MM * float(mean_over(take.held.fixed[:, i], 0)), MM * soft_off,
-                     MM * float(np.percentile(shown, 95)) if len(shown) else np.nan, 100 * float(seen.mean()), np.nan))
-    return [*sorted(held, key=lambda row: -row[1]), *out]
+    motion, held = take.motion, take.held
+    found = marker_rows(motion.labels, motion.residuals, None if take.soft is None else take.soft.motion.residuals,
+                        motion.trusted)
+    if held is not None:
+        found = marker_rows([f"{label} (held out)" for label in held.labels], held.fixed, held.soft, None) + found
+    return found
 
 
 def _unused(page: Page, take: Take) -> None:

@@ -3,7 +3,6 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
-from pathlib import Path
 
 import numpy as np
 
@@ -19,6 +18,7 @@ from ..files.markers import MarkerSequence
 from ..marker_sets.layout import MarkerLayout
 from ..pose.marked_body import supports
 from ..soft_tissue.soft_tissue import SoftTissue
+from .recordings import Recording
 
 LIGHT = 7000                         # triangles of a body in small pictures
 AT_ONCE = 128                        # frames whose changes are held at a time
@@ -46,14 +46,7 @@ class LightMesh:
 
 @dataclass(frozen=True, eq=False)
 class HeldOut:
-    """Markers that no stage has seen, and how far the body is from them where the layout has them.
-
-    Attributes
-    ----------
-    labels : H strings
-    fixed, soft : (T, H) float, metres
-        With the shape fixed, and changing in time; NaN where one was not seen. `soft` is None without soft tissue.
-    """
+    """How far the body is (T, H), metres, from markers that no stage saw; `soft` with soft tissue, if any."""
 
     labels: tuple[str, ...]
     fixed: np.ndarray
@@ -69,9 +62,7 @@ class HeldOut:
 class Take:
     """One sequence of a person: where it was read from, what was found of it, and a body for small pictures."""
 
-    name: str
-    path: Path
-    who: str | None
+    source: Recording
     unit: str | None
     model: BodyModel
     subject: Subject
@@ -82,6 +73,10 @@ class Take:
     held: HeldOut | None
     light: LightMesh
     _kept: dict[int, np.ndarray] = field(default_factory=dict)
+
+    @property
+    def name(self) -> str:
+        return self.source.name
 
     @property
     def shown(self) -> Motion:

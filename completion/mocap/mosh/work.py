@@ -1,7 +1,6 @@
 """One person: read the recordings, find the person and the motions, and write everything."""
 from __future__ import annotations
 
-import csv
 import time
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -11,28 +10,25 @@ from typing import Any
 import numpy as np
 
 from model.body import BodyModel
-from model.learning.sex_plane import SexGuess
+from model.learning.sexes import SexGuess
 from scanprep.batch.room import Room
-from scanprep.console import Metric, Outcome, plain, write_report
-from scanprep.geometry import storage
+from scanprep.cli import MM
+from scanprep.console import Metric, Outcome, write_report
+from scanprep.geometry import storage, tables
 from scanprep.pictures.camera import upright
 from scanprep.pictures.sheets import save_png
 
 from ...motion import spread_frames
 from ...motion_pictures import picture_bodies
-from ..artefacts.results import MarkerArtefacts
-from ..artefacts.virtual import artefact_table, write_virtual
+from ..artefacts.results import MarkerArtefacts, artefact_table, write_virtual
 from ..files.markers import MarkerSequence, read_markers
 from ..files.motion_files import KEYS, write_glb, write_motion, write_residuals
 from ..marker_sets.layout import MarkerLayout
 from ..marker_sets.named import choose_layout
 from ..pose.robust import motion_problem
-from ..retargeting.pictures import picture_transfer, write_character
 from ..retargeting.retarget import retarget
-from ..retargeting.soft_tissue import retarget_soft_tissue
-from .by_sex import mosh_by_sex
-from .charts import MM
-from .mosh import MoshConfig, MoshResult, mosh
+from ..retargeting.soft_tissue import picture_transfer, retarget_soft_tissue, write_character
+from .mosh import MoshConfig, MoshResult, mosh, mosh_by_sex
 from .pictures import standing
 from .recordings import Actor, Recording
 from .report import PICTURE, closing, person_page, person_picture, take_page, take_picture
@@ -45,24 +41,46 @@ HALF = 100                           # of progress: finding shape and motion, th
 
 @dataclass(frozen=True, eq=False)
 class Work:
-    """The work on each person of a call, with the model and its name for the output.
-
-    `sexes` are models of "female" and "male" people for the sex that `model` tells, empty to do without; the layout
-    comes with its name, else the named one that fits the labels best is used; no stage sees markers held out.
-    """
+    """The work on each person of a call."""
 
     model: BodyModel
-    name: str
-    sexes: Mapping[str, BodyModel]
+    name: str                            # of the model, for the output
+    sexes: Mapping[str, BodyModel]       # of "female" and "male" people, for the sex that the model tells; or none
     character: BodyModel | None
-    layout: tuple[MarkerLayout, str] | None
-    hold_out: tuple[str, ...]
+    layout: tuple[MarkerLayout, str] | None          # with its name; else the named one that fits the labels best
+    hold_out: tuple[str, ...]            # labels that no stage sees
     unit: str | None
     config: MoshConfig
     command: str = field(metadata={"digest": False})
 
     def __call__(self, actor: Actor, room: Room) -> tuple[list[Metric], list[str]]:
-        return mosh_person(self, actor, room)
+        """Everything of one person into the folder of a room: the figures, and what failed.
+
+        A recording that cannot be read is left out and told; ValueError where none can. The first figure is called
+        "problem" where a motion means nothing, and says why.
+        """
+        start, folder = time.perf_counter(), room.folder
+        found, failures = _solve(self, actor, room)
+        settings = {"mosh": self.config, "model": self.name, "layout": found.layout_name, "held out": self.hold_out}
+        _write_person(folder, found.result, {
+            "model": self.name, "layout": found.layout_name, "held_out": self.hold_out, "sex": found.guess,
+            "recordings": [r.path.name for r in actor.recordings]})
+        figures: dict[str, list[Metric]] = {}
+        total = len(found.takes) + 1
+        for i, take in enumerate(found.takes):
+            room.tell(HALF + HALF * i // total, 2 * HALF)
+            figures[take.name] = _write(self, found, take, room, settings)
+        room.tell(HALF + HALF * (total - 1) // total, 2 * HALF)
+        problems = "; ".join(f"{take.name}: {why}" for take in found.takes if (why := found.problem(take)))
+        metrics = [Metric("problem", problems)] if problems else []
+        metrics += [Metric("model", self.name), *_person_metrics(found), *_figures(found.takes)]
+        person_page(actor.name, found.model, found.result, found.usual, found.takes, metrics, figures,
+                    settings).write(folder / "report.html")
+        save_png(folder / PICTURE, person_picture(found.model, found.result))
+        metrics += _speeds(found)                    # not on the page: it is the same however often it is made
+        write_report(Outcome(folder, metrics, settings, failures), self.command, time.perf_counter() - start)
+        room.tell(2 * HALF, 2 * HALF)
+        return metrics, failures
 
 
 @dataclass(frozen=True, eq=False)
@@ -79,36 +97,6 @@ class _Found:
     def problem(self, take: Take) -> str | None:
         """Why the motion of a sequence means nothing."""
         return motion_problem(take.motion, take.subject.template, self.result.layout, take.markers)
-
-
-def mosh_person(work: Work, actor: Actor, room: Room) -> tuple[list[Metric], list[str]]:
-    """Everything of one person into the folder of a room: the figures, and what failed.
-
-    A recording that cannot be read is left out and told; ValueError where none can. The first figure is called
-    "problem" where a motion means nothing, and says why.
-    """
-    start, folder = time.perf_counter(), room.folder
-    found, failures = _solve(work, actor, room)
-    settings = {"mosh": work.config, "model": work.name, "layout": found.layout_name, "held out": work.hold_out}
-    _write_person(folder, found.result, {
-        "model": work.name, "layout": found.layout_name, "held_out": work.hold_out, "sex": found.guess,
-        "recordings": [r.path.name for r in actor.recordings]})
-    figures: dict[str, list[Metric]] = {}
-    total = len(found.takes) + 1
-    for i, take in enumerate(found.takes):
-        room.tell(HALF + HALF * i // total, 2 * HALF)
-        figures[take.name] = _write(work, found, take, room, settings)
-    room.tell(HALF + HALF * (total - 1) // total, 2 * HALF)
-    problems = "; ".join(f"{take.name}: {why}" for take in found.takes if (why := found.problem(take)))
-    metrics = [Metric("problem", problems)] if problems else []
-    metrics += [Metric("model", work.name), *_person_metrics(found), *_figures(found.takes)]
-    person_page(actor.name, found.model, found.result, found.usual, found.takes, metrics, figures,
-                settings).write(folder / "report.html")
-    save_png(folder / PICTURE, person_picture(found.model, found.result))
-    metrics += _speeds(found)                    # not on the page: it is the same however often it is made
-    write_report(Outcome(folder, metrics, settings, failures), work.command, time.perf_counter() - start)
-    room.tell(2 * HALF, 2 * HALF)
-    return metrics, failures
 
 
 def _solve(work: Work, actor: Actor, room: Room) -> tuple[_Found, list[str]]:
@@ -134,8 +122,8 @@ def _solve(work: Work, actor: Actor, room: Room) -> tuple[_Found, list[str]]:
     for i, (source, markers) in enumerate(zip(recordings, sequences, strict=True)):
         soft = result.soft_tissue[i] if result.soft_tissue else None
         held = held_out(model, usual, work.hold_out, markers, result.motions[i], soft)
-        takes.append(Take(source.name, source.path, source.who, work.unit, model, subject, markers, result.motions[i],
-                          soft, result.artefacts[i], held, light))
+        takes.append(Take(source, work.unit, model, subject, markers, result.motions[i], soft, result.artefacts[i],
+                          held, light))
     return _Found(model, guess, result, takes, usual, layout_name), failures
 
 
@@ -176,7 +164,7 @@ def _write(work: Work, found: _Found, take: Take, room: Room, settings: Mapping[
         outcome = Outcome(place(folder), metrics, settings, problem=found.problem(take))
         write_report(outcome, work.command, time.perf_counter() - start)
 
-    room.files(f"{take.name} files", (solved, take.path, take.who, take.unit, factor),
+    room.files(f"{take.name} files", (solved, take.source.path, take.source.who, take.unit, factor),
                lambda folder: write_take(place(folder), take, factor))
     shown: tuple[np.ndarray, str] | None = None if work.character is None else room.files(
         f"{take.name} character", (solved, work.character, factor), character)
@@ -189,8 +177,8 @@ def _write_person(folder: Path, result: MoshResult, about: Mapping[str, Any]) ->
     person = result.person
     moved = dict(zip(result.layout.labels, person.moved.tolist(), strict=True))
     storage.write_json(folder / "subject.json", {
-        "betas": result.betas.tolist(), **plain(about), "frames": person.frames.tolist(), "moved": moved,
-        "residual": person.residual, "energies": plain(person.energies), "converged": bool(person.converged)})
+        "betas": result.betas.tolist(), **about, "frames": person.frames.tolist(), "moved": moved,
+        "residual": person.residual, "energies": person.energies, "converged": bool(person.converged)})
     result.layout.save(folder / "layout.json")
 
 
@@ -205,8 +193,9 @@ def write_take(folder: Path, take: Take, factor: float = 1.0) -> None:
         write_residuals(folder / "residuals_soft.csv", soft.motion)
         if factor != 1:
             write_glb(folder / "exaggerated.glb", soft.motion, body, soft.vertices(take.model, shown, factor))
-    c3d = take.path.suffix.lower() == ".c3d"
-    write_virtual(folder / "virtual.c3d", take.artefacts, take.path if c3d else None, take.who, take.unit)
+    path = take.source.path
+    write_virtual(folder / "virtual.c3d", take.artefacts, path if path.suffix.lower() == ".c3d" else None,
+                  take.source.who, take.unit)
     _write_artefacts(folder, take.artefacts)
 
 
@@ -216,12 +205,8 @@ def _write_artefacts(folder: Path, found: MarkerArtefacts) -> None:
     rows: list[tuple[str, str, int, int, str]] = [
         *(("swapped", f"{s.first} {s.second}", s.begin, s.end, "") for s in found.swaps),
         *((b.kind, b.label, b.begin, b.end, f"{b.distance:.4g}") for b in found.bad)]
-    path = folder / "artefacts.csv"
-    with storage.writing(path) as beside, open(beside, "w", newline="", encoding="utf-8") as out:
-        table = csv.writer(out)
-        table.writerow(["artefact", "markers", "begin", "end", "distance"])
-        rows.sort(key=lambda row: (row[2], row[1]))
-        table.writerows(rows)
+    tables.write_table(folder / "artefacts.csv", ("artefact", "markers", "begin", "end", "distance"),
+                       sorted(rows, key=lambda row: (row[2], row[1])))
 
 
 def _character(character: BodyModel, take: Take, folder: Path, factor: float) -> tuple[np.ndarray, str]:

@@ -1,28 +1,28 @@
-"""Motion of a known body from markers: a few frames one after the other, then all of them as a whole."""
+"""Motion of a known body from markers: a few frames one after the other, then all as a whole; a low-pass filter."""
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from model.linear import Subject
 from scanprep.threads import one_thread
 
 from ...motion import Motion
+from ...smoothing import coupled_steps
 from ..files.markers import MarkerSequence
 from ..marker_sets.layout import MarkerLayout
-from .foot_contact import Floor, FootContact
+from .foot_contact import Floor, FootContact, HeldPoints
 from .initialise import reinitialise_limbs, search
-from .marked_body import MarkedBody
+from .marked_body import MarkedBody, batches
 from .robust import judge, label_order, marker_weights
 from .settings import AnimateConfig
-from .smooth import inertia, low_pass, smoothed
 from .stream import STEPS, Tracker
 
 __all__ = ["AnimateConfig", "animate"]
 
 Progress = Callable[[int, int], None]
-KEY_INTERVAL = 0.1                   # seconds between the frames that are solved one after the other
 STILL = 0.005                        # metres that the last round moves any marker of a frame that has converged
 
 
@@ -76,8 +76,7 @@ def follow_frames(body: MarkedBody, targets: np.ndarray, frames: np.ndarray, rat
                   tell: Progress, steps: int = STEPS) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Some frames, `rate` of them a second, each from those before: begins at a whole one and goes both ways.
 
-    Found are unknowns (n, P), from which column of targets (T, L, 3) each marker was taken (n, L), and which frames
-    converged (n,).
+    Found are unknowns (n, P), the columns of targets (T, L, 3) of each marker (n, L), and which frames converged (n,).
     """
     first = _first_frame(targets)
     x, converged = np.empty((len(frames), body.n_unknowns)), np.zeros(len(frames), dtype=bool)
@@ -98,7 +97,7 @@ def follow_frames(body: MarkedBody, targets: np.ndarray, frames: np.ndarray, rat
 def follow_whole(body: MarkedBody, targets: np.ndarray, rate: float, config: AnimateConfig, tell: Progress
                  ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """All frames together: unknowns (T, P), the order of the labels (T, L), and which frames converged (T,)."""
-    T, stiffness = len(targets), inertia(config, rate, body.n_unknowns)
+    T, stiffness = len(targets), config.inertia(rate, body.n_unknowns)
     x, moved, feet = between_keys(body, targets, rate, config), np.zeros(T), None
     seen = ~np.isnan(targets[..., 0])
     inside = seen_span(targets)
@@ -108,7 +107,7 @@ def follow_whole(body: MarkedBody, targets: np.ndarray, rate: float, config: Ani
         if i == free:
             feet = FootContact(body, x, rate, None if config.floor is None else Floor.given(config.floor))
         held = None if feet is None else feet.held(x)
-        order = label_order(body.positions(x), targets, config.outlier)
+        order = label_order(body.positions(x), targets, rate, config.outlier)
         taken = np.take_along_axis(targets, order[..., None], axis=1)[inside]
         near = reinitialise_limbs(body, x[inside], taken, config)
         weights, _ = marker_weights(body.positions(near), taken, config.marker_sd, config.outlier)
@@ -120,7 +119,7 @@ def follow_whole(body: MarkedBody, targets: np.ndarray, rate: float, config: Ani
 
 def between_keys(body: MarkedBody, targets: np.ndarray, rate: float, config: AnimateConfig) -> np.ndarray:
     """Unknowns (T, P) on the way from one key frame to the next, which are followed one after the other."""
-    T, every = len(targets), max(1, round(KEY_INTERVAL * rate))
+    T, every = len(targets), max(1, round(0.1 * rate))  # seconds between the frames that are solved one after the other
     frames = np.unique(np.r_[0, np.arange(_first_frame(targets) % every, T, every), T - 1])
     keys, _, _ = follow_frames(body, targets, frames, rate / every, config, lambda done, total: None, steps=8)
     if len(frames) == 1:
@@ -142,3 +141,44 @@ def _first_frame(targets: np.ndarray) -> int:
     if seen.max(initial=0) < 3:
         raise ValueError(f"markers: expected a frame with at least 3 known markers, the best has {seen.max(initial=0)}")
     return int(np.argmax(seen >= max(3, 0.9 * seen.max())))
+
+
+FURTHEST = 0.5                       # radians or metres that a step may go
+
+
+def smoothed(body: MarkedBody, stiffness: np.ndarray, x: np.ndarray, targets: np.ndarray, weights: np.ndarray,
+             held: HeldPoints | None = None) -> np.ndarray:
+    """Frames (T, P) after one Gauss-Newton step on markers (T, L, 3), weighted (T, L), and `coupled_steps`."""
+    T, P = x.shape
+    if T < 3:
+        return x
+    gradient, hessian = np.empty((T, P)), np.empty((T, P, P))
+    for some in batches(T):
+        _, gradient[some], hessian[some] = body.system(x[some], targets[some], weights[some])
+        if held is not None:
+            _, pull, stiff = held.system(*body.body.split(x[some])[:2], some)
+            gradient[some] += pull
+            hessian[some] += stiff
+    step = coupled_steps(x, gradient, hessian, stiffness)
+    longest = np.abs(step).max(axis=1, keepdims=True)
+    return body.retract(x, step * np.minimum(1, FURTHEST / np.maximum(longest, 1e-12)))
+
+
+def low_pass(pose: np.ndarray, trans: np.ndarray, rate: float, cutoff: float) -> tuple[np.ndarray, np.ndarray]:
+    """Poses (T, J, 3) and trans (T, 3) without what is faster than a frequency, hertz: Butterworth, there and back.
+
+    Rotations are filtered as unit quaternions of continuous sign, which have no jump at a half turn.
+    """
+    from scipy.signal import butter, sosfiltfilt
+
+    if not 0 < cutoff < rate / 2:
+        raise ValueError(f"low_pass: expected a frequency between 0 and half the rate, {rate / 2:g}, got {cutoff:g}")
+    sections = butter(2, cutoff, fs=rate, output="sos")
+    if len(pose) <= 3 * (2 * len(sections) + 1):
+        raise ValueError(f"low_pass: expected more than {3 * (2 * len(sections) + 1)} frames, got {len(pose)}")
+    q = Rotation.from_rotvec(pose.reshape(-1, 3)).as_quat().reshape(*pose.shape[:2], 4)
+    turned = np.einsum("tjc,tjc->tj", q[1:], q[:-1]) < 0
+    q[1:] *= np.where(np.cumsum(turned, axis=0) % 2, -1.0, 1.0)[..., None]
+    q = sosfiltfilt(sections, q, axis=0)
+    return (Rotation.from_quat(q.reshape(-1, 4)).as_rotvec().reshape(pose.shape),
+            sosfiltfilt(sections, trans, axis=0))

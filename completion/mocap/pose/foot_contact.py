@@ -7,12 +7,12 @@ import numpy as np
 from scipy.ndimage import label, uniform_filter1d
 
 from scanprep.geometry.farthest_points import farthest_points
+from scanprep.geometry.least_squares import Dense
 
-from .marked_body import MarkedBody, PartShapes, System, point_system
+from .marked_body import MarkedBody, PartShapes, point_system
 
 TOUCH = 0.025                        # metres above the floor below which a point may stand
 STILL = 0.2                          # metres per second below which it does
-CONTACT_SD = 0.002                   # metres that a standing point may be from its place
 
 
 @dataclass(frozen=True, eq=False)
@@ -34,8 +34,7 @@ class Floor:
     def below(vertices: np.ndarray) -> Floor:
         """The floor under a moving body (n, N, 3), metres; for who lies or sits it should be given.
 
-        Vertical is the world axis along which the body is longest on average, down is the end that is broad and
-        stays level, to half a centimetre, and the floor is where that end mostly is.
+        Up is the world axis along which the body is longest; down is the end that is broad and stays level, to 5 mm.
         """
         low, high = vertices.min(axis=1), vertices.max(axis=1)
         axis = int((high - low).mean(axis=0).argmax())
@@ -69,10 +68,11 @@ class HeldPoints:
         """Those of some frames."""
         return HeldPoints(self.shapes, self.places[frames])
 
-    def system(self, pose: np.ndarray, trans: np.ndarray, frames: slice) -> System:
-        """Energy, half its gradient and Gauss-Newton matrix of some frames."""
+    def system(self, pose: np.ndarray, trans: np.ndarray, frames: slice) -> Dense:
+        """The equations of some frames."""
         places = self.places[frames]
-        return point_system(self.shapes, pose, trans, places, np.full(places.shape[:2], CONTACT_SD**-2))
+        # metres that a standing point may be from its place
+        return point_system(*self.shapes.columns(pose, trans), places, np.full(places.shape[:2], 0.002**-2))
 
 
 class FootContact:

@@ -1,13 +1,10 @@
 """Where a body begins: from one frame of markers alone, and anew where it has lost a limb."""
 from __future__ import annotations
 
-from functools import partial
-
 import numpy as np
 
 from model.priors import typical_poses
 from scanprep.geometry import rotations
-from scanprep.geometry.least_squares import Minimum, levenberg_marquardt
 
 from ... import energy
 from ...starts import ANNEALING
@@ -19,30 +16,18 @@ SCALES = (1.0, 0.3, 0.1)             # metres, at which a marker of a lost limb 
 
 
 def search(body: MarkedBody, targets: np.ndarray, config: AnimateConfig) -> np.ndarray:
-    """Unknowns (P,) of a frame from nothing but its markers (L, 3), metres, at least three of them seen.
-
-    As `starts.search`, on the fewer products of the markers; then outliers lose their weight.
-    """
+    """Unknowns (P,) of a frame from nothing but its markers (L, 3), metres, at least three of them seen."""
     x = _laid_on(body, typical_poses(body.body.pose_mean, body.body.pose_covariance, axes=6), targets)
     weights = np.full(body.count, config.marker_sd**-2)
     for stiff in ANNEALING:
-        end = _solved(body, x, targets, weights, stiff / config.prior_weight if config.prior_weight else 0.0,
-                      iterations=8, tolerance=1e-3)
+        end = body.solve(x, targets, weights, 8, 1e-3, stiff / config.prior_weight if config.prior_weight else 0.0)
         x = end.x
     x = x[np.argsort(end.energy)[:2]]
     for _ in range(5):                                                  # with all markers, then with the likely ones
-        end = _solved(body, x, targets, weights)
+        end = body.solve(x, targets, weights, 30, 1e-5)
         x = end.x[np.argmin(end.energy)][None]
         weights, _ = marker_weights(body.positions(x[0]), targets, config.marker_sd, config.outlier)
     return x[0]
-
-
-def _solved(body: MarkedBody, x: np.ndarray, targets: np.ndarray, weights: np.ndarray, stiff: float = 1.0,
-            iterations: int = 30, tolerance: float = 1e-5) -> Minimum[np.ndarray]:
-    """All starts (n, P) on the same markers; `stiff` is a factor on the pose prior."""
-    system = partial(body.system, targets=np.broadcast_to(targets, (len(x), *targets.shape)),
-                     weights=np.broadcast_to(weights, (len(x), len(weights))), stiff=stiff)
-    return levenberg_marquardt(system, x, iterations, tolerance, retract=body.retract)
 
 
 def _laid_on(body: MarkedBody, poses: np.ndarray, targets: np.ndarray) -> np.ndarray:
@@ -64,10 +49,8 @@ def _laid_on(body: MarkedBody, poses: np.ndarray, targets: np.ndarray) -> np.nda
 def reinitialise_limbs(body: MarkedBody, x: np.ndarray, targets: np.ndarray, config: AnimateConfig) -> np.ndarray:
     """Unknowns (T, P) in which frames that had lost a limb have it again; markers are (T, L, 3), metres.
 
-    A body that follows a fast limb too late takes all its markers for outliers, and never sees them again. So frames
-    with three markers far away, twice an outlier's residual, are solved anew, from what they are and from the joints of
-    the nearest frames without, with outliers that keep their weight at first; they are taken where that explains the
-    markers better, by a fifth.
+    A body that follows a fast limb too late takes all its markers for outliers. Frames with three markers far away are
+    solved anew, from what they are and from the nearest frames without, and taken where that explains them better.
     """
     apart = _apart(body, x, targets)
     lost = (apart > 2.0 * config.outlier).sum(axis=1) >= 3
@@ -92,8 +75,7 @@ def _from_far(body: MarkedBody, x: np.ndarray, targets: np.ndarray, config: Anim
     """The unknowns (n, P) to which frames come from x, each by itself, while outliers lose their weight."""
     for scale in SCALES:
         weights = energy.geman_mcclure(np.nan_to_num(_apart(body, x, targets)), scale) / config.marker_sd**2
-        x = levenberg_marquardt(partial(body.system, targets=targets, weights=weights), x, 8, 1e-3, 1e-3,
-                                retract=body.retract).x
+        x = body.solve(x, targets, weights, 8, 1e-3).x
     return x
 
 

@@ -10,13 +10,15 @@ Everything is done for a batch of poses. Derivatives are by small rotations of e
 """
 from __future__ import annotations
 
+from collections.abc import Iterator
+
 import numpy as np
 
 from model.features import twists
 from model.linear import PointOperator, Subject
 from model.priors import gaussian_prior
 from scanprep.geometry import rotations
-from scanprep.geometry.least_squares import Dense
+from scanprep.geometry.least_squares import Dense, Minimum, levenberg_marquardt, retract_pose, step_between
 from scanprep.geometry.mesh import Mesh
 from scanprep.skeleton.tree import Skeleton
 
@@ -24,13 +26,12 @@ from ... import energy
 from ...bodies import FixedBody
 from ..marker_sets.layout import MarkerLayout
 
-System = tuple[np.ndarray, np.ndarray, np.ndarray]                      # energy, half its gradient, Gauss-Newton matrix
 BATCH = 64                           # frames whose parts are held at once
 SAMPLES = 120                        # poses from which the turning of the normals is learned
 
 
 class MarkedBody:
-    """A body of known shape with markers; unknowns are x = (pose (3J), trans (3)), steps are small rotations.
+    """A body of known shape with markers; unknowns are x = (pose (3J), trans (3)).
 
     A step (P,) rotates every joint from the right, `exp(pose) exp(d)`, so that nothing happens at a half turn.
     """
@@ -46,76 +47,63 @@ class MarkedBody:
 
     def positions(self, x: np.ndarray) -> np.ndarray:
         """Where the body puts the markers (..., L, 3), metres, for unknowns (..., P)."""
-        pose, trans, _ = self.body.split(x)
-        pose, trans = pose.reshape(-1, *pose.shape[-2:]), trans.reshape(-1, 3)
-        y = np.empty((len(pose), 3, self.count))
-        for start in range(0, len(pose), BATCH):
-            some = slice(start, start + BATCH)
-            y[some] = self.shapes.evaluate(pose[some], trans[some])
-        return np.swapaxes(y, -1, -2).reshape(*x.shape[:-1], self.count, 3)
+        pose, trans, _ = self.body.split(x.reshape(-1, x.shape[-1]))
+        y = np.empty((len(pose), self.count, 3))
+        for some in batches(len(pose)):
+            y[some] = np.swapaxes(self.shapes.evaluate(pose[some], trans[some]), 1, 2)
+        return y.reshape(*x.shape[:-1], self.count, 3)
 
     def system(self, x: np.ndarray, targets: np.ndarray, weights: np.ndarray, stiff: float = 1.0) -> Dense:
-        """Markers and pose prior: energy (B,), half its gradient (B, P) and Gauss-Newton matrix (B, P, P).
-
-        For unknowns (B, P), markers (B, L, 3), metres, NaN where not seen, and factors on their squared distances
-        (B, L); `stiff` is a further factor on the pose prior.
-
-        [SCAPE] §8
-        """
+        """Markers (B, L, 3), weighted (B, L), and the pose prior, with a factor, at unknowns (B, P). [SCAPE] §8"""
         pose, trans, _ = self.body.split(x)
-        n = self.body.n_angles
-        energy, gradient, hessian = point_system(self.shapes, pose, trans, targets, weights)
-        prior = self.prior_system(pose, stiff)
-        gradient[:, :n] += prior[1]
-        hessian[:, :n, :n] += prior[2]
-        return Dense(energy + prior[0], gradient, hessian)
+        return self.with_prior(point_system(*self.shapes.columns(pose, trans), targets, weights), pose, stiff)
 
-    def prior_system(self, pose: np.ndarray, stiff: float = 1.0) -> System:
-        """The pose prior at poses (B, J, 3): energy (B,), half its gradient (B, 3J), its matrix (B, 3J, 3J)."""
-        pose = twists(pose)
+    def solve(self, x: np.ndarray, targets: np.ndarray, weights: np.ndarray, iterations: int, tolerance: float,
+              stiff: float = 1.0) -> Minimum[np.ndarray]:
+        """The best unknowns near x (B, P), each row by itself; arguments as of `system`, without B if all are alike."""
+        targets, weights = (np.broadcast_to(of, (len(x), *of.shape[-k:])) for of, k in ((targets, 2), (weights, 1)))
+        return levenberg_marquardt(lambda at: self.system(at, targets, weights, stiff), x, iterations, tolerance,
+                                   retract=self.retract)
+
+    def with_prior(self, data: Dense, pose: np.ndarray, stiff: float = 1.0) -> Dense:
+        """Equations whose first unknowns are those of poses (B, J, 3), and the pose prior."""
+        pose, (energy, gradient, hessian) = twists(pose), data
         B, n = len(pose), self.body.n_angles
         local = rotations.inverse_right_jacobian(pose)                                           # dpose = local d
         off = pose.reshape(B, n) - self.prior.mean
         precision = stiff * self._precision
         pull = off @ precision
-        gradient = (pull.reshape(B, -1, 1, 3) @ local).reshape(B, n)
+        gradient[:, :n] += (pull.reshape(B, -1, 1, 3) @ local).reshape(B, n)
         half = precision.reshape(n, -1, 3).swapaxes(0, 1) @ local                          # (B, J, n, 3)
         half = half.reshape(B, -1, n // 3, 3, 3).swapaxes(-1, -2)                                # transposed rows
-        hessian = (half @ local[:, None]).transpose(0, 1, 3, 2, 4).reshape(B, n, n)
-        return (pull * off).sum(axis=1), gradient, hessian
+        hessian[:, :n, :n] += (half @ local[:, None]).transpose(0, 1, 3, 2, 4).reshape(B, n, n)
+        return Dense(energy + (pull * off).sum(axis=1), gradient, hessian)
 
     def retract(self, x: np.ndarray, step: np.ndarray) -> np.ndarray:
         """The unknowns (..., P) after a step (..., P); poses come out at most a half turn long."""
-        return self._composed(x, x, step)
+        return retract_pose(self.body.n_angles)(x, step)
 
     def step_to(self, x: np.ndarray, goal: np.ndarray) -> np.ndarray:
         """The step (..., P) that leads from unknowns (..., P) to others."""
-        return self._composed(x, -x, goal)
-
-    def _composed(self, x: np.ndarray, first: np.ndarray, second: np.ndarray) -> np.ndarray:
-        n = self.body.n_angles
-        out = first + second
-        out[..., :n] = rotations.compose(first[..., :n].reshape(-1, 3), second[..., :n].reshape(-1, 3)
-                                         ).reshape(*x.shape[:-1], n)
-        return out
+        return step_between(x, goal, self.body.n_angles)
 
 
-def point_system(shapes: PartShapes, pose: np.ndarray, trans: np.ndarray, targets: np.ndarray, weights: np.ndarray
-                 ) -> System:
-    """Points that are to be at their targets (B, L, 3): energy (B,), half its gradient, Gauss-Newton matrix.
+def batches(count: int) -> Iterator[slice]:
+    """So many frames, some at a time."""
+    return (slice(start, start + BATCH) for start in range(0, count, BATCH))
 
-    Targets are NaN where there is none; `weights` (B, L) are factors on the squared distance.
+
+def point_system(y: np.ndarray, columns: np.ndarray, targets: np.ndarray, weights: np.ndarray) -> Dense:
+    """The equations of points at y (B, 3, L), derivatives (B, P, 3, L), that are to be at targets (B, L, 3) or NaN.
+
+    `weights` (B, L) are factors on the squared distance. The derivatives are used up.
     """
-    y, by_rotation = shapes.columns(pose, trans)
-    (B, n), L = by_rotation.shape[:2], shapes.count
-    missing = np.isnan(targets[..., 0])
+    (B, P), missing = columns.shape[:2], np.isnan(targets[..., 0])
     root = np.sqrt(np.where(missing, 0.0, weights))[:, None]
     residual = (root * np.where(missing[:, None], 0.0, y - np.swapaxes(targets, -1, -2))).reshape(B, -1)
-    columns = np.empty((B, n + 3, 3, L))
-    np.multiply(by_rotation, root[:, None], out=columns[:, :n])
-    columns[:, n:] = np.eye(3)[:, :, None] * root[:, None]
-    A = columns.reshape(B, n + 3, -1)
-    return (residual**2).sum(axis=1), (A @ residual[..., None])[..., 0], A @ np.swapaxes(A, -1, -2)
+    columns *= root[:, None]
+    A = columns.reshape(B, P, -1)
+    return Dense((residual**2).sum(axis=1), (A @ residual[..., None])[..., 0], A @ np.swapaxes(A, -1, -2))
 
 
 class PartShapes:
@@ -172,10 +160,7 @@ class PartShapes:
         return carried.sum(axis=0) + (self.origin + trans)[:, :, None]
 
     def columns(self, pose: np.ndarray, trans: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Places (B, 3, L), metres, at poses (B, J, 3), and their derivatives (B, 3J, 3, L).
-
-        These are by small rotations of the joints from the right; by trans it is the identity.
-        """
+        """Places (B, 3, L), metres, at poses (B, J, 3), and their derivatives (B, 3J + 3, 3, L) as of `MarkedBody`."""
         t = twists(pose).swapaxes(0, 1)
         (J, B), L = t.shape[:2], self.count
         R = self.rotations(t)
@@ -187,14 +172,13 @@ class PartShapes:
         along = slope.swapaxes(-1, -2)[:, :, :, None, None, :, None] \
             * rotated[:, :, None].swapaxes(-2, -3)[..., None, :]
         columns += (along.reshape(J, 9 * B, -1) @ self._by_joint.reshape(J, -1, L)).reshape(J, B, 9, L)
-        return below[0] + (self.origin + trans)[:, :, None], \
-            columns.reshape(J, B, 3, 3, L).swapaxes(0, 1).reshape(B, 3 * J, 3, L)
+        out = np.empty((B, 3 * J + 3, 3, L))
+        out[:, :-3].reshape(B, J, 9, L)[:] = columns.swapaxes(0, 1)
+        out[:, -3:] = np.eye(3)[:, :, None]
+        return below[0] + (self.origin + trans)[:, :, None], out
 
     def lift_off(self, part: np.ndarray, offsets: np.ndarray, bends: list[dict[int, np.ndarray]]) -> None:
-        """Add to every point a vector (L, 3), metres, that turns with a part (L,) and bends with its joints.
-
-        `bends` holds for each point (m, 3), metres, of some joints.
-        """
+        """Add to every point a vector (L, 3), metres, that turns with a part (L,), and (m, 3) by its joints."""
         for i, p in enumerate(part):
             self.constant[p, :, i] += offsets[i]
             for j, bend in bends[i].items():
@@ -204,11 +188,10 @@ class PartShapes:
 
 def marker_shapes(subject: Subject, vertex_ids: np.ndarray, weights: np.ndarray, distances: np.ndarray
                   ) -> PartShapes:
-    """Markers at distances (L,), metres, above the skin as local shapes, the normal fitted once to the exact one.
+    """Markers at distances (L,), metres, above the skin as local shapes; points (3L, k) are those of `supports`.
 
-    Three points of the skin (3L, k) for each marker are those of `supports`. The exact normal, of `energy.above_skin`,
-    is no linear function of the body's features. Over poses drawn from the prior, each marker's normal is regressed on
-    the rotation of the part that it follows best and the lifted twists of that part's joints.
+    The exact normal, of `energy.above_skin`, is no linear function of the body's features: over poses drawn from the
+    prior it is regressed on the rotation of the part that it follows best and the lifted twists of that part's joints.
     """
     shapes = PartShapes(subject.points(vertex_ids[::3], weights[::3]))
     if not distances.any():
@@ -263,10 +246,8 @@ def _padded(lists: list[list[int]]) -> tuple[np.ndarray, np.ndarray]:
 def supports(template: Mesh, layout: MarkerLayout) -> tuple[np.ndarray, np.ndarray]:
     """Three points of the skin for each marker, below it and two around it that span its tangent plane.
 
-    They are vertices (3L, k), padded by repeats, and weights (3L, k) of which each row sums to 1. A marker on a
-    triangle has the triangle's own plane. For one on a vertex the two are weighted sums of the ring of neighbours, with
-    cosines and sines of the angle about the normal as weights, so that their cross product is a smooth normal that
-    moves with the body.
+    Vertices (3L, k), padded by repeats, and weights (3L, k), rows of which sum to 1. A marker on a triangle has its
+    plane; for one on a vertex the two are sums of the ring, by cosine and sine of the angle about the normal.
     """
     base, weights = layout.skin
     if base.max(initial=0) >= len(template.vertices):

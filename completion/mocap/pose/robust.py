@@ -9,18 +9,18 @@ from scanprep.meaning import extent, size, unit_problem
 from ...motion import Motion
 from ..files.markers import MarkerSequence
 from ..marker_sets.layout import MarkerLayout
+from .settings import AnimateConfig
+from .swaps import DEVIATION, find_order, marker_levels
 
-ASTRAY = 0.025                       # of the size, 34 mm on a man; good motions 4 to 25, sides swapped 36 to 60
 ENTER, LEAVE = 0.5, 1.0              # share of the distance that remains when labels are swapped, and put back
 
 
 def marker_weights(positions: np.ndarray, targets: np.ndarray, sd: float, outlier: float
                    ) -> tuple[np.ndarray, np.ndarray]:
-    """Factors (..., L) on the squared distances of markers, low for outliers, 0 where nothing was seen; which count.
+    """Factors (..., L) on the squared distances of markers, 0 where nothing was seen, and which count: above a quarter.
 
     Places and targets are (..., L, 3), metres, NaN where a marker was not seen; `sd` and `outlier` as in
-    `AnimateConfig`. What is common to all markers does not make an outlier: the body may be a step behind. Those count
-    that have more than a quarter of the full weight.
+    `AnimateConfig`. What is common to all markers does not make an outlier: the body may be a step behind.
     """
     squared, scale = distances_apart(positions, targets, outlier)
     share = np.where(np.isnan(squared), 0.0, (scale**2 / (scale**2 + squared))**2)
@@ -53,49 +53,26 @@ def misfit(apart: np.ndarray, outlier: float) -> np.ndarray:
 
 def judge(positions: np.ndarray, targets: np.ndarray, order: np.ndarray, outlier: float
           ) -> tuple[np.ndarray, np.ndarray]:
-    """Residuals (..., L), metres, of the markers as they came, and which were believed under their own label.
-
-    `order` (..., L) is which column each marker was taken from.
-    """
+    """Residuals (..., L), metres, of the markers as they came, and which were believed under their own label."""
     residuals = np.linalg.norm(positions - targets, axis=-1)
     squared, scale = distances_apart(positions, targets, outlier)
     return residuals, (squared < scale**2) & (order == np.arange(order.shape[-1]))
 
 
-def label_order(positions: np.ndarray, targets: np.ndarray, outlier: float) -> np.ndarray:
-    """Which column (T, L) each marker is taken from, the body having them at places (T, L, 3)."""
-    watch, order = LabelWatch(positions.shape[1], outlier), np.empty(positions.shape[:2], dtype=np.int64)
-    for t, uncertain in enumerate(_may_be_swapped(positions, targets, outlier)):
-        if uncertain or not watch.idle:
-            watch.update(positions[t], targets[t])
-        order[t] = watch.order
-    return order
-
-
-def _may_be_swapped(positions: np.ndarray, targets: np.ndarray, outlier: float) -> np.ndarray:
-    """Frames (T,) bool in which a `LabelWatch` would swap some labels, for places and targets (T, L, 3)."""
-    squared, scale = distances_apart(positions, targets, outlier)
-    suspect = squared > (0.5 * scale)**2
-    out = np.zeros(len(targets), dtype=bool)
-    for t in np.flatnonzero(suspect.sum(axis=1) > 1):
-        some = np.flatnonzero(suspect[t])
-        off = positions[t] - targets[t]
-        out[t] = bool(_gains(positions[t, some] - _median(off.T), targets[t, some], scale[t, 0]).any())
-    return out
-
-
-def _gains(places: np.ndarray, targets: np.ndarray, scale: float) -> np.ndarray:
-    """Pairs (n, n) bool that would fit well if they swapped their targets, and do not as they are."""
-    apart = np.linalg.norm(places[:, None] - targets, axis=2)
-    own = np.diag(apart)
-    return (apart + apart.T < ENTER * (own[:, None] + own)) & (np.maximum(apart, apart.T) < 0.5 * scale)
+def label_order(positions: np.ndarray, targets: np.ndarray, rate: float, outlier: float) -> np.ndarray:
+    """Which column (T, L) each marker is taken from, the body having them at places (T, L, 3), by `find_order`."""
+    shift = _median(np.swapaxes(positions - targets, -1, -2))[..., None, :]
+    _, scale = distances_apart(positions, targets, outlier)
+    # on a body that fits badly a marker is as much farther from its place as one must be to be an outlier
+    deviation = DEVIATION * scale[..., 0] / AnimateConfig.outlier
+    return find_order(targets, rate, marker_levels(positions - shift, targets, deviation))
 
 
 class LabelWatch:
-    """Finds pairs of markers, of so many, that have swapped their labels, and remembers them from frame to frame.
+    """Pairs of markers, of so many, that have swapped their labels, told frame by frame for streams.
 
-    A pair is swapped when that removes most of the distance of both from where the body would put them,
-    and put back when the labels as they came fit better again: in between nothing changes.
+    A pair is swapped when that removes most of the distance of both from where the body would put them, and put back
+    when the labels as they came fit better again. No scores of `find_order`: a body that has leapt is far from all.
     """
 
     def __init__(self, count: int, outlier: float) -> None:
@@ -105,11 +82,6 @@ class LabelWatch:
     def forget(self) -> None:
         """Take the labels as they come."""
         self.order = np.arange(len(self.order))
-
-    @property
-    def idle(self) -> bool:
-        """No labels are swapped at present."""
-        return bool((self.order == np.arange(len(self.order))).all())
 
     def update(self, positions: np.ndarray, targets: np.ndarray) -> np.ndarray:
         """Which column (L,) each marker is taken from, for places on the body and markers as they came (L, 3)."""
@@ -134,10 +106,7 @@ class LabelWatch:
 
 
 def motion_problem(motion: Motion, body: Mesh, layout: MarkerLayout, markers: MarkerSequence) -> str | None:
-    """Why a motion from markers of a layout means nothing, with the likely cause; None where it means something.
-
-    `body` is the template of the person's model.
-    """
+    """Why a motion from markers of a layout means nothing, and the likely cause; `body` is the model's template."""
     seen = np.isfinite(motion.residuals)
     if not seen.any():
         return "no marker of the layout was ever seen: markers of another layout?"
@@ -145,7 +114,8 @@ def motion_problem(motion: Motion, body: Mesh, layout: MarkerLayout, markers: Ma
     columns = [markers.labels.index(label) for label in known]
     spans = [extent(frame) for frame in markers.positions[:: max(1, len(seen) // 50), columns]]
     wrong = unit_problem(float(np.nanmax(spans)), extent(layout.select(known).place(body)), "the markers span a box")
-    off, far = float(motion.residuals[seen].mean()), ASTRAY * size(body)
+    # of the size, 34 mm on a man; good motions 4 to 25, sides swapped 36 to 60
+    off, far = float(motion.residuals[seen].mean()), 0.025 * size(body)
     if wrong is None and off <= far:
         return None
     believed = 100 * float(motion.trusted[seen].mean())

@@ -4,7 +4,11 @@ from __future__ import annotations
 from dataclasses import dataclass
 from typing import Annotated, Literal
 
+import numpy as np
+
 from scanprep.ranges import FLAG, Positive, Settings, Share, Signed
+
+from ...smoothing import inertia
 
 RATE = 120.0                         # frames per second for which the weight of the velocity is meant
 
@@ -52,3 +56,7 @@ class AnimateConfig(Settings):
     low_pass: float = 0.0
     ground: Annotated[bool, FLAG] = False
     floor: tuple[Signed, Signed, Signed, Signed] | None = None
+
+    def inertia(self, rate: float, n_unknowns: int) -> np.ndarray:
+        """Information (P,) of the change of velocity from frame to frame."""
+        return inertia(n_unknowns, rate, self.angle_acceleration, self.place_acceleration)

@@ -12,12 +12,12 @@ from scanprep.geometry.least_squares import Dense, Minimum, levenberg_marquardt
 from ..marker_sets.layout import MarkerLayout
 from .initialise import search
 from .marked_body import MarkedBody
-from .prediction import prediction_of
 from .robust import LabelWatch, judge, marker_weights, misfit
 from .settings import AnimateConfig
 
 STEPS = 3                            # most for a frame
 LOST = 0.08                          # metres, median residual of a frame above which it is searched anew
+LOOSE = 10.0                         # variance of a prediction from two uncertain frames, against the acceleration's
 PATIENCE = 0.25                      # seconds from a search that found nothing to the next; then twice as many
 
 
@@ -100,6 +100,79 @@ class MarkerStream:
                                                         tracker.config.outlier)
         pose, trans, _ = tracker.body.body.split(x)
         return Frame(pose, trans, residuals, trusted & tracker.believed, converged)
+
+
+class VelocityPrediction:
+    """The frame before, moved on at its slowly falling velocity; the same trust in it always."""
+
+    momentum = 0.95                  # share of the velocity that is kept
+
+    def __init__(self, body: MarkedBody, config: AnimateConfig, rate: float) -> None:
+        self.body = body
+        self.information = np.diag(config.inertia(rate, body.n_unknowns) / LOOSE)
+
+    def begin(self, x: np.ndarray) -> None:
+        self.x, self.velocity = x, np.zeros_like(x)
+
+    def expect(self) -> tuple[np.ndarray, np.ndarray]:
+        return self.body.retract(self.x, self.momentum * self.velocity), self.information
+
+    def update(self, x: np.ndarray, measured: np.ndarray) -> None:
+        self.velocity = self.body.step_to(self.x, x)
+        self.x = x
+
+
+class KalmanPrediction:
+    """A Kalman filter over rotations and velocities, the Gauss-Newton matrix of the markers as information.
+
+    Where markers are missing, what the last ones told about the joints together is not lost at once.
+    """
+
+    momentum = VelocityPrediction.momentum
+
+    def __init__(self, body: MarkedBody, config: AnimateConfig, rate: float) -> None:
+        self.body = body
+        self.noise = 1 / config.inertia(rate, body.n_unknowns)
+
+    def begin(self, x: np.ndarray) -> None:
+        self.x, self.velocity = x, np.zeros_like(x)
+        self.place = np.diag(LOOSE * self.noise)                       # covariances (P, P) of place, both, velocity
+        self.cross = 0 * self.place
+        self.speed = np.diag(LOOSE * self.noise)
+
+    def expect(self) -> tuple[np.ndarray, np.ndarray]:
+        m = self.momentum
+        kept = m * m * self.speed
+        place = self.place + m * (self.cross + self.cross.T) + kept
+        cross, speed = m * self.cross + kept, kept
+        for block, share in ((place, 0.25), (cross, 0.5), (speed, 1.0)):  # after one frame of constant acceleration
+            block[np.diag_indices(len(block))] += share * self.noise
+        self._ahead = cross, speed
+        self._expected = self.body.retract(self.x, m * self.velocity)
+        information = np.linalg.inv(place)
+        self._information = 0.5 * (information + information.T)
+        return self._expected, self._information
+
+    def update(self, x: np.ndarray, measured: np.ndarray) -> None:
+        cross, speed = self._ahead
+        gain = self._information @ cross                                # of the velocity, by the place
+        self.velocity = self.momentum * self.velocity + self.body.step_to(self._expected, x) @ gain
+        place = np.linalg.inv(self._information + measured)
+        self.place = 0.5 * (place + place.T)
+        known = self.place @ gain
+        speed = speed - cross.T @ gain + gain.T @ known
+        self.speed = 0.5 * (speed + speed.T)                            # rounding grows where it is not symmetric
+        self.cross = known
+        self.x = x
+
+
+def prediction_of(body: MarkedBody, config: AnimateConfig, rate: float) -> VelocityPrediction | KalmanPrediction:
+    """The prediction that the settings name."""
+    kinds: dict[str, type[VelocityPrediction] | type[KalmanPrediction]] = {
+        "velocity": VelocityPrediction, "kalman": KalmanPrediction}
+    if config.prediction not in kinds:
+        raise ValueError(f"prediction: expected one of {', '.join(kinds)}, got '{config.prediction}'")
+    return kinds[config.prediction](body, config, rate)
 
 
 class Tracker:
@@ -187,8 +260,8 @@ class Tracker:
     def _to_pass_over(self, targets: np.ndarray, before: np.ndarray) -> bool:
         """Whether the markers (L, 3) are to be passed over, the body at `places` having been expected at `before`.
 
-        No body explains them, or it would have leapt there: that is believed when the next frame says the same, and
-        anything when it goes on for long.
+        No body explains them, or it leapt there: that is believed when the next frame says the same, or it goes on for
+        long.
         """
         # the markers of a body stray at most 10 m/s together from where they are expected
         near = LOST + 10.0 * self.since / self.rate

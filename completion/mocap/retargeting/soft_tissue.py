@@ -1,14 +1,25 @@
-"""Pose and soft tissue of a person on a character [MoSh]."""
+"""Pose and soft tissue of a person on a character [MoSh]: motion, pictures, and creases laid smooth."""
 from __future__ import annotations
 
 from dataclasses import replace
+from pathlib import Path
 
 import numpy as np
-from scipy.sparse import csr_array
+from scipy.sparse import csr_array, diags_array
+from scipy.sparse.csgraph import connected_components
 
 from model.body import BodyModel
 from model.linear import Subject, posed_product
+from scanprep.geometry.mesh import Mesh
+from scanprep.geometry.sparse import harmonic
+from scanprep.pictures.colors import color_bar, heat
+from scanprep.pictures.shading import side_by_side
+from scanprep.skeleton.tree import Skeleton
 
+from ...bodies import at_rest
+from ...motion import spread_frames
+from ...motion_pictures import bodies_in_a_row, seconds
+from ..files.motion_files import write_glb
 from ..soft_tissue.soft_tissue import SoftTissue
 from .retarget import AT_ONCE, retarget, world_up
 
@@ -113,10 +124,104 @@ def _products(vertices: np.ndarray, faces: np.ndarray) -> tuple[np.ndarray, np.n
 
 
 def moving_character(character: BodyModel, soft: SoftTissue, frames: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """The meshes (n, N, 3), metres, of some frames without and with soft tissue.
-
-    `frames` (n,).
-    """
+    """The meshes (n, N, 3), metres, of some frames (n,) without and with soft tissue."""
     poses, trans = soft.motion.poses[frames], soft.motion.trans[frames]
     fixed = soft.motion.vertices(character.subject(soft.motion.betas), frames)
     return fixed, character.vertices(poses, soft.betas()[frames], trans)
+
+
+FULL = 0.2                           # deformation at the end of the heat map
+
+
+def picture_transfer(model: BodyModel, soft: SoftTissue, character: BodyModel, moved: SoftTissue, count: int = 8,
+                     height: int = 320) -> np.ndarray:
+    """Frames in three rows: the person, the character moving as `moved`, how far its skin is deformed. [MoSh]"""
+    frames = spread_frames(len(soft.motion.poses), count)
+    person = moving_character(model, soft, frames)[1]
+    fixed, changed = moving_character(character, moved, frames)
+    colors = heat(deformation(character.template.faces, fixed, changed), 0.0, FULL)
+    poses = moved.motion.poses[frames]
+    changed = Creases(at_rest(character), character.skeleton).smoothed(changed, poses)
+    who, what = model.subject(soft.motion.betas), character.subject(moved.motion.betas)
+    rows = [bodies_in_a_row(who, soft.motion.poses[frames], person, None, height),
+            bodies_in_a_row(what, poses, changed, None, height), bodies_in_a_row(what, poses, changed, colors, height)]
+    sheet = side_by_side([image for row in rows for image in row],
+                         [""] * 2 * len(frames) + seconds(soft.motion, frames), columns=len(frames))
+    bar = color_bar(0.0, FULL, "deformation of the skin", scale=100.0, unit="%")
+    return side_by_side([sheet, bar], columns=1)
+
+
+def write_character(path: Path, character: BodyModel, soft: SoftTissue, keys: int = 60) -> np.ndarray:
+    """Write an animated GLB of soft tissue on its character, coloured by the most that its skin is deformed (N,)."""
+    frames = spread_frames(len(soft.motion.poses), keys)
+    fixed, changed = moving_character(character, soft, frames)
+    most = np.asarray(deformation(character.template.faces, fixed, changed).max(axis=0))
+    changed = Creases(at_rest(character), character.skeleton).smoothed(changed, soft.motion.poses[frames])
+    write_glb(path, soft.motion, character.subject(soft.motion.betas), changed, heat(most, 0.0, FULL), keys)
+    return most
+
+
+REACH = (1, 2, 2, 3, 3, 4)           # rings around inverted triangles that are laid anew, one round each
+
+
+class Creases:
+    """Where triangles of a posed body are inverted, and the body without.
+
+    Inverted is one that faces away from where its parts' rotations, mixed over `blend` rings, take it: at a raised
+    shoulder the skin rightly faces away from its own part.
+    """
+
+    def __init__(self, rest: Mesh, skeleton: Skeleton, blend: int = 6) -> None:
+        self.rest, self.skeleton = rest, skeleton
+        self._near = csr_array(rest.vertex_adjacency, dtype=np.float64)
+        self._shares = np.eye(len(skeleton.parents))[skeleton.part_of_face]
+        if blend:
+            own = np.eye(len(skeleton.parents))[skeleton.part_of_vertex(rest)]
+            spread = diags_array(1 / (1 + np.asarray(self._near.sum(axis=1)).ravel()))
+            for _ in range(blend):
+                own = spread @ (own + self._near @ own)
+            self._shares = own[rest.faces].mean(axis=1)
+
+    def inverted(self, bodies: np.ndarray, poses: np.ndarray) -> np.ndarray:
+        """(..., F) bool: triangles of bodies (..., N, 3) in poses (..., J, 3) that face the wrong way."""
+        corners = bodies[..., self.rest.faces, :]
+        now = np.cross(corners[..., 1, :] - corners[..., 0, :], corners[..., 2, :] - corners[..., 0, :])
+        R = np.tensordot(self._shares, self.skeleton.part_rotations(poses), axes=(1, -3))
+        R = np.moveaxis(R, 0, -3)
+        return np.asarray((now * (R @ self.rest.face_normals[..., None])[..., 0]).sum(axis=-1) < 0)
+
+    def smoothed(self, bodies: np.ndarray, poses: np.ndarray) -> np.ndarray:
+        """Bodies (n, N, 3) in poses (n, J, 3) whose folded hollows are laid as smoothly as what is around allows.
+
+        Patches around inverted triangles grow while some are left; one that leaves more of them is not taken.
+        """
+        out = np.array(bodies)
+        for t in range(len(out)):
+            bad = self.inverted(out[t], poses[t])
+            for rings in REACH:
+                if not bad.any():
+                    break
+                out[t] = self._laid(out[t], poses[t], bad, rings)
+                bad = self.inverted(out[t], poses[t])
+        return out
+
+    def _laid(self, x: np.ndarray, pose: np.ndarray, bad: np.ndarray, rings: int) -> np.ndarray:
+        """Vertices (N, 3) with patches of so many rings around inverted triangles (F,) laid where that helps."""
+        free = np.zeros(len(x))
+        free[self.rest.faces[bad]] = 1
+        for _ in range(rings - 1):
+            free = (free + self._near @ free > 0).astype(float)
+        mine = np.flatnonzero(free)
+        if len(mine) == len(x):
+            return x
+        count, patch = connected_components(self._near[mine][:, mine])
+        trial = harmonic(self._near, x, free == 0)
+        left = self.inverted(trial, pose)
+        of_vertex = np.full(len(x), -1)
+        of_vertex[mine] = patch
+        of_face = of_vertex[self.rest.faces].max(axis=1)                      # no triangle touches two patches
+        better = np.bincount(of_face[left & (of_face >= 0)], minlength=count) < np.bincount(of_face[bad],
+                                                                                           minlength=count)
+        kept = mine[~better[patch]]
+        trial[kept] = x[kept]
+        return trial

@@ -5,10 +5,11 @@ import numpy as np
 
 from model.body import BodyModel
 from model.linear import check_pose, posed_product
-from scanprep.geometry import rotations
+from scanprep.geometry.least_squares import Dense
 
+from ...energy import MovingPoints, above_skin
 from ..marker_sets.layout import MarkerLayout
-from ..pose.marked_body import BATCH, MarkedBody, System, supports
+from ..pose.marked_body import MarkedBody, batches, point_system, supports
 
 AT_ONCE = 32                         # bodies that are made together
 
@@ -37,23 +38,17 @@ def skin_movement(model: BodyModel, changes: np.ndarray) -> np.ndarray:
 
 
 def skin_metric(model: BodyModel, slopes: np.ndarray) -> np.ndarray:
-    """(K, K): `Δ @ metric @ Δ` is how far a change Δ of betas moves the skin, squared, square metres.
-
-    The mean over the surface, areas as on the template; `slopes` (N, 3, K) are the vertices' derivatives by betas.
-    """
+    """(K, K): `Δ @ metric @ Δ` is how far a change Δ of betas moves the skin, square metres, the mean by area."""
     areas = model.template.vertex_areas
     D = (np.sqrt(areas / areas.sum())[:, None, None] * slopes).reshape(-1, slopes.shape[-1])
     return np.asarray(D.T @ D)
 
 
 class ChangingBody:
-    """A person with markers whose betas change by Δ = z @ directions around their own.
+    """A person with markers whose betas change by Δ = z @ directions (K, K) around their own.
 
-    Markers are affine in z, `y(θ) + D(θ) z`, and D (3L, K) is a linear function of products of features and rotations:
-    for a batch of poses it is one matrix product. The derivative by the pose is that of the person's own shape.
-
-    The directions (K, K) are rows of betas; `slopes` (N, 3, K) are derivatives of all vertices by betas in the mean
-    pose, from which the turning of the skin is known.
+    Markers are affine in z, `y(θ) + D(θ) z`, D (3L, K) linear in products of features and rotations: one matrix product
+    for a batch of poses. `slopes` (N, 3, K) of all vertices by betas in the mean pose tell how the skin turns.
     """
 
     def __init__(self, model: BodyModel, betas: np.ndarray, layout: MarkerLayout, directions: np.ndarray,
@@ -71,8 +66,8 @@ class ChangingBody:
         distances = np.asarray(layout.distances)
         if distances.any():
             mean = self.marked.body.subject.vertices(model.pose_mean)
-            corners, by_betas = (np.einsum("lk,lk...->l...", weights, of[ids]) for of in (mean, slopes))
-            turning = normal_slopes(corners, by_betas)
+            skin = MovingPoints(*(np.einsum("lk,lk...->l...", weights, of[ids]) for of in (mean, slopes)))
+            turning = above_skin(skin, np.ones(len(distances))).jacobian - skin.jacobian[::3]    # of the normals
             part = model.skeleton.part_of_vertex(model.template)[ids[::3, 0]]
             R = model.skeleton.part_rotations(model.pose_mean)
             plain = self.terms.features.constant[self.terms.feature] == 1
@@ -90,61 +85,25 @@ class ChangingBody:
 
     def positions(self, x: np.ndarray, z: np.ndarray) -> np.ndarray:
         """Where the body puts the markers (T, L, 3), metres, for unknowns (T, P) and changes z (T, K)."""
-        pose, trans, _ = self.marked.body.split(x)
-        y = np.empty((len(x), self.count, 3))
-        for start in range(0, len(x), BATCH):
-            some = slice(start, start + BATCH)
-            D = self.slopes(pose[some])
-            y[some] = np.swapaxes(self.marked.shapes.evaluate(pose[some], trans[some]), 1, 2)
-            moved = z[some, None] @ D.reshape(len(D), self.n_betas, -1)
-            y[some] += np.swapaxes(moved.reshape(len(D), 3, -1), 1, 2)
+        pose, _, _ = self.marked.body.split(x)
+        y = self.marked.positions(x)
+        for some in batches(len(x)):
+            y[some] += np.swapaxes(_moved(z[some], self.slopes(pose[some])), 1, 2)
         return y
 
-    def system(self, x: np.ndarray, z: np.ndarray, targets: np.ndarray, weights: np.ndarray) -> System:
-        """Markers and pose prior at x (B, P), z (B, K): energy (B,), half its gradient (B, P + K), its matrix.
-
-        Markers are to be at targets (B, L, 3), metres, NaN where not seen; weights (B, L) are on squared metres.
-        """
+    def system(self, x: np.ndarray, z: np.ndarray, targets: np.ndarray, weights: np.ndarray) -> Dense:
+        """Markers and pose prior at x (B, P), z (B, K), with P + K unknowns; arguments as of `point_system`."""
         pose, trans, _ = self.marked.body.split(x)
-        y, by_turn = self.marked.shapes.columns(pose, trans)
-        D = self.slopes(pose)
-        y += (z[:, None] @ D.reshape(len(x), self.n_betas, -1)).reshape(y.shape)
-        (B, n), P, L = by_turn.shape[:2], x.shape[1], self.count
-        root, residual = _weighed(y, targets, weights)
-        A = np.empty((B, P + self.n_betas, 3, L))
-        np.multiply(by_turn, root[:, None], out=A[:, :n])
-        A[:, n:P] = np.eye(3)[:, :, None] * root[:, None]
-        np.multiply(D, root[:, None], out=A[:, P:])
-        A = A.reshape(B, P + self.n_betas, -1)
-        energy, gradient, hessian = (residual**2).sum(axis=1), (A @ residual[..., None])[..., 0], A @ A.swapaxes(1, 2)
-        prior = self.marked.prior_system(pose)
-        gradient[:, :n] += prior[1]
-        hessian[:, :n, :n] += prior[2]
-        return energy + prior[0], gradient, hessian
+        (y, by_turn), D = self.marked.shapes.columns(pose, trans), self.slopes(pose)
+        data = point_system(y + _moved(z, D), np.concatenate([by_turn, D], axis=1), targets, weights)
+        return self.marked.with_prior(data, pose)
 
-    def change_system(self, x: np.ndarray, targets: np.ndarray, weights: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """Half the gradient (B, K) of the markers by z, at z = 0, and its matrix (B, K, K); as for `system`."""
+    def change_system(self, x: np.ndarray, targets: np.ndarray, weights: np.ndarray) -> Dense:
+        """Markers by z (B, K), at z = 0; as for `system`."""
         pose, trans, _ = self.marked.body.split(x)
-        root, residual = _weighed(self.marked.shapes.evaluate(pose, trans), targets, weights)
-        A = (self.slopes(pose) * root[:, None]).reshape(len(x), self.n_betas, -1)
-        return (A @ residual[..., None])[..., 0], A @ A.swapaxes(1, 2)
+        return point_system(self.marked.shapes.evaluate(pose, trans), self.slopes(pose), targets, weights)
 
 
-def _weighed(y: np.ndarray, targets: np.ndarray, weights: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Roots of the weights (B, 1, L), 0 where nothing was seen, and the residuals (B, 3L) of places (B, 3, L)."""
-    missing = np.isnan(targets[..., 0])
-    root = np.sqrt(np.where(missing, 0.0, weights))[:, None]
-    return root, (root * np.where(missing[:, None], 0.0, y - np.swapaxes(targets, -1, -2))).reshape(len(y), -1)
-
-
-def normal_slopes(corners: np.ndarray, slopes: np.ndarray) -> np.ndarray:
-    """Derivative (L, 3, K) of unit normals by betas, from three points of the skin each (3L, 3), and theirs (3L, 3, K).
-    """
-    p = corners.reshape(-1, 3, 3)
-    J = slopes.reshape(*p.shape, -1)
-    u, v = p[:, 1] - p[:, 0], p[:, 2] - p[:, 0]
-    c = np.cross(u, v)
-    length = np.linalg.norm(c, axis=-1)[:, None]
-    n = c / length
-    tangent = (np.eye(3) - n[:, :, None] * n[:, None, :]) / length[..., None]
-    return np.asarray(tangent @ (rotations.hat(u) @ (J[:, 2] - J[:, 0]) - rotations.hat(v) @ (J[:, 1] - J[:, 0])))
+def _moved(z: np.ndarray, D: np.ndarray) -> np.ndarray:
+    """How changes z (B, K) move the markers (B, 3, L), with derivatives D (B, K, 3, L)."""
+    return np.asarray((z[:, None] @ D.reshape(*z.shape, -1)).reshape(len(z), *D.shape[2:]))

@@ -14,19 +14,18 @@ from scanprep.ranges import Positive, Settings
 from scanprep.threads import one_thread
 
 from ...motion import Motion
+from ...smoothing import coupled_steps
 from ..files.markers import MarkerSequence
 from ..marker_sets.layout import MarkerLayout
-from ..pose.marked_body import BATCH
+from ..pose.follow import FURTHEST
+from ..pose.marked_body import batches
 from ..pose.robust import marker_weights
 from ..pose.settings import RATE, AnimateConfig
-from ..pose.smooth import FURTHEST, coupled_steps, inertia
 from .changing_body import ChangingBody, changing_bodies, skin_metric, skin_movement
 
 Progress = Callable[[int, int], None]
 PER_SQUARE_METRE = 1e4               # of a weight on square centimetres
 ROUNDS = 3                           # Gauss-Newton steps over the whole sequence, which begins near its end
-STILL = 0.002                        # metres that the last round moves any marker of a frame that has settled
-N_BETAS = 200                        # components in which the shape may change, of those that the model has
 WINDOW, OVERLAP = 400, 40            # frames smoothed at once, and those that each side lends to its neighbour
 
 
@@ -160,8 +159,7 @@ def follow_soft_tissue(model: BodyModel, motion: Motion, markers: MarkerSequence
 class SoftFollower:
     """The markers of a sequence, and the changing body that is to carry them; arguments as of `follow_soft_tissue`.
 
-    Unknowns are x (T, P) as in `MarkedBody` and changes z (T, K) along directions of which each costs the same: their
-    energy is |z|².
+    Unknowns are x (T, P) as in `MarkedBody` and changes z (T, K), whose energy is |z|².
     """
 
     def __init__(self, model: BodyModel, motion: Motion, markers: MarkerSequence, layout: MarkerLayout,
@@ -172,12 +170,13 @@ class SoftFollower:
         self.config, self.motion = config, motion
         self.rows = np.array([markers.labels.index(label) for label in labels])
         self.targets = markers.positions[:, self.rows]
-        K = min(max(N_BETAS, len(motion.betas)), model.n_betas)
+        # components in which the shape may change, of those that the model has
+        K = min(max(200, len(motion.betas)), model.n_betas)
         slopes = model.shape_jacobian(model.pose_mean)[..., :K]
         poses = AnimateConfig(prior_weight=config.pose, angle_acceleration=RATE**2 / np.sqrt(config.velocity))
         self.body = ChangingBody(model, motion.betas, layout.select(labels), cheap_directions(model, slopes, config),
                                  slopes, config.pose, poses.prior_shrinkage)
-        self.inertia = inertia(poses, markers.rate, self.body.marked.n_unknowns)
+        self.inertia = poses.inertia(markers.rate, self.body.marked.n_unknowns)
         self.smoothness = config.temporal_smoothness * (markers.rate / RATE)**4
 
     def solve(self, progress: Progress | None = None) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
@@ -199,7 +198,7 @@ class SoftFollower:
             z[some] = smooth_changes(self.body, x[some], targets, weights, self.smoothness)
         if progress:
             progress(T, T)
-        return x, z, moved < STILL
+        return x, z, moved < 0.002  # metres that the last round moves any marker of a frame that has settled
 
     def weights(self, positions: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Frames from the first to the last with a marker that counts (n,), and weights of all markers (T, L)."""
@@ -214,8 +213,7 @@ class SoftFollower:
         T, P = x.shape
         gradient, hessian = np.empty((T, P)), np.empty((T, P, P))
         back = np.empty((T, self.body.n_betas, P + 1), dtype=np.float32)
-        for start in range(0, T, BATCH):
-            some = slice(start, start + BATCH)
+        for some in batches(T):
             _, g, H = self.body.system(x[some], z[some], targets[some], weights[some])
             g[:, P:] += z[some]                                         # [MoSh] Eq. 24
             across = H[:, :P, P:]
@@ -223,7 +221,7 @@ class SoftFollower:
             back[some] = solved = np.linalg.solve(H[:, P:, P:] + np.eye(self.body.n_betas), right)
             hessian[some] = H[:, :P, :P] - across @ solved[:, :, :P]
             gradient[some] = g[:, :P] - (across @ solved[:, :, P:])[..., 0]
-        step = coupled_steps(self.body.marked, self.inertia, x, gradient, hessian) if T > 2 \
+        step = coupled_steps(x, gradient, hessian, self.inertia) if T > 2 \
             else -np.linalg.solve(hessian, gradient[..., None])[..., 0]
         share = np.minimum(1, FURTHEST / np.maximum(np.abs(step).max(axis=1, keepdims=True), 1e-12))
         shift = -(back[:, :, P] + (back[:, :, :P] @ step[..., None].astype(np.float32))[..., 0])
@@ -231,32 +229,23 @@ class SoftFollower:
 
 
 def cheap_directions(model: BodyModel, slopes: np.ndarray, config: SoftTissueConfig) -> np.ndarray:
-    """(K, K) directions of betas, by rows, that each cost one: `Δ = z @ directions` has the energy |z|².
-
-    `slopes` (N, 3, K) are the derivatives of the vertices by betas in the mean pose, metres.
-
-    [MoSh] Eq. 24
-    """
+    """(K, K) directions of betas, by rows, each of cost one, from the vertices' slopes (N, 3, K). [MoSh] Eq. 24"""
     cost = config.change * np.eye(slopes.shape[-1]) + config.skin * PER_SQUARE_METRE * skin_metric(model, slopes)
     return np.asarray(np.linalg.inv(np.linalg.cholesky(cost)))
 
 
 def smooth_changes(body: ChangingBody, x: np.ndarray, targets: np.ndarray, weights: np.ndarray, smoothness: float
                    ) -> np.ndarray:
-    """The changes z (T, K) of at least 3 frames that follow each other, poses x held, constant velocity of z as prior.
+    """The changes z (T, K) of at least 3 frames, poses x held, with `smoothness` on their second difference over time.
 
-    Minimised is what the markers say, |z|² and `smoothness` times the squared second difference of z over time. Where
-    markers say little it is a low-pass filter; the poses were found with changes free of each other, and filtering
-    these hardly moves a marker.
+    Poses were found with changes free of each other; filtering these hardly moves a marker.
     """
     z, eye = np.empty((len(x), body.n_betas)), np.eye(body.n_betas)
     for near, kept, where in overlapping_windows(len(x), WINDOW, OVERLAP):
-        gradient = np.empty((near.stop - near.start, body.n_betas))
-        hessian = np.empty((*gradient.shape, body.n_betas))
-        for first in range(0, len(gradient), BATCH):
-            some = slice(near.start + first, min(near.stop, near.start + first + BATCH))
-            mine = slice(first, first + BATCH)
-            gradient[mine], hessian[mine] = body.change_system(x[some], targets[some], weights[some])
+        at, goal, share = x[near], targets[near], weights[near]
+        gradient, hessian = np.empty((len(at), body.n_betas)), np.empty((len(at), body.n_betas, body.n_betas))
+        for some in batches(len(at)):
+            _, gradient[some], hessian[some] = body.change_system(at[some], goal[some], share[some])
         z[where] = -solve_smooth(hessian + eye, smoothness, gradient)[kept]
     return z
 

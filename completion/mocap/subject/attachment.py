@@ -21,16 +21,7 @@ Attachment = Literal["triangle", "neighbourhood"]
 
 @dataclass(frozen=True, eq=False)
 class LatentMarkers:
-    """Markers that hang on a surface.
-
-    Attributes
-    ----------
-    kind : "triangle" or "neighbourhood"
-    ids, weights : (3 L, k)
-        The three supports of every marker as combinations of vertices, as `BodyModel.points` takes them.
-    corners : (L, 3) int
-        Vertices of the triangle nearest to each marker.
-    """
+    """Markers on a surface: three supports each, combinations of vertices (3 L, k), and the nearest triangle (L, 3)."""
 
     kind: Attachment
     ids: np.ndarray
@@ -55,8 +46,8 @@ class LatentMarkers:
 def latent_markers(mesh: Mesh, points: np.ndarray, kind: Attachment = "triangle") -> LatentMarkers:
     """Hang points (L, 3) on the surface to which they are nearest; the mesh is the body in the latent pose.
 
-    In the frame of the nearest triangle: its normal, a normalised edge and the cross product of the two; or as a sum
-    of the edges that leave the nearest vertex, of least norm, and the normal there.
+    In the frame of the nearest triangle: normal, edge and their product; or as a sum of the edges of the nearest
+    vertex.
 
     [MoSh] Eq. 1, Eq. 15
     """
@@ -104,10 +95,7 @@ def _frames(kind: Attachment, supports: np.ndarray) -> tuple[np.ndarray, np.ndar
 
 
 def simulated(kind: Attachment, supports: MovingPoints, coefficients: np.ndarray) -> tuple[MovingPoints, np.ndarray]:
-    """The simulated markers on 3 L supports, and their derivative (..., L, 3, 3) by the coefficients (L, 3) of each.
-
-    The derivative by the coefficients is the frame itself, its axes in columns; that of the points is by what moves
-    the supports.
+    """The simulated markers on 3 L supports, and their derivative (..., L, 3, 3) by their own coefficients: the frame.
 
     [MoSh] Eq. 4, Eq. 16
     """
@@ -141,8 +129,7 @@ def _by_supports(kind: Attachment, supports: np.ndarray, frame: np.ndarray, c: n
 def above_triangles(points: np.ndarray, corners: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """Signed distances (n,) of points (n, 3) from triangles (n, 3, 3), one each, and their derivatives by both.
 
-    The distance r(x, S) of [MoSh] Eq. 18 as long as the triangle is the nearest. The nearest point stays where it is
-    on the triangle to first order: the derivative by a corner is that by the point, backwards, times its share.
+    [MoSh] Eq. 18. The nearest point keeps its shares of the corners to first order: each moves it by its share.
     """
     share = barycentric(points, corners)
     nearest = np.einsum("nc,ncd->nd", share, corners)

@@ -2,7 +2,6 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from functools import partial
 
 import numpy as np
 from scipy.spatial import cKDTree
@@ -10,7 +9,6 @@ from scipy.spatial import cKDTree
 from model.body import BodyModel
 from model.linear import Subject
 from scanprep.geometry import rotations
-from scanprep.geometry.least_squares import levenberg_marquardt
 
 from ..marker_sets.layout import MarkerLayout
 from ..pose.initialise import search
@@ -19,8 +17,6 @@ from ..pose.settings import AnimateConfig
 
 MEAN_PERSON = AnimateConfig(marker_sd=0.03)     # metres: the mean person carries the markers only roughly
 LOST = 0.1                           # metres, median distance of a frame's markers above which it is searched anew
-LOOSE_REACH = 0.2                    # metres from its usual place that a loose marker is looked for: half a thigh
-FAR = 0.06                           # metres beyond which it does not matter how far a loose marker is
 
 
 def mean_person(mean: Subject, layout: MarkerLayout) -> MarkedBody:
@@ -50,26 +46,23 @@ def _from_found(body: MarkedBody, found: Sequence[np.ndarray], targets: np.ndarr
     x[:, -3:] += (targets - body.positions(x))[:, there].mean(axis=1)
     off = np.nanmean(np.linalg.norm(body.positions(x) - targets, axis=2), axis=1)
     x = x[np.argsort(off)[:most]]
-    weights = np.full((len(x), len(targets)), MEAN_PERSON.marker_sd**-2)
-    system = partial(body.system, targets=np.broadcast_to(targets, (len(x), *targets.shape)), weights=weights)
-    end = levenberg_marquardt(system, x, iterations=20, tolerance=1e-3, retract=body.retract)
+    end = body.solve(x, targets, np.full(len(targets), MEAN_PERSON.marker_sd**-2), 20, 1e-3)
     return end.x[np.argmin(end.energy)]
 
 
 def find_loose(model: BodyModel, vertices: np.ndarray, layout: MarkerLayout, targets: np.ndarray) -> dict[str, int]:
-    """The vertex of its part on which each loose marker is nearest to where it was measured, by its label.
-
-    `vertices` (B, N, 3) are the body in all frames, `targets` (B, L, 3) the markers, NaN where not seen; metres.
-    """
+    """The vertex of its part on which each loose marker is nearest to its targets (B, L, 3), on bodies (B, N, 3)."""
     template, distances, usual = model.template, np.asarray(layout.distances), layout.nearest
     meshes, found = [template.with_vertices(v) for v in vertices], {}
     tree, part = cKDTree(template.vertices), model.skeleton.part_of_vertex(template)
     for row in np.flatnonzero(np.isin(layout.labels, layout.loose)):
-        near = np.array(tree.query_ball_point(template.vertices[usual[row]], LOOSE_REACH))
+        # metres from its usual place that a loose marker is looked for: half a thigh
+        near = np.array(tree.query_ball_point(template.vertices[usual[row]], 0.2))
         near = near[part[near] == part[usual[row]]]
         off = np.stack([mesh.vertices[near] + distances[row] * mesh.vertex_normals[near] - target
                         for mesh, target in zip(meshes, targets[:, row], strict=True)
                         if np.isfinite(target[0])] or [np.zeros((len(near), 3))])
-        squared = np.minimum((off**2).sum(axis=2), FAR**2)
+        # metres beyond which it does not matter how far a loose marker is
+        squared = np.minimum((off**2).sum(axis=2), 0.06**2)
         found[layout.labels[row]] = int(near[squared.mean(axis=0).argmin()])
     return found

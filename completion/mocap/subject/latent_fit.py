@@ -24,8 +24,6 @@ from .attachment import Attachment, LatentMarkers, above_triangles, latent_marke
 from .frame_starts import find_loose
 
 CENTIMETRES = 100.0                  # in a metre
-LOOSE = 0.0025                       # weight of the usual place of a marker that the layout calls loose: 20 cm
-UNSURE = 5.0                         # how much farther off a loose marker may be before it was looked for
 
 
 @dataclass(frozen=True)
@@ -158,42 +156,24 @@ def shape_term(z: np.ndarray, n_betas: int, weight: float) -> Residual:
 
 @dataclass(frozen=True, eq=False)
 class Hung:
-    """Latent markers with their supports on the body, posed and of any shape, and in the latent pose.
-
-    `corners` are those of the nearest triangles in the latent pose.
-    """
+    """Latent markers with their supports on the body, posed and of any shape, and in the latent pose."""
 
     markers: LatentMarkers
     points: ShapedPoints
     supports: LatentPoints
-    corners: LatentPoints
+    corners: LatentPoints                # of the nearest triangles in the latent pose
 
 
 @dataclass(frozen=True, eq=False)
 class State:
-    """Where the solution stands.
+    """Where the solution stands."""
 
-    Attributes
-    ----------
-    x : (B, 3J + 3) float
-        Pose and place in every frame.
-    betas : (K,) float
-    coefficients : (L, 3) float
-        Of the latent markers.
-    hung : Hung
-        What they are coefficients of.
-    layout : MarkerLayout
-        Where the markers usually are, loose ones where they were found.
-    looked : bool
-        Loose markers were looked for.
-    """
-
-    x: np.ndarray
-    betas: np.ndarray
-    coefficients: np.ndarray
-    hung: Hung
-    layout: MarkerLayout
-    looked: bool = False
+    x: np.ndarray                        # (B, 3J + 3) pose and place in every frame
+    betas: np.ndarray                    # (K,)
+    coefficients: np.ndarray             # (L, 3) of the latent markers
+    hung: Hung                           # what they are coefficients of
+    layout: MarkerLayout                 # where the markers usually are, loose ones where they were found
+    looked: bool = False                 # loose markers were looked for
 
     @property
     def z(self) -> np.ndarray:
@@ -228,7 +208,8 @@ class LatentFit:
                                    model.shape_jacobian(rest)[..., :self.n_betas])
         self.prior = gaussian_prior(model.pose_mean, model.pose_covariance)
         self.distances, self.loose = np.asarray(layout.distances), np.isin(layout.labels, layout.loose)
-        self.place_weight = np.where(self.loose, min(LOOSE, config.initial), config.initial)
+        # weight of the usual place of a marker that the layout calls loose: 20 cm
+        self.place_weight = np.where(self.loose, min(0.0025, config.initial), config.initial)
         self.pool = PointPool(model, self.n_betas)
 
     def split(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
@@ -281,7 +262,8 @@ class LatentFit:
         off = self.residuals(state)
         usual = np.nanmedian(off, axis=1, keepdims=True)
         share = energy.geman_mcclure(np.nan_to_num(off), np.maximum(self.config.outlier, 3 * usual))
-        return self.config.data * share / np.where(self.loose & (not state.looked), UNSURE, 1.0)**2
+        # how much farther off a loose marker may be before it was looked for
+        return self.config.data * share / np.where(self.loose & (not state.looked), 5.0, 1.0)**2
 
     def solve(self, state: State, factor: float, last: bool) -> tuple[np.ndarray, bool, int]:
         """One stage of [MoSh] Eq. 23, everything together: unknowns as `State.rows`, whether it settled, and steps."""
@@ -293,7 +275,8 @@ class LatentFit:
             return Arrow(normal_equations(list(self.of_frames(state, x, z, weights, factor).values())), len(z),
                          normal_equations(common))
 
-        end = levenberg_marquardt(equations, state.rows, *((24, 1e-4) if last else (8, 1e-3)))      # steps, tolerance
+        steps, tolerance = (24, 1e-4) if last else (8, 1e-3)
+        end = levenberg_marquardt(equations, state.rows, steps, tolerance, angles=self.n_angles)
         return end.x, bool(end.converged[0]), end.iterations
 
     def of_frames(self, state: State, x: np.ndarray, z: np.ndarray, weights: np.ndarray, factor: float

@@ -8,7 +8,7 @@ from functools import partial
 import numpy as np
 
 from model.body import BodyModel
-from scanprep.batch.steps import Step, once
+from scanprep.batch.room import Step, once
 from scanprep.geometry import rotations
 from scanprep.threads import one_thread
 
@@ -21,7 +21,6 @@ __all__ = ["PersonConfig", "PersonFit", "find_person"]
 
 Progress = Callable[[int, int], None]
 LOOK = (1, 3)                        # before these stages loose markers are looked for
-FEW_SEEN = 0.9                       # of the most markers that any frame has; frames with fewer are not used
 
 
 @dataclass(frozen=True, eq=False)
@@ -141,26 +140,17 @@ def one_or_more(sequences: MarkerSequence | Sequence[MarkerSequence]) -> list[Ma
 
 def common_markers(sequences: Sequence[MarkerSequence], layout: MarkerLayout
                    ) -> tuple[MarkerLayout, list[np.ndarray]]:
-    """The part of a layout that is in any of the sequences, and its markers (T, L, 3) in each, metres.
-
-    Sequences may name a marker differently, each by another alias; where one lacks a marker it is NaN.
-    """
+    """The part of a layout that is in any of the sequences, and its markers (T, L, 3) in each, NaN if it lacks one."""
     columns = []
     for sequence in sequences:
         labels = layout.matched(sequence.labels)
         columns.append({layout.aliases.get(label, label): sequence.labels.index(label) for label in labels})
-    rows = [i for i, label in enumerate(layout.labels) if any(label in mine for mine in columns)]
-    kept = tuple(layout.labels[i] for i in rows)
-    known = MarkerLayout(kept, layout.vertices[rows], np.asarray(layout.distances)[rows],
-                         None if layout.weights is None else layout.weights[rows],
-                         {alias: label for alias, label in layout.aliases.items() if label in kept},
-                         tuple(label for label in layout.loose if label in kept))
+    known = layout.without([label for label in layout.labels if not any(label in mine for mine in columns)])
     positions = []
     for sequence, mine in zip(sequences, columns, strict=True):
-        there = np.full((len(sequence.positions), len(kept), 3), np.nan)
-        some = [i for i, label in enumerate(kept) if label in mine]
-        there[:, some] = sequence.positions[:, [mine[kept[i]] for i in some]]
-        positions.append(there)
+        missing = np.full((len(sequence.positions), 3), np.nan)
+        positions.append(np.stack([sequence.positions[:, mine[label]] if label in mine else missing
+                                   for label in known.labels], axis=1))
     return known, positions
 
 
@@ -173,7 +163,8 @@ def choose_frames(positions: Sequence[np.ndarray], config: PersonConfig) -> np.n
     if seen.max(initial=0) < 3:
         raise ValueError(f"sequences: expected a frame with at least 3 known markers, the best has "
                          f"{seen.max(initial=0)}")
-    good = np.flatnonzero(seen >= max(3, FEW_SEEN * seen.max()))
+    # of the most markers that any frame has; frames with fewer are not used
+    good = np.flatnonzero(seen >= max(3, 0.9 * seen.max()))
     if config.choice == "random":
         rng = np.random.default_rng(config.seed)
         return np.sort(rng.choice(good, min(config.frames, len(good)), replace=False))
@@ -181,10 +172,7 @@ def choose_frames(positions: Sequence[np.ndarray], config: PersonConfig) -> np.n
 
 
 def spread_frames(positions: np.ndarray, count: int) -> np.ndarray:
-    """Frames (B,) in which markers (T, L, 3) stand to each other in many ways, by the distances between them.
-
-    The first is the most usual one; each further one is farthest from those before.
-    """
+    """Frames (B,) in which markers (T, L, 3) stand to each other in many ways, by the distances between them."""
     some = np.unique(np.linspace(0, len(positions) - 1, 400).round().astype(int))
     first, second = np.triu_indices(positions.shape[1], 1)
     apart = np.linalg.norm(positions[some][:, first] - positions[some][:, second], axis=2)

@@ -3,12 +3,14 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from fractions import Fraction
 from functools import cached_property
 
 import numpy as np
 from scipy.sparse import coo_array, csr_array
 from scipy.sparse.csgraph import connected_components, dijkstra
 
+from scanprep.geometry import sparse
 from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.surface import Rays
 from scanprep.skeleton.tree import Skeleton
@@ -19,17 +21,13 @@ def find_seams(mesh: Mesh, skeleton: Skeleton) -> list[np.ndarray]:
     hidden. Each tip in turn, the nearest first, is joined to the seams there are by the shortest path over the edges.
     """
     graph = _costs(mesh)
-    tips = limb_tips(mesh, skeleton)
-    tree = np.array(tips[:1])
-    seams: list[np.ndarray] = []
-    left = set(tips[1:])
+    first, *rest = limb_tips(mesh, skeleton)
+    tree, left, seams = np.array([first]), set(rest), list[np.ndarray]()
     while left or not seams:
-        if left:
-            far = dijkstra(graph, directed=False, indices=tree, min_only=True)
-            goal = min(left, key=lambda v: (far[v], v))
-            left.discard(goal)
-        else:                                                          # one tip only: through the body to its far end
-            goal = int(dijkstra(graph, directed=False, indices=tree, min_only=True).argmax())
+        far = dijkstra(graph, directed=False, indices=tree, min_only=True)
+        # one tip only: through the body to its far end
+        goal = min(left, key=lambda v: (far[v], v)) if left else int(far.argmax())
+        left.discard(goal)
         seam = join(graph, tree, goal)
         if len(seam) > 1:
             seams.append(seam)
@@ -107,11 +105,7 @@ def _costs(mesh: Mesh) -> csr_array:
     n = len(mesh.vertices)
     seen = np.bincount(vertex, weight * free, n) / np.maximum(np.bincount(vertex, weight, n), 1e-12)
     x, y = mesh.edges.T
-    return csr_array(coo_array((mesh.edge_lengths * (1 + (2.0 - 1) * (seen[x] + seen[y]) / 2), (x, y)),
-                               shape=(n, n)))
-
-
-FINE = 1 / 3                         # of the mean density, in length: coarser triangles ask for one more seam
+    return csr_array(coo_array((mesh.edge_lengths * (1 + (seen[x] + seen[y]) / 2), (x, y)), shape=(n, n)))
 
 
 @dataclass(frozen=True, eq=False)
@@ -145,8 +139,6 @@ class Chart:
 
 def make_chart(mesh: Mesh, seams: Sequence[np.ndarray]) -> Chart:
     """A closed mesh cut along seams, a tree that must leave one disk, and laid flat in the unit square."""
-    from .flatten import flatten
-
     faces, corner = cut(mesh, seams)
     disk = Mesh(mesh.vertices[corner], faces)
     euler = len(disk.vertices) - len(disk.edges) + len(disk.faces)
@@ -175,18 +167,51 @@ def automatic_chart(mesh: Mesh, skeleton: Skeleton, rounds: int = 4) -> Chart:
 
 
 def crowded_places(mesh: Mesh, density: np.ndarray) -> list[int]:
-    """A vertex of the smallest triangle of every region that is drawn smaller than `FINE`."""
-    crowded = np.flatnonzero(density < FINE)
-    part, old = mesh.submesh(crowded)
-    region = part.vertex_component[part.faces[:, 0]]
-    return [int(old[part.faces[np.flatnonzero(region == k)[density[crowded][region == k].argmin()], 0]])
-            for k in np.unique(region)]
+    """A vertex of the smallest triangle of every region that is drawn smaller than a third of the mean, in length."""
+    crowded = np.flatnonzero(density < 1 / 3)
+    region = mesh.submesh(crowded)[0]
+    region_of = region.vertex_component[region.faces[:, 0]]
+    return [int(mesh.faces[mine[density[mine].argmin()], 0])
+            for mine in (crowded[region_of == k] for k in np.unique(region_of))]
 
 
 def densities(mesh: Mesh, chart: Chart) -> np.ndarray:
     """(F,) how large each triangle is drawn against the mean of the surface, in length."""
     drawn = _twice_area(*chart.uv[chart.faces].swapaxes(0, 1)) / 2
     return np.sqrt(drawn / mesh.face_areas * mesh.face_areas.sum() / drawn.sum())
+
+
+def flatten(mesh: Mesh) -> np.ndarray:
+    """Places in the plane (N, 2) of a surface with one border, scaled to its area, one-to-one.
+
+    From an embedding of Tutte on, libigl's SLIM lowers the symmetric Dirichlet energy. Its steps invert no triangle;
+    each goes only so far that the border does not cross itself.
+    """
+    import igl
+
+    border = mesh.boundary_loops[0]
+    uv = tutte(mesh, border)
+    uv *= np.sqrt(2 * mesh.face_areas.sum() / _twice_area(*uv[mesh.faces].swapaxes(0, 1)).sum())
+    vertices, faces = np.asfortranarray(mesh.vertices), np.asfortranarray(mesh.faces.astype(np.int32))
+    for _ in range(100):
+        slim = igl.slim_precompute(vertices, faces, np.asfortranarray(uv), igl.MappingEnergyType.SYMMETRIC_DIRICHLET,
+                                   np.zeros(0, dtype=np.int32), np.zeros((0, 2), order="F"), 0.0)
+        step = np.asarray(igl.slim_solve(slim, 1))[:, :2] - uv
+        while crossings((uv + step)[border]):
+            step /= 2
+        uv = uv + step
+        if np.linalg.norm(step, axis=1).max() < 1e-3 * mesh.mean_edge:
+            break
+    return uv
+
+
+def tutte(mesh: Mesh, border: np.ndarray) -> np.ndarray:
+    """The embedding (N, 2) with the border on a circle and every other vertex in the mean of its neighbours."""
+    sides = np.linalg.norm(mesh.vertices[border] - np.roll(mesh.vertices[border], -1, axis=0), axis=1)
+    angle = 2 * np.pi * np.r_[0, np.cumsum(sides)[:-1]] / sides.sum()
+    uv = np.zeros((len(mesh.vertices), 2))
+    uv[border] = np.stack([np.cos(angle), np.sin(angle)], axis=1)
+    return sparse.harmonic(mesh.vertex_adjacency, uv, np.isin(np.arange(len(uv)), border))
 
 
 def fill_square(uv: np.ndarray, mesh: Mesh) -> np.ndarray:
@@ -197,7 +222,7 @@ def fill_square(uv: np.ndarray, mesh: Mesh) -> np.ndarray:
     extent = np.ptp(places, axis=1).max(axis=1)
     best = places[extent.argmin()]
     middle = (best.min(axis=0) + best.max(axis=0)) / 2
-    return 0.5 + (best - middle) * (1 - 2 * 6 / 1024) / extent.min()    # left free around the chart
+    return 0.5 + (best - middle) * (1 - 2 * 6 / 1024) / extent.min()    # six pixels of 1,024 are left free around it
 
 
 def chart_problem(mesh: Mesh, chart: Chart) -> str | None:
@@ -206,8 +231,6 @@ def chart_problem(mesh: Mesh, chart: Chart) -> str | None:
     A chart is one disk inside the unit square, no triangle inverted, whose border does not meet itself: then it
     is one-to-one.
     """
-    from .flatten import crossings, orientation
-
     if chart.faces.shape != mesh.faces.shape:
         return f"it has {len(chart.faces)} triangles, the mesh {len(mesh.faces)}"
     if not (np.isfinite(chart.uv).all() and (chart.uv >= 0).all() and (chart.uv <= 1).all()):
@@ -236,3 +259,36 @@ def barycentric(points: np.ndarray, a: np.ndarray, b: np.ndarray, c: np.ndarray)
     """(n, 3) where points lie in triangles of the plane, negative outside."""
     parts = np.stack([_twice_area(points, b, c), _twice_area(points, c, a), _twice_area(points, a, b)], axis=1)
     return parts / _twice_area(a, b, c)[:, None]
+
+
+def crossings(loop: np.ndarray) -> bool:
+    """Whether a closed polygon (n, 2) meets itself other than where its sides follow each other, exactly."""
+    a, b = loop, np.roll(loop, -1, axis=0)
+    n = len(loop)
+    low, high = np.minimum(a, b), np.maximum(a, b)
+    near = (low[:, None] <= high[None]).all(axis=2) & (low[None] <= high[:, None]).all(axis=2)
+    i, j = np.nonzero(np.triu(near, 2))
+    apart = (j - i) % n != n - 1
+    i, j = i[apart], j[apart]
+
+    met = _across(a[i], b[i], a[j], b[j]) <= 0
+    i, j = i[met], j[met]
+    return bool((_across(a[j], b[j], a[i], b[i]) <= 0).any())
+
+
+def _across(a: np.ndarray, b: np.ndarray, c: np.ndarray, d: np.ndarray) -> np.ndarray:
+    """(n,) -1 where c and d lie on different sides of the line ab, 0 where one of them lies on it, else 1."""
+    return orientation(a, b, c) * orientation(a, b, d)
+
+
+def orientation(a: np.ndarray, b: np.ndarray, c: np.ndarray) -> np.ndarray:
+    """(n,) the exact sign of the area of triangles in the plane: 1 counter-clockwise, 0 without area, -1 clockwise."""
+    first = (b[:, 0] - a[:, 0]) * (c[:, 1] - a[:, 1])
+    second = (b[:, 1] - a[:, 1]) * (c[:, 0] - a[:, 0])
+    sign = np.sign(first - second).astype(int)
+    # else the sign is worked out in fractions
+    for k in np.flatnonzero(np.abs(first - second) <= 1e-15 * (np.abs(first) + np.abs(second))):
+        (ax, ay), (bx, by), (cx, cy) = (map(Fraction, map(float, p[k])) for p in (a, b, c))
+        area = (bx - ax) * (cy - ay) - (by - ay) * (cx - ax)
+        sign[k] = (area > 0) - (area < 0)
+    return sign

@@ -1,7 +1,9 @@
-"""Files of control models: our own, and skinned meshes of other programs."""
+"""Files of control models: our own, the generic humanoid among them, and skinned meshes of other programs."""
 from __future__ import annotations
 
-from dataclasses import dataclass
+import json
+from dataclasses import dataclass, replace
+from functools import lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -29,12 +31,10 @@ def read_control(path: str | Path) -> ControlModel:
     landmarks. Joints that carry no triangle are left out. Without texture coordinates a chart is made. StorageError
     says what is wrong with a file.
     """
-    path = Path(path)
-    if path.suffix.lower() == ".npz":
-        return _load(path)
-    if path.suffix.lower() == ".glb":
-        return read_skinned(path)
-    raise storage.StorageError(f"{path}: expected a control model in .npz or a skinned mesh in .glb")
+    readers = {".npz": _load, ".glb": _read_skinned}
+    if Path(path).suffix.lower() not in readers:
+        raise storage.StorageError(f"{path}: expected a control model in .npz or a skinned mesh in .glb")
+    return readers[Path(path).suffix.lower()](Path(path))
 
 
 def write_control(control: ControlModel, path: str | Path) -> None:
@@ -50,7 +50,7 @@ def write_control(control: ControlModel, path: str | Path) -> None:
         {"names": list(skeleton.names), "segments": list(control.segments), "landmarks": list(control.landmarks)})
 
 
-def _load(path: str | Path) -> ControlModel:
+def _load(path: Path) -> ControlModel:
     """A file of `write_control`."""
     header, arrays = storage.load(path, KIND, (VERSION,))
     with storage.taking_apart(path, "a whole control model"):
@@ -89,8 +89,7 @@ class _Corners:
     faces: np.ndarray
 
 
-def read_skinned(path: Path) -> ControlModel:
-    """The control model of a GLB file, as `read_control`."""
+def _read_skinned(path: Path) -> ControlModel:
     data = storage.read_bytes(path, WHAT, MeshFileError)
     tree, binary = glb.chunks_of(path, data)
     with storage.taking_apart(path, WHAT, MeshFileError):
@@ -101,8 +100,9 @@ def read_skinned(path: Path) -> ControlModel:
             raise ValueError(f"joint {_name(tree, missing[0])} does not stand in the scene")
         matrices = np.stack([places[number] for number in skin["joints"]])
         corners = _corners(tree, binary, glb.item(tree["meshes"], mesh_node["mesh"]), len(matrices))
-        return _control(_as_it_stands(tree, binary, skin, matrices, corners), matrices[:, :3, 3],
-                        _parents(tree, skin["joints"]), [_name(tree, number) for number in skin["joints"]])
+        return _control(replace(corners, points=_as_it_stands(tree, binary, skin, matrices, corners)),
+                        matrices[:, :3, 3], _parents(tree, skin["joints"]),
+                        [_name(tree, number) for number in skin["joints"]])
 
 
 def _skinned(tree: dict[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
@@ -119,13 +119,13 @@ def _skinned(tree: dict[str, Any]) -> tuple[dict[str, Any], dict[str, Any]]:
 def _corners(tree: dict[str, Any], binary: bytes, mesh: dict[str, Any], joints: int) -> _Corners:
     """All primitives of a mesh one after the other: materials do not part a control mesh."""
     found = [_primitive(tree, binary, primitive, joints) for primitive in mesh["primitives"]]
-    starts = np.cumsum([0] + [len(part.points) for part in found])
     uv = [part.uv for part in found if part.uv is not None]
     if 0 < len(uv) < len(found):
         raise ValueError("some of its primitives have texture coordinates and some have none")
-    return _Corners(np.concatenate([part.points for part in found]), np.concatenate([part.weights for part in found]),
-                    np.concatenate(uv) if uv else None,
-                    np.concatenate([part.faces + start for part, start in zip(found, starts, strict=False)]))
+    points, weights = (np.concatenate([getattr(part, name) for part in found]) for name in ("points", "weights"))
+    starts = np.cumsum([0] + [len(part.points) for part in found])
+    faces = np.concatenate([part.faces + start for part, start in zip(found, starts, strict=False)])
+    return _Corners(points, weights, np.concatenate(uv) if uv else None, faces)
 
 
 def _primitive(tree: dict[str, Any], binary: bytes, primitive: dict[str, Any], joints: int) -> _Corners:
@@ -162,8 +162,8 @@ def _primitive(tree: dict[str, Any], binary: bytes, primitive: dict[str, Any], j
 
 
 def _as_it_stands(tree: dict[str, Any], binary: bytes, skin: dict[str, Any], matrices: np.ndarray, corners: _Corners
-                  ) -> _Corners:
-    """The vertices where the joints of the scene carry them, which is what every program shows."""
+                  ) -> np.ndarray:
+    """Where the joints of the scene carry the vertices (n, 3), which is what every program shows."""
     motion = matrices
     if "inverseBindMatrices" in skin:
         inverse = glb.accessor(tree, binary, skin["inverseBindMatrices"], "MAT4").astype(np.float64)
@@ -172,19 +172,18 @@ def _as_it_stands(tree: dict[str, Any], binary: bytes, skin: dict[str, Any], mat
     points = np.einsum("nj,jab,nb->na", corners.weights, motion, one, optimize=True)[:, :3]
     if not np.isfinite(points).all():
         raise ValueError(f"{(~np.isfinite(points).all(axis=1)).sum()} vertices are not finite")
-    return _Corners(points, corners.weights, corners.uv, corners.faces)
+    return np.asarray(points)
 
 
 def _parents(tree: dict[str, Any], joints: list[int]) -> np.ndarray:
     """(J,) the joint next above every joint, -1 where there is none."""
     above = {child: number for number, node in enumerate(tree["nodes"]) for child in node.get("children", [])}
-    index = {number: j for j, number in enumerate(joints)}
     out = []
     for number in joints:
         up = above.get(number)
-        while up is not None and up not in index:
+        while up is not None and up not in joints:
             up = above.get(up)
-        out.append(-1 if up is None else index[up])
+        out.append(-1 if up is None else joints.index(up))
     return np.array(out)
 
 
@@ -194,19 +193,20 @@ def _name(tree: dict[str, Any], number: int) -> str:
 
 def _control(corners: _Corners, places: np.ndarray, parents: np.ndarray, names: list[str]) -> ControlModel:
     mesh, weights, chart = _welded(corners)
-    problem = surface_problem(mesh) or (chart_problem(mesh, chart) if chart else None)
+    problem = surface_problem(mesh)
     if problem:
-        raise ValueError(f"not usable as a control mesh: {problem}" if surface_problem(mesh) else
-                         f"its texture coordinates are not usable: {problem}; without any, a chart is made")
+        raise ValueError(f"not usable as a control mesh: {problem}")
+    problem = chart_problem(mesh, chart) if chart else None
+    if problem:
+        raise ValueError(f"its texture coordinates are not usable: {problem}; without any, a chart is made")
     up = turn_up(2)                                                    # z up, as the people
     mesh, places = mesh.with_vertices(mesh.vertices @ up), places @ up
     kept, parents, weights, part_of_face = _with_triangles(mesh, weights, parents)
     joints, names = places[kept], [names[j] for j in kept]
     distinct = tuple(name if names.count(name) == 1 else f"{name} {k}" for k, name in enumerate(names))
-    skeleton = Skeleton(part_of_face, parents, joints, distinct)
-    joints[0] = mesh.vertices[skeleton.part_of_vertex(mesh) == 0].mean(axis=0)
-    skeleton = Skeleton(part_of_face, parents, joints, skeleton.names)
-    J = len(parents)
+    in_root = Skeleton(part_of_face, parents, joints).part_of_vertex(mesh) == 0
+    joints[0] = mesh.vertices[in_root].mean(axis=0)
+    skeleton, J = Skeleton(part_of_face, parents, joints, distinct), len(parents)
     control = ControlModel(mesh, skeleton, strongest(weights), chart or automatic_chart(mesh, skeleton), {},
                            (np.eye(3),) * J, (np.array([[-np.pi, np.pi]] * 3),) * J, skeleton.names, np.arange(J))
     problem = control_problem(control)
@@ -222,47 +222,61 @@ def _welded(corners: _Corners) -> tuple[Mesh, np.ndarray, Chart | None]:
     faces = place[corners.faces]
     whole = (faces != np.roll(faces, 1, axis=1)).all(axis=1)
     faces, at_corners = faces[whole], corners.faces[whole]
-    used = np.unique(faces)
-    number = np.zeros(len(first), dtype=np.int64)
-    number[used] = np.arange(len(used))
-    mesh = Mesh(corners.points[first[used]], number[faces])
+    used, number = np.unique(faces, return_inverse=True)
+    mesh = Mesh(corners.points[first[used]], number.reshape(-1, 3))
     chart = None
     if corners.uv is not None:
         rows = np.column_stack([place, np.round(corners.uv * 2**20)])
         _, once, row = np.unique(rows, axis=0, return_index=True, return_inverse=True)
-        chart_faces = row.reshape(-1)[at_corners]
-        kept, renumbered = np.unique(chart_faces, return_inverse=True)
-        chart = Chart(corners.uv[once[kept]], renumbered.reshape(-1, 3))
+        kept, number = np.unique(row.reshape(-1)[at_corners], return_inverse=True)
+        chart = Chart(corners.uv[once[kept]], number.reshape(-1, 3))
     return mesh, corners.weights[first[used]], chart
 
 
 def _with_triangles(mesh: Mesh, weights: np.ndarray, parents: np.ndarray
                     ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray]:
     """The joints (k,) that carry some triangle more than any other does, parents first; their parents, weights (N, k)
-    and the part of every triangle.
-
-    What the other joints carry goes to the next one above. Where more than one tree is left, the others hang on the one
-    with most triangles.
+    and the part of every triangle. What the others carry goes to the next one above; where more than one tree is left,
+    all hang on the one with most triangles.
     """
-    wanted = weights[mesh.faces].mean(axis=1)
-    own = np.bincount(wanted.argmax(axis=1), minlength=len(parents)) > 0
+    carrier = weights[mesh.faces].mean(axis=1).argmax(axis=1)
+    size = np.bincount(carrier, minlength=len(parents))
     heir = np.arange(len(parents))
     for j in range(len(parents)):
-        while heir[j] >= 0 and not own[heir[j]]:
+        while heir[j] >= 0 and not size[heir[j]]:
             heir[j] = parents[heir[j]]
-    size = np.bincount(wanted.argmax(axis=1), minlength=len(parents))
-    tops = [j for j in np.flatnonzero(own) if parents[j] < 0 or heir[parents[j]] < 0]
+    own = np.flatnonzero(size)
+    tops = [j for j in own if parents[j] < 0 or heir[parents[j]] < 0]
     root = max(tops, key=lambda j: size[j])
-    above = {j: -1 if j == root else root if j in tops else heir[parents[j]] for j in np.flatnonzero(own).tolist()}
-    order, ahead = [], [root]
+    above = {j: -1 if j == root else root if j in tops else heir[parents[j]] for j in own.tolist()}
+    kept, ahead = [], [root]
     while ahead:                                                       # in the order of the file, parents first
-        order.append(ahead.pop())
-        ahead += [j for j in reversed(above) if above[j] == order[-1]]
-    kept = np.array(order)
+        kept.append(ahead.pop())
+        ahead += [j for j in reversed(above) if above[j] == kept[-1]]
     index = np.full(len(parents), -1)
     index[kept] = np.arange(len(kept))
     heir[heir < 0] = root
-    tree = np.array([-1 if j == root else index[above[j]] for j in order])
     gathered = np.zeros((len(weights), len(kept)))
     np.add.at(gathered.T, index[heir], weights.T)
-    return kept, tree, gathered, index[wanted.argmax(axis=1)]
+    return np.array(kept), np.array([-1 if j == root else index[above[j]] for j in kept]), gathered, index[carrier]
+
+
+STORED = Path(__file__).with_name("humanoid.npz")           # made by tests/humanoid_maker.py
+
+
+@lru_cache(maxsize=1)
+def humanoid() -> ControlModel:
+    """The generic humanoid, the average of a man and a woman of 1.69 m, arms and legs a little apart.
+
+    z is up, it faces -y and stands on z = 0, its left side is at +x. Its joints turn and its segments stretch as in the
+    paper: with the place of the root 38 parameters of pose, and 9 lengths.
+
+    [Statues] Section 3.1
+    """
+    return read_control(STORED)
+
+
+@lru_cache(maxsize=1)
+def humanoid_markers() -> dict[str, int]:
+    """Label -> vertex of 41 motion-capture markers, labelled as in the CMU recordings."""
+    return dict(json.loads(STORED.with_name("humanoid_markers.json").read_text(encoding="utf-8")))

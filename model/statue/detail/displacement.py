@@ -1,8 +1,7 @@
 """The displacement map of a scan over a control model, and where the scan is not one-to-one with it [Statues].
 
-Every pixel is a place of the control mesh; its height is where the interpolated normal there crosses the scan: Eq. 19
-solved at the pixel itself. The paper solves it at the scan's vertices and interpolates between them, which is the
-same where the scan's triangles are small against the control mesh's, and depends on their shape where they are not.
+Every pixel's height is where the interpolated normal there crosses the scan: Eq. 19 at the pixel itself. The paper
+solves it at the scan's vertices and interpolates, which is the same where the scan's triangles are small.
 """
 from __future__ import annotations
 
@@ -11,21 +10,22 @@ from dataclasses import dataclass, replace
 from typing import Annotated
 
 import numpy as np
-from scipy.sparse import coo_array
+from scipy.sparse import coo_array, csc_array, csr_array, diags_array
 from scipy.sparse.csgraph import connected_components
+from scipy.spatial import cKDTree
 
 from scanprep.geometry import sparse
 from scanprep.geometry.mesh import Mesh
-from scanprep.geometry.surface import Rays, Surface
+from scanprep.geometry.surface import OrientedPoints, Rays, Surface
 from scanprep.ranges import FLAG, Positive, Range, Settings
+from scanprep.threads import search_threads
 
 from ..control.model import FOLDED, HOLE, MEASURED, OUTSIDE, ControlModel, DisplacementMap
 from .normal_volume import Crossings, find_crossings, interpolate, limits, not_inverted, outer_layers
 from .texels import Lattice, Texels, find_texels
-from .vectors import bend_over_folds
 
 Progress = Callable[[int, int], None]
-FILL_LEVEL = 3                       # of the subdivision on which holes are filled: edges of some 5 mm
+SPACING = 0.002                      # metres between the places of the scan that draw the surface over folds
 
 
 @dataclass(frozen=True)
@@ -110,7 +110,7 @@ def unfold_control(control: ControlModel, scan: Mesh, config: DisplacementConfig
             break
         best, before = control, without
         if number < rounds and without > 0:
-            drawn, u = _over_folds(Lattice(control.mesh, control.chart, FILL_LEVEL), scan, found, config.reach)
+            drawn, u = _over_folds(Lattice(control), scan, found, config.reach)
             count = len(control.mesh.vertices)                   # the first of the lattice
             moved = np.where(drawn[:count, None], u[:count], 0)
             control = replace(control, mesh=control.mesh.with_vertices(control.mesh.vertices + moved))
@@ -206,10 +206,11 @@ def _without_data(mesh: Mesh, scan: Mesh, texels: Texels, empty: np.ndarray, rea
 
 def _filled(control: ControlModel, texels: Texels, heights: np.ndarray, known: np.ndarray) -> np.ndarray:
     """Heights where none is known, from around them: harmonic on the control surface, so across seams too."""
-    lattice = Lattice(control.mesh, control.chart, FILL_LEVEL)
+    lattice, out = Lattice(control), heights.copy()
     values, sure = lattice.gather(texels, heights, known)
     values = sparse.harmonic(lattice.fine.vertex_adjacency, values[:, None], sure)[:, 0]
-    return np.where(known, heights, lattice.sample(values, texels.faces, texels.bary))
+    out[~known] = lattice.sample(values, texels.faces[~known], texels.bary[~known])
+    return out
 
 
 def _over_folds(lattice: Lattice, scan: Mesh, found: Heights, reach: float) -> tuple[np.ndarray, np.ndarray]:
@@ -222,15 +223,92 @@ def _over_folds(lattice: Lattice, scan: Mesh, found: Heights, reach: float) -> t
 
 def _vectors(control: ControlModel, scan: Mesh, found: Heights, reach: float) -> np.ndarray:
     """What is to be added (n, 3) to the heights of pixels in and around folds."""
-    lattice, texels = Lattice(control.mesh, control.chart, 4), found.texels
+    lattice, texels = Lattice(control, 4), found.texels
     drawn, u = _over_folds(lattice, scan, found, reach)
-    out = np.zeros((len(found.heights), 3))
-    vertex, _ = lattice.places(texels.faces, texels.bary)
-    which = np.flatnonzero(drawn[vertex].any(axis=1))
+    near = np.unique(lattice.subdivision.face_parent[drawn[lattice.fine.faces].any(axis=1)])
+    which = np.flatnonzero(np.isin(texels.faces, near))
+    which = which[lattice.sample(drawn.astype(float), texels.faces[which], texels.bary[which]) > 0]
     faces, bary = texels.faces[which], texels.bary[which]
-    _, n = interpolate(control.mesh, faces, bary)
-    out[which] = lattice.sample(u, faces, bary) - found.heights[which, None] * n
+    out = np.zeros((len(found.heights), 3))
+    out[which] = lattice.sample(u, faces, bary) - found.heights[which, None] * interpolate(control.mesh, faces, bary)[1]
     return out
+
+
+def bend_over_folds(lattice: Lattice, scan: Mesh, heights: np.ndarray, folded: np.ndarray, reach: float
+                    ) -> tuple[np.ndarray, np.ndarray]:
+    """Which fine vertices (n,) of a lattice are drawn onto the scan, and the displacements (n, 3) of all, metres in the
+    axes of the world; from `heights` (n,), smooth across folds, and which of them are `folded` (n,).
+
+    Each vertex is drawn to the closest place whose normal agrees, held by the thin-plate energy of its displacement,
+    which is solved for (implicit steps) and made softer from step to step. Around folds it stays where heights say.
+    """
+    fine = lattice.fine
+    p, n = interpolate(lattice.control.mesh, lattice.subdivision.parent, lattice.subdivision.bary)
+    start = p + heights[:, None] * n
+    near = fine.vertex_adjacency
+    drawn = folded
+    for _ in range(5):    # vertices around a fold that are drawn with it
+        drawn = drawn | (near @ drawn.astype(float) > 0)
+    free = np.flatnonzero(drawn)
+    if not len(free):
+        return drawn, start - p
+    used = np.flatnonzero(drawn[fine.faces].any(axis=1))
+    L = csr_array(diags_array(1 / near.sum(axis=1)) @ near - diags_array(np.ones(len(p))))
+    held = start.copy()
+    held[free] = 0
+    of_free = csc_array(L)[:, free]
+    bending, pull = csc_array(of_free.T @ of_free), -of_free.T @ (L @ held)
+    places, facing = _places(scan, start[free], reach)
+    if not len(places):
+        return drawn, start - p
+    target = OrientedPoints(places, facing, 0.01)    # metres that a change of the normal by 60 degrees is worth
+    surface = start.copy()
+    for stiffness in (100.0, 30.0, 10.0, 3.0, 1.0, 0.3, 0.1, 0.03):    # of the thin plate
+        for _ in range(3):
+            normals = Mesh(surface, fine.faces[used]).vertex_normals[free]
+            match = target.match(surface[free], normals, reach, 0.3)
+            onto = _onto(places[match.index], facing[match.index], surface[free])
+            w = np.where(match.valid, 1.0, 0.001)[:, None]    # lightly held where nothing matches
+            wanted = np.where(match.valid[:, None], onto, surface[free])
+            solver = sparse.Factored(csc_array(stiffness * bending + diags_array(w[:, 0])))
+            surface[free] = solver.solve(w * wanted + stiffness * pull)
+    better = _better(lattice, scan, start, surface, drawn)
+    return drawn & better, np.where(better[:, None], surface, start) - p
+
+
+def _better(lattice: Lattice, scan: Mesh, before: np.ndarray, after: np.ndarray, drawn: np.ndarray) -> np.ndarray:
+    """(n,) bool: vertices of those patches of drawn ones that have come nearer to the scan, in the mean square."""
+    only = diags_array(drawn.astype(float))
+    _, patch = connected_components(only @ lattice.fine.vertex_adjacency @ only, directed=False)
+    faces = lattice.fine.faces[drawn[lattice.fine.faces].all(axis=1)]
+    surface, of = Surface(scan), patch[faces[:, 0]]
+    error = []
+    for vertices in (before, after):
+        there = Mesh(vertices, faces)
+        far = surface.closest(there.corners.mean(axis=1)).distances
+        area = np.bincount(of, there.face_areas, len(patch))
+        error.append(np.bincount(of, there.face_areas * far**2, len(patch)) / np.maximum(area, 1e-30))
+    return (error[1] < error[0])[patch]
+
+
+def _places(scan: Mesh, points: np.ndarray, reach: float) -> tuple[np.ndarray, np.ndarray]:
+    """Places (m, 3) spread over the scan within reach of points, one for a square of SPACING, with normals (m, 3)."""
+    middle = scan.corners.mean(axis=1)
+    far = reach + np.sqrt(((scan.corners[:, 0] - middle)**2).sum(axis=1).max())
+    apart, _ = cKDTree(points).query(middle, distance_upper_bound=far, workers=search_threads(len(middle)))
+    around = scan.submesh(np.flatnonzero(np.isfinite(apart)))[0]
+    if not len(around.faces) or not around.face_areas.sum():
+        return np.zeros((0, 3)), np.zeros((0, 3))
+    count = int(np.ceil(around.face_areas.sum() / SPACING**2))
+    places, faces, _ = around.sample(count, np.random.default_rng(0))
+    return places, around.face_normals[faces]
+
+
+def _onto(q: np.ndarray, m: np.ndarray, points: np.ndarray) -> np.ndarray:
+    """Points moved into the planes through their matches (n, 3), and no farther than SPACING from these."""
+    off = points - q
+    slip = off - np.einsum("nd,nd->n", off, m)[:, None] * m
+    return q + slip * np.minimum(1, SPACING / np.maximum(np.linalg.norm(slip, axis=1), 1e-12))[:, None]
 
 
 def coverage_shares(control: ControlModel, map: DisplacementMap) -> dict[str, float]:

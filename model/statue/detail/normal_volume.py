@@ -1,22 +1,19 @@
 """Space around a control mesh: a triangle, a place on it and a height along its interpolated normal [Statues].
 
-The normals of a triangle's corners are interpolated linearly and not made unit length again, as in Eq. 20: only so is a
-point of the volume a linear function of its place for a given height, and heights are what the corners' normals say.
-
-The paper finds the height from the plane that is parallel to the triangle and passes through the point and a
-displaced corner. That is exact only where the three corners' normals rise equally fast above the triangle.
-Eliminating the place from Eq. 19 instead says that the point lies in the plane of the three corners
-displaced by d, det[v_r + d n_r - p, v_s + d n_s - p, v_t + d n_t - p] = 0: a cubic in d, solved here.
+Normals are interpolated linearly and not made unit length again, as in Eq. 20. Eq. 19 without its place says that a
+point lies in the plane of three corners displaced by d, det[v_r + d n_r - p, v_s + d n_s - p, v_t + d n_t - p] = 0: a
+cubic in d, solved here; the paper's plane parallel to the triangle is exact only where three normals rise alike.
 """
 from __future__ import annotations
 
 from dataclasses import dataclass
+from itertools import chain
 
 import numpy as np
 from scipy.spatial import cKDTree
 
 from scanprep.geometry.mesh import Mesh
-from scanprep.geometry.surface import Rays, checked_points
+from scanprep.geometry.surface import Rays
 
 
 @dataclass(frozen=True, eq=False)
@@ -41,17 +38,14 @@ def interpolate(mesh: Mesh, faces: np.ndarray, bary: np.ndarray) -> tuple[np.nda
             np.einsum("nc,ncd->nd", bary, mesh.vertex_normals[corners]))
 
 
-def from_normal_volume(mesh: Mesh, coordinates: NormalCoordinates) -> np.ndarray:
-    """The points (n, 3) of normal coordinates; NaN where they are in no triangle's volume. [Statues] Eq. 19"""
-    p, n = interpolate(mesh, coordinates.faces, coordinates.bary)
-    return p + coordinates.heights[:, None] * n
+def from_normal_volume(mesh: Mesh, faces: np.ndarray, bary: np.ndarray, heights: np.ndarray) -> np.ndarray:
+    """The points (n, 3) at heights (n,), metres, above places of a control mesh. [Statues] Eq. 19"""
+    p, n = interpolate(mesh, faces, bary)
+    return p + heights[:, None] * n
 
 
 def to_normal_volume(mesh: Mesh, points: np.ndarray, reach: float) -> NormalCoordinates:
     """Every point's (n, 3) triangle, place and least height, at most `reach` up or down. [Statues] Eq. 19, 20"""
-    points = checked_points(points)
-    if not 0 < reach < np.inf:
-        raise ValueError(f"reach: expected a length above 0, got {reach}")
     count = len(points)
     face, bary, height = np.full(count, -1), np.zeros((count, 3)), np.full(count, np.nan)
     which, triangle = _near(mesh, points, reach)
@@ -94,34 +88,23 @@ def _cubic(v: np.ndarray, n: np.ndarray) -> np.ndarray:
 
 
 def _roots(c: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-    """Real roots in [-1, 1] of cubics (k, 4), whose leading coefficient may vanish.
+    """Real roots in [-1, 1] of cubics (k, 4), whose leading coefficient may vanish, and of which cubic each is.
 
-    Between its turning points a cubic has one root or none: there Newton's steps, halving where they would leave.
+    Between its turning points a cubic has one root or none, which is found by halving.
     """
     a, b, k = 3 * c[:, 3], c[:, 2], c[:, 1]                  # its derivative is a x² + 2 b x + k
-    root = np.sqrt(np.maximum(b * b - a * k, 0))
-    q = -(b + np.copysign(root, b))
+    q = -(b + np.copysign(np.sqrt(np.maximum(b * b - a * k, 0)), b))
     with np.errstate(divide="ignore", invalid="ignore"):
         turns = np.sort(np.clip(np.nan_to_num(np.stack([q / a, k / q], axis=1), nan=1.0), -1, 1), axis=1)
     ends = np.column_stack([-np.ones(len(c)), turns, np.ones(len(c))])
     at = _value(c[:, None], ends)
     cubic, piece = np.nonzero((np.signbit(at[:, :-1]) != np.signbit(at[:, 1:])) & (ends[:, :-1] < ends[:, 1:]))
-    low, high, c = ends[cubic, piece], ends[cubic, piece + 1], c[cubic]
-    rising = at[cubic, piece] < 0
-    x = 0.5 * (low + high)
-    for _ in range(60):    # each at least halves the interval, most stop after 8
-        value = _value(c, x)
-        above = (value > 0) == rising
+    low, high, c, rising = ends[cubic, piece], ends[cubic, piece + 1], c[cubic], at[cubic, piece] < 0
+    for _ in range(54):                                      # to the last digit of a number near 1
+        x = 0.5 * (low + high)
+        above = (_value(c, x) > 0) == rising
         low, high = np.where(above, low, x), np.where(above, x, high)
-        with np.errstate(divide="ignore", invalid="ignore"):
-            step = x - value / (c[:, 1] + x * (2 * c[:, 2] + 3 * x * c[:, 3]))
-        inside = (step > low) & (step < high)
-        following = np.where(inside, step, 0.5 * (low + high))
-        done = np.abs(following - x).max(initial=0) < 1e-15
-        x = following
-        if done:
-            break
-    return cubic, x
+    return cubic, 0.5 * (low + high)
 
 
 def _value(c: np.ndarray, x: np.ndarray) -> np.ndarray:
@@ -133,16 +116,13 @@ def _near(mesh: Mesh, points: np.ndarray, reach: float) -> tuple[np.ndarray, np.
 
     The volume lies in the convex hull of the corners displaced up and down, so in its box and the ball around it.
     """
-    none = np.zeros(0, dtype=np.int64)
-    if not len(points) or not len(mesh.faces):
-        return none, none
     shift = reach * mesh.vertex_normals[mesh.faces]
     hull = np.concatenate([mesh.corners + shift, mesh.corners - shift], axis=1)
     low, high, center = hull.min(axis=1) - 1e-9, hull.max(axis=1) + 1e-9, hull.mean(axis=1)
     radius = np.linalg.norm(hull - center[:, None], axis=2).max(axis=1) + 1e-9
     near = cKDTree(points).query_ball_point(center, radius)
-    which = np.concatenate([none, *(np.array(found, dtype=np.int64) for found in near)])
     face = np.repeat(np.arange(len(near)), [len(found) for found in near])
+    which = np.fromiter(chain.from_iterable(near), np.int64, len(face))
     inside = ((points[which] > low[face]) & (points[which] < high[face])).all(axis=1)
     return which[inside], face[inside]
 
@@ -169,11 +149,10 @@ class Crossings:
     normal: np.ndarray   # (k,), which normal
     heights: np.ndarray  # (k,) metres
     cosines: np.ndarray  # (k,), between the normals of both; negative where the surface is met from inside
-    faces: np.ndarray    # (k,), triangle of the scan
 
     def pick(self, keep: np.ndarray) -> Crossings:
         """Only some of them."""
-        return Crossings(self.normal[keep], self.heights[keep], self.cosines[keep], self.faces[keep])
+        return Crossings(self.normal[keep], self.heights[keep], self.cosines[keep])
 
 
 def outer_layers(found: Crossings) -> Crossings:
@@ -191,7 +170,7 @@ def outer_layers(found: Crossings) -> Crossings:
     group = np.cumsum(begins) - 1
     count = np.maximum(np.bincount(group), 1)
     return Crossings(front.normal[begins], np.bincount(group, front.heights) / count,
-                     np.bincount(group, front.cosines) / count, front.faces[begins])
+                     np.bincount(group, front.cosines) / count)
 
 
 def find_crossings(scan: Mesh, rays: Rays, points: np.ndarray, normals: np.ndarray, reach: float) -> Crossings:
@@ -202,7 +181,8 @@ def find_crossings(scan: Mesh, rays: Rays, points: np.ndarray, normals: np.ndarr
     length = np.maximum(np.linalg.norm(normals, axis=1), 1e-12)
     along = normals / length[:, None]
     active, at = np.arange(len(points)), np.full(len(points), -reach)
-    found: list[tuple[np.ndarray, np.ndarray]] = []
+    none = np.zeros(0, dtype=int)
+    found = [(none, none)]
     for _ in range(30):
         face, far = rays.cast(points[active] + at[active, None] * along[active], along[active], 2 * reach)
         met = face >= 0
@@ -213,20 +193,19 @@ def find_crossings(scan: Mesh, rays: Rays, points: np.ndarray, normals: np.ndarr
         if not len(active):
             break
         found.append((active, face))
-    normal = np.concatenate([a for a, _ in found]) if found else np.zeros(0, dtype=int)
-    face = np.concatenate([f for _, f in found]) if found else np.zeros(0, dtype=int)
-    N, m = scan.face_normals[face], along[normal]
-    cosine = np.einsum("nd,nd->n", N, m)
+    normal, face = map(np.concatenate, zip(*found, strict=True))
+    N = scan.face_normals[face]
+    cosine = np.einsum("nd,nd->n", N, along[normal])
     away = np.einsum("nd,nd->n", scan.corners[face, 0] - points[normal], N)
     steep = np.abs(cosine) < 1e-3                           # seen from the edge: where, is not to be said
     height = away / np.where(steep, 1, cosine)
     order = np.lexsort((height, normal))
-    normal, height, cosine, face, steep = (v[order] for v in (normal, height, cosine, face, steep))
+    normal, height, cosine, steep = (v[order] for v in (normal, height, cosine, steep))
     again = np.zeros(len(normal), dtype=bool)
     # metres: met twice on a shared edge
     again[1:] = (normal[1:] == normal[:-1]) & (height[1:] - height[:-1] < 1e-6) & (cosine[1:] * cosine[:-1] > 0)
     keep = ~again & ~steep & (np.abs(height) <= reach)
-    return Crossings(normal[keep], (height / length[normal])[keep], cosine[keep], face[keep])
+    return Crossings(normal[keep], (height / length[normal])[keep], cosine[keep])
 
 
 def limits(control: Mesh, points: np.ndarray, normals: np.ndarray, reach: float) -> tuple[np.ndarray, np.ndarray]:

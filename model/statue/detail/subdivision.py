@@ -1,8 +1,6 @@
 """Control meshes split at their edges: everywhere alike, or where the surface asks for it; without a crack [Statues].
 
-A new vertex lies in the middle of an edge, so every vertex is a place on a control triangle, and it belongs to all
-triangles around it: where the chart has a seam there is one vertex and one place, taken from one of the sides.
-A closed mesh of V vertices without handles has 4 V - 6 after a split of every edge.
+A new vertex lies in the middle of an edge: a place on a control triangle, shared by all around it, across seams too.
 """
 from __future__ import annotations
 
@@ -61,12 +59,14 @@ class _Corners:
     uv: np.ndarray
 
 
+def chart_places(chart: Chart, faces: np.ndarray, bary: np.ndarray) -> np.ndarray:
+    """Texture coordinates (n, 2) of places on triangles. [Statues] Eq. 21"""
+    return np.einsum("nc,ncd->nd", bary, chart.uv[chart.faces[faces]])
+
+
 def subdivide(mesh: Mesh, chart: Chart, level: int) -> Subdivision:
-    """Every triangle in four, `level` times over; ValueError for a level below 0 or a chart of another mesh."""
-    now = _begin(mesh, chart, level)
-    for _ in range(level):
-        now = _split(now, np.ones(now.vertex.shape, dtype=bool), mesh)
-    return _finish(now)
+    """Every triangle in four, `level` times over."""
+    return _subdivided(mesh, chart, level, lambda now: np.ones(now.vertex.shape, dtype=bool))
 
 
 def subdivide_adaptive(mesh: Mesh, chart: Chart, displaced: Displaced, tolerance: float, level: int) -> Subdivision:
@@ -76,30 +76,19 @@ def subdivide_adaptive(mesh: Mesh, chart: Chart, displaced: Displaced, tolerance
     An edge is split if the surface is farther from it anywhere along it, or at a place inside a triangle beside it: a
     decision of the edge, the same for both sides, so that no vertex lies on a neighbour's edge.
     """
-    if not 0 < tolerance < np.inf:
-        raise ValueError(f"tolerance: expected a length above 0, got {tolerance}")
-    now = _begin(mesh, chart, level)
+    return _subdivided(mesh, chart, level, lambda now: _bent(now, displaced, tolerance))
+
+
+def _subdivided(mesh: Mesh, chart: Chart, level: int, choose: Callable[[_Corners], np.ndarray]) -> Subdivision:
+    """Sides (f, 3) that `choose` marks are split, `level` times over or until it marks none."""
+    now = _Corners(mesh.faces, chart.faces, np.tile(np.eye(3), (len(mesh.faces), 1, 1)), np.arange(len(mesh.faces)),
+                   chart.uv)
     for _ in range(level):
-        marked = _bent(now, displaced, tolerance)
+        marked = choose(now)
         if not marked.any():
             break
         now = _split(now, marked, mesh)
-    return _finish(now)
-
-
-def _begin(mesh: Mesh, chart: Chart, level: int) -> _Corners:
-    if chart.faces.shape != mesh.faces.shape:
-        raise ValueError(f"chart: expected one of {len(mesh.faces)} triangles as the mesh has, got {len(chart.faces)}")
-    if level < 0:
-        raise ValueError(f"level: expected 0 or more, got {level}")
-    return _Corners(mesh.faces, chart.faces, np.tile(np.eye(3), (len(mesh.faces), 1, 1)), np.arange(len(mesh.faces)),
-                    chart.uv)
-
-
-def _finish(now: _Corners) -> Subdivision:
-    count = now.vertex.max(initial=-1) + 1
     _, first = np.unique(now.vertex, return_index=True)     # the first triangle around a vertex places it
-    assert len(first) == count, "a split makes no vertex that no triangle uses"
     return Subdivision(now.vertex, now.parent[first // 3], now.bary.reshape(-1, 3)[first], now.parent,
                        Chart(now.uv, now.row))
 

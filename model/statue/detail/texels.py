@@ -1,15 +1,21 @@
-"""The pixels of a chart: places of the control mesh, inside it and a little beyond its borders."""
+"""Images over a chart: their pixels, inside it and a little beyond its borders; colours of a scan, and normals."""
 from __future__ import annotations
 
 from dataclasses import dataclass
 
 import numpy as np
 
+from scanprep.geometry import sparse
 from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.surface import Surface
+from scanprep.pictures.textures import Look, Texture, bilinear, padded
 
 from ..control.chart import Chart, barycentric
-from .subdivision import subdivide
+from ..control.model import ControlModel, DisplacementMap
+from .normal_volume import interpolate
+from .subdivision import Subdivision, chart_places, subdivide
+
+FILL_LEVEL = 3                       # of the subdivision on which holes are filled: edges of some 5 mm
 
 
 @dataclass(frozen=True, eq=False)
@@ -74,10 +80,12 @@ def continue_chart(mesh: Mesh, chart: Chart, uv: np.ndarray) -> tuple[np.ndarray
     The triangle at the nearest border goes on in its plane; what lies beyond the seam is laid onto the triangle on its
     other side, as if that were unfolded into the plane. At a border of the mesh itself the border's place is taken.
     """
+    import igl
+
     flat = chart.flat
     found = Surface(flat).closest(np.column_stack([uv, np.zeros(len(uv))]))
     face, side = found.faces, (np.argmin(found.bary, axis=1) + 1) % 3
-    other, back = _across(mesh)
+    other, back = igl.triangle_triangle_adjacency(mesh.faces)          # the triangle beyond each side, and its side
     beyond = np.where(flat.edge_use[flat.face_edges[face, side]] == 1, other[face, side], -1)
     bary = np.clip(found.bary, 0, None)
     seam = np.flatnonzero(beyond >= 0)
@@ -100,68 +108,122 @@ def continue_chart(mesh: Mesh, chart: Chart, uv: np.ndarray) -> tuple[np.ndarray
     return face, bary / bary.sum(axis=1, keepdims=True)
 
 
-def _across(mesh: Mesh) -> tuple[np.ndarray, np.ndarray]:
-    """The triangle beyond each side (F, 3) and which of its sides that is; -1 at a border."""
-    other, back = np.full(mesh.faces.shape, -1), np.full(mesh.faces.shape, -1)
-    order = np.argsort(mesh.face_edges.ravel(), kind="stable")
-    start = np.concatenate([[0], np.cumsum(mesh.edge_use)[:-1]])[mesh.edge_use == 2]
-    one, two = order[start], order[start + 1]
-    for a, b in ((one, two), (two, one)):
-        other.ravel()[a], back.ravel()[a] = np.divmod(b, 3)
-    return other, back
-
-
 class Lattice:
-    """A control mesh subdivided evenly, whose fine triangles are found by their place without a search: `subdivision`,
-    and `fine`, its vertices on the control mesh.
-    """
+    """A control mesh subdivided evenly: `subdivision`, and `fine`, its vertices on the control mesh."""
 
-    def __init__(self, mesh: Mesh, chart: Chart, level: int) -> None:
-        self.subdivision = subdivide(mesh, chart, level)
-        self.fine = self.subdivision.mesh(mesh)
-        self.mesh, self._chart, self._steps = mesh, chart, 2**level
-        corners = np.repeat(chart.uv[chart.faces[self.subdivision.face_parent]], 3, axis=0).swapaxes(0, 1)
-        fine_uv = self.subdivision.chart.uv[self.subdivision.chart.faces].reshape(-1, 2)
-        _, i, j = np.rint(barycentric(fine_uv, *corners) * self._steps).astype(int).reshape(-1, 3, 3).transpose(2, 0, 1)
-        parent = self.subdivision.face_parent[:, None]
-        self._vertex = np.full((len(mesh.faces), self._steps + 2, self._steps + 2), -1)
-        self._vertex[parent, i, j] = self.subdivision.faces
-
-    def places(self, faces: np.ndarray, bary: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """For places of the control mesh the three fine vertices (n, 3) around each, and their shares (n, 3)."""
-        x, y = np.clip(bary[:, 1:] * self._steps, 0, self._steps).T
-        i, j = np.minimum(x.astype(int), self._steps - 1), np.minimum(y.astype(int), self._steps - 1)
-        i, j = np.where(i + j >= self._steps, self._steps - 1 - j, i), j
-        i = np.maximum(i, 0)
-        x, y = x - i, y - j
-        upper = (x + y > 1) & (i + j + 2 <= self._steps)
-        one = np.stack([i + upper, j + upper], axis=1)
-        a = self._vertex[faces, one[:, 0], one[:, 1]]
-        b, c = self._vertex[faces, i + 1, j], self._vertex[faces, i, j + 1]
-        u, v = np.where(upper, 1 - y, x), np.where(upper, 1 - x, y)
-        share = np.clip(np.stack([1 - u - v, u, v], axis=1), 0, 1)
-        return np.stack([a, b, c], axis=1), share / share.sum(axis=1, keepdims=True)
+    def __init__(self, control: ControlModel, level: int = FILL_LEVEL) -> None:
+        self.control, self.subdivision = control, subdivide(control.mesh, control.chart, level)
+        self.fine = self.subdivision.mesh(control.mesh)
+        self._surface = Surface(self.fine)
 
     def sample(self, values: np.ndarray, faces: np.ndarray, bary: np.ndarray) -> np.ndarray:
         """Values (n,) or (n, k) at places of the control mesh, linear between those of the fine vertices."""
-        vertex, share = self.places(faces, bary)
-        return np.einsum("nc,nc...->n...", share, values[vertex])
+        found = self._surface.closest(interpolate(self.control.mesh, faces, bary)[0])
+        return np.einsum("nc,nc...->n...", found.bary, values[self.fine.faces[found.faces]])
 
     def gather(self, texels: Texels, values: np.ndarray, known: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        """What the pixels (n,) say of the fine vertices, and of which they say anything.
+        """What the pixels (n,) say of the fine vertices, from one side of a seam; whether all around it are known."""
+        uv = chart_places(self.control.chart, self.subdivision.parent, self.subdivision.bary)
+        image, sure = texels.image(np.where(known, values, 0.0), 0.0), texels.image(known.astype(float), 0.0)
+        return bilinear(image, uv), bilinear(sure, uv) > 1 - 1e-9
 
-        Bilinear, from one side of a seam; a vertex is known where all four pixels around it are.
-        """
-        size = texels.size
-        image, sure = np.zeros(size**2), np.zeros(size**2, dtype=bool)
-        image[texels.pixels], sure[texels.pixels] = np.where(known, values, 0), known
-        corners = self._chart.uv[self._chart.faces[self.subdivision.parent]]
-        x, y = (np.einsum("nc,ncd->nd", self.subdivision.bary, corners) * size - 0.5).T
-        left, low = np.floor(x).astype(int), np.floor(y).astype(int)
-        out, all_known = np.zeros(len(x)), np.ones(len(x), dtype=bool)
-        for dx in (0, 1):
-            for dy in (0, 1):
-                pixel = np.clip(size - 1 - low - dy, 0, size - 1) * size + np.clip(left + dx, 0, size - 1)
-                out += np.abs(1 - dx - (x - left)) * np.abs(1 - dy - (y - low)) * image[pixel]
-                all_known &= sure[pixel]
-        return out, all_known
+
+def scan_look(scan: Mesh | Texture) -> Look:
+    """The colours of a scan, of its vertices or its picture, at the closest place; weight 0 where it has none."""
+    mesh = scan.mesh if isinstance(scan, Texture) else scan
+    if not isinstance(scan, Texture) and mesh.colors is None:
+        raise ValueError("scan: expected colours of its vertices or a texture, found neither")
+    surface = Surface(mesh)
+
+    def look(places: np.ndarray, normals: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        found = surface.closest(places)
+        if isinstance(scan, Texture):
+            colors = scan.sample(found.faces, found.bary)
+        else:
+            assert mesh.colors is not None, "a scan without colours was refused"
+            colors = np.einsum("nc,ncd->nd", found.bary, mesh.colors[mesh.faces[found.faces]])
+        facing = np.einsum("nd,nd->n", mesh.face_normals[found.faces], normals)
+        # metres: farther away the scan does not say
+        return colors, ((found.distances < 0.01) & (facing > 0)).astype(float)
+    return look
+
+
+def bake_texture(control: ControlModel, map: DisplacementMap, look: Look) -> np.ndarray:
+    """(H, W, 3) uint8 colours over the chart of a control model, those of the displaced surface. Where `look` (places,
+    normals -> colours, weights) says nothing, they go over smoothly from those around, across seams too.
+    """
+    texels = find_texels(control.mesh, control.chart, len(map.heights))
+    p, n = interpolate(control.mesh, texels.faces, texels.bary)
+    places = p + map.heights.ravel()[texels.pixels, None] * n
+    if map.vectors is not None:
+        places += map.vectors.reshape(-1, 3)[texels.pixels]
+    colors, weight = look(places, n / np.maximum(np.linalg.norm(n, axis=1), 1e-12)[:, None])
+    known = weight > 0
+    if not known.all():
+        lattice = Lattice(control)
+        found = [lattice.gather(texels, colors[:, k], known) for k in range(3)]
+        values, sure = np.stack([value for value, _ in found], axis=1), found[0][1]
+        # where nothing at all is known
+        values = sparse.harmonic(lattice.fine.vertex_adjacency, np.where(sure[:, None], values, 0.6), sure)
+        colors[~known] = lattice.sample(values, texels.faces[~known], texels.bary[~known])
+    return texels.image((255 * np.clip(colors, 0, 1) + 0.5).astype(np.uint8))
+
+
+def vertex_of_row(mesh: Mesh, chart: Chart) -> np.ndarray:
+    """(M,) the vertex of every row of a chart's `uv`."""
+    out = np.zeros(len(chart.uv), dtype=np.int64)
+    out[chart.faces] = mesh.faces
+    return out
+
+
+def chart_tangents(mesh: Mesh, chart: Chart) -> np.ndarray:
+    """(M, 4) tangents at every row of a chart, as MikkTSpace makes them, which glTF and Blender go by.
+
+    Of each triangle the direction in which u grows, made perpendicular to the vertex normal, weighted by the
+    triangle's angle there; then the sign of `cross(normal, tangent) * sign`, the direction in which v grows.
+    """
+    x, n = mesh.corners, mesh.vertex_normals[mesh.faces]                 # (F, 3, 3)
+    uv = chart.uv[chart.faces]
+    (a, b), (p, q) = ((w[:, 1] - w[:, 0], w[:, 2] - w[:, 0]) for w in (uv, x))
+    area = a[:, 0] * b[:, 1] - a[:, 1] * b[:, 0]
+    along = (b[:, 1, None] * p - a[:, 1, None] * q) * np.sign(area)[:, None]
+    level = _unit(along[:, None] - np.einsum("fkd,fd->fk", n, along)[..., None] * n)
+    sides = [np.roll(x, -step, axis=1) - x for step in (1, 2)]
+    sides = [_unit(side - np.einsum("fkd,fkd->fk", n, side)[..., None] * n) for side in sides]
+    angle = np.arccos(np.clip(np.einsum("fkd,fkd->fk", *sides), -1, 1))
+    tangents, sign = np.zeros((len(chart.uv), 3)), np.zeros(len(chart.uv))
+    np.add.at(tangents, chart.faces, angle[..., None] * level)
+    np.add.at(sign, chart.faces, angle * np.sign(area)[:, None])
+    tangents = _unit(tangents)
+    tangents[~tangents.any(axis=1)] = (1, 0, 0)
+    return np.column_stack([tangents, np.where(sign < 0, -1, 1)])
+
+
+def normal_image(control: ControlModel, vertices: np.ndarray, subdivision: Subdivision, size: int) -> np.ndarray:
+    """(size, size, 3) uint8, the normals of the detailed surface, vertices (n, 3), in the frames of the control mesh: x
+    to the right in the image, y upwards, z outwards; -1 to 1 are 0 to 255, as glTF has them.
+    """
+    rows, columns, face, bary = control.chart.texels(size)
+    N = np.einsum("nc,ncd->nd", bary, control.mesh.vertex_normals[control.mesh.faces[face]])
+    T = np.einsum("nc,ncd->nd", bary, chart_tangents(control.mesh, control.chart)[control.chart.faces[face]])
+    T, side = T[:, :3], np.sign(T[:, 3:])
+    B = np.cross(N, T) * side
+    detail, at = Mesh(vertices, subdivision.faces), np.full((size, size), -1)
+    there = subdivision.chart.texels(size)
+    at[there[0], there[1]] = np.arange(len(there[0]))
+    known = at[rows, columns] >= 0
+    fine_face, fine_bary = there[2][at[rows, columns][known]], there[3][at[rows, columns][known]]
+    fine = np.einsum("nc,ncd->nd", fine_bary, detail.vertex_normals[detail.faces[fine_face]])
+    rows, columns = rows[known], columns[known]
+    T, B, N, side = T[known], B[known], N[known], side[known]
+    # T, B and N are not quite perpendicular: fine = x T + y B + z N is solved, up to its length
+    local = side * _unit(np.stack([np.einsum("nd,nd->n", fine, np.cross(*pair)) for pair in ((B, N), (N, T), (T, B))],
+                                  axis=1))
+    out, covered = np.full((size, size, 3), (128, 128, 255), dtype=np.uint8), np.zeros((size, size), dtype=bool)
+    out[rows, columns] = np.round(127.5 * (local + 1))
+    covered[rows, columns] = True
+    return padded(out, covered)
+
+
+def _unit(vectors: np.ndarray) -> np.ndarray:
+    return vectors / np.maximum(np.linalg.norm(vectors, axis=-1, keepdims=True), 1e-300)

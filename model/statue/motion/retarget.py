@@ -7,6 +7,7 @@ from dataclasses import dataclass
 from itertools import pairwise
 
 import numpy as np
+from scipy.spatial.transform import Rotation
 
 from scanprep.geometry import rotations
 
@@ -32,9 +33,8 @@ SIDED_ROLES = {
 
 
 def find_roles(names: Sequence[str]) -> dict[str, int]:
-    """The joints that play the parts of the humanoid: {H-Anim name: number of the joint}.
-
-    Case, separators and what stands before a colon do not matter.
+    """The joints that play the parts of the humanoid, {H-Anim name: joint}; case, separators and what stands before a
+    colon do not matter.
     """
     plain: dict[str, int] = {}
     for j, name in enumerate(names):
@@ -62,9 +62,8 @@ def above(parents: np.ndarray, j: int) -> list[int]:
 
 
 def trunk(parents: np.ndarray, roles: Mapping[str, int]) -> tuple[int, int]:
-    """The lowest joint of the trunk above the pelvis and the one that carries arms and head.
-
-    Both are the pelvis where the tree has no joint between them.
+    """The lowest joint of the trunk above the pelvis, and the one that carries arms and head; the pelvis for both where
+    the tree has none between.
     """
     pelvis = roles["humanoid_root"]
     chains = [above(parents, roles[role]) for role in ("l_shoulder", "r_shoulder") if role in roles]
@@ -91,10 +90,9 @@ class StatueMotion:
 
 
 class Pairing:
-    """A statue and a skeleton that moves, both at rest.
-
-    `P` (J, 3, 3) is how the generic model's parts were rotated to the pose of the scan, `joints` (J, 3) those of the
-    statue in the generic default pose, `ours` and `theirs` the parts and joints by their H-Anim names.
+    """A statue and a skeleton that moves, both at rest: `P` (J, 3, 3) is how the generic model's parts were rotated to
+    the pose of the scan, `joints` (J, 3) those of the statue in the generic default pose, `ours` and `theirs` the parts
+    and joints by their H-Anim names.
     """
 
     def __init__(self, control: ControlModel, pose: np.ndarray, moving: BvhMotion) -> None:
@@ -135,7 +133,7 @@ class Pairing:
                     if {role, following} <= self.ours.keys() & self.theirs.keys():
                         own = self.joints[self.ours[following]] - self.joints[self.ours[role]]
                         other = self.moving.rest[self.theirs[following]] - self.moving.rest[self.theirs[role]]
-                        R = _smallest_rotation(R @ own, other) @ R
+                        R = Rotation.align_vectors(other, R @ own)[0].as_matrix() @ R
                         A[self.ours[role]] = R
                 if chain[2] == "wrist" and roles[2] in self.ours:
                     A[self.ours[roles[2]]] = R                          # a hand continues the forearm
@@ -158,8 +156,9 @@ class Pairing:
         return rotations.project(np.einsum("tka,kb->tab", there, points - rest[low]))
 
     def world(self, aligned: bool) -> np.ndarray:
-        """The rotation (3, 3) from the axes of the motion to those of the scan: upwards to upwards, and forwards
-        at rest to where the scan faces."""
+        """The rotation (3, 3) from the axes of the motion to those of the scan: upwards to upwards, and forwards at
+        rest to where the scan faces.
+        """
         return _upright(self.P[0] @ self.axes[:, 2], self.up) @ self.standing(aligned).T
 
     def whole(self, aligned: bool) -> np.ndarray:
@@ -271,15 +270,3 @@ def _upright(forwards: np.ndarray, up: np.ndarray) -> np.ndarray:
         level = level - (level @ up) * up
     level = level / np.linalg.norm(level)
     return np.stack([np.cross(up, level), up, level], axis=1)
-
-
-def _smallest_rotation(a: np.ndarray, b: np.ndarray) -> np.ndarray:
-    """The rotation (3, 3) by the smallest angle that brings direction a (3,) to direction b."""
-    axis = np.cross(a, b)
-    size = np.linalg.norm(axis)
-    if size < 1e-12 * np.linalg.norm(a) * np.linalg.norm(b):
-        if a @ b >= 0:
-            return np.eye(3)
-        axis = np.cross(a, np.eye(3)[np.abs(a).argmin()])
-        size = np.linalg.norm(axis)
-    return rotations.exp(axis / size * np.arctan2(np.linalg.norm(np.cross(a, b)), a @ b))

@@ -13,15 +13,15 @@ from ..control.model import ControlModel
 
 @dataclass(frozen=True, eq=False)
 class Points:
-    """Points that hang on a control model: joints, landmarks, vertices."""
+    """Points that hang on a control model, by the weights (n, J) of its parts, in the default pose (n, 3), metres."""
 
-    weights: np.ndarray  # (n, J), how much each part carries each point; rows sum to 1
-    rest: np.ndarray     # (n, 3) metres, in the default pose
+    weights: np.ndarray
+    rest: np.ndarray
 
 
 @dataclass(frozen=True, eq=False)
 class Frames:
-    """Where the parts are for one set of parameters."""
+    """Where the J parts are for one set of parameters."""
 
     R: np.ndarray       # (J, 3, 3), world rotation of every part
     joints: np.ndarray  # (J, 3) metres
@@ -56,33 +56,29 @@ class Articulated:
 
     @cached_property
     def limits(self) -> np.ndarray:
-        """(A, 2) float, radians: least and greatest angle; none at the root."""
+        """(A, 2) radians, least and greatest angle; none at the root."""
         found = np.concatenate([np.reshape(a, (-1, 2)) for a in self.control.limits])
         return np.where(self.joint_of[:, None] == 0, [-np.inf, np.inf], found)
 
     @cached_property
     def bones(self) -> np.ndarray:
-        """(J, 3) float, metres: from the joint of every part to where its bone ends.
-
-        That is the joint of a child of the same segment, else the farthest child; a part without children reaches to
-        the farthest of the vertices that it carries most.
+        """(J, 3) metres, from the joint of every part to where its bone ends: the joint of a child of the same segment,
+        else the farthest child, else the farthest of the vertices that it carries most.
         """
         control, o = self.control, self.control.skeleton.joints
-        segment, parents = control.segment_of_part, control.skeleton.parents
-        out = np.zeros_like(o)
+        segment, out = control.segment_of_part, np.zeros_like(o)
         most = control.weights.argmax(axis=1)
         for p in range(len(o)):
-            children = np.flatnonzero(parents == p)
+            children = np.flatnonzero(control.skeleton.parents == p)
             same = children[segment[children] == segment[p]]
-            mine = np.flatnonzero(most == p)
-            ends = o[same] if len(same) else o[children] if len(children) else control.mesh.vertices[mine]
+            ends = o[same] if len(same) else o[children] if len(children) else control.mesh.vertices[most == p]
             if len(ends):
                 out[p] = max(ends - o[p], key=np.linalg.norm)
         return out
 
     @cached_property
     def lengths(self) -> np.ndarray:
-        """(S,) float, metres: the default lengths of the segments; the mean of left and right."""
+        """(S,) metres, the default lengths of the segments; the mean of left and right."""
         segment, parents = self.control.segment_of_part, self.control.skeleton.parents
         own = np.linalg.norm(self.bones, axis=1)
         heads = [p for p in range(len(own)) if p == 0 or segment[p] != segment[parents[p]]]
@@ -103,7 +99,7 @@ class Articulated:
 
     @cached_property
     def is_of(self) -> np.ndarray:
-        """(J, S) float: 1 where a part belongs to a segment."""
+        """(J, S) 1 where a part belongs to a segment."""
         return np.eye(len(self.control.segments))[self.control.segment_of_part]
 
     @cached_property
@@ -121,7 +117,7 @@ class Articulated:
         return x[:A], x[A:A + S], x[A + S:]
 
     def pose(self, x: np.ndarray) -> np.ndarray:
-        """(J, 3) float, radians: `exp(angles @ axes)` rotates every part in its parent."""
+        """(J, 3) radians: `exp(angles @ axes)` rotates every part in its parent."""
         pose = np.zeros_like(self.control.skeleton.joints)
         np.add.at(pose, self.joint_of, self.split(x)[0][:, None] * self.axes)
         return pose

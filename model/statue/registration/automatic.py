@@ -6,10 +6,10 @@ from dataclasses import dataclass, replace
 import numpy as np
 from scipy.spatial import cKDTree
 
+from scanprep.geometry.farthest_points import thin
 from scanprep.geometry.format_common import UNITS
 from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.target import Target, target_of
-from scanprep.geometry.thinning import thin
 from scanprep.registration.nonrigid import Registration, register
 from scanprep.registration.schedule import RegistrationConfig
 from scanprep.threads import one_thread, search_threads
@@ -19,7 +19,7 @@ from .articulated import Articulated
 from .features import FeatureFit, fit_features
 from .person_search import PoseSearch, Stand, find_person
 
-SHOWN = 0.3                      # share of the vertices around a joint that have data
+SHOWN = 0.3                      # share of the vertices around a joint or landmark that must have data
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,9 +31,6 @@ class Features:
     missing: tuple[str, ...]       # joints and landmarks that the scan does not show
     registered: Mesh | None        # the control mesh on the scan; None where no person was found
     fit: FeatureFit | None         # of the control model to these features
-    unit: str                      # in which the scan would be most nearly as long as a person is tall
-    up: np.ndarray                 # (3,) unit, upwards
-    front: np.ndarray              # (3,) unit, to where the person faces
     problem: str | None            # why the features should not be trusted
 
 
@@ -57,19 +54,16 @@ def find_features(control: ControlModel, scan: Mesh) -> Features:
     stands = find_person(search, target, UNITS[unit])
     best = stands[0]
     margin = stands[1].off / best.off if len(stands) > 1 else np.inf
-    up, front = (best.direction(search, np.array(axis)) for axis in ((0.0, 0, 1), (0.0, -1, 0)))
     problem = nobody_problem(best.off, margin, unit)
     if problem:
-        return Features({}, {}, (*control.skeleton.names, *control.landmarks), None, None, unit, up, front, problem)
-    start = search.mesh(best.posed)
+        return Features({}, {}, (*control.skeleton.names, *control.landmarks), None, None, problem)
     placed = (data.vertices if isinstance(data, Mesh) else data) @ best.T[:3, :3].T + best.T[:3, 3]
-    found = register(start, Mesh(placed, data.faces) if isinstance(data, Mesh) else placed,
+    found = register(search.mesh(best.posed), Mesh(placed, data.faces) if isinstance(data, Mesh) else placed,
                      config=RegistrationConfig(graph=RegistrationConfig().graph[-2:]), start=np.eye(4))
     joints, points, missing = _features(control, best, found)
     fit = fit_features(control, joints, points) if len(joints) + len(points) > 2 else None
     registered = control.mesh.with_vertices(best.to_scan(found.mesh.vertices))
-    problem = why_uncertain(best.off, margin, found.uncovered)
-    return Features(joints, points, missing, registered, fit, unit, up, front, problem)
+    return Features(joints, points, missing, registered, fit, why_uncertain(best.off, margin, found.uncovered))
 
 
 def nobody_problem(off: float, margin: float, unit: str) -> str | None:
@@ -121,10 +115,10 @@ def _facing_outward(target: Target, scan: Mesh, spacing: float) -> Target:
 def _features(control: ControlModel, stand: Stand, found: Registration
               ) -> tuple[dict[str, np.ndarray], dict[str, np.ndarray], tuple[str, ...]]:
     """Joints and points with data around them, in the axes of the scan, and the names of the others."""
+    skeleton, near = control.skeleton, control.mesh.vertex_adjacency
     x, seen = found.mesh.vertices, found.confidence
-    centres = stand.to_scan(control.skeleton.joint_regressor(control.mesh) @ x)
-    around = (control.mesh.vertex_adjacency @ seen + seen) / (control.mesh.vertex_adjacency.sum(axis=1) + 1)
-    skeleton = control.skeleton
+    centres = stand.to_scan(skeleton.joint_regressor(control.mesh) @ x)
+    around = (near @ seen + seen) / (near.sum(axis=1) + 1)
     shown = np.array([seen[skeleton.joint_weights(control.mesh, j)[0]].mean() > SHOWN for j in range(len(centres))])
     for j, parent in enumerate(skeleton.parents):
         shown[j] &= parent <= 0 or shown[parent]                # a hand on the thigh, where no elbow is, is the thigh
@@ -133,5 +127,5 @@ def _features(control: ControlModel, stand: Stand, found: Registration
     places = stand.to_scan(x)
     points = {name: places[v] for name, v in control.landmarks.items()
               if around[v] > SHOWN and (shown[part[v]] or part[v] == 0)}
-    names = [*control.skeleton.names, *control.landmarks]
-    return joints, points, tuple(name for name in names if name not in joints and name not in points)
+    lacking = tuple(name for name in (*skeleton.names, *control.landmarks) if name not in {*joints, *points})
+    return joints, points, lacking

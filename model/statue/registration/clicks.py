@@ -74,9 +74,7 @@ class MedialAxis:
         from skimage.morphology import skeletonize
 
         vertices, faces = checked_surface(mesh)
-        if not voxel > 0:
-            raise ValueError(f"voxel: expected a width above 0, got {voxel}")
-        self.voxel = float(voxel)
+        self.voxel = voxel
         self._origin = vertices.min(axis=0) - 1.5 * voxel
         shape = np.ceil(np.ptp(vertices, axis=0) / voxel) + 4
         if np.prod(shape) > 60_000_000:
@@ -91,24 +89,23 @@ class MedialAxis:
             raise ValueError(f"mesh: no voxel of {voxel} m is inside; is it open, inside out, or in another unit?")
         self._tree = cKDTree(self.points)
 
-    def nearest_to_ray(self, origin: np.ndarray, direction: np.ndarray, depth: float | None = None) -> np.ndarray:
+    def nearest_to_ray(self, origin: np.ndarray, direction: np.ndarray, depth: float = 0.0) -> np.ndarray:
         """The point (3,) of a ray, on its first way through the body, nearest to the medial axis; `depth` farther."""
-        origin, along = np.asarray(origin, dtype=np.float64), np.asarray(direction, dtype=np.float64)
-        if not (np.isfinite(origin).all() and np.isfinite(along).all() and np.linalg.norm(along) > 0):
-            raise ValueError(f"origin, direction: expected finite numbers and a length, got {origin} and {along}")
-        along = along / np.linalg.norm(along)
+        if not np.linalg.norm(direction) > 0:
+            raise ValueError(f"direction: expected a length, got {direction}")
+        along = direction / np.linalg.norm(direction)
         t = self._stretch(origin, along)
         apart, nearest = self._tree.query(origin + t[:, None] * along)
         point = self.points[nearest[apart.argmin()]]
         t_point = np.clip((point - origin) @ along, t[0], t[-1])
-        return np.asarray(origin + (t_point + (depth or 0.0)) * along)
+        return np.asarray(origin + (t_point + depth) * along)
 
     def _stretch(self, origin: np.ndarray, along: np.ndarray) -> np.ndarray:
         """Distances along a ray, a quarter of a voxel apart, at which it first is inside the body."""
         shape = np.array(self.inside.shape)
-        middle = self._origin + 0.5 * self.voxel * shape
+        middle = (self._origin + 0.5 * self.voxel * shape - origin) @ along
         radius = 0.5 * self.voxel * float(np.linalg.norm(shape))
-        t = np.arange(max((middle - origin) @ along - radius, 0), (middle - origin) @ along + radius, 0.25 * self.voxel)
+        t = np.arange(max(middle - radius, 0), middle + radius, 0.25 * self.voxel)
         cells = np.floor((origin + t[:, None] * along - self._origin) / self.voxel).astype(int)
         held = ((cells >= 0) & (cells < shape)).all(axis=1)
         held[held] = self.inside[tuple(cells[held].T)]

@@ -1,6 +1,7 @@
 """Registration of the control model by features: pose, segment lengths and place, then the shape of the head."""
 from __future__ import annotations
 
+from collections import defaultdict
 from collections.abc import Mapping
 from dataclasses import dataclass
 
@@ -23,24 +24,20 @@ class FeatureFit:
 
     pose: np.ndarray      # (J, 3) radians, as `Skeleton.part_rotations` takes it
     lengths: np.ndarray   # (S,) metres, of the segments
-    size: float           # of the body against the default one; its thickness grows by it
-    trans: np.ndarray     # (3,) metres, from the default place of the root's joint to where it stands
     vertices: np.ndarray  # (N, 3) metres
     joints: np.ndarray    # (J, 3) metres
-    joint_rms: float      # metres, misfit of the features; NaN without any of the kind
-    point_rms: float      # metres, misfit of the features; NaN without any of the kind
+    joint_rms: float      # metres, misfit of the joints; NaN without any
+    point_rms: float      # metres, misfit of the points of the surface; NaN without any
     converged: bool
-    iterations: int
 
 
 def fit_features(control: ControlModel, joints: Mapping[str, np.ndarray],
                  points: Mapping[str, np.ndarray] | None = None) -> FeatureFit:
     """Pose, segment lengths and place of a control model that bring its features, by name, to those of a scan.
 
-    Features that are not given are not in the sum. What the given ones leave open (the twist of an arm with a straight
-    elbow, the length of a hand) a weak prior keeps near the default pose and lengths. The result rotates, moves and
-    scales with the features. How lengths stretch the surface: see `Articulated`. ValueError for unknown names, places
-    that are not finite, fewer than three features that are not on one line.
+    What they leave open (the twist of an arm with a straight elbow, the length of a hand) a weak prior keeps near the
+    default pose and lengths. ValueError for unknown names, places that are not finite, fewer than three features that
+    are not on one line.
 
     [Statues] Eq. 4
     """
@@ -75,10 +72,9 @@ def fit_features(control: ControlModel, joints: Mapping[str, np.ndarray],
     pose[0] = rotations.log(R @ rotations.exp(pose[0]))
     centres = scale * frames.joints @ R.T + T[:3, 3]
     apart = scale * np.linalg.norm(model.positions(frames, features) - goal, axis=1)
-    return FeatureFit(
-        pose, scale * model.split(x)[1] * model.lengths, scale * model.size(x), centres[0] - control.skeleton.joints[0],
-        scale * model.positions(frames, model.vertices) @ R.T + T[:3, 3], centres, _rms(apart[:len(joints)]),
-        _rms(apart[len(joints):]), bool(found.success), int(found.nit))
+    vertices = scale * model.positions(frames, model.vertices) @ R.T + T[:3, 3]
+    return FeatureFit(pose, scale * model.split(x)[1] * model.lengths, vertices, centres, _rms(apart[:len(joints)]),
+                      _rms(apart[len(joints):]), bool(found.success))
 
 
 def misfit(model: Articulated, x: np.ndarray, features: Points, goal: np.ndarray) -> tuple[float, np.ndarray]:
@@ -98,18 +94,11 @@ def warp(vertices: np.ndarray, from_points: np.ndarray, to_points: np.ndarray, s
     """
     from scipy.interpolate import RBFInterpolator
 
-    source, goal = np.asarray(from_points, dtype=np.float64), np.asarray(to_points, dtype=np.float64)
-    if source.ndim != 2 or source.shape[1] != 3 or goal.shape != source.shape:
-        raise ValueError(f"from_points, to_points: expected two arrays (n, 3), got {source.shape} and {goal.shape}")
-    if not (np.isfinite(source).all() and np.isfinite(goal).all()):
-        raise ValueError("from_points, to_points: expected finite numbers")
-    spread = np.linalg.svd(source - source.mean(axis=0), compute_uv=False) if len(source) > 3 else np.zeros(3)
-    if spread[2] <= 0.02 * spread[0]:
-        raise ValueError(f"from_points: expected at least 4 points that are not in one plane, got {len(source)}")
-    if len(np.unique(source, axis=0)) < len(source):
-        raise ValueError("from_points: expected different points, two are at one place")
-    moved = RBFInterpolator(source, goal - source, kernel="cubic", degree=1)(vertices)
-    return vertices + (moved if share is None else np.asarray(share)[:, None] * moved)
+    spread = np.linalg.svd(from_points - from_points.mean(axis=0), compute_uv=False)
+    if len(from_points) < 4 or spread[2] <= 0.02 * spread[0]:
+        raise ValueError(f"from_points: expected at least 4 points that are not in one plane, got {len(from_points)}")
+    moved = RBFInterpolator(from_points, to_points - from_points, kernel="cubic", degree=1)(vertices)
+    return vertices + (moved if share is None else share[:, None] * moved)
 
 
 def head_share(control: ControlModel, part: str = "skullbase") -> np.ndarray:
@@ -139,13 +128,11 @@ def _features(control: ControlModel, joints: Mapping[str, np.ndarray], points: M
 
 def _place(model: Articulated, features: Points, joints: Mapping[str, np.ndarray], goal: np.ndarray) -> np.ndarray:
     """The similarity (4, 4) of the trunk, from the bases of the limbs where they suffice, else from all features."""
-    names = list(joints)
     bases = [model.control.skeleton.names[base] for base, _, _ in limbs(model)]
-    trunk = [names.index(name) for name in bases if name in names]
+    trunk = [k for k, name in enumerate(joints) if name in bases]
     for rows in (trunk, list(range(len(goal)))):
-        if len(rows) < 3 or _on_a_line(goal[rows]) or _on_a_line(features.rest[rows]):
-            continue
-        return align_landmarks(features.rest[rows], goal[rows], scale=True).T_target_source
+        if len(rows) > 2 and not _on_a_line(goal[rows]) and not _on_a_line(features.rest[rows]):
+            return align_landmarks(features.rest[rows], goal[rows], scale=True).T_target_source
     raise ValueError(f"joints, points: expected at least three features that are not on one line, got {len(goal)}")
 
 
@@ -173,16 +160,14 @@ def limbs(model: Articulated) -> list[tuple[int, int, int | None]]:
 
 def analytic_start(model: Articulated, at: Mapping[str, np.ndarray]) -> np.ndarray:
     """Lengths from joints that are neighbours, and each limb from its base, middle and end joints in closed form."""
-    skeleton = model.control.skeleton
+    skeleton, x = model.control.skeleton, model.rest.copy()
     o, names = skeleton.joints, skeleton.names
-    x = model.rest.copy()
     angles, factors, _ = model.split(x)
-    ratios: dict[int, list[float]] = {}
-    for c in range(1, len(o)):
-        p = skeleton.parents[c]
+    ratios = defaultdict(list)
+    for c, p in enumerate(skeleton.parents[1:], 1):
         if names[c] in at and names[p] in at:
-            ratios.setdefault(int(model.control.segment_of_part[p]), []).append(float(
-                np.linalg.norm(at[names[c]] - at[names[p]]) / max(np.linalg.norm(o[c] - o[p]), 1e-9)))
+            ratios[model.control.segment_of_part[p]].append(
+                np.linalg.norm(at[names[c]] - at[names[p]]) / max(np.linalg.norm(o[c] - o[p]), 1e-9))
     for s, values in ratios.items():
         factors[s] = np.mean(values)
     for base, middle, end in limbs(model):

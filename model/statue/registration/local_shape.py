@@ -1,18 +1,8 @@
 """Local shape of a triangle mesh: where every vertex lies in the frames of the triangles around it.
 
-The frame of a triangle is the larger triangle of the three vertices opposite across its sides. Each corner of the
-central triangle has barycentric coordinates and a height there. What the paper leaves open, and what is done here:
-
-- Heights are not free of scale. Here they are multiples of √(2 · area) of the frame, so that the local shape is
-  invariant under any similarity and people of any size are as welcome as those of the generic one's.
-- A triangle at a border has no frame. It is left out: its vertices are held by the triangles farther inside, and as
-  corners of their frames. (A control mesh is closed.)
-- A frame whose corners nearly lie on one line says nothing safe about height or place: at a vertex of three triangles
-  two of its corners are even the same vertex. Frames flatter than 0.05 of their longest side, or where a barycentric
-  coordinate is above 4, are left out as well.
-- N_i, the valence, is the number of frames that hold the vertex: on a closed mesh with sound frames they are the same.
-- Eq. 12 is not the gradient of Eq. 10: a vertex that moves also moves the frames of which it is a corner, and the
-  factor 2 is missing. Both are here: `published_force`, and `gradient`, which is exact.
+The frame of a triangle is that of the three vertices opposite across its sides. Heights are multiples of √(2 · area) of
+the frame, so that the shape is invariant under similarities. Triangles at a border have no frame; those flatter than
+0.05 of their longest side, or with a barycentric coordinate above 4, say nothing safe and are left out as well.
 
 [Statues] section 4.1
 """
@@ -40,7 +30,7 @@ class LocalShape:
 
     @cached_property
     def weights(self) -> np.ndarray:
-        """(R,) 1 / N_i of the vertex of each row."""
+        """(R,) 1 / N_i of the vertex of each row, N_i the number of frames that hold it."""
         return 1 / np.bincount(self.held, minlength=self.count)[self.held]
 
     @cached_property
@@ -65,8 +55,8 @@ class LocalShape:
         return float(self.weights @ (self.residuals(x) ** 2).sum(axis=1))
 
     def published_force(self, x: np.ndarray) -> np.ndarray:
-        """(N, 3) mean over its frames of what would bring each vertex where they want it, the frames standing still.
-        [Statues] Eq. 12
+        """(N, 3) mean over its frames of what would bring each vertex where they want it, the frames standing still:
+        not the gradient of Eq. 10, for a vertex also moves the frames of which it is a corner. [Statues] Eq. 12
         """
         return -self._summed(self.held, self.weights[:, None] * self.residuals(x))
 

@@ -3,16 +3,17 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
+from operator import attrgetter
 from typing import NamedTuple
 
 import numpy as np
 from scipy.spatial import cKDTree
 
 from scanprep.geometry import rotations
+from scanprep.geometry.farthest_points import thin
 from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.surface import Surface
 from scanprep.geometry.target import Target, orient
-from scanprep.geometry.thinning import thin
 from scanprep.registration.matches import Described, Likeness, Pull, pull, tukey
 
 from .articulated import Articulated, Points
@@ -23,7 +24,7 @@ GIRTH = -0.03, 0.12             # metres off the default surface
 
 
 class PoseStage(NamedTuple):
-    """Rounds of matching at one reach; lengths, metres, are those of the control model."""
+    """Rounds of matching at one reach; lengths are metres of the control model."""
 
     reach: float   # farthest match that counts
     prior: float   # distance to the data that an angle of one radian is worth
@@ -40,10 +41,12 @@ FINE = (PoseStage(0.2, 0.015, 0.1, 0.15, 0.03, 6), PoseStage(0.12, 0.01, 0.08, 0
 
 @dataclass(frozen=True, eq=False)
 class Posed:
-    """A control model on its way to a scan."""
+    """A control model on its way to a scan: parameters (P,), and how far every segment's surface stands off the default
+    one, (S,) metres.
+    """
 
-    x: np.ndarray      # (P,), parameters
-    girth: np.ndarray  # (S,) metres, how far the surface of every segment stands off the default one
+    x: np.ndarray
+    girth: np.ndarray
 
 
 class PoseSearch:
@@ -67,9 +70,8 @@ class PoseSearch:
 
     def points(self, girth: np.ndarray) -> Points:
         """All vertices of a body so thick, in the default pose."""
-        mesh = self.model.control.mesh
-        thicker = (self.segments @ girth)[:, None] * mesh.vertex_normals
-        return Points(self.model.control.weights, mesh.vertices + thicker)
+        mesh, off = self.model.control.mesh, (self.segments @ girth)[:, None]
+        return Points(self.model.control.weights, mesh.vertices + off * mesh.vertex_normals)
 
     def mesh(self, posed: Posed) -> Mesh:
         """The control mesh as it lies."""
@@ -160,10 +162,8 @@ class Stand:
 
     T: np.ndarray  # (4, 4), similarity from the scan to the axes and the size of the control model
     posed: Posed
-    off: float     # metres, root mean square distance of the scan from the body, at most `CAP` each, turned normals
-                   # counted in
-    misfit: float  # metres, the same with the distances of the body from the scan, which count less: what the best
-                   # stand is chosen by
+    off: float     # metres, RMS distance of the scan from the body, at most `CAP` each, with what normals differ
+    misfit: float  # metres, the same with the body from the scan, which counts less: the best stand has the least
 
     @property
     def scale(self) -> float:
@@ -173,25 +173,24 @@ class Stand:
         """Points (n, 3) of the control model in the axes of the scan."""
         return (points - self.T[:3, 3]) @ self.T[:3, :3] / self.scale**2
 
-    def direction(self, search: PoseSearch, axis: np.ndarray) -> np.ndarray:
-        """A direction of the root part in the scan, unit."""
-        return np.asarray(search.model.frames(self.posed.x).R[0] @ axis @ self.T[:3, :3] / self.scale)
+    def facing(self, search: PoseSearch) -> np.ndarray:
+        """(3,) unit, to where the root part looks in the scan: -y of the control model."""
+        return -np.asarray(search.model.frames(self.posed.x).R[0][:, 1] @ self.T[:3, :3] / self.scale)
 
 
 def find_person(search: PoseSearch, target: Target, metres: float) -> list[Stand]:
     """The best stand in a scan whose unit is so many `metres`, and the best that faces another way."""
-    def facing(stand: Stand) -> np.ndarray:
-        return stand.direction(search, np.array([0.0, -1, 0]))
-
+    by_misfit = attrgetter("misfit")
     bent = sorted((bend(search, target, T, search.start, COARSE) for T in rough_stands(search, target, metres)[:8]),
-                  key=lambda stand: stand.misfit)
-    best = bent[:1] + [s for s in bent[1:] if facing(s) @ facing(bent[0]) < 0.5][:1]
-    best = sorted((bend(search, target, s.T, s.posed, FINE) for s in best), key=lambda stand: stand.misfit)
+                  key=by_misfit)
+    front = bent[0].facing(search)
+    best = bent[:1] + [s for s in bent[1:] if s.facing(search) @ front < 0.5][:1]
+    best = sorted((bend(search, target, s.T, s.posed, FINE) for s in best), key=by_misfit)
     found = [with_arms(search, target, best[0])]
     for rival in best[1:]:
         close = rival.misfit < 1.3 * found[0].misfit    # what fits worse is no more than the other facing
         found.append(with_arms(search, target, rival) if close else rival)
-    return sorted(found, key=lambda stand: stand.misfit)
+    return sorted(found, key=by_misfit)
 
 
 def bend(search: PoseSearch, target: Target, T: np.ndarray, posed: Posed, stages: tuple) -> Stand:
@@ -277,8 +276,8 @@ def with_arms(search: PoseSearch, target: Target, stand: Stand) -> Stand:
         starts.sort(key=lambda posed: misfit(search.mesh(posed), coarse)[1])
         # No coarser: from afar a hand beside the head is drawn to the head.
         tried = min((bend(search, target, stand.T, posed, FINE[1:]) for posed in starts[:6]),
-                    key=lambda s: s.misfit)
-        stand = min(stand, bend(search, target, stand.T, tried.posed, FINE), key=lambda s: s.misfit)
+                    key=attrgetter("misfit"))
+        stand = min(stand, bend(search, target, stand.T, tried.posed, FINE), key=attrgetter("misfit"))
     return stand
 
 

@@ -1,18 +1,9 @@
-"""Annealed soft assignment of the vertices of a model to the points of a scan.
+"""Annealed soft assignment of the vertices of a model to points of a scan: to several at once, the nearer ones more.
 
-Every vertex is assigned to several points at once, the nearer ones more; no point is assigned more than once in sum.
-What the paper leaves open, and what is done here:
-
-- The closest subset: the `neighbours` nearest points whose normals lie in the half-space of the vertex normal.
-- The slack of a point starts as the smallest of its matches. Balanced to the end, with far more points than vertices,
-  this takes distance out of the assignment: m_ij becomes proportional to exp((d_max² - d_ij²) / T) with d_max the
-  distance of the farthest vertex that knows the point, and a point that only one vertex knows counts the same however
-  far it lies. That is `slack="published"`. With `slack="rest"` the slack is whatever remains of a point, and costs
-  nothing: m is the minimum of Eq. 15 under Σ_i m_ij <= 1, and for T → 0 it assigns the closest points, as the paper
-  says it should.
-- Where vertices outnumber the points that they know, Eq. 14 has no solution. Rows come last, so they always sum to 1;
-  `excess` tells by how much a point is assigned more than once.
-- Everything is done with logarithms: at small T the matches of the paper's Eq. 17 are zero in floating point.
+The published slack of a point, begun as its smallest match and balanced, takes distance out of the assignment: m_ij
+becomes proportional to exp((d_max² - d_ij²) / T). With `slack="rest"` it is whatever remains and costs nothing: m is
+the minimum of Eq. 15 under Σ_i m_ij <= 1, and tends to the closest points as T goes to 0. Where vertices outnumber
+their points Eq. 14 has no solution: rows come last and sum to 1, `excess` tells by how much a point is assigned twice.
 
 [Statues] Eq. 13-17
 """
@@ -42,13 +33,6 @@ class SoftAssignment:
     def seen(self) -> np.ndarray:
         """(I,) bool: vertices that know a point."""
         return np.diff(self.matches.indptr) > 0
-
-    def energy(self, x: np.ndarray, points: np.ndarray, temperature: float) -> tuple[float, float]:
-        """The data term Σ m |y - x|² and the entropy term T Σ m (log m - 1), square metres. [Statues] Eq. 15"""
-        i, j = np.repeat(np.arange(len(x)), np.diff(self.matches.indptr)), self.matches.indices
-        m = self.matches.data
-        apart = ((points[j] - x[i]) ** 2).sum(axis=1)
-        return float(m @ apart), float(temperature * (m @ (np.log(np.maximum(m, 1e-300)) - 1)))
 
 
 class ScanPoints:

@@ -1,8 +1,7 @@
 """Fit of a control mesh to a scan: a shape-constrained deformable surface under annealed soft assignment.
 
-Beyond the paper: points of the scan draw the mesh as well (`cover`), without which it leaves tips of limbs empty; at
-the end vertices are drawn to the surface between the points (`polish`); at the edge of a hole the data draw only across
-the surface, and beyond it not at all. `SurfaceFitConfig.published()` has nothing of the first two.
+Beyond the paper, points of the scan draw the mesh as well (`cover`), at the end vertices are drawn to the surface
+between the points (`polish`), and at the edge of a hole the data draw only across the surface.
 
 [Statues] section 4
 """
@@ -10,10 +9,10 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass, replace
-from typing import Annotated, Literal, NamedTuple
+from typing import Annotated, Literal
 
 import numpy as np
-from scipy.sparse import csc_array, diags_array, eye_array
+from scipy.sparse import csc_array, csr_array, diags_array, eye_array
 
 from scanprep.geometry.mesh import Mesh, check_template
 from scanprep.geometry.sparse import Factored, conjugate_gradients
@@ -24,7 +23,7 @@ from scanprep.registration.final_fit import inverted_triangles, unfold
 from scanprep.threads import one_thread
 
 from .local_shape import local_shape
-from .soft_assignment import ScanPoints, Slack, SoftAssignment, assign
+from .soft_assignment import ScanPoints, Slack, assign
 
 
 @dataclass(frozen=True)
@@ -75,16 +74,14 @@ class SurfaceFitConfig(Settings):
 class SurfaceFit:
     """A control mesh on a scan."""
 
-    vertices: np.ndarray        # (N, 3) metres
-    seen: np.ndarray            # (N,), whether there were data here; the others are carried by the shape
-    rms: float                  # metres, distances of the vertices seen to the surface of the scan
-    largest: float              # metres, the largest of them
-    inverted: int               # triangles that face against their surroundings
-    energies: dict[str, float]  # square metres: "shape", "data", "entropy" of Eq. 16 and our "cover", at the end
-    temperatures: np.ndarray    # (K,) square metres
-    steps: np.ndarray           # (K,), steps at each of them
-    converged: bool             # the longest gradient of a vertex fell below √T at the last temperature, and there were
-                                # data; at a higher one the fit goes on, for the next has another minimum anyway
+    vertices: np.ndarray      # (N, 3) metres
+    seen: np.ndarray          # (N,), whether there were data here; the others are carried by the shape
+    rms: float                # metres, distances of the vertices seen to the surface of the scan
+    largest: float            # metres, the largest of them
+    inverted: int             # triangles that face against their surroundings
+    temperatures: np.ndarray  # (K,) square metres
+    converged: bool           # the longest gradient of a vertex fell below √T at the last temperature, and there were
+                              # data; at a higher one the fit goes on, for the next has another minimum anyway
 
 
 @one_thread()
@@ -120,13 +117,12 @@ def fit_surface(rest: Mesh, start: np.ndarray, scan: Mesh, config: SurfaceFitCon
     if not len(scan.faces):
         raise ValueError(f"scan: expected at least one triangle, got {scan}")
     fit, tell = _Fit(rest, start, scan, config, hidden), progress or (lambda done, total: None)
-    x, temperatures, steps = start, fit.schedule(start), []
+    x, temperatures = start, fit.schedule(start)
     total = len(temperatures) + config.polish
-    for k, T in enumerate(temperatures):
-        last = k == len(temperatures) - 1
-        x, annealed = fit.anneal(x, T, 10 * config.most if last else config.most)             # [Statues] Eq. 16-18
-        steps.append(annealed.steps)
-        tell(k + 1, total)
+    for k, T in enumerate(temperatures, 1):
+        most = config.most if k < len(temperatures) else 10 * config.most
+        x, converged = fit.anneal(x, T, most)                                                  # [Statues] Eq. 16-18
+        tell(k, total)
     for k in range(config.polish):
         x = fit.polish(x)
         tell(len(temperatures) + k + 1, total)
@@ -135,16 +131,7 @@ def fit_surface(rest: Mesh, start: np.ndarray, scan: Mesh, config: SurfaceFitCon
     seen, _ = fit.seen(x)
     apart, inverted = fit.surface.closest(x).distances[seen], int(inverted_triangles(rest, x).sum())
     return SurfaceFit(x, seen, float(np.sqrt(np.mean(apart**2))) if seen.any() else np.nan,
-                      float(apart.max(initial=0.0)), inverted, annealed.energies, temperatures, np.array(steps),
-                      bool(annealed.converged and seen.any()))
-
-
-class _Annealed(NamedTuple):
-    """How the steps at one temperature ended."""
-
-    steps: int
-    converged: bool
-    energies: dict[str, float]
+                      float(apart.max(initial=0.0)), inverted, temperatures, bool(converged and seen.any()))
 
 
 class _Fit:
@@ -174,24 +161,22 @@ class _Fit:
         stages = int(np.ceil(np.log(final / first) / np.log(self.config.cooling))) + 1
         return np.geomspace(first, final, stages)
 
-    def anneal(self, x: np.ndarray, T: float, most: int) -> tuple[np.ndarray, _Annealed]:
-        """Vertices after steps at one temperature, until the gradient lies within the region of matching."""
+    def anneal(self, x: np.ndarray, T: float, most: int) -> tuple[np.ndarray, bool]:
+        """Vertices after steps at one temperature, until the gradient lies within the region of matching, or not."""
         explicit, lam = self.config.step == "explicit", self.config.shape
         for count in range(most + 1):
-            matches, A = self.assignment(x, T)                                                 # [Statues] Eq. 14, 17
-            wanted = matches.matches @ self.points.points
+            matches, A = self.assignment(x, T)                                             # [Statues] Eq. 14, 15, 17
+            wanted = matches @ self.points.points
             data = self.undrawn(A, wanted) if explicit else self.drawn(x, A, wanted)           # [Statues] Eq. 13
             force = data.force(x) + lam * (self.shape.published_force(x) if explicit else -0.5 * self.shape.gradient(x))
             converged = bool(np.linalg.norm(force, axis=1).max() <= np.sqrt(T))
             if (converged and count) or count == most:
                 break
             x = x + 0.5 * force if explicit else self.stepped(x, data, force)                  # [Statues] Eq. 18
-        misfit, entropy = matches.energy(x, self.points.points, T)
-        return x, _Annealed(count, converged, {"shape": lam * self.shape.energy(x), "data": misfit, "entropy": entropy,
-                                               "cover": data.cover(x)})                        # [Statues] Eq. 16
+        return x, converged
 
-    def assignment(self, x: np.ndarray, T: float) -> tuple[SoftAssignment, np.ndarray]:
-        """The balanced assignment, and (N, 3, 3) what it weighs: nothing without data, at borders only across them.
+    def assignment(self, x: np.ndarray, T: float) -> tuple[csr_array, np.ndarray]:
+        """The balanced matches, and (N, 3, 3) what they weigh: nothing without data, at borders only across them.
 
         At the edge of a hole all points lie to one side: their mean would draw the mesh off the hole.
         """
@@ -201,7 +186,7 @@ class _Fit:
         n = self.points.normals[near[:, 0]]
         edge = (self.points.border[near] & (near >= 0)).any(axis=1)
         A = np.where(edge[:, None, None], np.einsum("ni,nj->nij", n, n), np.eye(3))
-        return found, found.seen[:, None, None] * A
+        return found.matches, found.seen[:, None, None] * A
 
     def beside_data(self, x: np.ndarray, nearest: np.ndarray) -> np.ndarray:
         """(N,) bool: shown, within reach of the nearest point, not past the edge of a hole where it says nothing."""
@@ -287,11 +272,8 @@ class SurfaceData:
 
     def energy(self, x: np.ndarray) -> float:
         """At vertices x (N, 3), square metres."""
-        return float(np.einsum("ni,nij,nj->", x - self.y, self.A, x - self.y)) + self.cover(x)
-
-    def cover(self, x: np.ndarray) -> float:
-        """The part of the points that draw the mesh."""
-        return self.share * float(((self.C @ x - self.z) ** 2).sum())
+        return float(np.einsum("ni,nij,nj->", x - self.y, self.A, x - self.y)
+                     + self.share * ((self.C @ x - self.z) ** 2).sum())
 
     def force(self, x: np.ndarray) -> np.ndarray:
         """(N, 3) minus half the gradient."""

@@ -8,8 +8,6 @@ from __future__ import annotations
 import numpy as np
 from scipy.ndimage import median_filter
 
-from .results import Swap
-
 TORN = 10.0                          # most that a torn track counts, in half squared standard deviations
 AWAY = 8.0                           # most that a marker away from its place counts, in half squared deviations
 CHANGE = 4.0                         # what each change of a label must be worth, likewise
@@ -22,16 +20,8 @@ class Tracks:
     """Tracks (T, L, 3) of labels, metres, NaN where one was not seen.
 
     From one frame to the next a track moves at the mean of its velocities before and after, which misses no more
-    than a change of acceleration. A label that takes over another's track goes on from that one's place.
-
-    Attributes
-    ----------
-    off : (T, L) float, metres
-        From the prediction; NaN where the label is not seen both in this frame and the one before.
-    sd : (T, L) float, metres
-        The usual size of `off` around that time.
-    jumped, open : (T, L) bool
-        The track does not go on here; it is not known whether it does.
+    than a change of acceleration: it is `off` (T, L) metres, usually `sd`, NaN where it is not seen in both. It
+    `jumped` (T, L), or is `open`: not known to go on. A label that takes over another's track goes on from its place.
     """
 
     def __init__(self, positions: np.ndarray, rate: float) -> None:
@@ -66,9 +56,8 @@ class Tracks:
     def links(self, times: np.ndarray, before: np.ndarray, after: np.ndarray) -> np.ndarray:
         """What it counts that labels `after` go on, in frames `times`, where labels `before` were until then.
 
-        Half squared standard deviations, no more than `TORN`; as much for one that appears, nothing where no label
-        `after` is seen. Over a gap a track may have taken another way, the farther the longer it was. The three are
-        arrays of one shape, after broadcasting.
+        Half squared standard deviations, at most `TORN`, as for a label that appears; nothing where no label `after` is
+        seen. Over a gap a track may have taken another way. The three are arrays of one shape, after broadcasting.
         """
         acceleration, longest = 10.0, 0.25          # m/s² out of sight; seconds of a gap beyond which nothing is told
         last = self._last[times - 1, before]
@@ -108,27 +97,26 @@ def relabelled(positions: np.ndarray, order: np.ndarray) -> np.ndarray:
     return np.take_along_axis(positions, order[..., None], axis=1)
 
 
-def marker_levels(places: np.ndarray, positions: np.ndarray, rate: float) -> np.ndarray:
-    """What it counts (T, L, L) that the label of a column is the marker of a row, by where the body has the markers.
+def marker_levels(places: np.ndarray, positions: np.ndarray, deviation: float | np.ndarray = DEVIATION) -> np.ndarray:
+    """What it counts (..., L, L) that a column's label is the marker of a row: half squared deviations, at most `AWAY`.
 
-    Zero where nothing is known. What a marker is off changes slowly: the frames of `MEMORY` count as one. Places are
-    NaN for markers that the body does not know, which are taken to be nowhere near.
+    Places (..., L, 3) on the body are NaN where unknown, then nowhere near; `deviation`, metres, one for each frame.
     """
-    squared = sum((places[:, :, None, d] - positions[:, None, :, d])**2 for d in range(3))
-    assert isinstance(squared, np.ndarray)
-    cost = np.minimum(np.nan_to_num(squared / (2 * DEVIATION**2), nan=AWAY), AWAY)
-    return min(1.0, 1 / (MEMORY * rate)) * cost * np.isfinite(positions[:, None, :, 0])
+    squared = sum((places[..., :, None, d] - positions[..., None, :, d])**2 for d in range(3))
+    cost = np.minimum(np.nan_to_num(squared / (2 * np.asarray(deviation)[..., None, None]**2), nan=AWAY), AWAY)
+    return np.asarray(cost * np.isfinite(positions[..., None, :, 0]))
 
 
 def find_order(positions: np.ndarray, rate: float, levels: np.ndarray | None = None) -> np.ndarray:
     """Which column (T, L) each marker is to be taken from, by its track and by `marker_levels`, if there are any.
 
-    The best pair and span is swapped, then the best of what is left, until nothing gains: of a longer cycle each swap
-    puts one marker right.
+    The frames of `MEMORY` count as one. The best pair and span is swapped, then the best of what is left, until nothing
+    gains: of a longer cycle each swap puts one marker right.
     """
     T, L = positions.shape[:2]
     order, tracks = np.tile(np.arange(L), (T, 1)), Tracks(positions, rate)
-    levels, touched = np.zeros((T, L, L)) if levels is None else levels.copy(), set(range(L))
+    levels = np.zeros((T, L, L)) if levels is None else min(1.0, 1 / (MEMORY * rate)) * levels
+    touched = set(range(L))
     for _ in range(12):                                                 # longer cycles come apart into pairs
         found = _best_spans(tracks, levels, touched)
         touched = set()
@@ -160,10 +148,7 @@ def _best_spans(tracks: Tracks, levels: np.ndarray, touched: set[int]
 
 
 def best_stretches(tracks: Tracks, a: int, b: int, begins: np.ndarray, gains: np.ndarray) -> tuple[float, np.ndarray]:
-    """What it gains to swap a pair, and in which frames (n,).
-
-    Stretches that begin at frames (m,) are swapped or not; the places of the markers tell what each gains (m,).
-    """
+    """What it gains to swap a pair in some of the stretches that begin at frames (m,), and in which frames (n,)."""
     lengths = np.diff(np.r_[begins, len(tracks.positions)])
     minority = 2.0                                  # changes that swapping the labels of the whole sequence counts
     gains = gains - minority * CHANGE * lengths / lengths.sum()
@@ -203,8 +188,7 @@ def _pairs_that_fit(own: np.ndarray, levels: np.ndarray, touched: set[int]) -> s
 def _two_states(gains: np.ndarray, stay: np.ndarray, switch: np.ndarray) -> tuple[float, np.ndarray]:
     """The best way through stretches (n + 1) of a pair as labelled or swapped: what it gains, and where (n + 1).
 
-    `gains` (n + 1,) are of being swapped in a stretch; `stay` and `switch` (n,) what it costs to remain as it is or to
-    change between two stretches, to which `CHANGE` comes.
+    `gains` (n + 1,) are of being swapped in a stretch; `stay`, `switch` (n,) what remaining and changing cost.
     """
     value, came = np.array([0.0, gains[0]]), np.zeros((len(stay), 2), dtype=int)
     for i, (remain, change) in enumerate(zip(stay, switch, strict=True)):
@@ -218,25 +202,3 @@ def _two_states(gains: np.ndarray, stay: np.ndarray, switch: np.ndarray) -> tupl
         state = 1 - state if from_other[state] else state
         states.append(state)
     return gained, np.array(states[::-1], dtype=bool)
-
-
-def list_swaps(order: np.ndarray, seen: np.ndarray, labels: tuple[str, ...]) -> tuple[Swap, ...]:
-    """The swaps that an order (T, L) is made of; a longer cycle is a chain of pairs.
-
-    A swap begins and ends where one of the two labels is seen (T, L), as they came.
-    """
-    frames: dict[tuple[int, int], list[int]] = {}
-    for t in np.flatnonzero((order != np.arange(order.shape[1])).any(axis=1)):
-        left = order[t].copy()
-        for a in range(len(left)):
-            while left[a] != a:                                        # puts one label right at a time
-                b = int(left[a])
-                left[a], left[b] = left[b], b
-                frames.setdefault((min(a, b), max(a, b)), []).append(int(t))
-    out = []
-    for (a, b), times in frames.items():
-        for run in np.split(np.array(times), np.flatnonzero(np.diff(times) > 1) + 1):
-            there = run[seen[run, a] | seen[run, b]]
-            if len(there):
-                out.append(Swap(labels[a], labels[b], int(there[0]), int(there[-1])))
-    return tuple(sorted(out, key=lambda s: (s.begin, s.first, s.second)))

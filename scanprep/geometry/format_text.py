@@ -1,0 +1,179 @@
+"""Formats of text: Wavefront OBJ; OFF with its variants COFF, NOFF, CNOFF; and points, one `x y z` a line."""
+from __future__ import annotations
+
+import re
+from pathlib import Path
+
+import numpy as np
+
+from .format_common import (
+    Contents,
+    Lines,
+    MeshFileError,
+    as_bytes,
+    polygons,
+    quote,
+    text_rows,
+    three_numbers,
+)
+from .format_ply import Element, Property, ascii_element
+
+
+def read_obj(path: Path, data: bytes) -> Contents:
+    """The vertices, in their order, triangles and vertex colours of an OBJ file; everything else is skipped."""
+    lines = Lines(path, data.replace(b"\\\r\n", b" ").replace(b"\\\n", b" "), comment=b"#")
+    starts = [line[:2] for line in map(bytes.lstrip, lines.text)]
+    v_rows = [row for row, start in enumerate(starts) if start in (b"v ", b"v\t")]
+    f_rows = [row for row, start in enumerate(starts) if start in (b"f ", b"f\t", b"f")]
+    if not v_rows:
+        raise MeshFileError(f"{path}: expected an OBJ file with lines 'v x y z', found none")
+    table = _vertices(lines, v_rows)
+    corners, sizes = _corners(lines, v_rows, f_rows)
+    faces = polygons(path, sizes, corners, len(v_rows), [lines.numbers[row] for row in f_rows])
+    return Contents(table[:, :3], faces, None, np.clip(table[:, 3:6], 0, 1) if table.shape[1] >= 6 else None)
+
+
+def _after(lines: Lines, rows: list[int]) -> list[bytes]:
+    """What follows the keyword, one letter, on these rows."""
+    return [lines.text[row].lstrip()[1:] for row in rows]
+
+
+def _vertices(lines: Lines, rows: list[int]) -> np.ndarray:
+    """(N, 3) coordinates, or (N, 6) and more where every line has a colour as well."""
+    text = _after(lines, rows)
+    try:
+        table = np.loadtxt(text, ndmin=2, comments=None) if any(map(bytes.strip, text)) else np.zeros((0, 3))
+        if len(table) != len(rows) or table.shape[1] < 3:
+            raise ValueError
+        return table[:, :6 if table.shape[1] >= 6 else 3]
+    except ValueError:               # lines of unequal length, or one that is wrong
+        out = []
+        for row, line in zip(rows, text, strict=True):
+            try:
+                x, y, z = map(float, line.split()[:3])
+            except ValueError:
+                raise lines.fail(row, "a vertex 'v x y z'") from None
+            out.append((x, y, z))
+        return np.array(out)
+
+
+def _corners(lines: Lines, v_rows: list[int], f_rows: list[int]) -> tuple[np.ndarray, np.ndarray]:
+    """The vertices of all faces one after the other, counted from 0, and how many each face has."""
+    text = _after(lines, f_rows)
+    if any(b"/" in line for line in text):           # v/vt/vn: the first number is the vertex
+        text = re.sub(rb"/\S*", b"", b"\n".join(text)).split(b"\n")
+    try:
+        table: np.ndarray = np.zeros((0, 3))
+        if any(map(bytes.strip, text)):
+            table = np.loadtxt(text, dtype=np.int64, ndmin=2, comments=None)
+        if len(table) != len(text):
+            raise ValueError
+        corners, sizes = table.astype(np.int64).ravel(), np.full(len(text), table.shape[1])
+    except (ValueError, OverflowError):      # polygons of several sizes, or one that is wrong
+        words = [line.split() for line in text]
+        bad = next((i for i, w in enumerate(words) if not all(re.fullmatch(rb"[+-]?\d{1,18}", x) for x in w)), None)
+        if bad is not None:
+            raise lines.fail(f_rows[bad], "a face 'f v v v' of vertex numbers") from None
+        corners = np.array([x for w in words for x in w], dtype=np.int64)
+        sizes = np.array([len(w) for w in words])
+    zero = np.flatnonzero(corners == 0)
+    if len(zero):
+        face = int(np.searchsorted(np.cumsum(sizes), zero[0], side="right"))
+        raise lines.fail(f_rows[face], "vertex numbers counted from 1")
+    known = np.repeat(np.searchsorted(v_rows, f_rows), sizes)      # a negative number counts back from here
+    return np.where(corners < 0, known + corners, corners - 1), sizes
+
+
+def encode_obj(contents: Contents, double: bool) -> bytes:
+    """An OBJ file; colours, when there are any, behind the coordinates."""
+    form, columns = f"v {three_numbers(double)}", [contents.vertices]
+    if contents.colors is not None:
+        form, columns = form + " %.4g %.4g %.4g", [contents.vertices, contents.colors]
+    text = text_rows(form, *columns)
+    return (text if contents.faces is None else text + text_rows("f %d %d %d", contents.faces + 1)).encode()
+
+
+def read_off(path: Path, data: bytes) -> Contents:
+    """The vertices, polygons as triangles, normals and vertex colours of an OFF file in ascii."""
+    lines = Lines(path, data, comment=b"#")
+    head = lines.text[0].split() if len(lines) else [b""]
+    kind = re.fullmatch(rb"(ST)?(C)?(N)?OFF", head[0])
+    if kind is None:
+        raise MeshFileError(f"{path}: expected a file that begins with OFF or COFF, found {quote(data[:20])}")
+    if head[1:2] == [b"BINARY"]:
+        raise MeshFileError(f"{path}: expected an ascii OFF file, found a binary one")
+    counts, place = (head[1:], 1) if len(head) > 1 else (lines.text[1].split() if len(lines) > 1 else [], 2)
+    if len(counts) < 2 or not all(word.isdigit() and len(word) < 10 for word in counts[:2]):
+        raise lines.fail(place - 1, "the numbers of vertices, faces and edges")
+    n, f = int(counts[0]), int(counts[1])
+    width = 6 if kind[3] else 3
+    table = lines.table(range(place, place + n), f"{width} or more numbers of vertex 0..{n - 1}", width)
+    colors = None
+    if kind[2] and table.shape[1] >= width + 3:
+        colors = table[:, width:width + 3] / (255 if table[:, width:width + 3].max(initial=0) > 1 else 1)
+        colors = np.clip(colors, 0, 1)
+    place += n
+    if place + f != len(lines):
+        found = len(lines) - place
+        raise MeshFileError(f"{path}: {'truncated: ' if found < f else ''}expected {f} faces after {n} vertices, "
+                            f"found {found} lines")
+    face = Element("face", f, (Property("corners", "i4", "u1"),))                 # as in PLY; what follows is skipped
+    sizes, corners = ascii_element(lines, face, place)[0]["corners"]
+    faces = polygons(path, sizes, corners, n, lines.numbers[place:place + f])
+    return Contents(table[:, :3], faces, table[:, 3:6] if kind[3] else None, colors)
+
+
+def encode_off(contents: Contents, double: bool) -> bytes:
+    """An OFF file, or COFF where there are colours."""
+    assert contents.faces is not None, "an OFF file is written for meshes"
+    kind, form, columns = "OFF", three_numbers(double), [contents.vertices]
+    if contents.colors is not None:
+        kind, form = "COFF", form + " %d %d %d 255"
+        columns.append(as_bytes(contents.colors))
+    return (f"{kind}\n{len(contents.vertices)} {len(contents.faces)} 0\n" + text_rows(form, *columns)
+            + text_rows("3 %d %d %d", contents.faces)).encode()
+
+
+def read_xyz(path: Path, data: bytes) -> Contents:
+    """The points of a text file; a first line that is a heading or a count is skipped.
+
+    Three more columns are normals when every row of them has length one, otherwise colours, 0..255 or 0..1;
+    both may follow, in either order.
+    """
+    if b"\0" in data:
+        raise MeshFileError(f"{path}: expected text with lines 'x y z', found a binary file")
+    lines = Lines(path, re.sub(rb"[,;]", b" ", data), comment=b"#")
+    first = 1 if len(lines) and not _is_point(lines.text[0]) and _is_heading(lines.text[0]) else 0
+    if len(lines) == first:
+        raise MeshFileError(f"{path}: expected lines 'x y z', found none")
+    table = lines.table(range(first, len(lines)), "numbers 'x y z', as many on every line", 3)
+    normals = colors = None
+    for start in range(3, table.shape[1] - 2, 3):
+        triple = table[:, start:start + 3]
+        if normals is None and np.allclose(np.linalg.norm(triple, axis=1), 1, atol=1e-2):
+            normals = triple
+        elif colors is None and triple.min() >= 0 and triple.max() <= 255:
+            colors = triple / (255 if triple.max() > 1 else 1)
+    return Contents(table[:, :3], None, normals, colors)
+
+
+def _is_point(line: bytes) -> bool:
+    try:
+        return len([float(word) for word in line.split()]) >= 3
+    except ValueError:
+        return False
+
+
+def _is_heading(line: bytes) -> bool:
+    words = line.split()
+    return (len(words) == 1 and words[0].isdigit()) or words[0].lstrip(b'/"').lower() in (b"x", b"")
+
+
+def encode_xyz(contents: Contents, double: bool) -> bytes:
+    """Lines of coordinates, then normals, then colours 0..255."""
+    form, columns = three_numbers(double), [contents.vertices]
+    if contents.normals is not None:
+        form, columns = form + " %.7g %.7g %.7g", [*columns, contents.normals]
+    if contents.colors is not None:
+        form, columns = form + " %.6g %.6g %.6g", [*columns, 255 * contents.colors]
+    return text_rows(form, *columns).encode()
