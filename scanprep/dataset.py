@@ -2,8 +2,8 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Sequence
-from dataclasses import astuple, dataclass, field, fields
+from collections.abc import Iterable, Sequence
+from dataclasses import astuple, dataclass, field, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -119,19 +119,10 @@ class RegisteredSet:
         check_same_topology(Path(name), mesh, self.folder / "template.ply", self.template)
         entry = SetEntry(name, subject, pose, sex, f"meshes/{name}.ply")
         write_mesh(self.folder / entry.file, mesh)
-        rows = list(_read_rows(self.folder))
-        places = [i for i, row in enumerate(rows) if row.name == name]
-        place = places[0] if places else len(rows)
-        rows[place:place + 1] = [entry]
-        _write_rows(self.folder, rows)
-        return RegisteredSet(self.folder, self.template, tuple(rows), self.skeleton, self.info)
-
-    def in_order(self) -> RegisteredSet:
-        """The set with its meshes in the order of their names, however they came in."""
-        rows = tuple(sorted(self.entries, key=lambda entry: entry.name))
-        if rows != self.entries:
-            _write_rows(self.folder, rows)
-        return RegisteredSet(self.folder, self.template, rows, self.skeleton, self.info)
+        rows = {row.name: row for row in _read_rows(self.folder)}
+        rows[name] = entry                               # in the place of the old one, if there was one
+        _write_rows(self.folder, rows.values())
+        return replace(self, entries=tuple(rows.values()))
 
     def with_skeleton(self, skeleton: Skeleton) -> RegisteredSet:
         """Write a skeleton into the set; ValueError for one of another triangulation."""
@@ -139,7 +130,7 @@ class RegisteredSet:
             raise ValueError(f"skeleton: expected {len(self.template.faces)} faces as the template has, "
                              f"got {len(skeleton.part_of_face)}")
         skeleton.save(self.folder / "skeleton.json")
-        return RegisteredSet(self.folder, self.template, self.entries, skeleton, self.info)
+        return replace(self, skeleton=skeleton)
 
     @property
     def names(self) -> tuple[str, ...]:
@@ -220,5 +211,5 @@ def _read_rows(folder: Path) -> tuple[SetEntry, ...]:
     return tuple(entries.values())
 
 
-def _write_rows(folder: Path, rows: Sequence[SetEntry]) -> None:
+def _write_rows(folder: Path, rows: Iterable[SetEntry]) -> None:
     tables.write_table(folder / "set.csv", _COLUMNS, map(astuple, rows))

@@ -5,6 +5,8 @@ import shlex
 import shutil
 from pathlib import Path
 
+import numpy as np
+
 from completion import Motion
 from completion.__main__ import main
 from model import load_model
@@ -66,4 +68,16 @@ def user_folder(demo, folder):
         (folder / "registered" / part).mkdir(parents=True)
         for row in names:
             shutil.copy(demo / "set" / "meshes" / f"{row.split(',')[0]}.ply", folder / "registered" / part)
+    return folder
+
+
+def with_demo_model(folder):
+    """The model of the demonstration, which learned from more scans than a user has, and what was made with it."""
+    demo = folder / "scape_demo"
+    shutil.copy(demo / "model.npz", folder / "model.npz")
+    model = load_model(demo / "model.npz")
+    standing = np.zeros((len(model.skeleton.parents), 3))
+    write_mesh(folder / "heavier.ply", model.template.with_vertices(model.vertices(standing, np.array([1.5]))))
+    (folder / "walk").mkdir(exist_ok=True)
+    shutil.copy(demo / "animation" / "motion.npz", folder / "walk")
     return folder

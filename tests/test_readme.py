@@ -5,7 +5,7 @@ One file, so that one process does it all: the READMEs of the packages go on wit
 import re
 
 import pytest
-from readme_folder import ROOT, SET_UP, blocks, commands, run_commands, user_folder
+from readme_folder import ROOT, SET_UP, blocks, commands, run_commands, user_folder, with_demo_model
 
 README = (ROOT / "README.md").read_text(encoding="utf-8")
 PACKAGES = [f"{package}/README.md" for package in ("scanprep", "model", "completion")]
@@ -21,6 +21,12 @@ def place(demo_folder, tmp_path_factory):
         patch.setenv("SCAPEKIT_CACHE", str(folder / "cache"))
         run_commands("README.md")
     return folder
+
+
+@pytest.fixture(scope="module")
+def results(place):
+    """The same folder for the READMEs of the packages."""
+    return with_demo_model(place)
 
 
 @pytest.fixture(autouse=True)
@@ -51,12 +57,12 @@ def test_snippets(place, code):
 
 
 @pytest.mark.parametrize("readme", PACKAGES)
-def test_commands_of_packages(place, readme):
+def test_commands_of_packages(results, readme):
     run_commands(readme)
 
 
 @pytest.mark.parametrize("readme, code", [(readme, code) for readme in PACKAGES for code in blocks(readme, "python")])
-def test_snippets_of_packages(place, readme, code):
+def test_snippets_of_packages(results, readme, code):
     exec(compile(code, readme, "exec"), {})
 
 

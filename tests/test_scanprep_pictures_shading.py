@@ -140,14 +140,11 @@ def test_the_picture_does_not_depend_on_where_the_scene_is():
 def test_background_and_ground():
     mesh = ball()
     camera = Camera.around(np.array([[-0.8, -0.8, -0.6], [0.8, 0.8, 0.6]]), 0, 25)
-    plain = render(mesh, camera, 80, 80, background=(0.2, 0.4, 0.6))
-    assert plain[0, 0].tolist() == [51, 102, 153]
-    clear = render(mesh, camera, 80, 80, background=None)
-    assert clear.shape == (80, 80, 4)
-    assert clear[0, 0, 3] == 0 and clear[40, 40, 3] == 255
-    shadow = render(mesh, camera, 80, 80, ground=True, background=None)
-    assert shadow[..., 3].sum() > clear[..., 3].sum() * 1.02
-    assert (shadow[:30, :, 3] == clear[:30, :, 3]).all()           # none above the horizon of the floor
+    clear, shadow = (render(mesh, camera, 80, 80, ground=ground).astype(int) for ground in (False, True))
+    assert clear.shape == (80, 80, 3) and clear[0, 0].tolist() == [255] * 3 and clear[40, 40].max() < 250
+    darker = (clear - shadow).min(axis=2)
+    assert darker.min() >= 0 and darker.sum() / 255 > 0.02 * (clear.min(axis=2) < 250).sum()
+    assert (shadow[:30] == clear[:30]).all()                       # none above the horizon of the floor
 
 
 def test_occluded_places_are_darker():
@@ -190,7 +187,6 @@ def test_heat_darkens_evenly():
     assert np.array_equal(heat(np.array([-1.0, 5.0]), 0, 1), heat(np.array([0.0, 1.0]), 0, 1))
     grey = heat(np.array([np.nan, 0.5]), 0, 1)[0]
     assert np.ptp(grey) < 0.06
-    assert np.allclose(heat(np.array([0.0, 3.0]))[1], heat(np.array([3.0]), 0, 3)[0])
 
 
 def test_sixteen_parts_can_be_told_apart():

@@ -274,11 +274,12 @@ def test_what_leads_the_template(scans, template, tmp_path):
     (scans / "body0.landmarks.json").unlink()
     settings = {init: dataclasses.replace(QUICK, scan=dataclasses.replace(QUICK.scan, init=init))
                 for init in ("landmarks", "pose")}
-    asked = prepare(find_scans(scans), template, MARKS, tmp_path / "asked", settings["landmarks"])
-    assert asked.registered.names == ("body1", "body2") and "body0" in asked.failures[0]
-    best = prepare(find_scans(scans), template, MARKS, tmp_path / "best", QUICK)
-    assert best.registered.names == ("body1", "body2") and "or --init pose" in best.failures[0]  # it has no limbs
-    near = prepare(find_scans(scans)[:2], template, {}, tmp_path / "near", settings["pose"])
+    tasks = find_scans(scans)[:2]
+    asked = prepare(tasks, template, MARKS, tmp_path / "asked", settings["landmarks"])
+    assert asked.registered.names == ("body1",) and "body0" in asked.failures[0]
+    best = prepare(tasks, template, MARKS, tmp_path / "best", QUICK)
+    assert best.registered.names == ("body1",) and "or --init pose" in best.failures[0]          # it has no limbs
+    near = prepare(tasks, template, {}, tmp_path / "near", settings["pose"])
     assert [f.init for f in near.figures] == ["pose", "pose"] and np.isnan(near.figures[0].landmarks)
 
 
@@ -290,8 +291,8 @@ def test_correspondences_lead_where_there_are_no_landmarks(scans, template, tmp_
     some = np.arange(0, 642, 30)
     pairs = Correspondences(some, turned.vertices[some], np.ones(len(some)))
     monkeypatch.setattr(scan_module, "find_correspondences", lambda *args, **named: pairs)
-    done = prepare(find_scans(scans), template, MARKS, tmp_path / "set", QUICK)
-    assert [f.init for f in done.figures] == ["22 correspondences", "5 landmarks", "5 landmarks"]
+    done = prepare(find_scans(scans)[:2], template, MARKS, tmp_path / "set", QUICK)
+    assert [f.init for f in done.figures] == ["22 correspondences", "5 landmarks"]
     found = done.registered.vertices(["body0"])[0]
     assert np.linalg.norm(found - turned.vertices, axis=1).max() < 0.05
 
@@ -309,18 +310,18 @@ def test_clutter_is_cleaned_off_when_asked(scans, template, tmp_path):
 
 
 def test_other_settings_or_template_do_all_anew(scans, template, tmp_path):
-    tasks = find_scans(scans)
+    tasks = find_scans(scans)[:2]
     prepare(tasks, template, MARKS, tmp_path / "set", QUICK)
     clean = dataclasses.replace(QUICK, scan=dataclasses.replace(QUICK.scan, clean=CleanScanConfig()))
-    assert prepare(tasks, template, MARKS, tmp_path / "set", clean).fresh == 3
+    assert prepare(tasks, template, MARKS, tmp_path / "set", clean).fresh == 2
     wider = template.with_vertices(1.05 * template.vertices)
-    assert prepare(tasks, wider, MARKS, tmp_path / "set", clean).fresh == 3
+    assert prepare(tasks, wider, MARKS, tmp_path / "set", clean).fresh == 2
     moved = {**MARKS, "left": int(np.linalg.norm(wider.vertices - wider.vertices[MARKS["left"]], axis=1).argsort()[1])}
-    assert prepare(tasks, wider, moved, tmp_path / "set", clean).fresh == 3
+    assert prepare(tasks, wider, moved, tmp_path / "set", clean).fresh == 2
     prepare(tasks, wider, moved, tmp_path / "fresh", clean)
     assert contents(tmp_path / "set") == {name: data.replace(b"Scans of fresh", b"Scans of set")
                                           for name, data in contents(tmp_path / "fresh").items()}
-    with pytest.raises(ValueError, match="2 other scans that were registered with another template"):
+    with pytest.raises(ValueError, match="1 other scans that were registered with another template"):
         prepare(tasks[:1], template, MARKS, tmp_path / "set", clean)
 
 

@@ -50,15 +50,14 @@ def place_by_landmarks(landmarks: Sequence[Mapping[str, np.ndarray]], count: int
     return T
 
 
-def fit_of_views(views: Sequence[tuple[Mesh, np.ndarray]], near: float = 0.01, apart: float = 0.02,
-                 points: int = 2000, rng: np.random.Generator | None = None) -> tuple[np.ndarray, np.ndarray]:
+def fit_of_views(views: Sequence[tuple[Mesh, np.ndarray]]) -> tuple[np.ndarray, np.ndarray]:
     """Shares (V,) of the points of each view that another saw as well, and (V,) that another looks through.
 
-    Two views agree about a point when their surfaces, facing the same way, are `near` (metres); they contradict each
-    other when one looks through what the other saw, so far `apart` in front of its own surface.
+    Two views agree about a point when their surfaces, facing the same way, are 1 cm apart at most; they contradict each
+    other when one looks through what the other saw, 2 cm in front of its own surface.
     """
-    rng = rng or np.random.default_rng(0)
-    chosen = [rng.permutation(len(mesh.vertices))[:points] for mesh, _ in views]
+    rng = np.random.default_rng(0)
+    chosen = [rng.permutation(len(mesh.vertices))[:2000] for mesh, _ in views]
     targets = [OrientedPoints(mesh.vertices, mesh.vertex_normals) for mesh, _ in views]
     overlap, conflict = np.zeros(len(views)), np.zeros(len(views))
     for number, (mesh, _) in enumerate(views):
@@ -67,8 +66,8 @@ def fit_of_views(views: Sequence[tuple[Mesh, np.ndarray]], near: float = 0.01, a
         if not others or not len(rows):
             continue
         p, n = mesh.vertices[rows], mesh.vertex_normals[rows]
-        overlap[number] = np.mean(np.any([targets[k].match(p, n, near, 0.5).valid for k in others], axis=0))
-        conflict[number] = np.mean(SeenSpace([views[k] for k in others]).ahead(p) > apart)
+        overlap[number] = np.mean(np.any([targets[k].match(p, n, 0.01, 0.5).valid for k in others], axis=0))
+        conflict[number] = np.mean(SeenSpace([views[k] for k in others]).ahead(p) > 0.02)
     return overlap, conflict
 
 
@@ -83,10 +82,9 @@ def _means(T: np.ndarray, points: np.ndarray) -> np.ndarray:
 def place_by_features(views: list[tuple[Mesh, np.ndarray]], rng: np.random.Generator) -> np.ndarray:
     """Motions (V, 4, 4) of views that bring alike shapes together where no view then looks through another.
 
-    Histograms of the angles between normals around points are compared between all pairs of views, three matches
-    at a time propose a motion, and motions are judged by how much surface agrees and how much one view looks
-    through the other. The best pairs are chained from the first view, which stays. The proposal may be wrong where
-    views overlap little: see `AlignedViews.trusted`.
+    Histograms of the angles between normals around points are compared between all pairs of views, three matches at a
+    time propose a motion, and motions are judged by how much surface agrees and how much one view looks through the
+    other. The best pairs are chained from the first view. It may be wrong where views overlap little: see `trusted`.
     """
     extent = float(max(np.ptp(mesh.vertices, axis=0).max() for mesh, _ in views))
     described = [_described(mesh, extent) for mesh, _ in views]

@@ -43,8 +43,7 @@ class Plane:
 def find_plane(points: np.ndarray, min_area: float, rng: np.random.Generator) -> Plane | None:
     """The largest plane that has nearly all points (n, 3) on it or on one side of it; None below `min_area` m².
 
-    Guesses go through single points along the normal of their neighbourhood, and the best is fitted to closer and
-    closer points.
+    Guesses go through single points along the normal of their neighbourhood; the best is fitted to ever closer points.
     """
     few = points[rng.permutation(len(points))[:10_000]]
     tree = cKDTree(few)
@@ -74,10 +73,10 @@ def find_plane(points: np.ndarray, min_area: float, rng: np.random.Generator) ->
     return plane
 
 
-def local_noise(points: np.ndarray, rng: np.random.Generator, count: int = 500, near: int = 16) -> float:
+def local_noise(points: np.ndarray, rng: np.random.Generator) -> float:
     """Standard deviation, metres, of points (n, 3) from planes through their nearest neighbours: the median."""
-    near = min(near, len(points))
-    index = cKDTree(points).query(points[rng.choice(len(points), min(count, len(points)), replace=False)], near)[1]
+    near = min(16, len(points))
+    index = cKDTree(points).query(points[rng.choice(len(points), min(500, len(points)), replace=False)], near)[1]
     patch = points[index.reshape(-1, near)]
     spread = np.linalg.svd(patch - patch.mean(axis=1, keepdims=True), compute_uv=False)[:, 2]
     return max(float(np.median(spread)) / max(near - 3, 1) ** 0.5, 1e-4)

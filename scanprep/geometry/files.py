@@ -148,9 +148,9 @@ def read_scan(path: str | Path, unit: str | None = None) -> Mesh | np.ndarray:
         raise
 
 
-def write_points(path: str | Path, cloud: PointCloud, precision: Precision = "double") -> None:
+def write_points(path: str | Path, cloud: PointCloud) -> None:
     """Write points in metres, whole or not at all: `.ply`, `.ply.gz`, `.pcd`, `.xyz`, `.txt` or `.pts`."""
-    _write(Path(path), Contents(cloud.points, None, cloud.normals, cloud.colors), precision, _POINTS)
+    _write(Path(path), Contents(cloud.points, None, cloud.normals, cloud.colors), "double", _POINTS)
 
 
 def list_meshes(folder: str | Path) -> list[Path]:

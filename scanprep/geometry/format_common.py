@@ -86,10 +86,10 @@ def metres_per_unit(path: Path, points: np.ndarray, unit: str | None, smallest: 
     return 1.0
 
 
-def quote(text: bytes | str, length: int = 40) -> str:
+def quote(text: bytes | str) -> str:
     """The beginning of a piece of a file, fit for one line of an error."""
     shown = text if isinstance(text, str) else text.decode("latin-1")
-    return repr(shown if len(shown) <= length else shown[:length] + "...")
+    return repr(shown if len(shown) <= 40 else shown[:40] + "...")
 
 
 class Lines:

@@ -88,7 +88,7 @@ def mean_of_neighbours(mesh: Mesh) -> csr_array:
     return csr_array(adjacency.multiply(1 / degree[:, None]))
 
 
-def relax(mesh: Mesh, surface: Surface, rounds: int = 5) -> Mesh:
+def relax(mesh: Mesh, surface: Surface, rounds: int) -> Mesh:
     """Vertices moved towards the middle of their neighbours along a surface, all but those on the border."""
     free = np.ones(len(mesh.vertices), dtype=bool)
     free[mesh.boundary_vertices] = False
@@ -104,7 +104,7 @@ def relax(mesh: Mesh, surface: Surface, rounds: int = 5) -> Mesh:
     return mesh
 
 
-def smooth(mesh: Mesh, rounds: int = 10) -> Mesh:
+def smooth(mesh: Mesh, rounds: int) -> Mesh:
     """Noise taken off without shrinking, by steps forward and back [Taubin].
 
     A border is smoothed as the curve it is.
@@ -127,22 +127,21 @@ def smooth(mesh: Mesh, rounds: int = 10) -> Mesh:
     return mesh.with_vertices(vertices)
 
 
-def improve_triangles(mesh: Mesh, surface: Surface | None = None) -> Mesh:
-    """Slivers turned into well-shaped triangles on a surface, or on the mesh itself; their number stays."""
-    surface = surface or Surface(mesh)
+def improve_triangles(mesh: Mesh, surface: Surface) -> Mesh:
+    """Slivers turned into well-shaped triangles on a surface; their number stays."""
     for _ in range(6):
         mesh = relax(flip_edges(mesh, rounds=8), surface, rounds=2)
     return flip_edges(mesh)
 
 
-def clamped_cotangents(mesh: Mesh, low: float = 0.02, high: float = 20.0) -> csr_array:
+def clamped_cotangents(mesh: Mesh) -> csr_array:
     """(N, N) Laplacian, rows summing to 0, whose off-diagonal weights stay positive on any triangles."""
     rows, cols, values = [], [], []
     for corner in range(3):
         tip, p, q = (mesh.faces[:, (corner + i) % 3] for i in range(3))
         x, y = mesh.vertices[p] - mesh.vertices[tip], mesh.vertices[q] - mesh.vertices[tip]
         area = np.maximum(np.linalg.norm(np.cross(x, y), axis=1), 1e-30)
-        weight = np.clip(_dot(x, y) / area, low, high) / 2
+        weight = np.clip(_dot(x, y) / area, 0.02, 20) / 2
         rows += [p, q]
         cols += [q, p]
         values += [weight, weight]

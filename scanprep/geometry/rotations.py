@@ -105,16 +105,9 @@ def _terms(twist: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.nd
     return angle, small, np.where(small, 1.0, angle), hat(twist)
 
 
-def procrustes(source: np.ndarray, target: np.ndarray, weights: np.ndarray | None = None
-               ) -> tuple[np.ndarray, np.ndarray]:
-    """R (..., 3, 3) and t (..., 3) that bring `source` (..., n, 3) nearest to `target`: `target ≈ source @ R.T + t`.
-
-    Points count by their weights (n,).
-    """
-    w = np.ones(source.shape[-2]) if weights is None else np.asarray(weights, dtype=np.float64)
-    w = w / w.sum()
-    centre_s = np.einsum("n,...nd->...d", w, source)
-    centre_t = np.einsum("n,...nd->...d", w, target)
-    H = np.einsum("n,...ni,...nj->...ij", w, target - centre_t[..., None, :], source - centre_s[..., None, :])
+def procrustes(source: np.ndarray, target: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """R (..., 3, 3) and t (..., 3) that bring `source` (..., n, 3) nearest to `target`: `target ≈ source @ R.T + t`."""
+    centre_s, centre_t = source.mean(axis=-2), target.mean(axis=-2)
+    H = np.einsum("...ni,...nj->...ij", target - centre_t[..., None, :], source - centre_s[..., None, :])
     R = project(H.reshape(-1, 3, 3)).reshape(H.shape)
     return R, centre_t - np.einsum("...ij,...j->...i", R, centre_s)

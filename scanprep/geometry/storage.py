@@ -153,9 +153,9 @@ def load_arrays(path: str | Path, what: str = "an .npz file") -> dict[str, np.nd
     return _arrays(path, what, None)
 
 
-def load_array(path: str | Path, what: str = "an array of NumPy") -> np.ndarray:
+def load_array(path: str | Path) -> np.ndarray:
     """The array of an `.npy` file, or StorageError when it is missing, damaged or holds objects."""
-    with taking_apart(path, what), open(path, "rb") as stream:
+    with taking_apart(path, "an array of NumPy"), open(path, "rb") as stream:
         return _array(stream, os.fstat(stream.fileno()).st_size, "")
 
 

@@ -57,11 +57,11 @@ def _spread_normals(near: np.ndarray) -> np.ndarray:
     return np.linalg.eigh(np.matmul(offset.transpose(0, 2, 1), offset))[1][:, :, 0]
 
 
-def _one_sided(points: np.ndarray, near: np.ndarray, limit: float = 0.3) -> np.ndarray:
+def _one_sided(points: np.ndarray, near: np.ndarray) -> np.ndarray:
     """(n,) bool: the neighbours lie to one side, as at the edge of a hole; single missing points do not count."""
     offset = points[near] - points[:, None]
     reach = np.linalg.norm(offset, axis=2).max(axis=1)
-    return np.linalg.norm(offset.mean(axis=1), axis=1) > limit * reach
+    return np.linalg.norm(offset.mean(axis=1), axis=1) > 0.3 * reach
 
 
 def orient(target: Target, deformed: Mesh, scale: float) -> Target:

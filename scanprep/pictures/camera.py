@@ -51,10 +51,9 @@ class Camera:
         away = self.distance if np.isfinite(self.distance) else 10 * (self.width + self.height)
         return self.target + away * self.axes[2]
 
-    def closer(self, factor: float, target: np.ndarray | None = None) -> Camera:
-        """The same view `factor` times as large, about another target (3,) when one is given."""
-        return replace(self, width=self.width / factor, height=self.height / factor,
-                       target=self.target if target is None else np.asarray(target, dtype=float))
+    def closer(self, factor: float) -> Camera:
+        """The same view `factor` times as large."""
+        return replace(self, width=self.width / factor, height=self.height / factor)
 
     def rays(self, width: int, height: int, samples: int = 1) -> tuple[np.ndarray, np.ndarray]:
         """Origins, relative to the target, and unit directions of the rays of a picture, row by row.
@@ -118,12 +117,12 @@ def upright(mesh: Mesh) -> tuple[int, float]:
     return up, float(np.degrees(np.arctan2(forward[1], forward[0])))
 
 
-def look_around(body: Mesh, poses: np.ndarray | None = None, turns: tuple[float, ...] = (0, 90, 180, 270),
-                elevation: float = 8.0) -> list[Camera]:
+def look_around(body: Mesh, poses: np.ndarray | None = None, turns: tuple[float, ...] = (0, 90, 180, 270)
+                ) -> list[Camera]:
     """Cameras around a standing body: by default from its front, its left, its back and its right.
 
     `turns` are degrees from the front; `poses` (..., 3), metres, is what has to fit into the picture if not the body.
     """
     up, front = upright(body)
     subject = body.vertices if poses is None else np.asarray(poses, dtype=float).reshape(-1, 3)
-    return [Camera.around(subject, azimuth=front + turn, elevation=elevation, up=up) for turn in turns]
+    return [Camera.around(subject, azimuth=front + turn, up=up) for turn in turns]

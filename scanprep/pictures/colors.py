@@ -10,35 +10,28 @@ HEAT_END = 0.86       # the darkest end of the map would swallow the shading
 NO_VALUE = (0.72, 0.74, 0.76)
 
 
-def heat(values: np.ndarray, low: float = 0.0, high: float | None = None, colormap: str = HEAT) -> np.ndarray:
-    """Colours (..., 3) in [0, 1] of a perceptually uniform map of matplotlib; NaN becomes a neutral grey.
-
-    `high` is the largest value when not given.
-    """
+def heat(values: np.ndarray, low: float, high: float, colormap: str = HEAT) -> np.ndarray:
+    """Colours (..., 3) in [0, 1] of a perceptually uniform map of matplotlib; NaN becomes a neutral grey."""
     from matplotlib import colormaps
 
     values = np.asarray(values, dtype=float)
-    if high is None:
-        high = float(np.nanmax(values, initial=low))
     place = np.clip((values - low) / max(high - low, 1e-30), 0, 1)
     colors = colormaps[colormap](np.nan_to_num(place) * (HEAT_END if colormap == HEAT else 1.0))[..., :3]
     colors[np.isnan(values)] = NO_VALUE
     return colors
 
 
-def color_bar(low: float, high: float, title: str = "", colormap: str = HEAT, width: int = 320,
-              scale: float = 1000.0, unit: str = "mm") -> np.ndarray:
+def color_bar(low: float, high: float, title: str, colormap: str = HEAT, scale: float = 1000.0, unit: str = "mm"
+              ) -> np.ndarray:
     """A legend (H, W, 3) uint8 for `heat`; the numbers written are `scale` times `low` to `high`, in `unit`."""
     from PIL import Image, ImageDraw
 
     from .sheets import INK, font
 
-    pad, thick = 26, 14
-    top = 26 if title else 6
+    width, pad, top, thick = 320, 26, 26, 14
     image = Image.new("RGB", (width, top + thick + 26), "white")
     draw = ImageDraw.Draw(image)
-    if title:
-        draw.text((width / 2, 4), title, fill=INK, anchor="ma", font=font(14))
+    draw.text((width / 2, 4), title, fill=INK, anchor="ma", font=font(14))
     ramp = heat(np.linspace(low, high, width - 2 * pad), low, high, colormap)
     image.paste(Image.fromarray(np.repeat((255 * ramp[None] + 0.5).astype(np.uint8), thick, axis=0)), (pad, top))
     for place in np.linspace(0, 1, 5):

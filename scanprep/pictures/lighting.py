@@ -178,8 +178,8 @@ class Canvas:
         nearer = (alpha >= 1) & (depth < self.depth[rays])
         self.depth[rays[nearer]] = depth[nearer]
 
-    def finish(self, width: int, height: int, samples: int, background: Sequence[float] | None) -> np.ndarray:
-        """Average the rays of every pixel and lay them on the background."""
+    def finish(self, width: int, height: int, samples: int) -> np.ndarray:
+        """Average the rays of every pixel and lay them on white."""
         def mean(values: np.ndarray) -> np.ndarray:
             rows = values.reshape(height * samples, width * samples, -1)
             parts = [rows[i::samples, j::samples] for i in range(samples) for j in range(samples)]
@@ -188,12 +188,9 @@ class Canvas:
         color, alpha = mean(self.color), mean(self.alpha)
         if self.floor is not None:
             alpha = alpha + (1 - alpha) * self.floor.reshape(height, width, 1)
-        if background is None:
-            straight = np.divide(color, alpha, out=np.zeros_like(color), where=alpha > 0)
-            return _bytes(np.concatenate([as_seen(straight), alpha], axis=-1))
-        # The background is blended as displayed, so that shadows on white fade evenly.
+        # White is blended as displayed, so that shadows on it fade evenly.
         inked = as_seen(np.divide(color, alpha, out=np.zeros_like(color), where=alpha > 0))
-        return _bytes(inked * alpha + np.asarray(background, dtype=float) * (1 - alpha))
+        return np.clip(255 * (inked * alpha + 1 - alpha) + 0.5, 0, 255).astype(np.uint8)
 
 
 def sphere_directions(count: int) -> np.ndarray:
@@ -215,7 +212,3 @@ def cone_directions(axis: np.ndarray, radius: float, count: int) -> np.ndarray:
 
 def _unit(v: np.ndarray) -> np.ndarray:
     return v / np.maximum(np.linalg.norm(v, axis=-1, keepdims=True), 1e-20).astype(v.dtype)
-
-
-def _bytes(values: np.ndarray) -> np.ndarray:
-    return np.clip(255 * values + 0.5, 0, 255).astype(np.uint8)

@@ -64,14 +64,14 @@ class Page:
         self._parts.append(f'<div class="scroll"><table>{head}<tbody>{body}</tbody></table></div>')
         return self
 
-    def chart(self, figure: Any, caption: str = "", alt: str = "") -> Page:
+    def chart(self, figure: Any, caption: str = "") -> Page:
         """A matplotlib figure, as vector graphics; the same figure gives the same bytes."""
         from matplotlib import rc_context
 
         out = io.BytesIO()
         with rc_context({"svg.hashsalt": "scapekit"}):
             figure.savefig(out, format="svg", bbox_inches="tight", metadata={"Date": None})
-        return self.picture(out.getvalue(), caption, alt)
+        return self.picture(out.getvalue(), caption)
 
     def download(self, name: str, data: bytes, text: str = "") -> Page:
         """A link that saves a file carried by the page itself."""

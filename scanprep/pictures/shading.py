@@ -59,17 +59,12 @@ class Bones:
 Shape = Mesh | Solid | Dots | Bones
 
 
-def render(shapes: Shape | Sequence[Shape], camera: Camera | None = None, width: int = 480, height: int = 640,
-           ground: bool = False, background: Sequence[float] | None = (1.0, 1.0, 1.0), samples: int = 2) -> np.ndarray:
-    """A shaded picture (height, width, 3) uint8, or (height, width, 4) when the background is None.
-
-    The camera sees all meshes from their front when it is not given. `ground` is a soft shadow on the floor below the
-    lowest point; each pixel is the mean of samples × samples rays.
+def render(shapes: Shape | Sequence[Shape], camera: Camera, width: int, height: int, ground: bool = False
+           ) -> np.ndarray:
+    """A shaded picture (height, width, 3) uint8 on white; `ground`: a soft shadow on the floor below the lowest point.
     """
     everything = [shapes] if isinstance(shapes, Shape) else list(shapes)
-    if camera is None:
-        camera = Camera.around([s for s in everything if isinstance(s, Mesh | Solid)])
-    origins, directions = camera.rays(width, height, samples)
+    origins, directions = camera.rays(width, height, samples=2)
     canvas = Canvas(len(origins))
     solid = [s for s in everything if not _on_top(s) and _opacity(s) == 1]
     if solid:
@@ -83,7 +78,7 @@ def render(shapes: Shape | Sequence[Shape], camera: Camera | None = None, width:
     top = [s for s in everything if _on_top(s)]
     if top:
         canvas.cover(_scene(top, camera).seen(origins, directions), through=0.8)
-    return canvas.finish(width, height, samples, background)
+    return canvas.finish(width, height, samples=2)
 
 
 def _on_top(shape: Shape) -> bool:
@@ -160,10 +155,9 @@ def balls(points: np.ndarray, radius: float, divisions: int | None = None
     return (corners.reshape(-1, 3, 3), np.tile(normals, (count, 1, 1)), np.repeat(np.arange(count), len(faces)))
 
 
-def capsules(starts: np.ndarray, ends: np.ndarray, radius: float, sides: int = 16
-             ) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+def capsules(starts: np.ndarray, ends: np.ndarray, radius: float) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
     """One rod with round ends for each pair of points (n, 3), in the form of `balls`."""
-    count = len(starts)
+    count, sides = len(starts), 16
     along = ends - starts
     length = np.linalg.norm(along, axis=1, keepdims=True)
     along = np.divide(along, length, out=np.tile([0.0, 0.0, 1.0], (count, 1)), where=length > 0)

@@ -42,16 +42,14 @@ def side_by_side(images: Sequence[np.ndarray], labels: Sequence[str] | None = No
     for number, image in enumerate(images):
         x, y, cell_h = (number % columns) * (cell_w + gap), int(tops[number // columns]), heights[number // columns]
         h, w = image.shape[:2]
-        picture = Image.fromarray(image)
-        place = (x + (cell_w - w) // 2, y + (cell_h - h) // 2)
-        sheet.paste(picture, place, picture if image.shape[2] == 4 else None)
+        sheet.paste(Image.fromarray(image), (x + (cell_w - w) // 2, y + (cell_h - h) // 2))
         if labels:
             draw.text((x + cell_w / 2, y + cell_h + 4), labels[number], fill=INK, anchor="ma", font=font(15))
     return np.asarray(sheet)
 
 
 def png_bytes(image: np.ndarray) -> bytes:
-    """A picture (H, W, 3 or 4) uint8, or grey (H, W) uint8 or uint16, as PNG."""
+    """A picture (H, W, 3) uint8, or grey (H, W) uint8 or uint16, as PNG."""
     from PIL import Image
 
     out = io.BytesIO()
@@ -60,7 +58,7 @@ def png_bytes(image: np.ndarray) -> bytes:
 
 
 def save_png(path: str | Path, image: np.ndarray) -> None:
-    """Write a picture (H, W, 3 or 4) uint8, whole or not at all."""
+    """Write a picture (H, W, 3) uint8, whole or not at all."""
     write(path, png_bytes(image))
 
 

@@ -18,7 +18,7 @@ from ..console import Metric, Outcome, bar, say
 from ..geometry.files import read_mesh
 from ..geometry.landmarks import read_template_landmarks
 from ..geometry.mesh import Mesh
-from .figures import Limits, ScanFigures
+from .figures import Limits, Verdict
 from .page import PAGE, judge_set, write_set_page
 from .prepare import PrepareConfig, Prepared, prepare
 from .scan import Init
@@ -52,7 +52,7 @@ def run_all(scans: ScansArg, template: Path, output: Output, landmarks: Path | N
     marks = _template_marks(template, template_landmarks, body, tasks, config.scan.init)
     with bar("registering scans") as registering, bar("finding the skeleton") as finding:
         done = prepare(tasks, body, marks, space.folder, config, registering, finding)
-    return Outcome(output, [*_progress_made(done, tasks), *_quality(output, done.figures),
+    return Outcome(output, [*_progress_made(done, tasks), *_quality(judge_set(output)),
                             Metric("unit assumed", config.scan.unit or "m")], {"prepare": config}, list(done.failures))
 
 
@@ -67,9 +67,7 @@ def page(registered: SetArg, limits: Limits = Limits()) -> Outcome:  # noqa: B00
     with workspace(registered) as space, space.staging("page") as staged:
         write_set_page(registered, limits, to=staged.folder)
     say(f"written: {registered / PAGE}")
-    verdicts = judge_set(registered, limits)
-    figures = [v.figures for v in verdicts if v.figures is not None]
-    return Outcome(None, _quality(registered, figures, limits), {"limits": limits})
+    return Outcome(None, _quality(judge_set(registered, limits)), {"limits": limits})
 
 
 def _template_marks(template: Path, given: Path | None, body: Mesh, tasks: Sequence[ScanTask], init: Init
@@ -99,10 +97,10 @@ def _progress_made(done: Prepared, tasks: Sequence[ScanTask]) -> list[Metric]:
             Metric("parts of the skeleton", len(tree.parents) if tree else "none sought")]
 
 
-def _quality(folder: Path, figures: Sequence[ScanFigures], limits: Limits | None = None) -> list[Metric]:
+def _quality(verdicts: Sequence[Verdict]) -> list[Metric]:
     """Means over the set, and the scans that need a look."""
-    verdicts = judge_set(folder, limits)
     suspects = [v for v in verdicts if v.suspect]
+    figures = [v.figures for v in verdicts if v.figures is not None]
 
     def mean(name: str) -> float:
         values = np.array([getattr(f, name) for f in figures], dtype=float)

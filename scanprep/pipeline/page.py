@@ -13,6 +13,7 @@ from ..dataset import RegisteredSet, SetEntry
 from ..geometry import rotations
 from ..geometry.farthest_points import thin
 from ..geometry.mesh import Mesh
+from ..meaning import size as size_of
 from ..pictures.camera import Camera, look_around, upright
 from ..pictures.page import Page, data_uri
 from ..pictures.shading import CLAY, Dots, Shape, Solid, color_bar, heat, part_colors, render, side_by_side
@@ -32,7 +33,7 @@ def write_set_page(folder: str | Path, limits: Limits | None = None, to: Path | 
     """Write `report.html` of a set, from what lies in its folder, there or into another folder; returns its path."""
     folder, limits = Path(folder), limits or Limits()
     whole, verdicts = RegisteredSet.load(folder), judge_set(folder, limits)
-    size = float(np.sqrt(whole.template.face_areas.sum()))
+    size = size_of(whole.template)
     entries = {entry.name: entry for entry in whole.entries}
     page = Page(f"Scans of {folder.absolute().name}", _lead(verdicts))
     page.markup("", Path(__file__).with_name("page.css").read_text(encoding="utf-8"))
@@ -54,9 +55,8 @@ def judge_set(folder: str | Path, limits: Limits | None = None) -> list[Verdict]
     """The verdicts on all scans of a set, worst first."""
     folder = Path(folder)
     whole = RegisteredSet.load(folder)
-    size = float(np.sqrt(whole.template.face_areas.sum()))
     figures = [f for f in read_figures(folder) if f.name in whole.names]
-    return review(figures, read_failures(folder), size, len(whole.template.faces), limits)
+    return review(figures, read_failures(folder), size_of(whole.template), len(whole.template.faces), limits)
 
 
 def _lead(verdicts: Sequence[Verdict]) -> str:
@@ -167,7 +167,7 @@ def strip(template: Mesh, scan: Mesh | np.ndarray, fit: Registration) -> bytes:
     body = fit.mesh.with_vertices((fit.mesh.vertices - middle) @ R.T)
     up, front = upright(template)
     near, back = (Camera.around(body.vertices, front + turn, up=up, margin=1.12) for turn in (TURN, TURN + 180))
-    size = float(np.sqrt(template.face_areas.sum()))
+    size = size_of(template)
     far = Solid(body, heat(evened(body, fit.distances), 0, FAR * size))
     shown = [(_scan(scan, R, middle, size), near), (Solid(body, CLAY), near), (far, near), (far, back),
              (Solid(body, heat(1 - fit.confidence, -0.35, 1, "Blues")), near)]      # unlike the distances
@@ -183,11 +183,11 @@ def _scan(scan: Mesh | np.ndarray, R: np.ndarray, middle: np.ndarray, size: floa
     return Dots((points[thin(points, 1.25 * BALL * size)] - middle) @ R.T, CLAY, BALL * size)
 
 
-def evened(mesh: Mesh, values: np.ndarray, rounds: int = 2) -> np.ndarray:
+def evened(mesh: Mesh, values: np.ndarray) -> np.ndarray:
     """Values (N,) averaged with those of neighbours, so that noise fades and misfit stays; NaN stays NaN."""
     known = np.isfinite(values)
     weights = mesh.vertex_adjacency.astype(float) + eye_array(len(values))
-    for _ in range(rounds):
+    for _ in range(2):
         total = weights @ np.where(known, values, 0.0)
         values = np.where(known, total / np.maximum(weights @ known.astype(float), 1.0), np.nan)
     return values
@@ -205,10 +205,10 @@ def coarsened(mesh: Mesh, cell: float) -> Mesh:
     return Mesh(means, faces[apart], colors)
 
 
-def webp_bytes(image: np.ndarray, quality: int = 82) -> bytes:
+def webp_bytes(image: np.ndarray) -> bytes:
     """A picture (H, W, 3) uint8 as a WebP file, a tenth of the size of a PNG."""
     from PIL import Image
 
     out = io.BytesIO()
-    Image.fromarray(image).save(out, format="WEBP", quality=quality, method=4)
+    Image.fromarray(image).save(out, format="WEBP", quality=82, method=4)
     return out.getvalue()

@@ -67,12 +67,10 @@ def prepare(tasks: Sequence[ScanTask], template: Mesh, template_landmarks: Mappi
             skeleton_progress: Progress | None = None) -> Prepared:
     """Register the template to every scan, find the skeleton, and write a page that shows how it went.
 
-    What the folder already holds is done again only where something that it depends on has changed: a scan, its
-    landmarks, the template, the settings; for the skeleton any mesh of its subject. A scan that cannot be read or
-    registered is listed and the others go on. Scans of earlier calls stay in the set. A skeleton that was edited since
-    it was found stays as it is. Nothing that is written depends on the number of workers, their order or interruptions,
-    but for `times.csv`. ValueError for a template that cannot serve, or a folder that holds other scans registered
-    with another template or settings.
+    What the folder already holds is done again only where something that it depends on has changed. A scan that cannot
+    be read or registered is listed; scans of earlier calls, and a skeleton that was edited, stay as they are. Nothing
+    that is written depends on the number of workers, their order or interruptions, but for `times.csv`. ValueError for
+    a template that cannot serve, or a folder of other scans registered with another template or settings.
     """
     config = config or PrepareConfig()
     check_template(template)

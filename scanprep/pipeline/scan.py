@@ -67,9 +67,8 @@ class RegisteredScan:
 
 
 def register_scan(task: ScanTask, template: Mesh, template_landmarks: dict[str, int],
-                  settings: ScanSettings | None = None) -> RegisteredScan:
+                  settings: ScanSettings) -> RegisteredScan:
     """Read and register one scan; ValueError for files that cannot be read, or a registration that means nothing."""
-    settings = settings or ScanSettings()
     start = time.perf_counter()
     with one_thread():
         scan = read_scan(task.scan, settings.unit)

@@ -29,9 +29,8 @@ def find_scans(folder: str | Path, landmarks: str | Path | None = None, subject:
     """The scans of a folder sorted by name, their landmark files, and what `scans.csv` says of them.
 
     The name is the part of the file name before its first dot; a landmark file has the same name, in `landmarks`, in
-    the folder `landmarks` inside, or beside the scan. `scans.csv` has the columns name, subject, pose, sex. Where it
-    does not say whose scan it is, it is of `subject`, or when that is empty of a person of its own. ValueError for no
-    scans, two scans of one name, a table with unknown names.
+    the folder `landmarks` inside, or beside the scan. Where `scans.csv` (name, subject, pose, sex) does not say whose
+    scan it is, it is of `subject`, or of a person of its own. ValueError for no scans, or two of one name.
     """
     folder = Path(folder)
     paths = _list_scans(folder)
