@@ -1,6 +1,7 @@
 """A motion: one pose and place a frame, and the file it lives in."""
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 
@@ -11,6 +12,7 @@ from scanprep.geometry import storage
 from scanprep.ranges import BETAS, TINY, TURNS, Range
 
 SURFACE_MODEL = "scape"
+Progress = Callable[[int, int], None]            # called with (done, total)
 
 
 @dataclass(frozen=True, eq=False)

@@ -2,7 +2,7 @@
 from __future__ import annotations
 
 import re
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
 
@@ -11,6 +11,7 @@ import numpy as np
 from scanprep.batch.workspace import Workspace
 from scanprep.geometry.files import MeshFileError, PointCloud, read_points, write_mesh
 
+from ..motion import Progress
 from .sequence import TrackedFrame, Tracker, TrackerState, without_points
 
 ENDINGS = (".ply", ".ply.gz", ".obj", ".stl", ".off", ".glb", ".pcd", ".xyz", ".txt", ".pts")
@@ -119,7 +120,6 @@ def _numbers(found: set[int]) -> list[int]:
     return list(range(order[0], order[-1] + 1, step)) if filled <= 2 * len(order) else order
 
 
-Progress = Callable[[int, int], None]
 AT_ONCE = 5                          # frames that are kept together
 START = "frames/"                    # of the names of what is kept
 SURFACES = "surfaces"

@@ -13,7 +13,7 @@ from scanprep.geometry.mesh import Mesh
 from scanprep.threads import one_thread
 
 from ..bodies import FixedBody, ShapedBody, as_body
-from ..motion import Motion
+from ..motion import Motion, Progress
 from ..partial.completion import complete
 from ..partial.free_surface import free_surface
 from ..partial.scan import ScanPoints
@@ -22,7 +22,6 @@ from .frame_fit import FrameFit, Refined, shared_shape, spread_poses
 from .frames import Frame, as_views, prepare_frame
 from .settings import TrackConfig
 
-Progress = Callable[[int, int], None]
 Surfaces = Callable[[int, Mesh], None]
 
 

@@ -1,14 +1,13 @@
 """What is wrong with the markers of a sequence, by the body that carries them."""
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from model.linear import Subject
 
-from ...motion import Motion
+from ...motion import Motion, Progress
 from ..files.markers import MarkerSequence
 from ..marker_sets.layout import MarkerLayout
 from ..pose import swaps
@@ -18,7 +17,6 @@ from .results import ArtefactConfig, BadSpan, MarkerArtefacts, list_swaps
 from .simulated import Simulation, bridged
 from .slips import find_bad, without_lost_limbs
 
-Progress = Callable[[int, int], None]
 FOLLOW = AnimateConfig()             # how the body follows the markers here
 ROUNDS = 6                           # most times that markers are repaired and the body follows them anew
 CLOSE = 0.25                         # metres between markers whose swap a body can follow

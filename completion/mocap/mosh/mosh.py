@@ -16,7 +16,7 @@ from scanprep.batch.room import Step, inside, once
 from scanprep.ranges import Settings
 from scanprep.threads import one_thread
 
-from ...motion import Motion
+from ...motion import Motion, Progress
 from ..artefacts.find import find_artefacts, no_artefacts, relabelled_by_tracks
 from ..artefacts.results import ArtefactConfig, MarkerArtefacts
 from ..files.markers import MarkerSequence
@@ -26,7 +26,6 @@ from ..pose.settings import RATE, AnimateConfig
 from ..soft_tissue.soft_tissue import SoftTissue, SoftTissueConfig, follow_soft_tissue
 from ..subject.person import PersonConfig, PersonFit, find_person, one_or_more
 
-Progress = Callable[[int, int], None]
 T = TypeVar("T")
 STEPS = 100                          # of progress, of each stage
 

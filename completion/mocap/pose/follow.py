@@ -1,7 +1,7 @@
 """Motion of a known body from markers: a few frames one after the other, then all as a whole; a low-pass filter."""
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 
 import numpy as np
 from scipy.spatial.transform import Rotation
@@ -9,7 +9,7 @@ from scipy.spatial.transform import Rotation
 from model.linear import Subject
 from scanprep.threads import one_thread
 
-from ...motion import Motion
+from ...motion import Motion, Progress
 from ...smoothing import coupled_steps
 from ..files.markers import MarkerSequence
 from ..marker_sets.layout import MarkerLayout
@@ -22,7 +22,6 @@ from .stream import STEPS, Tracker
 
 __all__ = ["AnimateConfig", "animate"]
 
-Progress = Callable[[int, int], None]
 STILL = 0.005                        # metres that the last round moves any marker of a frame that has converged
 
 

@@ -1,7 +1,6 @@
 """Soft tissue: a person whose shape changes a little in every frame. [MoSh] Eq. 24"""
 from __future__ import annotations
 
-from collections.abc import Callable
 from dataclasses import dataclass, replace
 from pathlib import Path
 
@@ -13,7 +12,7 @@ from scanprep.geometry.sparse import overlapping_windows, solve_smooth
 from scanprep.ranges import Positive, Settings
 from scanprep.threads import one_thread
 
-from ...motion import Motion
+from ...motion import Motion, Progress
 from ...smoothing import coupled_steps
 from ..files.markers import MarkerSequence
 from ..marker_sets.layout import MarkerLayout
@@ -23,7 +22,6 @@ from ..pose.robust import marker_weights
 from ..pose.settings import RATE, AnimateConfig
 from .changing_body import ChangingBody, changing_bodies, skin_metric, skin_movement
 
-Progress = Callable[[int, int], None]
 PER_SQUARE_METRE = 1e4               # of a weight on square centimetres
 ROUNDS = 3                           # Gauss-Newton steps over the whole sequence, which begins near its end
 WINDOW, OVERLAP = 400, 40            # frames smoothed at once, and those that each side lends to its neighbour

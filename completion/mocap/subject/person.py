@@ -1,7 +1,7 @@
 """The first stage of [MoSh]: the shape of a person and where the markers really sit, from some frames."""
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import partial
 
@@ -13,6 +13,7 @@ from scanprep.geometry import rotations
 from scanprep.geometry.farthest_points import farthest_points
 from scanprep.threads import one_thread
 
+from ...motion import Progress
 from ..files.markers import MarkerSequence
 from ..marker_sets.layout import MarkerLayout
 from .frame_starts import mean_person, start_frames
@@ -20,7 +21,6 @@ from .latent_fit import LatentFit, PersonConfig, State
 
 __all__ = ["PersonConfig", "PersonFit", "find_person"]
 
-Progress = Callable[[int, int], None]
 LOOK = (1, 3)                        # before these stages loose markers are looked for
 
 
