@@ -27,7 +27,7 @@ KILLED = """
 import os, sys
 import {package} as module
 from model.learning.cli import learn
-from scanprep.console import run
+from scanprep.command_line import run
 
 real, calls = module.{name}, []
 
