@@ -34,11 +34,16 @@ def worst_frames(motion: Motion, count: int) -> np.ndarray:
     """At most so many frames, in order: those with the largest mean residual, at least a quarter of a second apart."""
     off = np.where(np.isfinite(motion.residuals), motion.residuals, 0).sum(axis=1)
     off /= np.maximum(np.isfinite(motion.residuals).sum(axis=1), 1)
-    frames: list[int] = []
-    for t in np.argsort(-off):
-        if len(frames) < count and all(abs(int(t) - other) >= motion.rate / 4 for other in frames):
-            frames.append(int(t))
-    return np.sort(frames).astype(int)
+    return frames_apart(np.argsort(-off), count, motion.rate / 4)
+
+
+def frames_apart(frames: np.ndarray, count: int, apart: float) -> np.ndarray:
+    """In order the first frames of some, at most so many, that are no closer in time than `apart` frames."""
+    found: list[int] = []
+    for t in frames.tolist():
+        if len(found) < count and all(abs(t - other) >= apart for other in found):
+            found.append(t)
+    return np.sort(found).astype(int)
 
 
 def picture_frames(motion: Motion, subject: Subject, markers: np.ndarray | None,

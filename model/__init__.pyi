@@ -6,6 +6,11 @@ from .coregistration.rounds import Coregistration as Coregistration
 from .coregistration.rounds import coregister as coregister
 from .coregistration.single import ModelRegistration as ModelRegistration
 from .coregistration.single import register_with_model as register_with_model
+from .evaluation.errors import compactness as compactness
+from .evaluation.errors import pose_errors as pose_errors
+from .evaluation.errors import shape_errors as shape_errors
+from .evaluation.sampling import sample_bodies as sample_bodies
+from .evaluation.sampling import specificity as specificity
 from .export.bvh import read_bvh as read_bvh
 from .export.bvh import write_bvh as write_bvh
 from .export.correctives import write_body_npz as write_body_npz
@@ -28,12 +33,15 @@ from .learning.sexes import learn_by_sex as learn_by_sex
 from .learning.skinning import SkinConfig as SkinConfig
 from .learning.skinning import learn_skinning as learn_skinning
 from .linear import Subject as Subject
+from .posing.character import CharacterConfig as CharacterConfig
+from .posing.character import character_model as character_model
 from .posing.poses import find_mirror as find_mirror
 from .posing.poses import mirror_pose as mirror_pose
 from .posing.poses import pose_from_angles as pose_from_angles
 from .posing.poses import rotate_joint as rotate_joint
 from .posing.transfer import subject_from_body as subject_from_body
 from .priors import sample_poses as sample_poses
+from .resolution.change import ResolutionConfig as ResolutionConfig
 from .resolution.change import change_resolution as change_resolution
 from .scape import BlendScapeModel as BlendScapeModel
 from .scape import ScapeModel as ScapeModel

@@ -6,6 +6,8 @@ from .correspondence.correlated import find_correspondences as find_corresponden
 from .correspondence.search import CorrelatedConfig as CorrelatedConfig
 from .dataset import RegisteredSet as RegisteredSet
 from .decimation.decimate import decimate as decimate
+from .decimation.registered_set import DecimateSetConfig as DecimateSetConfig
+from .decimation.registered_set import decimate_set as decimate_set
 from .fusion.tsdf import merge_views as merge_views
 from .geometry.files import (
     MeshFileError as MeshFileError,
@@ -38,6 +40,10 @@ from .repair.hole_filling import fill_holes as fill_holes
 from .skeleton.edit import (
     apply_edits as apply_edits,
 )
+from .skeleton.edit import merge_parts as merge_parts
+from .skeleton.edit import move_joint as move_joint
+from .skeleton.edit import rename_part as rename_part
+from .skeleton.edit import split_part as split_part
 from .skeleton.find import SkeletonConfig as SkeletonConfig
 from .skeleton.find import find_skeleton as find_skeleton
 from .skeleton.tree import Skeleton as Skeleton

@@ -18,6 +18,7 @@ from completion.__main__ import main
 from completion.mocap.mosh import cli, pictures, report
 from completion.mocap.mosh.work import Work
 from scanprep.batch.workspace import HOME
+from scanprep.pictures.page import Page
 
 FRAMES = 40
 BETAS = {"ann": np.array([0.9, -0.6, 0.4]), "bob": np.array([-0.8, 0.5, -0.3])}
@@ -75,10 +76,11 @@ def small_pictures():
 
 
 class QuietWork(Work):
-    """The work with small pictures, in other processes too."""
+    """The work with small pictures and charts that are not drawn, in other processes too."""
 
     def __call__(self, actor, room):
-        with small_pictures():
+        with small_pictures(), pytest.MonkeyPatch.context() as patch:
+            patch.setattr(Page, "chart", lambda page, *_rest: page)
             return super().__call__(actor, room)
 
 

@@ -8,8 +8,8 @@ from jointed_bodies import bent, crab
 
 from scanprep.geometry import rotations
 from scanprep.geometry.mesh import Mesh
-from scanprep.registration.deformation_graph import GraphFit, Stiffness, pull, start_fit
-from scanprep.registration.matches import prepare
+from scanprep.registration.graph_fit import GraphFit, Stiffness, start_fit
+from scanprep.registration.matches import prepare, pull
 from scanprep.registration.nonrigid import register
 from scanprep.registration.schedule import RegistrationConfig
 

@@ -13,8 +13,8 @@ from jointed_bodies import bent, crab
 from scanprep.geometry import rotations
 from scanprep.geometry.mesh import Mesh, template_problem
 from scanprep.geometry.surface import Surface
-from scanprep.registration import deformation_graph as graph
 from scanprep.registration import final_fit as inverted
+from scanprep.registration import graph_fit as graph
 from scanprep.registration.nonrigid import register
 from scanprep.registration.schedule import RegistrationConfig
 

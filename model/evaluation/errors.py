@@ -89,9 +89,23 @@ def errors_between(model: BodyModel, made: Sequence[np.ndarray], truth: np.ndarr
 
 def pose_errors(model: BodyModel, bodies: np.ndarray, subject: Subject | None = None,
                 config: FitConfig | None = None, progress: Progress | None = None) -> PoseErrors:
-    """What is left of one person's registered bodies (M, N, 3), metres, after fitting pose and place.
+    """Error of one person's bodies after fitting pose and place.
 
-    Best of bodies that the model was not trained on; the subject is the template's own body when not given.
+    Parameters
+    ----------
+    model : BodyModel
+    bodies : (M, N, 3) float, metres
+        Registered, of the subject, best those that the model was not trained on.
+    subject : Subject, optional
+        Whose bodies they are; the template's own body when not given.
+    config : FitConfig, optional
+    progress : callable, optional
+        Called with the bodies done and their number.
+
+    Raises
+    ------
+    ValueError
+        Bodies of another count of vertices or not finite.
     """
     bodies = checked_bodies(model, bodies, "bodies")
     subject = subject or model.subject()
@@ -107,10 +121,26 @@ def pose_errors(model: BodyModel, bodies: np.ndarray, subject: Subject | None = 
 def shape_errors(model: BodyModel, people: np.ndarray, counts: Sequence[int] = (10, 20, 40),
                  train: np.ndarray | None = None, config: FitConfig | None = None,
                  progress: Progress | None = None) -> ShapeErrors:
-    """What is left of registered people (S, N, 3), metres, after fitting shape, pose and place: the curve of
-    generalisation over numbers of components, of which more than the model has mean all of them.
+    """Error of people after fitting shape, pose and place: the curve of generalisation.
 
-    `train` (P, N, 3) are the training people, for plain principal components of vertices as a yardstick.
+    Parameters
+    ----------
+    model : BodyModel
+        With shape components.
+    people : (S, N, 3) float, metres
+        Registered, best people that the model was not trained on.
+    counts : ints
+        Numbers of components; more than the model has means all of them.
+    train : (P, N, 3) float, metres, optional
+        The training people, for plain principal components of vertices as a yardstick.
+    config : FitConfig, optional
+    progress : callable, optional
+        Called with the fits done and their number.
+
+    Raises
+    ------
+    ValueError
+        People of another count of vertices or not finite, a count below 1, a model without shape components.
     """
     people, wanted = checked_bodies(model, people, "people"), checked_counts(model, counts)
     largest = ShapeFitter(model, replace(config or FitConfig(), n_betas=wanted[-1]))

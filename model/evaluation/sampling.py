@@ -26,9 +26,22 @@ class Samples:
 
 def sample_bodies(model: BodyModel, count: int, rng: np.random.Generator, pose_too: bool = False,
                   n_betas: int | None = None) -> Samples:
-    """So many bodies with betas of the standard normal distribution, of the first `n_betas` components only.
+    """Bodies with betas of the standard normal distribution.
 
-    With `pose_too` they stand in poses of the Gaussian of the training poses, else at rest.
+    Parameters
+    ----------
+    model : BodyModel
+    count : int
+    rng : numpy Generator
+    pose_too : bool
+        Poses from the Gaussian of the training poses; else all stand at rest.
+    n_betas : int, optional
+        Vary the first components only.
+
+    Raises
+    ------
+    ValueError
+        A count below 1, more components than the model has, poses wanted of a model that lacks them.
 
     [SCAPE] Eq. 7
     """
@@ -64,11 +77,31 @@ class Specificity:
 def specificity(model: BodyModel, people: np.ndarray, count: int = 100, rng: np.random.Generator | None = None,
                 counts: Sequence[int] = (10, 20, 40), config: FitConfig | None = None,
                 progress: Progress | None = None) -> Specificity:
-    """Distance of `count` random bodies of the model to the nearest of the people (S, N, 3) that it was trained on.
+    """Distance of random bodies of the model to the nearest training person.
 
     Random bodies have betas of the standard normal distribution and stand at rest. The people are brought to rest
-    by `unposed`, and all bodies are centred, before vertices are compared. Of the counts of components those beyond the
-    model's mean all of them.
+    by `unposed`, and all bodies are centred, before vertices are compared.
+
+    Parameters
+    ----------
+    model : BodyModel
+        With shape components.
+    people : (S, N, 3) float, metres
+        Registered, the people that the model was trained on.
+    count : int
+        Random bodies for each number of components.
+    rng : numpy Generator, optional
+        The one of seed 0 when not given.
+    counts : ints
+        Numbers of components; more than the model has means all of them.
+    config : FitConfig, optional
+    progress : callable, optional
+        Called with the people fitted and their number.
+
+    Raises
+    ------
+    ValueError
+        Fewer than two people, a count below 1, a model without shape components.
     """
     rng = rng or np.random.default_rng(0)
     people, wanted = checked_bodies(model, people, "people"), checked_counts(model, counts)

@@ -31,7 +31,6 @@ from .within import choose_within, fit_within, held_out_bodies, number_people
 MIX = LearnConfig(features="quadratic", ridges=(1e-4, 3e-4, 1e-3, 3e-3, 0.01, 0.03, 0.1), detail=0.005, refinements=6)
 CORRECTIONS = 2                      # of Q and of S in a round, by what the stitched model leaves
 GAIN = 0.01                          # a round counts as progress when it lowers the held-out error by this share of it
-DAMPING = 0.1                        # of the inverse of S, against triangles that somebody has nearly flat
 
 
 @dataclass(frozen=True, eq=False)
@@ -185,11 +184,8 @@ def _next_round(mix: Mix, state: State, number: int, work: Work) -> State:
 
 
 def _learn_pose(mix: Mix, state: State) -> tuple[PoseSpace, Design]:
-    """The pose space with the shapes held, first as in the paper, then corrected on the stitched surface.
-
-    As in `learn_pose`, where all bodies are one person's.
-
-    [SCAPE] Eq. 4, Eq. 5
+    """The pose space with the shapes held, first as in the paper, then corrected on the stitched surface, as in
+    `learn_pose`. [SCAPE] Eq. 4, Eq. 5
     """
     parts, config, poses, S = mix.parts, mix.config, state.poses, state.S
     gradients = GradientSystem(parts.template, config.smoothness, parts.skeleton.part_of_face)
@@ -211,10 +207,10 @@ def _learn_pose(mix: Mix, state: State) -> tuple[PoseSpace, Design]:
 
 
 def _safe_inverse(S: np.ndarray) -> np.ndarray:
-    """`S⁻¹`, less of it where S is nearly flat; the identity stays the identity."""
+    """`S⁻¹`, a tenth damped against triangles that somebody has nearly flat; the identity stays the identity."""
     S = S.astype(np.float64)
     St = np.swapaxes(S, -1, -2)
-    return (1 + DAMPING) * St @ np.linalg.inv(S @ St + DAMPING * np.eye(3))
+    return 1.1 * St @ np.linalg.inv(S @ St + 0.1 * np.eye(3))
 
 
 def _at_rest(space: PoseSpace) -> PoseSpace:
@@ -226,11 +222,8 @@ def _at_rest(space: PoseSpace) -> PoseSpace:
 
 
 def _learn_people(mix: Mix, poses: np.ndarray, space: PoseSpace) -> np.ndarray:
-    """S (P, F, 3, 3) of every person from all of his bodies together, in float32 to halve the memory.
-
-    As with Q, Eq. 8 does not know of the stitching: what the stitched bodies leave is added and solved for again.
-
-    [SCAPE] Eq. 8
+    """S (P, F, 3, 3) of every person from all of their bodies together, in float32 to halve the memory. As with Q, what
+    the stitched bodies leave is added and solved for again. [SCAPE] Eq. 8
     """
     parts = mix.parts
     system = GradientSystem(parts.template, mix.config.smoothness)

@@ -38,10 +38,7 @@ class Design:
     left_out_error: float = float("nan")
 
     def fit(self, poses: np.ndarray, Q: np.ndarray) -> PoseSpace:
-        """Q (M, F, 3, 3), seen at poses (M, J, 3), as a function of the features.
-
-        [SCAPE] Eq. 4
-        """
+        """Q (M, F, 3, 3), seen at poses (M, J, 3), as a function of the features. [SCAPE] Eq. 4"""
         delta = self.features.evaluate(poses)
         v_hat = self.template.corners[:, 1:] - self.template.corners[:, :1]
 
@@ -57,9 +54,8 @@ class Design:
         return self.space(solve)
 
     def space(self, solve: Callable[[np.ndarray, np.ndarray], np.ndarray]) -> PoseSpace:
-        """The pose space with the coefficients (n, 9f) that `solve` finds for each group.
-
-        It gets the group's features (n,), the constant of the part first, and its faces (f,).
+        """The pose space with the coefficients (n, 9f) that `solve` finds for each group, from its features (n,), the
+        constant of the part first, and its faces (f,).
         """
         features, each = self.features, faces_of_part(self.features.skeleton)
         coefficients = tuple(np.zeros((features.of_part(p).stop - features.of_part(p).start, len(f), 3, 3),
@@ -76,12 +72,9 @@ class Design:
 
 def choose_design(template: Mesh, skeleton: Skeleton, poses: np.ndarray, Q: np.ndarray, config: LearnConfig,
                   judge: Judge, start: Design | None = None) -> Design:
-    """The features, pruning and penalty that predict left-out poses best, one sought after the other.
-
-    Of poses (M, J, 3) and Q (M, F, 3, 3); the judge gives the error in metres of predictions of Q, each made without
-    its own pose. The choices begin with those of `start`, or with the middle of what there is to choose from.
-
-    [SCAPE] Eq. 4
+    """The features, pruning and penalty that predict left-out poses best, one sought after the other, of poses
+    (M, J, 3) and Q (M, F, 3, 3). The judge gives the error in metres of predictions of Q, each made without its own
+    pose. The choices begin with those of `start`, or with the middle of what there is. [SCAPE] Eq. 4
     """
     choices = {"pruning": config.prunings, "radius": RADII if config.features == "radial" else (float("nan"),),
                "ridge": config.ridges}
@@ -179,11 +172,8 @@ def _left_out(design: Design, poses: np.ndarray, Q: np.ndarray) -> np.ndarray:
 
 def _support_vectors(X: np.ndarray, Q: np.ndarray, v_hat: np.ndarray, ridge: float
                      ) -> tuple[np.ndarray, np.ndarray]:
-    """Slopes (n, 9f) and means (9f,) of support-vector regression of Q (M, f, 3, 3) on centred features (M, n).
-
-    Q of the group is first written in its principal components, weighted as the edges see them: few numbers carry
-    all that varies between M poses.
-
+    """Slopes (n, 9f) and means (9f,) of support-vector regression of Q (M, f, 3, 3) on centred features (M, n). Q is
+    first written in its principal components, weighted as the edges see them: few numbers carry all that varies.
     [SCAPE-patent] §0047
     """
     from sklearn.svm import SVR
@@ -207,10 +197,8 @@ def _support_vectors(X: np.ndarray, Q: np.ndarray, v_hat: np.ndarray, ridge: flo
 
 
 def compress(space: PoseSpace, poses: np.ndarray, template: Mesh, tolerance: float) -> PoseSpace:
-    """The pose space with those mixtures of its features alone that matter for the edges in the poses (M, J, 3) seen.
-
-    The fast path pays for features one by one. In each part an edge may change by the tolerance, metres root mean
-    square.
+    """The pose space with those mixtures of its features alone that matter for the edges in the poses (M, J, 3) seen:
+    the fast path pays for features one by one. In each part an edge may change by the tolerance, metres RMS.
     """
     features, delta = space.features, space.features.evaluate(poses)
     v_hat = np.swapaxes(template.corners[:, 1:] - template.corners[:, :1], -1, -2)

@@ -139,10 +139,7 @@ class LearnedPose:
 
 
 def learn_pose(parts: BlendedTemplate, bodies: np.ndarray, config: LearnConfig, work: Work) -> LearnedPose:
-    """The pose space, first as in the paper, then refined on the stitched surface.
-
-    [SCAPE] Eq. 3, Eq. 4, Eq. 5
-    """
+    """The pose space, first as in the paper, then refined on the stitched surface. [SCAPE] Eq. 3, Eq. 4, Eq. 5"""
     inputs = parts, bodies, replace(config, components=0)
     return work.step("pose space", inputs, POSES, lambda inner: _learned(parts, bodies, config, inputs, inner))
 
@@ -231,10 +228,7 @@ def _by_vertices(parts: BlendedTemplate, bodies: np.ndarray, poses: np.ndarray) 
 
 def learn_people(parts: BlendedTemplate, space: PoseSpace, shapes: np.ndarray | None, config: LearnConfig, work: Work
                  ) -> ShapeSpace:
-    """The space of body shapes of people (P, N, 3), without components where there are none.
-
-    [SCAPE] Eq. 7, Eq. 8
-    """
+    """The space of body shapes of people (P, N, 3), without components where there are none. [SCAPE] Eq. 7, Eq. 8"""
     if shapes is None:
         work.tick(1 - POSES)
         return ShapeSpace.empty(len(parts.template.faces))

@@ -22,7 +22,6 @@ from .scape import POSES, Progress, Work, checked_training, learn_pose, seen_in_
 
 SEXES = ("female", "male")
 PLANE = "sex_plane"                  # its place in a model's info
-SOFTNESS = (0.003, 0.01, 0.03, 0.1, 0.3, 1.0)        # C of the support vectors, the softest first
 
 
 @one_thread()
@@ -99,11 +98,9 @@ def _groups(sexes: Sequence[str], count: int) -> dict[str, np.ndarray]:
 
 @dataclass(frozen=True, eq=False)
 class SexPlane:
-    """A plane between the betas of women and men.
-
-    `weights` (K,) is its unit normal, towards the men; `weights @ betas + bias` the signed distance. `accuracy` is the
-    share of the `count` people that planes learned without them told right, and `1 / (1 + exp(-slope distance))` the
-    probability of a man, by the same planes.
+    """A plane between the betas of women and men: its unit normal `weights` (K,), towards the men, and the signed
+    distance `weights @ betas + bias`. Planes learned without them told the share `accuracy` of the `count` people
+    right, and give the probability of a man, `1 / (1 + exp(-slope distance))`.
     """
 
     weights: np.ndarray
@@ -138,7 +135,7 @@ def learn_sex_plane(betas: np.ndarray, sexes: Sequence[str]) -> SexPlane:
     betas, men = np.asarray(betas, dtype=np.float64), np.array([sex == "male" for sex in sexes], dtype=bool)
     # three people for each beta that counts: with a beta a person everybody is like nobody else
     count, betas = betas.shape[1], betas[:, :max(1, len(betas) // 3)]
-    tried = [(_unseen(betas, men, C), C) for C in SOFTNESS]
+    tried = [(_unseen(betas, men, C), C) for C in (0.003, 0.01, 0.03, 0.1, 0.3, 1.0)]       # the softest first
     right = [float(np.mean((margins > 0) == men)) for margins, _ in tried]
     margins, C = tried[int(np.argmax(right))]
     weights, bias = _plane(betas, men, C)

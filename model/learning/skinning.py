@@ -24,7 +24,6 @@ from .regression import ridge_operator
 from .scape import POSES, Progress, Work, checked_training, fit_poses, pose_examples, pose_prior
 
 RIDGES = (1e-4, 1e-3, 3e-3, 0.01, 0.03, 0.1, 0.3)      # penalties; the one that predicts left-out poses best is taken
-LEVELS = 8                           # of how freely a joint corrects a vertex: vertices of one level share a solve
 PEOPLE_ROUNDS = 3                    # of fitting the poses of the other people and undoing them
 QUICK = FitConfig(sample=400, iterations=20, polish=0, tolerance=1e-4)     # of poses that will be fitted again
 
@@ -219,8 +218,8 @@ def _acting_joints(model: SkinningModel) -> np.ndarray:
         far = np.linalg.norm(x[mine, None] - joints[near], axis=2)
         # two joints correct a vertex: those of its heaviest part that are nearest to it
         acting[mine[:, None], near[np.argsort(far, axis=1, kind="stable")[:, :2]]] = 1
-    # metres of surface over which the correctives of a joint give way to another's
-    return np.round(LEVELS * diffused(model.template, acting, 0.05)) / LEVELS
+    # over 5 cm of surface a joint's correctives give way to another's; vertices of one of eight levels share a solve
+    return np.round(8 * diffused(model.template, acting, 0.05)) / 8
 
 
 def _regress(features: PoseFeatures, poses: np.ndarray, unposed: np.ndarray, acting: np.ndarray, ridge: float

@@ -18,11 +18,9 @@ from .regression import RADII, Design, make_design
 
 @dataclass(frozen=True, eq=False)
 class Within:
-    """The transform that makes a regression with a random effect a person an ordinary one.
-
-    From every body a share of the mean over its person's bodies is taken, the larger the more there are; `who` (M,)
-    says whose each is, 0..P-1. What people have of their own weighs little then, and where each has one body only, all
-    are weighed alike.
+    """The transform that makes a regression with a random effect a person an ordinary one; `who` (M,) says whose each
+    body is, 0..P-1. From every body a share of the mean over its person's bodies is taken, the larger the more there
+    are. What people have of their own weighs little then; where each has one body only, all are weighed alike.
     """
 
     who: np.ndarray
@@ -37,9 +35,8 @@ class Within:
         return out
 
     def without_the_person(self, X: np.ndarray, operator: np.ndarray, target: np.ndarray) -> np.ndarray:
-        """Residuals (M, n) of transformed targets, every person predicted from the others, in closed form.
-
-        Of transformed features X (M, k) and the operator (k, M) from targets to coefficients.
+        """Residuals (M, n) of transformed targets, every person predicted from the others, in closed form, with
+        transformed features X (M, k) and the operator (k, M) from targets to coefficients.
         """
         hat = X @ operator
         left = target - hat @ target
@@ -51,11 +48,8 @@ class Within:
 
 def choose_within(template: Mesh, skeleton: Skeleton, poses: np.ndarray, Q: np.ndarray, who: np.ndarray,
                   config: LearnConfig) -> Design:
-    """The pruning and penalty that predict the edges of left-out people best.
-
-    Of poses (M, J, 3), Q (M, F, 3, 3), and whose body each is (M,).
-
-    [SCAPE] Eq. 4
+    """The pruning and penalty that predict the edges of left-out people best, of poses (M, J, 3), Q (M, F, 3, 3), and
+    whose body each is (M,). [SCAPE] Eq. 4
     """
     designs = (make_design(template, skeleton, poses, config, pruning, RADII[0], ridge)
                for pruning, ridge in product(config.prunings, config.ridges))
@@ -65,7 +59,6 @@ def choose_within(template: Mesh, skeleton: Skeleton, poses: np.ndarray, Q: np.n
 
 def fit_within(design: Design, poses: np.ndarray, Q: np.ndarray, who: np.ndarray) -> PoseSpace:
     """Q as a function of the features, as `Design.fit`, were it not for what each person has of their own.
-
     [SCAPE] Eq. 4
     """
     within = Within(who)

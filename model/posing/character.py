@@ -46,11 +46,24 @@ class CharacterConfig(Settings):
 
 def character_model(model: BodyModel, vertices: np.ndarray, config: CharacterConfig | None = None,
                     pose: np.ndarray | None = None) -> BodyModel:
-    """The model with a character, vertices (N, 3) in the triangles of its template, in place of its mean person.
+    """The model with a character in place of its mean person.
 
     Shape components, pose-dependent deformation and pose prior stay: betas are offsets from the character, whose own
-    are zero. None is still the template's own body. The pose (J, 3) is how the character stands, where it is known.
-    ValueError for other vertices and for a model without betas.
+    are zero. None is still the template's own body.
+
+    Parameters
+    ----------
+    model : BodyModel
+    vertices : (N, 3) float, metres
+        The character in the triangles of the model's template, anywhere.
+    config : CharacterConfig, optional
+    pose : (J, 3) float, radians, optional
+        How the character stands, where it is known.
+
+    Raises
+    ------
+    ValueError
+        Vertices of another count or not finite, a pose of another shape, a model without betas.
 
     [MoSh]
     """

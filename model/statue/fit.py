@@ -108,16 +108,15 @@ def posed_by_features(control: ControlModel, joints: Mapping[str, np.ndarray], p
                       ) -> Posed:
     """The control model posed by features, and its head warped to those of the face."""
     fit = fit_features(control, joints, points)                                                  # [Statues] Eq. 4
-    shown = np.zeros(len(fit.vertices), dtype=bool)
-    face = [name for name in FACE if name in points]
-    if len(face) < 4 or "skullbase" not in control.skeleton.names:
-        return Posed(fit, fit.vertices, shown)
-    own = fit.vertices[[control.landmarks[name] for name in face]]
+    start, face = fit.vertices, [name for name in FACE if name in points]
+    if "skullbase" not in control.skeleton.names:
+        face = []
     try:
-        goal = np.array([points[name] for name in face])
-        return Posed(fit, warp(fit.vertices, own, goal, head_share(control)), shown, len(face))  # [Statues] Eq. 5
-    except ValueError:                   # points in one plane say nothing of the shape of a head
-        return Posed(fit, fit.vertices, shown)
+        own, goal = start[[control.landmarks[name] for name in face]], np.array([points[name] for name in face])
+        start = warp(start, own, goal, head_share(control)) if face else start                   # [Statues] Eq. 5
+    except ValueError:                   # fewer than four, or in one plane: they say nothing of the shape of a head
+        face = []
+    return Posed(fit, start, np.zeros(len(start), dtype=bool), len(face))
 
 
 def posed_automatically(control: ControlModel, found: Features) -> Posed:
@@ -136,9 +135,6 @@ def posed_automatically(control: ControlModel, found: Features) -> Posed:
 def fitted_control(control: ControlModel, posed: FeatureFit, surface: SurfaceFit, scan: Mesh,
                    config: DisplacementConfig | None = None) -> ControlModel:
     """The control model on the scan, drawn out of folds, its joints where the features put them."""
-    root = control.skeleton.part_of_vertex(control.mesh) == 0
-
-    def on(vertices: np.ndarray) -> ControlModel:
-        return control.fitted(vertices, np.concatenate([vertices[root].mean(axis=0)[None], posed.joints[1:]]))
-
-    return on(unfold_control(on(surface.vertices), scan, config).mesh.vertices)
+    unfolded = unfold_control(control.fitted(surface.vertices, posed.joints), scan, config).mesh.vertices
+    root = unfolded[control.skeleton.part_of_vertex(control.mesh) == 0].mean(axis=0)
+    return control.fitted(unfolded, np.vstack([root, posed.joints[1:]]))

@@ -20,7 +20,6 @@ from .detail.subdivision import subdivide
 from .motion.motions import people_motion
 
 HEIGHT = 520                         # pixels of the pictures
-SIDES = ("front", "left", "back", "right")
 WORST = 0.003                        # metres: the end of the colours of errors
 KINDS = {MEASURED: (0.62, 0.70, 0.78), FOLDED: (0.86, 0.36, 0.22), HOLE: (0.93, 0.75, 0.42), OUTSIDE: (1.0, 1.0, 1.0)}
 
@@ -74,9 +73,9 @@ def _fit(page: Page, scan: Mesh, statue: Statue) -> None:
                            Dots(joints, on_top=True), Dots(marks, (0.15, 0.45, 0.75), 0.006, True)]
     page.section("Joints and control mesh", "Red: joint centres. Blue: feature points of the control model. Below, the "
                  "control mesh; its colours are the parts of the skeleton.")
-    page.picture(_row([(inside, camera) for camera in cameras(statue, scan)], SIDES))
+    page.picture(_row([(inside, camera) for camera in cameras(statue, scan)], ("front", "left", "back", "right")))
     parts = Solid(control.mesh, part_colors(control.skeleton.part_of_face), smooth=False)
-    page.picture(_row([(parts, camera) for camera in cameras(statue, scan)], SIDES))
+    page.picture(_row([(parts, camera) for camera in cameras(statue, scan)], ("front", "left", "back", "right")))
 
 
 def _map(page: Page, statue: Statue, scan: Mesh) -> None:
@@ -85,7 +84,8 @@ def _map(page: Page, statue: Statue, scan: Mesh) -> None:
                  "yellow were filled smoothly.")
     page.picture(side_by_side(map_pictures(statue.map), ("displacement", "coverage")))
     colors = np.array([KINDS[kind] for kind in coverage_of_vertices(statue)])
-    page.picture(_row([(Solid(statue.control.mesh, colors), camera) for camera in cameras(statue, scan)], SIDES))
+    page.picture(_row([(Solid(statue.control.mesh, colors), camera) for camera in cameras(statue, scan)],
+                      ("front", "left", "back", "right")))
 
 
 def _errors(page: Page, scan: Mesh, statue: Statue, levels: Sequence[Level]) -> None:

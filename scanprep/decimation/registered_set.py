@@ -92,11 +92,33 @@ class DecimatedSet:
 def decimate_set(template: Mesh, poses: np.ndarray | None, faces: int, config: DecimateSetConfig | None = None,
                  keep: np.ndarray | None = None, skeleton: Skeleton | None = None,
                  progress: Progress | None = None) -> DecimatedSet:
-    """Collapse edges of a template so that all meshes registered with it keep their shape, down to so many triangles.
+    """Collapse edges of a template so that all meshes registered with it keep their shape.
 
-    What bends in any of the poses (M, N, 3), metres, counts as curved; None is the template alone. Borders, and borders
-    of the skeleton's parts, stay curves, the vertices `keep` (k,) where they are. There may be a triangle or two less
-    than wanted, or more when no further edge can go without harm.
+    What bends in any of them counts as curved. Borders, and borders of the skeleton's parts, stay curves.
+
+    Parameters
+    ----------
+    template : Mesh
+    poses : (M, N, 3) float, metres, or None
+        Other meshes in its topology; None for the template alone.
+    faces : int
+        How many triangles are wanted.
+    config : DecimateSetConfig, optional
+    keep : (k,) int, optional
+        Vertices that stay, such as landmarks.
+    skeleton : Skeleton, optional
+    progress : callback(done, total), optional
+
+    Returns
+    -------
+    DecimatedSet
+        With a template that has a triangle or two less than wanted, or more when no further edge can go without
+        harm.
+
+    Raises
+    ------
+    ValueError
+        Not a template, meshes of other topology, vertices or a skeleton that are not of it.
 
     [QEM] pair contraction
     """

@@ -20,8 +20,7 @@ from ..geometry.sparse import Factored, conjugate_gradients, factor
 from ..geometry.surface import OrientedPoints
 from ..geometry.target import Target, orient
 from ..threads import search_threads
-from .deformation_graph import Pull, pull
-from .matches import NORMALS
+from .matches import NORMALS, Pull, pull
 from .schedule import FinalFitConfig, FinalFitRound
 
 

@@ -1,25 +1,30 @@
 """The coarse registration: a deformation graph is drawn to the scan by matches in both directions, stage by stage.
 
-Ends of the body are tried in other rotations about themselves: a head that looks elsewhere is out of reach of nearest
-points.
+A node has seven unknowns: a left rotation (radians), a change of log-scale and a translation (metres). All energies
+are areas times squared lengths, so their balance does not depend on how finely template, graph or scan are divided.
 """
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass, field, replace
 from functools import lru_cache
+from typing import NamedTuple
 
 import numpy as np
-from scipy.spatial import cKDTree
+from scipy.sparse import bsr_array, coo_array, csc_array, csr_array
 
 from ..geometry import rotations
 from ..geometry.farthest_points import thin
-from ..geometry.geodesics import SurfaceGraph
+from ..geometry.least_squares import Sparse, levenberg_marquardt
 from ..geometry.mesh import Mesh
-from ..geometry.target import Target, orient
-from .deformation_graph import GraphFit, Stiffness, pull, start_fit, terms
-from .matches import NORMALS, Inputs, landmark_pull, wanted_by
+from ..geometry.target import orient
+from .deformation_graph import DeformationGraph, build_graph
+from .limb_ends import End, RigidFit, find_ends, rotated_end
+from .matches import NORMALS, Inputs, Pull, landmark_pull, pull, wanted_by
 from .schedule import GraphStage
+
+UNKNOWNS = 7
 
 
 def graph_fit(given: Inputs, T: np.ndarray, stages: tuple[GraphStage, ...], ends: int,
@@ -49,8 +54,9 @@ def bent(given: Inputs, fit: GraphFit, stage: GraphStage) -> GraphFit:
 def with_end_rotated(given: Inputs, fit: GraphFit, stage: GraphStage, end: End) -> GraphFit:
     """The fit with an end of the body rotated about itself, where that lies nearer to the scan, stretch counted in."""
     size, template = given.size, given.template
-    scan = RigidFit(orient(given.target.thinned(0.5 * stage.detail * size), template.with_vertices(fit.x),
-                           NORMALS * size), size)
+    target = given.target.thinned(0.5 * stage.detail * size)
+    target = orient(target, template.with_vertices(fit.x), NORMALS * size)
+    scan = RigidFit(target, size)
     places = rotated_end(template, end, fit.x, scan)
     if places is None:
         return fit
@@ -73,80 +79,237 @@ def _stiffness(stage: GraphStage, size: float) -> Stiffness:
 
 
 @dataclass(frozen=True, eq=False)
-class End:
-    """An end of a body: its vertices, and the direction in which it points away from the rest."""
+class NodeMotion:
+    """How every node has rotated, R (M, 3, 3), grown, log_scale (M,), and moved: positions (M, 3), metres."""
 
-    vertices: np.ndarray
-    axis: np.ndarray
+    R: np.ndarray
+    log_scale: np.ndarray
+    positions: np.ndarray
+
+    @property
+    def linear(self) -> np.ndarray:
+        """(M, 3, 3) rotation and growth together."""
+        return np.exp(self.log_scale)[:, None, None] * self.R
+
+    def moved(self, step: np.ndarray) -> NodeMotion:
+        """After a step (M, 7): left rotation (radians), change of log-scale, translation (metres)."""
+        return replace(self, R=rotations.exp(step[:, :3]) @ self.R, log_scale=self.log_scale + step[:, 3],
+                       positions=self.positions + step[:, 4:])
+
+
+def start_motion(graph: DeformationGraph, T: np.ndarray) -> NodeMotion:
+    """The motion of all nodes by one rigid transform (4, 4)."""
+    M = len(graph.nodes)
+    return NodeMotion(np.broadcast_to(T[:3, :3], (M, 3, 3)).copy(), np.zeros(M),
+                      graph.nodes @ T[:3, :3].T + T[:3, 3])
+
+
+def arms(graph: DeformationGraph, motion: NodeMotion, vertices: np.ndarray) -> np.ndarray:
+    """(n, K, 3) from each carrying node to each of the vertices (n,), as the node sees it, metres."""
+    carriers = graph.carriers[vertices]
+    local = graph.rest[vertices, None] - graph.nodes[carriers]
+    return np.matmul(motion.linear[carriers], local[..., None])[..., 0]
+
+
+def deform(graph: DeformationGraph, motion: NodeMotion) -> np.ndarray:
+    """The template's vertices (N, 3) after the motion, metres."""
+    linear = motion.linear
+    offset = motion.positions - np.matmul(linear, graph.nodes[..., None])[..., 0]
+    affine = np.concatenate([linear, offset[..., None]], axis=2).reshape(-1, 12)
+    blended = np.einsum("nk,nkc->nc", graph.weights, affine[graph.carriers]).reshape(-1, 3, 4)
+    return np.matmul(blended[..., :3], graph.rest[..., None])[..., 0] + blended[..., 3]
+
+
+def transferred(old: DeformationGraph, motion: NodeMotion, new: DeformationGraph) -> NodeMotion:
+    """The motion of a finer graph of the same template that repeats the motion of a coarser one."""
+    at = new.node_vertices
+    w, carriers = old.weights[at], old.carriers[at]
+    R = rotations.project(np.einsum("mk,mkij->mij", w, motion.R[carriers]))
+    return NodeMotion(R, np.einsum("mk,mk->m", w, motion.log_scale[carriers]), deform(old, motion)[at])
+
+
+class NodePattern:
+    """Where the normal matrix of a graph has blocks, and which block every vertex and edge adds to."""
+
+    def __init__(self, graph: DeformationGraph) -> None:
+        M, K = len(graph.node_vertices), graph.carriers.shape[1]
+        i, j = graph.edges.T
+        of_vertices = (graph.carriers[:, :, None] * M + graph.carriers[:, None, :]).reshape(-1)
+        of_edges = np.concatenate([i * M + i, i * M + j, j * M + i, j * M + j])
+        keys, where = np.unique(np.concatenate([of_vertices, of_edges, np.arange(M) * (M + 1)]),
+                                return_inverse=True)
+        self.nodes = M
+        self.rows, self.columns = keys // M, keys % M
+        self._indptr = np.searchsorted(self.rows, np.arange(M + 1))
+        self.vertex_slots = where[:len(of_vertices)].reshape(-1, K * K)
+        self.edge_slots = where[len(of_vertices):len(of_vertices) + len(of_edges)]
+
+    def matrix(self, blocks: np.ndarray) -> csc_array:
+        """The sparse symmetric matrix of all blocks (P, 7, 7)."""
+        size = self.nodes * UNKNOWNS
+        return csc_array(bsr_array((blocks, self.columns, self._indptr), shape=(size, size)))
 
 
 @lru_cache(maxsize=4)
-def find_ends(template: Mesh, count: int, radius: float) -> tuple[End, ...]:
-    """The `count` places farthest from all others along the surface, with all within `radius` (metres)."""
-    surface = SurfaceGraph(template)
-    tips = surface.farthest_points(count, first=int(surface.farthest_points(2)[1]))
-    ends = []
-    for distance in surface.distances(tips):
-        inside = np.flatnonzero(distance <= radius)
-        rim = inside[distance[inside] > 0.8 * radius]
-        axis = template.vertices[inside].mean(axis=0) - template.vertices[rim].mean(axis=0) if len(rim) else np.zeros(3)
-        if np.linalg.norm(axis) > 1e-3 * radius:
-            ends.append(End(inside, axis / np.linalg.norm(axis)))
-    return tuple(ends)
+def node_pattern(graph: DeformationGraph) -> NodePattern:
+    """The pattern of a graph, made once."""
+    return NodePattern(graph)
 
 
-def rotated_end(template: Mesh, end: End, x: np.ndarray, scan: RigidFit, moved: float = 0.01
-                ) -> np.ndarray | None:
-    """Places (n, 3) of the vertices of an end after the rotation that fits best as a rigid piece.
-
-    None where that is no farther than `moved`, a share of the template's size, from where they are.
+class Term(NamedTuple):
+    """One energy at one state: its value, and on demand the Gauss-Newton blocks (P, 7, 7) and half the gradient (M, 7)
+    that it adds to the normal equations.
     """
-    rest, middle = template.vertices[end.vertices], x[end.vertices].mean(axis=0)
-    R, _ = rotations.procrustes(rest, x[end.vertices])
-    sample = np.linspace(0, len(rest) - 1, min(120, len(rest))).astype(int)
-    local, normals = rest - rest.mean(axis=0), template.vertex_normals[end.vertices]
-    found = []
-    for angle in (0.0, 0.5, 1.0, -0.5, -1.0):        # radians: nearest points find what is half a step away
-        start = rotations.exp(angle * (R @ end.axis)) @ R
-        rotation, place, error = scan.fitted(local[sample], normals[sample], start, middle)
-        found.append((error, local @ rotation.T + place))
-    best = int(np.argmin([error for error, _ in found]))
-    apart = np.linalg.norm(found[best][1] - x[end.vertices], axis=1).mean()
-    return found[best][1] if apart > moved * scan.size else None
+
+    value: float
+    normal: Callable[[NodePattern], tuple[np.ndarray, np.ndarray]]
 
 
-class RigidFit:
-    """A scan that rigid pieces of a template of some size are laid on; errors do not grow beyond `cap`, metres."""
+def _edge_term(graph: DeformationGraph, r: np.ndarray, Ji: np.ndarray, Jj: np.ndarray, w: np.ndarray) -> Term:
+    """`Σ w |r|²` over the edges of a graph, for residuals r (E, d) with weights w (E,).
 
-    def __init__(self, target: Target, size: float) -> None:
-        self.target, self.size, self.scale, self.cap = target, size, NORMALS * size, 0.035 * size
-        self.tree = cKDTree(np.hstack([target.points, self.scale * target.normals]))
+    Ji, Jj (E, d, 7) are their derivatives by the unknowns of the first and the second node.
+    """
+    def normal(pattern: NodePattern) -> tuple[np.ndarray, np.ndarray]:
+        wi, wj = (w[:, None, None] * J.transpose(0, 2, 1) for J in (Ji, Jj))
+        blocks = np.concatenate([wi @ Ji, wi @ Jj, wj @ Ji, wj @ Jj])
+        force = np.concatenate([wi @ r[..., None], wj @ r[..., None]])[..., 0]
+        return (summed(pattern.edge_slots, blocks, len(pattern.rows)),
+                summed(graph.edges.T.reshape(-1), force, pattern.nodes))
 
-    def nearest(self, x: np.ndarray, n: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Points and normals (n, 3) of the scan nearest to others, and which of them are near and on no border."""
-        index = self.tree.query(np.hstack([x, self.scale * n]))[1]
-        y, m = self.target.points[index], self.target.normals[index]
-        near = np.linalg.norm(y - x, axis=1) <= 2 * self.cap
-        return y, m, near & ~self.target.border[index]
+    return Term(float(np.sum(w[:, None] * r**2)), normal)
 
-    def error(self, x: np.ndarray, n: np.ndarray) -> np.ndarray:
-        """Squared error (n,) of points with normals: across the surface and of the normals, at most `cap`²."""
-        y, m, good = self.nearest(x, n)
-        off = np.einsum("nd,nd->n", m, x - y) ** 2 + self.scale**2 * ((n - m) ** 2).sum(axis=1)
-        return np.where(good, np.minimum(off, self.cap**2), self.cap**2)
 
-    def fitted(self, local: np.ndarray, normals: np.ndarray, R: np.ndarray, place: np.ndarray
-               ) -> tuple[np.ndarray, np.ndarray, float]:
-        """A rigid piece after some rounds of nearest points: its rotation, its place, its mean error."""
-        for _ in range(8):
-            x, n = local @ R.T + place, normals @ R.T
-            y, m, good = self.nearest(x, n)
-            if good.sum() < 6:
-                break
-            arm = x - place
-            J = np.hstack([np.cross(arm, m), m])[good]
-            H = J.T @ J
-            step = -np.linalg.solve(H + 1e-6 * np.trace(H) * np.eye(6),
-                                    J.T @ np.einsum("nd,nd->n", m, x - y)[good])
-            R, place = rotations.exp(step[:3]) @ R, place + step[3:]
-        return R, place, float(self.error(local @ R.T + place, normals @ R.T).mean())
+def data_term(graph: DeformationGraph, motion: NodeMotion, wanted: Pull) -> Term:
+    """What matches and landmarks ask of the nodes that carry the vertices."""
+    active = np.flatnonzero(np.einsum("nii->n", wanted.A) > 0)
+    A, b = wanted.A[active], wanted.b[active]
+    w, carriers = graph.weights[active], graph.carriers[active]
+    y = arms(graph, motion, active)
+    x = np.einsum("nk,nkd->nd", w, motion.positions[carriers] + y)
+    Ax = np.matmul(A, x[..., None])[..., 0]
+
+    def normal(pattern: NodePattern) -> tuple[np.ndarray, np.ndarray]:
+        n, K = w.shape
+        J = np.empty((n, 3, K, UNKNOWNS))
+        J[..., :3] = -rotations.hat(y).transpose(0, 2, 1, 3)
+        J[..., 3] = y.transpose(0, 2, 1)
+        J[..., 4:] = np.eye(3)[:, None]
+        J *= w[:, None, :, None]
+        flat = J.reshape(n, 3, K * UNKNOWNS)
+        blocks = np.matmul(flat.transpose(0, 2, 1), np.matmul(A, flat)).reshape(n, K, UNKNOWNS, K, UNKNOWNS)
+        force = np.matmul(flat.transpose(0, 2, 1), (Ax - b)[..., None]).reshape(n * K, UNKNOWNS)
+        return (summed(pattern.vertex_slots[active].reshape(-1),
+                       blocks.transpose(0, 1, 3, 2, 4).reshape(n * K * K, UNKNOWNS, UNKNOWNS), len(pattern.rows)),
+                summed(carriers.reshape(-1), force, pattern.nodes))
+
+    return Term(float(np.sum(x * (Ax - 2 * b)) + wanted.c), normal)
+
+
+def stretch_term(graph: DeformationGraph, motion: NodeMotion, stiffness: float) -> Term:
+    """Every node wants to see its neighbours where its own rotation and growth would put them.
+
+    A strain of one costs as much as `stiffness` metres from the data.
+    """
+    i, j = graph.edges.T
+    rest = graph.edge_vectors
+    y = np.matmul(motion.linear[i], rest[..., None])[..., 0]
+    Ji, Jj = np.zeros((2, len(i), 3, UNKNOWNS))
+    Ji[..., :3], Ji[..., 3], Ji[..., 4:], Jj[..., 4:] = -rotations.hat(y), y, np.eye(3), -np.eye(3)
+    squared = np.sum(rest**2, axis=1)
+    squared = np.maximum(squared, 1e-6 * squared.mean())           # nodes may coincide where sheets touch
+    return _edge_term(graph, y - (motion.positions[j] - motion.positions[i]), Ji, Jj,
+                      stiffness**2 * graph.edge_area / squared)
+
+
+def bend_term(graph: DeformationGraph, motion: NodeMotion, stiffness: float) -> Term:
+    """Neighbours want to rotate alike: one radian between them costs as much as `stiffness` metres from the data."""
+    i, j = graph.edges.T
+    r = rotations.log(motion.R[j] @ motion.R[i].transpose(0, 2, 1))
+    inverse = rotations.inverse_right_jacobian(r)
+    Ji, Jj = np.zeros((2, len(i), 3, UNKNOWNS))
+    Ji[..., :3], Jj[..., :3] = -inverse, inverse.transpose(0, 2, 1)
+    return _edge_term(graph, r, Ji, Jj, stiffness**2 * graph.edge_area)
+
+
+def growth_term(graph: DeformationGraph, motion: NodeMotion, stiffness: float) -> Term:
+    """Neighbours want to grow alike: a factor of e between them costs as much as `stiffness` metres from the data."""
+    i, j = graph.edges.T
+    Ji, Jj = np.zeros((2, len(i), 1, UNKNOWNS))
+    Ji[..., 3], Jj[..., 3] = -1, 1
+    return _edge_term(graph, (motion.log_scale[j] - motion.log_scale[i])[:, None], Ji, Jj,
+                      stiffness**2 * graph.edge_area)
+
+
+class Stiffness(NamedTuple):
+    """How much the nodes resist, each in metres of distance to the data; with a growth of 0 they keep their size."""
+
+    stretch: float
+    bend: float
+    growth: float
+
+
+def terms(graph: DeformationGraph, motion: NodeMotion, wanted: Pull, stiffness: Stiffness) -> dict[str, Term]:
+    """All terms of the energy at one state."""
+    return {"data": data_term(graph, motion, wanted),
+            "stretch": stretch_term(graph, motion, stiffness.stretch),
+            "bend": bend_term(graph, motion, stiffness.bend),
+            "growth": growth_term(graph, motion, stiffness.growth)}
+
+
+@dataclass(frozen=True, eq=False)
+class GraphFit:
+    """Where the template lies: its vertices x (N, 3), metres, and the motion of the nodes that carry them.
+
+    `moved` is how far the last stage moved the mean vertex, metres.
+    """
+
+    x: np.ndarray
+    graph: DeformationGraph
+    motion: NodeMotion
+    energies: dict[str, float] = field(default_factory=dict)
+    iterations: int = 0
+    moved: float = np.inf
+
+    def refined(self, template: Mesh, nodes: int) -> GraphFit:
+        """The same motion on a graph of so many nodes."""
+        if min(nodes, len(self.x)) == len(self.graph.node_vertices):
+            return self
+        finer = build_graph(template, nodes)
+        return replace(self, graph=finer, motion=transferred(self.graph, self.motion, finer))
+
+    def minimised(self, wanted: Pull, stiffness: Stiffness, steps: int) -> GraphFit:
+        """The fit nearer to what matches and landmarks want, against the resistance of the nodes."""
+        if not wanted.A.any():
+            return self
+        pattern = node_pattern(self.graph)
+
+        def equations(at: NodeMotion) -> Sparse:
+            now = terms(self.graph, at, wanted, stiffness).values()
+
+            def assemble() -> tuple[np.ndarray, csc_array]:
+                blocks, half = (np.sum(parts, axis=0) for parts in zip(*(t.normal(pattern) for t in now), strict=True))
+                if not stiffness.growth:
+                    blocks[:, 3], blocks[:, :, 3], half[:, 3] = 0, 0, 0               # the log-scale
+                return half.reshape(-1), pattern.matrix(blocks)
+
+            return Sparse(sum(term.value for term in now), assemble)
+
+        found = levenberg_marquardt(equations, self.motion, steps, tolerance=1e-3, damping=1e-5,
+                                    retract=lambda at, step: at.moved(step.reshape(-1, UNKNOWNS)))
+        now = {name: term.value for name, term in terms(self.graph, found.x, wanted, stiffness).items()}
+        return replace(self, x=deform(self.graph, found.x), motion=found.x, energies=now,
+                       iterations=self.iterations + found.iterations)
+
+
+def start_fit(template: Mesh, T: np.ndarray, nodes: int) -> GraphFit:
+    """The template where a rigid transform (4, 4) places it, on a graph of so many nodes."""
+    graph = build_graph(template, nodes)
+    return GraphFit(template.vertices @ T[:3, :3].T + T[:3, 3], graph, start_motion(graph, T))
+
+
+def summed(index: np.ndarray, values: np.ndarray, count: int) -> np.ndarray:
+    """(count, ...) the sums of the values (n, ...) of each index (n,)."""
+    n = len(index)
+    add = csr_array(coo_array((np.ones(n), (index, np.arange(n))), shape=(count, n)))
+    return (add @ values.reshape(n, math.prod(values.shape[1:]))).reshape(count, *values.shape[1:])

@@ -17,7 +17,6 @@ from ..geometry.farthest_points import farthest_points, thin
 from ..geometry.mesh import Mesh, check_template
 from ..geometry.target import Target, orient, target_of
 from ..threads import search_threads
-from .deformation_graph import Pull, pull
 from .schedule import GraphStage
 
 NORMALS = 0.04                # of the template's size: what a difference of normals of one is worth when matching
@@ -178,6 +177,42 @@ def _bridged(p: np.ndarray, graph: csr_array, smallest: float = 0.003) -> tuple[
     i, j, length = (np.array(column) for column in zip(*extra, strict=True))
     bridges = coo_array((length, (i.astype(int), j.astype(int))), shape=graph.shape)
     return csr_array(graph + bridges), np.flatnonzero(joined)
+
+
+@dataclass(frozen=True, eq=False)
+class Pull:
+    """A quadratic energy of each vertex, `Σ xᵀ A x - 2 b·x + c`: what matches and landmarks want.
+
+    A (N, 3, 3), square metres; b (N, 3), cubic metres.
+    """
+
+    A: np.ndarray
+    b: np.ndarray
+    c: float
+
+    def __add__(self, other: Pull) -> Pull:
+        return Pull(self.A + other.A, self.b + other.b, self.c + other.c)
+
+    def energy(self, x: np.ndarray) -> float:
+        """The energy of vertices (N, 3)."""
+        return float(np.einsum("ni,nij,nj->", x, self.A, x, optimize=True) - 2 * np.sum(self.b * x) + self.c)
+
+
+def pull(count: int, vertices: np.ndarray, targets: np.ndarray, weights: np.ndarray,
+         normals: np.ndarray | None = None, slide: float = 1.0) -> Pull:
+    """Some of `count` vertices, (n,), drawn to targets (n, 3) with weights (n,), square metres.
+
+    A vertex may have several targets. With their normals the force along the surface is only a share, `slide`, of that
+    across it.
+    """
+    A = np.broadcast_to(np.eye(3), (len(vertices), 3, 3))
+    if normals is not None:
+        A = slide * A + (1 - slide) * normals[:, :, None] * normals[:, None, :]
+    A = weights[:, None, None] * A
+    b = np.einsum("nij,nj->ni", A, targets)
+    gather = csr_array(coo_array((np.ones(len(vertices)), (vertices, np.arange(len(vertices)))),
+                                 shape=(count, len(vertices))))
+    return Pull((gather @ A.reshape(-1, 9)).reshape(-1, 3, 3), gather @ b, float(np.sum(b * targets)))
 
 
 @dataclass(frozen=True)

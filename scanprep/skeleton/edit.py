@@ -44,8 +44,18 @@ def part_number(skeleton: Skeleton, part: int | str) -> int:
 def merge_parts(skeleton: Skeleton, template: Mesh, a: int | str, b: int | str) -> Skeleton:
     """Two parts as one, called like the first.
 
-    They are linked, or touch and hang on the same part: then the joint comes to lie between their two. ValueError for
-    others, whose union would close a loop or lie in two pieces.
+    They are linked, or touch and hang on the same part: then the joint comes to lie between their two.
+
+    Parameters
+    ----------
+    skeleton : Skeleton
+    template : Mesh
+    a, b : names or numbers of parts
+
+    Raises
+    ------
+    ValueError
+        A part that is not there, twice the same, or parts whose union would close a loop or lie in two pieces.
     """
     first, second = part_number(skeleton, a), part_number(skeleton, b)
     if first == second:
@@ -71,10 +81,24 @@ def merge_parts(skeleton: Skeleton, template: Mesh, a: int | str, b: int | str) 
 
 def split_part(skeleton: Skeleton, template: Mesh, part: int | str, poses: np.ndarray | None = None,
                names: Sequence[str] | None = None) -> Skeleton:
-    """One part as two: where it bends most in the poses (M, N, 3) or, without, across its length in the middle.
+    """One part as two: where it bends most in the poses or, without poses, across its length in the middle.
 
     The half that lies on the old parent (in the root: the larger) keeps number and name; the new one follows it.
-    Children go with the half they share the longer border with. ValueError for a part that the poses do not bend.
+    Children go with the half they share the longer border with.
+
+    Parameters
+    ----------
+    skeleton : Skeleton
+    template : Mesh
+    part : name or number
+    poses : (M, N, 3) float, metres, optional
+    names : two strings, optional
+        Of the half that stays and of the new one.
+
+    Raises
+    ------
+    ValueError
+        A part that is not there, one that the poses do not bend, or names that are taken.
     """
     p = part_number(skeleton, part)
     label = skeleton.part_of_face
@@ -112,7 +136,13 @@ def split_part(skeleton: Skeleton, template: Mesh, part: int | str, poses: np.nd
 
 
 def rename_part(skeleton: Skeleton, part: int | str, name: str) -> Skeleton:
-    """The skeleton with another name for one part; ValueError for one that is empty, a number, or taken."""
+    """The skeleton with another name for one part.
+
+    Raises
+    ------
+    ValueError
+        A part that is not there, or a name that is empty, a number, or taken.
+    """
     p = part_number(skeleton, part)
     if not isinstance(name, str) or not name.strip() or name.isdecimal():
         raise ValueError(f"name: expected a name that is not a number, got {name!r}")
@@ -123,9 +153,21 @@ def rename_part(skeleton: Skeleton, part: int | str, name: str) -> Skeleton:
 
 def move_joint(skeleton: Skeleton, template: Mesh, part: int | str, position: Sequence[float] | None = None,
                ring: Sequence[int] | None = None) -> Skeleton:
-    """The skeleton with the joint between a part and its parent elsewhere, on the template.
+    """The skeleton with the joint between a part and its parent elsewhere.
 
-    At a position (3,), metres, or in the middle of a ring of vertices (n,).
+    Parameters
+    ----------
+    skeleton : Skeleton
+    template : Mesh
+    part : name or number
+    position : (3,) float, metres, on the template
+    ring : (n,) int
+        Instead of a position: vertices of the template, in whose middle the joint is put.
+
+    Raises
+    ------
+    ValueError
+        The root, which has no joint; not one of `position` and `ring`; numbers that are no position or no vertices.
     """
     p = part_number(skeleton, part)
     if p == 0:

@@ -20,10 +20,11 @@ from scanprep.pictures.page import Page
 from scanprep.ranges import BETAS
 
 from ...cli import ModelOrNone, read_model
+from ..files.markers import READERS
 from ..marker_sets.named import layout_or_file
 from ..pose.follow import AnimateConfig
 from ..subject.person import PersonConfig
-from .work import ENDINGS, MEAN_ERROR, BetasTo, Work
+from .work import MEAN_ERROR, BetasTo, Work
 
 MarkersArg = Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="MARKERS")]
 
@@ -111,9 +112,9 @@ def _marker_files(markers: Path) -> list[Path]:
     """The file, or the marker files of a folder; files of one name would be written over each other."""
     if not markers.is_dir():
         return [markers]
-    found = sorted(p for p in markers.iterdir() if p.suffix.lower() in ENDINGS)
+    found = sorted(p for p in markers.iterdir() if p.suffix.lower() in READERS)
     if not found:
-        raise ValueError(f"{markers}: expected files ending in {', '.join(ENDINGS)}, found none")
+        raise ValueError(f"{markers}: expected files ending in {', '.join(READERS)}, found none")
     names = [p.stem for p in found]
     twice = sorted({name for name in names if names.count(name) > 1})
     if twice:

@@ -36,7 +36,6 @@ from ..retargeting.retarget import morphed_vertices, retarget
 from ..subject.person import PersonConfig, find_person
 
 BetasTo = dict[float, np.ndarray] | np.ndarray      # keys over seconds, or betas at the end
-ENDINGS = (".c3d", ".trc", ".csv")
 MEAN_ERROR = "distance of markers, mean"
 
 

@@ -12,10 +12,10 @@ from ...motion import Motion
 from ..files.markers import MarkerSequence
 from ..marker_sets.layout import MarkerLayout
 from ..pose import swaps
-from ..pose.robust import marker_weights
+from ..pose.robust import known_median, marker_weights
 from ..pose.settings import AnimateConfig
 from .results import ArtefactConfig, BadSpan, MarkerArtefacts, list_swaps
-from .simulated import Simulation, bridged, usual_places
+from .simulated import Simulation, bridged
 from .slips import find_bad, without_lost_limbs
 
 Progress = Callable[[int, int], None]
@@ -144,7 +144,7 @@ def _same(body: Simulation, markers: MarkerSequence, before: _State, after: _Sta
 def _expected(body: Simulation, state: _State, repaired: np.ndarray, simulated: np.ndarray) -> np.ndarray:
     """Where markers (T, L, 3) are expected: off the simulated ones as they mostly are in their part's frame."""
     assert state.x is not None, "the body has followed"
-    usual = usual_places(body.local(repaired - simulated, state.x))
+    usual = known_median(body.local(repaired - simulated, state.x), 0)
     usual[state.unsure[body.rows]] = 0
     length = np.linalg.norm(usual, axis=1, keepdims=True)
     # metres, most that a marker's usual place is taken to be from its simulation

@@ -2,6 +2,7 @@
 from __future__ import annotations
 
 import numpy as np
+from scipy.interpolate import interp1d
 
 from model.linear import Subject
 
@@ -10,7 +11,7 @@ from ..files.markers import MarkerSequence
 from ..marker_sets.layout import MarkerLayout
 from ..pose.follow import between_keys, seen_span, smoothed
 from ..pose.marked_body import MarkedBody, batches
-from ..pose.robust import marker_weights
+from ..pose.robust import known_median, marker_weights
 from ..pose.settings import AnimateConfig
 
 
@@ -56,7 +57,10 @@ class Simulation:
         """
         T, every = len(x), max(1, round(self.rate / 15))                # 15 looks a second at how markers draw the body
         frames = np.arange(min(every // 2, T - 1), T, every)
-        freed = _between(self._freed(x[frames], frames), frames, T)
+        freed = self._freed(x[frames], frames)
+        ends = freed[0], freed[-1]                                      # before the first and after the last look
+        freed = np.repeat(freed, T, axis=0) if len(frames) == 1 else interp1d(
+            frames, freed, axis=0, bounds_error=False, fill_value=ends, assume_sorted=True)(np.arange(T))
         return (freed @ off[..., None])[..., 0]
 
     def local(self, vectors: np.ndarray, x: np.ndarray) -> np.ndarray:
@@ -85,25 +89,9 @@ class Simulation:
         return out
 
 
-def _between(values: np.ndarray, frames: np.ndarray, count: int) -> np.ndarray:
-    """Values (n, ...) of some frames for all of them (count, ...), straight between."""
-    if len(frames) == 1:
-        return np.repeat(values, count, axis=0)
-    times = np.arange(count)
-    i = np.clip(np.searchsorted(frames, times, side="right") - 1, 0, len(frames) - 2)
-    share = np.clip((times - frames[i]) / (frames[i + 1] - frames[i]), 0, 1).reshape(-1, *[1] * (values.ndim - 1))
-    return (1 - share) * values[i] + share * values[i + 1]
-
-
-def usual_places(local: np.ndarray) -> np.ndarray:
-    """The median (L, 3) of what markers are off in the frames of their parts (T, L, 3), zero without any."""
-    return np.array([np.median(off[np.isfinite(off[:, 0])], axis=0) if np.isfinite(off[:, 0]).any() else np.zeros(3)
-                     for off in np.swapaxes(local, 0, 1)])
-
-
 def bridged(local: np.ndarray, reach: float) -> np.ndarray:
     """What markers are off (T, L, 3), NaN in gaps, with these bridged: straight, long ones by the usual place."""
-    out = np.repeat(usual_places(local)[None], len(local), axis=0)
+    out = np.repeat(known_median(local, 0)[None], len(local), axis=0)
     for i in range(local.shape[1]):
         seen = np.flatnonzero(np.isfinite(local[:, i, 0]))
         if not len(seen):

@@ -6,6 +6,7 @@ from itertools import pairwise
 import numpy as np
 from scipy.ndimage import binary_dilation, median_filter
 
+from ..pose.robust import known_median, runs
 from .results import ArtefactConfig, BadKind, BadSpan
 
 SLIP_SUDDEN = 0.6                    # share of the lasting displacement that comes within a tenth of a second
@@ -19,7 +20,7 @@ def find_bad(off: np.ndarray, alone: np.ndarray, jumps: np.ndarray, labels: tupl
     `off` is as the body follows all, `alone` as it would the others; `jumps` (T, L), metres, is how far tracks jump.
     """
     noise_usual, stray_usual, joined = 5.0, 4.0, 0.1        # times what is usual; seconds between spans that are one
-    usual = np.nan_to_num(_median(np.linalg.norm(off - _median(off), axis=2), axis=1))
+    usual = known_median(np.linalg.norm(off - known_median(off, 0), axis=2))
     jitter = [_jitter(off[:, i][np.isfinite(off[:, i, 0])]) for i in range(len(labels))]
     known = [np.median(q) for q in jitter if len(q)]
     limit = max(config.noise, noise_usual * float(np.median(known))) if known else config.noise
@@ -72,7 +73,7 @@ def _noisy(jitter: np.ndarray, limit: float, rate: float) -> np.ndarray:
     rough = jitter > limit
     reach = binary_dilation(wide, iterations=width // 2) if wide.any() else wide
     out = np.zeros(len(jitter), dtype=bool)
-    for run in _runs(reach):
+    for run in runs(reach):
         some = run[rough[run]]
         if len(some) > width // 2:
             out[some[0]:some[-1] + 1] = True
@@ -154,18 +155,3 @@ def _spans(label: str, kind: BadKind, seen: np.ndarray, bad: np.ndarray, away: n
     at = np.flatnonzero(bad)
     runs = np.split(at, np.flatnonzero(np.diff(seen[at]) > max(1.0, joined)) + 1) if len(at) else []
     return [BadSpan(label, kind, int(seen[r[0]]), int(seen[r[-1]]), float(np.median(away[r]))) for r in runs]
-
-
-def _runs(mask: np.ndarray) -> list[np.ndarray]:
-    """The stretches of true values."""
-    at = np.flatnonzero(mask)
-    return np.split(at, np.flatnonzero(np.diff(at) > 1) + 1) if len(at) else []
-
-
-def _median(values: np.ndarray, axis: int = 0) -> np.ndarray:
-    """The median of values that are not NaN; NaN without any."""
-    ordered = np.sort(values, axis=axis)
-    known = np.isfinite(ordered).sum(axis=axis, keepdims=True)
-    last = values.shape[axis] - 1
-    below, above = (np.take_along_axis(ordered, np.clip(i, 0, last), axis=axis) for i in ((known - 1) // 2, known // 2))
-    return np.squeeze(0.5 * (below + np.where(known > 0, above, np.nan)), axis=axis)

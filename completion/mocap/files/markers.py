@@ -14,6 +14,7 @@ from scanprep.geometry.format_common import FARTHEST, UNITS
 from .c3d import read_c3d, write_c3d
 from .text import MarkerFileError, RawMarkers, encode_csv, read_csv, read_trc
 
+READERS = {".c3d": read_c3d, ".trc": read_trc, ".csv": read_csv}
 __all__ = ["MarkerFileError", "MarkerSequence", "read_markers", "write_markers"]
 
 
@@ -149,13 +150,12 @@ def marker_subjects(path: str | Path) -> tuple[str, ...]:
 
 def _read_raw(path: Path) -> RawMarkers:
     """What a file holds, by its ending."""
-    readers = {".c3d": read_c3d, ".trc": read_trc, ".csv": read_csv}
     data = storage.read_bytes(path, "a file of markers", MarkerFileError)
-    if path.suffix.lower() not in readers:
-        raise MarkerFileError(f"{path}: expected a name ending in {', '.join(readers)}, found '{path.suffix}'")
+    if path.suffix.lower() not in READERS:
+        raise MarkerFileError(f"{path}: expected a name ending in {', '.join(READERS)}, found '{path.suffix}'")
     if not data:
         raise MarkerFileError(f"{path}: the file is empty")
-    return readers[path.suffix.lower()](path, data)
+    return READERS[path.suffix.lower()](path, data)
 
 
 def _of_subject(path: Path, labels: tuple[str, ...], subject: str | None) -> tuple[list[int], tuple[str, ...]]:

@@ -122,9 +122,7 @@ def design_markers(model: BodyModel, bodies: np.ndarray, candidates: MarkerLayou
     ValueError
         A model without betas, bodies of another shape, a count that cannot be had, unknown labels.
 
-    [MoSh] Eq. 25
-    [MoSh] Eq. 26
-    [MoSh] Eq. 27
+    [MoSh] Eq. 25, Eq. 26, Eq. 27
     """
     config = config or DesignConfig()
     groups = symmetric_groups(candidates.labels, partners)

@@ -60,8 +60,7 @@ class MarkerSets:
     `2 s k·q + kᵀ F k`, where `q = B C (G d - p)` and `F = B C G C Bᵀ`. What changes with C is kept for the rows of
     each group alone, so trying all groups costs small solves only, and taking one costs one pass over the rows.
 
-    [MoSh] Eq. 26
-    [MoSh] Eq. 27
+    [MoSh] Eq. 26, Eq. 27
     """
 
     def __init__(self, linear: LinearBodies, groups: Groups, chosen: Collection[int]) -> None:

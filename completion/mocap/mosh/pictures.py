@@ -13,13 +13,13 @@ from scanprep.geometry.mesh import Mesh
 from scanprep.pictures.camera import Camera, look_around, upright
 from scanprep.pictures.shading import Bones, Dots, Shape, Solid, color_bar, heat, render, side_by_side
 
-from ...motion_pictures import MARKER, chart_states, facing, mean_over, moving_picture
+from ...motion_pictures import MARKER, chart_states, facing, frames_apart, mean_over, moving_picture
 from ..artefacts.results import MarkerArtefacts
 from ..files.markers import MarkerSequence
 from ..marker_sets.layout import MarkerLayout
 from .takes import Take
 
-USUAL, DOUBTED, UNUSED = (0.30, 0.50, 0.72), (0.93, 0.62, 0.16), (0.20, 0.62, 0.32)
+USUAL, UNCERTAIN, UNUSED = (0.30, 0.50, 0.72), (0.93, 0.62, 0.16), (0.20, 0.62, 0.32)
 SIDES = ("front", "left", "back", "right")
 LITTLE = 0.005                       # metres: the end of a colour scale that must not make much of nothing
 
@@ -98,7 +98,7 @@ def contact_sheet(take: Take, frames: np.ndarray, columns: int = 8, width: int =
 
 def marker_dots(take: Take, t: int, radius: float = 0.014, coarse: bool = False) -> Dots:
     """The measured markers of a frame: believed, not believed, and those that no stage has seen."""
-    colors = np.where(take.motion.trusted[t][:, None], MARKER, DOUBTED)
+    colors = np.where(take.motion.trusted[t][:, None], MARKER, UNCERTAIN)
     unused = ~np.isfinite(take.motion.residuals).any(axis=0)
     held = () if take.held is None else take.held.labels
     points = take.markers.positions[t].copy()
@@ -160,12 +160,7 @@ def picture_fixed_and_soft(take: Take, frames: np.ndarray, height: int = 400) ->
 def most_changed(take: Take, frames: np.ndarray, count: int) -> np.ndarray:
     """Of some frames those, in order, in which soft tissue moves the body most, no two close in time."""
     size = np.sqrt((soft_change(take, frames)**2).mean(axis=1))
-    apart = len(take.motion.poses) / (3 * count)
-    chosen: list[int] = []
-    for t in frames[np.argsort(-size)].tolist():
-        if len(chosen) < count and all(abs(t - other) >= apart for other in chosen):
-            chosen.append(t)
-    return np.sort(chosen)
+    return frames_apart(frames[np.argsort(-size)], count, len(take.motion.poses) / (3 * count))
 
 
 def moving(take: Take, seconds: float = 4.0, rate: float = 6.0) -> bytes:
@@ -247,8 +242,8 @@ def chart_timeline(take: Take) -> Any:
     markers, found, names = take.markers, take.artefacts, list(STATES)
     labels = [label for label in markers.labels if label in found.labels_touched or label in found.labels]
     columns = [markers.labels.index(label) for label in labels]
-    doubted = np.isfinite(take.motion.residuals[:, columns]) & ~take.motion.trusted[:, columns]
-    state = np.where(markers.seen[:, columns], doubted.astype(int), names.index("missing"))
+    uncertain = np.isfinite(take.motion.residuals[:, columns]) & ~take.motion.trusted[:, columns]
+    state = np.where(markers.seen[:, columns], uncertain.astype(int), names.index("missing"))
     for label, spans in _spans(found).items():
         for kind, begin, end, _ in spans:
             state[begin:end + 1, labels.index(label)] = names.index(kind)

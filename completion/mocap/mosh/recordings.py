@@ -10,11 +10,10 @@ from typing import Literal, cast, get_args
 from scanprep.batch.workspace import HOME
 from scanprep.geometry import storage, tables
 
-from ..files.markers import marker_subjects
+from ..files.markers import READERS, marker_subjects
 from ..files.text import MarkerFileError
 
 By = Literal["auto", "name", "label", "each", "all"]
-ENDINGS = (".c3d", ".trc", ".csv")
 TABLE = "subjects.csv"
 
 
@@ -67,7 +66,7 @@ def find_actors(markers: Iterable[Path], grouping: Grouping, output: Path | None
             raise ValueError(f"{output}: expected a folder for the output that does not hold the recordings, {place}")
     found = list(_files(given, output, grouping.table))
     if not found:
-        raise ValueError(f"{', '.join(map(str, given))}: expected files ending in {', '.join(ENDINGS)}, found none")
+        raise ValueError(f"{', '.join(map(str, given))}: expected files ending in {', '.join(READERS)}, found none")
     whole = grouping.by == "all" or (grouping.by == "auto" and all(path.is_file() for path in given))
     if grouping.table is not None:
         said = _read_table(grouping.table, [f.path for f in found])
@@ -116,7 +115,7 @@ def _files(given: list[Path], output: Path | None, table: Path | None) -> Iterat
                         if (found.parent / "report.html").exists() or (found.parent / HOME).exists()}
         for path in sorted(place.rglob("*")) if place.is_dir() else [place]:
             parts, whole = path.relative_to(place).parts, path.resolve()
-            if place.is_dir() and (path.suffix.lower() not in ENDINGS or any(part.startswith(".") for part in parts)
+            if place.is_dir() and (path.suffix.lower() not in READERS or any(part.startswith(".") for part in parts)
                                    or outputs & set(whole.parents)):
                 continue
             if whole not in seen:

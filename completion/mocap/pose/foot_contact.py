@@ -4,12 +4,13 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-from scipy.ndimage import label, uniform_filter1d
+from scipy.ndimage import uniform_filter1d
 
 from scanprep.geometry.farthest_points import farthest_points
 from scanprep.geometry.least_squares import Dense
 
 from .marked_body import MarkedBody, PartShapes, point_system
+from .robust import runs
 
 TOUCH = 0.025                        # metres above the floor below which a point may stand
 STILL = 0.2                          # metres per second below which it does
@@ -106,9 +107,7 @@ class FootContact:
         speed = np.linalg.norm(np.gradient(calm, axis=0), axis=2) * rate
         stands = (self.floor.above(calm) < TOUCH) & (speed < STILL)
         for k in range(points.shape[1]):
-            runs, count = label(stands[:, k])
-            for run in range(1, count + 1):
-                mine = np.flatnonzero(runs == run)
+            for mine in runs(stands[:, k]):
                 if len(mine) >= 0.08 * rate:
                     place = np.median(points[mine, k], axis=0)
                     held[mine, k] = place - min(0.0, float(self.floor.above(place))) * self.floor.normal

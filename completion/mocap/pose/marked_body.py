@@ -252,27 +252,35 @@ def supports(template: Mesh, layout: MarkerLayout) -> tuple[np.ndarray, np.ndarr
     base, weights = layout.skin
     if base.max(initial=0) >= len(template.vertices):
         raise ValueError(f"layout: expected vertices of 0..{len(template.vertices) - 1}, got {base.max()}")
-    adjacency = template.vertex_adjacency
     rows: list[tuple[np.ndarray, np.ndarray]] = []
     for mine, share in zip(base, weights, strict=True):
         if len(set(mine.tolist())) == 3:
             rows += [(mine, share + side) for side in _sides(template, mine)]
             continue
         centre = int(mine[np.argmax(share)])
-        ring = adjacency.indices[adjacency.indptr[centre]:adjacency.indptr[centre + 1]]
-        spokes = template.vertices[ring] - template.vertices[centre]
-        normal = template.vertex_normals[centre]
-        u = np.cross(normal, np.eye(3)[np.argmin(np.abs(normal))])
-        u /= np.linalg.norm(u)
-        plane = spokes @ np.stack([u, np.cross(normal, u)]).T
+        ring, plane = ring_around(template, centre)
         direction = plane / np.maximum(np.linalg.norm(plane, axis=1, keepdims=True), 1e-12)
         rows.append((mine, share))
         for axis in range(2):
             pull = direction[:, axis] / len(ring)
             rows.append((np.concatenate([mine, ring, [centre]]), np.concatenate([share, pull, [-pull.sum()]])))
+    return padded(rows)
+
+
+def ring_around(mesh: Mesh, centre: int) -> tuple[np.ndarray, np.ndarray]:
+    """The neighbours (n,) of a vertex, and how they lie about it in its tangent plane (n, 2), metres."""
+    adjacency, normal = mesh.vertex_adjacency, mesh.vertex_normals[centre]
+    ring = adjacency.indices[adjacency.indptr[centre]:adjacency.indptr[centre + 1]]
+    u = np.cross(normal, np.eye(3)[np.argmin(np.abs(normal))])
+    u /= np.linalg.norm(u)
+    return ring, (mesh.vertices[ring] - mesh.vertices[centre]) @ np.stack([u, np.cross(normal, u)]).T
+
+
+def padded(rows: list[tuple[np.ndarray, np.ndarray]]) -> tuple[np.ndarray, np.ndarray]:
+    """Points as vertices and weights of different number, as two arrays (n, k), padded by repeats and zeros."""
     width = max(len(ids) for ids, _ in rows)
-    ids = np.array([np.pad(i, (0, width - len(i)), mode="edge") for i, _ in rows])
-    return ids, np.array([np.pad(w, (0, width - len(w))) for _, w in rows])
+    return (np.array([np.pad(ids, (0, width - len(ids)), mode="edge") for ids, _ in rows]),
+            np.array([np.pad(weights, (0, width - len(weights))) for _, weights in rows]))
 
 
 def _sides(template: Mesh, corners: np.ndarray) -> np.ndarray:

@@ -30,19 +30,25 @@ def marker_weights(positions: np.ndarray, targets: np.ndarray, sd: float, outlie
 def distances_apart(positions: np.ndarray, targets: np.ndarray, outlier: float) -> tuple[np.ndarray, np.ndarray]:
     """Squared distances (..., L) without what is common to all, and the length (..., 1) that makes an outlier."""
     off = positions - targets
-    off = off - _median(np.swapaxes(off, -1, -2))[..., None, :]
+    off = off - known_median(off, -2)[..., None, :]
     squared = np.einsum("...d,...d->...", off, off)
     # metres; a marker farther off is an outlier on however bad a fit
-    return squared, np.maximum(outlier, np.minimum(3 * np.sqrt(_median(squared)), 5.0))[..., None]
+    return squared, np.maximum(outlier, np.minimum(3 * np.sqrt(known_median(squared)), 5.0))[..., None]
 
 
-def _median(values: np.ndarray) -> np.ndarray:
-    """The median (...) of values (..., n) that are not NaN, 0 without any; on few values much faster than numpy's."""
-    ordered = np.sort(values, axis=-1)                                  # NaN comes last
-    seen = (~np.isnan(ordered)).sum(axis=-1)[..., None]
-    below = np.take_along_axis(ordered, np.maximum((seen - 1) // 2, 0), axis=-1)
-    above = np.take_along_axis(ordered, np.minimum(seen // 2, ordered.shape[-1] - 1), axis=-1)
-    return np.where(seen > 0, 0.5 * (below + above), 0.0)[..., 0]
+def known_median(values: np.ndarray, axis: int = -1) -> np.ndarray:
+    """The median of values that are not NaN, 0 without any; on few values much faster than numpy's."""
+    ordered = np.sort(values, axis=axis)                                # NaN comes last
+    seen = (~np.isnan(ordered)).sum(axis=axis, keepdims=True)
+    low, high = np.maximum((seen - 1) // 2, 0), np.minimum(seen // 2, values.shape[axis] - 1)
+    both = np.take_along_axis(ordered, low, axis=axis) + np.take_along_axis(ordered, high, axis=axis)
+    return np.where(seen > 0, 0.5 * both, 0.0).squeeze(axis)
+
+
+def runs(mask: np.ndarray) -> list[np.ndarray]:
+    """The stretches (n,) of true values."""
+    at = np.flatnonzero(mask)
+    return np.split(at, np.flatnonzero(np.diff(at) > 1) + 1) if len(at) else []
 
 
 def misfit(apart: np.ndarray, outlier: float) -> np.ndarray:
@@ -61,8 +67,10 @@ def judge(positions: np.ndarray, targets: np.ndarray, order: np.ndarray, outlier
 
 def label_order(positions: np.ndarray, targets: np.ndarray, rate: float, outlier: float) -> np.ndarray:
     """Which column (T, L) each marker is taken from, the body having them at places (T, L, 3), by `find_order`."""
-    shift = _median(np.swapaxes(positions - targets, -1, -2))[..., None, :]
-    _, scale = distances_apart(positions, targets, outlier)
+    squared, scale = distances_apart(positions, targets, outlier)
+    if ((squared > (0.5 * scale)**2).sum(axis=1) < 2).all():            # nothing is far off, or everything is believed
+        return np.tile(np.arange(targets.shape[1]), (len(targets), 1))
+    shift = known_median(positions - targets, -2)[..., None, :]
     # on a body that fits badly a marker is as much farther from its place as one must be to be an outlier
     deviation = DEVIATION * scale[..., 0] / AnimateConfig.outlier
     return find_order(targets, rate, marker_levels(positions - shift, targets, deviation))
@@ -91,7 +99,7 @@ class LabelWatch:
         changed = self.order != np.arange(len(self.order))
         if suspect.sum() < 2 and not changed.any():
             return self.order
-        shift = _median((positions - taken).T)
+        shift = known_median(positions - taken, 0)
         some = np.flatnonzero((suspect | changed) & ~np.isnan(squared))
         apart = np.linalg.norm(positions[some, None] - shift - taken[some], axis=2)
         for i, j in zip(*np.triu_indices(len(some), 1), strict=True):

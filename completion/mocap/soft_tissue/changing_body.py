@@ -94,8 +94,8 @@ class ChangingBody:
     def system(self, x: np.ndarray, z: np.ndarray, targets: np.ndarray, weights: np.ndarray) -> Dense:
         """Markers and pose prior at x (B, P), z (B, K), with P + K unknowns; arguments as of `point_system`."""
         pose, trans, _ = self.marked.body.split(x)
-        (y, by_turn), D = self.marked.shapes.columns(pose, trans), self.slopes(pose)
-        data = point_system(y + _moved(z, D), np.concatenate([by_turn, D], axis=1), targets, weights)
+        (y, by_rotation), D = self.marked.shapes.columns(pose, trans), self.slopes(pose)
+        data = point_system(y + _moved(z, D), np.concatenate([by_rotation, D], axis=1), targets, weights)
         return self.marked.with_prior(data, pose)
 
     def change_system(self, x: np.ndarray, targets: np.ndarray, weights: np.ndarray) -> Dense:

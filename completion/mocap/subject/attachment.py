@@ -15,6 +15,7 @@ from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.surface import Surface, barycentric
 
 from ...energy import MovingPoints
+from ..pose.marked_body import padded, ring_around
 
 Attachment = Literal["triangle", "neighbourhood"]
 
@@ -60,9 +61,7 @@ def latent_markers(mesh: Mesh, points: np.ndarray, kind: Attachment = "triangle"
     off = np.linalg.norm(mesh.vertices[corners] - points[:, None], axis=2)
     nearest = np.take_along_axis(corners, off.argmin(axis=1)[:, None], axis=1)[:, 0]
     rows = [row for centre in nearest for row in _ring_supports(mesh, int(centre))]
-    width = max(len(ids) for ids, _ in rows)
-    ids = np.array([np.pad(i, (0, width - len(i)), mode="edge") for i, _ in rows])
-    return LatentMarkers(kind, ids, np.array([np.pad(w, (0, width - len(w))) for _, w in rows]), corners)
+    return LatentMarkers(kind, *padded(rows), corners)
 
 
 def _ring_supports(mesh: Mesh, centre: int) -> list[tuple[np.ndarray, np.ndarray]]:
@@ -70,12 +69,7 @@ def _ring_supports(mesh: Mesh, centre: int) -> list[tuple[np.ndarray, np.ndarray
 
     [MoSh] Eq. 2, Eq. 3
     """
-    adjacency = mesh.vertex_adjacency
-    ring = adjacency.indices[adjacency.indptr[centre]:adjacency.indptr[centre + 1]]
-    normal = mesh.vertex_normals[centre]
-    u = np.cross(normal, np.eye(3)[np.argmin(np.abs(normal))])
-    u /= np.linalg.norm(u)
-    plane = (mesh.vertices[ring] - mesh.vertices[centre]) @ np.stack([u, np.cross(normal, u)]).T     # (n, 2)
+    ring, plane = ring_around(mesh, centre)
     shares = np.linalg.pinv(plane).T                                                                 # (n, 2)
     ids = np.concatenate([[centre], ring])
     rows = [(ids[:1], np.ones(1))]

@@ -10,6 +10,7 @@ import numpy as np
 from model.body import BodyModel
 from scanprep.batch.room import Step, once
 from scanprep.geometry import rotations
+from scanprep.geometry.farthest_points import farthest_points
 from scanprep.threads import one_thread
 
 from ..files.markers import MarkerSequence
@@ -179,14 +180,7 @@ def spread_frames(positions: np.ndarray, count: int) -> np.ndarray:
     there = ~np.isnan(apart)
     middle = np.where(there, apart, 0).sum(axis=0) / np.maximum(there.sum(axis=0), 1)
     apart = np.where(there, apart - middle, 0)
-    chosen = [int(np.argmin((apart**2).sum(axis=1)))]
-    far = np.full(len(some), np.inf)
-    while len(chosen) < min(count, len(some)):
-        far = np.minimum(far, ((apart - apart[chosen[-1]])**2).sum(axis=1))
-        if far.max() <= 0:
-            break
-        chosen.append(int(far.argmax()))
-    return some[np.sort(chosen)]
+    return some[np.sort(farthest_points(apart, count, np.argmin((apart**2).sum(axis=1))))]
 
 
 def _whose(positions: Sequence[np.ndarray], chosen: np.ndarray) -> np.ndarray:

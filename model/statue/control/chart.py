@@ -226,10 +226,8 @@ def fill_square(uv: np.ndarray, mesh: Mesh) -> np.ndarray:
 
 
 def chart_problem(mesh: Mesh, chart: Chart) -> str | None:
-    """Why a chart cannot carry the images of a mesh, or None when it can.
-
-    A chart is one disk inside the unit square, no triangle inverted, whose border does not meet itself: then it
-    is one-to-one.
+    """Why a chart cannot carry the images of a mesh, or None when it can: it is one disk inside the unit square, no
+    triangle inverted, whose border does not meet itself, so one-to-one.
     """
     if chart.faces.shape != mesh.faces.shape:
         return f"it has {len(chart.faces)} triangles, the mesh {len(mesh.faces)}"

@@ -21,15 +21,16 @@ from .chart import Chart, automatic_chart, chart_problem
 from .model import ControlModel, control_problem, surface_problem
 
 KIND, VERSION = "control model", 1
+WHAT = "a GLB file with one mesh that hangs on joints"
+STORED = Path(__file__).with_name("humanoid.npz")           # made by tests/humanoid_maker.py
 
 
 def read_control(path: str | Path) -> ControlModel:
     """A control model: a file of `write_control`, or a skinned mesh in a GLB file as Blender exports it.
 
-    Of a skinned mesh the pose of the file is the default pose, turned so that z is up; vertices that stand at one place
-    are one; joints turn about three axes with wide limits, every part is a segment of its own, and there are no
-    landmarks. Joints that carry no triangle are left out. Without texture coordinates a chart is made. StorageError
-    says what is wrong with a file.
+    Of a skinned mesh the pose of the file is the default pose, turned so that z is up; joints turn about three axes
+    with wide limits, every part is a segment of its own, and there are no landmarks. Joints that carry no triangle are
+    left out; without texture coordinates a chart is made. StorageError says what is wrong with a file.
     """
     readers = {".npz": _load, ".glb": _read_skinned}
     if Path(path).suffix.lower() not in readers:
@@ -74,9 +75,6 @@ def _load(path: Path) -> ControlModel:
         if problem:
             raise ValueError(problem)
     return control
-
-
-WHAT = "a GLB file with one mesh that hangs on joints"
 
 
 @dataclass(frozen=True, eq=False)
@@ -259,9 +257,6 @@ def _with_triangles(mesh: Mesh, weights: np.ndarray, parents: np.ndarray
     gathered = np.zeros((len(weights), len(kept)))
     np.add.at(gathered.T, index[heir], weights.T)
     return np.array(kept), np.array([-1 if j == root else index[above[j]] for j in kept]), gathered, index[carrier]
-
-
-STORED = Path(__file__).with_name("humanoid.npz")           # made by tests/humanoid_maker.py
 
 
 @lru_cache(maxsize=1)

@@ -157,10 +157,8 @@ def _choose(found: Crossings, several: np.ndarray, pairs: np.ndarray) -> np.ndar
 
 def _sort(control: ControlModel, texels: Texels, heights: np.ndarray, several: np.ndarray
           ) -> tuple[np.ndarray, np.ndarray]:
-    """Which pixels (n,) keep their height, and which lie in folds.
-
-    Neighbours whose heights differ by more than three times their distance are torn apart; so many square metres
-    (1 cm²) between such folds are left out and filled.
+    """Which pixels (n,) keep their height, and which lie in folds. Neighbours whose heights differ by more than three
+    times their distance are torn apart; less than 1 cm² between such tears is left out and filled.
     """
     points, _ = interpolate(control.mesh, texels.faces, texels.bary)
     a, b = texels.neighbours().T
@@ -188,10 +186,8 @@ def texel_areas(control: ControlModel, texels: Texels) -> np.ndarray:
 
 
 def _without_data(mesh: Mesh, scan: Mesh, texels: Texels, empty: np.ndarray, reach: float) -> np.ndarray:
-    """(n of empty,) bool: the scan is out of reach, or ends at what is nearest, or that is another body part.
-
-    A place inside the scan, however deep, is a fold of the control mesh. Outside the scan the surface is missing unless
-    it passes close by.
+    """(n of empty,) bool: the scan is out of reach, or ends at what is nearest, or that is another body part. A place
+    inside the scan, however deep, is a fold; outside the surface is missing unless it passes close by.
     """
     import igl
 

@@ -138,10 +138,6 @@ def _count_places(count: int, who: np.ndarray, at: np.ndarray, d: np.ndarray) ->
     return found - np.bincount(who[1:][same], minlength=count)
 
 
-NEAREST = 0.003                      # metres: crossings up to this height are never those of another body part
-THICK = 0.75                         # share of the way to the other side of a limb, or across a gap, that heights go
-
-
 @dataclass(frozen=True, eq=False)
 class Crossings:
     """Crossings of normals with a surface, ordered by normal and height."""
@@ -209,13 +205,15 @@ def find_crossings(scan: Mesh, rays: Rays, points: np.ndarray, normals: np.ndarr
 
 
 def limits(control: Mesh, points: np.ndarray, normals: np.ndarray, reach: float) -> tuple[np.ndarray, np.ndarray]:
-    """Least and greatest distance (n,) along normals before which no other body part is met, metres."""
+    """Least and greatest distance (n,) along normals before which no other body part is met, metres.
+
+    Heights go three quarters of the way to the other side of a limb, or across a gap; 3 mm are never another body part.
+    """
     along = normals / np.maximum(np.linalg.norm(normals, axis=1), 1e-12)[:, None]
-    rays = Rays(control)
-    ends = []
+    rays, most, ends = Rays(control), reach / 0.75, []
     for side in (-along, along):
-        far = rays.cast(points + 1e-4 * side, side, reach / THICK)[1]
-        ends.append(np.maximum(THICK * np.nan_to_num(far, nan=reach / THICK), NEAREST))
+        far = rays.cast(points + 1e-4 * side, side, most)[1]
+        ends.append(np.maximum(0.75 * np.nan_to_num(far, nan=most), 0.003))
     return -ends[0], ends[1]
 
 

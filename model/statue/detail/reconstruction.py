@@ -17,11 +17,10 @@ from .subdivision import Displaced, Subdivision, chart_places, subdivide, subdiv
 
 
 class Reconstruction:
-    """Vertices of the detailed surface for any vertices of the control mesh.
+    """Vertices of the detailed surface for any vertices of the control mesh; what does not change is computed once.
 
-    Everything that does not change from frame to frame is computed once. Heights follow the interpolated normal of the
-    moved mesh. The rest of a vector displacement, if there is any, turns with the control surface around it: by the
-    rotation that best turns the edges around each control vertex, interpolated over triangles. [Statues] Eq. 19, 20
+    Heights follow the interpolated normal of the moved mesh. The rest of a vector displacement turns with the edges
+    around each control vertex. [Statues] Eq. 19, 20
     """
 
     def __init__(self, control: ControlModel, map: DisplacementMap, subdivision: Subdivision) -> None:
@@ -197,11 +196,8 @@ def remaining_error(control: ControlModel, map: DisplacementMap, scan: Mesh, cou
 
 def inverted_triangles(control: ControlModel, vertices: np.ndarray, subdivision: Subdivision, detailed: np.ndarray
                        ) -> np.ndarray:
-    """Fine triangles, ascending, whose normal opposes that of the control surface below them, which has vertices (N,
-    3); `detailed` (n, 3) are those of the fine ones.
-
-    That is its interpolated normal: on it the heights stand, and a steep flank is not inverted because the control mesh
-    has an edge there.
+    """Fine triangles, ascending, with vertices `detailed` (n, 3), whose normal opposes the interpolated one of the
+    control surface below, with vertices (N, 3): a steep flank is not inverted where the control mesh has an edge.
     """
     _, n = interpolate(control.mesh.with_vertices(vertices), subdivision.parent, subdivision.bary)
     below = n[subdivision.faces].sum(axis=1)

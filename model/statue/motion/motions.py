@@ -115,9 +115,6 @@ def _average_person() -> Skeleton:
     return Person().skeleton
 
 
-_SAME_SIDE = 0.3                     # cosine of normals below which the nearest triangle is of another limb or side
-
-
 class Follower:
     """A control mesh bound to the surface of a learned model's person, in the pose and place of the scan.
 
@@ -162,10 +159,10 @@ def _bound(mesh: Mesh, body: Mesh) -> csr_array:
     close = Surface(body).closest(mesh.vertices)
     corners, weights = body.faces[close.faces].copy(), close.bary.copy()
     facing = np.einsum("nd,nd->n", np.einsum("nc,ncd->nd", weights, body.vertex_normals[corners]), mesh.vertex_normals)
-    wrong = np.flatnonzero(facing < _SAME_SIDE)
+    wrong = np.flatnonzero(facing < 0.3)       # the nearest triangle is of another limb or side
     if len(wrong):
         there = OrientedPoints(body.vertices, body.vertex_normals)
-        found = there.match(mesh.vertices[wrong], mesh.vertex_normals[wrong], min_cosine=_SAME_SIDE)
+        found = there.match(mesh.vertices[wrong], mesh.vertex_normals[wrong], min_cosine=0.3)
         wrong, vertex = wrong[found.valid], found.index[found.valid]
         corners[wrong], weights[wrong] = vertex[:, None], [1, 0, 0]
     n = len(mesh.vertices)

@@ -38,9 +38,8 @@ class Features:
 def find_features(control: ControlModel, scan: Mesh) -> Features:
     """Joint centres and landmarks of a person who stands upright, by a control model that is a humanoid.
 
-    Neither unit nor axes of the scan need to be known; it may have holes, several components, or show a part of a
-    person. The control model, z up and facing -y, is placed in many ways, the best are bent onto the scan, and the best
-    of them is registered; front and back, and with them left and right, are told by what fits better.
+    Neither unit nor axes of the scan need to be known; it may have holes, or show a part of a person. The control
+    model, z up and facing -y, is placed in many ways, the best are bent onto the scan, and of them one is registered.
     """
     if len(scan.vertices) < 100:
         raise ValueError(f"scan: expected a person of at least 100 points, got {scan}")

@@ -13,10 +13,6 @@ from scanprep.geometry import rotations
 from ..control.model import ControlModel
 from .articulated import Articulated, Points
 
-# metres: the misfit of a feature that an angle of one radian from the default pose, or a length twice the default one,
-# is worth; it decides only what the features leave open
-PRIOR = 0.001
-
 
 @dataclass(frozen=True, eq=False)
 class FeatureFit:
@@ -61,8 +57,9 @@ def fit_features(control: ControlModel, joints: Mapping[str, np.ndarray],
         value, slope = misfit(model, x, features, goal)
         off = (x - model.rest)[:-3]
         off[:3] = 0                                             # the way the body stands is nobody's default
-        slope[:-3] += 2 * PRIOR**2 * off
-        return 1e6 * (value + PRIOR**2 * float(off @ off)), 1e6 * unit * slope
+        # one radian, or a length twice the default one, is worth a misfit of 1 mm: what the features leave open
+        slope[:-3] += 2e-6 * off
+        return 1e6 * (value + 1e-6 * float(off @ off)), 1e6 * unit * slope
 
     found = minimize(energy, start / unit, jac=True, method="L-BFGS-B", bounds=bounds / unit[:, None],
                      options={"maxiter": 2000, "maxfun": 4000, "ftol": 1e-9, "gtol": 1e-6, "maxcor": 50})

@@ -19,9 +19,6 @@ from scanprep.registration.matches import Described, Likeness, Pull, pull, tukey
 from .articulated import Articulated, Points
 from .features import limb_angles, limbs
 
-BOUNDS = 0.6, 1.6               # of a length, as multiples of the default one
-GIRTH = -0.03, 0.12             # metres off the default surface
-
 
 class PoseStage(NamedTuple):
     """Rounds of matching at one reach; lengths are metres of the control model."""
@@ -56,17 +53,14 @@ class PoseSearch:
     the joints, one Gauss-Newton step a round. Between the steps every segment grows thicker or thinner.
     """
 
-    def __init__(self, model: Articulated, normals: float = 0.06) -> None:
-        self.model, self.normals = model, normals
+    def __init__(self, model: Articulated) -> None:
+        self.model, self.normals = model, 0.06      # metres that a difference of normals of one is worth in matching
         mesh = model.control.mesh
         self.area = float(mesh.face_areas.sum())
         self.sample = thin(mesh.vertices, 0.03)
         self.segments = model.control.weights @ model.is_of
-        self.bounds = np.concatenate([model.limits, np.tile(BOUNDS, (len(model.lengths), 1)), [[-np.inf, np.inf]] * 3])
-
-    @property
-    def start(self) -> Posed:
-        return Posed(self.model.rest, np.zeros(len(self.model.lengths)))
+        # lengths from 0.6 to 1.6 of the default ones
+        self.bounds = np.concatenate([model.limits, [[0.6, 1.6]] * len(model.lengths), [[-np.inf, np.inf]] * 3])
 
     def points(self, girth: np.ndarray) -> Points:
         """All vertices of a body so thick, in the default pose."""
@@ -77,14 +71,6 @@ class PoseSearch:
         """The control mesh as it lies."""
         vertices = self.model.positions(self.model.frames(posed.x), self.points(posed.girth))
         return self.model.control.mesh.with_vertices(vertices)
-
-    def run(self, posed: Posed, target: Target, stages: tuple[PoseStage, ...]) -> Posed:
-        """Bring the control model onto a target that has its size and stands near it."""
-        for stage in stages:
-            goal = target.thinned(stage.detail)
-            for _ in range(stage.rounds):
-                posed = self.step(posed, goal, stage)
-        return posed
 
     def step(self, posed: Posed, goal: Target, stage: PoseStage) -> Posed:
         """One round of matching, one step of the parameters, then of the girth."""
@@ -107,7 +93,7 @@ class PoseSearch:
         outward = mesh.vertex_normals
         weight = np.einsum("ni,nij,nj->n", outward, wanted.A, outward)
         more = (self.segments.T @ np.einsum("ni,ni->n", outward, off)) / (self.segments.T @ weight + 0.02 * self.area)
-        return Posed(moved, np.clip(posed.girth + more, *GIRTH))
+        return Posed(moved, np.clip(posed.girth + more, -0.03, 0.12))              # metres off the default surface
 
     def wanted(self, mesh: Mesh, goal: Target, stage: PoseStage) -> Pull:
         """What matches in both directions want of the vertices.
@@ -149,7 +135,6 @@ def _bounded_step(x: np.ndarray, H: np.ndarray, g: np.ndarray, bounds: np.ndarra
 
 
 CAP, NORMALS = 0.08, 0.05        # metres: of a distance, and what a difference of normals of one is worth
-ASTRAY = 0.01, 0.25              # shares of a scan off the body, by more than a hand: arms are in a wrong place
 # Outwards, frontwards, upwards: where an upper arm may point, and a forearm, which else goes on straight.
 UPPER_ARMS = ((0.4, 0, -1), (0.7, 0.4, -0.7), (0.6, -0.6, -0.7), (1, 0, 0), (0.8, 0.6, 0.2), (0.2, 1, 0), (0.8, 0, 0.7),
               (0.2, 0, 1), (0.2, 0.7, 0.7))
@@ -180,8 +165,8 @@ class Stand:
 
 def find_person(search: PoseSearch, target: Target, metres: float) -> list[Stand]:
     """The best stand in a scan whose unit is so many `metres`, and the best that faces another way."""
-    by_misfit = attrgetter("misfit")
-    bent = sorted((bend(search, target, T, search.start, COARSE) for T in rough_stands(search, target, metres)[:8]),
+    by_misfit, start = attrgetter("misfit"), Posed(search.model.rest, np.zeros(len(search.model.lengths)))
+    bent = sorted((bend(search, target, T, start, COARSE) for T in rough_stands(search, target, metres)[:8]),
                   key=by_misfit)
     front = bent[0].facing(search)
     best = bent[:1] + [s for s in bent[1:] if s.facing(search) @ front < 0.5][:1]
@@ -193,10 +178,13 @@ def find_person(search: PoseSearch, target: Target, metres: float) -> list[Stand
     return sorted(found, key=by_misfit)
 
 
-def bend(search: PoseSearch, target: Target, T: np.ndarray, posed: Posed, stages: tuple) -> Stand:
+def bend(search: PoseSearch, target: Target, T: np.ndarray, posed: Posed, stages: tuple[PoseStage, ...]) -> Stand:
     """The stand that a start leads to."""
     goal = moved(target, T).thinned(0.02)
-    posed = search.run(posed, goal, stages)
+    for stage in stages:
+        near = goal.thinned(stage.detail)
+        for _ in range(stage.rounds):
+            posed = search.step(posed, near, stage)
     return Stand(T, posed, *misfit(search.mesh(posed), goal))
 
 
@@ -267,7 +255,7 @@ def with_arms(search: PoseSearch, target: Target, stand: Stand) -> Stand:
     o, z = search.model.control.skeleton.joints, search.model.control.mesh.vertices[:, 2]
     for base, middle, end in limbs(search.model):
         astray = (Surface(search.mesh(stand.posed)).closest(goal.points).distances > CAP).mean()
-        if not ASTRAY[0] < astray < ASTRAY[1]:
+        if not 0.01 < astray < 0.25:    # of the scan off the body by more than a hand: arms are in a wrong place
             break
         if end is None or o[base, 2] <= 0.5 * (z.min() + z.max()):      # a leg
             continue

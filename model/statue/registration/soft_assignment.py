@@ -104,9 +104,8 @@ def assign(near: np.ndarray, squared: np.ndarray, count: int, temperature: float
 
 def _balanced(M: csr_array, most: np.ndarray | None, log_s: np.ndarray, tolerance: float, rounds: int = 20
               ) -> tuple[np.ndarray, np.ndarray, float]:
-    """Factors of rows (I,) and columns (J,), rows last, and the largest relative change in the last round.
-
-    Columns come to 1 together with a slack of exp(log_s); or at most to 1, by factors of at most `most`.
+    """Factors of rows (I,) and columns (J,), rows last, and the largest relative change in the last round. Columns come
+    to 1 together with a slack of exp(log_s); or at most to 1, by factors of at most `most`.
     """
     T = csr_array(M.T)
     empty = np.diff(M.indptr) == 0
