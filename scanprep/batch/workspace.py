@@ -120,10 +120,7 @@ class Workspace:
                        tuple(job.name for job in jobs if job.name not in failures))
 
     def step(self, name: str, inputs: Any, make: Callable[[Path], T]) -> T:
-        """What `make` returns, or returned when it was last called with the same inputs.
-
-        It gets a folder; files that it writes there take their place in the output.
-        """
+        """What `make` returns, or returned for the same inputs before; it gets a folder for files of the output."""
         key = self.digests.of(inputs)
         kept = self._kept(name, key)
         if kept is not NOTHING:
@@ -291,17 +288,12 @@ class KeptSteps:
     made: set[str] = field(default_factory=set)             # those that were done now
 
     def __call__(self, name: str, inputs: Any, make: Callable[[], T]) -> T:
-        fresh = False
-
         def now(folder: Path) -> T:
-            nonlocal fresh
-            fresh = True
+            self.made.add(name)
             return make()
 
         value = self.space.step(name, inputs, now)
-        if fresh:
-            self.made.add(name)
-        elif name not in self.made:
+        if name not in self.made:
             self.found.append(name)
         self.space.drop_others(f"{name}/")
         return value

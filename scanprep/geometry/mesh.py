@@ -183,10 +183,7 @@ class Mesh:
 
     @cached_property
     def boundary_loops(self) -> list[np.ndarray]:
-        """Closed borders as vertex lists, longest first, in the direction of the triangles' own sides.
-
-        Where a border touches itself in a vertex it is cut into simple loops.
-        """
+        """Closed simple borders as vertex lists, longest first, in the direction of the triangles' own sides."""
         half = self.faces[:, [0, 1, 1, 2, 2, 0]].reshape(-1, 2)
         border = half[self.edge_use[self.face_edges.ravel()] == 1]
         return sorted(_loops(border), key=len, reverse=True)
@@ -198,10 +195,7 @@ class Mesh:
 
     @cached_property
     def vertex_component(self) -> np.ndarray:
-        """(N,) number of the connected component of each vertex, largest component 0.
-
-        A vertex without triangles is a component of its own.
-        """
+        """(N,) number of the connected component of each vertex, largest 0; one without triangles is its own."""
         _, label = connected_components(self.vertex_adjacency, directed=False)
         rank = np.argsort(-np.bincount(label), kind="stable")
         return np.argsort(rank)[label]
@@ -236,8 +230,7 @@ class Mesh:
 def template_problem(mesh: Mesh) -> str | None:
     """Why a mesh cannot serve as template, or None when it can.
 
-    A template is one connected, closed or bordered manifold component without unused vertices,
-    repeated triangles or triangles without area.
+    It is one connected manifold component, without unused vertices, repeated triangles or triangles without area.
     """
     if not len(mesh.faces):
         return "it has no triangles"
