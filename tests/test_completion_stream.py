@@ -94,16 +94,14 @@ def test_the_derivative_of_the_frame_energy_is_a_finite_difference(subject, layo
     np.testing.assert_allclose(body.retract(x, body.step_to(x, x[::-1])), x[::-1], atol=1e-12)
 
 
-@pytest.mark.parametrize("kind", ["velocity", "kalman"])
-def test_a_stream_follows_and_looks_at_no_later_frame(subject, layout, sway, kind):
+def test_a_stream_follows_and_looks_at_no_later_frame(subject, layout, sway):
     meshes, positions = sway
-    config = replace(CONFIG, prediction=kind)
-    frames = pushed(MarkerStream(subject, layout, layout.labels, 100.0, config), positions)
+    frames = pushed(MarkerStream(subject, layout, layout.labels, 100.0, CONFIG), positions)
     assert errors(subject, frames, meshes).max() < 0.006
     assert all(f.converged and f.trusted.all() for f in frames)
     other = positions.copy()
     other[20:] += 0.5
-    again = pushed(MarkerStream(subject, layout, layout.labels, 100.0, config), other[:25])
+    again = pushed(MarkerStream(subject, layout, layout.labels, 100.0, CONFIG), other[:25])
     np.testing.assert_array_equal([f.pose for f in again[:20]], [f.pose for f in frames[:20]])
 
 
@@ -203,8 +201,6 @@ def test_wrong_streams_are_refused(subject, layout):
         MarkerStream(subject, layout, layout.labels, 0.0)
     with pytest.raises(ValueError, match="found 1"):
         MarkerStream(subject, layout, ("M1", "X"), 100.0)
-    with pytest.raises(ValueError, match="expected one of velocity, kalman, got 'best'"):
-        MarkerStream(subject, layout, layout.labels, 100.0, AnimateConfig(prediction="best"))
     with pytest.raises(ValueError, match=r"positions: expected shape \(30, 3\), got \(2, 3\)"):
         MarkerStream(subject, layout, layout.labels, 100.0).push(np.zeros((2, 3)))
 
@@ -324,11 +320,11 @@ WRONG = {"times 1000": lambda p: 1000 * p, "half of it": lambda p: p * np.where(
          "mixed up": lambda p: p[np.random.default_rng(0).permutation(90)]}
 
 
-@pytest.fixture(scope="module", params=["velocity", "kalman"])
-def unbroken(passing, request):
+@pytest.fixture(scope="module")
+def unbroken(passing):
     """A stream of 20 frames, what the next 20 come to, and how far they are from the truth at most."""
     subject, layout, truth, positions = passing
-    stream = MarkerStream(subject, layout, layout.labels, 60.0, replace(CONFIG, prediction=request.param))
+    stream = MarkerStream(subject, layout, layout.labels, 60.0, CONFIG)
     first = pushed(stream, positions[:20])
     frames = pushed(copy.deepcopy(stream), positions[20:40])
     return stream, frames, errors(subject, [*first, *frames], truth[:40]).max()

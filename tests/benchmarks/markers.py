@@ -34,8 +34,7 @@ from model.linear import Subject
 from model.scape import ScapeModel
 from scanprep.skeleton.tree import Skeleton
 
-WAYS = (("stream, velocity", AnimateConfig(prediction="velocity")), ("stream, kalman", AnimateConfig()),
-        ("sequence", AnimateConfig()))
+WAYS = (("stream, kalman", AnimateConfig()), ("sequence", AnimateConfig()))
 
 
 def held_out_poses(data: RealData, model: ScapeModel, fold: int, count: int) -> list[dict[str, float]]:

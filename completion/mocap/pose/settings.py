@@ -2,7 +2,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Annotated, Literal
+from typing import Annotated
 
 import numpy as np
 
@@ -28,9 +28,6 @@ class AnimateConfig(Settings):
         Factor on the pose prior: small, it speaks for joints that no marker sees.
     prior_shrinkage : float in [0, 1]
         See `gaussian_prior`.
-    prediction : "velocity" or "kalman"
-        What a frame is expected to be: the one before, moved on at its velocity and held by how strongly
-        joints accelerate; or a Kalman filter, whose uncertainty remembers what the markers have told.
     angle_acceleration : float, radians per second squared
         How strongly joints accelerate, as a standard deviation.
     place_acceleration : float, metres per second squared
@@ -49,7 +46,6 @@ class AnimateConfig(Settings):
     outlier: Positive = 0.06
     prior_weight: float = 0.3
     prior_shrinkage: Share = 0.3
-    prediction: Literal["velocity", "kalman"] = "kalman"
     angle_acceleration: Positive = 60.0
     place_acceleration: Positive = 15.0
     smoothing: int = 2

@@ -102,33 +102,13 @@ class MarkerStream:
         return Frame(pose, trans, residuals, trusted & tracker.believed, converged)
 
 
-class VelocityPrediction:
-    """The frame before, moved on at its slowly falling velocity; the same trust in it always."""
-
-    momentum = 0.95                  # share of the velocity that is kept
-
-    def __init__(self, body: MarkedBody, config: AnimateConfig, rate: float) -> None:
-        self.body = body
-        self.information = np.diag(config.inertia(rate, body.n_unknowns) / LOOSE)
-
-    def begin(self, x: np.ndarray) -> None:
-        self.x, self.velocity = x, np.zeros_like(x)
-
-    def expect(self) -> tuple[np.ndarray, np.ndarray]:
-        return self.body.retract(self.x, self.momentum * self.velocity), self.information
-
-    def update(self, x: np.ndarray, measured: np.ndarray) -> None:
-        self.velocity = self.body.step_to(self.x, x)
-        self.x = x
-
-
 class KalmanPrediction:
     """A Kalman filter over rotations and velocities, the Gauss-Newton matrix of the markers as information.
 
     Where markers are missing, what the last ones told about the joints together is not lost at once.
     """
 
-    momentum = VelocityPrediction.momentum
+    momentum = 0.95                  # share of the velocity that is kept
 
     def __init__(self, body: MarkedBody, config: AnimateConfig, rate: float) -> None:
         self.body = body
@@ -166,22 +146,13 @@ class KalmanPrediction:
         self.x = x
 
 
-def prediction_of(body: MarkedBody, config: AnimateConfig, rate: float) -> VelocityPrediction | KalmanPrediction:
-    """The prediction that the settings name."""
-    kinds: dict[str, type[VelocityPrediction] | type[KalmanPrediction]] = {
-        "velocity": VelocityPrediction, "kalman": KalmanPrediction}
-    if config.prediction not in kinds:
-        raise ValueError(f"prediction: expected one of {', '.join(kinds)}, got '{config.prediction}'")
-    return kinds[config.prediction](body, config, rate)
-
-
 class Tracker:
     """The state of a stream of markers (L, 3) that all belong to the body, `rate` frames a second."""
 
     def __init__(self, body: MarkedBody, config: AnimateConfig, rate: float, steps: int = STEPS) -> None:
         self.body, self.config, self.rate, self.steps = body, config, rate, steps
         self.watch = LabelWatch(body.count, config.outlier)
-        self.prediction = prediction_of(body, config, rate)
+        self.prediction = KalmanPrediction(body, config, rate)
         self.wait, self.patience, self.started = 0, PATIENCE * rate, False
         self.places = np.full((body.count, 3), np.nan)                  # of the markers on the body of the last frame
         self.believed, self.since, self.passed = False, 0, 0            # frames since one was believed, passed over
