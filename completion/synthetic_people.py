@@ -154,7 +154,8 @@ def build_synthetic(recipe: SyntheticRecipe, progress: Progress | None = None) -
     small = _decimated(person, np.stack(poses), recipe.faces)
     assert small.skeleton is not None, "a skeleton was given"
     model = learn_scape(small.template, small.transfer(np.stack(poses)), small.transfer(np.stack(shapes)),
-                        small.skeleton, recipe.learn, lambda done, total: tell(made + done, made + total))
+                        small.skeleton, recipe.learn,
+                        lambda done, total: tell(made + learning * done // total, made + learning))
     return replace(model, info={
         **model.info, "name": "synthetic people", "built": datetime.date.today().isoformat(),
         "landmarks": small.landmarks(landmarks()), "markers": small.landmarks(markers()),

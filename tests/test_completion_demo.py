@@ -188,12 +188,12 @@ def test_what_is_not_ours_stays(tmp_path, capsys):
 
 KILLED = """
 import os, sys
-from completion.demo import chain, chain
+from completion.demo import chain
 from scanprep.batch import pool
 from scanprep.batch.opening import workspace
 from scanprep.console import bar
 
-config = settings.QUICK.__class__(poses=3, subjects=2, resolution=0.03)
+config = chain.DemoConfig(poses=3, subjects=2, resolution=0.03)
 real, calls = pool.attempt, []
 
 def dying(*given):
