@@ -275,8 +275,8 @@ class LatentFit:
             return Arrow(normal_equations(list(self.of_frames(state, x, z, weights, factor).values())), len(z),
                          normal_equations(common))
 
-        steps, tolerance = (24, 1e-4) if last else (8, 1e-3)
-        end = levenberg_marquardt(equations, state.rows, steps, tolerance, angles=self.n_angles)
+        # with 1e-3 in the stages before the last, the triangles under the markers depended on how the world was turned
+        end = levenberg_marquardt(equations, state.rows, 24 if last else 8, 1e-4, angles=self.n_angles)
         return end.x, bool(end.converged[0]), end.iterations
 
     def of_frames(self, state: State, x: np.ndarray, z: np.ndarray, weights: np.ndarray, factor: float
