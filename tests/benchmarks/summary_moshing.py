@@ -122,6 +122,10 @@ MOSHING: dict[str, tuple[str, str, Callable[[dict], str], str]] = {
         "6.2 mm, held "
         "out 34 mm, on its data. Where we lose: the held-out markers, because technicians put them elsewhere; the best "
         "single places, chosen with these very markers, leave 36.6 mm."),
+    "mosh_c3d_published": (
+        "The same with the weights of the patent",
+        "python tests/benchmarks/mosh_c3d.py FOLDER -m MODEL --preset published", recordings,
+        "Random frames, no marker is an outlier, nothing is repaired; its prior of poses is that of 71 scans here."),
     "mosh_speed": (
         "How long MoSh takes",
         "python tests/benchmarks/mosh_speed.py FOLDER -m MODEL", speed,
