@@ -102,8 +102,8 @@ COMPLETION: dict[str, tuple[str, str, Callable[[dict], str], str]] = {
         "python tests/benchmarks/markers.py -m FOLD_0 --c3d FOLDER --people MODEL", markers,
         "Fold 0, known subject. First every pose a frame of its own; then a motion through these scans at 120 Hz, "
         "with markers missing, exchanged and astray; then four recordings whose person comes from the markers. One "
-        "core, beside other work: frames a second of wall time are lower bounds. Streams predicted by velocity, which were "
-        "never better, are no longer offered. Where we lose: strays in the very "
+        "core, beside other work: frames a second of wall time are lower bounds. Streams predicted by velocity, which "
+        "were never better, are no longer offered. Where we lose: strays in the very "
         "first frame, and acrobatics, where a quarter of the frames does not settle."),
     "c3d": (
         "Person and motion from real recordings",
