@@ -26,12 +26,12 @@ def people(report: dict) -> str:
 
 def recordings(report: dict) -> str:
     """Observed and held-out markers of real files."""
-    rows: Rows = [(f["file"], f["frames"], f["observed_mm"], f["soft_observed_mm"], f["p95_mm"], f["worst_frame_mm"],
-                   f["held_out_mm"], f["held_out_steady_mm"],
+    rows: Rows = [(f["file"], f["frames"], f["observed_mm"], f.get("soft_observed_mm", ""), f["p95_mm"],
+                   f["worst_frame_mm"], f["held_out_mm"], f["held_out_steady_mm"],
                    ", ".join(f"{label} {far:.0f}" for label, far in f["each_mm"].items()), f["beta_rms"])
                   for f in report["files"]]
     mean = {name: both["of_files"] for name, both in report["mean"].items()}
-    rows.append(("mean", "", mean["observed_mm"], mean["soft_observed_mm"], "", "", mean["held_out_mm"],
+    rows.append(("mean", "", mean["observed_mm"], mean.get("soft_observed_mm", ""), "", "", mean["held_out_mm"],
                  mean["held_out_steady_mm"], "", ""))
     return table(("file", "frames", "markers, fixed shape (mm)", "with soft tissue (mm)", "p95 (mm)",
                   "worst frame (mm)", "held out (mm)", "held out, what varies (mm)", "each (mm)", "betas (RMS)"), rows)
