@@ -11,8 +11,8 @@ from .evaluation.errors import pose_errors as pose_errors
 from .evaluation.errors import shape_errors as shape_errors
 from .evaluation.sampling import sample_bodies as sample_bodies
 from .evaluation.sampling import specificity as specificity
-from .export.bvh import read_bvh as read_bvh
 from .export.bvh import write_bvh as write_bvh
+from .export.bvh_read import read_bvh as read_bvh
 from .export.correctives import write_body_npz as write_body_npz
 from .export.glb import write_skinned_glb as write_skinned_glb
 from .export.rig import make_rig as make_rig

@@ -19,7 +19,8 @@ from completion.mocap.soft_tissue.soft_tissue import SoftTissue
 from completion.motion import Motion
 from completion.partial.completion import Completion, load_completion, save_completion
 from completion.partial.masks import read_mask
-from model.export.bvh import read_bvh, write_bvh
+from model.export.bvh import write_bvh
+from model.export.bvh_read import read_bvh
 from model.export.cli import read_motion
 from model.files import load_model
 from model.learning.cli import _read_sexes

@@ -8,7 +8,8 @@ from bvh_reader import Bvh
 from glb_reader import Glb
 from model_bodies import random_poses, worm_model
 
-from model.export.bvh import part_ends, read_bvh, write_bvh
+from model.export.bvh import part_ends, write_bvh
+from model.export.bvh_read import read_bvh
 from model.export.cli import export, read_motion, write_frames
 from model.export.correctives import motion_correctives, pose_directions, pose_features, write_body_npz
 from model.export.glb import continuous_quaternions, skinned_glb, write_skinned_glb

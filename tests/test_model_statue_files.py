@@ -1,5 +1,6 @@
 """Statues for other programs: GLB with images, X3D; read back by readers of their own."""
 import io
+import json
 from dataclasses import replace
 from xml.etree import ElementTree
 
@@ -13,10 +14,11 @@ from model.statue.control.chart import Chart
 from model.statue.control.files import humanoid
 from model.statue.detail.subdivision import subdivide
 from model.statue.detail.texels import chart_tangents, normal_image, vertex_of_row
-from model.statue.files import write_statue_glb, write_x3d
+from model.statue.files import ABOUT, KIND, load_statue, write_statue_glb, write_x3d
 from model.statue.motion.motions import people_motion
 from scanprep.geometry import rotations
 from scanprep.geometry.mesh import Mesh
+from scanprep.geometry.storage import StorageError
 from scanprep.synthetic.people import walk
 
 NAMES = humanoid().skeleton.names
@@ -124,6 +126,24 @@ def test_tangents_go_along_the_rows_of_the_image():
         upwards = turn.T @ np.cross(turn[:, 2], found[0, :3]) * sign
         grows = np.linalg.lstsq(mesh.vertices[:, :2], uv[:, 1] - uv[0, 1], rcond=None)[0]
         assert upwards[:2] @ grows > 0.4, "the way in which v grows"
+
+
+def test_vertices_of_another_level_are_refused(detailed, tmp_path):
+    control, (fine, vertices) = humanoid(), detailed
+    with pytest.raises(ValueError, match="vertices, subdivision: expected both or none"):
+        write_statue_glb(tmp_path / "a.glb", control, vertices)
+    with pytest.raises(ValueError, match=rf"vertices: expected shape \({len(vertices)}, 3\), got \(5, 3\)"):
+        write_statue_glb(tmp_path / "a.glb", control, vertices[:5], fine)
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.parametrize("about, words", [
+    ({"kind": "model", "version": 1}, "expected a statue in JSON, found something else"),
+    ({"kind": KIND, "version": 99}, "statue version 99 is not known here"), ([1], "found something else")])
+def test_folders_of_something_else_are_refused(tmp_path, about, words):
+    (tmp_path / ABOUT).write_text(json.dumps(about))
+    with pytest.raises(StorageError, match=words):
+        load_statue(tmp_path)
 
 
 def numbers(node, name, width):

@@ -5,7 +5,8 @@ import numpy as np
 import pytest
 from model_bodies import worm, worm_model
 
-from model.export.bvh import BvhMotion, read_bvh, write_bvh
+from model.export.bvh import write_bvh
+from model.export.bvh_read import BvhMotion, read_bvh
 from model.export.cli import read_motion
 from model.export.rig import joint_places
 from model.features import linear_features

@@ -62,10 +62,13 @@ def load_statue(folder: str | Path, edited: str | Path | None = None) -> Statue:
 
     folder, texture = Path(folder), None
     about = storage.read_json(folder / ABOUT, "a folder of scape statue fit")
+    if not isinstance(about, dict) or about.get("kind") != KIND:
+        raise storage.StorageError(f"{folder / ABOUT}: expected a statue in JSON, found something else")
+    if about.get("version") != VERSION:
+        raise storage.StorageError(f"{folder / ABOUT}: statue version {about.get('version')} is not known here "
+                                   f"(known: {VERSION})")
     control = read_control(folder / CONTROL)
     with storage.taking_apart(folder / ABOUT, "a whole statue"):
-        if not isinstance(about, dict) or (about.get("kind"), about.get("version")) != (KIND, VERSION):
-            raise ValueError(f"no statue of the version that is known here, {VERSION}")
         pose = storage.numbers({"pose": np.array(about["pose"], dtype=np.float64)}, "pose",
                                len(control.skeleton.parents), 3)
     if about.get("texture"):
@@ -127,8 +130,12 @@ def write_statue_glb(path: str | Path, control: ControlModel, vertices: np.ndarr
     subdivision it is the control mesh itself, which `normals` (`normal_image`) and `heights` detail; glTF has no place
     for heights, so they are an image that the material's `extras` name.
     """
+    if (vertices is None) != (subdivision is None):
+        raise ValueError("vertices, subdivision: expected both or none")
     if subdivision is None or vertices is None:
         subdivision, vertices = subdivide(control.mesh, control.chart, 0), control.mesh.vertices
+    if np.shape(vertices) != (len(subdivision.parent), 3):
+        raise ValueError(f"vertices: expected shape ({len(subdivision.parent)}, 3), got {np.shape(vertices)}")
     mesh, chart = Mesh(vertices, subdivision.faces), subdivision.chart
     weights = np.einsum("nc,ncj->nj", subdivision.bary, control.weights[control.mesh.faces[subdivision.parent]])
     row = vertex_of_row(mesh, chart)                            # vertices are repeated along the seams of the chart

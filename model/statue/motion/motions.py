@@ -19,7 +19,7 @@ from scanprep.registration.nonrigid import Registration, register, registration_
 from scanprep.skeleton.tree import Skeleton
 
 from ...body import BodyModel
-from ...export.bvh import BvhMotion, read_bvh
+from ...export.bvh_read import BvhMotion, read_bvh
 from ...export.rig import check_motion, joint_places
 from ...fitting import fit_shape
 from ...linear import Subject

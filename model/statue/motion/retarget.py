@@ -11,7 +11,7 @@ from scipy.spatial.transform import Rotation
 
 from scanprep.geometry import rotations
 
-from ...export.bvh import BvhMotion
+from ...export.bvh_read import BvhMotion
 from ...export.rig import check_motion
 from ..control.model import ControlModel
 
