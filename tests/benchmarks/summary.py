@@ -14,7 +14,7 @@ from typing import Any
 
 import numpy as np
 from summary_completion import COMPLETION
-from summary_moshing import MOSHING
+from summary_mocap import MOCAP
 from summary_scans import (
     Rows,
     coregistration,
@@ -204,7 +204,7 @@ SECTIONS: dict[str, tuple[str, str, Callable[[dict], str], str]] = {
               "are known. Where we lose: armpits (up to 22 mm from patch to truth); Poisson columns of the patch are "
               "missing as it remeshes everything."),
     **COMPLETION,
-    **MOSHING,
+    **MOCAP,
     **STATUES,
 }
 

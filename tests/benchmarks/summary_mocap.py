@@ -101,7 +101,7 @@ def marker_sets(report: dict) -> str:
                   "best of them (mm)", "time (s CPU)"), rows)
 
 
-MOSHING: dict[str, tuple[str, str, Callable[[dict], str], str]] = {
+MOCAP: dict[str, tuple[str, str, Callable[[dict], str], str]] = {
     "mosh_people": (
         "People from simulated markers alone",
         "python tests/benchmarks/mosh_people.py -m MODEL --every 3", people,
