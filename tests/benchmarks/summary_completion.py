@@ -77,8 +77,7 @@ def searches(report: dict) -> str:
     """Two searches on the same scans, case by case."""
     names = ("mesh_mm", "model_mm", "worst_part_mm", "cpu_s")
     rows: Rows = [(r["what"], r["landmarks"], r["way"], *(r[n] for n in names)) for r in report["rows"]]
-    return table(("scan", "landmarks", "way", "mesh (mm)", "model (mm)", "worst part of the model (mm)", "time (s CPU)"),
-                 rows)
+    return table(("scan", "landmarks", "way", "mesh (mm)", "model (mm)", "worst part (mm)", "time (s CPU)"), rows)
 
 
 COMPLETION: dict[str, tuple[str, str, Callable[[dict], str], str]] = {
@@ -108,8 +107,8 @@ COMPLETION: dict[str, tuple[str, str, Callable[[dict], str], str]] = {
     "searches": (
         "Two searches for pose and shape",
         "python tests/benchmarks/searches.py -m MODEL --fold FOLD_0", searches,
-        "Four held-out men and three held-out poses. The way of co-registration ends with a non-rigid registration, after "
-        "which pose and shape are found again. Where each loses: without landmarks, its time."),
+        "Four held-out men and three held-out poses. The way of co-registration ends with a non-rigid registration, "
+        "after which pose and shape are found again. Where each loses: without landmarks, its time."),
     "markers": (
         "Markers on random vertices of held-out poses, and real recordings",
         "python tests/benchmarks/markers.py -m FOLD_0 --c3d FOLDER --people MODEL", markers,
