@@ -17,7 +17,7 @@ from typing import Any
 
 from . import config_files, ranges
 from .config_files import Flag
-from .console import PROBLEM, Metric, Outcome, say, show, write_report
+from .console import JUDGEMENT, Metric, Outcome, say, show, write_report
 from .threads import one_thread
 
 OUTPUTS, SPACE, FORCE = ("output", "out"), "space", "force"     # parameters of commands that are dealt with here
@@ -28,7 +28,7 @@ def run(function: Callable[..., Outcome], prog: str, argv: list[str]) -> int:
     """Read the command line for `function`, run it, print its table; returns the exit code.
 
     The signature of the function is the command line: names, types, defaults and the docstring.
-    0: done; 1: failed, with one line that says why; 2: wrong usage.
+    0: done, though perhaps to be looked at; 1: failed, with one line that says why; 2: wrong usage.
 
     A function with a parameter `space: Workspace` works in its output folder and goes on there where it was
     interrupted. All others write to a folder of their own, from which the output takes its place when it is whole.
@@ -53,14 +53,18 @@ def run(function: Callable[..., Outcome], prog: str, argv: list[str]) -> int:
             told = _told(error)
             say(f"{prog}: {told if call is None else call.real(told)}")
             return wrong
-    if outcome.problem:
-        say(f"{prog}: THE RESULT MEANS NOTHING: {outcome.problem}")
-    show([*(m for m in outcome.metrics if m.name != PROBLEM), Metric("time", time.perf_counter() - start, "s")])
+    judgement = outcome.judgement
+    failed = judgement is not None and judgement.verdict == "failed"
+    if judgement is not None and judgement.reasons:
+        say(f"{prog}: {'THE RESULT MEANS NOTHING' if failed else 'LOOK AT THE RESULT'}: {judgement.why}")
+    judged = [] if judgement is None else [Metric(JUDGEMENT, judgement.verdict)]
+    show([*judged, *(m for m in outcome.metrics if m.name != JUDGEMENT),
+          Metric("time", time.perf_counter() - start, "s")])
     if outcome.output is not None:
         say(call.real(f"written: {outcome.output}" + (f" (figures in {report})" if report else "")))
     for failure in outcome.failures:
         say(call.real(f"{prog}: failed: {failure}"))
-    return 1 if outcome.failures or outcome.problem else 0
+    return 1 if outcome.failures or failed else 0
 
 
 def settings_file(function: Callable[..., Outcome], argv: list[str]) -> str | None:

@@ -14,6 +14,7 @@ from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:               # imported where it is used: help answers at once
     from .batch.workspace import Results
+    from .judgement import Judgement
 
 Progress = Callable[[int, int], None]
 
@@ -40,28 +41,36 @@ class Metric:
 class Outcome:
     """What a command did: where it wrote, the figures, and what failed on the way.
 
-    `problem` says in one line why the result means nothing, with the likely cause; the files are there all the same.
+    `judgement` says what the result is worth, where the command can tell; the files are there whatever it says.
     """
 
     output: Path | None
     metrics: list[Metric]
     settings: Mapping[str, Any] = dataclasses.field(default_factory=dict)
     failures: list[str] = dataclasses.field(default_factory=list)
-    problem: str | None = None
+    judgement: Judgement | None = None
 
 
-PROBLEM = "problem"                  # name of the row of figures that says why they mean nothing
+JUDGEMENT = "judgement"              # name of the row of figures that says what they are worth
 
 
-def problem_of(metrics: Iterable[Metric]) -> str | None:
-    """Why a result means nothing, where its figures say so."""
-    return next((str(m.value) for m in metrics if m.name == PROBLEM), None)
+def judgement_row(judgement: Judgement) -> Metric:
+    """The row of the closing table that says what the result is worth."""
+    return Metric(JUDGEMENT, str(judgement))
+
+
+def judgement_of(metrics: Iterable[Metric]) -> Judgement | None:
+    """What a result is worth, where its figures say so."""
+    from .judgement import Judgement
+
+    return next((Judgement.read(str(m.value)) for m in metrics if m.name == JUDGEMENT), None)
 
 
 def failures_of(results: Results) -> list[str]:
     """One line a task that failed, or of which the result means nothing."""
-    told = {name: f"{name}: {problem}" for name, rows in results.values.items() if (problem := problem_of(rows))}
-    return [*results.failures.values(), *told.values()]
+    judged = {name: judgement_of(rows) for name, rows in results.values.items()}
+    told = [f"{name}: {one.why}" for name, one in judged.items() if one is not None and one.verdict == "failed"]
+    return [*results.failures.values(), *told]
 
 
 @contextlib.contextmanager
@@ -139,7 +148,8 @@ def write_report(outcome: Outcome, command: str, seconds: float, written: Mappin
     path = report_path(outcome.output)
     storage.write_json(path, {
         "command": command, "seconds": round(seconds, 2), "versions": versions(),
-        "settings": outcome.settings, "failures": outcome.failures, "problem": outcome.problem,
+        "settings": outcome.settings, "failures": outcome.failures,
+        "judgement": None if outcome.judgement is None else dataclasses.asdict(outcome.judgement),
         "metrics": [{"metric": m.name, "value": m.value, "unit": m.unit} for m in outcome.metrics],
         **({} if written is None else {"written": dict(written)})})
     return path

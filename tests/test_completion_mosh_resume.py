@@ -174,7 +174,7 @@ def test_figures_that_mean_nothing_are_a_failure(place, tmp_path, monkeypatch, c
 
     done = QuietWork.__call__
     monkeypatch.setattr(QuietWork, "__call__", lambda *given: (
-        [Metric("problem", "half the body was missed: unit?"), *(found := done(*given))[0]], found[1]))
+        [Metric("judgement", "failed: half the body was missed: unit?"), *(found := done(*given))[0]], found[1]))
     assert run(place, place / "people" / "bob", "--subjects", "all", "-o", tmp_path / "out", soft_tissue=False) == 1
     assert "failed: bob: half the body was missed: unit?" in capsys.readouterr().err
     assert (tmp_path / "out" / "bob" / "jump" / "motion.npz").exists()

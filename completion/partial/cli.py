@@ -13,7 +13,7 @@ from model.posing.cli import read_subject
 from scanprep.batch.pool import Workers
 from scanprep.batch.workspace import Task, Workspace
 from scanprep.cli import Output, Unit
-from scanprep.console import Outcome, bar, failures_of, problem_of, say
+from scanprep.console import Outcome, bar, failures_of, judgement_of, say
 from scanprep.geometry.landmarks import landmarks_beside, read_landmark_vertices
 
 from ..cli import ModelOrNone, read_model
@@ -74,7 +74,7 @@ def complete_scan(scans: ScansArg, output: Output, model: ModelOrNone = None, la
             say("note: no landmarks; the search starts from typical poses, look at report.html for limbs mixed up")
         with bar("completing") as progress:
             done = space.run(work, [Task("completion", inputs)], inside=progress).only
-        return Outcome(output, done, settings, problem=problem_of(done))
+        return Outcome(output, done, settings, judgement=judgement_of(done))
     work = replace(work, command=f"scape complete {folder}")
     with bar("completing scans") as progress:
         results = space.run(work, [Task(name, one, name) for name, one in found.items()], workers, progress)

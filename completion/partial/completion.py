@@ -13,7 +13,7 @@ from model.linear import Subject
 from scanprep.geometry import storage
 from scanprep.geometry.files import check_same_topology, read_mesh, write_mesh
 from scanprep.geometry.mesh import Mesh
-from scanprep.meaning import HAND, extent, size, unit_problem
+from scanprep.judgement import HAND, extent, size, unit_problem
 from scanprep.threads import one_thread
 
 from ..bodies import as_body

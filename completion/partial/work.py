@@ -14,10 +14,11 @@ from model.body import BodyModel
 from model.linear import Subject
 from scanprep.batch.room import Room
 from scanprep.cli import MM, Unit
-from scanprep.console import Metric, Outcome, write_report
+from scanprep.console import Metric, Outcome, judgement_row, write_report
 from scanprep.geometry.files import POINT_ENDINGS, PointCloud, read_mesh, read_points
 from scanprep.geometry.landmarks import match_landmarks, read_landmarks
 from scanprep.geometry.mesh import Mesh
+from scanprep.judgement import Judgement
 from scanprep.pictures.page import Page
 from scanprep.pictures.sheets import save_png
 from scanprep.pictures.textures import Texture, bake, read_texture, write_textured
@@ -88,7 +89,7 @@ class ScanFiles:
 def complete_files(work: Work, inputs: Inputs, room: Room) -> list[Metric]:
     """Complete the scan of some files into the folder of a room, report.html in it; the figures.
 
-    The first is called "problem" where the completion means nothing, and says why.
+    The first says what the completion is worth.
     """
     with warnings.catch_warnings():
         if work.config.free_scale:
@@ -103,7 +104,7 @@ def complete_files(work: Work, inputs: Inputs, room: Room) -> list[Metric]:
         done = _with_colors(work, files, done, output)
     save_completion(output, done)
     problem = completion_problem(done, all_points(files.views), work.config.free_scale)
-    metrics = [*([Metric("problem", problem)] if problem else []), *figures(work, inputs, done, landmarks, masked)]
+    metrics = [judgement_row(Judgement.of(problem)), *figures(work, inputs, done, landmarks, masked)]
     picture = picture_completion(views, done, work.body.template, masked=masked)
     save_png(output / "picture.png", picture)
     rows = [(m.name, m.value, m.unit) for m in metrics]

@@ -14,6 +14,7 @@ from model.posing.cli import read_subject
 from scanprep.batch.workspace import Workspace
 from scanprep.cli import MM, Output, Unit
 from scanprep.console import Metric, Outcome, bar, say
+from scanprep.judgement import Judgement
 from scanprep.ranges import Count, Positive
 
 from ..cli import ModelOrNone, read_landmark_pairs, read_model, rows
@@ -82,7 +83,7 @@ def track_frames(frames: FramesArg, output: Output, model: ModelOrNone = None, r
     space.step("animation", (of_motion, keys),
                lambda folder: write_glb(folder / "animation.glb", motion, person, keys=keys))
     return Outcome(output, metrics, {"track": config, "rate": rate, "model": name}, found.problems,
-                   tracking_problem(motion))
+                   Judgement.of(tracking_problem(motion)))
 
 
 def _figures(motion: Motion) -> list[Metric]:

@@ -16,6 +16,7 @@ from scanprep.geometry.files import write_mesh
 from scanprep.geometry.landmarks import match_landmarks, read_landmarks, write_landmarks
 from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.tables import write_table
+from scanprep.judgement import Judgement
 from scanprep.pipeline.prepare import mesh_file
 from scanprep.pipeline.scans import ScanTask, find_scans
 
@@ -75,7 +76,7 @@ def coregister_scans(model: ModelArg, scans: ScansArg, output: Output, landmarks
     with space.staging("set") as staged:
         write_coregistered(staged.folder, loaded, kept, done)
     return Outcome(output, _figures(done, names), {"coregistration": config}, [*failures, *done.failures.values()],
-                   coregistration_problem(done, read))
+                   Judgement.of(coregistration_problem(done, read)))
 
 
 def write_coregistered(folder: Path, first: BodyModel, tasks: Sequence[ScanTask], done: Coregistration) -> None:

@@ -13,6 +13,7 @@ from scanprep.console import Metric, Outcome, bar
 from scanprep.geometry import storage
 from scanprep.geometry.files import write_mesh
 from scanprep.geometry.tables import write_table
+from scanprep.judgement import Judgement
 from scanprep.ranges import Count, Seed
 
 from ..body import BodyModel
@@ -75,16 +76,16 @@ def evaluate(model: ModelArg, output: Output, poses: Path | None = None, shapes:
     page.write(output / "report.html")
     return Outcome(output, metrics, {"model": model, "poses": poses, "shapes": shapes, "counts": counts,
                                      "train_shapes": train_shapes, "subject": subject, "seed": seed},
-                   problem=_problem(loaded, found))
+                   judgement=Judgement.of(_problems(loaded, found)))
 
 
-def _problem(model: BodyModel, found: Findings) -> str | None:
+def _problems(model: BodyModel, found: Findings) -> list[str]:
     told = []
     if found.poses is not None and found.pose_bodies is not None:
         told.append(errors_problem(found.poses.errors, found.pose_bodies, model))
     if found.shapes is not None and found.shape_bodies is not None:
         told.append(errors_problem(found.shapes.errors[-1], found.shape_bodies, model))
-    return "; ".join(problem for problem in told if problem) or None
+    return [problem for problem in told if problem]
 
 
 def sample(model: ModelArg, output: Output,

@@ -9,7 +9,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from scanprep.meaning import HAND, extent, size, unit_problem
+from scanprep.judgement import HAND, extent, size, unit_problem
 
 from ..body import BodyModel
 from ..fitting import FitConfig, PoseFit, PoseFitter, ShapeFit, ShapeFitter

@@ -19,6 +19,7 @@ from scanprep.geometry.files import list_meshes
 from scanprep.geometry.landmarks import read_landmark_vertices
 from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.tables import read_table
+from scanprep.judgement import Judgement
 from scanprep.ranges import Count
 from scanprep.skeleton.find import find_skeleton
 from scanprep.skeleton.parts import SkeletonConfig
@@ -109,7 +110,8 @@ def learn(poses: Path, output: Output, shapes: Path | None = None, template: Pat
         Metric("parts", len(tree.parents)), *about(models["neutral"]),
         *[Metric(f"people of the {name} model", model.info["shapes"]) for name, model in models.items() if by_sex],
         *_times(seconds, kept_steps.found)],
-        {"scape": scape, "skinning": skinning, "mixed": mixed}, problem=learning_problem(models["neutral"], people))
+        {"scape": scape, "skinning": skinning, "mixed": mixed}, 
+        judgement=Judgement.of(learning_problem(models["neutral"], people)))
 
 
 def _find_skeleton(body: Mesh, posed: np.ndarray, parts: int | None, step: Step, progress: Progress) -> Skeleton:

@@ -11,7 +11,7 @@ import numpy as np
 
 from scanprep.batch.room import Step, inside, once
 from scanprep.geometry.mesh import Mesh, check_template
-from scanprep.meaning import HAND, extent, size, unit_problem
+from scanprep.judgement import HAND, extent, size, unit_problem
 from scanprep.skeleton.tree import Skeleton
 from scanprep.threads import one_thread
 

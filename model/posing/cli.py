@@ -12,7 +12,7 @@ from scanprep.console import Metric, Outcome, bar
 from scanprep.geometry.files import read_mesh, write_mesh
 from scanprep.geometry.landmarks import read_landmark_vertices, read_landmarks
 from scanprep.geometry.storage import load_arrays, numbers, read_json, taking_apart
-from scanprep.meaning import HAND, size
+from scanprep.judgement import HAND, Judgement, size
 from scanprep.ranges import BETAS, TURNS, Beta
 
 from ..body import BodyModel
@@ -51,8 +51,8 @@ def repose(model: ModelArg, body: BodyArg, poses: Path, output: Output, unit: Un
         Metric("meshes", len(written)),
         Metric("distance from the body in its own pose, mean", 1e3 * found.mean, "mm"),
         Metric("distance from the body in its own pose, largest", 1e3 * found.largest, "mm")],
-        problem=None if found.mean <= HAND * size(loaded.template) else
-        f"the body is {1e3 * found.mean:.0f} mm from the model's; registered otherwise, or the wrong unit (--unit)?")
+        judgement=Judgement.of(None if found.mean <= HAND * size(loaded.template) else
+        f"the body is {1e3 * found.mean:.0f} mm from the model's; registered otherwise, or the wrong unit (--unit)?"))
 
 
 def character(mesh: CharacterArg, model: Annotated[Path, tyro.conf.arg(aliases=["-m"])], output: Output,
@@ -93,7 +93,8 @@ def character(mesh: CharacterArg, model: Annotated[Path, tyro.conf.arg(aliases=[
         from ..report import picture_character
 
         save_png(output.with_suffix(".png"), picture_character(found.model))
-    return Outcome(output, _about(loaded, found), {"character": config}, problem=character_problem(found))
+    return Outcome(output, _about(loaded, found), {"character": config},
+                   judgement=Judgement.of(character_problem(found)))
 
 
 def _about(model: BodyModel, found: Character) -> list[Metric]:

@@ -13,10 +13,11 @@ from scanprep.batch.room import Room
 from scanprep.batch.workspace import Task, Workspace
 from scanprep.cleaning.clean_scan import clean_scan
 from scanprep.cli import MM, Output, ScanArg, Unit
-from scanprep.console import Metric, Outcome, bar, failures_of, problem_of, write_report
+from scanprep.console import Metric, Outcome, bar, failures_of, judgement_of, judgement_row, write_report
 from scanprep.geometry.files import read_mesh, write_mesh
 from scanprep.geometry.format_common import UNITS
 from scanprep.geometry.mesh import Mesh
+from scanprep.judgement import Judgement
 from scanprep.pictures.gltf import write_animated_glb
 from scanprep.pictures.sheets import save_png, write_gif
 from scanprep.pictures.textures import Texture, read_texture
@@ -78,7 +79,7 @@ def fit(scan: ScanArg, output: Output, features: Path | None = None, control: Pa
                              "humanoid is found by itself")
         with bar("fitting the statue") as progress:
             done = space.run(work, [Task("statue", ScanTask("statue", scan, features))], inside=progress).only
-        return Outcome(output, done, {"statue": config}, problem=problem_of(done))
+        return Outcome(output, done, {"statue": config}, judgement=judgement_of(done))
     if features is not None and not features.is_dir():
         raise ValueError(f"--features: expected a folder for a folder of scans, got {features}")
     work = replace(work, command=f"scape statue fit {scan}")
@@ -128,7 +129,7 @@ def write_statue(folder: Path, name: str, scan: Mesh, statue: FittedStatue, rows
     write_for_programs(folder, statue, levels[-1].mesh.vertices, fine, statue.upright_axis)
     stored = sum((folder / file).stat().st_size for file in ("control.npz", "displacement.png", "coverage.png"))
     problem = statue_problem(statue)
-    rows = [*([Metric("problem", problem)] if problem else []), *rows, *_of_the_fit(statue),
+    rows = [judgement_row(Judgement.of(problem)), *rows, *_of_the_fit(statue),
             *_of_the_map(statue, scan, levels, adaptive, fine),
             Metric("control model and map on disk", stored / 1e6, "MB"),
             Metric("scan on disk as binary PLY", (12 * len(scan.vertices) + 13 * len(scan.faces)) / 1e6, "MB")]

@@ -10,7 +10,7 @@ from ..geometry import rotations
 from ..geometry.mesh import Mesh
 from ..geometry.surface import checked_points
 from ..geometry.target import target_of
-from ..meaning import extent, unit_problem
+from ..judgement import extent, unit_problem
 from ..ranges import Positive, Settings, SomeShare
 from ..threads import search_threads
 

@@ -13,7 +13,7 @@ from ..dataset import RegisteredSet, SetEntry
 from ..geometry import rotations
 from ..geometry.farthest_points import thin
 from ..geometry.mesh import Mesh
-from ..meaning import size as size_of
+from ..judgement import size as size_of
 from ..pictures.camera import Camera, look_around, upright
 from ..pictures.page import Page, data_uri
 from ..pictures.shading import CLAY, Dots, Shape, Solid, color_bar, heat, part_colors, render, side_by_side

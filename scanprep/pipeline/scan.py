@@ -14,7 +14,7 @@ from ..correspondence.search import CorrelatedConfig
 from ..geometry.files import read_scan
 from ..geometry.landmarks import check_on_surface, match_landmarks, read_landmarks
 from ..geometry.mesh import Mesh
-from ..meaning import extent
+from ..judgement import extent
 from ..ranges import FLAG, Settings
 from ..registration.nonrigid import Registration, register, registration_problem, stretched_share
 from ..registration.schedule import RegistrationConfig

@@ -20,6 +20,7 @@ from ..correspondence.search import CorrelatedConfig
 from ..geometry.files import read_mesh, read_scan, write_mesh
 from ..geometry.landmarks import landmarks_beside, match_landmarks, read_landmarks, read_template_landmarks
 from ..geometry.mesh import Mesh
+from ..judgement import Judgement
 from .nonrigid import register, registration_problem
 from .schedule import RegistrationConfig
 
@@ -48,7 +49,7 @@ def align(source: MeshArg, target: TargetArg, output: Output, landmarks: Path | 
     return Outcome(output, [
         Metric("RMS distance", MM * found.rms, "mm"), Metric("converged", str(found.converged)),
         Metric("T_target_source", np.array2string(T, precision=6).replace("\n", " "))], {"align": config},
-        problem=alignment_problem(moving.vertices, fixed.vertices, found))
+        judgement=Judgement.of(alignment_problem(moving.vertices, fixed.vertices, found)))
 
 
 def correspond(scan: ScanArg, template: Path, output: Output, landmarks: Path | None = None,
@@ -78,7 +79,7 @@ def correspond(scan: ScanArg, template: Path, output: Output, landmarks: Path | 
         Metric("method", found.method), *_led_by(given, pairs), Metric("correspondences", len(found)),
         Metric("confidence, median", float(np.median(found.confidence))),
         Metric("converged", str(found.converged))], {"correspond": config},
-        problem=correspondences_problem(found))
+        judgement=Judgement.of(correspondences_problem(found)))
 
 
 def register_one(scan: ScanArg, template: Path, output: Output, landmarks: Path | None = None,
@@ -115,7 +116,7 @@ def register_one(scan: ScanArg, template: Path, output: Output, landmarks: Path 
         Metric("scan off the template", 100 * fit.uncovered, "%"),
         Metric("distance of landmarks, RMS", MM * fit.landmark_rms, "mm"),
         Metric("inverted triangles", fit.inverted), Metric("converged", str(fit.converged))], {"register": config},
-        problem=registration_problem(body, data, fit, pairs is not None))
+        judgement=Judgement.of(registration_problem(body, data, fit, pairs is not None)))
 
 
 Landmarks = tuple[np.ndarray, np.ndarray]

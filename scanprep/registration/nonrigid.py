@@ -19,7 +19,7 @@ from ..correspondence.correspondences import Correspondences
 from ..geometry.mesh import Mesh
 from ..geometry.surface import OrientedPoints, Surface
 from ..geometry.target import Target, orient
-from ..meaning import HAND, extent, size, unit_problem
+from ..judgement import HAND, extent, size, unit_problem
 from ..threads import one_thread
 from .final_fit import final_fit, inverted_triangles, without_inverted
 from .graph_fit import GraphFit, graph_fit

@@ -12,6 +12,7 @@ from ..console import Metric, Outcome, bar
 from ..dataset import RegisteredSet
 from ..geometry.files import read_mesh
 from ..geometry.mesh import Mesh
+from ..judgement import Judgement
 from ..ranges import Signed
 from .edit import apply_edits, read_edits
 from .find import SkeletonSearch, search_skeleton, skeleton_problem
@@ -42,7 +43,7 @@ def skeleton(poses: PosesArg, output: Output, template: Path | None = None, subj
     search.skeleton.save(output)
     return Outcome(output, [Metric("poses", len(vertices)), Metric("parts", len(search.skeleton.parents)),
                             *_facts(search), *_shares(search.skeleton, body)], {"skeleton": config},
-                   problem=skeleton_problem(search, config.parts))
+                   judgement=Judgement.of(skeleton_problem(search, config.parts)))
 
 
 def _facts(search: SkeletonSearch) -> list[Metric]:

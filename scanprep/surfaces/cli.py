@@ -19,6 +19,7 @@ from ..geometry import storage
 from ..geometry.files import UNITS, PointCloud, list_meshes, read_mesh, read_scan, write_mesh, write_points
 from ..geometry.landmarks import landmarks_beside, read_landmark_vertices, read_landmarks
 from ..geometry.mesh import Mesh
+from ..judgement import Judgement
 from ..ranges import Faces
 from ..repair.hole_filling import FillConfig, FilledHole, fill_holes, fill_report
 from .template import make_template
@@ -107,7 +108,8 @@ def align_cameras(views: ViewsArg, output: Output, cameras: Path | None = None, 
         Metric("largest shift of a camera", MM * max(shifts), "mm"),
         Metric("seen by others too, least of a view", 100 * float(found.overlap.min()), "%"),
         Metric("looked through by others, most of a view", 100 * float(found.conflict.max()), "%")],
-        {"views": config}, [f"{name}: its place is uncertain" for name in uncertain], views_problem(found))
+        {"views": config}, [f"{name}: its place is uncertain" for name in uncertain],
+        Judgement.of(views_problem(found)))
 
 
 def _view_landmarks(folder: Path, name: str, view: Mesh, unit: Unit | None) -> dict[str, np.ndarray]:

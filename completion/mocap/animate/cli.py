@@ -14,7 +14,7 @@ from model.posing.cli import read_subject
 from scanprep.batch.pool import Workers
 from scanprep.batch.workspace import Results, Task, Workspace
 from scanprep.cli import Output, Unit
-from scanprep.console import Metric, Outcome, bar, failures_of, problem_of
+from scanprep.console import Metric, Outcome, bar, failures_of, judgement_of
 from scanprep.geometry.storage import read_json
 from scanprep.pictures.page import Page
 from scanprep.ranges import BETAS
@@ -74,7 +74,7 @@ def animate_markers(markers: MarkersArg, output: Output, model: ModelOrNone = No
     if markers.is_file():
         with bar("following the markers") as following:
             done = space.run(work, [Task("motion", markers)], inside=following).only
-        return Outcome(output, done, settings, problem=problem_of(done))
+        return Outcome(output, done, settings, judgement=judgement_of(done))
     with bar("files") as progress:
         results = space.run(work, [Task(path.stem, path, path.stem) for path in found], workers, progress)
     with space.staging("page") as staged:

@@ -11,8 +11,9 @@ from model.body import BodyModel
 from model.linear import Subject
 from scanprep.batch.room import Room
 from scanprep.cli import MM
-from scanprep.console import Metric
+from scanprep.console import Metric, judgement_row
 from scanprep.geometry import storage
+from scanprep.judgement import Judgement
 from scanprep.pictures.page import Page
 
 from ...cli import rows
@@ -57,7 +58,7 @@ class Work:
     def __call__(self, path: Path, room: Room) -> list[Metric]:
         """Follow the markers of a file, write everything into the folder of a room, and return the figures.
 
-        The first is called "problem" where the motion means nothing, and says why.
+        The first says what the motion is worth.
         """
         sequence = read_markers(path, self.unit, self.who)
         layout, name = choose_layout(self.model, self.layout, sequence.labels)
@@ -78,7 +79,7 @@ class Work:
                                                          "frames": found.frames[:, 1].tolist()})
             layout.save(output / "layout.json")
         problem = motion_problem(motion, body.template, layout, sequence)
-        metrics = [*([Metric("problem", problem)] if problem else []), *metrics, *figures(motion, sequence)]
+        metrics = [judgement_row(Judgement.of(problem)), *metrics, *figures(motion, sequence)]
         write_motion(output, motion, body)
         write_glb(output / "animation.glb", motion, body)
         page = motion_page(motion, body, sequence, path.name, rows(metrics))

@@ -15,7 +15,7 @@ from model.files import load_model
 from scanprep.batch.pool import Workers
 from scanprep.batch.workspace import Task, Workspace
 from scanprep.cli import Output, Unit
-from scanprep.console import PROBLEM, Metric, Outcome, bar, say
+from scanprep.console import JUDGEMENT, Metric, Outcome, bar, judgement_of, say
 from scanprep.pictures.page import Page
 
 from ...cli import read_model
@@ -82,8 +82,10 @@ def mosh_markers(markers: MarkersArg, output: Output, model: Models = (), layout
         done = space.run(work, [Task(actor.name, actor, actor.name) for actor in actors], workers, people, inside)
     failures = [line if line.startswith(f"{name}: ") else f"{name}: {line}" for name, line in done.failures.items()]
     for name, (rows, failed) in done.values.items():
-        failures += [f"{name}: {line}" for line in [*(str(m.value) for m in rows if m.name == PROBLEM), *failed]]
-    metrics = {name: [m for m in rows if m.name != PROBLEM] for name, (rows, _) in done.values.items()}
+        judgement = judgement_of(rows)
+        told = judgement.reasons if judgement is not None and judgement.verdict == "failed" else ()
+        failures += [f"{name}: {line}" for line in [*told, *failed]]
+    metrics = {name: [m for m in rows if m.name != JUDGEMENT] for name, (rows, _) in done.values.items()}
     with space.staging("page") as staged:
         _page(actors, metrics, failures).write(staged.folder / "report.html")
     settings = {"mosh": config, "model": model_name, "layout": layout, "held out": held}

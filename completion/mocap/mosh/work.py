@@ -13,8 +13,9 @@ from model.body import BodyModel
 from model.learning.sexes import SexGuess
 from scanprep.batch.room import Room
 from scanprep.cli import MM
-from scanprep.console import Metric, Outcome, write_report
+from scanprep.console import Metric, Outcome, judgement_row, write_report
 from scanprep.geometry import storage, tables
+from scanprep.judgement import Judgement
 from scanprep.pictures.camera import upright
 from scanprep.pictures.sheets import save_png
 
@@ -56,8 +57,8 @@ class Work:
     def __call__(self, actor: Actor, room: Room) -> tuple[list[Metric], list[str]]:
         """Everything of one person into the folder of a room: the figures, and what failed.
 
-        A recording that cannot be read is left out and told; ValueError where none can. The first figure is called
-        "problem" where a motion means nothing, and says why.
+        A recording that cannot be read is left out and told; ValueError where none can. The first figure says
+        what the motions are worth.
         """
         start, folder = time.perf_counter(), room.folder
         found, failures = _solve(self, actor, room)
@@ -71,9 +72,9 @@ class Work:
             room.tell(HALF + HALF * i // total, 2 * HALF)
             figures[take.name] = _write(self, found, take, room, settings)
         room.tell(HALF + HALF * (total - 1) // total, 2 * HALF)
-        problems = "; ".join(f"{take.name}: {why}" for take in found.takes if (why := found.problem(take)))
-        metrics = [Metric("problem", problems)] if problems else []
-        metrics += [Metric("model", self.name), *_person_metrics(found), *_figures(found.takes)]
+        problems = [f"{take.name}: {why}" for take in found.takes if (why := found.problem(take))]
+        metrics = [judgement_row(Judgement.of(problems)), Metric("model", self.name), *_person_metrics(found),
+                   *_figures(found.takes)]
         person_page(actor.name, found.model, found.result, found.usual, found.takes, metrics, figures,
                     settings).write(folder / "report.html")
         save_png(folder / PICTURE, person_picture(found.model, found.result))
@@ -161,7 +162,7 @@ def _write(work: Work, found: _Found, take: Take, room: Room, settings: Mapping[
                          f"person are; soft tissue taken {factor:g} times.").picture(*shown)
         closing(page, metrics, settings).write(place(folder) / "report.html")
         save_png(place(folder) / PICTURE, take_picture(take))
-        outcome = Outcome(place(folder), metrics, settings, problem=found.problem(take))
+        outcome = Outcome(place(folder), metrics, settings, judgement=Judgement.of(found.problem(take)))
         write_report(outcome, work.command, time.perf_counter() - start)
 
     room.files(f"{take.name} files", (solved, take.source.path, take.source.who, take.unit, factor),

@@ -4,7 +4,7 @@ from __future__ import annotations
 import numpy as np
 
 from scanprep.geometry.mesh import Mesh
-from scanprep.meaning import extent, size, unit_problem
+from scanprep.judgement import extent, size, unit_problem
 
 from ...motion import Motion
 from ..files.markers import MarkerSequence

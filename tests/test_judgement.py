@@ -31,6 +31,7 @@ from scanprep.batch.room import Room
 from scanprep.console import Metric
 from scanprep.correspondence.correspondences import Correspondences, correspondences_problem
 from scanprep.geometry.files import PointCloud, write_points
+from scanprep.judgement import Judgement
 from scanprep.registration.nonrigid import Registration, registration_problem
 from scanprep.skeleton.find import skeleton_problem
 
@@ -89,7 +90,8 @@ def test_a_command_says_that_its_result_means_nothing(place, capsys, case):
     said = [line for line in capsys.readouterr().err.splitlines() if "THE RESULT MEANS NOTHING" in line]
     assert len(said) == 1 and all(word in said[0] for word in words), said
     told = json.loads(Path("out.report.json").read_text())
-    assert Path("out.ply").exists() and told["problem"] in said[0]
+    assert Path("out.ply").exists() and told["judgement"]["verdict"] == "failed"
+    assert told["judgement"]["reasons"][0] in said[0]
     if case == "ten points":                                        # there is nothing to converge to
         assert {"metric": "converged", "value": "False", "unit": ""} in told["metrics"]
         assert {"metric": "distance to the scan, RMS", "value": None, "unit": "mm"} in told["metrics"]
@@ -122,11 +124,11 @@ def test_completions(place, tmp_path, scan, unit, words):
 
 
 def check(rows: list[Metric], words):
-    problems = [row.value for row in rows if row.name == "problem"]
+    judgement = Judgement.read(rows[0].value)
     if words is None:
-        assert not problems
+        assert judgement.verdict == "good", judgement
     else:
-        assert rows[0].name == "problem" and all(word in rows[0].value for word in words), rows[0]
+        assert judgement.verdict == "failed" and all(word in judgement.why for word in words), judgement
 
 
 def walk(layout, scale=1.0):
