@@ -14,7 +14,7 @@ from scanprep.geometry.surface import OrientedPoints
 
 from .. import energy
 from ..bodies import FixedBody
-from .free_space import Clothing, Contact, Violation, find_cameras, free_space_violation
+from .free_space import Clothing, Contact, Outside, Violation, find_cameras, free_space_violation
 from .masks import part_vertices
 from .scan import ScanPoints, spread
 from .settings import CompletionConfig
@@ -62,6 +62,7 @@ class ScanFit:
         self.tree = OrientedPoints(cloud.points, cloud.normals)
         self.cameras = find_cameras(cloud) if config.free_space_weight > 0 else ()
         self.clothing = None if cloud.masked is None else Clothing(cloud.masked)
+        self._outside: Outside | None = None
 
     def on(self, cloud: ScanPoints) -> ScanFit:
         """The same body with another scan, without landmarks; all that belongs to the body is shared."""
@@ -75,6 +76,13 @@ class ScanFit:
         out = copy(self)
         out.body = self.body.held(x)
         return out
+
+    @property
+    def outside(self) -> Outside | None:
+        """A table of where the cameras saw that nothing is; None without cameras."""
+        if self._outside is None and self.cameras:
+            self._outside = Outside(self.cameras)
+        return self._outside
 
     def mesh(self, x: np.ndarray) -> Mesh:
         """The predicted mesh of unknowns (P,)."""
@@ -102,16 +110,13 @@ class ScanFit:
                                                                          MIN_COSINE)
         counted = np.minimum(found.distances, cap)**2 * ~(found.valid & self.ignored[found.index])
         apart = counted.mean()
-        for weight, ids, found_out in self._violations(mesh):
+        for weight, ids, found_out in self.objections(mesh):
             apart += weight * (np.minimum(found_out.excess, cap)**2).sum() / len(ids)
         off = ((mesh.vertices[self.vertices] - self.points)**2).sum() / config.landmark_sd**2
         return float(EVIDENCE * apart / config.scan_sd**2 + off) + self.unlikely(x)
 
-    def quick_misfits(self, x: np.ndarray, moved: np.ndarray | None = None, cap: float = 0.1) -> np.ndarray:
-        """How badly bodies (n, P) explain the scan, on few vertices whose normals rotate with their parts.
-
-        Where the bodies differ in some parts only, these alone are tested for passing through others.
-        """
+    def quick_misfits(self, x: np.ndarray, cap: float = 0.1) -> np.ndarray:
+        """How badly bodies (n, P) explain the scan, on few vertices whose normals rotate with their parts."""
         ids, few = spread(self.body.template.vertices, QUICK), slice(None, None, 3)
         contact = Contact(self.body.skeleton, self.part[ids[few]])
         pose, trans, _ = self.body.split(x)
@@ -120,7 +125,7 @@ class ScanFit:
         for i, (y, n) in enumerate(zip(places, normals, strict=True)):
             found = OrientedPoints(y, n).match(self.coarse.points, self.coarse.normals, cap, MIN_COSINE)
             apart = (np.minimum(found.distances, cap)**2).mean()
-            depth = contact.violation(y[few], n[few], moved).excess
+            depth = contact.violation(y[few], n[few]).excess
             apart += self.config.contact_weight * (np.minimum(depth, cap)**2).mean()
             if self.cameras:
                 excess = free_space_violation(self.cameras, y[few]).excess
@@ -220,7 +225,7 @@ class ScanFit:
         """
         share = EVIDENCE / self.config.scan_sd**2
         ids, targets, normals, weights = [], [], [], []
-        for weight, mine, found in self._violations(mesh):
+        for weight, mine, found in self.objections(mesh):
             out = found.excess > 0
             ids.append(mine[out])
             targets.append(found.target[out])
@@ -228,7 +233,7 @@ class ScanFit:
             weights.append(weight * share / len(mine) * energy.geman_mcclure(found.excess[out], 0.1))
         return tuple(np.concatenate(part) for part in (ids, targets, normals, weights))
 
-    def _violations(self, mesh: Mesh) -> list[tuple[float, np.ndarray, Violation]]:
+    def objections(self, mesh: Mesh) -> list[tuple[float, np.ndarray, Violation]]:
         """What says that vertices cannot be where they are: its weight, and the vertices."""
         config, places, normals = self.config, mesh.vertices, mesh.vertex_normals
         mine = self.matched

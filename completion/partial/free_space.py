@@ -23,6 +23,7 @@ FEW = 2000                           # points that are enough to find the viewpo
 FACING = 0.97                        # share of the points of a scan that must face its one viewpoint
 TOLERANCE = 0.03                     # metres: the rim that scanners lose, and an inexact viewpoint
 INSIDE, PRESSED = 0.12, 0.015        # metres: half of the thickest part of a body; how deep skin may press into skin
+CELL, MARGIN, CAP = 0.04, 0.3, 0.15   # metres: of the table of what cameras must have seen; further off is as bad
 CLOTHING, NOISE = 0.10, 0.003        # metres that hair or a skirt may stand off the skin; that skin may stick out
 
 
@@ -71,6 +72,23 @@ def free_space_violation(cameras: Sequence[CameraView], vertices: np.ndarray) ->
         return found[0]
     worst, each = np.argmax([one.excess for one in found], axis=0), np.arange(len(vertices))
     return Violation(*(np.stack(part)[worst, each] for part in zip(*found, strict=True)))
+
+
+class Outside:
+    """A table of how far places stand where cameras, at least one, would have seen them."""
+
+    def __init__(self, cameras: Sequence[CameraView]) -> None:
+        points = np.concatenate([camera.points for camera in cameras])
+        self.low = points.min(axis=0) - MARGIN
+        self.count = np.ceil((points.max(axis=0) + MARGIN - self.low) / CELL).astype(np.int64)
+        grid = np.stack(np.meshgrid(*[np.arange(n) for n in self.count], indexing="ij"), axis=-1).reshape(-1, 3)
+        excess = free_space_violation(cameras, self.low + CELL * (grid + 0.5)).excess
+        self.excess = np.minimum(excess, CAP).astype(np.float32)
+
+    def at(self, places: np.ndarray) -> np.ndarray:
+        """(...) metres, for places (..., 3); beyond the table as at its end."""
+        cell = np.clip(((places - self.low) / CELL).astype(np.int64), 0, self.count - 1)
+        return self.excess[(cell[..., 0] * self.count[1] + cell[..., 1]) * self.count[2] + cell[..., 2]]
 
 
 def find_cameras(cloud: ScanPoints) -> tuple[CameraView, ...]:
@@ -124,10 +142,10 @@ class Contact:
         self._mine = [np.flatnonzero(part == p) for p in range(J)]
         self._others = [np.flatnonzero(~near[p][part]) for p in range(J)]
 
-    def violation(self, places: np.ndarray, normals: np.ndarray, parts: np.ndarray | None = None) -> Violation:
-        """How deep vertices (n, 3) with normals (n, 3) stand inside another part, those of some parts or of all."""
+    def violation(self, places: np.ndarray, normals: np.ndarray) -> Violation:
+        """How deep vertices (n, 3) with normals (n, 3) stand inside another part."""
         depth, way = np.zeros(len(places)), np.zeros_like(places)
-        for p in range(len(self._mine)) if parts is None else parts:
+        for p in range(len(self._mine)):
             mine, others = self._mine[p], self._others[p]
             if not len(mine) or not len(others):
                 continue

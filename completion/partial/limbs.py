@@ -1,64 +1,176 @@
-"""Limbs in the wrong place begin again from random starts, where that explains the scan better."""
+"""Limbs in the wrong place begin again from draws, where that explains the scan better."""
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
+from scipy.spatial import cKDTree
 
 from model.priors import GaussianPrior
+from scanprep.geometry.mesh import Mesh
 from scanprep.skeleton.tree import Skeleton
 
 from ..bodies import FixedBody
-from .fit import ScanFit
+from ..starts import distinct
+from .fit import EVIDENCE, ScanFit
+from .free_space import INSIDE, PRESSED, Outside
+from .scan import spread
 from .starts import approach
 
-LOOSE = 0.1                          # radians around the limb of a training pose
+LOOSE = 0.15                         # radians around the limb of a known pose
 REACHES = (0.2, 0.15, 0.1)           # metres, of the rounds after a limb was moved
-AMISS = 0.012                        # share of scan or body that may be in the wrong place for no reason
-MANY = 6                             # times as many starts of a limb are compared with what is unexplained
-PROMISING = 30.0                     # a limb at random may be this much worse before it is fitted
+DRAWS = 12                           # times as many poses of a limb are drawn as `random_starts` says
+SKIN, SCAN = 80, 120                 # vertices of a limb and points of the scan that a draw is judged by
+CAP = 0.1                            # metres: further off is as bad
+CAPS, NOISES = (0.4, 0.25, 0.15, 0.1), (0.4, 0.25, 0.15, 0.1)   # metres, and radians, of draws around the best
+KEPT = 24                            # draws around which the next are made
+CELL = 0.03                          # metres: of the table of the inside of a body
+EXPLAINED = 0.04                     # metres of the body within which a point of the scan needs no limb
+FOLLOWED, APART = 4, 0.1             # draws that are followed, and by how many metres they differ at the limb's end
+AMISS = 12.0                         # energy of what is wrong with a limb from which on it is sought
 BETTER = 5.0                         # by how much the misfit must fall for a limb to be moved
+ROUNDS = 2                           # times that all limbs that are amiss are gone through
 
 
 def reinitialise_limbs(fit: ScanFit, x: np.ndarray) -> np.ndarray:
     """Unknowns (P,) with limbs moved elsewhere where that explains the scan better; the shape is held."""
-    if not misplaced(fit, x):
+    if not limbs_amiss(fit, x):
         return x
     free, held = fit.body.n_angles + 3, fit.held(x)
     moved = approach(held, x[:free], REACHES)
-    for root in limbs(fit.body.skeleton):
-        moved = _reinitialised(held, moved, root)
+    for _ in range(ROUNDS):
+        before = moved
+        for limb in limbs_amiss(held, moved):
+            moved = _reinitialised(held, moved, limb)
+        if moved is before:
+            break
     return np.concatenate([moved, x[free:]])
 
 
-def misplaced(fit: ScanFit, x: np.ndarray) -> bool:
-    """Whether more than a little of the scan is unexplained, or of the body where nothing can be."""
-    return bool(fit.unexplained(x, fit.thin).mean() > AMISS
-                or len(fit.violations(fit.mesh(x))[0]) > AMISS * len(fit.spread))
+def limbs_amiss(fit: ScanFit, x: np.ndarray) -> list[list[int]]:
+    """The limbs, runs of parts, that stand where nothing can be or could explain what nothing does; worst first."""
+    found = {tuple(limb): amiss(fit, x, limb) for limb in limbs(fit.body.skeleton)}
+    return [list(limb) for limb in sorted(found, key=lambda limb: -found[limb]) if found[limb] > AMISS]
 
 
-def _reinitialised(fit: ScanFit, x: np.ndarray, root: int) -> np.ndarray:
-    """Unknowns (P,) with the limb at a joint as it is, or drawn from the prior and from the training poses."""
-    best, count = fit.misfit(x), fit.config.random_starts
-    moved = np.flatnonzero(fit.body.skeleton.descends[:, root])
-    drawn = np.concatenate([examples_of(fit.body, x, root, MANY * count // 2, fit.rng),
-                            redrawn(fit.body, x, root, fit.prior, MANY * count, fit.rng)])
-    drawn = drawn[fit.rng.permutation(len(drawn))]
-    wanted = fit.coarse.points[fit.unexplained(x, fit.coarse)]
-    drawn = np.vstack([near_points(fit, drawn, moved, wanted, count // 3), drawn[:count]])
-    quick = fit.quick_misfits(np.vstack([x, drawn]), moved)
-    for i in np.argsort(quick[1:])[:2]:
-        if quick[i + 1] > quick[0] + PROMISING:
-            continue
-        tried = approach(fit, drawn[i], REACHES)
+def amiss(fit: ScanFit, x: np.ndarray, limb: list[int]) -> float:
+    """Energy of what is wrong with a limb, and of what it could explain."""
+    mesh, J = fit.mesh(x), len(fit.body.skeleton.parents)
+    mine = np.isin(np.arange(J), limb)[fit.part]
+    wrong = sum(float(weight * (np.minimum(found.excess, CAP)**2 * mine[ids]).sum() / len(ids))
+                for weight, ids, found in fit.objections(mesh))
+    lost = fit.thin.points[fit.unexplained(x, fit.thin)]
+    joint = fit.body.skeleton.joints[limb[0]]         # of the template, to know how far the limb reaches
+    reach = np.linalg.norm(fit.body.template.vertices[mine] - joint, axis=1).max() + CAP
+    hangs = mesh.vertices[fit.body.skeleton.ring(fit.body.template, limb[0])].mean(axis=0)
+    near = np.linalg.norm(lost - hangs, axis=1) < reach
+    return EVIDENCE / fit.config.scan_sd**2 * (wrong + (EXPLAINED**2 * near.sum()) / len(fit.thin.points))
+
+
+def _reinitialised(fit: ScanFit, x: np.ndarray, limb: list[int]) -> np.ndarray:
+    """Unknowns (P,) with a limb as it is, or as the draw that explains most after a few rounds."""
+    best, search = fit.misfit(x), LimbSearch.around(fit, x, limb)
+    for drawn in search.best(draws(fit, x, limb, DRAWS * fit.config.random_starts)):
+        tried = approach(fit, drawn, REACHES)
         if (misfit := fit.misfit(tried)) < best - BETTER:
             x, best = tried, misfit
     return x
 
 
-def limbs(skeleton: Skeleton) -> list[int]:
-    """Joints below which hangs a limb without a branch, the largest limbs first."""
-    size = skeleton.descends.sum(axis=0)
-    starts = [j for run in unbranched(skeleton.parents) for j in run if size[run[-1]] == 1]
-    return sorted(starts, key=lambda j: (-size[j], j))
+def draws(fit: ScanFit, x: np.ndarray, limb: list[int], count: int) -> np.ndarray:
+    """Poses (count, P) of a limb, from its first joint or a later one on: of the prior, and of known poses."""
+    roots, out = [j for j in limb for _ in range(3 if j == limb[0] else 1)], []
+    for root in roots:
+        some = count // (2 * len(roots)) + 1
+        out += [examples_of(fit.body, x, root, some, fit.rng), redrawn(fit.body, x, root, fit.prior, some, fit.rng)]
+    return np.concatenate(out)
+
+
+@dataclass(frozen=True, eq=False)
+class LimbSearch:
+    """One limb of a body of which all else stays, judged by a few of its vertices and what the rest leaves open."""
+
+    fit: ScanFit
+    limb: list[int]                  # its parts, from the body outwards
+    ids: np.ndarray                  # (L,) vertices of the limb
+    end: np.ndarray                  # which of them are of its last part
+    loose: np.ndarray                # (L,) bool: not of the part that hangs on the rest of the body
+    wanted: np.ndarray               # (m, 3) points of the scan that the rest of the body does not explain, metres
+    lacking: float                   # their share of the scan
+    rest: InsideBody
+    free: Outside | None             # where the cameras saw that nothing is
+
+    @staticmethod
+    def around(fit: ScanFit, x: np.ndarray, limb: list[int]) -> LimbSearch:
+        """The search for a limb of unknowns (P,)."""
+        mesh, mine = fit.mesh(x), np.isin(fit.part, limb)
+        ids = np.flatnonzero(mine)
+        ids = ids[spread(fit.body.template.vertices[ids], SKIN)]
+        away = cKDTree(mesh.vertices[~mine]).query(fit.coarse.points)[0] > EXPLAINED
+        return LimbSearch(fit, limb, ids, np.flatnonzero(fit.part[ids] == limb[-1]), fit.part[ids] != limb[0],
+                          fit.coarse.some(away).thinned(SCAN).points, float(away.mean()), InsideBody.of(mesh, ~mine),
+                          fit.outside)
+
+    def best(self, drawn: np.ndarray) -> np.ndarray:
+        """Those few of unknowns (n, P) that explain most and differ, each after draws closer and closer around it."""
+        angles = (3 * np.array(self.limb)[:, None] + np.arange(3)).ravel()
+        for cap, noise in zip(CAPS, NOISES, strict=True):
+            places, cost = self.judged(drawn, cap)
+            order = np.argsort(cost)
+            kept = drawn[order[distinct(places[order][:, self.end], KEPT, noise / 4)]]
+            near = np.repeat(kept, len(drawn) // len(kept), axis=0)
+            near[:, angles] += self.fit.rng.normal(0, noise, (len(near), len(angles)))
+            drawn = np.vstack([kept, near])
+        places, cost = self.judged(drawn, CAPS[-1])
+        order = np.argsort(cost)
+        return drawn[order[distinct(places[order][:, self.end], FOLLOWED, APART)]]
+
+    def judged(self, drawn: np.ndarray, cap: float) -> tuple[np.ndarray, np.ndarray]:
+        """Places (n, L, 3), metres, of the limb's vertices for unknowns (n, P), and energies (n,) up to a constant.
+
+        What is off by more than `cap`, metres, is as bad.
+        """
+        fit, config = self.fit, self.fit.config
+        pose, trans, _ = fit.body.split(drawn)
+        places = fit.body.subject.points(self.ids).evaluate(pose, trans)
+        share = np.isin(fit.part[fit.spread], fit.part[self.ids]).mean()
+        depth = self.rest.depth(places) * self.loose
+        cost = config.contact_weight * share * (np.minimum(depth, cap)**2).mean(axis=1)
+        if self.free is not None:
+            cost += config.free_space_weight * share * (np.minimum(self.free.at(places), cap)**2).mean(axis=1)
+        if len(self.wanted):
+            apart = np.stack([cKDTree(one).query(self.wanted)[0] for one in places])
+            cost += self.lacking * (np.minimum(apart, cap)**2).mean(axis=1)
+        unlikely = sum(term.energy for term in fit.prior_terms(drawn).values())
+        return places, EVIDENCE / config.scan_sd**2 * cost + unlikely
+
+
+@dataclass(frozen=True, eq=False)
+class InsideBody:
+    """A table of how deep places are inside some of a body."""
+
+    low: np.ndarray                  # (3,), metres
+    deep: np.ndarray                 # (a, b, c), metres
+
+    @staticmethod
+    def of(mesh: Mesh, some: np.ndarray) -> InsideBody:
+        """The table for some of the vertices (N,) of a mesh."""
+        vertices, normals = mesh.vertices[some], mesh.vertex_normals[some]
+        low = vertices.min(axis=0)
+        axes = [np.arange(a, b + CELL, CELL) for a, b in zip(low, vertices.max(axis=0), strict=True)]
+        grid = np.stack(np.meshgrid(*axes, indexing="ij"), axis=-1)
+        far, hit = cKDTree(vertices).query(grid.reshape(-1, 3), distance_upper_bound=INSIDE)
+        near = np.isfinite(far)
+        deep = np.zeros(len(far))
+        deep[near] = np.einsum("nd,nd->n", normals[hit[near]], vertices[hit[near]] - grid.reshape(-1, 3)[near])
+        return InsideBody(low, np.maximum(deep - PRESSED, 0).reshape(grid.shape[:3]))
+
+    def depth(self, places: np.ndarray) -> np.ndarray:
+        """(...) metres, of places (..., 3)."""
+        cell = np.rint((places - self.low) / CELL).astype(np.int64)
+        within = ((cell >= 0) & (cell < self.deep.shape)).all(axis=-1)
+        cell = np.where(within[..., None], cell, 0)
+        return np.where(within, self.deep[cell[..., 0], cell[..., 1], cell[..., 2]], 0.0)
 
 
 def unbranched(parents: np.ndarray) -> list[list[int]]:
@@ -73,6 +185,12 @@ def unbranched(parents: np.ndarray) -> list[list[int]]:
             run.append(int(children[run[-1]][0]))
         runs.append(run)
     return runs
+
+
+def limbs(skeleton: Skeleton) -> list[list[int]]:
+    """Runs of parts without a branch that end in a part from which nothing hangs, the largest first."""
+    parents = skeleton.parents
+    return sorted((run for run in unbranched(parents) if run[-1] not in parents), key=len, reverse=True)
 
 
 def examples_of(body: FixedBody, x: np.ndarray, root: int, count: int, rng: np.random.Generator) -> np.ndarray:
@@ -100,15 +218,3 @@ def redrawn(body: FixedBody, x: np.ndarray, root: int, prior: GaussianPrior, cou
     spreads = np.linalg.solve(np.linalg.cholesky(block).T, rng.normal(size=(len(angles), count))).T
     drawn[:, angles] = prior.mean[angles] - np.linalg.solve(block, pull) + spreads
     return drawn
-
-
-def near_points(fit: ScanFit, x: np.ndarray, moved: np.ndarray, points: np.ndarray, count: int) -> np.ndarray:
-    """Those `count` of the bodies (n, P) whose moved parts come nearest to points (m, 3) that want explaining."""
-    ids = fit.spread[np.isin(fit.part[fit.spread], moved)][::2]
-    if len(points) < 5 or not len(ids):
-        return x[:count]
-    pose, trans, _ = fit.body.split(x)
-    places = fit.body.subject.points(ids).evaluate(pose, trans)
-    some = points[::max(1, len(points) // 40)]
-    apart = np.linalg.norm(places[:, :, None] - some, axis=3).min(axis=1)
-    return x[np.argsort((np.minimum(apart, 0.15)**2).mean(axis=1))[:count]]

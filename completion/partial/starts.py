@@ -1,8 +1,6 @@
 """Where the fit of a scan begins: bodies that meet the landmarks, or without any typical poses, rotated every way."""
 from __future__ import annotations
 
-from collections.abc import Sequence
-
 import numpy as np
 
 from model.priors import GaussianPrior, typical_poses
@@ -15,7 +13,6 @@ from .. import energy
 from ..bodies import FixedBody, Follow
 from ..starts import distinct, search
 from .fit import ScanFit
-from .free_space import CameraView, free_space_violation
 from .scan import ScanPoints, spread
 
 AXES = 4                             # directions of the training poses along which a search from landmarks starts
@@ -28,7 +25,6 @@ POSES = 100                          # tried at most
 VERTICES, POINTS = 500, 120          # of body and scan, in the first look at all turns
 CAP = 0.15                           # metres: further off is as bad
 NORMALS = 0.1                        # metres that a difference of normals of unit length weighs
-CELL, MARGIN = 0.04, 0.3             # metres: of the table of what the camera must have seen
 FACING = 0.15                        # cosine to the camera's direction from which a vertex counts as seen
 PROMISING = 0.4                      # share of all placements, those least denied by the camera, that are compared
 AT_ONCE = 1000                       # points that are compared at a time
@@ -133,23 +129,6 @@ def all_rotations(count: int) -> np.ndarray:
                      2 * (x * z - y * w), 2 * (y * z + x * w), 1 - 2 * (x * x + y * y)], axis=1).reshape(-1, 3, 3)
 
 
-class Outside:
-    """A table of how far places stand where cameras, at least one, would have seen them."""
-
-    def __init__(self, cameras: Sequence[CameraView]) -> None:
-        points = np.concatenate([camera.points for camera in cameras])
-        self.low = points.min(axis=0) - MARGIN
-        self.count = np.ceil((points.max(axis=0) + MARGIN - self.low) / CELL).astype(np.int64)
-        grid = np.stack(np.meshgrid(*[np.arange(n) for n in self.count], indexing="ij"), axis=-1).reshape(-1, 3)
-        excess = free_space_violation(cameras, self.low + CELL * (grid + 0.5)).excess
-        self.excess = np.minimum(excess, CAP).astype(np.float32)
-
-    def at(self, places: np.ndarray) -> np.ndarray:
-        """(...) metres, for places (..., 3); beyond the table as at its end."""
-        cell = np.clip(((places - self.low) / CELL).astype(np.int64), 0, self.count - 1)
-        return self.excess[(cell[..., 0] * self.count[1] + cell[..., 1]) * self.count[2] + cell[..., 2]]
-
-
 def placements(fit: ScanFit) -> tuple[np.ndarray, np.ndarray]:
     """The best of all poses in all turns, laid on the scan: unknowns (POOL, P) and costs, best first."""
     body, config = fit.body, fit.config
@@ -158,7 +137,7 @@ def placements(fit: ScanFit) -> tuple[np.ndarray, np.ndarray]:
     places, normals = fit.posed_points(ids, poses)
     toward = np.array([camera.viewpoint - scan.points.mean(axis=0) for camera in fit.cameras]).reshape(-1, 3)
     toward /= np.linalg.norm(toward, axis=1, keepdims=True)
-    table = Outside(fit.cameras) if fit.cameras else None
+    table = fit.outside
     cost, shift = np.zeros((len(poses), ROTATIONS)), np.empty((len(poses), ROTATIONS, 3))
     for a, (y, n) in enumerate(zip(places, normals, strict=True)):
         shift[a] = scan.points.mean(axis=0) - (turns @ _shown(y, n, turns, toward)[:, :, None])[..., 0]

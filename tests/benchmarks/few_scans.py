@@ -8,8 +8,8 @@ For each offset o the poses are mesh000 and those at `range(3 + o, 71, 9)[:7]`, 
 out are the poses at indices 0 (mod 5) and the men at 2 (mod 5) that were not used; with `--inner` those at 1 and 3, so
 that what is tuned never meets what is reported. Rows: *poses*, *men*, the model fitted to held-out bodies; *known*,
 half views of held-out poses of the known man; *unknown*, half views of every third held-out man, of unknown shape;
-*mosh*, the shape of every sixth held-out man from 47 simulated markers. `judgement` and `limb_mm`, the mean of the worst
-part, are there for every half view, so that what a completion says about itself can be compared with what it is worth.
+*mosh*, the shape of every sixth held-out man from 47 simulated markers. `judgement` and `limb_mm`, the mean of the
+worst part, are there for every half view: what a completion says about itself is compared with what it is worth.
 """
 from __future__ import annotations
 
