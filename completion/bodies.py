@@ -2,10 +2,12 @@
 from __future__ import annotations
 
 from collections.abc import Callable
+from functools import cached_property
 
 import numpy as np
 
 from model.body import BodyModel
+from model.human_poses import human_poses
 from model.linear import Subject
 from scanprep.geometry import rotations
 from scanprep.geometry.mesh import Mesh
@@ -14,6 +16,7 @@ from scanprep.skeleton.tree import Skeleton
 from .energy import MovingPoints, moving_points
 
 Follow = Callable[[np.ndarray], MovingPoints]
+PEOPLE = 150                         # poses that people take, beside those a body was seen in
 
 
 class FixedBody:
@@ -31,6 +34,12 @@ class FixedBody:
         self.pose_mean, self.pose_covariance = subject.pose_mean, subject.pose_covariance
         none = np.zeros((0, *subject.pose_mean.shape))
         self.pose_examples = none if subject.pose_examples is None else subject.pose_examples
+
+    @cached_property
+    def known_poses(self) -> np.ndarray:
+        """(M, J, 3) radians, that the body was seen in, and for a person as many as `PEOPLE` that people take."""
+        people = human_poses(self.template, self.skeleton, PEOPLE, np.random.default_rng(0))
+        return self.pose_examples if people is None else np.concatenate([self.pose_examples, people])
 
     def split(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
         """Pose (..., J, 3), trans (..., 3) and betas (..., K)."""

@@ -2,7 +2,7 @@
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -13,7 +13,8 @@ from model.linear import Subject
 from scanprep.geometry import storage
 from scanprep.geometry.files import check_same_topology, read_mesh, write_mesh
 from scanprep.geometry.mesh import Mesh
-from scanprep.judgement import HAND, extent, size, unit_problem
+from scanprep.judgement import HAND, Judgement, extent, size, unit_problem
+from scanprep.skeleton.names import in_words
 from scanprep.threads import one_thread
 
 from ..bodies import as_body
@@ -34,6 +35,7 @@ KIND, VERSION = "completion", 2       # 1 had no scale, expected error and confi
 _ARRAYS = ("pose", "betas", "trans", "seen", "expected_error", "confidence")
 _FACTS = ("rms", "explained", "landmark_rms", "converged", "iterations")
 
+DOUBTFUL = 0.06                      # metres that a part is expected to be off, from which on it is to be looked at
 LOST = 0.5                           # share of a scan explained below which a completion means nothing
 ASTRAY, ENOUGH = 0.016, 0.9          # so far landmarks, of the size, and so little explained: left and right exchanged
 
@@ -71,6 +73,8 @@ class Completion:
         where it was seen, from its true place elsewhere. None in files of earlier versions.
     confidence : (N,) float in [0, 1]
         Probability that the vertex is within `config.tolerance` of the truth. None in files of earlier versions.
+    judgement : Judgement
+        Whether it can be used as it is, and why not. None in files of earlier versions.
     """
 
     completed: Mesh
@@ -88,6 +92,7 @@ class Completion:
     scale: float = 1.0
     expected_error: np.ndarray | None = None
     confidence: np.ndarray | None = None
+    judgement: Judgement | None = None
 
 
 @one_thread()
@@ -140,9 +145,27 @@ def complete(body: BodyModel | Subject, scan: View | Sequence[View],
     shape = body.betas if isinstance(body, Subject) else betas if person.n_betas else None
     off = np.linalg.norm(predicted.vertices[given.vertices] - given.points, axis=1)
     landmark_rms = float(np.sqrt((off**2).mean())) if len(off) else np.nan
-    return Completion(completed, predicted, pose, shape, trans, seen, rms, float(used.mean()), landmark_rms,
+    done = Completion(completed, predicted, pose, shape, trans, seen, rms, float(used.mean()), landmark_rms,
                       solved.converged, solved.rounds, solved.energies, given.metres, error,
                       probability_within(error, config.tolerance))
+    problem = completion_problem(done, given.cloud.points, config.free_scale)
+    return replace(done, judgement=Judgement.of(problem, doubts(fit, solved.x, error, seen)))
+
+
+def doubts(fit: ScanFit, x: np.ndarray, error: np.ndarray, seen: np.ndarray) -> list[str]:
+    """Why the body of unknowns (P,) is to be looked at before it is used: what is not known of it, and what is wrong.
+
+    `error` (N,), metres, as `expected_error`; `seen` (N,) bool, the vertices with data.
+    """
+    names, found = fit.body.skeleton.names, []
+    open_parts = [(float(np.sqrt((error[mine]**2).mean())), p) for p in range(len(names))
+                  if (mine := fit.part == p).any()]
+    for off, p in sorted(open_parts, reverse=True):
+        if off > DOUBTFUL:
+            share = f"{100 * seen[fit.part == p].mean():.0f}% of it was seen" if seen[fit.part == p].any() else \
+                "nothing of it was seen"
+            found.append(f"the {in_words(names[p])} may be {1000 * off:.0f} mm off, {share}")
+    return found
 
 
 def completion_problem(done: Completion, points: np.ndarray, free_scale: bool = False) -> str | None:
@@ -170,6 +193,7 @@ def save_completion(folder: str | Path, completion: Completion) -> Path:
     write_mesh(folder / "predicted.ply", completion.predicted)
     arrays = {name: getattr(completion, name) for name in _ARRAYS if getattr(completion, name) is not None}
     facts = {name: getattr(completion, name) for name in (*_FACTS, "energies", "scale")}
+    facts["judgement"] = None if completion.judgement is None else str(completion.judgement)
     storage.save(folder / "completion.npz", KIND, VERSION, arrays, facts)
     return folder
 
@@ -192,4 +216,5 @@ def load_completion(folder: str | Path) -> Completion:
         return Completion(completed, predicted, **{"betas": None, **found}, **facts,
                           converged=bool(header["converged"]), iterations=int(header["iterations"]),
                           energies={name: float(value) for name, value in header["energies"].items()},
-                          scale=float(header["scale"]) if header["version"] > 1 else 1.0)
+                          scale=float(header["scale"]) if header["version"] > 1 else 1.0,
+                          judgement=Judgement.read(header["judgement"]) if header.get("judgement") else None)

@@ -3,7 +3,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from copy import copy
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -23,7 +23,8 @@ Terms = dict[str, Residual]
 
 LIKELY = 0.04                        # metres: matches closer than this are mostly right
 SETTLED = 5e-4                       # metres, root mean square over the vertices from round to round
-REACH, FINAL_REACH = 0.2, 0.03       # metres: limits on the distance of matches in the first round and the last
+REACH, WIDE_REACH, FINAL_REACH = 0.2, 0.08, 0.03    # metres: limits on the distance of matches, from first to last
+NARROWING, SETTLING = 3, 6           # rounds from the wide to the final reach; that a reach is held at most
 QUICK = 3000                         # vertices that a quick look takes
 BEYOND = 0.2                         # radians that joints may rotate farther than in the training poses
 MIN_COSINE = 0.6                     # between the normals of a match
@@ -259,16 +260,28 @@ class Solved:
 def solve_jointly(fit: ScanFit, x: np.ndarray, tell: Callable[[int], None]) -> Solved:
     """All unknowns at once from x (P,) on, in rounds of matching with shrinking reach.
 
+    A model of many scans follows a scan closely, and matches that are farther off than it ever is are wrong. One of
+    few scans does not, and drops the limbs that it follows badly. So the rounds stop twice, at a wide reach and at a
+    narrow one, and what explains more is kept.
+
     [SCAPE] Eq. 10
     """
-    config, shift, place = fit.config, np.inf, fit.mesh(x).vertices
+    rounds = fit.config.rounds
+    wide = _in_rounds(fit, x, np.geomspace(REACH, WIDE_REACH, rounds), lambda i: tell(min(i, rounds)))
+    narrow = _in_rounds(fit, wide.x, np.geomspace(WIDE_REACH, FINAL_REACH, NARROWING), lambda i: None)
+    best = min((narrow, wide), key=lambda solved: fit.misfit(solved.x))
+    return replace(best, rounds=wide.rounds + narrow.rounds)
+
+
+def _in_rounds(fit: ScanFit, x: np.ndarray, reaches: np.ndarray, tell: Callable[[int], None]) -> Solved:
+    """Unknowns from x (P,) on when matches reach so far, metres, round by round, and the last until they settle."""
+    shift, place = np.inf, fit.mesh(x).vertices
     energies: dict[str, float] = {}
-    reaches = np.geomspace(REACH, FINAL_REACH, config.rounds)
-    for i, reach in enumerate([*reaches, *[FINAL_REACH] * 6]):
+    for i, reach in enumerate([*reaches, *reaches[-1:].repeat(SETTLING)]):
         x, energies = fit.step(x, fit.thin, reach)
         before, place = place, fit.mesh(x).vertices
         shift = float(np.sqrt(((place - before)**2).sum(axis=1).mean()))
-        tell(min(i + 1, config.rounds))
-        if i >= config.rounds and shift < SETTLED:
+        tell(i + 1)
+        if i >= len(reaches) and shift < SETTLED:
             break
     return Solved(x, bool(shift < 2 * SETTLED), i + 1, energies)

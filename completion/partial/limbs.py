@@ -17,7 +17,7 @@ from .free_space import INSIDE, PRESSED, Outside
 from .scan import spread
 from .starts import approach
 
-LOOSE = 0.15                         # radians around the limb of a known pose
+LOOSE = 0.1                          # radians around the limb of a known pose
 REACHES = (0.2, 0.15, 0.1)           # metres, of the rounds after a limb was moved
 DRAWS = 12                           # times as many poses of a limb are drawn as `random_starts` says
 SKIN, SCAN = 80, 120                 # vertices of a limb and points of the scan that a draw is judged by
@@ -194,13 +194,13 @@ def limbs(skeleton: Skeleton) -> list[list[int]]:
 
 
 def examples_of(body: FixedBody, x: np.ndarray, root: int, count: int, rng: np.random.Generator) -> np.ndarray:
-    """Draws (count or none, P) of the limb at a joint: as it is in the training poses, loosened a little."""
-    drawn = np.repeat(x[None], count if len(body.pose_examples) else 0, axis=0)
+    """Draws (count or none, P) of the limb at a joint: as it is in known poses, loosened a little."""
+    known = body.known_poses.reshape(len(body.known_poses), -1)
+    drawn = np.repeat(x[None], count if len(known) else 0, axis=0)
     if len(drawn):
         parts = np.flatnonzero(body.skeleton.descends[:, root])
         angles = (3 * parts[:, None] + np.arange(3)).ravel()
-        which = np.arange(count) % len(body.pose_examples)
-        drawn[:, angles] = body.pose_examples.reshape(len(body.pose_examples), -1)[which][:, angles]
+        drawn[:, angles] = known[np.arange(count) * max(1, len(known) // count) % len(known)][:, angles]
         drawn[:, angles] += rng.normal(0, LOOSE, (count, len(angles)))
     return drawn
 

@@ -37,7 +37,7 @@ class ScaledBody(FixedBody):
         self.inner, self.n_betas = inner, inner.n_betas + 1
         self.template, self.skeleton, self.n_angles = inner.template, inner.skeleton, inner.n_angles
         self.pose_mean, self.pose_covariance = inner.pose_mean, inner.pose_covariance
-        self.pose_examples = inner.pose_examples
+        self.pose_examples, self.known_poses = inner.pose_examples, inner.known_poses
         self.subject = inner.subject
 
     def held(self, x: np.ndarray) -> FixedBody:

@@ -104,13 +104,13 @@ def from_nothing(fit: ScanFit) -> np.ndarray:
 
 
 def starting_poses(fit: ScanFit) -> np.ndarray:
-    """Poses (M, J, 3) to try: those the model was trained on, or steps along the Gaussian's main directions."""
+    """Poses (M, J, 3) to try: those that are known, or steps along the Gaussian's main directions."""
     body = fit.body
-    if not len(body.pose_examples):
+    if not len(body.known_poses):
         return typical_poses(body.pose_mean, body.pose_covariance, AXES)
     mean = body.pose_mean.copy()
     mean[0] = 0
-    return varied(np.concatenate([mean[None], body.pose_examples]), POSES)
+    return varied(np.concatenate([mean[None], body.known_poses]), POSES)
 
 
 def varied(poses: np.ndarray, count: int) -> np.ndarray:

@@ -103,8 +103,7 @@ def complete_files(work: Work, inputs: Inputs, room: Room) -> list[Metric]:
     if files.colored:
         done = _with_colors(work, files, done, output)
     save_completion(output, done)
-    problem = completion_problem(done, all_points(files.views), work.config.free_scale)
-    metrics = [judgement_row(Judgement.of(problem)), *figures(work, inputs, done, landmarks, masked)]
+    metrics = [judgement_row(done.judgement), *figures(work, inputs, done, landmarks, masked)]
     picture = picture_completion(views, done, work.body.template, masked=masked)
     save_png(output / "picture.png", picture)
     rows = [(m.name, m.value, m.unit) for m in metrics]

@@ -19,6 +19,7 @@ from ..blending import BlendedTemplate, rigid_weights
 from ..digests import body_digests, digest
 from ..fitting import FitConfig, ShapeFitter
 from ..gradients import GradientSystem, ShapeSolver, pose_gradients
+from ..human_poses import with_human_poses
 from ..pose_space import PoseSpace
 from ..scape import ScapeModel
 from ..shape_space import ShapeSpace, learn_shape_space
@@ -153,8 +154,8 @@ def _model(mix: Mix, state: State, shapes: ShapeSpace, info: dict[str, object]) 
     """The model that a round has reached."""
     template, skeleton = mix.parts.template, mix.parts.skeleton
     examples = pose_examples(template, skeleton, state.poses)
-    return ScapeModel(template, skeleton, state.space, shapes, *pose_prior(examples, len(examples)), info,
-                      pose_examples=examples)
+    prior = with_human_poses(template, skeleton, len(examples), *pose_prior(examples, len(examples)))
+    return ScapeModel(template, skeleton, state.space, shapes, *prior, info, pose_examples=examples)
 
 
 def _start(mix: Mix) -> State:

@@ -22,6 +22,7 @@ from ..digests import body_digest, body_digests, digest
 from ..features import twists
 from ..fitting import FitConfig, PoseFitter
 from ..gradients import GradientSystem, pose_gradients, shape_gradients
+from ..human_poses import with_human_poses
 from ..linear import Subject
 from ..pose_space import PoseSpace
 from ..scape import BlendScapeModel, ScapeModel
@@ -266,7 +267,7 @@ def seen_in_training(template: Mesh, skeleton: Skeleton, learned: LearnedPose, p
                      shapes: np.ndarray | None, config: LearnConfig) -> dict[str, Any]:
     """What a model keeps of its making: the pose prior, its examples, and settings, choices, sizes and digests."""
     design, examples = learned.design, pose_examples(template, skeleton, learned.poses, shapes)
-    mean, covariance = pose_prior(examples, len(poses))
+    mean, covariance = with_human_poses(template, skeleton, len(poses), *pose_prior(examples, len(poses)))
     return {"pose_mean": mean, "pose_covariance": covariance, "pose_examples": examples, "info": {
         "settings": asdict(config), "poses": len(poses), "shapes": 0 if shapes is None else len(shapes),
         "pruning": design.pruning, "ridge": design.ridge, "features": learned.space.features.count,

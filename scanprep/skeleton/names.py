@@ -48,6 +48,12 @@ class _Person:
     centre: np.ndarray
 
 
+def in_words(name: str) -> str:
+    """A part's name as a sentence has it: "left forearm" for forearm_left."""
+    plain, _, side = name.rpartition("_")
+    return f"{side} {plain.replace('_', ' ')}" if plain and side in ("left", "right") else name.replace("_", " ")
+
+
 def part_partners(template: Mesh, skeleton: Skeleton, symmetry: Symmetry) -> np.ndarray | None:
     """(J,) the part that holds most of each part's mirror image; None if that pairs no parts or breaks the tree."""
     J, part = len(skeleton.parents), skeleton.part_of_face

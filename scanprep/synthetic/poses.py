@@ -2,7 +2,7 @@
 from __future__ import annotations
 
 import json
-from functools import lru_cache
+from functools import cache, lru_cache
 from pathlib import Path
 from typing import Any
 
@@ -97,6 +97,11 @@ def named_pose(name: str) -> np.ndarray:
     """A pose (16, 3), radians, by its name in `NAMED_POSES`."""
     if name not in NAMED_POSES:
         raise ValueError(f"name: no pose '{name}', expected one of {', '.join(NAMED_POSES)}")
+    return _named(name).copy()
+
+
+@cache
+def _named(name: str) -> np.ndarray:
     return compose(**_STORED["named"][name])
 
 

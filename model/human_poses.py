@@ -18,6 +18,9 @@ from scanprep.synthetic.poses import average, random_pose
 
 TRUNK = ("pelvis", "abdomen", "chest", "head")
 LIMBS = {"arm": ("upper_arm", "forearm", "hand"), "leg": ("thigh", "shin", "foot")}
+WORTH = 8                            # training poses that what people do with their joints counts as
+LOOSE = 0.25                         # radians by which joints of this body may differ from those of all people
+DRAWN = 400                          # poses for its mean and covariance
 SHOULDER = 0.3                       # of an upper arm's rotation against the chest happens in the shoulder itself
 KINDS = {"arm": ("shoulder", "upper_arm", "forearm", "hand", "arm"), "leg": ("hip", "thigh", "shin", "foot", "leg")}
 
@@ -37,6 +40,25 @@ def human_poses(template: Mesh, skeleton: Skeleton, count: int, rng: np.random.G
     poses = skeleton.pose_of(world @ person.at_rest)
     poses[:, 0] = 0
     return poses
+
+
+def with_human_poses(template: Mesh, skeleton: Skeleton, count: int, mean: np.ndarray, covariance: np.ndarray
+                     ) -> tuple[np.ndarray, np.ndarray]:
+    """Mean (J, 3) and covariance (3J, 3J) of `count` training poses mixed with those of all people.
+
+    The fewer poses were seen, the more is taken from all people, of whom no joint is quite like this body's: of eight
+    poses one half, of eighty a tenth. Nothing changes for a body that is no person.
+    """
+    people = human_poses(template, skeleton, DRAWN, np.random.default_rng(0))
+    if people is None:
+        return mean, covariance
+    loose = np.full(mean.size, LOOSE)
+    loose[:3] = 0                                                                 # the root is at rest
+    theirs, share = people.mean(axis=0), count / (count + WORTH)
+    apart = (mean - theirs).ravel()
+    return (share * mean + (1 - share) * theirs,
+            share * covariance + (1 - share) * (np.cov(people.reshape(DRAWN, -1).T) + np.diag(loose**2))
+            + share * (1 - share) * np.outer(apart, apart))
 
 
 @dataclass(frozen=True, eq=False)
