@@ -74,3 +74,14 @@ def test_parts_that_may_be_far_off_are_named_the_worst_first():
     error[fit.part == 2], seen[fit.part == 2] = 0.25, False
     assert doubts(fit, x, error, seen) == ["the left forearm may be 250 mm off, nothing of it was seen",
                                            "the left upper arm may be 80 mm off, 50% of it was seen"]
+
+
+def test_a_bend_that_the_model_never_saw_is_named():
+    poses = np.random.default_rng(0).normal(0, 0.4, (6, 4, 3)) * np.array([0, 1, 0.01, 1])[:, None]
+    fit = ScanFit(FixedBody(replace(MODEL, pose_examples=poses).subject(None)), prepare_scan(MODEL.template.vertices),
+                  np.zeros(0, dtype=np.int64), np.zeros((0, 3)), CompletionConfig())
+    x = np.zeros(15)
+    x[[3, 6]] = np.radians(50)                                        # of the second part poses say that it bends
+    fine = np.full(398, 0.004), np.ones(398, dtype=bool)
+    assert doubts(fit, x, *fine) == ["the left elbow is bent by 50 degrees, and never was when the model was learned"]
+    assert doubts(fit, x / 5, *fine) == []

@@ -10,11 +10,12 @@ import numpy as np
 
 from model.body import BodyModel
 from model.linear import Subject
+from model.priors import stiff_joints
 from scanprep.geometry import storage
 from scanprep.geometry.files import check_same_topology, read_mesh, write_mesh
 from scanprep.geometry.mesh import Mesh
 from scanprep.judgement import HAND, Judgement, extent, size, unit_problem
-from scanprep.skeleton.names import in_words
+from scanprep.skeleton.names import in_words, joint_in_words
 from scanprep.threads import one_thread
 
 from ..bodies import as_body
@@ -36,6 +37,7 @@ _ARRAYS = ("pose", "betas", "trans", "seen", "expected_error", "confidence")
 _FACTS = ("rms", "explained", "landmark_rms", "converged", "iterations")
 
 DOUBTFUL = 0.06                      # metres that a part is expected to be off, from which on it is to be looked at
+BENT = np.radians(20)                # rotation that is more than an error, of a joint that was not seen to bend
 LOST = 0.5                           # share of a scan explained below which a completion means nothing
 UNJUDGED = Judgement.of(check=["no judgement was made"])
 ASTRAY, ENOUGH = 0.016, 0.9          # so far landmarks, of the size, and so little explained: left and right exchanged
@@ -166,6 +168,10 @@ def doubts(fit: ScanFit, x: np.ndarray, error: np.ndarray, seen: np.ndarray) -> 
             share = f"{100 * seen[fit.part == p].mean():.0f}% of it was seen" if seen[fit.part == p].any() else \
                 "nothing of it was seen"
             found.append(f"the {in_words(names[p])} may be {1000 * off:.0f} mm off, {share}")
+    angles = np.linalg.norm(fit.body.split(x)[0], axis=1)
+    found += [f"the {joint_in_words(names[j])} is bent by {np.degrees(angles[j]):.0f} degrees, "
+              f"and never was when the model was learned"
+              for j in stiff_joints(fit.body.pose_examples) if angles[j] > BENT]
     return found
 
 
