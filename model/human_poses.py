@@ -16,6 +16,8 @@ from scanprep.skeleton.tree import Skeleton
 from scanprep.synthetic.anatomy import PARENTS, PARTS
 from scanprep.synthetic.poses import average, random_pose
 
+Moments = tuple[np.ndarray, np.ndarray]         # mean (J, 3) and covariance (3J, 3J) of poses, radians
+
 TRUNK = ("pelvis", "abdomen", "chest", "head")
 LIMBS = {"arm": ("upper_arm", "forearm", "hand"), "leg": ("thigh", "shin", "foot")}
 WORTH = 8                            # training poses that what people do with their joints counts as
@@ -43,7 +45,7 @@ def human_poses(template: Mesh, skeleton: Skeleton, count: int, rng: np.random.G
 
 
 def with_human_poses(template: Mesh, skeleton: Skeleton, count: int, mean: np.ndarray, covariance: np.ndarray
-                     ) -> tuple[np.ndarray, np.ndarray]:
+                     ) -> Moments:
     """Mean (J, 3) and covariance (3J, 3J) of `count` training poses mixed with those of all people.
 
     The fewer poses were seen, the more is taken from all people, of whom no joint is quite like this body's: of eight
@@ -54,11 +56,15 @@ def with_human_poses(template: Mesh, skeleton: Skeleton, count: int, mean: np.nd
         return mean, covariance
     loose = np.full(mean.size, LOOSE)
     loose[:3] = 0                                                                 # the root is at rest
-    theirs, share = people.mean(axis=0), count / (count + WORTH)
-    apart = (mean - theirs).ravel()
-    return (share * mean + (1 - share) * theirs,
-            share * covariance + (1 - share) * (np.cov(people.reshape(DRAWN, -1).T) + np.diag(loose**2))
-            + share * (1 - share) * np.outer(apart, apart))
+    theirs = people.mean(axis=0), np.cov(people.reshape(DRAWN, -1).T) + np.diag(loose**2)
+    return mixed((mean, covariance), theirs, count / (count + WORTH))
+
+
+def mixed(one: Moments, other: Moments, share: float) -> Moments:
+    """Moments of poses of which a share has those of the one, and the rest those of the other."""
+    apart = (one[0] - other[0]).ravel()
+    return (share * one[0] + (1 - share) * other[0],
+            share * one[1] + (1 - share) * other[1] + share * (1 - share) * np.outer(apart, apart))
 
 
 @dataclass(frozen=True, eq=False)

@@ -13,9 +13,9 @@ from scanprep.skeleton.motions import PosedSurface, closure, fit_motions, rigid_
 from scanprep.skeleton.names import part_partners
 from scanprep.skeleton.parts import PartSearch, SkeletonConfig
 from scanprep.skeleton.sides import Sides, cover, mirror_pairs
-from scanprep.skeleton.symmetry import find_symmetry
+from scanprep.skeleton.symmetry import find_symmetry, mirrored_poses
 from scanprep.synthetic.anatomy import MIRROR_PART
-from scanprep.synthetic.people import Person
+from scanprep.synthetic.people import Person, mirrored_pose
 
 CONFIG = SkeletonConfig(restarts=1, patches=120, start=20)
 
@@ -67,6 +67,30 @@ def test_a_body_that_stands_crooked_is_judged_in_its_straightest_pose():
     helped = find_symmetry(crooked, np.stack([body.posed(bent / 2), body.mesh.vertices, body.posed(-bent / 2)]))
     assert not alone.holds and alone.pose == -1
     assert helped.holds and helped.pose == 1 and abs(helped.normal[0]) > 0.999
+
+
+@pytest.mark.parametrize("crooked", [False, True])
+def test_a_mirrored_pose_is_that_of_the_other_side(crooked):
+    body, bent = Person(), np.zeros((16, 3))
+    bent[[4, 5, 10]] = [[0, -1.0, 0.4], [0, 0.8, 0.8], [-1.2, 0, 0]]
+    poses = np.stack([body.mesh.vertices, body.posed(bent)])
+    template = body.mesh.with_vertices(poses[1]) if crooked else body.mesh
+    found = mirrored_poses(template, poses, find_symmetry(template, poses))
+    wanted = np.stack([body.mesh.vertices, body.posed(mirrored_pose(bent))])
+    for one, other in zip(found, wanted, strict=True):
+        R, t = rotations.procrustes(one, other)
+        assert np.linalg.norm(one @ R.T + t - other, axis=1).max() < 0.01
+
+
+def test_parts_that_moved_on_one_side_alone_are_found_on_both():
+    body, rng = Person(), np.random.default_rng(1)
+    bent = np.zeros((5, 16, 3))
+    for part in ("l_forearm", "r_thigh", "head", "l_upper_arm"):
+        bent[1:, body.names.index(part)] = rng.normal(0, 0.5, (4, 3))
+    poses = np.stack([body.posed(pose) for pose in bent])
+    found = search_skeleton(body.mesh, poses, CONFIG)
+    assert found.symmetric and part_partners(body.mesh, found.skeleton, found.symmetry) is not None
+    assert {"forearm_left", "forearm_right", "thigh_left", "thigh_right", "head"} <= set(found.skeleton.names)
 
 
 def test_a_lump_is_not_symmetric():

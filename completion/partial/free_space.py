@@ -10,16 +10,14 @@ from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
-from scipy.optimize import minimize
 from scipy.spatial import cKDTree
 
 from scanprep.geometry.surface import OrientedPoints
 from scanprep.skeleton.tree import Skeleton
 
-from .scan import ScanPoints, spread
+from .normals import faces, facing_point
+from .scan import ScanPoints
 
-GRAZING = 0.3                        # cosine below which a scanner sees little
-FEW = 2000                           # points that are enough to find the viewpoint
 FACING = 0.97                        # share of the points of a scan that must face its one viewpoint
 TOLERANCE = 0.03                     # metres: the rim that scanners lose, and an inexact viewpoint
 INSIDE, PRESSED = 0.12, 0.015        # metres: half of the thickest part of a body; how deep skin may press into skin
@@ -107,28 +105,9 @@ def find_camera(cloud: ScanPoints, viewpoint: np.ndarray | None = None) -> Camer
     degrees, its distance is not.
     """
     if viewpoint is None:
-        viewpoint = _facing_point(cloud)
-    to = viewpoint - cloud.points
-    facing = np.einsum("nd,nd->n", to, cloud.normals) > 0.05 * np.linalg.norm(to, axis=1)
+        viewpoint = facing_point(cloud.points, cloud.normals)
+    facing = faces(viewpoint, cloud.points, cloud.normals)
     return CameraView(np.asarray(viewpoint, dtype=np.float64), cloud.points) if facing.mean() >= FACING else None
-
-
-def _facing_point(cloud: ScanPoints) -> np.ndarray:
-    keep = spread(cloud.points, FEW) if len(cloud.points) > FEW else slice(None)
-    normals, centre = cloud.normals[keep], cloud.points[keep].mean(axis=0)
-    points = cloud.points[keep] - centre
-    size = np.linalg.norm(points, axis=1).max()
-
-    def turned_away(q: np.ndarray) -> float:
-        to = q[:3] / np.linalg.norm(q[:3]) - q[3] * points / size
-        cosine = np.einsum("nd,nd->n", normals, to) / np.linalg.norm(to, axis=1)
-        return float(np.mean(np.clip(GRAZING - cosine, 0, 0.5)**2))   # some normals may have the wrong sign
-
-    start = normals.mean(axis=0)
-    found = minimize(turned_away, np.r_[start / max(np.linalg.norm(start), 1e-12), 0.3], method="Nelder-Mead",
-                     options={"maxiter": 400, "xatol": 1e-3, "fatol": 1e-9}).x
-    nearness = np.clip(found[3], 0.05, 0.7)
-    return centre + size / nearness * found[:3] / np.linalg.norm(found[:3])
 
 
 class Contact:

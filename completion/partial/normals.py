@@ -2,6 +2,7 @@
 from __future__ import annotations
 
 import numpy as np
+from scipy.optimize import minimize
 from scipy.sparse import coo_array
 from scipy.sparse.csgraph import breadth_first_order, connected_components, minimum_spanning_tree
 from scipy.spatial import cKDTree
@@ -10,6 +11,9 @@ from scanprep.threads import search_threads
 
 COARSE = 2000                        # points that show the form at large
 WIDE = 0.12                          # metres: at this scale a body is convex enough to tell in from out
+GRAZING = 0.3                        # cosine below which a scanner sees little
+FEW = 2000                           # points that are enough to find the viewpoint
+ONE_VIEW = 0.9                       # share of the points that face one viewpoint, of a scan from there
 AGREE = 0.95                         # share of neighbours that must agree for given normals to be of one sign
 
 
@@ -56,7 +60,10 @@ def one_sign(normals: np.ndarray, near: np.ndarray) -> bool:
 
 def turn_outward(points: np.ndarray, normals: np.ndarray, near: np.ndarray, distance: np.ndarray, reach: float
                   ) -> np.ndarray:
-    """Normals of one sign along each connected patch, then each patch turned to its convex side."""
+    """Normals of one sign along each connected patch, then each patch turned to its convex side.
+
+    Where nearly all then face one viewpoint, the scan is from there, and patches that turn away have the wrong sign.
+    """
     n = len(points)
     a, b = np.repeat(np.arange(n), near.shape[1] - 1), near[:, 1:].ravel()
     kept = distance[:, 1:].ravel() <= reach
@@ -78,4 +85,34 @@ def turn_outward(points: np.ndarray, normals: np.ndarray, near: np.ndarray, dist
     total = np.where(found[:, :, None], coarse[np.where(found, around, 0)] - points[:, None], 0).sum(axis=1)
     bulge = -np.einsum("nd,nd->n", out, total)
     sign = np.where(np.bincount(patch, bulge, patches) < 0, -1.0, 1.0)
+    out = out * sign[patch][:, None]
+    facing = faces(facing_point(points, out), points, out)
+    if facing.mean() < ONE_VIEW:
+        return out
+    sign = np.where(np.bincount(patch, facing - 0.5, patches) < 0, -1.0, 1.0)
     return out * sign[patch][:, None]
+
+
+def faces(viewpoint: np.ndarray, points: np.ndarray, normals: np.ndarray) -> np.ndarray:
+    """(n,) bool: whether normals (n, 3) of points (n, 3) face a viewpoint (3,)."""
+    to = viewpoint - points
+    return np.einsum("nd,nd->n", to, normals) > 0.05 * np.linalg.norm(to, axis=1)
+
+
+def facing_point(points: np.ndarray, normals: np.ndarray) -> np.ndarray:
+    """The viewpoint (3,) from which the fewest normals (n, 3) of points (n, 3) turn away; its distance is not exact."""
+    keep = spread(points, FEW) if len(points) > FEW else slice(None)
+    normals, centre = normals[keep], points[keep].mean(axis=0)
+    points = points[keep] - centre
+    size = np.linalg.norm(points, axis=1).max()
+
+    def turned_away(q: np.ndarray) -> float:
+        to = q[:3] / np.linalg.norm(q[:3]) - q[3] * points / size
+        cosine = np.einsum("nd,nd->n", normals, to) / np.linalg.norm(to, axis=1)
+        return float(np.mean(np.clip(GRAZING - cosine, 0, 0.5)**2))   # some normals may have the wrong sign
+
+    start = normals.mean(axis=0)
+    found = minimize(turned_away, np.r_[start / max(np.linalg.norm(start), 1e-12), 0.3], method="Nelder-Mead",
+                     options={"maxiter": 400, "xatol": 1e-3, "fatol": 1e-9}).x
+    nearness = np.clip(found[3], 0.05, 0.7)
+    return centre + size / nearness * found[:3] / np.linalg.norm(found[:3])

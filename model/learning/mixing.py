@@ -19,7 +19,6 @@ from ..blending import BlendedTemplate, rigid_weights
 from ..digests import body_digests, digest
 from ..fitting import FitConfig, ShapeFitter
 from ..gradients import GradientSystem, ShapeSolver, pose_gradients
-from ..human_poses import with_human_poses
 from ..pose_space import PoseSpace
 from ..scape import ScapeModel
 from ..shape_space import ShapeSpace, learn_shape_space
@@ -154,7 +153,7 @@ def _model(mix: Mix, state: State, shapes: ShapeSpace, info: dict[str, object]) 
     """The model that a round has reached."""
     template, skeleton = mix.parts.template, mix.parts.skeleton
     examples = pose_examples(template, skeleton, state.poses)
-    prior = with_human_poses(template, skeleton, len(examples), *pose_prior(examples, len(examples)))
+    prior = pose_prior(template, skeleton, examples, len(examples))
     return ScapeModel(template, skeleton, state.space, shapes, *prior, info, pose_examples=examples)
 
 

@@ -23,7 +23,7 @@ from ..digests import body_digest, body_digests, digest
 from ..features import twists
 from ..fitting import FitConfig, PoseFitter
 from ..gradients import GradientSystem, pose_gradients, shape_gradients
-from ..human_poses import with_human_poses
+from ..human_poses import mixed, with_human_poses
 from ..linear import Subject
 from ..pose_space import PoseSpace
 from ..priors import STIFF, stiff_joints
@@ -269,7 +269,7 @@ def seen_in_training(template: Mesh, skeleton: Skeleton, learned: LearnedPose, p
                      shapes: np.ndarray | None, config: LearnConfig) -> dict[str, Any]:
     """What a model keeps of its making: the pose prior, its examples, and settings, choices, sizes and digests."""
     design, examples = learned.design, pose_examples(template, skeleton, learned.poses, shapes)
-    mean, covariance = with_human_poses(template, skeleton, len(poses), *pose_prior(examples, len(poses)))
+    mean, covariance = pose_prior(template, skeleton, examples, len(poses))
     return {"pose_mean": mean, "pose_covariance": covariance, "pose_examples": examples, "info": {
         "settings": asdict(config), "poses": len(poses), "shapes": 0 if shapes is None else len(shapes),
         "pruning": design.pruning, "ridge": design.ridge, "features": learned.space.features.count,
@@ -277,19 +277,23 @@ def seen_in_training(template: Mesh, skeleton: Skeleton, learned: LearnedPose, p
         "digests": body_digests(poses, shapes)}}
 
 
-def pose_prior(examples: np.ndarray, count: int) -> tuple[np.ndarray, np.ndarray]:
-    """Mean (J, 3) and covariance (3J, 3J) of `pose_examples` (M, J, 3), radians, zero for the root.
+def pose_prior(template: Mesh, skeleton: Skeleton, examples: np.ndarray, count: int
+               ) -> tuple[np.ndarray, np.ndarray]:
+    """Mean (J, 3) and covariance (3J, 3J) of poses, radians, zero for the root, from `pose_examples` (M, J, 3).
 
-    The first `count` and the rest count alike, however many there are of each: those one person took for the sake of
-    the pose, and those in which people stood. A limb that nothing is known of would else be as likely behind the back
-    as at the side: on half views of five men that were not learned from, that left 20 mm where nothing was seen, and
-    this 14.
+    The first `count`, which one person took for the sake of the pose, are mixed with what people do. They and the
+    rest, in which people stood, count alike, however many there are of each. A limb that nothing is known of would
+    else be as likely behind the back as at the side: on half views of five men that were not learned from, that left
+    20 mm where nothing was seen, and this 14.
     """
-    flat = examples.reshape(len(examples), -1)
-    kinds = [kind for kind in (flat[:count], flat[count:]) if len(kind)]
-    mean = np.mean([kind.mean(axis=0) for kind in kinds], axis=0)
-    spreads = [(kind - mean).T @ (kind - mean) / max(1, len(kind) - (len(kinds) == 1)) for kind in kinds]
-    return mean.reshape(-1, 3), np.mean(spreads, axis=0)
+    flat, one_kind = examples.reshape(len(examples), -1), count == len(examples)
+
+    def moments(kind: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        off = kind - kind.mean(axis=0)
+        return kind.mean(axis=0).reshape(-1, 3), off.T @ off / max(1, len(kind) - one_kind)
+
+    taken = with_human_poses(template, skeleton, count, *moments(flat[:count]))
+    return taken if one_kind else mixed(taken, moments(flat[count:]), 0.5)
 
 
 def pose_examples(template: Mesh, skeleton: Skeleton, poses: np.ndarray, shapes: np.ndarray | None = None
@@ -340,9 +344,12 @@ def checked_bodies(template: Mesh, bodies: np.ndarray, name: str) -> np.ndarray:
 def judge_model(model: BodyModel, people: np.ndarray | None = None) -> Judgement:
     """What a model learned with people (S, N, 3), metres, is worth: whether it means nothing, what it never saw."""
     stiff = stiff_joints(model.pose_examples[:model.info.get("poses")]) if model.pose_examples is not None else ()
-    names = [joint_in_words(model.skeleton.names[j]) for j in stiff]
-    unseen = f" never bent more than {np.degrees(STIFF):.0f} degrees in your poses, and will not bend well"
-    return Judgement.of(learning_problem(model, people), [f"the {', '.join(names)}{unseen}"] if names else [])
+    never, doubts = f"never bent more than {np.degrees(STIFF):.0f} degrees in your poses", []
+    if len(stiff) and len(stiff) == len(model.skeleton.parents) - 1:
+        doubts = [f"the poses are all alike: joints {never}"]
+    elif len(stiff):
+        doubts = [f"the {', '.join(joint_in_words(model.skeleton.names[j]) for j in stiff)} {never}"]
+    return Judgement.of(learning_problem(model, people), doubts)
 
 
 def learning_problem(model: BodyModel, people: np.ndarray | None = None) -> str | None:

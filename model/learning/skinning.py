@@ -17,7 +17,6 @@ from ..blend_weights import diffused, diffused_weights, fit_weights, strongest
 from ..digests import body_digest, digest
 from ..features import LinearLift, PoseFeatures, part_features
 from ..fitting import FitConfig, PoseFitter, ShapeFitter
-from ..human_poses import with_human_poses
 from ..pose_space import kept_directions
 from ..shape_space import learn_shape_space
 from ..skinning import SkinningModel, unblended
@@ -90,7 +89,7 @@ def learn_skinning(template: Mesh, poses: np.ndarray, shapes: np.ndarray | None,
         model = work.step("shape components", (model, shapes, config.components), 1 - POSES,
                           partial(_learn_people, model, shapes, config.components))
     examples = pose_examples(template, skeleton, at, shapes)
-    mean, covariance = with_human_poses(template, skeleton, len(at), *pose_prior(examples, len(at)))
+    mean, covariance = pose_prior(template, skeleton, examples, len(at))
     info = {"settings": asdict(config), "poses": len(poses), "shapes": 0 if shapes is None else len(shapes),
             **model.info, "terms": model.terms.count, "digest": digest(template, poses, shapes)}
     return replace(model, pose_mean=mean, pose_covariance=covariance, pose_examples=examples, info=info)

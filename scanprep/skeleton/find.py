@@ -26,7 +26,7 @@ from .joints import (
 from .motions import PosedSurface
 from .names import name_parts
 from .parts import FADING, PartSearch, SkeletonConfig, find_parts
-from .symmetry import Symmetry, find_symmetry
+from .symmetry import Symmetry, find_symmetry, mirrored_poses
 from .tree import Skeleton, reorder
 
 __all__ = ["SkeletonConfig", "find_skeleton", "search_skeleton"]
@@ -99,7 +99,8 @@ def search_skeleton(template: Mesh, poses: np.ndarray, config: SkeletonConfig | 
     """
     config = config or SkeletonConfig()
     check_template(template)
-    surface = PosedSurface(template, _checked_poses(template, poses))
+    poses = _checked_poses(template, poses)
+    surface = PosedSurface(template, poses)
     symmetry = find_symmetry(template, poses)
     tied = symmetry.holds if config.symmetric is None else config.symmetric
     if tied and not symmetry.two_sided:
@@ -108,8 +109,10 @@ def search_skeleton(template: Mesh, poses: np.ndarray, config: SkeletonConfig | 
     # a restart knows nothing of the count of parts or of the other restarts
     kept = partial(step, inputs=(template, poses, replace(config, parts=None, restarts=1)))
     runs = _restarts(surface, config, symmetry if tied else None, tell, kept)       # [Articulated] E- and M-steps
-    if tied and config.symmetric is None and _held_back(runs[0]):
-        runs, tied = _restarts(surface, config, None, tell, kept), False
+    if tied and _held_back(runs[0]):                                 # few poses: a limb bends on one side alone
+        both = np.concatenate([poses, mirrored_poses(template, poses, symmetry)])
+        surface = PosedSurface(template, both)
+        runs = _restarts(surface, config, symmetry, tell, kept, "mirrored")
     label, links, tied = _of_count(runs[0], surface, config)
     if tied:
         label = _borders_untied(surface, config, label, links)
@@ -135,7 +138,7 @@ def _checked_poses(template: Mesh, poses: np.ndarray) -> np.ndarray:
     if poses.ndim != 3 or poses.shape[1:] != (n, 3):
         raise ValueError(f"poses: expected shape (M, {n}, 3) for this template, got {poses.shape}")
     if len(poses) < 3:
-        raise ValueError(f"poses: expected at least 3, got {len(poses)}")
+        raise ValueError(f"poses: expected at least 3, got {len(poses)}; where they differ the joints show")
     bad = np.flatnonzero(~np.isfinite(poses).all(axis=(1, 2)))
     if len(bad):
         raise ValueError(f"poses: {len(bad)} have vertices that are not finite, the first is pose {bad[0]}")
@@ -168,13 +171,13 @@ class _Restart:
 
 
 def _restarts(surface: PosedSurface, config: SkeletonConfig, symmetry: Symmetry | None, tell: Callable[..., None],
-              kept: Callable[..., Tree]) -> list[_Restart]:
-    """All restarts, the best first."""
+              kept: Callable[..., Tree], poses: str = "") -> list[_Restart]:
+    """All restarts, the best first; `poses` says which, for what is kept."""
     rng = np.random.default_rng(config.seed)
     runs = []
     for number in range(config.restarts):
         search = PartSearch(surface, config, symmetry, rng)
-        label, links, loops = kept(f"{'free' if symmetry is None else 'symmetric'} restart {number}",
+        label, links, loops = kept(f"{poses or ('free' if symmetry is None else 'symmetric')} restart {number}",
                                    make=partial(_searched, search))
         search.forget()
         runs.append(_Restart(label, links, loops, search.energy(label) / surface.area, _score(search, label), search))

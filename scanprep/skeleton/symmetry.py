@@ -9,7 +9,7 @@ from scipy.spatial import cKDTree
 
 from ..geometry.mesh import Mesh
 from ..geometry.sparse import factor
-from ..geometry.surface import OrientedPoints
+from ..geometry.surface import OrientedPoints, Surface
 from .labels import keep_connected
 
 NORMAL_WEIGHT = 0.05                 # of the body's size: how much distance a difference of normals weighs
@@ -60,6 +60,13 @@ class Symmetry(MirrorPlane):
     def two_sided(self) -> bool:
         """Whether there are triangles on either side."""
         return bool(self.left.any()) and not bool(self.left.all())
+
+
+def mirrored_poses(template: Mesh, poses: np.ndarray, symmetry: Symmetry) -> np.ndarray:
+    """Poses (M, N, 3), metres, with left and right exchanged: what a body does on one side it can do on the other."""
+    body = template if symmetry.pose < 0 else template.with_vertices(poses[symmetry.pose])
+    image = Surface(body).closest(symmetry.image)
+    return symmetry.reflect(np.stack([image.transferred(pose, template.faces) for pose in poses]))
 
 
 def find_symmetry(template: Mesh, poses: np.ndarray | None = None) -> Symmetry:
