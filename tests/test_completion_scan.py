@@ -110,3 +110,18 @@ def test_distinct_bodies_are_kept_in_order():
     places = np.array([0, 0.001, 0.1, 0.101, 0.3])[:, None, None] * np.ones((5, 7, 3))
     assert distinct(places, 2) == [0, 2]
     assert distinct(places, 9) == [0, 2, 4]
+
+
+@pytest.mark.parametrize("share", [0.05, 0.3])
+def test_a_hollow_patch_is_turned_to_the_camera_that_saw_the_rest(share):
+    rng = np.random.default_rng(0)
+    n, hollow = 6000, int(share * 6000)
+    ball = rng.normal(size=(n, 3))
+    ball[:, 1] = -np.abs(ball[:, 1])                                     # what a camera at -y sees of a ball
+    ball *= 0.3 / np.linalg.norm(ball, axis=1, keepdims=True)
+    bowl = rng.normal(size=(hollow, 3)) * [0.5, 0, 0.5] + [0, 1, 0]      # and of a bowl beside it
+    bowl *= 0.1 / np.linalg.norm(bowl, axis=1, keepdims=True)
+    cloud = prepare_scan(np.concatenate([ball[ball[:, 1] < -0.1], bowl + [0.6, 0, 0]]))
+    toward = cloud.normals[:, 1] < 0
+    assert toward[cloud.points[:, 0] < 0.4].mean() > 0.98
+    assert toward[cloud.points[:, 0] > 0.4].mean() > 0.98 if share < 0.1 else ~toward[cloud.points[:, 0] > 0.4].any()

@@ -104,7 +104,7 @@ def facing_point(points: np.ndarray, normals: np.ndarray) -> np.ndarray:
     keep = spread(points, FEW) if len(points) > FEW else slice(None)
     normals, centre = normals[keep], points[keep].mean(axis=0)
     points = points[keep] - centre
-    size = np.linalg.norm(points, axis=1).max()
+    size = max(np.linalg.norm(points, axis=1).max(), 1e-12)
 
     def turned_away(q: np.ndarray) -> float:
         to = q[:3] / np.linalg.norm(q[:3]) - q[3] * points / size

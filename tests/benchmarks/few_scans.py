@@ -10,10 +10,13 @@ that what is tuned never meets what is reported. Rows: *poses*, *men*, the model
 half views of held-out poses of the known man; *unknown*, half views of every third held-out man, of unknown shape;
 *mosh*, the shape of every sixth held-out man from 47 simulated markers. `judgement` and `limb_mm`, the mean of the
 worst part, are there for every half view: what a completion says about itself is compared with what it is worth.
+`wrong` is a half view whose unseen surface is off by more than 30 mm on average, or a part by more than 150 mm;
+`flagged` one that is not judged good.
 """
 from __future__ import annotations
 
 import argparse
+import json
 import time
 from pathlib import Path
 from typing import Any
@@ -21,6 +24,7 @@ from typing import Any
 import numpy as np
 from half_views import errors, picture
 from protocols import RealData, half_view, load_real, machine, write_report
+from scipy.stats import spearmanr
 
 from completion.partial.completion import Completion, complete
 from model import learn_scape
@@ -144,10 +148,18 @@ def summary(rows: dict[str, list[dict[str, Any]]]) -> dict[str, float]:
         for name in ("error_mm", "seen_mm", "unseen_mm", "limb_mm", "cpu_seconds"):
             if values := [row[name] for row in found if name in row]:
                 out |= {f"{stage}_{name}": float(np.mean(values)), f"{stage}_{name}_worst": float(np.max(values))}
-        if views := [row for row in found if "limb_mm" in row]:
-            out[f"{stage}_limbs_beyond_150_mm"] = sum(row["limb_mm"] > 150 for row in views)
-            out[f"{stage}_and_said_good"] = sum(row["limb_mm"] > 150 and row.get("judgement", "good") == "good"
-                                                for row in views)
+    views = [row for found in rows.values() for row in found if "limb_mm" in row]
+    if views:
+        limb = np.array([row["limb_mm"] for row in views])
+        wrong = (limb > 150) | (np.array([row["unseen_mm"] for row in views]) > 30)
+        flagged = np.array([row.get("judgement", "good") != "good" for row in views])
+        out |= {"views": len(views), "limbs_beyond_150_mm": int((limb > 150).sum()),
+                "limbs_beyond_150_mm_said_good": int(((limb > 150) & ~flagged).sum()), "wrong": int(wrong.sum()),
+                "flagged": int(flagged.sum()), "wrong_and_flagged": int((wrong & flagged).sum())}
+        for name, true in (("expected_mm", "unseen_mm"), ("expected_limb_mm", "limb_mm")):
+            if all(row.get(name) is not None for row in views):
+                out[f"correlation_{name}"] = float(spearmanr([row[name] for row in views],
+                                                             [row[true] for row in views]).statistic)
     return out
 
 
@@ -163,6 +175,7 @@ def main() -> None:
     parser.add_argument("--stages", nargs="*", choices=STAGES, default=list(STAGES))
     parser.add_argument("--only", type=int, nargs="*", help="half views of these places in the list")
     parser.add_argument("--models", type=Path, help="folder in which models are kept")
+    parser.add_argument("--before", type=Path, help="report of earlier code, to stand beside")
     parser.add_argument("--pictures", type=Path, help="folder for a picture of each half view")
     args = parser.parse_args()
     data, rows = load_real(), {stage: [] for stage in args.stages}
@@ -172,8 +185,10 @@ def main() -> None:
     mean = summary(rows)
     for name, value in mean.items():
         print(f"{name:32s} {value:8.2f}")
+    before = {} if args.before is None else {"before": json.loads(args.before.read_text(encoding="utf-8"))["mean"]}
     write_report(args.output, {"protocol": "few scans", "offsets": args.offsets, "inner": args.inner,
-                               "poses": args.poses, "men": args.men, "machine": machine(), "mean": mean, "rows": rows})
+                               "poses": args.poses, "men": args.men, "machine": machine(), "mean": mean, **before,
+                               "rows": rows})
 
 
 if __name__ == "__main__":
