@@ -1,0 +1,207 @@
+"""Markers that are not worn where the layout has them: sought over the whole body, pairs of exchanged names first.
+
+A marker that keeps its place on the skin, but another one than the layout's, is an outlier in every frame. The body is
+fitted to the others; where it then has the marker, in frames that differ most, is where the marker is worn.
+"""
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from itertools import combinations
+
+import numpy as np
+
+from model.body import BodyModel
+from scanprep.geometry.mesh import Mesh
+
+from ..files.markers import MarkerSequence
+from ..marker_sets.layout import DISTANCE, MarkerLayout
+from .person import PersonFit, common_markers
+
+FAR = 0.06                           # metres from its usual place, from which on a marker is suspected
+NEAR = 0.03                          # metres, RMS over the frames, within which a place explains a marker, at least
+USUAL = 2.5                          # times that of the other markers' own best places, likewise
+GAIN = 0.4                           # share of the distance from the usual place that another place leaves at most
+LIMB = 0.2                           # metres along its part that a loose marker may be off its usual place
+ROUNDS = 3                           # most times that the body is fitted without the suspects
+
+
+@dataclass(frozen=True, eq=False)
+class MovedMarker:
+    """A marker that is worn elsewhere.
+
+    Attributes
+    ----------
+    label : str
+    corners : (3,) int
+        The vertices of the triangle on which it was found.
+    weights : (3,) float
+        Of the corners.
+    distance : float, metres
+        From the skin.
+    before, after : float, metres
+        RMS distance over the frames from where the layout has it, and from where it was found.
+    """
+
+    label: str
+    corners: np.ndarray
+    weights: np.ndarray
+    distance: float
+    before: float
+    after: float
+
+
+@dataclass(frozen=True, eq=False)
+class Worn:
+    """How the markers are worn, as far as the layout is wrong about it.
+
+    Attributes
+    ----------
+    moved : tuple of MovedMarker
+    exchanged : pairs of labels
+        Markers that bear each other's name throughout.
+    unplaced : labels
+        Markers that are far from where the layout has them and that no place on the skin explains.
+    """
+
+    moved: tuple[MovedMarker, ...] = ()
+    exchanged: tuple[tuple[str, str], ...] = ()
+    unplaced: tuple[str, ...] = ()
+
+    @property
+    def changes(self) -> bool:
+        """Whether anything is to be done otherwise than the layout says."""
+        return bool(self.moved or self.exchanged)
+
+    def named(self, sequence: MarkerSequence, layout: MarkerLayout) -> MarkerSequence:
+        """A sequence with exchanged names put back."""
+        return MarkerSequence(sequence.positions[:, self.order(sequence, layout)], sequence.labels, sequence.rate)
+
+    def order(self, sequence: MarkerSequence, layout: MarkerLayout) -> np.ndarray:
+        """From which column (L,) of a sequence each of its labels is to be taken."""
+        rows = {layout.aliases.get(label, label): sequence.labels.index(label)
+                for label in layout.matched(sequence.labels, 0)}
+        order = np.arange(len(sequence.labels))
+        for first, second in self.exchanged:
+            if first in rows and second in rows:
+                order[[rows[first], rows[second]]] = rows[second], rows[first]
+        return order
+
+    def placed(self, layout: MarkerLayout) -> MarkerLayout:
+        """A layout with the moved markers where they are worn, at its end; they are no longer loose."""
+        if not self.moved:
+            return layout
+        found = MarkerLayout(tuple(m.label for m in self.moved), np.array([m.corners for m in self.moved]),
+                             np.array([m.distance for m in self.moved]), np.array([m.weights for m in self.moved]))
+        return replace(layout.without(found.labels).joined(found), aliases=layout.aliases)
+
+
+class _Frames:
+    """The bodies of a person in their frames, and the markers there."""
+
+    def __init__(self, model: BodyModel, person: PersonFit, sequences: Sequence[MarkerSequence], layout: MarkerLayout
+                 ) -> None:
+        self.layout, positions = common_markers(sequences, layout)
+        self.targets = np.stack([positions[which][t] for which, t in person.frames])                  # (B, L, 3)
+        vertices = model.subject(person.betas).vertices(person.poses, person.trans).astype(float)
+        self.bodies = [model.template.with_vertices(v) for v in vertices]
+        self.normals = [body.vertex_normals for body in self.bodies]
+        self.part = model.skeleton.part_of_vertex(model.template)
+        self.template: Mesh = model.template
+        self.places = np.stack([self.layout.place(body) for body in self.bodies])                     # (B, L, 3)
+
+    def off_places(self) -> np.ndarray:
+        """(L, L) RMS distance of every marker from the usual place of each, metres; NaN for one that is never seen."""
+        apart = np.linalg.norm(self.targets[:, :, None] - self.places[:, None], axis=3)
+        return _rms(apart)
+
+    def off_skin(self, row: int, distance: float) -> np.ndarray:
+        """(N,) RMS distance of a marker from every vertex, lifted off the skin so far, metres."""
+        return _rms(np.stack([np.linalg.norm(body.vertices + distance * normals - target, axis=1)
+                              for body, normals, target in
+                              zip(self.bodies, self.normals, self.targets[:, row], strict=True)]))
+
+    def off_usual(self) -> np.ndarray:
+        """(L,) RMS distance of every marker from its usual place, that of a loose one anywhere along its part."""
+        usual = np.diagonal(self.off_places()).copy()
+        for row in np.flatnonzero(np.isin(self.layout.labels, self.layout.loose)):
+            centre = self.layout.nearest[row]
+            near = (np.linalg.norm(self.template.vertices - self.template.vertices[centre], axis=1) < LIMB) \
+                & (self.part == self.part[centre])
+            usual[row] = min(usual[row], self.off_skin(row, np.asarray(self.layout.distances)[row])[near].min())
+        return usual
+
+
+def _rms(apart: np.ndarray) -> np.ndarray:
+    """The root of the mean square over the first axis, of what is not NaN."""
+    seen = np.isfinite(apart)
+    total, count = np.where(seen, apart, 0.0)**2, seen.sum(axis=0)
+    return np.where(count > 0, np.sqrt(total.sum(axis=0) / np.maximum(count, 1)), np.nan)
+
+
+def find_worn(model: BodyModel, sequences: Sequence[MarkerSequence], layout: MarkerLayout, person: PersonFit,
+              fit_without: Callable[[tuple[str, ...]], PersonFit]) -> Worn:
+    """Which markers are worn elsewhere, and where; which pairs bear each other's name.
+
+    Parameters
+    ----------
+    model : BodyModel
+    sequences : MarkerSequences of one subject
+    layout : MarkerLayout
+        Where markers usually sit.
+    person : PersonFit
+        Fitted to all of them.
+    fit_without : callable
+        Fits the person without the markers of some labels.
+
+    [MoSh]
+    """
+    suspects: tuple[str, ...] = ()
+    for _ in range(ROUNDS):
+        at = _Frames(model, person, sequences, layout)
+        far = tuple(np.array(at.layout.labels)[np.nan_to_num(at.off_usual()) > FAR].tolist())
+        if set(far) == set(suspects) or len(at.layout.labels) - len(far) < 3:
+            break
+        suspects = far
+        person = fit_without(suspects)
+    return _explained(at, suspects)
+
+
+def _explained(at: _Frames, suspects: Sequence[str]) -> Worn:
+    """What explains the suspects: a pair of exchanged names, or another place on the skin."""
+    labels, usual, cross = at.layout.labels, at.off_usual(), at.off_places()
+    limit = max(NEAR, USUAL * float(np.nanmedian([usual[i] for i, label in enumerate(labels) if label not in suspects])))
+    rows, exchanged = {labels.index(label) for label in suspects}, []
+    pairs = sorted((max(cross[i, j], cross[j, i]), i, j) for i, j in combinations(sorted(rows), 2))
+    for worse, i, j in pairs:
+        if {i, j} <= rows and worse < FAR and cross[i, j] + cross[j, i] < GAIN * (usual[i] + usual[j]):
+            exchanged.append((labels[i], labels[j]))
+            rows -= {i, j}
+    found = {row: _best_place(at, row, float(usual[row])) for row in sorted(rows)}
+    moved = {row: m for row, m in found.items() if m.after < limit and m.after < GAIN * m.before}
+    return Worn(tuple(moved.values()), tuple(exchanged), tuple(labels[row] for row in found if row not in moved))
+
+
+def _best_place(at: _Frames, row: int, before: float) -> MovedMarker:
+    """Where on the skin a marker is nearest, at its own distance from it or that of a common one. [MoSh]"""
+    own = float(np.asarray(at.layout.distances)[row])
+    tried = []
+    for distance in {own, DISTANCE}:
+        vertex = int(at.off_skin(row, distance).argmin())
+        tried += [MovedMarker(at.layout.labels[row], corners, weights, distance, before, after)
+                  for corners in at.template.faces[(at.template.faces == vertex).any(axis=1)]
+                  for weights, after in [_on_triangle(at, row, distance, corners)]]
+    return min(tried, key=lambda m: m.after)
+
+
+def _on_triangle(at: _Frames, row: int, distance: float, corners: np.ndarray) -> tuple[np.ndarray, float]:
+    """The weights (3,) of a triangle's corners that come nearest to a marker, lifted so far, and its RMS distance."""
+    lifted = np.stack([body.vertices[corners] + distance * normals[corners]
+                       for body, normals in zip(at.bodies, at.normals, strict=True)])                 # (B, 3, 3)
+    target = at.targets[:, row]
+    seen = np.isfinite(target[:, 0])
+    sides = (lifted[seen, 1:] - lifted[seen, :1]).swapaxes(1, 2).reshape(-1, 2)
+    share = np.linalg.lstsq(sides, (target - lifted[:, 0])[seen].ravel(), rcond=None)[0]
+    weights = np.maximum([1 - share.sum(), *share], 0)
+    weights /= weights.sum()
+    return weights, float(_rms(np.linalg.norm(np.einsum("c,bcd->bd", weights, lifted) - target, axis=1)))
