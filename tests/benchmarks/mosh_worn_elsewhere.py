@@ -5,8 +5,9 @@
 FOLDER has real marker files, of which every fourth frame is taken. Each is solved as it is; every marker that is moved
 or exchanged there is an alarm, to be looked at. Then it is disturbed and solved again, in turns of four kinds:
 
-- *moved*: one to four markers sit 10-40 cm from their place, on a vertex of the fitted body. They move with its surface,
-  and what the marker was off the fitted body before, in the frame of its part, is added in the frame of the new part.
+- *moved*: one to four markers sit 10-40 cm from their place, on a vertex of the fitted body. They move with its
+  surface, and what the marker was off the fitted body before, in the frame of its part, is added in the frame of the
+  new part.
 - *taken over*: one or two labels are those of another marker that was measured 10-40 cm away, whose own label is gone:
   real trajectories of places that no model made.
 - *renamed*: one or two pairs, left and right or front and back, at least 10 cm apart, bear each other's name.
@@ -14,8 +15,8 @@ or exchanged there is an alarm, to be looked at. Then it is disturbed and solved
 
 A moved marker is right when its new place is less than 20 mm from the true one, on the fitted body in the mean pose.
 Shape and pose are compared by the mean distance of the markers that nobody touched, as a multiple of what it is without
-disturbance (`ratio`), and by how far the surface is from the one without (`surface_mm`); `plain` is the same without the
-search. Seeds from 100 on were used for tuning, those from 0 on are reported.
+disturbance (`ratio`), and by how far the surface is from the one without (`surface_mm`). With `--plain` nothing is
+sought, which is how it was before. Seeds from 100 on were used for tuning, those from 0 on are reported.
 """
 from __future__ import annotations
 
@@ -119,7 +120,8 @@ def moved(model: BodyModel, ref: Reference, count: int, rng: np.random.Generator
         v = int(rng.choice(np.flatnonzero((away > NEAREST) & (away < FARTHEST))))
         there = layout.moved({"X": v})
         turned = rotations_of(model, ref.result, np.array([v]))[:, 0]
-        into.positions[:, i] = simulated(model, ref.result, there)[:, 0] + np.einsum("tdc,tc->td", turned, ref.noise[:, i])
+        noise = np.einsum("tdc,tc->td", turned, ref.noise[:, i])
+        into.positions[:, i] = simulated(model, ref.result, there)[:, 0] + noise
         into.moved[labels[i]] = there.place(ref.body)[0]
 
 

@@ -32,7 +32,7 @@ from ..files.markers import MarkerSequence, read_markers
 from ..files.motion_files import KEYS, write_glb, write_motion
 from ..marker_sets.named import choose_layout
 from ..pose.follow import AnimateConfig, animate
-from ..pose.robust import motion_problem
+from ..pose.robust import hardly_believed, markers_told, motion_problem
 from ..retargeting.retarget import morphed_vertices, retarget
 from ..subject.person import PersonConfig, find_person
 
@@ -79,7 +79,8 @@ class Work:
                                                          "frames": found.frames[:, 1].tolist()})
             layout.save(output / "layout.json")
         problem = motion_problem(motion, body.template, layout, sequence)
-        metrics = [judgement_row(Judgement.of(problem)), *metrics, *figures(motion, sequence)]
+        judgement = Judgement.of(problem, hardly_believed([motion]))
+        metrics = [judgement_row(judgement), *metrics, *figures(motion, sequence)]
         write_motion(output, motion, body)
         write_glb(output / "animation.glb", motion, body)
         page = motion_page(motion, body, sequence, path.name, rows(metrics))
@@ -99,7 +100,8 @@ def figures(motion: Motion, markers: MarkerSequence) -> list[Metric]:
     return [
         Metric("frames", len(motion.poses)), Metric("rate", motion.rate, "1/s"),
         Metric("markers used", f"{int(seen.any(axis=0).sum())} of {len(markers.labels)}"),
-        Metric(MEAN_ERROR, float(off.mean()), "mm"),
+        Metric(MEAN_ERROR, MM * float(np.nanmean(motion.told())) if seen.any() else np.nan, "mm"),
+        markers_told([motion]),
         Metric("distance of markers, 95th percentile", float(np.percentile(off, 95)), "mm"),
         Metric("distance of markers, mean of the worst frame", float(frame.max()), "mm"),
         Metric("markers missing", 100 * float(1 - seen[:, seen.any(axis=0)].mean()) if seen.any() else 100.0, "%"),

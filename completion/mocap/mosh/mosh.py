@@ -128,9 +128,9 @@ def mosh(model: BodyModel, sequences: MarkerSequence | Sequence[MarkerSequence],
     """Body shape, marker places, poses and soft tissue of one subject from marker sequences.
 
     Labels are put right as far as tracks tell. The person is found from a few frames of all sequences; markers that are
-    far from where the layout has them are sought over the whole body. Then the pose of every frame is found. The motion tells which labels were swapped and which markers were not on the body; where that
-    concerns the frames that told of the person, the person is found again, and so is what is wrong. At last the shape
-    may change with time.
+    far from where the layout has them are sought over the whole body. Then the pose of every frame is found. The motion
+    tells which labels were swapped and which markers were not on the body; where that concerns the frames that told of
+    the person, the person is found again, and so is what is wrong. At last the shape may change with time.
 
     Parameters
     ----------

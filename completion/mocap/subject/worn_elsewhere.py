@@ -128,7 +128,7 @@ class _Frames:
             centre = self.layout.nearest[row]
             near = (np.linalg.norm(self.template.vertices - self.template.vertices[centre], axis=1) < LIMB) \
                 & (self.part == self.part[centre])
-            usual[row] = min(usual[row], self.off_skin(row, np.asarray(self.layout.distances)[row])[near].min())
+            usual[row] = min(usual[row], self.off_skin(int(row), np.asarray(self.layout.distances)[row])[near].min())
         return usual
 
 
@@ -170,10 +170,10 @@ def find_worn(model: BodyModel, sequences: Sequence[MarkerSequence], layout: Mar
 def _explained(at: _Frames, suspects: Sequence[str]) -> Worn:
     """What explains the suspects: a pair of exchanged names, or another place on the skin."""
     labels, usual, cross = at.layout.labels, at.off_usual(), at.off_places()
-    limit = max(NEAR, USUAL * float(np.nanmedian([usual[i] for i, label in enumerate(labels) if label not in suspects])))
+    others = [i for i, label in enumerate(labels) if label not in suspects]
+    limit = max(NEAR, USUAL * float(np.nanmedian(usual[others])))
     rows, exchanged = {labels.index(label) for label in suspects}, []
-    pairs = sorted((max(cross[i, j], cross[j, i]), i, j) for i, j in combinations(sorted(rows), 2))
-    for worse, i, j in pairs:
+    for worse, i, j in sorted((max(cross[i, j], cross[j, i]), i, j) for i, j in combinations(sorted(rows), 2)):
         if {i, j} <= rows and worse < FAR and cross[i, j] + cross[j, i] < GAIN * (usual[i] + usual[j]):
             exchanged.append((labels[i], labels[j]))
             rows -= {i, j}
