@@ -260,7 +260,7 @@ def test_a_marker_that_no_place_of_the_skin_explains_is_told_and_left_out_of_the
 
 
 def test_markers_in_their_places_are_let_be():
-    found = find_worn(MODEL, [sequence(displaced())], LAYOUT, beside(), lambda labels: pytest.fail("nothing to seek"))
+    found = find_worn(MODEL, [sequence(displaced())], LAYOUT, beside(), USUAL)
     assert not found.changes and not found.unplaced
 
 

@@ -1,4 +1,4 @@
-"""Markers worn elsewhere, and pairs that bear each other's name throughout: what `mosh` finds, moves and exchanges.
+"""Markers worn elsewhere, and pairs that bear each other's name throughout: what is found, moved and exchanged.
 
     python tests/benchmarks/mosh_worn_elsewhere.py FOLDER -m MODEL.npz -o mosh_worn_elsewhere.json [--seeds 6]
 
@@ -34,8 +34,12 @@ from completion.mocap.files.markers import MarkerSequence, read_markers
 from completion.mocap.marker_sets.layout import MarkerLayout
 from completion.mocap.marker_sets.named import named_layout
 from completion.mocap.marker_sets.symmetry import other_side
-from completion.mocap.mosh.mosh import MoshConfig, MoshResult, mosh
+from completion.mocap.mosh.mosh import MoshConfig
+from completion.mocap.pose.follow import animate
 from completion.mocap.pose.marked_body import supports
+from completion.mocap.subject.person import find_person
+from completion.mocap.subject.worn_elsewhere import Worn, find_worn
+from completion.motion import Motion
 from model.body import BodyModel
 from model.files import load_model
 from scanprep.geometry.mesh import Mesh
@@ -46,7 +50,17 @@ RIGHT = 0.02                         # metres within which a place is right
 DISTANCE = 0.0095                    # metres from the skin of a moved marker
 FRONT_BACK = (("LFHD", "LBHD"), ("RFHD", "RBHD"), ("LFWT", "LBWT"), ("RFWT", "RBWT"), ("CLAV", "C7"), ("STRN", "T10"))
 KINDS = ("moved", "taken over", "renamed", "both")
-CONFIG = MoshConfig(soft_tissue=False)
+CONFIG = MoshConfig()
+
+
+@dataclass(frozen=True, eq=False)
+class Solved:
+    """What was found of a recording: who, how the markers are worn, and the motion."""
+
+    betas: np.ndarray
+    layout: MarkerLayout
+    worn: Worn
+    motion: Motion
 
 
 @dataclass(frozen=True, eq=False)
@@ -55,7 +69,7 @@ class Reference:
 
     name: str
     markers: MarkerSequence              # those that the layout knows, under its labels
-    result: MoshResult
+    result: Solved
     body: Mesh                           # the person in the mean pose
     places: np.ndarray                   # (L, 3) of the markers on it, metres
     noise: np.ndarray                    # (T, L, 3) what they are off, metres, in the frames of their parts
@@ -83,18 +97,30 @@ def mean_body(model: BodyModel, betas: np.ndarray) -> Mesh:
     return model.template.with_vertices(model.vertices(pose, betas))
 
 
-def simulated(model: BodyModel, result: MoshResult, layout: MarkerLayout) -> np.ndarray:
+def solved(model: BodyModel, markers: MarkerSequence, layout: MarkerLayout, seek: bool = True) -> Solved:
+    """The stages of `mosh` up to the poses, without those that mend tracks; all as it was before without `seek`."""
+    person, worn = find_person(model, markers, layout, CONFIG.person), Worn()
+    if seek:
+        worn = find_worn(model, [markers], layout, person, CONFIG.person)
+    if worn.changes:
+        markers, layout = worn.named(markers, layout), worn.placed(layout)
+        person = find_person(model, markers, layout, CONFIG.person)
+    motion = animate(model.subject(person.betas), markers, person.layout, CONFIG.poses)
+    return Solved(person.betas, person.layout, worn, motion)
+
+
+def simulated(model: BodyModel, result: Solved, layout: MarkerLayout) -> np.ndarray:
     """Markers (T, L, 3) of a layout in a motion, metres."""
-    motion = result.motions[0]
+    motion = result.motion
     points = model.subject(result.betas).points(*supports(model.template, layout))
     return np.concatenate([energy.lifted(points.evaluate(motion.poses[i:i + 64], motion.trans[i:i + 64]),
                                          np.asarray(layout.distances)) for i in range(0, len(motion.poses), 64)])
 
 
-def rotations_of(model: BodyModel, result: MoshResult, vertices: np.ndarray) -> np.ndarray:
+def rotations_of(model: BodyModel, result: Solved, vertices: np.ndarray) -> np.ndarray:
     """Rotations (T, n, 3, 3) of the parts of some vertices (n,)."""
     part = model.skeleton.part_of_vertex(model.template)[vertices]
-    return model.skeleton.part_rotations(result.motions[0].poses)[:, part]
+    return model.skeleton.part_rotations(result.motion.poses)[:, part]
 
 
 def reference(model: BodyModel, path: Path, layout: MarkerLayout) -> Reference:
@@ -103,7 +129,7 @@ def reference(model: BodyModel, path: Path, layout: MarkerLayout) -> Reference:
     labels = [label for label in layout.matched(whole.labels) if whole.select([label]).seen.any()]
     few = whole.select(labels).frames(slice(None, None, EVERY))
     markers = MarkerSequence(few.positions, tuple(layout.aliases.get(label, label) for label in labels), few.rate)
-    result = mosh(model, markers, layout, CONFIG)
+    result = solved(model, markers, layout)
     own = result.layout.select(markers.labels)
     body = mean_body(model, result.betas)
     turned = rotations_of(model, result, own.nearest)
@@ -167,14 +193,14 @@ def disturbed(model: BodyModel, ref: Reference, kind: str, seed: int) -> Disturb
     return into
 
 
-def compared(model: BodyModel, ref: Reference, result: MoshResult, untouched: Sequence[str]) -> dict[str, float]:
+def compared(model: BodyModel, ref: Reference, result: Solved, untouched: Sequence[str]) -> dict[str, float]:
     """Distance of the markers that nobody touched, and of the surface from that without disturbance."""
     rows = [ref.markers.labels.index(label) for label in untouched]
-    before = np.nanmean(ref.result.motions[0].residuals[:, rows])
-    rows = [result.motions[0].labels.index(label) for label in untouched]
-    off = np.nanmean(result.motions[0].residuals[:, rows])
+    before = np.nanmean(ref.result.motion.residuals[:, rows])
+    rows = [result.motion.labels.index(label) for label in untouched]
+    off = np.nanmean(result.motion.residuals[:, rows])
     step = max(1, len(ref.markers.positions) // 40)
-    here, there = (model.subject(r.betas).vertices(r.motions[0].poses[::step], r.motions[0].trans[::step])
+    here, there = (model.subject(r.betas).vertices(r.motion.poses[::step], r.motion.trans[::step])
                    for r in (result, ref.result))
     shape = [mean_body(model, r.betas).vertices for r in (result, ref.result)]
     return {"ratio": float(off / before), "untouched_mm": 1e3 * float(off),
@@ -182,13 +208,13 @@ def compared(model: BodyModel, ref: Reference, result: MoshResult, untouched: Se
             "shape_mm": 1e3 * float(np.linalg.norm(shape[0] - shape[1], axis=1).mean())}
 
 
-def run_case(model: BodyModel, ref: Reference, layout: MarkerLayout, kind: str, seed: int) -> dict:
+def run_case(model: BodyModel, ref: Reference, layout: MarkerLayout, kind: str, seed: int, seek: bool) -> dict:
     """Disturb, solve, compare."""
     case = disturbed(model, ref, kind, seed)
     there = [label for label in ref.markers.labels if label not in case.gone]
     markers = MarkerSequence(case.positions, ref.markers.labels, ref.markers.rate).select(there)
     start = time.process_time()
-    result = mosh(model, markers, layout, CONFIG)
+    result = solved(model, markers, layout, seek)
     seconds, worn = time.process_time() - start, result.worn
     on = result.layout.place(ref.body)
     off = {label: 1e3 * float(np.linalg.norm(on[result.layout.labels.index(label)] - place))
@@ -218,6 +244,7 @@ def main() -> None:
     parser.add_argument("--files", nargs="*")
     parser.add_argument("--kinds", nargs="*", default=KINDS)
     parser.add_argument("--first", type=int, default=0, help="the first seed; 100 for tuning")
+    parser.add_argument("--plain", action="store_true", help="seek nothing")
     parser.add_argument("--seeds", type=int, default=3)
     args = parser.parse_args()
     model = load_model(args.model)
@@ -228,11 +255,11 @@ def main() -> None:
         ref = reference(model, path, layout)
         worn = ref.result.worn
         plain.append({"file": path.name, "alarms": [*worn.exchanged, *(m.label for m in worn.moved)],
-                      "unplaced": worn.unplaced, "mm": 1e3 * float(np.nanmean(ref.result.motions[0].residuals))})
+                      "unplaced": worn.unplaced, "mm": 1e3 * float(np.nanmean(ref.result.motion.residuals))})
         print(plain[-1], flush=True)
         for seed in range(args.first, args.first + args.seeds):
             for kind in args.kinds:
-                rows.append(run_case(model, ref, layout, kind, seed))
+                rows.append(run_case(model, ref, layout, kind, seed, not args.plain))
                 print("  ".join(f"{name} {value:.3g}" if isinstance(value, float) else f"{name} {value}"
                                 for name, value in rows[-1].items()), flush=True)
     total = {kind: totals([row for row in rows if row["kind"] == kind]) for kind in args.kinds}

@@ -248,8 +248,7 @@ def _worn(stages: _Stages, person: _Person, sequences: Sequence[MarkerSequence],
         return Worn()
     model = person.model
     return stages.run("person", "worn", (model, sequences, layout, person.fit, config.person), lambda _: find_worn(
-        model, sequences, layout, person.fit,
-        lambda labels: find_person(model, sequences, layout.without(labels), config.person)))
+        model, sequences, layout, person.fit, config.person))
 
 
 def _motion(stages: _Stages, name: str, person: _Person, markers: MarkerSequence, config: MoshConfig, told: bool

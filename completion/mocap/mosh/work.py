@@ -105,6 +105,7 @@ def _solve(work: Work, actor: Actor, room: Room) -> tuple[_Found, list[str]]:
     recordings, sequences, failures = _read(work, actor.recordings)
     labels = tuple(dict.fromkeys(label for each in sequences for label in each.labels))
     usual, layout_name = work.layout or choose_layout(work.model, None, labels)
+    usual = usual.spelled(labels)
     try:
         layout = usual.without(work.hold_out) if work.hold_out else usual
     except ValueError as error:
@@ -239,10 +240,7 @@ def _person_metrics(found: _Found) -> list[Metric]:
             Metric("betas, length", float(np.linalg.norm(result.betas)), "sd"),
             Metric("markers moved, mean", float(moved.mean()), "mm"),
             Metric(f"markers moved, most ({result.layout.labels[int(moved.argmax())]})", float(moved.max()), "mm")]
-    for first, second in result.worn.exchanged:
-        told.append(Metric("names exchanged", f"{first} and {second}"))
-    for m in result.worn.moved:
-        told.append(Metric(f"worn elsewhere, and moved there ({m.label})", MM * m.before, "mm"))
+    told += result.worn.metrics()
     if found.guess is not None:
         told[1:1] = [Metric("sex", found.guess.sex), Metric("sex, probability", 100 * found.guess.probability, "%")]
     return told

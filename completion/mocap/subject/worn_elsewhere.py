@@ -5,25 +5,29 @@ fitted to the others; where it then has the marker, in frames that differ most, 
 """
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass, replace
 from itertools import combinations
 
 import numpy as np
 
 from model.body import BodyModel
+from scanprep.console import Metric
 from scanprep.geometry.mesh import Mesh
 
 from ..files.markers import MarkerSequence
 from ..marker_sets.layout import DISTANCE, MarkerLayout
-from .person import PersonFit, common_markers
+from .person import PersonConfig, PersonFit, common_markers, find_person
 
-FAR = 0.06                           # metres from its usual place, from which on a marker is suspected
-NEAR = 0.03                          # metres, RMS over the frames, within which a place explains a marker, at least
-USUAL = 2.5                          # times that of the other markers' own best places, likewise
+SUSPECT = 0.04                       # metres, RMS over frames, from its usual place, from which on a marker is left out
+FAR = 0.06                           # the same on a body that was fitted roughly, or without it: worn elsewhere
+NEAR = 0.03                          # metres within which another place explains a marker, at least
+USUAL = 2.5                          # times that of the other markers from their usual places, likewise
 GAIN = 0.4                           # share of the distance from the usual place that another place leaves at most
 LIMB = 0.2                           # metres along its part that a loose marker may be off its usual place
-ROUNDS = 3                           # most times that the body is fitted without the suspects
+ROUNDS = 4                           # most times that the body is fitted without the suspects
+LEAST = 6                            # markers that must be left to fit the body to
+ROUGH = {"n_betas": 20, "annealing": (40.0, 10.0, 2.0, 1.0)}  # of those fits: few betas do not follow a wrong marker
 
 
 @dataclass(frozen=True, eq=False)
@@ -73,6 +77,12 @@ class Worn:
         """Whether anything is to be done otherwise than the layout says."""
         return bool(self.moved or self.exchanged)
 
+    def metrics(self) -> list[Metric]:
+        """A row for each thing that is otherwise than the layout says."""
+        return [*(Metric("names exchanged throughout, put back", " and ".join(pair)) for pair in self.exchanged),
+                *(Metric(f"worn elsewhere, moved there ({m.label})", 1000 * m.before, "mm") for m in self.moved),
+                *(Metric("far from the layout's place, and found nowhere", label) for label in self.unplaced)]
+
     def named(self, sequence: MarkerSequence, layout: MarkerLayout) -> MarkerSequence:
         """A sequence with exchanged names put back."""
         return MarkerSequence(sequence.positions[:, self.order(sequence, layout)], sequence.labels, sequence.rate)
@@ -88,11 +98,12 @@ class Worn:
         return order
 
     def placed(self, layout: MarkerLayout) -> MarkerLayout:
-        """A layout with the moved markers where they are worn, at its end; they are no longer loose."""
+        """A layout with the moved markers about where they are worn, at its end: loose, to be looked for there."""
         if not self.moved:
             return layout
         found = MarkerLayout(tuple(m.label for m in self.moved), np.array([m.corners for m in self.moved]),
-                             np.array([m.distance for m in self.moved]), np.array([m.weights for m in self.moved]))
+                             np.array([m.distance for m in self.moved]), np.array([m.weights for m in self.moved]),
+                             loose=tuple(m.label for m in self.moved))
         return replace(layout.without(found.labels).joined(found), aliases=layout.aliases)
 
 
@@ -140,8 +151,11 @@ def _rms(apart: np.ndarray) -> np.ndarray:
 
 
 def find_worn(model: BodyModel, sequences: Sequence[MarkerSequence], layout: MarkerLayout, person: PersonFit,
-              fit_without: Callable[[tuple[str, ...]], PersonFit]) -> Worn:
-    """Which markers are worn elsewhere, and where; which pairs bear each other's name.
+              config: PersonConfig) -> Worn:
+    """Which markers are worn elsewhere than in a layout, and where; which pairs bear each other's name.
+
+    The body is fitted without the markers that are suspected until they are the same as before. One that it puts back
+    near its usual place, though it was left out, is where it should be and not suspected again.
 
     Parameters
     ----------
@@ -151,28 +165,32 @@ def find_worn(model: BodyModel, sequences: Sequence[MarkerSequence], layout: Mar
         Where markers usually sit.
     person : PersonFit
         Fitted to all of them.
-    fit_without : callable
-        Fits the person without the markers of some labels.
+    config : PersonConfig
 
     [MoSh]
     """
-    suspects: tuple[str, ...] = ()
+    suspects, cleared, far = frozenset[str](), frozenset[str](), SUSPECT
+    at = _Frames(model, person, sequences, layout)
     for _ in range(ROUNDS):
-        at = _Frames(model, person, sequences, layout)
-        far = tuple(np.array(at.layout.labels)[np.nan_to_num(at.off_usual()) > FAR].tolist())
-        if set(far) == set(suspects) or len(at.layout.labels) - len(far) < 3:
+        off = dict(zip(at.layout.labels, np.nan_to_num(at.off_usual()).tolist(), strict=True))
+        cleared |= {label for label in suspects if off[label] <= FAR}
+        before, suspects = suspects, frozenset(label for label in off if label not in cleared and off[label] > far)
+        if len(off) - len(suspects) < LEAST:
+            return Worn(unplaced=tuple(label for label in at.layout.labels if label in suspects))
+        if suspects == before:
             break
-        suspects = far
-        person = fit_without(suspects)
+        far = FAR
+        others = layout.without([label for label in layout.labels if label in suspects])
+        at = _Frames(model, find_person(model, sequences, others, replace(config, **ROUGH)), sequences, layout)
     return _explained(at, suspects)
 
 
-def _explained(at: _Frames, suspects: Sequence[str]) -> Worn:
+def _explained(at: _Frames, suspects: Collection[str]) -> Worn:
     """What explains the suspects: a pair of exchanged names, or another place on the skin."""
     labels, usual, cross = at.layout.labels, at.off_usual(), at.off_places()
     others = [i for i, label in enumerate(labels) if label not in suspects]
     limit = max(NEAR, USUAL * float(np.nanmedian(usual[others])))
-    rows, exchanged = {labels.index(label) for label in suspects}, []
+    rows, exchanged = {i for i, label in enumerate(labels) if label in suspects and usual[i] > FAR}, []
     for worse, i, j in sorted((max(cross[i, j], cross[j, i]), i, j) for i, j in combinations(sorted(rows), 2)):
         if {i, j} <= rows and worse < FAR and cross[i, j] + cross[j, i] < GAIN * (usual[i] + usual[j]):
             exchanged.append((labels[i], labels[j]))
