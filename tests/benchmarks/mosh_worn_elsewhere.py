@@ -24,6 +24,7 @@ import argparse
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, field
+from itertools import product
 from pathlib import Path
 
 import numpy as np
@@ -248,24 +249,24 @@ def main() -> None:
     parser.add_argument("--seeds", type=int, default=3)
     args = parser.parse_args()
     model = load_model(args.model)
-    layout, rows, plain = named_layout(args.layout, model.template), [], []
+    layout, rows, refs, plain = named_layout(args.layout, model.template), [], [], []
     for path in sorted(args.folder.glob("*.c3d")):
         if args.files and path.stem not in args.files:
             continue
-        ref = reference(model, path, layout)
-        worn = ref.result.worn
+        refs.append(reference(model, path, layout))
+        worn, motion = refs[-1].result.worn, refs[-1].result.motion
         plain.append({"file": path.name, "alarms": [*worn.exchanged, *(m.label for m in worn.moved)],
-                      "unplaced": worn.unplaced, "mm": 1e3 * float(np.nanmean(ref.result.motion.residuals))})
+                      "unplaced": worn.unplaced, "mm": 1e3 * float(np.nanmean(motion.residuals))})
         print(plain[-1], flush=True)
-        for seed in range(args.first, args.first + args.seeds):
-            for kind in args.kinds:
-                rows.append(run_case(model, ref, layout, kind, seed, not args.plain))
-                print("  ".join(f"{name} {value:.3g}" if isinstance(value, float) else f"{name} {value}"
-                                for name, value in rows[-1].items()), flush=True)
-    total = {kind: totals([row for row in rows if row["kind"] == kind]) for kind in args.kinds}
+    for seed in range(args.first, args.first + args.seeds):
+        for ref, kind in product(refs, args.kinds):
+            rows.append(run_case(model, ref, layout, kind, seed, not args.plain))
+            print("  ".join(f"{name} {value:.3g}" if isinstance(value, float) else f"{name} {value}"
+                            for name, value in rows[-1].items()), flush=True)
+            total = {one: totals(some) for one in args.kinds if (some := [row for row in rows if row["kind"] == one])}
+            write_report(args.output, {"machine": machine(), "undisturbed": plain, "rows": rows, "total": total})
     for kind, values in total.items():
         print(f"{kind:12s} " + "  ".join(f"{name} {value:.3g}" for name, value in values.items()))
-    write_report(args.output, {"machine": machine(), "undisturbed": plain, "rows": rows, "total": total})
 
 
 def totals(rows: Sequence[dict]) -> dict[str, float]:

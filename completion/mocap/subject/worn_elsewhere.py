@@ -17,16 +17,18 @@ from scanprep.geometry.mesh import Mesh
 
 from ..files.markers import MarkerSequence
 from ..marker_sets.layout import DISTANCE, MarkerLayout
+from ..marker_sets.symmetry import label_pairs
 from .person import PersonConfig, PersonFit, common_markers, find_person
 
 SUSPECT = 0.04                       # metres, RMS over frames, from its usual place, from which on a marker is left out
 FAR = 0.06                           # the same on a body that was fitted roughly, or without it: worn elsewhere
-NEAR = 0.03                          # metres within which another place explains a marker, at least
-USUAL = 2.5                          # times that of the other markers from their usual places, likewise
+NEAR = 0.02                          # metres within which another place explains a marker, at least
+USUAL = 1.5                          # times that of the other markers from their usual places, likewise
 GAIN = 0.4                           # share of the distance from the usual place that another place leaves at most
 LIMB = 0.2                           # metres along its part that a loose marker may be off its usual place
 ROUNDS = 4                           # most times that the body is fitted without the suspects
-LEAST = 6                            # markers that must be left to fit the body to
+SEVERAL = 5                          # suspects from which on left and right are tried the other way round
+MOST = 0.25                          # share of the markers beyond which not they are at fault, but the body
 ROUGH = {"n_betas": 20, "annealing": (40.0, 10.0, 2.0, 1.0)}  # of those fits: few betas do not follow a wrong marker
 
 
@@ -94,7 +96,8 @@ class Worn:
         order = np.arange(len(sequence.labels))
         for first, second in self.exchanged:
             if first in rows and second in rows:
-                order[[rows[first], rows[second]]] = rows[second], rows[first]
+                two = [rows[first], rows[second]]
+                order[two] = order[two[::-1]]
         return order
 
     def placed(self, layout: MarkerLayout) -> MarkerLayout:
@@ -169,20 +172,60 @@ def find_worn(model: BodyModel, sequences: Sequence[MarkerSequence], layout: Mar
 
     [MoSh]
     """
-    suspects, cleared, far = frozenset[str](), frozenset[str](), SUSPECT
-    at = _Frames(model, person, sequences, layout)
+    at, rough = _Frames(model, person, sequences, layout), replace(config, **ROUGH)
+    sides, sequences, at = _exchanged_sides(model, sequences, layout, at, rough)
+    suspects, cleared, far = frozenset[str](), frozenset[str](), FAR if sides else SUSPECT
     for _ in range(ROUNDS):
         off = dict(zip(at.layout.labels, np.nan_to_num(at.off_usual()).tolist(), strict=True))
         cleared |= {label for label in suspects if off[label] <= FAR}
         before, suspects = suspects, frozenset(label for label in off if label not in cleared and off[label] > far)
-        if len(off) - len(suspects) < LEAST:
+        if len(suspects) > MOST * len(off):
             return Worn(unplaced=tuple(label for label in at.layout.labels if label in suspects))
         if suspects == before:
             break
         far = FAR
         others = layout.without([label for label in layout.labels if label in suspects])
-        at = _Frames(model, find_person(model, sequences, others, replace(config, **ROUGH)), sequences, layout)
-    return _explained(at, suspects)
+        at = _Frames(model, find_person(model, sequences, others, rough), sequences, layout)
+    found = _explained(at, suspects)
+    again = set(sides) & set(found.exchanged)                           # exchanged, and put back
+    return replace(found, exchanged=tuple(pair for pair in (*sides, *found.exchanged) if pair not in again))
+
+
+def _exchanged_sides(model: BodyModel, sequences: Sequence[MarkerSequence], layout: MarkerLayout, at: _Frames,
+                     rough: PersonConfig) -> tuple[tuple[tuple[str, str], ...], Sequence[MarkerSequence], _Frames]:
+    """Left and right exchanged on a limb or the whole body, where many markers are far off: others do not tell then.
+
+    Returned are the pairs, the sequences under their right names, and the body on them.
+    """
+    labels, off = at.layout.labels, np.nan_to_num(at.off_usual())
+    best = (), sequences, at
+    for tried in _limbs(model.skeleton.parents, at) if (off > FAR).sum() >= SEVERAL else ():
+        names = Worn(exchanged=tuple((labels[i], labels[j]) for i, j in tried))
+        renamed = [names.named(each, layout) for each in sequences]
+        other = _Frames(model, find_person(model, renamed, layout, rough), renamed, layout)
+        if _burden(other) < 0.5 * _burden(at) and _burden(other) < _burden(best[2]):
+            best = names.exchanged, renamed, other
+    return best
+
+
+def _limbs(parents: np.ndarray, at: _Frames) -> list[list[tuple[int, int]]]:
+    """The pairs of left and right: all, and those of each pair of limbs, which part where their bones do."""
+    def way(part: int) -> list[int]:
+        return [*(way(int(parents[part])) if part else []), part]
+
+    pairs = [(i, int(j)) for i, j in enumerate(label_pairs(at.layout.labels)) if i < j]
+    limbs: dict[tuple[int, int], list[tuple[int, int]]] = {}
+    for i, j in pairs:
+        fork = next((both for both in zip(*(way(int(at.part[at.layout.nearest[k]])) for k in (i, j)), strict=False)
+                     if both[0] != both[1]), None)
+        if fork:
+            limbs.setdefault(fork, []).append((i, j))
+    return [pairs, *limbs.values()] if pairs else []
+
+
+def _burden(at: _Frames) -> float:
+    """How badly a body explains its markers; beyond some distance it does not matter how far they are."""
+    return float(np.minimum(np.nan_to_num(at.off_usual()), 2 * FAR).sum())
 
 
 def _explained(at: _Frames, suspects: Collection[str]) -> Worn:
