@@ -259,6 +259,24 @@ def test_a_marker_that_no_place_of_the_skin_explains_is_told_and_left_out_of_the
     assert "M03" in hardly_believed([motion])[0]
 
 
+def test_left_and_right_exchanged_on_many_markers_are_put_right_together():
+    sides = [(f"L{name}", f"R{name}") for name in "ABCDE"]
+    names = tuple(dict.fromkeys([left for left, _ in sides] + list(LABELS[5:20]) + [right for _, right in sides]
+                                + list(LABELS[25:])))
+    layout, data = replace(LAYOUT, labels=names), sequence(displaced()).positions
+    markers = MarkerSequence(data[:, [*range(20, 25), *range(5, 20), *range(5), 25]], names, 60.0)
+    found = find_worn(MODEL, [markers], layout, find_person(MODEL, markers, layout, USUAL), USUAL)
+    assert found.exchanged == tuple(sides) and not found.moved and not found.unplaced
+    np.testing.assert_array_equal(found.named(markers, layout).positions, data)
+
+
+def test_where_the_body_is_at_fault_no_marker_is_moved():
+    order = np.random.default_rng(0).permutation(26)
+    markers = MarkerSequence(sequence(displaced()).positions[:, order], LABELS, 60.0)
+    found = find_worn(MODEL, [markers], LAYOUT, find_person(MODEL, markers, LAYOUT, USUAL), USUAL)
+    assert not found.changes and len(found.unplaced) > 7
+
+
 def test_markers_in_their_places_are_let_be():
     found = find_worn(MODEL, [sequence(displaced())], LAYOUT, beside(), USUAL)
     assert not found.changes and not found.unplaced
