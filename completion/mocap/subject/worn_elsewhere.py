@@ -101,12 +101,11 @@ class Worn:
         return order
 
     def placed(self, layout: MarkerLayout) -> MarkerLayout:
-        """A layout with the moved markers about where they are worn, at its end: loose, to be looked for there."""
+        """A layout with the moved markers where they are worn, at its end, and none of them loose."""
         if not self.moved:
             return layout
         found = MarkerLayout(tuple(m.label for m in self.moved), np.array([m.corners for m in self.moved]),
-                             np.array([m.distance for m in self.moved]), np.array([m.weights for m in self.moved]),
-                             loose=tuple(m.label for m in self.moved))
+                             np.array([m.distance for m in self.moved]), np.array([m.weights for m in self.moved]))
         return replace(layout.without(found.labels).joined(found), aliases=layout.aliases)
 
 
@@ -124,26 +123,25 @@ class _Frames:
         self.template: Mesh = model.template
         self.places = np.stack([self.layout.place(body) for body in self.bodies])                     # (B, L, 3)
 
-    def off_places(self) -> np.ndarray:
-        """(L, L) RMS distance of every marker from the usual place of each, metres; NaN for one that is never seen."""
-        apart = np.linalg.norm(self.targets[:, :, None] - self.places[:, None], axis=3)
-        return _rms(apart)
-
     def off_skin(self, row: int, distance: float) -> np.ndarray:
         """(N,) RMS distance of a marker from every vertex, lifted off the skin so far, metres."""
         return _rms(np.stack([np.linalg.norm(body.vertices + distance * normals - target, axis=1)
                               for body, normals, target in
                               zip(self.bodies, self.normals, self.targets[:, row], strict=True)]))
 
+    def off_place(self, row: int, of: int) -> float:
+        """RMS distance of a marker from the usual place of one, that of a loose one anywhere along its part, metres."""
+        apart = float(_rms(np.linalg.norm(self.targets[:, row] - self.places[:, of], axis=1)))
+        if self.layout.labels[of] not in self.layout.loose:
+            return apart
+        centre = self.layout.nearest[of]
+        near = (np.linalg.norm(self.template.vertices - self.template.vertices[centre], axis=1) < LIMB) \
+            & (self.part == self.part[centre])
+        return min(apart, float(self.off_skin(row, float(np.asarray(self.layout.distances)[of]))[near].min()))
+
     def off_usual(self) -> np.ndarray:
-        """(L,) RMS distance of every marker from its usual place, that of a loose one anywhere along its part."""
-        usual = np.diagonal(self.off_places()).copy()
-        for row in np.flatnonzero(np.isin(self.layout.labels, self.layout.loose)):
-            centre = self.layout.nearest[row]
-            near = (np.linalg.norm(self.template.vertices - self.template.vertices[centre], axis=1) < LIMB) \
-                & (self.part == self.part[centre])
-            usual[row] = min(usual[row], self.off_skin(int(row), np.asarray(self.layout.distances)[row])[near].min())
-        return usual
+        """(L,) the same of every marker from its own."""
+        return np.array([self.off_place(row, row) for row in range(len(self.layout.labels))])
 
 
 def _rms(apart: np.ndarray) -> np.ndarray:
@@ -230,12 +228,13 @@ def _burden(at: _Frames) -> float:
 
 def _explained(at: _Frames, suspects: Collection[str]) -> Worn:
     """What explains the suspects: a pair of exchanged names, or another place on the skin."""
-    labels, usual, cross = at.layout.labels, at.off_usual(), at.off_places()
+    labels, usual = at.layout.labels, at.off_usual()
     others = [i for i, label in enumerate(labels) if label not in suspects]
     limit = max(NEAR, USUAL * float(np.nanmedian(usual[others])))
     rows, exchanged = {i for i, label in enumerate(labels) if label in suspects and usual[i] > FAR}, []
-    for worse, i, j in sorted((max(cross[i, j], cross[j, i]), i, j) for i, j in combinations(sorted(rows), 2)):
-        if {i, j} <= rows and worse < FAR and cross[i, j] + cross[j, i] < GAIN * (usual[i] + usual[j]):
+    crossed = [(at.off_place(i, j), at.off_place(j, i), i, j) for i, j in combinations(sorted(rows), 2)]
+    for one, other, i, j in sorted(crossed, key=lambda both: max(both[:2])):
+        if {i, j} <= rows and max(one, other) < FAR and one + other < GAIN * (usual[i] + usual[j]):
             exchanged.append((labels[i], labels[j]))
             rows -= {i, j}
     found = {row: _best_place(at, row, float(usual[row])) for row in sorted(rows)}
