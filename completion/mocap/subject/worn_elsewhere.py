@@ -26,6 +26,7 @@ NEAR = 0.02                          # metres within which another place explain
 USUAL = 1.5                          # times that of the other markers from their usual places, likewise
 GAIN = 0.4                           # share of the distance from the usual place that another place leaves at most
 LIMB = 0.2                           # metres along its part that a loose marker may be off its usual place
+FEW = 4                              # frames that must have seen a marker for anything to be told of it
 ROUNDS = 4                           # most times that the body is fitted without the suspects
 SEVERAL = 5                          # suspects from which on left and right are tried the other way round
 MOST = 0.25                          # share of the markers beyond which not they are at fault, but the body
@@ -140,8 +141,9 @@ class _Frames:
         return min(apart, float(self.off_skin(row, float(np.asarray(self.layout.distances)[of]))[near].min()))
 
     def off_usual(self) -> np.ndarray:
-        """(L,) the same of every marker from its own."""
-        return np.array([self.off_place(row, row) for row in range(len(self.layout.labels))])
+        """(L,) the same of every marker from its own, NaN for one that too few frames have seen."""
+        often = np.isfinite(self.targets[..., 0]).sum(axis=0) >= FEW
+        return np.array([self.off_place(row, row) if seen else np.nan for row, seen in enumerate(often)])
 
 
 def _rms(apart: np.ndarray) -> np.ndarray:
@@ -228,6 +230,8 @@ def _burden(at: _Frames) -> float:
 
 def _explained(at: _Frames, suspects: Collection[str]) -> Worn:
     """What explains the suspects: a pair of exchanged names, or another place on the skin."""
+    if not suspects:
+        return Worn()
     labels, usual = at.layout.labels, at.off_usual()
     others = [i for i, label in enumerate(labels) if label not in suspects]
     limit = max(NEAR, USUAL * float(np.nanmedian(usual[others])))
