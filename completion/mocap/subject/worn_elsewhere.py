@@ -30,7 +30,7 @@ FEW = 4                              # frames that must have seen a marker for a
 ROUNDS = 4                           # most times that the body is fitted without the suspects
 SEVERAL = 5                          # suspects from which on left and right are tried the other way round
 MOST = 0.25                          # share of the markers beyond which not they are at fault, but the body
-ROUGH = {"n_betas": 20, "annealing": (40.0, 10.0, 2.0, 1.0)}  # of those fits: few betas do not follow a wrong marker
+ROUGH_BETAS, ROUGH_STAGES = 20, (40.0, 10.0, 2.0, 1.0)  # of those fits: few betas do not follow a wrong marker
 
 
 @dataclass(frozen=True, eq=False)
@@ -172,7 +172,8 @@ def find_worn(model: BodyModel, sequences: Sequence[MarkerSequence], layout: Mar
 
     [MoSh]
     """
-    at, rough = _Frames(model, person, sequences, layout), replace(config, **ROUGH)
+    at = _Frames(model, person, sequences, layout)
+    rough = replace(config, n_betas=ROUGH_BETAS, annealing=ROUGH_STAGES)
     sides, sequences, at = _exchanged_sides(model, sequences, layout, at, rough)
     suspects, cleared, far = frozenset[str](), frozenset[str](), FAR if sides else SUSPECT
     for _ in range(ROUNDS):
@@ -198,7 +199,7 @@ def _exchanged_sides(model: BodyModel, sequences: Sequence[MarkerSequence], layo
     Returned are the pairs, the sequences under their right names, and the body on them.
     """
     labels, off = at.layout.labels, np.nan_to_num(at.off_usual())
-    best = (), sequences, at
+    best: tuple[tuple[tuple[str, str], ...], Sequence[MarkerSequence], _Frames] = (), sequences, at
     for tried in _limbs(model.skeleton.parents, at) if (off > FAR).sum() >= SEVERAL else ():
         names = Worn(exchanged=tuple((labels[i], labels[j]) for i, j in tried))
         renamed = [names.named(each, layout) for each in sequences]
