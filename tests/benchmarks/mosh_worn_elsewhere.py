@@ -259,7 +259,7 @@ def main() -> None:
                       "unplaced": worn.unplaced, "mm": 1e3 * float(np.nanmean(motion.residuals))})
         print(plain[-1], flush=True)
     for seed in range(args.first, args.first + args.seeds):
-        for ref, kind in product(refs, args.kinds):
+        for kind, ref in product(args.kinds, refs):
             rows.append(run_case(model, ref, layout, kind, seed, not args.plain))
             print("  ".join(f"{name} {value:.3g}" if isinstance(value, float) else f"{name} {value}"
                             for name, value in rows[-1].items()), flush=True)
