@@ -185,11 +185,19 @@ def find_worn(model: BodyModel, sequences: Sequence[MarkerSequence], layout: Mar
         if suspects == before:
             break
         far = FAR
-        others = layout.without([label for label in layout.labels if label in suspects])
-        at = _Frames(model, find_person(model, sequences, others, rough), sequences, layout)
+        at = _without(model, sequences, layout, suspects, rough)
+    if suspects:
+        at = _without(model, sequences, layout, suspects, config)
     found = _explained(at, suspects)
     again = set(sides) & set(found.exchanged)                           # exchanged, and put back
     return replace(found, exchanged=tuple(pair for pair in (*sides, *found.exchanged) if pair not in again))
+
+
+def _without(model: BodyModel, sequences: Sequence[MarkerSequence], layout: MarkerLayout, suspects: Collection[str],
+             config: PersonConfig) -> _Frames:
+    """The body that is fitted without some markers, and all markers on it."""
+    others = layout.without([label for label in layout.labels if label in suspects])
+    return _Frames(model, find_person(model, sequences, others, config), sequences, layout)
 
 
 def _exchanged_sides(model: BodyModel, sequences: Sequence[MarkerSequence], layout: MarkerLayout, at: _Frames,
