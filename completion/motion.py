@@ -69,6 +69,17 @@ class Motion:
         """(T,) seconds from the first frame."""
         return np.arange(len(self.poses)) / self.rate
 
+    @property
+    def distrusted(self) -> tuple[str, ...]:
+        """Markers that were seen, but believed in less than a tenth of those frames."""
+        seen = np.isfinite(self.residuals)
+        few = (self.trusted & seen).sum(axis=0) < 0.1 * seen.sum(axis=0)
+        return tuple(label for label, is_few in zip(self.labels, few, strict=True) if is_few)
+
+    def told(self) -> np.ndarray:
+        """The residuals (T, L) of the markers that tell of the body, metres, NaN for those that are `distrusted`."""
+        return np.where(np.isin(self.labels, self.distrusted), np.nan, self.residuals)
+
     def vertices(self, subject: Subject, frames: np.ndarray | slice = slice(None)) -> np.ndarray:
         """The meshes (n, N, 3) of some frames, metres."""
         return subject.vertices(self.poses[frames], self.trans[frames])

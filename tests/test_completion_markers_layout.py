@@ -59,6 +59,14 @@ def test_matching_and_selecting():
         LAYOUT.select(["D"])
 
 
+def test_labels_spelled_otherwise_are_known_where_only_one_is_meant():
+    layout = MarkerLayout(("L.Knee", "RBAC", "a.b", "AB"), np.arange(4), aliases={"RBAK": "RBAC"})
+    labels = ("l_knee", "rbak", "RBAC-1", "A B", "L.Knee")
+    found = layout.spelled(labels)
+    assert dict(found.aliases) == {"RBAK": "RBAC", "l_knee": "L.Knee", "rbak": "RBAC"}     # A B may be either
+    assert found.matched(labels, 0) == ("rbak", "L.Knee") and layout.spelled(("RBAK", "AB")) is layout
+
+
 def test_markers_are_left_out_with_their_aliases():
     layout = MarkerLayout(("A", "B", "C"), np.array([3, 0, 2]), np.array([0.01, 0.02, 0.03]),
                           aliases={"X": "A", "Y": "B"}, loose=("A", "B"))

@@ -9,9 +9,11 @@ from completion import MoshConfig, PersonConfig, find_person, mosh
 from completion.mocap.files.markers import MarkerSequence
 from completion.mocap.marker_sets.layout import MarkerLayout
 from completion.mocap.mosh.mosh import PoseConfig
+from completion.mocap.pose.robust import hardly_believed, markers_told
 from completion.mocap.pose.settings import AnimateConfig
 from completion.mocap.subject.attachment import latent_markers
 from completion.mocap.subject.person import choose_frames, common_markers
+from completion.mocap.subject.worn_elsewhere import find_worn
 from scanprep.geometry import rotations
 from scanprep.geometry.surface import Surface
 
@@ -219,6 +221,65 @@ def test_labels_that_were_exchanged_do_not_spoil_the_person():
     assert {swap.first, swap.second} == {LABELS[0], LABELS[7]} and (swap.begin, swap.end) == (some[0], some[-1])
     np.testing.assert_array_equal(found.betas, beside().betas)
     assert np.nanmean(found.motions[0].residuals) < 5e-3
+
+
+def worn_otherwise(row, places, exchanged=()):
+    """A marker at other places (T, 3), and pairs that bear each other's name."""
+    data = np.array(sequence(displaced()).positions)
+    data[:, row] = places
+    for i, j in exchanged:
+        data[:, [i, j]] = data[:, [j, i]]
+    return mosh(MODEL, MarkerSequence(data, LABELS, 60.0), LAYOUT, MoshConfig(person=USUAL, soft_tissue=False))
+
+
+def test_a_marker_worn_elsewhere_and_a_pair_of_exchanged_names_are_put_right():
+    moved = np.array(displaced())
+    moved[3] = moved[15]                                        # half a metre along the worm, beside another marker
+    found = worn_otherwise(3, sequence(displaced()).positions[:, 15], [(6, 20)])
+    assert [m.label for m in found.worn.moved] == ["M03"] and found.worn.exchanged == (("M06", "M20"),)
+    rows = [LABELS.index(label) for label in found.layout.labels]
+    off = np.linalg.norm(rest_places(found.layout, found.betas) - moved[rows], axis=1)
+    assert off[found.layout.labels.index("M03")] < 0.01 and off.max() < 0.04
+    swap, = found.artefacts[0].swaps
+    assert (swap.first, swap.second, swap.begin, swap.end) == ("M06", "M20", 0, 39)
+    assert found.artefacts[0].order[0, [6, 20]].tolist() == [20, 6]
+    assert not found.motions[0].distrusted and np.nanmean(found.motions[0].residuals) < 5e-3
+    np.testing.assert_allclose(found.betas, beside().betas, atol=0.35)
+
+
+def test_a_marker_that_no_place_of_the_skin_explains_is_told_and_left_out_of_the_mean():
+    floating = np.array(displaced())
+    floating[3] += [0.0, 0.0, 0.3]
+    found = worn_otherwise(3, sequence(floating).positions[:, 3])
+    assert not found.worn.changes and found.worn.unplaced == ("M03",)
+    motion = found.motions[0]
+    assert motion.distrusted == ("M03",)
+    assert np.nanmean(motion.told()) < 5e-3 and np.nanmean(motion.residuals) > 0.01
+    assert markers_told([motion]).value == "25 of 26, without M03"
+    assert "M03" in hardly_believed([motion])[0]
+
+
+def test_left_and_right_exchanged_on_many_markers_are_put_right_together():
+    sides = [(f"L{name}", f"R{name}") for name in "ABCDE"]
+    names = tuple(dict.fromkeys([left for left, _ in sides] + list(LABELS[5:20]) + [right for _, right in sides]
+                                + list(LABELS[25:])))
+    layout, data = replace(LAYOUT, labels=names), sequence(displaced()).positions
+    markers = MarkerSequence(data[:, [*range(20, 25), *range(5, 20), *range(5), 25]], names, 60.0)
+    found = find_worn(MODEL, [markers], layout, find_person(MODEL, markers, layout, USUAL), USUAL)
+    assert found.exchanged == tuple(sides) and not found.moved and not found.unplaced
+    np.testing.assert_array_equal(found.named(markers, layout).positions, data)
+
+
+def test_where_the_body_is_at_fault_no_marker_is_moved():
+    order = np.random.default_rng(0).permutation(26)
+    markers = MarkerSequence(sequence(displaced()).positions[:, order], LABELS, 60.0)
+    found = find_worn(MODEL, [markers], LAYOUT, find_person(MODEL, markers, LAYOUT, USUAL), USUAL)
+    assert not found.changes and len(found.unplaced) > 7
+
+
+def test_markers_in_their_places_are_let_be():
+    found = find_worn(MODEL, [sequence(displaced())], LAYOUT, beside(), USUAL)
+    assert not found.changes and not found.unplaced
 
 
 def test_the_published_preset_is_the_patent():

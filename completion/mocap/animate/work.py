@@ -30,11 +30,13 @@ from ...motion_pictures import (
 )
 from ..files.markers import MarkerSequence, read_markers
 from ..files.motion_files import KEYS, write_glb, write_motion
+from ..marker_sets.layout import MarkerLayout
 from ..marker_sets.named import choose_layout
 from ..pose.follow import AnimateConfig, animate
-from ..pose.robust import motion_problem
+from ..pose.robust import hardly_believed, markers_told, motion_problem
 from ..retargeting.retarget import morphed_vertices, retarget
-from ..subject.person import PersonConfig, find_person
+from ..subject.person import PersonConfig, PersonFit, find_person
+from ..subject.worn_elsewhere import Worn, find_worn
 
 BetasTo = dict[float, np.ndarray] | np.ndarray      # keys over seconds, or betas at the end
 MEAN_ERROR = "distance of markers, mean"
@@ -65,10 +67,10 @@ class Work:
         metrics = [Metric("model", self.name), Metric("layout", name)]
         body, found = self.subject, None
         if body is None:
-            found = room.step("subject", (self.model, sequence, layout, self.person),
-                              lambda: find_person(self.model, sequence, layout, self.person, room.tell))
+            sequence, found, worn = self._person(sequence, layout, room)
             body, layout = self.model.subject(found.betas), found.layout
-            metrics.append(Metric("subject", f"{len(found.betas)} betas from {len(found.frames)} frames"))
+            metrics += [Metric("subject", f"{len(found.betas)} betas from {len(found.frames)} frames"),
+                        *worn.metrics()]
         # a person found from a model: what it was found from tells as much as its body, and sooner
         whose = self.subject if found is None else (self.model, found.betas)
         motion = room.step("motion", (whose, sequence, layout, self.animate),
@@ -79,7 +81,8 @@ class Work:
                                                          "frames": found.frames[:, 1].tolist()})
             layout.save(output / "layout.json")
         problem = motion_problem(motion, body.template, layout, sequence)
-        metrics = [judgement_row(Judgement.of(problem)), *metrics, *figures(motion, sequence)]
+        judgement = Judgement.of(problem, hardly_believed([motion]))
+        metrics = [judgement_row(judgement), *metrics, *figures(motion, sequence)]
         write_motion(output, motion, body)
         write_glb(output / "animation.glb", motion, body)
         page = motion_page(motion, body, sequence, path.name, rows(metrics))
@@ -90,6 +93,21 @@ class Work:
         page.write(output / "report.html")
         return metrics
 
+    def _person(self, sequence: MarkerSequence, layout: MarkerLayout, room: Room
+                ) -> tuple[MarkerSequence, PersonFit, Worn]:
+        """The markers under their right names, whose they are, and how they are worn."""
+        def find(name: str, markers: MarkerSequence, usual: MarkerLayout) -> PersonFit:
+            return room.step(name, (self.model, markers, usual, self.person),
+                             lambda: find_person(self.model, markers, usual, self.person, room.tell))
+
+        found = find("subject", sequence, layout)
+        worn = room.step("worn", (self.model, sequence, layout, found, self.person),
+                         lambda: find_worn(self.model, [sequence], layout, found, self.person))
+        if not worn.changes:
+            return sequence, found, worn
+        sequence = worn.named(sequence, layout)
+        return sequence, find("subject again", sequence, worn.placed(layout)), worn
+
 
 def figures(motion: Motion, markers: MarkerSequence) -> list[Metric]:
     """What a motion is judged by."""
@@ -99,7 +117,8 @@ def figures(motion: Motion, markers: MarkerSequence) -> list[Metric]:
     return [
         Metric("frames", len(motion.poses)), Metric("rate", motion.rate, "1/s"),
         Metric("markers used", f"{int(seen.any(axis=0).sum())} of {len(markers.labels)}"),
-        Metric(MEAN_ERROR, float(off.mean()), "mm"),
+        Metric(MEAN_ERROR, MM * float(np.nanmean(motion.told())) if seen.any() else np.nan, "mm"),
+        markers_told([motion]),
         Metric("distance of markers, 95th percentile", float(np.percentile(off, 95)), "mm"),
         Metric("distance of markers, mean of the worst frame", float(frame.max()), "mm"),
         Metric("markers missing", 100 * float(1 - seen[:, seen.any(axis=0)].mean()) if seen.any() else 100.0, "%"),

@@ -1,7 +1,7 @@
 """Marker artefacts: labels that two markers have swapped, markers that slip, jitter or stray; and virtual markers."""
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any, Literal
 
@@ -100,6 +100,16 @@ class MarkerArtefacts:
             gone = np.isnan(out[:, row, 0])
             out[gone, row] = self.expected[gone, i]
         return MarkerSequence(out, self.repaired.labels, self.repaired.rate)
+
+    def renamed(self, order: np.ndarray, seen: np.ndarray) -> MarkerArtefacts:
+        """The same of the sequence as it came, from whose columns `order` (L,) the labels were taken all through.
+
+        `seen` (T, L) is where its markers were seen.
+        """
+        if (order == np.arange(len(order))).all():
+            return self
+        whole = order[self.order]
+        return replace(self, order=whole, swaps=list_swaps(whole, seen, self.repaired.labels))
 
     @property
     def labels_touched(self) -> set[str]:

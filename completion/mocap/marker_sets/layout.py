@@ -1,6 +1,7 @@
 """Where on the body the markers sit."""
 from __future__ import annotations
 
+import re
 from collections import Counter
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, replace
@@ -158,6 +159,16 @@ class MarkerLayout:
                              f"layout: {', '.join(self.labels)}; sequence: {', '.join(labels) or 'none'}")
         return found
 
+    def spelled(self, labels: Sequence[str]) -> MarkerLayout:
+        """The same with those labels as aliases that differ from its own only in case, dots, blanks or dashes."""
+        meant: dict[str, set[str]] = {}
+        for name in (*self.labels, *self.aliases):
+            meant.setdefault(_plain(name), set()).add(self.aliases.get(name, name))
+        found = {label: meant[_plain(label)] for label in labels
+                 if label not in self.labels and label not in self.aliases and _plain(label) in meant}
+        more = {label: next(iter(names)) for label, names in found.items() if len(names) == 1}
+        return replace(self, aliases={**self.aliases, **more}) if more else self
+
     def select(self, labels: Sequence[str]) -> MarkerLayout:
         """The markers of these labels, in this order; an alias becomes the label."""
         unknown = [label for label in labels if label not in self.labels and label not in self.aliases]
@@ -224,6 +235,11 @@ class MarkerLayout:
             place = self.vertices[self.labels.index(outside[0])].tolist()
             error = ValueError if what == "vertices" else MarkerFileError
             raise error(f"{what}: marker '{outside[0]}' sits on vertex {place}, the body has 0..{n_vertices - 1}")
+
+
+def _plain(label: str) -> str:
+    """A label without case, dots, blanks, dashes and underscores."""
+    return re.sub(r"[ ._-]", "", label).upper()
 
 
 def _restored(path: Path, tree: Any) -> MarkerLayout:

@@ -94,7 +94,7 @@ def _files() -> tuple[tuple[Path, dict[str, Any]], ...]:
 def fitting_layout(labels: Sequence[str], template: Mesh, kept: np.ndarray | None = None
                    ) -> tuple[MarkerLayout, str]:
     """The named layout that knows most of some labels, and its name; ValueError where none knows three of them."""
-    found = {name: named_layout(name, template, kept) for name in layout_names()}
+    found = {name: named_layout(name, template, kept).spelled(labels) for name in layout_names()}
     best = max(found, key=lambda name: (len(found[name].matched(labels, 0)), -len(found[name].labels)))
     found[best].matched(labels)
     return found[best], best
@@ -106,7 +106,7 @@ def choose_layout(model: BodyModel, given: str | Path | None, labels: Sequence[s
     of_people = None if kept is None else np.array(kept)
     if given is None:
         return fitting_layout(labels, model.template, of_people)
-    return read_layout(given, model.template, of_people), str(given)
+    return read_layout(given, model.template, of_people).spelled(labels), str(given)
 
 
 def read_layout(given: str | Path, template: Mesh, kept: np.ndarray | None = None) -> MarkerLayout:

@@ -25,6 +25,7 @@ from ..pose.follow import animate
 from ..pose.settings import RATE, AnimateConfig
 from ..soft_tissue.soft_tissue import SoftTissue, SoftTissueConfig, follow_soft_tissue
 from ..subject.person import PersonConfig, PersonFit, find_person, one_or_more
+from ..subject.worn_elsewhere import Worn, find_worn
 
 T = TypeVar("T")
 STEPS = 100                          # of progress, of each stage
@@ -69,7 +70,8 @@ class MoshConfig(Settings):
     soft_tissue : bool
         Let the shape change with time.
     repair : bool
-        Put swapped labels right and leave out markers that slip, jitter or stray.
+        Put swapped labels right, seek markers that are worn elsewhere than in the layout, and leave out markers that
+        slip, jitter or stray.
     exaggeration : float
         Factor on the change of shape in exaggerated.glb and on a character; 0 leaves it out there.
     """
@@ -104,6 +106,8 @@ class MoshResult:
         With the shape fixed; residuals in the order of the sequence's labels, NaN where the layout does not know one.
     soft_tissue : one SoftTissue for each sequence, or none
     artefacts : one MarkerArtefacts for each sequence
+    worn : Worn
+        Markers that are worn elsewhere than in the layout, and pairs that bear each other's name.
     seconds : {str: float}
         How long each stage took: "person", "poses", "artefacts", "soft tissue".
     """
@@ -114,6 +118,7 @@ class MoshResult:
     motions: tuple[Motion, ...]
     soft_tissue: tuple[SoftTissue, ...]
     artefacts: tuple[MarkerArtefacts, ...]
+    worn: Worn = field(default_factory=Worn)
     seconds: dict[str, float] = field(default_factory=dict)
 
 
@@ -122,10 +127,10 @@ def mosh(model: BodyModel, sequences: MarkerSequence | Sequence[MarkerSequence],
          config: MoshConfig | None = None, progress: Progress | None = None, step: Step = once) -> MoshResult:
     """Body shape, marker places, poses and soft tissue of one subject from marker sequences.
 
-    Labels are put right as far as tracks tell. The person is found from a few frames of all sequences, then the pose of
-    every frame. The motion tells which labels were swapped and which markers were not on the body; where that
-    concerns the frames that told of the person, the person is found again, and so is what is wrong. At last the shape
-    may change with time.
+    Labels are put right as far as tracks tell. The person is found from a few frames of all sequences; markers that are
+    far from where the layout has them are sought over the whole body. Then the pose of every frame is found. The motion
+    tells which labels were swapped and which markers were not on the body; where that concerns the frames that told of
+    the person, the person is found again, and so is what is wrong. At last the shape may change with time.
 
     Parameters
     ----------
@@ -151,6 +156,12 @@ def mosh(model: BodyModel, sequences: MarkerSequence | Sequence[MarkerSequence],
     stages = _Stages(step, progress, STEPS * (1 + len(sequences) * (2 + config.soft_tissue)))
     used = [_relabelled(stages, i, each, config) for i, each in enumerate(sequences)]
     person = _person(stages, model, used, layout, config)                       # [MoSh] Eq. 23, shape and markers
+    worn = _worn(stages, person, used, layout, config)
+    orders, seen = [worn.order(each, layout) for each in sequences], [each.seen for each in sequences]
+    if worn.changes:
+        sequences, used = ([worn.named(each, layout) for each in some] for some in (sequences, used))
+        layout = worn.placed(layout)
+        person = _person(stages, model, used, layout, config, "worn")
     for n in range(3):  # most times that a person is followed and the markers are judged
         motions = [_motion(stages, f"poses {n} {i}", person, each, config, n == 0)  # [MoSh] Eq. 23, poses
                    for i, each in enumerate(used)]
@@ -165,7 +176,8 @@ def mosh(model: BodyModel, sequences: MarkerSequence | Sequence[MarkerSequence],
                for i, (motion, old, new) in enumerate(zip(motions, before, used, strict=True))]
     soft = [_soft_tissue(stages, i, person, each, motion, config)               # [MoSh] Eq. 24
             for i, (each, motion) in enumerate(zip(used, motions, strict=True)) if config.soft_tissue]
-    return MoshResult(person.fit.betas, person.fit.layout, person.fit, tuple(motions), tuple(soft), tuple(artefacts),
+    told = tuple(each.renamed(*names) for each, *names in zip(artefacts, orders, seen, strict=True))
+    return MoshResult(person.fit.betas, person.fit.layout, person.fit, tuple(motions), tuple(soft), told, worn,
                       stages.seconds)
 
 
@@ -227,6 +239,16 @@ def _person(stages: _Stages, model: BodyModel, sequences: Sequence[MarkerSequenc
     return _Person(model, stages.run(
         "person", f"{again} person".strip(), (model, sequences, layout, config.person),
         lambda tell: find_person(model, sequences, layout, config.person, tell, step), not again))
+
+
+def _worn(stages: _Stages, person: _Person, sequences: Sequence[MarkerSequence], layout: MarkerLayout,
+          config: MoshConfig) -> Worn:
+    """Which markers are not worn as the layout says."""
+    if not config.repair:
+        return Worn()
+    model = person.model
+    return stages.run("person", "worn", (model, sequences, layout, person.fit, config.person), lambda _: find_worn(
+        model, sequences, layout, person.fit, config.person))
 
 
 def _motion(stages: _Stages, name: str, person: _Person, markers: MarkerSequence, config: MoshConfig, told: bool

@@ -46,6 +46,7 @@ def person_page(name: str, model: BodyModel, result: MoshResult, usual: MarkerLa
     page.section("Sequences")
     for take in takes:
         add_entry(page, take.name, (f"{m.name}: {m.text()} {m.unit}" for m in _main(figures[take.name])))
+    _worn_section(page, result)
     page.section("Markers before and after", "Blue: where the layout has each marker on this body. Red: where it was "
                  "found, with a rod from the one to the other. Those that moved most are named, from a centimetre on.")
     page.picture(pictures.picture_sides(body, found, before.place(body), labels))
@@ -57,6 +58,19 @@ def person_page(name: str, model: BodyModel, result: MoshResult, usual: MarkerLa
     page.section("Frames that shape and markers were found from")
     page.picture(_chosen_frames(model, result, takes))
     return closing(page, metrics, settings)
+
+
+def _worn_section(page: Page, result: MoshResult) -> None:
+    worn = result.worn
+    if not (worn.changes or worn.unplaced):
+        return
+    page.section("Markers worn elsewhere", "Markers that were far from where the layout has them, sought over the "
+                 "whole body that the others tell.")
+    page.table([*((f"{first} and {second}", "bore each other's name; put back", np.nan, np.nan)
+                  for first, second in worn.exchanged),
+                *((m.label, "worn elsewhere; moved there", MM * m.before, MM * m.after) for m in worn.moved),
+                *((label, "no place on the skin explains it", np.nan, np.nan) for label in worn.unplaced)],
+               ("marker", "what was found", "from the layout's place (mm)", "from the new place (mm)"))
 
 
 def take_page(take: Take, metrics: Sequence[Metric]) -> Page:
@@ -168,7 +182,7 @@ def _moved_rows(result: MoshResult, before: MarkerLayout, moved: np.ndarray, tak
     out = []
     for i, label in enumerate(before.labels):
         off = np.concatenate(left.get(label, [np.array([np.nan])]))
-        out.append((label, MM * float(result.person.moved[i]), *(MM * moved[i]).round(1).tolist(),
+        out.append((label, MM * float(np.linalg.norm(moved[i])), *(MM * moved[i]).round(1).tolist(),
                     MM * float(np.asarray(before.distances)[i]), MM * float(np.asarray(result.layout.distances)[i]),
                     MM * float(mean_over(off, 0))))
     return sorted(out, key=lambda row: -row[1])

@@ -26,7 +26,7 @@ from ..files.markers import MarkerSequence, read_markers
 from ..files.motion_files import KEYS, write_glb, write_motion, write_residuals
 from ..marker_sets.layout import MarkerLayout
 from ..marker_sets.named import choose_layout
-from ..pose.robust import motion_problem
+from ..pose.robust import hardly_believed, markers_told, motion_problem
 from ..retargeting.retarget import retarget
 from ..retargeting.soft_tissue import picture_transfer, retarget_soft_tissue, write_character
 from .mosh import MoshConfig, MoshResult, mosh, mosh_by_sex
@@ -73,7 +73,8 @@ class Work:
             figures[take.name] = _write(self, found, take, room, settings)
         room.tell(HALF + HALF * (total - 1) // total, 2 * HALF)
         problems = [f"{take.name}: {why}" for take in found.takes if (why := found.problem(take))]
-        metrics = [judgement_row(Judgement.of(problems)), Metric("model", self.name), *_person_metrics(found),
+        doubts = hardly_believed([take.motion for take in found.takes])
+        metrics = [judgement_row(Judgement.of(problems, doubts)), Metric("model", self.name), *_person_metrics(found),
                    *_figures(found.takes)]
         person_page(actor.name, found.model, found.result, found.usual, found.takes, metrics, figures,
                     settings).write(folder / "report.html")
@@ -104,6 +105,7 @@ def _solve(work: Work, actor: Actor, room: Room) -> tuple[_Found, list[str]]:
     recordings, sequences, failures = _read(work, actor.recordings)
     labels = tuple(dict.fromkeys(label for each in sequences for label in each.labels))
     usual, layout_name = work.layout or choose_layout(work.model, None, labels)
+    usual = usual.spelled(labels)
     try:
         layout = usual.without(work.hold_out) if work.hold_out else usual
     except ValueError as error:
@@ -162,7 +164,8 @@ def _write(work: Work, found: _Found, take: Take, room: Room, settings: Mapping[
                          f"person are; soft tissue taken {factor:g} times.").picture(*shown)
         closing(page, metrics, settings).write(place(folder) / "report.html")
         save_png(place(folder) / PICTURE, take_picture(take))
-        outcome = Outcome(place(folder), metrics, settings, judgement=Judgement.of(found.problem(take)))
+        judgement = Judgement.of(found.problem(take), hardly_believed([take.motion]))
+        outcome = Outcome(place(folder), metrics, settings, judgement=judgement)
         write_report(outcome, work.command, time.perf_counter() - start)
 
     room.files(f"{take.name} files", (solved, take.source.path, take.source.who, take.unit, factor),
@@ -179,7 +182,9 @@ def _write_person(folder: Path, result: MoshResult, about: Mapping[str, Any]) ->
     moved = dict(zip(result.layout.labels, person.moved.tolist(), strict=True))
     storage.write_json(folder / "subject.json", {
         "betas": result.betas.tolist(), **about, "frames": person.frames.tolist(), "moved": moved,
-        "residual": person.residual, "energies": person.energies, "converged": bool(person.converged)})
+        "worn_elsewhere": {m.label: {"from_the_layout": m.before, "left": m.after} for m in result.worn.moved},
+        "exchanged": result.worn.exchanged, "unplaced": result.worn.unplaced, "residual": person.residual,
+        "energies": person.energies, "converged": bool(person.converged)})
     result.layout.save(folder / "layout.json")
 
 
@@ -235,6 +240,7 @@ def _person_metrics(found: _Found) -> list[Metric]:
             Metric("betas, length", float(np.linalg.norm(result.betas)), "sd"),
             Metric("markers moved, mean", float(moved.mean()), "mm"),
             Metric(f"markers moved, most ({result.layout.labels[int(moved.argmax())]})", float(moved.max()), "mm")]
+    told += result.worn.metrics()
     if found.guess is not None:
         told[1:1] = [Metric("sex", found.guess.sex), Metric("sex, probability", 100 * found.guess.probability, "%")]
     return told
@@ -252,7 +258,9 @@ def _figures(takes: Sequence[Take]) -> list[Metric]:
     out = [Metric("frames", sum(len(take.motion.poses) for take in takes))]
     if len(takes) == 1:
         out.append(Metric("rate", takes[0].motion.rate, "1/s"))
-    fixed, soft = ([t.motion.residuals for t in takes], [t.soft.motion.residuals for t in takes if t.soft is not None])
+    out.append(markers_told([take.motion for take in takes]))
+    fixed = [t.motion.told() for t in takes]
+    soft = [np.where(np.isnan(t.motion.told()), np.nan, t.soft.motion.residuals) for t in takes if t.soft is not None]
     held = [t.held for t in takes if t.held is not None]
     held_soft = [h.soft for h in held if h.soft is not None]
     for name, values in zip(ERRORS, (fixed, soft, [h.fixed for h in held], held_soft), strict=True):

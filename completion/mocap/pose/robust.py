@@ -1,8 +1,11 @@
 """Which markers are believed: weights that outliers lose, and labels that two markers have swapped."""
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import numpy as np
 
+from scanprep.console import Metric
 from scanprep.geometry.mesh import Mesh
 from scanprep.judgement import extent, size, unit_problem
 
@@ -111,6 +114,22 @@ class LabelWatch:
                 taken[[a, b]] = taken[[b, a]]
                 apart[:, [i, j]] = apart[:, [j, i]]
         return self.order
+
+
+def markers_told(motions: Sequence[Motion]) -> Metric:
+    """Over which markers the mean distance of motions of one body is taken."""
+    seen = {label for motion in motions for label, column in zip(motion.labels, motion.residuals.T, strict=True)
+            if np.isfinite(column).any()}
+    out = sorted({label for motion in motions for label in motion.distrusted})
+    without = f", without {', '.join(out)}" if out else ""
+    return Metric("markers in the mean distance", f"{len(seen) - len(out)} of {len(seen)}{without}")
+
+
+def hardly_believed(motions: Sequence[Motion]) -> tuple[str, ...]:
+    """A reason to look at motions of one body: markers that are distrusted throughout."""
+    out = sorted({label for motion in motions for label in motion.distrusted})
+    return (f"{', '.join(out)} hardly ever believed: not worn where the layout has it, and not in the mean distance",
+            ) if out else ()
 
 
 def motion_problem(motion: Motion, body: Mesh, layout: MarkerLayout, markers: MarkerSequence) -> str | None:

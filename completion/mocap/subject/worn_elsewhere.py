@@ -1,0 +1,280 @@
+"""Markers that are not worn where the layout has them: sought over the whole body, pairs of exchanged names first.
+
+A marker that keeps its place on the skin, but another one than the layout's, is an outlier in every frame. The body is
+fitted to the others; where it then has the marker, in frames that differ most, is where the marker is worn.
+"""
+from __future__ import annotations
+
+from collections.abc import Collection, Sequence
+from dataclasses import dataclass, replace
+from itertools import combinations
+
+import numpy as np
+
+from model.body import BodyModel
+from scanprep.console import Metric
+from scanprep.geometry.mesh import Mesh
+
+from ..files.markers import MarkerSequence
+from ..marker_sets.layout import DISTANCE, MarkerLayout
+from ..marker_sets.symmetry import label_pairs
+from .person import PersonConfig, PersonFit, common_markers, find_person
+
+SUSPECT = 0.04                       # metres, RMS over frames, from its usual place, from which on a marker is left out
+FAR = 0.06                           # the same on a body that was fitted roughly, or without it: worn elsewhere
+NEAR = 0.02                          # metres within which another place explains a marker, at least
+USUAL = 1.5                          # times that of the other markers from their usual places, likewise
+GAIN = 0.4                           # share of the distance from the usual place that another place leaves at most
+LIMB = 0.2                           # metres along its part that a loose marker may be off its usual place
+FEW = 4                              # frames that must have seen a marker for anything to be told of it
+ROUNDS = 4                           # most times that the body is fitted without the suspects
+SEVERAL = 5                          # suspects from which on left and right are tried the other way round
+MOST = 0.25                          # share of the markers beyond which not they are at fault, but the body
+ROUGH_BETAS, ROUGH_STAGES = 20, (40.0, 10.0, 2.0, 1.0)  # of those fits: few betas do not follow a wrong marker
+
+
+@dataclass(frozen=True, eq=False)
+class MovedMarker:
+    """A marker that is worn elsewhere.
+
+    Attributes
+    ----------
+    label : str
+    corners : (3,) int
+        The vertices of the triangle on which it was found.
+    weights : (3,) float
+        Of the corners.
+    distance : float, metres
+        From the skin.
+    before, after : float, metres
+        RMS distance over the frames from where the layout has it, and from where it was found.
+    """
+
+    label: str
+    corners: np.ndarray
+    weights: np.ndarray
+    distance: float
+    before: float
+    after: float
+
+
+@dataclass(frozen=True, eq=False)
+class Worn:
+    """How the markers are worn, as far as the layout is wrong about it.
+
+    Attributes
+    ----------
+    moved : tuple of MovedMarker
+    exchanged : pairs of labels
+        Markers that bear each other's name throughout.
+    unplaced : labels
+        Markers that are far from where the layout has them and that no place on the skin explains.
+    """
+
+    moved: tuple[MovedMarker, ...] = ()
+    exchanged: tuple[tuple[str, str], ...] = ()
+    unplaced: tuple[str, ...] = ()
+
+    @property
+    def changes(self) -> bool:
+        """Whether anything is to be done otherwise than the layout says."""
+        return bool(self.moved or self.exchanged)
+
+    def metrics(self) -> list[Metric]:
+        """A row for each thing that is otherwise than the layout says."""
+        return [*(Metric("names exchanged throughout, put back", " and ".join(pair)) for pair in self.exchanged),
+                *(Metric(f"worn elsewhere, moved there ({m.label})", 1000 * m.before, "mm") for m in self.moved),
+                *(Metric("far from the layout's place, and found nowhere", label) for label in self.unplaced)]
+
+    def named(self, sequence: MarkerSequence, layout: MarkerLayout) -> MarkerSequence:
+        """A sequence with exchanged names put back."""
+        return MarkerSequence(sequence.positions[:, self.order(sequence, layout)], sequence.labels, sequence.rate)
+
+    def order(self, sequence: MarkerSequence, layout: MarkerLayout) -> np.ndarray:
+        """From which column (L,) of a sequence each of its labels is to be taken."""
+        rows = {layout.aliases.get(label, label): sequence.labels.index(label)
+                for label in layout.matched(sequence.labels, 0)}
+        order = np.arange(len(sequence.labels))
+        for first, second in self.exchanged:
+            if first in rows and second in rows:
+                two = [rows[first], rows[second]]
+                order[two] = order[two[::-1]]
+        return order
+
+    def placed(self, layout: MarkerLayout) -> MarkerLayout:
+        """A layout with the moved markers where they are worn, at its end, and none of them loose."""
+        if not self.moved:
+            return layout
+        found = MarkerLayout(tuple(m.label for m in self.moved), np.array([m.corners for m in self.moved]),
+                             np.array([m.distance for m in self.moved]), np.array([m.weights for m in self.moved]))
+        return replace(layout.without(found.labels).joined(found), aliases=layout.aliases)
+
+
+class _Frames:
+    """The bodies of a person in their frames, and the markers there."""
+
+    def __init__(self, model: BodyModel, person: PersonFit, sequences: Sequence[MarkerSequence], layout: MarkerLayout
+                 ) -> None:
+        self.layout, positions = common_markers(sequences, layout)
+        self.targets = np.stack([positions[which][t] for which, t in person.frames])                  # (B, L, 3)
+        vertices = model.subject(person.betas).vertices(person.poses, person.trans).astype(float)
+        self.bodies = [model.template.with_vertices(v) for v in vertices]
+        self.normals = [body.vertex_normals for body in self.bodies]
+        self.part = model.skeleton.part_of_vertex(model.template)
+        self.template: Mesh = model.template
+        self.places = np.stack([self.layout.place(body) for body in self.bodies])                     # (B, L, 3)
+
+    def off_skin(self, row: int, distance: float) -> np.ndarray:
+        """(N,) RMS distance of a marker from every vertex, lifted off the skin so far, metres."""
+        return _rms(np.stack([np.linalg.norm(body.vertices + distance * normals - target, axis=1)
+                              for body, normals, target in
+                              zip(self.bodies, self.normals, self.targets[:, row], strict=True)]))
+
+    def off_place(self, row: int, of: int) -> float:
+        """RMS distance of a marker from the usual place of one, that of a loose one anywhere along its part, metres."""
+        apart = float(_rms(np.linalg.norm(self.targets[:, row] - self.places[:, of], axis=1)))
+        if self.layout.labels[of] not in self.layout.loose:
+            return apart
+        centre = self.layout.nearest[of]
+        near = (np.linalg.norm(self.template.vertices - self.template.vertices[centre], axis=1) < LIMB) \
+            & (self.part == self.part[centre])
+        return min(apart, float(self.off_skin(row, float(np.asarray(self.layout.distances)[of]))[near].min()))
+
+    def off_usual(self) -> np.ndarray:
+        """(L,) the same of every marker from its own, NaN for one that too few frames have seen."""
+        often = np.isfinite(self.targets[..., 0]).sum(axis=0) >= FEW
+        return np.array([self.off_place(row, row) if seen else np.nan for row, seen in enumerate(often)])
+
+
+def _rms(apart: np.ndarray) -> np.ndarray:
+    """The root of the mean square over the first axis, of what is not NaN."""
+    seen = np.isfinite(apart)
+    total, count = np.where(seen, apart, 0.0)**2, seen.sum(axis=0)
+    return np.where(count > 0, np.sqrt(total.sum(axis=0) / np.maximum(count, 1)), np.nan)
+
+
+def find_worn(model: BodyModel, sequences: Sequence[MarkerSequence], layout: MarkerLayout, person: PersonFit,
+              config: PersonConfig) -> Worn:
+    """Which markers are worn elsewhere than in a layout, and where; which pairs bear each other's name.
+
+    The body is fitted without the markers that are suspected until they are the same as before. One that it puts back
+    near its usual place, though it was left out, is where it should be and not suspected again.
+
+    Parameters
+    ----------
+    model : BodyModel
+    sequences : MarkerSequences of one subject
+    layout : MarkerLayout
+        Where markers usually sit.
+    person : PersonFit
+        Fitted to all of them.
+    config : PersonConfig
+
+    [MoSh]
+    """
+    at = _Frames(model, person, sequences, layout)
+    rough = replace(config, n_betas=ROUGH_BETAS, annealing=ROUGH_STAGES)
+    sides, sequences, at = _exchanged_sides(model, sequences, layout, at, rough)
+    suspects, cleared, far = frozenset[str](), frozenset[str](), FAR if sides else SUSPECT
+    for _ in range(ROUNDS):
+        off = dict(zip(at.layout.labels, np.nan_to_num(at.off_usual()).tolist(), strict=True))
+        cleared |= {label for label in suspects if off[label] <= FAR}
+        before, suspects = suspects, frozenset(label for label in off if label not in cleared and off[label] > far)
+        if len(suspects) > MOST * len(off):
+            return Worn(unplaced=tuple(label for label in at.layout.labels if label in suspects))
+        if suspects == before:
+            break
+        far = FAR
+        at = _without(model, sequences, layout, suspects, rough)
+    if suspects:
+        at = _without(model, sequences, layout, suspects, config)
+    found = _explained(at, suspects)
+    again = set(sides) & set(found.exchanged)                           # exchanged, and put back
+    return replace(found, exchanged=tuple(pair for pair in (*sides, *found.exchanged) if pair not in again))
+
+
+def _without(model: BodyModel, sequences: Sequence[MarkerSequence], layout: MarkerLayout, suspects: Collection[str],
+             config: PersonConfig) -> _Frames:
+    """The body that is fitted without some markers, and all markers on it."""
+    others = layout.without([label for label in layout.labels if label in suspects])
+    return _Frames(model, find_person(model, sequences, others, config), sequences, layout)
+
+
+def _exchanged_sides(model: BodyModel, sequences: Sequence[MarkerSequence], layout: MarkerLayout, at: _Frames,
+                     rough: PersonConfig) -> tuple[tuple[tuple[str, str], ...], Sequence[MarkerSequence], _Frames]:
+    """Left and right exchanged on a limb or the whole body, where many markers are far off: others do not tell then.
+
+    Returned are the pairs, the sequences under their right names, and the body on them.
+    """
+    labels, off = at.layout.labels, np.nan_to_num(at.off_usual())
+    best: tuple[tuple[tuple[str, str], ...], Sequence[MarkerSequence], _Frames] = (), sequences, at
+    for tried in _limbs(model.skeleton.parents, at) if (off > FAR).sum() >= SEVERAL else ():
+        names = Worn(exchanged=tuple((labels[i], labels[j]) for i, j in tried))
+        renamed = [names.named(each, layout) for each in sequences]
+        other = _Frames(model, find_person(model, renamed, layout, rough), renamed, layout)
+        if _burden(other) < 0.5 * _burden(at) and _burden(other) < _burden(best[2]):
+            best = names.exchanged, renamed, other
+    return best
+
+
+def _limbs(parents: np.ndarray, at: _Frames) -> list[list[tuple[int, int]]]:
+    """The pairs of left and right: all, and those of each pair of limbs, which part where their bones do."""
+    def way(part: int) -> list[int]:
+        return [*(way(int(parents[part])) if part else []), part]
+
+    pairs = [(i, int(j)) for i, j in enumerate(label_pairs(at.layout.labels)) if i < j]
+    limbs: dict[tuple[int, int], list[tuple[int, int]]] = {}
+    for i, j in pairs:
+        fork = next((both for both in zip(*(way(int(at.part[at.layout.nearest[k]])) for k in (i, j)), strict=False)
+                     if both[0] != both[1]), None)
+        if fork:
+            limbs.setdefault(fork, []).append((i, j))
+    return [pairs, *limbs.values()] if pairs else []
+
+
+def _burden(at: _Frames) -> float:
+    """How badly a body explains its markers; beyond some distance it does not matter how far they are."""
+    return float(np.minimum(np.nan_to_num(at.off_usual()), 2 * FAR).sum())
+
+
+def _explained(at: _Frames, suspects: Collection[str]) -> Worn:
+    """What explains the suspects: a pair of exchanged names, or another place on the skin."""
+    if not suspects:
+        return Worn()
+    labels, usual = at.layout.labels, at.off_usual()
+    others = [i for i, label in enumerate(labels) if label not in suspects]
+    limit = max(NEAR, USUAL * float(np.nanmedian(usual[others])))
+    rows, exchanged = {i for i, label in enumerate(labels) if label in suspects and usual[i] > FAR}, []
+    crossed = [(at.off_place(i, j), at.off_place(j, i), i, j) for i, j in combinations(sorted(rows), 2)]
+    for one, other, i, j in sorted(crossed, key=lambda both: max(both[:2])):
+        if {i, j} <= rows and max(one, other) < FAR and one + other < GAIN * (usual[i] + usual[j]):
+            exchanged.append((labels[i], labels[j]))
+            rows -= {i, j}
+    found = {row: _best_place(at, row, float(usual[row])) for row in sorted(rows)}
+    moved = {row: m for row, m in found.items() if m.after < limit and m.after < GAIN * m.before}
+    return Worn(tuple(moved.values()), tuple(exchanged), tuple(labels[row] for row in found if row not in moved))
+
+
+def _best_place(at: _Frames, row: int, before: float) -> MovedMarker:
+    """Where on the skin a marker is nearest, at its own distance from it or that of a common one. [MoSh]"""
+    own = float(np.asarray(at.layout.distances)[row])
+    tried = []
+    for distance in {own, DISTANCE}:
+        vertex = int(at.off_skin(row, distance).argmin())
+        tried += [MovedMarker(at.layout.labels[row], corners, weights, distance, before, after)
+                  for corners in at.template.faces[(at.template.faces == vertex).any(axis=1)]
+                  for weights, after in [_on_triangle(at, row, distance, corners)]]
+    return min(tried, key=lambda m: m.after)
+
+
+def _on_triangle(at: _Frames, row: int, distance: float, corners: np.ndarray) -> tuple[np.ndarray, float]:
+    """The weights (3,) of a triangle's corners that come nearest to a marker, lifted so far, and its RMS distance."""
+    lifted = np.stack([body.vertices[corners] + distance * normals[corners]
+                       for body, normals in zip(at.bodies, at.normals, strict=True)])                 # (B, 3, 3)
+    target = at.targets[:, row]
+    seen = np.isfinite(target[:, 0])
+    sides = (lifted[seen, 1:] - lifted[seen, :1]).swapaxes(1, 2).reshape(-1, 2)
+    share = np.linalg.lstsq(sides, (target - lifted[:, 0])[seen].ravel(), rcond=None)[0]
+    weights = np.maximum([1 - share.sum(), *share], 0)
+    weights /= weights.sum()
+    return weights, float(_rms(np.linalg.norm(np.einsum("c,bcd->bd", weights, lifted) - target, axis=1)))
