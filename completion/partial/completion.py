@@ -1,7 +1,7 @@
 """Completion of a partial scan: a start from landmarks, the pose and shape, then the free surface; and its folder."""
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -25,7 +25,7 @@ from .free_surface import free_surface
 from .inputs import in_metres
 from .limbs import reinitialise_limbs
 from .scale import ScaledBody
-from .scan import View
+from .scan import Scan
 from .settings import CompletionConfig
 from .starts import best_start, first_starts
 
@@ -96,17 +96,16 @@ class Completion:
 
 
 @one_thread()
-def complete(body: BodyModel | Subject, scan: View | Sequence[View],
-             landmarks: tuple[np.ndarray, np.ndarray] | None = None, config: CompletionConfig | None = None,
-             progress: Progress | None = None, masked: np.ndarray | None = None) -> Completion:
+def complete(body: BodyModel | Subject, scan: Scan, landmarks: tuple[np.ndarray, np.ndarray] | None = None,
+             config: CompletionConfig | None = None, progress: Progress | None = None, masked: np.ndarray | None = None) -> Completion:
     """The whole body from a scan of some of it.
 
     Parameters
     ----------
     body : BodyModel or Subject
         A model when the person's shape is unknown, a subject when it is known.
-    scan : Mesh, PointCloud, (n, 3) or (n, 6) float, metres, or a sequence of these
-        A sequence holds several views in one frame; (n, 6) are points with normals. In any unit where
+    scan : Mesh, PointCloud, (n, 3) or (n, 6) float, metres, or a sequence of these, or a DepthPicture
+        A depth picture holds one person, and floor and walls, which are taken away. A sequence holds several views in one frame; (n, 6) are points with normals. In any unit where
         `config.free_scale` says so.
     landmarks : ((L,) int, (L, 3) float), optional
         Vertices of the template and where they are on the scan; 4 to 10, at least 3. Without them the search
