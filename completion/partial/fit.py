@@ -18,6 +18,7 @@ from .free_space import Clothing, Contact, Outside, Violation, find_cameras, fre
 from .masks import part_vertices
 from .scan import ScanPoints, spread
 from .settings import CompletionConfig
+from .upright import TILT, Upright
 
 Terms = dict[str, Residual]
 
@@ -50,6 +51,7 @@ class ScanFit:
         self.ignored = part_vertices(body.template, body.skeleton, config.ignored_parts)
         self.matched = self.spread[~self.ignored[self.spread]]
         self.part = body.skeleton.part_of_vertex(body.template)
+        self.upright = Upright.of(body.template, body.skeleton, config.up, cloud.person is not None)
         self.contact = Contact(body.skeleton, self.part[self.spread])
         self.rng = np.random.default_rng(config.seed)
         self._take(cloud)
@@ -146,13 +148,15 @@ class ScanFit:
         return float(sum(term.energy[0] for term in self.prior_terms(x[None]).values()))
 
     def prior_terms(self, x: np.ndarray) -> Terms:
-        """What is known of poses (B, P) beforehand: the Gaussian, and joint limits where asked for.
+        """What is known of poses (B, P) beforehand: the Gaussian, joint limits where asked for, and that people stand.
 
         [SCAPE-patent] §0090
         """
         weight = self.config.prior_weight
         limits = {} if self.limits is None else {"joint_limits": energy.joint_limits(x, self.limits, weight)}
-        return {"pose_prior": energy.pose_prior(x, self.prior, weight), **limits}
+        stands = {} if self.upright is None else {"upright": energy.upright(x, self.upright.of_body,
+                                                                            self.upright.nearest(x), TILT)}
+        return {"pose_prior": energy.pose_prior(x, self.prior, weight), **limits, **stands}
 
     def step(self, x: np.ndarray, scan: ScanPoints, reach: float) -> tuple[np.ndarray, dict[str, float]]:
         """One matching and the best unknowns (P,) for it, and the energies there."""

@@ -53,6 +53,9 @@ class CompletionConfig(Settings):
         How far clothing and hair, of which `complete` is told, usually stand off the skin.
     viewpoint : (3,) floats, metres, or one for each view, optional
         Where the scan was seen from; found by itself when not given.
+    up : (3,) floats, optional
+        The direction that is up in the scan, where people in it mostly stand; without it all directions are tried,
+        and for a depth picture its four sides.
     ignored_parts : names of parts
         Parts of the body that the scan says nothing about, though it may show something there.
     free_scale : bool
@@ -78,6 +81,7 @@ class CompletionConfig(Settings):
     contact_weight: float = 0.5
     clothing_sd: Positive = 0.06
     viewpoint: tuple[Signed, Signed, Signed] | tuple[tuple[Signed, Signed, Signed], ...] | None = None
+    up: tuple[Signed, Signed, Signed] | None = None
     ignored_parts: tuple[str, ...] = ()
     free_scale: bool = False
     tolerance: float = 0.01

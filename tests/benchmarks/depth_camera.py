@@ -195,7 +195,7 @@ def attempt(case: Case, body: BodyModel, data: RealData, marks: str, part: np.nd
             ) -> tuple[dict[str, Any], Completion | None]:
     """A row, and the completion unless it was refused."""
     rng, start, cpu = np.random.default_rng(7), time.perf_counter(), time.process_time()
-    config = CompletionConfig()
+    config = CompletionConfig(up=tuple(case.up)) if marks == "up" else CompletionConfig()
     pairs = case.landmarks(data.landmarks, int(marks), rng) if marks.isdigit() else None
     row = {**case.facts, "marks": marks}
     try:
