@@ -214,7 +214,7 @@ def _distances(y: np.ndarray, n: np.ndarray, turns: np.ndarray, shift: np.ndarra
     # |a - b|² = |a|² + (|b|² - 2 a·b); a piece at a time, so that it stays near the processor
     nearest = np.concatenate([(squared + have @ (-2 * some.T)).min(axis=0)
                               for some in np.array_split(ask, 1 + len(ask) // AT_ONCE)]) + (ask**2).sum(axis=1)
-    return np.minimum(nearest, CAP**2).reshape(len(turns), -1).mean(axis=1)
+    return np.minimum(nearest, CAP**2).reshape(len(turns), len(scan.points)).mean(axis=1)
 
 
 def _rotated(pose: np.ndarray, R: np.ndarray) -> np.ndarray:

@@ -7,7 +7,7 @@ import numpy as np
 from scipy import ndimage
 from scipy.spatial import cKDTree
 
-from .picture import JUMP, NOISE, DepthPicture
+from .picture import JUMP, NOISE, SMOOTHED, DepthPicture
 
 # Lengths are in sizes of the body, the root of its surface area (1.36 m for a man), areas in squares of it.
 LEAST_AREA, LEAST_RADIUS = 0.07, 0.07   # of what is seen of a body, and of the largest circle in it: a leg has less
@@ -40,11 +40,15 @@ class Person:
         return replace(self.picture, depth=np.where(self.mask, self.picture.depth, np.nan))
 
     def oriented_points(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
-        """Points (n, 3), metres, their normals (n, 3) towards the camera, and which are at the edge of a surface (n,)."""
-        alone = self.alone()
+        """Points (n, 3), metres, their normals (n, 3) towards the camera, and which are at the edge of a surface (n,).
+
+        Near a jump in depth neither a pixel nor its normal can be trusted, and it is left out.
+        """
+        alone, reach = self.alone(), np.ones((2 * SMOOTHED + 1,) * 2)
         points, normals = alone.points(), alone.normals()
-        found = self.mask & np.isfinite(normals).all(axis=2)
-        edge = ~ndimage.binary_erosion(_one_surface(alone), np.ones((3, 3)), border_value=0)
+        smooth = ndimage.binary_erosion(_one_surface(alone) | ~self.mask, reach, border_value=1)
+        found = self.mask & smooth & np.isfinite(normals).all(axis=2)
+        edge = ~ndimage.binary_erosion(found, np.ones((3, 3)), border_value=0)
         return points[found], normals[found], edge[found]
 
 
