@@ -11,6 +11,7 @@ from .body import BodyModel
 from .linear import check_pose
 
 LEAST_POSES = 5
+STIFF = np.radians(5)                # a joint that rotated less in every pose was not seen to bend
 
 
 def whitening(covariance: np.ndarray, shrinkage: float = 0.3, floor: float = 0.15) -> np.ndarray:
@@ -59,6 +60,13 @@ def typical_poses(mean: np.ndarray, covariance: np.ndarray, axes: int, deviation
     step = np.zeros((len(kept), mean.size))
     step[:, 3:] = deviation * (np.sqrt(variance[kept]) * direction[:, kept]).T
     return mean + np.concatenate([np.zeros((1, mean.size)), step, -step]).reshape(-1, *mean.shape)
+
+
+def stiff_joints(poses: np.ndarray) -> np.ndarray:
+    """Parts whose joints never rotated more than `STIFF` in poses (M, J, 3), radians; none where there are no poses."""
+    if not len(poses):
+        return np.zeros(0, dtype=np.int64)
+    return 1 + np.flatnonzero(np.linalg.norm(poses[:, 1:], axis=-1).max(axis=0) < STIFF)
 
 
 def sample_poses(model: BodyModel, count: int, rng: np.random.Generator, limits: JointLimits | None = None

@@ -1,13 +1,20 @@
 import json
+from dataclasses import replace
 
 import numpy as np
 import pytest
 from completion_bodies import worm_with_prior
 
-from completion.partial.completion import Completion, load_completion, save_completion
+from completion.bodies import FixedBody
+from completion.partial.completion import Completion, doubts, load_completion, save_completion
+from completion.partial.fit import ScanFit
+from completion.partial.scan import prepare_scan
+from completion.partial.settings import CompletionConfig
 from scanprep.geometry import storage
+from scanprep.judgement import Judgement
 
-MODEL = worm_with_prior()
+MODEL = replace(worm_with_prior(), skeleton=replace(worm_with_prior().skeleton,
+                                                    names=("trunk", "upper_arm_left", "forearm_left", "head")))
 
 
 def made(betas):
@@ -15,7 +22,8 @@ def made(betas):
     mesh = MODEL.template.with_vertices(MODEL.vertices(pose, betas))
     error = rng.random(398)
     return Completion(mesh.with_vertices(mesh.vertices + 0.01), mesh, pose, betas, np.ones(3), error > 0.5, 0.002, 0.9,
-                      0.01, True, 9, {"scan_planes": 3.5}, 0.001, error, 1 - error)
+                      0.01, True, 9, {"scan_planes": 3.5}, 0.001, error, 1 - error,
+                      Judgement("check", ("the left hand may be 90 mm off, nothing of it was seen", "a leg")))
 
 
 @pytest.mark.parametrize("betas", [None, np.arange(3.0)], ids=["known", "unknown"])
@@ -25,7 +33,7 @@ def test_a_completion_comes_back_from_its_folder(tmp_path, betas):
     for name in ("pose", "trans", "seen", "expected_error", "confidence"):
         np.testing.assert_array_equal(getattr(again, name), getattr(saved, name))
     assert again.betas is None if betas is None else np.array_equal(again.betas, betas)
-    for name in ("rms", "explained", "landmark_rms", "converged", "iterations", "energies", "scale"):
+    for name in ("rms", "explained", "landmark_rms", "converged", "iterations", "energies", "scale", "judgement"):
         assert getattr(again, name) == getattr(saved, name)
     for name in ("completed", "predicted"):
         np.testing.assert_allclose(getattr(again, name).vertices, getattr(saved, name).vertices, atol=1e-6)
@@ -39,10 +47,11 @@ def test_a_folder_of_the_first_version_is_read_without_what_it_lacks(tmp_path):
     with np.load(path) as kept:
         header = json.loads(str(kept["header"]))
         arrays = {name: kept[name] for name in ("pose", "trans", "seen")}
-    facts = {name: header[name] for name in header if name not in ("kind", "version", "scale")}
+    facts = {name: header[name] for name in header if name not in ("kind", "version", "scale", "judgement")}
     storage.save(path, "completion", 1, arrays, facts)
     again = load_completion(tmp_path)
     assert again.scale == 1 and again.expected_error is None and again.confidence is None and again.rms == saved.rms
+    assert again.judgement.verdict == "check" and "no judgement" in again.judgement.why
     save_completion(tmp_path, again)
     assert load_completion(tmp_path).confidence is None
 
@@ -52,3 +61,27 @@ def test_a_folder_that_lacks_an_array_is_refused(tmp_path):
     storage.save(tmp_path / "completion.npz", "completion", 2, {"pose": np.zeros((4, 3))}, {})
     with pytest.raises(storage.StorageError, match="it lacks"):
         load_completion(tmp_path)
+
+
+def test_parts_that_may_be_far_off_are_named_the_worst_first():
+    body, x = FixedBody(MODEL.subject(None)), np.zeros(15)
+    fit = ScanFit(body, prepare_scan(MODEL.template.vertices), np.zeros(0, dtype=np.int64), np.zeros((0, 3)),
+                  CompletionConfig())
+    error, seen = np.full(398, 0.004), np.ones(398, dtype=bool)
+    assert doubts(fit, x, error, seen) == []
+    error[fit.part == 1] = 0.08
+    seen[np.flatnonzero(fit.part == 1)[::2]] = False
+    error[fit.part == 2], seen[fit.part == 2] = 0.25, False
+    assert doubts(fit, x, error, seen) == ["the left forearm may be 250 mm off, nothing of it was seen",
+                                           "the left upper arm may be 80 mm off, 50% of it was seen"]
+
+
+def test_a_bend_that_the_model_never_saw_is_named():
+    poses = np.random.default_rng(0).normal(0, 0.4, (6, 4, 3)) * np.array([0, 1, 0.01, 1])[:, None]
+    fit = ScanFit(FixedBody(replace(MODEL, pose_examples=poses).subject(None)), prepare_scan(MODEL.template.vertices),
+                  np.zeros(0, dtype=np.int64), np.zeros((0, 3)), CompletionConfig())
+    x = np.zeros(15)
+    x[[3, 6]] = np.radians(50)                                        # of the second part poses say that it bends
+    fine = np.full(398, 0.004), np.ones(398, dtype=bool)
+    assert doubts(fit, x, *fine) == ["the left elbow is bent by 50 degrees, and never was when the model was learned"]
+    assert doubts(fit, x / 5, *fine) == []

@@ -7,11 +7,11 @@ from completion_bodies import half_view, worm_with_prior
 from completion.bodies import FixedBody
 from completion.partial.completion import complete
 from completion.partial.fit import ScanFit
-from completion.partial.free_space import find_camera
+from completion.partial.free_space import Outside, find_camera
 from completion.partial.limbs import examples_of
 from completion.partial.scan import prepare_scan
 from completion.partial.settings import CompletionConfig
-from completion.partial.starts import AXES, Outside, all_rotations, from_nothing, placements, starting_poses, varied
+from completion.partial.starts import AXES, all_rotations, from_nothing, placements, starting_poses, varied
 from scanprep.geometry import rotations
 from scanprep.geometry.surface import Surface
 

@@ -24,7 +24,7 @@ from completion.partial.work import Inputs, Work, complete_files
 from completion.tracking.sequence import tracking_problem
 from model.coregistration.rounds import coregistration_problem
 from model.evaluation.errors import Errors, errors_problem
-from model.learning.scape import learning_problem
+from model.learning.scape import judge_model, learning_problem
 from scanprep import Mesh, write_landmarks, write_mesh
 from scanprep.alignment.views import align_views, views_problem
 from scanprep.batch.room import Room
@@ -198,6 +198,18 @@ def test_models_mean_nothing_when_their_errors_are_a_hands_width():
     assert "--unit" in learning_problem(model, 1000 * body[None])
     wrong = dataclasses.replace(model, info={"left_out_error": 0.2})
     assert "200 mm" in learning_problem(wrong) and "too few poses" in learning_problem(wrong)
+
+
+def test_a_model_says_which_joints_it_never_saw_bend():
+    worm = worm_with_prior()
+    poses = np.random.default_rng(0).normal(0, 0.3, (8, 4, 3))
+    poses[:6, 2], poses[6:, 2] = np.radians([0, 3, 3]), 0.5            # only how the people stand bends it
+    skeleton = dataclasses.replace(worm.skeleton, names=("trunk", "head", "forearm_right", "tail"))
+    model = dataclasses.replace(worm, skeleton=skeleton, pose_examples=poses, info={"poses": 6})
+    found = judge_model(model)
+    assert found.verdict == "check" and found.why.startswith("the right elbow never bent more than 5 degrees")
+    assert judge_model(dataclasses.replace(model, info={"poses": 8})).verdict == "good"
+    assert judge_model(dataclasses.replace(model, info={"poses": 6, "left_out_error": 0.2})).verdict == "failed"
 
 
 def test_errors_of_bodies_in_another_unit_mean_nothing():

@@ -6,7 +6,7 @@ from animal_bodies import Animal, Build
 from scanprep.geometry import rotations
 from scanprep.geometry.mesh import Mesh
 from scanprep.skeleton.edit import merge_parts, split_part
-from scanprep.skeleton.names import name_parts
+from scanprep.skeleton.names import in_words, joint_in_words, name_parts
 from scanprep.skeleton.symmetry import find_symmetry
 from scanprep.skeleton.tree import Skeleton
 from scanprep.synthetic.people import BodyShape, Person
@@ -86,3 +86,11 @@ def test_what_is_no_person_keeps_its_names(person):
     tailless = Animal(Build(aside=0.0))
     skeleton = unnamed(merge_parts(tailless.skeleton, tailless.mesh, "barrel", "tail"))
     assert named(tailless.mesh, skeleton) == skeleton.names
+
+
+@pytest.mark.parametrize(("name", "part", "joint"), [
+    ("forearm_left", "left forearm", "left elbow"), ("upper_arm_right", "right upper arm", "right shoulder"),
+    ("head", "head", "neck"), ("tail", "tail", "joint of the tail"),
+    ("spine_2", "spine 2", "joint of the spine 2"), ("thigh2_left", "left thigh2", "joint of the left thigh2")])
+def test_names_in_words(name, part, joint):
+    assert in_words(name) == part and joint_in_words(name) == joint

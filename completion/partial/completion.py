@@ -10,11 +10,12 @@ import numpy as np
 
 from model.body import BodyModel
 from model.linear import Subject
+from model.priors import stiff_joints
 from scanprep.geometry import storage
 from scanprep.geometry.files import check_same_topology, read_mesh, write_mesh
 from scanprep.geometry.mesh import Mesh
 from scanprep.judgement import HAND, Judgement, extent, size, unit_problem
-from scanprep.skeleton.names import in_words
+from scanprep.skeleton.names import in_words, joint_in_words
 from scanprep.threads import one_thread
 
 from ..bodies import as_body
@@ -31,12 +32,14 @@ from .starts import best_start, first_starts
 
 Progress = Callable[[int, int], None]
 
-KIND, VERSION = "completion", 2       # 1 had no scale, expected error and confidence
+KIND, VERSION = "completion", 3       # 1 had no scale, expected error and confidence, 2 no judgement
 _ARRAYS = ("pose", "betas", "trans", "seen", "expected_error", "confidence")
 _FACTS = ("rms", "explained", "landmark_rms", "converged", "iterations")
 
 DOUBTFUL = 0.06                      # metres that a part is expected to be off, from which on it is to be looked at
+BENT = np.radians(20)                # rotation that is more than an error, of a joint that was not seen to bend
 LOST = 0.5                           # share of a scan explained below which a completion means nothing
+UNJUDGED = Judgement.of(check=["no judgement was made"])
 ASTRAY, ENOUGH = 0.016, 0.9          # so far landmarks, of the size, and so little explained: left and right exchanged
 
 
@@ -74,7 +77,7 @@ class Completion:
     confidence : (N,) float in [0, 1]
         Probability that the vertex is within `config.tolerance` of the truth. None in files of earlier versions.
     judgement : Judgement
-        Whether it can be used as it is, and why not. None in files of earlier versions.
+        Whether it can be used as it is, and why not. Of files of earlier versions: to be looked at.
     """
 
     completed: Mesh
@@ -92,7 +95,7 @@ class Completion:
     scale: float = 1.0
     expected_error: np.ndarray | None = None
     confidence: np.ndarray | None = None
-    judgement: Judgement | None = None
+    judgement: Judgement = UNJUDGED
 
 
 @one_thread()
@@ -164,6 +167,10 @@ def doubts(fit: ScanFit, x: np.ndarray, error: np.ndarray, seen: np.ndarray) -> 
             share = f"{100 * seen[fit.part == p].mean():.0f}% of it was seen" if seen[fit.part == p].any() else \
                 "nothing of it was seen"
             found.append(f"the {in_words(names[p])} may be {1000 * off:.0f} mm off, {share}")
+    angles = np.linalg.norm(fit.body.split(x)[0], axis=1)
+    found += [f"the {joint_in_words(names[j])} is bent by {np.degrees(angles[j]):.0f} degrees, "
+              f"and never was when the model was learned"
+              for j in stiff_joints(fit.body.pose_examples) if angles[j] > BENT]
     return found
 
 
@@ -192,7 +199,7 @@ def save_completion(folder: str | Path, completion: Completion) -> Path:
     write_mesh(folder / "predicted.ply", completion.predicted)
     arrays = {name: getattr(completion, name) for name in _ARRAYS if getattr(completion, name) is not None}
     facts = {name: getattr(completion, name) for name in (*_FACTS, "energies", "scale")}
-    facts["judgement"] = None if completion.judgement is None else str(completion.judgement)
+    facts["judgement"] = str(completion.judgement)
     storage.save(folder / "completion.npz", KIND, VERSION, arrays, facts)
     return folder
 
@@ -201,7 +208,7 @@ def load_completion(folder: str | Path) -> Completion:
     """Read a folder of `save_completion`."""
     folder = Path(folder)
     path = folder / "completion.npz"
-    header, arrays = storage.load(path, KIND, (1, VERSION))
+    header, arrays = storage.load(path, KIND, tuple(range(1, VERSION + 1)))
     with storage.taking_apart(path, "a whole completion"):
         completed, predicted = (read_mesh(folder / f"{name}.ply", unit="m") for name in ("completed", "predicted"))
         check_same_topology(folder / "predicted.ply", predicted, folder / "completed.ply", completed)
@@ -216,4 +223,4 @@ def load_completion(folder: str | Path) -> Completion:
                           converged=bool(header["converged"]), iterations=int(header["iterations"]),
                           energies={name: float(value) for name, value in header["energies"].items()},
                           scale=float(header["scale"]) if header["version"] > 1 else 1.0,
-                          judgement=Judgement.read(header["judgement"]) if header.get("judgement") else None)
+                          judgement=Judgement.read(header["judgement"]) if header["version"] > 2 else UNJUDGED)

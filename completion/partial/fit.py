@@ -26,6 +26,7 @@ LIKELY = 0.04                        # metres: matches closer than this are most
 SETTLED = 5e-4                       # metres, root mean square over the vertices from round to round
 REACH, WIDE_REACH, FINAL_REACH = 0.2, 0.08, 0.03    # metres: limits on the distance of matches, from first to last
 NARROWING, SETTLING = 3, 6           # rounds from the wide to the final reach; that a reach is held at most
+CLEARLY = 0.93                       # of the narrow reach's misfit, below which the wide one's is clearly less
 QUICK = 3000                         # vertices that a quick look takes
 BEYOND = 0.2                         # radians that joints may rotate farther than in the training poses
 MIN_COSINE = 0.6                     # between the normals of a match
@@ -265,15 +266,15 @@ def solve_jointly(fit: ScanFit, x: np.ndarray, tell: Callable[[int], None]) -> S
     """All unknowns at once from x (P,) on, in rounds of matching with shrinking reach.
 
     A model of many scans follows a scan closely, and matches that are farther off than it ever is are wrong. One of
-    few scans does not, and drops the limbs that it follows badly. So the rounds stop twice, at a wide reach and at a
-    narrow one, and what explains more is kept.
+    few scans does not, and drops the limbs that it follows badly. So the rounds settle at a wide reach first, then at
+    a narrow one, and the former is kept where it explains clearly more.
 
     [SCAPE] Eq. 10
     """
     rounds = fit.config.rounds
     wide = _in_rounds(fit, x, np.geomspace(REACH, WIDE_REACH, rounds), lambda i: tell(min(i, rounds)))
     narrow = _in_rounds(fit, wide.x, np.geomspace(WIDE_REACH, FINAL_REACH, NARROWING), lambda i: None)
-    best = min((narrow, wide), key=lambda solved: fit.misfit(solved.x))
+    best = wide if fit.misfit(wide.x) < CLEARLY * fit.misfit(narrow.x) else narrow
     return replace(best, rounds=wide.rounds + narrow.rounds)
 
 

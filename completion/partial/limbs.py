@@ -195,7 +195,7 @@ def limbs(skeleton: Skeleton) -> list[list[int]]:
 
 def examples_of(body: FixedBody, x: np.ndarray, root: int, count: int, rng: np.random.Generator) -> np.ndarray:
     """Draws (count or none, P) of the limb at a joint: as it is in known poses, loosened a little."""
-    known = body.known_poses.reshape(len(body.known_poses), -1)
+    known = body.known_poses.reshape(-1, body.n_angles)
     drawn = np.repeat(x[None], count if len(known) else 0, axis=0)
     if len(drawn):
         parts = np.flatnonzero(body.skeleton.descends[:, root])

@@ -18,14 +18,13 @@ from scanprep.console import Metric, Outcome, judgement_row, write_report
 from scanprep.geometry.files import POINT_ENDINGS, PointCloud, read_mesh, read_points
 from scanprep.geometry.landmarks import match_landmarks, read_landmarks
 from scanprep.geometry.mesh import Mesh
-from scanprep.judgement import Judgement
 from scanprep.pictures.page import Page
 from scanprep.pictures.sheets import save_png
 from scanprep.pictures.textures import Texture, bake, read_texture, write_textured
 from scanprep.pipeline.scans import find_scans
 
 from .colors import ColorConfig, blend, carry_colors, colored_views
-from .completion import Completion, complete, completion_problem, save_completion
+from .completion import Completion, complete, save_completion
 from .masks import read_mask
 from .report import completion_page, picture_completion
 from .scan import all_points, point_count

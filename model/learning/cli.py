@@ -19,7 +19,6 @@ from scanprep.geometry.files import list_meshes
 from scanprep.geometry.landmarks import read_landmark_vertices
 from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.tables import read_table
-from scanprep.judgement import Judgement
 from scanprep.ranges import Count
 from scanprep.skeleton.find import find_skeleton
 from scanprep.skeleton.parts import SkeletonConfig
@@ -30,7 +29,7 @@ from ..cli import about, read_bodies
 from .config import LearnConfig
 from .mixing import MIX, learn_scape_mix
 from .parts import choose_skeleton
-from .scape import Progress, learn_blendscape, learn_scape, learning_problem
+from .scape import Progress, judge_model, learn_blendscape, learn_scape
 from .sexes import learn_by_sex
 from .skinning import SkinConfig, learn_skinning
 
@@ -111,7 +110,7 @@ def learn(poses: Path, output: Output, shapes: Path | None = None, template: Pat
         *[Metric(f"people of the {name} model", model.info["shapes"]) for name, model in models.items() if by_sex],
         *_times(seconds, kept_steps.found)],
         {"scape": scape, "skinning": skinning, "mixed": mixed}, 
-        judgement=Judgement.of(learning_problem(models["neutral"], people)))
+        judgement=judge_model(models["neutral"], people))
 
 
 def _find_skeleton(body: Mesh, posed: np.ndarray, parts: int | None, step: Step, progress: Progress) -> Skeleton:

@@ -11,7 +11,8 @@ import numpy as np
 
 from scanprep.batch.room import Step, inside, once
 from scanprep.geometry.mesh import Mesh, check_template
-from scanprep.judgement import HAND, extent, size, unit_problem
+from scanprep.judgement import HAND, Judgement, extent, size, unit_problem
+from scanprep.skeleton.names import joint_in_words
 from scanprep.skeleton.tree import Skeleton
 from scanprep.threads import one_thread
 
@@ -25,6 +26,7 @@ from ..gradients import GradientSystem, pose_gradients, shape_gradients
 from ..human_poses import with_human_poses
 from ..linear import Subject
 from ..pose_space import PoseSpace
+from ..priors import STIFF, stiff_joints
 from ..scape import BlendScapeModel, ScapeModel
 from ..shape_space import ShapeSpace, learn_shape_space
 from .config import LearnConfig
@@ -333,6 +335,14 @@ def checked_bodies(template: Mesh, bodies: np.ndarray, name: str) -> np.ndarray:
     if len(bodies) < 2:
         raise ValueError(f"{name}: expected at least 2 bodies, got {len(bodies)}")
     return bodies
+
+
+def judge_model(model: BodyModel, people: np.ndarray | None = None) -> Judgement:
+    """What a model learned with people (S, N, 3), metres, is worth: whether it means nothing, what it never saw."""
+    stiff = stiff_joints(model.pose_examples[:model.info.get("poses")]) if model.pose_examples is not None else ()
+    names = [joint_in_words(model.skeleton.names[j]) for j in stiff]
+    unseen = f" never bent more than {np.degrees(STIFF):.0f} degrees in your poses, and will not bend well"
+    return Judgement.of(learning_problem(model, people), [f"the {', '.join(names)}{unseen}"] if names else [])
 
 
 def learning_problem(model: BodyModel, people: np.ndarray | None = None) -> str | None:

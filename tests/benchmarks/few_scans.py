@@ -59,11 +59,13 @@ def learned(data: RealData, offset: int, poses: int, men: int, folder: Path | No
     return model
 
 
-def judged(result: Completion) -> dict[str, Any]:
-    """What a completion says about itself."""
+def judged(result: Completion, part: np.ndarray) -> dict[str, Any]:
+    """What a completion says about itself; `part` (N,) of each vertex."""
     error = result.expected_error
+    means = [] if error is None else [1e3 * float(np.sqrt((of**2).mean())) for of in
+                                      (error[~result.seen], *(error[part == p] for p in range(part.max() + 1)))]
     return {"explained": result.explained, "converged": result.converged,
-            "expected_mm": None if error is None else 1e3 * float(np.sqrt((error[~result.seen]**2).mean())),
+            "expected_mm": means[0] if means else None, "expected_limb_mm": max(means[1:], default=None),
             **({"judgement": result.judgement.verdict, "reasons": list(result.judgement.reasons)}
                if hasattr(result, "judgement") else {})}
 
@@ -84,7 +86,7 @@ def half_views(data: RealData, model: BodyModel, known: bool, which: np.ndarray,
         found = errors(truth, view, result, part)
         row = {"offset": offset, "k": k, "index": int(which[k]),
                "seen_mm": found["completed_seen_mm"], "unseen_mm": found["completed_unseen_mm"],
-               "limb_mm": found["worst_part_mm"], "limb": found["worst_part"], **judged(result),
+               "limb_mm": found["worst_part_mm"], "limb": found["worst_part"], **judged(result, part),
                "cpu_seconds": round(time.process_time() - start, 1)}
         rows.append(row)
         print(row, flush=True)
