@@ -22,7 +22,8 @@ from ..bodies import as_body
 from .alternation import turns_of
 from .confidence import distance_to_seen, expected_error, posterior_error, probability_within
 from .fit import ScanFit, solve_jointly
-from .free_surface import free_surface
+from .free_space import free_space_violation
+from .free_surface import distance_to, free_surface
 from .inputs import in_metres
 from .limbs import reinitialise_limbs
 from .scale import ScaledBody
@@ -37,6 +38,8 @@ _ARRAYS = ("pose", "betas", "trans", "seen", "expected_error", "confidence")
 _FACTS = ("rms", "explained", "landmark_rms", "converged", "iterations")
 
 DOUBTFUL = 0.06                      # metres that a part is expected to be off, from which on it is to be looked at
+PART_SHOWN = 0.5                     # share of a part within the picture, below which it is beyond
+LOST_LIMB, ENTERED = 0.01, 0.01      # shares: of a picture's person without a body near, of the body in free space
 BENT = np.radians(20)                # rotation that is more than an error, of a joint that was not seen to bend
 LOST = 0.5                           # share of a scan explained below which a completion means nothing
 UNJUDGED = Judgement.of(check=["no judgement was made"])
@@ -100,7 +103,8 @@ class Completion:
 
 @one_thread()
 def complete(body: BodyModel | Subject, scan: Scan, landmarks: tuple[np.ndarray, np.ndarray] | None = None,
-             config: CompletionConfig | None = None, progress: Progress | None = None, masked: np.ndarray | None = None) -> Completion:
+             config: CompletionConfig | None = None, progress: Progress | None = None,
+             masked: np.ndarray | None = None) -> Completion:
     """The whole body from a scan of some of it.
 
     Parameters
@@ -108,8 +112,8 @@ def complete(body: BodyModel | Subject, scan: Scan, landmarks: tuple[np.ndarray,
     body : BodyModel or Subject
         A model when the person's shape is unknown, a subject when it is known.
     scan : Mesh, PointCloud, (n, 3) or (n, 6) float, metres, or a sequence of these, or a DepthPicture
-        A depth picture holds one person, and floor and walls, which are taken away. A sequence holds several views in one frame; (n, 6) are points with normals. In any unit where
-        `config.free_scale` says so.
+        A sequence holds several views in one frame; (n, 6) are points with normals. In any unit where
+        `config.free_scale` says so. A depth picture shows one person, dressed or not; floor and walls are taken away.
     landmarks : ((L,) int, (L, 3) float), optional
         Vertices of the template and where they are on the scan; 4 to 10, at least 3. Without them the search
         starts from typical poses, rotated every way.
@@ -141,6 +145,8 @@ def complete(body: BodyModel | Subject, scan: Scan, landmarks: tuple[np.ndarray,
     predicted = person.template.with_vertices(person.vertices(x))
     cloud = fit.without_ignored(given.cloud, predicted)
     completed, seen, used, rms = free_surface(predicted, cloud, config)   # [SCAPE] Eq. 10, over Y
+    if cloud.person is not None:                # what it shows is clothes, and noisier than the model is inexact
+        completed, rms = predicted, distance_to(predicted, cloud.points[used])
     error = expected_error(open_error, distance_to_seen(predicted, seen), rms)
     tell(total, total)
     pose, trans, betas = person.split(x)
@@ -157,11 +163,12 @@ def complete(body: BodyModel | Subject, scan: Scan, landmarks: tuple[np.ndarray,
 def doubts(fit: ScanFit, x: np.ndarray, error: np.ndarray, seen: np.ndarray) -> list[str]:
     """Why the body of unknowns (P,) is to be looked at before it is used: what is not known of it, and what is wrong.
 
-    `error` (N,), metres, as `expected_error`; `seen` (N,) bool, the vertices with data.
+    `error` (N,), metres, as `expected_error`; `seen` (N,) bool, the vertices with data. What is beyond the border of a
+    picture is a guess, and no reason to doubt what is within.
     """
-    names, found = fit.body.skeleton.names, []
+    names, found, shown = fit.body.skeleton.names, [], ~fit.beyond(x)
     open_parts = [(float(np.sqrt((error[mine]**2).mean())), p) for p in range(len(names))
-                  if (mine := fit.part == p).any()]
+                  if (mine := fit.part == p).any() and shown[mine].mean() >= PART_SHOWN]
     for off, p in sorted(open_parts, reverse=True):
         if off > DOUBTFUL:
             share = f"{100 * seen[fit.part == p].mean():.0f}% of it was seen" if seen[fit.part == p].any() else \
@@ -171,6 +178,19 @@ def doubts(fit: ScanFit, x: np.ndarray, error: np.ndarray, seen: np.ndarray) -> 
     found += [f"the {joint_in_words(names[j])} is bent by {np.degrees(angles[j]):.0f} degrees, "
               f"and never was when the model was learned"
               for j in stiff_joints(fit.body.pose_examples) if angles[j] > BENT]
+    return found + strayed(fit, x)
+
+
+def strayed(fit: ScanFit, x: np.ndarray) -> list[str]:
+    """What of the body of unknowns (P,) a camera speaks against, and what of a picture's person no part is near."""
+    if fit.cloud.person is None:
+        return []
+    entered = free_space_violation(fit.cameras, fit.mesh(x).vertices[fit.matched]).excess > 0
+    lost, found = fit.unexplained(x, fit.thin), []
+    if lost.mean() > LOST_LIMB:
+        found.append(f"{100 * lost.mean():.1f}% of what was seen of the person has no body near")
+    if entered.mean() > ENTERED:
+        found.append(f"{100 * entered.mean():.1f}% of the body is where the camera saw that nothing is")
     return found
 
 

@@ -33,6 +33,7 @@ MIN_COSINE = 0.6                     # between the normals of a match
 # Independent measurements that a whole scan is worth: what the model cannot follow is alike at neighbouring points, so
 # this is far fewer than there are points.
 EVIDENCE = 400.0
+UNDER_CLOTHES = 0.1                  # weight of a match of skin below what a depth camera saw, against skin above it
 
 
 class ScanFit:
@@ -98,6 +99,12 @@ class ScanFit:
         found = OrientedPoints(mesh.vertices, mesh.vertex_normals).match(scan.points, scan.normals, 0.05,
                                                                          MIN_COSINE)
         return ~found.valid
+
+    def beyond(self, x: np.ndarray) -> np.ndarray:
+        """(N,) bool: vertices beyond the border of the picture, of which nothing can be known; none without one."""
+        person = self.cloud.person
+        return np.zeros(len(self.part), dtype=bool) if person is None else \
+            ~person.picture.project(self.mesh(x).vertices)[2]
 
     def without_ignored(self, cloud: ScanPoints, predicted: Mesh) -> ScanPoints:
         """A scan without its points on parts of the body that are not to be matched."""
@@ -217,6 +224,9 @@ class ScanFit:
         distance = np.concatenate([there.distances[a], back.distances[b]])
         share = np.concatenate([np.full(a.sum(), 1 / len(scan.points)), np.full(b.sum(), 0.5 / len(mine))])
         weights = EVIDENCE / config.scan_sd**2 * share * energy.geman_mcclure(distance, max(reach / 2, 0.015))
+        if self.cloud.person is not None:
+            under = np.einsum("nd,nd->n", normal, mesh.vertices[ids] - target) < 0
+            weights = np.where(under, UNDER_CLOTHES, 1.0) * weights
         if self.clothing is None:
             return ids, target, normal, weights
         under, over, away = self.clothing.below(mesh.vertices[mine], mesh.vertex_normals[mine])

@@ -10,7 +10,7 @@ from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
-from scipy.ndimage import distance_transform_edt
+from scipy.ndimage import binary_dilation, distance_transform_edt
 from scipy.optimize import minimize
 from scipy.spatial import cKDTree
 
@@ -24,6 +24,7 @@ GRAZING = 0.3                        # cosine below which a scanner sees little
 FEW = 2000                           # points that are enough to find the viewpoint
 FACING = 0.97                        # share of the points of a scan that must face its one viewpoint
 TOLERANCE = 0.03                     # metres: the rim that scanners lose, and an inexact viewpoint
+RIM = 2                              # pixels that a depth camera loses at the edge of a body
 INSIDE, PRESSED = 0.12, 0.015        # metres: half of the thickest part of a body; how deep skin may press into skin
 CELL, MARGIN, CAP = 0.04, 0.3, 0.15   # metres: of the table of what cameras must have seen; further off is as bad
 CLOTHING, NOISE = 0.10, 0.003        # metres that hair or a skirt may stand off the skin; that skin may stick out
@@ -68,14 +69,14 @@ class CameraView:
 
 
 class PictureView:
-    """A person as a depth camera saw them: in front of all that was measured is nothing; beyond the border, who knows."""
+    """A person as a depth camera saw them: nothing is in front of what was measured, beyond the border anything."""
 
     def __init__(self, person: Person) -> None:
         self.picture = person.picture
         self.points, self.viewpoint = person.picture.points()[person.mask], np.zeros(3)
         known = np.isfinite(person.picture.depth)
         self._depth = np.where(known, person.picture.depth, 0.0)
-        self._empty = known & ~person.mask
+        self._empty = known & ~binary_dilation(person.mask, np.ones((3, 3)), RIM)
         self._way, self._edge = distance_transform_edt(self._empty, return_indices=True)
 
     def violation(self, vertices: np.ndarray) -> Violation:

@@ -55,8 +55,8 @@ def _of_picture(body: FixedBody, picture: DepthPicture, landmarks: tuple[np.ndar
     """The person in a picture; ValueError for what only other scans have."""
     told = {"free_scale": config.free_scale, "viewpoint": config.viewpoint is not None, "masked": masked is not None}
     if any(told.values()):
-        raise ValueError(f"{next(name for name in told if told[name])}: expected none with a depth picture, which is in "
-                         "metres in its camera's frame; set the depth of what is to be left out to 0")
+        raise ValueError(f"{next(name for name in told if told[name])}: expected none with a depth picture, which "
+                         "is in metres in its camera's frame; set the depth of what is to be left out to 0")
     marks = (np.zeros(0, dtype=np.int64), np.zeros((0, 3))) if landmarks is None else \
         check_landmarks(landmarks, body.template)
     return Given(prepare_picture(picture, size(body.template), marks[1]), *marks)

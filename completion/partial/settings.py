@@ -60,6 +60,8 @@ class CompletionConfig(Settings):
         Parts of the body that the scan says nothing about, though it may show something there.
     free_scale : bool
         The unit of the scan is not known: one factor is found together with pose, place and shape.
+    fill_colors : bool
+        The colours of a scan are spread over what was not seen, which else is grey.
     tolerance : float, metres
         Distance from the truth within which a vertex counts as right in `Completion.confidence`.
     """
@@ -84,6 +86,7 @@ class CompletionConfig(Settings):
     up: tuple[Signed, Signed, Signed] | None = None
     ignored_parts: tuple[str, ...] = ()
     free_scale: bool = False
+    fill_colors: bool = False
     tolerance: float = 0.01
 
     @classmethod

@@ -12,12 +12,13 @@ from .picture import JUMP, NOISE, SMOOTHED, DepthPicture
 # Lengths are in sizes of the body, the root of its surface area (1.36 m for a man), areas in squares of it.
 LEAST_AREA, LEAST_RADIUS = 0.07, 0.07   # of what is seen of a body, and of the largest circle in it: a leg has less
 MOST_AREA = 0.5                      # two people that touch show more
-PLANE_AREA = 0.2                     # of floors and walls; a back is not that flat
+PLANE_AREA, OPEN_AREA = 0.2, 0.6     # of floors and walls; of what something is behind: two backs are not that large
+BEHIND = 0.02                        # share of the picture that may seem to be behind a wall
 PIECE = 0.003                        # area below which a piece is noise
 APART = 0.08                         # pieces closer than this are one: an arm in front of its body
 NEAR = 0.15                          # pieces too small for a person are of the person who is so near: an arm behind
 GUESSES, PLANES = 300, 8             # of planes, and planes taken away at most
-THICK, SIGMAS, PARALLEL = 0.012, 3.0, 0.9    # metres, deviations of the noise, and cosine within which points are on one
+THICK, SIGMAS, PARALLEL = 0.012, 3.0, 0.9    # metres, deviations of the noise, cosine within which points are on one
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,13 +69,13 @@ def find_person(picture: DepthPicture, size: float, marks: np.ndarray | None = N
     if not people:
         raise ValueError(f"picture: {_nobody(shown, size)}")
     if len(people) > 1:
-        raise ValueError(f"picture: {len(people)} people, or things as large, are in it; one is expected: set the depth "
-                         "of all else to 0, or give landmarks on the person")
+        raise ValueError(f"picture: {len(people)} people, or things as large, are in it; one is expected: set the "
+                         "depth of all else to 0, or give landmarks on the person")
     mask = _with_neighbours(small, people[0], pieces, size)
     area = _shown(small, mask, size)[0]
     if area > MOST_AREA:
-        raise ValueError(f"picture: what stands in it shows {area * size**2:.1f} m², more than a person does: two people "
-                         "who touch, or a wall that was not recognised; set the depth of all else to 0")
+        raise ValueError(f"picture: what stands in it shows {area * size**2:.1f} m², more than a person does: two "
+                         "people who touch, or a wall that was not recognised; set the depth of all else to 0")
     return Person(small, mask)
 
 
@@ -105,20 +106,16 @@ def room_planes(picture: DepthPicture, size: float) -> np.ndarray:
             normal = normal * np.sign(-normal @ centre)
             offset = normal @ centre
         mine = _on(p, n, normal, offset)
-        if _areas(picture, p[mine], n[mine]).sum() < PLANE_AREA * size**2:
+        behind = np.mean(points[picture.seen] @ normal - offset < -2 * _thickness(points[picture.seen]))
+        if _areas(picture, p[mine], n[mine]).sum() < (OPEN_AREA if behind > BEHIND else PLANE_AREA) * size**2:
             break
-        every = np.abs(np.nan_to_num(points) @ normal - offset) < _thickness(np.nan_to_num(points))
-        taken |= every & picture.seen & ~(open_ & ~_within_angle(normals, normal))
+        taken[picture.seen] |= np.abs(points[picture.seen] @ normal - offset) < _thickness(points[picture.seen])
         open_ &= ~taken
     return taken
 
 
 def _thickness(points: np.ndarray) -> np.ndarray:
     return THICK + SIGMAS * NOISE * points[..., 2]**2
-
-
-def _within_angle(normals: np.ndarray, normal: np.ndarray) -> np.ndarray:
-    return np.asarray(np.nan_to_num(normals) @ normal > 0.7)
 
 
 def _on(p: np.ndarray, n: np.ndarray, normal: np.ndarray, offset: float) -> np.ndarray:
@@ -184,7 +181,7 @@ def _joined(mask: np.ndarray, across: np.ndarray, down: np.ndarray) -> np.ndarra
 
 
 def _shown(picture: DepthPicture, mask: np.ndarray, size: float) -> tuple[float, float]:
-    """Area that a piece shows, and radius of the largest circle in it, in sizes; the border of the picture is no end."""
+    """Area of a piece, and radius of the largest circle in it, in sizes; the border of the picture is no end."""
     z = np.where(mask, np.nan_to_num(picture.depth), 0.0)
     fx, fy = np.diag(picture.intrinsics)[:2]
     closed = ndimage.binary_closing(np.pad(mask, 2, mode="edge"), np.ones((3, 3)), iterations=2)

@@ -1,7 +1,9 @@
 """What a depth camera saw: a picture of distances, cleaned of pixels between two surfaces, as points with normals."""
 from __future__ import annotations
 
+import json
 from dataclasses import dataclass, replace
+from pathlib import Path
 
 import numpy as np
 from scipy import ndimage
@@ -123,3 +125,39 @@ class DepthPicture:
         K[:2] /= 2
         K[:2, 2] -= 0.25
         return DepthPicture(np.where(count > 0, mean, np.nan), K)
+
+
+def read_depth(path: Path, metres: float = 0.001) -> DepthPicture:
+    """A picture from a PNG file of 16 bits, 0 where nothing was measured, `metres` long each unit.
+
+    The camera is read from `NAME.camera.json` beside it: `{"fx", "fy", "cx", "cy"}` in pixels, or what Open3D writes,
+    `{"intrinsic_matrix": [...]}`, column by column.
+    """
+    from PIL import Image, UnidentifiedImageError
+
+    try:
+        with Image.open(path) as image:
+            values = np.array(image)
+    except UnidentifiedImageError:
+        raise ValueError(f"{path}: it is not a PNG file") from None
+    if values.ndim != 2 or values.dtype == np.uint8:
+        raise ValueError(f"{path}: expected distances, one channel of 16 bits, got {values.dtype} {values.shape}")
+    try:
+        return DepthPicture.of(metres * values, read_camera(path.with_name(path.stem + ".camera.json")))
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}") from None
+
+
+def read_camera(path: Path) -> np.ndarray:
+    """Intrinsics (3, 3), pixels, from a JSON file."""
+    if not path.exists():
+        raise ValueError(f"expected its camera in {path}, as {{\"fx\": 589, \"fy\": 589, \"cx\": 319.5, "
+                         "\"cy\": 239.5}, pixels; there is none")
+    try:
+        told = json.loads(path.read_text(encoding="utf-8"))
+        if "intrinsic_matrix" in told:
+            return np.array(told["intrinsic_matrix"], dtype=np.float64).reshape(3, 3).T
+        fx, fy, cx, cy = (float(told[name]) for name in ("fx", "fy", "cx", "cy"))
+    except (ValueError, KeyError, TypeError) as error:
+        raise ValueError(f"{path}: expected fx, fy, cx and cy, or intrinsic_matrix ({error!r})") from None
+    return np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1.0]])
