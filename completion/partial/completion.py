@@ -25,11 +25,11 @@ from .fit import ScanFit, solve_jointly
 from .free_space import free_space_violation
 from .free_surface import distance_to, free_surface
 from .inputs import in_metres
-from .limbs import reinitialise_limbs
+from .limbs import with_limbs
 from .scale import ScaledBody
 from .scan import Scan
 from .settings import CompletionConfig
-from .starts import best_start, first_starts
+from .starts import best_starts, first_starts
 
 Progress = Callable[[int, int], None]
 
@@ -137,7 +137,7 @@ def complete(body: BodyModel | Subject, scan: Scan, landmarks: tuple[np.ndarray,
     fit = ScanFit(sized, given.cloud, given.vertices, given.points, config)
     starts = first_starts(fit)                                # [SCAPE] §7
     tell(1, total)
-    x = reinitialise_limbs(fit, best_start(fit, starts))
+    x = with_limbs(fit, best_starts(fit, starts))
     tell(2, total)
     solved = solve(fit, x, lambda done: tell(2 + done, total))            # [SCAPE] Eq. 10, Eq. 11
     x, factor = fit.body.in_metres(solved.x)

@@ -20,7 +20,7 @@ AXES = 4                             # directions of the training poses along wh
 CANDIDATES = 3                       # starts that are carried on from the landmarks to the scan
 COARSE = (0.25, 0.2, 0.15, 0.12, 0.1)    # metres: reaches of the first rounds, on few points
 PAIRS_SD = 0.05                      # metres: correspondences are that far off, and not independently of each other
-FINALISTS = 4                        # starts that are carried through all these rounds
+FINALISTS, ELSEWHERE = 4, 0.1        # starts that are carried through all these rounds; metres by which they differ
 ROTATIONS = 600                         # about 25 degrees between neighbours
 LEVELS = 5                           # heights at which a body that stands is laid on what is seen of it
 POSES = 100                          # tried at most
@@ -51,13 +51,11 @@ def from_landmarks(fit: ScanFit, vertices: np.ndarray, points: np.ndarray, sd: f
     body = fit.body
     follow = body.follow(vertices, np.zeros(body.n_angles + 3 + body.n_betas))
     x, _ = search(body, follow, points, sd, fit.prior, AXES)
-    places = body.subject.points(fit.spread).evaluate(*body.split(x)[:2])
-    x = x[distinct(places, CANDIDATES)]
+    x = x[distinct(places_of(fit, x), CANDIDATES)]
     drawn = np.concatenate([x, *(around(body, follow, start, points, sd, fit.prior, fit.config.random_starts, fit.rng)
                                 for start in x)])
     drawn = drawn[np.argsort(fit.quick_misfits(drawn))]
-    places = body.subject.points(fit.spread).evaluate(*body.split(drawn)[:2])
-    return drawn[distinct(places, CANDIDATES)]
+    return drawn[distinct(places_of(fit, drawn), CANDIDATES)]
 
 
 def around(body: FixedBody, follow: Follow, x: np.ndarray, targets: np.ndarray, sd: float, prior: GaussianPrior,
@@ -75,8 +73,8 @@ def around(body: FixedBody, follow: Follow, x: np.ndarray, targets: np.ndarray, 
     return drawn
 
 
-def best_start(fit: ScanFit, starts: np.ndarray) -> np.ndarray:
-    """The start (P,) that explains the scan best after a few rounds on few points; the worst drop out early.
+def best_starts(fit: ScanFit, starts: np.ndarray) -> np.ndarray:
+    """Starts (n, P) after a few rounds on few points, the one that explains most first; the worst drop out early.
 
     As long as there are many, the shape is held.
     """
@@ -84,11 +82,18 @@ def best_start(fit: ScanFit, starts: np.ndarray) -> np.ndarray:
     if len(ends) > FINALISTS:
         held = fit.held(ends[0])
         ends[:, :free] = [approach(held, x[:free], COARSE[:2]) for x in ends]
-        ends = ends[np.argsort([held.misfit(x[:free]) for x in ends], kind="stable")[:FINALISTS]]
+        ends = ends[np.argsort([held.misfit(x[:free]) for x in ends], kind="stable")]
+        ends = ends[distinct(places_of(fit, ends), FINALISTS, ELSEWHERE)]
         ends = np.array([approach(fit, x, COARSE[2:]) for x in ends])
     else:
         ends = np.array([approach(fit, x) for x in ends])
-    return ends[int(np.argmin([fit.misfit(x) for x in ends]))]
+    ends = ends[np.argsort([fit.misfit(x) for x in ends], kind="stable")]
+    return ends[distinct(places_of(fit, ends), FINALISTS, ELSEWHERE)]
+
+
+def places_of(fit: ScanFit, x: np.ndarray) -> np.ndarray:
+    """Some vertices (n, L, 3) of bodies (n, P), in one shape, to tell which are alike."""
+    return fit.body.subject.points(fit.spread).evaluate(*fit.body.split(x)[:2])
 
 
 def approach(fit: ScanFit, x: np.ndarray, reaches: tuple[float, ...] = COARSE) -> np.ndarray:
@@ -105,8 +110,7 @@ def from_nothing(fit: ScanFit) -> np.ndarray:
     with what it shows and with what its camera must have seen.
     """
     x, _ = placements(fit)
-    places = fit.body.subject.points(fit.spread).evaluate(*fit.body.split(x)[:2])
-    return x[distinct(places, BLIND, APART)]
+    return x[distinct(places_of(fit, x), BLIND, APART)]
 
 
 def starting_poses(fit: ScanFit) -> np.ndarray:

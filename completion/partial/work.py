@@ -84,8 +84,8 @@ class ScanFiles:
     @property
     def mesh(self) -> Mesh | None:
         """What vertices and faces of a landmark file can refer to: the mesh, where there is one view."""
-        only = self.views[0]
-        return only if len(self.views) == 1 and isinstance(only, Mesh) else None
+        only = self.views[0] if len(self.views) == 1 else None
+        return only if isinstance(only, Mesh) else None
 
 
 def complete_files(work: Work, inputs: Inputs, room: Room) -> list[Metric]:
@@ -96,16 +96,18 @@ def complete_files(work: Work, inputs: Inputs, room: Room) -> list[Metric]:
     with warnings.catch_warnings():
         if work.config.free_scale:
             warnings.filterwarnings("ignore", ".*when read as metres", UserWarning)
-        picture = read_picture(inputs.scans, work.unit)
-        files = read_views(inputs.scans, work.unit) if picture is None else ScanFiles((), ())
+        depth = read_picture(inputs.scans, work.unit)
+        files = read_views(inputs.scans, work.unit) if depth is None else ScanFiles((), ())
         landmarks = _landmarks(work, inputs, files)
-        masked = read_masks(inputs.masks, files, work.unit)
-    if picture is not None:
+        masked = read_masks(inputs.masks, files, work.unit) if depth is None else None
+    if depth is not None:
+        if inputs.masks:
+            raise ValueError("--mask: expected none with a depth picture; set the depth of what is not skin to 0")
         marks = np.zeros((0, 3)) if landmarks is None else landmarks[1]
-        person = prepare_picture(picture, size(work.body.template), marks)
+        person = prepare_picture(depth, size(work.body.template), marks)
         files = ScanFiles((PointCloud(person.points, person.normals),), (None,))
     views, output = list(files.views), room.folder
-    scan = views if picture is None else picture
+    scan = views if depth is None else depth
     done = room.step("completion", (work.body, work.marks, work.config, work.unit, inputs),
                      lambda: complete(work.body, scan, landmarks, work.config, room.tell, masked))
     if files.colored:

@@ -53,7 +53,7 @@ class DepthPicture:
 
     def points(self) -> np.ndarray:
         """(h, w, 3) metres; NaN where nothing was measured."""
-        row, column = np.indices(self.depth.shape)
+        row, column = pixels(self.depth.shape)
         return self.depth[..., None] * self.directions(column, row)
 
     def directions(self, column: np.ndarray, row: np.ndarray) -> np.ndarray:
@@ -95,7 +95,7 @@ class DepthPicture:
         A plane of space is linear in inverse depth over the picture: 1/z = a·ray, and a is its normal.
         """
         size = 2 * smoothed + 1
-        row, column = np.indices(self.depth.shape)
+        row, column = pixels(self.depth.shape)
         rays, known = self.directions(column, row), self.seen
         inverse = np.where(known, 1 / np.where(known, self.depth, 1.0), 0.0)
 
@@ -125,6 +125,12 @@ class DepthPicture:
         K[:2] /= 2
         K[:2, 2] -= 0.25
         return DepthPicture(np.where(count > 0, mean, np.nan), K)
+
+
+def pixels(shape: tuple[int, ...]) -> tuple[np.ndarray, np.ndarray]:
+    """Row and column (h, w) of every pixel."""
+    row, column = np.indices(shape)
+    return np.asarray(row), np.asarray(column)
 
 
 def read_depth(path: Path, metres: float = 0.001) -> DepthPicture:

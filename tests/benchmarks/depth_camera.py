@@ -16,10 +16,13 @@ that are off by 5 mm. Errors are those of corresponding vertices of the undresse
 seen or not, and *beyond* it. A result is *right* when the head is off by less than 100 mm and every other part by less
 than 150 mm in the mean, over the parts of which a fifth was seen, as in half views: where nothing was seen the place is
 a guess. *Within right* is over all parts of which half is within the picture, hidden or not, *all right* over all.
+
+A run goes on where the one before stopped: what stands in the output already is not done again.
 """
 from __future__ import annotations
 
 import argparse
+import json
 import time
 from dataclasses import dataclass
 from pathlib import Path
@@ -285,20 +288,22 @@ def main() -> None:
     data = load_real()
     model = learned(data, args.model)
     worn, part = clothes(data.template, data.landmarks), model.skeleton.part_of_vertex(data.template)
-    rows = []
+    output = Path(args.output)
+    rows = json.loads(output.read_text())["rows"] if output.exists() else []
+    done = {(row["k"], row["marks"]) for row in rows}
     for k in args.only:
         case = make_case(data, worn, k, args.tuning)
-        for marks in args.marks:
+        for marks in (marks for marks in args.marks if (k, marks) not in done):
             row, result = attempt(case, model, data, marks, part)
             rows.append(row)
             print({name: round(v, 3) if isinstance(v, float) else v for name, v in row.items()}, flush=True)
             if args.pictures:
                 picture_of(case, result, args.pictures / f"{case.name}_{marks}.png")
-    mean = summary(rows)
+        mean = summary(rows)
+        write_report(output, {"protocol": "depth camera", "tuning": args.tuning, "machine": machine(), "mean": mean,
+                              "rows": rows})
     for name, value in mean.items():
         print(f"{name:32s} {value:8.2f}")
-    write_report(args.output, {"protocol": "depth camera", "tuning": args.tuning, "machine": machine(), "mean": mean,
-                               "rows": rows})
 
 
 if __name__ == "__main__":
