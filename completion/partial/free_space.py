@@ -10,7 +10,7 @@ from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
-from scipy.ndimage import binary_dilation, distance_transform_edt
+from scipy.ndimage import binary_dilation, distance_transform_edt, minimum_filter
 from scipy.optimize import minimize
 from scipy.spatial import cKDTree
 
@@ -75,8 +75,10 @@ class PictureView:
         self.picture = person.picture
         self.points, self.viewpoint = person.picture.points()[person.mask], np.zeros(3)
         known = np.isfinite(person.picture.depth)
-        self._depth = np.where(known, person.picture.depth, 0.0)
         self._empty = known & ~binary_dilation(person.mask, np.ones((3, 3)), RIM)
+        told = person.mask | self._empty
+        nearest = minimum_filter(np.where(told, person.picture.depth, np.inf), 3)     # an edge is good to a pixel
+        self._depth = np.where(told, nearest, 0.0)
         self._way, self._edge = distance_transform_edt(self._empty, return_indices=True)
 
     def violation(self, vertices: np.ndarray) -> Violation:

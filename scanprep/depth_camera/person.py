@@ -60,14 +60,13 @@ def find_person(picture: DepthPicture, size: float, marks: np.ndarray | None = N
     """
     small = picture.without_flying_pixels().halved()
     pieces = _pieces(small, small.seen & ~room_planes(small, size), size)
-    if marks is not None and len(marks):
-        near = [np.mean(cKDTree(small.points()[mask]).query(marks)[0] < APART * size) for mask in pieces]
-        pieces = [mask for mask, share in zip(pieces, near, strict=True) if share > 0.5]
     shown = [_shown(small, mask, size) for mask in pieces]
     people = [mask for mask, (area, radius) in zip(pieces, shown, strict=True)
               if area >= LEAST_AREA and radius >= LEAST_RADIUS]
     if not people:
         raise ValueError(f"picture: {_nobody(shown, size)}")
+    if marks is not None and len(marks):
+        people = [min(people, key=lambda mask: np.median(cKDTree(small.points()[mask]).query(marks)[0]))]
     if len(people) > 1:
         raise ValueError(f"picture: {len(people)} people, or things as large, are in it; one is expected: set the "
                          "depth of all else to 0, or give landmarks on the person")
