@@ -55,7 +55,7 @@ def complete_scan(scans: ScansArg, output: Output, model: ModelOrNone = None, la
             scans, the folder of such files.
         unit: Unit of the scan and landmarks; "unknown": it is found together with the body.
         up: The axis of the scan that points up, where it is known: people mostly stand. Of a depth camera that stands
-            upright it is -y, of one upside down y.
+            upright it is -y, written --up=-y, of one upside down y.
         config: Settings.
         workers: Who completes the scans of a folder.
     """
