@@ -40,6 +40,7 @@ _FACTS = ("rms", "explained", "landmark_rms", "converged", "iterations")
 DOUBTFUL = 0.06                      # metres that a part is expected to be off, from which on it is to be looked at
 PART_SHOWN = 0.5                     # share of a part within the picture, below which it is beyond
 LOST_LIMB, ENTERED = 0.01, 0.01      # shares: of a picture's person without a body near, of the body in free space
+UNLIKELY = 150.0                     # squared deviations of a pose from those that are known, all joints together
 BENT = np.radians(20)                # rotation that is more than an error, of a joint that was not seen to bend
 LOST = 0.5                           # share of a scan explained below which a completion means nothing
 UNJUDGED = Judgement.of(check=["no judgement was made"])
@@ -137,7 +138,7 @@ def complete(body: BodyModel | Subject, scan: Scan, landmarks: tuple[np.ndarray,
     fit = ScanFit(sized, given.cloud, given.vertices, given.points, config)
     starts = first_starts(fit)                                # [SCAPE] §7
     tell(1, total)
-    x = with_limbs(fit, best_starts(fit, starts))
+    x, rival = with_limbs(fit, best_starts(fit, starts))
     tell(2, total)
     solved = solve(fit, x, lambda done: tell(2 + done, total))            # [SCAPE] Eq. 10, Eq. 11
     x, factor = fit.body.in_metres(solved.x)
@@ -157,7 +158,8 @@ def complete(body: BodyModel | Subject, scan: Scan, landmarks: tuple[np.ndarray,
                       solved.converged, solved.rounds, solved.energies, given.metres, error,
                       probability_within(error, config.tolerance))
     problem = completion_problem(done, given.cloud.points, config.free_scale)
-    return replace(done, judgement=Judgement.of(problem, doubts(fit, solved.x, error, seen)))
+    found = doubts(fit, solved.x, error, seen) + ambiguous(fit, solved.x, rival)
+    return replace(done, judgement=Judgement.of(problem, found))
 
 
 def doubts(fit: ScanFit, x: np.ndarray, error: np.ndarray, seen: np.ndarray) -> list[str]:
@@ -181,6 +183,15 @@ def doubts(fit: ScanFit, x: np.ndarray, error: np.ndarray, seen: np.ndarray) -> 
     return found + strayed(fit, x)
 
 
+def ambiguous(fit: ScanFit, x: np.ndarray, rival: np.ndarray | None) -> list[str]:
+    """What speaks for another body than that of unknowns (P,): a `rival` (P,), where there is one, far from it."""
+    if rival is None:
+        return []
+    apart = np.linalg.norm(fit.mesh(x).vertices - fit.mesh(rival).vertices, axis=1)[~fit.beyond(x)].mean()
+    return [f"another body, {1000 * apart:.0f} mm away in the mean, explains the scan nearly as well"] \
+        if apart > DOUBTFUL else []
+
+
 def strayed(fit: ScanFit, x: np.ndarray) -> list[str]:
     """What of the body of unknowns (P,) a camera speaks against, and what of a picture's person no part is near."""
     if fit.cloud.person is None:
@@ -191,6 +202,8 @@ def strayed(fit: ScanFit, x: np.ndarray) -> list[str]:
         found.append(f"{100 * lost.mean():.1f}% of what was seen of the person has no body near")
     if entered.mean() > ENTERED:
         found.append(f"{100 * entered.mean():.1f}% of the body is where the camera saw that nothing is")
+    if fit.unlikely(x) > UNLIKELY:
+        found.append("the pose is unlike those that are known")
     return found
 
 
