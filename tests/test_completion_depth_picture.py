@@ -4,13 +4,18 @@ from dataclasses import replace
 import numpy as np
 import pytest
 from completion_bodies import MARKS, POSE, QUICK, worm_with_prior
+from config_files import config_file
+from PIL import Image
 
+from completion.__main__ import main
 from completion.bodies import as_body
-from completion.partial.completion import complete, doubts, strayed
+from completion.partial import report
+from completion.partial.completion import complete, doubts, load_completion, strayed
 from completion.partial.fit import ScanFit
 from completion.partial.inputs import in_metres
 from completion.partial.work import read_picture
 from scanprep.depth_camera.picture import DepthPicture
+from scanprep.geometry.landmarks import write_landmarks
 from scanprep.geometry.surface import Rays
 
 K = np.array([[300.0, 0, 159.5], [0, 300.0, 119.5], [0, 0, 1]])
@@ -81,6 +86,23 @@ def test_what_a_picture_cannot_have_is_refused(model, body):
         complete(model, DepthPicture.of(np.full((240, 320), 3.0), K), None, QUICK)
     with pytest.raises(ValueError, match="no head and legs"):
         complete(model, picture, None, replace(QUICK, up=(0.0, -1.0, 0.0)))
+
+
+def test_a_picture_goes_in_as_a_file_and_a_refusal_says_why(model, body, marks, tmp_path, capsys, monkeypatch):
+    monkeypatch.setattr(report, "HEIGHT", 60)
+    replace(model, info={**model.info, "landmarks": {f"m{v}": int(v) for v in MARKS}}).save(tmp_path / "model.npz")
+    write_landmarks(tmp_path / "one.landmarks.json", {f"m{v}": p for v, p in zip(*marks, strict=True)})
+    for name, depth in (("one", taken(body).depth), ("wall", np.full((240, 320), 3.0))):
+        Image.fromarray(np.round(1000 * depth).astype(np.uint16)).save(tmp_path / f"{name}.png")
+        (tmp_path / f"{name}.camera.json").write_text('{"fx": 300, "fy": 300, "cx": 159.5, "cy": 119.5}')
+    few = config_file(tmp_path, random_starts=3, rounds=3, scan_points=300, model_points=150)
+    words = ["-m", str(tmp_path / "model.npz"), "-o", str(tmp_path / "out"), "--config", str(few)]
+    assert main(["complete", str(tmp_path / "one.png"), *words]) == 0
+    done = load_completion(tmp_path / "out")
+    assert np.linalg.norm(done.predicted.vertices - body.vertices, axis=1).mean() < 0.03
+    assert (tmp_path / "out" / "report.html").exists()
+    assert main(["complete", str(tmp_path / "wall.png"), *words[:3], str(tmp_path / "none"), *words[4:]]) == 1
+    assert "nobody is in it" in capsys.readouterr().err
 
 
 def test_a_picture_comes_alone(tmp_path):
