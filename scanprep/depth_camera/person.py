@@ -10,7 +10,7 @@ from scipy.spatial import cKDTree
 from .picture import JUMP, NOISE, SMOOTHED, DepthPicture
 
 # Lengths are in sizes of the body, the root of its surface area (1.36 m for a man), areas in squares of it.
-LEAST_AREA, LEAST_RADIUS = 0.07, 0.07   # of what is seen of a body, and of the largest circle in it: a leg has less
+LEAST_AREA, LEAST_RADIUS = 0.075, 0.08  # of what is seen of a body, and of the largest circle in it: a leg has less
 MOST_AREA = 0.5                      # two people that touch show more
 PLANE_AREA, OPEN_AREA = 0.2, 0.6     # of floors and walls; of what something is behind: two backs are not that large
 BEHIND = 0.02                        # share of the picture that may seem to be behind a wall

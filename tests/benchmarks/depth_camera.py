@@ -17,6 +17,8 @@ seen or not, and *beyond* it. A result is *right* when the head is off by less t
 than 150 mm in the mean, over the parts of which a fifth was seen, as in half views: where nothing was seen the place is
 a guess. *Within right* is over all parts of which half is within the picture, hidden or not, *all right* over all.
 
+Pictures of nobody, of two people and of one leg have to be refused, those of one person not.
+
 A run goes on where the one before stopped: what stands in the output already is not done again.
 """
 from __future__ import annotations
@@ -36,11 +38,13 @@ from completion.partial.settings import CompletionConfig
 from model import LearnConfig, learn_scape
 from model.body import BodyModel
 from model.files import load_model
+from scanprep.depth_camera.person import find_person
 from scanprep.depth_camera.picture import DepthPicture
 from scanprep.geometry.farthest_points import farthest_points
 from scanprep.geometry.geodesics import SurfaceGraph
 from scanprep.geometry.mesh import Mesh
 from scanprep.geometry.surface import Rays
+from scanprep.judgement import size
 from scanprep.skeleton.find import find_skeleton
 
 SIZE, FOCAL = (480, 640), 589.0
@@ -218,6 +222,40 @@ def attempt(case: Case, body: BodyModel, data: RealData, marks: str, part: np.nd
             "cpu_seconds": round(time.process_time() - cpu, 1)}, result
 
 
+def scenes(data: RealData, worn: np.ndarray, part: np.ndarray, names: tuple[str, ...], tuning: bool, every: int = 3
+           ) -> list[tuple[str, DepthPicture]]:
+    """Pictures with one person, nobody, two people side by side, and a leg alone, of every third of the men."""
+    leg = np.isin(part, [p for p, name in enumerate(names) if name in ("thigh_left", "shin_left", "foot_left")])
+    out = []
+    for k, man in enumerate(np.arange(3 if tuning else 2, 227, 5)[::every]):
+        rng, v = np.random.default_rng([k, tuning]), data.shapes[man]
+        camera, _, R = _camera(data.template.with_vertices(v), "knees", k, 0.0, data.landmarks, rng)
+        clad = dressed(data.template.with_vertices(v), data.template, worn, rng)
+        aside = 0.45 * R[0] + rng.uniform(0, 0.4) * R[2]
+        two = Mesh(np.vstack([clad.vertices - aside, clad.vertices + aside]),
+                   np.vstack([clad.faces, clad.faces + len(v)]))
+        low = np.r_[camera[:2], v[:, 2].min() + 0.45]
+        for name, mesh, place in (("one", clad, camera), ("nobody", clad, camera + 4 * R[0]),
+                                  ("two", two, camera - 0.6 * R[2]),
+                                  ("leg", clad.submesh(leg[clad.faces].all(axis=1))[0], low)):
+            seen = mesh.with_vertices((mesh.vertices - place) @ R.T)
+            out.append((name, _taken(seen, R[:, 2], float(v[:, 2].min() - place[2]), 3.0, rng)[0]))
+    return out
+
+
+def refusals(found: list[tuple[str, DepthPicture]], body: BodyModel) -> dict[str, dict[str, int]]:
+    """How many pictures of each kind were taken for one person, and how many refused."""
+    counts: dict[str, dict[str, int]] = {}
+    for name, picture in found:
+        mine = counts.setdefault(name, {"accepted": 0, "refused": 0})
+        try:
+            find_person(picture, size(body.template))
+            mine["accepted"] += 1
+        except ValueError:
+            mine["refused"] += 1
+    return counts
+
+
 def picture_of(case: Case, result: Completion | None, path: Path) -> None:
     """The depth picture, then truth (dressed, points of the picture) and result from the camera and from its side."""
     from scanprep.pictures.camera import Camera
@@ -289,6 +327,8 @@ def main() -> None:
     model = learned(data, args.model)
     worn, part = clothes(data.template, data.landmarks), model.skeleton.part_of_vertex(data.template)
     output = Path(args.output)
+    who = refusals(scenes(data, worn, part, model.skeleton.names, args.tuning), model)
+    print(who)
     rows = json.loads(output.read_text())["rows"] if output.exists() else []
     done = {(row["k"], row["marks"]) for row in rows}
     for k in args.only:
@@ -301,7 +341,7 @@ def main() -> None:
                 picture_of(case, result, args.pictures / f"{case.name}_{marks}.png")
         mean = summary(rows)
         write_report(output, {"protocol": "depth camera", "tuning": args.tuning, "machine": machine(), "mean": mean,
-                              "rows": rows})
+                              "taken_for_one_person": who, "rows": rows})
     for name, value in mean.items():
         print(f"{name:32s} {value:8.2f}")
 
