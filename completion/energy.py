@@ -98,6 +98,15 @@ def pose_prior(x: np.ndarray, prior: GaussianPrior, weight: float | np.ndarray =
     return Residual(r, J)
 
 
+def upright(x: np.ndarray, of_body: np.ndarray, up: np.ndarray, sd: float) -> Residual:
+    """How far the root's axis `of_body` (3,) leans from the direction `up` (..., 3); `sd`, radians."""
+    R = rotations.exp(x[..., :3])
+    axis = R @ of_body
+    J = np.zeros((*axis.shape, x.shape[-1]))
+    J[..., :3] = -rotations.hat(axis) @ R @ rotations.right_jacobian(x[..., :3]) / sd
+    return Residual((axis - up) / sd, J)
+
+
 def joint_limits(x: np.ndarray, limits: JointLimits, weight: float = 1.0) -> Residual:
     """How far joints are beyond their limits, with a unit cost at `GIVE`; nothing within.
 

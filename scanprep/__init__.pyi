@@ -8,6 +8,8 @@ from .dataset import RegisteredSet as RegisteredSet
 from .decimation.decimate import decimate as decimate
 from .decimation.registered_set import DecimateSetConfig as DecimateSetConfig
 from .decimation.registered_set import decimate_set as decimate_set
+from .depth_camera.picture import DepthPicture as DepthPicture
+from .depth_camera.picture import read_depth as read_depth
 from .fusion.tsdf import merge_views as merge_views
 from .geometry.files import (
     MeshFileError as MeshFileError,

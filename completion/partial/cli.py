@@ -22,11 +22,14 @@ from .settings import CompletionConfig
 from .work import Inputs, Work, folder_inputs, folder_page, summary
 
 ScansArg = Annotated[tyro.conf.Positional[tuple[Path, ...]], tyro.conf.arg(metavar="SCAN [SCAN ...]")]
+AXES = {"x": (1.0, 0.0, 0.0), "-x": (-1.0, 0.0, 0.0), "y": (0.0, 1.0, 0.0), "-y": (0.0, -1.0, 0.0),
+        "z": (0.0, 0.0, 1.0), "-z": (0.0, 0.0, -1.0)}
 
 
 def complete_scan(scans: ScansArg, output: Output, model: ModelOrNone = None, landmarks: Path | None = None,
                   subject: str | None = None, template_landmarks: Path | None = None, mask: tuple[Path, ...] = (),
-                  unit: Unit | Literal["unknown"] | None = None, fill_colors: bool = False,
+                  unit: Unit | Literal["unknown"] | None = None,
+                  up: Literal["x", "-x", "y", "-y", "z", "-z"] | None = None,
                   config: CompletionConfig = CompletionConfig(),  # noqa: B008
                   workers: Workers = Workers(), *, space: Workspace) -> Outcome:                 # noqa: B008
     """The whole body from a scan of some of it.
@@ -37,7 +40,8 @@ def complete_scan(scans: ScansArg, output: Output, model: ModelOrNone = None, la
     Example: scape complete half.ply -m model.npz --landmarks half.landmarks.json -o completed
 
     Args:
-        scans: Mesh or point cloud, the views of one body, or a folder of scans.
+        scans: Mesh or point cloud, the views of one body, or a folder of scans; or one depth picture, a 16-bit PNG in
+            millimetres with its camera beside it in NAME.camera.json.
         output: Folder to write completed.ply, predicted.ply, completion.npz and report.html to; completed.glb for a
             scan with a texture.
         model: Model of `scape learn`; without it that of the synthetic people, which is made on first use.
@@ -50,7 +54,8 @@ def complete_scan(scans: ScansArg, output: Output, model: ModelOrNone = None, la
             mesh or cloud in which they are painted in a colour. One file, or one for each view; for a folder of
             scans, the folder of such files.
         unit: Unit of the scan and landmarks; "unknown": it is found together with the body.
-        fill_colors: Spread the scan's colours over what was not seen, which else is grey.
+        up: The axis of the scan that points up, where it is known: people mostly stand. Of a depth camera that stands
+            upright it is -y, written --up=-y, of one upside down y.
         config: Settings.
         workers: Who completes the scans of a folder.
     """
@@ -58,6 +63,8 @@ def complete_scan(scans: ScansArg, output: Output, model: ModelOrNone = None, la
         raise ValueError("SCAN: expected at least one scan, or a folder of scans")
     if unit == "unknown":
         config, unit = replace(config, free_scale=True), None
+    if up is not None:
+        config = replace(config, up=AXES[up])
     folder = scans[0] if len(scans) == 1 and scans[0].is_dir() else None
     found = folder_inputs(folder, landmarks, _only(mask)) if folder else {}
     loaded, name = read_model(model)
@@ -67,7 +74,7 @@ def complete_scan(scans: ScansArg, output: Output, model: ModelOrNone = None, la
     inputs = Inputs(scans, landmarks or landmarks_beside(scans[0]), mask)
     wanted = any(one.landmarks for one in found.values()) if folder else inputs.landmarks is not None
     marks = _template_landmarks(loaded, template_landmarks, name) if wanted else {}
-    work = Work(body, name, marks, config, unit, ColorConfig(fill=fill_colors))
+    work = Work(body, name, marks, config, unit, ColorConfig(fill=config.fill_colors))
     settings = {"complete": config, "model": name}
     if folder is None:
         if inputs.landmarks is None:

@@ -1,7 +1,7 @@
 """Completion of a partial scan: a start from landmarks, the pose and shape, then the free surface; and its folder."""
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
@@ -22,13 +22,14 @@ from ..bodies import as_body
 from .alternation import turns_of
 from .confidence import distance_to_seen, expected_error, posterior_error, probability_within
 from .fit import ScanFit, solve_jointly
-from .free_surface import free_surface
+from .free_space import free_space_violation
+from .free_surface import distance_to, free_surface
 from .inputs import in_metres
-from .limbs import reinitialise_limbs
+from .limbs import with_limbs
 from .scale import ScaledBody
-from .scan import View
+from .scan import Scan
 from .settings import CompletionConfig
-from .starts import best_start, first_starts
+from .starts import best_starts, first_starts
 
 Progress = Callable[[int, int], None]
 
@@ -37,6 +38,9 @@ _ARRAYS = ("pose", "betas", "trans", "seen", "expected_error", "confidence")
 _FACTS = ("rms", "explained", "landmark_rms", "converged", "iterations")
 
 DOUBTFUL = 0.06                      # metres that a part is expected to be off, from which on it is to be looked at
+PART_SHOWN = 0.5                     # share of a part within the picture, below which it is beyond
+LOST_LIMB, ENTERED = 0.01, 0.01      # shares: of a picture's person without a body near, of the body in free space
+UNLIKELY = 150.0                     # squared deviations of a pose from those that are known, all joints together
 BENT = np.radians(20)                # rotation that is more than an error, of a joint that was not seen to bend
 LOST = 0.5                           # share of a scan explained below which a completion means nothing
 UNJUDGED = Judgement.of(check=["no judgement was made"])
@@ -99,18 +103,18 @@ class Completion:
 
 
 @one_thread()
-def complete(body: BodyModel | Subject, scan: View | Sequence[View],
-             landmarks: tuple[np.ndarray, np.ndarray] | None = None, config: CompletionConfig | None = None,
-             progress: Progress | None = None, masked: np.ndarray | None = None) -> Completion:
+def complete(body: BodyModel | Subject, scan: Scan, landmarks: tuple[np.ndarray, np.ndarray] | None = None,
+             config: CompletionConfig | None = None, progress: Progress | None = None,
+             masked: np.ndarray | None = None) -> Completion:
     """The whole body from a scan of some of it.
 
     Parameters
     ----------
     body : BodyModel or Subject
         A model when the person's shape is unknown, a subject when it is known.
-    scan : Mesh, PointCloud, (n, 3) or (n, 6) float, metres, or a sequence of these
+    scan : Mesh, PointCloud, (n, 3) or (n, 6) float, metres, or a sequence of these, or a DepthPicture
         A sequence holds several views in one frame; (n, 6) are points with normals. In any unit where
-        `config.free_scale` says so.
+        `config.free_scale` says so. A depth picture shows one person, dressed or not; floor and walls are taken away.
     landmarks : ((L,) int, (L, 3) float), optional
         Vertices of the template and where they are on the scan; 4 to 10, at least 3. Without them the search
         starts from typical poses, rotated every way.
@@ -134,7 +138,7 @@ def complete(body: BodyModel | Subject, scan: View | Sequence[View],
     fit = ScanFit(sized, given.cloud, given.vertices, given.points, config)
     starts = first_starts(fit)                                # [SCAPE] §7
     tell(1, total)
-    x = reinitialise_limbs(fit, best_start(fit, starts))
+    x, rival = with_limbs(fit, best_starts(fit, starts))
     tell(2, total)
     solved = solve(fit, x, lambda done: tell(2 + done, total))            # [SCAPE] Eq. 10, Eq. 11
     x, factor = fit.body.in_metres(solved.x)
@@ -142,6 +146,8 @@ def complete(body: BodyModel | Subject, scan: View | Sequence[View],
     predicted = person.template.with_vertices(person.vertices(x))
     cloud = fit.without_ignored(given.cloud, predicted)
     completed, seen, used, rms = free_surface(predicted, cloud, config)   # [SCAPE] Eq. 10, over Y
+    if cloud.person is not None:                # what it shows is clothes, and noisier than the model is inexact
+        completed, rms = predicted, distance_to(predicted, cloud.points[used])
     error = expected_error(open_error, distance_to_seen(predicted, seen), rms)
     tell(total, total)
     pose, trans, betas = person.split(x)
@@ -152,17 +158,19 @@ def complete(body: BodyModel | Subject, scan: View | Sequence[View],
                       solved.converged, solved.rounds, solved.energies, given.metres, error,
                       probability_within(error, config.tolerance))
     problem = completion_problem(done, given.cloud.points, config.free_scale)
-    return replace(done, judgement=Judgement.of(problem, doubts(fit, solved.x, error, seen)))
+    found = doubts(fit, solved.x, error, seen) + ambiguous(fit, solved.x, rival)
+    return replace(done, judgement=Judgement.of(problem, found))
 
 
 def doubts(fit: ScanFit, x: np.ndarray, error: np.ndarray, seen: np.ndarray) -> list[str]:
     """Why the body of unknowns (P,) is to be looked at before it is used: what is not known of it, and what is wrong.
 
-    `error` (N,), metres, as `expected_error`; `seen` (N,) bool, the vertices with data.
+    `error` (N,), metres, as `expected_error`; `seen` (N,) bool, the vertices with data. What is beyond the border of a
+    picture is a guess, and no reason to doubt what is within.
     """
-    names, found = fit.body.skeleton.names, []
+    names, found, shown = fit.body.skeleton.names, [], ~fit.beyond(x)
     open_parts = [(float(np.sqrt((error[mine]**2).mean())), p) for p in range(len(names))
-                  if (mine := fit.part == p).any()]
+                  if (mine := fit.part == p).any() and shown[mine].mean() >= PART_SHOWN]
     for off, p in sorted(open_parts, reverse=True):
         if off > DOUBTFUL:
             share = f"{100 * seen[fit.part == p].mean():.0f}% of it was seen" if seen[fit.part == p].any() else \
@@ -172,6 +180,30 @@ def doubts(fit: ScanFit, x: np.ndarray, error: np.ndarray, seen: np.ndarray) -> 
     found += [f"the {joint_in_words(names[j])} is bent by {np.degrees(angles[j]):.0f} degrees, "
               f"and never was when the model was learned"
               for j in stiff_joints(fit.body.pose_examples) if angles[j] > BENT]
+    return found + strayed(fit, x)
+
+
+def ambiguous(fit: ScanFit, x: np.ndarray, rival: np.ndarray | None) -> list[str]:
+    """What speaks for another body than that of unknowns (P,): a `rival` (P,), where there is one, far from it."""
+    if rival is None:
+        return []
+    apart = np.linalg.norm(fit.mesh(x).vertices - fit.mesh(rival).vertices, axis=1)[~fit.beyond(x)].mean()
+    return [f"another body, {1000 * apart:.0f} mm away in the mean, explains the scan nearly as well"] \
+        if apart > DOUBTFUL else []
+
+
+def strayed(fit: ScanFit, x: np.ndarray) -> list[str]:
+    """What of the body of unknowns (P,) a camera speaks against, and what of a picture's person no part is near."""
+    if fit.cloud.person is None:
+        return []
+    entered = free_space_violation(fit.cameras, fit.mesh(x).vertices[fit.matched]).excess > 0
+    lost, found = fit.unexplained(x, fit.thin), []
+    if lost.mean() > LOST_LIMB:
+        found.append(f"{100 * lost.mean():.1f}% of what was seen of the person has no body near")
+    if entered.mean() > ENTERED:
+        found.append(f"{100 * entered.mean():.1f}% of the body is where the camera saw that nothing is")
+    if fit.unlikely(x) > UNLIKELY:
+        found.append("the pose is unlike those that are known")
     return found
 
 

@@ -18,6 +18,7 @@ from .free_space import Clothing, Contact, Outside, Violation, find_cameras, fre
 from .masks import part_vertices
 from .scan import ScanPoints, spread
 from .settings import CompletionConfig
+from .upright import TILT, Upright
 
 Terms = dict[str, Residual]
 
@@ -32,6 +33,7 @@ MIN_COSINE = 0.6                     # between the normals of a match
 # Independent measurements that a whole scan is worth: what the model cannot follow is alike at neighbouring points, so
 # this is far fewer than there are points.
 EVIDENCE = 400.0
+UNDER_CLOTHES = 0.1                  # weight of a match of skin below what a depth camera saw, against skin above it
 
 
 class ScanFit:
@@ -51,6 +53,7 @@ class ScanFit:
         self.ignored = part_vertices(body.template, body.skeleton, config.ignored_parts)
         self.matched = self.spread[~self.ignored[self.spread]]
         self.part = body.skeleton.part_of_vertex(body.template)
+        self.upright = Upright.of(body.template, body.skeleton, config.up, cloud.person is not None)
         self.contact = Contact(body.skeleton, self.part[self.spread])
         self.rng = np.random.default_rng(config.seed)
         self._take(cloud)
@@ -96,6 +99,12 @@ class ScanFit:
         found = OrientedPoints(mesh.vertices, mesh.vertex_normals).match(scan.points, scan.normals, 0.05,
                                                                          MIN_COSINE)
         return ~found.valid
+
+    def beyond(self, x: np.ndarray) -> np.ndarray:
+        """(N,) bool: vertices beyond the border of the picture, of which nothing can be known; none without one."""
+        person = self.cloud.person
+        return np.zeros(len(self.part), dtype=bool) if person is None else \
+            ~person.picture.project(self.mesh(x).vertices)[2]
 
     def without_ignored(self, cloud: ScanPoints, predicted: Mesh) -> ScanPoints:
         """A scan without its points on parts of the body that are not to be matched."""
@@ -147,13 +156,15 @@ class ScanFit:
         return float(sum(term.energy[0] for term in self.prior_terms(x[None]).values()))
 
     def prior_terms(self, x: np.ndarray) -> Terms:
-        """What is known of poses (B, P) beforehand: the Gaussian, and joint limits where asked for.
+        """What is known of poses (B, P) beforehand: the Gaussian, joint limits where asked for, and that people stand.
 
         [SCAPE-patent] §0090
         """
         weight = self.config.prior_weight
         limits = {} if self.limits is None else {"joint_limits": energy.joint_limits(x, self.limits, weight)}
-        return {"pose_prior": energy.pose_prior(x, self.prior, weight), **limits}
+        stands = {} if self.upright is None else {"upright": energy.upright(x, self.upright.of_body,
+                                                                            self.upright.nearest(x), TILT)}
+        return {"pose_prior": energy.pose_prior(x, self.prior, weight), **limits, **stands}
 
     def step(self, x: np.ndarray, scan: ScanPoints, reach: float) -> tuple[np.ndarray, dict[str, float]]:
         """One matching and the best unknowns (P,) for it, and the energies there."""
@@ -213,6 +224,9 @@ class ScanFit:
         distance = np.concatenate([there.distances[a], back.distances[b]])
         share = np.concatenate([np.full(a.sum(), 1 / len(scan.points)), np.full(b.sum(), 0.5 / len(mine))])
         weights = EVIDENCE / config.scan_sd**2 * share * energy.geman_mcclure(distance, max(reach / 2, 0.015))
+        if self.cloud.person is not None:
+            under = np.einsum("nd,nd->n", normal, mesh.vertices[ids] - target) < 0
+            weights = np.where(under, UNDER_CLOTHES, 1.0) * weights
         if self.clothing is None:
             return ids, target, normal, weights
         under, over, away = self.clothing.below(mesh.vertices[mine], mesh.vertex_normals[mine])

@@ -10,8 +10,10 @@ from functools import cached_property
 from typing import NamedTuple
 
 import numpy as np
+from scipy.ndimage import binary_dilation, distance_transform_edt, minimum_filter
 from scipy.spatial import cKDTree
 
+from scanprep.depth_camera.person import Person
 from scanprep.geometry.surface import OrientedPoints
 from scanprep.skeleton.tree import Skeleton
 
@@ -20,6 +22,7 @@ from .scan import ScanPoints
 
 FACING = 0.97                        # share of the points of a scan that must face its one viewpoint
 TOLERANCE = 0.03                     # metres: the rim that scanners lose, and an inexact viewpoint
+RIM = 2                              # pixels that a depth camera loses at the edge of a body
 INSIDE, PRESSED = 0.12, 0.015        # metres: half of the thickest part of a body; how deep skin may press into skin
 CELL, MARGIN, CAP = 0.04, 0.3, 0.15   # metres: of the table of what cameras must have seen; further off is as bad
 CLOTHING, NOISE = 0.10, 0.003        # metres that hair or a skirt may stand off the skin; that skin may stick out
@@ -63,7 +66,35 @@ class CameraView:
         return Violation(excess, normal, vertices - excess[:, None] * normal)
 
 
-def free_space_violation(cameras: Sequence[CameraView], vertices: np.ndarray) -> Violation:
+class PictureView:
+    """A person as a depth camera saw them: nothing is in front of what was measured, beyond the border anything."""
+
+    def __init__(self, person: Person) -> None:
+        self.picture = person.picture
+        self.points, self.viewpoint = person.picture.points()[person.mask], np.zeros(3)
+        known = np.isfinite(person.picture.depth)
+        self._empty = known & ~binary_dilation(person.mask, np.ones((3, 3)), RIM)
+        told = person.mask | self._empty
+        nearest = minimum_filter(np.where(told, person.picture.depth, np.inf), 3)     # an edge is good to a pixel
+        self._depth = np.where(told, nearest, 0.0)
+        self._way, self._edge = distance_transform_edt(self._empty, return_indices=True)
+
+    def violation(self, vertices: np.ndarray) -> Violation:
+        """How far vertices (n, 3) stand beside the person, or in front of what was seen."""
+        row, column, inside = self.picture.project(vertices)
+        z = vertices[:, 2]
+        ahead = np.where(inside, self._depth[row, column] - z, 0.0)
+        far = np.maximum(np.linalg.norm(vertices, axis=1), 1e-9)
+        target = self.picture.directions(self._edge[1][row, column], self._edge[0][row, column]) * z[:, None]
+        beside = vertices - target
+        wide = np.linalg.norm(beside, axis=1)
+        outside = self._empty[row, column] & (wide < ahead)
+        normal = np.where(outside[:, None], beside / np.maximum(wide, 1e-12)[:, None], -vertices / far[:, None])
+        excess = np.maximum(np.where(outside, wide, ahead) - TOLERANCE, 0)
+        return Violation(excess, normal, vertices - excess[:, None] * normal)
+
+
+def free_space_violation(cameras: Sequence[CameraView | PictureView], vertices: np.ndarray) -> Violation:
     """That of the camera, at least one, that objects most to each of the vertices (n, 3)."""
     found = [camera.violation(vertices) for camera in cameras]
     if len(found) == 1:
@@ -75,7 +106,7 @@ def free_space_violation(cameras: Sequence[CameraView], vertices: np.ndarray) ->
 class Outside:
     """A table of how far places stand where cameras, at least one, would have seen them."""
 
-    def __init__(self, cameras: Sequence[CameraView]) -> None:
+    def __init__(self, cameras: Sequence[CameraView | PictureView]) -> None:
         points = np.concatenate([camera.points for camera in cameras])
         self.low = points.min(axis=0) - MARGIN
         self.count = np.ceil((points.max(axis=0) + MARGIN - self.low) / CELL).astype(np.int64)
@@ -89,8 +120,10 @@ class Outside:
         return self.excess[(cell[..., 0] * self.count[1] + cell[..., 1]) * self.count[2] + cell[..., 2]]
 
 
-def find_cameras(cloud: ScanPoints) -> tuple[CameraView, ...]:
+def find_cameras(cloud: ScanPoints) -> tuple[CameraView | PictureView, ...]:
     """The cameras of those views that have a viewpoint, given or found; what is masked was seen too."""
+    if cloud.person is not None:
+        return (PictureView(cloud.person),)
     seen = cloud.everything
     views = [seen.some(seen.view == number) for number in range(cloud.views)]
     given: Sequence[np.ndarray | None] = len(views) * (None,) if cloud.viewpoints is None else list(cloud.viewpoints)

@@ -72,8 +72,12 @@ def free_surface(predicted: Mesh, cloud: ScanPoints, config: CompletionConfig
                                                     np.full(used.sum(), config.surface_weight)))
     seen = np.zeros(len(predicted.vertices), dtype=bool)
     seen[predicted.faces[found.faces[used]]] = True
-    distance = Surface(mesh).closest(cloud.points[used]).distances if used.any() else np.array([np.nan])
-    return mesh, seen, used, float(np.sqrt((distance**2).mean()))
+    return mesh, seen, used, distance_to(mesh, cloud.points[used])
+
+
+def distance_to(mesh: Mesh, points: np.ndarray) -> float:
+    """Root mean square distance of points (n, 3) to a mesh, metres; NaN without points."""
+    return float(np.sqrt((Surface(mesh).closest(points).distances**2).mean())) if len(points) else np.nan
 
 
 def _rows(mesh: Mesh, faces: np.ndarray, bary: np.ndarray) -> csr_array:

@@ -1,17 +1,18 @@
 """What a user gives, checked and brought into metres."""
 from __future__ import annotations
 
-from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
 
 from scanprep.correspondence.correspondences import checked_pairs
+from scanprep.depth_camera.picture import DepthPicture
 from scanprep.geometry.mesh import Mesh
+from scanprep.judgement import size
 
 from ..bodies import FixedBody
 from .scale import landmark_scale, rough_scale
-from .scan import ScanPoints, View, all_points, check_mask, prepare_scan
+from .scan import Scan, ScanPoints, all_points, check_mask, prepare_picture, prepare_scan
 from .settings import CompletionConfig
 
 
@@ -30,10 +31,12 @@ class Given:
                        metres=factor * self.metres)
 
 
-def in_metres(body: FixedBody, scan: View | Sequence[View], landmarks: tuple[np.ndarray, np.ndarray] | None,
+def in_metres(body: FixedBody, scan: Scan, landmarks: tuple[np.ndarray, np.ndarray] | None,
               masked: np.ndarray | None, config: CompletionConfig) -> Given:
     """A scan made ready for matching; of unknown scale, as nearly in metres as can be told before the fit."""
     metres = 1.0
+    if isinstance(scan, DepthPicture):
+        return _of_picture(body, scan, landmarks, masked, config)
     if config.free_scale:
         every = all_points(scan)
         bare = every if masked is None else every[~check_mask(masked, len(every))]
@@ -45,6 +48,18 @@ def in_metres(body: FixedBody, scan: View | Sequence[View], landmarks: tuple[np.
     if config.free_scale and len(vertices):
         return given.scaled(landmark_scale(body, vertices, points, config))
     return given
+
+
+def _of_picture(body: FixedBody, picture: DepthPicture, landmarks: tuple[np.ndarray, np.ndarray] | None,
+                masked: np.ndarray | None, config: CompletionConfig) -> Given:
+    """The person in a picture; ValueError for what only other scans have."""
+    told = {"free_scale": config.free_scale, "viewpoint": config.viewpoint is not None, "masked": masked is not None}
+    if any(told.values()):
+        raise ValueError(f"{next(name for name in told if told[name])}: expected none with a depth picture, which "
+                         "is in metres in its camera's frame; set the depth of what is to be left out to 0")
+    marks = (np.zeros(0, dtype=np.int64), np.zeros((0, 3))) if landmarks is None else \
+        check_landmarks(landmarks, body.template)
+    return Given(prepare_picture(picture, size(body.template), marks[1]), *marks)
 
 
 def check_landmarks(landmarks: tuple[np.ndarray, np.ndarray], template: Mesh) -> tuple[np.ndarray, np.ndarray]:

@@ -28,8 +28,29 @@ CELL = 0.03                          # metres: of the table of the inside of a b
 EXPLAINED = 0.04                     # metres of the body within which a point of the scan needs no limb
 FOLLOWED, APART = 4, 0.1             # draws that are followed, and by how many metres they differ at the limb's end
 AMISS = 12.0                         # energy of what is wrong with a limb from which on it is sought
+GRAVE = 100.0                        # energy from which on the whole body may be wrong
+RIVAL = 1.1                          # times the least misfit that of another body may have to be nearly as good
 BETTER = 5.0                         # by how much the misfit must fall for a limb to be moved
 ROUNDS = 2                           # times that all limbs that are amiss are gone through
+
+
+def with_limbs(fit: ScanFit, starts: np.ndarray) -> tuple[np.ndarray, np.ndarray | None]:
+    """Unknowns (P,) of the best of starts (n, P), best first, when limbs were moved to where they explain the scan.
+
+    Those after the first have their turn while something grave is amiss: a body that faces the wrong way keeps limbs
+    that explain nothing wherever they are moved. In clothes front and back are so much alike that without landmarks
+    the second is always tried. Returns also another body (P,) that explains the scan nearly as well; None without one.
+    """
+    ends = [reinitialise_limbs(fit, starts[0])]
+    for x in starts[1:]:
+        both = len(ends) == 1 and fit.cloud.person is not None and not len(fit.vertices)
+        if not both and not limbs_amiss(fit, min(ends, key=fit.misfit), GRAVE):
+            break
+        ends.append(reinitialise_limbs(fit, x))
+    misfits = np.array([fit.misfit(x) for x in ends])
+    first, *others = np.argsort(misfits)
+    rival = next((ends[i] for i in others if misfits[i] < RIVAL * misfits[first]), None)
+    return ends[first], rival
 
 
 def reinitialise_limbs(fit: ScanFit, x: np.ndarray) -> np.ndarray:
@@ -47,10 +68,10 @@ def reinitialise_limbs(fit: ScanFit, x: np.ndarray) -> np.ndarray:
     return np.concatenate([moved, x[free:]])
 
 
-def limbs_amiss(fit: ScanFit, x: np.ndarray) -> list[list[int]]:
+def limbs_amiss(fit: ScanFit, x: np.ndarray, least: float = AMISS) -> list[list[int]]:
     """The limbs, runs of parts, that stand where nothing can be or could explain what nothing does; worst first."""
     found = {tuple(limb): amiss(fit, x, limb) for limb in limbs(fit.body.skeleton)}
-    return [list(limb) for limb in sorted(found, key=lambda limb: -found[limb]) if found[limb] > AMISS]
+    return [list(limb) for limb in sorted(found, key=lambda limb: -found[limb]) if found[limb] > least]
 
 
 def amiss(fit: ScanFit, x: np.ndarray, limb: list[int]) -> float:

@@ -112,7 +112,7 @@ def completion_page(scan: View | Sequence[View], completion: Completion, templat
     page.picture(all_sides(Solid(plain, _two_colors(completion)), *marks))
     if body.colors is not None:
         page.section("Colours", "Carried over from the scan where it was seen; elsewhere grey, or spread smoothly when "
-                     "--fill-colors asks for it.")
+                     "fill_colors = true in a --config file asks for it.")
         page.picture(all_sides(Solid(body)))
     page.section("Distance of the scan", "Grey: no data. The completed mesh follows the scan, up to its noise; the "
                  "predicted mesh is the model's own, and where it is far off the model cannot follow.")

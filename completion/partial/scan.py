@@ -8,6 +8,8 @@ from typing import Any
 import numpy as np
 from scipy.spatial import cKDTree
 
+from scanprep.depth_camera.person import Person, find_person
+from scanprep.depth_camera.picture import DepthPicture
 from scanprep.geometry.files import PointCloud
 from scanprep.geometry.mesh import Mesh
 from scanprep.threads import search_threads
@@ -17,6 +19,7 @@ from .normals import completed_normals, one_sign, plane_normals, spread, turn_ou
 NEIGHBOURS = 16                      # points that make one normal
 
 View = Mesh | PointCloud | np.ndarray
+Scan = View | Sequence[View] | DepthPicture
 
 
 @dataclass(frozen=True, eq=False)
@@ -31,6 +34,7 @@ class ScanPoints:
     index: np.ndarray       # (n,) int, its number among all points that were given, one view after the other
     masked: ScanPoints | None = None  # the points that are clothing or hair; they are not among `points`
     viewpoints: np.ndarray | None = None  # (views, 3), metres, where each view was seen from, when that was told
+    person: Person | None = None      # in the picture that the points are from, where they are from one
 
     @property
     def views(self) -> int:
@@ -55,6 +59,7 @@ class ScanPoints:
         """The scan in another unit: all lengths times a factor."""
         masked = None if self.masked is None else self.masked.scaled(factor)
         seen_from = None if self.viewpoints is None else factor * self.viewpoints
+        assert self.person is None or factor == 1, "a picture is in metres"
         return replace(self, points=factor * self.points, spacing=factor * self.spacing, masked=masked,
                        viewpoints=seen_from)
 
@@ -77,6 +82,18 @@ def prepare_scan(scan: View | Sequence[View], viewpoint: Any = None, masked: np.
     whole = parts[0] if len(parts) == 1 else _without_inner_borders(_joined(parts))
     whole = replace(whole, viewpoints=from_where)
     return whole if masked is None else _set_apart(whole, check_mask(masked, start))
+
+
+def prepare_picture(picture: DepthPicture, size: float, marks: np.ndarray) -> ScanPoints:
+    """Points and normals of the one person in a picture; ValueError where there is not one.
+
+    `size`, metres, of the body, the root of its surface area; `marks` (L, 3), metres, points on the person.
+    """
+    person = find_person(picture, size, marks)
+    points, normals, edge = person.oriented_points()
+    spacing = float(np.median(points[:, 2])) / person.picture.intrinsics[0, 0]
+    every = np.arange(len(points))
+    return ScanPoints(points, normals, edge, spacing, 0 * every, every, viewpoints=np.zeros((1, 3)), person=person)
 
 
 def as_views(scan: View | Sequence[View]) -> list[View]:

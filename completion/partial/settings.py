@@ -53,10 +53,15 @@ class CompletionConfig(Settings):
         How far clothing and hair, of which `complete` is told, usually stand off the skin.
     viewpoint : (3,) floats, metres, or one for each view, optional
         Where the scan was seen from; found by itself when not given.
+    up : (3,) floats, optional
+        The direction that is up in the scan, where people in it mostly stand; without it all directions are tried,
+        and for a depth picture its four sides.
     ignored_parts : names of parts
         Parts of the body that the scan says nothing about, though it may show something there.
     free_scale : bool
         The unit of the scan is not known: one factor is found together with pose, place and shape.
+    fill_colors : bool
+        The colours of a scan are spread over what was not seen, which else is grey.
     tolerance : float, metres
         Distance from the truth within which a vertex counts as right in `Completion.confidence`.
     """
@@ -78,8 +83,10 @@ class CompletionConfig(Settings):
     contact_weight: float = 0.5
     clothing_sd: Positive = 0.06
     viewpoint: tuple[Signed, Signed, Signed] | tuple[tuple[Signed, Signed, Signed], ...] | None = None
+    up: tuple[Signed, Signed, Signed] | None = None
     ignored_parts: tuple[str, ...] = ()
     free_scale: bool = False
+    fill_colors: bool = False
     tolerance: float = 0.01
 
     @classmethod

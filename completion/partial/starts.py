@@ -14,19 +14,21 @@ from ..bodies import FixedBody, Follow
 from ..starts import distinct, search
 from .fit import ScanFit
 from .scan import ScanPoints, spread
+from .upright import SPREAD, SPREAD_OF_MANY, Upright
 
 AXES = 4                             # directions of the training poses along which a search from landmarks starts
 CANDIDATES = 3                       # starts that are carried on from the landmarks to the scan
 COARSE = (0.25, 0.2, 0.15, 0.12, 0.1)    # metres: reaches of the first rounds, on few points
 PAIRS_SD = 0.05                      # metres: correspondences are that far off, and not independently of each other
-FINALISTS = 4                        # starts that are carried through all these rounds
+FINALISTS, ELSEWHERE = 4, 0.2        # starts that are carried through all these rounds; metres by which they differ
 ROTATIONS = 600                         # about 25 degrees between neighbours
+LEVELS = 5                           # heights at which a body that stands is laid on what is seen of it
 POSES = 100                          # tried at most
 VERTICES, POINTS = 500, 120          # of body and scan, in the first look at all turns
 CAP = 0.15                           # metres: further off is as bad
 NORMALS = 0.1                        # metres that a difference of normals of unit length weighs
 FACING = 0.15                        # cosine to the camera's direction from which a vertex counts as seen
-PROMISING = 0.4                      # share of all placements, those least denied by the camera, that are compared
+PROMISING, STANDING = 0.4, 0.15      # share of all placements, those least denied by the camera, that are compared
 AT_ONCE = 1000                       # points that are compared at a time
 POOL = 200                           # best placements that are kept
 BLIND, APART = 24, 0.08              # of them, starts that differ by so many metres on average
@@ -49,13 +51,11 @@ def from_landmarks(fit: ScanFit, vertices: np.ndarray, points: np.ndarray, sd: f
     body = fit.body
     follow = body.follow(vertices, np.zeros(body.n_angles + 3 + body.n_betas))
     x, _ = search(body, follow, points, sd, fit.prior, AXES)
-    places = body.subject.points(fit.spread).evaluate(*body.split(x)[:2])
-    x = x[distinct(places, CANDIDATES)]
+    x = x[distinct(places_of(fit, x), CANDIDATES)]
     drawn = np.concatenate([x, *(around(body, follow, start, points, sd, fit.prior, fit.config.random_starts, fit.rng)
                                 for start in x)])
     drawn = drawn[np.argsort(fit.quick_misfits(drawn))]
-    places = body.subject.points(fit.spread).evaluate(*body.split(drawn)[:2])
-    return drawn[distinct(places, CANDIDATES)]
+    return drawn[distinct(places_of(fit, drawn), CANDIDATES)]
 
 
 def around(body: FixedBody, follow: Follow, x: np.ndarray, targets: np.ndarray, sd: float, prior: GaussianPrior,
@@ -73,16 +73,27 @@ def around(body: FixedBody, follow: Follow, x: np.ndarray, targets: np.ndarray, 
     return drawn
 
 
-def best_start(fit: ScanFit, starts: np.ndarray) -> np.ndarray:
-    """The start (P,) that explains the scan best after a few rounds on few points; the worst drop out early."""
-    ends = np.array(starts)
+def best_starts(fit: ScanFit, starts: np.ndarray) -> np.ndarray:
+    """Starts (n, P) after a few rounds on few points, the one that explains most first; the worst drop out early.
+
+    As long as there are many, the shape is held.
+    """
+    ends, free = np.array(starts), fit.body.n_angles + 3
     if len(ends) > FINALISTS:
-        ends = np.array([approach(fit, x, COARSE[:2]) for x in ends])
-        ends = ends[np.argsort([fit.misfit(x) for x in ends], kind="stable")[:FINALISTS]]
+        held = fit.held(ends[0])
+        ends[:, :free] = [approach(held, x[:free], COARSE[:2]) for x in ends]
+        ends = ends[np.argsort([held.misfit(x[:free]) for x in ends], kind="stable")]
+        ends = ends[distinct(places_of(fit, ends), FINALISTS, ELSEWHERE)]
         ends = np.array([approach(fit, x, COARSE[2:]) for x in ends])
     else:
         ends = np.array([approach(fit, x) for x in ends])
-    return ends[int(np.argmin([fit.misfit(x) for x in ends]))]
+    ends = ends[np.argsort([fit.misfit(x) for x in ends], kind="stable")]
+    return ends[distinct(places_of(fit, ends), FINALISTS, ELSEWHERE)]
+
+
+def places_of(fit: ScanFit, x: np.ndarray) -> np.ndarray:
+    """Some vertices (n, L, 3) of bodies (n, P), in one shape, to tell which are alike."""
+    return fit.body.subject.points(fit.spread).evaluate(*fit.body.split(x)[:2])
 
 
 def approach(fit: ScanFit, x: np.ndarray, reaches: tuple[float, ...] = COARSE) -> np.ndarray:
@@ -95,12 +106,11 @@ def approach(fit: ScanFit, x: np.ndarray, reaches: tuple[float, ...] = COARSE) -
 def from_nothing(fit: ScanFit) -> np.ndarray:
     """The likeliest bodies (n, P) for a scan without landmarks, distinct and best first.
 
-    Typical poses are turned in every direction, for no axis is known to be up, laid on the scan and compared
+    Typical poses are turned in every direction, where no axis is known to be up, laid on the scan and compared
     with what it shows and with what its camera must have seen.
     """
     x, _ = placements(fit)
-    places = fit.body.subject.points(fit.spread).evaluate(*fit.body.split(x)[:2])
-    return x[distinct(places, BLIND, APART)]
+    return x[distinct(places_of(fit, x), BLIND, APART)]
 
 
 def starting_poses(fit: ScanFit) -> np.ndarray:
@@ -132,19 +142,21 @@ def all_rotations(count: int) -> np.ndarray:
 def placements(fit: ScanFit) -> tuple[np.ndarray, np.ndarray]:
     """The best of all poses in all turns, laid on the scan: unknowns (POOL, P) and costs, best first."""
     body, config = fit.body, fit.config
-    poses, turns = starting_poses(fit), all_rotations(ROTATIONS)
+    poses, turns, lift = starting_poses(fit), *placed_turns(fit.upright)
     scan, ids = fit.cloud.thinned(POINTS), spread(body.template.vertices, VERTICES)
     places, normals = fit.posed_points(ids, poses)
     toward = np.array([camera.viewpoint - scan.points.mean(axis=0) for camera in fit.cameras]).reshape(-1, 3)
     toward /= np.linalg.norm(toward, axis=1, keepdims=True)
     table = fit.outside
-    cost, shift = np.zeros((len(poses), ROTATIONS)), np.empty((len(poses), ROTATIONS, 3))
+    cost, shift = np.zeros((len(poses), len(turns))), np.empty((len(poses), len(turns), 3))
     for a, (y, n) in enumerate(zip(places, normals, strict=True)):
-        shift[a] = scan.points.mean(axis=0) - (turns @ _shown(y, n, turns, toward)[:, :, None])[..., 0]
+        shift[a] = _laid(y, n, turns, toward, scan.points) if fit.upright is None else \
+            _stood(y, n, turns, lift, toward, scan.points, fit.upright)
         if table is not None:
             out = table.at((y @ np.swapaxes(turns, 1, 2) + shift[a][:, None]).astype(np.float32))
             cost[a] = config.free_space_weight * (out**2).mean(axis=1)
-    unlikely = cost > (np.quantile(cost, PROMISING) if table is not None else np.inf)
+    share = PROMISING if fit.upright is None else STANDING
+    unlikely = cost > (np.quantile(cost, share) if table is not None else np.inf)
     for a, (y, n) in enumerate(zip(places, normals, strict=True)):
         likely = ~unlikely[a]
         cost[a, likely] += _distances(y, n, turns[likely], shift[a, likely], scan)
@@ -157,12 +169,44 @@ def placements(fit: ScanFit) -> tuple[np.ndarray, np.ndarray]:
     return x, cost.ravel()[order]
 
 
-def _shown(y: np.ndarray, n: np.ndarray, turns: np.ndarray, toward: np.ndarray) -> np.ndarray:
-    """Centre (T, 3), in the body's frame, of the vertices that face a camera in direction (C, 3); of all without."""
+def placed_turns(upright: Upright | None) -> tuple[np.ndarray, np.ndarray]:
+    """Rotations (T, 3, 3) to try, and how high the body is placed in each (T,).
+
+    Of a body that stands as much as nothing may be beyond the picture: its upper end is laid on that of the scan at
+    0, its lower end at 1.
+    """
+    if upright is None:
+        return all_rotations(ROTATIONS), np.zeros(ROTATIONS)
+    turns = upright.rotations(all_rotations(SPREAD if len(upright.ups) == 1 else SPREAD_OF_MANY))
+    return np.repeat(turns, LEVELS, axis=0), np.tile(np.linspace(0, 1, LEVELS), len(turns))
+
+
+def _facing(n: np.ndarray, turns: np.ndarray, toward: np.ndarray) -> np.ndarray:
+    """(T, L) 1 for vertices with normals (L, 3) that face a camera in direction (C, 3) when turned; without one all."""
     if not len(toward):
-        return np.repeat(y.mean(axis=0)[None], len(turns), axis=0)
-    facing = ((n @ np.swapaxes(turns, 1, 2) @ toward.T) > FACING).any(axis=2).astype(float)
-    return facing @ y / np.maximum(facing.sum(axis=1, keepdims=True), 1)
+        return np.ones((len(turns), len(n)))
+    return ((n @ np.swapaxes(turns, 1, 2) @ toward.T) > FACING).any(axis=2).astype(float)
+
+
+def _laid(y: np.ndarray, n: np.ndarray, turns: np.ndarray, toward: np.ndarray, scan: np.ndarray) -> np.ndarray:
+    """Shifts (T, 3) that lay the middle of what faces a camera on that of a scan (m, 3)."""
+    facing = _facing(n, turns, toward)
+    shown = facing @ y / np.maximum(facing.sum(axis=1, keepdims=True), 1)
+    return scan.mean(axis=0) - (turns @ shown[:, :, None])[..., 0]
+
+
+def _stood(y: np.ndarray, n: np.ndarray, turns: np.ndarray, lift: np.ndarray, toward: np.ndarray, scan: np.ndarray,
+           upright: Upright) -> np.ndarray:
+    """Shifts (T, 3) that stand a body as high as `lift` (T,) says, and lay what is then level with the scan on it."""
+    up = upright.ups[np.argmax(turns @ upright.of_body @ upright.ups.T, axis=1)]
+    high, own = (scan @ up.T).T, np.einsum("ld,tde,te->tl", y, np.swapaxes(turns, 1, 2), up)
+    raised = ((1 - lift) * (high.max(axis=1) - own.max(axis=1)) + lift * (high.min(axis=1) - own.min(axis=1)))
+    level = own + raised[:, None]
+    shown = _facing(n, turns, toward) * (level < high.max(axis=1, keepdims=True)) * (
+        level > high.min(axis=1, keepdims=True))
+    centre = (turns @ (shown @ y / np.maximum(shown.sum(axis=1, keepdims=True), 1))[:, :, None])[..., 0]
+    apart = scan.mean(axis=0) - centre
+    return apart + (raised - np.einsum("td,td->t", apart, up))[:, None] * up
 
 
 def _distances(y: np.ndarray, n: np.ndarray, turns: np.ndarray, shift: np.ndarray, scan: ScanPoints) -> np.ndarray:
@@ -174,7 +218,7 @@ def _distances(y: np.ndarray, n: np.ndarray, turns: np.ndarray, shift: np.ndarra
     # |a - b|² = |a|² + (|b|² - 2 a·b); a piece at a time, so that it stays near the processor
     nearest = np.concatenate([(squared + have @ (-2 * some.T)).min(axis=0)
                               for some in np.array_split(ask, 1 + len(ask) // AT_ONCE)]) + (ask**2).sum(axis=1)
-    return np.minimum(nearest, CAP**2).reshape(len(turns), -1).mean(axis=1)
+    return np.minimum(nearest, CAP**2).reshape(len(turns), len(scan.points)).mean(axis=1)
 
 
 def _rotated(pose: np.ndarray, R: np.ndarray) -> np.ndarray:

@@ -15,9 +15,12 @@ from model.linear import Subject
 from scanprep.batch.room import Room
 from scanprep.cli import MM, Unit
 from scanprep.console import Metric, Outcome, judgement_row, write_report
+from scanprep.depth_camera.picture import DepthPicture, read_depth
 from scanprep.geometry.files import POINT_ENDINGS, PointCloud, read_mesh, read_points
+from scanprep.geometry.format_common import UNITS
 from scanprep.geometry.landmarks import match_landmarks, read_landmarks
 from scanprep.geometry.mesh import Mesh
+from scanprep.judgement import size
 from scanprep.pictures.page import Page
 from scanprep.pictures.sheets import save_png
 from scanprep.pictures.textures import Texture, bake, read_texture, write_textured
@@ -27,7 +30,7 @@ from .colors import ColorConfig, blend, carry_colors, colored_views
 from .completion import Completion, complete, save_completion
 from .masks import read_mask
 from .report import completion_page, picture_completion
-from .scan import all_points, point_count
+from .scan import all_points, point_count, prepare_picture
 from .settings import CompletionConfig
 
 _STYLE = """.scan { display: grid; grid-template-columns: minmax(9rem, 1fr) 3fr; gap: 1rem; margin: 1.4rem 0; }
@@ -81,8 +84,8 @@ class ScanFiles:
     @property
     def mesh(self) -> Mesh | None:
         """What vertices and faces of a landmark file can refer to: the mesh, where there is one view."""
-        only = self.views[0]
-        return only if len(self.views) == 1 and isinstance(only, Mesh) else None
+        only = self.views[0] if len(self.views) == 1 else None
+        return only if isinstance(only, Mesh) else None
 
 
 def complete_files(work: Work, inputs: Inputs, room: Room) -> list[Metric]:
@@ -93,12 +96,20 @@ def complete_files(work: Work, inputs: Inputs, room: Room) -> list[Metric]:
     with warnings.catch_warnings():
         if work.config.free_scale:
             warnings.filterwarnings("ignore", ".*when read as metres", UserWarning)
-        files = read_views(inputs.scans, work.unit)
+        depth = read_picture(inputs.scans, work.unit)
+        files = read_views(inputs.scans, work.unit) if depth is None else ScanFiles((), ())
         landmarks = _landmarks(work, inputs, files)
-        masked = read_masks(inputs.masks, files, work.unit)
+        masked = read_masks(inputs.masks, files, work.unit) if depth is None else None
+    if depth is not None:
+        if inputs.masks:
+            raise ValueError("--mask: expected none with a depth picture; set the depth of what is not skin to 0")
+        marks = np.zeros((0, 3)) if landmarks is None else landmarks[1]
+        person = prepare_picture(depth, size(work.body.template), marks)
+        files = ScanFiles((PointCloud(person.points, person.normals),), (None,))
     views, output = list(files.views), room.folder
+    scan = views if depth is None else depth
     done = room.step("completion", (work.body, work.marks, work.config, work.unit, inputs),
-                     lambda: complete(work.body, views, landmarks, work.config, room.tell, masked))
+                     lambda: complete(work.body, scan, landmarks, work.config, room.tell, masked))
     if files.colored:
         done = _with_colors(work, files, done, output)
     save_completion(output, done)
@@ -175,6 +186,16 @@ def read_views(paths: Sequence[Path], unit: str | None = None) -> ScanFiles:
     views = tuple(read_view(path, unit) for path in paths)
     return ScanFiles(views, tuple(read_texture(path, unit) if isinstance(view, Mesh) else None
                                   for path, view in zip(paths, views, strict=True)))
+
+
+def read_picture(paths: Sequence[Path], unit: str | None = None) -> DepthPicture | None:
+    """The depth picture among the files, in millimetres where no other unit is told; None without one."""
+    pictures = [path for path in paths if path.suffix.lower() == ".png"]
+    if not pictures:
+        return None
+    if len(paths) > 1:
+        raise ValueError(f"SCAN: expected one depth picture alone, got {len(paths)} files")
+    return read_depth(pictures[0], UNITS[unit or "mm"])
 
 
 def read_view(path: Path, unit: str | None = None) -> Mesh | PointCloud:

@@ -24,7 +24,7 @@ from ..bodies import FixedBody, ShapedBody
 from ..partial.fit import ScanFit, Terms
 from ..partial.limbs import reinitialise_limbs
 from ..partial.scan import ScanPoints
-from ..partial.starts import approach, best_start, first_starts
+from ..partial.starts import approach, best_starts, first_starts
 from ..smoothing import inertia
 from .settings import TrackConfig
 
@@ -88,7 +88,7 @@ class FrameFit:
     def again(self, fit: ScanFit, starts: Sequence[np.ndarray], scratch: bool) -> Refined:
         """A lost frame anew from far starts (P,), or from scratch as well, whichever explains it best."""
         if scratch:
-            starts = [*starts, best_start(fit, first_starts(fit))]
+            starts = [*starts, best_starts(fit, first_starts(fit))[0]]
         ends = [approach(fit, _laid(self.body, x, fit.cloud)) for x in starts]
         best = ends[int(np.argmin([fit.misfit(x) for x in ends]))]
         return self.refine(fit, reinitialise_limbs(fit, best) if scratch else best)

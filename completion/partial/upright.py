@@ -1,0 +1,63 @@
+"""People mostly stand: which way is up in a scan and in a body, and how a body is turned that stands."""
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from model.human_poses import KINDS
+from scanprep.geometry import rotations
+from scanprep.geometry.mesh import Mesh
+from scanprep.skeleton.tree import Skeleton
+
+TILT = 0.35                          # radians that trunks of people who stand lean, standard deviation
+WIDEST = 0.6                         # radians that they lean at most where the search begins
+PICTURE = np.array([[0, -1.0, 0], [0, 1.0, 0], [1.0, 0, 0], [-1.0, 0, 0]])    # a camera as it is, upside down, rolled
+SPREAD = 3000                        # rotations of which those are tried that stand, when up is known: every 15 degrees
+SPREAD_OF_MANY = 1500                # when it is one of several
+
+
+@dataclass(frozen=True, eq=False)
+class Upright:
+    """Directions one of which is up in a scan, and what is up in the frame of a body's trunk."""
+
+    ups: np.ndarray                  # (n, 3) unit
+    of_body: np.ndarray              # (3,) unit
+
+    @staticmethod
+    def of(template: Mesh, skeleton: Skeleton, up: tuple[float, float, float] | None, picture: bool) -> Upright | None:
+        """What is known of the way up; None where that is nothing.
+
+        `up` is that of the scan where it is told; a camera that took a `picture` is upright, upside down, or rolled.
+        """
+        of_body = standing_axis(template, skeleton) if up is not None or picture else None
+        if up is not None:
+            length = float(np.linalg.norm(up))
+            if length < 1e-9:
+                raise ValueError(f"up: expected a direction, got {up}")
+            if of_body is None:
+                raise ValueError("up: expected none with a body that has no head and legs; name its parts "
+                                 "(scape prep skeleton)")
+            return Upright(np.array(up)[None] / length, of_body)
+        return None if of_body is None else Upright(PICTURE, of_body)
+
+    def rotations(self, spread: np.ndarray) -> np.ndarray:
+        """Those (T, 3, 3) of rotations (n, 3, 3) in which the body stands."""
+        return spread[((spread @ self.of_body) @ self.ups.T).max(axis=1) > np.cos(WIDEST)]
+
+    def nearest(self, x: np.ndarray) -> np.ndarray:
+        """The direction (..., 3) among them that is up for bodies of unknowns (..., P)."""
+        return self.ups[np.argmax(rotations.exp(x[..., :3]) @ self.of_body @ self.ups.T, axis=-1)]
+
+
+def standing_axis(template: Mesh, skeleton: Skeleton) -> np.ndarray | None:
+    """The axis (3,) of a template's frame that points most from its legs to its head; None without head or legs."""
+    part = skeleton.part_of_vertex(template)
+    legs = [p for p, name in enumerate(skeleton.names) if name.rpartition("_")[0] in KINDS["leg"]]
+    heads = [p for p, name in enumerate(skeleton.names) if name == "head"]
+    if not legs or not heads:
+        return None
+    way = template.vertices[np.isin(part, heads)].mean(axis=0) - template.vertices[np.isin(part, legs)].mean(axis=0)
+    axis = np.zeros(3)
+    axis[np.abs(way).argmax()] = np.sign(way[np.abs(way).argmax()])
+    return axis

@@ -1,0 +1,1 @@
+"""Depth pictures, and the person in them."""

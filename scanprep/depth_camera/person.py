@@ -1,0 +1,200 @@
+"""The person in a depth picture: what is left when floor and walls are taken away; refused where there is not one."""
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from scipy import ndimage
+from scipy.spatial import cKDTree
+
+from .picture import JUMP, NOISE, SMOOTHED, DepthPicture
+
+# Lengths are in sizes of the body, the root of its surface area (1.36 m for a man), areas in squares of it.
+LEAST_AREA, LEAST_RADIUS = 0.075, 0.08  # of what is seen of a body, and of the largest circle in it: a leg has less
+MOST_AREA = 0.5                      # two people that touch show more
+PLANE_AREA, OPEN_AREA = 0.2, 0.6     # of floors and walls; of what something is behind: two backs are not that large
+BEHIND = 0.02                        # share of the picture that may seem to be behind a wall
+PIECE = 0.003                        # area below which a piece is noise
+APART = 0.08                         # pieces closer than this are one: an arm in front of its body
+NEAR = 0.15                          # pieces too small for a person are of the person who is so near: an arm behind
+GUESSES, PLANES = 300, 8             # of planes, and planes taken away at most
+THICK, SIGMAS, PARALLEL = 0.012, 3.0, 0.9    # metres, deviations of the noise, cosine within which points are on one
+
+
+@dataclass(frozen=True, eq=False)
+class Person:
+    """Somebody in a picture.
+
+    Attributes
+    ----------
+    picture : DepthPicture
+        All that was seen, without flying pixels.
+    mask : (h, w) bool
+        Where the person is.
+    """
+
+    picture: DepthPicture
+    mask: np.ndarray
+
+    def alone(self) -> DepthPicture:
+        """The picture without all else."""
+        return replace(self.picture, depth=np.where(self.mask, self.picture.depth, np.nan))
+
+    def oriented_points(self) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Points (n, 3), metres, their normals (n, 3) towards the camera, and which are at the edge of a surface (n,).
+
+        Near a jump in depth neither a pixel nor its normal can be trusted, and it is left out.
+        """
+        alone, reach = self.alone(), np.ones((2 * SMOOTHED + 1,) * 2)
+        points, normals = alone.points(), alone.normals()
+        smooth = ndimage.binary_erosion(_one_surface(alone) | ~self.mask, reach, border_value=1)
+        found = self.mask & smooth & np.isfinite(normals).all(axis=2)
+        edge = ~ndimage.binary_erosion(found, np.ones((3, 3)), border_value=0)
+        return points[found], normals[found], edge[found]
+
+
+def find_person(picture: DepthPicture, size: float, marks: np.ndarray | None = None) -> Person:
+    """The one person in a picture of half the resolution; ValueError with the reason where there is not one.
+
+    `size`, metres, of the body, the root of its surface area; `marks` (L, 3), metres, points that are on the person.
+    """
+    small = picture.without_flying_pixels().halved()
+    pieces = _pieces(small, small.seen & ~room_planes(small, size), size)
+    shown = [_shown(small, mask, size) for mask in pieces]
+    people = [mask for mask, (area, radius) in zip(pieces, shown, strict=True)
+              if area >= LEAST_AREA and radius >= LEAST_RADIUS]
+    if not people:
+        raise ValueError(f"picture: {_nobody(shown, size)}")
+    if marks is not None and len(marks):
+        people = [min(people, key=lambda mask: np.median(cKDTree(small.points()[mask]).query(marks)[0]))]
+    if len(people) > 1:
+        raise ValueError(f"picture: {len(people)} people, or things as large, are in it; one is expected: set the "
+                         "depth of all else to 0, or give landmarks on the person")
+    mask = _with_neighbours(small, people[0], pieces, size)
+    area = _shown(small, mask, size)[0]
+    if area > MOST_AREA:
+        raise ValueError(f"picture: what stands in it shows {area * size**2:.1f} m², more than a person does: two "
+                         "people who touch, or a wall that was not recognised; set the depth of all else to 0")
+    return Person(small, mask)
+
+
+def room_planes(picture: DepthPicture, size: float) -> np.ndarray:
+    """(h, w) bool: pixels on planes too large and too flat for a body: floor, walls, doors, tables.
+
+    `size`, metres, of the body.
+    """
+    points, normals = picture.points(), picture.normals()
+    open_, rng = picture.seen & np.isfinite(normals).all(axis=2), np.random.default_rng(0)
+    taken = np.zeros(open_.shape, dtype=bool)
+    for _ in range(PLANES):
+        p, n = points[open_], normals[open_]
+        if len(p) < 100:
+            break
+        some = rng.choice(len(p), min(4000, len(p)), replace=False)
+        area = _areas(picture, p[some], n[some]) * len(p) / len(some)
+        guesses = [(area[_on(p[some], n[some], n[i], n[i] @ p[i])].sum(), i)
+                   for i in rng.choice(len(p), min(GUESSES, len(p)), replace=False)]
+        _, best = max(guesses)
+        normal, offset = n[best], n[best] @ p[best]
+        for _ in range(3):
+            mine = _on(p, n, normal, offset)
+            if mine.sum() < 100:
+                break
+            centre = p[mine].mean(axis=0)
+            normal = np.linalg.eigh(np.cov(p[mine].T))[1][:, 0]
+            normal = normal * np.sign(-normal @ centre)
+            offset = normal @ centre
+        mine = _on(p, n, normal, offset)
+        behind = np.mean(points[picture.seen] @ normal - offset < -2 * _thickness(points[picture.seen]))
+        if _areas(picture, p[mine], n[mine]).sum() < (OPEN_AREA if behind > BEHIND else PLANE_AREA) * size**2:
+            break
+        taken[picture.seen] |= np.abs(points[picture.seen] @ normal - offset) < _thickness(points[picture.seen])
+        open_ &= ~taken
+    return taken
+
+
+def _thickness(points: np.ndarray) -> np.ndarray:
+    return THICK + SIGMAS * NOISE * points[..., 2]**2
+
+
+def _on(p: np.ndarray, n: np.ndarray, normal: np.ndarray, offset: float) -> np.ndarray:
+    return (np.abs(p @ normal - offset) < _thickness(p)) & (n @ normal > PARALLEL)
+
+
+def _areas(picture: DepthPicture, p: np.ndarray, n: np.ndarray) -> np.ndarray:
+    """Square metres (n,) of the surface that each pixel shows."""
+    slope = np.abs(np.einsum("nd,nd->n", n, p)) / np.linalg.norm(p, axis=1)
+    return p[:, 2]**2 / (picture.intrinsics[0, 0] * picture.intrinsics[1, 1]) / np.maximum(slope, 0.15)
+
+
+def _one_surface(picture: DepthPicture) -> np.ndarray:
+    """(h, w) bool: pixels whose measured neighbours are all on their surface."""
+    filled = np.where(picture.seen, picture.depth, np.inf)
+    low = ndimage.minimum_filter(filled, 3)
+    high = ndimage.maximum_filter(np.where(picture.seen, picture.depth, -np.inf), 3)
+    return picture.seen & (high - low < 2 * picture.jump())
+
+
+def _pieces(picture: DepthPicture, mask: np.ndarray, size: float) -> list[np.ndarray]:
+    """Masks (h, w) of what hangs together in space, largest first."""
+    across, down = (np.abs(np.diff(picture.depth, axis=a)) < 1.5 * JUMP * np.maximum(
+        np.nan_to_num(picture.depth[:, 1:] if a else picture.depth[1:]), 1) for a in (1, 0))
+    number = _joined(mask, across, down)
+    count = np.bincount(number[mask])
+    area = np.bincount(number[mask], weights=picture.depth[mask]**2) / np.prod(np.diag(picture.intrinsics)[:2])
+    kept = [i for i in np.argsort(-area) if area[i] > PIECE * size**2 and count[i] > 20]
+    points = picture.points()
+    pieces = [number == i for i in kept]
+    trees = [cKDTree(points[piece & mask][::3]) for piece in pieces]
+    group = list(range(len(kept)))
+    for i in range(len(kept)):
+        for j in range(i):
+            if group[i] != group[j] and trees[i].query(trees[j].data, distance_upper_bound=APART * size)[0].min() \
+                    < APART * size:
+                group = [group[j] if g == group[i] else g for g in group]
+    found = [np.any([pieces[i] for i in range(len(kept)) if group[i] == g], axis=0) & mask for g in sorted(set(group))]
+    return sorted(found, key=lambda piece: -float((picture.depth[piece]**2).sum()))
+
+
+def _with_neighbours(picture: DepthPicture, person: np.ndarray, pieces: list[np.ndarray], size: float) -> np.ndarray:
+    """The mask (h, w) of a person with the pieces near."""
+    points, out = picture.points(), person.copy()
+    tree = cKDTree(points[person][::3])
+    for piece in pieces:
+        if piece is not person and tree.query(points[piece][::3])[0].min() < NEAR * size:
+            out |= piece
+    return out
+
+
+def _joined(mask: np.ndarray, across: np.ndarray, down: np.ndarray) -> np.ndarray:
+    """(h, w) numbers of pieces of a mask whose neighbours hang together; `across` (h, w - 1), `down` (h - 1, w)."""
+    from scipy.sparse import coo_array
+    from scipy.sparse.csgraph import connected_components
+
+    index = np.arange(mask.size).reshape(mask.shape)
+    right, below = across & mask[:, 1:] & mask[:, :-1], down & mask[1:] & mask[:-1]
+    a = np.concatenate([index[:, :-1][right], index[:-1][below]])
+    b = np.concatenate([index[:, 1:][right], index[1:][below]])
+    graph = coo_array((np.ones(len(a), dtype=bool), (a, b)), shape=(mask.size, mask.size))
+    return np.asarray(connected_components(graph, directed=False)[1].reshape(mask.shape))
+
+
+def _shown(picture: DepthPicture, mask: np.ndarray, size: float) -> tuple[float, float]:
+    """Area of a piece, and radius of the largest circle in it, in sizes; the border of the picture is no end."""
+    z = np.where(mask, np.nan_to_num(picture.depth), 0.0)
+    fx, fy = np.diag(picture.intrinsics)[:2]
+    closed = ndimage.binary_closing(np.pad(mask, 2, mode="edge"), np.ones((3, 3)), iterations=2)
+    reach = ndimage.distance_transform_edt(np.pad(closed, max(mask.shape), mode="edge"))
+    cut = max(mask.shape) + 2
+    radius = (reach[cut:-cut, cut:-cut] * z / np.sqrt(fx * fy)).max()
+    return float((z**2).sum() / (fx * fy)) / size**2, float(radius) / size
+
+
+def _nobody(shown: list[tuple[float, float]], size: float) -> str:
+    """Why what is in the picture is no person."""
+    if not shown:
+        return "nobody is in it: nothing stands in front of floor and walls"
+    area, radius = max(shown)
+    return (f"only a part of a body is in it, or nobody: the largest thing in front of floor and walls shows "
+            f"{area * size**2:.2f} m² and is {2 * radius * size:.2f} m thick, a person from hips to head more than "
+            f"{LEAST_AREA * size**2:.2f} m² and {2 * LEAST_RADIUS * size:.2f} m")

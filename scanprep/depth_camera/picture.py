@@ -1,0 +1,169 @@
+"""What a depth camera saw: a picture of distances, cleaned of pixels between two surfaces, as points with normals."""
+from __future__ import annotations
+
+import json
+from dataclasses import dataclass, replace
+from pathlib import Path
+
+import numpy as np
+from scipy import ndimage
+
+NOISE = 0.002                        # metres at one metre, growing with the square of the distance: what cameras have
+JUMP = 0.02                          # metres, and as much of the distance: neighbours farther apart are two surfaces
+SMOOTHED = 2                         # pixels around each from which its normal comes
+
+
+@dataclass(frozen=True, eq=False)
+class DepthPicture:
+    """Distances along the optical axis, of a camera in the origin that looks along z, x to the right and y down.
+
+    Attributes
+    ----------
+    depth : (h, w) float, metres
+        NaN where nothing was measured.
+    intrinsics : (3, 3) float, pixels
+        Focal lengths on the diagonal, the optical centre in the last column.
+    """
+
+    depth: np.ndarray
+    intrinsics: np.ndarray
+
+    @staticmethod
+    def of(depth: np.ndarray, intrinsics: np.ndarray) -> DepthPicture:
+        """A picture from numbers that may be zero, infinite or negative where nothing was measured.
+
+        `depth` (h, w), metres; `intrinsics` (3, 3), pixels.
+        """
+        depth, intrinsics = np.asarray(depth, dtype=np.float64), np.asarray(intrinsics, dtype=np.float64)
+        if depth.ndim != 2 or min(depth.shape) < 8:
+            raise ValueError(f"depth: expected a picture of distances (h, w), got shape {depth.shape}")
+        if intrinsics.shape != (3, 3) or not np.isfinite(intrinsics).all() or min(np.diag(intrinsics)) <= 0:
+            raise ValueError(f"intrinsics: expected (3, 3) with focal lengths in pixels, got {intrinsics.tolist()}")
+        depth = np.where(np.isfinite(depth) & (depth > 0), depth, np.nan)
+        if not (known := depth[np.isfinite(depth)]).size:
+            raise ValueError("depth: nothing was measured anywhere in the picture")
+        if not 0.1 < float(np.median(known)) < 30:
+            raise ValueError(f"depth: its median is {np.median(known):.3g} m; expected metres, 0.1 to 30")
+        return DepthPicture(depth, intrinsics)
+
+    @property
+    def seen(self) -> np.ndarray:
+        """(h, w) bool: where something was measured."""
+        return np.isfinite(self.depth)
+
+    def points(self) -> np.ndarray:
+        """(h, w, 3) metres; NaN where nothing was measured."""
+        row, column = pixels(self.depth.shape)
+        return self.depth[..., None] * self.directions(column, row)
+
+    def directions(self, column: np.ndarray, row: np.ndarray) -> np.ndarray:
+        """(..., 3) rays of pixels, one long along the optical axis."""
+        K = self.intrinsics
+        return np.stack([(column - K[0, 2]) / K[0, 0], (row - K[1, 2]) / K[1, 1], np.ones(np.shape(column))], axis=-1)
+
+    def project(self, points: np.ndarray) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+        """Row and column (...) of the pixels of points (..., 3), and whether they are in the picture."""
+        K, (h, w) = self.intrinsics, self.depth.shape
+        ahead = points[..., 2] > 1e-6
+        z = np.where(ahead, points[..., 2], 1.0)
+        column = np.rint(K[0, 0] * points[..., 0] / z + K[0, 2])
+        row = np.rint(K[1, 1] * points[..., 1] / z + K[1, 2])
+        inside = ahead & (row >= 0) & (row < h) & (column >= 0) & (column < w)
+        return (np.where(inside, row, 0).astype(np.int64), np.where(inside, column, 0).astype(np.int64), inside)
+
+    def jump(self) -> np.ndarray:
+        """(h, w) metres by which neighbours on one surface may differ."""
+        return JUMP * np.maximum(np.nan_to_num(self.depth), 1.0)
+
+    def without_flying_pixels(self) -> DepthPicture:
+        """The picture without pixels that hang between two surfaces, on neither.
+
+        A pixel stays when at least half of its neighbours that were measured are about as far away.
+        """
+        alike, there = np.zeros(self.depth.shape), np.zeros(self.depth.shape)
+        padded, jump, (h, w) = np.pad(self.depth, 1, constant_values=np.nan), self.jump(), self.depth.shape
+        for i in range(3):
+            for j in range(3):
+                other = padded[i:i + h, j:j + w]
+                there += np.isfinite(other)
+                alike += np.abs(other - self.depth) < jump
+        return replace(self, depth=np.where((alike - 1 >= 0.5 * 8) & (there > 4), self.depth, np.nan))
+
+    def normals(self, smoothed: int = SMOOTHED) -> np.ndarray:
+        """(h, w, 3) unit, towards the camera, from planes of inverse depth over a few pixels; NaN where unknown.
+
+        A plane of space is linear in inverse depth over the picture: 1/z = a·ray, and a is its normal.
+        """
+        size = 2 * smoothed + 1
+        row, column = pixels(self.depth.shape)
+        rays, known = self.directions(column, row), self.seen
+        inverse = np.where(known, 1 / np.where(known, self.depth, 1.0), 0.0)
+
+        def over(values: np.ndarray) -> np.ndarray:
+            return np.asarray(ndimage.uniform_filter(values * known, size, mode="constant"))
+
+        A, b = np.zeros((*self.depth.shape, 3, 3)), np.zeros((*self.depth.shape, 3))
+        for i in range(3):
+            b[..., i] = over(rays[..., i] * inverse)
+            for j in range(i, 3):
+                A[..., i, j] = A[..., j, i] = over(rays[..., i] * rays[..., j])
+        enough = known & (over(np.ones(self.depth.shape)) > 0.4)
+        out = np.full((*self.depth.shape, 3), np.nan)
+        n = -np.linalg.solve(A[enough] + 1e-12 * np.eye(3), b[enough][..., None])[..., 0]
+        out[enough] = n / np.maximum(np.linalg.norm(n, axis=1), 1e-12)[:, None]
+        return out
+
+    def halved(self) -> DepthPicture:
+        """Every second pixel of every second row, means of those around on the same surface."""
+        h, w = (n // 2 * 2 for n in self.depth.shape)
+        blocks = self.depth[:h, :w].reshape(h // 2, 2, w // 2, 2).transpose(0, 2, 1, 3).reshape(h // 2, w // 2, 4)
+        nearest = np.nanmin(np.where(np.isfinite(blocks), blocks, np.inf), axis=2)[..., None]
+        near = np.isfinite(blocks) & (blocks - nearest < JUMP * np.maximum(nearest, 1.0))
+        count = near.sum(axis=2)
+        mean = np.where(near, blocks, 0).sum(axis=2) / np.maximum(count, 1)
+        K = self.intrinsics.copy()
+        K[:2] /= 2
+        K[:2, 2] -= 0.25
+        return DepthPicture(np.where(count > 0, mean, np.nan), K)
+
+
+def pixels(shape: tuple[int, ...]) -> tuple[np.ndarray, np.ndarray]:
+    """Row and column (h, w) of every pixel."""
+    row, column = np.indices(shape)
+    return np.asarray(row), np.asarray(column)
+
+
+def read_depth(path: Path, metres: float = 0.001) -> DepthPicture:
+    """A picture from a PNG file of 16 bits, 0 where nothing was measured, `metres` long each unit.
+
+    The camera is read from `NAME.camera.json` beside it: `{"fx", "fy", "cx", "cy"}` in pixels, or what Open3D writes,
+    `{"intrinsic_matrix": [...]}`, column by column.
+    """
+    from PIL import Image, UnidentifiedImageError
+
+    try:
+        with Image.open(path) as image:
+            values = np.array(image)
+    except UnidentifiedImageError:
+        raise ValueError(f"{path}: it is not a PNG file") from None
+    if values.ndim != 2 or values.dtype == np.uint8:
+        raise ValueError(f"{path}: expected distances, one channel of 16 bits, got {values.dtype} {values.shape}")
+    try:
+        return DepthPicture.of(metres * values, read_camera(path.with_name(path.stem + ".camera.json")))
+    except ValueError as error:
+        raise ValueError(f"{path}: {error}") from None
+
+
+def read_camera(path: Path) -> np.ndarray:
+    """Intrinsics (3, 3), pixels, from a JSON file."""
+    if not path.exists():
+        raise ValueError(f"expected its camera in {path}, as {{\"fx\": 589, \"fy\": 589, \"cx\": 319.5, "
+                         "\"cy\": 239.5}, pixels; there is none")
+    try:
+        told = json.loads(path.read_text(encoding="utf-8"))
+        if "intrinsic_matrix" in told:
+            return np.array(told["intrinsic_matrix"], dtype=np.float64).reshape(3, 3).T
+        fx, fy, cx, cy = (float(told[name]) for name in ("fx", "fy", "cx", "cy"))
+    except (ValueError, KeyError, TypeError) as error:
+        raise ValueError(f"{path}: expected fx, fy, cx and cy, or intrinsic_matrix ({error!r})") from None
+    return np.array([[fx, 0, cx], [0, fy, cy], [0, 0, 1.0]])
