@@ -19,6 +19,7 @@ from ..skeleton.names import in_words
 from ..skeleton.tree import Skeleton
 from ..synthetic.anatomy import MIRROR_PART
 from ..synthetic.people import NAMED_POSES, PARENTS, PARTS, named_pose, random_pose
+from .limb_ends import bending
 from .person import PersonParts, average_person
 
 DRAWN = 60                             # random poses beside the named ones that show what people do
@@ -152,11 +153,7 @@ def part_bending(template: Mesh, skeleton: Skeleton, vertices: np.ndarray) -> tu
     out = np.zeros((2, len(skeleton.parents)))
     for p in range(len(skeleton.parents)):
         mine = part == p
-        rest, now, w = template.vertices[mine], vertices[mine], areas[mine] / areas[mine].sum()
-        rest, now = rest - w @ rest, now - w @ now
-        turned = rest @ rotations.procrustes(rest, now)[0].T
-        growth = np.einsum("n,nd,nd->", w, turned, now) / np.einsum("n,nd,nd->", w, turned, turned)
-        out[:, p] = np.sqrt(w @ ((now - growth * turned) ** 2).sum(axis=1)), np.log(max(growth, 1e-3))
+        out[:, p] = bending(template.vertices[mine], vertices[mine], areas[mine])
     return out[0], out[1]
 
 
