@@ -153,8 +153,9 @@ SECTIONS: dict[str, tuple[str, str, Callable[[dict], str], str]] = {
     "registration_4": ("Registration, four landmarks", "python tests/benchmarks/registration.py --set held --marks 4",
                        registration, "Hands and toes."),
     "registration_0": ("Registration without landmarks", "python tests/benchmarks/registration.py --set held --marks 0",
-                       registration, "Led by `find_correspondences`, as `scape prep run` does without landmark files; "
-                       "the time includes it."),
+                       registration, "Led by `register_unmarked`, as `scape prep run` does without landmark files; the "
+                       "time includes it. Scans that were not all covered were registered again with the ends of "
+                       "their limbs as landmarks."),
     "registration_front": ("Registration, one view from the front",
                            "python tests/benchmarks/registration.py --set held --marks 10 --front", registration,
                            "Ten landmarks, of which some lie where there are no data."),
