@@ -1,8 +1,12 @@
 import numpy as np
 import pytest
 
+from scanprep.correspondence.correspondences import Correspondences
 from scanprep.geometry import rotations
+from scanprep.registration import unmarked
+from scanprep.registration.limb_ends import bending
 from scanprep.registration.limbs import frames, joint_angles, limb_doubts, part_bending, rolls
+from scanprep.registration.nonrigid import Registration
 from scanprep.registration.person import NAMES, PersonParts, average_person
 from scanprep.skeleton.tree import Skeleton
 from scanprep.synthetic.people import NAMED_POSES, PARTS, named_pose
@@ -82,3 +86,31 @@ def test_growth_of_the_whole_body_is_no_bending(person, parts):
     bending, growth = part_bending(person.mesh, parts.skeleton, 1.2 * person.mesh.vertices + 3)
     assert np.abs(bending).max() < 1e-9 and np.allclose(growth, np.log(1.2))
     assert not words(person, parts, 1.2 * person.mesh.vertices)
+
+
+def test_bending_leaves_out_place_rotation_and_size():
+    points, twisted = rng.normal(size=(2, 40, 3))
+    moved = 1.7 * points @ rotations.exp(np.array([1.0, 2, -1])).T + [3, 0, 1]
+    off, growth = bending(points, moved)
+    assert off < 1e-12 and np.isclose(growth, np.log(1.7))
+    assert bending(points, moved + 0.1 * twisted)[0] > 0.05
+
+
+@pytest.mark.parametrize("first, second, kept", [(0.001, 0.0, [None]), (0.03, 0.002, [None, 5]),
+                                                 (0.03, 0.04, [None, 5])])
+def test_where_a_limb_was_lost_its_ends_lead(person, monkeypatch, first, second, kept):
+    """A scan that is covered is registered once; else again with its ends, and what covers more is kept."""
+    ends = Correspondences(np.arange(5), np.zeros((5, 3)), np.ones(5))
+    led = []
+
+    def register(template, scan, landmarks, *rest):
+        led.append(None if landmarks is None else len(landmarks[0]))
+        nothing = np.zeros(0)
+        return Registration(template, nothing, nothing, 0.0, 0.01, True, 1, {}, 0, nothing,
+                            first if landmarks is None else second)
+
+    monkeypatch.setattr(unmarked, "find_seeds", lambda *args: ends)
+    monkeypatch.setattr(unmarked, "find_correspondences", lambda *args: ends)
+    monkeypatch.setattr(unmarked, "register", register)
+    fit, _ = unmarked.register_unmarked(person.mesh, person.mesh)
+    assert led == kept and fit.uncovered == (min(first, second) if len(kept) > 1 else first)
