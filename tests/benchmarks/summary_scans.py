@@ -41,6 +41,12 @@ def verdicts(report: dict) -> str:
     return f"{rates}\n\n{told}"
 
 
+def rolled_limbs(report: dict) -> str:
+    """A row for every limb and angle."""
+    return table(("limb", "rolled by (degrees)", "bodies", "told", "limb off (mm)"),
+                 [tuple(r[n] for n in ("limb", "degrees", "bodies", "told", "limb_off_mm")) for r in report["rows"]])
+
+
 def peers(report: dict) -> str:
     """A row for every tool: its error on every body, and its time."""
     bodies = list(dict.fromkeys(r["body"] for r in report["rows"]))
