@@ -9,19 +9,23 @@ from scipy.spatial.transform import Rotation
 
 from scanprep import RegisteredSet, write_landmarks, write_mesh
 from scanprep.geometry.files import PointCloud, write_points
+from scanprep.judgement import Judgement
 from scanprep.pipeline import page as pictures
 from scanprep.pipeline.figures import (
     Limits,
     ScanFigures,
+    read_doubts,
     read_failures,
     read_figures,
     review,
+    write_doubts,
     write_failures,
     write_figures,
 )
 from scanprep.pipeline.page import write_set_page
 from scanprep.pipeline.prepare import prepare
 from scanprep.pipeline.scans import find_scans
+from scanprep.registration.limbs import Doubt
 from scanprep.registration.nonrigid import principal_stretches, stretched_share, uncovered_share
 
 GOOD = ScanFigures("good", "10 landmarks", 0.001, 0.0015, 0.85, 0.85, 0.0, 0.004, 0.002, 0, True, 0.0, 3.25)
@@ -123,6 +127,17 @@ def test_order_of_verdicts():
     assert [v.name for v in verdicts] == ["a", "z", "c", "b", "d"]
     assert [v.failed for v in verdicts] == [True, True, False, False, False]
     assert [v.badness for v in verdicts[2:4]] == [pytest.approx(20), pytest.approx(2)]
+
+
+def test_a_rolled_limb_puts_a_scan_on_top(tmp_path):
+    figures = [replace(GOOD, name=name) for name in "abc"]
+    rolled = Doubt(3.0, "the left forearm is rolled by 160 degrees against the left upper arm")
+    write_doubts(tmp_path, {"b": [rolled, Doubt(1.2, "the head is 20% smaller than on the template")], "a": []})
+    verdicts = review(figures, {}, 1.4, 25_000, doubts=read_doubts(tmp_path))
+    assert verdicts[0].name == "b" and verdicts[0].badness == 3.0 and verdicts[0].reasons[0] == rolled.words
+    assert [v.judgement.verdict for v in verdicts] == ["check", "good", "good"]
+    assert review(figures, {"a": "gone"}, 1.4, 25_000)[0].judgement == Judgement("failed", ("gone",))
+    assert not any(v.suspect for v in review(figures, {}, 1.4, 25_000, Limits(limbs=4), read_doubts(tmp_path)))
 
 
 def test_scans_from_one_side_are_not_blamed_for_it():

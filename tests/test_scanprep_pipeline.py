@@ -22,9 +22,9 @@ from scanprep.batch.pool import Workers, run_jobs
 from scanprep.batch.room import Failure, Job
 from scanprep.cleaning.clean_scan import CleanScanConfig
 from scanprep.correspondence.correspondences import Correspondences
-from scanprep.pipeline import scan as scan_module
 from scanprep.pipeline.prepare import RegisterScan, prepare
 from scanprep.pipeline.scans import find_scans
+from scanprep.registration import unmarked
 
 
 @pytest.fixture(scope="module")
@@ -290,7 +290,8 @@ def test_correspondences_lead_where_there_are_no_landmarks(scans, template, tmp_
     (scans / "body0.landmarks.json").unlink()
     some = np.arange(0, 642, 30)
     pairs = Correspondences(some, turned.vertices[some], np.ones(len(some)))
-    monkeypatch.setattr(scan_module, "find_correspondences", lambda *args, **named: pairs)
+    monkeypatch.setattr(unmarked, "find_seeds", lambda *args: pairs)
+    monkeypatch.setattr(unmarked, "find_correspondences", lambda *args: pairs)
     done = prepare(find_scans(scans)[:2], template, MARKS, tmp_path / "set", QUICK)
     assert [f.init for f in done.figures] == ["22 correspondences", "5 landmarks"]
     found = done.registered.vertices(["body0"])[0]

@@ -9,11 +9,13 @@ from typing import Any
 import numpy as np
 
 from ..geometry import tables
+from ..judgement import Judgement
 from ..ranges import Settings
+from ..registration.limbs import Doubt
 
 NONE = "none"                  # what a table says where a figure has no value
 EARLIER = {"guide": "init", "flipped": "inverted"}      # names of columns in tables written before
-FIGURES, TIMES, FAILURES = "registration.csv", "times.csv", "failures.csv"
+FIGURES, TIMES, FAILURES, LIMBS = "registration.csv", "times.csv", "failures.csv", "limbs.csv"
 
 
 @dataclass(frozen=True)
@@ -77,6 +79,21 @@ def write_failures(folder: Path, failures: Mapping[str, str]) -> None:
         (folder / FAILURES).unlink(missing_ok=True)
 
 
+def read_doubts(folder: Path) -> dict[str, list[Doubt]]:
+    """What in each scan no person can do, the gravest first."""
+    found: dict[str, list[Doubt]] = {}
+    for row in _read(folder / LIMBS):
+        found.setdefault(row["name"], []).append(Doubt(float(row["excess"]), row["reason"]))
+    return found
+
+
+def write_doubts(folder: Path, doubts: Mapping[str, Iterable[Doubt]]) -> None:
+    """Write the table of what no person can do, sorted by name."""
+    tables.write_table(folder / LIMBS, ["name", "excess", "reason"],
+                       [(name, f"{doubt.excess:.3f}", doubt.words) for name in sorted(doubts)
+                        for doubt in doubts[name]])
+
+
 def _read(path: Path) -> list[dict[str, str]]:
     return [row for _, row in tables.read_table(path, ())] if path.exists() else []
 
@@ -102,6 +119,9 @@ class Limits(Settings):
         Share of the triangles that face against their surroundings.
     landmarks : float
         RMS distance of the landmarks, over the size.
+    limbs : float
+        What no person can do: joints that roll or bend too far, limbs whose skin is out of shape or that grew or
+        shrank against the body. One is where it begins; double of it is 30 degrees more.
     not_converged : float
         What a registration that did not converge counts, as a multiple of a limit; below 1 it is not suspect for
         that alone.
@@ -113,6 +133,7 @@ class Limits(Settings):
     stretch: float = 0.02
     inverted: float = 0.001
     landmarks: float = 0.015
+    limbs: float = 1.0
     not_converged: float = 0.5
 
 
@@ -135,19 +156,28 @@ class Verdict:
         """Whether a person should look at it."""
         return self.badness >= 1
 
+    @property
+    def judgement(self) -> Judgement:
+        """The same in one word and its reasons."""
+        return Judgement.of(self.reasons) if self.failed else Judgement.of(None, self.reasons if self.suspect else ())
+
 
 def review(figures: Sequence[ScanFigures], failures: Mapping[str, str], size: float, faces: int,
-           limits: Limits | None = None) -> list[Verdict]:
-    """Verdicts on all scans, worst first; `size` of the template in metres, the number of its `faces`."""
+           limits: Limits | None = None, doubts: Mapping[str, Sequence[Doubt]] | None = None) -> list[Verdict]:
+    """Verdicts on all scans, worst first; `size` of the template in metres, the number of its `faces`.
+
+    `doubts` are what in each scan no person can do.
+    """
     limits = limits or Limits()
     usual = float(np.median([1 - f.seen for f in figures])) if figures else 0.0
     known = {f.name: f for f in figures}
     verdicts = [Verdict(name, np.inf, (reason,), known.get(name)) for name, reason in sorted(failures.items())]
-    judged = [_judge(f, size, faces, usual, limits) for f in figures if f.name not in failures]
+    judged = [_judge(f, size, faces, usual, limits, (doubts or {}).get(f.name, ())) for f in figures
+              if f.name not in failures]
     return verdicts + sorted(judged, key=lambda verdict: (-verdict.badness, verdict.name))
 
 
-def _judge(f: ScanFigures, size: float, faces: int, usual: float, limits: Limits) -> Verdict:
+def _judge(f: ScanFigures, size: float, faces: int, usual: float, limits: Limits, doubts: Sequence[Doubt]) -> Verdict:
     over = {
         f"{100 * f.missed:.1f}% of the scan lies off the template: an uncovered limb, or clutter":
             f.missed / limits.missed,
@@ -159,7 +189,8 @@ def _judge(f: ScanFigures, size: float, faces: int, usual: float, limits: Limits
         f"{f.inverted} triangles inverted": f.inverted / faces / limits.inverted,
         f"landmarks {1000 * f.landmarks:.0f} mm off": f.landmarks / (limits.landmarks * size),
         "not converged": 0.0 if f.converged else limits.not_converged,
-        "nowhere near the scan": 0.0 if f.seen else 100.0}
+        "nowhere near the scan": 0.0 if f.seen else 100.0,
+        **{doubt.words: doubt.excess / limits.limbs for doubt in doubts}}
     over = {reason: value for reason, value in over.items() if np.isfinite(value)}
     reasons = sorted((reason for reason, value in over.items() if value >= 1), key=lambda reason: -over[reason])
     return Verdict(f.name, max(over.values()), tuple(reasons), f)

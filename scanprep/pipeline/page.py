@@ -18,7 +18,7 @@ from ..pictures.camera import Camera, look_around, upright
 from ..pictures.page import Page, data_uri
 from ..pictures.shading import CLAY, Dots, Shape, Solid, color_bar, heat, part_colors, render, side_by_side
 from ..registration.nonrigid import Registration
-from .figures import Limits, ScanFigures, Verdict, read_failures, read_figures, review
+from .figures import Limits, ScanFigures, Verdict, read_doubts, read_failures, read_figures, review
 
 PICTURES, PAGE = "pictures", "report.html"
 WIDTH, HEIGHT = 150, 216
@@ -56,7 +56,8 @@ def judge_set(folder: str | Path, limits: Limits | None = None) -> list[Verdict]
     folder = Path(folder)
     whole = RegisteredSet.load(folder)
     figures = [f for f in read_figures(folder) if f.name in whole.names]
-    return review(figures, read_failures(folder), size_of(whole.template), len(whole.template.faces), limits)
+    return review(figures, read_failures(folder), size_of(whole.template), len(whole.template.faces), limits,
+                  read_doubts(folder))
 
 
 def _lead(verdicts: Sequence[Verdict]) -> str:
@@ -89,7 +90,9 @@ def _explanation(limits: Limits, size: float) -> str:
         f"{100 * limits.unseen:.3g} points more surface without data than is usual in this set, "
         f"{100 * limits.stretch:.3g}% of the surface stretched to the double or shrunk to the half, "
         f"{100 * limits.inverted:.3g}% of the triangles inverted, landmarks {1000 * limits.landmarks * size:.0f} mm "
-        f"off. A registration that did not converge counts {limits.not_converged:.3g}.\n\n"
+        f"off. A registration that did not converge counts {limits.not_converged:.3g}. On a template that is a person, "
+        "joints that roll or bend as no person's do and limbs whose skin is out of shape count too: a rolled limb lies "
+        "on the scan as well as the right one.\n\n"
         "To mend a scan, correct its landmarks or click more of them where it went wrong and run the same command "
         "again: only scans whose files have changed are registered anew.")
 

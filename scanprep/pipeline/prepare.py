@@ -1,7 +1,7 @@
 """A folder of scans to a registered set: one task a scan, resumable, and one bad scan stops no other.
 
     scans/name.ply, its landmarks, scans.csv  ->  set/meshes/name.ply, set.csv, skeleton.json,
-                                                  registration.csv, failures.csv, pictures/name.webp, report.html
+                                                  registration.csv, limbs.csv, failures.csv, report.html
 """
 from __future__ import annotations
 
@@ -20,10 +20,12 @@ from ..geometry.files import read_mesh, write_mesh
 from ..geometry.landmarks import write_landmarks
 from ..geometry.mesh import Mesh, check_template
 from ..ranges import Count, Settings
+from ..registration.limbs import limb_doubts
+from ..registration.person import person_parts
 from ..skeleton.find import find_skeleton
 from ..skeleton.parts import SkeletonConfig
 from ..threads import one_thread
-from .figures import ScanFigures, write_failures, write_figures
+from .figures import ScanFigures, write_doubts, write_failures, write_figures
 from .page import PICTURES, write_set_page
 from .scan import ScanSettings, register_scan
 from .scans import ScanTask
@@ -88,6 +90,7 @@ def prepare(tasks: Sequence[ScanTask], template: Mesh, template_landmarks: Mappi
             done = space.run(work, [Task(SCANS + task.name, task) for task in tasks], config.workers, progress)
             failures, fresh = {name.removeprefix(SCANS): line for name, line in done.failures.items()}, done.fresh
             registered = tables.write(failures)
+            _with_doubts(space, registered)
             _with_skeleton(space, registered, config, skeleton_progress)
         finally:
             tables.write(failures)
@@ -159,6 +162,18 @@ class _Tables:
             raise ValueError(f"{self.space.folder}: holds {len(lost)} other scans that were registered with another "
                              f"template or other settings ({', '.join(lost[:5])}); name another folder")
         return others
+
+
+def _with_doubts(space: Workspace, registered: RegisteredSet) -> None:
+    """The table of what in the registrations no person can do, where the template is a person."""
+    bare = Mesh(registered.template.vertices, registered.template.faces)
+    parts = space.step("person", bare, lambda folder: person_parts(bare))
+    if parts is None:
+        space.drop("limbs")
+        return
+    doubts = {name: limb_doubts(bare, parts, registered.vertices([name])[0]) for name in registered.names}
+    with space.staging("limbs") as staged:
+        write_doubts(staged.folder, doubts)
 
 
 def _with_skeleton(space: Workspace, registered: RegisteredSet, config: PrepareConfig, progress: Progress | None

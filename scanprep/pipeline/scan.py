@@ -8,8 +8,6 @@ from typing import Annotated, Literal
 import numpy as np
 
 from ..cleaning.clean_scan import CleanScanConfig, clean_scan
-from ..correspondence.correlated import find_correspondences
-from ..correspondence.correspondences import Correspondences
 from ..correspondence.search import CorrelatedConfig
 from ..geometry.files import read_scan
 from ..geometry.landmarks import check_on_surface, match_landmarks, read_landmarks
@@ -18,6 +16,7 @@ from ..judgement import extent
 from ..ranges import FLAG, Settings
 from ..registration.nonrigid import Registration, register, registration_problem, stretched_share
 from ..registration.schedule import RegistrationConfig
+from ..registration.unmarked import register_unmarked
 from ..threads import one_thread
 from .figures import ScanFigures
 from .scans import ScanTask
@@ -75,8 +74,7 @@ def register_scan(task: ScanTask, template: Mesh, template_landmarks: dict[str, 
         _check_unit(task, scan, template)
         landmarks = _landmarks(task, scan, template_landmarks, settings)
         scan, removed = _cleaned(scan, landmarks, settings.clean)
-        pairs = _correspondences(template, scan, landmarks, settings)
-        fit = register(template, scan, landmarks, settings.registration, correspondences=pairs)
+        fit, init = _registered(template, scan, landmarks, settings)
         problem = registration_problem(template, scan, fit, landmarks is not None)
         if problem:
             raise ValueError(f"{task.scan}: the template is not on it: {problem}")
@@ -85,9 +83,7 @@ def register_scan(task: ScanTask, template: Mesh, template_landmarks: dict[str, 
             from .page import strip
 
             picture = strip(template, scan, fit)
-    init = (f"{len(landmarks[0])} landmarks" if landmarks is not None else
-             f"{len(pairs)} correspondences" if pairs is not None else "pose")
-    figures = _measure(task, template, fit, init)
+    figures = figures_of(task.name, init, template, fit)
     return RegisteredScan(fit.mesh.vertices, replace(figures, removed=removed, seconds=time.perf_counter() - start),
                           picture)
 
@@ -114,13 +110,15 @@ def _landmarks(task: ScanTask, scan: Mesh | np.ndarray, template_landmarks: dict
         raise ValueError(f"{task.landmarks}: {error}") from None
 
 
-def _correspondences(template: Mesh, scan: Mesh | np.ndarray, landmarks: Landmarks | None, settings: ScanSettings
-                     ) -> Correspondences | None:
-    """What leads the template where landmarks do not, or None where its pose is to do."""
+def _registered(template: Mesh, scan: Mesh | np.ndarray, landmarks: Landmarks | None, settings: ScanSettings
+                ) -> tuple[Registration, str]:
+    """The template on the scan, and what led it there: landmarks, or correspondences, or its pose."""
     if landmarks is not None or settings.init == "pose":
-        return None
+        return (register(template, scan, landmarks, settings.registration),
+                "pose" if landmarks is None else f"{len(landmarks[0])} landmarks")
     try:
-        return find_correspondences(template, scan, config=settings.correspondences)
+        fit, pairs = register_unmarked(template, scan, settings.registration, settings.correspondences)
+        return fit, f"{len(pairs)} correspondences"
     except ValueError as error:
         raise ValueError(f"{error} (a landmark file, or --init pose, needs no ends of limbs)") from None
 
@@ -134,8 +132,9 @@ def _cleaned(scan: Mesh | np.ndarray, landmarks: Landmarks | None, config: Clean
     return found.scan, 1 - float(found.kept.mean())
 
 
-def _measure(task: ScanTask, template: Mesh, fit: Registration, init: str) -> ScanFigures:
+def figures_of(name: str, init: str, template: Mesh, fit: Registration) -> ScanFigures:
+    """How well a template lies on a scan of some name; `init` is what led it there."""
     return ScanFigures(
-        task.name, init, float(np.nanmean(fit.distances)) if fit.seen.any() else np.nan, fit.rms,
+        name, init, float(np.nanmean(fit.distances)) if fit.seen.any() else np.nan, fit.rms,
         float(fit.seen.mean()), float(fit.confidence.mean()), fit.uncovered,
         stretched_share(template, fit.mesh), fit.landmark_rms, fit.inverted, fit.converged)

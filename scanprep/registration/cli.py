@@ -21,7 +21,9 @@ from ..geometry.files import read_mesh, read_scan, write_mesh
 from ..geometry.landmarks import landmarks_beside, match_landmarks, read_landmarks, read_template_landmarks
 from ..geometry.mesh import Mesh
 from ..judgement import Judgement
+from .limbs import limb_doubts
 from .nonrigid import register, registration_problem
+from .person import person_parts
 from .schedule import RegistrationConfig
 
 TargetArg = Annotated[tyro.conf.Positional[Path], tyro.conf.arg(metavar="TARGET")]
@@ -108,6 +110,8 @@ def register_one(scan: ScanArg, template: Path, output: Output, landmarks: Path 
     with bar("registering") as progress:
         fit = register(body, data, pairs, config=config, progress=progress, correspondences=hints)
     write_mesh(output, fit.mesh)
+    parts = person_parts(body)
+    doubts = limb_doubts(body, parts, fit.mesh.vertices) if parts else ()
     return Outcome(output, [
         *_led_by(given, pairs),
         Metric("distance to the scan, RMS", MM * fit.rms, "mm"),
@@ -116,7 +120,8 @@ def register_one(scan: ScanArg, template: Path, output: Output, landmarks: Path 
         Metric("scan off the template", 100 * fit.uncovered, "%"),
         Metric("distance of landmarks, RMS", MM * fit.landmark_rms, "mm"),
         Metric("inverted triangles", fit.inverted), Metric("converged", str(fit.converged))], {"register": config},
-        judgement=Judgement.of(registration_problem(body, data, fit, pairs is not None)))
+        judgement=Judgement.of(registration_problem(body, data, fit, pairs is not None),
+                               [doubt.words for doubt in doubts]))
 
 
 Landmarks = tuple[np.ndarray, np.ndarray]

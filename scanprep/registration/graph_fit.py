@@ -20,11 +20,12 @@ from ..geometry.least_squares import Sparse, levenberg_marquardt
 from ..geometry.mesh import Mesh
 from ..geometry.target import orient
 from .deformation_graph import DeformationGraph, build_graph
-from .limb_ends import End, RigidFit, find_ends, rotated_end
+from .limb_ends import End, RigidFit, bending, find_ends, rotated_end
 from .matches import NORMALS, Inputs, Pull, landmark_pull, pull, wanted_by
 from .schedule import GraphStage
 
 UNKNOWNS = 7
+SHAPE = 20.0                # what bending of an end of a body in itself weighs against its distance to the scan
 
 
 def graph_fit(given: Inputs, T: np.ndarray, stages: tuple[GraphStage, ...], ends: int,
@@ -52,7 +53,11 @@ def bent(given: Inputs, fit: GraphFit, stage: GraphStage) -> GraphFit:
 
 
 def with_end_rotated(given: Inputs, fit: GraphFit, stage: GraphStage, end: End) -> GraphFit:
-    """The fit with an end of the body rotated about itself, where that lies nearer to the scan, stretch counted in."""
+    """The fit with an end of the body rotated about itself, where that lies nearer to the scan and needs less bending.
+
+    A head or a hand that is rolled wrongly lies on the scan as well, but must change its shape for it. The joint above
+    may bend, so what counts is how far the end is from an enlarged copy of itself.
+    """
     size, template = given.size, given.template
     target = given.target.thinned(0.5 * stage.detail * size)
     target = orient(target, template.with_vertices(fit.x), NORMALS * size)
@@ -62,14 +67,16 @@ def with_end_rotated(given: Inputs, fit: GraphFit, stage: GraphStage, end: End) 
         return fit
     held = landmark_pull(len(fit.x), given.landmarks, stage.landmarks * size**2)
     stiffness = _stiffness(stage, size)
-    drawn = held + pull(len(fit.x), end.vertices, places, template.vertex_areas[end.vertices])
+    areas = template.vertex_areas
+    drawn = held + pull(len(fit.x), end.vertices, places, areas[end.vertices])
     trial = bent(given, fit.minimised(drawn, stiffness, 8), replace(stage, hints=0.0, paths=0.0))
 
     def misfit(of: GraphFit) -> float:
-        """Error against the scan and strain, as they are now."""
+        """Error against the scan, strain, and what the end is bent in itself, as they are now."""
         body = template.with_vertices(of.x)
         strain = sum(term.value for term in terms(of.graph, of.motion, held, stiffness).values())
-        return float(scan.error(body.vertices, body.vertex_normals) @ template.vertex_areas) + strain
+        bent = SHAPE * areas[end.vertices].sum() * bending(template.vertices[end.vertices], of.x[end.vertices])[0] ** 2
+        return float(scan.error(body.vertices, body.vertex_normals) @ areas) + strain + bent
 
     return trial if misfit(trial) < misfit(fit) else fit
 

@@ -57,6 +57,18 @@ def rotated_end(template: Mesh, end: End, x: np.ndarray, scan: RigidFit, moved: 
     return found[best][1] if apart > moved * scan.size else None
 
 
+def bending(rest: np.ndarray, now: np.ndarray, weights: np.ndarray | None = None) -> tuple[float, float]:
+    """How far points (n, 3) are from the nearest enlarged copy of others, metres RMS; and the logarithm of its growth.
+
+    Weights (n,) by default are alike.
+    """
+    w = np.full(len(rest), 1 / len(rest)) if weights is None else weights / weights.sum()
+    rest, now = rest - w @ rest, now - w @ now
+    turned = rest @ rotations.procrustes(rest, now)[0].T
+    growth = np.einsum("n,nd,nd->", w, turned, now) / np.einsum("n,nd,nd->", w, turned, turned)
+    return float(np.sqrt(w @ ((now - growth * turned) ** 2).sum(axis=1))), float(np.log(max(growth, 1e-3)))
+
+
 class RigidFit:
     """A scan that rigid pieces of a template of some size are laid on; errors do not grow beyond `cap`, metres."""
 

@@ -24,8 +24,27 @@ def registration(report: dict) -> str:
     for kind, figures in report["summary"].items():
         rows.append((f"mean of {kind}s", *(figures[n] for n in names)))
         rows.append((f"{kind}s below 15 mm", f"{figures['below_15mm']:.0%}", *([""] * (len(names) - 1))))
-    return table(("scan", "all (mm)", "where data (mm)", "elsewhere (mm)", "share beyond 50 mm",
-                  "to the true surface, where data (mm)", "worst vertex (mm)", "flipped", "time (s CPU)"), rows)
+    errors = table(("scan", "all (mm)", "where data (mm)", "elsewhere (mm)", "share beyond 50 mm",
+                    "to the true surface, where data (mm)", "worst vertex (mm)", "flipped", "time (s CPU)"), rows)
+    return f"{errors}\n\n{verdicts(report)}" if "flags" in report else errors
+
+
+def verdicts(report: dict) -> str:
+    """How often scans that went wrong were told, and what was told."""
+    wrong = {"off": "30 mm off on average, or a limb 150 mm", "rolled": "a limb 50 mm off on average"}
+    rates = table(("wrong", "scans", "told to be looked at", "of them wrong", "precision", "recall"),
+                  [(text, *(report["flags"][name][key] for key in ("wrong", "flagged", "both", "precision", "recall")))
+                   for name, text in wrong.items()])
+    told = table(("scan", "worst limb", "off (mm)", "verdict"),
+                 [(r["scan"], r["worst_limb"], r["worst_limb_mm"], r["verdict"]) for r in report["rows"]
+                  if r["verdict"] != "good" or r["worst_limb_mm"] > 50 or r["all_mm"] > 30])
+    return f"{rates}\n\n{told}"
+
+
+def rolled_limbs(report: dict) -> str:
+    """A row for every limb and angle."""
+    return table(("limb", "rolled by (degrees)", "bodies", "told", "limb off (mm)"),
+                 [tuple(r[n] for n in ("limb", "degrees", "bodies", "told", "limb_off_mm")) for r in report["rows"]])
 
 
 def peers(report: dict) -> str:

@@ -1,0 +1,173 @@
+"""What in a finished registration no person can do: limbs rolled about their own axis, and skin that slid.
+
+A template rolled about its forearm lies on the scan as well as the right one, so distances say nothing. Its joints do,
+when their angles are compared with those of people, and so does its skin: a part that is brought where it does not
+belong must bend and stretch to lie there. What is usual is measured on the synthetic people in the same way, as the
+rotation that best carries the whole skin of a part, so that skin that lags behind its bones counts on both sides.
+"""
+from __future__ import annotations
+
+from dataclasses import dataclass
+from functools import lru_cache
+
+import numpy as np
+
+from ..geometry import rotations
+from ..geometry.mesh import Mesh
+from ..judgement import size
+from ..skeleton.names import in_words
+from ..skeleton.tree import Skeleton
+from ..synthetic.anatomy import MIRROR_PART
+from ..synthetic.people import NAMED_POSES, PARENTS, PARTS, named_pose, random_pose
+from .limb_ends import bending
+from .person import PersonParts, average_person
+
+DRAWN = 60                             # random poses beside the named ones that show what people do
+ROLL, BEND, SIDE = range(3)
+MOVED = ("rolled", "bent", "bent sideways")
+# Degrees by which joints of real people go beyond those of the synthetic ones (roll, bend, side), found on 57 scans
+# of one man: hands are held in more ways, and skin lags behind the bones of knees and elbows more.
+SLACK = {"pelvis": (0, 0, 0), "abdomen": (20, 40, 20), "chest": (20, 20, 20), "head": (25, 40, 25),
+         "upper_arm": (20, 20, 20), "forearm": (35, 20, 45), "hand": (55, 50, 45), "thigh": (20, 20, 20),
+         "shin": (35, 20, 75), "foot": (20, 30, 60)}
+# Of a body's size: what muscles and build add to the bending of a part
+SHAPE = {"pelvis": 0.01, "abdomen": 0.01, "chest": 0.01, "head": 0.006, "upper_arm": 0.008, "forearm": 0.008,
+         "hand": 0.008, "thigh": 0.012, "shin": 0.008, "foot": 0.008}
+LIMBS = range(3, len(PARTS))           # head, arms and legs; a trunk tells of the build
+SCALE = 0.18                           # logarithm: how much one limb may grow against the whole body
+GRAVE = 30                             # degrees beyond what people do that double a doubt
+
+
+@dataclass(frozen=True)
+class Doubt:
+    """Something that no person can do: how grave, 1 where it begins, and in words."""
+
+    excess: float
+    words: str
+
+
+@dataclass(frozen=True, eq=False)
+class LimbMeasures:
+    """How the parts of a person came to lie, and how that compares with what people do.
+
+    `angles` (16, 3), degrees: by how much each part is rolled about its own axis, bent, and bent sideways against its
+    parent, from the rest of the synthetic people; `beyond` (16, 3), degrees, is what of it no person does. `bending`
+    (16,), metres: how far the skin of a part is from any enlarged copy of the template's, root mean square; `most`
+    (16,), metres, is what people have. `growth` (16,): logarithm of the size of each part against that of all.
+    """
+
+    angles: np.ndarray
+    beyond: np.ndarray
+    bending: np.ndarray
+    most: np.ndarray
+    growth: np.ndarray
+
+    def doubts(self, skeleton: Skeleton) -> tuple[Doubt, ...]:
+        """What is unlikely, the gravest first."""
+        found: list[Doubt] = []
+        for part in range(1, len(PARTS)):
+            name, parent = (in_words(skeleton.names[k]) for k in (part, skeleton.parents[part]))
+            kind = int(self.beyond[part].argmax())
+            if self.beyond[part, kind] > 0:
+                found.append(Doubt(1 + float(self.beyond[part, kind]) / GRAVE,
+                                   f"the {name} is {MOVED[kind]} by {abs(self.angles[part, kind]):.0f} degrees "
+                                   f"against the {parent}"))
+            if part in LIMBS and self.bending[part] > self.most[part]:
+                found.append(Doubt(float(self.bending[part] / self.most[part]),
+                                   f"the skin of the {name} is {1e3 * self.bending[part]:.0f} mm out of shape: it is "
+                                   "rolled, or slid"))
+            if part in LIMBS and abs(self.growth[part]) > SCALE:
+                found.append(Doubt(abs(float(self.growth[part])) / SCALE,
+                                   f"the {name} is {100 * abs(np.expm1(self.growth[part])):.0f}% "
+                                   f"{'smaller' if self.growth[part] < 0 else 'larger'} than on the template"))
+        return tuple(sorted(found, key=lambda doubt: -doubt.excess))
+
+
+def limb_doubts(template: Mesh, parts: PersonParts, vertices: np.ndarray) -> tuple[Doubt, ...]:
+    """What in a registration, vertices (N, 3), metres, no person can do, the gravest first."""
+    return limb_measures(template, parts, vertices).doubts(parts.skeleton)
+
+
+def limb_measures(template: Mesh, parts: PersonParts, vertices: np.ndarray) -> LimbMeasures:
+    """How the parts of a template came to lie on its new vertices (N, 3), metres, against what people do."""
+    low, high, bent = people_do()
+    angles = joint_angles(parts.skeleton.fit_rotations(template, vertices) @ parts.R_template_rest)
+    beyond = np.maximum(low - angles, angles - high) - np.array([SLACK[_kind(part)] for part in PARTS])
+    bending, growth = part_bending(template, parts.skeleton, vertices)
+    most = (bent + np.array([SHAPE[_kind(part)] for part in PARTS])) * size(template.with_vertices(vertices))
+    return LimbMeasures(angles, np.maximum(beyond, 0), bending, most, growth - np.median(growth))
+
+
+def _kind(part: str) -> str:
+    """A part of either side."""
+    return part[2:] if part[1] == "_" else part
+
+
+def joint_angles(R: np.ndarray) -> np.ndarray:
+    """Roll, bend and sideways bend (..., 16, 3), degrees, of every part against its parent; 0 for the root.
+
+    From world rotations R (..., 16, 3, 3) against the rest of the synthetic people. The relative rotation is a roll
+    about the bone of the part, followed by the rotation that takes the bone to its new direction the shortest way.
+    """
+    angles = np.zeros((*R.shape[:-2], 3))
+    for part in range(1, len(PARTS)):
+        roll, bend, side = frames()[part]
+        relative = np.swapaxes(R[..., PARENTS[part], :, :], -1, -2) @ R[..., part, :, :]
+        about = rolls(relative, roll)
+        swing = rotations.log(relative @ rotations.exp(-about[..., None] * roll))
+        angles[..., part, :] = np.stack([about, swing @ bend, swing @ side], axis=-1)
+    return np.degrees(angles)
+
+
+@lru_cache(maxsize=1)
+def frames() -> np.ndarray:
+    """The axes (16, 3, 3) of every part of the synthetic people at rest: along its bone, of bending, and across."""
+    anatomy = average_person().anatomy
+    out = np.zeros((len(PARTS), 3, 3))
+    for part in range(len(PARTS)):
+        bone = anatomy.ends[part] - anatomy.joints[part]
+        bone /= np.linalg.norm(bone)
+        bend = np.array([1.0, 0.0, 0.0])
+        if 4 <= part < 10:                                     # arms hang obliquely, and so do the axes of elbows
+            bend = np.cross(anatomy.upper_arm_frame[2], anatomy.upper_arm_frame[1])
+            bend = bend if part < 7 else bend * [1, -1, -1]
+        bend = bend - bone * (bend @ bone)
+        bend /= np.linalg.norm(bend)
+        out[part] = bone, bend, np.cross(bone, bend)
+    return out
+
+
+def rolls(R: np.ndarray, axis: np.ndarray) -> np.ndarray:
+    """The angles (...), radians, about an axis (3,) of rotations R (..., 3, 3): those that leave the least rotation."""
+    trace = np.trace(R, axis1=-2, axis2=-1)
+    vector = np.stack([R[..., 2, 1] - R[..., 1, 2], R[..., 0, 2] - R[..., 2, 0], R[..., 1, 0] - R[..., 0, 1]], axis=-1)
+    return np.arctan2(vector @ axis, trace - np.einsum("i,...ij,j->...", axis, R, axis))
+
+
+def part_bending(template: Mesh, skeleton: Skeleton, vertices: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """How far every part is from the nearest enlarged copy of itself (J,), metres RMS, and the logarithm of its growth.
+
+    Vertices (N, 3), metres.
+    """
+    part, areas = skeleton.part_of_vertex(template), template.vertex_areas
+    out = np.zeros((2, len(skeleton.parents)))
+    for p in range(len(skeleton.parents)):
+        mine = part == p
+        out[:, p] = bending(template.vertices[mine], vertices[mine], areas[mine])
+    return out[0], out[1]
+
+
+@lru_cache(maxsize=1)
+def people_do() -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """The lowest and the highest joint angles (16, 3) of people, degrees, and how far parts (16,) bend, of their size.
+
+    Measured on the skin of the average synthetic person in its named poses and some random ones, left and right alike.
+    """
+    person, rng = average_person(), np.random.default_rng(0)
+    poses = [*map(named_pose, NAMED_POSES), *(random_pose(rng) for _ in range(DRAWN))]
+    bodies = np.stack([person.posed(pose) for pose in poses])
+    angles = joint_angles(person.skeleton.fit_rotations(person.mesh, bodies))
+    bent = np.stack([part_bending(person.mesh, person.skeleton, body)[0] for body in bodies])
+    angles = np.concatenate([angles, angles[:, MIRROR_PART] * [-1, 1, -1]])
+    bent = np.concatenate([bent, bent[:, MIRROR_PART]])
+    return angles.min(axis=0), angles.max(axis=0), bent.max(axis=0) / size(person.mesh)

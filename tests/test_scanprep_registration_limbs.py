@@ -1,0 +1,116 @@
+import numpy as np
+import pytest
+
+from scanprep.correspondence.correspondences import Correspondences
+from scanprep.geometry import rotations
+from scanprep.registration import unmarked
+from scanprep.registration.limb_ends import bending
+from scanprep.registration.limbs import frames, joint_angles, limb_doubts, part_bending, rolls
+from scanprep.registration.nonrigid import Registration
+from scanprep.registration.person import NAMES, PersonParts, average_person
+from scanprep.skeleton.tree import Skeleton
+from scanprep.synthetic.people import NAMED_POSES, PARTS, named_pose
+
+rng = np.random.default_rng(4)
+
+
+@pytest.fixture(scope="module")
+def person():
+    return average_person()
+
+
+@pytest.fixture(scope="module")
+def parts(person):
+    """The parts of a template that is the average person itself, but stands differently in its own frame."""
+    skeleton = Skeleton(person.part_of_face, person.parents, person.joints, NAMES)
+    return PersonParts(skeleton, np.broadcast_to(np.eye(3), (len(PARTS), 3, 3)))
+
+
+def words(person, parts, vertices):
+    return [doubt.words for doubt in limb_doubts(person.mesh, parts, vertices)]
+
+
+def test_a_roll_about_an_axis_is_what_was_put_in():
+    axis, angle = rotations.exp(rng.normal(size=3)) @ np.array([0, 0, 1.0]), 2.3
+    tilt = np.cross(axis, rng.normal(size=3))                        # no roll: about an axis across
+    assert np.isclose(rolls(rotations.exp(tilt) @ rotations.exp(angle * axis), axis), angle)
+
+
+def test_angles_are_those_that_a_joint_was_given(person):
+    pose = np.zeros((len(PARTS), 3))
+    forearm, shin = PARTS.index("l_forearm"), PARTS.index("r_shin")
+    pose[forearm], pose[shin] = np.radians(40) * frames()[forearm, 1], np.radians(-25) * frames()[shin, 0]
+    angles = joint_angles(person.part_rotations(pose))
+    wanted = np.zeros((len(PARTS), 3))
+    wanted[forearm, 1], wanted[shin, 0] = 40, -25
+    assert np.allclose(angles, wanted, atol=1e-9)
+
+
+@pytest.mark.parametrize("name", NAMED_POSES[::7])
+def test_what_people_do_is_not_doubted(person, parts, name):
+    turned = person.posed(named_pose(name)) @ rotations.exp(np.array([0.3, -2.0, 0.5])).T
+    assert not words(person, parts, turned)
+
+
+@pytest.mark.parametrize("part, name, parent", [("l_forearm", "left forearm", "left upper arm"),
+                                                ("r_shin", "right shin", "right thigh"), ("head", "head", "chest")])
+def test_a_limb_rolled_about_its_own_axis_is_told(person, parts, part, name, parent):
+    pose, p = np.zeros((len(PARTS), 3)), PARTS.index(part)
+    pose[p] = np.radians(150) * frames()[p, 0]
+    first = words(person, parts, person.posed(pose))[0]
+    assert first.startswith(f"the {name} is rolled by ") and first.endswith(f" degrees against the {parent}")
+    assert 130 < int(first.split(" by ")[1].split()[0]) < 165        # skin lags behind bones
+
+
+def test_skin_that_slid_is_told(person, parts):
+    """The skin of a head, taken round the head by a quarter while the head stays where it is."""
+    from scanprep.geometry.surface import Surface
+
+    mine, p = person.part_of_vertex == PARTS.index("head"), PARTS.index("head")
+    middle = person.mesh.vertices[mine].mean(axis=0)
+    around = rotations.exp(np.pi / 2 * frames()[p, 0])
+    slid = person.mesh.vertices.copy()
+    slid[mine] = Surface(person.mesh).closest((slid[mine] - middle) @ around.T + middle).points
+    assert any(text.startswith("the skin of the head is ") for text in words(person, parts, slid))
+
+
+def test_a_limb_drawn_into_the_body_is_told(person, parts):
+    p = PARTS.index("l_forearm")
+    mine = person.part_of_vertex == p
+    small = person.mesh.vertices.copy()
+    small[mine] = person.joints[p] + 0.7 * (small[mine] - person.joints[p])
+    assert "the left forearm is 30% smaller than on the template" in words(person, parts, small)
+
+
+def test_growth_of_the_whole_body_is_no_bending(person, parts):
+    bending, growth = part_bending(person.mesh, parts.skeleton, 1.2 * person.mesh.vertices + 3)
+    assert np.abs(bending).max() < 1e-9 and np.allclose(growth, np.log(1.2))
+    assert not words(person, parts, 1.2 * person.mesh.vertices)
+
+
+def test_bending_leaves_out_place_rotation_and_size():
+    points, twisted = rng.normal(size=(2, 40, 3))
+    moved = 1.7 * points @ rotations.exp(np.array([1.0, 2, -1])).T + [3, 0, 1]
+    off, growth = bending(points, moved)
+    assert off < 1e-12 and np.isclose(growth, np.log(1.7))
+    assert bending(points, moved + 0.1 * twisted)[0] > 0.05
+
+
+@pytest.mark.parametrize("first, second, kept", [(0.001, 0.0, [None]), (0.03, 0.002, [None, 5]),
+                                                 (0.03, 0.04, [None, 5])])
+def test_where_a_limb_was_lost_its_ends_lead(person, monkeypatch, first, second, kept):
+    """A scan that is covered is registered once; else again with its ends, and what covers more is kept."""
+    ends = Correspondences(np.arange(5), np.zeros((5, 3)), np.ones(5))
+    led = []
+
+    def register(template, scan, landmarks, *rest):
+        led.append(None if landmarks is None else len(landmarks[0]))
+        nothing = np.zeros(0)
+        return Registration(template, nothing, nothing, 0.0, 0.01, True, 1, {}, 0, nothing,
+                            first if landmarks is None else second)
+
+    monkeypatch.setattr(unmarked, "find_seeds", lambda *args: ends)
+    monkeypatch.setattr(unmarked, "find_correspondences", lambda *args: ends)
+    monkeypatch.setattr(unmarked, "register", register)
+    fit, _ = unmarked.register_unmarked(person.mesh, person.mesh)
+    assert led == kept and fit.uncovered == (min(first, second) if len(kept) > 1 else first)
