@@ -156,8 +156,8 @@ MOCAP: dict[str, tuple[str, str, Callable[[dict], str], str]] = {
         "Markers worn elsewhere, and names exchanged throughout",
         "python tests/benchmarks/mosh_worn_elsewhere.py FOLDER -m MODEL", worn_elsewhere,
         "The four recordings, every fourth frame. Moved markers are simulated from the fitted body and what the marker "
-        "was off it; those taken over are real tracks of other markers. Limits were chosen with other draws on two of "
-        "the recordings; what was touched differs, the people do not. Pairs nearer than 10 cm are not drawn."),
+        "was off it; those taken over are real tracks of other markers. Limits were chosen with other draws of "
+        "these recordings: what was touched differs, the people do not. Pairs nearer than 10 cm are not drawn."),
     "mosh_sex": (
         "Sex from markers",
         "python tests/benchmarks/mosh_sex.py --models DIR", sex,
