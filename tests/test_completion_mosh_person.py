@@ -5,7 +5,7 @@ import numpy as np
 import pytest
 from completion_bodies import worm_with_prior
 
-from completion import MoshConfig, PersonConfig, find_person, mosh
+from completion import MoshConfig, PersonConfig, animate, find_person, mosh
 from completion.mocap.files.markers import MarkerSequence
 from completion.mocap.marker_sets.layout import MarkerLayout
 from completion.mocap.mosh.mosh import PoseConfig
@@ -247,12 +247,20 @@ def test_a_marker_worn_elsewhere_and_a_pair_of_exchanged_names_are_put_right():
     np.testing.assert_allclose(found.betas, beside().betas, atol=0.35)
 
 
-def test_a_marker_that_no_place_of_the_skin_explains_is_told_and_left_out_of_the_mean():
+def test_a_marker_that_no_place_of_the_skin_explains_is_told_and_left_out():
     floating = np.array(displaced())
     floating[3] += [0.0, 0.0, 0.3]
     found = worn_otherwise(3, sequence(floating).positions[:, 3])
-    assert not found.worn.changes and found.worn.unplaced == ("M03",)
-    motion = found.motions[0]
+    assert found.worn.unplaced == ("M03",) and not found.worn.moved and not found.worn.exchanged
+    assert "M03" not in found.layout.labels and "M03" in found.worn.doubts()[0]
+    assert np.nanmean(found.motions[0].residuals) < 5e-3
+    np.testing.assert_allclose(found.betas, beside().betas, atol=0.35)
+
+
+def test_a_marker_that_is_never_believed_is_left_out_of_the_mean():
+    floating = np.array(displaced())
+    floating[3] += [0.0, 0.0, 0.3]
+    motion = animate(MODEL.subject(beside().betas), sequence(floating), beside().layout)
     assert motion.distrusted == ("M03",)
     assert np.nanmean(motion.told()) < 5e-3 and np.nanmean(motion.residuals) > 0.01
     assert markers_told([motion]).value == "25 of 26, without M03"
@@ -274,12 +282,12 @@ def test_where_the_body_is_at_fault_no_marker_is_moved():
     order = np.random.default_rng(0).permutation(26)
     markers = MarkerSequence(sequence(displaced()).positions[:, order], LABELS, 60.0)
     found = find_worn(MODEL, [markers], LAYOUT, find_person(MODEL, markers, LAYOUT, USUAL), USUAL)
-    assert not found.changes and len(found.unplaced) > 7
+    assert not found.changes and len(found.too_many) > 7 and "the wrong layout" in found.doubts()[0]
 
 
 def test_markers_in_their_places_are_let_be():
     found = find_worn(MODEL, [sequence(displaced())], LAYOUT, beside(), USUAL)
-    assert not found.changes and not found.unplaced
+    assert not found.changes and not found.too_many
 
 
 def test_the_published_preset_is_the_patent():

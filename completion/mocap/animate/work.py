@@ -65,7 +65,7 @@ class Work:
         sequence = read_markers(path, self.unit, self.who)
         layout, name = choose_layout(self.model, self.layout, sequence.labels)
         metrics = [Metric("model", self.name), Metric("layout", name)]
-        body, found = self.subject, None
+        body, found, worn = self.subject, None, Worn()
         if body is None:
             sequence, found, worn = self._person(sequence, layout, room)
             body, layout = self.model.subject(found.betas), found.layout
@@ -81,7 +81,7 @@ class Work:
                                                          "frames": found.frames[:, 1].tolist()})
             layout.save(output / "layout.json")
         problem = motion_problem(motion, body.template, layout, sequence)
-        judgement = Judgement.of(problem, hardly_believed([motion]))
+        judgement = Judgement.of(problem, (*worn.doubts(), *hardly_believed([motion])))
         metrics = [judgement_row(judgement), *metrics, *figures(motion, sequence)]
         write_motion(output, motion, body)
         write_glb(output / "animation.glb", motion, body)

@@ -62,14 +62,15 @@ def person_page(name: str, model: BodyModel, result: MoshResult, usual: MarkerLa
 
 def _worn_section(page: Page, result: MoshResult) -> None:
     worn = result.worn
-    if not (worn.changes or worn.unplaced):
+    if not (worn.changes or worn.too_many):
         return
     page.section("Markers worn elsewhere", "Markers that were far from where the layout has them, sought over the "
                  "whole body that the others tell.")
     page.table([*((f"{first} and {second}", "bore each other's name; put back", np.nan, np.nan)
                   for first, second in worn.exchanged),
                 *((m.label, "worn elsewhere; moved there", MM * m.before, MM * m.after) for m in worn.moved),
-                *((label, "no place on the skin explains it", np.nan, np.nan) for label in worn.unplaced)],
+                *((label, "no place on the skin explains it; left out", np.nan, np.nan) for label in worn.unplaced),
+                *((label, "too many are far off; let be", np.nan, np.nan) for label in worn.too_many)],
                ("marker", "what was found", "from the layout's place (mm)", "from the new place (mm)"))
 
 

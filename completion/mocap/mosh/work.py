@@ -73,7 +73,7 @@ class Work:
             figures[take.name] = _write(self, found, take, room, settings)
         room.tell(HALF + HALF * (total - 1) // total, 2 * HALF)
         problems = [f"{take.name}: {why}" for take in found.takes if (why := found.problem(take))]
-        doubts = hardly_believed([take.motion for take in found.takes])
+        doubts = (*found.result.worn.doubts(), *hardly_believed([take.motion for take in found.takes]))
         metrics = [judgement_row(Judgement.of(problems, doubts)), Metric("model", self.name), *_person_metrics(found),
                    *_figures(found.takes)]
         person_page(actor.name, found.model, found.result, found.usual, found.takes, metrics, figures,
@@ -164,7 +164,8 @@ def _write(work: Work, found: _Found, take: Take, room: Room, settings: Mapping[
                          f"person are; soft tissue taken {factor:g} times.").picture(*shown)
         closing(page, metrics, settings).write(place(folder) / "report.html")
         save_png(place(folder) / PICTURE, take_picture(take))
-        judgement = Judgement.of(found.problem(take), hardly_believed([take.motion]))
+        doubts = (*found.result.worn.doubts(), *hardly_believed([take.motion]))
+        judgement = Judgement.of(found.problem(take), doubts)
         outcome = Outcome(place(folder), metrics, settings, judgement=judgement)
         write_report(outcome, work.command, time.perf_counter() - start)
 
@@ -183,7 +184,7 @@ def _write_person(folder: Path, result: MoshResult, about: Mapping[str, Any]) ->
     storage.write_json(folder / "subject.json", {
         "betas": result.betas.tolist(), **about, "frames": person.frames.tolist(), "moved": moved,
         "worn_elsewhere": {m.label: {"from_the_layout": m.before, "left": m.after} for m in result.worn.moved},
-        "exchanged": result.worn.exchanged, "unplaced": result.worn.unplaced, "residual": person.residual,
+        "exchanged": result.worn.exchanged, "left_out": result.worn.unplaced, "residual": person.residual,
         "energies": person.energies, "converged": bool(person.converged)})
     result.layout.save(folder / "layout.json")
 

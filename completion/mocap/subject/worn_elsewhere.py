@@ -68,23 +68,33 @@ class Worn:
     exchanged : pairs of labels
         Markers that bear each other's name throughout.
     unplaced : labels
-        Markers that are far from where the layout has them and that no place on the skin explains.
+        Markers that are far from where the layout has them and that no place on the skin explains; they are left out.
+    too_many : labels
+        Markers that are far from where the layout has them, and so many that the body is at fault: nothing is changed.
     """
 
     moved: tuple[MovedMarker, ...] = ()
     exchanged: tuple[tuple[str, str], ...] = ()
     unplaced: tuple[str, ...] = ()
+    too_many: tuple[str, ...] = ()
 
     @property
     def changes(self) -> bool:
         """Whether anything is to be done otherwise than the layout says."""
-        return bool(self.moved or self.exchanged)
+        return bool(self.moved or self.exchanged or self.unplaced)
 
     def metrics(self) -> list[Metric]:
         """A row for each thing that is otherwise than the layout says."""
         return [*(Metric("names exchanged throughout, put back", " and ".join(pair)) for pair in self.exchanged),
                 *(Metric(f"worn elsewhere, moved there ({m.label})", 1000 * m.before, "mm") for m in self.moved),
-                *(Metric("far from the layout's place, and found nowhere", label) for label in self.unplaced)]
+                *(Metric("far from the layout's place, and found nowhere: left out", label) for label in self.unplaced),
+                *(Metric("far from the layout's place, as are too many others", label) for label in self.too_many)]
+
+    def doubts(self) -> tuple[str, ...]:
+        """Reasons to look at what was found with these markers."""
+        told = ((self.unplaced, "not worn where the layout has it, and found nowhere: left out"),
+                (self.too_many, "far from where the layout has it: the wrong layout, or the wrong body?"))
+        return tuple(f"{', '.join(labels)} {words}" for labels, words in told if labels)
 
     def named(self, sequence: MarkerSequence, layout: MarkerLayout) -> MarkerSequence:
         """A sequence with exchanged names put back."""
@@ -102,7 +112,8 @@ class Worn:
         return order
 
     def placed(self, layout: MarkerLayout) -> MarkerLayout:
-        """A layout with the moved markers where they are worn, at its end, and none of them loose."""
+        """A layout with the moved markers where they are worn, at its end, and without those found nowhere."""
+        layout = layout.without(self.unplaced) if self.unplaced else layout
         if not self.moved:
             return layout
         found = MarkerLayout(tuple(m.label for m in self.moved), np.array([m.corners for m in self.moved]),
@@ -181,7 +192,7 @@ def find_worn(model: BodyModel, sequences: Sequence[MarkerSequence], layout: Mar
         cleared |= {label for label in suspects if off[label] <= FAR}
         before, suspects = suspects, frozenset(label for label in off if label not in cleared and off[label] > far)
         if len(suspects) > MOST * len(off):
-            return Worn(unplaced=tuple(label for label in at.layout.labels if label in suspects))
+            return Worn(too_many=tuple(label for label in at.layout.labels if label in suspects))
         if suspects == before:
             break
         far = FAR
@@ -189,6 +200,11 @@ def find_worn(model: BodyModel, sequences: Sequence[MarkerSequence], layout: Mar
     if suspects:
         at = _without(model, sequences, layout, suspects, config)
     found = _explained(at, suspects)
+    if found.unplaced and (found.moved or found.exchanged):             # on the body that what was found leads to
+        renamed = [found.named(each, layout) for each in sequences]
+        there = replace(found, unplaced=()).placed(layout)
+        rest = _explained(_without(model, renamed, there, found.unplaced, config), found.unplaced)
+        found = Worn(found.moved + rest.moved, found.exchanged + rest.exchanged, rest.unplaced)
     again = set(sides) & set(found.exchanged)                           # exchanged, and put back
     return replace(found, exchanged=tuple(pair for pair in (*sides, *found.exchanged) if pair not in again))
 
