@@ -219,7 +219,7 @@ def run_case(model: BodyModel, ref: Reference, layout: MarkerLayout, kind: str, 
     seconds, worn = time.process_time() - start, result.worn
     on = result.layout.place(ref.body)
     off = {label: 1e3 * float(np.linalg.norm(on[result.layout.labels.index(label)] - place))
-           for label, place in case.moved.items()}
+           for label, place in case.moved.items() if label in result.layout.labels}
     usual = np.linalg.norm(layout.select(list(case.moved)).place(ref.body) - np.array(list(case.moved.values())
                            ).reshape(-1, 3), axis=1) if case.moved else np.zeros(0)
     own = {m.label for m in worn.moved}
