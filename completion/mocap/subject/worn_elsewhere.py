@@ -200,13 +200,25 @@ def find_worn(model: BodyModel, sequences: Sequence[MarkerSequence], layout: Mar
     if suspects:
         at = _without(model, sequences, layout, suspects, config)
     found = _explained(at, suspects)
-    if found.unplaced and (found.moved or found.exchanged):             # on the body that what was found leads to
-        renamed = [found.named(each, layout) for each in sequences]
-        there = replace(found, unplaced=()).placed(layout)
-        rest = _explained(_without(model, renamed, there, found.unplaced, config), found.unplaced)
-        found = Worn(found.moved + rest.moved, found.exchanged + rest.exchanged, rest.unplaced)
+    if found.unplaced and (found.moved or found.exchanged):
+        found = _once_more(model, sequences, layout, found, config)
     again = set(sides) & set(found.exchanged)                           # exchanged, and put back
     return replace(found, exchanged=tuple(pair for pair in (*sides, *found.exchanged) if pair not in again))
+
+
+def _once_more(model: BodyModel, sequences: Sequence[MarkerSequence], layout: MarkerLayout, found: Worn,
+               config: PersonConfig) -> Worn:
+    """What was found, with those that were found nowhere sought again on the body that it leads to.
+
+    Two exchanged names on a leg can draw all its markers away; without any of them, nothing would tell of the leg.
+    """
+    sequences = [found.named(each, layout) for each in sequences]
+    layout = replace(found, unplaced=()).placed(layout)
+    at = _without(model, sequences, layout, (), config)
+    off = dict(zip(at.layout.labels, at.off_usual(), strict=True))
+    far = [label for label in found.unplaced if off[label] > FAR]
+    rest = _explained(_without(model, sequences, layout, far, config), far) if far else Worn()
+    return Worn(found.moved + rest.moved, found.exchanged + rest.exchanged, rest.unplaced)
 
 
 def _without(model: BodyModel, sequences: Sequence[MarkerSequence], layout: MarkerLayout, suspects: Collection[str],
