@@ -1,5 +1,6 @@
 import json
 from dataclasses import replace
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -7,7 +8,7 @@ from completion_bodies import worm_with_prior
 
 from completion.bodies import FixedBody
 from completion.partial.completion import Completion, doubts, load_completion, save_completion
-from completion.partial.fit import ScanFit
+from completion.partial.fit import ScanFit, Solved, solve_jointly
 from completion.partial.scan import prepare_scan
 from completion.partial.settings import CompletionConfig
 from scanprep.geometry import storage
@@ -85,3 +86,17 @@ def test_a_bend_that_the_model_never_saw_is_named():
     fine = np.full(398, 0.004), np.ones(398, dtype=bool)
     assert doubts(fit, x, *fine) == ["the left elbow is bent by 50 degrees, and never was when the model was learned"]
     assert doubts(fit, x / 5, *fine) == []
+
+
+@pytest.mark.parametrize(("wide", "narrow", "kept"), [(100, 90, 1), (100, 100, 1), (95, 100, 1), (90, 100, 0)])
+def test_the_wide_reach_is_kept_where_it_explains_clearly_more(monkeypatch, wide, narrow, kept):
+    reaches = []
+
+    def rounds(fit, x, some, tell):
+        reaches.append(some[-1])
+        return Solved(np.array([len(reaches) - 1]), True, len(some), {})
+
+    monkeypatch.setattr("completion.partial.fit._in_rounds", rounds)
+    fit = SimpleNamespace(config=CompletionConfig(), misfit=lambda x: (wide, narrow)[x[0]])
+    solved = solve_jointly(fit, np.zeros(1), lambda done: None)
+    assert solved.x[0] == kept and reaches[0] > reaches[1] and solved.rounds > CompletionConfig().rounds
