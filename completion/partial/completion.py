@@ -213,9 +213,9 @@ def completion_problem(done: Completion, points: np.ndarray, free_scale: bool = 
     `points` (n, 3), metres, the scan, in whatever unit it was taken to be.
     """
     off, most = done.landmark_rms / size(done.predicted), done.explained
-    if done.seen.any() and most >= LOST and not (off > HAND or (off > ASTRAY and most < ENOUGH)):
-        return None
     wrong = None if free_scale else unit_problem(extent(points), extent(done.predicted.vertices), "the scan is", 0.05)
+    if wrong is None and done.seen.any() and most >= LOST and not (off > HAND or (off > ASTRAY and most < ENOUGH)):
+        return None
     marks = "" if np.isnan(done.landmark_rms) else f", the landmarks are {1000 * done.landmark_rms:.0f} mm off"
     return (f"the body explains {100 * done.explained:.0f}% of the scan, {100 * done.seen.mean():.2g}% of it has "
             f"data{marks}; " + (wrong or ("landmarks of other places, left and right exchanged, or " if marks else "")

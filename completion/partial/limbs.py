@@ -30,7 +30,7 @@ FOLLOWED, APART = 4, 0.1             # draws that are followed, and by how many 
 AMISS = 12.0                         # energy of what is wrong with a limb from which on it is sought
 GRAVE = 100.0                        # energy from which on the whole body may be wrong
 RIVAL = 1.1                          # times the least misfit that of another body may have to be nearly as good
-BETTER = 5.0                         # by how much the misfit must fall for a limb to be moved
+BETTER, SHARE = 5.0, 0.01            # by how much, and what share of it, the misfit must fall for a limb to be moved
 ROUNDS = 2                           # times that all limbs that are amiss are gone through
 
 
@@ -93,7 +93,7 @@ def _reinitialised(fit: ScanFit, x: np.ndarray, limb: list[int]) -> np.ndarray:
     best, search = fit.misfit(x), LimbSearch.around(fit, x, limb)
     for drawn in search.best(draws(fit, x, limb, DRAWS * fit.config.random_starts)):
         tried = approach(fit, drawn, REACHES)
-        if (misfit := fit.misfit(tried)) < best - BETTER:
+        if (misfit := fit.misfit(tried)) < best - max(BETTER, SHARE * best):
             x, best = tried, misfit
     return x
 
