@@ -247,6 +247,7 @@ def _polished(model: BodyModel, target: np.ndarray, x: np.ndarray, matrix: np.nd
     By gradients alone, the matrix is where BFGS begins: whether it converged, and how many steps it took.
     """
     J3, lowest = 3 * len(model.skeleton.parents), [np.inf]
+    nothing = 0.5 * target.size * (100 * np.finfo(float).eps * np.abs(target).max())**2     # rounding leaves as much
 
     def energy(x: np.ndarray) -> tuple[float, np.ndarray]:
         force = model.vertices(x[:J3].reshape(-1, 3), x[J3 + 3:], x[J3:J3 + 3]) - target
@@ -255,7 +256,7 @@ def _polished(model: BodyModel, target: np.ndarray, x: np.ndarray, matrix: np.nd
 
     def settled(intermediate_result: OptimizeResult) -> None:
         before, lowest[0] = lowest[0], intermediate_result.fun
-        if before - lowest[0] <= config.tolerance * lowest[0]:
+        if before - lowest[0] <= config.tolerance * lowest[0] or lowest[0] <= nothing:
             raise StopIteration
 
     start = np.linalg.inv(matrix + 1e-6 * np.diag(np.diag(matrix)))
