@@ -68,7 +68,8 @@ def worn_elsewhere(report: dict) -> str:
     """Moved and renamed markers, found and there; and alarms without disturbance."""
     names = ("moved", "right", "place_mm", "pairs", "pairs_right", "false", "ratio", "ratio_worst", "shape_mm",
              "surface_mm")
-    rows: Rows = [(kind, *(values[name] for name in names)) for kind, values in report["total"].items()]
+    rows: Rows = [(kind, *("" if values[name] is None else values[name] for name in names))
+                  for kind, values in report["total"].items()]
     alarms: Rows = [(f["file"], len(f["alarms"]), len(f["unplaced"]), f["mm"]) for f in report["undisturbed"]]
     return table(("disturbance", "markers moved", "found within 20 mm", "off (mm)", "pairs renamed", "found", "false",
                   "markers untouched, times undisturbed", "worst", "shape, from undisturbed (mm)",
@@ -154,10 +155,13 @@ MOCAP: dict[str, tuple[str, str, Callable[[dict], str], str]] = {
         "Thresholds were chosen on the recordings with faults put in."),
     "mosh_worn_elsewhere": (
         "Markers worn elsewhere, and names exchanged throughout",
-        "python tests/benchmarks/mosh_worn_elsewhere.py FOLDER -m MODEL", worn_elsewhere,
+        "python tests/benchmarks/mosh_worn_elsewhere.py FOLDER -m MODEL --first 20 --seeds 1", worn_elsewhere,
         "The four recordings, every fourth frame. Moved markers are simulated from the fitted body and what the marker "
         "was off it; those taken over are real tracks of other markers. Limits were chosen with other draws of "
-        "these recordings: what was touched differs, the people do not. Pairs nearer than 10 cm are not drawn."),
+        "these recordings: what was touched differs, the people do not. Pairs nearer than 10 cm are not drawn. Of the four "
+        "moved markers that were not told, two are loose ones, which the usual search had put within 9 mm, and two were "
+        "told to be nowhere and left out. That they are left out, and that the limb of an exchanged pair is tried again "
+        "with all its markers, was mended when two cases of 85_02 in this draw showed it; they were run again."),
     "mosh_sex": (
         "Sex from markers",
         "python tests/benchmarks/mosh_sex.py --models DIR", sex,
