@@ -152,8 +152,8 @@ SECTIONS: dict[str, tuple[str, str, Callable[[dict], str], str]] = {
                                "[Hahnel]; beside `registration_10`: 8.23, 6.29, 7.46 and 13.4 mm. Times beside other "
                                "work."),
     "registration_4": ("Registration, four landmarks", "python tests/benchmarks/registration.py --set held --marks 4",
-                       registration, "Hands and toes. Correspondences from the four landmarks, beside them, lead the deep "
-                       "squat of pose 7 to 110 mm: not kept."),
+                       registration, "Hands and toes. Correspondences from the four landmarks, beside them, lead the "
+                       "deep squat of pose 7 to 110 mm: not kept."),
     "registration_0": ("Registration without landmarks", "python tests/benchmarks/registration.py --set held --marks 0",
                        registration, "Led by `register_unmarked`, as `scape prep run` does without landmark files; the "
                        "time includes it. Scans that were not all covered were registered again with the ends of "

@@ -158,10 +158,11 @@ MOCAP: dict[str, tuple[str, str, Callable[[dict], str], str]] = {
         "python tests/benchmarks/mosh_worn_elsewhere.py FOLDER -m MODEL --first 20 --seeds 1", worn_elsewhere,
         "The four recordings, every fourth frame. Moved markers are simulated from the fitted body and what the marker "
         "was off it; those taken over are real tracks of other markers. Limits were chosen with other draws of "
-        "these recordings: what was touched differs, the people do not. Pairs nearer than 10 cm are not drawn. Of the four "
-        "moved markers that were not told, two are loose ones, which the usual search had put within 9 mm, and two were "
-        "told to be nowhere and left out. That they are left out, and that the limb of an exchanged pair is tried again "
-        "with all its markers, was mended when two cases of 85_02 in this draw showed it; they were run again."),
+        "these recordings: what was touched differs, the people do not. Pairs nearer than 10 cm are not drawn. Of the "
+        "four moved markers that were not found, two are loose ones, which the usual search had put within 9 mm, and "
+        "two were told to be nowhere and left out. That they are left out, and that the limb of an exchanged pair is "
+        "tried again with all its markers, was mended when two cases of 85_02 in this draw showed it; they were run "
+        "again."),
     "mosh_sex": (
         "Sex from markers",
         "python tests/benchmarks/mosh_sex.py --models DIR", sex,
