@@ -34,6 +34,7 @@ class FixedBody:
         self.pose_mean, self.pose_covariance = subject.pose_mean, subject.pose_covariance
         none = np.zeros((0, *subject.pose_mean.shape))
         self.pose_examples = none if subject.pose_examples is None else subject.pose_examples
+        self.left_out_error = subject.left_out_error
 
     @cached_property
     def known_poses(self) -> np.ndarray:
@@ -92,7 +93,7 @@ class ShapedBody(FixedBody):
         self.template, self.skeleton = model.template, model.skeleton
         self.n_angles = 3 * len(model.skeleton.parents)
         self.pose_mean, self.pose_covariance = model.pose_mean, model.pose_covariance
-        self.pose_examples = model.pose_examples
+        self.pose_examples, self.left_out_error = model.pose_examples, model.info.get("left_out_error")
         self._at = np.zeros(self.n_betas)
         self.subject = model.subject(self._at)
         self._anchor: Anchor | None = None

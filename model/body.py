@@ -202,7 +202,8 @@ class BodyModel(ABC):
             raise ValueError(f"dtype: expected float32 or float64, got {np.dtype(dtype)}")
         kept = None if betas is None else np.array(betas, dtype=np.float64)
         return Subject(self.template, self.skeleton, kept, self.terms, self.basis(betas).astype(dtype, copy=False),
-                       self.skeleton.joints[0], self.pose_mean, self.pose_covariance, self.pose_examples)
+                       self.skeleton.joints[0], self.pose_mean, self.pose_covariance, self.pose_examples,
+                       self.info.get("left_out_error"))
 
     def jacobian(self, pose: np.ndarray, betas: np.ndarray | None = None, trans: np.ndarray | None = None,
                  vertex_ids: np.ndarray | None = None) -> Derivatives:

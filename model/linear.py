@@ -128,6 +128,8 @@ class Subject:
         The model's pose prior, which a body of known shape keeps.
     pose_examples : (M, J, 3) float, radians, optional
         The model's training poses.
+    left_out_error : float, metres, optional
+        How far off the model predicted poses that were left out of learning.
     """
 
     template: Mesh
@@ -139,6 +141,7 @@ class Subject:
     pose_mean: np.ndarray | None = None
     pose_covariance: np.ndarray | None = None
     pose_examples: np.ndarray | None = None
+    left_out_error: float | None = None
 
     @property
     def n_vertices(self) -> int:

@@ -8,6 +8,7 @@ from completion_bodies import worm_with_prior
 
 from completion.bodies import FixedBody
 from completion.partial.completion import Completion, doubts, load_completion, save_completion
+from completion.partial.confidence import expected_error
 from completion.partial.fit import ScanFit, Solved, solve_jointly
 from completion.partial.scan import prepare_scan
 from completion.partial.settings import CompletionConfig
@@ -75,6 +76,18 @@ def test_parts_that_may_be_far_off_are_named_the_worst_first():
     error[fit.part == 2], seen[fit.part == 2] = 0.25, False
     assert doubts(fit, x, error, seen) == ["the left forearm may be 250 mm off, nothing of it was seen",
                                            "the left upper arm may be 80 mm off, 50% of it was seen"]
+
+
+def test_a_model_of_too_few_poses_is_doubted_and_its_errors_are_expected():
+    nothing = np.zeros(0, dtype=np.int64), np.zeros((0, 3))
+    for left_out, told in ((0.01, 0), (0.05, 1)):
+        body = FixedBody(replace(MODEL, info={"left_out_error": left_out}).subject(None))
+        fit = ScanFit(body, prepare_scan(MODEL.template.vertices), *nothing, CompletionConfig())
+        found = doubts(fit, np.zeros(15), np.full(398, 0.004), np.ones(398, dtype=bool))
+        assert len(found) == told and all("50 mm off" in reason for reason in found)
+    far, off = np.array([0.0, 1.0]), np.zeros(2)
+    np.testing.assert_allclose(expected_error(off, far, 0.001, 0.05), [0.001, 0.0425], rtol=1e-3)
+    np.testing.assert_allclose(expected_error(off, far, 0.001), [0.001, 0.0076], rtol=1e-2)
 
 
 def test_a_bend_that_the_model_never_saw_is_named():

@@ -37,6 +37,7 @@ KIND, VERSION = "completion", 3       # 1 had no scale, expected error and confi
 _ARRAYS = ("pose", "betas", "trans", "seen", "expected_error", "confidence")
 _FACTS = ("rms", "explained", "landmark_rms", "converged", "iterations")
 
+CRUDE = 0.03                         # metres off in poses that were left out: from there on a model itself is doubtful
 DOUBTFUL = 0.06                      # metres that a part is expected to be off, from which on it is to be looked at
 PART_SHOWN = 0.5                     # share of a part within the picture, below which it is beyond
 LOST_LIMB, ENTERED = 0.01, 0.01      # shares: of a picture's person without a body near, of the body in free space
@@ -148,7 +149,7 @@ def complete(body: BodyModel | Subject, scan: Scan, landmarks: tuple[np.ndarray,
     completed, seen, used, rms = free_surface(predicted, cloud, config)   # [SCAPE] Eq. 10, over Y
     if cloud.person is not None:                # what it shows is clothes, and noisier than the model is inexact
         completed, rms = predicted, distance_to(predicted, cloud.points[used])
-    error = expected_error(open_error, distance_to_seen(predicted, seen), rms)
+    error = expected_error(open_error, distance_to_seen(predicted, seen), rms, person.left_out_error)
     tell(total, total)
     pose, trans, betas = person.split(x)
     shape = body.betas if isinstance(body, Subject) else betas if person.n_betas else None
@@ -180,6 +181,8 @@ def doubts(fit: ScanFit, x: np.ndarray, error: np.ndarray, seen: np.ndarray) -> 
     found += [f"the {joint_in_words(names[j])} is bent by {np.degrees(angles[j]):.0f} degrees, "
               f"and never was when the model was learned"
               for j in stiff_joints(fit.body.pose_examples) if angles[j] > BENT]
+    if (left_out := fit.body.left_out_error) is not None and left_out > CRUDE:
+        found.append(f"the model was {1000 * left_out:.0f} mm off in poses that it was not learned from: it needs more")
     return found + strayed(fit, x)
 
 

@@ -12,7 +12,8 @@ from ..bodies import FixedBody
 # Chosen so that the stated probabilities fit best (least Brier score at 5, 10, 20 and 40 mm) on completed half views
 # of tuning bodies: 14 poses of a known man and 7 men of unknown shape, none of which the models were learned from.
 INFLATED = 1.4                       # real errors against those that the fit believes in, as it is not quite linear
-BEYOND = 0.0075                      # metres: what the model cannot explain far from all data
+BEYOND = 0.0075                      # metres: what the model cannot explain far from all data, and its share of the
+LEFT_OUT = 0.85                      # error of poses that were left out of learning, where that is known
 FADES = 0.014                        # metres along the surface from the data, within which errors set in
 NEAREST = 0.0005                     # metres: no scan is better
 
@@ -40,7 +41,7 @@ def distance_to_seen(mesh: Mesh, seen: np.ndarray) -> np.ndarray:
     return SurfaceGraph(mesh).nearest(np.flatnonzero(seen))[0]
 
 
-def expected_error(posterior: np.ndarray, away: np.ndarray, rms: float) -> np.ndarray:
+def expected_error(posterior: np.ndarray, away: np.ndarray, rms: float, left_out: float | None = None) -> np.ndarray:
     """Root mean square distance (N,), metres, of vertices from the truth.
 
     Where the scan was, that is the distance to the true surface, and as large as the scan's own from the completed
@@ -48,11 +49,13 @@ def expected_error(posterior: np.ndarray, away: np.ndarray, rms: float) -> np.nd
     the model can follow. Near the scan the free surface carries the data over, so both set in gradually.
 
     `posterior` (N,), metres, see `posterior_error`; `away` (N,), metres, distance from what was seen, along the
-    surface; `rms`, metres, distance of the scan points that were used to the completed mesh.
+    surface; `rms`, metres, distance of the scan points that were used to the completed mesh; `left_out`, metres, what
+    the model said of poses that it was not learned from, where that is known.
     """
+    beyond = BEYOND if left_out is None else LEFT_OUT * left_out
     sets_in = 1 - np.exp(-away / FADES)
     near = max(NEAREST, 0.0 if np.isnan(rms) else rms)
-    return np.sqrt(near**2 + sets_in * ((INFLATED * posterior)**2 + BEYOND**2))
+    return np.sqrt(near**2 + sets_in * ((INFLATED * posterior)**2 + beyond**2))
 
 
 def probability_within(error: np.ndarray, tolerance: float) -> np.ndarray:

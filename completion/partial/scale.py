@@ -38,6 +38,7 @@ class ScaledBody(FixedBody):
         self.template, self.skeleton, self.n_angles = inner.template, inner.skeleton, inner.n_angles
         self.pose_mean, self.pose_covariance = inner.pose_mean, inner.pose_covariance
         self.pose_examples, self.known_poses = inner.pose_examples, inner.known_poses
+        self.left_out_error = inner.left_out_error
         self.subject = inner.subject
 
     def held(self, x: np.ndarray) -> FixedBody:

@@ -91,7 +91,8 @@ def _of_triangles(model: ScapeModel, vertices: np.ndarray, fit: PoseFit) -> Subj
         left = vertices - parts.stitched(S @ Q, fit.pose)
         S += shape_gradients(system, posed, posed + parts.local_edges(left, fit.pose)) - np.eye(3)
     return replace(parts.subject(model.pose_space, S), pose_mean=model.pose_mean,
-                   pose_covariance=model.pose_covariance, pose_examples=model.pose_examples)
+                   pose_covariance=model.pose_covariance, pose_examples=model.pose_examples,
+                   left_out_error=model.info.get("left_out_error"))
 
 
 @exact_subject.register
