@@ -109,7 +109,7 @@ def search_skeleton(template: Mesh, poses: np.ndarray, config: SkeletonConfig | 
     # a restart knows nothing of the count of parts or of the other restarts
     kept = partial(step, inputs=(template, poses, replace(config, parts=None, restarts=1)))
     runs = _restarts(surface, config, symmetry if tied else None, tell, kept)       # [Articulated] E- and M-steps
-    if tied and symmetry.holds and _held_back(runs[0]):                                 # few poses: a limb bends on one side alone
+    if tied and symmetry.holds and _held_back(runs[0]):              # few poses: a limb bends on one side alone
         both = np.concatenate([poses, mirrored_poses(template, poses, symmetry)])
         surface = PosedSurface(template, both)
         runs = _restarts(surface, config, symmetry, tell, kept, "mirrored")
