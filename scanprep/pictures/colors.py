@@ -1,6 +1,8 @@
 """Colours that carry numbers: heat maps with their bar, and a palette for parts."""
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 
 from ..geometry.format_common import as_seen
@@ -19,6 +21,24 @@ def heat(values: np.ndarray, low: float, high: float, colormap: str = HEAT) -> n
     colors = colormaps[colormap](np.nan_to_num(place) * (HEAT_END if colormap == HEAT else 1.0))[..., :3]
     colors[np.isnan(values)] = NO_VALUE
     return colors
+
+
+@dataclass(frozen=True, eq=False)
+class Heat:
+    """Values of vertices, shown as colours between two limits; NaN is grey."""
+
+    values: np.ndarray  # (N,) float
+    low: float
+    high: float
+    title: str = ""  # what the values are; lengths are in metres
+
+    def colors(self) -> np.ndarray:
+        """(N, 3) in [0, 1]."""
+        return heat(self.values, self.low, self.high)
+
+    def bar(self) -> np.ndarray:
+        """The legend as a picture."""
+        return color_bar(self.low, self.high, self.title)
 
 
 def color_bar(low: float, high: float, title: str, colormap: str = HEAT, scale: float = 1000.0, unit: str = "mm"

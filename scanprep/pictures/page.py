@@ -2,6 +2,8 @@
 from __future__ import annotations
 
 import base64
+import functools
+import gzip
 import io
 import mimetypes
 from collections.abc import Iterable, Sequence
@@ -12,7 +14,20 @@ from typing import Any
 import numpy as np
 
 from ..geometry.storage import write
-from .sheets import png_bytes
+from .scene import Pane, pack_scene
+from .shading import Moving, render
+from .sheets import png_bytes, side_by_side, webp_bytes
+
+VIEWER = Path(__file__).parents[1] / "viewer"
+# The viewer travels compressed: a browser that cannot take it apart, or has no WebGL, goes on showing the pictures.
+START = """(async () => {
+const raw = atob(document.getElementById("viewer").textContent), bytes = Uint8Array.from(raw, (c) => c.charCodeAt(0));
+const text = await new Response(new Blob([bytes]).stream().pipeThrough(new DecompressionStream("gzip"))).text();
+const script = document.createElement("script");
+script.textContent = text;
+document.head.append(script);
+scapekit.start();
+})().catch((error) => { document.body.classList.add("sk-pictures-only"); throw error; });"""
 
 
 class Page:
@@ -23,6 +38,7 @@ class Page:
         self._parts: list[str] = []
         self._styles: list[str] = []
         self._sections: list[str] = []
+        self._scenes: list[bytes] = []
 
     def section(self, title: str, text: str = "") -> Page:
         """A heading and a paragraph below it."""
@@ -45,6 +61,23 @@ class Page:
     def picture(self, image: np.ndarray | bytes, caption: str = "", alt: str = "") -> Page:
         """A picture."""
         self._parts.append(_figure(image, caption, alt))
+        return self
+
+    def bodies(self, panes: Sequence[Pane], caption: str = "", height: int = 400,
+               picture: np.ndarray | bytes | None = None) -> Page:
+        """Shapes that the reader can turn, one pane beside the other.
+
+        Where there is no WebGL, and until they are drawn, stands a picture of them, by default what the cameras see.
+        """
+        if picture is None:
+            views = [render([shape.shape if isinstance(shape, Moving) else shape for shape in pane.shapes], pane.camera,
+                            max(110, int(height * pane.camera.width / pane.camera.height) + 10), height)
+                     for pane in panes]
+            picture = webp_bytes(side_by_side(views, [pane.label for pane in panes]))
+        self._scenes.append(pack_scene(panes))
+        still = _figure(picture, caption, "")
+        self._parts.append(still.replace("<figure>", f'<figure data-scene="scene{len(self._scenes)}" '
+                                                     f'data-height="{height}">', 1))
         return self
 
     def pictures(self, images: Sequence[np.ndarray | bytes], captions: Sequence[str] = ()) -> Page:
@@ -84,6 +117,7 @@ class Page:
     def html(self) -> str:
         """The whole page."""
         style = Path(__file__).with_name("page.css").read_text(encoding="utf-8") + "".join(self._styles)
+        style += (VIEWER / "viewer.css").read_text(encoding="utf-8") if self._scenes else ""
         lead = f'<p class="lead">{escape(self.lead)}</p>' if self.lead else ""
         links = "".join(f'<a href="#s{i + 1}">{escape(s)}</a>' for i, s in enumerate(self._sections))
         nav = f'<nav aria-label="Contents">{links}</nav>' if len(self._sections) > 2 else ""
@@ -91,11 +125,27 @@ class Page:
                 f'<meta name="viewport" content="width=device-width, initial-scale=1">\n'
                 f"<title>{escape(self.title)}</title>\n<style>{style}</style>\n</head>\n<body>\n<main>\n"
                 f"<header><h1>{escape(self.title)}</h1>{lead}{nav}</header>\n"
-                + "\n".join(self._parts) + "\n</main>\n</body>\n</html>\n")
+                + "\n".join(self._parts) + "\n</main>\n" + self._viewer() + "</body>\n</html>\n")
+
+    def _viewer(self) -> str:
+        """What makes bodies turn: the scenes, the viewer, and its start; nothing on a page of pictures alone."""
+        if not self._scenes:
+            return ""
+        scenes = "".join(_carried(f"scene{i + 1}", scene) for i, scene in enumerate(self._scenes))
+        return f"{scenes}{_carried('viewer', _viewer_code())}<script>{START}</script>\n"
 
     def write(self, path: str | Path) -> None:
         """Write the page, whole or not at all."""
         write(path, self.html())
+
+
+def _carried(name: str, data: bytes) -> str:
+    return f'<script type="text/plain" id="{name}">{base64.b64encode(data).decode()}</script>\n'
+
+
+@functools.cache
+def _viewer_code() -> bytes:
+    return gzip.compress((VIEWER / "viewer.js").read_bytes(), 9, mtime=0)
 
 
 def _figure(image: np.ndarray | bytes, caption: str, alt: str) -> str:

@@ -5,20 +5,20 @@ at the vertices in sight and interpolated, which keeps them free of noise.
 """
 from __future__ import annotations
 
-from collections.abc import Sequence
-from dataclasses import dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
 
 import numpy as np
 
 from ..geometry.format_common import as_light
 from ..geometry.mesh import Mesh
 from .camera import Camera
-from .colors import color_bar, heat, part_colors, part_palette
+from .colors import Heat, color_bar, heat, part_colors, part_palette
 from .lighting import Canvas, Scene, Triangles
 from .sheets import png_bytes, save_png, side_by_side
 
-__all__ = ["Bones", "Camera", "Dots", "Solid", "color_bar", "heat", "part_colors", "part_palette", "png_bytes",
-           "render", "save_png", "side_by_side"]
+__all__ = ["Bones", "Camera", "Dots", "Heat", "Moving", "Solid", "color_bar", "heat", "part_colors", "part_palette",
+           "png_bytes", "render", "save_png", "side_by_side"]
 
 CLAY = (0.79, 0.76, 0.725)
 
@@ -29,9 +29,11 @@ class Solid:
 
     mesh: Mesh
     # (3,), (N, 3) per vertex or (F, 3) per triangle, in [0, 1]; by default the mesh's own colours, else clay
-    color: np.ndarray | Sequence[float] | None = None
+    color: np.ndarray | Sequence[float] | Heat | None = None
     opacity: float = 1.0  # below 1 what lies behind shines through
     smooth: bool = True  # interpolate normals: false shows the single triangles
+    name: str = ""  # in the browser, where shapes with a name can be hidden
+    shades: Mapping[str, np.ndarray | Heat] = field(default_factory=dict)  # other colours to choose from in the browser
 
 
 @dataclass(frozen=True, eq=False)
@@ -43,6 +45,8 @@ class Dots:
     radius: float = 0.012  # metres
     on_top: bool = False  # seen through the meshes in front of them
     coarse: bool = False  # balls of few triangles, for pictures in which they are a few pixels wide
+    name: str = ""
+    labels: Sequence[str] = ()  # of each point, shown in the browser
 
 
 @dataclass(frozen=True, eq=False)
@@ -54,6 +58,16 @@ class Bones:
     color: np.ndarray | Sequence[float] = (0.25, 0.30, 0.38)  # (3,) or (n, 3) in [0, 1]
     radius: float = 0.006  # metres
     on_top: bool = False
+    name: str = ""
+
+
+@dataclass(frozen=True, eq=False)
+class Moving:
+    """A shape in motion, for the browser; pictures show it as it is."""
+
+    shape: Solid | Dots
+    frames: np.ndarray  # (T, n, 3) float, metres: of its vertices or points
+    rate: float  # frames a second
 
 
 Shape = Mesh | Solid | Dots | Bones
@@ -101,7 +115,7 @@ def _triangles(shape: Shape, origin: np.ndarray) -> Triangles:
         mesh = shape.mesh
         flat = np.broadcast_to(mesh.face_normals[:, None], mesh.corners.shape)
         normals = mesh.vertex_normals[mesh.faces] if shape.smooth else flat
-        color = shape.color if shape.color is not None else CLAY if mesh.colors is None else mesh.colors
+        color = own_color(shape)
         return Triangles(mesh.corners - origin, normals, _corner_colors(np.asarray(color, dtype=float), mesh),
                          mesh.faces, mesh.vertex_normals)
     if isinstance(shape, Dots):
@@ -116,6 +130,13 @@ def _triangles(shape: Shape, origin: np.ndarray) -> Triangles:
         count = len(starts)
     color = as_light(np.broadcast_to(np.asarray(shape.color, dtype=float), (count, 3)))[use][owner]
     return Triangles(corners, normals, np.repeat(color[:, None], 3, axis=1))
+
+
+def own_color(solid: Solid) -> np.ndarray | Sequence[float]:
+    """What a mesh is coloured by: what was said, else its own colours, else clay."""
+    if isinstance(solid.color, Heat):
+        return solid.color.colors()
+    return solid.color if solid.color is not None else CLAY if solid.mesh.colors is None else solid.mesh.colors
 
 
 def _corner_colors(color: np.ndarray, mesh: Mesh) -> np.ndarray:

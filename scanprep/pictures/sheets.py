@@ -57,6 +57,15 @@ def png_bytes(image: np.ndarray) -> bytes:
     return out.getvalue()
 
 
+def webp_bytes(image: np.ndarray) -> bytes:
+    """A picture (H, W, 3) uint8 as a WebP file, a tenth of the size of a PNG."""
+    from PIL import Image
+
+    out = io.BytesIO()
+    Image.fromarray(image).save(out, format="WEBP", quality=82, method=4)
+    return out.getvalue()
+
+
 def save_png(path: str | Path, image: np.ndarray) -> None:
     """Write a picture (H, W, 3) uint8, whole or not at all."""
     write(path, png_bytes(image))

@@ -1,7 +1,6 @@
 """The page of a registered set: every scan with its pictures and figures, worst first; and these pictures."""
 from __future__ import annotations
 
-import io
 from collections.abc import Sequence
 from html import escape
 from pathlib import Path
@@ -17,6 +16,7 @@ from ..judgement import size as size_of
 from ..pictures.camera import Camera, look_around, upright
 from ..pictures.page import Page, data_uri
 from ..pictures.shading import CLAY, Dots, Shape, Solid, color_bar, heat, part_colors, render, side_by_side
+from ..pictures.sheets import webp_bytes
 from ..registration.nonrigid import Registration
 from .figures import Limits, ScanFigures, Verdict, read_doubts, read_failures, read_figures, review
 
@@ -206,12 +206,3 @@ def coarsened(mesh: Mesh, cell: float) -> Mesh:
     means = np.stack([np.bincount(place.reshape(-1), axis) / count for axis in mesh.vertices.T], axis=1)
     colors = None if mesh.colors is None else mesh.colors[first]
     return Mesh(means, faces[apart], colors)
-
-
-def webp_bytes(image: np.ndarray) -> bytes:
-    """A picture (H, W, 3) uint8 as a WebP file, a tenth of the size of a PNG."""
-    from PIL import Image
-
-    out = io.BytesIO()
-    Image.fromarray(image).save(out, format="WEBP", quality=82, method=4)
-    return out.getvalue()

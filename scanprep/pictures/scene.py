@@ -1,0 +1,159 @@
+"""Shapes as a browser gets them: small, and put together again by `viewer/source/unpack.js`.
+
+A packed scene is compressed (zlib) and holds the length of its header, the header in JSON, and columns of numbers.
+Positions are in steps of a 65,535th of a shape's extent, 0.03 mm for a person. What moves is stored as a few columns
+times coefficients that change from frame to frame, so that a long motion takes little more than a short one.
+"""
+from __future__ import annotations
+
+import json
+import zlib
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from typing import Any
+
+import numpy as np
+
+from ..geometry.mesh import Mesh
+from .camera import Camera
+from .colors import Heat
+from .low_rank import low_rank
+from .shading import Bones, Dots, Moving, Shape, Solid, own_color
+
+FORMAT = 1
+NO_INDEX = 255                       # place in a palette of vertices without a value; it has as many colours before
+
+
+@dataclass(frozen=True, eq=False)
+class Pane:
+    """Shapes that are seen together, and where from at first."""
+
+    shapes: Sequence[Shape | Moving]
+    camera: Camera
+    label: str = ""
+
+
+def pack_scene(panes: Sequence[Pane], exact: bool = False) -> bytes:
+    """Panes as bytes; `exact` keeps positions as float32, for those that are clicked on."""
+    columns = _Columns()
+    origin = panes[0].camera.target
+    header = {"format": FORMAT, "origin": origin.tolist(),
+              "panes": [{"label": pane.label, "camera": _camera(pane.camera, origin),
+                         "layers": [_layer(shape, origin, columns, exact) for shape in pane.shapes]}
+                        for pane in panes]}
+    text = json.dumps({**header, "columns": columns.described}, allow_nan=False).encode()
+    text += b" " * (-len(text) % 4)
+    return zlib.compress(len(text).to_bytes(4, "little") + text + columns.data, 9)
+
+
+@dataclass
+class _Columns:
+    """Arrays that go into one file, each of them once."""
+
+    described: list[dict[str, Any]] = field(default_factory=list)
+    data: bytes = b""
+    _known: dict[bytes, int] = field(default_factory=dict)
+
+    def add(self, values: np.ndarray, differences: bool = False) -> int:
+        """The number of a column of values (n, width); rows as differences to the one before compress better."""
+        values = np.ascontiguousarray(values.reshape(len(values), -1))
+        rows, width = values.shape
+        if differences:
+            values = _zigzag(np.diff(values, axis=0, prepend=np.zeros_like(values[:1])))
+        kind = values.dtype.str[1:]
+        planes = values.astype(values.dtype.newbyteorder("<")).view(np.uint8).reshape(-1, values.itemsize).T.tobytes()
+        key = kind.encode() + planes
+        if key not in self._known:
+            self._known[key] = len(self.described)
+            self.described.append({"at": len(self.data), "type": kind, "rows": rows, "width": width,
+                                   "differences": differences})
+            self.data += planes
+        return self._known[key]
+
+
+def _zigzag(steps: np.ndarray) -> np.ndarray:
+    """Unsigned steps that may have wrapped around, as 0, -1, 1, -2, ... -> 0, 1, 2, 3, ..."""
+    signed = steps.view(steps.dtype.str.replace("u", "i"))
+    return ((signed << 1) ^ (signed >> (8 * signed.itemsize - 1))).view(steps.dtype)
+
+
+def _camera(camera: Camera, origin: np.ndarray) -> dict[str, Any]:
+    away = camera.distance if np.isfinite(camera.distance) else 6 * (camera.width + camera.height)
+    return {"target": (camera.target - origin).tolist(), "back": camera.axes[2].tolist(), "distance": away,
+            "up": camera.vertical.tolist(), "width": camera.width, "height": camera.height}
+
+
+def _layer(shape: Shape | Moving, origin: np.ndarray, columns: _Columns, exact: bool) -> dict[str, Any]:
+    """One shape of a pane."""
+    if isinstance(shape, Moving):
+        return {**_layer(shape.shape, origin, columns, exact), "motion": _motion(shape, origin, columns)}
+    if isinstance(shape, Mesh):
+        shape = Solid(shape)
+    if isinstance(shape, Solid):
+        points = shape.mesh.vertices
+        first = shape.color if isinstance(shape.color, Heat) else own_color(shape)
+        shades = [_shade(name, shade, shape.mesh, columns) for name, shade in {"": first, **shape.shades}.items()]
+        looks = {"kind": "mesh", "opacity": shape.opacity, "smooth": shape.smooth, "shades": shades,
+                 "faces": columns.add(shape.mesh.faces.astype(np.uint32), True)}
+    else:
+        rods = isinstance(shape, Bones)
+        points = np.stack([shape.starts, shape.ends], axis=1) if isinstance(shape, Bones) else shape.points
+        color = np.asarray(shape.color, dtype=float)
+        color = np.repeat(color, 2, axis=0) if rods and color.ndim == 2 else color
+        looks = {"kind": "bones" if rods else "dots", "radius": shape.radius, "on_top": shape.on_top,
+                 "shades": [_shade("", color, None, columns)],
+                 "labels": list(shape.labels) if isinstance(shape, Dots) else []}
+    points = np.asarray(points, dtype=float).reshape(-1, 3) - origin
+    known = np.isfinite(points).all(axis=1)
+    return {"name": shape.name, **looks, "hidden": np.flatnonzero(~known).tolist(),
+            "positions": _positions(np.where(known[:, None], points, 0.0), columns, exact)}
+
+
+def _positions(points: np.ndarray, columns: _Columns, exact: bool) -> dict[str, Any]:
+    if exact or not len(points):
+        return {"column": columns.add(points.astype(np.float32)), "low": [0, 0, 0], "step": 1}
+    low = points.min(axis=0)
+    step = max(float(np.ptp(points, axis=0).max()), 1e-9) / 65535
+    return {"column": columns.add(np.round((points - low) / step).astype(np.uint16), True), "low": low.tolist(),
+            "step": step}
+
+
+def _shade(name: str, shade: Any, mesh: Mesh | None, columns: _Columns) -> dict[str, Any]:
+    """One way to colour a shape: values with a legend, a colour for each vertex, or one for all."""
+    if isinstance(shade, Heat):
+        share = (shade.values - shade.low) / max(shade.high - shade.low, 1e-30)
+        index = np.where(np.isnan(share), NO_INDEX, np.round((NO_INDEX - 1) * np.clip(np.nan_to_num(share), 0, 1)))
+        ramp = Heat(np.append(np.linspace(0, 1, NO_INDEX), np.nan), 0, 1).colors()
+        return {"name": name or shade.title, "index": columns.add(index.astype(np.uint8)),
+                "palette": _hex(np.round(255 * ramp)),
+                "legend": {"title": shade.title, "low": shade.low, "high": shade.high}}
+    colors = np.round(255 * np.asarray(shade, dtype=float)).clip(0, 255).astype(np.uint8)
+    if colors.ndim == 1:
+        return {"name": name, "palette": _hex(colors)}
+    if mesh is not None and len(colors) == len(mesh.faces) != len(mesh.vertices):
+        of_vertex = np.zeros(mesh.vertices.shape, dtype=np.uint8)
+        of_vertex[mesh.faces.ravel()] = np.repeat(colors, 3, axis=0)
+        colors = of_vertex
+    palette, index = np.unique(colors, axis=0, return_inverse=True)
+    if len(palette) <= NO_INDEX:
+        return {"name": name, "palette": _hex(palette), "index": columns.add(index.reshape(-1).astype(np.uint8))}
+    return {"name": name, "colors": columns.add(colors, True)}
+
+
+def _hex(colors: np.ndarray) -> str:
+    return np.asarray(colors, dtype=np.uint8).tobytes().hex()
+
+
+def _motion(moving: Moving, origin: np.ndarray, columns: _Columns) -> dict[str, Any]:
+    """Frames (T, n, 3) as columns (n, r) times coefficients (T, r, 3), both in whole steps."""
+    frames = np.asarray(moving.frames, dtype=float) - origin
+    known = np.isfinite(frames).all(axis=2)
+    hidden: Mapping[str, Any] = {} if known.all() else {"seen": columns.add(known.astype(np.uint8))}
+    basis, coefficients = low_rank(np.where(known[..., None], frames, 0.0))
+    steps = np.maximum(np.abs(basis).max(axis=0), 1e-12) / 32767
+    sizes = np.maximum(np.abs(coefficients).max(axis=(0, 2)), 1e-12) / 32767
+    return {"rate": moving.rate, "frames": len(frames), "rank": basis.shape[1], **hidden,
+            "basis": columns.add(np.round(basis / steps).astype(np.int16)),
+            "coefficients": columns.add(np.round(coefficients / sizes[:, None]).astype(np.int16).reshape(
+                len(frames), -1).view(np.uint16), True),
+            "scale": (steps * sizes).tolist()}
