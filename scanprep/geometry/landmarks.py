@@ -13,6 +13,7 @@ from scipy.spatial import cKDTree
 
 from . import storage
 from .format_common import FARTHEST, UNITS, Lines, MeshFileError, load_bytes, metres_per_unit, quote
+from .landmark_writing import as_bytes
 from .mesh import Mesh
 
 LANDMARK_ENDINGS = (".landmarks.json", ".json", ".mrk.json", ".pp", "_picked_points.pp", ".lnd", ".landmarks.txt")
@@ -115,18 +116,42 @@ def check_on_surface(path: str | Path, landmarks: Mapping[str, np.ndarray], surf
                             "it; are both in the same unit?")
 
 
-def write_landmarks(path: str | Path, landmarks: Mapping[str, np.ndarray | int]) -> None:
-    """Write named points (3,), metres, or named vertices as JSON, whole or not at all."""
+def write_landmarks(path: str | Path, landmarks: Mapping[str, np.ndarray | int | Mapping[str, Any]], unit: str = "m"
+                    ) -> None:
+    """Write named points, whole or not at all.
+
+    Parameters
+    ----------
+    path : str or Path
+        The ending tells the format, as for `read_landmarks`; an unknown one is JSON.
+    landmarks : name to (3,) float, metres, or vertex, or {"face": f, "bary": [a, b, c]}
+        The last two in JSON only.
+    unit : str
+        Unit of the coordinates in the file, where the format leaves it open.
+
+    Raises
+    ------
+    ValueError
+        A point that is not finite, or that the format cannot hold.
+    """
     out: dict[str, Any] = {}
     for name, value in landmarks.items():
-        if isinstance(value, int | np.integer):
-            out[name] = int(value)
+        if isinstance(value, int | np.integer | Mapping):
+            out[name] = value if isinstance(value, Mapping) else int(value)
             continue
         point = np.asarray(value, dtype=np.float64)
         if point.shape != (3,) or not np.isfinite(point).all():
             raise ValueError(f"landmarks: '{name}' expected three finite numbers or a vertex, got {value}")
-        out[name] = point.tolist()
-    storage.write_json(path, out)
+        out[name] = point
+    points = {name: value for name, value in out.items() if isinstance(value, np.ndarray)}
+    data = as_bytes(Path(path).name, points, unit)
+    if data is None:
+        storage.write_json(path, {name: (value / UNITS[unit]).tolist() if name in points else value
+                                  for name, value in out.items()})
+    elif len(points) < len(out):
+        raise ValueError(f"{path}: expected points; vertices and faces of a mesh can be written as JSON only")
+    else:
+        storage.write(path, data)
 
 
 def match_landmarks(template_landmarks: Mapping[str, Any], scan_landmarks: Mapping[str, Any], minimum: int = 3

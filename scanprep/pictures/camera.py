@@ -109,7 +109,7 @@ def upright(mesh: Mesh) -> tuple[int, float]:
     across = [(up + 1) % 3, (up + 2) % 3]
     height = (mesh.vertices[:, up] - mesh.vertices[:, up].min()) / extent[up]
     flat = mesh.vertices[:, across]
-    _, directions = np.linalg.eigh(np.cov(flat.T, aweights=mesh.vertex_areas))
+    _, directions = np.linalg.eigh(np.cov(flat.T, aweights=mesh.vertex_areas if len(mesh.faces) else None))
     forward = directions[:, 0]
     toes = flat[height < 0.05].mean(axis=0) - flat[(height >= 0.05) & (height < 0.25)].mean(axis=0)
     if forward @ toes < 0:

@@ -33,14 +33,12 @@ class Pane:
     label: str = ""
 
 
-def pack_scene(panes: Sequence[Pane], exact: bool = False) -> bytes:
-    """Panes as bytes; `exact` keeps positions as float32, for those that are clicked on."""
+def pack_scene(panes: Sequence[Pane]) -> bytes:
+    """Panes as bytes."""
     columns = _Columns()
-    origin = panes[0].camera.target
-    header = {"format": FORMAT, "origin": origin.tolist(),
-              "panes": [{"label": pane.label, "camera": _camera(pane.camera, origin),
-                         "layers": [_layer(shape, origin, columns, exact) for shape in pane.shapes]}
-                        for pane in panes]}
+    header = {"format": FORMAT, "panes": [
+        {"label": pane.label, "camera": _camera(pane.camera), "origin": pane.camera.target.tolist(),
+         "layers": [_layer(shape, pane.camera.target, columns) for shape in pane.shapes]} for pane in panes]}
     text = json.dumps({**header, "columns": columns.described}, allow_nan=False).encode()
     text += b" " * (-len(text) % 4)
     return zlib.compress(len(text).to_bytes(4, "little") + text + columns.data, 9)
@@ -77,16 +75,17 @@ def _zigzag(steps: np.ndarray) -> np.ndarray:
     return ((signed << 1) ^ (signed >> (8 * signed.itemsize - 1))).view(steps.dtype)
 
 
-def _camera(camera: Camera, origin: np.ndarray) -> dict[str, Any]:
+def _camera(camera: Camera) -> dict[str, Any]:
+    """A camera that looks at the origin."""
     away = camera.distance if np.isfinite(camera.distance) else 6 * (camera.width + camera.height)
-    return {"target": (camera.target - origin).tolist(), "back": camera.axes[2].tolist(), "distance": away,
+    return {"target": [0, 0, 0], "back": camera.axes[2].tolist(), "distance": away,
             "up": camera.vertical.tolist(), "width": camera.width, "height": camera.height}
 
 
-def _layer(shape: Shape | Moving, origin: np.ndarray, columns: _Columns, exact: bool) -> dict[str, Any]:
+def _layer(shape: Shape | Moving, origin: np.ndarray, columns: _Columns) -> dict[str, Any]:
     """One shape of a pane."""
     if isinstance(shape, Moving):
-        return {**_layer(shape.shape, origin, columns, exact), "motion": _motion(shape, origin, columns)}
+        return {**_layer(shape.shape, origin, columns), "motion": _motion(shape, origin, columns)}
     if isinstance(shape, Mesh):
         shape = Solid(shape)
     if isinstance(shape, Solid):
@@ -106,12 +105,12 @@ def _layer(shape: Shape | Moving, origin: np.ndarray, columns: _Columns, exact: 
     points = np.asarray(points, dtype=float).reshape(-1, 3) - origin
     known = np.isfinite(points).all(axis=1)
     return {"name": shape.name, **looks, "hidden": np.flatnonzero(~known).tolist(),
-            "positions": _positions(np.where(known[:, None], points, 0.0), columns, exact)}
+            "positions": _positions(np.where(known[:, None], points, 0.0), columns)}
 
 
-def _positions(points: np.ndarray, columns: _Columns, exact: bool) -> dict[str, Any]:
-    if exact or not len(points):
-        return {"column": columns.add(points.astype(np.float32)), "low": [0, 0, 0], "step": 1}
+def _positions(points: np.ndarray, columns: _Columns) -> dict[str, Any]:
+    if not len(points):
+        return {"column": columns.add(np.zeros((0, 3), dtype=np.uint16)), "low": [0, 0, 0], "step": 1}
     low = points.min(axis=0)
     step = max(float(np.ptp(points, axis=0).max()), 1e-9) / 65535
     return {"column": columns.add(np.round((points - low) / step).astype(np.uint16), True), "low": low.tolist(),

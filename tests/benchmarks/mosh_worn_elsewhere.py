@@ -34,7 +34,6 @@ from completion import energy
 from completion.mocap.files.markers import MarkerSequence, read_markers
 from completion.mocap.marker_sets.layout import MarkerLayout
 from completion.mocap.marker_sets.named import named_layout
-from completion.mocap.marker_sets.symmetry import other_side
 from completion.mocap.mosh.mosh import MoshConfig
 from completion.mocap.pose.follow import animate
 from completion.mocap.pose.marked_body import supports
@@ -43,6 +42,7 @@ from completion.mocap.subject.worn_elsewhere import Worn, find_worn
 from completion.motion import Motion
 from model.body import BodyModel
 from model.files import load_model
+from scanprep.geometry.sides import other_side
 from scanprep.geometry.mesh import Mesh
 
 EVERY = 4                            # of the frames one

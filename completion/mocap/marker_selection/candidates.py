@@ -13,7 +13,7 @@ from scanprep.skeleton.tree import Skeleton
 
 from ...bodies import at_rest
 from ..marker_sets.layout import MarkerLayout
-from ..marker_sets.symmetry import SkinMirror, find_skin_mirror, other_side, side_of
+from ..marker_sets.symmetry import SkinMirror, find_skin_mirror
 
 if TYPE_CHECKING:
     from model.body import BodyModel

@@ -1,6 +1,7 @@
 // What a page calls: `scapekit.start()` in reports, `scapekit.start("view")` and the like in programs.
 import { Figure } from "./figure.js";
 import { hasWebGL } from "./pane.js";
+import { Pick } from "./pick.js";
 import { fromBase64, unpackScene } from "./unpack.js";
 
 // Every figure of a report becomes one that turns, when it comes into sight; without WebGL its picture stays.
@@ -31,6 +32,9 @@ async function turn(figure) {
   figure.dataset.turns = "";
 }
 
+const PROGRAMS = { pick: Pick };
+
 export function start(name) {
   if (!name) startReport();
+  else window.program = new PROGRAMS[name]().start();
 }

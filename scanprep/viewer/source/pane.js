@@ -1,6 +1,7 @@
 // A pane: a canvas with shapes, a camera, and what the pointer does. All panes of a page share one WebGL renderer.
 import { AmbientLight, DirectionalLight, HemisphereLight, PerspectiveCamera, Raycaster, Scene, Vector2, Vector3, WebGLRenderer } from "three";
 import { OrbitControls } from "three/examples/jsm/controls/OrbitControls.js";
+import { Layer } from "./layer.js";
 
 let renderer = null;
 const waiting = new Set();
@@ -26,8 +27,9 @@ function drawAll() {
 }
 
 export class Pane {
-  constructor(element, { camera, label }) {
+  constructor(element, { camera, label, origin }) {
     this.element = element;
+    this.origin = new Vector3().fromArray(origin);      // all places are relative to it
     this.layers = [];
     this.scene = new Scene();
     this.canvas = document.createElement("canvas");
@@ -112,6 +114,30 @@ export class Pane {
   }
 
   redraw() { drawSoon(this); }
+
+  // Points with names that a program shows, in the colour given; they take the place of those of the same group.
+  setDots(group, points, labels, color) {
+    const old = this.layers.find((layer) => layer.group === group);
+    if (old) this.remove(old);
+    if (!points.length) return;
+    const steps = Float32Array.from(points.flat(), (value, i) => value - this.origin.getComponent(i % 3));
+    const layer = new Layer({ kind: "dots", name: "", labels, radius: 0.012, on_top: true, hidden: [],
+      positions: { column: 0, low: [0, 0, 0], step: 1 }, shades: [{ name: "", palette: color.slice(1) }] }, [steps]);
+    layer.group = group;
+    this.add(layer);
+  }
+
+  view() { return { position: this.camera.position.clone(), target: this.controls.target.clone(), zoom: this.camera.zoom, home: this.home }; }
+
+  restore({ position, target, zoom, home }) {
+    const grown = this.home.distance / home.distance;
+    if (Math.abs(Math.log(grown)) > 0.2 || home.back.some((x, i) => Math.abs(x - this.home.back[i]) > 0.3)) return;   // another kind of thing
+    this.camera.position.copy(position);
+    this.controls.target.copy(target);
+    this.camera.zoom = zoom;
+    this.controls.update();
+    this.redraw();
+  }
 
   draw() {
     const { width, height } = this.canvas;

@@ -1,0 +1,32 @@
+"""Left and right in the names of landmarks, markers and joints."""
+from __future__ import annotations
+
+import re
+
+_WORDS = re.compile(r"(?<![A-Za-z])(left|right|lt|rt)(?![A-Za-z])", re.IGNORECASE)
+_LETTER = re.compile(r"^[LR](?=[A-Z0-9._ ])|^[lr](?=[._ ])|(?<=[._ ])[LRlr]$|(?<=[a-z0-9])[LR]$")
+_OTHER = {"L": "R", "R": "L", "l": "r", "r": "l", "left": "right", "right": "left", "lt": "rt", "rt": "lt"}
+
+
+def other_side(label: str) -> str | None:
+    """The label of the same place on the other side, or None for a label that names no side.
+
+    Sides are an L or R in front (LELB, L.Knee), one at the end (elbow_l, KneeR), or the words left and right, or Lt. and Rt.
+    """
+    if _WORDS.search(label):
+        return _WORDS.sub(lambda found: _like(found[0]), label, count=1)
+    if _LETTER.search(label):
+        return _LETTER.sub(lambda found: _OTHER[found[0]], label, count=1)
+    return None
+
+
+def side_of(label: str) -> int:
+    """1 for a label of the left, -1 for the right, 0 for one that names no side."""
+    found = _WORDS.search(label) or _LETTER.search(label)
+    return 0 if found is None else 1 if found[0][0] in "lL" else -1
+
+
+def _like(word: str) -> str:
+    """The other word, in the same case."""
+    other = _OTHER[word.lower()]
+    return other.upper() if word.isupper() else other.capitalize() if word[0].isupper() else other

@@ -1,0 +1,55 @@
+"""`scape pick`: landmarks clicked in the browser."""
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Annotated, Literal
+
+import tyro
+
+from ..cli import MeshArg, Unit
+from ..console import Metric, Outcome
+from ..pipeline.scans import find_scans
+from ..ranges import Range
+from .landmark_names import read_names
+from .pick import Clicked, PickApp
+
+ScansArg = Annotated[tyro.conf.Positional[tuple[Path, ...]], tyro.conf.arg(metavar="[SCAN ...]")]
+Port = Annotated[int, Range(1, 65535)]
+Ending = Literal["json", "pp", "mrk.json", "lnd", "txt"]
+
+
+def pick_landmarks(mesh: MeshArg, scans: ScansArg = (), names: str = "ten", format: Ending = "json",  # noqa: A002
+                   unit: Unit | None = None, port: Port | None = None, open: bool = True) -> Outcome:  # noqa: A002
+    """Click named points on a template and on scans, in the browser. Every click is saved at once.
+
+    Example: scape pick template.ply scans
+
+    Args:
+        mesh: The template, or any mesh whose landmarks are wanted.
+        scans: Scans to click the same landmarks on, one after the other, or folders of them.
+        names: Names to offer beside those that are there already: "ten" for people, "caesar" for the 73 of CAESAR, or
+            a text file with one name in each line.
+        format: Of new landmark files, which are written beside each scan with its name: json, pp (MeshLab),
+            mrk.json (3D Slicer), lnd (CAESAR), txt. A file that is there keeps its format, and a copy of it as it was.
+        unit: Unit of the scans and of their landmarks.
+        port: Port of this machine to use; else any that is free.
+        open: Open the browser. With --no-open the address is printed, and how to reach it from another machine.
+    """
+    from .server import serve
+
+    ending = ".landmarks.json" if format == "json" else "." + format
+    template, *others = [Clicked.found(path, ending, unit) for path in (mesh, *_files(scans))]
+    _ = template.body                                     # a file that is no mesh is refused before a browser opens
+    app = PickApp(template, others, read_names(names))
+    before = {one.path: len(one.places) for one in (template, *others)}
+    serve(app, port, open)
+    done = [one for one in (template, *others) if one.places]
+    return Outcome(None, [Metric("bodies with landmarks", len(done)),
+                          Metric("landmarks", sum(len(one.places) for one in done)),
+                          Metric("more than before", sum(len(one.places) - before[one.path] for one in done)),
+                          *(Metric(one.path.name, len(one.places), f"in {one.file.name}") for one in done)])
+
+
+def _files(scans: tuple[Path, ...]) -> list[Path]:
+    """Scans, and those of folders."""
+    return [path for one in scans for path in ([task.path for task in find_scans(one)] if one.is_dir() else [one])]

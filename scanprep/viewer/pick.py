@@ -1,0 +1,368 @@
+"""Landmarks clicked in the browser: `scape pick`, and what `scape complete --interactive` is built on.
+
+The page sends rays and names; where a ray meets the surface is found here, every change is saved at once, and the
+page is sent the whole state, which is small. So a second tab, or one that was loaded again, shows the same.
+"""
+from __future__ import annotations
+
+import shutil
+import threading
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, field
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from ..geometry.files import read_scan
+from ..geometry.landmarks import landmarks_beside, read_landmarks, write_landmarks
+from ..geometry.mesh import Mesh
+from ..geometry.surface import Surface
+from ..pictures.camera import Camera, upright
+from ..pictures.scene import Pane, pack_scene
+from ..pictures.shading import CLAY, Dots, Shape, Solid
+from ..pictures.thinned import thinned
+from .landmark_names import next_name
+from .messages import Message
+from .surface_clicks import Clickable
+
+TEMPLATE, SCAN = 0, 1                # panes
+ENOUGH = 4                           # landmarks from which the others can be predicted
+KEPT = ".before"                     # ending of the copy of a landmark file as it was found
+
+Send = Callable[[Message], None]
+Places = dict[str, np.ndarray]
+
+
+@dataclass(eq=False)
+class Clicked:
+    """A mesh or cloud with the landmarks that are on it and the file that they are saved to."""
+
+    path: Path
+    file: Path
+    unit: str | None = None
+    places: Places = field(default_factory=dict)
+    predicted: Places = field(default_factory=dict)
+    _body: Clickable | None = None
+
+    @classmethod
+    def found(cls, path: Path, ending: str, unit: str | None = None) -> Clicked:
+        """With the landmarks of the file of its name beside it; else they will be saved in one of this ending."""
+        file = landmarks_beside(path)
+        one = cls(path, file or path.with_name(path.name.split(".")[0] + ending), unit)
+        if file is not None:
+            shape = one.body.shape
+            one.places = read_landmarks(file, shape if isinstance(shape, Mesh) else None, unit)
+        return one
+
+    @property
+    def body(self) -> Clickable:
+        """What is clicked on; read when it is first shown."""
+        if self._body is None:
+            self._body = Clickable(read_scan(self.path, self.unit))
+        return self._body
+
+    def close(self) -> None:
+        """Forget the surface, not the landmarks."""
+        self._body = None
+
+    def save(self) -> None:
+        """Write all landmarks; a file that was there before is kept beside it, once."""
+        if not self.places and not self.file.exists():
+            return
+        kept = self.file.with_name(self.file.name + KEPT)
+        if self.file.exists() and not kept.exists():
+            shutil.copyfile(self.file, kept)
+        write_landmarks(self.file, self.places, self.unit or "m")
+
+    def pane(self, label: str) -> Pane:
+        """Its surface as the browser gets it."""
+        shape = self.body.shape
+        shown: Shape = Solid(thinned(shape)) if self.body.has_surface and isinstance(shape, Mesh) else \
+            Dots(self.body.points[::max(1, len(self.body.points) // 150_000)], CLAY, 0.004)
+        return Pane([shown], camera_of(self.body.points), label)
+
+
+def camera_of(points: np.ndarray) -> Camera:
+    """A view of a body from its front, as far as that can be seen from its outline."""
+    up, front = upright(Mesh(points, np.zeros((0, 3), dtype=np.int64)))
+    return Camera.around(points, front, up=up)
+
+
+@dataclass(frozen=True)
+class Change:
+    """Landmarks before and after, on one of the bodies; None where there was none."""
+
+    body: int
+    before: Mapping[str, np.ndarray | None]
+    after: Mapping[str, np.ndarray | None]
+
+
+class PickApp:
+    """The state of `scape pick`: a template, scans one after the other, names, and what can be undone."""
+
+    name, title = "pick", "Landmarks"
+    folders: Sequence[Path] = ()
+
+    def __init__(self, template: Clicked, scans: Sequence[Clicked], names: Sequence[str],
+                 fixed: Mapping[str, np.ndarray] | None = None) -> None:
+        self.template, self.scans, self.current = template, list(scans), 0
+        if fixed is not None:                                    # a model's own: nothing to click or to save
+            template.places = dict(fixed)
+        self.fixed = fixed is not None
+        known = [*template.places, *(name for one in self.scans for name in one.places)]
+        self.names = tuple(dict.fromkeys([*known, *names]))
+        self.done: list[Change] = []
+        self.undone: list[Change] = []
+        self.chosen: str | None = None
+        self.working: tuple[str, int, int] | None = None
+        self.note = ""
+        self._lock = threading.RLock()
+        self.choose_next(None)
+
+    # what the page is sent
+
+    @property
+    def scan(self) -> Clicked | None:
+        """The scan that is shown."""
+        return self.scans[self.current] if self.scans else None
+
+    def greet(self) -> list[Message]:
+        """The bodies and the state."""
+        with self._lock:
+            return [self.scene(), self.state()]
+
+    def scene(self) -> Message:
+        """All panes."""
+        panes = [self.template.pane(self.template.path.name)]
+        if self.scan is not None:
+            panes.append(self.scan.pane(self.scan.path.name))
+        return Message("scene", {}, pack_scene(panes))
+
+    def state(self) -> Message:
+        """Everything but the bodies."""
+        with self._lock:
+            return Message("state", {**self._state(), **self.more()}, latest="state")
+
+    def _state(self) -> dict[str, Any]:
+        shown = [self.template, *([self.scan] if self.scan else [])]
+        return {
+            "names": list(self.names), "chosen": self.chosen, "fixed": self.fixed, "note": self.note,
+            "panes": [{"places": _lists(one.places), "predicted": _lists(one.predicted), "file": one.file.name}
+                      for one in shown],
+            "scan": self.current, "scans": [{"name": one.path.name, "count": len(one.places)} for one in self.scans],
+            "undo": bool(self.done), "redo": bool(self.undone), "working": self.working, "enough": ENOUGH}
+
+    def more(self) -> dict[str, Any]:
+        """What an app that is built on this one adds to the state."""
+        return {}
+
+    # what the page sends
+
+    def handle(self, message: Message, send: Send) -> None:
+        """One click, key or button; everything that it changes is saved before the page is told."""
+        action = getattr(self, f"on_{message.kind}", None)
+        if action is None:
+            raise ValueError(f"a message of kind '{message.kind}', which nothing here answers")
+        with self._lock:
+            self.note = ""
+            action(send, **message.fields)
+        send(self.state())
+
+    def receive(self, name: str, path: Path, send: Send) -> None:
+        """Files cannot be dropped here: there would be no folder to save their landmarks in."""
+        raise ValueError("name scans on the command line: their landmarks are saved beside them")
+
+    def close(self) -> None:
+        """Nothing is left to do: every click was saved."""
+
+    def on_place(self, send: Send, pane: int, name: str, origin: list[float], direction: list[float],
+                 inside: bool = False, seen: list[float] | None = None, dragged: bool = False) -> None:
+        """A landmark where a ray meets the surface; a landmark inside is half way to where the ray leaves the body."""
+        one = self._editable(pane)
+        body, ray = one.body, (_point(origin), _point(direction))
+        place = body.middle(*ray) if inside else body.hit(*ray)
+        if place is None and seen is not None:                   # the ray met the thinned surface, and just not ours
+            place = body.nearest(_point(seen))
+        if place is not None:
+            self._change(self._number(pane), {self._named(name): place}, merged=dragged)
+            if not dragged:
+                self.choose_next(name, pane)
+            self._predict_if_time(send, pane)
+
+    def on_slide(self, send: Send, pane: int, name: str, direction: list[float], by: float) -> None:
+        """Move a landmark along a ray, metres: into the body, to where a joint is."""
+        along = _point(direction)
+        place = self._editable(pane).places[name] + by * along / np.linalg.norm(along)
+        self._change(self._number(pane), {name: place}, merged=True)
+
+    def on_remove(self, send: Send, pane: int, name: str) -> None:
+        """Take a landmark away."""
+        if name in self._editable(pane).places:
+            self._change(self._number(pane), {name: None})
+        self.chosen = name
+
+    def on_choose(self, send: Send, name: str) -> None:
+        """The landmark that the next click sets; a new name joins the list."""
+        self.chosen = self._named(name)
+
+    def on_open(self, send: Send, scan: int) -> None:
+        """Another scan."""
+        if not 0 <= scan < len(self.scans):
+            raise ValueError(f"scan: expected 0 to {len(self.scans) - 1}, got {scan}")
+        if scan != self.current:
+            self.scans[self.current].close()
+            self.current = scan
+            self.choose_next(None)
+            send(self.scene())
+
+    def on_undo(self, send: Send) -> None:
+        """Take the last change back."""
+        self._step(self.done, self.undone, back=True, send=send)
+
+    def on_redo(self, send: Send) -> None:
+        """Make it again."""
+        self._step(self.undone, self.done, back=False, send=send)
+
+    def on_confirm(self, send: Send, names: list[str]) -> None:
+        """Take predicted landmarks as they are."""
+        one = self._editable(SCAN)
+        wanted = {name: one.predicted[name] for name in names if name in one.predicted}
+        if wanted:
+            self._change(self._number(SCAN), wanted)
+            self.choose_next(None)
+
+    def on_predict(self, send: Send) -> None:
+        """Where the other landmarks of the template should be on the scan."""
+        if self.scan is not None:
+            self._predict(self.scan, send)
+
+    # the state itself
+
+    def choose_next(self, last: str | None, pane: int = SCAN) -> None:
+        """Offer the next name: one that the template lacks while it is clicked on, then those that the scan lacks."""
+        template, scan = self.template.places, self.scan.places if self.scan else {}
+        missing = [name for name in self.names if name not in template]
+        if self.scan is None or not template or (pane == TEMPLATE and missing):
+            offered, done = self.names, set(template)
+        else:
+            offered, done = tuple(name for name in self.names if name in template), set(scan)
+        self.chosen = next_name(offered, done, last) or last or (self.names[0] if self.names else None)
+
+    def _number(self, pane: int) -> int:
+        return -1 if pane == TEMPLATE else self.current
+
+    def _of(self, number: int) -> Clicked:
+        return self.template if number < 0 else self.scans[number]
+
+    def _editable(self, pane: int) -> Clicked:
+        if pane == TEMPLATE and self.fixed:
+            raise ValueError("the landmarks of the model are fixed; click on the scan")
+        if pane not in (TEMPLATE, SCAN) or (pane == SCAN and self.scan is None):
+            raise ValueError(f"pane: expected 0, the template, or 1, the scan, got {pane}")
+        return self._of(self._number(pane))
+
+    def _named(self, name: str) -> str:
+        name = " ".join(str(name).split())[:200]
+        if not name:
+            raise ValueError("a landmark needs a name")
+        if name not in self.names:
+            self.names = (*self.names, name)
+        return name
+
+    def _change(self, number: int, after: Mapping[str, np.ndarray | None], merged: bool = False) -> None:
+        """Set landmarks, remember what they were, save; `merged` with the change before, where that was a drag too."""
+        one = self._of(number)
+        before = {name: one.places.get(name) for name in after}
+        if merged and self.done and self.done[-1].body == number and list(self.done[-1].after) == list(after):
+            before = dict(self.done.pop().before)
+        self.done.append(Change(number, before, after))
+        self.undone.clear()
+        self._set(number, after)
+
+    def _set(self, number: int, places: Mapping[str, np.ndarray | None]) -> None:
+        one = self._of(number)
+        for name, place in places.items():
+            if place is None:
+                one.places.pop(name, None)
+            else:
+                one.places[name] = place
+        one.save()
+
+    def _step(self, source: list[Change], target: list[Change], back: bool, send: Send) -> None:
+        if source:
+            change = source.pop()
+            target.append(change)
+            if change.body >= 0 and change.body != self.current:
+                self.on_open(send, change.body)
+            self._set(change.body, change.before if back else change.after)
+            self.chosen = next(iter(change.after))
+
+    # what registration says of the landmarks that are missing
+
+    def _predict_if_time(self, send: Send, pane: int) -> None:
+        """Predict when a scan has just got enough landmarks, and the template has more."""
+        one = self.scan
+        if pane == SCAN and one is not None and not one.predicted and self.working is None:
+            common = [name for name in self.template.places if name in one.places]
+            if len(common) == ENOUGH < len(self.template.places):
+                self._predict(one, send)
+
+    def _predict(self, one: Clicked, send: Send) -> None:
+        common = [name for name in self.template.places if name in one.places]
+        template = self.template.body.shape
+        if len(common) < ENOUGH:
+            raise ValueError(f"click {ENOUGH} landmarks that the template has too, then the others can be predicted")
+        if self.working is not None or not isinstance(template, Mesh):
+            return
+        self.working = ("looking for the other landmarks", 0, 1)
+        threading.Thread(target=self._predicted, args=(one, dict(self.template.places), dict(one.places), template,
+                                                       one.body, send), daemon=True).start()
+
+    def _predicted(self, one: Clicked, on_template: Places, on_scan: Places, template: Mesh, body: Clickable,
+                   send: Send) -> None:
+        """Register the template to the scan and see where its landmarks come to lie; beside the clicks that go on."""
+        def tell(done: int, total: int) -> None:
+            self.working = ("looking for the other landmarks", done, total)
+            send(self.state())
+
+        try:
+            found = predict_landmarks(template, on_template, body, on_scan, tell)
+            with self._lock:
+                one.predicted = found
+                self.note = f"{sum(name not in one.places for name in found)} landmarks predicted: confirm or correct"
+        except ValueError as error:
+            self.note = f"the other landmarks could not be predicted: {error}"
+        finally:
+            self.working = None
+        send(self.state())
+
+
+def predict_landmarks(template: Mesh, on_template: Mapping[str, np.ndarray], body: Clickable,
+                      on_scan: Mapping[str, np.ndarray], progress: Callable[[int, int], None] | None = None) -> Places:
+    """Where all landmarks of a template should be on a body of which some are known: by registration.
+
+    Points (3,), metres. ValueError for fewer than three in common.
+    """
+    from ..registration.nonrigid import register
+
+    common = [name for name in on_template if name in on_scan]
+    nearest = Surface(template).closest(np.array(list(on_template.values())))
+    corners = template.faces[nearest.faces]
+    vertices = corners[np.arange(len(corners)), nearest.bary.argmax(axis=1)]
+    of_name = dict(zip(on_template, vertices.tolist(), strict=True))
+    fit = register(template, body.shape, (np.array([of_name[name] for name in common]),
+                                          np.array([on_scan[name] for name in common])), progress=progress)
+    moved = nearest.transferred(fit.mesh.vertices, template.faces)
+    return {name: body.nearest(place) for name, place in zip(on_template, moved, strict=True)}
+
+
+def _lists(places: Places) -> dict[str, list[float]]:
+    return {name: place.tolist() for name, place in places.items()}
+
+
+def _point(values: Any) -> np.ndarray:
+    point = np.asarray(values, dtype=float)
+    if point.shape != (3,) or not np.isfinite(point).all():
+        raise ValueError(f"expected three finite numbers, got {values}")
+    return point

@@ -1,0 +1,197 @@
+// `scape pick`: a template, a scan, a list of names; a click is sent as a ray, and Python finds what it meets.
+import { Vector3 } from "three";
+import { make } from "./figure.js";
+import { Program } from "./program.js";
+
+const NEAR = 12;                     // pixels from a landmark that still take hold of it
+const STILL = 4;                     // pixels that a hand moves while it clicks
+const COLORS = { set: "#d5392f", chosen: "#f0a400", predicted: "#3b82c4" };
+export const KEYS = [["n, p", "next, previous name"], ["z, y", "undo, redo"], ["Delete", "take the landmark away"],
+  ["Enter", "confirm the predicted ones"], ["[ and ]", "previous, next scan"], ["+ and -", "move it along the view, into the body"],
+  ["i", "click inside the body: joints"]];
+
+export class Pick extends Program {
+  constructor() {
+    super();
+    this.inside = false;
+    this.state = null;
+    this.measured = [];
+    this.on("state", (fields) => this.update(fields));
+    this.build();
+    addEventListener("keydown", (event) => this.key(event));
+  }
+
+  build() {
+    this.scans = make("select", { "aria-label": "scan", onchange: () => this.send("open", { scan: this.scans.selectedIndex }) });
+    this.list = make("ol", { class: "sk-names", "aria-label": "landmarks" });
+    this.added = make("input", { placeholder: "another name", "aria-label": "another name", onkeydown: (event) => {
+      if (event.key === "Enter" && this.added.value.trim()) { this.send("choose", { name: this.added.value }); this.added.value = ""; }
+    } });
+    this.buttons = {
+      undo: button("undo", "take the last change back (z)", () => this.send("undo")),
+      redo: button("redo", "make it again (y)", () => this.send("redo")),
+      predict: button("predict the others", "register the template to the scan and see where the other landmarks should be", () => this.send("predict")),
+      confirm: button("confirm all", "take all predicted landmarks as they are (Enter)", () => this.confirm()),
+    };
+    this.insideBox = make("input", { type: "checkbox", onchange: () => { this.inside = this.insideBox.checked; } });
+    this.measure = make("p", { class: "sk-measure" });
+    this.file = make("p", { class: "sk-file" });
+    this.panel.append(this.scans, this.list, this.added, make("div", { class: "sk-buttons" }, ...Object.values(this.buttons)),
+      make("label", {}, this.insideBox, "inside the body (joints)"), this.measure, this.file,
+      make("details", {}, make("summary", {}, "keys"), make("dl", {}, ...KEYS.flatMap(([key, what]) => [make("dt", {}, key), make("dd", {}, what)]))));
+  }
+
+  confirm() { this.send("confirm", { names: Object.keys(this.waiting()) }); }
+
+  // Predicted landmarks that nobody has clicked yet.
+  waiting() {
+    const { predicted = {}, places = {} } = this.state?.panes[1] ?? {};
+    return Object.fromEntries(Object.entries(predicted).filter(([name]) => !(name in places)));
+  }
+
+  update(state) {
+    this.state = state;
+    this.scans.hidden = state.scans.length < 2;
+    this.scans.replaceChildren(...state.scans.map(({ name, count }, i) => make("option", { selected: i === state.scan }, `${name}: ${count}`)));
+    this.buttons.undo.disabled = !state.undo;
+    this.buttons.redo.disabled = !state.redo;
+    const waiting = Object.keys(this.waiting()).length;
+    this.buttons.confirm.disabled = !waiting;
+    this.buttons.confirm.textContent = waiting ? `confirm ${waiting}` : "confirm all";
+    const common = Object.keys(state.panes[0].places).filter((name) => name in (state.panes[1]?.places ?? {}));
+    this.buttons.predict.disabled = common.length < state.enough || Boolean(state.working);
+    this.buttons.predict.hidden = this.buttons.confirm.hidden = state.panes.length < 2;
+    this.names();
+    this.tellFile();
+    if (state.working) this.work(state.working); else { this.work(null); this.say(state.note || this.hint()); }
+    this.paint();
+  }
+
+  hint() {
+    const { chosen, fixed, panes } = this.state;
+    if (!chosen) return "";
+    return panes.length > 1 && (fixed || chosen in panes[0].places) ? `Click “${chosen}” on the scan.` : `Click “${chosen}” on the template.`;
+  }
+
+  tellFile() {
+    this.file.textContent = this.state.fixed ? "" : `saved at every click in ${this.state.panes.map((pane) => pane.file).join(" and ")}`;
+  }
+
+  names() {
+    const { names, chosen, panes } = this.state;
+    this.list.replaceChildren(...names.map((name) => {
+      const marks = panes.map((pane) => make("span", { class: name in pane.places ? "sk-on" : name in pane.predicted ? "sk-guess" : "sk-off",
+        title: name in pane.places ? "set" : name in pane.predicted ? "predicted" : "not set" }));
+      const far = panes[1] && name in panes[1].places && name in panes[1].predicted ? distance(panes[1].places[name], panes[1].predicted[name]) : null;
+      const item = make("li", { "aria-current": name === chosen ? "true" : null, tabindex: 0, onclick: (event) => this.choose(name, event) },
+        make("span", { class: "sk-dots" }, ...marks), make("span", {}, name),
+        far === null ? "" : make("small", { title: "from where it was predicted" }, `${(1000 * far).toFixed(0)} mm`));
+      return item;
+    }));
+    this.list.querySelector("[aria-current]")?.scrollIntoView({ block: "nearest" });
+  }
+
+  choose(name, event) {
+    if (event.shiftKey && this.state.chosen) this.tellDistance(this.state.chosen, name);
+    this.send("choose", { name });
+  }
+
+  tellDistance(a, b) {
+    const told = this.state.panes.map((pane, i) => a in pane.places && b in pane.places ?
+      `${i ? "scan" : "template"} ${(1000 * distance(pane.places[a], pane.places[b])).toFixed(1)} mm` : null).filter(Boolean);
+    this.measure.textContent = told.length ? `${a} to ${b}: ${told.join(", ")}` : `${a} and ${b} are not both set`;
+  }
+
+  // Landmarks as dots with names, in every pane.
+  paint() {
+    if (!this.figure || !this.state) return;
+    this.figure.panes.forEach((pane, i) => {
+      const marks = this.state.panes[i];
+      if (!marks) return;
+      const groups = { predicted: i === 1 ? this.waiting() : {}, set: {}, chosen: {} };
+      for (const [name, place] of Object.entries(marks.places)) groups[name === this.state.chosen ? "chosen" : "set"][name] = place;
+      for (const [group, places] of Object.entries(groups)) {
+        pane.setDots(group, Object.values(places), Object.keys(places), COLORS[group], i);
+      }
+    });
+  }
+
+  shown(figure) {
+    figure.panes.forEach((pane, i) => this.listen(pane, i));
+    this.paint();
+  }
+
+  listen(pane, number) {
+    const { canvas } = pane;
+    let down = null;
+    canvas.addEventListener("pointerdown", (event) => {
+      if (event.button !== 0) return;
+      const name = this.near(pane, number, event);
+      down = { x: event.clientX, y: event.clientY, name, moved: false };
+      if (name && !(number === 0 && this.state.fixed)) { pane.controls.enabled = false; canvas.setPointerCapture(event.pointerId); }
+    }, true);
+    canvas.addEventListener("pointermove", (event) => {
+      if (!down) return;
+      down.moved ||= Math.hypot(event.clientX - down.x, event.clientY - down.y) > STILL;
+      if (down.moved && !pane.controls.enabled) this.place(pane, number, down.name, event, true);
+    });
+    canvas.addEventListener("pointerup", (event) => {
+      if (!down) return;
+      const { name, moved } = down;
+      const dragging = !pane.controls.enabled;
+      down = null;
+      pane.controls.enabled = true;
+      if (dragging && moved) this.place(pane, number, name, event, true);
+      else if (!moved && name && name !== this.state.chosen && !(name in this.waiting())) this.send("choose", { name });
+      else if (!moved) this.place(pane, number, name ?? this.state.chosen, event, false);
+    });
+  }
+
+  // The landmark under the pointer.
+  near(pane, number, event) {
+    const box = pane.canvas.getBoundingClientRect();
+    const marks = { ...(number === 1 ? this.waiting() : {}), ...this.state.panes[number].places };
+    let best = null, least = NEAR;
+    for (const [name, place] of Object.entries(marks)) {
+      const at = pane.project(new Vector3().fromArray(place).sub(pane.origin));
+      const away = at ? Math.hypot(at.x - (event.clientX - box.left), at.y - (event.clientY - box.top)) : Infinity;
+      if (away < least) { best = name; least = away; }
+    }
+    return best;
+  }
+
+  place(pane, number, name, event, dragged) {
+    if (!name) { this.say("Name the landmark first: choose one from the list, or type another name.", "bad"); return; }
+    const { raycaster } = pane.ray(event), hit = pane.hit(event);
+    const fields = { pane: number, name, inside: this.inside, dragged, origin: raycaster.ray.origin.clone().add(pane.origin).toArray(),
+      direction: raycaster.ray.direction.toArray(), seen: hit ? hit.point.clone().add(pane.origin).toArray() : null };
+    this.send("place", fields, dragged ? `drag ${number} ${name}` : "");
+  }
+
+  key(event) {
+    if (!this.state || event.target.matches("input:not([type=checkbox]), select, textarea")) return;
+    const { names, chosen, scan, scans, panes } = this.state;
+    const step = (by) => this.send("choose", { name: names[(names.indexOf(chosen) + by + names.length) % names.length] });
+    const pane = panes.length > 1 && chosen in panes[1].places ? 1 : 0;
+    const slide = (by) => {
+      if (!(chosen in panes[pane].places)) return;
+      const direction = new Vector3().fromArray(panes[pane].places[chosen]).sub(this.figure.panes[pane].origin).sub(this.figure.panes[pane].camera.position);
+      this.send("slide", { pane, name: chosen, direction: direction.toArray(), by });
+    };
+    const actions = {
+      n: () => step(1), p: () => step(-1), z: () => this.send(event.shiftKey ? "redo" : "undo"), Z: () => this.send("redo"), y: () => this.send("redo"),
+      Delete: () => this.send("remove", { pane, name: chosen }), Backspace: () => this.send("remove", { pane, name: chosen }),
+      Enter: () => this.confirm(), "[": () => scan > 0 && this.send("open", { scan: scan - 1 }),
+      "]": () => scan < scans.length - 1 && this.send("open", { scan: scan + 1 }),
+      "+": () => slide(0.002), "-": () => slide(-0.002), i: () => this.insideBox.click(),
+    };
+    if (event.target.matches("button") && event.key === "Enter") return;
+    if (actions[event.key]) { event.preventDefault(); actions[event.key](); }
+  }
+}
+
+export function button(text, title, onclick) {
+  return make("button", { type: "button", title, onclick }, text);
+}
+
+function distance(a, b) { return Math.hypot(a[0] - b[0], a[1] - b[1], a[2] - b[2]); }

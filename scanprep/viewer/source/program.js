@@ -1,0 +1,89 @@
+// What programs share: a panel beside the figure, the connection to Python, notes and progress.
+import { connect } from "./connection.js";
+import { Figure, make } from "./figure.js";
+import { unpackScene } from "./unpack.js";
+import { hasWebGL } from "./pane.js";
+
+export class Program {
+  constructor() {
+    document.body.classList.add("sk-program");
+    this.panel = make("aside", { class: "sk-panel" });
+    this.stage = make("div", { class: "sk-stage" });
+    this.status = make("p", { class: "sk-status", role: "status" });
+    this.progress = make("progress", { hidden: true });
+    document.body.append(make("main", { class: "sk-main" }, this.panel,
+      make("section", { class: "sk-view" }, this.stage, make("footer", {}, this.progress, this.status))));
+    this.answers = {};
+    this.theme();
+    if (!hasWebGL()) this.say("This browser has no WebGL, so that bodies cannot be shown. Another browser, or its settings, may help.", "bad");
+  }
+
+  start() {
+    this.connection = connect((message) => this.received(message), (state) => this.connected(state));
+    return this;
+  }
+
+  theme() {
+    const button = make("button", { type: "button", class: "sk-theme", title: "dark or light", "aria-label": "dark or light",
+      onclick: () => {
+        const dark = matchMedia("(prefers-color-scheme: dark)").matches;
+        const now = document.documentElement.dataset.theme ?? (dark ? "dark" : "light");
+        document.documentElement.dataset.theme = now === "dark" ? "light" : "dark";
+        this.figure?.panes.forEach((pane) => pane.redraw());
+      } }, "◐");
+    this.panel.append(make("header", {}, make("h1", {}, document.title), button));
+  }
+
+  on(kind, answer) { this.answers[kind] = answer; }
+
+  send(kind, fields = {}, latest = "", data = undefined) { this.connection.send(kind, fields, data, latest); }
+
+  async received(message) {
+    if (message.kind === "scene") await this.show(message.data);
+    else if (message.kind === "positions") this.move(message);
+    else if (message.kind === "error") this.say(message.fields.text, "bad");
+    this.answers[message.kind]?.(message.fields, message.data);
+  }
+
+  connected(state) {
+    this.element ??= document.body;
+    document.body.dataset.connection = state;
+    if (state === "lost") this.say("The connection is lost; what you do is kept and sent when it is back.", "bad");
+    if (state === "refused") this.say("This page was refused: start the program again and use the address that it prints.", "bad");
+    if (state === "open" && this.lost) this.say("");
+    this.lost = state !== "open";
+  }
+
+  async show(data) {
+    const scene = await unpackScene(data);
+    const before = this.figure?.panes.map((pane) => pane.view());
+    this.figure = new Figure(this.stage, scene);
+    this.figure.linked = false;
+    if (before?.length === scene.panes.length) this.figure.panes.forEach((pane, i) => pane.restore(before[i]));
+    this.shown?.(this.figure);
+  }
+
+  // New places of a layer's vertices, as float32 relative to the pane's origin.
+  move({ fields, data }) {
+    const layer = this.figure?.panes[fields.pane]?.layers[fields.layer];
+    if (!layer) return;
+    const values = new Float32Array(data.slice().buffer);
+    if (values.length !== layer.positions.length) return;
+    layer.setPositions(values);
+    this.figure.panes[fields.pane].redraw();
+  }
+
+  say(text, kind = "") {
+    this.status.textContent = text ?? "";
+    this.status.dataset.kind = kind;
+  }
+
+  work(working) {
+    this.progress.hidden = !working;
+    if (!working) return;
+    const [what, done, total] = working;
+    this.progress.max = total;
+    this.progress.value = done;
+    this.say(`${what} (${done} of ${total})`);
+  }
+}
