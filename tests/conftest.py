@@ -11,6 +11,8 @@ import pytest
 if "PYTEST_XDIST_WORKER" in os.environ:                      # processes do not take each other's cores
     os.environ.setdefault("OMP_NUM_THREADS", "1")
 
+from browser import browser, new_page, page  # noqa: F401 -- fixtures
+
 from scanprep.command_line import run
 
 

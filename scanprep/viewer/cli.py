@@ -18,8 +18,8 @@ Port = Annotated[int, Range(1, 65535)]
 Ending = Literal["json", "pp", "mrk.json", "lnd", "txt"]
 
 
-def pick_landmarks(mesh: MeshArg, scans: ScansArg = (), names: str = "ten", format: Ending = "json",  # noqa: A002
-                   unit: Unit | None = None, port: Port | None = None, open: bool = True) -> Outcome:  # noqa: A002
+def pick_landmarks(mesh: MeshArg, scans: ScansArg = (), names: str = "ten", format: Ending = "json",
+                   unit: Unit | None = None, port: Port | None = None, open: bool = True) -> Outcome:
     """Click named points on a template and on scans, in the browser. Every click is saved at once.
 
     Example: scape pick template.ply scans
@@ -38,7 +38,7 @@ def pick_landmarks(mesh: MeshArg, scans: ScansArg = (), names: str = "ten", form
     from .server import serve
 
     ending = ".landmarks.json" if format == "json" else "." + format
-    template, *others = [Clicked.found(path, ending, unit) for path in (mesh, *_files(scans))]
+    template, *others = [Clicked.found(path, ending, unit, file) for path, file in ((mesh, None), *_files(scans))]
     _ = template.body                                     # a file that is no mesh is refused before a browser opens
     app = PickApp(template, others, read_names(names))
     before = {one.path: len(one.places) for one in (template, *others)}
@@ -50,6 +50,7 @@ def pick_landmarks(mesh: MeshArg, scans: ScansArg = (), names: str = "ten", form
                           *(Metric(one.path.name, len(one.places), f"in {one.file.name}") for one in done)])
 
 
-def _files(scans: tuple[Path, ...]) -> list[Path]:
-    """Scans, and those of folders."""
-    return [path for one in scans for path in ([task.path for task in find_scans(one)] if one.is_dir() else [one])]
+def _files(scans: tuple[Path, ...]) -> list[tuple[Path, Path | None]]:
+    """Scans, and those of folders, with their landmark files where they are not beside them."""
+    return [pair for one in scans for pair in (
+        [(task.scan, task.landmarks) for task in find_scans(one)] if one.is_dir() else [(one, None)])]

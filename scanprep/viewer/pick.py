@@ -46,9 +46,9 @@ class Clicked:
     _body: Clickable | None = None
 
     @classmethod
-    def found(cls, path: Path, ending: str, unit: str | None = None) -> Clicked:
-        """With the landmarks of the file of its name beside it; else they will be saved in one of this ending."""
-        file = landmarks_beside(path)
+    def found(cls, path: Path, ending: str, unit: str | None = None, file: Path | None = None) -> Clicked:
+        """With the landmarks of its file, or of that of its name beside it; else one of this ending will be written."""
+        file = file or landmarks_beside(path)
         one = cls(path, file or path.with_name(path.name.split(".")[0] + ending), unit)
         if file is not None:
             shape = one.body.shape

@@ -42,8 +42,8 @@ from completion.mocap.subject.worn_elsewhere import Worn, find_worn
 from completion.motion import Motion
 from model.body import BodyModel
 from model.files import load_model
-from scanprep.geometry.sides import other_side
 from scanprep.geometry.mesh import Mesh
+from scanprep.geometry.sides import other_side
 
 EVERY = 4                            # of the frames one
 NEAREST, FARTHEST = 0.1, 0.4         # metres from its place that a marker is moved

@@ -8,6 +8,7 @@ from scipy.sparse import coo_array, csr_array, diags_array
 
 from scanprep.geometry.geodesics import SurfaceGraph
 from scanprep.geometry.mesh import Mesh
+from scanprep.geometry.sides import other_side, side_of
 from scanprep.geometry.surface import Rays
 from scanprep.skeleton.tree import Skeleton
 

@@ -1,0 +1,246 @@
+"""What the server answers: the page, its socket, files dropped on it and files taken from it."""
+from __future__ import annotations
+
+import contextlib
+import re
+import secrets
+import shutil
+import tempfile
+import traceback
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+from urllib.parse import quote
+
+from tornado.iostream import StreamClosedError
+from tornado.web import HTTPError, RequestHandler, stream_request_body
+from tornado.websocket import WebSocketHandler
+
+from .gate import file_name, inside, one_line
+from .messages import Message
+from .served_page import HEADERS, NOTHING, page, policy
+from .tabs import Tab
+
+if TYPE_CHECKING:
+    from .server import Server
+
+LARGEST_MESSAGE = 2**24              # bytes
+LARGEST_FILE = 2**30                 # bytes of a dropped file
+TOO_LARGE = f"a file of more than {LARGEST_FILE} bytes"
+PIECE = 2**20                        # bytes of a download at a time
+TAB = re.compile(r"[\w-]{8,64}", re.ASCII)
+
+
+class Refusal(HTTPError):
+    """A request that is not answered, and why, for the terminal."""
+
+    def __init__(self, status: int, why: str) -> None:
+        super().__init__(status)
+        self.why = why
+
+
+class Guarded(RequestHandler):
+    """Anything that is asked of the server: refused unless host, token and, where it acts, origin are ours."""
+
+    acts = False
+
+    def initialize(self, server: Server) -> None:
+        self.server = server
+
+    def set_default_headers(self) -> None:
+        self.clear_header("Server")
+        for name, value in HEADERS.items():
+            self.set_header(name, value)
+        self.set_header("Content-Security-Policy", NOTHING)
+
+    def prepare(self) -> None:
+        gate, host = self.server.gate, self.request.host
+        if gate.wrong_host(host):
+            raise Refusal(403, f"foreign Host {host}")
+        if self.acts and gate.wrong_origin(host, self.request.headers.get("Origin")):
+            raise Refusal(403, f"foreign Origin {self.request.headers.get('Origin', '(none)')}")
+        if not self.passes():
+            raise Refusal(403, "wrong or missing token")
+        if self.get_query_argument("server", gate.server) != gate.server:
+            raise Refusal(403, "a page of an earlier server")
+
+    def passes(self) -> bool:
+        """Whether the request has the token."""
+        gate = self.server.gate
+        return not gate.wrong_token(self.get_query_argument("token", None), self.get_cookie(gate.cookie))
+
+    def refused(self, why: str) -> None:
+        """Tell the terminal of a refusal; the token is no part of it."""
+        self.server.say(one_line(f"refused: {self.request.method} {self.request.path}: {why}"))
+
+    def log_exception(self, typ: Any, value: BaseException | None, tb: Any) -> None:
+        if isinstance(value, HTTPError):
+            self.refused(getattr(value, "why", str(value)))
+        else:
+            self.server.say("".join(traceback.format_exception(typ, value, tb)).rstrip())
+
+    def write_error(self, status_code: int, **kwargs: Any) -> None:
+        self.set_header("Content-Type", "text/plain; charset=utf-8")
+        told = "Refused: open the address that the terminal shows." if status_code == 403 else self._reason
+        self.finish(f"{told}\n")
+
+
+class Unknown(Guarded):
+    """Any other address."""
+
+    def prepare(self) -> None:
+        super().prepare()
+        raise Refusal(404, "no such address")
+
+
+class Alive(Guarded):
+    """Tells a page that lost its connection whether this is still its server."""
+
+    def get(self) -> None:
+        self.set_status(204)
+
+
+class PageHandler(Guarded):
+    """The page; a cookie takes the place of the token, so that it can be loaded again."""
+
+    def passes(self) -> bool:
+        opening = self.get_query_argument("open", None)
+        return super().passes() if opening is None else self.server.gate.use(opening) or super().passes()
+
+    def get(self) -> None:
+        server, nonce = self.server, secrets.token_urlsafe(16)
+        self.set_cookie(server.gate.cookie, server.gate.token, httponly=True, samesite="Strict", path="/")
+        self.set_header("Content-Security-Policy", policy(self.request.host, nonce))
+        self.finish(page(server.app.title, server.app.name, server.script, server.style, server.gate.server, nonce))
+
+
+class Socket(Guarded, WebSocketHandler):
+    """The connection of one tab."""
+
+    acts = True
+
+    def prepare(self) -> None:
+        super().prepare()
+        self.tab_name = self.get_query_argument("tab", "")
+        if not TAB.fullmatch(self.tab_name):
+            raise Refusal(400, "expected the name of a tab")
+
+    def get_websocket_protocol(self) -> Any:
+        protocol = super().get_websocket_protocol()
+        if protocol is not None:
+            close = protocol.close
+
+            def told(code: int | None = None, reason: str | None = None) -> None:
+                if code == 1009:
+                    self.refused(f"a message of more than {LARGEST_MESSAGE} bytes")
+                close(code, reason)
+
+            protocol.close = told           # type: ignore[method-assign]
+        return protocol
+
+    def open(self, *args: str, **kwargs: str) -> None:
+        self.set_nodelay(True)
+
+        async def write(frame: bytes) -> None:
+            await self.write_message(frame, binary=True)
+
+        self.tab = Tab(write, self.end)
+        self.server.tab_opened(self.tab_name, self.tab)
+
+    def end(self) -> None:
+        """Close, without the patience of the protocol where the tab reads nothing."""
+        stream = getattr(self.ws_connection, "stream", None)
+        self.close(1001)
+        if stream is not None and stream.writing():
+            stream.close()
+
+    def on_message(self, message: str | bytes) -> None:
+        try:
+            self.server.take_in(self.tab_name, Message.unpack(message))
+        except ValueError as problem:
+            self.refused(str(problem))
+            self.close(1003)
+
+    def on_close(self) -> None:
+        if hasattr(self, "tab"):
+            self.server.tabs.leave(self.tab_name, self.tab)
+
+
+@stream_request_body
+class Drop(Guarded):
+    """A file that was dropped on the page, written to a temporary folder as it comes."""
+
+    acts = True
+
+    def prepare(self) -> None:
+        self.folder: Path | None = None
+        super().prepare()
+        if self.request.method != "POST":
+            raise Refusal(405, "only POST")
+        try:
+            self.name = file_name(self.get_query_argument("name", ""))
+            expected = int(self.request.headers.get("Content-Length", 0))
+        except ValueError as problem:
+            raise Refusal(400, str(problem)) from None
+        if expected > LARGEST_FILE:
+            raise Refusal(413, TOO_LARGE)
+        self.request.connection.set_max_body_size(LARGEST_FILE + PIECE)     # type: ignore[union-attr]
+        self.folder = Path(tempfile.mkdtemp(dir=self.server.dropped))
+        self.out = open(self.folder / self.name, "wb")
+        self.size = 0
+
+    def data_received(self, chunk: bytes) -> None:
+        if self.folder is None:
+            return
+        self.size += len(chunk)
+        if self.size > LARGEST_FILE:
+            self._fail(413, TOO_LARGE)
+            return
+        try:
+            self.out.write(chunk)
+        except OSError as problem:
+            self._fail(507, f"cannot store the file: {problem.strerror}")
+
+    def post(self) -> None:
+        if self.folder is None:
+            return
+        self.out.close()
+        self.server.file_dropped(self.name, self.folder / self.name)
+        self.folder = None
+        self.set_status(204)
+
+    def on_connection_close(self) -> None:
+        self._forget()
+        super().on_connection_close()
+
+    def _fail(self, status: int, why: str) -> None:
+        self._forget()
+        self.refused(why)
+        self.set_status(status)
+        self.finish(why)
+
+    def _forget(self) -> None:
+        """Remove what came of the file."""
+        if self.folder is not None:
+            self.out.close()
+            shutil.rmtree(self.folder, ignore_errors=True)
+            self.folder = None
+
+
+class Download(Guarded):
+    """A file inside of the folders of the app."""
+
+    async def get(self, name: str) -> None:
+        try:
+            path = inside(self.server.app.folders, name)
+        except ValueError as problem:
+            raise Refusal(404, str(problem)) from None
+        self.set_header("Content-Type", "application/octet-stream")
+        self.set_header("Content-Disposition", f"attachment; filename*=UTF-8''{quote(path.name, safe='')}")
+        with open(path, "rb") as stored, contextlib.suppress(StreamClosedError):
+            left = stored.seek(0, 2)
+            self.set_header("Content-Length", str(left))
+            stored.seek(0)
+            while piece := stored.read(min(PIECE, left)):
+                left -= len(piece)
+                self.write(piece)
+                await self.flush()

@@ -1,0 +1,245 @@
+"""A server of this machine for one user: a page in a browser, and an app in Python behind it."""
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import errno
+import os
+import shutil
+import signal
+import socket
+import tempfile
+import threading
+import time
+import traceback
+import webbrowser
+from collections.abc import Callable, Iterator, Sequence
+from pathlib import Path
+from typing import Protocol
+
+from tornado.httpserver import HTTPServer
+from tornado.netutil import bind_sockets
+from tornado.web import Application
+
+from .. import console
+from . import handlers
+from .gate import Gate, one_line
+from .messages import Message
+from .tabs import Tab, Tabs
+from .worker import Stopped, Worker
+
+__all__ = ["App", "Message", "Send", "Server", "Stopped", "serve"]
+
+Send = Callable[[Message], None]
+ADDRESS = "127.0.0.1"
+GRACE = 0.5                          # seconds that work gets to end
+LARGEST_REQUEST = 2**20              # bytes of a request that is no file
+HERE = Path(__file__).parent
+
+
+class App(Protocol):
+    """What a command puts into the browser: one user, several tabs that show the same state.
+
+    `handle` and `receive` run one at a time, in one thread. `greet` runs in another, also while they work, so that a
+    page can be loaded again meanwhile: it is quick and only reads. Change the state first, then send what changed.
+    """
+
+    title: str
+    name: str                        # front end of the bundle: "view", "pick", "complete"
+    folders: Sequence[Path]          # from which files may be downloaded
+
+    def greet(self) -> list[Message]:
+        """What a tab that opens, or returns, needs to show the present state."""
+        ...
+
+    def handle(self, message: Message, send: Send) -> None:
+        """A message of a tab; `send` goes to all tabs and raises Stopped when the server has ended."""
+        ...
+
+    def receive(self, name: str, path: Path, send: Send) -> None:
+        """A file dropped on the page; it is removed afterwards. ValueError for one that is not wanted."""
+        ...
+
+    def close(self) -> None:
+        """The server ended; a job that does not call `send` may still run."""
+        ...
+
+
+class Server:
+    """An app behind its address, in a thread of its own, from entering the context to leaving it.
+
+    Parameters
+    ----------
+    port : int, optional
+        Any free one unless given; ValueError for one that cannot be had.
+    say : (line) -> None
+        Told of every refusal, and of errors nobody foresaw.
+    script, style : str, optional
+        Bundle of the page, unless it is that of the package.
+    """
+
+    def __init__(self, app: App, port: int | None = None, say: Callable[[str], None] = console.say,
+                 script: str | None = None, style: str | None = None) -> None:
+        self.app, self.say = app, say
+        self.script = (HERE / "viewer.js").read_text(encoding="utf-8") if script is None else script
+        self.style = (HERE / "viewer.css").read_text(encoding="utf-8") if style is None else style
+        self._sockets = _listen(port)
+        self.port: int = self._sockets[0].getsockname()[1]
+        self.gate, self.tabs = Gate(self.port), Tabs()
+        self._stopped, self._ready = threading.Event(), threading.Event()
+        self._thread = threading.Thread(target=lambda: asyncio.run(self._run()), name="scapekit server", daemon=True)
+        self._told: set[str] = set()
+
+    @property
+    def address(self) -> str:
+        """Where the page is, with its token."""
+        return f"http://{ADDRESS}:{self.port}/?token={self.gate.token}"
+
+    def opening(self) -> str:
+        """The address for one use, to hand to a browser."""
+        return f"http://{ADDRESS}:{self.port}/?open={self.gate.opening()}"
+
+    def __enter__(self) -> Server:
+        self.dropped = Path(tempfile.mkdtemp(prefix="scapekit-"))
+        self._worker, self._greeter = Worker("scapekit work", self._failed), Worker("scapekit greeting", self._failed)
+        self._thread.start()
+        assert self._ready.wait(10), "the server did not start"
+        return self
+
+    def __exit__(self, *exc: object) -> None:
+        self._stopped.set()
+        with contextlib.suppress(RuntimeError):          # the loop ended by itself
+            self._loop.call_soon_threadsafe(self._ending.set)
+        self._thread.join(GRACE)
+        self._greeter.stop(0)
+        self._worker.stop(GRACE)
+        self.app.close()
+        shutil.rmtree(self.dropped, ignore_errors=True)
+
+    def send(self, message: Message) -> None:
+        """Tell all tabs; from any thread. Stopped when the server has ended."""
+        frame = message.pack()
+        self._in_loop(lambda: self.tabs.put(frame, message.latest))
+
+    def tab_opened(self, name: str, tab: Tab) -> None:
+        """A tab opened or came back: it is greeted, then told what all tabs are told."""
+        self.tabs.join(name, tab)
+
+        def greet() -> None:
+            greeting = []
+            try:
+                greeting = [(message.pack(), message.latest) for message in self.app.greet()]
+            finally:
+                self._in_loop(lambda: tab.greet([self.tabs.acknowledgement(name), *greeting]))
+
+        self._greeter.put(greet)
+
+    def take_in(self, name: str, message: Message) -> None:
+        """A message of a tab, to be handled once however often it comes."""
+        if self.tabs.is_new(name, message.number):
+            self._worker.put(lambda: self.app.handle(message, self.send), message.latest)
+        self.tabs.acknowledge(name)
+
+    def file_dropped(self, name: str, path: Path) -> None:
+        """A file that was stored, to be received in its turn, and removed."""
+        def receive() -> None:
+            try:
+                self.app.receive(name, path, self.send)
+            except ValueError as problem:                # the user knows the file by its own name
+                raise ValueError(str(problem).replace(str(path), name)) from problem
+            finally:
+                shutil.rmtree(path.parent, ignore_errors=True)
+
+        self._worker.put(receive)
+
+    def _in_loop(self, job: Callable[[], None]) -> None:
+        try:
+            if self._stopped.is_set():
+                raise Stopped
+            self._loop.call_soon_threadsafe(job)
+        except RuntimeError:
+            raise Stopped from None
+
+    def _failed(self, problem: BaseException) -> None:
+        """A job failed: the tabs are told; the terminal too, once, where nobody foresaw it."""
+        text = str(problem)
+        if not isinstance(problem, ValueError):
+            text = f"unexpected {type(problem).__name__}: {problem}"
+            trace = "\n".join(map(one_line, "".join(traceback.format_exception(problem)).splitlines()))
+            if trace not in self._told:
+                self._told.add(trace)
+                self.say(trace)
+        with contextlib.suppress(Stopped):
+            self.send(Message("error", {"text": text}))
+
+    async def _run(self) -> None:
+        own = {"server": self}
+        routes = [(r"/", handlers.PageHandler, own), (r"/socket", handlers.Socket, own), (r"/drop", handlers.Drop, own),
+                  (r"/alive", handlers.Alive, own), (r"/file/(.*)", handlers.Download, own)]
+        application = Application(
+            routes, default_handler_class=handlers.Unknown, default_handler_args=own,      # type: ignore[arg-type]
+            log_function=lambda handler: None, websocket_max_message_size=handlers.LARGEST_MESSAGE,
+            websocket_ping_interval=30)
+        server = HTTPServer(application, max_body_size=LARGEST_REQUEST)
+        server.add_sockets(self._sockets)
+        self._loop, self._ending = asyncio.get_running_loop(), asyncio.Event()
+        self._ready.set()
+        await self._ending.wait()
+        server.stop()
+        self.tabs.close()
+        with contextlib.suppress(asyncio.TimeoutError):
+            await asyncio.wait_for(server.close_all_connections(), GRACE / 2)
+
+
+def serve(app: App, port: int | None = None, open_browser: bool = True, say: Callable[[str], None] = console.say
+          ) -> None:
+    """Show an app in the browser until Ctrl-C or SIGTERM.
+
+    Parameters
+    ----------
+    open_browser : bool
+        Start the browser of this machine, unless the user is logged in from another one.
+    """
+    remote = "SSH_CONNECTION" in os.environ
+    with contextlib.suppress(KeyboardInterrupt), _terminated_as_interrupted(), Server(app, port, say) as server:
+        say(f"{one_line(app.title)}: {server.address}\nCtrl-C ends it")
+        if remote or not open_browser:
+            say(f"from another machine: ssh -N -L {server.port}:{ADDRESS}:{server.port} {socket.gethostname()}")
+        elif _has_screen():
+            webbrowser.open(server.opening())
+        while True:
+            time.sleep(0.2)                  # a longer sleep is not interrupted everywhere
+
+
+def _listen(port: int | None) -> list[socket.socket]:
+    """Sockets that listen, to this machine only; ValueError for a port that cannot be had."""
+    if port is not None and not 0 < port < 2**16:
+        raise ValueError(f"port: expected a number from 1 to {2**16 - 1}, got {port}")
+    try:
+        return bind_sockets(port or 0, ADDRESS)
+    except OSError as problem:
+        why = "is in use by another program" if problem.errno == errno.EADDRINUSE else problem.strerror
+        raise ValueError(f"port: {port} {why}; without a port a free one is taken") from None
+
+
+def _has_screen() -> bool:
+    """Whether a browser with windows can start here."""
+    return os.name == "nt" or os.uname().sysname == "Darwin" or bool(
+        os.environ.get("DISPLAY") or os.environ.get("WAYLAND_DISPLAY"))
+
+
+@contextlib.contextmanager
+def _terminated_as_interrupted() -> Iterator[None]:
+    """SIGTERM ends the block as Ctrl-C does."""
+    if threading.current_thread() is not threading.main_thread():
+        yield
+        return
+
+    def interrupt(number: int, frame: object) -> None:
+        raise KeyboardInterrupt
+
+    before = signal.signal(signal.SIGTERM, interrupt)
+    try:
+        yield
+    finally:
+        signal.signal(signal.SIGTERM, before)

@@ -1,0 +1,64 @@
+"""A real browser for tests of pages; without one they are skipped with the reason."""
+import contextlib
+import shutil
+
+import pytest
+
+NAMES = ("chromium", "chromium-browser", "google-chrome")
+FLAGS = ("--headless", "--no-sandbox", "--use-gl=angle", "--use-angle=swiftshader", "--enable-unsafe-swiftshader",
+         "--disable-quic", "--no-first-run", "--disable-background-networking", "--disable-component-update",
+         "--disable-sync")
+WITHOUT_3D = ("--headless", "--no-sandbox", "--disable-3d-apis", *FLAGS[5:])
+
+
+@contextlib.contextmanager
+def chromium(flags=FLAGS):
+    """A browser of its own, such as one without WebGL (`WITHOUT_3D`); not inside another one."""
+    playwright = pytest.importorskip("playwright.sync_api", reason="playwright is not installed")
+    path = next(filter(None, map(shutil.which, NAMES)), None)
+    if path is None:
+        pytest.skip(f"no browser: none of {', '.join(NAMES)}")
+    with playwright.sync_playwright() as started:
+        launched = started.chromium.launch(executable_path=path, args=list(flags))
+        try:
+            yield launched
+        finally:
+            launched.close()
+
+
+@pytest.fixture(scope="module")
+def browser():
+    """The browser of one file of tests: while it is open, no test of the process can start a loop of asyncio."""
+    with chromium() as launched:
+        yield launched
+
+
+@pytest.fixture
+def new_page(browser):
+    """A function that opens a page in a context of its own, with what went wrong in it and what it asked for.
+
+    `new_page(offline=True, viewport={"width": 420, "height": 800})`: options of `browser.new_context`. The page has the
+    lists `errors` (of the console, and uncaught) and `requests` (addresses).
+    """
+    with contextlib.ExitStack() as opened:
+        def open_page(**options):
+            context = opened.enter_context(contextlib.closing(browser.new_context(**options)))
+            return watched(context)
+
+        yield open_page
+
+
+@pytest.fixture
+def page(new_page):
+    """One such page, online."""
+    return new_page()
+
+
+def watched(context):
+    """A new page of a context that collects its `errors` and `requests`."""
+    page = context.new_page()
+    page.errors, page.requests = [], []
+    page.on("console", lambda told: page.errors.append(told.text) if told.type == "error" else None)
+    page.on("pageerror", lambda error: page.errors.append(str(error)))
+    page.on("request", lambda request: page.requests.append(request.url))
+    return page

@@ -1,0 +1,84 @@
+"""An app that writes down the clicks it is told of, and a page with nothing but its connection."""
+import contextlib
+import threading
+import time
+from pathlib import Path
+
+from scanprep.viewer.messages import Message
+from scanprep.viewer.server import Server, Stopped
+
+CONNECTION = Path(__file__).parents[1] / "scanprep" / "viewer" / "source" / "connection.js"
+START = """
+const scapekit = (() => {
+%s
+  return {pack, unpack, start(name) {
+    const got = [], states = [];
+    const line = connect((m) => got.push([m.kind, m.fields, Array.from(m.data)]), (s) => states.push(s));
+    Object.assign(window, {name, line, got, states});
+    document.body.append("started");
+  }};
+})();
+"""
+
+
+class Clicks:
+    """An app that writes down what it is told."""
+
+    title, name = "Clicks <of> a test", "pick"
+
+    def __init__(self, *folders):
+        self.folders = folders
+        self.seen, self.files, self.closed = [], [], 0
+        self.busy, self.go, self.ended = threading.Event(), threading.Event(), threading.Event()
+
+    def greet(self):
+        return [Message("state", {"clicks": len(self.seen)}, b"\x01\x02")]
+
+    def handle(self, message, send):
+        if message.kind == "work":
+            self.busy.set()
+            self.go.wait(5)
+        elif message.kind == "endless":
+            self.busy.set()
+            try:
+                while True:
+                    send(Message("progress", latest="progress"))
+                    time.sleep(0.01)
+            except Stopped:
+                self.ended.set()
+                raise
+        elif message.kind == "wrong":
+            raise ValueError("no such landmark")
+        elif message.kind == "broken":
+            raise KeyError("crown")
+        else:
+            self.seen.append(message.fields.get("n"))
+            send(Message("state", {"clicks": len(self.seen), "n": message.fields.get("n")}, message.data))
+
+    def receive(self, name, path, send):
+        if path.suffix != ".ply":
+            raise ValueError(f"{path}: expected a mesh")
+        self.files.append((name, path.name, path.read_bytes(), path))
+        send(Message("received", {"name": name}))
+
+    def close(self):
+        self.closed += 1
+
+
+@contextlib.contextmanager
+def clicking(app):
+    """Its server; `told` has what the terminal was told."""
+    told = []
+    script = START % CONNECTION.read_text(encoding="utf-8").replace("export function", "function")
+    with Server(app, say=told.append, script=script, style="body { color: navy }") as server:
+        server.told = told
+        yield server
+        app.go.set()
+
+
+def until(what, seconds=5.0):
+    """Wait until this is so."""
+    end = time.monotonic() + seconds
+    while not what():
+        assert time.monotonic() < end, "it did not happen"
+        time.sleep(0.01)
