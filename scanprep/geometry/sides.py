@@ -11,7 +11,8 @@ _OTHER = {"L": "R", "R": "L", "l": "r", "r": "l", "left": "right", "right": "lef
 def other_side(label: str) -> str | None:
     """The label of the same place on the other side, or None for a label that names no side.
 
-    Sides are an L or R in front (LELB, L.Knee), one at the end (elbow_l, KneeR), or the words left and right, or Lt. and Rt.
+    Sides are an L or R in front (LELB, L.Knee), one at the end (elbow_l, KneeR), or the words left, right,
+    Lt. and Rt.
     """
     if _WORDS.search(label):
         return _WORDS.sub(lambda found: _like(found[0]), label, count=1)

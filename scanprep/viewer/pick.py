@@ -80,13 +80,14 @@ class Clicked:
         shape = self.body.shape
         shown: Shape = Solid(thinned(shape)) if self.body.has_surface and isinstance(shape, Mesh) else \
             Dots(self.body.points[::max(1, len(self.body.points) // 150_000)], CLAY, 0.004)
-        return Pane([shown], camera_of(self.body.points), label)
+        return Pane([shown], camera_of(shape), label)
 
 
-def camera_of(points: np.ndarray) -> Camera:
+def camera_of(shape: Mesh | np.ndarray) -> Camera:
     """A view of a body from its front, as far as that can be seen from its outline."""
-    up, front = upright(Mesh(points, np.zeros((0, 3), dtype=np.int64)))
-    return Camera.around(points, front, up=up)
+    body = shape if isinstance(shape, Mesh) else Mesh(shape, np.zeros((0, 3), dtype=np.int64))
+    up, front = upright(body)
+    return Camera.around(body.vertices, front, up=up)
 
 
 @dataclass(frozen=True)
@@ -184,11 +185,13 @@ class PickApp:
         place = body.middle(*ray) if inside else body.hit(*ray)
         if place is None and seen is not None:                   # the ray met the thinned surface, and just not ours
             place = body.nearest(_point(seen))
-        if place is not None:
-            self._change(self._number(pane), {self._named(name): place}, merged=dragged)
-            if not dragged:
-                self.choose_next(name, pane)
-            self._predict_if_time(send, pane)
+        if place is None:
+            self.note = "the click met nothing: turn the body so that the place faces you"
+            return
+        self._change(self._number(pane), {self._named(name): place}, merged=dragged)
+        if not dragged:
+            self.choose_next(name, pane)
+        self._predict_if_time(send, pane)
 
     def on_slide(self, send: Send, pane: int, name: str, direction: list[float], by: float) -> None:
         """Move a landmark along a ray, metres: into the body, to where a joint is."""

@@ -22,10 +22,10 @@ export function choice(label, names, onChoose, chosen = 0) {
 }
 
 export class Figure {
-  constructor(element, scene) {
+  constructor(element, scene, linked = true) {
     this.element = element;
     this.scene = scene;
-    this.linked = true;
+    this.linked = linked;
     this.frame = 0;
     this.row = make("div", { class: "sk-panes" });
     this.panes = scene.panes.map((described) => this.addPane(described));

@@ -157,7 +157,8 @@ export class Pane {
     this.context.fillStyle = getComputedStyle(this.canvas).backgroundColor;
     this.context.fillRect(0, 0, width, height);
     this.context.drawImage(renderer.domElement, 0, tall - height, width, height, 0, 0, width, height);
-    for (const layer of this.layers) drawLabels(this, layer);
+    const taken = [];                                   // by labels: those drawn last in the list come first
+    for (const layer of [...this.layers].reverse()) drawLabels(this, layer, taken);
     for (const overlay of this.overlays) overlay(this.context, this);
     this.drawn = (this.drawn ?? 0) + 1;
   }
@@ -195,7 +196,7 @@ export class Pane {
   }
 }
 
-function drawLabels(pane, layer) {
+function drawLabels(pane, layer, taken) {
   if (!layer.labels.length || !layer.object.visible) return;
   const { context } = pane, scale = pane.canvas.width / Math.max(pane.canvas.clientWidth, 1);
   context.font = `${12 * scale}px system-ui, sans-serif`;
@@ -208,7 +209,10 @@ function drawLabels(pane, layer) {
     if (!text || layer.hidden.has(i)) return;
     const at = pane.project(new Vector3().fromArray(layer.positions, 3 * i));
     if (!at) return;
-    context.strokeText(text, (at.x + 8) * scale, at.y * scale);
-    context.fillText(text, (at.x + 8) * scale, at.y * scale);
+    const x = (at.x + 8) * scale, y = at.y * scale, wide = context.measureText(text).width, high = 7 * scale;
+    if (taken.some((box) => x < box.right && x + wide > box.left && y - high < box.bottom && y + high > box.top)) return;
+    taken.push({ left: x, right: x + wide, top: y - high, bottom: y + high });
+    context.strokeText(text, x, y);
+    context.fillText(text, x, y);
   });
 }

@@ -13,6 +13,7 @@ export const KEYS = [["n, p", "next, previous name"], ["z, y", "undo, redo"], ["
 export class Pick extends Program {
   constructor() {
     super();
+    this.linked = false;                                // template and scan stand differently
     this.inside = false;
     this.state = null;
     this.measured = [];

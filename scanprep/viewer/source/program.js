@@ -57,8 +57,7 @@ export class Program {
   async show(data) {
     const scene = await unpackScene(data);
     const before = this.figure?.panes.map((pane) => pane.view());
-    this.figure = new Figure(this.stage, scene);
-    this.figure.linked = false;
+    this.figure = new Figure(this.stage, scene, this.linked ?? true);
     if (before?.length === scene.panes.length) this.figure.panes.forEach((pane, i) => pane.restore(before[i]));
     this.shown?.(this.figure);
   }
