@@ -8,7 +8,7 @@ from __future__ import annotations
 import shutil
 import threading
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any
 
@@ -348,14 +348,17 @@ def predict_landmarks(template: Mesh, on_template: Mapping[str, np.ndarray], bod
     Points (3,), metres. ValueError for fewer than three in common.
     """
     from ..registration.nonrigid import register
+    from ..registration.schedule import RegistrationConfig
 
     common = [name for name in on_template if name in on_scan]
     nearest = Surface(template).closest(np.array(list(on_template.values())))
     corners = template.faces[nearest.faces]
     vertices = corners[np.arange(len(corners)), nearest.bary.argmax(axis=1)]
     of_name = dict(zip(on_template, vertices.tolist(), strict=True))
+    config = RegistrationConfig()              # without its last steps: half the time, and 5 mm instead of 4
+    config = replace(config, graph=config.graph[:-1], final_fit=None)
     fit = register(template, body.shape, (np.array([of_name[name] for name in common]),
-                                          np.array([on_scan[name] for name in common])), progress=progress)
+                                          np.array([on_scan[name] for name in common])), config, progress)
     moved = nearest.transferred(fit.mesh.vertices, template.faces)
     return {name: body.nearest(place) for name, place in zip(on_template, moved, strict=True)}
 
