@@ -2,7 +2,7 @@
 import json
 
 import pytest
-from browser import watched
+from browser import wait_until, watched
 from click_app import Clicks, clicking, until
 
 from scanprep.viewer import handlers
@@ -43,7 +43,7 @@ def opened(page, server):
 
 
 def connected(page):
-    page.wait_for_function("states.at(-1) === 'open'", timeout=10000)
+    wait_until(page, "states.at(-1) === 'open'")
 
 
 def disconnect(server):
@@ -107,7 +107,7 @@ def test_two_tabs_show_the_same(opened, server, app):
     connected(second)
     opened.evaluate("line.send('click', {n: 4}, new Float32Array([1]))")
     for tab in (opened, second):
-        tab.wait_for_function("got.length === 2")
+        wait_until(tab, "got.length === 2")
         assert tab.evaluate("got[1]") == ["state", {"clicks": 1, "n": 4}, [0, 0, 128, 63]]
 
 
@@ -122,7 +122,7 @@ def test_what_is_clicked_while_the_connection_is_lost_arrives_once_and_in_order(
     until(lambda: len(app.seen) >= 31)
     assert app.seen == list(range(31))
     assert "lost" in opened.evaluate("states")
-    opened.wait_for_function("got.at(-1)[1].clicks === 31")
+    wait_until(opened, "got.at(-1)[1].clicks === 31")
 
 
 @pytest.mark.parametrize("after", [0, 100], ids=["at once", "when it arrived"])
@@ -132,7 +132,7 @@ def test_what_arrived_but_was_not_acknowledged_is_not_done_twice(new_page, serve
     page.goto(server.opening())
     connected(page)
     page.evaluate("for (let n = 0; n < 6; n++) line.send('click', {n})")
-    page.wait_for_function("states.join() === 'open,lost,open'")
+    wait_until(page, "states.join() === 'open,lost,open'")
     until(lambda: len(app.seen) >= 6)
     page.evaluate("line.send('click', {n: 6})")
     until(lambda: len(app.seen) >= 7)
@@ -141,7 +141,7 @@ def test_what_arrived_but_was_not_acknowledged_is_not_done_twice(new_page, serve
 
 def test_moves_of_a_lost_connection_are_replaced_but_overtake_no_click(opened, server, app):
     disconnect(server)
-    opened.wait_for_function("states.at(-1) === 'lost'")
+    wait_until(opened, "states.at(-1) === 'lost'")
     opened.evaluate("""for (const n of [1, 2, 3, "click", 4, 5]) {
         line.send("move", {n}, undefined, n === "click" ? "" : "pose"); }""")
     until(lambda: len(app.seen) == 3, 10)
@@ -151,7 +151,7 @@ def test_moves_of_a_lost_connection_are_replaced_but_overtake_no_click(opened, s
 def test_the_page_of_a_server_that_ended_waits_and_that_of_an_earlier_one_is_refused(opened, server):
     server.gate.server = "another server at the same port"
     disconnect(server)
-    opened.wait_for_function("states.at(-1) === 'refused'", timeout=10000)
+    wait_until(opened, "states.at(-1) === 'refused'")
     assert opened.evaluate("states") == ["open", "lost", "refused"]
     line, = server.told
     assert line == "refused: GET /alive: a page of an earlier server"
@@ -175,10 +175,10 @@ def test_messages_that_are_too_large_are_not_sent(opened, server, app):
 
 def test_files_are_dropped_and_downloaded(opened, server, app):
     opened.evaluate("line.upload(new File([new Uint8Array(100000).fill(7)], 'änna 1.ply'))")
-    opened.wait_for_function("got.some(([kind, fields]) => kind === 'received' && fields.name === 'änna 1.ply')")
+    wait_until(opened, "got.some(([kind, fields]) => kind === 'received' && fields.name === 'änna 1.ply')")
     assert app.files[0][2] == b"\x07" * 100000
     opened.evaluate("line.upload(new File(['x'], 'notes.txt'))")
-    opened.wait_for_function("got.some(([kind, fields]) => kind === 'error' && fields.text.startsWith('notes.txt: '))")
+    wait_until(opened, "got.some(([kind, fields]) => kind === 'error' && fields.text.startsWith('notes.txt: '))")
     with opened.expect_download() as started:
         opened.evaluate("Object.assign(document.createElement('a'), {href: '/file/body.ply'}).click()")
     assert started.value.suggested_filename == "body.ply"
