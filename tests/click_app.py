@@ -37,7 +37,7 @@ class Clicks:
     def handle(self, message, send):
         if message.kind == "work":
             self.busy.set()
-            self.go.wait(5)
+            self.go.wait(20)
         elif message.kind == "endless":
             self.busy.set()
             try:

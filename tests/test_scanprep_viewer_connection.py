@@ -1,5 +1,7 @@
 """The page's side of the connection, in a real browser: frames, reload, lost connections, dropped files."""
+import http.server
 import json
+import threading
 
 import pytest
 from browser import wait_until, watched
@@ -139,6 +141,19 @@ def test_what_arrived_but_was_not_acknowledged_is_not_done_twice(new_page, serve
     assert app.seen == list(range(7))
 
 
+def test_what_is_sent_again_is_not_done_twice(opened, server, app, monkeypatch):
+    """The old connection may still deliver what the new one was told to be missing."""
+    monkeypatch.setattr(server.tabs, "acknowledgement", lambda name: (nothing_came, "acknowledged"))
+    nothing_came = Message("acknowledged", {"number": 0}).pack()
+    opened.evaluate("for (let n = 0; n < 6; n++) line.send('click', {n})")
+    until(lambda: len(app.seen) >= 6)
+    disconnect(server)
+    wait_until(opened, "states.join() === 'open,lost,open'")
+    opened.evaluate("line.send('click', {n: 6})")
+    until(lambda: 6 in app.seen)
+    assert app.seen == list(range(7))
+
+
 def test_moves_of_a_lost_connection_are_replaced_but_overtake_no_click(opened, server, app):
     disconnect(server)
     wait_until(opened, "states.at(-1) === 'lost'")
@@ -191,17 +206,33 @@ def test_a_file_without_a_name_is_told_to_the_user(opened):
     assert said == "..: Bad Request"
 
 
-@pytest.mark.parametrize("site", ["http://evil.example/", "http://127.0.0.1:9/", "http://localhost:9/"])
-def test_another_site_can_neither_connect_nor_store(opened, server, app, site):
-    """The user's cookie does not help: a page of another port is of the same site, but of another origin."""
+class Foreign(http.server.SimpleHTTPRequestHandler):
+    """A site that another program of this machine serves."""
+
+    def do_GET(self):
+        self.send_response(200)
+        self.end_headers()
+
+    def log_message(self, *given):
+        pass
+
+
+@pytest.mark.parametrize("host", ["127.0.0.1", "localhost"])
+def test_another_site_can_neither_connect_nor_store(opened, server, app, host):
+    """Another port is the same site, which gets the user's cookie, but another origin."""
     foreign = watched(opened.context)
-    foreign.route(site, lambda route: route.fulfill(body="<p>foreign", content_type="text/html"))
-    foreign.goto(site)
-    said = foreign.evaluate(f"""async () => {{
-      const own = "127.0.0.1:{server.port}";
-      await fetch(`http://${{own}}/drop?name=a.ply`, {{method: "POST", body: "x", mode: "no-cors",
-        credentials: "include"}}).catch(() => null);
-      const line = new WebSocket(`ws://${{own}}/socket?tab=12345678`);
-      return new Promise((done) => {{ line.onopen = () => done("open"); line.onclose = () => done("closed"); }});
-    }}""")
+    with http.server.ThreadingHTTPServer(("127.0.0.1", 0), Foreign) as site:
+        threading.Thread(target=site.serve_forever, daemon=True).start()
+        foreign.goto(f"http://{host}:{site.server_port}/")
+        said = foreign.evaluate(f"""async () => {{
+          const own = "127.0.0.1:{server.port}";
+          await fetch(`http://${{own}}/drop?name=a.ply`, {{method: "POST", body: "x", mode: "no-cors",
+            credentials: "include"}}).catch(() => null);
+          const line = new WebSocket(`ws://${{own}}/socket?tab=12345678`);
+          return new Promise((done) => {{ line.onopen = () => done("open"); line.onclose = () => done("closed"); }});
+        }}""")
+        site.shutdown()
     assert said == "closed" and not app.files and len(server.tabs) == 1
+    origin = f"http://{host}:{site.server_port}"
+    assert server.told == [f"refused: POST /drop: foreign Origin {origin}",
+                           f"refused: GET /socket: foreign Origin {origin}"]

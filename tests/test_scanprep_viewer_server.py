@@ -356,6 +356,18 @@ def test_errors_of_the_app_are_shown_and_unforeseen_ones_told_once(server, app):
         until(lambda: app.seen == [1])
 
 
+def test_a_greeting_that_fails_is_told_and_clicks_go_on(server, app):
+    def greet():
+        raise ValueError("anna.ply: no triangles")
+
+    app.greet = greet
+    with Tab(server) as tab:
+        tab.send("click", 1, n=1)
+        assert tab.receive("acknowledged")
+        assert tab.receive("error").fields == {"text": "anna.ply: no triangles"}
+        until(lambda: app.seen == [1])
+
+
 # ---- the end ----
 
 def test_the_server_ends_within_a_second_though_a_job_runs(app):
