@@ -160,7 +160,7 @@ def test_moves_of_a_lost_connection_are_replaced_but_overtake_no_click(opened, s
     opened.evaluate("""for (const n of [1, 2, 3, "click", 4, 5]) {
         line.send("move", {n}, undefined, n === "click" ? "" : "pose"); }""")
     until(lambda: len(app.seen) == 3, 10)
-    assert app.seen == [3, "click", 5]
+    assert app.seen == [3, "click", 5] and app.numbers == [1, 2, 3]
 
 
 def test_the_page_of_a_server_that_ended_waits_and_that_of_an_earlier_one_is_refused(opened, server):

@@ -226,6 +226,14 @@ def test_a_file_that_is_too_large_is_not_stored(server, app, monkeypatch, body):
     assert not app.files and not list(server.dropped.iterdir())
 
 
+def test_a_file_that_is_too_large_is_refused_before_it_comes(server):
+    with socket.create_connection(("127.0.0.1", server.port), timeout=5) as large:
+        large.sendall((f"POST /drop?name=a.ply&token={server.gate.token} HTTP/1.1\r\nHost: 127.0.0.1:{server.port}\r\n"
+                       f"Origin: http://127.0.0.1:{server.port}\r\nContent-Length: {2**31}\r\n\r\n").encode())
+        status = int(large.recv(1000).split()[1])
+    assert refused_in_one_line(server, 413, status)
+
+
 def test_half_an_upload_leaves_nothing(server, app):
     with socket.create_connection(("127.0.0.1", server.port)) as half:
         half.sendall((f"POST /drop?name=a.ply&token={server.gate.token} HTTP/1.1\r\nHost: 127.0.0.1:{server.port}\r\n"
