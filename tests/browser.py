@@ -1,6 +1,7 @@
 """A real browser for tests of pages; without one they are skipped with the reason."""
 import contextlib
 import shutil
+import time
 
 import pytest
 
@@ -62,3 +63,11 @@ def watched(context):
     page.on("pageerror", lambda error: page.errors.append(str(error)))
     page.on("request", lambda request: page.requests.append(request.url))
     return page
+
+
+def wait_until(page, expression, seconds=10.0):
+    """Wait until a JavaScript expression is true; `page.wait_for_function` needs eval, which our pages forbid."""
+    end = time.monotonic() + seconds
+    while not page.evaluate(expression):
+        assert time.monotonic() < end, f"{expression} did not become true; errors of the page: {page.errors}"
+        page.wait_for_timeout(20)

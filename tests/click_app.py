@@ -28,7 +28,7 @@ class Clicks:
 
     def __init__(self, *folders):
         self.folders = folders
-        self.seen, self.files, self.closed = [], [], 0
+        self.seen, self.numbers, self.files, self.closed = [], [], [], 0
         self.busy, self.go, self.ended = threading.Event(), threading.Event(), threading.Event()
 
     def greet(self):
@@ -37,7 +37,7 @@ class Clicks:
     def handle(self, message, send):
         if message.kind == "work":
             self.busy.set()
-            self.go.wait(5)
+            self.go.wait(20)
         elif message.kind == "endless":
             self.busy.set()
             try:
@@ -52,6 +52,7 @@ class Clicks:
         elif message.kind == "broken":
             raise KeyError("crown")
         else:
+            self.numbers.append(message.number)
             self.seen.append(message.fields.get("n"))
             send(Message("state", {"clicks": len(self.seen), "n": message.fields.get("n")}, message.data))
 

@@ -226,6 +226,14 @@ def test_a_file_that_is_too_large_is_not_stored(server, app, monkeypatch, body):
     assert not app.files and not list(server.dropped.iterdir())
 
 
+def test_a_file_that_is_too_large_is_refused_before_it_comes(server):
+    with socket.create_connection(("127.0.0.1", server.port), timeout=5) as large:
+        large.sendall((f"POST /drop?name=a.ply&token={server.gate.token} HTTP/1.1\r\nHost: 127.0.0.1:{server.port}\r\n"
+                       f"Origin: http://127.0.0.1:{server.port}\r\nContent-Length: {2**31}\r\n\r\n").encode())
+        status = int(large.recv(1000).split()[1])
+    assert refused_in_one_line(server, 413, status)
+
+
 def test_half_an_upload_leaves_nothing(server, app):
     with socket.create_connection(("127.0.0.1", server.port)) as half:
         half.sendall((f"POST /drop?name=a.ply&token={server.gate.token} HTTP/1.1\r\nHost: 127.0.0.1:{server.port}\r\n"
@@ -353,6 +361,18 @@ def test_errors_of_the_app_are_shown_and_unforeseen_ones_told_once(server, app):
         trace, = server.told
         assert "Traceback" in trace and "KeyError" in trace
         tab.send("click", n=1)
+        until(lambda: app.seen == [1])
+
+
+def test_a_greeting_that_fails_is_told_and_clicks_go_on(server, app):
+    def greet():
+        raise ValueError("anna.ply: no triangles")
+
+    app.greet = greet
+    with Tab(server) as tab:
+        tab.send("click", 1, n=1)
+        assert tab.receive("acknowledged")
+        assert tab.receive("error").fields == {"text": "anna.ply: no triangles"}
         until(lambda: app.seen == [1])
 
 
