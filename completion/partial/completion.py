@@ -29,7 +29,7 @@ from .limbs import with_limbs
 from .scale import ScaledBody
 from .scan import Scan
 from .settings import CompletionConfig
-from .starts import best_starts, first_starts
+from .starts import best_starts, first_starts, going_on
 
 Progress = Callable[[int, int], None]
 
@@ -106,7 +106,7 @@ class Completion:
 @one_thread()
 def complete(body: BodyModel | Subject, scan: Scan, landmarks: tuple[np.ndarray, np.ndarray] | None = None,
              config: CompletionConfig | None = None, progress: Progress | None = None,
-             masked: np.ndarray | None = None) -> Completion:
+             masked: np.ndarray | None = None, start: Completion | None = None) -> Completion:
     """The whole body from a scan of some of it.
 
     Parameters
@@ -123,21 +123,25 @@ def complete(body: BodyModel | Subject, scan: Scan, landmarks: tuple[np.ndarray,
         Called with (done, total).
     masked : (n,) bool, optional
         Points, one view after the other, that are clothing or hair: the body is somewhere inside.
+    start : Completion, optional
+        Of the same scan and model, to go on from when landmarks were moved or added: no search, a few seconds.
 
     Raises
     ------
     ValueError
-        Fewer than 3 landmarks, landmarks or a scan that cannot be used.
+        Fewer than 3 landmarks, landmarks or a scan that cannot be used; a start where the scale is to be found.
 
     [SCAPE] Eq. 10
     """
+    if start is not None and config is not None and config.free_scale:
+        raise ValueError("start: expected none where the unit of the scan is not known")
     config, tell = config or CompletionConfig(), progress or (lambda done, total: None)
     total, person = config.rounds + 3, as_body(body)
     solve = solve_jointly if config.method == "joint" else turns_of(body, config)
     given = in_metres(person, scan, landmarks, masked, config)
     sized = ScaledBody(person) if config.free_scale else person
     fit = ScanFit(sized, given.cloud, given.vertices, given.points, config)
-    starts = first_starts(fit)                                # [SCAPE] §7
+    starts = first_starts(fit) if start is None else going_on(fit, start.pose, start.trans, start.betas)   # [SCAPE] §7
     tell(1, total)
     x, rival = with_limbs(fit, best_starts(fit, starts))
     tell(2, total)
