@@ -110,6 +110,14 @@ def complete_files(work: Work, inputs: Inputs, room: Room) -> list[Metric]:
     scan = views if depth is None else depth
     done = room.step("completion", (work.body, work.marks, work.config, work.unit, inputs),
                      lambda: complete(work.body, scan, landmarks, work.config, room.tell, masked))
+    return write_results(work, inputs, replace(files, views=tuple(views)), done, landmarks, masked, output)
+
+
+def write_results(work: Work, inputs: Inputs, files: ScanFiles, done: Completion,
+                  landmarks: tuple[np.ndarray, np.ndarray] | None, masked: np.ndarray | None, output: Path
+                  ) -> list[Metric]:
+    """Write a completion with its colours, its pictures and its page into a folder; the figures."""
+    views = list(files.views)
     if files.colored:
         done = _with_colors(work, files, done, output)
     save_completion(output, done)

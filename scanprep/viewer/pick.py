@@ -43,7 +43,7 @@ class Clicked:
     unit: str | None = None
     places: Places = field(default_factory=dict)
     predicted: Places = field(default_factory=dict)
-    _body: Clickable | None = None
+    surface: Clickable | None = None
 
     @classmethod
     def found(cls, path: Path, ending: str, unit: str | None = None, file: Path | None = None) -> Clicked:
@@ -58,13 +58,13 @@ class Clicked:
     @property
     def body(self) -> Clickable:
         """What is clicked on; read when it is first shown."""
-        if self._body is None:
-            self._body = Clickable(read_scan(self.path, self.unit))
-        return self._body
+        if self.surface is None:
+            self.surface = Clickable(read_scan(self.path, self.unit))
+        return self.surface
 
-    def close(self) -> None:
-        """Forget the surface, not the landmarks."""
-        self._body = None
+    def forget(self) -> None:
+        """Let go of the surface, not of the landmarks; it is read again when it is shown."""
+        self.surface = None
 
     def save(self) -> None:
         """Write all landmarks; a file that was there before is kept beside it, once."""
@@ -214,7 +214,7 @@ class PickApp:
         if not 0 <= scan < len(self.scans):
             raise ValueError(f"scan: expected 0 to {len(self.scans) - 1}, got {scan}")
         if scan != self.current:
-            self.scans[self.current].close()
+            self.scans[self.current].forget()
             self.current = scan
             self.choose_next(None)
             send(self.scene())

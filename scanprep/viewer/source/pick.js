@@ -106,7 +106,7 @@ export class Pick extends Program {
   // Landmarks as dots with names, in every pane.
   paint() {
     if (!this.figure || !this.state) return;
-    this.figure.panes.forEach((pane, i) => {
+    this.figure.panes.slice(0, 2).forEach((pane, i) => {
       const marks = this.state.panes[i];
       if (!marks) return;
       const groups = { predicted: i === 1 ? this.waiting() : {}, set: {}, chosen: {} };
@@ -118,7 +118,7 @@ export class Pick extends Program {
   }
 
   shown(figure) {
-    figure.panes.forEach((pane, i) => this.listen(pane, i));
+    figure.panes.slice(0, 2).forEach((pane, i) => this.listen(pane, i));
     this.paint();
   }
 
