@@ -131,7 +131,7 @@ export class Pane {
     this.context.fillStyle = getComputedStyle(this.canvas).backgroundColor;
     this.context.fillRect(0, 0, width, height);
     this.context.drawImage(renderer.domElement, 0, tall - height, width, height, 0, 0, width, height);
-    for (const layer of this.layers) drawLabels(this, layer);
+    if (this.names !== false) for (const layer of this.layers) drawLabels(this, layer);
     for (const overlay of this.overlays) overlay(this.context, this);
     this.drawn = (this.drawn ?? 0) + 1;
   }
