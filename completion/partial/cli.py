@@ -86,7 +86,7 @@ def complete_scan(scans: ScansArg, output: Output, model: ModelOrNone = None, la
     with bar("completing scans") as progress:
         results = space.run(work, [Task(name, one, name) for name, one in found.items()], workers, progress)
     with space.staging("page") as staged:
-        folder_page(results.values, list(results.failures.values())).write(staged.folder / "report.html")
+        folder_page(results.values, list(results.failures.values()), space.folder).write(staged.folder / "report.html")
     return Outcome(output, summary(results.values, len(results.fresh), len(found)), settings, failures_of(results))
 
 

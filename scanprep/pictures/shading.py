@@ -34,6 +34,7 @@ class Solid:
     smooth: bool = True  # interpolate normals: false shows the single triangles
     name: str = ""  # in the browser, where shapes with a name can be hidden
     shades: Mapping[str, np.ndarray | Heat] = field(default_factory=dict)  # other colours to choose from in the browser
+    visible: bool = True  # at first: a name brings it into sight
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,6 +48,7 @@ class Dots:
     coarse: bool = False  # balls of few triangles, for pictures in which they are a few pixels wide
     name: str = ""
     labels: Sequence[str] = ()  # of each point, shown in the browser
+    visible: bool = True
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,6 +61,7 @@ class Bones:
     radius: float = 0.006  # metres
     on_top: bool = False
     name: str = ""
+    visible: bool = True
 
 
 @dataclass(frozen=True, eq=False)

@@ -115,6 +115,7 @@ class RegisterScan:
         if found.picture:
             (room.folder / PICTURES).mkdir()
             (room.folder / PICTURES / f"{task.name}.webp").write_bytes(found.picture)
+            (room.folder / PICTURES / f"{task.name}.scene").write_bytes(found.scene)
         return found.figures
 
 

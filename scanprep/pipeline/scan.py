@@ -63,6 +63,7 @@ class RegisteredScan:
     vertices: np.ndarray            # (N, 3), metres
     figures: ScanFigures
     picture: bytes = b""            # a strip of small pictures as a WebP file; empty where none were asked for
+    scene: bytes = b""              # the same for the browser
 
 
 def register_scan(task: ScanTask, template: Mesh, template_landmarks: dict[str, int],
@@ -78,14 +79,14 @@ def register_scan(task: ScanTask, template: Mesh, template_landmarks: dict[str, 
         problem = registration_problem(template, scan, fit, landmarks is not None)
         if problem:
             raise ValueError(f"{task.scan}: the template is not on it: {problem}")
-        picture = b""
+        picture = scene = b""
         if settings.pictures:
-            from .page import strip
+            from .page import pictures_of
 
-            picture = strip(template, scan, fit)
+            picture, scene = pictures_of(template, scan, fit)
     figures = figures_of(task.name, init, template, fit)
     return RegisteredScan(fit.mesh.vertices, replace(figures, removed=removed, seconds=time.perf_counter() - start),
-                          picture)
+                          picture, scene)
 
 
 def _check_unit(task: ScanTask, scan: Mesh | np.ndarray, template: Mesh) -> None:

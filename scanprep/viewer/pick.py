@@ -21,7 +21,6 @@ from ..geometry.surface import Surface
 from ..pictures.camera import Camera, upright
 from ..pictures.scene import Pane, pack_scene
 from ..pictures.shading import CLAY, Dots, Shape, Solid
-from ..pictures.thinned import thinned
 from .landmark_names import next_name
 from .messages import Message
 from .surface_clicks import Clickable
@@ -78,7 +77,7 @@ class Clicked:
     def pane(self, label: str) -> Pane:
         """Its surface as the browser gets it."""
         shape = self.body.shape
-        shown: Shape = Solid(thinned(shape)) if self.body.has_surface and isinstance(shape, Mesh) else \
+        shown: Shape = Solid(shape) if self.body.has_surface and isinstance(shape, Mesh) else \
             Dots(self.body.points[::max(1, len(self.body.points) // 150_000)], CLAY, 0.004)
         return Pane([shown], camera_of(shape), label)
 

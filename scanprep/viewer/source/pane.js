@@ -158,7 +158,7 @@ export class Pane {
     this.context.fillRect(0, 0, width, height);
     this.context.drawImage(renderer.domElement, 0, tall - height, width, height, 0, 0, width, height);
     const taken = [];                                   // by labels: those drawn last in the list come first
-    for (const layer of [...this.layers].reverse()) drawLabels(this, layer, taken);
+    if (this.names !== false) for (const layer of [...this.layers].reverse()) drawLabels(this, layer, taken);
     for (const overlay of this.overlays) overlay(this.context, this);
     this.drawn = (this.drawn ?? 0) + 1;
   }
