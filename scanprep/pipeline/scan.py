@@ -15,6 +15,8 @@ from ..geometry.mesh import Mesh
 from ..judgement import extent
 from ..ranges import FLAG, Settings
 from ..registration.nonrigid import Registration, register, registration_problem, stretched_share
+from ..registration.person import PersonParts
+from ..registration.repair import repaired
 from ..registration.schedule import RegistrationConfig
 from ..registration.unmarked import register_unmarked
 from ..threads import one_thread
@@ -66,15 +68,18 @@ class RegisteredScan:
 
 
 def register_scan(task: ScanTask, template: Mesh, template_landmarks: dict[str, int],
-                  settings: ScanSettings) -> RegisteredScan:
-    """Read and register one scan; ValueError for files that cannot be read, or a registration that means nothing."""
+                  settings: ScanSettings, parts: PersonParts | None = None) -> RegisteredScan:
+    """Read and register one scan, and try other rolls of limbs where the template has the parts of a person.
+
+    ValueError for files that cannot be read, or a registration that means nothing.
+    """
     start = time.perf_counter()
     with one_thread():
         scan = read_scan(task.scan, settings.unit)
         _check_unit(task, scan, template)
         landmarks = _landmarks(task, scan, template_landmarks, settings)
         scan, removed = _cleaned(scan, landmarks, settings.clean)
-        fit, init = _registered(template, scan, landmarks, settings)
+        fit, init = _registered(template, scan, landmarks, settings, parts)
         problem = registration_problem(template, scan, fit, landmarks is not None)
         if problem:
             raise ValueError(f"{task.scan}: the template is not on it: {problem}")
@@ -110,17 +115,20 @@ def _landmarks(task: ScanTask, scan: Mesh | np.ndarray, template_landmarks: dict
         raise ValueError(f"{task.landmarks}: {error}") from None
 
 
-def _registered(template: Mesh, scan: Mesh | np.ndarray, landmarks: Landmarks | None, settings: ScanSettings
-                ) -> tuple[Registration, str]:
+def _registered(template: Mesh, scan: Mesh | np.ndarray, landmarks: Landmarks | None, settings: ScanSettings,
+                parts: PersonParts | None) -> tuple[Registration, str]:
     """The template on the scan, and what led it there: landmarks, or correspondences, or its pose."""
+    pairs = None
     if landmarks is not None or settings.init == "pose":
-        return (register(template, scan, landmarks, settings.registration),
-                "pose" if landmarks is None else f"{len(landmarks[0])} landmarks")
-    try:
-        fit, pairs = register_unmarked(template, scan, settings.registration, settings.correspondences)
-        return fit, f"{len(pairs)} correspondences"
-    except ValueError as error:
-        raise ValueError(f"{error} (a landmark file, or --init pose, needs no ends of limbs)") from None
+        fit = register(template, scan, landmarks, settings.registration)
+        init = "pose" if landmarks is None else f"{len(landmarks[0])} landmarks"
+    else:
+        try:
+            fit, pairs = register_unmarked(template, scan, settings.registration, settings.correspondences)
+        except ValueError as error:
+            raise ValueError(f"{error} (a landmark file, or --init pose, needs no ends of limbs)") from None
+        init = f"{len(pairs)} correspondences"
+    return repaired(template, scan, fit, parts, landmarks, settings.registration, correspondences=pairs), init
 
 
 def _cleaned(scan: Mesh | np.ndarray, landmarks: Landmarks | None, config: CleanScanConfig | None
@@ -137,4 +145,4 @@ def figures_of(name: str, init: str, template: Mesh, fit: Registration) -> ScanF
     return ScanFigures(
         name, init, float(np.nanmean(fit.distances)) if fit.seen.any() else np.nan, fit.rms,
         float(fit.seen.mean()), float(fit.confidence.mean()), fit.uncovered,
-        stretched_share(template, fit.mesh), fit.landmark_rms, fit.inverted, fit.converged)
+        stretched_share(template, fit.mesh), fit.landmark_rms, fit.inverted, fit.converged, rolled=fit.rolled)

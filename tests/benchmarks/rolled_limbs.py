@@ -35,7 +35,7 @@ def rolled(data: RealData, parts: PersonParts, body: np.ndarray, limb: int, angl
             for j, x in ((skeleton.joints, rest), (joints, body))]
     bone_rest, bone = (end / np.linalg.norm(end) for end in ends)
     along = (rest - skeleton.joints[limb]) @ bone_rest
-    share = np.clip((along - BEGINS[0]) / (BEGINS[1] - BEGINS[0]), 0, 1) * skeleton.descends[limb][part]
+    share = np.clip((along - BEGINS[0]) / (BEGINS[1] - BEGINS[0]), 0, 1) * skeleton.descends[part, limb]
     moved, out = share > 0, body.copy()
     R = rotations.exp((angle * share[moved])[:, None] * bone)
     turned = joints[limb] + np.einsum("nij,nj->ni", R, body[moved] - joints[limb])
