@@ -8,7 +8,7 @@ from scanprep.geometry import rotations
 from scanprep.geometry.surface import Surface
 from scanprep.registration import person as person_module
 from scanprep.registration.deformation_graph import build_graph
-from scanprep.registration.graph_fit import GraphFit, deform, start_motion
+from scanprep.registration.graph_fit import deform, start_fit, start_motion
 from scanprep.registration.limbs import beyond_people, frames, joint_angles, limb_doubts
 from scanprep.registration.matches import prepare
 from scanprep.registration.nonrigid import Registration, measured
@@ -37,7 +37,8 @@ def parts(person):
 
 def registration(person, scan, x):
     """What a registration with vertices (N, 3) says of itself."""
-    return measured(prepare(person.mesh, scan), GraphFit(x, None, None, moved=0.0), scan)
+    fit = replace(start_fit(person.mesh, np.eye(4), 300), x=x, moved=0.0)
+    return measured(prepare(person.mesh, scan), fit, scan)
 
 
 def with_rolled_skin(person, body, part, angle):

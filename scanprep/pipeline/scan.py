@@ -8,6 +8,7 @@ from typing import Annotated, Literal
 import numpy as np
 
 from ..cleaning.clean_scan import CleanScanConfig, clean_scan
+from ..correspondence.correspondences import Correspondences
 from ..correspondence.search import CorrelatedConfig
 from ..geometry.files import read_scan
 from ..geometry.landmarks import check_on_surface, match_landmarks, read_landmarks
@@ -79,10 +80,11 @@ def register_scan(task: ScanTask, template: Mesh, template_landmarks: dict[str, 
         _check_unit(task, scan, template)
         landmarks = _landmarks(task, scan, template_landmarks, settings)
         scan, removed = _cleaned(scan, landmarks, settings.clean)
-        fit, init = _registered(template, scan, landmarks, settings, parts)
+        fit, pairs, init = _registered(template, scan, landmarks, settings)
         problem = registration_problem(template, scan, fit, landmarks is not None)
         if problem:
             raise ValueError(f"{task.scan}: the template is not on it: {problem}")
+        fit = repaired(template, scan, fit, parts, landmarks, settings.registration, correspondences=pairs)
         picture = b""
         if settings.pictures:
             from .page import strip
@@ -115,20 +117,17 @@ def _landmarks(task: ScanTask, scan: Mesh | np.ndarray, template_landmarks: dict
         raise ValueError(f"{task.landmarks}: {error}") from None
 
 
-def _registered(template: Mesh, scan: Mesh | np.ndarray, landmarks: Landmarks | None, settings: ScanSettings,
-                parts: PersonParts | None) -> tuple[Registration, str]:
-    """The template on the scan, and what led it there: landmarks, or correspondences, or its pose."""
-    pairs = None
+def _registered(template: Mesh, scan: Mesh | np.ndarray, landmarks: Landmarks | None, settings: ScanSettings
+                ) -> tuple[Registration, Correspondences | None, str]:
+    """The template on the scan, and what led it there: landmarks, or correspondences, or its pose; that in words."""
     if landmarks is not None or settings.init == "pose":
-        fit = register(template, scan, landmarks, settings.registration)
-        init = "pose" if landmarks is None else f"{len(landmarks[0])} landmarks"
-    else:
-        try:
-            fit, pairs = register_unmarked(template, scan, settings.registration, settings.correspondences)
-        except ValueError as error:
-            raise ValueError(f"{error} (a landmark file, or --init pose, needs no ends of limbs)") from None
-        init = f"{len(pairs)} correspondences"
-    return repaired(template, scan, fit, parts, landmarks, settings.registration, correspondences=pairs), init
+        return (register(template, scan, landmarks, settings.registration), None,
+                "pose" if landmarks is None else f"{len(landmarks[0])} landmarks")
+    try:
+        fit, pairs = register_unmarked(template, scan, settings.registration, settings.correspondences)
+        return fit, pairs, f"{len(pairs)} correspondences"
+    except ValueError as error:
+        raise ValueError(f"{error} (a landmark file, or --init pose, needs no ends of limbs)") from None
 
 
 def _cleaned(scan: Mesh | np.ndarray, landmarks: Landmarks | None, config: CleanScanConfig | None
