@@ -43,6 +43,8 @@ def registered(data: RealData, parts: PersonParts, item: TestScan, marks: str, c
         found = register(data.template, item.scan, landmarks, config)
     else:
         found, pairs = register_unmarked(data.template, item.scan, config)
+    if registration_problem(data.template, item.scan, found, marks != "0"):
+        return found, found                      # as in a folder: it means nothing, whatever its limbs do
     return found, repaired(data.template, item.scan, found, parts, landmarks, config, correspondences=pairs)
 
 
