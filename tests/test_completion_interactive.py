@@ -124,7 +124,8 @@ def test_from_a_half_view_to_a_saved_body_by_mouse_alone(case, new_page, tmp_pat
         wait_until(page, "Boolean(window.program?.figure && program.state)")
         wait_until(page, "program.figure.panes.every((pane) => pane.drawn > 1)")
         toward = np.array([0.3, -1, 0.5]) / np.linalg.norm([0.3, -1, 0.5])
-        page.evaluate("""(back) => { const pane = program.figure.panes[1]; pane.home.back = back; pane.reset(); }""",
+        page.evaluate("""(back) => { const pane = program.figure.panes[1]; Object.assign(pane.home,
+            { back, width: 2 * pane.home.width, height: 2 * pane.home.height }); pane.reset(); }""",
                       toward.tolist())                                  # as if turned, to where the camera stood
         for name, vertex in zip(NAMES, MARKS, strict=True):
             if not seen[vertex] or len(app.scan.places) == 4:
