@@ -21,7 +21,7 @@ from scanprep.threads import one_thread
 from ..bodies import as_body
 from .alternation import turns_of
 from .confidence import distance_to_seen, expected_error, posterior_error, probability_within
-from .fit import ScanFit, solve_jointly
+from .fit import STRANGE, ScanFit, solve_jointly
 from .free_space import free_space_violation
 from .free_surface import distance_to, free_surface
 from .inputs import in_metres
@@ -43,7 +43,6 @@ PART_SHOWN = 0.5                     # share of a part within the picture, below
 LOST_LIMB, ENTERED = 0.01, 0.01      # shares: of a picture's person without a body near, of the body in free space
 UNLIKELY = 150.0                     # squared deviations of a pose from those that are known, all joints together
 BENT = np.radians(20)                # rotation that is more than an error, of a joint that was not seen to bend
-STRANGE = np.radians(45)             # rotation of a joint from the nearest one that is known
 LEFT_OVER = 0.03                     # share of a scan without a body near that is clutter, or a limb elsewhere
 LOST = 0.5                           # share of a scan explained below which a completion means nothing
 UNJUDGED = Judgement.of(check=["no judgement was made"])
