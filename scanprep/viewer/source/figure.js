@@ -59,9 +59,11 @@ export class Figure {
     const { tools } = this;
     tools.replaceChildren(choice("side", Object.keys(SIDES), (i) => this.look(...Object.values(SIDES)[i])),
       choice("surface", SURFACES, (i) => this.each((layer) => layer.setSurface(SURFACES[i]))));
-    const shades = [...new Set(this.layers.flatMap((layer) => layer.shades.map((shade) => shade.name)))];
-    if (shades.length > 1 && this.layers.some((layer) => layer.shades.length > 1)) {
-      tools.append(choice("colour", shades.map((name) => name || "as given"), (i) => this.color(shades[i])));
+    const many = this.layers.filter((layer) => layer.shades.length > 1);
+    if (many.length) {
+      const shades = [...new Set(many.flatMap((layer) => layer.shades.map((shade) => shade.name)))];
+      tools.append(choice("colour", shades.map((name) => name || "as given"), (i) => this.color(shades[i]),
+        shades.indexOf(many[0].shade.name)));
     }
     const named = [...new Set(this.layers.map((layer) => layer.name).filter(Boolean))];
     for (const name of named) {
