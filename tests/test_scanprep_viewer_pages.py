@@ -23,16 +23,17 @@ def report(tmp_path_factory):
     points = body.vertices[[3, 40, 200]]
     looks = Solid(body, Heat(far, 0, 0.01, "distance to the scan"), name="body", shades={
         "sure": Heat(far * 100, 0, 1, "sure", "%", "Blues"), "plain": np.array([0.2, 0.8, 0.4])})
+    camera = Camera.around(body)
+    sides = [body.vertices.mean(axis=0) + side * 0.32 * camera.axes[2] for side in (1, -1)]
     ghost = Solid(body, (1, 0, 0), name="ghost", visible=False)
     shapes = [looks, ghost, Dots(points, name="marks", labels=["head", "", "hand"], on_top=True),
-              Bones(points[:2], points[1:], name="bones")]
+              Bones(points[:2], points[1:], name="bones"), Dots(np.array(sides), name="skin", labels=["near", "far"])]
     way = np.stack([np.linspace(0, 0.4, T), 0 * np.arange(T), 0.1 * np.sin(np.arange(T))], axis=1)
     moves = body.vertices + way[:, None]
     moves[4:6] = np.nan
     seen = moves[:, [3, 40]].copy()
     seen[7, 1] = np.nan
     moving = [Moving(Solid(body, name="body"), moves, 10.0), Moving(Dots(seen[0], name="dots"), seen, 10.0)]
-    camera = Camera.around(body)
     page = Page("Bodies").bodies([Pane(shapes, camera, "left"), Pane(shapes[:1], camera, "right")])
     page.text("Below.").bodies([Pane(moving, camera)], "a motion")
     path = tmp_path_factory.mktemp("pages") / "report.html"
@@ -107,6 +108,16 @@ def test_what_is_hidden_at_first_can_be_shown_and_the_other_way(shown):
     assert ink(shown, 0) < before / 3
     first.get_by_label("ghost", exact=True).check()
     assert ink(shown, 0) == pytest.approx(before, rel=0.1)
+
+
+def test_names_are_of_what_is_in_sight(shown):
+    told = "document.querySelector('figure').sk.panes[0].told.map((label) => label.text).sort()"
+    assert shown.evaluate(told) == ["hand", "head", "near"]           # marks are seen through the body
+    shown.locator("figure").first.get_by_label("side").select_option("back")
+    wait_until(shown, f"{told}.includes('far')")
+    assert shown.evaluate(told) == ["far", "hand", "head"]
+    shown.locator("figure").first.get_by_label("names").uncheck()
+    wait_until(shown, f"!{told}.length")
 
 
 def test_every_frame_is_where_it_was(shown, report):
