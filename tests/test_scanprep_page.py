@@ -182,9 +182,13 @@ def test_missed_points(template):
 
 
 def test_tables_keep_their_numbers(tmp_path):
-    rows = [replace(GOOD, name="b", landmarks=np.nan), replace(GOOD, name="a", distance=1 / 3, converged=False)]
+    rows = [replace(GOOD, name="b", landmarks=np.nan),
+            replace(GOOD, name="a", distance=1 / 3, converged=False, rolled=True)]
     write_figures(tmp_path, rows)
     assert [repr(f) for f in read_figures(tmp_path)] == [repr(rows[1]), repr(rows[0])]
+    table = tmp_path / "registration.csv"
+    table.write_text("\n".join(line.rpartition(",")[0] for line in table.read_text().splitlines()))
+    assert [f.rolled for f in read_figures(tmp_path)] == [False, False]           # a table of before
     write_failures(tmp_path, {"x": 'a, "b"\tc'})
     assert read_failures(tmp_path) == {"x": 'a, "b"\tc'}
     (tmp_path / "registration.csv").write_text("name,distance\na,1\n")

@@ -108,11 +108,10 @@ def complete_files(work: Work, inputs: Inputs, room: Room) -> list[Metric]:
         marks = np.zeros((0, 3)) if landmarks is None else landmarks[1]
         person = prepare_picture(depth, size(work.body.template), marks)
         files = ScanFiles((PointCloud(person.points, person.normals),), (None,))
-    views, output = list(files.views), room.folder
-    scan = views if depth is None else depth
+    scan = list(files.views) if depth is None else depth
     done = room.step("completion", (work.body, work.marks, work.config, work.unit, inputs),
                      lambda: complete(work.body, scan, landmarks, work.config, room.tell, masked))
-    return write_results(work, inputs, replace(files, views=tuple(views)), done, landmarks, masked, output)
+    return write_results(work, inputs, files, done, landmarks, masked, room.folder)
 
 
 def write_results(work: Work, inputs: Inputs, files: ScanFiles, done: Completion,

@@ -145,6 +145,7 @@ def _figure_table(f: ScanFigures) -> str:
             ("with data", f"{100 * f.seen:.0f}%"), ("confidence, mean", f"{f.confidence:.2f}"),
             ("scan off the template", f"{100 * f.missed:.1f}%"),
             ("stretched or shrunk", f"{100 * f.stretch:.1f}%"), ("inverted triangles", f"{f.inverted}"),
+            *([("limbs rolled otherwise", "yes")] if f.rolled else []),
             ("landmarks off, RMS", "–" if np.isnan(f.landmarks) else f"{1000 * f.landmarks:.1f} mm"),
             ("converged", "yes" if f.converged else "no"))
     return "<table>" + "".join(f'<tr><td>{name}</td><td class="number">{value}</td></tr>'

@@ -27,6 +27,7 @@ from .surface_clicks import Clickable
 
 TEMPLATE, SCAN = 0, 1                # panes
 ENOUGH = 4                           # landmarks from which the others can be predicted
+SLIDES = -1                          # movements by key are one as long as they follow each other
 KEPT = ".before"                     # ending of the copy of a landmark file as it was found
 
 Send = Callable[[Message], None]
@@ -96,6 +97,7 @@ class Change:
     body: int
     before: Mapping[str, np.ndarray | None]
     after: Mapping[str, np.ndarray | None]
+    drag: int = 0                        # number of the movement that it is part of; 0 for a click
 
 
 class PickApp:
@@ -177,8 +179,11 @@ class PickApp:
         """Nothing is left to do: every click was saved."""
 
     def on_place(self, send: Send, pane: int, name: str, origin: list[float], direction: list[float],
-                 inside: bool = False, seen: list[float] | None = None, dragged: bool = False) -> None:
-        """A landmark where a ray meets the surface; a landmark inside is half way to where the ray leaves the body."""
+                 inside: bool = False, seen: list[float] | None = None, drag: int = 0) -> None:
+        """A landmark where a ray meets the surface; one inside is half way to where the ray leaves the body.
+
+        The places of one drag, which has a number, are undone as one.
+        """
         one = self._editable(pane)
         body, ray = one.body, (_point(origin), _point(direction))
         place = body.middle(*ray) if inside else body.hit(*ray)
@@ -187,8 +192,8 @@ class PickApp:
         if place is None:
             self.note = "the click met nothing: turn the body so that the place faces you"
             return
-        self._change(self._number(pane), {self._named(name): place}, merged=dragged)
-        if not dragged:
+        self._change(self._number(pane), {self._named(name): place}, drag)
+        if not drag:
             self.choose_next(name, pane)
         self._predict_if_time(send, pane)
 
@@ -196,7 +201,7 @@ class PickApp:
         """Move a landmark along a ray, metres: into the body, to where a joint is."""
         along = _point(direction)
         place = self._editable(pane).places[name] + by * along / np.linalg.norm(along)
-        self._change(self._number(pane), {name: place}, merged=True)
+        self._change(self._number(pane), {name: place}, SLIDES)
 
     def on_remove(self, send: Send, pane: int, name: str) -> None:
         """Take a landmark away."""
@@ -272,13 +277,14 @@ class PickApp:
             self.names = (*self.names, name)
         return name
 
-    def _change(self, number: int, after: Mapping[str, np.ndarray | None], merged: bool = False) -> None:
-        """Set landmarks, remember what they were, save; `merged` with the change before, where that was a drag too."""
+    def _change(self, number: int, after: Mapping[str, np.ndarray | None], drag: int = 0) -> None:
+        """Set landmarks, remember what they were, save; the changes of one drag are one."""
         one = self._of(number)
         before = {name: one.places.get(name) for name in after}
-        if merged and self.done and self.done[-1].body == number and list(self.done[-1].after) == list(after):
+        last = self.done[-1] if self.done else None
+        if drag and last and (last.drag, last.body, *last.after) == (drag, number, *after):
             before = dict(self.done.pop().before)
-        self.done.append(Change(number, before, after))
+        self.done.append(Change(number, before, after, drag))
         self.undone.clear()
         self._set(number, after)
 
