@@ -15,7 +15,8 @@ class SceneReader:
         length = int.from_bytes(data[:4], "little")
         self.header = json.loads(data[4:4 + length])
         self.columns = [self._column(data[4 + length:], c) for c in self.header["columns"]]
-        self.origin = np.array(self.header["origin"])
+        self.origins = {id(layer): np.array(pane["origin"]) for pane in self.header["panes"]
+                        for layer in pane["layers"]}
 
     @staticmethod
     def _column(data, described):
@@ -39,7 +40,8 @@ class SceneReader:
     def positions(self, layer):
         """(n, 3), NaN where hidden."""
         place = layer["positions"]
-        points = np.array(place["low"]) + place["step"] * self.columns[place["column"]].astype(float) + self.origin
+        points = np.array(place["low"]) + place["step"] * self.columns[place["column"]].astype(float)
+        points += self.origins[id(layer)]
         points[layer["hidden"]] = np.nan
         return points
 
@@ -53,7 +55,7 @@ class SceneReader:
         rows = rows * np.array(motion["scale"])[:, None]
         if motion["basis"] is not None:
             rows = np.einsum("nr,trc->tnc", self.columns[motion["basis"]].astype(float), rows)
-        rows += self.origin
+        rows += self.origins[id(layer)]
         if "seen" in motion:
             rows[self.columns[motion["seen"]] == 0] = np.nan
         return rows

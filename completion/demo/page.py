@@ -1,7 +1,7 @@
 """The page of the demonstration: a picture of every stage."""
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -10,17 +10,17 @@ import numpy as np
 
 from model.report import component_panes, parts_panes
 from scanprep.console import Metric
-from scanprep.geometry import storage
 from scanprep.geometry.files import read_mesh
+from scanprep.geometry.landmarks import match_landmarks
 from scanprep.geometry.mesh import Mesh
-from scanprep.pictures.camera import look_around, upright
-from scanprep.pictures.gltf import animated_glb
+from scanprep.pictures.camera import look_around
 from scanprep.pictures.page import Page
 from scanprep.pictures.scene import Pane, picture_panes
 from scanprep.pictures.shading import CLAY, Dots, Heat, Solid, part_colors
 from scanprep.pictures.sheets import save_png, webp_bytes
 from scanprep.pictures.thinning import thinned
 
+from ..mocap.files.motion_files import write_glb
 from ..motion_pictures import MARKER, chart_residuals, moving_pane, played
 from ..partial.report import COMPLETED, HEIGHT, MEASURED, completion_panes, picture_completion
 from .chain import PARTS, Demo
@@ -70,6 +70,12 @@ def _pane(demo: Demo, shape: Mesh | Solid, fits: np.ndarray, label: str, turn: f
     return Pane([thinned(solid, SMALL)], look_around(demo.template, fits, (turn,))[0], label)
 
 
+def _in_rows(page: Page, panes: Sequence[Pane], caption: str) -> None:
+    """Figures of two pairs each."""
+    for i in range(0, len(panes), 4):
+        page.bodies(panes[i:i + 4], caption, 340)
+
+
 def _scans(demo: Demo, page: Page) -> None:
     page.section("Scans", "Four range views of each person, as a scanner sees them: 2 mm noise, holes under the arms, "
                  "between the legs and wherever nothing was in sight. Seen from behind, a surface is dark.")
@@ -105,7 +111,7 @@ def _registration(demo: Demo, page: Page) -> None:
         panes += [_pane(demo, read_mesh(demo.folder / "scans" / f"{name}.ply"), fits, name),
                   _pane(demo, Solid(meshes[name], off, shades={"plain": np.array(CLAY)}), fits,
                         f"{1000 * errors[name].mean():.1f} mm from the truth")]
-    page.bodies(panes, "the four worst: the scan, and the template on it", 340)
+    _in_rows(page, panes, "the worst: the scan, and the template on it")
     page.table([(f.name, 1000 * f.distance, 1000 * float(errors[f.name].mean()), 100 * f.seen)
                 for f in sorted(demo.prepared.figures, key=lambda f: -errors[f.name].mean())],
                ("scan", "to the scan (mm)", "to the truth (mm)", "with data (%)"))
@@ -136,7 +142,7 @@ def _poses(demo: Demo, page: Page) -> None:
         panes += [_pane(demo, truth.mesh, found, "truth"),
                   _pane(demo, Solid(demo.template.with_vertices(found), off), found,
                         f"model, {1000 * error.mean():.1f} mm")]
-    page.bodies(panes, "the truth, and the model beside it", 340)
+    _in_rows(page, panes, "the truth, and the model beside it")
 
 
 def _completion(demo: Demo, page: Page, to: Path) -> None:
@@ -147,7 +153,9 @@ def _completion(demo: Demo, page: Page, to: Path) -> None:
     image = picture_completion(half, done, demo.template)
     save_png(to / "completed" / "completion.png", image)
     error = np.linalg.norm(done.completed.vertices - demo.truth_map.vertices(truth), axis=1)
-    scan, whole = completion_panes(half, done, demo.template)
+    names, vertices, points = match_landmarks(demo.template_landmarks, marks)
+    scan, whole = completion_panes(half, done, demo.template, landmarks=(vertices, points),
+                                   names=dict(zip(vertices.tolist(), names, strict=True)))
     title = "distance of corresponding points"
     shades = {title: Heat(error, 0, 3 * FAR, title)}
     shapes = [replace(shape, shades={**shape.shades, **shades}) if isinstance(shape, Solid) and
@@ -161,11 +169,9 @@ def _animation(demo: Demo, page: Page, to: Path) -> None:
     motion, subject = demo.motion, demo.subject
     page.section("Animation", f"{len(sequence.labels)} markers of a walk, 3% of them missing at any time, and the body "
                  "that follows them.")
-    glb = animated_glb(subject.template.faces, motion.vertices(subject), motion.rate, up=upright(subject.template)[0])
-    with storage.writing(to / "animation" / "walk.glb") as beside:
-        beside.write_bytes(glb)
+    write_glb(to / "animation" / "walk.glb", motion, subject)
     at = sequence.positions[played(motion)[0]]
     dots = Dots(at[0], MARKER, 0.013, name="measured markers", labels=sequence.labels)
     page.bodies([moving_pane(motion, subject, [(dots, at)])], "the walk with the measured markers", 480)
     page.chart(chart_residuals(motion), "distance of the markers to where the body puts them")
-    page.download("walk.glb", glb, "the walk as an animated GLB")
+    page.text("animation/walk.glb, beside this page, plays in any viewer of glTF.")

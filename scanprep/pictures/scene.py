@@ -27,6 +27,7 @@ FORMAT = 1
 SCENE = "picture.scene"              # beside a picture, for the page of many
 SMALL = 8000                         # triangles of a shape in it
 MOST_TURN, MOST_BYTES = 20, 4_000_000        # figures that turn on a page of many
+FINE = 2e-5                          # metres: step of what one column adds to a motion
 NO_INDEX = 255                       # place in a palette of vertices without a value; it has as many colours before
 
 
@@ -187,18 +188,23 @@ def _hex(colors: np.ndarray) -> str:
     return np.asarray(colors, dtype=np.uint8).tobytes().hex()
 
 
+def _steps(values: np.ndarray, axes: int | tuple[int, ...], factor: np.ndarray | float) -> np.ndarray:
+    """Steps that 16 bits can count, no smaller than is seen when the values are taken so many times."""
+    return np.maximum(np.abs(values).max(axis=axes, initial=1e-12) / 32767, FINE / np.maximum(factor, 1e-9))
+
+
 def _motion(moving: Moving, origin: np.ndarray, columns: _Columns) -> dict[str, Any]:
     """Frames (T, n, 3) as columns (n, r) times coefficients (T, r, 3), both in whole steps; of dots without columns."""
     frames = np.asarray(moving.frames) - origin.astype(moving.frames.dtype)
     known = np.isfinite(frames).all(axis=2)
     hidden: Mapping[str, Any] = {} if known.all() else {"seen": columns.add(known.astype(np.uint8))}
     coefficients, basis = np.where(known[..., None], frames, np.float32(0)), None
-    steps = np.ones(frames.shape[1])
+    steps, sizes = np.ones(frames.shape[1]), _steps(coefficients, (0, 2), 1.0)
     if not isinstance(moving.shape, Dots):             # what each of those does tells nothing of the others
         made, coefficients = low_rank(coefficients)
-        steps = np.maximum(np.abs(made).max(axis=0), 1e-12) / 32767
+        steps = _steps(made, 0, np.abs(coefficients).max(axis=(0, 2)))
+        sizes = _steps(coefficients, (0, 2), np.abs(made).max(axis=0))
         basis = columns.add(np.round(made / steps).astype(np.int16))
-    sizes = np.maximum(np.abs(coefficients).max(axis=(0, 2), initial=0), 1e-12) / 32767
     return {"rate": moving.rate, "frames": len(frames), "rank": len(steps), **hidden, "basis": basis,
             "coefficients": columns.add(np.round(coefficients / sizes[:, None]).astype(np.int16).reshape(
                 len(frames), -1).view(np.uint16), True),

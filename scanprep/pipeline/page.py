@@ -24,7 +24,7 @@ from .figures import Limits, ScanFigures, Verdict, read_doubts, read_failures, r
 
 PICTURES, PAGE = "pictures", "report.html"
 WIDTH, HEIGHT, TALL = 150, 216, 300
-FEW = 6                     # scans that turn where none needs a look
+FEW = 6                     # scans that turn where fewer need a look
 FAR = 0.005                 # of the template's size: the dark end of the distances
 TURN = 20.0                 # degrees from the front
 BALL = 0.013                # of the template's size: radius of the balls that stand for points
@@ -46,7 +46,7 @@ def write_set_page(folder: str | Path, limits: Limits | None = None, to: Path | 
     page.section("Worst first", _explanation(limits, size))
     page.picture(_legend(size))
     scenes = worst_that_turn([folder / PICTURES / f"{verdict.name}.scene" for verdict in verdicts])
-    look = sum(verdict.suspect or verdict.failed for verdict in verdicts) or FEW
+    look = max(FEW, sum(verdict.suspect or verdict.failed for verdict in verdicts))
     for number, (verdict, scene) in enumerate(zip(verdicts, scenes, strict=True)):
         page.markup(_card(page, folder, verdict, entries.get(verdict.name), scene if number < look else None))
     if whole.skeleton is not None:

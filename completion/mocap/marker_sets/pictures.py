@@ -101,7 +101,7 @@ def layout_page(name: str, body: Mesh, layout: MarkerLayout, picture: np.ndarray
                 skeleton: Skeleton | None = None) -> Page:
     """The page of `scape layout show`; a picture stands for the body until it turns."""
     page = Page(f"Markers: {name}", "Red markers sit on a point of the anatomy, yellow ones anywhere on their limb.")
-    page.bodies([layout_pane(body, layout)], "Names can be shown.", 640, webp_bytes(picture))
+    page.bodies([layout_pane(body, layout)], "", 640, webp_bytes(picture))
     page.table(list(figures.items()), ("", ""))
     page.section("Markers").table(
         marker_rows(body, layout, skeleton), ("label", "also", "part", "partner", "from the skin", "place"))

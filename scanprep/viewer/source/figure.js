@@ -4,7 +4,7 @@ import { Pane } from "./pane.js";
 
 const SIDES = { "first view": [0, null], front: [0, 0], left: [90, 0], back: [180, 0], right: [-90, 0], above: [0, 85] };
 
-const FEW_NAMES = 15;
+const FEW_NAMES = [80, 15];                             // that are shown at first, where nothing moves, and in motions
 
 export function make(tag, attributes = {}, ...children) {
   const element = document.createElement(tag);
@@ -45,7 +45,8 @@ export class Figure {
     for (const layer of described.layers) pane.add(new Layer(layer, this.scene.columns));
     if (described.label) box.append(make("div", { class: "sk-label" }, described.label));
     box.append(pane.tip = make("div", { class: "sk-tip", hidden: true }));
-    pane.names = pane.layers.reduce((sum, layer) => sum + layer.labels.length, 0) <= FEW_NAMES;
+    const moves = pane.layers.some((layer) => layer.motion);
+    pane.names = pane.layers.reduce((sum, layer) => sum + layer.labels.length, 0) <= FEW_NAMES[moves ? 1 : 0];
     pane.onTurn = () => this.turned(pane);
     pane.canvas.addEventListener("pointermove", (event) => this.tell(pane, event));
     pane.canvas.addEventListener("pointerleave", () => { pane.tip.hidden = true; });
@@ -59,9 +60,11 @@ export class Figure {
     const { tools } = this;
     tools.replaceChildren(choice("side", Object.keys(SIDES), (i) => this.look(...Object.values(SIDES)[i])),
       choice("surface", SURFACES, (i) => this.each((layer) => layer.setSurface(SURFACES[i]))));
-    const shades = [...new Set(this.layers.flatMap((layer) => layer.shades.map((shade) => shade.name)))];
-    if (shades.length > 1 && this.layers.some((layer) => layer.shades.length > 1)) {
-      tools.append(choice("colour", shades.map((name) => name || "as given"), (i) => this.color(shades[i])));
+    const many = this.layers.filter((layer) => layer.shades.length > 1);
+    if (many.length) {
+      const shades = [...new Set(many.flatMap((layer) => layer.shades.map((shade) => shade.name)))];
+      tools.append(choice("colour", shades.map((name) => name || "as given"), (i) => this.color(shades[i]),
+        shades.indexOf(many[0].shade.name)));
     }
     const named = [...new Set(this.layers.map((layer) => layer.name).filter(Boolean))];
     for (const name of named) {

@@ -217,7 +217,9 @@ function dotMaterial(radius, onTop) {
       void main() {
         shade = color;
         vec4 eye = modelViewMatrix * vec4(position, 1.0);
+        vec4 front = projectionMatrix * (eye + vec4(0.0, 0.0, radius, 0.0));    // half of a ball on a skin is in sight
         gl_Position = projectionMatrix * eye;
+        gl_Position.z = front.z / front.w * gl_Position.w;
         gl_PointSize = max(2.0, radius * pixels * projectionMatrix[1][1] / gl_Position.w);
       }`,
     fragmentShader: `varying vec3 shade;
