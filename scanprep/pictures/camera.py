@@ -2,7 +2,7 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -60,10 +60,6 @@ class Camera:
         """(3,) float, metres; of a camera with parallel rays, a point far behind the scene."""
         away = self.distance if np.isfinite(self.distance) else 10 * (self.width + self.height)
         return self.target + away * self.axes[2]
-
-    def closer(self, factor: float) -> Camera:
-        """The same view `factor` times as large."""
-        return replace(self, width=self.width / factor, height=self.height / factor)
 
     def rays(self, width: int, height: int, samples: int = 1) -> tuple[np.ndarray, np.ndarray]:
         """Origins, relative to the target, and unit directions of the rays of a picture, row by row.

@@ -5,7 +5,6 @@ import base64
 import functools
 import gzip
 import io
-import mimetypes
 from collections.abc import Iterable, Sequence
 from html import escape
 from pathlib import Path
@@ -83,15 +82,6 @@ class Page:
         still = _figure(picture if isinstance(picture, bytes) else webp_bytes(picture), caption, "")
         return still.replace("<figure>", f'<figure data-scene="scene{len(self._scenes)}" data-height="{height}">', 1)
 
-    def pictures(self, images: Sequence[np.ndarray | bytes], captions: Sequence[str] = ()) -> Page:
-        """Pictures in a row that wraps on narrow screens."""
-        if captions and len(captions) != len(images):
-            raise ValueError(f"captions: expected {len(images)}, one for each image, got {len(captions)}")
-        figures = [_figure(image, caption, "") for image, caption in
-                   zip(images, captions or [""] * len(images), strict=True)]
-        self._parts.append(f'<div class="row">{"".join(figures)}</div>')
-        return self
-
     def table(self, rows: Iterable[Sequence[Any]], header: Sequence[str] = ()) -> Page:
         """A table; numbers are set flush right, floats with three significant figures."""
         head = "".join(f"<th>{escape(name)}</th>" for name in header)
@@ -108,14 +98,6 @@ class Page:
         with rc_context({"svg.hashsalt": "scapekit"}):
             figure.savefig(out, format="svg", bbox_inches="tight", metadata={"Date": None})
         return self.picture(out.getvalue(), caption)
-
-    def download(self, name: str, data: bytes, text: str = "") -> Page:
-        """A link that saves a file carried by the page itself."""
-        kind = "model/gltf-binary" if name.endswith(".glb") else mimetypes.guess_type(name)[0]
-        size = f"{len(data) / 1e6:.1f} MB" if len(data) >= 1e5 else f"{len(data) / 1e3:.1f} kB"
-        self._parts.append(f'<a class="file" download="{escape(name)}" href="{_data_uri(data, kind)}">'
-                           f"{escape(text or name)}<small>{size}</small></a>")
-        return self
 
     def html(self) -> str:
         """The whole page."""
@@ -172,11 +154,7 @@ def _image_kind(data: bytes) -> str:
 
 def data_uri(data: bytes) -> str:
     """The bytes of a picture as the address of an `img`."""
-    return _data_uri(data, _image_kind(data))
-
-
-def _data_uri(data: bytes, kind: str | None) -> str:
-    return f"data:{kind or 'application/octet-stream'};base64,{base64.b64encode(data).decode()}"
+    return f"data:{_image_kind(data)};base64,{base64.b64encode(data).decode()}"
 
 
 def _cell(value: Any) -> str:
