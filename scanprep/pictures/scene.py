@@ -104,7 +104,7 @@ def _layer(shape: Shape | Moving, origin: np.ndarray, columns: _Columns) -> dict
                  "labels": list(shape.labels) if isinstance(shape, Dots) else []}
     points = np.asarray(points, dtype=float).reshape(-1, 3) - origin
     known = np.isfinite(points).all(axis=1)
-    return {"name": shape.name, **looks, "hidden": np.flatnonzero(~known).tolist(),
+    return {"name": shape.name, "visible": shape.visible, **looks, "hidden": np.flatnonzero(~known).tolist(),
             "positions": _positions(np.where(known[:, None], points, 0.0), columns)}
 
 
@@ -145,14 +145,19 @@ def _hex(colors: np.ndarray) -> str:
 
 def _motion(moving: Moving, origin: np.ndarray, columns: _Columns) -> dict[str, Any]:
     """Frames (T, n, 3) as columns (n, r) times coefficients (T, r, 3), both in whole steps."""
-    frames = np.asarray(moving.frames, dtype=float) - origin
-    known = np.isfinite(frames).all(axis=2)
-    hidden: Mapping[str, Any] = {} if known.all() else {"seen": columns.add(known.astype(np.uint8))}
-    basis, coefficients = low_rank(np.where(known[..., None], frames, 0.0))
+    hidden: Mapping[str, Any] = {}
+    if moving.columns is not None:                     # a shift of all points is one of the things that columns can do
+        basis, coefficients = moving.columns
+        coefficients = coefficients - np.linalg.lstsq(basis, np.ones(len(basis)))[0][:, None] * origin
+    else:
+        frames = np.asarray(moving.frames, dtype=float) - origin
+        known = np.isfinite(frames).all(axis=2)
+        hidden = {} if known.all() else {"seen": columns.add(known.astype(np.uint8))}
+        basis, coefficients = low_rank(np.where(known[..., None], frames, 0.0))
     steps = np.maximum(np.abs(basis).max(axis=0), 1e-12) / 32767
     sizes = np.maximum(np.abs(coefficients).max(axis=(0, 2)), 1e-12) / 32767
-    return {"rate": moving.rate, "frames": len(frames), "rank": basis.shape[1], **hidden,
+    return {"rate": moving.rate, "frames": len(coefficients), "rank": basis.shape[1], **hidden,
             "basis": columns.add(np.round(basis / steps).astype(np.int16)),
             "coefficients": columns.add(np.round(coefficients / sizes[:, None]).astype(np.int16).reshape(
-                len(frames), -1).view(np.uint16), True),
+                len(coefficients), -1).view(np.uint16), True),
             "scale": (steps * sizes).tolist()}

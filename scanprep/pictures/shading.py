@@ -34,6 +34,7 @@ class Solid:
     smooth: bool = True  # interpolate normals: false shows the single triangles
     name: str = ""  # in the browser, where shapes with a name can be hidden
     shades: Mapping[str, np.ndarray | Heat] = field(default_factory=dict)  # other colours to choose from in the browser
+    visible: bool = True  # at first: a name brings it into sight
 
 
 @dataclass(frozen=True, eq=False)
@@ -47,6 +48,7 @@ class Dots:
     coarse: bool = False  # balls of few triangles, for pictures in which they are a few pixels wide
     name: str = ""
     labels: Sequence[str] = ()  # of each point, shown in the browser
+    visible: bool = True
 
 
 @dataclass(frozen=True, eq=False)
@@ -59,6 +61,7 @@ class Bones:
     radius: float = 0.006  # metres
     on_top: bool = False
     name: str = ""
+    visible: bool = True
 
 
 @dataclass(frozen=True, eq=False)
@@ -68,6 +71,8 @@ class Moving:
     shape: Solid | Dots
     frames: np.ndarray  # (T, n, 3) float, metres: of its vertices or points
     rate: float  # frames a second
+    # the same as columns (n, r) times coefficients (T, r, 3), where they are known; `frames` is then the first alone
+    columns: tuple[np.ndarray, np.ndarray] | None = None
 
 
 Shape = Mesh | Solid | Dots | Bones

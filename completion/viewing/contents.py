@@ -1,0 +1,157 @@
+"""What is seen of one thing: shapes, where they stand, and what can be done with them."""
+from __future__ import annotations
+
+import warnings
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+from typing import Any
+
+import numpy as np
+
+from model.body import BodyModel
+from model.linear import Subject
+from scanprep.geometry import rotations
+from scanprep.geometry.mesh import Mesh
+from scanprep.pictures.camera import Camera, upright
+from scanprep.pictures.colors import part_colors
+from scanprep.pictures.shading import CLAY, Dots, Heat, Moving, Shape, Solid
+from scanprep.pictures.thinned import thinned
+
+from ..bodies import at_rest
+from ..partial.completion import Completion
+
+POINTS = 150_000                     # of a cloud that are shown
+MARKER = (0.85, 0.25, 0.2)
+ELEVATION, TURN = 8.0, 20.0          # degrees from which a body is seen at first
+AXES = {f"{sign}{axis}": s * np.eye(3)[i] for sign, s in (("", 1.0), ("-", -1.0)) for i, axis in enumerate("xyz")}
+
+
+@dataclass(frozen=True, eq=False)
+class Stance:
+    """Where a thing is, and which way it stands: extent (n, 3) metres, the axis that is up and where the front is."""
+
+    extent: np.ndarray
+    up: np.ndarray
+    front: np.ndarray
+
+    @staticmethod
+    def of(mesh: Mesh) -> Stance:
+        """As far as it can be told from the outline of a body."""
+        up, azimuth = upright(mesh)
+        first, second = np.eye(3)[[(up + 1) % 3, (up + 2) % 3]]
+        front = np.cos(np.radians(azimuth)) * first + np.sin(np.radians(azimuth)) * second
+        return Stance(_box(mesh.vertices), np.eye(3)[up], front)
+
+    def turned(self, poses: np.ndarray, points: np.ndarray) -> Stance:
+        """Of a motion of the body: poses (T, J, 3), and the points (..., 3) that it comes by."""
+        R = rotations.exp(poses[:, 0])
+        mean = (R @ self.up).mean(axis=0)
+        axis = int(np.abs(mean).argmax())
+        return Stance(_box(points.reshape(-1, 3)), np.sign(mean[axis]) * np.eye(3)[axis], R[0] @ self.front)
+
+    def camera(self, up: np.ndarray | None = None) -> Camera:
+        """A view from beside the front, this way up."""
+        up = self.up if up is None else up
+        axis, sign = int(np.abs(up).argmax()), float(np.sign(up.sum()))
+        a, b = self.front[(axis + 1) % 3], self.front[(axis + 2) % 3]
+        azimuth = np.degrees(np.arctan2(b, a)) if np.hypot(a, b) > 1e-6 else 0.0
+        camera = Camera.around(self.extent, float(azimuth) + sign * TURN, sign * ELEVATION, axis)
+        if sign > 0:
+            return camera
+        return replace(camera, axes=camera.axes * np.array([[-1.0], [-1.0], [1.0]]), vertical=up)
+
+
+@dataclass(frozen=True, eq=False)
+class MarkersTold:
+    """Residuals (T, L) metres of markers that are dots of one of the shapes, NaN where they were not seen."""
+
+    shape: int
+    labels: tuple[str, ...]
+    residuals: np.ndarray
+
+
+@dataclass(frozen=True, eq=False)
+class Content:
+    """One thing, as it is shown: its first shape is a model's body where there is a model."""
+
+    name: str
+    shapes: Sequence[Shape | Moving]
+    stance: Stance
+    model: BodyModel | None = None
+    markers: MarkersTold | None = None
+    notes: tuple[str, ...] = ()
+
+
+def of_mesh(name: str, shape: Mesh | np.ndarray, landmarks: dict[str, np.ndarray] | None = None) -> Content:
+    """A mesh, or points (n, 3), with landmarks."""
+    mesh = shape if isinstance(shape, Mesh) else Mesh(shape, np.zeros((0, 3), dtype=np.int64))
+    stance = Stance.of(mesh)
+    size = float(np.linalg.norm(np.ptp(stance.extent, axis=0)))
+    marks = _landmarks(landmarks, size)
+    if not len(mesh.faces):
+        every = max(1, len(mesh.vertices) // POINTS)
+        return Content(name, [Dots(mesh.vertices[::every], CLAY, size / 500), *marks], stance)
+    few = thinned(mesh)
+    notes = (f"{name}: shown with fewer than its {len(mesh.faces):,} triangles",) * (len(few.faces) < len(mesh.faces))
+    shown = Solid(few, shades={"plain": np.array(CLAY)} if mesh.colors is not None else {})
+    return Content(name, [shown, *marks], stance, notes=notes)
+
+
+def _landmarks(places: dict[str, np.ndarray] | None, size: float) -> list[Dots]:
+    if not places:
+        return []
+    return [Dots(np.array(list(places.values())), MARKER, size / 160, True, name="landmarks", labels=tuple(places))]
+
+
+def body_shades(mesh: Mesh, part_of_face: np.ndarray, **more: Any) -> Solid:
+    """A body in one colour, or by its parts."""
+    return Solid(mesh, CLAY, shades={"parts": part_colors(part_of_face)}, **more)
+
+
+def of_model(name: str, model: BodyModel) -> Content:
+    """A model's mean body, or its template's own, at rest."""
+    body = at_rest(model)
+    reach = (body.vertices - body.vertices.mean(axis=0)) * 1.12 + body.vertices.mean(axis=0)
+    return Content(name, [body_shades(body, model.skeleton.part_of_face)],
+                   replace(Stance.of(body), extent=_box(reach)), model)
+
+
+def of_subject(name: str, subject: Subject) -> Content:
+    """A body of fixed shape at rest."""
+    body = subject.template.with_vertices(subject.vertices(np.zeros((len(subject.skeleton.parents), 3))))
+    return Content(name, [body_shades(body, subject.skeleton.part_of_face)], Stance.of(body))
+
+
+def of_completion(name: str, done: Completion) -> Content:
+    """The completed body, with what was seen and how far it may be off, and the predicted one to be shown too."""
+    mesh = done.completed
+    shades: dict[str, np.ndarray | Heat] = {"seen": np.where(done.seen[:, None], CLAY, (0.55, 0.66, 0.80))}
+    if done.expected_error is not None:
+        error = np.asarray(done.expected_error, dtype=float)
+        shades["expected error"] = Heat(error, 0.0, max(float(np.nanpercentile(error, 98)), 1e-3), "expected error")
+    if mesh.colors is not None:
+        shades["plain"] = np.array(CLAY)
+    shapes = [Solid(mesh, name="completed", shades=shades),
+              Solid(done.predicted, (0.55, 0.66, 0.80), name="predicted", visible=False)]
+    return Content(name, shapes, Stance.of(mesh), notes=(f"{name}: {done.judgement}",))
+
+
+def beside(content: Content, shapes: Sequence[Shape], notes: Sequence[str] = ()) -> Content:
+    """The same with more shapes and notes."""
+    return replace(content, shapes=[*content.shapes, *shapes], notes=(*content.notes, *notes))
+
+
+def told(make: Callable[[], Content]) -> Content:
+    """What is made, with the warnings on the way as its notes; they are given again."""
+    with warnings.catch_warnings(record=True) as caught:
+        warnings.simplefilter("always", UserWarning)
+        content = make()
+    mine = [str(w.message) for w in caught if issubclass(w.category, UserWarning)]
+    for text in mine:
+        warnings.warn(text, stacklevel=2)
+    return replace(content, notes=(*mine, *content.notes))
+
+
+def _box(points: np.ndarray) -> np.ndarray:
+    points = points[np.isfinite(points).all(axis=1)]
+    return np.stack([points.min(axis=0), points.max(axis=0)])
