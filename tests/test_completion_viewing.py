@@ -19,6 +19,7 @@ from completion.viewing.dragging import Drag
 from completion.viewing.files import Files
 from completion.viewing.motions import as_columns
 from completion.viewing.movable import FEW, MovableBody
+from completion.viewing.notebook import view
 from model.files import load_model
 from scanprep import RegisteredSet, read_mesh, write_landmarks, write_mesh
 from scanprep.geometry import rotations
@@ -272,7 +273,7 @@ def test_a_recording_laid_over_its_motion_tells_residuals(files, tmp_path, model
     app = app_of(tmp_path, "walk.npz", "walk.csv", over=True, model=files / "worm.npz")
     assert app.shown == [0] and len(app.contents[0].shapes) == 2
     told = next(message for message in app.greet() if message.kind == "residuals")
-    assert told.fields == {"pane": 0, "layer": 1, "labels": ("A", "B", "C")}
+    assert [told.fields[name] for name in ("pane", "layer", "labels")] == [0, 1, ("A", "B", "C")]
     assert np.allclose(np.frombuffer(told.data, "<f4"), 0.004)
 
 
@@ -332,7 +333,7 @@ def test_many_triangles_are_thinned(tmp_path):
     write_mesh(tmp_path / "many.ply", Mesh(np.stack([x, y, 0.1 * np.sin(9 * x)], -1).reshape(-1, 3), faces))
     content = app_of(tmp_path, "many.ply").contents[0]
     assert len(content.shapes[0].mesh.faces) < 200_000 < len(faces)
-    assert "fewer" in content.notes[0]
+    assert "fewer" in content.notes[0] and f"{len(faces):,} triangles" in content.about
 
 
 def test_what_is_saved_is_never_written_over(files, tmp_path, model):
@@ -371,6 +372,33 @@ def test_random_bodies_and_poses_are_as_the_model_says(files, model):
     assert not app.controls.turns[model.skeleton.names[0]].any() and app.controls.turns[PART].any()
     ask(app, "reset")
     assert not any(turn.any() for turn in app.controls.turns.values()) and not app.controls.betas.any()
+
+
+# in a notebook
+
+
+def test_a_notebook_shows_what_turns_without_a_network(model, new_page, tmp_path):
+    subject, motion = model.subject(np.array([0.5, -1.0])), a_motion(20)
+    shown = view(model.template, model.template.vertices, model, subject, (motion, subject))
+    assert len(shown._repr_html_()) < 2_000_000
+    (tmp_path / "notebook.html").write_text(f"<body>{shown._repr_html_()}</body>", encoding="utf-8")
+    page = new_page(offline=True)
+    page.goto((tmp_path / "notebook.html").as_uri())
+    frame = page.frames[-1]
+    wait_until(page, "Boolean(document.querySelector('iframe').contentDocument.querySelector('figure')?.sk)", 20)
+    assert frame.evaluate("document.querySelector('figure').sk.panes.length") == 5
+    assert not page.errors and all(url.startswith(("file:", "about:", "data:", "blob:")) for url in page.requests)
+
+
+def test_a_notebook_shows_files_and_refuses_the_rest(files):
+    assert [content.name for content in view(files / "body.ply", str(files / "worm.npz")).contents] == [
+        "body.ply", "worm.npz"]
+    with pytest.raises(ValueError, match="got dict"):
+        view({})
+    with pytest.raises(ValueError, match="got nothing"):
+        view()
+    with pytest.raises(ValueError, match="up: expected one of"):
+        view(files / "body.ply", up="w")
 
 
 # in the browser

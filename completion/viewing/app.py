@@ -6,6 +6,7 @@ and with where all sliders stand. Older answers that still wait give way to newe
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -55,6 +56,7 @@ class ViewApp:
         self.number = 0                                   # of the scene, which positions name
         self._scene: list[Message] = []                   # and what belongs to it
         self._notes: tuple[str, ...] = ()
+        self._about: dict[int, str] = {}
         self._positions: dict[tuple[int, int], Message] = {}
         first = [i for i, entry in enumerate(self.entries) if entry.first] or [0]
         self.show(first if len(first) <= MOST else first[:1])
@@ -71,8 +73,8 @@ class ViewApp:
         """All but the shapes."""
         sliders = self.controls
         return Message("state", {
-            "entries": [{"name": entry.name, "shown": i in self.shown, "problem": self.problems.get(i, "")}
-                        for i, entry in enumerate(self.entries)],
+            "entries": [{"name": entry.name, "shown": i in self.shown, "problem": self.problems.get(i, ""),
+                         "about": self._about.get(i, "")} for i, entry in enumerate(self.entries)],
             "notes": list(self._notes), "problems": list(self.problems.values()),
             "saved": [str(path) for path in self.written],
             "parts": list(sliders.turns), "models": [{"pane": one.pane, "layer": one.layer, "name": one.name}
@@ -90,8 +92,8 @@ class ViewApp:
         for i, pane, layer in self._places():
             told = self.contents[i].markers
             if told is not None:
-                out.append(Message("residuals", {"pane": pane, "layer": layer + told.shape, "labels": told.labels},
-                                   told.residuals.astype("<f4").tobytes()))
+                fields = {"pane": pane, "layer": layer + told.shape, "labels": told.labels, **told.colors()}
+                out.append(Message("residuals", fields, told.residuals.astype("<f4").tobytes()))
         return out
 
     # what is shown
@@ -104,7 +106,10 @@ class ViewApp:
         for i in wanted:
             try:
                 if i not in self.contents:
-                    self.contents[i] = self.entries[i].load()
+                    content = self.entries[i].load()
+                    self.contents[i] = replace(content, name=self.entries[i].name,
+                                               stance=content.start or content.stance)
+                    self._about[i] = content.about
                 model = self.contents[i].model
                 if model is not None and i not in self.bodies:
                     self.bodies[i] = MovableBody(model)
@@ -165,7 +170,7 @@ class ViewApp:
         raise ValueError("name files on the command line: scape view FILES")
 
     def close(self) -> None:
-        """Nothing is left to do."""
+        """All that was wanted was saved."""
 
     def _tell(self, send: Send) -> None:
         for one in self.controls.shown:

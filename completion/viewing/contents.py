@@ -14,6 +14,7 @@ from scanprep.geometry import rotations
 from scanprep.geometry.mesh import Mesh
 from scanprep.pictures.camera import Camera, upright
 from scanprep.pictures.colors import part_colors
+from scanprep.pictures.scene import NO_INDEX
 from scanprep.pictures.shading import CLAY, Dots, Heat, Moving, Shape, Solid
 from scanprep.pictures.thinned import thinned
 
@@ -21,6 +22,7 @@ from ..bodies import at_rest
 from ..partial.completion import Completion
 
 POINTS = 150_000                     # of a cloud that are shown
+SHOWN_OFF = 0.03                     # metres: residual of a marker that is darkest
 MARKER = (0.85, 0.25, 0.2)
 ELEVATION, TURN = 8.0, 20.0          # degrees from which a body is seen at first
 AXES = {f"{sign}{axis}": s * np.eye(3)[i] for sign, s in (("", 1.0), ("-", -1.0)) for i, axis in enumerate("xyz")}
@@ -49,6 +51,10 @@ class Stance:
         axis = int(np.abs(mean).argmax())
         return Stance(_box(points.reshape(-1, 3)), np.sign(mean[axis]) * np.eye(3)[axis], R[0] @ self.front)
 
+    def around(self, points: np.ndarray) -> Stance:
+        """The same way up, at other places (n, 3)."""
+        return replace(self, extent=_box(points))
+
     def camera(self, up: np.ndarray | None = None) -> Camera:
         """A view from beside the front, this way up."""
         up = self.up if up is None else up
@@ -69,14 +75,24 @@ class MarkersTold:
     labels: tuple[str, ...]
     residuals: np.ndarray
 
+    def colors(self) -> dict[str, Any]:
+        """The distance shown darkest, and the colours up to it with that of no value last."""
+        ramp = Heat(np.append(np.linspace(0, 1, NO_INDEX), np.nan), 0, 1).colors()
+        return {"high": SHOWN_OFF, "palette": np.round(255 * ramp).astype(np.uint8).tobytes().hex()}
+
 
 @dataclass(frozen=True, eq=False)
 class Content:
-    """One thing, as it is shown: its first shape is a model's body where there is a model."""
+    """One thing, as it is shown: its first shape is a model's body where there is a model.
+
+    `start` is the stance in the first frame of a motion, for a view that goes along with it.
+    """
 
     name: str
     shapes: Sequence[Shape | Moving]
     stance: Stance
+    about: str = ""
+    start: Stance | None = None
     model: BodyModel | None = None
     markers: MarkersTold | None = None
     notes: tuple[str, ...] = ()
@@ -90,11 +106,17 @@ def of_mesh(name: str, shape: Mesh | np.ndarray, landmarks: dict[str, np.ndarray
     marks = _landmarks(landmarks, size)
     if not len(mesh.faces):
         every = max(1, len(mesh.vertices) // POINTS)
-        return Content(name, [Dots(mesh.vertices[::every], CLAY, size / 500), *marks], stance)
+        return Content(name, [Dots(mesh.vertices[::every], CLAY, size / 500), *marks], stance,
+                       f"{len(mesh.vertices):,} points")
     few = thinned(mesh)
     notes = (f"{name}: shown with fewer than its {len(mesh.faces):,} triangles",) * (len(few.faces) < len(mesh.faces))
     shown = Solid(few, shades={"plain": np.array(CLAY)} if mesh.colors is not None else {})
-    return Content(name, [shown, *marks], stance, notes=notes)
+    return Content(name, [shown, *marks], stance, sizes(mesh), notes=notes)
+
+
+def sizes(mesh: Mesh) -> str:
+    """How many vertices and triangles."""
+    return f"{len(mesh.vertices):,} vertices, {len(mesh.faces):,} triangles"
 
 
 def _landmarks(places: dict[str, np.ndarray] | None, size: float) -> list[Dots]:
@@ -113,13 +135,14 @@ def of_model(name: str, model: BodyModel) -> Content:
     body = at_rest(model)
     reach = (body.vertices - body.vertices.mean(axis=0)) * 1.12 + body.vertices.mean(axis=0)
     return Content(name, [body_shades(body, model.skeleton.part_of_face)],
-                   replace(Stance.of(body), extent=_box(reach)), model)
+                   replace(Stance.of(body), extent=_box(reach)),
+                   f"{sizes(body)}, {len(model.skeleton.parents)} parts, {model.n_betas} betas", model=model)
 
 
 def of_subject(name: str, subject: Subject) -> Content:
     """A body of fixed shape at rest."""
     body = subject.template.with_vertices(subject.vertices(np.zeros((len(subject.skeleton.parents), 3))))
-    return Content(name, [body_shades(body, subject.skeleton.part_of_face)], Stance.of(body))
+    return Content(name, [body_shades(body, subject.skeleton.part_of_face)], Stance.of(body), sizes(body))
 
 
 def of_completion(name: str, done: Completion) -> Content:
@@ -133,12 +156,7 @@ def of_completion(name: str, done: Completion) -> Content:
         shades["plain"] = np.array(CLAY)
     shapes = [Solid(mesh, name="completed", shades=shades),
               Solid(done.predicted, (0.55, 0.66, 0.80), name="predicted", visible=False)]
-    return Content(name, shapes, Stance.of(mesh), notes=(f"{name}: {done.judgement}",))
-
-
-def beside(content: Content, shapes: Sequence[Shape], notes: Sequence[str] = ()) -> Content:
-    """The same with more shapes and notes."""
-    return replace(content, shapes=[*content.shapes, *shapes], notes=(*content.notes, *notes))
+    return Content(name, shapes, Stance.of(mesh), str(done.judgement))
 
 
 def told(make: Callable[[], Content]) -> Content:

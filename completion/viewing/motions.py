@@ -13,11 +13,10 @@ from scanprep.pictures.shading import CLAY, Dots, Moving
 
 from ..mocap.files.markers import MarkerSequence
 from ..motion import Motion, spread_frames
-from .contents import MARKER, Content, MarkersTold, Stance, body_shades
+from .contents import MARKER, SHOWN_OFF, Content, MarkersTold, Stance, body_shades
 
 MADE = 150                           # frames that the columns are made from
 AT_ONCE = 256                        # frames whose coefficients are computed together
-SHOWN_OFF = 0.03                     # metres: residual of a marker that is darkest
 
 
 def of_motion(name: str, motion: Motion, subject: Subject, markers: MarkerSequence | None = None) -> Content:
@@ -29,7 +28,8 @@ def of_motion(name: str, motion: Motion, subject: Subject, markers: MarkerSequen
     shapes = [Moving(body_shades(body, subject.skeleton.part_of_face, name="body"), frames[:1], motion.rate,
                      (basis, coefficients))]
     at_rest = subject.template.with_vertices(subject.vertices(np.zeros((len(subject.skeleton.parents), 3))))
-    content = Content(name, shapes, Stance.of(at_rest).turned(motion.poses, frames[:, ::7]))
+    stance = Stance.of(at_rest).turned(motion.poses, frames[:, ::7])
+    content = Content(name, shapes, stance, lasting(motion.poses, motion.rate), stance.around(frames[0]))
     return content if markers is None else with_markers(content, motion, markers)
 
 
@@ -83,5 +83,11 @@ def of_markers(name: str, markers: MarkerSequence) -> Content:
     every = every[np.isfinite(every).all(axis=1)]
     every = np.concatenate([every, points])
     dots = replace(marker_dots(markers), labels=markers.labels, color=CLAY)
-    return Content(name, [Moving(dots, markers.positions, markers.rate)], replace(stance, extent=np.stack(
-        [every.min(axis=0), every.max(axis=0)])))
+    about = f"{len(markers.labels)} markers, {lasting(markers.positions, markers.rate)}"
+    return Content(name, [Moving(dots, markers.positions, markers.rate)], stance.around(every), about,
+                   stance.around(points))
+
+
+def lasting(frames: np.ndarray, rate: float) -> str:
+    """How long a motion is."""
+    return f"{len(frames):,} frames at {rate:g}/s, {len(frames) / rate:.3g} s"

@@ -20,7 +20,7 @@ export class View extends Program {
     this.count = FIRST;
     this.turn = Promise.resolve();
     this.on("state", (fields) => this.update(fields));
-    this.on("residuals", (fields, data) => this.markers.push({ ...fields, values: new Float32Array(data.slice().buffer) }));
+    this.on("residuals", (fields, data) => this.addMarkers({ ...fields, values: new Float32Array(data.slice().buffer) }));
     this.build();
     addEventListener("keydown", (event) => this.key(event));
   }
@@ -92,7 +92,6 @@ export class View extends Program {
   update(state) {
     const { entries, notes, problems, saved, parts, models } = state;
     this.entries = entries;
-    this.list.hidden = entries.length < 2;
     this.list.replaceChildren(...entries.map((entry, i) => this.entry(entry, i)));
     this.notes.replaceChildren(...problems.map((text) => make("p", { class: "sk-bad" }, text)),
       ...notes.map((text) => make("p", {}, text)));
@@ -106,10 +105,12 @@ export class View extends Program {
     this.stand(state);
   }
 
-  entry({ name, shown, problem }, i) {
+  entry({ name, shown, problem, about }, i) {
     const box = make("input", { type: "checkbox", checked: shown, onchange: () => this.send("show", { entries: this.wanted(i, box.checked) }) });
+    const text = make("span", { class: problem ? "sk-bad" : "" }, name, make("small", {}, about));
+    if (this.entries.length < 2) return make("li", {}, text);
     const only = button("only", `show ${name} alone`, () => this.send("show", { entries: [i] }));
-    return make("li", { title: problem || name }, make("label", {}, box, make("span", { class: problem ? "sk-bad" : "" }, name)), only);
+    return make("li", { title: problem || name }, make("label", {}, box, text), only);
   }
 
   wanted(i, on) { return this.entries.flatMap((entry, k) => (k === i ? on : entry.shown) ? [k] : []); }
@@ -132,7 +133,50 @@ export class View extends Program {
     this.stand(fields);
   }
 
+  // Markers are coloured by how far they are from where the body puts them, frame by frame.
+  addMarkers(told) {
+    const dots = this.figure?.panes[told.pane]?.layers[told.layer];
+    if (!dots?.motion) return;
+    this.markers.push({ ...told, dots });
+    dots.setValues(this.residuals(this.markers.at(-1)), 0, told.high, "distance of markers", told.palette);
+    this.figure.legend();
+  }
+
+  residuals({ dots, labels, values }) {
+    const frame = Math.min(this.figure.frameOf(dots), values.length / labels.length - 1);
+    return values.subarray(frame * labels.length, (frame + 1) * labels.length);
+  }
+
+  wentOn(figure) {
+    for (const told of this.markers) {
+      const { dots, high } = told, { index } = dots.shades.at(-1), now = this.residuals(told);
+      now.forEach((value, i) => { dots.columns[index][i] = Number.isNaN(value) ? 255 : Math.round(254 * Math.min(1, value / high)); });
+      dots.setShade(dots.shades.length - 1);
+    }
+    for (const pane of figure.panes) {
+      const body = pane.layers.find((layer) => layer.motion), at = body && middle(body);
+      if (at && pane.followed && this.following.checked) {
+        const step = at.clone().sub(pane.followed);
+        pane.camera.position.add(step);
+        pane.controls.target.add(step);
+        pane.camera.updateMatrixWorld();
+      }
+      pane.followed = at ?? null;
+    }
+  }
+
+  // The view goes along with bodies that walk.
+  timeline(figure) {
+    if (!figure.time) return;
+    const go = figure.go.bind(figure);
+    figure.go = (frame) => { go(frame); this.wentOn(figure); };
+    this.following = make("input", { type: "checkbox", checked: true });
+    figure.below.querySelector(".sk-time").append(make("label", { title: "the view goes along with the body" }, this.following, "follow"));
+    this.wentOn(figure);
+  }
+
   shown(figure) {
+    this.timeline(figure);
     figure.panes.forEach((pane, i) => {
       pane.overlays.push((context) => this.drawJoint(context, pane));
       this.listen(pane, i);
@@ -193,14 +237,12 @@ export class View extends Program {
   tellMarker(pane, number, event) {
     const box = pane.canvas.getBoundingClientRect();
     let best = null, least = NEAR;
-    for (const { layer, labels, values } of this.markers.filter((one) => one.pane === number)) {
-      const dots = pane.layers[layer];
-      if (!dots?.object.visible) continue;
-      const frame = Math.min(this.figure.frameOf(dots), values.length / labels.length - 1);
+    for (const told of this.markers.filter((one) => one.pane === number && one.dots.object.visible)) {
+      const { dots, labels } = told, now = this.residuals(told);
       labels.forEach((label, i) => {
         const at = dots.hidden.has(i) ? null : pane.project(new Vector3().fromArray(dots.positions, 3 * i));
         const away = at ? Math.hypot(at.x - (event.clientX - box.left), at.y - (event.clientY - box.top)) : Infinity;
-        if (away < least) { least = away; best = { label, value: values[frame * labels.length + i] }; }
+        if (away < least) { least = away; best = { label, value: now[i] }; }
       });
     }
     if (!best) { if (pane.told) pane.tip.hidden = true; pane.told = false; return; }
@@ -220,4 +262,15 @@ export class View extends Program {
     const action = this.shownModels?.length && actions[event.key] || time && !event.target.matches("[type=checkbox]") && moving[event.key];
     if (action) { event.preventDefault(); action(); }
   }
+}
+
+function middle({ positions, count, hidden }) {
+  const sum = new Vector3(), one = new Vector3();
+  let known = 0;
+  for (let i = 0; i < count; i += 5) {
+    if (hidden.has(i)) continue;
+    sum.add(one.fromArray(positions, 3 * i));
+    known++;
+  }
+  return known ? sum.divideScalar(known) : null;
 }
