@@ -13,13 +13,13 @@ from completion.mocap.files.markers import MarkerSequence, write_markers
 from completion.motion import Motion
 from completion.partial.completion import Completion, save_completion
 from completion.viewing.app import ViewApp
-from completion.viewing.arrangement import free_name
 from completion.viewing.contents import Stance
 from completion.viewing.dragging import Drag
 from completion.viewing.files import Files
 from completion.viewing.motions import as_columns
-from completion.viewing.movable import FEW, MovableBody
+from completion.viewing.movable import FEW, MovableBody, part_in_words
 from completion.viewing.notebook import view
+from completion.viewing.saving import free_name
 from model.files import load_model
 from scanprep import RegisteredSet, read_mesh, write_landmarks, write_mesh
 from scanprep.geometry import rotations
@@ -144,6 +144,11 @@ def test_a_body_with_many_other_betas_is_made_again():
     assert np.array_equal(body.betas, betas)
 
 
+def test_models_that_name_their_parts_otherwise_share_them():
+    assert [part_in_words(name) for name in ("hand_left", "l_hand", "upper_arm_right", "r_upper_arm", "chest", "part3")
+            ] == ["left hand"] * 2 + ["right upper arm"] * 2 + ["chest", "part3"]
+
+
 def test_a_model_without_betas_is_its_own_body(model):
     alone = worm_model(components=0)
     body = MovableBody(alone)
@@ -217,6 +222,13 @@ def test_landmarks_beside_a_mesh_are_shown_with_it(files):
     assert [shape.name for shape in mesh.shapes] == ["", "landmarks"]
     assert mesh.shapes[1].labels == ("head", "tail")
     assert len(cloud.shapes[0].points) == len(mesh.shapes[0].mesh.vertices)
+
+
+def test_a_file_beside_that_has_no_landmarks_hides_nothing(files, tmp_path):
+    (tmp_path / "body.ply").write_bytes((files / "body.ply").read_bytes())
+    (tmp_path / "body.json").write_text('{"kind": "statue"}')
+    content = app_of(tmp_path, "body.ply").contents[0]
+    assert len(content.shapes) == 1 and "body.json" in content.notes[0]
 
 
 def test_landmarks_and_layouts_are_laid_on_what_was_named_before(files, tmp_path, model):

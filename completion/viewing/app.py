@@ -12,17 +12,16 @@ from typing import Any
 
 import numpy as np
 
-from scanprep.geometry.files import write_mesh
 from scanprep.pictures.scene import pack_scene
 from scanprep.viewer.messages import Message
 from scanprep.viewer.server import Send
 
-from ..motion import Motion
-from .arrangement import free_name, over_each_other, side_by_side
+from .arrangement import over_each_other, side_by_side
 from .contents import AXES, Content
 from .controls import Controls, Shown
 from .files import Entry
 from .movable import MovableBody
+from .saving import save_bodies, save_poses
 
 MOST = 12                            # panes
 
@@ -113,9 +112,10 @@ class ViewApp:
                 model = self.contents[i].model
                 if model is not None and i not in self.bodies:
                     self.bodies[i] = MovableBody(model)
-            except ValueError as problem:
+            except (ValueError, OSError) as problem:
                 self.problems[i] = str(problem)
             else:
+                self.problems.pop(i, None)
                 read.append(i)
         self.shown = read
         self.contents = {i: self.contents[i] for i in read}
@@ -148,8 +148,8 @@ class ViewApp:
         body = one.body
         y = self.controls.vertices(body) + (body.origin - self.cameras[one.pane].target).astype(np.float32)
         joint = None
-        if self.controls.chosen in body.skeleton.names:
-            joint = body.regressor[[body.skeleton.names.index(self.controls.chosen)]] @ y
+        if self.controls.chosen in body.parts:
+            joint = body.regressor[[body.parts.index(self.controls.chosen)]] @ y
         fields = {"scene": self.number, "pane": one.pane, "layer": one.layer, "joint": joint, **self._where()}
         message = Message("positions", fields, np.ascontiguousarray(y, dtype="<f4").tobytes(),
                           f"positions {one.pane} {one.layer}")
@@ -237,21 +237,10 @@ class ViewApp:
 
     def on_save_body(self, send: Send) -> None:
         """Each body as a mesh."""
-        for one in self.controls.shown:
-            body = one.body
-            path = free_name(self.output / f"{Path(one.name).stem}_body.ply")
-            write_mesh(path, body.model.template.with_vertices(self._exact(body)))
-            self.written.append(path)
+        self.written += save_bodies(self.controls, self.output)
         send(self.state())
 
     def on_save_pose(self, send: Send) -> None:
         """The pose of each as a motion of one frame."""
-        for one in self.controls.shown:
-            path = free_name(self.output / f"{Path(one.name).stem}_pose.npz")
-            Motion(self.controls.pose_of(one.body)[None], self.controls.trans[None], self.controls.betas_of(one.body),
-                   1.0, np.zeros((1, 0))).save(path)
-            self.written.append(path)
+        self.written += save_poses(self.controls, self.output)
         send(self.state())
-
-    def _exact(self, body: MovableBody) -> np.ndarray:
-        return body.model.vertices(self.controls.pose_of(body), self.controls.betas_of(body), self.controls.trans)

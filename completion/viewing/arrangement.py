@@ -1,9 +1,8 @@
-"""Contents beside each other or in one place, and names for what is saved."""
+"""Contents beside each other or in one place."""
 from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import replace
-from pathlib import Path
 
 import numpy as np
 
@@ -48,11 +47,3 @@ def _renamed(shape: Shape | Moving, content: Content, number: int, color: tuple[
     name = f"{content.name}: {shape.name}" if number else content.name
     return replace(shape, name=name, color=color) if isinstance(shape, Solid) and not number else replace(
         shape, name=name)
-
-
-def free_name(path: Path) -> Path:
-    """The path, or the first with a number that is not there yet."""
-    tried, number = path, 2
-    while tried.exists():
-        tried, number = path.with_stem(f"{path.stem}_{number}"), number + 1
-    return tried

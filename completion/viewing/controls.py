@@ -41,7 +41,7 @@ class Controls:
         count = max([one.body.model.n_betas for one in shown], default=0)
         betas = np.zeros(count)
         betas[:min(count, len(self.betas))] = self.betas[:count]
-        names = dict.fromkeys(name for one in shown for name in one.body.skeleton.names)
+        names = dict.fromkeys(name for one in shown for name in one.body.parts)
         self.turns = {name: self.turns.get(name, np.zeros(3)) for name in names}
         self.shown, self.betas, self.held = shown, betas, None
         if self.chosen not in names:
@@ -49,7 +49,7 @@ class Controls:
 
     def pose_of(self, body: MovableBody) -> np.ndarray:
         """(J, 3)"""
-        return np.array([self.turns[name] for name in body.skeleton.names])
+        return np.array([self.turns[name] for name in body.parts])
 
     def betas_of(self, body: MovableBody) -> np.ndarray | None:
         """(K,), or None for a model without."""
@@ -89,7 +89,7 @@ class Controls:
         limits = JointLimits.from_poses(examples) if len(examples) >= LEAST_POSES else None
         pose = sample_poses(body.model, 1, rng, limits)[0]
         pose[0] = 0
-        self.turns.update(zip(body.skeleton.names, pose, strict=True))
+        self.turns.update(zip(body.parts, pose, strict=True))
         self.trans = np.zeros(3)
 
     def reset(self) -> None:
@@ -112,7 +112,7 @@ class Controls:
         one = self.find(pane, layer)
         if not 0 <= vertex < len(one.body.part_of_vertex):
             raise ValueError(f"vertex: expected 0 to {len(one.body.part_of_vertex) - 1}, got {vertex}")
-        self.chosen = one.body.skeleton.names[int(one.body.part_of_vertex[vertex])]
+        self.chosen = one.body.parts[int(one.body.part_of_vertex[vertex])]
         return one
 
     def grab(self, pane: int, layer: int, vertex: int) -> None:
@@ -128,4 +128,4 @@ class Controls:
         if self.held is not None:
             one, held = self.held
             pose, self.trans = held.moved(self.pose_of(one.body), self.trans, wanted)
-            self.turns.update(zip(one.body.skeleton.names, pose, strict=True))
+            self.turns.update(zip(one.body.parts, pose, strict=True))

@@ -102,8 +102,12 @@ class Files:
 
     def _surface(self, path: Path, name: str) -> Content:
         shape, file = read_scan(path, self.unit), landmarks_beside(path)
-        marks = {} if file is None else read_landmarks(file, shape if isinstance(shape, Mesh) else None, self.unit)
-        return of_mesh(name, shape, marks)
+        if file is None:
+            return of_mesh(name, shape)
+        try:
+            return of_mesh(name, shape, read_landmarks(file, shape if isinstance(shape, Mesh) else None, self.unit))
+        except ValueError as problem:                    # a file of another kind that happens to have its name
+            return replace(of_mesh(name, shape), notes=(f"no landmarks beside {name}: {problem}",))
 
     def _lay_on(self, found: list[Entry], path: Path) -> None:
         """Landmarks, or a marker layout, on the thing that was named before them."""

@@ -12,6 +12,7 @@ import numpy as np
 
 from model.body import BodyModel
 from model.linear import PointOperator, posed_product
+from scanprep.skeleton.names import in_words
 
 FEW = 3                              # differences beside the basis at a new pose: for more it gets these betas itself
 KEPT = 24                            # differences of the basis that are kept, those used last
@@ -27,6 +28,7 @@ class MovableBody:
 
     def __init__(self, model: BodyModel) -> None:
         self.model, self.skeleton = model, model.skeleton
+        self.parts = tuple(map(part_in_words, model.skeleton.names))
         self.part_of_vertex = model.skeleton.part_of_vertex(model.template)
         self.regressor = model.skeleton.joint_regressor(model.template)
         self.betas: np.ndarray | None = np.zeros(model.n_betas) if model.n_betas else None
@@ -116,3 +118,9 @@ class MovableBody:
                 self._differences.popitem(last=False)
         self._differences.move_to_end(k)
         return self._differences[k]
+
+
+def part_in_words(name: str) -> str:
+    """A part's name by which models that name them otherwise share it: "left hand" for hand_left and l_hand."""
+    side = {"l_": "left", "r_": "right"}.get(name[:2])
+    return in_words(name if side is None else f"{name[2:]}_{side}")

@@ -64,7 +64,7 @@ export class View extends Program {
     const set = (value) => {
       if (input === document.activeElement && performance.now() - (input.moved ?? 0) < 400) return;      // still in a hand
       input.value = value;
-      told.textContent = `${Number(value.toFixed(2))}${unit}`;
+      told.textContent = `${Number(value.toFixed(unit ? 0 : 2))}${unit}`;
     };
     input.addEventListener("input", () => { input.moved = performance.now(); });
     return { input, set, row: make("label", { class: "sk-slider" }, make("span", {}, name), input, told) };
@@ -100,7 +100,7 @@ export class View extends Program {
     this.models.hidden = !models.length;
     if (String(parts) !== String(this.parts)) {
       this.parts = parts;
-      this.part.replaceChildren(...parts.map((name) => make("option", {}, name.replaceAll("_", " "))));
+      this.part.replaceChildren(...parts.map((name) => make("option", {}, name)));
     }
     this.stand(state);
   }
